@@ -1,0 +1,28 @@
+"""Explicit invariants-preserving (EIP) integrators for SciPy."""
+
+from importlib.metadata import version as _version
+
+from .invariants import Invariant, check_gradient
+from .longrun import integrate
+from .result import Diagnostics, IntegrationResult, ProjectionResult
+from .solvers import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPSolver, eip_method
+from .tableaux import Tableau
+
+__version__ = _version("eip_scipy")
+
+__all__ = [
+    "EIPRK1",
+    "EIPRK2",
+    "EIPRK3",
+    "EIPRK4",
+    "EIPRK5",
+    "Diagnostics",
+    "EIPSolver",
+    "IntegrationResult",
+    "Invariant",
+    "ProjectionResult",
+    "Tableau",
+    "check_gradient",
+    "eip_method",
+    "integrate",
+]

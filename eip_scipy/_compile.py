@@ -1,0 +1,218 @@
+"""Users' Numba functions in the form that the compiled driver takes: ``(t, y, out, params) -> None``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import config, from_dtype, njit, types
+from numba.core.errors import NumbaError
+from numba.extending import is_jitted
+
+from .invariants import Invariant, InvariantSet
+
+__all__ = ["CompiledFunctions", "NotCompilable", "compile_functions", "signatures"]
+
+
+class NotCompilable(TypeError):
+    """A run cannot be compiled; the message names the function and says why."""
+
+
+class CompiledFunctions(NamedTuple):
+    """The three functions of the step as Numba dispatchers."""
+
+    rhs: Callable[..., None]
+    inv: Callable[..., None]
+    grad: Callable[..., None]
+
+
+class Signatures(NamedTuple):
+    """Their signatures for one type of state."""
+
+    rhs: Any
+    inv: Any
+    grad: Any
+
+
+def signatures(dtype: np.dtype) -> Signatures:
+    """Signatures of rhs, inv and grad for states of `dtype`."""
+    real, scalar = types.float64, from_dtype(np.dtype(dtype))
+    state, rows, floats = scalar[::1], scalar[:, ::1], real[::1]
+    return Signatures(
+        rhs=types.void(real, state, state, floats),
+        inv=types.void(real, state, floats, floats),
+        grad=types.void(real, state, state, rows, floats),
+    )
+
+
+def compile_functions(
+    fun: Callable[..., Any], in_place: bool, has_params: bool, invariants: InvariantSet, dtype: np.dtype
+) -> CompiledFunctions:
+    """Wrap and compile the functions of a run.
+
+    Raises
+    ------
+    NotCompilable
+        When one of them is no lazily jitted Numba function of the arguments that `integrate` documents.
+    """
+    if config.DISABLE_JIT:
+        raise NotCompilable("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
+    sigs = signatures(dtype)
+    rhs = _compiled(_wrap_rhs(_jitted(fun, "fun"), in_place, has_params), sigs.rhs, "fun")
+    inv, grad = _no_values, _no_gradients
+    for k, item in enumerate(invariants.items):
+        label, scalar = invariants.labels[k], invariants.scalar[k]
+        start, stop = int(invariants.starts[k]), int(invariants.starts[k + 1])
+        value, gradient = _invariant_functions(item, label)
+        inv = _compiled(_chain_value(inv, value, start, scalar, has_params), sigs.inv, f"invariant {label!r}")
+        rows = 0 if scalar else stop - start
+        wrapped = _chain_gradient(grad, _wrap_gradient(gradient, item, has_params), start, rows, item.in_place)
+        grad = _compiled(wrapped, sigs.grad, f"gradient of invariant {label!r}")
+    return CompiledFunctions(rhs, inv, grad)
+
+
+def _jitted(fun: Callable[..., Any], name: str) -> Callable[..., Any]:
+    if not is_jitted(fun):
+        raise NotCompilable(f"{name} is not a Numba function; decorate it with @numba.njit")
+    return fun
+
+
+def _invariant_functions(item: Invariant, label: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    if item.args:
+        raise NotCompilable(f"invariant {label!r} has args; pass its parameters through params")
+    if item.grad is None:
+        raise NotCompilable(f"invariant {label!r} has no grad")
+    return _jitted(item.fun, f"invariant {label!r}"), _jitted(item.grad, f"gradient of invariant {label!r}")
+
+
+def _compiled(wrapper: Any, signature: Any, name: str) -> Any:
+    try:
+        wrapper.compile(signature.args)
+    except NumbaError as error:
+        first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        raise NotCompilable(f"{name} does not compile for this state: {first}") from error
+    return wrapper
+
+
+def _wrap_rhs(fun: Any, in_place: bool, has_params: bool) -> Any:
+    if in_place and has_params:
+        return fun
+    if in_place:
+
+        @njit
+        def rhs(t, y, out, params):
+            fun(t, y, out)
+
+    elif has_params:
+
+        @njit
+        def rhs(t, y, out, params):
+            out[:] = fun(t, y, params)
+
+    else:
+
+        @njit
+        def rhs(t, y, out, params):
+            out[:] = fun(t, y)
+
+    return rhs
+
+
+@njit(cache=True)
+def _no_values(t, y, values, params):
+    pass
+
+
+@njit(cache=True)
+def _no_gradients(t, y, f, G, params):
+    pass
+
+
+def _chain_value(before: Any, fun: Any, start: int, scalar: bool, has_params: bool) -> Any:
+    """`before`, then the values of one more invariant from place `start` on."""
+    if scalar and has_params:
+
+        @njit
+        def inv(t, y, values, params):
+            before(t, y, values, params)
+            values[start] = fun(t, y, params)
+
+    elif scalar:
+
+        @njit
+        def inv(t, y, values, params):
+            before(t, y, values, params)
+            values[start] = fun(t, y)
+
+    elif has_params:
+
+        @njit
+        def inv(t, y, values, params):
+            before(t, y, values, params)
+            part = fun(t, y, params)
+            values[start : start + part.size] = part
+
+    else:
+
+        @njit
+        def inv(t, y, values, params):
+            before(t, y, values, params)
+            part = fun(t, y)
+            values[start : start + part.size] = part
+
+    return inv
+
+
+def _wrap_gradient(grad: Any, item: Invariant, has_params: bool) -> Any:
+    """The user's gradient with all arguments: (t, y, f, params) -> rows, or (t, y, f, out, params) in place."""
+    uses_f = item.uses_f
+    if item.in_place:
+        if uses_f and has_params:
+            return njit(lambda t, y, f, out, params: grad(t, y, f, out, params))
+        if uses_f:
+            return njit(lambda t, y, f, out, params: grad(t, y, f, out))
+        if has_params:
+            return njit(lambda t, y, f, out, params: grad(t, y, out, params))
+        return njit(lambda t, y, f, out, params: grad(t, y, out))
+    if uses_f and has_params:
+        return njit(lambda t, y, f, params: grad(t, y, f, params))
+    if uses_f:
+        return njit(lambda t, y, f, params: grad(t, y, f))
+    if has_params:
+        return njit(lambda t, y, f, params: grad(t, y, params))
+    return njit(lambda t, y, f, params: grad(t, y))
+
+
+def _chain_gradient(before: Any, gradient: Any, start: int, rows: int, in_place: bool) -> Any:
+    """`before`, then the gradient of one more invariant in row `start`, or in `rows` rows from there."""
+    stop = start + rows
+    if in_place and rows:
+
+        @njit
+        def grad(t, y, f, G, params):
+            before(t, y, f, G, params)
+            gradient(t, y, f, G[start:stop], params)
+
+    elif in_place:
+
+        @njit
+        def grad(t, y, f, G, params):
+            before(t, y, f, G, params)
+            gradient(t, y, f, G[start], params)
+
+    elif rows:
+
+        @njit
+        def grad(t, y, f, G, params):
+            before(t, y, f, G, params)
+            G[start:stop] = gradient(t, y, f, params)
+
+    else:
+
+        @njit
+        def grad(t, y, f, G, params):
+            before(t, y, f, G, params)
+            G[start] = gradient(t, y, f, params)
+
+    return grad

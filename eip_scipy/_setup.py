@@ -1,0 +1,398 @@
+"""From a user's options to what the step needs: validation, in one place for `solve_ivp` and `integrate`."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ._kernels import EPS, FrameRows, Grouping
+from ._step import ERROR, EUCLIDEAN, GIVEN, MIDPOINT, NEW, OLD, Method, Options, Work, make_work, project_step
+from .invariants import InvariantSet
+from .result import LAST_RANK, REJECTED, Diagnostics
+from .tableaux import Tableau
+
+__all__ = ["ProjectionOptions", "Run", "as_derivative", "fixed_steps", "nearest_option", "prepare"]
+
+DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
+START_ITERATIONS = 50
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectionOptions:
+    """The options of the projection as a user gives them; see `EIPSolver`."""
+
+    invariants: Any = ()
+    metric: Any = None
+    blocks: Any = None
+    frame: Any = None
+    direction: str = "new"
+    iterations: int = 1
+    every: int = 1
+    reuse_f: bool = True
+    check: bool = True
+    project_initial: bool = False
+
+
+@dataclass
+class Run:
+    """All that a driver needs besides the user's functions."""
+
+    y0: np.ndarray
+    method: Method
+    options: Options
+    work: Work
+    invariants: InvariantSet
+
+
+def nearest_option(name: str, known: Iterable[str]) -> str:
+    """`` did you mean ...?`` for the nearest known option, or nothing."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def as_derivative(value: Any, n: int, dtype: np.dtype) -> np.ndarray:
+    """The value of a user's right-hand side as an array (n,), or an error that says what came.
+
+    Raises
+    ------
+    TypeError
+        For None or values that are no numbers.
+    ValueError
+        For a wrong shape, or complex values where the state is real.
+    """
+    if value is None:
+        raise TypeError(f"fun returned None, expected {n} numbers (does it end without a return?).")
+    f = np.asarray(value)
+    if f.dtype.kind not in "fiubc":
+        raise TypeError(f"fun returned {value!r}, expected {n} numbers.")
+    if f.shape != (n,):
+        raise ValueError(f"fun returned shape {f.shape}, expected ({n},).")
+    if f.dtype.kind == "c" and dtype.kind != "c":
+        raise ValueError("fun returned complex values, but y0 is real; pass y0.astype(complex).")
+    return f
+
+
+def initial_state(y0: Any) -> np.ndarray:
+    """y0 as a new float64 or complex128 array (n,), with SciPy's messages for what is no state."""
+    if np.ma.isMaskedArray(y0) and np.ma.is_masked(y0):
+        raise ValueError("masked values in y0; fill or drop them first.")
+    y = np.asarray(y0)
+    if y.dtype.kind not in "fiubc":
+        raise TypeError(f"`y0` must hold numbers, got dtype {y.dtype}.")
+    y = np.array(y, dtype=complex if y.dtype.kind == "c" else float, order="C")
+    if y.ndim != 1:
+        raise ValueError("`y0` must be 1-dimensional.")
+    if not np.isfinite(y).all():
+        raise ValueError("All components of the initial state `y0` must be finite.")
+    return y
+
+
+def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Both tolerances as arrays (n,).
+
+    Raises
+    ------
+    ValueError
+        For NaN, negative values or a wrong shape.
+    """
+    out = []
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        a = np.asarray(value, dtype=float)
+        if a.ndim > 0 and a.shape != (n,):
+            raise ValueError(f"`{name}` has wrong shape. It has {a.shape}, the state ({n},).")
+        if not np.all(a >= 0):
+            raise ValueError(f"`{name}` must be positive. Got {value!r}.")
+        out.append(np.ascontiguousarray(np.broadcast_to(a, (n,))))
+    return out[0], out[1]
+
+
+def check_fixed_step(h: Any, t0: float, t_bound: float) -> float:
+    """h as a positive float.
+
+    Raises
+    ------
+    ValueError
+        When it is no positive number, longer than the interval, or below ten spacings of t.
+    """
+    if isinstance(h, (bool, np.bool_)) or not np.isscalar(h) or not np.isreal(h) or not h > 0 or not np.isfinite(h):
+        raise ValueError(f"`h` must be positive. Got {h!r}.")
+    h = float(h)
+    span = abs(t_bound - t0)
+    if span == 0:
+        return h
+    if h > span * (1 + _slack(h, t0, t_bound)):
+        raise ValueError(f"`h` exceeds bounds. Got h = {h:g} for an interval of length {span:g}.")
+    largest = max(abs(t0), abs(t_bound)) if math.isfinite(t_bound) else abs(t0)
+    spacing = float(np.spacing(largest))
+    if h < 10 * spacing:
+        raise ValueError(f"`h` is too small: h = {h:g} is below 10 spacings of t, which are {spacing:.3g} at t = {largest:g}.")
+    return h
+
+
+def _slack(h: float, t0: float, t_bound: float) -> float:
+    """How far T/h may be from a whole number and still count as one."""
+    if not math.isfinite(t_bound):
+        return 0.0
+    return max(1e-9, 8 * EPS * (abs(t_bound - t0) + abs(t0) + abs(t_bound)) / h)
+
+
+def fixed_steps(h: float, t0: float, t_bound: float) -> float:
+    """Number of steps of length h from t0 to t_bound (a float: inf for an unbounded interval).
+
+    T/h rounded where it is a whole number but for round-off, else the next larger one; the last step is then shorter.
+    """
+    ratio = abs(t_bound - t0) / h
+    if not math.isfinite(ratio):
+        return math.inf
+    whole = round(ratio)
+    return float(whole if abs(ratio - whole) <= _slack(h, t0, t_bound) else math.ceil(ratio))
+
+
+def count(name: str, value: Any) -> int:
+    """An integer option >= 1."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"{name} must be an integer >= 1, got {value!r}.")
+    return int(value)
+
+
+def _flag(name: str, value: Any) -> bool:
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name} must be True or False, got {value!r}.")
+    return bool(value)
+
+
+def _metric(metric: Any, tableau: Tableau, n: int, width: int) -> tuple[int, np.ndarray | None]:
+    if metric is None:
+        return (ERROR if tableau.has_estimate else EUCLIDEAN), None
+    if isinstance(metric, str):
+        if metric == "euclidean":
+            return EUCLIDEAN, None
+        if metric == "error":
+            return (ERROR if tableau.has_estimate else EUCLIDEAN), None
+        raise ValueError(f"metric must be 'error', 'euclidean' or an array of n weights, got {metric!r}.")
+    return GIVEN, np.repeat(_weights("metric", metric, n), width)
+
+
+def _weights(name: str, sigma: Any, n: int) -> np.ndarray:
+    a = np.asarray(sigma, dtype=float)
+    if a.shape != (n,):
+        raise ValueError(f"{name}: weights have shape {a.shape}, the state has {n} components.")
+    if not np.all(np.isfinite(a)) or np.any(a < 0) or not np.any(a > 0):
+        raise ValueError(f"{name}: weights must be finite, >= 0 and not all 0.")
+    return a / a.max()
+
+
+def _blocks(blocks: Any, n: int, width: int) -> Grouping:
+    if blocks is None:
+        groups = [np.array([i]) for i in range(n)]
+    elif isinstance(blocks, (int, np.integer)) and not isinstance(blocks, bool):
+        if blocks < 1 or n % blocks:
+            raise ValueError(f"blocks = {blocks} does not divide the state's {n} components.")
+        groups = list(np.arange(n).reshape(-1, blocks))
+    else:
+        groups = _block_lists(blocks, n)
+    start = np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(np.int64)
+    return Grouping(np.concatenate([*groups, []]).astype(np.int64), start, width)
+
+
+def _block_lists(blocks: Any, n: int) -> list[np.ndarray]:
+    try:
+        groups = [np.atleast_1d(np.asarray(b)) for b in blocks]
+    except TypeError:
+        raise ValueError(f"blocks must be an integer or a sequence of index arrays, got {blocks!r}.") from None
+    groups = [g for g in groups if g.size]
+    for g in groups:
+        if g.dtype.kind not in "iu" or g.ndim != 1 or g.min() < 0 or g.max() >= n:
+            raise ValueError(f"blocks: {g!r} is no array of indices from 0 to {n - 1}.")
+    used = np.concatenate([*groups, np.array([], dtype=int)]).astype(int)
+    if np.unique(used).size != used.size:
+        raise ValueError("blocks: a component stands in two blocks.")
+    return groups + [np.array([i]) for i in np.setdiff1d(np.arange(n), used)]
+
+
+def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
+    """The frame (C, S) as sparse rows of C and of the transpose of S (C S)^-1, over float views.
+
+    Raises
+    ------
+    ValueError
+        When the shapes disagree or C S is singular.
+    """
+    if frame is None:
+        C, M = np.zeros((0, n * width)), np.zeros((0, n * width))
+    else:
+        C, M = _frame_matrices(frame, n, width)
+    return FrameRows(*_sparse_rows(C), *_sparse_rows(M))
+
+
+def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        C, S = (np.atleast_2d(np.asarray(a)) for a in frame)
+    except (TypeError, ValueError):
+        raise ValueError("frame must be a pair (C, S) of matrices of shapes (k, n) and (n, k).") from None
+    k = C.shape[0]
+    if C.shape != (k, n) or S.shape != (n, k) or C.dtype.kind not in "fiuc" or S.dtype.kind not in "fiuc":
+        raise ValueError(f"frame: C has shape {C.shape} and S {S.shape}; expected (k, {n}) and ({n}, k).")
+    if width == 2:
+        C, S = _real_form(C), _real_form(S)
+    elif C.dtype.kind == "c" or S.dtype.kind == "c":
+        raise ValueError("frame: C and S must be real for a real state.")
+    # Rows of C and columns of S in units of their own: only then does the condition number tell singular from scaled.
+    C = C / np.maximum(np.abs(C).max(axis=1, keepdims=True), np.finfo(float).tiny)
+    S = S / np.maximum(np.abs(S).max(axis=0, keepdims=True), np.finfo(float).tiny)
+    product = C @ S
+    if not np.all(np.isfinite(product)) or not np.linalg.cond(product) < 1e12:
+        raise ValueError("frame: C S is singular; S must span shifts that change every row of C y.")
+    return C, np.ascontiguousarray(np.linalg.solve(product.T, S.T))
+
+
+def _real_form(a: np.ndarray) -> np.ndarray:
+    """The matrix that acts on (Re, Im) pairs as `a` does on complex components."""
+    out = np.empty((a.shape[0], 2, a.shape[1], 2))
+    out[:, 0, :, 0] = out[:, 1, :, 1] = a.real
+    out[:, 1, :, 0], out[:, 0, :, 1] = a.imag, -a.imag
+    return out.reshape(2 * a.shape[0], 2 * a.shape[1])
+
+
+def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rows = [np.flatnonzero(row) for row in a]
+    start = np.concatenate([[0], np.cumsum([len(r) for r in rows])]).astype(np.int64)
+    index = np.concatenate([*rows, []]).astype(np.int64)
+    value = np.concatenate([*(row[r] for row, r in zip(a, rows, strict=True)), []]).astype(float)
+    return start, index, value
+
+
+def method_arrays(tableau: Tableau) -> Method:
+    """A tableau as the arrays that the step takes (writable copies: compiled code has one array type for all)."""
+    return Method(
+        tableau.A.copy(), tableau.b.copy(), tableau.b_low.copy(), tableau.c.copy(), tableau.e.copy(), tableau.fsal
+    )
+
+
+def prepare(
+    tableau: Tableau,
+    rhs: Callable[[float, np.ndarray], np.ndarray],
+    t0: float,
+    y0: np.ndarray,
+    f0: np.ndarray,
+    tau: float,
+    projection: ProjectionOptions,
+    rtol: Any,
+    atol: Any,
+    *,
+    extra: tuple = (),
+    compensated: bool = False,
+) -> Run:
+    """Validate a run's options and make its buffers; the invariants are checked at the start.
+
+    Parameters
+    ----------
+    tableau : Tableau
+    rhs : callable
+        ``rhs(t, y) -> (n,)``, checked; called only where an invariant's start must be projected.
+    t0, y0, f0 : float, ndarray, ndarray
+        Start, and the derivative there.
+    tau : float
+        Step or initial step: the scale of time of the checks.
+    projection : ProjectionOptions
+    rtol, atol : float or array_like
+    extra : tuple
+        Further arguments of the invariants' functions (``(params,)`` or nothing).
+    compensated : bool
+    """
+    n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
+    kind, sigma = _metric(projection.metric, tableau, n, width)
+    if projection.direction not in DIRECTIONS:
+        raise ValueError(f"direction must be 'new', 'old' or 'midpoint', got {projection.direction!r}.")
+    rtol, atol = tolerances(rtol, atol, n)
+    groups = _blocks(projection.blocks, n, width)
+    invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra)
+    options = Options(
+        rtol=rtol,
+        atol=atol,
+        groups=groups,
+        frame=frame_rows(projection.frame, n, width),
+        target=invariants.target,
+        scales=invariants.scales,
+        kappa=tableau.kappa,
+        metric=kind,
+        direction=DIRECTIONS[projection.direction],
+        iterations=count("iterations", projection.iterations),
+        every=count("every", projection.every),
+        reuse_f=_flag("reuse_f", projection.reuse_f),
+        uses_f=invariants.uses_f,
+        compensated=_flag("compensated", compensated),
+    )
+    work = make_work(n, y0.dtype, tableau.n_stages, invariants.size, groups.start.size - 1)
+    if sigma is not None:
+        work.sigma[:] = sigma
+    run = Run(y0, method_arrays(tableau), options, work, invariants)
+    if _flag("project_initial", projection.project_initial):
+        run.y0 = projected_start(run, rhs, t0, f0)
+    violation = invariants.start_violation(t0, run.y0, f0)
+    if violation:
+        raise ValueError(f"{violation}; mend y0 or the target, or pass project_initial=True to project y0 first.")
+    if _flag("check", projection.check) and np.isfinite(f0).all():
+        invariants.check(t0, run.y0, f0, tau)
+    return run
+
+
+def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, f0: np.ndarray) -> np.ndarray:
+    """y0 on the targets, by full Newton steps in the euclidean metric."""
+    options = run.options._replace(metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False)
+    work = make_work(run.y0.size, run.y0.dtype, 0, run.invariants.size, 0)
+    work.y_hat[:] = run.y0
+    work.K[-1] = f0
+    y = np.empty_like(run.y0)
+
+    def fill(t: float, state: np.ndarray, out: np.ndarray, params: Any) -> None:
+        out[:] = rhs(t, state)
+
+    status = project_step(
+        fill, run.invariants.inv, run.invariants.grad, None, t0, run.y0, run.y0.view(float), t0, options, work, y, y.view(float)
+    )
+    missed = np.abs(work.defect) > 1e-8 * run.invariants.term_sizes(t0, y, f0) if status == 0 else [True]
+    if np.any(missed):
+        raise ValueError(projection_failure(run.invariants, work, t0))
+    return y
+
+
+def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
+    """Which invariant a failed projection left worst, by how much, and the rank it had."""
+    work.counters[REJECTED] += 1
+    excess = np.abs(work.defect) / np.maximum(work.band, np.finfo(float).tiny)
+    worst = int(np.argmax(np.where(np.isfinite(excess), excess, np.inf)))
+    return (
+        f"projection failed at t={t:g}: invariant {invariants.names[worst]!r}, residual {work.defect[worst]:.3g}, "
+        f"rank {int(work.counters[LAST_RANK])} of {invariants.size}"
+    )
+
+
+def not_finite(work: Work, method: Method, t: float, h: float) -> str:
+    """Why a raw step was not finite: the first stage that was not, or overflow of the sum."""
+    for i in range(method.b.size):
+        if not np.isfinite(work.K[i]).all():
+            return f"fun returned a non-finite value at t={t + method.c[i] * h:.10g}"
+    return f"the state is no longer finite at t={t + h:.10g}: it overflowed, or h is too large"
+
+
+def attach(diagnostics: Any, run: Run) -> None:
+    """Let `diagnostics` read the run's buffers."""
+    if diagnostics is None:
+        return
+    if not isinstance(diagnostics, Diagnostics):
+        raise TypeError(f"diagnostics must be a Diagnostics() object, got {diagnostics!r}.")
+    w = run.work
+    diagnostics._attach(
+        tuple(run.invariants.names),
+        w.max_defect,
+        w.defect,
+        w.max_correction,
+        w.counters,
+        estimated=run.options.metric == ERROR,
+    )

@@ -1,0 +1,305 @@
+"""Störmer-Verlet (leapfrog), the symplectic method of order 2 for q'' = a(t, q), in both of its forms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+from numba.core.dispatcher import Dispatcher
+from numba.extending import register_jitable
+
+__all__ = ["FORMS", "StormerVerletResult", "stormer_verlet"]
+
+FORMS = ("kick-drift-kick", "drift-kick-drift")
+
+_EPS = np.finfo(float).eps
+
+
+@dataclass(frozen=True)
+class StormerVerletResult:
+    """What `stormer_verlet` returns.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+        Saved times, the first and the last of the interval among them.
+    y : ndarray, shape (n, m)
+        States (q, v) at `t`.
+    nfev : int
+        Evaluations of the acceleration.
+    wall_time : float
+        Seconds spent in the integration, compilation excluded.
+    message : str
+        "compiled", or "interpreted" and the reason; and where the states stop being finite, if they do.
+    """
+
+    t: np.ndarray
+    y: np.ndarray
+    nfev: int
+    wall_time: float
+    message: str
+
+
+def stormer_verlet(
+    acc: Callable[..., Any],
+    t_span: tuple[float, float],
+    y0: Any,
+    h: float,
+    *,
+    form: str = "kick-drift-kick",
+    params: Any = None,
+    save_every: int | None = None,
+) -> StormerVerletResult:
+    """Integrate q'' = a(t, q) by Störmer-Verlet with a fixed step.
+
+    Both forms are symplectic (as long as all steps are equal), reversible and of order 2, with one evaluation
+    per step; their error constants differ. REBOUND's "leapfrog" is the drift-kick-drift form.
+
+    Parameters
+    ----------
+    acc : callable
+        ``acc(t, q[, params]) -> (n/2,)``. A function jitted lazily by Numba that returns a new C-contiguous float64
+        array runs compiled; any other callable runs interpreted, through the same loop.
+    t_span : tuple of float
+        Start and end; a smaller end integrates backward.
+    y0 : array_like, shape (n,)
+        Initial state (q, v), real.
+    h : float
+        Length of a step, positive in both directions. Step k starts at t0 + k h; the last one ends on the end of the
+        interval exactly, shortened where `h` does not divide the interval.
+    form : {"kick-drift-kick", "drift-kick-drift"}
+        Order of the updates within a step: v first and last (velocity Verlet), or q first and last.
+    params : array_like, shape (p,), optional
+        Passed to `acc` as a float64 array when given.
+    save_every : int, optional
+        Save each `save_every`-th state besides the first and the last; default: these two only.
+
+    Returns
+    -------
+    StormerVerletResult
+        A record with t (m,), y (n, m), nfev, wall_time [s] and message.
+
+    Raises
+    ------
+    TypeError
+        The state, `params` or what `acc` returns is not made of real numbers.
+    ValueError
+        An argument has a wrong value, or `acc` returns a wrong shape. The message says what came and what was expected.
+
+    Notes
+    -----
+    nfev is the number of steps plus one: the first evaluation, which also checks the shape, opens the
+    kick-drift-kick form, and the drift-kick-drift form has no further use for it.
+
+    References
+    ----------
+    E. Hairer, C. Lubich, G. Wanner, Geometric numerical integration illustrated by the Störmer-Verlet method,
+    Acta Numerica 12 (2003) 399-450.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy.comparators import stormer_verlet
+    >>> run = stormer_verlet(lambda t, q: -q, (0.0, 10.0), [1.0, 0.0], 0.01)
+    >>> bool(abs(run.y[0, -1] - np.cos(10.0)) < 1e-4)
+    True
+    """
+    t0, t_bound = _check_span(t_span)
+    y = _check_state(y0)
+    if form not in FORMS:
+        raise ValueError(f"unknown form {form!r}: expected one of {', '.join(map(repr, FORMS))}")
+    extra = () if params is None else (_real_vector(params, "params"),)
+    n_steps = _count_steps(t0, t_bound, h)
+    saved = _saved_steps(n_steps, save_every)
+
+    checked = _checked(acc, y.size // 2)
+    a = checked(t0, y[: y.size // 2], *extra).copy()
+    reason = _why_interpreted(acc, len(extra))
+    drive = _drive if reason else _compiled_drive(len(extra))
+    step = math.copysign(float(h), t_bound - t0)
+    last_step = t_bound - (t0 + (n_steps - 1) * step)
+    ys = np.empty((saved.size, y.size))
+    ys[0] = y
+
+    def advance(to_save: np.ndarray) -> None:
+        drive(checked if reason else acc, extra, t0, step, last_step, form == FORMS[0], to_save, y, a, ys)
+
+    # Saving nothing but the start takes no step: whatever is still to be compiled or bound is so before the clock runs.
+    advance(saved[:1])
+    start = perf_counter()
+    advance(saved)
+    wall_time = perf_counter() - start
+
+    t = t0 + saved * step
+    t[-1] = t_bound
+    return StormerVerletResult(t, ys.T, n_steps + 1, wall_time, _message(reason, t, ys))
+
+
+def _check_span(t_span: Any) -> tuple[float, float]:
+    span = np.asarray(t_span, dtype=float)
+    if span.shape != (2,) or not np.isfinite(span).all():
+        raise ValueError(f"t_span must hold two finite numbers, got {t_span!r}")
+    return float(span[0]), float(span[1])
+
+
+def _real_vector(values: Any, name: str) -> np.ndarray:
+    """Copy a 1-D array of real numbers to contiguous float64."""
+    if np.iscomplexobj(values):
+        raise TypeError(f"{name} must be real, got complex numbers")
+    if np.ma.is_masked(values):
+        raise ValueError(f"masked values in {name}")
+    vector = np.array(values, dtype=float, order="C")
+    if vector.ndim != 1:
+        raise ValueError(f"{name} must be 1-dimensional, got shape {vector.shape}")
+    return vector
+
+
+def _check_state(y0: Any) -> np.ndarray:
+    y = _real_vector(y0, "y0")
+    if y.size == 0 or y.size % 2:
+        raise ValueError(f"y0 must hold q and v, an even number of components, got {y.size}")
+    if not np.isfinite(y).all():
+        raise ValueError("All components of the initial state `y0` must be finite.")
+    return y
+
+
+def _count_steps(t0: float, t_bound: float, h: float) -> int:
+    """Count the steps of length h; the last one may be shorter, unless all fit to rounding."""
+    if not (h > 0 and math.isfinite(h)):
+        raise ValueError(f"`h` must be positive and finite, got {h!r}")
+    length = abs(t_bound - t0)
+    if length == 0:
+        return 0
+    spacing = math.ulp(max(abs(t0), abs(t_bound)))
+    if h < 10 * spacing:
+        raise ValueError(f"`h` = {h!r} is less than 10 spacings of t ({spacing:.1e} on this interval)")
+    tolerance = max(1e-9, 8 * _EPS * (length + abs(t0) + abs(t_bound)) / h)
+    ratio = length / h
+    if ratio < 1 - tolerance:
+        raise ValueError(f"`h` exceeds bounds: {h!r} on an interval of length {length!r}")
+    nearest = round(ratio)
+    return nearest if abs(ratio - nearest) <= tolerance else math.ceil(ratio)
+
+
+def _saved_steps(n_steps: int, save_every: int | None) -> np.ndarray:
+    """Numbers of the steps after which the state is saved; 0, the start, is the first of them."""
+    if save_every is None:
+        save_every = max(n_steps, 1)
+    if isinstance(save_every, bool) or not isinstance(save_every, (int, np.integer)) or save_every < 1:
+        raise ValueError(f"save_every must be a positive integer or None, got {save_every!r}")
+    return np.unique(np.append(np.arange(0, n_steps + 1, save_every, dtype=np.int64), np.int64(n_steps)))
+
+
+def _checked(acc: Callable[..., Any], size: int) -> Callable[..., np.ndarray]:
+    """`acc` with its result checked: NumPy would broadcast a scalar and drop an imaginary part silently."""
+
+    def checked(*args: Any) -> np.ndarray:
+        value = acc(*args)
+        if value is None:
+            raise TypeError(f"acc returned None, expected {size} numbers")
+        if np.iscomplexobj(value):
+            raise TypeError("acc returned complex numbers, expected real ones")
+        array = np.ascontiguousarray(value, dtype=float)
+        if np.shape(value) != (size,):
+            raise ValueError(f"acc returned shape {np.shape(value)}, expected ({size},)")
+        return array
+
+    return checked
+
+
+def _why_interpreted(acc: Callable[..., Any], n_extra: int) -> str:
+    """Why `acc` cannot enter the compiled loop; empty when it can."""
+    if not isinstance(acc, Dispatcher):
+        return "acc is not jitted by Numba"
+    signature = _acc_signature(n_extra)
+    # The checked first call compiled a lazily jitted acc for these types.
+    returned = {known.args: known.return_type for known in acc.nopython_signatures}.get(signature.args)
+    if returned is None:
+        return f"acc is jitted for other signatures than {signature}"
+    return "" if returned == signature.return_type else f"acc returns {returned}, not {signature.return_type}"
+
+
+def _message(reason: str, t: np.ndarray, ys: np.ndarray) -> str:
+    message = f"interpreted: {reason}" if reason else "compiled"
+    finite = np.isfinite(ys).all(axis=1)
+    if finite.all():
+        return message
+    return f"{message}; the saved states from t={t[np.argmin(finite)].item()!r} on are not finite"
+
+
+def _acc_signature(n_extra: int) -> Any:
+    vector = types.float64[::1]
+    return vector(types.float64, vector, *[vector] * n_extra)
+
+
+@cache
+def _compiled_drive(n_extra: int) -> Callable[..., None]:
+    """`_drive` compiled for any jitted acceleration.
+
+    With the acceleration typed as a first-class function and the signature given, the machine code does not depend on
+    the user's function and is found in Numba's cache by the next process.
+    """
+    vector = types.float64[::1]
+    signature = types.void(
+        types.FunctionType(_acc_signature(n_extra)),
+        types.UniTuple(vector, n_extra),
+        types.float64,
+        types.float64,
+        types.float64,
+        types.boolean,
+        types.int64[::1],
+        vector,
+        vector,
+        types.float64[:, ::1],
+    )
+    return njit(signature, cache=True, error_model="numpy")(_drive)
+
+
+@njit(cache=True, error_model="numpy")
+def _add(x: np.ndarray, c: float, dx: np.ndarray) -> None:
+    """Add c dx to x. Compiled in interpreted runs as well, so that both give the same bits."""
+    for i in range(x.size):
+        x[i] += c * dx[i]
+
+
+@register_jitable
+def _kick_drift_kick(acc, extra, t, h, q, v, a):  # type: ignore[no-untyped-def]
+    """One step in place; `a` holds a(t, q) before and after it."""
+    _add(v, 0.5 * h, a)
+    _add(q, h, v)
+    a[:] = acc(t + h, q, *extra)
+    _add(v, 0.5 * h, a)
+
+
+@register_jitable
+def _drift_kick_drift(acc, extra, t, h, q, v, a):  # type: ignore[no-untyped-def]
+    """One step in place; `a` is work space."""
+    _add(q, 0.5 * h, v)
+    a[:] = acc(t + 0.5 * h, q, *extra)
+    _add(v, h, a)
+    _add(q, 0.5 * h, v)
+
+
+def _drive(acc, extra, t0, h, last_step, kick_first, saved, y, a, ys):  # type: ignore[no-untyped-def]
+    """Take saved[-1] steps; ys[row] receives the state after step saved[row]. `extra` is () or (params,)."""
+    half = y.size // 2
+    q = y[:half]
+    v = y[half:]
+    n_steps = saved[-1]
+    row = 1
+    for k in range(n_steps):
+        t = t0 + k * h
+        step = last_step if k == n_steps - 1 else h
+        if kick_first:
+            _kick_drift_kick(acc, extra, t, step, q, v, a)
+        else:
+            _drift_kick_drift(acc, extra, t, step, q, v, a)
+        if k + 1 == saved[row]:
+            ys[row] = y
+            row += 1

@@ -1,0 +1,420 @@
+"""Invariants, their gradients, and the checks that a run starts with."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ._kernels import EPS
+
+__all__ = ["Invariant", "InvariantSet", "as_invariants", "check_gradient"]
+
+Array = np.ndarray
+
+CHECK_STEP = 6e-6
+CHECK_TOLERANCE = 1e-4
+INVARIANCE_TOLERANCE = 1e-8
+TARGET_TOLERANCE = 1e-8
+COMPLEX_STEP = 1e-100
+# Central differences of order 6: weights of +-1, +-2, +-3 steps (Fornberg 1988, table 1).
+DIFFERENCE_WEIGHTS = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
+DIFFERENCE_STEP = 5e-3
+
+
+class Invariant:
+    """A conserved quantity of a system, or several at once.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(t, y, *args) -> float or (l_i,)``, real.
+    grad : callable, optional
+        ``grad(t, y, *args) -> (n,) or (l_i, n)``. For complex y, dI = Re sum_k conj(g_k) dy_k. Without it the
+        gradient comes from a complex step where `fun` allows one, else from central differences of order 6 (with a
+        warning; both cost n evaluations of `fun` and more, and neither is compiled).
+    target : float or array_like, shape (l_i,), optional
+        The value to keep. Default: the value at the start. A given target is a condition that the start must meet.
+    args : tuple, optional
+        Further arguments of `fun` and `grad`. (``solve_ivp(args=...)`` reaches only its own functions.)
+    name : str, optional
+        Name in messages and diagnostics.
+    scale : float, optional
+        Size of the terms that cancel in `fun`, in its own unit: defects below four rounding errors of it are left
+        alone. Needed only where neither the value nor sum_k |G_k y_k| shows that size.
+    in_place : bool, optional
+        ``grad(t, y, out, *args)`` fills ``out``, (n,) for a scalar invariant, else (l_i, n).
+    uses_f : bool, optional
+        ``grad(t, y, f, *args)`` also receives f = fun(t, y) of the system, which the step often has already.
+
+    Notes
+    -----
+    Linear invariants are kept by every Runge-Kutta method; keep the corrections out of them with the option ``frame``
+    rather than list them here.
+
+    Examples
+    --------
+    >>> from eip_scipy import Invariant
+    >>> energy = Invariant(lambda t, y: 0.5 * (y @ y), grad=lambda t, y: y, name="energy")
+    """
+
+    def __init__(
+        self,
+        fun: Callable[..., Any],
+        grad: Callable[..., Any] | None = None,
+        *,
+        target: Any = None,
+        args: Sequence[Any] = (),
+        name: str | None = None,
+        scale: float | None = None,
+        in_place: bool = False,
+        uses_f: bool = False,
+    ) -> None:
+        if not callable(fun):
+            raise TypeError(f"Invariant: fun must be callable, got {fun!r}.")
+        if grad is not None and not callable(grad):
+            raise TypeError(f"Invariant: grad must be callable or None, got {grad!r}.")
+        if grad is None and (in_place or uses_f):
+            raise ValueError("Invariant: in_place and uses_f describe grad; give grad or leave them out.")
+        if scale is not None and not (np.isscalar(scale) and np.isfinite(scale) and scale >= 0):
+            raise ValueError(f"Invariant: scale must be a finite number >= 0, got {scale!r}.")
+        if not isinstance(args, tuple):
+            raise TypeError(f"Invariant: args must be a tuple, got {args!r}; write args=(x,) for a single argument.")
+        self.fun = fun
+        self.grad = grad
+        self.target = None if target is None else np.asarray(target, dtype=float)
+        self.args = args
+        self.name = name
+        self.scale = scale
+        self.in_place = in_place
+        self.uses_f = uses_f
+
+    def __repr__(self) -> str:
+        name = self.name or getattr(self.fun, "__name__", "?")
+        return f"Invariant({name})"
+
+
+def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
+    """One Invariant or a sequence of them, as a tuple.
+
+    Raises
+    ------
+    TypeError
+        For anything else.
+    """
+    if isinstance(invariants, Invariant):
+        return (invariants,)
+    if callable(invariants):
+        raise TypeError(f"invariants: got the function {invariants!r}; wrap it: Invariant({getattr(invariants, '__name__', 'fun')}, grad=...).")
+    try:
+        items = tuple(invariants)
+    except TypeError:
+        raise TypeError(f"invariants: expected an Invariant or a sequence of them, got {invariants!r}.") from None
+    for item in items:
+        if not isinstance(item, Invariant):
+            raise TypeError(f"invariants: expected Invariant objects, got {item!r}; wrap functions: Invariant(fun, grad=...).")
+    return items
+
+
+def _real_value(invariant: Invariant, label: str, t: float, y: Array, extra: tuple) -> Array:
+    value = np.asarray(invariant.fun(t, y, *invariant.args, *extra))
+    if value.dtype.kind == "c":
+        raise ValueError(f"invariant {label!r} returned complex values; expected a real number or a real array (l,).")
+    if value.dtype.kind not in "fiub":
+        raise TypeError(f"invariant {label!r} returned {value!r}; expected a real number or a real array (l,).")
+    if value.ndim > 1:
+        raise ValueError(f"invariant {label!r} returned shape {value.shape}; expected a number or one dimension (l,).")
+    return value.astype(float)
+
+
+class NumericalGradient:
+    """Gradient of an invariant without `grad`: complex step where it is valid, else differences of order 6."""
+
+    def __init__(self, invariant: Invariant, label: str, t: float, y: Array, f: Array, tau: float, extra: tuple) -> None:
+        self._invariant, self._label = invariant, label
+        self._floor = np.abs(tau * f)
+        self._floor[(self._floor == 0) & (y == 0)] = 1.0
+        self.complex_step = y.dtype.kind == "f" and self._complex_step_is_valid(t, y, extra)
+        if not self.complex_step:
+            warnings.warn(
+                f"invariant {label!r} has no grad and allows no complex step: its gradient comes from central "
+                "differences of order 6 (about 1e-12 relative). Give grad for full accuracy and speed.",
+                UserWarning,
+                stacklevel=2,
+            )
+
+    def __call__(self, t: float, y: Array, *extra: Any) -> Array:
+        if self.complex_step:
+            return self._by_complex_step(t, y, extra)
+        return difference_gradient(lambda x: self._fun(t, x, extra), y, self._floor)
+
+    def _fun(self, t: float, y: Array, extra: tuple) -> Array:
+        return np.asarray(self._invariant.fun(t, y, *self._invariant.args, *extra))
+
+    def _by_complex_step(self, t: float, y: Array, extra: tuple) -> Array:
+        columns = []
+        for k in range(y.size):
+            shifted = y.astype(complex)
+            shifted[k] += 1j * COMPLEX_STEP
+            columns.append(np.imag(self._fun(t, shifted, extra)) / COMPLEX_STEP)
+        return np.stack(columns, axis=-1)
+
+    def _complex_step_is_valid(self, t: float, y: Array, extra: tuple) -> bool:
+        """Whether `fun` takes complex states and is analytic there: the real part unmoved, differences agree."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)
+                G = self._by_complex_step(t, y, extra)
+                plain = self._fun(t, y.astype(complex), extra)
+        except (TypeError, ValueError, np.exceptions.ComplexWarning):
+            return False
+        if np.any(np.imag(plain) != 0) or not np.allclose(np.real(plain), self._fun(t, y, extra), rtol=1e-12):
+            return False
+        D = difference_gradient(lambda x: self._fun(t, x, extra), y, self._floor)
+        size = np.abs(y) + self._floor
+        return bool(np.all(np.abs((G - D) * size) <= 1e-7 * np.max(np.abs(D * size), axis=-1, keepdims=True)))
+
+
+def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -> Array:
+    """Gradient of value(y) by central differences of order 6, steps in units of |y_k| + floor_k."""
+
+    def along(k: int, unit: complex) -> Any:
+        # A power of two: y + step and y - step then differ by the step exactly, but for their own rounding.
+        step = 2.0 ** np.round(np.log2(DIFFERENCE_STEP * (abs(y[k]) + floor[k])))
+        total: Any = 0.0
+        for multiple, weight in DIFFERENCE_WEIGHTS:
+            shift = np.zeros_like(y)
+            shift[k] = multiple * step * unit
+            total = total + weight * (np.asarray(value(y + shift)) - np.asarray(value(y - shift)))
+        return total / step
+
+    columns = [along(k, 1.0) for k in range(y.size)]
+    if y.dtype.kind == "c":
+        columns = [column + 1j * along(k, 1j) for k, column in enumerate(columns)]
+    return np.stack(columns, axis=-1)
+
+
+class InvariantSet:
+    """All invariants of a run as one: sizes, names, targets, scales, and the functions that the step calls.
+
+    Made at the start state, where values and shapes are checked. `extra` holds the run's `params`, if any.
+    """
+
+    def __init__(self, invariants: Any, t0: float, y0: Array, f0: Array, tau: float, extra: tuple = ()) -> None:
+        self.items = as_invariants(invariants)
+        self.extra = extra
+        self.labels = [item.name or f"invariant {k}" for k, item in enumerate(self.items)]
+        values = [_real_value(item, label, t0, y0, extra) for item, label in zip(self.items, self.labels, strict=True)]
+        self.scalar = [value.ndim == 0 for value in values]
+        sizes = [value.size for value in values]
+        self.starts = np.concatenate([[0], np.cumsum(sizes, dtype=int)])
+        self.size = int(self.starts[-1])
+        self.start_values = np.concatenate([np.atleast_1d(v) for v in values]) if values else np.zeros(0)
+        self.names = [
+            label if scalar else f"{label}[{j}]"
+            for label, scalar, size in zip(self.labels, self.scalar, sizes, strict=True)
+            for j in range(size)
+        ]
+        self._require_finite(self.start_values, "not finite at y0")
+        self.scales = np.repeat([float(item.scale or 0.0) for item in self.items], sizes)
+        self.uses_f = any(item.uses_f for item in self.items)
+        self.grads = [
+            item.grad or NumericalGradient(item, label, t0, y0, f0, tau, extra)
+            for item, label in zip(self.items, self.labels, strict=True)
+        ]
+        self.target = self._targets()
+        self._shape = (self.size, y0.size)
+        self._gradients_at_start(t0, y0, f0)
+
+    def _require_finite(self, values: Array, what: str) -> None:
+        for name, value in zip(self.names, values, strict=True):
+            if not np.isfinite(value):
+                raise ValueError(f"invariant {name!r} is {what}: it returned {value}.")
+
+    def _targets(self) -> Array:
+        target = self.start_values.copy()
+        for k, item in enumerate(self.items):
+            if item.target is None:
+                continue
+            part = target[self.starts[k] : self.starts[k + 1]]
+            if item.target.ndim > 1 or item.target.size not in (1, part.size):
+                raise ValueError(
+                    f"invariant {self.labels[k]!r}: target has shape {item.target.shape}, its value {part.size} entries."
+                )
+            part[:] = item.target
+            self._require_finite_target(k, part)
+        return target
+
+    def _require_finite_target(self, k: int, part: Array) -> None:
+        if not np.all(np.isfinite(part)):
+            raise ValueError(f"invariant {self.labels[k]!r}: target must be finite, got {part}.")
+
+    def _gradients_at_start(self, t: float, y: Array, f: Array) -> None:
+        """Shapes and finiteness of every gradient, once."""
+        for k in range(len(self.items)):
+            rows = int(self.starts[k + 1] - self.starts[k])
+            expected = (y.size,) if self.scalar[k] else (rows, y.size)
+            G = np.asarray(self._gradient(k, t, y, f))
+            if G.shape != expected:
+                raise ValueError(
+                    f"gradient of invariant {self.labels[k]!r} has shape {G.shape}, expected {expected} for a state of "
+                    f"{y.size} components."
+                )
+            if G.dtype.kind == "c" and y.dtype.kind != "c":
+                raise ValueError(f"gradient of invariant {self.labels[k]!r} is complex, but y0 is real.")
+            if not np.all(np.isfinite(G)):
+                raise ValueError(f"gradient of invariant {self.labels[k]!r} is not finite at y0.")
+
+    def _gradient(self, k: int, t: float, y: Array, f: Array) -> Any:
+        item = self.items[k]
+        before = (f,) if item.uses_f else ()
+        if not item.in_place:
+            if item.grad is None:
+                return self.grads[k](t, y, *self.extra)
+            return self.grads[k](t, y, *before, *item.args, *self.extra)
+        rows = int(self.starts[k + 1] - self.starts[k])
+        out = np.zeros(y.size if self.scalar[k] else (rows, y.size), dtype=y.dtype)
+        self.grads[k](t, y, *before, out, *item.args, *self.extra)
+        return out
+
+    def inv(self, t: float, y: Array, values: Array, params: Any = None) -> None:
+        """Fill `values` (l,)."""
+        for k, item in enumerate(self.items):
+            value = item.fun(t, y, *item.args, *self.extra)
+            if self.scalar[k]:
+                values[self.starts[k]] = value
+            else:
+                values[self.starts[k] : self.starts[k + 1]] = value
+
+    def grad(self, t: float, y: Array, f: Array, G: Array, params: Any = None) -> None:
+        """Fill the gradients `G` (l, n)."""
+        for k in range(len(self.items)):
+            if self.scalar[k]:
+                G[self.starts[k]] = self._gradient(k, t, y, f)
+            else:
+                G[self.starts[k] : self.starts[k + 1]] = self._gradient(k, t, y, f)
+
+    def values(self, t: float, y: Array) -> Array:
+        """All values (l,)."""
+        out = np.empty(self.size)
+        self.inv(t, y, out)
+        return out
+
+    def gradients(self, t: float, y: Array, f: Array) -> Array:
+        """All gradients (l, n)."""
+        out = np.zeros(self._shape, dtype=y.dtype)
+        self.grad(t, y, f, out)
+        return out
+
+    def term_sizes(self, t: float, y: Array, f: Array) -> Array:
+        """Size of the terms in each invariant: max(|I|, |target|, sum_k |G_k y_k|, scale)."""
+        terms = np.sum(np.abs(self.gradients(t, y, f) * y), axis=1)
+        return np.max([np.abs(self.values(t, y)), np.abs(self.target), terms, self.scales], axis=0)
+
+    def start_violation(self, t: float, y: Array, f: Array) -> str | None:
+        """What is wrong with the start, where it misses a given target by more than 1e-8 of its terms."""
+        residual = self.values(t, y) - self.target
+        for name, r, size in zip(self.names, residual, self.term_sizes(t, y, f), strict=True):
+            if not abs(r) <= TARGET_TOLERANCE * size:
+                return f"the start violates invariant {name!r} by {r:.3g}"
+        return None
+
+    def check(self, t: float, y: Array, f: Array, tau: float) -> None:
+        """Compare gradients with differences along two directions, and the invariance with the system.
+
+        Raises
+        ------
+        ValueError
+            When a gradient disagrees with the difference of its invariant.
+
+        Warns
+        -----
+        UserWarning
+            When an invariant changes along the flow of this system.
+        """
+        if self.size == 0:
+            return
+        rng = np.random.default_rng(20220)
+        span = np.abs(y) + tau * np.abs(f)
+        for _ in range(2):
+            d = rng.standard_normal(y.size) * span
+            if y.dtype.kind == "c":
+                d = d + 1j * rng.standard_normal(y.size) * span
+            self._check_direction(t, y, f, d)
+        self._check_invariance(t, y, f, tau)
+
+    def _check_direction(self, t: float, y: Array, f: Array, d: Array) -> None:
+        plus, minus = self.values(t, y + CHECK_STEP * d), self.values(t, y - CHECK_STEP * d)
+        difference = (plus - minus) / (2 * CHECK_STEP)
+        products = np.real(np.conj(self.gradients(t, y, f)) * d)
+        along, terms = products.sum(axis=1), np.abs(products).sum(axis=1)
+        noise = 1e6 * (EPS * np.max([np.abs(plus), np.abs(minus)], axis=0) + 5e-324)
+        for k, name in enumerate(self.names):
+            if np.isfinite(difference[k]) and not abs(difference[k] - along[k]) <= CHECK_TOLERANCE * terms[k] + noise[k]:
+                raise ValueError(
+                    f"gradient of invariant {name!r} is wrong: along a test direction its derivative is "
+                    f"{difference[k]:.6g} by differences and {along[k]:.6g} by grad. Mend grad, leave it out (it is then "
+                    "computed), or pass check=False to skip this check."
+                )
+
+    def _check_invariance(self, t: float, y: Array, f: Array, tau: float) -> None:
+        in_time = self._time_derivative(t, y, tau)
+        products = np.real(np.conj(self.gradients(t, y, f)) * f)
+        rate, terms = in_time + products.sum(axis=1), np.abs(in_time) + np.abs(products).sum(axis=1)
+        for k, name in enumerate(self.names):
+            if abs(rate[k]) > INVARIANCE_TOLERANCE * terms[k]:
+                warnings.warn(
+                    f"{name!r} is no invariant of this system: at the start it changes at the rate {rate[k]:.3g}, where "
+                    f"the terms of that rate sum to {terms[k]:.3g}. Projecting on it gives a wrong solution. "
+                    "(check=False skips this check.)",
+                    UserWarning,
+                    stacklevel=6,
+                )
+
+    def _time_derivative(self, t: float, y: Array, tau: float) -> Array:
+        step = 2.0 ** np.round(np.log2(0.01 * tau)) if tau > 0 else 0.0
+        if t + step == t or step == 0.0:
+            return np.zeros(self.size)
+        total = np.zeros(self.size)
+        for multiple, weight in DIFFERENCE_WEIGHTS:
+            total += weight * (self.values(t + multiple * step, y) - self.values(t - multiple * step, y))
+        total /= step
+        return np.where(np.isfinite(total), total, 0.0)
+
+
+def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., Any] | None = None) -> float:
+    """Largest relative difference between an invariant's gradient and central differences of order 6.
+
+    Parameters
+    ----------
+    invariant : Invariant
+    t : float
+    y : array_like, shape (n,)
+        Where to compare; real or complex.
+    fun : callable, optional
+        ``fun(t, y)``, the system, needed by an invariant with ``uses_f=True``.
+
+    Returns
+    -------
+    float
+        max over the components k of |grad_k - difference_k| s_k / max_j |grad_j| s_j, with s the sizes of y's
+        components (of the largest one, for components that are 0): about 1e-12 for a right gradient.
+
+    Raises
+    ------
+    ValueError
+        When the gradient has the wrong shape, or `fun` is missing for ``uses_f``.
+    """
+    y = np.array(y, dtype=complex if np.iscomplexobj(y) else float)
+    if invariant.uses_f and fun is None:
+        raise ValueError("check_gradient: this invariant's grad uses f; pass fun=.")
+    f = np.asarray(fun(t, y), dtype=y.dtype) if fun is not None else np.zeros_like(y)
+    size = np.where(y == 0, np.max(np.abs(y), initial=0.0) or 1.0, np.abs(y))
+    G = InvariantSet(invariant, t, y, f, 0.0).gradients(t, y, f)
+    floor = np.where(y == 0, size, 0.0)
+    D = np.atleast_2d(difference_gradient(lambda x: invariant.fun(t, x, *invariant.args), y, floor))
+    largest = np.max(np.abs(G) * size, axis=1, keepdims=True)
+    largest[largest == 0] = 1.0
+    return float(np.max(np.abs(G - D) * size / largest))

@@ -1,0 +1,68 @@
+"""The harmonic oscillator of the paper's tables 1 and 2."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from ..invariants import Invariant
+from ._problem import Problem, bind
+
+__all__ = ["harmonic"]
+
+
+@njit(cache=True)
+def _rhs(t, y, out, params):
+    out[0] = params[0] * y[1]
+    out[1] = -params[0] * y[0]
+
+
+@njit(cache=True)
+def _energy(t, y, params):
+    return 0.5 * params[0] * (y[0] * y[0] + y[1] * y[1])
+
+
+@njit(cache=True)
+def _energy_gradient(t, y, out, params):
+    out[0] = params[0] * y[0]
+    out[1] = params[0] * y[1]
+
+
+def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: float = 0.1) -> Problem:
+    """Harmonic oscillator y1' = omega y2, y2' = -omega y1 with H = omega |y|^2 / 2.
+
+    Parameters
+    ----------
+    omega : float
+        Angular frequency.
+    y0 : array_like, shape (2,)
+    t_end, h : float
+        End of the interval that starts at 0, and a step.
+
+    Returns
+    -------
+    Problem
+        With the closed form as `reference`.
+    """
+    start = np.array(y0, dtype=float)
+    params = np.array([omega], dtype=float)
+
+    def reference(t: float) -> np.ndarray:
+        c, s = np.cos(omega * t), np.sin(omega * t)
+        return np.array([c * start[0] + s * start[1], c * start[1] - s * start[0]])
+
+    return Problem(
+        name="harmonic",
+        fun=bind(_rhs, params),
+        rhs=_rhs,
+        y0=start,
+        t_span=(0.0, t_end),
+        h=h,
+        params=params,
+        invariants=(Invariant(_energy, _energy_gradient, args=(params,), in_place=True, name="H"),),
+        reference=reference,
+        units="dimensionless",
+        source="Cai, Gong & Wang, section 2.1",
+    )

@@ -1,0 +1,147 @@
+"""Records that a run fills: diagnostics, the result of `integrate`, the result of `project`."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import OptimizeResult
+
+__all__ = ["Diagnostics", "IntegrationResult", "ProjectionResult"]
+
+# Places of the counters that the step fills (see _step.py, which takes them from here).
+NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F = range(9)
+N_COUNTERS = 9
+
+
+class Diagnostics:
+    """What the projection did in a run; pass an empty one as ``diagnostics=`` and read it during or after the run.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the l invariants, in order.
+    max_defect, last_defect : ndarray, shape (l,)
+        Largest and last |I - target| after a projection, in each invariant's own unit.
+    n_projections, n_skipped : int
+        Projections done, and those left out because every defect was round-off.
+    n_rank_reduced : int
+        Projections in which gradients were (nearly) dependent or zero and fewer corrections were made.
+    n_rejected_projections : int
+        Projections that failed.
+    max_correction : float
+        Largest correction in units of the step's local error: at most about 5 when all is well; nan where the run
+        has no error estimate (the euclidean metric at fixed steps).
+    """
+
+    def __init__(self) -> None:
+        self._attach((), np.zeros(0), np.zeros(0), np.zeros(1), np.zeros(N_COUNTERS, np.int64), estimated=False)
+
+    def _attach(
+        self,
+        names: tuple[str, ...],
+        max_defect: np.ndarray,
+        last_defect: np.ndarray,
+        max_correction: np.ndarray,
+        counters: np.ndarray,
+        *,
+        estimated: bool,
+    ) -> None:
+        """Take the buffers of a run, so that reading costs the run nothing."""
+        self.names = names
+        self.max_defect = max_defect
+        self._defect = last_defect
+        self._max_correction = max_correction
+        self._counters = counters
+        self._estimated = estimated
+
+    @property
+    def last_defect(self) -> np.ndarray:
+        return np.abs(self._defect)
+
+    @property
+    def n_projections(self) -> int:
+        return int(self._counters[PROJECTIONS])
+
+    @property
+    def n_skipped(self) -> int:
+        return int(self._counters[SKIPPED])
+
+    @property
+    def n_rank_reduced(self) -> int:
+        return int(self._counters[RANK_REDUCED])
+
+    @property
+    def n_rejected_projections(self) -> int:
+        return int(self._counters[REJECTED])
+
+    @property
+    def max_correction(self) -> float:
+        return float(self._max_correction[0]) if self._estimated else float("nan")
+
+    def __repr__(self) -> str:
+        if not self.names:
+            return "Diagnostics: no invariants"
+        lines = [
+            f"Diagnostics: {self.n_projections} projections, {self.n_skipped} skipped (round-off), "
+            f"{self.n_rank_reduced} of reduced rank, {self.n_rejected_projections} rejected",
+        ]
+        width = max(len(name) for name in self.names)
+        for name, largest, last in zip(self.names, self.max_defect, self.last_defect, strict=True):
+            lines.append(f"  {name:<{width}}  max defect {largest:.2e}, last {last:.2e}")
+        if self._estimated:
+            lines.append(f"  largest correction: {self.max_correction:.3g} local errors")
+        return "\n".join(lines)
+
+
+class IntegrationResult(OptimizeResult):
+    """Result of `integrate`; fields by name or by key, as in SciPy's own results.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+        Saved times.
+    y : ndarray, shape (n, m)
+        Saved states.
+    invariants : ndarray, shape (l, m)
+        Values of the invariants there.
+    max_defect : ndarray, shape (l,)
+        Largest |I - target| after a projection or at a saved step.
+    diagnostics : Diagnostics
+    t_events, y_events : list of ndarray or None
+        As in `scipy.integrate.solve_ivp`.
+    nfev, njev, nlu : int
+        Evaluations of the right-hand side and of the invariants' gradients, and factorisations.
+    status : int
+        0: the end was reached; 1: a callback or an event stopped the run; -1: a step failed.
+    message : str
+    success : bool
+        ``status >= 0``.
+    wall_time : float
+        Seconds in the integration, compilation left out.
+    compiled : bool
+        Whether the run was compiled; if not, `message` says why.
+    method : str
+    h : float or None
+    """
+
+
+class ProjectionResult(NamedTuple):
+    """Result of `project`.
+
+    Attributes
+    ----------
+    y : ndarray, shape (n,)
+        The projected state.
+    defect : ndarray, shape (l,)
+        I(y) - target.
+    rank : int
+        Rank that the gradients had (l when all invariants were independent; 0 when nothing was to be done).
+    correction : ndarray, shape (n,)
+        y - y_hat.
+    """
+
+    y: Any
+    defect: np.ndarray
+    rank: int
+    correction: Any

@@ -1,0 +1,341 @@
+"""The solver classes: EIP methods that `scipy.integrate.solve_ivp` takes as ``method=``."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.integrate import DenseOutput, OdeSolver
+
+from . import _kernels as kn
+from . import _setup
+from ._setup import ProjectionOptions
+from ._step import OK, close_step, project_step, raw_step
+from .dense import HermiteDenseOutput
+from .result import NFEV, NJEV, NLU
+from .tableaux import RK1, RK2, RK3, RK4, RK5, Tableau
+
+__all__ = ["EIPRK1", "EIPRK2", "EIPRK3", "EIPRK4", "EIPRK5", "EIPSolver", "eip_method"]
+
+OPTIONS = (
+    "h first_step max_step rtol atol vectorized invariants metric blocks frame direction iterations every reuse_f "
+    "check project_initial diagnostics"
+).split()
+
+
+class EIPSolver(OdeSolver):
+    """Explicit invariants-preserving solver: a Runge-Kutta step, then one Newton step of projection.
+
+    Use one of the methods `EIPRK1` ... `EIPRK5`, or `eip_method` for a tableau of your own, with
+    `scipy.integrate.solve_ivp`.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(t, y) -> (n,)``, the right-hand side.
+    t0 : float
+        Start.
+    y0 : array_like, shape (n,)
+        Initial state, real or complex.
+    t_bound : float
+        End; before t0 to integrate backward.
+    h : float
+        Length of the step, > 0 in either direction. The last step ends on `t_bound` and may be shorter.
+    invariants : Invariant or sequence of Invariant, optional
+        What to keep.
+    metric : {"error", "euclidean"} or array_like, shape (n,), optional
+        Weights of the correction's components. "error" (default where the method has an error estimate) makes the
+        least correction measured in local errors of the step; "euclidean" is the least correction in the plain
+        2-norm; an array gives the weights themselves (larger: moves more).
+    blocks : int or sequence of index arrays, optional
+        Components that the error metric weighs together: consecutive groups of that many, or index arrays. Bodies'
+        positions and velocities in 3 dimensions: ``blocks=3``. Default: each component by itself.
+    frame : (C, S), optional
+        Linear invariants C y, with C of shape (k, n), that corrections must not touch, and the shifts S, (n, k),
+        that compensate for it; C S must be invertible.
+    direction : {"new", "old", "midpoint"}, optional
+        Where the gradients that span the correction are taken: at the step's raw result (default), at its start or
+        in the middle.
+    iterations : int, optional
+        Newton steps of the projection. 1 (default) is the EIP method; more is the standard projection.
+    every : int, optional
+        Project each `every`-th step and the last one.
+    reuse_f : bool, optional
+        Where the step evaluates f at its raw result anyway, let it serve as the next step's first stage.
+    check : bool, optional
+        Check the invariants and their gradients at the start.
+    project_initial : bool, optional
+        Project y0 onto given targets before the first step.
+    diagnostics : Diagnostics, optional
+        An empty `Diagnostics`, which the run fills.
+    rtol, atol : float or array_like, shape (n,), optional
+        Scale of the error metric: atol + rtol |y|.
+    vectorized : bool, optional
+        Whether `fun` takes (n, k) arrays, as in SciPy.
+
+    Attributes
+    ----------
+    n, status, t_bound, direction, t, y, t_old, step_size, nfev, njev, nlu
+        As in `scipy.integrate.OdeSolver`; `njev` counts evaluations of the invariants' gradients and `nlu`
+        factorisations of the projection.
+
+    Notes
+    -----
+    The error estimate sees the step before its projection. Defects of the invariants after it are O(h^(2p + 2)) for a
+    method of order p (theorem 2.1 of [1]_), and the method keeps its order.
+
+    References
+    ----------
+    .. [1] W. Cai, Y. Gong, Y. Wang, "An explicit and practically invariants-preserving method for conservative
+       systems".
+    """
+
+    TABLEAU: ClassVar[Tableau]
+
+    def __init__(
+        self,
+        fun: Callable[..., Any],
+        t0: float,
+        y0: Any,
+        t_bound: float,
+        max_step: float = np.inf,
+        rtol: Any = 1e-3,
+        atol: Any = 1e-6,
+        vectorized: bool = False,
+        first_step: float | None = None,
+        *,
+        h: float | None = None,
+        invariants: Any = (),
+        metric: Any = None,
+        blocks: Any = None,
+        frame: Any = None,
+        direction: str = "new",
+        iterations: int = 1,
+        every: int = 1,
+        reuse_f: bool = True,
+        check: bool = True,
+        project_initial: bool = False,
+        diagnostics: Any = None,
+        **extraneous: Any,
+    ) -> None:
+        for name in extraneous:
+            hint = _setup.nearest_option(name, OPTIONS)
+            warnings.warn(f"{type(self).__name__} has no option {name!r}; it is ignored{hint}", UserWarning, stacklevel=3)
+        start = _setup.initial_state(y0)
+        derivative = _checked(fun, start.size, start.dtype, vectorized)
+        super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
+        if h is None:
+            raise ValueError(f"{type(self).__name__} needs the step h=...")
+        if first_step is not None or max_step != np.inf:
+            raise ValueError("h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other.")
+        self.h = _setup.check_fixed_step(h, t0, t_bound)
+        self._n_steps = _setup.fixed_steps(self.h, t0, t_bound)
+        self._k = 0
+        self._t0 = t0
+        self._signed_h = self.h * self.direction
+        f0 = derivative(t0, start)
+        run = _setup.prepare(
+            self.TABLEAU,
+            derivative,
+            t0,
+            start,
+            f0,
+            self.h,
+            ProjectionOptions(
+                invariants=invariants,
+                metric=metric,
+                blocks=blocks,
+                frame=frame,
+                direction=direction,
+                iterations=iterations,
+                every=every,
+                reuse_f=reuse_f,
+                check=check,
+                project_initial=project_initial,
+            ),
+            rtol,
+            atol,
+        )
+        _setup.attach(diagnostics, run)
+        self._run, self._work = run, run.work
+        self._derivative = derivative
+        self.y = run.y0
+        if run.y0 is not start:
+            f0 = derivative(t0, run.y0)
+        self._work.K[0] = self.f = f0
+        self._work.counters[NFEV] = 1 if run.y0 is start else 2
+        self._count()
+        self.y_old: np.ndarray | None = None
+        self.f_old: np.ndarray | None = None
+
+    def _rhs(self, t: float, y: np.ndarray, out: np.ndarray, params: Any) -> None:
+        # A copy, because a user's function may keep what it was given and `y` is a buffer.
+        out[:] = self._derivative(t, y.copy())
+
+    def _count(self) -> None:
+        counters = self._work.counters
+        self.nfev, self.njev, self.nlu = int(counters[NFEV]), int(counters[NJEV]), int(counters[NLU])
+
+    def _step_impl(self) -> tuple[bool, str | None]:
+        last = self._k + 1 >= self._n_steps
+        t_new = self.t_bound if last else self._t0 + (self._k + 1) * self._signed_h
+        h = t_new - (self._t0 + self._k * self._signed_h) if last else self._signed_h
+        run, w = self._run, self._work
+        o = run.options
+        self._project_now = run.invariants.size > 0 and (last or (self._k + 1) % o.every == 0)
+        y = self.y
+        status = raw_step(
+            self._rhs, None, self.t, y, y.view(float), t_new, h, self._project_now, run.method, o, w
+        )
+        if status != OK:
+            self._count()
+            return False, _setup.not_finite(w, run.method, self.t, h)
+        self._projection_status = OK
+        y_new = self._project_step(t_new, y, w.y_hat, w.err)
+        if self._projection_status != OK:
+            self._count()
+            return False, _setup.projection_failure(run.invariants, w, t_new)
+        close_step(self._rhs, None, t_new, y_new, self._project_now, o, w)
+        self._count()
+        self._k += 1
+        self.y_old, self.f_old = y, self.f
+        self.y, self.t = y_new, t_new
+        self.f = w.K[-1].copy()
+        w.K[0] = self.f
+        return True, None
+
+    def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
+        """The accepted state from a raw step; override to act after each step.
+
+        Parameters
+        ----------
+        t : float
+            Time of the new state.
+        y : ndarray, shape (n,)
+            The state that the step started from.
+        y_hat : ndarray, shape (n,)
+            The raw result; a buffer, valid during the call.
+        err : ndarray
+            Its local error estimate (float view: 2 n entries for a complex state), zero where there is none.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            A new array.
+        """
+        w = self._work
+        if not self._project_now:
+            return y_hat.copy()
+        if y_hat is not w.y_hat:
+            w.y_hat[:] = y_hat
+        if err is not w.err:
+            w.err[:] = err
+        y_new = np.empty_like(y)
+        invariants = self._run.invariants
+        self._projection_status = project_step(
+            self._rhs,
+            invariants.inv,
+            invariants.grad,
+            None,
+            self.t,
+            y,
+            y.view(float),
+            t,
+            self._run.options,
+            w,
+            y_new,
+            y_new.view(float),
+        )
+        return y_new
+
+    def _dense_output_impl(self) -> DenseOutput:
+        return HermiteDenseOutput(self.t_old, self.t, self.y_old, self.y, self.f_old, self.f)
+
+
+def _checked(fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool) -> Callable[[float, np.ndarray], np.ndarray]:
+    """The user's right-hand side as (t, y) -> new array (n,) of the state's type, with clear errors."""
+    shape = (n,)
+
+    def derivative(t: float, y: np.ndarray) -> np.ndarray:
+        f = np.asarray(fun(t, y[:, None])).reshape(-1) if vectorized else fun(t, y)
+        if type(f) is np.ndarray and f.shape == shape and f.dtype == dtype:
+            return f.copy()
+        return _setup.as_derivative(f, n, dtype).astype(dtype)
+
+    return derivative
+
+
+class EIPRK1(EIPSolver):
+    """EIP method on explicit Euler (order 1); it has no error estimate, so the metric is euclidean.
+
+    Options: see `EIPSolver`.
+    """
+
+    TABLEAU = RK1
+
+
+class EIPRK2(EIPSolver):
+    """EIP method on the explicit midpoint rule (order 2). Options: see `EIPSolver`."""
+
+    TABLEAU = RK2
+
+
+class EIPRK3(EIPSolver):
+    """EIP method on Heun's third-order method. Options: see `EIPSolver`."""
+
+    TABLEAU = RK3
+
+
+class EIPRK4(EIPSolver):
+    """EIP method on the classical Runge-Kutta method of order 4, the paper's choice.
+
+    Options: see `EIPSolver`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.integrate import solve_ivp
+    >>> from eip_scipy import EIPRK4, Invariant
+    >>> def fun(t, y):
+    ...     return [y[2], y[3], *(-y[:2] / np.hypot(*y[:2]) ** 3)]
+    >>> def energy(t, y):
+    ...     return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.hypot(*y[:2])
+    >>> def energy_gradient(t, y):
+    ...     return np.concatenate([y[:2] / np.hypot(*y[:2]) ** 3, y[2:]])
+    >>> H = Invariant(energy, energy_gradient, name="energy")
+    >>> sol = solve_ivp(fun, (0, 20), [0.4, 0, 0, 2], method=EIPRK4, h=0.03, invariants=H)
+    >>> bool(abs(energy(20, sol.y[:, -1]) - energy(0, sol.y[:, 0])) < 1e-11)
+    True
+    """
+
+    TABLEAU = RK4
+
+
+class EIPRK5(EIPSolver):
+    """EIP method on Fehlberg's method of order 5 (six stages). Options: see `EIPSolver`."""
+
+    TABLEAU = RK5
+
+
+def eip_method(tableau: Tableau) -> type[EIPSolver]:
+    """A solver class on any explicit Runge-Kutta tableau.
+
+    Parameters
+    ----------
+    tableau : Tableau
+
+    Returns
+    -------
+    type[EIPSolver]
+        To be passed as ``method=`` to `scipy.integrate.solve_ivp` or `integrate`.
+
+    Raises
+    ------
+    TypeError
+        When `tableau` is no Tableau.
+    """
+    if not isinstance(tableau, Tableau):
+        raise TypeError(f"eip_method expects a Tableau, got {tableau!r}.")
+    return type(f"EIP_{tableau.name}", (EIPSolver,), {"TABLEAU": tableau, "__doc__": f"EIP method on {tableau!r}."})

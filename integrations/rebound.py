@@ -1,0 +1,343 @@
+"""REBOUND as a judge: its integrators on our states, run so that a comparison is fair.
+
+Masses enter as G m with G = 1, the Sun first, in the frame of the centre of mass. Fixed steps are counted and not
+timed: REBOUND's own clock accumulates rounding, which at 1000 years is more than WHFast's own error. WHFast and SABA
+run without safe mode and are synchronised before each reading, in a way that leaves the run itself untouched.
+
+REBOUND (H. Rein, S.-F. Liu, Astronomy & Astrophysics 537 (2012) A128) is free software under the GPL and is not
+distributed with this package; versions 4.6 and 5 are supported.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+try:
+    import rebound
+except ModuleNotFoundError as error:
+    raise ImportError(
+        'eip_scipy.integrations.rebound needs REBOUND: pip install "eip_scipy[rebound]"', name="rebound"
+    ) from error
+
+if TYPE_CHECKING:
+    from eip_scipy.problems._problem import Problem
+
+__all__ = ["INTEGRATORS", "ReboundRun", "problem_from_simulation", "run", "simulation"]
+
+INTEGRATORS = ("whfast", "whfast-c17", "ias15", "leapfrog", "saba(10,6,4)")
+
+# Steps between two looks at Ctrl-C, which Python handles only outside of REBOUND's loop. REBOUND counts in 32 bits.
+_CHUNK = 100_000
+
+
+@dataclass(frozen=True)
+class ReboundRun:
+    """What `run` returns; m saved points, N bodies, n = 6 N.
+
+    Attributes
+    ----------
+    name : str
+        The integrator, as given to `run`.
+    version : str
+        REBOUND's version.
+    t : ndarray, shape (m,)
+        Saved times k h, 0 and the end among them.
+    y : ndarray, shape (n, m)
+        States (q, v) at `t`, in the frame of the centre of mass.
+    wall_time : float
+        Seconds spent in the integration and its synchronisations; reading and the invariants are not in it.
+    steps : int
+        Steps taken; for "ias15" those that were accepted.
+    energy_error : ndarray, shape (m,)
+        |E(t) - E(0)| / |E(0)| of the Newtonian energy.
+    angular_momentum_error : ndarray, shape (m,)
+        |L(t) - L(0)| / |L(0)|, Euclidean norms.
+    """
+
+    name: str
+    version: str
+    t: np.ndarray
+    y: np.ndarray
+    wall_time: float
+    steps: int
+    energy_error: np.ndarray
+    angular_momentum_error: np.ndarray
+
+
+def simulation(gm: Any, y: Any) -> rebound.Simulation:
+    """Build a REBOUND simulation from a state of ours.
+
+    Parameters
+    ----------
+    gm : array_like, shape (N,)
+        G times the masses, the central body (the Sun) first.
+    y : array_like, shape (6 N,)
+        State (q, v): positions (N, 3), then velocities (N, 3), in units that agree with `gm`.
+
+    Returns
+    -------
+    rebound.Simulation
+        With G = 1, m = gm and t = 0, moved to the frame of the centre of mass.
+
+    Raises
+    ------
+    ValueError
+        Shapes do not fit, a number is not finite, or a mass is not positive.
+    """
+    gm, y = _check_state(gm, y)
+    sim = rebound.Simulation()
+    sim.G = 1.0
+    q, v = y.reshape(2, -1, 3).tolist()
+    for m, (x, y_, z), (vx, vy, vz) in zip(gm.tolist(), q, v, strict=True):
+        sim.add(m=m, x=x, y=y_, z=z, vx=vx, vy=vy, vz=vz)
+    sim.move_to_com()
+    return sim
+
+
+def run(
+    gm: Any,
+    y0: Any,
+    integrator: str,
+    *,
+    h: float,
+    n_steps: int | None = None,
+    t_end: float | None = None,
+    save_every: int | None = None,
+) -> ReboundRun:
+    """Integrate N bodies forward from t = 0 with one of REBOUND's integrators.
+
+    Parameters
+    ----------
+    gm : array_like, shape (N,)
+        G times the masses, the central body (the Sun) first.
+    y0 : array_like, shape (6 N,)
+        Initial state (q, v); its centre of mass is moved to the origin and brought to rest.
+    integrator : str
+        - "whfast": WHFast in Jacobi coordinates without corrector, REBOUND's default;
+        - "whfast-c17": the same with the symplectic corrector of order 17;
+        - "saba(10,6,4)": SABA(10,6,4);
+        - "leapfrog": Störmer-Verlet of order 2 in its drift-kick-drift form, as
+          ``stormer_verlet(..., form="drift-kick-drift")``;
+        - "ias15": adaptive of order 15, with REBOUND's own tolerance and first step.
+    h : float
+        Length of a step. "ias15" chooses its steps itself and ends one on each saved time k h exactly.
+    n_steps : int, optional
+        Number of steps of length `h`; either this or `t_end`.
+    t_end : float, optional
+        End, a whole number of steps from 0; the run then ends at round(t_end / h) h.
+    save_every : int, optional
+        Save each `save_every`-th state besides the first and the last; default: these two only.
+
+    Returns
+    -------
+    ReboundRun
+        States, errors of the invariants and the time it took.
+
+    Raises
+    ------
+    ValueError
+        An unknown integrator or a wrong value; the message says what was expected.
+
+    Notes
+    -----
+    Saving does not disturb the steps of a fixed-step integrator: the states do not depend on `save_every`. Those of
+    "ias15" do, at the level of its round-off, for each saved time cuts a step.
+
+    References
+    ----------
+    H. Rein, D. Tamayo, WHFast, MNRAS 452 (2015) 376-388; H. Rein, D. S. Spiegel, IAS15, MNRAS 446 (2015) 1424-1437;
+    H. Rein, D. Tamayo, G. Brown, High-order symplectic integrators for planetary dynamics, MNRAS 489 (2019) 4632-4640.
+    """
+    gm, y0 = _check_state(gm, y0)
+    _check_integrator(integrator, gm)
+    saved = _saved_steps(_count_steps(h, n_steps, t_end), save_every)
+    sim = simulation(gm, y0)
+    _set_integrator(sim, integrator)
+    if integrator != "ias15":
+        sim.dt = h
+    y = np.empty((saved.size, y0.size))
+    y[0] = _state(sim)
+    wall_time = 0.0
+    for row, (first, last) in enumerate(pairwise(saved.tolist()), start=1):
+        start = perf_counter()
+        if integrator == "ias15":
+            sim.integrate(last * h, exact_finish_time=1)
+        else:
+            _take_steps(sim, last - first)
+        sim.synchronize()
+        wall_time += perf_counter() - start
+        y[row] = _state(sim)
+    energy_error, angular_momentum_error = _invariant_errors(gm, y)
+    return ReboundRun(
+        name=integrator,
+        version=rebound.__version__,
+        t=saved * h,
+        y=y.T,
+        wall_time=wall_time,
+        steps=int(sim.steps_done),
+        energy_error=energy_error,
+        angular_momentum_error=angular_momentum_error,
+    )
+
+
+def problem_from_simulation(
+    sim: rebound.Simulation, *, t_span: tuple[float, float] | None = None, h: float | None = None
+) -> Problem:
+    """Build an N-body problem from a REBOUND simulation, at its present state.
+
+    Parameters
+    ----------
+    sim : rebound.Simulation
+        Point masses under their mutual Newtonian gravity. It is synchronised, as before any reading of a simulation.
+    t_span : tuple of float, optional
+        Start and end; default: from sim.t over 1000 steps sim.dt.
+    h : float, optional
+        A sensible fixed step; default: the magnitude of sim.dt.
+
+    Returns
+    -------
+    Problem
+        In the simulation's units of length and time, with params = sim.G times the masses.
+
+    Raises
+    ------
+    ValueError
+        The simulation has what the N-body problem lacks (test or variational particles, softening, further forces,
+        collisions, boundaries ...); the message says which and why it is not supported.
+    """
+    _refuse_unsupported(sim)
+    from eip_scipy.problems.nbody import nbody
+
+    sim.synchronize()
+    q, v = _state(sim).reshape(2, -1, 3)
+    return nbody(
+        np.array([sim.G * p.m for p in sim.particles]),
+        q,
+        v,
+        t_span=(sim.t, sim.t + 1000 * sim.dt) if t_span is None else t_span,
+        h=abs(sim.dt) if h is None else h,
+        name="rebound",
+        units="as in the REBOUND simulation",
+        source=f"REBOUND {rebound.__version__} simulation of {sim.N} bodies at t = {sim.t!r}",
+    )
+
+
+def _check_state(gm: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+    gm = np.array(gm, dtype=float)
+    y = np.array(y, dtype=float)
+    if gm.ndim != 1 or gm.size < 2:
+        raise ValueError(f"gm must hold at least two bodies in one dimension, got shape {gm.shape}")
+    if y.shape != (6 * gm.size,):
+        raise ValueError(f"the state of {gm.size} bodies has shape ({6 * gm.size},), got {y.shape}")
+    if not (np.isfinite(gm).all() and np.isfinite(y).all()):
+        raise ValueError("gm and the state must be finite")
+    if not (gm > 0).all():
+        raise ValueError(f"gm must be positive (test particles are not supported), got {gm.min()!r}")
+    return gm, y
+
+
+def _check_integrator(integrator: str, gm: np.ndarray) -> None:
+    if integrator not in INTEGRATORS:
+        raise ValueError(f"unknown integrator {integrator!r}: expected one of {', '.join(map(repr, INTEGRATORS))}")
+    if integrator.startswith(("whfast", "saba")) and gm.argmax() != 0:
+        raise ValueError(f"{integrator} splits off the orbits around body 0: put the heaviest body (the Sun) first")
+
+
+def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
+    if not (h > 0 and math.isfinite(h)):
+        raise ValueError(f"h must be positive and finite, got {h!r}")
+    if (n_steps is None) == (t_end is None):
+        raise ValueError("give either n_steps or t_end")
+    if t_end is None:
+        return _check_count(n_steps, "n_steps")
+    if not (t_end > 0 and math.isfinite(t_end)):
+        raise ValueError(f"t_end must be positive and finite, got {t_end!r}")
+    n_steps = round(t_end / h)
+    # The looser bound is for long runs, where the rounding of h alone makes t_end / h miss an integer.
+    if n_steps < 1 or abs(t_end / h - n_steps) > max(1e-9, 8 * np.finfo(float).eps * n_steps):
+        raise ValueError(
+            f"t_end = {t_end!r} is {t_end / h!r} steps of h = {h!r}: a whole number is needed, for a shortened "
+            "step would spoil a symplectic method"
+        )
+    return n_steps
+
+
+def _check_count(value: Any, name: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"{name} must be a positive integer, got {value!r}")
+    return int(value)
+
+
+def _saved_steps(n_steps: int, save_every: int | None) -> np.ndarray:
+    every = n_steps if save_every is None else _check_count(save_every, "save_every")
+    return np.unique(np.append(np.arange(0, n_steps, every), n_steps))
+
+
+def _set_integrator(sim: rebound.Simulation, name: str) -> None:
+    family = name.removesuffix("-c17").removesuffix("(10,6,4)")
+    sim.integrator = family
+    # Version 4 keeps an integrator's options in sim.ri_<family>, version 5 in sim.integrator.
+    version_4 = hasattr(sim, "ri_whfast")
+    options = getattr(sim, f"ri_{family}") if version_4 else sim.integrator
+    if family in ("whfast", "saba"):
+        options.safe_mode = 0
+        # Synchronise a copy, so that a saved point leaves no trace in the run.
+        options.keep_unsynchronized = 1
+    if family == "saba":
+        options.type = "10,6,4" if version_4 else "10_6_4"
+    if name == "whfast-c17":
+        options.corrector = 17
+
+
+def _take_steps(sim: rebound.Simulation, n: int) -> None:
+    for done in range(0, n, _CHUNK):
+        sim.steps(min(_CHUNK, n - done))
+
+
+def _state(sim: rebound.Simulation) -> np.ndarray:
+    q = np.empty((sim.N, 3))
+    v = np.empty((sim.N, 3))
+    sim.serialize_particle_data(xyz=q, vxvyvz=v)
+    return np.concatenate((q, v), axis=None)
+
+
+def _invariant_errors(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Relative errors of energy and angular momentum along y (m, 6 N); absolute where the initial value is 0."""
+    q, v = np.moveaxis(y.reshape(len(y), 2, -1, 3), 1, 0)
+    energy = 0.5 * (v**2).sum(axis=2) @ gm
+    for i, j in combinations(range(gm.size), 2):
+        energy -= gm[i] * gm[j] / np.linalg.norm(q[:, i] - q[:, j], axis=1)
+    momentum = (gm[:, None] * np.cross(q, v)).sum(axis=1)
+    energy_error = np.abs(energy - energy[0])
+    momentum_error = np.linalg.norm(momentum - momentum[0], axis=1)
+    return energy_error / (abs(energy[0]) or 1.0), momentum_error / (np.linalg.norm(momentum[0]) or 1.0)
+
+
+def _refuse_unsupported(sim: rebound.Simulation) -> None:
+    callbacks = (sim._additional_forces, sim._pre_timestep_modifications, sim._post_timestep_modifications)
+    obstacles = (
+        (sim.N_var > 0, "variational particles: they are no bodies, and our state has no place for them"),
+        (sim.N < 2, f"{sim.N} particles: gravity needs at least two"),
+        (
+            0 <= sim.N_active < sim.N or any(p.m == 0 for p in sim.particles),
+            "test particles: without mass they have no part in the invariants that are to be preserved",
+        ),
+        (any(map(bool, callbacks)), "additional forces or modifications of a step: their invariants are unknown"),
+        (sim._N_odes > 0, "further differential equations: our state has no place for them"),
+        (sim.softening != 0, "softened gravity: the problem's potential is 1/r"),
+        (sim.gravity in ("none", "tree", "custom"), f"gravity {sim.gravity!r}: the problem sums 1/r over all pairs"),
+        (sim.collision != "none", "collisions: they change the number of bodies or the invariants"),
+        (
+            sim.boundary != "none" or str(sim.integrator) == "sei",
+            "boundaries or a shearing sheet: the problem's space is open and inertial",
+        ),
+    )
+    for present, what in obstacles:
+        if present:
+            raise ValueError(f"the simulation has what an N-body problem of eip_scipy does not support: {what}")

@@ -1,0 +1,24 @@
+"""What holds for every test: the meaning of ``needs_jit``, plotting without a screen, the hypothesis profile."""
+
+import os
+
+import hypothesis
+import numba
+import pytest
+
+# Before any import of matplotlib, and through the environment, so that subprocesses inherit it.
+os.environ["MPLBACKEND"] = "Agg"
+
+# The same examples in each run, and no deadline: the first call of a function compiles it. To look for new
+# counterexamples: python -m pytest --hypothesis-profile=default
+hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
+hypothesis.settings.load_profile("ci")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    if not numba.config.DISABLE_JIT:
+        return
+    skip = pytest.mark.skip(reason="needs compiled code; NUMBA_DISABLE_JIT is set")
+    for item in items:
+        if item.get_closest_marker("needs_jit"):
+            item.add_marker(skip)
