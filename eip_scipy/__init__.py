@@ -4,6 +4,7 @@ from importlib.metadata import version as _version
 
 from .invariants import Invariant, check_gradient
 from .longrun import integrate
+from .projection import project
 from .result import Diagnostics, IntegrationResult, ProjectionResult
 from .solvers import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPSolver, eip_method
 from .tableaux import Tableau
@@ -25,4 +26,5 @@ __all__ = [
     "check_gradient",
     "eip_method",
     "integrate",
+    "project",
 ]

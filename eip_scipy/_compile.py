@@ -1,4 +1,8 @@
-"""Users' Numba functions in the form that the compiled driver takes: ``(t, y, out, params) -> None``."""
+"""Users' Numba functions in the form that the compiled driver takes: ``(t, y, out, params) -> None``.
+
+Arrays are copied by loops: these wrappers are compiled in every process, and a slice assignment alone takes Numba more
+than a second.
+"""
 
 from __future__ import annotations
 
@@ -108,13 +112,17 @@ def _wrap_rhs(fun: Any, in_place: bool, has_params: bool) -> Any:
 
         @njit
         def rhs(t, y, out, params):
-            out[:] = fun(t, y, params)
+            f = fun(t, y, params)
+            for i in range(min(out.size, f.size)):
+                out[i] = f[i]
 
     else:
 
         @njit
         def rhs(t, y, out, params):
-            out[:] = fun(t, y)
+            f = fun(t, y)
+            for i in range(min(out.size, f.size)):
+                out[i] = f[i]
 
     return rhs
 
@@ -151,7 +159,8 @@ def _chain_value(before: Any, fun: Any, start: int, scalar: bool, has_params: bo
         def inv(t, y, values, params):
             before(t, y, values, params)
             part = fun(t, y, params)
-            values[start : start + part.size] = part
+            for i in range(part.size):
+                values[start + i] = part[i]
 
     else:
 
@@ -159,7 +168,8 @@ def _chain_value(before: Any, fun: Any, start: int, scalar: bool, has_params: bo
         def inv(t, y, values, params):
             before(t, y, values, params)
             part = fun(t, y)
-            values[start : start + part.size] = part
+            for i in range(part.size):
+                values[start + i] = part[i]
 
     return inv
 
@@ -206,13 +216,18 @@ def _chain_gradient(before: Any, gradient: Any, start: int, rows: int, in_place:
         @njit
         def grad(t, y, f, G, params):
             before(t, y, f, G, params)
-            G[start:stop] = gradient(t, y, f, params)
+            part = gradient(t, y, f, params)
+            for i in range(rows):
+                for j in range(G.shape[1]):
+                    G[start + i, j] = part[i, j]
 
     else:
 
         @njit
         def grad(t, y, f, G, params):
             before(t, y, f, G, params)
-            G[start] = gradient(t, y, f, params)
+            row = gradient(t, y, f, params)
+            for j in range(G.shape[1]):
+                G[start, j] = row[j]
 
     return grad

@@ -1,8 +1,8 @@
 """Array kernels of the step and the projection, always compiled.
 
 Every state enters as a float64 view: a complex state of n components is 2 n floats, and Re<., .> is then the
-ordinary inner product, so that one set of kernels serves both. Sums run in a fixed order with eight partial
-sums: the same bits whether a kernel is called from Python or inlined in a compiled driver.
+ordinary inner product, so that one set of kernels serves both. Sums run in a fixed order: the same bits whether a
+kernel is called from Python or inlined in a compiled driver.
 """
 
 from __future__ import annotations
@@ -13,19 +13,23 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from ._lanes import abs_dot, dot, largest, remove_component
+
 OK, NOT_FINITE, FAILED_PROJECTION = 0, 1, 2
 
 EPS = 2.220446049250313e-16
 BAND_FACTOR = 4.0
 METRIC_FLOOR = 1e-7
 RANK_TOLERANCE = sqrt(EPS)
+# Below this length one Gram-Schmidt pass would leave errors of 1e-13 and more of the defects uncorrected.
+REORTHOGONALISE = 0.05
 TINY = 1e-290
 FAILURE_BANDS = 100.0
 SPLITTER = 134217729.0  # 2**27 + 1 (Dekker)
 
 
 class Grouping(NamedTuple):
-    """Blocks as index lists: block b holds components ``index[start[b]:start[b + 1]]``; width 2 for complex."""
+    """Blocks as lists of floats' indices: ``index[start[b]:start[b + 1]]``; width 2 for a complex state."""
 
     index: np.ndarray
     start: np.ndarray
@@ -33,7 +37,7 @@ class Grouping(NamedTuple):
 
 
 class FrameRows(NamedTuple):
-    """Non-zeros of C and of the transpose of S (C S)^-1, row by row."""
+    """Non-zeros of C and of M^T, M = S (C S)^-1, row by row; `products` is scratch."""
 
     c_start: np.ndarray
     c_index: np.ndarray
@@ -41,6 +45,7 @@ class FrameRows(NamedTuple):
     m_start: np.ndarray
     m_index: np.ndarray
     m_value: np.ndarray
+    products: np.ndarray
 
 
 class Inner(NamedTuple):
@@ -48,7 +53,7 @@ class Inner(NamedTuple):
 
     matrix: np.ndarray
     g: np.ndarray
-    norms: np.ndarray
+    inverse_norms: np.ndarray
     R: np.ndarray
     pivots: np.ndarray
     mu: np.ndarray
@@ -81,73 +86,19 @@ def fill(a, value):
 
 
 @_jit
-def dot(a, b):
-    n = a.size
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
-    i = 0
-    while i + 7 < n:
-        s0 += a[i] * b[i]
-        s1 += a[i + 1] * b[i + 1]
-        s2 += a[i + 2] * b[i + 2]
-        s3 += a[i + 3] * b[i + 3]
-        s4 += a[i + 4] * b[i + 4]
-        s5 += a[i + 5] * b[i + 5]
-        s6 += a[i + 6] * b[i + 6]
-        s7 += a[i + 7] * b[i + 7]
-        i += 8
-    if i + 3 < n:
-        s0 += a[i] * b[i]
-        s1 += a[i + 1] * b[i + 1]
-        s2 += a[i + 2] * b[i + 2]
-        s3 += a[i + 3] * b[i + 3]
-        i += 4
-    while i < n:
-        s4 += a[i] * b[i]
-        i += 1
-    return ((s0 + s4) + (s1 + s5)) + ((s2 + s6) + (s3 + s7))
-
-
-@_jit
-def abs_dot(a, b):
-    n = a.size
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
-    i = 0
-    while i + 7 < n:
-        s0 += abs(a[i] * b[i])
-        s1 += abs(a[i + 1] * b[i + 1])
-        s2 += abs(a[i + 2] * b[i + 2])
-        s3 += abs(a[i + 3] * b[i + 3])
-        s4 += abs(a[i + 4] * b[i + 4])
-        s5 += abs(a[i + 5] * b[i + 5])
-        s6 += abs(a[i + 6] * b[i + 6])
-        s7 += abs(a[i + 7] * b[i + 7])
-        i += 8
-    if i + 3 < n:
-        s0 += abs(a[i] * b[i])
-        s1 += abs(a[i + 1] * b[i + 1])
-        s2 += abs(a[i + 2] * b[i + 2])
-        s3 += abs(a[i + 3] * b[i + 3])
-        i += 4
-    while i < n:
-        s4 += abs(a[i] * b[i])
-        i += 1
-    return ((s0 + s4) + (s1 + s5)) + ((s2 + s6) + (s3 + s7))
-
-
-@_jit
 def norm(a):
     square = dot(a, a)
     if 1e-200 < square < 1e200:
         return sqrt(square)
-    largest = 0.0
+    top = 0.0
     for i in range(a.size):
-        largest = max(largest, abs(a[i]))
-    if largest == 0.0 or not np.isfinite(largest):
-        return largest
+        top = max(top, abs(a[i]))
+    if top == 0.0 or not np.isfinite(top):
+        return top
     total = 0.0
     for i in range(a.size):
-        total += (a[i] / largest) ** 2
-    return largest * sqrt(total)
+        total += (a[i] / top) ** 2
+    return top * sqrt(total)
 
 
 @_jit
@@ -176,8 +127,7 @@ def combine(y, h, weights, K, stages, out):
                 out[i] += w * K[j, i]
         used += 1
     if used == 0:
-        for i in range(n):
-            out[i] = y[i]
+        copy(y, out)
     else:
         for i in range(n):
             out[i] = y[i] + h * out[i]
@@ -247,100 +197,89 @@ def quadrature_add(err, total):
 
 
 @_jit
-def power(x, exponent):
-    """x**exponent for x in [0, 1]; the exponents of RK4 and DOP853 by square roots, several times faster."""
-    if x == 0.0 or x == 1.0:
-        return x
+def powers(x, exponent):
+    """x <- x**exponent, x in [0, 1]; for RK4 and DOP853 by square roots, several times faster than pow."""
     if exponent == 1.25:
-        return x * sqrt(sqrt(x))
-    if exponent == 1.125:
-        return x * sqrt(sqrt(sqrt(x)))
-    return x**exponent
+        for i in range(x.size):
+            x[i] *= sqrt(sqrt(x[i]))
+    elif exponent == 1.125:
+        for i in range(x.size):
+            x[i] *= sqrt(sqrt(sqrt(x[i])))
+    else:
+        for i in range(x.size):
+            x[i] = x[i] ** exponent
 
 
 @_jit
-def magnitude(a, i, width):
+def component_scales(y, y_hat, rtol, atol, width, out):
+    """Out = atol + rtol max(|y|, |y_hat|), the same for both parts of a complex component; returns the largest."""
     if width == 1:
-        return abs(a[i])
-    return np.hypot(a[2 * i], a[2 * i + 1])
+        for i in range(out.size):
+            out[i] = atol[i] + rtol[i] * max(abs(y[i]), abs(y_hat[i]))
+    else:
+        for i in range(atol.size):
+            size = max(np.hypot(y[2 * i], y[2 * i + 1]), np.hypot(y_hat[2 * i], y_hat[2 * i + 1]))
+            out[2 * i] = atol[i] + rtol[i] * size
+            out[2 * i + 1] = out[2 * i]
+    return largest(out)
 
 
 @_jit
 def block_square(a, b, unit, groups):
-    """Square of the norm of block b of a, in units of `unit`."""
+    """Squared norm of block b of a, in units of 1 / unit."""
     total = 0.0
     for p in range(groups.start[b], groups.start[b + 1]):
-        i = groups.index[p]
-        for part in range(groups.width):
-            total += (a[groups.width * i + part] / unit) ** 2
+        x = a[groups.index[p]] * unit
+        total += x * x
     return total
 
 
 @_jit_inline
-def error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale):
+def error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio, component):
     """Weights sigma of the error metric and the blocks' scales; returns the largest relative error r.
 
-    r = 0 (no error at all) leaves the euclidean metric.
+    r = 0 (no error at all) leaves the euclidean metric. `ratio` (blocks) and `component` (n) are scratch. Squares of
+    extreme scales are taken in units of the largest: a block 150 decades below it counts as one without weight.
     """
-    blocks = groups.start.size - 1
-    width = groups.width
-    largest = 0.0
-    for b in range(blocks):
-        first = groups.index[groups.start[b]]
-        if groups.start[b + 1] - groups.start[b] == 1:
-            s = atol[first] + rtol[first] * max(magnitude(y, first, width), magnitude(y_hat, first, width))
-            scale[b] = s if s >= TINY else 0.0
-            r = magnitude(err, first, width) / s if s >= TINY else 0.0
-            sigma[width * first] = r
-            largest = max(largest, r)
-            continue
-        unit = 0.0
-        for p in range(groups.start[b], groups.start[b + 1]):
-            i = groups.index[p]
-            s = atol[i] + rtol[i] * max(magnitude(y, i, width), magnitude(y_hat, i, width))
-            sigma[width * i] = s
-            unit = max(unit, s)
-        if unit < TINY:
-            scale[b] = 0.0
-            sigma[width * first] = 0.0
-            continue
-        inverse = 1.0 / unit
-        scale_square = 0.0
-        error_square = 0.0
-        for p in range(groups.start[b], groups.start[b + 1]):
-            i = groups.index[p]
-            scale_square += (sigma[width * i] * inverse) ** 2
-            error_square += (magnitude(err, i, width) * inverse) ** 2
-        scale[b] = unit * sqrt(scale_square)
-        r = sqrt(error_square / scale_square)
-        sigma[width * first] = r
-        largest = max(largest, r)
-    if largest == 0.0:
+    top = component_scales(y, y_hat, rtol, atol, groups.width, component)
+    if top < TINY:
+        fill(sigma, 1.0)
+        fill(scale, 0.0)
+        return 0.0
+    unit = 1.0 if 1e-140 < top < 1e140 else 1.0 / top
+    for b in range(ratio.size):
+        scale[b] = block_square(component, b, unit, groups)
+        ratio[b] = block_square(err, b, unit, groups)
+    for b in range(ratio.size):
+        relative = sqrt(ratio[b] / max(scale[b], TINY))
+        ratio[b] = relative if scale[b] > 0.0 else 0.0
+        scale[b] = sqrt(scale[b]) / unit
+    largest_ratio = largest(ratio)
+    if largest_ratio == 0.0:
         fill(sigma, 1.0)
         return 0.0
-    top = 0.0
-    for b in range(blocks):
-        first = width * groups.index[groups.start[b]]
-        weight = scale[b] * (power(sigma[first] / largest, kappa) + METRIC_FLOOR)
-        sigma[first] = weight
-        top = max(top, weight)
-    for b in range(blocks):
-        weight = sigma[width * groups.index[groups.start[b]]] / top
+    inverse = 1.0 / largest_ratio
+    for b in range(ratio.size):
+        ratio[b] = min(1.0, ratio[b] * inverse)
+    powers(ratio, kappa)
+    for b in range(ratio.size):
+        ratio[b] = scale[b] * (ratio[b] + METRIC_FLOOR)
+    inverse = 1.0 / largest(ratio)
+    for b in range(ratio.size):
+        weight = ratio[b] * inverse
         for p in range(groups.start[b], groups.start[b + 1]):
-            i = groups.index[p]
-            for part in range(width):
-                sigma[width * i + part] = weight
-    return largest
+            sigma[groups.index[p]] = weight
+    return largest_ratio
 
 
 @_jit_inline
 def correction_in_local_errors(move, scale, groups, largest_error, record):
     """Raise record[0] to the largest ratio over the blocks of the correction to the step's largest local error."""
-    largest = 0.0
+    top = 0.0
     for b in range(scale.size):
         if scale[b] > 0.0:
-            largest = max(largest, block_square(move, b, scale[b], groups))
-    record[0] = max(record[0], sqrt(largest) / largest_error)
+            top = max(top, block_square(move, b, 1.0 / scale[b], groups))
+    record[0] = max(record[0], sqrt(top) / largest_error)
 
 
 @_jit
@@ -362,15 +301,22 @@ def defects(values, target, G, y_hat, scales, g, band):
     return outside
 
 
-@_jit_inline
-def apply_frame(row, frame):
-    """Row of gradients <- row (1 - S (C S)^-1 C)."""
-    for k in range(frame.c_start.size - 1):
-        t = 0.0
-        for p in range(frame.m_start[k], frame.m_start[k + 1]):
-            t += row[frame.m_index[p]] * frame.m_value[p]
-        for p in range(frame.c_start[k], frame.c_start[k + 1]):
-            row[frame.c_index[p]] -= t * frame.c_value[p]
+@_jit
+def sparse_products(start, index, value, a, out):
+    """Out[k] = the k-th sparse row times a."""
+    for k in range(out.size):
+        total = 0.0
+        for p in range(start[k], start[k + 1]):
+            total += value[p] * a[index[p]]
+        out[k] = total
+
+
+@_jit
+def subtract_sparse(start, index, value, factors, a):
+    """Subtract factors[k] times the k-th sparse row from a, for all k."""
+    for k in range(factors.size):
+        for p in range(start[k], start[k + 1]):
+            a[index[p]] -= factors[k] * value[p]
 
 
 @_jit_inline
@@ -380,7 +326,8 @@ def weigh_rows(G, sigma, frame, B):
         row = B[i]
         for j in range(row.size):
             row[j] = G[i, j]
-        apply_frame(row, frame)
+        sparse_products(frame.m_start, frame.m_index, frame.m_value, row, frame.products)
+        subtract_sparse(frame.c_start, frame.c_index, frame.c_value, frame.products, row)
         for j in range(row.size):
             row[j] *= sigma[j]
 
@@ -392,63 +339,56 @@ def scale_row(row, factor):
 
 
 @_jit
-def remove_component(row, unit_row):
-    r = dot(unit_row, row)
-    for j in range(row.size):
-        row[j] -= r * unit_row[j]
-    return r
-
-
-@_jit
-def factor(B, norms, R, pivots):
+def factor(B, inverse_norms, R, pivots):
     """Pivoted QR of the normalised rows of B, in place; returns the numerical rank.
 
-    Row pivots[k] of B becomes the k-th orthonormal direction, R[k, i] the component of normalised row i along it.
-    Modified Gram-Schmidt, with a second pass where cancellation would have spoilt the first.
+    `inverse_norms` normalise the rows (0 for a zero row). Row pivots[k] of B becomes the k-th orthonormal direction;
+    R[k, i] is the component of normalised row i along it, but for i = pivots[k] its reciprocal. Modified Gram-Schmidt, with a second pass where cancellation would have spoilt the first.
     """
     rows = B.shape[0]
     first = 0
     for i in range(rows):
         pivots[i] = i
-        norms[i] = norm(B[i])
-        if norms[i] > 0.0:
-            scale_row(B[i], 1.0 / norms[i])
-            if norms[first] == 0.0:
-                first = i
-    if rows == 0 or norms[first] == 0.0:
+        length = norm(B[i])
+        inverse_norms[i] = 1.0 / length if length > 0.0 else 0.0
+        scale_row(B[i], inverse_norms[i])
+        if inverse_norms[first] == 0.0:
+            first = i
+    if rows == 0 or inverse_norms[first] == 0.0:
         return 0
     pivots[0], pivots[first] = first, 0
     R[0, first] = 1.0
     for k in range(1, rows):
-        best, length = k, -1.0
+        best, left = k, -1.0
         for p in range(k, rows):
             row = pivots[p]
-            R[k - 1, row] = remove_component(B[row], B[pivots[k - 1]])
-            left = norm(B[row])
-            if left > length:
-                best, length = p, left
+            R[k - 1, row], square = remove_component(B[row], B[pivots[k - 1]])
+            if square > left:
+                best, left = p, square
+        length = sqrt(left)
         pivots[k], pivots[best] = pivots[best], pivots[k]
         row = pivots[k]
-        if RANK_TOLERANCE < length < 0.5:
+        if RANK_TOLERANCE < length < REORTHOGONALISE:
             for q in range(k):
-                R[q, row] += remove_component(B[row], B[pivots[q]])
-            length = norm(B[row])
+                again, left = remove_component(B[row], B[pivots[q]])
+                R[q, row] += again
+            length = sqrt(left)
         if length <= RANK_TOLERANCE:
             return k
-        R[k, row] = length
-        scale_row(B[row], 1.0 / length)
+        R[k, row] = 1.0 / length
+        scale_row(B[row], R[k, row])
     return rows
 
 
 @_jit
-def least_norm(g, norms, R, pivots, rank, mu):
+def least_norm(g, inverse_norms, R, pivots, rank, mu):
     """Coefficients mu along the orthonormal directions of the least-norm x with (row_i . x) = -g_i on the pivot rows."""
     for k in range(rank):
         row = pivots[k]
-        value = -g[row] / norms[row]
+        value = -g[row] * inverse_norms[row]
         for q in range(k):
             value -= R[q, row] * mu[q]
-        mu[k] = value / R[k, row]
+        mu[k] = value * R[k, row]
 
 
 @_jit_inline
@@ -459,8 +399,8 @@ def newton_matrix_solve(rows, g, Q, pivots, rank, inner, mu):
         for q in range(rank):
             matrix[k, q] = dot(rows[pivots[k]], Q[pivots[q]])
         inner.g[k] = g[pivots[k]]
-    inner_rank = factor(matrix, inner.norms, inner.R, inner.pivots)
-    least_norm(inner.g, inner.norms, inner.R, inner.pivots, inner_rank, inner.mu)
+    inner_rank = factor(matrix, inner.inverse_norms, inner.R, inner.pivots)
+    least_norm(inner.g, inner.inverse_norms, inner.R, inner.pivots, inner_rank, inner.mu)
     for k in range(inner_rank):
         row = matrix[inner.pivots[k]]
         for q in range(rank):
@@ -483,12 +423,8 @@ def move_along(mu, Q, pivots, rank, sigma, frame, y_hat, move, out):
                 move[j] += mu[k] * row[j]
         for j in range(n):
             move[j] *= sigma[j]
-    for k in range(frame.c_start.size - 1):
-        t = 0.0
-        for p in range(frame.c_start[k], frame.c_start[k + 1]):
-            t += frame.c_value[p] * move[frame.c_index[p]]
-        for p in range(frame.m_start[k], frame.m_start[k + 1]):
-            move[frame.m_index[p]] -= t * frame.m_value[p]
+    sparse_products(frame.c_start, frame.c_index, frame.c_value, move, frame.products)
+    subtract_sparse(frame.m_start, frame.m_index, frame.m_value, frame.products, move)
     for j in range(n):
         out[j] = y_hat[j] + move[j]
 

@@ -18,6 +18,8 @@ from .tableaux import Tableau
 
 __all__ = ["ProjectionOptions", "Run", "as_derivative", "fixed_steps", "nearest_option", "prepare"]
 
+# Unsigned: Numba then leaves out the test for negative indices, which costs more than the access itself.
+INDEX = np.uint64
 DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
 START_ITERATIONS = 50
 
@@ -175,10 +177,10 @@ def _metric(metric: Any, tableau: Tableau, n: int, width: int) -> tuple[int, np.
         if metric == "error":
             return (ERROR if tableau.has_estimate else EUCLIDEAN), None
         raise ValueError(f"metric must be 'error', 'euclidean' or an array of n weights, got {metric!r}.")
-    return GIVEN, np.repeat(_weights("metric", metric, n), width)
+    return GIVEN, np.repeat(weights("metric", metric, n), width)
 
 
-def _weights(name: str, sigma: Any, n: int) -> np.ndarray:
+def weights(name: str, sigma: Any, n: int) -> np.ndarray:
     a = np.asarray(sigma, dtype=float)
     if a.shape != (n,):
         raise ValueError(f"{name}: weights have shape {a.shape}, the state has {n} components.")
@@ -187,7 +189,7 @@ def _weights(name: str, sigma: Any, n: int) -> np.ndarray:
     return a / a.max()
 
 
-def _blocks(blocks: Any, n: int, width: int) -> Grouping:
+def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
     if blocks is None:
         groups = [np.array([i]) for i in range(n)]
     elif isinstance(blocks, (int, np.integer)) and not isinstance(blocks, bool):
@@ -196,8 +198,10 @@ def _blocks(blocks: Any, n: int, width: int) -> Grouping:
         groups = list(np.arange(n).reshape(-1, blocks))
     else:
         groups = _block_lists(blocks, n)
-    start = np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(np.int64)
-    return Grouping(np.concatenate([*groups, []]).astype(np.int64), start, width)
+    if width == 2:
+        groups = [np.column_stack([2 * g, 2 * g + 1]).ravel() for g in groups]
+    start = np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(INDEX)
+    return Grouping(np.concatenate([*groups, []]).astype(INDEX), start, width)
 
 
 def _block_lists(blocks: Any, n: int) -> list[np.ndarray]:
@@ -227,7 +231,7 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
         C, M = np.zeros((0, n * width)), np.zeros((0, n * width))
     else:
         C, M = _frame_matrices(frame, n, width)
-    return FrameRows(*_sparse_rows(C), *_sparse_rows(M))
+    return FrameRows(*_sparse_rows(C), *_sparse_rows(M), np.zeros(C.shape[0]))
 
 
 def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -261,8 +265,8 @@ def _real_form(a: np.ndarray) -> np.ndarray:
 
 def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rows = [np.flatnonzero(row) for row in a]
-    start = np.concatenate([[0], np.cumsum([len(r) for r in rows])]).astype(np.int64)
-    index = np.concatenate([*rows, []]).astype(np.int64)
+    start = np.concatenate([[0], np.cumsum([len(r) for r in rows])]).astype(INDEX)
+    index = np.concatenate([*rows, []]).astype(INDEX)
     value = np.concatenate([*(row[r] for row, r in zip(a, rows, strict=True)), []]).astype(float)
     return start, index, value
 
@@ -310,7 +314,7 @@ def prepare(
     if projection.direction not in DIRECTIONS:
         raise ValueError(f"direction must be 'new', 'old' or 'midpoint', got {projection.direction!r}.")
     rtol, atol = tolerances(rtol, atol, n)
-    groups = _blocks(projection.blocks, n, width)
+    groups = blocks_of(projection.blocks, n, width)
     invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra)
     options = Options(
         rtol=rtol,

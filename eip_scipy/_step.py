@@ -73,13 +73,15 @@ class Work(NamedTuple):
     err_sum: np.ndarray
     sigma: np.ndarray
     scale: np.ndarray
+    ratio: np.ndarray
+    component: np.ndarray
     move: np.ndarray
     carry: np.ndarray
     carry_hat: np.ndarray
     B: np.ndarray
     Q: np.ndarray
     R: np.ndarray
-    norms: np.ndarray
+    inverse_norms: np.ndarray
     pivots: np.ndarray
     mu: np.ndarray
     values: np.ndarray
@@ -107,7 +109,7 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
     y_hat, y_hat_r = pair(n)
     G, G_r = pair(n_invariants, n)
     floats = {name: np.zeros(m) for name in ("err", "err_sum", "sigma", "move", "carry", "carry_hat")}
-    small = {name: np.zeros(n_invariants) for name in ("norms", "mu", "values", "g", "band", "before", "defect")}
+    small = {name: np.zeros(n_invariants) for name in ("inverse_norms", "mu", "values", "g", "band", "before", "defect")}
     floats["sigma"][:] = 1.0
     return Work(
         K=K,
@@ -122,6 +124,8 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
         **floats,
         **small,
         scale=np.zeros(n_blocks),
+        ratio=np.zeros(n_blocks),
+        component=np.zeros(m),
         B=np.zeros((n_invariants, m)),
         Q=np.zeros((n_invariants, m)),
         R=np.zeros((n_invariants, n_invariants)),
@@ -246,18 +250,18 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
     largest_error = 0.0
     if o.metric == ERROR:
         largest_error = kn.error_metric(
-            w.err, y_r, w.y_hat_r, o.rtol, o.atol, o.groups, o.kappa, w.sigma, w.scale
+            w.err, y_r, w.y_hat_r, o.rtol, o.atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio, w.component
         )
     if o.direction != NEW:
         kn.weigh_rows(w.G_r, w.sigma, o.frame, w.B)
     weighted_directions(rhs, grad, params, t_old, y, y_r, t, o, w)
-    rank = kn.factor(w.Q, w.norms, w.R, w.pivots)
+    rank = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)
     counters[NLU] += 1
     counters[LAST_RANK] = rank
     if rank < w.g.size:
         counters[RANK_REDUCED] += 1
     if o.direction == NEW:
-        kn.least_norm(w.g, w.norms, w.R, w.pivots, rank, w.mu)
+        kn.least_norm(w.g, w.inverse_norms, w.R, w.pivots, rank, w.mu)
     else:
         kn.fill(w.mu, 0.0)
         kn.newton_matrix_solve(w.B, w.g, w.Q, w.pivots, rank, w.inner, w.mu)

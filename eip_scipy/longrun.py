@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit, types, typeof
 
 from . import _kernels as kn
-from . import _setup, _step
+from . import _lanes, _setup, _step
 from ._compile import CompiledFunctions, NotCompilable, compile_functions, signatures
 from ._setup import ProjectionOptions, Run
 from ._step import NOT_FINITE, OK, eip_step
@@ -57,7 +57,7 @@ def source_stamp() -> str:
     Numba's cache on disk looks only at the file of the function itself: without this, an upgraded or edited kernel
     would leave the old driver, with the old kernel inlined, in use.
     """
-    sources = [Path(module.__file__).read_bytes() for module in (kn, _step)] + [Path(__file__).read_bytes()]
+    sources = [Path(module.__file__).read_bytes() for module in (_lanes, kn, _step)] + [Path(__file__).read_bytes()]
     return hashlib.sha256(b"".join(sources)).hexdigest()
 
 

@@ -32,7 +32,7 @@ __all__ = ["INTEGRATORS", "ReboundRun", "problem_from_simulation", "run", "simul
 
 INTEGRATORS = ("whfast", "whfast-c17", "ias15", "leapfrog", "saba(10,6,4)")
 
-# Steps between two looks at Ctrl-C, which Python handles only outside of REBOUND's loop. REBOUND counts in 32 bits.
+# Steps between two looks at Ctrl-C, which Python handles only outside of REBOUND's loop. Version 4 counts in 32 bits.
 _CHUNK = 100_000
 
 
@@ -148,6 +148,9 @@ def run(
     -----
     Saving does not disturb the steps of a fixed-step integrator: the states do not depend on `save_every`. Those of
     "ias15" do, at the level of its round-off, for each saved time cuts a step.
+
+    REBOUND's own warnings come through, for example its RuntimeWarning when a step of WHFast, or of its corrector,
+    exceeds a period.
 
     References
     ----------

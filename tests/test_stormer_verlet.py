@@ -182,6 +182,14 @@ def test_an_acceleration_may_reuse_its_buffer():
     np.testing.assert_array_equal(stormer_verlet(reused, (0.0, 1.0), [1.0, 0.0], 0.1).y, honest.y)
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_an_acceleration_may_return_a_constant_that_is_not_to_be_written(form):
+    gravity = np.array([-9.81])
+    gravity.flags.writeable = False
+    run = stormer_verlet(lambda t, q: gravity, (0.0, 2.0), [0.0, 0.0], 0.5, form=form)
+    np.testing.assert_allclose(run.y[:, -1], [-2 * 9.81, -2 * 9.81], rtol=1e-15)
+
+
 def test_non_finite_states_are_reported():
     run = stormer_verlet(
         lambda t, q: np.array([np.nan if t > 0.45 else 0.0]), (0.0, 1.0), [1.0, 0.0], 0.1, save_every=1

@@ -1,0 +1,8 @@
+"""``python -m eip_scipy``: the command line."""
+
+import sys
+
+from .cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

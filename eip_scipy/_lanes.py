@@ -1,0 +1,186 @@
+"""Reductions in eight explicit lanes: fast, and the same bits wherever they are compiled.
+
+A plain loop over a sum is not vectorised without "fastmath", which would let every place where the loop is inlined
+choose its own order of summation. Here the order is fixed: lane k sums the entries k, k + 8, k + 16, ..., the lanes
+are added in pairs, the entries beyond the last multiple of eight come last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import config, njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+__all__ = ["abs_dot", "dot", "largest", "remove_component"]
+
+LANES = 8
+VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+
+
+def _pointer(context: Any, builder: Any, kind: Any, array: Any, i: Any) -> Any:
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [i]), VECTOR.as_pointer())
+
+
+def _load(builder: Any, pointer: Any) -> Any:
+    return builder.load(pointer, align=8)
+
+
+def _fold(builder: Any, vector: Any, join: Callable[..., Any]) -> Any:
+    lanes = [builder.extract_element(vector, ir.Constant(ir.IntType(32), k)) for k in range(LANES)]
+    while len(lanes) > 1:
+        half = len(lanes) // 2
+        lanes = [join(builder, lanes[k], lanes[k + half]) for k in range(half)]
+    return lanes[0]
+
+
+def _add(builder: Any, a: Any, b: Any) -> Any:
+    return builder.fadd(a, b)
+
+
+def _larger(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered(">", b, a), b, a)
+
+
+def _loop(builder: Any, n: Any, body: Callable[[Any], Any], join: Callable[..., Any] = _add) -> Any:
+    """The vectors that `body` gives for i = 0, 8, ... below n, joined by lane, then the lanes."""
+    total = cgutils.alloca_once_value(builder, ir.Constant(VECTOR, [0.0] * LANES))
+    zero, step = (ir.Constant(n.type, value) for value in (0, LANES))
+    with cgutils.for_range_slice(builder, zero, n, step, n.type) as (i, _):
+        builder.store(join(builder, builder.load(total), body(i)), total)
+    return _fold(builder, builder.load(total), join)
+
+
+def _products(context: Any, builder: Any, signature: Any, arguments: Any, i: Any) -> Any:
+    a, b = (
+        _load(builder, _pointer(context, builder, signature.args[k], arguments[k], i)) for k in range(2)
+    )
+    return builder.fmul(a, b)
+
+
+@intrinsic
+def _lanes_dot(typingctx, a, b, n):
+    def codegen(context, builder, signature, arguments):
+        return _loop(builder, arguments[2], lambda i: _products(context, builder, signature, arguments, i))
+
+    return types.float64(a, b, types.intp), codegen
+
+
+@intrinsic
+def _lanes_abs_dot(typingctx, a, b, n):
+    def codegen(context, builder, signature, arguments):
+        kind = ir.FunctionType(VECTOR, [VECTOR])
+        fabs = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fabs.v{LANES}f64")
+        return _loop(
+            builder,
+            arguments[2],
+            lambda i: builder.call(fabs, [_products(context, builder, signature, arguments, i)]),
+        )
+
+    return types.float64(a, b, types.intp), codegen
+
+
+@intrinsic
+def _lanes_largest(typingctx, a, n):
+    def codegen(context, builder, signature, arguments):
+        return _loop(
+            builder,
+            arguments[1],
+            lambda i: _load(builder, _pointer(context, builder, signature.args[0], arguments[0], i)),
+            _larger,
+        )
+
+    return types.float64(a, types.intp), codegen
+
+
+@intrinsic
+def _lanes_remove(typingctx, row, unit_row, r, n):
+    def codegen(context, builder, signature, arguments):
+        spread = ir.Constant(VECTOR, ir.Undefined)
+        for k in range(LANES):
+            spread = builder.insert_element(spread, arguments[2], ir.Constant(ir.IntType(32), k))
+
+        def body(i):
+            target = _pointer(context, builder, signature.args[0], arguments[0], i)
+            unit = _load(builder, _pointer(context, builder, signature.args[1], arguments[1], i))
+            left = builder.fsub(_load(builder, target), builder.fmul(spread, unit))
+            builder.store(left, target, align=8)
+            return builder.fmul(left, left)
+
+        return _loop(builder, arguments[3], body)
+
+    return types.float64(row, unit_row, types.float64, types.intp), codegen
+
+
+if config.DISABLE_JIT:
+
+    def _numpy_sum(products):
+        lanes = np.add.reduce(products.reshape(-1, LANES), axis=0)
+        while lanes.size > 1:
+            lanes = lanes[: lanes.size // 2] + lanes[lanes.size // 2 :]
+        return lanes[0]
+
+    def _lanes_dot(a, b, n):  # noqa: F811
+        return _numpy_sum(a[:n] * b[:n])
+
+    def _lanes_abs_dot(a, b, n):  # noqa: F811
+        return _numpy_sum(np.abs(a[:n] * b[:n]))
+
+    def _lanes_largest(a, n):  # noqa: F811
+        return np.max(a[:n], initial=0.0)
+
+    def _lanes_remove(row, unit_row, r, n):  # noqa: F811
+        row[:n] -= r * unit_row[:n]
+        return _numpy_sum(row[:n] * row[:n])
+
+
+_jit = njit(cache=True, error_model="numpy", _nrt=False)
+
+
+@_jit
+def dot(a, b):
+    """a . b."""
+    whole = a.size - a.size % LANES
+    rest = 0.0
+    for i in range(whole, a.size):
+        rest += a[i] * b[i]
+    return _lanes_dot(a, b, whole) + rest
+
+
+@_jit
+def abs_dot(a, b):
+    """Sum of |a_i b_i|."""
+    whole = a.size - a.size % LANES
+    rest = 0.0
+    for i in range(whole, a.size):
+        rest += abs(a[i] * b[i])
+    return _lanes_abs_dot(a, b, whole) + rest
+
+
+@_jit
+def largest(a):
+    """Largest entry of a non-negative array, 0 for an empty one; NaN is passed over."""
+    whole = a.size - a.size % LANES
+    top = _lanes_largest(a, whole)
+    for i in range(whole, a.size):
+        if a[i] > top:
+            top = a[i]
+    return top
+
+
+@_jit
+def remove_component(row, unit_row):
+    """Row -= (unit_row . row) unit_row; returns that product and the square of what is left."""
+    r = dot(unit_row, row)
+    whole = row.size - row.size % LANES
+    rest = 0.0
+    for i in range(whole, row.size):
+        left = row[i] - r * unit_row[i]
+        row[i] = left
+        rest += left * left
+    return r, _lanes_remove(row, unit_row, r, whole) + rest

@@ -1,0 +1,128 @@
+"""The command line: ``eip-scipy COMMAND`` or ``python -m eip_scipy COMMAND``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NoReturn
+
+from . import comparators, problems, solar_command
+from .problems import solar_data
+from .report import UsageError, check_target, document, say, versions, warn, write_json
+
+__all__ = ["main"]
+
+DONE, WRONG_USAGE = 0, 2
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One line, without the usage that argparse puts before it."""
+        self.exit(WRONG_USAGE, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments; default: those of the process.
+
+    Returns
+    -------
+    int
+        Exit status: 0 done, 1 a check inside the command failed, 2 wrong usage, 130 interrupted.
+    """
+    try:
+        args = _parser().parse_args(argv)
+        return int(args.run(args))
+    except SystemExit as leave:  # argparse, for --help, --version and errors
+        return int(leave.code or DONE)
+    except UsageError as error:
+        warn(str(error))
+        return WRONG_USAGE
+    except KeyboardInterrupt:
+        warn("interrupted")
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="eip-scipy", description="Explicit invariants-preserving integrators for SciPy.")
+    parser.add_argument("--version", action="version", version=f"eip_scipy {versions()['eip_scipy']}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
+    for name, (summary, add_arguments, run) in _commands().items():
+        command = commands.add_parser(name, help=summary, description=summary)
+        add_arguments(command)
+        _add_common(command)
+        command.set_defaults(run=run)
+    return parser
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--out", type=Path, default=Path("eip_results"), metavar="DIR", help="folder of figures and CSV (./%(default)s)"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="the numbers as JSON, with versions and machine")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+
+def _commands() -> dict[str, tuple[str, Any, Any]]:
+    """For each command a summary, what adds its options, and what runs it."""
+    commands: dict[str, tuple[str, Any, Any]] = {
+        "list": ("list commands, methods, problems and data sets", lambda parser: None, _list),
+        "solar-system": (
+            "run the solar system and compare with other methods (the paper's Experiment II)",
+            solar_command.add_arguments,
+            lambda args: solar_command.run(args, _rebound(args)),
+        ),
+    }
+    name = "eip_scipy.reproduce"
+    if find_spec(name) is not None:
+        reproduce = import_module(name)
+        commands["reproduce"] = ("recompute the paper's tables", reproduce.add_arguments, reproduce.run)
+    return commands
+
+
+def _rebound(args: argparse.Namespace) -> Any:
+    """REBOUND's integrators, or None and a line that says how to get them."""
+    try:
+        from eip_scipy.integrations import rebound
+    except ImportError as error:
+        warn(f"no comparison with WHFast and IAS15: {error}")
+        return None
+    return rebound.run
+
+
+def _list(args: argparse.Namespace) -> int:
+    content = _listing()
+    if not args.quiet:
+        for heading, entries in content.items():
+            say(f"{heading}:")
+            width = max(map(len, entries))
+            for name, summary in entries.items():
+                say(f"  {name:<{width}}  {summary}".rstrip())
+    if args.json is not None:
+        check_target(args.json)
+        write_json(args.json, document("list", {}, **content))
+    return DONE
+
+
+def _listing() -> dict[str, dict[str, str]]:
+    sets = {name: solar_data.load(name) for name in solar_data.available()}
+    others = {name: getattr(comparators, name) for name in comparators.__all__}
+    scenes = {name: getattr(problems, name) for name in problems.__all__}
+    return {
+        "commands": {name: summary for name, (summary, _, _) in _commands().items()},
+        "methods": {name: _first_line(method) for name, method in solar_command.fixed_step_methods().items()},
+        "comparators": {name: _first_line(make) for name, make in others.items() if not isinstance(make, type)},
+        "problems": {name: _first_line(make) for name, make in scenes.items() if not isinstance(make, type)},
+        "data": {name: f"{len(data.bodies)} bodies at {data.epoch}, {data.axes}" for name, data in sets.items()},
+    }
+
+
+def _first_line(item: Any) -> str:
+    return (item.__doc__ or "").strip().split("\n")[0].split(". ")[0].rstrip(".")

@@ -1,0 +1,359 @@
+"""Figures: functions that take data and return a matplotlib Figure. The only module that imports matplotlib.
+
+Needs ``pip install "eip_scipy[plot]"``. The figures belong to no window: save them with ``figure.savefig(path)``, or
+show them in a notebook.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+try:
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+except ModuleNotFoundError as error:
+    message = 'eip_scipy.plotting needs matplotlib: pip install "eip_scipy[plot]"'
+    raise ImportError(message, name="matplotlib") from error
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = [
+    "ErrorSeries",
+    "Orbits",
+    "cost_figure",
+    "errors_figure",
+    "longitude_figure",
+    "method_styles",
+    "orbit_in_time_figure",
+    "orbits_figure",
+]
+
+# Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white.
+PALETTE = ("#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#777777")
+LINES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), "-", "--")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<")
+DPI = 160
+POINTS = 250
+# Below the spacing of numbers an error means nothing, and a log axis cannot show zero.
+FLOOR = 1e-16
+
+
+class ErrorSeries(NamedTuple):
+    """Errors of one method in time.
+
+    Attributes
+    ----------
+    t : array_like, shape (m,)
+    invariants : mapping of str to array_like, shape (m,)
+        Relative error of each invariant.
+    trajectory : array_like, shape (m,)
+        Error of the trajectory; nan where unknown.
+    """
+
+    t: Any
+    invariants: Mapping[str, Any]
+    trajectory: Any
+
+
+class Orbits(NamedTuple):
+    """Orbits of k bodies by one method.
+
+    Attributes
+    ----------
+    paths : array_like, shape (k, m, 2, points)
+        For each body m curves in the plane.
+    last : array_like, shape (k, 2)
+        The final positions.
+    """
+
+    paths: Any
+    last: Any
+
+
+Styles = Mapping[str, Mapping[str, Any]]
+
+
+def method_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Choose colour, line and marker of each method, so that none is told apart by its colour alone.
+
+    Parameters
+    ----------
+    names : iterable of str
+        All methods that appear in a set of figures, for the same styles in each.
+
+    Returns
+    -------
+    dict
+        For each name keywords of ``Axes.plot``.
+    """
+    return {
+        name: {
+            "color": PALETTE[k % len(PALETTE)],
+            "ls": LINES[k % len(LINES)],
+            "marker": MARKERS[k % len(MARKERS)],
+            "label": name,
+        }
+        for k, name in enumerate(names)
+    }
+
+
+def errors_figure(
+    series: Mapping[str, ErrorSeries], *, time: str, trajectory: str, title: str = "", styles: Styles | None = None
+) -> Figure:
+    """Draw invariant errors in time, and beside them the trajectory error, without which they prove nothing.
+
+    Parameters
+    ----------
+    series : mapping of str to ErrorSeries
+        For each method; all with the same invariants.
+    time, trajectory : str
+        Labels of the time axis and of the trajectory's error, with units.
+    title : str, optional
+    styles : mapping, optional
+        From `method_styles`.
+
+    Returns
+    -------
+    Figure
+    """
+    names = list(next(iter(series.values())).invariants)
+    styles = method_styles(series) if styles is None else styles
+    figure = _figure(3.9 * (len(names) + 1), 4.4, title)
+    axes = figure.subplots(1, len(names) + 1, sharex=True)
+    for axis, name in zip(axes, names, strict=False):
+        for method, data in series.items():
+            _envelope(axis, data.t, data.invariants[name], styles[method])
+        _log_errors(axis, time, f"relative error of {name}")
+    for method, data in series.items():
+        _envelope(axes[-1], data.t, data.trajectory, styles[method])
+    _log_errors(axes[-1], time, trajectory)
+    _legend_below(figure, axes[0])
+    return figure
+
+
+def longitude_figure(
+    t: Any,
+    errors: Mapping[str, Any],
+    planets: Sequence[str],
+    *,
+    time: str,
+    title: str = "",
+    styles: Styles | None = None,
+) -> Figure:
+    """Draw the longitude error in time, one panel for each planet; on log axes a power of time is a straight line.
+
+    Parameters
+    ----------
+    t : array_like, shape (m,)
+    errors : mapping of str to array_like, shape (k, m)
+        For each method the errors of the k planets in rad; nan where unknown.
+    planets : sequence of str, length k
+    time : str
+        Label of the time axis, with its unit.
+    title : str, optional
+    styles : mapping, optional
+        From `method_styles`.
+
+    Returns
+    -------
+    Figure
+    """
+    styles = method_styles(errors) if styles is None else styles
+    columns = min(3, len(planets))
+    rows = -(-len(planets) // columns)
+    figure = _figure(3.7 * columns, 2.5 * rows + 1.2, title)
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for k, axis in enumerate(axes.flat):
+        if k >= len(planets):
+            axis.set_visible(False)
+            continue
+        for method, values in errors.items():
+            _envelope(axis, t, np.asarray(values)[k], styles[method], log=True)
+        _log_x(axis)
+        _log_errors(axis, time if k + columns >= len(planets) else "", "")
+        axis.set_title(planets[k], fontsize="medium")
+    figure.supylabel("|error of longitude| [rad]", fontsize="medium")
+    _legend_below(figure, axes[0, 0])
+    return figure
+
+
+def orbits_figure(panels: Mapping[str, Orbits], bodies: Sequence[str], *, unit: str, title: str = "") -> Figure:
+    """Draw orbits in a plane, one panel for each method, with the final positions.
+
+    Parameters
+    ----------
+    panels : mapping of str to Orbits
+        For each method the orbits of k bodies.
+    bodies : sequence of str, length k
+    unit : str
+        Unit of length.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    figure = _figure(4.1 * len(panels), 5.4, title)
+    axes = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+    for axis, (name, orbits) in zip(axes, panels.items(), strict=True):
+        for k, body in enumerate(bodies):
+            colour = PALETTE[k % len(PALETTE)]
+            for path in np.asarray(orbits.paths)[k]:
+                axis.plot(*path, color=colour, lw=0.5)
+            mark = {"marker": MARKERS[k % len(MARKERS)], "mec": "white", "ms": 7, "zorder": 3}
+            axis.plot(*np.asarray(orbits.last)[k], ls="", color=colour, label=body, **mark)
+        _plane(axis, name, unit)
+    axes[0].set_ylabel(f"y [{unit}]")
+    _legend_below(figure, axes[0], heading="final position")
+    return figure
+
+
+def orbit_in_time_figure(
+    panels: Mapping[str, tuple[Any, Any]], *, unit: str, time: str, title: str = ""
+) -> Figure:
+    """Draw one body's changing orbit in a plane, coloured by time, one panel for each method.
+
+    Parameters
+    ----------
+    panels : mapping of str to (array_like, array_like)
+        For each method times, (m,), and curves, (m, 2, points).
+    unit, time : str
+        Unit of length, and label of the time.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    figure = _figure(4.1 * len(panels) + 0.8, 4.9, title)
+    axes = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+    norm = Normalize(0.0, max(float(np.max(t)) for t, _ in panels.values()))
+    for axis, (name, (t, paths)) in zip(axes, panels.items(), strict=True):
+        curves = LineCollection(list(np.swapaxes(paths, 1, 2)), cmap="viridis", norm=norm, lw=0.7)
+        curves.set_array(np.asarray(t, dtype=float))
+        axis.add_collection(curves)
+        axis.autoscale()
+        _plane(axis, name, unit)
+    axes[0].set_ylabel(f"y [{unit}]")
+    figure.colorbar(curves, ax=list(axes), label=time, shrink=0.8, pad=0.01)
+    return figure
+
+
+def cost_figure(
+    points: Iterable[Any], *, error: str, title: str = "", footnote: str = "", styles: Styles | None = None
+) -> Figure:
+    """Draw error against wall time, a line for each method.
+
+    Parameters
+    ----------
+    points : iterable of WorkPoint
+        Those without an error (failed runs) are left out.
+    error : str
+        Label of the error, with its unit.
+    title, footnote : str, optional
+    styles : mapping, optional
+        From `method_styles`.
+
+    Returns
+    -------
+    Figure
+    """
+    methods: dict[str, list[Any]] = {}
+    for point in points:
+        methods.setdefault(point.method, []).append(point)
+    styles = method_styles(methods) if styles is None else styles
+    figure = _figure(7.6, 5.2, title)
+    axis = figure.subplots()
+    for name, all_points in methods.items():
+        good = [p for p in all_points if np.isfinite(p.error) and p.error > 0]
+        axis.plot([p.wall_time for p in good], [p.error for p in good], ms=6, **styles[name])
+    _log_x(axis)
+    _log_errors(axis, "wall time [s]", error)
+    axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, handlelength=3.5)
+    if footnote:
+        figure.supxlabel(footnote, fontsize="small", color="0.35")
+    return figure
+
+
+def _figure(width: float, height: float, title: str) -> Figure:
+    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+    if title:
+        figure.suptitle(title, fontsize="large")
+    return figure
+
+
+def _envelope(axis: Axes, t: Any, values: Any, style: Mapping[str, Any], *, log: bool = False) -> None:
+    """Draw the largest magnitude in each of some hundred spans of time; noise drawn in full would be a block."""
+    t, magnitude = np.asarray(t, dtype=float), np.abs(np.asarray(values, dtype=float))
+    n = min(t.size, magnitude.size)
+    known = np.flatnonzero(np.isfinite(magnitude[:n]) & (t[:n] > 0))
+    if not known.size:
+        axis.plot([], [], **style)
+        return
+    scale = np.log(t[known]) if log else t[known]
+    edges = np.linspace(scale[0], scale[-1], POINTS + 1)[1:-1]
+    groups = [group for group in np.split(known, np.searchsorted(scale, edges, side="right")) if group.size]
+    at = np.array([t[group[-1]] for group in groups])
+    top = np.array([max(magnitude[group].max(), FLOOR) for group in groups])
+    axis.plot(at, top, lw=1.3, ms=4.5, markevery=_marked(np.log(at) if log else at), **style)
+
+
+def _marked(scale: np.ndarray, count: int = 6) -> list[int]:
+    """Numbers of `count` points about equally spaced, for markers."""
+    wanted = np.linspace(scale[0], scale[-1], 2 * count + 1)[1::2]
+    return sorted({int(np.argmin(np.abs(scale - at))) for at in wanted})
+
+
+def _log_x(axis: Axes) -> None:
+    """A log axis with labels at powers of ten; in a short span at 2 and 5 times those as well."""
+    axis.set_xscale("log")
+    low, high = axis.get_xlim()
+    if high / low < 50:
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _log_errors(axis: Axes, x: str, y: str) -> None:
+    axis.set_yscale("log")
+    low, high = axis.get_ylim()
+    # One labelled tick for at most seven or eight powers of ten, and room that is no smaller than two powers.
+    if high / low < 100:
+        axis.set_ylim(low / 3, high * 3)
+    axis.yaxis.set_major_locator(LogLocator(numticks=9))
+    axis.yaxis.set_minor_formatter(NullFormatter())
+    axis.set_xlabel(x)
+    axis.set_ylabel(y)
+    axis.grid(which="major", alpha=0.3)
+
+
+def _plane(axis: Axes, title: str, unit: str) -> None:
+    """Equal scales, and a cross for the central body."""
+    axis.plot(0, 0, ls="", marker="+", color="black", ms=8)
+    axis.set_title(title, fontsize="medium")
+    axis.set_aspect("equal", adjustable="box")
+    axis.set_xlabel(f"x [{unit}]")
+    axis.xaxis.set_major_locator(MaxNLocator(5))
+    axis.yaxis.set_major_locator(MaxNLocator(5))
+    axis.grid(alpha=0.2)
+
+
+def _legend_below(figure: Figure, axis: Axes, heading: str | None = None) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=min(len(labels), 4 if len(labels) > 5 else 5),
+        fontsize="small",
+        frameon=False,
+        handlelength=3.5 if heading is None else 1.5,
+        title=heading,
+        title_fontsize="small",
+    )

@@ -1,0 +1,104 @@
+"""Error against cost: methods at several steps, timed on one machine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .report import describe_machine
+
+__all__ = ["Runner", "WorkPoint", "WorkPrecision", "work_precision"]
+
+Runner = Callable[[float], tuple[float, np.ndarray]]
+"""``run(step) -> (wall_time, y)``."""
+
+
+class WorkPoint(NamedTuple):
+    """One method at one step.
+
+    Attributes
+    ----------
+    method : str
+    step : float
+    wall_time : float
+        Seconds, the least of several runs.
+    error : float
+        nan for a run that did not reach the end.
+    """
+
+    method: str
+    step: float
+    wall_time: float
+    error: float
+
+
+@dataclass(frozen=True)
+class WorkPrecision:
+    """Result of `work_precision`.
+
+    Attributes
+    ----------
+    points : tuple of WorkPoint
+        In the order of the methods and of their steps.
+    machine : str
+        The machine that the times hold for.
+    """
+
+    points: tuple[WorkPoint, ...]
+    machine: str
+
+
+def work_precision(
+    methods: Mapping[str, tuple[Runner, Sequence[float]]],
+    error: Callable[[np.ndarray], float],
+    *,
+    repeats: int = 3,
+    enough_seconds: float = 1.0,
+    callback: Callable[[], Any] | None = None,
+) -> WorkPrecision:
+    """Run methods at several steps and take error and time.
+
+    Parameters
+    ----------
+    methods : mapping of str to (callable, sequence of float)
+        For each method ``run(step) -> (wall_time, y)``, the seconds it took, compilation left out, and its final
+        state; and the steps. The state of a run that failed is nan.
+    error : callable
+        ``error(y) -> float``, the error of a final state.
+    repeats : int, optional
+        Runs of each point, the least time of which counts: what disturbs a timing makes it longer, never shorter.
+    enough_seconds : float, optional
+        No further run of a point that took longer.
+    callback : callable, optional
+        ``callback()`` after each of the ``repeats`` runs of each point, those left out included.
+
+    Returns
+    -------
+    WorkPrecision
+
+    Raises
+    ------
+    ValueError
+        When `repeats` is not positive.
+    """
+    if repeats < 1:
+        raise ValueError(f"repeats must be at least 1, got {repeats!r}.")
+    points = [WorkPoint(method, step, 0.0, math.nan) for method, (_, steps) in methods.items() for step in steps]
+    for turn in range(repeats):
+        # All points in turn, not each at once: another process that disturbs for a while disturbs one run of a point.
+        for k, point in enumerate(points):
+            if point.wall_time <= enough_seconds:
+                seconds, state = methods[point.method][0](point.step)
+                least = min(seconds, point.wall_time) if turn else seconds
+                points[k] = point._replace(wall_time=least, error=_error(state, error))
+            if callback is not None:
+                callback()
+    return WorkPrecision(tuple(points), describe_machine())
+
+
+def _error(state: np.ndarray, error: Callable[[np.ndarray], float]) -> float:
+    return float(error(state)) if np.isfinite(state).all() else math.nan

@@ -1,0 +1,532 @@
+"""Guards of the projection: dependent and vanishing gradients, round-off, units, amplitudes, and clean failures."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPRK1, EIPRK3, EIPRK4, Diagnostics, Invariant, integrate, project
+from eip_scipy.problems import kepler, solar_system
+
+EPS = np.finfo(float).eps
+METRICS = ["error", "euclidean"]
+GM_SUN, AU = 1.32712440018e20, 1.495978707e11
+
+
+def oscillator(t, y):
+    return np.array([y[1], -y[0]])
+
+
+def pendulum(t, y):
+    return np.array([y[1], -math.sin(y[0])])
+
+
+SQUARE = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="S")
+PENDULUM_ENERGY = Invariant(
+    lambda t, y: 0.5 * y[1] ** 2 - math.cos(y[0]), lambda t, y: np.array([math.sin(y[0]), y[1]]), name="H"
+)
+
+
+def by_scipy(fun, t_span, y0, **options):
+    """Through solve_ivp, with the defects of `integrate`'s result."""
+    diagnostics = Diagnostics()
+    sol = solve_ivp(fun, t_span, y0, method=EIPRK4, diagnostics=diagnostics, **options)
+    sol.max_defect, sol.diagnostics = diagnostics.max_defect, diagnostics
+    return sol
+
+
+def by_integrate(fun, t_span, y0, **options):
+    return integrate(fun, t_span, y0, method=EIPRK4, save_every=1, **options)
+
+
+DRIVERS = [by_scipy, by_integrate]
+both = pytest.mark.parametrize("driver", DRIVERS, ids=["solve_ivp", "integrate"])
+metrics = pytest.mark.parametrize("metric", METRICS)
+
+
+# Circular Kepler: the gradients of H and L are parallel.
+
+
+@both
+@metrics
+@pytest.mark.parametrize("eccentricity", [0.0, 1e-12, 1e-8, 1e-4])
+def test_circular_kepler(driver, metric, eccentricity):
+    problem = kepler(eccentricity, 0.0)
+    run = driver(problem.fun, (0.0, 12.6), problem.y0, h=0.03, invariants=problem.invariants, metric=metric)
+    assert run.status == 0
+    assert np.isfinite(run.y).all()
+    assert (run.max_defect <= 4 * EPS).all()
+    error, plain = (
+        np.linalg.norm(y[:, -1] - problem.reference(12.6))
+        for y in (run.y, driver(problem.fun, (0.0, 12.6), problem.y0, h=0.03).y)
+    )
+    assert error < plain
+    reduced, done = run.diagnostics.n_rank_reduced, run.diagnostics.n_projections
+    assert reduced == (done if eccentricity < 1e-7 else 0)
+    assert done == 420
+
+
+@pytest.mark.needs_jit
+@metrics
+@pytest.mark.parametrize("eccentricity", [0.0, 1e-12, 1e-8, 1e-4])
+def test_circular_kepler_for_long(metric, eccentricity):
+    """LU on the Gram matrix gave NaN within 15 steps."""
+    run = integrate(kepler(eccentricity, 0.0), (0, 3000), method=EIPRK4, h=0.03, metric=metric, compiled=True)
+    assert run.status == 0
+    assert (run.max_defect <= 6 * EPS).all()
+    assert np.hypot(*run.y[:2, -1]) == pytest.approx(1.0, abs=1.1 * eccentricity + 1e-6)
+
+
+# Equilibria and saddles: the gradient of H vanishes.
+
+
+@both
+@metrics
+@pytest.mark.parametrize("y0", [[0.0, 0.0], [np.pi, 0.0]], ids=["hanging", "upright"])
+def test_equilibrium_at_rest(driver, metric, y0):
+    run = driver(pendulum, (0, 30), y0, h=0.05, invariants=PENDULUM_ENERGY, metric=metric)
+    plain = driver(pendulum, (0, 30), y0, h=0.05)
+    assert run.status == 0
+    np.testing.assert_array_equal(run.y, plain.y)
+    assert run.diagnostics.n_projections == 0
+    assert run.diagnostics.n_skipped == 600
+    assert (run.max_defect <= 4 * EPS).all()
+
+
+@both
+@metrics
+@pytest.mark.parametrize("offset", [1e-3, 1e-6, 1e-8, 1e-12])
+@pytest.mark.parametrize("fast", [False, True], ids=["at rest", "moving"])
+def test_saddle(driver, metric, offset, fast):
+    """Near (pi, 0) a correction of round-off divided by the small gradient must not kick the pendulum about."""
+    y0 = [np.pi, offset] if fast else [np.pi - offset, 0.0]
+    run = driver(pendulum, (0, 10), y0, h=0.05, invariants=PENDULUM_ENERGY, metric=metric)
+    plain = driver(pendulum, (0, 10), y0, h=0.05)
+    assert run.status == 0
+    assert (run.max_defect <= 8 * EPS).all()
+    # While it is near the saddle the two runs part by no more than the step's error there.
+    near = np.abs(plain.y[0] - np.pi) < 0.1
+    assert near.sum() > 40
+    assert np.abs((run.y - plain.y)[:, near]).max() < 1e-6 * np.abs(plain.y[0, near] - np.pi).max() + 1e-14
+
+
+def test_zero_gradient_drops_the_row_and_counts():
+    """A product of two coordinates, both 0: no division by 0, the other invariant is met."""
+    product = Invariant(lambda t, y: y[2] * y[3], lambda t, y: np.array([0.0, 0.0, y[3], y[2]]), name="product")
+    norm = Invariant(lambda t, y: y[0] ** 2 + y[1] ** 2, lambda t, y: np.array([2 * y[0], 2 * y[1], 0, 0]), name="norm")
+    run = by_integrate(
+        lambda t, y: np.array([y[1], -y[0], 0.0, 0.0]), (0, 5), [1.0, 0, 0, 0], h=0.1, invariants=[product, norm]
+    )
+    assert run.status == 0
+    assert run.diagnostics.n_rank_reduced == run.diagnostics.n_projections > 40
+    assert run.max_defect[0] == 0
+    assert run.max_defect[1] <= 4 * EPS
+    assert (run.y[2:, -1] == 0).all()
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_project_with_zero_gradient(iterations):
+    result = project([0.0, 0.0], SQUARE, target=1.0, iterations=iterations)
+    assert result.rank == 0
+    np.testing.assert_array_equal(result.y, [0.0, 0.0])
+    np.testing.assert_array_equal(result.correction, [0.0, 0.0])
+    np.testing.assert_array_equal(result.defect, [-1.0])
+
+
+# Units and amplitudes.
+
+
+def kepler_si(eccentricity):
+    energy = Invariant(
+        lambda t, y: 0.5 * (y[2] ** 2 + y[3] ** 2) - GM_SUN / math.hypot(y[0], y[1]),
+        lambda t, y: np.array([*(GM_SUN / math.hypot(y[0], y[1]) ** 3 * y[:2]), y[2], y[3]]),
+        name="H",
+    )
+    momentum = Invariant(
+        lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]), name="L"
+    )
+    speed = math.sqrt(GM_SUN / AU * (1 + eccentricity) / (1 - eccentricity))
+    return (
+        lambda t, y: np.array([y[2], y[3], *(-GM_SUN / math.hypot(y[0], y[1]) ** 3 * y[:2])]),
+        [AU * (1 - eccentricity), 0.0, 0.0, speed],
+        [energy, momentum],
+        2 * np.pi * math.sqrt(AU**3 / GM_SUN),
+    )
+
+
+@both
+@pytest.mark.parametrize(("metric", "e"), [("error", 0.0), ("euclidean", 0.0), ("error", 0.1), ("error", 0.5)])
+def test_kepler_in_si_units(driver, metric, e):
+    fun, y0, invariants, period = kepler_si(e)
+    run = driver(fun, (0, period), y0, h=period / 500, invariants=invariants, metric=metric)
+    size = np.array([0.5 * y0[3] ** 2 + GM_SUN / y0[0], y0[0] * y0[3]])
+    assert run.status == 0
+    assert (run.max_defect <= 1e-14 * size).all()
+    assert np.linalg.norm(run.y[:2, -1] - y0[:2]) < 1e-7 * AU
+    assert run.diagnostics.n_rank_reduced == (run.diagnostics.n_projections if e == 0 else 0)
+
+
+@both
+def test_kepler_in_si_units_euclidean_says_so_or_holds(driver):
+    """The 2-norm of metres and metres per second is a bad metric; where it fails it says so and never drifts."""
+    fun, y0, invariants, period = kepler_si(0.5)
+    run = driver(fun, (0, 2 * period), y0, h=period / 500, invariants=invariants, metric="euclidean")
+    size = np.array([0.5 * y0[3] ** 2 + GM_SUN / y0[0], y0[0] * y0[3]])
+    assert np.isfinite(run.y).all()
+    assert (run.max_defect <= 1e-11 * size).all()
+    assert run.status == 0 or run.message.startswith("projection failed at t=")
+
+
+def sizes_of_h_and_l(problem):
+    """Sums of the absolute terms of H and of the components of L."""
+    gm, (q, v) = problem.params, problem.y0.reshape(2, -1, 3)
+    distance = np.linalg.norm(q[:, None] - q, axis=2)[np.triu_indices(len(gm), 1)]
+    energy = 0.5 * gm @ (v**2).sum(axis=1) + (np.outer(gm, gm)[np.triu_indices(len(gm), 1)] / distance).sum()
+    momentum = [gm @ (abs(q[:, i] * v[:, j]) + abs(q[:, j] * v[:, i])) for i, j in ((1, 2), (2, 0), (0, 1))]
+    return np.array([energy, *momentum])
+
+
+@pytest.mark.needs_jit
+@metrics
+def test_solar_system_in_si_units(metric):
+    problem = solar_system(units="SI", years=2.0)
+    run = integrate(problem, method=EIPRK4, metric=metric, compiled=True)
+    assert run.status == 0
+    assert np.isfinite(run.y).all()
+    assert (run.max_defect <= 30 * EPS * sizes_of_h_and_l(problem)).all()
+    assert run.diagnostics.n_rank_reduced == 0
+
+
+AMPLITUDES = [1e-160, 1e-155, 1e-100, 1e-20, 1.0, 1e20, 1e100, 1e150]
+D = np.array([1 / 3, 1 / 2, 1.0])
+
+
+@both
+@metrics
+@pytest.mark.parametrize("atol", [0.0, 1e-6])
+@pytest.mark.parametrize("amplitude", AMPLITUDES)
+def test_amplitudes_of_an_oscillator(driver, metric, atol, amplitude):
+    """A quadratic energy, which is subnormal (5e-324 apart) at the smallest amplitude, and a norm, which is not."""
+    energy = Invariant(lambda t, y: 0.5 * (y @ y), lambda t, y: 1.0 * y, name="H")
+    length = Invariant(lambda t, y: math.hypot(*y), lambda t, y: y / math.hypot(*y), name="N")
+    for invariant in (energy, length):
+        options = {"invariants": invariant, "metric": metric, "atol": atol, "h": 0.1}
+        run = driver(oscillator, (0, 5), [amplitude, 0.3 * amplitude], **options)
+        start = invariant.fun(0.0, run.y[:, 0])
+        assert run.status == 0
+        assert np.isfinite(run.y).all()
+        assert run.max_defect[0] <= 8 * EPS * start + 2 * 5e-324
+        plain = driver(oscillator, (0, 5), [amplitude, 0.3 * amplitude], h=0.1)
+        # A subnormal energy resolves 5e-324 / H of the amplitude; the correction may move by that much.
+        assert np.abs(run.y - plain.y).max() <= (1e-5 + 5e-324 / start) * amplitude
+        assert run.diagnostics.n_rejected_projections == 0
+
+
+@both
+@metrics
+@pytest.mark.parametrize("blocks", [None, 3])
+@pytest.mark.parametrize("amplitude", AMPLITUDES)
+def test_amplitudes_of_a_nonlinear_problem(driver, metric, blocks, amplitude):
+    """Euler's top is homogeneous: times an amplitude, it runs that many times faster along the same curve."""
+    invariants = [
+        Invariant(lambda t, y: 0.5 * (y @ (D * y)), lambda t, y: D * y, name="T"),
+        Invariant(lambda t, y: 0.5 * (y @ y), lambda t, y: 1.0 * y, name="M"),
+    ]
+    options = {"invariants": invariants, "metric": metric, "blocks": blocks, "atol": 0.0}
+    direction = np.array([1.0, 0.1, 0.4])
+
+    def top(t, y):
+        return np.cross(y, D * y)
+
+    run = driver(top, (0, 5 / amplitude), amplitude * direction, h=0.1 / amplitude, **options)
+    one = driver(top, (0, 5), direction, h=0.1, **options)
+    start = 0.5 * amplitude**2 * np.array([direction @ (D * direction), direction @ direction])
+    assert run.status == 0
+    assert np.isfinite(run.y).all()
+    assert (run.max_defect <= 8 * EPS * start + 2 * 5e-324).all()
+    if amplitude >= 1e-150:
+        np.testing.assert_allclose(run.y / amplitude, one.y, rtol=0, atol=1e-12)
+
+
+# The dead band.
+
+
+@both
+@metrics
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_a_step_on_the_manifold_is_returned_bitwise(driver, metric, iterations):
+    """RK keeps linear invariants: with one, the projected run is the plain one, bit for bit, and says it skipped."""
+    total = Invariant(lambda t, y: y.sum(), lambda t, y: np.ones(3), name="total")
+
+    def exchange(t, y):
+        flow = np.array([y[0] * y[1], y[1] * y[2]])
+        return np.array([-flow[0], flow[0] - flow[1], flow[1]])
+
+    options = {"h": 0.1, "metric": metric, "iterations": iterations}
+    run = driver(exchange, (0, 10), [0.7, 0.2, 0.1], invariants=total, **options)
+    plain = driver(exchange, (0, 10), [0.7, 0.2, 0.1], h=0.1)
+    np.testing.assert_array_equal(run.y, plain.y)
+    assert run.diagnostics.n_skipped == 100
+    assert run.diagnostics.n_projections == 0
+    assert run.nlu == 0
+
+
+@pytest.mark.parametrize("defect", [3, 5])
+def test_width_of_the_dead_band(defect):
+    """Four rounding errors of the largest of |I|, |target|, sum |G_k y_k| and the given scale."""
+    outside = defect > 4
+    # |target| = sum |G_k y_k| = 1; a scale of 2^20 widens the band by as much.
+    for scale in (1.0, 2.0**20):
+        first = Invariant(lambda t, y: y[0], lambda t, y: np.array([1.0, 0.0]), target=1.0, scale=scale)
+        result = project([1.0 + defect * EPS * scale, 0.0], first)
+        assert result.rank == int(outside)
+        assert (result.correction[0] != 0) == outside
+
+
+def test_dead_band_sees_cancelling_terms():
+    """I = y0 - y1 with terms of 1e8 that cancel: a defect of 1e-8 is round-off of the terms."""
+    gap = Invariant(lambda t, y: y[0] - y[1], lambda t, y: np.array([1.0, -1.0]), target=0.0)
+    y = np.array([1e8, 1e8 - 2.0**-26])
+    result = project(y, gap)
+    np.testing.assert_array_equal(result.y, y)
+    assert result.rank == 0
+    assert result.defect[0] == 2.0**-26
+    assert project([1e8, 1e8 - 2.0**-20], gap).rank == 1
+
+
+def test_row_inside_the_band_stays():
+    """With one defect outside its band, the correction leaves the invariant that is inside alone."""
+    sphere = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=1.01, name="sphere")
+    plane = Invariant(lambda t, y: y.sum(), lambda t, y: np.ones(3), target=1.0, name="plane")
+    y = np.array([1.0, 0.0, 0.0])
+    result = project(y, [sphere, plane])
+    assert result.rank == 2
+    assert abs(result.y.sum() - 1.0) <= 2 * EPS
+    alone = project(y, sphere)
+    assert abs(alone.y.sum() - 1.0) > 1e-3
+
+
+# Duplicate and contradicting invariants.
+
+
+@both
+@metrics
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_duplicate_invariants(driver, metric, iterations):
+    twice = Invariant(lambda t, y: 3 * (y @ y), lambda t, y: 6 * y, name="thrice")
+    options = {"h": 0.1, "metric": metric, "iterations": iterations}
+    run = driver(oscillator, (0, 10), [1.0, 2.0], invariants=[SQUARE, twice, SQUARE], **options)
+    alone = driver(oscillator, (0, 10), [1.0, 2.0], invariants=SQUARE, **options)
+    assert run.status == 0
+    assert run.diagnostics.n_rank_reduced == run.diagnostics.n_projections > 90
+    assert (run.max_defect <= 8 * EPS * np.array([5.0, 15.0, 5.0])).all()
+    np.testing.assert_allclose(run.y, alone.y, rtol=0, atol=1e-13)
+
+
+def test_project_duplicates():
+    result = project([0.6, 0.81], [SQUARE, SQUARE], target=[1.0, 1.0])
+    assert result.rank == 1
+    np.testing.assert_allclose(result.y, project([0.6, 0.81], SQUARE, target=1.0).y, rtol=EPS)
+
+
+A1000 = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=1000.0, name="a")
+B20 = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=20.0, name="b")
+
+
+@both
+@pytest.mark.parametrize(("invariants", "first", "residual"), [([A1000, B20], "a", -995), ([B20, A1000], "b", -15)])
+def test_contradicting_targets(driver, invariants, first, residual):
+    with pytest.raises(ValueError, match=rf"violates invariant '{first}' by {residual}.*project_initial=True"):
+        driver(oscillator, (0, 1), [1.0, 2.0], h=0.1, invariants=invariants)
+    with pytest.raises(ValueError, match=r"projection failed at t=0: invariant '[ab]', residual .*, rank 1 of 2"):
+        driver(oscillator, (0, 1), [1.0, 2.0], h=0.1, invariants=invariants, project_initial=True)
+
+
+def test_unreachable_target():
+    below = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=-1.0, name="below")
+    with pytest.raises(ValueError, match=r"projection failed at t=0: invariant 'below', residual .*, rank 1 of 1"):
+        integrate(oscillator, (0, 1), [1.0, 2.0], method=EIPRK4, h=0.1, invariants=below, project_initial=True)
+
+
+@both
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_contradiction_on_the_way(driver, iterations):
+    """Parallel gradients, values that part at t = 0.45: one projection before it, one failure after it."""
+    drifting = Invariant(lambda t, y: y @ y + 1e-3 * max(t - 0.45, 0), lambda t, y: 2 * y, name="drifting")
+    options = {"invariants": [SQUARE, drifting], "iterations": iterations, "check": False, "h": 0.1}
+    run = driver(oscillator, (0, 1), [1.0, 2.0], **options)
+    assert run.status == -1
+    assert not run.success
+    assert run.message.startswith("projection failed at t=0.5: invariant 'drifting', residual 5e-05, rank 1 of 2")
+    np.testing.assert_allclose(run.t, np.arange(5) * 0.1, atol=1e-15)
+    assert run.y.shape == (2, 5)
+    np.testing.assert_allclose((run.y**2).sum(axis=0), 5.0, rtol=4 * EPS)
+    assert run.diagnostics.n_rejected_projections == 1
+
+
+# Failing projections and right-hand sides: status -1, the message of the contract, everything kept.
+
+
+def lotka_volterra(t, u):
+    return np.array([u[0] * (1 - u[1]), u[1] * (u[0] - 1)])
+
+
+def volterra_value(t, u):
+    return u[0] - math.log(u[0]) + u[1] - math.log(u[1]) if (u > 0).all() else math.nan
+
+
+VOLTERRA = Invariant(volterra_value, lambda t, u: 1 - 1 / u, name="V")
+
+
+@both
+def test_invariant_not_finite_after_a_step(driver):
+    """A step of 2 takes Lotka-Volterra to u < 0, where log u is NaN."""
+    run = driver(lotka_volterra, (0, 30), [4.0, 2.0], h=2.0, invariants=VOLTERRA)
+    assert run.status == -1
+    assert run.message.startswith("projection failed at t=2: invariant 'V', residual nan, rank 1 of 1")
+    np.testing.assert_array_equal(run.t, [0.0])
+    np.testing.assert_array_equal(run.y, [[4.0], [2.0]])
+
+
+def test_invariant_not_finite_later():
+    run = integrate(lotka_volterra, (0, 30), [4.0, 2.0], method=EIPRK1, h=0.5, invariants=VOLTERRA, save_every=1)
+    assert run.message.startswith("projection failed at t=1: invariant 'V', residual nan, rank 1 of 1")
+    np.testing.assert_array_equal(run.t, [0.0, 0.5])
+    assert np.isfinite(run.y).all()
+    assert np.isfinite(run.invariants).all()
+
+
+@both
+def test_correction_in_the_wrong_direction(driver):
+    """A gradient of the wrong sign doubles the defect: that is a failure, not a result."""
+    wrong = Invariant(lambda t, y: y @ y, lambda t, y: -2 * y, name="wrong")
+    run = driver(oscillator, (0, 1), [1.0, 2.0], h=0.1, invariants=wrong, check=False)
+    assert run.status == -1
+    assert run.message.startswith("projection failed at t=0.1: invariant 'wrong', residual ")
+    assert run.t.tolist() == [0.0]
+
+
+@both
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_gradient_not_finite_on_the_way(driver, bad):
+    """It must not switch the projection off without a word."""
+    broken = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y if t < 0.45 else bad * y, name="broken")
+    run = driver(oscillator, (0, 1), [1.0, 2.0], h=0.1, invariants=broken, check=False)
+    assert run.status == -1
+    assert "broken" in run.message
+    assert "t=0.5" in run.message
+    assert len(run.t) == 5
+
+
+def not_finite_at_call(number, component):
+    """The oscillator, one component NaN at one call (from 1)."""
+    calls = 0
+
+    def fun(t, y):
+        nonlocal calls
+        calls += 1
+        f = oscillator(t, y)
+        if calls == number:
+            f[component] = np.nan
+        return f
+
+    return fun
+
+
+@both
+@pytest.mark.parametrize("component", [0, 1, slice(None)], ids=["first", "second", "both"])
+@pytest.mark.parametrize("call", range(3, 12))
+def test_rhs_not_finite_at_any_stage(driver, call, component):
+    """Whichever evaluation it is, the one at the new point (for the error estimate) included."""
+    run = driver(not_finite_at_call(call, component), (0, 1), [1.0, 2.0], h=0.1, invariants=SQUARE)
+    assert run.status == -1
+    assert run.message.startswith("fun returned a non-finite value at t=0.")
+    assert np.isfinite(run.y).all()
+    assert len(run.t) in (1, 2, 3)
+    np.testing.assert_allclose(run.t, np.arange(len(run.t)) * 0.1, atol=1e-16)
+
+
+@both
+def test_rhs_not_finite_at_the_start(driver):
+    for invariant in (SQUARE, Invariant(lambda t, y: y @ y, name="without grad")):
+        run = driver(lambda t, y: y * np.nan, (0, 1), [1.0, 2.0], h=0.1, invariants=invariant)
+        assert run.status == -1
+        assert run.message.startswith("fun returned a non-finite value at t=0")
+        assert run.t.tolist() == [0.0]
+
+
+@both
+def test_rhs_not_finite_after_some_time(driver):
+    def fun(t, y):
+        return oscillator(t, y) if t < 0.5 else np.full(2, np.nan)
+
+    run = driver(fun, (0, 1), [1.0, 2.0], h=0.01, invariants=SQUARE)
+    assert run.status == -1
+    assert run.message.startswith("fun returned a non-finite value at t=0.5")
+    assert len(run.t) == 50
+    assert run.t[-1] == 0.49
+
+
+@pytest.mark.needs_jit
+def test_failures_of_compiled_runs_are_the_same():
+    from numba import njit
+
+    lv = njit(lambda t, u: np.array([u[0] * (1 - u[1]), u[1] * (u[0] - 1)]))
+    value = njit(lambda t, u: u[0] - np.log(u[0]) + u[1] - np.log(u[1]))
+    grad = njit(lambda t, u: 1 - 1 / u)
+    late_nan = njit(lambda t, u: np.array([u[1], -u[0]]) * (1.0 if t < 0.5 else np.nan))
+    cases = [
+        (lv, (0, 30), [4.0, 2.0], 2.0, Invariant(value, grad, name="V")),
+        (lv, (0, 30), [4.0, 2.0], 1.0, Invariant(value, grad, name="V")),
+        (late_nan, (0, 1), [1.0, 2.0], 0.01, ()),
+    ]
+    for fun, span, y0, h, invariants in cases:
+        one, other = (
+            integrate(fun, span, y0, method=EIPRK4, h=h, invariants=invariants, save_every=1, compiled=compiled)
+            for compiled in (True, False)
+        )
+        assert one.compiled
+        assert one.status == other.status == -1
+        assert other.message.startswith(one.message)
+        np.testing.assert_array_equal(one.t, other.t)
+        np.testing.assert_array_equal(one.y, other.y)
+
+
+@both
+def test_blow_up_ends_with_a_finite_state(driver):
+    """y' = y^2 reaches infinity at t = 1; a fixed step finds out somewhat later."""
+    with np.errstate(all="ignore"):
+        run = driver(lambda t, y: y * y, (0, 2), [1.0], h=0.01)
+    assert run.status == -1
+    assert np.isfinite(run.y).all()
+    assert 1.0 < run.t[-1] < 1.1
+    assert "non-finite" in run.message or "finite" in run.message
+
+
+@both
+def test_overflow_in_one_step(driver):
+    with np.errstate(all="ignore"):
+        run = driver(lambda t, y: 1e200 * y, (0, 2), [1.0], h=0.01)
+    assert run.status == -1
+    assert run.t.tolist() == [0.0]
+    assert run.message.startswith("fun returned a non-finite value at t=0.00")
+
+
+def test_overflow_of_the_sum_alone():
+    """Every stage finite, the new state not: the message blames the step."""
+    with np.errstate(all="ignore"):
+        run = integrate(lambda t, y: np.full(1, 1e308), (0, 100), [1e308], method=EIPRK3, h=1.0)
+    assert run.status == -1
+    assert run.message.startswith("the state is no longer finite at t=1")
+    assert run.t.tolist() == [0.0]
+
+
+@pytest.mark.needs_jit
+@both
+def test_no_flood_of_warnings(driver):
+    """Without an errstate of the user's, numpy warns from the user's own line; the package adds none."""
+    with pytest.warns(RuntimeWarning) as record:
+        driver(lambda t, y: 1e200 * y, (0, 2), [1.0], h=0.01)
+    assert len(record) <= 4
+    assert all(w.filename == __file__ for w in record)

@@ -1,0 +1,562 @@
+"""Properties of the projection on random data: invariances, least norms, and the metric against its formula."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, Invariant, integrate, project
+from eip_scipy.problems import harmonic, kepler, nbody
+
+EPS = np.finfo(float).eps
+seeds = st.integers(0, 2**32 - 1)
+few = settings(max_examples=60)
+
+
+class Quadratics:
+    """l random invariants y'My/2 + c'y in n dimensions, their values at a random y, and a point off the manifold."""
+
+    def __init__(self, seed, n, rows, offset=1e-3):
+        self.rng = np.random.default_rng(seed)
+        M = self.rng.standard_normal((rows, n, n))
+        self.M, self.c = M + M.transpose(0, 2, 1), self.rng.standard_normal((rows, n))
+        self.y = self.rng.standard_normal(n)
+        self.target = self.value(0.0, self.y)
+        self.y_hat = self.y + offset * self.rng.standard_normal(n)
+
+    def value(self, t, y):
+        # einsum with a fixed order of sums: the same bits whatever the memory layout.
+        return np.array([0.5 * sum((M @ y) * y) + sum(c * y) for M, c in zip(self.M, self.c, strict=True)])
+
+    def grad(self, t, y):
+        return np.array([M @ y + c for M, c in zip(self.M, self.c, strict=True)])
+
+    def invariant(self, factors=1.0):
+        factors = np.broadcast_to(factors, len(self.c))
+        return Invariant(
+            lambda t, y: factors * self.value(t, y),
+            lambda t, y: factors[:, None] * self.grad(t, y),
+            target=factors * self.target,
+        )
+
+    def well_conditioned(self, sigma=1.0):
+        rows = self.grad(0.0, self.y_hat) * sigma
+        return np.linalg.svd(rows / np.linalg.norm(rows, axis=1, keepdims=True))[1][-1] > 0.05
+
+
+sizes = st.tuples(st.integers(2, 9), st.integers(1, 3)).filter(lambda s: s[1] < s[0])
+
+
+@given(seeds, sizes)
+@few
+def test_a_state_on_the_manifold_stays_bitwise(seed, size):
+    q = Quadratics(seed, *size)
+    result = project(q.y, q.invariant(), sigma=q.rng.uniform(0.1, 1, size[0]), iterations=3)
+    np.testing.assert_array_equal(result.y, q.y)
+    np.testing.assert_array_equal(result.correction, 0.0)
+    assert result.rank == 0
+
+
+@given(seeds, sizes, st.integers(1, 3), st.data())
+@few
+def test_powers_of_two_in_the_invariants_change_no_bit(seed, size, iterations, data):
+    q = Quadratics(seed, *size)
+    exponents = data.draw(st.lists(st.integers(-150, 150), min_size=size[1], max_size=size[1]))
+    plain = project(q.y_hat, q.invariant(), iterations=iterations)
+    scaled = project(q.y_hat, q.invariant(2.0 ** np.array(exponents)), iterations=iterations)
+    np.testing.assert_array_equal(scaled.y, plain.y)
+    np.testing.assert_array_equal(scaled.defect, plain.defect * 2.0 ** np.array(exponents))
+    assert scaled.rank == plain.rank
+
+
+@given(seeds, sizes, st.integers(1, 2))
+@few
+def test_any_factors_of_the_invariants(seed, size, iterations):
+    """Over 24 decades; only round-off may depend on them."""
+    q = Quadratics(seed, *size)
+    assume(q.well_conditioned())
+    factors = 10.0 ** q.rng.uniform(-12, 12, size[1]) * q.rng.choice([-1, 1], size[1])
+    plain, scaled = (project(q.y_hat, q.invariant(f), iterations=iterations).y for f in (1.0, factors))
+    np.testing.assert_allclose(scaled, plain, rtol=0, atol=1e-13)
+
+
+@given(seeds, sizes, st.integers(1, 2))
+@few
+def test_order_of_invariants_and_components(seed, size, iterations):
+    q = Quadratics(seed, *size)
+    n, rows = size
+    sigma = 10.0 ** q.rng.uniform(-2, 0, n)
+    assume(q.well_conditioned(sigma))
+    p, r = q.rng.permutation(n), q.rng.permutation(rows)
+    back = np.argsort(p)
+    plain = project(q.y_hat, q.invariant(), sigma=sigma, iterations=iterations).y
+    shuffled = Invariant(
+        lambda t, z: q.value(t, z[back])[r], lambda t, z: q.grad(t, z[back])[r][:, p], target=q.target[r]
+    )
+    permuted = project(q.y_hat[p], shuffled, sigma=sigma[p], iterations=iterations).y
+    np.testing.assert_allclose(permuted[back], plain, rtol=0, atol=1e-11)
+
+
+@given(seeds, sizes, st.integers(1, 2))
+@few
+def test_units_of_the_components(seed, size, iterations):
+    """Weights in each component's own unit: the same correction, in that unit, over 24 decades."""
+    q = Quadratics(seed, *size)
+    n = size[0]
+    unit, sigma = 10.0 ** q.rng.uniform(-12, 12, n), 10.0 ** q.rng.uniform(-2, 0, n)
+    assume(q.well_conditioned(sigma))
+    plain = project(q.y_hat, q.invariant(), sigma=sigma, iterations=iterations).y
+    scaled = Invariant(
+        lambda t, z: q.value(t, z / unit), lambda t, z: q.grad(t, z / unit) / unit, target=q.target
+    )
+    z = project(q.y_hat * unit, scaled, sigma=sigma * unit, iterations=iterations).y
+    np.testing.assert_allclose(z / unit, plain, rtol=0, atol=1e-11)
+
+
+def random_frame(rng, n, k):
+    C, S = rng.standard_normal((k, n)), rng.standard_normal((n, k))
+    return C, S, np.eye(n) - S @ np.linalg.solve(C @ S, C)
+
+
+@given(seeds, st.integers(2, 9), st.integers(1, 3), st.integers(0, 2))
+@few
+def test_least_norm_in_the_metric_and_neutral_to_the_frame(seed, n, rows, k):
+    """Against numpy's pseudo-inverse: move = P sigma x, x of least norm with (G P sigma) x = -g."""
+    assume(rows + k < n)
+    rng = np.random.default_rng(seed)
+    G, y_hat, sigma = rng.standard_normal((rows, n)), rng.standard_normal(n), 10.0 ** rng.uniform(-3, 0, n)
+    target = G @ y_hat + rng.standard_normal(rows)
+    C, S, P = random_frame(rng, n, k)
+    A = (G @ P) * sigma
+    assume(np.linalg.cond(C @ S) < 100 if k else True)
+    assume(np.linalg.cond(A / np.linalg.norm(A, axis=1, keepdims=True)) < 1e3)
+    x = np.linalg.pinv(A) @ (target - G @ y_hat)
+    linear = Invariant(lambda t, y: G @ y, lambda t, y: G, target=target)
+    result = project(y_hat, linear, sigma=sigma, frame=(C, S) if k else None)
+    move = P @ (sigma / sigma.max() * x * sigma.max())
+    np.testing.assert_allclose(result.correction, move, rtol=0, atol=1e-10 * np.abs(move).max())
+    assert result.rank == rows
+    if k:
+        drift = np.abs(C @ result.correction)
+        assert (drift <= 50 * EPS * (np.abs(C) @ (np.abs(result.y) + np.abs(y_hat)))).all()
+        unweighted = project(y_hat, linear, sigma=sigma).correction
+        assert np.abs(C @ unweighted).max() > 1e-6 * np.abs(unweighted).max()
+
+
+@given(seeds, st.integers(2, 8), st.integers(1, 3))
+@few
+def test_least_norm_by_the_kkt_system(seed, n, rows):
+    """Minimise |d / sigma|^2 / 2 with G d = -g, multipliers and all."""
+    assume(rows < n)
+    rng = np.random.default_rng(seed)
+    G, y_hat, sigma = rng.standard_normal((rows, n)), rng.standard_normal(n), rng.uniform(0.2, 1, n)
+    assume(np.linalg.cond(G) < 100)
+    target = G @ y_hat + rng.standard_normal(rows)
+    K = np.block([[np.diag(sigma**-2), G.T], [G, np.zeros((rows, rows))]])
+    d = np.linalg.solve(K, np.concatenate([np.zeros(n), target - G @ y_hat]))[:n]
+    result = project(y_hat, Invariant(lambda t, y: G @ y, lambda t, y: G, target=target), sigma=sigma)
+    np.testing.assert_allclose(result.correction, d, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(result.defect, 0.0, atol=1e-13)
+
+
+@given(seeds, st.integers(2, 6), st.integers(1, 3))
+@few
+def test_dependent_rows_give_the_pseudo_inverse_s_answer(seed, n, rows):
+    """A consistent system of deficient rank: exact multiples and sums of rows."""
+    assume(rows < n)
+    rng = np.random.default_rng(seed)
+    base = rng.standard_normal((rows, n))
+    assume(np.linalg.cond(base) < 30)
+    G = np.concatenate([base, rng.choice([-2.0, -1.0, 1.0, 3.0], (2, rows)) @ base])
+    y_hat, wanted = rng.standard_normal(n), rng.standard_normal(n)
+    result = project(y_hat, Invariant(lambda t, y: G @ y, lambda t, y: G, target=G @ wanted))
+    assert result.rank == rows
+    np.testing.assert_allclose(result.correction, np.linalg.pinv(G, rcond=1e-10) @ (G @ (wanted - y_hat)), atol=1e-11)
+
+
+@given(seeds, sizes)
+@few
+def test_euclidean_projection_is_the_paper_s_formula(seed, size):
+    """y + G^T lambda, lambda = -(G G^T)^-1 g."""
+    q = Quadratics(seed, *size)
+    assume(q.well_conditioned())
+    G, g = q.grad(0.0, q.y_hat), q.value(0.0, q.y_hat) - q.target
+    result = project(q.y_hat, q.invariant())
+    np.testing.assert_allclose(result.correction, -G.T @ np.linalg.solve(G @ G.T, g), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(result.defect, q.value(0.0, result.y) - q.target, rtol=0, atol=0)
+
+
+@given(seeds, sizes, st.sampled_from([1e-2, 1e-3, 1e-4]))
+@few
+def test_second_projection_moves_by_offset_times_the_first(seed, size, offset):
+    q = Quadratics(seed, *size, offset=offset)
+    assume(q.well_conditioned())
+    first = project(q.y_hat, q.invariant())
+    second = project(first.y, q.invariant())
+    assert np.linalg.norm(second.correction) <= 200 * offset * np.linalg.norm(first.correction)
+    assert np.linalg.norm(first.correction) < 100 * offset
+
+
+@given(seeds, sizes, st.integers(2, 4))
+@few
+def test_more_iterations_are_newton_s(seed, size, iterations):
+    """On the fixed directions G(y_hat)' mu: the defects of Newton's method written with numpy's solver."""
+    q = Quadratics(seed, *size, offset=1e-2)
+    assume(q.well_conditioned())
+    directions = q.grad(0.0, q.y_hat).T
+    y = q.y_hat
+    for _ in range(iterations):
+        y = y - directions @ np.linalg.solve(q.grad(0.0, y) @ directions, q.value(0.0, y) - q.target)
+    result = project(q.y_hat, q.invariant(), iterations=iterations)
+    # Convergence squares the distance, so that a simplified Newton would be far off.
+    np.testing.assert_allclose(result.y, y, rtol=0, atol=1e-13)
+
+
+# Complex states.
+
+
+class ComplexQuadratic:
+    """Hermitian forms y^H M y: the mass |y|^2, and a random one."""
+
+    def __init__(self, seed, n):
+        self.rng = np.random.default_rng(seed)
+        M = self.rng.standard_normal((n, n)) + 1j * self.rng.standard_normal((n, n))
+        self.M = np.array([np.eye(n), 0.5 * (M + M.conj().T)])
+        self.y = self.rng.standard_normal(n) + 1j * self.rng.standard_normal(n)
+        self.target = self.value(0.0, self.y)
+        self.y_hat = self.y + 1e-3 * (self.rng.standard_normal(n) + 1j * self.rng.standard_normal(n))
+
+    def value(self, t, y):
+        return np.array([sum((np.conj(y) * (M @ y)).real) for M in self.M])
+
+    def grad(self, t, y):
+        return np.array([2 * (M @ y) for M in self.M])
+
+
+@given(seeds, st.integers(2, 6), st.integers(1, 3))
+@few
+def test_complex_projection_is_that_of_its_parts_bitwise(seed, n, iterations):
+    q = ComplexQuadratic(seed, n)
+    result = project(q.y_hat, Invariant(q.value, q.grad, target=q.target), iterations=iterations)
+    in_parts = Invariant(
+        lambda t, z: q.value(t, z.view(complex)),
+        lambda t, z: np.ascontiguousarray(q.grad(t, z.view(complex))).view(float),
+        target=q.target,
+    )
+    parts = project(q.y_hat.view(float), in_parts, iterations=iterations)
+    np.testing.assert_array_equal(result.y.view(float), parts.y)
+    assert result.y.dtype == complex
+    assert result.rank == parts.rank == 2
+
+
+@given(seeds, st.integers(2, 6))
+@few
+def test_complex_frame(seed, n):
+    q = ComplexQuadratic(seed, n)
+    C, S = (q.rng.standard_normal(s) + 1j * q.rng.standard_normal(s) for s in ((1, n), (n, 1)))
+    assume(abs((C @ S)[0, 0]) > 0.3)
+    result = project(q.y_hat, Invariant(q.value, q.grad, target=q.target), frame=(C, S))
+    assert abs(C @ result.correction) < 1e-13
+    assert abs(C @ project(q.y_hat, Invariant(q.value, q.grad, target=q.target)).correction) > 1e-9
+
+
+def lattice_run(y0, phase=1.0, **options):
+    """A nonlinear Schroedinger lattice of 6 sites: mass and energy."""
+
+    def hop(y):
+        return np.roll(y, 1) + np.roll(y, -1)
+
+    def fun(t, y):
+        return 1j * (hop(y) + np.abs(y) ** 2 * y)
+
+    mass = Invariant(lambda t, y: np.sum(np.abs(y) ** 2), lambda t, y: 2 * y, name="mass")
+    energy = Invariant(
+        lambda t, y: -np.sum((np.conj(y) * hop(y)).real) - 0.5 * np.sum(np.abs(y) ** 4),
+        lambda t, y: -2 * (hop(y) + np.abs(y) ** 2 * y),
+        name="energy",
+    )
+    options |= {"method": EIPRK4, "h": 0.05, "invariants": [mass, energy], "save_every": 1, "check": False}
+    return integrate(fun, (0, 1), phase * y0, **options)
+
+
+@given(seeds, st.sampled_from([None, 2, 3]), st.sampled_from(["error", "euclidean"]))
+@settings(max_examples=15)
+def test_phase_of_a_complex_state(seed, blocks, metric):
+    rng = np.random.default_rng(seed)
+    y0 = rng.standard_normal(6) + 1j * rng.standard_normal(6)
+    phase = np.exp(1j * rng.uniform(0, 2 * np.pi))
+    plain = lattice_run(y0, blocks=blocks, metric=metric)
+    turned = lattice_run(y0, phase, blocks=blocks, metric=metric)
+    assert plain.status == 0
+    np.testing.assert_allclose(turned.y, phase * plain.y, rtol=0, atol=1e-11 * np.abs(y0).max())
+    assert np.abs(plain.y[:, -1] - y0).max() > 0.1
+
+
+# The step: units, rotations, frames.
+
+
+def three_bodies(seed):
+    """Three bodies of different masses on wide orbits about the first."""
+    rng = np.random.default_rng(seed)
+    gm = np.array([1.0, 1e-3, 1e-4]) * rng.uniform(0.5, 2, 3)
+    q, v = np.zeros((3, 3)), np.zeros((3, 3))
+    for body, distance in ((1, 1.0), (2, 3.0)):
+        turn = Rotation.random(random_state=rng).as_matrix()
+        q[body] = distance * turn[0]
+        v[body] = math.sqrt(gm[0] / distance) * rng.uniform(0.8, 1.1) * turn[1]
+    v -= gm @ v / gm.sum()
+    return gm, q, v
+
+
+def n_body_run(gm, q, v, steps=5, h=0.2, **options):
+    problem = nbody(gm, q, v, t_span=(0.0, steps * h), h=h)
+    return integrate(problem, method=EIPRK4, **{"compiled": False, **options})
+
+
+@given(seeds, st.sampled_from(["error", "euclidean"]), st.booleans())
+@settings(max_examples=25)
+def test_rotation_of_n_bodies(seed, metric, framed):
+    gm, q, v = three_bodies(seed)
+    turn = Rotation.random(random_state=np.random.default_rng(seed + 1)).as_matrix()
+    options = {"metric": metric, "atol": 0.0} | ({} if framed else {"frame": None})
+    run = n_body_run(gm, q, v, **options)
+    turned = n_body_run(gm, q @ turn.T, v @ turn.T, **options)
+    assert run.status == turned.status == 0
+    rotated = run.y[:, -1].reshape(-1, 3) @ turn.T
+    np.testing.assert_allclose(turned.y[:, -1].reshape(-1, 3), rotated, rtol=0, atol=1e-11)
+
+
+def test_rotation_needs_blocks():
+    """With each component weighed by itself the result depends on the axes: the test above can fail."""
+    gm, q, v = three_bodies(3)
+    turn = Rotation.random(random_state=np.random.default_rng(4)).as_matrix()
+    run, turned = n_body_run(gm, q, v, blocks=None), n_body_run(gm, q @ turn.T, v @ turn.T, blocks=None)
+    rotated = run.y[:, -1].reshape(-1, 3) @ turn.T
+    assert np.abs(turned.y[:, -1].reshape(-1, 3) - rotated).max() > 1e-7
+
+
+def kepler_in_units(unit, metric="error", atol=0.0, blocks=None, steps=40):
+    """Eccentric Kepler, each component in a unit of its own."""
+    problem = kepler(0.6, 0.005)
+
+    def inner(item, t, z):
+        y = z / unit
+        f = problem.fun(t, y)
+        out = np.empty(4)
+        item.grad(t, y, *([f] if item.uses_f else []), out, *item.args)
+        return out / unit
+
+    invariants = [
+        Invariant(lambda t, z, item=item: item.fun(t, z / unit, *item.args), lambda t, z, item=item: inner(item, t, z))
+        for item in problem.invariants
+    ]
+    options = {"metric": metric, "atol": atol, "blocks": blocks, "invariants": invariants, "method": EIPRK4, "h": 0.03}
+    return integrate(lambda t, z: problem.fun(t, z / unit) * unit, (0, 0.03 * steps), problem.y0 * unit, **options)
+
+
+@given(seeds, st.booleans())
+@settings(max_examples=20)
+def test_units_of_the_state_with_the_error_metric(seed, blocks):
+    """Steps with atol=0: any units of the components (of the blocks, where there are any), over 24 decades."""
+    rng = np.random.default_rng(seed)
+    unit = 10.0 ** (np.repeat(rng.uniform(-12, 12, 2), 2) if blocks else rng.uniform(-12, 12, 4))
+    options = {"blocks": 2} if blocks else {}
+    plain, scaled = kepler_in_units(np.ones(4), **options), kepler_in_units(unit, **options)
+    np.testing.assert_allclose(scaled.y[:, -1] / unit, plain.y[:, -1], rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("options", [{"metric": "euclidean"}, {"atol": 1e-6}])
+def test_units_matter_without_it(options):
+    """The euclidean metric, or an atol, ties the result to the units: the test above can fail."""
+    unit = np.array([1e6, 1e3, 1e-3, 1e-6])
+    plain, scaled = kepler_in_units(np.ones(4), **options), kepler_in_units(unit, **options)
+    assert np.abs(scaled.y[:, -1] / unit - plain.y[:, -1]).max() > 1e-9
+
+
+@pytest.mark.needs_jit
+def test_frame_keeps_momentum_and_centre_of_mass():
+    gm, q, v = three_bodies(7)
+    q -= gm @ q / gm.sum()
+
+    def drift(**options):
+        run = n_body_run(gm, q, v, steps=20_000, h=0.05, save_every=20, compiled=True, **options)
+        assert run.status == 0
+        y = run.y.reshape(2, 3, 3, -1)
+        return [np.abs(np.einsum("b,bxm->xm", gm, part)).max() / gm.sum() for part in y]
+
+    centre, momentum = drift()
+    assert momentum < 2e-14
+    assert centre < 2e-11
+    assert drift(frame=None)[1] > 10 * momentum
+
+
+# The error metric and the step, written out with numpy.
+
+
+def raw_step(tableau, fun, t, y, h):
+    s = tableau.n_stages
+    K = np.zeros((s + 1, y.size))
+    for i in range(s):
+        K[i] = fun(t + tableau.c[i] * h, y + h * tableau.A[i, :i] @ K[:i])
+    y_hat = y + h * tableau.b @ K[:s]
+    K[s] = fun(t + h, y_hat)
+    return y_hat, h * tableau.e @ K
+
+
+def weights(err, y, y_hat, rtol, atol, blocks, kappa):
+    """Design 2.1, to the letter; also the scales and relative errors of the blocks."""
+    scale_of = atol + rtol * np.maximum(np.abs(y), np.abs(y_hat))
+    scale = np.array([np.linalg.norm(scale_of[b]) for b in blocks])
+    r = np.array([np.linalg.norm(err[b]) for b in blocks]) / scale
+    sigma_b = scale * ((r / r.max()) ** kappa + 1e-7)
+    sigma = np.zeros(y.size)
+    for b, value in zip(blocks, sigma_b, strict=True):
+        sigma[b] = value
+    return sigma / sigma.max(), scale, r
+
+
+def spin(t, y):
+    return np.array([y[1], -y[0]])
+
+
+def swing(t, y):
+    """Henon and Heiles."""
+    return np.array([y[2], y[3], -y[0] - 2 * y[0] * y[1], -y[1] - y[0] ** 2 + y[1] ** 2])
+
+
+def swing_energy(t, y):
+    return 0.5 * (y @ y) + y[0] ** 2 * y[1] - y[1] ** 3 / 3
+
+
+def swing_gradient(t, y):
+    f = swing(t, y)
+    return np.array([-f[2], -f[3], y[2], y[3]])
+
+
+def orbit(t, y):
+    return np.array([y[2], y[3], *(-y[:2] / math.hypot(y[0], y[1]) ** 3)])
+
+
+ORBIT = [
+    Invariant(
+        lambda t, y: 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / math.hypot(y[0], y[1]),
+        lambda t, y: np.array([*(y[:2] / math.hypot(y[0], y[1]) ** 3), y[2], y[3]]),
+        name="H",
+    ),
+    Invariant(lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]), name="L"),
+]
+LAYOUTS = {
+    "components": (None, [[0], [1], [2], [3]]),
+    "pairs": (2, [[0, 1], [2, 3]]),
+    "lists": ([np.array([0, 3])], [[0, 3], [1], [2]]),
+    "one": (4, [[0, 1, 2, 3]]),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("method", [EIPRK2, EIPRK3, EIPRK4, EIPRK5])
+@pytest.mark.parametrize("every", [1, 2])
+def test_error_metric_is_its_formula(layout, method, every):
+    """One projection after `every` steps against the weights of the design and the pseudo-inverse."""
+    tableau, h = method.TABLEAU, 0.2
+    blocks, lists = LAYOUTS[layout]
+    y0 = np.array([0.6, 0.3, -0.4, 1.3])
+    rtol, atol = np.array([1e-3, 1e-2, 1e-4, 1e-3]), np.array([1e-4, 1e-6, 1e-3, 1e-5])
+    options = {"h": h, "blocks": blocks, "rtol": rtol, "atol": atol, "every": every, "invariants": ORBIT}
+    run = integrate(orbit, (0, every * h), y0, method=method, **options)
+    y, squares = y0, 0.0
+    for k in range(every):
+        before = y
+        y, err = raw_step(tableau, orbit, k * h, y, h)
+        squares = squares + err**2
+    sigma, scale, r = weights(np.sqrt(squares), before, y, rtol, atol, lists, tableau.kappa)
+    G = np.array([item.grad(0, y) for item in ORBIT])
+    g = np.array([item.fun(0, y) - item.fun(0, y0) for item in ORBIT])
+    move = -sigma * (np.linalg.pinv(G * sigma) @ g)
+    assert run.status == 0
+    np.testing.assert_allclose(run.y[:, -1] - y, move, rtol=0, atol=1e-9 * np.abs(move).max() + 4 * EPS)
+    largest = max(np.linalg.norm(move[b]) / s for b, s in zip(lists, scale, strict=True)) / r.max()
+    assert run.diagnostics.max_correction == pytest.approx(largest, rel=1e-6)
+    assert run.diagnostics.n_projections == 1
+
+
+def test_error_metric_without_any_error_is_euclidean():
+    """f = 0: err = 0 in each component."""
+    keep = Invariant(lambda t, y: y[0] + 3 * y[1] + t, lambda t, y: np.array([1.0, 3.0]))
+    run = integrate(lambda t, y: np.zeros(2), (0, 1), [0.0, 0.0], method=EIPRK4, h=1.0, invariants=keep, check=False)
+    np.testing.assert_allclose(run.y[:, -1], [-0.1, -0.3], rtol=4 * EPS)
+
+
+def test_components_without_error_hardly_move():
+    """A component that the estimate sees exactly moves by the floor only."""
+    keep = Invariant(lambda t, y: y[0] + y[1], lambda t, y: np.ones(2))
+    options = {"method": EIPRK4, "h": 0.5, "invariants": keep, "check": False}
+    run = integrate(lambda t, y: np.array([np.sin(5 * y[0]), 0.0]), (0, 0.5), [1.0, 1.0], **options)
+    assert run.max_defect[0] <= 4 * EPS
+    assert abs(run.y[1, -1] - 1.0) < 1e-12
+
+
+def test_given_weights():
+    keep = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y)
+    start, options = np.array([1.0, 2.0]), {"method": EIPRK4, "h": 0.5, "invariants": keep}
+    run = integrate(spin, (0, 0.5), start, metric=[3.0, 0.0], **options)
+    y_hat, _ = raw_step(EIPRK4.TABLEAU, spin, 0.0, start, 0.5)
+    assert run.y[1, -1] == pytest.approx(y_hat[1], rel=2 * EPS)
+    assert run.y[0, -1] - y_hat[0] == pytest.approx((5 - y_hat @ y_hat) / (2 * y_hat[0]), rel=1e-9)
+
+
+@pytest.mark.parametrize("direction", ["new", "old", "midpoint"])
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_directions_are_those_of_the_paper_s_remark(direction, iterations):
+    """y + D mu with D the gradient at the new, old or middle point and Newton's mu, gradients at the iterates."""
+    y0, h = np.array([0.1, -0.2, 0.35, 0.05]), 0.4
+    keep = Invariant(swing_energy, swing_gradient)
+    options = {"direction": direction, "iterations": iterations, "metric": "euclidean"}
+    run = integrate(swing, (0, h), y0, method=EIPRK4, h=h, invariants=keep, **options)
+    y_hat, _ = raw_step(EIPRK4.TABLEAU, swing, 0.0, y0, h)
+    D = swing_gradient(0, {"new": y_hat, "old": y0, "midpoint": 0.5 * (y0 + y_hat)}[direction])
+    y = y_hat
+    for _ in range(iterations):
+        y = y - D * (swing_energy(0, y) - swing_energy(0, y0)) / (swing_gradient(0, y) @ D)
+    np.testing.assert_allclose(run.y[:, -1], y, rtol=0, atol=2 * EPS)
+
+
+def test_harmonic_oscillator_multiplier_of_the_paper():
+    """One EIP step is y_hat + lambda omega y_hat with lambda = -(1 - |y0|^2 / |y_hat|^2) / (2 omega)."""
+    problem = harmonic(omega=10.0, h=0.1, t_end=0.1)
+    run = integrate(problem, method=EIPRK4, metric="euclidean")
+    z = 1.0
+    step = 1 - z**2 / 2 + z**4 / 24, z - z**3 / 6
+    y_hat = np.array([step[0], -step[1]])
+    factor = 1 - 0.5 * (1 - 1 / (y_hat @ y_hat))
+    np.testing.assert_allclose(run.y[:, -1], factor * y_hat, rtol=0, atol=2 * EPS)
+
+
+def kepler_errors(method, steps, **options):
+    """Error at the end, and largest defects of H and L, of the package's own problem over half an orbit."""
+    problem = kepler(0.3, 0.0)
+    run = integrate(problem, (0, 3.0), method=method, h=3.0 / steps, compiled=False, **options)
+    assert run.status == 0
+    return np.linalg.norm(run.y[:, -1] - problem.reference(3.0)), run.max_defect
+
+
+@pytest.mark.parametrize("options", [{}, {"blocks": 2}, {"metric": "euclidean"}], ids=["default", "blocks", "plain"])
+@pytest.mark.parametrize(
+    ("method", "steps"), [(EIPRK1, 1600), (EIPRK2, 300), (EIPRK3, 600), (EIPRK4, 300), (EIPRK5, 80)]
+)
+def test_order_is_kept(method, steps, options):
+    error, finer = (kepler_errors(method, n, **options)[0] for n in (steps, 2 * steps))
+    assert np.log2(error / finer) == pytest.approx(method.TABLEAU.order, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("method", "steps"), [(EIPRK1, 48), (EIPRK2, 24), (EIPRK3, 24), (EIPRK4, 24), (EIPRK5, 12)]
+)
+def test_defects_are_of_twice_the_order(method, steps):
+    """O(h^(2p + 2)), theorem 2.1 of the paper."""
+    coarse, fine = (kepler_errors(method, n, metric="euclidean")[1] for n in (steps, 2 * steps))
+    assert (np.log2(coarse / fine) > 2 * (method.TABLEAU.order + 1) - 0.5)[0]
+    assert (np.log2(coarse / fine) > 2 * (method.TABLEAU.order + 1) - 3)[1]
