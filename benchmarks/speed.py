@@ -162,7 +162,14 @@ def kepler_speed() -> dict[str, float]:
         in_place = least_run(fun=problem, t_span=span, method=EIPRK4, h=H, metric=metric) / STEPS
         array = (
             least_run(
-                fun=kepler_array, t_span=span, y0=y0, method=EIPRK4, h=H, metric=metric, invariants=arrays, compiled=True
+                fun=kepler_array,
+                t_span=span,
+                y0=y0,
+                method=EIPRK4,
+                h=H,
+                metric=metric,
+                invariants=arrays,
+                compiled=True,
             )
             / STEPS
         )
@@ -172,9 +179,7 @@ def kepler_speed() -> dict[str, float]:
         out[f"{metric}: in place [us/step]"] = 1e6 * in_place
     solution = solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9)
     scipy_step = least(lambda: solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9)) / (solution.t.size - 1)
-    fixed = least(
-        lambda: solve_ivp(kepler_array, (0, 60), y0, method=EIPRK4, h=H, invariants=arrays)
-    ) / round(60 / H)
+    fixed = least(lambda: solve_ivp(kepler_array, (0, 60), y0, method=EIPRK4, h=H, invariants=arrays)) / round(60 / H)
     out["solve_ivp RK45 [us/step]"] = 1e6 * scipy_step
     out["solve_ivp EIPRK4 with H and L [us/step]"] = 1e6 * fixed
     out["solve_ivp RK45 / compiled EIPRK4 (array-returning), per step"] = scipy_step / array
@@ -231,7 +236,8 @@ def process_times() -> dict[str, float]:
     return {
         "second process: import [s]": float(rest[0]),
         "second process: start to the end of its first compiled run [s]": float(rest[1]),
-        "import eip_scipy / import scipy.integrate and numba": imports["eip_scipy"] / imports["scipy.integrate and numba"],
+        "import eip_scipy / import scipy.integrate and numba": imports["eip_scipy"]
+        / imports["scipy.integrate and numba"],
     }
 
 

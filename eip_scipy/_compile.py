@@ -16,10 +16,10 @@ from numba.extending import is_jitted
 
 from .invariants import Invariant, InvariantSet
 
-__all__ = ["CompiledFunctions", "NotCompilable", "compile_functions", "signatures"]
+__all__ = ["CompiledFunctions", "NotCompilableError", "compile_functions", "signatures"]
 
 
-class NotCompilable(TypeError):
+class NotCompilableError(TypeError):
     """A run cannot be compiled; the message names the function and says why."""
 
 
@@ -57,11 +57,11 @@ def compile_functions(
 
     Raises
     ------
-    NotCompilable
+    NotCompilableError
         When one of them is no lazily jitted Numba function of the arguments that `integrate` documents.
     """
     if config.DISABLE_JIT:
-        raise NotCompilable("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
+        raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
     sigs = signatures(dtype)
     rhs = _compiled(_wrap_rhs(_jitted(fun, "fun"), in_place, has_params), sigs.rhs, "fun")
     inv, grad = _no_values, _no_gradients
@@ -78,15 +78,15 @@ def compile_functions(
 
 def _jitted(fun: Callable[..., Any], name: str) -> Callable[..., Any]:
     if not is_jitted(fun):
-        raise NotCompilable(f"{name} is not a Numba function; decorate it with @numba.njit")
+        raise NotCompilableError(f"{name} is not a Numba function; decorate it with @numba.njit")
     return fun
 
 
 def _invariant_functions(item: Invariant, label: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
     if item.args:
-        raise NotCompilable(f"invariant {label!r} has args; pass its parameters through params")
+        raise NotCompilableError(f"invariant {label!r} has args; pass its parameters through params")
     if item.grad is None:
-        raise NotCompilable(f"invariant {label!r} has no grad")
+        raise NotCompilableError(f"invariant {label!r} has no grad")
     return _jitted(item.fun, f"invariant {label!r}"), _jitted(item.grad, f"gradient of invariant {label!r}")
 
 
@@ -95,7 +95,7 @@ def _compiled(wrapper: Any, signature: Any, name: str) -> Any:
         wrapper.compile(signature.args)
     except NumbaError as error:
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        raise NotCompilable(f"{name} does not compile for this state: {first}") from error
+        raise NotCompilableError(f"{name} does not compile for this state: {first}") from error
     return wrapper
 
 

@@ -29,9 +29,9 @@ SPLITTER = 134217729.0  # 2**27 + 1 (Dekker)
 
 
 class Grouping(NamedTuple):
-    """Blocks as lists of floats' indices: ``index[start[b]:start[b + 1]]``; width 2 for a complex state."""
+    """Blocks as lists of floats' indices: ``member[start[b]:start[b + 1]]``; width 2 for a complex state."""
 
-    index: np.ndarray
+    member: np.ndarray
     start: np.ndarray
     width: int
 
@@ -86,15 +86,21 @@ def fill(a, value):
 
 
 @_jit
+def largest_abs(a):
+    top = 0.0
+    for i in range(a.size):
+        top = max(top, abs(a[i]))
+    return top
+
+
+@_jit
 def norm(a):
     square = dot(a, a)
     if 1e-200 < square < 1e200:
         return sqrt(square)
-    top = 0.0
-    for i in range(a.size):
-        top = max(top, abs(a[i]))
+    top = largest_abs(a)
     if top == 0.0 or not np.isfinite(top):
-        return top
+        return square - square + top
     total = 0.0
     for i in range(a.size):
         total += (a[i] / top) ** 2
@@ -112,7 +118,7 @@ def all_finite(a):
 
 @_jit_inline
 def combine(y, h, weights, K, stages, out):
-    """out = y + h sum_j weights[j] K[j] over the first `stages` rows, zero weights skipped."""
+    """Out = y + h sum_j weights[j] K[j] over the first `stages` rows, zero weights skipped."""
     n = y.size
     used = 0
     for j in range(stages):
@@ -135,7 +141,7 @@ def combine(y, h, weights, K, stages, out):
 
 @_jit_inline
 def weighted_sum(weights, K, scale, out):
-    """out = scale sum_j weights[j] K[j]."""
+    """Out = scale sum_j weights[j] K[j]."""
     n = out.size
     for i in range(n):
         out[i] = 0.0
@@ -198,7 +204,7 @@ def quadrature_add(err, total):
 
 @_jit
 def powers(x, exponent):
-    """x <- x**exponent, x in [0, 1]; for RK4 and DOP853 by square roots, several times faster than pow."""
+    """X <- x**exponent, x in [0, 1]; for RK4 and DOP853 by square roots, several times faster than pow."""
     if exponent == 1.25:
         for i in range(x.size):
             x[i] *= sqrt(sqrt(x[i]))
@@ -211,49 +217,50 @@ def powers(x, exponent):
 
 
 @_jit
-def component_scales(y, y_hat, rtol, atol, width, out):
-    """Out = atol + rtol max(|y|, |y_hat|), the same for both parts of a complex component; returns the largest."""
-    if width == 1:
-        for i in range(out.size):
-            out[i] = atol[i] + rtol[i] * max(abs(y[i]), abs(y_hat[i]))
-    else:
-        for i in range(atol.size):
-            size = max(np.hypot(y[2 * i], y[2 * i + 1]), np.hypot(y_hat[2 * i], y_hat[2 * i + 1]))
-            out[2 * i] = atol[i] + rtol[i] * size
-            out[2 * i + 1] = out[2 * i]
-    return largest(out)
-
-
-@_jit
 def block_square(a, b, unit, groups):
     """Squared norm of block b of a, in units of 1 / unit."""
     total = 0.0
     for p in range(groups.start[b], groups.start[b + 1]):
-        x = a[groups.index[p]] * unit
+        x = a[groups.member[p]] * unit
         total += x * x
     return total
 
 
+@_jit
+def block_sizes(y, y_hat, err, rtol, unit, groups, sizes, errors):
+    """Per block: sizes = max(|rtol y|, |rtol y_hat|), errors = |err|, squares taken in units of 1 / unit."""
+    for b in range(sizes.size):
+        old = new = 0.0
+        for p in range(groups.start[b], groups.start[b + 1]):
+            i = groups.member[p]
+            weight = rtol[i] * unit
+            x = weight * y[i]
+            old += x * x
+            x = weight * y_hat[i]
+            new += x * x
+        sizes[b] = max(old, new)
+        errors[b] = block_square(err, b, unit, groups)
+    for b in range(sizes.size):
+        sizes[b] = sqrt(sizes[b]) / unit
+        errors[b] = sqrt(errors[b]) / unit
+
+
 @_jit_inline
-def error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio, component):
+def error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio):
     """Weights sigma of the error metric and the blocks' scales; returns the largest relative error r.
 
-    r = 0 (no error at all) leaves the euclidean metric. `ratio` (blocks) and `component` (n) are scratch. Squares of
-    extreme scales are taken in units of the largest: a block 150 decades below it counts as one without weight.
+    `atol` is by block. r = 0 (no error at all) leaves the euclidean metric. `ratio` is scratch.
     """
-    top = component_scales(y, y_hat, rtol, atol, groups.width, component)
-    if top < TINY:
-        fill(sigma, 1.0)
-        fill(scale, 0.0)
-        return 0.0
-    unit = 1.0 if 1e-140 < top < 1e140 else 1.0 / top
-    for b in range(ratio.size):
-        scale[b] = block_square(component, b, unit, groups)
-        ratio[b] = block_square(err, b, unit, groups)
-    for b in range(ratio.size):
-        relative = sqrt(ratio[b] / max(scale[b], TINY))
+    block_sizes(y, y_hat, err, rtol, 1.0, groups, scale, ratio)
+    top = largest(scale)
+    if not 1e-140 < top < 1e140:
+        top = max(largest_abs(y), largest_abs(y_hat))
+        if 0.0 < top < np.inf:
+            block_sizes(y, y_hat, err, rtol, 1.0 / top, groups, scale, ratio)
+    for b in range(scale.size):
+        scale[b] += atol[b]
+        relative = ratio[b] / max(scale[b], TINY)
         ratio[b] = relative if scale[b] > 0.0 else 0.0
-        scale[b] = sqrt(scale[b]) / unit
     largest_ratio = largest(ratio)
     if largest_ratio == 0.0:
         fill(sigma, 1.0)
@@ -268,7 +275,7 @@ def error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio, 
     for b in range(ratio.size):
         weight = ratio[b] * inverse
         for p in range(groups.start[b], groups.start[b + 1]):
-            sigma[groups.index[p]] = weight
+            sigma[groups.member[p]] = weight
     return largest_ratio
 
 
@@ -294,7 +301,7 @@ def defects(values, target, G, y_hat, scales, g, band):
         size = max(max(size, scales[i]), abs_dot(G[i], y_hat))
         band[i] = BAND_FACTOR * EPS * size
         g[i] = values[i] - target[i]
-        if abs(g[i]) <= band[i]:
+        if np.isfinite(band[i]) and abs(g[i]) <= band[i]:
             g[i] = 0.0
         else:
             outside = True
@@ -340,16 +347,19 @@ def scale_row(row, factor):
 
 @_jit
 def factor(B, inverse_norms, R, pivots):
-    """Pivoted QR of the normalised rows of B, in place; returns the numerical rank.
+    """Pivoted QR of the normalised rows of B, in place; returns the numerical rank, -1 where B is not finite.
 
     `inverse_norms` normalise the rows (0 for a zero row). Row pivots[k] of B becomes the k-th orthonormal direction;
-    R[k, i] is the component of normalised row i along it, but for i = pivots[k] its reciprocal. Modified Gram-Schmidt, with a second pass where cancellation would have spoilt the first.
+    R[k, i] is the component of normalised row i along it, but for i = pivots[k] its reciprocal. By modified
+    Gram-Schmidt, with a second pass where cancellation would have spoilt the first.
     """
     rows = B.shape[0]
     first = 0
     for i in range(rows):
         pivots[i] = i
         length = norm(B[i])
+        if not np.isfinite(length):
+            return -1
         inverse_norms[i] = 1.0 / length if length > 0.0 else 0.0
         scale_row(B[i], inverse_norms[i])
         if inverse_norms[first] == 0.0:
@@ -382,7 +392,7 @@ def factor(B, inverse_norms, R, pivots):
 
 @_jit
 def least_norm(g, inverse_norms, R, pivots, rank, mu):
-    """Coefficients mu along the orthonormal directions of the least-norm x with (row_i . x) = -g_i on the pivot rows."""
+    """Coefficients mu along the orthonormal directions of the least-norm x with row_i . x = -g_i (pivot rows)."""
     for k in range(rank):
         row = pivots[k]
         value = -g[row] * inverse_norms[row]
@@ -400,6 +410,8 @@ def newton_matrix_solve(rows, g, Q, pivots, rank, inner, mu):
             matrix[k, q] = dot(rows[pivots[k]], Q[pivots[q]])
         inner.g[k] = g[pivots[k]]
     inner_rank = factor(matrix, inner.inverse_norms, inner.R, inner.pivots)
+    if inner_rank < 0:
+        fill(mu, np.nan)
     least_norm(inner.g, inner.inverse_norms, inner.R, inner.pivots, inner_rank, inner.mu)
     for k in range(inner_rank):
         row = matrix[inner.pivots[k]]
@@ -445,8 +457,10 @@ def add_products(rows, a, out):
 
 @_jit
 def judge(values, target, before, band, y, defect, max_defect):
-    """Defects after a projection: FAILED_PROJECTION where something is not finite, or a defect has grown and stands
-    above FAILURE_BANDS dead bands; else OK, with the largest defects so far noted."""
+    """Note the defects after a projection; OK or FAILED_PROJECTION.
+
+    It has failed where something is not finite, or a defect has grown and stands above FAILURE_BANDS dead bands.
+    """
     good = all_finite(y)
     for i in range(defect.size):
         defect[i] = values[i] - target[i]
@@ -474,9 +488,7 @@ def hermite(theta, h, y_old, f_old, y, f, out):
     for i in range(y.size):
         change = y[i] - y_old[i]
         out[i] = (
-            y_old[i]
-            + theta * change
-            + theta * rest * (rest * (h * f_old[i] - change) - theta * (h * f[i] - change))
+            y_old[i] + theta * change + theta * rest * (rest * (h * f_old[i] - change) - theta * (h * f[i] - change))
         )
 
 

@@ -57,9 +57,7 @@ def _loop(builder: Any, n: Any, body: Callable[[Any], Any], join: Callable[..., 
 
 
 def _products(context: Any, builder: Any, signature: Any, arguments: Any, i: Any) -> Any:
-    a, b = (
-        _load(builder, _pointer(context, builder, signature.args[k], arguments[k], i)) for k in range(2)
-    )
+    a, b = (_load(builder, _pointer(context, builder, signature.args[k], arguments[k], i)) for k in range(2))
     return builder.fmul(a, b)
 
 
@@ -125,16 +123,16 @@ if config.DISABLE_JIT:
             lanes = lanes[: lanes.size // 2] + lanes[lanes.size // 2 :]
         return lanes[0]
 
-    def _lanes_dot(a, b, n):  # noqa: F811
+    def _lanes_dot(a, b, n):
         return _numpy_sum(a[:n] * b[:n])
 
-    def _lanes_abs_dot(a, b, n):  # noqa: F811
+    def _lanes_abs_dot(a, b, n):
         return _numpy_sum(np.abs(a[:n] * b[:n]))
 
-    def _lanes_largest(a, n):  # noqa: F811
+    def _lanes_largest(a, n):
         return np.max(a[:n], initial=0.0)
 
-    def _lanes_remove(row, unit_row, r, n):  # noqa: F811
+    def _lanes_remove(row, unit_row, r, n):
         row[:n] -= r * unit_row[:n]
         return _numpy_sum(row[:n] * row[:n])
 
@@ -144,7 +142,7 @@ _jit = njit(cache=True, error_model="numpy", _nrt=False)
 
 @_jit
 def dot(a, b):
-    """a . b."""
+    """A . b."""
     whole = a.size - a.size % LANES
     rest = 0.0
     for i in range(whole, a.size):

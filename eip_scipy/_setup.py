@@ -113,15 +113,20 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
     return out[0], out[1]
 
 
+def is_number(value: Any) -> bool:
+    """Whether a value is a real number (no bool, no array)."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
 def check_fixed_step(h: Any, t0: float, t_bound: float) -> float:
-    """h as a positive float.
+    """H as a positive float.
 
     Raises
     ------
     ValueError
         When it is no positive number, longer than the interval, or below ten spacings of t.
     """
-    if isinstance(h, (bool, np.bool_)) or not np.isscalar(h) or not np.isreal(h) or not h > 0 or not np.isfinite(h):
+    if not is_number(h) or not 0 < h < math.inf:
         raise ValueError(f"`h` must be positive. Got {h!r}.")
     h = float(h)
     span = abs(t_bound - t0)
@@ -132,7 +137,9 @@ def check_fixed_step(h: Any, t0: float, t_bound: float) -> float:
     largest = max(abs(t0), abs(t_bound)) if math.isfinite(t_bound) else abs(t0)
     spacing = float(np.spacing(largest))
     if h < 10 * spacing:
-        raise ValueError(f"`h` is too small: h = {h:g} is below 10 spacings of t, which are {spacing:.3g} at t = {largest:g}.")
+        raise ValueError(
+            f"`h` is too small: h = {h:g} is below 10 spacings of t, which are {spacing:.3g} at t = {largest:g}."
+        )
     return h
 
 
@@ -317,8 +324,10 @@ def prepare(
     groups = blocks_of(projection.blocks, n, width)
     invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra)
     options = Options(
-        rtol=rtol,
-        atol=atol,
+        rtol=np.repeat(rtol, width),
+        atol=np.sqrt(
+            np.add.reduceat(np.repeat(atol, width)[groups.member] ** 2 / width, groups.start[:-1].astype(np.intp))
+        ),
         groups=groups,
         frame=frame_rows(projection.frame, n, width),
         target=invariants.target,
@@ -358,7 +367,18 @@ def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0
         out[:] = rhs(t, state)
 
     status = project_step(
-        fill, run.invariants.inv, run.invariants.grad, None, t0, run.y0, run.y0.view(float), t0, options, work, y, y.view(float)
+        fill,
+        run.invariants.inv,
+        run.invariants.grad,
+        None,
+        t0,
+        run.y0,
+        run.y0.view(float),
+        t0,
+        options,
+        work,
+        y,
+        y.view(float),
     )
     missed = np.abs(work.defect) > 1e-8 * run.invariants.term_sizes(t0, y, f0) if status == 0 else [True]
     if np.any(missed):

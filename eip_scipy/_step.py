@@ -39,7 +39,7 @@ class Method(NamedTuple):
 
 
 class Options(NamedTuple):
-    """What a run fixes about its projection. Arrays of states' length are in components (width 1 or 2 floats)."""
+    """What a run fixes about its projection: `rtol` by float of the state, `atol` by block."""
 
     rtol: np.ndarray
     atol: np.ndarray
@@ -74,7 +74,6 @@ class Work(NamedTuple):
     sigma: np.ndarray
     scale: np.ndarray
     ratio: np.ndarray
-    component: np.ndarray
     move: np.ndarray
     carry: np.ndarray
     carry_hat: np.ndarray
@@ -109,7 +108,9 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
     y_hat, y_hat_r = pair(n)
     G, G_r = pair(n_invariants, n)
     floats = {name: np.zeros(m) for name in ("err", "err_sum", "sigma", "move", "carry", "carry_hat")}
-    small = {name: np.zeros(n_invariants) for name in ("inverse_norms", "mu", "values", "g", "band", "before", "defect")}
+    small = {
+        name: np.zeros(n_invariants) for name in ("inverse_norms", "mu", "values", "g", "band", "before", "defect")
+    }
     floats["sigma"][:] = 1.0
     return Work(
         K=K,
@@ -125,7 +126,6 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
         **small,
         scale=np.zeros(n_blocks),
         ratio=np.zeros(n_blocks),
-        component=np.zeros(m),
         B=np.zeros((n_invariants, m)),
         Q=np.zeros((n_invariants, m)),
         R=np.zeros((n_invariants, n_invariants)),
@@ -250,14 +250,17 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
     largest_error = 0.0
     if o.metric == ERROR:
         largest_error = kn.error_metric(
-            w.err, y_r, w.y_hat_r, o.rtol, o.atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio, w.component
+            w.err, y_r, w.y_hat_r, o.rtol, o.atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio
         )
     if o.direction != NEW:
         kn.weigh_rows(w.G_r, w.sigma, o.frame, w.B)
     weighted_directions(rhs, grad, params, t_old, y, y_r, t, o, w)
     rank = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)
     counters[NLU] += 1
-    counters[LAST_RANK] = rank
+    counters[LAST_RANK] = max(rank, 0)
+    if rank < 0:
+        kn.copy(w.before, w.defect)
+        return FAILED_PROJECTION
     if rank < w.g.size:
         counters[RANK_REDUCED] += 1
     if o.direction == NEW:

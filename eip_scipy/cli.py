@@ -9,7 +9,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
-from . import comparators, problems, solar_command
+from . import comparators, problems
+from .commands import solar_system
 from .problems import solar_data
 from .report import UsageError, check_target, document, say, versions, warn, write_json
 
@@ -76,8 +77,8 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
         "list": ("list commands, methods, problems and data sets", lambda parser: None, _list),
         "solar-system": (
             "run the solar system and compare with other methods (the paper's Experiment II)",
-            solar_command.add_arguments,
-            lambda args: solar_command.run(args, _rebound(args)),
+            solar_system.add_arguments,
+            lambda args: solar_system.run(args, _rebound(args)),
         ),
     }
     name = "eip_scipy.reproduce"
@@ -117,7 +118,7 @@ def _listing() -> dict[str, dict[str, str]]:
     scenes = {name: getattr(problems, name) for name in problems.__all__}
     return {
         "commands": {name: summary for name, (summary, _, _) in _commands().items()},
-        "methods": {name: _first_line(method) for name, method in solar_command.fixed_step_methods().items()},
+        "methods": {name: _first_line(method) for name, method in solar_system.fixed_step_methods().items()},
         "comparators": {name: _first_line(make) for name, make in others.items() if not isinstance(make, type)},
         "problems": {name: _first_line(make) for name, make in scenes.items() if not isinstance(make, type)},
         "data": {name: f"{len(data.bodies)} bodies at {data.epoch}, {data.axes}" for name, data in sets.items()},

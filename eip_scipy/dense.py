@@ -27,7 +27,9 @@ class HermiteDenseOutput(DenseOutput):
         return np.where(theta == 1, y, np.where(theta == 0, y_old, out))
 
 
-def hermite(theta: np.ndarray, h: float, y_old: np.ndarray, f_old: np.ndarray, y: np.ndarray, f: np.ndarray) -> np.ndarray:
+def hermite(
+    theta: np.ndarray, h: float, y_old: np.ndarray, f_old: np.ndarray, y: np.ndarray, f: np.ndarray
+) -> np.ndarray:
     """The cubic with the given values and slopes at theta = 0 and 1 of a step of length h."""
     change = y - y_old
     rest = 1 - theta

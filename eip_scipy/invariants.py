@@ -78,7 +78,7 @@ class Invariant:
             raise TypeError(f"Invariant: grad must be callable or None, got {grad!r}.")
         if grad is None and (in_place or uses_f):
             raise ValueError("Invariant: in_place and uses_f describe grad; give grad or leave them out.")
-        if scale is not None and not (np.isscalar(scale) and np.isfinite(scale) and scale >= 0):
+        if scale is not None and not (isinstance(scale, (int, float)) and 0 <= scale < np.inf):
             raise ValueError(f"Invariant: scale must be a finite number >= 0, got {scale!r}.")
         if not isinstance(args, tuple):
             raise TypeError(f"Invariant: args must be a tuple, got {args!r}; write args=(x,) for a single argument.")
@@ -107,14 +107,16 @@ def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
     if isinstance(invariants, Invariant):
         return (invariants,)
     if callable(invariants):
-        raise TypeError(f"invariants: got the function {invariants!r}; wrap it: Invariant({getattr(invariants, '__name__', 'fun')}, grad=...).")
+        raise TypeError(f"invariants: got the function {invariants!r}; wrap it: Invariant(fun, grad=...).")
     try:
         items = tuple(invariants)
     except TypeError:
         raise TypeError(f"invariants: expected an Invariant or a sequence of them, got {invariants!r}.") from None
     for item in items:
         if not isinstance(item, Invariant):
-            raise TypeError(f"invariants: expected Invariant objects, got {item!r}; wrap functions: Invariant(fun, grad=...).")
+            raise TypeError(
+                f"invariants: expected Invariant objects, got {item!r}; wrap functions: Invariant(fun, grad=...)."
+            )
     return items
 
 
@@ -132,9 +134,11 @@ def _real_value(invariant: Invariant, label: str, t: float, y: Array, extra: tup
 class NumericalGradient:
     """Gradient of an invariant without `grad`: complex step where it is valid, else differences of order 6."""
 
-    def __init__(self, invariant: Invariant, label: str, t: float, y: Array, f: Array, tau: float, extra: tuple) -> None:
+    def __init__(
+        self, invariant: Invariant, label: str, t: float, y: Array, f: Array, tau: float, extra: tuple
+    ) -> None:
         self._invariant, self._label = invariant, label
-        self._floor = np.abs(tau * f)
+        self._floor = np.where(np.isfinite(f), np.abs(tau * f), 0.0)
         self._floor[(self._floor == 0) & (y == 0)] = 1.0
         self.complex_step = y.dtype.kind == "f" and self._complex_step_is_valid(t, y, extra)
         if not self.complex_step:
@@ -241,7 +245,8 @@ class InvariantSet:
             part = target[self.starts[k] : self.starts[k + 1]]
             if item.target.ndim > 1 or item.target.size not in (1, part.size):
                 raise ValueError(
-                    f"invariant {self.labels[k]!r}: target has shape {item.target.shape}, its value {part.size} entries."
+                    f"invariant {self.labels[k]!r}: target has shape {item.target.shape}, its value "
+                    f"{part.size} entries."
                 )
             part[:] = item.target
             self._require_finite_target(k, part)
@@ -352,29 +357,34 @@ class InvariantSet:
         along, terms = products.sum(axis=1), np.abs(products).sum(axis=1)
         noise = 1e6 * (EPS * np.max([np.abs(plus), np.abs(minus)], axis=0) + 5e-324)
         for k, name in enumerate(self.names):
-            if np.isfinite(difference[k]) and not abs(difference[k] - along[k]) <= CHECK_TOLERANCE * terms[k] + noise[k]:
+            if (
+                np.isfinite(difference[k])
+                and not abs(difference[k] - along[k]) <= CHECK_TOLERANCE * terms[k] + noise[k]
+            ):
                 raise ValueError(
                     f"gradient of invariant {name!r} is wrong: along a test direction its derivative is "
-                    f"{difference[k]:.6g} by differences and {along[k]:.6g} by grad. Mend grad, leave it out (it is then "
-                    "computed), or pass check=False to skip this check."
+                    f"{difference[k]:.6g} by differences and {along[k]:.6g} by grad. Mend grad, leave it out (it is "
+                    "then computed), or pass check=False to skip this check."
                 )
 
     def _check_invariance(self, t: float, y: Array, f: Array, tau: float) -> None:
-        in_time = self._time_derivative(t, y, tau)
-        products = np.real(np.conj(self.gradients(t, y, f)) * f)
+        # In units of the largest component of f: large states would overflow otherwise.
+        unit = np.max(np.abs(f), initial=0.0) or 1.0
+        in_time = self._time_derivative(t, y, tau) / unit
+        products = np.real(np.conj(self.gradients(t, y, f)) * (f / unit))
         rate, terms = in_time + products.sum(axis=1), np.abs(in_time) + np.abs(products).sum(axis=1)
         for k, name in enumerate(self.names):
             if abs(rate[k]) > INVARIANCE_TOLERANCE * terms[k]:
                 warnings.warn(
-                    f"{name!r} is no invariant of this system: at the start it changes at the rate {rate[k]:.3g}, where "
-                    f"the terms of that rate sum to {terms[k]:.3g}. Projecting on it gives a wrong solution. "
+                    f"{name!r} is no invariant of this system: at the start it changes at the rate {rate[k] * unit:.3g}, "
+                    f"where the terms of that rate sum to {terms[k] * unit:.3g}. Projecting on it gives a wrong solution. "
                     "(check=False skips this check.)",
                     UserWarning,
                     stacklevel=6,
                 )
 
     def _time_derivative(self, t: float, y: Array, tau: float) -> Array:
-        step = 2.0 ** np.round(np.log2(0.01 * tau)) if tau > 0 else 0.0
+        step = float(2.0 ** np.round(np.log2(0.01 * tau))) if tau > 0 else 0.0
         if t + step == t or step == 0.0:
             return np.zeros(self.size)
         total = np.zeros(self.size)

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, types, typeof
+from numba import njit, typeof, types
 
 from . import _kernels as kn
-from . import _lanes, _setup, _step
-from ._compile import CompiledFunctions, NotCompilable, compile_functions, signatures
+from . import _setup
+from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures
+from ._kernels import NOT_FINITE, OK
 from ._setup import ProjectionOptions, Run
-from ._step import NOT_FINITE, OK, eip_step
+from ._step import eip_step
 from .invariants import Invariant, InvariantSet, as_invariants
 from .problems._problem import Problem
 from .result import NFEV, NJEV, NLU, Diagnostics, IntegrationResult
@@ -57,7 +58,8 @@ def source_stamp() -> str:
     Numba's cache on disk looks only at the file of the function itself: without this, an upgraded or edited kernel
     would leave the old driver, with the old kernel inlined, in use.
     """
-    sources = [Path(module.__file__).read_bytes() for module in (_lanes, kn, _step)] + [Path(__file__).read_bytes()]
+    folder = Path(__file__).parent
+    sources = [(folder / name).read_bytes() for name in ("_lanes.py", "_kernels.py", "_step.py", "longrun.py")]
     return hashlib.sha256(b"".join(sources)).hexdigest()
 
 
@@ -257,9 +259,12 @@ def integrate(
         not possible. False: interpreted.
     max_bytes : float, optional
         Bound on the memory for saved states; default: half of what is free.
-    invariants, metric, blocks, frame, direction, iterations, every, reuse_f, check, project_initial, diagnostics, rtol, atol
-        As for the solver classes, see `EIPSolver`. Functions of invariants are called as ``fun(t, y, *args[, params])``;
-        an invariant whose args are the array `params` itself takes the run's `params` in their place.
+    invariants, metric, blocks, frame, direction, iterations, every, reuse_f, check, project_initial
+        As for the solver classes, see `EIPSolver`. Functions of invariants are called as
+        ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` takes the run's
+        `params` in its place.
+    diagnostics, rtol, atol
+        Likewise.
 
     Returns
     -------
@@ -289,7 +294,7 @@ def integrate(
     ((4, 68), True)
     """
     for name in unknown:
-        hint = _setup.nearest_option(name, integrate.__kwdefaults__)
+        hint = _setup.nearest_option(name, integrate.__kwdefaults__ or ())
         raise TypeError(f"integrate() has no option {name!r}{hint}")
     given = {"invariants": invariants, "metric": metric, "blocks": blocks, "frame": frame}
     given = {key: value for key, value in given.items() if value is not DEFAULT}
@@ -436,7 +441,9 @@ class _Loop:
         values = driver.values()
         max_defect = driver.run.work.max_defect
         if rows:
-            np.fmax(max_defect, np.nanmax(np.abs(values - invariants.target[:, None]), axis=1, initial=0), out=max_defect)
+            np.fmax(
+                max_defect, np.nanmax(np.abs(values - invariants.target[:, None]), axis=1, initial=0), out=max_defect
+            )
         if self.why_not is not None:
             message = f"{message} (interpreted: {self.why_not})"
         return IntegrationResult(
@@ -474,7 +481,9 @@ def _required(name: str, value: Any) -> Any:
 
 def _tableau(method: Any) -> Any:
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
-        raise TypeError(f"integrate: method must be an EIP class such as EIPRK4, or eip_method(tableau); got {method!r}.")
+        raise TypeError(
+            f"integrate: method must be an EIP class such as EIPRK4, or eip_method(tableau); got {method!r}."
+        )
     if method._project_step is not EIPSolver._project_step:
         raise TypeError(f"integrate does not call {method.__name__}._project_step; use it through solve_ivp.")
     return method.TABLEAU
@@ -498,8 +507,8 @@ def _parameters(params: Any) -> np.ndarray:
 
 
 def _with_run_params(item: Invariant, params: Any) -> Invariant:
-    """The invariant with `params` taken out of its args, where they are what it has: the run passes them."""
-    if params is None or len(item.args) != 1 or item.args[0] is not params:
+    """The invariant with `params` taken out of its args, where they are all it has: the run passes them."""
+    if params is None or len(item.args) != 1 or not np.array_equal(item.args[0], params):
         return item
     bare = Invariant.__new__(Invariant)
     bare.__dict__.update(item.__dict__, args=())
@@ -567,7 +576,11 @@ def _interpreted_rhs(fun: Callable[..., Any], in_place: bool, extra: tuple, y0: 
 
         def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
             f = fun(t, y.copy(), *extra)
-            out[:] = f if type(f) is np.ndarray and f.shape == shape and f.dtype == dtype else _setup.as_derivative(f, n, dtype)
+            out[:] = (
+                f
+                if type(f) is np.ndarray and f.shape == shape and f.dtype == dtype
+                else _setup.as_derivative(f, n, dtype)
+            )
 
     return rhs
 
@@ -587,7 +600,7 @@ def _functions(
         return interpreted, "compiled=False"
     try:
         return compile_functions(fun, in_place, bool(extra), invariants, dtype), None
-    except NotCompilable as reason:
+    except NotCompilableError as reason:
         if compiled:
             raise
         return interpreted, str(reason)

@@ -214,9 +214,7 @@ def orbits_figure(panels: Mapping[str, Orbits], bodies: Sequence[str], *, unit: 
     return figure
 
 
-def orbit_in_time_figure(
-    panels: Mapping[str, tuple[Any, Any]], *, unit: str, time: str, title: str = ""
-) -> Figure:
+def orbit_in_time_figure(panels: Mapping[str, tuple[Any, Any]], *, unit: str, time: str, title: str = "") -> Figure:
     """Draw one body's changing orbit in a plane, coloured by time, one panel for each method.
 
     Parameters
@@ -311,7 +309,7 @@ def _marked(scale: np.ndarray, count: int = 6) -> list[int]:
 
 
 def _log_x(axis: Axes) -> None:
-    """A log axis with labels at powers of ten; in a short span at 2 and 5 times those as well."""
+    """Make x a log axis with labels at powers of ten; in a short span at 2 and 5 times those as well."""
     axis.set_xscale("log")
     low, high = axis.get_xlim()
     if high / low < 50:

@@ -81,9 +81,11 @@ def project(
         raise ValueError("project: a gradient uses f; pass f=, the derivative at y_hat or a function f(t, y).")
     iterations = _setup.count("iterations", iterations)
     if known.uses_f and iterations > 1 and not callable(f):
-        raise ValueError("project: a gradient uses f at each Newton step; with iterations > 1 pass f as a function f(t, y).")
+        raise ValueError(
+            "project: a gradient uses f at each Newton step; with iterations > 1 pass f as a function f(t, y)."
+        )
     options = Options(
-        rtol=np.zeros(n),
+        rtol=np.zeros(n * width),
         atol=np.zeros(n),
         groups=_setup.blocks_of(None, n, width),
         frame=_setup.frame_rows(frame, n, width),
@@ -107,9 +109,7 @@ def project(
     def rhs(time: float, state: np.ndarray, f_out: np.ndarray, params: Any) -> None:
         f_out[:] = derivative(time, state)
 
-    status = project_step(
-        rhs, known.inv, known.grad, None, t, y, y.view(float), t, options, work, out, out.view(float)
-    )
+    status = project_step(rhs, known.inv, known.grad, None, t, y, y.view(float), t, options, work, out, out.view(float))
     if status != 0:
         raise ValueError(_setup.projection_failure(known, work, t))
     return ProjectionResult(out, work.defect.copy(), int(work.counters[LAST_RANK]), out - y)

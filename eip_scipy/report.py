@@ -161,9 +161,10 @@ def _line(label: str, cells: Sequence[str], first: int, widths: Sequence[int]) -
 
 
 def say(text: str = "") -> None:
-    """Print on stdout; a reader that has left, say `head`, does not end the command."""
+    """Print on stdout; neither a reader that has left, say `head`, nor a terminal without Unicode ends the command."""
+    encoding = sys.stdout.encoding or "utf-8"
     try:
-        print(text, flush=True)
+        print(text.encode(encoding, "replace").decode(encoding), flush=True)
     except BrokenPipeError:
         # Python writes what is left when it closes stdout; let that go nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

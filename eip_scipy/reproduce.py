@@ -79,9 +79,13 @@ class Value:
 
     @property
     def within_roundoff(self) -> bool:
-        """Whether ours lies within round-off of a number that the paper would print so."""
+        """Whether ours lies within round-off of what the paper would print so, or of the number in 50 digits.
+
+        In the second case the round-off is the paper's.
+        """
         half_unit = 0.5 * 10.0 ** int(Decimal(self.paper).as_tuple().exponent)
-        return abs(self.ours - float(self.paper)) <= half_unit + self.roundoff
+        from_paper, from_exact = abs(self.ours - float(self.paper)), abs(self.ours - self.mpmath)
+        return from_paper <= half_unit + self.roundoff or from_exact <= self.roundoff
 
     @property
     def status(self) -> str:
@@ -277,15 +281,17 @@ def run(args: argparse.Namespace) -> int:
     if args.json is not None:
         report.check_target(Path(args.json))
     tables = {table: reproduce(table) for table in dict.fromkeys(args.table)}
-    if not args.quiet:
-        print("\n\n".join(table_text(cells) for cells in tables.values()))
-    if args.out is not None:
-        for table, cells in tables.items():
-            report.write_csv(Path(args.out) / f"{table}.csv", _lines(cells))
     everything = [cell for cells in tables.values() for cell in cells]
+    if not args.quiet:
+        report.say("\n\n".join(table_text(cells) for cells in tables.values()))
+    written = []
+    if args.out is not None:
+        written += [report.write_csv(Path(args.out) / f"{table}.csv", _lines(cells)) for table, cells in tables.items()]
     if args.json is not None:
         content = report.document("reproduce", {"table": list(tables)}, **as_dict(everything))
-        report.write_json(Path(args.json), content)
+        written.append(report.write_json(Path(args.json), content))
+    if written and not args.quiet:
+        report.say("\n".join(["", *(f"wrote {path}" for path in written)]))
     return 0 if passed(everything) else 1
 
 

@@ -57,26 +57,32 @@ class Diagnostics:
 
     @property
     def last_defect(self) -> np.ndarray:
+        """Last |I - target|, (l,)."""
         return np.abs(self._defect)
 
     @property
     def n_projections(self) -> int:
+        """Projections done."""
         return int(self._counters[PROJECTIONS])
 
     @property
     def n_skipped(self) -> int:
+        """Projections left out as round-off."""
         return int(self._counters[SKIPPED])
 
     @property
     def n_rank_reduced(self) -> int:
+        """Projections of reduced rank."""
         return int(self._counters[RANK_REDUCED])
 
     @property
     def n_rejected_projections(self) -> int:
+        """Projections that failed."""
         return int(self._counters[REJECTED])
 
     @property
     def max_correction(self) -> float:
+        """Largest correction in local errors."""
         return float(self._max_correction[0]) if self._estimated else float("nan")
 
     def __repr__(self) -> str:

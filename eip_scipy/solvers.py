@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.integrate import DenseOutput, OdeSolver
 
-from . import _kernels as kn
 from . import _setup
+from ._kernels import OK
 from ._setup import ProjectionOptions
-from ._step import OK, close_step, project_step, raw_step
+from ._step import close_step, project_step, raw_step
 from .dense import HermiteDenseOutput
 from .result import NFEV, NJEV, NLU
 from .tableaux import RK1, RK2, RK3, RK4, RK5, Tableau
@@ -20,9 +20,9 @@ from .tableaux import RK1, RK2, RK3, RK4, RK5, Tableau
 __all__ = ["EIPRK1", "EIPRK2", "EIPRK3", "EIPRK4", "EIPRK5", "EIPSolver", "eip_method"]
 
 OPTIONS = (
-    "h first_step max_step rtol atol vectorized invariants metric blocks frame direction iterations every reuse_f "
-    "check project_initial diagnostics"
-).split()
+    *("h", "first_step", "max_step", "rtol", "atol", "vectorized", "invariants", "metric", "blocks", "frame"),
+    *("direction", "iterations", "every", "reuse_f", "check", "project_initial", "diagnostics"),
+)
 
 
 class EIPSolver(OdeSolver):
@@ -93,6 +93,8 @@ class EIPSolver(OdeSolver):
     """
 
     TABLEAU: ClassVar[Tableau]
+    t: float
+    t_old: float
 
     def __init__(
         self,
@@ -122,14 +124,18 @@ class EIPSolver(OdeSolver):
     ) -> None:
         for name in extraneous:
             hint = _setup.nearest_option(name, OPTIONS)
-            warnings.warn(f"{type(self).__name__} has no option {name!r}; it is ignored{hint}", UserWarning, stacklevel=3)
+            warnings.warn(
+                f"{type(self).__name__} has no option {name!r}; it is ignored{hint}", UserWarning, stacklevel=3
+            )
         start = _setup.initial_state(y0)
         derivative = _checked(fun, start.size, start.dtype, vectorized)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
         if h is None:
             raise ValueError(f"{type(self).__name__} needs the step h=...")
         if first_step is not None or max_step != np.inf:
-            raise ValueError("h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other.")
+            raise ValueError(
+                "h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other."
+            )
         self.h = _setup.check_fixed_step(h, t0, t_bound)
         self._n_steps = _setup.fixed_steps(self.h, t0, t_bound)
         self._k = 0
@@ -167,8 +173,7 @@ class EIPSolver(OdeSolver):
         self._work.K[0] = self.f = f0
         self._work.counters[NFEV] = 1 if run.y0 is start else 2
         self._count()
-        self.y_old: np.ndarray | None = None
-        self.f_old: np.ndarray | None = None
+        self.y_old, self.f_old = self.y, self.f
 
     def _rhs(self, t: float, y: np.ndarray, out: np.ndarray, params: Any) -> None:
         # A copy, because a user's function may keep what it was given and `y` is a buffer.
@@ -186,9 +191,7 @@ class EIPSolver(OdeSolver):
         o = run.options
         self._project_now = run.invariants.size > 0 and (last or (self._k + 1) % o.every == 0)
         y = self.y
-        status = raw_step(
-            self._rhs, None, self.t, y, y.view(float), t_new, h, self._project_now, run.method, o, w
-        )
+        status = raw_step(self._rhs, None, self.t, y, y.view(float), t_new, h, self._project_now, run.method, o, w)
         if status != OK:
             self._count()
             return False, _setup.not_finite(w, run.method, self.t, h)
@@ -254,7 +257,9 @@ class EIPSolver(OdeSolver):
         return HermiteDenseOutput(self.t_old, self.t, self.y_old, self.y, self.f_old, self.f)
 
 
-def _checked(fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool) -> Callable[[float, np.ndarray], np.ndarray]:
+def _checked(
+    fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool
+) -> Callable[[float, np.ndarray], np.ndarray]:
     """The user's right-hand side as (t, y) -> new array (n,) of the state's type, with clear errors."""
     shape = (n,)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -60,8 +61,14 @@ def order_residuals(A: np.ndarray, b: np.ndarray, order: int) -> Iterator[tuple[
             yield tree, b.dot(_stage_weights(tree, A)) - Fraction(1, _density(tree))
 
 
-def _exact(value: Number) -> Fraction | float:
-    return value if isinstance(value, float) else Fraction(value)
+def _exact(name: str, value: Number) -> Fraction | float:
+    try:
+        exact = value if isinstance(value, float) else Fraction(value)
+    except (TypeError, ValueError):
+        exact = math.nan
+    if not math.isfinite(exact):
+        raise ValueError(f"{name}: coefficients must be finite numbers or strings such as '1/3', got {value!r}.")
+    return exact
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +119,7 @@ class Tableau:
     order: int
     b_hat: np.ndarray | None = None
     error_estimator_order: int | None = None
-    c: np.ndarray | None = None
+    c: np.ndarray = field(init=False)
     reference: str = ""
     e: np.ndarray = field(init=False)
     b_low: np.ndarray = field(init=False)
@@ -131,18 +138,20 @@ class Tableau:
         c: Sequence[Number] | None = None,
         reference: str = "",
     ) -> None:
+        if isinstance(order, bool) or not isinstance(order, int) or order < 1:
+            raise ValueError(f"{name}: order must be an integer >= 1, got {order!r}.")
         s = len(b)
-        exact_A, exact_b = _stage_matrix(name, A, s), _vector(b)
-        nodes = exact_A.sum(axis=1) if s > 1 else _vector([0])
+        exact_A, exact_b = _stage_matrix(name, A, s), _vector(name, b)
+        nodes = exact_A.sum(axis=1) if s > 1 else _vector(name, [0])
         if c is not None:
-            _check_nodes(name, _vector(c), nodes)
+            _check_nodes(name, _vector(name, c), nodes)
         _check_order(name, "b", exact_A, exact_b, order)
         weights_hat = None
         if b_hat is not None:
             weights_hat = self._check_embedded(name, exact_A, exact_b, b_hat, order, error_estimator_order)
         e = np.zeros(s + 1)
         if weights_hat is not None:
-            e[:] = [float(x) for x in np.append(exact_b, Fraction(0)) - weights_hat]
+            e[:] = [float(x) for x in _vector(name, [*exact_b, 0]) - weights_hat]
         values = {
             "name": name,
             "A": exact_A.astype(float),
@@ -169,10 +178,12 @@ class Tableau:
         """`b_hat` with s + 1 entries, its order checked on the stages and f at the new point (row b)."""
         s = len(b)
         if len(b_hat) not in (s, s + 1):
-            raise ValueError(f"{name}: b_hat has {len(b_hat)} entries; expected {s} or {s + 1} (with f at the new point).")
+            raise ValueError(
+                f"{name}: b_hat has {len(b_hat)} entries; expected {s} or {s + 1} (with f at the new point)."
+            )
         if order_hat is None:
             raise ValueError(f"{name}: b_hat was given without error_estimator_order; give the order of b_hat.")
-        weights = np.append(_vector(b_hat), [Fraction(0)] * (s + 1 - len(b_hat)))
+        weights = _vector(name, [*b_hat, *[0] * (s + 1 - len(b_hat))])
         extended = np.full((s + 1, s + 1), Fraction(0), dtype=object)
         extended[:s, :s], extended[s, :s] = A, b
         _check_order(name, "b_hat", extended, weights, order_hat)
@@ -195,9 +206,9 @@ class Tableau:
         return f"<Tableau {self.name}: {self.n_stages} stages, order {self.order}{estimate}>"
 
 
-def _vector(values: Sequence[Number]) -> np.ndarray:
+def _vector(name: str, values: Sequence[Number]) -> np.ndarray:
     out = np.empty(len(values), dtype=object)
-    out[:] = [_exact(v) for v in values]
+    out[:] = [_exact(name, v) for v in values]
     return out
 
 
@@ -206,9 +217,11 @@ def _stage_matrix(name: str, A: Sequence[Sequence[Number]], s: int) -> np.ndarra
         raise ValueError(f"{name}: A has {len(A)} rows and b {s} entries; they must agree.")
     full = np.full((s, s), Fraction(0), dtype=object)
     for i, row in enumerate(A):
-        entries = [_exact(v) for v in row]
+        entries = [_exact(name, v) for v in row]
         if any(entries[i:]):
-            raise ValueError(f"{name}: row {i} of A reaches its diagonal; an explicit method needs A strictly lower triangular.")
+            raise ValueError(
+                f"{name}: row {i} of A reaches its diagonal; an explicit method needs A strictly lower triangular."
+            )
         full[i, : min(i, len(entries))] = entries[:i]
     return full
 

@@ -269,7 +269,7 @@ def _add(x: np.ndarray, c: float, dx: np.ndarray) -> None:
 
 
 @register_jitable
-def _kick_drift_kick(acc, extra, t, h, q, v, a):  # type: ignore[no-untyped-def]
+def _kick_drift_kick(acc, extra, t, h, q, v, a):
     """One step in place; `a` holds a(t, q) before and after it."""
     _add(v, 0.5 * h, a)
     _add(q, h, v)
@@ -278,7 +278,7 @@ def _kick_drift_kick(acc, extra, t, h, q, v, a):  # type: ignore[no-untyped-def]
 
 
 @register_jitable
-def _drift_kick_drift(acc, extra, t, h, q, v, a):  # type: ignore[no-untyped-def]
+def _drift_kick_drift(acc, extra, t, h, q, v, a):
     """One step in place; `a` is work space."""
     _add(q, 0.5 * h, v)
     a[:] = acc(t + 0.5 * h, q, *extra)
@@ -286,7 +286,7 @@ def _drift_kick_drift(acc, extra, t, h, q, v, a):  # type: ignore[no-untyped-def
     _add(q, 0.5 * h, v)
 
 
-def _drive(acc, extra, t0, h, last_step, kick_first, saved, y, a, ys):  # type: ignore[no-untyped-def]
+def _drive(acc, extra, t0, h, last_step, kick_first, saved, y, a, ys):
     """Take saved[-1] steps; ys[row] receives the state after step saved[row]. `extra` is () or (params,)."""
     half = y.size // 2
     q = y[:half]

@@ -100,6 +100,7 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
             Invariant(_momentum, _momentum_gradient, args=(params,), in_place=True, name="L"),
         ),
         reference=(lambda t: _orbit(e, t)) if relativistic == 0 else None,
+        blocks=2,
         units="G M = 1, semi-major axis 1: period 2 pi",
         source="Cai, Gong & Wang, section 3.1 (eq. 3.2, with L = q1 p2 - q2 p1)",
     )

@@ -147,7 +147,9 @@ def nbody(
     q, v = np.array(position, dtype=float), np.array(velocity, dtype=float)
     n = params.size
     if params.ndim != 1 or q.shape != (n, 3) or v.shape != (n, 3):
-        raise ValueError(f"nbody: gm {params.shape}, position {q.shape}, velocity {v.shape}; expected (N,), (N, 3), (N, 3).")
+        raise ValueError(
+            f"nbody: gm {params.shape}, position {q.shape}, velocity {v.shape}; expected (N,), (N, 3), (N, 3)."
+        )
     if not np.all(params > 0):
         raise ValueError("nbody: every G m must be positive (a test particle's motion enters no invariant).")
     return Problem(

@@ -1,0 +1,166 @@
+"""``eip-scipy solar-system``: the paper's Experiment II as a table, figures and files; options and order of events."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+from .. import solvers
+from ..problems.solar_data import available
+from ..report import UsageError, check_folder, check_target, say, warn, write_csv, write_file, write_json
+from .solar_cost import REPEATS, cost, cost_methods
+from .solar_errors import Study
+from .solar_report import cost_rows, csv_rows, json_content, text
+from .solar_run import Judge, make_scene, plan
+
+__all__ = ["add_arguments", "fixed_step_methods", "run"]
+
+METRICS = ("error", "euclidean")
+COST_YEARS = 100.0
+DONE, CHECK_FAILED, INTERRUPTED = 0, 1, 130
+
+
+def fixed_step_methods() -> dict[str, type[solvers.EIPSolver]]:
+    """Find the solver classes that a user names: those with a tableau."""
+    found = {name: getattr(solvers, name) for name in solvers.__all__}
+    return {
+        name: value
+        for name, value in found.items()
+        if isinstance(value, type) and issubclass(value, solvers.EIPSolver) and hasattr(value, "TABLEAU")
+    }
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``solar-system``."""
+    parser.add_argument("--years", type=_positive, default=2000.0, help="length in Julian years (%(default)g)")
+    parser.add_argument(
+        "--h", type=_positive, default=0.002, help="step in years, shortened to divide the run (%(default)g)"
+    )
+    parser.add_argument(
+        "--method", choices=list(fixed_step_methods()), default="EIPRK4", help="the method to show (%(default)s)"
+    )
+    parser.add_argument("--metric", choices=METRICS, default="error", help="its metric (%(default)s)")
+    parser.add_argument("--data", choices=available(), default="de440", help="initial data (%(default)s)")
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (value > 0 and math.isfinite(value)):
+        raise argparse.ArgumentTypeError(f"expected a positive number, got {text!r}")
+    return value
+
+
+def run(args: argparse.Namespace, judge: Judge | None) -> int:
+    """Run the command.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Options of `add_arguments`, and ``out``, ``json`` (Path or None) and ``quiet``.
+    judge : callable or None
+        `eip_scipy.integrations.rebound.run`, None without REBOUND.
+
+    Returns
+    -------
+    int
+        Exit status: 0 done, 1 a check failed, 130 interrupted.
+
+    Raises
+    ------
+    UsageError
+        For arguments or files that cannot be used.
+    """
+    try:
+        study = Study(make_scene(args.data, args.years, args.h), fixed_step_methods()[args.method].TABLEAU.order)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    check_folder(args.out)
+    if args.json is not None:
+        check_target(args.json)
+    interrupted = _integrate(study, args, judge)
+    if not study.runs:
+        warn("interrupted; no run was done")
+        return INTERRUPTED
+    if not args.quiet:
+        say(text(study, args))
+    status = DONE if all(check.passed for check in study.checks()) else CHECK_FAILED
+    _write_numbers(study, args)
+    if interrupted:
+        warn("interrupted; the runs that were done are in the table and the files")
+        return INTERRUPTED
+    try:
+        _time_methods(study, args, judge)
+        _write_numbers(study, args)
+    except KeyboardInterrupt:
+        warn("interrupted; the table is complete, error against cost and the figures are missing")
+        return INTERRUPTED
+    _write_figures(study, args)
+    return status
+
+
+def _integrate(study: Study, args: argparse.Namespace, judge: Judge | None) -> bool:
+    """Do the runs one by one; True if the user interrupted them."""
+    tasks = plan(study.scene, fixed_step_methods()[args.method], args.metric, judge)
+    try:
+        for task in tasks:
+            with _waiting(task.name, shown=not (args.quiet or task.has_bar)):
+                study.runs.append(task.start(not args.quiet))
+        study.tight = study.runs[-1]
+    except KeyboardInterrupt:
+        return True
+    except MemoryError as error:
+        raise UsageError(f"not enough memory: {error}") from error
+    return False
+
+
+@contextlib.contextmanager
+def _waiting(label: str, *, shown: bool) -> Iterator[None]:
+    """Show what runs, and for how long, where there is no progress to be had."""
+    from tqdm import tqdm
+
+    with tqdm(total=1, desc=label, bar_format="{desc}: {elapsed}", disable=not shown) as bar:
+        yield
+        bar.update()
+
+
+def _time_methods(study: Study, args: argparse.Namespace, judge: Judge | None) -> None:
+    from tqdm import tqdm
+
+    years = min(study.scene.years, COST_YEARS)
+    scene = study.scene if years == study.scene.years else make_scene(args.data, years, min(args.h, years))
+    methods = cost_methods(scene, fixed_step_methods()[args.method], args.metric, judge)
+    total = REPEATS * sum(len(steps) for _, steps in methods.values())
+    with tqdm(total=total, desc="error against cost", unit="run", disable=args.quiet) as bar:
+        study.cost = cost(scene, methods, judge, bar.update)
+    study.cost_scene = scene
+
+
+def _write_numbers(study: Study, args: argparse.Namespace) -> None:
+    """Write what is known; a second time when the timings are there, too."""
+    again = study.cost is not None
+    _say(args, write_csv(args.out / "solar-system.csv", csv_rows(study)), again=again)
+    if study.cost is not None:
+        _say(args, write_csv(args.out / "error-against-cost.csv", cost_rows(study)))
+    if args.json is not None:
+        _say(args, write_json(args.json, json_content(study, args)), again=again)
+
+
+def _write_figures(study: Study, args: argparse.Namespace) -> None:
+    try:
+        from .solar_figures import figures
+    except ImportError as error:
+        warn(f"no figures: {error}")
+        return
+    for name, figure in figures(study):
+        _say(args, write_file(args.out / name, figure.savefig))
+
+
+def _say(args: argparse.Namespace, path: Path, *, again: bool = False) -> None:
+    if not (args.quiet or again):
+        say(f"wrote {path}")

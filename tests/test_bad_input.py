@@ -1,0 +1,937 @@
+"""What a user may get wrong: each mistake gets its answer, at once, and nothing computed is lost.
+
+Failures on the way (NaN, blow-up, contradicting invariants, vanishing gradients) are in test_guards.
+"""
+
+import math
+import re
+import signal
+import time
+
+import numpy as np
+import pytest
+from scipy.integrate import RK45, solve_ivp
+
+from eip_scipy import (
+    EIPRK1,
+    EIPRK3,
+    EIPRK4,
+    Diagnostics,
+    EIPSolver,
+    Invariant,
+    check_gradient,
+    integrate,
+    project,
+)
+from eip_scipy.problems import kepler
+
+EPS = np.finfo(float).eps
+Y0 = [1.0, 2.0]
+
+
+def oscillator(t, y):
+    return np.array([y[1], -y[0]])
+
+
+def square(t, y):
+    return y @ y
+
+
+def square_gradient(t, y):
+    return 2 * y
+
+
+SQUARE = Invariant(square, square_gradient, name="S")
+
+
+def by_scipy(fun=oscillator, t_span=(0, 1), y0=Y0, **options):
+    return solve_ivp(fun, t_span, y0, **{"method": EIPRK4, "h": 0.1, **options})
+
+
+def by_integrate(fun=oscillator, t_span=(0, 1), y0=Y0, **options):
+    return integrate(fun, t_span, y0, **{"method": EIPRK4, "h": 0.1, **options})
+
+
+both = pytest.mark.parametrize("driver", [by_scipy, by_integrate], ids=["solve_ivp", "integrate"])
+
+
+# The state.
+
+
+@both
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_y0_not_finite(driver, bad):
+    with pytest.raises(ValueError, match=r"All components of the initial state `y0` must be finite\."):
+        driver(y0=[1.0, bad])
+
+
+@both
+@pytest.mark.parametrize("y0", [[[1.0, 2.0]], 1.0, np.zeros((2, 1))])
+def test_y0_not_one_dimensional(driver, y0):
+    with pytest.raises(ValueError, match=r"`y0` must be 1-dimensional\."):
+        driver(y0=y0)
+
+
+@both
+def test_y0_masked(driver):
+    with pytest.raises(ValueError, match="masked values in y0"):
+        driver(y0=np.ma.array(Y0, mask=[False, True]))
+    plain, unmasked = driver(), driver(y0=np.ma.array(Y0, mask=[False, False]))
+    np.testing.assert_array_equal(np.asarray(unmasked.y), plain.y)
+
+
+@both
+@pytest.mark.parametrize("y0", [["a", "b"], [1.0, None]])
+def test_y0_no_numbers(driver, y0):
+    with pytest.raises(TypeError, match="`y0` must hold numbers"):
+        driver(y0=y0)
+
+
+@both
+@pytest.mark.parametrize("kind", [int, np.float32, np.longdouble, list, tuple])
+def test_y0_of_other_kinds(driver, kind):
+    y0 = kind([1, 2]) if kind in (list, tuple) else np.array([1, 2], dtype=kind)
+    np.testing.assert_array_equal(driver(y0=y0).y[:, -1].astype(float), driver().y[:, -1])
+
+
+@both
+def test_y0_is_not_changed(driver):
+    y0 = np.array(Y0)
+    target = Invariant(square, square_gradient, target=5.1)
+    driver(y0=y0, invariants=target, project_initial=True)
+    np.testing.assert_array_equal(y0, Y0)
+
+
+# The right-hand side.
+
+WRONG_VALUES = [
+    (lambda t, y: None, TypeError, "fun returned None, expected 2 numbers"),
+    (lambda t, y: 1.0, ValueError, r"fun returned shape \(\), expected \(2,\)"),
+    (lambda t, y: [1, 2, 3], ValueError, r"fun returned shape \(3,\), expected \(2,\)"),
+    (lambda t, y: y[:1], ValueError, r"fun returned shape \(1,\), expected \(2,\)"),
+    (lambda t, y: np.ones((2, 1)), ValueError, r"fun returned shape \(2, 1\), expected \(2,\)"),
+    (lambda t, y: 1j * y, ValueError, "y0 is real; pass y0.astype"),
+    (lambda t, y: "ab", TypeError, "fun returned 'ab', expected 2 numbers"),
+]
+wrong_values = pytest.mark.parametrize(("wrong", "error", "match"), WRONG_VALUES)
+
+
+@both
+@wrong_values
+def test_fun_of_wrong_value(driver, wrong, error, match):
+    with pytest.raises(error, match=match):
+        driver(wrong)
+
+
+@both
+@wrong_values
+def test_fun_of_wrong_value_later(driver, wrong, error, match):
+    with pytest.raises(error, match=match) as info:
+        driver(lambda t, y: oscillator(t, y) if t < 0.5 else wrong(t, y))
+    if driver is by_integrate:
+        assert info.value.partial.t[-1] == 0.4
+
+
+@both
+def test_fun_as_list_or_integers(driver):
+    np.testing.assert_array_equal(driver(lambda t, y: [y[1], -y[0]]).y, driver().y)
+    np.testing.assert_allclose(driver(lambda t, y: [1, 2]).y[:, -1], [2.0, 4.0])
+
+
+@both
+def test_real_fun_of_a_complex_state(driver):
+    run = driver(lambda t, y: [1.0, 2.0], y0=np.array([1j, 0]))
+    np.testing.assert_allclose(run.y[:, -1], [1 + 1j, 2])
+
+
+@both
+@pytest.mark.parametrize("invariants", [(), SQUARE])
+def test_fun_that_returns_its_buffer(driver, invariants):
+    buffer = np.zeros(2)
+
+    def reusing(t, y):
+        buffer[:] = y[1], -y[0]
+        return buffer
+
+    np.testing.assert_array_equal(driver(reusing, invariants=invariants).y, driver(invariants=invariants).y)
+
+
+@both
+@pytest.mark.parametrize("invariants", [(), SQUARE])
+def test_fun_that_keeps_or_overwrites_its_argument(driver, invariants):
+    """SciPy hands out fresh arrays; so must this."""
+    kept = []
+
+    def careless(t, y):
+        f = np.array([y[1], -y[0]])
+        kept.append((y, y.copy()))
+        return f
+
+    def destructive(t, y):
+        f = np.array([y[1], -y[0]])
+        y[:] = 1e9
+        return f
+
+    good = driver(invariants=invariants).y
+    np.testing.assert_array_equal(driver(careless, invariants=invariants).y, good)
+    assert all((now == then).all() for now, then in kept)
+    np.testing.assert_array_equal(driver(destructive, invariants=invariants).y, good)
+
+
+@both
+def test_invariant_that_keeps_its_arguments(driver):
+    """A user's invariant may record the states it saw."""
+    kept = []
+
+    def value(t, y):
+        kept.append((y, y.copy()))
+        return y @ y
+
+    driver(invariants=Invariant(value, square_gradient))
+    assert all((now == then).all() for now, then in kept)
+
+
+class MineError(Exception):
+    pass
+
+
+@both
+@pytest.mark.parametrize("error", [MineError("here"), ZeroDivisionError("x"), KeyboardInterrupt(), SystemExit(3)])
+def test_exceptions_of_the_user_pass_unchanged(driver, error):
+    def fun(t, y):
+        if t > 0.5:
+            raise error
+        return oscillator(t, y)
+
+    with pytest.raises(type(error)) as info:
+        driver(fun, h=0.01, invariants=SQUARE, **({"save_every": 10} if driver is by_integrate else {}))
+    assert info.value is error
+    if driver is by_integrate:
+        check_partial(error.partial)
+
+
+def check_partial(partial):
+    """Of a run that broke in the step from 0.5, saved every tenth step of .01."""
+    np.testing.assert_allclose(partial.t, [0.0, 0.1, 0.2, 0.3, 0.4, 0.5], atol=1e-15)
+    assert partial.y.shape == (2, 6)
+    np.testing.assert_allclose(partial.y[0], np.cos(partial.t) + 2 * np.sin(partial.t), atol=1e-8)
+    assert partial.status == -1
+    assert not partial.success
+    assert "interrupted" in partial.message
+
+
+def test_partial_ends_with_the_last_accepted_state():
+    def fun(t, y):
+        if t > 0.5:
+            raise MineError
+        return oscillator(t, y)
+
+    with pytest.raises(MineError) as info:
+        integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.02, save_every=7, invariants=SQUARE)
+    np.testing.assert_allclose(info.value.partial.t, [0.0, 0.14, 0.28, 0.42, 0.5], atol=1e-15)
+    assert info.value.partial.invariants.shape == (1, 5)
+
+
+@pytest.mark.parametrize("part", ["fun", "grad", "callback"])
+@pytest.mark.parametrize("error", [MineError, KeyboardInterrupt])
+def test_partial_whoever_raises(part, error):
+    """From the invariants and the callback too, and although they go on raising when the result is made."""
+    broken = False
+
+    def raising(t, ok):
+        nonlocal broken
+        broken = broken or t > 0.5
+        if broken:
+            raise error("mine")
+        return ok
+
+    kept = Invariant(
+        lambda t, y: raising(t, y @ y) if part == "fun" else y @ y,
+        lambda t, y: raising(t, 2 * y) if part == "grad" else 2 * y,
+    )
+    callback = (lambda t, y, d: raising(t, None)) if part == "callback" else None
+    with pytest.raises(error, match="mine") as info:
+        integrate(oscillator, (0, 1), Y0, method=EIPRK4, h=0.1, invariants=kept, save_every=1, callback=callback)
+    partial = info.value.partial
+    assert partial.t[-1] == pytest.approx(0.6 if part == "callback" else 0.5)
+    assert partial.y.shape == (2, len(partial.t))
+
+
+@pytest.mark.needs_jit
+class TestCompiledExceptions:
+    @staticmethod
+    def functions(where):
+        from numba import njit
+
+        number = ["fun", "in place", "value", "grad"].index(where)
+
+        @njit
+        def fun(t, y):
+            if number == 0 and t > 0.5:
+                raise ValueError("from compiled code")
+            return np.array([y[1], -y[0]])
+
+        @njit
+        def in_place(t, y, out):
+            if number == 1 and t > 0.5:
+                raise ValueError("from compiled code")
+            out[0], out[1] = y[1], -y[0]
+
+        @njit
+        def value(t, y):
+            if number == 2 and t > 0.5:
+                raise ValueError("from compiled code")
+            return y[0] * y[0] + y[1] * y[1]
+
+        @njit
+        def grad(t, y):
+            if number == 3 and t > 0.5:
+                raise ValueError("from compiled code")
+            return 2 * y
+
+        return (in_place if where == "in place" else fun), Invariant(value, grad, name="S")
+
+    @pytest.mark.parametrize("where", ["fun", "in place", "value", "grad"])
+    def test_propagate(self, where):
+        fun, kept = self.functions(where)
+        options = {"in_place": where == "in place", "invariants": kept, "compiled": True, "save_every": 10}
+        with pytest.raises(ValueError, match="from compiled code") as info:
+            integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.01, **options)
+        check_partial(info.value.partial)
+
+    @pytest.mark.parametrize("wrong", ["fun", "grad", "value"])
+    def test_shape_that_changes_on_the_way(self, wrong):
+        """One value where two belong must not be spread over both."""
+        from numba import njit
+
+        number = ["fun", "grad", "value"].index(wrong)
+        fun = njit(lambda t, y: np.array([y[1], -y[0]])[: (1 if number == 0 and t > 0.5 else 2)].copy())
+        grad = njit(lambda t, y: np.stack((2 * y, y))[: (1 if number == 1 and t > 0.5 else 2)].copy())
+        value = njit(lambda t, y: np.array([y @ y, 0.5 * (y @ y)])[: (1 if number == 2 and t > 0.5 else 2)].copy())
+        with pytest.raises(ValueError, match=r"size|shape|returned"):
+            integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.1, invariants=Invariant(value, grad), compiled=True)
+
+    def test_ctrl_c_is_honoured_within_a_second(self):
+        from numba import njit
+
+        fun = njit(lambda t, y: np.array([y[1], -y[0]]))
+
+        def interrupt(signum, frame):
+            raise KeyboardInterrupt
+
+        integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.1, compiled=True)
+        before = signal.signal(signal.SIGALRM, interrupt)
+        try:
+            signal.setitimer(signal.ITIMER_REAL, 2.5)
+            begin = time.perf_counter()
+            with pytest.raises(KeyboardInterrupt) as info:
+                integrate(fun, (0, 1e7), Y0, method=EIPRK4, h=1e-3, save_every=10**6, compiled=True)
+            seconds = time.perf_counter() - begin
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, before)
+        assert seconds < 3.5
+        partial = info.value.partial
+        assert partial.t[-1] > 10.0
+        assert partial.t.size >= 2
+        np.testing.assert_allclose(partial.y[0], np.cos(partial.t) + 2 * np.sin(partial.t), atol=1e-6)
+
+
+# The interval and the step.
+
+
+@pytest.mark.parametrize("span", [(0, 1, 2), (0,), "ab", None, 1.0, (0, None)])
+def test_t_span_of_two_numbers(span):
+    with pytest.raises(ValueError, match="t_span must hold two numbers"):
+        by_integrate(t_span=span)
+
+
+@pytest.mark.parametrize("span", [(0, math.inf), (math.nan, 1), (0, math.nan), (-math.inf, 0)])
+def test_t_span_finite(span):
+    with pytest.raises(ValueError, match="t_span must be finite"):
+        by_integrate(t_span=span)
+
+
+def test_t_bound_nan_through_the_solver_class():
+    with pytest.raises(ValueError, match="nan"):
+        by_scipy(t_span=(0, math.nan))
+
+
+def test_unbounded_interval_through_the_solver_class():
+    """It cannot know whether an event ends the run."""
+    solver = EIPRK4(oscillator, 0.0, Y0, math.inf, h=0.1, invariants=SQUARE)
+    for _ in range(25):
+        solver.step()
+    assert solver.status == "running"
+    assert solver.t == 25 * 0.1
+
+    def far(t, y):
+        return t - 2.05
+
+    far.terminal = True
+    sol = solve_ivp(oscillator, (0, math.inf), Y0, method=EIPRK4, h=0.1, invariants=SQUARE, events=far)
+    assert sol.status == 1
+    assert sol.t_events[0][0] == pytest.approx(2.05)
+
+
+@both
+@pytest.mark.parametrize("h", [0, -0.1, math.nan, math.inf, True, "0.1", [0.1], 0.1 + 0j])
+def test_h_positive(driver, h):
+    with pytest.raises(ValueError, match=r"`h` must be positive\. Got " + re.escape(repr(h))):
+        driver(h=h)
+
+
+@both
+def test_h_missing(driver):
+    with pytest.raises(ValueError, match="EIPRK4 needs the step h="):
+        driver(h=None)
+
+
+@both
+@pytest.mark.parametrize("span", [(0, 1), (1, 0), (100, 101)])
+def test_h_longer_than_the_interval(driver, span):
+    with pytest.raises(ValueError, match=r"`h` exceeds bounds"):
+        driver(t_span=span, h=1.1)
+    assert driver(t_span=span, h=1.0).t[-1] == span[1]
+
+
+@both
+@pytest.mark.parametrize("t", [5.0, 1e6, -3e9])
+def test_h_of_ten_spacings(driver, t):
+    spacing = float(np.spacing(abs(t)))
+    span = (t, t + 100 * spacing)
+    with pytest.raises(ValueError, match=r"`h` is too small: h = .* below 10 spacings of t"):
+        driver(t_span=span, h=9.5 * float(np.spacing(max(map(abs, span)))))
+    run = driver(t_span=span, h=10 * float(np.spacing(max(map(abs, span)))))
+    assert run.status == 0
+    assert run.t[-1] == span[1]
+    assert (np.diff(run.t) > 0).all()
+
+
+@both
+def test_h_far_below_the_spacing(driver):
+    with pytest.raises(ValueError, match="`h` is too small"):
+        driver(t_span=(5, 6), h=1e-20)
+
+
+@both
+@pytest.mark.parametrize("option", ["first_step", "max_step"])
+def test_h_with_options_of_adaptive_steps(driver, option):
+    with pytest.raises((ValueError, TypeError), match=option):
+        driver(**{option: 0.1})
+
+
+@both
+@pytest.mark.parametrize(
+    ("span", "h", "n"),
+    [
+        ((0, 1), 0.3, 4),
+        ((1, 0), 0.3, 4),
+        ((0, 1), 0.1, 10),
+        ((0, 0.3), 0.1, 3),
+        ((0.1, 0.7), 0.1, 6),
+        ((1e6, 1e6 + 1), 1e-3, 1000),
+        ((0, 1), 1 / 3, 3),
+        ((0, 1), 1 / 3 * (1 - 1e-12), 3),
+        ((0, 1), 1 / 3 * (1 - 1e-6), 4),
+        ((-2.5, 1.0), 0.7, 5),
+    ],
+)
+def test_steps_end_on_t_bound(driver, span, h, n):
+    """All of nominal length but the last; none of round-off's length."""
+    run = driver(t_span=span, h=h, **({"save_every": 1} if driver is by_integrate else {}))
+    assert len(run.t) == n + 1
+    assert (run.t[0], run.t[-1]) == span
+    sign = np.sign(span[1] - span[0])
+    np.testing.assert_array_equal(run.t[:-1], span[0] + np.arange(n) * (sign * h))
+    assert (sign * np.diff(run.t) > 1e-7 * h).all()
+
+
+@both
+def test_backward_is_the_inverse(driver):
+    there = driver(t_span=(0, 1), h=0.01, invariants=SQUARE)
+    back = driver(t_span=(1, 0), h=0.01, y0=there.y[:, -1], invariants=SQUARE)
+    assert back.t[-1] == 0.0
+    np.testing.assert_allclose(back.y[:, -1], Y0, atol=1e-9)
+    exact = [np.cos(1.0) + 2 * np.sin(1.0), 2 * np.cos(1.0) - np.sin(1.0)]
+    np.testing.assert_allclose(there.y[:, -1], exact, atol=1e-9)
+
+
+@both
+@pytest.mark.parametrize("h", [1e-30, 0.1, 1e9])
+def test_zero_length_interval(driver, h):
+    """Any h; no step is made, nothing projected."""
+    run = driver(t_span=(2, 2), h=h, invariants=SQUARE)
+    assert run.status == 0
+    assert set(run.t.tolist()) == {2.0}
+    assert (run.y == np.array(Y0)[:, None]).all()
+    assert run.njev == 0
+
+
+# Tolerances and options.
+
+
+@both
+@pytest.mark.parametrize("name", ["rtol", "atol"])
+@pytest.mark.parametrize("value", [-1e-3, math.nan, [1e-3, -1e-3], [math.nan, 1.0]])
+def test_tolerances_positive(driver, name, value):
+    with pytest.raises(ValueError, match=f"`{name}` must be positive"):
+        driver(**{name: value})
+
+
+@both
+@pytest.mark.parametrize("name", ["rtol", "atol"])
+@pytest.mark.parametrize("value", [[1e-6], [1e-6] * 3, np.full((2, 1), 1e-6)])
+def test_tolerances_of_wrong_shape(driver, name, value):
+    with pytest.raises(ValueError, match=f"`{name}` has wrong shape"):
+        driver(**{name: value})
+
+
+@both
+@pytest.mark.parametrize("name", ["rtol", "atol"])
+def test_tolerances_no_numbers(driver, name):
+    with pytest.raises((ValueError, TypeError), match=name):
+        driver(**{name: "tight"})
+
+
+WRONG_OPTIONS = [
+    ("metric", "errors", "metric must be 'error', 'euclidean' or an array"),
+    ("metric", [1.0, 2.0, 3.0], r"metric: weights have shape \(3,\), the state has 2"),
+    ("metric", 3.0, r"metric: weights have shape \(\)"),
+    ("metric", [1.0, -1.0], "metric: weights must be finite, >= 0"),
+    ("metric", [0.0, 0.0], "metric: weights must be finite, >= 0 and not all 0"),
+    ("metric", [1.0, math.nan], "metric: weights must be finite"),
+    ("blocks", 3, "blocks = 3 does not divide the state's 2 components"),
+    ("blocks", 0, "blocks = 0 does not divide"),
+    ("blocks", -2, "blocks = -2 does not divide"),
+    ("blocks", True, "blocks must be an integer or a sequence of index arrays"),
+    ("blocks", 1.5, "blocks must be an integer or a sequence of index arrays"),
+    ("blocks", "ab", "blocks: "),
+    ("blocks", [[0, 1], [1]], "blocks: a component stands in two blocks"),
+    ("blocks", [[0, 0]], "blocks: a component stands in two blocks"),
+    ("blocks", [[0, 2]], "blocks: .* no array of indices from 0 to 1"),
+    ("blocks", [[-1]], "blocks: .* no array of indices from 0 to 1"),
+    ("blocks", [[0.5]], "blocks: .* no array of indices from 0 to 1"),
+    ("frame", 3, r"frame must be a pair \(C, S\)"),
+    ("frame", (np.ones((1, 3)), np.ones((3, 1))), r"frame: C has shape \(1, 3\)"),
+    ("frame", (np.ones((1, 2)), np.ones((1, 2))), r"frame: C has shape \(1, 2\) and S \(1, 2\)"),
+    ("frame", (np.array([[1.0, 0.0]]), np.array([[0.0], [1.0]])), "frame: C S is singular"),
+    ("frame", (np.array([[math.nan, 0.0]]), np.array([[1.0], [1.0]])), "frame: C S is singular"),
+    ("frame", (np.array([[1j, 0.0]]), np.array([[1.0], [1.0]])), "frame: C and S must be real"),
+    ("frame", (np.zeros((0, 2)), np.zeros((2, 0))), "frame"),
+    ("direction", "newest", "direction must be 'new', 'old' or 'midpoint', got 'newest'"),
+    ("direction", None, "direction must be 'new', 'old' or 'midpoint', got None"),
+    ("direction", ["new"], "direction must be 'new', 'old' or 'midpoint'"),
+    *((key, v, f"{key} must be an integer >= 1") for key in ("iterations", "every") for v in (0, -1, 1.0, "2", True)),
+    *((key, v, f"{key} must be True or False") for key in ("reuse_f", "check", "project_initial") for v in (1, None)),
+]
+
+
+@both
+@pytest.mark.parametrize(("name", "value", "match"), WRONG_OPTIONS)
+def test_wrong_values_of_options(driver, name, value, match):
+    with pytest.raises(ValueError, match=match):
+        driver(invariants=SQUARE, **{name: value})
+
+
+@both
+@pytest.mark.parametrize("value", [{}, Diagnostics, True])
+def test_wrong_diagnostics(driver, value):
+    with pytest.raises(TypeError, match=r"diagnostics must be a Diagnostics\(\) object"):
+        driver(diagnostics=value)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "nearest"),
+    [("invarients", "invariants"), ("iteration", "iterations"), ("block", "blocks"), ("Rtol", "rtol")],
+)
+def test_unknown_options_name_the_nearest(wrong, nearest):
+    with pytest.raises(TypeError, match=f"no option '{wrong}'.*did you mean '{nearest}'"):
+        by_integrate(**{wrong: 1})
+    with pytest.warns(UserWarning, match=f"EIPRK4 has no option '{wrong}'.*did you mean '{nearest}'") as record:
+        by_scipy(**{wrong: 1})
+    assert len(record) == 1
+
+
+def test_unknown_option_like_no_other():
+    with pytest.raises(TypeError, match=r"no option 'zzzz'$"):
+        by_integrate(zzzz=1)
+    with pytest.warns(UserWarning, match="no option 'zzzz'"):
+        by_scipy(zzzz=1)
+
+
+@pytest.mark.parametrize("method", ["RK45", "EIPRK4", RK45, None, EIPSolver, 4])
+def test_wrong_method(method):
+    with pytest.raises(TypeError, match="method must be an EIP class such as EIPRK4"):
+        by_integrate(method=method)
+
+
+def test_method_without_a_tableau_through_solve_ivp():
+    with pytest.raises(TypeError, match="eip_method"):
+        by_scipy(method=EIPSolver)
+
+
+def test_method_with_a_hook_of_its_own():
+    class Hooked(EIPRK4):
+        def _project_step(self, t, y, y_hat, err):
+            return super()._project_step(t, y, y_hat, err)
+
+    with pytest.raises(TypeError, match="_project_step; use it through solve_ivp"):
+        by_integrate(method=Hooked)
+    np.testing.assert_array_equal(by_scipy(method=Hooked, invariants=SQUARE).y, by_scipy(invariants=SQUARE).y)
+
+
+def test_missing_arguments():
+    with pytest.raises(TypeError, match="method"):
+        integrate(oscillator, (0, 1), Y0, h=0.1)
+    with pytest.raises(TypeError, match="y0 is missing"):
+        integrate(oscillator, (0, 1), method=EIPRK4, h=0.1)
+    with pytest.raises(TypeError, match="fun must be callable or a Problem, got 3"):
+        by_integrate(3)
+
+
+# Saving.
+
+
+@pytest.mark.parametrize("value", [0, -1, 1.5, "1", True])
+def test_save_every_is_a_positive_integer(value):
+    with pytest.raises(ValueError, match="save_every must be an integer >= 1"):
+        by_integrate(save_every=value)
+
+
+@pytest.mark.parametrize(
+    ("t_eval", "match"),
+    [
+        ([0.2, math.nan], "t_eval must be finite"),
+        ([0.2, math.inf], "t_eval must be finite"),
+        ([0.5, 1.1], "`t_eval` are not within `t_span`"),
+        ([-0.1, 0.5], "`t_eval` are not within `t_span`"),
+        ([0.5, 0.2], "`t_eval` are not properly sorted"),
+        ([0.5, 0.5], "`t_eval` are not properly sorted"),
+        ([[0.5]], "`t_eval` must be 1-dimensional"),
+        (0.5, "`t_eval` must be 1-dimensional"),
+        ([], "`t_eval` must be 1-dimensional and not empty"),
+    ],
+)
+def test_wrong_t_eval(t_eval, match):
+    with pytest.raises(ValueError, match=match):
+        by_integrate(t_eval=t_eval)
+
+
+def test_t_eval_in_the_direction_of_the_run():
+    with pytest.raises(ValueError, match="`t_eval` are not properly sorted"):
+        by_integrate(t_span=(1, 0), t_eval=[0.2, 0.5])
+    with pytest.raises(ValueError, match="save_every or t_eval, not both"):
+        by_integrate(t_eval=[0.5], save_every=1)
+
+
+def test_memory_is_estimated_before_the_run():
+    begin = time.perf_counter()
+    with pytest.raises(MemoryError, match=r"needs 2\.4e\+04 GB, .*save_every"):
+        by_integrate(t_span=(0, 1e6), h=1e-6, save_every=1)
+    with pytest.raises(MemoryError, match=r"1e\+03 states of 2 components needs .* bound is .* GB; .*save_every"):
+        by_integrate(h=1e-3, save_every=1, max_bytes=20_000)
+    assert time.perf_counter() - begin < 2.0
+    assert by_integrate(h=1e-3, save_every=1, max_bytes=30_000).t.size == 1001
+    assert by_integrate(h=1e-3, max_bytes=1000).t.size == 2
+
+
+def test_memory_of_the_invariants_counts_too():
+    """Fifty values at each saved state are 25 times what a state of two components needs."""
+    many = Invariant(lambda t, y: np.full(50, y @ y), lambda t, y: np.tile(2 * y, (50, 1)))
+    with pytest.raises(MemoryError, match="save_every"):
+        by_integrate(h=1e-3, save_every=1, max_bytes=30_000, invariants=many)
+
+
+# Invariants.
+
+
+@both
+def test_invariants_of_wrong_kind(driver):
+    with pytest.raises(TypeError, match=r"wrap it: Invariant\(square, grad="):
+        driver(invariants=square)
+    with pytest.raises(TypeError, match=r"expected Invariant objects, got .*wrap functions"):
+        driver(invariants=[SQUARE, square])
+    with pytest.raises(TypeError, match="expected an Invariant or a sequence of them, got None"):
+        driver(invariants=None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "error", "match"),
+    [
+        ((3,), {}, TypeError, "fun must be callable, got 3"),
+        ((square, 3), {}, TypeError, "grad must be callable or None, got 3"),
+        ((square,), {"in_place": True}, ValueError, "in_place and uses_f describe grad"),
+        ((square,), {"uses_f": True}, ValueError, "in_place and uses_f describe grad"),
+        ((square,), {"scale": -1.0}, ValueError, "scale must be a finite number >= 0"),
+        ((square,), {"scale": math.nan}, ValueError, "scale must be a finite number >= 0"),
+        ((square,), {"args": 3}, TypeError, r"args must be a tuple, got 3; write args=\(x,\)"),
+        ((square,), {"target": "x"}, (ValueError, TypeError), "target|string"),
+    ],
+)
+def test_wrong_invariants(arguments, options, error, match):
+    with pytest.raises(error, match=match):
+        Invariant(*arguments, **options)
+
+
+VALUE_MISTAKES = [
+    (lambda t, y: math.nan, ValueError, "invariant 'H' is not finite at y0"),
+    (lambda t, y: math.inf, ValueError, "invariant 'H' is not finite at y0"),
+    (lambda t, y: np.array([1.0, math.nan]), ValueError, r"invariant 'H\[1\]' is not finite at y0"),
+    (lambda t, y: np.ones((2, 2)), ValueError, r"invariant 'H' returned shape \(2, 2\)"),
+    (lambda t, y: 1j * (y @ y), ValueError, "invariant 'H' returned complex values"),
+    (lambda t, y: None, TypeError, "invariant 'H' returned .*None"),
+    (lambda t, y: "x", TypeError, "invariant 'H' returned"),
+]
+
+
+@both
+@pytest.mark.parametrize(("value", "error", "match"), VALUE_MISTAKES)
+@pytest.mark.parametrize("grad", [None, square_gradient], ids=["no grad", "grad"])
+def test_wrong_values_of_invariants(driver, value, error, match, grad):
+    with pytest.raises(error, match=match):
+        driver(invariants=Invariant(value, grad, name="H"))
+
+
+GRADIENT_MISTAKES = [
+    (lambda t, y: 2 * y[:1], r"gradient of invariant 'H' has shape \(1,\), expected \(2,\)"),
+    (lambda t, y: 2 * y[None], r"gradient of invariant 'H' has shape \(1, 2\), expected \(2,\)"),
+    (lambda t, y: 1.0, r"gradient of invariant 'H' has shape \(\), expected \(2,\)"),
+    (lambda t, y: None, "gradient of invariant 'H'"),
+    (lambda t, y: 2j * y, "gradient of invariant 'H' is complex, but y0 is real"),
+    (lambda t, y: math.nan * y, "gradient of invariant 'H' is not finite at y0"),
+]
+
+
+@both
+@pytest.mark.parametrize(("grad", "match"), GRADIENT_MISTAKES)
+def test_wrong_gradients(driver, grad, match):
+    with pytest.raises((ValueError, TypeError), match=match):
+        driver(invariants=Invariant(square, grad, name="H"))
+
+
+@both
+def test_value_and_gradient_must_fit(driver):
+    """Three values, a gradient of one."""
+    with pytest.raises(ValueError, match=r"gradient of invariant 'H' has shape \(2,\), expected \(3, 2\)"):
+        driver(invariants=Invariant(lambda t, y: np.full(3, y @ y), square_gradient, name="H"))
+
+
+LATE_MISTAKES = {
+    "value, three for one": (lambda t, y: y @ y if t < 0.5 else np.ones(3), square_gradient),
+    "value, one for two": (
+        lambda t, y: np.full(2 if t < 0.5 else 1, y @ y), lambda t, y: np.array([2 * y, 2 * y]),
+    ),
+    "gradient, one for two": (square, lambda t, y: 2 * y if t < 0.5 else 2 * y[:1]),
+    "gradient, matrix for row": (square, lambda t, y: 2 * y if t < 0.5 else 2 * y[None]),
+}  # fmt: skip
+
+
+@both
+@pytest.mark.parametrize("mistake", LATE_MISTAKES)
+def test_shapes_that_change_on_the_way(driver, mistake):
+    """Named, and never spread over the components silently."""
+    value, grad = LATE_MISTAKES[mistake]
+    with pytest.raises(ValueError, match=r"'H'.*shape"):
+        driver(invariants=Invariant(value, grad, name="H"), check=False)
+
+
+@both
+@pytest.mark.parametrize("factor", [-1.0, 1.001, 2.0, 0.0])
+def test_wrong_gradient_is_found_at_the_start(driver, factor):
+    wrong = Invariant(square, lambda t, y: factor * 2 * y, name="H")
+    with pytest.raises(ValueError, match=r"gradient of invariant 'H' is wrong: .* by differences and .* by grad"):
+        driver(invariants=wrong)
+
+
+@both
+def test_check_false_skips_the_check(driver):
+    assert driver(invariants=Invariant(square, lambda t, y: 1.001 * 2 * y), check=False).status == 0
+
+
+@both
+def test_wrong_component_of_a_small_part_is_found(driver):
+    """A wrong derivative by a component of 1e-9 between ones of 1e9: units do not hide it."""
+    y0 = np.array([1e9, 2e9, 1e-9, 2e-9])
+    wrong = Invariant(
+        lambda t, y: y[0] ** 2 + y[1] ** 2 + 1e36 * (y[2] ** 2 + y[3] ** 2),
+        lambda t, y: np.array([2 * y[0], 2 * y[1], 2e36 * y[2], -2e36 * y[3]]),
+    )
+    with pytest.raises(ValueError, match=r"gradient of invariant .* is wrong"):
+        driver(lambda t, y: np.array([y[1], -y[0], y[3], -y[2]]), y0=y0, invariants=wrong)
+
+
+@both
+def test_no_invariant_warns(driver):
+    first = Invariant(lambda t, y: y[0], lambda t, y: np.array([1.0, 0.0]), name="first")
+    with pytest.warns(UserWarning, match="'first' is no invariant of this system: .* changes at the rate 2") as record:
+        driver(invariants=first)
+    assert len(record) == 1
+    assert record[0].filename == __file__
+
+
+@both
+def test_start_off_the_target(driver):
+    off = Invariant(square, square_gradient, target=5.001, name="H")
+    with pytest.raises(ValueError, match=r"start violates invariant 'H' by -0\.001; .*project_initial=True"):
+        driver(invariants=off)
+    assert driver(invariants=Invariant(square, square_gradient, target=5 * (1 + 1e-9))).status == 0
+    with pytest.raises(ValueError, match="violates invariant"):
+        driver(invariants=Invariant(square, square_gradient, target=5 * (1 + 3e-8)))
+
+
+@both
+@pytest.mark.parametrize(("target", "match"), [(math.nan, "must be finite"), ([1.0, 2.0], r"has shape \(2,\)")])
+def test_wrong_targets(driver, target, match):
+    with pytest.raises(ValueError, match=f"invariant 'H': target {match}"):
+        driver(invariants=Invariant(square, square_gradient, target=target, name="H"))
+
+
+# project() and check_gradient().
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({}, "invariant 'S' has no target"),
+        ({"target": [1.0, 2.0]}, "target must be 1 finite numbers"),
+        ({"target": math.nan}, "target must be 1 finite numbers"),
+        ({"target": 1.0, "sigma": [1.0]}, r"sigma: weights have shape \(1,\)"),
+        ({"target": 1.0, "sigma": [0.0, 0.0]}, "sigma: weights must be finite"),
+        ({"target": 1.0, "iterations": 0}, "iterations must be an integer >= 1"),
+        ({"target": 1.0, "frame": 3}, "frame must be a pair"),
+    ],
+)
+def test_wrong_arguments_of_project(options, match):
+    with pytest.raises(ValueError, match=match):
+        project(Y0, SQUARE, **options)
+
+
+def test_project_needs_f_where_a_gradient_uses_it():
+    kept = Invariant(square, lambda t, y, f: 2 * y, uses_f=True, target=1.0)
+    with pytest.raises(ValueError, match="pass f="):
+        project([0.6, 0.81], kept)
+    with pytest.raises(ValueError, match=r"function f\(t, y\)"):
+        project([0.6, 0.81], kept, f=[1.0, 1.0], iterations=2)
+    assert project([0.6, 0.81], kept, f=oscillator, iterations=3).defect[0] == pytest.approx(0, abs=4 * EPS)
+    with pytest.raises(ValueError, match="pass fun="):
+        check_gradient(kept, 0.0, Y0)
+
+
+def test_project_state():
+    with pytest.raises(ValueError, match="must be finite"):
+        project([1.0, math.nan], SQUARE, target=1.0)
+    with pytest.raises(ValueError, match="1-dimensional"):
+        project([Y0], SQUARE, target=1.0)
+
+
+def test_project_that_fails():
+    wrong = Invariant(square, lambda t, y: -2 * y, target=1.0, name="W")
+    with pytest.raises(ValueError, match=r"projection failed at t=3: invariant 'W', residual .*, rank 1 of 1"):
+        project([0.6, 0.81], wrong, t=3.0)
+
+
+# Compilation.
+
+
+@pytest.mark.needs_jit
+class TestNotCompilable:
+    @staticmethod
+    def jitted():
+        from numba import njit
+
+        return (
+            njit(lambda t, y: np.array([y[1], -y[0]])),
+            njit(lambda t, y: y[0] * y[0] + y[1] * y[1]),
+            njit(lambda t, y: 2 * y),
+        )
+
+    def cases(self):
+        from numba import njit
+
+        fun, value, grad = self.jitted()
+        two_arguments = njit(lambda t, y, p: y)
+        return {
+            "plain fun": (oscillator, (), "fun is not a Numba function"),
+            "plain value": (fun, Invariant(square, grad, name="V"), "invariant 'V' is not a Numba function"),
+            "plain grad": (fun, Invariant(value, square_gradient, name="V"), "gradient of invariant 'V' is not"),
+            "no grad": (fun, Invariant(value, name="V"), "invariant 'V' has no grad"),
+            "args": (fun, Invariant(lambda t, y, a: y @ y, lambda t, y, a: 2 * y, args=(1,), name="V"), "'V' has args"),
+            "arguments": (fun, Invariant(value, two_arguments, name="V"), None),
+        }
+
+    @pytest.mark.filterwarnings("ignore:invariant 'V' has no grad")
+    @pytest.mark.parametrize("case", ["plain fun", "plain value", "plain grad", "no grad", "args"])
+    def test_says_which_and_why(self, case):
+        fun, invariants, reason = self.cases()[case]
+        with pytest.raises(TypeError, match=reason):
+            by_integrate(fun, invariants=invariants, compiled=True)
+        run = by_integrate(fun, invariants=invariants)
+        assert run.status == 0
+        assert not run.compiled
+        assert "interpreted: " in run.message
+        assert reason.lstrip("'") in run.message
+
+    def test_wrong_number_of_arguments(self):
+        fun, invariants, _ = self.cases()["arguments"]
+        with pytest.raises(TypeError, match=r"argument|V"):
+            by_integrate(fun, invariants=invariants, compiled=True)
+
+    def test_compiled_false_says_so(self):
+        run = by_integrate(self.jitted()[0], compiled=False)
+        assert not run.compiled
+        assert "compiled=False" in run.message
+
+    def test_compiled_run_says_so(self):
+        run = by_integrate(self.jitted()[0])
+        assert run.compiled
+        assert "interpreted" not in run.message
+
+
+def test_jit_disabled_is_a_reason(monkeypatch):
+    import numba
+
+    monkeypatch.setattr(numba.config, "DISABLE_JIT", True)
+    run = integrate(kepler(), (0, 1), method=EIPRK4)
+    assert not run.compiled
+    assert "NUMBA_DISABLE_JIT" in run.message
+    with pytest.raises(TypeError, match="NUMBA_DISABLE_JIT"):
+        integrate(kepler(), (0, 1), method=EIPRK4, compiled=True)
+
+
+@pytest.mark.parametrize("value", ["x", [[1], [2, 3]], {"a": 1}])
+def test_params_are_numbers(value):
+    with pytest.raises(TypeError, match="params must be an array of numbers"):
+        by_integrate(lambda t, y, p: oscillator(t, y), params=value)
+
+
+# What callers see while it runs.
+
+
+def test_progress_goes_to_stderr(capsys):
+    by_integrate(progress=True, invariants=SQUARE)
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert "EIPRK4" in shown.err
+    assert "100%" in shown.err
+    by_integrate()
+    assert capsys.readouterr().err == ""
+
+
+def test_progress_bar_is_closed_when_the_run_fails(capsys):
+    def fun(t, y):
+        return oscillator(t, y) if t < 0.45 else np.full(2, np.nan)
+
+    run = by_integrate(fun, progress=True)
+    assert run.status == -1
+    shown = capsys.readouterr().err
+    assert "40%" in shown
+    assert shown.endswith("\n")
+
+
+def test_no_estimate_no_error_metric():
+    """RK1 has none: metric="error" is then the euclidean one, and the largest correction is unknown."""
+    one, other = (by_integrate(method=EIPRK1, metric=m, invariants=SQUARE) for m in ("error", "euclidean"))
+    np.testing.assert_array_equal(one.y, other.y)
+    assert math.isnan(one.diagnostics.max_correction)
+    assert not math.isnan(by_integrate(method=EIPRK3, invariants=SQUARE).diagnostics.max_correction)

@@ -1,0 +1,347 @@
+"""Compiled and interpreted runs of the same jitted functions agree bit for bit, and with solve_ivp."""
+
+from math import sqrt
+
+import numpy as np
+import pytest
+from numba import njit
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, Invariant, integrate
+from eip_scipy.problems import nbody
+
+pytestmark = pytest.mark.needs_jit
+
+# Kepler with a relativistic term: plain, with params, and in place.
+
+
+@njit
+def fun(t, y):
+    r2 = y[0] * y[0] + y[1] * y[1]
+    w = 1.0 / (r2 * sqrt(r2))
+    w += 0.0075 * w / r2
+    return np.array([y[2], y[3], -w * y[0], -w * y[1]])
+
+
+@njit
+def energy(t, y):
+    r2 = y[0] * y[0] + y[1] * y[1]
+    r = sqrt(r2)
+    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1.0 / r - 0.0025 / (r * r2)
+
+
+@njit
+def energy_gradient(t, y):
+    f = fun(t, y)
+    return np.array([-f[2], -f[3], y[2], y[3]])
+
+
+@njit
+def energy_gradient_of_f(t, y, f):
+    return np.array([-f[2], -f[3], y[2], y[3]])
+
+
+@njit
+def momentum(t, y):
+    return y[0] * y[3] - y[1] * y[2]
+
+
+@njit
+def momentum_gradient(t, y):
+    return np.array([y[3], -y[2], -y[1], y[0]])
+
+
+@njit
+def both(t, y):
+    return np.array([energy(t, y), momentum(t, y)])
+
+
+@njit
+def both_gradients(t, y):
+    out = np.empty((2, 4))
+    out[0], out[1] = energy_gradient(t, y), momentum_gradient(t, y)
+    return out
+
+
+@njit
+def fun_in_place(t, y, out, p):
+    r2 = y[0] * y[0] + y[1] * y[1]
+    w = p[0] / (r2 * sqrt(r2))
+    out[0], out[1], out[2], out[3] = y[2], y[3], -w * y[0], -w * y[1]
+
+
+@njit
+def fun_of_params(t, y, p):
+    out = np.empty(4)
+    fun_in_place(t, y, out, p)
+    return out
+
+
+@njit
+def energy_of_params(t, y, p):
+    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - p[0] / sqrt(y[0] * y[0] + y[1] * y[1])
+
+
+@njit
+def energy_gradient_in_place(t, y, f, out, p):
+    out[0], out[1], out[2], out[3] = -f[2], -f[3], y[2], y[3]
+
+
+@njit
+def momentum_of_params(t, y, p):
+    return y[0] * y[3] - y[1] * y[2]
+
+
+@njit
+def momentum_gradient_in_place(t, y, out, p):
+    out[0], out[1], out[2], out[3] = y[3], -y[2], -y[1], y[0]
+
+
+@njit
+def clock(t, y):
+    return np.array([y[1], -y[0] + np.sin(3.0 * t), 1.0])
+
+
+@njit
+def clock_value(t, y):
+    return y[2] - t
+
+
+@njit
+def clock_gradient(t, y):
+    return np.array([0.0, 0.0, 1.0])
+
+
+Y0 = np.array([0.4, 0.0, 0.0, 2.0])
+H, L = Invariant(energy, energy_gradient, name="H"), Invariant(momentum, momentum_gradient, name="L")
+H_OF_F = Invariant(energy, energy_gradient_of_f, uses_f=True, name="H")
+HL = Invariant(both, both_gradients, name="HL")
+WITH_PARAMS = [
+    Invariant(energy_of_params, energy_gradient_in_place, in_place=True, uses_f=True, name="H"),
+    Invariant(momentum_of_params, momentum_gradient_in_place, in_place=True, name="L"),
+]
+FRAME = (np.array([[1.0, 2.0, 0.0, 0.0]]), np.array([[0.5], [0.25], [0.0], [0.0]]))
+
+
+def same(one, other):
+    """Every number of two results."""
+    assert other.message.startswith(one.message)
+    for key in ("t", "y", "invariants", "max_defect"):
+        np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+    for key in ("status", "nfev", "njev", "nlu"):
+        assert one[key] == other[key], key
+    for key in ("n_projections", "n_skipped", "n_rank_reduced", "n_rejected_projections"):
+        assert getattr(one.diagnostics, key) == getattr(other.diagnostics, key), key
+    np.testing.assert_array_equal(one.diagnostics.last_defect, other.diagnostics.last_defect)
+    np.testing.assert_array_equal(one.diagnostics.max_correction, other.diagnostics.max_correction)
+
+
+def compare(fun, span, y0, **options):
+    options = {"method": EIPRK4, "h": 0.03, "save_every": 1} | options
+    compiled, interpreted = (integrate(fun, span, y0, compiled=c, **options) for c in (True, False))
+    assert compiled.compiled
+    assert not interpreted.compiled
+    same(compiled, interpreted)
+    return compiled
+
+
+CASES = {
+    "no invariants": {},
+    "one": {"invariants": H},
+    "two": {"invariants": [H, L]},
+    "duplicates": {"invariants": [H, H, L]},
+    "one of two values": {"invariants": HL},
+    "uses f": {"invariants": [H_OF_F, L]},
+    "uses f, fresh": {"invariants": [H_OF_F, L], "reuse_f": False},
+    "euclidean, uses f": {"invariants": [L, H_OF_F], "metric": "euclidean"},
+    "weights": {"invariants": [H, L], "metric": [1.0, 0.5, 0.25, 0.3]},
+    "tolerances": {"invariants": [H, L], "rtol": [1e-3, 1e-4, 1e-5, 1e-2], "atol": 0.0},
+    "blocks": {"invariants": [H, L], "blocks": 2},
+    "block lists": {"invariants": [H, L], "blocks": [[0, 3], [2]]},
+    "frame": {"invariants": [H, L], "frame": FRAME},
+    "midpoint": {"invariants": [H_OF_F, L], "direction": "midpoint"},
+    "two iterations": {"invariants": [H, L], "iterations": 2},
+    "old, two iterations, frame": {"invariants": [H_OF_F, L], "direction": "old", "iterations": 2, "frame": FRAME},
+    "midpoint, two iterations": {"invariants": [H, L], "direction": "midpoint", "iterations": 2, "blocks": 4},
+    "every third": {"invariants": [H, L], "every": 3},
+    "every seventh, blocks, frame": {"invariants": [H, L], "every": 7, "blocks": 2, "frame": FRAME},
+    "compensated": {"invariants": [H, L], "compensated": True},
+    "compensated, alone": {"compensated": True},
+    "compensated, every second": {"invariants": [H_OF_F, L], "compensated": True, "every": 2, "iterations": 2},
+    "saved now and then": {"invariants": [H, L], "save_every": 7, "h": 0.0317},
+    "t_eval": {"invariants": [H, L], "save_every": None, "t_eval": np.sqrt(np.linspace(0.0, 36.0, 57))},
+    "RK1": {"invariants": [H, L], "method": EIPRK1, "h": 0.003},
+    "RK2": {"invariants": [H, L], "method": EIPRK2},
+    "RK3": {"invariants": [H, L], "method": EIPRK3},
+    "RK5, compensated": {"invariants": [H, L], "method": EIPRK5, "compensated": True, "reuse_f": False},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_real(case):
+    run = compare(fun, (0.0, 6.0), Y0, **CASES[case])
+    assert run.status == 0
+    if "invariants" in CASES[case]:
+        assert run.diagnostics.n_projections > 0
+
+
+@pytest.mark.parametrize("case", ["midpoint, two iterations", "compensated, every second"])
+def test_backward(case):
+    run = compare(fun, (6.0, -0.1), Y0, **CASES[case])
+    assert run.t[-1] == -0.1
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+@pytest.mark.parametrize("options", [{}, {"direction": "old", "compensated": True, "iterations": 2}])
+def test_params_and_in_place(in_place, options):
+    rhs = fun_in_place if in_place else fun_of_params
+    options = options | {"in_place": in_place, "invariants": WITH_PARAMS}
+    run = compare(rhs, (0, 6), Y0, params=[1.0], **options)
+    other = integrate(rhs, (0, 6), Y0, params=[1.1], method=EIPRK4, h=0.03, compiled=False, **options)
+    assert (run.y[:, -1] != other.y[:, -1]).any()
+
+
+def test_array_and_in_place_functions_give_the_same_bits():
+    options = {"method": EIPRK4, "h": 0.03, "params": [1.0], "invariants": WITH_PARAMS, "compiled": True}
+    same(integrate(fun_of_params, (0, 6), Y0, **options), integrate(fun_in_place, (0, 6), Y0, in_place=True, **options))
+
+
+def test_time_dependent_functions():
+    kept = Invariant(clock_value, clock_gradient, name="clock")
+    compare(clock, (1.0, 4.0), np.array([1.0, 0.5, 1.0]), invariants=kept, method=EIPRK3, h=0.07)
+
+
+def test_n_bodies():
+    """A vector-valued invariant in place, blocks and a frame."""
+    rng = np.random.default_rng(1)
+    gm, q = np.array([1.0, 1e-3, 2e-4]), np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 0.1]])
+    v = np.array([[0.0, 0, 0], [0, 1.0, 0.1], [-0.7, 0, 0]]) + 1e-3 * rng.standard_normal((3, 3))
+    problem = nbody(gm, q, v, t_span=(0.0, 20.0), h=0.05)
+    for options in ({}, {"every": 5, "compensated": True}):
+        compiled, interpreted = (
+            integrate(problem, method=EIPRK4, save_every=1, compiled=c, **options) for c in (True, False)
+        )
+        same(compiled, interpreted)
+
+
+# A nonlinear Schroedinger lattice.
+
+
+@njit
+def hop(y):
+    out = np.empty_like(y)
+    n = y.size
+    for i in range(n):
+        out[i] = y[(i + 1) % n] + y[i - 1]
+    return out
+
+
+@njit
+def lattice(t, y):
+    w = hop(y)
+    for i in range(y.size):
+        w[i] = 1j * (w[i] + (y[i].real ** 2 + y[i].imag ** 2) * y[i])
+    return w
+
+
+@njit
+def lattice_in_place(t, y, out):
+    out[:] = lattice(t, y)
+
+
+@njit
+def mass(t, y):
+    total = 0.0
+    for z in y:
+        total += z.real**2 + z.imag**2
+    return total
+
+
+@njit
+def mass_gradient(t, y):
+    return 2.0 * y
+
+
+@njit
+def lattice_energy(t, y):
+    total, w = 0.0, hop(y)
+    for i in range(y.size):
+        square = y[i].real ** 2 + y[i].imag ** 2
+        total -= (y[i].conjugate() * w[i]).real + 0.5 * square * square
+    return total
+
+
+@njit
+def lattice_energy_gradient(t, y, f):
+    return 2j * f
+
+
+@njit
+def lattice_energy_gradient_in_place(t, y, f, out):
+    for i in range(y.size):
+        out[i] = 2j * f[i]
+
+
+Z0 = np.exp(1j * np.arange(7.0)) * (1.0 + 0.1 * np.arange(7.0))
+MASS = Invariant(mass, mass_gradient, name="mass")
+ENERGY = Invariant(lattice_energy, lattice_energy_gradient, uses_f=True, name="energy")
+ENERGY_IN_PLACE = Invariant(
+    lattice_energy, lattice_energy_gradient_in_place, uses_f=True, in_place=True, name="energy"
+)
+COMPLEX_FRAME = (np.full((1, 7), 1.0 + 0.5j), np.full((7, 1), 0.2 - 0.1j))
+COMPLEX_CASES = {
+    "no invariants": {},
+    "mass and energy": {"invariants": [MASS, ENERGY]},
+    "euclidean": {"invariants": [MASS, ENERGY], "metric": "euclidean", "iterations": 2},
+    "weights": {"invariants": [ENERGY, MASS], "metric": np.linspace(0.1, 1.0, 7)},
+    "blocks, every": {"invariants": [MASS, ENERGY], "blocks": [[0, 1, 2], [5, 3]], "every": 4},
+    "one block": {"invariants": [MASS, ENERGY], "blocks": 7, "direction": "old"},
+    "frame": {"invariants": [MASS, ENERGY], "frame": COMPLEX_FRAME},
+    "midpoint, compensated": {"invariants": [MASS, ENERGY], "direction": "midpoint", "compensated": True},
+    "t_eval": {"invariants": MASS, "save_every": None, "t_eval": [0.0, 0.1, 0.33, 0.34, 1.9, 2.0]},
+}
+
+
+@pytest.mark.parametrize("case", COMPLEX_CASES)
+def test_complex(case):
+    run = compare(lattice, (0.0, 2.0), Z0, check=False, **COMPLEX_CASES[case])
+    assert run.status == 0
+    assert run.y.dtype == complex
+
+
+@pytest.mark.parametrize("span", [(0.0, 2.0), (2.0, 0.0)])
+def test_complex_in_place(span):
+    options = {"invariants": [MASS, ENERGY_IN_PLACE], "in_place": True, "check": False, "method": EIPRK5}
+    compare(lattice_in_place, span, Z0, **options)
+
+
+# solve_ivp takes the same steps.
+
+
+IVP_CASES = [name for name, options in CASES.items() if not {"compensated", "save_every"} & options.keys()]
+
+
+@pytest.mark.parametrize("case", IVP_CASES)
+@pytest.mark.parametrize("span", [(0.0, 6.0), (0.0, -6.0)])
+def test_solve_ivp_is_the_same_step(case, span):
+    options = {"method": EIPRK4, "h": 0.03} | CASES[case]
+    run = integrate(fun, span, Y0, save_every=1, compiled=False, **options)
+    sol = solve_ivp(fun, span, Y0, **options)
+    np.testing.assert_array_equal(sol.t, run.t)
+    np.testing.assert_array_equal(sol.y, run.y)
+    assert (sol.nfev, sol.njev, sol.nlu) == (run.nfev, run.njev, run.nlu)
+
+
+@pytest.mark.parametrize("case", ["no invariants", "mass and energy", "blocks, every", "frame"])
+def test_solve_ivp_is_the_same_complex_step(case):
+    options = {"method": EIPRK4, "h": 0.03, "check": False} | COMPLEX_CASES[case]
+    run = integrate(lattice, (0, 2), Z0, save_every=1, compiled=True, **options)
+    np.testing.assert_array_equal(solve_ivp(lattice, (0, 2), Z0, **options).y, run.y)
+
+
+def test_results_do_not_depend_on_what_is_saved():
+    """The same steps whatever is saved, interpolated or called back, and again in a second run."""
+    options = {"method": EIPRK4, "h": 0.03, "invariants": [H, L], "compiled": True}
+    end = integrate(fun, (0, 6), Y0, **options).y[:, -1]
+    for more in ({"save_every": 1}, {"t_eval": [0.5, 6.0], "callback": lambda t, y, d: None}):
+        np.testing.assert_array_equal(integrate(fun, (0, 6), Y0, **options, **more).y[:, -1], end)
