@@ -369,15 +369,18 @@ class InvariantSet:
 
     def _check_invariance(self, t: float, y: Array, f: Array, tau: float) -> None:
         # In units of the largest component of f: large states would overflow otherwise.
-        unit = np.max(np.abs(f), initial=0.0) or 1.0
+        unit = np.max(np.abs(f), initial=0.0)
+        if unit < np.finfo(float).tiny / EPS:
+            return
         in_time = self._time_derivative(t, y, tau) / unit
         products = np.real(np.conj(self.gradients(t, y, f)) * (f / unit))
         rate, terms = in_time + products.sum(axis=1), np.abs(in_time) + np.abs(products).sum(axis=1)
         for k, name in enumerate(self.names):
             if abs(rate[k]) > INVARIANCE_TOLERANCE * terms[k]:
                 warnings.warn(
-                    f"{name!r} is no invariant of this system: at the start it changes at the rate {rate[k] * unit:.3g}, "
-                    f"where the terms of that rate sum to {terms[k] * unit:.3g}. Projecting on it gives a wrong solution. "
+                    f"{name!r} is no invariant of this system: at the start it changes at the rate "
+                    f"{rate[k] * unit:.3g}, where the terms of that rate sum to {terms[k] * unit:.3g}. Projecting on "
+                    "it gives a wrong solution. "
                     "(check=False skips this check.)",
                     UserWarning,
                     stacklevel=6,

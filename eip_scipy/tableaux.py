@@ -147,6 +147,8 @@ class Tableau:
             _check_nodes(name, _vector(name, c), nodes)
         _check_order(name, "b", exact_A, exact_b, order)
         weights_hat = None
+        if b_hat is None and error_estimator_order is not None:
+            raise ValueError(f"{name}: error_estimator_order was given without b_hat.")
         if b_hat is not None:
             weights_hat = self._check_embedded(name, exact_A, exact_b, b_hat, order, error_estimator_order)
         e = np.zeros(s + 1)

@@ -57,9 +57,9 @@ def check_no_drift(t, defects):
     ("method", "setting", "largest"),
     [
         (EIPRK4, "paper", (9.4e-13, 3.4e-14)),
-        (EIPRK4, "default", (8.0e-13, 9.6e-14)),
+        (EIPRK4, "default", (1.06e-12, 2.8e-14)),
         (EIPRK5, "paper", (5.8e-15, 1.8e-15)),
-        (EIPRK5, "default", (3.5e-14, 7.2e-15)),
+        (EIPRK5, "default", (2.0e-15, 1.8e-15)),
     ],
 )
 def test_defects_are_stationary(method, setting, largest):

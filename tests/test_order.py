@@ -78,7 +78,7 @@ SYMMETRIC_POINT = pytest.mark.xfail(
     [EIPRK2, pytest.param(EIPRK3, marks=SYMMETRIC_POINT), EIPRK4, pytest.param(EIPRK5, marks=SYMMETRIC_POINT)],
 )
 def test_order_of_the_solution_without_blocks(method, end):
-    order = order_of(method, end, {"metric": "error"})
+    order = order_of(method, end, {"metric": "error", "blocks": None})
     assert order == pytest.approx(method.TABLEAU.order, abs=TOLERANCE)
 
 

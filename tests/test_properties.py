@@ -407,9 +407,9 @@ def raw_step(tableau, fun, t, y, h):
 
 
 def weights(err, y, y_hat, rtol, atol, blocks, kappa):
-    """Design 2.1, to the letter; also the scales and relative errors of the blocks."""
-    scale_of = atol + rtol * np.maximum(np.abs(y), np.abs(y_hat))
-    scale = np.array([np.linalg.norm(scale_of[b]) for b in blocks])
+    """The formula of the documentation; also the scales and relative errors of the blocks."""
+    size = np.linalg.norm
+    scale = np.array([size(atol[b]) + max(size(rtol[b] * y[b]), size(rtol[b] * y_hat[b])) for b in blocks])
     r = np.array([np.linalg.norm(err[b]) for b in blocks]) / scale
     sigma_b = scale * ((r / r.max()) ** kappa + 1e-7)
     sigma = np.zeros(y.size)
