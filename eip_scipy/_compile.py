@@ -7,6 +7,7 @@ than a second.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,17 +63,48 @@ def compile_functions(
     """
     if config.DISABLE_JIT:
         raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
+    parts = tuple(
+        _Part(
+            *_invariant_functions(item, label),
+            label,
+            invariants.scalar[k],
+            int(invariants.starts[k]),
+            int(invariants.starts[k + 1]),
+            item.in_place,
+            item.uses_f,
+        )
+        for k, (item, label) in enumerate(zip(invariants.items, invariants.labels, strict=True))
+    )
+    return _compile_parts(_jitted(fun, "fun"), in_place, has_params, parts, np.dtype(dtype))
+
+
+class _Part(NamedTuple):
+    """One invariant: its functions and its places among all values."""
+
+    fun: Callable[..., Any]
+    grad: Callable[..., Any]
+    label: str
+    scalar: bool
+    start: int
+    stop: int
+    in_place: bool
+    uses_f: bool
+
+
+@lru_cache(maxsize=64)
+def _compile_parts(
+    fun: Callable[..., Any], in_place: bool, has_params: bool, parts: tuple[_Part, ...], dtype: np.dtype
+) -> CompiledFunctions:
+    """The wrappers of the same functions are compiled once in a process."""
     sigs = signatures(dtype)
-    rhs = _compiled(_wrap_rhs(_jitted(fun, "fun"), in_place, has_params), sigs.rhs, "fun")
+    rhs = _compiled(_wrap_rhs(fun, in_place, has_params), sigs.rhs, "fun")
     inv, grad = _no_values, _no_gradients
-    for k, item in enumerate(invariants.items):
-        label, scalar = invariants.labels[k], invariants.scalar[k]
-        start, stop = int(invariants.starts[k]), int(invariants.starts[k + 1])
-        value, gradient = _invariant_functions(item, label)
-        inv = _compiled(_chain_value(inv, value, start, scalar, has_params), sigs.inv, f"invariant {label!r}")
-        rows = 0 if scalar else stop - start
-        wrapped = _chain_gradient(grad, _wrap_gradient(gradient, item, has_params), start, rows, item.in_place)
-        grad = _compiled(wrapped, sigs.grad, f"gradient of invariant {label!r}")
+    for part in parts:
+        value = _chain_value(inv, part.fun, part.start, part.scalar, has_params)
+        inv = _compiled(value, sigs.inv, f"invariant {part.label!r}")
+        rows = 0 if part.scalar else part.stop - part.start
+        gradient = _chain_gradient(grad, _wrap_gradient(part, has_params), part.start, rows, part.in_place)
+        grad = _compiled(gradient, sigs.grad, f"gradient of invariant {part.label!r}")
     return CompiledFunctions(rhs, inv, grad)
 
 
@@ -174,10 +206,10 @@ def _chain_value(before: Any, fun: Any, start: int, scalar: bool, has_params: bo
     return inv
 
 
-def _wrap_gradient(grad: Any, item: Invariant, has_params: bool) -> Any:
+def _wrap_gradient(part: _Part, has_params: bool) -> Any:
     """The user's gradient with all arguments: (t, y, f, params) -> rows, or (t, y, f, out, params) in place."""
-    uses_f = item.uses_f
-    if item.in_place:
+    grad, uses_f = part.grad, part.uses_f
+    if part.in_place:
         if uses_f and has_params:
             return njit(lambda t, y, f, out, params: grad(t, y, f, out, params))
         if uses_f:
