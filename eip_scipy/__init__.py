@@ -6,17 +6,31 @@ from .invariants import Invariant, check_gradient
 from .longrun import integrate
 from .projection import project
 from .result import Diagnostics, IntegrationResult, ProjectionResult
-from .solvers import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPSolver, eip_method
+from .solvers import (
+    EIPDOP853,
+    EIPRK1,
+    EIPRK2,
+    EIPRK3,
+    EIPRK4,
+    EIPRK5,
+    EIPRK23,
+    EIPRK45,
+    EIPSolver,
+    eip_method,
+)
 from .tableaux import Tableau
 
 __version__ = _version("eip_scipy")
 
 __all__ = [
+    "EIPDOP853",
     "EIPRK1",
     "EIPRK2",
     "EIPRK3",
     "EIPRK4",
     "EIPRK5",
+    "EIPRK23",
+    "EIPRK45",
     "Diagnostics",
     "EIPSolver",
     "IntegrationResult",

@@ -17,6 +17,8 @@ from numba.extending import is_jitted
 
 from .invariants import Invariant, InvariantSet
 
+WRONG_FUN = "fun returned an array of another shape than at the start"
+
 __all__ = ["CompiledFunctions", "NotCompilableError", "compile_functions", "signatures"]
 
 
@@ -25,11 +27,12 @@ class NotCompilableError(TypeError):
 
 
 class CompiledFunctions(NamedTuple):
-    """The three functions of the step as Numba dispatchers."""
+    """The functions of the loop, as Numba dispatchers or as Python functions."""
 
     rhs: Callable[..., None]
     inv: Callable[..., None]
     grad: Callable[..., None]
+    event: Callable[..., None]
 
 
 class Signatures(NamedTuple):
@@ -52,7 +55,12 @@ def signatures(dtype: np.dtype) -> Signatures:
 
 
 def compile_functions(
-    fun: Callable[..., Any], in_place: bool, has_params: bool, invariants: InvariantSet, dtype: np.dtype
+    fun: Callable[..., Any],
+    in_place: bool,
+    has_params: bool,
+    invariants: InvariantSet,
+    events: tuple[Callable[..., Any], ...],
+    dtype: np.dtype,
 ) -> CompiledFunctions:
     """Wrap and compile the functions of a run.
 
@@ -68,14 +76,16 @@ def compile_functions(
             *_invariant_functions(item, label),
             label,
             invariants.scalar[k],
-            int(invariants.starts[k]),
-            int(invariants.starts[k + 1]),
+            invariants.starts[k],
+            invariants.starts[k + 1],
             item.in_place,
             item.uses_f,
         )
         for k, (item, label) in enumerate(zip(invariants.items, invariants.labels, strict=True))
     )
-    return _compile_parts(_jitted(fun, "fun"), in_place, has_params, parts, np.dtype(dtype))
+    names = tuple(f"event {k}" for k in range(len(events)))
+    jitted = tuple(_jitted(event, name) for event, name in zip(events, names, strict=True))
+    return _compile_parts(_jitted(fun, "fun"), in_place, has_params, parts, jitted, np.dtype(dtype))
 
 
 class _Part(NamedTuple):
@@ -93,19 +103,26 @@ class _Part(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _compile_parts(
-    fun: Callable[..., Any], in_place: bool, has_params: bool, parts: tuple[_Part, ...], dtype: np.dtype
+    fun: Callable[..., Any],
+    in_place: bool,
+    has_params: bool,
+    parts: tuple[_Part, ...],
+    events: tuple[Callable[..., Any], ...],
+    dtype: np.dtype,
 ) -> CompiledFunctions:
     """The wrappers of the same functions are compiled once in a process."""
     sigs = signatures(dtype)
     rhs = _compiled(_wrap_rhs(fun, in_place, has_params), sigs.rhs, "fun")
     inv, grad = _no_values, _no_gradients
     for part in parts:
-        value = _chain_value(inv, part.fun, part.start, part.scalar, has_params)
-        inv = _compiled(value, sigs.inv, f"invariant {part.label!r}")
-        rows = 0 if part.scalar else part.stop - part.start
-        gradient = _chain_gradient(grad, _wrap_gradient(part, has_params), part.start, rows, part.in_place)
+        inv = _compiled(_chain_value(inv, part, has_params), sigs.inv, f"invariant {part.label!r}")
+        gradient = _chain_gradient(grad, _wrap_gradient(part, has_params), part)
         grad = _compiled(gradient, sigs.grad, f"gradient of invariant {part.label!r}")
-    return CompiledFunctions(rhs, inv, grad)
+    event = _no_values
+    for k, function in enumerate(events):
+        one = _Part(function, function, f"event {k}", True, k, k + 1, False, False)
+        event = _compiled(_chain_value(event, one, has_params), sigs.inv, f"event {k}")
+    return CompiledFunctions(rhs, inv, grad, event)
 
 
 def _jitted(fun: Callable[..., Any], name: str) -> Callable[..., Any]:
@@ -145,7 +162,9 @@ def _wrap_rhs(fun: Any, in_place: bool, has_params: bool) -> Any:
         @njit
         def rhs(t, y, out, params):
             f = fun(t, y, params)
-            for i in range(min(out.size, f.size)):
+            if f.size != out.size:
+                raise ValueError(WRONG_FUN)
+            for i in range(out.size):
                 out[i] = f[i]
 
     else:
@@ -153,7 +172,9 @@ def _wrap_rhs(fun: Any, in_place: bool, has_params: bool) -> Any:
         @njit
         def rhs(t, y, out, params):
             f = fun(t, y)
-            for i in range(min(out.size, f.size)):
+            if f.size != out.size:
+                raise ValueError(WRONG_FUN)
+            for i in range(out.size):
                 out[i] = f[i]
 
     return rhs
@@ -169,8 +190,10 @@ def _no_gradients(t, y, f, G, params):
     pass
 
 
-def _chain_value(before: Any, fun: Any, start: int, scalar: bool, has_params: bool) -> Any:
-    """`before`, then the values of one more invariant from place `start` on."""
+def _chain_value(before: Any, part: _Part, has_params: bool) -> Any:
+    """`before`, then the values of one more invariant."""
+    fun, start, stop, scalar = part.fun, part.start, part.stop, part.scalar
+    wrong = f"invariant {part.label!r} returned an array of another shape than at the start"
     if scalar and has_params:
 
         @njit
@@ -190,18 +213,22 @@ def _chain_value(before: Any, fun: Any, start: int, scalar: bool, has_params: bo
         @njit
         def inv(t, y, values, params):
             before(t, y, values, params)
-            part = fun(t, y, params)
-            for i in range(part.size):
-                values[start + i] = part[i]
+            found = fun(t, y, params)
+            if found.size != stop - start:
+                raise ValueError(wrong)
+            for i in range(found.size):
+                values[start + i] = found[i]
 
     else:
 
         @njit
         def inv(t, y, values, params):
             before(t, y, values, params)
-            part = fun(t, y)
-            for i in range(part.size):
-                values[start + i] = part[i]
+            found = fun(t, y)
+            if found.size != stop - start:
+                raise ValueError(wrong)
+            for i in range(found.size):
+                values[start + i] = found[i]
 
     return inv
 
@@ -226,40 +253,45 @@ def _wrap_gradient(part: _Part, has_params: bool) -> Any:
     return njit(lambda t, y, f, params: grad(t, y))
 
 
-def _chain_gradient(before: Any, gradient: Any, start: int, rows: int, in_place: bool) -> Any:
-    """`before`, then the gradient of one more invariant in row `start`, or in `rows` rows from there."""
-    stop = start + rows
-    if in_place and rows:
+def _chain_gradient(before: Any, gradient: Any, part: _Part) -> Any:
+    """`before`, then the gradient of one more invariant in its row or rows."""
+    start, stop, rows = part.start, part.stop, part.stop - part.start
+    wrong = f"gradient of invariant {part.label!r} has another shape than at the start"
+    if part.in_place and not part.scalar:
 
         @njit
         def grad(t, y, f, G, params):
             before(t, y, f, G, params)
             gradient(t, y, f, G[start:stop], params)
 
-    elif in_place:
+    elif part.in_place:
 
         @njit
         def grad(t, y, f, G, params):
             before(t, y, f, G, params)
             gradient(t, y, f, G[start], params)
 
-    elif rows:
+    elif not part.scalar:
 
         @njit
         def grad(t, y, f, G, params):
             before(t, y, f, G, params)
-            part = gradient(t, y, f, params)
+            found = gradient(t, y, f, params)
+            if found.shape[0] != rows or found.shape[1] != G.shape[1]:
+                raise ValueError(wrong)
             for i in range(rows):
                 for j in range(G.shape[1]):
-                    G[start + i, j] = part[i, j]
+                    G[start + i, j] = found[i, j]
 
     else:
 
         @njit
         def grad(t, y, f, G, params):
             before(t, y, f, G, params)
-            row = gradient(t, y, f, params)
+            found = gradient(t, y, f, params)
+            if found.size != G.shape[1]:
+                raise ValueError(wrong)
             for j in range(G.shape[1]):
-                G[start, j] = row[j]
+                G[start, j] = found[j]
 
     return grad

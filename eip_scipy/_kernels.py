@@ -196,10 +196,10 @@ def compensated_add(y, carry, move):
 
 
 @_jit
-def quadrature_add(err, total):
-    """Total = hypot(total, err), by component."""
-    for i in range(err.size):
-        total[i] = np.hypot(total[i], err[i])
+def quadrature(a, b, out):
+    """Out = hypot(a, b), by component."""
+    for i in range(out.size):
+        out[i] = np.hypot(a[i], b[i])
 
 
 @_jit
@@ -482,25 +482,59 @@ def midpoint(a, b, out):
 
 
 @_jit
-def hermite(theta, h, y_old, f_old, y, f, out):
-    """Cubic Hermite interpolation at t_old + theta h."""
-    rest = 1.0 - theta
-    for i in range(y.size):
-        change = y[i] - y_old[i]
-        out[i] = (
-            y_old[i] + theta * change + theta * rest * (rest * (h * f_old[i] - change) - theta * (h * f[i] - change))
-        )
+def relative_square(a, i, y, y_hat, rtol, atol, width):
+    """Square of component i of a in units of atol + rtol max(|y|, |y_hat|), and 1 for it in a complex state too."""
+    if width == 1:
+        size = max(abs(y[i]), abs(y_hat[i]))
+        part = abs(a[i])
+    else:
+        size = max(np.hypot(y[2 * i], y[2 * i + 1]), np.hypot(y_hat[2 * i], y_hat[2 * i + 1]))
+        part = np.hypot(a[2 * i], a[2 * i + 1])
+    scale = atol[i] + rtol[width * i] * size
+    if scale == 0.0:
+        return 0.0 if part == 0.0 else np.inf
+    ratio = part / scale
+    return ratio * ratio
 
 
 @_jit
-def sample(t_eval, place, t, t_new, h, y, K, y_new, t_saved, y_saved):
-    """Save the states at those t_eval that the step from t to t_new has reached; place[1] counts the rows."""
-    sign = 1.0 if h > 0 else -1.0
-    while place[1] < t_eval.size and sign * (t_eval[place[1]] - t_new) <= 0:
-        row = place[1]
-        t_saved[row] = t_eval[row]
-        if t_eval[row] == t_new:
-            copy(y_new, y_saved[row])
+def error_norm(err, y, y_hat, rtol, atol, width):
+    """SciPy's norm of the error: root mean square in units of the tolerance."""
+    n = atol.size
+    total = 0.0
+    for i in range(n):
+        total += relative_square(err, i, y, y_hat, rtol, atol, width)
+    return sqrt(total / n)
+
+
+@_jit
+def paired_error_norm(err, low, y, y_hat, rtol, atol, width):
+    """The same for DOP853's pair of estimates; then err <- err |err| / hypot(err, low / 10), by component."""
+    n = atol.size
+    fine = coarse = 0.0
+    for i in range(n):
+        fine += relative_square(err, i, y, y_hat, rtol, atol, width)
+        coarse += relative_square(low, i, y, y_hat, rtol, atol, width)
+    for i in range(n):
+        if width == 1:
+            a, b = abs(err[i]), abs(low[i])
         else:
-            hermite((t_eval[row] - t) / h, h, y, K[0], y_new, K[-1], y_saved[row])
-        place[1] = row + 1
+            a = np.hypot(err[2 * i], err[2 * i + 1])
+            b = np.hypot(low[2 * i], low[2 * i + 1])
+        factor = a / np.hypot(a, 0.1 * b) if a > 0.0 else 0.0
+        for part in range(width):
+            err[width * i + part] *= factor
+    if fine == 0.0 and coarse == 0.0:
+        return 0.0
+    return fine / sqrt((fine + 0.01 * coarse) * n)
+
+
+@_jit
+def crossed(g, g_new, direction):
+    """Whether an event changes its sign in the direction that it looks at."""
+    for i in range(g.size):
+        if g[i] <= 0.0 <= g_new[i] and direction[i] >= 0.0:
+            return True
+        if g[i] >= 0.0 >= g_new[i] and direction[i] <= 0.0:
+            return True
+    return False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from ._kernels import EPS, FrameRows, Grouping
 from ._step import ERROR, EUCLIDEAN, GIVEN, MIDPOINT, NEW, OLD, Method, Options, Work, make_work, project_step
 from .invariants import InvariantSet
-from .result import LAST_RANK, REJECTED, Diagnostics
+from .result import LAST_RANK, Diagnostics
 from .tableaux import Tableau
 
 __all__ = ["ProjectionOptions", "Run", "as_derivative", "fixed_steps", "nearest_option", "prepare"]
@@ -22,6 +23,7 @@ __all__ = ["ProjectionOptions", "Run", "as_derivative", "fixed_steps", "nearest_
 INDEX = np.uint64
 DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
 START_ITERATIONS = 50
+UNBOUNDED = 2**62
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +51,18 @@ class Run:
     options: Options
     work: Work
     invariants: InvariantSet
+
+
+class Counted:
+    """A right-hand side that counts its calls."""
+
+    def __init__(self, rhs: Callable[[float, np.ndarray], np.ndarray]) -> None:
+        self._rhs = rhs
+        self.count = 0
+
+    def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
+        self.count += 1
+        return self._rhs(t, y)
 
 
 def nearest_option(name: str, known: Iterable[str]) -> str:
@@ -104,7 +118,10 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
     """
     out = []
     for name, value in (("rtol", rtol), ("atol", atol)):
-        a = np.asarray(value, dtype=float)
+        try:
+            a = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError(f"`{name}` must be a number or an array of {n} numbers. Got {value!r}.") from None
         if a.ndim > 0 and a.shape != (n,):
             raise ValueError(f"`{name}` has wrong shape. It has {a.shape}, the state ({n},).")
         if not np.all(a >= 0):
@@ -150,16 +167,76 @@ def _slack(h: float, t0: float, t_bound: float) -> float:
     return max(1e-9, 8 * EPS * (abs(t_bound - t0) + abs(t0) + abs(t_bound)) / h)
 
 
-def fixed_steps(h: float, t0: float, t_bound: float) -> float:
-    """Number of steps of length h from t0 to t_bound (a float: inf for an unbounded interval).
+def fixed_steps(h: float, t0: float, t_bound: float) -> int:
+    """Number of steps of length h from t0 to t_bound, UNBOUNDED for an endless interval.
 
     T/h rounded where it is a whole number but for round-off, else the next larger one; the last step is then shorter.
     """
     ratio = abs(t_bound - t0) / h
-    if not math.isfinite(ratio):
-        return math.inf
+    if not ratio < UNBOUNDED:
+        return UNBOUNDED
     whole = round(ratio)
-    return float(whole if abs(ratio - whole) <= _slack(h, t0, t_bound) else math.ceil(ratio))
+    return whole if abs(ratio - whole) <= _slack(h, t0, t_bound) else math.ceil(ratio)
+
+
+def step_bounds(first_step: Any, max_step: Any, t0: float, t_bound: float) -> tuple[float | None, float]:
+    """first_step and max_step, with SciPy's messages for what they must not be."""
+    if not isinstance(max_step, (int, float, np.integer, np.floating)) or not max_step > 0:
+        raise ValueError(f"`max_step` must be positive. Got {max_step!r}.")
+    if first_step is None:
+        return None, float(max_step)
+    if not is_number(first_step) or not first_step > 0:
+        raise ValueError(f"`first_step` must be positive. Got {first_step!r}.")
+    if first_step > abs(t_bound - t0):
+        raise ValueError(
+            f"`first_step` exceeds bounds. Got {first_step:g} for an interval of length {abs(t_bound - t0):g}."
+        )
+    return float(first_step), float(max_step)
+
+
+def adaptive_rtol(rtol: Any) -> Any:
+    """rtol, no smaller than SciPy takes it."""
+    least = 100 * EPS
+    if np.any(np.asarray(rtol) < least):
+        warnings.warn(
+            f"At least one element of `rtol` is too small. Setting `rtol = np.maximum(rtol, {least})`.", stacklevel=4
+        )
+        return np.maximum(rtol, least)
+    return rtol
+
+
+def initial_step(
+    rhs: Callable[[float, np.ndarray], np.ndarray],
+    t0: float,
+    y0: np.ndarray,
+    t_bound: float,
+    max_step: float,
+    f0: np.ndarray,
+    order: int,
+    rtol: np.ndarray,
+    atol: np.ndarray,
+) -> float:
+    """First step of an adaptive run (Hairer, Norsett & Wanner I, section II.4), by one evaluation of `rhs`."""
+    if y0.size == 0:
+        return math.inf
+    length = abs(t_bound - t0)
+    if length == 0.0:
+        return 0.0
+    direction = 1.0 if t_bound > t0 else -1.0
+    scale = atol + np.abs(y0) * rtol
+
+    def size(x: np.ndarray) -> float:
+        return float(np.linalg.norm(x / scale)) / math.sqrt(x.size)
+
+    d0, d1 = size(y0), size(f0)
+    h0 = 1e-6 if d0 < 1e-5 or d1 < 1e-5 else 0.01 * d0 / d1
+    h0 = min(h0, length)
+    d2 = size(rhs(t0 + h0 * direction, y0 + h0 * direction * f0) - f0) / h0
+    if d1 <= 1e-15 and d2 <= 1e-15:
+        h1 = max(1e-6, h0 * 1e-3)
+    else:
+        h1 = (0.01 / max(d1, d2)) ** (1 / (order + 1))
+    return min(100 * h0, h1, length, max_step)
 
 
 def count(name: str, value: Any) -> int:
@@ -247,7 +324,7 @@ def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndar
     except (TypeError, ValueError):
         raise ValueError("frame must be a pair (C, S) of matrices of shapes (k, n) and (n, k).") from None
     k = C.shape[0]
-    if C.shape != (k, n) or S.shape != (n, k) or C.dtype.kind not in "fiuc" or S.dtype.kind not in "fiuc":
+    if k == 0 or C.shape != (k, n) or S.shape != (n, k) or C.dtype.kind not in "fiuc" or S.dtype.kind not in "fiuc":
         raise ValueError(f"frame: C has shape {C.shape} and S {S.shape}; expected (k, {n}) and ({n}, k).")
     if width == 2:
         C, S = _real_form(C), _real_form(S)
@@ -281,7 +358,15 @@ def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def method_arrays(tableau: Tableau) -> Method:
     """A tableau as the arrays that the step takes (writable copies: compiled code has one array type for all)."""
     return Method(
-        tableau.A.copy(), tableau.b.copy(), tableau.b_low.copy(), tableau.c.copy(), tableau.e.copy(), tableau.fsal
+        tableau.A.copy(),
+        tableau.b.copy(),
+        tableau.b_low.copy(),
+        tableau.c.copy(),
+        tableau.e.copy(),
+        tableau.e_low.copy(),
+        tableau.fsal,
+        tableau.paired,
+        -1.0 / ((tableau.error_estimator_order or 0) + 1),
     )
 
 
@@ -298,6 +383,7 @@ def prepare(
     *,
     extra: tuple = (),
     compensated: bool = False,
+    adaptive: bool = False,
 ) -> Run:
     """Validate a run's options and make its buffers; the invariants are checked at the start.
 
@@ -314,18 +400,19 @@ def prepare(
     rtol, atol : float or array_like
     extra : tuple
         Further arguments of the invariants' functions (``(params,)`` or nothing).
-    compensated : bool
+    compensated, adaptive : bool
     """
     n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
     kind, sigma = _metric(projection.metric, tableau, n, width)
-    if projection.direction not in DIRECTIONS:
+    if not isinstance(projection.direction, str) or projection.direction not in DIRECTIONS:
         raise ValueError(f"direction must be 'new', 'old' or 'midpoint', got {projection.direction!r}.")
     rtol, atol = tolerances(rtol, atol, n)
     groups = blocks_of(projection.blocks, n, width)
     invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra)
     options = Options(
         rtol=np.repeat(rtol, width),
-        atol=np.sqrt(
+        atol=atol,
+        block_atol=np.sqrt(
             np.add.reduceat(np.repeat(atol, width)[groups.member] ** 2 / width, groups.start[:-1].astype(np.intp))
         ),
         groups=groups,
@@ -340,6 +427,7 @@ def prepare(
         reuse_f=_flag("reuse_f", projection.reuse_f),
         uses_f=invariants.uses_f,
         compensated=_flag("compensated", compensated),
+        adaptive=adaptive,
     )
     work = make_work(n, y0.dtype, tableau.n_stages, invariants.size, groups.start.size - 1)
     if sigma is not None:
@@ -347,6 +435,7 @@ def prepare(
     run = Run(y0, method_arrays(tableau), options, work, invariants)
     if _flag("project_initial", projection.project_initial):
         run.y0 = projected_start(run, rhs, t0, f0)
+        f0 = rhs(t0, run.y0)
     violation = invariants.start_violation(t0, run.y0, f0)
     if violation:
         raise ValueError(f"{violation}; mend y0 or the target, or pass project_initial=True to project y0 first.")
@@ -388,7 +477,6 @@ def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0
 
 def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
     """Which invariant a failed projection left worst, by how much, and the rank it had."""
-    work.counters[REJECTED] += 1
     excess = np.abs(work.defect) / np.maximum(work.band, np.finfo(float).tiny)
     worst = int(np.argmax(np.where(np.isfinite(excess), excess, np.inf)))
     return (

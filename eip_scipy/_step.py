@@ -17,7 +17,7 @@ from numba.extending import register_jitable
 
 from . import _kernels as kn
 from ._kernels import FAILED_PROJECTION, NOT_FINITE, OK, FrameRows, Grouping
-from .result import HAVE_F, LAST_RANK, N_COUNTERS, NFEV, NJEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
+from .result import HAVE_F, LAST_RANK, N_COUNTERS, NFEV, NJEV, NLU, PROJECTIONS, RANK_REDUCED, REJECTED, SKIPPED
 
 # Without reference counting and inlined, the driver runs 20 times faster: it hands records of some 40 arrays down.
 _jitable = register_jitable(_nrt=False, error_model="numpy", forceinline=True)
@@ -25,6 +25,26 @@ _jitable_cold = register_jitable(_nrt=False, error_model="numpy")
 
 NEW, OLD, MIDPOINT = 0, 1, 2
 EUCLIDEAN, ERROR, GIVEN = 0, 1, 2
+
+
+# Step control, as in SciPy's Runge-Kutta classes; a failed projection shrinks the step as CVODE does.
+SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
+RETRY_FACTOR, MAX_RETRIES = 0.25, 10
+TOO_SMALL = 3
+
+# Places in the clock of a run: the current time, the time and length of the step tried last, the length to try next.
+T, T_NEW, H, H_ABS = range(4)
+
+
+class Span(NamedTuple):
+    """Where a run steps: t_k = t0 + k h (h = 0: adaptive steps), the last one on t_bound."""
+
+    t0: float
+    h: float
+    t_bound: float
+    sign: float
+    n_steps: int
+    max_step: float
 
 
 class Method(NamedTuple):
@@ -35,14 +55,18 @@ class Method(NamedTuple):
     b_low: np.ndarray
     c: np.ndarray
     e: np.ndarray
+    e_low: np.ndarray
     fsal: bool
+    paired: bool
+    exponent: float
 
 
 class Options(NamedTuple):
-    """What a run fixes about its projection: `rtol` by float of the state, `atol` by block."""
+    """What a run fixes: `rtol` by float of the state, `atol` by component, `block_atol` by block."""
 
     rtol: np.ndarray
     atol: np.ndarray
+    block_atol: np.ndarray
     groups: Grouping
     frame: FrameRows
     target: np.ndarray
@@ -55,6 +79,7 @@ class Options(NamedTuple):
     reuse_f: bool
     uses_f: bool
     compensated: bool
+    adaptive: bool
 
 
 class Work(NamedTuple):
@@ -67,9 +92,12 @@ class Work(NamedTuple):
     y_hat: np.ndarray
     y_hat_r: np.ndarray
     f_point: np.ndarray
+    f_new: np.ndarray
+    f_new_r: np.ndarray
     G: np.ndarray
     G_r: np.ndarray
     err: np.ndarray
+    err_low: np.ndarray
     err_sum: np.ndarray
     sigma: np.ndarray
     scale: np.ndarray
@@ -90,6 +118,7 @@ class Work(NamedTuple):
     defect: np.ndarray
     max_defect: np.ndarray
     max_correction: np.ndarray
+    norm: np.ndarray
     counters: np.ndarray
     inner: kn.Inner
 
@@ -106,8 +135,9 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
     K, K_r = pair(stages + 1, n)
     stage, stage_r = pair(n)
     y_hat, y_hat_r = pair(n)
+    f_new, f_new_r = pair(n)
     G, G_r = pair(n_invariants, n)
-    floats = {name: np.zeros(m) for name in ("err", "err_sum", "sigma", "move", "carry", "carry_hat")}
+    floats = {name: np.zeros(m) for name in ("err", "err_low", "err_sum", "sigma", "move", "carry", "carry_hat")}
     small = {
         name: np.zeros(n_invariants) for name in ("inverse_norms", "mu", "values", "g", "band", "before", "defect")
     }
@@ -120,6 +150,8 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
         y_hat=y_hat,
         y_hat_r=y_hat_r,
         f_point=np.zeros(n, dtype),
+        f_new=f_new,
+        f_new_r=f_new_r,
         G=G,
         G_r=G_r,
         **floats,
@@ -132,6 +164,7 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
         pivots=np.zeros(n_invariants, np.int64),
         max_defect=np.zeros(n_invariants),
         max_correction=np.zeros(1),
+        norm=np.zeros(1),
         counters=np.zeros(N_COUNTERS, np.int64),
         inner=kn.make_inner(n_invariants),
     )
@@ -159,33 +192,47 @@ def rk_step(rhs, params, t, y, y_r, h, m, o, w):
 
 @_jitable
 def raw_step(rhs, params, t, y, y_r, t_new, h, project, m, o, w):
-    """Raw step and, where the projection wants them, f(y_hat) in K[-1] and the local error in w.err."""
+    """Raw step; f(y_hat) in K[-1], the local error in w.err and its norm in w.norm where they are wanted."""
     w.counters[HAVE_F] = 0
     if not rk_step(rhs, params, t, y, y_r, h, m, o, w):
         return NOT_FINITE
-    estimate = o.metric == ERROR and o.target.size > 0
+    estimate = o.adaptive or (o.metric == ERROR and o.target.size > 0)
     if (estimate and m.fsal) or (project and o.uses_f):
         rhs(t_new, w.y_hat, w.K[-1], params)
         w.counters[NFEV] += 1
         w.counters[HAVE_F] = 1
     if estimate:
-        kn.weighted_sum(m.e, w.K_r, h, w.err)
-        if o.every > 1:
-            kn.quadrature_add(w.err, w.err_sum)
-            if project:
-                kn.copy(w.err_sum, w.err)
-                kn.fill(w.err_sum, 0.0)
+        estimate_error(y_r, h, m, o, w)
     return OK
 
 
 @_jitable
+def estimate_error(y_r, h, m, o, w):
+    """Fill w.err, and w.norm for the step control."""
+    width = o.groups.width
+    kn.weighted_sum(m.e, w.K_r, h, w.err)
+    if m.paired:
+        kn.weighted_sum(m.e_low, w.K_r, h, w.err_low)
+        w.norm[0] = kn.paired_error_norm(w.err, w.err_low, y_r, w.y_hat_r, o.rtol, o.atol, width)
+    elif o.adaptive:
+        w.norm[0] = kn.error_norm(w.err, y_r, w.y_hat_r, o.rtol, o.atol, width)
+
+
+@_jitable
 def close_step(rhs, params, t_new, y_new, project, o, w):
-    """After the projection: the carry, and f for the next step's first stage in K[-1]."""
+    """After the projection: the carry, the errors gathered, and f for the next step's first stage in w.f_new."""
     if o.compensated:
         kn.copy(w.carry_hat, w.carry)
+    if o.every > 1 and o.metric == ERROR:
+        if project:
+            kn.fill(w.err_sum, 0.0)
+        else:
+            kn.quadrature(w.err, w.err_sum, w.err_sum)
     if w.counters[HAVE_F] == 0 or (project and not o.reuse_f):
-        rhs(t_new, y_new, w.K[-1], params)
+        rhs(t_new, y_new, w.f_new, params)
         w.counters[NFEV] += 1
+    else:
+        kn.copy(w.K_r[-1], w.f_new_r)
 
 
 @_jitable
@@ -249,8 +296,10 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
         return kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect, w.max_defect)
     largest_error = 0.0
     if o.metric == ERROR:
+        if o.every > 1:
+            kn.quadrature(w.err, w.err_sum, w.err)
         largest_error = kn.error_metric(
-            w.err, y_r, w.y_hat_r, o.rtol, o.atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio
+            w.err, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio
         )
     if o.direction != NEW:
         kn.weigh_rows(w.G_r, w.sigma, o.frame, w.B)
@@ -284,19 +333,66 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
 
 
 @_jitable
-def eip_step(rhs, inv, grad, params, t, y, y_r, t_new, h, project, m, o, w, y_new, y_new_r):
-    """One step from (t, y) to (t_new, y_new), projected if `project`; K[0] = f(t, y) on entry, K[-1] = f there on exit.
-
-    Returns OK, NOT_FINITE or FAILED_PROJECTION.
-    """
-    status = raw_step(rhs, params, t, y, y_r, t_new, h, project, m, o, w)
-    if status != OK:
-        return status
+def finish_step(rhs, inv, grad, params, t, y, y_r, t_new, project, m, o, w, y_new, y_new_r):
+    """The rest of a step whose raw result is accepted; returns OK or FAILED_PROJECTION."""
     if project:
         status = project_step(rhs, inv, grad, params, t, y, y_r, t_new, o, w, y_new, y_new_r)
         if status != OK:
+            w.counters[REJECTED] += 1
             return status
     else:
         kn.copy(w.y_hat_r, y_new_r)
     close_step(rhs, params, t_new, y_new, project, o, w)
     return OK
+
+
+@_jitable
+def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y_new, y_new_r):
+    """Step k: fixed, or the first one that the error control accepts; K[0] = f(t, y) on entry, w.f_new = f at its end.
+
+    `finish` is `finish_step` or does as much. The control is SciPy's; a failed projection shortens the step, at most
+    MAX_RETRIES times in a row. Returns OK, NOT_FINITE, FAILED_PROJECTION or TOO_SMALL.
+    """
+    adaptive = span.h == 0.0
+    if not adaptive:
+        clock[T] = span.t0 + k * span.h
+    t = clock[T]
+    least = 10.0 * abs(np.nextafter(t, span.sign * np.inf) - t) if adaptive else 0.0
+    h_abs = min(span.max_step, max(clock[H_ABS], least))
+    rejected = False
+    retries = 0
+    status = TOO_SMALL
+    while h_abs >= least:
+        if adaptive:
+            t_new = t + h_abs * span.sign
+            last = span.sign * (t_new - span.t_bound) >= 0
+        else:
+            t_new = span.t0 + (k + 1) * span.h
+            last = k + 1 >= span.n_steps
+        clock[T_NEW] = span.t_bound if last else t_new
+        clock[H] = span.h if not (adaptive or last) else clock[T_NEW] - t
+        h_abs = abs(clock[H])
+        project = o.target.size > 0 and (last or (k + 1) % o.every == 0)
+        status = raw_step(rhs, params, t, y, y_r, clock[T_NEW], clock[H], project, m, o, w)
+        norm = w.norm[0] if adaptive else 0.0
+        if status == OK and not np.isfinite(norm):
+            status = NOT_FINITE
+        if status == OK and norm < 1.0:
+            status = finish(rhs, inv, grad, params, t, y, y_r, clock[T_NEW], project, m, o, w, y_new, y_new_r)
+            if status == OK:
+                factor = MAX_FACTOR if norm == 0.0 else min(MAX_FACTOR, SAFETY * norm**m.exponent)
+                clock[H_ABS] = h_abs * (min(1.0, factor) if rejected else factor)
+                return OK
+            if retries == MAX_RETRIES:
+                return status
+            retries += 1
+            h_abs *= RETRY_FACTOR
+        elif status == OK:
+            h_abs *= max(MIN_FACTOR, SAFETY * norm**m.exponent)
+            status = TOO_SMALL
+        else:
+            h_abs *= MIN_FACTOR
+        if not adaptive:
+            return status
+        rejected = True
+    return status

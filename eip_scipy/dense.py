@@ -1,36 +1,176 @@
-"""Dense output of the solvers."""
+"""Dense output: interpolants of SciPy's orders that meet the projected states and stay on the manifold."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
+from scipy.integrate import DOP853 as SCIPY_DOP853
 from scipy.integrate import DenseOutput
 
-__all__ = ["HermiteDenseOutput"]
+from ._kernels import OK
+from ._setup import Run
+from ._step import GIVEN, NEW, make_work, project_step
+from .result import HAVE_F, NFEV
+from .tableaux import DOP853, Tableau
+
+__all__ = ["ManifoldDenseOutput", "dense_output"]
+
+Array = np.ndarray
+ITERATIONS = 5
 
 
-class HermiteDenseOutput(DenseOutput):
-    """Cubic Hermite interpolation between two steps, from the states and slopes at both ends."""
+def dense_output(
+    rhs: Callable[..., None],
+    run: Run,
+    tableau: Tableau,
+    t_old: float,
+    t: float,
+    y_old: Array,
+    y: Array,
+    f_old: Array,
+    f: Array,
+    params: Any = None,
+) -> ManifoldDenseOutput:
+    """Dense output over the step that `run` made last, from (t_old, y_old) to (t, y), with slopes f_old and f."""
+    h = t - t_old
+    K = run.work.K.copy()
+    # The raw result's own slope belongs to the tableau; without it the next step's differs by O(h^(p + 1)).
+    if not run.work.counters[HAVE_F]:
+        K[-1] = f
+    if tableau is DOP853:
+        base = _dop853(rhs, params, t_old, h, y_old, y, f, K, run.work.counters)
+    elif tableau.P is not None:
+        base = _polynomial(h, y_old, y, f, K, tableau.P)
+    else:
+        base = _hermite(h, y_old, y, f_old, f)
+    return ManifoldDenseOutput(rhs, run, t_old, t, y_old.copy(), y.copy(), base, params)
+
+
+class ManifoldDenseOutput(DenseOutput):
+    """An interpolant, projected onto the invariants' levels between those of the step's two ends.
+
+    The levels are linear between the defects of the two ends, which are 1e-15 to 1e-12 after a projection, and what
+    the step left where it was not projected: the ends themselves are met exactly.
+    """
 
     def __init__(
-        self, t_old: float, t: float, y_old: np.ndarray, y: np.ndarray, f_old: np.ndarray, f: np.ndarray
+        self,
+        rhs: Callable[..., None],
+        run: Run,
+        t_old: float,
+        t: float,
+        y_old: Array,
+        y: Array,
+        base: Callable[[Array], Array],
+        params: Any,
     ) -> None:
         super().__init__(t_old, t)
-        self.h = t - t_old
-        self.y_old, self.y, self.f_old, self.f = y_old, y, f_old, f
+        self._rhs, self._invariants, self._params = rhs, run.invariants, params
+        self._y_old, self._y, self._base = y_old, y, base
+        self._sigma = run.work.sigma.copy() if run.invariants.size else None
+        self._options = run.options._replace(
+            metric=GIVEN, direction=NEW, iterations=ITERATIONS, every=1, compensated=False
+        )
+        self._counters = run.work.counters
+        self._levels: tuple[Array, Array] | None = None
+        self._work: Any = None
 
-    def _call_impl(self, t: np.ndarray) -> np.ndarray:
-        theta = np.asarray((t - self.t_old) / self.h)
-        column = (slice(None),) + (None,) * theta.ndim
-        y_old, y = self.y_old[column], self.y[column]
-        out = hermite(theta, self.h, y_old, self.f_old[column], y, self.f[column])
-        # Exactly the steps' own states at both ends, whatever rounding the polynomial has there.
-        return np.where(theta == 1, y, np.where(theta == 0, y_old, out))
+    def _call_impl(self, t: Array) -> Array:
+        times = np.atleast_1d(t)
+        theta = (times - self.t_old) / (self.t - self.t_old)
+        out = self._base(theta)
+        for k in range(times.size):
+            if times[k] == self.t:
+                out[:, k] = self._y
+            elif times[k] == self.t_old:
+                out[:, k] = self._y_old
+            elif self._invariants.size:
+                out[:, k] = self._projected(float(times[k]), float(theta[k]), np.ascontiguousarray(out[:, k]))
+        return out[:, 0] if t.ndim == 0 else out
+
+    def _projected(self, t: float, theta: float, y: Array) -> Array:
+        if self._levels is None:
+            self._levels = self._prepare()
+        at_old, at_new = self._levels
+        share = min(1.0, max(0.0, theta))
+        options = self._options._replace(target=(1 - share) * at_old + share * at_new)
+        w = self._work
+        w.y_hat[:] = y
+        if options.uses_f:
+            self._rhs(t, y, w.K[-1], self._params)
+            self._counters[NFEV] += 1
+        out = np.empty_like(y)
+        inv, grad = self._invariants.inv, self._invariants.grad
+        status = project_step(
+            self._rhs, inv, grad, self._params, t, y, y.view(float), t, options, w, out, out.view(float)
+        )
+        # Where the invariants cannot be met, the interpolant itself is the best there is.
+        return out if status == OK else y
+
+    def _prepare(self) -> tuple[Array, Array]:
+        invariants = self._invariants
+        self._work = make_work(self._y.size, self._y.dtype, 0, invariants.size, 0)
+        self._work.sigma[:] = self._sigma
+        return invariants.values(self.t_old, self._y_old), invariants.values(self.t, self._y)
 
 
-def hermite(
-    theta: np.ndarray, h: float, y_old: np.ndarray, f_old: np.ndarray, y: np.ndarray, f: np.ndarray
-) -> np.ndarray:
-    """The cubic with the given values and slopes at theta = 0 and 1 of a step of length h."""
+def _hermite(h: float, y_old: Array, y: Array, f_old: Array, f: Array) -> Callable[[Array], Array]:
+    """The cubic through both ends with their slopes."""
     change = y - y_old
-    rest = 1 - theta
-    return y_old + theta * change + theta * rest * (rest * (h * f_old - change) - theta * (h * f - change))
+    left, right = (h * f_old - change)[:, None], (h * f - change)[:, None]
+    y_old, change = y_old[:, None].copy(), change[:, None]
+
+    def base(theta: Array) -> Array:
+        rest = 1 - theta
+        return y_old + theta * change + theta * rest * (rest * left - theta * right)
+
+    return base
+
+
+def _polynomial(h: float, y_old: Array, y: Array, f: Array, K: Array, P: Array) -> Callable[[Array], Array]:
+    """The tableau's interpolant, bent at its end to the projected state and the slope there."""
+    Q = h * (K.T @ P)
+    moved = (y - y_old - Q.sum(axis=1))[:, None]
+    turned = (h * (f - K[-1]))[:, None]
+    y_old = y_old[:, None].copy()
+
+    def base(theta: Array) -> Array:
+        powers = theta ** np.arange(1, P.shape[1] + 1)[:, None]
+        square = theta * theta
+        return y_old + Q @ powers + moved * (square * (3 - 2 * theta)) + turned * (square * (theta - 1))
+
+    return base
+
+
+def _dop853(
+    rhs: Callable[..., None],
+    params: Any,
+    t_old: float,
+    h: float,
+    y_old: Array,
+    y: Array,
+    f: Array,
+    K: Array,
+    counters: Array,
+) -> Callable[[Array], Array]:
+    """SciPy's interpolant of order 7, from three more evaluations of the right-hand side."""
+    stages = K.shape[0]
+    K = np.concatenate([K, np.zeros((3, y.size), K.dtype)])
+    rows = zip(SCIPY_DOP853.A_EXTRA, SCIPY_DOP853.C_EXTRA, strict=True)
+    for s, (a, c) in enumerate(rows, start=stages):
+        stage = y_old + h * (K[:s].T @ a[:s])
+        rhs(t_old + c * h, stage, K[s], params)
+        counters[NFEV] += 1
+    change = y - y_old
+    F = [change, h * K[0] - change, 2 * change - h * (f + K[0]), *(h * (SCIPY_DOP853.D @ K))]
+    y_old = y_old[:, None].copy()
+
+    def base(theta: Array) -> Array:
+        out = np.zeros((y.size, theta.size), K.dtype)
+        for i, part in enumerate(reversed(F)):
+            out = (out + part[:, None]) * (theta if i % 2 == 0 else 1 - theta)
+        return out + y_old
+
+    return base

@@ -170,14 +170,17 @@ class NumericalGradient:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", np.exceptions.ComplexWarning)
-                G = self._by_complex_step(t, y, extra)
+                self._by_complex_step(t, y, extra)
                 plain = self._fun(t, y.astype(complex), extra)
         except (TypeError, ValueError, np.exceptions.ComplexWarning):
             return False
         if np.any(np.imag(plain) != 0) or not np.allclose(np.real(plain), self._fun(t, y, extra), rtol=1e-12):
             return False
-        D = difference_gradient(lambda x: self._fun(t, x, extra), y, self._floor)
+        # Beside y, which may be a point where the derivatives of |y_k| and the like happen to vanish.
         size = np.abs(y) + self._floor
+        y = y + 0.01 * size * np.random.default_rng(20220).standard_normal(y.size)
+        G = self._by_complex_step(t, y, extra)
+        D = difference_gradient(lambda x: self._fun(t, x, extra), y, self._floor)
         return bool(np.all(np.abs((G - D) * size) <= 1e-7 * np.max(np.abs(D * size), axis=-1, keepdims=True)))
 
 
@@ -213,8 +216,8 @@ class InvariantSet:
         values = [_real_value(item, label, t0, y0, extra) for item, label in zip(self.items, self.labels, strict=True)]
         self.scalar = [value.ndim == 0 for value in values]
         sizes = [value.size for value in values]
-        self.starts = np.concatenate([[0], np.cumsum(sizes, dtype=int)])
-        self.size = int(self.starts[-1])
+        self.starts = [0, *np.cumsum(sizes, dtype=int).tolist()]
+        self.size = self.starts[-1]
         self.start_values = np.concatenate([np.atleast_1d(v) for v in values]) if values else np.zeros(0)
         self.names = [
             label if scalar else f"{label}[{j}]"
@@ -259,7 +262,7 @@ class InvariantSet:
     def _gradients_at_start(self, t: float, y: Array, f: Array) -> None:
         """Shapes and finiteness of every gradient, once."""
         for k in range(len(self.items)):
-            rows = int(self.starts[k + 1] - self.starts[k])
+            rows = self.starts[k + 1] - self.starts[k]
             expected = (y.size,) if self.scalar[k] else (rows, y.size)
             G = np.asarray(self._gradient(k, t, y, f))
             if G.shape != expected:
@@ -279,27 +282,38 @@ class InvariantSet:
             if item.grad is None:
                 return self.grads[k](t, y, *self.extra)
             return self.grads[k](t, y, *before, *item.args, *self.extra)
-        rows = int(self.starts[k + 1] - self.starts[k])
+        rows = self.starts[k + 1] - self.starts[k]
         out = np.zeros(y.size if self.scalar[k] else (rows, y.size), dtype=y.dtype)
         self.grads[k](t, y, *before, out, *item.args, *self.extra)
         return out
 
     def inv(self, t: float, y: Array, values: Array, params: Any = None) -> None:
         """Fill `values` (l,)."""
+        # Copies here and in grad: a user's function may keep what it was given, and y and f are buffers.
+        y = y.copy()
         for k, item in enumerate(self.items):
             value = item.fun(t, y, *item.args, *self.extra)
-            if self.scalar[k]:
-                values[self.starts[k]] = value
-            else:
-                values[self.starts[k] : self.starts[k + 1]] = value
+            start, stop = self.starts[k], self.starts[k + 1]
+            expected = () if self.scalar[k] else (stop - start,)
+            if np.shape(value) != expected:
+                raise ValueError(
+                    f"invariant {self.labels[k]!r} returned shape {np.shape(value)} at t={t:g}, expected {expected}."
+                )
+            values[start:stop] = value
 
     def grad(self, t: float, y: Array, f: Array, G: Array, params: Any = None) -> None:
         """Fill the gradients `G` (l, n)."""
+        y, f = y.copy(), f.copy()
         for k in range(len(self.items)):
-            if self.scalar[k]:
-                G[self.starts[k]] = self._gradient(k, t, y, f)
-            else:
-                G[self.starts[k] : self.starts[k + 1]] = self._gradient(k, t, y, f)
+            row = self._gradient(k, t, y, f)
+            start, stop = self.starts[k], self.starts[k + 1]
+            expected = (y.size,) if self.scalar[k] else (stop - start, y.size)
+            if np.shape(row) != expected:
+                raise ValueError(
+                    f"gradient of invariant {self.labels[k]!r} has shape {np.shape(row)} at t={t:g}, expected "
+                    f"{expected}."
+                )
+            G[start:stop] = row
 
     def values(self, t: float, y: Array) -> Array:
         """All values (l,)."""
@@ -353,8 +367,8 @@ class InvariantSet:
     def _check_direction(self, t: float, y: Array, f: Array, d: Array) -> None:
         plus, minus = self.values(t, y + CHECK_STEP * d), self.values(t, y - CHECK_STEP * d)
         difference = (plus - minus) / (2 * CHECK_STEP)
-        products = np.real(np.conj(self.gradients(t, y, f)) * d)
-        along, terms = products.sum(axis=1), np.abs(products).sum(axis=1)
+        products = np.conj(self.gradients(t, y, f)) * d
+        along, terms = np.real(products).sum(axis=1), np.abs(products).sum(axis=1)
         noise = 1e6 * (EPS * np.max([np.abs(plus), np.abs(minus)], axis=0) + 5e-324)
         for k, name in enumerate(self.names):
             if (
@@ -370,31 +384,34 @@ class InvariantSet:
     def _check_invariance(self, t: float, y: Array, f: Array, tau: float) -> None:
         # In units of the largest component of f: large states would overflow otherwise.
         unit = np.max(np.abs(f), initial=0.0)
-        if unit < np.finfo(float).tiny / EPS:
+        if 0 < unit < np.finfo(float).tiny / EPS:
             return
-        in_time = self._time_derivative(t, y, tau) / unit
-        products = np.real(np.conj(self.gradients(t, y, f)) * (f / unit))
-        rate, terms = in_time + products.sum(axis=1), np.abs(in_time) + np.abs(products).sum(axis=1)
+        unit = unit or 1.0
+        in_time, noise = (rates / unit for rates in self._time_derivative(t, y, f, tau))
+        products = np.conj(self.gradients(t, y, f)) * (f / unit)
+        rate = in_time + np.real(products).sum(axis=1)
+        terms = np.abs(in_time) + np.abs(products).sum(axis=1)
         for k, name in enumerate(self.names):
-            if abs(rate[k]) > INVARIANCE_TOLERANCE * terms[k]:
+            if abs(rate[k]) > INVARIANCE_TOLERANCE * terms[k] + noise[k]:
                 warnings.warn(
                     f"{name!r} is no invariant of this system: at the start it changes at the rate "
                     f"{rate[k] * unit:.3g}, where the terms of that rate sum to {terms[k] * unit:.3g}. Projecting on "
-                    "it gives a wrong solution. "
-                    "(check=False skips this check.)",
+                    "it gives a wrong solution. (check=False skips this check.)",
                     UserWarning,
                     stacklevel=6,
                 )
 
-    def _time_derivative(self, t: float, y: Array, tau: float) -> Array:
+    def _time_derivative(self, t: float, y: Array, f: Array, tau: float) -> tuple[Array, Array]:
+        """The partial derivative in time, and the rounding in it."""
         step = float(2.0 ** np.round(np.log2(0.01 * tau))) if tau > 0 else 0.0
-        if t + step == t or step == 0.0:
-            return np.zeros(self.size)
+        if step == 0.0 or not abs(step) > 100 * np.spacing(abs(t)):
+            return np.zeros(self.size), np.zeros(self.size)
         total = np.zeros(self.size)
         for multiple, weight in DIFFERENCE_WEIGHTS:
             total += weight * (self.values(t + multiple * step, y) - self.values(t - multiple * step, y))
-        total /= step
-        return np.where(np.isfinite(total), total, 0.0)
+        rates = np.where(np.isfinite(total), total, 0.0) / step
+        noise = np.where(rates == 0, 0.0, 10 * EPS * self.term_sizes(t, y, f) / step)
+        return rates, noise
 
 
 def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., Any] | None = None) -> float:

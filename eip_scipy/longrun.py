@@ -17,19 +17,25 @@ from numba import njit, typeof, types
 from . import _kernels as kn
 from . import _setup
 from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures
+from ._events import Events
 from ._kernels import NOT_FINITE, OK
 from ._setup import ProjectionOptions, Run
-from ._step import eip_step
+from ._step import T_NEW, TOO_SMALL, H, Span, T, finish_step, next_step
+from .dense import ManifoldDenseOutput, dense_output
 from .invariants import Invariant, InvariantSet, as_invariants
 from .problems._problem import Problem
 from .result import NFEV, NJEV, NLU, Diagnostics, IntegrationResult
 from .solvers import EIPSolver
+from .tableaux import Tableau
 
 __all__ = ["integrate"]
 
 CHUNK_SECONDS = 0.2
 FIRST_CHUNK = 64
-STEP, ROW = 0, 1
+FIRST_ROWS = 1024
+STEP, ROW, PENDING = 0, 1, 2
+PAUSE, FULL = 10, 11
+STOPPED = "stopped by the callback"
 
 
 class _Default:
@@ -41,15 +47,20 @@ DEFAULT: Any = _Default()
 
 
 class Grid(NamedTuple):
-    """The steps of a run: t_k = t0 + k h, the last one on t_bound; and what is saved in `place` [step, row]."""
+    """Where a run steps and what it saves.
 
-    t0: float
-    h: float
-    t_bound: float
-    n_steps: int
+    `place` holds [step, row, pending]: pending is 1 between a step and its becoming the current state, so that whoever
+    is called in between sees both of its ends. `clock` is that of the step.
+    """
+
+    span: Span
     save_every: int
     t_eval: np.ndarray
     place: np.ndarray
+    clock: np.ndarray
+    g: np.ndarray
+    g_new: np.ndarray
+    g_direction: np.ndarray
 
 
 def source_stamp() -> str:
@@ -66,30 +77,41 @@ def source_stamp() -> str:
 def make_advance(stamp):
     """The loop over steps; `stamp` enters the key of its cache."""
 
-    def advance(rhs, inv, grad, params, grid, k_end, m, o, w, y, y_r, y_new, y_new_r, t_saved, y_saved):
+    def advance(rhs, inv, grad, event, params, grid, k_end, m, o, w, y, y_r, y_new, y_new_r, t_saved, y_saved):
         """Steps up to `k_end`; the one loop of compiled and interpreted runs. Returns OK or why it stopped."""
         _ = stamp
-        while grid.place[STEP] < k_end:
-            k = grid.place[STEP]
-            last = k + 1 == grid.n_steps
-            t = grid.t0 + k * grid.h
-            t_new = grid.t_bound if last else grid.t0 + (k + 1) * grid.h
-            h = t_new - t if last else grid.h
-            project = o.target.size > 0 and (last or (k + 1) % o.every == 0)
-            status = eip_step(rhs, inv, grad, params, t, y, y_r, t_new, h, project, m, o, w, y_new, y_new_r)
+        place, clock = grid.place, grid.clock
+        while True:
+            if place[PENDING] == 1:
+                clock[T] = clock[T_NEW]
+                kn.copy(w.f_new_r, w.K_r[0])
+                kn.copy(y_new_r, y_r)
+                kn.copy(grid.g_new, grid.g)
+                place[PENDING] = 0
+            k = place[STEP]
+            if clock[T] == grid.span.t_bound or k >= k_end:
+                return OK
+            if place[ROW] + 2 > t_saved.size:
+                return FULL
+            status = next_step(
+                finish_step, rhs, inv, grad, params, clock, k, grid.span, m, o, w, y, y_r, y_new, y_new_r
+            )
             if status != OK:
                 return status
-            if grid.t_eval.size > 0:
-                kn.sample(grid.t_eval, grid.place, t, t_new, h, y_r, w.K_r, y_new_r, t_saved, y_saved)
-            elif last or (grid.save_every > 0 and (k + 1) % grid.save_every == 0):
-                row = grid.place[ROW]
-                t_saved[row] = t_new
-                kn.copy(y_new_r, y_saved[row])
-                grid.place[ROW] = row + 1
-            kn.copy(w.K_r[-1], w.K_r[0])
-            kn.copy(y_new_r, y_r)
-            grid.place[STEP] = k + 1
-        return OK
+            place[STEP] = k + 1
+            place[PENDING] = 1
+            t_new = clock[T_NEW]
+            saved = t_new == grid.span.t_bound or (grid.save_every > 0 and (k + 1) % grid.save_every == 0)
+            if grid.t_eval.size == 0 and saved:
+                t_saved[place[ROW]] = t_new
+                kn.copy(y_new_r, y_saved[place[ROW]])
+                place[ROW] += 1
+            if grid.g.size > 0:
+                event(t_new, y_new, grid.g_new, params)
+                if kn.crossed(grid.g, grid.g_new, grid.g_direction):
+                    return PAUSE
+            if place[ROW] < grid.t_eval.size and grid.span.sign * (grid.t_eval[place[ROW]] - t_new) <= 0.0:
+                return PAUSE
 
     return advance
 
@@ -106,7 +128,8 @@ def fill_values(inv, params, t, y, values):
 @cache
 def _compiled_advance(dtype: np.dtype, arguments: tuple[Any, ...]) -> Callable[..., int]:
     """The driver compiled for one type of state, its callables as first-class functions: cached on disk."""
-    functions = [types.FunctionType(s) for s in signatures(dtype)]
+    rhs, inv, grad = signatures(dtype)
+    functions = [types.FunctionType(s) for s in (rhs, inv, grad, inv)]
     return njit([types.int64(*functions, *arguments)], cache=True, error_model="numpy", _nrt=False)(advance)
 
 
@@ -121,10 +144,11 @@ class _Driver:
 
     def __init__(self, run: Run, grid: Grid, functions: CompiledFunctions, params: np.ndarray, compiled: bool) -> None:
         self.run, self.grid, self.functions, self.params, self.compiled = run, grid, functions, params, compiled
-        rows = saved_rows(grid) + 1
+        rows = saved_rows(grid) or FIRST_ROWS
         n, dtype = run.y0.size, run.y0.dtype
-        self.t = np.empty(rows)
-        self.y = np.empty((rows, n), dtype)
+        # One row to spare for the last state of a run that ends early.
+        self.t = np.empty(rows + 1)
+        self.y = np.empty((rows + 1, n), dtype)
         self.state = run.y0.copy()
         self.new = np.empty_like(self.state)
         self._tail = (
@@ -135,22 +159,14 @@ class _Driver:
             self.state.view(float),
             self.new,
             self.new.view(float),
-            self.t,
-            self.y.view(float),
         )
         self._advance: Callable[..., int] = advance
         if compiled:
-            arguments = tuple(typeof(a) for a in (params, grid, 0, *self._tail))
+            arguments = tuple(typeof(a) for a in (params, grid, 0, *self._tail, self.t, self.y.view(float)))
             self._advance = _compiled_advance(dtype, arguments)
 
-    def save_start(self) -> None:
-        """The first row: the start, where it is asked for."""
-        if self.grid.t_eval.size == 0 or self.grid.t_eval[0] == self.grid.t0:
-            self.t[0], self.y[0] = self.grid.t0, self.state
-            self.grid.place[ROW] = 1
-
     def advance(self, k_end: int) -> int:
-        return self._advance(*self.functions, self.params, self.grid, k_end, *self._tail)
+        return self._advance(*self.functions, self.params, self.grid, k_end, *self._tail, self.t, self.y.view(float))
 
     @property
     def step(self) -> int:
@@ -160,15 +176,54 @@ class _Driver:
     def rows(self) -> int:
         return int(self.grid.place[ROW])
 
-    def time_of(self, k: int) -> float:
-        return self.grid.t_bound if k == self.grid.n_steps else self.grid.t0 + k * self.grid.h
+    @property
+    def now(self) -> tuple[float, np.ndarray]:
+        """Time and state after the last step that was accepted."""
+        pending = self.grid.place[PENDING] == 1
+        return float(self.grid.clock[T_NEW if pending else T]), self.new if pending else self.state
 
-    def save_last(self) -> None:
+    def save(self, t: float, y: np.ndarray) -> None:
+        """One more row."""
+        self.t[self.rows], self.y[self.rows] = t, y
+        self.grid.place[ROW] += 1
+
+    def save_start(self) -> None:
+        """The first row: the start, where it is asked for."""
+        if self.grid.t_eval.size == 0 or self.grid.t_eval[0] == self.grid.span.t0:
+            self.save(self.grid.span.t0, self.state)
+
+    def save_now(self) -> None:
         """After an early end: the last accepted state too."""
-        t = self.time_of(self.step)
+        t, y = self.now
         if self.rows == 0 or self.t[self.rows - 1] != t:
-            self.t[self.rows], self.y[self.rows] = t, self.state
-            self.grid.place[ROW] += 1
+            self.save(t, y)
+
+    def cut(self, t: float, y: np.ndarray) -> None:
+        """End the rows with the state at which an event ended the run inside the last step."""
+        while self.rows and self.grid.span.sign * (self.t[self.rows - 1] - t) >= 0:
+            self.grid.place[ROW] -= 1
+        self.save(t, y)
+
+    def grow(self, max_bytes: float) -> None:
+        """Room for twice as many rows.
+
+        Raises
+        ------
+        MemoryError
+            When they would need more than `max_bytes`.
+        """
+        rows = 2 * self.t.size
+        check_memory(rows, self.run, max_bytes)
+        self.t = np.resize(self.t, rows)
+        self.y = np.concatenate([self.y, np.empty_like(self.y)])
+
+    def dense(self, tableau: Tableau, rhs: Callable[..., None]) -> ManifoldDenseOutput:
+        """Dense output over the step that is pending."""
+        t_old, t = (float(self.grid.clock[place]) for place in (T, T_NEW))
+        w = self.run.work
+        return dense_output(
+            rhs, self.run, tableau, t_old, t, self.state, self.new, w.K[0].copy(), w.f_new.copy(), self.params
+        )
 
     def values(self) -> np.ndarray:
         """Invariants of the saved states, (l, m)."""
@@ -183,12 +238,14 @@ class _Driver:
 
 
 def saved_rows(grid: Grid) -> int:
-    """States that a run saves, its start included."""
+    """States that a run saves, its start included; 0 where that is not known before."""
     if grid.t_eval.size:
         return grid.t_eval.size
     if grid.save_every == 0:
         return 2
-    return 1 + math.ceil(grid.n_steps / grid.save_every)
+    if grid.span.h == 0.0 or grid.span.n_steps == _setup.UNBOUNDED:
+        return 0
+    return 1 + math.ceil(grid.span.n_steps / grid.save_every)
 
 
 def integrate(
@@ -202,6 +259,7 @@ def integrate(
     in_place: bool = False,
     save_every: int | None = None,
     t_eval: Any = None,
+    events: Any = None,
     callback: Callable[[float, np.ndarray, np.ndarray], Any] | None = None,
     progress: bool = False,
     compensated: bool = False,
@@ -220,9 +278,11 @@ def integrate(
     diagnostics: Diagnostics | None = None,
     rtol: Any = 1e-3,
     atol: Any = 1e-6,
+    first_step: float | None = None,
+    max_step: float = np.inf,
     **unknown: Any,
 ) -> IntegrationResult:
-    """Integrate with fixed steps, compiled where the functions are Numba functions.
+    """Integrate with fixed or adaptive steps, compiled where the functions are Numba functions.
 
     The step is that of the solver classes; with the same jitted functions the same bits come out, compiled or not.
 
@@ -236,9 +296,11 @@ def integrate(
     y0 : array_like, shape (n,)
         Initial state, real or complex.
     method : type
-        `EIPRK1` ... `EIPRK5` or a class made by `eip_method`.
-    h : float
-        Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter.
+        `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, or a class made by `eip_method`.
+    h : float, optional
+        Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter. Default: a problem's own
+        step; without one, adaptive steps by `rtol`, `atol`, `first_step` and `max_step`. To take adaptive steps on a
+        problem with a step of its own, give `first_step` or ``h=None`` through ``dataclasses.replace``.
     params : array_like of float, optional
         Passed on to `fun` and to the invariants' functions as the last argument.
     in_place : bool, optional
@@ -246,8 +308,11 @@ def integrate(
     save_every : int, optional
         Save each so many-th step, besides the first and the last state.
     t_eval : array_like, optional
-        Times to save at instead, inside `t_span`, in its direction. States between steps come from cubic Hermite
-        interpolation. With neither, the first and the last state are saved.
+        Times to save at instead, inside `t_span`, in its direction; states between steps come from dense output, on
+        the manifold. With neither, the first and the last state are saved.
+    events : callable or sequence of callable, optional
+        ``event(t, y[, params]) -> float``, with ``terminal`` and ``direction`` as for `scipy.integrate.solve_ivp`; in
+        compiled runs Numba functions.
     callback : callable, optional
         ``callback(t, y, defects)`` at each saved point; return True to stop the run.
     progress : bool, optional
@@ -298,6 +363,7 @@ def integrate(
         raise TypeError(f"integrate() has no option {name!r}{hint}")
     given = {"invariants": invariants, "metric": metric, "blocks": blocks, "frame": frame}
     given = {key: value for key, value in given.items() if value is not DEFAULT}
+    given_h = h
     if isinstance(fun, Problem):
         problem = fun
         fun, in_place = (problem.fun, False) if problem.rhs is None else (problem.rhs, True)
@@ -312,26 +378,41 @@ def integrate(
     if not callable(fun):
         raise TypeError(f"integrate: fun must be callable or a Problem, got {fun!r}.")
     tableau = _tableau(method)
-    t0, t_bound = _span(t_span)
-    start = _setup.initial_state(_required("y0", y0))
-    if h is None:
-        raise ValueError(f"integrate with {method.__name__} needs the step h=...")
-    h = _setup.check_fixed_step(h, t0, t_bound)
-    grid = _grid(t0, t_bound, h, save_every, t_eval)
-    _check_memory(grid, start, max_bytes)
     parameters = np.zeros(0) if params is None else _parameters(params)
     extra = () if params is None else (parameters,)
+    happenings = Events(events, extra)
+    t0, t_bound = _span(t_span, happenings.terminal)
+    start = _setup.initial_state(_required("y0", y0))
+    if first_step is not None or max_step != np.inf:
+        if given_h is not None:
+            raise ValueError(
+                "h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other."
+            )
+        h = None
+    if h is None and not tableau.has_estimate:
+        raise ValueError(f"{method.__name__} has no error estimate and needs the step h=...")
     if params is not None and "invariants" in given:
         given["invariants"] = [_with_run_params(item, params) for item in as_invariants(given["invariants"])]
     rhs = _interpreted_rhs(fun, in_place, extra, start)
-    f0 = np.zeros_like(start)
-    rhs(t0, start, f0, parameters)
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
         out = np.zeros_like(y)
         rhs(t, y, out, parameters)
         return out
 
+    calls = _setup.Counted(derivative)
+    first_step, max_step = _setup.step_bounds(first_step, max_step, t0, t_bound)
+    if h is None:
+        rtol = _setup.adaptive_rtol(rtol)
+    else:
+        h = _setup.check_fixed_step(h, t0, t_bound)
+    tolerances = _setup.tolerances(rtol, atol, start.size)
+    f0 = calls(t0, start)
+    tau = h or first_step
+    if tau is None:
+        order = tableau.error_estimator_order or 0
+        tau = _setup.initial_step(calls, t0, start, t_bound, max_step, f0, order, *tolerances)
+    grid = _grid(t0, t_bound, h, tau, max_step, save_every, t_eval, happenings)
     projection = ProjectionOptions(
         **given,
         direction=direction,
@@ -342,77 +423,122 @@ def integrate(
         project_initial=project_initial,
     )
     run = _setup.prepare(
-        tableau, derivative, t0, start, f0, h, projection, rtol, atol, extra=extra, compensated=compensated
+        tableau,
+        calls,
+        t0,
+        start,
+        f0,
+        tau,
+        projection,
+        *tolerances,
+        extra=extra,
+        compensated=compensated,
+        adaptive=h is None,
     )
+    bound = 0.5 * free_memory() if max_bytes is None else max_bytes
+    check_memory(saved_rows(grid), run, bound)
     record = Diagnostics() if diagnostics is None else diagnostics
     _setup.attach(record, run)
-    functions, why_not = _functions(fun, in_place, extra, run.invariants, start.dtype, compiled, rhs)
+    functions, why_not = _functions(fun, in_place, extra, run.invariants, happenings, start.dtype, compiled, rhs)
     driver = _Driver(run, grid, functions, parameters, compiled=why_not is None)
-    rhs(t0, driver.state, run.work.K[0], parameters)
-    run.work.counters[NFEV] = 1
-    loop = _Loop(driver, record, callback, progress, method.__name__, why_not)
-    return loop.run()
+    run.work.K[0] = f0 if run.y0 is start else calls(t0, run.y0)
+    run.work.counters[NFEV] = calls.count
+    happenings.fill(t0, run.y0, grid.g)
+    return _Loop(driver, tableau, rhs, happenings, record, callback, progress, method.__name__, why_not, bound).run()
 
 
 class _Loop:
-    """Drives chunks of steps: time, progress, callbacks, and what is kept when something goes wrong."""
+    """Drives chunks of steps: progress, samples, events, callbacks, and what is kept when something goes wrong."""
 
     def __init__(
         self,
         driver: _Driver,
+        tableau: Tableau,
+        rhs: Callable[..., None],
+        events: Events,
         diagnostics: Diagnostics,
         callback: Callable[..., Any] | None,
         progress: bool,
         method: str,
         why_not: str | None,
+        max_bytes: float,
     ) -> None:
-        self.driver, self.diagnostics, self.callback, self.progress = driver, diagnostics, callback, progress
-        self.method, self.why_not = method, why_not
+        self.driver, self.tableau, self.rhs, self.events = driver, tableau, rhs, events
+        self.diagnostics, self.callback, self.progress = diagnostics, callback, progress
+        self.method, self.why_not, self.max_bytes = method, why_not, max_bytes
         self.wall_time = 0.0
 
     def run(self) -> IntegrationResult:
         driver = self.driver
         begin = time.perf_counter()
         try:
-            with _bar(self.progress, driver.grid.n_steps, self.method) as bar:
+            with _bar(self.progress, driver.grid, self.method) as bar:
                 status, message = self._steps(bar)
         except BaseException as error:
             self.wall_time = time.perf_counter() - begin
-            driver.save_last()
-            error.partial = self._result(-1, f"interrupted by {type(error).__name__}")  # type: ignore[attr-defined]
+            driver.save_now()
+            partial = self._result(-1, f"interrupted by {type(error).__name__}", broken=True)
+            error.partial = partial  # type: ignore[attr-defined]
             raise
         self.wall_time = time.perf_counter() - begin
-        if status != 0:
-            driver.save_last()
+        if status < 0:
+            driver.save_now()
         return self._result(status, message)
 
     def _steps(self, bar: Any) -> tuple[int, str]:
         driver = self.driver
         driver.save_start()
         if self._stopped_by_callback(0):
-            return 1, "stopped by the callback"
+            return 1, STOPPED
         chunk = FIRST_CHUNK
-        while driver.step < driver.grid.n_steps:
+        while True:
             k, rows, begin = driver.step, driver.rows, time.perf_counter()
-            code = driver.advance(min(k + self._chunk(chunk), driver.grid.n_steps))
+            code = driver.advance(k + self._chunk(chunk))
             seconds = time.perf_counter() - begin
-            bar.update(driver.step - k)
-            if code != OK:
-                return -1, self._failure(code)
+            ended = self._pause() if code == PAUSE else False
+            bar.update(self._progress(bar.n, k))
             if self._stopped_by_callback(rows):
-                return 1, "stopped by the callback"
-            # At most a doubling, so that one fast chunk cannot make a slow one long.
-            chunk = max(1, min(2 * chunk, int(chunk * CHUNK_SECONDS / max(seconds, 1e-9))))
-        return 0, "reached the end of the interval"
+                return 1, STOPPED
+            if ended:
+                return 1, "A termination event occurred."
+            if code == FULL:
+                driver.grow(self.max_bytes)
+            elif code not in (OK, PAUSE):
+                return -1, self._failure(code)
+            elif code == OK and driver.grid.clock[T] == driver.grid.span.t_bound:
+                return 0, "reached the end of the interval"
+            if code == OK:
+                # At most a doubling, so that one fast chunk cannot make a slow one long.
+                chunk = max(1, min(2 * chunk, int(chunk * CHUNK_SECONDS / max(seconds, 1e-9))))
+
+    def _progress(self, shown: float, k: int) -> float:
+        """What the bar is to grow by: steps where their number is known, else time."""
+        grid = self.driver.grid
+        if grid.span.h != 0.0:
+            return self.driver.step - k
+        return abs(self.driver.now[0] - grid.span.t0) - shown
+
+    def _pause(self) -> bool:
+        """Samples and events in the step that is pending; True where an event ends the run."""
+        driver, grid = self.driver, self.driver.grid
+        sol = driver.dense(self.tableau, self.rhs)
+        end = None
+        if grid.g.size:
+            end = self.events.handle(grid.g, grid.g_new, sol)
+        limit = sol.t if end is None else end
+        while driver.rows < grid.t_eval.size and grid.span.sign * (grid.t_eval[driver.rows] - limit) <= 0:
+            t = float(grid.t_eval[driver.rows])
+            driver.save(t, sol(t))
+        if end is None:
+            return False
+        if grid.t_eval.size == 0:
+            driver.cut(end, sol(end))
+        return True
 
     def _chunk(self, chunk: int) -> int:
         """Steps of the next call: with a callback, none beyond the next saved one."""
-        if self.callback is None:
-            return chunk
         grid = self.driver.grid
-        if grid.t_eval.size:
-            return 1
-        if grid.save_every == 0:
+        if self.callback is None or grid.save_every == 0:
             return chunk
         return min(chunk, grid.save_every - self.driver.step % grid.save_every)
 
@@ -424,36 +550,31 @@ class _Loop:
             t, y = float(driver.t[row]), driver.y[row].copy()
             invariants = driver.run.invariants
             if self.callback(t, y, invariants.values(t, y) - invariants.target):
+                driver.grid.place[ROW] = row + 1
                 return True
         return False
 
     def _failure(self, code: int) -> str:
-        driver = self.driver
-        t, run = driver.time_of(driver.step), driver.run
-        t_new = driver.time_of(driver.step + 1)
+        run, clock = self.driver.run, self.driver.grid.clock
         if code == NOT_FINITE:
-            return _setup.not_finite(run.work, run.method, t, t_new - t)
-        return _setup.projection_failure(run.invariants, run.work, t_new)
+            return _setup.not_finite(run.work, run.method, clock[T], clock[H])
+        if code == TOO_SMALL:
+            return EIPSolver.TOO_SMALL_STEP
+        return _setup.projection_failure(run.invariants, run.work, clock[T_NEW])
 
-    def _result(self, status: int, message: str) -> IntegrationResult:
+    def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
         driver = self.driver
-        rows, invariants, counters = driver.rows, driver.run.invariants, driver.run.work.counters
-        values = driver.values()
-        max_defect = driver.run.work.max_defect
-        if rows:
-            np.fmax(
-                max_defect, np.nanmax(np.abs(values - invariants.target[:, None]), axis=1, initial=0), out=max_defect
-            )
+        rows, counters, events = driver.rows, driver.run.work.counters, self.events
         if self.why_not is not None:
             message = f"{message} (interpreted: {self.why_not})"
         return IntegrationResult(
             t=driver.t[:rows],
             y=driver.y[:rows].T,
-            invariants=values,
-            max_defect=max_defect,
+            invariants=self._values(broken),
+            max_defect=driver.run.work.max_defect,
             diagnostics=self.diagnostics,
-            t_events=None,
-            y_events=None,
+            t_events=[np.asarray(t) for t in events.t] if events.functions else None,
+            y_events=[np.asarray(y) for y in events.y] if events.functions else None,
             nfev=int(counters[NFEV]),
             njev=int(counters[NJEV]),
             nlu=int(counters[NLU]),
@@ -463,14 +584,30 @@ class _Loop:
             wall_time=self.wall_time,
             compiled=self.why_not is None,
             method=self.method,
-            h=abs(driver.grid.h),
+            h=abs(driver.grid.span.h) or None,
         )
 
+    def _values(self, broken: bool) -> np.ndarray:
+        """Invariants of the saved states; NaN where the run was broken off by an invariant that still raises."""
+        try:
+            return self.driver.values()
+        except Exception:
+            if not broken:
+                raise
+            return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)
 
-def _bar(progress: bool, total: int, label: str) -> Any:
+
+def _bar(progress: bool, grid: Grid, label: str) -> Any:
     from tqdm import tqdm
 
-    return tqdm(total=total, desc=label, unit="step", unit_scale=True, disable=not progress, smoothing=0.05)
+    fixed = grid.span.h != 0.0
+    total: float | None
+    if fixed:
+        total = grid.span.n_steps if grid.span.n_steps < _setup.UNBOUNDED else None
+    else:
+        total = abs(grid.span.t_bound - grid.span.t0) if math.isfinite(grid.span.t_bound) else None
+    unit = "step" if fixed else "time"
+    return tqdm(total=total, desc=label, unit=unit, unit_scale=True, disable=not progress, smoothing=0.05)
 
 
 def _required(name: str, value: Any) -> Any:
@@ -489,13 +626,13 @@ def _tableau(method: Any) -> Any:
     return method.TABLEAU
 
 
-def _span(t_span: Any) -> tuple[float, float]:
+def _span(t_span: Any, unbounded: bool) -> tuple[float, float]:
     try:
         t0, t_bound = map(float, _required("t_span", t_span))
     except (TypeError, ValueError):
         raise ValueError(f"t_span must hold two numbers, got {t_span!r}.") from None
-    if not (math.isfinite(t0) and math.isfinite(t_bound)):
-        raise ValueError(f"t_span must be finite, got {t_span!r}.")
+    if not math.isfinite(t0) or math.isnan(t_bound) or not (math.isfinite(t_bound) or unbounded):
+        raise ValueError(f"t_span must be finite unless a terminal event ends the run, got {t_span!r}.")
     return t0, t_bound
 
 
@@ -515,16 +652,40 @@ def _with_run_params(item: Invariant, params: Any) -> Invariant:
     return bare
 
 
-def _grid(t0: float, t_bound: float, h: float, save_every: Any, t_eval: Any) -> Grid:
-    n_steps = int(_setup.fixed_steps(h, t0, t_bound))
+def _grid(
+    t0: float,
+    t_bound: float,
+    h: float | None,
+    tau: float,
+    max_step: float,
+    save_every: Any,
+    t_eval: Any,
+    events: Events,
+) -> Grid:
     sign = -1.0 if t_bound < t0 else 1.0
     times = np.zeros(0)
     if t_eval is not None:
         if save_every is not None:
             raise ValueError("give save_every or t_eval, not both.")
         times = _evaluation_times(t_eval, t0, t_bound, sign)
-    every = 0 if save_every is None else _setup.count("save_every", save_every)
-    return Grid(t0, sign * h, t_bound, n_steps, every, times, np.zeros(2, np.int64))
+    n_events = len(events.functions)
+    return Grid(
+        span=Span(
+            t0=t0,
+            h=sign * (h or 0.0),
+            t_bound=t_bound,
+            sign=sign,
+            n_steps=_setup.UNBOUNDED if h is None else _setup.fixed_steps(h, t0, t_bound),
+            max_step=max_step,
+        ),
+        save_every=0 if save_every is None else _setup.count("save_every", save_every),
+        t_eval=times,
+        place=np.zeros(3, np.int64),
+        clock=np.array([t0, t0, 0.0, tau]),
+        g=np.zeros(n_events),
+        g_new=np.zeros(n_events),
+        g_direction=events.directions,
+    )
 
 
 def _evaluation_times(t_eval: Any, t0: float, t_bound: float, sign: float) -> np.ndarray:
@@ -540,13 +701,19 @@ def _evaluation_times(t_eval: Any, t0: float, t_bound: float, sign: float) -> np
     return times
 
 
-def _check_memory(grid: Grid, y0: np.ndarray, max_bytes: float | None) -> None:
-    bound = 0.5 * free_memory() if max_bytes is None else max_bytes
-    needed = saved_rows(grid) * (y0.nbytes + 8)
-    if needed > bound:
+def check_memory(rows: int, run: Run, max_bytes: float) -> None:
+    """Refuse to save more than fits.
+
+    Raises
+    ------
+    MemoryError
+        With the number of bytes and what to do.
+    """
+    needed = rows * (run.y0.nbytes + 8 * (1 + run.invariants.size))
+    if needed > max_bytes:
         raise MemoryError(
-            f"saving {saved_rows(grid):.3g} states of {y0.size} components needs {needed / 1e9:.3g} GB, the bound is "
-            f"{bound / 1e9:.3g} GB; raise save_every (or max_bytes)."
+            f"saving {rows:.3g} states of {run.y0.size} components needs {needed / 1e9:.3g} GB, the bound is "
+            f"{max_bytes / 1e9:.3g} GB; raise save_every (or max_bytes)."
         )
 
 
@@ -590,16 +757,17 @@ def _functions(
     in_place: bool,
     extra: tuple,
     invariants: InvariantSet,
+    events: Events,
     dtype: np.dtype,
     compiled: bool | None,
     rhs: Callable[..., None],
 ) -> tuple[CompiledFunctions, str | None]:
-    """The three functions of the step, and why they are not compiled (None: they are)."""
-    interpreted = CompiledFunctions(rhs, invariants.inv, invariants.grad)
+    """The functions of the loop, and why they are not compiled (None: they are)."""
+    interpreted = CompiledFunctions(rhs, invariants.inv, invariants.grad, events.fill)
     if compiled is False:
         return interpreted, "compiled=False"
     try:
-        return compile_functions(fun, in_place, bool(extra), invariants, dtype), None
+        return compile_functions(fun, in_place, bool(extra), invariants, tuple(events.functions), dtype), None
     except NotCompilableError as reason:
         if compiled:
             raise

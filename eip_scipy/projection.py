@@ -87,6 +87,7 @@ def project(
     options = Options(
         rtol=np.zeros(n * width),
         atol=np.zeros(n),
+        block_atol=np.zeros(n),
         groups=_setup.blocks_of(None, n, width),
         frame=_setup.frame_rows(frame, n, width),
         target=_targets(known, target),
@@ -99,6 +100,7 @@ def project(
         reuse_f=True,
         uses_f=known.uses_f,
         compensated=False,
+        adaptive=False,
     )
     work = make_work(n, y.dtype, 0, known.size, n)
     if sigma is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -10,14 +11,25 @@ import numpy as np
 from scipy.integrate import DenseOutput, OdeSolver
 
 from . import _setup
-from ._kernels import OK
+from ._kernels import NOT_FINITE, OK
 from ._setup import ProjectionOptions
-from ._step import close_step, project_step, raw_step
-from .dense import HermiteDenseOutput
-from .result import NFEV, NJEV, NLU
-from .tableaux import RK1, RK2, RK3, RK4, RK5, Tableau
+from ._step import T_NEW, TOO_SMALL, H, Span, T, close_step, next_step, project_step
+from .dense import dense_output
+from .result import NFEV, NJEV, NLU, REJECTED
+from .tableaux import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
 
-__all__ = ["EIPRK1", "EIPRK2", "EIPRK3", "EIPRK4", "EIPRK5", "EIPSolver", "eip_method"]
+__all__ = [
+    "EIPDOP853",
+    "EIPRK1",
+    "EIPRK2",
+    "EIPRK3",
+    "EIPRK4",
+    "EIPRK5",
+    "EIPRK23",
+    "EIPRK45",
+    "EIPSolver",
+    "eip_method",
+]
 
 OPTIONS = (
     *("h", "first_step", "max_step", "rtol", "atol", "vectorized", "invariants", "metric", "blocks", "frame"),
@@ -41,8 +53,13 @@ class EIPSolver(OdeSolver):
         Initial state, real or complex.
     t_bound : float
         End; before t0 to integrate backward.
-    h : float
-        Length of the step, > 0 in either direction. The last step ends on `t_bound` and may be shorter.
+    max_step, rtol, atol, first_step
+        Step control, as in SciPy's own methods; the error estimate sees the step before its projection. `rtol` and
+        `atol` are also the scale of the error metric: |atol| + rtol |y|, norms over a block.
+    vectorized : bool, optional
+        Whether `fun` takes (n, k) arrays, as in SciPy.
+    h : float, optional
+        A fixed step instead: its length, > 0 in either direction. The last step ends on `t_bound` and may be shorter.
     invariants : Invariant or sequence of Invariant, optional
         What to keep.
     metric : {"error", "euclidean"} or array_like, shape (n,), optional
@@ -70,10 +87,6 @@ class EIPSolver(OdeSolver):
         Project y0 onto given targets before the first step.
     diagnostics : Diagnostics, optional
         An empty `Diagnostics`, which the run fills.
-    rtol, atol : float or array_like, shape (n,), optional
-        Scale of the error metric: atol + rtol |y|.
-    vectorized : bool, optional
-        Whether `fun` takes (n, k) arrays, as in SciPy.
 
     Attributes
     ----------
@@ -127,28 +140,58 @@ class EIPSolver(OdeSolver):
             warnings.warn(
                 f"{type(self).__name__} has no option {name!r}; it is ignored{hint}", UserWarning, stacklevel=3
             )
+        if not hasattr(self, "TABLEAU"):
+            raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
+        if math.isnan(t0) or math.isnan(t_bound):
+            raise ValueError(f"t_span must hold two numbers, got ({t0}, {t_bound}).")
         start = _setup.initial_state(y0)
         derivative = _checked(fun, start.size, start.dtype, vectorized)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
-        if h is None:
-            raise ValueError(f"{type(self).__name__} needs the step h=...")
-        if first_step is not None or max_step != np.inf:
+        adaptive = h is None
+        if adaptive and not self.TABLEAU.has_estimate:
+            raise ValueError(f"{type(self).__name__} has no error estimate and needs the step h=...")
+        if not adaptive and (first_step is not None or max_step != np.inf):
             raise ValueError(
                 "h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other."
             )
-        self.h = _setup.check_fixed_step(h, t0, t_bound)
-        self._n_steps = _setup.fixed_steps(self.h, t0, t_bound)
+        first_step, self.max_step = _setup.step_bounds(first_step, max_step, t0, t_bound)
+        if adaptive:
+            rtol = _setup.adaptive_rtol(rtol)
+        else:
+            h = _setup.check_fixed_step(h, t0, t_bound)
+        self.h = h
+        self.rtol, self.atol = _setup.tolerances(rtol, atol, self.n)
         self._k = 0
-        self._t0 = t0
-        self._signed_h = self.h * self.direction
-        f0 = derivative(t0, start)
+        self._span = Span(
+            t0=t0,
+            h=0.0 if h is None else h * self.direction,
+            t_bound=t_bound,
+            sign=self.direction,
+            n_steps=_setup.UNBOUNDED if h is None else _setup.fixed_steps(h, t0, t_bound),
+            max_step=self.max_step,
+        )
+        calls = _setup.Counted(derivative)
+        f0 = calls(t0, start.copy())
+        self.h_abs = h if h is not None else first_step
+        if self.h_abs is None:
+            self.h_abs = _setup.initial_step(
+                calls,
+                t0,
+                start,
+                t_bound,
+                self.max_step,
+                f0,
+                self.TABLEAU.error_estimator_order or 0,
+                self.rtol,
+                self.atol,
+            )
         run = _setup.prepare(
             self.TABLEAU,
-            derivative,
+            calls,
             t0,
             start,
             f0,
-            self.h,
+            self.h_abs,
             ProjectionOptions(
                 invariants=invariants,
                 metric=metric,
@@ -163,15 +206,18 @@ class EIPSolver(OdeSolver):
             ),
             rtol,
             atol,
+            adaptive=adaptive,
         )
         _setup.attach(diagnostics, run)
         self._run, self._work = run, run.work
         self._derivative = derivative
-        self.y = run.y0
+        self._clock = np.array([t0, t0, 0.0, self.h_abs])
+        self._project_now, self._projection_status = False, OK
+        self._buffer = self._accepted = run.y0
         if run.y0 is not start:
-            f0 = derivative(t0, run.y0)
-        self._work.K[0] = self.f = f0
-        self._work.counters[NFEV] = 1 if run.y0 is start else 2
+            f0 = calls(t0, run.y0.copy())
+        self.y, self.f = run.y0, f0
+        self._work.counters[NFEV] = calls.count
         self._count()
         self.y_old, self.f_old = self.y, self.f
 
@@ -184,30 +230,43 @@ class EIPSolver(OdeSolver):
         self.nfev, self.njev, self.nlu = int(counters[NFEV]), int(counters[NJEV]), int(counters[NLU])
 
     def _step_impl(self) -> tuple[bool, str | None]:
-        last = self._k + 1 >= self._n_steps
-        t_new = self.t_bound if last else self._t0 + (self._k + 1) * self._signed_h
-        h = t_new - (self._t0 + self._k * self._signed_h) if last else self._signed_h
-        run, w = self._run, self._work
-        o = run.options
-        self._project_now = run.invariants.size > 0 and (last or (self._k + 1) % o.every == 0)
-        y = self.y
-        status = raw_step(self._rhs, None, self.t, y, y.view(float), t_new, h, self._project_now, run.method, o, w)
-        if status != OK:
-            self._count()
-            return False, _setup.not_finite(w, run.method, self.t, h)
-        self._projection_status = OK
-        y_new = self._project_step(t_new, y, w.y_hat, w.err)
-        if self._projection_status != OK:
-            self._count()
-            return False, _setup.projection_failure(run.invariants, w, t_new)
-        close_step(self._rhs, None, t_new, y_new, self._project_now, o, w)
+        run, w, clock = self._run, self._work, self._clock
+        y, y_new = self.y, np.empty_like(self.y)
+        w.K[0] = self.f
+        clock[T] = self.t
+        status = next_step(
+            self._finish, self._rhs, run.invariants.inv, run.invariants.grad, None, clock, self._k, self._span,
+            run.method, run.options, w, y, y.view(float), y_new, y_new.view(float),
+        )  # fmt: skip
         self._count()
+        if status != OK:
+            return False, self._failure(status)
         self._k += 1
         self.y_old, self.f_old = y, self.f
-        self.y, self.t = y_new, t_new
-        self.f = w.K[-1].copy()
-        w.K[0] = self.f
+        self.y, self.t, self.f = self._accepted, float(clock[T_NEW]), w.f_new.copy()
         return True, None
+
+    def _finish(
+        self, rhs: Any, inv: Any, grad: Any, params: Any, t: Any, y: Any, y_r: Any, t_new: Any, project: Any, m: Any,
+        o: Any, w: Any, y_new: Any, y_new_r: Any,
+    ) -> int:  # fmt: skip
+        """What `finish_step` does, with the hook in its place."""
+        self._project_now, self._projection_status = project, OK
+        self._buffer = y_new
+        self._accepted = self._project_step(t_new, y, w.y_hat, w.err)
+        if self._projection_status != OK:
+            w.counters[REJECTED] += 1
+            return self._projection_status
+        close_step(rhs, params, t_new, self._accepted, project, o, w)
+        return OK
+
+    def _failure(self, status: int) -> str:
+        clock, run = self._clock, self._run
+        if status == NOT_FINITE:
+            return _setup.not_finite(run.work, run.method, clock[T], clock[H])
+        if status == TOO_SMALL:
+            return self.TOO_SMALL_STEP
+        return _setup.projection_failure(run.invariants, run.work, clock[T_NEW])
 
     def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
         """The accepted state from a raw step; override to act after each step.
@@ -228,25 +287,25 @@ class EIPSolver(OdeSolver):
         ndarray, shape (n,)
             A new array.
         """
-        w = self._work
+        w, y_new = self._work, self._buffer
         if not self._project_now:
-            return y_hat.copy()
+            y_new[:] = y_hat
+            return y_new
         if y_hat is not w.y_hat:
             w.y_hat[:] = y_hat
         if err is not w.err:
             w.err[:] = err
-        y_new = np.empty_like(y)
-        invariants = self._run.invariants
+        run = self._run
         self._projection_status = project_step(
             self._rhs,
-            invariants.inv,
-            invariants.grad,
+            run.invariants.inv,
+            run.invariants.grad,
             None,
             self.t,
             y,
             y.view(float),
             t,
-            self._run.options,
+            run.options,
             w,
             y_new,
             y_new.view(float),
@@ -254,7 +313,11 @@ class EIPSolver(OdeSolver):
         return y_new
 
     def _dense_output_impl(self) -> DenseOutput:
-        return HermiteDenseOutput(self.t_old, self.t, self.y_old, self.y, self.f_old, self.f)
+        out = dense_output(
+            self._rhs, self._run, self.TABLEAU, self.t_old, self.t, self.y_old, self.y, self.f_old, self.f
+        )
+        self._count()
+        return out
 
 
 def _checked(
@@ -322,6 +385,27 @@ class EIPRK5(EIPSolver):
     """EIP method on Fehlberg's method of order 5 (six stages). Options: see `EIPSolver`."""
 
     TABLEAU = RK5
+
+
+class EIPRK23(EIPSolver):
+    """EIP method on SciPy's RK23, the pair of Bogacki and Shampine. Options: see `EIPSolver`."""
+
+    TABLEAU = RK23
+
+
+class EIPRK45(EIPSolver):
+    """EIP method on SciPy's RK45, the pair of Dormand and Prince.
+
+    Options: see `EIPSolver`. Without invariants it takes the steps of `scipy.integrate.RK45`.
+    """
+
+    TABLEAU = RK45
+
+
+class EIPDOP853(EIPSolver):
+    """EIP method on SciPy's DOP853, of order 8. Options: see `EIPSolver`."""
+
+    TABLEAU = DOP853
 
 
 def eip_method(tableau: Tableau) -> type[EIPSolver]:

@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 
-__all__ = ["RK1", "RK2", "RK3", "RK4", "RK5", "Tableau"]
+__all__ = ["DOP853", "RK1", "RK2", "RK3", "RK4", "RK5", "RK23", "RK45", "Tableau"]
 
 Number = int | float | str | Fraction
 Tree = tuple["Tree", ...]
@@ -92,6 +92,11 @@ class Tableau:
         Order of `b_hat`, checked likewise; needed with `b_hat`.
     c : sequence, length s, optional
         Nodes; default, and required to equal, the row sums of `A`.
+    e_low : sequence, length s + 1, optional
+        Weights of a second, cruder error e3 beside ``e = b - b_hat`` (e5): the estimate is then
+        h e5 |e5| / hypot(e5, e3 / 10), as in DOP853, and `b_hat` two orders below `error_estimator_order`.
+    P : sequence of sequences, shape (s + 1, q), optional
+        Dense output: y(t + theta h) = y + h sum_j theta^(j + 1) (K^T P)_j, the last row for f at the new point.
     reference : str
         Where the coefficients come from, down to the equation or table.
 
@@ -99,13 +104,14 @@ class Tableau:
     ----------
     A, b, c : ndarray of float64
         (s, s), (s,), (s,).
-    e : ndarray of float64, shape (s + 1,)
-        Weights of the error estimate, ``b - b_hat``; zero without one.
+    e, e_low : ndarray of float64, shape (s + 1,)
+        Weights of the error estimate, ``b - b_hat``, and of its second part; zero without one.
+    P : ndarray of float64, shape (s + 1, q), or None
     b_low : ndarray of float64, shape (s,)
         What rounding `b` to double lost, for compensated summation.
     n_stages : int
     fsal : bool
-        Whether the estimate uses f at the new point.
+        Whether the estimate takes f at the new point: `b_hat` has s + 1 entries.
 
     Raises
     ------
@@ -122,6 +128,8 @@ class Tableau:
     c: np.ndarray = field(init=False)
     reference: str = ""
     e: np.ndarray = field(init=False)
+    e_low: np.ndarray = field(init=False)
+    P: np.ndarray | None = field(init=False)
     b_low: np.ndarray = field(init=False)
     n_stages: int = field(init=False)
     fsal: bool = field(init=False)
@@ -136,6 +144,8 @@ class Tableau:
         b_hat: Sequence[Number] | None = None,
         error_estimator_order: int | None = None,
         c: Sequence[Number] | None = None,
+        e_low: Sequence[Number] | None = None,
+        P: Sequence[Sequence[Number]] | None = None,
         reference: str = "",
     ) -> None:
         if isinstance(order, bool) or not isinstance(order, int) or order < 1:
@@ -150,7 +160,9 @@ class Tableau:
         if b_hat is None and error_estimator_order is not None:
             raise ValueError(f"{name}: error_estimator_order was given without b_hat.")
         if b_hat is not None:
-            weights_hat = self._check_embedded(name, exact_A, exact_b, b_hat, order, error_estimator_order)
+            # Of a pair of orders 5 and 3 the combined estimate is of order 2 * 5 - 3 = 7.
+            fewer = 0 if e_low is None else 2
+            weights_hat = self._check_embedded(name, exact_A, exact_b, b_hat, error_estimator_order, fewer)
         e = np.zeros(s + 1)
         if weights_hat is not None:
             e[:] = [float(x) for x in _vector(name, [*exact_b, 0]) - weights_hat]
@@ -164,9 +176,11 @@ class Tableau:
             "error_estimator_order": error_estimator_order if b_hat is not None else None,
             "reference": reference,
             "e": e,
+            "e_low": np.zeros(s + 1) if e_low is None else _vector(name, e_low).astype(float),
+            "P": None if P is None else np.array([_vector(name, row) for row in P]).astype(float),
             "b_low": _low_parts(exact_b, nodes, order),
             "n_stages": s,
-            "fsal": bool(e[s] != 0),
+            "fsal": b_hat is not None and len(b_hat) == s + 1,
         }
         for key, value in values.items():
             if isinstance(value, np.ndarray):
@@ -175,7 +189,7 @@ class Tableau:
 
     @staticmethod
     def _check_embedded(
-        name: str, A: np.ndarray, b: np.ndarray, b_hat: Sequence[Number], order: int, order_hat: int | None
+        name: str, A: np.ndarray, b: np.ndarray, b_hat: Sequence[Number], order_hat: int | None, fewer: int
     ) -> np.ndarray:
         """`b_hat` with s + 1 entries, its order checked on the stages and f at the new point (row b)."""
         s = len(b)
@@ -188,7 +202,7 @@ class Tableau:
         weights = _vector(name, [*b_hat, *[0] * (s + 1 - len(b_hat))])
         extended = np.full((s + 1, s + 1), Fraction(0), dtype=object)
         extended[:s, :s], extended[s, :s] = A, b
-        _check_order(name, "b_hat", extended, weights, order_hat)
+        _check_order(name, "b_hat", extended, weights, order_hat - fewer)
         return weights
 
     @property
@@ -202,6 +216,11 @@ class Tableau:
         if self.error_estimator_order is None:
             return 1.0
         return (self.order + 1) / (self.error_estimator_order + 1)
+
+    @property
+    def paired(self) -> bool:
+        """Whether the estimate has two parts."""
+        return bool(np.any(self.e_low))
 
     def __repr__(self) -> str:
         estimate = f", estimate of order {self.error_estimator_order}" if self.has_estimate else ""
@@ -308,3 +327,60 @@ RK5 = Tableau(
     error_estimator_order=4,
     reference="Fehlberg's 4(5) pair: Hairer, Norsett & Wanner, Solving ODEs I, table II.5.1",
 )
+
+RK23 = Tableau(
+    "RK23",
+    [[], ["1/2"], [0, "3/4"]],
+    ["2/9", "1/3", "4/9"],
+    order=3,
+    b_hat=["7/24", "1/4", "1/3", "1/8"],
+    error_estimator_order=2,
+    P=[[1, "-4/3", "5/9"], [0, 1, "-2/3"], [0, "4/3", "-8/9"], [0, -1, 1]],
+    reference="Bogacki & Shampine, Appl. Math. Lett. 2 (1989) 321; interpolant: cubic Hermite",
+)
+RK45 = Tableau(
+    "RK45",
+    [
+        [],
+        ["1/5"],
+        ["3/40", "9/40"],
+        ["44/45", "-56/15", "32/9"],
+        ["19372/6561", "-25360/2187", "64448/6561", "-212/729"],
+        ["9017/3168", "-355/33", "46732/5247", "49/176", "-5103/18656"],
+    ],
+    ["35/384", 0, "500/1113", "125/192", "-2187/6784", "11/84"],
+    order=5,
+    b_hat=["5179/57600", 0, "7571/16695", "393/640", "-92097/339200", "187/2100", "1/40"],
+    error_estimator_order=4,
+    P=[
+        [1, "-8048581381/2820520608", "8663915743/2820520608", "-12715105075/11282082432"],
+        [0, 0, 0, 0],
+        [0, "131558114200/32700410799", "-68118460800/10900136933", "87487479700/32700410799"],
+        [0, "-1754552775/470086768", "14199869525/1410260304", "-10690763975/1880347072"],
+        [0, "127303824393/49829197408", "-318862633887/49829197408", "701980252875/199316789632"],
+        [0, "-282668133/205662961", "2019193451/616988883", "-1453857185/822651844"],
+        [0, "40617522/29380423", "-110615467/29380423", "69997945/29380423"],
+    ],
+    reference="Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19; interpolant: Shampine, Math. Comp. 46 (1986) 135",
+)
+
+
+def _dop853() -> Tableau:
+    """The coefficients that SciPy's public class carries, so that there is one copy of these 150 numbers."""
+    import scipy.integrate
+
+    source = scipy.integrate.DOP853
+    b = [Fraction(float(x)) for x in source.B]
+    return Tableau(
+        "DOP853",
+        [[float(x) for x in row[:i]] for i, row in enumerate(source.A[: len(b), : len(b)])],
+        b,
+        order=8,
+        b_hat=[x - Fraction(float(e)) for x, e in zip([*b, Fraction(0)], source.E5, strict=True)],
+        error_estimator_order=7,
+        e_low=[float(x) for x in source.E3],
+        reference="Hairer, Norsett & Wanner, Solving ODEs I, section II.10 (DOP853)",
+    )
+
+
+DOP853 = _dop853()

@@ -285,9 +285,7 @@ def lattice_energy_gradient_in_place(t, y, f, out):
 Z0 = np.exp(1j * np.arange(7.0)) * (1.0 + 0.1 * np.arange(7.0))
 MASS = Invariant(mass, mass_gradient, name="mass")
 ENERGY = Invariant(lattice_energy, lattice_energy_gradient, uses_f=True, name="energy")
-ENERGY_IN_PLACE = Invariant(
-    lattice_energy, lattice_energy_gradient_in_place, uses_f=True, in_place=True, name="energy"
-)
+ENERGY_IN_PLACE = Invariant(lattice_energy, lattice_energy_gradient_in_place, uses_f=True, in_place=True, name="energy")
 COMPLEX_FRAME = (np.full((1, 7), 1.0 + 0.5j), np.full((7, 1), 0.2 - 0.1j))
 COMPLEX_CASES = {
     "no invariants": {},

@@ -618,6 +618,12 @@ def test_time_dependent_function_that_is_no_invariant():
         run((0.3, 1.3), [1.0], lambda t, y: np.cos(t) * np.ones(1), invariants=wrong)
 
 
+def test_time_dependent_function_at_rest_is_no_invariant():
+    wrong = Invariant(lambda t, y: y[0] + t, lambda t, y: np.ones(1), name="I")
+    with pytest.warns(UserWarning, match="'I' is no invariant"):
+        run((0, 1), [1.0], lambda t, y: np.zeros(1), invariants=wrong)
+
+
 def test_slow_drift_is_noticed():
     """A damping of 1e-6 breaks the energy by more than 1e-8 of its terms' rates."""
 

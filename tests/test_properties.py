@@ -109,9 +109,7 @@ def test_units_of_the_components(seed, size, iterations):
     unit, sigma = 10.0 ** q.rng.uniform(-12, 12, n), 10.0 ** q.rng.uniform(-2, 0, n)
     assume(q.well_conditioned(sigma))
     plain = project(q.y_hat, q.invariant(), sigma=sigma, iterations=iterations).y
-    scaled = Invariant(
-        lambda t, z: q.value(t, z / unit), lambda t, z: q.grad(t, z / unit) / unit, target=q.target
-    )
+    scaled = Invariant(lambda t, z: q.value(t, z / unit), lambda t, z: q.grad(t, z / unit) / unit, target=q.target)
     z = project(q.y_hat * unit, scaled, sigma=sigma * unit, iterations=iterations).y
     np.testing.assert_allclose(z / unit, plain, rtol=0, atol=1e-11)
 
@@ -552,9 +550,7 @@ def test_order_is_kept(method, steps, options):
     assert np.log2(error / finer) == pytest.approx(method.TABLEAU.order, abs=0.2)
 
 
-@pytest.mark.parametrize(
-    ("method", "steps"), [(EIPRK1, 48), (EIPRK2, 24), (EIPRK3, 24), (EIPRK4, 24), (EIPRK5, 12)]
-)
+@pytest.mark.parametrize(("method", "steps"), [(EIPRK1, 48), (EIPRK2, 24), (EIPRK3, 24), (EIPRK4, 24), (EIPRK5, 12)])
 def test_defects_are_of_twice_the_order(method, steps):
     """O(h^(2p + 2)), theorem 2.1 of the paper."""
     coarse, fine = (kepler_errors(method, n, metric="euclidean")[1] for n in (steps, 2 * steps))

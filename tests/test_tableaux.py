@@ -151,9 +151,7 @@ def moment_residuals(tableau):
     weights = [Fraction(x) + Fraction(y) for x, y in zip(tableau.b, tableau.b_low, strict=True)]
     nodes = [Fraction(x) for x in tableau.c]
     count = min(tableau.order, len(set(nodes)))
-    return [
-        abs(sum(w * x**k for w, x in zip(weights, nodes, strict=True)) - Fraction(1, k + 1)) for k in range(count)
-    ]
+    return [abs(sum(w * x**k for w, x in zip(weights, nodes, strict=True)) - Fraction(1, k + 1)) for k in range(count)]
 
 
 @pytest.mark.parametrize("tableau", METHODS, ids=name)
