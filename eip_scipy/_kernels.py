@@ -227,9 +227,19 @@ def block_square(a, b, unit, groups):
 
 
 @_jit
-def block_sizes(y, y_hat, err, rtol, unit, groups, sizes, errors):
-    """Per block: sizes = max(|rtol y|, |rtol y_hat|), errors = |err|, squares taken in units of 1 / unit."""
+def block_sizes(y, y_hat, err, rtol, groups, extreme, sizes, errors):
+    """Per block: sizes = max(|rtol y|, |rtol y_hat|), errors = |err|.
+
+    `extreme`: squares are taken in a unit of each block's own, so that they neither vanish nor overflow.
+    """
+    unit = 1.0
     for b in range(sizes.size):
+        if extreme:
+            top = 0.0
+            for p in range(groups.start[b], groups.start[b + 1]):
+                i = groups.member[p]
+                top = max(top, max(rtol[i] * max(abs(y[i]), abs(y_hat[i])), abs(err[i])))
+            unit = 1.0 / top if top > 0.0 else 1.0
         old = new = 0.0
         for p in range(groups.start[b], groups.start[b + 1]):
             i = groups.member[p]
@@ -238,11 +248,8 @@ def block_sizes(y, y_hat, err, rtol, unit, groups, sizes, errors):
             old += x * x
             x = weight * y_hat[i]
             new += x * x
-        sizes[b] = max(old, new)
-        errors[b] = block_square(err, b, unit, groups)
-    for b in range(sizes.size):
-        sizes[b] = sqrt(sizes[b]) / unit
-        errors[b] = sqrt(errors[b]) / unit
+        sizes[b] = sqrt(max(old, new)) / unit
+        errors[b] = sqrt(block_square(err, b, unit, groups)) / unit
 
 
 @_jit_inline
@@ -251,12 +258,11 @@ def error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio):
 
     `atol` is by block. r = 0 (no error at all) leaves the euclidean metric. `ratio` is scratch.
     """
-    block_sizes(y, y_hat, err, rtol, 1.0, groups, scale, ratio)
-    top = largest(scale)
-    if not 1e-140 < top < 1e140:
-        top = max(largest_abs(y), largest_abs(y_hat))
-        if 0.0 < top < np.inf:
-            block_sizes(y, y_hat, err, rtol, 1.0 / top, groups, scale, ratio)
+    block_sizes(y, y_hat, err, rtol, groups, False, scale, ratio)
+    for b in range(scale.size):
+        if not 1e-140 < scale[b] < 1e140:
+            block_sizes(y, y_hat, err, rtol, groups, True, scale, ratio)
+            break
     for b in range(scale.size):
         scale[b] += atol[b]
         relative = ratio[b] / max(scale[b], TINY)

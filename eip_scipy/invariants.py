@@ -409,8 +409,9 @@ class InvariantSet:
         total = np.zeros(self.size)
         for multiple, weight in DIFFERENCE_WEIGHTS:
             total += weight * (self.values(t + multiple * step, y) - self.values(t - multiple * step, y))
-        rates = np.where(np.isfinite(total), total, 0.0) / step
-        noise = np.where(rates == 0, 0.0, 10 * EPS * self.term_sizes(t, y, f) / step)
+        with np.errstate(over="ignore"):
+            rates = np.where(np.isfinite(total), total, 0.0) / step
+            noise = np.where(rates == 0, 0.0, 10 * EPS * self.term_sizes(t, y, f) / step)
         return rates, noise
 
 

@@ -591,7 +591,7 @@ class _Loop:
         """Invariants of the saved states; NaN where the run was broken off by an invariant that still raises."""
         try:
             return self.driver.values()
-        except Exception:
+        except BaseException:
             if not broken:
                 raise
             return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
 from . import _setup
@@ -15,6 +16,7 @@ from ._kernels import NOT_FINITE, OK
 from ._setup import ProjectionOptions
 from ._step import T_NEW, TOO_SMALL, H, Span, T, close_step, next_step, project_step
 from .dense import dense_output
+from .invariants import as_invariants
 from .result import NFEV, NJEV, NLU, REJECTED
 from .tableaux import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
 
@@ -106,6 +108,8 @@ class EIPSolver(OdeSolver):
     """
 
     TABLEAU: ClassVar[Tableau]
+    # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
+    SCIPY: ClassVar[type[OdeSolver] | None] = None
     t: float
     t_old: float
 
@@ -171,9 +175,10 @@ class EIPSolver(OdeSolver):
             max_step=self.max_step,
         )
         calls = _setup.Counted(derivative)
-        f0 = calls(t0, start.copy())
+        self._scipy = self._scipy_solver(calls, start, first_step, as_invariants(invariants)) if adaptive else None
+        f0 = calls(t0, start.copy()) if self._scipy is None else np.zeros_like(start)
         self.h_abs = h if h is not None else first_step
-        if self.h_abs is None:
+        if self.h_abs is None and self._scipy is None:
             self.h_abs = _setup.initial_step(
                 calls,
                 t0,
@@ -191,7 +196,7 @@ class EIPSolver(OdeSolver):
             t0,
             start,
             f0,
-            self.h_abs,
+            self.h_abs or 0.0,
             ProjectionOptions(
                 invariants=invariants,
                 metric=metric,
@@ -211,7 +216,7 @@ class EIPSolver(OdeSolver):
         _setup.attach(diagnostics, run)
         self._run, self._work = run, run.work
         self._derivative = derivative
-        self._clock = np.array([t0, t0, 0.0, self.h_abs])
+        self._clock = np.array([t0, t0, 0.0, self.h_abs or 0.0])
         self._project_now, self._projection_status = False, OK
         self._buffer = self._accepted = run.y0
         if run.y0 is not start:
@@ -229,7 +234,27 @@ class EIPSolver(OdeSolver):
         counters = self._work.counters
         self.nfev, self.njev, self.nlu = int(counters[NFEV]), int(counters[NJEV]), int(counters[NLU])
 
+    def _scipy_solver(
+        self, calls: _setup.Counted, start: np.ndarray, first_step: float | None, invariants: tuple[Any, ...]
+    ) -> OdeSolver | None:
+        if self.SCIPY is None or invariants or type(self)._project_step is not EIPSolver._project_step:
+            return None
+        control = {"first_step": first_step, "max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
+        return self.SCIPY(calls, self.t, start, self.t_bound, **control)
+
+    def _scipy_step(self, solver: OdeSolver) -> tuple[bool, str | None]:
+        message = solver.step()
+        self.nfev = solver.nfev
+        if solver.status == "failed":
+            if not np.isfinite(solver.K).all():
+                message = f"fun returned a non-finite value at t={self.t:.10g}"
+            return False, message
+        self.y, self.t = solver.y, solver.t
+        return True, None
+
     def _step_impl(self) -> tuple[bool, str | None]:
+        if self._scipy is not None:
+            return self._scipy_step(self._scipy)
         run, w, clock = self._run, self._work, self._clock
         y, y_new = self.y, np.empty_like(self.y)
         w.K[0] = self.f
@@ -313,6 +338,10 @@ class EIPSolver(OdeSolver):
         return y_new
 
     def _dense_output_impl(self) -> DenseOutput:
+        if self._scipy is not None:
+            out = self._scipy.dense_output()
+            self.nfev = self._scipy.nfev
+            return out
         out = dense_output(
             self._rhs, self._run, self.TABLEAU, self.t_old, self.t, self.y_old, self.y, self.f_old, self.f
         )
@@ -391,6 +420,7 @@ class EIPRK23(EIPSolver):
     """EIP method on SciPy's RK23, the pair of Bogacki and Shampine. Options: see `EIPSolver`."""
 
     TABLEAU = RK23
+    SCIPY = scipy.integrate.RK23
 
 
 class EIPRK45(EIPSolver):
@@ -400,12 +430,14 @@ class EIPRK45(EIPSolver):
     """
 
     TABLEAU = RK45
+    SCIPY = scipy.integrate.RK45
 
 
 class EIPDOP853(EIPSolver):
     """EIP method on SciPy's DOP853, of order 8. Options: see `EIPSolver`."""
 
     TABLEAU = DOP853
+    SCIPY = scipy.integrate.DOP853
 
 
 def eip_method(tableau: Tableau) -> type[EIPSolver]:

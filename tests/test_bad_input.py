@@ -401,8 +401,8 @@ def test_h_positive(driver, h):
 
 @both
 def test_h_missing(driver):
-    with pytest.raises(ValueError, match="EIPRK4 needs the step h="):
-        driver(h=None)
+    with pytest.raises(ValueError, match="EIPRK1 has no error estimate and needs the step h="):
+        driver(h=None, method=EIPRK1)
 
 
 @both

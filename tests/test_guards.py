@@ -330,6 +330,14 @@ def test_row_inside_the_band_stays():
     assert abs(alone.y.sum() - 1.0) > 1e-3
 
 
+def test_row_inside_the_band_is_not_corrected():
+    """Its own defect is round-off of its scale, though another one is projected."""
+    first = Invariant(lambda t, y: y[0], lambda t, y: np.array([1.0, 0.0]), target=1.0)
+    noisy = Invariant(lambda t, y: y[1], lambda t, y: np.array([0.0, 1.0]), target=1.0, scale=1e12)
+    result = project([1.1, 1.0 + 1e-6], [first, noisy])
+    np.testing.assert_array_equal(result.y, [1.0, 1.0 + 1e-6])
+
+
 # Duplicate and contradicting invariants.
 
 
@@ -351,6 +359,15 @@ def test_project_duplicates():
     result = project([0.6, 0.81], [SQUARE, SQUARE], target=[1.0, 1.0])
     assert result.rank == 1
     np.testing.assert_allclose(result.y, project([0.6, 0.81], SQUARE, target=1.0).y, rtol=EPS)
+
+
+def test_duplicates_hide_no_other_invariant():
+    """The independent row is found behind the two that are one."""
+    tilted = Invariant(lambda t, y: y[0] + 0.5 * y[1], lambda t, y: np.array([1.0, 0.5]))
+    for order in ([SQUARE, SQUARE, tilted], [tilted, SQUARE, SQUARE], [SQUARE, tilted, SQUARE]):
+        result = project([0.6, 0.81], order, target=[1.0 if item is SQUARE else 1.05 for item in order], iterations=8)
+        assert result.rank == 2
+        np.testing.assert_allclose(result.defect, 0.0, atol=4 * EPS)
 
 
 A1000 = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=1000.0, name="a")
@@ -418,6 +435,13 @@ def test_invariant_not_finite_later():
     np.testing.assert_array_equal(run.t, [0.0, 0.5])
     assert np.isfinite(run.y).all()
     assert np.isfinite(run.invariants).all()
+
+
+def test_value_not_finite_at_the_projected_state():
+    """It was finite before the correction, which leads out of the domain."""
+    edge = Invariant(lambda t, y: y[0] if y[0] < 1.005 else math.nan, lambda t, y: np.ones(1), target=1.01, name="edge")
+    with pytest.raises(ValueError, match="projection failed at t=0: invariant 'edge', residual nan, rank 1 of 1"):
+        project([1.0], edge)
 
 
 @both

@@ -2,6 +2,7 @@
 
 import math
 
+import mpmath
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -175,6 +176,33 @@ def test_dependent_rows_give_the_pseudo_inverse_s_answer(seed, n, rows):
     np.testing.assert_allclose(result.correction, np.linalg.pinv(G, rcond=1e-10) @ (G @ (wanted - y_hat)), atol=1e-11)
 
 
+@pytest.mark.parametrize("angle", [1e-3, 1e-5, 1e-7])
+def test_nearly_parallel_rows(angle):
+    """Above the tolerance of rank both are met to round-off: one Gram-Schmidt pass would miss by EPS / angle."""
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        first, other = rng.standard_normal((2, 6))
+        G = np.array([first, first + angle * other])
+        # A shift of size one: the second defect holds its angle's worth.
+        y_hat, shift = np.zeros(6), rng.standard_normal(6)
+        result = project(y_hat, Invariant(lambda t, y, G=G: G @ y, lambda t, y, G=G: G, target=G @ shift))
+        assert result.rank == 2
+        with mpmath.workdps(40):
+            A = mpmath.matrix(G.tolist())
+            wanted = A.T * mpmath.lu_solve(A * A.T, mpmath.matrix((G @ shift).tolist()))
+            wanted = np.array([float(x) for x in wanted])
+        np.testing.assert_allclose(result.correction, wanted, rtol=0, atol=20 * EPS / angle)
+        np.testing.assert_allclose(result.defect, 0.0, atol=40 * EPS)
+
+
+def test_size_of_the_weights_does_not_matter():
+    q = Quadratics(3, 5, 2)
+    sigma = q.rng.uniform(0.1, 1, 5)
+    plain = project(q.y_hat, q.invariant(), sigma=sigma)
+    for factor in (2.0**1000, 2.0**-1000):
+        np.testing.assert_array_equal(project(q.y_hat, q.invariant(), sigma=factor * sigma).y, plain.y)
+
+
 @given(seeds, sizes)
 @few
 def test_euclidean_projection_is_the_paper_s_formula(seed, size):
@@ -256,7 +284,7 @@ def test_complex_frame(seed, n):
     q = ComplexQuadratic(seed, n)
     C, S = (q.rng.standard_normal(s) + 1j * q.rng.standard_normal(s) for s in ((1, n), (n, 1)))
     assume(abs((C @ S)[0, 0]) > 0.3)
-    result = project(q.y_hat, Invariant(q.value, q.grad, target=q.target), frame=(C, S))
+    result = project(q.y_hat, Invariant(q.value, q.grad, target=q.target), frame=(C, S), iterations=4)
     assert abs(C @ result.correction) < 1e-13
     assert abs(C @ project(q.y_hat, Invariant(q.value, q.grad, target=q.target)).correction) > 1e-9
 
@@ -506,12 +534,29 @@ def test_given_weights():
     assert run.y[0, -1] - y_hat[0] == pytest.approx((5 - y_hat @ y_hat) / (2 * y_hat[0]), rel=1e-9)
 
 
+def test_spaced_projections_start_afresh():
+    """The errors that a projection has used count no more at the next one."""
+    y0 = np.array([0.6, 0.3, -0.4, 1.3])
+    kept = [Invariant(item.fun, item.grad, target=item.fun(0.0, y0)) for item in ORBIT]
+    options = {"method": EIPRK3, "h": 0.2, "every": 2, "invariants": kept, "atol": 0.0, "iterations": 4}
+    whole = integrate(orbit, (0, 0.8), y0, **options).y[:, -1]
+    half = integrate(orbit, (0, 0.4), y0, **options).y[:, -1]
+    np.testing.assert_allclose(integrate(orbit, (0.4, 0.8), half, **options).y[:, -1], whole, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("uses_f", [False, True])
 @pytest.mark.parametrize("direction", ["new", "old", "midpoint"])
 @pytest.mark.parametrize("iterations", [1, 2])
-def test_directions_are_those_of_the_paper_s_remark(direction, iterations):
+def test_directions_are_those_of_the_paper_s_remark(direction, iterations, uses_f):
     """y + D mu with D the gradient at the new, old or middle point and Newton's mu, gradients at the iterates."""
     y0, h = np.array([0.1, -0.2, 0.35, 0.05]), 0.4
-    keep = Invariant(swing_energy, swing_gradient)
+    times = []
+
+    def gradient(t, y, f):
+        times.append(t)
+        return np.array([-f[2], -f[3], y[2], y[3]])
+
+    keep = Invariant(swing_energy, gradient if uses_f else swing_gradient, uses_f=uses_f)
     options = {"direction": direction, "iterations": iterations, "metric": "euclidean"}
     run = integrate(swing, (0, h), y0, method=EIPRK4, h=h, invariants=keep, **options)
     y_hat, _ = raw_step(EIPRK4.TABLEAU, swing, 0.0, y0, h)
@@ -520,6 +565,8 @@ def test_directions_are_those_of_the_paper_s_remark(direction, iterations):
     for _ in range(iterations):
         y = y - D * (swing_energy(0, y) - swing_energy(0, y0)) / (swing_gradient(0, y) @ D)
     np.testing.assert_allclose(run.y[:, -1], y, rtol=0, atol=2 * EPS)
+    if uses_f:
+        assert (0.5 * h in times) == (direction == "midpoint")
 
 
 def test_harmonic_oscillator_multiplier_of_the_paper():
