@@ -358,7 +358,11 @@ def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y
         clock[T] = span.t0 + k * span.h
     t = clock[T]
     least = 10.0 * abs(np.nextafter(t, span.sign * np.inf) - t) if adaptive else 0.0
-    h_abs = min(span.max_step, max(clock[H_ABS], least))
+    h_abs = clock[H_ABS]
+    if h_abs > span.max_step:
+        h_abs = span.max_step
+    elif h_abs < least:
+        h_abs = least
     rejected = False
     retries = 0
     status = TOO_SMALL

@@ -155,6 +155,7 @@ class Tableau:
         nodes = exact_A.sum(axis=1) if s > 1 else _vector(name, [0])
         if c is not None:
             _check_nodes(name, _vector(name, c), nodes)
+            nodes = _vector(name, c)
         _check_order(name, "b", exact_A, exact_b, order)
         weights_hat = None
         if b_hat is None and error_estimator_order is not None:
@@ -376,6 +377,7 @@ def _dop853() -> Tableau:
         [[float(x) for x in row[:i]] for i, row in enumerate(source.A[: len(b), : len(b)])],
         b,
         order=8,
+        c=[float(x) for x in source.C[: len(b)]],
         b_hat=[x - Fraction(float(e)) for x, e in zip([*b, Fraction(0)], source.E5, strict=True)],
         error_estimator_order=7,
         e_low=[float(x) for x in source.E3],

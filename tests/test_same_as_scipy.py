@@ -1,0 +1,492 @@
+"""Without invariants the adaptive pairs take the steps of SciPy's classes; `integrate` takes those of the classes."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from numba import njit
+from scipy.integrate import DOP853, RK23, RK45, solve_ivp
+
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, Diagnostics, Invariant, eip_method, integrate
+from eip_scipy.problems import kepler
+
+EPS = np.finfo(float).eps
+SCIPY = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853}
+OURS = {"RK23": EIPRK23, "RK45": EIPRK45, "DOP853": EIPDOP853}
+# The same pairs with the package's own steps, whatever the classes do where nothing is to be projected.
+OWN = {name: eip_method(cls.TABLEAU) for name, cls in OURS.items()}
+PAIRS = [(name, cls) for table in (OURS, OWN) for name, cls in table.items()]
+pairs = pytest.mark.parametrize(("name", "method"), PAIRS, ids=[cls.__name__ for _, cls in PAIRS])
+
+
+def orbit(t, y):
+    return np.array([y[2], y[3], *(-y[:2] / math.hypot(y[0], y[1]) ** 3)])
+
+
+def orbit_start(e):
+    return [1 - e, 0.0, 0.0, math.sqrt((1 + e) / (1 - e))]
+
+
+def van_der_pol(t, y, mu=5.0):
+    return np.array([y[1], mu * (1 - y[0] ** 2) * y[1] - y[0]])
+
+
+def spin(t, y):
+    """Two coupled complex amplitudes, driven."""
+    return np.array([-1j * y[0] + 0.5j * y[1], -2j * y[1] + 0.5j * y[0] - 0.1 * abs(y[1]) ** 2 * y[1]])
+
+
+def rotor(t, y):
+    return np.array([y[1], -math.sin(y[0]) + 0.1 * math.cos(t)])
+
+
+CASES = {
+    "Kepler e=.6": (orbit, (0.0, 20.0), orbit_start(0.6)),
+    "Kepler e=.9": (orbit, (0.0, 7.0), orbit_start(0.9)),
+    "van der Pol": (van_der_pol, (0.0, 30.0), [2.0, 0.0]),
+    "complex": (spin, (0.0, 20.0), [1.0 + 0j, 0.2j]),
+    "driven rotor": (rotor, (-1.0, 20.0), [1.5, 0.0]),
+    "backward Kepler": (orbit, (3.0, -20.0), orbit_start(0.6)),
+    "backward complex": (spin, (5.0, 0.0), [1.0 + 0j, 0.2j]),
+    "one component": (lambda t, y: np.array([math.cos(t) * y[0]]), (0.0, 10.0), [1.0]),
+    "one component at zero": (lambda t, y: np.array([t]), (0.0, 10.0), [0.0]),
+    "from rest": (lambda t, y: np.zeros(2), (0.0, 10.0), [1.0, -1.0]),
+}
+
+
+def assert_close(ours, theirs, rtol):
+    """To rtol of the largest size that a component takes."""
+    ours, theirs = np.asarray(ours), np.asarray(theirs)
+    assert ours.shape == theirs.shape
+    assert ours.dtype == theirs.dtype
+    size = np.abs(theirs).max(axis=-1, keepdims=True, initial=0.0)
+    assert (np.abs(ours - theirs) <= rtol * size + 5e-324).all(), np.abs(ours - theirs).max()
+
+
+def assert_same(ours, theirs, rtol=1e-12):
+    assert ours.status == theirs.status
+    assert ours.success == theirs.success
+    assert ours.message == theirs.message
+    assert (ours.nfev, ours.njev, ours.nlu) == (theirs.nfev, 0, 0)
+    assert len(ours.t) == len(theirs.t)
+    assert_close(ours.t, theirs.t, rtol)
+    assert_close(ours.y, theirs.y, rtol)
+    assert (ours.t_events is None) == (theirs.t_events is None)
+    for kind in ("t_events", "y_events") if theirs.t_events is not None else ():
+        for mine, other in zip(ours[kind], theirs[kind], strict=True):
+            assert_close(mine.T, other.T, rtol)
+    if theirs.sol is not None:
+        times = np.linspace(theirs.t[0], theirs.t[-1], 137)
+        assert_close(ours.sol(times), theirs.sol(times), rtol)
+
+
+def both(method, name, fun, t_span, y0, **options):
+    """Our result and SciPy's."""
+    return (solve_ivp(fun, t_span, y0, method=m, **options) for m in (method, SCIPY[name]))
+
+
+@pairs
+@pytest.mark.parametrize("dense_output", [False, True])
+@pytest.mark.parametrize("case", CASES)
+def test_default_tolerances(name, method, case, dense_output):
+    ours, theirs = both(method, name, *CASES[case], dense_output=dense_output)
+    assert theirs.success
+    assert_same(ours, theirs)
+
+
+@pairs
+@pytest.mark.parametrize("case", CASES)
+def test_tight_tolerances(name, method, case):
+    """The estimate is a difference of terms h K_i of size h |f|, so round-off of them, eps h |f|, is a share
+    eps h |f| / tolerance of it: 1e-3 of it per step at rtol 1e-11, and an eighth of that of h. Steps then differ at
+    that level, and states by the method's own error times it."""
+    rtol = {"RK23": 1e-6, "RK45": 1e-8, "DOP853": 1e-11}[name]
+    ours, theirs = both(method, name, *CASES[case], rtol=rtol, atol=rtol * 1e-3)
+    assert theirs.success
+    assert abs(ours.nfev - theirs.nfev) <= 0.01 * theirs.nfev
+    assert abs(len(ours.t) - len(theirs.t)) <= 0.01 * len(theirs.t)
+    assert ours.t[-1] == theirs.t[-1]
+    assert_close(np.atleast_2d(ours.y[:, -1]).T, np.atleast_2d(theirs.y[:, -1]).T, 1e3 * rtol * 1e-3)
+
+
+OPTIONS = {
+    "array rtol and atol": {"rtol": [1e-3, 1e-4, 1e-5, 1e-3], "atol": [1e-6, 1e-7, 1e-8, 1e-4]},
+    "atol = 0": {"atol": 1e-30},
+    "loose": {"rtol": 0.1, "atol": 0.1},
+    "max_step": {"max_step": 0.05},
+    "first_step": {"first_step": 0.01},
+    "first_step too large": {"first_step": 10.0},
+    "first_step and max_step": {"first_step": 1e-3, "max_step": 0.3},
+    "integers": {"rtol": 1, "atol": 1, "max_step": 1, "first_step": 1},
+    "t_eval": {"t_eval": np.linspace(0.0, 20.0, 33)},
+    "t_eval inside": {"t_eval": [0.3, 0.31, 7.0, 19.999]},
+    "t_eval and dense_output": {"t_eval": np.linspace(0.0, 20.0, 33), "dense_output": True},
+}
+
+
+@pairs
+@pytest.mark.parametrize("option", OPTIONS)
+def test_options(name, method, option):
+    ours, theirs = both(method, name, *CASES["Kepler e=.6"], **OPTIONS[option])
+    assert_same(ours, theirs)
+
+
+def crossing(direction=0, terminal=False):
+    def event(t, y):
+        return y[0].real - 0.3
+
+    event.direction, event.terminal = direction, terminal
+    return event
+
+
+@pairs
+@pytest.mark.parametrize("direction", [0, 1, -1])
+@pytest.mark.parametrize("terminal", [False, True, 3])
+@pytest.mark.parametrize("case", ["Kepler e=.6", "van der Pol", "complex", "backward Kepler", "driven rotor"])
+def test_events(name, method, case, direction, terminal):
+    events = [crossing(direction, terminal), lambda t, y: t - 4.0, crossing()]
+    ours, theirs = both(method, name, *CASES[case], events=events)
+    assert theirs.t_events[2].size > 0
+    assert_same(ours, theirs)
+
+
+@pairs
+def test_terminal_event_with_t_eval_on_an_endless_interval(name, method):
+    fun, (t0, _), y0 = CASES["Kepler e=.6"]
+    options = {"events": crossing(terminal=4), "t_eval": np.linspace(0.0, 100.0, 500), "dense_output": True}
+    ours, theirs = both(method, name, fun, (t0, np.inf), y0, **options)
+    assert theirs.status == 1
+    assert_same(ours, theirs)
+
+
+@pairs
+def test_args(name, method):
+    ours, theirs = both(method, name, van_der_pol, (0.0, 10.0), [2.0, 0.0], args=(3.0,))
+    assert_same(ours, theirs)
+    assert abs(ours.y[0, -1] - solve_ivp(van_der_pol, (0.0, 10.0), [2.0, 0.0], method=method).y[0, -1]) > 1e-3
+
+
+@pairs
+@pytest.mark.parametrize("case", ["van der Pol", "complex"])
+def test_vectorized(name, method, case):
+    _, t_span, y0 = CASES[case]
+
+    def fun(t, y):
+        assert y.ndim == 2
+        if case == "complex":
+            return np.vstack([-1j * y[0] + 0.5j * y[1], -2j * y[1] + 0.5j * y[0]])
+        return np.vstack([y[1], 5 * (1 - y[0] ** 2) * y[1] - y[0]])
+
+    ours, theirs = both(method, name, fun, t_span, y0, vectorized=True)
+    assert_same(ours, theirs)
+
+
+@pairs
+def test_list_valued(name, method):
+    ours, theirs = both(method, name, lambda t, y: [y[1], -y[0]], (0, 10), [1, 0], dense_output=True)
+    assert_same(ours, theirs)
+
+
+@pairs
+def test_buffer_that_fun_reuses(name, method):
+    """SciPy's classes give wrong results with it; ours must not."""
+    buffer = np.zeros(4)
+
+    def reusing(t, y):
+        buffer[:] = orbit(t, y)
+        return buffer
+
+    _, t_span, y0 = CASES["Kepler e=.6"]
+    ours = solve_ivp(reusing, t_span, y0, method=method)
+    assert_same(ours, solve_ivp(orbit, t_span, y0, method=SCIPY[name]))
+
+
+@pairs
+def test_failures(name, method):
+    """Step size below the spacing of t, at the same place."""
+    fun = lambda t, y: y * y  # noqa: E731
+    with np.errstate(all="ignore"):
+        ours, theirs = both(method, name, fun, (0.0, 2.0), [1.0])
+    assert theirs.status == ours.status == -1
+    assert ours.message == theirs.message == "Required step size is less than spacing between numbers."
+    assert_close(ours.t, theirs.t, 1e-12)
+    # At the pole y changes by its own size with the last digits of t.
+    assert_close(ours.y[:, :-40], theirs.y[:, :-40], 1e-9)
+
+
+@pairs
+def test_first_steps_of_the_solver_object(name, method):
+    """max_step below the spacing of t: the first step is taken, the second fails, with SciPy's own words."""
+    solvers = [m(orbit, 5.0, orbit_start(0.6), 9.0, max_step=1e-20) for m in (method, SCIPY[name])]
+    for _ in range(2):
+        messages = [solver.step() for solver in solvers]
+        assert messages[0] == messages[1]
+        assert solvers[0].status == solvers[1].status
+        assert solvers[0].t == solvers[1].t
+    assert solvers[0].status == "failed"
+    assert solvers[0].t > 5.0
+
+
+@pairs
+def test_attributes_step_by_step(name, method):
+    ours, theirs = (m(orbit, 0.0, orbit_start(0.6), 5.0) for m in (method, SCIPY[name]))
+    while theirs.status == "running":
+        assert ours.status == "running"
+        assert ours.step() == theirs.step()
+        for key in ("t", "t_old", "step_size"):
+            assert getattr(ours, key) == pytest.approx(getattr(theirs, key), rel=1e-12, abs=0)
+        for key in ("n", "nfev", "njev", "nlu", "direction", "t_bound", "status"):
+            assert getattr(ours, key) == getattr(theirs, key)
+        assert_close(ours.y, theirs.y, 1e-12)
+        mine, other = ours.dense_output(), theirs.dense_output()
+        assert (mine.t_old, mine.t) == (ours.t_old, ours.t)
+        t = 0.3 * theirs.t_old + 0.7 * theirs.t
+        assert_close(mine(t), other(t), 1e-12)
+    assert ours.status == "finished"
+
+
+# `integrate` and the classes: the same steps, bit for bit, from the same jitted functions.
+
+
+@njit
+def jit_orbit(t, y):
+    r3 = (y[0] * y[0] + y[1] * y[1]) ** 1.5
+    return np.array([y[2], y[3], -y[0] / r3, -y[1] / r3])
+
+
+@njit
+def jit_energy(t, y):
+    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1 / np.sqrt(y[0] * y[0] + y[1] * y[1])
+
+
+@njit
+def jit_energy_gradient(t, y):
+    r3 = (y[0] * y[0] + y[1] * y[1]) ** 1.5
+    return np.array([y[0] / r3, y[1] / r3, y[2], y[3]])
+
+
+@njit
+def jit_momentum(t, y):
+    return y[0] * y[3] - y[1] * y[2]
+
+
+@njit
+def jit_momentum_gradient(t, y):
+    return np.array([y[3], -y[2], -y[1], y[0]])
+
+
+@njit
+def jit_spin(t, y):
+    return np.array([-1j * y[0] + 0.5j * y[1], -2j * y[1] + 0.5j * y[0]])
+
+
+@njit
+def jit_norm(t, y):
+    return (y[0] * np.conj(y[0]) + y[1] * np.conj(y[1])).real
+
+
+@njit
+def jit_norm_gradient(t, y):
+    return 2 * y
+
+
+@njit
+def jit_event(t, y):
+    return y[0].real - 0.3
+
+
+@njit
+def jit_time_event(t, y):
+    return t - 4.0
+
+
+@njit
+def jit_lower_event(t, y):
+    return y[1].real + 0.1
+
+
+ORBIT = [Invariant(jit_energy, jit_energy_gradient, name="H"), Invariant(jit_momentum, jit_momentum_gradient, name="L")]
+NORM = Invariant(jit_norm, jit_norm_gradient, name="N")
+RUNS = {
+    "orbit": (jit_orbit, (0.0, 15.0), orbit_start(0.6), ORBIT),
+    "backward": (jit_orbit, (2.0, -10.0), orbit_start(0.6), ORBIT),
+    "complex": (jit_spin, (0.0, 15.0), [1.0 + 0j, 0.2j], NORM),
+    "complex backward": (jit_spin, (3.0, -9.0), [1.0 + 0j, 0.2j], NORM),
+}
+runs = pytest.mark.parametrize("case", RUNS)
+projected = pytest.mark.parametrize("projected", [True, False], ids=["projected", "plain"])
+drivers = pytest.mark.parametrize(
+    "compiled", [pytest.param(True, marks=pytest.mark.needs_jit), False], ids=["compiled", "interpreted"]
+)
+own = pytest.mark.parametrize("method", [*OWN.values(), EIPRK4], ids=lambda m: m.__name__)
+
+
+def compare(run, sol, *, counts=True):
+    """Bit for bit."""
+    assert run.status == sol.status
+    np.testing.assert_array_equal(run.t, sol.t)
+    np.testing.assert_array_equal(run.y, sol.y)
+    if counts:
+        assert (run.nfev, run.njev, run.nlu) == (sol.nfev, sol.njev, sol.nlu)
+
+
+def with_terminal(terminal):
+    """The jitted events; SciPy reads `terminal` from the functions themselves."""
+    jit_event.terminal = terminal
+    return [jit_event, jit_time_event, jit_lower_event]
+
+
+@drivers
+@projected
+@own
+@runs
+def test_integrate_takes_the_steps_of_the_class(case, method, projected, compiled):
+    fun, t_span, y0, invariants = RUNS[case]
+    options = {"invariants": invariants if projected else ()}
+    d = Diagnostics()
+    sol = solve_ivp(fun, t_span, y0, method=method, diagnostics=d, **options)
+    run = integrate(fun, t_span, y0, method=method, save_every=1, compiled=compiled, **options)
+    assert run.compiled is compiled
+    assert len(sol.t) > 10
+    compare(run, sol)
+    np.testing.assert_array_equal(run.max_defect, d.max_defect)
+    assert repr(run.diagnostics) == repr(d)
+    assert run.h is None
+
+
+@drivers
+@pytest.mark.parametrize("method", OURS.values(), ids=OURS)
+@runs
+def test_the_named_classes_too(case, method, compiled):
+    """Projected bit for bit; plain, where the classes may leave the steps to SciPy, to round-off."""
+    fun, t_span, y0, invariants = RUNS[case]
+    options = {"method": method, "invariants": invariants}
+    compare(
+        integrate(fun, t_span, y0, save_every=1, compiled=compiled, **options), solve_ivp(fun, t_span, y0, **options)
+    )
+    options["invariants"] = ()
+    run = integrate(fun, t_span, y0, save_every=1, compiled=compiled, **options)
+    sol = solve_ivp(fun, t_span, y0, **options)
+    assert (len(run.t), run.nfev) == (len(sol.t), sol.nfev)
+    assert_close(run.t, sol.t, 1e-12)
+    assert_close(run.y, sol.y, 1e-12)
+
+
+@drivers
+@projected
+@own
+@pytest.mark.parametrize("save_every", [2, 7, 1000])
+def test_save_every(method, projected, compiled, save_every):
+    fun, t_span, y0, invariants = RUNS["orbit"]
+    options = {"method": method, "invariants": invariants if projected else ()}
+    sol = solve_ivp(fun, t_span, y0, **options)
+    run = integrate(fun, t_span, y0, save_every=save_every, compiled=compiled, **options)
+    last = len(sol.t) - 1
+    keep = [*range(0, last, save_every), last]
+    np.testing.assert_array_equal(run.t, sol.t[keep])
+    np.testing.assert_array_equal(run.y, sol.y[:, keep])
+    only_ends = integrate(fun, t_span, y0, compiled=compiled, **options)
+    np.testing.assert_array_equal(only_ends.y, sol.y[:, [0, -1]])
+
+
+@drivers
+@projected
+@own
+@runs
+def test_t_eval(case, method, projected, compiled):
+    fun, t_span, y0, invariants = RUNS[case]
+    options = {"method": method, "invariants": invariants if projected else (), "t_eval": np.linspace(*t_span, 41)}
+    sol = solve_ivp(fun, t_span, y0, **options)
+    run = integrate(fun, t_span, y0, compiled=compiled, **options)
+    compare(run, sol, counts=False)
+
+
+@drivers
+@projected
+@own
+@runs
+@pytest.mark.parametrize("terminal", [False, True, 3])
+def test_events_of_integrate(case, method, projected, compiled, terminal):
+    fun, t_span, y0, invariants = RUNS[case]
+    options = {"method": method, "invariants": invariants if projected else ()}
+    jit_event.terminal = terminal
+    events = [jit_event, jit_time_event, jit_lower_event]
+    try:
+        sol = solve_ivp(fun, t_span, y0, events=events, **options)
+        run = integrate(fun, t_span, y0, events=events, save_every=1, compiled=compiled, **options)
+    finally:
+        jit_event.terminal = False
+    assert run.compiled is compiled
+    assert sol.status == (1 if terminal else 0)
+    compare(run, sol, counts=False)
+    for kind in ("t_events", "y_events"):
+        for mine, other in zip(run[kind], sol[kind], strict=True):
+            assert mine.shape == other.shape
+            np.testing.assert_array_equal(mine, other)
+
+
+@drivers
+@own
+def test_terminal_event_and_t_eval(method, compiled):
+    """SciPy drops the samples after the event and does not add its state."""
+    fun, (t0, _), y0, invariants = RUNS["orbit"]
+    options = {"method": method, "invariants": invariants, "t_eval": np.linspace(0.0, 50.0, 301)}
+    jit_event.terminal = 3
+    try:
+        sol = solve_ivp(fun, (t0, np.inf), y0, events=jit_event, **options)
+        run = integrate(fun, (t0, np.inf), y0, events=jit_event, compiled=compiled, **options)
+    finally:
+        jit_event.terminal = False
+    assert sol.status == 1
+    assert 10 < len(sol.t) < 301
+    compare(run, sol, counts=False)
+
+
+OPTIONS_OF_BOTH = {
+    "tolerances": {"rtol": 1e-7, "atol": 1e-9},
+    "array tolerances": {"rtol": [1e-4, 1e-5, 1e-6, 1e-4], "atol": [1e-6, 1e-7, 1e-8, 1e-4]},
+    "first_step": {"first_step": 0.02},
+    "max_step": {"max_step": 0.1},
+    "metric": {"metric": "euclidean"},
+    "weights": {"metric": [1.0, 2.0, 0.5, 0.1]},
+    "blocks": {"blocks": 2},
+    "direction old": {"direction": "old"},
+    "direction midpoint": {"direction": "midpoint"},
+    "iterations": {"iterations": 3},
+    "every": {"every": 4},
+    "every without an estimate in the metric": {"every": 3, "metric": "euclidean"},
+    "reuse_f": {"reuse_f": False},
+    "check": {"check": False},
+    "several": {"every": 2, "iterations": 2, "blocks": 2, "reuse_f": False, "max_step": 0.5, "rtol": 1e-5},
+}
+
+
+@drivers
+@own
+@pytest.mark.parametrize("option", OPTIONS_OF_BOTH)
+def test_options_of_integrate(method, compiled, option):
+    fun, t_span, y0, invariants = RUNS["orbit"]
+    options = {"method": method, "invariants": invariants, **OPTIONS_OF_BOTH[option]}
+    plain = solve_ivp(fun, t_span, y0, method=method, invariants=invariants)
+    sol = solve_ivp(fun, t_span, y0, **options)
+    run = integrate(fun, t_span, y0, save_every=1, compiled=compiled, **options)
+    compare(run, sol)
+    if option != "check":
+        assert not np.array_equal(sol.y[:, -1], plain.y[:, -1]), "the option has no effect"
+
+
+@drivers
+def test_adaptive_problem(compiled):
+    """A problem with a step of its own runs adaptively once h is taken out of it or first_step given."""
+    problem = kepler(0.6, 0.0)
+    bare = dataclasses.replace(problem, h=None)
+    run = integrate(bare, (0, 10), method=EIPRK45, save_every=1, compiled=compiled)
+    assert run.h is None
+    invariants = [dataclasses.replace(problem).invariants]
+    sol = solve_ivp(problem.fun, (0, 10), problem.y0, method=EIPRK45, invariants=invariants[0], blocks=problem.blocks)
+    assert len(run.t) == len(sol.t)
+    np.testing.assert_allclose(run.y, sol.y, rtol=0, atol=1e-11)
+    run = integrate(problem, (0, 10), method=EIPRK45, first_step=0.01, compiled=compiled)
+    assert run.h is None
+    assert (run.max_defect < 1e-9).all()
