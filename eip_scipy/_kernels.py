@@ -296,17 +296,18 @@ def correction_in_local_errors(move, scale, groups, largest_error, record):
 
 
 @_jit
-def defects(values, target, G, y_hat, scales, g, band):
+def defects(values, target, G, y_hat, scales, g, band, raw):
     """Defects g = values - target and their dead bands; inside its band a defect is set to 0.
 
-    Returns whether anything is left to project.
+    `raw` keeps all of them. Returns whether anything is left to project.
     """
     outside = False
     for i in range(g.size):
         size = max(abs(values[i]), abs(target[i]))
         size = max(max(size, scales[i]), abs_dot(G[i], y_hat))
         band[i] = BAND_FACTOR * EPS * size
-        g[i] = values[i] - target[i]
+        raw[i] = values[i] - target[i]
+        g[i] = raw[i]
         if np.isfinite(band[i]) and abs(g[i]) <= band[i]:
             g[i] = 0.0
         else:
@@ -447,11 +448,15 @@ def move_along(mu, Q, pivots, rank, sigma, frame, y_hat, move, out):
         out[j] = y_hat[j] + move[j]
 
 
-@_jit
-def subtract(a, b, out):
-    """Out = a - b."""
-    for i in range(a.size):
-        out[i] = a[i] - b[i]
+@_jit_inline
+def first_move(G, sigma, frame, Q, inverse_norms, R, pivots, g, mu, y_hat, move, out):
+    """The whole first Newton step along the gradients at y_hat: out = y_hat + move; returns the rank."""
+    weigh_rows(G, sigma, frame, Q)
+    rank = factor(Q, inverse_norms, R, pivots)
+    if rank >= 0:
+        least_norm(g, inverse_norms, R, pivots, rank, mu)
+        move_along(mu, Q, pivots, rank, sigma, frame, y_hat, move, out)
+    return rank
 
 
 @_jit

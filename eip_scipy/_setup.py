@@ -54,7 +54,7 @@ class Run:
 
 
 class Counted:
-    """A right-hand side that counts its calls."""
+    """A right-hand side that counts its calls and returns new arrays."""
 
     def __init__(self, rhs: Callable[[float, np.ndarray], np.ndarray]) -> None:
         self._rhs = rhs
@@ -62,7 +62,7 @@ class Counted:
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         self.count += 1
-        return self._rhs(t, y)
+        return self._rhs(t, y).copy()
 
 
 def nearest_option(name: str, known: Iterable[str]) -> str:

@@ -244,20 +244,27 @@ def evaluate_invariants(inv, params, t, y, o, w):
 
 
 @_jitable_cold
-def weighted_directions(rhs, grad, params, t_old, y, y_r, t, o, w):
-    """Rows that span the correction, in w.Q: the gradients at y_hat, which are there already, at y or between."""
+def other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r):
+    """The first Newton step along the gradients at y or at the midpoint; w.G holds those at y_hat. Returns the rank."""
+    kn.weigh_rows(w.G_r, w.sigma, o.frame, w.B)
     if o.direction == OLD:
         grad(t_old, y, w.K[0], w.G, params)
-        w.counters[NJEV] += 1
-    elif o.direction == MIDPOINT:
+    else:
         kn.midpoint(y_r, w.y_hat_r, w.stage_r)
         t_mid = 0.5 * (t_old + t)
         if o.uses_f:
             rhs(t_mid, w.stage, w.f_point, params)
             w.counters[NFEV] += 1
         grad(t_mid, w.stage, w.f_point, w.G, params)
-        w.counters[NJEV] += 1
+    w.counters[NJEV] += 1
     kn.weigh_rows(w.G_r, w.sigma, o.frame, w.Q)
+    rank = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)
+    if rank >= 0:
+        kn.fill(w.mu, 0.0)
+        kn.newton_matrix_solve(w.B, w.g, w.Q, w.pivots, rank, w.inner, w.mu)
+        w.counters[NLU] += 1
+        kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
+    return rank
 
 
 @_jitable_cold
@@ -269,7 +276,7 @@ def newton_iteration(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
         w.counters[NFEV] += 1
     grad(t, y_new, w.f_point, w.G, params)
     w.counters[NJEV] += 1
-    if not kn.defects(w.values, o.target, w.G_r, y_new_r, o.scales, w.g, w.band):
+    if not kn.defects(w.values, o.target, w.G_r, y_new_r, o.scales, w.g, w.band, w.defect):
         return False
     kn.weigh_rows(w.G_r, w.sigma, o.frame, w.B)
     kn.newton_matrix_solve(w.B, w.g, w.Q, w.pivots, rank, w.inner, w.mu)
@@ -288,8 +295,7 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
     grad(t, w.y_hat, w.K[-1], w.G, params)
     counters[NJEV] += 1
     evaluate_invariants(inv, params, t, w.y_hat, o, w)
-    outside = kn.defects(w.values, o.target, w.G_r, w.y_hat_r, o.scales, w.g, w.band)
-    kn.subtract(w.values, o.target, w.before)
+    outside = kn.defects(w.values, o.target, w.G_r, w.y_hat_r, o.scales, w.g, w.band, w.before)
     if not outside:
         counters[SKIPPED] += 1
         kn.copy(w.y_hat_r, y_new_r)
@@ -301,10 +307,12 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
         largest_error = kn.error_metric(
             w.err, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio
         )
-    if o.direction != NEW:
-        kn.weigh_rows(w.G_r, w.sigma, o.frame, w.B)
-    weighted_directions(rhs, grad, params, t_old, y, y_r, t, o, w)
-    rank = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)
+    if o.direction == NEW:
+        rank = kn.first_move(
+            w.G_r, w.sigma, o.frame, w.Q, w.inverse_norms, w.R, w.pivots, w.g, w.mu, w.y_hat_r, w.move, y_new_r
+        )
+    else:
+        rank = other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r)
     counters[NLU] += 1
     counters[LAST_RANK] = max(rank, 0)
     if rank < 0:
@@ -312,13 +320,6 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
         return FAILED_PROJECTION
     if rank < w.g.size:
         counters[RANK_REDUCED] += 1
-    if o.direction == NEW:
-        kn.least_norm(w.g, w.inverse_norms, w.R, w.pivots, rank, w.mu)
-    else:
-        kn.fill(w.mu, 0.0)
-        kn.newton_matrix_solve(w.B, w.g, w.Q, w.pivots, rank, w.inner, w.mu)
-        counters[NLU] += 1
-    kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
     for _ in range(1, o.iterations):
         if not newton_iteration(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
             break

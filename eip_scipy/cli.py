@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from . import comparators, problems
-from .commands import solar_system
+from .commands import hard_cases, solar_system
 from .problems import solar_data
 from .report import UsageError, check_target, document, say, versions, warn, write_json
 
@@ -79,6 +79,11 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
             "run the solar system and compare with other methods (the paper's Experiment II)",
             solar_system.add_arguments,
             lambda args: solar_system.run(args, _rebound(args)),
+        ),
+        "hard-cases": (
+            "run 35 hard cases with and without projection",
+            hard_cases.add_arguments,
+            hard_cases.run,
         ),
     }
     name = "eip_scipy.reproduce"

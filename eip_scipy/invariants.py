@@ -43,7 +43,7 @@ class Invariant:
         Name in messages and diagnostics.
     scale : float, optional
         Size of the terms that cancel in `fun`, in its own unit: defects below four rounding errors of it are left
-        alone. Needed only where neither the value nor sum_k |G_k y_k| shows that size.
+        alone. Needed only where neither the value nor ``sum_k |G_k y_k|`` shows that size.
     in_place : bool, optional
         ``grad(t, y, out, *args)`` fills ``out``, (n,) for a scalar invariant, else (l_i, n).
     uses_f : bool, optional
@@ -294,6 +294,9 @@ class InvariantSet:
         for k, item in enumerate(self.items):
             value = item.fun(t, y, *item.args, *self.extra)
             start, stop = self.starts[k], self.starts[k + 1]
+            if isinstance(value, float) and self.scalar[k]:
+                values[start] = value
+                continue
             expected = () if self.scalar[k] else (stop - start,)
             if np.shape(value) != expected:
                 raise ValueError(
@@ -307,6 +310,9 @@ class InvariantSet:
         for k in range(len(self.items)):
             row = self._gradient(k, t, y, f)
             start, stop = self.starts[k], self.starts[k + 1]
+            if self.scalar[k] and isinstance(row, np.ndarray) and row.shape == y.shape:
+                G[start] = row
+                continue
             expected = (y.size,) if self.scalar[k] else (stop - start, y.size)
             if np.shape(row) != expected:
                 raise ValueError(
@@ -430,7 +436,7 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     Returns
     -------
     float
-        max over the components k of |grad_k - difference_k| s_k / max_j |grad_j| s_j, with s the sizes of y's
+        max over the components k of ``|grad_k - difference_k| s_k / max_j |grad_j| s_j``, with s the sizes of y's
         components (of the largest one, for components that are 0): about 1e-12 for a right gradient.
 
     Raises

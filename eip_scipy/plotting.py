@@ -28,10 +28,13 @@ __all__ = [
     "Orbits",
     "cost_figure",
     "errors_figure",
+    "gains_figure",
     "longitude_figure",
     "method_styles",
     "orbit_in_time_figure",
     "orbits_figure",
+    "paper_kepler_figure",
+    "work_figure",
 ]
 
 # Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white.
@@ -276,6 +279,139 @@ def cost_figure(
     axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, handlelength=3.5)
     if footnote:
         figure.supxlabel(footnote, fontsize="small", color="0.35")
+    return figure
+
+
+class KeplerRun(NamedTuple):
+    """A run of the perturbed Kepler problem by one method.
+
+    Attributes
+    ----------
+    t : array_like, shape (m,)
+    energy_error, momentum_error, position_error : array_like, shape (m,)
+    orbit : array_like, shape (2, k)
+        Positions to draw.
+    """
+
+    t: Any
+    energy_error: Any
+    momentum_error: Any
+    position_error: Any
+    orbit: Any
+
+
+def paper_kepler_figure(runs: Mapping[str, KeplerRun], *, title: str = "") -> Figure:
+    """Draw orbits, energy, momentum and position errors, a row for each method, as the paper's figures 1 and 2 do.
+
+    Parameters
+    ----------
+    runs : mapping of str to KeplerRun
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    figure = _figure(14.0, 3.1 * len(runs) + 0.6, title)
+    axes = figure.subplots(len(runs), 4, squeeze=False, width_ratios=[0.85, 1, 1, 1])
+    for row, (name, run) in zip(axes, runs.items(), strict=True):
+        row[0].plot(*np.asarray(run.orbit), color=PALETTE[0], lw=0.35)
+        _plane(row[0], "", "")
+        row[0].set_xlabel("$q_1$")
+        row[0].set_ylabel(f"{name}\n\n$q_2$")
+        errors = (("$|H - H_0|$", run.energy_error), ("$|L - L_0|$", run.momentum_error))
+        for k, (label, values) in enumerate((*errors, ("error of position", run.position_error))):
+            _envelope(row[1 + k], run.t, values, {"color": PALETTE[k], "ls": "-", "marker": ""})
+            _log_errors(row[1 + k], "t", label)
+    return figure
+
+
+def gains_figure(errors: Mapping[str, tuple[float, float]], *, what: str, title: str = "", labels: int = 6) -> Figure:
+    """Draw errors with projection against errors without; below the diagonal projection helps.
+
+    Parameters
+    ----------
+    errors : mapping of str to (float, float)
+        For each case the error without and with; those not finite or zero are left out.
+    what : str
+        Name of the error, with its unit.
+    title : str, optional
+    labels : int, optional
+        How many of the largest gains get their names; those above the diagonal all do.
+
+    Returns
+    -------
+    Figure
+    """
+    figure = _figure(6.8, 6.4, title)
+    axis = figure.subplots()
+    good = {name: pair for name, pair in errors.items() if all(np.isfinite(x) and x > 0 for x in pair)}
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    x, y = np.array(list(good.values())).reshape(-1, 2).T
+    low, high = (float(f(10.0, g(np.log10([x, y])) + d)) for f, g, d in ((pow, np.min, -0.5), (pow, np.max, 0.5)))
+    span = np.array([low, high])
+    axis.plot(span, span, color="0.4", lw=1.0)
+    for factor in (1e-1, 1e-2, 1e-3):
+        axis.plot(span, factor * span, color="0.75", lw=0.7, ls=":")
+        axis.annotate(
+            f"{1 / factor:.0f} times less", (low / factor, low), (10, 3), textcoords="offset points",
+            fontsize="x-small", color="0.5", rotation=45, rotation_mode="anchor",
+        )  # fmt: skip
+    worse = y > x
+    axis.plot(
+        x[~worse], y[~worse], ls="", marker="o", color=PALETTE[0], mec="white", ms=7, label="less with projection"
+    )
+    if worse.any():
+        axis.plot(
+            x[worse], y[worse], ls="", marker="s", color=PALETTE[2], mec="white", ms=7, label="more with projection"
+        )
+    gains = set(np.argsort(y / x)[:labels])
+    for k, name in enumerate(good):
+        if worse[k]:  # to the left, where no other points are
+            axis.annotate(name, (x[k], y[k]), (-6, 3), textcoords="offset points", fontsize="x-small", ha="right")
+        elif k in gains:
+            where = (
+                {"ha": "left", "xytext": (6, -8)} if x[k] * y[k] < low * high else {"ha": "center", "xytext": (0, -12)}
+            )
+            axis.annotate(name, (x[k], y[k]), textcoords="offset points", fontsize="x-small", **where)
+    axis.set_xlim(low, high)
+    axis.set_ylim(low, high)
+    axis.set_aspect("equal")
+    axis.set_xlabel(f"{what}, without projection")
+    axis.set_ylabel(f"{what}, with projection")
+    axis.grid(which="major", alpha=0.25)
+    axis.legend(loc="upper left", fontsize="small", framealpha=0.9)
+    return figure
+
+
+def work_figure(series: Mapping[str, Mapping[str, Any]], *, error: str, title: str = "", footnote: str = "") -> Figure:
+    """Draw error against evaluations of f and against wall time, a line for each method.
+
+    Parameters
+    ----------
+    series : mapping of str to mapping
+        For each method arrays "nfev", "wall_time" and "error".
+    error : str
+        Label of the error.
+    title, footnote : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    styles = method_styles(series)
+    figure = _figure(10.5, 5.2, title)
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, key, label in zip(axes, ("nfev", "wall_time"), ("evaluations of f", "wall time [s]"), strict=True):
+        for name, values in series.items():
+            good = np.isfinite(values["error"]) & (np.asarray(values["error"]) > 0)
+            axis.plot(np.asarray(values[key])[good], np.asarray(values["error"])[good], ms=5, **styles[name])
+        _log_x(axis)
+        _log_errors(axis, label, error if axis is axes[0] else "")
+    _legend_below(figure, axes[0])
+    if footnote:
+        axes[1].annotate(footnote, (1, 1.02), xycoords="axes fraction", ha="right", fontsize="x-small", color="0.35")
     return figure
 
 

@@ -22,7 +22,7 @@ class Diagnostics:
     names : tuple of str
         Names of the l invariants, in order.
     max_defect, last_defect : ndarray, shape (l,)
-        Largest and last |I - target| after a projection, in each invariant's own unit.
+        Largest and last ``|I - target|`` after a projection, in each invariant's own unit.
     n_projections, n_skipped : int
         Projections done, and those left out because every defect was round-off.
     n_rank_reduced : int
@@ -57,7 +57,7 @@ class Diagnostics:
 
     @property
     def last_defect(self) -> np.ndarray:
-        """Last |I - target|, (l,)."""
+        """Last ``|I - target|``, (l,)."""
         return np.abs(self._defect)
 
     @property
@@ -112,7 +112,7 @@ class IntegrationResult(OptimizeResult):
     invariants : ndarray, shape (l, m)
         Values of the invariants there.
     max_defect : ndarray, shape (l,)
-        Largest |I - target| after a projection or at a saved step.
+        Largest ``|I - target|`` after a projection or at a saved step.
     diagnostics : Diagnostics
     t_events, y_events : list of ndarray or None
         As in `scipy.integrate.solve_ivp`.

@@ -57,7 +57,7 @@ class EIPSolver(OdeSolver):
         End; before t0 to integrate backward.
     max_step, rtol, atol, first_step
         Step control, as in SciPy's own methods; the error estimate sees the step before its projection. `rtol` and
-        `atol` are also the scale of the error metric: |atol| + rtol |y|, norms over a block.
+        `atol` are also the scale of the error metric: ``|atol| + rtol |y|``, norms over a block.
     vectorized : bool, optional
         Whether `fun` takes (n, k) arrays, as in SciPy.
     h : float, optional
@@ -149,7 +149,7 @@ class EIPSolver(OdeSolver):
         if math.isnan(t0) or math.isnan(t_bound):
             raise ValueError(f"t_span must hold two numbers, got ({t0}, {t_bound}).")
         start = _setup.initial_state(y0)
-        derivative = _checked(fun, start.size, start.dtype, vectorized)
+        self._checked = _checked(fun, start.size, start.dtype, vectorized)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
         adaptive = h is None
         if adaptive and not self.TABLEAU.has_estimate:
@@ -174,7 +174,8 @@ class EIPSolver(OdeSolver):
             n_steps=_setup.UNBOUNDED if h is None else _setup.fixed_steps(h, t0, t_bound),
             max_step=self.max_step,
         )
-        calls = _setup.Counted(derivative)
+        calls = _setup.Counted(self._checked)
+        self._calls = calls
         self._scipy = self._scipy_solver(calls, start, first_step, as_invariants(invariants)) if adaptive else None
         f0 = calls(t0, start.copy()) if self._scipy is None else np.zeros_like(start)
         self.h_abs = h if h is not None else first_step
@@ -215,7 +216,6 @@ class EIPSolver(OdeSolver):
         )
         _setup.attach(diagnostics, run)
         self._run, self._work = run, run.work
-        self._derivative = derivative
         self._clock = np.array([t0, t0, 0.0, self.h_abs or 0.0])
         self._project_now, self._projection_status = False, OK
         self._buffer = self._accepted = run.y0
@@ -228,7 +228,7 @@ class EIPSolver(OdeSolver):
 
     def _rhs(self, t: float, y: np.ndarray, out: np.ndarray, params: Any) -> None:
         # A copy, because a user's function may keep what it was given and `y` is a buffer.
-        out[:] = self._derivative(t, y.copy())
+        out[:] = self._checked(t, y.copy())
 
     def _count(self) -> None:
         counters = self._work.counters
@@ -240,11 +240,13 @@ class EIPSolver(OdeSolver):
         if self.SCIPY is None or invariants or type(self)._project_step is not EIPSolver._project_step:
             return None
         control = {"first_step": first_step, "max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
-        return self.SCIPY(calls, self.t, start, self.t_bound, **control)
+        solver = self.SCIPY(calls, self.t, start, self.t_bound, **control)
+        solver.fun = calls  # in the place of SciPy's three wrappers, whose work it does
+        return solver
 
     def _scipy_step(self, solver: OdeSolver) -> tuple[bool, str | None]:
         message = solver.step()
-        self.nfev = solver.nfev
+        self.nfev = self._calls.count
         if solver.status == "failed":
             if not np.isfinite(solver.K).all():
                 message = f"fun returned a non-finite value at t={self.t:.10g}"
@@ -340,7 +342,7 @@ class EIPSolver(OdeSolver):
     def _dense_output_impl(self) -> DenseOutput:
         if self._scipy is not None:
             out = self._scipy.dense_output()
-            self.nfev = self._scipy.nfev
+            self.nfev = self._calls.count
             return out
         out = dense_output(
             self._rhs, self._run, self.TABLEAU, self.t_old, self.t, self.y_old, self.y, self.f_old, self.f
@@ -352,13 +354,13 @@ class EIPSolver(OdeSolver):
 def _checked(
     fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool
 ) -> Callable[[float, np.ndarray], np.ndarray]:
-    """The user's right-hand side as (t, y) -> new array (n,) of the state's type, with clear errors."""
+    """The user's right-hand side as (t, y) -> (n,) of the state's type, with clear errors; maybe their buffer."""
     shape = (n,)
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
         f = np.asarray(fun(t, y[:, None])).reshape(-1) if vectorized else fun(t, y)
-        if type(f) is np.ndarray and f.shape == shape and f.dtype == dtype:
-            return f.copy()
+        if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
+            return f
         return _setup.as_derivative(f, n, dtype).astype(dtype)
 
     return derivative

@@ -94,7 +94,7 @@ class Tableau:
         Nodes; default, and required to equal, the row sums of `A`.
     e_low : sequence, length s + 1, optional
         Weights of a second, cruder error e3 beside ``e = b - b_hat`` (e5): the estimate is then
-        h e5 |e5| / hypot(e5, e3 / 10), as in DOP853, and `b_hat` two orders below `error_estimator_order`.
+        ``h e5 |e5| / hypot(e5, e3 / 10)``, as in DOP853, and `b_hat` two orders below `error_estimator_order`.
     P : sequence of sequences, shape (s + 1, q), optional
         Dense output: y(t + theta h) = y + h sum_j theta^(j + 1) (K^T P)_j, the last row for f at the new point.
     reference : str

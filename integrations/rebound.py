@@ -55,9 +55,9 @@ class ReboundRun:
     steps : int
         Steps taken; for "ias15" those that were accepted.
     energy_error : ndarray, shape (m,)
-        |E(t) - E(0)| / |E(0)| of the Newtonian energy.
+        ``|E(t) - E(0)| / |E(0)|`` of the Newtonian energy.
     angular_momentum_error : ndarray, shape (m,)
-        |L(t) - L(0)| / |L(0)|, Euclidean norms.
+        ``|L(t) - L(0)| / |L(0)|``, Euclidean norms.
     """
 
     name: str

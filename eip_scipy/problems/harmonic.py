@@ -31,7 +31,7 @@ def _energy_gradient(t, y, out, params):
 
 
 def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: float = 0.1) -> Problem:
-    """Harmonic oscillator y1' = omega y2, y2' = -omega y1 with H = omega |y|^2 / 2.
+    """Harmonic oscillator y1' = omega y2, y2' = -omega y1 with ``H = omega |y|^2 / 2``.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ def _momentum_gradient(t, y, out, params):
 
 
 def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float = 200.0, h: float = 0.03) -> Problem:
-    """Kepler problem, H = |p|^2 / 2 - 1 / r - relativistic / (2 r^3), L = q1 p2 - q2 p1.
+    """Kepler problem, ``H = |p|^2 / 2 - 1 / r - relativistic / (2 r^3)``, L = q1 p2 - q2 p1.
 
     Parameters
     ----------

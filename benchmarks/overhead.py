@@ -1,0 +1,87 @@
+"""What an EIP class costs in solve_ivp beside SciPy's own, per step on the same right-hand side.
+
+    python benchmarks/overhead.py [--json FILE]
+
+Kepler's problem in plain NumPy, e = .6, two invariants (H, L) with analytic gradients; medians of paired runs, each
+class in turn with RK45, so that a machine whose speed drifts does not decide.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, Invariant
+
+PAIRS = 15
+SPAN = (0.0, 60.0)
+Y0 = np.array([0.4, 0.0, 0.0, 2.0])
+
+
+def fun(t, y):
+    r = math.hypot(y[0], y[1])
+    w = -1.0 / (r * r * r)
+    return np.array([y[2], y[3], w * y[0], w * y[1]])
+
+
+def energy(t, y):
+    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1.0 / math.hypot(y[0], y[1])
+
+
+def energy_gradient(t, y):
+    r = math.hypot(y[0], y[1])
+    w = 1.0 / (r * r * r)
+    return np.array([w * y[0], w * y[1], y[2], y[3]])
+
+
+def momentum(t, y):
+    return y[0] * y[3] - y[1] * y[2]
+
+
+def momentum_gradient(t, y):
+    return np.array([y[3], -y[2], -y[1], y[0]])
+
+
+BOTH = [Invariant(energy, energy_gradient, name="H"), Invariant(momentum, momentum_gradient, name="L")]
+CASES = {
+    "EIPRK4, h = .03, H and L": {"method": EIPRK4, "h": 0.03, "invariants": BOTH},
+    "EIPRK45, H and L": {"method": EIPRK45, "invariants": BOTH, "rtol": 1e-6, "atol": 1e-9},
+    "EIPRK23, no invariants": {"method": EIPRK23, "rtol": 1e-6, "atol": 1e-9},
+    "EIPRK45, no invariants": {"method": EIPRK45, "rtol": 1e-6, "atol": 1e-9},
+    "EIPDOP853, no invariants": {"method": EIPDOP853, "rtol": 1e-6, "atol": 1e-9},
+    "EIPRK4, h = .03, no invariants": {"method": EIPRK4, "h": 0.03},
+}
+PEERS = {EIPRK4: "RK45", EIPRK45: "RK45", EIPRK23: "RK23", EIPDOP853: "DOP853"}
+
+
+def per_step(options) -> float:
+    begin = time.perf_counter()
+    solution = solve_ivp(fun, SPAN, Y0, **options)
+    return (time.perf_counter() - begin) / (solution.t.size - 1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", metavar="FILE")
+    arguments = parser.parse_args()
+    results = {}
+    for name, options in CASES.items():
+        peer = {"method": PEERS[options["method"]], "rtol": 1e-6, "atol": 1e-9}
+        per_step(options), per_step(peer)
+        pairs = np.array([(per_step(options), per_step(peer)) for _ in range(PAIRS)])
+        ours, theirs = np.median(pairs, axis=0)
+        ratio = float(np.median(pairs[:, 0] / pairs[:, 1]))
+        results[name] = {"us per step": 1e6 * ours, f"{peer['method']} us per step": 1e6 * theirs, "ratio": ratio}
+        print(f"{name:32} {1e6 * ours:7.1f} us   SciPy's {peer['method']:7}{1e6 * theirs:7.1f} us   ratio {ratio:5.2f}")
+    if arguments.json:
+        with open(arguments.json, "w") as file:
+            json.dump(results, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Published examples of solve_ivp run with the method's name changed, and keep what they could not keep before.
+
+The first three are those of the documentation of `scipy.integrate.solve_ivp` (exponential decay, the cannon with its
+events, Lotka-Volterra with args and dense output); the last is the double pendulum of Matplotlib's gallery with its
+equations (masses and lengths 1), where a user would watch the energy.
+"""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPRK45, Invariant
+
+
+def test_exponential_decay():
+    def exponential_decay(t, y):
+        return -0.5 * y
+
+    sol = solve_ivp(exponential_decay, [0, 10], [2, 4, 8], method=EIPRK45, t_eval=[0, 1, 2, 4, 10])
+    same = solve_ivp(exponential_decay, [0, 10], [2, 4, 8], t_eval=[0, 1, 2, 4, 10])
+    np.testing.assert_array_equal(sol.y, same.y)
+
+
+def test_cannon():
+    def upward_cannon(t, y):
+        return [y[1], -0.5]
+
+    def hit_ground(t, y):
+        return y[0]
+
+    hit_ground.terminal = True
+    hit_ground.direction = -1
+
+    def apex(t, y):
+        return y[1]
+
+    energy = Invariant(lambda t, y: 0.5 * y[1] ** 2 + 0.5 * y[0], lambda t, y: np.array([0.5, y[1]]), name="energy")
+    for kept in ((), energy):
+        sol = solve_ivp(
+            upward_cannon,
+            [0, 100],
+            [0, 10],
+            method=EIPRK45,
+            events=(hit_ground, apex),
+            dense_output=True,
+            invariants=kept,
+        )
+        assert sol.status == 1
+        np.testing.assert_allclose(sol.t_events[0], [40.0], rtol=1e-12)
+        np.testing.assert_allclose(sol.t_events[1], [20.0], rtol=1e-12)
+        np.testing.assert_allclose(sol.sol(sol.t_events[1][0]), [100.0, 0.0], atol=1e-11)
+
+
+def test_lotka_volterra():
+    a, b, c, d = 1.5, 1, 3, 1
+
+    def lotkavolterra(t, z, a, b, c, d):
+        x, y = z
+        return [a * x - b * x * y, -c * y + d * x * y]
+
+    def value(t, z):
+        return d * z[0] - c * np.log(z[0]) + b * z[1] - a * np.log(z[1])
+
+    def gradient(t, z):
+        return np.array([d - c / z[0], b - a / z[1]])
+
+    def run(method, **options):
+        sol = solve_ivp(lotkavolterra, [0, 15], [10, 5], args=(a, b, c, d), dense_output=True, method=method, **options)
+        z = sol.sol(np.linspace(0, 15, 300))
+        assert sol.success
+        return np.ptp([value(0, column) for column in z.T]), sol.y[:, -1]
+
+    plain, _ = run("RK45")
+    same, _ = run(EIPRK45)
+    kept, end = run(EIPRK45, invariants=Invariant(value, gradient, name="V"))
+    exact = solve_ivp(lotkavolterra, [0, 15], [10, 5], args=(a, b, c, d), method="DOP853", rtol=1e-12, atol=1e-12).y[
+        :, -1
+    ]
+    assert same == plain
+    assert plain > 0.1
+    assert kept < 2e-3
+    assert np.linalg.norm(end - exact) < 0.2 * np.linalg.norm(run("RK45")[1] - exact)
+
+
+def test_double_pendulum():
+    G = 9.8
+
+    def derivs(t, state):
+        dydx = np.zeros_like(state)
+        delta = state[2] - state[0]
+        dydx[0] = state[1]
+        den = 2 - np.cos(delta) ** 2
+        dydx[1] = (
+            state[1] ** 2 * np.sin(delta) * np.cos(delta)
+            + G * np.sin(state[2]) * np.cos(delta)
+            + state[3] ** 2 * np.sin(delta)
+            - 2 * G * np.sin(state[0])
+        ) / den
+        dydx[2] = state[3]
+        dydx[3] = (
+            -(state[3] ** 2) * np.sin(delta) * np.cos(delta)
+            + 2 * (G * np.sin(state[0]) * np.cos(delta) - state[1] ** 2 * np.sin(delta) - G * np.sin(state[2]))
+        ) / den
+        return dydx
+
+    def energy(t, s):
+        kinetic = s[1] ** 2 + 0.5 * s[3] ** 2 + s[1] * s[3] * np.cos(s[0] - s[2])
+        return kinetic - G * (2 * np.cos(s[0]) + np.cos(s[2]))
+
+    state = np.radians([120.0, 0.0, -10.0, 0.0])
+    t = np.arange(0, 2.5, 0.01)
+    kept = solve_ivp(derivs, t[[0, -1]], state, t_eval=t, method=EIPRK45, invariants=Invariant(energy, name="energy"))
+    plain = solve_ivp(derivs, t[[0, -1]], state, t_eval=t)
+    exact = solve_ivp(derivs, t[[0, -1]], state, t_eval=t, method="DOP853", rtol=1e-12, atol=1e-12)
+    drift = [np.ptp([energy(0, s) for s in sol.y.T]) for sol in (plain, kept)]
+    assert drift[0] > 1e-2
+    assert drift[1] < 1e-2 * drift[0]
+    assert np.abs(kept.y - exact.y).max() < np.abs(plain.y - exact.y).max()
