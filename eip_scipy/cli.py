@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from . import comparators, problems
-from .commands import hard_cases, solar_system
+from .commands import hard_cases, kepler_cost, solar_system
 from .problems import solar_data
 from .report import UsageError, check_target, document, say, versions, warn, write_json
 
@@ -85,11 +85,20 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
             hard_cases.add_arguments,
             hard_cases.run,
         ),
+        "work-precision": (
+            "error against cost of all methods on the perturbed Kepler problem",
+            kepler_cost.add_arguments,
+            kepler_cost.run,
+        ),
     }
     name = "eip_scipy.reproduce"
     if find_spec(name) is not None:
         reproduce = import_module(name)
-        commands["reproduce"] = ("recompute the paper's tables", reproduce.add_arguments, reproduce.run)
+        commands["reproduce"] = (
+            "recompute the paper's tables and figures",
+            reproduce.add_arguments,
+            lambda args: reproduce.run(args, lambda: _rebound(args)),
+        )
     return commands
 
 

@@ -316,13 +316,15 @@ def paper_kepler_figure(runs: Mapping[str, KeplerRun], *, title: str = "") -> Fi
     axes = figure.subplots(len(runs), 4, squeeze=False, width_ratios=[0.85, 1, 1, 1])
     for row, (name, run) in zip(axes, runs.items(), strict=True):
         row[0].plot(*np.asarray(run.orbit), color=PALETTE[0], lw=0.35)
-        _plane(row[0], "", "")
+        _plane(row[0], name, "")
         row[0].set_xlabel("$q_1$")
-        row[0].set_ylabel(f"{name}\n\n$q_2$")
+        row[0].set_ylabel("$q_2$")
         errors = (("$|H - H_0|$", run.energy_error), ("$|L - L_0|$", run.momentum_error))
         for k, (label, values) in enumerate((*errors, ("error of position", run.position_error))):
             _envelope(row[1 + k], run.t, values, {"color": PALETTE[k], "ls": "-", "marker": ""})
             _log_errors(row[1 + k], "t", label)
+            low, high = np.log10(row[1 + k].get_ylim())
+            row[1 + k].set_ylim(10 ** np.floor(low), 10 ** np.ceil(high))  # two labelled ticks at least
     return figure
 
 
@@ -343,7 +345,7 @@ def gains_figure(errors: Mapping[str, tuple[float, float]], *, what: str, title:
     -------
     Figure
     """
-    figure = _figure(6.8, 6.4, title)
+    figure = _figure(7.4, 6.4, title)
     axis = figure.subplots()
     good = {name: pair for name, pair in errors.items() if all(np.isfinite(x) and x > 0 for x in pair)}
     axis.set_xscale("log")
@@ -371,11 +373,9 @@ def gains_figure(errors: Mapping[str, tuple[float, float]], *, what: str, title:
         if worse[k]:  # to the left, where no other points are
             axis.annotate(name, (x[k], y[k]), (-6, 3), textcoords="offset points", fontsize="x-small", ha="right")
         elif k in gains:
-            where = (
-                {"ha": "left", "xytext": (6, -8)} if x[k] * y[k] < low * high else {"ha": "center", "xytext": (0, -12)}
-            )
-            axis.annotate(name, (x[k], y[k]), textcoords="offset points", fontsize="x-small", **where)
-    axis.set_xlim(low, high)
+            axis.annotate(name, (x[k], y[k]), (6, -3), textcoords="offset points", fontsize="x-small")
+    high_x = high * 40  # room for names
+    axis.set_xlim(low, high_x)
     axis.set_ylim(low, high)
     axis.set_aspect("equal")
     axis.set_xlabel(f"{what}, without projection")

@@ -1,4 +1,4 @@
-"""``eip-scipy reproduce table1 ... table4``: the paper's numbers beside ours, with the digits that agree.
+"""``eip-scipy reproduce table1 ... table4 fig-kepler fig-solar all``: the paper's numbers beside ours, and its figures.
 
 The paper's numbers, their misprints and the same computations in 50 digits are data: ``data/paper_tables.json``.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import cache
@@ -21,14 +21,16 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from . import report
+from .commands import kepler_figures, solar_system
 from .diagnostics import observed_order
 from .longrun import integrate
 from .problems import Problem, harmonic, kepler
 from .solvers import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPSolver
 
-__all__ = ["TABLES", "Cell", "Value", "add_arguments", "reproduce", "run"]
+__all__ = ["FIGURES", "TABLES", "Cell", "Value", "add_arguments", "reproduce", "run"]
 
 TABLES = ("table1", "table2", "table3", "table4")
+FIGURES = ("fig-kepler", "fig-solar")
 OMEGA = 10.0
 METHODS: dict[str, type[EIPSolver]] = {"RK1": EIPRK1, "RK2": EIPRK2, "RK3": EIPRK3, "RK4": EIPRK4}
 PAPER_SETTING: dict[str, Any] = {"metric": "euclidean", "reuse_f": False}
@@ -260,39 +262,90 @@ _ERRORS = {1: _multiplier_errors, 2: _last_defects, 3: _differences, 4: _last_de
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what the command takes besides the options of all commands."""
-    parser.add_argument("table", nargs="+", choices=TABLES, help="table of the paper; several may be given")
+    parser.add_argument(
+        "table",
+        nargs="+",
+        choices=(*TABLES, *FIGURES, "all"),
+        metavar="WHAT",
+        help=f"{', '.join((*TABLES, *FIGURES))} or all; several may be given",
+    )
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the tables, write them where that is asked for, and return the exit status.
+def run(args: argparse.Namespace, judge: Callable[[], Any] = lambda: None) -> int:
+    """Print the tables and figures' numbers, write them where that is asked for, and return the exit status.
 
     Parameters
     ----------
     args : argparse.Namespace
         With `table` (list of str), `out`, `json` and `quiet`.
+    judge : callable, optional
+        ``judge()`` finds REBOUND's integrators or returns None; called for the solar figures only.
 
     Returns
     -------
     int
         0 when every number agrees with the paper's to the printed digits or to round-off, else 1.
     """
+    wanted = list(dict.fromkeys((*TABLES, *FIGURES) if "all" in args.table else args.table))
     if args.out is not None:
         report.check_folder(Path(args.out))
     if args.json is not None:
         report.check_target(Path(args.json))
-    tables = {table: reproduce(table) for table in dict.fromkeys(args.table)}
+    tables = {name: reproduce(name) for name in wanted if name in TABLES}
     everything = [cell for cells in tables.values() for cell in cells]
-    if not args.quiet:
+    if tables and not args.quiet:
         report.say("\n\n".join(table_text(cells) for cells in tables.values()))
     written = []
     if args.out is not None:
         written += [report.write_csv(Path(args.out) / f"{table}.csv", _lines(cells)) for table, cells in tables.items()]
+    _say_written(args, written)
+    content, status = as_dict(everything), 0 if passed(everything) else 1
+    for name in wanted:
+        if name in FIGURES:
+            if not args.quiet and name != wanted[0]:
+                report.say()
+            worse, content[name] = _kepler(args) if name == "fig-kepler" else _solar(args, judge)
+            status = max(status, worse)
+    content["passed"] = status == 0
     if args.json is not None:
-        content = report.document("reproduce", {"table": list(tables)}, **as_dict(everything))
-        written.append(report.write_json(Path(args.json), content))
+        report.write_json(Path(args.json), report.document("reproduce", {"table": wanted}, **content))
+        _say_written(args, [Path(args.json)])
+    return status
+
+
+def _say_written(args: argparse.Namespace, written: list[Path]) -> None:
     if written and not args.quiet:
         report.say("\n".join(["", *(f"wrote {path}" for path in written)]))
-    return 0 if passed(everything) else 1
+
+
+def _kepler(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """Make the paper's figures 1 and 2; exit status and content of the JSON."""
+    lines = kepler_figures.study()
+    if not args.quiet:
+        report.say(kepler_figures.text(lines))
+    checks = kepler_figures.checks(lines)
+    if args.out is not None:
+        folder = Path(args.out)
+        written = [report.write_csv(folder / "fig-kepler.csv", kepler_figures.rows(lines))]
+        try:
+            for name, figure in kepler_figures.figures(lines):
+                written.append(report.write_file(folder / name, figure.savefig))
+        except ImportError as error:
+            report.warn(f"no figures: {error}")
+        _say_written(args, written)
+    return 0 if all(check["matched"] for check in checks) else 1, {"checks": checks}
+
+
+def _solar(args: argparse.Namespace, judge: Callable[[], Any]) -> tuple[int, dict[str, Any]]:
+    """Make the figures of Experiment II by the command ``solar-system``; exit status and content of the JSON."""
+    parser = argparse.ArgumentParser()
+    solar_system.add_arguments(parser)
+    own = parser.parse_args([])
+    own.out, own.quiet = Path("." if args.out is None else args.out), args.quiet
+    own.json = own.out / "solar-system.json"
+    own.json.unlink(missing_ok=True)  # one that is there afterwards is of this run
+    status = solar_system.run(own, judge())
+    return status, json.loads(own.json.read_text(encoding="utf-8")) if own.json.exists() else {}
 
 
 def passed(cells: Iterable[Cell]) -> bool:

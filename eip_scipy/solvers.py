@@ -15,7 +15,7 @@ from . import _setup
 from ._kernels import NOT_FINITE, OK
 from ._setup import ProjectionOptions
 from ._step import T_NEW, TOO_SMALL, H, Span, T, close_step, next_step, project_step
-from .dense import dense_output
+from .dense import ExactEnds, dense_output
 from .invariants import as_invariants
 from .result import NFEV, NJEV, NLU, REJECTED
 from .tableaux import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
@@ -251,7 +251,7 @@ class EIPSolver(OdeSolver):
             if not np.isfinite(solver.K).all():
                 message = f"fun returned a non-finite value at t={self.t:.10g}"
             return False, message
-        self.y, self.t = solver.y, solver.t
+        self.y_old, self.y, self.t = self.y, solver.y, solver.t
         return True, None
 
     def _step_impl(self) -> tuple[bool, str | None]:
@@ -341,7 +341,7 @@ class EIPSolver(OdeSolver):
 
     def _dense_output_impl(self) -> DenseOutput:
         if self._scipy is not None:
-            out = self._scipy.dense_output()
+            out = ExactEnds(self._scipy.dense_output(), self.y_old, self.y)
             self.nfev = self._calls.count
             return out
         out = dense_output(

@@ -17,7 +17,9 @@ def test_exponential_decay():
 
     sol = solve_ivp(exponential_decay, [0, 10], [2, 4, 8], method=EIPRK45, t_eval=[0, 1, 2, 4, 10])
     same = solve_ivp(exponential_decay, [0, 10], [2, 4, 8], t_eval=[0, 1, 2, 4, 10])
-    np.testing.assert_array_equal(sol.y, same.y)
+    # The last point is the step's own state, where SciPy's interpolant has its rounding.
+    np.testing.assert_array_equal(sol.y[:, :-1], same.y[:, :-1])
+    np.testing.assert_allclose(sol.y, same.y, rtol=1e-15)
 
 
 def test_cannon():
@@ -108,10 +110,11 @@ def test_double_pendulum():
 
     state = np.radians([120.0, 0.0, -10.0, 0.0])
     t = np.arange(0, 2.5, 0.01)
-    kept = solve_ivp(derivs, t[[0, -1]], state, t_eval=t, method=EIPRK45, invariants=Invariant(energy, name="energy"))
-    plain = solve_ivp(derivs, t[[0, -1]], state, t_eval=t)
+    options = {"t_eval": t, "rtol": 1e-5, "atol": 1e-8}
+    kept = solve_ivp(derivs, t[[0, -1]], state, method=EIPRK45, invariants=Invariant(energy, name="energy"), **options)
+    plain = solve_ivp(derivs, t[[0, -1]], state, **options)
     exact = solve_ivp(derivs, t[[0, -1]], state, t_eval=t, method="DOP853", rtol=1e-12, atol=1e-12)
     drift = [np.ptp([energy(0, s) for s in sol.y.T]) for sol in (plain, kept)]
-    assert drift[0] > 1e-2
-    assert drift[1] < 1e-2 * drift[0]
+    assert drift[0] > 1e-3
+    assert drift[1] < 1e-4 * drift[0]
     assert np.abs(kept.y - exact.y).max() < np.abs(plain.y - exact.y).max()
