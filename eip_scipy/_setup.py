@@ -56,6 +56,8 @@ class Run:
 class Counted:
     """A right-hand side that counts its calls and returns new arrays."""
 
+    __slots__ = ("_rhs", "count")
+
     def __init__(self, rhs: Callable[[float, np.ndarray], np.ndarray]) -> None:
         self._rhs = rhs
         self.count = 0

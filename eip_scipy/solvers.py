@@ -149,7 +149,8 @@ class EIPSolver(OdeSolver):
         if math.isnan(t0) or math.isnan(t_bound):
             raise ValueError(f"t_span must hold two numbers, got ({t0}, {t_bound}).")
         start = _setup.initial_state(y0)
-        self._checked = _checked(fun, start.size, start.dtype, vectorized)
+        self._calls = [0]
+        derivative, self._rhs = _checked(fun, start.size, start.dtype, vectorized, self._calls)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
         adaptive = h is None
         if adaptive and not self.TABLEAU.has_estimate:
@@ -174,14 +175,12 @@ class EIPSolver(OdeSolver):
             n_steps=_setup.UNBOUNDED if h is None else _setup.fixed_steps(h, t0, t_bound),
             max_step=self.max_step,
         )
-        calls = _setup.Counted(self._checked)
-        self._calls = calls
-        self._scipy = self._scipy_solver(calls, start, first_step, as_invariants(invariants)) if adaptive else None
-        f0 = calls(t0, start.copy()) if self._scipy is None else np.zeros_like(start)
+        self._scipy = self._scipy_solver(derivative, start, first_step, as_invariants(invariants)) if adaptive else None
+        f0 = derivative(t0, start.copy()).copy() if self._scipy is None else np.zeros_like(start)
         self.h_abs = h if h is not None else first_step
         if self.h_abs is None and self._scipy is None:
             self.h_abs = _setup.initial_step(
-                calls,
+                derivative,
                 t0,
                 start,
                 t_bound,
@@ -193,7 +192,7 @@ class EIPSolver(OdeSolver):
             )
         run = _setup.prepare(
             self.TABLEAU,
-            calls,
+            derivative,
             t0,
             start,
             f0,
@@ -220,33 +219,37 @@ class EIPSolver(OdeSolver):
         self._project_now, self._projection_status = False, OK
         self._buffer = self._accepted = run.y0
         if run.y0 is not start:
-            f0 = calls(t0, run.y0.copy())
+            f0 = derivative(t0, run.y0.copy()).copy()
         self.y, self.f = run.y0, f0
-        self._work.counters[NFEV] = calls.count
+        self._work.counters[NFEV] = self._calls[0]
         self._count()
         self.y_old, self.f_old = self.y, self.f
-
-    def _rhs(self, t: float, y: np.ndarray, out: np.ndarray, params: Any) -> None:
-        # A copy, because a user's function may keep what it was given and `y` is a buffer.
-        out[:] = self._checked(t, y.copy())
 
     def _count(self) -> None:
         counters = self._work.counters
         self.nfev, self.njev, self.nlu = int(counters[NFEV]), int(counters[NJEV]), int(counters[NLU])
 
     def _scipy_solver(
-        self, calls: _setup.Counted, start: np.ndarray, first_step: float | None, invariants: tuple[Any, ...]
+        self,
+        derivative: Callable[[float, np.ndarray], np.ndarray],
+        start: np.ndarray,
+        first_step: float | None,
+        invariants: tuple[Any, ...],
     ) -> OdeSolver | None:
         if self.SCIPY is None or invariants or type(self)._project_step is not EIPSolver._project_step:
             return None
+
+        def fresh(t: float, y: np.ndarray) -> np.ndarray:
+            return derivative(t, y).copy()
+
         control = {"first_step": first_step, "max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
-        solver = self.SCIPY(calls, self.t, start, self.t_bound, **control)
-        solver.fun = calls  # in the place of SciPy's three wrappers, whose work it does
+        solver = self.SCIPY(fresh, self.t, start, self.t_bound, **control)
+        solver.fun = fresh  # in the place of SciPy's two wrappers, whose work it does
         return solver
 
     def _scipy_step(self, solver: OdeSolver) -> tuple[bool, str | None]:
         message = solver.step()
-        self.nfev = self._calls.count
+        self.nfev = self._calls[0]
         if solver.status == "failed":
             if not np.isfinite(solver.K).all():
                 message = f"fun returned a non-finite value at t={self.t:.10g}"
@@ -342,7 +345,7 @@ class EIPSolver(OdeSolver):
     def _dense_output_impl(self) -> DenseOutput:
         if self._scipy is not None:
             out = ExactEnds(self._scipy.dense_output(), self.y_old, self.y)
-            self.nfev = self._calls.count
+            self.nfev = self._calls[0]
             return out
         out = dense_output(
             self._rhs, self._run, self.TABLEAU, self.t_old, self.t, self.y_old, self.y, self.f_old, self.f
@@ -352,18 +355,35 @@ class EIPSolver(OdeSolver):
 
 
 def _checked(
-    fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool
-) -> Callable[[float, np.ndarray], np.ndarray]:
-    """The user's right-hand side as (t, y) -> (n,) of the state's type, with clear errors; maybe their buffer."""
+    fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool, calls: list[int]
+) -> tuple[Callable[[float, np.ndarray], np.ndarray], Callable[..., None]]:
+    """The user's right-hand side with clear errors: as (t, y) -> (n,), maybe their buffer, and as the step calls it.
+
+    The first counts in `calls`; the step counts its own. Both test the common case, an array of the right shape and type, in place: this runs at every stage.
+    """
     shape = (n,)
 
+    def flat(t: float, y: np.ndarray) -> np.ndarray:
+        return np.asarray(fun(t, y[:, None])).reshape(-1)
+
+    call = flat if vectorized else fun
+
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
-        f = np.asarray(fun(t, y[:, None])).reshape(-1) if vectorized else fun(t, y)
+        calls[0] += 1
+        f = call(t, y)
         if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
             return f
         return _setup.as_derivative(f, n, dtype).astype(dtype)
 
-    return derivative
+    def rhs(t: float, y: np.ndarray, out: np.ndarray, params: Any) -> None:
+        # A copy, because a user's function may keep what it was given and `y` is a buffer.
+        f = call(t, y.copy())
+        if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
+            out[:] = f
+        else:
+            out[:] = _setup.as_derivative(f, n, dtype)
+
+    return derivative, rhs
 
 
 class EIPRK1(EIPSolver):

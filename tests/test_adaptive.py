@@ -1,0 +1,781 @@
+"""Adaptive steps with invariants: every option in both drivers, what they buy, and how runs fail."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+from numba import njit
+from scipy.integrate import solve_ivp
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPRK1,
+    EIPRK2,
+    EIPRK3,
+    EIPRK4,
+    EIPRK5,
+    EIPRK23,
+    EIPRK45,
+    Diagnostics,
+    EIPSolver,
+    Invariant,
+    eip_method,
+    integrate,
+)
+from eip_scipy.problems import kepler, solar_system
+
+EPS = np.finfo(float).eps
+METHODS = [EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]
+methods = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.__name__)
+E = 0.6
+Y0 = np.array([1 - E, 0.0, 0.0, math.sqrt((1 + E) / (1 - E))])
+
+
+def orbit(t, y):
+    return np.array([y[2], y[3], *(-y[:2] / math.hypot(y[0], y[1]) ** 3)])
+
+
+def energy(t, y):
+    return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.hypot(y[0], y[1])
+
+
+def energy_gradient(t, y):
+    return np.array([*(y[:2] / math.hypot(y[0], y[1]) ** 3), y[2], y[3]])
+
+
+def momentum(t, y):
+    return y[0] * y[3] - y[1] * y[2]
+
+
+H = Invariant(energy, energy_gradient, name="energy")
+L = Invariant(momentum, lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]), name="momentum")
+H_USES_F = Invariant(energy, lambda t, y, f: np.array([-f[2], -f[3], y[2], y[3]]), name="energy", uses_f=True)
+
+
+def by_scipy(fun, t_span, y0, *, method=EIPRK45, **options):
+    d = Diagnostics()
+    sol = solve_ivp(fun, t_span, y0, method=method, **{"diagnostics": d, **options})
+    sol.diagnostics, sol.max_defect = d, d.max_defect
+    return sol
+
+
+def by_integrate(fun, t_span, y0, *, method=EIPRK45, **options):
+    return integrate(fun, t_span, y0, method=method, **{"save_every": 1, **options})
+
+
+both = pytest.mark.parametrize("driver", [by_scipy, by_integrate], ids=["solve_ivp", "integrate"])
+
+
+# It works, and what it buys.
+
+
+@both
+@methods
+@pytest.mark.parametrize("t_span", [(0.0, 10.0), (10.0, 0.0)], ids=["forward", "backward"])
+def test_invariants_are_kept(driver, method, t_span):
+    """No h needed; defects O(h^(2p + 2)) below the local error, so far below the tolerance."""
+    options = {"method": method, "rtol": 1e-6, "atol": 1e-9}
+    run = driver(orbit, t_span, Y0, invariants=[H, L], **options)
+    assert run.status == 0
+    assert run.t[-1] == t_span[1]
+    assert (np.diff(run.t) * np.sign(t_span[1] - t_span[0]) > 0).all()
+    assert len(set(np.round(np.diff(run.t), 12))) > 5, "steps of one length"
+    assert (run.max_defect < 1e-9).all()
+    for item in (H, L):
+        drift = np.abs([item.fun(t, y) - item.fun(0, Y0) for t, y in zip(run.t, run.y.T, strict=True)])
+        assert drift.max() < 1e-9
+    plain = driver(orbit, t_span, Y0, **options)
+    assert np.abs(energy(0, plain.y[:, -1]) - energy(0, Y0)) > 1e-8
+
+
+@methods
+def test_error_goes_with_the_tolerance(method):
+    """A tenth of rtol costs steps by 10^(1 / (p_hat + 1)) and buys accuracy."""
+    exact = solve_ivp(orbit, (0, 10), Y0, method="DOP853", rtol=3e-14, atol=1e-16).y[:, -1]
+    errors, steps = [], []
+    for rtol in (1e-4, 1e-7):
+        run = by_scipy(orbit, (0, 10), Y0, method=method, rtol=rtol, atol=rtol * 1e-3, invariants=[H, L], blocks=2)
+        errors.append(np.abs(run.y[:, -1] - exact).max())
+        steps.append(len(run.t))
+    assert errors[1] < errors[0] / 30
+    order = method.TABLEAU.error_estimator_order
+    assert math.log(1e3) / math.log(steps[1] / steps[0]) == pytest.approx(order + 1, rel=0.25)
+
+
+@methods
+def test_step_control_is_that_of_the_raw_step(method):
+    """The estimate sees the step before its projection: about as many steps with invariants as without."""
+    with_them = by_scipy(orbit, (0, 20), Y0, method=method, rtol=1e-5, invariants=[H, L])
+    without = by_scipy(orbit, (0, 20), Y0, method=method, rtol=1e-5)
+    assert len(with_them.t) == pytest.approx(len(without.t), rel=0.2)
+
+
+@both
+def test_euler_needs_h(driver):
+    with pytest.raises(ValueError, match=r"EIPRK1 has no error estimate and needs the step h=\.\.\."):
+        driver(orbit, (0, 10), Y0, method=EIPRK1)
+    assert driver(orbit, (0, 1), Y0, method=EIPRK1, h=0.1).status == 0
+
+
+@both
+def test_max_step_and_first_step_are_obeyed(driver):
+    run = driver(orbit, (0, 10), Y0, invariants=H, max_step=0.07, first_step=0.05)
+    steps = np.diff(run.t)
+    assert steps[0] == pytest.approx(0.05)
+    assert steps.max() <= 0.07 + 1e-15
+    assert steps.max() > 0.069
+    run = driver(orbit, (0, 10), Y0, invariants=H, first_step=5.0)
+    assert run.t[1] < 1.0
+
+
+# Options, in both drivers.
+
+OPTIONS = {
+    "no invariants": {},
+    "one": {"invariants": H},
+    "two": {"invariants": [H, L]},
+    "rtol by component": {"invariants": H, "rtol": [1e-3, 1e-4, 1e-5, 1e-6]},
+    "atol by component": {"invariants": H, "atol": [1e-3, 1e-4, 1e-5, 1e-6]},
+    "metric error": {"invariants": [H, L], "metric": "error"},
+    "metric euclidean": {"invariants": [H, L], "metric": "euclidean"},
+    "metric weights": {"invariants": [H, L], "metric": [1.0, 1.0, 0.3, 0.3]},
+    "blocks": {"invariants": [H, L], "blocks": 2},
+    "blocks by index": {"invariants": [H, L], "blocks": [[0, 1], [2, 3]]},
+    "frame": {"invariants": H, "frame": ([[0.0, 0.0, 1.0, 0.0]], [[0.0], [0.0], [1.0], [0.0]])},
+    "direction old": {"invariants": [H, L], "direction": "old"},
+    "direction midpoint": {"invariants": [H, L], "direction": "midpoint"},
+    "iterations": {"invariants": [H, L], "iterations": 4},
+    "every": {"invariants": [H, L], "every": 5},
+    "reuse_f": {"invariants": [H, L], "reuse_f": False},
+    "uses_f": {"invariants": [H_USES_F, L]},
+    "check": {"invariants": [H, L], "check": False},
+    "project_initial": {
+        "invariants": Invariant(energy, energy_gradient, target=-0.45, name="H"),
+        "project_initial": True,
+    },
+    "target": {"invariants": Invariant(energy, energy_gradient, target=-0.5, name="H")},
+    "first_step": {"invariants": H, "first_step": 0.01},
+    "max_step": {"invariants": H, "max_step": 0.1},
+}
+
+
+@methods
+@pytest.mark.parametrize("option", OPTIONS)
+def test_both_drivers_take_every_option(method, option):
+    """The same functions, so the same steps to round-off of the fixed arithmetic; and the invariants are kept."""
+    options = {"rtol": 1e-4, "atol": 1e-6, **OPTIONS[option]}
+    one, other = (driver(orbit, (0.0, 6.0), Y0, method=method, **options) for driver in (by_scipy, by_integrate))
+    assert one.status == other.status == 0
+    assert one.nfev == other.nfev
+    assert len(one.t) == len(other.t)
+    if "invariants" in options:
+        np.testing.assert_array_equal(one.t, other.t)
+        np.testing.assert_array_equal(one.y, other.y)
+        assert (one.njev, one.nlu) == (other.njev, other.nlu)
+        assert one.njev > 0
+        target = options["invariants"].target if option in ("project_initial", "target") else energy(0, Y0)
+        assert abs(energy(0, one.y[:, -1]) - target) < 1e-5
+    else:
+        np.testing.assert_allclose(one.y, other.y, rtol=0, atol=1e-3 * options["rtol"])
+    if option == "frame":
+        assert np.isfinite(one.y).all()
+
+
+@both
+def test_every_projects_each_kth_accepted_step_and_the_last(driver):
+    run = driver(orbit, (0, 6), Y0, invariants=[H, L], every=4, rtol=1e-6, atol=1e-9)
+    defect = np.abs([energy(0, y) - energy(0, Y0) for y in run.y.T])
+    n = len(run.t) - 1
+    projected = [k for k in range(n + 1) if k % 4 == 0 or k == n]
+    rest = sorted(set(range(n + 1)) - set(projected))
+    assert defect[projected].max() < 1e-10
+    assert np.median(defect[rest]) > 1e-10
+    assert run.diagnostics.n_projections + run.diagnostics.n_skipped == len(projected) - 1
+
+
+@both
+def test_args_of_invariants(driver):
+    scaled = Invariant(lambda t, y, c: c * energy(t, y), lambda t, y, c: c * energy_gradient(t, y), args=(3.0,))
+    run = driver(orbit, (0, 6), Y0, invariants=scaled, rtol=1e-6, atol=1e-9)
+    assert abs(energy(0, run.y[:, -1]) - energy(0, Y0)) < 1e-10
+
+
+def test_vectorized_args_and_lists():
+    def fun(t, y, k):
+        return np.vstack([y[1], -k * y[0]])
+
+    square = Invariant(lambda t, y: 4 * y[0] ** 2 + y[1] ** 2, lambda t, y: np.array([8 * y[0], 2 * y[1]]))
+    one = solve_ivp(fun, (0, 5), [1, 2], method=EIPRK45, args=(4.0,), vectorized=True, invariants=square)
+    other = solve_ivp(lambda t, y: [y[1], -4.0 * y[0]], (0, 5), [1, 2], method=EIPRK45, invariants=square)
+    np.testing.assert_array_equal(one.y, other.y)
+    assert one.nfev == other.nfev
+    assert abs(square.fun(0, one.y[:, -1]) - 8.0) < 1e-9
+
+
+@both
+def test_complex_states(driver):
+    norm = Invariant(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y, name="N")
+    A = np.array([[1.0, 0.3j], [-0.3j, -0.5]])
+    run = driver(lambda t, y: -1j * (A @ y), (0, 20), np.array([0.6, 0.8j]), invariants=norm)
+    assert run.y.dtype == complex
+    values, vectors = np.linalg.eigh(A)
+    exact = vectors @ (np.exp(-20j * values) * (vectors.conj().T @ [0.6, 0.8j]))
+    assert np.abs(run.y[:, -1] - exact).max() < 2e-2
+    assert abs(norm.fun(0, run.y[:, -1]) - 1) < 1e-7
+    plain = driver(lambda t, y: -1j * (A @ y), (0, 20), np.array([0.6, 0.8j]))
+    assert abs(norm.fun(0, plain.y[:, -1]) - 1) > 1e-3
+
+
+@both
+def test_complex_function_of_a_real_state(driver):
+    with pytest.raises(ValueError, match=r"complex values, but y0 is real; pass y0\.astype\(complex\)"):
+        driver(lambda t, y: 1j * y, (0, 1), [1.0])
+
+
+@both
+def test_buffer_that_fun_reuses(driver):
+    buffer = np.zeros(4)
+
+    def reusing(t, y):
+        buffer[:] = orbit(t, y)
+        return buffer
+
+    for invariants in ((), [H, L]):
+        one, other = (driver(fun, (0, 6), Y0, invariants=invariants) for fun in (reusing, orbit))
+        np.testing.assert_array_equal(one.y, other.y)
+
+
+@both
+@methods
+def test_zero_length_interval(driver, method):
+    run = driver(orbit, (2.0, 2.0), Y0, method=method, invariants=[H, L])
+    assert run.status == 0
+    assert set(run.t.tolist()) == {2.0}
+    assert (run.y == Y0[:, None]).all()
+    assert run.njev == 0
+
+
+@both
+def test_zero_length_interval_with_first_step(driver):
+    with pytest.raises(ValueError, match="`first_step` exceeds bounds"):
+        driver(orbit, (2.0, 2.0), Y0, first_step=0.1)
+
+
+def test_zero_length_interval_with_dense_output_and_events():
+    sol = solve_ivp(orbit, (2.0, 2.0), Y0, method=EIPRK45, invariants=H, dense_output=True, events=lambda t, y: y[0])
+    np.testing.assert_array_equal(sol.sol(2.0), Y0)
+    run = integrate(orbit, (2.0, 2.0), Y0, method=EIPRK45, invariants=H, t_eval=[2.0], events=lambda t, y: y[0])
+    np.testing.assert_array_equal(run.y[:, 0], Y0)
+    assert run.t_events[0].size == 0
+
+
+@methods
+def test_frame_on_planets(method):
+    problem = solar_system()
+    options = {"invariants": problem.invariants, "blocks": problem.blocks, "rtol": 1e-6, "atol": 1e-9}
+    kept, not_kept = (
+        solve_ivp(problem.fun, (0, 0.5), problem.y0, method=method, frame=frame, **options)
+        for frame in (problem.frame, None)
+    )
+    C = problem.frame[0]
+    momenta = [np.abs(C @ sol.y[:, -1] - C @ sol.y[:, 0])[3:].max() for sol in (kept, not_kept)]
+    assert momenta[0] < 1e-12 * np.abs(C).sum(axis=1).max()
+    assert momenta[0] < momenta[1]
+
+
+def test_problem_adaptive_is_as_good_through_both():
+    problem = kepler(0.3, 0.0)
+    sol = solve_ivp(problem.fun, (0, 20), problem.y0, method=EIPDOP853, rtol=1e-9, atol=1e-12, invariants=H)
+    run = integrate(problem, (0, 20), method=EIPDOP853, rtol=1e-9, atol=1e-12, first_step=1e-3)
+    for y in (sol.y[:, -1], run.y[:, -1]):
+        np.testing.assert_allclose(y, problem.reference(20.0), atol=1e-7)
+
+
+# Wrong values.
+
+
+@both
+@pytest.mark.parametrize(
+    ("name", "value", "match"),
+    [
+        ("first_step", 0.0, "`first_step` must be positive"),
+        ("first_step", -1.0, "`first_step` must be positive"),
+        ("first_step", math.nan, "`first_step` must be positive"),
+        ("first_step", 11.0, "`first_step` exceeds bounds"),
+        ("first_step", math.inf, "`first_step` exceeds bounds"),
+        ("first_step", "small", "`first_step` must be positive"),
+        ("first_step", [0.1], "`first_step` must be positive"),
+        ("first_step", True, "`first_step` must be positive"),
+        ("max_step", 0.0, "`max_step` must be positive"),
+        ("max_step", -1, "`max_step` must be positive"),
+        ("max_step", math.nan, "`max_step` must be positive"),
+        ("max_step", None, "`max_step` must be positive"),
+        ("max_step", "large", "`max_step` must be positive"),
+        ("rtol", -1e-3, "`rtol` must be positive"),
+        ("rtol", math.nan, "`rtol` must be positive"),
+        ("rtol", [1e-3, math.nan, 1e-3, 1e-3], "`rtol` must be positive"),
+        ("rtol", [1e-3] * 3, "`rtol` has wrong shape"),
+        ("atol", -1e-6, "`atol` must be positive"),
+        ("atol", math.nan, "`atol` must be positive"),
+        ("atol", [1e-6, -1e-6, 1e-6, 1e-6], "`atol` must be positive"),
+        ("atol", [1e-6] * 3, "`atol` has wrong shape"),
+    ],
+)
+@pytest.mark.parametrize("invariants", [(), H], ids=["plain", "projected"])
+def test_wrong_values(driver, name, value, match, invariants):
+    """At once and without a warning on the way: SciPy itself hangs on some of them."""
+    with pytest.raises(ValueError, match=match):
+        driver(orbit, (0, 10), Y0, invariants=invariants, **{name: value})
+
+
+@both
+@pytest.mark.parametrize("rtol", [1e-20, 0.0, [1e-3, 1e-20, 1e-3, 1e-3]])
+def test_rtol_too_small_warns_as_scipy_s(driver, rtol):
+    least = 100 * EPS
+    with pytest.warns(UserWarning, match=r"At least one element of `rtol` is too small\. Setting `rtol = np") as record:
+        run = driver(orbit, (0, 0.1), Y0, rtol=rtol, invariants=H)
+    assert len(record) == 1
+    assert record[0].filename == __file__ or "scipy" in record[0].filename
+    one = driver(orbit, (0, 0.1), Y0, rtol=np.maximum(rtol, least), invariants=H)
+    np.testing.assert_array_equal(run.y, one.y)
+
+
+@both
+def test_h_with_options_of_adaptive_steps(driver):
+    with pytest.raises(ValueError, match="h sets a fixed step; first_step and max_step belong to adaptive steps"):
+        driver(orbit, (0, 10), Y0, h=0.1, max_step=0.2)
+
+
+def test_unknown_options():
+    with pytest.warns(UserWarning, match="EIPRK45 has no option 'max_stepp'; it is ignored; did you mean 'max_step'"):
+        EIPRK45(orbit, 0, Y0, 1.0, max_stepp=3)
+    with pytest.raises(TypeError, match=r"no option 'first_stepp'; did you mean 'first_step'"):
+        integrate(orbit, (0, 1), Y0, method=EIPRK45, first_stepp=3)
+
+
+# Endless intervals.
+
+
+@both
+@pytest.mark.parametrize("sign", [1, -1])
+def test_endless_interval_with_a_terminal_event(driver, sign):
+    def half_turn(t, y):
+        return y[1]
+
+    half_turn.terminal, half_turn.direction = True, -1
+    options = {"rtol": 1e-8, "atol": 1e-11, "invariants": [H, L], "events": half_turn}
+    run = driver(orbit, (0.0, sign * np.inf), Y0, **options)
+    assert run.status == 1
+    assert run.message.startswith("A termination event occurred.")
+    assert run.t[-1] == pytest.approx(sign * math.pi * (1 if sign > 0 else 2), abs=1e-5)
+    assert run.t_events[0].size == 1
+    np.testing.assert_array_equal(run.y[:, -1], run.y_events[0][0])
+
+
+def test_endless_interval_without_one():
+    with pytest.raises(ValueError, match="t_span must be finite unless a terminal event ends the run"):
+        integrate(orbit, (0.0, np.inf), Y0, method=EIPRK45)
+    with pytest.raises(ValueError, match="t_span must be finite"):
+        integrate(orbit, (0.0, np.inf), Y0, method=EIPRK45, events=lambda t, y: y[0])
+    solver = EIPRK45(orbit, 0.0, Y0, np.inf, invariants=H)
+    for _ in range(5):
+        assert solver.step() is None
+    assert solver.status == "running"
+
+
+# Failures: rejected, retried, reported, everything kept.
+
+
+def lotka_volterra(t, u):
+    return np.array([u[0] * (1 - u[1]), u[1] * (u[0] - 1)])
+
+
+def volterra(t, u):
+    return u[0] - math.log(u[0]) + u[1] - math.log(u[1]) if (u > 0).all() else math.nan
+
+
+V = Invariant(volterra, lambda t, u: 1 - 1 / u, name="Volterra")
+
+
+@both
+@pytest.mark.parametrize("method", [EIPRK2, EIPRK23, EIPRK4, EIPRK45], ids=lambda m: m.__name__)
+def test_invariant_nan_after_a_trial_step_is_mended_by_shorter_ones(driver, method):
+    """A first step of 2 at a loose tolerance takes Lotka-Volterra to u < 0: rejected, h x 0.25, and on it goes."""
+    run = driver(lotka_volterra, (0, 20), [4.0, 2.0], method=method, rtol=0.5, atol=5.0, first_step=2.0, invariants=V)
+    assert run.status == 0
+    assert (run.y > 0).all()
+    assert run.diagnostics.n_rejected_projections >= 1
+    assert run.t[1] - run.t[0] <= 2.0 * 0.25 * (1 + 1e-15)
+    assert np.isfinite(run.max_defect).all()
+    assert np.ptp([volterra(0, u) for u in run.y.T]) < 1.0
+
+
+class Stubborn:
+    """An invariant that cannot be met beyond t = 0.45; notes the times at which it was asked."""
+
+    def __init__(self):
+        self.times = []
+
+    def value(self, t, y):
+        self.times.append(t)
+        return y @ y if t < 0.45 else math.nan
+
+
+@both
+def test_shorter_and_shorter_at_most_ten_times(driver):
+    """Trial steps h, h/4, h/16 ... from the last good state: one and ten retries, then the end."""
+    stubborn = Stubborn()
+    item = Invariant(stubborn.value, lambda t, y: 2 * y, name="stubborn")
+    # Exactly 0.4 is reached by equal steps; from there every trial lands beyond 0.45 until h is below 0.05.
+    fun = lambda t, y: np.array([y[1], -y[0]])  # noqa: E731
+    run = driver(fun, (0, 1), [1.0, 2.0], rtol=1e-2, atol=1e-2, max_step=0.1, invariants=item, check=False)
+    # Steps creep up to 0.45: each is shortened until it stays below, and only the last finds no way.
+    assert run.status == -1
+    assert not run.success
+    assert run.message.startswith("projection failed at t=")
+    assert "invariant 'stubborn', residual nan, rank 1 of 1" in run.message
+    assert 0.449999 < run.t[-1] < 0.45
+    np.testing.assert_allclose((run.y**2).sum(axis=0), 5.0, rtol=1e-9)
+    assert run.y.shape == (2, len(run.t))
+    rejected = run.diagnostics.n_rejected_projections
+    assert rejected >= 11
+    last = np.unique([t for t in stubborn.times if t >= 0.45])
+    # The last eleven trials: from one state, each a quarter of the one before.
+    trials = sorted(last - run.t[-1])[:11]
+    np.testing.assert_allclose(np.array(trials[1:]) / np.array(trials[:-1]), 4.0, rtol=1e-6)
+    assert trials[0] <= 0.1 / 4**10 * 1.01
+
+
+@both
+def test_impossible_manifold(driver):
+    """Two invariants that part at t = 0.45 whatever the state: the rest is kept, the loser named."""
+    square = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="square")
+    drifting = Invariant(lambda t, y: y @ y + 10 * max(t - 0.45, 0.0), lambda t, y: 2 * y, name="drifting")
+    options = {"max_step": 0.1, "invariants": [square, drifting], "check": False}
+    run = driver(lambda t, y: np.array([y[1], -y[0]]), (0, 1), [1.0, 2.0], **options)
+    assert run.status == -1
+    assert run.message.startswith("projection failed at t=")
+    assert "invariant 'drifting'" in run.message or "invariant 'square'" in run.message
+    assert "rank 1 of 2" in run.message
+    assert 0.4499 < run.t[-1] < 0.4501
+    assert np.isfinite(run.y).all()
+    np.testing.assert_allclose((run.y**2).sum(axis=0), 5.0, rtol=1e-9)
+    assert run.diagnostics.n_rejected_projections >= 11
+
+
+@both
+def test_first_projection_fails(driver):
+    """At the very first step: one state, the start, and eleven rejections."""
+    wrong = Invariant(lambda t, y: y @ y, lambda t, y: -2 * y, name="wrong")
+    options = {"invariants": wrong, "check": False, "first_step": 0.5, "rtol": 1e-2, "atol": 1.0}
+    # A constant push off the sphere, so that the defect is large at any step.
+    run = driver(lambda t, y: y * 1.0, (0, 1), [1.0, 2.0], **options)
+    assert run.status == -1
+    assert run.message.startswith("projection failed at t=")
+    assert "invariant 'wrong', residual" in run.message
+    assert run.t.tolist() == [0.0]
+    assert run.diagnostics.n_rejected_projections == 11
+    assert run.njev == 12 or run.njev == 11
+
+
+@both
+def test_failed_projection_counts_only_in_a_row(driver):
+    """A failure now and then is mended each time: many rejections, and the run ends well."""
+    asked = []
+
+    def value(t, y):
+        asked.append(t)
+        return math.nan if len(asked) % 7 == 0 else y @ y
+
+    flaky = Invariant(value, lambda t, y: 2 * y, target=5.0, name="flaky")
+    run = (
+        driver(
+            lambda t, y: np.array([y[1], -y[0]]),
+            (0, 30),
+            [1.0, 2.0],
+            invariants=flaky,
+            check=False,
+            rtol=1e-5,
+            save_every=None,
+        )
+        if driver is by_integrate
+        else driver(lambda t, y: np.array([y[1], -y[0]]), (0, 30), [1.0, 2.0], invariants=flaky, check=False, rtol=1e-5)
+    )
+    assert run.status == 0
+    assert run.diagnostics.n_rejected_projections > 11
+
+
+@both
+def test_gradient_not_finite_on_the_way(driver):
+    broken = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y if t < 0.45 else np.nan * y, name="broken")
+    with np.errstate(all="ignore"):
+        run = driver(lambda t, y: np.array([y[1], -y[0]]), (0, 1), [1.0, 2.0], invariants=broken, check=False)
+    assert run.status == -1
+    assert "broken" in run.message
+    assert 0.449 < run.t[-1] < 0.45
+    assert np.isfinite(run.y).all()
+
+
+@both
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("invariants", [(), [H]], ids=["plain", "projected"])
+def test_rhs_not_finite(driver, bad, invariants):
+    """From t = 1 on: the step shrinks towards it, then status -1 that names the time; everything before is kept."""
+
+    def fun(t, y):
+        return orbit(t, y) if t < 1.0 else np.full(4, bad)
+
+    with np.errstate(all="ignore"):
+        run = driver(fun, (0, 2), Y0, invariants=invariants)
+    assert run.status == -1
+    assert run.message.startswith("fun returned a non-finite value at t=1")
+    assert 0.99 < run.t[-1] < 1.0
+    assert np.isfinite(run.y).all()
+    assert len(run.t) > 3
+    clean = driver(orbit, (0, 2), Y0, invariants=invariants)
+    first = np.count_nonzero(clean.t < 0.5)
+    np.testing.assert_array_equal(run.y[:, :first], clean.y[:, :first])
+
+
+@both
+@pytest.mark.parametrize("invariants", [(), [H]], ids=["plain", "projected"])
+def test_rhs_not_finite_at_the_start(driver, invariants):
+    with np.errstate(all="ignore"):
+        run = driver(lambda t, y: np.full(4, np.nan), (0, 2), Y0, invariants=invariants, check=False)
+    assert run.status == -1
+    assert run.message.startswith("fun returned a non-finite value at t=0")
+    assert run.t.tolist() == [0.0]
+    np.testing.assert_array_equal(run.y[:, 0], Y0)
+
+
+@both
+def test_rhs_not_finite_at_one_stage_only_is_passed_by(driver):
+    """A hole that the shrunk step misses: SciPy's own classes go on, ours too."""
+    hole = []
+
+    def fun(t, y):
+        if 0.5 < t < 0.6 and not hole:
+            hole.append(t)
+            return np.full(4, np.nan)
+        return orbit(t, y)
+
+    run = driver(fun, (0, 2), Y0, invariants=[H])
+    assert hole
+    assert run.status == 0
+    assert abs(energy(0, run.y[:, -1]) - energy(0, Y0)) < 1e-4
+
+
+@both
+@methods
+def test_blow_up(driver, method):
+    """y' = y^2: infinite at t = 1."""
+    with np.errstate(all="ignore"):
+        run = driver(lambda t, y: y * y, (0, 2), [1.0], method=method)
+    assert run.status == -1
+    assert np.isfinite(run.y).all()
+    assert run.t[-1] == pytest.approx(1.0, abs=2e-2)
+    assert run.t[-1] > 0.9
+    assert run.y[0, -1] > 1e4
+    assert run.message.startswith(("Required step size is less than spacing", "fun returned a non-finite", "the state"))
+
+
+@both
+@methods
+@pytest.mark.parametrize("invariants", [(), [Invariant(lambda t, y: 1.0, lambda t, y: np.zeros(1))]])
+def test_overflow_without_a_flood_of_warnings(driver, method, invariants):
+    """y' = 1e200 y: a handful of warnings at most, none of them of the package's own lines, and a clean end."""
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        run = driver(lambda t, y: 1e200 * y, (0, 2), [1.0], method=method, invariants=invariants, check=False)
+    assert run.status == -1
+    assert np.isfinite(run.y).all()
+    ours = [str(w.message) for w in record if "eip_scipy" in w.filename and not w.filename.startswith(__file__)]
+    assert not ours
+    assert len(record) <= 10
+
+
+@both
+def test_step_size_below_the_spacing(driver):
+    """A wall that no step crosses: SciPy's message."""
+    run = driver(lambda t, y: np.where(t < 1, 1.0, 1e15) * np.ones(1), (0, 2), [0.0], rtol=1e-10, atol=1e-12)
+    if run.status == -1:
+        assert run.message.startswith("Required step size is less than spacing between numbers.")
+        assert run.t[-1] == pytest.approx(1.0, abs=1e-9)
+    else:
+        assert run.t[-1] == 2.0
+
+
+@both
+def test_exceptions_of_the_user_pass(driver):
+    class MineError(Exception):
+        pass
+
+    def fun(t, y):
+        if t > 1:
+            raise MineError("mine")
+        return orbit(t, y)
+
+    with pytest.raises(MineError, match="mine") as caught:
+        driver(fun, (0, 2), Y0, invariants=H)
+    if driver is by_integrate:
+        partial = caught.value.partial
+        assert partial.status == -1
+        assert 0.5 < partial.t[-1] <= 1.0
+        assert partial.y.shape == (4, len(partial.t))
+
+
+# Diagnostics.
+
+
+@both
+@methods
+def test_counts_of_projections(driver, method):
+    run = driver(orbit, (0, 6), Y0, method=method, invariants=[H, L])
+    d = run.diagnostics
+    assert d.names == ("energy", "momentum")
+    assert d.n_projections + d.n_skipped == len(run.t) - 1
+    assert d.n_projections > 0.9 * (len(run.t) - 1)
+    assert d.n_rejected_projections == 0
+    assert run.njev == len(run.t) - 1
+    assert run.nlu == d.n_projections
+    at_steps = np.array([[abs(item.fun(0, y) - item.fun(0, Y0)) for item in (H, L)] for y in run.y.T])
+    np.testing.assert_allclose(d.max_defect, at_steps.max(axis=0), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(d.last_defect, at_steps[-1], rtol=0, atol=1e-15)
+    assert 0 < d.max_correction < 1e4
+    assert "2 invariants" in repr(d) or "energy" in repr(d)
+
+
+@both
+def test_max_correction_without_the_error_metric(driver):
+    """It is measured in local errors, which the euclidean metric does not look at."""
+    run = driver(orbit, (0, 6), Y0, invariants=[H, L], metric="euclidean")
+    assert math.isnan(run.diagnostics.max_correction)
+
+
+@both
+def test_nfev_is_the_number_of_calls(driver):
+    for method in METHODS:
+        for options in ({}, {"invariants": [H, L]}, {"invariants": [H_USES_F], "reuse_f": False}, {"every": 3}):
+            calls = []
+
+            def fun(t, y, calls=calls):
+                calls.append(t)
+                return orbit(t, y)
+
+            check = {} if "invariants" not in options else {"check": False}
+            run = driver(fun, (0, 6), Y0, method=method, **options, **check)
+            assert run.nfev == len(calls), (method, options)
+
+
+# Memory, saving, callbacks.
+
+
+@pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.needs_jit), False])
+def test_memory_bound_of_an_adaptive_run(compiled):
+    """The number of steps is not known before: the run ends when the rows would outgrow the bound, with all of them."""
+    fun = njit(lambda t, y: np.array([y[1], -y[0]]))
+    square = Invariant(njit(lambda t, y: y[0] ** 2 + y[1] ** 2), njit(lambda t, y: 2 * y), name="S")
+    options = {"method": EIPRK45, "invariants": square, "max_step": 0.01, "compiled": compiled}
+    # A row: time, two components, one invariant.
+    bound = 8 * 4 * 3000
+    with pytest.raises(MemoryError, match=r"save_every \(or max_bytes\)") as caught:
+        integrate(fun, (0, 1e4), [1.0, 2.0], save_every=1, max_bytes=bound, **options)
+    partial = caught.value.partial
+    assert partial.status == -1
+    assert 1000 <= len(partial.t) <= 3000
+    steps = np.diff(partial.t)
+    assert steps.max() <= 0.01 + 1e-12
+    assert (steps > 0).all()
+    np.testing.assert_allclose((partial.y**2).sum(axis=0), 5.0, rtol=1e-12)
+    assert partial.invariants.shape == (1, len(partial.t))
+    run = integrate(fun, (0, 1e4), [1.0, 2.0], save_every=1000, max_bytes=bound, **{**options, "max_step": 1.0})
+    assert run.status == 0
+
+
+def test_t_eval_is_refused_before_the_run():
+    calls = []
+    with pytest.raises(MemoryError, match="needs"):
+        integrate(
+            lambda t, y: calls.append(t) or -y, (0, 1), [1.0], method=EIPRK45, t_eval=np.linspace(0, 1, 1000),
+            max_bytes=100,
+        )  # fmt: skip
+    assert len(calls) < 10
+
+
+def test_rows_grow_beyond_the_first_thousand():
+    options = {"method": EIPRK23, "rtol": 1e-7, "atol": 1e-9, "invariants": H}
+    sol = solve_ivp(orbit, (0, 12), Y0, **options)
+    assert len(sol.t) > 2100
+    run = integrate(orbit, (0, 12), Y0, save_every=1, **options)
+    np.testing.assert_array_equal(run.t, sol.t)
+    np.testing.assert_array_equal(run.y, sol.y)
+
+
+def test_callback_at_saved_points():
+    seen = []
+
+    def callback(t, y, defects):
+        seen.append((t, y.copy(), defects.copy()))
+        return t > 3.0
+
+    run = integrate(orbit, (0, 6), Y0, method=EIPRK45, invariants=[H, L], save_every=2, callback=callback)
+    assert run.status == 1
+    assert "stopped by the callback" in run.message
+    assert [t for t, _, _ in seen] == run.t.tolist()
+    assert run.t[-2] <= 3.0 < run.t[-1]
+    np.testing.assert_array_equal(np.array([y for _, y, _ in seen]).T, run.y)
+    assert all(d.shape == (2,) for _, _, d in seen)
+
+
+def test_progress_of_an_adaptive_run(capsys):
+    integrate(orbit, (0, 6), Y0, method=EIPRK45, progress=True)
+    assert "EIPRK45" in capsys.readouterr().err
+
+
+def test_hook_after_each_accepted_step():
+    """`_project_step` is called once per accepted step, never for rejected ones, and its state goes on."""
+    seen = []
+
+    class Mine(EIPRK45):
+        def _project_step(self, t, y, y_hat, err):
+            seen.append(t)
+            out = super()._project_step(t, y, y_hat, err)
+            return out * 0.0 + np.where(out > 10, 10.0, out)
+
+    assert issubclass(Mine, EIPSolver)
+    for invariants in ((), H):
+        seen.clear()
+        sol = solve_ivp(orbit, (0, 6), Y0, method=Mine, invariants=invariants, first_step=3.0)
+        assert seen == sol.t[1:].tolist()
+        assert sol.nfev > 6 * len(sol.t)
+        same = solve_ivp(orbit, (0, 6), Y0, method=eip_method(EIPRK45.TABLEAU), invariants=invariants, first_step=3.0)
+        np.testing.assert_array_equal(sol.y, same.y)
+
+
+@pytest.mark.needs_jit
+@methods
+def test_failures_of_compiled_runs_are_the_same(method):
+    lv = njit(lambda t, u: np.array([u[0] * (1 - u[1]), u[1] * (u[0] - 1)]))
+    value = njit(lambda t, u: u[0] - np.log(u[0]) + u[1] - np.log(u[1]))
+    grad = njit(lambda t, u: 1 - 1 / u)
+    late_nan = njit(lambda t, u: np.array([u[1], -u[0]]) * (1.0 if t < 0.5 else np.nan))
+    ball = njit(lambda t, u: u[0] ** 2 + u[1] ** 2 if t < 0.5 else np.nan)
+    double = njit(lambda t, u: 2 * u)
+    turn = njit(lambda t, u: np.array([u[1], -u[0]]))
+    cases = [
+        (lv, {"rtol": 0.5, "atol": 5.0, "first_step": 2.0, "invariants": Invariant(value, grad, name="V")}),
+        (late_nan, {}),
+        (turn, {"invariants": Invariant(ball, double, name="ball"), "check": False}),
+    ]
+    for fun, options in cases:
+        one, other = (
+            integrate(fun, (0, 20), [4.0, 2.0], method=method, save_every=1, compiled=compiled, **options)
+            for compiled in (True, False)
+        )
+        assert one.compiled
+        assert one.status == other.status
+        assert other.message.startswith(one.message)
+        np.testing.assert_array_equal(one.t, other.t)
+        np.testing.assert_array_equal(one.y, other.y)
+        assert repr(one.diagnostics) == repr(other.diagnostics)
