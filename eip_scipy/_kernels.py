@@ -53,8 +53,6 @@ class Inner(NamedTuple):
 
     matrix: np.ndarray
     g: np.ndarray
-    band: np.ndarray
-    noise: np.ndarray
     inverse_norms: np.ndarray
     R: np.ndarray
     pivots: np.ndarray
@@ -65,14 +63,7 @@ def make_inner(size: int) -> Inner:
     """Scratch for systems of up to `size` invariants."""
     square = (size, size)
     return Inner(
-        matrix=np.zeros(square),
-        g=np.zeros(size),
-        band=np.zeros(size),
-        noise=np.zeros(size),
-        inverse_norms=np.zeros(size),
-        R=np.zeros(square),
-        pivots=np.zeros(size, np.int64),
-        mu=np.zeros(size),
+        np.zeros(square), np.zeros(size), np.zeros(size), np.zeros(square), np.zeros(size, np.int64), np.zeros(size)
     )
 
 
@@ -407,36 +398,28 @@ def factor(B, inverse_norms, R, pivots):
 
 
 @_jit
-def least_norm(g, band, inverse_norms, R, pivots, rank, mu, noise):
-    """Coefficients mu along the orthonormal directions of the least-norm x with row_i . x = -g_i (pivot rows).
-
-    `band` is the rounding in g. Nearly parallel rows leave differences that are nothing but rounding, which dividing by
-    their small distance would magnify: where a difference is within the rounding of its terms, it counts as 0.
-    """
+def least_norm(g, inverse_norms, R, pivots, rank, mu):
+    """Coefficients mu along the orthonormal directions of the least-norm x with row_i . x = -g_i (pivot rows)."""
     for k in range(rank):
         row = pivots[k]
         value = -g[row] * inverse_norms[row]
-        rounding = band[row] * inverse_norms[row]
         for q in range(k):
             value -= R[q, row] * mu[q]
-            rounding += abs(R[q, row]) * noise[q]
-        noise[k] = rounding * R[k, row]
-        mu[k] = value * R[k, row] if abs(value) > rounding else 0.0
+        mu[k] = value * R[k, row]
 
 
 @_jit_inline
-def newton_matrix_solve(rows, g, band, Q, pivots, rank, inner, mu):
+def newton_matrix_solve(rows, g, Q, pivots, rank, inner, mu):
     """Add to mu the Newton step of (rows . Q) step = -g, on the rows that the first factorisation chose."""
     matrix = inner.matrix[:rank, :rank]
     for k in range(rank):
         for q in range(rank):
             matrix[k, q] = dot(rows[pivots[k]], Q[pivots[q]])
         inner.g[k] = g[pivots[k]]
-        inner.band[k] = band[pivots[k]]
     inner_rank = factor(matrix, inner.inverse_norms, inner.R, inner.pivots)
     if inner_rank < 0:
         fill(mu, np.nan)
-    least_norm(inner.g, inner.band, inner.inverse_norms, inner.R, inner.pivots, inner_rank, inner.mu, inner.noise)
+    least_norm(inner.g, inner.inverse_norms, inner.R, inner.pivots, inner_rank, inner.mu)
     for k in range(inner_rank):
         row = matrix[inner.pivots[k]]
         for q in range(rank):
@@ -466,12 +449,12 @@ def move_along(mu, Q, pivots, rank, sigma, frame, y_hat, move, out):
 
 
 @_jit_inline
-def first_move(G, sigma, frame, Q, inverse_norms, R, pivots, g, band, mu, noise, y_hat, move, out):
+def first_move(G, sigma, frame, Q, inverse_norms, R, pivots, g, mu, y_hat, move, out):
     """The whole first Newton step along the gradients at y_hat: out = y_hat + move; returns the rank."""
     weigh_rows(G, sigma, frame, Q)
     rank = factor(Q, inverse_norms, R, pivots)
     if rank >= 0:
-        least_norm(g, band, inverse_norms, R, pivots, rank, mu, noise)
+        least_norm(g, inverse_norms, R, pivots, rank, mu)
         move_along(mu, Q, pivots, rank, sigma, frame, y_hat, move, out)
     return rank
 
@@ -500,16 +483,6 @@ def judge(values, target, before, band, y, defect, max_defect):
     for i in range(defect.size):
         max_defect[i] = max(max_defect[i], abs(defect[i]))
     return OK
-
-
-@_jit
-def shared_defects(before, inverse_norms, shared):
-    """Per row, the defects of all rows in its own unit: what a projection of reduced rank may move between them."""
-    total = 0.0
-    for i in range(before.size):
-        total += abs(before[i]) * inverse_norms[i]
-    for i in range(before.size):
-        shared[i] = total / inverse_norms[i] if inverse_norms[i] > 0.0 else abs(before[i])
 
 
 @_jit
@@ -576,3 +549,13 @@ def crossed(g, g_new, direction):
         if g[i] >= 0.0 >= g_new[i] and direction[i] <= 0.0:
             return True
     return False
+
+
+@_jit
+def shared_defects(before, inverse_norms, shared):
+    """Per row, the defects of all rows in its own unit: what a projection of lower rank may move between them."""
+    total = 0.0
+    for i in range(before.size):
+        total += abs(before[i]) * inverse_norms[i]
+    for i in range(before.size):
+        shared[i] = total / inverse_norms[i] if inverse_norms[i] > 0.0 else abs(before[i])

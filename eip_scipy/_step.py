@@ -261,7 +261,7 @@ def other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r):
     rank = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)
     if rank >= 0:
         kn.fill(w.mu, 0.0)
-        kn.newton_matrix_solve(w.B, w.g, w.band, w.Q, w.pivots, rank, w.inner, w.mu)
+        kn.newton_matrix_solve(w.B, w.g, w.Q, w.pivots, rank, w.inner, w.mu)
         w.counters[NLU] += 1
         kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
     return rank
@@ -279,7 +279,7 @@ def newton_iteration(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
     if not kn.defects(w.values, o.target, w.G_r, y_new_r, o.scales, w.g, w.band, w.defect):
         return False
     kn.weigh_rows(w.G_r, w.sigma, o.frame, w.B)
-    kn.newton_matrix_solve(w.B, w.g, w.band, w.Q, w.pivots, rank, w.inner, w.mu)
+    kn.newton_matrix_solve(w.B, w.g, w.Q, w.pivots, rank, w.inner, w.mu)
     w.counters[NLU] += 1
     kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
     return True
@@ -309,20 +309,7 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
         )
     if o.direction == NEW:
         rank = kn.first_move(
-            w.G_r,
-            w.sigma,
-            o.frame,
-            w.Q,
-            w.inverse_norms,
-            w.R,
-            w.pivots,
-            w.g,
-            w.band,
-            w.mu,
-            w.inner.noise,
-            w.y_hat_r,
-            w.move,
-            y_new_r,
+            w.G_r, w.sigma, o.frame, w.Q, w.inverse_norms, w.R, w.pivots, w.g, w.mu, w.y_hat_r, w.move, y_new_r
         )
     else:
         rank = other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r)
@@ -344,25 +331,20 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
         kn.compensated_add(y_new_r, w.carry_hat, w.move)
     evaluate_invariants(inv, params, t, y_new, o, w)
     status = kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect, w.max_defect)
-    if status != OK and rank > 1 and o.direction == NEW and o.iterations == 1:
+    if status != OK and rank > 1 and o.direction == NEW and o.iterations == 1 and not o.compensated:
         status = project_with_fewer(inv, params, t, rank - 1, o, w, y_new, y_new_r)
     return status
 
 
 @_jitable_cold
 def project_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
-    """A projection that failed, again with the first `rank` directions.
+    """A projection that failed, again with the first `rank` directions only.
 
-    Where gradients are nearly dependent, as on a nearly circular orbit, the states may not reach a target at all: its
-    defect is then of second order in the distance, and no shorter step mends it. What the directions left out would
-    have corrected stays, so a defect may grow to the sum of all.
+    Where gradients are nearly parallel, as on a nearly circular orbit, states near y_hat may not reach a target at all: the distance is of second
+    order, and no shorter step mends it. What the directions left out would have corrected stays, so that a defect may
+    grow to the sum of all.
     """
     kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
-    if o.compensated:
-        kn.copy(w.y_hat_r, y_new_r)
-        # The carry of the failed attempt is gone; the raw state's own is of the same size as the rounding here.
-        kn.fill(w.carry_hat, 0.0)
-        kn.compensated_add(y_new_r, w.carry_hat, w.move)
     evaluate_invariants(inv, params, t, y_new, o, w)
     kn.shared_defects(w.before, w.inverse_norms, w.g)
     status = kn.judge(w.values, o.target, w.g, w.band, y_new_r, w.defect, w.max_defect)

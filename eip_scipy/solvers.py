@@ -359,7 +359,8 @@ def _checked(
 ) -> tuple[Callable[[float, np.ndarray], np.ndarray], Callable[..., None]]:
     """The user's right-hand side with clear errors: as (t, y) -> (n,), maybe their buffer, and as the step calls it.
 
-    The first counts in `calls`; the step counts its own. Both test the common case, an array of the right shape and type, in place: this runs at every stage.
+    The first counts in `calls`; the step counts its own. Both test the common case, an array of the right shape and
+    type, in place: this runs at every stage.
     """
     shape = (n,)
 

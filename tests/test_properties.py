@@ -14,7 +14,7 @@ from eip_scipy.problems import harmonic, kepler, nbody
 
 EPS = np.finfo(float).eps
 seeds = st.integers(0, 2**32 - 1)
-few = settings(max_examples=60)
+few = settings(max_examples=60, deadline=None)
 
 
 class Quadratics:
@@ -286,9 +286,9 @@ def test_complex_frame(seed, n):
     assume(abs((C @ S)[0, 0]) > 0.3)
     rows = np.conj(q.grad(0.0, q.y_hat)) @ (np.eye(n) - S @ C / (C @ S)[0, 0])
     assume(np.linalg.cond(rows.view(float) / np.linalg.norm(rows, axis=1, keepdims=True)) < 20)
-    result = project(q.y_hat, Invariant(q.value, q.grad, target=q.target), frame=(C, S))
-    assert abs(C @ result.correction) < 1e-13
-    assert abs(C @ project(q.y_hat, Invariant(q.value, q.grad, target=q.target)).correction) > 1e-9
+    kept = Invariant(q.value, q.grad, target=q.target)
+    assert abs(C @ project(q.y_hat, kept, frame=(C, S), iterations=5).correction) < 1e-13
+    assert abs(C @ project(q.y_hat, kept, iterations=5).correction) > 1e-9
 
 
 def lattice_run(y0, phase=1.0, **options):
@@ -311,10 +311,10 @@ def lattice_run(y0, phase=1.0, **options):
 
 
 @given(seeds, st.sampled_from([None, 2, 3]), st.sampled_from(["error", "euclidean"]))
-@settings(max_examples=15)
+@settings(max_examples=15, deadline=None)
 def test_phase_of_a_complex_state(seed, blocks, metric):
     rng = np.random.default_rng(seed)
-    y0 = rng.standard_normal(6) + 1j * rng.standard_normal(6)
+    y0 = 0.5 * (rng.standard_normal(6) + 1j * rng.standard_normal(6))
     phase = np.exp(1j * rng.uniform(0, 2 * np.pi))
     plain = lattice_run(y0, blocks=blocks, metric=metric)
     turned = lattice_run(y0, phase, blocks=blocks, metric=metric)
@@ -345,7 +345,7 @@ def n_body_run(gm, q, v, steps=5, h=0.2, **options):
 
 
 @given(seeds, st.sampled_from(["error", "euclidean"]), st.booleans())
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 def test_rotation_of_n_bodies(seed, metric, framed):
     gm, q, v = three_bodies(seed)
     turn = Rotation.random(random_state=np.random.default_rng(seed + 1)).as_matrix()
@@ -386,7 +386,7 @@ def kepler_in_units(unit, metric="error", atol=0.0, blocks=None, steps=40):
 
 
 @given(seeds, st.booleans())
-@settings(max_examples=20)
+@settings(max_examples=20, deadline=None)
 def test_units_of_the_state_with_the_error_metric(seed, blocks):
     """Steps with atol=0: any units of the components (of the blocks, where there are any), over 24 decades."""
     rng = np.random.default_rng(seed)
