@@ -340,9 +340,9 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
 def project_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
     """A projection that failed, again with the first `rank` directions only.
 
-    Where gradients are nearly parallel, as on a nearly circular orbit, states near y_hat may not reach a target at all: the distance is of second
-    order, and no shorter step mends it. What the directions left out would have corrected stays, so that a defect may
-    grow to the sum of all.
+    Where gradients are nearly parallel, as on a nearly circular orbit, states near y_hat may not reach a target at
+    all: the distance is of second order, and no shorter step mends it. What the directions left out would have
+    corrected stays, so that a defect may grow to the sum of all.
     """
     kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
     evaluate_invariants(inv, params, t, y_new, o, w)

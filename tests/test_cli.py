@@ -195,7 +195,7 @@ def test_without_matplotlib_the_numbers_are_there(tmp_path, capsys, no_rebound, 
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("little_to_time")
 def test_a_run_that_fails_is_reported_and_changes_the_status(tmp_path, capsys, no_rebound):
-    status = main(["solar-system", "--years", "2", "--h", "0.04", "--method", "EIPRK5", "--out", str(tmp_path)])
+    status = main(["solar-system", "--years", "2", "--h", "0.125", "--method", "EIPRK5", "--out", str(tmp_path)])
     out = capsys.readouterr().out
     assert status == 1
     assert "FAILED EIPRK5 (error) reached the end" in out

@@ -363,9 +363,8 @@ def test_thresholds_one_by_one_and_terminal(method):
 def test_thresholds_without_invariants(method, variant):
     """SciPy's own RK45 raises here: its interpolant misses the end of a step by an ulp."""
     sol = solve(method, **VARIANTS[variant])
-    cases = [
-        (i, sol.y[i, k].real * (1 + s)) for k in range(1, len(sol.t) - 1) for i in (0, 2) for s in (0.0, EPS, -EPS)
-    ]
+    shifts = (0.0, EPS, -EPS, 1e-12, -1e-12)
+    cases = [(i, sol.y[i, k].real * (1 + s)) for k in range(1, len(sol.t) - 1) for i in (0, 1, 2) for s in shifts]
     assert len(cases) >= 57
     found = solve(method, **VARIANTS[variant], events=[passing(i, value) for i, value in cases])
     np.testing.assert_array_equal(found.y, sol.y)

@@ -165,7 +165,8 @@ def test_args_with_a_tolerance_for_explicit_pairs(label):
     """test_args was written for Radau at rtol = 1e-10, atol = 1e-13; its growth by e^20 takes a bit more here."""
     name, module, used = SUITES[label]
     solve = module.solve_ivp
-    tighter = {"rtol": 1e-12, "atol": 1e-16 if name == "DOP853" else 1e-15}
+    # RK23's steps are so short that its errors are well below the tolerance.
+    tighter = {"rtol": 1e-11, "atol": 1e-14} if name == "RK23" else {"rtol": 1e-12, "atol": 1e-16}
     try:
         module.solve_ivp = lambda *args, **options: solve(*args, **{**options, **tighter})
         call(module, "test_args", name, {})
