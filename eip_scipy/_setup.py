@@ -218,7 +218,7 @@ def initial_step(
     rtol: np.ndarray,
     atol: np.ndarray,
 ) -> float:
-    """First step of an adaptive run (Hairer, Norsett & Wanner I, section II.4), by one evaluation of `rhs`."""
+    """First step of an adaptive run (Hairer, Norsett & Wanner I, II.4), one more call of `rhs`; NaN for such an f0."""
     if y0.size == 0:
         return math.inf
     length = abs(t_bound - t0)
@@ -231,6 +231,8 @@ def initial_step(
         return float(np.linalg.norm(x / scale)) / math.sqrt(x.size)
 
     d0, d1 = size(y0), size(f0)
+    if not math.isfinite(d1):
+        return math.nan
     h0 = 1e-6 if d0 < 1e-5 or d1 < 1e-5 else 0.01 * d0 / d1
     h0 = min(h0, length)
     d2 = size(rhs(t0 + h0 * direction, y0 + h0 * direction * f0) - f0) / h0

@@ -387,7 +387,7 @@ def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y
         h_abs = least
     rejected = False
     retries = 0
-    status = TOO_SMALL
+    status = NOT_FINITE if np.isnan(h_abs) else TOO_SMALL
     while h_abs >= least:
         if adaptive:
             t_new = t + h_abs * span.sign

@@ -403,6 +403,7 @@ def integrate(
     calls = _setup.Counted(derivative)
     first_step, max_step = _setup.step_bounds(first_step, max_step, t0, t_bound)
     if h is None:
+        _setup.tolerances(rtol, atol, start.size)
         rtol = _setup.adaptive_rtol(rtol)
     else:
         h = _setup.check_fixed_step(h, t0, t_bound)

@@ -161,6 +161,7 @@ class EIPSolver(OdeSolver):
             )
         first_step, self.max_step = _setup.step_bounds(first_step, max_step, t0, t_bound)
         if adaptive:
+            _setup.tolerances(rtol, atol, self.n)
             rtol = _setup.adaptive_rtol(rtol)
         else:
             h = _setup.check_fixed_step(h, t0, t_bound)
@@ -244,6 +245,8 @@ class EIPSolver(OdeSolver):
 
         control = {"first_step": first_step, "max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
         solver = self.SCIPY(fresh, self.t, start, self.t_bound, **control)
+        if np.isnan(solver.h_abs):
+            return None  # SciPy's loop would never end
         solver.fun = fresh  # in the place of SciPy's two wrappers, whose work it does
         return solver
 

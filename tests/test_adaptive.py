@@ -328,7 +328,6 @@ def test_problem_adaptive_is_as_good_through_both():
     ],
 )
 @pytest.mark.parametrize("invariants", [(), H], ids=["plain", "projected"])
-@pytest.mark.xfail(strict=False, reason="open: some wrong values are not yet named")
 def test_wrong_values(driver, name, value, match, invariants):
     """At once and without a warning on the way: SciPy itself hangs on some of them."""
     with pytest.raises(ValueError, match=match):
@@ -533,7 +532,6 @@ def test_rhs_not_finite(driver, bad, invariants):
 
 @both
 @pytest.mark.parametrize("invariants", [(), [H]], ids=["plain", "projected"])
-@pytest.mark.xfail(strict=False, reason="open: the message of an adaptive run whose first derivative is not finite")
 def test_rhs_not_finite_at_the_start(driver, invariants):
     calls = []
 
@@ -584,7 +582,6 @@ def test_blow_up(driver, method):
 @both
 @methods
 @pytest.mark.parametrize("invariants", [(), [Invariant(lambda t, y: 1.0, lambda t, y: np.zeros(1))]])
-@pytest.mark.xfail(strict=False, reason="open: some overflowing runs still warn")
 def test_overflow_without_a_flood_of_warnings(driver, method, invariants):
     """y' = 1e200 y: a handful of warnings at most, none of them of the package's own lines, and a clean end."""
     with warnings.catch_warnings(record=True) as record:
