@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from scipy.integrate import DOP853 as SCIPY_DOP853
 from scipy.integrate import DenseOutput
 
-from ._kernels import OK
+from ._kernels import OK, Grouping
 from ._setup import Run
-from ._step import GIVEN, NEW, make_work, project_step
+from ._step import ERROR, GIVEN, NEW, make_work, project_step
 from .result import HAVE_F, NFEV
 from .tableaux import DOP853, Tableau
 
@@ -45,7 +48,7 @@ def dense_output(
         base = _polynomial(h, y_old, y, f, K, tableau.P)
     else:
         base = _hermite(h, y_old, y, f_old, f)
-    return ManifoldDenseOutput(rhs, run, t_old, t, y_old.copy(), y.copy(), base, params)
+    return ManifoldDenseOutput(rhs, run, t_old, t, y_old.copy(), y.copy(), f_old, f, base, params)
 
 
 class ExactEnds(DenseOutput):
@@ -76,13 +79,17 @@ class ManifoldDenseOutput(DenseOutput):
         t: float,
         y_old: Array,
         y: Array,
+        f_old: Array,
+        f: Array,
         base: Callable[[Array], Array],
         params: Any,
     ) -> None:
         super().__init__(t_old, t)
         self._rhs, self._invariants, self._params = rhs, run.invariants, params
         self._y_old, self._y, self._base = y_old, y, base
-        self._sigma = run.work.sigma.copy() if run.invariants.size else None
+        self._sigma = run.work.sigma
+        if run.invariants.size and run.options.metric == ERROR:
+            self._sigma = _travelled(y_old, y, (t - t_old) * f_old, (t - t_old) * f, run.options.groups)
         self._options = run.options._replace(
             metric=GIVEN, direction=NEW, iterations=ITERATIONS, every=1, compensated=False
         )
@@ -119,14 +126,38 @@ class ManifoldDenseOutput(DenseOutput):
         status = project_step(
             self._rhs, inv, grad, self._params, t, y, y.view(float), t, options, w, out, out.view(float)
         )
-        # Where the invariants cannot be met, the interpolant itself is the best there is.
-        return out if status == OK else y
+        if status == OK:
+            return out
+        if theta == share:  # an extrapolation may lead anywhere
+            warnings.warn(
+                f"dense output at t={t}: no state near the interpolant meets the invariants' levels "
+                f"(they miss by {w.defect}); it is given as it is",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return y
 
     def _prepare(self) -> tuple[Array, Array]:
         invariants = self._invariants
         self._work = make_work(self._y.size, self._y.dtype, 0, invariants.size, 0)
         self._work.sigma[:] = self._sigma
         return invariants.values(self.t_old, self._y_old), invariants.values(self.t, self._y)
+
+
+def _travelled(y_old: Array, y: Array, step_old: Array, step: Array, groups: Grouping) -> Array:
+    """Weights of the interpolant's correction: how far each block goes within the step.
+
+    The weights of the step itself do not fit: an interpolant errs in other components than the end of a step does.
+    A slope that passes through zero within the step does not make a block immobile, hence the second term.
+    """
+    a, b, u, v = (x.view(float) for x in (y_old, y, step_old, step))
+    sigma = np.empty(a.size)
+    for first, last in pairwise(groups.start):
+        i = groups.member[first:last]
+        size, slope = (max(np.linalg.norm(p[i]), np.linalg.norm(q[i])) for p, q in ((a, b), (u, v)))
+        sigma[i] = math.hypot(slope, math.sqrt(size) * math.sqrt(np.linalg.norm(u[i] - v[i])))
+    largest = sigma.max()
+    return sigma / largest if largest > 0.0 else np.ones_like(sigma)
 
 
 def _hermite(h: float, y_old: Array, y: Array, f_old: Array, f: Array) -> Callable[[Array], Array]:

@@ -237,7 +237,6 @@ ORDER_OPTIONS = {
 
 @pytest.mark.parametrize(("method", "order", "steps"), ORDERS, ids=[case[0].__name__ for case in ORDERS])
 @pytest.mark.parametrize("option", ORDER_OPTIONS)
-@pytest.mark.xfail(strict=False, reason="open: the step's error weights misplace the interpolant's correction")
 def test_order_of_interpolation(method, order, steps, option):
     factor = 4 if "complex" in option else 1
     coarse, fine = (interpolation_errors(method, factor * h, **ORDER_OPTIONS[option]) for h in steps)
@@ -275,7 +274,6 @@ def piece_errors(piece, y):
 
 
 @every_class
-@pytest.mark.xfail(strict=False, reason="open: small kinks where the interpolant is not projected")
 def test_no_kink_inside_a_step(method):
     """Between steps the curve is smooth: second differences go with the square of the spacing."""
     sol = solve(method, invariants=[H, L], dense_output=True, rtol=1e-3)
