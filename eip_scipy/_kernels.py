@@ -286,13 +286,25 @@ def error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio):
 
 
 @_jit_inline
-def correction_in_local_errors(move, scale, groups, largest_error, record):
-    """Raise record[0] to the largest ratio over the blocks of the correction to the step's largest local error."""
+def correction_in_local_errors(move, scale, groups, largest_error):
+    """Largest ratio over the blocks of the correction to the step's largest local error."""
     top = 0.0
     for b in range(scale.size):
         if scale[b] > 0.0:
             top = max(top, block_square(move, b, 1.0 / scale[b], groups))
-    record[0] = max(record[0], sqrt(top) / largest_error)
+    return sqrt(top) / largest_error
+
+
+@_jit
+def soften(err, scale, groups, sigma):
+    """Half way, on a log scale, from the error metric to equal relative errors; blocks without error stay put."""
+    inverse = 1.0 / largest(scale)
+    for b in range(scale.size):
+        if scale[b] == 0.0 or block_square(err, b, 1.0 / scale[b], groups) == 0.0:
+            continue
+        for p in range(groups.start[b], groups.start[b + 1]):
+            i = groups.member[p]
+            sigma[i] = sqrt(sigma[i] * (scale[b] * inverse))
 
 
 @_jit
@@ -467,7 +479,7 @@ def add_products(rows, a, out):
 
 
 @_jit
-def judge(values, target, before, band, y, defect, max_defect):
+def judge(values, target, before, band, y, defect):
     """Note the defects after a projection; OK or FAILED_PROJECTION.
 
     It has failed where something is not finite, or a defect has grown and stands above FAILURE_BANDS dead bands.
@@ -478,11 +490,14 @@ def judge(values, target, before, band, y, defect, max_defect):
         size = abs(defect[i])
         if not np.isfinite(size) or (size > abs(before[i]) and size > FAILURE_BANDS * band[i]):
             good = False
-    if not good:
-        return FAILED_PROJECTION
-    for i in range(defect.size):
-        max_defect[i] = max(max_defect[i], abs(defect[i]))
-    return OK
+    return OK if good else FAILED_PROJECTION
+
+
+@_jit
+def raise_to(sizes, record):
+    """Record = the larger of itself and |sizes|, by component."""
+    for i in range(record.size):
+        record[i] = max(record[i], abs(sizes[i]))
 
 
 @_jit
@@ -553,9 +568,12 @@ def crossed(g, g_new, direction):
 
 @_jit
 def shared_defects(before, inverse_norms, shared):
-    """Per row, the defects of all rows in its own unit: what a projection of lower rank may move between them."""
+    """Per row, twice the defects of all rows in its own unit: what a projection of lower rank may move between them.
+
+    Twice, because what one row loses to second order another may gain.
+    """
     total = 0.0
     for i in range(before.size):
         total += abs(before[i]) * inverse_norms[i]
     for i in range(before.size):
-        shared[i] = total / inverse_norms[i] if inverse_norms[i] > 0.0 else abs(before[i])
+        shared[i] = 2.0 * total / inverse_norms[i] if inverse_norms[i] > 0.0 else abs(before[i])

@@ -17,7 +17,19 @@ from numba.extending import register_jitable
 
 from . import _kernels as kn
 from ._kernels import FAILED_PROJECTION, NOT_FINITE, OK, FrameRows, Grouping
-from .result import HAVE_F, LAST_RANK, N_COUNTERS, NFEV, NJEV, NLU, PROJECTIONS, RANK_REDUCED, REJECTED, SKIPPED
+from .result import (
+    HAVE_F,
+    LAST_RANK,
+    N_COUNTERS,
+    NFEV,
+    NJEV,
+    NLU,
+    PROJECTIONS,
+    RANK_REDUCED,
+    REJECTED,
+    SKIPPED,
+    SOFTENED,
+)
 
 # Without reference counting and inlined, the driver runs 20 times faster: it hands records of some 40 arrays down.
 _jitable = register_jitable(_nrt=False, error_model="numpy", forceinline=True)
@@ -30,6 +42,7 @@ EUCLIDEAN, ERROR, GIVEN = 0, 1, 2
 # Step control, as in SciPy's Runge-Kutta classes; a failed projection shrinks the step as CVODE does.
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 RETRY_FACTOR, MAX_RETRIES = 0.25, 10
+HEALTHY, MAX_SOFTENED = 5.0, 3
 TOO_SMALL = 3
 
 # Places in the clock of a run: the current time, the time and length of the step tried last, the length to try next.
@@ -299,7 +312,10 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
     if not outside:
         counters[SKIPPED] += 1
         kn.copy(w.y_hat_r, y_new_r)
-        return kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect, w.max_defect)
+        status = kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect)
+        if status == OK:
+            kn.raise_to(w.defect, w.max_defect)
+        return status
     largest_error = 0.0
     if o.metric == ERROR:
         if o.every > 1:
@@ -307,38 +323,74 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
         largest_error = kn.error_metric(
             w.err, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio
         )
+    status, rank, correction = correct(rhs, inv, grad, params, t_old, y, y_r, t, largest_error, o, w, y_new, y_new_r)
+    if o.direction == NEW and o.iterations == 1 and not o.compensated:
+        alone = w.scale.size * o.groups.width == w.sigma.size
+        doubtful = kn.all_finite(w.defect) if status != OK else alone and correction > HEALTHY
+        if largest_error > 0.0 and doubtful:
+            status, rank, correction = correct_softly(
+                rhs, inv, grad, params, t_old, y, y_r, t, largest_error, alone, o, w, y_new, y_new_r
+            )
+        if status != OK and rank > 1:
+            status, rank = correct_with_fewer(inv, params, t, rank - 1, o, w, y_new, y_new_r)
+    counters[LAST_RANK] = max(rank, 0)
+    if rank >= 0:
+        counters[PROJECTIONS] += 1
+        counters[RANK_REDUCED] += rank < w.g.size
+    if status == OK:
+        kn.raise_to(w.defect, w.max_defect)
+        w.max_correction[0] = max(w.max_correction[0], correction)
+    return status
+
+
+@_jitable
+def correct(rhs, inv, grad, params, t_old, y, y_r, t, largest_error, o, w, y_new, y_new_r):
+    """One try: the Newton steps with the weights at hand. Returns the status, the rank and the correction's size."""
     if o.direction == NEW:
         rank = kn.first_move(
             w.G_r, w.sigma, o.frame, w.Q, w.inverse_norms, w.R, w.pivots, w.g, w.mu, w.y_hat_r, w.move, y_new_r
         )
     else:
         rank = other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r)
-    counters[NLU] += 1
-    counters[LAST_RANK] = max(rank, 0)
+    w.counters[NLU] += 1
     if rank < 0:
         kn.copy(w.before, w.defect)
-        return FAILED_PROJECTION
-    if rank < w.g.size:
-        counters[RANK_REDUCED] += 1
+        return FAILED_PROJECTION, rank, 0.0
     for _ in range(1, o.iterations):
         if not newton_iteration(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
             break
-    counters[PROJECTIONS] += 1
+    correction = 0.0
     if largest_error > 0.0:
-        kn.correction_in_local_errors(w.move, w.scale, o.groups, largest_error, w.max_correction)
+        correction = kn.correction_in_local_errors(w.move, w.scale, o.groups, largest_error)
     if o.compensated:
         kn.copy(w.y_hat_r, y_new_r)
         kn.compensated_add(y_new_r, w.carry_hat, w.move)
     evaluate_invariants(inv, params, t, y_new, o, w)
-    status = kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect, w.max_defect)
-    if status != OK and rank > 1 and o.direction == NEW and o.iterations == 1 and not o.compensated:
-        status = project_with_fewer(inv, params, t, rank - 1, o, w, y_new, y_new_r)
-    return status
+    return kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect), rank, correction
 
 
 @_jitable_cold
-def project_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
-    """A projection that failed, again with the first `rank` directions only.
+def correct_softly(rhs, inv, grad, params, t_old, y, y_r, t, largest_error, alone, o, w, y_new, y_new_r):
+    """Further tries with weights ever nearer to equal relative errors; at most MAX_SOFTENED.
+
+    An estimate can vanish in a component, by symmetry, where the error does not; the others then carry a correction
+    far larger than any error of the step. Components that stand alone are prone to it; a block's length is not.
+    """
+    w.counters[SOFTENED] += 1
+    status, rank, correction = FAILED_PROJECTION, 0, np.inf
+    for _ in range(MAX_SOFTENED):
+        kn.soften(w.err, w.scale, o.groups, w.sigma)
+        status, rank, correction = correct(
+            rhs, inv, grad, params, t_old, y, y_r, t, largest_error, o, w, y_new, y_new_r
+        )
+        if status == OK and not (alone and correction > HEALTHY):
+            break
+    return status, rank, correction
+
+
+@_jitable_cold
+def correct_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
+    """A last try with the first `rank` directions only; returns the status and the rank.
 
     Where gradients are nearly parallel, as on a nearly circular orbit, states near y_hat may not reach a target at
     all: the distance is of second order, and no shorter step mends it. What the directions left out would have
@@ -347,11 +399,7 @@ def project_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
     kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
     evaluate_invariants(inv, params, t, y_new, o, w)
     kn.shared_defects(w.before, w.inverse_norms, w.g)
-    status = kn.judge(w.values, o.target, w.g, w.band, y_new_r, w.defect, w.max_defect)
-    if status == OK:
-        w.counters[RANK_REDUCED] += 1
-        w.counters[LAST_RANK] = rank
-    return status
+    return kn.judge(w.values, o.target, w.g, w.band, y_new_r, w.defect), rank
 
 
 @_jitable

@@ -10,8 +10,8 @@ from scipy.optimize import OptimizeResult
 __all__ = ["Diagnostics", "IntegrationResult", "ProjectionResult"]
 
 # Places of the counters that the step fills (see _step.py, which takes them from here).
-NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F = range(9)
-N_COUNTERS = 9
+NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED = range(10)
+N_COUNTERS = 10
 
 
 class Diagnostics:
@@ -27,6 +27,9 @@ class Diagnostics:
         Projections done, and those left out because every defect was round-off.
     n_rank_reduced : int
         Projections in which gradients were (nearly) dependent or zero and fewer corrections were made.
+    n_softened : int
+        Projections in which the error metric was not believed and its weights were brought nearer to one another,
+        because the correction would have been far larger than any error of the step or would have failed.
     n_rejected_projections : int
         Projections that failed.
     max_correction : float
@@ -76,6 +79,11 @@ class Diagnostics:
         return int(self._counters[RANK_REDUCED])
 
     @property
+    def n_softened(self) -> int:
+        """Projections with weights nearer to one another than the error metric's."""
+        return int(self._counters[SOFTENED])
+
+    @property
     def n_rejected_projections(self) -> int:
         """Projections that failed."""
         return int(self._counters[REJECTED])
@@ -90,7 +98,7 @@ class Diagnostics:
             return "Diagnostics: no invariants"
         lines = [
             f"Diagnostics: {self.n_projections} projections, {self.n_skipped} skipped (round-off), "
-            f"{self.n_rank_reduced} of reduced rank, {self.n_rejected_projections} rejected",
+            f"{self.n_rank_reduced} of reduced rank, {self.n_softened} softened, {self.n_rejected_projections} rejected",
         ]
         width = max(len(name) for name in self.names)
         for name, largest, last in zip(self.names, self.max_defect, self.last_defect, strict=True):

@@ -16,7 +16,7 @@ import pytest
 
 import eip_scipy
 import eip_scipy.integrations
-from eip_scipy import EIPRK1, EIPRK4, report
+from eip_scipy import EIPRK1, EIPRK4, Invariant, integrate, report
 from eip_scipy.cli import main
 from eip_scipy.commands import solar_cost, solar_errors, solar_run, solar_system
 from eip_scipy.commands.solar_figures import jacobi, osculating_orbits
@@ -194,12 +194,20 @@ def test_without_matplotlib_the_numbers_are_there(tmp_path, capsys, no_rebound, 
 
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("little_to_time")
-def test_a_run_that_fails_is_reported_and_changes_the_status(tmp_path, capsys, no_rebound):
+def test_a_run_that_fails_is_reported_and_changes_the_status(tmp_path, capsys, no_rebound, monkeypatch):
+    broken = Invariant(lambda t, y, p: 1.0 if t < 1 else np.nan, lambda t, y, p: 0.0 * y, name="broken")
+
+    def integrate_with_it(problem, **options):
+        if options.get("metric") == "error":
+            options["invariants"] = [*problem.invariants, broken]
+        return integrate(problem, **options)
+
+    monkeypatch.setattr(solar_run, "integrate", integrate_with_it)
     status = main(["solar-system", "--years", "2", "--h", "0.125", "--method", "EIPRK5", "--out", str(tmp_path)])
     out = capsys.readouterr().out
     assert status == 1
     assert "FAILED EIPRK5 (error) reached the end" in out
-    assert "projection failed at t=" in out
+    assert "projection failed at t=1: invariant 'broken'" in out
     assert "failed" in next(line for line in out.splitlines() if line.startswith("  Mercury"))
     assert (tmp_path / "orbits-inner.png").exists()
 

@@ -70,7 +70,6 @@ def test_circular_kepler(driver, metric, eccentricity):
 @metrics
 @pytest.mark.parametrize("eccentricity", [0.0, 1e-12, 1e-8, 1e-4])
 @pytest.mark.parametrize(("method", "h"), [(EIPRK1, 0.005), (EIPRK2, 0.02), (EIPRK3, 0.02), (EIPRK5, 0.05)])
-@pytest.mark.xfail(strict=False, reason="open: EIPRK2 on circular orbits, where the second direction is nearly lost")
 def test_circular_kepler_by_other_methods(metric, eccentricity, method, h):
     """Their truncation errors make parallel gradients nearly so: a poor correction must not end a healthy run."""
     problem = kepler(eccentricity, 0.0)
