@@ -34,7 +34,8 @@ def test_two_thousand_years():
     problem = solar_system(years=2000)
     eip = integrate(problem, method=EIPRK4, save_every=20)
     plain = integrate(problem, method=EIPRK4, invariants=(), save_every=20)
-    assert max(relative_drift(eip)) < 4e-15
+    # The terms of H are four times H: its dead band, 4 eps of them, is 3.6e-15 and is met within its half.
+    assert max(relative_drift(eip)) < 1.5 * 16 * np.finfo(float).eps
 
     last = longitudes(eip.y)[:, -1]
     reference = longitudes(problem.reference(2000.0)[:, None])[:, 0]
@@ -45,6 +46,12 @@ def test_two_thousand_years():
     assert abs(plain_error[0]) > 50 * abs(error[0])
     assert abs(error[0]) < 1.0
     assert np.all(np.abs(error[1:]) < np.maximum(2 * np.abs(plain_error[1:]), 1e-7))
+
+    # Nor does a planet move for Mercury's sake: the recoil of corrections goes to the Sun.
+    reference = problem.reference(2000.0)
+    assert np.all(
+        position_errors(eip.y[:, -1], reference) < np.maximum(2 * position_errors(plain.y[:, -1], reference), 1e-10)
+    )
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -46,7 +46,7 @@ def test_short_run_agrees_to_round_off_with_the_error_metric_only():
     # The euclidean metric measures in metres and metres per second, or in AU and AU/yr: not the same run.
     plain, plain_si = in_au(0.1, metric="euclidean"), in_au(0.1, "SI", metric="euclidean")
     assert planets(si - there)[3:].max() < 2e-13
-    assert planets(plain_si - plain)[3:].min() > 5e-11
+    assert planets(plain_si - plain)[3:].max() > 1e-10
 
 
 def scaled_run(length, time, steps, **options):

@@ -166,16 +166,20 @@ def nbody(
             Invariant(_momentum, _momentum_gradient, args=(params,), in_place=True, name="L"),
         ),
         blocks=3,
-        frame=common_shift(params),
+        frame=recoil(params),
         units=units,
         source=source,
         reference=reference,
     )
 
 
-def common_shift(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The frame (C, S): centre of mass and momentum, kept by a common shift of all positions or velocities."""
+def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The frame (C, S): centre of mass and momentum, kept by shifts of the bodies in proportion to their masses.
+
+    So the recoil of a planet's correction goes to its star. A common shift would move the outer planets as far.
+    """
     axes = np.eye(3)
-    C = np.kron(np.eye(2), np.kron(gm / gm.sum(), axes))
-    S = np.kron(np.eye(2), np.kron(np.ones((gm.size, 1)), axes))
+    share = gm / gm.sum()
+    C = np.kron(np.eye(2), np.kron(share, axes))
+    S = np.kron(np.eye(2), np.kron(share[:, None], axes))
     return C, S
