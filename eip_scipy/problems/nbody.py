@@ -3,108 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import sqrt
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from ..invariants import Invariant
+from . import _gravity
 from ._problem import Problem, bind
 
 __all__ = ["nbody"]
-
-
-@njit(cache=True)
-def _accelerations(q, gm, out):
-    """Sum over pairs of gm_j (q_j - q_i) / r^3, added into out (3 N,)."""
-    n = gm.size
-    for i in range(n):
-        x, y, z = q[3 * i], q[3 * i + 1], q[3 * i + 2]
-        ax = ay = az = 0.0
-        for j in range(i + 1, n):
-            dx, dy, dz = q[3 * j] - x, q[3 * j + 1] - y, q[3 * j + 2] - z
-            r2 = dx * dx + dy * dy + dz * dz
-            w = 1.0 / (r2 * sqrt(r2))
-            wi, wj = w * gm[j], w * gm[i]
-            ax += wi * dx
-            ay += wi * dy
-            az += wi * dz
-            out[3 * j] -= wj * dx
-            out[3 * j + 1] -= wj * dy
-            out[3 * j + 2] -= wj * dz
-        out[3 * i] += ax
-        out[3 * i + 1] += ay
-        out[3 * i + 2] += az
-
-
-@njit(cache=True)
-def _rhs(t, y, out, params):
-    half = y.size // 2
-    for i in range(half):
-        out[i] = y[half + i]
-        out[half + i] = 0.0
-    _accelerations(y[:half], params, out[half:])
-
-
-@njit(cache=True)
-def _acc(t, q, params):
-    out = np.zeros(q.size)
-    _accelerations(q, params, out)
-    return out
-
-
-@njit(cache=True)
-def _energy(t, y, params):
-    n, half = params.size, y.size // 2
-    kinetic = potential = 0.0
-    for i in range(n):
-        vx, vy, vz = y[half + 3 * i], y[half + 3 * i + 1], y[half + 3 * i + 2]
-        kinetic += params[i] * (vx * vx + vy * vy + vz * vz)
-        partial = 0.0
-        for j in range(i + 1, n):
-            dx, dy, dz = y[3 * j] - y[3 * i], y[3 * j + 1] - y[3 * i + 1], y[3 * j + 2] - y[3 * i + 2]
-            partial += params[j] / sqrt(dx * dx + dy * dy + dz * dz)
-        potential += params[i] * partial
-    return 0.5 * kinetic - potential
-
-
-@njit(cache=True)
-def _energy_gradient(t, y, f, out, params):
-    half = y.size // 2
-    for i in range(half):
-        gm = params[i // 3]
-        out[i] = -gm * f[half + i]
-        out[half + i] = gm * y[half + i]
-
-
-@njit(cache=True)
-def _momentum(t, y, params):
-    half = y.size // 2
-    out = np.zeros(3)
-    for i in range(params.size):
-        qx, qy, qz = y[3 * i], y[3 * i + 1], y[3 * i + 2]
-        vx, vy, vz = y[half + 3 * i], y[half + 3 * i + 1], y[half + 3 * i + 2]
-        gm = params[i]
-        out[0] += gm * (qy * vz - qz * vy)
-        out[1] += gm * (qz * vx - qx * vz)
-        out[2] += gm * (qx * vy - qy * vx)
-    return out
-
-
-@njit(cache=True)
-def _momentum_gradient(t, y, out, params):
-    half = y.size // 2
-    for i in range(params.size):
-        gm, a = params[i], 3 * i
-        b = half + a
-        # d(q x v): row c holds the component c of L, +-gm times the other two components.
-        out[0, a], out[0, a + 1], out[0, a + 2] = 0.0, gm * y[b + 2], -gm * y[b + 1]
-        out[1, a], out[1, a + 1], out[1, a + 2] = -gm * y[b + 2], 0.0, gm * y[b]
-        out[2, a], out[2, a + 1], out[2, a + 2] = gm * y[b + 1], -gm * y[b], 0.0
-        out[0, b], out[0, b + 1], out[0, b + 2] = 0.0, -gm * y[a + 2], gm * y[a + 1]
-        out[1, b], out[1, b + 1], out[1, b + 2] = gm * y[a + 2], 0.0, -gm * y[a]
-        out[2, b], out[2, b + 1], out[2, b + 2] = -gm * y[a + 1], gm * y[a], 0.0
 
 
 def nbody(
@@ -154,16 +61,16 @@ def nbody(
         raise ValueError("nbody: every G m must be positive (a test particle's motion enters no invariant).")
     return Problem(
         name=name,
-        fun=bind(_rhs, params),
-        rhs=_rhs,
-        acc=_acc,
+        fun=bind(_gravity.rhs, params),
+        rhs=_gravity.rhs,
+        acc=_gravity.acc,
         y0=np.concatenate([q.ravel(), v.ravel()]),
         t_span=(float(t_span[0]), float(t_span[1])),
         h=h,
         params=params,
         invariants=(
-            Invariant(_energy, _energy_gradient, args=(params,), in_place=True, uses_f=True, name="H"),
-            Invariant(_momentum, _momentum_gradient, args=(params,), in_place=True, name="L"),
+            Invariant(_gravity.energy, _gravity.energy_gradient, args=(params,), in_place=True, uses_f=True, name="H"),
+            Invariant(_gravity.momentum, _gravity.momentum_gradient, args=(params,), in_place=True, name="L"),
         ),
         blocks=3,
         frame=recoil(params),
