@@ -98,7 +98,8 @@ class Diagnostics:
             return "Diagnostics: no invariants"
         lines = [
             f"Diagnostics: {self.n_projections} projections, {self.n_skipped} skipped (round-off), "
-            f"{self.n_rank_reduced} of reduced rank, {self.n_softened} softened, {self.n_rejected_projections} rejected",
+            f"{self.n_rank_reduced} of reduced rank, {self.n_softened} softened, "
+            f"{self.n_rejected_projections} rejected",
         ]
         width = max(len(name) for name in self.names)
         for name, largest, last in zip(self.names, self.max_defect, self.last_defect, strict=True):
