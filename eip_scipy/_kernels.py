@@ -15,7 +15,7 @@ from numba import njit
 
 from ._lanes import abs_dot, dot, largest, remove_component
 
-OK, NOT_FINITE, FAILED_PROJECTION = 0, 1, 2
+OK, NOT_FINITE, FAILED_PROJECTION, POSTPONED = 0, 1, 2, 4
 
 EPS = 2.220446049250313e-16
 BAND_FACTOR = 4.0
@@ -25,6 +25,7 @@ RANK_TOLERANCE = sqrt(EPS)
 REORTHOGONALISE = 0.05
 TINY = 1e-290
 FAILURE_BANDS = 100.0
+NOISE_BANDS = 3.0
 SPLITTER = 134217729.0  # 2**27 + 1 (Dekker)
 
 
@@ -140,8 +141,8 @@ def combine(y, h, weights, K, stages, out):
 
 
 @_jit_inline
-def weighted_sum(weights, K, scale, out):
-    """Out = scale sum_j weights[j] K[j]."""
+def weighted_sum(weights, K, first, scale, out):
+    """Out = scale sum_j weights[j] K[j, first:]."""
     n = out.size
     for i in range(n):
         out[i] = 0.0
@@ -149,9 +150,39 @@ def weighted_sum(weights, K, scale, out):
         w = weights[j]
         if w != 0.0:
             for i in range(n):
-                out[i] += w * K[j, i]
+                out[i] += w * K[j, first + i]
     for i in range(n):
         out[i] *= scale
+
+
+@_jit_inline
+def nystrom_position(y, h, c, weights, K, stages, out):
+    """First half of out = q + c h v + h^2 sum_j weights[j] a_j, for y = (q, v) and a_j the second half of K[j]."""
+    half = out.size // 2
+    for i in range(half):
+        out[i] = 0.0
+    for j in range(stages):
+        w = weights[j]
+        if w != 0.0:
+            for i in range(half):
+                out[i] += w * K[j, half + i]
+    for i in range(half):
+        out[i] = y[i] + h * (c * y[half + i] + h * out[i])
+
+
+@_jit_inline
+def nystrom_velocity(y, h, weights, K, stages, out):
+    """Second half of out = v + h sum_j weights[j] a_j."""
+    half = out.size // 2
+    for i in range(half):
+        out[half + i] = 0.0
+    for j in range(stages):
+        w = weights[j]
+        if w != 0.0:
+            for i in range(half, 2 * half):
+                out[i] += w * K[j, i]
+    for i in range(half, 2 * half):
+        out[i] = y[i] + h * out[i]
 
 
 @_jit
@@ -185,6 +216,30 @@ def compensated_step(y, carry, h, weights, weights_low, K, out, carry_out):
         increment, rest = two_product(h, main)
         s, lost = two_sum(y[i], increment)
         out[i], carry_out[i] = two_sum(s, lost + (rest + h * low + carry[i]))
+
+
+@_jit
+def compensated_nystrom(y, carry, h, b, b_low, b_v, b_v_low, K, out, carry_out):
+    """The same for q + h v + h^2 sum_j (b + b_low)[j] a_j and v + h sum_j (b_v + b_v_low)[j] a_j."""
+    half = y.size // 2
+    for i in range(half):
+        k = half + i
+        place = place_low = speed = speed_low = 0.0
+        for j in range(b.size):
+            place += b[j] * K[j, k]
+            place_low += b_low[j] * K[j, k]
+            speed += b_v[j] * K[j, k]
+            speed_low += b_v_low[j] * K[j, k]
+        drift, drift_rest = two_product(h, y[k])
+        half_kick, lost = two_product(h, place)
+        kick, kick_rest = two_product(h, half_kick)
+        rest = drift_rest + kick_rest + h * (carry[k] + lost + h * place_low) + carry[i]
+        s, first = two_sum(y[i], drift)
+        s, second = two_sum(s, kick)
+        out[i], carry_out[i] = two_sum(s, first + second + rest)
+        increment, rest = two_product(h, speed)
+        s, lost = two_sum(y[k], increment)
+        out[k], carry_out[k] = two_sum(s, lost + (rest + h * speed_low + carry[k]))
 
 
 @_jit
@@ -553,6 +608,20 @@ def paired_error_norm(err, low, y, y_hat, rtol, atol, width):
     if fine == 0.0 and coarse == 0.0:
         return 0.0
     return fine / sqrt((fine + 0.01 * coarse) * n)
+
+
+@_jit
+def tells_more(err, G, y):
+    """Whether the errors gathered make some invariant more uncertain than NOISE_BANDS roundings of its terms."""
+    for i in range(G.shape[0]):
+        error = noise = 0.0
+        for j in range(y.size):
+            x = err[j] * G[i, j]
+            error += x * x
+            noise += abs(G[i, j] * y[j])
+        if sqrt(error) > NOISE_BANDS * EPS * noise:
+            return True
+    return False
 
 
 @_jit

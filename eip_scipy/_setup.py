@@ -14,6 +14,7 @@ from scipy.integrate import OdeSolver
 
 from ._kernels import EPS, NOT_FINITE, FrameRows, Grouping
 from ._step import (
+    AUTO,
     ERROR,
     EUCLIDEAN,
     GIVEN,
@@ -32,6 +33,7 @@ from ._step import (
     project_step,
 )
 from .invariants import InvariantSet
+from .nystrom import NystromTableau
 from .result import LAST_RANK, Diagnostics
 from .tableaux import Tableau
 
@@ -55,7 +57,7 @@ class ProjectionOptions:
     frame: Any = None
     direction: str = "new"
     iterations: int = 1
-    every: int = 1
+    every: int | str = 1
     reuse_f: bool = True
     check: bool = True
     project_initial: bool = False
@@ -72,7 +74,11 @@ class Stepping:
     atol: np.ndarray
 
     def first(
-        self, rhs: Callable[[float, np.ndarray], np.ndarray], y0: np.ndarray, f0: np.ndarray, tableau: Tableau
+        self,
+        rhs: Callable[[float, np.ndarray], np.ndarray],
+        y0: np.ndarray,
+        f0: np.ndarray,
+        tableau: Tableau | NystromTableau,
     ) -> float:
         """Length of the first step."""
         if self.h is not None:
@@ -150,6 +156,39 @@ def initial_state(y0: Any) -> np.ndarray:
     if not np.isfinite(y).all():
         raise ValueError("All components of the initial state `y0` must be finite.")
     return y
+
+
+def check_halves(n: int) -> None:
+    """A state (q, v) has an even number of components."""
+    if n % 2:
+        raise ValueError(f"a Nystrom method needs the state (q, v), an even number of components; y0 has {n}.")
+
+
+def check_second_order(
+    rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, y0: np.ndarray, f0: np.ndarray, method: str
+) -> None:
+    """Whether the right-hand side is that of q'' = a(t, q) for y = (q, v), by one more evaluation.
+
+    Raises
+    ------
+    ValueError
+        When the first half of the derivative is not v, or the second changes with v.
+    """
+    check_halves(y0.size)
+    half = y0.size // 2
+    other = y0.copy()
+    other[half:] = 1.5 * y0[half:] + 1.0
+    f = rhs(t0, other)
+    if not (np.array_equal(f0[:half], y0[half:]) and np.array_equal(f[:half], other[half:])):
+        raise ValueError(
+            f"{method} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be v, "
+            f"the second half of the state. Reorder the state, or take a Runge-Kutta method such as EIPDOP853."
+        )
+    if not np.array_equal(f[half:], f0[half:], equal_nan=True):
+        raise ValueError(
+            f"{method} integrates q'' = a(t, q), but fun's accelerations change with the velocity; take a Runge-Kutta "
+            f"method such as EIPDOP853."
+        )
 
 
 def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -240,7 +279,7 @@ def step_bounds(first_step: Any, max_step: Any, t0: float, t_bound: float) -> tu
 
 def stepping(
     name: str,
-    tableau: Tableau,
+    tableau: Tableau | NystromTableau,
     t0: float,
     t_bound: float,
     n: int,
@@ -322,13 +361,23 @@ def count(name: str, value: Any) -> int:
     return int(value)
 
 
+def _every(value: Any, tableau: Tableau | NystromTableau) -> int:
+    if not isinstance(value, str):
+        return count("every", value)
+    if value != "auto":
+        raise ValueError(f"every must be an integer >= 1 or 'auto', got {value!r}.")
+    if not tableau.has_estimate:
+        raise ValueError(f"every='auto' needs an error estimate, and {tableau.name} has none; give an integer.")
+    return AUTO
+
+
 def _flag(name: str, value: Any) -> bool:
     if not isinstance(value, (bool, np.bool_)):
         raise ValueError(f"{name} must be True or False, got {value!r}.")
     return bool(value)
 
 
-def _metric(metric: Any, tableau: Tableau, n: int, width: int) -> tuple[int, np.ndarray | None]:
+def _metric(metric: Any, tableau: Tableau | NystromTableau, n: int, width: int) -> tuple[int, np.ndarray | None]:
     if metric is None:
         return (ERROR if tableau.has_estimate else EUCLIDEAN), None
     if isinstance(metric, str):
@@ -431,23 +480,56 @@ def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return start, index, value
 
 
-def method_arrays(tableau: Tableau) -> Method:
+def method_arrays(tableau: Tableau | NystromTableau) -> Method:
     """A tableau as the arrays that the step takes (writable copies: compiled code has one array type for all)."""
+    exponent = -1.0 / ((tableau.error_estimator_order or 0) + 1)
+    if isinstance(tableau, NystromTableau):
+        return _nystrom_arrays(tableau, exponent)
+    none = np.zeros(tableau.b.size)
     return Method(
-        tableau.A.copy(),
-        tableau.b.copy(),
-        tableau.b_low.copy(),
-        tableau.c.copy(),
-        tableau.e.copy(),
-        tableau.e_low.copy(),
-        tableau.fsal,
-        tableau.paired,
-        -1.0 / ((tableau.error_estimator_order or 0) + 1),
+        A=tableau.A.copy(),
+        b=tableau.b.copy(),
+        b_low=tableau.b_low.copy(),
+        b_v=none,
+        b_v_low=none,
+        c=tableau.c.copy(),
+        e=tableau.e.copy(),
+        e_v=none,
+        e_low=tableau.e_low.copy(),
+        nystrom=False,
+        fsal=tableau.fsal,
+        paired=tableau.paired,
+        exponent=exponent,
+    )
+
+
+def _nystrom_arrays(tableau: NystromTableau, exponent: float) -> Method:
+    """A last stage that is the next step's first one is f at the new point, after the step."""
+    s = tableau.n_stages - tableau.fsal
+
+    def weights(e: np.ndarray) -> np.ndarray:
+        return np.concatenate([e, np.zeros(s + 1 - e.size)])
+
+    e, e_v = weights(tableau.e), weights(tableau.e_prime)
+    return Method(
+        A=np.ascontiguousarray(tableau.A[:s, :s]),
+        b=tableau.b[:s].copy(),
+        b_low=tableau.b_low[:s].copy(),
+        b_v=tableau.b_prime[:s].copy(),
+        b_v_low=tableau.b_prime_low[:s].copy(),
+        c=tableau.c[:s].copy(),
+        e=e,
+        e_v=e_v,
+        e_low=np.zeros(s + 1),
+        nystrom=True,
+        fsal=bool(e[-1] != 0.0 or e_v[-1] != 0.0),
+        paired=False,
+        exponent=exponent,
     )
 
 
 def prepare(
-    tableau: Tableau,
+    tableau: Tableau | NystromTableau,
     rhs: Callable[[float, np.ndarray], np.ndarray],
     t0: float,
     y0: np.ndarray,
@@ -463,7 +545,7 @@ def prepare(
 
     Parameters
     ----------
-    tableau : Tableau
+    tableau : Tableau or NystromTableau
     rhs : callable
         ``rhs(t, y) -> (n,)``, checked; called only where an invariant's start must be projected.
     t0, y0, f0 : float, ndarray, ndarray
@@ -497,16 +579,17 @@ def prepare(
         metric=kind,
         direction=DIRECTIONS[projection.direction],
         iterations=count("iterations", projection.iterations),
-        every=count("every", projection.every),
+        every=_every(projection.every, tableau),
         reuse_f=_flag("reuse_f", projection.reuse_f),
         uses_f=invariants.uses_f,
         compensated=_flag("compensated", compensated),
         adaptive=stepping.h is None,
     )
-    work = make_work(n, y0.dtype, tableau.n_stages, invariants.size, groups.start.size - 1)
+    arrays = method_arrays(tableau)
+    work = make_work(n, y0.dtype, arrays.b.size, invariants.size, groups.start.size - 1)
     if sigma is not None:
         work.sigma[:] = sigma
-    run = Run(y0, method_arrays(tableau), options, work, invariants)
+    run = Run(y0, arrays, options, work, invariants)
     if _flag("project_initial", projection.project_initial):
         run.y0 = projected_start(run, rhs, t0, f0)
         f0 = rhs(t0, run.y0)
@@ -538,6 +621,7 @@ def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0
         run.y0,
         run.y0.view(float),
         t0,
+        True,
         options,
         work,
         y,
