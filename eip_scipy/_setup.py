@@ -410,7 +410,9 @@ def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
     if width == 2:
         groups = [np.column_stack([2 * g, 2 * g + 1]).ravel() for g in groups]
     start = np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(INDEX)
-    return Grouping(np.concatenate([*groups, []]).astype(INDEX), start, width)
+    member = np.concatenate([*groups, []]).astype(INDEX)
+    regular = len({len(g) for g in groups}) == 1 and np.array_equal(member, np.arange(member.size))
+    return Grouping(member, start, width, len(groups[0]) if regular else 0)
 
 
 def _block_lists(blocks: Any, n: int) -> list[np.ndarray]:
@@ -440,7 +442,7 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
         C, M = np.zeros((0, n * width)), np.zeros((0, n * width))
     else:
         C, M = _frame_matrices(frame, n, width)
-    return FrameRows(*_sparse_rows(C), *_sparse_rows(M), np.zeros(C.shape[0]))
+    return FrameRows(*_sparse_rows(C), *_sparse_rows(M), np.zeros(C.shape[0]), _spatial(C) and _spatial(M))
 
 
 def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -470,6 +472,17 @@ def _real_form(a: np.ndarray) -> np.ndarray:
     out[:, 0, :, 0] = out[:, 1, :, 1] = a.real
     out[:, 1, :, 0], out[:, 0, :, 1] = a.imag, -a.imag
     return out.reshape(2 * a.shape[0], 2 * a.shape[1])
+
+
+def _spatial(a: np.ndarray) -> bool:
+    """Whether rows come in threes, the second and the third being the first moved by one and two places."""
+    first, second, third = a[::3], a[1::3], a[2::3]
+    return (
+        first.shape == third.shape
+        and not first[:, -2:].any()
+        and np.array_equal(np.roll(first, 1, axis=1), second)
+        and np.array_equal(np.roll(first, 2, axis=1), third)
+    )
 
 
 def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

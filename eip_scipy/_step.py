@@ -378,8 +378,9 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_
 def correct(rhs, inv, grad, params, t_old, y, y_r, t, largest_error, o, w, y_new, y_new_r):
     """One try: the Newton steps with the weights at hand. Returns the status, the rank and the correction's size."""
     if o.direction == NEW:
+        more = o.iterations > 1
         rank = kn.first_move(
-            w.G_r, w.sigma, o.frame, w.Q, w.inverse_norms, w.R, w.pivots, w.g, w.mu, w.y_hat_r, w.move, y_new_r
+            w.G_r, w.sigma, o.frame, w.Q, w.inverse_norms, w.R, w.pivots, w.g, w.mu, w.y_hat_r, w.move, y_new_r, more
         )
     else:
         rank = other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r)
@@ -427,6 +428,10 @@ def correct_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
     all: the distance is of second order, and no shorter step mends it. What the directions left out would have
     corrected stays, so that a defect may grow to the sum of all.
     """
+    kn.weigh_rows(w.G_r, w.sigma, o.frame, w.Q)
+    found = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)
+    rank = max(0, min(rank, found))
+    kn.least_norm(w.g, w.inverse_norms, w.R, w.pivots, rank, w.mu)
     kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
     evaluate_invariants(inv, params, t, y_new, o, w)
     kn.shared_defects(w.before, w.inverse_norms, w.g)
