@@ -15,7 +15,8 @@ EPS = np.finfo(float).eps
 PAIRS = [EIPRK23, EIPRK45, EIPDOP853]
 OWN = {cls: eip_method(cls.TABLEAU) for cls in PAIRS}
 pairs = pytest.mark.parametrize("method", PAIRS, ids=lambda m: m.__name__)
-every_class = pytest.mark.parametrize("method", [*PAIRS, EIPRK2, EIPRK4, EIPRK5], ids=lambda m: m.__name__)
+second_order = pytest.param(EIPRK2, marks=pytest.mark.slow_without_jit)  # in thousands of steps
+every_class = pytest.mark.parametrize("method", [*PAIRS, second_order, EIPRK4, EIPRK5], ids=lambda m: m.__name__)
 
 E = 0.6
 Y0 = np.array([1 - E, 0.0, 0.0, math.sqrt((1 + E) / (1 - E))])
@@ -308,6 +309,7 @@ def passing(component, value):
 LEVELS = {"default": {}, "backward": {"t_span": (8.0, 0.0)}, "every 3": {"every": 3}, "reuse_f off": {"reuse_f": False}}
 
 
+@pytest.mark.slow_without_jit
 @pairs
 @pytest.mark.parametrize("kind", LEVELS)
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8])
@@ -414,7 +416,10 @@ def jit_energy_gradient(t, y):
 jit_momentum, jit_momentum_gradient = njit(momentum), njit(momentum_gradient)
 
 
-@pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.needs_jit), False])
+@pytest.mark.parametrize(
+    "compiled",
+    [pytest.param(True, marks=pytest.mark.needs_jit), pytest.param(False, marks=pytest.mark.slow_without_jit)],
+)
 @pairs
 def test_adversarial_thresholds_of_integrate(method, compiled):
     """The threshold comes with the parameters, so that one event is compiled for all."""
