@@ -4,6 +4,7 @@ from importlib.metadata import version as _version
 
 from .invariants import Invariant, check_gradient
 from .longrun import integrate
+from .nystrom import NystromTableau
 from .projection import project
 from .result import Diagnostics, IntegrationResult, ProjectionResult
 from .solvers import (
@@ -15,6 +16,8 @@ from .solvers import (
     EIPRK5,
     EIPRK23,
     EIPRK45,
+    EIPRKN8,
+    EIPRKN12,
     EIPSolver,
     eip_method,
 )
@@ -31,10 +34,13 @@ __all__ = [
     "EIPRK5",
     "EIPRK23",
     "EIPRK45",
+    "EIPRKN8",
+    "EIPRKN12",
     "Diagnostics",
     "EIPSolver",
     "IntegrationResult",
     "Invariant",
+    "NystromTableau",
     "ProjectionResult",
     "Tableau",
     "check_gradient",

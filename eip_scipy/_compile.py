@@ -56,7 +56,7 @@ def signatures(dtype: np.dtype) -> Signatures:
 
 def compile_functions(
     fun: Callable[..., Any],
-    in_place: bool,
+    form: str,
     has_params: bool,
     invariants: InvariantSet,
     events: tuple[Callable[..., Any], ...],
@@ -85,7 +85,7 @@ def compile_functions(
     )
     names = tuple(f"event {k}" for k in range(len(events)))
     jitted = tuple(_jitted(event, name) for event, name in zip(events, names, strict=True))
-    return _compile_parts(_jitted(fun, "fun"), in_place, has_params, parts, jitted, np.dtype(dtype))
+    return _compile_parts(_jitted(fun, "fun"), form, has_params, parts, jitted, np.dtype(dtype))
 
 
 class _Part(NamedTuple):
@@ -104,7 +104,7 @@ class _Part(NamedTuple):
 @lru_cache(maxsize=64)
 def _compile_parts(
     fun: Callable[..., Any],
-    in_place: bool,
+    form: str,
     has_params: bool,
     parts: tuple[_Part, ...],
     events: tuple[Callable[..., Any], ...],
@@ -112,7 +112,7 @@ def _compile_parts(
 ) -> CompiledFunctions:
     """The wrappers of the same functions are compiled once in a process."""
     sigs = signatures(dtype)
-    rhs = _compiled(_wrap_rhs(fun, in_place, has_params), sigs.rhs, "fun")
+    rhs = _compiled(WRAPPERS[form](fun, has_params), sigs.rhs, "fun")
     inv, grad = _no_values, _no_gradients
     for part in parts:
         inv = _compiled(_chain_value(inv, part, has_params), sigs.inv, f"invariant {part.label!r}")
@@ -148,36 +148,54 @@ def _compiled(wrapper: Any, signature: Any, name: str) -> Any:
     return wrapper
 
 
-def _wrap_rhs(fun: Any, in_place: bool, has_params: bool) -> Any:
-    if in_place and has_params:
+def _wrap_value(fun: Any, has_params: bool) -> Any:
+    """From fun(t, y[, params]) -> (n,)."""
+    if has_params:
+        return njit(lambda t, y, out, params: _fill(out, fun(t, y, params)))
+    return njit(lambda t, y, out, params: _fill(out, fun(t, y)))
+
+
+def _wrap_in_place(fun: Any, has_params: bool) -> Any:
+    """From fun(t, y, out[, params])."""
+    if has_params:
         return fun
-    if in_place:
+    return njit(lambda t, y, out, params: fun(t, y, out))
 
-        @njit
-        def rhs(t, y, out, params):
-            fun(t, y, out)
 
-    elif has_params:
+def _wrap_acceleration(fun: Any, has_params: bool) -> Any:
+    """From fun(t, q[, params]) -> (n / 2,), for y = (q, v)."""
+    return njit(_second_order(_wrap_value(fun, has_params)))
 
-        @njit
-        def rhs(t, y, out, params):
-            f = fun(t, y, params)
-            if f.size != out.size:
-                raise ValueError(WRONG_FUN)
-            for i in range(out.size):
-                out[i] = f[i]
 
-    else:
+def _wrap_acceleration_in_place(fun: Any, has_params: bool) -> Any:
+    """From fun(t, q, out[, params]), for y = (q, v)."""
+    return njit(_second_order(_wrap_in_place(fun, has_params)))
 
-        @njit
-        def rhs(t, y, out, params):
-            f = fun(t, y)
-            if f.size != out.size:
-                raise ValueError(WRONG_FUN)
-            for i in range(out.size):
-                out[i] = f[i]
+
+@njit
+def _fill(out, f):
+    if f.size != out.size:
+        raise ValueError(WRONG_FUN)
+    for i in range(out.size):
+        out[i] = f[i]
+
+
+def _second_order(acc: Any) -> Any:
+    def rhs(t, y, out, params):
+        half = y.size // 2
+        for i in range(half):
+            out[i] = y[half + i]
+        acc(t, y[:half], out[half:], params)
 
     return rhs
+
+
+WRAPPERS = {
+    "value": _wrap_value,
+    "in place": _wrap_in_place,
+    "acceleration": _wrap_acceleration,
+    "acceleration in place": _wrap_acceleration_in_place,
+}
 
 
 @njit(cache=True)
@@ -214,9 +232,9 @@ def _chain_value(before: Any, part: _Part, has_params: bool) -> Any:
         def inv(t, y, values, params):
             before(t, y, values, params)
             found = fun(t, y, params)
-            if found.size != stop - start:
+            if len(found) != stop - start:
                 raise ValueError(wrong)
-            for i in range(found.size):
+            for i in range(stop - start):
                 values[start + i] = found[i]
 
     else:
@@ -225,9 +243,9 @@ def _chain_value(before: Any, part: _Part, has_params: bool) -> Any:
         def inv(t, y, values, params):
             before(t, y, values, params)
             found = fun(t, y)
-            if found.size != stop - start:
+            if len(found) != stop - start:
                 raise ValueError(wrong)
-            for i in range(found.size):
+            for i in range(stop - start):
                 values[start + i] = found[i]
 
     return inv

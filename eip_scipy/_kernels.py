@@ -15,7 +15,7 @@ from numba import njit
 
 from ._lanes import abs_dot, dot, largest, remove_component
 
-OK, NOT_FINITE, FAILED_PROJECTION = 0, 1, 2
+OK, NOT_FINITE, FAILED_PROJECTION, POSTPONED = 0, 1, 2, 4
 
 EPS = 2.220446049250313e-16
 BAND_FACTOR = 4.0
@@ -25,19 +25,29 @@ RANK_TOLERANCE = sqrt(EPS)
 REORTHOGONALISE = 0.05
 TINY = 1e-290
 FAILURE_BANDS = 100.0
+NOISE_BANDS = 3.0
+# Unsigned as the indices are: a signed offset would make floats of the sum.
+STEP, TWO_STEPS = np.uint64(1), np.uint64(2)
 SPLITTER = 134217729.0  # 2**27 + 1 (Dekker)
 
 
 class Grouping(NamedTuple):
-    """Blocks as lists of floats' indices: ``member[start[b]:start[b + 1]]``; width 2 for a complex state."""
+    """Blocks as lists of floats' indices: ``member[start[b]:start[b + 1]]``; width 2 for a complex state.
+
+    `size` is that of consecutive blocks of one size, 0 for others.
+    """
 
     member: np.ndarray
     start: np.ndarray
     width: int
+    size: int
 
 
 class FrameRows(NamedTuple):
-    """Non-zeros of C and of M^T, M = S (C S)^-1, row by row; `products` is scratch."""
+    """Non-zeros of C and of M^T, M = S (C S)^-1, row by row; `products` is scratch.
+
+    `spatial`: rows come in threes, the second and the third being the first moved by one and two places.
+    """
 
     c_start: np.ndarray
     c_index: np.ndarray
@@ -46,6 +56,7 @@ class FrameRows(NamedTuple):
     m_index: np.ndarray
     m_value: np.ndarray
     products: np.ndarray
+    spatial: bool
 
 
 class Inner(NamedTuple):
@@ -109,7 +120,9 @@ def norm(a):
 
 @_jit
 def all_finite(a):
-    """Whether no entry is NaN or infinite: x - x is 0 for finite x only."""
+    """Whether no entry is NaN or infinite: the sum of squares is finite too unless it overflows; x - x is 0 then."""
+    if np.isfinite(dot(a, a)):
+        return True
     total = 0.0
     for i in range(a.size):
         total += a[i] - a[i]
@@ -140,8 +153,8 @@ def combine(y, h, weights, K, stages, out):
 
 
 @_jit_inline
-def weighted_sum(weights, K, scale, out):
-    """Out = scale sum_j weights[j] K[j]."""
+def weighted_sum(weights, K, first, scale, out):
+    """Out = scale sum_j weights[j] K[j, first:]."""
     n = out.size
     for i in range(n):
         out[i] = 0.0
@@ -149,9 +162,39 @@ def weighted_sum(weights, K, scale, out):
         w = weights[j]
         if w != 0.0:
             for i in range(n):
-                out[i] += w * K[j, i]
+                out[i] += w * K[j, first + i]
     for i in range(n):
         out[i] *= scale
+
+
+@_jit_inline
+def nystrom_position(y, h, c, weights, K, stages, out):
+    """First half of out = q + c h v + h^2 sum_j weights[j] a_j, for y = (q, v) and a_j the second half of K[j]."""
+    half = out.size // 2
+    for i in range(half):
+        out[i] = 0.0
+    for j in range(stages):
+        w = weights[j]
+        if w != 0.0:
+            for i in range(half):
+                out[i] += w * K[j, half + i]
+    for i in range(half):
+        out[i] = y[i] + h * (c * y[half + i] + h * out[i])
+
+
+@_jit_inline
+def nystrom_velocity(y, h, weights, K, stages, out):
+    """Second half of out = v + h sum_j weights[j] a_j."""
+    half = out.size // 2
+    for i in range(half):
+        out[half + i] = 0.0
+    for j in range(stages):
+        w = weights[j]
+        if w != 0.0:
+            for i in range(half, 2 * half):
+                out[i] += w * K[j, i]
+    for i in range(half, 2 * half):
+        out[i] = y[i] + h * out[i]
 
 
 @_jit
@@ -188,6 +231,30 @@ def compensated_step(y, carry, h, weights, weights_low, K, out, carry_out):
 
 
 @_jit
+def compensated_nystrom(y, carry, h, b, b_low, b_v, b_v_low, K, out, carry_out):
+    """The same for q + h v + h^2 sum_j (b + b_low)[j] a_j and v + h sum_j (b_v + b_v_low)[j] a_j."""
+    half = y.size // 2
+    for i in range(half):
+        k = half + i
+        place = place_low = speed = speed_low = 0.0
+        for j in range(b.size):
+            place += b[j] * K[j, k]
+            place_low += b_low[j] * K[j, k]
+            speed += b_v[j] * K[j, k]
+            speed_low += b_v_low[j] * K[j, k]
+        drift, drift_rest = two_product(h, y[k])
+        half_kick, lost = two_product(h, place)
+        kick, kick_rest = two_product(h, half_kick)
+        rest = drift_rest + kick_rest + h * (carry[k] + lost + h * place_low) + carry[i]
+        s, first = two_sum(y[i], drift)
+        s, second = two_sum(s, kick)
+        out[i], carry_out[i] = two_sum(s, first + second + rest)
+        increment, rest = two_product(h, speed)
+        s, lost = two_sum(y[k], increment)
+        out[k], carry_out[k] = two_sum(s, lost + (rest + h * speed_low + carry[k]))
+
+
+@_jit
 def compensated_add(y, carry, move):
     """Y + carry += move, in place."""
     for i in range(y.size):
@@ -197,9 +264,13 @@ def compensated_add(y, carry, move):
 
 @_jit
 def quadrature(a, b, out):
-    """Out = hypot(a, b), by component."""
+    """Out = sqrt(a^2 + b^2), by component."""
+    lost = 0
     for i in range(out.size):
-        out[i] = np.hypot(a[i], b[i])
+        square = a[i] * a[i] + b[i] * b[i]
+        lost += square > 1e280 or (square < 1e-280 and (a[i] != 0.0 or b[i] != 0.0))
+    for i in range(out.size):
+        out[i] = sqrt(a[i] * a[i] + b[i] * b[i]) if lost == 0 else np.hypot(a[i], b[i])
 
 
 @_jit
@@ -219,6 +290,9 @@ def powers(x, exponent):
 @_jit
 def block_square(a, b, unit, groups):
     """Squared norm of block b of a, in units of 1 / unit."""
+    if groups.size == 3:
+        x, y, z = a[3 * b] * unit, a[3 * b + 1] * unit, a[3 * b + 2] * unit
+        return x * x + y * y + z * z
     total = 0.0
     for p in range(groups.start[b], groups.start[b + 1]):
         x = a[groups.member[p]] * unit
@@ -227,19 +301,64 @@ def block_square(a, b, unit, groups):
 
 
 @_jit
-def block_sizes(y, y_hat, err, rtol, groups, extreme, sizes, errors):
-    """Per block: sizes = max(|rtol y|, |rtol y_hat|), errors = |err|.
-
-    `extreme`: squares are taken in a unit of each block's own, so that they neither vanish nor overflow.
-    """
-    unit = 1.0
-    for b in range(sizes.size):
-        if extreme:
-            top = 0.0
+def block_sums(a, groups, out):
+    """Per block the sum of a; consecutive blocks of one or three without looking places up."""
+    if groups.size == 3:
+        for b in range(out.size):
+            out[b] = a[3 * b] + a[3 * b + 1] + a[3 * b + 2]
+    elif groups.size == 1:
+        copy(a, out)
+    else:
+        for b in range(out.size):
+            total = 0.0
             for p in range(groups.start[b], groups.start[b + 1]):
-                i = groups.member[p]
-                top = max(top, max(rtol[i] * max(abs(y[i]), abs(y_hat[i])), abs(err[i])))
-            unit = 1.0 / top if top > 0.0 else 1.0
+                total += a[groups.member[p]]
+            out[b] = total
+
+
+@_jit
+def squares(a, out):
+    """Out = a^2, by component."""
+    for i in range(a.size):
+        out[i] = a[i] * a[i]
+
+
+@_jit
+def weighted_squares(weights, a, out):
+    """Out = (weights a)^2, by component."""
+    for i in range(a.size):
+        x = weights[i] * a[i]
+        out[i] = x * x
+
+
+@_jit
+def block_sizes(y, y_hat, err, rtol, groups, scratch, sizes, errors):
+    """Per block: sizes = max(|rtol y|, |rtol y_hat|), errors = |err|; returns how many sizes are too extreme."""
+    weighted_squares(rtol, y, scratch)
+    block_sums(scratch, groups, errors)
+    weighted_squares(rtol, y_hat, scratch)
+    block_sums(scratch, groups, sizes)
+    extreme = 0
+    for b in range(sizes.size):
+        square = max(sizes[b], errors[b])
+        extreme += not 1e-280 < square < 1e280
+        sizes[b] = sqrt(square)
+    squares(err, scratch)
+    block_sums(scratch, groups, errors)
+    for b in range(sizes.size):
+        errors[b] = sqrt(errors[b])
+    return extreme
+
+
+@_jit
+def extreme_block_sizes(y, y_hat, err, rtol, groups, sizes, errors):
+    """The same, squares taken in a unit of each block's own, so that they neither vanish nor overflow."""
+    for b in range(sizes.size):
+        top = 0.0
+        for p in range(groups.start[b], groups.start[b + 1]):
+            i = groups.member[p]
+            top = max(top, max(rtol[i] * max(abs(y[i]), abs(y_hat[i])), abs(err[i])))
+        unit = 1.0 / top if top > 0.0 else 1.0
         old = new = 0.0
         for p in range(groups.start[b], groups.start[b + 1]):
             i = groups.member[p]
@@ -258,15 +377,12 @@ def error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio):
 
     `atol` is by block. r = 0 (no error at all) leaves the euclidean metric. `ratio` is scratch.
     """
-    block_sizes(y, y_hat, err, rtol, groups, False, scale, ratio)
-    for b in range(scale.size):
-        if not 1e-140 < scale[b] < 1e140:
-            block_sizes(y, y_hat, err, rtol, groups, True, scale, ratio)
-            break
+    if block_sizes(y, y_hat, err, rtol, groups, sigma, scale, ratio) > 0:
+        extreme_block_sizes(y, y_hat, err, rtol, groups, scale, ratio)
     for b in range(scale.size):
         scale[b] += atol[b]
-        relative = ratio[b] / max(scale[b], TINY)
-        ratio[b] = relative if scale[b] > 0.0 else 0.0
+        # Over a scale of 0 there is no error to speak of.
+        ratio[b] = ratio[b] / max(scale[b], TINY) if scale[b] > 0.0 else 0.0
     largest_ratio = largest(ratio)
     if largest_ratio == 0.0:
         fill(sigma, 1.0)
@@ -280,8 +396,11 @@ def error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio):
     inverse = 1.0 / largest(ratio)
     for b in range(ratio.size):
         weight = ratio[b] * inverse
-        for p in range(groups.start[b], groups.start[b + 1]):
-            sigma[groups.member[p]] = weight
+        if groups.size == 3:
+            sigma[3 * b] = sigma[3 * b + 1] = sigma[3 * b + 2] = weight
+        else:
+            for p in range(groups.start[b], groups.start[b + 1]):
+                sigma[groups.member[p]] = weight
     return largest_ratio
 
 
@@ -328,8 +447,18 @@ def defects(values, target, G, y_hat, scales, g, band, raw):
 
 
 @_jit
-def sparse_products(start, index, value, a, out):
+def sparse_products(start, index, value, spatial, a, out):
     """Out[k] = the k-th sparse row times a."""
+    if spatial:
+        for k in range(0, out.size, 3):
+            x = y = z = 0.0
+            for p in range(start[k], start[k + 1]):
+                i, v = index[p], value[p]
+                x += v * a[i]
+                y += v * a[i + STEP]
+                z += v * a[i + TWO_STEPS]
+            out[k], out[k + 1], out[k + 2] = x, y, z
+        return
     for k in range(out.size):
         total = 0.0
         for p in range(start[k], start[k + 1]):
@@ -338,8 +467,17 @@ def sparse_products(start, index, value, a, out):
 
 
 @_jit
-def subtract_sparse(start, index, value, factors, a):
+def subtract_sparse(start, index, value, spatial, factors, a):
     """Subtract factors[k] times the k-th sparse row from a, for all k."""
+    if spatial:
+        for k in range(0, factors.size, 3):
+            x, y, z = factors[k], factors[k + 1], factors[k + 2]
+            for p in range(start[k], start[k + 1]):
+                i, v = index[p], value[p]
+                a[i] -= x * v
+                a[i + STEP] -= y * v
+                a[i + TWO_STEPS] -= z * v
+        return
     for k in range(factors.size):
         for p in range(start[k], start[k + 1]):
             a[index[p]] -= factors[k] * value[p]
@@ -352,8 +490,8 @@ def weigh_rows(G, sigma, frame, B):
         row = B[i]
         for j in range(row.size):
             row[j] = G[i, j]
-        sparse_products(frame.m_start, frame.m_index, frame.m_value, row, frame.products)
-        subtract_sparse(frame.c_start, frame.c_index, frame.c_value, frame.products, row)
+        sparse_products(frame.m_start, frame.m_index, frame.m_value, frame.spatial, row, frame.products)
+        subtract_sparse(frame.c_start, frame.c_index, frame.c_value, frame.spatial, frame.products, row)
         for j in range(row.size):
             row[j] *= sigma[j]
 
@@ -410,6 +548,45 @@ def factor(B, inverse_norms, R, pivots):
 
 
 @_jit
+def solve_gram(B, g, inverse_norms, R, mu):
+    """Coefficients mu of the rows of B in the least-norm x with B x = -g, if the rows are far from dependent.
+
+    By Cholesky's factorisation of the rows' Gram matrix, which costs a third of `factor` and squares the condition
+    number: whether it will do shows on the way, by the same bound below which one pass of Gram-Schmidt would not.
+    """
+    rows = B.shape[0]
+    for i in range(rows):
+        for j in range(i + 1):
+            R[i, j] = dot(B[i], B[j])
+        if not 1e-200 < R[i, i] < 1e200:
+            return False
+        inverse_norms[i] = 1.0 / sqrt(R[i, i])
+    for i in range(rows):
+        value = -g[i] * inverse_norms[i]
+        square = 1.0
+        for j in range(i):
+            x = R[i, j] * inverse_norms[i] * inverse_norms[j]
+            for k in range(j):
+                x -= R[i, k] * R[j, k]
+            x *= R[j, j]
+            R[i, j] = x
+            square -= x * x
+            value -= x * mu[j]
+        if not square > REORTHOGONALISE * REORTHOGONALISE:
+            return False
+        R[i, i] = 1.0 / sqrt(square)
+        mu[i] = value * R[i, i]
+    for i in range(rows - 1, -1, -1):
+        value = mu[i]
+        for j in range(i + 1, rows):
+            value -= R[j, i] * mu[j]
+        mu[i] = value * R[i, i]
+    for i in range(rows):
+        mu[i] *= inverse_norms[i]
+    return True
+
+
+@_jit
 def least_norm(g, inverse_norms, R, pivots, rank, mu):
     """Coefficients mu along the orthonormal directions of the least-norm x with row_i . x = -g_i (pivot rows)."""
     for k in range(rank):
@@ -454,19 +631,27 @@ def move_along(mu, Q, pivots, rank, sigma, frame, y_hat, move, out):
                 move[j] += mu[k] * row[j]
         for j in range(n):
             move[j] *= sigma[j]
-    sparse_products(frame.c_start, frame.c_index, frame.c_value, move, frame.products)
-    subtract_sparse(frame.m_start, frame.m_index, frame.m_value, frame.products, move)
+    sparse_products(frame.c_start, frame.c_index, frame.c_value, frame.spatial, move, frame.products)
+    subtract_sparse(frame.m_start, frame.m_index, frame.m_value, frame.spatial, frame.products, move)
     for j in range(n):
         out[j] = y_hat[j] + move[j]
 
 
 @_jit_inline
-def first_move(G, sigma, frame, Q, inverse_norms, R, pivots, g, mu, y_hat, move, out):
-    """The whole first Newton step along the gradients at y_hat: out = y_hat + move; returns the rank."""
+def first_move(G, sigma, frame, Q, inverse_norms, R, pivots, g, mu, y_hat, move, out, more):
+    """The whole first Newton step along the gradients at y_hat: out = y_hat + move; returns the rank.
+
+    `more`: other steps follow, for which the directions in Q must be orthonormal.
+    """
     weigh_rows(G, sigma, frame, Q)
-    rank = factor(Q, inverse_norms, R, pivots)
-    if rank >= 0:
+    if not more and solve_gram(Q, g, inverse_norms, R, mu):
+        rank = Q.shape[0]
+        for i in range(rank):
+            pivots[i] = i
+    else:
+        rank = factor(Q, inverse_norms, R, pivots)
         least_norm(g, inverse_norms, R, pivots, rank, mu)
+    if rank >= 0:
         move_along(mu, Q, pivots, rank, sigma, frame, y_hat, move, out)
     return rank
 
@@ -553,6 +738,20 @@ def paired_error_norm(err, low, y, y_hat, rtol, atol, width):
     if fine == 0.0 and coarse == 0.0:
         return 0.0
     return fine / sqrt((fine + 0.01 * coarse) * n)
+
+
+@_jit
+def tells_more(err, G, y):
+    """Whether the errors gathered make some invariant more uncertain than NOISE_BANDS roundings of its terms."""
+    for i in range(G.shape[0]):
+        error = noise = 0.0
+        for j in range(y.size):
+            x = err[j] * G[i, j]
+            error += x * x
+            noise += abs(G[i, j] * y[j])
+        if sqrt(error) > NOISE_BANDS * EPS * noise:
+            return True
+    return False
 
 
 @_jit

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from ._kernels import EPS, FrameRows, Grouping
-from ._step import ERROR, EUCLIDEAN, GIVEN, MIDPOINT, NEW, OLD, Method, Options, Work, make_work, project_step
+from ._step import AUTO, ERROR, EUCLIDEAN, GIVEN, MIDPOINT, NEW, OLD, Method, Options, Work, make_work, project_step
 from .invariants import InvariantSet
+from .nystrom import NystromTableau
 from .result import LAST_RANK, Diagnostics
 from .tableaux import Tableau
 
@@ -36,7 +37,7 @@ class ProjectionOptions:
     frame: Any = None
     direction: str = "new"
     iterations: int = 1
-    every: int = 1
+    every: int | str = 1
     reuse_f: bool = True
     check: bool = True
     project_initial: bool = False
@@ -108,6 +109,39 @@ def initial_state(y0: Any) -> np.ndarray:
     if not np.isfinite(y).all():
         raise ValueError("All components of the initial state `y0` must be finite.")
     return y
+
+
+def check_halves(n: int) -> None:
+    """A state (q, v) has an even number of components."""
+    if n % 2:
+        raise ValueError(f"a Nystrom method needs the state (q, v), an even number of components; y0 has {n}.")
+
+
+def check_second_order(
+    rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, y0: np.ndarray, f0: np.ndarray, method: str
+) -> None:
+    """Whether the right-hand side is that of q'' = a(t, q) for y = (q, v), by one more evaluation.
+
+    Raises
+    ------
+    ValueError
+        When the first half of the derivative is not v, or the second changes with v.
+    """
+    check_halves(y0.size)
+    half = y0.size // 2
+    other = y0.copy()
+    other[half:] = 1.5 * y0[half:] + 1.0
+    f = rhs(t0, other)
+    if not (np.array_equal(f0[:half], y0[half:]) and np.array_equal(f[:half], other[half:])):
+        raise ValueError(
+            f"{method} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be v, "
+            f"the second half of the state. Reorder the state, or take a Runge-Kutta method such as EIPDOP853."
+        )
+    if not np.array_equal(f[half:], f0[half:], equal_nan=True):
+        raise ValueError(
+            f"{method} integrates q'' = a(t, q), but fun's accelerations change with the velocity; take a Runge-Kutta "
+            f"method such as EIPDOP853."
+        )
 
 
 def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -250,13 +284,23 @@ def count(name: str, value: Any) -> int:
     return int(value)
 
 
+def _every(value: Any, tableau: Tableau | NystromTableau) -> int:
+    if not isinstance(value, str):
+        return count("every", value)
+    if value != "auto":
+        raise ValueError(f"every must be an integer >= 1 or 'auto', got {value!r}.")
+    if not tableau.has_estimate:
+        raise ValueError(f"every='auto' needs an error estimate, and {tableau.name} has none; give an integer.")
+    return AUTO
+
+
 def _flag(name: str, value: Any) -> bool:
     if not isinstance(value, (bool, np.bool_)):
         raise ValueError(f"{name} must be True or False, got {value!r}.")
     return bool(value)
 
 
-def _metric(metric: Any, tableau: Tableau, n: int, width: int) -> tuple[int, np.ndarray | None]:
+def _metric(metric: Any, tableau: Tableau | NystromTableau, n: int, width: int) -> tuple[int, np.ndarray | None]:
     if metric is None:
         return (ERROR if tableau.has_estimate else EUCLIDEAN), None
     if isinstance(metric, str):
@@ -289,7 +333,9 @@ def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
     if width == 2:
         groups = [np.column_stack([2 * g, 2 * g + 1]).ravel() for g in groups]
     start = np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(INDEX)
-    return Grouping(np.concatenate([*groups, []]).astype(INDEX), start, width)
+    member = np.concatenate([*groups, []]).astype(INDEX)
+    regular = len({len(g) for g in groups}) == 1 and np.array_equal(member, np.arange(member.size))
+    return Grouping(member, start, width, len(groups[0]) if regular else 0)
 
 
 def _block_lists(blocks: Any, n: int) -> list[np.ndarray]:
@@ -319,7 +365,7 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
         C, M = np.zeros((0, n * width)), np.zeros((0, n * width))
     else:
         C, M = _frame_matrices(frame, n, width)
-    return FrameRows(*_sparse_rows(C), *_sparse_rows(M), np.zeros(C.shape[0]))
+    return FrameRows(*_sparse_rows(C), *_sparse_rows(M), np.zeros(C.shape[0]), _spatial(C) and _spatial(M))
 
 
 def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -351,6 +397,17 @@ def _real_form(a: np.ndarray) -> np.ndarray:
     return out.reshape(2 * a.shape[0], 2 * a.shape[1])
 
 
+def _spatial(a: np.ndarray) -> bool:
+    """Whether rows come in threes, the second and the third being the first moved by one and two places."""
+    first, second, third = a[::3], a[1::3], a[2::3]
+    return (
+        first.shape == third.shape
+        and not first[:, -2:].any()
+        and np.array_equal(np.roll(first, 1, axis=1), second)
+        and np.array_equal(np.roll(first, 2, axis=1), third)
+    )
+
+
 def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rows = [np.flatnonzero(row) for row in a]
     start = np.concatenate([[0], np.cumsum([len(r) for r in rows])]).astype(INDEX)
@@ -359,23 +416,56 @@ def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return start, index, value
 
 
-def method_arrays(tableau: Tableau) -> Method:
+def method_arrays(tableau: Tableau | NystromTableau) -> Method:
     """A tableau as the arrays that the step takes (writable copies: compiled code has one array type for all)."""
+    exponent = -1.0 / ((tableau.error_estimator_order or 0) + 1)
+    if isinstance(tableau, NystromTableau):
+        return _nystrom_arrays(tableau, exponent)
+    none = np.zeros(tableau.b.size)
     return Method(
-        tableau.A.copy(),
-        tableau.b.copy(),
-        tableau.b_low.copy(),
-        tableau.c.copy(),
-        tableau.e.copy(),
-        tableau.e_low.copy(),
-        tableau.fsal,
-        tableau.paired,
-        -1.0 / ((tableau.error_estimator_order or 0) + 1),
+        A=tableau.A.copy(),
+        b=tableau.b.copy(),
+        b_low=tableau.b_low.copy(),
+        b_v=none,
+        b_v_low=none,
+        c=tableau.c.copy(),
+        e=tableau.e.copy(),
+        e_v=none,
+        e_low=tableau.e_low.copy(),
+        nystrom=False,
+        fsal=tableau.fsal,
+        paired=tableau.paired,
+        exponent=exponent,
+    )
+
+
+def _nystrom_arrays(tableau: NystromTableau, exponent: float) -> Method:
+    """A last stage that is the next step's first one is f at the new point, after the step."""
+    s = tableau.n_stages - tableau.fsal
+
+    def weights(e: np.ndarray) -> np.ndarray:
+        return np.concatenate([e, np.zeros(s + 1 - e.size)])
+
+    e, e_v = weights(tableau.e), weights(tableau.e_prime)
+    return Method(
+        A=np.ascontiguousarray(tableau.A[:s, :s]),
+        b=tableau.b[:s].copy(),
+        b_low=tableau.b_low[:s].copy(),
+        b_v=tableau.b_prime[:s].copy(),
+        b_v_low=tableau.b_prime_low[:s].copy(),
+        c=tableau.c[:s].copy(),
+        e=e,
+        e_v=e_v,
+        e_low=np.zeros(s + 1),
+        nystrom=True,
+        fsal=bool(e[-1] != 0.0 or e_v[-1] != 0.0),
+        paired=False,
+        exponent=exponent,
     )
 
 
 def prepare(
-    tableau: Tableau,
+    tableau: Tableau | NystromTableau,
     rhs: Callable[[float, np.ndarray], np.ndarray],
     t0: float,
     y0: np.ndarray,
@@ -393,7 +483,7 @@ def prepare(
 
     Parameters
     ----------
-    tableau : Tableau
+    tableau : Tableau or NystromTableau
     rhs : callable
         ``rhs(t, y) -> (n,)``, checked; called only where an invariant's start must be projected.
     t0, y0, f0 : float, ndarray, ndarray
@@ -427,16 +517,17 @@ def prepare(
         metric=kind,
         direction=DIRECTIONS[projection.direction],
         iterations=count("iterations", projection.iterations),
-        every=count("every", projection.every),
+        every=_every(projection.every, tableau),
         reuse_f=_flag("reuse_f", projection.reuse_f),
         uses_f=invariants.uses_f,
         compensated=_flag("compensated", compensated),
         adaptive=adaptive,
     )
-    work = make_work(n, y0.dtype, tableau.n_stages, invariants.size, groups.start.size - 1)
+    arrays = method_arrays(tableau)
+    work = make_work(n, y0.dtype, arrays.b.size, invariants.size, groups.start.size - 1)
     if sigma is not None:
         work.sigma[:] = sigma
-    run = Run(y0, method_arrays(tableau), options, work, invariants)
+    run = Run(y0, arrays, options, work, invariants)
     if _flag("project_initial", projection.project_initial):
         run.y0 = projected_start(run, rhs, t0, f0)
         f0 = rhs(t0, run.y0)
@@ -468,6 +559,7 @@ def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0
         run.y0,
         run.y0.view(float),
         t0,
+        True,
         options,
         work,
         y,

@@ -16,7 +16,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from . import _kernels as kn
-from ._kernels import FAILED_PROJECTION, NOT_FINITE, OK, FrameRows, Grouping
+from ._kernels import FAILED_PROJECTION, NOT_FINITE, OK, POSTPONED, FrameRows, Grouping
 from .result import (
     HAVE_F,
     LAST_RANK,
@@ -36,6 +36,8 @@ _jitable = register_jitable(_nrt=False, error_model="numpy", forceinline=True)
 _jitable_cold = register_jitable(_nrt=False, error_model="numpy")
 
 NEW, OLD, MIDPOINT = 0, 1, 2
+# every="auto": each AUTO_SPACING-th step asks whether a projection is worth it.
+AUTO, AUTO_SPACING = 0, 5
 EUCLIDEAN, ERROR, GIVEN = 0, 1, 2
 
 
@@ -61,14 +63,21 @@ class Span(NamedTuple):
 
 
 class Method(NamedTuple):
-    """A tableau as arrays. `e` weighs the rows of K in the error estimate; `fsal` when it uses f at the new point."""
+    """A tableau as arrays. `e` weighs the rows of K in the error estimate; `fsal` when it uses f at the new point.
+
+    Names ending in _v are a Nystrom method's weights of the velocity.
+    """
 
     A: np.ndarray
     b: np.ndarray
     b_low: np.ndarray
+    b_v: np.ndarray
+    b_v_low: np.ndarray
     c: np.ndarray
     e: np.ndarray
+    e_v: np.ndarray
     e_low: np.ndarray
+    nystrom: bool
     fsal: bool
     paired: bool
     exponent: float
@@ -184,32 +193,43 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
 
 
 @_jitable
-def rk_stages(rhs, params, t, y, y_r, h, m, w):
-    """Stages 1 ... s - 1; K[0] holds f(t, y)."""
+def rk_step(rhs, params, t, y, y_r, h, m, o, w):
+    """Raw Runge-Kutta step: y_hat (and its carry) from y, with K[0] = f(t, y)."""
     for i in range(1, m.b.size):
         kn.combine(y_r, h, m.A[i], w.K_r, i, w.stage_r)
         rhs(t + m.c[i] * h, w.stage, w.K[i], params)
-    w.counters[NFEV] += m.b.size - 1
-
-
-@_jitable
-def rk_step(rhs, params, t, y, y_r, h, m, o, w):
-    """Raw step: y_hat (and its carry) from y, with K[0] = f(t, y)."""
-    rk_stages(rhs, params, t, y, y_r, h, m, w)
     if o.compensated:
         kn.compensated_step(y_r, w.carry, h, m.b, m.b_low, w.K_r, w.y_hat_r, w.carry_hat)
     else:
         kn.combine(y_r, h, m.b, w.K_r, m.b.size, w.y_hat_r)
-    return kn.all_finite(w.y_hat_r)
+
+
+@_jitable
+def rkn_step(rhs, params, t, y_r, h, m, o, w):
+    """Raw Runge-Kutta-Nystrom step of y = (q, v): the stages keep v, which the accelerations do not see."""
+    kn.copy(y_r, w.stage_r)
+    for i in range(1, m.b.size):
+        kn.nystrom_position(y_r, h, m.c[i], m.A[i], w.K_r, i, w.stage_r)
+        rhs(t + m.c[i] * h, w.stage, w.K[i], params)
+    if o.compensated:
+        kn.compensated_nystrom(y_r, w.carry, h, m.b, m.b_low, m.b_v, m.b_v_low, w.K_r, w.y_hat_r, w.carry_hat)
+    else:
+        kn.nystrom_position(y_r, h, 1.0, m.b, w.K_r, m.b.size, w.y_hat_r)
+        kn.nystrom_velocity(y_r, h, m.b_v, w.K_r, m.b.size, w.y_hat_r)
 
 
 @_jitable
 def raw_step(rhs, params, t, y, y_r, t_new, h, project, m, o, w):
     """Raw step; f(y_hat) in K[-1], the local error in w.err and its norm in w.norm where they are wanted."""
     w.counters[HAVE_F] = 0
-    if not rk_step(rhs, params, t, y, y_r, h, m, o, w):
+    if m.nystrom:
+        rkn_step(rhs, params, t, y_r, h, m, o, w)
+    else:
+        rk_step(rhs, params, t, y, y_r, h, m, o, w)
+    w.counters[NFEV] += m.b.size - 1
+    if not kn.all_finite(w.y_hat_r):
         return NOT_FINITE
-    estimate = o.adaptive or (o.metric == ERROR and o.target.size > 0)
+    estimate = o.adaptive or ((o.metric == ERROR or o.every == AUTO) and o.target.size > 0)
     if (estimate and m.fsal) or (project and o.uses_f):
         rhs(t_new, w.y_hat, w.K[-1], params)
         w.counters[NFEV] += 1
@@ -223,25 +243,32 @@ def raw_step(rhs, params, t, y, y_r, t_new, h, project, m, o, w):
 def estimate_error(y_r, h, m, o, w):
     """Fill w.err, and w.norm for the step control."""
     width = o.groups.width
-    kn.weighted_sum(m.e, w.K_r, h, w.err)
+    if m.nystrom:
+        half = w.err.size // 2
+        kn.weighted_sum(m.e, w.K_r, half, h * h, w.err[:half])
+        kn.weighted_sum(m.e_v, w.K_r, half, h, w.err[half:])
+    else:
+        kn.weighted_sum(m.e, w.K_r, 0, h, w.err)
     if m.paired:
-        kn.weighted_sum(m.e_low, w.K_r, h, w.err_low)
+        kn.weighted_sum(m.e_low, w.K_r, 0, h, w.err_low)
         w.norm[0] = kn.paired_error_norm(w.err, w.err_low, y_r, w.y_hat_r, o.rtol, o.atol, width)
     elif o.adaptive:
         w.norm[0] = kn.error_norm(w.err, y_r, w.y_hat_r, o.rtol, o.atol, width)
 
 
 @_jitable
-def close_step(rhs, params, t_new, y_new, project, o, w):
+def close_step(rhs, params, t_new, y_new, project, status, o, w):
     """After the projection: the carry, the errors gathered, and f for the next step's first stage in w.f_new."""
     if o.compensated:
         kn.copy(w.carry_hat, w.carry)
-    if o.every > 1 and o.metric == ERROR:
-        if project:
+    if o.every != 1:
+        if status == POSTPONED:
+            kn.copy(w.err, w.err_sum)
+        elif project:
             kn.fill(w.err_sum, 0.0)
-        else:
+        elif o.metric == ERROR or o.every == AUTO:
             kn.quadrature(w.err, w.err_sum, w.err_sum)
-    if w.counters[HAVE_F] == 0 or (project and not o.reuse_f):
+    if w.counters[HAVE_F] == 0 or (project and status == OK and not o.reuse_f):
         rhs(t_new, y_new, w.f_new, params)
         w.counters[NFEV] += 1
     else:
@@ -299,14 +326,20 @@ def newton_iteration(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
 
 
 @_jitable
-def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r):
-    """Project w.y_hat into y_new by o.iterations Newton steps; returns OK or FAILED_PROJECTION.
+def project_step(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_new_r):
+    """Project w.y_hat into y_new by o.iterations Newton steps; returns OK, FAILED_PROJECTION or POSTPONED.
 
-    w.err holds the local error of y_hat where the metric wants it, w.K[-1] f there where a gradient does.
+    w.err holds the local error of y_hat where the metric wants it, w.K[-1] f there where a gradient does. POSTPONED:
+    with o.every == AUTO, while the invariants know no more than round-off (y_new is then y_hat).
     """
     counters = w.counters
     grad(t, w.y_hat, w.K[-1], w.G, params)
     counters[NJEV] += 1
+    if o.every != 1 and (o.metric == ERROR or o.every == AUTO):
+        kn.quadrature(w.err, w.err_sum, w.err)
+        if o.every == AUTO and not last and not kn.tells_more(w.err, w.G_r, w.y_hat_r):
+            kn.copy(w.y_hat_r, y_new_r)
+            return POSTPONED
     evaluate_invariants(inv, params, t, w.y_hat, o, w)
     outside = kn.defects(w.values, o.target, w.G_r, w.y_hat_r, o.scales, w.g, w.band, w.before)
     if not outside:
@@ -318,8 +351,6 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
         return status
     largest_error = 0.0
     if o.metric == ERROR:
-        if o.every > 1:
-            kn.quadrature(w.err, w.err_sum, w.err)
         largest_error = kn.error_metric(
             w.err, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio
         )
@@ -347,8 +378,9 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, o, w, y_new, y_new_r)
 def correct(rhs, inv, grad, params, t_old, y, y_r, t, largest_error, o, w, y_new, y_new_r):
     """One try: the Newton steps with the weights at hand. Returns the status, the rank and the correction's size."""
     if o.direction == NEW:
+        more = o.iterations > 1
         rank = kn.first_move(
-            w.G_r, w.sigma, o.frame, w.Q, w.inverse_norms, w.R, w.pivots, w.g, w.mu, w.y_hat_r, w.move, y_new_r
+            w.G_r, w.sigma, o.frame, w.Q, w.inverse_norms, w.R, w.pivots, w.g, w.mu, w.y_hat_r, w.move, y_new_r, more
         )
     else:
         rank = other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r)
@@ -396,6 +428,10 @@ def correct_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
     all: the distance is of second order, and no shorter step mends it. What the directions left out would have
     corrected stays, so that a defect may grow to the sum of all.
     """
+    kn.weigh_rows(w.G_r, w.sigma, o.frame, w.Q)
+    found = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)
+    rank = max(0, min(rank, found))
+    kn.least_norm(w.g, w.inverse_norms, w.R, w.pivots, rank, w.mu)
     kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
     evaluate_invariants(inv, params, t, y_new, o, w)
     kn.shared_defects(w.before, w.inverse_norms, w.g)
@@ -403,16 +439,17 @@ def correct_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
 
 
 @_jitable
-def finish_step(rhs, inv, grad, params, t, y, y_r, t_new, project, m, o, w, y_new, y_new_r):
+def finish_step(rhs, inv, grad, params, t, y, y_r, t_new, project, last, m, o, w, y_new, y_new_r):
     """The rest of a step whose raw result is accepted; returns OK or FAILED_PROJECTION."""
+    status = OK
     if project:
-        status = project_step(rhs, inv, grad, params, t, y, y_r, t_new, o, w, y_new, y_new_r)
-        if status != OK:
+        status = project_step(rhs, inv, grad, params, t, y, y_r, t_new, last, o, w, y_new, y_new_r)
+        if status == FAILED_PROJECTION:
             w.counters[REJECTED] += 1
             return status
     else:
         kn.copy(w.y_hat_r, y_new_r)
-    close_step(rhs, params, t_new, y_new, project, o, w)
+    close_step(rhs, params, t_new, y_new, project, status, o, w)
     return OK
 
 
@@ -424,6 +461,7 @@ def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y
     MAX_RETRIES times in a row. Returns OK, NOT_FINITE, FAILED_PROJECTION or TOO_SMALL.
     """
     adaptive = span.h == 0.0
+    spacing = AUTO_SPACING if o.every == AUTO else o.every
     if not adaptive:
         clock[T] = span.t0 + k * span.h
     t = clock[T]
@@ -446,13 +484,13 @@ def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y
         clock[T_NEW] = span.t_bound if last else t_new
         clock[H] = span.h if not (adaptive or last) else clock[T_NEW] - t
         h_abs = abs(clock[H])
-        project = o.target.size > 0 and (last or (k + 1) % o.every == 0)
+        project = o.target.size > 0 and (last or (k + 1) % spacing == 0)
         status = raw_step(rhs, params, t, y, y_r, clock[T_NEW], clock[H], project, m, o, w)
         norm = w.norm[0] if adaptive else 0.0
         if status == OK and not np.isfinite(norm):
             status = NOT_FINITE
         if status == OK and norm < 1.0:
-            status = finish(rhs, inv, grad, params, t, y, y_r, clock[T_NEW], project, m, o, w, y_new, y_new_r)
+            status = finish(rhs, inv, grad, params, t, y, y_r, clock[T_NEW], project, last, m, o, w, y_new, y_new_r)
             if status == OK:
                 factor = MAX_FACTOR if norm == 0.0 else min(MAX_FACTOR, SAFETY * norm**m.exponent)
                 clock[H_ABS] = h_abs * (min(1.0, factor) if rejected else factor)

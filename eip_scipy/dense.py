@@ -15,6 +15,7 @@ from scipy.integrate import DenseOutput
 from ._kernels import OK, Grouping
 from ._setup import Run
 from ._step import ERROR, GIVEN, NEW, make_work, project_step
+from .nystrom import NystromTableau
 from .result import HAVE_F, NFEV
 from .tableaux import DOP853, Tableau
 
@@ -27,7 +28,7 @@ ITERATIONS = 5
 def dense_output(
     rhs: Callable[..., None],
     run: Run,
-    tableau: Tableau,
+    tableau: Tableau | NystromTableau,
     t_old: float,
     t: float,
     y_old: Array,
@@ -42,7 +43,9 @@ def dense_output(
     # The raw result's own slope belongs to the tableau; without it the next step's differs by O(h^(p + 1)).
     if not run.work.counters[HAVE_F]:
         K[-1] = f
-    if tableau is DOP853:
+    if isinstance(tableau, NystromTableau):
+        base = _quintic(h, y_old, y, f_old, f)
+    elif tableau is DOP853:
         base = _dop853(rhs, params, t_old, h, y_old, y, f, K, run.work.counters)
     elif tableau.P is not None:
         base = _polynomial(h, y_old, y, f, K, tableau.P)
@@ -124,7 +127,7 @@ class ManifoldDenseOutput(DenseOutput):
         out = np.empty_like(y)
         inv, grad = self._invariants.inv, self._invariants.grad
         status = project_step(
-            self._rhs, inv, grad, self._params, t, y, y.view(float), t, options, w, out, out.view(float)
+            self._rhs, inv, grad, self._params, t, y, y.view(float), t, True, options, w, out, out.view(float)
         )
         if status == OK:
             return out
@@ -169,6 +172,32 @@ def _hermite(h: float, y_old: Array, y: Array, f_old: Array, f: Array) -> Callab
     def base(theta: Array) -> Array:
         rest = 1 - theta
         return y_old + theta * change + theta * rest * (rest * left - theta * right)
+
+    return base
+
+
+def _quintic(h: float, y_old: Array, y: Array, f_old: Array, f: Array) -> Callable[[Array], Array]:
+    """For y = (q, v): the quintic through positions, velocities and accelerations at both ends, and its slope."""
+    half = y.size // 2
+    q, v, a = y_old[:half], y_old[half:], f_old[half:]
+    # What the Taylor polynomial at the old end misses at the new one: in the position, the slope and the curvature.
+    place = y[:half] - q - h * v - 0.5 * h * h * a
+    slope = h * (y[half:] - v - h * a)
+    curvature = h * h * (f[half:] - a)
+    rows = [
+        q,
+        h * v,
+        0.5 * h * h * a,
+        10 * place - 4 * slope + 0.5 * curvature,
+        -15 * place + 7 * slope - curvature,
+        6 * place - 3 * slope + 0.5 * curvature,
+    ]
+    position = np.stack(rows, axis=1)
+    velocity = position[:, 1:] * np.arange(1, 6) / h
+
+    def base(theta: Array) -> Array:
+        powers = theta ** np.arange(6)[:, None]
+        return np.concatenate([position @ powers, velocity @ powers[:5]])
 
     return base
 

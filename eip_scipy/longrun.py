@@ -23,6 +23,7 @@ from ._setup import ProjectionOptions, Run
 from ._step import T_NEW, TOO_SMALL, H, Span, T, finish_step, next_step
 from .dense import ManifoldDenseOutput, dense_output
 from .invariants import Invariant, InvariantSet, as_invariants
+from .nystrom import NystromTableau
 from .problems._problem import Problem
 from .result import NFEV, NJEV, NLU, Diagnostics, IntegrationResult
 from .solvers import EIPSolver
@@ -36,6 +37,12 @@ FIRST_ROWS = 1024
 STEP, ROW, PENDING = 0, 1, 2
 PAUSE, FULL = 10, 11
 STOPPED = "stopped by the callback"
+FORMS = {  # (of a Nystrom method, in place) -> what a user's function is
+    (False, False): "value",
+    (False, True): "in place",
+    (True, False): "acceleration",
+    (True, True): "acceleration in place",
+}
 
 
 class _Default:
@@ -271,7 +278,7 @@ def integrate(
     frame: Any = DEFAULT,
     direction: str = "new",
     iterations: int = 1,
-    every: int = 1,
+    every: int | str = 1,
     reuse_f: bool = True,
     check: bool = True,
     project_initial: bool = False,
@@ -290,13 +297,16 @@ def integrate(
     ----------
     fun : callable or Problem
         ``fun(t, y[, params]) -> (n,)``; with ``in_place=True``, ``fun(t, y, out[, params])``. For a compiled run a
-        lazily jitted Numba function. A `Problem` brings everything else with it; options given here take precedence.
+        lazily jitted Numba function. With a Nystrom method (`EIPRKN8`, `EIPRKN12`), whose state is (q, v), the
+        acceleration: ``acc(t, q[, params]) -> (n/2,)``, in place ``acc(t, q, out[, params])``. A `Problem` brings
+        everything else with it; options given here take precedence.
     t_span : (float, float)
         Start and end; backward if the end comes first.
     y0 : array_like, shape (n,)
         Initial state, real or complex.
     method : type
-        `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, or a class made by `eip_method`.
+        `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, or a class made by
+        `eip_method`.
     h : float, optional
         Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter. Default: a problem's own
         step; without one, adaptive steps by `rtol`, `atol`, `first_step` and `max_step`. To take adaptive steps on a
@@ -364,9 +374,12 @@ def integrate(
     given = {"invariants": invariants, "metric": metric, "blocks": blocks, "frame": frame}
     given = {key: value for key, value in given.items() if value is not DEFAULT}
     given_h = h
+    tableau = _tableau(method)
+    form = FORMS[isinstance(tableau, NystromTableau), bool(in_place)]
     if isinstance(fun, Problem):
         problem = fun
-        fun, in_place = (problem.fun, False) if problem.rhs is None else (problem.rhs, True)
+        form = "value" if problem.rhs is None else "in place"
+        fun = problem.fun if problem.rhs is None else problem.rhs
         t_span = problem.t_span if t_span is None else t_span
         y0 = problem.y0 if y0 is None else y0
         h = problem.h if h is None else h
@@ -377,7 +390,6 @@ def integrate(
             params = problem.params
     if not callable(fun):
         raise TypeError(f"integrate: fun must be callable or a Problem, got {fun!r}.")
-    tableau = _tableau(method)
     parameters = np.zeros(0) if params is None else _parameters(params)
     extra = () if params is None else (parameters,)
     happenings = Events(events, extra)
@@ -393,7 +405,7 @@ def integrate(
         raise ValueError(f"{method.__name__} has no error estimate and needs the step h=...")
     if params is not None and "invariants" in given:
         given["invariants"] = [_with_run_params(item, params) for item in as_invariants(given["invariants"])]
-    rhs = _interpreted_rhs(fun, in_place, extra, start)
+    rhs = INTERPRETED[form](fun, extra, start)
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
         out = np.zeros_like(y)
@@ -409,6 +421,8 @@ def integrate(
         h = _setup.check_fixed_step(h, t0, t_bound)
     tolerances = _setup.tolerances(rtol, atol, start.size)
     f0 = calls(t0, start)
+    if isinstance(tableau, NystromTableau):
+        _setup.check_second_order(calls, t0, start, f0, method.__name__)
     tau = h or first_step
     if tau is None:
         order = tableau.error_estimator_order or 0
@@ -440,7 +454,7 @@ def integrate(
     check_memory(saved_rows(grid), run, bound)
     record = Diagnostics() if diagnostics is None else diagnostics
     _setup.attach(record, run)
-    functions, why_not = _functions(fun, in_place, extra, run.invariants, happenings, start.dtype, compiled, rhs)
+    functions, why_not = _functions(fun, form, extra, run.invariants, happenings, start.dtype, compiled, rhs)
     driver = _Driver(run, grid, functions, parameters, compiled=why_not is None)
     run.work.K[0] = f0 if run.y0 is start else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
@@ -732,30 +746,61 @@ def free_memory() -> float:
     return 4e9
 
 
-def _interpreted_rhs(fun: Callable[..., Any], in_place: bool, extra: tuple, y0: np.ndarray) -> Callable[..., None]:
+def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
     """The user's right-hand side as Python calls it, its values checked."""
     n, dtype, shape = y0.size, y0.dtype, y0.shape
-    if in_place:
 
-        def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
-            fun(t, y, out, *extra)
-
-    else:
-
-        def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
-            f = fun(t, y.copy(), *extra)
-            out[:] = (
-                f
-                if type(f) is np.ndarray and f.shape == shape and f.dtype == dtype
-                else _setup.as_derivative(f, n, dtype)
-            )
+    def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
+        f = fun(t, y.copy(), *extra)
+        out[:] = (
+            f if type(f) is np.ndarray and f.shape == shape and f.dtype == dtype else _setup.as_derivative(f, n, dtype)
+        )
 
     return rhs
 
 
+def _interpreted_in_place(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
+    def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
+        fun(t, y, out, *extra)
+
+    return rhs
+
+
+def _interpreted_acceleration(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
+    return _second_order(_interpreted_value(fun, extra, _positions(y0)))
+
+
+def _interpreted_acceleration_in_place(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
+    return _second_order(_interpreted_in_place(fun, extra, _positions(y0)))
+
+
+def _positions(y0: np.ndarray) -> np.ndarray:
+    _setup.check_halves(y0.size)
+    return y0[: y0.size // 2]
+
+
+def _second_order(acc: Callable[..., None]) -> Callable[..., None]:
+    """The right-hand side of (q, v) from its acceleration."""
+
+    def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
+        half = y.size // 2
+        out[:half] = y[half:]
+        acc(t, y[:half], out[half:], params)
+
+    return rhs
+
+
+INTERPRETED = {
+    "value": _interpreted_value,
+    "in place": _interpreted_in_place,
+    "acceleration": _interpreted_acceleration,
+    "acceleration in place": _interpreted_acceleration_in_place,
+}
+
+
 def _functions(
     fun: Callable[..., Any],
-    in_place: bool,
+    form: str,
     extra: tuple,
     invariants: InvariantSet,
     events: Events,
@@ -768,7 +813,7 @@ def _functions(
     if compiled is False:
         return interpreted, "compiled=False"
     try:
-        return compile_functions(fun, in_place, bool(extra), invariants, tuple(events.functions), dtype), None
+        return compile_functions(fun, form, bool(extra), invariants, tuple(events.functions), dtype), None
     except NotCompilableError as reason:
         if compiled:
             raise

@@ -239,6 +239,11 @@ class NystromTableau:
         """Whether there is an embedded error estimate."""
         return self.b_hat is not None
 
+    @property
+    def kappa(self) -> float:
+        """Exponent of the error metric, (p + 1) / (p_hat + 1); 1 without an estimate."""
+        return (self.order + 1) / ((self.error_estimator_order or self.order) + 1)
+
     def __repr__(self) -> str:
         estimate = f", estimate of order {self.error_estimator_order}" if self.has_estimate else ""
         return f"<NystromTableau {self.name}: {self.n_stages} stages, order {self.order}{estimate}>"

@@ -111,7 +111,9 @@ def project(
     def rhs(time: float, state: np.ndarray, f_out: np.ndarray, params: Any) -> None:
         f_out[:] = derivative(time, state)
 
-    status = project_step(rhs, known.inv, known.grad, None, t, y, y.view(float), t, options, work, out, out.view(float))
+    status = project_step(
+        rhs, known.inv, known.grad, None, t, y, y.view(float), t, True, options, work, out, out.view(float)
+    )
     if status != 0:
         raise ValueError(_setup.projection_failure(known, work, t))
     return ProjectionResult(out, work.defect.copy(), int(work.counters[LAST_RANK]), out - y)

@@ -12,11 +12,12 @@ import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
 from . import _setup
-from ._kernels import NOT_FINITE, OK
+from ._kernels import FAILED_PROJECTION, NOT_FINITE, OK
 from ._setup import ProjectionOptions
 from ._step import T_NEW, TOO_SMALL, H, Span, T, close_step, next_step, project_step
 from .dense import ExactEnds, dense_output
 from .invariants import as_invariants
+from .nystrom import RKN86, RKN1210, NystromTableau
 from .result import NFEV, NJEV, NLU, REJECTED
 from .tableaux import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
 
@@ -29,6 +30,8 @@ __all__ = [
     "EIPRK5",
     "EIPRK23",
     "EIPRK45",
+    "EIPRKN8",
+    "EIPRKN12",
     "EIPSolver",
     "eip_method",
 ]
@@ -79,8 +82,9 @@ class EIPSolver(OdeSolver):
         in the middle.
     iterations : int, optional
         Newton steps of the projection. 1 (default) is the EIP method; more is the standard projection.
-    every : int, optional
-        Project each `every`-th step and the last one.
+    every : int or "auto", optional
+        Project each `every`-th step and the last one; "auto": when the error estimates, added in quadrature since the
+        last projection, make an invariant more uncertain than round-off (asked at each fifth step).
     reuse_f : bool, optional
         Where the step evaluates f at its raw result anyway, let it serve as the next step's first stage.
     check : bool, optional
@@ -107,7 +111,7 @@ class EIPSolver(OdeSolver):
        systems".
     """
 
-    TABLEAU: ClassVar[Tableau]
+    TABLEAU: ClassVar[Tableau | NystromTableau]
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     SCIPY: ClassVar[type[OdeSolver] | None] = None
     t: float
@@ -132,7 +136,7 @@ class EIPSolver(OdeSolver):
         frame: Any = None,
         direction: str = "new",
         iterations: int = 1,
-        every: int = 1,
+        every: int | str = 1,
         reuse_f: bool = True,
         check: bool = True,
         project_initial: bool = False,
@@ -178,6 +182,8 @@ class EIPSolver(OdeSolver):
         )
         self._scipy = self._scipy_solver(derivative, start, first_step, as_invariants(invariants)) if adaptive else None
         f0 = derivative(t0, start.copy()).copy() if self._scipy is None else np.zeros_like(start)
+        if isinstance(self.TABLEAU, NystromTableau):
+            _setup.check_second_order(lambda t, y: derivative(t, y).copy(), t0, start, f0, type(self).__name__)
         self.h_abs = h if h is not None else first_step
         if self.h_abs is None and self._scipy is None:
             self.h_abs = _setup.initial_step(
@@ -217,7 +223,7 @@ class EIPSolver(OdeSolver):
         _setup.attach(diagnostics, run)
         self._run, self._work = run, run.work
         self._clock = np.array([t0, t0, 0.0, self.h_abs or 0.0])
-        self._project_now, self._projection_status = False, OK
+        self._project_now, self._projection_status, self._last = False, OK, False
         self._buffer = self._accepted = run.y0
         if run.y0 is not start:
             f0 = derivative(t0, run.y0.copy()).copy()
@@ -280,17 +286,17 @@ class EIPSolver(OdeSolver):
         return True, None
 
     def _finish(
-        self, rhs: Any, inv: Any, grad: Any, params: Any, t: Any, y: Any, y_r: Any, t_new: Any, project: Any, m: Any,
-        o: Any, w: Any, y_new: Any, y_new_r: Any,
+        self, rhs: Any, inv: Any, grad: Any, params: Any, t: Any, y: Any, y_r: Any, t_new: Any, project: Any,
+        last: Any, m: Any, o: Any, w: Any, y_new: Any, y_new_r: Any,
     ) -> int:  # fmt: skip
         """What `finish_step` does, with the hook in its place."""
-        self._project_now, self._projection_status = project, OK
+        self._project_now, self._projection_status, self._last = project, OK, last
         self._buffer = y_new
         self._accepted = self._project_step(t_new, y, w.y_hat, w.err)
-        if self._projection_status != OK:
+        if self._projection_status == FAILED_PROJECTION:
             w.counters[REJECTED] += 1
-            return self._projection_status
-        close_step(rhs, params, t_new, self._accepted, project, o, w)
+            return FAILED_PROJECTION
+        close_step(rhs, params, t_new, self._accepted, project, self._projection_status, o, w)
         return OK
 
     def _failure(self, status: int) -> str:
@@ -338,6 +344,7 @@ class EIPSolver(OdeSolver):
             y,
             y.view(float),
             t,
+            self._last,
             run.options,
             w,
             y_new,
@@ -466,12 +473,32 @@ class EIPDOP853(EIPSolver):
     SCIPY = scipy.integrate.DOP853
 
 
-def eip_method(tableau: Tableau) -> type[EIPSolver]:
-    """A solver class on any explicit Runge-Kutta tableau.
+class EIPRKN8(EIPSolver):
+    """EIP method on the Runge-Kutta-Nystrom pair 8(6) of Dormand, El-Mikkawy and Prince, nine stages.
+
+    For q'' = a(t, q) as a first-order system: the state is (q, v), and the first half of `fun` must be v. With
+    `integrate`, `fun` is the acceleration. Options: see `EIPSolver`.
+    """
+
+    TABLEAU = RKN86
+
+
+class EIPRKN12(EIPSolver):
+    """EIP method on the Runge-Kutta-Nystrom pair 12(10) of Dormand, El-Mikkawy and Prince, 17 stages.
+
+    For q'' = a(t, q) as a first-order system: the state is (q, v), and the first half of `fun` must be v. With
+    `integrate`, `fun` is the acceleration. Options: see `EIPSolver`; at small steps ``every="auto"``.
+    """
+
+    TABLEAU = RKN1210
+
+
+def eip_method(tableau: Tableau | NystromTableau) -> type[EIPSolver]:
+    """A solver class on any explicit Runge-Kutta or Runge-Kutta-Nystrom tableau.
 
     Parameters
     ----------
-    tableau : Tableau
+    tableau : Tableau or NystromTableau
 
     Returns
     -------
@@ -481,8 +508,8 @@ def eip_method(tableau: Tableau) -> type[EIPSolver]:
     Raises
     ------
     TypeError
-        When `tableau` is no Tableau.
+        When `tableau` is neither.
     """
-    if not isinstance(tableau, Tableau):
-        raise TypeError(f"eip_method expects a Tableau, got {tableau!r}.")
+    if not isinstance(tableau, (Tableau, NystromTableau)):
+        raise TypeError(f"eip_method expects a Tableau or a NystromTableau, got {tableau!r}.")
     return type(f"EIP_{tableau.name}", (EIPSolver,), {"TABLEAU": tableau, "__doc__": f"EIP method on {tableau!r}."})

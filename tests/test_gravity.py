@@ -159,7 +159,7 @@ def test_gradients(n):
     q, v = y.reshape(2, n, 3)
     np.testing.assert_allclose(_gravity.momentum(0.0, y, gm), gm @ np.cross(q, v), rtol=0, atol=1e-14)
     step = 1e-6 * np.random.default_rng(3).standard_normal(6 * n)
-    ahead, back = ((_gravity.energy(0.0, z, gm), _gravity.momentum(0.0, z, gm)) for z in (y + step, y - step))
+    ahead, back = ((_gravity.energy(0.0, z, gm), np.array(_gravity.momentum(0.0, z, gm))) for z in (y + step, y - step))
     assert grad @ step == pytest.approx((ahead[0] - back[0]) / 2, rel=1e-4, abs=1e-14)
     np.testing.assert_allclose(grads @ step, (ahead[1] - back[1]) / 2, rtol=0, atol=1e-14)
 

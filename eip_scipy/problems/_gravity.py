@@ -458,7 +458,7 @@ def energy_gradient(t, y, f, out, params):
 
 @_jit_allocating
 def momentum(t, y, params):
-    """G times the angular momentum, (3,)."""
+    """G times the angular momentum, three numbers: an array would be allocated at every call."""
     half = y.size // 2
     lx = ly = lz = 0.0
     for i in range(params.size):
@@ -468,9 +468,7 @@ def momentum(t, y, params):
         lx += gm * (qy * vz - qz * vy)
         ly += gm * (qz * vx - qx * vz)
         lz += gm * (qx * vy - qy * vx)
-    out = np.empty(3)
-    out[0], out[1], out[2] = lx, ly, lz
-    return out
+    return lx, ly, lz
 
 
 @_jit
