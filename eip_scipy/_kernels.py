@@ -18,7 +18,8 @@ from ._lanes import abs_dot, dot, largest, remove_component
 OK, NOT_FINITE, FAILED_PROJECTION, POSTPONED = 0, 1, 2, 4
 
 EPS = 2.220446049250313e-16
-BAND_FACTOR = 4.0
+# Dead band in roundings of an invariant's terms; where the state's own roundings are carried, the values' remain.
+BAND, BAND_COMPENSATED = 4.0, 1.0
 METRIC_FLOOR = 1e-7
 RANK_TOLERANCE = sqrt(EPS)
 # Below this length one Gram-Schmidt pass would leave errors of 1e-13 and more of the defects uncorrected.
@@ -427,7 +428,7 @@ def soften(err, scale, groups, sigma):
 
 
 @_jit
-def defects(values, target, G, y_hat, scales, g, band, raw):
+def defects(values, target, G, y_hat, scales, compensated, g, band, raw):
     """Defects g = values - target and their dead bands; inside its band a defect is set to 0.
 
     `raw` keeps all of them. Returns whether anything is left to project.
@@ -436,7 +437,7 @@ def defects(values, target, G, y_hat, scales, g, band, raw):
     for i in range(g.size):
         size = max(abs(values[i]), abs(target[i]))
         size = max(max(size, scales[i]), abs_dot(G[i], y_hat))
-        band[i] = BAND_FACTOR * EPS * size
+        band[i] = (BAND_COMPENSATED if compensated else BAND) * EPS * size
         raw[i] = values[i] - target[i]
         g[i] = raw[i]
         if np.isfinite(band[i]) and abs(g[i]) <= band[i]:

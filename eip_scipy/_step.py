@@ -316,7 +316,7 @@ def newton_iteration(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
         w.counters[NFEV] += 1
     grad(t, y_new, w.f_point, w.G, params)
     w.counters[NJEV] += 1
-    if not kn.defects(w.values, o.target, w.G_r, y_new_r, o.scales, w.g, w.band, w.defect):
+    if not kn.defects(w.values, o.target, w.G_r, y_new_r, o.scales, o.compensated, w.g, w.band, w.defect):
         return False
     kn.weigh_rows(w.G_r, w.sigma, o.frame, w.B)
     kn.newton_matrix_solve(w.B, w.g, w.Q, w.pivots, rank, w.inner, w.mu)
@@ -341,7 +341,7 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_
             kn.copy(w.y_hat_r, y_new_r)
             return POSTPONED
     evaluate_invariants(inv, params, t, w.y_hat, o, w)
-    outside = kn.defects(w.values, o.target, w.G_r, w.y_hat_r, o.scales, w.g, w.band, w.before)
+    outside = kn.defects(w.values, o.target, w.G_r, w.y_hat_r, o.scales, o.compensated, w.g, w.band, w.before)
     if not outside:
         counters[SKIPPED] += 1
         kn.copy(w.y_hat_r, y_new_r)
