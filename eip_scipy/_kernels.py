@@ -407,7 +407,9 @@ def error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio):
 
 @_jit_inline
 def correction_in_local_errors(move, scale, groups, largest_error):
-    """Largest ratio over the blocks of the correction to the step's largest local error."""
+    """Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none."""
+    if largest_error == 0.0:
+        return 0.0
     top = 0.0
     for b in range(scale.size):
         if scale[b] > 0.0:
@@ -655,6 +657,18 @@ def first_move(G, sigma, frame, Q, inverse_norms, R, pivots, g, mu, y_hat, move,
     if rank >= 0:
         move_along(mu, Q, pivots, rank, sigma, frame, y_hat, move, out)
     return rank
+
+
+@_jit_inline
+def weighted_move(
+    weigh, largest_error, err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio,
+    G, frame, Q, inverse_norms, R, pivots, g, mu, move, out, more,
+):  # fmt: skip
+    """`error_metric` if `weigh`, `first_move`, `correction_in_local_errors`: from Python each call takes its time."""
+    if weigh:
+        largest_error = error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio)
+    rank = first_move(G, sigma, frame, Q, inverse_norms, R, pivots, g, mu, y_hat, move, out, more)
+    return largest_error, rank, correction_in_local_errors(move, scale, groups, largest_error)
 
 
 @_jit

@@ -22,16 +22,16 @@ LANES = 8
 VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 
 
-def _pointer(context: Any, builder: Any, kind: Any, array: Any, i: Any) -> Any:
+def _pointer(context: Any, builder: Any, kind: Any, array: Any, i: Any) -> Any:  # emits LLVM
     data = context.make_array(kind)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [i]), VECTOR.as_pointer())
 
 
-def _load(builder: Any, pointer: Any) -> Any:
+def _load(builder: Any, pointer: Any) -> Any:  # emits LLVM
     return builder.load(pointer, align=8)
 
 
-def _fold(builder: Any, vector: Any, join: Callable[..., Any]) -> Any:
+def _fold(builder: Any, vector: Any, join: Callable[..., Any]) -> Any:  # emits LLVM
     lanes = [builder.extract_element(vector, ir.Constant(ir.IntType(32), k)) for k in range(LANES)]
     while len(lanes) > 1:
         half = len(lanes) // 2
@@ -39,15 +39,15 @@ def _fold(builder: Any, vector: Any, join: Callable[..., Any]) -> Any:
     return lanes[0]
 
 
-def _add(builder: Any, a: Any, b: Any) -> Any:
+def _add(builder: Any, a: Any, b: Any) -> Any:  # emits LLVM
     return builder.fadd(a, b)
 
 
-def _larger(builder: Any, a: Any, b: Any) -> Any:
+def _larger(builder: Any, a: Any, b: Any) -> Any:  # emits LLVM
     return builder.select(builder.fcmp_ordered(">", b, a), b, a)
 
 
-def _loop(builder: Any, n: Any, body: Callable[[Any], Any], join: Callable[..., Any] = _add) -> Any:
+def _loop(builder: Any, n: Any, body: Callable[[Any], Any], join: Callable[..., Any] = _add) -> Any:  # emits LLVM
     """The vectors that `body` gives for i = 0, 8, ... below n, joined by lane, then the lanes."""
     total = cgutils.alloca_once_value(builder, ir.Constant(VECTOR, [0.0] * LANES))
     zero, step = (ir.Constant(n.type, value) for value in (0, LANES))
@@ -56,12 +56,12 @@ def _loop(builder: Any, n: Any, body: Callable[[Any], Any], join: Callable[..., 
     return _fold(builder, builder.load(total), join)
 
 
-def _products(context: Any, builder: Any, signature: Any, arguments: Any, i: Any) -> Any:
+def _products(context: Any, builder: Any, signature: Any, arguments: Any, i: Any) -> Any:  # emits LLVM
     a, b = (_load(builder, _pointer(context, builder, signature.args[k], arguments[k], i)) for k in range(2))
     return builder.fmul(a, b)
 
 
-@intrinsic
+@intrinsic  # emits LLVM
 def _lanes_dot(typingctx, a, b, n):
     def codegen(context, builder, signature, arguments):
         return _loop(builder, arguments[2], lambda i: _products(context, builder, signature, arguments, i))
@@ -69,7 +69,7 @@ def _lanes_dot(typingctx, a, b, n):
     return types.float64(a, b, types.intp), codegen
 
 
-@intrinsic
+@intrinsic  # emits LLVM
 def _lanes_abs_dot(typingctx, a, b, n):
     def codegen(context, builder, signature, arguments):
         kind = ir.FunctionType(VECTOR, [VECTOR])
@@ -83,7 +83,7 @@ def _lanes_abs_dot(typingctx, a, b, n):
     return types.float64(a, b, types.intp), codegen
 
 
-@intrinsic
+@intrinsic  # emits LLVM
 def _lanes_largest(typingctx, a, n):
     def codegen(context, builder, signature, arguments):
         return _loop(
@@ -96,7 +96,7 @@ def _lanes_largest(typingctx, a, n):
     return types.float64(a, types.intp), codegen
 
 
-@intrinsic
+@intrinsic  # emits LLVM
 def _lanes_remove(typingctx, row, unit_row, r, n):
     def codegen(context, builder, signature, arguments):
         spread = ir.Constant(VECTOR, ir.Undefined)

@@ -349,12 +349,9 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_
         if status == OK:
             kn.raise_to(w.defect, w.max_defect)
         return status
-    largest_error = 0.0
-    if o.metric == ERROR:
-        largest_error = kn.error_metric(
-            w.err, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio
-        )
-    status, rank, correction = correct(rhs, inv, grad, params, t_old, y, y_r, t, largest_error, o, w, y_new, y_new_r)
+    weigh = o.metric == ERROR
+    largest_error, rank, correction = move(rhs, grad, params, t_old, y, y_r, t, weigh, 0.0, o, w, y_new_r)
+    status = correct(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r)
     if o.direction == NEW and o.iterations == 1 and not o.compensated:
         alone = w.scale.size * o.groups.width == w.sigma.size
         doubtful = kn.all_finite(w.defect) if status != OK else alone and correction > HEALTHY
@@ -375,30 +372,39 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_
 
 
 @_jitable
-def correct(rhs, inv, grad, params, t_old, y, y_r, t, largest_error, o, w, y_new, y_new_r):
-    """One try: the Newton steps with the weights at hand. Returns the status, the rank and the correction's size."""
-    if o.direction == NEW:
-        more = o.iterations > 1
-        rank = kn.first_move(
-            w.G_r, w.sigma, o.frame, w.Q, w.inverse_norms, w.R, w.pivots, w.g, w.mu, w.y_hat_r, w.move, y_new_r, more
-        )
-    else:
-        rank = other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r)
+def move(rhs, grad, params, t_old, y, y_r, t, weigh, largest_error, o, w, y_new_r):
+    """The first Newton step; returns the largest relative error, the rank and the correction in local errors.
+
+    `weigh`: fill the weights of the error metric before; else they stand, for the `largest_error` given.
+    """
     w.counters[NLU] += 1
+    if o.direction == NEW:
+        return kn.weighted_move(
+            weigh, largest_error, w.err, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma, w.scale,
+            w.ratio, w.G_r, o.frame, w.Q, w.inverse_norms, w.R, w.pivots, w.g, w.mu, w.move, y_new_r, o.iterations > 1,
+        )  # fmt: skip
+    if weigh:
+        largest_error = kn.error_metric(
+            w.err, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio
+        )
+    rank = other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r)
+    return largest_error, rank, kn.correction_in_local_errors(w.move, w.scale, o.groups, largest_error)
+
+
+@_jitable
+def correct(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
+    """What follows the first Newton step: further ones, and whether the projection holds."""
     if rank < 0:
         kn.copy(w.before, w.defect)
-        return FAILED_PROJECTION, rank, 0.0
+        return FAILED_PROJECTION
     for _ in range(1, o.iterations):
         if not newton_iteration(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
             break
-    correction = 0.0
-    if largest_error > 0.0:
-        correction = kn.correction_in_local_errors(w.move, w.scale, o.groups, largest_error)
     if o.compensated:
         kn.copy(w.y_hat_r, y_new_r)
         kn.compensated_add(y_new_r, w.carry_hat, w.move)
     evaluate_invariants(inv, params, t, y_new, o, w)
-    return kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect), rank, correction
+    return kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect)
 
 
 @_jitable_cold
@@ -412,9 +418,8 @@ def correct_softly(rhs, inv, grad, params, t_old, y, y_r, t, largest_error, alon
     status, rank, correction = FAILED_PROJECTION, 0, np.inf
     for _ in range(MAX_SOFTENED):
         kn.soften(w.err, w.scale, o.groups, w.sigma)
-        status, rank, correction = correct(
-            rhs, inv, grad, params, t_old, y, y_r, t, largest_error, o, w, y_new, y_new_r
-        )
+        _, rank, correction = move(rhs, grad, params, t_old, y, y_r, t, False, largest_error, o, w, y_new_r)
+        status = correct(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r)
         if status == OK and not (alone and correction > HEALTHY):
             break
     return status, rank, correction

@@ -225,7 +225,7 @@ class EIPSolver(OdeSolver):
         solver = self.SCIPY(fresh, self.t, start, self.t_bound, **control)
         if np.isnan(solver.h_abs):
             return None  # SciPy's loop would never end
-        solver.fun = fresh  # in the place of SciPy's two wrappers, whose work it does
+        solver.fun = derivative  # in the place of SciPy's two wrappers, whose work it does
         return solver
 
     def _scipy_step(self, solver: OdeSolver) -> tuple[bool, str | None]:
@@ -235,6 +235,8 @@ class EIPSolver(OdeSolver):
             if not np.isfinite(solver.K).all():
                 message = f"fun returned a non-finite value at t={self.t:.10g}"
             return False, message
+        # SciPy keeps the value itself, and a user's function may return the same buffer again.
+        solver.f = solver.f.copy()
         self.y_old, self.y, self.t = self.y, solver.y, solver.t
         return True, None
 

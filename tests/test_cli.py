@@ -245,6 +245,15 @@ def test_an_interruption_while_timing_keeps_the_table(tmp_path, capsys, no_rebou
     assert [path.name for path in tmp_path.iterdir()] == ["solar-system.csv"]
 
 
+def test_an_interruption_anywhere_is_one_line(capsys, monkeypatch):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("eip_scipy.reproduce.reproduce", interrupted)
+    assert main(["reproduce", "table1", "--quiet"]) == 130
+    assert lines(capsys.readouterr().err) == ["eip-scipy: interrupted"]
+
+
 @pytest.mark.needs_jit
 def test_control_c(tmp_path):
     out = tmp_path / "out"
@@ -429,6 +438,22 @@ def test_a_run_that_ended_early_has_no_error_after_that():
     assert np.isfinite(errors[:, :50]).all()
     assert np.isnan(errors[:, 50:]).all()
     assert solar_errors.errors_at(scene, stopped, 100.0, truth) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "offset", "passed"),
+    [("IAS15", 5e-9, True), ("IAS15", 2e-8, False), ("EIPRK5 (tight)", 0.1, True), ("EIPRK5 (tight)", 0.3, False)],
+)
+def test_the_tightest_run_is_checked_against_the_stored_states(name, offset, passed):
+    """IAS15 by its positions, 1e-8 AU; another run need only be near enough for counting turns, 0.5 rad."""
+    scene = solar_run.make_scene("de440", 1.0, 0.1)
+    y = np.stack([scene.problem.y0, solar_run.stored_state(scene, 1.0)], axis=1)
+    y[3:5, 1] += offset  # Mercury
+    zero = np.zeros(2)
+    run = solar_run.MethodRun(name, (name,), 0.1, 0.0, np.array([0.0, 1.0]), y, zero, zero)
+    *_, check = solar_errors.Study(scene, 4, [run], run).checks()
+    assert check.text.startswith(f"{name} agrees with the stored states at 1 yr")
+    assert check.passed == passed
 
 
 def test_ecliptic_axes():

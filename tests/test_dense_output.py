@@ -29,7 +29,8 @@ EPS = np.finfo(float).eps
 PAIRS = [EIPRK23, EIPRK45, EIPDOP853]
 OWN = {cls: eip_method(cls.TABLEAU) for cls in PAIRS}
 pairs = pytest.mark.parametrize("method", PAIRS, ids=lambda m: m.__name__)
-every_class = pytest.mark.parametrize("method", [*PAIRS, EIPRK2, EIPRK4, EIPRK5], ids=lambda m: m.__name__)
+second_order = pytest.param(EIPRK2, marks=pytest.mark.slow_without_jit)  # in thousands of steps
+every_class = pytest.mark.parametrize("method", [*PAIRS, second_order, EIPRK4, EIPRK5], ids=lambda m: m.__name__)
 
 Y0 = pericentre(0.6)
 I0 = np.array([energy(0, Y0), momentum(0, Y0)])
@@ -299,6 +300,7 @@ def passing(component, value):
 LEVELS = {"default": {}, "backward": {"t_span": (8.0, 0.0)}, "every 3": {"every": 3}, "reuse_f off": {"reuse_f": False}}
 
 
+@pytest.mark.slow_without_jit
 @pairs
 @pytest.mark.parametrize("kind", LEVELS)
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8])
@@ -385,7 +387,10 @@ def test_an_invariant_as_an_event(method):
     assert all(len(t) > 0 for t in found.t_events)
 
 
-@pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.needs_jit), False])
+@pytest.mark.parametrize(
+    "compiled",
+    [pytest.param(True, marks=pytest.mark.needs_jit), pytest.param(False, marks=pytest.mark.slow_without_jit)],
+)
 @pairs
 def test_adversarial_thresholds_of_integrate(method, compiled):
     """The threshold comes with the parameters, so that one event is compiled for all."""

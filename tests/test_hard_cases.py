@@ -198,6 +198,14 @@ def test_command_prints_and_writes(tmp_path, capsys):
     assert (tmp_path / "hard-cases-EIPDOP853-error.png").read_bytes().startswith(PNG)
 
 
+def test_a_case_without_known_cause_is_judged_by_its_neighbours():
+    case = next(case for case in CASES if case.name not in command.CAUSES)
+    plain, projected = (command.Outcome(error, drift=0.0, steps=1, nfev=1) for error in (1e-6, 2e-6))
+    worse = command.Comparison(case, plain, projected, nearby=(1.5, 1.5, 0.1))
+    assert "scatter" in command.cause(worse)  # 0.5 * 1.5 * 1.5 > 1; the third is the euclidean metric's
+    assert "not known" in command.cause(replace(worse, nearby=(1.5, 1.2, 9.0)))
+
+
 @pytest.mark.usefixtures("few")
 def test_other_settings_have_no_bars_but_success(tmp_path, capsys):
     arguments = ["--method", "EIPRK23", "--rtol", "1e-4", "--metric", "euclidean", "--out", str(tmp_path)]

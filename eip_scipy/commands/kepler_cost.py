@@ -21,6 +21,7 @@ __all__ = ["Work", "add_arguments", "cost_to_reach", "measure", "run", "text"]
 
 DONE, INTERRUPTED = 0, 130
 T_END, REPEATS = 200.0, 5
+REFERENCE_STEPS = 40_000
 FIXED: dict[type[EIPSolver], tuple[int, ...]] = {
     # Steps in the whole run.
     EIPRK2: (10_000, 30_000, 100_000, 300_000, 1_000_000),
@@ -76,7 +77,7 @@ def measure(repeats: int = REPEATS, callback: Any = None) -> tuple[dict[str, Wor
     """
     problem = kepler(t_end=T_END)
     adaptive = replace(problem, h=None)
-    truth = integrate(problem, method=EIPDOP853, h=T_END / 40_000, compensated=True).y[:2, -1]
+    truth = integrate(problem, method=EIPDOP853, h=T_END / REFERENCE_STEPS, compensated=True).y[:2, -1]
     nfev: dict[tuple[str, float], int] = {}
     methods: dict[str, tuple[Runner, Sequence[float]]] = {}
     for method, counts in FIXED.items():

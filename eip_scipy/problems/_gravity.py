@@ -41,19 +41,19 @@ ESTIMATE = 0x5FE6996542967F58
 CUBIC = (2.216453840039739, -2.274298221857139, 1.3991927078645605, -0.3413483382980669)
 
 
-def _index(k: int) -> Any:
+def _index(k: int) -> Any:  # emits LLVM
     return ir.Constant(INDEX, k)
 
 
-def _lane(k: int) -> Any:
+def _lane(k: int) -> Any:  # emits LLVM
     return ir.Constant(ir.IntType(32), k)
 
 
-def _constant(values: Any) -> Any:
+def _constant(values: Any) -> Any:  # emits LLVM
     return ir.Constant(VECTOR, np.broadcast_to(np.asarray(values, dtype=float), LANES).tolist())
 
 
-class _Entries:
+class _Entries:  # emits LLVM
     """The entries of a 1-D array, by pointer; vectors at once where they are contiguous."""
 
     def __init__(self, builder: Any, kind: Any, array: Any, start: Any = None) -> None:
@@ -93,7 +93,7 @@ class _Entries:
             b.store(b.extract_element(vector, _lane(k)), self._pointer(b.add(i, _index(k))))
 
 
-class _Lanes:
+class _Lanes:  # emits LLVM
     """Emits instructions on vectors of eight lanes."""
 
     def __init__(self, builder: Any) -> None:
@@ -189,7 +189,7 @@ class _Lanes:
         return self.fma(b.fmul(m, h), self.fma(_constant(15 / 8), h, _constant(3 / 2)), m)
 
 
-class _Sources(_Lanes):
+class _Sources(_Lanes):  # emits LLVM
     """Bodies as they meet `targets` others: lane k holds target k % targets and source k // targets of a group."""
 
     def __init__(self, builder: Any, q: _Entries, gm: _Entries, targets: int) -> None:
@@ -223,7 +223,7 @@ class _Sources(_Lanes):
         return self.row(f"eip_below_{self.targets}", rows, k)
 
 
-def _emit_accelerations(s: _Sources, n: Any, out: _Entries, first: Any) -> None:
+def _emit_accelerations(s: _Sources, n: Any, out: _Entries, first: Any) -> None:  # emits LLVM
     b = s.builder
     x = s.own(s.q, first)
     total = [cgutils.alloca_once_value(b, _constant(0.0)) for _ in range(3)]
@@ -251,7 +251,7 @@ def _emit_accelerations(s: _Sources, n: Any, out: _Entries, first: Any) -> None:
     out.store(s.pick(xy, [c * m + k for k in range(m) for c in range(3)], z), b.mul(first, _index(3)))
 
 
-def _emit_potential(s: _Sources, n: Any, first: Any, begin: Any, from_row: np.ndarray) -> tuple[Any, Any]:
+def _emit_potential(s: _Sources, n: Any, first: Any, begin: Any, from_row: np.ndarray) -> tuple[Any, Any]:  # emits LLVM
     """The potential of each target in the field of those after it, from `begin` on, with its carry."""
     b = s.builder
     x = s.own(s.q, first)
@@ -269,7 +269,7 @@ def _emit_potential(s: _Sources, n: Any, first: Any, begin: Any, from_row: np.nd
     return b.load(potential), b.load(carry)
 
 
-def _emit_energy(s: _Sources, n: Any, first: Any, skip: Any) -> Any:
+def _emit_energy(s: _Sources, n: Any, first: Any, skip: Any) -> Any:  # emits LLVM
     b, zero = s.builder, _constant(0.0)
     from_row = np.arange(LANES) >= np.arange(LANES + 1)[:, None]
     begin = b.add(b.add(first, skip), _index(1))
@@ -285,18 +285,18 @@ def _emit_energy(s: _Sources, n: Any, first: Any, skip: Any) -> Any:
     return s.carried_fold(total, s.fma(gm, carry, lost))
 
 
-def _entries(context: Any, builder: Any, signature: Any, arguments: Any, k: int) -> _Entries:
+def _entries(context: Any, builder: Any, signature: Any, arguments: Any, k: int) -> _Entries:  # emits LLVM
     kind = signature.args[k]
     return _Entries(builder, kind, context.make_array(kind)(context, builder, arguments[k]))
 
 
-def _require_vectors(*kinds: Any) -> None:
+def _require_vectors(*kinds: Any) -> None:  # emits LLVM
     for kind in kinds:
         if not (isinstance(kind, types.Array) and kind.ndim == 1 and kind.dtype == types.float64):
             raise TypingError(f"N bodies: expected a vector of float64, got {kind}")
 
 
-def _acceleration_block(targets: int) -> Any:
+def _acceleration_block(targets: int) -> Any:  # emits LLVM
     """``block(q, gm, out, first)`` for the bodies first ... first + targets - 1."""
 
     @intrinsic
@@ -313,7 +313,7 @@ def _acceleration_block(targets: int) -> Any:
     return block
 
 
-@intrinsic
+@intrinsic  # emits LLVM
 def _energy_block(typingctx, y, gm, first, skip):
     """Energy of the bodies first + skip ... first + 7, with the pairs that they make with later ones."""
     _require_vectors(y, gm)
