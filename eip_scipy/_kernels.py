@@ -489,8 +489,13 @@ def subtract_sparse(start, index, value, spatial, factors, a):
 @_jit_inline
 def weigh_rows(G, sigma, frame, B):
     """Rows B_i = sigma * (G_i projected along the frame)."""
+    framed = frame.products.size > 0
     for i in range(B.shape[0]):
         row = B[i]
+        if not framed:
+            for j in range(row.size):
+                row[j] = G[i, j] * sigma[j]
+            continue
         for j in range(row.size):
             row[j] = G[i, j]
         sparse_products(frame.m_start, frame.m_index, frame.m_value, frame.spatial, row, frame.products)
@@ -551,31 +556,32 @@ def factor(B, inverse_norms, R, pivots):
 
 
 @_jit
-def solve_gram(B, g, inverse_norms, R, mu):
+def solve_gram(B, g, R, mu):
     """Coefficients mu of the rows of B in the least-norm x with B x = -g, if the rows are far from dependent.
 
     By Cholesky's factorisation of the rows' Gram matrix, which costs a third of `factor` and squares the condition
-    number: whether it will do shows on the way, by the same bound below which one pass of Gram-Schmidt would not.
+    number: whether it will do shows on the way, by the same bound below which one pass of Gram-Schmidt would not. The
+    diagonal of R holds reciprocals.
     """
     rows = B.shape[0]
     for i in range(rows):
         for j in range(i + 1):
             R[i, j] = dot(B[i], B[j])
-        if not 1e-200 < R[i, i] < 1e200:
+        if not 1e-140 < R[i, i] < 1e140:
             return False
-        inverse_norms[i] = 1.0 / sqrt(R[i, i])
     for i in range(rows):
-        value = -g[i] * inverse_norms[i]
-        square = 1.0
+        value = -g[i]
+        square = R[i, i]
+        least = REORTHOGONALISE * REORTHOGONALISE * square
         for j in range(i):
-            x = R[i, j] * inverse_norms[i] * inverse_norms[j]
+            x = R[i, j]
             for k in range(j):
                 x -= R[i, k] * R[j, k]
             x *= R[j, j]
             R[i, j] = x
             square -= x * x
             value -= x * mu[j]
-        if not square > REORTHOGONALISE * REORTHOGONALISE:
+        if not square > least:
             return False
         R[i, i] = 1.0 / sqrt(square)
         mu[i] = value * R[i, i]
@@ -584,8 +590,6 @@ def solve_gram(B, g, inverse_norms, R, mu):
         for j in range(i + 1, rows):
             value -= R[j, i] * mu[j]
         mu[i] = value * R[i, i]
-    for i in range(rows):
-        mu[i] *= inverse_norms[i]
     return True
 
 
@@ -647,7 +651,7 @@ def first_move(G, sigma, frame, Q, inverse_norms, R, pivots, g, mu, y_hat, move,
     `more`: other steps follow, for which the directions in Q must be orthonormal.
     """
     weigh_rows(G, sigma, frame, Q)
-    if not more and solve_gram(Q, g, inverse_norms, R, mu):
+    if not more and solve_gram(Q, g, R, mu):
         rank = Q.shape[0]
         for i in range(rank):
             pivots[i] = i

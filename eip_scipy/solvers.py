@@ -229,14 +229,16 @@ class EIPSolver(OdeSolver):
         return solver
 
     def _scipy_step(self, solver: OdeSolver) -> tuple[bool, str | None]:
-        message = solver.step()
+        # Not its step(), whose bookkeeping is done for this solver already.
+        success, message = solver._step_impl()
         self.nfev = self._calls[0]
-        if solver.status == "failed":
+        if not success:
             if not np.isfinite(solver.K).all():
                 message = f"fun returned a non-finite value at t={self.t:.10g}"
             return False, message
         # SciPy keeps the value itself, and a user's function may return the same buffer again.
         solver.f = solver.f.copy()
+        solver.t_old = self.t
         self.y_old, self.y, self.t = self.y, solver.y, solver.t
         return True, None
 
