@@ -95,6 +95,18 @@ def test_one_step_is_the_tableau(method):
         np.testing.assert_allclose(run.y[:, -1], expected, rtol=4e-16, atol=4e-16)
 
 
+@both
+def test_time_reaches_every_stage(method):
+    """q'' = -9 sin 3t from t0 = 0.4: exact q = sin 3t."""
+    start, end = (np.array([np.sin(3 * t), 3 * np.cos(3 * t)]) for t in (0.4, 2.4))
+    for compensated in (False, True):
+        run = integrate(
+            lambda t, q: np.array([-9 * np.sin(3 * t)]), (0.4, 2.4), start, method=method, h=0.05,
+            compensated=compensated,
+        )  # fmt: skip
+        np.testing.assert_allclose(run.y[:, -1], end, rtol=0, atol=1e-10)
+
+
 @pytest.mark.needs_jit
 @both
 @pytest.mark.parametrize("options", [{"invariants": ()}, KEPT, {**KEPT, "every": 3}, {**KEPT, "every": "auto"}])
