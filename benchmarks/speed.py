@@ -3,7 +3,7 @@
     python benchmarks/speed.py [--json FILE]
 
 1. Compiled Kepler EIP-RK4 with H and L against a loop in which the same step (stages, metric, projection) is fused by
-   hand for this one problem; per step also against solve_ivp with SciPy's RK45.
+   hand for this one problem; per step also against solve_ivp with SciPy's RK45, and so EIP-RK45 with adaptive steps.
 2. Compiled solar system, EIP-RK4 (H, L, blocks, frame) against plain compiled RK4.
 3. A second process: from its start to its first compiled step, with a user's functions that no cache knows.
 4. Importing eip_scipy against importing scipy.integrate and numba.
@@ -23,7 +23,7 @@ import numpy as np
 from numba import njit
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK4, Invariant, integrate
+from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
 from eip_scipy.problems import kepler, solar_system
 
 REPEATS = 7
@@ -179,10 +179,25 @@ def kepler_speed() -> dict[str, float]:
         out[f"{metric}: in place [us/step]"] = 1e6 * in_place
     solution = solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9)
     scipy_step = least(lambda: solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9)) / (solution.t.size - 1)
+    adaptive = integrate(
+        kepler_array, (0, 6000), y0, method=EIPRK45, rtol=1e-6, atol=1e-9, invariants=arrays, save_every=1
+    )
+    adaptive_step = least_run(
+        fun=kepler_array,
+        t_span=(0, 6000),
+        y0=y0,
+        method=EIPRK45,
+        rtol=1e-6,
+        atol=1e-9,
+        invariants=arrays,
+        compiled=True,
+    ) / (adaptive.t.size - 1)
     fixed = least(lambda: solve_ivp(kepler_array, (0, 60), y0, method=EIPRK4, h=H, invariants=arrays)) / round(60 / H)
     out["solve_ivp RK45 [us/step]"] = 1e6 * scipy_step
     out["solve_ivp EIPRK4 with H and L [us/step]"] = 1e6 * fixed
     out["solve_ivp RK45 / compiled EIPRK4 (array-returning), per step"] = scipy_step / array
+    out["compiled EIPRK45, adaptive, with H and L [us/step]"] = 1e6 * adaptive_step
+    out["solve_ivp RK45 / compiled EIPRK45 (array-returning), per step"] = scipy_step / adaptive_step
     return out
 
 

@@ -10,21 +10,41 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.integrate import OdeSolver
 
-from ._kernels import EPS, FrameRows, Grouping
-from ._step import AUTO, ERROR, EUCLIDEAN, GIVEN, MIDPOINT, NEW, OLD, Method, Options, Work, make_work, project_step
+from ._kernels import EPS, NOT_FINITE, FrameRows, Grouping
+from ._step import (
+    AUTO,
+    ERROR,
+    EUCLIDEAN,
+    GIVEN,
+    MIDPOINT,
+    NEW,
+    OLD,
+    T_NEW,
+    TOO_SMALL,
+    H,
+    Method,
+    Options,
+    Span,
+    T,
+    Work,
+    make_work,
+    project_step,
+)
 from .invariants import InvariantSet
 from .nystrom import NystromTableau
 from .result import LAST_RANK, Diagnostics
 from .tableaux import Tableau
 
-__all__ = ["ProjectionOptions", "Run", "as_derivative", "fixed_steps", "nearest_option", "prepare"]
+__all__ = ["ProjectionOptions", "Run", "Stepping", "as_derivative", "fixed_steps", "nearest_option", "prepare"]
 
 # Unsigned: Numba then leaves out the test for negative indices, which costs more than the access itself.
 INDEX = np.uint64
 DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
 START_ITERATIONS = 50
 UNBOUNDED = 2**62
+LEAST_RTOL = 100 * EPS  # SciPy's
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +61,33 @@ class ProjectionOptions:
     reuse_f: bool = True
     check: bool = True
     project_initial: bool = False
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """How a run steps: by a fixed `h`, or, where that is None, by tolerances, from `first_step` (None: estimated)."""
+
+    span: Span
+    h: float | None
+    first_step: float | None
+    rtol: np.ndarray
+    atol: np.ndarray
+
+    def first(
+        self,
+        rhs: Callable[[float, np.ndarray], np.ndarray],
+        y0: np.ndarray,
+        f0: np.ndarray,
+        tableau: Tableau | NystromTableau,
+    ) -> float:
+        """Length of the first step."""
+        if self.h is not None:
+            return self.h
+        if self.first_step is not None:
+            return self.first_step
+        t0, t_bound, max_step = self.span.t0, self.span.t_bound, self.span.max_step
+        order = tableau.error_estimator_order or 0
+        return initial_step(rhs, t0, y0, t_bound, max_step, f0, order, self.rtol, self.atol)
 
 
 @dataclass
@@ -230,15 +277,45 @@ def step_bounds(first_step: Any, max_step: Any, t0: float, t_bound: float) -> tu
     return float(first_step), float(max_step)
 
 
-def adaptive_rtol(rtol: Any) -> Any:
-    """rtol, no smaller than SciPy takes it."""
-    least = 100 * EPS
-    if np.any(np.asarray(rtol) < least):
-        warnings.warn(
-            f"At least one element of `rtol` is too small. Setting `rtol = np.maximum(rtol, {least})`.", stacklevel=4
+def stepping(
+    name: str,
+    tableau: Tableau | NystromTableau,
+    t0: float,
+    t_bound: float,
+    n: int,
+    h: Any,
+    first_step: Any,
+    max_step: Any,
+    rtol: Any,
+    atol: Any,
+    *,
+    stacklevel: int,
+) -> Stepping:
+    """Validate the options of the step size; `stacklevel` is that of the user, for a warning.
+
+    Raises
+    ------
+    ValueError
+        For options with wrong values, for `h` beside those of adaptive steps, and without `h` where the method `name`
+        has no error estimate.
+    """
+    if h is None and not tableau.has_estimate:
+        raise ValueError(f"{name} has no error estimate and needs the step h=...")
+    if h is not None and (first_step is not None or max_step != np.inf):
+        raise ValueError(
+            "h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other."
         )
-        return np.maximum(rtol, least)
-    return rtol
+    first_step, max_step = step_bounds(first_step, max_step, t0, t_bound)
+    rtol, atol = tolerances(rtol, atol, n)
+    if h is not None:
+        h = check_fixed_step(h, t0, t_bound)
+    elif np.any(rtol < LEAST_RTOL):
+        message = f"At least one element of `rtol` is too small. Setting `rtol = np.maximum(rtol, {LEAST_RTOL})`."
+        warnings.warn(message, stacklevel=stacklevel)
+        rtol = np.maximum(rtol, LEAST_RTOL)
+    sign = -1.0 if t_bound < t0 else 1.0
+    n_steps = UNBOUNDED if h is None else fixed_steps(h, t0, t_bound)
+    return Stepping(Span(t0, sign * (h or 0.0), t_bound, sign, n_steps, max_step), h, first_step, rtol, atol)
 
 
 def initial_step(
@@ -472,12 +549,10 @@ def prepare(
     f0: np.ndarray,
     tau: float,
     projection: ProjectionOptions,
-    rtol: Any,
-    atol: Any,
+    stepping: Stepping,
     *,
     extra: tuple = (),
     compensated: bool = False,
-    adaptive: bool = False,
 ) -> Run:
     """Validate a run's options and make its buffers; the invariants are checked at the start.
 
@@ -491,16 +566,16 @@ def prepare(
     tau : float
         Step or initial step: the scale of time of the checks.
     projection : ProjectionOptions
-    rtol, atol : float or array_like
+    stepping : Stepping
     extra : tuple
         Further arguments of the invariants' functions (``(params,)`` or nothing).
-    compensated, adaptive : bool
+    compensated : bool
     """
     n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
     kind, sigma = _metric(projection.metric, tableau, n, width)
     if not isinstance(projection.direction, str) or projection.direction not in DIRECTIONS:
         raise ValueError(f"direction must be 'new', 'old' or 'midpoint', got {projection.direction!r}.")
-    rtol, atol = tolerances(rtol, atol, n)
+    rtol, atol = stepping.rtol, stepping.atol
     groups = blocks_of(projection.blocks, n, width)
     invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra)
     options = Options(
@@ -521,7 +596,7 @@ def prepare(
         reuse_f=_flag("reuse_f", projection.reuse_f),
         uses_f=invariants.uses_f,
         compensated=_flag("compensated", compensated),
-        adaptive=adaptive,
+        adaptive=stepping.h is None,
     )
     arrays = method_arrays(tableau)
     work = make_work(n, y0.dtype, arrays.b.size, invariants.size, groups.start.size - 1)
@@ -579,6 +654,15 @@ def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
         f"projection failed at t={t:g}: invariant {invariants.names[worst]!r}, residual {work.defect[worst]:.3g}, "
         f"rank {int(work.counters[LAST_RANK])} of {invariants.size}"
     )
+
+
+def failure(status: int, run: Run, clock: np.ndarray) -> str:
+    """Why a step failed."""
+    if status == NOT_FINITE:
+        return not_finite(run.work, run.method, clock[T], clock[H])
+    if status == TOO_SMALL:
+        return OdeSolver.TOO_SMALL_STEP
+    return projection_failure(run.invariants, run.work, clock[T_NEW])
 
 
 def not_finite(work: Work, method: Method, t: float, h: float) -> str:

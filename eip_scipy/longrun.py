@@ -18,9 +18,9 @@ from . import _kernels as kn
 from . import _setup
 from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures
 from ._events import Events
-from ._kernels import NOT_FINITE, OK
+from ._kernels import OK
 from ._setup import ProjectionOptions, Run
-from ._step import T_NEW, TOO_SMALL, H, Span, T, finish_step, next_step
+from ._step import T_NEW, Span, T, finish_step, next_step
 from .dense import ManifoldDenseOutput, dense_output
 from .invariants import Invariant, InvariantSet, as_invariants
 from .nystrom import NystromTableau
@@ -373,7 +373,6 @@ def integrate(
         raise TypeError(f"integrate() has no option {name!r}{hint}")
     given = {"invariants": invariants, "metric": metric, "blocks": blocks, "frame": frame}
     given = {key: value for key, value in given.items() if value is not DEFAULT}
-    given_h = h
     tableau = _tableau(method)
     form = FORMS[isinstance(tableau, NystromTableau), bool(in_place)]
     if isinstance(fun, Problem):
@@ -382,7 +381,8 @@ def integrate(
         fun = problem.fun if problem.rhs is None else problem.rhs
         t_span = problem.t_span if t_span is None else t_span
         y0 = problem.y0 if y0 is None else y0
-        h = problem.h if h is None else h
+        if h is None and first_step is None and max_step == np.inf:
+            h = problem.h
         own = {key: getattr(problem, key) for key in ("invariants", "metric", "blocks", "frame")}
         given = {**own, **given}
         given["invariants"] = [_with_run_params(item, problem.params) for item in as_invariants(given["invariants"])]
@@ -395,14 +395,9 @@ def integrate(
     happenings = Events(events, extra)
     t0, t_bound = _span(t_span, happenings.terminal)
     start = _setup.initial_state(_required("y0", y0))
-    if first_step is not None or max_step != np.inf:
-        if given_h is not None:
-            raise ValueError(
-                "h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other."
-            )
-        h = None
-    if h is None and not tableau.has_estimate:
-        raise ValueError(f"{method.__name__} has no error estimate and needs the step h=...")
+    stepping = _setup.stepping(
+        method.__name__, tableau, t0, t_bound, start.size, h, first_step, max_step, rtol, atol, stacklevel=3
+    )
     if params is not None and "invariants" in given:
         given["invariants"] = [_with_run_params(item, params) for item in as_invariants(given["invariants"])]
     rhs = INTERPRETED[form](fun, extra, start)
@@ -413,21 +408,11 @@ def integrate(
         return out
 
     calls = _setup.Counted(derivative)
-    first_step, max_step = _setup.step_bounds(first_step, max_step, t0, t_bound)
-    if h is None:
-        _setup.tolerances(rtol, atol, start.size)
-        rtol = _setup.adaptive_rtol(rtol)
-    else:
-        h = _setup.check_fixed_step(h, t0, t_bound)
-    tolerances = _setup.tolerances(rtol, atol, start.size)
     f0 = calls(t0, start)
     if isinstance(tableau, NystromTableau):
         _setup.check_second_order(calls, t0, start, f0, method.__name__)
-    tau = h or first_step
-    if tau is None:
-        order = tableau.error_estimator_order or 0
-        tau = _setup.initial_step(calls, t0, start, t_bound, max_step, f0, order, *tolerances)
-    grid = _grid(t0, t_bound, h, tau, max_step, save_every, t_eval, happenings)
+    tau = stepping.first(calls, start, f0, tableau)
+    grid = _grid(stepping.span, tau, save_every, t_eval, happenings)
     projection = ProjectionOptions(
         **given,
         direction=direction,
@@ -437,19 +422,7 @@ def integrate(
         check=check,
         project_initial=project_initial,
     )
-    run = _setup.prepare(
-        tableau,
-        calls,
-        t0,
-        start,
-        f0,
-        tau,
-        projection,
-        *tolerances,
-        extra=extra,
-        compensated=compensated,
-        adaptive=h is None,
-    )
+    run = _setup.prepare(tableau, calls, t0, start, f0, tau, projection, stepping, extra=extra, compensated=compensated)
     bound = 0.5 * free_memory() if max_bytes is None else max_bytes
     check_memory(saved_rows(grid), run, bound)
     record = Diagnostics() if diagnostics is None else diagnostics
@@ -519,7 +492,7 @@ class _Loop:
             if code == FULL:
                 driver.grow(self.max_bytes)
             elif code not in (OK, PAUSE):
-                return -1, self._failure(code)
+                return -1, _setup.failure(code, driver.run, driver.grid.clock)
             elif code == OK and driver.grid.clock[T] == driver.grid.span.t_bound:
                 return 0, "reached the end of the interval"
             if code == OK:
@@ -568,14 +541,6 @@ class _Loop:
                 driver.grid.place[ROW] = row + 1
                 return True
         return False
-
-    def _failure(self, code: int) -> str:
-        run, clock = self.driver.run, self.driver.grid.clock
-        if code == NOT_FINITE:
-            return _setup.not_finite(run.work, run.method, clock[T], clock[H])
-        if code == TOO_SMALL:
-            return EIPSolver.TOO_SMALL_STEP
-        return _setup.projection_failure(run.invariants, run.work, clock[T_NEW])
 
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
         driver = self.driver
@@ -667,51 +632,34 @@ def _with_run_params(item: Invariant, params: Any) -> Invariant:
     return bare
 
 
-def _grid(
-    t0: float,
-    t_bound: float,
-    h: float | None,
-    tau: float,
-    max_step: float,
-    save_every: Any,
-    t_eval: Any,
-    events: Events,
-) -> Grid:
-    sign = -1.0 if t_bound < t0 else 1.0
+def _grid(span: Span, tau: float, save_every: Any, t_eval: Any, events: Events) -> Grid:
     times = np.zeros(0)
     if t_eval is not None:
         if save_every is not None:
             raise ValueError("give save_every or t_eval, not both.")
-        times = _evaluation_times(t_eval, t0, t_bound, sign)
+        times = _evaluation_times(t_eval, span)
     n_events = len(events.functions)
     return Grid(
-        span=Span(
-            t0=t0,
-            h=sign * (h or 0.0),
-            t_bound=t_bound,
-            sign=sign,
-            n_steps=_setup.UNBOUNDED if h is None else _setup.fixed_steps(h, t0, t_bound),
-            max_step=max_step,
-        ),
+        span=span,
         save_every=0 if save_every is None else _setup.count("save_every", save_every),
         t_eval=times,
         place=np.zeros(3, np.int64),
-        clock=np.array([t0, t0, 0.0, tau]),
+        clock=np.array([span.t0, span.t0, 0.0, tau]),
         g=np.zeros(n_events),
         g_new=np.zeros(n_events),
         g_direction=events.directions,
     )
 
 
-def _evaluation_times(t_eval: Any, t0: float, t_bound: float, sign: float) -> np.ndarray:
+def _evaluation_times(t_eval: Any, span: Span) -> np.ndarray:
     times = np.array(t_eval, dtype=float)
     if times.ndim != 1 or times.size == 0:
         raise ValueError("`t_eval` must be 1-dimensional and not empty.")
     if not np.isfinite(times).all():
         raise ValueError("t_eval must be finite.")
-    if np.any(times < min(t0, t_bound)) or np.any(times > max(t0, t_bound)):
+    if np.any(times < min(span.t0, span.t_bound)) or np.any(times > max(span.t0, span.t_bound)):
         raise ValueError("Values in `t_eval` are not within `t_span`.")
-    if np.any(sign * np.diff(times) <= 0):
+    if np.any(span.sign * np.diff(times) <= 0):
         raise ValueError("Values in `t_eval` are not properly sorted.")
     return times
 

@@ -12,9 +12,9 @@ import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
 from . import _setup
-from ._kernels import FAILED_PROJECTION, NOT_FINITE, OK
-from ._setup import ProjectionOptions
-from ._step import T_NEW, TOO_SMALL, H, Span, T, close_step, next_step, project_step
+from ._kernels import FAILED_PROJECTION, OK
+from ._setup import ProjectionOptions, Stepping
+from ._step import T_NEW, T, close_step, next_step, project_step
 from .dense import ExactEnds, dense_output
 from .invariants import as_invariants
 from .nystrom import RKN86, RKN1210, NystromTableau
@@ -156,47 +156,20 @@ class EIPSolver(OdeSolver):
         self._calls = [0]
         derivative, self._rhs = _checked(fun, start.size, start.dtype, vectorized, self._calls)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
-        adaptive = h is None
-        if adaptive and not self.TABLEAU.has_estimate:
-            raise ValueError(f"{type(self).__name__} has no error estimate and needs the step h=...")
-        if not adaptive and (first_step is not None or max_step != np.inf):
-            raise ValueError(
-                "h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other."
-            )
-        first_step, self.max_step = _setup.step_bounds(first_step, max_step, t0, t_bound)
-        if adaptive:
-            _setup.tolerances(rtol, atol, self.n)
-            rtol = _setup.adaptive_rtol(rtol)
-        else:
-            h = _setup.check_fixed_step(h, t0, t_bound)
-        self.h = h
-        self.rtol, self.atol = _setup.tolerances(rtol, atol, self.n)
-        self._k = 0
-        self._span = Span(
-            t0=t0,
-            h=0.0 if h is None else h * self.direction,
-            t_bound=t_bound,
-            sign=self.direction,
-            n_steps=_setup.UNBOUNDED if h is None else _setup.fixed_steps(h, t0, t_bound),
-            max_step=self.max_step,
+        stepping = _setup.stepping(
+            type(self).__name__, self.TABLEAU, t0, t_bound, self.n, h, first_step, max_step, rtol, atol, stacklevel=4
         )
-        self._scipy = self._scipy_solver(derivative, start, first_step, as_invariants(invariants)) if adaptive else None
+        self.h, self.max_step = stepping.h, stepping.span.max_step
+        self.rtol, self.atol = stepping.rtol, stepping.atol
+        self._k, self._span = 0, stepping.span
+        kept = as_invariants(invariants)
+        self._scipy = self._scipy_solver(derivative, start, stepping, kept)
         f0 = derivative(t0, start.copy()).copy() if self._scipy is None else np.zeros_like(start)
         if isinstance(self.TABLEAU, NystromTableau):
             _setup.check_second_order(lambda t, y: derivative(t, y).copy(), t0, start, f0, type(self).__name__)
-        self.h_abs = h if h is not None else first_step
-        if self.h_abs is None and self._scipy is None:
-            self.h_abs = _setup.initial_step(
-                derivative,
-                t0,
-                start,
-                t_bound,
-                self.max_step,
-                f0,
-                self.TABLEAU.error_estimator_order or 0,
-                self.rtol,
-                self.atol,
-            )
+        self.h_abs = stepping.first_step
+        if self._scipy is None:
+            self.h_abs = stepping.first(derivative, start, f0, self.TABLEAU)
         run = _setup.prepare(
             self.TABLEAU,
             derivative,
@@ -205,7 +178,7 @@ class EIPSolver(OdeSolver):
             f0,
             self.h_abs or 0.0,
             ProjectionOptions(
-                invariants=invariants,
+                invariants=kept,
                 metric=metric,
                 blocks=blocks,
                 frame=frame,
@@ -216,9 +189,7 @@ class EIPSolver(OdeSolver):
                 check=check,
                 project_initial=project_initial,
             ),
-            rtol,
-            atol,
-            adaptive=adaptive,
+            stepping,
         )
         _setup.attach(diagnostics, run)
         self._run, self._work = run, run.work
@@ -240,16 +211,17 @@ class EIPSolver(OdeSolver):
         self,
         derivative: Callable[[float, np.ndarray], np.ndarray],
         start: np.ndarray,
-        first_step: float | None,
+        stepping: Stepping,
         invariants: tuple[Any, ...],
     ) -> OdeSolver | None:
-        if self.SCIPY is None or invariants or type(self)._project_step is not EIPSolver._project_step:
+        own_steps = invariants or type(self)._project_step is not EIPSolver._project_step
+        if self.SCIPY is None or stepping.h is not None or own_steps:
             return None
 
         def fresh(t: float, y: np.ndarray) -> np.ndarray:
             return derivative(t, y).copy()
 
-        control = {"first_step": first_step, "max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
+        control = {"first_step": stepping.first_step, "max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
         solver = self.SCIPY(fresh, self.t, start, self.t_bound, **control)
         if np.isnan(solver.h_abs):
             return None  # SciPy's loop would never end
@@ -279,7 +251,7 @@ class EIPSolver(OdeSolver):
         )  # fmt: skip
         self._count()
         if status != OK:
-            return False, self._failure(status)
+            return False, _setup.failure(status, run, clock)
         self._k += 1
         self.y_old, self.f_old = y, self.f
         self.y, self.t, self.f = self._accepted, float(clock[T_NEW]), w.f_new.copy()
@@ -298,14 +270,6 @@ class EIPSolver(OdeSolver):
             return FAILED_PROJECTION
         close_step(rhs, params, t_new, self._accepted, project, self._projection_status, o, w)
         return OK
-
-    def _failure(self, status: int) -> str:
-        clock, run = self._clock, self._run
-        if status == NOT_FINITE:
-            return _setup.not_finite(run.work, run.method, clock[T], clock[H])
-        if status == TOO_SMALL:
-            return self.TOO_SMALL_STEP
-        return _setup.projection_failure(run.invariants, run.work, clock[T_NEW])
 
     def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
         """The accepted state from a raw step; override to act after each step.

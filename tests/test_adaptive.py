@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
+from systems import H_USES_F, VOLTERRA, H, L, energy, energy_gradient, lotka_volterra, orbit, pericentre
 
 from eip_scipy import (
     EIPDOP853,
@@ -30,28 +31,7 @@ METHODS = [EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]
 second_order = pytest.param(EIPRK2, marks=pytest.mark.slow_without_jit)  # in thousands of steps
 methods = pytest.mark.parametrize("method", [second_order, *METHODS[1:]], ids=lambda m: m.__name__)
 E = 0.6
-Y0 = np.array([1 - E, 0.0, 0.0, math.sqrt((1 + E) / (1 - E))])
-
-
-def orbit(t, y):
-    return np.array([y[2], y[3], *(-y[:2] / math.hypot(y[0], y[1]) ** 3)])
-
-
-def energy(t, y):
-    return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.hypot(y[0], y[1])
-
-
-def energy_gradient(t, y):
-    return np.array([*(y[:2] / math.hypot(y[0], y[1]) ** 3), y[2], y[3]])
-
-
-def momentum(t, y):
-    return y[0] * y[3] - y[1] * y[2]
-
-
-H = Invariant(energy, energy_gradient, name="energy")
-L = Invariant(momentum, lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]), name="momentum")
-H_USES_F = Invariant(energy, lambda t, y, f: np.array([-f[2], -f[3], y[2], y[3]]), name="energy", uses_f=True)
+Y0 = pericentre(E)
 
 
 def by_scipy(fun, t_span, y0, *, method=EIPRK45, **options):
@@ -353,6 +333,14 @@ def test_h_with_options_of_adaptive_steps(driver):
         driver(orbit, (0, 10), Y0, h=0.1, max_step=0.2)
 
 
+@both
+def test_invariants_from_an_iterator(driver):
+    """Read once, not first for whether there are any and then for what they are."""
+    run, same = (driver(orbit, (0, 1), Y0, invariants=given) for given in (iter([H, L]), [H, L]))
+    assert run.diagnostics.names == ("energy", "momentum")
+    np.testing.assert_array_equal(run.y, same.y)
+
+
 def test_unknown_options():
     with pytest.warns(UserWarning, match="EIPRK45 has no option 'max_stepp'; it is ignored; did you mean 'max_step'"):
         EIPRK45(orbit, 0, Y0, 1.0, max_stepp=3)
@@ -394,29 +382,18 @@ def test_endless_interval_without_one():
 # Failures: rejected, retried, reported, everything kept.
 
 
-def lotka_volterra(t, u):
-    return np.array([u[0] * (1 - u[1]), u[1] * (u[0] - 1)])
-
-
-def volterra(t, u):
-    return u[0] - math.log(u[0]) + u[1] - math.log(u[1]) if (u > 0).all() else math.nan
-
-
-V = Invariant(volterra, lambda t, u: 1 - 1 / u, name="Volterra")
-
-
 @both
 @pytest.mark.parametrize("method", [EIPRK2, EIPRK23, EIPRK4, EIPRK45], ids=lambda m: m.__name__)
 def test_invariant_nan_after_a_trial_step_is_mended_by_shorter_ones(driver, method):
     """A first step of 2 at a loose tolerance takes Lotka-Volterra to u < 0: rejected, h x 0.25, and on it goes."""
-    options = {"rtol": 0.5, "atol": 5.0, "first_step": 2.0, "invariants": V, "metric": "euclidean"}
+    options = {"rtol": 0.5, "atol": 5.0, "first_step": 2.0, "invariants": VOLTERRA, "metric": "euclidean"}
     run = driver(lotka_volterra, (0, 20), [4.0, 2.0], method=method, **options)
     assert run.status == 0
     assert (run.y > 0).all()
     assert run.diagnostics.n_rejected_projections >= 1
     assert run.t[1] - run.t[0] < 1.0
     assert np.isfinite(run.max_defect).all()
-    assert np.ptp([volterra(0, u) for u in run.y.T]) < 3.0
+    assert np.ptp([VOLTERRA.fun(0, u) for u in run.y.T]) < 3.0
 
 
 def turn(t, y):

@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 from scipy.integrate import RK45, solve_ivp
+from systems import oscillator
 
 from eip_scipy import (
     EIPRK1,
@@ -27,10 +28,6 @@ from eip_scipy.problems import kepler
 
 EPS = np.finfo(float).eps
 Y0 = [1.0, 2.0]
-
-
-def oscillator(t, y):
-    return np.array([y[1], -y[0]])
 
 
 def square(t, y):

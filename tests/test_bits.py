@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
+from systems import jit_momentum as momentum
+from systems import jit_momentum_gradient as momentum_gradient
 
 from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, Invariant, integrate
 from eip_scipy.problems import nbody
@@ -39,16 +41,6 @@ def energy_gradient(t, y):
 @njit
 def energy_gradient_of_f(t, y, f):
     return np.array([-f[2], -f[3], y[2], y[3]])
-
-
-@njit
-def momentum(t, y):
-    return y[0] * y[3] - y[1] * y[2]
-
-
-@njit
-def momentum_gradient(t, y):
-    return np.array([y[3], -y[2], -y[1], y[0]])
 
 
 @njit

@@ -6,6 +6,20 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
+from systems import (
+    H_USES_F,
+    H,
+    L,
+    energy,
+    jit_energy,
+    jit_energy_gradient,
+    jit_momentum,
+    jit_momentum_gradient,
+    jit_orbit,
+    momentum,
+    orbit,
+    pericentre,
+)
 
 from eip_scipy import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, EIPRK23, EIPRK45, Invariant, eip_method, integrate
 from eip_scipy.diagnostics import observed_order
@@ -18,30 +32,7 @@ pairs = pytest.mark.parametrize("method", PAIRS, ids=lambda m: m.__name__)
 second_order = pytest.param(EIPRK2, marks=pytest.mark.slow_without_jit)  # in thousands of steps
 every_class = pytest.mark.parametrize("method", [*PAIRS, second_order, EIPRK4, EIPRK5], ids=lambda m: m.__name__)
 
-E = 0.6
-Y0 = np.array([1 - E, 0.0, 0.0, math.sqrt((1 + E) / (1 - E))])
-
-
-def orbit(t, y):
-    return np.array([y[2], y[3], *(-y[:2] / math.hypot(y[0], y[1]) ** 3)])
-
-
-def energy(t, y):
-    return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.hypot(y[0], y[1])
-
-
-def momentum(t, y):
-    return y[0] * y[3] - y[1] * y[2]
-
-
-def momentum_gradient(t, y):
-    return np.array([y[3], -y[2], -y[1], y[0]])
-
-
-H = Invariant(energy, lambda t, y: np.array([*(y[:2] / math.hypot(y[0], y[1]) ** 3), y[2], y[3]]), name="H")
-L = Invariant(momentum, momentum_gradient, name="L")
-# The same energy by f: its gradient is (-a, v).
-H_USES_F = Invariant(energy, lambda t, y, f: np.array([-f[2], -f[3], y[2], y[3]]), name="H", uses_f=True)
+Y0 = pericentre(0.6)
 I0 = np.array([energy(0, Y0), momentum(0, Y0)])
 
 
@@ -394,26 +385,6 @@ def test_an_invariant_as_an_event(method):
     found = solve(method, invariants=[H, L], events=events)
     assert found.status == 0
     assert all(len(t) > 0 for t in found.t_events)
-
-
-@njit
-def jit_orbit(t, y):
-    r3 = (y[0] * y[0] + y[1] * y[1]) ** 1.5
-    return np.array([y[2], y[3], -y[0] / r3, -y[1] / r3])
-
-
-@njit
-def jit_energy(t, y):
-    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1 / np.sqrt(y[0] * y[0] + y[1] * y[1])
-
-
-@njit
-def jit_energy_gradient(t, y):
-    r3 = (y[0] * y[0] + y[1] * y[1]) ** 1.5
-    return np.array([y[0] / r3, y[1] / r3, y[2], y[3]])
-
-
-jit_momentum, jit_momentum_gradient = njit(momentum), njit(momentum_gradient)
 
 
 @pytest.mark.parametrize(

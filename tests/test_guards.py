@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from systems import SQUARE, VOLTERRA, lotka_volterra, oscillator
 
 from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, Diagnostics, Invariant, integrate, project
 from eip_scipy.problems import kepler, solar_system
@@ -14,15 +15,10 @@ METRICS = ["error", "euclidean"]
 GM_SUN, AU = 1.32712440018e20, 1.495978707e11
 
 
-def oscillator(t, y):
-    return np.array([y[1], -y[0]])
-
-
 def pendulum(t, y):
     return np.array([y[1], -math.sin(y[0])])
 
 
-SQUARE = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="S")
 PENDULUM_ENERGY = Invariant(
     lambda t, y: 0.5 * y[1] ** 2 - math.cos(y[0]), lambda t, y: np.array([math.sin(y[0]), y[1]]), name="H"
 )
@@ -423,17 +419,6 @@ def test_contradiction_on_the_way(driver, iterations):
 
 
 # Failing projections and right-hand sides: status -1, the message of the contract, everything kept.
-
-
-def lotka_volterra(t, u):
-    return np.array([u[0] * (1 - u[1]), u[1] * (u[0] - 1)])
-
-
-def volterra_value(t, u):
-    return u[0] - math.log(u[0]) + u[1] - math.log(u[1]) if (u > 0).all() else math.nan
-
-
-VOLTERRA = Invariant(volterra_value, lambda t, u: 1 - 1 / u, name="V")
 
 
 @both

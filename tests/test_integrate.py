@@ -7,6 +7,7 @@ import mpmath
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from systems import SQUARE, oscillator
 
 from eip_scipy import (
     EIPRK1,
@@ -29,15 +30,10 @@ EPS = np.finfo(float).eps
 Y0 = np.array([1.0, 2.0])
 
 
-def oscillator(t, y):
-    return np.array([y[1], -y[0]])
-
-
 def exact(t):
     return np.array([np.cos(t) + 2 * np.sin(t), 2 * np.cos(t) - np.sin(t)])
 
 
-SQUARE = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="S")
 PAIR = Invariant(lambda t, y: np.array([y @ y, y @ y + 1]), lambda t, y: np.array([2 * y, 2 * y]), name="P")
 
 

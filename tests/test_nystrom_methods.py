@@ -5,6 +5,7 @@ import numba
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from systems import energy, jit_energy, jit_energy_gradient, jit_momentum, jit_momentum_gradient
 
 from eip_scipy import EIPRKN8, EIPRKN12, Diagnostics, Invariant, NystromTableau, eip_method, integrate
 from eip_scipy.diagnostics import observed_order
@@ -29,28 +30,7 @@ def orbit(t, y):
     return np.concatenate([y[2:], acceleration(t, y[:2])])
 
 
-@numba.njit
-def energy(t, y):
-    return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2)
-
-
-@numba.njit
-def energy_gradient(t, y):
-    w = (y[0] ** 2 + y[1] ** 2) ** -1.5
-    return np.array([w * y[0], w * y[1], y[2], y[3]])
-
-
-@numba.njit
-def momentum(t, y):
-    return y[0] * y[3] - y[1] * y[2]
-
-
-@numba.njit
-def momentum_gradient(t, y):
-    return np.array([y[3], -y[2], -y[1], y[0]])
-
-
-INVARIANTS = [Invariant(energy, energy_gradient, name="H"), Invariant(momentum, momentum_gradient, name="L")]
+INVARIANTS = [Invariant(jit_energy, jit_energy_gradient), Invariant(jit_momentum, jit_momentum_gradient)]
 KEPT = {"invariants": INVARIANTS, "blocks": 2}
 
 

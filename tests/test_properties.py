@@ -9,6 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from systems import H, L, orbit, oscillator
 
 from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, Invariant, integrate, project
 from eip_scipy.problems import harmonic, kepler, nbody
@@ -447,10 +448,6 @@ def weights(err, y, y_hat, rtol, atol, blocks, kappa):
     return sigma / sigma.max(), scale, r
 
 
-def spin(t, y):
-    return np.array([y[1], -y[0]])
-
-
 def swing(t, y):
     """Henon and Heiles."""
     return np.array([y[2], y[3], -y[0] - 2 * y[0] * y[1], -y[1] - y[0] ** 2 + y[1] ** 2])
@@ -465,18 +462,7 @@ def swing_gradient(t, y):
     return np.array([-f[2], -f[3], y[2], y[3]])
 
 
-def orbit(t, y):
-    return np.array([y[2], y[3], *(-y[:2] / math.hypot(y[0], y[1]) ** 3)])
-
-
-ORBIT = [
-    Invariant(
-        lambda t, y: 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / math.hypot(y[0], y[1]),
-        lambda t, y: np.array([*(y[:2] / math.hypot(y[0], y[1]) ** 3), y[2], y[3]]),
-        name="H",
-    ),
-    Invariant(lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]), name="L"),
-]
+ORBIT = [H, L]
 LAYOUTS = {
     "components": (None, [[0], [1], [2], [3]]),
     "pairs": (2, [[0, 1], [2, 3]]),
@@ -531,8 +517,8 @@ def test_components_without_error_hardly_move():
 def test_given_weights():
     keep = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y)
     start, options = np.array([1.0, 2.0]), {"method": EIPRK4, "h": 0.5, "invariants": keep}
-    run = integrate(spin, (0, 0.5), start, metric=[3.0, 0.0], **options)
-    y_hat, _ = raw_step(EIPRK4.TABLEAU, spin, 0.0, start, 0.5)
+    run = integrate(oscillator, (0, 0.5), start, metric=[3.0, 0.0], **options)
+    y_hat, _ = raw_step(EIPRK4.TABLEAU, oscillator, 0.0, start, 0.5)
     assert run.y[1, -1] == pytest.approx(y_hat[1], rel=2 * EPS)
     assert run.y[0, -1] - y_hat[0] == pytest.approx((5 - y_hat @ y_hat) / (2 * y_hat[0]), rel=1e-9)
 

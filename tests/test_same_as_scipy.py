@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import DOP853, RK23, RK45, solve_ivp
+from systems import jit_energy, jit_energy_gradient, jit_momentum, jit_momentum_gradient, jit_orbit, orbit, pericentre
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, Diagnostics, Invariant, eip_method, integrate
 from eip_scipy.problems import kepler
@@ -25,14 +26,6 @@ OWN_LEVEL = {"RK23": 1e-9, "RK45": 1e-6, "DOP853": 2e-3}
 pairs = pytest.mark.parametrize(("name", "method"), PAIRS, ids=[cls.__name__ for _, cls in PAIRS])
 
 
-def orbit(t, y):
-    return np.array([y[2], y[3], *(-y[:2] / math.hypot(y[0], y[1]) ** 3)])
-
-
-def orbit_start(e):
-    return np.array([1 - e, 0.0, 0.0, math.sqrt((1 + e) / (1 - e))])
-
-
 def van_der_pol(t, y, mu=5.0):
     return np.array([y[1], mu * (1 - y[0] ** 2) * y[1] - y[0]])
 
@@ -47,12 +40,12 @@ def rotor(t, y):
 
 
 CASES = {
-    "Kepler e=.6": (orbit, (0.0, 20.0), orbit_start(0.6)),
-    "Kepler e=.9": (orbit, (0.0, 7.0), orbit_start(0.9)),
+    "Kepler e=.6": (orbit, (0.0, 20.0), pericentre(0.6)),
+    "Kepler e=.9": (orbit, (0.0, 7.0), pericentre(0.9)),
     "van der Pol": (van_der_pol, (0.0, 30.0), [2.0, 0.0]),
     "complex": (spin, (0.0, 20.0), [1.0 + 0j, 0.2j]),
     "driven rotor": (rotor, (-1.0, 20.0), [1.5, 0.0]),
-    "backward Kepler": (orbit, (3.0, -20.0), orbit_start(0.6)),
+    "backward Kepler": (orbit, (3.0, -20.0), pericentre(0.6)),
     "backward complex": (spin, (5.0, 0.0), [1.0 + 0j, 0.2j]),
     "one component": (lambda t, y: np.array([math.cos(t) * y[0]]), (0.0, 10.0), [1.0]),
     "one component at zero": (lambda t, y: np.array([t]), (0.0, 10.0), [0.0]),
@@ -230,7 +223,7 @@ def test_failures(name, method):
 @pairs
 def test_first_steps_of_the_solver_object(name, method):
     """max_step below the spacing of t: the first step is taken, the second fails, with SciPy's own words."""
-    solvers = [m(orbit, 5.0, orbit_start(0.6), 9.0, max_step=1e-20) for m in (method, SCIPY[name])]
+    solvers = [m(orbit, 5.0, pericentre(0.6), 9.0, max_step=1e-20) for m in (method, SCIPY[name])]
     for _ in range(2):
         messages = [solver.step() for solver in solvers]
         assert messages[0] == messages[1]
@@ -242,7 +235,7 @@ def test_first_steps_of_the_solver_object(name, method):
 
 @pairs
 def test_attributes_step_by_step(name, method):
-    ours, theirs = (m(orbit, 0.0, orbit_start(0.6), 5.0) for m in (method, SCIPY[name]))
+    ours, theirs = (m(orbit, 0.0, pericentre(0.6), 5.0) for m in (method, SCIPY[name]))
     rtol = level(name, method)
     while theirs.status == "running":
         assert ours.status == "running"
@@ -260,33 +253,6 @@ def test_attributes_step_by_step(name, method):
 
 
 # `integrate` and the classes: the same steps, bit for bit, from the same jitted functions.
-
-
-@njit
-def jit_orbit(t, y):
-    r3 = (y[0] * y[0] + y[1] * y[1]) ** 1.5
-    return np.array([y[2], y[3], -y[0] / r3, -y[1] / r3])
-
-
-@njit
-def jit_energy(t, y):
-    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1 / np.sqrt(y[0] * y[0] + y[1] * y[1])
-
-
-@njit
-def jit_energy_gradient(t, y):
-    r3 = (y[0] * y[0] + y[1] * y[1]) ** 1.5
-    return np.array([y[0] / r3, y[1] / r3, y[2], y[3]])
-
-
-@njit
-def jit_momentum(t, y):
-    return y[0] * y[3] - y[1] * y[2]
-
-
-@njit
-def jit_momentum_gradient(t, y):
-    return np.array([y[3], -y[2], -y[1], y[0]])
 
 
 @njit
@@ -322,8 +288,8 @@ def jit_lower_event(t, y):
 ORBIT = [Invariant(jit_energy, jit_energy_gradient, name="H"), Invariant(jit_momentum, jit_momentum_gradient, name="L")]
 NORM = Invariant(jit_norm, jit_norm_gradient, name="N")
 RUNS = {
-    "orbit": (jit_orbit, (0.0, 15.0), orbit_start(0.6), ORBIT),
-    "backward": (jit_orbit, (2.0, -10.0), orbit_start(0.6), ORBIT),
+    "orbit": (jit_orbit, (0.0, 15.0), pericentre(0.6), ORBIT),
+    "backward": (jit_orbit, (2.0, -10.0), pericentre(0.6), ORBIT),
     "complex": (jit_spin, (0.0, 15.0), np.array([1.0 + 0j, 0.2j]), NORM),
     "complex backward": (jit_spin, (3.0, -9.0), np.array([1.0 + 0j, 0.2j]), NORM),
 }

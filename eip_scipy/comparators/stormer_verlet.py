@@ -14,11 +14,11 @@ from numba import njit, types
 from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
+from .._setup import check_fixed_step, fixed_steps
+
 __all__ = ["FORMS", "StormerVerletResult", "stormer_verlet"]
 
 FORMS = ("kick-drift-kick", "drift-kick-drift")
-
-_EPS = np.finfo(float).eps
 
 
 @dataclass(frozen=True)
@@ -115,14 +115,15 @@ def stormer_verlet(
     if form not in FORMS:
         raise ValueError(f"unknown form {form!r}: expected one of {', '.join(map(repr, FORMS))}")
     extra = () if params is None else (_real_vector(params, "params"),)
-    n_steps = _count_steps(t0, t_bound, h)
+    h = check_fixed_step(h, t0, t_bound)
+    n_steps = fixed_steps(h, t0, t_bound)
     saved = _saved_steps(n_steps, save_every)
 
     checked = _checked(acc, y.size // 2)
     a = checked(t0, y[: y.size // 2], *extra).copy()
     reason = _why_interpreted(acc, len(extra))
     drive = _drive if reason else _compiled_drive(len(extra))
-    step = math.copysign(float(h), t_bound - t0)
+    step = math.copysign(h, t_bound - t0)
     last_step = t_bound - (t0 + (n_steps - 1) * step)
     ys = np.empty((saved.size, y.size))
     ys[0] = y
@@ -167,24 +168,6 @@ def _check_state(y0: Any) -> np.ndarray:
     if not np.isfinite(y).all():
         raise ValueError("All components of the initial state `y0` must be finite.")
     return y
-
-
-def _count_steps(t0: float, t_bound: float, h: float) -> int:
-    """Count the steps of length h; the last one may be shorter, unless all fit to rounding."""
-    if not (h > 0 and math.isfinite(h)):
-        raise ValueError(f"`h` must be positive and finite, got {h!r}")
-    length = abs(t_bound - t0)
-    if length == 0:
-        return 0
-    spacing = math.ulp(max(abs(t0), abs(t_bound)))
-    if h < 10 * spacing:
-        raise ValueError(f"`h` = {h!r} is less than 10 spacings of t ({spacing:.1e} on this interval)")
-    tolerance = max(1e-9, 8 * _EPS * (length + abs(t0) + abs(t_bound)) / h)
-    ratio = length / h
-    if ratio < 1 - tolerance:
-        raise ValueError(f"`h` exceeds bounds: {h!r} on an interval of length {length!r}")
-    nearest = round(ratio)
-    return nearest if abs(ratio - nearest) <= tolerance else math.ceil(ratio)
 
 
 def _saved_steps(n_steps: int, save_every: int | None) -> np.ndarray:

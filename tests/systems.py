@@ -1,0 +1,80 @@
+"""Small systems that several test modules share: oscillator, Kepler's problem (G M = 1), Lotka-Volterra."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from eip_scipy import Invariant
+
+
+def oscillator(t, y):
+    return np.array([y[1], -y[0]])
+
+
+SQUARE = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="S")
+
+
+# Kepler's problem in the plane, y = (x, y, vx, vy). The invariants take states (4, m) too.
+
+
+def pericentre(e):
+    """The state there, on an orbit of semi-major axis 1."""
+    return np.array([1 - e, 0.0, 0.0, math.sqrt((1 + e) / (1 - e))])
+
+
+def orbit(t, y):
+    return np.array([y[2], y[3], *(-y[:2] / math.hypot(y[0], y[1]) ** 3)])
+
+
+def energy(t, y):
+    return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.hypot(y[0], y[1])
+
+
+def energy_gradient(t, y):
+    return np.array([*(y[:2] / math.hypot(y[0], y[1]) ** 3), y[2], y[3]])
+
+
+def momentum(t, y):
+    return y[0] * y[3] - y[1] * y[2]
+
+
+def momentum_gradient(t, y):
+    return np.array([y[3], -y[2], -y[1], y[0]])
+
+
+H = Invariant(energy, energy_gradient, name="energy")
+L = Invariant(momentum, momentum_gradient, name="momentum")
+# The same energy by f: its gradient is (-a, v).
+H_USES_F = Invariant(energy, lambda t, y, f: np.array([-f[2], -f[3], y[2], y[3]]), name="energy", uses_f=True)
+
+
+@njit
+def jit_orbit(t, y):
+    r3 = (y[0] * y[0] + y[1] * y[1]) ** 1.5
+    return np.array([y[2], y[3], -y[0] / r3, -y[1] / r3])
+
+
+@njit
+def jit_energy(t, y):
+    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1 / np.sqrt(y[0] * y[0] + y[1] * y[1])
+
+
+@njit
+def jit_energy_gradient(t, y):
+    r3 = (y[0] * y[0] + y[1] * y[1]) ** 1.5
+    return np.array([y[0] / r3, y[1] / r3, y[2], y[3]])
+
+
+jit_momentum, jit_momentum_gradient = njit(momentum), njit(momentum_gradient)
+
+
+def lotka_volterra(t, u):
+    return np.array([u[0] * (1 - u[1]), u[1] * (u[0] - 1)])
+
+
+def _volterra(t, u):
+    return u[0] - math.log(u[0]) + u[1] - math.log(u[1]) if (u > 0).all() else math.nan
+
+
+VOLTERRA = Invariant(_volterra, lambda t, u: 1 - 1 / u, name="V")
