@@ -120,6 +120,44 @@ def test_compensated_step_loses_nothing_of_a_small_increment():
     assert abs(sum(exact([out[0], rest[0]])) - expected) < 2.0**-106
 
 
+def test_compensated_nystrom_step():
+    """To the square of a rounding but for the sums over the stages, which are plain."""
+    rng = RNG(14)
+    y, K = rng.standard_normal(4), rng.standard_normal((2, 4))
+    carry, h = 1e-17 * rng.standard_normal(4), 0.1
+    b, b_v = np.array([0.0, 0.3]), np.array([0.7, 0.0])
+    b_low, b_v_low = np.array([0.0, 1e-17]), np.array([-2e-17, 0.0])
+    out, rest = np.empty(4), np.empty(4)
+    kn.compensated_nystrom(y, carry, h, b, b_low, b_v, b_v_low, K, out, rest)
+    q, v = (np.array(exact(part)) for part in (y[:2], y[2:]))
+    dq, dv = (np.array(exact(part)) for part in (carry[:2], carry[2:]))
+    a, step = (np.array(exact(row[2:])) for row in K), Fraction(h)
+    first, second = a
+    weight, weight_v = Fraction(0.3) + Fraction(1e-17), Fraction(0.7) - Fraction(2e-17)
+    place = q + dq + step * (v + dv) + step**2 * weight * second
+    speed = v + dv + step * weight_v * first
+    found = [Fraction(x) + Fraction(r) for x, r in zip(out, rest, strict=True)]
+    # Each sum over the stages is one product, rounded once.
+    bounds = EPS * np.abs(np.concatenate([h * h * 0.3 * K[1, 2:], h * 0.7 * K[0, 2:]]))
+    assert (np.abs(np.array(found) - np.concatenate([place, speed])) <= bounds).all()
+    assert (np.abs(rest) <= 0.5 * EPS * np.abs(out)).all()
+
+
+@pytest.mark.parametrize("places", [(30, 20), (1, 40)])
+def test_compensated_nystrom_step_carries_every_rounding(places):
+    """Weights and accelerations that are powers of two: nothing but the carried products is rounded."""
+    up, down = (2.0**-k for k in places)
+    y, carry = np.array([1.0, 1 / 3]), np.array([2.0**-57, -(2.0**-59)])
+    K, h, low = np.array([[0.0, up]]), 0.1 * down, np.array([2.0**-56])
+    out, rest = np.empty(2), np.empty(2)
+    kn.compensated_nystrom(y, carry, h, np.array([0.5]), low, np.array([1.0]), low, K, out, rest)
+    q, v, dq, dv, step, a, more = map(Fraction, (*y, *carry, h, up, low[0]))
+    place = q + dq + step * (v + dv) + step**2 * a * (Fraction(1, 2) + more)
+    speed = v + dv + step * a * (1 + more)
+    for x, r, wanted in zip(out, rest, (place, speed), strict=True):
+        assert abs(Fraction(x) + Fraction(r) - wanted) < 2.0**-106
+
+
 def test_compensated_add():
     y, carry = np.array([1.0, -3.0]), np.array([2.0**-55, 2.0**-57])
     move = np.array([2.0**-54, 1.0 + 2.0**-52])

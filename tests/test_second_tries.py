@@ -17,23 +17,23 @@ HEALTHY, TRIES = 5.0, 3
 class Case:
     """A state at rest, an invariant that moves away from it by `defect` in the step, and an error estimate at will."""
 
-    def __init__(self, slope, bend, defect, err, blocks=None):
+    def __init__(self, slope, bend, defect, err, blocks=None, kind=float):
         self.slope, self.bend, self.defect, self.blocks = np.array(slope), bend, defect, blocks
-        self.err, self.y = np.array(err), np.ones(len(slope))
+        self.err, self.y = np.array(err), np.ones(len(slope), dtype=kind)
         self.evaluated = []
 
     def value(self, t, y):
         self.evaluated.append(y.copy())
-        d = y - self.y
+        d = (y - self.y).real
         return self.slope @ d + self.bend * d[0] ** 2 + self.defect * t / STEP
 
     def gradient(self, t, y):
-        out = self.slope.copy()
+        out = self.slope.astype(self.y.dtype)
         out[0] += 2 * self.bend * (y - self.y)[0]
         return out
 
     def run(self):
-        err = self.err
+        err = self.err.astype(self.y.dtype).view(float)
 
         class Given(EIPRK4):
             def _project_step(self, t, y, y_hat, _):
@@ -89,10 +89,11 @@ def check(case, tries, good=True):
         np.testing.assert_array_equal(sol.y[:, -1], after_start[-1])
 
 
+@pytest.mark.parametrize("kind", [float, complex])
 @pytest.mark.parametrize(("factor", "tries"), [(0.0049, 1), (0.0053, 2), (1.5, 3), (2.0, 4), (20.0, 4)])
-def test_components_alone_soften_until_the_correction_is_healthy(factor, tries):
+def test_components_alone_soften_until_the_correction_is_healthy(factor, tries, kind):
     """The second component, with nearly all of the gradient, has an estimate a million times smaller."""
-    check(Case([1e-3, 1.0], 0.0, factor * 1e-6, [1e-6, 1e-12]), tries)
+    check(Case([1e-3, 1.0], 0.0, factor * 1e-6, [1e-6, 1e-12], kind=kind), tries)
 
 
 def test_blocks_are_believed():
