@@ -309,7 +309,7 @@ def test_least_norm_solution():
 def gram(rows, g):
     size = len(rows)
     mu = np.full(size, math.nan)
-    done = kn.solve_gram(np.array(rows), g, np.empty(size), np.empty((size, size)), mu)
+    done = kn.solve_gram(np.array(rows), g, np.empty((size, size)), mu)
     return done, mu
 
 
@@ -328,7 +328,7 @@ def test_gram_solution_is_refused_where_rows_are_nearly_dependent(angle, done):
     assert gram(rows / np.linalg.norm(rows, axis=1, keepdims=True), np.ones(3))[0] == done
 
 
-@pytest.mark.parametrize("length", [0.0, 1e-101, 1e101, math.nan, math.inf])
+@pytest.mark.parametrize("length", [0.0, 1e-71, 1e71, math.nan, math.inf])
 def test_gram_solution_is_refused_where_squares_do_not_fit(length):
     assert not gram([[1.0, 0.0], [0.0, length]], np.ones(2))[0]
 
