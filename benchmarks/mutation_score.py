@@ -31,7 +31,17 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = ("_step", "_kernels", "projection")
-TESTS = ("kernels", "projection", "properties", "guards", "adaptive", "integrate", "tables", "units")
+TESTS = (
+    "kernels",
+    "second_tries",
+    "nystrom_methods",
+    "properties",
+    "guards",
+    "adaptive",
+    "integrate",
+    "tables",
+    "units",
+)
 MARKERS = "not slow and not needs_jit and not slow_without_jit"
 PRELOADED = ("numba", "scipy.integrate", "scipy.optimize", "mpmath", "pytest")
 LOG, KILLER = "log.txt", "killer.txt"

@@ -489,7 +489,7 @@ def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y
         clock[T_NEW] = span.t_bound if last else t_new
         clock[H] = span.h if not (adaptive or last) else clock[T_NEW] - t
         h_abs = abs(clock[H])
-        project = o.target.size > 0 and (last or (k + 1) % spacing == 0)
+        project = o.target.size > 0 and (last or spacing == 1 or (k + 1) % spacing == 0)
         status = raw_step(rhs, params, t, y, y_r, clock[T_NEW], clock[H], project, m, o, w)
         norm = w.norm[0] if adaptive else 0.0
         if status == OK and not np.isfinite(norm):

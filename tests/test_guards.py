@@ -136,6 +136,18 @@ def test_zero_gradient_drops_the_row_and_counts():
     assert (run.y[2:, -1] == 0).all()
 
 
+@both
+@pytest.mark.parametrize("direction", ["new", "old", "midpoint"])
+def test_without_any_gradient_the_raw_state_stays(driver, direction):
+    """A defect that nothing can correct: rank 0, counted, and no failure while it does not grow in the projection."""
+    square = Invariant(lambda t, y: y[0] ** 2 + 1e-3 * t, lambda t, y: np.array([2 * y[0], 0.0]))
+    options = {"h": 0.25, "invariants": square, "direction": direction, "check": False}
+    run = driver(lambda t, y: np.array([0.0, 1.0]), (0, 1), [0.0, 3.0], **options)
+    np.testing.assert_array_equal(run.y, [[0.0] * 5, [3.0, 3.25, 3.5, 3.75, 4.0]])
+    assert run.diagnostics.n_projections == run.diagnostics.n_rank_reduced == 4
+    assert run.max_defect[0] == 1e-3
+
+
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_project_with_zero_gradient(iterations):
     result = project([0.0, 0.0], SQUARE, target=1.0, iterations=iterations)
@@ -306,6 +318,7 @@ def test_a_step_on_the_manifold_is_returned_bitwise(driver, metric, iterations):
     assert run.diagnostics.n_skipped == 100
     assert run.diagnostics.n_projections == 0
     assert run.nlu == 0
+    assert run.max_defect[0] == np.abs(run.y.sum(axis=0) - run.y[:, 0].sum()).max() > 0
 
 
 @pytest.mark.parametrize("defect", [3, 5])

@@ -1,5 +1,7 @@
 """Runge-Kutta-Nystrom methods through solve_ivp and integrate: orders, dense output, bits, what they refuse."""
 
+from fractions import Fraction
+
 import mpmath
 import numba
 import numpy as np
@@ -31,6 +33,7 @@ def orbit(t, y):
 
 
 INVARIANTS = [Invariant(jit_energy, jit_energy_gradient), Invariant(jit_momentum, jit_momentum_gradient)]
+TAYLOR = NystromTableau("Taylor 2", [[]], ["1/2"], [1], [0], 1, reference="q + h v + h^2 a / 2, v + h a")
 KEPT = {"invariants": INVARIANTS, "blocks": 2}
 
 
@@ -73,6 +76,18 @@ def test_one_step_is_the_tableau(method):
     for compensated in (False, True):
         run = integrate(acceleration, (0, h), Y0, method=method, h=h, compensated=compensated)
         np.testing.assert_allclose(run.y[:, -1], expected, rtol=4e-16, atol=4e-16)
+
+
+@both
+def test_time_reaches_every_stage(method):
+    """q'' = -9 sin 3t from t0 = 0.4: exact q = sin 3t."""
+    start, end = (np.array([np.sin(3 * t), 3 * np.cos(3 * t)]) for t in (0.4, 2.4))
+    for compensated in (False, True):
+        run = integrate(
+            lambda t, q: np.array([-9 * np.sin(3 * t)]), (0.4, 2.4), start, method=method, h=0.05,
+            compensated=compensated,
+        )  # fmt: skip
+        np.testing.assert_allclose(run.y[:, -1], end, rtol=0, atol=1e-10)
 
 
 @pytest.mark.needs_jit
@@ -217,9 +232,25 @@ def test_compensation_of_a_nystrom_step():
     assert np.all(drift[True] < 0.5 * drift[False])
 
 
+def test_compensated_sum_of_a_constant_acceleration():
+    """There and back in 3000 steps of a length with many bits, against fractions; one stage leaves no sum to round."""
+    h, steps, a = 0.1, 3_000, np.array([1 / 3, -0.7])
+    v0 = -0.5 * a * (steps * h)
+    last = Fraction(steps * h - (steps - 1) * h)
+    time = (steps - 1) * Fraction(h) + last
+    exact_end = [Fraction(v) * time + Fraction(x) * time**2 / 2 for v, x in zip(v0, a, strict=True)]
+
+    def error(compensated):
+        options = {"h": h, "method": eip_method(TAYLOR), "compensated": compensated, "compiled": False}
+        y = integrate(lambda t, q: a, (0, steps * h), np.concatenate([0 * v0, v0]), **options).y[:2, -1]
+        return max(abs(float(Fraction(x) - wanted)) for x, wanted in zip(y, exact_end, strict=True))
+
+    assert error(True) < 1e-14
+    assert error(False) > 100 * error(True)
+
+
 def test_a_tableau_of_ones_own():
-    stormer = NystromTableau("Taylor 2", [[]], ["1/2"], [1], [0], 1, reference="q + h v + h^2 a / 2, v + h a")
-    method = eip_method(stormer)
+    method = eip_method(TAYLOR)
     run = integrate(acceleration, (0, 1), Y0, method=method, h=0.001, **KEPT)
     assert run.success
     assert method.__doc__ == "EIP method on <NystromTableau Taylor 2: 1 stages, order 1>."
@@ -233,7 +264,7 @@ def test_every_is_a_number_or_auto(value):
 
 
 def test_auto_needs_an_estimate():
-    method = eip_method(NystromTableau("Taylor 2", [[]], ["1/2"], [1], [0], 1, reference="q + h v + h^2 a / 2"))
+    method = eip_method(TAYLOR)
     with pytest.raises(ValueError, match="every='auto' needs an error estimate, and Taylor 2 has none"):
         integrate(acceleration, (0, 1), Y0, method=method, h=0.1, every="auto", **KEPT)
 

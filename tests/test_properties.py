@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from systems import H, L, orbit, oscillator
 
@@ -530,6 +531,36 @@ def test_spaced_projections_start_afresh():
     whole = integrate(orbit, (0, 0.8), y0, **options).y[:, -1]
     half = integrate(orbit, (0, 0.4), y0, **options).y[:, -1]
     np.testing.assert_allclose(integrate(orbit, (0.4, 0.8), half, **options).y[:, -1], whole, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("metric", ["error", "euclidean"])
+@pytest.mark.parametrize("h", [3.5e-4, 4e-4])
+def test_spacing_by_itself_is_its_rule(h, metric):
+    """Each fifth step asks whether the errors since the last projection exceed three roundings of the terms."""
+    seen, evaluated = [], set()
+
+    class Recorder(EIPRK4):
+        def _project_step(self, t, y, y_hat, err):
+            seen.append((t, y_hat.copy(), err.copy()))
+            return super()._project_step(t, y, y_hat, err)
+
+    def value(t, y):
+        evaluated.add(t)
+        return swing_energy(t, y)
+
+    y0, n = [0.1, -0.2, 0.35, 0.05], 103
+    keep = Invariant(value, swing_gradient)
+    options = {"method": Recorder, "h": h, "invariants": keep, "metric": metric, "check": False}
+    solve_ivp(swing, (0, n * h), y0, every="auto", **options)
+    squares, expected = 0.0, {0.0, n * h}
+    for k, (t, y_hat, err) in enumerate(seen, start=1):
+        squares = squares + err**2
+        terms = swing_gradient(t, y_hat)
+        if k % 5 == 0 and math.sqrt(squares @ terms**2) > 3 * EPS * np.abs(terms * y_hat).sum():
+            expected.add(t)
+            squares = 0.0
+    assert evaluated == expected
+    assert 2 < len(expected) < 20  # some asked in vain
 
 
 @pytest.mark.parametrize("uses_f", [False, True])

@@ -27,6 +27,7 @@ from ..report import (
 )
 from ..result import Diagnostics
 from ..solvers import EIPSolver
+from ..tableaux import Tableau
 from .solar_system import METRICS, fixed_step_methods
 
 __all__ = ["Bar", "Comparison", "Outcome", "adaptive_methods", "add_arguments", "bars", "compare", "run"]
@@ -123,8 +124,12 @@ def _ratio(a: float, b: float) -> float:
 
 
 def adaptive_methods() -> dict[str, type[EIPSolver]]:
-    """Find the solver classes that choose their steps."""
-    return {name: method for name, method in fixed_step_methods().items() if method.TABLEAU.has_estimate}
+    """Find the solver classes that choose their steps, for systems of the first order."""
+    return {
+        name: method
+        for name, method in fixed_step_methods().items()
+        if method.TABLEAU.has_estimate and isinstance(method.TABLEAU, Tableau)
+    }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
