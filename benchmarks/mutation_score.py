@@ -41,6 +41,7 @@ TESTS = (
     "integrate",
     "tables",
     "units",
+    "bad_input",
 )
 MARKERS = "not slow and not needs_jit and not slow_without_jit"
 PRELOADED = ("numba", "scipy.integrate", "scipy.optimize", "mpmath", "pytest")
