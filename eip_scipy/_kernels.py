@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from ._lanes import abs_dot, dot, largest, remove_component
+from ._triples import shift_and_weigh, shift_bodies, sum_bodies
 
 OK, NOT_FINITE, FAILED_PROJECTION, POSTPONED = 0, 1, 2, 4
 
@@ -27,8 +28,6 @@ REORTHOGONALISE = 0.05
 TINY = 1e-290
 FAILURE_BANDS = 100.0
 NOISE_BANDS = 3.0
-# Unsigned as the indices are: a signed offset would make floats of the sum.
-STEP, TWO_STEPS = np.uint64(1), np.uint64(2)
 SPLITTER = 134217729.0  # 2**27 + 1 (Dekker)
 
 
@@ -47,7 +46,8 @@ class Grouping(NamedTuple):
 class FrameRows(NamedTuple):
     """Non-zeros of C and of M^T, M = S (C S)^-1, row by row; `products` is scratch.
 
-    `spatial`: rows come in threes, the second and the third being the first moved by one and two places.
+    Where x, y and z of bodies have rows alike, `c_bodies` and `m_bodies` replace them: as a state of (groups, bodies,
+    3) floats, with (groups, bodies) weights. Else these are empty.
     """
 
     c_start: np.ndarray
@@ -57,7 +57,8 @@ class FrameRows(NamedTuple):
     m_index: np.ndarray
     m_value: np.ndarray
     products: np.ndarray
-    spatial: bool
+    c_bodies: np.ndarray
+    m_bodies: np.ndarray
 
 
 class Inner(NamedTuple):
@@ -450,18 +451,8 @@ def defects(values, target, G, y_hat, scales, compensated, g, band, raw):
 
 
 @_jit
-def sparse_products(start, index, value, spatial, a, out):
+def sparse_products(start, index, value, a, out):
     """Out[k] = the k-th sparse row times a."""
-    if spatial:
-        for k in range(0, out.size, 3):
-            x = y = z = 0.0
-            for p in range(start[k], start[k + 1]):
-                i, v = index[p], value[p]
-                x += v * a[i]
-                y += v * a[i + STEP]
-                z += v * a[i + TWO_STEPS]
-            out[k], out[k + 1], out[k + 2] = x, y, z
-        return
     for k in range(out.size):
         total = 0.0
         for p in range(start[k], start[k + 1]):
@@ -470,17 +461,8 @@ def sparse_products(start, index, value, spatial, a, out):
 
 
 @_jit
-def subtract_sparse(start, index, value, spatial, factors, a):
+def subtract_sparse(start, index, value, factors, a):
     """Subtract factors[k] times the k-th sparse row from a, for all k."""
-    if spatial:
-        for k in range(0, factors.size, 3):
-            x, y, z = factors[k], factors[k + 1], factors[k + 2]
-            for p in range(start[k], start[k + 1]):
-                i, v = index[p], value[p]
-                a[i] -= x * v
-                a[i + STEP] -= y * v
-                a[i + TWO_STEPS] -= z * v
-        return
     for k in range(factors.size):
         for p in range(start[k], start[k + 1]):
             a[index[p]] -= factors[k] * value[p]
@@ -489,19 +471,38 @@ def subtract_sparse(start, index, value, spatial, factors, a):
 @_jit_inline
 def weigh_rows(G, sigma, frame, B):
     """Rows B_i = sigma * (G_i projected along the frame)."""
-    framed = frame.products.size > 0
+    groups, bodies = frame.c_bodies.shape
     for i in range(B.shape[0]):
         row = B[i]
-        if not framed:
+        if groups > 0:
+            for k in range(groups):
+                first = 3 * bodies * k
+                x, y, z = sum_bodies(frame.m_bodies[k], G[i], first, bodies)
+                shift_and_weigh(G[i], frame.c_bodies[k], x, y, z, sigma, row, first, bodies)
+            continue
+        if frame.products.size > 0:
+            copy(G[i], row)
+            sparse_products(frame.m_start, frame.m_index, frame.m_value, row, frame.products)
+            subtract_sparse(frame.c_start, frame.c_index, frame.c_value, frame.products, row)
             for j in range(row.size):
-                row[j] = G[i, j] * sigma[j]
+                row[j] *= sigma[j]
             continue
         for j in range(row.size):
-            row[j] = G[i, j]
-        sparse_products(frame.m_start, frame.m_index, frame.m_value, frame.spatial, row, frame.products)
-        subtract_sparse(frame.c_start, frame.c_index, frame.c_value, frame.spatial, frame.products, row)
-        for j in range(row.size):
-            row[j] *= sigma[j]
+            row[j] = G[i, j] * sigma[j]
+
+
+@_jit_inline
+def keep_frame(move, frame, out):
+    """Out = move - M C move, neutral to the frame."""
+    groups, bodies = frame.c_bodies.shape
+    for k in range(groups):
+        first = 3 * bodies * k
+        x, y, z = sum_bodies(frame.c_bodies[k], move, first, bodies)
+        shift_bodies(move, frame.m_bodies[k], x, y, z, out, first, bodies)
+    if groups == 0:
+        copy(move, out)
+        sparse_products(frame.c_start, frame.c_index, frame.c_value, out, frame.products)
+        subtract_sparse(frame.m_start, frame.m_index, frame.m_value, frame.products, out)
 
 
 @_jit
@@ -559,9 +560,9 @@ def factor(B, inverse_norms, R, pivots):
 def solve_gram(B, g, R, mu):
     """Coefficients mu of the rows of B in the least-norm x with B x = -g, if the rows are far from dependent.
 
-    By Cholesky's factorisation of the rows' Gram matrix, which costs a third of `factor` and squares the condition
+    By the factorisation L D L^T of the rows' Gram matrix, which costs a third of `factor` and squares the condition
     number: whether it will do shows on the way, by the same bound below which one pass of Gram-Schmidt would not. The
-    diagonal of R holds reciprocals.
+    diagonal of R holds 1/D.
     """
     rows = B.shape[0]
     for i in range(rows):
@@ -570,26 +571,24 @@ def solve_gram(B, g, R, mu):
         if not 1e-140 < R[i, i] < 1e140:
             return False
     for i in range(rows):
-        value = -g[i]
+        for j in range(1, i):
+            for k in range(j):
+                R[i, j] -= R[i, k] * R[j, k]
         square = R[i, i]
         least = REORTHOGONALISE * REORTHOGONALISE * square
+        mu[i] = -g[i]
         for j in range(i):
-            x = R[i, j]
-            for k in range(j):
-                x -= R[i, k] * R[j, k]
-            x *= R[j, j]
+            x = R[i, j] * R[j, j]
+            square -= x * R[i, j]
+            mu[i] -= x * mu[j]
             R[i, j] = x
-            square -= x * x
-            value -= x * mu[j]
         if not square > least:
             return False
-        R[i, i] = 1.0 / sqrt(square)
-        mu[i] = value * R[i, i]
+        R[i, i] = 1.0 / square
     for i in range(rows - 1, -1, -1):
-        value = mu[i]
+        mu[i] *= R[i, i]
         for j in range(i + 1, rows):
-            value -= R[j, i] * mu[j]
-        mu[i] = value * R[i, i]
+            mu[i] -= R[j, i] * mu[j]
     return True
 
 
@@ -627,19 +626,18 @@ def move_along(mu, Q, pivots, rank, sigma, frame, y_hat, move, out):
     """Move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction, neutral to the frame; out = y_hat + move."""
     n = move.size
     if rank == 0:
-        fill(move, 0.0)
+        fill(out, 0.0)
     else:
         first = Q[pivots[0]]
         for j in range(n):
-            move[j] = mu[0] * first[j]
+            out[j] = mu[0] * first[j]
         for k in range(1, rank):
             row = Q[pivots[k]]
             for j in range(n):
-                move[j] += mu[k] * row[j]
+                out[j] += mu[k] * row[j]
         for j in range(n):
-            move[j] *= sigma[j]
-    sparse_products(frame.c_start, frame.c_index, frame.c_value, frame.spatial, move, frame.products)
-    subtract_sparse(frame.m_start, frame.m_index, frame.m_value, frame.spatial, frame.products, move)
+            out[j] *= sigma[j]
+    keep_frame(out, frame, move)
     for j in range(n):
         out[j] = y_hat[j] + move[j]
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from scipy.integrate import OdeSolver
+from scipy.linalg import block_diag
 
 from ._kernels import EPS, NOT_FINITE, FrameRows, Grouping
 from ._step import (
@@ -442,7 +443,10 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
         C, M = np.zeros((0, n * width)), np.zeros((0, n * width))
     else:
         C, M = _frame_matrices(frame, n, width)
-    return FrameRows(*_sparse_rows(C), *_sparse_rows(M), np.zeros(C.shape[0]), _spatial(C) and _spatial(M))
+    c_bodies, m_bodies = _by_bodies(C), _by_bodies(M)
+    if c_bodies.size == 0 or m_bodies.size == 0:
+        c_bodies = m_bodies = np.zeros((0, 0))
+    return FrameRows(*_sparse_rows(C), *_sparse_rows(M), np.zeros(C.shape[0]), c_bodies, m_bodies)
 
 
 def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -474,15 +478,13 @@ def _real_form(a: np.ndarray) -> np.ndarray:
     return out.reshape(2 * a.shape[0], 2 * a.shape[1])
 
 
-def _spatial(a: np.ndarray) -> bool:
-    """Whether rows come in threes, the second and the third being the first moved by one and two places."""
-    first, second, third = a[::3], a[1::3], a[2::3]
-    return (
-        first.shape == third.shape
-        and not first[:, -2:].any()
-        and np.array_equal(np.roll(first, 1, axis=1), second)
-        and np.array_equal(np.roll(first, 2, axis=1), third)
-    )
+def _by_bodies(a: np.ndarray) -> np.ndarray:
+    """Weights (k, b) of b bodies, where `a` (3 k, 3 k b) sums the x, y and z of k groups of them; else none."""
+    groups = a.shape[0] // 3
+    if groups == 0 or a.shape[1] % (3 * groups):
+        return np.zeros((0, 0))
+    weights = np.array([a[3 * k, part] for k, part in enumerate(np.arange(a.shape[1]).reshape(groups, -1)[:, ::3])])
+    return weights if np.array_equal(a, np.kron(block_diag(*weights), np.eye(3))) else np.zeros((0, 0))
 
 
 def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -77,8 +77,8 @@ def source_stamp() -> str:
     would leave the old driver, with the old kernel inlined, in use.
     """
     folder = Path(__file__).parent
-    sources = [(folder / name).read_bytes() for name in ("_lanes.py", "_kernels.py", "_step.py", "longrun.py")]
-    return hashlib.sha256(b"".join(sources)).hexdigest()
+    names = ("_lanes.py", "_triples.py", "_kernels.py", "_step.py", "longrun.py")
+    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in names)).hexdigest()
 
 
 def make_advance(stamp):
