@@ -44,21 +44,17 @@ class Grouping(NamedTuple):
 
 
 class FrameRows(NamedTuple):
-    """Non-zeros of C and of M^T, M = S (C S)^-1, row by row; `products` is scratch.
+    """Non-zeros of C and, after them, of M^T, M = S (C S)^-1: row k of the first is ``start[0, k]:start[0, k + 1]``.
 
-    Where x, y and z of bodies have rows alike, `c_bodies` and `m_bodies` replace them: as a state of (groups, bodies,
-    3) floats, with (groups, bodies) weights. Else these are empty.
+    Where x, y and z of bodies have rows alike, `bodies` (2, groups, bodies) holds the weights of a state of (groups,
+    bodies, 3) floats instead; else it is empty. `products` is scratch.
     """
 
-    c_start: np.ndarray
-    c_index: np.ndarray
-    c_value: np.ndarray
-    m_start: np.ndarray
-    m_index: np.ndarray
-    m_value: np.ndarray
+    start: np.ndarray
+    place: np.ndarray
+    value: np.ndarray
     products: np.ndarray
-    c_bodies: np.ndarray
-    m_bodies: np.ndarray
+    bodies: np.ndarray
 
 
 class Inner(NamedTuple):
@@ -451,58 +447,56 @@ def defects(values, target, G, y_hat, scales, compensated, g, band, raw):
 
 
 @_jit
-def sparse_products(start, index, value, a, out):
-    """Out[k] = the k-th sparse row times a."""
+def sparse_products(frame, which, a, out):
+    """Out[k] = row k of C (`which` = 0) or of M^T (1) times a."""
     for k in range(out.size):
         total = 0.0
-        for p in range(start[k], start[k + 1]):
-            total += value[p] * a[index[p]]
+        for p in range(frame.start[which, k], frame.start[which, k + 1]):
+            total += frame.value[p] * a[frame.place[p]]
         out[k] = total
 
 
 @_jit
-def subtract_sparse(start, index, value, factors, a):
-    """Subtract factors[k] times the k-th sparse row from a, for all k."""
+def subtract_sparse(frame, which, factors, a):
+    """Subtract factors[k] times that row from a, for all k."""
     for k in range(factors.size):
-        for p in range(start[k], start[k + 1]):
-            a[index[p]] -= factors[k] * value[p]
+        for p in range(frame.start[which, k], frame.start[which, k + 1]):
+            a[frame.place[p]] -= factors[k] * frame.value[p]
 
 
 @_jit_inline
 def weigh_rows(G, sigma, frame, B):
     """Rows B_i = sigma * (G_i projected along the frame)."""
-    groups, bodies = frame.c_bodies.shape
+    _, groups, bodies = frame.bodies.shape
     for i in range(B.shape[0]):
         row = B[i]
         if groups > 0:
             for k in range(groups):
                 first = 3 * bodies * k
-                x, y, z = sum_bodies(frame.m_bodies[k], G[i], first, bodies)
-                shift_and_weigh(G[i], frame.c_bodies[k], x, y, z, sigma, row, first, bodies)
-            continue
-        if frame.products.size > 0:
-            copy(G[i], row)
-            sparse_products(frame.m_start, frame.m_index, frame.m_value, row, frame.products)
-            subtract_sparse(frame.c_start, frame.c_index, frame.c_value, frame.products, row)
-            for j in range(row.size):
-                row[j] *= sigma[j]
+                x, y, z = sum_bodies(frame.bodies[1, k], G[i], first, bodies)
+                shift_and_weigh(G[i], frame.bodies[0, k], x, y, z, sigma, row, first, bodies)
             continue
         for j in range(row.size):
-            row[j] = G[i, j] * sigma[j]
+            row[j] = G[i, j]
+        if frame.products.size > 0:
+            sparse_products(frame, 1, row, frame.products)
+            subtract_sparse(frame, 0, frame.products, row)
+        for j in range(row.size):
+            row[j] *= sigma[j]
 
 
 @_jit_inline
 def keep_frame(move, frame, out):
     """Out = move - M C move, neutral to the frame."""
-    groups, bodies = frame.c_bodies.shape
+    _, groups, bodies = frame.bodies.shape
     for k in range(groups):
         first = 3 * bodies * k
-        x, y, z = sum_bodies(frame.c_bodies[k], move, first, bodies)
-        shift_bodies(move, frame.m_bodies[k], x, y, z, out, first, bodies)
+        x, y, z = sum_bodies(frame.bodies[0, k], move, first, bodies)
+        shift_bodies(move, frame.bodies[1, k], x, y, z, out, first, bodies)
     if groups == 0:
         copy(move, out)
-        sparse_products(frame.c_start, frame.c_index, frame.c_value, out, frame.products)
-        subtract_sparse(frame.m_start, frame.m_index, frame.m_value, frame.products, out)
+        sparse_products(frame, 0, out, frame.products)
+        subtract_sparse(frame, 1, frame.products, out)
 
 
 @_jit
@@ -693,6 +687,19 @@ def judge(values, target, before, band, y, defect):
         if not np.isfinite(size) or (size > abs(before[i]) and size > FAILURE_BANDS * band[i]):
             good = False
     return OK if good else FAILED_PROJECTION
+
+
+@_jit
+def estimate(weights, K, scale, err, y, y_hat, rtol, atol, width, wanted):
+    """`weighted_sum` into err, and its `error_norm` if `wanted`: from Python each call takes its time."""
+    weighted_sum(weights, K, 0, scale, err)
+    return error_norm(err, y, y_hat, rtol, atol, width) if wanted else 0.0
+
+
+@_jit
+def least_step(t, sign):
+    """SciPy's: ten spacings of the numbers at t."""
+    return 10.0 * abs(np.nextafter(t, sign * np.inf) - t)
 
 
 @_jit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -443,10 +443,12 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
         C, M = np.zeros((0, n * width)), np.zeros((0, n * width))
     else:
         C, M = _frame_matrices(frame, n, width)
-    c_bodies, m_bodies = _by_bodies(C), _by_bodies(M)
-    if c_bodies.size == 0 or m_bodies.size == 0:
-        c_bodies = m_bodies = np.zeros((0, 0))
-    return FrameRows(*_sparse_rows(C), *_sparse_rows(M), np.zeros(C.shape[0]), c_bodies, m_bodies)
+    starts, index, value = _sparse_rows(np.concatenate([C, M]))
+    k = C.shape[0]
+    bodies = np.zeros((2, 0, 0))
+    if _by_bodies(C).size and _by_bodies(M).size:
+        bodies = np.array([_by_bodies(C), _by_bodies(M)])
+    return FrameRows(np.array([starts[: k + 1], starts[k:]]), index, value, np.zeros(k), bodies)
 
 
 def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -658,7 +660,7 @@ def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
     )
 
 
-def failure(status: int, run: Run, clock: np.ndarray) -> str:
+def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
     """Why a step failed."""
     if status == NOT_FINITE:
         return not_finite(run.work, run.method, clock[T], clock[H])

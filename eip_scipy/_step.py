@@ -10,6 +10,7 @@ The functions here take callables. They are plain Python when called from Python
 
 from __future__ import annotations
 
+from math import isfinite, isnan
 from typing import NamedTuple
 
 import numpy as np
@@ -247,13 +248,14 @@ def estimate_error(y_r, h, m, o, w):
         half = w.err.size // 2
         kn.weighted_sum(m.e, w.K_r, half, h * h, w.err[:half])
         kn.weighted_sum(m.e_v, w.K_r, half, h, w.err[half:])
-    else:
+        if o.adaptive:
+            w.norm[0] = kn.error_norm(w.err, y_r, w.y_hat_r, o.rtol, o.atol, width)
+    elif m.paired:
         kn.weighted_sum(m.e, w.K_r, 0, h, w.err)
-    if m.paired:
         kn.weighted_sum(m.e_low, w.K_r, 0, h, w.err_low)
         w.norm[0] = kn.paired_error_norm(w.err, w.err_low, y_r, w.y_hat_r, o.rtol, o.atol, width)
-    elif o.adaptive:
-        w.norm[0] = kn.error_norm(w.err, y_r, w.y_hat_r, o.rtol, o.atol, width)
+    else:
+        w.norm[0] = kn.estimate(m.e, w.K_r, h, w.err, y_r, w.y_hat_r, o.rtol, o.atol, width, o.adaptive)
 
 
 @_jitable
@@ -470,7 +472,7 @@ def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y
     if not adaptive:
         clock[T] = span.t0 + k * span.h
     t = clock[T]
-    least = 10.0 * abs(np.nextafter(t, span.sign * np.inf) - t) if adaptive else 0.0
+    least = kn.least_step(t, span.sign) if adaptive else 0.0
     h_abs = clock[H_ABS]
     if h_abs > span.max_step:
         h_abs = span.max_step
@@ -478,7 +480,7 @@ def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y
         h_abs = least
     rejected = False
     retries = 0
-    status = NOT_FINITE if np.isnan(h_abs) else TOO_SMALL
+    status = NOT_FINITE if isnan(h_abs) else TOO_SMALL
     while h_abs >= least:
         if adaptive:
             t_new = t + h_abs * span.sign
@@ -492,7 +494,7 @@ def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y
         project = o.target.size > 0 and (last or spacing == 1 or (k + 1) % spacing == 0)
         status = raw_step(rhs, params, t, y, y_r, clock[T_NEW], clock[H], project, m, o, w)
         norm = w.norm[0] if adaptive else 0.0
-        if status == OK and not np.isfinite(norm):
+        if status == OK and not isfinite(norm):
             status = NOT_FINITE
         if status == OK and norm < 1.0:
             status = finish(rhs, inv, grad, params, t, y, y_r, clock[T_NEW], project, last, m, o, w, y_new, y_new_r)

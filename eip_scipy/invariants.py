@@ -203,6 +203,11 @@ def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -
     return np.stack(columns, axis=-1)
 
 
+def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
+    """``fun`` with its last arguments given; itself where there are none."""
+    return (lambda *first: fun(*first, *arguments)) if arguments else fun
+
+
 class InvariantSet:
     """All invariants of a run as one: sizes, names, targets, scales, and the functions that the step calls.
 
@@ -233,6 +238,10 @@ class InvariantSet:
         ]
         self.target = self._targets()
         self._shape = (self.size, y0.size)
+        places = list(zip(self.starts[:-1], self.starts[1:], self.scalar, strict=True))
+        functions = (bound(item.fun, item.args + extra) for item in self.items)
+        self._values = [(fun, *place) for fun, place in zip(functions, places, strict=True)]
+        self._gradients = [(*self._bound_gradient(k, y0), *place) for k, place in enumerate(places)]
         self._gradients_at_start(t0, y0, f0)
 
     def _require_finite(self, values: Array, what: str) -> None:
@@ -261,10 +270,9 @@ class InvariantSet:
 
     def _gradients_at_start(self, t: float, y: Array, f: Array) -> None:
         """Shapes and finiteness of every gradient, once."""
-        for k in range(len(self.items)):
-            rows = self.starts[k + 1] - self.starts[k]
-            expected = (y.size,) if self.scalar[k] else (rows, y.size)
-            G = np.asarray(self._gradient(k, t, y, f))
+        for k, (gradient, takes_f, start, stop, scalar) in enumerate(self._gradients):
+            expected = y.shape if scalar else (stop - start, y.size)
+            G = np.asarray(gradient(t, y, f) if takes_f else gradient(t, y))
             if G.shape != expected:
                 raise ValueError(
                     f"gradient of invariant {self.labels[k]!r} has shape {G.shape}, expected {expected} for a state of "
@@ -275,49 +283,54 @@ class InvariantSet:
             if not np.all(np.isfinite(G)):
                 raise ValueError(f"gradient of invariant {self.labels[k]!r} is not finite at y0.")
 
-    def _gradient(self, k: int, t: float, y: Array, f: Array) -> Any:
-        item = self.items[k]
-        before = (f,) if item.uses_f else ()
+    def _bound_gradient(self, k: int, y0: Array) -> tuple[Callable[..., Any], bool]:
+        """Gradient k as gradient(t, y) or, if the second is true, gradient(t, y, f)."""
+        item, grad = self.items[k], self.grads[k]
+        arguments = self.extra if item.grad is None else item.args + self.extra
+        takes_f = item.uses_f and item.grad is not None
         if not item.in_place:
-            if item.grad is None:
-                return self.grads[k](t, y, *self.extra)
-            return self.grads[k](t, y, *before, *item.args, *self.extra)
-        rows = self.starts[k + 1] - self.starts[k]
-        out = np.zeros(y.size if self.scalar[k] else (rows, y.size), dtype=y.dtype)
-        self.grads[k](t, y, *before, out, *item.args, *self.extra)
-        return out
+            return bound(grad, arguments), takes_f
+        shape = y0.shape if self.scalar[k] else (self.starts[k + 1] - self.starts[k], y0.size)
+
+        def in_place(t: float, y: Array, *f: Array) -> Array:
+            out = np.zeros(shape, y0.dtype)
+            grad(t, y, *f, out, *arguments)
+            return out
+
+        return in_place, takes_f
 
     def inv(self, t: float, y: Array, values: Array, params: Any = None) -> None:
         """Fill `values` (l,)."""
         # Copies here and in grad: a user's function may keep what it was given, and y and f are buffers.
         y = y.copy()
-        for k, item in enumerate(self.items):
-            value = item.fun(t, y, *item.args, *self.extra)
-            start, stop = self.starts[k], self.starts[k + 1]
-            if isinstance(value, float) and self.scalar[k]:
+        for fun, start, stop, scalar in self._values:
+            value = fun(t, y)
+            if scalar and isinstance(value, float):
                 values[start] = value
                 continue
-            expected = () if self.scalar[k] else (stop - start,)
+            expected = () if scalar else (stop - start,)
             if np.shape(value) != expected:
+                label = self.labels[self.starts.index(start)]
                 raise ValueError(
-                    f"invariant {self.labels[k]!r} returned shape {np.shape(value)} at t={t:g}, expected {expected}."
+                    f"invariant {label!r} returned shape {np.shape(value)} at t={t:g}, expected {expected}."
                 )
             values[start:stop] = value
 
     def grad(self, t: float, y: Array, f: Array, G: Array, params: Any = None) -> None:
         """Fill the gradients `G` (l, n)."""
-        y, f = y.copy(), f.copy()
-        for k in range(len(self.items)):
-            row = self._gradient(k, t, y, f)
-            start, stop = self.starts[k], self.starts[k + 1]
-            if self.scalar[k] and isinstance(row, np.ndarray) and row.shape == y.shape:
+        y, shape = y.copy(), y.shape
+        if self.uses_f:
+            f = f.copy()
+        for gradient, takes_f, start, stop, scalar in self._gradients:
+            row = gradient(t, y, f) if takes_f else gradient(t, y)
+            if scalar and type(row) is np.ndarray and row.shape == shape:
                 G[start] = row
                 continue
-            expected = (y.size,) if self.scalar[k] else (stop - start, y.size)
+            expected = shape if scalar else (stop - start, y.size)
             if np.shape(row) != expected:
+                label = self.labels[self.starts.index(start)]
                 raise ValueError(
-                    f"gradient of invariant {self.labels[k]!r} has shape {np.shape(row)} at t={t:g}, expected "
-                    f"{expected}."
+                    f"gradient of invariant {label!r} has shape {np.shape(row)} at t={t:g}, expected {expected}."
                 )
             G[start:stop] = row
 
