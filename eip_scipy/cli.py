@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from . import comparators, problems
-from .commands import hard_cases, kepler_cost, solar_system
+from .commands import hard_cases, kepler_cost, solar_frontier, solar_system
 from .problems import solar_data
 from .report import UsageError, check_target, document, say, versions, warn, write_json
 
@@ -78,7 +78,7 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
         "solar-system": (
             "run the solar system and compare with other methods (the paper's Experiment II)",
             solar_system.add_arguments,
-            lambda args: solar_system.run(args, _rebound(args)),
+            _solar_system,
         ),
         "hard-cases": (
             "run 35 hard cases with and without projection",
@@ -110,6 +110,21 @@ def _rebound(args: argparse.Namespace) -> Any:
         warn(f"no comparison with WHFast and IAS15: {error}")
         return None
     return rebound.run
+
+
+def _solar_system(args: argparse.Namespace) -> int:
+    if args.frontier:
+        return solar_frontier.run(args, _rebound(args), _heyoka())
+    return solar_system.run(args, _rebound(args))
+
+
+def _heyoka() -> Any:
+    """The integrator of heyoka, or None: a peer that few will have installed."""
+    try:
+        from eip_scipy.integrations import heyoka
+    except ImportError:
+        return None
+    return heyoka.run
 
 
 def _list(args: argparse.Namespace) -> int:

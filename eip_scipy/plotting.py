@@ -28,6 +28,7 @@ __all__ = [
     "Orbits",
     "cost_figure",
     "errors_figure",
+    "frontier_figure",
     "gains_figure",
     "longitude_figure",
     "method_styles",
@@ -98,8 +99,8 @@ def method_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     return {
         name: {
             "color": PALETTE[k % len(PALETTE)],
-            "ls": LINES[k % len(LINES)],
-            "marker": MARKERS[k % len(MARKERS)],
+            "ls": LINES[(k + k // len(PALETTE)) % len(LINES)],
+            "marker": MARKERS[(k + 3 * (k // len(PALETTE))) % len(MARKERS)],
             "label": name,
         }
         for k, name in enumerate(names)
@@ -412,6 +413,40 @@ def work_figure(series: Mapping[str, Mapping[str, Any]], *, error: str, title: s
     _legend_below(figure, axes[0])
     if footnote:
         axes[1].annotate(footnote, (1, 1.02), xycoords="axes fraction", ha="right", fontsize="x-small", color="0.35")
+    return figure
+
+
+def frontier_figure(
+    series: Mapping[str, Mapping[str, Any]], *, unit: str, title: str = "", footnote: str = ""
+) -> Figure:
+    """Draw errors against wall time in one panel for each kind of error, a line for each method.
+
+    Parameters
+    ----------
+    series : mapping of str to mapping
+        For each method arrays "wall_time" and, by the panels' titles, errors.
+    unit : str
+        Of the errors.
+    title, footnote : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    styles = method_styles(series)
+    panels = [key for key in next(iter(series.values())) if key != "wall_time"]
+    figure = _figure(5.4 * len(panels), 5.6, title)
+    axes = figure.subplots(1, len(panels), sharex=True, sharey=True)
+    for axis, panel in zip(axes, panels, strict=True):
+        for name, values in series.items():
+            axis.plot(values["wall_time"], values[panel], ms=5, **styles[name])
+        axis.set_title(panel, fontsize="medium")
+    for axis in axes:
+        _log_x(axis)
+        _log_errors(axis, "wall time [s]", f"error of position [{unit}]" if axis is axes[0] else "")
+    _legend_below(figure, axes[0])
+    if footnote:
+        axes[-1].annotate(footnote, (1, -0.17), xycoords="axes fraction", ha="right", fontsize="x-small", color="0.35")
     return figure
 
 

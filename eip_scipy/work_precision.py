@@ -11,7 +11,7 @@ import numpy as np
 
 from .report import describe_machine
 
-__all__ = ["Runner", "WorkPoint", "WorkPrecision", "work_precision"]
+__all__ = ["Runner", "WorkPoint", "WorkPrecision", "cost_to_reach", "work_precision"]
 
 Runner = Callable[[float], tuple[float, np.ndarray]]
 """``run(step) -> (wall_time, y)``."""
@@ -98,6 +98,29 @@ def work_precision(
             if callback is not None:
                 callback()
     return WorkPrecision(tuple(points), describe_machine())
+
+
+def cost_to_reach(costs: Any, errors: Any, level: float) -> float:
+    """Interpolate the cost at which a method's error falls to `level`, on log axes.
+
+    Parameters
+    ----------
+    costs, errors : array_like, shape (m,)
+        Of the method's runs, from the cheapest to the dearest.
+    level : float
+
+    Returns
+    -------
+    float
+        That of the cheapest run, an upper bound, where its error is smaller; nan where no run's is.
+    """
+    if errors[0] <= level:
+        return float(costs[0])
+    for k in range(1, len(errors)):
+        if errors[k] <= level < errors[k - 1]:
+            part = math.log(errors[k - 1] / level) / math.log(errors[k - 1] / errors[k])
+            return float(costs[k - 1] * (costs[k] / costs[k - 1]) ** part)
+    return math.nan
 
 
 def _error(state: np.ndarray, error: Callable[[np.ndarray], float]) -> float:

@@ -14,6 +14,7 @@ from eip_scipy.cli import main
 from eip_scipy.commands import hard_cases as command
 from eip_scipy.commands import kepler_cost, kepler_figures
 from eip_scipy.problems.hard_cases import EQUATIONS, hard_cases
+from eip_scipy.work_precision import cost_to_reach
 
 CASES = hard_cases()
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -290,12 +291,10 @@ def test_all_means_all(tmp_path, monkeypatch):
 
 
 def test_cost_to_reach():
-    work = kepler_cost.Work(
-        np.ones(3), np.array([1e3, 1e4, 1e5]), np.array([0.1, 1.0, 10.0]), np.array([1, 1e-2, 1e-4])
-    )
-    assert kepler_cost.cost_to_reach(work, 1e-3, "nfev") == pytest.approx(10**4.5)
-    assert kepler_cost.cost_to_reach(work, 2.0, "wall_time") == 0.1
-    assert math.isnan(kepler_cost.cost_to_reach(work, 1e-5, "nfev"))
+    errors = np.array([1, 1e-2, 1e-4])
+    assert cost_to_reach([1e3, 1e4, 1e5], errors, 1e-3) == pytest.approx(10**4.5)
+    assert cost_to_reach([0.1, 1.0, 10.0], errors, 2.0) == 0.1
+    assert math.isnan(cost_to_reach([1e3, 1e4, 1e5], errors, 1e-5))
 
 
 @pytest.mark.needs_jit

@@ -15,9 +15,9 @@ from ..longrun import integrate
 from ..problems import Problem, kepler
 from ..report import check_folder, check_target, compact, document, say, table, warn, write_csv, write_file, write_json
 from ..solvers import EIPDOP853, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPSolver
-from ..work_precision import Runner, work_precision
+from ..work_precision import Runner, cost_to_reach, work_precision
 
-__all__ = ["Work", "add_arguments", "cost_to_reach", "measure", "run", "text"]
+__all__ = ["Work", "add_arguments", "measure", "run", "text"]
 
 DONE, INTERRUPTED = 0, 130
 T_END, REPEATS = 200.0, 5
@@ -110,43 +110,19 @@ def _noted(result: Any, method: type[EIPSolver], nfev: dict[Any, int], step: flo
     return result.wall_time, result.y[:, -1] if result.success else np.full(4, np.nan)
 
 
-def cost_to_reach(work: Work, level: float, cost: str) -> float:
-    """Interpolate the cost at which the error falls to `level`, on log axes.
-
-    Parameters
-    ----------
-    work : Work
-    level : float
-    cost : {"nfev", "wall_time"}
-
-    Returns
-    -------
-    float
-        That of the cheapest run, an upper bound, where its error is smaller; nan where no run's is.
-    """
-    values, errors = getattr(work, cost), work.error
-    if errors[0] <= level:
-        return float(values[0])
-    for k in range(1, errors.size):
-        if errors[k] <= level < errors[k - 1]:
-            part = math.log(errors[k - 1] / level) / math.log(errors[k - 1] / errors[k])
-            return float(values[k - 1] * (values[k] / values[k - 1]) ** part)
-    return math.nan
-
-
 def text(works: dict[str, Work], machine: str) -> str:
     """Lay out the cost of each method at some errors."""
     parts = [f"Work and precision: perturbed Kepler problem, e = 0.6, H and L kept, t = {T_END:g}", machine]
     for cost, unit, factor in (("nfev", "1000 evaluations of f", 1e-3), ("wall_time", "milliseconds", 1e3)):
         body = []
         for name, work in works.items():
-            cells = [compact(factor * cost_to_reach(work, level, cost)) for level in LEVELS]
+            cells = [compact(factor * cost_to_reach(getattr(work, cost), work.error, level)) for level in LEVELS]
             body.append(
                 (name, [f"<{cell}" if work.error[0] <= x else cell for x, cell in zip(LEVELS, cells, strict=True)])
             )
         cheapest = []
         for level in LEVELS:
-            known = {name: cost_to_reach(work, level, cost) for name, work in works.items()}
+            known = {name: cost_to_reach(getattr(work, cost), work.error, level) for name, work in works.items()}
             fixed = {name: known[name] for name in (method.__name__ for method in FIXED)}
             cheapest.append([_cheapest(fixed), _cheapest(known)])
         body.append(("cheapest with fixed step", [pair[0] for pair in cheapest]))

@@ -43,6 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--method", choices=list(fixed_step_methods()), default="EIPRK4", help="the method to show (%(default)s)"
     )
     parser.add_argument("--metric", choices=METRICS, default="error", help="its metric (%(default)s)")
+    parser.add_argument(
+        "--frontier",
+        action="store_true",
+        help="error against cost of high-order methods and their peers instead; --years 1, 10, 100, 1000 or 2000",
+    )
     parser.add_argument("--data", choices=available(), default="de440", help="initial data (%(default)s)")
 
 
