@@ -34,7 +34,7 @@ def test_the_frontier_names_errors_and_times(two_methods, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "1.7e-7" in printed
     assert "Seconds for an error" in printed
-    rows = list(csv.DictReader((tmp_path / "frontier.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "frontier.csv").read_text().splitlines()))
     assert [row["method"] for row in rows] == ["near", "near", "failed"]
     assert float(rows[0]["Mercury_au"]) == pytest.approx(np.sqrt(3) * 1e-7, rel=1e-6)
     assert float(rows[1]["wall_time_s"]) == 0.02

@@ -184,13 +184,12 @@ def _setting(item: FrontierRun) -> str:
 
 def text(runs: Sequence[FrontierRun], years: float, machine: str) -> str:
     """Lay out all runs, and what it costs to reach a level of error."""
-    planets = load("de440").bodies[1:]
+    others = np.delete(np.array(load("de440").bodies[1:]), MERCURY)
     body = []
     for item in runs:
-        worst = int(np.argmax(np.nan_to_num(np.delete(item.errors, MERCURY), nan=np.inf)))
-        others = np.delete(item.errors, MERCURY)[worst]
-        name = np.delete(np.array(planets), MERCURY)[worst]
-        cells = [_setting(item), f"{item.wall_time:.3g}", compact(item.errors[MERCURY]), f"{compact(others)} {name}"]
+        rest = np.delete(item.errors, MERCURY)
+        worst = f"{compact(rest.max())} {others[rest.argmax()]}" if np.isfinite(rest).all() else compact(math.nan)
+        cells = [_setting(item), f"{item.wall_time:.3g}", compact(item.errors[MERCURY]), worst]
         body.append((item.method, cells))
     parts = [
         f"Ten bodies, Newton, {years:g} years: errors of position [AU] and wall time, least of {REPEATS}, one core",
