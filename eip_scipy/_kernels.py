@@ -315,13 +315,6 @@ def block_sums(a, groups, out):
 
 
 @_jit
-def squares(a, out):
-    """Out = a^2, by component."""
-    for i in range(a.size):
-        out[i] = a[i] * a[i]
-
-
-@_jit
 def weighted_squares(weights, a, out):
     """Out = (weights a)^2, by component."""
     for i in range(a.size):
@@ -330,8 +323,11 @@ def weighted_squares(weights, a, out):
 
 
 @_jit
-def block_sizes(y, y_hat, err, rtol, groups, scratch, sizes, errors):
-    """Per block: sizes = max(|rtol y|, |rtol y_hat|), errors = |err|; returns how many sizes are too extreme."""
+def block_sizes(y, y_hat, err, rounding, rtol, groups, scratch, sizes, errors):
+    """Per block: sizes = max(|rtol y|, |rtol y_hat|), errors = |(err, rounding y_hat)|.
+
+    Returns how many sizes are too extreme.
+    """
     weighted_squares(rtol, y, scratch)
     block_sums(scratch, groups, errors)
     weighted_squares(rtol, y_hat, scratch)
@@ -341,7 +337,9 @@ def block_sizes(y, y_hat, err, rtol, groups, scratch, sizes, errors):
         square = max(sizes[b], errors[b])
         extreme += not 1e-280 < square < 1e280
         sizes[b] = sqrt(square)
-    squares(err, scratch)
+    for i in range(err.size):
+        x = rounding * y_hat[i]
+        scratch[i] = err[i] * err[i] + x * x
     block_sums(scratch, groups, errors)
     for b in range(sizes.size):
         errors[b] = sqrt(errors[b])
@@ -349,7 +347,7 @@ def block_sizes(y, y_hat, err, rtol, groups, scratch, sizes, errors):
 
 
 @_jit
-def extreme_block_sizes(y, y_hat, err, rtol, groups, sizes, errors):
+def extreme_block_sizes(y, y_hat, err, rounding, rtol, groups, sizes, errors):
     """The same, squares taken in a unit of each block's own, so that they neither vanish nor overflow."""
     for b in range(sizes.size):
         top = 0.0
@@ -357,7 +355,7 @@ def extreme_block_sizes(y, y_hat, err, rtol, groups, sizes, errors):
             i = groups.member[p]
             top = max(top, max(rtol[i] * max(abs(y[i]), abs(y_hat[i])), abs(err[i])))
         unit = 1.0 / top if top > 0.0 else 1.0
-        old = new = 0.0
+        old = new = error = 0.0
         for p in range(groups.start[b], groups.start[b + 1]):
             i = groups.member[p]
             weight = rtol[i] * unit
@@ -365,18 +363,23 @@ def extreme_block_sizes(y, y_hat, err, rtol, groups, sizes, errors):
             old += x * x
             x = weight * y_hat[i]
             new += x * x
+            x = err[i] * unit
+            error += x * x
+            x = rounding * unit * y_hat[i]
+            error += x * x
         sizes[b] = sqrt(max(old, new)) / unit
-        errors[b] = sqrt(block_square(err, b, unit, groups)) / unit
+        errors[b] = sqrt(error) / unit
 
 
 @_jit_inline
-def error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio):
+def error_metric(err, rounding, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio):
     """Weights sigma of the error metric and the blocks' scales; returns the largest relative error r.
 
-    `atol` is by block. r = 0 (no error at all) leaves the euclidean metric. `ratio` is scratch.
+    The error is the estimate and `rounding` times the state, in quadrature. `atol` is by block. r = 0 (no error at all)
+    leaves the euclidean metric. `ratio` is scratch.
     """
-    if block_sizes(y, y_hat, err, rtol, groups, sigma, scale, ratio) > 0:
-        extreme_block_sizes(y, y_hat, err, rtol, groups, scale, ratio)
+    if block_sizes(y, y_hat, err, rounding, rtol, groups, sigma, scale, ratio) > 0:
+        extreme_block_sizes(y, y_hat, err, rounding, rtol, groups, scale, ratio)
     for b in range(scale.size):
         scale[b] += atol[b]
         # Over a scale of 0 there is no error to speak of.
@@ -657,12 +660,12 @@ def first_move(G, sigma, frame, Q, inverse_norms, R, pivots, g, mu, y_hat, move,
 
 @_jit_inline
 def weighted_move(
-    weigh, largest_error, err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio,
+    weigh, largest_error, err, rounding, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio,
     G, frame, Q, inverse_norms, R, pivots, g, mu, move, out, more,
 ):  # fmt: skip
     """`error_metric` if `weigh`, `first_move`, `correction_in_local_errors`: from Python each call takes its time."""
     if weigh:
-        largest_error = error_metric(err, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio)
+        largest_error = error_metric(err, rounding, y, y_hat, rtol, atol, groups, kappa, sigma, scale, ratio)
     rank = first_move(G, sigma, frame, Q, inverse_norms, R, pivots, g, mu, y_hat, move, out, more)
     return largest_error, rank, correction_in_local_errors(move, scale, groups, largest_error)
 

@@ -380,14 +380,17 @@ def move(rhs, grad, params, t_old, y, y_r, t, weigh, largest_error, o, w, y_new_
     `weigh`: fill the weights of the error metric before; else they stand, for the `largest_error` given.
     """
     w.counters[NLU] += 1
+    # The state's own rounding is an error of the step, and at small steps the largest, unless it is carried along.
+    rounding = 0.0 if o.compensated else kn.EPS
     if o.direction == NEW:
         return kn.weighted_move(
-            weigh, largest_error, w.err, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma, w.scale,
-            w.ratio, w.G_r, o.frame, w.Q, w.inverse_norms, w.R, w.pivots, w.g, w.mu, w.move, y_new_r, o.iterations > 1,
+            weigh, largest_error, w.err, rounding, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma,
+            w.scale, w.ratio, w.G_r, o.frame, w.Q, w.inverse_norms, w.R, w.pivots, w.g, w.mu, w.move, y_new_r,
+            o.iterations > 1,
         )  # fmt: skip
     if weigh:
         largest_error = kn.error_metric(
-            w.err, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio
+            w.err, rounding, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma, w.scale, w.ratio
         )
     rank = other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r)
     return largest_error, rank, kn.correction_in_local_errors(w.move, w.scale, o.groups, largest_error)
