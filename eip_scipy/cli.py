@@ -78,7 +78,7 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
         "solar-system": (
             "run the solar system and compare with other methods (the paper's Experiment II)",
             solar_system.add_arguments,
-            lambda args: solar_system.run(args, _rebound(args)),
+            lambda args: solar_system.run(args, _rebound(args), _ephemeris),
         ),
         "hard-cases": (
             "run 35 hard cases with and without projection",
@@ -110,6 +110,13 @@ def _rebound(args: argparse.Namespace) -> Any:
         warn(f"no comparison with WHFast and IAS15: {error}")
         return None
     return rebound.run
+
+
+def _ephemeris(*args: Any) -> solar_data.SolarSystemData:
+    """Initial data from a JPL kernel; the import waits, for it belongs to an extra."""
+    from eip_scipy.integrations import jpl
+
+    return jpl.initial_data(*args)
 
 
 def _list(args: argparse.Namespace) -> int:
