@@ -115,7 +115,7 @@ def _rebound(args: argparse.Namespace) -> Any:
 def _solar_system(args: argparse.Namespace) -> int:
     if args.frontier:
         return solar_frontier.run(args, _rebound(args), _heyoka())
-    return solar_system.run(args, _rebound(args))
+    return solar_system.run(args, _rebound(args), _ephemeris)
 
 
 def _heyoka() -> Any:
@@ -125,6 +125,13 @@ def _heyoka() -> Any:
     except ImportError:
         return None
     return heyoka.run
+
+
+def _ephemeris(*args: Any) -> solar_data.SolarSystemData:
+    """Initial data from a JPL kernel; the import waits, for it belongs to an extra."""
+    from eip_scipy.integrations import jpl
+
+    return jpl.initial_data(*args)
 
 
 def _list(args: argparse.Namespace) -> int:

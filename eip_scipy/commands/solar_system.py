@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from .. import solvers
-from ..problems.solar_data import available
 from ..report import UsageError, check_folder, check_target, say, warn, write_csv, write_file, write_json
+from . import solar_epoch
 from .solar_cost import REPEATS, cost, cost_methods
 from .solar_errors import Study
 from .solar_report import cost_rows, csv_rows, json_content, text
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="error against cost of high-order methods and their peers instead; --years 1, 10, 100, 1000 or 2000",
     )
-    parser.add_argument("--data", choices=available(), default="de440", help="initial data (%(default)s)")
+    solar_epoch.add_arguments(parser)
 
 
 def _positive(text: str) -> float:
@@ -61,7 +61,7 @@ def _positive(text: str) -> float:
     return value
 
 
-def run(args: argparse.Namespace, judge: Judge | None) -> int:
+def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ephemeris | None = None) -> int:
     """Run the command.
 
     Parameters
@@ -70,6 +70,8 @@ def run(args: argparse.Namespace, judge: Judge | None) -> int:
         Options of `add_arguments`, and ``out``, ``json`` (Path or None) and ``quiet``.
     judge : callable or None
         `eip_scipy.integrations.rebound.run`, None without REBOUND.
+    ephemeris : callable, optional
+        `eip_scipy.integrations.jpl.initial_data`, for ``--epoch``.
 
     Returns
     -------
@@ -81,8 +83,9 @@ def run(args: argparse.Namespace, judge: Judge | None) -> int:
     UsageError
         For arguments or files that cannot be used.
     """
+    data = solar_epoch.initial_data(args, ephemeris)
     try:
-        study = Study(make_scene(args.data, args.years, args.h), fixed_step_methods()[args.method].TABLEAU.order)
+        study = Study(make_scene(data, args.years, args.h), fixed_step_methods()[args.method].TABLEAU.order)
     except ValueError as error:
         raise UsageError(str(error)) from error
     check_folder(args.out)
@@ -138,7 +141,7 @@ def _time_methods(study: Study, args: argparse.Namespace, judge: Judge | None) -
     from tqdm import tqdm
 
     years = min(study.scene.years, COST_YEARS)
-    scene = study.scene if years == study.scene.years else make_scene(args.data, years, min(args.h, years))
+    scene = study.scene if years == study.scene.years else make_scene(study.scene.data, years, min(args.h, years))
     methods = cost_methods(scene, fixed_step_methods()[args.method], args.metric, judge)
     total = REPEATS * sum(len(steps) for _, steps in methods.values())
     with tqdm(total=total, desc="error against cost", unit="run", disable=args.quiet) as bar:

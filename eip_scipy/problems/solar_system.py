@@ -33,8 +33,8 @@ def solar_system(
     Returns
     -------
     Problem
-        Of 60 components, see `nbody`. With "de440" its `reference` gives stored states at 1, 10, 100, 1000 and 2000
-        years (Taylor integration in extended precision).
+        Of 60 components, see `nbody`. With "de440", or the same data from a kernel, its `reference` gives stored states
+        at 1, 10, 100, 1000 and 2000 years (Taylor integration in extended precision).
 
     Raises
     ------
@@ -52,7 +52,7 @@ def solar_system(
         half = state.size // 2
         return np.concatenate([state[:half] * length, state[half:] * (length / time)])
 
-    references = reference_states(known.name) if known.name == "de440" else {}
+    references = reference_states() if _starts_as_references(known) else {}
     return nbody(
         known.gm * (length**3 / time**2),
         known.position * length,
@@ -64,6 +64,12 @@ def solar_system(
         source=known.source,
         reference=reference,
     )
+
+
+def _starts_as_references(data: SolarSystemData) -> bool:
+    """Whether these are the masses and states that the stored states start from; a name tells nothing of the epoch."""
+    start = load("de440")
+    return np.array_equal(data.gm, start.gm) and np.array_equal(data.y0, start.y0)
 
 
 def _units(units: str) -> tuple[float, float]:
