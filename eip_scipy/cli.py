@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from . import comparators, problems
-from .commands import hard_cases, kepler_cost, solar_system
+from .commands import hard_cases, kepler_cost, solar_system, solar_truth
 from .problems import solar_data
 from .report import UsageError, check_target, document, say, versions, warn, write_json
 
@@ -78,7 +78,7 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
         "solar-system": (
             "run the solar system and compare with other methods (the paper's Experiment II)",
             solar_system.add_arguments,
-            lambda args: solar_system.run(args, _rebound(args)),
+            lambda args: solar_truth.run(args, _ephemeris()) if args.truth else solar_system.run(args, _rebound(args)),
         ),
         "hard-cases": (
             "run 35 hard cases with and without projection",
@@ -110,6 +110,13 @@ def _rebound(args: argparse.Namespace) -> Any:
         warn(f"no comparison with WHFast and IAS15: {error}")
         return None
     return rebound.run
+
+
+def _ephemeris() -> solar_truth.Ephemeris:
+    """JPL's kernels; what they need is looked for when they are read."""
+    from eip_scipy.integrations import jpl
+
+    return solar_truth.Ephemeris(jpl.initial_data, jpl.heliocentric)
 
 
 def _list(args: argparse.Namespace) -> int:

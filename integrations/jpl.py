@@ -160,7 +160,8 @@ def initial_data(
     Returns
     -------
     SolarSystemData
-        Ten bodies, or eleven with the Moon, AU and AU/day, ICRF axes, barycentre of all at rest at the origin; GM by `mass_parameters`.
+        Ten bodies, or eleven with the Moon, AU and AU/day, ICRF axes, barycentre of all at rest at the origin; GM
+        by `mass_parameters`.
 
     Raises
     ------
@@ -184,6 +185,7 @@ def initial_data(
     # Divided before the barycentre is removed: the reference states start from numbers rounded in this order. Rounding
     # only once would move Mercury by 5e-12 AU after 1000 yr, ten times the reference's own error.
     position, velocity = to_barycentre(gm, km / AU_KM, km_per_day / AU_KM)
+    apart = ", Earth and Moon" if moon else ""
     return SolarSystemData(
         name=path.stem,
         bodies=tuple(bodies),
@@ -193,7 +195,7 @@ def initial_data(
         epoch_jd_tdb=day + rest,
         epoch=_date(day, rest),
         axes="ICRF",
-        source=f"JPL {ephemeris}, system barycentres{', Earth and Moon' if moon else ''}; GM in km^3/s^2 from the kernel's comments",
+        source=f"JPL {ephemeris}, system barycentres{apart}; GM in km^3/s^2 from the kernel's comments",
     )
 
 

@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from .. import solvers
-from ..problems.solar_data import available
+from ..problems.solar_data import available, load
 from ..report import UsageError, check_folder, check_target, say, warn, write_csv, write_file, write_json
+from . import solar_truth
 from .solar_cost import REPEATS, cost, cost_methods
 from .solar_errors import Study
 from .solar_report import cost_rows, csv_rows, json_content, text
@@ -18,6 +19,8 @@ from .solar_run import Judge, make_scene, plan
 
 __all__ = ["add_arguments", "fixed_step_methods", "run"]
 
+TEN_BODIES = [name for name in available() if len(load(name).bodies) == 10]  # what the tables and figures are made for
+YEARS, STEP = 2000.0, 0.002
 METRICS = ("error", "euclidean")
 COST_YEARS = 100.0
 DONE, CHECK_FAILED, INTERRUPTED = 0, 1, 130
@@ -35,15 +38,26 @@ def fixed_step_methods() -> dict[str, type[solvers.EIPSolver]]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``solar-system``."""
-    parser.add_argument("--years", type=_positive, default=2000.0, help="length in Julian years (%(default)g)")
     parser.add_argument(
-        "--h", type=_positive, default=0.002, help="step in years, shortened to divide the run (%(default)g)"
+        "--years",
+        type=_span,
+        help=f"length in Julian years ({YEARS:g}; with --truth {solar_truth.YEARS:g}, negative to go back)",
+    )
+    parser.add_argument(
+        "--h",
+        type=_positive,
+        help=f"step in years, shortened to divide the run ({STEP:g}; with --truth {solar_truth.STEP:g})",
     )
     parser.add_argument(
         "--method", choices=list(fixed_step_methods()), default="EIPRK4", help="the method to show (%(default)s)"
     )
     parser.add_argument("--metric", choices=METRICS, default="error", help="its metric (%(default)s)")
-    parser.add_argument("--data", choices=available(), default="de440", help="initial data (%(default)s)")
+    parser.add_argument("--data", choices=TEN_BODIES, default="de440", help="initial data (%(default)s)")
+    solar_truth.add_arguments(parser)
+
+
+def _span(text: str) -> float:
+    return -_positive(text[1:]) if text.startswith("-") else _positive(text)
 
 
 def _positive(text: str) -> float:
@@ -76,6 +90,12 @@ def run(args: argparse.Namespace, judge: Judge | None) -> int:
     UsageError
         For arguments or files that cannot be used.
     """
+    args.years = YEARS if args.years is None else args.years
+    args.h = STEP if args.h is None else args.h
+    if args.years < 0:
+        raise UsageError(f"--years: expected a positive number, got '{args.years:g}'; only --truth goes back in time")
+    if args.forces:
+        raise UsageError("--forces goes with --truth; without it, methods are compared under Newton's gravitation")
     try:
         study = Study(make_scene(args.data, args.years, args.h), fixed_step_methods()[args.method].TABLEAU.order)
     except ValueError as error:

@@ -8,8 +8,9 @@ n = (q_a - q_b)/r and phi_a the sum of G m_b / r over the others, the terms in 1
 - the momentum p_a: 1/2 m v_a^2 v_a, and of each pair G m_a m_b / r [3 v_a - 7/2 v_b - 1/2 n (n.v_b)]; the angular
   momentum is the sum of q_a x p_a.
 
-The accelerations are those whose right-hand sides hold Newton's accelerations, hence all of these vary by terms in 1/c^4.
-What is computed is G times energy and momenta. params: every G m, any entry, then 1/c^2 (see `forces.parameters`).
+The accelerations are those whose right-hand sides hold Newton's accelerations, hence all of these vary by terms in
+1/c^4. What is computed is G times energy and momenta. params: every G m, any entry, then 1/c^2 (see
+`forces.parameters`).
 """
 
 from __future__ import annotations
@@ -211,8 +212,9 @@ def momentum(t, y, params):
 
 @_jit
 def _add_pair_momentum(out, a, b, half, w, qa, qb, va, vb):
-    """Add one pair's rows: w {A/r - (qb x qa) s / (2 r^3)}, A = qa x (3 va - 7/2 vb) + qb x (3 vb - 7/2 va),
-    s = (qa - qb).(va + vb).
+    """Add one pair's rows, of w {A/r - (qb x qa) s / (2 r^3)}.
+
+    A = qa x (3 va - 7/2 vb) + qb x (3 vb - 7/2 va), s = (qa - qb).(va + vb).
     """
     x, both = _sum(1.0, qa, -1.0, qb), _sum(1.0, va, 1.0, vb)
     u2 = 1.0 / _dot(x, x)

@@ -1,9 +1,9 @@
 """What the bodies feel besides Newton's gravitation: relativity, the Sun's oblateness, a Moon without orbit.
 
-All terms are chosen by numbers in the vector of parameters, so that one right-hand side serves every combination and is
-compiled once: first G m of each body, then the entries that `parameters` lists. The first body is the Sun; each force on
-another body has its reaction on the Sun, so that momentum and centre of mass are those of Newton. (The full post-Newtonian
-equations, which have their own, are in `_einstein`.)
+All terms are chosen by numbers in the vector of parameters, so that one right-hand side serves every combination and
+is compiled once: first G m of each body, then the entries that `parameters` lists. The first body is the Sun; each
+force on another body has its reaction on the Sun, so that momentum and centre of mass are those of Newton. (The full
+post-Newtonian equations, which have their own, are in `_einstein`.)
 """
 
 from __future__ import annotations
@@ -376,8 +376,9 @@ def _relative(y, over_c2, mu):
 def pair_energy(t, y, params):
     """Energy of two bodies' relative motion with "1pn", per reduced mass; no order is left out.
 
-    With w = v^2 and u = 1/r the equations give dw/du + 6 mu/c^2 w = 2 mu - 8 mu M u/c^2, linear; this is the constant of
-    its solution, v^2/2 - mu/r + c^-2 (...) to first order, which is the known energy but for 3/(2 c^2) (v^2/2 - mu/r)^2.
+    With w = v^2 and u = 1/r the equations give dw/du + 6 mu/c^2 w = 2 mu - 8 mu M u/c^2, linear; this is the constant
+    of its solution. For a test particle it is, to first order in 1/c^2, the known energy
+    v^2/2 - M/r + c^-2 (3/8 v^4 + 3/2 M v^2/r + M^2/(2 r^2)), but for 3/(2 c^2) (v^2/2 - M/r)^2, which is constant too.
     """
     gm_sun, mu, over_c2 = params[0], params[0] + params[1], params[2 + OVER_C2]
     _, v, u, x = _relative(y, over_c2, mu)

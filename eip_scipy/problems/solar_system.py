@@ -53,8 +53,8 @@ def solar_system(
     Returns
     -------
     Problem
-        Of 60 components (66 with the Moon), see `nbody`. With "de440" and no further forces its `reference` gives stored states at 1, 10, 100, 1000 and 2000
-        years (Taylor integration in extended precision).
+        Of 60 components (66 with the Moon), see `nbody`. With "de440" and no further forces its `reference` gives
+        stored states at 1, 10, 100, 1000 and 2000 years (Taylor integration in extended precision).
 
     Raises
     ------
