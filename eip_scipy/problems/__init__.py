@@ -2,10 +2,21 @@
 
 from ._problem import Problem
 from .hard_cases import HardCase, hard_cases
+from .forces import ForceConstants
 from .harmonic import harmonic
 from .kepler import kepler
 from .nbody import nbody
 from .solar_data import SolarSystemData
 from .solar_system import solar_system
 
-__all__ = ["HardCase", "Problem", "SolarSystemData", "hard_cases", "harmonic", "kepler", "nbody", "solar_system"]
+__all__ = [
+    "ForceConstants",
+    "HardCase",
+    "Problem",
+    "SolarSystemData",
+    "hard_cases",
+    "harmonic",
+    "kepler",
+    "nbody",
+    "solar_system",
+]

@@ -4,6 +4,8 @@ All terms are chosen by numbers in the vector of parameters, so that one right-h
 is compiled once: first G m of each body, then the entries that `parameters` lists. The first body is the Sun; each
 force on another body has its reaction on the Sun, so that momentum and centre of mass are those of Newton. (The full
 post-Newtonian equations, which have their own, are in `_einstein`.)
+
+Newton's part is that of `_gravity`, inlined here: after an edit there, clear Numba's cache (CONTRIBUTING).
 """
 
 from __future__ import annotations
