@@ -448,6 +448,11 @@ def test_bad_forces(forces, constants, message):
         problem(forces, constants)
 
 
+def test_no_forces_is_an_empty_sequence():
+    with pytest.raises(TypeError, match="must be a name or a sequence of names, got None"):
+        problem(None)
+
+
 def test_the_first_body_is_the_sun():
     with pytest.raises(ValueError, match="the first body must be the Sun"):
         problem("1pn", gm=[0.0, 1.0, 1.0, 1.0])

@@ -1,8 +1,8 @@
 """Problems with invariants: functions that return a `Problem`, and `hard_cases`, which returns many with solutions."""
 
 from ._problem import Problem
-from .hard_cases import HardCase, hard_cases
 from .forces import ForceConstants
+from .hard_cases import HardCase, hard_cases
 from .harmonic import harmonic
 from .kepler import kepler
 from .nbody import nbody

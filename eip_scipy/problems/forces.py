@@ -11,7 +11,7 @@ Newton's part is that of `_gravity`, inlined here: after an edit there, clear Nu
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import exp, expm1, isfinite, sqrt
 from typing import Any
@@ -85,7 +85,11 @@ def check_forces(forces: Any) -> tuple[str, ...]:
     ------
     ValueError
         For an unknown name, or two kinds of relativity at once.
+    TypeError
+        For what is no name and no sequence.
     """
+    if not isinstance(forces, Iterable):
+        raise TypeError(f"forces must be a name or a sequence of names, got {forces!r}; () is Newton alone.")
     names = (forces,) if isinstance(forces, str) else tuple(forces)
     for name in names:
         if name not in FORCES:

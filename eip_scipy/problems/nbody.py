@@ -96,8 +96,8 @@ def nbody(
     none, "gr-potential",             "H" and "L", exact
     "moon-quadrupole"
     "j2", also with these two         "H" and "L_pole", the component of L along the Sun's pole, exact
-    "1pn", two bodies                 "H" and "L" of the relative motion, per reduced mass, exact
-    "1pn", three bodies and more      none: only two bodies have an exact energy with it
+    "1pn" alone, two bodies           "H" and "L" of the relative motion, per reduced mass, exact
+    "1pn" otherwise                   none: no more bodies have an exact energy with it
     "eih"                             "H" and "L" ("L_pole" with "j2") with their terms in 1/c^2. What is left
                                       is of the order of 1/c^4; they are given where that is below 1e-13 at
                                       the start, as in the solar system, and otherwise left out
@@ -151,24 +151,31 @@ def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndar
         raise ValueError("nbody: every G m is 0, so nothing attracts; at least one must be positive.")
     if not (np.isfinite(q).all() and np.isfinite(v).all()):
         raise ValueError("nbody: position and velocity must be finite.")
-    distance = np.linalg.norm(q[:, None] - q, axis=2) + np.diag(np.full(n, np.inf))
-    if (distance == 0).any():
-        i, j = np.argwhere(distance == 0)[0]
-        raise ValueError(f"nbody: bodies {i} and {j} are at the same place, {q[i]}; move one, or make them one body.")
-    _check_speeds(masses, v, distance)
+    _check_speeds(_relative_speeds(masses, q, v))
     return masses, q, v
 
 
-def _check_speeds(gm: np.ndarray, v: np.ndarray, distance: np.ndarray) -> None:
-    """Warn when every body is far too fast, or too slow, for the one that binds it most: units that do not go together.
+def _relative_speeds(gm: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Speeds relative to the body that binds each most, in units of the escape speed; those at rest are left out."""
+    found = []
+    for i in range(gm.size):  # row by row: all pairs at once would take the memory of N^2 distances
+        distance = np.linalg.norm(q - q[i], axis=1)
+        distance[i] = np.inf
+        if (distance == 0).any():
+            j = int(np.argmin(distance))
+            raise ValueError(
+                f"nbody: bodies {i} and {j} are at the same place, {q[i]}; move one, or make them one body."
+            )
+        pair = (gm + gm[i]) / distance
+        j = int(np.argmax(pair))
+        speed = np.linalg.norm(v[i] - v[j])
+        if speed > 0 and pair[j] > 0:
+            found.append(speed / np.sqrt(2 * pair[j]))
+    return np.array(found)
 
-    Bodies at rest relative to that one are left out.
-    """
-    pair = (gm[:, None] + gm) / distance
-    other = pair.argmax(axis=1)
-    escape = np.sqrt(2 * pair.max(axis=1))
-    speed = np.linalg.norm(v - v[other], axis=1)
-    ratio = (speed / np.where(escape > 0, escape, np.inf))[speed > 0]
+
+def _check_speeds(ratio: np.ndarray) -> None:
+    """Warn when every body is far too fast, or too slow: units that do not go together."""
     if ratio.size and (ratio.min() > TOO_FAST or ratio.max() < TOO_SLOW):
         warnings.warn(
             f"nbody: relative speeds are {ratio.min():.2g} to {ratio.max():.2g} times the escape speed; check that "
