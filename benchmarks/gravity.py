@@ -63,7 +63,8 @@ def least(repeat, function, times, *arguments) -> float:
 
 def times_of(n: int) -> list[float]:
     rng = np.random.default_rng(n)
-    problem = nbody(1e-6 * rng.random(n), *rng.standard_normal((2, n, 3)), t_span=(0.0, 1.0))
+    gm, (q, v) = 1e-6 * rng.random(n), rng.standard_normal((2, n, 3))
+    problem = nbody(gm, q, 1e-3 * v, t_span=(0.0, 1.0))
     H, L = problem.invariants
     y, gm, out = problem.y0.copy(), problem.params, np.empty(6 * n)
     times = 20 + 200_000 // (n * n + 10)

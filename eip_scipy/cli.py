@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from . import comparators, problems
-from .commands import hard_cases, kepler_cost, solar_frontier, solar_system
+from .commands import hard_cases, kepler_cost, solar_frontier, solar_system, solar_truth
 from .problems import solar_data
 from .report import UsageError, check_target, document, say, versions, warn, write_json
 
@@ -113,9 +113,11 @@ def _rebound(args: argparse.Namespace) -> Any:
 
 
 def _solar_system(args: argparse.Namespace) -> int:
+    if args.truth:
+        return solar_truth.run(args, _ephemeris())
     if args.frontier:
         return solar_frontier.run(args, _rebound(args), _heyoka())
-    return solar_system.run(args, _rebound(args), _ephemeris)
+    return solar_system.run(args, _rebound(args), lambda *where: _ephemeris().initial_data(*where))
 
 
 def _heyoka() -> Any:
@@ -127,11 +129,11 @@ def _heyoka() -> Any:
     return heyoka.run
 
 
-def _ephemeris(*args: Any) -> solar_data.SolarSystemData:
-    """Initial data from a JPL kernel; the import waits, for it belongs to an extra."""
+def _ephemeris() -> solar_truth.Ephemeris:
+    """JPL's kernels; what they need is looked for when they are read."""
     from eip_scipy.integrations import jpl
 
-    return jpl.initial_data(*args)
+    return solar_truth.Ephemeris(jpl.initial_data, jpl.heliocentric)
 
 
 def _list(args: argparse.Namespace) -> int:

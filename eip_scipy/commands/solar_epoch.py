@@ -19,6 +19,7 @@ Ephemeris = Callable[[tuple[float, float], Path | None], SolarSystemData]
 """`eip_scipy.integrations.jpl.initial_data`."""
 
 DEFAULT = "de440"
+TEN_BODIES = [name for name in available() if len(load(name).bodies) == 10]  # what the tables and figures are made for
 FORMS = '"2014-02-02T20:18", "2000-01-01" (both TDB, Gregorian calendar), "JD2451545.0" or "2451545.0"'
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d):(\d\d)(?::(\d\d(?:\.\d+)?))?)?")
 _JULIAN_DATE = re.compile(r"(?:JD ?)?(-?\d{1,8}(?:\.\d*)?)", re.IGNORECASE)
@@ -36,7 +37,7 @@ class Epoch(NamedTuple):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--data``, or instead ``--epoch`` with ``--kernel``."""
     start = parser.add_mutually_exclusive_group()
-    start.add_argument("--data", choices=available(), help=f"initial data that the package carries ({DEFAULT})")
+    start.add_argument("--data", choices=TEN_BODIES, help=f"initial data that the package carries ({DEFAULT})")
     start.add_argument(
         "--epoch", type=_epoch, help=f'start at any epoch of a JPL kernel: {FORMS}; needs "eip_scipy[jpl]"'
     )

@@ -37,7 +37,7 @@ from .solar_run import Judge, whole_number
 __all__ = ["FrontierRun", "measure", "methods", "run"]
 
 DONE, INTERRUPTED = 0, 130
-REPEATS = 3
+YEARS, REPEATS = 1000.0, 3
 PATIENCE = 30.0  # a run of so many seconds is not repeated
 LEVELS = (1e-6, 1e-7, 1e-8, 1e-9)
 KEPT: dict[str, Any] = {"every": 10, "compensated": True}
@@ -252,6 +252,7 @@ def run(args: argparse.Namespace, judge: Judge | None, heyoka: Judge | None) -> 
     """
     from tqdm import tqdm
 
+    args.years = YEARS if args.years is None else args.years
     if args.data not in (None, "de440") or args.epoch is not None:
         raise UsageError(f"--frontier has reference states for --data de440 only, got {args.data or args.epoch!r}")
     check_folder(args.out)

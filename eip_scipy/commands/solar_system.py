@@ -10,7 +10,7 @@ from pathlib import Path
 
 from .. import solvers
 from ..report import UsageError, check_folder, check_target, say, warn, write_csv, write_file, write_json
-from . import solar_epoch
+from . import solar_epoch, solar_truth
 from .solar_cost import REPEATS, cost, cost_methods
 from .solar_errors import Study
 from .solar_report import cost_rows, csv_rows, json_content, text
@@ -18,6 +18,7 @@ from .solar_run import Judge, make_scene, plan
 
 __all__ = ["add_arguments", "fixed_step_methods", "run"]
 
+YEARS, STEP = 2000.0, 0.002
 METRICS = ("error", "euclidean")
 COST_YEARS = 100.0
 DONE, CHECK_FAILED, INTERRUPTED = 0, 1, 130
@@ -35,9 +36,15 @@ def fixed_step_methods() -> dict[str, type[solvers.EIPSolver]]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``solar-system``."""
-    parser.add_argument("--years", type=_positive, default=2000.0, help="length in Julian years (%(default)g)")
     parser.add_argument(
-        "--h", type=_positive, default=0.002, help="step in years, shortened to divide the run (%(default)g)"
+        "--years",
+        type=_span,
+        help=f"length in Julian years ({YEARS:g}; with --truth {solar_truth.YEARS:g}, negative to go back)",
+    )
+    parser.add_argument(
+        "--h",
+        type=_positive,
+        help=f"step in years, shortened to divide the run ({STEP:g}; with --truth {solar_truth.STEP:g})",
     )
     parser.add_argument(
         "--method", choices=list(fixed_step_methods()), default="EIPRK4", help="the method to show (%(default)s)"
@@ -49,6 +56,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="error against cost of high-order methods and their peers instead; --years 1, 10, 100, 1000 or 2000",
     )
     solar_epoch.add_arguments(parser)
+    solar_truth.add_arguments(parser)
+
+
+def _span(text: str) -> float:
+    return -_positive(text[1:]) if text.startswith("-") else _positive(text)
 
 
 def _positive(text: str) -> float:
@@ -83,6 +95,12 @@ def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ep
     UsageError
         For arguments or files that cannot be used.
     """
+    args.years = YEARS if args.years is None else args.years
+    args.h = STEP if args.h is None else args.h
+    if args.years < 0:
+        raise UsageError(f"--years: expected a positive number, got '{args.years:g}'; only --truth goes back in time")
+    if args.forces:
+        raise UsageError("--forces goes with --truth; without it, methods are compared under Newton's gravitation")
     data = solar_epoch.initial_data(args, ephemeris)
     try:
         study = Study(make_scene(data, args.years, args.h), fixed_step_methods()[args.method].TABLEAU.order)

@@ -1,8 +1,9 @@
 """Initial data and reference states of the solar system: what the package carries, and no solver.
 
-Three sets travel with the package: ``"de440"``, the Sun and the nine system barycentres of JPL's DE440 at
-2014-02-02 20:18:00 TDB, the epoch of Cai, Gong and Wang; ``"de440-j2000"``, the same at JD 2451545.0 TDB; and
-``"paper"``, the table of their Appendix A. Any other epoch: `eip_scipy.integrations.jpl.initial_data`.
+Four sets travel with the package: ``"de440"``, the Sun and the nine system barycentres of JPL's DE440 at
+2014-02-02 20:18:00 TDB, the epoch of Cai, Gong and Wang; ``"de440-j2000"``, the same at JD 2451545.0 TDB;
+``"de440-moon"``, the first with Earth and Moon in place of their barycentre; and ``"paper"``, the table of their
+Appendix A. Any other epoch: `eip_scipy.integrations.jpl.initial_data`.
 """
 
 from __future__ import annotations
@@ -93,9 +94,10 @@ def load(name: str = "de440", *, as_printed: bool = False) -> SolarSystemData:
 
     Parameters
     ----------
-    name : {"de440", "de440-j2000", "paper"}
+    name : {"de440", "de440-j2000", "de440-moon", "paper"}
         ``"de440"``: Sun and nine system barycentres, ICRF axes, at 2014-02-02 20:18:00 TDB, the initial state of
-        `reference_states`. ``"de440-j2000"``: the same at JD 2451545.0 TDB. ``"paper"``: the table of Cai, Gong and
+        `reference_states`. ``"de440-j2000"``: the same at JD 2451545.0 TDB. ``"de440-moon"``: as the first, with Earth
+        and Moon for their barycentre. ``"paper"``: the table of Cai, Gong and
         Wang at the first of these epochs, ecliptic J2000 axes, with the Sun added. The table joins planet centres to
         masses without satellites (Jupiter is 112 km from its system's barycentre, Earth lacks the Moon), hence is good
         for reproducing the paper and not for predicting planets: Earth is 42 degrees off DE440 after 100 yr.
