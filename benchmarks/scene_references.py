@@ -57,9 +57,7 @@ def ias15(problem: Problem, times: Sequence[float]) -> np.ndarray | None:
         from eip_scipy.integrations import rebound
     except ImportError:
         return None
-    return np.array(
-        [rebound.run(problem.params, problem.y0, "ias15", h=t, n_steps=1).y[:, -1] for t in times]
-    )
+    return np.array([rebound.run(problem.params, problem.y0, "ias15", h=t, n_steps=1).y[:, -1] for t in times])
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> list[float]:
@@ -75,7 +73,11 @@ def main() -> None:
     args = parser.parse_args()
     stored = {}
     for problem, times in scenes():
-        rows, fewer, double = states(problem, times, args.bits), states(problem, times, CHECK_BITS), ias15(problem, times)
+        rows, fewer, double = (
+            states(problem, times, args.bits),
+            states(problem, times, CHECK_BITS),
+            ias15(problem, times),
+        )
         stored[problem.name] = [{"t": t, "state": row.tolist()} for t, row in zip(times, rows, strict=True)]
         apart = difference(rows, fewer)
         others = [float("nan")] * len(times) if double is None else difference(rows, double)

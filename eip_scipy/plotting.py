@@ -34,6 +34,7 @@ __all__ = [
     "orbit_in_time_figure",
     "orbits_figure",
     "paper_kepler_figure",
+    "scenes_figure",
     "work_figure",
 ]
 
@@ -412,6 +413,50 @@ def work_figure(series: Mapping[str, Mapping[str, Any]], *, error: str, title: s
     _legend_below(figure, axes[0])
     if footnote:
         axes[1].annotate(footnote, (1, 1.02), xycoords="axes fraction", ha="right", fontsize="x-small", color="0.35")
+    return figure
+
+
+def scenes_figure(
+    scenes: Mapping[str, Mapping[str, Mapping[str, Any]]], *, error: str, title: str = "", footnote: str = ""
+) -> Figure:
+    """Draw error against evaluations and, below, against wall time: two panels for each scene, three scenes abreast.
+
+    Parameters
+    ----------
+    scenes : mapping of str to mapping
+        For each scene its methods, with arrays as for `work_figure`; a method has the same style in all.
+    error : str
+        Label of the error.
+    title, footnote : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    styles = method_styles(dict.fromkeys(name for series in scenes.values() for name in series))
+    columns = min(3, len(scenes))
+    blocks = -(-len(scenes) // columns)
+    figure = _figure(max(4.0 * columns, 6.5), 5.6 * blocks + 1.1, title)
+    axes = figure.subplots(2 * blocks, columns, squeeze=False)
+    for axis in axes.flat[len(scenes) :]:
+        axis.set_visible(False)
+    for k, (name, series) in enumerate(scenes.items()):
+        block, column = divmod(k, columns)
+        pair = axes[2 * block, column], axes[2 * block + 1, column]
+        pair[0].set_title(name, fontsize="medium")
+        for axis, key, label in zip(pair, ("nfev", "wall_time"), ("evaluations of f", "wall time [s]"), strict=True):
+            axis.set_visible(True)
+            for method, values in series.items():
+                good = np.isfinite(values["error"]) & (np.asarray(values["error"]) > 0)
+                axis.plot(
+                    np.asarray(values[key])[good], np.asarray(values["error"])[good], ms=4.5, lw=1.2, **styles[method]
+                )
+            _log_x(axis)
+            _log_errors(axis, label, "")
+    figure.supylabel(error, fontsize="medium")
+    _legend_below(figure, axes[0, 0])
+    if footnote:
+        figure.supxlabel(footnote, fontsize="x-small", color="0.35")
     return figure
 
 

@@ -7,6 +7,7 @@ the problem. So a method of fixed step, with its projection, needs nothing new f
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from math import sqrt
 from typing import Any
 
@@ -112,6 +113,8 @@ def reaches(t: float) -> Callable[..., float]:
     return event
 
 
+# Cached, so that two problems of the same functions are one to the compiler.
+@cache
 def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callable[..., None]:
     @njit
     def transformed(s, y, out, params):
@@ -126,8 +129,15 @@ def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callabl
 
 
 def _transformed_invariant(item: Invariant) -> Invariant:
-    """The invariant as a function of (y, t); an invariant of the original has f = (dy/dt), here dy/ds = g dy/dt."""
-    fun, grad = item.fun, item.grad
+    fun, grad = _transformed_functions(item.fun, item.grad, item.uses_f)
+    return Invariant(fun, grad, args=item.args, in_place=True, uses_f=item.uses_f, name=item.name, scale=item.scale)
+
+
+@cache
+def _transformed_functions(
+    fun: Callable[..., Any], grad: Callable[..., Any], uses_f: bool
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """The functions of an invariant for the state (y, t); those that want f = dy/dt get it from dy/ds and dt/ds."""
 
     @njit
     def value(s, y, params):
@@ -143,15 +153,7 @@ def _transformed_invariant(item: Invariant) -> Invariant:
         grad(y[-1], y[:-1], f[:-1] / f[-1], out[..., :-1], params)
         out[..., -1] = 0.0
 
-    return Invariant(
-        value,
-        gradient_of_f if item.uses_f else gradient,
-        args=item.args,
-        in_place=True,
-        uses_f=item.uses_f,
-        name=item.name,
-        scale=item.scale,
-    )
+    return value, gradient_of_f if uses_f else gradient
 
 
 def _blocks(blocks: Any, n: int) -> Any:
