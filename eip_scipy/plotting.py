@@ -417,7 +417,12 @@ def work_figure(series: Mapping[str, Mapping[str, Any]], *, error: str, title: s
 
 
 def scenes_figure(
-    scenes: Mapping[str, Mapping[str, Mapping[str, Any]]], *, error: str, title: str = "", footnote: str = ""
+    scenes: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    *,
+    error: str,
+    largest: float = np.inf,
+    title: str = "",
+    footnote: str = "",
 ) -> Figure:
     """Draw error against evaluations and, below, against wall time: two panels for each scene, three scenes abreast.
 
@@ -427,6 +432,8 @@ def scenes_figure(
         For each scene its methods, with arrays as for `work_figure`; a method has the same style in all.
     error : str
         Label of the error.
+    largest : float, optional
+        Larger errors, of runs that lost the orbit, are left out.
     title, footnote : str, optional
 
     Returns
@@ -447,16 +454,15 @@ def scenes_figure(
         for axis, key, label in zip(pair, ("nfev", "wall_time"), ("evaluations of f", "wall time [s]"), strict=True):
             axis.set_visible(True)
             for method, values in series.items():
-                good = np.isfinite(values["error"]) & (np.asarray(values["error"]) > 0)
-                axis.plot(
-                    np.asarray(values[key])[good], np.asarray(values["error"])[good], ms=4.5, lw=1.2, **styles[method]
-                )
+                errors = np.asarray(values["error"])
+                good = (errors > 0) & (errors <= largest)
+                axis.plot(np.asarray(values[key])[good], errors[good], ms=4.5, lw=1.2, **styles[method])
             _log_x(axis)
             _log_errors(axis, label, "")
     figure.supylabel(error, fontsize="medium")
     _legend_below(figure, axes[0, 0])
-    if footnote:
-        figure.supxlabel(footnote, fontsize="x-small", color="0.35")
+    if footnote:  # above: the legend is below
+        figure.suptitle(f"{title}\n{footnote}", fontsize="medium")
     return figure
 
 

@@ -32,6 +32,9 @@ __all__ = ["INTEGRATORS", "ReboundRun", "ReboundSteps", "ias15_steps", "problem_
 
 INTEGRATORS = ("whfast", "whfast-c17", "ias15", "leapfrog", "saba(10,6,4)")
 
+# IAS15's step criteria by REBOUND's numbers.
+_CRITERIA = {"global": 1, "prs23": 2}
+
 # Steps between two looks at Ctrl-C, which Python handles only outside of REBOUND's loop. Version 4 counts in 32 bits.
 _CHUNK = 100_000
 
@@ -129,6 +132,7 @@ def run(
     t_end: float | None = None,
     save_every: int | None = None,
     epsilon: float | None = None,
+    criterion: str | None = None,
 ) -> ReboundRun:
     """Integrate N bodies forward from t = 0 with one of REBOUND's integrators.
 
@@ -155,6 +159,10 @@ def run(
         Save each `save_every`-th state besides the first and the last; default: these two only.
     epsilon : float, optional
         Tolerance of "ias15"; default: REBOUND's own, 1e-9, which is tight: about machine precision.
+    criterion : {"prs23", "global"}, optional
+        How "ias15" finds its steps: from each body's derivatives, which REBOUND prefers since version 4 and which
+        takes very small steps where an acceleration passes through zero; or from the largest over all bodies, as in
+        the paper of 2015. Default: REBOUND's own.
 
     Returns
     -------
@@ -184,7 +192,7 @@ def run(
     saved = _saved_steps(_count_steps(h, n_steps, t_end), save_every)
     sim = simulation(gm, y0)
     _set_integrator(sim, integrator)
-    _set_epsilon(sim, integrator, epsilon)
+    _set_ias15(sim, integrator, epsilon, criterion)
     if integrator != "ias15":
         sim.dt = h
     y = np.empty((saved.size, y0.size))
@@ -212,12 +220,14 @@ def run(
     )
 
 
-def ias15_steps(gm: Any, y0: Any, t_end: float, *, epsilon: float | None = None) -> ReboundSteps:
+def ias15_steps(
+    gm: Any, y0: Any, t_end: float, *, epsilon: float | None = None, criterion: str | None = None
+) -> ReboundSteps:
     """Integrate forward from t = 0 with IAS15, and look at each step and count each evaluation.
 
     Parameters
     ----------
-    gm, y0, epsilon
+    gm, y0, epsilon, criterion
         As for `run`.
     t_end : float
         End, which the last step meets exactly.
@@ -237,7 +247,7 @@ def ias15_steps(gm: Any, y0: Any, t_end: float, *, epsilon: float | None = None)
     _count_steps(t_end, 1, None)
     sim = simulation(gm, y0)
     _set_integrator(sim, "ias15")
-    _set_epsilon(sim, "ias15", epsilon)
+    _set_ias15(sim, "ias15", epsilon, criterion)
     times, states, evaluations = [0.0], [_state(sim)], [0]
 
     def count(_: Any) -> None:
@@ -363,15 +373,21 @@ def _set_integrator(sim: rebound.Simulation, name: str) -> None:
         options.corrector = 17
 
 
-def _set_epsilon(sim: rebound.Simulation, integrator: str, epsilon: float | None) -> None:
-    if epsilon is None:
+def _set_ias15(sim: rebound.Simulation, integrator: str, epsilon: float | None, criterion: str | None) -> None:
+    given = {name: value for name, value in (("epsilon", epsilon), ("criterion", criterion)) if value is not None}
+    if not given:
         return
     if integrator != "ias15":
-        raise ValueError(f"epsilon is an option of 'ias15', got it with {integrator!r}")
-    if not (epsilon > 0 and math.isfinite(epsilon)):
-        raise ValueError(f"epsilon must be positive and finite, got {epsilon!r}")
+        raise ValueError(f"{' and '.join(given)}: for 'ias15' only, got {integrator!r}")
     options = getattr(sim, "ri_ias15", None) or sim.integrator
-    options.epsilon = epsilon
+    if epsilon is not None:
+        if not (epsilon > 0 and math.isfinite(epsilon)):
+            raise ValueError(f"epsilon must be positive and finite, got {epsilon!r}")
+        options.epsilon = epsilon
+    if criterion is not None:
+        if criterion not in _CRITERIA:
+            raise ValueError(f"unknown criterion {criterion!r}: expected one of {', '.join(map(repr, _CRITERIA))}")
+        options.adaptive_mode = _CRITERIA[criterion]
 
 
 def _take_steps(sim: rebound.Simulation, n: int) -> None:

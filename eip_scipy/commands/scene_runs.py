@@ -23,7 +23,8 @@ from ..solvers import EIPDOP853, EIPRKN12
 __all__ = ["SCENES", "Method", "Outcome", "Point", "Scene", "measure", "methods", "scene"]
 
 TOLERANCES = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
-EPSILONS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-9)
+# Of IAS15, by its step criterion; each starts where the steps are about as long as its corrector converges with.
+EPSILONS = {"prs23": (1e-4, 1e-5, 1e-6, 1e-7, 1e-9), "global": (1e-2, 1e-3, 1e-4, 1e-6, 1e-9)}
 STEPS_PER_TURN = (20, 40, 60, 80, 120)
 ATOL_PER_RTOL = 1e-3
 REPEATS, ENOUGH_SECONDS = 5, 0.5
@@ -116,9 +117,9 @@ def _kepler(eccentricity: float, steps: tuple[int, ...]) -> Scene:
 SCENES: dict[str, Callable[[], Scene]] = {
     "kepler-0.9": partial(_kepler, 0.9, (10_000, 20_000, 40_000)),
     "kepler-0.99": partial(_kepler, 0.99, (100_000, 200_000, 400_000)),
-    "kepler-0.999": partial(_kepler, 0.999, (1_000_000, 2_000_000)),
+    "kepler-0.999": partial(_kepler, 0.999, (1_000_000,)),
     "pythagorean": lambda: Scene(
-        "pythagorean", "Burrau's three bodies, t = 70", pythagorean(), pair_time, (70_000, 700_000), 1e-2
+        "pythagorean", "Burrau's three bodies, t = 70", pythagorean(), pair_time, (700_000,), 1e-2
     ),
     "figure-eight": lambda: Scene(
         "figure-eight",
@@ -237,7 +238,8 @@ def methods(of: Scene, rebound: Any = None) -> dict[str, Method]:
         "SciPy's DOP853": Method("rtol", TOLERANCES, partial(_scipy, of.problem)),
     }
     if rebound is not None:
-        found["IAS15"] = Method("epsilon", EPSILONS, partial(_ias15, of, rebound))
+        for criterion, epsilons in EPSILONS.items():
+            found[f"IAS15, {criterion}"] = Method("epsilon", epsilons, partial(_ias15, of, rebound, criterion))
     return found
 
 
@@ -306,11 +308,11 @@ def _scipy(problem: Problem, rtol: float, look: bool) -> Outcome:
     return Outcome(run.y, run.nfev, perf_counter() - start, "" if run.success else run.message)
 
 
-def _ias15(of: Scene, rebound: Any, epsilon: float, look: bool) -> Outcome:
+def _ias15(of: Scene, rebound: Any, criterion: str, epsilon: float, look: bool) -> Outcome:
     gm, y0 = of.bodies()
     t_end = of.problem.t_span[1]
     if look:
-        steps = rebound.ias15_steps(gm, y0, t_end, epsilon=epsilon)
+        steps = rebound.ias15_steps(gm, y0, t_end, epsilon=epsilon, criterion=criterion)
         return Outcome(of.from_bodies(steps.y), steps.nfev, math.nan)
-    run = rebound.run(gm, y0, "ias15", h=t_end, n_steps=1, epsilon=epsilon)
+    run = rebound.run(gm, y0, "ias15", h=t_end, n_steps=1, epsilon=epsilon, criterion=criterion)
     return Outcome(of.from_bodies(run.y), 0, run.wall_time)

@@ -97,7 +97,7 @@ def figure_eight(periods: float = 100.0) -> Problem:
 
 
 def comet() -> Problem:
-    """A long-period comet that one passage of Jupiter makes a short-period one; Sun, Jupiter, Saturn and the comet.
+    """A short-period comet that one passage of Jupiter throws far out; Sun, Jupiter, Saturn and the comet.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def comet() -> Problem:
         Twenty years, in AU and years, centre of mass at rest. Sun, Jupiter and Saturn start from the DE440 data of
         `SolarSystemData` (2014-02-02); the comet is synthetic, a body of 1e13 kg placed so that after 10 years it
         passes Jupiter's centre at 3.0 radii (0.0014 AU), about as near as Lexell's comet did in 1779. Before that its
-        semi-major axis is 500 AU, afterwards 3.2 AU, with perihelia at 1.3 AU. An error before the passage has grown
+        semi-major axis is 3.2 AU, with perihelia at 1.3 AU; afterwards 500 AU. An error before the passage has grown
         700-fold at the end. Invariants as those of `nbody`, to which the comet contributes 1e-17: they do not see it.
         With the `reference` state at 20 years.
     """
