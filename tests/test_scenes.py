@@ -5,6 +5,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -184,8 +185,6 @@ def test_fixed_steps_in_fictitious_time_beat_fixed_steps():
 
 
 def test_a_problem_without_compiled_equations_is_refused():
-    from dataclasses import replace
-
     with pytest.raises(ValueError, match="has no compiled right-hand side"):
         time_transformed(replace(harmonic(), rhs=None), 1.0)
 
@@ -235,14 +234,34 @@ def test_command_compares_methods(tmp_path, capsys):
     assert max(map(len, out.splitlines()[2:-4])) <= 110
 
 
-@pytest.mark.needs_jit
-@pytest.mark.usefixtures("few_runs", "no_rebound")
+@pytest.fixture
+def small_scene(monkeypatch):
+    """One that is quick in plain Python, too."""
+    problem = replace(kepler(0.5, 0.0, t_end=2.0), h=None)
+    monkeypatch.setitem(SCENES, "small", lambda: scene_runs.Scene("small", "small", problem, centre_time, (40,), 1e-4))
+    monkeypatch.setattr(scene_runs, "TOLERANCES", (1e-3, 1e-5))
+    monkeypatch.setattr(scene_runs, "STEPS_PER_TURN", (10, 20))
+
+
+@pytest.mark.usefixtures("few_runs", "no_rebound", "small_scene")
 def test_command_without_rebound_says_what_to_install(tmp_path, capsys):
-    assert main(["hard-scenes", "--scene", "comet", "--out", str(tmp_path)]) == 0
+    assert main(["hard-scenes", "--scene", "small", "--out", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
-    assert "IAS15" in err
+    assert "no comparison with WHFast and IAS15" in err
     assert 'pip install "eip_scipy[rebound]"' in err
     assert "epsilon" not in out
+    with open(tmp_path / "hard-scenes.csv", newline="") as stream:
+        points = list(csv.DictReader(stream))
+    assert len(points) == 5 * 2 + 1
+    assert max(float(p["position_error"]) for p in points) < 0.1
+
+
+@pytest.mark.usefixtures("few_runs", "small_scene")
+def test_a_run_that_fails_is_listed(capsys):
+    of = scene("small")
+    failed = scene_runs.Point("small", "EIPRKN12", "h", 0.1, 7, 0.01, math.nan, 0.0, 0.0, "projection failed")
+    text = hard_scenes.text({"small": (of, [failed])}, "a machine")
+    assert "Did not reach the end:\n  small, EIPRKN12, h 0.10: projection failed" in text
 
 
 @pytest.mark.parametrize(

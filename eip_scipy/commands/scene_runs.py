@@ -27,7 +27,8 @@ TOLERANCES = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 EPSILONS = {"prs23": (1e-4, 1e-5, 1e-6, 1e-7, 1e-9), "global": (1e-2, 1e-3, 1e-4, 1e-6, 1e-9)}
 STEPS_PER_TURN = (20, 40, 60, 80, 120)
 ATOL_PER_RTOL = 1e-3
-REPEATS, ENOUGH_SECONDS = 5, 0.5
+# A short run is timed often, so that one of them fits between two disturbances by other processes.
+REPEATS, ENOUGH_SECONDS = 40, 0.4
 MOST_SAVES = 20_000
 # Longer than any scene takes in fictitious time, which ends at an event.
 FAR = 1e6
@@ -253,7 +254,7 @@ def measure(
     of : Scene
     rebound : module, optional
     repeats : int, optional
-        Timed runs of each point, the least time of which counts; no further ones of a point that takes long.
+        Timed runs of each point at most, the least time of which counts; fewer of one that takes long.
     callback : callable, optional
         ``callback()`` after each point.
 
@@ -264,18 +265,24 @@ def measure(
     for name, method in methods(of, rebound).items():
         for value in method.settings:
             looked = method.run(value, True)
-            wall_time, outcome = math.inf, looked
-            for _ in range(repeats):
-                outcome = method.run(value, False)
-                wall_time = min(wall_time, outcome.wall_time)
-                if outcome.wall_time > ENOUGH_SECONDS:
-                    break
+            outcome, wall_time = _timed(partial(method.run, value, False), repeats)
             error = math.nan if outcome.failure else of.error(outcome.y[:, -1])
             yield Point(
                 of.name, name, method.setting, value, looked.nfev, wall_time, error,
                 *of.invariant_errors(looked.y), outcome.failure,
             )  # fmt: skip
             callback()
+
+
+def _timed(run: Callable[[], Outcome], repeats: int) -> tuple[Outcome, float]:
+    outcome = run()
+    least = spent = outcome.wall_time
+    for _ in range(1, repeats):
+        if spent > ENOUGH_SECONDS:
+            break
+        seconds = run().wall_time
+        least, spent = min(least, seconds), spent + seconds
+    return outcome, least
 
 
 def _adaptive(problem: Problem, options: dict[str, Any], rtol: float, look: bool) -> Outcome:
