@@ -111,7 +111,7 @@ def _kepler(eccentricity: float, steps: tuple[int, ...]) -> Scene:
         replace(kepler(eccentricity, relativistic=0.0, t_end=200.0), h=None),
         centre_time,
         steps,
-        1e-9,
+        1e-8,
     )
 
 
@@ -128,7 +128,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
         replace(figure_eight(), h=None),
         pair_time,
         (2_000, 4_000, 8_000, 16_000),
-        1e-9,
+        1e-8,
     ),
     "comet": lambda: Scene(
         "comet",
