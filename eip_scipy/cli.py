@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from . import comparators, problems
-from .commands import hard_cases, kepler_cost, solar_frontier, solar_system, solar_truth
+from .commands import hard_cases, hard_scenes, kepler_cost, solar_frontier, solar_system, solar_truth
 from .problems import solar_data
 from .report import UsageError, check_target, document, say, versions, warn, write_json
 
@@ -85,6 +85,11 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
             hard_cases.add_arguments,
             hard_cases.run,
         ),
+        "hard-scenes": (
+            "error against cost on high eccentricities, chaos and close encounters, beside IAS15",
+            hard_scenes.add_arguments,
+            lambda args: hard_scenes.run(args, _rebound_module()),
+        ),
         "work-precision": (
             "error against cost of all methods on the perturbed Kepler problem",
             kepler_cost.add_arguments,
@@ -104,12 +109,17 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
 
 def _rebound(args: argparse.Namespace) -> Any:
     """REBOUND's integrators, or None and a line that says how to get them."""
+    module = _rebound_module()
+    return None if module is None else module.run
+
+
+def _rebound_module() -> Any:
     try:
         from eip_scipy.integrations import rebound
     except ImportError as error:
         warn(f"no comparison with WHFast and IAS15: {error}")
         return None
-    return rebound.run
+    return rebound
 
 
 def _solar_system(args: argparse.Namespace) -> int:

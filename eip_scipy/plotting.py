@@ -35,6 +35,7 @@ __all__ = [
     "orbit_in_time_figure",
     "orbits_figure",
     "paper_kepler_figure",
+    "scenes_figure",
     "work_figure",
 ]
 
@@ -449,6 +450,56 @@ def frontier_figure(
     _legend_below(figure, axes[0])
     if footnote:
         axes[-1].annotate(footnote, (1, -0.17), xycoords="axes fraction", ha="right", fontsize="x-small", color="0.35")
+    return figure
+
+
+def scenes_figure(
+    scenes: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    *,
+    error: str,
+    largest: float = np.inf,
+    title: str = "",
+    footnote: str = "",
+) -> Figure:
+    """Draw error against evaluations and, below, against wall time: two panels for each scene, three scenes abreast.
+
+    Parameters
+    ----------
+    scenes : mapping of str to mapping
+        For each scene its methods, with arrays as for `work_figure`; a method has the same style in all.
+    error : str
+        Label of the error.
+    largest : float, optional
+        Larger errors, of runs that lost the orbit, are left out.
+    title, footnote : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    styles = method_styles(dict.fromkeys(name for series in scenes.values() for name in series))
+    columns = min(3, len(scenes))
+    blocks = -(-len(scenes) // columns)
+    figure = _figure(max(4.0 * columns, 6.5), 5.6 * blocks + 1.1, title)
+    axes = figure.subplots(2 * blocks, columns, squeeze=False)
+    for axis in axes.flat[len(scenes) :]:
+        axis.set_visible(False)
+    for k, (name, series) in enumerate(scenes.items()):
+        block, column = divmod(k, columns)
+        pair = axes[2 * block, column], axes[2 * block + 1, column]
+        pair[0].set_title(name, fontsize="medium")
+        for axis, key, label in zip(pair, ("nfev", "wall_time"), ("evaluations of f", "wall time [s]"), strict=True):
+            axis.set_visible(True)
+            for method, values in series.items():
+                errors = np.asarray(values["error"])
+                good = (errors > 0) & (errors <= largest)
+                axis.plot(np.asarray(values[key])[good], errors[good], ms=4.5, lw=1.2, **styles[method])
+            _log_x(axis)
+            _log_errors(axis, label, "")
+    figure.supylabel(error, fontsize="medium")
+    _legend_below(figure, axes[0, 0])
+    if footnote:  # above: the legend is below
+        figure.suptitle(f"{title}\n{footnote}", fontsize="medium")
     return figure
 
 

@@ -11,6 +11,7 @@ distributed with this package; versions 4.6 and 5 are supported.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 from time import perf_counter
@@ -28,9 +29,12 @@ except ModuleNotFoundError as error:
 if TYPE_CHECKING:
     from eip_scipy.problems._problem import Problem
 
-__all__ = ["INTEGRATORS", "ReboundRun", "problem_from_simulation", "run", "simulation"]
+__all__ = ["INTEGRATORS", "ReboundRun", "ReboundSteps", "ias15_steps", "problem_from_simulation", "run", "simulation"]
 
 INTEGRATORS = ("whfast", "whfast-c17", "ias15", "leapfrog", "saba(10,6,4)")
+
+# IAS15's step criteria by REBOUND's numbers.
+_CRITERIA = {"global": 1, "prs23": 2}
 
 # Steps between two looks at Ctrl-C, which Python handles only outside of REBOUND's loop. Version 4 counts in 32 bits.
 _CHUNK = 100_000
@@ -68,6 +72,25 @@ class ReboundRun:
     steps: int
     energy_error: np.ndarray
     angular_momentum_error: np.ndarray
+
+
+@dataclass(frozen=True)
+class ReboundSteps:
+    """What `ias15_steps` returns; m - 1 steps, N bodies, n = 6 N.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+        Start, and the end of each step.
+    y : ndarray, shape (n, m)
+        States (q, v) at `t`.
+    nfev : int
+        Evaluations of all bodies' accelerations.
+    """
+
+    t: np.ndarray
+    y: np.ndarray
+    nfev: int
 
 
 def simulation(gm: Any, y: Any) -> rebound.Simulation:
@@ -109,6 +132,9 @@ def run(
     n_steps: int | None = None,
     t_end: float | None = None,
     save_every: int | None = None,
+    epsilon: float | None = None,
+    criterion: str | None = None,
+    prepare: Callable[[rebound.Simulation], Any] | None = None,
 ) -> ReboundRun:
     """Integrate N bodies forward from t = 0 with one of REBOUND's integrators.
 
@@ -133,6 +159,15 @@ def run(
         End, a whole number of steps from 0; the run then ends at round(t_end / h) h.
     save_every : int, optional
         Save each `save_every`-th state besides the first and the last; default: these two only.
+    epsilon : float, optional
+        Tolerance of "ias15"; default: REBOUND's own, 1e-9, which is tight: about machine precision.
+    criterion : {"prs23", "global"}, optional
+        How "ias15" finds its steps: from each body's derivatives, which REBOUND prefers since version 4 and which
+        takes very small steps where an acceleration passes through zero; or from the largest over all bodies, as in
+        the paper of 2015. Default: REBOUND's own.
+    prepare : callable, optional
+        ``prepare(simulation)`` before the run, for example to add forces by REBOUNDx; what it returns is kept alive.
+        The errors of the invariants remain those of the Newtonian ones.
 
     Returns
     -------
@@ -162,6 +197,8 @@ def run(
     saved = _saved_steps(_count_steps(h, n_steps, t_end), save_every)
     sim = simulation(gm, y0)
     _set_integrator(sim, integrator)
+    _set_ias15(sim, integrator, epsilon, criterion)
+    kept = None if prepare is None else prepare(sim)
     if integrator != "ias15":
         sim.dt = h
     y = np.empty((saved.size, y0.size))
@@ -176,6 +213,7 @@ def run(
         sim.synchronize()
         wall_time += perf_counter() - start
         y[row] = _state(sim)
+    del kept
     energy_error, angular_momentum_error = _invariant_errors(gm, y)
     return ReboundRun(
         name=integrator,
@@ -187,6 +225,50 @@ def run(
         energy_error=energy_error,
         angular_momentum_error=angular_momentum_error,
     )
+
+
+def ias15_steps(
+    gm: Any, y0: Any, t_end: float, *, epsilon: float | None = None, criterion: str | None = None
+) -> ReboundSteps:
+    """Integrate forward from t = 0 with IAS15, and look at each step and count each evaluation.
+
+    Parameters
+    ----------
+    gm, y0, epsilon, criterion
+        As for `run`.
+    t_end : float
+        End, which the last step meets exactly.
+
+    Returns
+    -------
+    ReboundSteps
+        The run takes the steps of ``run(gm, y0, "ias15", h=t_end, n_steps=1)``, which is to be timed instead: the
+        looking, from Python, takes many times longer.
+
+    Raises
+    ------
+    ValueError
+        For a wrong value, as `run`.
+    """
+    gm, y0 = _check_state(gm, y0)
+    _count_steps(t_end, 1, None)
+    sim = simulation(gm, y0)
+    _set_integrator(sim, "ias15")
+    _set_ias15(sim, "ias15", epsilon, criterion)
+    times, states, evaluations = [0.0], [_state(sim)], [0]
+
+    def count(_: Any) -> None:
+        evaluations[0] += 1
+
+    def look(_: Any) -> None:
+        if sim.t != times[-1]:
+            times.append(sim.t)
+            states.append(_state(sim))
+
+    sim.additional_forces = count
+    sim.heartbeat = look
+    sim.integrate(t_end, exact_finish_time=1)
+    return ReboundSteps(np.array(times), np.array(states).T, evaluations[0])
 
 
 def problem_from_simulation(
@@ -296,6 +378,23 @@ def _set_integrator(sim: rebound.Simulation, name: str) -> None:
         options.type = "10,6,4" if version_4 else "10_6_4"
     if name == "whfast-c17":
         options.corrector = 17
+
+
+def _set_ias15(sim: rebound.Simulation, integrator: str, epsilon: float | None, criterion: str | None) -> None:
+    given = {name: value for name, value in (("epsilon", epsilon), ("criterion", criterion)) if value is not None}
+    if not given:
+        return
+    if integrator != "ias15":
+        raise ValueError(f"{' and '.join(given)}: for 'ias15' only, got {integrator!r}")
+    options = getattr(sim, "ri_ias15", None) or sim.integrator
+    if epsilon is not None:
+        if not (epsilon > 0 and math.isfinite(epsilon)):
+            raise ValueError(f"epsilon must be positive and finite, got {epsilon!r}")
+        options.epsilon = epsilon
+    if criterion is not None:
+        if criterion not in _CRITERIA:
+            raise ValueError(f"unknown criterion {criterion!r}: expected one of {', '.join(map(repr, _CRITERIA))}")
+        options.adaptive_mode = _CRITERIA[criterion]
 
 
 def _take_steps(sim: rebound.Simulation, n: int) -> None:

@@ -11,7 +11,7 @@ rebound = pytest.importorskip("rebound")
 
 from eip_scipy.comparators import stormer_verlet  # noqa: E402
 from eip_scipy.integrations import rebound as judge  # noqa: E402
-from eip_scipy.problems import solar_data  # noqa: E402
+from eip_scipy.problems import comet, solar_data  # noqa: E402
 
 DATA = solar_data.load("de440")
 REFERENCE = solar_data.reference_states("de440")
@@ -280,3 +280,62 @@ def test_problem_from_simulation_refuses(change, message):
 def test_problem_from_simulation_needs_two_bodies():
     with pytest.raises(ValueError, match="0 particles"):
         judge.problem_from_simulation(rebound.Simulation())
+
+
+# IAS15's own options.
+
+
+def comet_run(**options):
+    problem = comet()
+    return problem, judge.run(problem.params, problem.y0, "ias15", h=20.0, n_steps=1, **options)
+
+
+@pytest.mark.parametrize("options", [{}, {"epsilon": 1e-5}, {"criterion": "global", "epsilon": 1e-4}])
+def test_steps_of_ias15_are_those_of_the_timed_run(options):
+    problem, timed = comet_run(**options)
+    looked = judge.ias15_steps(problem.params, problem.y0, 20.0, **options)
+    np.testing.assert_array_equal(looked.y[:, -1], timed.y[:, -1])
+    assert looked.t[0] == 0.0
+    assert looked.t[-1] == 20.0
+    assert looked.t.size == timed.steps + 1
+    assert looked.nfev >= 14 * timed.steps
+
+
+def test_epsilon_and_criterion_change_the_steps():
+    _, usual = comet_run()
+    _, coarse = comet_run(epsilon=1e-5)
+    problem, all_bodies = comet_run(criterion="global")
+    assert coarse.steps < usual.steps < all_bodies.steps
+    end = problem.reference(20.0)
+    assert np.abs(all_bodies.y[:, -1] - end)[:12].max() < 1e-10
+    assert 1e-10 < np.abs(coarse.y[:, -1] - end)[:12].max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("integrator", "options", "message"),
+    [
+        ("whfast", {"epsilon": 1e-6}, "epsilon: for 'ias15' only, got 'whfast'"),
+        ("ias15", {"epsilon": 0.0}, "epsilon must be positive and finite, got 0.0"),
+        ("ias15", {"criterion": "aarseth"}, "unknown criterion 'aarseth': expected one of 'global', 'prs23'"),
+    ],
+)
+def test_wrong_options_of_ias15(integrator, options, message):
+    problem = comet()
+    with pytest.raises(ValueError, match=message):
+        judge.run(problem.params, problem.y0, integrator, h=1.0, n_steps=1, **options)
+
+
+def test_what_prepare_adds_is_in_the_run():
+    """A force that cancels gravity: straight lines."""
+
+    def cancel(sim):
+        def force(_):
+            for p in sim.particles:
+                p.ax = p.ay = p.az = 0.0
+
+        sim.additional_forces = force
+        return force
+
+    result = run("ias15", h=10.0, n_steps=1, prepare=cancel)
+    q, v = result.y[:, 0].reshape(2, -1)
+    np.testing.assert_allclose(result.y[:30, -1], q + 10.0 * v, rtol=1e-13, atol=1e-14)

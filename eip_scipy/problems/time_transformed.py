@@ -1,0 +1,167 @@
+"""Fictitious time: the same orbit in steps that are short where the motion is fast, with a fixed step.
+
+With dt = g(y) ds the state (y, t) as a function of s obeys another autonomous system, whose invariants are those of
+the problem. So a method of fixed step, with its projection, needs nothing new for close encounters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from math import sqrt
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from ..invariants import Invariant
+from ._problem import Problem, bind
+
+__all__ = ["centre_time", "pair_time", "reaches", "time_transformed"]
+
+
+@njit(cache=True)
+def centre_time(y, params):
+    """Time scale r^(3/2) of motion around one centre with G M = 1: the choice of g for `kepler`."""
+    r2 = 0.0
+    for k in range(y.size // 2):
+        r2 += y[k] * y[k]
+    r = sqrt(r2)
+    return r * sqrt(r)
+
+
+@njit(cache=True)
+def pair_time(y, params):
+    """Time scale of the closest pair of N bodies, smooth in all: (sum over pairs of (Gm_i + Gm_j) / r^3)^(-1/2)."""
+    rate2 = 0.0
+    for i in range(params.size):
+        for j in range(i):
+            x, y_, z = y[3 * i] - y[3 * j], y[3 * i + 1] - y[3 * j + 1], y[3 * i + 2] - y[3 * j + 2]
+            r2 = x * x + y_ * y_ + z * z
+            rate2 += (params[i] + params[j]) / (r2 * sqrt(r2))
+    return 1.0 / sqrt(rate2)
+
+
+def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pair_time) -> Problem:
+    """Write a problem in fictitious time s, dt = g(y) ds.
+
+    Parameters
+    ----------
+    problem : Problem
+        Autonomous, with ``rhs``.
+    s_end : float
+        End of the interval of s, which starts at 0. To stop at a time t, choose it large and give
+        ``events=reaches(t)`` to `integrate`.
+    g : callable, optional
+        Compiled ``g(y, params) -> float``, positive: what one unit of s is worth at y. Default: `pair_time`, for
+        `nbody` and its like; `centre_time` is for `kepler`. With these a circular orbit takes 2 pi in s (of two bodies
+        that are alone), and so does about half of a narrow ellipse with a passage of its pericentre.
+
+    Returns
+    -------
+    Problem
+        State (y, t), with t = ``problem.t_span[0]`` at the start. The same invariants, blocks and frame; t is in none
+        of them. It has no step of its own.
+
+    Raises
+    ------
+    ValueError
+        When the problem has no compiled right-hand side, or a part of its state would have the wrong size.
+
+    Notes
+    -----
+    The system is of the first order: Nyström methods do not apply to it.
+
+    References
+    ----------
+    K. F. Sundman, Mémoire sur le problème des trois corps, Acta Mathematica 36 (1913) 105-179. The exponent 3/2, for
+    which dt / ds is the local time scale: S. Mikkola, K. Tanikawa, Celestial Mechanics and Dynamical Astronomy 74
+    (1999) 287-295.
+    """
+    if problem.rhs is None:
+        raise ValueError(
+            f"time_transformed: the problem {problem.name!r} has no compiled right-hand side in place (rhs); "
+            "expected one such as kepler() or nbody(...)."
+        )
+    params = np.zeros(0) if problem.params is None else problem.params
+    rhs = _transformed_rhs(problem.rhs, g)
+    n = problem.y0.size
+    return Problem(
+        name=f"{problem.name} in fictitious time",
+        fun=bind(rhs, params),
+        rhs=rhs,
+        y0=np.append(problem.y0, problem.t_span[0]),
+        t_span=(0.0, float(s_end)),
+        params=params,
+        invariants=tuple(_transformed_invariant(item) for item in problem.invariants),
+        blocks=_blocks(problem.blocks, n),
+        frame=_frame(problem.frame),
+        units=problem.units,
+        source=problem.source,
+    )
+
+
+def reaches(t: float) -> Callable[..., float]:
+    """Make a terminal event for `integrate` on a transformed problem: the time is `t`."""
+    t = float(t)
+
+    @njit
+    def event(s, y, params):
+        return y[-1] - t
+
+    event.terminal = True
+    return event
+
+
+# Cached, so that two problems of the same functions are one to the compiler.
+@cache
+def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callable[..., None]:
+    @njit
+    def transformed(s, y, out, params):
+        n = y.size - 1
+        rhs(y[n], y[:n], out[:n], params)
+        weight = g(y[:n], params)
+        for k in range(n):
+            out[k] *= weight
+        out[n] = weight
+
+    return transformed
+
+
+def _transformed_invariant(item: Invariant) -> Invariant:
+    fun, grad = _transformed_functions(item.fun, item.grad, item.uses_f)
+    return Invariant(fun, grad, args=item.args, in_place=True, uses_f=item.uses_f, name=item.name, scale=item.scale)
+
+
+@cache
+def _transformed_functions(
+    fun: Callable[..., Any], grad: Callable[..., Any], uses_f: bool
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """The functions of an invariant for the state (y, t); those that want f = dy/dt get it from dy/ds and dt/ds."""
+
+    @njit
+    def value(s, y, params):
+        return fun(y[-1], y[:-1], params)
+
+    @njit
+    def gradient(s, y, out, params):
+        grad(y[-1], y[:-1], out[..., :-1], params)
+        out[..., -1] = 0.0
+
+    @njit
+    def gradient_of_f(s, y, f, out, params):
+        grad(y[-1], y[:-1], f[:-1] / f[-1], out[..., :-1], params)
+        out[..., -1] = 0.0
+
+    return value, gradient_of_f if uses_f else gradient
+
+
+def _blocks(blocks: Any, n: int) -> Any:
+    return tuple(np.arange(n).reshape(-1, blocks)) if isinstance(blocks, int) else blocks
+
+
+def _frame(frame: tuple[np.ndarray, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray] | None:
+    if frame is None:
+        return None
+    C, S = frame
+    return np.pad(C, ((0, 0), (0, 1))), np.pad(S, ((0, 1), (0, 0)))
