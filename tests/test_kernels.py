@@ -434,7 +434,7 @@ def test_no_directions_no_move():
 
 
 def verdict(value, before, y=0.0):
-    defect, band = np.empty(2), np.full(2, 1e-3)
+    defect, band = np.empty(2), np.full(2, 2.0**-10)
     values, target = np.array([value, 5.0]), np.array([3.0, 5.0])
     status = kn.judge(values, target, np.array([before, 0.0]), band, np.array([y]), defect)
     return status, defect[0]
@@ -444,6 +444,7 @@ def verdict(value, before, y=0.0):
     ("defect", "before", "good"),
     [
         (0.0625, 0.0, True),  # within 100 bands
+        (100 / 1024, 0.0, True),  # neither above them
         (0.25, 0.375, True),  # smaller than before
         (0.25, 0.25, True),
         (-0.25, -0.375, True),
@@ -554,6 +555,21 @@ def test_dead_bands_and_the_defects_outside():
     assert not kn.defects(target, target, G, y_hat, scales, False, g, band, raw)
     kn.defects(values, target, G, y_hat, scales, True, g, band, raw)
     np.testing.assert_allclose(band[:3] / EPS, [2.0, 4.0, 7.0], rtol=4 * EPS)
+
+
+@pytest.mark.parametrize(("value", "target"), [(-8.0, 1.0), (1.0, -8.0), (8.0, 1.0)])
+def test_dead_band_goes_with_the_size_of_value_and_target(value, target):
+    g, band, raw = np.empty(1), np.empty(1), np.empty(1)
+    nothing = np.zeros(1)
+    assert kn.defects(np.array([value]), np.array([target]), np.zeros((1, 1)), nothing, nothing, False, g, band, raw)
+    assert band[0] == 4 * EPS * 8.0
+    assert g[0] == raw[0] == value - target
+
+
+def test_products_are_added():
+    rows, out = np.array([[1.0, 2.0], [0.0, -3.0]]), np.array([10.0, 20.0])
+    kn.add_products(rows, np.array([0.5, 4.0]), out)
+    np.testing.assert_array_equal(out, [18.5, 8.0])
 
 
 def test_errors_tell_more_than_round_off_of_the_terms():
