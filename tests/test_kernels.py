@@ -94,6 +94,11 @@ def test_product_and_what_it_lost(pair):
     assert sum(exact([p, lost])) == math.prod(exact(pair))
 
 
+def test_products_of_numbers_with_all_their_bits():
+    for a, b in RNG(16).standard_normal((300, 2)):
+        assert sum(exact(kn.two_product(a, b))) == Fraction(a) * Fraction(b)
+
+
 def test_compensated_step_is_rounded_once_to_two_doubles():
     rng = RNG(4)
     y, K = rng.standard_normal(6), rng.standard_normal((3, 6))
@@ -395,6 +400,11 @@ def test_newton_step_of_dependent_rows_is_the_smallest():
 
 def test_newton_step_of_rows_that_are_not_finite():
     assert np.isnan(newton([[math.nan, 1.0]], [[1.0, 0.0]], np.array([1.0]), [0.0])).all()
+
+
+def test_newton_step_where_no_row_sees_a_direction():
+    """Zero gradients along the directions: the multipliers stay."""
+    np.testing.assert_array_equal(newton([[0.0, 1.0]], [[1.0, 0.0]], np.array([1.0]), [2.0]), [2.0])
 
 
 # Frames.
