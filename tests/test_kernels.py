@@ -237,14 +237,18 @@ def by_block(lists, x):
     return np.array([math.hypot(*x[b]) for b in lists])
 
 
-@pytest.mark.parametrize("unit", [1.0, 1e-160, 1e160])
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e-160, 1e-160), (1e160, 1e160), (1e-160, 1.0), (1e160, 1.0)])
 @pytest.mark.parametrize("layout", BLOCKS)
-def test_error_metric(layout, unit):
-    """Weights, scales and the largest relative error by their formulas; also where squares vanish or overflow."""
+def test_error_metric(layout, units):
+    """Weights, scales and the largest relative error by their formulas; also where squares vanish or overflow.
+
+    The first block may stand alone with that.
+    """
     blocks, lists = BLOCKS[layout]
-    rng = RNG(15)
-    y, y_hat, err = rng.standard_normal((3, 6)) * [[unit], [unit], [1e-3 * unit]]
-    rtol, atol = rng.uniform(1e-6, 1e-3, 6), unit * rng.uniform(1e-6, 1e-4, len(lists))
+    rng, unit = RNG(15), np.full(6, units[1])
+    unit[lists[0]] = units[0]
+    y, y_hat, err = rng.standard_normal((3, 6)) * [[1.0], [1.0], [1e-3]] * unit
+    rtol, atol = rng.uniform(1e-6, 1e-3, 6), rng.uniform(1e-6, 1e-4, len(lists)) * [unit[b[0]] for b in lists]
     sigma, scale, ratio = np.full(6, math.nan), np.empty(len(lists)), np.empty(len(lists))
     largest = kn.error_metric(err, y, y_hat, rtol, atol, grouping(blocks, 6), 1.25, sigma, scale, ratio)
     sizes = atol + np.maximum(by_block(lists, rtol * y), by_block(lists, rtol * y_hat))
@@ -540,6 +544,14 @@ def test_paired_norm_is_that_of_dop853(kind):
     fifth, third = (np.sum(np.abs(e / scale) ** 2) for e in (fine, coarse))
     assert found == pytest.approx(fifth / math.sqrt((fifth + 0.01 * third) * fine.size), rel=1e-13)
     np.testing.assert_allclose(err, fine * np.abs(fine) / np.hypot(np.abs(fine), 0.1 * np.abs(coarse)), rtol=1e-13)
+
+
+def test_paired_norm_without_the_coarse_error():
+    """It is the root mean square of the fine one then, which is not damped."""
+    fine, none, one = np.array([3.0, -4.0]), np.zeros(2), np.ones(2)
+    err = fine.copy()
+    assert kn.paired_error_norm(err, none, none, none, none, one, 1) == pytest.approx(math.sqrt(12.5), rel=4 * EPS)
+    np.testing.assert_array_equal(err, fine)
 
 
 def test_norms_where_the_tolerance_is_nothing():
