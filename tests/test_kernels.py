@@ -554,6 +554,14 @@ def test_paired_norm_without_the_coarse_error():
     np.testing.assert_array_equal(err, fine)
 
 
+@pytest.mark.parametrize(
+    ("t", "sign", "spacing"),
+    [(1.0, 1.0, EPS), (1.0, -1.0, EPS / 2), (-4.0, -1.0, 4 * EPS), (-4.0, 1.0, 2 * EPS), (0.0, -1.0, 5e-324)],
+)
+def test_least_step_is_ten_spacings_of_the_times_ahead(t, sign, spacing):
+    assert kn.least_step(t, sign) == 10 * spacing
+
+
 def test_norms_where_the_tolerance_is_nothing():
     """No error over no scale is none; any error is infinitely large."""
     zero, one, none = np.zeros(2), np.array([0.0, 1.0]), np.zeros(2)
