@@ -228,6 +228,12 @@ def test_second_projection_moves_by_offset_times_the_first(seed, size, offset):
     assert np.linalg.norm(first.correction) < 100 * offset
 
 
+def test_project_takes_one_newton_step_at_t_0_unless_told():
+    """From y = 2 towards (1 + t) y^2 = 1: 2 - 3/4."""
+    square = Invariant(lambda t, y: (1 + t) * y[0] ** 2, lambda t, y: 2 * (1 + t) * y, target=1.0)
+    np.testing.assert_array_equal(project([2.0], square).y, [1.25])
+
+
 @given(seeds, sizes, st.integers(2, 4))
 @few
 def test_more_iterations_are_newton_s(seed, size, iterations):
