@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from systems import H, L, orbit, oscillator
+from systems import H_USES_F, H, L, orbit, oscillator
 
 from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, Invariant, integrate, project
 from eip_scipy.problems import harmonic, kepler, nbody
@@ -232,6 +232,14 @@ def test_project_takes_one_newton_step_at_t_0_unless_told():
     """From y = 2 towards (1 + t) y^2 = 1: 2 - 3/4."""
     square = Invariant(lambda t, y: (1 + t) * y[0] ** 2, lambda t, y: 2 * (1 + t) * y, target=1.0)
     np.testing.assert_array_equal(project([2.0], square).y, [1.25])
+
+
+def test_project_takes_the_derivative_as_an_array_for_one_step():
+    """The energy's gradient by f is the same as that written out, bit for bit."""
+    y = np.array([0.6, 0.3, -0.4, 1.3])
+    by_f = project(y, H_USES_F, f=orbit(0.0, y), target=-0.5)
+    np.testing.assert_array_equal(by_f.y, project(y, H, target=-0.5).y)
+    assert by_f.rank == 1
 
 
 @given(seeds, sizes, st.integers(2, 4))
