@@ -234,11 +234,14 @@ def test_project_takes_one_newton_step_at_t_0_unless_told():
     np.testing.assert_array_equal(project([2.0], square).y, [1.25])
 
 
-def test_project_takes_the_derivative_as_an_array_for_one_step():
-    """The energy's gradient by f is the same as that written out, bit for bit."""
-    y = np.array([0.6, 0.3, -0.4, 1.3])
-    by_f = project(y, H_USES_F, f=orbit(0.0, y), target=-0.5)
-    np.testing.assert_array_equal(by_f.y, project(y, H, target=-0.5).y)
+ORBIT_STATE = np.array([0.6, 0.3, -0.4, 1.3])
+
+
+@pytest.mark.parametrize(("f", "iterations"), [(orbit(0.0, ORBIT_STATE), 1), (orbit, 1), (orbit, 3)])
+def test_project_with_a_gradient_by_f(f, iterations):
+    """As with the one written out, bit for bit: f as an array will do for one step, others evaluate it anew."""
+    by_f = project(ORBIT_STATE, H_USES_F, f=f, target=-0.5, iterations=iterations)
+    np.testing.assert_array_equal(by_f.y, project(ORBIT_STATE, H, target=-0.5, iterations=iterations).y)
     assert by_f.rank == 1
 
 
