@@ -79,6 +79,20 @@ def test_one_step_is_the_tableau(method):
 
 
 @both
+def test_stages_keep_the_velocity(method):
+    """The accelerations do not see it, but fun may."""
+    seen = []
+
+    def fun(t, y):
+        seen.append(y[2:].copy())
+        return orbit(t, y)
+
+    solve_ivp(fun, (0, 0.1), Y0, method=method, h=0.1)
+    # The last stage may be the first of the next step.
+    assert sum(np.array_equal(v, Y0[2:]) for v in seen) >= method.TABLEAU.n_stages - 1
+
+
+@both
 def test_time_reaches_every_stage(method):
     """q'' = -9 sin 3t from t0 = 0.4: exact q = sin 3t."""
     start, end = (np.array([np.sin(3 * t), 3 * np.cos(3 * t)]) for t in (0.4, 2.4))
