@@ -209,6 +209,12 @@ def test_correction_in_local_errors(layout):
     assert kn.correction_in_local_errors(move, scale, grouping(blocks, 6), 0.3) == pytest.approx(expected, rel=8 * EPS)
 
 
+def test_correction_is_none_where_there_is_no_error_or_no_scale():
+    groups, move = grouping(None, 2), np.array([3.0, 4.0])
+    assert kn.correction_in_local_errors(move, np.ones(2), groups, 0.0) == 0.0
+    assert kn.correction_in_local_errors(move, np.zeros(2), groups, 0.5) == 0.0
+
+
 @pytest.mark.parametrize("layout", BLOCKS)
 def test_softening_is_half_way_on_a_log_scale(layout):
     blocks, lists = BLOCKS[layout]
