@@ -179,6 +179,13 @@ def test_quadrature(unit):
     np.testing.assert_allclose(out, np.array([5.0, 0.0, 13.0]) * unit, rtol=2 * EPS)
 
 
+@pytest.mark.parametrize("unit", [1e-160, 1e160])
+def test_quadrature_with_one_component_whose_square_does_not_fit(unit):
+    out = np.empty(2)
+    kn.quadrature(np.array([3.0 * unit, -5.0]), np.array([4.0 * unit, 12.0]), out)
+    np.testing.assert_allclose(out, [5.0 * unit, 13.0], rtol=2 * EPS)
+
+
 @pytest.mark.parametrize("exponent", [1.25, 1.125, 1.5, 2.0])
 def test_powers(exponent):
     x = np.array([0.0, 1e-200, 1e-5, 0.3, 1.0])
