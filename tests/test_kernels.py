@@ -77,6 +77,17 @@ def test_weighted_sum_of_a_part_of_the_rows():
     np.testing.assert_allclose(out, 0.5 * (2.0 * K[0, 3:5] - K[2, 3:5]), rtol=4 * EPS)
 
 
+def test_nystrom_sums_take_weights_of_one_and_skip_those_of_zero():
+    """q + c h v + h^2 (a_0 - a_2) of the first three rows, v + h (a_0 - a_2 + a_3) of four; dyadic, so exact."""
+    y, h, weights = np.array([1.0, 2.0, 3.0, 5.0]), 0.5, np.array([1.0, 0.0, -1.0, 1.0])
+    K, out = np.full((4, 4), math.nan), np.full(4, math.nan)
+    K[[0, 2, 3], 2:] = [[4.0, 8.0], [16.0, -8.0], [2.0, 32.0]]
+    kn.nystrom_position(y, h, 0.25, weights, K, 3, out)
+    np.testing.assert_array_equal(out, [1 + 0.125 * 3 + 0.25 * -12, 2 + 0.125 * 5 + 0.25 * 16, math.nan, math.nan])
+    kn.nystrom_velocity(y, h, weights, K, 4, out)
+    np.testing.assert_array_equal(out[2:], [3 + 0.5 * -10, 5 + 0.5 * 48])
+
+
 # Compensated arithmetic: exact, or to the square of a rounding.
 
 
