@@ -197,7 +197,7 @@ def test_quadrature_with_one_component_whose_square_does_not_fit(unit):
     np.testing.assert_allclose(out, [5.0 * unit, 13.0], rtol=2 * EPS)
 
 
-@pytest.mark.parametrize("exponent", [1.25, 1.125, 1.5, 2.0])
+@pytest.mark.parametrize("exponent", [1.25, 1.125, 1.5, 2.0, 2.25, 2.5])
 def test_powers(exponent):
     x = np.array([0.0, 1e-200, 1e-5, 0.3, 1.0])
     expected = x**exponent
