@@ -77,6 +77,17 @@ def test_weighted_sum_of_a_part_of_the_rows():
     np.testing.assert_allclose(out, 0.5 * (2.0 * K[0, 3:5] - K[2, 3:5]), rtol=4 * EPS)
 
 
+def test_nystrom_sums_take_weights_of_one_and_skip_those_of_zero():
+    """q + c h v + h^2 (a_0 - a_2) of the first three rows, v + h (a_0 - a_2 + a_3) of four; dyadic, so exact."""
+    y, h, weights = np.array([1.0, 2.0, 3.0, 5.0]), 0.5, np.array([1.0, 0.0, -1.0, 1.0])
+    K, out = np.full((4, 4), math.nan), np.full(4, math.nan)
+    K[[0, 2, 3], 2:] = [[4.0, 8.0], [16.0, -8.0], [2.0, 32.0]]
+    kn.nystrom_position(y, h, 0.25, weights, K, 3, out)
+    np.testing.assert_array_equal(out, [1 + 0.125 * 3 + 0.25 * -12, 2 + 0.125 * 5 + 0.25 * 16, math.nan, math.nan])
+    kn.nystrom_velocity(y, h, weights, K, 4, out)
+    np.testing.assert_array_equal(out[2:], [3 + 0.5 * -10, 5 + 0.5 * 48])
+
+
 # Compensated arithmetic: exact, or to the square of a rounding.
 
 
@@ -92,6 +103,11 @@ def test_product_and_what_it_lost(pair):
     p, lost = kn.two_product(*pair)
     assert p == pair[0] * pair[1]
     assert sum(exact([p, lost])) == math.prod(exact(pair))
+
+
+def test_products_of_numbers_with_all_their_bits():
+    for a, b in RNG(16).standard_normal((300, 2)):
+        assert sum(exact(kn.two_product(a, b))) == Fraction(a) * Fraction(b)
 
 
 def test_compensated_step_is_rounded_once_to_two_doubles():
@@ -174,7 +190,14 @@ def test_quadrature(unit):
     np.testing.assert_allclose(out, np.array([5.0, 0.0, 13.0]) * unit, rtol=2 * EPS)
 
 
-@pytest.mark.parametrize("exponent", [1.25, 1.125, 1.5, 2.0])
+@pytest.mark.parametrize("unit", [1e-160, 1e160])
+def test_quadrature_with_one_component_whose_square_does_not_fit(unit):
+    out = np.empty(2)
+    kn.quadrature(np.array([3.0 * unit, -5.0]), np.array([4.0 * unit, 12.0]), out)
+    np.testing.assert_allclose(out, [5.0 * unit, 13.0], rtol=2 * EPS)
+
+
+@pytest.mark.parametrize("exponent", [1.25, 1.125, 1.5, 2.0, 2.25, 2.5])
 def test_powers(exponent):
     x = np.array([0.0, 1e-200, 1e-5, 0.3, 1.0])
     expected = x**exponent
@@ -204,6 +227,12 @@ def test_correction_in_local_errors(layout):
     assert kn.correction_in_local_errors(move, scale, grouping(blocks, 6), 0.3) == pytest.approx(expected, rel=8 * EPS)
 
 
+def test_correction_is_none_where_there_is_no_error_or_no_scale():
+    groups, move = grouping(None, 2), np.array([3.0, 4.0])
+    assert kn.correction_in_local_errors(move, np.ones(2), groups, 0.0) == 0.0
+    assert kn.correction_in_local_errors(move, np.zeros(2), groups, 0.5) == 0.0
+
+
 @pytest.mark.parametrize("layout", BLOCKS)
 def test_softening_is_half_way_on_a_log_scale(layout):
     blocks, lists = BLOCKS[layout]
@@ -225,6 +254,43 @@ def test_softening_tends_to_equal_relative_errors():
     for _ in range(60):
         kn.soften(err, scale, grouping(None, 3), sigma)
     np.testing.assert_allclose(sigma, scale, rtol=1e-12)
+
+
+def by_block(lists, x):
+    """The blocks' lengths, without overflow."""
+    return np.array([math.hypot(*x[b]) for b in lists])
+
+
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e-160, 1e-160), (1e160, 1e160), (1e-160, 1.0), (1e160, 1.0)])
+@pytest.mark.parametrize("layout", BLOCKS)
+def test_error_metric(layout, units):
+    """Weights, scales and the largest relative error by their formulas; also where squares vanish or overflow.
+
+    The first block may stand alone with that.
+    """
+    blocks, lists = BLOCKS[layout]
+    rng, unit = RNG(15), np.full(6, units[1])
+    unit[lists[0]] = units[0]
+    y, y_hat, err = rng.standard_normal((3, 6)) * [[1.0], [1.0], [1e-3]] * unit
+    rtol, atol = rng.uniform(1e-6, 1e-3, 6), rng.uniform(1e-6, 1e-4, len(lists)) * [unit[b[0]] for b in lists]
+    sigma, scale, ratio = np.full(6, math.nan), np.empty(len(lists)), np.empty(len(lists))
+    largest = kn.error_metric(err, y, y_hat, rtol, atol, grouping(blocks, 6), 1.25, sigma, scale, ratio)
+    sizes = atol + np.maximum(by_block(lists, rtol * y), by_block(lists, rtol * y_hat))
+    relative = by_block(lists, err) / sizes
+    weights = sizes * ((relative / relative.max()) ** 1.25 + 1e-7)
+    np.testing.assert_allclose(scale, sizes, rtol=8 * EPS)
+    assert largest == pytest.approx(relative.max(), rel=16 * EPS)
+    for b, weight in zip(lists, weights / weights.max(), strict=True):
+        np.testing.assert_allclose(sigma[b], weight, rtol=32 * EPS)
+
+
+def test_error_metric_of_a_block_that_is_nothing():
+    """Without size, tolerance or error it has no weight, and the others' are theirs."""
+    y, err, rtol = np.array([0.0, 2.0]), np.array([0.0, 1e-3]), np.full(2, 0.5)
+    sigma, scale, ratio = (np.full(2, math.nan) for _ in range(3))
+    assert kn.error_metric(err, y, y, rtol, np.zeros(2), grouping(None, 2), 1.25, sigma, scale, ratio) == 1e-3
+    np.testing.assert_array_equal(scale, [0.0, 1.0])
+    np.testing.assert_array_equal(sigma, [0.0, 1.0])
 
 
 # Orthogonal directions, ranks, least norms.
@@ -364,6 +430,11 @@ def test_newton_step_of_rows_that_are_not_finite():
     assert np.isnan(newton([[math.nan, 1.0]], [[1.0, 0.0]], np.array([1.0]), [0.0])).all()
 
 
+def test_newton_step_where_no_row_sees_a_direction():
+    """Zero gradients along the directions: the multipliers stay."""
+    np.testing.assert_array_equal(newton([[0.0, 1.0]], [[1.0, 0.0]], np.array([1.0]), [2.0]), [2.0])
+
+
 # Frames.
 
 PAIR = (np.kron(np.eye(2), [[1.0, 3.0]]), np.kron(np.eye(2), [[1.0], [1.0]]))
@@ -401,7 +472,7 @@ def test_no_directions_no_move():
 
 
 def verdict(value, before, y=0.0):
-    defect, band = np.empty(2), np.full(2, 1e-3)
+    defect, band = np.empty(2), np.full(2, 2.0**-10)
     values, target = np.array([value, 5.0]), np.array([3.0, 5.0])
     status = kn.judge(values, target, np.array([before, 0.0]), band, np.array([y]), defect)
     return status, defect[0]
@@ -411,6 +482,7 @@ def verdict(value, before, y=0.0):
     ("defect", "before", "good"),
     [
         (0.0625, 0.0, True),  # within 100 bands
+        (100 / 1024, 0.0, True),  # neither above them
         (0.25, 0.375, True),  # smaller than before
         (0.25, 0.25, True),
         (-0.25, -0.375, True),
@@ -498,6 +570,22 @@ def test_paired_norm_is_that_of_dop853(kind):
     np.testing.assert_allclose(err, fine * np.abs(fine) / np.hypot(np.abs(fine), 0.1 * np.abs(coarse)), rtol=1e-13)
 
 
+def test_paired_norm_without_the_coarse_error():
+    """It is the root mean square of the fine one then, which is not damped."""
+    fine, none, one = np.array([3.0, -4.0]), np.zeros(2), np.ones(2)
+    err = fine.copy()
+    assert kn.paired_error_norm(err, none, none, none, none, one, 1) == pytest.approx(math.sqrt(12.5), rel=4 * EPS)
+    np.testing.assert_array_equal(err, fine)
+
+
+@pytest.mark.parametrize(
+    ("t", "sign", "spacing"),
+    [(1.0, 1.0, EPS), (1.0, -1.0, EPS / 2), (-4.0, -1.0, 4 * EPS), (-4.0, 1.0, 2 * EPS), (0.0, -1.0, 5e-324)],
+)
+def test_least_step_is_ten_spacings_of_the_times_ahead(t, sign, spacing):
+    assert kn.least_step(t, sign) == 10 * spacing
+
+
 def test_norms_where_the_tolerance_is_nothing():
     """No error over no scale is none; any error is infinitely large."""
     zero, one, none = np.zeros(2), np.array([0.0, 1.0]), np.zeros(2)
@@ -521,6 +609,21 @@ def test_dead_bands_and_the_defects_outside():
     assert not kn.defects(target, target, G, y_hat, scales, False, g, band, raw)
     kn.defects(values, target, G, y_hat, scales, True, g, band, raw)
     np.testing.assert_allclose(band[:3] / EPS, [2.0, 4.0, 7.0], rtol=4 * EPS)
+
+
+@pytest.mark.parametrize(("value", "target"), [(-8.0, 1.0), (1.0, -8.0), (8.0, 1.0)])
+def test_dead_band_goes_with_the_size_of_value_and_target(value, target):
+    g, band, raw = np.empty(1), np.empty(1), np.empty(1)
+    nothing = np.zeros(1)
+    assert kn.defects(np.array([value]), np.array([target]), np.zeros((1, 1)), nothing, nothing, False, g, band, raw)
+    assert band[0] == 4 * EPS * 8.0
+    assert g[0] == raw[0] == value - target
+
+
+def test_products_are_added():
+    rows, out = np.array([[1.0, 2.0], [0.0, -3.0]]), np.array([10.0, 20.0])
+    kn.add_products(rows, np.array([0.5, 4.0]), out)
+    np.testing.assert_array_equal(out, [18.5, 8.0])
 
 
 def test_errors_tell_more_than_round_off_of_the_terms():

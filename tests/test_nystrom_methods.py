@@ -65,17 +65,54 @@ def test_order(method, n, options, exact):
     assert order > method.TABLEAU.order - 1.0
 
 
+def accelerations(tableau, h):
+    """Those of the stages of the first step, by the definition."""
+    q, v, k = Y0[:2], Y0[2:], []
+    for i in range(tableau.n_stages):
+        k.append(acceleration(0, q + tableau.c[i] * h * v + h * h * sum(tableau.A[i, j] * k[j] for j in range(i))))
+    return np.array(k)
+
+
 @both
 def test_one_step_is_the_tableau(method):
     """Against a step written from the definition, in fractions' own floats."""
     tableau, h = method.TABLEAU, 0.1
-    q, v, k = Y0[:2], Y0[2:], []
-    for i in range(tableau.n_stages):
-        k.append(acceleration(0, q + tableau.c[i] * h * v + h * h * sum(tableau.A[i, j] * k[j] for j in range(i))))
+    q, v, k = Y0[:2], Y0[2:], accelerations(tableau, h)
     expected = np.concatenate([q + h * v + h * h * tableau.b @ k, v + h * tableau.b_prime @ k])
     for compensated in (False, True):
         run = integrate(acceleration, (0, h), Y0, method=method, h=h, compensated=compensated)
         np.testing.assert_allclose(run.y[:, -1], expected, rtol=4e-16, atol=4e-16)
+
+
+@both
+def test_local_error_is_the_difference_of_the_tableau_s_weights(method):
+    """h^2 e . a in q, h e' . a in v, which the metric is made of."""
+    found, h, tableau = [], 0.5, method.TABLEAU
+
+    class Recorder(method):
+        def _project_step(self, t, y, y_hat, err):
+            found.append(err.copy())
+            return super()._project_step(t, y, y_hat, err)
+
+    solve_ivp(orbit, (0, h), Y0, method=Recorder, h=h, **KEPT)
+    k = accelerations(tableau, h)
+    expected = np.concatenate([h * h * tableau.e @ k, h * tableau.e_prime @ k])
+    assert np.abs(expected).min() > 1e-12
+    np.testing.assert_allclose(found, [expected], rtol=0, atol=1e-14)
+
+
+@both
+def test_stages_keep_the_velocity(method):
+    """The accelerations do not see it, but fun may."""
+    seen = []
+
+    def fun(t, y):
+        seen.append(y[2:].copy())
+        return orbit(t, y)
+
+    solve_ivp(fun, (0, 0.1), Y0, method=method, h=0.1)
+    # The last stage may be the first of the next step.
+    assert sum(np.array_equal(v, Y0[2:]) for v in seen) >= method.TABLEAU.n_stages - 1
 
 
 @both

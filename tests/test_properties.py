@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from systems import H, L, orbit, oscillator
+from systems import H_USES_F, H, L, orbit, oscillator
 
 from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, Invariant, integrate, project
 from eip_scipy.problems import harmonic, kepler, nbody
@@ -226,6 +226,23 @@ def test_second_projection_moves_by_offset_times_the_first(seed, size, offset):
     second = project(first.y, q.invariant())
     assert np.linalg.norm(second.correction) <= 200 * offset * np.linalg.norm(first.correction)
     assert np.linalg.norm(first.correction) < 100 * offset
+
+
+def test_project_takes_one_newton_step_at_t_0_unless_told():
+    """From y = 2 towards (1 + t) y^2 = 1: 2 - 3/4."""
+    square = Invariant(lambda t, y: (1 + t) * y[0] ** 2, lambda t, y: 2 * (1 + t) * y, target=1.0)
+    np.testing.assert_array_equal(project([2.0], square).y, [1.25])
+
+
+ORBIT_STATE = np.array([0.6, 0.3, -0.4, 1.3])
+
+
+@pytest.mark.parametrize(("f", "iterations"), [(orbit(0.0, ORBIT_STATE), 1), (orbit, 1), (orbit, 3)])
+def test_project_with_a_gradient_by_f(f, iterations):
+    """As with the one written out, bit for bit: f as an array will do for one step, others evaluate it anew."""
+    by_f = project(ORBIT_STATE, H_USES_F, f=f, target=-0.5, iterations=iterations)
+    np.testing.assert_array_equal(by_f.y, project(ORBIT_STATE, H, target=-0.5, iterations=iterations).y)
+    assert by_f.rank == 1
 
 
 @given(seeds, sizes, st.integers(2, 4))
