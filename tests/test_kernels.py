@@ -261,9 +261,10 @@ def by_block(lists, x):
     return np.array([math.hypot(*x[b]) for b in lists])
 
 
+@pytest.mark.parametrize("rounding", [0.0, 2.0**-10])
 @pytest.mark.parametrize("units", [(1.0, 1.0), (1e-160, 1e-160), (1e160, 1e160), (1e-160, 1.0), (1e160, 1.0)])
 @pytest.mark.parametrize("layout", BLOCKS)
-def test_error_metric(layout, units):
+def test_error_metric(layout, units, rounding):
     """Weights, scales and the largest relative error by their formulas; also where squares vanish or overflow.
 
     The first block may stand alone with that.
@@ -274,9 +275,9 @@ def test_error_metric(layout, units):
     y, y_hat, err = rng.standard_normal((3, 6)) * [[1.0], [1.0], [1e-3]] * unit
     rtol, atol = rng.uniform(1e-6, 1e-3, 6), rng.uniform(1e-6, 1e-4, len(lists)) * [unit[b[0]] for b in lists]
     sigma, scale, ratio = np.full(6, math.nan), np.empty(len(lists)), np.empty(len(lists))
-    largest = kn.error_metric(err, y, y_hat, rtol, atol, grouping(blocks, 6), 1.25, sigma, scale, ratio)
+    largest = kn.error_metric(err, rounding, y, y_hat, rtol, atol, grouping(blocks, 6), 1.25, sigma, scale, ratio)
     sizes = atol + np.maximum(by_block(lists, rtol * y), by_block(lists, rtol * y_hat))
-    relative = by_block(lists, err) / sizes
+    relative = by_block(lists, np.hypot(err, rounding * y_hat)) / sizes
     weights = sizes * ((relative / relative.max()) ** 1.25 + 1e-7)
     np.testing.assert_allclose(scale, sizes, rtol=8 * EPS)
     assert largest == pytest.approx(relative.max(), rel=16 * EPS)
@@ -288,7 +289,7 @@ def test_error_metric_of_a_block_that_is_nothing():
     """Without size, tolerance or error it has no weight, and the others' are theirs."""
     y, err, rtol = np.array([0.0, 2.0]), np.array([0.0, 1e-3]), np.full(2, 0.5)
     sigma, scale, ratio = (np.full(2, math.nan) for _ in range(3))
-    assert kn.error_metric(err, y, y, rtol, np.zeros(2), grouping(None, 2), 1.25, sigma, scale, ratio) == 1e-3
+    assert kn.error_metric(err, 0.0, y, y, rtol, np.zeros(2), grouping(None, 2), 1.25, sigma, scale, ratio) == 1e-3
     np.testing.assert_array_equal(scale, [0.0, 1.0])
     np.testing.assert_array_equal(sigma, [0.0, 1.0])
 

@@ -522,6 +522,15 @@ def test_error_metric_without_any_error_is_euclidean():
     np.testing.assert_allclose(run.y[:, -1], [-0.1, -0.3], rtol=4 * EPS)
 
 
+@pytest.mark.parametrize(("compensated", "move"), [(False, [0.25 / 9.25, 3 / 9.25]), (True, [0.1, 0.3])])
+def test_rounding_is_an_error_unless_it_is_carried(compensated, move):
+    """f = 0: what errs is the rounding of the state, in proportion to its size; or nothing, the metric is euclidean."""
+    keep = Invariant(lambda t, y: y[0] + 3 * y[1] + t, lambda t, y: np.array([1.0, 3.0]))
+    options = {"method": EIPRK4, "h": 1.0, "invariants": keep, "check": False, "atol": 0.0, "compensated": compensated}
+    run = integrate(lambda t, y: np.zeros(2), (0, 1), [1.0, 2.0], **options)
+    np.testing.assert_allclose(run.y[:, -1] - [1.0, 2.0], np.negative(move), rtol=1e-6)
+
+
 def test_components_without_error_hardly_move():
     """A component that the estimate sees exactly moves by the floor only."""
     keep = Invariant(lambda t, y: y[0] + y[1], lambda t, y: np.ones(2))
