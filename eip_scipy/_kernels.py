@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ._lanes import abs_dot, dot, largest, remove_component
+from ._lanes import abs_dot, dot, largest, remove_component, weighted_rows
 from ._triples import shift_and_weigh, shift_bodies, sum_bodies
 
 OK, NOT_FINITE, FAILED_PROJECTION, POSTPONED = 0, 1, 2, 4
@@ -130,38 +130,16 @@ def all_finite(a):
 @_jit_inline
 def combine(y, h, weights, K, stages, out):
     """Out = y + h sum_j weights[j] K[j] over the first `stages` rows, zero weights skipped."""
-    n = y.size
-    used = 0
-    for j in range(stages):
-        w = weights[j]
-        if w == 0.0:
-            continue
-        if used == 0:
-            for i in range(n):
-                out[i] = w * K[j, i]
-        else:
-            for i in range(n):
-                out[i] += w * K[j, i]
-        used += 1
-    if used == 0:
-        copy(y, out)
-    else:
-        for i in range(n):
-            out[i] = y[i] + h * out[i]
+    weighted_rows(weights, K, stages, 0, out)
+    for i in range(y.size):
+        out[i] = y[i] + h * out[i]
 
 
 @_jit_inline
 def weighted_sum(weights, K, first, scale, out):
     """Out = scale sum_j weights[j] K[j, first:]."""
-    n = out.size
-    for i in range(n):
-        out[i] = 0.0
-    for j in range(weights.size):
-        w = weights[j]
-        if w != 0.0:
-            for i in range(n):
-                out[i] += w * K[j, first + i]
-    for i in range(n):
+    weighted_rows(weights, K, weights.size, first, out)
+    for i in range(out.size):
         out[i] *= scale
 
 
@@ -169,13 +147,7 @@ def weighted_sum(weights, K, first, scale, out):
 def nystrom_position(y, h, c, weights, K, stages, out):
     """First half of out = q + c h v + h^2 sum_j weights[j] a_j, for y = (q, v) and a_j the second half of K[j]."""
     half = out.size // 2
-    for i in range(half):
-        out[i] = 0.0
-    for j in range(stages):
-        w = weights[j]
-        if w != 0.0:
-            for i in range(half):
-                out[i] += w * K[j, half + i]
+    weighted_rows(weights, K, stages, half, out[:half])
     for i in range(half):
         out[i] = y[i] + h * (c * y[half + i] + h * out[i])
 
@@ -184,13 +156,7 @@ def nystrom_position(y, h, c, weights, K, stages, out):
 def nystrom_velocity(y, h, weights, K, stages, out):
     """Second half of out = v + h sum_j weights[j] a_j."""
     half = out.size // 2
-    for i in range(half):
-        out[half + i] = 0.0
-    for j in range(stages):
-        w = weights[j]
-        if w != 0.0:
-            for i in range(half, 2 * half):
-                out[i] += w * K[j, i]
+    weighted_rows(weights, K, stages, half, out[half:])
     for i in range(half, 2 * half):
         out[i] = y[i] + h * out[i]
 

@@ -16,10 +16,11 @@ from numba import config, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-__all__ = ["abs_dot", "dot", "largest", "remove_component"]
+__all__ = ["abs_dot", "dot", "largest", "remove_component", "weighted_rows"]
 
 LANES = 8
-VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+DOUBLE = ir.DoubleType()
+VECTOR = ir.VectorType(DOUBLE, LANES)
 
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, i: Any) -> Any:  # emits LLVM
@@ -115,7 +116,52 @@ def _lanes_remove(typingctx, row, unit_row, r, n):
     return types.float64(row, unit_row, types.float64, types.intp), codegen
 
 
+def _emit_rows(builder: Any, weights: Any, K: Any, stride: Any, rows: Any, out: Any, i: Any, width: int) -> None:
+    # emits LLVM
+    """out[i : i + width] = the sum, row by row, weights of 0 skipped."""
+    kind = ir.VectorType(DOUBLE, width)
+
+    def place(data: Any, at: Any) -> Any:
+        return builder.bitcast(builder.gep(data, [at]), kind.as_pointer())
+
+    total = cgutils.alloca_once_value(builder, ir.Constant(kind, [0.0] * width))
+    zero, one = (ir.Constant(rows.type, value) for value in (0, 1))
+    with cgutils.for_range_slice(builder, zero, rows, one, rows.type) as (j, _):
+        weight = builder.load(builder.gep(weights, [j]))
+        with builder.if_then(builder.fcmp_unordered("!=", weight, ir.Constant(DOUBLE, 0.0))):
+            spread = ir.Constant(kind, ir.Undefined)
+            for k in range(width):
+                spread = builder.insert_element(spread, weight, ir.Constant(ir.IntType(32), k))
+            row = builder.load(place(K, builder.add(builder.mul(j, stride), i)), align=8)
+            builder.store(builder.fadd(builder.load(total), builder.fmul(spread, row)), total)
+    builder.store(builder.load(total), place(out, i), align=8)
+
+
+@intrinsic  # emits LLVM
+def _lanes_rows(typingctx, weights, K, rows, first, out):
+    def codegen(context, builder, signature, arguments):
+        weights, K, out = (context.make_array(signature.args[k])(context, builder, arguments[k]) for k in (0, 1, 4))
+        rows, first = arguments[2:4]
+        stride = cgutils.unpack_tuple(builder, K.shape)[1]
+        data, n = builder.gep(K.data, [first]), out.nitems
+        begin = ir.Constant(n.type, 0)
+        for width in (LANES, 4, 2, 1):
+            end = builder.sub(n, builder.and_(n, ir.Constant(n.type, width - 1)))
+            with cgutils.for_range_slice(builder, begin, end, ir.Constant(n.type, width), n.type) as (i, _):
+                _emit_rows(builder, weights.data, data, stride, rows, out.data, i, width)
+            begin = end
+        return context.get_dummy_value()
+
+    return types.void(weights, K, types.intp, types.intp, out), codegen
+
+
 if config.DISABLE_JIT:
+
+    def _lanes_rows(weights, K, rows, first, out):
+        out[:] = 0.0
+        for j in range(rows):
+            if weights[j] != 0.0:
+                out += weights[j] * K[j, first : first + out.size]
 
     def _numpy_sum(products):
         lanes = np.add.reduce(products.reshape(-1, LANES), axis=0)
@@ -158,6 +204,12 @@ def abs_dot(a, b):
     for i in range(whole, a.size):
         rest += abs(a[i] * b[i])
     return _lanes_abs_dot(a, b, whole) + rest
+
+
+@_jit
+def weighted_rows(weights, K, rows, first, out):
+    """Out = sum_j weights[j] K[j, first:] over the first `rows` rows, in their order, zero weights skipped."""
+    _lanes_rows(weights, K, rows, first, out)
 
 
 @_jit
