@@ -77,7 +77,8 @@ def figure(times: np.ndarray, errors: dict[str, np.ndarray]) -> Any:
     axes = page.subplots(1, len(BODIES), sharex=True, sharey=True)
     for axis, (body, k) in zip(axes, BODIES.items(), strict=True):
         for (name, own), marker in zip(errors.items(), MARKERS, strict=True):
-            axis.loglog(times, own[:, k], color=COLOURS[name], marker=marker, ms=4, label=name)
+            shown = np.where(own[:, k] > 0, own[:, k], np.nan)
+            axis.loglog(times, shown, color=COLOURS[name], marker=marker, ms=4, label=name)
         start = np.median([own[0, k] for own in errors.values()])
         axis.loglog(times, 0.1 * start * (times / times[0]) ** 1.5, color="0.5", ls=":", label="slope 3/2 (Brouwer)")
         axis.set_title(body)

@@ -427,8 +427,9 @@ def integrate(
     check_memory(saved_rows(grid), run, bound)
     record = Diagnostics() if diagnostics is None else diagnostics
     _setup.attach(record, run)
-    functions, why_not = _functions(fun, form, extra, run.invariants, happenings, start.dtype, compiled, rhs)
-    driver = _Driver(run, grid, functions, parameters, compiled=why_not is None)
+    with _compiling(progress):
+        functions, why_not = _functions(fun, form, extra, run.invariants, happenings, start.dtype, compiled, rhs)
+        driver = _Driver(run, grid, functions, parameters, compiled=why_not is None)
     run.work.K[0] = f0 if run.y0 is start else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
     happenings.fill(t0, run.y0, grid.g)
@@ -575,6 +576,14 @@ class _Loop:
             if not broken:
                 raise
             return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)
+
+
+def _compiling(progress: bool) -> Any:
+    """A line while the first run of an installation compiles, which takes longer than anyone waits without a word."""
+    from tqdm import tqdm
+
+    line = "compiling (a minute or two in the first run, then kept on disk)"
+    return tqdm(total=0, desc=line, bar_format="{desc}", leave=False, disable=not progress)
 
 
 def _bar(progress: bool, grid: Grid, label: str) -> Any:
