@@ -274,7 +274,7 @@ def test_solar_figures_come_from_the_command(tmp_path, monkeypatch):
     monkeypatch.setattr("eip_scipy.cli._rebound", lambda args: "REBOUND")
     target = tmp_path / "run.json"
     assert main(["reproduce", "fig-solar", "--out", str(tmp_path), "--json", str(target), "--quiet"]) == 1
-    assert seen == [(2000.0, "EIPRK4", tmp_path, "REBOUND")]
+    assert seen == [(None, "EIPRK4", tmp_path, "REBOUND")]  # None: the command's own default
     run = json.loads(target.read_text())
     assert (run["passed"], run["fig-solar"]) == (False, {"checks": []})
 

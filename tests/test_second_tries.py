@@ -6,6 +6,7 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK4, Diagnostics, Invariant, project
 
+EPS = np.finfo(float).eps
 RTOL, STEP = 1e-3, 0.5
 KAPPA, FLOOR = EIPRK4.TABLEAU.kappa, 1e-7
 HEALTHY, TRIES = 5.0, 3
@@ -57,7 +58,8 @@ class Case:
         """The corrected states, one for each try."""
         lists, alone = self.lists(), self.blocks is None
         scale = np.array([RTOL * np.linalg.norm(self.y[b]) for b in lists])
-        r = np.array([np.linalg.norm(self.err[b]) for b in lists]) / scale
+        estimate = np.array([np.linalg.norm(self.err[b]) for b in lists])
+        r = np.hypot(estimate, EPS * scale / RTOL) / scale
         weight = scale * ((r / r.max()) ** KAPPA + FLOOR)
         weight /= weight.max()
         states = []
@@ -72,7 +74,7 @@ class Case:
             correction = max(np.linalg.norm(move[b]) / s for b, s in zip(lists, scale, strict=True)) / r.max()
             if not failed and not (alone and correction > HEALTHY):
                 return states, True
-            weight = np.where(r > 0, np.sqrt(weight * scale / scale.max()), weight)
+            weight = np.where(estimate > 0, np.sqrt(weight * scale / scale.max()), weight)
         return states, not failed
 
 
