@@ -210,7 +210,7 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
             raise ValueError(f"`{name}` has wrong shape. It has {a.shape}, the state ({n},).")
         if not np.all(a >= 0):
             raise ValueError(f"`{name}` must be positive. Got {value!r}.")
-        out.append(np.ascontiguousarray(np.broadcast_to(a, (n,))))
+        out.append(np.array(np.broadcast_to(a, (n,)), order="C"))
     return out[0], out[1]
 
 
@@ -529,7 +529,7 @@ def _nystrom_arrays(tableau: NystromTableau, exponent: float) -> Method:
 
     e, e_v = weights(tableau.e), weights(tableau.e_prime)
     return Method(
-        A=np.ascontiguousarray(tableau.A[:s, :s]),
+        A=tableau.A[:s, :s].copy(),
         b=tableau.b[:s].copy(),
         b_low=tableau.b_low[:s].copy(),
         b_v=tableau.b_prime[:s].copy(),

@@ -627,7 +627,7 @@ def _span(t_span: Any, unbounded: bool) -> tuple[float, float]:
 
 def _parameters(params: Any) -> np.ndarray:
     try:
-        return np.ascontiguousarray(params, dtype=float).reshape(-1)
+        return np.array(params, dtype=float, order="C").reshape(-1)
     except (TypeError, ValueError):
         raise TypeError(f"params must be an array of numbers, got {params!r}.") from None
 
