@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,7 +37,7 @@ from .nystrom import NystromTableau
 from .result import LAST_RANK, Diagnostics
 from .tableaux import Tableau
 
-__all__ = ["ProjectionOptions", "Run", "Stepping", "as_derivative", "fixed_steps", "nearest_option", "prepare"]
+__all__ = ["ProjectionOptions", "Run", "Stepping", "as_derivative", "fixed_steps", "prepare"]
 
 # Unsigned: Numba then leaves out the test for negative indices, which costs more than the access itself.
 INDEX = np.uint64
@@ -114,12 +113,6 @@ class Counted:
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         self.count += 1
         return self._rhs(t, y).copy()
-
-
-def nearest_option(name: str, known: Iterable[str]) -> str:
-    """`` did you mean ...?`` for the nearest known option, or nothing."""
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def as_derivative(value: Any, n: int, dtype: np.dtype) -> np.ndarray:
@@ -445,9 +438,8 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
         C, M = _frame_matrices(frame, n, width)
     starts, index, value = _sparse_rows(np.concatenate([C, M]))
     k = C.shape[0]
-    bodies = np.zeros((2, 0, 0))
-    if _by_bodies(C).size and _by_bodies(M).size:
-        bodies = np.array([_by_bodies(C), _by_bodies(M)])
+    weights = _by_bodies(C), _by_bodies(M)
+    bodies = np.array(weights) if weights[0].size and weights[1].size else np.zeros((2, 0, 0))
     return FrameRows(np.array([starts[: k + 1], starts[k:]]), index, value, np.zeros(k), bodies)
 
 

@@ -19,6 +19,7 @@ from . import _setup
 from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures
 from ._events import Events
 from ._kernels import OK
+from ._names import nearest
 from ._setup import ProjectionOptions, Run
 from ._step import T_NEW, Span, T, finish_step, next_step
 from .dense import ManifoldDenseOutput, dense_output
@@ -369,7 +370,7 @@ def integrate(
     ((4, 68), True)
     """
     for name in unknown:
-        hint = _setup.nearest_option(name, integrate.__kwdefaults__ or ())
+        hint = nearest(name, integrate.__kwdefaults__ or ())
         raise TypeError(f"integrate() has no option {name!r}{hint}")
     given = {"invariants": invariants, "metric": metric, "blocks": blocks, "frame": frame}
     given = {key: value for key, value in given.items() if value is not DEFAULT}

@@ -20,6 +20,7 @@ import numpy as np
 __all__ = [
     "UsageError",
     "check_folder",
+    "check_outputs",
     "check_target",
     "compact",
     "describe_machine",
@@ -204,6 +205,19 @@ def check_target(path: Path) -> None:
         _try_to_write(path.parent)
     except OSError as error:
         raise UsageError(f"cannot write {str(path)!r}: {_reason(error)}") from error
+
+
+def check_outputs(folder: Path, target: Path | None) -> None:
+    """Check the folder of a command's files and the file of its JSON, if one is wanted, before it computes.
+
+    Raises
+    ------
+    UsageError
+        When one of them cannot be written.
+    """
+    check_folder(folder)
+    if target is not None:
+        check_target(target)
 
 
 def _try_to_write(folder: Path) -> None:

@@ -13,6 +13,7 @@ from scipy.integrate import DenseOutput, OdeSolver
 
 from . import _setup
 from ._kernels import FAILED_PROJECTION, OK
+from ._names import nearest
 from ._setup import ProjectionOptions, Stepping
 from ._step import T_NEW, T, close_step, next_step, project_step
 from .dense import ExactEnds, dense_output
@@ -144,7 +145,7 @@ class EIPSolver(OdeSolver):
         **extraneous: Any,
     ) -> None:
         for name in extraneous:
-            hint = _setup.nearest_option(name, OPTIONS)
+            hint = nearest(name, OPTIONS)
             warnings.warn(
                 f"{type(self).__name__} has no option {name!r}; it is ignored{hint}", UserWarning, stacklevel=3
             )

@@ -14,8 +14,7 @@ from scipy.integrate import solve_ivp
 
 from ..problems.hard_cases import HardCase, hard_cases
 from ..report import (
-    check_folder,
-    check_target,
+    check_outputs,
     compact,
     document,
     say,
@@ -410,9 +409,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from tqdm import tqdm
 
-    check_folder(args.out)
-    if args.json is not None:
-        check_target(args.json)
+    check_outputs(args.out, args.json)
     rtol = args.rtol or TOLERANCES.get(args.method, USUAL_TOLERANCE)
     arguments = {"method": args.method, "rtol": rtol, "atol": ATOL_PER_RTOL * rtol, "metric": args.metric}
     cases = hard_cases()

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
 
+from .._names import nearest
 from ..report import (
-    check_folder,
-    check_target,
+    check_outputs,
     compact,
     describe_machine,
     document,
@@ -47,9 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _known(name: str) -> str:
     if name in SCENES:
         return name
-    close = get_close_matches(name, SCENES, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    raise argparse.ArgumentTypeError(f"unknown scene {name!r}, expected one of {', '.join(SCENES)}{hint}")
+    raise argparse.ArgumentTypeError(
+        f"unknown scene {name!r}, expected one of {', '.join(SCENES)}{nearest(name, SCENES)}"
+    )
 
 
 def works(points: Sequence[Point]) -> dict[str, Work]:
@@ -139,9 +138,7 @@ def run(args: argparse.Namespace, rebound: Any) -> int:
     """
     from tqdm import tqdm
 
-    check_folder(args.out)
-    if args.json is not None:
-        check_target(args.json)
+    check_outputs(args.out, args.json)
     scenes = [scene(name) for name in dict.fromkeys(args.scene or SCENES)]
     total = sum(len(method.settings) for of in scenes for method in methods(of, rebound).values())
     try:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..longrun import integrate
 from ..problems import Problem, kepler
-from ..report import check_folder, check_target, compact, document, say, table, warn, write_csv, write_file, write_json
+from ..report import check_outputs, compact, document, say, table, warn, write_csv, write_file, write_json
 from ..solvers import EIPDOP853, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPSolver
 from ..work_precision import Runner, cost_to_reach, work_precision
 
@@ -170,9 +170,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from tqdm import tqdm
 
-    check_folder(args.out)
-    if args.json is not None:
-        check_target(args.json)
+    check_outputs(args.out, args.json)
     total = REPEATS * sum(map(len, (*FIXED.values(), *PAIRS.values())))
     try:
         with tqdm(total=total, desc="error against cost", unit="run", disable=args.quiet, leave=False) as bar:

@@ -17,8 +17,7 @@ from ..problems import Problem, solar_system
 from ..problems.solar_data import YEAR_D, load, reference_states
 from ..report import (
     UsageError,
-    check_folder,
-    check_target,
+    check_outputs,
     compact,
     describe_machine,
     document,
@@ -255,9 +254,7 @@ def run(args: argparse.Namespace, judge: Judge | None, heyoka: Judge | None) -> 
     args.years = YEARS if args.years is None else args.years
     if args.data not in (None, "de440") or args.epoch is not None:
         raise UsageError(f"--frontier has reference states for --data de440 only, got {args.data or args.epoch!r}")
-    check_folder(args.out)
-    if args.json is not None:
-        check_target(args.json)
+    check_outputs(args.out, args.json)
     points = sum(len(steps) for _, steps in methods(solar_system(years=1.0), 1.0, judge, heyoka).values())
     try:
         with tqdm(total=REPEATS * points, desc="frontier", unit="run", disable=args.quiet, leave=False) as bar:

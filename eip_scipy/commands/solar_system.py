@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from .. import solvers
-from ..report import UsageError, check_folder, check_target, say, warn, write_csv, write_file, write_json
+from ..report import UsageError, check_outputs, say, warn, write_csv, write_file, write_json
 from . import solar_epoch, solar_truth
 from .solar_cost import REPEATS, cost, cost_methods
 from .solar_errors import Study
@@ -106,9 +106,7 @@ def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ep
         study = Study(make_scene(data, args.years, args.h), fixed_step_methods()[args.method].TABLEAU.order)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    check_folder(args.out)
-    if args.json is not None:
-        check_target(args.json)
+    check_outputs(args.out, args.json)
     interrupted = _integrate(study, args, judge)
     if not study.runs:
         warn("interrupted; no run was done")

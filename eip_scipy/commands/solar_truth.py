@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,14 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .._names import nearest
 from ..longrun import integrate
 from ..problems import SolarSystemData, solar_system
 from ..problems.forces import FORCES, check_forces
 from ..problems.solar_data import AU_KM, YEAR_D
 from ..report import (
     UsageError,
-    check_folder,
-    check_target,
+    check_outputs,
     compact,
     document,
     say,
@@ -93,8 +92,7 @@ def _force(text: str) -> str:
     known = [*FORCES, MOON]
     if text in known:
         return text
-    close = difflib.get_close_matches(text.lower(), known, n=1, cutoff=0.4)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
+    hint = nearest(text.lower(), known, cutoff=0.4)
     raise argparse.ArgumentTypeError(f"unknown force {text!r}; known: {', '.join(known)}{hint}")
 
 
@@ -145,9 +143,7 @@ def run(args: argparse.Namespace, ephemeris: Ephemeris) -> int:
             solar_system(data[model.moon], forces=model.forces)
     except (ImportError, OSError, ValueError) as error:
         raise UsageError(" ".join(str(error).split())) from error
-    check_folder(args.out)
-    if args.json is not None:
-        check_target(args.json)
+    check_outputs(args.out, args.json)
     runs: list[ModelRun] = []
     try:
         for model in chosen:

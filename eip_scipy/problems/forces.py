@@ -10,7 +10,6 @@ Newton's part is that of `_gravity`, inlined here: after an edit there, clear Nu
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import exp, expm1, isfinite, sqrt
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .._names import nearest
 from ..invariants import Invariant
 from . import _einstein, _gravity
 from ._einstein import add_cross, add_outer
@@ -93,8 +93,7 @@ def check_forces(forces: Any) -> tuple[str, ...]:
     names = (forces,) if isinstance(forces, str) else tuple(forces)
     for name in names:
         if name not in FORCES:
-            close = difflib.get_close_matches(str(name).lower(), list(FORCES), n=1, cutoff=0.4)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
+            hint = nearest(str(name).lower(), FORCES, cutoff=0.4)
             raise ValueError(f"unknown force {name!r}; known: {', '.join(map(repr, FORCES))}{hint}")
     found = tuple(name for name in FORCES if name in names)
     if len(kinds := [name for name in found if name in RELATIVITY]) > 1:
