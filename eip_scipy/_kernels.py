@@ -228,13 +228,19 @@ def compensated_add(y, carry, move):
 
 @_jit
 def quadrature(a, b, out):
-    """Out = sqrt(a^2 + b^2), by component."""
+    """Out = sqrt(a^2 + b^2), by component; components whose squares would vanish or overflow by hypot."""
     lost = 0
     for i in range(out.size):
-        square = a[i] * a[i] + b[i] * b[i]
-        lost += square > 1e280 or (square < 1e-280 and (a[i] != 0.0 or b[i] != 0.0))
+        size = abs(a[i]) + abs(b[i])
+        lost += (size > 1e140) | ((size < 1e-140) & (size > 0.0))
+    if lost == 0:
+        for i in range(out.size):
+            out[i] = sqrt(a[i] * a[i] + b[i] * b[i])
+        return
     for i in range(out.size):
-        out[i] = sqrt(a[i] * a[i] + b[i] * b[i]) if lost == 0 else np.hypot(a[i], b[i])
+        size = abs(a[i]) + abs(b[i])
+        extreme = (size > 1e140) | ((size < 1e-140) & (size > 0.0))
+        out[i] = np.hypot(a[i], b[i]) if extreme else sqrt(a[i] * a[i] + b[i] * b[i])
 
 
 @_jit

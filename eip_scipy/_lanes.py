@@ -7,7 +7,7 @@ are added in pairs, the entries beyond the last multiple of eight come last.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from numba.extending import intrinsic
 __all__ = ["abs_dot", "dot", "largest", "remove_component", "weighted_rows"]
 
 LANES = 8
+WIDTHS = (16, 8, 4, 2, 1)  # of sums over rows: two vectors side by side wait less for each other's additions
 DOUBLE = ir.DoubleType()
 VECTOR = ir.VectorType(DOUBLE, LANES)
 
@@ -137,6 +138,17 @@ def _emit_rows(builder: Any, weights: Any, K: Any, stride: Any, rows: Any, out: 
     builder.store(builder.load(total), place(out, i), align=8)
 
 
+def _emit_choice(builder: Any, n: Any, widths: Sequence[int], blocks: Callable[[int], None]) -> None:  # emits LLVM
+    """The first of the `widths` that n reaches."""
+    width, *narrower = widths
+    with builder.if_else(builder.icmp_signed(">=", n, ir.Constant(n.type, width))) as (then, otherwise):
+        with then:
+            blocks(width)
+        with otherwise:
+            if narrower:
+                _emit_choice(builder, n, narrower, blocks)
+
+
 @intrinsic  # emits LLVM
 def _lanes_rows(typingctx, weights, K, rows, first, out):
     def codegen(context, builder, signature, arguments):
@@ -144,12 +156,19 @@ def _lanes_rows(typingctx, weights, K, rows, first, out):
         rows, first = arguments[2:4]
         stride = cgutils.unpack_tuple(builder, K.shape)[1]
         data, n = builder.gep(K.data, [first]), out.nitems
-        begin = ir.Constant(n.type, 0)
-        for width in (LANES, 4, 2, 1):
-            end = builder.sub(n, builder.and_(n, ir.Constant(n.type, width - 1)))
-            with cgutils.for_range_slice(builder, begin, end, ir.Constant(n.type, width), n.type) as (i, _):
-                _emit_rows(builder, weights.data, data, stride, rows, out.data, i, width)
-            begin = end
+
+        def fill(begin: Any, width: int) -> None:
+            _emit_rows(builder, weights.data, data, stride, rows, out.data, begin, width)
+
+        def blocks(width: int) -> None:
+            """Blocks of one width; the last one ends with the array and may overlap the one before it."""
+            step = ir.Constant(n.type, width)
+            last = builder.sub(n, step)
+            with cgutils.for_range_slice(builder, ir.Constant(n.type, 0), last, step, n.type) as (i, _):
+                fill(i, width)
+            fill(last, width)
+
+        _emit_choice(builder, n, WIDTHS, blocks)
         return context.get_dummy_value()
 
     return types.void(weights, K, types.intp, types.intp, out), codegen
