@@ -15,6 +15,7 @@ from numba import config, from_dtype, njit, types
 from numba.core.errors import NumbaError
 from numba.extending import is_jitted
 
+from ._octets import LANES, OCTET, octets
 from .invariants import Invariant, InvariantSet
 
 WRONG_FUN = "fun returned an array of another shape than at the start"
@@ -54,6 +55,26 @@ def signatures(dtype: np.dtype) -> Signatures:
     )
 
 
+def signatures_of_octets() -> Signatures:
+    """The same for the members of an octet, and for all octets of a batch."""
+    real, state, rows = types.float64, *(types.Array(OCTET, ndim, "A", aligned=False) for ndim in (1, 2))
+    return Signatures(
+        rhs=types.void(real, state, state, state),
+        inv=types.void(real, state, state, state),
+        grad=types.void(real, state, state, rows, state),
+    )
+
+
+def signatures_of_batches() -> Signatures:
+    """Signatures of rhs, inv and grad for lanes of members: (n, lanes), (l, lanes), (l, n, lanes), (p, lanes)."""
+    real, lanes, rows = types.float64, types.float64[:, ::1], types.float64[:, :, ::1]
+    return Signatures(
+        rhs=types.void(real, lanes, lanes, lanes),
+        inv=types.void(real, lanes, lanes, lanes),
+        grad=types.void(real, lanes, lanes, rows, lanes),
+    )
+
+
 def compile_functions(
     fun: Callable[..., Any],
     form: str,
@@ -61,8 +82,9 @@ def compile_functions(
     invariants: InvariantSet,
     events: tuple[Callable[..., Any], ...],
     dtype: np.dtype,
+    in_octets: bool = False,
 ) -> CompiledFunctions:
-    """Wrap and compile the functions of a run.
+    """Wrap and compile the functions of a run, or with `in_octets` those of members side by side.
 
     Raises
     ------
@@ -85,7 +107,9 @@ def compile_functions(
     )
     names = tuple(f"event {k}" for k in range(len(events)))
     jitted = tuple(_jitted(event, name) for event, name in zip(events, names, strict=True))
-    return _compile_parts(_jitted(fun, "fun"), form, has_params, parts, jitted, np.dtype(dtype))
+    sigs = signatures_of_octets() if in_octets else signatures(dtype)
+    functions = _compile_parts(_jitted(fun, "fun"), form, has_params, parts, jitted, sigs)
+    return _for_batches(functions) if in_octets else functions
 
 
 class _Part(NamedTuple):
@@ -108,10 +132,9 @@ def _compile_parts(
     has_params: bool,
     parts: tuple[_Part, ...],
     events: tuple[Callable[..., Any], ...],
-    dtype: np.dtype,
+    sigs: Signatures,
 ) -> CompiledFunctions:
     """The wrappers of the same functions are compiled once in a process."""
-    sigs = signatures(dtype)
     rhs = _compiled(WRAPPERS[form](fun, has_params), sigs.rhs, "fun")
     inv, grad = _no_values, _no_gradients
     for part in parts:
@@ -123,6 +146,35 @@ def _compile_parts(
         one = _Part(function, function, f"event {k}", True, k, k + 1, False, False)
         event = _compiled(_chain_value(event, one, has_params), sigs.inv, f"event {k}")
     return CompiledFunctions(rhs, inv, grad, event)
+
+
+@lru_cache(maxsize=64)
+def _for_batches(one: CompiledFunctions) -> CompiledFunctions:
+    """Functions of all lanes from those of eight."""
+    rhs, inv, grad, event = one
+
+    @njit(_nrt=False)
+    def all_rhs(t, y, out, params):
+        for c in range(0, y.shape[1], LANES):
+            rhs(t, octets(y, c), octets(out, c), octets(params, c))
+
+    @njit(_nrt=False)
+    def all_inv(t, y, values, params):
+        for c in range(0, y.shape[1], LANES):
+            inv(t, octets(y, c), octets(values, c), octets(params, c))
+
+    @njit(_nrt=False)
+    def all_grad(t, y, f, G, params):
+        for c in range(0, y.shape[1], LANES):
+            grad(t, octets(y, c), octets(f, c), octets(G, c), octets(params, c))
+
+    sigs = signatures_of_batches()
+    return CompiledFunctions(
+        _compiled(all_rhs, sigs.rhs, "fun"),
+        _compiled(all_inv, sigs.inv, "an invariant"),
+        _compiled(all_grad, sigs.grad, "a gradient"),
+        event,
+    )
 
 
 def _jitted(fun: Callable[..., Any], name: str) -> Callable[..., Any]:

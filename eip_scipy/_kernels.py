@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from ._lanes import abs_dot, dot, largest, remove_component, weighted_rows
+from ._octets import is_not, where
 from ._triples import shift_and_weigh, shift_bodies, sum_bodies
 
 OK, NOT_FINITE, FAILED_PROJECTION, POSTPONED = 0, 1, 2, 4
@@ -298,16 +299,16 @@ def weighted_squares(weights, a, out):
 def block_sizes(y, y_hat, err, rounding, rtol, groups, scratch, sizes, errors):
     """Per block: sizes = max(|rtol y|, |rtol y_hat|), errors = |(err, rounding y_hat)|.
 
-    Returns how many sizes are too extreme.
+    Returns whether some sizes are too extreme.
     """
     weighted_squares(rtol, y, scratch)
     block_sums(scratch, groups, errors)
     weighted_squares(rtol, y_hat, scratch)
     block_sums(scratch, groups, sizes)
-    extreme = 0
+    extreme = False
     for b in range(sizes.size):
         square = max(sizes[b], errors[b])
-        extreme += not 1e-280 < square < 1e280
+        extreme = extreme | is_not((square > 1e-280) & (square < 1e280))
         sizes[b] = sqrt(square)
     for i in range(err.size):
         x = rounding * y_hat[i]
@@ -350,16 +351,19 @@ def error_metric(err, rounding, y, y_hat, rtol, atol, groups, kappa, sigma, scal
     The error is the estimate and `rounding` times the state, in quadrature. `atol` is by block. r = 0 (no error at all)
     leaves the euclidean metric. `ratio` is scratch.
     """
-    if block_sizes(y, y_hat, err, rounding, rtol, groups, sigma, scale, ratio) > 0:
+    if block_sizes(y, y_hat, err, rounding, rtol, groups, sigma, scale, ratio):
         extreme_block_sizes(y, y_hat, err, rounding, rtol, groups, scale, ratio)
+    return weights_from_sizes(atol, groups, kappa, sigma, scale, ratio)
+
+
+@_jit_inline
+def weights_from_sizes(atol, groups, kappa, sigma, scale, ratio):
+    """The rest of `error_metric`, from what `block_sizes` has put into `scale` and `ratio`."""
     for b in range(scale.size):
         scale[b] += atol[b]
         # Over a scale of 0 there is no error to speak of.
-        ratio[b] = ratio[b] / max(scale[b], TINY) if scale[b] > 0.0 else 0.0
+        ratio[b] = where(scale[b] > 0.0, ratio[b] / max(scale[b], TINY), 0.0)
     largest_ratio = largest(ratio)
-    if largest_ratio == 0.0:
-        fill(sigma, 1.0)
-        return 0.0
     inverse = 1.0 / largest_ratio
     for b in range(ratio.size):
         ratio[b] = min(1.0, ratio[b] * inverse)
@@ -368,7 +372,7 @@ def error_metric(err, rounding, y, y_hat, rtol, atol, groups, kappa, sigma, scal
         ratio[b] = scale[b] * (ratio[b] + METRIC_FLOOR)
     inverse = 1.0 / largest(ratio)
     for b in range(ratio.size):
-        weight = ratio[b] * inverse
+        weight = where(largest_ratio > 0.0, ratio[b] * inverse, 1.0)
         if groups.size == 3:
             sigma[3 * b] = sigma[3 * b + 1] = sigma[3 * b + 2] = weight
         else:
@@ -380,13 +384,11 @@ def error_metric(err, rounding, y, y_hat, rtol, atol, groups, kappa, sigma, scal
 @_jit_inline
 def correction_in_local_errors(move, scale, groups, largest_error):
     """Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none."""
-    if largest_error == 0.0:
-        return 0.0
     top = 0.0
     for b in range(scale.size):
-        if scale[b] > 0.0:
-            top = max(top, block_square(move, b, 1.0 / scale[b], groups))
-    return sqrt(top) / largest_error
+        square = block_square(move, b, 1.0 / scale[b], groups)
+        top = where(scale[b] > 0.0, max(top, square), top)
+    return where(largest_error > 0.0, sqrt(top) / largest_error, 0.0)
 
 
 @_jit
@@ -413,11 +415,9 @@ def defects(values, target, G, y_hat, scales, compensated, g, band, raw):
         size = max(max(size, scales[i]), abs_dot(G[i], y_hat))
         band[i] = (BAND_COMPENSATED if compensated else BAND) * EPS * size
         raw[i] = values[i] - target[i]
-        g[i] = raw[i]
-        if np.isfinite(band[i]) and abs(g[i]) <= band[i]:
-            g[i] = 0.0
-        else:
-            outside = True
+        inside = (band[i] < np.inf) & (abs(raw[i]) <= band[i])
+        g[i] = where(inside, 0.0, raw[i])
+        outside = outside | is_not(inside)
     return outside
 
 
@@ -534,11 +534,11 @@ def solve_gram(B, g, R, mu):
     diagonal of R holds 1/D.
     """
     rows = B.shape[0]
+    good = True
     for i in range(rows):
         for j in range(i + 1):
             R[i, j] = dot(B[i], B[j])
-        if not 1e-140 < R[i, i] < 1e140:
-            return False
+        good = good & (R[i, i] > 1e-140) & (R[i, i] < 1e140)
     for i in range(rows):
         for j in range(1, i):
             for k in range(j):
@@ -551,14 +551,13 @@ def solve_gram(B, g, R, mu):
             square -= x * R[i, j]
             mu[i] -= x * mu[j]
             R[i, j] = x
-        if not square > least:
-            return False
+        good = good & (square > least)
         R[i, i] = 1.0 / square
     for i in range(rows - 1, -1, -1):
         mu[i] *= R[i, i]
         for j in range(i + 1, rows):
             mu[i] -= R[j, i] * mu[j]
-    return True
+    return good
 
 
 @_jit
@@ -655,13 +654,19 @@ def judge(values, target, before, band, y, defect):
 
     It has failed where something is not finite, or a defect has grown and stands above FAILURE_BANDS dead bands.
     """
-    good = all_finite(y)
+    return OK if all_finite(y) & defects_held(values, target, before, band, defect) else FAILED_PROJECTION
+
+
+@_jit
+def defects_held(values, target, before, band, defect):
+    """Note the defects; whether all are finite and none has grown beyond what round-off explains."""
+    good = True
     for i in range(defect.size):
         defect[i] = values[i] - target[i]
         size = abs(defect[i])
-        if not np.isfinite(size) or (size > abs(before[i]) and size > FAILURE_BANDS * band[i]):
-            good = False
-    return OK if good else FAILED_PROJECTION
+        grown = (size > abs(before[i])) & (size > FAILURE_BANDS * band[i])
+        good = good & (size < np.inf) & is_not(grown)
+    return good
 
 
 @_jit

@@ -2,7 +2,8 @@
 
 A plain loop over a sum is not vectorised without "fastmath", which would let every place where the loop is inlined
 choose its own order of summation. Here the order is fixed: lane k sums the entries k, k + 8, k + 16, ..., the lanes
-are added in pairs, the entries beyond the last multiple of eight come last.
+are added in pairs, the entries beyond the last multiple of eight come last. Members of an ensemble that run side by
+side (see `_octets`) take their sums in the same order, so that each gets the bits of a run of its own.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ from numba import config, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from ._octets import OCTET, in_octets, over_members, spread, where
+
 __all__ = ["abs_dot", "dot", "largest", "remove_component", "weighted_rows"]
 
 LANES = 8
-WIDTHS = (16, 8, 4, 2, 1)  # of sums over rows: two vectors side by side wait less for each other's additions
+WIDTHS = (16, 8, 4, 2, 1)  # of sums over rows: two vectors side by side wait less for each other
 DOUBLE = ir.DoubleType()
 VECTOR = ir.VectorType(DOUBLE, LANES)
 
@@ -63,8 +66,46 @@ def _products(context: Any, builder: Any, signature: Any, arguments: Any, i: Any
     return builder.fmul(a, b)
 
 
+def _members_dot(a, b, n):  # emits LLVM
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = spread(0.0)
+    for i in range(0, n, 8):
+        s0 += a[i] * b[i]
+        s1 += a[i + 1] * b[i + 1]
+        s2 += a[i + 2] * b[i + 2]
+        s3 += a[i + 3] * b[i + 3]
+        s4 += a[i + 4] * b[i + 4]
+        s5 += a[i + 5] * b[i + 5]
+        s6 += a[i + 6] * b[i + 6]
+        s7 += a[i + 7] * b[i + 7]
+    return ((s0 + s4) + (s2 + s6)) + ((s1 + s5) + (s3 + s7))
+
+
+def _members_abs_dot(a, b, n):  # emits LLVM
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = spread(0.0)
+    for i in range(0, n, 8):
+        s0 += abs(a[i] * b[i])
+        s1 += abs(a[i + 1] * b[i + 1])
+        s2 += abs(a[i + 2] * b[i + 2])
+        s3 += abs(a[i + 3] * b[i + 3])
+        s4 += abs(a[i + 4] * b[i + 4])
+        s5 += abs(a[i + 5] * b[i + 5])
+        s6 += abs(a[i + 6] * b[i + 6])
+        s7 += abs(a[i + 7] * b[i + 7])
+    return ((s0 + s4) + (s2 + s6)) + ((s1 + s5) + (s3 + s7))
+
+
+def _members_largest(a, n):  # emits LLVM
+    top = spread(0.0)
+    for i in range(n):
+        top = max(top, a[i])
+    return top
+
+
 @intrinsic  # emits LLVM
 def _lanes_dot(typingctx, a, b, n):
+    if over_members(a, b):
+        return in_octets(_members_dot, OCTET, a, b, n)
+
     def codegen(context, builder, signature, arguments):
         return _loop(builder, arguments[2], lambda i: _products(context, builder, signature, arguments, i))
 
@@ -73,6 +114,9 @@ def _lanes_dot(typingctx, a, b, n):
 
 @intrinsic  # emits LLVM
 def _lanes_abs_dot(typingctx, a, b, n):
+    if over_members(a, b):
+        return in_octets(_members_abs_dot, OCTET, a, b, n)
+
     def codegen(context, builder, signature, arguments):
         kind = ir.FunctionType(VECTOR, [VECTOR])
         fabs = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fabs.v{LANES}f64")
@@ -87,6 +131,9 @@ def _lanes_abs_dot(typingctx, a, b, n):
 
 @intrinsic  # emits LLVM
 def _lanes_largest(typingctx, a, n):
+    if over_members(a):
+        return in_octets(_members_largest, OCTET, a, n)
+
     def codegen(context, builder, signature, arguments):
         return _loop(
             builder,
@@ -237,8 +284,7 @@ def largest(a):
     whole = a.size - a.size % LANES
     top = _lanes_largest(a, whole)
     for i in range(whole, a.size):
-        if a[i] > top:
-            top = a[i]
+        top = where(a[i] > top, a[i], top)
     return top
 
 

@@ -222,14 +222,27 @@ def rkn_step(rhs, params, t, y_r, h, m, o, w):
 @_jitable
 def raw_step(rhs, params, t, y, y_r, t_new, h, project, m, o, w):
     """Raw step; f(y_hat) in K[-1], the local error in w.err and its norm in w.norm where they are wanted."""
-    w.counters[HAVE_F] = 0
+    advance_raw(rhs, params, t, y, y_r, h, m, o, w)
+    if not kn.all_finite(w.y_hat_r):
+        return NOT_FINITE
+    look_back(rhs, params, t_new, y_r, h, project, m, o, w)
+    return OK
+
+
+@_jitable
+def advance_raw(rhs, params, t, y, y_r, h, m, o, w):
+    """The stages and their sum, w.y_hat."""
     if m.nystrom:
         rkn_step(rhs, params, t, y_r, h, m, o, w)
     else:
         rk_step(rhs, params, t, y, y_r, h, m, o, w)
     w.counters[NFEV] += m.b.size - 1
-    if not kn.all_finite(w.y_hat_r):
-        return NOT_FINITE
+
+
+@_jitable
+def look_back(rhs, params, t_new, y_r, h, project, m, o, w):
+    """f(y_hat) in K[-1], the local error in w.err and its norm in w.norm where they are wanted."""
+    w.counters[HAVE_F] = 0
     estimate = o.adaptive or ((o.metric == ERROR or o.every == AUTO) and o.target.size > 0)
     if (estimate and m.fsal) or (project and o.uses_f):
         rhs(t_new, w.y_hat, w.K[-1], params)
@@ -237,7 +250,6 @@ def raw_step(rhs, params, t, y, y_r, t_new, h, project, m, o, w):
         w.counters[HAVE_F] = 1
     if estimate:
         estimate_error(y_r, h, m, o, w)
-    return OK
 
 
 @_jitable

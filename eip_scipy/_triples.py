@@ -15,6 +15,8 @@ from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from ._octets import OCTET, in_octets, multiply_add, over_members, spread
+
 __all__ = ["shift_and_weigh", "shift_bodies", "sum_bodies"]
 
 DOUBLE, INDEX = ir.DoubleType(), ir.IntType(64)
@@ -84,6 +86,32 @@ def _for_each(builder: Any, count: Any, body: Callable[[Any, bool], None]) -> No
     body(last, True)
 
 
+def _members_sum(weights, row, first, count):  # emits LLVM
+    x = y = z = spread(0.0)
+    for j in range(count):
+        i = first + 3 * j
+        x = multiply_add(weights[j], row[i], x)
+        y = multiply_add(weights[j], row[i + 1], y)
+        z = multiply_add(weights[j], row[i + 2], z)
+    return x, y, z
+
+
+def _members_shift(row, weights, x, y, z, out, first, count):  # emits LLVM
+    for j in range(count):
+        i = first + 3 * j
+        out[i] = multiply_add(weights[j], -x, row[i])
+        out[i + 1] = multiply_add(weights[j], -y, row[i + 1])
+        out[i + 2] = multiply_add(weights[j], -z, row[i + 2])
+
+
+def _members_shift_and_weigh(row, weights, x, y, z, sigma, out, first, count):  # emits LLVM
+    for j in range(count):
+        i = first + 3 * j
+        out[i] = multiply_add(weights[j], -x, row[i]) * sigma[i]
+        out[i + 1] = multiply_add(weights[j], -y, row[i + 1]) * sigma[i + 1]
+        out[i + 2] = multiply_add(weights[j], -z, row[i + 2]) * sigma[i + 2]
+
+
 def _data(context: Any, builder: Any, signature: Any, arguments: Any, k: int) -> Any:  # emits LLVM
     return context.make_array(signature.args[k])(context, builder, arguments[k]).data
 
@@ -104,6 +132,8 @@ def sum_bodies(typingctx, weights, row, first, count):
         _for_each(builder, arguments[3], add)
         return context.make_tuple(builder, signature.return_type, _split(builder, builder.load(total)))
 
+    if over_members(row):
+        return in_octets(_members_sum, types.UniTuple(OCTET, 3), weights, row, first, count)
     return types.UniTuple(types.float64, 3)(weights, row, types.intp, types.intp), codegen
 
 
@@ -130,6 +160,8 @@ def shift_bodies(typingctx, row, weights, x, y, z, out, first, count):
     def codegen(context, builder, signature, arguments):
         return _emit_shift(context, builder, signature, arguments, False)
 
+    if over_members(row):
+        return in_octets(_members_shift, types.void, row, weights, OCTET, OCTET, OCTET, out, first, count)
     number = types.float64
     return types.void(row, weights, number, number, number, out, types.intp, types.intp), codegen
 
@@ -141,6 +173,10 @@ def shift_and_weigh(typingctx, row, weights, x, y, z, sigma, out, first, count):
     def codegen(context, builder, signature, arguments):
         return _emit_shift(context, builder, signature, arguments, True)
 
+    if over_members(row):
+        return in_octets(
+            _members_shift_and_weigh, types.void, row, weights, OCTET, OCTET, OCTET, sigma, out, first, count
+        )
     number = types.float64
     return types.void(row, weights, number, number, number, sigma, out, types.intp, types.intp), codegen
 

@@ -78,7 +78,7 @@ def source_stamp() -> str:
     would leave the old driver, with the old kernel inlined, in use.
     """
     folder = Path(__file__).parent
-    names = ("_lanes.py", "_triples.py", "_kernels.py", "_step.py", "longrun.py")
+    names = ("_octets.py", "_lanes.py", "_triples.py", "_kernels.py", "_step.py", "longrun.py")
     return hashlib.sha256(b"".join((folder / name).read_bytes() for name in names)).hexdigest()
 
 

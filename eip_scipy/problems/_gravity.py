@@ -29,6 +29,8 @@ from numba.core import cgutils
 from numba.core.errors import TypingError
 from numba.extending import intrinsic
 
+from .._octets import OCTET, in_octets, multiply_add, on_stack, over_members, spread
+
 __all__ = ["acc", "energy", "energy_gradient", "momentum", "momentum_gradient", "rhs"]
 
 LANES = 8
@@ -38,6 +40,7 @@ VECTOR, BITS = ir.VectorType(DOUBLE, LANES), ir.VectorType(INDEX, LANES)
 # x^-1/2 to 6.3e-7: y from the bits of x, times a minimax cubic in x y^2. The constant is the one that leaves the least
 # range of x y^2, [0.912, 1.040]; the cubic is that of Remez for it.
 ESTIMATE = 0x5FE6996542967F58
+MOST_SUMS = 3 * 2 * 7  # floats of `_accelerations_of_members` in streams, at seven bodies
 CUBIC = (2.216453840039739, -2.274298221857139, 1.3991927078645605, -0.3413483382980669)
 
 
@@ -400,13 +403,130 @@ def _accelerations(q, gm, out):
             _accelerations_2(q, gm, out, n - 2)
 
 
+@intrinsic  # emits LLVM
+def _inverse_roots(typingctx, x):
+    """What `over_cube` shares between the two bodies of a pair: y and y^2 for y near x^-1/2, h, and 3/2 + 15/8 h."""
+
+    def codegen(context, builder, signature, arguments):
+        lanes = _Lanes(builder)
+        y = lanes.root_estimate(arguments[0])
+        y2 = builder.fmul(y, y)
+        h = lanes.fma(builder.fneg(arguments[0]), y2, _constant(1.0))
+        p = lanes.fma(_constant(15 / 8), h, _constant(3 / 2))
+        return context.make_tuple(builder, signature.return_type, (y, y2, h, p))
+
+    return types.UniTuple(OCTET, 4)(OCTET), codegen
+
+
+@intrinsic  # emits LLVM
+def _over_distance(typingctx, x):
+    def codegen(context, builder, signature, arguments):
+        return _Lanes(builder).over_distance(arguments[0])
+
+    return OCTET(OCTET), codegen
+
+
+@_jit
+def _pull(gm, y, y2, h, p):
+    """The quotient gm / x^(3/2) from `_inverse_roots`."""
+    w = gm * y * y2
+    return multiply_add(w * h, p, w)
+
+
+@_jit
+def _difference(q, i, j):
+    """From body i to body j, and its square."""
+    dx, dy, dz = q[3 * j] - q[3 * i], q[3 * j + 1] - q[3 * i + 1], q[3 * j + 2] - q[3 * i + 2]
+    return dx, dy, dz, multiply_add(dz, dz, multiply_add(dy, dy, dx * dx))
+
+
+@_jit
+def _streams(n):
+    """First of the bodies whose sources `_accelerations` takes in streams, and the number of streams."""
+    rest = n % 8
+    if n < 8:
+        return 0, 2
+    if 2 < rest <= 4:
+        return n - 4, 2
+    if 0 < rest <= 2:
+        return n - 2, 4
+    return n, 1
+
+
+@_jit
+def _add_pull(w, dx, dy, dz, out, k):
+    out[k] = multiply_add(w, dx, out[k])
+    out[k + 1] = multiply_add(w, dy, out[k + 1])
+    out[k + 2] = multiply_add(w, dz, out[k + 2])
+
+
+@_jit
+def _accelerations_of_members(q, gm, out):
+    """The same for octets: every pair once, sums in the same order.
+
+    Bodies that `_accelerations` leaves to its last block get their sums in streams: those of body i stand in `sums`
+    from 3 streams (i - in_streams) on.
+    """
+    n = gm.size
+    in_streams, streams = _streams(n)
+    start = n % streams
+    sums = on_stack(MOST_SUMS)
+    for k in range(3 * n):
+        out[k] = 0.0
+    for k in range(3 * streams * (n - in_streams)):
+        sums[k] = 0.0
+    for i in range(n):
+        of_i = 3 * (i if i < start else (i - start) % streams)
+        ax, ay, az = out[3 * i], out[3 * i + 1], out[3 * i + 2]
+        for j in range(i + 1, n):
+            dx, dy, dz, r2 = _difference(q, i, j)
+            y, y2, h, p = _inverse_roots(r2)
+            w = _pull(gm[j], y, y2, h, p)
+            if i < in_streams:
+                ax, ay, az = multiply_add(w, dx, ax), multiply_add(w, dy, ay), multiply_add(w, dz, az)
+            else:
+                of_j = 3 * (j if j < start else (j - start) % streams)
+                _add_pull(w, dx, dy, dz, sums, 3 * streams * (i - in_streams) + of_j)
+            w = -_pull(gm[i], y, y2, h, p)
+            if j < in_streams:
+                _add_pull(w, dx, dy, dz, out, 3 * j)
+            else:
+                _add_pull(w, dx, dy, dz, sums, 3 * streams * (j - in_streams) + of_i)
+        out[3 * i], out[3 * i + 1], out[3 * i + 2] = ax, ay, az
+    for i in range(in_streams, n):
+        first = 3 * streams * (i - in_streams)
+        for k in range(3):
+            total = sums[first + k] + sums[first + k + 3]
+            if streams == 4:
+                halves = sums[first + k] + sums[first + k + 6], sums[first + k + 3] + sums[first + k + 9]
+                total = halves[0] + halves[1]
+            out[3 * i + k] = total
+
+
+@intrinsic  # emits LLVM
+def _accelerate(typingctx, q, gm, out):
+    """`_accelerations` of one run, or of the members of an octet."""
+    lanes = over_members(q)
+
+    def one(q, gm, out):
+        _accelerations(q, gm, out)
+
+    def members(q, gm, out):
+        if gm.size < 4:
+            _accelerations_of_few(q, gm, out)
+        else:
+            _accelerations_of_members(q, gm, out)
+
+    return in_octets(members if lanes else one, types.void, q, gm, out)
+
+
 @_jit
 def rhs(t, y, out, params):
     """The derivative (v, a) of the state (q, v); params holds every G m."""
     half = y.size // 2
     for i in range(half):
         out[i] = y[half + i]
-    _accelerations(y[:half], params, out[half:])
+    _accelerate(y[:half], params, out[half:])
 
 
 @_jit_allocating
@@ -433,17 +553,98 @@ def _energy_of_few(y, gm):
 
 
 @_jit
-def energy(t, y, params):
-    """G times the energy."""
+def _energy_of_many(y, params):
     n = params.size
-    if n < 8:
-        return _energy_of_few(y, params)
     total = 0.0
     for first in range(0, n - 7, 8):
         total += _energy_block(y, params, first, 0)
     if n % 8 > 0:
         total += _energy_block(y, params, n - 8, 8 - n % 8)
     return total
+
+
+@_jit
+def _carried_product(a, b, total, carry):
+    new = multiply_add(a, b, total)
+    return new, carry + multiply_add(a, b, total - new)
+
+
+@_jit
+def _carried_sum(a, b):
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)
+
+
+@_jit
+def _energy_of_body(y, gm, i):
+    """Energy of body i with the pairs that it makes with later ones, and its carry."""
+    half = y.size // 2
+    potential = potential_carry = square = carry = spread(0.0)
+    for j in range(i + 1, gm.size):
+        _, _, _, r2 = _difference(y, i, j)
+        potential, potential_carry = _carried_product(gm[j], _over_distance(r2), potential, potential_carry)
+    for k in range(half + 3 * i, half + 3 * i + 3):
+        square, carry = _carried_product(y[k], y[k], square, carry)
+    energy, lost = _carried_sum(0.5 * square, -potential)
+    carry = lost + (0.5 * carry - potential_carry)
+    total, lost = _carried_product(gm[i], energy, spread(0.0), spread(0.0))
+    return total, multiply_add(gm[i], carry, lost)
+
+
+@_jit
+def _energy_of_eight(y, gm, first, skip):
+    """The sum over the bodies first + skip ... first + 7, by halves."""
+    a = _energy_of_four(y, gm, first, skip, 0)
+    b = _energy_of_four(y, gm, first, skip, 1)
+    total, lost = _carried_sum(a[0], b[0])
+    return total + ((a[1] + b[1]) + lost)
+
+
+@_jit
+def _energy_of_four(y, gm, first, skip, k):
+    """Bodies k, k + 4, k + 2 and k + 6 of a block of eight."""
+    a, b = _energy_of_two(y, gm, first, skip, k), _energy_of_two(y, gm, first, skip, k + 2)
+    total, lost = _carried_sum(a[0], b[0])
+    return total, (a[1] + b[1]) + lost
+
+
+@_jit
+def _energy_of_two(y, gm, first, skip, k):
+    a = b = spread(0.0), spread(0.0)
+    if k >= skip:
+        a = _energy_of_body(y, gm, first + k)
+    if k + 4 >= skip:
+        b = _energy_of_body(y, gm, first + k + 4)
+    total, lost = _carried_sum(a[0], b[0])
+    return total, (a[1] + b[1]) + lost
+
+
+@_jit
+def _energy_of_members(y, gm):
+    n = gm.size
+    total = spread(0.0)
+    for first in range(0, n - 7, 8):
+        total += _energy_of_eight(y, gm, first, 0)
+    if n % 8 > 0:
+        total += _energy_of_eight(y, gm, n - 8, 8 - n % 8)
+    return total
+
+
+@intrinsic  # emits LLVM
+def _energy(typingctx, y, gm):
+    """The energy of one run, or of the members of an octet."""
+    if over_members(y):
+        return in_octets(lambda y, gm: _energy_of_members(y, gm), OCTET, y, gm)
+    return in_octets(lambda y, gm: _energy_of_many(y, gm), types.float64, y, gm)
+
+
+@_jit
+def energy(t, y, params):
+    """G times the energy."""
+    if params.size < 8:
+        return _energy_of_few(y, params)
+    return _energy(y, params)
 
 
 @_jit
