@@ -138,7 +138,8 @@ def _compiled_advance(dtype: np.dtype, arguments: tuple[Any, ...]) -> Callable[.
     """The driver compiled for one type of state, its callables as first-class functions: cached on disk."""
     rhs, inv, grad = signatures(dtype)
     functions = [types.FunctionType(s) for s in (rhs, inv, grad, inv)]
-    return njit([types.int64(*functions, *arguments)], cache=True, error_model="numpy", _nrt=False)(advance)
+    signature = types.int64(*functions, *arguments)
+    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(advance)
 
 
 @cache
@@ -369,11 +370,39 @@ def integrate(
     >>> run.y.shape, bool((run.max_defect < 1e-11).all())
     ((4, 68), True)
     """
+    arguments = {name: value for name, value in locals().items() if name != "unknown"}
     for name in unknown:
         hint = nearest(name, integrate.__kwdefaults__ or ())
         raise TypeError(f"integrate() has no option {name!r}{hint}")
-    given = {"invariants": invariants, "metric": metric, "blocks": blocks, "frame": frame}
-    given = {key: value for key, value in given.items() if value is not DEFAULT}
+    return prepared(**arguments).run()
+
+
+def prepared(
+    fun: Callable[..., Any] | Problem,
+    t_span: Any,
+    y0: Any,
+    *,
+    method: type[EIPSolver],
+    h: float | None,
+    params: Any,
+    in_place: bool,
+    save_every: int | None,
+    t_eval: Any,
+    events: Any,
+    callback: Callable[[float, np.ndarray, np.ndarray], Any] | None,
+    progress: bool,
+    compensated: bool,
+    compiled: bool | None,
+    max_bytes: float | None,
+    diagnostics: Diagnostics | None,
+    rtol: Any,
+    atol: Any,
+    first_step: float | None,
+    max_step: float,
+    **projection: Any,
+) -> Loop:
+    """What `integrate` runs, by the same arguments, all of them validated; `projection`: those of the projection."""
+    given = {key: value for key, value in projection.items() if value is not DEFAULT}
     tableau = _tableau(method)
     form = FORMS[isinstance(tableau, NystromTableau), bool(in_place)]
     if isinstance(fun, Problem):
@@ -397,7 +426,7 @@ def integrate(
     t0, t_bound = _span(t_span, happenings.terminal)
     start = _setup.initial_state(_required("y0", y0))
     stepping = _setup.stepping(
-        method.__name__, tableau, t0, t_bound, start.size, h, first_step, max_step, rtol, atol, stacklevel=3
+        method.__name__, tableau, t0, t_bound, start.size, h, first_step, max_step, rtol, atol, stacklevel=4
     )
     if params is not None and "invariants" in given:
         given["invariants"] = [_with_run_params(item, params) for item in as_invariants(given["invariants"])]
@@ -414,16 +443,18 @@ def integrate(
         _setup.check_second_order(calls, t0, start, f0, method.__name__)
     tau = stepping.first(calls, start, f0, tableau)
     grid = _grid(stepping.span, tau, save_every, t_eval, happenings)
-    projection = ProjectionOptions(
-        **given,
-        direction=direction,
-        iterations=iterations,
-        every=every,
-        reuse_f=reuse_f,
-        check=check,
-        project_initial=project_initial,
+    run = _setup.prepare(
+        tableau,
+        calls,
+        t0,
+        start,
+        f0,
+        tau,
+        ProjectionOptions(**given),
+        stepping,
+        extra=extra,
+        compensated=compensated,
     )
-    run = _setup.prepare(tableau, calls, t0, start, f0, tau, projection, stepping, extra=extra, compensated=compensated)
     bound = 0.5 * free_memory() if max_bytes is None else max_bytes
     check_memory(saved_rows(grid), run, bound)
     record = Diagnostics() if diagnostics is None else diagnostics
@@ -434,10 +465,10 @@ def integrate(
     run.work.K[0] = f0 if run.y0 is start else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
     happenings.fill(t0, run.y0, grid.g)
-    return _Loop(driver, tableau, rhs, happenings, record, callback, progress, method.__name__, why_not, bound).run()
+    return Loop(driver, tableau, rhs, happenings, record, callback, progress, method.__name__, why_not, bound)
 
 
-class _Loop:
+class Loop:
     """Drives chunks of steps: progress, samples, events, callbacks, and what is kept when something goes wrong."""
 
     def __init__(
@@ -457,13 +488,14 @@ class _Loop:
         self.diagnostics, self.callback, self.progress = diagnostics, callback, progress
         self.method, self.why_not, self.max_bytes = method, why_not, max_bytes
         self.wall_time = 0.0
+        self.chunk = FIRST_CHUNK
 
     def run(self) -> IntegrationResult:
         driver = self.driver
         begin = time.perf_counter()
         try:
             with _bar(self.progress, driver.grid, self.method) as bar:
-                status, message = self._steps(bar)
+                status, message = self.steps(bar)
         except BaseException as error:
             self.wall_time = time.perf_counter() - begin
             driver.save_now()
@@ -475,15 +507,15 @@ class _Loop:
             driver.save_now()
         return self._result(status, message)
 
-    def _steps(self, bar: Any) -> tuple[int, str]:
+    def steps(self, bar: Any) -> tuple[int, str]:
+        """Run to the end of the interval, or to what ends the run before it; returns status and message."""
         driver = self.driver
         driver.save_start()
         if self._stopped_by_callback(0):
             return 1, STOPPED
-        chunk = FIRST_CHUNK
         while True:
             k, rows, begin = driver.step, driver.rows, time.perf_counter()
-            code = driver.advance(k + self._chunk(chunk))
+            code = driver.advance(k + self._chunk(self.chunk))
             seconds = time.perf_counter() - begin
             ended = self._pause() if code == PAUSE else False
             bar.update(self._progress(bar.n, k))
@@ -499,7 +531,7 @@ class _Loop:
                 return 0, "reached the end of the interval"
             if code == OK:
                 # At most a doubling, so that one fast chunk cannot make a slow one long.
-                chunk = max(1, min(2 * chunk, int(chunk * CHUNK_SECONDS / max(seconds, 1e-9))))
+                self.chunk = max(1, min(2 * self.chunk, int(self.chunk * CHUNK_SECONDS / max(seconds, 1e-9))))
 
     def _progress(self, shown: float, k: int) -> float:
         """What the bar is to grow by: steps where their number is known, else time."""
