@@ -2,6 +2,7 @@
 
 from importlib.metadata import version as _version
 
+from .ensemble import EnsembleResult, ensemble
 from .invariants import Invariant, check_gradient
 from .longrun import integrate
 from .nystrom import NystromTableau
@@ -38,6 +39,7 @@ __all__ = [
     "EIPRKN12",
     "Diagnostics",
     "EIPSolver",
+    "EnsembleResult",
     "IntegrationResult",
     "Invariant",
     "NystromTableau",
@@ -45,6 +47,7 @@ __all__ = [
     "Tableau",
     "check_gradient",
     "eip_method",
+    "ensemble",
     "integrate",
     "project",
 ]

@@ -46,6 +46,7 @@ class Events:
         self._counts = [0] * len(items)
         self.t: list[list[float]] = [[] for _ in items]
         self.y: list[list[np.ndarray]] = [[] for _ in items]
+        self.last: tuple[float, np.ndarray] | None = None
 
     @property
     def terminal(self) -> bool:
@@ -69,6 +70,7 @@ class Events:
             self._counts[k] += 1
             self.t[k].append(root)
             self.y[k].append(sol(root))
+            self.last = root, self.y[k][-1]
             if self._counts[k] >= self._allowed[k]:
                 return root
         return None

@@ -37,7 +37,7 @@ FIRST_CHUNK = 64
 FIRST_ROWS = 1024
 STEP, ROW, PENDING = 0, 1, 2
 PAUSE, FULL = 10, 11
-STOPPED = "stopped by the callback"
+ARRIVED, STOPPED = "reached the end of the interval", "stopped by the callback"
 FORMS = {  # (of a Nystrom method, in place) -> what a user's function is
     (False, False): "value",
     (False, True): "in place",
@@ -508,11 +508,12 @@ class Loop:
         return self._result(status, message)
 
     def steps(self, bar: Any) -> tuple[int, str]:
-        """Run to the end of the interval, or to what ends the run before it; returns status and message."""
+        """Run on to the end of the interval, or to what ends the run before it; returns status and message."""
         driver = self.driver
-        driver.save_start()
-        if self._stopped_by_callback(0):
-            return 1, STOPPED
+        if driver.step == 0:
+            driver.save_start()
+            if self._stopped_by_callback(0):
+                return 1, STOPPED
         while True:
             k, rows, begin = driver.step, driver.rows, time.perf_counter()
             code = driver.advance(k + self._chunk(self.chunk))
@@ -528,7 +529,7 @@ class Loop:
             elif code not in (OK, PAUSE):
                 return -1, _setup.failure(code, driver.run, driver.grid.clock)
             elif code == OK and driver.grid.clock[T] == driver.grid.span.t_bound:
-                return 0, "reached the end of the interval"
+                return 0, ARRIVED
             if code == OK:
                 # At most a doubling, so that one fast chunk cannot make a slow one long.
                 self.chunk = max(1, min(2 * self.chunk, int(self.chunk * CHUNK_SECONDS / max(seconds, 1e-9))))
@@ -579,8 +580,6 @@ class Loop:
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
         driver = self.driver
         rows, counters, events = driver.rows, driver.run.work.counters, self.events
-        if self.why_not is not None:
-            message = f"{message} (interpreted: {self.why_not})"
         return IntegrationResult(
             t=driver.t[:rows],
             y=driver.y[:rows].T,
@@ -593,13 +592,17 @@ class Loop:
             njev=int(counters[NJEV]),
             nlu=int(counters[NLU]),
             status=status,
-            message=message,
+            message=self.explained(message),
             success=status >= 0,
             wall_time=self.wall_time,
             compiled=self.why_not is None,
             method=self.method,
             h=abs(driver.grid.span.h) or None,
         )
+
+    def explained(self, message: str) -> str:
+        """With the reason why the run was not compiled, if it was not."""
+        return message if self.why_not is None else f"{message} (interpreted: {self.why_not})"
 
     def _values(self, broken: bool) -> np.ndarray:
         """Invariants of the saved states; NaN where the run was broken off by an invariant that still raises."""
