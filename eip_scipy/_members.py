@@ -376,7 +376,8 @@ class _Driver:
         taus, evaluations = self._first_steps(plan, y0s, params)
         saved = np.empty((m, driver.t.size, plan.size), plan.dtype) if plan.times.size else None
         rows = self._row_buffer if saved is None else saved.view(float)
-        given = (np.ascontiguousarray(y0s), taus, evaluations, np.ascontiguousarray(params), rows)
+        y0s, params = (np.require(a, requirements=["C", "W"]) for a in (y0s, params))  # one type for compiled code
+        given = (y0s, taus, evaluations, params, rows)
         wanted = (out.y, out.max_defect, out.counters, out.max_correction)
         where[0], batch = 0, 1
         while where[0] < m:
