@@ -2,6 +2,7 @@
 
 from importlib.metadata import version as _version
 
+from .checkpoint import CheckpointError
 from .invariants import Invariant, check_gradient
 from .longrun import integrate
 from .nystrom import NystromTableau
@@ -36,6 +37,7 @@ __all__ = [
     "EIPRK45",
     "EIPRKN8",
     "EIPRKN12",
+    "CheckpointError",
     "Diagnostics",
     "EIPSolver",
     "IntegrationResult",
