@@ -2,6 +2,7 @@
 
 from importlib.metadata import version as _version
 
+from .checkpoint import CheckpointError
 from .ensemble import EnsembleResult, ensemble
 from .invariants import Invariant, check_gradient
 from .longrun import integrate
@@ -37,6 +38,7 @@ __all__ = [
     "EIPRK45",
     "EIPRKN8",
     "EIPRKN12",
+    "CheckpointError",
     "Diagnostics",
     "EIPSolver",
     "EnsembleResult",

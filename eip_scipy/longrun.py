@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit, typeof, types
 
 from . import _kernels as kn
-from . import _setup
+from . import _resume, _setup
 from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures
 from ._events import Events
 from ._kernels import OK
@@ -191,14 +191,44 @@ class _Driver:
         pending = self.grid.place[PENDING] == 1
         return float(self.grid.clock[T_NEW if pending else T]), self.new if pending else self.state
 
+    def parts(self) -> dict[str, np.ndarray]:
+        """The buffers that decide the steps to come, or count; all others are filled before they are read."""
+        w, grid = self.run.work, self.grid
+        kept = ("carry", "err_sum", "sigma", "defect", "max_defect", "max_correction", "counters")
+        return {
+            "place": grid.place,
+            "clock": grid.clock,
+            "y": self.state,
+            "slope": w.K[0],
+            "g": grid.g,
+            "target": self.run.options.target,
+            **{name: getattr(w, name) for name in kept},
+        }
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Copies of these after the last accepted step, made current as the loop does it."""
+        copies = {name: part.copy() for name, part in self.parts().items()}
+        if self.grid.place[PENDING] == 1:
+            copies["place"][PENDING] = 0
+            copies["clock"][T] = self.grid.clock[T_NEW]
+            copies["y"], copies["slope"] = self.new.copy(), self.run.work.f_new.copy()
+            copies["g"] = self.grid.g_new.copy()
+        return copies
+
+    def load(self, t: np.ndarray, y: np.ndarray, max_bytes: float) -> None:
+        """Rows of a run that is resumed."""
+        while self.t.size <= t.size:
+            self.grow(max_bytes)
+        self.t[: t.size], self.y[: t.size] = t, y
+
     def save(self, t: float, y: np.ndarray) -> None:
         """One more row."""
         self.t[self.rows], self.y[self.rows] = t, y
         self.grid.place[ROW] += 1
 
     def save_start(self) -> None:
-        """The first row: the start, where it is asked for."""
-        if self.grid.t_eval.size == 0 or self.grid.t_eval[0] == self.grid.span.t0:
+        """The first row: the start, where it is asked for and not there already."""
+        if self.rows == 0 and (self.grid.t_eval.size == 0 or self.grid.t_eval[0] == self.grid.span.t0):
             self.save(self.grid.span.t0, self.state)
 
     def save_now(self) -> None:
@@ -274,6 +304,9 @@ def integrate(
     compensated: bool = False,
     compiled: bool | None = None,
     max_bytes: float | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    checkpoint_every: float = 60.0,
+    resume: bool = False,
     invariants: Any = DEFAULT,
     metric: Any = DEFAULT,
     blocks: Any = DEFAULT,
@@ -336,6 +369,15 @@ def integrate(
         not possible. False: interpreted.
     max_bytes : float, optional
         Bound on the memory for saved states; default: half of what is free.
+    checkpoint : path-like, optional
+        File that holds the run, saved states included, so that it can be resumed; written at the start, every
+        `checkpoint_every` seconds, and when the run ends or is broken off. A file that is there already is replaced
+        only by the run that resumes it.
+    checkpoint_every : float, optional
+        Seconds from one checkpoint to the next; more where writing would take over a twentieth of the time.
+    resume : bool, optional
+        Go on from the checkpoint, with the same arguments: the result is bit for bit that of a run without the
+        interruption. Where the file does not exist yet the run starts at the beginning; `message` tells which.
     invariants, metric, blocks, frame, direction, iterations, every, reuse_f, check, project_initial
         As for the solver classes, see `EIPSolver`. Functions of invariants are called as
         ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` takes the run's
@@ -356,11 +398,16 @@ def integrate(
         Options with wrong values, a start that misses a given target, a wrong gradient.
     MemoryError
         When the saved states would need more than `max_bytes`.
+    CheckpointError
+        When the file cannot be written at the start, or is there and not to be resumed, or is damaged, or belongs to a
+        run with other arguments.
 
     Notes
     -----
     A step that fails ends the run with ``status=-1`` and everything up to there. Exceptions from user code and
-    KeyboardInterrupt pass through, with what the run had as ``exception.partial``.
+    KeyboardInterrupt pass through, with what the run had as ``exception.partial``, and with a note that says from
+    where its checkpoint goes on. A checkpoint that cannot be written later on is a RuntimeWarning and stands in
+    `message`; the former one stays.
 
     Examples
     --------
@@ -399,9 +446,13 @@ def prepared(
     atol: Any,
     first_step: float | None,
     max_step: float,
+    checkpoint: str | os.PathLike[str] | None,
+    checkpoint_every: float,
+    resume: bool,
     **projection: Any,
 ) -> Loop:
     """What `integrate` runs, by the same arguments, all of them validated; `projection`: those of the projection."""
+    keeper = _resume.kept(checkpoint, checkpoint_every, resume)
     given = {key: value for key, value in projection.items() if value is not DEFAULT}
     tableau = _tableau(method)
     form = FORMS[isinstance(tableau, NystromTableau), bool(in_place)]
@@ -459,13 +510,17 @@ def prepared(
     check_memory(saved_rows(grid), run, bound)
     record = Diagnostics() if diagnostics is None else diagnostics
     _setup.attach(record, run)
+    happenings.fill(t0, run.y0, grid.g)
+    if checkpoint is not None:
+        settings = _resume.settings(method.__name__, stepping, start, parameters, run, grid, happenings)
+        keeper.identify(settings, run, t0, start, f0)
     with _compiling(progress):
         functions, why_not = _functions(fun, form, extra, run.invariants, happenings, start.dtype, compiled, rhs)
         driver = _Driver(run, grid, functions, parameters, compiled=why_not is None)
     run.work.K[0] = f0 if run.y0 is start else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
-    happenings.fill(t0, run.y0, grid.g)
-    return Loop(driver, tableau, rhs, happenings, record, callback, progress, method.__name__, why_not, bound)
+    keeper.begin(driver, happenings, bound)
+    return Loop(driver, tableau, rhs, happenings, record, callback, progress, method.__name__, why_not, bound, keeper)
 
 
 class Loop:
@@ -483,11 +538,13 @@ class Loop:
         method: str,
         why_not: str | None,
         max_bytes: float,
+        keeper: _resume.Keeper,
     ) -> None:
         self.driver, self.tableau, self.rhs, self.events = driver, tableau, rhs, events
         self.diagnostics, self.callback, self.progress = diagnostics, callback, progress
         self.method, self.why_not, self.max_bytes = method, why_not, max_bytes
-        self.wall_time = 0.0
+        self.keeper = keeper
+        self.wall_time = keeper.seconds
         self.chunk = FIRST_CHUNK
 
     def run(self) -> IntegrationResult:
@@ -497,12 +554,14 @@ class Loop:
             with _bar(self.progress, driver.grid, self.method) as bar:
                 status, message = self.steps(bar)
         except BaseException as error:
-            self.wall_time = time.perf_counter() - begin
+            self.wall_time += time.perf_counter() - begin
             driver.save_now()
             partial = self._result(-1, f"interrupted by {type(error).__name__}", broken=True)
             error.partial = partial  # type: ignore[attr-defined]
+            self.keeper.interrupted(error)
             raise
-        self.wall_time = time.perf_counter() - begin
+        self.wall_time += time.perf_counter() - begin
+        self.keeper.end(status, message)
         if status < 0:
             driver.save_now()
         return self._result(status, message)
@@ -515,6 +574,7 @@ class Loop:
             if self._stopped_by_callback(0):
                 return 1, STOPPED
         while True:
+            self.keeper.keep()
             k, rows, begin = driver.step, driver.rows, time.perf_counter()
             code = driver.advance(k + self._chunk(self.chunk))
             seconds = time.perf_counter() - begin
@@ -601,8 +661,9 @@ class Loop:
         )
 
     def explained(self, message: str) -> str:
-        """With the reason why the run was not compiled, if it was not."""
-        return message if self.why_not is None else f"{message} (interpreted: {self.why_not})"
+        """With what is to be said about checkpoints, and the reason why the run was not compiled, if it was not."""
+        notes = [*self.keeper.notes, *([] if self.why_not is None else [f"interpreted: {self.why_not}"])]
+        return f"{message} ({'; '.join(notes)})" if notes else message
 
     def _values(self, broken: bool) -> np.ndarray:
         """Invariants of the saved states; NaN where the run was broken off by an invariant that still raises."""
@@ -632,7 +693,11 @@ def _bar(progress: bool, grid: Grid, label: str) -> Any:
     else:
         total = abs(grid.span.t_bound - grid.span.t0) if math.isfinite(grid.span.t_bound) else None
     unit = "step" if fixed else "time"
-    return tqdm(total=total, desc=label, unit=unit, unit_scale=True, disable=not progress, smoothing=0.05)
+    # Beyond 0 where the run is resumed.
+    initial = int(grid.place[STEP]) if fixed else abs(float(grid.clock[T]) - grid.span.t0)
+    return tqdm(
+        total=total, initial=initial, desc=label, unit=unit, unit_scale=True, disable=not progress, smoothing=0.05
+    )
 
 
 def _required(name: str, value: Any) -> Any:
