@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from math import isnan
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from . import _kernels as kn
 from . import _setup
 from ._compile import signatures
 from ._kernels import OK
+from ._resume import settings
 from ._setup import Stepping
 from ._step import H_ABS, T_NEW, T, Work
 from .longrun import ARRIVED, PENDING, ROW, STEP, Loop, integrate, prepared, saved_rows
@@ -33,6 +34,7 @@ __all__ = ["FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_
 FAILED, NOT_RUN = -1, -2
 DOUBTFUL = -1
 BATCH_SECONDS = 0.1
+COMPARED = 16
 
 
 class StoppedError(Exception):
@@ -144,6 +146,9 @@ class Plan:
         self.t_bound, self.h = grid.span.t_bound, abs(grid.span.h) or None
         self.times = saved_times(loop)
         self.n_steps = None if grid.span.n_steps >= _setup.UNBOUNDED else grid.span.n_steps
+        first = np.concatenate([loop.driver.run.work.K[0], run.invariants.start_values])
+        self._start_values = [repr(value) for value in first[:COMPARED].tolist()]
+        self._settings = partial(_settings, loop, options=task.options)
         own_targets = any(item.target is not None for item in run.invariants.items)
         own_start = bool(task.options.get("project_initial", False)) or own_targets
         self._together = self.why_not is None and not (own_start or loop.events.functions or grid.t_eval.size)
@@ -164,6 +169,10 @@ class Plan:
         """The run of one member by itself."""
         return self.task.loop(y0, None if self.task.params is None else params, **self._options)
 
+    def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int) -> dict[str, Any]:
+        """What makes two ensembles the same, as JSON holds it: settings, and what their functions give at one start."""
+        return {"settings": self._settings(starts, params) | {"chunk": chunk}, "start": self._start_values}
+
     @contextmanager
     def driver(self) -> Iterator[_Driver | None]:
         """A driver that no other thread uses now; None where each member needs its own."""
@@ -176,6 +185,13 @@ class Plan:
             mine = _Driver(self.task.loop(self.task.y0, self.task.params, **self._options))
         yield mine
         self._idle.append(mine)
+
+
+def _settings(loop: Loop, starts: np.ndarray, params: np.ndarray, options: dict[str, Any]) -> dict[str, Any]:
+    run, grid = loop.driver.run, loop.driver.grid
+    stepping = Stepping(grid.span, abs(grid.span.h) or None, options.get("first_step"), run.options.rtol, starts)
+    found = settings(loop.method, stepping, starts, params, run, grid, loop.events)
+    return found | {"project_initial": bool(options.get("project_initial", False))}
 
 
 def saved_times(loop: Loop) -> np.ndarray:

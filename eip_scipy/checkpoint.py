@@ -25,7 +25,7 @@ from numpy.lib import format as npy
 
 from .report import versions
 
-__all__ = ["CheckpointError", "read", "require_same", "warn_of_other_versions", "write"]
+__all__ = ["CheckpointError", "origin", "read", "require_same", "warn_of_other_versions", "write"]
 
 FORMAT, SCHEMA = "eip_scipy checkpoint", 1
 HEADER = "header.json"
@@ -72,7 +72,7 @@ def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mappi
     >>> header["kind"], arrays["x"]
     ('example', array([0, 1, 2]))
     """
-    own = {"format": FORMAT, "schema": SCHEMA, "versions": _versions(), "machine": _machine()}
+    own = {"format": FORMAT, "schema": SCHEMA, **origin()}
     text = json.dumps({**header, **own}, indent=1, allow_nan=False).encode()
     target = Path(os.path.realpath(path))
     temporary = target.with_name(f".{target.name}-{os.getpid()}.tmp")
@@ -185,6 +185,11 @@ def _versions() -> dict[str, str | None]:
 
 def _machine() -> str:
     return f"{platform.system()} {platform.machine()}"
+
+
+def origin() -> dict[str, Any]:
+    """Versions and machine, as the header of every checkpoint has them."""
+    return {"versions": _versions(), "machine": _machine()}
 
 
 def _here() -> dict[str, str | None]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import math
+import os
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -22,7 +22,7 @@ from ._members import FAILED, NOT_RUN, Members, Plan, Task
 from ._names import nearest
 from ._pools import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
 from ._statistics import Statistics, merge
-from ._store import ZarrStore
+from ._store import CheckpointStore, Store, ZarrStore
 from .invariants import as_invariants
 from .longrun import DEFAULT, free_memory, integrate
 from .problems._problem import Problem
@@ -119,6 +119,8 @@ def ensemble(
     reduce: Any = None,
     callback: Callable[[EnsembleResult], Any] | None = None,
     out: Any = None,
+    checkpoint: Any = None,
+    checkpoint_every: float = 60.0,
     resume: bool = False,
     chunk: int | None = None,
     progress: bool = False,
@@ -163,8 +165,14 @@ def ensemble(
         True to stop.
     out : path-like, optional
         A Zarr group to write to, chunk by chunk, for trajectories that do not fit into memory; xarray opens it.
+    checkpoint : path-like, optional
+        Without `out`: a file that keeps finished members, see `eip_scipy.checkpoint`; written every `checkpoint_every`
+        seconds, and when the ensemble ends or is broken off.
+    checkpoint_every : float, optional
+        Seconds; more where writing would take over a twentieth of the time.
     resume : bool, optional
-        Go on with what is in `out`: only members that are missing there run. Where there is nothing, start.
+        Go on with what is in `out` or `checkpoint`, with the same arguments: only members that are missing there run,
+        and the result has the same bits. Where there is nothing, start.
     chunk : int, optional
         Members that run together; results do not depend on it, but for the last bits of `reduce`.
     progress : bool, optional
@@ -187,8 +195,8 @@ def ensemble(
         As by `integrate`, for what would fail in every member.
     MemoryError
         When results would need more than `max_bytes`.
-    FileExistsError
-        When `out` exists and is not to be resumed.
+    CheckpointError
+        When `out` or `checkpoint` exists and is not to be resumed, or is damaged, or belongs to other arguments.
 
     Notes
     -----
@@ -213,8 +221,7 @@ def ensemble(
     starts, parameters = _inputs(fun, y0s, params, given)
     if not (reduce is None or reduce == "state" or callable(reduce)):
         raise ValueError(f"reduce must be 'state' or a function reduce(t, y), got {reduce!r}.")
-    if resume and out is None:
-        raise ValueError("resume=True goes on with what is in out=; give it.")
+    _check_places(out, checkpoint, checkpoint_every, resume)
     keep = reduce is None or out is not None
     task = Task(_bare(fun), t_span, given, starts[0], parameters[0] if parameters.shape[1] else None, reduce, keep)
     task = _first_that_starts(task, starts, parameters)
@@ -223,10 +230,12 @@ def ensemble(
     size = _chunk_size(plan, len(starts), fun) if chunk is None else _setup.count("chunk", chunk)
     held = plan.times.size if reduce is None and out is None else 0
     _check_memory(plan, len(starts), held, max_bytes)
-    store = None
+    store: Store | None = None
     if out is not None:
-        header = _header(plan, starts, parameters, size)
-        store = ZarrStore(out, header, plan.empty(size), plan.times, len(starts), size, resume)
+        identity = plan.identity(starts, parameters, size)
+        store = ZarrStore(out, identity, plan.empty(size), plan.times, len(starts), resume)
+    elif checkpoint is not None:
+        store = CheckpointStore(checkpoint, plan.identity(starts, parameters, size), checkpoint_every, resume)
     gathered = _Gathered(plan, len(starts), held, size, store, callback)
     return gathered.run(partial(_pool, executor, task, gathered.method), _chunks(starts, parameters, size), progress)
 
@@ -240,7 +249,7 @@ class _Gathered:
         members: int,
         held: int,
         chunk: int,
-        store: ZarrStore | None,
+        store: Store | None,
         callback: Callable[[EnsembleResult], Any] | None,
     ) -> None:
         self.plan, self.chunk, self.store, self.callback = plan, chunk, store, callback
@@ -269,24 +278,30 @@ class _Gathered:
 
     def _stored(self) -> int:
         """Take what the store has; returns the number of members."""
-        done = 0 if self.store is None else self.store.finished
+        if self.store is None:
+            return 0
+        done, statistics = self.store.finished, self.store.statistics
         for first in range(0, done, self.chunk):
-            members = self.store.read(first, min(first + self.chunk, done))  # type: ignore[union-attr]
-            self._take(first, finished(self.plan.task, self.plan, members))
+            members = self.store.read(first, min(first + self.chunk, done))
+            part = Part(members, None) if statistics is not None else finished(self.plan.task, self.plan, members)
+            self._take(first, part)
+        self.statistics = self.statistics if statistics is None else statistics
         return done
 
     def _gather(self, pool: Pool, chunks: Iterator[Chunk], bar: Any) -> None:
         try:
             for chunk, part in in_order(pool, chunks):
-                if self.store is not None:
-                    self.store.write(chunk.first, part.members)
                 self._take(chunk.first, part)
+                if self.store is not None:
+                    self.store.write(chunk.first, part.members, self.whole, self.statistics)
                 bar.update(len(part.members.t))
                 if self.callback is not None and self.callback(self._of(part.members, part.statistics, chunk.first)):
                     self.stopped = True
                     return
         finally:
             pool.close()
+            if self.store is not None:
+                self.store.close()
 
     def _take(self, first: int, part: Part) -> None:
         members, last = part.members, first + len(part.members.t)
@@ -343,6 +358,18 @@ def _check_options(options: dict[str, Any]) -> dict[str, Any]:
         if not getattr(event, "terminal", False):
             raise ValueError("ensemble: an event must be terminal: it ends a member; the times of others are not kept.")
     return options
+
+
+def _check_places(out: Any, checkpoint: Any, every: Any, resume: Any) -> None:
+    if not _setup.is_number(every) or not every > 0:
+        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {every!r}.")
+    if out is not None and checkpoint is not None:
+        raise ValueError("give out= or checkpoint=, not both: out keeps finished members already.")
+    for name, path in (("out", out), ("checkpoint", checkpoint)):
+        if path is not None and not isinstance(path, (str, os.PathLike)):
+            raise TypeError(f"{name} must be a path, got {path!r}.")
+    if resume and out is None and checkpoint is None:
+        raise ValueError("resume=True needs the place to go on from: out= or checkpoint=.")
 
 
 def _inputs(fun: Any, y0s: Any, params: Any, given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
@@ -444,23 +471,6 @@ def _chunks(starts: np.ndarray, params: np.ndarray, size: int) -> Callable[[int]
             yield Chunk(first, starts[first : first + size], np.ascontiguousarray(params[first : first + size]))
 
     return chunks
-
-
-def _header(plan: Plan, starts: np.ndarray, params: np.ndarray, chunk: int) -> dict[str, Any]:
-    """What makes two ensembles the same, as far as numbers and names tell."""
-    options = plan.task.options
-    plain = {name: value for name, value in options.items() if isinstance(value, (bool, int, float, str))}
-    arrays = [starts, params, plan.times, np.array([plan.t0, plan.t_bound])]
-    digest = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
-    return {
-        "method": options["method"].__name__,
-        "members": len(starts),
-        "components": plan.size,
-        "chunk": chunk,
-        "invariants": list(plan.names),
-        "options": plain,
-        "starts, params and times (SHA-256)": digest,
-    }
 
 
 def _pool(executor: Any, task: Task, method: str) -> Pool:

@@ -3,10 +3,13 @@
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,8 +34,10 @@ from eip_scipy import (
     EIPRK5,
     EIPRK45,
     EIPRKN8,
+    CheckpointError,
     EnsembleResult,
     Invariant,
+    checkpoint,
     ensemble,
     integrate,
 )
@@ -428,7 +433,10 @@ def test_progress(capsys):
         ({"events": oscillator}, ValueError, "an event must be terminal"),
         ({"save_every": 0}, ValueError, "save_every must be an integer >= 1"),
         ({"save_every": 1, "h": None}, ValueError, "needs fixed steps"),
-        ({"resume": True}, ValueError, "resume=True goes on with what is in out="),
+        ({"resume": True}, ValueError, "resume=True needs the place to go on from"),
+        ({"out": "a", "checkpoint": "b"}, ValueError, "give out= or checkpoint=, not both"),
+        ({"checkpoint": 3}, TypeError, "checkpoint must be a path"),
+        ({"checkpoint": "a", "checkpoint_every": 0}, ValueError, "checkpoint_every must be a number of seconds"),
         ({"invariants": Invariant(lambda t, y, a: y @ y, lambda t, y, a: 2 * y, args=(1,)), "params": [[1], [2]]},
          ValueError, "leave args out"),
     ],
@@ -470,15 +478,18 @@ def test_threads_of_the_user():
 STORED = {"h": 0.1, "invariants": SQUARE, "save_every": 4, "chunk": 3}
 
 
-@pytest.fixture
-def stored():
-    pytest.importorskip("zarr", reason="needs zarr")
+ZARR = pytest.param("out", marks=pytest.mark.skipif(find_spec("zarr") is None, reason="needs zarr"))
+both_stores = pytest.mark.parametrize("where", [ZARR, "checkpoint"])
+
+
+def stored(fun=oscillator, **options):
     y0s = np.random.default_rng(3).standard_normal((11, 2))
     y0s[5] = np.nan
-    return partial(ensemble, oscillator, (0, 1), y0s, **STORED)
+    return ensemble(fun, (0, 1), y0s, **STORED | options)
 
 
-def test_store_holds_what_memory_does(stored, tmp_path):
+def test_store_holds_what_memory_does(tmp_path):
+    pytest.importorskip("zarr", reason="needs zarr")
     plain, kept = stored(), stored(out=tmp_path / "run.zarr")
     same(plain, kept)
     np.testing.assert_array_equal(kept.trajectories[:], plain.trajectories)
@@ -489,50 +500,66 @@ def test_store_holds_what_memory_does(stored, tmp_path):
         np.testing.assert_array_equal(data.states.sel(time=plain.times[1]), plain.trajectories[:, :, 1])
         np.testing.assert_array_equal(data.status, plain.status)
         assert data.message.values[5] == plain.message[5]
-        assert data.attrs["eip_scipy_ensemble"]["method"] == "EIPRK4"
+        assert data.attrs["eip_scipy_ensemble"]["settings"]["h"] == 0.1
 
 
-@pytest.mark.parametrize("more", [{}, {"reduce": "state"}])
-def test_resume_runs_what_is_missing(stored, tmp_path, more):
+@both_stores
+@pytest.mark.parametrize("more", [{}, {"reduce": "state"}, {"save_every": None}])
+def test_resume_runs_what_is_missing(where, tmp_path, more):
     def broken_off(part):
         if part.first == 3:
             raise KeyboardInterrupt
 
+    def ran_on(part):
+        ran.append(part.first)
+
     ran = []
+    options = {where: tmp_path / "kept", **more}
     whole = stored(**more)
     with pytest.raises(KeyboardInterrupt):
-        stored(out=tmp_path / "run.zarr", callback=broken_off, **more)
-    resumed = stored(out=tmp_path / "run.zarr", resume=True, callback=lambda part: ran.append(part.first), **more)
+        stored(callback=broken_off, **options)
+    resumed = stored(resume=True, callback=ran_on, **options)
     assert ran == [6, 9]
     same(whole, resumed)
-    again = stored(out=tmp_path / "run.zarr", resume=True, callback=lambda part: ran.append(part.first), **more)
+    again = stored(resume=True, callback=ran_on, **options)
     assert ran == [6, 9]
     same(whole, again)
-    np.testing.assert_array_equal(again.trajectories[:], stored().trajectories)
+    if again.trajectories is not None:
+        np.testing.assert_array_equal(again.trajectories[:], stored().trajectories)
 
 
-def test_resume_starts_where_there_is_nothing(stored, tmp_path):
-    same(stored(), stored(out=tmp_path / "run.zarr", resume=True))
+@both_stores
+def test_resume_starts_where_there_is_nothing(where, tmp_path):
+    same(stored(), stored(resume=True, **{where: tmp_path / "kept"}))
 
 
-def test_a_store_is_not_overwritten_nor_mixed_up(stored, tmp_path):
-    path = tmp_path / "run.zarr"
-    stored(out=path)
-    with pytest.raises(FileExistsError, match="pass resume=True"):
-        stored(out=path)
-    with pytest.raises(ValueError, match="belongs to another ensemble: its options"):
-        stored(out=path, resume=True, h=0.2)
-    with pytest.raises(ValueError, match=r"its starts, params and times \(SHA-256\)"):
-        ensemble(oscillator, (0, 1), np.ones((11, 2)), out=path, resume=True, **STORED)
-    (tmp_path / "other").mkdir()
-    with pytest.raises(ValueError, match="is no ensemble of eip_scipy"):
-        stored(out=tmp_path / "other", resume=True)
+@both_stores
+def test_a_store_is_not_overwritten_nor_mixed_up(where, tmp_path):
+    place = {where: tmp_path / "kept"}
+    stored(**place)
+    with pytest.raises(CheckpointError, match="resume=True goes on with the ensemble"):
+        stored(**place)
+    with pytest.raises(CheckpointError, match=r"another run: h is 0\.1 there and 0\.2 here"):
+        stored(resume=True, h=0.2, **place)
+    with pytest.raises(CheckpointError, match="y0 differs"):
+        ensemble(oscillator, (0, 1), np.ones((11, 2)), resume=True, **place, **STORED)
+    with pytest.raises(CheckpointError, match="fun or an invariant had other values at the start"):
+        stored(lambda t, y: 2 * oscillator(t, y), resume=True, **place)
+    with pytest.raises(CheckpointError, match="chunk is 3 there and 4 here"):
+        stored(resume=True, chunk=4, **place)
 
 
-def test_a_chunk_without_its_status_runs_again(stored, tmp_path):
+@both_stores
+def test_what_is_no_store(where, tmp_path):
+    place = tmp_path / "other"
+    place.write_text("something") if where == "checkpoint" else place.mkdir()
+    with pytest.raises(CheckpointError, match=r"is no (ensemble|checkpoint) of eip_scipy"):
+        stored(resume=True, **{where: place})
+
+
+def test_a_chunk_without_its_status_runs_again(tmp_path):
     """As after a kill between the arrays of a chunk."""
-    import zarr
-
+    zarr = pytest.importorskip("zarr", reason="needs zarr")
     path = tmp_path / "run.zarr"
     whole = stored(out=path)
     group = zarr.open_group(path, mode="r+")
@@ -541,3 +568,48 @@ def test_a_chunk_without_its_status_runs_again(stored, tmp_path):
     ran = []
     same(whole, stored(out=path, resume=True, callback=lambda part: ran.append(part.first)))
     assert ran == [6, 9]
+
+
+def test_a_store_that_was_not_begun_yet(tmp_path):
+    """As after a kill between the making of the group and that of its arrays."""
+    zarr = pytest.importorskip("zarr", reason="needs zarr")
+    zarr.open_group(tmp_path / "run.zarr", mode="w", attributes={"eip_scipy_ensemble": None})
+    same(stored(), stored(out=tmp_path / "run.zarr", resume=True))
+
+
+def test_checkpoints_in_time(tmp_path):
+    """Each chunk, where the seconds are over; and a file in use is whole."""
+    path, seen = tmp_path / "kept", []
+
+    def callback(part):
+        seen.append(checkpoint.read(path, "ensemble")[0]["finished"])
+
+    stored(checkpoint=path, checkpoint_every=1e-9, callback=callback)
+    assert seen[0] == 3
+    assert sorted(seen) == seen
+
+
+KILLED = """
+import os, signal, sys, numpy as np
+sys.path.insert(0, {tests!r})
+from systems import SQUARE, oscillator
+from eip_scipy import ensemble
+def callback(part):
+    if part.first == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+y0s = np.random.default_rng(3).standard_normal((11, 2))
+y0s[5] = np.nan
+ensemble(oscillator, (0, 1), y0s, h=0.1, invariants=SQUARE, save_every=4, chunk=3, {where}={path!r}, callback=callback,
+         checkpoint_every=1e-9)
+"""
+
+
+@both_stores
+def test_a_killed_run_goes_on(where, tmp_path):
+    path = str(tmp_path / "kept")
+    code = KILLED.format(tests=str(Path(__file__).parent), where=where, path=path)
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL
+    ran = []
+    same(stored(), stored(resume=True, callback=lambda part: ran.append(part.first), **{where: path}))
+    assert ran[-2:] == [6, 9]
+    assert ran[0] > 0
