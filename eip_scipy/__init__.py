@@ -2,6 +2,8 @@
 
 from importlib.metadata import version as _version
 
+from .checkpoint import CheckpointError
+from .ensemble import EnsembleResult, ensemble
 from .invariants import Invariant, check_gradient
 from .longrun import integrate
 from .nystrom import NystromTableau
@@ -36,8 +38,10 @@ __all__ = [
     "EIPRK45",
     "EIPRKN8",
     "EIPRKN12",
+    "CheckpointError",
     "Diagnostics",
     "EIPSolver",
+    "EnsembleResult",
     "IntegrationResult",
     "Invariant",
     "NystromTableau",
@@ -45,6 +49,7 @@ __all__ = [
     "Tableau",
     "check_gradient",
     "eip_method",
+    "ensemble",
     "integrate",
     "project",
 ]

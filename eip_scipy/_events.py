@@ -46,11 +46,21 @@ class Events:
         self._counts = [0] * len(items)
         self.t: list[list[float]] = [[] for _ in items]
         self.y: list[list[np.ndarray]] = [[] for _ in items]
+        self.last: tuple[float, np.ndarray] | None = None
 
     @property
     def terminal(self) -> bool:
         """Whether an event can end the run."""
         return any(math.isfinite(allowed) for allowed in self._allowed)
+
+    @property
+    def ends(self) -> list[tuple[float, float]]:
+        """Of each event the direction and the number of times after which it ends the run."""
+        return list(zip(self.directions.tolist(), self._allowed, strict=True))
+
+    def restore(self, k: int, t: np.ndarray, y: np.ndarray) -> None:
+        """Let event `k` have happened at the times `t` (m,) in the states `y` (m, n)."""
+        self.t[k], self.y[k], self._counts[k] = t.tolist(), list(y), t.size
 
     def fill(self, t: float, y: np.ndarray, values: np.ndarray, params: Any = None) -> None:
         """Values of all events."""
@@ -69,6 +79,7 @@ class Events:
             self._counts[k] += 1
             self.t[k].append(root)
             self.y[k].append(sol(root))
+            self.last = root, self.y[k][-1]
             if self._counts[k] >= self._allowed[k]:
                 return root
         return None

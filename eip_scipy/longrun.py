@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit, typeof, types
 
 from . import _kernels as kn
-from . import _setup
+from . import _resume, _setup
 from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures
 from ._events import Events
 from ._kernels import OK
@@ -37,7 +37,7 @@ FIRST_CHUNK = 64
 FIRST_ROWS = 1024
 STEP, ROW, PENDING = 0, 1, 2
 PAUSE, FULL = 10, 11
-STOPPED = "stopped by the callback"
+ARRIVED, STOPPED = "reached the end of the interval", "stopped by the callback"
 FORMS = {  # (of a Nystrom method, in place) -> what a user's function is
     (False, False): "value",
     (False, True): "in place",
@@ -138,7 +138,8 @@ def _compiled_advance(dtype: np.dtype, arguments: tuple[Any, ...]) -> Callable[.
     """The driver compiled for one type of state, its callables as first-class functions: cached on disk."""
     rhs, inv, grad = signatures(dtype)
     functions = [types.FunctionType(s) for s in (rhs, inv, grad, inv)]
-    return njit([types.int64(*functions, *arguments)], cache=True, error_model="numpy", _nrt=False)(advance)
+    signature = types.int64(*functions, *arguments)
+    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(advance)
 
 
 @cache
@@ -190,14 +191,44 @@ class _Driver:
         pending = self.grid.place[PENDING] == 1
         return float(self.grid.clock[T_NEW if pending else T]), self.new if pending else self.state
 
+    def parts(self) -> dict[str, np.ndarray]:
+        """The buffers that decide the steps to come, or count; all others are filled before they are read."""
+        w, grid = self.run.work, self.grid
+        kept = ("carry", "err_sum", "sigma", "defect", "max_defect", "max_correction", "counters")
+        return {
+            "place": grid.place,
+            "clock": grid.clock,
+            "y": self.state,
+            "slope": w.K[0],
+            "g": grid.g,
+            "target": self.run.options.target,
+            **{name: getattr(w, name) for name in kept},
+        }
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Copies of these after the last accepted step, made current as the loop does it."""
+        copies = {name: part.copy() for name, part in self.parts().items()}
+        if self.grid.place[PENDING] == 1:
+            copies["place"][PENDING] = 0
+            copies["clock"][T] = self.grid.clock[T_NEW]
+            copies["y"], copies["slope"] = self.new.copy(), self.run.work.f_new.copy()
+            copies["g"] = self.grid.g_new.copy()
+        return copies
+
+    def load(self, t: np.ndarray, y: np.ndarray, max_bytes: float) -> None:
+        """Rows of a run that is resumed."""
+        while self.t.size <= t.size:
+            self.grow(max_bytes)
+        self.t[: t.size], self.y[: t.size] = t, y
+
     def save(self, t: float, y: np.ndarray) -> None:
         """One more row."""
         self.t[self.rows], self.y[self.rows] = t, y
         self.grid.place[ROW] += 1
 
     def save_start(self) -> None:
-        """The first row: the start, where it is asked for."""
-        if self.grid.t_eval.size == 0 or self.grid.t_eval[0] == self.grid.span.t0:
+        """The first row: the start, where it is asked for and not there already."""
+        if self.rows == 0 and (self.grid.t_eval.size == 0 or self.grid.t_eval[0] == self.grid.span.t0):
             self.save(self.grid.span.t0, self.state)
 
     def save_now(self) -> None:
@@ -273,6 +304,9 @@ def integrate(
     compensated: bool = False,
     compiled: bool | None = None,
     max_bytes: float | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    checkpoint_every: float = 60.0,
+    resume: bool = False,
     invariants: Any = DEFAULT,
     metric: Any = DEFAULT,
     blocks: Any = DEFAULT,
@@ -335,6 +369,15 @@ def integrate(
         not possible. False: interpreted.
     max_bytes : float, optional
         Bound on the memory for saved states; default: half of what is free.
+    checkpoint : path-like, optional
+        File that holds the run, saved states included, so that it can be resumed; written at the start, every
+        `checkpoint_every` seconds, and when the run ends or is broken off. A file that is there already is replaced
+        only by the run that resumes it.
+    checkpoint_every : float, optional
+        Seconds from one checkpoint to the next; more where writing would take over a twentieth of the time.
+    resume : bool, optional
+        Go on from the checkpoint, with the same arguments: the result is bit for bit that of a run without the
+        interruption. Where the file does not exist yet the run starts at the beginning; `message` tells which.
     invariants, metric, blocks, frame, direction, iterations, every, reuse_f, check, project_initial
         As for the solver classes, see `EIPSolver`. Functions of invariants are called as
         ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` takes the run's
@@ -355,11 +398,16 @@ def integrate(
         Options with wrong values, a start that misses a given target, a wrong gradient.
     MemoryError
         When the saved states would need more than `max_bytes`.
+    CheckpointError
+        When the file cannot be written at the start, or is there and not to be resumed, or is damaged, or belongs to a
+        run with other arguments.
 
     Notes
     -----
     A step that fails ends the run with ``status=-1`` and everything up to there. Exceptions from user code and
-    KeyboardInterrupt pass through, with what the run had as ``exception.partial``.
+    KeyboardInterrupt pass through, with what the run had as ``exception.partial``, and with a note that says from
+    where its checkpoint goes on. A checkpoint that cannot be written later on is a RuntimeWarning and stands in
+    `message`; the former one stays.
 
     Examples
     --------
@@ -369,11 +417,43 @@ def integrate(
     >>> run.y.shape, bool((run.max_defect < 1e-11).all())
     ((4, 68), True)
     """
+    arguments = {name: value for name, value in locals().items() if name != "unknown"}
     for name in unknown:
         hint = nearest(name, integrate.__kwdefaults__ or ())
         raise TypeError(f"integrate() has no option {name!r}{hint}")
-    given = {"invariants": invariants, "metric": metric, "blocks": blocks, "frame": frame}
-    given = {key: value for key, value in given.items() if value is not DEFAULT}
+    return prepared(**arguments).run()
+
+
+def prepared(
+    fun: Callable[..., Any] | Problem,
+    t_span: Any,
+    y0: Any,
+    *,
+    method: type[EIPSolver],
+    h: float | None,
+    params: Any,
+    in_place: bool,
+    save_every: int | None,
+    t_eval: Any,
+    events: Any,
+    callback: Callable[[float, np.ndarray, np.ndarray], Any] | None,
+    progress: bool,
+    compensated: bool,
+    compiled: bool | None,
+    max_bytes: float | None,
+    diagnostics: Diagnostics | None,
+    rtol: Any,
+    atol: Any,
+    first_step: float | None,
+    max_step: float,
+    checkpoint: str | os.PathLike[str] | None,
+    checkpoint_every: float,
+    resume: bool,
+    **projection: Any,
+) -> Loop:
+    """What `integrate` runs, by the same arguments, all of them validated; `projection`: those of the projection."""
+    keeper = _resume.kept(checkpoint, checkpoint_every, resume)
+    given = {key: value for key, value in projection.items() if value is not DEFAULT}
     tableau = _tableau(method)
     form = FORMS[isinstance(tableau, NystromTableau), bool(in_place)]
     if isinstance(fun, Problem):
@@ -397,7 +477,7 @@ def integrate(
     t0, t_bound = _span(t_span, happenings.terminal)
     start = _setup.initial_state(_required("y0", y0))
     stepping = _setup.stepping(
-        method.__name__, tableau, t0, t_bound, start.size, h, first_step, max_step, rtol, atol, stacklevel=3
+        method.__name__, tableau, t0, t_bound, start.size, h, first_step, max_step, rtol, atol, stacklevel=4
     )
     if params is not None and "invariants" in given:
         given["invariants"] = [_with_run_params(item, params) for item in as_invariants(given["invariants"])]
@@ -414,30 +494,36 @@ def integrate(
         _setup.check_second_order(calls, t0, start, f0, method.__name__)
     tau = stepping.first(calls, start, f0, tableau)
     grid = _grid(stepping.span, tau, save_every, t_eval, happenings)
-    projection = ProjectionOptions(
-        **given,
-        direction=direction,
-        iterations=iterations,
-        every=every,
-        reuse_f=reuse_f,
-        check=check,
-        project_initial=project_initial,
+    run = _setup.prepare(
+        tableau,
+        calls,
+        t0,
+        start,
+        f0,
+        tau,
+        ProjectionOptions(**given),
+        stepping,
+        extra=extra,
+        compensated=compensated,
     )
-    run = _setup.prepare(tableau, calls, t0, start, f0, tau, projection, stepping, extra=extra, compensated=compensated)
     bound = 0.5 * free_memory() if max_bytes is None else max_bytes
     check_memory(saved_rows(grid), run, bound)
     record = Diagnostics() if diagnostics is None else diagnostics
     _setup.attach(record, run)
+    happenings.fill(t0, run.y0, grid.g)
+    if checkpoint is not None:
+        settings = _resume.settings(method.__name__, stepping, start, parameters, run, grid, happenings)
+        keeper.identify(settings, run, t0, start, f0)
     with _compiling(progress):
         functions, why_not = _functions(fun, form, extra, run.invariants, happenings, start.dtype, compiled, rhs)
         driver = _Driver(run, grid, functions, parameters, compiled=why_not is None)
     run.work.K[0] = f0 if run.y0 is start else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
-    happenings.fill(t0, run.y0, grid.g)
-    return _Loop(driver, tableau, rhs, happenings, record, callback, progress, method.__name__, why_not, bound).run()
+    keeper.begin(driver, happenings, bound)
+    return Loop(driver, tableau, rhs, happenings, record, callback, progress, method.__name__, why_not, bound, keeper)
 
 
-class _Loop:
+class Loop:
     """Drives chunks of steps: progress, samples, events, callbacks, and what is kept when something goes wrong."""
 
     def __init__(
@@ -452,38 +538,45 @@ class _Loop:
         method: str,
         why_not: str | None,
         max_bytes: float,
+        keeper: _resume.Keeper,
     ) -> None:
         self.driver, self.tableau, self.rhs, self.events = driver, tableau, rhs, events
         self.diagnostics, self.callback, self.progress = diagnostics, callback, progress
         self.method, self.why_not, self.max_bytes = method, why_not, max_bytes
-        self.wall_time = 0.0
+        self.keeper = keeper
+        self.wall_time = keeper.seconds
+        self.chunk = FIRST_CHUNK
 
     def run(self) -> IntegrationResult:
         driver = self.driver
         begin = time.perf_counter()
         try:
             with _bar(self.progress, driver.grid, self.method) as bar:
-                status, message = self._steps(bar)
+                status, message = self.steps(bar)
         except BaseException as error:
-            self.wall_time = time.perf_counter() - begin
+            self.wall_time += time.perf_counter() - begin
             driver.save_now()
             partial = self._result(-1, f"interrupted by {type(error).__name__}", broken=True)
             error.partial = partial  # type: ignore[attr-defined]
+            self.keeper.interrupted(error)
             raise
-        self.wall_time = time.perf_counter() - begin
+        self.wall_time += time.perf_counter() - begin
+        self.keeper.end(status, message)
         if status < 0:
             driver.save_now()
         return self._result(status, message)
 
-    def _steps(self, bar: Any) -> tuple[int, str]:
+    def steps(self, bar: Any) -> tuple[int, str]:
+        """Run on to the end of the interval, or to what ends the run before it; returns status and message."""
         driver = self.driver
-        driver.save_start()
-        if self._stopped_by_callback(0):
-            return 1, STOPPED
-        chunk = FIRST_CHUNK
+        if driver.step == 0:
+            driver.save_start()
+            if self._stopped_by_callback(0):
+                return 1, STOPPED
         while True:
+            self.keeper.keep()
             k, rows, begin = driver.step, driver.rows, time.perf_counter()
-            code = driver.advance(k + self._chunk(chunk))
+            code = driver.advance(k + self._chunk(self.chunk))
             seconds = time.perf_counter() - begin
             ended = self._pause() if code == PAUSE else False
             bar.update(self._progress(bar.n, k))
@@ -496,10 +589,10 @@ class _Loop:
             elif code not in (OK, PAUSE):
                 return -1, _setup.failure(code, driver.run, driver.grid.clock)
             elif code == OK and driver.grid.clock[T] == driver.grid.span.t_bound:
-                return 0, "reached the end of the interval"
+                return 0, ARRIVED
             if code == OK:
                 # At most a doubling, so that one fast chunk cannot make a slow one long.
-                chunk = max(1, min(2 * chunk, int(chunk * CHUNK_SECONDS / max(seconds, 1e-9))))
+                self.chunk = max(1, min(2 * self.chunk, int(self.chunk * CHUNK_SECONDS / max(seconds, 1e-9))))
 
     def _progress(self, shown: float, k: int) -> float:
         """What the bar is to grow by: steps where their number is known, else time."""
@@ -547,8 +640,6 @@ class _Loop:
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
         driver = self.driver
         rows, counters, events = driver.rows, driver.run.work.counters, self.events
-        if self.why_not is not None:
-            message = f"{message} (interpreted: {self.why_not})"
         return IntegrationResult(
             t=driver.t[:rows],
             y=driver.y[:rows].T,
@@ -561,13 +652,18 @@ class _Loop:
             njev=int(counters[NJEV]),
             nlu=int(counters[NLU]),
             status=status,
-            message=message,
+            message=self.explained(message),
             success=status >= 0,
             wall_time=self.wall_time,
             compiled=self.why_not is None,
             method=self.method,
             h=abs(driver.grid.span.h) or None,
         )
+
+    def explained(self, message: str) -> str:
+        """With what is to be said about checkpoints, and the reason why the run was not compiled, if it was not."""
+        notes = [*self.keeper.notes, *([] if self.why_not is None else [f"interpreted: {self.why_not}"])]
+        return f"{message} ({'; '.join(notes)})" if notes else message
 
     def _values(self, broken: bool) -> np.ndarray:
         """Invariants of the saved states; NaN where the run was broken off by an invariant that still raises."""
@@ -597,7 +693,11 @@ def _bar(progress: bool, grid: Grid, label: str) -> Any:
     else:
         total = abs(grid.span.t_bound - grid.span.t0) if math.isfinite(grid.span.t_bound) else None
     unit = "step" if fixed else "time"
-    return tqdm(total=total, desc=label, unit=unit, unit_scale=True, disable=not progress, smoothing=0.05)
+    # Beyond 0 where the run is resumed.
+    initial = int(grid.place[STEP]) if fixed else abs(float(grid.clock[T]) - grid.span.t0)
+    return tqdm(
+        total=total, initial=initial, desc=label, unit=unit, unit_scale=True, disable=not progress, smoothing=0.05
+    )
 
 
 def _required(name: str, value: Any) -> Any:

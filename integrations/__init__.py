@@ -1,1 +1,4 @@
-"""Adapters to other packages, each behind an extra: `rebound` (judge and source of problems), `jpl` (ephemerides)."""
+"""Adapters to other packages, each behind an extra.
+
+`rebound` (judge and source of problems), `heyoka` (peer), `jpl` (ephemerides), `dask` (clusters).
+"""

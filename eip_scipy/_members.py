@@ -1,0 +1,492 @@
+"""The members of an ensemble: one driver, set up once, that runs them one after the other.
+
+What the members share is a `Task`, which travels to other processes; in each of them it becomes a `Plan`, with
+compiled functions and buffers, which `run_members` runs. A member's result depends on nothing but the task, its start
+and its parameters: it is that of `integrate`, bit for bit, whatever ran before it and beside it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache, partial
+from math import isnan
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, typeof, types
+
+from . import _kernels as kn
+from . import _setup
+from ._compile import signatures
+from ._kernels import OK
+from ._resume import settings
+from ._setup import Stepping
+from ._step import H_ABS, T_NEW, T, Work
+from .longrun import ARRIVED, PENDING, ROW, STEP, Loop, integrate, prepared, saved_rows
+from .result import N_COUNTERS, NFEV
+
+__all__ = ["FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
+
+FAILED, NOT_RUN = -1, -2
+DOUBTFUL = -1
+BATCH_SECONDS = 0.1
+COMPARED = 16
+
+
+class StoppedError(Exception):
+    """The ensemble was stopped while members ran."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What all members share, as it travels to other processes.
+
+    Attributes
+    ----------
+    fun : callable or Problem
+        As for `integrate`.
+    t_span : (float, float) or None
+    options : dict
+        The options of `integrate` that are not left at their defaults, `params` left out.
+    y0, params : ndarray
+        Start and parameters (None: the functions take none) of a member that `integrate` takes.
+    reduce : callable, "state" or None
+        What `Statistics` are wanted of.
+    keep : bool
+        Whether the saved states themselves are wanted.
+    """
+
+    fun: Any
+    t_span: Any
+    options: dict[str, Any]
+    y0: np.ndarray
+    params: np.ndarray | None
+    reduce: Any = None
+    keep: bool = True
+
+    def loop(self, y0: np.ndarray, params: np.ndarray | None, **options: Any) -> Loop:
+        """The run of one member, as `integrate` prepares it."""
+        defaults: dict[str, Any] = dict(integrate.__kwdefaults__ or {})
+        return prepared(self.fun, self.t_span, y0, **{**defaults, **self.options, "params": params, **options})
+
+
+class Members(NamedTuple):
+    """What some members came to.
+
+    Attributes
+    ----------
+    y : ndarray, shape (m, n)
+        Last states.
+    t : ndarray, shape (m,)
+        Their times.
+    status : ndarray, shape (m,)
+        As in `integrate`: 0, 1, or FAILED; NOT_RUN where nothing was computed.
+    message : list of str
+    max_defect : ndarray, shape (m, l)
+    counters : ndarray, shape (m, N_COUNTERS)
+        Those of the step, in the places that `result` names.
+    max_correction : ndarray, shape (m,)
+        In local errors.
+    saved : ndarray, shape (m, times, n)
+        States at the plan's `times`; nan after the end of a member that did not reach them. No times: shape (m, 0, n).
+    """
+
+    y: np.ndarray
+    t: np.ndarray
+    status: np.ndarray
+    message: list[str]
+    max_defect: np.ndarray
+    counters: np.ndarray
+    max_correction: np.ndarray
+    saved: np.ndarray
+
+    @classmethod
+    def empty(cls, m: int, n: int, dtype: Any, invariants: int, times: int) -> Members:
+        """Members that did not run."""
+        return cls(
+            y=np.full((m, n), np.nan, dtype),
+            t=np.full(m, np.nan),
+            status=np.full(m, NOT_RUN),
+            message=["not run"] * m,
+            max_defect=np.full((m, invariants), np.nan),
+            counters=np.zeros((m, N_COUNTERS), np.int64),
+            max_correction=np.full(m, np.nan),
+            saved=np.full((m, times, n), np.nan, dtype),
+        )
+
+
+class Plan:
+    """A task in one process: compiled where it can be, with a driver for each thread that asks for one.
+
+    Attributes
+    ----------
+    task : Task
+    why_not : str or None
+        Why the members run interpreted; None: they are compiled.
+    names : tuple of str
+        Of the l invariants.
+    times : ndarray, shape (rows,)
+        Times at which states are saved; none where only the last state is wanted.
+    n_steps : int or None
+        Steps of one member, where that is known.
+    """
+
+    def __init__(self, task: Task, *, compiled: bool | None = None) -> None:
+        options = {"check": False} if compiled is None else {"check": False, "compiled": compiled}
+        self.task, self._options = task, options
+        loop = task.loop(task.y0, task.params, **options)
+        grid, run = loop.driver.grid, loop.driver.run
+        self.why_not = loop.why_not
+        self.names = tuple(run.invariants.names)
+        self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, grid.span.t0
+        self.t_bound, self.h = grid.span.t_bound, abs(grid.span.h) or None
+        self.times = saved_times(loop)
+        self.n_steps = None if grid.span.n_steps >= _setup.UNBOUNDED else grid.span.n_steps
+        first = np.concatenate([loop.driver.run.work.K[0], run.invariants.start_values])
+        self._start_values = [repr(value) for value in first[:COMPARED].tolist()]
+        self._settings = partial(_settings, loop, options=task.options)
+        own_targets = any(item.target is not None for item in run.invariants.items)
+        own_start = bool(task.options.get("project_initial", False)) or own_targets
+        self._together = self.why_not is None and not (own_start or loop.events.functions or grid.t_eval.size)
+        self._idle = [_Driver(loop)] if self._together else []
+
+    def empty(self, m: int) -> Members:
+        """Room for `m` members."""
+        return Members.empty(m, self.size, self.dtype, len(self.names), self.times.size)
+
+    def states(self, members: Members) -> tuple[np.ndarray, np.ndarray]:
+        """Times (m,) and states (members, m, n) to look at: saved ones, else the last; nan where a member failed."""
+        if self.times.size:
+            return self.times, members.saved
+        last = np.where((members.status >= 0)[:, None], members.y, np.nan)
+        return np.array([self.t_bound]), last[:, None]
+
+    def loop(self, y0: np.ndarray, params: np.ndarray) -> Loop:
+        """The run of one member by itself."""
+        return self.task.loop(y0, None if self.task.params is None else params, **self._options)
+
+    def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int) -> dict[str, Any]:
+        """What makes two ensembles the same, as JSON holds it: settings, and what their functions give at one start."""
+        return {"settings": self._settings(starts, params) | {"chunk": chunk}, "start": self._start_values}
+
+    @contextmanager
+    def driver(self) -> Iterator[_Driver | None]:
+        """A driver that no other thread uses now; None where each member needs its own."""
+        if not self._together:
+            yield None
+            return
+        try:
+            mine = self._idle.pop()
+        except IndexError:
+            mine = _Driver(self.task.loop(self.task.y0, self.task.params, **self._options))
+        yield mine
+        self._idle.append(mine)
+
+
+def _settings(loop: Loop, starts: np.ndarray, params: np.ndarray, options: dict[str, Any]) -> dict[str, Any]:
+    run, grid = loop.driver.run, loop.driver.grid
+    stepping = Stepping(grid.span, abs(grid.span.h) or None, options.get("first_step"), run.options.rtol, starts)
+    found = settings(loop.method, stepping, starts, params, run, grid, loop.events)
+    return found | {"project_initial": bool(options.get("project_initial", False))}
+
+
+def saved_times(loop: Loop) -> np.ndarray:
+    """Times of the rows that a run saves; none where it saves its two ends only.
+
+    Raises
+    ------
+    ValueError
+        Where each member would save at times of its own.
+    """
+    grid = loop.driver.grid
+    if grid.t_eval.size:
+        return grid.t_eval.copy()
+    if grid.save_every == 0:
+        return np.zeros(0)
+    if saved_rows(grid) == 0:
+        raise ValueError(
+            "save_every in an ensemble needs fixed steps h and a finite interval: with adaptive steps each member "
+            "would save at times of its own; give t_eval."
+        )
+    steps = np.unique([*range(0, grid.span.n_steps, grid.save_every), grid.span.n_steps])
+    times = grid.span.t0 + steps * grid.span.h
+    times[-1] = grid.span.t_bound
+    return times
+
+
+def run_members(plan: Plan, y0s: np.ndarray, params: np.ndarray, stop: threading.Event | None = None) -> Members:
+    """Run members one after the other.
+
+    Parameters
+    ----------
+    plan : Plan
+    y0s : ndarray, shape (m, n)
+        Starts, of the plan's dtype.
+    params : ndarray, shape (m, p)
+        Parameters of each; p = 0 where the functions take none.
+    stop : threading.Event, optional
+        Set it to stop within some tenths of a second.
+
+    Returns
+    -------
+    Members
+        In the order of the starts. A member that fails (also by an exception of the user's functions) has the status
+        FAILED and says why; the others are as if it were not there.
+
+    Raises
+    ------
+    StoppedError
+        When `stop` is set.
+    """
+    out = plan.empty(len(y0s))
+    watch = _Watch(stop)
+    with plan.driver() as driver:
+        if driver is not None:
+            driver.run(plan, y0s, params, out, watch)
+        else:
+            for k in range(len(y0s)):
+                _alone(plan, k, y0s[k], params[k], out, watch)
+    return out
+
+
+class _Watch:
+    """In the place of a progress bar: the one thing that a run calls now and then."""
+
+    n = 0.0
+
+    def __init__(self, stop: threading.Event | None) -> None:
+        self._stop = stop
+
+    def update(self, amount: float = 0.0) -> None:
+        if self._stop is not None and self._stop.is_set():
+            raise StoppedError
+
+
+def _alone(plan: Plan, k: int, y0: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
+    """One member as `integrate` runs it."""
+    try:
+        loop = plan.loop(y0, params)
+    except Exception as error:
+        out.y[k], out.t[k] = y0, plan.t0
+        _describe(out, k, FAILED, _reason(error))
+        return
+    _finish(plan, loop, k, out, watch)
+    rows = min(loop.driver.rows, plan.times.size)
+    same = np.flatnonzero(loop.driver.t[:rows] != plan.times[:rows])
+    rows = int(same[0]) if same.size else rows
+    out.saved[k, :rows] = loop.driver.y[:rows]
+
+
+def _finish(plan: Plan, loop: Loop, k: int, out: Members, watch: _Watch) -> None:
+    """Run a member to its end, and store what it came to."""
+    try:
+        status, message = loop.steps(watch)
+    except StoppedError:
+        raise
+    except Exception as error:
+        status, message = FAILED, _reason(error)
+    _store(loop, k, status, loop.explained(message), out)
+
+
+def _store(loop: Loop, k: int, status: int, message: str, out: Members) -> None:
+    driver, work = loop.driver, loop.driver.run.work
+    t, y = driver.now
+    if status == 1:
+        t, y = loop.events.last or (t, y)
+    out.y[k], out.t[k] = y, t
+    out.max_defect[k] = work.max_defect
+    out.counters[k] = work.counters
+    out.max_correction[k] = loop.diagnostics.max_correction
+    _describe(out, k, status, message)
+
+
+def _describe(out: Members, k: int, status: int, message: str) -> None:
+    out.status[k] = status
+    out.message[k] = message
+
+
+def _reason(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def sweep(
+    advance, rhs, inv, grad, event, params, grid, m, o, w, y, y_r, y_new, y_new_r, t_saved,
+    buffers, fresh, G, G_r, where, last, k_end, starts, taus, evaluations, all_params, saved, ends, defects, counters,
+    corrections,
+):  # fmt: skip
+    """Members from where[0] to `last`, by the driver `advance`.
+
+    Returns its code; where[0] is then `last`, or the member that it is about, which Python looks at: it failed, or is
+    not at its end after `k_end` steps, or (DOUBTFUL) its start is not finite in some part.
+    """
+    place, clock = grid.place, grid.clock
+    t0 = grid.span.t0
+    while where[0] < last:
+        k = where[0]
+        for i in range(len(buffers)):
+            kn.copy(fresh[i], buffers[i])
+        kn.copy(all_params[k], params)
+        kn.copy(starts[k], y)
+        place[STEP] = 0
+        place[PENDING] = 0
+        clock[T] = t0
+        clock[T_NEW] = t0
+        clock[H_ABS] = taus[k]
+        if isnan(taus[k]):
+            return DOUBTFUL
+        rhs(t0, y, w.K[0], params)
+        w.counters[NFEV] = evaluations
+        inv(t0, y, o.target, params)
+        grad(t0, y, w.K[0], G, params)
+        if not (kn.all_finite(y_r) and kn.all_finite(w.K_r[0]) and kn.all_finite(o.target) and kn.all_finite(G_r)):
+            return DOUBTFUL
+        rows = saved[min(k, saved.shape[0] - 1)]
+        t_saved[0] = t0
+        kn.copy(y_r, rows[0])
+        place[ROW] = 1
+        code = advance(rhs, inv, grad, event, params, grid, k_end, m, o, w, y, y_r, y_new, y_new_r, t_saved, rows)
+        if code != OK or clock[T] != grid.span.t_bound:
+            return code
+        kn.copy(y, ends[k])
+        kn.copy(w.max_defect, defects[k])
+        kn.copy(w.counters, counters[k])
+        corrections[k] = w.max_correction[0]
+        where[0] += 1
+    return OK
+
+
+@cache
+def _compiled_sweep(dtype: np.dtype, advance: Any, arguments: tuple[Any, ...]) -> Callable[..., int]:
+    """The sweep compiled for one type of driver, which it calls by its address: seconds, then cached on disk."""
+    rhs, inv, grad = signatures(dtype)
+    functions = [types.FunctionType(s) for s in (types.int64(*advance), rhs, inv, grad, inv)]
+    signature = types.int64(*functions, *arguments)
+    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(sweep)
+
+
+class _Driver:
+    """A compiled driver with its buffers, which runs member after member."""
+
+    def __init__(self, loop: Loop) -> None:
+        self.loop = loop
+        driver, options, span = loop.driver, loop.driver.run.options, loop.driver.grid.span
+        buffers = _buffers(driver.run.work)
+        self._buffers = tuple(a.reshape(-1).view(np.int64) for a in buffers)
+        self._fresh = tuple(a.copy() for a in self._buffers)
+        self._G = np.zeros_like(driver.run.work.G)
+        self._where = np.zeros(1, np.int64)
+        self._compiled: Callable[..., int] | None = None
+        width = options.rtol.size // max(1, options.atol.size)
+        first = None if options.adaptive else float(driver.grid.clock[H_ABS])
+        self._stepping = Stepping(span, first, None, options.rtol[::width], options.atol)
+        self._row_buffer = driver.y[None].view(float)
+
+    def run(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
+        """All members into `out`."""
+        loop, driver, where = self.loop, self.loop.driver, self._where
+        m = len(y0s)
+        taus, evaluations = self._first_steps(plan, y0s, params)
+        saved = np.empty((m, driver.t.size, plan.size), plan.dtype) if plan.times.size else None
+        rows = self._row_buffer if saved is None else saved.view(float)
+        y0s, params = (np.require(a, requirements=["C", "W"]) for a in (y0s, params))  # one type for compiled code
+        given = (y0s, taus, evaluations, params, rows)
+        wanted = (out.y, out.max_defect, out.counters, out.max_correction)
+        where[0], batch = 0, 1
+        while where[0] < m:
+            watch.update()
+            last, begin = min(m, int(where[0]) + batch), time.perf_counter()
+            first = int(where[0])
+            reason, code = None, OK
+            try:
+                code = self._sweep(last, *given, *wanted)
+            except Exception as error:
+                reason = _reason(error)
+            done = int(where[0])
+            out.status[first:done] = 0
+            out.t[first:done] = driver.grid.span.t_bound
+            out.message[first:done] = [ARRIVED] * (done - first)
+            if done < last:
+                if saved is not None:
+                    driver.y = saved[done]
+                self._look_at(plan, done, code, reason, y0s[done], params[done], out, watch)
+                if code == DOUBTFUL and saved is not None:
+                    saved[done, :-1] = out.saved[done]
+                elif saved is not None:
+                    saved[done, driver.rows :] = np.nan
+                where[0] += 1
+            elif time.perf_counter() - begin < BATCH_SECONDS:
+                batch *= 2
+        if saved is not None:
+            out.saved[:] = saved[:, : plan.times.size]
+        if np.isnan(loop.diagnostics.max_correction):  # no error estimate to measure by
+            out.max_correction[:] = np.nan
+
+    def _sweep(self, last: int, *arguments: Any) -> int:
+        driver, G = self.loop.driver, self._G
+        passed = (
+            *(driver.params, driver.grid, *driver._tail, driver.t, self._buffers, self._fresh, G),
+            *(G.view(float).reshape(-1), self._where, last, self.loop.chunk, *arguments),
+        )
+        advance: Any = driver._advance
+        if self._compiled is None:
+            signature = advance.nopython_signatures[0].args
+            self._compiled = _compiled_sweep(driver.run.y0.dtype, signature, tuple(typeof(a) for a in passed))
+        return self._compiled(advance, *driver.functions, *passed)
+
+    def _look_at(
+        self,
+        plan: Plan,
+        k: int,
+        code: int,
+        reason: str | None,
+        y0: np.ndarray,
+        params: np.ndarray,
+        out: Members,
+        watch: _Watch,
+    ) -> None:
+        """A member that the sweep came back with."""
+        loop = self.loop
+        if reason is not None:
+            _store(loop, k, FAILED, reason, out)
+        elif code == DOUBTFUL:
+            _alone(plan, k, y0, params, out, watch)
+        elif code == OK:
+            loop.chunk *= 2  # so that the next one ends within the sweep
+            _finish(plan, loop, k, out, watch)
+        else:
+            _store(loop, k, FAILED, _setup.failure(code, loop.driver.run, loop.driver.grid.clock), out)
+
+    def _first_steps(self, plan: Plan, y0s: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, int]:
+        """Lengths of the first steps, and the evaluations before them."""
+        driver, stepping = self.loop.driver, self._stepping
+        first_step = plan.task.options.get("first_step")
+        if stepping.h is not None or first_step is not None:
+            return np.full(len(y0s), stepping.h or first_step, float), 1
+        taus = np.empty(len(y0s))
+        for k, (y0, p) in enumerate(zip(y0s, params, strict=True)):
+            derivative = self._derivative(p)
+            try:
+                taus[k] = stepping.first(derivative, y0, derivative(driver.grid.span.t0, y0), self.loop.tableau)
+            except Exception:
+                taus[k] = np.nan
+        return taus, 2
+
+    def _derivative(self, params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
+        rhs = self.loop.driver.functions.rhs
+
+        def derivative(t: float, y: np.ndarray) -> np.ndarray:
+            out = np.zeros_like(y)
+            rhs(t, y, out, params)
+            return out
+
+        return derivative
+
+
+def _buffers(work: Work) -> list[np.ndarray]:
+    """All arrays of a run's work, each once."""
+    own = [a for name, a in work._asdict().items() if name != "inner" and not name.endswith("_r")]
+    return [*own, *work.inner]

@@ -1,0 +1,113 @@
+"""Statistics over the members of an ensemble, gathered chunk by chunk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Statistics", "merge", "statistics_of"]
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Mean, variance and extremes over members, at each of m times, of k quantities.
+
+    Members that failed before a time are left out there; `count` says how many remain.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+    count : ndarray, shape (m,)
+    mean : ndarray, shape (k, m)
+    squares : ndarray, shape (k, m)
+        Sum of the squares of the deviations from the mean.
+    min, max : ndarray, shape (k, m)
+    """
+
+    t: np.ndarray
+    count: np.ndarray
+    mean: np.ndarray
+    squares: np.ndarray
+    min: np.ndarray
+    max: np.ndarray
+
+    @property
+    def var(self) -> np.ndarray:
+        """Variance (k, m), that of the members themselves: divided by their number; nan where there are none."""
+        return self.squares / np.where(self.count > 0, self.count, np.nan)
+
+    @property
+    def std(self) -> np.ndarray:
+        """Square root of the variance."""
+        return np.sqrt(self.var)
+
+
+def statistics_of(reduce: Any, t: np.ndarray, states: np.ndarray) -> Statistics | None:
+    """Statistics of some members.
+
+    Parameters
+    ----------
+    reduce : "state" or callable
+        The quantities: the states themselves, or ``reduce(t, y) -> float or (k,)``.
+    t : ndarray, shape (m,)
+    states : ndarray, shape (members, m, n)
+        With nan where there is none.
+
+    Returns
+    -------
+    Statistics or None
+        None where no member has a state, so that the number of quantities is not known.
+
+    Raises
+    ------
+    TypeError
+        When the quantities are no real numbers.
+    """
+    there = ~np.isnan(states).any(axis=2)
+    values = states if isinstance(reduce, str) else _values(reduce, t, states, there)
+    if values is None:
+        return None
+    if values.dtype.kind == "c":
+        raise TypeError("reduce: statistics are of real numbers; pass a real function reduce(t, y) of the state.")
+    count = there.sum(axis=0)
+    weight = there[:, :, None]
+    divisor = np.maximum(count, 1)[:, None]
+    mean = np.where(weight, values, 0.0).sum(axis=0) / divisor
+    squares = (np.where(weight, values - mean, 0.0) ** 2).sum(axis=0)
+    low, high = np.where(weight, values, np.inf).min(axis=0), np.where(weight, values, -np.inf).max(axis=0)
+    some = (count > 0)[:, None]
+    mean, low, high = (np.where(some, a, np.nan) for a in (mean, low, high))
+    return Statistics(t, count, mean.T, squares.T, low.T, high.T)
+
+
+def _values(reduce: Callable[..., Any], t: np.ndarray, states: np.ndarray, there: np.ndarray) -> np.ndarray | None:
+    """The user's quantities (members, m, k), nan where there is no state."""
+    out: np.ndarray | None = None
+    for i, j in zip(*np.nonzero(there), strict=True):
+        value = np.atleast_1d(np.asarray(reduce(float(t[j]), states[i, j].copy())))
+        if out is None:
+            if value.ndim != 1 or value.dtype.kind not in "fiubc":
+                raise TypeError(f"reduce returned {value!r}, expected a number or one dimension (k,).")
+            dtype = complex if value.dtype.kind == "c" else float
+            out = np.full((*there.shape, value.size), np.nan, dtype)
+        out[i, j] = value
+    return out
+
+
+def merge(first: Statistics | None, second: Statistics | None) -> Statistics | None:
+    """Statistics of two groups together (Chan, Golub & LeVeque 1983, eq. 2.1).
+
+    The order matters in the last bits: merge chunks in their own order.
+    """
+    if first is None or second is None:
+        return first if second is None else second
+    count = first.count + second.count
+    total = np.maximum(count, 1)
+    none, alone = first.count == 0, second.count == 0
+    shift = np.where(none | alone, 0.0, second.mean - first.mean)
+    mean = np.where(none, second.mean, first.mean + shift * (second.count / total))
+    squares = first.squares + second.squares + shift**2 * (first.count * (second.count / total))
+    return Statistics(first.t, count, mean, squares, np.fmin(first.min, second.min), np.fmax(first.max, second.max))

@@ -1,0 +1,204 @@
+"""Ensembles on Dask: members on the workers of a cluster, from processes of this machine to a supercomputer.
+
+``ensemble(..., executor="dask")`` takes the cluster that Dask's configuration names (``DASK_SCHEDULER_ADDRESS``), else
+starts processes on this machine that listen on its loopback interface only. ``executor=client`` takes a
+`distributed.Client`. Functions travel by value or by name, as Dask sends them, and are compiled once in each worker.
+
+Needs ``pip install "eip_scipy[distributed]"``.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import uuid
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from eip_scipy._members import FAILED, Members, Plan, Task
+from eip_scipy._pools import Chunk, Part, cores, finished, run_elsewhere
+
+try:
+    import dask
+    import distributed
+    from distributed.comm.addressing import get_address_host
+except ModuleNotFoundError as error:
+    raise ImportError(
+        'eip_scipy.integrations.dask needs distributed: pip install "eip_scipy[distributed]"', name="distributed"
+    ) from error
+
+__all__ = ["DaskExecutor", "local_client", "pool"]
+
+ENCRYPTED = ("tls", "wss")
+WITHIN_A_PROCESS = "inproc"
+
+
+class DaskExecutor:
+    """A client together with what it may do; for ``ensemble(..., executor=)``.
+
+    Parameters
+    ----------
+    client : distributed.Client
+    allow_insecure : bool, optional
+        Go on where the cluster is reached over a network without encryption. Whoever reaches such a scheduler or worker
+        can run code on it as you (CVE-2021-42343): only where nobody else reaches the network.
+
+    Raises
+    ------
+    PermissionError
+        When the cluster listens beyond this machine without TLS, and `allow_insecure` is false.
+    """
+
+    def __init__(self, client: distributed.Client, *, allow_insecure: bool = False) -> None:
+        self.client = client
+        if not allow_insecure:
+            require_secure(client)
+
+
+def local_client(workers: int | None = None) -> distributed.Client:
+    """A client of processes on this machine, one thread each, that listen on its loopback interface only.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Default: as many as there are cores. Close the client and its ``cluster`` after use.
+
+    Returns
+    -------
+    distributed.Client
+    """
+    loopback = "127.0.0.1"
+    cluster = distributed.LocalCluster(
+        n_workers=cores() if workers is None else workers,
+        threads_per_worker=1,
+        processes=True,
+        host=loopback,
+        dashboard_address=f"{loopback}:0",
+        worker_dashboard_address=f"{loopback}:0",
+    )
+    return distributed.Client(cluster)
+
+
+def require_secure(client: distributed.Client) -> None:
+    """Refuse a cluster that listens beyond this machine without TLS.
+
+    Raises
+    ------
+    PermissionError
+        With its address, and what to do.
+    """
+    information = client.scheduler_info(n_workers=-1)
+    for address in (information["address"], *information["workers"]):
+        if not _is_secure(address):
+            raise PermissionError(
+                f"the Dask cluster at {address} is reached over a network without encryption or authentication; "
+                "whoever reaches it can run code there as you (CVE-2021-42343). Start it with TLS "
+                "(distributed.Security), or, on a network that nobody else reaches, pass "
+                "executor=DaskExecutor(client, allow_insecure=True)."
+            )
+
+
+def _is_secure(address: str) -> bool:
+    protocol, _, rest = address.partition("://")
+    if protocol in ENCRYPTED or protocol == WITHIN_A_PROCESS:
+        return True
+    host = get_address_host(address) if rest else address
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def pool(executor: Any, task: Task, key: str) -> DaskPool:
+    """Where the chunks of an ensemble run; for `eip_scipy.ensemble`.
+
+    Parameters
+    ----------
+    executor : "dask", distributed.Client or DaskExecutor
+    task : Task
+    key : str
+
+    Returns
+    -------
+    DaskPool
+    """
+    if isinstance(executor, DaskExecutor):
+        return DaskPool(executor.client, task, key, own=False)
+    if isinstance(executor, distributed.Client):
+        return DaskPool(DaskExecutor(executor).client, task, key, own=False)
+    if dask.config.get("scheduler-address", None):
+        return DaskPool(DaskExecutor(distributed.Client()).client, task, key, own=True)
+    Plan(task)  # compiled here, the workers find it on the disk instead of all compiling the same
+    return DaskPool(local_client(), task, key, own=True)
+
+
+class DaskPool:
+    """Chunks as tasks of Dask, which runs those of a lost worker again on another."""
+
+    def __init__(self, client: distributed.Client, task: Task, key: str, *, own: bool) -> None:
+        self._client, self._task, self._key, self._own = client, task, key, own
+        self._open: set[distributed.Future] = set()
+
+    def capacity(self) -> int:
+        """Threads of the workers that are there now; at least one, for those to come."""
+        return max(1, sum(self._client.nthreads().values()))
+
+    def submit(self, chunk: Chunk) -> distributed.Future:
+        return self._submit(self._task, chunk)
+
+    def collect(self, chunk: Chunk, ticket: distributed.Future) -> Part:
+        try:
+            return self._result(ticket)
+        except distributed.KilledWorker as error:
+            task = replace(self._task, reduce=None, keep=True)
+            plan = Plan(self._task, compiled=False)
+            members = _joined(self._one_by_one(task, plan, chunk, error))
+            return finished(self._task, plan, members)
+
+    def close(self) -> None:
+        self._client.cancel(list(self._open))
+        if self._own:
+            cluster = self._client.cluster
+            self._client.close()
+            if cluster is not None:
+                cluster.close()
+
+    def _submit(self, task: Task, chunk: Chunk) -> distributed.Future:
+        name = f"eip-ensemble-{chunk.first}-{uuid.uuid4().hex}"
+        key = self._key if task is self._task else f"{self._key}-again"
+        future = self._client.submit(run_elsewhere, task, key, chunk, key=name, pure=False)
+        self._open.add(future)
+        return future
+
+    def _result(self, future: distributed.Future) -> Part:
+        try:
+            return future.result()
+        finally:
+            self._open.discard(future)
+
+    def _one_by_one(self, task: Task, plan: Plan, chunk: Chunk, error: Exception) -> Iterable[Members]:
+        """A chunk that killed its workers, in halves of halves: the member that does it is found, the others run."""
+        m = len(chunk.y0s)
+        if m == 1:
+            members = plan.empty(1)
+            members.y[:], members.t[:], members.status[:] = chunk.y0s, plan.t0, FAILED
+            members.message[0] = f"its workers died, one after the other: {error}"
+            return [members]
+        found: list[Members] = []
+        for first, last in ((0, m // 2), (m // 2, m)):
+            half = Chunk(chunk.first + first, chunk.y0s[first:last], chunk.params[first:last])
+            try:
+                found.append(self._result(self._submit(task, half)).members)
+            except distributed.KilledWorker as again:
+                found.extend(self._one_by_one(task, plan, half, again))
+        return found
+
+
+def _joined(parts: Iterable[Members]) -> Members:
+    parts = list(parts)
+    fields = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in Members._fields if name != "message"
+    }
+    return Members(**fields, message=[text for part in parts for text in part.message])
