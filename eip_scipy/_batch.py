@@ -18,11 +18,12 @@ import numpy as np
 
 from . import _kernels as kn
 from ._kernels import OK, FrameRows
+from ._lanes import dot, largest
 from ._octets import LANES, any_lane, is_not, lane_of, octets, spread, where
 from ._step import ERROR, HEALTHY, Work, _jitable, _jitable_cold, advance_raw, close_step, look_back, make_work
 from .result import N_COUNTERS, NJEV
 
-__all__ = ["Lanes", "Leavers", "advance_batch", "make_lanes", "make_lanes_work"]
+__all__ = ["Lanes", "Leavers", "make_advance_batch", "make_lanes", "make_lanes_work"]
 
 
 class Leavers(NamedTuple):
@@ -149,7 +150,7 @@ def _make_single(n: int, rows: int) -> Single:
 @_jitable
 def all_finite(a):
     """Per lane, whether the sum of squares is finite; states so large that it overflows are for the single run."""
-    square = kn.dot(a, a)
+    square = dot(a, a)
     return square - square == 0.0
 
 
@@ -275,20 +276,25 @@ def finish_batch(rhs, inv, grad, params, k, t_new, project, o, w, s, y, y_new, y
     close_step(rhs, params, t_new, y_new, project, OK, o, w)
 
 
-def advance_batch(rhs, inv, grad, params, span, k, k_end, m, o, w, s, y, y_r, y_new, y_new_r):
-    """Steps k ... k_end - 1 of all members that are alive; K[0] = f(t, y) on entry and at the end."""
-    while k < k_end:
-        for i in range(s.start_counts.size):
-            s.start_counts[i] = w.counters[i]
-        t = span.t0 + k * span.h
-        last = k + 1 >= span.n_steps
-        t_new = span.t_bound if last else span.t0 + (k + 1) * span.h
-        h = t_new - t if last else span.h
-        project = o.target.size > 0 and (last or (k + 1) % o.every == 0)
-        advance_raw(rhs, params, t, y, y_r, h, m, o, w)
-        look_back(rhs, params, t_new, y_r, h, project, m, o, w)
-        finish_batch(rhs, inv, grad, params, k, t_new, project, o, w, s, y, y_new, y_new_r)
-        kn.copy(w.f_new_r, w.K_r[0])
-        kn.copy(y_new_r, y_r)
-        k += 1
-    return OK
+def make_advance_batch(stamp):
+    """The loop over steps; `stamp` enters the key of its cache (see `longrun.source_stamp`)."""
+
+    def advance_batch(rhs, inv, grad, params, span, k, k_end, m, o, w, s, y, y_r, y_new, y_new_r):
+        """Steps k ... k_end - 1 while a member is alive; K[0] = f(t, y) on entry and at the end."""
+        _ = stamp
+        while k < k_end and largest(s.alive[0]) > 0.0:
+            kn.copy(w.counters, s.start_counts)
+            t = span.t0 + k * span.h
+            last = k + 1 >= span.n_steps
+            t_new = span.t_bound if last else span.t0 + (k + 1) * span.h
+            h = t_new - t if last else span.h
+            project = o.target.size > 0 and (last or (k + 1) % o.every == 0)
+            advance_raw(rhs, params, t, y, y_r, h, m, o, w)
+            look_back(rhs, params, t_new, y_r, h, project, m, o, w)
+            finish_batch(rhs, inv, grad, params, k, t_new, project, o, w, s, y, y_new, y_new_r)
+            kn.copy(w.f_new_r, w.K_r[0])
+            kn.copy(y_new_r, y_r)
+            k += 1
+        return OK
+
+    return advance_batch

@@ -21,12 +21,13 @@ from numba import njit, typeof, types
 
 from . import _kernels as kn
 from . import _setup
-from ._compile import signatures
+from ._compile import NotCompilableError, signatures
 from ._kernels import OK
 from ._resume import settings
 from ._setup import Stepping
+from ._side_by_side import Batch
 from ._step import H_ABS, T_NEW, T, Work
-from .longrun import ARRIVED, PENDING, ROW, STEP, Loop, integrate, prepared, saved_rows
+from .longrun import ARRIVED, PENDING, ROW, STEP, Grid, Loop, integrate, prepared, saved_rows
 from .result import N_COUNTERS, NFEV
 
 __all__ = ["FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
@@ -212,10 +213,14 @@ def saved_times(loop: Loop) -> np.ndarray:
             "save_every in an ensemble needs fixed steps h and a finite interval: with adaptive steps each member "
             "would save at times of its own; give t_eval."
         )
-    steps = np.unique([*range(0, grid.span.n_steps, grid.save_every), grid.span.n_steps])
-    times = grid.span.t0 + steps * grid.span.h
+    times = grid.span.t0 + saved_steps(grid) * grid.span.h
     times[-1] = grid.span.t_bound
     return times
+
+
+def saved_steps(grid: Grid) -> np.ndarray:
+    """Steps after which a run of fixed steps saves its state, the start included."""
+    return np.unique([*range(0, grid.span.n_steps, grid.save_every or grid.span.n_steps), grid.span.n_steps])
 
 
 def run_members(plan: Plan, y0s: np.ndarray, params: np.ndarray, stop: threading.Event | None = None) -> Members:
@@ -384,6 +389,12 @@ class _Driver:
         first = None if options.adaptive else float(driver.grid.clock[H_ABS])
         self._stepping = Stepping(span, first, None, options.rtol[::width], options.atol)
         self._row_buffer = driver.y[None].view(float)
+        self._batch: Batch | None = None
+        self.why_one_by_one = ""
+        try:
+            self._batch = Batch(loop)
+        except NotCompilableError as reason:
+            self.why_one_by_one = str(reason)
 
     def run(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
         """All members into `out`."""
@@ -395,7 +406,7 @@ class _Driver:
         y0s, params = (np.require(a, requirements=["C", "W"]) for a in (y0s, params))  # one type for compiled code
         given = (y0s, taus, evaluations, params, rows)
         wanted = (out.y, out.max_defect, out.counters, out.max_correction)
-        where[0], batch = 0, 1
+        where[0], batch = self._side_by_side(plan, y0s, params, evaluations, saved, out, watch), 1
         while where[0] < m:
             watch.update()
             last, begin = min(m, int(where[0]) + batch), time.perf_counter()
@@ -424,6 +435,44 @@ class _Driver:
             out.saved[:] = saved[:, : plan.times.size]
         if np.isnan(loop.diagnostics.max_correction):  # no error estimate to measure by
             out.max_correction[:] = np.nan
+
+    def _side_by_side(
+        self,
+        plan: Plan,
+        y0s: np.ndarray,
+        params: np.ndarray,
+        evaluations: int,
+        saved: np.ndarray | None,
+        out: Members,
+        watch: _Watch,
+    ) -> int:
+        """Run members in batches, while there are enough; returns how many have run."""
+        batch, m = self._batch, len(y0s)
+        if batch is None:
+            return 0
+        meetings = saved_steps(self.loop.driver.grid)[1:].tolist()
+        first = 0
+        while m - first >= batch.lanes // 4:
+            group = slice(first, min(m, first + batch.lanes))
+
+            def save(row: int, states: np.ndarray, group: slice = group) -> None:
+                if saved is not None:
+                    saved[group, row + 1] = states
+
+            if saved is not None:
+                saved[group, 0] = y0s[group]
+            ends = batch.run(y0s[group], params[group], evaluations, meetings, save, watch.update)
+            for k, end in zip(range(group.start, group.stop), ends, strict=True):
+                if end is None:
+                    _alone(plan, k, y0s[k], params[k], out, watch)
+                    if saved is not None:
+                        saved[k, : plan.times.size] = out.saved[k]
+                    continue
+                out.y[k], out.t[k], out.max_defect[k] = end.y, end.t, end.max_defect
+                out.max_correction[k], out.counters[k] = end.max_correction, end.counters
+                _describe(out, k, FAILED if end.reason else 0, end.reason or ARRIVED)
+            first = group.stop
+        return first
 
     def _sweep(self, last: int, *arguments: Any) -> int:
         driver, G = self.loop.driver, self._G

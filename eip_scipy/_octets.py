@@ -202,13 +202,14 @@ def _define_by_lanes(function: Any, arguments: int) -> None:  # emits LLVM
             lower_builtin(function, *choice)(lower)
 
 
-for _function in (
+_UNARY: tuple[Any, ...] = (
     math.sin, math.cos, math.tan, math.asin, math.acos, math.atan, math.sinh, math.cosh, math.tanh, math.exp,
     math.expm1, math.log, math.log1p,
-):  # fmt: skip
-    _define_by_lanes(_function, 1)
-for _function in (math.atan2, math.hypot, operator.pow, operator.ipow):
-    _define_by_lanes(_function, 2)
+)  # fmt: skip
+_BINARY: tuple[Any, ...] = (math.atan2, math.hypot, operator.pow, operator.ipow)
+for _count, _functions in enumerate((_UNARY, _BINARY), start=1):
+    for _function in _functions:
+        _define_by_lanes(_function, _count)
 
 
 @intrinsic  # emits LLVM

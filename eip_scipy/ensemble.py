@@ -21,6 +21,7 @@ from . import _setup
 from ._members import FAILED, NOT_RUN, Members, Plan, Task
 from ._names import nearest
 from ._pools import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
+from ._side_by_side import lanes_of
 from ._statistics import Statistics, merge
 from ._store import CheckpointStore, Store, ZarrStore
 from .invariants import as_invariants
@@ -37,7 +38,6 @@ UNKNOWN_STEPS = 10_000
 CHUNK_BYTES = 16e6
 LARGEST_CHUNK = 4096
 LEAST_CHUNKS = 16
-LANES = 8
 TRIED = 8
 SHOWN = 5
 
@@ -449,7 +449,8 @@ def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
     by_work = budget * 4 / (steps * max(4, plan.size))
     by_bytes = CHUNK_BYTES / (plan.size * plan.dtype.itemsize * (1 + plan.times.size))
     size = min(by_work, by_bytes, LARGEST_CHUNK, math.ceil(members / LEAST_CHUNKS))
-    return LANES * max(1, math.ceil(size / LANES))
+    lanes = lanes_of(plan.size)
+    return lanes * max(1, math.ceil(size / lanes))
 
 
 def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) -> None:

@@ -7,7 +7,7 @@ import math
 import os
 import time
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,14 +71,14 @@ class Grid(NamedTuple):
     g_direction: np.ndarray
 
 
-def source_stamp() -> str:
-    """Hash of all source that goes into the compiled driver.
+def source_stamp(*names: str) -> str:
+    """Hash of all source that goes into a compiled driver, that of the files `names` too.
 
     Numba's cache on disk looks only at the file of the function itself: without this, an upgraded or edited kernel
     would leave the old driver, with the old kernel inlined, in use.
     """
     folder = Path(__file__).parent
-    names = ("_octets.py", "_lanes.py", "_triples.py", "_kernels.py", "_step.py", "longrun.py")
+    names = ("_octets.py", "_lanes.py", "_triples.py", "_kernels.py", "_step.py", *names)
     return hashlib.sha256(b"".join((folder / name).read_bytes() for name in names)).hexdigest()
 
 
@@ -124,7 +124,7 @@ def make_advance(stamp):
     return advance
 
 
-advance = make_advance(source_stamp())
+advance = make_advance(source_stamp("longrun.py"))
 
 
 def fill_values(inv, params, t, y, values):
@@ -520,7 +520,9 @@ def prepared(
     run.work.K[0] = f0 if run.y0 is start else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
     keeper.begin(driver, happenings, bound)
-    return Loop(driver, tableau, rhs, happenings, record, callback, progress, method.__name__, why_not, bound, keeper)
+    loop = Loop(driver, tableau, rhs, happenings, record, callback, progress, method.__name__, why_not, bound, keeper)
+    loop.in_octets = partial(compile_functions, fun, form, bool(extra), run.invariants, (), start.dtype, in_octets=True)
+    return loop
 
 
 class Loop:
@@ -546,6 +548,7 @@ class Loop:
         self.keeper = keeper
         self.wall_time = keeper.seconds
         self.chunk = FIRST_CHUNK
+        self.in_octets: Callable[[], CompiledFunctions]
 
     def run(self) -> IntegrationResult:
         driver = self.driver

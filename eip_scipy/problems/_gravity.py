@@ -639,6 +639,10 @@ def _energy(typingctx, y, gm):
     return in_octets(lambda y, gm: _energy_of_many(y, gm), types.float64, y, gm)
 
 
+if config.DISABLE_JIT:
+    _accelerate, _energy = _accelerations, _energy_of_many
+
+
 @_jit
 def energy(t, y, params):
     """G times the energy."""

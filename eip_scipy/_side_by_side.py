@@ -1,0 +1,244 @@
+"""Members of an ensemble side by side: buffers, starts and ends of batches, and those members that leave one.
+
+See `_batch` for the loop. A member that leaves is taken to the next point of meeting by the driver of single runs, and
+comes back there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, typeof, types
+
+from . import _setup
+from ._batch import make_advance_batch, make_lanes, make_lanes_work
+from ._compile import NotCompilableError, signatures_of_batches
+from ._kernels import OK
+from ._octets import LANES
+from ._step import AUTO, NEW, Options, Span, T
+from .longrun import PENDING, ROW, STEP, Loop, source_stamp
+from .result import LAST_RANK, N_COUNTERS, NFEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
+
+__all__ = ["Batch", "Ended", "lanes_of", "why_one_by_one"]
+
+FEW_FLOATS = 128  # in a state of all lanes: more lanes for small systems, as the loop itself takes its time
+MOST_LANES = 32
+FIRST_MEETING, LEAST_MEETING, MOST_MEETING = 256, 32, 16384  # in steps
+
+advance_batch = make_advance_batch(source_stamp("_batch.py"))
+
+
+@cache
+def _compiled(arguments: tuple[Any, ...]) -> Callable[..., int]:
+    """The loop compiled, its callables as first-class functions: cached on disk."""
+    functions = [types.FunctionType(s) for s in signatures_of_batches()]
+    signature = types.int64(*functions, *arguments)
+    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(advance_batch)
+
+
+def lanes_of(n: int) -> int:
+    """Members side by side, of n components each."""
+    return LANES * max(1, min(MOST_LANES, FEW_FLOATS // n) // LANES)
+
+
+class Ended(NamedTuple):
+    """A member at its end, or where it failed (`reason`: why, "" where it did not)."""
+
+    y: np.ndarray
+    t: float
+    max_defect: np.ndarray
+    max_correction: float
+    counters: np.ndarray
+    reason: str
+
+
+def why_one_by_one(options: Options, span: Span, dtype: np.dtype) -> str | None:
+    """Why members with these options cannot run side by side; None: they can."""
+    if options.adaptive:
+        return "with adaptive steps each member takes steps of its own; give h"
+    if np.dtype(dtype).kind == "c":
+        return "the state is complex"
+    if span.n_steps >= _setup.UNBOUNDED:
+        return "the interval has no end"
+    wanted = {
+        "compensated=True": options.compensated,
+        f"iterations={options.iterations}": options.iterations > 1,
+        "direction other than 'new'": options.direction != NEW,
+        "every='auto'": options.every == AUTO,
+    }
+    return next((f"{name} works on members one by one" for name, found in wanted.items() if found), None)
+
+
+class Batch:
+    """Buffers for some members at once, beside the driver `loop` of single runs.
+
+    Attributes
+    ----------
+    lanes : int
+        Members that it takes.
+
+    Raises
+    ------
+    NotCompilableError
+        Where a function branches on values, makes arrays, or does something else that octets cannot.
+    """
+
+    def __init__(self, loop: Loop) -> None:
+        driver = loop.driver
+        run, span = driver.run, driver.grid.span
+        reason = why_one_by_one(run.options, span, run.y0.dtype)
+        if reason is not None:
+            raise NotCompilableError(reason)
+        self.functions = loop.in_octets()
+        self.loop, self.span = loop, span
+        n, rows = run.y0.size, run.invariants.size
+        self.lanes = lanes = lanes_of(n)
+        o = run.options
+        self._work = make_lanes_work(n, lanes, run.method.b.size, rows)
+        self._work.pivots[:] = np.arange(rows)
+        self._s = make_lanes(self._work, o.rtol, o.block_atol.size, o.frame.products.size)
+        self._options = o._replace(rtol=np.repeat(o.rtol, lanes), atol=np.repeat(o.atol, lanes))
+        self._sigma = run.work.sigma.copy()
+        self._y, self._new = np.zeros((n, lanes)), np.zeros((n, lanes))
+        self._params = np.zeros((driver.params.size, lanes))
+        # Counters of what a member has done so far are those of the batch, less `_joined`, plus `_own`.
+        self._own, self._joined = np.zeros((2, N_COUNTERS, lanes), np.int64)
+        self._failed: dict[int, Ended] = {}
+        self._advance: Callable[..., int] | None = None
+        self._rows = driver.y.copy()
+        self._single_work = [a for a in run.work if isinstance(a, np.ndarray)] + list(run.work.inner)
+        self._fresh = [a.copy() for a in self._single_work]
+
+    def run(
+        self,
+        y0s: np.ndarray,
+        params: np.ndarray,
+        evaluations: int,
+        meetings: list[int],
+        save: Callable[[int, np.ndarray], None],
+        watch: Callable[[], None],
+    ) -> list[Ended | None]:
+        """Run up to `lanes` members; None for one whose start is not finite in some part.
+
+        `meetings` are the steps (the last one at the end) at which ``save(row, states (m, n))`` is called; `watch` is
+        called now and then.
+        """
+        m = len(y0s)
+        sound = self._start(y0s, params, evaluations)
+        k, length = 0, FIRST_MEETING
+        for row, stop in enumerate(meetings):
+            while k < stop:
+                watch()
+                end = min(stop, k + length)
+                left = self._steps(k, end, params)
+                length = max(LEAST_MEETING, length // 2) if left else min(MOST_MEETING, 2 * length)
+                k = end
+            save(row, self._states()[:m])
+        return [self._ended(lane) if sound[lane] else None for lane in range(m)]
+
+    def _start(self, y0s: np.ndarray, params: np.ndarray, evaluations: int) -> np.ndarray:
+        """Everything as at the start; returns which members are sound."""
+        w, s, m = self._work, self._s, len(y0s)
+        for a in (w.K, w.err_sum, w.counters, s.max_defect, s.max_correction, s.projections, s.skips, s.reduced):
+            a[...] = 0
+        s.sigma[:] = self._sigma[:, None]
+        s.left.step[:] = -1
+        self._own[:], self._joined[:] = 0, 0
+        self._failed.clear()
+        # Lanes to spare repeat the last member.
+        members = np.minimum(np.arange(self.lanes), m - 1)
+        self._y[:] = y0s[members].T
+        self._params[:] = params[members].T
+        t0 = self.span.t0
+        self.functions.rhs(t0, self._y, w.K[0], self._params)
+        self.functions.inv(t0, self._y, s.target, self._params)
+        self.functions.grad(t0, self._y, w.K[0], w.G, self._params)
+        w.counters[NFEV] = evaluations
+        parts = (self._y, w.K[0], s.target, w.G.reshape(-1, self.lanes))
+        sound = np.logical_and.reduce([np.isfinite(part).all(axis=0) for part in parts])
+        s.alive[0] = sound
+        s.alive[0, m:] = 0.0
+        return sound
+
+    def _steps(self, k: int, end: int, params: np.ndarray) -> bool:
+        """All members from step k to `end`; returns whether some had to leave."""
+        y, new = self._y, self._new
+        arguments = (
+            *(self._params, self.span, k, end, self.loop.driver.run.method, self._options, self._work, self._s),
+            *(y, y.reshape(-1), new, new.reshape(-1)),
+        )
+        functions = self.functions
+        if self._advance is None:
+            self._advance = _compiled(tuple(typeof(a) for a in arguments))
+        self._advance(functions.rhs, functions.inv, functions.grad, *arguments)
+        those = np.flatnonzero(self._s.left.step >= 0)
+        for lane in those:
+            self._alone(int(lane), end, params[lane])
+        return those.size > 0
+
+    def _counters(self, lane: int, shared: np.ndarray) -> np.ndarray:
+        """What one member's counters are, those of the batch being `shared`."""
+        s = self._s
+        out = self._own[:, lane] + shared - self._joined[:, lane]
+        projections = int(s.projections[0, lane])
+        out[PROJECTIONS] += projections
+        out[NLU] += projections
+        out[SKIPPED] += int(s.skips[0, lane])
+        out[RANK_REDUCED] += int(s.reduced[0, lane])
+        out[LAST_RANK] = int(s.rank[0, lane])
+        return out
+
+    def _alone(self, lane: int, end: int, params: np.ndarray) -> None:
+        """A member that left: by the driver of single runs to step `end`, and back into its lane."""
+        s, left, driver = self._s, self._s.left, self.loop.driver
+        w, grid = driver.run.work, driver.grid
+        for a, fresh in zip(self._single_work, self._fresh, strict=True):
+            a[...] = fresh
+        driver.state[:], w.K[0], w.err_sum[:] = left.y[:, lane], left.f[:, lane], left.err_sum[:, lane]
+        driver.params[:] = params
+        driver.y = self._rows
+        driver.run.options.target[:] = s.target[:, lane]
+        w.max_defect[:], w.max_correction[0] = s.max_defect[:, lane], s.max_correction[0, lane]
+        w.counters[:] = self._counters(lane, left.counters[:, lane])
+        k = int(left.step[lane])
+        grid.place[STEP], grid.place[ROW], grid.place[PENDING] = k, 0, 0
+        grid.clock[T] = grid.span.t0 + k * grid.span.h
+        try:
+            code = driver.advance(end)
+            reason = "" if code == OK else _setup.failure(code, driver.run, grid.clock)
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+        left.step[lane] = -1
+        if reason:
+            t, y = driver.now
+            state = y.copy(), t, w.max_defect.copy(), float(w.max_correction[0]), w.counters.copy()
+            self._failed[lane] = Ended(*state, reason)
+            return
+        self._y[:, lane], self._work.K[0, :, lane] = driver.state, w.K[0]
+        self._work.err_sum.reshape(-1, self.lanes)[:, lane] = w.err_sum
+        s.max_defect[:, lane], s.max_correction[0, lane] = w.max_defect, w.max_correction[0]
+        s.projections[0, lane] = s.skips[0, lane] = s.reduced[0, lane] = 0.0
+        self._own[:, lane], self._joined[:, lane] = w.counters, self._work.counters
+        s.alive[0, lane] = 1.0
+
+    def _states(self) -> np.ndarray:
+        """The states now, (lanes, n); NaN for members that failed."""
+        states = self._y.T.copy()
+        states[list(self._failed)] = np.nan
+        return states
+
+    def _ended(self, lane: int) -> Ended:
+        if lane in self._failed:
+            return self._failed[lane]
+        s = self._s
+        return Ended(
+            self._y[:, lane].copy(),
+            self.span.t_bound,
+            s.max_defect[:, lane].copy(),
+            float(s.max_correction[0, lane]),
+            self._counters(lane, self._work.counters),
+            "",
+        )
