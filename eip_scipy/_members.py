@@ -382,6 +382,7 @@ class _Driver:
         buffers = _buffers(driver.run.work)
         self._buffers = tuple(a.reshape(-1).view(np.int64) for a in buffers)
         self._fresh = tuple(a.copy() for a in self._buffers)
+        self._evaluations = int(driver.run.work.counters[NFEV])
         self._G = np.zeros_like(driver.run.work.G)
         self._where = np.zeros(1, np.int64)
         self._compiled: Callable[..., int] | None = None
@@ -514,7 +515,7 @@ class _Driver:
         driver, stepping = self.loop.driver, self._stepping
         first_step = plan.task.options.get("first_step")
         if stepping.h is not None or first_step is not None:
-            return np.full(len(y0s), stepping.h or first_step, float), 1
+            return np.full(len(y0s), stepping.h or first_step, float), self._evaluations
         taus = np.empty(len(y0s))
         for k, (y0, p) in enumerate(zip(y0s, params, strict=True)):
             derivative = self._derivative(p)
@@ -522,7 +523,7 @@ class _Driver:
                 taus[k] = stepping.first(derivative, y0, derivative(driver.grid.span.t0, y0), self.loop.tableau)
             except Exception:
                 taus[k] = np.nan
-        return taus, 2
+        return taus, self._evaluations
 
     def _derivative(self, params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
         rhs = self.loop.driver.functions.rhs

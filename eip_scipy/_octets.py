@@ -184,15 +184,18 @@ def _define_by_lanes(function: Any, arguments: int) -> None:  # emits LLVM
             return None
 
     def lower(context, builder, sig, args):
-        plain = [types.float64 if a is OCTET else a for a in sig.args]
-        of_floats = signature(types.float64, *plain)
-        callee = context.get_function(context.typing_context.resolve_value_type(function), of_floats)
+        kinds = tuple(types.float64 if a is OCTET else types.unliteral(a) for a in sig.args)
+        kind = context.typing_context.resolve_value_type(function)
+        of_floats = context.typing_context.resolve_function_type(kind, kinds, {})
+        callee = context.get_function(kind, of_floats)
+        # Numba passes constant exponents as they stand in the source.
+        args = [context.get_constant(types.int64, a) if isinstance(a, int) else a for a in args]
         out = ir.Constant(VECTOR, ir.Undefined)
         for k in range(LANES):
-            lane = [
-                builder.extract_element(value, _lane(k)) if kind is OCTET else value
-                for kind, value in zip(sig.args, args, strict=True)
-            ]
+            lane = []
+            for value, own, plain, wanted in zip(args, sig.args, kinds, of_floats.args, strict=True):
+                number = builder.extract_element(value, _lane(k)) if own is OCTET else value
+                lane.append(number if plain == wanted else context.cast(builder, number, plain, wanted))
             out = builder.insert_element(out, callee(builder, lane), _lane(k))
         return out
 
@@ -206,7 +209,7 @@ _UNARY: tuple[Any, ...] = (
     math.sin, math.cos, math.tan, math.asin, math.acos, math.atan, math.sinh, math.cosh, math.tanh, math.exp,
     math.expm1, math.log, math.log1p,
 )  # fmt: skip
-_BINARY: tuple[Any, ...] = (math.atan2, math.hypot, operator.pow, operator.ipow)
+_BINARY: tuple[Any, ...] = (math.atan2, math.hypot, math.pow, operator.pow, operator.ipow)
 for _count, _functions in enumerate((_UNARY, _BINARY), start=1):
     for _function in _functions:
         _define_by_lanes(_function, _count)

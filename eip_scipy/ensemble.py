@@ -216,8 +216,8 @@ def ensemble(
     ((5, 4), True, True)
     """
     known = _check_options(options)
-    given = {"method": method, "h": h, "invariants": invariants, "save_every": save_every, "t_eval": t_eval, **known}
-    given = {name: value for name, value in given.items() if value is not None and value is not DEFAULT}
+    given = {"method": method, "h": h, "invariants": invariants, "save_every": save_every, "t_eval": t_eval}
+    given = {name: value for name, value in given.items() if value is not None and value is not DEFAULT} | known
     starts, parameters = _inputs(fun, y0s, params, given)
     if not (reduce is None or reduce == "state" or callable(reduce)):
         raise ValueError(f"reduce must be 'state' or a function reduce(t, y), got {reduce!r}.")
