@@ -26,10 +26,15 @@ def assert_output(found, printed):
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", "docs/quickstart.md", "docs/adaptive.md", "docs/hard-scenes.md", "docs/ensembles.md"]
+    "page",
+    [
+        *("README.md", "docs/quickstart.md", "docs/adaptive.md", "docs/hard-scenes.md", "docs/checkpoints.md"),
+        "docs/ensembles.md",
+    ],
 )
-def test_page(page, capsys):
+def test_page(page, capsys, tmp_path, monkeypatch):
     """All blocks of a page in turn, in one namespace; a block of text is what the code before it prints."""
+    monkeypatch.chdir(tmp_path)  # where pages write their files
     path = ROOT / page
     text = path.read_text(encoding="utf-8")
     namespace = {"__name__": path.stem}

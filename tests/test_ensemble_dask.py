@@ -144,6 +144,25 @@ def test_ctrl_c(pair):
     assert (info.value.partial.status == -2).any()
 
 
+def oscillator(t, y):
+    return np.array([y[1], -y[0]])
+
+
+def test_workers_in_this_process():
+    y0s = np.random.default_rng(0).standard_normal((20, 2))
+    y0s[7] = np.nan
+    client = distributed.Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None)
+    try:
+        runs = [
+            ensemble(oscillator, (0, 1), y0s, h=0.1, save_every=3, reduce="state", chunk=4, executor=where)
+            for where in (None, client, DaskExecutor(client))
+        ]
+    finally:
+        client.close()
+    same(runs[0], runs[1])
+    same(runs[0], runs[2])
+
+
 class Client:
     """What `require_secure` asks a client."""
 
