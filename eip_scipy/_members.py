@@ -136,10 +136,10 @@ class Plan:
         Steps of one member, where that is known.
     """
 
-    def __init__(self, task: Task, *, compiled: bool | None = None) -> None:
+    def __init__(self, task: Task, *, compiled: bool | None = None, progress: bool = False) -> None:
         options = {"check": False} if compiled is None else {"check": False, "compiled": compiled}
         self.task, self._options = task, options
-        loop = task.loop(task.y0, task.params, **options)
+        loop = task.loop(task.y0, task.params, **options, progress=progress)
         grid, run = loop.driver.grid, loop.driver.run
         self.why_not = loop.why_not
         self.names = tuple(run.invariants.names)
@@ -154,6 +154,8 @@ class Plan:
         own_start = bool(task.options.get("project_initial", False)) or own_targets
         self._together = self.why_not is None and not (own_start or loop.events.functions or grid.t_eval.size)
         self._idle = [_Driver(loop)] if self._together else []
+        none = np.zeros((0, self.size), self.dtype), np.zeros((0, loop.driver.params.size))
+        run_members(self, *none)  # compiles, before there are threads that would all do it
 
     def empty(self, m: int) -> Members:
         """Room for `m` members."""
@@ -408,6 +410,8 @@ class _Driver:
         given = (y0s, taus, evaluations, params, rows)
         wanted = (out.y, out.max_defect, out.counters, out.max_correction)
         where[0], batch = self._side_by_side(plan, y0s, params, evaluations, saved, out, watch), 1
+        if m == 0:
+            self._sweep(0, *given, *wanted)
         while where[0] < m:
             watch.update()
             last, begin = min(m, int(where[0]) + batch), time.perf_counter()

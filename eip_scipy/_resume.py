@@ -80,7 +80,7 @@ def kept(path: Any, every: Any, resume: Any) -> Keeper:
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"checkpoint must be the path of a file, got {path!r}.")
     path = os.fspath(path)
-    if not os.path.lexists(path):
+    if not os.path.exists(path):
         origin = "no checkpoint was there: started at the beginning" if resume else ""
         return _FileKeeper(path, float(every), origin=origin)
     if not resume:
@@ -244,7 +244,7 @@ class _FileKeeper(Keeper):
         for k in range(len(events.functions)):
             events.restore(k, arrays[f"event_{k}_t"], arrays[f"event_{k}_y"])
         self.seconds = float(header["wall_time"])
-        self._ended = (header.get("status"), header.get("message"))
+        self._ended = (header.get("status"), header.get("message"), step)
         self._origin = f"resumed at step {step}"
 
     @property
@@ -261,7 +261,8 @@ class _FileKeeper(Keeper):
     def end(self, status: int, message: str) -> None:
         if status == 0:
             self._take_snapshot()
-        if self._ended != (status, message):  # else the file says so already
+        step = int(self._snapshot.arrays["place"][STEP])
+        if self._ended != (status, message, step):  # else the file says so already
             self._write_or_warn(status, message, stacklevel=5)
 
     def interrupted(self, error: BaseException) -> None:
@@ -301,7 +302,7 @@ class _FileKeeper(Keeper):
 
     def _write(self, status: int | None, message: str) -> None:
         driver, events, snapshot = self._driver, self._events, self._snapshot
-        y0 = driver.run.y0
+        y0, begin = driver.run.y0, time.perf_counter()
         step, rows, _ = (int(k) for k in snapshot.arrays["place"])
         header = {
             "kind": KIND,
@@ -319,10 +320,7 @@ class _FileKeeper(Keeper):
         arrays = {**self._start, **snapshot.arrays, "saved_t": driver.t[:rows], "saved_y": driver.y[:rows]}
         for k, count in enumerate(snapshot.happened):
             arrays[f"event_{k}_t"] = np.array(events.t[k][:count])
-            arrays[f"event_{k}_y"] = np.array(events.y[k][:count], driver.run.y0.dtype).reshape(
-                count, driver.run.y0.size
-            )
-        begin = time.perf_counter()
+            arrays[f"event_{k}_y"] = np.array(events.y[k][:count], y0.dtype).reshape(count, y0.size)
         checkpoint.write(self._path, header, arrays)
         end = time.perf_counter()
         self._due = end + max(self._every, LEAST_RATIO * (end - begin))

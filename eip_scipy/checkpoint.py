@@ -7,12 +7,16 @@ pickled, and no part is believed before the digest is checked.
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import glob
 import hashlib
 import json
 import math
 import os
 import platform
+import secrets
+import time
 import warnings
 import zipfile
 from collections.abc import Mapping
@@ -33,6 +37,7 @@ MARK = b"eip_scipy checkpoint, SHA-256 "
 DIGITS = 64
 ZIP = b"PK\x03\x04"
 BLOCK = 2**20
+LEFT_OVER = 3600.0
 DECIDING = ("python", "eip_scipy", "numpy", "scipy", "numba")
 # One date for all members: the same content gives the same bytes.
 DATE = (1980, 1, 1, 0, 0, 0)
@@ -46,7 +51,8 @@ def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mappi
     """Write a checkpoint; a file at `path` is replaced in one step, or stays as it was.
 
     The bytes go to a temporary file in the same folder, are brought to the disk, and take the place of `path` then. A
-    process that is killed meanwhile leaves the former checkpoint and a file ``.NAME-PID.tmp`` to be deleted.
+    process that is killed meanwhile leaves the former checkpoint, and a file ``.NAME-*.tmp`` that the first `write`
+    an hour later removes.
 
     Parameters
     ----------
@@ -75,10 +81,10 @@ def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mappi
     own = {"format": FORMAT, "schema": SCHEMA, **origin()}
     text = json.dumps({**header, **own}, indent=1, allow_nan=False).encode()
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.name}-{os.getpid()}.tmp")
+    temporary = target.with_name(f".{target.name}-{secrets.token_hex(4)}.tmp")
     try:
         try:
-            with open(temporary, "wb") as stream:
+            with open(temporary, "xb") as stream:
                 _fill(stream, text, arrays)
                 stream.flush()
                 os.fsync(stream.fileno())
@@ -86,6 +92,7 @@ def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mappi
         finally:
             temporary.unlink(missing_ok=True)
         _sync_folder(target.parent)
+        _remove_leftovers(target)
     except OSError as error:
         raise CheckpointError(f"cannot write the checkpoint {_name(path)}: {_reason(error)}") from error
 
@@ -236,6 +243,14 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+def _remove_leftovers(target: Path) -> None:
+    """Remove the temporary files of processes that were killed: those that nobody has written to for an hour."""
+    for leftover in target.parent.glob(f".{glob.escape(target.name)}-*.tmp"):
+        with contextlib.suppress(OSError):  # another process may be as tidy; the checkpoint is written in any case
+            if time.time() - leftover.stat().st_mtime > LEFT_OVER:
+                leftover.unlink()
+
+
 def _require_undamaged(path: str | os.PathLike[str], stream: BinaryIO) -> int:
     """Check mark and digest; returns the size of the file."""
     start = stream.read(4)
@@ -295,8 +310,5 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         flat = out.reshape(-1).view(np.uint8)
         for begin in range(0, n_bytes, BLOCK):
             part = flat[begin : begin + BLOCK]
-            part[:] = np.frombuffer(stream.read(part.size), np.uint8)
-        # The member's checksum is compared when its end is read.
-        if stream.read(1):
-            raise ValueError(f"{member.filename} is longer than it says")
+            part[:] = np.frombuffer(stream.read(part.size), np.uint8, part.size)
         return out

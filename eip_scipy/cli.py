@@ -123,6 +123,8 @@ def _rebound_module() -> Any:
 
 
 def _solar_system(args: argparse.Namespace) -> int:
+    if (args.truth or args.frontier) and (args.checkpoint is not None or args.resume):
+        raise UsageError("--checkpoint and --resume go with the comparison of methods, not with --truth or --frontier")
     if args.truth:
         return solar_truth.run(args, _ephemeris())
     if args.frontier:

@@ -35,7 +35,7 @@ __all__ = ["EnsembleResult", "ensemble"]
 CHUNK_STEPS = 2_000_000
 INTERPRETED_STEPS = 20_000
 UNKNOWN_STEPS = 10_000
-CHUNK_BYTES = 16e6
+CHUNK_BYTES = 4e6
 LARGEST_CHUNK = 4096
 LEAST_CHUNKS = 16
 TRIED = 8
@@ -237,7 +237,7 @@ def ensemble(
     elif checkpoint is not None:
         store = CheckpointStore(checkpoint, plan.identity(starts, parameters, size), checkpoint_every, resume)
     gathered = _Gathered(plan, len(starts), held, size, store, callback)
-    return gathered.run(partial(_pool, executor, task, gathered.method), _chunks(starts, parameters, size), progress)
+    return gathered.run(partial(_pool, executor, task, progress), _chunks(starts, parameters, size), progress)
 
 
 class _Gathered:
@@ -474,11 +474,11 @@ def _chunks(starts: np.ndarray, params: np.ndarray, size: int) -> Callable[[int]
     return chunks
 
 
-def _pool(executor: Any, task: Task, method: str) -> Pool:
+def _pool(executor: Any, task: Task, progress: bool) -> Pool:
     """Where the chunks run."""
     key = uuid.uuid4().hex
     if executor is None or isinstance(executor, (int, np.integer)):
-        plan = Plan(task)
+        plan = Plan(task, progress=progress)
         workers = cores() if executor is None else _setup.count("executor", executor)
         return ThreadPool(plan, workers if plan.why_not is None else 1)
     if isinstance(executor, Executor):

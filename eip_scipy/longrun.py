@@ -556,6 +556,7 @@ class Loop:
         try:
             with _bar(self.progress, driver.grid, self.method) as bar:
                 status, message = self.steps(bar)
+            self.keeper.end(status, message)
         except BaseException as error:
             self.wall_time += time.perf_counter() - begin
             driver.save_now()
@@ -564,7 +565,6 @@ class Loop:
             self.keeper.interrupted(error)
             raise
         self.wall_time += time.perf_counter() - begin
-        self.keeper.end(status, message)
         if status < 0:
             driver.save_now()
         return self._result(status, message)

@@ -10,6 +10,7 @@ Needs ``pip install "eip_scipy[distributed]"``.
 from __future__ import annotations
 
 import ipaddress
+import time
 import uuid
 from collections.abc import Iterable
 from dataclasses import replace
@@ -33,6 +34,8 @@ __all__ = ["DaskExecutor", "local_client", "pool"]
 
 ENCRYPTED = ("tls", "wss")
 WITHIN_A_PROCESS = "inproc"
+# Seconds: between two looks at whether there are workers, and before a member is tried that may kill one.
+PATIENCE, GRACE = 20.0, 1.0
 
 
 class DaskExecutor:
@@ -174,9 +177,25 @@ class DaskPool:
 
     def _result(self, future: distributed.Future) -> Part:
         try:
-            return future.result()
+            while True:
+                try:
+                    return future.result(timeout=PATIENCE)
+                except TimeoutError:
+                    self._replace_lost_workers()
         finally:
             self._open.discard(future)
+
+    def _replace_lost_workers(self) -> None:
+        """New processes where all local ones are gone: a nanny gives up on one that dies while it starts."""
+        cluster = self._client.cluster
+        if not isinstance(cluster, distributed.LocalCluster) or self._client.nthreads():
+            return
+        workers = len(cluster.worker_spec)
+        cluster.scale(0)
+        until = time.monotonic() + PATIENCE
+        while cluster.workers and time.monotonic() < until:
+            time.sleep(0.1)
+        cluster.scale(workers)
 
     def _one_by_one(self, task: Task, plan: Plan, chunk: Chunk, error: Exception) -> Iterable[Members]:
         """A chunk that killed its workers, in halves of halves: the member that does it is found, the others run."""
@@ -188,6 +207,9 @@ class DaskPool:
             return [members]
         found: list[Members] = []
         for first, last in ((0, m // 2), (m // 2, m)):
+            # A worker that dies before its nanny knows that it has started is not replaced.
+            self._client.wait_for_workers(1)
+            time.sleep(GRACE)
             half = Chunk(chunk.first + first, chunk.y0s[first:last], chunk.params[first:last])
             try:
                 found.append(self._result(self._submit(task, half)).members)

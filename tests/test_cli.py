@@ -245,6 +245,51 @@ def test_an_interruption_while_timing_keeps_the_table(tmp_path, capsys, no_rebou
     assert [path.name for path in tmp_path.iterdir()] == ["solar-system.csv"]
 
 
+@pytest.mark.usefixtures("little_to_time")
+def test_an_interrupted_command_goes_on(tmp_path, capsys, no_rebound, monkeypatch):
+    """With --checkpoint, runs that were done are not done again; the numbers are those of an uninterrupted command."""
+    folder = tmp_path / "kept"
+    command = ["solar-system", *SPAN, "--checkpoint", str(folder)]
+    assert main(["solar-system", *SPAN, "--out", str(tmp_path / "whole"), "--quiet"]) == 0
+
+    def interrupted(scene):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(solar_run, "_verlet", interrupted)
+        assert main([*command, "--out", str(tmp_path / "first")]) == 130
+    assert f"the same command with --resume goes on from the checkpoints in '{folder}'" in capsys.readouterr().err
+    done = {"EIPRK4-error.npz", "EIPRK4-euclidean.npz", "RK4.npz"}
+    assert {path.name for path in folder.iterdir()} == done
+    before = {name: (folder / name).read_bytes() for name in done}
+    assert main([*command, "--out", str(tmp_path / "again")]) == 2
+    assert "exists. resume=True goes on with the run that it holds" in capsys.readouterr().err
+    assert main([*command, "--out", str(tmp_path / "second"), "--resume", "--quiet"]) == 0
+    assert {path.name for path in folder.iterdir()} == {*done, "EIPRK5-tight.npz"}
+    assert {name: (folder / name).read_bytes() for name in done} == before
+
+    def numbers(name):
+        with open(tmp_path / name / "solar-system.csv", newline="") as stream:
+            return [{k: v for k, v in row.items() if k != "wall_time_s"} for row in csv.DictReader(stream)]
+
+    assert numbers("second") == numbers("whole")
+    assert main([*command, "--out", str(tmp_path / "third"), "--resume", "--h", "0.001"]) == 2
+    assert "belongs to another run: h is" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--resume"], "--resume needs the folder to resume from: --checkpoint DIR"),
+        (["--truth", "--checkpoint", "a"], "--checkpoint and --resume go with the comparison of methods"),
+        (["--frontier", "--resume"], "--checkpoint and --resume go with the comparison of methods"),
+    ],
+)
+def test_checkpoints_that_nothing_can_be_done_with(options, message, tmp_path, capsys, no_rebound):
+    assert main(["solar-system", *options, "--out", str(tmp_path)]) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_an_interruption_anywhere_is_one_line(capsys, monkeypatch):
     def interrupted(*args):
         raise KeyboardInterrupt

@@ -41,7 +41,7 @@ from eip_scipy import (
     ensemble,
     integrate,
 )
-from eip_scipy._members import Plan, Task, run_members
+from eip_scipy._members import Plan, Task, _Driver, _Watch, run_members, sweep
 from eip_scipy.problems import kepler
 
 needs_jit = pytest.mark.needs_jit
@@ -242,6 +242,24 @@ def test_bits_do_not_depend_on_the_number_of_threads(more):
 @needs_jit
 def test_members_do_not_depend_on_the_chunk():
     same(ensemble(kepler(), SPAN, starts(40), chunk=3), ensemble(kepler(), SPAN, starts(40), chunk=40))
+
+
+@pytest.mark.slow_without_jit
+@pytest.mark.parametrize("options", [{}, {"save_every": 4}, {"h": None, "method": EIPRK45}])
+def test_the_sweep_is_plain_python_too(options):
+    """What is compiled, interpreted: the same bits as member by member."""
+    y0s = starts(4)
+    y0s[1] = np.nan
+    shared = {"method": EIPRK4, "h": 0.1, "invariants": [H, L], "compiled": False, **options}
+    plan = Plan(Task(orbit, (0.0, 2.0), {k: v for k, v in shared.items() if v is not None}, y0s[0], None))
+    none = np.zeros((4, 0))
+    expected = run_members(plan, y0s, none)
+    driver = _Driver(plan.loop(y0s[0], none[0]))
+    driver._compiled = sweep
+    found = plan.empty(4)
+    driver.run(plan, y0s, none, found, _Watch(None))
+    for name in ("y", "t", "status", "max_defect", "counters", "max_correction", "saved"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
 
 # Failures.

@@ -43,6 +43,7 @@ Judge = Callable[..., Any]
 
 WHFAST_DAYS = 5.0
 MOST_SAVES = 20_000
+TIGHT = "EIPRK5 (tight)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +163,13 @@ def whole_number(ratio: float) -> int:
     return max(1, nearest if abs(ratio - nearest) <= 1e-9 * ratio else math.ceil(ratio))
 
 
-def plan(scene: Scene, method: type[EIPSolver], metric: str, judge: Judge | None) -> list[Task]:
+def plan(
+    scene: Scene,
+    method: type[EIPSolver],
+    metric: str,
+    judge: Judge | None,
+    kept: Callable[[str], dict[str, Any]] = lambda name: {},
+) -> list[Task]:
     """List the runs of the comparison: first the method asked for, last the tightest, which serves as reference.
 
     Parameters
@@ -173,6 +180,8 @@ def plan(scene: Scene, method: type[EIPSolver], metric: str, judge: Judge | None
     metric : {"error", "euclidean"}
     judge : callable or None
         REBOUND, if it is there.
+    kept : callable, optional
+        ``kept(name)``: the options of `integrate` that keep checkpoints of the run of that name.
 
     Returns
     -------
@@ -180,11 +189,15 @@ def plan(scene: Scene, method: type[EIPSolver], metric: str, judge: Judge | None
     """
     metrics = {metric_of(method, metric), metric_of(method, "error"), "euclidean"}
     ordered = sorted(metrics, key=lambda m: m != metric_of(method, metric))
-    tasks = [Task(eip_name(method, m), partial(_eip, scene, method, m), True) for m in ordered]
-    tasks.append(Task(method.TABLEAU.name, partial(_plain, scene, method), True))
+    names = [eip_name(method, m) for m in ordered]
+    tasks = [
+        Task(name, partial(_eip, scene, method, m, **kept(name)), True) for name, m in zip(names, ordered, strict=True)
+    ]
+    name = method.TABLEAU.name
+    tasks.append(Task(name, partial(_plain, scene, method, **kept(name)), True))
     tasks.append(Task("SV", lambda progress: _verlet(scene), False))
     if judge is None:
-        tasks.append(Task("EIPRK5 (tight)", partial(tight_run, scene), True))
+        tasks.append(Task(TIGHT, partial(tight_run, scene, **kept(TIGHT)), True))
         return tasks
     per_save = max(1, round(scene.interval * YEAR_D / WHFAST_DAYS))
     for name, integrator, steps in (("WHFast", "whfast", per_save), ("WHFast (c17)", "whfast-c17", per_save)):
@@ -208,35 +221,35 @@ def _named(method: type[EIPSolver], name: str) -> type[EIPSolver]:
     return type(name, (method,), {"__doc__": method.__doc__})
 
 
-def _eip(scene: Scene, method: type[EIPSolver], metric: str, progress: bool) -> MethodRun:
+def _eip(scene: Scene, method: type[EIPSolver], metric: str, progress: bool, **kept: Any) -> MethodRun:
     name = eip_name(method, metric)
     head = (method.__name__, "euclid." if metric == "euclidean" else metric)
     result = integrate(
-        scene.problem, method=_named(method, name), metric=metric, save_every=scene.every, progress=progress
+        scene.problem, method=_named(method, name), metric=metric, save_every=scene.every, progress=progress, **kept
     )
     return _finished(scene, name, head, scene.h, result, "" if result.success else result.message)
 
 
-def _plain(scene: Scene, method: type[EIPSolver], progress: bool) -> MethodRun:
+def _plain(scene: Scene, method: type[EIPSolver], progress: bool, **kept: Any) -> MethodRun:
     name = method.TABLEAU.name
     result = integrate(
-        scene.problem, method=_named(method, name), invariants=(), save_every=scene.every, progress=progress
+        scene.problem, method=_named(method, name), invariants=(), save_every=scene.every, progress=progress, **kept
     )
     return _finished(scene, name, (name, "alone"), scene.h, result, "" if result.success else result.message)
 
 
-def tight_run(scene: Scene, progress: bool) -> MethodRun:
+def tight_run(scene: Scene, progress: bool, **kept: Any) -> MethodRun:
     """Run the tightest at hand without REBOUND: EIPRK5, a quarter of the step, compensated."""
-    name = "EIPRK5 (tight)"
     result = integrate(
         scene.problem,
-        method=_named(EIPRK5, name),
+        method=_named(EIPRK5, TIGHT),
         h=scene.h / 4,
         save_every=4 * scene.every,
         compensated=True,
         progress=progress,
+        **kept,
     )
-    return _finished(scene, name, ("EIPRK5", "tight"), scene.h / 4, result, "" if result.success else result.message)
+    return _finished(scene, TIGHT, ("EIPRK5", "tight"), scene.h / 4, result, "" if result.success else result.message)
 
 
 def _verlet(scene: Scene) -> MethodRun:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+import re
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from .. import solvers
-from ..report import UsageError, check_outputs, say, warn, write_csv, write_file, write_json
+from ..checkpoint import CheckpointError
+from ..report import UsageError, check_folder, check_outputs, say, warn, write_csv, write_file, write_json
 from . import solar_epoch, solar_truth
 from .solar_cost import REPEATS, cost, cost_methods
 from .solar_errors import Study
@@ -55,6 +59,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="error against cost of high-order methods and their peers instead; --years 1, 10, 100, 1000 or 2000",
     )
+    parser.add_argument(
+        "--checkpoint", type=Path, metavar="DIR", help="keep checkpoints of the runs that this package does in DIR"
+    )
+    parser.add_argument("--resume", action="store_true", help="with --checkpoint: go on from those that are in DIR")
     solar_epoch.add_arguments(parser)
     solar_truth.add_arguments(parser)
 
@@ -101,13 +109,19 @@ def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ep
         raise UsageError(f"--years: expected a positive number, got '{args.years:g}'; only --truth goes back in time")
     if args.forces:
         raise UsageError("--forces goes with --truth; without it, methods are compared under Newton's gravitation")
+    if args.resume and args.checkpoint is None:
+        raise UsageError("--resume needs the folder to resume from: --checkpoint DIR")
     data = solar_epoch.initial_data(args, ephemeris)
     try:
         study = Study(make_scene(data, args.years, args.h), fixed_step_methods()[args.method].TABLEAU.order)
     except ValueError as error:
         raise UsageError(str(error)) from error
     check_outputs(args.out, args.json)
+    if args.checkpoint is not None:
+        check_folder(args.checkpoint)
     interrupted = _integrate(study, args, judge)
+    if interrupted and args.checkpoint is not None:
+        warn(f"the same command with --resume goes on from the checkpoints in {str(args.checkpoint)!r}")
     if not study.runs:
         warn("interrupted; no run was done")
         return INTERRUPTED
@@ -130,7 +144,7 @@ def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ep
 
 def _integrate(study: Study, args: argparse.Namespace, judge: Judge | None) -> bool:
     """Do the runs one by one; True if the user interrupted them."""
-    tasks = plan(study.scene, fixed_step_methods()[args.method], args.metric, judge)
+    tasks = plan(study.scene, fixed_step_methods()[args.method], args.metric, judge, partial(_kept, args))
     try:
         for task in tasks:
             with _waiting(task.name, shown=not (args.quiet or task.has_bar)):
@@ -140,7 +154,17 @@ def _integrate(study: Study, args: argparse.Namespace, judge: Judge | None) -> b
         return True
     except MemoryError as error:
         raise UsageError(f"not enough memory: {error}") from error
+    except CheckpointError as error:
+        raise UsageError(f"{error} On the command line, resume=True is --resume.") from error
     return False
+
+
+def _kept(args: argparse.Namespace, name: str) -> dict[str, Any]:
+    """Options of `integrate` for the checkpoints of the run of that name: one file each."""
+    if args.checkpoint is None:
+        return {}
+    file = re.sub("[^A-Za-z0-9]+", "-", name).strip("-")
+    return {"checkpoint": args.checkpoint / f"{file}.npz", "resume": args.resume}
 
 
 @contextlib.contextmanager

@@ -1,0 +1,205 @@
+"""Ensembles on Dask: the same bits on any number of workers, lost workers, poisonous members, who may connect."""
+
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+from numba import njit
+
+from eip_scipy import EIPRK4, ensemble, integrate
+from eip_scipy.problems import kepler
+
+distributed = pytest.importorskip("distributed", reason="needs Dask's distributed")
+dask = pytest.importorskip("dask", reason="needs Dask")
+psutil = pytest.importorskip("psutil", reason="needs psutil, which comes with distributed")
+
+from eip_scipy.integrations.dask import DaskExecutor, local_client, require_secure  # noqa: E402
+
+slow = pytest.mark.slow
+SPAN = (0.0, 60.0)
+
+
+def starts(members):
+    y0s = kepler().y0 * (1 + 1e-3 * np.random.default_rng(members).standard_normal((members, 4)))
+    y0s[members // 3] = np.nan
+    return y0s
+
+
+def same(one, other):
+    for name in ("y", "t", "status", "message", "max_defect", "max_correction", "nfev", "njev", "nlu", "times"):
+        assert np.array_equal(one[name], other[name], equal_nan=name != "message"), name
+    if one.statistics is not None:
+        for name in ("count", "mean", "squares", "min", "max"):
+            np.testing.assert_array_equal(getattr(one.statistics, name), getattr(other.statistics, name))
+
+
+@pytest.fixture(scope="module", params=[1, 2, 4])
+def workers(request):
+    client = local_client(request.param)
+    yield client
+    client.close()
+    client.cluster.close()
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Here a chunk whose worker died is given up by Dask at once: to be run again is left to this package."""
+    with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+        client = local_client(2)
+        yield client
+        client.close()
+        client.cluster.close()
+
+
+@slow
+def test_bits_do_not_depend_on_the_number_of_workers(workers):
+    y0s = starts(100)
+    for more in ({}, {"save_every": 100, "reduce": "state"}):
+        here, there = (ensemble(kepler(), SPAN, y0s, executor=where, **more) for where in (None, workers))
+        same(here, there)
+        assert here.failed.tolist() == [33]
+
+
+@slow
+def test_functions_without_a_module(pair):
+    @njit
+    def fun(t, y, p):
+        return np.array([y[1], -p[0] * y[0]])
+
+    params = np.linspace(1.0, 2.0, 20)[:, None]
+    run = ensemble(fun, (0, 3), [1.0, 0.0], params=params, h=0.1, executor=pair, save_every=10)
+    for k in (0, 19):
+        own = integrate(fun, (0, 3), [1.0, 0.0], params=params[k], method=EIPRK4, h=0.1, save_every=10)
+        np.testing.assert_array_equal(run.trajectories[k], own.y)
+
+
+@slow
+@pytest.mark.parametrize("allowed_failures", [0, 3])
+def test_a_killed_worker_loses_nothing(allowed_failures):
+    """One of two workers gets SIGKILL while it computes; its chunks run again, by Dask or, given up by it, by us."""
+    y0s = starts(400)
+    here = ensemble(kepler(), SPAN, y0s, chunk=8)
+    victims = []
+
+    def kill(part):
+        if not victims:
+            victims.append(next(iter(client.run(os.getpid).values())))
+            os.kill(victims[0], signal.SIGKILL)
+
+    with dask.config.set({"distributed.scheduler.allowed-failures": allowed_failures}):
+        client = local_client(2)
+    try:
+        there = ensemble(kepler(), SPAN, y0s, chunk=8, executor=client, callback=kill)
+    finally:
+        client.close()
+        client.cluster.close()
+    same(here, there)
+    assert victims
+
+
+def deadly(t, y):
+    if y[0] > 100.0:
+        os._exit(1)
+    return np.array([y[1], -y[0]])
+
+
+@slow
+def test_a_member_that_kills_its_workers_is_found(pair):
+    y0s = np.ones((24, 2))
+    y0s[13] = [99.9, 10.0]  # not at the start, which is tried here too
+    run = ensemble(deadly, (0, 1), y0s, h=0.1, chunk=8, executor=pair, reduce="state")
+    assert run.failed.tolist() == [13]
+    assert "its workers died" in run.message[13]
+    own = integrate(deadly, (0, 1), y0s[0], method=EIPRK4, h=0.1)
+    np.testing.assert_array_equal(np.delete(run.y, 13, axis=0), np.tile(own.y[:, -1], (23, 1)))
+    assert run.statistics.count.tolist() == [23]
+
+
+@slow
+def test_nothing_listens_beyond_this_machine(pair):
+    me = psutil.Process()
+    for process in (me, *me.children(recursive=True)):
+        for connection in process.net_connections("inet"):
+            if connection.status == psutil.CONN_LISTEN:
+                assert connection.laddr.ip in ("127.0.0.1", "::1")
+
+
+@slow
+def test_by_name():
+    y0s = starts(20)
+    same(ensemble(kepler(), SPAN, y0s), ensemble(kepler(), SPAN, y0s, executor="dask"))
+
+
+@slow
+def test_ctrl_c(pair):
+    timer = threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    begin = time.perf_counter()
+    with pytest.raises(KeyboardInterrupt) as info:
+        ensemble(kepler(), (0, 1e5), starts(64), executor=pair)
+    assert time.perf_counter() - begin < 10
+    assert (info.value.partial.status == -2).any()
+
+
+def oscillator(t, y):
+    return np.array([y[1], -y[0]])
+
+
+def test_workers_in_this_process():
+    y0s = np.random.default_rng(0).standard_normal((20, 2))
+    y0s[7] = np.nan
+    client = distributed.Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None)
+    try:
+        runs = [
+            ensemble(oscillator, (0, 1), y0s, h=0.1, save_every=3, reduce="state", chunk=4, executor=where)
+            for where in (None, client, DaskExecutor(client))
+        ]
+    finally:
+        client.close()
+    same(runs[0], runs[1])
+    same(runs[0], runs[2])
+
+
+class Client:
+    """What `require_secure` asks a client."""
+
+    def __init__(self, scheduler, *workers):
+        self._found = {"address": scheduler, "workers": dict.fromkeys(workers)}
+
+    def scheduler_info(self, n_workers):
+        assert n_workers == -1
+        return self._found
+
+
+@pytest.mark.parametrize(
+    "addresses",
+    [
+        ("tcp://127.0.0.1:8786", "tcp://127.0.0.1:1", "tcp://[::1]:2"),
+        ("tls://10.0.0.1:8786", "tls://10.0.0.2:1"),
+        ("wss://example.org:8786", "tls://10.0.0.2:1"),
+        ("inproc://10.0.0.1/1/1", "inproc://10.0.0.1/1/3"),
+        ("tcp://localhost:8786",),
+    ],
+)
+def test_secure_clusters(addresses):
+    require_secure(Client(*addresses))
+
+
+@pytest.mark.parametrize(
+    "addresses",
+    [
+        ("tcp://10.0.0.1:8786",),
+        ("tcp://0.0.0.0:8786",),
+        ("tcp://127.0.0.1:8786", "tcp://192.168.0.2:1"),
+        ("ws://10.0.0.1:8786",),
+        ("tcp://head-node:8786",),
+        ("tls://10.0.0.1:8786", "tcp://10.0.0.2:1"),
+    ],
+)
+def test_insecure_clusters_are_refused(addresses):
+    with pytest.raises(PermissionError, match=r"without encryption.*CVE-2021-42343.*allow_insecure=True"):
+        require_secure(Client(*addresses))
+    assert DaskExecutor(Client(*addresses), allow_insecure=True).client
