@@ -455,6 +455,8 @@ class _Driver:
         batch, m = self._batch, len(y0s)
         if batch is None:
             return 0
+        if m == 0:
+            batch.compile()
         meetings = saved_steps(self.loop.driver.grid)[1:].tolist()
         first = 0
         while m - first >= batch.lanes // 4:

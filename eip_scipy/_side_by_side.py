@@ -139,6 +139,10 @@ class Batch:
             save(row, self._states()[:m])
         return [self._ended(lane) if sound[lane] else None for lane in range(m)]
 
+    def compile(self) -> None:
+        """What the first run would compile."""
+        self._steps(0, 0, np.zeros((0, self._params.shape[0])))
+
     def _start(self, y0s: np.ndarray, params: np.ndarray, evaluations: int) -> np.ndarray:
         """Everything as at the start; returns which members are sound."""
         w, s, m = self._work, self._s, len(y0s)

@@ -306,6 +306,7 @@ def test_octets_are_typed_apart_from_floats():
         lifted(1.0)
 
 
-def test_the_reason_for_one_by_one():
-    adaptive = ensemble(harmonic(), (0, 1), spread_starts(harmonic().y0, 9), first_step=0.1, executor=1)
-    assert adaptive.success
+def test_adaptive_members_run_one_by_one(batches):
+    starts = spread_starts(harmonic().y0, 9)
+    check_bits(harmonic(), (0, 1), starts, method=EIPRK45, first_step=0.1)
+    assert batches["members"] == 0
