@@ -24,8 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
+    "Curves",
     "ErrorSeries",
     "Orbits",
+    "ParticleRow",
     "cost_figure",
     "errors_figure",
     "frontier_figure",
@@ -35,6 +37,7 @@ __all__ = [
     "orbit_in_time_figure",
     "orbits_figure",
     "paper_kepler_figure",
+    "particle_figure",
     "scenes_figure",
     "work_figure",
 ]
@@ -330,6 +333,88 @@ def paper_kepler_figure(runs: Mapping[str, KeplerRun], *, title: str = "") -> Fi
             low, high = np.log10(row[1 + k].get_ylim())
             row[1 + k].set_ylim(10 ** np.floor(low), 10 ** np.ceil(high))  # two labelled ticks at least
     return figure
+
+
+class Curves(NamedTuple):
+    """Curves in one plane.
+
+    Attributes
+    ----------
+    x, y : str
+        Labels of the axes.
+    paths : mapping of str to array_like, shape (2, k)
+    """
+
+    x: str
+    y: str
+    paths: Mapping[str, Any]
+
+
+class ParticleRow(NamedTuple):
+    """What one method got of a charged particle.
+
+    Attributes
+    ----------
+    orbits : mapping of str to Curves
+        By the panels' titles.
+    invariants : mapping of str to (array_like, array_like)
+        Times and relative errors.
+    trajectory : str
+        Label of the trajectory's errors, with unit.
+    errors : mapping of str to (array_like, array_like)
+        Times and errors of the trajectory.
+    """
+
+    orbits: Mapping[str, Curves]
+    invariants: Mapping[str, tuple[Any, Any]]
+    trajectory: str
+    errors: Mapping[str, tuple[Any, Any]]
+
+
+def particle_figure(rows: Mapping[str, ParticleRow], *, title: str = "") -> Figure:
+    """Draw orbits, errors of the invariants and of the trajectory, a row for each method.
+
+    Parameters
+    ----------
+    rows : mapping of str to ParticleRow
+        By the methods' names; all with as many orbits.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    orbits = len(next(iter(rows.values())).orbits)
+    figure = _figure(3.4 * (orbits + 2), 2.9 * len(rows) + 0.6, title)
+    axes = figure.subplots(len(rows), orbits + 2, squeeze=False)
+    for line, (name, row) in zip(axes, rows.items(), strict=True):
+        for axis, (panel, curves) in zip(line, row.orbits.items(), strict=False):
+            for path in curves.paths.values():
+                axis.plot(*np.asarray(path), color=PALETTE[0], lw=0.35, rasterized=True)
+            axis.set_title(f"{name}: {panel}", fontsize="medium")
+            axis.set_xlabel(curves.x)
+            axis.set_ylabel(curves.y)
+            axis.set_aspect("equal", adjustable="box")
+            axis.grid(alpha=0.2)
+        for axis, label, values in (
+            (line[-2], "relative error", row.invariants),
+            (line[-1], row.trajectory, row.errors),
+        ):
+            for style, (key, (t, error)) in zip(method_styles(values).values(), values.items(), strict=True):
+                _envelope(axis, t, error, {**style, "label": key})
+            _log_errors(axis, "t", label)
+            axis.legend(fontsize="x-small", loc="best", handlelength=3, framealpha=0.8)
+    for column in range(orbits + 2):
+        _share_limits(axes[:, column], both=column < orbits)
+    return figure
+
+
+def _share_limits(axes: Iterable[Axes], *, both: bool) -> None:
+    """Give axes the limits that hold all of them, in y or in x and y."""
+    for get, put in (("get_ylim", "set_ylim"), ("get_xlim", "set_xlim"))[: 1 + both]:
+        limits = np.array([getattr(axis, get)() for axis in axes])
+        for axis in axes:
+            getattr(axis, put)(limits[:, 0].min(), limits[:, 1].max())
 
 
 def gains_figure(errors: Mapping[str, tuple[float, float]], *, what: str, title: str = "", labels: int = 6) -> Figure:
