@@ -505,7 +505,12 @@ def work_figure(series: Mapping[str, Mapping[str, Any]], *, error: str, title: s
 
 
 def frontier_figure(
-    series: Mapping[str, Mapping[str, Any]], *, unit: str, title: str = "", footnote: str = ""
+    series: Mapping[str, Mapping[str, Any]],
+    *,
+    unit: str,
+    time: str = "wall time [s]",
+    title: str = "",
+    footnote: str = "",
 ) -> Figure:
     """Draw errors against wall time in one panel for each kind of error, a line for each method.
 
@@ -515,6 +520,8 @@ def frontier_figure(
         For each method arrays "wall_time" and, by the panels' titles, errors.
     unit : str
         Of the errors.
+    time : str, optional
+        Label of the time.
     title, footnote : str, optional
 
     Returns
@@ -531,7 +538,7 @@ def frontier_figure(
         axis.set_title(panel, fontsize="medium")
     for axis in axes:
         _log_x(axis)
-        _log_errors(axis, "wall time [s]", f"error of position [{unit}]" if axis is axes[0] else "")
+        _log_errors(axis, time, f"error of position [{unit}]" if axis is axes[0] else "")
     _legend_below(figure, axes[0])
     if footnote:
         axes[-1].annotate(footnote, (1, -0.17), xycoords="axes fraction", ha="right", fontsize="x-small", color="0.35")
@@ -621,7 +628,7 @@ def _log_x(axis: Axes) -> None:
     """Make x a log axis with labels at powers of ten; in a short span at 2 and 5 times those as well."""
     axis.set_xscale("log")
     low, high = axis.get_xlim()
-    if high / low < 50:
+    if high / low < 100:
         axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())

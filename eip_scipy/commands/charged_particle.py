@@ -90,12 +90,13 @@ def run_scenes(scenes: Sequence[str], *, paper_only: bool, quiet: bool) -> dict[
 
 
 def write(args: argparse.Namespace, studies: dict[str, Study], stem: str, *, paper_only: bool) -> list[Any]:
-    """Write ``STEM.csv`` and the figures ``STEM-uniform.png`` and ``STEM-tokamak.png``; these need matplotlib."""
+    """Write ``STEM.csv`` and the figures, ``STEM-FIELD.png`` or, for the paper's, ``STEM.png``; they need matplotlib."""
     lines = [row for found in studies.values() for row in particle_report.rows(found)]
     written = [write_csv(args.out / f"{stem}.csv", lines)]
     try:
         for name, figure in particle_report.figures(studies, paper_only=paper_only):
-            written.append(write_file(args.out / f"{stem}-{name}.png", figure.savefig))
+            file = f"{stem}.png" if paper_only else f"{stem}-{name}.png"
+            written.append(write_file(args.out / file, figure.savefig))
     except ImportError as error:
         warn(f"no figures: {error}")
     return written

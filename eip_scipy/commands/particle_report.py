@@ -127,13 +127,17 @@ UNIFORM = {
     "gyroradius_last": ["gyroradius", "last turn"],
     "angle_error": ["guiding", "angle"],
 }
-TOKAMAK = {
-    "tips": ["banana", "tips"],
-    "tip_nearest": ["least R", "of tips"],
-    "tip_farthest": ["largest R", "of tips"],
+TRANSIT = {
     "extrema_error": ["extrema", "of R, z"],
     "moment_change": ["magnetic", "moment"],
 }
+BANANA = {
+    "tips": ["banana", "tips"],
+    "tip_nearest": ["least R", "of tips"],
+    "tip_farthest": ["largest R", "of tips"],
+    **TRANSIT,
+}
+SPECIAL = {"uniform": UNIFORM, "tokamak-banana": BANANA, "tokamak-transit": TRANSIT}
 PRECISE = {"gyroradius_first": 4, "gyroradius_last": 4, "tip_nearest": 5, "tip_farthest": 5}
 LEGEND = {
     "uniform": [
@@ -150,7 +154,7 @@ LEGEND = {
 def text(found: Study) -> str:
     """Lay out the numbers and the checks of one scene."""
     got, problem = found.numbers, found.problem
-    columns = {**(UNIFORM if found.scene == "uniform" else TOKAMAK), **COMMON}
+    columns = {**SPECIAL[found.scene], **COMMON}
     body = [(name, [_cell(key, values[key]) for key in columns]) for name, values in got.items()]
     steps = found.reference.orbit.t.size - 1
     lines = [
