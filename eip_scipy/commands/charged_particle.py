@@ -90,7 +90,7 @@ def run_scenes(scenes: Sequence[str], *, paper_only: bool, quiet: bool) -> dict[
 
 
 def write(args: argparse.Namespace, studies: dict[str, Study], stem: str, *, paper_only: bool) -> list[Any]:
-    """Write ``STEM.csv`` and the figures, ``STEM-FIELD.png`` or, for the paper's, ``STEM.png``; they need matplotlib."""
+    """Write ``STEM.csv`` and figures, ``STEM-FIELD.png`` or, for the paper's, ``STEM.png``; they need matplotlib."""
     lines = [row for found in studies.values() for row in particle_report.rows(found)]
     written = [write_csv(args.out / f"{stem}.csv", lines)]
     try:

@@ -113,7 +113,7 @@ class ParticleOrbit:
 
     @cached_property
     def gyrofrequency(self) -> np.ndarray:
-        """|q| B / m (m,)."""
+        """Frequency ``|q| B / m`` (m,)."""
         return abs(self.problem.charge) / self.problem.mass * self._strength
 
     @cached_property
@@ -130,12 +130,12 @@ class ParticleOrbit:
 
     @cached_property
     def gyroradius(self) -> np.ndarray:
-        """Radius m v_perp / (|q| B) (m,), with v_perp relative to the drift E x B / B^2."""
+        """Radius ``m v_perp / (|q| B)`` (m,), with v_perp relative to the drift E x B / B^2."""
         return np.sqrt((self._gyrating**2).sum(axis=0)) / self.gyrofrequency
 
     @cached_property
     def magnetic_moment(self) -> np.ndarray:
-        """Moment m v_perp^2 / (2 B) (m,), with v_perp relative to the drift E x B / B^2; an adiabatic invariant."""
+        """Moment ``m v_perp^2 / (2 B)`` (m,), with v_perp relative to the drift E x B / B^2; an adiabatic invariant."""
         return 0.5 * self.problem.mass * (self._gyrating**2).sum(axis=0) / self._strength
 
     @cached_property
