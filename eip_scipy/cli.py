@@ -10,7 +10,15 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from . import comparators, problems
-from .commands import hard_cases, hard_scenes, kepler_cost, solar_frontier, solar_system, solar_truth
+from .commands import (
+    charged_particle,
+    hard_cases,
+    hard_scenes,
+    kepler_cost,
+    solar_frontier,
+    solar_system,
+    solar_truth,
+)
 from .problems import solar_data
 from .report import UsageError, check_target, document, say, versions, warn, write_json
 
@@ -79,6 +87,11 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
             "run the solar system and compare with other methods (the paper's Experiment II)",
             solar_system.add_arguments,
             _solar_system,
+        ),
+        "charged-particle": (
+            "charged particles in two fields by several methods (the paper's Experiment III)",
+            charged_particle.add_arguments,
+            charged_particle.run,
         ),
         "hard-cases": (
             "run 35 hard cases with and without projection",

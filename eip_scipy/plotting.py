@@ -24,8 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
+    "Curves",
     "ErrorSeries",
     "Orbits",
+    "ParticleRow",
     "cost_figure",
     "errors_figure",
     "frontier_figure",
@@ -35,6 +37,7 @@ __all__ = [
     "orbit_in_time_figure",
     "orbits_figure",
     "paper_kepler_figure",
+    "particle_figure",
     "scenes_figure",
     "work_figure",
 ]
@@ -332,6 +335,88 @@ def paper_kepler_figure(runs: Mapping[str, KeplerRun], *, title: str = "") -> Fi
     return figure
 
 
+class Curves(NamedTuple):
+    """Curves in one plane.
+
+    Attributes
+    ----------
+    x, y : str
+        Labels of the axes.
+    paths : mapping of str to array_like, shape (2, k)
+    """
+
+    x: str
+    y: str
+    paths: Mapping[str, Any]
+
+
+class ParticleRow(NamedTuple):
+    """What one method got of a charged particle.
+
+    Attributes
+    ----------
+    orbits : mapping of str to Curves
+        By the panels' titles.
+    invariants : mapping of str to (array_like, array_like)
+        Times and relative errors.
+    trajectory : str
+        Label of the trajectory's errors, with unit.
+    errors : mapping of str to (array_like, array_like)
+        Times and errors of the trajectory.
+    """
+
+    orbits: Mapping[str, Curves]
+    invariants: Mapping[str, tuple[Any, Any]]
+    trajectory: str
+    errors: Mapping[str, tuple[Any, Any]]
+
+
+def particle_figure(rows: Mapping[str, ParticleRow], *, title: str = "") -> Figure:
+    """Draw orbits, errors of the invariants and of the trajectory, a row for each method.
+
+    Parameters
+    ----------
+    rows : mapping of str to ParticleRow
+        By the methods' names; all with as many orbits.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    orbits = len(next(iter(rows.values())).orbits)
+    figure = _figure(3.4 * (orbits + 2), 2.9 * len(rows) + 0.6, title)
+    axes = figure.subplots(len(rows), orbits + 2, squeeze=False)
+    for line, (name, row) in zip(axes, rows.items(), strict=True):
+        for axis, (panel, curves) in zip(line, row.orbits.items(), strict=False):
+            for path in curves.paths.values():
+                axis.plot(*np.asarray(path), color=PALETTE[0], lw=0.35, rasterized=True)
+            axis.set_title(f"{name}: {panel}", fontsize="medium")
+            axis.set_xlabel(curves.x)
+            axis.set_ylabel(curves.y)
+            axis.set_aspect("equal", adjustable="box")
+            axis.grid(alpha=0.2)
+        for axis, label, values in (
+            (line[-2], "relative error", row.invariants),
+            (line[-1], row.trajectory, row.errors),
+        ):
+            for style, (key, (t, error)) in zip(method_styles(values).values(), values.items(), strict=True):
+                _envelope(axis, t, error, {**style, "label": key})
+            _log_errors(axis, "t", label)
+            axis.legend(fontsize="x-small", loc="best", handlelength=3, framealpha=0.8)
+    for column in range(orbits + 2):
+        _share_limits(axes[:, column], both=column < orbits)
+    return figure
+
+
+def _share_limits(axes: Iterable[Axes], *, both: bool) -> None:
+    """Give axes the limits that hold all of them, in y or in x and y."""
+    for get, put in (("get_ylim", "set_ylim"), ("get_xlim", "set_xlim"))[: 1 + both]:
+        limits = np.array([getattr(axis, get)() for axis in axes])
+        for axis in axes:
+            getattr(axis, put)(limits[:, 0].min(), limits[:, 1].max())
+
+
 def gains_figure(errors: Mapping[str, tuple[float, float]], *, what: str, title: str = "", labels: int = 6) -> Figure:
     """Draw errors with projection against errors without; below the diagonal projection helps.
 
@@ -420,7 +505,12 @@ def work_figure(series: Mapping[str, Mapping[str, Any]], *, error: str, title: s
 
 
 def frontier_figure(
-    series: Mapping[str, Mapping[str, Any]], *, unit: str, title: str = "", footnote: str = ""
+    series: Mapping[str, Mapping[str, Any]],
+    *,
+    unit: str,
+    time: str = "wall time [s]",
+    title: str = "",
+    footnote: str = "",
 ) -> Figure:
     """Draw errors against wall time in one panel for each kind of error, a line for each method.
 
@@ -430,6 +520,8 @@ def frontier_figure(
         For each method arrays "wall_time" and, by the panels' titles, errors.
     unit : str
         Of the errors.
+    time : str, optional
+        Label of the time.
     title, footnote : str, optional
 
     Returns
@@ -446,7 +538,7 @@ def frontier_figure(
         axis.set_title(panel, fontsize="medium")
     for axis in axes:
         _log_x(axis)
-        _log_errors(axis, "wall time [s]", f"error of position [{unit}]" if axis is axes[0] else "")
+        _log_errors(axis, time, f"error of position [{unit}]" if axis is axes[0] else "")
     _legend_below(figure, axes[0])
     if footnote:
         axes[-1].annotate(footnote, (1, -0.17), xycoords="axes fraction", ha="right", fontsize="x-small", color="0.35")
@@ -536,7 +628,7 @@ def _log_x(axis: Axes) -> None:
     """Make x a log axis with labels at powers of ten; in a short span at 2 and 5 times those as well."""
     axis.set_xscale("log")
     low, high = axis.get_xlim()
-    if high / low < 50:
+    if high / low < 100:
         axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())

@@ -1,4 +1,4 @@
-"""``eip-scipy reproduce table1 ... table4 fig-kepler fig-solar all``: the paper's numbers beside ours, and its figures.
+"""``eip-scipy reproduce table1 ... table4 fig-kepler ... all``: the paper's numbers beside ours, and its figures.
 
 The paper's numbers, their misprints and the same computations in 50 digits are data: ``data/paper_tables.json``.
 """
@@ -21,7 +21,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from . import report
-from .commands import kepler_figures, solar_system
+from .commands import charged_particle, kepler_figures, particle_report, solar_system
 from .diagnostics import observed_order
 from .longrun import integrate
 from .problems import Problem, harmonic, kepler
@@ -30,7 +30,8 @@ from .solvers import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPSolver
 __all__ = ["FIGURES", "TABLES", "Cell", "Value", "add_arguments", "reproduce", "run"]
 
 TABLES = ("table1", "table2", "table3", "table4")
-FIGURES = ("fig-kepler", "fig-solar")
+FIGURES = ("fig-kepler", "fig-solar", "fig-particle", "fig-tokamak")
+PARTICLE_SCENES = {"fig-particle": ("uniform",), "fig-tokamak": ("tokamak-banana", "tokamak-transit")}
 OMEGA = 10.0
 METHODS: dict[str, type[EIPSolver]] = {"RK1": EIPRK1, "RK2": EIPRK2, "RK3": EIPRK3, "RK4": EIPRK4}
 PAPER_SETTING: dict[str, Any] = {"metric": "euclidean", "reuse_f": False}
@@ -304,7 +305,7 @@ def run(args: argparse.Namespace, judge: Callable[[], Any] = lambda: None) -> in
         if name in FIGURES:
             if not args.quiet and name != wanted[0]:
                 report.say()
-            worse, content[name] = _kepler(args) if name == "fig-kepler" else _solar(args, judge)
+            worse, content[name] = _figure(name, args, judge)
             status = max(status, worse)
     content["passed"] = status == 0
     if args.json is not None:
@@ -316,6 +317,13 @@ def run(args: argparse.Namespace, judge: Callable[[], Any] = lambda: None) -> in
 def _say_written(args: argparse.Namespace, written: list[Path]) -> None:
     if written and not args.quiet:
         report.say("\n".join(["", *(f"wrote {path}" for path in written)]))
+
+
+def _figure(name: str, args: argparse.Namespace, judge: Callable[[], Any]) -> tuple[int, dict[str, Any]]:
+    """Make one of the paper's figures; exit status and content of the JSON."""
+    if name == "fig-kepler":
+        return _kepler(args)
+    return _solar(args, judge) if name == "fig-solar" else _particle(name, args)
 
 
 def _kepler(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
@@ -334,6 +342,17 @@ def _kepler(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
             report.warn(f"no figures: {error}")
         _say_written(args, written)
     return 0 if all(check["matched"] for check in checks) else 1, {"checks": checks}
+
+
+def _particle(name: str, args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """Make the figures of Experiment III in one of its fields; exit status and content of the JSON."""
+    studies = charged_particle.run_scenes(PARTICLE_SCENES[name], paper_only=True, quiet=args.quiet)
+    if not args.quiet:
+        report.say("\n\n".join(particle_report.text(found) for found in studies.values()))
+    if args.out is not None:
+        _say_written(args, charged_particle.write(args, studies, name, paper_only=True))
+    content = charged_particle.record(studies)
+    return 0 if content["passed"] else 1, content
 
 
 def _solar(args: argparse.Namespace, judge: Callable[[], Any]) -> tuple[int, dict[str, Any]]:

@@ -25,13 +25,10 @@ def assert_output(found, printed):
         assert agree(float(a), float(b)), f"{a}, printed as {b}"
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        *("README.md", "docs/quickstart.md", "docs/adaptive.md", "docs/hard-scenes.md", "docs/checkpoints.md"),
-        "docs/ensembles.md",
-    ],
-)
+PAGES = ("quickstart", "adaptive", "hard-scenes", "checkpoints", "ensembles", "charged-particles")
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{page}.md" for page in PAGES)])
 def test_page(page, capsys, tmp_path, monkeypatch):
     """All blocks of a page in turn, in one namespace; a block of text is what the code before it prints."""
     monkeypatch.chdir(tmp_path)  # where pages write their files

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from time import perf_counter
 from typing import Any
@@ -15,35 +14,15 @@ from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
 from .._setup import check_fixed_step, fixed_steps
+from ._common import FixedStepResult, check_span, check_state, message, real_vector, saved_steps
 
 __all__ = ["FORMS", "StormerVerletResult", "stormer_verlet"]
 
 FORMS = ("kick-drift-kick", "drift-kick-drift")
 
 
-@dataclass(frozen=True)
-class StormerVerletResult:
-    """What `stormer_verlet` returns.
-
-    Attributes
-    ----------
-    t : ndarray, shape (m,)
-        Saved times, the first and the last of the interval among them.
-    y : ndarray, shape (n, m)
-        States (q, v) at `t`.
-    nfev : int
-        Evaluations of the acceleration.
-    wall_time : float
-        Seconds spent in the integration, compilation excluded.
-    message : str
-        "compiled", or "interpreted" and the reason; and where the states stop being finite, if they do.
-    """
-
-    t: np.ndarray
-    y: np.ndarray
-    nfev: int
-    wall_time: float
-    message: str
+class StormerVerletResult(FixedStepResult):
+    """What `stormer_verlet` returns: a `FixedStepResult` with states (q, v) and evaluations of the acceleration."""
 
 
 def stormer_verlet(
@@ -110,14 +89,14 @@ def stormer_verlet(
     >>> bool(abs(run.y[0, -1] - np.cos(10.0)) < 1e-4)
     True
     """
-    t0, t_bound = _check_span(t_span)
-    y = _check_state(y0)
+    t0, t_bound = check_span(t_span)
+    y = _check_halves(y0)
     if form not in FORMS:
         raise ValueError(f"unknown form {form!r}: expected one of {', '.join(map(repr, FORMS))}")
-    extra = () if params is None else (_real_vector(params, "params"),)
+    extra = () if params is None else (real_vector(params, "params"),)
     h = check_fixed_step(h, t0, t_bound)
     n_steps = fixed_steps(h, t0, t_bound)
-    saved = _saved_steps(n_steps, save_every)
+    saved = saved_steps(n_steps, save_every)
 
     checked = _checked(acc, y.size // 2)
     a = checked(t0, y[: y.size // 2], *extra).copy()
@@ -139,44 +118,14 @@ def stormer_verlet(
 
     t = t0 + saved * step
     t[-1] = t_bound
-    return StormerVerletResult(t, ys.T, n_steps + 1, wall_time, _message(reason, t, ys))
+    return StormerVerletResult(t, ys.T, n_steps + 1, wall_time, message(reason, t, ys))
 
 
-def _check_span(t_span: Any) -> tuple[float, float]:
-    span = np.asarray(t_span, dtype=float)
-    if span.shape != (2,) or not np.isfinite(span).all():
-        raise ValueError(f"t_span must hold two finite numbers, got {t_span!r}")
-    return float(span[0]), float(span[1])
-
-
-def _real_vector(values: Any, name: str) -> np.ndarray:
-    """Copy a 1-D array of real numbers to contiguous float64."""
-    if np.iscomplexobj(values):
-        raise TypeError(f"{name} must be real, got complex numbers")
-    if np.ma.is_masked(values):
-        raise ValueError(f"masked values in {name}")
-    vector = np.array(values, dtype=float, order="C")
-    if vector.ndim != 1:
-        raise ValueError(f"{name} must be 1-dimensional, got shape {vector.shape}")
-    return vector
-
-
-def _check_state(y0: Any) -> np.ndarray:
-    y = _real_vector(y0, "y0")
+def _check_halves(y0: Any) -> np.ndarray:
+    y = check_state(y0)
     if y.size == 0 or y.size % 2:
         raise ValueError(f"y0 must hold q and v, an even number of components, got {y.size}")
-    if not np.isfinite(y).all():
-        raise ValueError("All components of the initial state `y0` must be finite.")
     return y
-
-
-def _saved_steps(n_steps: int, save_every: int | None) -> np.ndarray:
-    """Numbers of the steps after which the state is saved; 0, the start, is the first of them."""
-    if save_every is None:
-        save_every = max(n_steps, 1)
-    if isinstance(save_every, bool) or not isinstance(save_every, (int, np.integer)) or save_every < 1:
-        raise ValueError(f"save_every must be a positive integer or None, got {save_every!r}")
-    return np.unique(np.append(np.arange(0, n_steps + 1, save_every, dtype=np.int64), np.int64(n_steps)))
 
 
 def _checked(acc: Callable[..., Any], size: int) -> Callable[..., np.ndarray]:
@@ -206,14 +155,6 @@ def _why_interpreted(acc: Callable[..., Any], n_extra: int) -> str:
     if returned is None:
         return f"acc is jitted for other signatures than {signature}"
     return "" if returned == signature.return_type else f"acc returns {returned}, not {signature.return_type}"
-
-
-def _message(reason: str, t: np.ndarray, ys: np.ndarray) -> str:
-    message = f"interpreted: {reason}" if reason else "compiled"
-    finite = np.isfinite(ys).all(axis=1)
-    if finite.all():
-        return message
-    return f"{message}; the saved states from t={t[np.argmin(finite)].item()!r} on are not finite"
 
 
 def _acc_signature(n_extra: int) -> Any:

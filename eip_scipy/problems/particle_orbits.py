@@ -1,0 +1,258 @@
+"""What a charged particle's states say: guiding centre, gyroradius, gyrophase, magnetic moment, banana tips."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .charged_particle import ParticleProblem
+
+__all__ = ["ParticleOrbit", "Tips", "radial_range"]
+
+FEWEST_PER_GYRATION = 4
+
+
+class Tips(NamedTuple):
+    """Where a trapped particle turns back.
+
+    Attributes
+    ----------
+    t, R, z : ndarray, shape (k,)
+        Time, and the guiding centre's distance from the axis and height.
+    """
+
+    t: np.ndarray
+    R: np.ndarray
+    z: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleOrbit:
+    """States of a charged particle along a run, and the observables that they hold.
+
+    Parameters
+    ----------
+    problem : ParticleProblem
+        Field, mass, charge and form of the states.
+    t : ndarray, shape (m,)
+    y : ndarray, shape (6, m)
+        As `integrate` returns them.
+
+    Notes
+    -----
+    Lengths, times and velocities are in the problem's units. Guiding centre, gyroradius and magnetic moment are those
+    of lowest order, at each state by itself; they oscillate with the gyration by a part of the order of the gyroradius
+    over the field's length. `averaged` takes that out where states are saved several times a gyration.
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPRK4, integrate
+    >>> from eip_scipy.problems import tokamak
+    >>> from eip_scipy.problems.particle_orbits import ParticleOrbit
+    >>> problem = tokamak("banana", t_end=30_000)
+    >>> run = integrate(problem, method=EIPRK4, save_every=1)
+    >>> ParticleOrbit(problem, run.t, run.y).banana_tips().R.round(3).tolist()
+    [1.01]
+    """
+
+    problem: ParticleProblem
+    t: np.ndarray
+    y: np.ndarray
+
+    @property
+    def x(self) -> np.ndarray:
+        """Positions (3, m)."""
+        return self.y[:3]
+
+    @cached_property
+    def v(self) -> np.ndarray:
+        """Velocities (3, m)."""
+        return self.problem.velocity(self.y)
+
+    @property
+    def R(self) -> np.ndarray:  # noqa: N802
+        """Distances from the z axis (m,)."""
+        return np.hypot(self.y[0], self.y[1])
+
+    @property
+    def z(self) -> np.ndarray:
+        """Heights (m,)."""
+        return self.y[2]
+
+    @cached_property
+    def energy(self) -> np.ndarray:
+        """H = m v^2 / 2 + q phi (m,); ValueError for a field whose potential is not known."""
+        if self.problem.field.functions.phi is None:
+            raise ValueError("the energy needs the field's potential; give it to ParticleField.")
+        phi = self.problem.field.along("phi", self.x)
+        return 0.5 * self.problem.mass * (self.v * self.v).sum(axis=0) + self.problem.charge * phi
+
+    @cached_property
+    def momentum(self) -> np.ndarray:
+        """L = x p_y - y p_x with the canonical p = m v + q A (m,); ValueError for a field whose A is not known."""
+        if self.problem.field.vector_potential is None:
+            raise ValueError("the canonical momentum needs the field's vector_potential; give it to ParticleField.")
+        if self.problem.form == "canonical":
+            p = self.y[3:]
+        else:
+            p = self.problem.mass * self.v + self.problem.charge * self.problem.field.along("A", self.x)
+        return self.y[0] * p[1] - self.y[1] * p[0]
+
+    @cached_property
+    def _magnetic(self) -> np.ndarray:
+        return self.problem.field.along("B", self.x)
+
+    @cached_property
+    def _strength(self) -> np.ndarray:
+        return np.sqrt((self._magnetic * self._magnetic).sum(axis=0))
+
+    @cached_property
+    def gyrofrequency(self) -> np.ndarray:
+        """Frequency ``|q| B / m`` (m,)."""
+        return abs(self.problem.charge) / self.problem.mass * self._strength
+
+    @cached_property
+    def parallel_velocity(self) -> np.ndarray:
+        """Component of v along B (m,)."""
+        return (self.v * self._magnetic).sum(axis=0) / self._strength
+
+    @cached_property
+    def _gyrating(self) -> np.ndarray:
+        """Velocity across B without the drift E x B / B^2."""
+        across = self.v - self.parallel_velocity / self._strength * self._magnetic
+        E = self.problem.field.along("E", self.x)
+        return across - np.cross(E, self._magnetic, axis=0) / self._strength**2
+
+    @cached_property
+    def gyroradius(self) -> np.ndarray:
+        """Radius ``m v_perp / (|q| B)`` (m,), with v_perp relative to the drift E x B / B^2."""
+        return np.sqrt((self._gyrating**2).sum(axis=0)) / self.gyrofrequency
+
+    @cached_property
+    def magnetic_moment(self) -> np.ndarray:
+        """Moment ``m v_perp^2 / (2 B)`` (m,), with v_perp relative to the drift E x B / B^2; an adiabatic invariant."""
+        return 0.5 * self.problem.mass * (self._gyrating**2).sum(axis=0) / self._strength
+
+    @cached_property
+    def guiding_centre(self) -> np.ndarray:
+        """Positions x + m v x B / (q B^2), (3, m)."""
+        ratio = self.problem.mass / self.problem.charge
+        return self.x + ratio * np.cross(self.v, self._magnetic, axis=0) / self._strength**2
+
+    @cached_property
+    def guiding_angle(self) -> np.ndarray:
+        """Angle of the guiding centre around the z axis in rad, without jumps (m,)."""
+        return np.unwrap(np.arctan2(self.guiding_centre[1], self.guiding_centre[0]))
+
+    @cached_property
+    def gyrophase(self) -> np.ndarray:
+        """Angle of the gyration around B in rad, without jumps (m,); from the direction away from the z axis."""
+        b = self._magnetic / self._strength
+        away = np.stack([self.y[0], self.y[1], np.zeros_like(self.t)]) / self.R
+        first = away - (away * b).sum(axis=0) * b
+        first = first / np.sqrt((first * first).sum(axis=0))
+        second = np.cross(b, first, axis=0)
+        return np.unwrap(np.arctan2((self._gyrating * second).sum(axis=0), (self._gyrating * first).sum(axis=0)))
+
+    @cached_property
+    def _per_gyration(self) -> int:
+        """States in one gyration at the start."""
+        spacing = float(np.median(np.diff(self.t[: 2 * FEWEST_PER_GYRATION])))
+        count = round(2 * np.pi / (self.gyrofrequency[0] * spacing))
+        if count < FEWEST_PER_GYRATION or count >= self.t.size:
+            raise ValueError(
+                f"a gyration has {count} of the {self.t.size} states; averages need at least {FEWEST_PER_GYRATION} in "
+                "one, and more than one: save more often (save_every), or integrate longer."
+            )
+        return count
+
+    def averaged(self, values: Any) -> np.ndarray:
+        """Running means over one gyration of what is known at each state.
+
+        Parameters
+        ----------
+        values : array_like, shape (..., m)
+
+        Returns
+        -------
+        ndarray, shape (..., k)
+            k = m + 1 less the states in a gyration; ``averaged(orbit.t)`` are the times.
+
+        Raises
+        ------
+        ValueError
+            When a gyration has fewer than four states, or more than there are.
+        """
+        n = self._per_gyration
+        values = np.asarray(values, dtype=float)
+        # About the first value, so that a long sum does not lose digits of what varies.
+        sums = np.cumsum(values - values[..., :1], axis=-1)
+        means = np.concatenate([sums[..., n - 1 : n], sums[..., n:] - sums[..., :-n]], axis=-1) / n
+        return means + values[..., :1]
+
+    def banana_tips(self) -> Tips:
+        """Places where the averaged velocity along B changes its sign.
+
+        Returns
+        -------
+        Tips
+            Of the guiding centre, averaged; interpolated linearly between two states.
+
+        Raises
+        ------
+        ValueError
+            As `averaged`.
+        """
+        along = self.averaged(self.parallel_velocity)
+        k = np.flatnonzero(np.sign(along[1:]) * np.sign(along[:-1]) < 0)
+        part = along[k] / (along[k] - along[k + 1])
+        X = self.guiding_centre
+        found = (self.averaged(values) for values in (self.t, np.hypot(X[0], X[1]), X[2]))
+        return Tips(*(values[k] + part * (values[k + 1] - values[k]) for values in found))
+
+    def turns(self) -> np.ndarray:
+        """Revolutions of the guiding centre around the z axis since the first state (m,), positive either way."""
+        return np.abs(self.guiding_angle - self.guiding_angle[0]) / (2 * np.pi)
+
+    def poloidal_turns(self) -> Iterator[slice]:
+        """Parts of the run between two passages of the averaged guiding centre upward through z = 0.
+
+        Yields
+        ------
+        slice
+            Of the states; the parts before the first and after the last such passage are left out.
+
+        Raises
+        ------
+        ValueError
+            As `averaged`.
+        """
+        height = self.averaged(self.guiding_centre[2])
+        shift = self._per_gyration // 2
+        yield from (slice(a, b) for a, b in pairwise(shift + np.flatnonzero((height[:-1] < 0) & (height[1:] >= 0))))
+
+
+def radial_range(orbit: ParticleOrbit, turn: float) -> float:
+    """Half of the range of R in one turn of the guiding centre around the z axis: the gyroradius that a picture shows.
+
+    Parameters
+    ----------
+    orbit : ParticleOrbit
+    turn : float
+        Its end in turns since the first state; 1 for the first turn.
+
+    Returns
+    -------
+    float
+        nan when the run does not reach the turn's end.
+    """
+    turns = orbit.turns()
+    if not turns[-1] >= turn:
+        return float("nan")
+    R = orbit.R[(turns >= turn - 1) & (turns <= turn)]
+    return float(np.ptp(R)) / 2

@@ -1,0 +1,412 @@
+"""Charged particles: fields against the paper's formulas in 30 digits, invariants, observables, fields of one's own."""
+
+import math
+from dataclasses import replace
+
+import mpmath as mp
+import numpy as np
+import pytest
+from numba import njit
+
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, Invariant, check_gradient, integrate
+from eip_scipy.problems import TOKAMAK, UNIFORM, ParticleField, charged_particle, tokamak, uniform_field
+from eip_scipy.problems.particle_orbits import ParticleOrbit, radial_range
+
+POINTS = [(1.05, 0.0, 0.0), (0.3, -0.9, 0.07), (-0.8, 0.7, -0.2), (1.3, 0.2, 0.5)]
+PROBLEMS = {
+    f"{make.__name__}-{form}": make(form=form)
+    for make in (uniform_field, tokamak)
+    for form in ("canonical", "velocity")
+}
+
+
+# --- the paper's fields ---
+
+
+def paper_uniform(x, y, z):
+    """A and phi as printed."""
+    return (-y / 2, x / 2, mp.mpf(0)), mp.mpf("1e-2") / mp.sqrt(x**2 + y**2)
+
+
+def paper_tokamak(x, y, z):
+    R = mp.sqrt(x**2 + y**2)
+    b = ((1 - R) ** 2 + z**2) / (4 * R**2)
+    return (x * z / (2 * R**2) - b * y, y * z / (2 * R**2) + b * x, -mp.log(R) / 2), mp.mpf(0)
+
+
+def paper_tokamak_magnetic(x, y, z):
+    R = mp.sqrt(x**2 + y**2)
+    return -(2 * y + x * z) / (2 * R**2), (2 * x - y * z) / (2 * R**2), (R - 1) / (2 * R)
+
+
+FIELDS = [(UNIFORM, paper_uniform), (TOKAMAK, paper_tokamak)]
+
+
+def exact_jacobian(paper, point):
+    """Rows dA_i/dx_j, and grad phi."""
+
+    def slope(value, j):
+        return mp.diff(value, point, tuple(int(k == j) for k in range(3)))
+
+    rows = [[slope(lambda *p, i=i: paper(*p)[0][i], j) for j in range(3)] for i in range(3)]
+    return np.array(rows, dtype=float), np.array([slope(lambda *p: paper(*p)[1], j) for j in range(3)], dtype=float)
+
+
+@pytest.mark.parametrize(("field", "paper"), FIELDS, ids=["uniform", "tokamak"])
+@pytest.mark.parametrize("point", POINTS)
+def test_field_is_the_papers(field, paper, point):
+    functions = field.functions
+    with mp.workdps(30):
+        exact = [mp.mpf(c) for c in point]
+        A, phi = paper(*exact)
+        jacobian, slope = exact_jacobian(paper, exact)
+    np.testing.assert_allclose(functions.A(*point), np.array(A, dtype=float), rtol=1e-14, atol=1e-16)
+    np.testing.assert_allclose(functions.phi(*point), float(phi), rtol=1e-15)
+    np.testing.assert_allclose(np.array(functions.jacobian(*point)), jacobian, rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(functions.E(*point), -slope, rtol=1e-13, atol=1e-17)
+
+
+@pytest.mark.parametrize(("field", "paper"), FIELDS, ids=["uniform", "tokamak"])
+@pytest.mark.parametrize("point", POINTS)
+def test_magnetic_field_is_the_curl_and_the_papers(field, paper, point):
+    with mp.workdps(30):
+        exact = [mp.mpf(c) for c in point]
+        d, _ = exact_jacobian(paper, exact)
+        printed = (0, 0, 1) if field is UNIFORM else paper_tokamak_magnetic(*exact)
+    curl = [d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1]]
+    np.testing.assert_allclose(field.functions.B(*point), curl, rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(field.functions.B(*point), np.array(printed, dtype=float), rtol=1e-14, atol=1e-16)
+
+
+def test_fields_along_many_points():
+    x = np.array(POINTS).T
+    for key in ("A", "E", "B"):
+        expected = np.array([getattr(UNIFORM.functions, key)(*point) for point in POINTS]).T
+        np.testing.assert_array_equal(UNIFORM.along(key, x), expected)
+    np.testing.assert_array_equal(UNIFORM.along("phi", x), [UNIFORM.functions.phi(*point) for point in POINTS])
+
+
+# --- equations and invariants ---
+
+
+@pytest.mark.parametrize("problem", PROBLEMS.values(), ids=list(PROBLEMS))
+def test_invariants_have_their_gradients_and_do_not_change(problem):
+    rng = np.random.default_rng(5)
+    for point in POINTS:
+        y = np.concatenate([point, rng.normal(0.0, 0.1, 3)])
+        f = problem.fun(0.0, y)
+        for item in problem.invariants:
+            assert check_gradient(item, 0.0, y, fun=problem.fun) < 1e-8
+            gradient = np.zeros(6)
+            item.grad(0.0, y, *([f] if item.uses_f else []), gradient, *item.args)
+            assert abs(gradient @ f) < 1e-15 + 1e-13 * (np.abs(gradient) * np.abs(f)).sum()
+
+
+@pytest.mark.parametrize("make", [uniform_field, tokamak])
+def test_both_forms_are_the_same_motion(make):
+    t_end = 40.0
+    ends = []
+    for form in ("canonical", "velocity"):
+        problem = make(form=form, t_end=t_end, h=0.02)
+        run = integrate(problem, method=EIPDOP853, invariants=())
+        end = run.y[:, -1:]
+        ends.append(np.concatenate([end[:3], problem.velocity(end)])[:, 0])
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-13)
+    assert np.linalg.norm(ends[0][:3] - problem.y0[:3]) > 0.01
+
+
+@pytest.mark.parametrize("make", [uniform_field, tokamak])
+@pytest.mark.parametrize("form", ["canonical", "velocity"])
+def test_first_reference_state_is_met(make, form):
+    problem = make(form=form)
+    t = problem.t_span[1] / 100
+    run = integrate(problem, (0.0, t), method=EIPDOP853, h=problem.h / 2, compensated=True)
+    np.testing.assert_allclose(run.y[:, -1], problem.reference(t), rtol=0, atol=1e-11)
+    assert problem.reference(1.5 * t) is None
+
+
+@pytest.mark.parametrize("problem", PROBLEMS.values(), ids=list(PROBLEMS))
+def test_order_four_with_the_invariants_kept(problem):
+    t = 300 * problem.h
+    truth = integrate(problem, (0.0, t), method=EIPDOP853, h=problem.h / 4).y[:, -1]
+    errors = []
+    for n in (2, 4):
+        run = integrate(problem, (0.0, t), method=EIPRK4, h=problem.h / n)
+        errors.append(np.linalg.norm(run.y[:, -1] - truth))
+        assert (run.max_defect / np.abs(run.invariants[:, 0])).max() < 1e-10
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.25)
+
+
+def test_orientation_of_the_axes_does_not_matter():
+    """Blocks of 3: a start turned around z gives the turned orbit, with the default metric, too."""
+    turn = np.array([[math.cos(0.7), -math.sin(0.7), 0.0], [math.sin(0.7), math.cos(0.7), 0.0], [0.0, 0.0, 1.0]])
+    x, v = np.array([1.05, 0, 0]), np.array([0, 4.816e-4, -2.059e-3])
+    ends = []
+    for R in (np.eye(3), turn):
+        problem = charged_particle(TOKAMAK, R @ x, R @ v, t_span=(0.0, 60.0), h=math.pi / 10)
+        ends.append(R.T @ integrate(problem, method=EIPRK4).y[:3, -1])
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-12)
+
+
+# --- observables ---
+
+
+@njit
+def constant_a(x, y, z):
+    return -y, x, 0.0
+
+
+@njit
+def constant_b(x, y, z):
+    return 0.0, 0.0, 2.0
+
+
+@njit
+def constant_e(x, y, z):
+    return 0.0, 0.3, 0.0
+
+
+@njit
+def slope_phi(x, y, z):
+    return -0.3 * y
+
+
+@pytest.mark.parametrize("charge", [3.0, -3.0])
+def test_gyration_in_a_constant_field(charge):
+    """B = 2 e_z, m = 1.5: frequency |q| B / m, radius m v / (|q| B), and the E x B drift (0.15, 0, 0)."""
+    field = ParticleField(vector_potential=constant_a, magnetic=constant_b, electric=constant_e, potential=slope_phi)
+    mass, v = 1.5, np.array([0.15 + 0.4, 0.0, 0.25])
+    problem = charged_particle(field, [0.5, 1.0, 0.0], v, mass=mass, charge=charge, t_span=(0.0, 10.0), h=0.01)
+    run = integrate(problem, method=EIPRK4, save_every=1)
+    orbit = ParticleOrbit(problem, run.t, run.y)
+    omega = abs(charge) * 2.0 / mass
+    assert orbit.gyrofrequency == pytest.approx(omega)
+    np.testing.assert_allclose(orbit.gyroradius, 0.4 / omega, rtol=1e-7)
+    np.testing.assert_allclose(orbit.magnetic_moment, 0.5 * mass * 0.4**2 / 2.0, rtol=1e-7)
+    np.testing.assert_allclose(orbit.parallel_velocity, 0.25, rtol=1e-7)
+    np.testing.assert_allclose(orbit.v[:, -1], problem.velocity(run.y)[:, -1])
+    # Guiding centre: drifts with 0.15 along x and 0.25 along z; averaged, its gyration is gone.
+    drift = np.diff(orbit.averaged(orbit.guiding_centre)[:, [0, -1]], axis=1)[:, 0]
+    expected = np.array([0.15, 0.0, 0.25]) * (orbit.averaged(run.t)[-1] - orbit.averaged(run.t)[0])
+    np.testing.assert_allclose(drift, expected, atol=2e-4)
+    np.testing.assert_allclose(orbit.energy, problem.invariants[0].fun(0.0, problem.y0, problem.params), rtol=1e-11)
+    # Clockwise for a positive charge, seen along B; relative to the direction away from the axis.
+    angle = orbit.gyrophase + np.unwrap(np.arctan2(run.y[1], run.y[0]))
+    np.testing.assert_allclose(angle - angle[0], -np.sign(charge) * omega * run.t, atol=1e-5)
+
+
+def test_drifting_gyration_in_the_papers_field():
+    problem = uniform_field(t_end=2700 * math.pi / 10)
+    run = integrate(problem, method=EIPDOP853, save_every=1)
+    orbit = ParticleOrbit(problem, run.t, run.y)
+    # Drift of the guiding centre at R = 1.1: E / B = 1e-2 / R^2, an angle of t 1e-2 / R^3, 2 % less by the gyroradius.
+    assert orbit.guiding_angle[-1] - orbit.guiding_angle[0] == pytest.approx(-run.t[-1] * 1e-2 / 1.1**3, rel=0.02)
+    assert radial_range(orbit, 1.0) == pytest.approx(0.10954, abs=1e-5)
+    assert math.isnan(radial_range(orbit, 2.0))
+    assert orbit.turns()[-1] == pytest.approx(1.0043, abs=0.001)
+    np.testing.assert_allclose(orbit.momentum, orbit.momentum[0], rtol=1e-11)
+
+
+def test_banana_tip():
+    """The first tip at a tenth of the paper's interval, by a method of order 8."""
+    problem = tokamak("banana", t_end=16_000)
+    run = integrate(problem, method=EIPDOP853, h=2 * problem.h, save_every=1)
+    orbit = ParticleOrbit(problem, run.t, run.y)
+    tips = orbit.banana_tips()
+    np.testing.assert_allclose(tips.R, [1.00953], atol=2e-5)
+    k = int(np.searchsorted(run.t, tips.t[0]))
+    assert abs(orbit.parallel_velocity[k]) < 0.01 * np.abs(orbit.parallel_velocity).max()
+    assert tips.z[0] == pytest.approx(orbit.guiding_centre[2, k], abs=1e-5)
+
+
+def test_poloidal_turns_of_the_transit_orbit():
+    problem = tokamak("transit", t_end=60_000)
+    run = integrate(problem, method=EIPDOP853, h=2 * problem.h, save_every=1)
+    orbit = ParticleOrbit(problem, run.t, run.y)
+    parts = list(orbit.poloidal_turns())
+    assert len(parts) == 2
+    assert parts[0].stop == parts[1].start
+    for part in parts:
+        assert orbit.z[part].max() == pytest.approx(0.0614, abs=2e-4)
+        assert orbit.z[part].min() == pytest.approx(-0.0614, abs=2e-4)
+        assert orbit.R[part].max() - 1 < 0.06 < 1 - orbit.R[part].min()
+
+
+def test_averages_need_enough_states():
+    problem = tokamak(t_end=200.0)
+    run = integrate(problem, method=EIPRK4, save_every=10)
+    with pytest.raises(ValueError, match="save more often"):
+        ParticleOrbit(problem, run.t, run.y).averaged(run.t)
+
+
+def test_averages_take_out_what_has_the_gyrations_period():
+    problem = uniform_field(t_end=10.0)
+    t = np.arange(100) * math.pi / 10
+    orbit = ParticleOrbit(problem, t, np.tile(problem.y0[:, None], 100))
+    np.testing.assert_allclose(orbit.averaged(3.0 + np.cos(t)), 3.0, rtol=1e-13)
+    np.testing.assert_allclose(orbit.averaged(t), t[:81] + 9.5 * math.pi / 10, rtol=1e-13)
+
+
+# --- fields of one's own ---
+
+
+@njit
+def mirror_a(x, y, z):
+    return -0.5 * y * (1 + z * z), 0.5 * x * (1 + z * z), 0.0
+
+
+@njit
+def mirror_b(x, y, z):
+    return -x * z, -y * z, 1 + z * z
+
+
+@njit
+def mirror_jacobian(x, y, z):
+    b = 0.5 * (1 + z * z)
+    return (0.0, -b, -y * z), (b, 0.0, x * z), (0.0, 0.0, 0.0)
+
+
+@njit
+def well(x, y, z):
+    return 0.05 * (x * x + y * y) * (1 + z)
+
+
+@njit
+def well_force(x, y, z):
+    return -0.1 * x * (1 + z), -0.1 * y * (1 + z), -0.05 * (x * x + y * y)
+
+
+MIRRORS = {
+    "A alone": (ParticleField(mirror_a, potential=well, axisymmetric=True), "canonical", "HL"),
+    "A, jacobian": (
+        ParticleField(mirror_a, mirror_jacobian, potential=well, electric=well_force, axisymmetric=True),
+        "canonical",
+        "HL",
+    ),
+    "A, (x, v)": (ParticleField(mirror_a, potential=well, axisymmetric=True), "velocity", "HL"),
+    "B alone": (ParticleField(magnetic=mirror_b, potential=well, electric=well_force), "velocity", "H"),
+    "no potential": (ParticleField(magnetic=mirror_b, electric=well_force), "velocity", ""),
+    "not axisymmetric": (ParticleField(mirror_a, potential=well), "canonical", "H"),
+}
+
+
+def mirror_run(field, form, **options):
+    problem = charged_particle(
+        field, [0.2, 0.1, 0.3], [0.1, 0.3, 0.2], mass=2.0, charge=-1.5, form=form, t_span=(0.0, 20.0), h=0.05
+    )
+    run = integrate(problem, method=EIPRK45, first_step=0.05, rtol=1e-11, atol=1e-13, **options)
+    return problem, run
+
+
+@pytest.mark.parametrize("name", MIRRORS)
+def test_own_field(name):
+    field, form, kept = MIRRORS[name]
+    problem, run = mirror_run(field, form)
+    assert "".join(item.name for item in problem.invariants) == kept
+    assert run.success
+    assert run.max_defect.max(initial=0.0) < 1e-11
+    reference, truth = mirror_run(*MIRRORS["A, jacobian"][:2])
+    np.testing.assert_allclose(run.y[:3, -1], truth.y[:3, -1], rtol=0, atol=2e-9)
+    np.testing.assert_allclose(problem.velocity(run.y[:, -1:]), reference.velocity(truth.y[:, -1:]), rtol=0, atol=2e-9)
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("name", MIRRORS)
+def test_own_field_compiles(name):
+    field, form, _ = MIRRORS[name]
+    assert mirror_run(field, form, compiled=True)[1].compiled
+
+
+def test_plain_python_functions_do_as_well():
+    plain = ParticleField(
+        lambda x, y, z: [-0.5 * y * (1 + z * z), 0.5 * x * (1 + z * z), 0.0],
+        potential=lambda x, y, z: 0.05 * (x * x + y * y) * (1 + z),
+        axisymmetric=True,
+    )
+    _, run = mirror_run(plain, "canonical")
+    _, truth = mirror_run(*MIRRORS["A, jacobian"][:2])
+    assert not run.compiled
+    np.testing.assert_allclose(run.y[:3, -1], truth.y[:3, -1], rtol=0, atol=2e-9)
+    assert run.max_defect.max() < 1e-11
+    points = np.array(POINTS).T
+    np.testing.assert_allclose(plain.along("B", points), np.array([mirror_b(*p) for p in POINTS]).T, rtol=1e-10)
+
+
+def test_differences_take_the_fields_length():
+    """The same field on a small scale: length tells the step."""
+    small = 1e-6
+    field = ParticleField(
+        lambda x, y, z: (-y * math.cos(z / small), x * math.cos(z / small), 0.0), axisymmetric=True, length=small
+    )
+    x = np.array([0.3, -0.2, 0.5]) * small
+    jacobian = np.array(field.functions.jacobian(*x))
+    assert jacobian[0, 2] == pytest.approx(x[1] / small * math.sin(0.5), rel=1e-11)
+
+
+def test_a_wrong_claim_of_symmetry_is_seen():
+    field = ParticleField(lambda x, y, z: (-y, x * (1 + 0.1 * x), 0.0), axisymmetric=True)
+    problem = charged_particle(field, [0.2, 0.1, 0.0], [0.1, 0.3, 0.2], t_span=(0.0, 1.0), h=0.1)
+    with pytest.warns(UserWarning, match="L"):
+        integrate(problem, method=EIPRK4)
+
+
+def test_functions_of_one_field_are_composed_once():
+    a, b = tokamak("banana"), tokamak("transit")
+    assert a.rhs is b.rhs
+    assert a.invariants[0].fun is b.invariants[0].fun
+    assert replace(a, h=0.1).field is TOKAMAK
+
+
+def start(field=UNIFORM, position=(1.0, 0, 0), velocity=(0, 0.1, 0), **options):
+    return charged_particle(field, position, velocity, t_span=(0.0, 1.0), **options)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: start(field="uniform"), TypeError, "ParticleField"),
+        (lambda: start(form="canonicl"), ValueError, "canonical"),
+        (lambda: start(position=(1.0, 0.0)), ValueError, "position must be three finite numbers"),
+        (lambda: start(velocity=(1.0, 0.0, np.nan)), ValueError, "velocity must be three finite numbers"),
+        (lambda: start(mass=0.0), ValueError, "mass must be positive"),
+        (lambda: start(charge=0.0), ValueError, "charge not 0"),
+        (lambda: start(position=(0.0, 0.0, 0.0)), (ValueError, ZeroDivisionError), "."),
+        (lambda: start(field=ParticleField(magnetic=constant_b)), ValueError, "vector_potential"),
+        (lambda: ParticleField(), ValueError, "vector_potential, or magnetic"),
+        (lambda: ParticleField(magnetic=constant_b, jacobian=mirror_jacobian), ValueError, "give vector_potential too"),
+        (lambda: ParticleField(vector_potential=3.0), TypeError, "function of"),
+        (lambda: ParticleField(constant_a, length=0.0), ValueError, "length must be positive"),
+        (lambda: start(field=ParticleField(constant_a, magnetic=mirror_b)), ValueError, "the curl of"),
+        (lambda: start(field=ParticleField(constant_a, mirror_jacobian)), ValueError, "the derivatives of"),
+        (
+            lambda: start(field=ParticleField(constant_a, potential=well, electric=constant_e)),
+            ValueError,
+            "minus the gradient",
+        ),
+        (lambda: start(field=ParticleField(lambda x, y, z: (x, y))), ValueError, "shape"),
+        (lambda: start(field=ParticleField(lambda x, y, z: (x, y, math.inf))), ValueError, "finite"),
+        (lambda: tokamak("bananna"), ValueError, "banana"),
+    ],
+)
+def test_bad_input(call, error, words):
+    with pytest.raises(error, match=words):
+        call()
+
+
+def test_energy_and_momentum_need_their_potentials():
+    field = ParticleField(magnetic=mirror_b, electric=well_force)
+    problem = start(field=field, form="velocity", h=0.1)
+    run = integrate(problem, method=EIPRK4, save_every=1)
+    orbit = ParticleOrbit(problem, run.t, run.y)
+    with pytest.raises(ValueError, match="potential"):
+        _ = orbit.energy
+    with pytest.raises(ValueError, match="vector_potential"):
+        _ = orbit.momentum
+
+
+def test_further_invariants_can_be_added():
+    """p_z in the uniform field, which the problem does not list: RK keeps it."""
+    problem = charged_particle(UNIFORM, [1, 0, 0], [0.1, 0, 0.2], t_span=(0, 20), h=math.pi / 10)
+    p_z = Invariant(lambda t, y, params: y[5], lambda t, y, params: np.eye(6)[5], args=(problem.params,), name="p_z")
+    run = integrate(problem, method=EIPRK4, invariants=[*problem.invariants, p_z])
+    assert run.max_defect[2] == 0.0
