@@ -92,6 +92,8 @@ class Members(NamedTuple):
         Those of the step, in the places that `result` names.
     max_correction : ndarray, shape (m,)
         In local errors.
+    side_by_side : ndarray of bool, shape (m,)
+        Whether the member ran in a vector with others.
     saved : ndarray, shape (m, times, n)
         States at the plan's `times`; nan after the end of a member that did not reach them. No times: shape (m, 0, n).
     """
@@ -103,6 +105,7 @@ class Members(NamedTuple):
     max_defect: np.ndarray
     counters: np.ndarray
     max_correction: np.ndarray
+    side_by_side: np.ndarray
     saved: np.ndarray
 
     @classmethod
@@ -116,6 +119,7 @@ class Members(NamedTuple):
             max_defect=np.full((m, invariants), np.nan),
             counters=np.zeros((m, N_COUNTERS), np.int64),
             max_correction=np.full(m, np.nan),
+            side_by_side=np.zeros(m, bool),
             saved=np.full((m, times, n), np.nan, dtype),
         )
 
@@ -477,6 +481,7 @@ class _Driver:
                     continue
                 out.y[k], out.t[k], out.max_defect[k] = end.y, end.t, end.max_defect
                 out.max_correction[k], out.counters[k] = end.max_correction, end.counters
+                out.side_by_side[k] = True
                 _describe(out, k, FAILED if end.reason else 0, end.reason or ARRIVED)
             first = group.stop
         return first

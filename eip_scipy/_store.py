@@ -140,6 +140,7 @@ class ZarrStore:
         self._make("max_defect", np.dtype(float), ("member", "invariant"), empty.max_defect.shape[1:])
         self._make("max_correction", np.dtype(float), ("member",))
         self._make("counters", np.dtype(np.int64), ("member", "counter"), empty.counters.shape[1:], fill=0)
+        self._make("side_by_side", np.dtype(bool), ("member",), fill=False)
         self._make("message", str, ("member",), fill="")
         self._make("status", np.dtype(np.int64), ("member",), fill=NOT_RUN)
         # Last: a group without it was left before it was whole.
@@ -174,6 +175,7 @@ class ZarrStore:
             max_defect=group["max_defect"][place],
             counters=group["counters"][place],
             max_correction=group["max_correction"][place],
+            side_by_side=group["side_by_side"][place],
             saved=group["states"][place].swapaxes(1, 2) if "states" in group else none,
         )
 
@@ -184,6 +186,7 @@ class ZarrStore:
         group["max_defect"][place] = members.max_defect
         group["counters"][place] = members.counters
         group["max_correction"][place] = members.max_correction
+        group["side_by_side"][place] = members.side_by_side
         if "states" in group:
             group["states"][place] = members.saved.swapaxes(1, 2)
         group["message"][place] = np.array(members.message, dtype=object)
