@@ -102,9 +102,10 @@ def canonical_rhs(A, jacobian, E, y, out, m, q):
     a = A(y[0], y[1], y[2])
     d = jacobian(y[0], y[1], y[2])
     e = E(y[0], y[1], y[2])
-    u = (y[3] - q * a[0]) / m
-    v = (y[4] - q * a[1]) / m
-    w = (y[5] - q * a[2]) / m
+    inverse = 1.0 / m  # does not wait for the field, as a division of the velocity would
+    u = (y[3] - q * a[0]) * inverse
+    v = (y[4] - q * a[1]) * inverse
+    w = (y[5] - q * a[2]) * inverse
     out[0] = u
     out[1] = v
     out[2] = w
@@ -120,7 +121,7 @@ def canonical_energy(A, phi, y, m, q):
     u = y[3] - q * a[0]
     v = y[4] - q * a[1]
     w = y[5] - q * a[2]
-    return 0.5 * (u * u + v * v + w * w) / m + q * phi(y[0], y[1], y[2])
+    return 0.5 / m * (u * u + v * v + w * w) + q * phi(y[0], y[1], y[2])
 
 
 def canonical_energy_gradient(t, y, f, out, params):
