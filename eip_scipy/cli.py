@@ -183,7 +183,11 @@ def _listing() -> dict[str, dict[str, str]]:
         "commands": {name: summary for name, (summary, _, _) in _commands().items()},
         "methods": {name: _first_line(method) for name, method in solar_system.fixed_step_methods().items()},
         "comparators": {name: _first_line(make) for name, make in others.items() if not isinstance(make, type)},
-        "problems": {name: _first_line(make) for name, make in scenes.items() if not isinstance(make, type)},
+        "problems": {
+            name: _first_line(make)
+            for name, make in scenes.items()
+            if callable(make) and not isinstance(make, type)  # neither records nor fields
+        },
         "data": {name: f"{len(data.bodies)} bodies at {data.epoch}, {data.axes}" for name, data in sets.items()},
     }
 

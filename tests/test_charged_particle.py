@@ -207,6 +207,7 @@ def test_drifting_gyration_in_the_papers_field():
     np.testing.assert_allclose(orbit.momentum, orbit.momentum[0], rtol=1e-11)
 
 
+@pytest.mark.slow_without_jit
 def test_banana_tip():
     """The first tip at a tenth of the paper's interval, by a method of order 8."""
     problem = tokamak("banana", t_end=16_000)
@@ -219,6 +220,7 @@ def test_banana_tip():
     assert tips.z[0] == pytest.approx(orbit.guiding_centre[2, k], abs=1e-5)
 
 
+@pytest.mark.slow_without_jit
 def test_poloidal_turns_of_the_transit_orbit():
     problem = tokamak("transit", t_end=60_000)
     run = integrate(problem, method=EIPDOP853, h=2 * problem.h, save_every=1)
@@ -348,6 +350,33 @@ def test_a_wrong_claim_of_symmetry_is_seen():
     problem = charged_particle(field, [0.2, 0.1, 0.0], [0.1, 0.3, 0.2], t_span=(0.0, 1.0), h=0.1)
     with pytest.warns(UserWarning, match="L"):
         integrate(problem, method=EIPRK4)
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("form", ["canonical", "velocity"])
+def test_compiled_functions_may_return_integers_and_arrays(form):
+    @njit
+    def mixed_a(x, y, z):
+        return -0.5 * y, 0.5 * x, 0
+
+    @njit
+    def array_jacobian(x, y, z):
+        return np.array([[0.0, -0.5, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
+
+    @njit
+    def mixed_e(x, y, z):
+        return 0, 0.02 * y, 0
+
+    field = ParticleField(mixed_a, array_jacobian, lambda x, y, z: -0.01 * y * y, mixed_e)
+    jitted = replace(field, potential=njit(field.potential))
+    problem = charged_particle(jitted, [1, 0, 0], [0.1, 0, 0.2], form=form, t_span=(0, 20), h=0.05)
+    run = integrate(problem, method=EIPRK4, compiled=True)
+    assert run.max_defect.max() < 1e-13
+    plain = charged_particle(field, [1, 0, 0], [0.1, 0, 0.2], form=form, t_span=(0, 20), h=0.05)
+    np.testing.assert_allclose(integrate(plain, method=EIPRK4).y[:, -1], run.y[:, -1], atol=1e-13)
+    out = np.empty(6)
+    jitted.fill(0.0, problem.y0[:3], out)
+    np.testing.assert_array_equal(out, [0, 0, 0, 0, 0, 1])
 
 
 def test_functions_of_one_field_are_composed_once():

@@ -2,7 +2,8 @@
 
 Each function here takes the field's functions first, and is plain Python when they are; `compose` binds them. Called
 from compiled code all is inlined, and what two of the field's functions have in common is computed once: the loop is as
-fast as one written out for the field.
+fast as one written out for the field. Components are written out, because Numba takes only constant indices of a tuple
+such as (-y, x, 0), whose types differ.
 """
 
 from __future__ import annotations
@@ -101,9 +102,10 @@ def canonical_rhs(A, jacobian, E, y, out, m, q):
     a = A(y[0], y[1], y[2])
     d = jacobian(y[0], y[1], y[2])
     e = E(y[0], y[1], y[2])
-    u = (y[3] - q * a[0]) / m
-    v = (y[4] - q * a[1]) / m
-    w = (y[5] - q * a[2]) / m
+    inverse = 1.0 / m  # does not wait for the field, as a division of the velocity would
+    u = (y[3] - q * a[0]) * inverse
+    v = (y[4] - q * a[1]) * inverse
+    w = (y[5] - q * a[2]) * inverse
     out[0] = u
     out[1] = v
     out[2] = w
@@ -119,7 +121,7 @@ def canonical_energy(A, phi, y, m, q):
     u = y[3] - q * a[0]
     v = y[4] - q * a[1]
     w = y[5] - q * a[2]
-    return 0.5 * (u * u + v * v + w * w) / m + q * phi(y[0], y[1], y[2])
+    return 0.5 / m * (u * u + v * v + w * w) + q * phi(y[0], y[1], y[2])
 
 
 def canonical_energy_gradient(t, y, f, out, params):
@@ -202,9 +204,12 @@ def velocity_energy(phi, y, m, q):
 def velocity_energy_gradient(E, y, out, m, q):
     """Of H: (-q E, m v)."""
     e = E(y[0], y[1], y[2])
-    for k in range(3):
-        out[k] = -q * e[k]
-        out[k + 3] = m * y[k + 3]
+    out[0] = -q * e[0]
+    out[1] = -q * e[1]
+    out[2] = -q * e[2]
+    out[3] = m * y[3]
+    out[4] = m * y[4]
+    out[5] = m * y[5]
 
 
 @_jitable
@@ -219,10 +224,9 @@ def velocity_momentum_gradient(A, jacobian, y, out, m, q):
     """Of L."""
     a = A(y[0], y[1], y[2])
     d = jacobian(y[0], y[1], y[2])
-    for k in range(3):
-        out[k] = q * (y[0] * d[1][k] - y[1] * d[0][k])
-    out[0] += m * y[4] + q * a[1]
-    out[1] -= m * y[3] + q * a[0]
+    out[0] = q * (y[0] * d[1][0] - y[1] * d[0][0] + a[1]) + m * y[4]
+    out[1] = q * (y[0] * d[1][1] - y[1] * d[0][1] - a[0]) - m * y[3]
+    out[2] = q * (y[0] * d[1][2] - y[1] * d[0][2])
     out[3] = -m * y[1]
     out[4] = m * y[0]
     out[5] = 0.0

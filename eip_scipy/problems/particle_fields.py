@@ -121,9 +121,12 @@ class ParticleField:
         def fields(t: float, x: np.ndarray, out: np.ndarray) -> None:
             e = E(x[0], x[1], x[2])
             b = B(x[0], x[1], x[2])
-            for i in range(3):
-                out[i] = e[i]
-                out[i + 3] = b[i]
+            out[0] = e[0]
+            out[1] = e[1]
+            out[2] = e[2]
+            out[3] = b[0]
+            out[4] = b[1]
+            out[5] = b[2]
 
         return jit_like(fields, E, B)
 
@@ -201,8 +204,9 @@ def _compare(key: str, given: np.ndarray | None, expected: np.ndarray, slack: fl
 def _vectors(fun, points, out):
     for k in range(points.shape[0]):
         value = fun(points[k, 0], points[k, 1], points[k, 2])
-        for i in range(3):
-            out[k, i] = value[i]
+        out[k, 0] = value[0]
+        out[k, 1] = value[1]
+        out[k, 2] = value[2]
 
 
 @njit
