@@ -6,6 +6,7 @@ comes back there.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
@@ -26,7 +27,9 @@ __all__ = ["Batch", "Ended", "lanes_of", "why_one_by_one"]
 
 FEW_FLOATS = 128  # in a state of all lanes: more lanes for small systems, as the loop itself takes its time
 MOST_LANES = 32
-FIRST_MEETING, LEAST_MEETING, MOST_MEETING = 256, 32, 16384  # in steps
+# Steps from one meeting to the next: longer while none leaves, never longer than some tenths of a second.
+FIRST_MEETING, LEAST_MEETING = 32, 32
+MEETING_SECONDS = 0.1
 
 advance_batch = make_advance_batch(source_stamp("_batch.py"))
 
@@ -108,6 +111,7 @@ class Batch:
         self._own, self._joined = np.zeros((2, N_COUNTERS, lanes), np.int64)
         self._failed: dict[int, Ended] = {}
         self._advance: Callable[..., int] | None = None
+        self._length = FIRST_MEETING
         self._rows = driver.y.copy()
         self._single_work = [a for a in run.work if isinstance(a, np.ndarray)] + list(run.work.inner)
         self._fresh = [a.copy() for a in self._single_work]
@@ -128,15 +132,20 @@ class Batch:
         """
         m = len(y0s)
         sound = self._start(y0s, params, evaluations)
-        k, length = 0, FIRST_MEETING
+        k, length = 0, self._length
         for row, stop in enumerate(meetings):
             while k < stop:
                 watch()
-                end = min(stop, k + length)
+                end, begin = min(stop, k + length), time.perf_counter()
                 left = self._steps(k, end, params)
-                length = max(LEAST_MEETING, length // 2) if left else min(MOST_MEETING, 2 * length)
+                seconds = time.perf_counter() - begin
+                if left or seconds > 2 * MEETING_SECONDS:
+                    length = max(LEAST_MEETING if left else 1, length // 2)
+                elif seconds < MEETING_SECONDS and end - k == length:
+                    length *= 2
                 k = end
             save(row, self._states()[:m])
+        self._length = length
         return [self._ended(lane) if sound[lane] else None for lane in range(m)]
 
     def compile(self) -> None:
