@@ -2,6 +2,16 @@
 
 from ._problem import Problem
 from .forces import ForceConstants
+from .gross_pitaevskii import (
+    FieldProblem,
+    Grid,
+    GrossPitaevskii,
+    harmonic_trap,
+    plane_wave,
+    quartic_trap,
+    rotating_packet,
+    soliton,
+)
 from .hard_cases import HardCase, hard_cases
 from .harmonic import harmonic
 from .kepler import kepler
@@ -12,7 +22,10 @@ from .solar_system import solar_system
 from .time_transformed import centre_time, pair_time, reaches, time_transformed
 
 __all__ = [
+    "FieldProblem",
     "ForceConstants",
+    "Grid",
+    "GrossPitaevskii",
     "HardCase",
     "Problem",
     "SolarSystemData",
@@ -21,11 +34,16 @@ __all__ = [
     "figure_eight",
     "hard_cases",
     "harmonic",
+    "harmonic_trap",
     "kepler",
     "nbody",
     "pair_time",
+    "plane_wave",
     "pythagorean",
+    "quartic_trap",
     "reaches",
+    "rotating_packet",
     "solar_system",
+    "soliton",
     "time_transformed",
 ]
