@@ -67,6 +67,7 @@ class GrossPitaevskii:
         As given.
     V : ndarray
         The potential on the grid.
+    transforms : Transforms
     fft : str
         The library of the transforms.
 
@@ -114,11 +115,11 @@ class GrossPitaevskii:
             raise ValueError(f"a rotation needs two dimensions: Omega = {Omega!r} on {grid!r}.")
         self.grid, self.Omega, self.beta, self.nyquist = grid, float(Omega), float(beta), nyquist
         self.V = _on_grid(potential, grid)
-        self._fft = make_transforms(grid.shape, fft, threads)
-        self.fft = self._fft.name
+        self.transforms = make_transforms(grid.shape, fft, threads)
+        self.fft = self.transforms.name
         self._options = {"nyquist": nyquist, "fft": fft, "threads": threads}
-        self._linear = SpectralSum(grid, self._fft, self._kinetic_and_rotation())
-        self._Lz = None if grid.dim == 1 else SpectralSum(grid, self._fft, self._rotation())
+        self._linear = SpectralSum(grid, self.transforms, self._kinetic_and_rotation())
+        self._Lz = None if grid.dim == 1 else SpectralSum(grid, self.transforms, self._rotation())
 
     def __repr__(self) -> str:
         return f"GrossPitaevskii({self.grid!r}, Omega={self.Omega:g}, beta={self.beta:g})"

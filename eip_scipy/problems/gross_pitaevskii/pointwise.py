@@ -9,7 +9,17 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["add_potential", "derivative", "interaction_energy", "multiply", "turn", "weighted_square"]
+__all__ = [
+    "add_potential",
+    "derivative",
+    "divide_by_root",
+    "interaction_energy",
+    "multiply",
+    "quartic_sums",
+    "rotate",
+    "turn",
+    "weighted_square",
+]
 
 _jit = njit(cache=True, error_model="numpy")
 
@@ -125,6 +135,44 @@ def turn(f, factor, out):
     for i in range(f.size // 2):
         re, im = f[2 * i], f[2 * i + 1]
         out[2 * i], out[2 * i + 1] = -factor * im, factor * re
+
+
+@_jit
+def quartic_sums(psi, p, out):
+    """Fill out (5,) with the sums of nn, nq, mm, mq, qq: n = |psi|^2, m = Re(conj(psi) p), q = |p|^2; (rows, 2 m)."""
+    out[:] = 0.0
+    for r in range(psi.shape[0]):
+        nn = nq = mm = mq = qq = 0.0
+        a, b = psi[r], p[r]
+        for i in range(a.size // 2):
+            x, y, u, v = a[2 * i], a[2 * i + 1], b[2 * i], b[2 * i + 1]
+            n, m, q = x * x + y * y, x * u + y * v, u * u + v * v
+            nn += n * n
+            nq += n * q
+            mm += m * m
+            mq += m * q
+            qq += q * q
+        out[0] += nn
+        out[1] += nq
+        out[2] += mm
+        out[3] += mq
+        out[4] += qq
+
+
+@_jit
+def divide_by_root(a, psi, V, beta, shift, out):
+    """Out = a / sqrt(shift + V + beta |psi|^2), all flat."""
+    for i in range(V.size):
+        x, y = psi[2 * i], psi[2 * i + 1]
+        weight = 1 / np.sqrt(shift + V[i] + beta * (x * x + y * y))
+        out[2 * i], out[2 * i + 1] = weight * a[2 * i], weight * a[2 * i + 1]
+
+
+@_jit
+def rotate(a, b, c, s):
+    """A <- c a + s b, flat."""
+    for i in range(a.size):
+        a[i] = c * a[i] + s * b[i]
 
 
 def float_rows(field: np.ndarray, columns: int) -> np.ndarray:
