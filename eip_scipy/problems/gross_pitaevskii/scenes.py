@@ -9,9 +9,9 @@ import numpy as np
 
 from .equation import FieldProblem, GrossPitaevskii
 from .grid import Grid
-from .potentials import harmonic_trap
+from .potentials import harmonic_trap, quartic_trap
 
-__all__ = ["plane_wave", "rotating_packet", "soliton"]
+__all__ = ["line_condensate", "plane_wave", "ring_condensate", "rotating_packet", "soliton"]
 
 
 def soliton(
@@ -146,3 +146,45 @@ def rotating_packet(
     x, y = grid.mesh()
     psi0 = 2 / sqrt(pi) * (x + 1j * y) * np.exp(-8 * (x**2 + y**2))
     return gpe.problem(psi0, t_end, h, name="rotating-packet")
+
+
+def ring_condensate(kappa: float = 0.3, points: int = 256, **options: Any) -> GrossPitaevskii:
+    """The paper's fast rotating ring: V = -0.1 r^2 + kappa / 4 r^4 on [-10, 10]^2, Omega = 3.5, beta = 1000.
+
+    Parameters
+    ----------
+    kappa : float
+        The paper's ground state is that of 0.3; its dynamics starts when that becomes 0.7.
+    points : int
+        Along each axis; the phase turns by Omega r h = 1.8 from point to point with the paper's 256.
+    **options
+        Of `GrossPitaevskii`.
+
+    Returns
+    -------
+    GrossPitaevskii
+    """
+    grid = Grid((points, points), -10.0, 10.0)
+    return GrossPitaevskii(grid, quartic_trap(1.2, kappa, 1.0, 1.0), Omega=3.5, beta=1000.0, **options)
+
+
+def line_condensate(Omega: float = 0.7, points: int = 64, **options: Any) -> GrossPitaevskii:
+    """The paper's condensate with vortex lines: V = (x^2 + y^2 + z^2 / 4) / 2, beta = 400.
+
+    On [-10, 10]^2 x [-15, 15].
+
+    Parameters
+    ----------
+    Omega : float
+        0.7 for the paper's ground state, 0.9 for its dynamics.
+    points : int
+        Along each axis.
+    **options
+        Of `GrossPitaevskii`.
+
+    Returns
+    -------
+    GrossPitaevskii
+    """
+    grid = Grid((points, points, points), (-10.0, -10.0, -15.0), (10.0, 10.0, 15.0))
+    return GrossPitaevskii(grid, harmonic_trap(1.0, 1.0, 0.5), Omega=Omega, beta=400.0, **options)
