@@ -25,7 +25,9 @@ def assert_output(found, printed):
         assert agree(float(a), float(b)), f"{a}, printed as {b}"
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md", "docs/adaptive.md", "docs/hard-scenes.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/quickstart.md", "docs/adaptive.md", "docs/hard-scenes.md", "docs/gross-pitaevskii.md"]
+)
 def test_page(page, capsys):
     """All blocks of a page in turn, in one namespace; a block of text is what the code before it prints."""
     path = ROOT / page

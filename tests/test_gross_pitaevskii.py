@@ -180,6 +180,46 @@ def test_gradients(shape):
         assert check_gradient(invariant, 0.0, noise(grid).ravel(), gpe.fun) < 1e-10
 
 
+@pytest.fixture
+def near():
+    """An energy that knows its value and f at a state of unit size."""
+    grid = Grid((16, 16), -3, 3)
+    gpe = GrossPitaevskii(grid, harmonic_trap(1, 2), Omega=0.7, beta=30.0)
+    x, y = grid.mesh()
+    psi = ((x + 1j * y) * np.exp(-(x**2) - y**2) + 0.01 * noise(grid)).ravel()
+    (energy,) = gpe.invariants(["energy"])
+    energy.grad(0.0, psi, gpe.fun(0.0, psi), np.empty_like(psi))
+    assert energy.fun(0.0, psi) == gpe.energy(psi)
+    return gpe, psi, energy.fun
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-16, 1e-13, 1e-11, 1e-9, 1e-6, 1e-3, 1.0])
+def test_energy_near_a_known_one_is_the_energy(near, size):
+    gpe, psi, energy = near
+    other = psi + size * noise(gpe.grid).ravel()
+    assert energy(0.0, other) == pytest.approx(gpe.energy(other), rel=2e-15)
+
+
+def test_energy_near_a_known_one_needs_no_transform(near, monkeypatch):
+    gpe, psi, energy = near
+    calls = []
+    monkeypatch.setattr(gpe, "energy", lambda y: calls.append(1) or 0.0)
+    energy(0.0, psi)
+    energy(0.0, psi * (1 + 1e-12))
+    assert not calls
+    energy(0.0, psi * (1 + 1e-7))
+    assert calls
+
+
+def test_energy_keeps_no_arrays_of_others(near):
+    gpe, psi, energy = near
+    expected = gpe.energy(psi)
+    kept = psi.copy()
+    psi *= 2
+    assert energy(0.0, psi) == pytest.approx(gpe.energy(psi), rel=1e-13)
+    assert energy(0.0, kept) == pytest.approx(expected, rel=1e-13)
+
+
 def test_angular_momentum_is_kept_where_the_trap_is_round_and_refused_where_not():
     grid = Grid((32, 32), -7, 7)
     x, y = grid.mesh()

@@ -13,12 +13,20 @@ from ..._names import nearest
 from ...invariants import Invariant
 from .._problem import Problem
 from .grid import Grid, Multiplier, SpectralSum
-from .pointwise import add_potential, derivative, float_rows, interaction_energy, turn
+from .pointwise import (
+    add_potential,
+    derivative,
+    expansion,
+    float_rows,
+    interaction_energy,
+    turn,
+)
 from .transforms import make_transforms
 
 __all__ = ["FieldProblem", "GrossPitaevskii"]
 
 NYQUIST = ("true", "zero")
+NEGLIGIBLE = 1e-17  # a twentieth of a rounding
 INVARIANTS = ("mass", "energy", "angular_momentum")
 SOURCE = "Cai, Gong & Wang, section 3.4 (eq. 3.9, 3.10), the quartic term as the sum of |psi|^4"
 
@@ -229,9 +237,6 @@ class GrossPitaevskii:
     def _mass_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
         np.multiply(y, 2 * self.grid.cell, out=out)
 
-    def _energy_gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
-        turn(f.view(float), 2 * self.grid.cell, out.view(float))  # 2 w H psi, and H psi = i f
-
     def _angular_momentum_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
         self._rotation_or_error().apply(y.reshape(self.grid.shape), out.reshape(self.grid.shape))
         out *= 2 * self.grid.cell
@@ -259,9 +264,10 @@ class GrossPitaevskii:
         return tuple(self._invariant(name) for name in ((names,) if isinstance(names, str) else names))
 
     def _invariant(self, name: str) -> Invariant:
+        energy = _Energy(self)
         made: dict[str, tuple[Callable[..., float], Callable[..., None]]] = {
             "mass": (self.mass, self._mass_gradient),
-            "energy": (self.energy, self._energy_gradient),
+            "energy": (energy.value, energy.gradient),
             "angular_momentum": (self.angular_momentum, self._angular_momentum_gradient),
         }
         if name not in made:
@@ -317,6 +323,12 @@ class GrossPitaevskii:
             equation=self,
         )
 
+    def largest_frequency(self) -> float:
+        """A bound of the linear part's norm: the terms' largest values one by one."""
+        kinetic = sum(float(self.kinetic_factor(axis).max()) for axis in range(self.grid.dim))
+        turning = sum(float(np.abs(f).max()) for f in self._rotation_factors()) if self.Omega else 0.0
+        return kinetic + abs(self.Omega) * turning + float(np.abs(self.V).max())
+
     def largest_step(self, psi: Any, limit: float = 2 * 2**0.5) -> float:
         """The step above which an explicit method is unstable.
 
@@ -332,11 +344,46 @@ class GrossPitaevskii:
         float
             From a bound of the largest frequency that counts the terms of H one by one; larger steps may do.
         """
-        kinetic = sum(float(self.kinetic_factor(axis).max()) for axis in range(self.grid.dim))
-        turning = sum(float(np.abs(f).max()) for f in self._rotation_factors()) if self.Omega else 0.0
         # Twice the interaction: the linearised term is 2 beta |psi|^2 u + beta psi^2 conj(u).
-        local = np.abs(self.V + 2 * self.beta * np.abs(self.as_field(psi)) ** 2).max()
-        return float(limit / (kinetic + abs(self.Omega) * turning + local))
+        local = 2 * abs(self.beta) * float((np.abs(self.as_field(psi)) ** 2).max())
+        return float(limit / (self.largest_frequency() + local))
+
+
+class _Energy:
+    """The energy as an invariant: beside a state where it and its gradient are known, by the expansion there.
+
+    A step asks for the gradient at its raw result, for the energy there, and for that of the projected state, 1e-12 or
+    so away. The second energy follows from the first without a transform, as long as the terms of second order and
+    higher are far below its rounding. Elsewhere it is evaluated as `GrossPitaevskii.energy` does.
+    """
+
+    def __init__(self, gpe: GrossPitaevskii) -> None:
+        self._gpe = gpe
+        self._norm = gpe.largest_frequency()
+        self._near: tuple[np.ndarray, np.ndarray] | None = None  # a state and its derivative
+        self._value: float | None = None  # the energy there
+
+    def value(self, y: np.ndarray) -> float:
+        gpe = self._gpe
+        psi = gpe.as_field(y)
+        if self._near is None:
+            return gpe.energy(psi)
+        square, slope, top = expansion(*(float_rows(a, gpe.grid.shape[-1]) for a in (psi, *self._near)))
+        if square == 0.0 and self._value is None:
+            self._value = gpe.energy(psi)
+        if self._value is None or not gpe.grid.cell * self._remainder(square, top) <= NEGLIGIBLE * abs(self._value):
+            return gpe.energy(psi)
+        return self._value + 2 * gpe.grid.cell * slope
+
+    def _remainder(self, square: float, top: float) -> float:
+        """A bound of what the expansion leaves out, by the sum of the squares of the difference."""
+        density = 3 * top + 2 * (top * square) ** 0.5 + 0.5 * square
+        return (self._norm + abs(self._gpe.beta) * density) * square
+
+    def gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
+        turn(f.view(float), 2 * self._gpe.grid.cell, out.view(float))  # 2 w H psi, and H psi = i f
+        # Copies: the caller may use its arrays for something else.
+        self._near, self._value = (self._gpe.as_field(y).copy(), f.copy()), None
 
 
 def _on_grid(potential: Any, grid: Grid) -> np.ndarray:
