@@ -394,3 +394,17 @@ def test_bad_states_and_names():
         line.angular_momentum(np.zeros(8))
     with pytest.raises(ValueError, match="beta < 0"):
         soliton(beta=1.0)
+
+
+def test_a_large_field_is_set_up_without_a_list_of_its_points(monkeypatch):
+    """Its components stand alone in the metric's blocks: arrays say so, not a million little ones."""
+    from eip_scipy import _setup
+
+    called = []
+    monkeypatch.setattr(_setup, "_block_lists", lambda *args: called.append(args))
+    for blocks, size in ((None, 2), (4, 8)):
+        groups = _setup.blocks_of(blocks, 64, 2)
+        assert (groups.size, groups.start.size) == (size, 128 // size + 1)
+        np.testing.assert_array_equal(groups.member, np.arange(128))
+        np.testing.assert_array_equal(groups.start, np.arange(0, 129, size))
+    assert not called
