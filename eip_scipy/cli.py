@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 from . import comparators, problems
 from .commands import (
     charged_particle,
+    gpe,
     hard_cases,
     hard_scenes,
     kepler_cost,
@@ -102,6 +103,11 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
             "error against cost on high eccentricities, chaos and close encounters, beside IAS15",
             hard_scenes.add_arguments,
             lambda args: hard_scenes.run(args, _rebound_module()),
+        ),
+        "gpe": (
+            "rotating Gross-Pitaevskii equation: ground states, and the dynamics of the ring (Experiment IV)",
+            gpe.add_arguments,
+            gpe.run,
         ),
         "work-precision": (
             "error against cost of all methods on the perturbed Kepler problem",

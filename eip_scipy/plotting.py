@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 try:
+    from matplotlib.animation import FuncAnimation, PillowWriter
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
@@ -26,10 +28,13 @@ if TYPE_CHECKING:
 __all__ = [
     "Curves",
     "ErrorSeries",
+    "FieldPanel",
     "Orbits",
     "ParticleRow",
     "cost_figure",
     "errors_figure",
+    "fields_figure",
+    "fields_movie",
     "frontier_figure",
     "gains_figure",
     "longitude_figure",
@@ -593,6 +598,107 @@ def scenes_figure(
     if footnote:  # above: the legend is below
         figure.suptitle(f"{title}\n{footnote}", fontsize="medium")
     return figure
+
+
+class FieldPanel(NamedTuple):
+    """A density in a plane.
+
+    Attributes
+    ----------
+    density : array_like, shape (m, n)
+        By the first coordinate, then by the second.
+    ends : tuple of float
+        Lower and upper end of the first coordinate, then of the second.
+    axes : tuple of str
+        Names of the coordinates.
+    vortices : array_like, shape (k, 2)
+        Positions to mark.
+    """
+
+    density: Any
+    ends: tuple[float, float, float, float]
+    axes: tuple[str, str]
+    vortices: Any
+
+
+def fields_figure(
+    panels: Mapping[str, FieldPanel], *, title: str = "", columns: int = 3, shared: bool = False
+) -> Figure:
+    """Draw densities in planes, with their vortices, a panel for each.
+
+    Parameters
+    ----------
+    panels : mapping of str to FieldPanel
+        By the panels' titles.
+    title : str, optional
+    columns : int, optional
+        Panels abreast.
+    shared : bool, optional
+        One scale of colours for all.
+
+    Returns
+    -------
+    Figure
+    """
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = _figure(max(4.1 * columns, 7.5), 4.0 * rows + 0.4, title)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    top = max(float(np.max(panel[0])) for panel in panels.values()) if shared else None
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    for axis, (name, panel) in zip(axes.flat, panels.items(), strict=False):
+        image = field_panel(axis, name, panel, top)
+        if not shared:
+            figure.colorbar(image, ax=axis, shrink=0.8, pad=0.02)
+    if shared:
+        figure.colorbar(image, ax=list(axes.flat), shrink=0.8, pad=0.02, label=r"density $|\psi|^2$")
+    return figure
+
+
+def fields_movie(path: Any, panels: Sequence[FieldPanel], titles: Sequence[str], *, per_second: int) -> None:
+    """Write an animated GIF, a frame for each panel, on one scale of colours.
+
+    Parameters
+    ----------
+    path : str or Path
+        Ends in ".gif".
+    panels : sequence of FieldPanel
+        All of one shape.
+    titles : sequence of str
+    per_second : int
+        Frames.
+    """
+    top = max(float(np.max(panel.density)) for panel in panels)
+    figure = Figure(figsize=(5.2, 4.6), dpi=90, layout="constrained")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    image = field_panel(axis, titles[0], panels[0], top)
+    figure.colorbar(image, ax=axis, shrink=0.9, pad=0.02, label=r"density $|\psi|^2$")
+
+    def frame(k: int) -> None:
+        axis.clear()
+        field_panel(axis, titles[k], panels[k], top)
+
+    movie = FuncAnimation(figure, frame, frames=len(panels))
+    movie.save(path, writer=PillowWriter(fps=per_second))
+
+
+def field_panel(axis: Axes, title: str, panel: FieldPanel, top: float | None) -> Any:
+    """Draw one density; the image, for a scale of colours or to be changed in a movie."""
+    density, ends, names, where = panel
+    image = axis.imshow(
+        np.asarray(density).T, origin="lower", extent=ends, cmap="viridis", vmin=0.0, vmax=top, interpolation="bilinear"
+    )
+    where = np.asarray(where)
+    if where.size:
+        axis.plot(*where.T, ls="", marker="o", mfc="none", mec=PALETTE[1], mew=0.9, ms=5)
+    axis.set_title(title, fontsize="medium")
+    axis.set_xlabel(names[0])
+    axis.set_ylabel(names[1])
+    axis.xaxis.set_major_locator(MaxNLocator(5))
+    axis.yaxis.set_major_locator(MaxNLocator(5))
+    return image
 
 
 def _figure(width: float, height: float, title: str) -> Figure:

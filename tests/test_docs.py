@@ -25,7 +25,7 @@ def assert_output(found, printed):
         assert agree(float(a), float(b)), f"{a}, printed as {b}"
 
 
-PAGES = ("quickstart", "adaptive", "hard-scenes", "checkpoints", "ensembles", "charged-particles")
+PAGES = ("quickstart", "adaptive", "hard-scenes", "checkpoints", "ensembles", "charged-particles", "gross-pitaevskii")
 
 
 @pytest.mark.parametrize("page", ["README.md", *(f"docs/{page}.md" for page in PAGES)])

@@ -1,4 +1,4 @@
-"""The paper's tables 1-4: every cell's agreement as measured, and the same computation in 50 digits."""
+"""The paper's tables: every cell's agreement as measured, tables 1-4 also beside the same computation in 50 digits."""
 
 import argparse
 import csv
@@ -13,6 +13,7 @@ from eip_scipy.reproduce import TABLES, Value
 
 EPS = np.finfo(float).eps
 DATA = json.loads(mpmath_tables.DATA.read_text(encoding="utf-8"))
+EXACT = [series for series in DATA["series"] if "mpmath" in series]
 
 # All that does not agree to the printed digits, as (table, column, row): round-off of the paper's numbers or of ours.
 ERRORS_APART = {
@@ -44,7 +45,7 @@ ORDERS_APART = {
 
 @pytest.fixture(scope="module")
 def cells():
-    return [cell for table in TABLES for cell in reproduce.reproduce(table)]
+    return [cell for table in TABLES if table not in reproduce.SLOW for cell in reproduce.reproduce(table)]
 
 
 def place(cell):
@@ -95,7 +96,7 @@ def test_paper_is_as_far_from_the_50_digit_values_as_we_are(cells):
     assert ours < 2 * paper
 
 
-@pytest.mark.parametrize("series", DATA["series"], ids=lambda s: f"table{s['table']}-{s['method']}-{s['name']}")
+@pytest.mark.parametrize("series", EXACT, ids=lambda s: f"table{s['table']}-{s['method']}-{s['name']}")
 def test_stored_50_digit_values(series):
     computed = [float(x) for x in mpmath_tables.evaluate(series)]
     np.testing.assert_allclose([float(x) for x in series["mpmath"]], computed, rtol=6e-12)
@@ -117,6 +118,43 @@ def test_transcription_and_errata(series):
     for k, misprint in series.get("errata", {}).items():
         printed = [misprint["printed"] if i == int(k) else x for i, x in enumerate(series["errors"])]
         assert (printed_order_misses(series, printed) > 100).any()
+
+
+def table5(name):
+    (stored,) = (s for s in DATA["series"] if (s["table"], s["name"]) == (5, name))
+    return stored
+
+
+@pytest.mark.slow
+@pytest.mark.needs_jit
+def test_table5_from_its_longest_steps():
+    """The paper's digits; the other cells take minutes: `eip-scipy reproduce table5`."""
+    stored = table5("Omega = 0.5, EIP-ME")
+    (error,) = reproduce._field_differences(reproduce.Series(**{**stored, "divisors": [2]}))
+    assert Value(stored["errors"][0], error, float("nan"), roundoff=1e-15).status in ("matched", "round-off")
+
+
+def test_table5_has_no_50_digit_column(monkeypatch):
+    """And a number is judged by the paper's alone: here one is off by more than round-off."""
+    monkeypatch.setitem(
+        reproduce._ERRORS, 5, lambda series: [float(x) * (1 + 1e-3 * (series.Omega == 0.9)) for x in series.errors]
+    )
+    cells = reproduce.reproduce("table5")
+    assert (len(cells), sum(cell.order is not None for cell in cells)) == (27, 18)
+    assert all(np.isnan(cell.error.mpmath) for cell in cells)
+    assert {cell.column[:11] for cell in cells if cell.error.status == "differs"} == {"Omega = 0.9"}
+    text = reproduce.table_text(cells)
+    assert "mpmath" not in text
+    assert "nan" not in text
+    assert max(map(len, text.splitlines())) <= 130
+
+
+def test_nine_columns_of_table5_are_stored():
+    stored = [s for s in DATA["series"] if s["table"] == 5]
+    assert sorted((s["Omega"], s["invariants"]) for s in stored) == [
+        (Omega, kept) for Omega in (0.0, 0.5, 0.9) for kept in ("E", "M", "ME")
+    ]
+    assert all(len(s["errors"]) == 3 for s in stored)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +232,7 @@ def test_a_wrong_number_fails_the_command(monkeypatch, capsys):
 
 def test_unknown_table_is_wrong_usage(capsys):
     with pytest.raises(SystemExit) as error:
-        arguments("table5")
+        arguments("table6")
     assert error.value.code == 2
-    with pytest.raises(ValueError, match=r"table must be one of table1, .*, got 'table5'\."):
-        reproduce.reproduce("table5")
+    with pytest.raises(ValueError, match=r"table must be one of table1, .*, got 'table6'\."):
+        reproduce.reproduce("table6")

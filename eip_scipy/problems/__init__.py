@@ -3,6 +3,16 @@
 from ._problem import Problem
 from .charged_particle import ParticleProblem, charged_particle, tokamak, uniform_field
 from .forces import ForceConstants
+from .gross_pitaevskii import (
+    FieldProblem,
+    Grid,
+    GrossPitaevskii,
+    harmonic_trap,
+    plane_wave,
+    quartic_trap,
+    rotating_packet,
+    soliton,
+)
 from .hard_cases import HardCase, hard_cases
 from .harmonic import harmonic
 from .kepler import kepler
@@ -16,7 +26,10 @@ from .time_transformed import centre_time, pair_time, reaches, time_transformed
 __all__ = [
     "TOKAMAK",
     "UNIFORM",
+    "FieldProblem",
     "ForceConstants",
+    "Grid",
+    "GrossPitaevskii",
     "HardCase",
     "ParticleField",
     "ParticleProblem",
@@ -28,12 +41,17 @@ __all__ = [
     "figure_eight",
     "hard_cases",
     "harmonic",
+    "harmonic_trap",
     "kepler",
     "nbody",
     "pair_time",
+    "plane_wave",
     "pythagorean",
+    "quartic_trap",
     "reaches",
+    "rotating_packet",
     "solar_system",
+    "soliton",
     "time_transformed",
     "tokamak",
     "uniform_field",

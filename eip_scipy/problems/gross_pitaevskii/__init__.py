@@ -1,0 +1,39 @@
+"""The rotating Gross-Pitaevskii equation in one, two and three dimensions."""
+
+from .equation import FieldProblem, GrossPitaevskii
+from .grid import Grid, Multiplier, SpectralSum
+from .ground_state import GroundState, ground_state
+from .potentials import harmonic_trap, quartic_trap
+from .scenes import line_condensate, plane_wave, ring_condensate, rotating_packet, soliton
+from .search import lowest_ring, lowest_state
+from .starts import imprint, polygon, ring_start, thomas_fermi, vortex_starts, with_noise
+from .transforms import make_transforms
+from .vortices import Vortices, vortices
+
+__all__ = [
+    "FieldProblem",
+    "Grid",
+    "GrossPitaevskii",
+    "GroundState",
+    "Multiplier",
+    "SpectralSum",
+    "Vortices",
+    "ground_state",
+    "harmonic_trap",
+    "imprint",
+    "line_condensate",
+    "lowest_ring",
+    "lowest_state",
+    "make_transforms",
+    "plane_wave",
+    "polygon",
+    "quartic_trap",
+    "ring_condensate",
+    "ring_start",
+    "rotating_packet",
+    "soliton",
+    "thomas_fermi",
+    "vortex_starts",
+    "vortices",
+    "with_noise",
+]

@@ -1,0 +1,400 @@
+"""The rotating Gross-Pitaevskii equation on a periodic grid: right-hand side, invariants, and the problem they make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..._lanes import dot
+from ..._names import nearest
+from ...invariants import Invariant
+from .._problem import Problem
+from .grid import Grid, Multiplier, SpectralSum
+from .pointwise import (
+    add_potential,
+    derivative,
+    expansion,
+    float_rows,
+    interaction_energy,
+    turn,
+)
+from .transforms import make_transforms
+
+__all__ = ["FieldProblem", "GrossPitaevskii"]
+
+NYQUIST = ("true", "zero")
+NEGLIGIBLE = 1e-17  # a twentieth of a rounding
+INVARIANTS = ("mass", "energy", "angular_momentum")
+SOURCE = "Cai, Gong & Wang, section 3.4 (eq. 3.9, 3.10), the quartic term as the sum of |psi|^4"
+
+
+@dataclass(frozen=True, eq=False)
+class FieldProblem(Problem):
+    """A `Problem` whose state is a field on a grid.
+
+    Attributes
+    ----------
+    equation : GrossPitaevskii
+        With the `grid`, and ``equation.grid.field(y)`` for states as fields. The other attributes are those of
+        `Problem`.
+    """
+
+    equation: GrossPitaevskii | None = None
+
+
+class GrossPitaevskii:
+    """The equation ``i psi_t = H(psi) psi`` with ``H = -Laplace / 2 + V - Omega Lz + beta |psi|^2``.
+
+    Here ``Lz = -i (x d_y - y d_x)``. Fourier pseudospectral in space: each term of the linear part is a real multiplier
+    of the modes along its axes, of those along x ``k^2 / 2 + Omega y k``, of those along y ``q^2 / 2 - Omega x q``. One
+    pair of transforms along each axis does everything, the rotation included.
+
+    Parameters
+    ----------
+    grid : Grid
+    potential : callable or array_like, optional
+        ``potential(x[, y[, z]])``, real, of coordinates that broadcast, or its values on the grid. Default: 0.
+    Omega : float, optional
+        Angular velocity about the z axis; needs two dimensions at least.
+    beta : float, optional
+        Strength of the interaction: > 0 repulsive, < 0 attractive.
+    nyquist : {"true", "zero"}, optional
+        The second derivative's factor of the Nyquist mode: its own, or 0 as where the second derivative is the first
+        one applied twice (the paper's tables).
+    fft : {"auto", "scipy", "ducc0", "pyfftw"}, optional
+        See `make_transforms`.
+    threads : int, optional
+        Threads of the transforms.
+
+    Attributes
+    ----------
+    grid, Omega, beta, nyquist
+        As given.
+    V : ndarray
+        The potential on the grid.
+    transforms : Transforms
+    fft : str
+        The library of the transforms.
+
+    Raises
+    ------
+    ValueError
+        For wrong values, a potential that is complex, not finite or of another shape, or a rotation in 1D.
+
+    Notes
+    -----
+    An object holds buffers: use one for each thread.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.integrate import solve_ivp
+    >>> from eip_scipy import EIPRK4
+    >>> from eip_scipy.problems import GrossPitaevskii, Grid, harmonic_trap
+    >>> gpe = GrossPitaevskii(Grid((32, 32), -6, 6), harmonic_trap(1, 1), Omega=0.5, beta=10)
+    >>> x, y = gpe.grid.mesh()
+    >>> psi = (x + 1j * y) * np.exp(-(x**2 + y**2) / 2)
+    >>> sol = solve_ivp(gpe.fun, (0, 0.1), psi.ravel(), method=EIPRK4, h=0.01, metric="euclidean",
+    ...                 invariants=gpe.invariants())
+    >>> gpe.grid.field(sol.y).shape
+    (11, 32, 32)
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        potential: Any = None,
+        *,
+        Omega: float = 0.0,
+        beta: float = 0.0,
+        nyquist: str = "true",
+        fft: str = "auto",
+        threads: int = 1,
+    ) -> None:
+        if nyquist not in NYQUIST:
+            raise ValueError(f"nyquist must be 'true' or 'zero', got {nyquist!r}.")
+        for name, value in (("Omega", Omega), ("beta", beta)):
+            if not isinstance(value, (int, float, np.integer, np.floating)) or not np.isfinite(value):
+                raise ValueError(f"{name} must be a finite number, got {value!r}.")
+        if Omega != 0 and grid.dim == 1:
+            raise ValueError(f"a rotation needs two dimensions: Omega = {Omega!r} on {grid!r}.")
+        self.grid, self.Omega, self.beta, self.nyquist = grid, float(Omega), float(beta), nyquist
+        self.V = _on_grid(potential, grid)
+        self.transforms = make_transforms(grid.shape, fft, threads)
+        self.fft = self.transforms.name
+        self._options = {"nyquist": nyquist, "fft": fft, "threads": threads}
+        self._linear = SpectralSum(grid, self.transforms, self._kinetic_and_rotation())
+        self._Lz = None if grid.dim == 1 else SpectralSum(grid, self.transforms, self._rotation())
+
+    def __repr__(self) -> str:
+        return f"GrossPitaevskii({self.grid!r}, Omega={self.Omega:g}, beta={self.beta:g})"
+
+    def changed(self, **options: Any) -> GrossPitaevskii:
+        """Make the same equation with other values of `potential`, `Omega`, `beta` and so on: a quench."""
+        options = {"potential": self.V, "Omega": self.Omega, "beta": self.beta, **self._options, **options}
+        return GrossPitaevskii(self.grid, **options)
+
+    def kinetic_factor(self, axis: int) -> np.ndarray:
+        """The factor k^2 / 2 of the modes along one axis."""
+        k = self.grid.wavenumbers(axis, odd=self.nyquist == "zero")
+        return 0.5 * k * k
+
+    def _rotation_factors(self) -> list[np.ndarray]:
+        """Factors of Lz = x q - y k: of the modes along x and of those along y."""
+        x, y, *_ = self.grid.mesh()
+        k, q = (self.grid.wavenumbers(axis, odd=True) for axis in (0, 1))
+        return [-y * k, x * q]
+
+    def _rotation(self) -> list[Multiplier]:
+        return [Multiplier(self.grid, (axis,), factor) for axis, factor in enumerate(self._rotation_factors())]
+
+    def _kinetic_and_rotation(self) -> list[Multiplier]:
+        """As few transforms as there are: all axes at once without rotation, else x, and then y and z together."""
+        kinetic = [self.kinetic_factor(axis) for axis in range(self.grid.dim)]
+        if self.Omega == 0:
+            return [Multiplier(self.grid, tuple(range(self.grid.dim)), sum(kinetic))]
+        along_x, along_y = self._rotation_factors()
+        others = tuple(range(1, self.grid.dim))
+        return [
+            Multiplier(self.grid, (0,), kinetic[0] - self.Omega * along_x),
+            Multiplier(self.grid, others, sum(kinetic[1:]) - self.Omega * along_y),
+        ]
+
+    def as_field(self, psi: Any) -> np.ndarray:
+        """`psi`, a field or a flat state, as a contiguous complex field.
+
+        Raises
+        ------
+        ValueError
+            When its shape is neither.
+        """
+        psi = np.ascontiguousarray(psi, dtype=complex)
+        if psi.shape not in (self.grid.shape, (self.grid.size,)):
+            raise ValueError(f"psi has shape {psi.shape}, expected {self.grid.shape} or ({self.grid.size},).")
+        return psi.reshape(self.grid.shape)
+
+    def rhs(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with -i H(psi) psi; both flat and contiguous, and not the same array."""
+        shape = self.grid.shape
+        rest = self._linear.parts(y.reshape(shape), out.reshape(shape))
+        derivative(rest.reshape(-1).view(float), y.view(float), self.V.reshape(-1), self.beta, out.view(float))
+
+    def fun(self, t: float, y: np.ndarray) -> np.ndarray:
+        """-i H(psi) psi, flat: what `solve_ivp` takes."""
+        y = np.ascontiguousarray(y, dtype=complex)
+        out = np.empty_like(y)
+        self.rhs(t, y, out)
+        return out
+
+    def linear(self, psi: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with (-Laplace / 2 - Omega Lz) psi, both fields."""
+        self._linear.apply(psi, out)
+
+    def hamiltonian(self, psi: Any) -> np.ndarray:
+        """H(psi) psi, a field."""
+        psi = self.as_field(psi)
+        out = np.empty_like(psi)
+        self._linear.apply(psi, out)
+        flat = (a.reshape(-1).view(float) for a in (psi, out))
+        add_potential(next(flat), self.V.reshape(-1), self.beta, next(flat))
+        return out
+
+    def mass(self, psi: Any) -> float:
+        """Sum of |psi|^2 over the grid, times the cell: 1 for a normalised state."""
+        flat = self.as_field(psi).reshape(-1).view(float)
+        return self.grid.cell * dot(flat, flat)
+
+    def energy(self, psi: Any) -> float:
+        """Kinetic, potential, rotational and interaction energy, the last beta / 2 times the sum of |psi|^4."""
+        psi = self.as_field(psi)
+        columns = self.grid.shape[-1]
+        local = interaction_energy(float_rows(psi, columns), self.V.reshape(-1, columns), self.beta)
+        return self.grid.cell * (self._linear.expectation(psi) + local)
+
+    def angular_momentum(self, psi: Any) -> float:
+        """Mean of Lz times the mass.
+
+        Raises
+        ------
+        ValueError
+            In one dimension.
+        """
+        return self.grid.cell * self._rotation_or_error().expectation(self.as_field(psi))
+
+    def chemical_potential(self, psi: Any) -> float:
+        """Mean of H: mu = Re <H(psi) psi, psi> / <psi, psi>."""
+        psi = self.as_field(psi)
+        return float(np.vdot(psi, self.hamiltonian(psi)).real / np.vdot(psi, psi).real)
+
+    def _rotation_or_error(self) -> SpectralSum:
+        if self._Lz is None:
+            raise ValueError("in one dimension there is no angular momentum.")
+        return self._Lz
+
+    def _mass_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
+        np.multiply(y, 2 * self.grid.cell, out=out)
+
+    def _angular_momentum_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
+        self._rotation_or_error().apply(y.reshape(self.grid.shape), out.reshape(self.grid.shape))
+        out *= 2 * self.grid.cell
+
+    def invariants(self, names: Sequence[str] = ("mass", "energy")) -> tuple[Invariant, ...]:
+        """Make the invariants of the equation.
+
+        Parameters
+        ----------
+        names : sequence of {"mass", "energy", "angular_momentum"}, optional
+            The angular momentum is conserved where the potential is symmetric about the z axis and the field vanishes
+            at the ends of the box; on the grid to spectral accuracy only.
+
+        Returns
+        -------
+        tuple of Invariant
+            Their gradients are 2 w psi, 2 w H psi and 2 w Lz psi, w the cell. That of the energy is a multiple of the
+            right-hand side, which the step evaluates once for it and for the next step's first stage (`reuse_f`).
+
+        Raises
+        ------
+        ValueError
+            For other names.
+        """
+        return tuple(self._invariant(name) for name in ((names,) if isinstance(names, str) else names))
+
+    def _invariant(self, name: str) -> Invariant:
+        energy = _Energy(self)
+        made: dict[str, tuple[Callable[..., float], Callable[..., None]]] = {
+            "mass": (self.mass, self._mass_gradient),
+            "energy": (energy.value, energy.gradient),
+            "angular_momentum": (self.angular_momentum, self._angular_momentum_gradient),
+        }
+        if name not in made:
+            raise ValueError(f"unknown invariant {name!r}, expected {', '.join(INVARIANTS)}{nearest(name, INVARIANTS)}")
+        value, gradient = made[name]
+        return Invariant(lambda t, y: value(y), gradient, name=name, in_place=True, uses_f=name == "energy")
+
+    def problem(
+        self,
+        psi0: Any,
+        t_end: float,
+        h: float | None = None,
+        *,
+        name: str = "gross-pitaevskii",
+        invariants: Sequence[str] = ("mass", "energy"),
+        reference: Callable[[float], np.ndarray | None] | None = None,
+        source: str = SOURCE,
+    ) -> FieldProblem:
+        """Make the initial value problem.
+
+        Parameters
+        ----------
+        psi0 : array_like
+            The field at t = 0, of the grid's shape or flat.
+        t_end : float
+            End of the interval that starts at 0.
+        h : float, optional
+            A step; `largest_step` bounds it.
+        name : str, optional
+        invariants : sequence of str, optional
+            See `invariants`.
+        reference : callable, optional
+            ``reference(t) -> y``, flat: a closed form.
+        source : str, optional
+
+        Returns
+        -------
+        FieldProblem
+            Its metric is "euclidean": the grid's points are alike, and the norm is that of the field.
+        """
+        return FieldProblem(
+            name=name,
+            fun=self.fun,
+            rhs=self.rhs,
+            y0=self.as_field(psi0).reshape(-1).copy(),
+            t_span=(0.0, t_end),
+            h=h,
+            invariants=self.invariants(invariants),
+            metric="euclidean",
+            reference=reference,
+            units="dimensionless",
+            source=source,
+            equation=self,
+        )
+
+    def largest_frequency(self) -> float:
+        """A bound of the linear part's norm: the terms' largest values one by one."""
+        kinetic = sum(float(self.kinetic_factor(axis).max()) for axis in range(self.grid.dim))
+        turning = sum(float(np.abs(f).max()) for f in self._rotation_factors()) if self.Omega else 0.0
+        return kinetic + abs(self.Omega) * turning + float(np.abs(self.V).max())
+
+    def largest_step(self, psi: Any, limit: float = 2 * 2**0.5) -> float:
+        """The step above which an explicit method is unstable.
+
+        Parameters
+        ----------
+        psi : array_like
+            A typical field.
+        limit : float, optional
+            The method's bound on h times the largest frequency; default: that of RK4, 2 sqrt(2).
+
+        Returns
+        -------
+        float
+            From a bound of the largest frequency that counts the terms of H one by one; larger steps may do.
+        """
+        # Twice the interaction: the linearised term is 2 beta |psi|^2 u + beta psi^2 conj(u).
+        local = 2 * abs(self.beta) * float((np.abs(self.as_field(psi)) ** 2).max())
+        return float(limit / (self.largest_frequency() + local))
+
+
+class _Energy:
+    """The energy as an invariant: beside a state where it and its gradient are known, by the expansion there.
+
+    A step asks for the gradient at its raw result, for the energy there, and for that of the projected state, 1e-12 or
+    so away. The second energy follows from the first without a transform, as long as the terms of second order and
+    higher are far below its rounding. Elsewhere it is evaluated as `GrossPitaevskii.energy` does.
+    """
+
+    def __init__(self, gpe: GrossPitaevskii) -> None:
+        self._gpe = gpe
+        self._norm = gpe.largest_frequency()
+        self._near: tuple[np.ndarray, np.ndarray] | None = None  # a state and its derivative
+        self._value: float | None = None  # the energy there
+
+    def value(self, y: np.ndarray) -> float:
+        gpe = self._gpe
+        psi = gpe.as_field(y)
+        if self._near is None:
+            return gpe.energy(psi)
+        square, slope, top = expansion(*(float_rows(a, gpe.grid.shape[-1]) for a in (psi, *self._near)))
+        if square == 0.0 and self._value is None:
+            self._value = gpe.energy(psi)
+        if self._value is None or not gpe.grid.cell * self._remainder(square, top) <= NEGLIGIBLE * abs(self._value):
+            return gpe.energy(psi)
+        return self._value + 2 * gpe.grid.cell * slope
+
+    def _remainder(self, square: float, top: float) -> float:
+        """A bound of what the expansion leaves out, by the sum of the squares of the difference."""
+        density = 3 * top + 2 * (top * square) ** 0.5 + 0.5 * square
+        return (self._norm + abs(self._gpe.beta) * density) * square
+
+    def gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
+        turn(f.view(float), 2 * self._gpe.grid.cell, out.view(float))  # 2 w H psi, and H psi = i f
+        # Copies: the caller may use its arrays for something else.
+        self._near, self._value = (self._gpe.as_field(y).copy(), f.copy()), None
+
+
+def _on_grid(potential: Any, grid: Grid) -> np.ndarray:
+    """The potential's values (J[, K[, L]])."""
+    values = np.asarray(potential(*grid.mesh()) if callable(potential) else 0.0 if potential is None else potential)
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"potential must be real, got values of type {values.dtype}.")
+    try:
+        values = np.broadcast_to(values, grid.shape)
+    except ValueError:
+        raise ValueError(f"potential has shape {values.shape}, which does not fit {grid!r}.") from None
+    if not np.isfinite(values).all():
+        raise ValueError("potential is not finite everywhere on the grid.")
+    return np.ascontiguousarray(values, dtype=float)

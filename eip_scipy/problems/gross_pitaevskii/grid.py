@@ -1,0 +1,194 @@
+"""Periodic grids, and real multipliers of the Fourier modes along some of their axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .pointwise import float_rows, multiply, weighted_square
+from .transforms import Axes, Transforms
+
+__all__ = ["Grid", "Multiplier", "SpectralSum"]
+
+MOST_AXES = 3
+
+
+class Grid:
+    """A uniform periodic grid in one, two or three dimensions; the upper ends are the lower ones again.
+
+    Parameters
+    ----------
+    shape : int or sequence of int
+        Points along x, y, z: at least two each.
+    lower, upper : float or sequence of float
+        Ends of the box; a single number serves every axis.
+
+    Attributes
+    ----------
+    shape : tuple of int
+    lower, upper, spacing : ndarray, shape (d,)
+    cell : float
+        Length, area or volume that belongs to a point, the paper's h_x h_y.
+
+    Raises
+    ------
+    ValueError
+        For other shapes, and ends that are not finite or in the wrong order.
+
+    Examples
+    --------
+    >>> from eip_scipy.problems import Grid
+    >>> grid = Grid((128, 64), (-4, -2), (4, 2))
+    >>> grid.size, grid.cell
+    (8192, 0.00390625)
+    """
+
+    def __init__(self, shape: Any, lower: Any, upper: Any) -> None:
+        given = np.atleast_1d(np.asarray(shape))
+        if given.ndim != 1 or not 1 <= given.size <= MOST_AXES or given.dtype.kind not in "iu" or np.any(given < 2):
+            raise ValueError(f"Grid: shape must be one to three integers >= 2, got {shape!r}.")
+        self.shape: tuple[int, ...] = tuple(int(n) for n in given)
+        self.lower, self.upper = (self._ends(name, a) for name, a in (("lower", lower), ("upper", upper)))
+        if np.any(self.upper <= self.lower):
+            raise ValueError(f"Grid: upper must be above lower, got lower = {lower!r}, upper = {upper!r}.")
+        self.spacing = (self.upper - self.lower) / self.shape
+        self.cell = float(np.prod(self.spacing))
+
+    def _ends(self, name: str, value: Any) -> np.ndarray:
+        ends = np.asarray(value, dtype=float)
+        if ends.ndim > 1 or (ends.ndim == 1 and ends.size != self.dim) or not np.isfinite(ends).all():
+            raise ValueError(f"Grid: {name} must be a finite number or {self.dim} of them, got {value!r}.")
+        return np.broadcast_to(ends, (self.dim,)).copy()
+
+    def __repr__(self) -> str:
+        return f"Grid({self.shape}, {tuple(self.lower.tolist())}, {tuple(self.upper.tolist())})"
+
+    @property
+    def dim(self) -> int:
+        """Number of axes."""
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return int(np.prod(self.shape))
+
+    def points(self, axis: int) -> np.ndarray:
+        """Coordinates along one axis, lower + j h."""
+        return self.lower[axis] + self.spacing[axis] * np.arange(self.shape[axis])
+
+    def mesh(self) -> tuple[np.ndarray, ...]:
+        """Coordinates that broadcast to fields: for two axes of shapes (J, 1) and (1, K)."""
+        return tuple(self._along(axis, self.points(axis)) for axis in range(self.dim))
+
+    def wavenumbers(self, axis: int, *, odd: bool = False) -> np.ndarray:
+        """Wavenumbers along one axis, of shapes as `mesh`; with `odd` that of the Nyquist mode is 0.
+
+        The mode of an even number of points has no sign: an odd derivative is 0 there, an even one is not.
+        """
+        n = self.shape[axis]
+        k = 2 * np.pi / (self.upper[axis] - self.lower[axis]) * np.fft.fftfreq(n, 1 / n)
+        if odd and n % 2 == 0:
+            k[n // 2] = 0.0
+        return self._along(axis, k)
+
+    def _along(self, axis: int, values: np.ndarray) -> np.ndarray:
+        return values.reshape([-1 if k == axis else 1 for k in range(self.dim)])
+
+    def field(self, y: Any) -> np.ndarray:
+        """States as fields, a view where `y` is contiguous.
+
+        Parameters
+        ----------
+        y : array_like, shape (n,) or (n, m)
+            One state, or m of them as the columns of ``sol.y``.
+
+        Returns
+        -------
+        ndarray, shape (J[, K[, L]]) or (m, J[, K[, L]])
+
+        Raises
+        ------
+        ValueError
+            When y does not belong to this grid.
+        """
+        y = np.asarray(y)
+        if y.ndim not in (1, 2) or y.shape[0] != self.size:
+            raise ValueError(f"field: got shape {y.shape}, expected ({self.size},) or ({self.size}, m) for {self!r}.")
+        return y.reshape(self.shape) if y.ndim == 1 else y.T.reshape(-1, *self.shape)
+
+
+class Multiplier:
+    """A real factor of the Fourier modes along some axes: transform, multiply, transform back.
+
+    Parameters
+    ----------
+    grid : Grid
+    axes : tuple of int
+        The axes that are transformed.
+    factor : array_like
+        Broadcasts to fields; along the other axes it may vary with the position.
+    """
+
+    def __init__(self, grid: Grid, axes: Axes, factor: Any) -> None:
+        self.axes = axes
+        # A factor that does not change along the last axis is one number for each row.
+        columns = 1 if np.shape(factor)[-1:] in ((), (1,)) and grid.dim > 1 else grid.shape[-1]
+        full = np.broadcast_to(factor, (*grid.shape[:-1], columns))
+        points = int(np.prod([grid.shape[axis] for axis in axes]))
+        self._columns = grid.shape[-1]
+        self._factor = np.ascontiguousarray(full, dtype=float).reshape(-1, columns) / points
+
+    def apply(self, fft: Transforms, psi: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with the multiplied field; `psi` stays."""
+        fft.forward(psi, self.axes, out)
+        multiply(float_rows(out, self._columns), self._factor)
+        fft.backward(out, self.axes)
+
+    def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
+        """Sum over the grid of conj(psi) times the multiplied field, by Parseval's theorem one transform only."""
+        fft.forward(psi, self.axes, work)
+        return float(weighted_square(float_rows(work, self._columns), self._factor))
+
+
+class SpectralSum:
+    """A sum of multipliers, a linear operator that is Hermitian to round-off.
+
+    Parameters
+    ----------
+    grid : Grid
+    fft : Transforms
+    terms : sequence of Multiplier
+        One at least.
+    """
+
+    def __init__(self, grid: Grid, fft: Transforms, terms: Sequence[Multiplier]) -> None:
+        self._fft, self._terms = fft, tuple(terms)
+        self._work = np.empty(grid.shape, complex)
+
+    def parts(self, psi: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """Fill `out` with all terms but the last of several, which is returned in a buffer; (0,) if there is but one.
+
+        Whoever adds something pointwise adds this as well, and saves a pass over the field.
+        """
+        first, *others = self._terms
+        first.apply(self._fft, psi, out)
+        for term in others[:-1]:
+            term.apply(self._fft, psi, self._work)
+            out += self._work
+        if not others:
+            return self._work.reshape(-1)[:0]
+        others[-1].apply(self._fft, psi, self._work)
+        return self._work
+
+    def apply(self, psi: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with the operator's image of `psi`."""
+        rest = self.parts(psi, out)
+        if rest.size:
+            out += rest
+
+    def expectation(self, psi: np.ndarray) -> float:
+        """Sum over the grid of conj(psi) times the image."""
+        return sum(term.expectation(self._fft, psi, self._work) for term in self._terms)

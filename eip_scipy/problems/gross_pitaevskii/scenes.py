@@ -1,0 +1,190 @@
+"""Scenes of the Gross-Pitaevskii equation: closed forms of the NLS equation, and the paper's experiment IV."""
+
+from __future__ import annotations
+
+from math import pi, sqrt
+from typing import Any
+
+import numpy as np
+
+from .equation import FieldProblem, GrossPitaevskii
+from .grid import Grid
+from .potentials import harmonic_trap, quartic_trap
+
+__all__ = ["line_condensate", "plane_wave", "ring_condensate", "rotating_packet", "soliton"]
+
+
+def soliton(
+    points: int = 256,
+    amplitude: float = 1.0,
+    velocity: float = 1.0,
+    beta: float = -1.0,
+    length: float = 40.0,
+    t_end: float = 10.0,
+    h: float | None = None,
+    **options: Any,
+) -> FieldProblem:
+    """Bright soliton of the focusing NLS equation in 1D, with its closed form.
+
+    ``psi = a / sqrt(-beta) sech(a (x - v t)) exp(i (v x + (a^2 - v^2) t / 2))``, on a ring of the given length.
+
+    Parameters
+    ----------
+    points : int
+    amplitude, velocity : float
+        a and v.
+    beta : float
+        < 0.
+    length : float
+        Of the ring; exp(-a length / 2) is the error of the closed form there.
+    t_end : float
+    h : float, optional
+        Default: half of what RK4 allows.
+    **options
+        Of `GrossPitaevskii`.
+
+    Returns
+    -------
+    FieldProblem
+        With the closed form as `reference`.
+
+    Raises
+    ------
+    ValueError
+        When beta is not negative or the amplitude not positive.
+    """
+    if not beta < 0 or not amplitude > 0:
+        raise ValueError(f"a bright soliton needs beta < 0 and amplitude > 0, got {beta!r} and {amplitude!r}.")
+    gpe = GrossPitaevskii(Grid(points, -length / 2, length / 2), beta=beta, **options)
+    x = gpe.grid.points(0)
+
+    def exact(t: float) -> np.ndarray:
+        # The distance from the centre, the short way round; the phase follows it, so that nothing jumps where it turns.
+        s = np.remainder(x - velocity * t + length / 2, length) - length / 2
+        phase = velocity * (s + velocity * t) + 0.5 * (amplitude**2 - velocity**2) * t
+        return amplitude / sqrt(-beta) / np.cosh(amplitude * s) * np.exp(1j * phase)
+
+    start = exact(0.0)
+    step = 0.5 * gpe.largest_step(start) if h is None else h
+    return gpe.problem(start, t_end, step, name="soliton", reference=exact, source="Zakharov & Shabat 1972, eq. 2")
+
+
+def plane_wave(
+    shape: Any = (64, 64),
+    modes: Any = (1, 1),
+    amplitude: float = 1.0,
+    beta: float = 1.0,
+    t_end: float = 1.0,
+    h: float | None = None,
+    **options: Any,
+) -> FieldProblem:
+    """Plane wave of the NLS equation, the paper's test of efficiency: a stationary state, H psi = omega psi.
+
+    ``psi = A exp(i (k . x - omega t))``, ``omega = |k|^2 / 2 + beta A^2``, on a box of sides 2 pi. The gradients of
+    mass and energy are parallel: a projection onto both has rank 1.
+
+    Parameters
+    ----------
+    shape : int or sequence of int
+        Of the grid.
+    modes : int or sequence of int
+        k, a whole number along each axis.
+    amplitude, beta, t_end : float
+    h : float, optional
+        Default: half of what RK4 allows.
+    **options
+        Of `GrossPitaevskii`.
+
+    Returns
+    -------
+    FieldProblem
+        With the closed form as `reference`.
+
+    Raises
+    ------
+    ValueError
+        When the modes are not whole numbers, one for each axis.
+    """
+    gpe = GrossPitaevskii(Grid(shape, 0.0, 2 * pi), beta=beta, **options)
+    k = np.atleast_1d(modes)
+    if k.shape != (gpe.grid.dim,) or np.any(k != np.round(k)):
+        raise ValueError(f"modes must be whole numbers, one for each axis of {gpe.grid!r}; got {modes!r}.")
+    phase = sum(n * x for n, x in zip(k, gpe.grid.mesh(), strict=True))
+    omega = 0.5 * float(k @ k) + beta * amplitude**2
+
+    def exact(t: float) -> np.ndarray:
+        return (amplitude * np.exp(1j * (phase - omega * t))).ravel()
+
+    start = exact(0.0)
+    step = 0.5 * gpe.largest_step(start) if h is None else h
+    return gpe.problem(start, t_end, step, name="plane-wave", reference=exact)
+
+
+def rotating_packet(
+    Omega: float = 0.5, points: int = 128, t_end: float = 0.5, h: float = 2e-4, **options: Any
+) -> FieldProblem:
+    """The rotating wave packet of the paper's table 5, psi0 = 2 / sqrt(pi) (x + i y) exp(-8 (x^2 + y^2)).
+
+    On [-2, 2]^2 with V = (x^2 + y^2) / 2 and beta = 1.
+
+    Parameters
+    ----------
+    Omega : float
+        Angular velocity; the paper's are 0, 0.5 and 0.9.
+    points : int
+        Along each axis.
+    t_end, h : float
+    **options
+        Of `GrossPitaevskii`; ``nyquist="zero"`` for the paper's numbers.
+
+    Returns
+    -------
+    FieldProblem
+    """
+    grid = Grid((points, points), -2.0, 2.0)
+    gpe = GrossPitaevskii(grid, harmonic_trap(1.0, 1.0), Omega=Omega, beta=1.0, **options)
+    x, y = grid.mesh()
+    psi0 = 2 / sqrt(pi) * (x + 1j * y) * np.exp(-8 * (x**2 + y**2))
+    return gpe.problem(psi0, t_end, h, name="rotating-packet")
+
+
+def ring_condensate(kappa: float = 0.3, points: int = 256, **options: Any) -> GrossPitaevskii:
+    """The paper's fast rotating ring: V = -0.1 r^2 + kappa / 4 r^4 on [-10, 10]^2, Omega = 3.5, beta = 1000.
+
+    Parameters
+    ----------
+    kappa : float
+        The paper's ground state is that of 0.3; its dynamics starts when that becomes 0.7.
+    points : int
+        Along each axis; the phase turns by Omega r h = 1.8 from point to point with the paper's 256.
+    **options
+        Of `GrossPitaevskii`.
+
+    Returns
+    -------
+    GrossPitaevskii
+    """
+    grid = Grid((points, points), -10.0, 10.0)
+    return GrossPitaevskii(grid, quartic_trap(1.2, kappa, 1.0, 1.0), Omega=3.5, beta=1000.0, **options)
+
+
+def line_condensate(Omega: float = 0.7, points: int = 64, **options: Any) -> GrossPitaevskii:
+    """The paper's condensate with vortex lines: V = (x^2 + y^2 + z^2 / 4) / 2, beta = 400.
+
+    On [-10, 10]^2 x [-15, 15].
+
+    Parameters
+    ----------
+    Omega : float
+        0.7 for the paper's ground state, 0.9 for its dynamics.
+    points : int
+        Along each axis.
+    **options
+        Of `GrossPitaevskii`.
+
+    Returns
+    -------
+    GrossPitaevskii
+    """
+    grid = Grid((points, points, points), (-10.0, -10.0, -15.0), (10.0, 10.0, 15.0))
+    return GrossPitaevskii(grid, harmonic_trap(1.0, 1.0, 0.5), Omega=Omega, beta=400.0, **options)

@@ -1,0 +1,108 @@
+"""The lowest of many stationary states: several starts, and for a condensate with a hole a walk over windings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from .equation import GrossPitaevskii
+from .ground_state import GroundState, Progress, ground_state
+from .starts import mean_square_radius, ring_start, thomas_fermi, with_noise
+
+__all__ = ["lowest_ring", "lowest_state"]
+
+WALK_TOLERANCE, WALK_ITERATIONS = 1e-3, 150
+NEIGHBOURS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))
+# Part of the vortices of a rigid rotation that a single row in the ring holds: only where the walk starts.
+ROW = 0.4
+BREAK_SYMMETRY = 1e-3
+
+
+def lowest_state(
+    gpe: GrossPitaevskii,
+    starts: Iterable[Any],
+    *,
+    tol: float = 1e-8,
+    max_iterations: int = 10_000,
+    progress: Progress | None = None,
+) -> list[GroundState]:
+    """Search from several starts.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+    starts : iterable of array_like
+        See `vortex_starts` and `imprint`.
+    tol, max_iterations, progress
+        See `ground_state`.
+
+    Returns
+    -------
+    list of GroundState
+        In the order of the starts. The least energy of them bounds that of the ground state from above, no more.
+    """
+    return [ground_state(gpe, s, tol=tol, max_iterations=max_iterations, progress=progress) for s in starts]
+
+
+def lowest_ring(
+    gpe: GrossPitaevskii,
+    *,
+    tol: float = 1e-8,
+    max_iterations: int = 10_000,
+    seed: int = 0,
+    progress: Progress | None = None,
+    report: Callable[[int, int, float], Any] | None = None,
+) -> GroundState:
+    """Search the lowest state with one row of vortices in a ring, by their number and the winding inside.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+        Whose Thomas-Fermi density has a hole.
+    tol, max_iterations, progress
+        For the last search, see `ground_state`.
+    seed : int, optional
+        Of the noise that breaks the symmetry of what the walk has found.
+    report : callable, optional
+        ``report(count, winding, energy)`` for each pair tried.
+
+    Returns
+    -------
+    GroundState
+
+    Raises
+    ------
+    ValueError
+        Where there is no hole.
+
+    Notes
+    -----
+    States with different windings lie apart: no descent leads from one to another. So the walk descends from pairs
+    (count, winding), goes to the lowest neighbour as long as there is a lower one, and descends from there with noise.
+    """
+    density = thomas_fermi(gpe)
+    x, y, *_ = gpe.grid.mesh()
+    r2 = (x**2 + y**2)[density > 0] if gpe.grid.dim == 2 else (x**2 + y**2 + 0 * density)[density > 0]
+    if not r2.min() > (4 * gpe.grid.spacing[:2].max()) ** 2:
+        raise ValueError("the condensate has no hole; use lowest_state.")
+    count = round(ROW * abs(gpe.Omega) * (r2.max() - r2.min()))
+    here = count, round(abs(gpe.Omega) * mean_square_radius(gpe) - count / 2)
+    found: dict[tuple[int, int], GroundState] = {}
+
+    def energy(pair: tuple[int, int]) -> float:
+        if pair not in found:
+            start = ring_start(gpe, *pair)
+            found[pair] = ground_state(gpe, start, tol=WALK_TOLERANCE, max_iterations=WALK_ITERATIONS)
+            if report is not None:
+                report(*pair, found[pair].energy)
+        return found[pair].energy
+
+    while True:
+        best = min([here, *((here[0] + a, here[1] + b) for a, b in NEIGHBOURS)], key=energy)
+        if best == here:
+            break
+        here = best
+    start = with_noise(found[here].psi, np.random.default_rng(seed), BREAK_SYMMETRY)
+    return ground_state(gpe, start, tol=tol, max_iterations=max_iterations, progress=progress)

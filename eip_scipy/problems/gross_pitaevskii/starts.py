@@ -1,0 +1,150 @@
+"""Fields to start the search for a ground state from: Thomas-Fermi densities with vortices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import cos, pi, sin, sqrt
+from typing import Any
+
+import numpy as np
+from scipy.optimize import brentq
+
+from .equation import GrossPitaevskii
+
+__all__ = ["imprint", "polygon", "ring_start", "thomas_fermi", "vortex_starts", "with_noise"]
+
+NOISE = 0.05  # of a start's amplitude: enough to leave a symmetry at once
+
+
+def thomas_fermi(gpe: GrossPitaevskii) -> np.ndarray:
+    """The density (mu - V + Omega^2 r^2 / 2) / beta where that is positive, of mass 1.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+        With beta > 0 and a trap that holds against the rotation.
+
+    Returns
+    -------
+    ndarray, shape (J[, K[, L]])
+
+    Raises
+    ------
+    ValueError
+        Without repulsion, or where the density reaches the ends of the box.
+    """
+    if not gpe.beta > 0:
+        raise ValueError(f"a Thomas-Fermi density needs beta > 0, got {gpe.beta:g}; give a start of your own.")
+    r2 = sum(a**2 for a in gpe.grid.mesh()[:2]) if gpe.Omega else 0.0
+    well = gpe.V - 0.5 * gpe.Omega**2 * r2
+    cell, low = gpe.grid.cell, float(well.min())
+
+    def excess(mu: float) -> float:
+        return cell * float(np.maximum(mu - well, 0.0).sum()) / gpe.beta - 1.0
+
+    volume = cell * gpe.grid.size
+    mu = brentq(excess, low, float(well.max()) + gpe.beta / volume, xtol=1e-12)
+    density = np.maximum(mu - well, 0.0) / gpe.beta
+    if any(np.any(np.take(density, 0, axis=axis)) for axis in range(gpe.grid.dim)):
+        raise ValueError("the condensate does not fit the box: enlarge it, or lower Omega.")
+    return density
+
+
+def imprint(gpe: GrossPitaevskii, positions: Any) -> np.ndarray:
+    """Thomas-Fermi amplitude with singly charged vortices, in three dimensions straight lines along z.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+        In two or three dimensions.
+    positions : array_like, shape (k, 2)
+        x and y of each vortex.
+
+    Returns
+    -------
+    ndarray, shape (J, K[, L])
+        A field of mass near 1.
+    """
+    density = thomas_fermi(gpe)
+    x, y, *_ = gpe.grid.mesh()
+    psi = np.sqrt(density).astype(complex)
+    core2 = 1 / (2 * gpe.beta * float(density.max()))  # the square of the healing length
+    for a, b in np.asarray(positions, dtype=float).reshape(-1, 2):
+        z = (x - a) + 1j * (y - b)
+        psi *= z / np.sqrt(np.abs(z) ** 2 + core2)
+    return psi
+
+
+def polygon(count: int, radius: float) -> np.ndarray:
+    """Corners (count, 2) of a regular polygon about the origin, the first on the x axis."""
+    angle = 2 * pi * np.arange(count) / max(count, 1)
+    return radius * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def ring_start(gpe: GrossPitaevskii, count: int, winding: int) -> np.ndarray:
+    """A ring with `count` vortices at equal distances in its middle, and a phase that winds `winding` times inside.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+        Whose Thomas-Fermi density has a hole.
+    count, winding : int
+
+    Returns
+    -------
+    ndarray, shape (J, K[, L])
+    """
+    psi = imprint(gpe, polygon(count, sqrt(mean_square_radius(gpe))))
+    x, y, *_ = gpe.grid.mesh()
+    return psi * np.exp(1j * winding * np.arctan2(y, x))
+
+
+def mean_square_radius(gpe: GrossPitaevskii) -> float:
+    """Mean of x^2 + y^2 over the Thomas-Fermi density."""
+    density = thomas_fermi(gpe)
+    x, y, *_ = gpe.grid.mesh()
+    return float(((x**2 + y**2) * density).sum() / density.sum())
+
+
+def with_noise(psi: np.ndarray, rng: np.random.Generator, size: float = NOISE) -> np.ndarray:
+    """The field with complex noise of `size` times its modulus at each point: no symmetry is left."""
+    noise = rng.standard_normal((2, *psi.shape))
+    return psi + size * np.abs(psi) * (noise[0] + 1j * noise[1])
+
+
+def vortex_starts(gpe: GrossPitaevskii, count: int, seed: int = 0) -> Iterator[np.ndarray]:
+    """Fields with triangular lattices of vortices, each turned, shifted and stretched at random, and a little noise.
+
+    A condensate that turns as a rigid body has Omega / pi vortices per unit area; the lattices have 0.6 to 1.2 times
+    as many, over the whole condensate and any hole in it. Without rotation there are none.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+    count : int
+    seed : int, optional
+
+    Yields
+    ------
+    ndarray, shape (J[, K[, L]])
+    """
+    rng = np.random.default_rng(seed)
+    amplitude = np.sqrt(thomas_fermi(gpe))
+    for _ in range(count):
+        psi = amplitude.astype(complex)
+        if gpe.Omega:
+            psi = imprint(gpe, _lattice(gpe, amplitude, rng))
+        yield with_noise(psi, rng)
+
+
+def _lattice(gpe: GrossPitaevskii, amplitude: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Points (k, 2) of a triangular lattice within the condensate's outer radius, of the sense of the rotation."""
+    x, y, *_ = gpe.grid.mesh()
+    radius = sqrt(float(np.max((x**2 + y**2) * (amplitude > 0))))
+    area = pi / abs(gpe.Omega) / rng.uniform(0.6, 1.2)
+    side, angle = sqrt(2 * area / sqrt(3.0)), rng.uniform(0, pi / 3)
+    reach = int(2 * radius / side) + 2
+    i, j = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1) + rng.uniform(size=(2, 1))
+    a, b = side * (i + 0.5 * j), side * sqrt(0.75) * j
+    points = np.column_stack([cos(angle) * a - sin(angle) * b, sin(angle) * a + cos(angle) * b])
+    return points[np.hypot(*points.T) < radius]

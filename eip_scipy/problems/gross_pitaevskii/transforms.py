@@ -1,0 +1,140 @@
+"""Fourier transforms of fields: which library and how many threads, decided here and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import scipy.fft
+
+__all__ = ["LIBRARIES", "Transforms", "make_transforms"]
+
+Axes = tuple[int, ...]
+
+
+class Transforms:
+    """Transforms of complex fields of one shape along some of their axes, without a factor either way.
+
+    Parameters
+    ----------
+    shape : sequence of int
+    threads : int
+    """
+
+    name = ""
+
+    def __init__(self, shape: Sequence[int], threads: int) -> None:
+        self.shape, self.threads = tuple(shape), threads
+
+    def forward(self, field: np.ndarray, axes: Axes, out: np.ndarray) -> None:
+        """Fill `out` with the transform of `field`, sum_j field_j exp(-i k x_j), along `axes`."""
+        raise NotImplementedError
+
+    def backward(self, field: np.ndarray, axes: Axes) -> None:
+        """Replace `field` by its inverse transform along `axes`, times the number of points along them."""
+        raise NotImplementedError
+
+
+class _SciPy(Transforms):
+    name = "scipy"
+
+    def forward(self, field: np.ndarray, axes: Axes, out: np.ndarray) -> None:
+        np.copyto(out, field)
+        self._in_place(scipy.fft.fftn, out, axes, "backward")
+
+    def backward(self, field: np.ndarray, axes: Axes) -> None:
+        self._in_place(scipy.fft.ifftn, field, axes, "forward")
+
+    def _in_place(self, transform: Callable[..., np.ndarray], field: np.ndarray, axes: Axes, norm: str) -> None:
+        # SciPy may, but need not, overwrite what it is given.
+        result = transform(field, axes=axes, norm=norm, overwrite_x=True, workers=self.threads)
+        if result is not field:
+            np.copyto(field, result)
+
+
+class _Ducc(Transforms):
+    name = "ducc0"
+
+    def __init__(self, shape: Sequence[int], threads: int) -> None:
+        super().__init__(shape, threads)
+        self._c2c = import_module("ducc0").fft.c2c
+
+    def forward(self, field: np.ndarray, axes: Axes, out: np.ndarray) -> None:
+        self._c2c(field, axes=axes, forward=True, out=out, nthreads=self.threads)
+
+    def backward(self, field: np.ndarray, axes: Axes) -> None:
+        self._c2c(field, axes=axes, forward=False, out=field, nthreads=self.threads)
+
+
+class _FFTW(Transforms):
+    """FFTW with measured plans: the fastest in 3D, but two runs may choose plans that round differently."""
+
+    name = "pyfftw"
+
+    def __init__(self, shape: Sequence[int], threads: int) -> None:
+        super().__init__(shape, threads)
+        self._pyfftw = import_module("pyfftw")
+        self._plans: dict[tuple[Axes, bool], Any] = {}
+
+    def forward(self, field: np.ndarray, axes: Axes, out: np.ndarray) -> None:
+        self._plan(axes, True)(field, out)
+
+    def backward(self, field: np.ndarray, axes: Axes) -> None:
+        self._plan(axes, False)(field, field, normalise_idft=False)
+
+    def _plan(self, axes: Axes, forward: bool) -> Any:
+        """Forward plans are from one array to another, backward plans in place, as they will be used."""
+        if (axes, forward) not in self._plans:
+            target = np.zeros(self.shape, complex)
+            source = np.zeros(self.shape, complex) if forward else target
+            self._plans[axes, forward] = self._pyfftw.FFTW(
+                source,
+                target,
+                axes=axes,
+                direction="FFTW_FORWARD" if forward else "FFTW_BACKWARD",
+                flags=("FFTW_MEASURE", "FFTW_UNALIGNED"),
+                threads=self.threads,
+            )
+        return self._plans[axes, forward]
+
+
+LIBRARIES: dict[str, type[Transforms]] = {kind.name: kind for kind in (_SciPy, _Ducc, _FFTW)}
+# Fastest first, by `python benchmarks/gpe.py`.
+PREFERENCE = {1: ("ducc0", "scipy"), 2: ("ducc0", "pyfftw", "scipy"), 3: ("pyfftw", "ducc0", "scipy")}
+
+
+def make_transforms(shape: Sequence[int], fft: str = "auto", threads: int = 1) -> Transforms:
+    """Choose a library and make its transforms.
+
+    Parameters
+    ----------
+    shape : sequence of int
+        Of the fields.
+    fft : {"auto", "scipy", "ducc0", "pyfftw"}, optional
+        "auto": the fastest of those installed. ducc0 and pyfftw come with ``pip install "eip_scipy[fft]"`` (both GPL).
+    threads : int, optional
+        Threads of each transform. No other part of the right-hand side has threads, so that no two pools compete.
+
+    Returns
+    -------
+    Transforms
+
+    Raises
+    ------
+    ValueError
+        For another name or a number of threads below 1.
+    ImportError
+        When the library asked for is not installed.
+    """
+    if isinstance(threads, bool) or not isinstance(threads, (int, np.integer)) or threads < 1:
+        raise ValueError(f"threads must be an integer >= 1, got {threads!r}.")
+    if fft == "auto":
+        fft = next(name for name in PREFERENCE[len(shape)] if find_spec(name) is not None)
+    if fft not in LIBRARIES:
+        raise ValueError(f"fft must be 'auto' or one of {', '.join(map(repr, LIBRARIES))}, got {fft!r}.")
+    if find_spec(fft) is None:
+        raise ImportError(f"fft={fft!r} needs {fft}: pip install \"eip_scipy[fft]\", or fft='scipy'.", name=fft)
+    return LIBRARIES[fft](shape, int(threads))
