@@ -291,7 +291,7 @@ def test_checkpoints_that_nothing_can_be_done_with(options, message, tmp_path, c
 
 
 def test_an_interruption_anywhere_is_one_line(capsys, monkeypatch):
-    def interrupted(*args):
+    def interrupted(*args, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("eip_scipy.reproduce.reproduce", interrupted)
