@@ -568,6 +568,17 @@ def test_a_store_is_not_overwritten_nor_mixed_up(where, tmp_path):
 
 
 @both_stores
+def test_another_machine_is_a_warning(where, tmp_path, monkeypatch):
+    place = {where: tmp_path / "kept"}
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "_machine", lambda: "another machine")
+        whole = stored(**place)
+    with pytest.warns(UserWarning, match="machine another machine, here") as seen:
+        same(whole, stored(resume=True, **place))
+    assert seen[0].filename == __file__
+
+
+@both_stores
 def test_what_is_no_store(where, tmp_path):
     place = tmp_path / "other"
     place.write_text("something") if where == "checkpoint" else place.mkdir()
