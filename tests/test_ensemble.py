@@ -618,6 +618,27 @@ def test_checkpoints_in_time(tmp_path):
     assert sorted(seen) == seen
 
 
+def test_a_full_disk_is_a_warning(tmp_path, monkeypatch):
+    """The result is there all the same, and so is the former file."""
+    path, write = tmp_path / "kept", checkpoint.write
+
+    def full(*arguments):
+        if path.exists():
+            raise CheckpointError("cannot write the checkpoint: no space left on device")
+        write(*arguments)
+
+    monkeypatch.setattr(checkpoint, "write", full)
+    with pytest.warns(RuntimeWarning, match="no space left on device; the former checkpoint stays"):
+        same(stored(), stored(checkpoint=path))
+    assert checkpoint.read(path, "ensemble")[0]["finished"] == 0
+
+
+def test_without_zarr(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(ImportError, match=r'out= needs zarr: pip install "eip_scipy\[zarr\]"'):
+        stored(out=tmp_path / "run.zarr")
+
+
 KILLED = """
 import os, signal, sys, numpy as np
 sys.path.insert(0, {tests!r})
