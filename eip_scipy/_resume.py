@@ -189,7 +189,7 @@ class _FileKeeper(Keeper):
         sizes = np.append(np.full(f0.size, np.abs(f0).max(initial=0.0)), run.invariants.term_sizes(t0, y0, f0))
         there, here = (np.append(a["start_f"], a["start_values"]) for a in (arrays, self._start))
         self._require_same_functions(labels, sizes, there, here)
-        checkpoint.warn_of_other_versions(self._path, header, stacklevel=3)
+        checkpoint.warn_of_other_versions(self._path, header, stacklevel=4)
 
     def _require_same_functions(self, labels: list[str], sizes: Any, there: Any, here: Any) -> None:
         with np.errstate(invalid="ignore"):

@@ -226,7 +226,7 @@ class CheckpointStore:
                 raise _existing(path)
             self._header, self._arrays = checkpoint.read(path, KIND)
             require_identity(path, self._header, identity)
-            checkpoint.warn_of_other_versions(path, self._header, stacklevel=4)
+            checkpoint.warn_of_other_versions(path, self._header, stacklevel=3)
         else:
             checkpoint.write(path, {"kind": KIND, **identity, **self._header}, {})
         self._written, self._cost = time.perf_counter(), 0.0

@@ -567,6 +567,17 @@ def test_a_store_is_not_overwritten_nor_mixed_up(where, tmp_path):
 
 
 @both_stores
+def test_another_machine_is_a_warning(where, tmp_path, monkeypatch):
+    place = {where: tmp_path / "kept"}
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "_machine", lambda: "another machine")
+        whole = stored(**place)
+    with pytest.warns(UserWarning, match="machine another machine, here") as seen:
+        same(whole, stored(resume=True, **place))
+    assert seen[0].filename == __file__
+
+
+@both_stores
 def test_what_is_no_store(where, tmp_path):
     place = tmp_path / "other"
     place.write_text("something") if where == "checkpoint" else place.mkdir()
@@ -604,6 +615,27 @@ def test_checkpoints_in_time(tmp_path):
     stored(checkpoint=path, checkpoint_every=1e-9, callback=callback)
     assert seen[0] == 3
     assert sorted(seen) == seen
+
+
+def test_a_full_disk_is_a_warning(tmp_path, monkeypatch):
+    """The result is there all the same, and so is the former file."""
+    path, write = tmp_path / "kept", checkpoint.write
+
+    def full(*arguments):
+        if path.exists():
+            raise CheckpointError("cannot write the checkpoint: no space left on device")
+        write(*arguments)
+
+    monkeypatch.setattr(checkpoint, "write", full)
+    with pytest.warns(RuntimeWarning, match="no space left on device; the former checkpoint stays"):
+        same(stored(), stored(checkpoint=path))
+    assert checkpoint.read(path, "ensemble")[0]["finished"] == 0
+
+
+def test_without_zarr(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(ImportError, match=r'out= needs zarr: pip install "eip_scipy\[zarr\]"'):
+        stored(out=tmp_path / "run.zarr")
 
 
 KILLED = """

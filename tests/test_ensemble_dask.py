@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ distributed = pytest.importorskip("distributed", reason="needs Dask's distribute
 dask = pytest.importorskip("dask", reason="needs Dask")
 psutil = pytest.importorskip("psutil", reason="needs psutil, which comes with distributed")
 
+from eip_scipy.integrations import dask as integration  # noqa: E402
 from eip_scipy.integrations.dask import DaskExecutor, local_client, require_secure  # noqa: E402
 
 slow = pytest.mark.slow
@@ -161,6 +163,55 @@ def test_workers_in_this_process():
         client.close()
     same(runs[0], runs[1])
     same(runs[0], runs[2])
+
+
+class Asked:
+    """A future."""
+
+    def __init__(self, result):
+        self.result = result
+
+
+class Lost:
+    """A client whose workers die of the member 13, and of nothing else; results come at the second asking."""
+
+    cluster = None
+
+    def submit(self, function, task, plan, chunk, *, key, pure):
+        late = []
+
+        def result(timeout):
+            if not late:
+                late.append(timeout)
+                raise TimeoutError
+            if (chunk.y0s[:, 0] == 13).any():
+                raise distributed.KilledWorker(key, SimpleNamespace(address="tcp://127.0.0.1:1"), 3)
+            return function(task, plan, chunk)
+
+        return Asked(result)
+
+    def nthreads(self):
+        return {}
+
+    def wait_for_workers(self, n):
+        assert n == 1
+
+    def cancel(self, futures):
+        assert not futures
+
+
+def test_halves_of_halves(monkeypatch):
+    monkeypatch.setattr(integration, "GRACE", 0.0)
+    y0s = np.column_stack([np.arange(20.0), np.zeros(20)])
+    run = ensemble(
+        oscillator, (0, 1), y0s, h=0.1, chunk=7, reduce="state", executor=DaskExecutor(Lost(), allow_insecure=True)
+    )
+    whole = ensemble(oscillator, (0, 1), y0s, h=0.1, chunk=7)
+    assert run.failed.tolist() == [13]
+    assert "its workers died" in run.message[13]
+    np.testing.assert_array_equal(run.y[13], y0s[13])
+    np.testing.assert_array_equal(np.delete(run.y, 13, axis=0), np.delete(whole.y, 13, axis=0))
+    assert run.statistics.count.tolist() == [19]
 
 
 class Client:
