@@ -35,6 +35,7 @@ __all__ = ["FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_
 FAILED, NOT_RUN = -1, -2
 DOUBTFUL = -1
 BATCH_SECONDS = 0.1
+LEAST_WORK = 3e7  # floats times steps, a second or two: compiling functions for vectors takes as long
 COMPARED = 16
 
 
@@ -59,6 +60,8 @@ class Task:
         What `Statistics` are wanted of.
     keep : bool
         Whether the saved states themselves are wanted.
+    members : int
+        How many there are in all.
     """
 
     fun: Any
@@ -68,6 +71,7 @@ class Task:
     params: np.ndarray | None
     reduce: Any = None
     keep: bool = True
+    members: int = 1
 
     def loop(self, y0: np.ndarray, params: np.ndarray | None, **options: Any) -> Loop:
         """The run of one member, as `integrate` prepares it."""
@@ -157,7 +161,7 @@ class Plan:
         own_targets = any(item.target is not None for item in run.invariants.items)
         own_start = bool(task.options.get("project_initial", False)) or own_targets
         self._together = self.why_not is None and not (own_start or loop.events.functions or grid.t_eval.size)
-        self._idle = [_Driver(loop)] if self._together else []
+        self._idle = [_Driver(loop, task.members)] if self._together else []
         none = np.zeros((0, self.size), self.dtype), np.zeros((0, loop.driver.params.size))
         run_members(self, *none)  # compiles, before there are threads that would all do it
 
@@ -189,7 +193,8 @@ class Plan:
         try:
             mine = self._idle.pop()
         except IndexError:
-            mine = _Driver(self.task.loop(self.task.y0, self.task.params, **self._options))
+            loop = self.task.loop(self.task.y0, self.task.params, **self._options)
+            mine = _Driver(loop, self.task.members)
         yield mine
         self._idle.append(mine)
 
@@ -379,10 +384,18 @@ def _compiled_sweep(dtype: np.dtype, advance: Any, arguments: tuple[Any, ...]) -
     return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(sweep)
 
 
+def _batch(loop: Loop) -> Batch | None:
+    """Buffers for members side by side; None where they cannot run so."""
+    try:
+        return Batch(loop)
+    except NotCompilableError:
+        return None
+
+
 class _Driver:
     """A compiled driver with its buffers, which runs member after member."""
 
-    def __init__(self, loop: Loop) -> None:
+    def __init__(self, loop: Loop, members: int) -> None:
         self.loop = loop
         driver, options, span = loop.driver, loop.driver.run.options, loop.driver.grid.span
         buffers = _buffers(driver.run.work)
@@ -396,12 +409,7 @@ class _Driver:
         first = None if options.adaptive else float(driver.grid.clock[H_ABS])
         self._stepping = Stepping(span, first, None, options.rtol[::width], options.atol)
         self._row_buffer = driver.y[None].view(float)
-        self._batch: Batch | None = None
-        self.why_one_by_one = ""
-        try:
-            self._batch = Batch(loop)
-        except NotCompilableError as reason:
-            self.why_one_by_one = str(reason)
+        self._batch = _batch(loop) if members * span.n_steps * driver.run.y0.size >= LEAST_WORK else None
 
     def run(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
         """All members into `out`."""

@@ -226,7 +226,8 @@ def ensemble(
         raise ValueError(f"reduce must be 'state' or a function reduce(t, y), got {reduce!r}.")
     _check_places(out, checkpoint, checkpoint_every, resume)
     keep = reduce is None or out is not None
-    task = Task(_bare(fun), t_span, given, starts[0], parameters[0] if parameters.shape[1] else None, reduce, keep)
+    own = parameters[0] if parameters.shape[1] else None
+    task = Task(_bare(fun), t_span, given, starts[0], own, reduce, keep, len(starts))
     task = _first_that_starts(task, starts, parameters)
     plan = Plan(task, compiled=False)
     starts = np.ascontiguousarray(starts, plan.dtype)

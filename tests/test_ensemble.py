@@ -253,7 +253,7 @@ def test_the_sweep_is_plain_python_too(options):
     plan = Plan(Task(orbit, (0.0, 2.0), {k: v for k, v in shared.items() if v is not None}, y0s[0], None))
     none = np.zeros((4, 0))
     expected = run_members(plan, y0s, none)
-    driver = _Driver(plan.loop(y0s[0], none[0]))
+    driver = _Driver(plan.loop(y0s[0], none[0]), 1)
     driver._compiled = sweep
     found = plan.empty(4)
     driver.run(plan, y0s, none, found, _Watch(None))

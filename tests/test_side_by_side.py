@@ -14,6 +14,7 @@ from eip_scipy import (
     EIPRKN8,
     EIPRKN12,
     Invariant,
+    _members,
     ensemble,
     integrate,
 )
@@ -28,6 +29,17 @@ FIELDS = ("y", "max_defect", "nfev", "njev", "nlu")
 
 def spread_starts(y0, members, size=1e-3, seed=0):
     return y0 * (1 + size * np.random.default_rng(seed).normal(size=(members, y0.size)))
+
+
+@pytest.fixture(autouse=True)
+def _small_ensembles_too(monkeypatch):
+    monkeypatch.setattr(_members, "LEAST_WORK", 0)
+
+
+def test_little_work_is_not_worth_compiling_for(monkeypatch):
+    monkeypatch.undo()
+    run = ensemble(kepler(), (0, 1), spread_starts(kepler().y0, 40), executor=1)
+    assert not run.side_by_side.any()
 
 
 @pytest.fixture
