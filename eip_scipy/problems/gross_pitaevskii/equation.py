@@ -179,8 +179,9 @@ class GrossPitaevskii:
     def rhs(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with -i H(psi) psi; both flat and contiguous, and not the same array."""
         shape = self.grid.shape
-        rest = self._linear.parts(y.reshape(shape), out.reshape(shape))
-        derivative(rest.reshape(-1).view(float), y.view(float), self.V.reshape(-1), self.beta, out.view(float))
+        psi, image = y.reshape(shape), out.reshape(shape)
+        for where, rest in self._linear.parts(psi, image):
+            derivative(_floats(rest), _floats(psi[where]), self.V[where].reshape(-1), self.beta, _floats(image[where]))
 
     def fun(self, t: float, y: np.ndarray) -> np.ndarray:
         """-i H(psi) psi, flat: what `solve_ivp` takes."""
@@ -235,7 +236,7 @@ class GrossPitaevskii:
         return self._Lz
 
     def _mass_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
-        np.multiply(y, 2 * self.grid.cell, out=out)
+        np.multiply(y.view(float), 2 * self.grid.cell, out=out.view(float))
 
     def _angular_momentum_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
         self._rotation_or_error().apply(y.reshape(self.grid.shape), out.reshape(self.grid.shape))
@@ -384,6 +385,10 @@ class _Energy:
         turn(f.view(float), 2 * self._gpe.grid.cell, out.view(float))  # 2 w H psi, and H psi = i f
         # Copies: the caller may use its arrays for something else.
         self._near, self._value = (self._gpe.as_field(y).copy(), f.copy()), None
+
+
+def _floats(field: np.ndarray) -> np.ndarray:
+    return field.reshape(-1).view(np.float64)
 
 
 def _on_grid(potential: Any, grid: Grid) -> np.ndarray:
