@@ -123,7 +123,7 @@ class GrossPitaevskii:
             raise ValueError(f"a rotation needs two dimensions: Omega = {Omega!r} on {grid!r}.")
         self.grid, self.Omega, self.beta, self.nyquist = grid, float(Omega), float(beta), nyquist
         self.V = _on_grid(potential, grid)
-        self.transforms = make_transforms(grid.shape, fft, threads)
+        self.transforms = make_transforms(fft, threads)
         self.fft = self.transforms.name
         self._options = {"nyquist": nyquist, "fft": fft, "threads": threads}
         self._linear = SpectralSum(grid, self.transforms, self._kinetic_and_rotation())

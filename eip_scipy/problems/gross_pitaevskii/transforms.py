@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -102,19 +102,18 @@ class _FFTW(Transforms):
 
 
 LIBRARIES: dict[str, type[Transforms]] = {kind.name: kind for kind in (_SciPy, _Ducc, _FFTW)}
-# Fastest first, by `python benchmarks/gpe.py`.
-PREFERENCE = {1: ("ducc0", "scipy"), 2: ("ducc0", "pyfftw", "scipy"), 3: ("pyfftw", "ducc0", "scipy")}
+# The first that is installed. By `python benchmarks/gpe.py` ducc0 is the fastest, but for the largest fields in 3D.
+PREFERENCE = ("ducc0", "pyfftw", "scipy")
 
 
-def make_transforms(shape: Sequence[int], fft: str = "auto", threads: int = 1) -> Transforms:
+def make_transforms(fft: str = "auto", threads: int = 1) -> Transforms:
     """Choose a library and make its transforms.
 
     Parameters
     ----------
-    shape : sequence of int
-        Of the fields: which library is fastest depends on the number of axes.
     fft : {"auto", "scipy", "ducc0", "pyfftw"}, optional
-        "auto": the fastest of those installed. ducc0 and pyfftw come with ``pip install "eip_scipy[fft]"`` (both GPL).
+        "auto": the first of ducc0, pyfftw and scipy that is installed. The first two, both GPL, come with
+        ``pip install "eip_scipy[fft]"``.
     threads : int, optional
         Threads of each transform. No other part of the right-hand side has threads, so that no two pools compete.
 
@@ -132,7 +131,7 @@ def make_transforms(shape: Sequence[int], fft: str = "auto", threads: int = 1) -
     if isinstance(threads, bool) or not isinstance(threads, (int, np.integer)) or threads < 1:
         raise ValueError(f"threads must be an integer >= 1, got {threads!r}.")
     if fft == "auto":
-        fft = next(name for name in PREFERENCE[len(shape)] if find_spec(name) is not None)
+        fft = next(name for name in PREFERENCE if find_spec(name) is not None)
     if fft not in LIBRARIES:
         raise ValueError(f"fft must be 'auto' or one of {', '.join(map(repr, LIBRARIES))}, got {fft!r}.")
     if find_spec(fft) is None:
