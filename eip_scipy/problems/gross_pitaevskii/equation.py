@@ -204,12 +204,12 @@ class GrossPitaevskii:
         return out
 
     def mass(self, psi: Any) -> float:
-        """Sum of |psi|^2 over the grid, times the cell: 1 for a normalised state."""
+        """Sum of ``|psi|^2`` over the grid, times the cell: 1 for a normalised state."""
         flat = self.as_field(psi).reshape(-1).view(float)
         return self.grid.cell * dot(flat, flat)
 
     def energy(self, psi: Any) -> float:
-        """Kinetic, potential, rotational and interaction energy, the last beta / 2 times the sum of |psi|^4."""
+        """Kinetic, potential, rotational and interaction energy, the last beta / 2 times the sum of ``|psi|^4``."""
         psi = self.as_field(psi)
         columns = self.grid.shape[-1]
         local = interaction_energy(float_rows(psi, columns), self.V.reshape(-1, columns), self.beta)
