@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -127,7 +128,6 @@ class GrossPitaevskii:
         self.fft = self.transforms.name
         self._options = {"nyquist": nyquist, "fft": fft, "threads": threads}
         self._linear = SpectralSum(grid, self.transforms, self._kinetic_and_rotation())
-        self._Lz = None if grid.dim == 1 else SpectralSum(grid, self.transforms, self._rotation())
 
     def __repr__(self) -> str:
         return f"GrossPitaevskii({self.grid!r}, Omega={self.Omega:g}, beta={self.beta:g})"
@@ -148,8 +148,12 @@ class GrossPitaevskii:
         k, q = (self.grid.wavenumbers(axis, odd=True) for axis in (0, 1))
         return [-y * k, x * q]
 
-    def _rotation(self) -> list[Multiplier]:
-        return [Multiplier(self.grid, (axis,), factor) for axis, factor in enumerate(self._rotation_factors())]
+    @cached_property
+    def _turning(self) -> SpectralSum:
+        if self.grid.dim == 1:
+            raise ValueError("in one dimension there is no angular momentum.")
+        terms = [Multiplier(self.grid, (axis,), factor) for axis, factor in enumerate(self._rotation_factors())]
+        return SpectralSum(self.grid, self.transforms, terms)
 
     def _kinetic_and_rotation(self) -> list[Multiplier]:
         """As few transforms as there are: all axes at once without rotation, else x, and then y and z together."""
@@ -223,23 +227,18 @@ class GrossPitaevskii:
         ValueError
             In one dimension.
         """
-        return self.grid.cell * self._rotation_or_error().expectation(self.as_field(psi))
+        return self.grid.cell * self._turning.expectation(self.as_field(psi))
 
     def chemical_potential(self, psi: Any) -> float:
         """Mean of H: mu = Re <H(psi) psi, psi> / <psi, psi>."""
         psi = self.as_field(psi)
         return float(np.vdot(psi, self.hamiltonian(psi)).real / np.vdot(psi, psi).real)
 
-    def _rotation_or_error(self) -> SpectralSum:
-        if self._Lz is None:
-            raise ValueError("in one dimension there is no angular momentum.")
-        return self._Lz
-
     def _mass_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
         np.multiply(y.view(float), 2 * self.grid.cell, out=out.view(float))
 
     def _angular_momentum_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
-        self._rotation_or_error().apply(y.reshape(self.grid.shape), out.reshape(self.grid.shape))
+        self._turning.apply(y.reshape(self.grid.shape), out.reshape(self.grid.shape))
         out *= 2 * self.grid.cell
 
     def invariants(self, names: Sequence[str] = ("mass", "energy")) -> tuple[Invariant, ...]:
