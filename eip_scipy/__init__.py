@@ -5,6 +5,7 @@ from importlib.metadata import version as _version
 from .invariants import Invariant, check_gradient
 from .longrun import integrate
 from .nystrom import NystromTableau
+from .one_step import OneStepMethod
 from .projection import project
 from .result import Diagnostics, IntegrationResult, ProjectionResult
 from .solvers import (
@@ -41,6 +42,7 @@ __all__ = [
     "IntegrationResult",
     "Invariant",
     "NystromTableau",
+    "OneStepMethod",
     "ProjectionResult",
     "Tableau",
     "check_gradient",
