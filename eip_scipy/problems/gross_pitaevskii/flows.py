@@ -12,8 +12,9 @@ from .transforms import Axes
 
 __all__ = ["LinearFlow", "rotated"]
 
-# The shears of larger angles carry the field far outside itself: tan(pi / 8) of its radius at this one.
 LARGEST_TURN = pi / 4
+# Shears stretch what they turn, by a fortieth of its radius at this angle: the field must stay inside the box.
+SMALL_TURN = pi / 32
 
 
 class LinearFlow:
@@ -90,7 +91,7 @@ def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
     psi : array_like
         A field or flat state that vanishes towards the ends of the box.
     angle : float
-        Any; more than pi / 4 is done in parts.
+        Any; done in parts of pi / 32 at most, whose shears hardly stretch the field.
 
     Returns
     -------
@@ -104,7 +105,7 @@ def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
     """
     psi = gpe.as_field(psi).copy()
     angle = remainder(angle, 2 * pi)
-    parts = max(1, ceil(abs(angle) / LARGEST_TURN - 1e-9))
+    parts = max(1, ceil(abs(angle) / SMALL_TURN - 1e-9))
     flow, work = LinearFlow(gpe, 0.0, angle / parts), np.empty_like(psi)
     for _ in range(parts):
         psi, work = flow.apply(psi, work)
