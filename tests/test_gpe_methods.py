@@ -8,7 +8,7 @@ from scipy.linalg import expm
 from eip_scipy import EIPDOP853, eip_method, integrate
 from eip_scipy.diagnostics import observed_order
 from eip_scipy.problems import Grid, GrossPitaevskii, Lawson4, Splitting, harmonic_trap, soliton
-from eip_scipy.problems.gross_pitaevskii import RKN6, S6, STRANG, LinearFlow, Scheme, rotated
+from eip_scipy.problems.gross_pitaevskii import RKN6, S6, STRANG, LinearFlow, Scheme, at_rest, rotated
 from eip_scipy.problems.gross_pitaevskii.pointwise import local_flow
 
 SCHEMES = [STRANG, S6, RKN6]
@@ -118,11 +118,10 @@ def test_local_flow_is_a_phase():
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=name)
-@pytest.mark.parametrize("radial", [False, True])
-def test_a_step_is_unitary_and_a_step_back_undoes_it(scheme, radial):
+def test_a_step_is_unitary_and_a_step_back_undoes_it(scheme):
     grid = Grid((16, 20), -3, 3)
     gpe = GrossPitaevskii(grid, harmonic_trap(1, 1), Omega=0.6, beta=3.0)
-    method = Splitting(gpe, scheme, radial=radial)
+    method = Splitting(gpe, scheme)
     start = noise(grid).ravel()
     there = method.one_step(0.0, start.copy(), 0.05).copy()
     assert np.linalg.norm(there) == pytest.approx(np.linalg.norm(start), rel=1e-14)
@@ -194,21 +193,20 @@ def test_rotating_condensate(condensate, method, kept):
     assert errors[-1] < 2e-3
 
 
-@pytest.mark.parametrize("scheme", ["s6", "rkn6"])
-def test_a_round_potential_lets_the_rotation_be_done_elsewhere(condensate, scheme):
-    """In two of the flows, or at the end of a run at rest, as far as the grid resolves the field."""
-    problem, _ = condensate
-    gpe = problem.equation
-    rest = gpe.changed(Omega=0.0)
-    h = 0.05
-
-    def end(scene, **options):
-        return integrate(scene, method=eip_method(Splitting(scene.equation, scheme, **options)), h=h, invariants=()).y
-
-    turning = end(problem)[:, -1]
-    np.testing.assert_allclose(end(problem, radial=True)[:, -1], turning, atol=1e-8)
-    resting = end(rest.problem(problem.y0, 0.5))[:, -1]
-    np.testing.assert_allclose(rotated(gpe, resting, gpe.Omega * 0.5).ravel(), turning, atol=1e-8)
+@pytest.mark.parametrize("kept", [(), KEPT], ids=["raw", "EIP"])
+def test_the_frame_at_rest(condensate, kept):
+    """Its field, rotated, is that of the rotating frame, as far as the grid resolves it; and so is its energy."""
+    problem, exact = condensate
+    gpe, rest = problem.equation, at_rest(problem)
+    assert rest.equation.Omega == 0
+    run = integrate(
+        rest, method=eip_method(Splitting(rest.equation)), h=0.025, invariants=rest.equation.invariants(kept)
+    )
+    if kept:
+        assert (run.max_defect < [MASS, 10 * ENERGY]).all()
+    seen = rotated(gpe, run.y[:, -1], gpe.Omega * 0.5)
+    np.testing.assert_allclose(seen.ravel(), exact, rtol=0, atol=2e-8)
+    assert gpe.energy(seen) == pytest.approx(gpe.energy(problem.y0), abs=1e-7)
 
 
 def test_lawson_adapts_its_step(condensate):
@@ -242,9 +240,9 @@ def test_wrong_options():
     with pytest.raises(ValueError, match=r"unknown scheme 'strangg', expected 'strang', .*Did you mean|strang"):
         Splitting(gpe, "strangg")
     with pytest.raises(ValueError, match="equally far from the z axis"):
-        Splitting(gpe.changed(potential=lambda x, y: x**4 + y**4), radial=True)
-    with pytest.raises(ValueError, match="two dimensions"):
-        Splitting(GrossPitaevskii(Grid(8, -1, 1)), radial=True)
+        at_rest(gpe.changed(potential=lambda x, y: x**4 + y**4).problem(np.ones((16, 16)), 1.0))
+    with pytest.raises(ValueError, match="no rotation: the problem has one dimension"):
+        at_rest(soliton())
     with pytest.raises(ValueError, match=r"turns by pi / 4 at most, got 1 "):
         Splitting(gpe, "strang").one_step(0.0, noise(grid).ravel(), 2.0)
     with pytest.raises(ValueError, match="no rotation"):

@@ -1,7 +1,8 @@
 """The rotating Gross-Pitaevskii equation in one, two and three dimensions."""
 
 from .equation import FieldProblem, GrossPitaevskii
-from .flows import LinearFlow, rotated
+from .flows import LinearFlow
+from .frames import at_rest, rotated
 from .grid import Grid, Multiplier, SpectralSum
 from .ground_state import GroundState, ground_state
 from .lawson import Lawson4
@@ -28,6 +29,7 @@ __all__ = [
     "SpectralSum",
     "Splitting",
     "Vortices",
+    "at_rest",
     "ground_state",
     "harmonic_trap",
     "imprint",

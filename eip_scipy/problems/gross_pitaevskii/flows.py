@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import ceil, cos, pi, remainder, sin, tan
+from math import cos, pi, sin, tan
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,9 @@ import numpy as np
 from .equation import GrossPitaevskii
 from .transforms import Axes
 
-__all__ = ["LinearFlow", "rotated"]
+__all__ = ["LinearFlow"]
 
 LARGEST_TURN = pi / 4
-# Shears stretch what they turn, by a fortieth of its radius at this angle: the field must stay inside the box.
-SMALL_TURN = pi / 32
 
 
 class LinearFlow:
@@ -76,37 +74,3 @@ class LinearFlow:
             self._fft.backward(work, axes)
             psi, work = work, psi
         return psi, work
-
-
-def rotated(gpe: GrossPitaevskii, psi: Any, angle: float) -> np.ndarray:
-    """exp(i angle Lz) psi: the field's values at points turned by `angle`, anticlockwise, about the z axis.
-
-    A solution of the equation with Omega = 0 and a potential that is round about z becomes that of Omega when it is
-    rotated by ``Omega t``: the rotating frame, from the frame at rest.
-
-    Parameters
-    ----------
-    gpe : GrossPitaevskii
-        In two or three dimensions.
-    psi : array_like
-        A field or flat state that vanishes towards the ends of the box.
-    angle : float
-        Any; done in parts of pi / 32 at most, whose shears hardly stretch the field.
-
-    Returns
-    -------
-    ndarray
-        A field.
-
-    Raises
-    ------
-    ValueError
-        In one dimension, or for a field of another shape.
-    """
-    psi = gpe.as_field(psi).copy()
-    angle = remainder(angle, 2 * pi)
-    parts = max(1, ceil(abs(angle) / SMALL_TURN - 1e-9))
-    flow, work = LinearFlow(gpe, 0.0, angle / parts), np.empty_like(psi)
-    for _ in range(parts):
-        psi, work = flow.apply(psi, work)
-    return psi

@@ -13,8 +13,6 @@ from .pointwise import local_flow
 
 __all__ = ["RKN6", "S6", "STRANG", "Scheme", "Splitting"]
 
-ALIKE = 1e-9  # radii and values of a potential that count as equal
-
 
 class Scheme(NamedTuple):
     """Coefficients of a symmetric splitting: flows of the local part and of the linear part in turn.
@@ -71,20 +69,17 @@ class Splitting:
     scheme : {"rkn6", "s6", "strang"} or Scheme, optional
         "rkn6" and "s6": of order 4, by Blanes and Moan; the former is made for Hamiltonians whose one part is quadratic
         in the momenta, as here. "strang": of order 2.
-    radial : bool, optional
-        The potential is round about the z axis. The rotation then commutes with all the rest, is done in the first
-        and the last linear flow only, and saves transforms (order 4: 7 instead of 9 pairs in two dimensions).
 
     Attributes
     ----------
-    gpe, scheme, radial
+    gpe, scheme
     order : int
     name : str
 
     Raises
     ------
     ValueError
-        For another scheme, or when a potential that was called radial is not.
+        For another scheme.
 
     Notes
     -----
@@ -101,21 +96,19 @@ class Splitting:
     (True, True)
     """
 
-    def __init__(self, gpe: GrossPitaevskii, scheme: str | Scheme = "rkn6", *, radial: bool = False) -> None:
+    def __init__(self, gpe: GrossPitaevskii, scheme: str | Scheme = "rkn6") -> None:
         if not isinstance(scheme, Scheme):
             if scheme not in SCHEMES:
                 names = ", ".join(map(repr, SCHEMES))
                 raise ValueError(f"unknown scheme {scheme!r}, expected {names} or a Scheme{nearest(scheme, SCHEMES)}")
             scheme = SCHEMES[scheme]
-        if radial:
-            check_radial(gpe)
-        self.gpe, self.scheme, self.radial = gpe, scheme, bool(radial)
+        self.gpe, self.scheme = gpe, scheme
         self.order, self.name = scheme.order, f"splitting-{scheme.name}"
         self._h: float | None = None
         self._flows: list[LinearFlow] = []
 
     def __repr__(self) -> str:
-        return f"Splitting({self.gpe!r}, {self.scheme.name!r}, radial={self.radial})"
+        return f"Splitting({self.gpe!r}, {self.scheme.name!r})"
 
     def one_step(self, t: float, y: np.ndarray, h: float) -> np.ndarray:
         """One step of length h; `y` is overwritten and returned."""
@@ -133,36 +126,5 @@ class Splitting:
         return y
 
     def _linear_flows(self, h: float) -> list[LinearFlow]:
-        parts = self.scheme.linear
-        angles = self._turns()
-        made: dict[tuple[float, float], LinearFlow] = {}
-        for key in zip(parts, angles, strict=True):
-            if key not in made:
-                made[key] = LinearFlow(self.gpe, key[0] * h, key[1] * self.gpe.Omega * h)
-        return [made[key] for key in zip(parts, angles, strict=True)]
-
-    def _turns(self) -> tuple[float, ...]:
-        """Parts of the rotation in the linear flows: symmetric, of sum 1."""
-        parts = self.scheme.linear
-        if not self.radial or len(parts) < 2:
-            return parts
-        return (0.5, *[0.0] * (len(parts) - 2), 0.5)
-
-
-def check_radial(gpe: GrossPitaevskii) -> None:
-    """Whether the potential has one value at all points of the grid that are equally far from the z axis.
-
-    Raises
-    ------
-    ValueError
-        When it has not, or in one dimension.
-    """
-    if gpe.grid.dim == 1:
-        raise ValueError("radial=True needs two dimensions.")
-    x, y, *_ = gpe.grid.mesh()
-    square = (x * x + y * y).ravel()
-    order = np.argsort(square)
-    values = gpe.V.reshape(square.size, -1)[order]
-    alike = np.diff(square[order]) <= ALIKE * square.max()
-    if np.any(np.abs(np.diff(values, axis=0))[alike] > ALIKE * np.abs(gpe.V).max()):
-        raise ValueError("radial=True, but the potential differs between points equally far from the z axis.")
+        made = {part: LinearFlow(self.gpe, part * h) for part in set(self.scheme.linear)}
+        return [made[part] for part in self.scheme.linear]
