@@ -26,7 +26,15 @@ def assert_output(found, printed):
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", "docs/quickstart.md", "docs/adaptive.md", "docs/hard-scenes.md", "docs/gross-pitaevskii.md"]
+    "page",
+    [
+        "README.md",
+        "docs/quickstart.md",
+        "docs/adaptive.md",
+        "docs/hard-scenes.md",
+        "docs/gross-pitaevskii.md",
+        "docs/own-methods.md",
+    ],
 )
 def test_page(page, capsys):
     """All blocks of a page in turn, in one namespace; a block of text is what the code before it prints."""
