@@ -7,6 +7,7 @@ from .ensemble import EnsembleResult, ensemble
 from .invariants import Invariant, check_gradient
 from .longrun import integrate
 from .nystrom import NystromTableau
+from .one_step import OneStepMethod
 from .projection import project
 from .result import Diagnostics, IntegrationResult, ProjectionResult
 from .solvers import (
@@ -45,6 +46,7 @@ __all__ = [
     "IntegrationResult",
     "Invariant",
     "NystromTableau",
+    "OneStepMethod",
     "ProjectionResult",
     "Tableau",
     "check_gradient",

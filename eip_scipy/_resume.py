@@ -96,9 +96,11 @@ def settings(
 ) -> dict[str, Any]:
     """All that decides the bits of a run, but for the functions, under the names that users give."""
     o, span = run.options, stepping.span
+    # A one-step method of the user's own is known by its name and orders, as functions are by what they give.
+    parts = run.method if isinstance(run.method, tuple) else (run.method.order, run.method.error_estimator_order)
     metric = {EUCLIDEAN: "euclidean", ERROR: "error"}.get(o.metric, run.work.sigma)
     found = {
-        "method": f"{method} {_digest(run.method)[:8]}",
+        "method": f"{method} {_digest(parts)[:8]}",
         "t_span": (span.t0, span.t_bound),
         "h": stepping.h,
         "first_step": stepping.first_step,

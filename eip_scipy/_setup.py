@@ -34,11 +34,13 @@ from ._step import (
 )
 from .invariants import InvariantSet
 from .nystrom import NystromTableau
+from .one_step import OneStep, as_vector
 from .result import LAST_RANK, Diagnostics
 from .tableaux import Tableau
 
 __all__ = ["ProjectionOptions", "Run", "Stepping", "as_derivative", "fixed_steps", "prepare"]
 
+AnyMethod = Tableau | NystromTableau | OneStep
 # Unsigned: Numba then leaves out the test for negative indices, which costs more than the access itself.
 INDEX = np.uint64
 DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
@@ -78,7 +80,7 @@ class Stepping:
         rhs: Callable[[float, np.ndarray], np.ndarray],
         y0: np.ndarray,
         f0: np.ndarray,
-        tableau: Tableau | NystromTableau,
+        tableau: AnyMethod,
     ) -> float:
         """Length of the first step."""
         if self.h is not None:
@@ -95,7 +97,7 @@ class Run:
     """All that a driver needs besides the user's functions."""
 
     y0: np.ndarray
-    method: Method
+    method: Method | OneStep
     options: Options
     work: Work
     invariants: InvariantSet
@@ -116,25 +118,8 @@ class Counted:
 
 
 def as_derivative(value: Any, n: int, dtype: np.dtype) -> np.ndarray:
-    """The value of a user's right-hand side as an array (n,), or an error that says what came.
-
-    Raises
-    ------
-    TypeError
-        For None or values that are no numbers.
-    ValueError
-        For a wrong shape, or complex values where the state is real.
-    """
-    if value is None:
-        raise TypeError(f"fun returned None, expected {n} numbers (does it end without a return?).")
-    f = np.asarray(value)
-    if f.dtype.kind not in "fiubc":
-        raise TypeError(f"fun returned {value!r}, expected {n} numbers.")
-    if f.shape != (n,):
-        raise ValueError(f"fun returned shape {f.shape}, expected ({n},).")
-    if f.dtype.kind == "c" and dtype.kind != "c":
-        raise ValueError("fun returned complex values, but y0 is real; pass y0.astype(complex).")
-    return f
+    """The value of a user's right-hand side as an array (n,), or an error; see `as_vector`."""
+    return as_vector(value, n, dtype, "fun returned")
 
 
 def initial_state(y0: Any) -> np.ndarray:
@@ -273,7 +258,7 @@ def step_bounds(first_step: Any, max_step: Any, t0: float, t_bound: float) -> tu
 
 def stepping(
     name: str,
-    tableau: Tableau | NystromTableau,
+    tableau: AnyMethod,
     t0: float,
     t_bound: float,
     n: int,
@@ -355,7 +340,7 @@ def count(name: str, value: Any) -> int:
     return int(value)
 
 
-def _every(value: Any, tableau: Tableau | NystromTableau) -> int:
+def _every(value: Any, tableau: AnyMethod) -> int:
     if not isinstance(value, str):
         return count("every", value)
     if value != "auto":
@@ -371,7 +356,7 @@ def _flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
-def _metric(metric: Any, tableau: Tableau | NystromTableau, n: int, width: int) -> tuple[int, np.ndarray | None]:
+def _metric(metric: Any, tableau: AnyMethod, n: int, width: int) -> tuple[int, np.ndarray | None]:
     if metric is None:
         return (ERROR if tableau.has_estimate else EUCLIDEAN), None
     if isinstance(metric, str):
@@ -495,8 +480,10 @@ def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return start, index, value
 
 
-def method_arrays(tableau: Tableau | NystromTableau) -> Method:
+def method_arrays(tableau: AnyMethod) -> Method | OneStep:
     """A tableau as the arrays that the step takes (writable copies: compiled code has one array type for all)."""
+    if isinstance(tableau, OneStep):
+        return tableau
     exponent = -1.0 / ((tableau.error_estimator_order or 0) + 1)
     if isinstance(tableau, NystromTableau):
         return _nystrom_arrays(tableau, exponent)
@@ -544,7 +531,7 @@ def _nystrom_arrays(tableau: NystromTableau, exponent: float) -> Method:
 
 
 def prepare(
-    tableau: Tableau | NystromTableau,
+    tableau: AnyMethod,
     rhs: Callable[[float, np.ndarray], np.ndarray],
     t0: float,
     y0: np.ndarray,
@@ -560,7 +547,7 @@ def prepare(
 
     Parameters
     ----------
-    tableau : Tableau or NystromTableau
+    tableau : Tableau, NystromTableau or OneStep
     rhs : callable
         ``rhs(t, y) -> (n,)``, checked; called only where an invariant's start must be projected.
     t0, y0, f0 : float, ndarray, ndarray
@@ -573,6 +560,8 @@ def prepare(
         Further arguments of the invariants' functions (``(params,)`` or nothing).
     compensated : bool
     """
+    if compensated and isinstance(tableau, OneStep):
+        raise ValueError(f"compensated=True carries the rounding of a tableau's sums; {tableau.name} is no tableau.")
     n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
     kind, sigma = _metric(projection.metric, tableau, n, width)
     if not isinstance(projection.direction, str) or projection.direction not in DIRECTIONS:
@@ -595,7 +584,8 @@ def prepare(
         direction=DIRECTIONS[projection.direction],
         iterations=count("iterations", projection.iterations),
         every=_every(projection.every, tableau),
-        reuse_f=_flag("reuse_f", projection.reuse_f),
+        # The steps of a one-step method do not take f: there is nothing to evaluate in the place of f(y_hat).
+        reuse_f=_flag("reuse_f", projection.reuse_f) or isinstance(tableau, OneStep),
         uses_f=invariants.uses_f,
         compensated=_flag("compensated", compensated),
         adaptive=stepping.h is None,
@@ -667,7 +657,7 @@ def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
     return projection_failure(run.invariants, run.work, clock[T_NEW])
 
 
-def not_finite(work: Work, method: Method, t: float, h: float) -> str:
+def not_finite(work: Work, method: Method | OneStep, t: float, h: float) -> str:
     """Why a raw step was not finite: the first stage that was not, or overflow of the sum."""
     for i in range(method.b.size):
         if not np.isfinite(work.K[i]).all():

@@ -14,7 +14,7 @@ from math import isfinite, isnan
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import register_jitable
+from numba.extending import overload, register_jitable
 
 from . import _kernels as kn
 from ._kernels import FAILED_PROJECTION, NOT_FINITE, OK, POSTPONED, FrameRows, Grouping
@@ -33,7 +33,8 @@ from .result import (
 )
 
 # Without reference counting and inlined, the driver runs 20 times faster: it hands records of some 40 arrays down.
-_jitable = register_jitable(_nrt=False, error_model="numpy", forceinline=True)
+_INLINED = {"_nrt": False, "error_model": "numpy", "forceinline": True}
+_jitable = register_jitable(**_INLINED)
 _jitable_cold = register_jitable(_nrt=False, error_model="numpy")
 
 NEW, OLD, MIDPOINT = 0, 1, 2
@@ -250,6 +251,18 @@ def look_back(rhs, params, t_new, y_r, h, project, m, o, w):
         w.counters[HAVE_F] = 1
     if estimate:
         estimate_error(y_r, h, m, o, w)
+
+
+def any_raw_step(rhs, params, t, y, y_r, t_new, h, project, m, o, w):
+    """`raw_step` of a tableau, or that of a user's one-step method, which only interpreted runs take."""
+    if isinstance(m, Method):
+        return raw_step(rhs, params, t, y, y_r, t_new, h, project, m, o, w)
+    return m.raw_step(rhs, params, t, y, y_r, t_new, h, project, o, w)
+
+
+@overload(any_raw_step, jit_options=_INLINED, strict=False)
+def _compiled_raw_step(rhs, params, t, y, y_r, t_new, h, project, m, o, w):
+    return raw_step
 
 
 @_jitable
@@ -507,7 +520,7 @@ def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y
         clock[H] = span.h if not (adaptive or last) else clock[T_NEW] - t
         h_abs = abs(clock[H])
         project = o.target.size > 0 and (last or spacing == 1 or (k + 1) % spacing == 0)
-        status = raw_step(rhs, params, t, y, y_r, clock[T_NEW], clock[H], project, m, o, w)
+        status = any_raw_step(rhs, params, t, y, y_r, clock[T_NEW], clock[H], project, m, o, w)
         norm = w.norm[0] if adaptive else 0.0
         if status == OK and not isfinite(norm):
             status = NOT_FINITE

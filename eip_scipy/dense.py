@@ -16,6 +16,7 @@ from ._kernels import OK, Grouping
 from ._setup import Run
 from ._step import ERROR, GIVEN, NEW, make_work, project_step
 from .nystrom import NystromTableau
+from .one_step import OneStep
 from .result import HAVE_F, NFEV
 from .tableaux import DOP853, Tableau
 
@@ -28,7 +29,7 @@ ITERATIONS = 5
 def dense_output(
     rhs: Callable[..., None],
     run: Run,
-    tableau: Tableau | NystromTableau,
+    tableau: Tableau | NystromTableau | OneStep,
     t_old: float,
     t: float,
     y_old: Array,
@@ -39,6 +40,11 @@ def dense_output(
 ) -> ManifoldDenseOutput:
     """Dense output over the step that `run` made last, from (t_old, y_old) to (t, y), with slopes f_old and f."""
     h = t - t_old
+    if isinstance(tableau, OneStep):  # whose steps do not take f
+        f_old, f = np.empty_like(y_old), np.empty_like(y)
+        rhs(t_old, y_old, f_old, params)
+        rhs(t, y, f, params)
+        run.work.counters[NFEV] += 2
     K = run.work.K.copy()
     # The raw result's own slope belongs to the tableau; without it the next step's differs by O(h^(p + 1)).
     if not run.work.counters[HAVE_F]:
@@ -47,7 +53,7 @@ def dense_output(
         base = _quintic(h, y_old, y, f_old, f)
     elif tableau is DOP853:
         base = _dop853(rhs, params, t_old, h, y_old, y, f, K, run.work.counters)
-    elif tableau.P is not None:
+    elif isinstance(tableau, Tableau) and tableau.P is not None:
         base = _polynomial(h, y_old, y, f, K, tableau.P)
     else:
         base = _hermite(h, y_old, y, f_old, f)

@@ -23,8 +23,9 @@ from ._names import nearest
 from ._setup import ProjectionOptions, Run
 from ._step import T_NEW, Span, T, finish_step, next_step
 from .dense import ManifoldDenseOutput, dense_output
-from .invariants import Invariant, InvariantSet, as_invariants
+from .invariants import Invariant, as_invariants
 from .nystrom import NystromTableau
+from .one_step import OneStep
 from .problems._problem import Problem
 from .result import NFEV, NJEV, NLU, Diagnostics, IntegrationResult
 from .solvers import EIPSolver
@@ -341,7 +342,7 @@ def integrate(
         Initial state, real or complex.
     method : type
         `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, or a class made by
-        `eip_method`.
+        `eip_method`; one on a one-step method runs interpreted.
     h : float, optional
         Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter. Default: a problem's own
         step; without one, adaptive steps by `rtol`, `atol`, `first_step` and `max_step`. To take adaptive steps on a
@@ -515,7 +516,7 @@ def prepared(
         settings = _resume.settings(method.__name__, stepping, start, parameters, run, grid, happenings)
         keeper.identify(settings, run, t0, start, f0)
     with _compiling(progress):
-        functions, why_not = _functions(fun, form, extra, run.invariants, happenings, start.dtype, compiled, rhs)
+        functions, why_not = _functions(fun, form, extra, run, happenings, compiled, rhs)
         driver = _Driver(run, grid, functions, parameters, compiled=why_not is None)
     run.work.K[0] = f0 if run.y0 is start else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
@@ -712,7 +713,7 @@ def _required(name: str, value: Any) -> Any:
 def _tableau(method: Any) -> Any:
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
         raise TypeError(
-            f"integrate: method must be an EIP class such as EIPRK4, or eip_method(tableau); got {method!r}."
+            f"integrate: method must be an EIP class such as EIPRK4, or one that eip_method made; got {method!r}."
         )
     if method._project_step is not EIPSolver._project_step:
         raise TypeError(f"integrate does not call {method.__name__}._project_step; use it through solve_ivp.")
@@ -863,17 +864,19 @@ def _functions(
     fun: Callable[..., Any],
     form: str,
     extra: tuple,
-    invariants: InvariantSet,
+    run: Run,
     events: Events,
-    dtype: np.dtype,
     compiled: bool | None,
     rhs: Callable[..., None],
 ) -> tuple[CompiledFunctions, str | None]:
     """The functions of the loop, and why they are not compiled (None: they are)."""
+    invariants, dtype = run.invariants, run.y0.dtype
     interpreted = CompiledFunctions(rhs, invariants.inv, invariants.grad, events.fill)
     if compiled is False:
         return interpreted, "compiled=False"
     try:
+        if isinstance(run.method, OneStep):
+            raise NotCompilableError(f"{run.method.name} is a one-step method in Python")
         return compile_functions(fun, form, bool(extra), invariants, tuple(events.functions), dtype), None
     except NotCompilableError as reason:
         if compiled:

@@ -19,6 +19,7 @@ from ._step import T_NEW, T, close_step, next_step, project_step
 from .dense import ExactEnds, dense_output
 from .invariants import as_invariants
 from .nystrom import RKN86, RKN1210, NystromTableau
+from .one_step import OneStep, OneStepMethod
 from .result import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from .tableaux import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
 
@@ -112,7 +113,7 @@ class EIPSolver(OdeSolver):
        systems".
     """
 
-    TABLEAU: ClassVar[Tableau | NystromTableau]
+    TABLEAU: ClassVar[Tableau | NystromTableau | OneStep]
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     SCIPY: ClassVar[type[OdeSolver] | None] = None
     t: float
@@ -464,12 +465,15 @@ class EIPRKN12(EIPSolver):
     TABLEAU = RKN1210
 
 
-def eip_method(tableau: Tableau | NystromTableau) -> type[EIPSolver]:
-    """A solver class on any explicit Runge-Kutta or Runge-Kutta-Nystrom tableau.
+def eip_method(method: Tableau | NystromTableau | OneStepMethod) -> type[EIPSolver]:
+    """A solver class on any explicit Runge-Kutta or Runge-Kutta-Nystrom tableau, or on a one-step method of your own.
 
     Parameters
     ----------
-    tableau : Tableau or NystromTableau
+    method : Tableau, NystromTableau or OneStepMethod
+        The last is any object with ``one_step(t, y, h) -> y_hat`` and ``order``; see `OneStepMethod`. Its steps are
+        projected like all others; `fun` serves gradients that take f and dense output (a cubic through both ends)
+        only, so that `nfev` does not count what `one_step` evaluates.
 
     Returns
     -------
@@ -479,8 +483,25 @@ def eip_method(tableau: Tableau | NystromTableau) -> type[EIPSolver]:
     Raises
     ------
     TypeError
-        When `tableau` is neither.
+        When it is none of them.
+    ValueError
+        When a one-step method's order is no integer >= 1.
+
+    Examples
+    --------
+    >>> from scipy.integrate import solve_ivp
+    >>> from eip_scipy import Invariant, eip_method
+    >>> class SymplecticEuler:
+    ...     order = 1
+    ...     def one_step(self, t, y, h):
+    ...         q, p = y
+    ...         p = p - h * q
+    ...         return [q + h * p, p]
+    >>> energy = Invariant(lambda t, y: y @ y / 2, lambda t, y: y, name="energy")
+    >>> sol = solve_ivp(lambda t, y: [y[1], -y[0]], (0, 10), [1.0, 0.0], method=eip_method(SymplecticEuler()),
+    ...                 h=0.01, invariants=energy)
+    >>> bool(abs(sol.y[:, -1] @ sol.y[:, -1] - 1) < 1e-8)
+    True
     """
-    if not isinstance(tableau, (Tableau, NystromTableau)):
-        raise TypeError(f"eip_method expects a Tableau or a NystromTableau, got {tableau!r}.")
+    tableau = method if isinstance(method, (Tableau, NystromTableau)) else OneStep(method)
     return type(f"EIP_{tableau.name}", (EIPSolver,), {"TABLEAU": tableau, "__doc__": f"EIP method on {tableau!r}."})

@@ -25,7 +25,10 @@ def assert_output(found, printed):
         assert agree(float(a), float(b)), f"{a}, printed as {b}"
 
 
-PAGES = ("quickstart", "adaptive", "hard-scenes", "checkpoints", "ensembles", "charged-particles", "gross-pitaevskii")
+PAGES = (
+    "quickstart", "adaptive", "own-methods", "hard-scenes", "checkpoints", "ensembles", "charged-particles",
+    "gross-pitaevskii",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("page", ["README.md", *(f"docs/{page}.md" for page in PAGES)])

@@ -1,23 +1,35 @@
 """The rotating Gross-Pitaevskii equation in one, two and three dimensions."""
 
 from .equation import FieldProblem, GrossPitaevskii
+from .flows import LinearFlow
+from .frames import at_rest, rotated
 from .grid import Grid, Multiplier, SpectralSum
 from .ground_state import GroundState, ground_state
+from .lawson import Lawson4
 from .potentials import harmonic_trap, quartic_trap
 from .scenes import line_condensate, plane_wave, ring_condensate, rotating_packet, soliton
 from .search import lowest_ring, lowest_state
+from .splitting import RKN6, S6, STRANG, Scheme, Splitting
 from .starts import imprint, polygon, ring_start, thomas_fermi, vortex_starts, with_noise
 from .transforms import make_transforms
 from .vortices import Vortices, vortices
 
 __all__ = [
+    "RKN6",
+    "S6",
+    "STRANG",
     "FieldProblem",
     "Grid",
     "GrossPitaevskii",
     "GroundState",
+    "Lawson4",
+    "LinearFlow",
     "Multiplier",
+    "Scheme",
     "SpectralSum",
+    "Splitting",
     "Vortices",
+    "at_rest",
     "ground_state",
     "harmonic_trap",
     "imprint",
@@ -30,6 +42,7 @@ __all__ = [
     "quartic_trap",
     "ring_condensate",
     "ring_start",
+    "rotated",
     "rotating_packet",
     "soliton",
     "thomas_fermi",

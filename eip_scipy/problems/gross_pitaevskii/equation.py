@@ -142,8 +142,16 @@ class GrossPitaevskii:
         k = self.grid.wavenumbers(axis, odd=self.nyquist == "zero")
         return 0.5 * k * k
 
-    def _rotation_factors(self) -> list[np.ndarray]:
-        """Factors of Lz = x q - y k: of the modes along x and of those along y."""
+    def rotation_factors(self) -> list[np.ndarray]:
+        """Factors of Lz = x q - y k: of the modes along x and of those along y.
+
+        Raises
+        ------
+        ValueError
+            In one dimension.
+        """
+        if self.grid.dim == 1:
+            raise ValueError("in one dimension there is no rotation.")
         x, y, *_ = self.grid.mesh()
         k, q = (self.grid.wavenumbers(axis, odd=True) for axis in (0, 1))
         return [-y * k, x * q]
@@ -152,7 +160,7 @@ class GrossPitaevskii:
     def _turning(self) -> SpectralSum:
         if self.grid.dim == 1:
             raise ValueError("in one dimension there is no angular momentum.")
-        terms = [Multiplier(self.grid, (axis,), factor) for axis, factor in enumerate(self._rotation_factors())]
+        terms = [Multiplier(self.grid, (axis,), factor) for axis, factor in enumerate(self.rotation_factors())]
         return SpectralSum(self.grid, self.transforms, terms)
 
     def _kinetic_and_rotation(self) -> list[Multiplier]:
@@ -160,7 +168,7 @@ class GrossPitaevskii:
         kinetic = [self.kinetic_factor(axis) for axis in range(self.grid.dim)]
         if self.Omega == 0:
             return [Multiplier(self.grid, tuple(range(self.grid.dim)), sum(kinetic))]
-        along_x, along_y = self._rotation_factors()
+        along_x, along_y = self.rotation_factors()
         others = tuple(range(1, self.grid.dim))
         return [
             Multiplier(self.grid, (0,), kinetic[0] - self.Omega * along_x),
@@ -326,7 +334,7 @@ class GrossPitaevskii:
     def largest_frequency(self) -> float:
         """A bound of the linear part's norm: the terms' largest values one by one."""
         kinetic = sum(float(self.kinetic_factor(axis).max()) for axis in range(self.grid.dim))
-        turning = sum(float(np.abs(f).max()) for f in self._rotation_factors()) if self.Omega else 0.0
+        turning = sum(float(np.abs(f).max()) for f in self.rotation_factors()) if self.Omega else 0.0
         return kinetic + abs(self.Omega) * turning + float(np.abs(self.V).max())
 
     def largest_step(self, psi: Any, limit: float = 2 * 2**0.5) -> float:
