@@ -1,8 +1,22 @@
 """Methods that the projection is measured against; each stands alone and knows no solver of this package.
 
-`stormer_verlet` is the symplectic leapfrog of order 2 for q'' = a(t, q), in both of its forms.
+`stormer_verlet` is the symplectic leapfrog of order 2 for q'' = a(t, q), in both of its forms. `crank_nicolson`,
+`linearly_implicit` and `sav_crank_nicolson` are the implicit schemes of the paper's test of efficiency, for the
+Gross-Pitaevskii equation without rotation.
 """
 
+from eip_scipy.comparators._fields import FieldResult
+from eip_scipy.comparators.crank_nicolson import crank_nicolson
+from eip_scipy.comparators.linearly_implicit import linearly_implicit
+from eip_scipy.comparators.scalar_auxiliary import SAVResult, sav_crank_nicolson
 from eip_scipy.comparators.stormer_verlet import StormerVerletResult, stormer_verlet
 
-__all__ = ["StormerVerletResult", "stormer_verlet"]
+__all__ = [
+    "FieldResult",
+    "SAVResult",
+    "StormerVerletResult",
+    "crank_nicolson",
+    "linearly_implicit",
+    "sav_crank_nicolson",
+    "stormer_verlet",
+]

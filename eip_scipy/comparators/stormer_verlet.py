@@ -15,6 +15,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
 from .._setup import check_fixed_step, fixed_steps
+from ._span import check_span, saved_steps
 
 __all__ = ["FORMS", "StormerVerletResult", "stormer_verlet"]
 
@@ -110,14 +111,14 @@ def stormer_verlet(
     >>> bool(abs(run.y[0, -1] - np.cos(10.0)) < 1e-4)
     True
     """
-    t0, t_bound = _check_span(t_span)
+    t0, t_bound = check_span(t_span)
     y = _check_state(y0)
     if form not in FORMS:
         raise ValueError(f"unknown form {form!r}: expected one of {', '.join(map(repr, FORMS))}")
     extra = () if params is None else (_real_vector(params, "params"),)
     h = check_fixed_step(h, t0, t_bound)
     n_steps = fixed_steps(h, t0, t_bound)
-    saved = _saved_steps(n_steps, save_every)
+    saved = saved_steps(n_steps, save_every)
 
     checked = _checked(acc, y.size // 2)
     a = checked(t0, y[: y.size // 2], *extra).copy()
@@ -142,13 +143,6 @@ def stormer_verlet(
     return StormerVerletResult(t, ys.T, n_steps + 1, wall_time, _message(reason, t, ys))
 
 
-def _check_span(t_span: Any) -> tuple[float, float]:
-    span = np.asarray(t_span, dtype=float)
-    if span.shape != (2,) or not np.isfinite(span).all():
-        raise ValueError(f"t_span must hold two finite numbers, got {t_span!r}")
-    return float(span[0]), float(span[1])
-
-
 def _real_vector(values: Any, name: str) -> np.ndarray:
     """Copy a 1-D array of real numbers to contiguous float64."""
     if np.iscomplexobj(values):
@@ -168,15 +162,6 @@ def _check_state(y0: Any) -> np.ndarray:
     if not np.isfinite(y).all():
         raise ValueError("All components of the initial state `y0` must be finite.")
     return y
-
-
-def _saved_steps(n_steps: int, save_every: int | None) -> np.ndarray:
-    """Numbers of the steps after which the state is saved; 0, the start, is the first of them."""
-    if save_every is None:
-        save_every = max(n_steps, 1)
-    if isinstance(save_every, bool) or not isinstance(save_every, (int, np.integer)) or save_every < 1:
-        raise ValueError(f"save_every must be a positive integer or None, got {save_every!r}")
-    return np.unique(np.append(np.arange(0, n_steps + 1, save_every, dtype=np.int64), np.int64(n_steps)))
 
 
 def _checked(acc: Callable[..., Any], size: int) -> Callable[..., np.ndarray]:
