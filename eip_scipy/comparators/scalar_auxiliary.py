@@ -71,8 +71,7 @@ def sav_crank_nicolson(
     References
     ----------
     J. Shen, J. Xu, J. Yang, The scalar auxiliary variable (SAV) approach for gradient flows, J. Comput. Phys. 353
-    (2018) 407-416; Y. Fu, W. Cai, Y. Wang, Structure-preserving algorithms for the two-dimensional fractional
-    Klein-Gordon-Schrodinger equation, Appl. Numer. Math. 156 (2020); Cai, Gong & Wang, section 3.4.1.
+    (2018) 407-416; Cai, Gong & Wang, section 3.4.1.
 
     Examples
     --------
