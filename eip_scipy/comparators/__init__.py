@@ -2,7 +2,7 @@
 
 `stormer_verlet` is the symplectic leapfrog of order 2 for q'' = a(t, q), in both of its forms. `crank_nicolson`,
 `linearly_implicit` and `sav_crank_nicolson` are the implicit schemes of the paper's test of efficiency, for the
-Gross-Pitaevskii equation without rotation.
+Gross-Pitaevskii equation (the last one without rotation).
 """
 
 from eip_scipy.comparators._fields import FieldResult

@@ -57,7 +57,6 @@ class Scheme:
     Parameters
     ----------
     gpe : GrossPitaevskii
-        Without rotation.
 
     Attributes
     ----------
@@ -74,6 +73,7 @@ class Scheme:
         self.axes = tuple(range(gpe.grid.dim))
         self.psi = np.empty(gpe.grid.size, complex)
         self.nfev = 0
+        self._rotation = np.empty(gpe.grid.size if gpe.Omega else 0, complex)
 
     def start(self, psi: np.ndarray) -> None:
         """Go back to t0, with a copy of `psi`."""
@@ -89,6 +89,14 @@ class Scheme:
         """Advance `psi` by h, signed; returns why that failed, or nothing."""
         raise NotImplementedError
 
+    def rotation(self, field: np.ndarray) -> np.ndarray:
+        """-Omega Lz field, flat and in a buffer; (0,) without rotation."""
+        if self.gpe.Omega:
+            shape = self.gpe.grid.shape
+            self.gpe.angular(field.reshape(shape), self._rotation.reshape(shape))
+            self._rotation *= -self.gpe.Omega
+        return self._rotation
+
     def forward(self, field: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with the modes of `field`; both flat."""
         shape = self.gpe.grid.shape
@@ -100,11 +108,11 @@ class Scheme:
 
 
 class FixedPoint:
-    """Solves ``m = psi - i c (K + W(m)) m``, W real and pointwise: K and a constant w implicit, W - w from before.
+    """Solves ``m = psi - i c (K + W(m)) m``: K and a constant w implicit, W - w from the iterate before.
 
     The iteration ``m <- (1 + i c (K + w))^-1 rhs(m)``, ``rhs(m) = psi - i c (W(m) - w) m``, contracts by about
-    c max|W - w|. The change of `rhs` from one iterate to the next is the residual of the equation itself, not of the
-    preconditioned one, and costs no transform.
+    c max|W - w| where W is pointwise. The change of `rhs` from one iterate to the next is the residual of the equation
+    itself, not of the preconditioned one, and costs no transform.
 
     Parameters
     ----------
@@ -179,22 +187,15 @@ def check_tol(tol: Any) -> float:
 
 
 def check_equation(gpe: Any) -> GrossPitaevskii:
-    """`gpe`, when these schemes can solve it.
+    """`gpe`, when it is an equation.
 
     Raises
     ------
     TypeError
         When it is no `GrossPitaevskii`.
-    ValueError
-        When it rotates.
     """
     if not isinstance(gpe, GrossPitaevskii):
         raise TypeError(f"gpe must be a GrossPitaevskii, got {type(gpe).__name__}; of a problem pass problem.equation")
-    if gpe.Omega != 0:
-        raise ValueError(
-            f"this scheme needs Omega = 0, where the linear part is diagonal in the modes; got Omega = {gpe.Omega:g}. "
-            "Use EIPRK4, or for a round trap the frame at rest"
-        )
     return gpe
 
 

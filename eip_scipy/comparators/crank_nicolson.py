@@ -21,15 +21,14 @@ def crank_nicolson(
     tol: float = 1e-12,
     save_every: int | None = None,
 ) -> FieldResult:
-    """Integrate the Gross-Pitaevskii equation without rotation by the energy-preserving Crank-Nicolson scheme.
+    """Integrate the Gross-Pitaevskii equation by the energy-preserving Crank-Nicolson scheme.
 
-    ``i (psi' - psi) / h = (K + V + beta / 2 (|psi'|^2 + |psi|^2)) (psi' + psi) / 2`` with K = -Laplace / 2. Order 2;
-    keeps mass and energy to the residual that the solver leaves.
+    ``i (psi' - psi) / h = (K + V - Omega Lz + beta / 2 (|psi'|^2 + |psi|^2)) (psi' + psi) / 2``, K = -Laplace / 2.
+    Order 2; keeps mass and energy to the residual that the solver leaves.
 
     Parameters
     ----------
     gpe : GrossPitaevskii
-        With Omega = 0.
     t_span : tuple of float
         Start and end; a smaller end integrates backward.
     y0 : array_like
@@ -57,7 +56,9 @@ def crank_nicolson(
     -----
     Each step is solved for the mean of its two states by a fixed point that is preconditioned in the modes and starts
     from a parabola through the three means before; an iteration takes a pair of transforms. It contracts where
-    h / 2 times half the range of V + beta |psi|^2 is well below 1.
+    h / 2 times half the range of V + beta |psi|^2 is well below 1. A rotation, which is not diagonal in the modes,
+    takes two more pairs along one axis and asks for h below about 2 / (Omega r)^2, r the largest distance from the
+    axis.
 
     References
     ----------
@@ -96,7 +97,9 @@ class CrankNicolson(Scheme):
         solver = self._solver
 
         def rhs(mean: np.ndarray, values: np.ndarray) -> float:
-            return float(right_side(self.psi, mean, self.V, self.gpe.beta, solver.w, solver.c, values))
+            return float(
+                right_side(self.psi, mean, self.rotation(mean), self.V, self.gpe.beta, solver.w, solver.c, values)
+            )
 
         mean, failure = solver.solve(rhs, self.psi)
         other_end(mean, self.psi, self.psi)
@@ -104,8 +107,11 @@ class CrankNicolson(Scheme):
 
 
 @jit
-def right_side(psi, mean, V, beta, w, c, out):
-    """Out <- psi - i c (V + beta / 2 (|2 mean - psi|^2 + |psi|^2) - w) mean; returns the norm of its change."""
+def right_side(psi, mean, rotation, V, beta, w, c, out):
+    """Out <- psi - i c ((V + beta / 2 (|2 mean - psi|^2 + |psi|^2) - w) mean + rotation); the norm of its change.
+
+    `rotation` may be empty.
+    """
     total = 0.0
     for i in range(psi.size):
         a, m = psi[i], mean[i]
@@ -113,6 +119,8 @@ def right_side(psi, mean, V, beta, w, c, out):
         density = a.real * a.real + a.imag * a.imag + b.real * b.real + b.imag * b.imag
         s = c * (V[i] + 0.5 * beta * density - w)
         value = complex(a.real + s * m.imag, a.imag - s * m.real)
+        if rotation.size > 0:
+            value += complex(c * rotation[i].imag, -c * rotation[i].real)
         change = value - out[i]
         total += change.real * change.real + change.imag * change.imag
         out[i] = value

@@ -22,11 +22,11 @@ def linearly_implicit(
     tol: float = 1e-12,
     save_every: int | None = None,
 ) -> FieldResult:
-    """Integrate the Gross-Pitaevskii equation without rotation by the linearly implicit central difference scheme.
+    """Integrate the Gross-Pitaevskii equation by the linearly implicit central difference scheme.
 
-    ``i (psi'' - psi) / (2 h) = (K + V + beta |psi'|^2) (psi'' + psi) / 2`` with K = -Laplace / 2: one linear system a
-    step, with coefficients that vary in space. Order 2; keeps the mass of every second state, and a quadratic form of
-    neighbours in the place of the energy.
+    ``i (psi'' - psi) / (2 h) = (K + V - Omega Lz + beta |psi'|^2) (psi'' + psi) / 2`` with K = -Laplace / 2: one linear
+    system a step, with coefficients that vary in space. Order 2; keeps the mass, and a form of two neighbours
+    in the place of the energy.
 
     Parameters
     ----------
@@ -46,9 +46,10 @@ def linearly_implicit(
     Notes
     -----
     The first step, and a last one that is shorter, are steps of `crank_nicolson`, which has the same order and keeps
-    the mass. The linear systems are solved as there, by a fixed point preconditioned in the modes.
+    the mass. The linear systems are solved as there, by a fixed point preconditioned in the modes; the bounds of h for
+    its convergence are half of those there.
 
-    What is kept is ``(<psi'', L psi''> + <psi', L psi'>) / 2 + beta / 2 <|psi'|^2, |psi''|^2>`` with L = K + V.
+    What is kept is ``(<psi'', L psi''> + <psi', L psi'>) / 2 + beta / 2 <|psi'|^2, |psi''|^2>``, L = K + V - Omega Lz.
 
     References
     ----------
@@ -91,7 +92,11 @@ class LinearlyImplicit(Scheme):
         solver, before = self._solver, self._before
 
         def rhs(mean: np.ndarray, values: np.ndarray) -> float:
-            return float(right_side(before, self.psi, mean, self.V, self.gpe.beta, solver.w, solver.c, values))
+            return float(
+                right_side(
+                    before, self.psi, mean, self.rotation(mean), self.V, self.gpe.beta, solver.w, solver.c, values
+                )
+            )
 
         mean, failure = solver.solve(rhs, self.psi)
         other_end(mean, before, before)
@@ -108,13 +113,15 @@ class LinearlyImplicit(Scheme):
 
 
 @jit
-def right_side(before, psi, mean, V, beta, w, c, out):
-    """Out <- before - i c (V + beta |psi|^2 - w) mean; returns the norm of its change."""
+def right_side(before, psi, mean, rotation, V, beta, w, c, out):
+    """Out <- before - i c ((V + beta |psi|^2 - w) mean + rotation), `rotation` may be empty; the norm of its change."""
     total = 0.0
     for i in range(psi.size):
         a, m = psi[i], mean[i]
         s = c * (V[i] + beta * (a.real * a.real + a.imag * a.imag) - w)
         value = complex(before[i].real + s * m.imag, before[i].imag - s * m.real)
+        if rotation.size > 0:
+            value += complex(c * rotation[i].imag, -c * rotation[i].real)
         change = value - out[i]
         total += change.real * change.real + change.imag * change.imag
         out[i] = value

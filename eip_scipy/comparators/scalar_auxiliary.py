@@ -49,7 +49,9 @@ def sav_crank_nicolson(
 
     Parameters
     ----------
-    gpe, t_span, y0, h, save_every
+    gpe : GrossPitaevskii
+        With Omega = 0.
+    t_span, y0, h, save_every
         As for `crank_nicolson`.
     shift : float, optional
         C, such that E1 + C stays positive. Default: 1, and ten times what a negative E1 takes away at the start.
@@ -62,7 +64,7 @@ def sav_crank_nicolson(
     Raises
     ------
     TypeError, ValueError
-        As `crank_nicolson`; and when `shift` is no finite number or leaves E1 + C not positive.
+        As `crank_nicolson`; when `gpe` rotates; and when `shift` is no finite number or leaves E1 + C not positive.
 
     Notes
     -----
@@ -84,6 +86,11 @@ def sav_crank_nicolson(
     """
 
     def make(gpe: GrossPitaevskii, psi: np.ndarray) -> Scheme:
+        if gpe.Omega:
+            raise ValueError(
+                f"SAV/CN needs Omega = 0, where the linear part is diagonal in the modes; got Omega = {gpe.Omega:g}. "
+                "Use EIPRK4 or crank_nicolson, or for a round trap the frame at rest"
+            )
         return _SAV(gpe, _shift(gpe, psi, shift))
 
     run, modified = march(make, gpe, t_span, y0, h, save_every, lambda scheme: scheme.r**2 - scheme.shift)
