@@ -323,3 +323,24 @@ def test_bad_shift(shift, message):
     problem = plane_wave((8, 8))
     with pytest.raises(ValueError, match=message):
         sav_crank_nicolson(problem.equation, (0, 1), problem.y0, 0.1, shift=shift)
+
+
+# The figure of the test of efficiency.
+
+
+def test_efficiency_figure():
+    """Two panels for each problem, in which each method has one style, and lines of the slopes asked for."""
+    plotting = pytest.importorskip("eip_scipy.plotting")
+    h = np.array([0.1, 0.05, 0.025])
+    series = {name: {"h": h, "cost": 1 / h, "error": h**p} for name, p in (("second", 2), ("fourth", 4))}
+    problems = {"one": series, "two": series}
+    figure = plotting.efficiency_figure(problems, error="error", cost="time [s]", slopes={"two": {"fourth": 4.0}})
+    axes = np.reshape(figure.axes, (2, 2))
+    assert [axis.get_title() for axis in axes.flat] == ["one", "one", "two", "two"]
+    assert [axis.get_xlabel() for axis in axes[1]] == ["step h", "time [s]"]
+    assert [len(axis.lines) for axis in axes.flat] == [2, 2, 3, 2]
+    ends = axes[1, 0].lines[2].get_xydata()
+    assert np.diff(np.log(ends[:, 1])) / np.diff(np.log(ends[:, 0])) == pytest.approx(4)
+    assert (ends[:, 1] < np.interp(ends[:, 0], h[::-1], h[::-1] ** 4)).all()
+    assert [text.get_text() for text in axes[1, 0].texts] == ["slope 4.00"]
+    assert axes[0, 1].lines[1].get_color() == axes[1, 0].lines[1].get_color() != axes[0, 1].lines[0].get_color()
