@@ -31,6 +31,7 @@ def largest(values):
 # Order.
 
 
+@pytest.mark.slow_without_jit
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_order_two_on_the_plane_wave(scheme):
     problem = plane_wave((16, 16), modes=(1, 2), beta=1.5)
@@ -41,6 +42,7 @@ def test_order_two_on_the_plane_wave(scheme):
     np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 2, atol=0.05)
 
 
+@pytest.mark.slow_without_jit
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_order_two_on_the_soliton(scheme):
     problem = soliton()
@@ -101,6 +103,7 @@ def test_crank_nicolson_solves_the_papers_equation():
     np.testing.assert_allclose(run.y[:, -1], solution.x.view(complex), rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow_without_jit
 @pytest.mark.parametrize("scheme", ITERATED)
 def test_order_two_in_a_rotating_trap(scheme):
     """The packet of the paper's table 5, with mass and energy kept as without rotation."""
@@ -230,6 +233,14 @@ def test_saved_states_and_a_shorter_last_step(scheme):
         assert abs(y - problem.reference(t)).max() < 1e-3
     assert run.message == "completed"
     assert run.wall_time > 0
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_empty_interval(scheme):
+    problem = plane_wave((8, 8))
+    run = scheme(problem.equation, (1.0, 1.0), problem.y0, 0.1)
+    assert (run.t.tolist(), run.nfev, run.message) == ([1.0], 0, "completed")
+    np.testing.assert_array_equal(run.y[:, 0], problem.y0)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
