@@ -32,6 +32,7 @@ __all__ = [
     "Orbits",
     "ParticleRow",
     "cost_figure",
+    "efficiency_figure",
     "errors_figure",
     "fields_figure",
     "fields_movie",
@@ -598,6 +599,55 @@ def scenes_figure(
     if footnote:  # above: the legend is below
         figure.suptitle(f"{title}\n{footnote}", fontsize="medium")
     return figure
+
+
+def efficiency_figure(
+    problems: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    *,
+    error: str,
+    cost: str,
+    slopes: Mapping[str, Mapping[str, float]] | None = None,
+    title: str = "",
+) -> Figure:
+    """Draw error against step and against cost, a row for each problem, as the paper's test of efficiency does.
+
+    Parameters
+    ----------
+    problems : mapping of str to mapping
+        For each problem its methods, with arrays "h", "cost" and "error"; a method has the same style in all.
+    error, cost : str
+        Labels, with units.
+    slopes : mapping of str to mapping, optional
+        For each problem the slopes of some methods in h, each drawn as a line a little below the method.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    styles = method_styles(dict.fromkeys(name for series in problems.values() for name in series))
+    figure = _figure(10.5, 4.1 * len(problems) + 0.9, title)
+    axes = figure.subplots(len(problems), 2, sharex="col", sharey="row", squeeze=False)
+    for row, (problem, series) in zip(axes, problems.items(), strict=True):
+        for axis, key, label in zip(row, ("h", "cost"), ("step h", cost), strict=True):
+            for method, values in series.items():
+                axis.plot(values[key], values["error"], ms=5, lw=1.2, **styles[method])
+            axis.set_title(problem, fontsize="medium")
+            _log_x(axis)
+            _log_errors(axis, label, error if axis is row[0] else "")
+        for method, slope in (slopes or {}).get(problem, {}).items():
+            _slope_line(row[0], np.asarray(series[method]["h"]), np.asarray(series[method]["error"]), slope)
+    _legend_below(figure, axes[0, 0])
+    return figure
+
+
+def _slope_line(axis: Axes, h: np.ndarray, error: np.ndarray, slope: float) -> None:
+    """A dotted line below a method, with its slope beside the middle."""
+    ends = np.array([h.min(), h.max()])
+    line = 0.25 * error[np.argmax(h)] * (ends / ends[1]) ** slope
+    axis.plot(ends, line, color="0.4", lw=1.0, ls=":")
+    middle = np.sqrt(ends.prod()), np.sqrt(line.prod())
+    axis.annotate(f"slope {slope:.2f}", middle, (6, -4), textcoords="offset points", va="top", fontsize="small")
 
 
 class FieldPanel(NamedTuple):

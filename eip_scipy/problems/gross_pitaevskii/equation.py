@@ -206,6 +206,16 @@ class GrossPitaevskii:
         """Fill `out` with (-Laplace / 2 - Omega Lz) psi, both fields."""
         self._linear.apply(psi, out)
 
+    def angular(self, psi: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with Lz psi, both fields.
+
+        Raises
+        ------
+        ValueError
+            In one dimension.
+        """
+        self._turning.apply(psi, out)
+
     def hamiltonian(self, psi: Any) -> np.ndarray:
         """H(psi) psi, a field."""
         psi = self.as_field(psi)
@@ -246,7 +256,7 @@ class GrossPitaevskii:
         np.multiply(y.view(float), 2 * self.grid.cell, out=out.view(float))
 
     def _angular_momentum_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
-        self._turning.apply(y.reshape(self.grid.shape), out.reshape(self.grid.shape))
+        self.angular(y.reshape(self.grid.shape), out.reshape(self.grid.shape))
         out *= 2 * self.grid.cell
 
     def invariants(self, names: Sequence[str] = ("mass", "energy")) -> tuple[Invariant, ...]:
