@@ -379,19 +379,25 @@ def weights(name: str, sigma: Any, n: int) -> np.ndarray:
 
 def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
     if blocks is None:
-        groups = [np.array([i]) for i in range(n)]
-    elif isinstance(blocks, (int, np.integer)) and not isinstance(blocks, bool):
+        return _consecutive(1, n, width)
+    if isinstance(blocks, (int, np.integer)) and not isinstance(blocks, bool):
         if blocks < 1 or n % blocks:
             raise ValueError(f"blocks = {blocks} does not divide the state's {n} components.")
-        groups = list(np.arange(n).reshape(-1, blocks))
-    else:
-        groups = _block_lists(blocks, n)
+        return _consecutive(int(blocks), n, width)
+    groups = _block_lists(blocks, n)
     if width == 2:
         groups = [np.column_stack([2 * g, 2 * g + 1]).ravel() for g in groups]
     start = np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(INDEX)
     member = np.concatenate([*groups, []]).astype(INDEX)
     regular = len({len(g) for g in groups}) == 1 and np.array_equal(member, np.arange(member.size))
     return Grouping(member, start, width, len(groups[0]) if regular else 0)
+
+
+def _consecutive(size: int, n: int, width: int) -> Grouping:
+    """Blocks of `size` components each, in their order; no list of them, for a field has a million."""
+    floats = n * width
+    start = np.arange(0, floats + 1, size * width, dtype=INDEX)
+    return Grouping(np.arange(floats, dtype=INDEX), start, width, size * width if n else 0)
 
 
 def _block_lists(blocks: Any, n: int) -> list[np.ndarray]:

@@ -241,7 +241,7 @@ class InvariantSet:
         places = list(zip(self.starts[:-1], self.starts[1:], self.scalar, strict=True))
         functions = (bound(item.fun, item.args + extra) for item in self.items)
         self._values = [(fun, *place) for fun, place in zip(functions, places, strict=True)]
-        self._gradients = [(*self._bound_gradient(k, y0), *place) for k, place in enumerate(places)]
+        self._gradients = [(*self._bound_gradient(k), *place) for k, place in enumerate(places)]
         self._gradients_at_start(t0, y0, f0)
 
     def _require_finite(self, values: Array, what: str) -> None:
@@ -270,9 +270,14 @@ class InvariantSet:
 
     def _gradients_at_start(self, t: float, y: Array, f: Array) -> None:
         """Shapes and finiteness of every gradient, once."""
-        for k, (gradient, takes_f, start, stop, scalar) in enumerate(self._gradients):
+        for k, (gradient, takes_f, in_place, start, stop, scalar) in enumerate(self._gradients):
             expected = y.shape if scalar else (stop - start, y.size)
-            G = np.asarray(gradient(t, y, f) if takes_f else gradient(t, y))
+            first = (t, y, f) if takes_f else (t, y)
+            if in_place:
+                G = np.zeros(expected, y.dtype)
+                gradient(*first, G)
+            else:
+                G = np.asarray(gradient(*first))
             if G.shape != expected:
                 raise ValueError(
                     f"gradient of invariant {self.labels[k]!r} has shape {G.shape}, expected {expected} for a state of "
@@ -283,21 +288,11 @@ class InvariantSet:
             if not np.all(np.isfinite(G)):
                 raise ValueError(f"gradient of invariant {self.labels[k]!r} is not finite at y0.")
 
-    def _bound_gradient(self, k: int, y0: Array) -> tuple[Callable[..., Any], bool]:
-        """Gradient k as gradient(t, y) or, if the second is true, gradient(t, y, f)."""
+    def _bound_gradient(self, k: int) -> tuple[Callable[..., Any], bool, bool]:
+        """Gradient k as gradient(t, y), with f behind y if the second is true and `out` at the end if the third is."""
         item, grad = self.items[k], self.grads[k]
         arguments = self.extra if item.grad is None else item.args + self.extra
-        takes_f = item.uses_f and item.grad is not None
-        if not item.in_place:
-            return bound(grad, arguments), takes_f
-        shape = y0.shape if self.scalar[k] else (self.starts[k + 1] - self.starts[k], y0.size)
-
-        def in_place(t: float, y: Array, *f: Array) -> Array:
-            out = np.zeros(shape, y0.dtype)
-            grad(t, y, *f, out, *arguments)
-            return out
-
-        return in_place, takes_f
+        return bound(grad, arguments), item.uses_f and item.grad is not None, item.in_place
 
     def inv(self, t: float, y: Array, values: Array, params: Any = None) -> None:
         """Fill `values` (l,)."""
@@ -321,7 +316,11 @@ class InvariantSet:
         y, shape = y.copy(), y.shape
         if self.uses_f:
             f = f.copy()
-        for gradient, takes_f, start, stop, scalar in self._gradients:
+        for gradient, takes_f, in_place, start, stop, scalar in self._gradients:
+            if in_place:
+                out = G[start] if scalar else G[start:stop]
+                gradient(t, y, f, out) if takes_f else gradient(t, y, out)
+                continue
             row = gradient(t, y, f) if takes_f else gradient(t, y)
             if scalar and type(row) is np.ndarray and row.shape == shape:
                 G[start] = row

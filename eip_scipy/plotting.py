@@ -550,7 +550,9 @@ def fields_figure(
     """
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
-    figure = _figure(max(4.1 * columns, 7.5), 4.0 * rows + 0.4, title)
+    figure = _figure(4.1 * columns if columns > 1 else 5.6, 4.0 * rows + 0.4, title)
+    if columns == 1:
+        figure.suptitle(title, fontsize="medium")
     axes = figure.subplots(rows, columns, squeeze=False)
     top = max(float(np.max(panel[0])) for panel in panels.values()) if shared else None
     for axis in axes.flat[len(panels) :]:

@@ -35,7 +35,9 @@ __all__ = [
     "write_json",
 ]
 
-PACKAGES = ("eip_scipy", "numpy", "scipy", "numba", "tqdm", "rebound", "matplotlib", "astropy", "jplephem")
+PACKAGES = (
+    "eip_scipy", "numpy", "scipy", "numba", "tqdm", "rebound", "matplotlib", "astropy", "jplephem", "ducc0", "pyfftw",
+)  # fmt: skip
 
 
 class UsageError(Exception):

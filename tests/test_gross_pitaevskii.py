@@ -120,7 +120,7 @@ def test_odd_numbers_of_points_and_one_dimension():
 def test_libraries_are_numpys_transform(library, shape):
     pytest.importorskip(library)
     grid = Grid(shape, -1, 1)
-    fft, psi = make_transforms(shape, library), noise(grid)
+    fft, psi = make_transforms(library), noise(grid)
     for axes in [(0,), tuple(range(len(shape))), tuple(range(1, len(shape))) or (0,)]:
         kept, out = psi.copy(), np.empty_like(psi)
         fft.forward(psi, axes, out)
@@ -133,10 +133,10 @@ def test_libraries_are_numpys_transform(library, shape):
 def test_library_is_chosen_among_those_installed(monkeypatch):
     module = "eip_scipy.problems.gross_pitaevskii.transforms.find_spec"
     monkeypatch.setattr(module, lambda name: name == "scipy" or None)
-    assert make_transforms((8, 8)).name == "scipy"
+    assert make_transforms().name == "scipy"
     assert GrossPitaevskii(Grid((8, 8), 0, 1)).fft == "scipy"
     with pytest.raises(ImportError, match=r'ducc0.*pip install "eip_scipy\[fft\]"'):
-        make_transforms((8, 8), "ducc0")
+        make_transforms("ducc0")
 
 
 def test_threads_do_not_change_the_result():
@@ -148,7 +148,7 @@ def test_threads_do_not_change_the_result():
 
 def test_multipliers_of_one_axis_and_of_all_agree():
     grid = Grid((6, 8, 10), -1, 1)
-    fft, psi = make_transforms(grid.shape, "scipy"), noise(grid)
+    fft, psi = make_transforms("scipy"), noise(grid)
     factors = [grid.wavenumbers(axis) ** 2 for axis in range(3)]
     single = SpectralSum(grid, fft, [Multiplier(grid, (axis,), f) for axis, f in enumerate(factors)])
     joint = SpectralSum(grid, fft, [Multiplier(grid, (0, 1, 2), sum(factors))])
@@ -394,3 +394,17 @@ def test_bad_states_and_names():
         line.angular_momentum(np.zeros(8))
     with pytest.raises(ValueError, match="beta < 0"):
         soliton(beta=1.0)
+
+
+def test_a_large_field_is_set_up_without_a_list_of_its_points(monkeypatch):
+    """Its components stand alone in the metric's blocks: arrays say so, not a million little ones."""
+    from eip_scipy import _setup
+
+    called = []
+    monkeypatch.setattr(_setup, "_block_lists", lambda *args: called.append(args))
+    for blocks, size in ((None, 2), (4, 8)):
+        groups = _setup.blocks_of(blocks, 64, 2)
+        assert (groups.size, groups.start.size) == (size, 128 // size + 1)
+        np.testing.assert_array_equal(groups.member, np.arange(128))
+        np.testing.assert_array_equal(groups.start, np.arange(0, 129, size))
+    assert not called

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -123,11 +124,10 @@ class GrossPitaevskii:
             raise ValueError(f"a rotation needs two dimensions: Omega = {Omega!r} on {grid!r}.")
         self.grid, self.Omega, self.beta, self.nyquist = grid, float(Omega), float(beta), nyquist
         self.V = _on_grid(potential, grid)
-        self.transforms = make_transforms(grid.shape, fft, threads)
+        self.transforms = make_transforms(fft, threads)
         self.fft = self.transforms.name
         self._options = {"nyquist": nyquist, "fft": fft, "threads": threads}
         self._linear = SpectralSum(grid, self.transforms, self._kinetic_and_rotation())
-        self._Lz = None if grid.dim == 1 else SpectralSum(grid, self.transforms, self._rotation())
 
     def __repr__(self) -> str:
         return f"GrossPitaevskii({self.grid!r}, Omega={self.Omega:g}, beta={self.beta:g})"
@@ -156,8 +156,12 @@ class GrossPitaevskii:
         k, q = (self.grid.wavenumbers(axis, odd=True) for axis in (0, 1))
         return [-y * k, x * q]
 
-    def _rotation(self) -> list[Multiplier]:
-        return [Multiplier(self.grid, (axis,), factor) for axis, factor in enumerate(self.rotation_factors())]
+    @cached_property
+    def _turning(self) -> SpectralSum:
+        if self.grid.dim == 1:
+            raise ValueError("in one dimension there is no angular momentum.")
+        terms = [Multiplier(self.grid, (axis,), factor) for axis, factor in enumerate(self.rotation_factors())]
+        return SpectralSum(self.grid, self.transforms, terms)
 
     def _kinetic_and_rotation(self) -> list[Multiplier]:
         """As few transforms as there are: all axes at once without rotation, else x, and then y and z together."""
@@ -187,8 +191,9 @@ class GrossPitaevskii:
     def rhs(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with -i H(psi) psi; both flat and contiguous, and not the same array."""
         shape = self.grid.shape
-        rest = self._linear.parts(y.reshape(shape), out.reshape(shape))
-        derivative(rest.reshape(-1).view(float), y.view(float), self.V.reshape(-1), self.beta, out.view(float))
+        psi, image = y.reshape(shape), out.reshape(shape)
+        for where, rest in self._linear.parts(psi, image):
+            derivative(_floats(rest), _floats(psi[where]), self.V[where].reshape(-1), self.beta, _floats(image[where]))
 
     def fun(self, t: float, y: np.ndarray) -> np.ndarray:
         """-i H(psi) psi, flat: what `solve_ivp` takes."""
@@ -211,12 +216,12 @@ class GrossPitaevskii:
         return out
 
     def mass(self, psi: Any) -> float:
-        """Sum of |psi|^2 over the grid, times the cell: 1 for a normalised state."""
+        """Sum of ``|psi|^2`` over the grid, times the cell: 1 for a normalised state."""
         flat = self.as_field(psi).reshape(-1).view(float)
         return self.grid.cell * dot(flat, flat)
 
     def energy(self, psi: Any) -> float:
-        """Kinetic, potential, rotational and interaction energy, the last beta / 2 times the sum of |psi|^4."""
+        """Kinetic, potential, rotational and interaction energy, the last beta / 2 times the sum of ``|psi|^4``."""
         psi = self.as_field(psi)
         columns = self.grid.shape[-1]
         local = interaction_energy(float_rows(psi, columns), self.V.reshape(-1, columns), self.beta)
@@ -230,23 +235,18 @@ class GrossPitaevskii:
         ValueError
             In one dimension.
         """
-        return self.grid.cell * self._rotation_or_error().expectation(self.as_field(psi))
+        return self.grid.cell * self._turning.expectation(self.as_field(psi))
 
     def chemical_potential(self, psi: Any) -> float:
         """Mean of H: mu = Re <H(psi) psi, psi> / <psi, psi>."""
         psi = self.as_field(psi)
         return float(np.vdot(psi, self.hamiltonian(psi)).real / np.vdot(psi, psi).real)
 
-    def _rotation_or_error(self) -> SpectralSum:
-        if self._Lz is None:
-            raise ValueError("in one dimension there is no angular momentum.")
-        return self._Lz
-
     def _mass_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
-        np.multiply(y, 2 * self.grid.cell, out=out)
+        np.multiply(y.view(float), 2 * self.grid.cell, out=out.view(float))
 
     def _angular_momentum_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
-        self._rotation_or_error().apply(y.reshape(self.grid.shape), out.reshape(self.grid.shape))
+        self._turning.apply(y.reshape(self.grid.shape), out.reshape(self.grid.shape))
         out *= 2 * self.grid.cell
 
     def invariants(self, names: Sequence[str] = ("mass", "energy")) -> tuple[Invariant, ...]:
@@ -392,6 +392,10 @@ class _Energy:
         turn(f.view(float), 2 * self._gpe.grid.cell, out.view(float))  # 2 w H psi, and H psi = i f
         # Copies: the caller may use its arrays for something else.
         self._near, self._value = (self._gpe.as_field(y).copy(), f.copy()), None
+
+
+def _floats(field: np.ndarray) -> np.ndarray:
+    return field.reshape(-1).view(np.float64)
 
 
 def _on_grid(potential: Any, grid: Grid) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from .transforms import Axes, Transforms
 __all__ = ["Grid", "Multiplier", "SpectralSum"]
 
 MOST_AXES = 3
+SLAB = 2**19  # bytes of a field that stay in a processor's cache, with others beside them
 
 
 class Grid:
@@ -138,13 +139,17 @@ class Multiplier:
         columns = 1 if np.shape(factor)[-1:] in ((), (1,)) and grid.dim > 1 else grid.shape[-1]
         full = np.broadcast_to(factor, (*grid.shape[:-1], columns))
         points = int(np.prod([grid.shape[axis] for axis in axes]))
-        self._columns = grid.shape[-1]
+        self._columns, self._rows = grid.shape[-1], int(np.prod(grid.shape[1:-1]))  # the latter of one x
         self._factor = np.ascontiguousarray(full, dtype=float).reshape(-1, columns) / points
 
-    def apply(self, fft: Transforms, psi: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with the multiplied field; `psi` stays."""
+    def apply(self, fft: Transforms, psi: np.ndarray, out: np.ndarray, first: int = 0) -> None:
+        """Fill `out` with the multiplied field; `psi` stays.
+
+        Both may be a slab of the field from index `first` of x on, if x is not among the axes transformed.
+        """
         fft.forward(psi, self.axes, out)
-        multiply(float_rows(out, self._columns), self._factor)
+        rows = slice(first * self._rows, (first + out.shape[0]) * self._rows) if out.ndim > 1 else slice(None)
+        multiply(float_rows(out, self._columns), self._factor[rows])
         fft.backward(out, self.axes)
 
     def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
@@ -167,27 +172,35 @@ class SpectralSum:
     def __init__(self, grid: Grid, fft: Transforms, terms: Sequence[Multiplier]) -> None:
         self._fft, self._terms = fft, tuple(terms)
         self._work = np.empty(grid.shape, complex)
+        whole = len(self._terms) == 1 or 0 in self._terms[-1].axes
+        self._slab = grid.shape[0] if whole else max(1, SLAB // max(1, 16 * int(np.prod(grid.shape[1:]))))
 
-    def parts(self, psi: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """Fill `out` with all terms but the last of several, which is returned in a buffer; (0,) if there is but one.
+    def parts(self, psi: np.ndarray, out: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+        """Fill `out` with all terms but the last of several, and yield that slab by slab, as long as it is in cache.
 
-        Whoever adds something pointwise adds this as well, and saves a pass over the field.
+        Yields
+        ------
+        (slice, ndarray)
+            Where along x, and what to add to `out` there: a buffer, or (0,) where there is but one term.
         """
         first, *others = self._terms
         first.apply(self._fft, psi, out)
         for term in others[:-1]:
             term.apply(self._fft, psi, self._work)
             out += self._work
-        if not others:
-            return self._work.reshape(-1)[:0]
-        others[-1].apply(self._fft, psi, self._work)
-        return self._work
+        for begin in range(0, out.shape[0], self._slab):
+            where = slice(begin, begin + self._slab)
+            rest = self._work.reshape(-1)[:0]
+            if others:
+                rest = self._work[: psi[where].shape[0]]
+                others[-1].apply(self._fft, psi[where], rest, begin)
+            yield where, rest
 
     def apply(self, psi: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with the operator's image of `psi`."""
-        rest = self.parts(psi, out)
-        if rest.size:
-            out += rest
+        for where, rest in self.parts(psi, out):
+            if rest.size:
+                out[where] += rest
 
     def expectation(self, psi: np.ndarray) -> float:
         """Sum over the grid of conj(psi) times the image."""

@@ -48,7 +48,7 @@ def multiply(field, factor):
 
 @_jit
 def weighted_square(field, weight):
-    """Sum of weight |field|^2; shapes as in `multiply`."""
+    """Sum of ``weight |field|^2``; shapes as in `multiply`."""
     total = 0.0
     for r in range(field.shape[0]):
         row, w = field[r], weight[r]
@@ -87,7 +87,7 @@ def weighted_row_square(row, w):
 
 @_jit
 def interaction_energy(psi, V, beta):
-    """Sum of V |psi|^2 + beta / 2 |psi|^4; psi (rows, 2 m), V (rows, m)."""
+    """Sum of ``V |psi|^2 + beta / 2 |psi|^4``; psi (rows, 2 m), V (rows, m)."""
     total = 0.0
     half = 0.5 * beta
     for r in range(V.shape[0]):
@@ -110,7 +110,7 @@ def interaction_energy(psi, V, beta):
 
 @_jit
 def derivative(linear, psi, V, beta, out):
-    """Out = -i (out + linear + (V + beta |psi|^2) psi), all flat; `linear` may be empty."""
+    """Out = ``-i (out + linear + (V + beta |psi|^2) psi)``, all flat; `linear` may be empty."""
     if linear.size == 0:
         for i in range(V.size):
             a, b = psi[2 * i], psi[2 * i + 1]
@@ -127,7 +127,7 @@ def derivative(linear, psi, V, beta, out):
 
 @_jit
 def add_potential(psi, V, beta, out):
-    """Out += (V + beta |psi|^2) psi, all flat."""
+    """Out += ``(V + beta |psi|^2) psi``, all flat."""
     for i in range(V.size):
         a, b = psi[2 * i], psi[2 * i + 1]
         v = V[i] + beta * (a * a + b * b)
@@ -170,7 +170,7 @@ def turn(f, factor, out):
 
 @_jit
 def expansion(psi, near, f):
-    """Sums of |d|^2 and Re(conj(H near) d) for d = psi - near, H near = i f, and the largest |near|^2; (rows, 2 m)."""
+    """Sums of ``|d|^2`` and Re(conj(i f) d) for d = psi - near, and the largest ``|near|^2``; all (rows, 2 m)."""
     square = slope = top = 0.0
     for r in range(psi.shape[0]):
         a, b, g = psi[r], near[r], f[r]
@@ -188,7 +188,10 @@ def expansion(psi, near, f):
 
 @_jit
 def quartic_sums(psi, p, out):
-    """Fill out (5,) with the sums of nn, nq, mm, mq, qq: n = |psi|^2, m = Re(conj(psi) p), q = |p|^2; (rows, 2 m)."""
+    """Fill out (5,) with the sums of nn, nq, mm, mq and qq; all (rows, 2 m).
+
+    Here ``n = |psi|^2``, ``m = Re(conj(psi) p)``, ``q = |p|^2``.
+    """
     out[:] = 0.0
     for r in range(psi.shape[0]):
         nn = nq = mm = mq = qq = 0.0
@@ -210,7 +213,7 @@ def quartic_sums(psi, p, out):
 
 @_jit
 def divide_by_root(a, psi, V, beta, shift, out):
-    """Out = a / sqrt(shift + V + beta |psi|^2), all flat."""
+    """Out = ``a / sqrt(shift + V + beta |psi|^2)``, all flat."""
     for i in range(V.size):
         x, y = psi[2 * i], psi[2 * i + 1]
         weight = 1 / np.sqrt(shift + V[i] + beta * (x * x + y * y))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -16,18 +16,17 @@ Axes = tuple[int, ...]
 
 
 class Transforms:
-    """Transforms of complex fields of one shape along some of their axes, without a factor either way.
+    """Transforms of contiguous complex fields along some of their axes, without a factor either way.
 
     Parameters
     ----------
-    shape : sequence of int
     threads : int
     """
 
     name = ""
 
-    def __init__(self, shape: Sequence[int], threads: int) -> None:
-        self.shape, self.threads = tuple(shape), threads
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
 
     def forward(self, field: np.ndarray, axes: Axes, out: np.ndarray) -> None:
         """Fill `out` with the transform of `field`, sum_j field_j exp(-i k x_j), along `axes`."""
@@ -58,8 +57,8 @@ class _SciPy(Transforms):
 class _Ducc(Transforms):
     name = "ducc0"
 
-    def __init__(self, shape: Sequence[int], threads: int) -> None:
-        super().__init__(shape, threads)
+    def __init__(self, threads: int) -> None:
+        super().__init__(threads)
         self._c2c = import_module("ducc0").fft.c2c
 
     def forward(self, field: np.ndarray, axes: Axes, out: np.ndarray) -> None:
@@ -74,23 +73,24 @@ class _FFTW(Transforms):
 
     name = "pyfftw"
 
-    def __init__(self, shape: Sequence[int], threads: int) -> None:
-        super().__init__(shape, threads)
+    def __init__(self, threads: int) -> None:
+        super().__init__(threads)
         self._pyfftw = import_module("pyfftw")
-        self._plans: dict[tuple[Axes, bool], Any] = {}
+        self._plans: dict[tuple[tuple[int, ...], Axes, bool], Any] = {}
 
     def forward(self, field: np.ndarray, axes: Axes, out: np.ndarray) -> None:
-        self._plan(axes, True)(field, out)
+        self._plan(field.shape, axes, True)(field, out)
 
     def backward(self, field: np.ndarray, axes: Axes) -> None:
-        self._plan(axes, False)(field, field, normalise_idft=False)
+        self._plan(field.shape, axes, False)(field, field, normalise_idft=False)
 
-    def _plan(self, axes: Axes, forward: bool) -> Any:
+    def _plan(self, shape: tuple[int, ...], axes: Axes, forward: bool) -> Any:
         """Forward plans are from one array to another, backward plans in place, as they will be used."""
-        if (axes, forward) not in self._plans:
-            target = np.zeros(self.shape, complex)
-            source = np.zeros(self.shape, complex) if forward else target
-            self._plans[axes, forward] = self._pyfftw.FFTW(
+        key = shape, axes, forward
+        if key not in self._plans:
+            target = np.zeros(shape, complex)
+            source = np.zeros(shape, complex) if forward else target
+            self._plans[key] = self._pyfftw.FFTW(
                 source,
                 target,
                 axes=axes,
@@ -98,23 +98,22 @@ class _FFTW(Transforms):
                 flags=("FFTW_MEASURE", "FFTW_UNALIGNED"),
                 threads=self.threads,
             )
-        return self._plans[axes, forward]
+        return self._plans[key]
 
 
 LIBRARIES: dict[str, type[Transforms]] = {kind.name: kind for kind in (_SciPy, _Ducc, _FFTW)}
-# Fastest first, by `python benchmarks/gpe.py`.
-PREFERENCE = {1: ("ducc0", "scipy"), 2: ("ducc0", "pyfftw", "scipy"), 3: ("pyfftw", "ducc0", "scipy")}
+# The first that is installed. By `python benchmarks/gpe.py` ducc0 is the fastest, but for the largest fields in 3D.
+PREFERENCE = ("ducc0", "pyfftw", "scipy")
 
 
-def make_transforms(shape: Sequence[int], fft: str = "auto", threads: int = 1) -> Transforms:
+def make_transforms(fft: str = "auto", threads: int = 1) -> Transforms:
     """Choose a library and make its transforms.
 
     Parameters
     ----------
-    shape : sequence of int
-        Of the fields.
     fft : {"auto", "scipy", "ducc0", "pyfftw"}, optional
-        "auto": the fastest of those installed. ducc0 and pyfftw come with ``pip install "eip_scipy[fft]"`` (both GPL).
+        "auto": the first of ducc0, pyfftw and scipy that is installed. The first two, both GPL, come with
+        ``pip install "eip_scipy[fft]"``.
     threads : int, optional
         Threads of each transform. No other part of the right-hand side has threads, so that no two pools compete.
 
@@ -132,9 +131,9 @@ def make_transforms(shape: Sequence[int], fft: str = "auto", threads: int = 1) -
     if isinstance(threads, bool) or not isinstance(threads, (int, np.integer)) or threads < 1:
         raise ValueError(f"threads must be an integer >= 1, got {threads!r}.")
     if fft == "auto":
-        fft = next(name for name in PREFERENCE[len(shape)] if find_spec(name) is not None)
+        fft = next(name for name in PREFERENCE if find_spec(name) is not None)
     if fft not in LIBRARIES:
         raise ValueError(f"fft must be 'auto' or one of {', '.join(map(repr, LIBRARIES))}, got {fft!r}.")
     if find_spec(fft) is None:
         raise ImportError(f"fft={fft!r} needs {fft}: pip install \"eip_scipy[fft]\", or fft='scipy'.", name=fft)
-    return LIBRARIES[fft](shape, int(threads))
+    return LIBRARIES[fft](int(threads))
