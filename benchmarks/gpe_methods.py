@@ -91,7 +91,7 @@ def main() -> None:
     arguments = parser.parse_args()
     made, defects, error = runners(start_of_the_ring(arguments.points), arguments.t_end, arguments.points)
     made = {name: made[name] for name in arguments.only or made}
-    result = work_precision(made, error, repeats=arguments.repeats, enough_seconds=np.inf)
+    result = work_precision(made, error, repeats=arguments.repeats, enough_seconds=5.0)
     print(result.machine)
     rows, body = [], []
     for point in result.points:
