@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from ._lanes import abs_dot, dot, largest, remove_component, weighted_rows
-from ._octets import is_not, where
+from ._octets import is_not, no_lane, where
 from ._triples import shift_and_weigh, shift_bodies, sum_bodies
 
 OK, NOT_FINITE, FAILED_PROJECTION, POSTPONED = 0, 1, 2, 4
@@ -245,6 +245,12 @@ def quadrature(a, b, out):
 
 
 @_jit
+def positive(x):
+    """X, or 1 in the place of 0: a divisor where the quotient does not count."""
+    return where(x > 0.0, x, 1.0)
+
+
+@_jit
 def powers(x, exponent):
     """X <- x**exponent, x in [0, 1]; for RK4 and DOP853 by square roots, several times faster than pow."""
     if exponent == 1.25:
@@ -362,15 +368,15 @@ def weights_from_sizes(atol, groups, kappa, sigma, scale, ratio):
     for b in range(scale.size):
         scale[b] += atol[b]
         # Over a scale of 0 there is no error to speak of.
-        ratio[b] = where(scale[b] > 0.0, ratio[b] / max(scale[b], TINY), 0.0)
+        ratio[b] = where(scale[b] > 0.0, ratio[b], 0.0) / max(scale[b], TINY)
     largest_ratio = largest(ratio)
-    inverse = 1.0 / largest_ratio
+    inverse = 1.0 / positive(largest_ratio)
     for b in range(ratio.size):
         ratio[b] = min(1.0, ratio[b] * inverse)
     powers(ratio, kappa)
     for b in range(ratio.size):
         ratio[b] = scale[b] * (ratio[b] + METRIC_FLOOR)
-    inverse = 1.0 / largest(ratio)
+    inverse = 1.0 / positive(largest(ratio))
     for b in range(ratio.size):
         weight = where(largest_ratio > 0.0, ratio[b] * inverse, 1.0)
         if groups.size == 3:
@@ -386,9 +392,9 @@ def correction_in_local_errors(move, scale, groups, largest_error):
     """Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none."""
     top = 0.0
     for b in range(scale.size):
-        square = block_square(move, b, 1.0 / scale[b], groups)
+        square = block_square(move, b, 1.0 / positive(scale[b]), groups)
         top = where(scale[b] > 0.0, max(top, square), top)
-    return where(largest_error > 0.0, sqrt(top) / largest_error, 0.0)
+    return where(largest_error > 0.0, sqrt(top) / positive(largest_error), 0.0)
 
 
 @_jit
@@ -539,6 +545,8 @@ def solve_gram(B, g, R, mu):
         for j in range(i + 1):
             R[i, j] = dot(B[i], B[j])
         good = good & (R[i, i] > 1e-140) & (R[i, i] < 1e140)
+    if no_lane(good):
+        return good
     for i in range(rows):
         for j in range(1, i):
             for k in range(j):
@@ -552,6 +560,8 @@ def solve_gram(B, g, R, mu):
             mu[i] -= x * mu[j]
             R[i, j] = x
         good = good & (square > least)
+        if no_lane(good):
+            return good
         R[i, i] = 1.0 / square
     for i in range(rows - 1, -1, -1):
         mu[i] *= R[i, i]

@@ -33,6 +33,7 @@ __all__ = [
     "is_not",
     "lane_of",
     "multiply_add",
+    "no_lane",
     "octets",
     "on_stack",
     "over_members",
@@ -335,6 +336,14 @@ def any_lane(typingctx, mask):
 
 
 @intrinsic  # emits LLVM
+def no_lane(typingctx, condition):
+    """Whether the condition holds in no lane; for a truth value, whether it does not hold."""
+    if not over_members(condition):
+        return types.boolean(types.boolean), lambda context, builder, sig, args: builder.not_(args[0])
+    return in_octets(lambda mask: not any_lane(mask), types.boolean, condition)
+
+
+@intrinsic  # emits LLVM
 def lane_of(typingctx, mask, k):
     """Whether the mask holds in lane k."""
 
@@ -351,6 +360,8 @@ if config.DISABLE_JIT:
 
     def is_not(condition):
         return not condition
+
+    no_lane = is_not
 
     def multiply_add(a, b, c):
         return a * b + c
