@@ -56,7 +56,7 @@ def crank_nicolson(
     -----
     Each step is solved for the mean of its two states by a fixed point that is preconditioned in the modes and starts
     from a parabola through the three means before; an iteration takes a pair of transforms. It contracts where
-    h / 2 times half the range of V + beta |psi|^2 is well below 1. A rotation, which is not diagonal in the modes,
+    h / 2 times half the range of ``V + beta |psi|^2`` is well below 1. A rotation, which is not diagonal in the modes,
     takes two more pairs along one axis and asks for h below about 2 / (Omega r)^2, r the largest distance from the
     axis.
 

@@ -137,7 +137,7 @@ def add_potential(psi, V, beta, out):
 
 @_jit
 def local_flow(psi, V, beta, h):
-    """Psi <- exp(-i h (V + beta |psi|^2)) psi, flat.
+    """Psi <- ``exp(-i h (V + beta |psi|^2)) psi``, flat.
 
     The sine and cosine are their Taylor polynomials on [-pi/4, pi/4], without a branch: the loop becomes vector code,
     three times as fast as with the library's functions. To 1e-15 for angles up to 1e6.

@@ -22,7 +22,7 @@ class Scheme(NamedTuple):
     name : str
     order : int
     local : tuple of float, length s + 1
-        Parts of the step of V + beta |psi|^2, whose flow is a phase at each point.
+        Parts of the step of ``V + beta |psi|^2``, whose flow is a phase at each point.
     linear : tuple of float, length s
         Parts of the step of -Laplace / 2 - Omega Lz, between the others.
     reference : str
@@ -83,7 +83,7 @@ class Splitting:
 
     Notes
     -----
-    |psi|^2 is constant in the local flow, which is thereby a phase. Every flow is unitary and reversible, and so are
+    ``|psi|^2`` is constant in the local flow, which is thereby a phase. Every flow is unitary and reversible, and so are
     the steps: the mass is kept to round-off, and a step back undoes a step. The energy is not kept: project.
 
     Examples
