@@ -165,7 +165,7 @@ class _SAV(Scheme):
 
 @jit
 def nonlinear_force(psi, other, a, V, beta, out):
-    """``out <- (V + beta |p|^2) p`` for ``p = psi + a (psi - other)``; returns the sum of ``V |p|^2 + beta / 2 |p|^4``."""
+    """``out <- (V + beta |p|^2) p``, ``p = psi + a (psi - other)``; returns the sum of ``V |p|^2 + beta / 2 |p|^4``."""
     total = 0.0
     for i in range(psi.size):
         p = psi[i] + a * (psi[i] - other[i])

@@ -83,8 +83,8 @@ class Splitting:
 
     Notes
     -----
-    ``|psi|^2`` is constant in the local flow, which is thereby a phase. Every flow is unitary and reversible, and so are
-    the steps: the mass is kept to round-off, and a step back undoes a step. The energy is not kept: project.
+    ``|psi|^2`` is constant in the local flow, which is thereby a phase. Every flow is unitary and reversible, and so
+    are the steps: the mass is kept to round-off, and a step back undoes a step. The energy is not kept: project.
 
     Examples
     --------
