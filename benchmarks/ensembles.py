@@ -163,8 +163,8 @@ def main() -> None:
     args = parser.parse_args()
     print(describe_machine())
     seconds(16, args.steps, None)  # compiled before
-    overhead_and_threads(max(16, args.members // 40), args.steps, args.repeats)
-    dask_workers(max(16, args.members // 20), args.steps, args.repeats)
+    overhead_and_threads(max(16, args.members // 10), args.steps, args.repeats)
+    dask_workers(max(16, args.members // 10), args.steps, args.repeats)
     memory(args.members)
     whole = seconds(args.members, args.steps, None)
     print(f"{args.members} members x {args.steps} steps on all cores: {whole:.1f} s", flush=True)

@@ -168,6 +168,7 @@ def test_an_own_step_runs_interpreted_and_says_so():
         integrate(oscillator, (0, 1), [1.0, 0.0], method=method, h=0.1, compensated=True)
 
 
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # inf - inf, by NumPy, without the JIT
 def test_failures_end_the_run():
     class Overflow(Verlet):
         def one_step(self, t, y, h):
