@@ -390,6 +390,8 @@ def weights_from_sizes(atol, groups, kappa, sigma, scale, ratio):
 @_jit_inline
 def correction_in_local_errors(move, scale, groups, largest_error):
     """Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none."""
+    if no_lane(largest_error > 0.0):
+        return 0.0 * largest_error
     top = 0.0
     for b in range(scale.size):
         square = block_square(move, b, 1.0 / positive(scale[b]), groups)
