@@ -56,7 +56,7 @@ def signatures(dtype: np.dtype) -> Signatures:
 
 
 def signatures_of_octets() -> Signatures:
-    """The same for the members of an octet, and for all octets of a batch."""
+    """The same for the members of an octet."""
     real, state, rows = types.float64, *(types.Array(OCTET, ndim, "A", aligned=False) for ndim in (1, 2))
     return Signatures(
         rhs=types.void(real, state, state, state),

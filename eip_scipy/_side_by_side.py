@@ -23,7 +23,7 @@ from ._step import AUTO, NEW, Options, Span, T
 from .longrun import PENDING, ROW, STEP, Loop, source_stamp
 from .result import LAST_RANK, N_COUNTERS, NFEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
 
-__all__ = ["Batch", "Ended", "lanes_of", "why_one_by_one"]
+__all__ = ["Batch", "Ended", "can_run", "lanes_of"]
 
 FEW_FLOATS = 128  # in a state of all lanes: more lanes for small systems, as the loop itself takes its time
 MOST_LANES = 32
@@ -58,21 +58,11 @@ class Ended(NamedTuple):
     reason: str
 
 
-def why_one_by_one(options: Options, span: Span, dtype: np.dtype) -> str | None:
-    """Why members with these options cannot run side by side; None: they can."""
-    if options.adaptive:
-        return "with adaptive steps each member takes steps of its own; give h"
-    if np.dtype(dtype).kind == "c":
-        return "the state is complex"
-    if span.n_steps >= _setup.UNBOUNDED:
-        return "the interval has no end"
-    wanted = {
-        "compensated=True": options.compensated,
-        f"iterations={options.iterations}": options.iterations > 1,
-        "direction other than 'new'": options.direction != NEW,
-        "every='auto'": options.every == AUTO,
-    }
-    return next((f"{name} works on members one by one" for name, found in wanted.items() if found), None)
+def can_run(options: Options, span: Span, dtype: np.dtype) -> bool:
+    """Whether members with these options take the same fixed steps, and a projection that a batch has."""
+    steps = not options.adaptive and span.n_steps < _setup.UNBOUNDED and np.dtype(dtype).kind != "c"
+    projection = options.iterations == 1 and options.direction == NEW and options.every != AUTO
+    return steps and projection and not options.compensated
 
 
 class Batch:
@@ -86,15 +76,15 @@ class Batch:
     Raises
     ------
     NotCompilableError
-        Where a function branches on values, makes arrays, or does something else that octets cannot.
+        Where the options ask for steps of each member's own, or a function branches on values, makes arrays, or does
+        something else that octets cannot.
     """
 
     def __init__(self, loop: Loop) -> None:
         driver = loop.driver
         run, span = driver.run, driver.grid.span
-        reason = why_one_by_one(run.options, span, run.y0.dtype)
-        if reason is not None:
-            raise NotCompilableError(reason)
+        if not can_run(run.options, span, run.y0.dtype):
+            raise NotCompilableError("members with these options run one by one")
         self.functions = loop.in_octets()
         self.loop, self.span = loop, span
         n, rows = run.y0.size, run.invariants.size
