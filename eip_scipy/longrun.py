@@ -93,7 +93,7 @@ def make_advance(stamp):
         while True:
             if place[PENDING] == 1:
                 clock[T] = clock[T_NEW]
-                kn.copy(w.f_new_r, w.K_r[0])
+                kn.copy(w.K_r[-1], w.K_r[0])
                 kn.copy(y_new_r, y_r)
                 kn.copy(grid.g_new, grid.g)
                 place[PENDING] = 0
@@ -161,6 +161,8 @@ class _Driver:
         self.y = np.empty((rows + 1, n), dtype)
         self.state = run.y0.copy()
         self.new = np.empty_like(self.state)
+        if compiled:
+            run.options = run.options._replace(joint=None)
         self._tail = (
             run.method,
             run.options,
@@ -212,7 +214,7 @@ class _Driver:
         if self.grid.place[PENDING] == 1:
             copies["place"][PENDING] = 0
             copies["clock"][T] = self.grid.clock[T_NEW]
-            copies["y"], copies["slope"] = self.new.copy(), self.run.work.f_new.copy()
+            copies["y"], copies["slope"] = self.new.copy(), self.run.work.K[-1].copy()
             copies["g"] = self.grid.g_new.copy()
         return copies
 
@@ -262,7 +264,7 @@ class _Driver:
         t_old, t = (float(self.grid.clock[place]) for place in (T, T_NEW))
         w = self.run.work
         return dense_output(
-            rhs, self.run, tableau, t_old, t, self.state, self.new, w.K[0].copy(), w.f_new.copy(), self.params
+            rhs, self.run, tableau, t_old, t, self.state, self.new, w.K[0].copy(), w.K[-1].copy(), self.params
         )
 
     def values(self) -> np.ndarray:
