@@ -642,12 +642,12 @@ def efficiency_figure(
 
 
 def _slope_line(axis: Axes, h: np.ndarray, error: np.ndarray, slope: float) -> None:
-    """A dotted line below a method, with its slope beside the middle."""
+    """A dotted line below a method, with its slope below the shortest step."""
     ends = np.array([h.min(), h.max()])
     line = 0.25 * error[np.argmax(h)] * (ends / ends[1]) ** slope
     axis.plot(ends, line, color="0.4", lw=1.0, ls=":")
-    middle = np.sqrt(ends.prod()), np.sqrt(line.prod())
-    axis.annotate(f"slope {slope:.2f}", middle, (6, -4), textcoords="offset points", va="top", fontsize="small")
+    start = float(ends[0]), float(line[0])
+    axis.annotate(f"slope {slope:.2f}", start, (4, -2), textcoords="offset points", va="top", fontsize="small")
 
 
 class FieldPanel(NamedTuple):

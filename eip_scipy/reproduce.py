@@ -22,7 +22,7 @@ from scipy.integrate import solve_ivp
 from tqdm import tqdm
 
 from . import report
-from .commands import charged_particle, kepler_figures, particle_report, solar_system
+from .commands import charged_particle, gpe_efficiency, kepler_figures, particle_report, solar_system
 from .diagnostics import observed_order
 from .longrun import integrate
 from .problems import Problem, harmonic, kepler, rotating_packet
@@ -32,7 +32,7 @@ __all__ = ["FIGURES", "TABLES", "Cell", "Value", "add_arguments", "reproduce", "
 
 TABLES = ("table1", "table2", "table3", "table4", "table5")
 SLOW = ("table5",)
-FIGURES = ("fig-kepler", "fig-solar", "fig-particle", "fig-tokamak")
+FIGURES = ("fig-kepler", "fig-solar", "fig-particle", "fig-tokamak", "fig-efficiency")
 PARTICLE_SCENES = {"fig-particle": ("uniform",), "fig-tokamak": ("tokamak-banana", "tokamak-transit")}
 OMEGA = 10.0
 METHODS: dict[str, type[EIPSolver]] = {"RK1": EIPRK1, "RK2": EIPRK2, "RK3": EIPRK3, "RK4": EIPRK4}
@@ -339,21 +339,32 @@ def _figure(name: str, args: argparse.Namespace, judge: Callable[[], Any]) -> tu
     """Make one of the paper's figures; exit status and content of the JSON."""
     if name == "fig-kepler":
         return _kepler(args)
+    if name == "fig-efficiency":
+        return _efficiency(args)
     return _solar(args, judge) if name == "fig-solar" else _particle(name, args)
 
 
 def _kepler(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Make the paper's figures 1 and 2; exit status and content of the JSON."""
-    lines = kepler_figures.study()
+    return _study("fig-kepler", kepler_figures, kepler_figures.study(), args)
+
+
+def _efficiency(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """Make the paper's figure of efficiency; exit status and content of the JSON."""
+    return _study("fig-efficiency", gpe_efficiency, gpe_efficiency.study(quiet=args.quiet), args)
+
+
+def _study(name: str, command: Any, found: Any, args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """Print and write what a module of a figure lays out of its study."""
     if not args.quiet:
-        report.say(kepler_figures.text(lines))
-    checks = kepler_figures.checks(lines)
+        report.say(command.text(found))
+    checks = command.checks(found)
     if args.out is not None:
         folder = Path(args.out)
-        written = [report.write_csv(folder / "fig-kepler.csv", kepler_figures.rows(lines))]
+        written = [report.write_csv(folder / f"{name}.csv", command.rows(found))]
         try:
-            for name, figure in kepler_figures.figures(lines):
-                written.append(report.write_file(folder / name, figure.savefig))
+            for file, figure in command.figures(found):
+                written.append(report.write_file(folder / file, figure.savefig))
         except ImportError as error:
             report.warn(f"no figures: {error}")
         _say_written(args, written)

@@ -286,6 +286,7 @@ def test_all_means_all(tmp_path, monkeypatch):
     monkeypatch.setattr(reproduce, "_kepler", lambda args: (done.append("fig-kepler"), (0, {}))[1])
     monkeypatch.setattr(reproduce, "_solar", lambda args, judge: (done.append("fig-solar"), (0, {}))[1])
     monkeypatch.setattr(reproduce, "_particle", lambda name, args: (done.append(name), (0, {}))[1])
+    monkeypatch.setattr(reproduce, "_efficiency", lambda args: (done.append("fig-efficiency"), (0, {}))[1])
     monkeypatch.setattr(reproduce, "reproduce", lambda name, progress: done.append(name) or [])
     assert main(["reproduce", "all", "--out", str(tmp_path), "--quiet"]) == 0
     assert done == [*reproduce.TABLES, *reproduce.FIGURES]

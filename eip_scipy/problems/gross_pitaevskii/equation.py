@@ -9,25 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from ..._lanes import dot
 from ..._names import nearest
 from ...invariants import Invariant
 from .._problem import Problem
+from .conserved import Energy, Joint
 from .grid import Grid, Multiplier, SpectralSum
-from .pointwise import (
-    add_potential,
-    derivative,
-    expansion,
-    float_rows,
-    interaction_energy,
-    turn,
-)
+from .lines import LineSum, fits
+from .moments import moments, total_mass
+from .pointwise import add_potential, derivative, float_rows
 from .transforms import make_transforms
 
 __all__ = ["FieldProblem", "GrossPitaevskii"]
 
 NYQUIST = ("true", "zero")
-NEGLIGIBLE = 1e-17  # a twentieth of a rounding
 INVARIANTS = ("mass", "energy", "angular_momentum")
 SOURCE = "Cai, Gong & Wang, section 3.4 (eq. 3.9, 3.10), the quartic term as the sum of |psi|^4"
 
@@ -66,7 +60,8 @@ class GrossPitaevskii:
         The second derivative's factor of the Nyquist mode: its own, or 0 as where the second derivative is the first
         one applied twice (the paper's tables).
     fft : {"auto", "scipy", "ducc0", "pyfftw"}, optional
-        See `make_transforms`.
+        A library of transforms, see `make_transforms`. With "auto" the right-hand side has transforms of its own where
+        each side of the grid is a power of two, 8 or more, in two or three dimensions: faster than any of them.
     threads : int, optional
         Threads of the transforms.
 
@@ -79,6 +74,8 @@ class GrossPitaevskii:
     transforms : Transforms
     fft : str
         The library of the transforms.
+    own_transforms : bool
+        Whether the right-hand side does without it.
 
     Raises
     ------
@@ -128,6 +125,8 @@ class GrossPitaevskii:
         self.fft = self.transforms.name
         self._options = {"nyquist": nyquist, "fft": fft, "threads": threads}
         self._linear = SpectralSum(grid, self.transforms, self._kinetic_and_rotation())
+        self._lines = self._line_sum() if fft == "auto" and fits(grid.shape) else None
+        self.own_transforms = self._lines is not None
 
     def __repr__(self) -> str:
         return f"GrossPitaevskii({self.grid!r}, Omega={self.Omega:g}, beta={self.beta:g})"
@@ -175,6 +174,11 @@ class GrossPitaevskii:
             Multiplier(self.grid, others, sum(kinetic[1:]) - self.Omega * along_y),
         ]
 
+    def _line_sum(self) -> LineSum:
+        kinetic = [self.kinetic_factor(axis) for axis in range(self.grid.dim)]
+        k, q = (self.grid.wavenumbers(axis, odd=True) for axis in (0, 1))
+        return LineSum(self.grid, kinetic, [self.Omega * k, -self.Omega * q], self.transforms.threads)
+
     def as_field(self, psi: Any) -> np.ndarray:
         """`psi`, a field or a flat state, as a contiguous complex field.
 
@@ -188,10 +192,17 @@ class GrossPitaevskii:
             raise ValueError(f"psi has shape {psi.shape}, expected {self.grid.shape} or ({self.grid.size},).")
         return psi.reshape(self.grid.shape)
 
+    def rows(self, psi: np.ndarray) -> np.ndarray:
+        """A contiguous field or flat state as floats (Re, Im, Re ...), a row of the grid in each row; no copy."""
+        return float_rows(psi, self.grid.shape[-1])
+
     def rhs(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with -i H(psi) psi; both flat and contiguous, and not the same array."""
         shape = self.grid.shape
         psi, image = y.reshape(shape), out.reshape(shape)
+        if self._lines is not None:
+            self._lines.derivative(psi, self.V, self.beta, image)
+            return
         for where, rest in self._linear.parts(psi, image):
             derivative(_floats(rest), _floats(psi[where]), self.V[where].reshape(-1), self.beta, _floats(image[where]))
 
@@ -203,8 +214,8 @@ class GrossPitaevskii:
         return out
 
     def linear(self, psi: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with (-Laplace / 2 - Omega Lz) psi, both fields."""
-        self._linear.apply(psi, out)
+        """Fill `out` with (-Laplace / 2 - Omega Lz) psi, both contiguous fields."""
+        (self._lines or self._linear).apply(psi, out)
 
     def angular(self, psi: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with Lz psi, both fields.
@@ -220,22 +231,20 @@ class GrossPitaevskii:
         """H(psi) psi, a field."""
         psi = self.as_field(psi)
         out = np.empty_like(psi)
-        self._linear.apply(psi, out)
+        self.linear(psi, out)
         flat = (a.reshape(-1).view(float) for a in (psi, out))
         add_potential(next(flat), self.V.reshape(-1), self.beta, next(flat))
         return out
 
     def mass(self, psi: Any) -> float:
         """Sum of ``|psi|^2`` over the grid, times the cell: 1 for a normalised state."""
-        flat = self.as_field(psi).reshape(-1).view(float)
-        return self.grid.cell * dot(flat, flat)
+        return self.grid.cell * total_mass(self.rows(self.as_field(psi)))
 
     def energy(self, psi: Any) -> float:
         """Kinetic, potential, rotational and interaction energy, the last beta / 2 times the sum of ``|psi|^4``."""
         psi = self.as_field(psi)
-        columns = self.grid.shape[-1]
-        local = interaction_energy(float_rows(psi, columns), self.V.reshape(-1, columns), self.beta)
-        return self.grid.cell * (self._linear.expectation(psi) + local)
+        f = self.fun(0.0, psi.reshape(-1))
+        return self.grid.cell * moments(self.rows(psi), self.rows(f)).energy(self.beta)
 
     def angular_momentum(self, psi: Any) -> float:
         """Mean of Lz times the mass.
@@ -282,7 +291,7 @@ class GrossPitaevskii:
         return tuple(self._invariant(name) for name in ((names,) if isinstance(names, str) else names))
 
     def _invariant(self, name: str) -> Invariant:
-        energy = _Energy(self)
+        energy = Energy(self)
         made: dict[str, tuple[Callable[..., float], Callable[..., None]]] = {
             "mass": (self.mass, self._mass_gradient),
             "energy": (energy.value, energy.gradient),
@@ -292,6 +301,24 @@ class GrossPitaevskii:
             raise ValueError(f"unknown invariant {name!r}, expected {', '.join(INVARIANTS)}{nearest(name, INVARIANTS)}")
         value, gradient = made[name]
         return Invariant(lambda t, y: value(y), gradient, name=name, in_place=True, uses_f=name == "energy")
+
+    def joint(self, names: Sequence[str] = ("mass", "energy")) -> Joint:
+        """Make the mass and the energy, or one of them, as one: a projection in two passes over the field.
+
+        Parameters
+        ----------
+        names : sequence of {"mass", "energy"}, optional
+
+        Returns
+        -------
+        Joint
+
+        Raises
+        ------
+        ValueError
+            For other names.
+        """
+        return Joint(self, (names,) if isinstance(names, str) else tuple(names))
 
     def problem(
         self,
@@ -365,43 +392,6 @@ class GrossPitaevskii:
         # Twice the interaction: the linearised term is 2 beta |psi|^2 u + beta psi^2 conj(u).
         local = 2 * abs(self.beta) * float((np.abs(self.as_field(psi)) ** 2).max())
         return float(limit / (self.largest_frequency() + local))
-
-
-class _Energy:
-    """The energy as an invariant: beside a state where it and its gradient are known, by the expansion there.
-
-    A step asks for the gradient at its raw result, for the energy there, and for that of the projected state, 1e-12 or
-    so away. The second energy follows from the first without a transform, as long as the terms of second order and
-    higher are far below its rounding. Elsewhere it is evaluated as `GrossPitaevskii.energy` does.
-    """
-
-    def __init__(self, gpe: GrossPitaevskii) -> None:
-        self._gpe = gpe
-        self._norm = gpe.largest_frequency()
-        self._near: tuple[np.ndarray, np.ndarray] | None = None  # a state and its derivative
-        self._value: float | None = None  # the energy there
-
-    def value(self, y: np.ndarray) -> float:
-        gpe = self._gpe
-        psi = gpe.as_field(y)
-        if self._near is None:
-            return gpe.energy(psi)
-        square, slope, top = expansion(*(float_rows(a, gpe.grid.shape[-1]) for a in (psi, *self._near)))
-        if square == 0.0 and self._value is None:
-            self._value = gpe.energy(psi)
-        if self._value is None or not gpe.grid.cell * self._remainder(square, top) <= NEGLIGIBLE * abs(self._value):
-            return gpe.energy(psi)
-        return self._value + 2 * gpe.grid.cell * slope
-
-    def _remainder(self, square: float, top: float) -> float:
-        """A bound of what the expansion leaves out, by the sum of the squares of the difference."""
-        density = 3 * top + 2 * (top * square) ** 0.5 + 0.5 * square
-        return (self._norm + abs(self._gpe.beta) * density) * square
-
-    def gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
-        turn(f.view(float), 2 * self._gpe.grid.cell, out.view(float))  # 2 w H psi, and H psi = i f
-        # Copies: the caller may use its arrays for something else.
-        self._near, self._value = (self._gpe.as_field(y).copy(), f.copy()), None
 
 
 def _floats(field: np.ndarray) -> np.ndarray:

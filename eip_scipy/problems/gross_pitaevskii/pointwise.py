@@ -13,7 +13,6 @@ __all__ = [
     "add_potential",
     "derivative",
     "divide_by_root",
-    "expansion",
     "interaction_energy",
     "local_flow",
     "multiply",
@@ -166,24 +165,6 @@ def turn(f, factor, out):
     for i in range(f.size // 2):
         re, im = f[2 * i], f[2 * i + 1]
         out[2 * i], out[2 * i + 1] = -factor * im, factor * re
-
-
-@_jit
-def expansion(psi, near, f):
-    """Sums of ``|d|^2`` and Re(conj(i f) d) for d = psi - near, and the largest ``|near|^2``; all (rows, 2 m)."""
-    square = slope = top = 0.0
-    for r in range(psi.shape[0]):
-        a, b, g = psi[r], near[r], f[r]
-        part = along = 0.0
-        for i in range(a.size // 2):
-            x, y = b[2 * i], b[2 * i + 1]
-            u, v = a[2 * i] - x, a[2 * i + 1] - y
-            part += u * u + v * v
-            along += v * g[2 * i] - u * g[2 * i + 1]
-            top = max(top, x * x + y * y)
-        square += part
-        slope += along
-    return square, slope, top
 
 
 @_jit

@@ -1,0 +1,158 @@
+"""Mass and energy of the Gross-Pitaevskii equation as a step asks for them, f = -i H psi at hand: no transforms."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..._names import nearest
+from .moments import Moments, expansion, moments, shifted
+from .pointwise import turn
+
+if TYPE_CHECKING:
+    from .equation import GrossPitaevskii
+
+__all__ = ["Energy", "Joint"]
+
+NEGLIGIBLE = 1e-17  # a twentieth of a rounding
+JOINT = ("mass", "energy")
+
+
+class _Known:
+    """A state where f is known: its energy, and that of states 1e-12 or so beside it, by the expansion there."""
+
+    def __init__(self, gpe: GrossPitaevskii) -> None:
+        self._gpe, self._norm = gpe, gpe.largest_frequency()
+        self.energy, self._peak = 0.0, np.inf
+
+    def note(self, psi: np.ndarray, f: np.ndarray) -> Moments:
+        """Take the energy of a state from f there."""
+        gpe = self._gpe
+        found = moments(gpe.rows(psi), gpe.rows(f))
+        self.energy, self._peak = gpe.grid.cell * found.energy(gpe.beta), found.peak
+        return found
+
+    def beside(self, square: float, slope: float) -> float | None:
+        """The energy of a state whose difference d has those sums of ``|d|^2`` and Re(conj(H psi) d).
+
+        None where the terms of second order and higher are not far below its rounding.
+        """
+        cell = self._gpe.grid.cell
+        density = 3 * self._peak + 2 * (self._peak * square) ** 0.5 + 0.5 * square
+        rest = (self._norm + abs(self._gpe.beta) * density) * square
+        return self.energy + 2 * cell * slope if cell * rest <= NEGLIGIBLE * abs(self.energy) else None
+
+
+class Energy:
+    """The energy as an invariant: value, and gradient 2 w i f.
+
+    A step asks for the gradient at its raw result, for the energy there, and for that of the projected state beside it.
+    Neither takes a transform.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+    """
+
+    def __init__(self, gpe: GrossPitaevskii) -> None:
+        self._gpe, self._known = gpe, _Known(gpe)
+        self._near: tuple[np.ndarray, np.ndarray] | None = None  # the state noted last and f there
+
+    def value(self, y: np.ndarray) -> float:
+        """The energy of a state."""
+        gpe = self._gpe
+        energy = None
+        if self._near is not None:
+            energy = self._known.beside(*expansion(*(gpe.rows(a) for a in (gpe.as_field(y), *self._near))))
+        return gpe.energy(y) if energy is None else energy
+
+    def gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with the gradient at `y`, where the right-hand side is `f`."""
+        turn(f.view(float), 2 * self._gpe.grid.cell, out.view(float))  # 2 w H psi, and H psi = i f
+        # Copies: the caller may use its arrays for something else.
+        if self._near is None:
+            self._near = np.empty_like(y), np.empty_like(f)
+        for kept, given in zip(self._near, (y, f), strict=True):
+            kept[:] = given
+        self._known.note(y, f)
+
+
+class Joint:
+    """Mass and energy, or one of them, as one: all that a projection needs in two passes over the field.
+
+    The gradients 2 w psi and 2 w H psi = 2 w i f are never formed: their products are sums over psi and f, and so is
+    the energy.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+    names : tuple of str
+        Of "mass" and "energy", each once at most, one at least.
+
+    Raises
+    ------
+    ValueError
+        For other names.
+    """
+
+    def __init__(self, gpe: GrossPitaevskii, names: tuple[str, ...] = JOINT) -> None:
+        for name in names:
+            if name not in JOINT:
+                raise ValueError(f"unknown invariant {name!r}, expected 'mass' or 'energy'{nearest(name, JOINT)}")
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"names must be 'mass', 'energy' or both, got {names!r}.")
+        self._gpe, self._known = gpe, _Known(gpe)
+        self._mass, self._energy = (names.index(name) if name in names else None for name in JOINT)
+
+    def moments(
+        self, t: float, y: np.ndarray, f: np.ndarray, values: np.ndarray, gram: np.ndarray, terms: np.ndarray
+    ) -> None:
+        """Fill what a projection asks for at a state.
+
+        Parameters
+        ----------
+        t : float
+        y, f : ndarray, shape (n,)
+            The state and the right-hand side there.
+        values : ndarray, shape (l,)
+            Takes the invariants.
+        gram : ndarray, shape (l, l)
+            Takes the gradients' inner products.
+        terms : ndarray, shape (l,)
+            Takes the sums of ``|G_k y_k|`` over the real components, for the dead bands.
+        """
+        found, w = self._known.note(y, f), self._gpe.grid.cell
+        m, e = self._mass, self._energy
+        if m is not None:
+            values[m], gram[m, m], terms[m] = w * found.mass, 4 * w * w * found.mass, 2 * w * found.mass
+        if e is not None:
+            values[e], gram[e, e], terms[e] = self._known.energy, 4 * w * w * found.square, 2 * w * found.sizes
+        if m is not None and e is not None:
+            gram[m, e] = gram[e, m] = 4 * w * w * found.along
+
+    def shift(
+        self, t: float, y: np.ndarray, f: np.ndarray, mu: np.ndarray, out: np.ndarray, values: np.ndarray
+    ) -> None:
+        """Move along the gradients at the state of the last `moments`, and take the invariants there.
+
+        Parameters
+        ----------
+        t : float
+        y, f : ndarray, shape (n,)
+            As given to `moments`.
+        mu : ndarray, shape (l,)
+            Multiples of the gradients.
+        out : ndarray, shape (n,)
+            Takes ``y + sum_i mu_i G_i(y)``.
+        values : ndarray, shape (l,)
+            Takes the invariants of `out`; the energy by a transform only where the move is a large one.
+        """
+        gpe, w = self._gpe, self._gpe.grid.cell
+        a, b = (0.0 if k is None else 2 * w * mu[k] for k in (self._mass, self._energy))
+        mass, square, slope = shifted(gpe.rows(y), gpe.rows(f), a, b, gpe.rows(out))
+        if self._mass is not None:
+            values[self._mass] = w * mass
+        if self._energy is not None:
+            energy = self._known.beside(square, slope)
+            values[self._energy] = gpe.energy(out) if energy is None else energy
