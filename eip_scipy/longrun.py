@@ -469,7 +469,7 @@ def prepared(
             h = problem.h
         own = {key: getattr(problem, key) for key in ("invariants", "metric", "blocks", "frame")}
         given = {**own, **given}
-        given["invariants"] = [_with_run_params(item, problem.params) for item in as_invariants(given["invariants"])]
+        given["invariants"] = _with_run_params(given["invariants"], problem.params)
         if params is None and problem.rhs is not None:
             params = problem.params
     if not callable(fun):
@@ -482,8 +482,8 @@ def prepared(
     stepping = _setup.stepping(
         method.__name__, tableau, t0, t_bound, start.size, h, first_step, max_step, rtol, atol, stacklevel=4
     )
-    if params is not None and "invariants" in given:
-        given["invariants"] = [_with_run_params(item, params) for item in as_invariants(given["invariants"])]
+    if "invariants" in given:
+        given["invariants"] = _with_run_params(given["invariants"], params)
     rhs = INTERPRETED[form](fun, extra, start)
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
@@ -739,10 +739,19 @@ def _parameters(params: Any) -> np.ndarray:
         raise TypeError(f"params must be an array of numbers, got {params!r}.") from None
 
 
-def _with_run_params(item: Invariant, params: Any) -> Invariant:
-    """The invariant with `params` taken out of its args, where they are all it has: the run passes them."""
-    if params is None or len(item.args) != 1 or not np.array_equal(item.args[0], params):
-        return item
+def _with_run_params(invariants: Any, params: Any) -> tuple[Invariant, ...]:
+    """The invariants with `params` taken out of their args, where they are all these hold: the run passes them."""
+    items = as_invariants(invariants)
+    if params is None:
+        return items
+    return tuple(_bare(item) if _takes(item, params) else item for item in items)
+
+
+def _takes(item: Invariant, params: Any) -> bool:
+    return len(item.args) == 1 and np.array_equal(item.args[0], params)
+
+
+def _bare(item: Invariant) -> Invariant:
     bare = Invariant.__new__(Invariant)
     bare.__dict__.update(item.__dict__, args=())
     return bare

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from ..._names import nearest
-from ...invariants import Invariant
+from ...invariants import Invariant, JointInvariants
 from .._problem import Problem
 from .conserved import Energy, Joint
 from .grid import Grid, Multiplier, SpectralSum
-from .lines import LineSum, fits
 from .moments import moments, total_mass
 from .pointwise import add_potential, derivative, float_rows
 from .transforms import make_transforms
@@ -60,8 +59,7 @@ class GrossPitaevskii:
         The second derivative's factor of the Nyquist mode: its own, or 0 as where the second derivative is the first
         one applied twice (the paper's tables).
     fft : {"auto", "scipy", "ducc0", "pyfftw"}, optional
-        A library of transforms, see `make_transforms`. With "auto" the right-hand side has transforms of its own where
-        each side of the grid is a power of two, 8 or more, in two or three dimensions: faster than any of them.
+        See `make_transforms`.
     threads : int, optional
         Threads of the transforms.
 
@@ -74,8 +72,6 @@ class GrossPitaevskii:
     transforms : Transforms
     fft : str
         The library of the transforms.
-    own_transforms : bool
-        Whether the right-hand side does without it.
 
     Raises
     ------
@@ -125,8 +121,6 @@ class GrossPitaevskii:
         self.fft = self.transforms.name
         self._options = {"nyquist": nyquist, "fft": fft, "threads": threads}
         self._linear = SpectralSum(grid, self.transforms, self._kinetic_and_rotation())
-        self._lines = self._line_sum() if fft == "auto" and fits(grid.shape) else None
-        self.own_transforms = self._lines is not None
 
     def __repr__(self) -> str:
         return f"GrossPitaevskii({self.grid!r}, Omega={self.Omega:g}, beta={self.beta:g})"
@@ -174,11 +168,6 @@ class GrossPitaevskii:
             Multiplier(self.grid, others, sum(kinetic[1:]) - self.Omega * along_y),
         ]
 
-    def _line_sum(self) -> LineSum:
-        kinetic = [self.kinetic_factor(axis) for axis in range(self.grid.dim)]
-        k, q = (self.grid.wavenumbers(axis, odd=True) for axis in (0, 1))
-        return LineSum(self.grid, kinetic, [self.Omega * k, -self.Omega * q], self.transforms.threads)
-
     def as_field(self, psi: Any) -> np.ndarray:
         """`psi`, a field or a flat state, as a contiguous complex field.
 
@@ -200,9 +189,6 @@ class GrossPitaevskii:
         """Fill `out` with -i H(psi) psi; both flat and contiguous, and not the same array."""
         shape = self.grid.shape
         psi, image = y.reshape(shape), out.reshape(shape)
-        if self._lines is not None:
-            self._lines.derivative(psi, self.V, self.beta, image)
-            return
         for where, rest in self._linear.parts(psi, image):
             derivative(_floats(rest), _floats(psi[where]), self.V[where].reshape(-1), self.beta, _floats(image[where]))
 
@@ -214,8 +200,8 @@ class GrossPitaevskii:
         return out
 
     def linear(self, psi: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with (-Laplace / 2 - Omega Lz) psi, both contiguous fields."""
-        (self._lines or self._linear).apply(psi, out)
+        """Fill `out` with (-Laplace / 2 - Omega Lz) psi, both fields."""
+        self._linear.apply(psi, out)
 
     def angular(self, psi: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with Lz psi, both fields.
@@ -281,14 +267,20 @@ class GrossPitaevskii:
         -------
         tuple of Invariant
             Their gradients are 2 w psi, 2 w H psi and 2 w Lz psi, w the cell. That of the energy is a multiple of the
-            right-hand side, which the step evaluates once for it and for the next step's first stage (`reuse_f`).
+            right-hand side, which the step evaluates once for it and for the next step's first stage (`reuse_f`). Mass
+            and energy are `JointInvariants`: handed on as they are, their projection takes two passes over the field.
 
         Raises
         ------
         ValueError
             For other names.
         """
-        return tuple(self._invariant(name) for name in ((names,) if isinstance(names, str) else names))
+        names = (names,) if isinstance(names, str) else tuple(names)
+        items = tuple(self._invariant(name) for name in names)
+        if not items or "angular_momentum" in names:
+            return items
+        joint = Joint(self, names)
+        return JointInvariants(items, joint.moments, joint.shift)
 
     def _invariant(self, name: str) -> Invariant:
         energy = Energy(self)
@@ -301,24 +293,6 @@ class GrossPitaevskii:
             raise ValueError(f"unknown invariant {name!r}, expected {', '.join(INVARIANTS)}{nearest(name, INVARIANTS)}")
         value, gradient = made[name]
         return Invariant(lambda t, y: value(y), gradient, name=name, in_place=True, uses_f=name == "energy")
-
-    def joint(self, names: Sequence[str] = ("mass", "energy")) -> Joint:
-        """Make the mass and the energy, or one of them, as one: a projection in two passes over the field.
-
-        Parameters
-        ----------
-        names : sequence of {"mass", "energy"}, optional
-
-        Returns
-        -------
-        Joint
-
-        Raises
-        ------
-        ValueError
-            For other names.
-        """
-        return Joint(self, (names,) if isinstance(names, str) else tuple(names))
 
     def problem(
         self,
