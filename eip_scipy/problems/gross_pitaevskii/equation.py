@@ -22,7 +22,7 @@ from .pointwise import (
     interaction_energy,
     turn,
 )
-from .transforms import make_transforms
+from .transforms import Axes, make_transforms
 
 __all__ = ["FieldProblem", "GrossPitaevskii"]
 
@@ -127,7 +127,8 @@ class GrossPitaevskii:
         self.transforms = make_transforms(fft, threads)
         self.fft = self.transforms.name
         self._options = {"nyquist": nyquist, "fft": fft, "threads": threads}
-        self._linear = SpectralSum(grid, self.transforms, self._kinetic_and_rotation())
+        terms = [self._multiplier(*term) for term in self.linear_terms()]
+        self._linear = SpectralSum(grid, self.transforms, terms)
 
     def __repr__(self) -> str:
         return f"GrossPitaevskii({self.grid!r}, Omega={self.Omega:g}, beta={self.beta:g})"
@@ -135,7 +136,7 @@ class GrossPitaevskii:
     def changed(self, **options: Any) -> GrossPitaevskii:
         """Make the same equation with other values of `potential`, `Omega`, `beta` and so on: a quench."""
         options = {"potential": self.V, "Omega": self.Omega, "beta": self.beta, **self._options, **options}
-        return GrossPitaevskii(self.grid, **options)
+        return type(self)(self.grid, **options)
 
     def kinetic_factor(self, axis: int) -> np.ndarray:
         """The factor k^2 / 2 of the modes along one axis."""
@@ -160,20 +161,31 @@ class GrossPitaevskii:
     def _turning(self) -> SpectralSum:
         if self.grid.dim == 1:
             raise ValueError("in one dimension there is no angular momentum.")
-        terms = [Multiplier(self.grid, (axis,), factor) for axis, factor in enumerate(self.rotation_factors())]
+        terms = [self._multiplier((axis,), factor) for axis, factor in enumerate(self.rotation_factors())]
         return SpectralSum(self.grid, self.transforms, terms)
 
-    def _kinetic_and_rotation(self) -> list[Multiplier]:
-        """As few transforms as there are: all axes at once without rotation, else x, and then y and z together."""
+    # These three a field on several ranks does in another way (`eip_scipy.integrations.mpi_fields`).
+
+    def _multiplier(self, axes: Axes, factor: Any) -> Multiplier:
+        return Multiplier(self.grid, axes, factor)
+
+    def _largest(self, a: np.ndarray) -> float:
+        return float(np.abs(a).max())
+
+    def _expansion(self, psi: np.ndarray, near: np.ndarray, f: np.ndarray) -> tuple[float, float, float]:
+        return expansion(*(float_rows(a, self.grid.shape[-1]) for a in (psi, near, f)))
+
+    def linear_terms(self) -> list[tuple[Axes, Any]]:
+        """The linear part, kinetic energy and rotation, as axes and the real factors of the modes along them.
+
+        As few transforms as there are: all axes at once without rotation, else x, and then y and z together.
+        """
         kinetic = [self.kinetic_factor(axis) for axis in range(self.grid.dim)]
         if self.Omega == 0:
-            return [Multiplier(self.grid, tuple(range(self.grid.dim)), sum(kinetic))]
+            return [(tuple(range(self.grid.dim)), sum(kinetic))]
         along_x, along_y = self.rotation_factors()
         others = tuple(range(1, self.grid.dim))
-        return [
-            Multiplier(self.grid, (0,), kinetic[0] - self.Omega * along_x),
-            Multiplier(self.grid, others, sum(kinetic[1:]) - self.Omega * along_y),
-        ]
+        return [((0,), kinetic[0] - self.Omega * along_x), (others, sum(kinetic[1:]) - self.Omega * along_y)]
 
     def as_field(self, psi: Any) -> np.ndarray:
         """`psi`, a field or a flat state, as a contiguous complex field.
@@ -344,8 +356,8 @@ class GrossPitaevskii:
     def largest_frequency(self) -> float:
         """A bound of the linear part's norm: the terms' largest values one by one."""
         kinetic = sum(float(self.kinetic_factor(axis).max()) for axis in range(self.grid.dim))
-        turning = sum(float(np.abs(f).max()) for f in self.rotation_factors()) if self.Omega else 0.0
-        return kinetic + abs(self.Omega) * turning + float(np.abs(self.V).max())
+        turning = sum(self._largest(f) for f in self.rotation_factors()) if self.Omega else 0.0
+        return kinetic + abs(self.Omega) * turning + self._largest(self.V)
 
     def largest_step(self, psi: Any, limit: float = 2 * 2**0.5) -> float:
         """The step above which an explicit method is unstable.
@@ -363,7 +375,7 @@ class GrossPitaevskii:
             From a bound of the largest frequency that counts the terms of H one by one; larger steps may do.
         """
         # Twice the interaction: the linearised term is 2 beta |psi|^2 u + beta psi^2 conj(u).
-        local = 2 * abs(self.beta) * float((np.abs(self.as_field(psi)) ** 2).max())
+        local = 2 * abs(self.beta) * self._largest(self.as_field(psi)) ** 2
         return float(limit / (self.largest_frequency() + local))
 
 
@@ -386,7 +398,7 @@ class _Energy:
         psi = gpe.as_field(y)
         if self._near is None:
             return gpe.energy(psi)
-        square, slope, top = expansion(*(float_rows(a, gpe.grid.shape[-1]) for a in (psi, *self._near)))
+        square, slope, top = gpe._expansion(psi, *self._near)
         if square == 0.0 and self._value is None:
             self._value = gpe.energy(psi)
         if self._value is None or not gpe.grid.cell * self._remainder(square, top) <= NEGLIGIBLE * abs(self._value):
