@@ -10,11 +10,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from test_docs import BLOCK
 
 from eip_scipy import EIPRK4
 from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
 from eip_scipy.problems.gross_pitaevskii import ArrayGrossPitaevskii
 
+TESTS = Path(__file__).parent
+needs_jax = pytest.mark.skipif(find_spec("jax") is None, reason="needs jax")
 GRIDS = (Grid(24, -3, 4), Grid((16, 15), -3, 4), Grid((8, 9, 10), -3, 4))
 
 
@@ -40,16 +43,25 @@ def test_the_standard():
     compare(pytest.importorskip("array_api_strict"))
 
 
-@pytest.mark.skipif(find_spec("jax") is None, reason="needs jax")
-def test_jax_on_the_cpu():
+def with_jax(code, **environment):
     """In a process of its own: the precision is a switch of the process, and JAX's threads do not go with forks."""
-    code = "import jax, test_array_api; test_array_api.compare(jax.numpy, jax.jit)"
-    environment = os.environ | {"JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=Path(__file__).parent, env=environment, capture_output=True, text=True,
-        timeout=300, check=False,
+        [sys.executable, "-c", code], cwd=TESTS, env=os.environ | {"JAX_PLATFORMS": "cpu"} | environment,
+        capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@needs_jax
+def test_jax_on_the_cpu():
+    with_jax("import jax, test_array_api; test_array_api.compare(jax.numpy, jax.jit)", JAX_ENABLE_X64="1")
+
+
+@needs_jax
+def test_the_page():
+    code, printed = (text for _, text in BLOCK.findall((TESTS.parent / "docs" / "gpu.md").read_text(encoding="utf-8")))
+    assert with_jax(code) == printed
 
 
 def test_single_precision_is_refused():

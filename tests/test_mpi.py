@@ -11,6 +11,7 @@ import mpi_runs
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from test_docs import BLOCK, assert_output
 
 pytest.importorskip("mpi4py")
 try:
@@ -41,16 +42,25 @@ def serial():
     return mpi_runs.serially()
 
 
+def on_ranks(ranks, script, *arguments, cwd):
+    """What a script prints; a rank that waits for another forever runs into the timeout."""
+    command = [MPIRUN, "-n", str(ranks), sys.executable, "-m", "mpi4py", str(script), *arguments]
+    done = subprocess.run(
+        command, cwd=cwd, env=os.environ | OPEN_MPI, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+needs_mpirun = pytest.mark.skipif(MPIRUN is None, reason="there is no mpirun")
+
+
 @pytest.mark.needs_jit
-@pytest.mark.skipif(MPIRUN is None, reason="there is no mpirun")
+@needs_mpirun
 @pytest.mark.parametrize("ranks", [1, 2, pytest.param(4, marks=pytest.mark.slow)])
 def test_results_are_the_serial_ones(ranks, serial, tmp_path):
-    """A rank that waits for another forever runs into the timeout."""
-    file = tmp_path / "results.npz"
-    command = [MPIRUN, "-n", str(ranks), sys.executable, "-m", "mpi4py", str(TESTS / "mpi_runs.py"), str(file)]
-    done = subprocess.run(command, env=os.environ | OPEN_MPI, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    with np.load(file) as results:
+    on_ranks(ranks, TESTS / "mpi_runs.py", "results.npz", cwd=tmp_path)
+    with np.load(tmp_path / "results.npz") as results:
         assert set(results) == set(serial)
         for name, expected in serial.items():
             what = name.split(": ")[1].split(",")[0]
@@ -63,6 +73,16 @@ def test_results_are_the_serial_ones(ranks, serial, tmp_path):
                 np.testing.assert_allclose(found, expected, rtol=1e-2, atol=2e-13, err_msg=name)
             else:
                 np.testing.assert_array_equal(found, expected, err_msg=name)
+
+
+@pytest.mark.needs_jit
+@needs_mpirun
+def test_the_page(tmp_path):
+    """The script of the documentation's page, on two ranks."""
+    code, printed = (text for _, text in BLOCK.findall((TESTS.parent / "docs" / "mpi.md").read_text(encoding="utf-8")))
+    (tmp_path / "condensate.py").write_text(code, encoding="utf-8")
+    assert_output(on_ranks(2, "condensate.py", cwd=tmp_path), printed)
+    assert np.load(tmp_path / "condensate.npy").shape == (32, 32, 24)
 
 
 # On one rank.
