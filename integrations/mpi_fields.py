@@ -84,31 +84,40 @@ class Transposition:
         if grid.dim == 1 or comm.size > min(grid.shape[:2]):
             raise ValueError(f"{comm.size} ranks need as many points along x and along y, got {grid!r}.")
         self._comm = comm
-        xs, self._ys = ([slice(*ends) for ends in pairwise(_cuts(n, comm.size))] for n in grid.shape[:2])
-        self.slab, self.turned = Slab(grid, 0, xs[comm.rank]), Slab(grid, 1, self._ys[comm.rank])
+        xs, ys = ([slice(*ends) for ends in pairwise(_cuts(n, comm.size))] for n in grid.shape[:2])
+        self.slab, self.turned = Slab(grid, 0, xs[comm.rank]), Slab(grid, 1, ys[comm.rank])
         self.here, self.image = np.empty(self.turned.shape, complex), np.empty(self.turned.shape, complex)
         self._sent = np.empty(self.slab.size, complex)
-        columns = self.slab.size // (self.slab.shape[0] * grid.shape[1])
-        self._sizes = [(y.stop - y.start) * self.slab.shape[0] * columns for y in self._ys]
-        self._turned_sizes = [(x.stop - x.start) * self.turned.shape[1] * columns for x in xs]
+        # Sizes and places of what MPI carries. What stays on this rank is of no size for it.
+        away = [rank != comm.rank for rank in range(comm.size)]
+        along_y, along_x = self.slab.size // grid.shape[1], self.turned.size // grid.shape[0]
+        sizes = [along_y * (y.stop - y.start) * far for y, far in zip(ys, away, strict=True)]
+        places = [sum(sizes[:rank]) for rank in range(comm.size)]
+        self._apart = sizes, places
+        self._turned = (
+            [along_x * (x.stop - x.start) * far for x, far in zip(xs, away, strict=True)],
+            [along_x * x.start for x in xs],
+        )
+        j, _, *columns = self.slab.shape
+        self._blocks = [
+            (y, self._sent[place : place + size].reshape(j, -1, *columns))
+            for y, place, size in zip(ys, places, sizes, strict=True)
+            if size
+        ]
 
     def turn(self, field: np.ndarray) -> None:
         """Fill `here` with the turned field."""
-        for part, y in self._blocks():
-            np.copyto(part, field[:, y])
-        self._comm.Alltoallv([self._sent, self._sizes], [self.here, self._turned_sizes])
+        for y, block in self._blocks:
+            np.copyto(block, field[:, y])
+        self.here[self.slab.part] = field[:, self.turned.part]
+        self._comm.Alltoallv([self._sent, self._apart], [self.here, self._turned])
 
     def turn_back(self, out: np.ndarray) -> None:
         """Fill `out` with the field whose turned one is in `image`."""
-        self._comm.Alltoallv([self.image, self._turned_sizes], [self._sent, self._sizes])
-        for part, y in self._blocks():
-            np.copyto(out[:, y], part)
-
-    def _blocks(self) -> list[tuple[np.ndarray, slice]]:
-        """For each rank what the buffer holds for it or from it, (j, k[, L]), and where that is along y."""
-        parts = np.split(self._sent, np.cumsum(self._sizes[:-1]))
-        j, _, *columns = self.slab.shape
-        return [(part.reshape(j, -1, *columns), y) for part, y in zip(parts, self._ys, strict=True)]
+        self._comm.Alltoallv([self.image, self._turned], [self._sent, self._apart])
+        for y, block in self._blocks:
+            np.copyto(out[:, y], block)
+        out[:, self.turned.part] = self.image[self.slab.part]
 
 
 def _cuts(n: int, ranks: int) -> list[int]:

@@ -93,7 +93,17 @@ def small(make=GrossPitaevskii, shape=(10, 8), **options):
     return gpe, mpi_runs.vortex(gpe)
 
 
-def test_a_run_through_solve_ivp():
+def test_values_are_those_of_the_equation():
+    gpe, psi = small()
+    slabs, _ = small(SlabGrossPitaevskii, comm=MPI.COMM_SELF)
+    for name in ("mass", "energy", "angular_momentum", "chemical_potential", "largest_step"):
+        assert getattr(slabs, name)(psi) == pytest.approx(getattr(gpe, name)(psi), rel=1e-14)
+    at_rest = slabs.changed(Omega=0.0).fun(0, psi)
+    np.testing.assert_allclose(at_rest, gpe.changed(Omega=0.0).fun(0, psi), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_a_run_through_solve_ivp(iterations):
     """The gradients by numbers and vectors, in place and not."""
 
     def both(t, y):
@@ -103,10 +113,9 @@ def test_a_run_through_solve_ivp():
     slabs, _ = small(SlabGrossPitaevskii, comm=MPI.COMM_SELF)
     invariants = [*gpe.invariants("energy"), Invariant(both, lambda t, y: np.array([2 * y, 4 * y]), name="mass")]
     seen = Diagnostics(), Diagnostics()
-    expected = solve_ivp(
-        gpe.fun, (0, 0.2), psi, method=EIPRK4, h=0.02, metric="euclidean", invariants=invariants, diagnostics=seen[0]
-    )
-    sol = solve_ivp(slabs.fun, (0, 0.2), psi, method=ALONE, h=0.02, invariants=invariants, diagnostics=seen[1])
+    options = {"h": 0.02, "metric": "euclidean", "invariants": invariants, "iterations": iterations}
+    expected = solve_ivp(gpe.fun, (0, 0.2), psi, method=EIPRK4, diagnostics=seen[0], **options)
+    sol = solve_ivp(slabs.fun, (0, 0.2), psi, method=ALONE, diagnostics=seen[1], **options)
     np.testing.assert_allclose(sol.y, expected.y, rtol=0, atol=1e-14)
     assert (sol.nfev, sol.njev) == (expected.nfev, expected.njev)
     assert seen[1].n_rank_reduced == seen[0].n_rank_reduced == 10
