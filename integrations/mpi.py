@@ -29,6 +29,10 @@ except ModuleNotFoundError as error:
     raise ImportError(
         'eip_scipy.integrations.mpi needs mpi4py and an MPI library: pip install "eip_scipy[mpi]" mpich', name="mpi4py"
     ) from error
+except RuntimeError as error:
+    raise ImportError(
+        "mpi4py finds no MPI library: load or install the machine's, or pip install mpich", name="mpi4py"
+    ) from error
 
 __all__ = ["MPI", "gathered", "over_ranks", "total"]
 

@@ -117,7 +117,7 @@ def main() -> None:
         join=lambda part: np.concatenate(comm.allgather(part)),
     )  # fmt: skip
     if comm.rank == 0:
-        np.savez(sys.argv[1], **results)
+        np.savez(sys.argv[1], ranks=comm.size, **results)
 
 
 if __name__ == "__main__":
