@@ -19,7 +19,7 @@ from eip_scipy import _setup
 from eip_scipy._lanes import abs_dot, dot
 from eip_scipy._names import nearest
 from eip_scipy._step import Method, Options, Work, advance_raw, look_back, make_work, project_step
-from eip_scipy.invariants import as_invariants
+from eip_scipy.invariants import Invariant, InvariantSet, as_invariants
 from eip_scipy.one_step import OneStep
 from eip_scipy.solvers import EIPSolver
 
@@ -36,7 +36,7 @@ except RuntimeError as error:
 
 __all__ = ["MPI", "gathered", "over_ranks", "total"]
 
-OPTIONS = ("h", "vectorized", "invariants", "metric", "iterations", "every", "reuse_f", "diagnostics")
+OPTIONS = ("h", "vectorized", "invariants", "metric", "iterations", "every", "reuse_f", "check", "diagnostics")
 
 
 def gathered(comm: MPI.Comm, a: Any) -> np.ndarray:
@@ -89,8 +89,8 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
     -------
     type
         A subclass of `method`. It steps with a fixed `h`, in the Euclidean metric, and takes the options `h`,
-        `invariants`, `iterations`, `every` (a number), `reuse_f` and `diagnostics`. Invariants are not checked at the
-        start; run the small case on one rank with the class itself.
+        `invariants`, `iterations`, `every` (a number), `reuse_f`, `check` and `diagnostics`. The check at the start
+        compares invariants between ranks, and with their gradients; whether they are invariants it does not see.
 
     Raises
     ------
@@ -135,9 +135,10 @@ class _OverRanks(EIPSolver):
 
     def __init__(self, fun: Callable[..., Any], t0: float, y0: Any, t_bound: float, **options: Any) -> None:
         _refuse(type(self).__name__, options)
-        options["metric"] = "euclidean"
-        super().__init__(fun, t0, y0, t_bound, check=False, **options)
+        super().__init__(fun, t0, y0, t_bound, **options | {"metric": "euclidean", "check": False})
         run = self._run
+        if options.get("check", True) and run.invariants.size:
+            _check(self.COMM, run.invariants, t0, self.y, self.f, options["h"])
         # In the place of the tableau, as a user's one-step method would be.
         run.method = _Tableau(self.COMM, run.method)  # type: ignore[arg-type, assignment]
         self._coordinates = _Coordinates(self.COMM, run, self._rhs)
@@ -178,6 +179,34 @@ def _refuse(name: str, options: dict[str, Any]) -> None:
     for item in as_invariants(options.get("invariants", ())):
         if item.target is not None or item.grad is None:
             raise ValueError(f"{name}: {item!r} must have a gradient and no target; its value at the start is kept.")
+
+
+def _check(comm: MPI.Comm, known: InvariantSet, t: float, y: np.ndarray, f: np.ndarray, h: float) -> None:
+    """What a run on one rank checks of gradients, on the plane through y along two random directions.
+
+    Raises
+    ------
+    ValueError
+        On all ranks, when an invariant differs between them or from its gradient.
+    """
+    for name, values in zip(known.names, gathered(comm, known.start_values).T, strict=True):
+        if np.any(values != values[0]):
+            raise ValueError(
+                f"invariant {name!r} is {values.min():.17g} on one rank and {values.max():.17g} on another; let it "
+                "return the sum over ranks, total(comm, ...)."
+            )
+    rng = np.random.default_rng([20220, comm.rank])
+    parts = rng.standard_normal((2, y.size)) + (1j * rng.standard_normal((2, y.size)) if y.dtype.kind == "c" else 0.0)
+    directions = parts * (np.abs(y) + h * np.abs(f))
+    slopes = total(comm, np.real(np.conj(known.gradients(t, y, f)) @ directions.T))
+    plane = [
+        Invariant(
+            lambda t, z, k=k: known.values(t, y + (z - 1) @ directions)[k], lambda t, z, k=k: slopes[k], name=name
+        )
+        for k, name in enumerate(known.names)
+    ]
+    here, nowhere = np.ones(2), np.zeros(2)
+    InvariantSet(plane, t, here, nowhere, 0.0).check(t, here, nowhere, 0.0)
 
 
 class _Tableau:

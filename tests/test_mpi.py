@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -82,6 +83,28 @@ def test_the_page(tmp_path):
     assert np.load(tmp_path / "condensate.npy").shape == (32, 32, 24)
 
 
+@pytest.mark.needs_jit
+@needs_mpirun
+def test_a_sum_that_is_missing(tmp_path):
+    """Ranks that know different values would decide differently, and wait for each other."""
+    code = """
+        import numpy as np
+        from eip_scipy import EIPRK4, Invariant
+        from eip_scipy.integrations.mpi import MPI, over_ranks
+        mass = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="mass")
+        start = np.array([1.0 + MPI.COMM_WORLD.rank, 0.0])
+        try:
+            over_ranks(EIPRK4)(lambda t, y: np.array([y[1], -y[0]]), 0.0, start, 1.0, h=0.1, invariants=mass)
+        except ValueError as error:
+            print(error)
+    """
+    (tmp_path / "run.py").write_text(textwrap.dedent(code), encoding="utf-8")
+    message = (
+        "invariant 'mass' is 1 on one rank and 4 on another; let it return the sum over ranks, total(comm, ...).\n"
+    )
+    assert on_ranks(2, "run.py", cwd=tmp_path) == 2 * message
+
+
 # On one rank.
 
 
@@ -117,6 +140,14 @@ def test_a_run_through_solve_ivp(iterations):
     assert (sol.nfev, sol.njev) == (expected.nfev, expected.njev)
     assert seen[1].n_rank_reduced == seen[0].n_rank_reduced == 10
     assert np.all(seen[1].max_defect < 1e-9)
+
+
+def test_a_wrong_gradient_is_seen():
+    gpe, psi = small(SlabGrossPitaevskii, comm=MPI.COMM_SELF)
+    wrong = Invariant(lambda t, y: gpe.mass(y), lambda t, y: 2.001 * gpe.grid.cell * y, name="mass")
+    with pytest.raises(ValueError, match="gradient of invariant 'mass' is wrong"):
+        ALONE(gpe.fun, 0.0, psi, 1.0, h=0.1, invariants=wrong)
+    ALONE(gpe.fun, 0.0, psi, 1.0, h=0.1, invariants=wrong, check=False)
 
 
 def test_a_gradient_that_is_not_finite_fails_the_projection():
