@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .moments import Moments, expansion, moments, shifted
+from .moments import Moments, expansion, shifted
 from .pointwise import turn
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class _Known:
     def note(self, psi: np.ndarray, f: np.ndarray) -> Moments:
         """Take the energy of a state from f there."""
         gpe = self._gpe
-        found = moments(gpe.rows(psi), gpe.rows(f))
+        found = gpe.moments(psi, f)
         self.energy, self._peak = gpe.grid.cell * found.energy(gpe.beta), found.quartic**0.5
         return found
 
@@ -63,7 +63,8 @@ class Energy:
         gpe = self._gpe
         energy = None
         if self._near is not None:
-            energy = self._known.beside(*expansion(*(gpe.rows(a) for a in (gpe.as_field(y), *self._near))))
+            sums = expansion(*(gpe.rows(a) for a in (gpe.as_field(y), *self._near)))
+            energy = self._known.beside(*gpe._total(sums))
         return gpe.energy(y) if energy is None else energy
 
     def gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
@@ -139,7 +140,7 @@ class Joint:
         """
         gpe, w = self._gpe, self._gpe.grid.cell
         a, b = (0.0 if k is None else 2 * w * mu[k] for k in (self._mass, self._energy))
-        mass, square, slope = shifted(gpe.rows(y), gpe.rows(f), a, b, gpe.rows(out))
+        mass, square, slope = gpe._total(shifted(gpe.rows(y), gpe.rows(f), a, b, gpe.rows(out)))
         if self._mass is not None:
             values[self._mass] = w * mass
         if self._energy is not None:
