@@ -703,7 +703,7 @@ def fields_figure(
     """
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
-    figure = _figure(4.1 * columns if columns > 1 else 5.6, (3.7 if shared else 3.9) * rows + 0.4, title)
+    figure = _figure(4.1 * columns if columns > 1 else 5.6, 3.9 * rows + 0.4, title)
     if columns == 1:
         figure.suptitle(typeset(title), fontsize="medium")
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -829,7 +829,7 @@ def field_panel(axis: Axes, title: str, panel: FieldPanel, top: float | None) ->
     if where.size:
         axis.plot(*where.T, ls="", marker="o", mfc="none", mec=PALETTE[1], mew=0.9, ms=5)
     if followed is not None:
-        axis.plot(*where[followed], ls="", marker="o", color=PALETTE[1], ms=5)
+        axis.plot(*where[followed], ls="", marker="o", mfc=PALETTE[2], mec="white", mew=0.9, ms=7)
     axis.set_title(typeset(title), fontsize="medium")
     axis.set_xlabel(names[0])
     axis.set_ylabel(names[1])
@@ -846,8 +846,8 @@ def _figure(width: float, height: float, title: str) -> Figure:
 
 
 def typeset(text: str) -> str:
-    """A title as the terminal shows it, with Greek letters and raised powers."""
-    greek = re.sub(r"\b(alpha|beta|kappa|Omega)\b", lambda name: GREEK[name[0]], text)
+    """A title as the terminal shows it, with Greek letters, raised powers and arrows."""
+    greek = re.sub(r"\b(alpha|beta|kappa|Omega)\b", lambda name: GREEK[name[0]], text.replace("->", "→"))
     return re.sub(r"\^(\d)", lambda power: POWERS[int(power[1])], greek)
 
 

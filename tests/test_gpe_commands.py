@@ -243,7 +243,7 @@ def coarse(monkeypatch):
     for module in (gpe_states, gpe_lines):
         monkeypatch.setattr(module, "LINE_POINTS", 40)
     monkeypatch.setattr(gpe_lines, "ENERGIES_KNOWN", 1e-3)
-    monkeypatch.setattr(gpe_lines, "TURN_KNOWN", 0.02)
+    monkeypatch.setattr(gpe_lines, "TURN_KNOWN", 0.03)
     monkeypatch.setattr(gpe_lines, "T_END", 0.2)
     monkeypatch.setattr(gpe_lines, "SAVED", 0.1)
     monkeypatch.setattr(gpe_lines, "SNAPSHOTS", (0.0, 0.1, 0.2))

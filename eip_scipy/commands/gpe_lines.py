@@ -37,7 +37,7 @@ SNAPSHOTS = (0.0, 4.0, 8.0, 12.0, 16.0, 20.0)
 # The trap is round: what stands still in the slower frame goes on with it, and stays behind the faster one.
 SENSE = -1
 ENERGY_KEPT = 1e-13
-TURN_KNOWN = 1e-2  # rad
+TURN_KNOWN = 0.02  # rad: at the lines a tenth of the distance between two points of the grid
 ENERGIES_KNOWN = 1e-4
 LEVEL = 1e-3  # of the paper's surfaces
 SLICE = 5.0  # half the side of the paper's slices
@@ -141,9 +141,8 @@ def _slice(made: Study, moved: Motion, k: int) -> Any:
 
     grid = made.quench.equation.grid
     density = np.abs(_field(made, k)[:, :, grid.shape[2] // 2]) ** 2
-    where = moved.found[k].positions
-    off = [abs(_off(moved, k, np.arctan2(y, x))) for x, y in where]
-    return FieldPanel(*cropped(density, grid, (0, 1), SLICE), ("x", "y"), where, int(np.argmin(off)))
+    shown = cropped(density, grid, (0, 1), SLICE)
+    return FieldPanel(*shown, ("x", "y"), moved.found[k].positions, moved.followed(k))
 
 
 def _surface(made: Study, moved: Motion, k: int) -> Any:
@@ -152,16 +151,10 @@ def _surface(made: Study, moved: Motion, k: int) -> Any:
 
     surface = density_surface(made.quench.equation, _field(made, k), LEVEL)
     x, y, _ = surface.corners.mean(axis=1).T
-    followed = np.abs(_off(moved, k, np.arctan2(y, x))) < np.pi / len(moved.found[k].charges)
+    followed = np.abs(moved.off(k, x, y)) < np.pi / len(moved.found[k].charges)
     return SurfacePanel(surface.corners, np.where(surface.inside, 1 + followed, 0))
 
 
 def _field(made: Study, k: int) -> np.ndarray:
     assert made.fields is not None
     return made.quench.equation.as_field(made.fields[:, k])
-
-
-def _off(moved: Motion, k: int, angle: Any) -> Any:
-    """Angles from where the line is in the state k that is the last one found at the start, in (-pi, pi]."""
-    x, y = moved.found[0].positions[-1]
-    return np.angle(np.exp(1j * (angle - np.arctan2(y, x) - moved.angle[k])))

@@ -20,7 +20,7 @@ __all__ = ["T_END", "run"]
 
 INTERRUPTED = 130
 POINTS, STEP, T_END = 256, 2e-4, 1.0
-REFERENCE_STEP = 4e-4
+REFERENCE_STEP = 5e-4
 SAVED = 0.02  # time between two saved states
 KAPPA_BEFORE, KAPPA_AFTER = 0.3, 0.7
 SNAPSHOTS = (0.0, 0.24, 0.44, 0.72, 0.8, 1.0)
@@ -96,6 +96,6 @@ def _panels(gpe: GrossPitaevskii, y: np.ndarray, moved: Motion) -> list[Any]:
         for axis in (0, 1)
     ]
     return [
-        FieldPanel(field[np.ix_(*keep)], ends, ("x", "y"), found.positions)
-        for field, found in zip(fields, moved.found, strict=True)
+        FieldPanel(field[np.ix_(*keep)], ends, ("x", "y"), moved.found[k].positions, moved.followed(k))
+        for k, field in enumerate(fields)
     ]

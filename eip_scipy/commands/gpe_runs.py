@@ -146,6 +146,17 @@ class Motion:
     found: list[Vortices]
     angle: np.ndarray
 
+    def off(self, k: int, x: Any, y: Any) -> Any:
+        """Angles of points from where one vortex, the rightmost at the start, is in the state k, in (-pi, pi]."""
+        a, b = self.found[0].positions[np.argmax(self.found[0].positions[:, 0])]
+        return np.angle(np.exp(1j * (np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])))
+
+    def followed(self, k: int) -> int | None:
+        """Which of the vortices in the state k that one is; None where there is none."""
+        if not (self.found[0].charges.size and self.found[k].charges.size):
+            return None
+        return int(np.abs(self.off(k, *self.found[k].positions.T)).argmin())
+
 
 def study(quench: Quench, *, progress: bool = False, kept: Callable[[str], dict[str, Any]] = lambda name: {}) -> Study:
     """Run the reference and each of `METHODS`; Ctrl-C ends it with what was done.

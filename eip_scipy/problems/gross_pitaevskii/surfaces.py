@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, grey_closing, map_coordinates
+from scipy.signal import resample
 
 from .equation import GrossPitaevskii
 from .vortices import core_size
 
-__all__ = ["Surface", "density_surface", "resample"]
+__all__ = ["Surface", "density_surface"]
 
 DEEP = 2.0  # where the density with the cores filled in is so many times that of the surface, it is inside
 SMOOTH = 2.0  # points, for an edge without teeth
@@ -66,36 +66,10 @@ def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
     except ModuleNotFoundError as error:
         message = 'surfaces of equal density need scikit-image: pip install "eip_scipy[surfaces]"'
         raise ImportError(message, name="skimage") from error
-    density = np.abs(resample(psi, [2 * n for n in psi.shape])) ** 2
+    for axis, n in enumerate(gpe.grid.shape):
+        psi = resample(psi, 2 * n, axis=axis)
+    density = np.abs(psi) ** 2
     points, triangles, _, _ = marching_cubes(density, level)
     filled = gaussian_filter(grey_closing(density, size=[*(2 * n + 1 for n in core_size(gpe, top)), 1]), SMOOTH)
     around = map_coordinates(filled, points[triangles].mean(axis=1).T, order=1)
     return Surface((gpe.grid.lower + 0.5 * gpe.grid.spacing * points)[triangles], around > DEEP * level)
-
-
-def resample(psi: np.ndarray, shape: Sequence[int]) -> np.ndarray:
-    """The periodic field on another number of points, by its Fourier modes.
-
-    Parameters
-    ----------
-    psi : ndarray
-    shape : sequence of int
-        Even along each axis, as the field's own.
-
-    Returns
-    -------
-    ndarray
-        Complex. Modes that it cannot hold are left out, and those of a Nyquist wavenumber are halved on either side.
-    """
-    out = np.asarray(psi, dtype=complex)
-    for axis, n in enumerate(shape):
-        old = out.shape[axis]
-        modes = np.moveaxis(np.fft.fft(out, axis=axis), axis, 0)
-        half = min(n, old) // 2
-        made = np.zeros((n, *modes.shape[1:]), complex)
-        made[:half], made[-half:] = modes[:half], modes[-half:]
-        if n > old:  # one mode stands for both signs of its wavenumber
-            made[-half] *= 0.5
-            made[half] = made[-half]
-        out = np.moveaxis(np.fft.ifft(made, axis=0), 0, axis) * (n / old)
-    return out
