@@ -24,6 +24,7 @@ from .gpe_states import (
     kept_state,
     leave_saddle,
     search_saddle,
+    searching,
 )
 
 __all__ = ["run"]
@@ -51,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
     before, after = (line_condensate(Omega, LINE_POINTS) for Omega in (OMEGA_BEFORE, OMEGA_AFTER))
     try:
         start = kept_state(args, before, search_saddle)
-        lower = leave_saddle(before, start, args.seed)
+        with searching(args) as update:
+            lower = leave_saddle(before, start, args.seed, update)
     except KeyboardInterrupt:
         warn("interrupted in the search for the stationary state; nothing was written")
         return INTERRUPTED

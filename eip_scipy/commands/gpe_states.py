@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,7 @@ __all__ = [
     "save_state",
     "search_ring",
     "search_saddle",
+    "searching",
 ]
 
 DONE, FAILED, INTERRUPTED = 0, 1, 130
@@ -149,8 +151,9 @@ def search_saddle(update: Update) -> Found:
     return Found(f"{SADDLE_LINES} without noise: a saddle", gpe, ground_state(gpe, start, tol=SADDLE_TOLERANCE))
 
 
-def leave_saddle(gpe: GrossPitaevskii, saddle: np.ndarray, seed: int) -> Found:
+def leave_saddle(gpe: GrossPitaevskii, saddle: np.ndarray, seed: int, update: Update) -> Found:
     """Where the descent goes from a state with a little noise: from a saddle to a lower state."""
+    update("lines, down from the saddle")
     start = with_noise(saddle, np.random.default_rng(seed))
     state = ground_state(gpe, start, tol=LINES_TOLERANCE, max_iterations=LINES_ITERATIONS)
     return Found("down from the saddle", gpe, state)
@@ -247,13 +250,11 @@ def rows(results: Results) -> list[dict[str, Any]]:
 
 def run(args: argparse.Namespace) -> int:
     """Run ``gpe ground-state``; see `eip_scipy.commands.gpe.run`."""
-    from tqdm import tqdm
-
     check_outputs(args.out, args.json)
     names = list(dict.fromkeys(args.scene or SCENES))
     try:
-        with tqdm(bar_format="{desc} [{elapsed}]", disable=args.quiet, leave=False) as bar:
-            results = {name: SCENES[name](args, bar.set_description_str) for name in names}
+        with searching(args) as update:
+            results = {name: SCENES[name](args, update) for name in names}
     except KeyboardInterrupt:
         warn("interrupted; nothing was written")
         return INTERRUPTED
@@ -347,6 +348,15 @@ def save_state(path: Path, item: Found) -> Path:
     return write_file(path, lambda temporary: np.savez_compressed(temporary, **content))
 
 
+@contextmanager
+def searching(args: argparse.Namespace) -> Iterator[Update]:
+    """Show what is searched, and for how long, unless ``--quiet``; yields what takes the words for it."""
+    from tqdm import tqdm
+
+    with tqdm(bar_format="{desc} [{elapsed}]", disable=args.quiet, leave=False) as bar:
+        yield bar.set_description_str
+
+
 def kept_state(args: argparse.Namespace, gpe: GrossPitaevskii, search: Callable[[Update], Found]) -> np.ndarray:
     """The field to start from: with ``--resume`` the one beside the checkpoints, else the one that `search` finds.
 
@@ -362,13 +372,11 @@ def kept_state(args: argparse.Namespace, gpe: GrossPitaevskii, search: Callable[
     -------
     ndarray, shape (J, K[, L])
     """
-    from tqdm import tqdm
-
     kept = None if args.checkpoint is None else args.checkpoint / "state.npz"
     if kept is not None and args.resume and kept.exists():
         return load_state(kept, gpe)
-    with tqdm(bar_format="{desc} [{elapsed}]", disable=args.quiet, leave=False) as bar:
-        found = search(bar.set_description_str)
+    with searching(args) as update:
+        found = search(update)
     if kept is not None:
         save_state(kept, found)
     return found.state.psi
