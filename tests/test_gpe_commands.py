@@ -166,6 +166,7 @@ def test_ring(tmp_path, start, capsys):
     assert all((out / name).read_bytes().startswith(PNG) for name in ("ring-snapshots.png", "ring-errors.png"))
 
 
+@pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch):
     monkeypatch.setattr(gpe_ring, "SENSE", 1)
@@ -173,6 +174,7 @@ def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch)
     assert "FAILED vortices turn anticlockwise" in capsys.readouterr().out
 
 
+@pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 def test_another_end(tmp_path, start, capsys):
     """Snapshots and movie are those of the times that the run has."""
@@ -185,6 +187,7 @@ def test_another_end(tmp_path, start, capsys):
     np.testing.assert_allclose(times, [0, 0.05, 0.1, 0.12], atol=1e-15)
 
 
+@pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 def test_a_stationary_state(start, tmp_path, monkeypatch):
     """Without a quench the gradients are parallel: that is counted, and nothing is nan."""
@@ -202,6 +205,7 @@ def test_a_stationary_state(start, tmp_path, monkeypatch):
     assert all(row["field_error"] < 1e-6 for row in content["errors"])  # null, were it not finite
 
 
+@pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize(("run", "evaluation", "done"), [(0, 207, []), (2, 93, ["EIP-M"])])
 def test_an_interrupted_command_goes_on(run, evaluation, done, tmp_path, start, capsys, monkeypatch):
