@@ -204,7 +204,7 @@ def _run(
     progress: bool,
     kept: Callable[[str], dict[str, Any]],
 ) -> Any:
-    chosen = [item for item in quench.problem.invariants if item.name in invariants]
+    chosen = quench.equation.invariants(invariants)
     run = integrate(
         quench.problem,
         method=long_runs.named(method, name),
