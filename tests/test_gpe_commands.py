@@ -253,6 +253,7 @@ def coarse(monkeypatch):
     monkeypatch.setattr(gpe_lines, "SNAPSHOTS", (0.0, 0.2))
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("coarse")
 def test_vortex_lines(tmp_path, capsys, monkeypatch):
