@@ -737,7 +737,7 @@ def fields_movie(path: Any, panels: Sequence[FieldPanel], titles: Sequence[str],
     FigureCanvasAgg(figure)
     axis = figure.subplots()
     image = field_panel(axis, titles[0], panels[0], top)
-    figure.colorbar(image, ax=axis, shrink=0.9, pad=0.02, label=DENSITY)
+    figure.colorbar(image, ax=axis, shrink=0.84, pad=0.02, label=DENSITY)
 
     def frame(k: int) -> None:
         axis.clear()

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=long_runs.positive,
         default=gpe_ring.T_END,
         metavar="T",
-        help="end of the run (%(default)s); the paper's 10",
+        help="end of the run (%(default)s); 10 in the paper's figure of the errors",
     )
     ring.add_argument("--movie", action="store_true", help="write ring.gif, too")
     long_runs.add_arguments(parser.add_argument_group("ring and vortex-lines"), "the runs")
