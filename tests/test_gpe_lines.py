@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap, quartic_trap
+from eip_scipy.problems.gross_pitaevskii import LinearFlow
 from eip_scipy.problems.gross_pitaevskii.lines import fits, order_of_modes
 from eip_scipy.problems.gross_pitaevskii.moments import expansion, moments, shifted, total_mass
 
@@ -105,6 +106,21 @@ def test_libraries_and_own_transforms_agree():
     f = other.fun(0.0, y)
     np.testing.assert_allclose(own.fun(0.0, y), f, rtol=0, atol=4e-15 * np.abs(f).max())
     assert own.energy(y) == pytest.approx(other.energy(y), rel=1e-14)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("angle", [0.0, 0.3, -0.6])
+@pytest.mark.parametrize("shape", [(8, 64), (32, 16), (8, 16, 8), (16, 8, 32)])
+def test_own_flows_are_the_libraries(shape, angle, threads):
+    grid = Grid(shape, np.array([-3.0, -2.0, -1.0])[: len(shape)], 2.0)
+    own, other = (
+        LinearFlow(GrossPitaevskii(grid, nyquist="zero", fft=fft, threads=threads), 0.07, angle)
+        for fft in ("auto", "scipy")
+    )
+    psi = noise(grid)
+    images = [flow.apply(psi.copy(), np.empty_like(psi))[0] for flow in (own, other)]
+    np.testing.assert_allclose(*images, rtol=0, atol=1e-13)
+    assert np.abs(images[0] - psi).max() > 0.1
 
 
 # Moments.

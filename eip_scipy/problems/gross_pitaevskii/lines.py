@@ -206,12 +206,8 @@ def along_rows(psi, axis, rest, V, beta, begin, end, out, buffer):
         multiply_lines(re, im, axis, load(axis.place, LANES * block))
         for k in range(0, width // 2, LANES):
             i = first + 2 * k
-            a, c, e, g, p, r, t, v = transpose(
-                (re[k], re[k + 1], re[k + 2], re[k + 3], re[k + 4], re[k + 5], re[k + 6], re[k + 7])
-            )
-            b, d, f, h, q, s, u, w = transpose(
-                (im[k], im[k + 1], im[k + 2], im[k + 3], im[k + 4], im[k + 5], im[k + 6], im[k + 7])
-            )
+            a, c, e, g, p, r, t, v = points(re, k)
+            b, d, f, h, q, s, u, w = points(im, k)
             finish(a, b, source, others, V, beta, target, i)
             finish(c, d, source, others, V, beta, target, i + width)
             finish(e, f, source, others, V, beta, target, i + 2 * width)
@@ -220,6 +216,14 @@ def along_rows(psi, axis, rest, V, beta, begin, end, out, buffer):
             finish(r, s, source, others, V, beta, target, i + 5 * width)
             finish(t, u, source, others, V, beta, target, i + 6 * width)
             finish(v, w, source, others, V, beta, target, i + 7 * width)
+
+
+@_jit_inline
+def points(part, k):
+    """Points k ... k + 7 of eight lines, one in each lane, as eight rows."""
+    return transpose(
+        (part[k], part[k + 1], part[k + 2], part[k + 3], part[k + 4], part[k + 5], part[k + 6], part[k + 7])
+    )
 
 
 @_jit_inline
@@ -284,7 +288,6 @@ class LineSum:
         self._last = make_axis(kinetic[2].ravel(), *still) if nz else along_y
         self._rest = aligned(grid.size * 2)
         self._buffers = {n: aligned(threads, 2, n, LANES) for n in grid.shape}
-        self._threads = threads
 
     def apply(self, psi: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with the operator's image of `psi`."""
@@ -297,24 +300,30 @@ class LineSum:
     def _fill(self, psi: np.ndarray, V: np.ndarray, beta: float, out: np.ndarray) -> None:
         source, target = (a.reshape(-1).view(float) for a in (psi, out))
         for axis, shape, add in self._columns:
-            first = source.reshape(shape), axis, add
-            self._run(along_columns, axis, source.size // axis.kinetic.size, first, self._rest.reshape(shape))
+            first, last = (source.reshape(shape), axis, add), (self._rest.reshape(shape),)
+            in_parts(along_columns, first, last, self._buffers[axis.kinetic.size], source.size)
         field, rest, image = (a.reshape(self._rows) for a in (source, self._rest, target))
-        self._run(along_rows, self._last, 2 * self._rows[0], (field, self._last, rest, V, beta), image)
+        first, buffers = (field, self._last, rest, V, beta), self._buffers[self._last.kinetic.size]
+        in_parts(along_rows, first, (image,), buffers, source.size)
 
-    def _run(self, kernel: Callable[..., None], axis: Axis, floats: int, first: tuple, out: np.ndarray) -> None:
-        """Call the kernel for all blocks of eight lines, `floats` being twice the lines, in parts by the threads."""
-        blocks, buffers = floats // (2 * LANES), self._buffers[axis.kinetic.size]
-        if self._threads == 1:
-            kernel(*first, 0, blocks, out, buffers[0])
-            return
-        ends = [blocks * k // self._threads for k in range(self._threads + 1)]
-        parts = [
-            _pool(self._threads, os.getpid()).submit(kernel, *first, begin, end, out, buffer)
-            for begin, end, buffer in zip(ends[:-1], ends[1:], buffers, strict=True)
-        ]
-        for part in parts:
-            part.result()
+
+def in_parts(kernel: Callable[..., None], first: tuple, last: tuple, buffers: np.ndarray, floats: int) -> None:
+    """Call ``kernel(*first, begin, end, *last, buffer)`` for all blocks of eight lines of a field of so many floats.
+
+    In as many threads as there are buffers (2, n, 8), n the points of a line.
+    """
+    blocks, threads = floats // (2 * LANES * buffers.shape[2]), buffers.shape[0]
+    if threads == 1:
+        kernel(*first, 0, blocks, *last, buffers[0])
+        return
+    ends = [blocks * k // threads for k in range(threads + 1)]
+    pool = _pool(threads, os.getpid())
+    parts = [
+        pool.submit(kernel, *first, begin, end, *last, buffer)
+        for begin, end, buffer in zip(ends[:-1], ends[1:], buffers, strict=True)
+    ]
+    for part in parts:
+        part.result()
 
 
 @cache
