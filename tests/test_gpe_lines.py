@@ -5,8 +5,9 @@ import pytest
 
 from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap, quartic_trap
 from eip_scipy.problems.gross_pitaevskii import LinearFlow
-from eip_scipy.problems.gross_pitaevskii.lines import fits, order_of_modes
+from eip_scipy.problems.gross_pitaevskii.lines import LineSum, fits, order_of_modes
 from eip_scipy.problems.gross_pitaevskii.moments import expansion, moments, shifted, total_mass
+from eip_scipy.problems.gross_pitaevskii.phases import LineFlow
 
 SHAPES = [(8, 8), (8, 32), (64, 16), (128, 8), (256, 512), (8, 16, 32), (64, 8, 8), (16, 128, 8)]
 
@@ -34,6 +35,32 @@ def by_numpy(gpe, psi):
 # Transforms.
 
 
+@pytest.mark.parametrize("shape", [(8, 8), (8, 16), (16, 8, 8), (8, 8, 32)])
+def test_transforms_by_themselves(shape):
+    """Also without the JIT, where the equation leaves them alone."""
+    grid = Grid(shape, -2, 3)
+    gpe = GrossPitaevskii(grid, lambda *a: sum(a) ** 2, Omega=0.7, beta=2.0, fft="scipy")
+    kinetic = [gpe.kinetic_factor(axis) for axis in range(grid.dim)]
+    k, q = (grid.wavenumbers(axis, odd=True) for axis in (0, 1))
+    lines = LineSum(grid, kinetic, [0.7 * k, -0.7 * q], threads=2)
+    psi = noise(grid)
+    linear = by_numpy(gpe, psi)
+    out, size = np.empty_like(psi), np.abs(linear).max()
+    lines.apply(psi, out)
+    np.testing.assert_allclose(out, linear, rtol=0, atol=4e-15 * size)
+    lines.derivative(psi, gpe.V, gpe.beta, out)
+    expected = -1j * (linear + (gpe.V + 2.0 * np.abs(psi) ** 2) * psi)
+    np.testing.assert_allclose(out, expected, rtol=0, atol=1e-14 * size)
+    flow = LineFlow(grid, [(0, kinetic[0], 0.3 * k), (1, kinetic[1], 0.0 * q)], threads=2)
+    modes = np.fft.fft(psi, axis=0)
+    y = grid.mesh()[1]
+    modes = np.fft.ifft(np.exp(-1j * (kinetic[0] + 0.3 * k * y)) * modes, axis=0)
+    expected = np.fft.ifft(np.exp(-1j * kinetic[1]) * np.fft.fft(modes, axis=1), axis=1)
+    flow.apply(psi)
+    np.testing.assert_allclose(psi, expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.needs_jit
 @pytest.mark.parametrize("nyquist", ["true", "zero"])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_right_hand_side_is_numpys(shape, nyquist):
@@ -57,6 +84,7 @@ def test_right_hand_side_is_numpys(shape, nyquist):
         np.testing.assert_array_equal(psi, noise(grid))
 
 
+@pytest.mark.needs_jit
 @pytest.mark.parametrize("shape", [(32, 64), (8, 16, 32)])
 def test_without_rotation_a_plane_wave_is_multiplied_by_its_energy(shape):
     grid = Grid(shape, 0, 2 * np.pi)
@@ -77,6 +105,7 @@ def test_order_of_modes_has_each_once(n):
     np.testing.assert_array_equal(order[: n // 4] % 4, 0)
 
 
+@pytest.mark.needs_jit
 @pytest.mark.parametrize("threads", [2, 3])
 @pytest.mark.parametrize("shape", [(32, 64), (8, 16, 32)])
 def test_threads_give_the_same_bits(shape, threads):
@@ -88,6 +117,7 @@ def test_threads_give_the_same_bits(shape, threads):
     np.testing.assert_array_equal(many.fun(0.0, y), one.fun(0.0, y))
 
 
+@pytest.mark.needs_jit
 def test_which_grids_have_own_transforms():
     assert all(fits(shape) for shape in SHAPES)
     assert not any(fits(shape) for shape in [(64,), (4, 8), (8, 4, 8), (48, 64), (64, 96), (8, 8, 12)])
@@ -97,6 +127,7 @@ def test_which_grids_have_own_transforms():
     assert not GrossPitaevskii(Grid((12, 16), -1, 1)).own_transforms
 
 
+@pytest.mark.needs_jit
 def test_libraries_and_own_transforms_agree():
     grid = Grid((64, 32), (-6, -7), (6, 5))
     own, other = (
@@ -108,6 +139,7 @@ def test_libraries_and_own_transforms_agree():
     assert own.energy(y) == pytest.approx(other.energy(y), rel=1e-14)
 
 
+@pytest.mark.needs_jit
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("angle", [0.0, 0.3, -0.6])
 @pytest.mark.parametrize("shape", [(8, 64), (32, 16), (8, 16, 8), (16, 8, 32)])

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numba import config
 
 from ..._names import nearest
 from ...invariants import Invariant
@@ -124,8 +125,9 @@ class GrossPitaevskii:
         self.transforms = make_transforms(fft, threads)
         self.fft = self.transforms.name
         self._options = {"nyquist": nyquist, "fft": fft, "threads": threads}
-        self._linear = SpectralSum(grid, self.transforms, self._kinetic_and_rotation())
-        self._lines = self._line_sum() if fft == "auto" and fits(grid.shape) else None
+        # Without the JIT a library is faster.
+        own = fft == "auto" and fits(grid.shape) and not config.DISABLE_JIT
+        self._lines = self._line_sum() if own else None
         self.own_transforms = self._lines is not None
 
     def __repr__(self) -> str:
@@ -161,6 +163,10 @@ class GrossPitaevskii:
             raise ValueError("in one dimension there is no angular momentum.")
         terms = [Multiplier(self.grid, (axis,), factor) for axis, factor in enumerate(self.rotation_factors())]
         return SpectralSum(self.grid, self.transforms, terms)
+
+    @cached_property
+    def _linear(self) -> SpectralSum:
+        return SpectralSum(self.grid, self.transforms, self._kinetic_and_rotation())
 
     def _kinetic_and_rotation(self) -> list[Multiplier]:
         """As few transforms as there are: all axes at once without rotation, else x, and then y and z together."""

@@ -15,11 +15,11 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import config, njit
+from numba import njit
 
-from ..._octets import LANES, multiply_add, octets, spread
+from ..._octets import LANES, multiply_add
 from .grid import Grid
-from .vectors import aligned, load, load_pair, store_pair, transpose
+from .vectors import aligned, load, load_pair, octets, spread, store_pair, transpose
 
 __all__ = ["LineSum", "fits"]
 
@@ -43,7 +43,7 @@ class Axis(NamedTuple):
 
 def fits(shape: tuple[int, ...]) -> bool:
     """Whether `LineSum` takes grids of this shape: two axes or three, each a power of two, 8 or more."""
-    return not config.DISABLE_JIT and len(shape) > 1 and all(n >= LANES and n & (n - 1) == 0 for n in shape)
+    return len(shape) > 1 and all(n >= LANES and n & (n - 1) == 0 for n in shape)
 
 
 def order_of_modes(n: int) -> np.ndarray:
@@ -88,7 +88,7 @@ def quarters(a, b, c, d, e, f, g, h):
 @_jit
 def forward(re, im, size, roots):
     """Split each block of `size` points into four, of the modes that leave 0, 1, 2 and 3 when divided by 4."""
-    n = re.size
+    n = len(re)
     m, step = size // 4, 2 * (n // size)
     for j in range(m):
         k = j * step
@@ -107,7 +107,7 @@ def forward(re, im, size, roots):
 @_jit
 def backward(re, im, size, roots):
     """The inverse of `forward`, times 4."""
-    n = re.size
+    n = len(re)
     m, step = size // 4, 2 * (n // size)
     for j in range(m):
         k = j * step
@@ -126,7 +126,7 @@ def backward(re, im, size, roots):
 @_jit
 def multiply_fours(re, im, kinetic, turning, place):
     """The last pass there on blocks of four, the factor, and the first pass back."""
-    for b in range(0, re.size, 4):
+    for b in range(0, len(re), 4):
         y = quarters(re[b], im[b], re[b + 1], im[b + 1], re[b + 2], im[b + 2], re[b + 3], im[b + 3])
         f = multiply_add(spread(turning[b]), place, spread(kinetic[b]))
         g = multiply_add(spread(turning[b + 1]), place, spread(kinetic[b + 1]))
@@ -140,7 +140,7 @@ def multiply_fours(re, im, kinetic, turning, place):
 @_jit
 def multiply_twos(re, im, kinetic, turning, place):
     """The same on blocks of two, where the number of points is no power of four."""
-    for b in range(0, re.size, 2):
+    for b in range(0, len(re), 2):
         f = multiply_add(spread(turning[b]), place, spread(kinetic[b]))
         g = multiply_add(spread(turning[b + 1]), place, spread(kinetic[b + 1]))
         sr, si = f * (re[b] + re[b + 1]), f * (im[b] + im[b + 1])
@@ -151,7 +151,7 @@ def multiply_twos(re, im, kinetic, turning, place):
 @_jit
 def multiply_lines(re, im, axis, place):
     """Multiply the modes of eight lines, (n,) octets each."""
-    size = re.size
+    size = len(re)
     while size > 4:
         forward(re, im, size, axis.roots)
         size //= 4
@@ -159,7 +159,7 @@ def multiply_lines(re, im, axis, place):
         multiply_fours(re, im, axis.kinetic, axis.turning, place)
     else:
         multiply_twos(re, im, axis.kinetic, axis.turning, place)
-    while size < re.size:
+    while size < len(re):
         size *= 4
         backward(re, im, size, axis.roots)
 
@@ -300,11 +300,11 @@ class LineSum:
     def _fill(self, psi: np.ndarray, V: np.ndarray, beta: float, out: np.ndarray) -> None:
         source, target = (a.reshape(-1).view(float) for a in (psi, out))
         for axis, shape, add in self._columns:
-            first, last = (source.reshape(shape), axis, add), (self._rest.reshape(shape),)
-            in_parts(along_columns, first, last, self._buffers[axis.kinetic.size], source.size)
+            columns, last = (source.reshape(shape), axis, add), (self._rest.reshape(shape),)
+            in_parts(along_columns, columns, last, self._buffers[axis.kinetic.size], source.size)
         field, rest, image = (a.reshape(self._rows) for a in (source, self._rest, target))
-        first, buffers = (field, self._last, rest, V, beta), self._buffers[self._last.kinetic.size]
-        in_parts(along_rows, first, (image,), buffers, source.size)
+        rows, buffers = (field, self._last, rest, V, beta), self._buffers[self._last.kinetic.size]
+        in_parts(along_rows, rows, (image,), buffers, source.size)
 
 
 def in_parts(kernel: Callable[..., None], first: tuple, last: tuple, buffers: np.ndarray, floats: int) -> None:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ..._octets import LANES, multiply_add, octets, spread
-from .vectors import load_pair, store_pair
+from ..._octets import LANES, multiply_add
+from .vectors import larger, load_pair, octets, spread, store_pair
 
 __all__ = ["Moments", "expansion", "moments", "shifted", "total_mass"]
 
@@ -69,7 +69,7 @@ def add_moments(psi, f, totals):
             n = multiply_add(x, x, y * y)
             first, second = y * u, x * v
             mass += n
-            sums[5] = max(sums[5], n)
+            sums[5] = larger(sums[5], n)
             quartic = multiply_add(n, n, quartic)
             along += first - second
             sizes += abs(first) + abs(second)
@@ -120,8 +120,7 @@ def add_expansion(psi, near, f, totals):
             x, y = load_pair(a, i)
             p, q = load_pair(b, i)
             u, v = load_pair(c, i)
-            x -= p
-            y -= q
+            x, y = x - p, y - q
             square += multiply_add(x, x, y * y)
             slope += y * u - x * v
         sums[0] += square

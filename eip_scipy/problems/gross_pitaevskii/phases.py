@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ..._octets import LANES, octets
+from ..._octets import LANES
 from .grid import Grid
 from .lines import backward, forward, in_parts, load_block, order_of_modes, points, quarters, times
-from .vectors import aligned, load_pair, store_pair
+from .vectors import aligned, load_pair, octets, store_pair
 
 __all__ = ["LineFlow"]
 
@@ -48,7 +48,7 @@ def make_phases(phase: np.ndarray, repeat: int, alike: bool) -> Phases:
 @_jit
 def turn_fours(re, im, cosine, sine):
     """The last pass there on blocks of four, the phases, and the first pass back."""
-    for b in range(0, re.size, 4):
+    for b in range(0, len(re), 4):
         y = quarters(re[b], im[b], re[b + 1], im[b + 1], re[b + 2], im[b + 2], re[b + 3], im[b + 3])
         p, q = times(cosine[b], sine[b], y[0], y[1])
         r, s = times(cosine[b + 1], sine[b + 1], y[2], y[3])
@@ -62,7 +62,7 @@ def turn_fours(re, im, cosine, sine):
 @_jit
 def turn_twos(re, im, cosine, sine):
     """The same on blocks of two, where the number of points is no power of four."""
-    for b in range(0, re.size, 2):
+    for b in range(0, len(re), 2):
         sr, si = times(cosine[b], sine[b], re[b] + re[b + 1], im[b] + im[b + 1])
         dr, di = times(cosine[b + 1], sine[b + 1], re[b] - re[b + 1], im[b] - im[b + 1])
         re[b], im[b], re[b + 1], im[b + 1] = sr + dr, si + di, sr - dr, si - di
@@ -73,7 +73,7 @@ def turn_lines(re, im, phases, block):
     """Turn the modes of eight lines, (n,) octets each."""
     k = block // phases.repeat
     cosine, sine = octets(phases.cosines[k], 0), octets(phases.sines[k], 0)
-    size = re.size
+    size = len(re)
     while size > 4:
         forward(re, im, size, phases.roots)
         size //= 4
@@ -81,7 +81,7 @@ def turn_lines(re, im, phases, block):
         turn_fours(re, im, cosine, sine)
     else:
         turn_twos(re, im, cosine, sine)
-    while size < re.size:
+    while size < len(re):
         size *= 4
         backward(re, im, size, phases.roots)
 

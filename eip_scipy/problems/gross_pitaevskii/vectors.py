@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import types
+from numba import config, njit, types
 from numba.extending import intrinsic
 
-from ..._octets import LANES, OCTET, VECTOR
+from ..._octets import LANES, OCTET, VECTOR, octets, spread
 
-__all__ = ["aligned", "load", "load_pair", "store_pair", "transpose"]
+__all__ = ["aligned", "larger", "load", "load_pair", "octets", "spread", "store_pair", "transpose"]
 
 EVEN, ODD = tuple(range(0, 2 * LANES, 2)), tuple(range(1, 2 * LANES, 2))
 LOW, HIGH = (0, 8, 1, 9, 2, 10, 3, 11), (4, 12, 5, 13, 6, 14, 7, 15)
@@ -103,3 +103,38 @@ def transpose(typingctx, rows):
         return context.make_tuple(builder, sig.return_type, block)
 
     return types.UniTuple(OCTET, LANES)(rows), codegen
+
+
+@njit(error_model="numpy", forceinline=True)
+def larger(a, b):
+    """The larger one of two octets, lane by lane."""
+    return max(a, b)
+
+
+if config.DISABLE_JIT:  # octets are arrays of eight, or numbers for eight alike
+
+    def octets(array, column):
+        """The octets of (n, 8)."""
+        return array
+
+    def spread(number):
+        """A number as an octet."""
+        return number
+
+    def load(a, i):
+        """The octet a[i] ... a[i + 7]."""
+        return a[i : i + LANES]
+
+    def load_pair(a, i):
+        """Real and imaginary parts of eight complex numbers."""
+        return a[i : i + 2 * LANES : 2], a[i + 1 : i + 2 * LANES : 2]
+
+    def store_pair(re, im, a, i):
+        """Store eight complex numbers."""
+        a[i : i + 2 * LANES : 2], a[i + 1 : i + 2 * LANES : 2] = re, im
+
+    def transpose(rows):
+        """Rows and columns of an 8 x 8 block exchanged."""
+        return tuple(np.array(rows).T)
+
+    larger = np.maximum
