@@ -50,7 +50,8 @@ def least(functions, seconds):
 
 
 def timed(function):
-    """Of short calls several at once: the clock of processor time is coarse."""
+    """Of short calls several at once: what a call of the clock takes is no part of them."""
+    function()  # compiled, planned
     begin = time.perf_counter()
     function()
     calls = max(1, int(2e-3 / max(time.perf_counter() - begin, 1e-6)))
@@ -61,7 +62,6 @@ def timed(function):
             function()
         return (time.process_time() - begin) / calls
 
-    function()
     return run
 
 
@@ -96,25 +96,26 @@ def steps(shape, seconds):
     """Least times [ms] of a step of each variant by `integrate` and in `solve_ivp`, and of SciPy's RK45."""
     gpe, psi = equation(shape, "auto")
     h = 0.2 * gpe.largest_step(psi)
-    options = {"h": h, "metric": "euclidean"}
-    solvers, functions = {}, {}
+    functions = {}
 
-    def run(invariants, count, **others):
+    def run(kept, count, others):
         begin = time.process_time()
-        integrate(gpe.problem(psi, count * h, h), method=EIPRK4, invariants=invariants, check=False, **others)
+        integrate(gpe.problem(psi, count * h, h), method=EIPRK4, invariants=kept, check=False, **others)
         return time.process_time() - begin
 
     for name, variant in VARIANTS.items():
         others = {key: value for key, value in variant.items() if key != "names"}
         kept = gpe.invariants(variant["names"])
-        solvers[name] = EIPRK4(gpe.fun, 0.0, psi, 1e3, invariants=kept, **options, **others)
-        functions[name, "integrate"] = lambda kept=kept, others=others: (
-            (run(kept, STEPS + 1, **others) - run(kept, 1, **others)) / STEPS
-        )
-    solvers["RK45"] = RK45(gpe.fun, 0.0, psi, 1e3, first_step=h, max_step=h, rtol=1e-2, atol=1.0)
-    for name, solver in solvers.items():
+        solver = EIPRK4(gpe.fun, 0.0, psi, 1e3, h=h, metric="euclidean", invariants=kept, **others)
         functions[name, "solve_ivp"] = timed(solver.step)
-    return {key: 1e3 * t for key, t in least(functions, seconds).items()}
+        for count in (1, STEPS + 1):
+            functions[name, count] = lambda kept=kept, count=count, others=others: run(kept, count, others)
+    solver = RK45(gpe.fun, 0.0, psi, 1e3, first_step=h, max_step=h, rtol=1e-2, atol=1.0)
+    functions["RK45", "solve_ivp"] = timed(solver.step)
+    found = least(functions, seconds)
+    for name in VARIANTS:  # without what a run of a single step takes
+        found[name, "integrate"] = (found.pop((name, STEPS + 1)) - found.pop((name, 1))) / STEPS
+    return {key: 1e3 * t for key, t in found.items()}
 
 
 def save_figure(found, path):
@@ -136,7 +137,7 @@ def save_figure(found, path):
             axis.plot(points, [found[shape][key] for shape in shapes], ms=5, lw=1.2, **styles[label])
         line = points * np.log2(points)
         line = line * found[shapes[0]][OWN, "f"] / line[0]
-        axis.plot(points, line, color="0.4", ls=":", label="N log N, through the first own one")
+        axis.plot(points, line, color="0.4", ls=":", label="N log N, through the first f")
         axis.set(xscale="log", yscale="log", xlabel="grid points N", title=title)
         sides = [f"${shape[0]}^{len(shape)}$" for shape in shapes]
         axis.set_xticks(points, sides)
