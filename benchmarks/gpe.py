@@ -4,7 +4,7 @@
 
 Processor time, the least of several; those that are compared are taken in turn, so that other load on the machine
 disturbs all alike. One thread. "transforms" are a library's alone, a pair along each axis: x, and then the other axes
-together. "linear part" is f's own transforms with the factors between them.
+together. "linear part" is f without potential and interaction, "auto" what a user gets.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FULL = tuple((n, n, n) for n in (32, 64, 128))
 STEPPED = ((256, 256), (64, 64, 64))
 SECONDS = 6.0  # for each row
 FEWEST = 3
-OWN = "own"
+AUTO = "auto"
 STEPS = 20  # of a run by `integrate`
 VARIANTS = {
     "RK4": {"names": ()},
@@ -72,15 +72,14 @@ def equation(shape, fft):
 
 
 def right_hand_side(shape, seconds):
-    """Least times [ms] of f and of its transforms, by our own and by each library."""
+    """Least times [ms] of f and of its transforms, as a user gets it and by each library."""
     functions = {}
-    for fft in ("auto", *(name for name in LIBRARIES if find_spec(name) is not None)):
+    for fft in (AUTO, *(name for name in LIBRARIES if find_spec(name) is not None)):
         gpe, psi = equation(shape, fft)
         out, field, work = np.empty_like(psi), psi.reshape(shape), np.empty(shape, complex)
-        name = OWN if fft == "auto" else fft
-        functions[name, "f"] = timed(lambda gpe=gpe, psi=psi, out=out: gpe.rhs(0.0, psi, out))
-        if fft == "auto":
-            functions[name, "linear part"] = timed(lambda gpe=gpe, field=field, work=work: gpe.linear(field, work))
+        functions[fft, "f"] = timed(lambda gpe=gpe, psi=psi, out=out: gpe.rhs(0.0, psi, out))
+        if fft == AUTO:
+            functions[fft, "linear part"] = timed(lambda gpe=gpe, field=field, work=work: gpe.linear(field, work))
             continue
 
         def transforms(gpe=gpe, field=field, work=work):
@@ -88,13 +87,13 @@ def right_hand_side(shape, seconds):
                 gpe.transforms.forward(field, axes, work)
                 gpe.transforms.backward(work, axes)
 
-        functions[name, "transforms"] = timed(transforms)
+        functions[fft, "transforms"] = timed(transforms)
     return {key: 1e3 * t for key, t in least(functions, seconds).items()}
 
 
 def steps(shape, seconds):
     """Least times [ms] of a step of each variant by `integrate` and in `solve_ivp`, and of SciPy's RK45."""
-    gpe, psi = equation(shape, "auto")
+    gpe, psi = equation(shape, AUTO)
     h = 0.2 * gpe.largest_step(psi)
     functions = {}
 
@@ -124,7 +123,7 @@ def save_figure(found, path):
 
     from eip_scipy.plotting import method_styles
 
-    labels = {(OWN, "f"): "f, own transforms", ("ducc0", "f"): "f by ducc0",
+    labels = {(AUTO, "f"): "f", ("ducc0", "f"): "f by ducc0",
               ("ducc0", "transforms"): "ducc0's transforms alone", ("pyfftw", "f"): "f by FFTW",
               ("scipy", "f"): "f by SciPy"}  # fmt: skip
     labels = {key: label for key, label in labels.items() if key in found[FLAT[0]]}
@@ -136,7 +135,7 @@ def save_figure(found, path):
         for key, label in labels.items():
             axis.plot(points, [found[shape][key] for shape in shapes], ms=5, lw=1.2, **styles[label])
         line = points * np.log2(points)
-        line = line * found[shapes[0]][OWN, "f"] / line[0]
+        line = line * found[shapes[0]][AUTO, "f"] / line[0]
         axis.plot(points, line, color="0.4", ls=":", label="N log N, through the first f")
         axis.set(xscale="log", yscale="log", xlabel="grid points N", title=title)
         sides = [f"${shape[0]}^{len(shape)}$" for shape in shapes]
@@ -165,13 +164,11 @@ def main() -> None:
     lines = [(named(shape), [f"{row[key]:.3f}" for key in keys]) for shape, row in found.items()]
     print("\nRight-hand side and its parts [ms]\n")
     print(table([list(key) for key in keys], lines))
-    print(
-        "\nf by our own transforms: over the linear part, over the cheapest library's transforms alone; ns per point\n"
-    )
+    print("\nf as a user gets it: over the linear part, over the cheapest library's transforms alone; ns per point\n")
     lines = []
     for shape, row in found.items():
-        f, cheapest = row[OWN, "f"], min(t for (_, what), t in row.items() if what == "transforms")
-        ratios = [f / row[OWN, "linear part"], f / cheapest]
+        f, cheapest = row[AUTO, "f"], min(t for (_, what), t in row.items() if what == "transforms")
+        ratios = [f / row[AUTO, "linear part"], f / cheapest]
         lines.append((named(shape), [*(f"{r:.2f}" for r in ratios), f"{1e6 * f / np.prod(shape):.1f}"]))
     print(table([["linear", "part"], ["transforms"], ["ns per", "point"]], lines))
     stepped = {shape: steps(shape, 5 * arguments.seconds) for shape in STEPPED}

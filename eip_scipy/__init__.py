@@ -4,7 +4,7 @@ from importlib.metadata import version as _version
 
 from .checkpoint import CheckpointError
 from .ensemble import EnsembleResult, ensemble
-from .invariants import Invariant, check_gradient
+from .invariants import Invariant, JointInvariants, check_gradient
 from .longrun import integrate
 from .nystrom import NystromTableau
 from .one_step import OneStepMethod
@@ -45,6 +45,7 @@ __all__ = [
     "EnsembleResult",
     "IntegrationResult",
     "Invariant",
+    "JointInvariants",
     "NystromTableau",
     "OneStepMethod",
     "ProjectionResult",

@@ -101,7 +101,6 @@ def make_lanes_work(n: int, lanes: int, stages: int, n_invariants: int) -> Work:
         stage=w.stage.reshape(state),
         y_hat=w.y_hat.reshape(state),
         f_point=w.f_point.reshape(state),
-        f_new=w.f_new.reshape(state),
         G=w.G.reshape(n_invariants, *state),
     )
 
@@ -173,8 +172,8 @@ def correct_octet(c, o, w, s, y, all_new):
         largest_error = kn.weights_from_sizes(o.block_atol, o.groups, o.kappa, sigma, scale, ratio)
     kn.weigh_rows(G, sigma, frame, Q)
     dependent = outside & is_not(kn.solve_gram(Q, g, R, mu))
-    kn.move_along(mu, Q, w.pivots, w.pivots.size, sigma, frame, y_hat, move, y_new)
-    octets(s.rank, c)[0] = spread(1.0 * w.pivots.size)
+    kn.move_along(mu, Q, sigma, frame, y_hat, move, y_new)
+    octets(s.rank, c)[0] = spread(1.0 * g.size)
     if any_lane(dependent):
         for lane in range(LANES):
             if lane_of(dependent, lane):
@@ -205,7 +204,7 @@ def solve_alone(lane, o, w, s, all_new):
     s.rank[0, lane] = rank
     if rank >= 0:
         kn.least_norm(one.g, one.inverse_norms, one.R, one.pivots, rank, one.mu)
-        kn.move_along(one.mu, one.Q, one.pivots, rank, one.sigma, o.frame, one.y_hat, one.move, one.y_new)
+        kn.move_along(one.mu, one.Q, one.sigma, o.frame, one.y_hat, one.move, one.y_new)
     for i in range(one.y_hat.size):
         s.move[i, lane] = one.move[i] if rank >= 0 else np.nan
         all_new[i, lane] = one.y_new[i] if rank >= 0 else np.nan
@@ -292,7 +291,7 @@ def make_advance_batch(stamp):
             advance_raw(rhs, params, t, y, y_r, h, m, o, w)
             look_back(rhs, params, t_new, y_r, h, project, m, o, w)
             finish_batch(rhs, inv, grad, params, k, t_new, project, o, w, s, y, y_new, y_new_r)
-            kn.copy(w.f_new_r, w.K_r[0])
+            kn.copy(w.K_r[-1], w.K_r[0])
             kn.copy(y_new_r, y_r)
             k += 1
         return OK

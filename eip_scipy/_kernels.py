@@ -458,14 +458,15 @@ def weigh_rows(G, sigma, frame, B):
                 first = 3 * bodies * k
                 x, y, z = sum_bodies(frame.bodies[1, k], G[i], first, bodies)
                 shift_and_weigh(G[i], frame.bodies[0, k], x, y, z, sigma, row, first, bodies)
-            continue
-        for j in range(row.size):
-            row[j] = G[i, j]
-        if frame.products.size > 0:
+        elif frame.products.size > 0:
+            copy(G[i], row)
             sparse_products(frame, 1, row, frame.products)
             subtract_sparse(frame, 0, frame.products, row)
-        for j in range(row.size):
-            row[j] *= sigma[j]
+            for j in range(row.size):
+                row[j] *= sigma[j]
+        else:
+            for j in range(row.size):
+                row[j] = G[i, j] * sigma[j]
 
 
 @_jit_inline
@@ -535,17 +536,24 @@ def factor(B, inverse_norms, R, pivots):
 
 @_jit
 def solve_gram(B, g, R, mu):
-    """Coefficients mu of the rows of B in the least-norm x with B x = -g, if the rows are far from dependent.
-
-    By the factorisation L D L^T of the rows' Gram matrix, which costs a third of `factor` and squares the condition
-    number: whether it will do shows on the way, by the same bound below which one pass of Gram-Schmidt would not. The
-    diagonal of R holds 1/D.
-    """
-    rows = B.shape[0]
-    good = True
-    for i in range(rows):
+    """Coefficients mu of the rows of B in the least-norm x with B x = -g, if the rows are far from dependent."""
+    for i in range(B.shape[0]):
         for j in range(i + 1):
             R[i, j] = dot(B[i], B[j])
+    return gram_solution(R, g, mu)
+
+
+@_jit
+def gram_solution(R, g, mu):
+    """The same, from the rows' Gram matrix in the lower half of R, which is overwritten.
+
+    By its factorisation L D L^T, which costs a third of `factor` and squares the condition number: whether it will do
+    shows on the way, by the same bound below which one pass of Gram-Schmidt would not. The diagonal of R then holds
+    1/D.
+    """
+    rows = g.size
+    good = True
+    for i in range(rows):
         good = good & (R[i, i] > 1e-140) & (R[i, i] < 1e140)
     if no_lane(good):
         return good
@@ -574,13 +582,14 @@ def solve_gram(B, g, R, mu):
 
 @_jit
 def least_norm(g, inverse_norms, R, pivots, rank, mu):
-    """Coefficients mu along the orthonormal directions of the least-norm x with row_i . x = -g_i (pivot rows)."""
+    """Coefficients mu of the rows that `factor` left, of the least-norm x with row_i . x = -g_i; 0 beyond the rank."""
+    fill(mu, 0.0)
     for k in range(rank):
         row = pivots[k]
         value = -g[row] * inverse_norms[row]
         for q in range(k):
-            value -= R[q, row] * mu[q]
-        mu[k] = value * R[k, row]
+            value -= R[q, row] * mu[pivots[q]]
+        mu[row] = value * R[k, row]
 
 
 @_jit_inline
@@ -595,31 +604,26 @@ def newton_matrix_solve(rows, g, Q, pivots, rank, inner, mu):
     if inner_rank < 0:
         fill(mu, np.nan)
     least_norm(inner.g, inner.inverse_norms, inner.R, inner.pivots, inner_rank, inner.mu)
-    for k in range(inner_rank):
-        row = matrix[inner.pivots[k]]
+    for k in range(rank):
         for q in range(rank):
-            mu[q] += inner.mu[k] * row[q]
+            mu[pivots[q]] += inner.mu[k] * matrix[k, q]
 
 
 @_jit_inline
-def move_along(mu, Q, pivots, rank, sigma, frame, y_hat, move, out):
+def move_along(mu, Q, sigma, frame, y_hat, move, out):
     """Move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction, neutral to the frame; out = y_hat + move."""
-    n = move.size
-    if rank == 0:
-        fill(out, 0.0)
-    else:
-        first = Q[pivots[0]]
-        for j in range(n):
-            out[j] = mu[0] * first[j]
-        for k in range(1, rank):
-            row = Q[pivots[k]]
-            for j in range(n):
-                out[j] += mu[k] * row[j]
-        for j in range(n):
+    weighted_rows(mu, Q, mu.size, 0, out)
+    if frame.products.size > 0:
+        for j in range(out.size):
             out[j] *= sigma[j]
-    keep_frame(out, frame, move)
-    for j in range(n):
-        out[j] = y_hat[j] + move[j]
+        keep_frame(out, frame, move)
+        for j in range(out.size):
+            out[j] = y_hat[j] + move[j]
+    else:
+        for j in range(out.size):
+            x = sigma[j] * out[j]
+            move[j] = x
+            out[j] = y_hat[j] + x
 
 
 @_jit_inline
@@ -629,15 +633,12 @@ def first_move(G, sigma, frame, Q, inverse_norms, R, pivots, g, mu, y_hat, move,
     `more`: other steps follow, for which the directions in Q must be orthonormal.
     """
     weigh_rows(G, sigma, frame, Q)
-    if not more and solve_gram(Q, g, R, mu):
-        rank = Q.shape[0]
-        for i in range(rank):
-            pivots[i] = i
-    else:
+    rank = Q.shape[0]
+    if more or not solve_gram(Q, g, R, mu):
         rank = factor(Q, inverse_norms, R, pivots)
         least_norm(g, inverse_norms, R, pivots, rank, mu)
     if rank >= 0:
-        move_along(mu, Q, pivots, rank, sigma, frame, y_hat, move, out)
+        move_along(mu, Q, sigma, frame, y_hat, move, out)
     return rank
 
 

@@ -32,7 +32,7 @@ from ._step import (
     make_work,
     project_step,
 )
-from .invariants import InvariantSet
+from .invariants import InvariantSet, JointInvariants
 from .nystrom import NystromTableau
 from .one_step import OneStep, as_vector
 from .result import LAST_RANK, Diagnostics
@@ -590,6 +590,8 @@ def prepare(
         compensated=_flag("compensated", compensated),
         adaptive=stepping.h is None,
     )
+    if _can_project_jointly(options, invariants):
+        options = options._replace(joint=invariants.items)
     arrays = method_arrays(tableau)
     work = make_work(n, y0.dtype, arrays.b.size, invariants.size, groups.start.size - 1)
     if sigma is not None:
@@ -604,6 +606,13 @@ def prepare(
     if _flag("check", projection.check) and np.isfinite(f0).all():
         invariants.check(t0, run.y0, f0, tau)
     return run
+
+
+def _can_project_jointly(options: Options, invariants: InvariantSet) -> bool:
+    """Whether the step is the one that `JointInvariants` take a shorter way to."""
+    plain = (options.metric, options.direction, options.iterations) == (EUCLIDEAN, NEW, 1)
+    free = options.frame.products.size == 0 and options.every != AUTO and not options.compensated
+    return isinstance(invariants.items, JointInvariants) and plain and free
 
 
 def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, f0: np.ndarray) -> np.ndarray:

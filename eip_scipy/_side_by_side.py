@@ -91,7 +91,6 @@ class Batch:
         self.lanes = lanes = lanes_of(n)
         o = run.options
         self._work = make_lanes_work(n, lanes, run.method.b.size, rows)
-        self._work.pivots[:] = np.arange(rows)
         self._s = make_lanes(self._work, o.rtol, o.block_atol.size, o.frame.products.size)
         self._options = o._replace(rtol=np.repeat(o.rtol, lanes), atol=np.repeat(o.atol, lanes))
         self._sigma = run.work.sigma.copy()

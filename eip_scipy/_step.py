@@ -11,12 +11,13 @@ The functions here take callables. They are plain Python when called from Python
 from __future__ import annotations
 
 from math import isfinite, isnan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba.extending import overload, register_jitable
 
 from . import _kernels as kn
+from ._joint import project_jointly
 from ._kernels import FAILED_PROJECTION, NOT_FINITE, OK, POSTPONED, FrameRows, Grouping
 from .result import (
     HAVE_F,
@@ -86,7 +87,10 @@ class Method(NamedTuple):
 
 
 class Options(NamedTuple):
-    """What a run fixes: `rtol` by float of the state, `atol` by component, `block_atol` by block."""
+    """What a run fixes: `rtol` by float of the state, `atol` by component, `block_atol` by block.
+
+    `joint`: in interpreted runs the `JointInvariants` whose functions serve, else None.
+    """
 
     rtol: np.ndarray
     atol: np.ndarray
@@ -104,6 +108,7 @@ class Options(NamedTuple):
     uses_f: bool
     compensated: bool
     adaptive: bool
+    joint: Any = None
 
 
 class Work(NamedTuple):
@@ -116,8 +121,6 @@ class Work(NamedTuple):
     y_hat: np.ndarray
     y_hat_r: np.ndarray
     f_point: np.ndarray
-    f_new: np.ndarray
-    f_new_r: np.ndarray
     G: np.ndarray
     G_r: np.ndarray
     err: np.ndarray
@@ -159,7 +162,6 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
     K, K_r = pair(stages + 1, n)
     stage, stage_r = pair(n)
     y_hat, y_hat_r = pair(n)
-    f_new, f_new_r = pair(n)
     G, G_r = pair(n_invariants, n)
     floats = {name: np.zeros(m) for name in ("err", "err_low", "err_sum", "sigma", "move", "carry", "carry_hat")}
     small = {
@@ -174,8 +176,6 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
         y_hat=y_hat,
         y_hat_r=y_hat_r,
         f_point=np.zeros(n, dtype),
-        f_new=f_new,
-        f_new_r=f_new_r,
         G=G,
         G_r=G_r,
         **floats,
@@ -285,7 +285,7 @@ def estimate_error(y_r, h, m, o, w):
 
 @_jitable
 def close_step(rhs, params, t_new, y_new, project, status, o, w):
-    """After the projection: the carry, the errors gathered, and f for the next step's first stage in w.f_new."""
+    """After the projection: the carry, the errors gathered, and f for the next step's first stage in K[-1]."""
     if o.compensated:
         kn.copy(w.carry_hat, w.carry)
     if o.every != 1:
@@ -296,10 +296,8 @@ def close_step(rhs, params, t_new, y_new, project, status, o, w):
         elif o.metric == ERROR or o.every == AUTO:
             kn.quadrature(w.err, w.err_sum, w.err_sum)
     if w.counters[HAVE_F] == 0 or (project and status == OK and not o.reuse_f):
-        rhs(t_new, y_new, w.f_new, params)
+        rhs(t_new, y_new, w.K[-1], params)
         w.counters[NFEV] += 1
-    else:
-        kn.copy(w.K_r[-1], w.f_new_r)
 
 
 @_jitable
@@ -330,7 +328,7 @@ def other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r):
         kn.fill(w.mu, 0.0)
         kn.newton_matrix_solve(w.B, w.g, w.Q, w.pivots, rank, w.inner, w.mu)
         w.counters[NLU] += 1
-        kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
+        kn.move_along(w.mu, w.Q, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
     return rank
 
 
@@ -348,7 +346,7 @@ def newton_iteration(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
     kn.weigh_rows(w.G_r, w.sigma, o.frame, w.B)
     kn.newton_matrix_solve(w.B, w.g, w.Q, w.pivots, rank, w.inner, w.mu)
     w.counters[NLU] += 1
-    kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
+    kn.move_along(w.mu, w.Q, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
     return True
 
 
@@ -396,6 +394,18 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_
         kn.raise_to(w.defect, w.max_defect)
         w.max_correction[0] = max(w.max_correction[0], correction)
     return status
+
+
+def project_any(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_new_r):
+    """`project_step`, or the shorter way of joint invariants, which only interpreted runs take, where that will do."""
+    if o.joint is not None and project_jointly(t, o, w, y_new, y_new_r):
+        return OK
+    return project_step(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_new_r)
+
+
+@overload(project_any, jit_options=_INLINED, strict=False)
+def _compiled_projection(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_new_r):
+    return project_step
 
 
 @_jitable
@@ -467,7 +477,7 @@ def correct_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
     found = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)
     rank = max(0, min(rank, found))
     kn.least_norm(w.g, w.inverse_norms, w.R, w.pivots, rank, w.mu)
-    kn.move_along(w.mu, w.Q, w.pivots, rank, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
+    kn.move_along(w.mu, w.Q, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
     evaluate_invariants(inv, params, t, y_new, o, w)
     kn.shared_defects(w.before, w.inverse_norms, w.g)
     return kn.judge(w.values, o.target, w.g, w.band, y_new_r, w.defect), rank
@@ -478,7 +488,7 @@ def finish_step(rhs, inv, grad, params, t, y, y_r, t_new, project, last, m, o, w
     """The rest of a step whose raw result is accepted; returns OK or FAILED_PROJECTION."""
     status = OK
     if project:
-        status = project_step(rhs, inv, grad, params, t, y, y_r, t_new, last, o, w, y_new, y_new_r)
+        status = project_any(rhs, inv, grad, params, t, y, y_r, t_new, last, o, w, y_new, y_new_r)
         if status == FAILED_PROJECTION:
             w.counters[REJECTED] += 1
             return status
@@ -490,7 +500,7 @@ def finish_step(rhs, inv, grad, params, t, y, y_r, t_new, project, last, m, o, w
 
 @_jitable
 def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y_new, y_new_r):
-    """Step k: fixed, or the first one that the error control accepts; K[0] = f(t, y) on entry, w.f_new = f at its end.
+    """Step k: fixed, or the first one that the error control accepts; K[0] = f(t, y) on entry, K[-1] = f at its end.
 
     `finish` is `finish_step` or does as much. The control is SciPy's; a failed projection shortens the step, at most
     MAX_RETRIES times in a row. Returns OK, NOT_FINITE, FAILED_PROJECTION or TOO_SMALL.

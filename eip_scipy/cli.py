@@ -105,7 +105,7 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
             lambda args: hard_scenes.run(args, _rebound_module()),
         ),
         "gpe": (
-            "rotating Gross-Pitaevskii equation: ground states, and the dynamics of the ring (Experiment IV)",
+            "rotating Gross-Pitaevskii equation: ground states, the ring, and vortex lines (Experiment IV)",
             gpe.add_arguments,
             gpe.run,
         ),

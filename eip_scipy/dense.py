@@ -17,7 +17,7 @@ from ._setup import Run
 from ._step import ERROR, GIVEN, NEW, make_work, project_step
 from .nystrom import NystromTableau
 from .one_step import OneStep
-from .result import HAVE_F, NFEV
+from .result import NFEV
 from .tableaux import DOP853, Tableau
 
 __all__ = ["ExactEnds", "ManifoldDenseOutput", "dense_output"]
@@ -46,9 +46,6 @@ def dense_output(
         rhs(t, y, f, params)
         run.work.counters[NFEV] += 2
     K = run.work.K.copy()
-    # The raw result's own slope belongs to the tableau; without it the next step's differs by O(h^(p + 1)).
-    if not run.work.counters[HAVE_F]:
-        K[-1] = f
     if isinstance(tableau, NystromTableau):
         base = _quintic(h, y_old, y, f_old, f)
     elif tableau is DOP853:

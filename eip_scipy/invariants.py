@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ._kernels import EPS
 
-__all__ = ["Invariant", "InvariantSet", "as_invariants", "check_gradient"]
+__all__ = ["Invariant", "InvariantSet", "JointInvariants", "as_invariants", "check_gradient"]
 
 Array = np.ndarray
 
@@ -96,8 +96,39 @@ class Invariant:
         return f"Invariant({name})"
 
 
+class JointInvariants(tuple[Invariant, ...]):
+    """Scalar invariants whose projection takes two passes over the state: for fields, whose gradients fill memory.
+
+    A tuple of `Invariant`, to be given as ``invariants=`` as it is. Interpreted runs with the euclidean metric,
+    ``direction="new"``, one Newton step and no frame call `moments` and `shift` in the place of the invariants'
+    values and gradients; all others, and steps whose gradients are nearly parallel, take those.
+
+    Parameters
+    ----------
+    items : iterable of Invariant
+    moments : callable
+        ``moments(t, y, f, values, gram, terms)`` fills, at the state `y`, the `values` (l,), the lower half of the
+        gradients' Gram matrix `gram` (l, l), Re <G_i, G_j>, and `terms` (l,), the sums of ``|G_ik y_k|`` over the
+        floats of the state. `f`, the derivative there, holds nothing unless an item `uses_f`.
+    shift : callable
+        ``shift(t, y, f, mu, out, values)`` fills `out` with ``y + sum_i mu_i G_i(y)``, and `values` with the
+        invariants there, not finite where `out` is not.
+    """
+
+    moments: Callable[..., None]
+    shift: Callable[..., None]
+
+    def __new__(
+        cls, items: Iterable[Invariant], moments: Callable[..., None], shift: Callable[..., None]
+    ) -> JointInvariants:
+        """The tuple of the items, with both functions."""
+        self = super().__new__(cls, items)
+        self.moments, self.shift = moments, shift
+        return self
+
+
 def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
-    """One Invariant or a sequence of them, as a tuple.
+    """One Invariant or a sequence of them, as a tuple; `JointInvariants` as they are.
 
     Raises
     ------
@@ -109,7 +140,7 @@ def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
     if callable(invariants):
         raise TypeError(f"invariants: got the function {invariants!r}; wrap it: Invariant(fun, grad=...).")
     try:
-        items = tuple(invariants)
+        items = invariants if isinstance(invariants, JointInvariants) else tuple(invariants)
     except TypeError:
         raise TypeError(f"invariants: expected an Invariant or a sequence of them, got {invariants!r}.") from None
     for item in items:

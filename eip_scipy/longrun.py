@@ -93,7 +93,7 @@ def make_advance(stamp):
         while True:
             if place[PENDING] == 1:
                 clock[T] = clock[T_NEW]
-                kn.copy(w.f_new_r, w.K_r[0])
+                kn.copy(w.K_r[-1], w.K_r[0])
                 kn.copy(y_new_r, y_r)
                 kn.copy(grid.g_new, grid.g)
                 place[PENDING] = 0
@@ -161,6 +161,8 @@ class _Driver:
         self.y = np.empty((rows + 1, n), dtype)
         self.state = run.y0.copy()
         self.new = np.empty_like(self.state)
+        if compiled:
+            run.options = run.options._replace(joint=None)
         self._tail = (
             run.method,
             run.options,
@@ -212,7 +214,7 @@ class _Driver:
         if self.grid.place[PENDING] == 1:
             copies["place"][PENDING] = 0
             copies["clock"][T] = self.grid.clock[T_NEW]
-            copies["y"], copies["slope"] = self.new.copy(), self.run.work.f_new.copy()
+            copies["y"], copies["slope"] = self.new.copy(), self.run.work.K[-1].copy()
             copies["g"] = self.grid.g_new.copy()
         return copies
 
@@ -262,7 +264,7 @@ class _Driver:
         t_old, t = (float(self.grid.clock[place]) for place in (T, T_NEW))
         w = self.run.work
         return dense_output(
-            rhs, self.run, tableau, t_old, t, self.state, self.new, w.K[0].copy(), w.f_new.copy(), self.params
+            rhs, self.run, tableau, t_old, t, self.state, self.new, w.K[0].copy(), w.K[-1].copy(), self.params
         )
 
     def values(self) -> np.ndarray:
@@ -467,7 +469,7 @@ def prepared(
             h = problem.h
         own = {key: getattr(problem, key) for key in ("invariants", "metric", "blocks", "frame")}
         given = {**own, **given}
-        given["invariants"] = [_with_run_params(item, problem.params) for item in as_invariants(given["invariants"])]
+        given["invariants"] = _with_run_params(given["invariants"], problem.params)
         if params is None and problem.rhs is not None:
             params = problem.params
     if not callable(fun):
@@ -480,8 +482,8 @@ def prepared(
     stepping = _setup.stepping(
         method.__name__, tableau, t0, t_bound, start.size, h, first_step, max_step, rtol, atol, stacklevel=4
     )
-    if params is not None and "invariants" in given:
-        given["invariants"] = [_with_run_params(item, params) for item in as_invariants(given["invariants"])]
+    if "invariants" in given:
+        given["invariants"] = _with_run_params(given["invariants"], params)
     rhs = INTERPRETED[form](fun, extra, start)
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
@@ -737,10 +739,19 @@ def _parameters(params: Any) -> np.ndarray:
         raise TypeError(f"params must be an array of numbers, got {params!r}.") from None
 
 
-def _with_run_params(item: Invariant, params: Any) -> Invariant:
-    """The invariant with `params` taken out of its args, where they are all it has: the run passes them."""
-    if params is None or len(item.args) != 1 or not np.array_equal(item.args[0], params):
-        return item
+def _with_run_params(invariants: Any, params: Any) -> tuple[Invariant, ...]:
+    """The invariants with `params` taken out of their args, where they are all these hold: the run passes them."""
+    items = as_invariants(invariants)
+    if params is None:
+        return items
+    return tuple(_bare(item) if _takes(item, params) else item for item in items)
+
+
+def _takes(item: Invariant, params: Any) -> bool:
+    return len(item.args) == 1 and np.array_equal(item.args[0], params)
+
+
+def _bare(item: Invariant) -> Invariant:
     bare = Invariant.__new__(Invariant)
     bare.__dict__.update(item.__dict__, args=())
     return bare

@@ -6,6 +6,7 @@ show them in a notebook.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,9 +16,10 @@ try:
     from matplotlib.animation import FuncAnimation, PillowWriter
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
-    from matplotlib.colors import Normalize
+    from matplotlib.colors import Normalize, to_rgba
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 except ModuleNotFoundError as error:
     message = 'eip_scipy.plotting needs matplotlib: pip install "eip_scipy[plot]"'
     raise ImportError(message, name="matplotlib") from error
@@ -31,6 +33,7 @@ __all__ = [
     "FieldPanel",
     "Orbits",
     "ParticleRow",
+    "SurfacePanel",
     "cost_figure",
     "efficiency_figure",
     "errors_figure",
@@ -45,6 +48,7 @@ __all__ = [
     "paper_kepler_figure",
     "particle_figure",
     "scenes_figure",
+    "surfaces_figure",
     "work_figure",
 ]
 
@@ -55,6 +59,10 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<")
 DPI = 160
 POINTS = 250
 LONG_LABEL = 24
+DENSITY = r"density $|\psi|^2$"
+GREEK = {"alpha": "α", "beta": "β", "kappa": "κ", "Omega": "Ω"}
+POWERS = "⁰¹²³⁴⁵⁶⁷⁸⁹"
+VEIL = 0.13  # opacity of what the inside is seen through
 # Below the spacing of numbers an error means nothing, and a log axis cannot show zero.
 FLOOR = 1e-16
 
@@ -664,12 +672,15 @@ class FieldPanel(NamedTuple):
         Names of the coordinates.
     vortices : array_like, shape (k, 2)
         Positions to mark.
+    followed : int, optional
+        Number of the one that is told from the others, to be followed from panel to panel.
     """
 
     density: Any
     ends: tuple[float, float, float, float]
     axes: tuple[str, str]
     vortices: Any
+    followed: int | None = None
 
 
 def fields_figure(
@@ -693,9 +704,9 @@ def fields_figure(
     """
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
-    figure = _figure(4.1 * columns if columns > 1 else 5.6, 4.0 * rows + 0.4, title)
+    figure = _figure(4.1 * columns if columns > 1 else 5.6, 3.9 * rows + 0.4, title)
     if columns == 1:
-        figure.suptitle(title, fontsize="medium")
+        figure.suptitle(typeset(title), fontsize="medium")
     axes = figure.subplots(rows, columns, squeeze=False)
     top = max(float(np.max(panel[0])) for panel in panels.values()) if shared else None
     for axis in axes.flat[len(panels) :]:
@@ -703,9 +714,9 @@ def fields_figure(
     for axis, (name, panel) in zip(axes.flat, panels.items(), strict=False):
         image = field_panel(axis, name, panel, top)
         if not shared:
-            figure.colorbar(image, ax=axis, shrink=0.8, pad=0.02)
+            figure.colorbar(image, cax=axis.inset_axes((1.03, 0.0, 0.05, 1.0)), label=DENSITY)
     if shared:
-        figure.colorbar(image, ax=list(axes.flat), shrink=0.8, pad=0.02, label=r"density $|\psi|^2$")
+        figure.colorbar(image, ax=list(axes.flat), shrink=0.8, pad=0.02, label=DENSITY)
     return figure
 
 
@@ -727,7 +738,7 @@ def fields_movie(path: Any, panels: Sequence[FieldPanel], titles: Sequence[str],
     FigureCanvasAgg(figure)
     axis = figure.subplots()
     image = field_panel(axis, titles[0], panels[0], top)
-    figure.colorbar(image, ax=axis, shrink=0.9, pad=0.02, label=r"density $|\psi|^2$")
+    figure.colorbar(image, ax=axis, shrink=0.9, pad=0.02, label=DENSITY)
 
     def frame(k: int) -> None:
         axis.clear()
@@ -737,28 +748,108 @@ def fields_movie(path: Any, panels: Sequence[FieldPanel], titles: Sequence[str],
     movie.save(path, writer=PillowWriter(fps=per_second))
 
 
+class SurfacePanel(NamedTuple):
+    """A surface in space.
+
+    Attributes
+    ----------
+    corners : array_like, shape (m, 3, 3)
+        x, y and z of the three corners of each triangle.
+    part : array_like of int, shape (m,)
+        What each triangle belongs to: 0 the outside, 1 the inside, 2 a part of it to be told from the rest.
+    """
+
+    corners: Any
+    part: Any
+
+
+def surfaces_figure(
+    panels: Mapping[str, Any],
+    ends: Sequence[tuple[float, float]],
+    *,
+    title: str = "",
+    columns: int = 3,
+    view: tuple[float, float] = (28.0, -62.0),
+) -> Figure:
+    """Draw surfaces in space, a panel for each: the outside as a veil, and solid what lies inside.
+
+    Parameters
+    ----------
+    panels : mapping of str to SurfacePanel
+        By the panels' titles.
+    ends : sequence of (float, float)
+        Lower and upper end of x, y and z.
+    title : str, optional
+    columns : int, optional
+        Panels abreast.
+    view : (float, float), optional
+        From where: degrees above the plane of x and y, and degrees from the x axis.
+
+    Returns
+    -------
+    Figure
+    """
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = _figure(3.4 * columns, 4.1 * rows + 0.4, title)
+    for k, (name, surface) in enumerate(panels.items()):
+        axis: Any = figure.add_subplot(rows, columns, k + 1, projection="3d", proj_type="ortho")
+        corners = np.asarray(surface.corners)
+        colours = _shaded(corners, np.asarray(surface.part), view)
+        axis.add_collection3d(Poly3DCollection(corners, facecolors=colours, lw=0))
+        axis.view_init(*view)
+        axis.set(xlim=ends[0], ylim=ends[1], zlim=ends[2], xlabel="x", ylabel="y", zlabel="z")
+        axis.set_box_aspect([high - low for low, high in ends], zoom=0.98)
+        axis.set_title(name, fontsize="medium")
+        for side in (axis.xaxis, axis.yaxis, axis.zaxis):
+            side.set_major_locator(MaxNLocator(4, steps=(2, 5, 10)))
+    return figure
+
+
+def _shaded(corners: np.ndarray, part: np.ndarray, view: tuple[float, float]) -> np.ndarray:
+    """Colours (m, 4) of triangles in a light that comes from beside the viewer."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal /= np.where(length > 0, length, 1.0)
+    high, around = np.radians([view[0] + 15, view[1] - 30])
+    light = np.array([np.cos(high) * np.cos(around), np.cos(high) * np.sin(around), np.sin(high)])
+    # Both sides are lit: through the veil the far side of the surface is seen from behind.
+    shade = 0.45 + 0.55 * np.abs(normal @ light)
+    colour = np.array([to_rgba(PALETTE[5], VEIL), to_rgba(PALETTE[0]), to_rgba(PALETTE[2])])[part]
+    colour[:, :3] *= shade[:, None]
+    return colour
+
+
 def field_panel(axis: Axes, title: str, panel: FieldPanel, top: float | None) -> Any:
     """Draw one density; the image, for a scale of colours or to be changed in a movie."""
-    density, ends, names, where = panel
+    density, ends, names, where, followed = panel
     image = axis.imshow(
         np.asarray(density).T, origin="lower", extent=ends, cmap="viridis", vmin=0.0, vmax=top, interpolation="bilinear"
     )
     where = np.asarray(where)
     if where.size:
         axis.plot(*where.T, ls="", marker="o", mfc="none", mec=PALETTE[1], mew=0.9, ms=5)
-    axis.set_title(title, fontsize="medium")
+    if followed is not None:
+        axis.plot(*where[followed], ls="", marker="o", mfc=PALETTE[2], mec="white", mew=0.9, ms=7)
+    axis.set_title(typeset(title), fontsize="medium")
     axis.set_xlabel(names[0])
     axis.set_ylabel(names[1])
-    axis.xaxis.set_major_locator(MaxNLocator(5))
-    axis.yaxis.set_major_locator(MaxNLocator(5))
+    axis.xaxis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
+    axis.yaxis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
     return image
 
 
 def _figure(width: float, height: float, title: str) -> Figure:
     figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
     if title:
-        figure.suptitle(title, fontsize="large")
+        figure.suptitle(typeset(title), fontsize="large")
     return figure
+
+
+def typeset(text: str) -> str:
+    """A title as the terminal shows it, with Greek letters, raised powers and arrows."""
+    greek = re.sub(r"\b(alpha|beta|kappa|Omega)\b", lambda name: GREEK[name[0]], text.replace("->", "→"))
+    return re.sub(r"\^(\d)", lambda power: POWERS[int(power[1])], greek)
 
 
 def _envelope(axis: Axes, t: Any, values: Any, style: Mapping[str, Any], *, log: bool = False) -> None:

@@ -15,7 +15,7 @@ from . import _setup
 from ._kernels import FAILED_PROJECTION, OK
 from ._names import nearest
 from ._setup import ProjectionOptions, Stepping
-from ._step import T_NEW, T, close_step, next_step, project_step
+from ._step import T_NEW, T, close_step, next_step, project_any
 from .dense import ExactEnds, dense_output
 from .invariants import as_invariants
 from .nystrom import RKN86, RKN1210, NystromTableau
@@ -262,7 +262,7 @@ class EIPSolver(OdeSolver):
             return False, _setup.failure(status, run, clock)
         self._k += 1
         self.y_old, self.f_old = y, self.f
-        self.y, self.t, self.f = self._accepted, clock[T_NEW], w.f_new.copy()
+        self.y, self.t, self.f = self._accepted, clock[T_NEW], w.K[-1].copy()
         return True, None
 
     def _finish(
@@ -307,7 +307,7 @@ class EIPSolver(OdeSolver):
         if err is not w.err:
             w.err[:] = err
         run = self._run
-        self._projection_status = project_step(
+        self._projection_status = project_any(
             self._rhs,
             run.invariants.inv,
             run.invariants.grad,

@@ -3,13 +3,24 @@
 import csv
 import json
 import sys
+from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
 
+from eip_scipy import _resume, integrate
 from eip_scipy.cli import main
-from eip_scipy.commands import gpe_ring, gpe_states
-from eip_scipy.problems.gross_pitaevskii import Grid, GrossPitaevskii, GroundState, Vortices, ring_condensate
+from eip_scipy.commands import gpe_lines, gpe_ring, gpe_runs, gpe_states
+from eip_scipy.problems.gross_pitaevskii import (
+    Grid,
+    GrossPitaevskii,
+    GroundState,
+    Vortices,
+    ground_state,
+    imprint,
+    quartic_trap,
+)
 from eip_scipy.report import UsageError
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -78,13 +89,14 @@ def test_a_missed_energy_fails_the_command(tmp_path, monkeypatch, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["ground-states.csv"]
 
 
-@pytest.mark.parametrize("task", ["ground-state", "ring"])
+@pytest.mark.parametrize("task", ["ground-state", "ring", "vortex-lines"])
 def test_interrupted(task, tmp_path, monkeypatch, capsys):
     def stop(*args):
         raise KeyboardInterrupt
 
     monkeypatch.setitem(gpe_states.SCENES, "trap", stop)
     monkeypatch.setattr(gpe_ring, "search_ring", stop)
+    monkeypatch.setattr(gpe_lines, "search_saddle", stop)
     assert main(["gpe", task, "--out", str(tmp_path), "--quiet"]) == 130
     assert "nothing was written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
@@ -100,29 +112,32 @@ def test_cropping_keeps_the_condensate():
     assert ends[0] == pytest.approx(-ends[1], abs=2 * grid.spacing[0])
 
 
-# The ring.
+# The dynamics.
+
+
+def small_ring(kappa=0.3, points=32):
+    """Two vortices in a trap that a coarse grid resolves."""
+    grid = Grid((points, points), -4, 4)
+    return GrossPitaevskii(grid, quartic_trap(0.0, kappa, 1, 1), Omega=1.0, beta=50.0)
 
 
 @pytest.fixture
 def short(monkeypatch):
-    """A few steps on a grid that barely shows the ring."""
+    monkeypatch.setattr(gpe_ring, "ring_condensate", small_ring)
     monkeypatch.setattr(gpe_ring, "POINTS", 32)
-    monkeypatch.setattr(gpe_ring, "T_END", 0.004)
-    monkeypatch.setattr(gpe_ring, "STEP", 2.5e-4)
-    monkeypatch.setattr(gpe_ring, "REFERENCE_STEP", 2.5e-4)
-    monkeypatch.setattr(gpe_ring, "SAVED", 0.001)
-    monkeypatch.setattr(gpe_ring, "SNAPSHOTS", (0.0, 0.002, 0.004))
-    monkeypatch.setattr(gpe_ring, "ENERGY_KEPT", 1e-10)
+    monkeypatch.setattr(gpe_ring, "T_END", 0.2)
+    monkeypatch.setattr(gpe_ring, "STEP", 5e-3)
+    monkeypatch.setattr(gpe_ring, "REFERENCE_STEP", 5e-3)
+    monkeypatch.setattr(gpe_ring, "SAVED", 0.05)
+    monkeypatch.setattr(gpe_ring, "SNAPSHOTS", (0.0, 0.1, 0.2, 7.0))
+    monkeypatch.setattr(gpe_ring, "SENSE", -1)  # two vortices near the centre are no ring
 
 
 @pytest.fixture
 def start(tmp_path):
-    """A soft lump in place of the ring's ground state, in a file as `ground-state` writes it."""
-    gpe = ring_condensate(points=32)
-    x, y = gpe.grid.mesh()
-    psi = (np.exp(-((np.hypot(x, y) - 5) ** 2) / 2) * np.exp(2j * np.arctan2(y, x))).astype(complex)
-    psi /= np.sqrt(gpe.mass(psi))
-    state = GroundState(psi, gpe.energy(psi), 0.0, 0.0, 0, True, "converged")
+    """A stationary state in a file as `ground-state` writes it."""
+    gpe = small_ring()
+    state = ground_state(gpe, imprint(gpe, [[0.8, 0.1], [-0.8, 0.0]]), tol=1e-4)
     return gpe_states.save_state(tmp_path / "start.npz", gpe_states.Found("", gpe, state))
 
 
@@ -132,37 +147,153 @@ def test_ring(tmp_path, start, capsys):
     command = ["gpe", "ring", "--start", str(start), "--movie", "--out", str(out), "--json", str(file)]
     assert main(command) == 0
     text = capsys.readouterr().out
-    assert "Ring, kappa = 0.3 -> 0.7" in text
-    assert text.count("\nok ") == 5
+    assert "Ring, kappa = 0.3 -> 0.7, RK4, h = 0.005, to t = 0.2" in text
+    assert "ok     vortices in the snapshots: [2, 2, 2]" in text
+    assert "ok     vortices turn clockwise, angle at t = 0.2 [rad]: -0.0038" in text
+    assert text.count("\nok ") == 6
     assert max(map(len, text.replace(str(tmp_path), "").splitlines())) <= 110
     rows = read(out / "ring.csv")
     last = {row["method"]: row for row in rows}
     assert float(last["EIP-M"]["mass_error"]) < 1e-14 < float(last["RK4"]["mass_error"])
-    assert float(last["EIP-E"]["energy_error"]) < 1e-10 < float(last["EIP-M"]["energy_error"])
+    assert float(last["EIP-E"]["energy_error"]) < 1e-12 < float(last["EIP-M"]["energy_error"])
     # Neither invariant makes the field right: its error is that of RK4.
     errors = [float(row["field_error"]) for row in last.values()]
     assert max(errors) < 3 * min(errors)
     content = json.loads(file.read_text())
-    assert len(content["vortices"]) == len(content["turned_rad"]) == 5
+    assert content["vortices"] == [2, 2, 2, 2, 2]
+    assert len(content["turned_rad"]) == 5
     assert (out / "ring.gif").read_bytes().startswith(GIF)
     assert all((out / name).read_bytes().startswith(PNG) for name in ("ring-snapshots.png", "ring-errors.png"))
 
 
-def test_vortices_are_followed_by_where_they_were_going():
+@pytest.mark.slow_without_jit
+@pytest.mark.usefixtures("short")
+def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch):
+    monkeypatch.setattr(gpe_ring, "SENSE", 1)
+    assert main(["gpe", "ring", "--start", str(start), "--out", str(tmp_path)]) == 1
+    assert "FAILED vortices turn anticlockwise" in capsys.readouterr().out
+
+
+@pytest.mark.slow_without_jit
+@pytest.mark.usefixtures("short")
+def test_another_end(tmp_path, start, capsys):
+    """Snapshots and movie are those of the times that the run has."""
+    command = ["gpe", "ring", "--start", str(start), "--t-end", "0.12", "--out", str(tmp_path / "out")]
+    assert main(command) == 0
+    text = capsys.readouterr().out
+    assert "to t = 0.12" in text
+    assert "vortices in the snapshots: [2, 2]" in text
+    times = [float(row["t"]) for row in read(tmp_path / "out" / "ring.csv") if row["method"] == "RK4"]
+    np.testing.assert_allclose(times, [0, 0.05, 0.1, 0.12], atol=1e-15)
+
+
+@pytest.mark.slow_without_jit
+@pytest.mark.usefixtures("short")
+def test_a_stationary_state(start, tmp_path, monkeypatch):
+    """Without a quench the gradients are parallel: that is counted, and nothing is nan."""
+    monkeypatch.setattr(gpe_ring, "KAPPA_AFTER", 0.3)
+    gpe = small_ring()
+    state = ground_state(gpe, gpe_states.load_state(start, gpe), tol=1e-11)
+    assert state.converged
+    gpe_states.save_state(start, gpe_states.Found("", gpe, state))
+    file = tmp_path / "ring.json"
+    main(["gpe", "ring", "--start", str(start), "--out", str(tmp_path), "--json", str(file), "--quiet"])
+    content = json.loads(file.read_text())
+    assert max(map(abs, content["turned_rad"])) < 1e-8  # so that the sense, and with it the status, is chance
+    assert content["rank_reduced"].pop("EIP-ME") > 0  # until the steps' own error has led away by 1e-8
+    assert content["rank_reduced"] == {"EIP-M": 0, "EIP-E": 0, "RK4": 0}
+    assert all(row["field_error"] < 1e-6 for row in content["errors"])  # null, were it not finite
+
+
+@pytest.mark.slow_without_jit
+@pytest.mark.usefixtures("short")
+@pytest.mark.parametrize(("run", "evaluation", "done"), [(0, 207, []), (2, 93, ["EIP-M"])])
+def test_an_interrupted_command_goes_on(run, evaluation, done, tmp_path, start, capsys, monkeypatch):
+    """In the reference or a method's run; the numbers are then those of an uninterrupted command, bit for bit."""
+    folder = tmp_path / "kept"
+    command = ["gpe", "ring", "--start", str(start), "--checkpoint", str(folder)]
+    assert main(["gpe", "ring", "--start", str(start), "--out", str(tmp_path / "whole"), "--quiet"]) == 0
+    runs, calls = count(), count()
+
+    def breaking(problem, **options):
+        this = next(runs)
+
+        def rhs(t, y, out):
+            if this == run and next(calls) == evaluation:
+                raise KeyboardInterrupt
+            problem.rhs(t, y, out)
+
+        return integrate(replace(problem, rhs=rhs), **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(gpe_runs, "integrate", breaking)
+        patch.setattr(_resume, "SNAPSHOT_SECONDS", 0.0)
+        assert main([*command, "--out", str(tmp_path / "first")]) == 130
+    captured = capsys.readouterr()
+    assert f"the same command with --resume goes on from the checkpoints in '{folder}'" in captured.err
+    assert [line.split()[0] for line in captured.out.splitlines() if line.startswith(("EIP", "RK4"))] == done
+    assert main([*command, "--out", str(tmp_path / "again")]) == 2
+    assert "exists. resume=True goes on with the run that it holds" in capsys.readouterr().err
+    assert main([*command, "--out", str(tmp_path / "second"), "--resume", "--quiet"]) == 0
+    assert {path.stem for path in folder.iterdir()} == {*gpe_runs.METHODS, gpe_runs.REFERENCE}
+    assert read(tmp_path / "second" / "ring.csv") == read(tmp_path / "whole" / "ring.csv")
+    assert main([*command, "--out", str(tmp_path / "third"), "--resume", "--t-end", "0.1"]) == 2
+    assert "belongs to another run: t_span is" in capsys.readouterr().err
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    """The paper's condensate on a grid that is good for three digits, and a few steps."""
+    for module in (gpe_states, gpe_lines):
+        monkeypatch.setattr(module, "LINE_POINTS", 40)
+    monkeypatch.setattr(gpe_lines, "ENERGIES_KNOWN", 1e-3)
+    monkeypatch.setattr(gpe_lines, "TURN_KNOWN", 0.03)
+    monkeypatch.setattr(gpe_lines, "T_END", 0.2)
+    monkeypatch.setattr(gpe_lines, "SAVED", 0.1)
+    monkeypatch.setattr(gpe_lines, "SNAPSHOTS", (0.0, 0.1, 0.2))
+
+
+@pytest.mark.needs_jit
+@pytest.mark.usefixtures("coarse")
+def test_vortex_lines(tmp_path, capsys, monkeypatch):
+    out, file, folder = tmp_path / "out", tmp_path / "lines.json", tmp_path / "kept"
+    command = ["gpe", "vortex-lines", "--out", str(out), "--json", str(file), "--checkpoint", str(folder)]
+    assert main(command) == 0
+    text = capsys.readouterr().out
+    assert "Vortex lines, Omega = 0.7 -> 0.9, RK4, h = 0.005, to t = 0.2" in text
+    assert "Start: 4 lines, E = 3.329" in text
+    assert "goes on to 2 lines, E = 3.302" in text
+    assert "ok     vortices in the snapshots: [4, 4, 4]" in text
+    assert "ok     vortices turn clockwise, angle at t = 0.2 [rad]: -0.0" in text
+    assert text.count("\nok ") == 11
+    assert max(map(len, text.replace(str(tmp_path), "").splitlines())) <= 110
+    names = {"vortex-lines.csv", *(f"vortex-lines-{name}.png" for name in ("slices", "surfaces", "errors"))}
+    assert {path.name for path in out.iterdir()} == names
+    before = read(out / "vortex-lines.csv")
+    # All is done; without scikit-image the surfaces are missing, and nothing else.
+    (out / "vortex-lines-surfaces.png").unlink()
+    monkeypatch.setattr(gpe_lines, "search_saddle", None)
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)
+    assert main([*command, "--resume"]) == 0
+    assert 'no surfaces: surfaces of equal density need scikit-image: pip install "eip_scipy[surfaces]"' in (
+        capsys.readouterr().err
+    )
+    assert not (out / "vortex-lines-surfaces.png").exists()
+    assert read(out / "vortex-lines.csv") == before
+
+
+def test_vortices_are_followed_by_where_they_were_going(monkeypatch):
     """Turns of more than half the distance between two vortices, once they have got so fast little by little."""
-    count = 38
+    total = 38
     turns = np.cumsum([0.01, 0.03, 0.05, 0.07, 0.09, 0.1])
-    gpe = ring_condensate(points=32)
-    line = gpe_ring.Line(np.arange(7.0), np.zeros((32 * 32, 7), complex), *[np.zeros(7)] * 3, 0.0, 0)
     places = iter([0.0, *turns])
 
     def at(*args):
-        angle = next(places) + 2 * np.pi * np.arange(count) / count
-        return Vortices(5 * np.column_stack([np.cos(angle), np.sin(angle)]), np.ones(count, int))
+        angle = next(places) + 2 * np.pi * np.arange(total) / total
+        return Vortices(5 * np.column_stack([np.cos(angle), np.sin(angle)]), np.ones(total, int))
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gpe_ring, "vortices", at)
-        moved = gpe_ring.motion(gpe, line)
+    monkeypatch.setattr(gpe_runs, "vortices", at)
+    moved = gpe_runs.motion(small_ring(), np.arange(7.0), np.zeros((32 * 32, 7), complex))
     np.testing.assert_allclose(moved.angle, [0, *turns], atol=1e-12)
 
 
@@ -172,7 +303,7 @@ def test_vortices_are_followed_by_where_they_were_going():
         (lambda content: content.pop("psi"), "cannot read a state"),
         (lambda content: content.update(Omega=3.0), "its Omega differs"),
         (lambda content: content.update(V=np.zeros((4, 4))), "its V differs"),
-        (lambda content: content.update(psi=np.zeros((16, 16))), "finite complex field"),
+        (lambda content: content.update(psi=np.zeros((16, 16), complex)), "finite complex field"),
         (lambda content: content.update(psi=np.full((32, 32), np.nan + 0j)), "finite complex field"),
         (lambda content: content.update(psi=np.array([None])), "cannot read a state"),
     ],
@@ -183,7 +314,7 @@ def test_states_that_do_not_belong(start, damage, message):
     damage(content)
     np.savez(start, **content)
     with pytest.raises(UsageError, match=message):
-        gpe_states.load_state(start, ring_condensate(points=32))
+        gpe_states.load_state(start, small_ring())
 
 
 def test_start_that_is_no_state(tmp_path, capsys):
@@ -202,6 +333,11 @@ def test_start_that_is_no_state(tmp_path, capsys):
         (["gpe", "ground-state", "--scene", "rings"], "did you mean 'ring'"),
         (["gpe", "ground-state", "--starts", "0"], "expected an integer >= 1, got '0'"),
         (["gpe"], "required: TASK"),
+        (["gpe", "ring", "--t-end", "0"], "expected a positive number, got '0'"),
+        (["gpe", "ring", "--resume"], "--resume needs the folder to resume from"),
+        (["gpe", "ring", "--starts", "3"], "--starts goes with ground-state, not with ring"),
+        (["gpe", "vortex-lines", "--t-end", "3"], "--t-end goes with ring, not with vortex-lines"),
+        (["gpe", "ground-state", "--checkpoint", "a"], "--checkpoint goes with ring and vortex-lines, not with ground"),
     ],
 )
 def test_wrong_usage(arguments, message, capsys):

@@ -1,4 +1,4 @@
-"""``eip-scipy gpe ground-state`` and ``eip-scipy gpe ring``: the rotating Gross-Pitaevskii equation (Experiment IV)."""
+"""``eip-scipy gpe``: ground states and dynamics of the rotating Gross-Pitaevskii equation (Experiment IV)."""
 
 from __future__ import annotations
 
@@ -6,16 +6,24 @@ import argparse
 from pathlib import Path
 
 from .._names import nearest
-from . import gpe_ring, gpe_states
+from ..report import UsageError
+from . import gpe_lines, gpe_ring, gpe_states, long_runs
 
 __all__ = ["add_arguments", "run"]
 
-TASKS = {"ground-state": gpe_states.run, "ring": gpe_ring.run}
+TASKS = {"ground-state": gpe_states.run, "ring": gpe_ring.run, "vortex-lines": gpe_lines.run}
+# What each task takes; the other options are not to be ignored in silence.
+OPTIONS = {
+    "ground-state": {"scene", "starts", "seed"},
+    "ring": {"start", "t_end", "movie", "seed", "checkpoint", "resume"},
+    "vortex-lines": {"seed", "checkpoint", "resume"},
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``gpe``."""
     parser.add_argument("task", choices=tuple(TASKS), metavar="TASK", help=" or ".join(TASKS))
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the random starts (%(default)s)")
     states = parser.add_argument_group("ground-state")
     states.add_argument(
         "--scene",
@@ -27,12 +35,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     states.add_argument(
         "--starts", type=_count, default=4, metavar="N", help="starts for each rotation in the trap (%(default)s)"
     )
-    states.add_argument("--seed", type=int, default=0, metavar="N", help="of the random starts (%(default)s)")
     ring = parser.add_argument_group("ring")
     ring.add_argument(
         "--start", type=Path, metavar="FILE", help="ring.npz of ground-state; default: the state is searched first"
     )
+    ring.add_argument(
+        "--t-end",
+        type=long_runs.positive,
+        default=gpe_ring.T_END,
+        metavar="T",
+        help="end of the run (%(default)s); the paper's 10",
+    )
     ring.add_argument("--movie", action="store_true", help="write ring.gif, too")
+    long_runs.add_arguments(parser.add_argument_group("ring and vortex-lines"), "the runs")
+    parser.set_defaults(parser=parser)
 
 
 def _scene(name: str) -> str:
@@ -66,5 +82,14 @@ def run(args: argparse.Namespace) -> int:
     -------
     int
         Exit status: 0 done, 1 a check failed, 130 interrupted.
+
+    Raises
+    ------
+    UsageError
+        For options of another task, and arguments or files that cannot be used.
     """
+    for name in set().union(*OPTIONS.values()) - OPTIONS[args.task]:
+        if getattr(args, name) != args.parser.get_default(name):
+            tasks = " and ".join(task for task, names in OPTIONS.items() if name in names)
+            raise UsageError(f"--{name.replace('_', '-')} goes with {tasks}, not with {args.task}")
     return TASKS[args.task](args)

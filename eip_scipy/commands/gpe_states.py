@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,15 +41,31 @@ from ..report import (
     write_json,
 )
 
-__all__ = ["SCENES", "Found", "load_state", "run", "search_ring"]
+__all__ = [
+    "LINES",
+    "LINES_ENERGY",
+    "SADDLE_ENERGY",
+    "SADDLE_LINES",
+    "SCENES",
+    "Found",
+    "kept_state",
+    "leave_saddle",
+    "load_state",
+    "run",
+    "save_state",
+    "search_ring",
+    "search_saddle",
+    "searching",
+]
 
 DONE, FAILED, INTERRUPTED = 0, 1, 130
 # V = r^2 / 2, beta = 100: angular velocity and published energy.
 PUBLISHED = {0.0: 3.9459469, 0.65: 3.6506129, 0.71: 3.4997148, 0.76: 3.3475310, 0.80: 3.1904172}
 PUBLISHED_DIGITS = 1e-5
 RING_ENERGY, LINES_ENERGY, LINES = -115.270, 3.3029, 2
+SADDLE_ENERGY, SADDLE_LINES = 3.3293, 4  # of the state in the paper's figure
 TRAP_POINTS, RING_POINTS, LINE_POINTS = 128, 256, 64
-TRAP_TOLERANCE, RING_TOLERANCE, LINES_TOLERANCE = 1e-6, 1e-8, 1e-5
+TRAP_TOLERANCE, RING_TOLERANCE, LINES_TOLERANCE, SADDLE_TOLERANCE = 1e-6, 1e-8, 1e-5, 1e-8
 MOST_LINES, LINES_RADIUS, LINES_ITERATIONS = 4, 1.5, 1000
 VISIBLE, MARGIN = 1e-3, 1.15  # part of the density that a figure shows, and the room around it
 Update = Callable[[str], Any]
@@ -114,7 +131,7 @@ def search_ring(seed: int, update: Update) -> Found:
 
 
 def lines(args: argparse.Namespace, update: Update) -> list[Found]:
-    """States of the paper's 3D condensate from starts with 0 ... 4 lines."""
+    """States of the paper's 3D condensate from starts with 0 ... 4 lines, and the saddle with four."""
     gpe = line_condensate(points=LINE_POINTS)
     rng = np.random.default_rng(args.seed)
     found = []
@@ -123,7 +140,23 @@ def lines(args: argparse.Namespace, update: Update) -> list[Found]:
         start = with_noise(imprint(gpe, polygon(count, LINES_RADIUS if count > 1 else 0.0)), rng)
         state = ground_state(gpe, start, tol=LINES_TOLERANCE, max_iterations=LINES_ITERATIONS)
         found.append(Found(f"{count} imprinted", gpe, state))
-    return found
+    return [*found, search_saddle(update)]
+
+
+def search_saddle(update: Update) -> Found:
+    """The paper's state with four lines, a saddle: the start has a square's symmetry, and the descent keeps it."""
+    update(f"lines, {SADDLE_LINES} imprinted without noise")
+    gpe = line_condensate(points=LINE_POINTS)
+    start = imprint(gpe, polygon(SADDLE_LINES, LINES_RADIUS))
+    return Found(f"{SADDLE_LINES} without noise: a saddle", gpe, ground_state(gpe, start, tol=SADDLE_TOLERANCE))
+
+
+def leave_saddle(gpe: GrossPitaevskii, saddle: np.ndarray, seed: int, update: Update) -> Found:
+    """Where the descent goes from a state with a little noise: from a saddle to a lower state."""
+    update("lines, down from the saddle")
+    start = with_noise(saddle, np.random.default_rng(seed))
+    state = ground_state(gpe, start, tol=LINES_TOLERANCE, max_iterations=LINES_ITERATIONS)
+    return Found("down from the saddle", gpe, state)
 
 
 SCENES: dict[str, Callable[[argparse.Namespace, Update], list[Found]]] = {"trap": trap, "ring": ring, "lines": lines}
@@ -157,6 +190,10 @@ def checks(results: Results) -> list[dict[str, Any]]:
         good = best.state.converged and abs(best.state.energy - LINES_ENERGY) < 1e-4
         found.append(_check("lines: lowest E", LINES_ENERGY, best.state.energy, good))
         found.append(_check("lines: of the lowest", LINES, best.count, best.count == LINES))
+        saddle = results["lines"][-1]
+        good = saddle.state.converged and abs(saddle.state.energy - SADDLE_ENERGY) < 1e-4
+        found.append(_check("lines: E of the saddle", SADDLE_ENERGY, saddle.state.energy, good))
+        found.append(_check("lines: of the saddle", SADDLE_LINES, saddle.count, saddle.count == SADDLE_LINES))
     return found
 
 
@@ -213,13 +250,11 @@ def rows(results: Results) -> list[dict[str, Any]]:
 
 def run(args: argparse.Namespace) -> int:
     """Run ``gpe ground-state``; see `eip_scipy.commands.gpe.run`."""
-    from tqdm import tqdm
-
     check_outputs(args.out, args.json)
     names = list(dict.fromkeys(args.scene or SCENES))
     try:
-        with tqdm(bar_format="{desc} [{elapsed}]", disable=args.quiet, leave=False) as bar:
-            results = {name: SCENES[name](args, bar.set_description_str) for name in names}
+        with searching(args) as update:
+            results = {name: SCENES[name](args, update) for name in names}
     except KeyboardInterrupt:
         warn("interrupted; nothing was written")
         return INTERRUPTED
@@ -246,7 +281,8 @@ def _write(args: argparse.Namespace, results: Results) -> None:
         warn(f"no figures: {error}")
     else:
         for name, found in results.items():
-            figure = fields_figure(panels(name, found), title=TITLES[name].split(";")[0])
+            shown = panels(name, found)
+            figure = fields_figure(shown, title=TITLES[name].split(";")[0], columns=3 if len(shown) <= 6 else 4)
             written.append(write_file(args.out / f"ground-state-{name}.png", figure.savefig))
     if not args.quiet:
         say("\n".join(f"wrote {path}" for path in written))
@@ -279,13 +315,14 @@ def _counted(count: int, kind: str) -> str:
     return f"{count or 'no'} {kind if count == 1 else plural}"
 
 
-def cropped(density: np.ndarray, grid: Grid, axes: tuple[int, int]) -> tuple[np.ndarray, Ends]:
-    """The middle of a plane, with little of the empty space around the condensate, and its ends."""
-    half = 0.0
-    for k, axis in enumerate(axes):
-        there = np.any(density > VISIBLE * density.max(), axis=1 - k)
-        half = max(half, float(np.abs(grid.points(axis)[there]).max()))
-    keep = [np.flatnonzero(np.abs(grid.points(axis)) <= MARGIN * half) for axis in axes]
+def cropped(
+    density: np.ndarray, grid: Grid, axes: tuple[int, int], half: float | None = None
+) -> tuple[np.ndarray, Ends]:
+    """The middle of a plane, by default with little of the empty space around the condensate, and its ends."""
+    if half is None:
+        seen = (np.any(density > VISIBLE * density.max(), axis=1 - k) for k in (0, 1))
+        half = MARGIN * max(float(np.abs(grid.points(a)[there]).max()) for a, there in zip(axes, seen, strict=True))
+    keep = [np.flatnonzero(np.abs(grid.points(axis)) <= half) for axis in axes]
     a, b, c, d = (
         float(grid.points(axis)[k[edge]] + shift * grid.spacing[axis])
         for axis, k in zip(axes, keep, strict=True)
@@ -309,6 +346,40 @@ def save_state(path: Path, item: Found) -> Path:
         "residual": state.residual,
     }
     return write_file(path, lambda temporary: np.savez_compressed(temporary, **content))
+
+
+@contextmanager
+def searching(args: argparse.Namespace) -> Iterator[Update]:
+    """Show what is searched, and for how long, unless ``--quiet``; yields what takes the words for it."""
+    from tqdm import tqdm
+
+    with tqdm(bar_format="{desc} [{elapsed}]", disable=args.quiet, leave=False) as bar:
+        yield bar.set_description_str
+
+
+def kept_state(args: argparse.Namespace, gpe: GrossPitaevskii, search: Callable[[Update], Found]) -> np.ndarray:
+    """The field to start from: with ``--resume`` the one beside the checkpoints, else the one that `search` finds.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        With ``checkpoint``, ``resume`` and ``quiet``.
+    gpe : GrossPitaevskii
+    search : callable
+        ``search(update)``.
+
+    Returns
+    -------
+    ndarray, shape (J, K[, L])
+    """
+    kept = None if args.checkpoint is None else args.checkpoint / "state.npz"
+    if kept is not None and args.resume and kept.exists():
+        return load_state(kept, gpe)
+    with searching(args) as update:
+        found = search(update)
+    if kept is not None:
+        save_state(kept, found)
+    return found.state.psi
 
 
 def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:

@@ -20,6 +20,7 @@ from ..longrun import integrate
 from ..problems import Problem, SolarSystemData, solar_system
 from ..problems.solar_data import YEAR_D, load
 from ..solvers import EIPRK5, EIPSolver
+from .long_runs import named
 
 __all__ = [
     "Judge",
@@ -216,16 +217,11 @@ def eip_name(method: type[EIPSolver], metric: str) -> str:
     return f"{method.__name__} ({metric})"
 
 
-def _named(method: type[EIPSolver], name: str) -> type[EIPSolver]:
-    """Put the method under another name, for its progress bar."""
-    return type(name, (method,), {"__doc__": method.__doc__})
-
-
 def _eip(scene: Scene, method: type[EIPSolver], metric: str, progress: bool, **kept: Any) -> MethodRun:
     name = eip_name(method, metric)
     head = (method.__name__, "euclid." if metric == "euclidean" else metric)
     result = integrate(
-        scene.problem, method=_named(method, name), metric=metric, save_every=scene.every, progress=progress, **kept
+        scene.problem, method=named(method, name), metric=metric, save_every=scene.every, progress=progress, **kept
     )
     return _finished(scene, name, head, scene.h, result, "" if result.success else result.message)
 
@@ -233,7 +229,7 @@ def _eip(scene: Scene, method: type[EIPSolver], metric: str, progress: bool, **k
 def _plain(scene: Scene, method: type[EIPSolver], progress: bool, **kept: Any) -> MethodRun:
     name = method.TABLEAU.name
     result = integrate(
-        scene.problem, method=_named(method, name), invariants=(), save_every=scene.every, progress=progress, **kept
+        scene.problem, method=named(method, name), invariants=(), save_every=scene.every, progress=progress, **kept
     )
     return _finished(scene, name, (name, "alone"), scene.h, result, "" if result.success else result.message)
 
@@ -242,7 +238,7 @@ def tight_run(scene: Scene, progress: bool, **kept: Any) -> MethodRun:
     """Run the tightest at hand without REBOUND: EIPRK5, a quarter of the step, compensated."""
     result = integrate(
         scene.problem,
-        method=_named(EIPRK5, TIGHT),
+        method=named(EIPRK5, TIGHT),
         h=scene.h / 4,
         save_every=4 * scene.every,
         compensated=True,

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
-import re
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from .. import solvers
 from ..checkpoint import CheckpointError
-from ..report import UsageError, check_folder, check_outputs, say, warn, write_csv, write_file, write_json
-from . import solar_epoch, solar_truth
+from ..report import UsageError, check_outputs, say, warn, write_csv, write_file, write_json
+from . import long_runs, solar_epoch, solar_truth
+from .long_runs import positive
 from .solar_cost import REPEATS, cost, cost_methods
 from .solar_errors import Study
 from .solar_report import cost_rows, csv_rows, json_content, text
@@ -47,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--h",
-        type=_positive,
+        type=positive,
         help=f"step in years, shortened to divide the run ({STEP:g}; with --truth {solar_truth.STEP:g})",
     )
     parser.add_argument(
@@ -59,26 +57,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="error against cost of high-order methods and their peers instead; --years 1, 10, 100, 1000 or 2000",
     )
-    parser.add_argument(
-        "--checkpoint", type=Path, metavar="DIR", help="keep checkpoints of the runs that this package does in DIR"
-    )
-    parser.add_argument("--resume", action="store_true", help="with --checkpoint: go on from those that are in DIR")
+    long_runs.add_arguments(parser, "the runs that this package does")
     solar_epoch.add_arguments(parser)
     solar_truth.add_arguments(parser)
 
 
 def _span(text: str) -> float:
-    return -_positive(text[1:]) if text.startswith("-") else _positive(text)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (value > 0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f"expected a positive number, got {text!r}")
-    return value
+    return -positive(text[1:]) if text.startswith("-") else positive(text)
 
 
 def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ephemeris | None = None) -> int:
@@ -109,19 +94,16 @@ def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ep
         raise UsageError(f"--years: expected a positive number, got '{args.years:g}'; only --truth goes back in time")
     if args.forces:
         raise UsageError("--forces goes with --truth; without it, methods are compared under Newton's gravitation")
-    if args.resume and args.checkpoint is None:
-        raise UsageError("--resume needs the folder to resume from: --checkpoint DIR")
+    long_runs.check(args)
     data = solar_epoch.initial_data(args, ephemeris)
     try:
         study = Study(make_scene(data, args.years, args.h), fixed_step_methods()[args.method].TABLEAU.order)
     except ValueError as error:
         raise UsageError(str(error)) from error
     check_outputs(args.out, args.json)
-    if args.checkpoint is not None:
-        check_folder(args.checkpoint)
     interrupted = _integrate(study, args, judge)
-    if interrupted and args.checkpoint is not None:
-        warn(f"the same command with --resume goes on from the checkpoints in {str(args.checkpoint)!r}")
+    if interrupted:
+        long_runs.tell_how_to_resume(args)
     if not study.runs:
         warn("interrupted; no run was done")
         return INTERRUPTED
@@ -144,7 +126,7 @@ def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ep
 
 def _integrate(study: Study, args: argparse.Namespace, judge: Judge | None) -> bool:
     """Do the runs one by one; True if the user interrupted them."""
-    tasks = plan(study.scene, fixed_step_methods()[args.method], args.metric, judge, partial(_kept, args))
+    tasks = plan(study.scene, fixed_step_methods()[args.method], args.metric, judge, partial(long_runs.kept, args))
     try:
         for task in tasks:
             with _waiting(task.name, shown=not (args.quiet or task.has_bar)):
@@ -152,19 +134,9 @@ def _integrate(study: Study, args: argparse.Namespace, judge: Judge | None) -> b
         study.tight = study.runs[-1]
     except KeyboardInterrupt:
         return True
-    except MemoryError as error:
-        raise UsageError(f"not enough memory: {error}") from error
-    except CheckpointError as error:
-        raise UsageError(f"{error} On the command line, resume=True is --resume.") from error
+    except (MemoryError, CheckpointError) as error:
+        raise long_runs.unusable(error) from error
     return False
-
-
-def _kept(args: argparse.Namespace, name: str) -> dict[str, Any]:
-    """Options of `integrate` for the checkpoints of the run of that name: one file each."""
-    if args.checkpoint is None:
-        return {}
-    file = re.sub("[^A-Za-z0-9]+", "-", name).strip("-")
-    return {"checkpoint": args.checkpoint / f"{file}.npz", "resume": args.resume}
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """The rotating Gross-Pitaevskii equation in one, two and three dimensions."""
 
+from .array_api import ArrayGrossPitaevskii
 from .equation import FieldProblem, GrossPitaevskii
 from .flows import LinearFlow
 from .frames import at_rest, rotated
@@ -11,6 +12,7 @@ from .scenes import line_condensate, plane_wave, ring_condensate, rotating_packe
 from .search import lowest_ring, lowest_state
 from .splitting import RKN6, S6, STRANG, Scheme, Splitting
 from .starts import imprint, polygon, ring_start, thomas_fermi, vortex_starts, with_noise
+from .surfaces import Surface, density_surface
 from .transforms import make_transforms
 from .vortices import Vortices, vortices
 
@@ -18,6 +20,7 @@ __all__ = [
     "RKN6",
     "S6",
     "STRANG",
+    "ArrayGrossPitaevskii",
     "FieldProblem",
     "Grid",
     "GrossPitaevskii",
@@ -28,8 +31,10 @@ __all__ = [
     "Scheme",
     "SpectralSum",
     "Splitting",
+    "Surface",
     "Vortices",
     "at_rest",
+    "density_surface",
     "ground_state",
     "harmonic_trap",
     "imprint",

@@ -8,17 +8,15 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import config
 
 from ..._names import nearest
-from ...invariants import Invariant
+from ...invariants import Invariant, JointInvariants
 from .._problem import Problem
 from .conserved import Energy, Joint
 from .grid import Grid, Multiplier, SpectralSum
-from .lines import LineSum, fits
-from .moments import moments, total_mass
+from .moments import Moments, moments, total_mass
 from .pointwise import add_potential, derivative, float_rows
-from .transforms import make_transforms
+from .transforms import Axes, make_transforms
 
 __all__ = ["FieldProblem", "GrossPitaevskii"]
 
@@ -61,8 +59,7 @@ class GrossPitaevskii:
         The second derivative's factor of the Nyquist mode: its own, or 0 as where the second derivative is the first
         one applied twice (the paper's tables).
     fft : {"auto", "scipy", "ducc0", "pyfftw"}, optional
-        A library of transforms, see `make_transforms`. With "auto" the right-hand side has transforms of its own where
-        each side of the grid is a power of two, 8 or more, in two or three dimensions: faster than any of them.
+        See `make_transforms`.
     threads : int, optional
         Threads of the transforms.
 
@@ -75,8 +72,6 @@ class GrossPitaevskii:
     transforms : Transforms
     fft : str
         The library of the transforms.
-    own_transforms : bool
-        Whether the right-hand side does without it.
 
     Raises
     ------
@@ -125,10 +120,8 @@ class GrossPitaevskii:
         self.transforms = make_transforms(fft, threads)
         self.fft = self.transforms.name
         self._options = {"nyquist": nyquist, "fft": fft, "threads": threads}
-        # Without the JIT a library is faster.
-        own = fft == "auto" and fits(grid.shape) and not config.DISABLE_JIT
-        self._lines = self._line_sum() if own else None
-        self.own_transforms = self._lines is not None
+        terms = [self._multiplier(*term) for term in self.linear_terms()]
+        self._linear = SpectralSum(grid, self.transforms, terms)
 
     def __repr__(self) -> str:
         return f"GrossPitaevskii({self.grid!r}, Omega={self.Omega:g}, beta={self.beta:g})"
@@ -136,7 +129,7 @@ class GrossPitaevskii:
     def changed(self, **options: Any) -> GrossPitaevskii:
         """Make the same equation with other values of `potential`, `Omega`, `beta` and so on: a quench."""
         options = {"potential": self.V, "Omega": self.Omega, "beta": self.beta, **self._options, **options}
-        return GrossPitaevskii(self.grid, **options)
+        return type(self)(self.grid, **options)
 
     def kinetic_factor(self, axis: int) -> np.ndarray:
         """The factor k^2 / 2 of the modes along one axis."""
@@ -161,29 +154,32 @@ class GrossPitaevskii:
     def _turning(self) -> SpectralSum:
         if self.grid.dim == 1:
             raise ValueError("in one dimension there is no angular momentum.")
-        terms = [Multiplier(self.grid, (axis,), factor) for axis, factor in enumerate(self.rotation_factors())]
+        terms = [self._multiplier((axis,), factor) for axis, factor in enumerate(self.rotation_factors())]
         return SpectralSum(self.grid, self.transforms, terms)
 
-    @cached_property
-    def _linear(self) -> SpectralSum:
-        return SpectralSum(self.grid, self.transforms, self._kinetic_and_rotation())
+    # These three a field on several ranks does in another way (`eip_scipy.integrations.mpi_fields`).
 
-    def _kinetic_and_rotation(self) -> list[Multiplier]:
-        """As few transforms as there are: all axes at once without rotation, else x, and then y and z together."""
+    def _total(self, sums: Any) -> Any:
+        """Sums over the whole grid from those over the part that is here."""
+        return sums
+
+    def _multiplier(self, axes: Axes, factor: Any) -> Multiplier:
+        return Multiplier(self.grid, axes, factor)
+
+    def _largest(self, a: np.ndarray) -> float:
+        return float(np.abs(a).max())
+
+    def linear_terms(self) -> list[tuple[Axes, Any]]:
+        """The linear part, kinetic energy and rotation, as axes and the real factors of the modes along them.
+
+        As few transforms as there are: all axes at once without rotation, else x, and then y and z together.
+        """
         kinetic = [self.kinetic_factor(axis) for axis in range(self.grid.dim)]
         if self.Omega == 0:
-            return [Multiplier(self.grid, tuple(range(self.grid.dim)), sum(kinetic))]
+            return [(tuple(range(self.grid.dim)), sum(kinetic))]
         along_x, along_y = self.rotation_factors()
         others = tuple(range(1, self.grid.dim))
-        return [
-            Multiplier(self.grid, (0,), kinetic[0] - self.Omega * along_x),
-            Multiplier(self.grid, others, sum(kinetic[1:]) - self.Omega * along_y),
-        ]
-
-    def _line_sum(self) -> LineSum:
-        kinetic = [self.kinetic_factor(axis) for axis in range(self.grid.dim)]
-        k, q = (self.grid.wavenumbers(axis, odd=True) for axis in (0, 1))
-        return LineSum(self.grid, kinetic, [self.Omega * k, -self.Omega * q], self.transforms.threads)
+        return [((0,), kinetic[0] - self.Omega * along_x), (others, sum(kinetic[1:]) - self.Omega * along_y)]
 
     def as_field(self, psi: Any) -> np.ndarray:
         """`psi`, a field or a flat state, as a contiguous complex field.
@@ -206,9 +202,6 @@ class GrossPitaevskii:
         """Fill `out` with -i H(psi) psi; both flat and contiguous, and not the same array."""
         shape = self.grid.shape
         psi, image = y.reshape(shape), out.reshape(shape)
-        if self._lines is not None:
-            self._lines.derivative(psi, self.V, self.beta, image)
-            return
         for where, rest in self._linear.parts(psi, image):
             derivative(_floats(rest), _floats(psi[where]), self.V[where].reshape(-1), self.beta, _floats(image[where]))
 
@@ -220,8 +213,8 @@ class GrossPitaevskii:
         return out
 
     def linear(self, psi: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with (-Laplace / 2 - Omega Lz) psi, both contiguous fields."""
-        (self._lines or self._linear).apply(psi, out)
+        """Fill `out` with (-Laplace / 2 - Omega Lz) psi, both fields."""
+        self._linear.apply(psi, out)
 
     def angular(self, psi: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with Lz psi, both fields.
@@ -244,13 +237,16 @@ class GrossPitaevskii:
 
     def mass(self, psi: Any) -> float:
         """Sum of ``|psi|^2`` over the grid, times the cell: 1 for a normalised state."""
-        return self.grid.cell * total_mass(self.rows(self.as_field(psi)))
+        return float(self.grid.cell * self._total(total_mass(self.rows(self.as_field(psi)))))
 
     def energy(self, psi: Any) -> float:
         """Kinetic, potential, rotational and interaction energy, the last beta / 2 times the sum of ``|psi|^4``."""
         psi = self.as_field(psi)
-        f = self.fun(0.0, psi.reshape(-1))
-        return self.grid.cell * moments(self.rows(psi), self.rows(f)).energy(self.beta)
+        return self.grid.cell * self.moments(psi, self.fun(0.0, psi.reshape(-1))).energy(self.beta)
+
+    def moments(self, psi: np.ndarray, f: np.ndarray) -> Moments:
+        """Sums over the grid that mass, energy and their gradients' products are made of; `f` as `fun` gives it."""
+        return Moments(*map(float, self._total(moments(self.rows(psi), self.rows(f)))))
 
     def angular_momentum(self, psi: Any) -> float:
         """Mean of Lz times the mass.
@@ -260,12 +256,13 @@ class GrossPitaevskii:
         ValueError
             In one dimension.
         """
-        return self.grid.cell * self._turning.expectation(self.as_field(psi))
+        return float(self.grid.cell * self._total(self._turning.expectation(self.as_field(psi))))
 
     def chemical_potential(self, psi: Any) -> float:
         """Mean of H: mu = Re <H(psi) psi, psi> / <psi, psi>."""
         psi = self.as_field(psi)
-        return float(np.vdot(psi, self.hamiltonian(psi)).real / np.vdot(psi, psi).real)
+        above, below = self._total((np.vdot(psi, self.hamiltonian(psi)).real, np.vdot(psi, psi).real))
+        return float(above / below)
 
     def _mass_gradient(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
         np.multiply(y.view(float), 2 * self.grid.cell, out=out.view(float))
@@ -287,14 +284,20 @@ class GrossPitaevskii:
         -------
         tuple of Invariant
             Their gradients are 2 w psi, 2 w H psi and 2 w Lz psi, w the cell. That of the energy is a multiple of the
-            right-hand side, which the step evaluates once for it and for the next step's first stage (`reuse_f`).
+            right-hand side, which the step evaluates once for it and for the next step's first stage (`reuse_f`). Mass
+            and energy are `JointInvariants`: handed on as they are, their projection takes two passes over the field.
 
         Raises
         ------
         ValueError
             For other names.
         """
-        return tuple(self._invariant(name) for name in ((names,) if isinstance(names, str) else names))
+        names = (names,) if isinstance(names, str) else tuple(names)
+        items = tuple(self._invariant(name) for name in names)
+        if not items or "angular_momentum" in names or len(set(names)) < len(names):
+            return items
+        joint = Joint(self, names)
+        return JointInvariants(items, joint.moments, joint.shift)
 
     def _invariant(self, name: str) -> Invariant:
         energy = Energy(self)
@@ -307,24 +310,6 @@ class GrossPitaevskii:
             raise ValueError(f"unknown invariant {name!r}, expected {', '.join(INVARIANTS)}{nearest(name, INVARIANTS)}")
         value, gradient = made[name]
         return Invariant(lambda t, y: value(y), gradient, name=name, in_place=True, uses_f=name == "energy")
-
-    def joint(self, names: Sequence[str] = ("mass", "energy")) -> Joint:
-        """Make the mass and the energy, or one of them, as one: a projection in two passes over the field.
-
-        Parameters
-        ----------
-        names : sequence of {"mass", "energy"}, optional
-
-        Returns
-        -------
-        Joint
-
-        Raises
-        ------
-        ValueError
-            For other names.
-        """
-        return Joint(self, (names,) if isinstance(names, str) else tuple(names))
 
     def problem(
         self,
@@ -377,8 +362,8 @@ class GrossPitaevskii:
     def largest_frequency(self) -> float:
         """A bound of the linear part's norm: the terms' largest values one by one."""
         kinetic = sum(float(self.kinetic_factor(axis).max()) for axis in range(self.grid.dim))
-        turning = sum(float(np.abs(f).max()) for f in self.rotation_factors()) if self.Omega else 0.0
-        return kinetic + abs(self.Omega) * turning + float(np.abs(self.V).max())
+        turning = sum(self._largest(f) for f in self.rotation_factors()) if self.Omega else 0.0
+        return kinetic + abs(self.Omega) * turning + self._largest(self.V)
 
     def largest_step(self, psi: Any, limit: float = 2 * 2**0.5) -> float:
         """The step above which an explicit method is unstable.
@@ -396,7 +381,7 @@ class GrossPitaevskii:
             From a bound of the largest frequency that counts the terms of H one by one; larger steps may do.
         """
         # Twice the interaction: the linearised term is 2 beta |psi|^2 u + beta psi^2 conj(u).
-        local = 2 * abs(self.beta) * float((np.abs(self.as_field(psi)) ** 2).max())
+        local = 2 * abs(self.beta) * self._largest(self.as_field(psi)) ** 2
         return float(limit / (self.largest_frequency() + local))
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from .equation import GrossPitaevskii
-from .phases import LineFlow
 from .transforms import Axes
 
 __all__ = ["LinearFlow"]
@@ -48,35 +47,16 @@ class LinearFlow:
         if abs(angle) > LARGEST_TURN * (1 + 1e-9):
             raise ValueError(f"a flow turns by pi / 4 at most, got {angle:.3g} (Omega h); take shorter steps.")
         self._fft = gpe.transforms
-        self._lines: LineFlow | None = None
-        self._factors: list[tuple[Axes, list[np.ndarray]]] = []
-        if gpe.own_transforms:
-            self._lines = LineFlow(gpe.grid, self._passes(gpe, time, angle), gpe.transforms.threads)
-        else:
-            self._factors = self._all_factors(gpe, time, angle)
-
-    @staticmethod
-    def _passes(gpe: GrossPitaevskii, time: float, angle: float) -> list[tuple[int, np.ndarray, np.ndarray]]:
-        """The phases axis by axis, as `LineFlow` takes them."""
-        kinetic = [gpe.kinetic_factor(axis) for axis in range(gpe.grid.dim)]
-        still = [np.zeros_like(k) for k in kinetic]
-        if angle == 0:
-            return [(axis, time * k, still[axis]) for axis, k in enumerate(kinetic)]
-        k, q = (gpe.grid.wavenumbers(axis, odd=True) for axis in (0, 1))
-        x = 0, time / (1 + cos(angle)) * kinetic[0], tan(angle / 2) * k
-        y = 1, time * cos(angle) * kinetic[1], -sin(angle) * q
-        return [x, y, *((2, time * p, still[2]) for p in kinetic[2:]), x]
-
-    @classmethod
-    def _all_factors(cls, gpe: GrossPitaevskii, time: float, angle: float) -> list[tuple[Axes, list[np.ndarray]]]:
-        """The same as factors of a library's modes."""
         kinetic = [gpe.kinetic_factor(axis) for axis in range(gpe.grid.dim)]
         if angle == 0:
-            return [cls._factor(gpe, tuple(range(gpe.grid.dim)), [time * sum(kinetic)])]
+            axes = tuple(range(gpe.grid.dim))
+            self._factors = [self._factor(gpe, axes, [time * sum(kinetic)])]
+            return
         along_x, along_y = gpe.rotation_factors()
-        x = cls._factor(gpe, (0,), [time / (1 + cos(angle)) * kinetic[0] - tan(angle / 2) * along_x])
+        others = tuple(range(1, gpe.grid.dim))
+        x = self._factor(gpe, (0,), [time / (1 + cos(angle)) * kinetic[0] - tan(angle / 2) * along_x])
         y = [time * cos(angle) * kinetic[1] - sin(angle) * along_y, *(time * k for k in kinetic[2:])]
-        return [x, cls._factor(gpe, tuple(range(1, gpe.grid.dim)), y), x]
+        self._factors = [x, self._factor(gpe, others, y), x]
 
     @staticmethod
     def _factor(gpe: GrossPitaevskii, axes: Axes, phases: list[Any]) -> tuple[Axes, list[np.ndarray]]:
@@ -86,9 +66,7 @@ class LinearFlow:
         return axes, [first / points, *rest]
 
     def apply(self, psi: np.ndarray, work: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The image of a contiguous field, in one of the two arrays, and the other one; both may be overwritten."""
-        if self._lines is not None:
-            self._lines.apply(psi)
+        """The field's image, in one of the two arrays, and the other one; both are overwritten."""
         for axes, factors in self._factors:
             self._fft.forward(psi, axes, work)
             for factor in factors:

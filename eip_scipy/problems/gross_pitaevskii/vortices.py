@@ -10,7 +10,7 @@ from scipy.ndimage import grey_closing
 
 from .equation import GrossPitaevskii
 
-__all__ = ["Vortices", "vortices"]
+__all__ = ["Vortices", "core_size", "vortices"]
 
 CORE = 4.0  # width of a core, in healing lengths
 
@@ -82,12 +82,17 @@ def vortices(
         psi = psi[:, :, gpe.grid.shape[2] // 2 if plane is None else plane]
     x, y = (gpe.grid.points(axis) for axis in (0, 1))
     dx, dy = gpe.grid.spacing[:2]
-    width = core if core is not None else CORE / sqrt(2 * gpe.beta * top) if gpe.beta > 0 else 0.0
-    filled = grey_closing(np.abs(psi) ** 2, size=[max(3, ceil(width / d) | 1) for d in (dx, dy)], mode="wrap")
+    filled = grey_closing(np.abs(psi) ** 2, size=core_size(gpe, top, core), mode="wrap")
     charge = _charges(psi, turning, x, y, dx, dy)
     i, j = np.nonzero((charge != 0) & (_least_of_corners(filled) > threshold * top))
     places = [_zero(psi[a : a + 2, b : b + 2], turning, x[a], y[b], dx, dy) for a, b in zip(i, j, strict=True)]
     return Vortices(np.array(places).reshape(-1, 2), charge[i, j])
+
+
+def core_size(gpe: GrossPitaevskii, top: float, core: float | None = None) -> list[int]:
+    """Points (odd, three at least) along x and y of the core of a vortex, whose width follows from the top density."""
+    width = core if core is not None else CORE / sqrt(2 * gpe.beta * top) if gpe.beta > 0 else 0.0
+    return [max(3, ceil(width / d) | 1) for d in gpe.grid.spacing[:2]]
 
 
 def _charges(psi: np.ndarray, Omega: float, x: np.ndarray, y: np.ndarray, dx: float, dy: float) -> np.ndarray:

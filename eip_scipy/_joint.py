@@ -1,0 +1,41 @@
+"""The projection where a problem knows its invariants' inner products: two passes over the state instead of twenty."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from . import _kernels as kn
+from .result import LAST_RANK, NJEV, NLU, PROJECTIONS, SKIPPED
+
+__all__ = ["project_jointly"]
+
+
+def project_jointly(t: float, o: Any, w: Any, y_new: np.ndarray, y_new_r: np.ndarray) -> bool:
+    """One Newton step from w.y_hat into y_new by the functions of o.joint (`JointInvariants`).
+
+    The same step as `project_step` takes in the euclidean metric, its dead bands, bounds and verdict included. False
+    where that needs more: gradients nearly parallel, or a projection that does not hold; nothing is counted then.
+    """
+    joint, f_hat, counters = o.joint, w.K[-1], w.counters
+    joint.moments(t, w.y_hat, f_hat, w.values, w.R, w.inverse_norms)
+    terms = np.maximum(w.inverse_norms, o.scales)
+    outside = kn.defects(w.values, o.target, w.G_r[:, :0], w.y_hat_r[:0], terms, False, w.g, w.band, w.before)
+    if outside:
+        if not kn.gram_solution(w.R, w.g, w.mu):
+            return False
+        joint.shift(t, w.y_hat, f_hat, w.mu, y_new, w.values)
+    else:
+        kn.copy(w.y_hat_r, y_new_r)
+    if not kn.defects_held(w.values, o.target, w.before, w.band, w.defect):
+        return False
+    counters[NJEV] += 1
+    if outside:
+        counters[NLU] += 1
+        counters[PROJECTIONS] += 1
+        counters[LAST_RANK] = o.target.size
+    else:
+        counters[SKIPPED] += 1
+    kn.raise_to(w.defect, w.max_defect)
+    return True

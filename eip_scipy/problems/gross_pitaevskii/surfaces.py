@@ -1,0 +1,75 @@
+"""Surfaces of equal density in three dimensions, and which parts of them are the tubes around vortex lines."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, grey_closing, map_coordinates
+from scipy.signal import resample
+
+from .equation import GrossPitaevskii
+from .vortices import core_size
+
+__all__ = ["Surface", "density_surface"]
+
+DEEP = 2.0  # where the density with the cores filled in is so many times that of the surface, it is inside
+SMOOTH = 2.0  # points, for an edge without teeth
+
+
+class Surface(NamedTuple):
+    """A surface of triangles.
+
+    Attributes
+    ----------
+    corners : ndarray, shape (m, 3, 3)
+        x, y and z of the three corners of each triangle.
+    inside : ndarray of bool, shape (m,)
+        Whether the triangle lies within the condensate: around the core of a vortex, which is all that is empty there.
+    """
+
+    corners: np.ndarray
+    inside: np.ndarray
+
+
+def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
+    """The surface on which ``|psi|^2`` has a given value, by marching cubes (Lewiner et al. 2003, in scikit-image).
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+        In three dimensions.
+    psi : array_like
+        A field or flat state, 0 at the ends of the box. It is evaluated on twice as many points along each axis.
+    level : float
+        Between 0 and the largest density.
+
+    Returns
+    -------
+    Surface
+
+    Raises
+    ------
+    ValueError
+        In one or two dimensions, or for a level that the density does not reach.
+    ImportError
+        Without scikit-image.
+    """
+    if gpe.grid.dim != 3:
+        raise ValueError(f"a surface needs three dimensions, got {gpe.grid!r}.")
+    psi = gpe.as_field(psi)
+    top = float((np.abs(psi) ** 2).max())
+    if not 0 < level < top:
+        raise ValueError(f"level must be between 0 and the largest density {top:.3g}, got {level!r}.")
+    try:
+        from skimage.measure import marching_cubes
+    except ModuleNotFoundError as error:
+        message = 'surfaces of equal density need scikit-image: pip install "eip_scipy[surfaces]"'
+        raise ImportError(message, name="skimage") from error
+    for axis, n in enumerate(gpe.grid.shape):
+        psi = resample(psi, 2 * n, axis=axis)
+    density = np.abs(psi) ** 2
+    points, triangles, _, _ = marching_cubes(density, level)
+    filled = gaussian_filter(grey_closing(density, size=[*(2 * n + 1 for n in core_size(gpe, top)), 1]), SMOOTH)
+    around = map_coordinates(filled, points[triangles].mean(axis=1).T, order=1)
+    return Surface((gpe.grid.lower + 0.5 * gpe.grid.spacing * points)[triangles], around > DEEP * level)

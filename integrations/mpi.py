@@ -1,0 +1,298 @@
+"""The state of one run on the ranks of an MPI communicator: each holds a part, and the step runs on all of them.
+
+``over_ranks(EIPRK4)`` is a class for `scipy.integrate.solve_ivp` as `EIPRK4` is. The right-hand side that it is given
+fills a rank's part of the derivative; an invariant returns the same number on every rank and the gradient's part. The
+step and its projection are those of `EIPSolver`.
+
+Needs ``pip install "eip_scipy[mpi]"`` and an MPI library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from eip_scipy import _kernels as kn
+from eip_scipy import _setup
+from eip_scipy._joint import project_jointly
+from eip_scipy._lanes import abs_dot, dot
+from eip_scipy._names import nearest
+from eip_scipy._step import Method, Options, Work, advance_raw, look_back, make_work, project_step
+from eip_scipy.invariants import Invariant, InvariantSet, as_invariants
+from eip_scipy.one_step import OneStep
+from eip_scipy.solvers import EIPSolver
+
+try:
+    from mpi4py import MPI
+except ModuleNotFoundError as error:
+    raise ImportError(
+        'eip_scipy.integrations.mpi needs mpi4py and an MPI library: pip install "eip_scipy[mpi]" mpich', name="mpi4py"
+    ) from error
+except RuntimeError as error:
+    raise ImportError(
+        "mpi4py finds no MPI library: load or install the machine's, or pip install mpich", name="mpi4py"
+    ) from error
+
+__all__ = ["MPI", "gathered", "over_ranks", "total"]
+
+OPTIONS = ("h", "vectorized", "invariants", "metric", "iterations", "every", "reuse_f", "check", "diagnostics")
+
+
+def gathered(comm: MPI.Comm, a: Any) -> np.ndarray:
+    """An array of floats of every rank, in their order; its shape is the same on all.
+
+    Parameters
+    ----------
+    comm : mpi4py.MPI.Comm
+    a : array_like
+
+    Returns
+    -------
+    ndarray, shape (ranks, ...)
+    """
+    part = np.array(a, dtype=float, order="C")  # "ascontiguousarray" would give a number an axis
+    parts = np.empty((comm.size, *part.shape))
+    comm.Allgather(part, parts)
+    return parts
+
+
+def total(comm: MPI.Comm, a: Any) -> Any:
+    """Sum over the ranks in their order, the same bits on each of them, which a reduction by MPI does not promise.
+
+    Parameters
+    ----------
+    comm : mpi4py.MPI.Comm
+    a : array_like
+
+    Returns
+    -------
+    float or ndarray
+    """
+    sums = gathered(comm, a).sum(axis=0)
+    return sums if sums.ndim else float(sums)
+
+
+def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EIPSolver]:
+    """Make of an EIP method the class for states that lie on several ranks.
+
+    Every rank calls `solve_ivp`, or the class itself and its ``step()``, with its part of the state.
+
+    Parameters
+    ----------
+    method : type
+        `EIPRK4` or another, on a tableau.
+    comm : mpi4py.MPI.Comm, optional
+        Default: ``MPI.COMM_WORLD``.
+
+    Returns
+    -------
+    type
+        A subclass of `method`. It steps with a fixed `h`, in the Euclidean metric, and takes the options `h`,
+        `invariants`, `iterations`, `every` (a number), `reuse_f`, `check` and `diagnostics`. The check at the start
+        compares invariants between ranks, and with their gradients; whether they are invariants it does not see.
+
+    Raises
+    ------
+    TypeError
+        When `method` is no such class.
+
+    Notes
+    -----
+    A correction is a combination of the gradients. On each rank their parts are written in an orthonormal basis of the
+    space that they span there, l numbers each for l invariants; what all ranks have together, (l, ranks * l), holds
+    every product of the gradients to round-off, and `eip_scipy._step.project_step` projects on that, alike on all
+    ranks. This is the first half of a QR factorisation of tall matrices (Demmel, Grigori, Hoemmen & Langou, SIAM J.
+    Sci. Comput. 34 (2012) A206-A239).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.integrate import solve_ivp
+    >>> from eip_scipy import EIPRK4, Invariant
+    >>> from eip_scipy.integrations.mpi import MPI, over_ranks, total
+    >>> def fun(t, y):  # oscillators, one on each rank
+    ...     return np.array([y[1], -y[0]])
+    >>> energy = Invariant(lambda t, y: total(MPI.COMM_WORLD, y @ y), lambda t, y: 2 * y)
+    >>> sol = solve_ivp(fun, (0, 1), [1.0, 0.0], method=over_ranks(EIPRK4), h=0.1, invariants=energy)
+    >>> bool(np.allclose(sol.y[:, -1], [np.cos(1), -np.sin(1)], atol=1e-5))
+    True
+    """
+    if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
+        raise TypeError(f"over_ranks: method must be an EIP class such as EIPRK4, got {method!r}.")
+    if isinstance(method.TABLEAU, OneStep):
+        raise TypeError(f"over_ranks: {method.__name__} is no Runge-Kutta method; its step would see one rank's part.")
+    if method._project_step is not EIPSolver._project_step:
+        raise TypeError(f"over_ranks: {method.__name__} has a _project_step of its own, or is on ranks already.")
+    members = {"COMM": MPI.COMM_WORLD if comm is None else comm, "__doc__": f"`{method.__name__}` over ranks."}
+    return type(f"{method.__name__}OverRanks", (_OverRanks, method), members)
+
+
+class _OverRanks(EIPSolver):
+    """What `over_ranks` puts before a method."""
+
+    COMM: MPI.Comm
+
+    def __init__(self, fun: Callable[..., Any], t0: float, y0: Any, t_bound: float, **options: Any) -> None:
+        _refuse(type(self).__name__, options)
+        super().__init__(fun, t0, y0, t_bound, **options | {"metric": "euclidean", "check": False})
+        run = self._run
+        if options.get("check", True) and run.invariants.size:
+            _check(self.COMM, run.invariants, t0, self.y, self.f, options["h"])
+        # In the place of the tableau, as a user's one-step method would be.
+        run.method = _Tableau(self.COMM, run.method)  # type: ignore[arg-type, assignment]
+        self._coordinates = _Coordinates(self.COMM, run, self._rhs)
+
+    def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
+        if not self._project_now:
+            return super()._project_step(t, y, y_hat, err)
+        options, y_new = self._run.options, self._buffer
+        # Joint invariants sum over the ranks themselves.
+        if options.joint is not None and project_jointly(t, options, self._work, y_new, y_new.view(float)):
+            self._projection_status = kn.OK
+        else:
+            self._projection_status = self._coordinates.project(self.t, t, self._last, y_new)
+        return y_new
+
+    def _dense_output_impl(self) -> Any:
+        raise NotImplementedError(
+            f"{type(self).__name__} has no dense output, which t_eval, events and dense_output=True need; choose h so "
+            "that steps end where you look."
+        )
+
+
+def _refuse(name: str, options: dict[str, Any]) -> None:
+    """The options that a state on several ranks does not have.
+
+    Raises
+    ------
+    TypeError
+        For an unknown option, or one of `EIPSolver` that is not among them.
+    ValueError
+        For a value that needs the whole state on one rank.
+    """
+    for option in options:
+        if option not in OPTIONS:
+            raise TypeError(f"{name} has no option {option!r}, only {', '.join(OPTIONS)}{nearest(option, OPTIONS)}")
+    if options.get("h") is None:
+        raise ValueError(f"{name} takes fixed steps only: give h.")
+    metric = options.get("metric")
+    if metric is not None and not (isinstance(metric, str) and metric == "euclidean"):
+        raise ValueError(f"{name} has the Euclidean metric only, got metric = {metric!r}.")
+    if options.get("every", 1) == "auto":
+        raise ValueError(f"{name}: every='auto' needs an error estimate, which fixed steps do not take; give a number.")
+    for item in as_invariants(options.get("invariants", ())):
+        if item.target is not None or item.grad is None:
+            raise ValueError(f"{name}: {item!r} must have a gradient and no target; its value at the start is kept.")
+
+
+def _check(comm: MPI.Comm, known: InvariantSet, t: float, y: np.ndarray, f: np.ndarray, h: float) -> None:
+    """What a run on one rank checks of gradients, on the plane through y along two random directions.
+
+    Raises
+    ------
+    ValueError
+        On all ranks, when an invariant differs between them or from its gradient.
+    """
+    for name, values in zip(known.names, gathered(comm, known.start_values).T, strict=True):
+        if np.any(values != values[0]):
+            raise ValueError(
+                f"invariant {name!r} is {values.min():.17g} on one rank and {values.max():.17g} on another; let it "
+                "return the sum over ranks, total(comm, ...)."
+            )
+    rng = np.random.default_rng([20220, comm.rank])
+    parts = rng.standard_normal((2, y.size)) + (1j * rng.standard_normal((2, y.size)) if y.dtype.kind == "c" else 0.0)
+    directions = parts * (np.abs(y) + h * np.abs(f))
+    slopes = total(comm, np.real(np.conj(known.gradients(t, y, f)) @ directions.T))
+    plane = [
+        Invariant(
+            lambda t, z, k=k: known.values(t, y + (z - 1) @ directions)[k], lambda t, z, k=k: slopes[k], name=name
+        )
+        for k, name in enumerate(known.names)
+    ]
+    here, nowhere = np.ones(2), np.zeros(2)
+    InvariantSet(plane, t, here, nowhere, 0.0).check(t, here, nowhere, 0.0)
+
+
+class _Tableau:
+    """A tableau whose step fails on all ranks if it fails on one: the others would wait for it in a sum."""
+
+    def __init__(self, comm: MPI.Comm, method: Method) -> None:
+        self._comm, self._method = comm, method
+        self.b, self.c, self.exponent = method.b, method.c, method.exponent
+
+    def raw_step(
+        self, rhs: Any, params: Any, t: float, y: np.ndarray, y_r: np.ndarray, t_new: float, h: float, project: bool,
+        o: Options, w: Work,
+    ) -> int:  # fmt: skip
+        """What `eip_scipy._step.raw_step` does."""
+        advance_raw(rhs, params, t, y, y_r, h, self._method, o, w)
+        if not gathered(self._comm, kn.all_finite(w.y_hat_r)).all():
+            return kn.NOT_FINITE
+        look_back(rhs, params, t_new, y_r, h, project, self._method, o, w)
+        return kn.OK
+
+
+class _Coordinates:
+    """The projection in coordinates of the space that the gradients span, the raw result being its origin.
+
+    `eip_scipy._step` calls `rhs`, `inv` and `grad` with coordinates of all ranks, ``c[rank * l + i]`` along the basis'
+    row i of that rank.
+    """
+
+    def __init__(self, comm: MPI.Comm, run: _setup.Run, rhs: Callable[..., None]) -> None:
+        self._comm, self._run, self._rhs = comm, run, rhs
+        w, size = run.work, run.invariants.size
+        self._own = slice(comm.rank * size, (comm.rank + 1) * size)
+        # Sizes of the invariants' terms stand in for those that the step would find at the state itself.
+        self._options = run.options._replace(scales=np.empty(size))
+        names = ("values", "g", "band", "before", "defect", "max_defect", "max_correction", "norm", "counters")
+        work = make_work(comm.size * size, np.dtype(float), 0, size, 0)
+        self._work = work._replace(**{name: getattr(w, name) for name in names})
+        self._new = np.zeros(comm.size * size)
+
+    def project(self, t_old: float, t: float, last: bool, y_new: np.ndarray) -> int:
+        """Project the run's raw result into `y_new`; returns a status of the step."""
+        w, new = self._work, self._new
+        status = project_step(self.rhs, self.inv, self.grad, None, t_old, new, new, t, last, self._options, w, new, new)
+        y_new[:] = self._state(new)
+        return status
+
+    def rhs(self, t: float, c: np.ndarray, out: np.ndarray, params: Any) -> None:
+        """The derivative at c, kept for `grad`; its coordinates are of no use."""
+        self._rhs(t, self._state(c), self._run.work.f_point, params)
+
+    def inv(self, t: float, c: np.ndarray, values: np.ndarray, params: Any) -> None:
+        """Fill `values` (l,)."""
+        self._run.invariants.inv(t, self._state(c), values)
+
+    def grad(self, t: float, c: np.ndarray, f: np.ndarray, G: np.ndarray, params: Any) -> None:
+        """Fill the gradients' coordinates `G` (l, ranks * l); at the raw result the basis is chosen."""
+        w, start = self._run.work, c is self._work.y_hat
+        self._run.invariants.grad(t, self._state(c), w.K[-1] if start else w.f_point, w.G)
+        if start:
+            self._choose_basis()
+        part = np.empty((self._options.scales.size, self._options.scales.size + 1))
+        part[:, :-1] = [[dot(row, direction) for direction in w.Q] for row in w.G_r]
+        part[:, -1] = [abs_dot(row, w.y_hat_r) for row in w.G_r]
+        parts = gathered(self._comm, part)
+        G[:] = parts[:, :, :-1].swapaxes(0, 1).reshape(G.shape)
+        if start:
+            np.maximum(self._run.options.scales, parts[:, :, -1].sum(axis=0), out=self._options.scales)
+
+    def _choose_basis(self) -> None:
+        """Orthonormal rows of Q, in the place of gradients that depend on the others rows of zeros."""
+        w = self._run.work
+        w.Q[:] = w.G_r
+        rank = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)
+        # A gradient that is not finite makes its products so, and all ranks see them.
+        w.Q[w.pivots[max(rank, 0) :].astype(int)] = 0.0 if rank >= 0 else np.nan
+
+    def _state(self, c: np.ndarray) -> np.ndarray:
+        """The rank's part of the state at c; a buffer."""
+        w = self._run.work
+        if c is self._work.y_hat:
+            return w.y_hat
+        kn.combine(w.y_hat_r, 1.0, c[self._own], w.Q, w.Q.shape[0], w.stage_r)
+        return w.stage

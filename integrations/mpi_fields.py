@@ -1,0 +1,235 @@
+"""The rotating Gross-Pitaevskii equation with its field cut into slabs, one for each rank of an MPI communicator.
+
+A rank holds the field at some of the points x, for all y and z. It transforms along y and z where the field lies, and
+along x after a transposition, in which each rank sends to every other one what the two have in common. A right-hand
+side takes two transpositions, an energy one.
+
+Needs ``pip install "eip_scipy[mpi]"`` and an MPI library.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from eip_scipy.problems.gross_pitaevskii import Grid, GrossPitaevskii, Multiplier
+from eip_scipy.problems.gross_pitaevskii.transforms import Axes, Transforms
+
+from .mpi import MPI, gathered, total
+
+__all__ = ["Slab", "SlabGrossPitaevskii", "Transposition"]
+
+
+class Slab(Grid):
+    """Consecutive points of a grid along one axis, all along the others.
+
+    Parameters
+    ----------
+    whole : Grid
+    axis : int
+    part : slice
+        Which points, from a start to a stop.
+
+    Attributes
+    ----------
+    whole, part
+        As given.
+    shape : tuple of int
+        Of the part. The other attributes are those of the whole grid.
+    """
+
+    def __init__(self, whole: Grid, axis: int, part: slice) -> None:
+        super().__init__(whole.shape, whole.lower, whole.upper)
+        self.whole, self.part, self._axis = whole, part, axis
+        self.shape = tuple(part.stop - part.start if k == axis else n for k, n in enumerate(whole.shape))
+
+    def __repr__(self) -> str:
+        return f"Slab({self.whole!r}, {self._axis}, {self.part!r})"
+
+    def points(self, axis: int) -> np.ndarray:
+        """Coordinates along one axis, of the points that are here."""
+        points = self.whole.points(axis)
+        return points[self.part] if axis == self._axis else points
+
+    def wavenumbers(self, axis: int, *, odd: bool = False) -> np.ndarray:
+        """All wavenumbers along one axis."""
+        return self.whole.wavenumbers(axis, odd=odd)
+
+
+class Transposition:
+    """How a field lies on the ranks, in slabs of x or turned, in slabs of y, and the way from one to the other.
+
+    Parameters
+    ----------
+    grid : Grid
+        The whole grid.
+    comm : mpi4py.MPI.Comm
+
+    Attributes
+    ----------
+    slab, turned : Slab
+        The parts of this rank, (j, K[, L]) and (J, k[, L]).
+    here, image : ndarray
+        Two turned fields of this rank, as transforms are from one array to another.
+
+    Raises
+    ------
+    ValueError
+        In one dimension, or when there are more ranks than points along x or y.
+    """
+
+    def __init__(self, grid: Grid, comm: MPI.Comm) -> None:
+        if grid.dim == 1 or comm.size > min(grid.shape[:2]):
+            raise ValueError(f"{comm.size} ranks need as many points along x and along y, got {grid!r}.")
+        self._comm = comm
+        xs, ys = ([slice(*ends) for ends in pairwise(_cuts(n, comm.size))] for n in grid.shape[:2])
+        self.slab, self.turned = Slab(grid, 0, xs[comm.rank]), Slab(grid, 1, ys[comm.rank])
+        self.here, self.image = np.empty(self.turned.shape, complex), np.empty(self.turned.shape, complex)
+        self._sent = np.empty(self.slab.size, complex)
+        # Sizes and places of what MPI carries. What stays on this rank is of no size for it.
+        away = [rank != comm.rank for rank in range(comm.size)]
+        along_y, along_x = self.slab.size // grid.shape[1], self.turned.size // grid.shape[0]
+        sizes = [along_y * (y.stop - y.start) * far for y, far in zip(ys, away, strict=True)]
+        places = [sum(sizes[:rank]) for rank in range(comm.size)]
+        self._apart = sizes, places
+        self._turned = (
+            [along_x * (x.stop - x.start) * far for x, far in zip(xs, away, strict=True)],
+            [along_x * x.start for x in xs],
+        )
+        j, _, *columns = self.slab.shape
+        self._blocks = [
+            (y, self._sent[place : place + size].reshape(j, -1, *columns))
+            for y, place, size in zip(ys, places, sizes, strict=True)
+            if size
+        ]
+
+    def turn(self, field: np.ndarray) -> None:
+        """Fill `here` with the turned field."""
+        for y, block in self._blocks:
+            np.copyto(block, field[:, y])
+        self.here[self.slab.part] = field[:, self.turned.part]
+        self._comm.Alltoallv([self._sent, self._apart], [self.here, self._turned])
+
+    def turn_back(self, out: np.ndarray) -> None:
+        """Fill `out` with the field whose turned one is in `image`."""
+        self._comm.Alltoallv([self.image, self._turned], [self._sent, self._apart])
+        for y, block in self._blocks:
+            np.copyto(out[:, y], block)
+        out[:, self.turned.part] = self.image[self.slab.part]
+
+
+def _cuts(n: int, ranks: int) -> list[int]:
+    """Where n points are cut, as evenly as can be."""
+    return [n * rank // ranks for rank in range(ranks + 1)]
+
+
+class _TurnedMultiplier(Multiplier):
+    """A real factor of the modes along x, which may vary with y and z: between two transpositions."""
+
+    def __init__(self, way: Transposition, factor: np.ndarray) -> None:
+        self._way = way
+        here = factor[:, way.turned.part] if factor.shape[1] > 1 else factor
+        super().__init__(way.turned, (0,), here)
+
+    def apply(self, fft: Transforms, psi: np.ndarray, out: np.ndarray, first: int = 0) -> None:
+        """Fill `out` with the multiplied field."""
+        self._way.turn(psi)
+        super().apply(fft, self._way.here, self._way.image)
+        self._way.turn_back(out)
+
+    def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
+        """The part of the sum that is on this rank."""
+        self._way.turn(psi)
+        return super().expectation(fft, self._way.here, self._way.image)
+
+
+class SlabGrossPitaevskii(GrossPitaevskii):
+    """`GrossPitaevskii` on the ranks of an MPI communicator.
+
+    Fields, states, gradients and right-hand sides are this rank's part of them. Mass, energy, angular momentum,
+    chemical potential and the bounds of frequencies and steps are those of the whole field, the same number on every
+    rank. All ranks must call these methods, in the same order.
+
+    Parameters
+    ----------
+    grid : Grid
+        The whole grid, in two or three dimensions.
+    potential : callable or array_like, optional
+        A callable gets the coordinates of this rank's points; values are those on the whole grid or on this part.
+    comm : mpi4py.MPI.Comm, optional
+        Default: ``MPI.COMM_WORLD``.
+    **options
+        Those of `GrossPitaevskii`.
+
+    Attributes
+    ----------
+    comm : mpi4py.MPI.Comm
+    grid : Slab
+        This rank's part of the grid; the others are those of `GrossPitaevskii`.
+
+    Raises
+    ------
+    ValueError
+        As `GrossPitaevskii` does, in one dimension, and when there are more ranks than points along x or y.
+
+    Notes
+    -----
+    Splitting methods, ground states and vortices need the whole field: `gather` it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.integrate import solve_ivp
+    >>> from eip_scipy import EIPRK4
+    >>> from eip_scipy.integrations.mpi import over_ranks
+    >>> from eip_scipy.integrations.mpi_fields import SlabGrossPitaevskii
+    >>> from eip_scipy.problems import Grid, harmonic_trap
+    >>> gpe = SlabGrossPitaevskii(Grid((32, 32), -6, 6), harmonic_trap(1, 1), Omega=0.5, beta=10)
+    >>> x, y = gpe.grid.mesh()
+    >>> psi = (x + 1j * y) * np.exp(-(x**2 + y**2) / 2)
+    >>> sol = solve_ivp(gpe.fun, (0, 0.1), psi.ravel(), method=over_ranks(EIPRK4), h=0.01, invariants=gpe.invariants())
+    >>> whole = gpe.gather(sol.y[:, -1])
+    >>> whole is None or whole.shape == (32, 32)  # None but on rank 0
+    True
+    """
+
+    grid: Slab
+
+    def __init__(self, grid: Grid, potential: Any = None, *, comm: MPI.Comm | None = None, **options: Any) -> None:
+        whole = grid.whole if isinstance(grid, Slab) else grid
+        self.comm = MPI.COMM_WORLD if comm is None else comm
+        self._way = Transposition(whole, self.comm)
+        if np.shape(potential) == whole.shape:
+            potential = np.asarray(potential)[self._way.slab.part]
+        super().__init__(self._way.slab, potential, **options)
+        self._options["comm"] = comm
+
+    def part(self, whole: Any) -> np.ndarray:
+        """Cut this rank's part out of a field that every rank has as a whole."""
+        return np.ascontiguousarray(np.reshape(whole, self.grid.whole.shape)[self.grid.part], dtype=complex)
+
+    def linear_terms(self) -> list[tuple[Axes, Any]]:
+        """As `GrossPitaevskii.linear_terms`, but never all axes at once: along x it is a transposed field."""
+        if self.Omega != 0:
+            return super().linear_terms()
+        along_x, *others = (self.kinetic_factor(axis) for axis in range(self.grid.dim))
+        return [((0,), along_x), (tuple(range(1, self.grid.dim)), sum(others))]
+
+    def gather(self, psi: Any) -> np.ndarray | None:
+        """The whole field on rank 0, None elsewhere."""
+        field = self.as_field(psi)
+        sizes = self.comm.gather(field.size)
+        whole = np.empty(self.grid.whole.shape, complex) if self.comm.rank == 0 else None
+        self.comm.Gatherv(field, None if whole is None else [whole, sizes])
+        return whole
+
+    def _total(self, sums: Any) -> Any:
+        return total(self.comm, sums)
+
+    def _largest(self, a: np.ndarray) -> float:
+        return float(gathered(self.comm, super()._largest(a)).max())
+
+    def _multiplier(self, axes: Axes, factor: Any) -> Multiplier:
+        return _TurnedMultiplier(self._way, factor) if 0 in axes else Multiplier(self.grid, axes, factor)
