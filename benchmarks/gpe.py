@@ -1,9 +1,10 @@
-"""Cost of the rotating Gross-Pitaevskii equation: its right-hand side beside its transforms, steps beside plain RK4.
+"""Cost of the rotating Gross-Pitaevskii equation: its right-hand side beside transforms alone, steps beside plain RK4.
 
-    python benchmarks/gpe.py [--json FILE]
+    python benchmarks/gpe.py [--json FILE] [--figure FILE] [--seconds S]
 
-Every time is the least of several, and those that are compared are taken in turn, so that other load on the machine
-disturbs all alike; of steps, processor time. One thread.
+Processor time, the least of several; those that are compared are taken in turn, so that other load on the machine
+disturbs all alike. One thread. "transforms" are a library's alone, a pair along each axis: x, and then the other axes
+together. "linear part" is f without potential and interaction, "auto" what a user gets.
 """
 
 from __future__ import annotations
@@ -16,14 +17,18 @@ from importlib.util import find_spec
 import numpy as np
 from scipy.integrate import RK45
 
-from eip_scipy import EIPRK4
+from eip_scipy import EIPRK4, integrate
 from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
 from eip_scipy.problems.gross_pitaevskii.transforms import LIBRARIES
 from eip_scipy.report import describe_machine, table
 
-SHAPES = ((64, 64), (128, 128), (256, 256), (512, 512), (32, 32, 32), (64, 64, 64), (128, 128, 128))
+FLAT = tuple((n, n) for n in (64, 128, 256, 512, 1024))
+FULL = tuple((n, n, n) for n in (32, 64, 128))
 STEPPED = ((256, 256), (64, 64, 64))
-SECONDS = 4.0  # for each row
+SECONDS = 6.0  # for each row
+FEWEST = 3
+AUTO = "auto"
+STEPS = 20  # of a run by `integrate`
 VARIANTS = {
     "RK4": {"names": ()},
     "EIP-M": {"names": ("mass",)},
@@ -33,21 +38,29 @@ VARIANTS = {
 }
 
 
-def least(functions, seconds=SECONDS):
+def least(functions, seconds):
     """Least result of each function, which times itself; in turn until the seconds are over."""
     best = dict.fromkeys(functions, np.inf)
-    end = time.perf_counter() + seconds
-    while time.perf_counter() < end:
+    end, turns = time.perf_counter() + seconds, 0
+    while turns < FEWEST or time.perf_counter() < end:
         for name, function in functions.items():
             best[name] = min(best[name], function())
+        turns += 1
     return best
 
 
-def timed(function, clock=time.perf_counter):
+def timed(function):
+    """Of short calls several at once: what a call of the clock takes is no part of them."""
+    function()  # compiled, planned
+    begin = time.perf_counter()
+    function()
+    calls = max(1, int(2e-3 / max(time.perf_counter() - begin, 1e-6)))
+
     def run():
-        begin = clock()
-        function()
-        return clock() - begin
+        begin = time.process_time()
+        for _ in range(calls):
+            function()
+        return (time.process_time() - begin) / calls
 
     return run
 
@@ -58,61 +71,131 @@ def equation(shape, fft):
     return gpe, (psi / np.sqrt(gpe.mass(psi))).ravel()
 
 
-def right_hand_side(shape, fft):
-    """Least times [ms] of f, of its transforms alone, and of the energy."""
-    gpe, psi = equation(shape, fft)
-    out, field, work = np.empty_like(psi), psi.reshape(shape), np.empty(shape, complex)
+def right_hand_side(shape, seconds):
+    """Least times [ms] of f and of its transforms, as a user gets it and by each library."""
+    functions = {}
+    for fft in (AUTO, *(name for name in LIBRARIES if find_spec(name) is not None)):
+        gpe, psi = equation(shape, fft)
+        out, field, work = np.empty_like(psi), psi.reshape(shape), np.empty(shape, complex)
+        functions[fft, "f"] = timed(lambda gpe=gpe, psi=psi, out=out: gpe.rhs(0.0, psi, out))
+        if fft == AUTO:
+            functions[fft, "linear part"] = timed(lambda gpe=gpe, field=field, work=work: gpe.linear(field, work))
+            continue
 
-    def transforms():
-        for axes in ((0,), tuple(range(1, len(shape)))):
-            gpe.transforms.forward(field, axes, work)
-            gpe.transforms.backward(work, axes)
+        def transforms(gpe=gpe, field=field, work=work):
+            for axes in ((0,), tuple(range(1, len(shape)))):
+                gpe.transforms.forward(field, axes, work)
+                gpe.transforms.backward(work, axes)
 
-    functions = {"f": lambda: gpe.rhs(0.0, psi, out), "transforms": transforms, "energy": lambda: gpe.energy(psi)}
-    return {name: 1e3 * t for name, t in least({k: timed(f) for k, f in functions.items()}).items()}
+        functions[fft, "transforms"] = timed(transforms)
+    return {key: 1e3 * t for key, t in least(functions, seconds).items()}
 
 
-def steps(shape):
-    """Least times [ms] of a step of each variant, and of SciPy's RK45, which has six stages."""
-    gpe, psi = equation(shape, "auto")
+def steps(shape, seconds):
+    """Least times [ms] of a step of each variant by `integrate` and in `solve_ivp`, and of SciPy's RK45."""
+    gpe, psi = equation(shape, AUTO)
     h = 0.2 * gpe.largest_step(psi)
+    functions = {}
 
-    def ours(names, **options):
-        options["metric"] = "euclidean"
-        return EIPRK4(gpe.fun, 0.0, psi, 1e3, h=h, invariants=gpe.invariants(names), **options)
+    def run(kept, count, others):
+        begin = time.process_time()
+        integrate(gpe.problem(psi, count * h, h), method=EIPRK4, invariants=kept, check=False, **others)
+        return time.process_time() - begin
 
-    solvers = {name: ours(**variant) for name, variant in VARIANTS.items()}
-    solvers["RK45"] = RK45(gpe.fun, 0.0, psi, 1e3, first_step=h, max_step=h, rtol=1e-2, atol=1.0)
-    functions = {name: timed(solver.step, time.process_time) for name, solver in solvers.items()}
-    return {name: 1e3 * t for name, t in least(functions, 5 * SECONDS).items()}
+    for name, variant in VARIANTS.items():
+        others = {key: value for key, value in variant.items() if key != "names"}
+        kept = gpe.invariants(variant["names"])
+        solver = EIPRK4(gpe.fun, 0.0, psi, 1e3, h=h, metric="euclidean", invariants=kept, **others)
+        functions[name, "solve_ivp"] = timed(solver.step)
+        for count in (1, STEPS + 1):
+            functions[name, count] = lambda kept=kept, count=count, others=others: run(kept, count, others)
+    solver = RK45(gpe.fun, 0.0, psi, 1e3, first_step=h, max_step=h, rtol=1e-2, atol=1.0)
+    functions["RK45", "solve_ivp"] = timed(solver.step)
+    found = least(functions, seconds)
+    for name in VARIANTS:  # without what a run of a single step takes
+        found[name, "integrate"] = (found.pop((name, STEPS + 1)) - found.pop((name, 1))) / STEPS
+    return {key: 1e3 * t for key, t in found.items()}
+
+
+def save_figure(found, path):
+    """Draw the cost of f against the number of points, and N log N beside it."""
+    from matplotlib.figure import Figure
+
+    from eip_scipy.plotting import method_styles
+
+    labels = {(AUTO, "f"): "f", ("ducc0", "f"): "f by ducc0",
+              ("ducc0", "transforms"): "ducc0's transforms alone", ("pyfftw", "f"): "f by FFTW",
+              ("scipy", "f"): "f by SciPy"}  # fmt: skip
+    labels = {key: label for key, label in labels.items() if key in found[FLAT[0]]}
+    styles = method_styles(labels.values())
+    figure = Figure(figsize=(9.5, 4.6), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, shapes, title in zip(axes, (FLAT, FULL), ("two dimensions", "three dimensions"), strict=True):
+        points = np.array([np.prod(shape) for shape in shapes])
+        for key, label in labels.items():
+            axis.plot(points, [found[shape][key] for shape in shapes], ms=5, lw=1.2, **styles[label])
+        line = points * np.log2(points)
+        line = line * found[shapes[0]][AUTO, "f"] / line[0]
+        axis.plot(points, line, color="0.4", ls=":", label="N log N, through the first f")
+        axis.set(xscale="log", yscale="log", xlabel="grid points N", title=title)
+        sides = [f"${shape[0]}^{len(shape)}$" for shape in shapes]
+        axis.set_xticks(points, sides)
+        axis.minorticks_off()
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("one evaluation of f [ms]")
+    axes[0].legend(fontsize="small", frameon=False)
+    figure.savefig(path, dpi=160)
+    print(f"wrote {path}")
+
+
+def named(shape):
+    return " x ".join(map(str, shape))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", metavar="FILE")
+    parser.add_argument("--figure", metavar="FILE")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="for each row")
     arguments = parser.parse_args()
     print(describe_machine())
-    results: dict = {"rhs": {}, "steps": {}}
+    found = {shape: right_hand_side(shape, arguments.seconds) for shape in (*FLAT, *FULL)}
+    keys = list(found[FLAT[0]])
+    lines = [(named(shape), [f"{row[key]:.3f}" for key in keys]) for shape, row in found.items()]
+    print("\nRight-hand side and its parts [ms]\n")
+    print(table([list(key) for key in keys], lines))
+    print("\nf as a user gets it: over the linear part, over the cheapest library's transforms alone; ns per point\n")
     lines = []
-    for shape in SHAPES:
-        for fft in LIBRARIES:
-            if find_spec(fft) is None:
-                continue
-            name = f"{' x '.join(map(str, shape))}, {fft}"
-            row = results["rhs"][name] = right_hand_side(shape, fft)
-            numbers = [f"{row[k]:.3f}" for k in ("f", "transforms")] + [f"{row['f'] / row['transforms']:.2f}"]
-            lines.append((name, [*numbers, f"{row['energy']:.3f}", f"{1e6 * row['f'] / np.prod(shape):.1f}"]))
-    print("\nRight-hand side [ms]\n")
-    print(table([["f"], ["transforms"], ["ratio"], ["energy"], ["f, ns per", "point"]], lines))
-    for shape in STEPPED:
-        row = results["steps"][" x ".join(map(str, shape))] = steps(shape)
-        body = [(name, [f"{row[name]:.3f}", f"{row[name] / row['RK4']:.2f}"]) for name in VARIANTS]
-        print(f"\nSteps, {' x '.join(map(str, shape))}, {equation(shape, 'auto')[0].fft}\n")
-        print(table([["ms per step"], ["over RK4"]], body))
-        print(f"an evaluation of f in a step: RK4 {row['RK4'] / 4:.3f} ms, SciPy's RK45 {row['RK45'] / 6:.3f} ms")
+    for shape, row in found.items():
+        f, cheapest = row[AUTO, "f"], min(t for (_, what), t in row.items() if what == "transforms")
+        ratios = [f / row[AUTO, "linear part"], f / cheapest]
+        lines.append((named(shape), [*(f"{r:.2f}" for r in ratios), f"{1e6 * f / np.prod(shape):.1f}"]))
+    print(table([["linear", "part"], ["transforms"], ["ns per", "point"]], lines))
+    stepped = {shape: steps(shape, 5 * arguments.seconds) for shape in STEPPED}
+    for shape, row in stepped.items():
+        body = []
+        for name in VARIANTS:
+            numbers = []
+            for driver in ("integrate", "solve_ivp"):
+                numbers += [f"{row[name, driver]:.3f}", f"{row[name, driver] / row['RK4', driver]:.2f}"]
+            body.append((name, numbers))
+        print(f"\nSteps, {named(shape)} [ms], and over RK4\n")
+        print(table([["integrate"], ["over RK4"], ["solve_ivp"], ["over RK4"]], body))
+        ours = [row["RK4", driver] / 4 for driver in ("integrate", "solve_ivp")]
+        print(
+            f"a stage: RK4 by integrate {ours[0]:.3f} ms, in solve_ivp {ours[1]:.3f} ms; "
+            f"SciPy's RK45 {row['RK45', 'solve_ivp'] / 6:.3f} ms"
+        )
     if arguments.json:
+        results = {"rhs": found, "steps": stepped}
+        plain = {
+            k: {named(s): {", ".join(key): t for key, t in row.items()} for s, row in part.items()}
+            for k, part in results.items()
+        }
         with open(arguments.json, "w") as file:
-            json.dump(results, file, indent=1)
+            json.dump(plain, file, indent=1)
+    if arguments.figure:
+        save_figure(found, arguments.figure)
 
 
 if __name__ == "__main__":

@@ -655,7 +655,8 @@ def _slope_line(axis: Axes, h: np.ndarray, error: np.ndarray, slope: float) -> N
     line = 0.25 * error[np.argmax(h)] * (ends / ends[1]) ** slope
     axis.plot(ends, line, color="0.4", lw=1.0, ls=":")
     start = float(ends[0]), float(line[0])
-    axis.annotate(f"slope {slope:.2f}", start, (4, -2), textcoords="offset points", va="top", fontsize="small")
+    text = axis.annotate(f"slope {slope:.2f}", start, (4, -2), textcoords="offset points", va="top", fontsize="small")
+    text.set_bbox({"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5})
 
 
 class FieldPanel(NamedTuple):
