@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Energy", "Joint"]
 
-NEGLIGIBLE = 1e-17  # a twentieth of a rounding
+NEGLIGIBLE = 1e-16  # less than half a rounding, of a bound that is far too large
 JOINT = ("mass", "energy")
 
 
