@@ -549,7 +549,7 @@ def gram_solution(R, g, mu):
 
     By its factorisation L D L^T, which costs a third of `factor` and squares the condition number: whether it will do
     shows on the way, by the same bound below which one pass of Gram-Schmidt would not. The diagonal of R then holds
-    1/D.
+    1/D. Two rows, the usual case, by Cramer's rule: one division to wait for.
     """
     rows = g.size
     good = True
@@ -557,6 +557,12 @@ def gram_solution(R, g, mu):
         good = good & (R[i, i] > 1e-140) & (R[i, i] < 1e140)
     if no_lane(good):
         return good
+    if rows == 2:
+        determinant = R[0, 0] * R[1, 1] - R[1, 0] * R[1, 0]
+        inverse = 1.0 / determinant
+        mu[0] = (R[1, 0] * g[1] - R[1, 1] * g[0]) * inverse
+        mu[1] = (R[1, 0] * g[0] - R[0, 0] * g[1]) * inverse
+        return good & (determinant > REORTHOGONALISE * REORTHOGONALISE * (R[0, 0] * R[1, 1]))
     for i in range(rows):
         for j in range(1, i):
             for k in range(j):
@@ -612,15 +618,22 @@ def newton_matrix_solve(rows, g, Q, pivots, rank, inner, mu):
 @_jit_inline
 def move_along(mu, Q, sigma, frame, y_hat, move, out):
     """Move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction, neutral to the frame; out = y_hat + move."""
-    weighted_rows(mu, Q, mu.size, 0, out)
+    n = out.size
+    fill(out, 0.0)
+    # Row by row: what the next loop reads was then written in pieces as long as those that it reads.
+    for k in range(mu.size):
+        row = Q[k]
+        if no_lane(mu[k] == 0.0):
+            for j in range(n):
+                out[j] += mu[k] * row[j]
     if frame.products.size > 0:
-        for j in range(out.size):
+        for j in range(n):
             out[j] *= sigma[j]
         keep_frame(out, frame, move)
-        for j in range(out.size):
+        for j in range(n):
             out[j] = y_hat[j] + move[j]
     else:
-        for j in range(out.size):
+        for j in range(n):
             x = sigma[j] * out[j]
             move[j] = x
             out[j] = y_hat[j] + x
