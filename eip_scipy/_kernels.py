@@ -623,9 +623,8 @@ def move_along(mu, Q, sigma, frame, y_hat, move, out):
     # Row by row: what the next loop reads was then written in pieces as long as those that it reads.
     for k in range(mu.size):
         row = Q[k]
-        if no_lane(mu[k] == 0.0):
-            for j in range(n):
-                out[j] += mu[k] * row[j]
+        for j in range(n):
+            out[j] += mu[k] * row[j]
     if frame.products.size > 0:
         for j in range(n):
             out[j] *= sigma[j]

@@ -101,14 +101,6 @@ def _members_largest(a, n):  # emits LLVM
     return top
 
 
-def _members_rows(weights, K, rows, first, out):  # emits LLVM
-    for i in range(out.size):
-        total = spread(0.0)
-        for j in range(rows):
-            total += weights[j] * K[j, first + i]
-        out[i] = total
-
-
 @intrinsic  # emits LLVM
 def _lanes_dot(typingctx, a, b, n):
     if over_members(a, b):
@@ -206,9 +198,6 @@ def _emit_choice(builder: Any, n: Any, widths: Sequence[int], blocks: Callable[[
 
 @intrinsic  # emits LLVM
 def _lanes_rows(typingctx, weights, K, rows, first, out):
-    if over_members(weights, K, out):
-        return in_octets(_members_rows, types.void, weights, K, rows, first, out)
-
     def codegen(context, builder, signature, arguments):
         weights, K, out = (context.make_array(signature.args[k])(context, builder, arguments[k]) for k in (0, 1, 4))
         rows, first = arguments[2:4]

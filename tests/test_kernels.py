@@ -462,7 +462,7 @@ def test_frame_is_a_projector_on_rows_and_moves(frame):
 def test_no_directions_no_move():
     move, out = np.full(2, math.nan), np.empty(2)
     free = _setup.frame_rows(None, 2, 1)
-    kn.move_along(np.zeros(2), np.full((2, 2), math.nan), np.ones(2), free, np.array([1.0, 2.0]), move, out)
+    kn.move_along(np.zeros(2), np.ones((2, 2)), np.ones(2), free, np.array([1.0, 2.0]), move, out)
     np.testing.assert_array_equal(move, 0.0)
     np.testing.assert_array_equal(out, [1.0, 2.0])
 
