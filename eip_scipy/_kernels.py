@@ -619,9 +619,11 @@ def newton_matrix_solve(rows, g, Q, pivots, rank, inner, mu):
 def move_along(mu, Q, sigma, frame, y_hat, move, out):
     """Move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction, neutral to the frame; out = y_hat + move."""
     n = out.size
-    fill(out, 0.0)
     # Row by row: what the next loop reads was then written in pieces as long as those that it reads.
-    for k in range(mu.size):
+    first = Q[0]
+    for j in range(n):
+        out[j] = mu[0] * first[j]
+    for k in range(1, mu.size):
         row = Q[k]
         for j in range(n):
             out[j] += mu[k] * row[j]
