@@ -559,7 +559,7 @@ def gram_solution(R, g, mu):
         return good
     if rows == 2:
         determinant = R[0, 0] * R[1, 1] - R[1, 0] * R[1, 0]
-        inverse = 1.0 / determinant
+        inverse = 1.0 / positive(determinant)
         mu[0] = (R[1, 0] * g[1] - R[1, 1] * g[0]) * inverse
         mu[1] = (R[1, 0] * g[0] - R[0, 0] * g[1]) * inverse
         return good & (determinant > REORTHOGONALISE * REORTHOGONALISE * (R[0, 0] * R[1, 1]))
