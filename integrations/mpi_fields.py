@@ -2,7 +2,7 @@
 
 A rank holds the field at some of the points x, for all y and z. It transforms along y and z where the field lies, and
 along x after a transposition, in which each rank sends to every other one what the two have in common. A right-hand
-side takes two transpositions, an energy one.
+side takes two transpositions; so does an energy, but for that of a raw result, whose right-hand side is known.
 
 Needs ``pip install "eip_scipy[mpi]"`` and an MPI library.
 """

@@ -51,11 +51,10 @@ def run(args: argparse.Namespace) -> int:
         energy_kept=ENERGY_KEPT,
     )
     made = study(quench, progress=not args.quiet, kept=partial(long_runs.kept, args))
-    moved = None
-    if made.fields is not None:
-        moved = motion(after, made.lines[SHOWN].t, made.fields)
-        return conclude(args, made, moved, figures=partial(_figures, args, made, moved))
-    return conclude(args, made, moved)
+    if made.fields is None:
+        return conclude(args, made, None)
+    moved = motion(after, made.lines[SHOWN].t, made.fields)
+    return conclude(args, made, moved, figures=partial(_figures, args, made, moved))
 
 
 def _start(args: argparse.Namespace) -> np.ndarray:
