@@ -18,6 +18,7 @@ from numba.extending import is_jitted
 from scipy.optimize import OptimizeResult
 
 from . import _setup
+from ._interrupts import kept_ctrl_c
 from ._members import FAILED, NOT_RUN, Members, Plan, Task
 from ._names import nearest
 from ._pools import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
@@ -271,9 +272,17 @@ class _Gathered:
         total = len(self.whole.t)
         try:
             if done < total:
-                with tqdm(
-                    total=total, initial=done, desc=self.method, unit="member", unit_scale=True, disable=not progress
-                ) as bar:
+                with (
+                    kept_ctrl_c(),
+                    tqdm(
+                        total=total,
+                        initial=done,
+                        desc=self.method,
+                        unit="member",
+                        unit_scale=True,
+                        disable=not progress,
+                    ) as bar,
+                ):
                     self._gather(pool(), chunks(done), bar)
         except BaseException as error:
             error.partial = self.result()  # type: ignore[attr-defined]

@@ -18,6 +18,7 @@ from . import _kernels as kn
 from . import _resume, _setup
 from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures
 from ._events import Events
+from ._interrupts import kept_ctrl_c, look_for_ctrl_c
 from ._kernels import OK
 from ._names import nearest
 from ._setup import ProjectionOptions, Run
@@ -424,7 +425,8 @@ def integrate(
     for name in unknown:
         hint = nearest(name, integrate.__kwdefaults__ or ())
         raise TypeError(f"integrate() has no option {name!r}{hint}")
-    return prepared(**arguments).run()
+    with kept_ctrl_c():
+        return prepared(**arguments).run()
 
 
 def prepared(
@@ -580,6 +582,7 @@ class Loop:
             if self._stopped_by_callback(0):
                 return 1, STOPPED
         while True:
+            look_for_ctrl_c()
             self.keeper.keep()
             k, rows, begin = driver.step, driver.rows, time.perf_counter()
             code = driver.advance(k + self._chunk(self.chunk))

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
@@ -405,11 +404,10 @@ def test_what_was_there_survives_an_exception():
 @needs_jit
 def test_ctrl_c_within_a_second():
     timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
-    ensemble(kepler(), (0, 3), starts(8))  # compiled before
+    ensemble(kepler(), (0, 4e4), starts(8))  # compiled before, for members side by side too
     timer.start()
     with pytest.raises(KeyboardInterrupt) as info:
-        ensemble(kepler(), (0, 3e7), starts(8))
-    assert time.perf_counter() - info.value.partial.wall_time < np.inf
+        ensemble(kepler(), (0, 3e6), starts(8))
     assert info.value.partial.wall_time < 5
     assert (info.value.partial.status == -2).any()
 
