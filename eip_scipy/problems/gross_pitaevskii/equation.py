@@ -15,7 +15,7 @@ from .._problem import Problem
 from .conserved import Energy, Joint
 from .grid import Grid, Multiplier, SpectralSum
 from .moments import Moments, moments, total_mass
-from .pointwise import add_potential, derivative, float_rows
+from .pointwise import add_potential, derivative, derivative_at_once, float_rows
 from .transforms import Axes, make_transforms
 
 __all__ = ["FieldProblem", "GrossPitaevskii"]
@@ -200,10 +200,13 @@ class GrossPitaevskii:
 
     def rhs(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with -i H(psi) psi; both flat and contiguous, and not the same array."""
-        shape = self.grid.shape
-        psi, image = y.reshape(shape), out.reshape(shape)
-        for where, rest in self._linear.parts(psi, image):
-            derivative(_floats(rest), _floats(psi[where]), self.V[where].reshape(-1), self.beta, _floats(image[where]))
+        shape, linear = self.grid.shape, self._linear
+        psi, V, image = self.rows(y), self.V.reshape(-1, shape[-1]), self.rows(out)
+        rows_of_x = len(V) // shape[0]
+        for begin, rest in linear.parts(y.reshape(shape), out.reshape(shape)):
+            derivative(begin * rows_of_x, self.rows(rest), psi, V, self.beta, image)
+        if linear.single:
+            derivative_at_once(psi, V, self.beta, image)
 
     def fun(self, t: float, y: np.ndarray) -> np.ndarray:
         """-i H(psi) psi, flat: what `solve_ivp` takes."""
@@ -383,10 +386,6 @@ class GrossPitaevskii:
         # Twice the interaction: the linearised term is 2 beta |psi|^2 u + beta psi^2 conj(u).
         local = 2 * abs(self.beta) * self._largest(self.as_field(psi)) ** 2
         return float(limit / (self.largest_frequency() + local))
-
-
-def _floats(field: np.ndarray) -> np.ndarray:
-    return field.reshape(-1).view(np.float64)
 
 
 def _on_grid(potential: Any, grid: Grid) -> np.ndarray:

@@ -148,8 +148,7 @@ class Multiplier:
         Both may be a slab of the field from index `first` of x on, if x is not among the axes transformed.
         """
         fft.forward(psi, self.axes, out)
-        rows = slice(first * self._rows, (first + out.shape[0]) * self._rows) if out.ndim > 1 else slice(None)
-        multiply(float_rows(out, self._columns), self._factor[rows])
+        multiply(first * self._rows, float_rows(out, self._columns), self._factor)
         fft.backward(out, self.axes)
 
     def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
@@ -167,40 +166,43 @@ class SpectralSum:
     fft : Transforms
     terms : sequence of Multiplier
         One at least.
+
+    Attributes
+    ----------
+    single : bool
+        Whether there is but one term.
     """
 
     def __init__(self, grid: Grid, fft: Transforms, terms: Sequence[Multiplier]) -> None:
         self._fft, self._terms = fft, tuple(terms)
+        self.single = len(self._terms) == 1
         self._work = np.empty(grid.shape, complex)
-        whole = len(self._terms) == 1 or 0 in self._terms[-1].axes
+        whole = self.single or 0 in self._terms[-1].axes
         self._slab = grid.shape[0] if whole else max(1, SLAB // max(1, 16 * int(np.prod(grid.shape[1:]))))
 
-    def parts(self, psi: np.ndarray, out: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+    def parts(self, psi: np.ndarray, out: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """Fill `out` with all terms but the last of several, and yield that slab by slab, as long as it is in cache.
 
         Yields
         ------
-        (slice, ndarray)
-            Where along x, and what to add to `out` there: a buffer, or (0,) where there is but one term.
+        (int, ndarray)
+            Where along x, and what to add to `out` from there on: a buffer. Nothing where there is but one term.
         """
         first, *others = self._terms
         first.apply(self._fft, psi, out)
         for term in others[:-1]:
             term.apply(self._fft, psi, self._work)
             out += self._work
-        for begin in range(0, out.shape[0], self._slab):
-            where = slice(begin, begin + self._slab)
-            rest = self._work.reshape(-1)[:0]
-            if others:
-                rest = self._work[: psi[where].shape[0]]
-                others[-1].apply(self._fft, psi[where], rest, begin)
-            yield where, rest
+        for begin in range(0, out.shape[0], self._slab) if others else ():
+            part = psi[begin : begin + self._slab]
+            rest = self._work[: part.shape[0]]
+            others[-1].apply(self._fft, part, rest, begin)
+            yield begin, rest
 
     def apply(self, psi: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with the operator's image of `psi`."""
-        for where, rest in self.parts(psi, out):
-            if rest.size:
-                out[where] += rest
+        for begin, rest in self.parts(psi, out):
+            out[begin : begin + rest.shape[0]] += rest
 
     def expectation(self, psi: np.ndarray) -> float:
         """Sum over the grid of conj(psi) times the image."""

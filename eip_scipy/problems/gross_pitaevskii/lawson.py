@@ -6,11 +6,9 @@ import numpy as np
 
 from .equation import GrossPitaevskii
 from .flows import LinearFlow
-from .pointwise import derivative
+from .pointwise import derivative_at_once
 
 __all__ = ["Lawson4"]
-
-NOTHING = np.zeros(0)
 
 
 class Lawson4:
@@ -66,8 +64,8 @@ class Lawson4:
     def _local(self, psi: np.ndarray) -> np.ndarray:
         """-i (V + beta |psi|^2) psi."""
         out = np.zeros_like(psi)
-        flat, V = psi.reshape(-1).view(float), self.gpe.V.reshape(-1)
-        derivative(NOTHING, flat, V, self.gpe.beta, out.reshape(-1).view(float))
+        gpe = self.gpe
+        derivative_at_once(gpe.rows(psi), gpe.V.reshape(-1, gpe.grid.shape[-1]), gpe.beta, gpe.rows(out))
         return out
 
     def _moved(self, psi: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from numba import njit
 __all__ = [
     "add_potential",
     "derivative",
+    "derivative_at_once",
     "divide_by_root",
     "interaction_energy",
     "local_flow",
@@ -30,19 +31,18 @@ QUARTER_LOW = float.fromhex("0x1.0b4611a626331p-34")
 
 
 @_jit
-def multiply(field, factor):
-    """Field (rows, 2 m) times real factors (rows, m) or, one for each row, (rows, 1)."""
-    rows, width = field.shape
-    for r in range(rows):
-        row = field[r]
-        if factor.shape[1] == 1:
-            a = factor[r, 0]
-            for i in range(width):
+def multiply(first, field, factor):
+    """Field (rows, 2 m) times real factors (more rows, m) or, one for each row, (more rows, 1), from `first` on."""
+    for r in range(field.shape[0]):
+        row, factors = field[r], factor[first + r]
+        if factors.size == 1:
+            a = factors[0]
+            for i in range(row.size):
                 row[i] *= a
         else:
-            for i in range(width // 2):
-                row[2 * i] *= factor[r, i]
-                row[2 * i + 1] *= factor[r, i]
+            for i in range(factors.size):
+                row[2 * i] *= factors[i]
+                row[2 * i + 1] *= factors[i]
 
 
 @_jit
@@ -108,20 +108,30 @@ def interaction_energy(psi, V, beta):
 
 
 @_jit
-def derivative(linear, psi, V, beta, out):
-    """Out = ``-i (out + linear + (V + beta |psi|^2) psi)``, all flat; `linear` may be empty."""
-    if linear.size == 0:
-        for i in range(V.size):
-            a, b = psi[2 * i], psi[2 * i + 1]
-            v = V[i] + beta * (a * a + b * b)
-            re, im = out[2 * i] + v * a, out[2 * i + 1] + v * b
-            out[2 * i], out[2 * i + 1] = im, -re
-    else:
-        for i in range(V.size):
-            a, b = psi[2 * i], psi[2 * i + 1]
-            v = V[i] + beta * (a * a + b * b)
-            re, im = out[2 * i] + linear[2 * i] + v * a, out[2 * i + 1] + linear[2 * i + 1] + v * b
-            out[2 * i], out[2 * i + 1] = im, -re
+def derivative(first, rest, psi, V, beta, out):
+    """Out = ``-i (out + rest + (V + beta |psi|^2) psi)``, in as many rows from `first` on as `rest` has.
+
+    Out and psi (rows, 2 m), V (rows, m), rest (some rows, 2 m).
+    """
+    for r in range(rest.shape[0]):
+        more, field, potential, image = rest[r], psi[first + r], V[first + r], out[first + r]
+        for i in range(potential.size):
+            a, b = field[2 * i], field[2 * i + 1]
+            v = potential[i] + beta * (a * a + b * b)
+            re, im = image[2 * i] + more[2 * i] + v * a, image[2 * i + 1] + more[2 * i + 1] + v * b
+            image[2 * i], image[2 * i + 1] = im, -re
+
+
+@_jit
+def derivative_at_once(psi, V, beta, out):
+    """Out = ``-i (out + (V + beta |psi|^2) psi)``; psi and out (rows, 2 m), V (rows, m)."""
+    for r in range(V.shape[0]):
+        field, potential, image = psi[r], V[r], out[r]
+        for i in range(potential.size):
+            a, b = field[2 * i], field[2 * i + 1]
+            v = potential[i] + beta * (a * a + b * b)
+            re, im = image[2 * i] + v * a, image[2 * i + 1] + v * b
+            image[2 * i], image[2 * i + 1] = im, -re
 
 
 @_jit
