@@ -18,12 +18,12 @@ import numpy as np
 
 from . import _kernels as kn
 from ._kernels import OK, FrameRows
-from ._lanes import dot, largest
+from ._lanes import dot, largest, out_of_line
 from ._octets import LANES, any_lane, is_not, lane_of, octets, spread, where
-from ._step import ERROR, HEALTHY, Work, _jitable, _jitable_cold, advance_raw, close_step, look_back, make_work
+from ._step import ERROR, HEALTHY, Work, _jitable, advance_raw, close_step, look_back, make_work
 from .result import N_COUNTERS, NJEV
 
-__all__ = ["Lanes", "Leavers", "make_advance_batch", "make_lanes", "make_lanes_work"]
+__all__ = ["Lanes", "Leavers", "finish_batch", "make_advance_batch", "make_lanes", "make_lanes_work"]
 
 
 class Leavers(NamedTuple):
@@ -188,9 +188,10 @@ def correct_octet(c, o, w, s, y, all_new):
     octets(s.correction, c)[0] = correction
 
 
-@_jitable_cold
+@_jitable
 def solve_alone(lane, o, w, s, all_new):
     """The Newton step of one member, whose gradients are nearly parallel or vanish, by pivoted QR."""
+    out_of_line()
     one = s.single
     for i in range(one.y_hat.size):
         one.sigma[i] = s.sigma[i, lane]
@@ -239,8 +240,9 @@ def let_leave(those, c, k, w, s, y, y_new):
                 put_aside(c + lane, k, w, s, y, y_new)
 
 
-@_jitable_cold
+@_jitable
 def put_aside(lane, k, w, s, y, y_new):
+    out_of_line()
     left = s.left
     s.alive[0, lane] = 0.0
     left.step[lane] = k

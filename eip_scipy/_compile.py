@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from .invariants import Invariant, InvariantSet
 
 WRONG_FUN = "fun returned an array of another shape than at the start"
 
-__all__ = ["CompiledFunctions", "NotCompilableError", "compile_functions", "signatures"]
+__all__ = ["CompiledFunctions", "NotCompilableError", "compile_functions", "signatures", "with_inlined"]
 
 
 class NotCompilableError(TypeError):
@@ -34,6 +35,17 @@ class CompiledFunctions(NamedTuple):
     inv: Callable[..., None]
     grad: Callable[..., None]
     event: Callable[..., None]
+
+
+def with_inlined(function: Callable[..., Any], *callees: Callable[..., Any]) -> Callable[..., Any]:
+    """A copy of a driver, to be compiled, into which Numba writes those of its callees before it compiles anything.
+
+    A callee that is compiled for itself is optimised and translated once by itself, and once more in the driver, with
+    all that it calls.
+    """
+    inlined = {callee.__name__: njit(inline="always", error_model="numpy", _nrt=False)(callee) for callee in callees}
+    names = function.__globals__ | inlined
+    return FunctionType(function.__code__, names, function.__name__, None, function.__closure__)
 
 
 class Signatures(NamedTuple):

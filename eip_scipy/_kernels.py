@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ._lanes import abs_dot, dot, largest, remove_component, weighted_rows
+from ._lanes import abs_dot, combined_rows, dot, largest, out_of_line, remove_component, weighted_rows
 from ._octets import is_not, no_lane, where
 from ._triples import shift_and_weigh, shift_bodies, sum_bodies
 
@@ -131,24 +131,20 @@ def all_finite(a):
 @_jit_inline
 def combine(y, h, weights, K, stages, out):
     """Out = y + h sum_j weights[j] K[j] over the first `stages` rows, zero weights skipped."""
-    weighted_rows(weights, K, stages, 0, out)
-    for i in range(y.size):
-        out[i] = y[i] + h * out[i]
+    combined_rows(y, h, weights, K, stages, 0, out)
 
 
 @_jit_inline
 def weighted_sum(weights, K, first, scale, out):
     """Out = scale sum_j weights[j] K[j, first:]."""
-    weighted_rows(weights, K, weights.size, first, out)
-    for i in range(out.size):
-        out[i] *= scale
+    weighted_rows(scale, weights, K, weights.size, first, out)
 
 
 @_jit_inline
 def nystrom_position(y, h, c, weights, K, stages, out):
     """First half of out = q + c h v + h^2 sum_j weights[j] a_j, for y = (q, v) and a_j the second half of K[j]."""
     half = out.size // 2
-    weighted_rows(weights, K, stages, half, out[:half])
+    weighted_rows(1.0, weights, K, stages, half, out[:half])
     for i in range(half):
         out[i] = y[i] + h * (c * y[half + i] + h * out[i])
 
@@ -157,9 +153,7 @@ def nystrom_position(y, h, c, weights, K, stages, out):
 def nystrom_velocity(y, h, weights, K, stages, out):
     """Second half of out = v + h sum_j weights[j] a_j."""
     half = out.size // 2
-    weighted_rows(weights, K, stages, half, out[half:])
-    for i in range(half, 2 * half):
-        out[i] = y[i] + h * out[i]
+    combined_rows(y[half:], h, weights, K, stages, half, out[half:])
 
 
 @_jit
@@ -497,6 +491,7 @@ def factor(B, inverse_norms, R, pivots):
     R[k, i] is the component of normalised row i along it, but for i = pivots[k] its reciprocal. By modified
     Gram-Schmidt, with a second pass where cancellation would have spoilt the first.
     """
+    out_of_line()
     rows = B.shape[0]
     first = 0
     for i in range(rows):

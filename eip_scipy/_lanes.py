@@ -15,11 +15,11 @@ import numpy as np
 from llvmlite import ir
 from numba import config, njit, types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.extending import intrinsic, lower_builtin, type_callable
 
 from ._octets import OCTET, in_octets, over_members, spread, where
 
-__all__ = ["abs_dot", "dot", "largest", "remove_component", "weighted_rows"]
+__all__ = ["abs_dot", "combined_rows", "dot", "largest", "out_of_line", "remove_component", "weighted_rows"]
 
 LANES = 8
 WIDTHS = (16, 8, 4, 2, 1)  # of sums over rows: two vectors side by side wait less for each other
@@ -145,12 +145,17 @@ def _lanes_largest(typingctx, a, n):
     return types.float64(a, types.intp), codegen
 
 
+def _spread(builder: Any, value: Any, kind: Any) -> Any:  # emits LLVM
+    vector = ir.Constant(kind, ir.Undefined)
+    for k in range(kind.count):
+        vector = builder.insert_element(vector, value, ir.Constant(ir.IntType(32), k))
+    return vector
+
+
 @intrinsic  # emits LLVM
 def _lanes_remove(typingctx, row, unit_row, r, n):
     def codegen(context, builder, signature, arguments):
-        spread = ir.Constant(VECTOR, ir.Undefined)
-        for k in range(LANES):
-            spread = builder.insert_element(spread, arguments[2], ir.Constant(ir.IntType(32), k))
+        spread = _spread(builder, arguments[2], VECTOR)
 
         def body(i):
             target = _pointer(context, builder, signature.args[0], arguments[0], i)
@@ -164,9 +169,10 @@ def _lanes_remove(typingctx, row, unit_row, r, n):
     return types.float64(row, unit_row, types.float64, types.intp), codegen
 
 
-def _emit_rows(builder: Any, weights: Any, K: Any, stride: Any, rows: Any, out: Any, i: Any, width: int) -> None:
-    # emits LLVM
-    """out[i : i + width] = the sum, row by row, weights of 0 skipped."""
+def _emit_rows(
+    builder: Any, y: Any, scale: Any, weights: Any, K: Any, stride: Any, rows: Any, out: Any, i: Any, width: int
+) -> None:  # emits LLVM
+    """out[i : i + width] = y + scale times the sum, row by row, weights of 0 skipped; no y: without it."""
     kind = ir.VectorType(DOUBLE, width)
 
     def place(data: Any, at: Any) -> Any:
@@ -177,12 +183,13 @@ def _emit_rows(builder: Any, weights: Any, K: Any, stride: Any, rows: Any, out: 
     with cgutils.for_range_slice(builder, zero, rows, one, rows.type) as (j, _):
         weight = builder.load(builder.gep(weights, [j]))
         with builder.if_then(builder.fcmp_unordered("!=", weight, ir.Constant(DOUBLE, 0.0))):
-            spread = ir.Constant(kind, ir.Undefined)
-            for k in range(width):
-                spread = builder.insert_element(spread, weight, ir.Constant(ir.IntType(32), k))
             row = builder.load(place(K, builder.add(builder.mul(j, stride), i)), align=8)
-            builder.store(builder.fadd(builder.load(total), builder.fmul(spread, row)), total)
-    builder.store(builder.load(total), place(out, i), align=8)
+            product = builder.fmul(_spread(builder, weight, kind), row)
+            builder.store(builder.fadd(builder.load(total), product), total)
+    result = builder.fmul(_spread(builder, scale, kind), builder.load(total))
+    if y is not None:
+        result = builder.fadd(builder.load(place(y, i), align=8), result)
+    builder.store(result, place(out, i), align=8)
 
 
 def _emit_choice(builder: Any, n: Any, widths: Sequence[int], blocks: Callable[[int], None]) -> None:  # emits LLVM
@@ -196,38 +203,76 @@ def _emit_choice(builder: Any, n: Any, widths: Sequence[int], blocks: Callable[[
                 _emit_choice(builder, n, narrower, blocks)
 
 
+def _emit_all_rows(context: Any, builder: Any, kinds: Any, y: Any, arguments: Any) -> Any:  # emits LLVM
+    """All of out, from (scale, weights, K, rows, first, out)."""
+    scale, weights, K, rows, first, out = arguments
+    weights, K, out = (
+        context.make_array(kind)(context, builder, a) for kind, a in zip(kinds, (weights, K, out), strict=True)
+    )
+    stride = cgutils.unpack_tuple(builder, K.shape)[1]
+    data, n = builder.gep(K.data, [first]), out.nitems
+
+    def fill(begin: Any, width: int) -> None:
+        _emit_rows(builder, y, scale, weights.data, data, stride, rows, out.data, begin, width)
+
+    def blocks(width: int) -> None:
+        """Blocks of one width; the last one ends with the array and may overlap the one before it."""
+        step = ir.Constant(n.type, width)
+        last = builder.sub(n, step)
+        with cgutils.for_range_slice(builder, ir.Constant(n.type, 0), n, step, n.type) as (i, _):
+            fill(builder.select(builder.icmp_signed("<", i, last), i, last), width)
+
+    _emit_choice(builder, n, WIDTHS, blocks)
+    return context.get_dummy_value()
+
+
 @intrinsic  # emits LLVM
-def _lanes_rows(typingctx, weights, K, rows, first, out):
+def _lanes_sum(typingctx, scale, weights, K, rows, first, out):
     def codegen(context, builder, signature, arguments):
-        weights, K, out = (context.make_array(signature.args[k])(context, builder, arguments[k]) for k in (0, 1, 4))
-        rows, first = arguments[2:4]
-        stride = cgutils.unpack_tuple(builder, K.shape)[1]
-        data, n = builder.gep(K.data, [first]), out.nitems
+        return _emit_all_rows(context, builder, (weights, K, out), None, arguments)
 
-        def fill(begin: Any, width: int) -> None:
-            _emit_rows(builder, weights.data, data, stride, rows, out.data, begin, width)
+    return types.void(types.float64, weights, K, types.intp, types.intp, out), codegen
 
-        def blocks(width: int) -> None:
-            """Blocks of one width; the last one ends with the array and may overlap the one before it."""
-            step = ir.Constant(n.type, width)
-            last = builder.sub(n, step)
-            with cgutils.for_range_slice(builder, ir.Constant(n.type, 0), last, step, n.type) as (i, _):
-                fill(i, width)
-            fill(last, width)
 
-        _emit_choice(builder, n, WIDTHS, blocks)
-        return context.get_dummy_value()
+@intrinsic  # emits LLVM
+def _lanes_combine(typingctx, y, scale, weights, K, rows, first, out):
+    def codegen(context, builder, signature, arguments):
+        start = context.make_array(y)(context, builder, arguments[0]).data
+        return _emit_all_rows(context, builder, (weights, K, out), start, arguments[1:])
 
-    return types.void(weights, K, types.intp, types.intp, out), codegen
+    return types.void(y, types.float64, weights, K, types.intp, types.intp, out), codegen
+
+
+def out_of_line():
+    """Keep the function that calls this out of its callers, and its code small: it is rarely run."""
+
+
+@type_callable(out_of_line)
+def _type_out_of_line(context):
+    return lambda: types.none
+
+
+@lower_builtin(out_of_line)  # emits LLVM
+def _mark_out_of_line(context, builder, signature, arguments):
+    # Numba's `forceinline` is handed on from a function to all those that it calls.
+    builder.function.attributes.discard("alwaysinline")
+    for attribute in ("noinline", "cold", "optsize"):
+        builder.function.attributes.add(attribute)
+    return context.get_dummy_value()
 
 
 if config.DISABLE_JIT:
 
-    def _lanes_rows(weights, K, rows, first, out):
+    def _lanes_sum(scale, weights, K, rows, first, out):
         out[:] = 0.0
         for j in range(rows):
             if weights[j] != 0.0:
                 out += weights[j] * K[j, first : first + out.size]
+        out *= scale
+
+    def _lanes_combine(y, scale, weights, K, rows, first, out):
+        _lanes_sum(scale, weights, K, rows, first, out)
+        out += y
 
     def _numpy_sum(products):
         lanes = np.add.reduce(products.reshape(-1, LANES), axis=0)
@@ -273,9 +318,15 @@ def abs_dot(a, b):
 
 
 @_jit
-def weighted_rows(weights, K, rows, first, out):
-    """Out = sum_j weights[j] K[j, first:] over the first `rows` rows, in their order, zero weights skipped."""
-    _lanes_rows(weights, K, rows, first, out)
+def weighted_rows(scale, weights, K, rows, first, out):
+    """Out = scale * sum_j weights[j] K[j, first:] over the first `rows` rows, in their order, zero weights skipped."""
+    _lanes_sum(scale, weights, K, rows, first, out)
+
+
+@_jit
+def combined_rows(y, scale, weights, K, rows, first, out):
+    """Out = y + scale * that sum; y is not out."""
+    _lanes_combine(y, scale, weights, K, rows, first, out)
 
 
 @_jit

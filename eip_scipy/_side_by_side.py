@@ -15,8 +15,8 @@ import numpy as np
 from numba import njit, typeof, types
 
 from . import _setup
-from ._batch import make_advance_batch, make_lanes, make_lanes_work
-from ._compile import NotCompilableError, signatures_of_batches
+from ._batch import finish_batch, make_advance_batch, make_lanes, make_lanes_work
+from ._compile import NotCompilableError, signatures_of_batches, with_inlined
 from ._kernels import OK
 from ._octets import LANES
 from ._step import AUTO, NEW, Options, Span, T
@@ -39,7 +39,8 @@ def _compiled(arguments: tuple[Any, ...]) -> Callable[..., int]:
     """The loop compiled, its callables as first-class functions: cached on disk."""
     functions = [types.FunctionType(s) for s in signatures_of_batches()]
     signature = types.int64(*functions, *arguments)
-    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(advance_batch)
+    whole = with_inlined(advance_batch, finish_batch)
+    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(whole)
 
 
 def lanes_of(n: int) -> int:

@@ -19,6 +19,7 @@ from numba.extending import overload, register_jitable
 from . import _kernels as kn
 from ._joint import project_jointly
 from ._kernels import FAILED_PROJECTION, NOT_FINITE, OK, POSTPONED, FrameRows, Grouping
+from ._lanes import out_of_line
 from .result import (
     HAVE_F,
     LAST_RANK,
@@ -36,7 +37,6 @@ from .result import (
 # Without reference counting and inlined, the driver runs 20 times faster: it hands records of some 40 arrays down.
 _INLINED = {"_nrt": False, "error_model": "numpy", "forceinline": True}
 _jitable = register_jitable(**_INLINED)
-_jitable_cold = register_jitable(_nrt=False, error_model="numpy")
 
 NEW, OLD, MIDPOINT = 0, 1, 2
 # every="auto": each AUTO_SPACING-th step asks whether a projection is worth it.
@@ -308,9 +308,10 @@ def evaluate_invariants(inv, params, t, y, o, w):
         kn.add_products(w.G_r, w.carry_hat, w.values)
 
 
-@_jitable_cold
+@_jitable
 def other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r):
     """The first Newton step along the gradients at y or at the midpoint; w.G holds those at y_hat. Returns the rank."""
+    out_of_line()
     kn.weigh_rows(w.G_r, w.sigma, o.frame, w.B)
     if o.direction == OLD:
         grad(t_old, y, w.K[0], w.G, params)
@@ -332,9 +333,10 @@ def other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r):
     return rank
 
 
-@_jitable_cold
+@_jitable
 def newton_iteration(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
     """One more Newton step along the same directions; False when every defect is inside its dead band."""
+    out_of_line()
     inv(t, y_new, w.values, params)
     if o.uses_f:
         rhs(t, y_new, w.f_point, params)
@@ -447,13 +449,14 @@ def correct(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
     return kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect)
 
 
-@_jitable_cold
+@_jitable
 def correct_softly(rhs, inv, grad, params, t_old, y, y_r, t, largest_error, alone, o, w, y_new, y_new_r):
     """Further tries with weights ever nearer to equal relative errors; at most MAX_SOFTENED.
 
     An estimate can vanish in a component, by symmetry, where the error does not; the others then carry a correction
     far larger than any error of the step. Components that stand alone are prone to it; a block's length is not.
     """
+    out_of_line()
     w.counters[SOFTENED] += 1
     status, rank, correction = FAILED_PROJECTION, 0, np.inf
     for _ in range(MAX_SOFTENED):
@@ -465,7 +468,7 @@ def correct_softly(rhs, inv, grad, params, t_old, y, y_r, t, largest_error, alon
     return status, rank, correction
 
 
-@_jitable_cold
+@_jitable
 def correct_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
     """A last try with the first `rank` directions only; returns the status and the rank.
 
@@ -473,6 +476,7 @@ def correct_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
     all: the distance is of second order, and no shorter step mends it. What the directions left out would have
     corrected stays, so that a defect may grow to the sum of all.
     """
+    out_of_line()
     kn.weigh_rows(w.G_r, w.sigma, o.frame, w.Q)
     found = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)
     rank = max(0, min(rank, found))

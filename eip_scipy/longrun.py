@@ -16,7 +16,7 @@ from numba import njit, typeof, types
 
 from . import _kernels as kn
 from . import _resume, _setup
-from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures
+from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures, with_inlined
 from ._events import Events
 from ._interrupts import kept_ctrl_c, look_for_ctrl_c
 from ._kernels import OK
@@ -141,7 +141,8 @@ def _compiled_advance(dtype: np.dtype, arguments: tuple[Any, ...]) -> Callable[.
     rhs, inv, grad = signatures(dtype)
     functions = [types.FunctionType(s) for s in (rhs, inv, grad, inv)]
     signature = types.int64(*functions, *arguments)
-    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(advance)
+    whole = with_inlined(advance, next_step, finish_step)
+    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(whole)
 
 
 @cache
