@@ -689,7 +689,7 @@ def _compiling(progress: bool) -> Any:
     """A line while the first run of an installation compiles, which takes longer than anyone waits without a word."""
     from tqdm import tqdm
 
-    line = "compiling (a minute or two in the first run, then kept on disk)"
+    line = "compiling (about a minute in the first run, then kept on disk)"
     return tqdm(total=0, desc=line, bar_format="{desc}", leave=False, disable=not progress)
 
 

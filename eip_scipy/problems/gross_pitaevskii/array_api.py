@@ -10,7 +10,7 @@ from .transforms import Axes
 __all__ = ["ArrayGrossPitaevskii", "multiply_modes"]
 
 
-def multiply_modes(field: Any, axes: Axes, factor: Any) -> Any:
+def multiply_modes(field: Any, axes: Axes, factor: Any, fft: Any) -> Any:
     """Transform a field along some axes, multiply by a real factor, transform back.
 
     Parameters
@@ -18,12 +18,13 @@ def multiply_modes(field: Any, axes: Axes, factor: Any) -> Any:
     field, factor : array
         Of one library; the factor broadcasts to the field.
     axes : tuple of int
+    fft : module
+        The library's ``fft``; not every array knows its library.
 
     Returns
     -------
     array
     """
-    fft = field.__array_namespace__().fft
     return fft.ifftn(factor * fft.fftn(field, axes=axes), axes=axes)
 
 
@@ -72,5 +73,5 @@ class ArrayGrossPitaevskii:
         psi = xp.reshape(xp.asarray(y), self._shape)
         image = (self._V + self._beta * (xp.real(psi) ** 2 + xp.imag(psi) ** 2)) * psi
         for axes, factor in self._terms:
-            image = image + multiply_modes(psi, axes, factor)
+            image = image + multiply_modes(psi, axes, factor, xp.fft)
         return xp.reshape(-1j * image, (-1,))
