@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, typeof, types
+from numba.extending import is_jitted
 
 from . import _kernels as kn
 from . import _resume, _setup
@@ -520,7 +521,7 @@ def prepared(
     if checkpoint is not None:
         settings = _resume.settings(method.__name__, stepping, start, parameters, run, grid, happenings)
         keeper.identify(settings, run, t0, start, f0)
-    with _compiling(progress):
+    with _compiling(progress and compiled is not False and is_jitted(fun)):
         functions, why_not = _functions(fun, form, extra, run, happenings, compiled, rhs)
         driver = _Driver(run, grid, functions, parameters, compiled=why_not is None)
     run.work.K[0] = f0 if run.y0 is start else calls(t0, run.y0)
@@ -685,12 +686,12 @@ class Loop:
             return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)
 
 
-def _compiling(progress: bool) -> Any:
+def _compiling(shown: bool) -> Any:
     """A line while the first run of an installation compiles, which takes longer than anyone waits without a word."""
     from tqdm import tqdm
 
     line = "compiling (about a minute in the first run, then kept on disk)"
-    return tqdm(total=0, desc=line, bar_format="{desc}", leave=False, disable=not progress)
+    return tqdm(total=0, desc=line, bar_format="{desc}", leave=False, disable=not shown)
 
 
 def _bar(progress: bool, grid: Grid, label: str) -> Any:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
-from systems import H_USES_F, VOLTERRA, H, L, energy, energy_gradient, lotka_volterra, orbit, pericentre
+from systems import H_USES_F, VOLTERRA, H, L, energy, energy_gradient, jit_orbit, lotka_volterra, orbit, pericentre
 
 from eip_scipy import (
     EIPDOP853,
@@ -708,7 +708,17 @@ def test_callback_at_saved_points():
 
 def test_progress_of_an_adaptive_run(capsys):
     integrate(orbit, (0, 6), Y0, method=EIPRK45, progress=True)
-    assert "EIPRK45" in capsys.readouterr().err
+    shown = capsys.readouterr().err
+    assert "EIPRK45" in shown
+    assert "compiling" not in shown
+
+
+@pytest.mark.needs_jit
+def test_progress_says_that_a_run_is_compiled(capsys):
+    integrate(jit_orbit, (0, 6), Y0, method=EIPRK45, progress=True)
+    assert capsys.readouterr().err.strip().startswith("compiling")
+    integrate(jit_orbit, (0, 6), Y0, method=EIPRK45, progress=True, compiled=False)
+    assert "compiling" not in capsys.readouterr().err
 
 
 def test_hook_after_each_accepted_step():
