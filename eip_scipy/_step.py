@@ -311,7 +311,6 @@ def evaluate_invariants(inv, params, t, y, o, w):
 @_jitable
 def other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r):
     """The first Newton step along the gradients at y or at the midpoint; w.G holds those at y_hat. Returns the rank."""
-    out_of_line()
     kn.weigh_rows(w.G_r, w.sigma, o.frame, w.B)
     if o.direction == OLD:
         grad(t_old, y, w.K[0], w.G, params)
@@ -336,7 +335,6 @@ def other_directions(rhs, grad, params, t_old, y, y_r, t, o, w, y_new_r):
 @_jitable
 def newton_iteration(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
     """One more Newton step along the same directions; False when every defect is inside its dead band."""
-    out_of_line()
     inv(t, y_new, w.values, params)
     if o.uses_f:
         rhs(t, y_new, w.f_point, params)
