@@ -1,4 +1,4 @@
-"""Users' Numba functions in the form that the compiled driver takes: ``(t, y, out, params) -> None``.
+"""Users' Numba functions in the form that the compiled driver takes, ``(t, y, out, params) -> None``; and the driver.
 
 Arrays are copied by loops: these wrappers are compiled in every process, and a slice assignment alone takes Numba more
 than a second.

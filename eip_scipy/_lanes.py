@@ -227,7 +227,9 @@ def _emit_all_rows(context: Any, builder: Any, kinds: Any, y: Any, arguments: An
 
 
 @intrinsic  # emits LLVM
-def _lanes_sum(typingctx, scale, weights, K, rows, first, out):
+def weighted_rows(typingctx, scale, weights, K, rows, first, out):
+    """Out = scale * sum_j weights[j] K[j, first:] over the first `rows` rows, in their order, zero weights skipped."""
+
     def codegen(context, builder, signature, arguments):
         return _emit_all_rows(context, builder, (weights, K, out), None, arguments)
 
@@ -235,7 +237,9 @@ def _lanes_sum(typingctx, scale, weights, K, rows, first, out):
 
 
 @intrinsic  # emits LLVM
-def _lanes_combine(typingctx, y, scale, weights, K, rows, first, out):
+def combined_rows(typingctx, y, scale, weights, K, rows, first, out):
+    """Out = y + scale * that sum; y is not out."""
+
     def codegen(context, builder, signature, arguments):
         start = context.make_array(y)(context, builder, arguments[0]).data
         return _emit_all_rows(context, builder, (weights, K, out), start, arguments[1:])
@@ -263,15 +267,15 @@ def _mark_out_of_line(context, builder, signature, arguments):
 
 if config.DISABLE_JIT:
 
-    def _lanes_sum(scale, weights, K, rows, first, out):
+    def weighted_rows(scale, weights, K, rows, first, out):
         out[:] = 0.0
         for j in range(rows):
             if weights[j] != 0.0:
                 out += weights[j] * K[j, first : first + out.size]
         out *= scale
 
-    def _lanes_combine(y, scale, weights, K, rows, first, out):
-        _lanes_sum(scale, weights, K, rows, first, out)
+    def combined_rows(y, scale, weights, K, rows, first, out):
+        weighted_rows(scale, weights, K, rows, first, out)
         out += y
 
     def _numpy_sum(products):
@@ -315,18 +319,6 @@ def abs_dot(a, b):
     for i in range(whole, a.size):
         rest += abs(a[i] * b[i])
     return _lanes_abs_dot(a, b, whole) + rest
-
-
-@_jit
-def weighted_rows(scale, weights, K, rows, first, out):
-    """Out = scale * sum_j weights[j] K[j, first:] over the first `rows` rows, in their order, zero weights skipped."""
-    _lanes_sum(scale, weights, K, rows, first, out)
-
-
-@_jit
-def combined_rows(y, scale, weights, K, rows, first, out):
-    """Out = y + scale * that sum; y is not out."""
-    _lanes_combine(y, scale, weights, K, rows, first, out)
 
 
 @_jit

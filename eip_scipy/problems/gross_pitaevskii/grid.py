@@ -177,7 +177,7 @@ class SpectralSum:
         self._fft, self._terms = fft, tuple(terms)
         self.single = len(self._terms) == 1
         self._work = np.empty(grid.shape, complex)
-        whole = self.single or 0 in self._terms[-1].axes
+        whole = 0 in self._terms[-1].axes
         self._slab = grid.shape[0] if whole else max(1, SLAB // max(1, 16 * int(np.prod(grid.shape[1:]))))
 
     def parts(self, psi: np.ndarray, out: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
