@@ -1,6 +1,7 @@
-"""What holds for every test: the meaning of ``needs_jit``, plotting without a screen, the hypothesis profile."""
+"""What holds for every test: the meaning of ``needs_jit``, plotting without a screen, Ctrl-C, hypothesis' profile."""
 
 import os
+import signal
 
 import hypothesis
 import numba
@@ -8,6 +9,9 @@ import pytest
 
 # Before any import of matplotlib, and through the environment, so that subprocesses inherit it.
 os.environ["MPLBACKEND"] = "Agg"
+
+# As in a terminal: what a shell starts in the background ignores Ctrl-C, with all its children, and tests press it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The same examples in each run, and no deadline: the first call of a function compiles it. To look for new
 # counterexamples: python -m pytest --hypothesis-profile=default
