@@ -12,16 +12,18 @@ single runs takes it from there.
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from . import _kernels as kn
 from ._kernels import OK, FrameRows
-from ._lanes import dot, largest, out_of_line
+from ._lanes import abs_dot, dot, largest, out_of_line
 from ._octets import LANES, any_lane, is_not, lane_of, octets, spread, where
 from ._step import ERROR, HEALTHY, Work, _jitable, advance_raw, close_step, look_back, make_work
-from .result import N_COUNTERS, NJEV
+from ._trust import EXPECTED, FAR, LARGE, LARGE_SHARE, LEFT, N_FIGURES, START, SUM, TERMS
+from .result import HAVE_ERROR, N_COUNTERS, NJEV, WAITED
 
 __all__ = ["Lanes", "Leavers", "finish_batch", "make_advance_batch", "make_lanes", "make_lanes_work"]
 
@@ -58,7 +60,8 @@ class Single(NamedTuple):
 class Lanes(NamedTuple):
     """What the projection of all members needs: the arrays of `Work`, options and counts with one lane per member.
 
-    `alive` is 1 or 0. What has one number per member has one row.
+    `alive` is 1 or 0. What has one number per member has one row. `trust` holds the figures of `Trust`, as far as they
+    tell which members are `suspect`: these run again by themselves, which then finds all of them.
     """
 
     rtol: np.ndarray
@@ -87,6 +90,8 @@ class Lanes(NamedTuple):
     outside: np.ndarray
     correction: np.ndarray
     alive: np.ndarray
+    trust: np.ndarray
+    suspect: np.ndarray
     start_counts: np.ndarray
     single: Single
     left: Leavers
@@ -124,6 +129,8 @@ def make_lanes(w: Work, rtol: np.ndarray, n_blocks: int, n_products: int) -> Lan
         R=np.zeros((rows, *small)),
         products=np.zeros((n_products, lanes)),
         alive=np.ones((1, lanes)),
+        trust=np.zeros((rows, N_FIGURES, lanes)),
+        suspect=np.zeros((1, lanes)),
         start_counts=np.zeros(N_COUNTERS, np.int64),
         single=_make_single(n, rows),
         left=Leavers(
@@ -212,7 +219,7 @@ def solve_alone(lane, o, w, s, all_new):
 
 
 @_jitable
-def judge_octet(c, k, w, s, y, y_new):
+def judge_octet(c, k, o, w, s, y, y_new):
     """Count what has been done, and let those members leave for whom it was not enough."""
     new, defect = octets(y_new, c), octets(s.defect, c)
     held = kn.defects_held(octets(s.values, c), octets(s.target, c), octets(s.before, c), octets(s.band, c), defect)
@@ -228,7 +235,34 @@ def judge_octet(c, k, w, s, y, y_new):
     reduced = octets(s.rank, c)[0] < 1.0 * defect.size
     octets(s.reduced, c)[0] += where(done & outside & reduced, 1.0, 0.0)
     octets(s.skips, c)[0] += where(done & is_not(outside), 1.0, 0.0)
+    if o.watched:
+        watch_octet(c, done, o, w, s, defect)
     let_leave(alive & is_not(good), c, k, w, s, y, y_new)
+
+
+@_jitable
+def watch_octet(c, done, o, w, s, defect):
+    """What `take_note` and `note` do for one member, as far as it tells whether something stands out."""
+    G, err, trust = octets(w.G, c), octets(s.err, c), octets(s.trust, c)
+    band, before = octets(s.band, c), octets(s.before, c)
+    steps = 1.0 + w.counters[WAITED]
+    errors = sqrt(steps) if o.metric == ERROR else steps
+    suspect = octets(s.suspect, c)[0] > 0.0
+    for i in range(defect.size):
+        terms = o.per_band * band[i]
+        own = min(max(terms, kn.LEAST_SHARE * trust[i, START]), trust[i, TERMS]) + kn.TINY
+        far = abs(defect[i]) > LARGE_SHARE * own
+        known = where(trust[i, TERMS] < np.inf, trust[i, TERMS], 0.0)
+        trust[i, TERMS] = where(far, trust[i, TERMS], max(known, terms))
+        suspect = suspect | (done & (far | (abs(before[i]) > FAR * own)))
+        if w.counters[HAVE_ERROR]:
+            change = before[i] - trust[i, LEFT]
+            expected = errors * abs_dot(G[i], err) + kn.EPS * sqrt(steps) * terms + kn.TINY
+            trust[i, SUM] += where(done, abs(change), 0.0)
+            trust[i, EXPECTED] += where(done, expected, 0.0)
+            suspect = suspect | (done & (abs(change) > LARGE * expected))
+        trust[i, LEFT] = where(done, defect[i], trust[i, LEFT])
+    octets(s.suspect, c)[0] = where(suspect, 1.0, 0.0)
 
 
 @_jitable
@@ -269,7 +303,7 @@ def finish_batch(rhs, inv, grad, params, k, t_new, project, o, w, s, y, y_new, y
             correct_octet(c, o, w, s, y, y_new)
         inv(t_new, y_new, s.values, params)
         for c in range(0, y.shape[1], LANES):
-            judge_octet(c, k, w, s, y, y_new)
+            judge_octet(c, k, o, w, s, y, y_new)
     else:
         for c in range(0, y.shape[1], LANES):
             alive = octets(s.alive, c)[0] > 0.0

@@ -16,6 +16,27 @@ from numba import njit
 from ._lanes import abs_dot, combined_rows, dot, largest, out_of_line, remove_component, weighted_rows
 from ._octets import is_not, no_lane, where
 from ._triples import shift_and_weigh, shift_bodies, sum_bodies
+from ._trust import (
+    AT,
+    EXPECTED,
+    FAR,
+    FIRST,
+    JUDGED,
+    LARGE,
+    LARGE_SHARE,
+    LEFT,
+    MANY,
+    NOTED,
+    NU,
+    RAW,
+    RAW_AT,
+    RAW_MANY,
+    SHARE,
+    SHARE_AT,
+    START,
+    SUM,
+    TERMS,
+)
 
 OK, NOT_FINITE, FAILED_PROJECTION, POSTPONED = 0, 1, 2, 4
 
@@ -29,6 +50,8 @@ REORTHOGONALISE = 0.05
 TINY = 1e-290
 FAILURE_BANDS = 100.0
 NOISE_BANDS = 3.0
+# Terms that vanish for a moment, where an invariant's own pass through zero, count as this share of those at the start.
+LEAST_SHARE = 1e-3
 SPLITTER = 134217729.0  # 2**27 + 1 (Dekker)
 
 
@@ -671,12 +694,14 @@ def add_products(rows, a, out):
 
 
 @_jit
-def judge(values, target, before, band, y, defect):
+def judge(values, target, before, band, y, defect, trust, per_band, limit):
     """Note the defects after a projection; OK or FAILED_PROJECTION.
 
-    It has failed where something is not finite, or a defect has grown and stands above FAILURE_BANDS dead bands.
+    It has failed where something is not finite, or a defect has grown and stands above FAILURE_BANDS dead bands, or it
+    is more than `limit` times the terms of its invariant.
     """
-    return OK if all_finite(y) & defects_held(values, target, before, band, defect) else FAILED_PROJECTION
+    good = all_finite(y) & defects_held(values, target, before, band, defect)
+    return OK if good and small_shares(defect, band, trust, per_band, limit) else FAILED_PROJECTION
 
 
 @_jit
@@ -689,6 +714,99 @@ def defects_held(values, target, before, band, defect):
         grown = (size > abs(before[i])) & (size > FAILURE_BANDS * band[i])
         good = good & (size < np.inf) & is_not(grown)
     return good
+
+
+@_jit
+def start_figures(values, target, scales, G, y, f, tau, trust):
+    """The first figures of a run: its invariants' terms; those that vanish at the start, as they are a step later."""
+    for i in range(target.size):
+        terms = max(max(abs(values[i]), abs(target[i])), max(scales[i], abs_dot(G[i], y)))
+        terms = max(terms, tau * abs_dot(G[i], f))
+        for k in range(trust.shape[1]):
+            trust[i, k] = 0.0
+        trust[i, LEFT] = values[i] - target[i]
+        trust[i, START] = terms if terms < np.inf else 0.0
+        trust[i, TERMS] = terms if terms > 0.0 else np.inf
+
+
+@_jit
+def own_terms(band, per_band, trust, i):
+    """Terms of invariant i to measure a defect by: those now, at most the largest of a state that was on the manifold.
+
+    A state that blows up carries terms as large as its defect. TINY, for what underflows.
+    """
+    return min(max(per_band * band[i], LEAST_SHARE * trust[i, START]), trust[i, TERMS]) + TINY
+
+
+@_jit
+def small_shares(defect, band, trust, per_band, limit):
+    """Whether no defect is more than `limit` times its invariant's terms."""
+    good = True
+    for i in range(defect.size):
+        good = good & (abs(defect[i]) <= limit * own_terms(band, per_band, trust, i))
+    return good
+
+
+@_jit
+def note(defect, max_defect, before, band, G, err, trust, per_band, t, errors, rounding):
+    """What an accepted projection leaves: its defects, and whether the errors of the steps explain its corrections.
+
+    An invariant's local errors since the last projection are worth ``errors sum_k |G_k err_k|``, their rounding
+    `rounding` times its terms; with ``errors = 0`` nothing is known of them. Returns how many invariants stand out.
+    """
+    found = 0
+    for i in range(defect.size):
+        size = abs(defect[i])
+        max_defect[i] = max(max_defect[i], size)
+        terms = per_band * band[i]
+        own = own_terms(band, per_band, trust, i)
+        trust[i, NOTED] += 1.0
+        if abs(before[i]) > FAR * own:
+            found += note_share(abs(before[i]) / own, t, trust[i], RAW, RAW_AT)
+            trust[i, RAW_MANY] += 1.0
+        if size > LARGE_SHARE * own:
+            found += note_share(size / own, t, trust[i], SHARE, SHARE_AT)
+        else:
+            known = trust[i, TERMS] if trust[i, TERMS] < np.inf else 0.0
+            trust[i, TERMS] = max(known, terms)
+        if errors > 0.0:
+            expected = errors * abs_dot(G[i], err) + rounding * terms + TINY
+            found += weigh_change(abs(before[i] - trust[i, LEFT]), expected, t, trust[i])
+        trust[i, LEFT] = defect[i]
+    return found
+
+
+@_jit
+def note_share(share, t, trust, largest_so_far, at):
+    """A defect that is large beside its invariant's terms."""
+    if share > trust[largest_so_far]:
+        trust[largest_so_far] = share
+        trust[at] = t
+    return 1
+
+
+@_jit_inline
+def weigh_change(size, expected, t, trust):
+    """What an invariant changed by since its last projection beside what the steps' errors explain; 1 if LARGE."""
+    trust[JUDGED] += 1.0
+    trust[SUM] += size
+    trust[EXPECTED] += expected
+    if size > trust[NU] * expected:
+        trust[NU] = size / expected
+        trust[AT] = t
+    if size > LARGE * expected:
+        if trust[MANY] == 0.0:
+            trust[FIRST] = t
+        trust[MANY] += 1.0
+        return 1
+    return 0
+
+
+@_jit
+def trapezoid_error(y, y_hat, h, f, f_hat, err):
+    """Err = y_hat - y - h (f + f_hat) / 2: the size of the local error for orders 1 and 2, above it for others."""
+    for i in range(err.size):
+        err[i] = y_hat[i] - y[i] - 0.5 * h * (f[i] + f_hat[i])
 
 
 @_jit

@@ -27,6 +27,7 @@ from ._resume import settings
 from ._setup import Stepping
 from ._side_by_side import Batch
 from ._step import H_ABS, T_NEW, T, Work
+from ._trust import Trust, sick
 from .longrun import ARRIVED, PENDING, ROW, STEP, Grid, Loop, integrate, prepared, saved_rows
 from .result import N_COUNTERS, NFEV
 
@@ -98,6 +99,8 @@ class Members(NamedTuple):
         In local errors.
     side_by_side : ndarray of bool, shape (m,)
         Whether the member ran in a vector with others.
+    trusted : ndarray of bool, shape (m,)
+        Whether it did not fail and nothing speaks against it.
     saved : ndarray, shape (m, times, n)
         States at the plan's `times`; nan after the end of a member that did not reach them. No times: shape (m, 0, n).
     """
@@ -110,6 +113,7 @@ class Members(NamedTuple):
     counters: np.ndarray
     max_correction: np.ndarray
     side_by_side: np.ndarray
+    trusted: np.ndarray
     saved: np.ndarray
 
     @classmethod
@@ -124,6 +128,7 @@ class Members(NamedTuple):
             counters=np.zeros((m, N_COUNTERS), np.int64),
             max_correction=np.full(m, np.nan),
             side_by_side=np.zeros(m, bool),
+            trusted=np.zeros(m, bool),
             saved=np.full((m, times, n), np.nan, dtype),
         )
 
@@ -145,7 +150,9 @@ class Plan:
     """
 
     def __init__(self, task: Task, *, compiled: bool | None = None, progress: bool = False) -> None:
-        options = {"check": False} if compiled is None else {"check": False, "compiled": compiled}
+        options: dict[str, Any] = {"check_start": False}
+        if compiled is not None:
+            options["compiled"] = compiled
         self.task, self._options = task, options
         loop = task.loop(task.y0, task.params, **options, progress=progress)
         grid, run = loop.driver.grid, loop.driver.run
@@ -317,6 +324,7 @@ def _store(loop: Loop, k: int, status: int, message: str, out: Members) -> None:
     out.max_defect[k] = work.max_defect
     out.counters[k] = work.counters
     out.max_correction[k] = loop.diagnostics.max_correction
+    out.trusted[k] = driver.run.trust.trusted and status >= 0
     _describe(out, k, status, message)
 
 
@@ -332,7 +340,7 @@ def _reason(error: BaseException) -> str:
 def sweep(
     advance, rhs, inv, grad, event, params, grid, m, o, w, y, y_r, y_new, y_new_r, t_saved,
     buffers, fresh, G, G_r, where, last, k_end, starts, taus, evaluations, all_params, saved, ends, defects, counters,
-    corrections,
+    corrections, figures,
 ):  # fmt: skip
     """Members from where[0] to `last`, by the driver `advance`.
 
@@ -358,8 +366,11 @@ def sweep(
         w.counters[NFEV] = evaluations
         inv(t0, y, o.target, params)
         grad(t0, y, w.K[0], G, params)
-        if not (kn.all_finite(y_r) and kn.all_finite(w.K_r[0]) and kn.all_finite(o.target) and kn.all_finite(G_r)):
+        sound = kn.all_finite(y_r) and kn.all_finite(w.K_r[0]) and kn.all_finite(o.target)
+        if not (sound and kn.all_finite(G_r.reshape(-1))):
             return DOUBTFUL
+        if o.watched:
+            kn.start_figures(o.target, o.target, o.scales, G_r, y_r, w.K_r[0], taus[k], w.trust)
         rows = saved[min(k, saved.shape[0] - 1)]
         t_saved[0] = t0
         kn.copy(y_r, rows[0])
@@ -371,6 +382,7 @@ def sweep(
         kn.copy(w.max_defect, defects[k])
         kn.copy(w.counters, counters[k])
         corrections[k] = w.max_correction[0]
+        kn.copy(w.trust.reshape(-1), figures[k])
         where[0] += 1
     return OK
 
@@ -390,6 +402,21 @@ def _batch(loop: Loop) -> Batch | None:
         return Batch(loop)
     except NotCompilableError:
         return None
+
+
+class _Each(NamedTuple):
+    """What a driver needs of the members it runs, by member.
+
+    Starts and parameters, lengths of the first steps, evaluations before them, rows for saved states, and the figures
+    of `Trust`, flat.
+    """
+
+    y0s: np.ndarray
+    params: np.ndarray
+    taus: np.ndarray
+    evaluations: int
+    saved: np.ndarray | None
+    figures: np.ndarray
 
 
 class _Driver:
@@ -413,64 +440,71 @@ class _Driver:
 
     def run(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
         """All members into `out`."""
-        loop, driver, where = self.loop, self.loop.driver, self._where
-        m = len(y0s)
+        loop, driver = self.loop, self.loop.driver
+        m, trust = len(y0s), driver.run.work.trust
         taus, evaluations = self._first_steps(plan, y0s, params)
         saved = np.empty((m, driver.t.size, plan.size), plan.dtype) if plan.times.size else None
-        rows = self._row_buffer if saved is None else saved.view(float)
         y0s, params = (np.require(a, requirements=["C", "W"]) for a in (y0s, params))  # one type for compiled code
-        given = (y0s, taus, evaluations, params, rows)
-        wanted = (out.y, out.max_defect, out.counters, out.max_correction)
-        where[0], batch = self._side_by_side(plan, y0s, params, evaluations, saved, out, watch), 1
+        each = _Each(y0s, params, taus, evaluations, saved, np.zeros((m, trust.size)))
+        first, again = self._side_by_side(plan, each, out, watch)
         if m == 0:
-            self._sweep(0, *given, *wanted)
+            self._sweep(0, each, out)
+        self._one_by_one(plan, first, m, each, out, watch)
+        for k in again:
+            self._one_by_one(plan, k, k + 1, each, out, watch)
+        if saved is not None:
+            out.saved[:] = saved[:, : plan.times.size]
+        if np.isnan(loop.diagnostics.max_correction):  # no error estimate to measure by
+            out.max_correction[:] = np.nan
+
+    def _one_by_one(self, plan: Plan, first: int, m: int, each: _Each, out: Members, watch: _Watch) -> None:
+        """Members `first` to `m`."""
+        driver, where, batch = self.loop.driver, self._where, 1
+        where[0] = first
         while where[0] < m:
             watch.update()
             last, begin = min(m, int(where[0]) + batch), time.perf_counter()
             first = int(where[0])
             reason, code = None, OK
             try:
-                code = self._sweep(last, *given, *wanted)
+                code = self._sweep(last, each, out)
             except Exception as error:
                 reason = _reason(error)
             done = int(where[0])
-            out.status[first:done] = 0
-            out.t[first:done] = driver.grid.span.t_bound
-            out.message[first:done] = [ARRIVED] * (done - first)
+            self._arrived(slice(first, done), each, out)
             if done < last:
-                if saved is not None:
-                    driver.y = saved[done]
-                self._look_at(plan, done, code, reason, y0s[done], params[done], out, watch)
-                if code == DOUBTFUL and saved is not None:
-                    saved[done, :-1] = out.saved[done]
-                elif saved is not None:
-                    saved[done, driver.rows :] = np.nan
+                if each.saved is not None:
+                    driver.y = each.saved[done]
+                self._look_at(plan, done, code, reason, each.y0s[done], each.params[done], out, watch)
+                if code == DOUBTFUL and each.saved is not None:
+                    each.saved[done, :-1] = out.saved[done]
+                elif each.saved is not None:
+                    each.saved[done, driver.rows :] = np.nan
                 where[0] += 1
             elif time.perf_counter() - begin < BATCH_SECONDS:
                 batch *= 2
-        if saved is not None:
-            out.saved[:] = saved[:, : plan.times.size]
-        if np.isnan(loop.diagnostics.max_correction):  # no error estimate to measure by
-            out.max_correction[:] = np.nan
 
-    def _side_by_side(
-        self,
-        plan: Plan,
-        y0s: np.ndarray,
-        params: np.ndarray,
-        evaluations: int,
-        saved: np.ndarray | None,
-        out: Members,
-        watch: _Watch,
-    ) -> int:
-        """Run members in batches, while there are enough; returns how many have run."""
-        batch, m = self._batch, len(y0s)
+    def _arrived(self, those: slice, each: _Each, out: Members) -> None:
+        """Members that the sweep took to their ends, and what their corrections say."""
+        run = self.loop.driver.run
+        out.status[those] = 0
+        out.t[those] = self.loop.driver.grid.span.t_bound
+        figures = each.figures[those].reshape(those.stop - those.start, *run.work.trust.shape)
+        out.trusted[those] = ~sick(figures).any(axis=1)
+        out.message[those] = [
+            ARRIVED if trusted else f"{ARRIVED}; {Trust(run.invariants.names, rows).message}"
+            for trusted, rows in zip(out.trusted[those], figures, strict=True)
+        ]
+
+    def _side_by_side(self, plan: Plan, each: _Each, out: Members, watch: _Watch) -> tuple[int, list[int]]:
+        """Run members in batches, while there are enough; how many have run, and which are to run again alone."""
+        batch, m, saved = self._batch, len(each.y0s), each.saved
         if batch is None:
-            return 0
+            return 0, []
         if m == 0:
             batch.compile()
         meetings = saved_steps(self.loop.driver.grid)[1:].tolist()
-        first = 0
+        first, again = 0, []
         while m - first >= batch.lanes // 4:
             group = slice(first, min(m, first + batch.lanes))
 
@@ -479,26 +513,27 @@ class _Driver:
                     saved[group, row + 1] = states
 
             if saved is not None:
-                saved[group, 0] = y0s[group]
-            ends = batch.run(y0s[group], params[group], evaluations, meetings, save, watch.update)
+                saved[group, 0] = each.y0s[group]
+            ends = batch.run(each.y0s[group], each.params[group], each.evaluations, meetings, save, watch.update)
             for k, end in zip(range(group.start, group.stop), ends, strict=True):
                 if end is None:
-                    _alone(plan, k, y0s[k], params[k], out, watch)
-                    if saved is not None:
-                        saved[k, : plan.times.size] = out.saved[k]
+                    again.append(k)
                     continue
                 out.y[k], out.t[k], out.max_defect[k] = end.y, end.t, end.max_defect
                 out.max_correction[k], out.counters[k] = end.max_correction, end.counters
-                out.side_by_side[k] = True
+                out.side_by_side[k], out.trusted[k] = True, not end.reason
                 _describe(out, k, FAILED if end.reason else 0, end.reason or ARRIVED)
             first = group.stop
-        return first
+        return first, again
 
-    def _sweep(self, last: int, *arguments: Any) -> int:
+    def _sweep(self, last: int, each: _Each, out: Members) -> int:
         driver, G = self.loop.driver, self._G
+        rows = self._row_buffer if each.saved is None else each.saved.view(float)
         passed = (
             *(driver.params, driver.grid, *driver._tail, driver.t, self._buffers, self._fresh, G),
-            *(G.view(float).reshape(-1), self._where, last, self.loop.chunk, *arguments),
+            *(G.view(float).reshape(G.shape[0], -1), self._where, last, self.loop.chunk),
+            *(each.y0s, each.taus, each.evaluations, each.params, rows),
+            *(out.y, out.max_defect, out.counters, out.max_correction, each.figures),
         )
         advance: Any = driver._advance
         if self._compiled is None:
@@ -525,6 +560,7 @@ class _Driver:
             _alone(plan, k, y0, params, out, watch)
         elif code == OK:
             loop.chunk *= 2  # so that the next one ends within the sweep
+            loop.driver.run.trust.doubts.clear()
             _finish(plan, loop, k, out, watch)
         else:
             _store(loop, k, FAILED, _setup.failure(code, loop.driver.run, loop.driver.grid.clock), out)

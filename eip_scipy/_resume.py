@@ -246,6 +246,7 @@ class _FileKeeper(Keeper):
         for k in range(len(events.functions)):
             events.restore(k, arrays[f"event_{k}_t"], arrays[f"event_{k}_y"])
         self.seconds = float(header["wall_time"])
+        driver.run.trust.doubts[:] = map(str, header.get("doubts") or ())
         self._ended = (header.get("status"), header.get("message"), step)
         self._origin = f"resumed at step {step}"
 
@@ -317,6 +318,7 @@ class _FileKeeper(Keeper):
             "status": status,
             "message": message,
             "wall_time": snapshot.seconds,
+            "doubts": driver.run.trust.doubts,
             "settings": self._settings,
         }
         arrays = {**self._start, **snapshot.arrays, "saved_t": driver.t[:rows], "saved_y": driver.y[:rows]}

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.integrate import OdeSolver
 from scipy.linalg import block_diag
 
-from ._kernels import EPS, NOT_FINITE, FrameRows, Grouping
+from . import _kernels as kn
+from ._kernels import BAND, BAND_COMPENSATED, EPS, NOT_FINITE, FrameRows, Grouping
 from ._step import (
     AUTO,
     ERROR,
@@ -32,6 +33,7 @@ from ._step import (
     make_work,
     project_step,
 )
+from ._trust import LARGE_SHARE, Trust
 from .invariants import InvariantSet, JointInvariants
 from .nystrom import NystromTableau
 from .one_step import OneStep, as_vector
@@ -45,6 +47,8 @@ AnyMethod = Tableau | NystromTableau | OneStep
 INDEX = np.uint64
 DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
 START_ITERATIONS = 50
+# Steps after which the invariants are checked once more.
+LOOKS = (10, 100)
 UNBOUNDED = 2**62
 LEAST_RTOL = 100 * EPS  # SciPy's
 
@@ -101,6 +105,27 @@ class Run:
     options: Options
     work: Work
     invariants: InvariantSet
+    trust: Trust
+    check: bool
+    tau: float
+
+    def look(self, steps: int, ended: bool, t: float, y: np.ndarray, derivative: Callable[[], np.ndarray]) -> bool:
+        """Look at a run after so many steps, or where it ends: whether something speaks against it, to be said now.
+
+        The invariants are checked at LOOKS (a run that ends before them: there), as their rates and gradients may
+        vanish at the start, and where the corrections are too large, to tell why.
+        """
+        if not self.options.watched:
+            return False
+        early = steps in LOOKS or (ended and steps < LOOKS[0])
+        doubtful = self.trust.beyond_doubt or (ended and bool(self.trust.sick.any()))
+        found: list[str] = []
+        if self.check and (early or doubtful) and not self.trust.doubts:
+            f = derivative()
+            if np.isfinite(f).all():
+                found = [complaint.text for complaint in self.invariants.complaints(t, y, f, self.tau)][:1]
+            self.trust.doubts += found
+        return doubtful or bool(found)
 
 
 class Counted:
@@ -542,6 +567,7 @@ def prepare(
     *,
     extra: tuple = (),
     compensated: bool = False,
+    check_start: bool = True,
 ) -> Run:
     """Validate a run's options and make its buffers; the invariants are checked at the start.
 
@@ -559,6 +585,8 @@ def prepare(
     extra : tuple
         Further arguments of the invariants' functions (``(params,)`` or nothing).
     compensated : bool
+    check_start : bool
+        False: the invariants are checked elsewhere, at the start and later.
     """
     if compensated and isinstance(tableau, OneStep):
         raise ValueError(f"compensated=True carries the rounding of a tableau's sums; {tableau.name} is no tableau.")
@@ -589,6 +617,9 @@ def prepare(
         uses_f=invariants.uses_f,
         compensated=_flag("compensated", compensated),
         adaptive=stepping.h is None,
+        per_band=1.0 / ((BAND_COMPENSATED if compensated else BAND) * EPS),
+        watched=_flag("check", projection.check) and invariants.size > 0,
+        limit=(LARGE_SHARE if stepping.h is None else 1.0) if projection.check else np.inf,
     )
     if _can_project_jointly(options, invariants):
         options = options._replace(joint=invariants.items)
@@ -596,16 +627,28 @@ def prepare(
     work = make_work(n, y0.dtype, arrays.b.size, invariants.size, groups.start.size - 1)
     if sigma is not None:
         work.sigma[:] = sigma
-    run = Run(y0, arrays, options, work, invariants)
+    check = bool(projection.check) and check_start
+    run = Run(y0, arrays, options, work, invariants, Trust(invariants.names, work.trust), check, tau)
     if _flag("project_initial", projection.project_initial):
         run.y0 = projected_start(run, rhs, t0, f0)
         f0 = rhs(t0, run.y0)
     violation = invariants.start_violation(t0, run.y0, f0)
     if violation:
         raise ValueError(f"{violation}; mend y0 or the target, or pass project_initial=True to project y0 first.")
-    if _flag("check", projection.check) and np.isfinite(f0).all():
-        invariants.check(t0, run.y0, f0, tau)
+    if options.watched:
+        _note_terms(run, t0, f0)
+    if check and np.isfinite(f0).all():
+        run.trust.doubts += invariants.check(t0, run.y0, f0, tau)
     return run
+
+
+def _note_terms(run: Run, t0: float, f0: np.ndarray) -> None:
+    """The invariants' terms at the start, by which defects are measured."""
+    known, y0 = run.invariants, run.y0
+    G = known.gradients(t0, y0, f0).view(float)
+    kn.start_figures(
+        known.start_values, known.target, known.scales, G, y0.view(float), f0.view(float), run.tau, run.work.trust
+    )
 
 
 def _can_project_jointly(options: Options, invariants: InvariantSet) -> bool:
@@ -617,7 +660,9 @@ def _can_project_jointly(options: Options, invariants: InvariantSet) -> bool:
 
 def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, f0: np.ndarray) -> np.ndarray:
     """y0 on the targets, by full Newton steps in the euclidean metric."""
-    options = run.options._replace(metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False)
+    options = run.options._replace(
+        metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False, watched=False, limit=np.inf
+    )
     work = make_work(run.y0.size, run.y0.dtype, 0, run.invariants.size, 0)
     work.y_hat[:] = run.y0
     work.K[-1] = f0
@@ -682,10 +727,10 @@ def attach(diagnostics: Any, run: Run) -> None:
         raise TypeError(f"diagnostics must be a Diagnostics() object, got {diagnostics!r}.")
     w = run.work
     diagnostics._attach(
-        tuple(run.invariants.names),
         w.max_defect,
         w.defect,
         w.max_correction,
         w.counters,
+        run.trust,
         estimated=run.options.metric == ERROR,
     )

@@ -20,8 +20,9 @@ from ._compile import NotCompilableError, signatures_of_batches, with_inlined
 from ._kernels import OK
 from ._octets import LANES
 from ._step import AUTO, NEW, Options, Span, T
+from ._trust import EXPECTED, START, SUM, TERMS, TOGETHER
 from .longrun import PENDING, ROW, STEP, Loop, source_stamp
-from .result import LAST_RANK, N_COUNTERS, NFEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
+from .result import FOUND, LAST_RANK, N_COUNTERS, NFEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
 
 __all__ = ["Batch", "Ended", "can_run", "lanes_of"]
 
@@ -115,8 +116,9 @@ class Batch:
         save: Callable[[int, np.ndarray], None],
         watch: Callable[[], None],
     ) -> list[Ended | None]:
-        """Run up to `lanes` members; None for one whose start is not finite in some part.
+        """Run up to `lanes` members; None for one that is to run alone.
 
+        These are members whose start is not finite in some part, and those of whom something stands out.
         `meetings` are the steps (the last one at the end) at which ``save(row, states (m, n))`` is called; `watch` is
         called now and then.
         """
@@ -136,7 +138,14 @@ class Batch:
                 k = end
             save(row, self._states()[:m])
         self._length = length
-        return [self._ended(lane) if sound[lane] else None for lane in range(m)]
+        alone = ~sound | self._suspect()
+        return [None if alone[lane] else self._ended(lane) for lane in range(m)]
+
+    def _suspect(self) -> np.ndarray:
+        """Members whose corrections stand out, singly or in their sum."""
+        s = self._s
+        together = s.trust[:, SUM] > TOGETHER * s.trust[:, EXPECTED]
+        return (s.suspect[0] > 0) | together.any(axis=0)
 
     def compile(self) -> None:
         """What the first run would compile."""
@@ -162,9 +171,21 @@ class Batch:
         w.counters[NFEV] = evaluations
         parts = (self._y, w.K[0], s.target, w.G.reshape(-1, self.lanes))
         sound = np.logical_and.reduce([np.isfinite(part).all(axis=0) for part in parts])
+        self._start_figures()
         s.alive[0] = sound
         s.alive[0, m:] = 0.0
         return sound
+
+    def _start_figures(self) -> None:
+        """What `start_figures` does for one member."""
+        w, s = self._work, self._s
+        moved = abs(self.span.h) * np.sum(np.abs(w.G * w.K[0]), axis=1)
+        sums = np.sum(np.abs(w.G * self._y), axis=1), moved, np.abs(s.target)
+        terms = np.maximum(np.max(sums, axis=0), self._options.scales[:, None])
+        s.trust[:] = 0.0
+        s.suspect[:] = 0.0
+        s.trust[:, START] = np.where(np.isfinite(terms), terms, 0.0)
+        s.trust[:, TERMS] = np.where(terms > 0, terms, np.inf)
 
     def _steps(self, k: int, end: int, params: np.ndarray) -> bool:
         """All members from step k to `end`; returns whether some had to leave."""
@@ -206,6 +227,7 @@ class Batch:
         driver.run.options.target[:] = s.target[:, lane]
         w.max_defect[:], w.max_correction[0] = s.max_defect[:, lane], s.max_correction[0, lane]
         w.counters[:] = self._counters(lane, left.counters[:, lane])
+        w.trust[:] = s.trust[:, :, lane]
         k = int(left.step[lane])
         grid.place[STEP], grid.place[ROW], grid.place[PENDING] = k, 0, 0
         grid.clock[T] = grid.span.t0 + k * grid.span.h
@@ -223,6 +245,7 @@ class Batch:
         self._y[:, lane], self._work.K[0, :, lane] = driver.state, w.K[0]
         self._work.err_sum.reshape(-1, self.lanes)[:, lane] = w.err_sum
         s.max_defect[:, lane], s.max_correction[0, lane] = w.max_defect, w.max_correction[0]
+        s.trust[:, :, lane], s.suspect[0, lane] = w.trust, max(s.suspect[0, lane], float(w.counters[FOUND]))
         s.projections[0, lane] = s.skips[0, lane] = s.reduced[0, lane] = 0.0
         self._own[:, lane], self._joined[:, lane] = w.counters, self._work.counters
         s.alive[0, lane] = 1.0

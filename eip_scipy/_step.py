@@ -10,7 +10,7 @@ The functions here take callables. They are plain Python when called from Python
 
 from __future__ import annotations
 
-from math import isfinite, isnan
+from math import isfinite, isnan, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,11 @@ from . import _kernels as kn
 from ._joint import project_jointly
 from ._kernels import FAILED_PROJECTION, NOT_FINITE, OK, POSTPONED, FrameRows, Grouping
 from ._lanes import out_of_line
+from ._trust import N_FIGURES, TERMS
 from .result import (
+    BEGUN,
+    FOUND,
+    HAVE_ERROR,
     HAVE_F,
     LAST_RANK,
     N_COUNTERS,
@@ -32,6 +36,7 @@ from .result import (
     REJECTED,
     SKIPPED,
     SOFTENED,
+    WAITED,
 )
 
 # Without reference counting and inlined, the driver runs 20 times faster: it hands records of some 40 arrays down.
@@ -41,6 +46,8 @@ _jitable = register_jitable(**_INLINED)
 NEW, OLD, MIDPOINT = 0, 1, 2
 # every="auto": each AUTO_SPACING-th step asks whether a projection is worth it.
 AUTO, AUTO_SPACING = 0, 5
+# Without an estimate of their own, the first so many projections are compared with one, then one in as many.
+SAMPLED_FIRST, SAMPLED_EACH = 8, 16
 EUCLIDEAN, ERROR, GIVEN = 0, 1, 2
 
 
@@ -89,6 +96,8 @@ class Method(NamedTuple):
 class Options(NamedTuple):
     """What a run fixes: `rtol` by float of the state, `atol` by component, `block_atol` by block.
 
+    `watched`: whether corrections are compared with the errors of the steps. `limit`: the share of an invariant's terms
+    that a projection may leave as its defect; the terms are `per_band` dead bands.
     `joint`: in interpreted runs the `JointInvariants` whose functions serve, else None.
     """
 
@@ -108,6 +117,9 @@ class Options(NamedTuple):
     uses_f: bool
     compensated: bool
     adaptive: bool
+    per_band: float
+    watched: bool = False
+    limit: float = np.inf
     joint: Any = None
 
 
@@ -145,6 +157,7 @@ class Work(NamedTuple):
     defect: np.ndarray
     max_defect: np.ndarray
     max_correction: np.ndarray
+    trust: np.ndarray
     norm: np.ndarray
     counters: np.ndarray
     inner: kn.Inner
@@ -168,6 +181,8 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
         name: np.zeros(n_invariants) for name in ("inverse_norms", "mu", "values", "g", "band", "before", "defect")
     }
     floats["sigma"][:] = 1.0
+    trust = np.zeros((n_invariants, N_FIGURES))
+    trust[:, TERMS] = np.inf
     return Work(
         K=K,
         K_r=K_r,
@@ -188,6 +203,7 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
         pivots=np.zeros(n_invariants, np.int64),
         max_defect=np.zeros(n_invariants),
         max_correction=np.zeros(1),
+        trust=trust,
         norm=np.zeros(1),
         counters=np.zeros(N_COUNTERS, np.int64),
         inner=kn.make_inner(n_invariants),
@@ -245,12 +261,36 @@ def look_back(rhs, params, t_new, y_r, h, project, m, o, w):
     """f(y_hat) in K[-1], the local error in w.err and its norm in w.norm where they are wanted."""
     w.counters[HAVE_F] = 0
     estimate = o.adaptive or ((o.metric == ERROR or o.every == AUTO) and o.target.size > 0)
+    w.counters[HAVE_ERROR] = estimate
     if (estimate and m.fsal) or (project and o.uses_f):
         rhs(t_new, w.y_hat, w.K[-1], params)
         w.counters[NFEV] += 1
         w.counters[HAVE_F] = 1
     if estimate:
         estimate_error(y_r, h, m, o, w)
+    elif project and is_sampled(o, w):
+        sample_error(rhs, params, t_new, y_r, h, m, o, w)
+
+
+@_jitable
+def is_sampled(o, w):
+    """Whether this projection, which needs no estimate, is compared with one all the same."""
+    w.counters[BEGUN] += 1
+    begun = w.counters[BEGUN]
+    return o.watched and (begun <= SAMPLED_FIRST or begun % SAMPLED_EACH == 0)
+
+
+@_jitable
+def sample_error(rhs, params, t_new, y_r, h, m, o, w):
+    """The local error in w.err, by an evaluation of f that is not counted and serves nothing else."""
+    out_of_line()
+    if w.counters[HAVE_F] == 0:
+        rhs(t_new, w.y_hat, w.K[-1], params)
+    if kn.largest_abs(m.e) > 0.0 or kn.largest_abs(m.e_v) > 0.0:
+        estimate_error(y_r, h, m, o, w)
+    else:
+        kn.trapezoid_error(y_r, w.y_hat_r, h, w.K_r[0], w.K_r[-1], w.err)
+    w.counters[HAVE_ERROR] = 1
 
 
 def any_raw_step(rhs, params, t, y, y_r, t_new, h, project, m, o, w):
@@ -288,6 +328,10 @@ def close_step(rhs, params, t_new, y_new, project, status, o, w):
     """After the projection: the carry, the errors gathered, and f for the next step's first stage in K[-1]."""
     if o.compensated:
         kn.copy(w.carry_hat, w.carry)
+    if not project or status == POSTPONED:
+        w.counters[WAITED] += 1
+    else:
+        w.counters[WAITED] = 0
     if o.every != 1:
         if status == POSTPONED:
             kn.copy(w.err, w.err_sum)
@@ -370,9 +414,9 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_
     if not outside:
         counters[SKIPPED] += 1
         kn.copy(w.y_hat_r, y_new_r)
-        status = kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect)
+        status = kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect, w.trust, o.per_band, o.limit)
         if status == OK:
-            kn.raise_to(w.defect, w.max_defect)
+            take_note(t, o, w)
         return status
     weigh = o.metric == ERROR
     largest_error, rank, correction = move(rhs, grad, params, t_old, y, y_r, t, weigh, 0.0, o, w, y_new_r)
@@ -391,9 +435,26 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_
         counters[PROJECTIONS] += 1
         counters[RANK_REDUCED] += rank < w.g.size
     if status == OK:
-        kn.raise_to(w.defect, w.max_defect)
+        take_note(t, o, w)
         w.max_correction[0] = max(w.max_correction[0], correction)
     return status
+
+
+@_jitable
+def take_note(t, o, w):
+    """Defects and corrections of an accepted projection; estimates gathered in quadrature are of errors that add."""
+    if not o.watched:
+        kn.raise_to(w.defect, w.max_defect)
+        return
+    waited = w.counters[WAITED]
+    rounding = kn.EPS
+    errors = 1.0 if w.counters[HAVE_ERROR] else 0.0
+    if waited > 0:
+        rounding *= sqrt(1.0 + waited)
+        errors *= sqrt(1.0 + waited) if o.metric == ERROR or o.every == AUTO else 1.0 + waited
+    w.counters[FOUND] += kn.note(
+        w.defect, w.max_defect, w.before, w.band, w.G_r, w.err, w.trust, o.per_band, t, errors, rounding
+    )
 
 
 def project_any(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_new_r):
@@ -444,7 +505,7 @@ def correct(rhs, inv, grad, params, t, rank, o, w, y_new, y_new_r):
         kn.copy(w.y_hat_r, y_new_r)
         kn.compensated_add(y_new_r, w.carry_hat, w.move)
     evaluate_invariants(inv, params, t, y_new, o, w)
-    return kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect)
+    return kn.judge(w.values, o.target, w.before, w.band, y_new_r, w.defect, w.trust, o.per_band, o.limit)
 
 
 @_jitable
@@ -482,7 +543,7 @@ def correct_with_fewer(inv, params, t, rank, o, w, y_new, y_new_r):
     kn.move_along(w.mu, w.Q, w.sigma, o.frame, w.y_hat_r, w.move, y_new_r)
     evaluate_invariants(inv, params, t, y_new, o, w)
     kn.shared_defects(w.before, w.inverse_norms, w.g)
-    return kn.judge(w.values, o.target, w.g, w.band, y_new_r, w.defect), rank
+    return kn.judge(w.values, o.target, w.g, w.band, y_new_r, w.defect, w.trust, o.per_band, o.limit), rank
 
 
 @_jitable

@@ -141,6 +141,7 @@ class ZarrStore:
         self._make("max_correction", np.dtype(float), ("member",))
         self._make("counters", np.dtype(np.int64), ("member", "counter"), empty.counters.shape[1:], fill=0)
         self._make("side_by_side", np.dtype(bool), ("member",), fill=False)
+        self._make("trusted", np.dtype(bool), ("member",), fill=False)
         self._make("message", str, ("member",), fill="")
         self._make("status", np.dtype(np.int64), ("member",), fill=NOT_RUN)
         # Last: a group without it was left before it was whole.
@@ -176,6 +177,7 @@ class ZarrStore:
             counters=group["counters"][place],
             max_correction=group["max_correction"][place],
             side_by_side=group["side_by_side"][place],
+            trusted=group["trusted"][place],
             saved=group["states"][place].swapaxes(1, 2) if "states" in group else none,
         )
 
@@ -187,6 +189,7 @@ class ZarrStore:
         group["counters"][place] = members.counters
         group["max_correction"][place] = members.max_correction
         group["side_by_side"][place] = members.side_by_side
+        group["trusted"][place] = members.trusted
         if "states" in group:
             group["states"][place] = members.saved.swapaxes(1, 2)
         group["message"][place] = np.array(members.message, dtype=object)

@@ -31,7 +31,7 @@ from .report import versions
 
 __all__ = ["CheckpointError", "origin", "read", "require_same", "warn_of_other_versions", "write"]
 
-FORMAT, SCHEMA = "eip_scipy checkpoint", 1
+FORMAT, SCHEMA = "eip_scipy checkpoint", 2
 HEADER = "header.json"
 MARK = b"eip_scipy checkpoint, SHA-256 "
 DIGITS = 64

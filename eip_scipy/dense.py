@@ -96,9 +96,8 @@ class ManifoldDenseOutput(DenseOutput):
         self._sigma = run.work.sigma
         if run.invariants.size and run.options.metric == ERROR:
             self._sigma = _travelled(y_old, y, (t - t_old) * f_old, (t - t_old) * f, run.options.groups)
-        self._options = run.options._replace(
-            metric=GIVEN, direction=NEW, iterations=ITERATIONS, every=1, compensated=False
-        )
+        fixed = {"metric": GIVEN, "direction": NEW, "iterations": ITERATIONS, "every": 1, "compensated": False}
+        self._options = run.options._replace(**fixed, watched=False, limit=math.inf)
         self._counters = run.work.counters
         self._levels: tuple[Array, Array] | None = None
         self._work: Any = None

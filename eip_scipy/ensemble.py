@@ -7,6 +7,7 @@ import math
 import os
 import time
 import uuid
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from functools import partial
@@ -25,6 +26,7 @@ from ._pools import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished,
 from ._side_by_side import lanes_of
 from ._statistics import Statistics, merge
 from ._store import CheckpointStore, Store, ZarrStore
+from ._trust import ProjectionWarning
 from .invariants import as_invariants
 from .longrun import DEFAULT, free_memory, integrate
 from .problems._problem import Problem
@@ -67,6 +69,8 @@ class EnsembleResult(OptimizeResult):
         Largest correction in local errors; nan where the method estimates none.
     side_by_side : ndarray of bool, shape (members,)
         Whether each ran in a vector with others, several times faster; the docs' page on ensembles says what it takes.
+    trusted : ndarray of bool, shape (members,)
+        Whether each did not fail and nothing speaks against it, as in `IntegrationResult`; else `message` says what.
     names : tuple of str
         Of the l invariants.
     nfev, njev, nlu, n_rejected_projections : ndarray, shape (members,)
@@ -101,10 +105,11 @@ class EnsembleResult(OptimizeResult):
         for name, defects in zip(self.names, self.max_defect[self.status >= 0].T, strict=True):
             if defects.size:
                 lines.append(f"  {name:<{width}}  max defect {defects.max():.2e}, median {np.median(defects):.2e}")
-        for k in self.failed[:SHOWN]:
-            lines.append(f"  member {self.first + k}: {self.message[k]}")
-        if self.failed.size > SHOWN:
-            lines.append(f"  ... and {self.failed.size - SHOWN} more: .failed, .message")
+        doubtful = np.flatnonzero((self.status >= 0) & ~self.trusted)
+        for those, what in ((self.failed, ".failed"), (doubtful, ".trusted")):
+            lines += [f"  member {self.first + k}: {self.message[k]}" for k in those[:SHOWN]]
+            if those.size > SHOWN:
+                lines.append(f"  ... and {those.size - SHOWN} more: {what}, .message")
         return "\n".join(lines)
 
 
@@ -242,7 +247,32 @@ def ensemble(
     elif checkpoint is not None:
         store = CheckpointStore(checkpoint, plan.identity(starts, parameters, size), checkpoint_every, resume)
     gathered = _Gathered(plan, len(starts), held, size, store, callback)
-    return gathered.run(partial(_pool, executor, task, progress), _chunks(starts, parameters, size), progress)
+    result = gathered.run(partial(_pool, executor, task, progress), _chunks(starts, parameters, size), progress)
+    doubtful = np.flatnonzero((result.status >= 0) & ~result.trusted)
+    if doubtful.size:
+        _warn(result, doubtful)
+    return result
+
+
+def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
+    """Say that members are not to be trusted.
+
+    Raises
+    ------
+    ProjectionWarning
+        Where warnings are errors, with the result as ``partial``.
+    """
+    k = int(doubtful[0])
+    try:
+        warnings.warn(
+            f"{doubtful.size} of {result.t.size} members are not to be trusted (.trusted, .message), the first of them "
+            f"member {k}: {result.message[k]}",
+            ProjectionWarning,
+            stacklevel=3,
+        )
+    except ProjectionWarning as error:
+        error.partial = result  # type: ignore[attr-defined]
+        raise
 
 
 class _Gathered:
@@ -342,6 +372,7 @@ class _Gathered:
             max_defect=members.max_defect,
             max_correction=members.max_correction,
             side_by_side=members.side_by_side,
+            trusted=members.trusted,
             names=plan.names,
             nfev=counters[:, NFEV],
             njev=counters[:, NJEV],

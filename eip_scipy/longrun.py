@@ -6,6 +6,7 @@ import hashlib
 import math
 import os
 import time
+import warnings
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -24,6 +25,7 @@ from ._kernels import OK
 from ._names import nearest
 from ._setup import ProjectionOptions, Run
 from ._step import T_NEW, Span, T, finish_step, next_step
+from ._trust import ProjectionWarning
 from .dense import ManifoldDenseOutput, dense_output
 from .invariants import Invariant, as_invariants
 from .nystrom import NystromTableau
@@ -81,7 +83,7 @@ def source_stamp(*names: str) -> str:
     would leave the old driver, with the old kernel inlined, in use.
     """
     folder = Path(__file__).parent
-    names = ("_octets.py", "_lanes.py", "_triples.py", "_kernels.py", "_step.py", *names)
+    names = ("_octets.py", "_lanes.py", "_triples.py", "_trust.py", "_kernels.py", "_step.py", *names)
     return hashlib.sha256(b"".join((folder / name).read_bytes() for name in names)).hexdigest()
 
 
@@ -200,7 +202,7 @@ class _Driver:
     def parts(self) -> dict[str, np.ndarray]:
         """The buffers that decide the steps to come, or count; all others are filled before they are read."""
         w, grid = self.run.work, self.grid
-        kept = ("carry", "err_sum", "sigma", "defect", "max_defect", "max_correction", "counters")
+        kept = ("carry", "err_sum", "sigma", "defect", "max_defect", "max_correction", "trust", "counters")
         return {
             "place": grid.place,
             "clock": grid.clock,
@@ -456,6 +458,7 @@ def prepared(
     checkpoint: str | os.PathLike[str] | None,
     checkpoint_every: float,
     resume: bool,
+    check_start: bool = True,
     **projection: Any,
 ) -> Loop:
     """What `integrate` runs, by the same arguments, all of them validated; `projection`: those of the projection."""
@@ -512,6 +515,7 @@ def prepared(
         stepping,
         extra=extra,
         compensated=compensated,
+        check_start=check_start,
     )
     bound = 0.5 * free_memory() if max_bytes is None else max_bytes
     check_memory(saved_rows(grid), run, bound)
@@ -555,6 +559,7 @@ class Loop:
         self.keeper = keeper
         self.wall_time = keeper.seconds
         self.chunk = FIRST_CHUNK
+        self.told = self._doubtful = False
         self.in_octets: Callable[[], CompiledFunctions]
 
     def run(self) -> IntegrationResult:
@@ -566,6 +571,7 @@ class Loop:
             self.keeper.end(status, message)
         except BaseException as error:
             self.wall_time += time.perf_counter() - begin
+            driver.run.trust.failed = True
             driver.save_now()
             partial = self._result(-1, f"interrupted by {type(error).__name__}", broken=True)
             error.partial = partial  # type: ignore[attr-defined]
@@ -574,10 +580,39 @@ class Loop:
         self.wall_time += time.perf_counter() - begin
         if status < 0:
             driver.save_now()
-        return self._result(status, message)
+        result = self._result(status, message)
+        if self.told:
+            try:
+                warnings.warn(driver.run.trust.message, ProjectionWarning, stacklevel=3)
+            except ProjectionWarning as error:
+                error.partial = result  # type: ignore[attr-defined]
+                raise
+        return result
 
     def steps(self, bar: Any) -> tuple[int, str]:
-        """Run on to the end of the interval, or to what ends the run before it; returns status and message."""
+        """Run on to the end of the interval, or to what ends the run before it; returns status and message.
+
+        At the end `told` says whether something speaks against a run that has not failed.
+        """
+        self._doubtful = False
+        status, message = self._steps(bar)
+        self.driver.run.trust.failed = status < 0
+        self._look(ended=True)
+        self.told = self._doubtful and status >= 0
+        return status, message
+
+    def _look(self, *, ended: bool = False) -> None:
+        driver = self.driver
+        t, y = driver.now
+
+        def derivative() -> np.ndarray:
+            f = np.empty_like(y)
+            self.rhs(t, y, f, driver.params)
+            return f
+
+        self._doubtful |= driver.run.look(driver.step, ended, t, y.copy(), derivative)
+
+    def _steps(self, bar: Any) -> tuple[int, str]:
         driver = self.driver
         if driver.step == 0:
             driver.save_start()
@@ -595,6 +630,8 @@ class Loop:
                 return 1, STOPPED
             if ended:
                 return 1, "A termination event occurred."
+            if driver.step in _setup.LOOKS:
+                self._look()
             if code == FULL:
                 driver.grow(self.max_bytes)
             elif code not in (OK, PAUSE):
@@ -630,11 +667,12 @@ class Loop:
         return True
 
     def _chunk(self, chunk: int) -> int:
-        """Steps of the next call: with a callback, none beyond the next saved one."""
-        grid = self.driver.grid
+        """Steps of the next call: none beyond the next look or, with a callback, the next saved one."""
+        grid, step = self.driver.grid, self.driver.step
+        chunk = min([chunk, *(look - step for look in _setup.LOOKS if look > step)])
         if self.callback is None or grid.save_every == 0:
             return chunk
-        return min(chunk, grid.save_every - self.driver.step % grid.save_every)
+        return min(chunk, grid.save_every - step % grid.save_every)
 
     def _stopped_by_callback(self, first_row: int) -> bool:
         if self.callback is None:
@@ -665,6 +703,7 @@ class Loop:
             status=status,
             message=self.explained(message),
             success=status >= 0,
+            trusted=driver.run.trust.trusted,
             wall_time=self.wall_time,
             compiled=self.why_not is None,
             method=self.method,
@@ -672,9 +711,11 @@ class Loop:
         )
 
     def explained(self, message: str) -> str:
-        """With what is to be said about checkpoints, and the reason why the run was not compiled, if it was not."""
+        """With what speaks against the run, and what is to be said about checkpoints and not being compiled."""
         notes = [*self.keeper.notes, *([] if self.why_not is None else [f"interpreted: {self.why_not}"])]
-        return f"{message} ({'; '.join(notes)})" if notes else message
+        message = f"{message} ({'; '.join(notes)})" if notes else message
+        doubt = self.driver.run.trust.message
+        return f"{message}; {doubt}" if doubt else message
 
     def _values(self, broken: bool) -> np.ndarray:
         """Invariants of the saved states; NaN where the run was broken off by an invariant that still raises."""

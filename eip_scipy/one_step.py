@@ -9,8 +9,8 @@ import numpy as np
 
 from . import _kernels as kn
 from ._kernels import NOT_FINITE, OK
-from ._step import OLD, Options, Work
-from .result import HAVE_F, NFEV
+from ._step import OLD, Options, Work, is_sampled
+from .result import HAVE_ERROR, HAVE_F, NFEV
 
 __all__ = ["OneStep", "OneStepMethod", "as_vector"]
 
@@ -127,6 +127,12 @@ class OneStep:
             rhs(t_new, w.y_hat, w.K[-1], params)
             w.counters[NFEV] += 1
         w.counters[HAVE_F] = 1  # as far as anyone asks for it: the next step does not
+        w.counters[HAVE_ERROR] = self.has_estimate
+        if project and not self.has_estimate and is_sampled(o, w):
+            rhs(t, y, w.f_point, params)
+            rhs(t_new, w.y_hat, w.stage, params)
+            kn.trapezoid_error(y_r, w.y_hat_r, h, w.f_point.view(float), w.stage_r, w.err)
+            w.counters[HAVE_ERROR] = 1
         if o.adaptive:
             w.norm[0] = kn.error_norm(w.err, y_r, w.y_hat_r, o.rtol, o.atol, o.groups.width)
         return OK

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from . import _setup
+from ._kernels import BAND, EPS
 from ._step import EUCLIDEAN, NEW, Options, make_work, project_step
+from ._trust import LARGE_SHARE, ProjectionWarning
 from .invariants import InvariantSet
 from .result import LAST_RANK, ProjectionResult
 
@@ -56,7 +59,12 @@ def project(
     ------
     ValueError
         When an invariant has no target, an argument has a wrong shape or value, or the projection fails: a defect that
-        is not finite, or larger after it than before.
+        is not finite, larger after it than before, or larger than the invariant's own terms.
+
+    Warns
+    -----
+    ProjectionWarning
+        When a defect of more than a hundredth of an invariant's terms is left.
 
     Notes
     -----
@@ -101,6 +109,8 @@ def project(
         uses_f=known.uses_f,
         compensated=False,
         adaptive=False,
+        per_band=1.0 / (BAND * EPS),
+        limit=1.0,
     )
     work = make_work(n, y.dtype, 0, known.size, n)
     if sigma is not None:
@@ -116,6 +126,14 @@ def project(
     )
     if status != 0:
         raise ValueError(_setup.projection_failure(known, work, t))
+    left = np.abs(work.defect) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)
+    for k in np.flatnonzero(left > LARGE_SHARE):
+        warnings.warn(
+            f"the projection left {known.names[k]!r} off by {work.defect[k]:.3g}, {left[k]:.2g} of its own terms: the "
+            "state was far from the target, or the gradient is wrong; raise iterations, or mend grad",
+            ProjectionWarning,
+            stacklevel=2,
+        )
     return ProjectionResult(out, work.defect.copy(), int(work.counters[LAST_RANK]), out - y)
 
 

@@ -7,11 +7,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import OptimizeResult
 
-__all__ = ["Diagnostics", "IntegrationResult", "ProjectionResult"]
+from ._trust import N_FIGURES, ProjectionWarning, Trust
+
+__all__ = ["Diagnostics", "IntegrationResult", "ProjectionResult", "ProjectionWarning"]
 
 # Places of the counters that the step fills (see _step.py, which takes them from here).
 NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED = range(10)
-N_COUNTERS = 10
+# Whether an estimate of the step's error is at hand, projections begun without one, steps since the last projection,
+# and what stood out in them.
+HAVE_ERROR, BEGUN, WAITED, FOUND = range(10, 14)
+N_COUNTERS = 14
 
 
 class Diagnostics:
@@ -34,24 +39,35 @@ class Diagnostics:
         Projections that failed.
     max_correction : float
         Largest correction in units of the step's local error: at most about 5 when all is well; nan where the run
-        has no error estimate (the euclidean metric at fixed steps).
+        has no error estimate (the euclidean metric at fixed steps). Where round-off exceeds the local errors, as in
+        compensated runs, it may be thousands and mean nothing; `worst` counts round-off too.
+    trusted : bool
+        Whether no step has failed, no check of the invariants has found anything, and all corrections are those of the
+        steps' errors. It says nothing about accuracy.
+    message : str
+        Why the run is not to be trusted; "" where nothing speaks against it.
+    worst : (str, float, float) or None
+        Invariant, time and size of the largest correction, in local errors (rounding counts as one): below 5 in most
+        healthy runs. None where none was measured.
     """
 
     def __init__(self) -> None:
-        self._attach((), np.zeros(0), np.zeros(0), np.zeros(1), np.zeros(N_COUNTERS, np.int64), estimated=False)
+        none, trust = np.zeros(0), Trust((), np.zeros((0, N_FIGURES)))
+        self._attach(none, none, np.zeros(1), np.zeros(N_COUNTERS, np.int64), trust, estimated=False)
 
     def _attach(
         self,
-        names: tuple[str, ...],
         max_defect: np.ndarray,
         last_defect: np.ndarray,
         max_correction: np.ndarray,
         counters: np.ndarray,
+        trust: Trust,
         *,
         estimated: bool,
     ) -> None:
         """Take the buffers of a run, so that reading costs the run nothing."""
-        self.names = names
+        self.names = trust.names
+        self._trust = trust
         self.max_defect = max_defect
         self._defect = last_defect
         self._max_correction = max_correction
@@ -93,6 +109,21 @@ class Diagnostics:
         """Largest correction in local errors."""
         return float(self._max_correction[0]) if self._estimated else float("nan")
 
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing speaks against the run."""
+        return self._trust.trusted
+
+    @property
+    def message(self) -> str:
+        """What speaks against the run."""
+        return self._trust.message
+
+    @property
+    def worst(self) -> tuple[str, float, float] | None:
+        """Invariant, time and size in local errors of the largest correction."""
+        return self._trust.worst
+
     def __repr__(self) -> str:
         if not self.names:
             return "Diagnostics: no invariants"
@@ -105,6 +136,8 @@ class Diagnostics:
             lines.append(f"  {name:<{width}}  max defect {largest:.2e}, last {last:.2e}")
         if self._estimated:
             lines.append(f"  largest correction: {self.max_correction:.3g} local errors")
+        if self.message:
+            lines.append(f"  {self.message}")
         return "\n".join(lines)
 
 
@@ -131,6 +164,8 @@ class IntegrationResult(OptimizeResult):
     message : str
     success : bool
         ``status >= 0``.
+    trusted : bool
+        Whether, besides, nothing speaks against the run; if not, `message` says what. See `Diagnostics`.
     wall_time : float
         Seconds in the integration, compilation left out.
     compiled : bool

@@ -16,11 +16,12 @@ from ._kernels import FAILED_PROJECTION, OK
 from ._names import nearest
 from ._setup import ProjectionOptions, Stepping
 from ._step import T_NEW, T, close_step, next_step, project_any
+from ._trust import ProjectionWarning
 from .dense import ExactEnds, dense_output
 from .invariants import as_invariants
 from .nystrom import RKN86, RKN1210, NystromTableau
 from .one_step import OneStep, OneStepMethod
-from .result import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
+from .result import FOUND, N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from .tableaux import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
 
 __all__ = [
@@ -157,6 +158,7 @@ class EIPSolver(OdeSolver):
         start = _setup.initial_state(y0)
         self._calls = [0]
         derivative, self._rhs = _checked(fun, start.size, start.dtype, vectorized, self._calls)
+        self._derivative = derivative
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
         stepping = _setup.stepping(
             type(self).__name__, self.TABLEAU, t0, t_bound, self.n, h, first_step, max_step, rtol, atol, stacklevel=4
@@ -206,6 +208,7 @@ class EIPSolver(OdeSolver):
         self._work.counters[NFEV] = self._calls[0]
         self._count()
         self.y_old, self.f_old = self.y, self.f
+        self._found, self._told = 0, False
 
     def _count(self) -> None:
         counters = self._work.counters
@@ -259,11 +262,22 @@ class EIPSolver(OdeSolver):
         )  # fmt: skip
         self._count()
         if status != OK:
+            run.trust.failed = True
             return False, _setup.failure(status, run, clock)
         self._k += 1
         self.y_old, self.f_old = y, self.f
         self.y, self.t, self.f = self._accepted, clock[T_NEW], w.K[-1].copy()
+        if w.counters[FOUND] != self._found or self._k in _setup.LOOKS or self.t == self.t_bound:
+            self._watch()
         return True, None
+
+    def _watch(self) -> None:
+        """Look at the run where something stands out, early and at its end; warn once, and at once: it may end here."""
+        run, arrived = self._run, self.t == self.t_bound
+        self._found = self._work.counters[FOUND]
+        if not self._told and run.look(self._k, arrived, self.t, self.y, lambda: self._derivative(self.t, self.y)):
+            self._told = True
+            warnings.warn(run.trust.message, ProjectionWarning, stacklevel=5)
 
     def _finish(
         self, rhs: Any, inv: Any, grad: Any, params: Any, t: Any, y: Any, y_r: Any, t_new: Any, project: Any,

@@ -7,7 +7,18 @@ import pytest
 from scipy.integrate import solve_ivp
 from systems import SQUARE, VOLTERRA, lotka_volterra, oscillator
 
-from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, Diagnostics, Invariant, integrate, project
+from eip_scipy import (
+    EIPRK1,
+    EIPRK2,
+    EIPRK3,
+    EIPRK4,
+    EIPRK5,
+    Diagnostics,
+    Invariant,
+    ProjectionWarning,
+    integrate,
+    project,
+)
 from eip_scipy.problems import kepler, solar_system
 
 EPS = np.finfo(float).eps
@@ -150,7 +161,8 @@ def test_without_any_gradient_the_raw_state_stays(driver, direction):
 
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_project_with_zero_gradient(iterations):
-    result = project([0.0, 0.0], SQUARE, target=1.0, iterations=iterations)
+    with pytest.warns(ProjectionWarning, match="left 'S' off by -1, 1 of its own terms"):
+        result = project([0.0, 0.0], SQUARE, target=1.0, iterations=iterations)
     assert result.rank == 0
     np.testing.assert_array_equal(result.y, [0.0, 0.0])
     np.testing.assert_array_equal(result.correction, [0.0, 0.0])

@@ -8,6 +8,7 @@ import pytest
 
 from eip_scipy import _kernels as kn
 from eip_scipy import _setup
+from eip_scipy._trust import N_FIGURES, TERMS
 
 EPS = np.finfo(float).eps
 RNG = np.random.default_rng
@@ -473,7 +474,9 @@ def test_no_directions_no_move():
 def verdict(value, before, y=0.0):
     defect, band = np.empty(2), np.full(2, 2.0**-10)
     values, target = np.array([value, 5.0]), np.array([3.0, 5.0])
-    status = kn.judge(values, target, np.array([before, 0.0]), band, np.array([y]), defect)
+    trust = np.zeros((2, N_FIGURES))
+    trust[:, TERMS] = np.inf
+    status = kn.judge(values, target, np.array([before, 0.0]), band, np.array([y]), defect, trust, 1.0, np.inf)
     return status, defect[0]
 
 

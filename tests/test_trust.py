@@ -1,0 +1,404 @@
+"""Runs that are not to be trusted, and runs that are: what users are told, through the public interface."""
+
+import math
+import warnings
+
+import numba
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPRK1,
+    EIPRK2,
+    EIPRK3,
+    EIPRK4,
+    EIPRK5,
+    EIPRK23,
+    EIPRK45,
+    EIPRKN8,
+    EIPRKN12,
+    Diagnostics,
+    Invariant,
+    JointInvariants,
+    ProjectionWarning,
+    eip_method,
+    ensemble,
+    integrate,
+    project,
+)
+from eip_scipy.problems import kepler, pythagorean
+
+EVERY_CLASS = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853, EIPRKN8, EIPRKN12]
+ADAPTIVE = [EIPRK23, EIPRK45, EIPDOP853, EIPRKN8, EIPRKN12]
+
+
+def pendulum(friction=0.0):
+    return lambda t, y: np.array([y[1], -np.sin(y[0]) - friction * y[1]])
+
+
+ENERGY = Invariant(
+    lambda t, y: 0.5 * y[1] ** 2 - np.cos(y[0]), lambda t, y: np.array([np.sin(y[0]), y[1]]), name="energy"
+)
+SQUARE = Invariant(lambda t, y: 0.5 * float(y @ y), lambda t, y: y, name="square")
+
+
+def oscillator(t, y):
+    return np.array([y[1], -y[0]])
+
+
+def by_solve_ivp(fun, t_span, y0, **options):
+    record = Diagnostics()
+    sol = solve_ivp(fun, t_span, y0, diagnostics=record, **options)
+    return sol, record
+
+
+def by_integrate(fun, t_span, y0, **options):
+    run = integrate(fun, t_span, y0, **options)
+    assert run.trusted == (run.diagnostics.trusted and run.success)
+    assert run.diagnostics.message in run.message
+    return run, run.diagnostics
+
+
+both = pytest.mark.parametrize("driver", [by_solve_ivp, by_integrate], ids=["solve_ivp", "integrate"])
+
+
+@both
+@pytest.mark.parametrize("method", ADAPTIVE)
+def test_an_invariant_whose_rate_is_zero_at_the_start(driver, method):
+    """Released from rest, a pendulum with friction does not lose energy yet."""
+    if method in (EIPRKN8, EIPRKN12):
+        if driver is by_integrate:
+
+            def fun(t, q):  # driven, from t = 0 of the force
+                return np.array([-np.sin(q[0]) + 0.3 * np.sin(t)])
+        else:
+
+            def fun(t, y):
+                return np.array([y[1], -np.sin(y[0]) + 0.3 * np.sin(t)])
+    else:
+        fun = pendulum(0.2)
+    with pytest.warns(ProjectionWarning, match=r"(?s)'energy'.*no invariant of this system.*docs/trust.md") as caught:
+        run, record = driver(fun, (0, 20), [2.0, 0.0], method=method, rtol=1e-8, invariants=ENERGY)
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
+    assert run.success
+    assert not record.trusted
+    name, t, size = record.worst
+    assert name == "energy"
+    assert 0 < t <= 20
+    assert size > 50
+    assert "energy" in record.message
+    assert record.message in repr(record)
+
+
+@both
+@pytest.mark.parametrize("method", EVERY_CLASS)
+@pytest.mark.parametrize("metric", ["error", "euclidean"])
+def test_every_class_tells(driver, method, metric):
+    """A quantity that is none, with fixed steps; the euclidean metric needs no estimate, and takes one all the same."""
+    nystrom = method in (EIPRKN8, EIPRKN12)
+    fun = (lambda t, q: -2.0 * q) if nystrom and driver is by_integrate else lambda t, y: np.array([y[1], -2.0 * y[0]])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run, record = driver(fun, (0, 10), [1.0, 0.3], method=method, h=0.02, metric=metric, invariants=SQUARE)
+    assert run.success
+    assert not record.trusted
+    # Local errors of orders 1 and 2 are nearly as large as what the quantity changes by; the check at the start tells.
+    low = method in (EIPRK1, EIPRK2)
+    assert [w.category for w in caught] == ([UserWarning] if low else [UserWarning, ProjectionWarning])
+
+
+@both
+@pytest.mark.parametrize("method", EVERY_CLASS)
+@pytest.mark.parametrize("metric", ["error", "euclidean"])
+def test_every_class_trusts(driver, method, metric):
+    nystrom = method in (EIPRKN8, EIPRKN12)
+    fun = (lambda t, q: -q) if nystrom and driver is by_integrate else oscillator
+    run, record = driver(fun, (0, 10), [1.0, 0.3], method=method, h=0.02, metric=metric, invariants=SQUARE)
+    assert run.success
+    assert record.trusted
+    assert record.message == ""
+    assert record.worst[2] < 50
+
+
+def test_a_leak_below_the_eye_of_the_start_check():
+    """Friction of a thousandth, at a tolerance of 1e-6, and a start where the energy's rate is as good as zero."""
+    for method in (EIPRK23, EIPRK45, EIPDOP853):
+        with pytest.warns(ProjectionWarning, match="energy"):
+            run = integrate(pendulum(1e-3), (0, 30), [2.0, 0.0], method=method, rtol=1e-6, invariants=ENERGY)
+        assert not run.trusted
+
+
+@both
+def test_a_step_that_is_far_too_long(driver):
+    """The projection leaves more than the energy itself: a failure, with what there was before."""
+    options = {"method": EIPRK4, "h": 3.0, "invariants": SQUARE}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ProjectionWarning)  # solve_ivp warns at the first step, before the run fails
+        run, record = driver(oscillator, (0, 60), [1.0, 0.0], **options)
+    assert run.status == -1
+    assert "projection failed" in run.message
+    assert "'square'" in run.message
+    assert not record.trusted
+    assert run.t.size > 1
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run, record = driver(oscillator, (0, 60), [1.0, 0.0], **options | {"h": 2.0})
+    assert run.success
+    assert not record.trusted
+    assert [w.category for w in caught] == [ProjectionWarning]
+
+
+def test_no_success_with_a_defect_of_the_size_of_the_terms():
+    @numba.njit
+    def fast(t, y):
+        return np.array([y[1], -1e8 * y[0]])
+
+    @numba.njit
+    def energy(t, y):
+        return 0.5 * (y[1] ** 2 + 1e8 * y[0] ** 2)
+
+    @numba.njit
+    def gradient(t, y):
+        return np.array([1e8 * y[0], y[1]])
+
+    H = Invariant(energy, gradient, name="H")
+    runs = [
+        integrate(fast, (0, 10), [1.0, 0.0], method=EIPRK4, h=0.1, invariants=H, compiled=compiled)
+        for compiled in (True, False)
+    ]
+    for run in runs:
+        assert run.status == -1
+        assert not run.trusted
+        assert "'H'" in run.message
+    assert runs[0].t.tolist() == runs[1].t.tolist()
+
+
+@both
+@pytest.mark.parametrize("rtol", [1e-1, 1.0])
+def test_loose_tolerances_leave_small_defects_or_tell(driver, rtol):
+    """Adaptive steps are shortened until the projection leaves less than a hundredth of the terms."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ProjectionWarning)
+        options = {"method": EIPRK45, "rtol": rtol, "atol": rtol, "invariants": ENERGY}
+        options |= {"save_every": 1} if driver is by_integrate else {}
+        run, record = driver(pendulum(), (0, 50), [2.0, 0.0], **options)
+    assert run.success
+    q, v = run.y
+    assert record.max_defect[0] <= 1e-2 * np.max(np.abs(np.sin(q) * q) + v**2)
+
+
+def test_a_passage_that_the_step_does_not_resolve():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ProjectionWarning)
+        run = integrate(pythagorean(), (0, 70), method=EIPRKN12, h=0.01)
+    assert not run.trusted
+    assert not run.success or run.diagnostics.worst[2] > 1e3
+
+
+def test_without_check_nobody_looks():
+    run = integrate(oscillator, (0, 60), [1.0, 0.0], method=EIPRK4, h=3.0, invariants=SQUARE, check=False)
+    assert run.success
+    assert run.max_defect[0] > 1e3
+    assert run.diagnostics.worst is None
+    assert run.diagnostics.message == ""
+
+
+def test_as_an_error_it_carries_the_run():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ProjectionWarning)
+        with pytest.raises(ProjectionWarning, match="energy") as caught:
+            integrate(pendulum(0.2), (0, 20), [2.0, 0.0], method=EIPRK45, rtol=1e-8, invariants=ENERGY)
+    run = caught.value.partial
+    assert run.status == 0
+    assert run.t[-1] == 20
+    assert not run.trusted
+
+
+def test_an_event_that_ends_the_run_early_does_not_keep_it_silent():
+    def turned(t, y):
+        return y[1] + 0.5
+
+    turned.terminal = True
+    with pytest.warns(ProjectionWarning):
+        sol = solve_ivp(
+            pendulum(0.2), (0, 1000), [2.0, 0.0], method=EIPRK45, rtol=1e-8, invariants=ENERGY, events=turned
+        )
+    assert sol.status == 1
+
+
+def test_a_gradient_that_is_wrong_where_the_start_does_not_show_it():
+    """At the start the second mass is at its place of rest and has no velocity."""
+    k = 0.7
+
+    def chain(t, y):
+        a, b, u, v = y
+        return np.array([u, v, -a - k * (a - b), -b - k * (b - a)])
+
+    def energy(t, y):
+        a, b, u, v = y
+        return 0.5 * (u * u + v * v + a * a + b * b + k * (a - b) ** 2)
+
+    def gradient(t, y):
+        a, b, u, v = y
+        return np.array([a + k * (a - b), b + k * (b - a), u, 3 * v])
+
+    H = Invariant(energy, gradient, name="H")
+    with pytest.warns(ProjectionWarning, match="gradient of invariant 'H' is wrong"):
+        run = integrate(chain, (0, 10), [1.0, 0.0, 0.0, 0.0], method=EIPRK45, rtol=1e-8, invariants=H)
+    assert not run.trusted
+
+
+def test_close_to_a_pericentre_a_right_gradient_is_right():
+    for e in (0.9, 1 - 1e-3, 1 - 1e-6, 1 - 1e-9):
+        problem = kepler(e, relativistic=0)
+        period = 2 * math.pi
+        run = integrate(
+            problem, (0, 1e-3 * period), method=EIPDOP853, h=None, first_step=1e-12, rtol=1e-10, compiled=False
+        )
+        assert run.success
+        assert run.trusted
+
+
+def test_complex_states():
+    H = np.diag([1.0, 2.0, 4.0]) + 0.3 * np.ones((3, 3))
+    loss = np.array([0.0, 1e-2, 0.0])
+    mass = Invariant(lambda t, y: float(np.vdot(y, y).real), lambda t, y: 2 * y, name="mass")
+    y0 = np.array([1.0, 0.0, 0.2j])
+
+    def kept(t, y):
+        return -1j * (H @ y)
+
+    def lost(t, y):
+        return -1j * (H @ y) - loss * y
+
+    run = integrate(kept, (0, 5), y0, method=EIPRK45, rtol=1e-8, invariants=mass)
+    assert run.trusted
+    with pytest.warns(ProjectionWarning, match="mass"):
+        run = integrate(lost, (0, 5), y0, method=EIPRK45, rtol=1e-8, invariants=mass)
+    assert not run.trusted
+
+
+@pytest.mark.parametrize("true", [True, False])
+def test_joint_invariants(true):
+    """A field's mass, by the functions that take two passes over it."""
+    n = 64
+    k = np.fft.fftfreq(n, 1 / n)
+    decay = 0.0 if true else 1e-2
+
+    def fun(t, y):
+        # A decay that begins slowly: the start check does not see it.
+        return -0.5j * np.fft.ifft(k**2 * np.fft.fft(y)) - 1j * np.abs(y) ** 2 * y - decay * t * y
+
+    mass = Invariant(lambda t, y: float(np.vdot(y, y).real), lambda t, y: 2 * y, name="mass")
+
+    def moments(t, y, f, values, gram, terms):
+        values[0] = np.vdot(y, y).real
+        gram[0, 0], terms[0] = 4 * values[0], 2 * values[0]
+
+    def shift(t, y, f, mu, out, values):
+        out[:] = y + mu[0] * 2 * y
+        values[0] = np.vdot(out, out).real
+
+    invariants = JointInvariants([mass], moments, shift)
+    x = 2 * np.pi * np.arange(n) / n
+    y0 = 1 + 0.1 * np.exp(1j * x)
+    options = {"method": EIPRK4, "h": 1e-3, "metric": "euclidean", "invariants": invariants}
+    if true:
+        run = integrate(fun, (0, 1), y0, **options)
+        assert run.trusted
+        assert run.diagnostics.worst[2] < 50
+    else:
+        with pytest.warns(ProjectionWarning, match="mass"):
+            run = integrate(fun, (0, 1), y0, **options)
+        assert not run.trusted
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_methods_of_a_users_own(fails):
+    class Verlet:
+        order = 2
+
+        def one_step(self, t, y, h):
+            q, v = y
+            force = -np.sin(q) - (0.2 * v if fails else 0.0)
+            v = v + h / 2 * force
+            q = q + h * v
+            return [q, v + h / 2 * (-np.sin(q) - (0.2 * v if fails else 0.0))]
+
+    fun = pendulum(0.2 if fails else 0.0)
+    options = {"method": eip_method(Verlet()), "h": 0.02, "invariants": ENERGY}
+    if fails:
+        with pytest.warns(ProjectionWarning, match="energy"):
+            run = integrate(fun, (0, 20), [2.0, 0.0], **options)
+    else:
+        run = integrate(fun, (0, 20), [2.0, 0.0], **options)
+    assert run.trusted is not fails
+
+
+def test_spaced_and_compensated_runs_are_trusted():
+    problem = kepler(0.3, relativistic=0)
+    for every in (1, 10, "auto"):
+        for compensated in (False, True):
+            run = integrate(problem, (0, 100), method=EIPRKN12, h=0.05, every=every, compensated=compensated)
+            assert run.trusted, (every, compensated, run.message)
+
+
+@numba.njit
+def damped(t, y, params):
+    return np.array([y[1], -np.sin(y[0]) - params[0] * y[1]])
+
+
+@numba.njit
+def pendulum_energy(t, y, params):
+    return 0.5 * y[1] ** 2 - np.cos(y[0])
+
+
+@numba.njit
+def pendulum_gradient(t, y, params):
+    return np.array([np.sin(y[0]), y[1]])
+
+
+@pytest.mark.parametrize("compiled", [None, False])
+def test_members_are_flagged_as_single_runs_are(compiled):
+    energy = Invariant(pendulum_energy, pendulum_gradient, name="energy")
+    friction = np.zeros((12, 1))
+    friction[7] = 0.1
+    options = {"method": EIPRK4, "h": 0.05, "invariants": energy, "compiled": compiled}
+    with pytest.warns(ProjectionWarning, match=r"1 of 12 members are not to be trusted.*member 7"):
+        run = ensemble(damped, (0, 20), np.tile([2.0, 0.0], (12, 1)), params=friction, **options)
+    assert run.success
+    assert np.flatnonzero(~run.trusted).tolist() == [7]
+    assert "energy" in run.message[7]
+    with pytest.warns(ProjectionWarning):
+        alone = integrate(damped, (0, 20), [2.0, 0.0], params=friction[7], **options)
+    np.testing.assert_array_equal(alone.y[:, -1], run.y[7])
+    assert "member 7" in repr(run)
+
+
+def test_project_tells_of_what_it_leaves():
+    far = Invariant(lambda t, y: float(y @ y), lambda t, y: 2 * y, target=1.0, name="length")
+    with pytest.warns(ProjectionWarning, match="left 'length' off"):
+        project([3.0, 4.0], far)
+    assert abs(project([0.6, 0.81], far, iterations=3).defect[0]) < 1e-15
+
+
+def test_what_a_resumed_run_says_is_what_a_whole_one_says(tmp_path):
+    def stop(t, y, defects):
+        if t > 5:
+            raise KeyboardInterrupt
+
+    options = {"method": EIPRK4, "h": 0.05, "invariants": ENERGY, "save_every": 10}
+    with pytest.warns(ProjectionWarning):
+        whole = integrate(pendulum(0.2), (0, 20), [2.0, 0.0], **options)
+    with pytest.raises(KeyboardInterrupt):
+        integrate(pendulum(0.2), (0, 20), [2.0, 0.0], checkpoint=tmp_path / "run.npz", callback=stop, **options)
+    with pytest.warns(ProjectionWarning):
+        resumed = integrate(
+            pendulum(0.2), (0, 20), [2.0, 0.0], checkpoint=tmp_path / "run.npz", resume=True, **options
+        )
+    np.testing.assert_array_equal(resumed.y, whole.y)
+    assert resumed.diagnostics.worst == whole.diagnostics.worst
+    assert resumed.diagnostics.message == whole.diagnostics.message
