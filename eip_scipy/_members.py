@@ -531,7 +531,7 @@ class _Driver:
         rows = self._row_buffer if each.saved is None else each.saved.view(float)
         passed = (
             *(driver.params, driver.grid, *driver._tail, driver.t, self._buffers, self._fresh, G),
-            *(G.view(float).reshape(G.shape[0], -1), self._where, last, self.loop.chunk),
+            *(G.view(float), self._where, last, self.loop.chunk),
             *(each.y0s, each.taus, each.evaluations, each.params, rows),
             *(out.y, out.max_defect, out.counters, out.max_correction, each.figures),
         )

@@ -59,7 +59,7 @@ def project(
     ------
     ValueError
         When an invariant has no target, an argument has a wrong shape or value, or the projection fails: a defect that
-        is not finite, larger after it than before, or larger than the invariant's own terms.
+        is not finite, or larger after it than before.
 
     Warns
     -----
@@ -110,7 +110,6 @@ def project(
         compensated=False,
         adaptive=False,
         per_band=1.0 / (BAND * EPS),
-        limit=1.0,
     )
     work = make_work(n, y.dtype, 0, known.size, n)
     if sigma is not None:

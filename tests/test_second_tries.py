@@ -137,6 +137,7 @@ def place(k, bend=0.0):
     return bent(np.eye(3)[k], bend, 0.0, k)
 
 
+@pytest.mark.filterwarnings("ignore:the projection left:eip_scipy.ProjectionWarning")  # what is left out stays
 @pytest.mark.parametrize(("slope", "bend"), [(1e-3, 1.0), (0.2, 1e3)])
 def test_the_last_direction_is_left_out(slope, bend):
     """A step of 5e-4 / slope along y1 bends the second invariant's defect beyond what it was: y1 stays."""
@@ -150,6 +151,7 @@ def test_the_last_direction_is_left_out(slope, bend):
     np.testing.assert_allclose(three.y, 0.0, atol=1e-18)
 
 
+@pytest.mark.filterwarnings("ignore:the projection left:eip_scipy.ProjectionWarning")
 @pytest.mark.parametrize(("rise", "good"), [(4.4e3, True), (4.6e3, False)])
 def test_what_is_left_may_not_exceed_the_defects_of_all(rise, good):
     """Defects of 1.0e-3 and 1.5e-3: the second may become 5.0e-3, twice their sum. It is 0.5e-3 + rise 1e-6."""
