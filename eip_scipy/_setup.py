@@ -101,6 +101,7 @@ class Run:
     options: Options
     work: Work
     invariants: InvariantSet
+    frame: Any  # the pair (C, S) as it was given: what `options` hold comes from LAPACK, whose last bits differ
 
 
 class Counted:
@@ -596,7 +597,7 @@ def prepare(
     work = make_work(n, y0.dtype, arrays.b.size, invariants.size, groups.start.size - 1)
     if sigma is not None:
         work.sigma[:] = sigma
-    run = Run(y0, arrays, options, work, invariants)
+    run = Run(y0, arrays, options, work, invariants, projection.frame)
     if _flag("project_initial", projection.project_initial):
         run.y0 = projected_start(run, rhs, t0, f0)
         f0 = rhs(t0, run.y0)
