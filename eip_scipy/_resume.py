@@ -115,7 +115,7 @@ def settings(
         ],
         "metric": metric,
         "blocks": (o.groups.start, o.groups.member),
-        "frame": (o.frame.start, o.frame.place, o.frame.value),
+        "frame": None if run.frame is None else [np.asarray(a, y0.dtype) for a in run.frame],
         "direction": next(name for name, value in DIRECTIONS.items() if value == o.direction),
         "iterations": o.iterations,
         "every": "auto" if o.every == AUTO else o.every,

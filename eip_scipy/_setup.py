@@ -105,6 +105,7 @@ class Run:
     options: Options
     work: Work
     invariants: InvariantSet
+    frame: Any  # the pair (C, S) as it was given: what `options` hold comes from LAPACK, whose last bits differ
     trust: Trust
     check: bool
     tau: float
@@ -628,7 +629,8 @@ def prepare(
     if sigma is not None:
         work.sigma[:] = sigma
     check = bool(projection.check) and check_start
-    run = Run(y0, arrays, options, work, invariants, Trust(invariants.names, work.trust), check, tau)
+    trust = Trust(invariants.names, work.trust)
+    run = Run(y0, arrays, options, work, invariants, projection.frame, trust, check, tau)
     if _flag("project_initial", projection.project_initial):
         run.y0 = projected_start(run, rhs, t0, f0)
         f0 = rhs(t0, run.y0)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .tableaux import Number, _stage_matrix, _vector
+from .tableaux import FLOAT_TOLERANCE, Number, _low_parts, _stage_matrix, _vector
 
 __all__ = ["RKN86", "RKN1210", "NystromTableau"]
 
@@ -20,7 +20,6 @@ __all__ = ["RKN86", "RKN1210", "NystromTableau"]
 FIXED_BITS = 256
 # The published fractions of RKN1210 miss the conditions by 2e-54; floats by 1e-16 times the size of the coefficients.
 TOLERANCE = 1e-50
-FLOAT_TOLERANCE = 1e-12
 # Beyond seven moments the corrections grow above what rounding lost, and a step no longer sees the moments.
 MOMENTS = 7
 
@@ -223,8 +222,8 @@ class NystromTableau:
         self._set(b_hat=None, b_prime_hat=None, exact=MappingProxyType(exact), n_stages=s, fsal=_is_fsal(exact))
         self._set(**{key: values.astype(float) for key, values in exact.items()})
         self._set(e=_difference(exact, "b"), e_prime=_difference(exact, "b_prime"))
-        self._set(b_low=_low_parts(exact["b"], exact["c"], _position_moments(order)))
-        self._set(b_prime_low=_low_parts(exact["b_prime"], exact["c"], _velocity_moments(order)))
+        self._set(b_low=_low_parts_of_used(exact["b"], exact["c"], _position_moments(order)))
+        self._set(b_prime_low=_low_parts_of_used(exact["b_prime"], exact["c"], _velocity_moments(order)))
         for values in exact.values():
             values.setflags(write=False)
 
@@ -284,18 +283,11 @@ def _position_moments(order: int) -> list[Fraction]:
     return [Fraction(1, (k + 1) * (k + 2)) for k in range(min(order - 1, MOMENTS))]
 
 
-def _low_parts(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]) -> np.ndarray:
-    """The smallest corrections of `b` rounded that make `moments` exact for `c` rounded, on top of what was lost."""
-    low = np.array([float(Fraction(x) - Fraction(float(x))) for x in b])
+def _low_parts_of_used(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]) -> np.ndarray:
+    """Low parts of the weights that are not zero; the others stay zero."""
     used = np.array([x != 0 for x in b])
-    nodes = [Fraction(float(x)) for x in c[used]]
-    moments = moments[: len(set(nodes))]
-    if len(moments):
-        weights = [Fraction(float(x)) + Fraction(y) for x, y in zip(b[used], low[used], strict=True)]
-        sums = [sum(w * x**k for w, x in zip(weights, nodes, strict=True)) for k in range(len(moments))]
-        missing = np.array([float(m - s) for m, s in zip(moments, sums, strict=True)])
-        vandermonde = np.array([[float(x) ** k for x in nodes] for k in range(len(moments))])
-        low[used] += np.linalg.lstsq(vandermonde, missing, rcond=None)[0]
+    low = np.zeros(len(b))
+    low[used] = _low_parts(b[used], c[used], moments)
     return low
 
 

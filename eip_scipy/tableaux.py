@@ -7,10 +7,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 
 __all__ = ["DOP853", "RK1", "RK2", "RK3", "RK4", "RK5", "RK23", "RK45", "Tableau"]
+
+# What passes for rounding in tableaux of floats.
+FLOAT_TOLERANCE = 1e-12
 
 Number = int | float | str | Fraction
 Tree = tuple["Tree", ...]
@@ -108,7 +112,8 @@ class Tableau:
         Weights of the error estimate, ``b - b_hat``, and of its second part; zero without one.
     P : ndarray of float64, shape (s + 1, q), or None
     b_low : ndarray of float64, shape (s,)
-        What rounding `b` to double lost, for compensated summation.
+        What rounding `b` to double lost, for compensated summation, corrected so that the first quadrature moments are
+        exact for the rounded nodes.
     n_stages : int
     fsal : bool
         Whether the estimate takes f at the new point: `b_hat` has s + 1 entries.
@@ -179,7 +184,7 @@ class Tableau:
             "e": e,
             "e_low": np.zeros(s + 1) if e_low is None else _vector(name, e_low).astype(float),
             "P": None if P is None else np.array([_vector(name, row) for row in P]).astype(float),
-            "b_low": _low_parts(exact_b, nodes, order),
+            "b_low": _low_parts(exact_b, nodes, [Fraction(1, k + 1) for k in range(order)]),
             "n_stages": s,
             "fsal": b_hat is not None and len(b_hat) == s + 1,
         }
@@ -249,7 +254,7 @@ def _stage_matrix(name: str, A: Sequence[Sequence[Number]], s: int) -> np.ndarra
 
 
 def _check_nodes(name: str, c: np.ndarray, row_sums: np.ndarray) -> None:
-    if len(c) != len(row_sums) or any(abs(float(x - y)) > 1e-12 for x, y in zip(c, row_sums, strict=True)):
+    if len(c) != len(row_sums) or any(abs(float(x - y)) > FLOAT_TOLERANCE for x, y in zip(c, row_sums, strict=True)):
         raise ValueError(f"{name}: c = {list(map(str, c))} differs from the row sums of A, {list(map(str, row_sums))}.")
 
 
@@ -258,28 +263,52 @@ def _check_order(name: str, label: str, A: np.ndarray, b: np.ndarray, order: int
     if not exact:
         A, b = A.astype(float), b.astype(float)
     for tree, residual in order_residuals(A, b, order):
-        if residual != 0 if exact else abs(float(residual)) > 1e-12:
+        if residual != 0 if exact else abs(float(residual)) > FLOAT_TOLERANCE:
             raise ValueError(
                 f"{name}: {label} is not of order {order}: the condition of tree {tree} of order {_size(tree)} "
                 f"misses by {float(residual):.3g}."
             )
 
 
-def _low_parts(b: np.ndarray, c: np.ndarray, order: int) -> np.ndarray:
-    """Corrections that make the first quadrature moments of the double weights exact for the double nodes.
+def _low_parts(b: np.ndarray, c: np.ndarray, moments: Sequence[Fraction]) -> np.ndarray:
+    """What rounding `b` lost, and the smallest corrections that make sum b c^k = moments[k] for `c` rounded.
 
-    Rounded weights and nodes miss sum b c^k = 1/(k+1) by about 1e-17, a systematic error that compensated long
-    runs would otherwise accumulate.
+    Rounded weights and nodes miss the quadrature moments by about 1e-17, a systematic error that compensated long runs
+    would otherwise accumulate. Nodes that only rounding tells apart count as one: there are no more moments to be met
+    than nodes, and a correction that makes use of the difference of two such nodes would be large.
     """
-    low = np.array([float(Fraction(x) - Fraction(float(x))) for x in b])
+    high = [Fraction(float(x)) for x in b]
+    lost = [float(Fraction(x) - y) for x, y in zip(b, high, strict=True)]
     nodes = [Fraction(float(x)) for x in c]
-    weights = [Fraction(float(x)) + Fraction(y) for x, y in zip(b, low, strict=True)]
-    moments = min(order, len(set(nodes)))
+    apart = len(nodes) and 1 + sum(right - left > FLOAT_TOLERANCE for left, right in pairwise(sorted(nodes)))
+    weights = [x + Fraction(y) for x, y in zip(high, lost, strict=True)]
     missing = [
-        float(Fraction(1, k + 1) - sum(w * x**k for w, x in zip(weights, nodes, strict=True))) for k in range(moments)
+        moment - sum(w * x**k for w, x in zip(weights, nodes, strict=True)) for k, moment in enumerate(moments[:apart])
     ]
-    vandermonde = np.array([[float(x) ** k for x in nodes] for k in range(moments)])
-    return low + np.linalg.lstsq(vandermonde, np.array(missing), rcond=None)[0]
+    corrections = _least_corrections(nodes, missing)
+    return np.array([float(Fraction(x) + y) for x, y in zip(lost, corrections, strict=True)])
+
+
+def _least_corrections(nodes: Sequence[Fraction], missing: Sequence[Fraction]) -> list[Fraction]:
+    """The smallest x, in the Euclidean norm, with sum_i x_i c_i^k = missing[k], exactly.
+
+    They are a polynomial in the nodes, x_i = sum_k a_k c_i^k, whose coefficients solve V V^T a = missing with the
+    Vandermonde matrix V: in whole numbers, with nodes in units of their last bit, by Bareiss's elimination.
+    """
+    unit = max((x.denominator for x in nodes), default=1)  # nodes are doubles, so that all denominators divide it
+    places = [int(x * unit) for x in nodes]
+    scale = math.lcm(*(x.denominator for x in missing))
+    count = len(missing)
+    sums = [sum(x**k for x in places) for k in range(2 * count)]
+    rows = [[*sums[k : k + count], int(missing[k] * scale * unit**k)] for k in range(count)]
+    last = 1
+    for k in range(count):
+        pivot = rows[k]
+        for row in rows[:k] + rows[k + 1 :]:
+            first = row[k]
+            row[:] = [(pivot[k] * x - first * y) // last for x, y in zip(row, pivot, strict=True)]
+        last = pivot[k]
+    return [Fraction(sum(row[-1] * x**k for k, row in enumerate(rows)), last * scale) for x in places]
 
 
 _PAPER = "Cai, Gong & Wang, An explicit and practically invariants-preserving method, section 2.1"

@@ -643,6 +643,53 @@ def test_functions_may_differ_by_rounding(tmp_path, monkeypatch):
     assert near.fun(0, Y0) != H.fun(0, Y0)
 
 
+ON_ANOTHER_MACHINE = """
+import sys
+import numpy as np
+from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, integrate
+from eip_scipy.problems import nbody
+
+gm = [1.0, 1e-3, 0.3, 0.2, 0.1]
+q = [[0.0, 0, 0], [1, 0.1, 0], [0, 5, 0.3], [-8, 0, 1], [0, -12, 2]]
+v = [[0.0, 0, 0], [0, 1, 0], [-0.4, 0, 0.1], [0, -0.3, 0], [0.3, 0, 0]]
+problem = nbody(gm, q, v, t_span=(0.0, 2.0), h=0.1)
+rng = np.random.default_rng(0)
+frame = rng.standard_normal((6, 30)), rng.standard_normal((30, 6))
+runs = {"4": {"method": EIPRK4, "compensated": True, "frame": frame}, "12": {"method": EIPRKN12, "every": 2},
+        "853": {"method": EIPDOP853, "h": None, "max_step": 0.4}}
+
+def stop(t, y, d):
+    if stop.end and t > 1.0:
+        raise SystemExit
+
+stop.end = sys.argv[2] == "stop"
+ends = []
+for name, options in runs.items():
+    try:
+        run = integrate(problem, compiled=False, save_every=1, callback=stop, checkpoint=f"{sys.argv[1]}/{name}",
+                        resume=not stop.end, **options)
+    except SystemExit:
+        continue
+    assert run.success and "resumed at step" in run.message, run.message
+    ends.append(run.t[-1])
+print(ends)
+"""
+
+
+def test_a_run_goes_on_where_blas_rounds_otherwise(tmp_path):
+    """The method's low parts and the frame are the same run's whatever kernels OpenBLAS takes for the processor."""
+    for what, kernel in (("stop", {"OPENBLAS_CORETYPE": "Prescott"}), ("go on", {})):  # every x86-64 runs Prescott's
+        found = subprocess.run(
+            [sys.executable, "-c", ON_ANOTHER_MACHINE, tmp_path, what],
+            env={**os.environ, **kernel},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert found.returncode == 0, found.stderr
+    assert found.stdout == "[np.float64(2.0), np.float64(2.0), np.float64(2.0)]\n"
+
+
 def test_another_kind_of_checkpoint(tmp_path):
     path = tmp_path / "members"
     checkpoint.write(path, {"kind": "ensemble"}, {"y": np.zeros((3, 4))})

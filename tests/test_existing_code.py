@@ -17,9 +17,9 @@ def test_exponential_decay():
 
     sol = solve_ivp(exponential_decay, [0, 10], [2, 4, 8], method=EIPRK45, t_eval=[0, 1, 2, 4, 10])
     same = solve_ivp(exponential_decay, [0, 10], [2, 4, 8], t_eval=[0, 1, 2, 4, 10])
-    # The last point is the step's own state, where SciPy's interpolant has its rounding.
     np.testing.assert_array_equal(sol.y[:, :-1], same.y[:, :-1])
-    np.testing.assert_allclose(sol.y, same.y, rtol=1e-15)
+    # The last point is the step's own state, where SciPy's interpolant has its rounding.
+    np.testing.assert_array_equal(sol.y[:, -1], solve_ivp(exponential_decay, [0, 10], [2, 4, 8]).y[:, -1])
 
 
 def test_cannon():

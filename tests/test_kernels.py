@@ -365,13 +365,34 @@ def test_second_pass_where_the_first_would_have_cancelled(angle):
     np.testing.assert_allclose(R[:2, last], directions[:2] @ unit[last], atol=4 * EPS)
 
 
+def least_norm(rows, g):
+    """The smallest x with rows @ x = -g, in fractions: rounded once, on every machine."""
+    R = [exact(row) for row in rows]
+    system = [
+        [sum(a * b for a, b in zip(r, q, strict=True)) for q in R] + [-y] for r, y in zip(R, exact(g), strict=True)
+    ]
+    for i, pivot in enumerate(system):
+        pivot[:] = [a / pivot[i] for a in pivot]
+        for row in system[:i] + system[i + 1 :]:
+            row[:] = [a - row[i] * b for a, b in zip(row, pivot, strict=True)]
+    return np.array(
+        [float(sum(m[-1] * a for m, a in zip(system, column, strict=True))) for column in zip(*R, strict=True)]
+    )
+
+
+def condition(rows):
+    """Of the rows in units of their own."""
+    return np.linalg.cond(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+
+
 def test_least_norm_solution():
     rng = RNG(10)
     rows, g = rng.standard_normal((3, 7)) * [[1.0], [50.0], [0.1]], rng.standard_normal(3)
     rank, Q, norms, R, pivots = factored(rows)
     mu = np.full(3, math.nan)
     kn.least_norm(g, norms, R, pivots, rank, mu)
-    np.testing.assert_allclose(mu @ Q, np.linalg.lstsq(rows, -g, rcond=None)[0], rtol=1e-13, atol=1e-14)
+    expected = least_norm(rows, g)
+    np.testing.assert_allclose(mu @ Q, expected, rtol=0, atol=10 * EPS * condition(rows) * np.abs(expected).max())
 
 
 def gram(rows, g):
@@ -387,7 +408,9 @@ def test_gram_solution(size):
     rows, g = rng.standard_normal((size, 9)) * 10.0 ** rng.integers(-5, 5, (size, 1)), rng.standard_normal(size)
     done, mu = gram(rows, g)
     assert done
-    np.testing.assert_allclose(mu @ rows, np.linalg.lstsq(rows, -g, rcond=None)[0], rtol=1e-10)
+    expected = least_norm(rows, g)
+    atol = 10 * EPS * condition(rows) ** 2 * np.abs(expected).max()  # squared, as by any Gram matrix
+    np.testing.assert_allclose(mu @ rows, expected, rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize(("angle", "done"), [(0.049, False), (0.051, True), (0.0, False)])
