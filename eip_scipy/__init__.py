@@ -9,7 +9,7 @@ from .longrun import integrate
 from .nystrom import NystromTableau
 from .one_step import OneStepMethod
 from .projection import project
-from .result import Diagnostics, IntegrationResult, ProjectionResult
+from .result import Diagnostics, IntegrationResult, ProjectionResult, ProjectionWarning
 from .solvers import (
     EIPDOP853,
     EIPRK1,
@@ -49,6 +49,7 @@ __all__ = [
     "NystromTableau",
     "OneStepMethod",
     "ProjectionResult",
+    "ProjectionWarning",
     "Tableau",
     "check_gradient",
     "eip_method",

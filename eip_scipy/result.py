@@ -7,11 +7,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import OptimizeResult
 
-__all__ = ["Diagnostics", "IntegrationResult", "ProjectionResult"]
+__all__ = ["Diagnostics", "IntegrationResult", "ProjectionResult", "ProjectionWarning"]
 
 # Places of the counters that the step fills (see _step.py, which takes them from here).
 NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED = range(10)
 N_COUNTERS = 10
+
+
+class ProjectionWarning(RuntimeWarning):
+    """The projection hides a failure: its corrections are not those of the step's errors."""
 
 
 class Diagnostics:
