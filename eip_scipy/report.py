@@ -8,12 +8,13 @@ import math
 import os
 import platform
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -25,6 +26,7 @@ __all__ = [
     "compact",
     "describe_machine",
     "document",
+    "listening",
     "machine",
     "say",
     "table",
@@ -36,8 +38,12 @@ __all__ = [
 ]
 
 PACKAGES = (
-    "eip_scipy", "numpy", "scipy", "numba", "tqdm", "rebound", "matplotlib", "astropy", "jplephem", "ducc0", "pyfftw",
+    "eip_scipy", "numpy", "scipy", "numba", "tqdm", "rebound", "heyoka", "matplotlib", "astropy", "jplephem", "ducc0",
+    "pyfftw",
 )  # fmt: skip
+
+
+_untrusted: list[str] = []  # what was said of runs that are not to be trusted, since `listening` began
 
 
 class UsageError(Exception):
@@ -86,6 +92,8 @@ def _processor() -> str:
 def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict[str, Any]:
     """Wrap a command's numbers for `write_json`: what was asked for, when, with which versions, on which machine.
 
+    It says too whether all runs since `listening` began are to be trusted.
+
     Parameters
     ----------
     command : str
@@ -102,6 +110,7 @@ def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict
         "command": command,
         "arguments": dict(arguments),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "trusted": not _untrusted,
         "versions": versions(),
         "machine": machine(),
         **content,
@@ -176,6 +185,42 @@ def say(text: str = "") -> None:
 def warn(message: str) -> None:
     """Print one line for the user on the error stream."""
     print(f"eip-scipy: {message}", file=sys.stderr)
+
+
+@contextmanager
+def listening(kind: type[Warning]) -> Iterator[list[str]]:
+    """Collect warnings that a run is not to be trusted, each text once, instead of showing them.
+
+    Parameters
+    ----------
+    kind : type
+        Theirs; others go where they went.
+
+    Yields
+    ------
+    list of str
+        Filled as runs end; `document` looks at it, too.
+    """
+    _untrusted.clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", kind)
+        show = warnings.showwarning
+
+        def listen(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if not issubclass(category, kind):
+                show(message, category, filename, lineno, file, line)
+            elif str(message) not in _untrusted:
+                _untrusted.append(str(message))
+
+        warnings.showwarning = listen
+        yield _untrusted
 
 
 def check_folder(folder: Path) -> None:
