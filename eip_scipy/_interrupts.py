@@ -1,52 +1,97 @@
-"""Ctrl-C, kept where Python forgets it."""
+"""Ctrl-C, kept where Python forgets it, and SIGTERM, which waits for the checkpoint."""
 
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["kept_ctrl_c", "look_for_ctrl_c"]
+__all__ = ["TerminatedError", "ended_by_sigterm", "kept_ctrl_c", "look_for_signals"]
 
 
-class _Kept:
-    pressed = False
+class TerminatedError(BaseException):
+    """SIGTERM has come, in a run that has something to keep first."""
+
+
+class _Came:
+    ctrl_c = False
+    sigterm = False
 
 
 @contextmanager
 def kept_ctrl_c() -> Iterator[None]:
-    """Let `look_for_ctrl_c` know of a Ctrl-C that comes from now on.
+    """Let `look_for_signals` know of a Ctrl-C that comes from now on.
 
     An exception that is raised inside a destructor is printed and dropped, KeyboardInterrupt too, and compilation makes
     and drops objects of LLVM all the time: a Ctrl-C then would do nothing. A handler of the user's own stays in place.
     """
-    on_main = threading.current_thread() is threading.main_thread()
-    if not on_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if not _is_ours(signal.SIGINT, signal.default_int_handler):
         yield
         return
-    _Kept.pressed = False
-    signal.signal(signal.SIGINT, _note)
+    _Came.ctrl_c = False
+    signal.signal(signal.SIGINT, _note_ctrl_c)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        _Kept.pressed = False
+        _Came.ctrl_c = False
 
 
-def _note(number: int, frame: FrameType | None) -> None:
-    _Kept.pressed = True
-    signal.default_int_handler(number, frame)
+@contextmanager
+def ended_by_sigterm(wanted: bool) -> Iterator[None]:
+    """Let SIGTERM end the block as an exception, and then the process, as whoever sent it expects.
+
+    What exceptions have to say in notes goes to the standard error stream. Only where SIGTERM would end the process at
+    once: in the main thread, without a handler of the user's own. A second SIGTERM does not disturb the first.
+
+    Parameters
+    ----------
+    wanted : bool
+        Whether there is anything to do before the end; if not, SIGTERM does what it always does.
+    """
+    if not (wanted and _is_ours(signal.SIGTERM, signal.SIG_DFL)):
+        yield
+        return
+    signal.signal(signal.SIGTERM, _note_sigterm)
+    try:
+        yield
+    except BaseException as error:
+        if _Came.sigterm:
+            print("SIGTERM", *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr, flush=True)
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        if _Came.sigterm:
+            signal.raise_signal(signal.SIGTERM)
 
 
-def look_for_ctrl_c() -> None:
+def look_for_signals() -> None:
     """Raise what was dropped.
 
     Raises
     ------
-    KeyboardInterrupt
-        In the main thread, after a Ctrl-C since `kept_ctrl_c` that did not end its block.
+    KeyboardInterrupt, TerminatedError
+        In the main thread, after a signal that did not end the block of `kept_ctrl_c` or `ended_by_sigterm`.
     """
-    if _Kept.pressed and threading.current_thread() is threading.main_thread():
-        raise KeyboardInterrupt
+    if not (_Came.ctrl_c or _Came.sigterm) or threading.current_thread() is not threading.main_thread():
+        return
+    raise TerminatedError if _Came.sigterm else KeyboardInterrupt
+
+
+def _is_ours(number: int, usual: object) -> bool:
+    """Whether a signal may be handled here: in the main thread, and not by the user already."""
+    return threading.current_thread() is threading.main_thread() and signal.getsignal(number) is usual
+
+
+def _note_ctrl_c(number: int, frame: FrameType | None) -> None:
+    _Came.ctrl_c = True
+    signal.default_int_handler(number, frame)
+
+
+def _note_sigterm(number: int, frame: FrameType | None) -> None:
+    if not _Came.sigterm:
+        _Came.sigterm = True
+        raise TerminatedError

@@ -23,7 +23,7 @@ from . import _kernels as kn
 from . import _setup
 from ._compile import NotCompilableError, signatures
 from ._kernels import OK
-from ._resume import settings
+from ._resume import Keeper, settings
 from ._setup import Stepping
 from ._side_by_side import Batch
 from ._step import H_ABS, T_NEW, T, Work
@@ -31,7 +31,7 @@ from ._trust import Trust, sick
 from .longrun import ARRIVED, PENDING, ROW, STEP, Grid, Loop, integrate, prepared, saved_rows
 from .result import N_COUNTERS, NFEV
 
-__all__ = ["FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
+__all__ = ["COMPARED", "FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
 
 FAILED, NOT_RUN = -1, -2
 DOUBTFUL = -1
@@ -77,7 +77,10 @@ class Task:
     def loop(self, y0: np.ndarray, params: np.ndarray | None, **options: Any) -> Loop:
         """The run of one member, as `integrate` prepares it."""
         defaults: dict[str, Any] = dict(integrate.__kwdefaults__ or {})
-        return prepared(self.fun, self.t_span, y0, **{**defaults, **self.options, "params": params, **options})
+        for name in ("checkpoint", "checkpoint_every", "resume"):
+            del defaults[name]
+        every = {**defaults, **self.options, "params": params, **options}
+        return prepared(self.fun, self.t_span, y0, keeper=Keeper(), **every)
 
 
 class Members(NamedTuple):
@@ -190,6 +193,29 @@ class Plan:
     def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int) -> dict[str, Any]:
         """What makes two ensembles the same, as JSON holds it: settings, and what their functions give at one start."""
         return {"settings": self._settings(starts, params) | {"chunk": chunk}, "start": self._start_values}
+
+    def known_by(self, y0s: np.ndarray, params: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
+        """What the functions give at the end of the first of these members that came to one, and how large they are.
+
+        By it they are recognised when an ensemble goes on, as by what they give at the start. Nothing where no member
+        came to an end, or the functions fail there.
+        """
+        nothing, ended = np.zeros(0), np.flatnonzero(members.status >= 0)
+        if not ended.size:
+            return nothing, nothing
+        k = int(ended[0])
+        t, y = float(members.t[k]), members.y[k].copy()
+        try:
+            loop = self.loop(y0s[k], params[k])
+            f, invariants = np.zeros_like(y), loop.driver.run.invariants
+            loop.rhs(t, y.copy(), f, params[k])
+            values, sizes = invariants.values(t, y), invariants.term_sizes(t, y, f)
+        except Exception:
+            return nothing, nothing
+        f = f.view(float)
+        some = f[np.linspace(0, f.size - 1, min(f.size, COMPARED)).astype(int)]
+        found = np.append(some, values), np.append(np.full(some.size, np.abs(f).max()), sizes)
+        return found if np.isfinite(found).all() else (nothing, nothing)
 
     @contextmanager
     def driver(self) -> Iterator[_Driver | None]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ._interrupts import look_for_ctrl_c
+from ._interrupts import look_for_signals
 from ._members import Members, Plan, Task, run_members
 from ._statistics import Statistics, statistics_of
 
@@ -147,6 +147,6 @@ def in_order(pool: Pool, chunks: Iterable[Chunk]) -> Iterator[tuple[Chunk, Part]
             under_way.append((chunk, pool.submit(chunk)))
         if not under_way:
             return
-        look_for_ctrl_c()
+        look_for_signals()
         chunk, ticket = under_way.popleft()
         yield chunk, pool.collect(chunk, ticket)

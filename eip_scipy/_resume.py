@@ -7,15 +7,18 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from . import checkpoint
 from ._events import Events
+from ._interrupts import TerminatedError
+from ._own_file import OwnFile, unlocked
 from ._setup import DIRECTIONS, Run, Stepping, is_number
-from ._step import AUTO, ERROR, EUCLIDEAN, T
+from ._step import AUTO, ERROR, EUCLIDEAN, H_ABS, T
 from .checkpoint import CheckpointError
 
 __all__ = ["Keeper", "kept", "settings"]
@@ -34,6 +37,7 @@ STEP = 0
 class Keeper:
     """What a run tells its checkpoints; this one keeps none."""
 
+    keeps = False
     seconds = 0.0
 
     @property
@@ -41,8 +45,16 @@ class Keeper:
         """What the message of the result says besides."""
         return ()
 
-    def identify(self, settings: dict[str, Any], run: Run, t0: float, y0: np.ndarray, f0: np.ndarray) -> None:
-        """Before anything is compiled: the settings of the run, and the derivative at the start that the user gave."""
+    def identify(
+        self,
+        settings: dict[str, Any],
+        run: Run,
+        derivative: Callable[[float, np.ndarray], np.ndarray],
+        t0: float,
+        y0: np.ndarray,
+        f0: np.ndarray,
+    ) -> None:
+        """Before anything is compiled: the settings of the run, and the derivative, f0 at the start."""
 
     def begin(self, driver: Any, events: Events, max_bytes: float) -> None:
         """All buffers are as at the start; a run that is resumed fills them."""
@@ -57,7 +69,8 @@ class Keeper:
         """`error` has broken the run off."""
 
 
-def kept(path: Any, every: Any, resume: Any) -> Keeper:
+@contextmanager
+def kept(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
     """The keeper for the options ``checkpoint``, ``checkpoint_every`` and ``resume`` of `integrate`.
 
     Raises
@@ -67,7 +80,7 @@ def kept(path: Any, every: Any, resume: Any) -> Keeper:
     ValueError
         For other wrong values, and for `resume` without a path.
     CheckpointError
-        When a file is there and the run is not to resume it, or it cannot be read.
+        When a file is there and the run is not to resume it, or it cannot be read, or another run has it.
     """
     if not isinstance(resume, (bool, np.bool_)):
         raise ValueError(f"resume must be True or False, got {resume!r}.")
@@ -76,19 +89,21 @@ def kept(path: Any, every: Any, resume: Any) -> Keeper:
     if path is None:
         if resume:
             raise ValueError("resume=True needs the file to resume from: checkpoint=path.")
-        return Keeper()
+        yield Keeper()
+        return
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"checkpoint must be the path of a file, got {path!r}.")
-    path = os.fspath(path)
-    if not os.path.exists(path):
-        origin = "no checkpoint was there: started at the beginning" if resume else ""
-        return _FileKeeper(path, float(every), origin=origin)
-    if not resume:
-        raise CheckpointError(
-            f"{path!r} exists. resume=True goes on with the run that it holds; to start anew, name another file or "
-            "delete this one."
-        )
-    return _FileKeeper(path, float(every), checkpoint.read(path, KIND))
+    with OwnFile(path) as file:
+        if file.problem:
+            warnings.warn(unlocked(file.name, file.problem), RuntimeWarning, stacklevel=4)
+        found, origin = None, ""
+        if file.exists():
+            if not resume:
+                raise file.existing("run")
+            found = file.read(KIND)
+        elif resume:
+            origin = "no checkpoint was there: started at the beginning"
+        yield _FileKeeper(file, float(every), found, origin)
 
 
 def settings(
@@ -161,45 +176,73 @@ class _Snapshot(NamedTuple):
 
 
 class _FileKeeper(Keeper):
-    """Checkpoints in the file `path`, one each `every` seconds; `found` is what was read there.
+    """Checkpoints in a file, one each `every` seconds; `found` is what was read there.
 
     What is written is always the last snapshot, never the buffers as they are: whoever breaks a run off may do so
     inside a step. Saved rows and events only grow, so that a snapshot knows them by their number.
     """
 
+    keeps = True
+
     def __init__(
         self,
-        path: str,
+        file: OwnFile,
         every: float,
-        found: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None,
-        origin: str = "",
+        found: tuple[dict[str, Any], dict[str, np.ndarray]] | None,
+        origin: str,
     ) -> None:
-        self._path, self._every, self._found = path, every, found
+        self._file, self._every, self._found = file, every, found
         self._origin = origin
         self._failure = ""
         self._ended: Any = None
 
-    def identify(self, settings: dict[str, Any], run: Run, t0: float, y0: np.ndarray, f0: np.ndarray) -> None:
-        self._settings, self._names = settings, run.invariants.names
+    def identify(
+        self,
+        settings: dict[str, Any],
+        run: Run,
+        derivative: Callable[[float, np.ndarray], np.ndarray],
+        t0: float,
+        y0: np.ndarray,
+        f0: np.ndarray,
+    ) -> None:
+        self._settings, self._names, self._derivative = settings, run.invariants.names, derivative
         self._start = {"start_f": f0, "start_values": run.invariants.start_values}
         if self._found is None:
             return
         header, arrays = self._found
-        checkpoint.require_same(self._path, header.get("settings"), settings)
-        self._require_fitting(arrays, self._start)
-        labels = ["fun"] * f0.size + [f"invariant {name!r}" for name in self._names]
-        sizes = np.append(np.full(f0.size, np.abs(f0).max(initial=0.0)), run.invariants.term_sizes(t0, y0, f0))
-        there, here = (np.append(a["start_f"], a["start_values"]) for a in (arrays, self._start))
-        self._require_same_functions(labels, sizes, there, here)
-        checkpoint.warn_of_other_versions(self._path, header, stacklevel=4)
+        checkpoint.require_same(self._file.name, header.get("settings"), settings)
+        self._require_same_functions(run, arrays, self._start, t0, y0, "at the start")
+        self._require_fitting(arrays, {"y": y0, "clock": np.zeros(H_ABS + 1)})
+        if "state_f" in arrays:
+            t, y = float(arrays["clock"][T]), arrays["y"]
+            here = self._known_by(run, t, y)
+            self._require_same_functions(run, arrays, here, t, y, f"at t = {t:.10g}, where it stands,")
+        checkpoint.warn_of_other_versions(self._file.name, header, stacklevel=4)
 
-    def _require_same_functions(self, labels: list[str], sizes: Any, there: Any, here: Any) -> None:
+    def _known_by(self, run: Run, t: float, y: np.ndarray) -> dict[str, np.ndarray]:
+        """What the functions are known by at a state of the run."""
+        return {"state_f": self._derivative(t, y.copy()), "state_values": run.invariants.values(t, y)}
+
+    def _require_same_functions(
+        self,
+        run: Run,
+        arrays: dict[str, np.ndarray],
+        known_by: dict[str, np.ndarray],
+        t: float,
+        y: np.ndarray,
+        where: str,
+    ) -> None:
+        self._require_fitting(arrays, known_by)
+        f, _ = known_by.values()
+        labels = ["fun"] * f.size + [f"invariant {name!r}" for name in self._names]
+        there, here = (np.concatenate([a[name] for name in known_by]) for a in (arrays, known_by))
         with np.errstate(invalid="ignore"):
+            sizes = np.append(np.full(f.size, np.abs(f).max(initial=0.0)), run.invariants.term_sizes(t, y, f))
             same = (there == here) | (np.abs(there - here) <= SAME * sizes) | (np.isnan(there) & np.isnan(here))
         if not same.all():
             k = int(np.flatnonzero(~same)[0])
             raise CheckpointError(
-                f"the checkpoint {self._path!r} belongs to another run: {labels[k]} was {there[k]:.12g} at the start "
+                f"the checkpoint {self._file.name!r} belongs to another run: {labels[k]} was {there[k]:.12g} {where} "
                 f"and is {here[k]:.12g} now. Resume with the functions of that run, or name another file to start anew."
             )
 
@@ -209,7 +252,7 @@ class _FileKeeper(Keeper):
             if found is None or (found.dtype, found.shape) != (a.dtype, a.shape):
                 what = "is missing" if found is None else f"is {found.dtype} {found.shape}"
                 raise CheckpointError(
-                    f"{self._path!r} is no checkpoint of this run: {name} {what}, expected {a.dtype} {a.shape}."
+                    f"{self._file.name!r} is no checkpoint of this run: {name} {what}, expected {a.dtype} {a.shape}."
                 )
 
     def begin(self, driver: Any, events: Events, max_bytes: float) -> None:
@@ -231,7 +274,8 @@ class _FileKeeper(Keeper):
         self._require_fitting(arrays, parts)
         step, rows, pending = (int(k) for k in arrays["place"])
         if step < 0 or rows < 0 or pending != 0 or not is_number(header.get("wall_time")):
-            raise CheckpointError(f"{self._path!r} is no checkpoint of this run: it stands at step {step}, row {rows}.")
+            where = f"it stands at step {step}, row {rows}"
+            raise CheckpointError(f"{self._file.name!r} is no checkpoint of this run: {where}.")
         n, dtype = driver.run.y0.size, driver.run.y0.dtype
         expected = {"saved_t": np.broadcast_to(0.0, rows), "saved_y": np.broadcast_to(dtype.type(0), (rows, n))}
         for k in range(len(events.functions)):
@@ -252,7 +296,7 @@ class _FileKeeper(Keeper):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        return tuple(note for note in (self._origin, self._failure) if note)
+        return tuple(note for note in (self._origin, self._file.moved, self._failure) if note)
 
     def keep(self) -> None:
         now = time.perf_counter()
@@ -273,11 +317,23 @@ class _FileKeeper(Keeper):
             self._write(None, f"interrupted by {type(error).__name__}")
         except CheckpointError as failure:
             error.add_note(str(failure))
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, TerminatedError):
             error.add_note("interrupted again while the checkpoint was written")
+        again = "resume=True"
+        if self._file.moved:
+            error.add_note(self._file.moved)
+            again = f"checkpoint={self._file.name!r}, {again}"
         error.add_note(
-            f"the checkpoint {self._path!r} holds {self._written}: the same call with resume=True goes on from there"
+            f"the checkpoint {self._file.name!r} holds {self._written}: the same call with {again} goes on from there"
         )
+
+    def _state(self) -> dict[str, np.ndarray]:
+        """What the functions are known by at the snapshot; not counted among the run's evaluations."""
+        arrays = self._snapshot.arrays
+        try:
+            return self._known_by(self._driver.run, float(arrays["clock"][T]), arrays["y"])
+        except Exception:  # where a function has just broken the run off: the checkpoint matters more
+            return {}
 
     def _take_snapshot(self) -> None:
         begin = time.perf_counter()
@@ -292,9 +348,11 @@ class _FileKeeper(Keeper):
 
     def _write_or_warn(self, status: int | None, message: str, *, stacklevel: int) -> None:
         """Write; a disk that is full is no reason to end a long run, but one to speak."""
-        self._failure = ""
+        self._failure, name = "", self._file.name
         try:
             self._write(status, message)
+            if self._file.name != name:
+                warnings.warn(f"{self._file.moved}.", RuntimeWarning, stacklevel=stacklevel)
         except CheckpointError as error:
             self._due = time.perf_counter() + self._every
             self._failure = f"{error}; it still holds {self._written}"
@@ -321,11 +379,12 @@ class _FileKeeper(Keeper):
             "doubts": driver.run.trust.doubts,
             "settings": self._settings,
         }
-        arrays = {**self._start, **snapshot.arrays, "saved_t": driver.t[:rows], "saved_y": driver.y[:rows]}
+        saved = {"saved_t": driver.t[:rows], "saved_y": driver.y[:rows]}
+        arrays = {**self._start, **self._state(), **snapshot.arrays, **saved}
         for k, count in enumerate(snapshot.happened):
             arrays[f"event_{k}_t"] = np.array(events.t[k][:count])
             arrays[f"event_{k}_y"] = np.array(events.y[k][:count], y0.dtype).reshape(count, y0.size)
-        checkpoint.write(self._path, header, arrays)
+        self._file.write(header, arrays)
         end = time.perf_counter()
         self._due = end + max(self._every, LEAST_RATIO * (end - begin))
         self._written = self._where()

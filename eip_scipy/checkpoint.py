@@ -19,7 +19,7 @@ import secrets
 import time
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -78,21 +78,44 @@ def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mappi
     >>> header["kind"], arrays["x"]
     ('example', array([0, 1, 2]))
     """
+    target = Path(os.path.realpath(path))
+    put(target, header, arrays, lambda temporary, digest: os.replace(temporary, target))
+
+
+def put(
+    path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], place: Callable[[Path, str], None]
+) -> None:
+    """Write a checkpoint to a file in the folder of `path`, bring it to the disk, and let `place` give it its name.
+
+    Parameters
+    ----------
+    path : Path
+        Links resolved.
+    header, arrays
+        As for `write`.
+    place : callable
+        ``place(temporary, digest)``: the temporary file, which is removed if it is still there afterwards, and the
+        SHA-256 that it ends with.
+
+    Raises
+    ------
+    CheckpointError
+        When the file cannot be written.
+    """
     own = {"format": FORMAT, "schema": SCHEMA, **origin()}
     text = json.dumps({**header, **own}, indent=1, allow_nan=False).encode()
-    target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.name}-{secrets.token_hex(4)}.tmp")
+    temporary = path.with_name(f".{path.name}-{secrets.token_hex(4)}.tmp")
     try:
         try:
             with open(temporary, "xb") as stream:
-                _fill(stream, text, arrays)
+                digest = _fill(stream, text, arrays)
                 stream.flush()
                 os.fsync(stream.fileno())
-            os.replace(temporary, target)
+            place(temporary, digest)
         finally:
             temporary.unlink(missing_ok=True)
-        _sync_folder(target.parent)
-        _remove_leftovers(target)
+        _sync_folder(path.parent)
+        _remove_leftovers(path)
     except OSError as error:
         raise CheckpointError(f"cannot write the checkpoint {_name(path)}: {_reason(error)}") from error
 
@@ -116,9 +139,18 @@ def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[st
     CheckpointError
         For a file that cannot be read, is no checkpoint, is damaged or truncated, or has another schema or kind.
     """
+    header, arrays, _, _ = read_known(path, kind)
+    return header, arrays
+
+
+def read_known(
+    path: str | os.PathLike[str], kind: str | None
+) -> tuple[dict[str, Any], dict[str, np.ndarray], os.stat_result, str]:
+    """As `read`, with what the file is known by: its status, and the SHA-256 that it ends with."""
     try:
         with open(path, "rb") as stream:
-            size = _require_undamaged(path, stream)
+            status = os.fstat(stream.fileno())
+            size, digest = _require_undamaged(path, stream)
             header, arrays = _parse(stream, size)
     except OSError as error:
         raise CheckpointError(f"cannot read the checkpoint {_name(path)}: {_reason(error)}") from error
@@ -133,7 +165,21 @@ def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[st
         )
     if kind is not None and header.get("kind") != kind:
         raise CheckpointError(f"{_name(path)} is a checkpoint of {header.get('kind')!r}, expected {kind!r}.")
-    return header, arrays
+    return header, arrays, status, digest
+
+
+def digest_of(path: str | os.PathLike[str]) -> str:
+    """The SHA-256 that an undamaged checkpoint ends with.
+
+    Raises
+    ------
+    CheckpointError
+        For another file.
+    OSError
+        When it cannot be read.
+    """
+    with open(path, "rb") as stream:
+        return _require_undamaged(path, stream)[1]
 
 
 def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, Any]) -> None:
@@ -217,7 +263,8 @@ class _Hashed:
         self._stream.flush()
 
 
-def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> None:
+def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> str:
+    """Write header, arrays and digest; returns the digest."""
     hashed: Any = _Hashed(stream)
     with zipfile.ZipFile(hashed, "w") as archive:
         archive.comment = MARK + b"0" * DIGITS
@@ -225,8 +272,10 @@ def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> No
         for name, value in arrays.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy", DATE), "w", force_zip64=True) as member:
                 npy.write_array(member, np.asarray(value, order="C"), version=(1, 0), allow_pickle=False)
+    digest: str = hashed.digest.hexdigest()
     stream.seek(-DIGITS, os.SEEK_END)
-    stream.write(hashed.digest.hexdigest().encode())
+    stream.write(digest.encode())
+    return digest
 
 
 def _sync_folder(folder: Path) -> None:
@@ -251,8 +300,8 @@ def _remove_leftovers(target: Path) -> None:
                 leftover.unlink()
 
 
-def _require_undamaged(path: str | os.PathLike[str], stream: BinaryIO) -> int:
-    """Check mark and digest; returns the size of the file."""
+def _require_undamaged(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[int, str]:
+    """Check mark and digest; returns the size of the file and the digest."""
     start = stream.read(4)
     size = stream.seek(0, os.SEEK_END)
     if start != ZIP:
@@ -276,7 +325,7 @@ def _require_undamaged(path: str | os.PathLike[str], stream: BinaryIO) -> int:
             f"{_name(path)} is damaged: its SHA-256 is not the one it was written with. Go back to a copy, or delete "
             "it and start anew."
         )
-    return size
+    return size, digest.hexdigest()
 
 
 def _parse(stream: BinaryIO, size: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

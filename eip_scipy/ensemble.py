@@ -10,6 +10,7 @@ import uuid
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
+from contextlib import ExitStack, closing, nullcontext
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -19,13 +20,14 @@ from numba.extending import is_jitted
 from scipy.optimize import OptimizeResult
 
 from . import _setup
-from ._interrupts import kept_ctrl_c
+from ._interrupts import ended_by_sigterm, kept_ctrl_c
 from ._members import FAILED, NOT_RUN, Members, Plan, Task
 from ._names import nearest
+from ._own_file import absolute
 from ._pools import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
 from ._side_by_side import lanes_of
 from ._statistics import Statistics, merge
-from ._store import CheckpointStore, Store, ZarrStore
+from ._store import CheckpointStore, Store, ZarrStore, location, require_same_functions
 from ._trust import ProjectionWarning
 from .invariants import as_invariants
 from .longrun import DEFAULT, free_memory, integrate
@@ -173,7 +175,8 @@ def ensemble(
         ``callback(part)`` after each chunk of members, in their order, with an `EnsembleResult` of that chunk; return
         True to stop.
     out : path-like, optional
-        A Zarr group to write to, chunk by chunk, for trajectories that do not fit into memory; xarray opens it.
+        A Zarr group to write to, chunk by chunk, for trajectories that do not fit into memory; xarray opens it. The
+        path of a folder, or a URL.
     checkpoint : path-like, optional
         Without `out`: a file that keeps finished members, see `eip_scipy.checkpoint`; written every `checkpoint_every`
         seconds, and when the ensemble ends or is broken off.
@@ -205,7 +208,8 @@ def ensemble(
     MemoryError
         When results would need more than `max_bytes`.
     CheckpointError
-        When `out` or `checkpoint` exists and is not to be resumed, or is damaged, or belongs to other arguments.
+        When `out` or `checkpoint` exists and is not to be resumed, or is damaged, or belongs to other arguments or
+        functions, or another ensemble has it, or `out` can no longer be written.
 
     Notes
     -----
@@ -231,6 +235,8 @@ def ensemble(
     if not (reduce is None or reduce == "state" or callable(reduce)):
         raise ValueError(f"reduce must be 'state' or a function reduce(t, y), got {reduce!r}.")
     _check_places(out, checkpoint, checkpoint_every, resume)
+    out = None if out is None else location(out)
+    checkpoint = None if checkpoint is None else absolute(checkpoint)
     keep = reduce is None or out is not None
     own = parameters[0] if parameters.shape[1] else None
     task = Task(_bare(fun), t_span, given, starts[0], own, reduce, keep, len(starts))
@@ -246,8 +252,9 @@ def ensemble(
         store = ZarrStore(out, identity, plan.empty(size), plan.times, len(starts), resume)
     elif checkpoint is not None:
         store = CheckpointStore(checkpoint, plan.identity(starts, parameters, size), checkpoint_every, resume)
-    gathered = _Gathered(plan, len(starts), held, size, store, callback)
-    result = gathered.run(partial(_pool, executor, task, progress), _chunks(starts, parameters, size), progress)
+    with ended_by_sigterm(store is not None), nullcontext() if store is None else closing(store):
+        gathered = _Gathered(plan, len(starts), held, size, store, callback)
+        result = gathered.run(partial(_pool, executor, task, progress), _chunks(starts, parameters, size), progress)
     doubtful = np.flatnonzero((result.status >= 0) & ~result.trusted)
     if doubtful.size:
         _warn(result, doubtful)
@@ -298,7 +305,7 @@ class _Gathered:
         """All chunks that are not in the store yet."""
         from tqdm import tqdm
 
-        done = self._stored()
+        done = self._stored(chunks)
         total = len(self.whole.t)
         try:
             if done < total:
@@ -319,7 +326,7 @@ class _Gathered:
             raise
         return self.result()
 
-    def _stored(self) -> int:
+    def _stored(self, chunks: Callable[[int], Iterator[Chunk]]) -> int:
         """Take what the store has; returns the number of members."""
         if self.store is None:
             return 0
@@ -328,23 +335,27 @@ class _Gathered:
             members = self.store.read(first, min(first + self.chunk, done))
             part = Part(members, None) if statistics is not None else finished(self.plan.task, self.plan, members)
             self._take(first, part)
+            if first + self.chunk >= done:
+                last = next(chunks(first))
+                here = self.plan.known_by(last.y0s, last.params, members)
+                require_same_functions(self.store.path, self.store.known_by(first), *here, first)
         self.statistics = self.statistics if statistics is None else statistics
         return done
 
     def _gather(self, pool: Pool, chunks: Iterator[Chunk], bar: Any) -> None:
-        try:
+        with ExitStack() as stack:
+            stack.callback(pool.close)
+            if self.store is not None:
+                stack.callback(self.store.flush)  # first: whoever ends the process may not wait long
             for chunk, part in in_order(pool, chunks):
                 self._take(chunk.first, part)
                 if self.store is not None:
-                    self.store.write(chunk.first, part.members, self.whole, self.statistics)
+                    known_by, _ = self.plan.known_by(chunk.y0s, chunk.params, part.members)
+                    self.store.write(chunk.first, part.members, known_by, self.whole, self.statistics)
                 bar.update(len(part.members.t))
                 if self.callback is not None and self.callback(self._of(part.members, part.statistics, chunk.first)):
                     self.stopped = True
                     return
-        finally:
-            pool.close()
-            if self.store is not None:
-                self.store.close()
 
     def _take(self, first: int, part: Part) -> None:
         members, last = part.members, first + len(part.members.t)

@@ -20,7 +20,7 @@ from . import _kernels as kn
 from . import _resume, _setup
 from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures, with_inlined
 from ._events import Events
-from ._interrupts import kept_ctrl_c, look_for_ctrl_c
+from ._interrupts import ended_by_sigterm, kept_ctrl_c, look_for_signals
 from ._kernels import OK
 from ._names import nearest
 from ._setup import ProjectionOptions, Run
@@ -379,8 +379,8 @@ def integrate(
         Bound on the memory for saved states; default: half of what is free.
     checkpoint : path-like, optional
         File that holds the run, saved states included, so that it can be resumed; written at the start, every
-        `checkpoint_every` seconds, and when the run ends or is broken off. A file that is there already is replaced
-        only by the run that resumes it.
+        `checkpoint_every` seconds, and when the run ends or is broken off, by SIGTERM too. A file that is there already
+        is replaced only by the run that resumes it, and only one run at a time may have it.
     checkpoint_every : float, optional
         Seconds from one checkpoint to the next; more where writing would take over a twentieth of the time.
     resume : bool, optional
@@ -408,7 +408,7 @@ def integrate(
         When the saved states would need more than `max_bytes`.
     CheckpointError
         When the file cannot be written at the start, or is there and not to be resumed, or is damaged, or belongs to a
-        run with other arguments.
+        run with other arguments or functions, or another run has it.
 
     Notes
     -----
@@ -429,8 +429,9 @@ def integrate(
     for name in unknown:
         hint = nearest(name, integrate.__kwdefaults__ or ())
         raise TypeError(f"integrate() has no option {name!r}{hint}")
-    with kept_ctrl_c():
-        return prepared(**arguments).run()
+    own = {name: arguments.pop(name) for name in ("checkpoint", "checkpoint_every", "resume")}
+    with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), _resume.kept(*own.values()) as keeper:
+        return prepared(**arguments, keeper=keeper).run()
 
 
 def prepared(
@@ -455,14 +456,11 @@ def prepared(
     atol: Any,
     first_step: float | None,
     max_step: float,
-    checkpoint: str | os.PathLike[str] | None,
-    checkpoint_every: float,
-    resume: bool,
+    keeper: _resume.Keeper,
     check_start: bool = True,
     **projection: Any,
 ) -> Loop:
     """What `integrate` runs, by the same arguments, all of them validated; `projection`: those of the projection."""
-    keeper = _resume.kept(checkpoint, checkpoint_every, resume)
     given = {key: value for key, value in projection.items() if value is not DEFAULT}
     tableau = _tableau(method)
     form = FORMS[isinstance(tableau, NystromTableau), bool(in_place)]
@@ -522,9 +520,9 @@ def prepared(
     record = Diagnostics() if diagnostics is None else diagnostics
     _setup.attach(record, run)
     happenings.fill(t0, run.y0, grid.g)
-    if checkpoint is not None:
+    if keeper.keeps:
         settings = _resume.settings(method.__name__, stepping, start, parameters, run, grid, happenings)
-        keeper.identify(settings, run, t0, start, f0)
+        keeper.identify(settings, run, derivative, t0, start, f0)
     with _compiling(progress and compiled is not False and is_jitted(fun)):
         functions, why_not = _functions(fun, form, extra, run, happenings, compiled, rhs)
         driver = _Driver(run, grid, functions, parameters, compiled=why_not is None)
@@ -571,11 +569,11 @@ class Loop:
             self.keeper.end(status, message)
         except BaseException as error:
             self.wall_time += time.perf_counter() - begin
+            self.keeper.interrupted(error)  # first: whoever ends the process may not wait long
             driver.run.trust.failed = True
             driver.save_now()
             partial = self._result(-1, f"interrupted by {type(error).__name__}", broken=True)
             error.partial = partial  # type: ignore[attr-defined]
-            self.keeper.interrupted(error)
             raise
         self.wall_time += time.perf_counter() - begin
         if status < 0:
@@ -619,7 +617,7 @@ class Loop:
             if self._stopped_by_callback(0):
                 return 1, STOPPED
         while True:
-            look_for_ctrl_c()
+            look_for_signals()
             self.keeper.keep()
             k, rows, begin = driver.step, driver.rows, time.perf_counter()
             code = driver.advance(k + self._chunk(self.chunk))

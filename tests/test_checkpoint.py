@@ -455,21 +455,21 @@ def test_a_problem(tmp_path, monkeypatch):
 
 def times_written(monkeypatch, path, every, seconds=0.0, **options):
     """How often a run of 200 chunks of 10 ms of a clock of its own writes, each in so many seconds."""
-    now, written, advance, write = [0.0], [], longrun._Driver.advance, checkpoint.write
+    now, written, advance, write = [0.0], [], longrun._Driver.advance, checkpoint.put
 
     def tick(driver, k_end):
         now[0] += 0.01
         return advance(driver, min(k_end, driver.step + 1))
 
-    def note(path, header, arrays):
+    def note(path, header, arrays, place):
         now[0] += seconds
         written.append((now[0], header["step"], header["status"]))
-        write(path, header, arrays)
+        write(path, header, arrays, place)
 
     with monkeypatch.context() as patch:
         patch.setattr(longrun._Driver, "advance", tick)
         patch.setattr(_resume.time, "perf_counter", lambda: now[0])
-        patch.setattr(checkpoint, "write", note)
+        patch.setattr(checkpoint, "put", note)
         integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=every, **FIXED | options)
     return written
 
@@ -551,8 +551,8 @@ def test_no_file_yet(tmp_path):
         ({"checkpoint": "a", "checkpoint_every": "1 min"}, ValueError, "checkpoint_every .* got '1 min'"),
         ({"checkpoints": "a"}, TypeError, "did you mean 'checkpoint'"),
         ({"checkpoint": "no/such/folder/a"}, CheckpointError, "cannot write .*no/such/folder/a'.* no such file or dir"),
-        ({"checkpoint": "."}, CheckpointError, "'.' exists"),
-        ({"checkpoint": ".", "resume": True}, CheckpointError, "cannot read the checkpoint '.': is a directory"),
+        ({"checkpoint": "."}, CheckpointError, "' exists"),
+        ({"checkpoint": ".", "resume": True}, CheckpointError, "cannot read the checkpoint '.*': is a directory"),
     ],
 )
 def test_bad_options(options, error, match, tmp_path, monkeypatch):
@@ -1077,15 +1077,15 @@ def test_folders_that_cannot_be_synced(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("fine")
 def test_a_run_goes_on_while_the_disk_is_full(tmp_path, monkeypatch):
     whole, path = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run"
-    write, calls = checkpoint.write, []
+    write, calls = checkpoint.put, []
 
-    def full_for_a_while(path, header, arrays):
+    def full_for_a_while(path, header, arrays, place):
         calls.append(header["step"])
         if 6 <= len(calls) <= 8:
             raise CheckpointError("cannot write the checkpoint: no space left on device")
-        write(path, header, arrays)
+        write(path, header, arrays, place)
 
-    monkeypatch.setattr(checkpoint, "write", full_for_a_while)
+    monkeypatch.setattr(checkpoint, "put", full_for_a_while)
     match = r"no space left on device; it still holds step 7, t = 0\.21\. The run goes on and tries again"
     with pytest.warns(RuntimeWarning, match=match) as record:
         found = integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=1e-9, **FIXED)
@@ -1149,14 +1149,14 @@ def test_interrupted_with_a_full_disk(reason, tmp_path, monkeypatch):
 @pytest.mark.usefixtures("fine")
 def test_interrupted_while_the_result_is_written(tmp_path, monkeypatch):
     """The run is done: all of it is in the partial result, and in the file after all."""
-    whole, path, write = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", checkpoint.write
+    whole, path, write = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", checkpoint.put
 
-    def interrupt_once(path, header, arrays):
+    def interrupt_once(path, header, arrays, place):
         if header["status"] == 0:
             raise KeyboardInterrupt
-        write(path, header, arrays)
+        write(path, header, arrays, place)
 
-    monkeypatch.setattr(checkpoint, "write", interrupt_once)
+    monkeypatch.setattr(checkpoint, "put", interrupt_once)
     with pytest.raises(KeyboardInterrupt) as info:
         integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED)
     np.testing.assert_array_equal(info.value.partial.y, whole.y)

@@ -617,14 +617,14 @@ def test_checkpoints_in_time(tmp_path):
 
 def test_a_full_disk_is_a_warning(tmp_path, monkeypatch):
     """The result is there all the same, and so is the former file."""
-    path, write = tmp_path / "kept", checkpoint.write
+    path, write = tmp_path / "kept", checkpoint.put
 
     def full(*arguments):
         if path.exists():
             raise CheckpointError("cannot write the checkpoint: no space left on device")
         write(*arguments)
 
-    monkeypatch.setattr(checkpoint, "write", full)
+    monkeypatch.setattr(checkpoint, "put", full)
     with pytest.warns(RuntimeWarning, match="no space left on device; the former checkpoint stays"):
         same(stored(), stored(checkpoint=path))
     assert checkpoint.read(path, "ensemble")[0]["finished"] == 0

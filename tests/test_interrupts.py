@@ -8,7 +8,7 @@ import pytest
 from systems import jit_orbit, orbit, oscillator, pericentre
 
 from eip_scipy import EIPRK4, ensemble, integrate
-from eip_scipy._interrupts import kept_ctrl_c, look_for_ctrl_c
+from eip_scipy._interrupts import kept_ctrl_c, look_for_signals
 
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
@@ -96,7 +96,7 @@ def test_other_threads():
     found = []
 
     def run():
-        look_for_ctrl_c()
+        look_for_signals()
         found.append(integrate(oscillator, (0, 1), [1.0, 0.0], method=EIPRK4, h=0.1).success)
 
     with kept_ctrl_c():
@@ -105,5 +105,5 @@ def test_other_threads():
         thread.start()
         thread.join()
         with pytest.raises(KeyboardInterrupt):
-            look_for_ctrl_c()
+            look_for_signals()
     assert found == [True]
