@@ -1,0 +1,425 @@
+"""Random systems with random options, by a number each: what a run is given, and what is known of its result."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+import eip_scipy
+from eip_scipy import Invariant
+
+from . import jitted
+from .families import Array, Quantity, System, random_system
+
+METHODS = {  # least and largest h times the fastest rate of the system; least rtol
+    "EIPRK1": (0.002, 0.02, None),
+    "EIPRK2": (0.01, 0.1, 1e-5),
+    "EIPRK3": (0.02, 0.2, 1e-7),
+    "EIPRK4": (0.03, 0.4, 1e-9),
+    "EIPRK5": (0.05, 0.5, 1e-10),
+    "EIPRK23": (0.02, 0.2, 1e-6),
+    "EIPRK45": (0.05, 0.5, 1e-10),
+    "EIPDOP853": (0.1, 1.0, 1e-12),
+    "EIPRKN8": (0.1, 1.0, 1e-11),
+    "EIPRKN12": (0.2, 1.5, 1e-12),
+}
+NYSTROM = ("EIPRKN8", "EIPRKN12")
+PHASES = (3.0, 15.0)  # length of a run times the fastest rate
+MOST_STEPS, MOST_CALLS = 200, 50_000
+SAMPLES = 4
+NEARBY, REGULAR = 1e-6, 1e3
+
+
+class TooManyCallsError(Exception):
+    """A run takes far more evaluations than any that ends."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A system and the options of its runs.
+
+    `sick`: one of the invariants is none. `truth` holds the true states at `times`, `size` the largest value of each
+    component, `growth` the factor by which the motion stretches a small change of the start.
+    """
+
+    seed: int
+    system: System
+    invariants: tuple[Invariant, ...]
+    sick: bool
+    method: str
+    t_span: tuple[float, float]
+    steps: dict[str, Any]
+    projection: dict[str, Any]
+    compensated: bool
+    params: Array | None
+    in_place: bool
+    events: tuple[Callable[..., float], ...]
+    times: Array
+    truth: Array
+    size: Array
+    growth: float
+
+    @property
+    def regular(self) -> bool:
+        """Whether neighbouring motions stay neighbours, so that a run can be compared with the true one."""
+        return self.growth < REGULAR
+
+    @property
+    def native(self) -> bool:
+        """Whether all functions are Numba functions."""
+        return self.system.name == jitted.NAME
+
+    @property
+    def terminal(self) -> bool:
+        """Whether an event may end the run."""
+        return any(event.terminal for event in self.events)  # type: ignore[attr-defined]
+
+    def error(self, y: Array) -> float:
+        """Largest error of the states (n, SAMPLES), in units of the components' sizes."""
+        return float(np.max(np.abs(y - self.truth) / self.size[:, None]))
+
+    def solve_ivp(self, **options: Any) -> Any:
+        """The run by SciPy."""
+        fun = counted(self.system.fun)
+        given = {"invariants": self.invariants, **self.steps, **self.projection}
+        if self.params is not None and not self.native:
+            fun, given["args"] = with_params(fun), (self.params,)
+        if self.events:
+            given["events"] = self.events
+        return solve_ivp(fun, self.t_span, self.system.y0.copy(), method=method(self.method), **given | options)
+
+    @property
+    def fun(self) -> Callable[..., Any]:
+        """The right-hand side as `integrate` and `ensemble` take it."""
+        if self.native:
+            return jitted.acceleration if self.method in NYSTROM else jitted.motion
+        fun = self.system.acc if self.method in NYSTROM else self.system.fun
+        assert fun is not None
+        fun = counted(fun)
+        if self.params is not None:
+            fun = with_params(fun)
+        return filling(fun) if self.in_place else fun
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options of both."""
+        given = {
+            "method": method(self.method),
+            "invariants": self.invariants,
+            "in_place": self.in_place,
+            "compensated": self.compensated,
+            "compiled": False,
+            **self.steps,
+            **self.projection,
+        }
+        if self.params is not None:
+            given["params"] = self.params
+        if self.events:
+            given["events"] = self.events
+        return given
+
+    def integrate(self, **options: Any) -> Any:
+        """The run by `integrate`."""
+        fun = options.pop("fun", None) or self.fun
+        return eip_scipy.integrate(fun, self.t_span, self.system.y0.copy(), **self.options | options)
+
+    def __str__(self) -> str:
+        kept = ", ".join(str(item.name) for item in self.invariants) or "nothing"
+        shown = [f"{name}={value!r}" for name, value in (self.steps | self.projection).items()]
+        shown += [name for name in ("compensated", "in_place", "sick") if getattr(self, name)]
+        shown += ["params"] if self.params is not None else []
+        shown += [f"event(terminal={e.terminal}, direction={e.direction})" for e in self.events]  # type: ignore[attr-defined]
+        notes = "".join(f", {note}" for note in self.system.notes)
+        return (
+            f"{self.system.name}, {self.system.y0.size} components{notes}; kept: {kept}; {self.method} on "
+            f"({self.t_span[0]:.6g}, {self.t_span[1]:.6g}); {', '.join(shown)}"
+        )
+
+
+def method(name: str) -> Any:
+    """The class of that name."""
+    return getattr(eip_scipy, name)
+
+
+def counted(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function, for a bounded number of calls."""
+    calls = 0
+
+    def bounded(*args: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls > MOST_CALLS:
+            raise TooManyCallsError
+        return fun(*args)
+
+    return bounded
+
+
+def with_params(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function with one more argument, whose first number is 1."""
+    return lambda t, y, p: fun(t, y) * p[0]
+
+
+def filling(fun: Callable[..., Any]) -> Callable[..., None]:
+    """The same function in place."""
+
+    def fill(t: float, y: Array, out: Array, *params: Array) -> None:
+        out[:] = fun(t, y, *params)
+
+    return fill
+
+
+def random_case(seed: int) -> Case:
+    """The case of that number."""
+    rng = np.random.default_rng(seed)
+    params, in_place, sick = None, False, False
+    if rng.random() < 0.15:
+        system, invariants, params = jitted.jitted_system(rng)
+        in_place = True
+    else:
+        system = random_system(rng)
+        kept = _chosen(rng, system.kept)
+        if kept and rng.random() < 0.08:
+            kept, sick = (*kept[:-1], _leaking(rng, system, kept[-1])), True
+        if rng.random() < 0.15:
+            params = np.array([1.0, rng.uniform(0.5, 2.0)])
+        in_place = bool(rng.random() < 0.2)
+        invariants = tuple(_formed(rng, quantity, system, params) for quantity in kept)
+    sign = -1.0 if rng.random() < 0.25 else 1.0
+    name = str(rng.choice([m for m in METHODS if system.acc is not None or m not in NYSTROM]))
+    low, high, least_rtol = METHODS[name]
+    rate = _rate(system, sign)
+    h = 10 ** rng.uniform(math.log10(low), math.log10(high)) / rate
+    length = min(rng.uniform(*PHASES) / rate, MOST_STEPS * h)
+    t_span = (system.t0, system.t0 + sign * length)
+    times = np.linspace(*t_span, SAMPLES + 1)[1:]
+    truth, growth = _truth(rng, system, times)
+    size = np.abs(np.column_stack([system.y0, truth])).max(axis=1)
+    size = np.maximum(size, 1e-3 * np.max(size * system.unit) / system.unit)
+    return Case(
+        seed=seed,
+        system=system,
+        invariants=invariants,
+        sick=sick,
+        method=name,
+        t_span=t_span,
+        steps=_steps(rng, system, min(h, length), length, least_rtol, size),
+        projection=_projection(rng, system, size, name != "EIPRK1"),
+        compensated=bool(rng.random() < 0.15),
+        params=params,
+        in_place=in_place,
+        events=() if system.name == jitted.NAME else _events(rng, size),
+        times=times,
+        truth=truth,
+        size=size,
+        growth=growth,
+    )
+
+
+# What is kept.
+
+
+def _chosen(rng: np.random.Generator, kept: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
+    """Some of them in any order, maybe with one that depends on them, maybe two of them as one vector."""
+    if rng.random() < 0.05:
+        return ()
+    chosen = [kept[k] for k in rng.permutation(len(kept))[: rng.integers(1, len(kept) + 1)]]
+    if rng.random() < 0.25:
+        made = (_multiple, _square)[rng.integers(2)]
+        chosen.append(made(rng, chosen[rng.integers(len(chosen))]))
+    if len(chosen) > 1 and rng.random() < 0.2:
+        chosen = [_stacked(chosen[0], chosen[1]), *chosen[2:]]
+    return tuple(chosen)
+
+
+def _multiple(rng: np.random.Generator, a: Quantity) -> Quantity:
+    factor = float(rng.choice([1.0, -2.5, 1e4]))
+    return Quantity(f"{factor:g} {a.name}", lambda t, y: factor * a.fun(t, y), lambda t, y: factor * a.grad(t, y))
+
+
+def _square(rng: np.random.Generator, a: Quantity) -> Quantity:
+    def gradient(t: float, y: Array) -> Array:
+        return 2 * np.asarray(a.fun(t, y))[..., None] * a.grad(t, y)
+
+    return Quantity(f"{a.name}^2", lambda t, y: a.fun(t, y) ** 2, gradient)
+
+
+def _stacked(a: Quantity, b: Quantity) -> Quantity:
+    def value(t: float, y: Array) -> Array:
+        return np.concatenate([np.atleast_1d(a.fun(t, y)), np.atleast_1d(b.fun(t, y))])
+
+    return Quantity(f"({a.name}, {b.name})", value, lambda t, y: np.vstack([a.grad(t, y), b.grad(t, y)]))
+
+
+def _leaking(rng: np.random.Generator, system: System, a: Quantity) -> Quantity:
+    """What is nearly kept: with a further term, whose rate may vanish at the start."""
+    y0, unit, power = system.y0, system.unit, int(rng.integers(1, 3))
+    amount = 10 ** rng.uniform(-4, 0) * np.max(np.abs(a.fun(system.t0, y0)))
+    way = rng.standard_normal(y0.size)
+
+    def moved(y: Array) -> float:
+        return float(np.real(way @ ((y - y0) * unit)))
+
+    def gradient(t: float, y: Array) -> Array:
+        return a.grad(t, y) + amount * power * moved(y) ** (power - 1) * way * unit
+
+    return Quantity(f"leaking {a.name}", lambda t, y: a.fun(t, y) + amount * moved(y) ** power, gradient)
+
+
+def _formed(rng: np.random.Generator, a: Quantity, system: System, params: Array | None) -> Invariant:
+    """As an `Invariant`, with or without a gradient, in place or not, by f or not."""
+
+    def factor(args: tuple[Any, ...]) -> float:
+        return args[0][1] if args else 1.0
+
+    def fun(t: float, y: Array, *args: Any) -> Any:
+        return a.fun(t, y) * factor(args)
+
+    by_f = a.by_f if rng.random() < 0.4 else None
+    in_place = bool(rng.random() < 0.3)
+
+    def value(*arguments: Any) -> Array:
+        """The gradient for (t, y, [f], *args)."""
+        if by_f is None:
+            t, y, *args = arguments
+            return a.grad(t, y) * factor(tuple(args))
+        t, y, f, *args = arguments
+        return by_f(t, y, f) * factor(tuple(args))
+
+    def fill(*arguments: Any) -> None:
+        at = 2 if by_f is None else 3
+        arguments[at][...] = value(*arguments[:at], *arguments[at + 1 :])
+
+    options: dict[str, Any] = {"name": a.name, "args": () if params is None else (params,)}
+    start = fun(system.t0, system.y0, *options["args"])
+    if rng.random() < 0.08:
+        options["target"] = start
+    if rng.random() < 0.05:
+        options["scale"] = float(np.max(np.abs(start)))
+    if rng.random() < 0.15 and _floats(system.y0).size <= 8:  # each gradient costs 12 evaluations for each float
+        return Invariant(fun, **options)
+    return Invariant(fun, fill if in_place else value, in_place=in_place, uses_f=by_f is not None, **options)
+
+
+# How it is run.
+
+
+def _steps(
+    rng: np.random.Generator, system: System, h: float, length: float, least_rtol: float | None, size: Array
+) -> dict[str, Any]:
+    if least_rtol is None or rng.random() < 0.5:
+        # The default atol is for states of about 1.
+        return {"h": float(h)} | ({} if np.ndim(system.unit) == 0 else {"atol": 1e-6 * size})
+    rtol = float(10 ** rng.uniform(math.log10(least_rtol), -3))
+    steps: dict[str, Any] = {"rtol": rtol, "atol": rtol * float(rng.choice([1e-3, 1.0])) * size}
+    if rng.random() < 0.2:
+        steps["first_step"] = float(h * rng.uniform(0.01, 1.0))
+    if rng.random() < 0.2:
+        steps["max_step"] = float(length * rng.uniform(0.05, 0.5))
+    return steps
+
+
+def _projection(rng: np.random.Generator, system: System, size: Array, has_estimate: bool) -> dict[str, Any]:
+    n = size.size
+    one_unit = np.ndim(system.unit) == 0
+    found: dict[str, Any] = {}
+    if rng.random() < 0.4:
+        found["metric"] = [
+            "error",
+            "euclidean" if one_unit else "error",
+            rng.uniform(0.2, 1.0, n) / system.unit,
+        ][rng.integers(3)]
+    if rng.random() < 0.25 and one_unit:
+        divisors = [b for b in range(1, n + 1) if n % b == 0]
+        lists = np.array_split(rng.permutation(n), rng.integers(1, n + 1))
+        found["blocks"] = lists[1:] or lists if rng.random() < 0.5 else int(rng.choice(divisors))
+    if system.frame is not None and rng.random() < 0.4:
+        found["frame"] = system.frame
+    if rng.random() < 0.3:
+        found["direction"] = str(rng.choice(["old", "midpoint"]))
+    if rng.random() < 0.2:
+        found["iterations"] = int(rng.integers(2, 4))
+    if rng.random() < 0.4:
+        every = [2, 3, 10, "auto" if has_estimate else 5]
+        found["every"] = every[rng.integers(4)]
+    if rng.random() < 0.2:
+        found["reuse_f"] = False
+    if rng.random() < 0.05:
+        found["project_initial"] = True
+    if rng.random() < 0.05:
+        found["check"] = False
+    return found
+
+
+def _events(rng: np.random.Generator, size: Array) -> tuple[Callable[..., float], ...]:
+    if rng.random() < 0.7:
+        return ()
+    return tuple(_event(rng, int(rng.integers(size.size)), size) for _ in range(rng.integers(1, 3)))
+
+
+def _event(rng: np.random.Generator, k: int, size: Array) -> Callable[..., float]:
+    level = rng.uniform(-0.5, 0.5) * size[k]
+
+    def event(t: float, y: Array, *args: Any) -> float:
+        return float(y[k].real - level)
+
+    event.terminal = [False, False, True, 2][rng.integers(4)]  # type: ignore[attr-defined]
+    event.direction = float(rng.integers(-1, 2))  # type: ignore[attr-defined]
+    return event
+
+
+# What is known of the motion.
+
+
+def _rate(system: System, sign: float) -> float:
+    """The fastest rate along the motion: that of the linearised equations, or of the state as a whole."""
+
+    def at(t: float, y: Array) -> float:
+        x, unit = _floats(y), np.repeat(np.broadcast_to(system.unit, y.size), 2 if y.dtype.kind == "c" else 1)
+        step = 1e-6 * np.max(np.abs(x * unit)) / unit
+        columns = []
+        for k in range(x.size):
+            shift = np.zeros(x.size)
+            shift[k] = step[k]
+            ahead, behind = (_floats(system.fun(t, (x + s * shift).view(y.dtype))) for s in (1, -1))
+            columns.append((ahead - behind) / (2 * step[k]))
+        whole = np.linalg.norm(_floats(system.fun(t, y)) * unit) / np.linalg.norm(x * unit)
+        return max(system.rate, whole, float(np.abs(np.linalg.eigvals(np.array(columns).T)).max()))
+
+    t0, y0 = system.t0, system.y0
+    rate = at(t0, y0)
+    scale = np.max(np.abs(y0 * system.unit)) / system.unit
+    end = t0 + sign * PHASES[1] / rate
+    sol = solve_ivp(counted(system.fun), (t0, end), y0, rtol=1e-4, atol=1e-5 * scale, t_eval=np.linspace(t0, end, 6))
+    return max(at(t, y) for t, y in zip(sol.t, sol.y.T.copy(), strict=True))
+
+
+def _floats(y: Array) -> Array:
+    return np.ascontiguousarray(y).view(float)
+
+
+def _truth(rng: np.random.Generator, system: System, times: Array) -> tuple[Array, float]:
+    """The states (n, SAMPLES) at `times`, and how far neighbours go apart."""
+    if system.exact is not None:
+        return np.column_stack([system.exact(t) for t in times]), 1.0
+    scale = np.max(np.abs(system.y0 * system.unit)) / system.unit
+    truth = _states(system, system.y0, times, 1e-13, 1e-15 * scale)
+    size = np.abs(truth).max(axis=1) + scale
+    change = NEARBY * size * rng.standard_normal(size.size)
+    other = _states(system, system.y0 + change, times, 1e-10, 1e-12 * scale)
+    return truth, max(1.0, float(np.max(np.abs(other - truth) / size[:, None])) / NEARBY)
+
+
+def _states(system: System, y0: Array, times: Array, rtol: float, atol: Array) -> Array:
+    """By SciPy's DOP853, from one of the times to the next."""
+    found, t, y = [], system.t0, y0
+    for end in times:
+        y = solve_ivp(counted(system.fun), (t, end), y, method="DOP853", rtol=rtol, atol=atol).y[:, -1]
+        t = end
+        found.append(y)
+    return np.column_stack(found)

@@ -1,0 +1,598 @@
+"""Random conservative systems, each with all that it keeps: polynomials, bodies, lattices, spins, vortices, fields."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Something that a system keeps, a number or a vector; its gradient, and the same by f where that is known."""
+
+    name: str
+    fun: Callable[[float, Array], Any]
+    grad: Callable[[float, Array], Array]
+    by_f: Callable[[float, Array, Array], Array] | None = None
+
+
+@dataclass(frozen=True)
+class System:
+    """An initial value problem: `acc` of q'' = acc(t, q) where it is one, `frame` for what it keeps linearly.
+
+    `rate` is the fastest one that the Jacobian matrix does not show (that of a driving force).
+    """
+
+    name: str
+    fun: Callable[[float, Array], Array]
+    y0: Array
+    kept: tuple[Quantity, ...]
+    acc: Callable[[float, Array], Array] | None = None
+    frame: tuple[Array, Array] | None = None
+    exact: Callable[[float], Array] | None = None
+    rate: float = 0.0
+    t0: float = 0.0
+    unit: Array | float = 1.0
+    notes: tuple[str, ...] = field(default=())
+
+
+def second_order(
+    name: str, acc: Callable[[float, Array], Array], q: Array, v: Array, kept: tuple[Quantity, ...], **more: Any
+) -> System:
+    """The system of q'' = acc(t, q)."""
+    return System(name, first_order(acc), np.concatenate([q, v]), kept, acc=acc, **more)
+
+
+def first_order(acc: Callable[[float, Array], Array]) -> Callable[[float, Array], Array]:
+    """The right-hand side for y = (q, v) of q'' = acc(t, q)."""
+
+    def fun(t: float, y: Array) -> Array:
+        half = y.size // 2
+        return np.concatenate([y[half:], acc(t, y[:half])])
+
+    return fun
+
+
+def mechanical(name: str, V: Callable[[Array], float], dV: Callable[[Array], Array]) -> Quantity:
+    """The energy of q'' = -dV(q)."""
+
+    def value(t: float, y: Array) -> float:
+        half = y.size // 2
+        return 0.5 * (y[half:] @ y[half:]) + V(y[:half])
+
+    def gradient(t: float, y: Array) -> Array:
+        half = y.size // 2
+        return np.concatenate([dV(y[:half]), y[half:]])
+
+    def by_f(t: float, y: Array, f: Array) -> Array:
+        half = y.size // 2
+        return np.concatenate([-f[half:], f[:half]])
+
+    return Quantity(name, value, gradient, by_f)
+
+
+def positive_matrix(rng: np.random.Generator, n: int, low: float, high: float) -> Array:
+    """A symmetric matrix with eigenvalues from `low` to `high`."""
+    Q, _ = np.linalg.qr(rng.standard_normal((n, n)))
+    return (Q * rng.uniform(low, high, n)) @ Q.T
+
+
+def skew(rng: np.random.Generator, n: int) -> Array:
+    a = rng.standard_normal((n, n))
+    return (a - a.T) / math.sqrt(n)
+
+
+def bowl(rng: np.random.Generator, n: int) -> tuple[Callable[[Array], float], Callable[[Array], Array]]:
+    """A polynomial of degree 4 that grows in all directions, and its gradient."""
+    A, B = positive_matrix(rng, n, 0.3, 3.0), rng.uniform(0.0, 0.5, (n, n))
+    B = B + B.T
+
+    def value(x: Array) -> float:
+        return 0.5 * (x @ A @ x) + 0.25 * (x**2 @ B @ x**2)
+
+    def gradient(x: Array) -> Array:
+        return A @ x + x * (B @ x**2)
+
+    return value, gradient
+
+
+def oscillators(rng: np.random.Generator) -> System:
+    """Linear ones of frequencies up to a factor of 30 apart, in coordinates that mix them; closed form."""
+    n = int(rng.integers(1, 6))
+    Q, _ = np.linalg.qr(rng.standard_normal((n, n)))
+    w = 10 ** rng.uniform(-0.75, 0.75, n)
+    K = (Q * w**2) @ Q.T
+    q, v = rng.standard_normal(n), rng.standard_normal(n)
+
+    def modes(t: float, y: Array) -> Array:
+        return 0.5 * ((Q.T @ y[n:]) ** 2 + (w * (Q.T @ y[:n])) ** 2)
+
+    def modes_gradient(t: float, y: Array) -> Array:
+        return np.hstack([(w**2 * (Q.T @ y[:n]))[:, None] * Q.T, (Q.T @ y[n:])[:, None] * Q.T])
+
+    def exact(t: float) -> Array:
+        a, b, c, s = Q.T @ q, Q.T @ v / w, np.cos(w * t), np.sin(w * t)
+        return np.concatenate([Q @ (a * c + b * s), Q @ (w * (b * c - a * s))])
+
+    kept = (mechanical("H", lambda x: 0.5 * (x @ K @ x), lambda x: K @ x), Quantity("modes", modes, modes_gradient))
+    return second_order("oscillators", lambda t, x: -(K @ x), q, v, kept, exact=exact)
+
+
+def driven(rng: np.random.Generator) -> System:
+    """A driven oscillator: what it keeps depends on time."""
+    w, drive, F = rng.uniform(0.5, 2.0), rng.uniform(2.5, 5.0), rng.uniform(0.2, 2.0)
+    gain = F / (w * w - drive * drive)
+
+    def relative(t: float, y: Array) -> tuple[float, float]:
+        return y[0] - gain * math.cos(drive * t), y[1] + gain * drive * math.sin(drive * t)
+
+    def value(t: float, y: Array) -> float:
+        q, v = relative(t, y)
+        return 0.5 * (v * v + w * w * q * q)
+
+    def gradient(t: float, y: Array) -> Array:
+        q, v = relative(t, y)
+        return np.array([w * w * q, v])
+
+    def acc(t: float, q: Array) -> Array:
+        return np.array([F * math.cos(drive * t) - w * w * q[0]])
+
+    kept = (Quantity("relative energy", value, gradient),)
+    return second_order("driven", acc, rng.standard_normal(1), rng.standard_normal(1), kept, rate=drive)
+
+
+def separable(rng: np.random.Generator) -> System:
+    """H = p.p / 2 + V(q), V of degree 4."""
+    n = int(rng.integers(1, 5))
+    V, dV = bowl(rng, n)
+    q, v = rng.standard_normal((2, n)) * rng.uniform(0.3, 1.0)
+    return second_order("separable", lambda t, x: -dV(x), q, v, (mechanical("H", V, dV),))
+
+
+def hamiltonian(rng: np.random.Generator) -> System:
+    """y' = J grad H(y), H not separable, of degree 4."""
+    n = int(rng.integers(1, 5))
+    H, dH = bowl(rng, 2 * n)
+
+    def fun(t: float, y: Array) -> Array:
+        g = dH(y)
+        return np.concatenate([g[n:], -g[:n]])
+
+    def by_f(t: float, y: Array, f: Array) -> Array:
+        return np.concatenate([-f[n:], f[:n]])
+
+    kept = (Quantity("H", lambda t, y: H(y), lambda t, y: dH(y), by_f),)
+    return System("hamiltonian", fun, 0.7 * rng.standard_normal(2 * n), kept)
+
+
+def poisson(rng: np.random.Generator) -> System:
+    """y' = S(y) grad H(y) with a skew matrix S that is linear in y."""
+    n = int(rng.integers(2, 8))
+    H, dH = bowl(rng, n)
+    S0, S1 = skew(rng, n), np.array([0.3 * skew(rng, n) for _ in range(n)])
+
+    def fun(t: float, y: Array) -> Array:
+        return (S0 + np.tensordot(y, S1, 1)) @ dH(y)
+
+    return System("poisson", fun, 0.7 * rng.standard_normal(n), (Quantity("H", lambda t, y: H(y), lambda t, y: dH(y)),))
+
+
+def nambu(rng: np.random.Generator) -> System:
+    """y' = grad C x grad H in three dimensions."""
+    (C, dC), (H, dH) = bowl(rng, 3), bowl(rng, 3)
+    kept = (
+        Quantity("C", lambda t, y: C(y), lambda t, y: dC(y)),
+        Quantity("H", lambda t, y: H(y), lambda t, y: dH(y)),
+    )
+    return System("nambu", lambda t, y: np.cross(dC(y), dH(y)), 0.7 * rng.standard_normal(3), kept)
+
+
+def rigid_body(rng: np.random.Generator) -> System:
+    """Euler's equations of a free body."""
+    inertia = rng.uniform(0.5, 3.0, 3)
+    kept = (
+        Quantity("H", lambda t, w: 0.5 * (inertia @ w**2), lambda t, w: inertia * w),
+        Quantity("L2", lambda t, w: (inertia * w) @ (inertia * w), lambda t, w: 2 * inertia**2 * w),
+    )
+    return System("rigid body", lambda t, w: np.cross(inertia * w, w) / inertia, rng.standard_normal(3), kept)
+
+
+def attitude(rng: np.random.Generator) -> System:
+    """A free body with its attitude as a quaternion of any length: (w, quaternion)."""
+    inertia = rng.uniform(0.5, 3.0, 3)
+    units = np.eye(4)
+
+    def product(a: Array, b: Array) -> Array:
+        u, v = a[1:], b[1:]
+        return np.array([a[0] * b[0] - u @ v, *(a[0] * v + b[0] * u + np.cross(u, v))])
+
+    def pure(v: Array) -> Array:
+        return np.array([0.0, *v])
+
+    def conjugate(q: Array) -> Array:
+        return q * np.array([1.0, -1.0, -1.0, -1.0])
+
+    def fun(t: float, y: Array) -> Array:
+        w, q = y[:3], y[3:]
+        return np.concatenate([np.cross(inertia * w, w) / inertia, 0.5 * product(q, pure(w))])
+
+    def turned(q: Array, v: Array) -> Array:
+        return product(product(q, pure(v)), conjugate(q))[1:]
+
+    def momentum(t: float, y: Array) -> Array:
+        return turned(y[3:], inertia * y[:3])
+
+    def momentum_gradient(t: float, y: Array) -> Array:
+        q, L = y[3:], inertia * y[:3]
+        by_w = [turned(q, inertia * e) for e in np.eye(3)]
+        by_q = [
+            (product(product(e, pure(L)), conjugate(q)) + product(product(q, pure(L)), conjugate(e)))[1:] for e in units
+        ]
+        return np.array([*by_w, *by_q]).T
+
+    none = np.zeros(4)
+    kept = (
+        Quantity("H", lambda t, y: 0.5 * (inertia @ y[:3] ** 2), lambda t, y: np.array([*(inertia * y[:3]), *none])),
+        Quantity("length", lambda t, y: y[3:] @ y[3:], lambda t, y: np.array([0.0, 0.0, 0.0, *(2 * y[3:])])),
+        Quantity("L", momentum, momentum_gradient),
+    )
+    q = rng.standard_normal(4)
+    return System("attitude", fun, np.array([*rng.standard_normal(3), *(q / np.linalg.norm(q))]), kept)
+
+
+def _momentum_frame(n: int) -> tuple[Array, Array]:
+    """The sum of n positions and that of n velocities, and a common shift of each."""
+    C = np.kron(np.eye(2), np.ones((1, n)))
+    return C, C.T.copy()
+
+
+def _total(name: str, n: int) -> Quantity:
+    row = np.array([*np.zeros(n), *np.ones(n)])
+    return Quantity(name, lambda t, y: float(y[n:].sum()), lambda t, y: row.copy())
+
+
+def chain(rng: np.random.Generator) -> System:
+    """A ring of Fermi, Pasta, Ulam and Tsingou."""
+    n = int(rng.integers(3, 9))
+    a, b = rng.uniform(0.0, 0.5), rng.uniform(0.0, 1.0)
+
+    def V(q: Array) -> float:
+        r = np.roll(q, -1) - q
+        return float((r**2 / 2 + a * r**3 / 3 + b * r**4 / 4).sum())
+
+    def dV(q: Array) -> Array:
+        r = np.roll(q, -1) - q
+        s = r + a * r**2 + b * r**3
+        return np.roll(s, 1) - s
+
+    q, v = 0.4 * rng.standard_normal((2, n))
+    kept = (mechanical("H", V, dV), _total("P", n))
+    return second_order("chain", lambda t, x: -dV(x), q, v, kept, frame=_momentum_frame(n))
+
+
+def toda(rng: np.random.Generator) -> System:
+    """Toda's ring, with the third of its invariants."""
+    n = int(rng.integers(3, 8))
+
+    def pull(q: Array) -> Array:
+        return np.exp(q - np.roll(q, -1))
+
+    def dV(q: Array) -> Array:
+        e = pull(q)
+        return e - np.roll(e, 1)
+
+    def third(t: float, y: Array) -> float:
+        e, p = pull(y[:n]), y[n:]
+        return float((p**3 + 3 * e * (p + np.roll(p, -1))).sum())
+
+    def third_gradient(t: float, y: Array) -> Array:
+        e, p = pull(y[:n]), y[n:]
+        s = 3 * e * (p + np.roll(p, -1))
+        return np.concatenate([s - np.roll(s, 1), 3 * p**2 + 3 * (e + np.roll(e, 1))])
+
+    q, v = 0.5 * rng.standard_normal((2, n))
+    kept = (
+        mechanical("H", lambda q: float(pull(q).sum()), dV),
+        _total("P", n),
+        Quantity("third", third, third_gradient),
+    )
+    return second_order("toda", lambda t, x: -dV(x), q, v, kept, frame=_momentum_frame(n))
+
+
+def charged(rng: np.random.Generator) -> System:
+    """A charge in a magnetic field along z that grows from the axis, and in an electric trap around it."""
+    b0, b1 = rng.uniform(0.5, 3.0), rng.uniform(-0.2, 0.5)
+    k, kz = rng.uniform(0.0, 0.3), rng.uniform(0.1, 1.0)
+
+    def field_at(y: Array) -> float:
+        return b0 + b1 * (y[0] ** 2 + y[1] ** 2)
+
+    def fun(t: float, y: Array) -> Array:
+        B = field_at(y)
+        return np.array([*y[3:], B * y[4] - k * y[0], -B * y[3] - k * y[1], -kz * y[2]])
+
+    def energy(t: float, y: Array) -> float:
+        return 0.5 * (y[3:] @ y[3:] + k * (y[0] ** 2 + y[1] ** 2) + kz * y[2] ** 2)
+
+    def momentum(t: float, y: Array) -> float:
+        s = y[0] ** 2 + y[1] ** 2
+        return y[0] * y[4] - y[1] * y[3] + b0 * s / 2 + b1 * s * s / 4
+
+    def momentum_gradient(t: float, y: Array) -> Array:
+        B = field_at(y)
+        return np.array([y[4] + B * y[0], -y[3] + B * y[1], 0.0, -y[1], y[0], 0.0])
+
+    kept = (
+        Quantity("H", energy, lambda t, y: np.array([k * y[0], k * y[1], kz * y[2], *y[3:]])),
+        Quantity("p_theta", momentum, momentum_gradient),
+    )
+    return System("charged", fun, rng.standard_normal(6), kept)
+
+
+def _angular(n: int) -> Quantity:
+    """Angular momentum of a body: a number in the plane, a vector in space."""
+    if n == 2:
+        return Quantity("L", lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]))
+
+    def cross_matrix(v: Array) -> Array:
+        return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+    return Quantity(
+        "L",
+        lambda t, y: np.cross(y[:3], y[3:]),
+        lambda t, y: np.hstack([-cross_matrix(y[3:]), cross_matrix(y[:3])]),
+    )
+
+
+def central(rng: np.random.Generator) -> System:
+    """A body in a central potential, a sum of powers of r and a logarithm."""
+    n = int(rng.integers(2, 4))
+    a, b, c, d = rng.uniform(0.0, 1.0, 4) * rng.integers(0, 2, 4) + np.array([0.1, 0.0, 0.0, 0.0])
+
+    def V(q: Array) -> float:
+        s = q @ q
+        return a * s / 2 + b * s * s / 4 + c * math.log(s) / 2 - d / math.sqrt(s)
+
+    def dV(q: Array) -> Array:
+        s = q @ q
+        return q * (a + b * s + c / s + d / s**1.5)
+
+    q, v = rng.standard_normal(n), rng.standard_normal(n)
+    q *= rng.uniform(0.7, 1.5) / np.linalg.norm(q)
+    v -= (v @ q) / (q @ q) * q * rng.uniform(0.5, 1.0)  # not towards the centre
+    v *= rng.uniform(0.6, 1.2) / np.linalg.norm(v)
+    return second_order("central", lambda t, x: -dV(x), q, v, (mechanical("H", V, dV), _angular(n)))
+
+
+def kepler(rng: np.random.Generator) -> System:
+    """Kepler's problem with the Runge-Lenz vector, which depends on the others."""
+    e = rng.choice([0.0, rng.uniform(0.0, 0.7)])
+    angle = rng.uniform(0, 2 * np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+    def dV(q: Array) -> Array:
+        return q / (q @ q) ** 1.5
+
+    def lenz(t: float, y: Array) -> Array:
+        q, v = y[:2], y[2:]
+        return (v @ v) * q - (q @ v) * v - q / math.sqrt(q @ q)
+
+    def lenz_gradient(t: float, y: Array) -> Array:
+        q, v = y[:2], y[2:]
+        r = math.sqrt(q @ q)
+        by_q = (v @ v - 1 / r) * np.eye(2) - np.outer(v, v) + np.outer(q, q) / r**3
+        return np.hstack([by_q, 2 * np.outer(q, v) - np.outer(v, q) - (q @ v) * np.eye(2)])
+
+    kept = (
+        mechanical("H", lambda q: -1 / math.sqrt(q @ q), dV),
+        _angular(2),
+        Quantity("lenz", lenz, lenz_gradient),
+    )
+    start = turn @ np.array([1 - e, 0.0]), turn @ np.array([0.0, math.sqrt((1 + e) / (1 - e))])
+    return second_order("kepler", lambda t, x: -dV(x), *start, kept)
+
+
+def lotka_volterra(rng: np.random.Generator) -> System:
+    a, b, c, d = rng.uniform(0.5, 2.0, 4)
+
+    def value(t: float, u: Array) -> float:
+        if not (u > 0).all():
+            return math.nan
+        return d * u[0] - c * math.log(u[0]) + b * u[1] - a * math.log(u[1])
+
+    def fun(t: float, u: Array) -> Array:
+        return np.array([u[0] * (a - b * u[1]), u[1] * (d * u[0] - c)])
+
+    kept = (Quantity("V", value, lambda t, u: np.array([d - c / u[0], b - a / u[1]])),)
+    return System("lotka volterra", fun, np.array([c / d, a / b]) * rng.uniform(0.5, 1.8, 2), kept)
+
+
+def spins(rng: np.random.Generator) -> System:
+    """A Heisenberg chain of classical spins: their lengths, their sum, the energy."""
+    n = int(rng.integers(2, 5))
+    J = rng.uniform(0.3, 1.5, n)
+
+    def force(s: Array) -> Array:
+        s = s.reshape(n, 3)
+        return J[:, None] * np.roll(s, -1, 0) + np.roll(J[:, None] * s, 1, 0)
+
+    def lengths_gradient(t: float, y: Array) -> Array:
+        out = np.zeros((n, n, 3))
+        out[np.arange(n), np.arange(n)] = 2 * y.reshape(n, 3)
+        return out.reshape(n, 3 * n)
+
+    kept = (
+        Quantity("lengths", lambda t, y: (y.reshape(n, 3) ** 2).sum(1), lengths_gradient),
+        Quantity("M", lambda t, y: y.reshape(n, 3).sum(0), lambda t, y: np.tile(np.eye(3), n)),
+        Quantity("H", lambda t, y: 0.5 * float(y @ force(y).ravel()), lambda t, y: force(y).ravel()),
+    )
+    return System("spins", lambda t, y: np.cross(y.reshape(n, 3), force(y)).ravel(), rng.standard_normal(3 * n), kept)
+
+
+def vortices(rng: np.random.Generator) -> System:
+    """Point vortices in the complex plane: the energy, the centre (two numbers), the second moment."""
+    n = int(rng.integers(2, 5))
+    G = rng.uniform(0.5, 2.0, n)
+    z = 1.5 * np.exp(2j * np.pi * (np.arange(n) + 0.3 * rng.uniform(size=n)) / n) * rng.uniform(0.8, 1.2, n)
+    pairs = np.triu_indices(n, 1)
+
+    def inverse(z: Array) -> Array:
+        d = z[:, None] - z[None, :] + np.eye(n)
+        return 1 / d - np.eye(n)
+
+    def fun(t: float, z: Array) -> Array:
+        return 1j * np.conj(inverse(z) @ G)
+
+    def energy(t: float, z: Array) -> float:
+        d = z[pairs[0]] - z[pairs[1]]
+        return -float((G[pairs[0]] * G[pairs[1]] * np.log(np.abs(d))).sum())
+
+    kept = (
+        Quantity("H", energy, lambda t, z: -G * np.conj(inverse(z) @ G)),
+        Quantity("centre", lambda t, z: np.array([G @ z.real, G @ z.imag]), lambda t, z: np.array([G, 1j * G])),
+        Quantity("moment", lambda t, z: float(G @ np.abs(z) ** 2), lambda t, z: 2 * G * z),
+    )
+    return System("vortices", fun, z, kept)
+
+
+def _hermitian(rng: np.random.Generator, n: int) -> Array:
+    A = rng.standard_normal((n, n)) + 1j * rng.standard_normal((n, n))
+    return (A + A.conj().T) / (2 * math.sqrt(n))
+
+
+def _norm() -> Quantity:
+    return Quantity("norm", lambda t, c: float(np.vdot(c, c).real), lambda t, c: 2 * c)
+
+
+def quantum(rng: np.random.Generator) -> System:
+    """i c' = H c; closed form."""
+    n = int(rng.integers(1, 8))
+    H = _hermitian(rng, n)
+    w, Q = np.linalg.eigh(H)
+    c0 = rng.standard_normal(n) + 1j * rng.standard_normal(n)
+    kept = (
+        _norm(),
+        Quantity("H", lambda t, c: float(np.vdot(c, H @ c).real), lambda t, c: 2 * (H @ c), lambda t, c, f: 2j * f),
+    )
+    exact = lambda t: Q @ (np.exp(-1j * w * t) * (Q.conj().T @ c0))  # noqa: E731
+    return System("quantum", lambda t, c: -1j * (H @ c), c0, kept, exact=exact)
+
+
+def driven_quantum(rng: np.random.Generator) -> System:
+    """i c' = (A + B cos w t) c: the norm alone."""
+    n, drive = int(rng.integers(2, 6)), rng.uniform(0.5, 3.0)
+    A, B = _hermitian(rng, n), _hermitian(rng, n)
+    c0 = rng.standard_normal(n) + 1j * rng.standard_normal(n)
+    return System("driven quantum", lambda t, c: -1j * ((A + math.cos(drive * t) * B) @ c), c0, (_norm(),), rate=drive)
+
+
+def schroedinger(rng: np.random.Generator) -> System:
+    """A discrete nonlinear Schroedinger equation: norm and energy."""
+    n, g = int(rng.integers(2, 9)), rng.uniform(-1.0, 1.0)
+    E = rng.uniform(-1.0, 1.0, n)
+
+    def linear(c: Array) -> Array:
+        return E * c + np.roll(c, 1) + np.roll(c, -1)
+
+    def energy(t: float, c: Array) -> float:
+        return float(np.vdot(c, linear(c)).real + 0.5 * g * (np.abs(c) ** 4).sum())
+
+    def gradient(t: float, c: Array) -> Array:
+        return 2 * (linear(c) + g * np.abs(c) ** 2 * c)
+
+    c0 = rng.standard_normal(n) + 1j * rng.standard_normal(n)
+    kept = (_norm(), Quantity("H", energy, gradient, lambda t, c, f: 2j * f))
+    return System("schroedinger", lambda t, c: -0.5j * gradient(t, c), c0, kept)
+
+
+FAMILIES = (
+    oscillators,
+    driven,
+    separable,
+    hamiltonian,
+    poisson,
+    nambu,
+    rigid_body,
+    attitude,
+    chain,
+    toda,
+    charged,
+    central,
+    kepler,
+    lotka_volterra,
+    spins,
+    vortices,
+    quantum,
+    driven_quantum,
+    schroedinger,
+)
+
+
+def random_system(rng: np.random.Generator) -> System:
+    """One of them; some begin at another time, some have each component in a unit of its own."""
+    system = FAMILIES[rng.integers(len(FAMILIES))](rng)
+    if rng.random() < 0.3:
+        system = begun_at(system, float(rng.choice([1.0, -7.3, 250.0])))
+    if rng.random() < 0.15:
+        system = in_units(system, 10 ** rng.uniform(-9, 9, system.y0.size))
+    return system
+
+
+def begun_at(system: System, t0: float) -> System:
+    """The same motion, its clock set to t0."""
+    kept = tuple(
+        Quantity(
+            k.name,
+            lambda t, y, k=k: k.fun(t - t0, y),
+            lambda t, y, k=k: k.grad(t - t0, y),
+            k.by_f and (lambda t, y, f, k=k: k.by_f(t - t0, y, f)),
+        )
+        for k in system.kept
+    )
+    fun, acc, exact = system.fun, system.acc, system.exact
+    return replace(
+        system,
+        fun=lambda t, y: fun(t - t0, y),
+        acc=acc and (lambda t, q: acc(t - t0, q)),
+        exact=exact and (lambda t: exact(t - t0)),
+        kept=kept,
+        t0=t0,
+        notes=(*system.notes, f"t0 = {t0:g}"),
+    )
+
+
+def in_units(system: System, unit: Array) -> System:
+    """The same motion with y = unit z; velocities keep the unit of their positions."""
+    if system.acc is not None:
+        unit = np.tile(unit[: unit.size // 2], 2)
+    kept = tuple(
+        Quantity(
+            k.name,
+            lambda t, z, k=k: k.fun(t, z * unit),
+            lambda t, z, k=k: k.grad(t, z * unit) * unit,
+            k.by_f and (lambda t, z, f, k=k: k.by_f(t, z * unit, f * unit) * unit),
+        )
+        for k in system.kept
+    )
+    old, old_acc, exact, frame = system.fun, system.acc, system.exact, system.frame
+
+    def acc(t: float, q: Array) -> Array:
+        return old_acc(t, q * unit[: q.size]) / unit[: q.size]
+
+    return replace(
+        system,
+        fun=first_order(acc) if old_acc else lambda t, z: old(t, z * unit) / unit,
+        acc=acc if old_acc else None,
+        exact=exact and (lambda t: exact(t) / unit),
+        y0=system.y0 / unit,
+        kept=kept,
+        frame=frame and (frame[0] * unit, frame[1] / unit[:, None]),
+        unit=unit,
+        notes=(*system.notes, "units of its own for each component"),
+    )

@@ -1,0 +1,203 @@
+"""Kill runs that write checkpoints, at random instants and again and again, and look whether they go on as if not.
+
+    python -m tests.fuzz.kills --kills 300
+
+Each chain of kills is made from a number. A violation prints the number and the command that runs the chain again; the
+exit status is then 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import multiprocessing
+import os
+import re
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, checkpoint, ensemble, integrate
+from eip_scipy import Invariant as Inv
+
+from . import families
+
+SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
+LONGEST = 0.9  # seconds from the start of a run to its kill; a whole run takes about as long
+MOST = 4  # kills of one run before it may end
+PATIENCE = 30.0
+OFTEN = 0.02
+ORBIT = families.kepler(np.random.default_rng(5))
+KEPT = [Inv(k.fun, k.grad, name=k.name) for k in ORBIT.kept]
+STARTS = ORBIT.y0 * np.linspace(0.95, 1.05, 30)[:, None]
+
+
+def crossing(t: float, y: np.ndarray) -> float:
+    """An event."""
+    return y[1]
+
+
+def ending(t: float, y: np.ndarray) -> float:
+    """An event that ends a member."""
+    return y[0] - 1e3
+
+
+ending.terminal = True  # type: ignore[attr-defined]
+
+
+def fixed(**options: Any) -> Any:
+    """Fixed steps that save much."""
+    given = {"method": EIPRK4, "h": 0.01, "every": "auto", "invariants": KEPT, "save_every": 5}
+    return integrate(ORBIT.fun, (0, 60), ORBIT.y0, **given | options)
+
+
+def adaptive(**options: Any) -> Any:
+    """Adaptive steps with events and samples."""
+    given = {"method": EIPDOP853, "rtol": 1e-8, "invariants": KEPT, "events": crossing}
+    return integrate(ORBIT.fun, (0, 120), ORBIT.y0, t_eval=np.arange(0, 120, 0.5), **given | options)
+
+
+def nystrom(**options: Any) -> Any:
+    """Compensated steps that are projected now and then."""
+    given = {"method": EIPRKN12, "h": 0.05, "every": 7, "compensated": True, "invariants": KEPT, "save_every": 10}
+    return integrate(ORBIT.acc, (0, 200), ORBIT.y0, **given | options)
+
+
+def members(**options: Any) -> Any:
+    """An ensemble, a few members at a time."""
+    given = {"method": EIPRK4, "h": 0.02, "invariants": KEPT, "chunk": 2, "save_every": 20, "reduce": "state"}
+    return ensemble(ORBIT.fun, (0, 3), STARTS, **given | options)
+
+
+def trajectories(**options: Any) -> Any:
+    """An ensemble that writes to a Zarr group."""
+    given = {"method": EIPRK4, "rtol": 1e-6, "invariants": KEPT, "chunk": 2, "events": ending}
+    return ensemble(ORBIT.fun, (0, 3), STARTS, t_eval=[0.0, 1.0, 2.5], **given | options)
+
+
+SINGLE = {run.__name__: run for run in (fixed, adaptive, nystrom)}
+KINDS: dict[str, Callable[..., Any]] = SINGLE | {run.__name__: run for run in (members, trajectories)}
+
+
+def kept_in(kind: str, path: Path) -> dict[str, Any]:
+    """The options that keep a run of that kind in `path`."""
+    if kind == "trajectories":
+        return {"out": path, "resume": True, "compiled": False}
+    return {"checkpoint": path, "checkpoint_every": OFTEN, "resume": True, "compiled": False}
+
+
+def work(kind: str, path: Path) -> None:
+    """What runs in the process that is killed."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # Ctrl-C prints where it came
+    KINDS[kind](**kept_in(kind, path))
+
+
+@cache
+def whole(kind: str) -> Any:
+    """The run that nobody kills."""
+    return KINDS[kind](compiled=False)
+
+
+def differences(kind: str, run: Any) -> Iterator[str]:
+    """What of a run is not that of the whole one, to the last bit."""
+    names = ["t", "y", "status", "max_defect", "trusted", "nfev", "njev", "nlu"]
+    names += ["invariants"] if kind in SINGLE else ["failed", "max_correction", "message"]
+    pairs = {name: (getattr(whole(kind), name), getattr(run, name)) for name in names}
+    if kind == "adaptive":
+        pairs |= {name: (whole(kind)[name][0], run[name][0]) for name in ("t_events", "y_events")}
+    if kind == "members":
+        pairs |= {f"statistics.{n}": (v, getattr(run.statistics, n)) for n, v in vars(whole(kind).statistics).items()}
+    if kind == "trajectories":
+        pairs["trajectories"] = whole(kind).trajectories, run.trajectories[:]
+    for name, (a, b) in pairs.items():
+        if not np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind == "f"):
+            yield f"{name}: {b!r} where the whole run has {a!r}"
+
+
+def done(kind: str, path: Path) -> int:
+    """Steps or members that a checkpoint holds; -1 without one."""
+    if kind == "trajectories" or not path.exists():
+        return -1
+    header, _ = checkpoint.read(path)
+    return int(header["step" if kind in SINGLE else "finished"])
+
+
+def chain(seed: int, folder: Path, context: Any, most: int, killed: Counter[str]) -> Iterator[str]:
+    """Kill one run up to `most` times, then let it end; yields what is wrong."""
+    rng = np.random.default_rng(seed)
+    kind = list(KINDS)[seed % len(KINDS)]
+    path, before = folder / f"{kind}-{seed}", -1
+    for _ in range(min(most, int(rng.integers(1, MOST + 1)))):
+        number = SIGNALS[rng.integers(len(SIGNALS))]
+        process = context.Process(target=work, args=(kind, path))
+        process.start()
+        time.sleep(LONGEST * rng.random() ** 2)
+        if process.is_alive():
+            os.kill(process.pid, number)
+        process.join(PATIENCE)
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+            yield f"{kind}: {number.name} did not end it within {PATIENCE:g} s"
+            return
+        ended = process.exitcode == 0
+        if process.exitcode not in ((0, 1) if number == signal.SIGINT else (0, -number)):
+            yield f"{kind}: exit status {process.exitcode} after {number.name}"
+        killed["ended before"] += ended
+        killed[number.name] += not ended
+        after = done(kind, path)
+        if after < before:
+            yield f"{kind}: the checkpoint held {before}, and {after} after {number.name}"
+        before = after
+        if ended:
+            break
+    run = KINDS[kind](**kept_in(kind, path))
+    if kind in SINGLE:
+        killed["killed before the first write"] += before < 0
+        resumed_at = re.search(r"resumed at step (\d+)|started at the beginning", run.message)
+        if resumed_at is None or int(resumed_at[1] or -1) != before:
+            yield f"{kind}: the checkpoint held step {before}, and the message is {run.message!r}"
+    for text in differences(kind, run):
+        yield f"{kind}: {text}"
+
+
+def kill(kills: int, seed: int, seconds: float = math.inf) -> tuple[Counter[str], list[str]]:
+    """Kill so many times; what was done, and what is wrong."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["tests.fuzz.warm"])  # where the run starts in the repository's root
+    killed, wrong, begin = Counter[str](), [], time.monotonic()
+    names = {number.name for number in SIGNALS}
+    while (left := kills - sum(killed[name] for name in names)) > 0 and time.monotonic() - begin < seconds:
+        with tempfile.TemporaryDirectory() as folder:
+            for text in chain(seed, Path(folder), context, left, killed):
+                wrong.append(text)
+                print(f"VIOLATION in chain {seed}: {text}\n  again: python -m tests.fuzz.kills --kills 1 --seed {seed}")
+        killed["runs"] += 1
+        seed += 1
+    return killed, wrong
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The script; returns its exit status."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz.kills", description=__doc__.partition("\n")[0])
+    parser.add_argument("--kills", type=int, default=60, help="stop after so many")
+    parser.add_argument("--seed", type=int, default=0, help="the number of the first chain of kills")
+    given = parser.parse_args(arguments)
+    begin = time.monotonic()
+    killed, wrong = kill(given.kills, given.seed)
+    print(f"in {time.monotonic() - begin:.0f} s: " + ", ".join(f"{name} {n}" for name, n in sorted(killed.items())))
+    print(f"violations: {len(wrong)}")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,411 @@
+"""Run random systems with random options for a while, and look whether what must hold for every run does.
+
+    python -m tests.fuzz.systems --seconds 60
+
+Each system is made from a number. A violation prints the number, the system and its options, and the command that runs
+it again; the exit status is then 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numba
+import numpy as np
+
+from eip_scipy import Diagnostics, ProjectionWarning, ensemble
+
+from .cases import METHODS, Case, TooManyCallsError, random_case
+
+# A trusted run may err so many times as much as the one without projection.
+FACTOR = 1e3
+# Errors of the true states and rounding, in units of what the motion makes of a small change.
+FLOOR = 1e-10
+DIFFERENCES = "has no grad and allows no complex step"
+NO_INVARIANT = "is no invariant of this system"
+CLOCK_STEP = 0.3  # seconds
+MOST_BREAKS = 3
+
+
+class BrokenOffError(Exception):
+    """In the place of a crash."""
+
+
+class Runs:
+    """The runs of a case, each made when it is first looked at, with the warnings that it gave."""
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+        self.rng = np.random.default_rng([case.seed, 1])
+
+    @cached_property
+    def _whole(self) -> tuple[Any, list[warnings.WarningMessage]]:
+        return observed(lambda: self.case.integrate(save_every=1))
+
+    @property
+    def whole(self) -> Any:
+        """By `integrate`, every step saved."""
+        return self._whole[0]
+
+    @property
+    def warned(self) -> list[warnings.WarningMessage]:
+        """What it warned of."""
+        return self._whole[1]
+
+    @cached_property
+    def plain(self) -> Any:
+        """Without invariants, at the times of the truth."""
+        options = {"invariants": (), "t_eval": self.case.times, "events": None, "project_initial": False}
+        return observed(lambda: self.case.integrate(**options))[0]
+
+    @cached_property
+    def sampled(self) -> Any:
+        """With them, at the same times."""
+        return observed(lambda: self.case.integrate(t_eval=self.case.times, events=None))[0]
+
+    @cached_property
+    def scipy(self) -> Any:
+        """By SciPy's `solve_ivp`; the diagnostics and the warnings go with it."""
+        record = Diagnostics()
+        found, warned = observed(lambda: self.case.solve_ivp(diagnostics=record, dense_output=True))
+        found.diagnostics, found.warned = record, warned
+        return found
+
+    @cached_property
+    def allowed(self) -> float:
+        """The error that a trusted run may have; endless where there is nothing to compare with."""
+        case = self.case
+        if not case.regular or self.plain.status != 0:
+            return math.inf
+        tolerance = case.steps.get("rtol", 0.0)
+        return FACTOR * case.error(self.plain.y) + tolerance + FLOOR * case.growth
+
+    @property
+    def checked(self) -> bool:
+        """Whether the run was to look at itself."""
+        return bool(self.case.projection.get("check", True))
+
+    @property
+    def healthy(self) -> bool:
+        """Whether nothing is wrong with the system, and the steps resolve it."""
+        return not self.case.sick and self.allowed < FACTOR * 1e-2
+
+
+def observed(call: Callable[[], Any]) -> tuple[Any, list[warnings.WarningMessage]]:
+    """The result of a call, and its warnings."""
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        return call(), warned
+
+
+def same(one: Any, other: Any) -> bool:
+    """Bit for bit, but for the sign of zero and the kinds of NaN."""
+    return np.array_equal(one, other, equal_nan=True)
+
+
+def different(one: Any, other: Any, *names: str) -> Iterator[str]:
+    """The names of those numbers of two results that are not the same bits."""
+    for name in names:
+        a, b = getattr(one, name), getattr(other, name)
+        if not (same(a, b) if a is not None and b is not None else a is b):
+            yield f"{name}: {_short(a)} and {_short(b)}"
+
+
+def _short(value: Any) -> str:
+    a = np.asarray(value)
+    return f"{value!r}" if a.size <= 8 else f"{a.dtype} {a.shape} ending with {a[..., -1]!r}"
+
+
+def different_events(one: Any, other: Any) -> Iterator[str]:
+    for name in ("t_events", "y_events"):
+        for k, (a, b) in enumerate(zip(one[name] or (), other[name] or (), strict=True)):
+            if not same(a, b):
+                yield f"{name}[{k}]: {a!r} and {b!r}"
+
+
+# What must hold. Each check yields what is wrong.
+
+
+def finite(runs: Runs) -> Iterator[str]:
+    """Success means numbers, times in order, and the end that was asked for."""
+    for name, run in (("saved", runs.whole), ("sampled", runs.sampled), ("solve_ivp", runs.scipy)):
+        if not run.success:
+            continue
+        for part in ("t", "y", "invariants", "max_defect"):
+            if part in run and not np.isfinite(run[part]).all():
+                yield f"{name}: success, and {part} holds {run[part][~np.isfinite(run[part])][:3]}"
+        t0, end = runs.case.t_span
+        if not (np.diff(run.t) * np.sign(end - t0) > 0).all():
+            yield f"{name}: times out of order"
+        if run.status == 0 and run.t[-1] != end:
+            yield f"{name}: status 0 at t = {run.t[-1]!r}, not at {end!r}"
+
+
+def accurate(runs: Runs) -> Iterator[str]:
+    """A trusted run errs at most so many times as much as the one without projection."""
+    run = runs.sampled
+    if run.trusted and (runs.checked or not runs.case.sick) and math.isfinite(runs.allowed):
+        error = runs.case.error(run.y)
+        if not error <= runs.allowed:
+            yield (
+                f"trusted, and its error is {error:.3g}; without projection {runs.case.error(runs.plain.y):.3g}, "
+                f"growth {runs.case.growth:.3g}"
+            )
+
+
+def survives(runs: Runs) -> Iterator[str]:
+    """Where the steps resolve the motion, keeping what it keeps neither fails nor takes far more steps.
+
+    Other directions and further iterations have no second tries where gradients are nearly parallel; they may fail.
+    """
+    usual = runs.case.projection.get("direction", "new") == "new" and runs.case.projection.get("iterations", 1) == 1
+    if not (runs.healthy and usual):
+        return
+    if runs.whole.status < 0:
+        yield f"failed: {runs.whole.message}"
+    elif runs.sampled.nfev > 10 * runs.plain.nfev + 200:
+        yield f"{runs.sampled.nfev} evaluations, {runs.plain.nfev} without projection"
+
+
+def kept(runs: Runs) -> Iterator[str]:
+    """The invariants of saved states are what `max_defect` says."""
+    run, case = runs.whole, runs.case
+    if not (run.success and case.projection.get("every", 1) == 1) or not run.max_defect.size or case.compensated:
+        return
+    target = run.invariants[:, 0]
+    off = np.abs(run.invariants[:, 1:] - target[:, None]).max(axis=1, initial=0.0)
+    rounding = 1e-15 * np.abs(run.invariants).max(axis=1)
+    if not (off <= run.max_defect + rounding).all() and run.status == 0:
+        yield f"saved states are off by {off}, max_defect says {run.max_defect}"
+
+
+def quiet(runs: Runs) -> Iterator[str]:
+    """No warning but for numerical gradients and doubts in the run."""
+    if runs.healthy:
+        for warned in (*runs.warned, *runs.scipy.warned):
+            if DIFFERENCES not in str(warned.message) and not issubclass(warned.category, ProjectionWarning):
+                yield f"{warned.category.__name__}: {warned.message}"
+
+
+def told(runs: Runs) -> Iterator[str]:
+    """`trusted`, the warning, the message and the diagnostics say the same."""
+    for name, run, warned in (("integrate", runs.whole, runs.warned), ("solve_ivp", runs.scipy, runs.scipy.warned)):
+        record = run.diagnostics
+        doubts = [str(w.message) for w in warned if issubclass(w.category, ProjectionWarning)]
+        early = [w for w in warned if NO_INVARIANT in str(w.message)]
+        if record.trusted != (run.status >= 0 and not doubts and not early):
+            yield (
+                f"{name}: trusted is {record.trusted}, status {run.status}, {len(doubts)} ProjectionWarnings, "
+                f"{len(early)} others; {record.message!r}"
+            )
+        if len(doubts) > 1:
+            yield f"{name}: {len(doubts)} ProjectionWarnings in one run"
+        if name == "integrate" and run.trusted != record.trusted:
+            yield f"trusted is {run.trusted} in the result and {record.trusted} in its diagnostics"
+        if doubts and name == "integrate" and doubts[0] not in run.message:
+            yield f"the message {run.message!r} does not have the warning {doubts[0]!r}"
+        if bool(doubts) and not record.message:
+            yield f"{name}: warned of {doubts[0]!r}, and Diagnostics.message is empty"
+
+
+def through_scipy(runs: Runs) -> Iterator[str]:
+    """`solve_ivp` takes the steps of `integrate`, with the same bits; SciPy's own where nothing is kept."""
+    case, run, other = runs.case, runs.whole, runs.scipy
+    if case.compensated:
+        return
+    if other.t.size != run.t.size or other.status != run.status:
+        yield f"{other.t.size} times and status {other.status}, integrate {run.t.size} and {run.status}"
+        return
+    if not case.invariants and "h" not in case.steps:
+        if not np.allclose(other.y, run.y, rtol=1e-9, atol=1e-9 * case.size.max()):
+            yield "other states, where nothing is kept"
+        return
+    yield from different(run, other, "t", "y")
+    yield from different_events(run, other)
+
+
+def dense(runs: Runs) -> Iterator[str]:
+    """Dense output meets the states at the ends of steps, and `t_eval` is dense output."""
+    run, case = runs.scipy, runs.case
+    if run.t.size < 2:  # no step was taken: nothing in between
+        return
+    if not same(run.sol(run.t), run.y):
+        k = np.flatnonzero((run.sol(run.t) != run.y).any(axis=0))
+        yield f"sol(t) is not y at the times {run.t[k[:3]]}"
+    if run.status == 0 and not (case.compensated or case.events) and runs.sampled.status == 0 and case.invariants:
+        found = np.column_stack([run.sol(t) for t in case.times])
+        if not same(found, runs.sampled.y):
+            yield f"sol and t_eval differ by {np.abs(found - runs.sampled.y).max()}"
+
+
+def resumed(runs: Runs, *, compiled: bool = False) -> Iterator[str]:
+    """A run that is broken off again and again, and resumed, is the whole one."""
+    whole, case = runs.whole, runs.case
+    broken, kinds = 0, [_at_a_row] if compiled else [_at_a_row, _at_a_call]
+    with tempfile.TemporaryDirectory() as folder, mock.patch("time.perf_counter", _hasty_clock()):
+        options = {
+            "save_every": 1,
+            "checkpoint": Path(folder) / "run",
+            "resume": True,
+            "compiled": compiled,
+        }
+        for _ in range(MOST_BREAKS):
+            breaking = kinds[runs.rng.integers(len(kinds))](runs)
+            try:
+                observed(lambda more=breaking: case.integrate(**options, **more))
+            except BrokenOffError:
+                broken += 1
+        run, _ = observed(lambda: case.integrate(**options))
+    found = [*different(whole, run, *BITS), *different_events(whole, run)]
+    found += different(whole.diagnostics, run.diagnostics, *COUNTS)
+    if run.message.split(" (")[0] != whole.message.split(" (")[0]:
+        found.append(f"{run.message!r} and {whole.message!r}")
+    for text in found:
+        yield f"broken off {broken} times, {run.message!r}: {text}"
+
+
+BITS = ("t", "y", "invariants", "max_defect", "status", "nfev", "njev", "nlu", "success", "trusted", "h")
+COUNTS = ("n_projections", "n_skipped", "n_rank_reduced", "n_softened", "n_rejected_projections", "max_correction")
+
+
+def _hasty_clock() -> Callable[[], float]:
+    """A clock that goes on by much each time it is read: checkpoints are due between any two steps."""
+    read = itertools.count()
+    return lambda: CLOCK_STEP * next(read)
+
+
+def _at_a_row(runs: Runs) -> dict[str, Any]:
+    """Broken off at a saved state."""
+    left = int(runs.rng.integers(runs.whole.t.size + 1))
+
+    def stop(t: float, y: np.ndarray, defects: np.ndarray) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise BrokenOffError
+
+    return {"callback": stop}
+
+
+def _at_a_call(runs: Runs) -> dict[str, Any]:
+    """Broken off inside a step."""
+    left, fun = int(runs.rng.integers(1, runs.whole.nfev + 5)), runs.case.fun
+
+    def failing(*arguments: Any) -> Any:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise BrokenOffError
+        return fun(*arguments)
+
+    return {"fun": failing}
+
+
+def members(runs: Runs, **options: Any) -> Iterator[str]:
+    """A member of an ensemble is the single run."""
+    case = runs.case
+    if any(not event.terminal for event in case.events):  # type: ignore[attr-defined]
+        return
+    starts = np.tile(case.system.y0, (2, 1))
+    if all(item.target is None for item in case.invariants):
+        starts[0] += 1e-3 * case.size * runs.rng.standard_normal(case.size.size)
+    given = {**case.options, "t_eval": case.times, **options}
+    run, _ = observed(lambda: ensemble(case.fun, case.t_span, starts, **given))
+    alone = runs.whole
+    end = alone.t[-1], alone.status, alone.message.split(" (")[0], alone.trusted
+    found = run.t[1], run.status[1], run.message[1].split(" (")[0], run.trusted[1]
+    if found != end or not same(run.y[1], alone.y[:, -1]):
+        yield f"the last member: {found}, {run.y[1]}; alone: {end}, {alone.y[:, -1]}"
+    if alone.status == 0 and not case.events and not same(run.trajectories[1], runs.sampled.y):
+        yield "other trajectories"
+
+
+def native(runs: Runs) -> Iterator[str]:
+    """Compiled runs have the bits of interpreted ones; broken off or as members too."""
+    case, whole = runs.case, runs.whole
+    if not case.native or numba.config.DISABLE_JIT:
+        return
+    run, warned = observed(lambda: case.integrate(save_every=1, compiled=True))
+    yield from different(whole, run, *BITS)
+    yield from different(whole.diagnostics, run.diagnostics, *COUNTS)
+    if [str(w.message) for w in warned] != [str(w.message) for w in runs.warned]:
+        yield f"warned of {[str(w.message) for w in warned]}, interpreted of {[str(w.message) for w in runs.warned]}"
+    yield from resumed(runs, compiled=True)
+    yield from members(runs, compiled=True)
+
+
+CHECKS = (finite, accurate, survives, kept, quiet, told, through_scipy, dense, resumed, members, native)
+
+
+def look_at(seed: int) -> tuple[Runs | None, list[tuple[str, str]]]:
+    """Run the case of that number; what was violated, and how. None: it takes too long, with and without projection."""
+    case = random_case(seed)
+    runs, wrong = Runs(case), []
+    try:
+        if runs.plain.status < 0 and "h" not in case.steps:
+            return None, []
+    except TooManyCallsError:
+        return None, []
+    for check in CHECKS:
+        try:
+            wrong += [(check.__name__, text) for text in check(runs)]
+        except Exception:
+            wrong.append((check.__name__, traceback.format_exc(limit=-6)))
+    return runs, wrong
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The script; returns its exit status."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz.systems", description=__doc__.partition("\n")[0])
+    parser.add_argument("--seconds", type=float, default=math.inf, help="stop after so many seconds")
+    parser.add_argument("--count", type=int, default=None, help="stop after so many systems")
+    parser.add_argument("--seed", type=int, default=0, help="the number of the first system")
+    given = parser.parse_args(arguments)
+    if given.count is None and math.isinf(given.seconds):
+        given.seconds = 60.0
+    count, begin, violations = Counter[str](), time.monotonic(), 0
+    used, doubted, last = Counter[str](), [], given.seed
+    for seed in itertools.count(given.seed):
+        if time.monotonic() - begin > given.seconds or seed - given.seed == given.count:
+            break
+        last = seed
+        runs, wrong = look_at(seed)
+        count["systems"] += 1
+        if runs is None:
+            count["endless"] += 1
+            continue
+        used[runs.case.method] += 1
+        count["regular"] += runs.case.regular
+        count["sick"] += runs.case.sick
+        if runs.healthy and not runs.whole.trusted:
+            doubted.append(seed)
+        count["healthy"] += runs.healthy
+        for name, text in wrong:
+            violations += 1
+            print(f"VIOLATION of {name!r} by system {seed}\n  {runs.case}\n  {text}")
+            print(f"  again: python -m tests.fuzz.systems --seed {seed} --count 1", flush=True)
+    print(
+        f"systems {given.seed} to {last} in {time.monotonic() - begin:.0f} s: {count['systems']}, of which "
+        f"{count['regular']} regular, {count['sick']} with a false invariant, {count['endless']} left out as endless; "
+        f"{', '.join(f'{name} {used[name]}' for name in METHODS)}"
+    )
+    print(f"not trusted, and nothing wrong was known of them: {len(doubted)} of {count['healthy']} {doubted[:20]}")
+    print(f"violations: {violations}")
+    return 1 if violations else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,11 @@
+"""Imported once by the server that forks the runs to be killed, so that they need not import and compile anything."""
+
+import tqdm
+import zarr  # noqa: F401
+
+tqdm.tqdm.monitor_interval = 0  # no thread: it would be lost by a fork, with what it holds
+
+from . import kills  # noqa: E402
+
+for kind in kills.SINGLE:
+    kills.whole(kind)
