@@ -1,0 +1,1 @@
+"""What benchmarks/trust.py runs: systems, sick runs, healthy runs."""
