@@ -3,7 +3,7 @@
     python benchmarks/trust.py [--only TEXT] [--workers 2] [--markdown FILE] [--csv FILE] [--json FILE]
 
 Sick runs: quantities that are no invariants (their rate 0 at the start, or not), leaks, wrong gradients, steps too
-long, passages that blow up, members of ensembles; by all methods, fixed and adaptive steps, solve_ivp and integrate, compiled
+long, passages that blow up, members of ensembles; by all methods, fixed and adaptive, solve_ivp and integrate, compiled
 and interpreted, real and complex. Told means: ValueError or UserWarning at the start, ProjectionWarning, status -1, or
 `trusted` false. Their error is that of the last state, relative to its largest component.
 

@@ -92,7 +92,7 @@ class EIPSolver(OdeSolver):
         Where the step evaluates f at its raw result anyway, let it serve as the next step's first stage.
     check : bool, optional
         Check the invariants and their gradients at the start and again after some steps, watch whether the corrections
-        are those of the steps' errors, and fail where a projection leaves a defect of the size of its invariant's terms.
+        are those of the steps' errors, and fail where a projection leaves a defect as large as its invariant's terms.
         False: none of these.
     project_initial : bool, optional
         Project y0 onto given targets before the first step.
