@@ -648,9 +648,8 @@ def _note_terms(run: Run, t0: float, f0: np.ndarray) -> None:
     """The invariants' terms at the start, by which defects are measured."""
     known, y0 = run.invariants, run.y0
     G = known.gradients(t0, y0, f0).view(float)
-    kn.start_figures(
-        known.start_values, known.target, known.scales, G, y0.view(float), f0.view(float), run.tau, run.work.trust
-    )
+    values, state, slope = known.values(t0, y0), y0.view(float), f0.view(float)
+    kn.start_figures(values, known.target, known.scales, G, state, slope, run.tau, run.work.trust)
 
 
 def _can_project_jointly(options: Options, invariants: InvariantSet) -> bool:
