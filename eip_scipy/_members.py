@@ -478,6 +478,7 @@ class _Driver:
         self._one_by_one(plan, first, m, each, out, watch)
         for k in again:
             self._one_by_one(plan, k, k + 1, each, out, watch)
+        self._look_at_ends(each, out)
         if saved is not None:
             out.saved[:] = saved[:, : plan.times.size]
         if np.isnan(loop.diagnostics.max_correction):  # no error estimate to measure by
@@ -509,6 +510,25 @@ class _Driver:
                 where[0] += 1
             elif time.perf_counter() - begin < BATCH_SECONDS:
                 batch *= 2
+
+    def _look_at_ends(self, each: _Each, out: Members) -> None:
+        """Check the invariants at the end of the first member that got there and, where they are none, of all."""
+        driver = self.loop.driver
+        run, t = driver.run, driver.grid.span.t_bound
+        arrived = np.flatnonzero(out.status == 0)
+        if not run.options.watched:
+            return
+        for k in arrived:
+            driver.params[:] = each.params[k]
+            f = self._derivative(each.params[k])(t, out.y[k])
+            found = next(run.invariants.complaints(t, out.y[k], f, each.taus[k]), None)
+            if found is not None:
+                trust = Trust(run.invariants.names, each.figures[k].reshape(run.work.trust.shape))
+                trust.doubts.append(found.text)
+                out.trusted[k] = False
+                out.message[k] = f"{ARRIVED}; {trust.message}"
+            elif k == arrived[0]:
+                return
 
     def _arrived(self, those: slice, each: _Each, out: Members) -> None:
         """Members that the sweep took to their ends, and what their corrections say."""

@@ -587,7 +587,7 @@ def prepare(
         Further arguments of the invariants' functions (``(params,)`` or nothing).
     compensated : bool
     check_start : bool
-        False: the invariants are checked elsewhere, at the start and later.
+        False: the invariants have been checked at the start of another run like this.
     """
     if compensated and isinstance(tableau, OneStep):
         raise ValueError(f"compensated=True carries the rounding of a tableau's sums; {tableau.name} is no tableau.")
@@ -628,7 +628,7 @@ def prepare(
     work = make_work(n, y0.dtype, arrays.b.size, invariants.size, groups.start.size - 1)
     if sigma is not None:
         work.sigma[:] = sigma
-    check = bool(projection.check) and check_start
+    check = bool(projection.check)
     trust = Trust(invariants.names, work.trust)
     run = Run(y0, arrays, options, work, invariants, projection.frame, trust, check, tau)
     if _flag("project_initial", projection.project_initial):
@@ -639,7 +639,7 @@ def prepare(
         raise ValueError(f"{violation}; mend y0 or the target, or pass project_initial=True to project y0 first.")
     if options.watched:
         _note_terms(run, t0, f0)
-    if check and np.isfinite(f0).all():
+    if check and check_start and np.isfinite(f0).all():
         run.trust.doubts += invariants.check(t0, run.y0, f0, tau)
     return run
 
