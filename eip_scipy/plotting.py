@@ -52,10 +52,10 @@ __all__ = [
     "work_figure",
 ]
 
-# Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white.
-PALETTE = ("#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#777777")
-LINES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), "-", "--")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<")
+# Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white, and Tol's wine.
+PALETTE = ("#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#777777", "#882255")
+LINES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), "-", "--", (0, (8, 2, 1, 2)))
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "*")
 DPI = 160
 POINTS = 250
 LONG_LABEL = 24
@@ -525,6 +525,7 @@ def frontier_figure(
     time: str = "wall time [s]",
     title: str = "",
     footnote: str = "",
+    styles: Styles | None = None,
 ) -> Figure:
     """Draw errors against wall time in one panel for each kind of error, a line for each method.
 
@@ -537,12 +538,14 @@ def frontier_figure(
     time : str, optional
         Label of the time.
     title, footnote : str, optional
+    styles : mapping, optional
+        From `method_styles`.
 
     Returns
     -------
     Figure
     """
-    styles = method_styles(series)
+    styles = method_styles(series) if styles is None else styles
     panels = [key for key in next(iter(series.values())) if key != "wall_time"]
     figure = _figure(5.4 * len(panels), 5.6, title)
     axes = figure.subplots(1, len(panels), sharex=True, sharey=True)

@@ -44,11 +44,14 @@ class WorkPrecision:
     ----------
     points : tuple of WorkPoint
         In the order of the methods and of their steps.
+    states : tuple of ndarray
+        Their final states.
     machine : str
         The machine that the times hold for.
     """
 
     points: tuple[WorkPoint, ...]
+    states: tuple[np.ndarray, ...]
     machine: str
 
 
@@ -88,16 +91,17 @@ def work_precision(
     if repeats < 1:
         raise ValueError(f"repeats must be at least 1, got {repeats!r}.")
     points = [WorkPoint(method, step, 0.0, math.nan) for method, (_, steps) in methods.items() for step in steps]
+    states = [np.empty(0)] * len(points)
     for turn in range(repeats):
         # All points in turn, not each at once: another process that disturbs for a while disturbs one run of a point.
         for k, point in enumerate(points):
             if point.wall_time <= enough_seconds:
-                seconds, state = methods[point.method][0](point.step)
+                seconds, states[k] = methods[point.method][0](point.step)
                 least = min(seconds, point.wall_time) if turn else seconds
-                points[k] = point._replace(wall_time=least, error=_error(state, error))
+                points[k] = point._replace(wall_time=least, error=_error(states[k], error))
             if callback is not None:
                 callback()
-    return WorkPrecision(tuple(points), describe_machine())
+    return WorkPrecision(tuple(points), tuple(states), describe_machine())
 
 
 def cost_to_reach(costs: Any, errors: Any, level: float) -> float:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -10,14 +12,105 @@ import numpy as np
 
 from ..longrun import integrate
 from ..problems.solar_data import YEAR_D
-from ..solvers import EIPRK4, EIPRK5, EIPSolver
-from ..work_precision import Runner, WorkPrecision, work_precision
-from .solar_errors import MERCURY
-from .solar_run import Judge, Scene, eip_name, leapfrog, metric_of, rebound_run, stored_state, tight_run, whole_number
+from ..solvers import EIPRK4, EIPRK5, EIPRKN12, EIPSolver
+from ..work_precision import Runner, work_precision
+from .solar_run import (
+    HIGH_ORDER,
+    KEPT,
+    Judge,
+    Scene,
+    eip_name,
+    leapfrog,
+    metric_of,
+    rebound_run,
+    stored_state,
+    tight_run,
+    whole_number,
+)
 
-__all__ = ["REPEATS", "cost", "cost_methods"]
+__all__ = ["MERCURY", "REPEATS", "TimedRun", "by_method", "cost", "cost_methods", "timed"]
 
 REPEATS = 3
+MERCURY = 0  # of the planets, which start behind the Sun
+
+
+@dataclass(frozen=True, eq=False)
+class TimedRun:
+    """One method at one step or tolerance.
+
+    Attributes
+    ----------
+    method : str
+    step : float
+        Years; for heyoka its tolerance; nan for IAS15, which has its own.
+    wall_time : float
+        Seconds.
+    errors : ndarray, shape (9,)
+        Distance of each planet from the reference [AU]; nan where the run failed.
+    """
+
+    method: str
+    step: float
+    wall_time: float
+    errors: np.ndarray
+
+    @property
+    def mercury(self) -> float:
+        """Mercury's error."""
+        return float(self.errors[MERCURY])
+
+    @property
+    def others(self) -> float:
+        """The largest error of another planet."""
+        return float(np.delete(self.errors, MERCURY).max())
+
+
+def timed(
+    methods: Mapping[str, tuple[Runner, Sequence[float]]],
+    truth: np.ndarray,
+    *,
+    repeats: int,
+    enough_seconds: float = 1.0,
+    callback: Callable[[], Any] | None = None,
+) -> list[TimedRun]:
+    """Run and time methods; see `work_precision`.
+
+    Parameters
+    ----------
+    methods : mapping
+        As `work_precision` takes it.
+    truth : ndarray, shape (60,)
+        The state at the end of all runs.
+    repeats, enough_seconds, callback
+        As for `work_precision`.
+
+    Returns
+    -------
+    list of TimedRun
+    """
+    done = work_precision(
+        methods, lambda y: math.nan, repeats=repeats, enough_seconds=enough_seconds, callback=callback
+    )
+
+    def errors(y: np.ndarray) -> np.ndarray:
+        return np.linalg.norm((y - truth)[: y.size // 2].reshape(-1, 3), axis=1)[1:]
+
+    return [
+        TimedRun(point.method, point.step, point.wall_time, errors(state))
+        for point, state in zip(done.points, done.states, strict=True)
+    ]
+
+
+def by_method(runs: Sequence[TimedRun]) -> dict[str, dict[str, list[float]]]:
+    """Series of times and errors, as `eip_scipy.plotting.frontier_figure` takes them."""
+    return {
+        name: {
+            "wall_time": [item.wall_time for item in runs if item.method == name],
+            "Mercury": [item.mercury for item in runs if item.method == name],
+            "the worst of the other planets": [item.others for item in runs if item.method == name],
+        }
+        for name in dict.fromkeys(item.method for item in runs)
+    }
 
 
 def cost(
@@ -25,8 +118,8 @@ def cost(
     methods: Mapping[str, tuple[Runner, Sequence[float]]],
     judge: Judge | None,
     callback: Callable[[], Any] | None = None,
-) -> WorkPrecision:
-    """Mercury's final position error against the time of the run, for several methods and steps.
+) -> list[TimedRun]:
+    """Final position errors against the time of the run, for several methods and steps.
 
     Parameters
     ----------
@@ -41,19 +134,14 @@ def cost(
 
     Returns
     -------
-    WorkPrecision
+    list of TimedRun
     """
     truth = stored_state(scene, scene.years)
     if truth is None:
         truth = (tight_run(scene, False) if judge is None else rebound_run(scene, judge, "IAS15", "ias15", 1, False)).y[
             :, -1
         ]
-    half = truth.size // 2
-
-    def error(y: np.ndarray) -> float:
-        return float(np.linalg.norm((y - truth)[:half].reshape(-1, 3)[1 + MERCURY]))
-
-    return work_precision(methods, error, repeats=REPEATS, callback=callback)
+    return timed(methods, truth, repeats=REPEATS, callback=callback)
 
 
 def cost_methods(
@@ -65,7 +153,7 @@ def cost_methods(
     ----------
     scene : Scene
     method : type
-        With its projection, and without; and beside it EIPRK5 (EIPRK4 beside EIPRK5).
+        With its projection, and without; and beside it EIPRK5 (EIPRK4 beside EIPRK5) and EIPRKN12.
     metric : {"error", "euclidean"}
     judge : callable or None
 
@@ -82,6 +170,7 @@ def cost_methods(
         method.TABLEAU.name: (partial(_time_eip, scene, method, {"invariants": ()}), steps),
         eip_name(other, metric): (partial(_time_eip, scene, other, {"metric": metric}), steps),
         "SV": (partial(_time_verlet, scene), _steps(scene, [scene.h * f for f in (2, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)])),
+        HIGH_ORDER: (partial(_time_eip, scene, EIPRKN12, KEPT), _steps(scene, [1 / n for n in (24, 32, 40, 48, 64)])),
     }
     if judge is None:
         return methods

@@ -10,7 +10,7 @@ import numpy as np
 from .. import plotting
 from ..problems.solar_data import YEAR_D
 from ..report import describe_machine
-from .solar_cost import REPEATS
+from .solar_cost import REPEATS, by_method
 from .solar_errors import MERCURY, Study, ecliptic, longitude_errors
 from .solar_run import MethodRun, Scene
 
@@ -33,9 +33,8 @@ def figures(study: Study) -> Iterator[tuple[str, Any]]:
     (str, Figure)
         File name and figure.
     """
-    assert study.cost is not None
     # One style for a method in all figures.
-    names = dict.fromkeys([*(run.name for run in study.runs), *(point.method for point in study.cost.points)])
+    names = dict.fromkeys([*(run.name for run in study.runs), *(item.method for item in study.cost)])
     styles = plotting.method_styles(names)
     yield "invariant-errors.png", _errors_figure(study, styles)
     yield "longitude-errors.png", _longitude_figure(study, styles)
@@ -182,12 +181,11 @@ def _mercury_figure(study: Study) -> Any:
 
 
 def _cost_figure(study: Study, styles: Any) -> Any:
-    assert study.cost is not None
     assert study.cost_scene is not None
-    return plotting.cost_figure(
-        study.cost.points,
+    return plotting.frontier_figure(
+        by_method(study.cost),
+        unit="AU",
         styles=styles,
-        error="error of Mercury's position [AU]",
         title=f"Error against cost: runs of {study.cost_scene.years:g} yr, {study.scene.data.name}",
         footnote=f"{describe_machine()}; one thread, least of {REPEATS} timings",
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -29,38 +28,16 @@ from ..report import (
     write_json,
 )
 from ..solvers import EIPDOP853, EIPRK4, EIPRKN8, EIPRKN12
-from ..work_precision import Runner, cost_to_reach, work_precision
-from .solar_errors import MERCURY
-from .solar_run import Judge, whole_number
+from ..work_precision import Runner, cost_to_reach
+from .solar_cost import MERCURY, TimedRun, by_method, timed
+from .solar_run import KEPT, Judge, whole_number
 
-__all__ = ["FrontierRun", "measure", "methods", "run"]
+__all__ = ["measure", "methods", "run"]
 
 DONE, INTERRUPTED = 0, 130
 YEARS, REPEATS = 1000.0, 3
 PATIENCE = 30.0  # a run of so many seconds is not repeated
 LEVELS = (1e-6, 1e-7, 1e-8, 1e-9)
-KEPT: dict[str, Any] = {"every": 10, "compensated": True}
-
-
-@dataclass(frozen=True, eq=False)
-class FrontierRun:
-    """One method at one step or tolerance.
-
-    Attributes
-    ----------
-    method : str
-    step : float
-        Years; for heyoka its tolerance; nan for IAS15, which has its own.
-    wall_time : float
-        Seconds.
-    errors : ndarray, shape (9,)
-        Distance of each planet from the reference [AU]; nan where the run failed.
-    """
-
-    method: str
-    step: float
-    wall_time: float
-    errors: np.ndarray
 
 
 def methods(problem: Problem, years: float, judge: Judge | None, heyoka: Judge | None) -> dict[str, Any]:
@@ -109,7 +86,7 @@ def methods(problem: Problem, years: float, judge: Judge | None, heyoka: Judge |
 
 def measure(
     years: float, judge: Judge | None, heyoka: Judge | None, callback: Callable[[], Any] | None = None
-) -> list[FrontierRun]:
+) -> list[TimedRun]:
     """Run and time all methods.
 
     Raises
@@ -122,24 +99,10 @@ def measure(
         raise ValueError(f"--frontier needs a stored reference state: --years must be one of {known}, got {years:g}")
     problem = solar_system(years=years)
     assert problem.reference is not None
-    truth, planets = problem.reference(years), len(load("de440").bodies) - 1
-    states: dict[tuple[str, float], np.ndarray] = {}
-
-    def noting(name: str, runner: Runner) -> Runner:
-        def noted(step: float) -> tuple[float, np.ndarray]:
-            seconds, states[name, step] = runner(step)
-            return seconds, states[name, step]
-
-        return noted
-
-    all_methods = methods(problem, years, judge, heyoka)
-    noted = {name: (noting(name, runner), steps) for name, (runner, steps) in all_methods.items()}
-    points = work_precision(noted, lambda y: 0.0, repeats=REPEATS, enough_seconds=PATIENCE, callback=callback).points
-
-    def errors(y: np.ndarray) -> np.ndarray:
-        return np.linalg.norm((y - truth)[: y.size // 2].reshape(-1, 3), axis=1)[-planets:]
-
-    return [FrontierRun(p.method, p.step, p.wall_time, errors(states[p.method, p.step])) for p in points]
+    truth = problem.reference(years)
+    assert truth is not None
+    found = methods(problem, years, judge, heyoka)
+    return timed(found, truth, repeats=REPEATS, enough_seconds=PATIENCE, callback=callback)
 
 
 def _dividing(years: float, wanted: Sequence[float]) -> list[float]:
@@ -175,13 +138,13 @@ def _heyoka(peer: Judge, problem: Problem, years: float, tolerance: float) -> tu
     return result.wall_time, result.y
 
 
-def _setting(item: FrontierRun) -> str:
+def _setting(item: TimedRun) -> str:
     if math.isnan(item.step):
         return "own"
     return f"tol {item.step:.0e}" if item.method.startswith("heyoka") else f"{item.step * YEAR_D:.4g} d"
 
 
-def text(runs: Sequence[FrontierRun], years: float, machine: str) -> str:
+def text(runs: Sequence[TimedRun], years: float, machine: str) -> str:
     """Lay out all runs, and what it costs to reach a level of error."""
     others = np.delete(np.array(load("de440").bodies[1:]), MERCURY)
     body = []
@@ -203,11 +166,11 @@ def text(runs: Sequence[FrontierRun], years: float, machine: str) -> str:
     return "\n".join(parts)
 
 
-def _costs(runs: Sequence[FrontierRun]) -> list[tuple[str, list[str]]]:
+def _costs(runs: Sequence[TimedRun]) -> list[tuple[str, list[str]]]:
     lines = []
     for name in dict.fromkeys(item.method for item in runs):
         own = [item for item in runs if item.method == name]
-        seconds, errors = [item.wall_time for item in own], [item.errors[MERCURY] for item in own]
+        seconds, errors = [item.wall_time for item in own], [item.mercury for item in own]
         cells = [
             ("<" if errors[0] <= level else "") + compact(cost_to_reach(seconds, errors, level)) for level in LEVELS
         ]
@@ -215,7 +178,7 @@ def _costs(runs: Sequence[FrontierRun]) -> list[tuple[str, list[str]]]:
     return lines
 
 
-def rows(runs: Sequence[FrontierRun]) -> list[dict[str, Any]]:
+def rows(runs: Sequence[TimedRun]) -> list[dict[str, Any]]:
     """Make the lines of the CSV file."""
     planets = load("de440").bodies[1:]
     return [
@@ -279,16 +242,7 @@ def run(args: argparse.Namespace, judge: Judge | None, heyoka: Judge | None) -> 
         warn(f"no figure: {error}")
     else:
         figure = frontier_figure(
-            {
-                name: {
-                    "wall_time": [item.wall_time for item in runs if item.method == name],
-                    "Mercury": [item.errors[MERCURY] for item in runs if item.method == name],
-                    "the worst of the other planets": [
-                        np.delete(item.errors, MERCURY).max() for item in runs if item.method == name
-                    ],
-                }
-                for name in dict.fromkeys(item.method for item in runs)
-            },
+            by_method(runs),
             unit="AU",
             title=f"Ten bodies, Newton, {args.years:g} years: error of position against cost",
             footnote=f"{machine}; one thread, least of {REPEATS}",

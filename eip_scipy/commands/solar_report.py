@@ -13,7 +13,7 @@ import numpy as np
 from ..problems.solar_data import YEAR_D
 from ..report import compact, document, table
 from .solar_errors import PointErrors, Study
-from .solar_run import MethodRun, report_times
+from .solar_run import HIGH_ORDER, TIGHT, MethodRun, report_times
 
 __all__ = ["cost_rows", "csv_rows", "json_content", "text"]
 
@@ -51,7 +51,7 @@ def _table(study: Study) -> str:
     end = study.errors(study.scene.years)
     rows: list[tuple[str, Sequence[str]]] = [
         ("step [d]", [_step(run) for run in study.runs]),
-        ("wall time [s]", [compact(run.wall_time) for run in study.runs]),
+        ("wall [s]", [compact(run.wall_time) for run in study.runs]),
         ("max |dH/H|", [compact(float(run.energy_error.max())) for run in study.runs]),
         ("max |dL/L|", [compact(float(run.momentum_error.max())) for run in study.runs]),
     ]
@@ -85,7 +85,8 @@ def _notes(study: Study) -> str:
         "Longitude: heliocentric, ecliptic, with whole turns. Position: from the centre of mass.",
         "SV: Stoermer-Verlet, kick-drift-kick." if "SV" in shown else "",
         "WHFast (c17: corrector of order 17), IAS15: REBOUND." if "IAS15" in shown else "",
-        "EIPRK5 tight: a quarter of the step, compensated." if "EIPRK5 (tight)" in shown else "",
+        f"{HIGH_ORDER}: Nystroem, order 12, projected at each tenth step, compensated." if HIGH_ORDER in shown else "",
+        f"{TIGHT}: half of its step." if TIGHT in shown else "",
         "EMB: barycentre of Earth and Moon." if "EMB" in study.scene.planets else "",
     ]
     end = study.errors(study.scene.years).values()
@@ -101,9 +102,19 @@ def _check_lines(study: Study) -> list[str]:
 
 def cost_rows(study: Study) -> list[dict[str, Any]]:
     """Make a row for each method and step that was timed."""
-    if study.cost is None or study.cost_scene is None:
+    if study.cost_scene is None:
         return []
-    return [{"years": study.cost_scene.years, **point._asdict()} for point in study.cost.points]
+    return [
+        {
+            "years": study.cost_scene.years,
+            "method": item.method,
+            "step": item.step,
+            "wall_time": item.wall_time,
+            "error": item.mercury,
+            "error_others": item.others,
+        }
+        for item in study.cost
+    ]
 
 
 def csv_rows(study: Study) -> list[dict[str, Any]]:
@@ -170,6 +181,10 @@ def json_content(study: Study, args: argparse.Namespace) -> dict[str, Any]:
         step_yr=scene.h,
         data={"epoch": scene.data.epoch, "axes": scene.data.axes, "source": scene.data.source},
         methods=methods,
-        error_against_cost={"error": "Mercury's position [AU]", "points": cost_rows(study)},
+        error_against_cost={
+            "error": "Mercury's position [AU]",
+            "error_others": "largest error of another planet's position [AU]",
+            "points": cost_rows(study),
+        },
         checks=[check._asdict() for check in study.checks()],
     )

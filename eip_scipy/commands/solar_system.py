@@ -163,9 +163,9 @@ def _time_methods(study: Study, args: argparse.Namespace, judge: Judge | None) -
 
 def _write_numbers(study: Study, args: argparse.Namespace) -> None:
     """Write what is known; a second time when the timings are there, too."""
-    again = study.cost is not None
+    again = bool(study.cost)
     _say(args, write_csv(args.out / "solar-system.csv", csv_rows(study)), again=again)
-    if study.cost is not None:
+    if study.cost:
         _say(args, write_csv(args.out / "error-against-cost.csv", cost_rows(study)))
     if args.json is not None:
         _say(args, write_json(args.json, json_content(study, args)), again=again)
