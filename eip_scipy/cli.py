@@ -21,11 +21,11 @@ from .commands import (
     solar_truth,
 )
 from .problems import solar_data
-from .report import UsageError, check_target, document, say, versions, warn, write_json
+from .report import UsageError, check_target, document, listening, say, versions, warn, write_json
 
 __all__ = ["main"]
 
-DONE, WRONG_USAGE = 0, 2
+DONE, CHECK_FAILED, WRONG_USAGE = 0, 1, 2
 
 
 class _Parser(argparse.ArgumentParser):
@@ -45,8 +45,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 done, 1 a check inside the command failed, 2 wrong usage, 130 interrupted.
+        Exit status: 0 done, 1 a check inside the command failed or a run is not to be trusted, 2 wrong usage, 130
+        interrupted.
     """
+    with listening() as untrusted:
+        try:
+            status = _run(argv)
+        finally:
+            for message in untrusted:
+                warn(message)
+    return CHECK_FAILED if status == DONE and untrusted else status
+
+
+def _run(argv: Sequence[str] | None) -> int:
     try:
         args = _parser().parse_args(argv)
         return int(args.run(args))

@@ -8,6 +8,7 @@ import math
 import os
 import platform
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -17,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from .result import ProjectionWarning
+
 __all__ = [
     "UsageError",
     "check_folder",
@@ -25,6 +28,7 @@ __all__ = [
     "compact",
     "describe_machine",
     "document",
+    "listening",
     "machine",
     "say",
     "table",
@@ -38,6 +42,9 @@ __all__ = [
 PACKAGES = (
     "eip_scipy", "numpy", "scipy", "numba", "tqdm", "rebound", "matplotlib", "astropy", "jplephem", "ducc0", "pyfftw",
 )  # fmt: skip
+
+
+_untrusted: list[str] = []  # what was said of runs that are not to be trusted, since `listening` began
 
 
 class UsageError(Exception):
@@ -86,6 +93,8 @@ def _processor() -> str:
 def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict[str, Any]:
     """Wrap a command's numbers for `write_json`: what was asked for, when, with which versions, on which machine.
 
+    It says too whether all runs since `listening` began are to be trusted.
+
     Parameters
     ----------
     command : str
@@ -102,6 +111,7 @@ def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict
         "command": command,
         "arguments": dict(arguments),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "trusted": not _untrusted,
         "versions": versions(),
         "machine": machine(),
         **content,
@@ -176,6 +186,32 @@ def say(text: str = "") -> None:
 def warn(message: str) -> None:
     """Print one line for the user on the error stream."""
     print(f"eip-scipy: {message}", file=sys.stderr)
+
+
+@contextmanager
+def listening() -> Iterator[list[str]]:
+    """Collect what a `ProjectionWarning` says of runs, each text once, instead of showing it.
+
+    Other warnings go where they went.
+
+    Yields
+    ------
+    list of str
+        Filled as runs end; `document` looks at it, too.
+    """
+    _untrusted.clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", ProjectionWarning)
+        show = warnings.showwarning
+
+        def listen(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if not issubclass(category, ProjectionWarning):
+                show(message, category, *where, **more)
+            elif str(message) not in _untrusted:
+                _untrusted.append(str(message))
+
+        warnings.showwarning = listen
+        yield _untrusted
 
 
 def check_folder(folder: Path) -> None:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -16,7 +17,7 @@ import pytest
 
 import eip_scipy
 import eip_scipy.integrations
-from eip_scipy import EIPRK1, EIPRK4, Invariant, integrate, report
+from eip_scipy import EIPRK1, EIPRK4, Invariant, ProjectionWarning, integrate, report
 from eip_scipy.cli import main
 from eip_scipy.commands import solar_cost, solar_errors, solar_run, solar_system
 from eip_scipy.commands.solar_figures import jacobi, osculating_orbits
@@ -224,6 +225,30 @@ def test_a_failed_check_changes_the_status(tmp_path, capsys, no_rebound, monkeyp
     monkeypatch.setattr(solar_errors, "FASTEST", 1e-9)
     assert main(["solar-system", *SPAN, "--out", str(tmp_path)]) == 1
     assert "FAILED EIPRK4 (error) keeps H" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("little_to_time")
+def test_a_run_that_is_not_to_be_trusted_is_told(tmp_path, capsys, no_rebound, monkeypatch):
+    """At the end, once, by its name; in the JSON and the exit status too. Other warnings are shown as usual."""
+
+    def doubtful(problem, **options):
+        if options.get("metric") == "error":
+            for category in (ProjectionWarning, ProjectionWarning, UserWarning):
+                warnings.warn(f"{options['method'].__name__}: doubtful", category, stacklevel=2)
+        return integrate(problem, **options)
+
+    file = tmp_path / "run.json"
+    command = ["solar-system", *SPAN, "--quiet", "--out", str(tmp_path), "--json", str(file)]
+    with monkeypatch.context() as patch:
+        patch.setattr(solar_run, "integrate", doubtful)
+        with pytest.warns(UserWarning, match="doubtful") as shown:
+            assert main(command) == 1
+    assert [item.category for item in shown] == [UserWarning]
+    assert lines(capsys.readouterr().err)[1:] == ["eip-scipy: EIPRK4 (error): doubtful"]  # after that on REBOUND
+    assert json.loads(file.read_text())["trusted"] is False
+    assert main(command) == 0
+    assert len(lines(capsys.readouterr().err)) == 1
+    assert json.loads(file.read_text())["trusted"] is True
 
 
 def test_an_interruption_keeps_what_was_done(tmp_path, capsys, no_rebound, monkeypatch):
