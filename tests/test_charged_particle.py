@@ -422,6 +422,61 @@ def test_bad_input(call, error, words):
         call()
 
 
+def dipole(x, y, z):
+    r2 = x * x + y * y + z * z
+    return 3 * x * z / r2**2.5, 3 * y * z / r2**2.5, (3 * z * z - r2) / r2**2.5
+
+
+def wire(x, y, z):
+    return -y / (x * x + y * y), x / (x * x + y * y), 0.0
+
+
+def ripple(x, y, z):
+    """It changes over a thirtieth of the length that is the default."""
+    return math.sin(200 * x) * math.cos(200 * y), -math.cos(200 * x) * math.sin(200 * y), 1e3
+
+
+def nothing(x, y, z):
+    return 0.0, 0.0, 0.0
+
+
+@pytest.mark.parametrize("place", [0.1, 1.0, 1e6])
+@pytest.mark.parametrize("field", [dipole, wire, ripple, nothing, mirror_b, constant_b, TOKAMAK.magnetic])
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e12])
+def test_a_field_without_divergence_passes(field, place, scale):
+    position = place * np.array([0.6, 0.5, -0.4])
+    scaled = ParticleField(magnetic=lambda x, y, z: tuple(scale * b for b in field(x, y, z)))
+    assert start(field=scaled, position=position, form="velocity").invariants
+
+
+@pytest.mark.parametrize(
+    "field",
+    [
+        lambda x, y, z: (x, 0.0, 0.0),
+        lambda x, y, z: (0.0, 0.0, 1 + z * z),  # none at z = 0, where the particle starts
+        lambda x, y, z: (0.0, 0.0, 5e4 + 1e-3 * z),
+        lambda x, y, z: tuple(b + x for b in dipole(x, y, z)),
+    ],
+)
+def test_a_field_with_a_divergence_is_refused(field):
+    with pytest.raises(ValueError, match=r"divergence of magnetic is -?[\d.e-]+ at \[.*, where its largest derivative"):
+        start(field=ParticleField(magnetic=field), form="velocity")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        (lambda x, y, z: (1e-4 * x - x * z, -y * z, 1 + z * z), r"0\.0001"),
+        (lambda x, y, z: (x * z, y * z, 1 + z * z), r"0\.0\d+"),  # small beside dB_x/dz where the particle starts
+    ],
+)
+def test_a_small_divergence_is_told(field, value):
+    """As a table may have it; the run goes on, for the energy is kept all the same."""
+    with pytest.warns(UserWarning, match=f"divergence of magnetic is {value} at") as told:
+        start(field=ParticleField(magnetic=field), form="velocity")
+    assert len(told) == 1
+
+
 def test_energy_and_momentum_need_their_potentials():
     field = ParticleField(magnetic=mirror_b, electric=well_force)
     problem = start(field=field, form="velocity", h=0.1)

@@ -189,6 +189,23 @@ def test_another_end(tmp_path, start, capsys):
 
 @pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
+@pytest.mark.parametrize("end", ["0.05", "0.005"])
+def test_an_end_before_the_vortices_have_turned(end, tmp_path, start, capsys):
+    """What cannot be checked is said, and fails nothing."""
+    assert main(["gpe", "ring", "--start", str(start), "--t-end", end, "--out", str(tmp_path / "out")]) == 0
+    text = capsys.readouterr().out
+    assert "-      not checked: in which sense the vortices turn, for the run ends before t = 0.1\n" in text
+    assert "FAILED" not in text
+
+
+@pytest.mark.usefixtures("short")
+def test_an_end_before_the_first_step(tmp_path, start, capsys):
+    assert main(["gpe", "ring", "--start", str(start), "--t-end", "0.004", "--out", str(tmp_path / "out")]) == 2
+    assert "--t-end: expected at least 0.005, the reference's step, got 0.004" in capsys.readouterr().err
+
+
+@pytest.mark.slow_without_jit
+@pytest.mark.usefixtures("short")
 def test_a_stationary_state(start, tmp_path, monkeypatch):
     """Without a quench the gradients are parallel: that is counted, and nothing is nan."""
     monkeypatch.setattr(gpe_ring, "KAPPA_AFTER", 0.3)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..problems import GrossPitaevskii
 from ..problems.gross_pitaevskii import ring_condensate
-from ..report import check_outputs, warn
+from ..report import UsageError, check_outputs, warn
 from . import long_runs
 from .gpe_runs import SHOWN, Figures, Motion, Quench, Study, conclude, motion, study
 from .gpe_states import cropped, kept_state, load_state, search_ring
@@ -32,6 +32,8 @@ FRAMES_PER_SECOND = 8
 
 def run(args: argparse.Namespace) -> int:
     """Run ``gpe ring``; see `eip_scipy.commands.gpe.run`."""
+    if args.t_end < REFERENCE_STEP:
+        raise UsageError(f"--t-end: expected at least {REFERENCE_STEP:g}, the reference's step, got {args.t_end:g}")
     check_outputs(args.out, args.json)
     long_runs.check(args)
     after = ring_condensate(KAPPA_AFTER, POINTS)

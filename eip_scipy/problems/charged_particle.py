@@ -116,7 +116,8 @@ def charged_particle(
         When `field` is no ParticleField.
     ValueError
         For an unknown form, a canonical form without A, a start or functions of the field that are not finite, a mass
-        that is not positive, a charge of 0, or functions that contradict each other at the start.
+        that is not positive, a charge of 0, functions that contradict each other at the start, or a magnetic field with
+        a divergence there.
 
     Notes
     -----

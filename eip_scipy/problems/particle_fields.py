@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +29,12 @@ _jit = njit(cache=True, error_model="numpy", _nrt=False)
 DIFFERENCE_STEP = 2.0**-7  # of the field's length
 AGREEMENT = 1e-6  # of functions of the field that must go together
 ROUND_OFF = 1e-10  # of a difference, where the true one is 0
+TINY = 1e-300
+# Divergence of B in its largest derivative: beyond this a field is none, from AGREEMENT on it may be one from a table.
+NO_FIELD = 0.1
+FINER = (1.0, 0.25, 0.0625)  # steps of the differences, in the usual one
+# Where else than at the start, in steps: a field may be right at one point by symmetry.
+NEAR = ((0.0, 0.0, 0.0), (2.9, -1.7, 1.3), (-2.3, 2.1, 2.7), (1.1, 3.1, -2.2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +148,12 @@ class ParticleField:
         ------
         ValueError
             When a function does not return so many finite real numbers; when the jacobian is not that of A, B not
-            curl A or E not -grad phi there.
+            curl A or E not -grad phi there; or when B has a divergence there or nearby.
+
+        Warns
+        -----
+        UserWarning
+            When B has a small divergence, as one that is interpolated in a table may have.
         """
         step = self._step
         found = {key: self._value(key, shape, position) for key, shape in SHAPES.items() if getattr(self, key)}
@@ -156,6 +168,36 @@ class ParticleField:
             truth = np.array(difference_force(lambda *x: phi(*x), step)(*position))
             slack = AGREEMENT * np.abs(truth).max() + ROUND_OFF * abs(found["potential"]) / self.length
             _compare("electric", found.get("electric"), truth, slack, "minus the gradient of potential")
+        if self.magnetic is not None:
+            self._check_divergence(position)
+
+    def _check_divergence(self, position: np.ndarray) -> None:
+        points = [position + self._step * np.array(near) for near in NEAR]
+        share, divergence, largest, point = max((*self._divergence(point), tuple(point)) for point in points)
+        if not share > AGREEMENT:
+            return
+        said = (
+            f"ParticleField: the divergence of magnetic is {divergence:.3g} at {np.array(point)}, where its largest "
+            f"derivative is {largest:.3g}; a magnetic field has none."
+        )
+        if share > NO_FIELD:
+            raise ValueError(f"{said} Correct it (or `length`, if the field changes over shorter distances).")
+        warnings.warn(said, stacklevel=4)
+
+    def _divergence(self, point: np.ndarray) -> tuple[float, float, float]:
+        """The divergence of B: its share in the largest derivative, itself, and that derivative.
+
+        Of several steps of the differences the one with the smallest share: their errors shrink with it.
+        """
+        B = self.magnetic
+        assert B is not None
+        slack = ROUND_OFF * float(np.abs(B(*point)).max()) / self.length
+        found = []
+        for finer in FINER:
+            slopes = np.array(difference_jacobian(lambda *x: B(*x), finer * self._step)(*point))
+            divergence, largest = float(np.trace(slopes)), float(np.abs(slopes).max())
+            found.append(((abs(divergence) - slack) / max(largest, slack, TINY), divergence, largest))
+        return min(found)
 
     def _value(self, key: str, shape: tuple[int, ...], position: np.ndarray) -> np.ndarray:
         value = np.asarray(getattr(self, key)(*position))
