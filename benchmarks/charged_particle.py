@@ -15,6 +15,7 @@ Times are processor times of the thread, which on an idle machine are wall times
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -144,6 +145,7 @@ def cases(problem: ParticleProblem, other: ParticleProblem) -> Iterator[Case]:
     try:
         import heyoka  # noqa: F401
     except ImportError:
+        print('no comparison with heyoka: pip install "eip_scipy[heyoka]"', file=sys.stderr)
         return
     for tolerance in (1e-6, 1e-9, 1e-12, 1e-15):
         yield taylor(other, tolerance)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import sys
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,8 @@ def peers(problem: Problem, t: float) -> dict[str, dict[str, Any]]:
     """REBOUND's integrators, where there is one."""
     try:
         from eip_scipy.integrations import rebound
-    except ImportError:
+    except ImportError as error:
+        print(f"no comparison with WHFast, SABA and IAS15: {error}", file=sys.stderr)
         return {}
     found = {}
     for label, name, steps in (

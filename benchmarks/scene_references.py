@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -55,7 +56,8 @@ def ias15(problem: Problem, times: Sequence[float]) -> np.ndarray | None:
     """The same by IAS15 in double precision."""
     try:
         from eip_scipy.integrations import rebound
-    except ImportError:
+    except ImportError as error:
+        print(f"no comparison with IAS15: {error}", file=sys.stderr)
         return None
     return np.array([rebound.run(problem.params, problem.y0, "ias15", h=t, n_steps=1).y[:, -1] for t in times])
 

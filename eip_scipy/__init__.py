@@ -2,6 +2,7 @@
 
 from importlib.metadata import version as _version
 
+from . import _source_tree as _source_tree
 from .checkpoint import CheckpointError
 from .ensemble import EnsembleResult, ensemble
 from .invariants import Invariant, JointInvariants, check_gradient

@@ -22,6 +22,7 @@ from .commands import (
 )
 from .problems import solar_data
 from .report import UsageError, check_target, document, listening, say, versions, warn, write_json
+from .result import ProjectionWarning
 
 __all__ = ["main"]
 
@@ -48,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 a check inside the command failed or a run is not to be trusted, 2 wrong usage, 130
         interrupted.
     """
-    with listening() as untrusted:
+    with listening(ProjectionWarning) as untrusted:
         try:
             status = _run(argv)
         finally:
@@ -60,7 +61,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     try:
         args = _parser().parse_args(argv)
-        return int(args.run(args))
+        args.absent = []
+        status = int(args.run(args))
+        for line in args.absent:  # at the end, where it is seen
+            warn(line)
+        return status
     except SystemExit as leave:  # argparse, for --help, --version and errors
         return int(leave.code or DONE)
     except UsageError as error:
@@ -113,7 +118,7 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
         "hard-scenes": (
             "error against cost on high eccentricities, chaos and close encounters, beside IAS15",
             hard_scenes.add_arguments,
-            lambda args: hard_scenes.run(args, _rebound_module()),
+            lambda args: hard_scenes.run(args, _rebound(args)),
         ),
         "gpe": (
             "rotating Gross-Pitaevskii equation: ground states, the ring, and vortex lines (Experiment IV)",
@@ -132,24 +137,26 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
         commands["reproduce"] = (
             "recompute the paper's tables and figures",
             reproduce.add_arguments,
-            lambda args: reproduce.run(args, lambda: _rebound(args)),
+            lambda args: reproduce.run(args, lambda: _runner(_rebound(args))),
         )
     return commands
 
 
 def _rebound(args: argparse.Namespace) -> Any:
-    """REBOUND's integrators, or None and a line that says how to get them."""
-    module = _rebound_module()
-    return None if module is None else module.run
+    return _peer(args, "rebound", "WHFast and IAS15")
 
 
-def _rebound_module() -> Any:
+def _peer(args: argparse.Namespace, name: str, methods: str) -> Any:
+    """An integration, or None and a line at the end that says how to get it."""
     try:
-        from eip_scipy.integrations import rebound
+        return import_module(f"eip_scipy.integrations.{name}")
     except ImportError as error:
-        warn(f"no comparison with WHFast and IAS15: {error}")
+        args.absent.append(f"no comparison with {methods}: {error}")
         return None
-    return rebound
+
+
+def _runner(peer: Any) -> Any:
+    return None if peer is None else peer.run
 
 
 def _solar_system(args: argparse.Namespace) -> int:
@@ -158,17 +165,8 @@ def _solar_system(args: argparse.Namespace) -> int:
     if args.truth:
         return solar_truth.run(args, _ephemeris())
     if args.frontier:
-        return solar_frontier.run(args, _rebound(args), _heyoka())
-    return solar_system.run(args, _rebound(args), lambda *where: _ephemeris().initial_data(*where))
-
-
-def _heyoka() -> Any:
-    """The integrator of heyoka, or None: a peer that few will have installed."""
-    try:
-        from eip_scipy.integrations import heyoka
-    except ImportError:
-        return None
-    return heyoka.run
+        return solar_frontier.run(args, _runner(_rebound(args)), _runner(_peer(args, "heyoka", "heyoka")))
+    return solar_system.run(args, _runner(_rebound(args)), lambda *where: _ephemeris().initial_data(*where))
 
 
 def _ephemeris() -> solar_truth.Ephemeris:

@@ -14,11 +14,9 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
-
-from .result import ProjectionWarning
 
 __all__ = [
     "UsageError",
@@ -40,7 +38,8 @@ __all__ = [
 ]
 
 PACKAGES = (
-    "eip_scipy", "numpy", "scipy", "numba", "tqdm", "rebound", "matplotlib", "astropy", "jplephem", "ducc0", "pyfftw",
+    "eip_scipy", "numpy", "scipy", "numba", "tqdm", "rebound", "heyoka", "matplotlib", "astropy", "jplephem", "ducc0",
+    "pyfftw",
 )  # fmt: skip
 
 
@@ -189,10 +188,13 @@ def warn(message: str) -> None:
 
 
 @contextmanager
-def listening() -> Iterator[list[str]]:
-    """Collect what a `ProjectionWarning` says of runs, each text once, instead of showing it.
+def listening(kind: type[Warning]) -> Iterator[list[str]]:
+    """Collect warnings that a run is not to be trusted, each text once, instead of showing them.
 
-    Other warnings go where they went.
+    Parameters
+    ----------
+    kind : type
+        Theirs; others go where they went.
 
     Yields
     ------
@@ -201,12 +203,19 @@ def listening() -> Iterator[list[str]]:
     """
     _untrusted.clear()
     with warnings.catch_warnings():
-        warnings.simplefilter("always", ProjectionWarning)
+        warnings.simplefilter("always", kind)
         show = warnings.showwarning
 
-        def listen(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-            if not issubclass(category, ProjectionWarning):
-                show(message, category, *where, **more)
+        def listen(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if not issubclass(category, kind):
+                show(message, category, filename, lineno, file, line)
             elif str(message) not in _untrusted:
                 _untrusted.append(str(message))
 

@@ -292,10 +292,17 @@ def problem_from_simulation(
 
     Raises
     ------
+    TypeError
+        For something else than a simulation, such as the path of an archive.
     ValueError
         The simulation has what the N-body problem lacks (test or variational particles, softening, further forces,
         collisions, boundaries ...); the message says which and why it is not supported.
     """
+    if not isinstance(sim, rebound.Simulation):
+        raise TypeError(
+            f"problem_from_simulation: expected a rebound.Simulation, got {sim!r}; "
+            "one in an archive is rebound.Simulation(path)"
+        )
     _refuse_unsupported(sim)
     from eip_scipy.problems.nbody import nbody
 

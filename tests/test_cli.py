@@ -9,6 +9,7 @@ import sys
 import time
 import warnings
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import matplotlib
@@ -191,7 +192,9 @@ def test_without_rebound_the_command_runs_and_says_what_to_install(tmp_path, cap
 def test_without_matplotlib_the_numbers_are_there(tmp_path, capsys, no_rebound, no_matplotlib):
     assert main(["solar-system", *SPAN, "--out", str(tmp_path), "--json", str(tmp_path / "run.json")]) == 0
     captured = capsys.readouterr()
-    assert 'pip install "eip_scipy[plot]"' in lines(captured.err)[-1]
+    figures, rebound = lines(captured.err)[-2:]
+    assert 'pip install "eip_scipy[plot]"' in figures
+    assert 'pip install "eip_scipy[rebound]"' in rebound
     assert "error of longitude [rad]" in captured.out
     assert {path.name for path in tmp_path.iterdir()} == {"solar-system.csv", "error-against-cost.csv", "run.json"}
 
@@ -244,7 +247,7 @@ def test_a_run_that_is_not_to_be_trusted_is_told(tmp_path, capsys, no_rebound, m
         with pytest.warns(UserWarning, match="doubtful") as shown:
             assert main(command) == 1
     assert [item.category for item in shown] == [UserWarning]
-    assert lines(capsys.readouterr().err)[1:] == ["eip-scipy: EIPRK4 (error): doubtful"]  # after that on REBOUND
+    assert lines(capsys.readouterr().err)[1:] == ["eip-scipy: EIPRK4 (error): doubtful"]  # after the one on REBOUND
     assert json.loads(file.read_text())["trusted"] is False
     assert main(command) == 0
     assert len(lines(capsys.readouterr().err)) == 1
@@ -414,6 +417,16 @@ def test_too_much_memory_is_one_line(tmp_path, capsys, no_rebound, monkeypatch):
 
 
 # --- list, version, entry points ---
+
+
+def test_a_clone_has_its_integrations(tmp_path):
+    """Python finds the folder it is started in first; what is installed lies elsewhere."""
+    root = Path(eip_scipy.__file__).parents[1]
+    for name in ("eip_scipy", "integrations"):
+        (tmp_path / name).symlink_to(root / name)
+    code = "import eip_scipy.integrations.jpl as jpl, eip_scipy; print(eip_scipy.integrations.jpl is jpl, jpl.__file__)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", str(tmp_path / "integrations" / "jpl.py")]
 
 
 def test_list(capsys, tmp_path):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -41,6 +42,14 @@ def test_the_frontier_names_errors_and_times(two_methods, tmp_path, capsys):
     assert rows[0]["setting"] == f"{0.01 * YEAR_D:.4g} d"
     assert len(json.loads((tmp_path / "r.json").read_text())["runs"]) == 3
     assert (tmp_path / "frontier.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", ["rebound", "heyoka"])
+def test_a_missing_peer_is_told_at_the_end(name, two_methods, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, f"eip_scipy.integrations.{name}", None)
+    assert main(["solar-system", "--frontier", "--years", "1", "--out", str(tmp_path)]) == 0
+    captured = capsys.readouterr()
+    assert any(line.startswith("eip-scipy: no comparison with") and name in line for line in captured.err.splitlines())
 
 
 @pytest.mark.parametrize(

@@ -277,6 +277,12 @@ def test_problem_from_simulation_refuses(change, message):
         judge.problem_from_simulation(sim)
 
 
+@pytest.mark.parametrize("given", ["archive.bin", None, np.zeros(12)])
+def test_problem_from_simulation_needs_a_simulation(given):
+    with pytest.raises(TypeError, match=r"got .*; one in an archive is rebound\.Simulation\(path\)"):
+        judge.problem_from_simulation(given)
+
+
 def test_problem_from_simulation_needs_two_bodies():
     with pytest.raises(ValueError, match="0 particles"):
         judge.problem_from_simulation(rebound.Simulation())
