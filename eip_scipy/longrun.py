@@ -581,7 +581,7 @@ class Loop:
         result = self._result(status, message)
         if self.told:
             try:
-                warnings.warn(driver.run.trust.message, ProjectionWarning, stacklevel=3)
+                warnings.warn(f"{self.method}: {driver.run.trust.message}", ProjectionWarning, stacklevel=3)
             except ProjectionWarning as error:
                 error.partial = result  # type: ignore[attr-defined]
                 raise

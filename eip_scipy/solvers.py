@@ -279,7 +279,7 @@ class EIPSolver(OdeSolver):
         self._found = self._work.counters[FOUND]
         if not self._told and run.look(self._k, arrived, self.t, self.y, lambda: self._derivative(self.t, self.y)):
             self._told = True
-            warnings.warn(run.trust.message, ProjectionWarning, stacklevel=5)
+            warnings.warn(f"{type(self).__name__}: {run.trust.message}", ProjectionWarning, stacklevel=5)
 
     def _finish(
         self, rhs: Any, inv: Any, grad: Any, params: Any, t: Any, y: Any, y_r: Any, t_new: Any, project: Any,

@@ -27,6 +27,7 @@ from ..report import (
 from ..result import Diagnostics
 from ..solvers import EIPSolver
 from ..tableaux import Tableau
+from .long_runs import named
 from .solar_system import METRICS, fixed_step_methods
 
 __all__ = ["Bar", "Comparison", "Outcome", "adaptive_methods", "add_arguments", "bars", "compare", "run"]
@@ -176,7 +177,7 @@ def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | No
                 problem.fun,
                 problem.t_span,
                 problem.y0,
-                method=method,
+                method=named(method, f"{method.__name__} on {problem.name}"),
                 rtol=rtol,
                 atol=ATOL_PER_RTOL * rtol,
                 diagnostics=record,

@@ -16,6 +16,7 @@ from ..problems import Problem, kepler
 from ..report import check_outputs, compact, document, say, table, warn, write_csv, write_file, write_json
 from ..solvers import EIPDOP853, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPSolver
 from ..work_precision import Runner, cost_to_reach, work_precision
+from .long_runs import named
 
 __all__ = ["Work", "add_arguments", "measure", "run", "text"]
 
@@ -98,11 +99,13 @@ def measure(repeats: int = REPEATS, callback: Any = None) -> tuple[dict[str, Wor
 
 
 def _fixed(problem: Problem, method: type[EIPSolver], nfev: dict[Any, int], step: float) -> tuple[float, np.ndarray]:
-    return _noted(integrate(problem, method=method, h=step), method, nfev, step)
+    name = f"{method.__name__}, h = {step:.3g}"
+    return _noted(integrate(problem, method=named(method, name), h=step), method, nfev, step)
 
 
 def _adaptive(problem: Problem, method: type[EIPSolver], nfev: dict[Any, int], rtol: float) -> tuple[float, np.ndarray]:
-    return _noted(integrate(problem, method=method, rtol=rtol, atol=1e-3 * rtol), method, nfev, rtol)
+    name = f"{method.__name__}, rtol = {rtol:.0e}"
+    return _noted(integrate(problem, method=named(method, name), rtol=rtol, atol=1e-3 * rtol), method, nfev, rtol)
 
 
 def _noted(result: Any, method: type[EIPSolver], nfev: dict[Any, int], step: float) -> tuple[float, np.ndarray]:

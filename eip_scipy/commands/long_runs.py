@@ -66,7 +66,7 @@ def kept(args: argparse.Namespace, name: str) -> dict[str, Any]:
 
 
 def named(method: type[EIPSolver], name: str) -> type[EIPSolver]:
-    """Put the method under another name, for its progress bar."""
+    """Put the method under another name, for its progress bar and for what is said of the run."""
     return type(name, (method,), {"__doc__": method.__doc__})
 
 

@@ -15,6 +15,7 @@ from ..problems import ParticleProblem, tokamak, uniform_field
 from ..problems.charged_particle import ORBITS
 from ..problems.particle_orbits import ParticleOrbit, radial_range
 from ..solvers import EIPDOP853, EIPRK4, EIPRK5, EIPSolver
+from .long_runs import named
 
 __all__ = ["METHODS", "PAPER_METHODS", "SCENES", "Line", "Study", "scene", "study"]
 
@@ -103,7 +104,8 @@ def scene(name: str, **options: Any) -> ParticleProblem:
 def _eip(method: type[EIPSolver], kept: str, **options: Any) -> Runner:
     def run(problem: ParticleProblem) -> Any:
         chosen = [item for item in problem.invariants if item.name in kept]
-        return integrate(problem, method=method, save_every=1, invariants=chosen, **options)
+        name = f"{method.__name__} keeping {kept or 'nothing'}, {problem.name}"
+        return integrate(problem, method=named(method, name), save_every=1, invariants=chosen, **options)
 
     return run
 

@@ -18,7 +18,8 @@ from scipy.integrate import solve_ivp
 from ..longrun import integrate
 from ..problems import Problem, centre_time, comet, figure_eight, kepler, pair_time, pythagorean, reaches
 from ..problems.time_transformed import time_transformed
-from ..solvers import EIPDOP853, EIPRKN12
+from ..solvers import EIPDOP853, EIPRKN12, EIPSolver
+from .long_runs import named
 
 __all__ = ["SCENES", "Method", "Outcome", "Point", "Scene", "measure", "methods", "scene"]
 
@@ -287,22 +288,27 @@ def _timed(run: Callable[[], Outcome], repeats: int) -> tuple[Outcome, float]:
 
 def _adaptive(problem: Problem, options: dict[str, Any], rtol: float, look: bool) -> Outcome:
     every = 1 if look else None
+    method = _on(problem, EIPDOP853)
     return _outcome(
-        integrate(problem, method=EIPDOP853, rtol=rtol, atol=ATOL_PER_RTOL * rtol, save_every=every, **options)
+        integrate(problem, method=method, rtol=rtol, atol=ATOL_PER_RTOL * rtol, save_every=every, **options)
     )
 
 
 def _fictitious(problem: Problem, end: Callable[..., float], options: dict[str, Any], h: float, look: bool) -> Outcome:
     # Without looking, only the start and the event are saved.
     every = 1 if look else round(FAR)
-    run = _outcome(integrate(problem, method=EIPDOP853, h=h, events=end, save_every=every, **options))
+    run = _outcome(integrate(problem, method=_on(problem, EIPDOP853), h=h, events=end, save_every=every, **options))
     return run._replace(y=run.y[:-1])
 
 
 def _fixed(problem: Problem, h: float, look: bool) -> Outcome:
     t0, t_end = problem.t_span
     every = max(1, round((t_end - t0) / h / MOST_SAVES)) if look else None
-    return _outcome(integrate(problem, method=EIPRKN12, h=h, save_every=every))
+    return _outcome(integrate(problem, method=_on(problem, EIPRKN12), h=h, save_every=every))
+
+
+def _on(problem: Problem, method: type[EIPSolver]) -> type[EIPSolver]:
+    return named(method, f"{method.__name__} on {problem.name}")
 
 
 def _outcome(run: Any) -> Outcome:

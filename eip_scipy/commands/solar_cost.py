@@ -14,6 +14,7 @@ from ..longrun import integrate
 from ..problems.solar_data import YEAR_D
 from ..solvers import EIPRK4, EIPRK5, EIPRKN12, EIPSolver
 from ..work_precision import Runner, work_precision
+from .long_runs import named
 from .solar_run import (
     HIGH_ORDER,
     KEPT,
@@ -188,7 +189,8 @@ def _steps(scene: Scene, wanted: Sequence[float]) -> list[float]:
 
 
 def _time_eip(scene: Scene, method: type[EIPSolver], options: dict[str, Any], step: float) -> tuple[float, np.ndarray]:
-    result = integrate(scene.problem, method=method, h=step, **options)
+    name = f"{method.__name__}, h = {step:.4g} yr"
+    result = integrate(scene.problem, method=named(method, name), h=step, **options)
     return result.wall_time, result.y[:, -1] if result.success else np.full_like(scene.problem.y0, np.nan)
 
 

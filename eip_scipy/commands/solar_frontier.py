@@ -29,6 +29,7 @@ from ..report import (
 )
 from ..solvers import EIPDOP853, EIPRK4, EIPRKN8, EIPRKN12
 from ..work_precision import Runner, cost_to_reach
+from .long_runs import named
 from .solar_cost import MERCURY, TimedRun, by_method, timed
 from .solar_run import KEPT, Judge, whole_number
 
@@ -113,7 +114,8 @@ def _dividing(years: float, wanted: Sequence[float]) -> list[float]:
 def _integrate(
     problem: Problem, years: float, method: Any, options: Mapping[str, Any], step: float
 ) -> tuple[float, np.ndarray]:
-    result = integrate(problem, (0.0, years), method=method, h=step, **options)
+    name = f"{method.__name__}, h = {step:.4g} yr"
+    result = integrate(problem, (0.0, years), method=named(method, name), h=step, **options)
     return result.wall_time, result.y[:, -1] if result.success else np.full(problem.y0.size, np.nan)
 
 
