@@ -240,7 +240,7 @@ def ensemble(
     keep = reduce is None or out is not None
     own = parameters[0] if parameters.shape[1] else None
     task = Task(_bare(fun), t_span, given, starts[0], own, reduce, keep, len(starts))
-    task = _first_that_starts(task, starts, parameters)
+    task, doubts = _first_that_starts(task, starts, parameters)
     plan = Plan(task, compiled=False)
     starts = np.ascontiguousarray(starts, plan.dtype)
     size = _chunk_size(plan, len(starts), fun) if chunk is None else _setup.count("chunk", chunk)
@@ -253,7 +253,7 @@ def ensemble(
     elif checkpoint is not None:
         store = CheckpointStore(checkpoint, plan.identity(starts, parameters, size), checkpoint_every, resume)
     with ended_by_sigterm(store is not None), nullcontext() if store is None else closing(store):
-        gathered = _Gathered(plan, len(starts), held, size, store, callback)
+        gathered = _Gathered(plan, len(starts), held, size, store, callback, doubts)
         result = gathered.run(partial(_pool, executor, task, progress), _chunks(starts, parameters, size), progress)
     doubtful = np.flatnonzero((result.status >= 0) & ~result.trusted)
     if doubtful.size:
@@ -293,8 +293,9 @@ class _Gathered:
         chunk: int,
         store: Store | None,
         callback: Callable[[EnsembleResult], Any] | None,
+        doubts: dict[int, str],
     ) -> None:
-        self.plan, self.chunk, self.store, self.callback = plan, chunk, store, callback
+        self.plan, self.chunk, self.store, self.callback, self.doubts = plan, chunk, store, callback, doubts
         self.method = plan.task.options["method"].__name__
         self.whole = Members.empty(members, plan.size, plan.dtype, len(plan.names), held)
         self.statistics: Statistics | None = None
@@ -373,17 +374,21 @@ class _Gathered:
         trajectories = members.saved.swapaxes(1, 2) if members.saved.shape[1] else None
         if members is self.whole and self.store is not None:
             trajectories = self.store.states
+        trusted, message = members.trusted.copy(), np.array(members.message, dtype=object)
+        for k in range(len(trusted)) if self.doubts else ():
+            if trusted[k] and first + k in self.doubts:
+                trusted[k], message[k] = False, f"{message[k]}; {self.doubts[first + k]}"
         return EnsembleResult(
             y=members.y,
             t=members.t,
             status=members.status,
-            message=np.array(members.message, dtype=object),
+            message=message,
             failed=np.flatnonzero(members.status == FAILED),
             success=bool((members.status >= 0).all()),
             max_defect=members.max_defect,
             max_correction=members.max_correction,
             side_by_side=members.side_by_side,
-            trusted=members.trusted,
+            trusted=trusted,
             names=plan.names,
             nfev=counters[:, NFEV],
             njev=counters[:, NJEV],
@@ -482,17 +487,22 @@ def _not_called(t: float, y: np.ndarray) -> np.ndarray:
     raise NotImplementedError("the problem's compiled right-hand side is in use")
 
 
-def _first_that_starts(task: Task, starts: np.ndarray, params: np.ndarray) -> Task:
-    """The task with a member whose start `integrate` takes; its error where it takes none of some members."""
+def _first_that_starts(task: Task, starts: np.ndarray, params: np.ndarray) -> tuple[Task, dict[int, str]]:
+    """The task with a member whose start `integrate` takes; its error where it takes none of some members.
+
+    Also what the checks of the start found, by member: it holds for all that have the same parameters.
+    """
     first: Exception | None = None
     for k in np.unique(np.linspace(0, len(starts) - 1, TRIED).astype(int)):
         tried = dataclasses.replace(task, y0=starts[k].copy(), params=None if task.params is None else params[k].copy())
         try:
-            tried.loop(tried.y0, tried.params, compiled=False)
+            loop = tried.loop(tried.y0, tried.params, compiled=False)
         except Exception as error:
             first = first or error
         else:
-            return tried
+            found = loop.driver.run.trust.message
+            alike: list[int] = np.flatnonzero((params == params[k]).all(axis=1)).tolist() if found else []
+            return tried, dict.fromkeys(alike, found)
     assert first is not None
     raise first
 

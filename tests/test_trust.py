@@ -378,6 +378,24 @@ def test_members_are_flagged_as_single_runs_are(compiled):
     assert "member 7" in repr(run)
 
 
+@pytest.mark.parametrize("differing", [False, True])
+def test_members_that_the_start_speaks_against(differing):
+    """The start of one member is checked: what it shows holds for those with the same parameters."""
+    energy = Invariant(pendulum_energy, pendulum_gradient, name="energy")
+    friction = np.full((4, 1), 1e-6)
+    friction[2:] *= 1 - differing
+    starts = [[2.0, 0.5], [1.9, 0.5], [2.0, 0.5], [1.9, 0.5]]
+    options = {"method": EIPRK4, "h": 0.05, "invariants": energy, "compiled": False, "params": friction}
+    with (
+        pytest.warns(UserWarning, match="'energy' is no invariant"),
+        pytest.warns(ProjectionWarning, match=f"{2 if differing else 4} of 4 members .* the first of them member 0"),
+    ):
+        run = ensemble(damped, (0, 1), starts, **options)
+    assert run.success
+    assert run.trusted.tolist() == [False, False, differing, differing]
+    assert ["'energy' is no invariant" in text for text in run.message] == (~run.trusted).tolist()
+
+
 def test_project_tells_of_what_it_leaves():
     far = Invariant(lambda t, y: float(y @ y), lambda t, y: 2 * y, target=1.0, name="length")
     with pytest.warns(ProjectionWarning, match="left 'length' off"):

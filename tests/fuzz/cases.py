@@ -328,12 +328,12 @@ def _projection(rng: np.random.Generator, system: System, size: Array, has_estim
     n = size.size
     one_unit = np.ndim(system.unit) == 0
     found: dict[str, Any] = {}
+    weights = rng.uniform(0.2, 1.0, n) / system.unit
     if rng.random() < 0.4:
-        found["metric"] = [
-            "error",
-            "euclidean" if one_unit else "error",
-            rng.uniform(0.2, 1.0, n) / system.unit,
-        ][rng.integers(3)]
+        # The euclidean metric, also the one in the place of a missing estimate, is for components of one unit.
+        found["metric"] = ["error", "euclidean" if one_unit else "error", weights][rng.integers(3)]
+    if not (one_unit or has_estimate):
+        found["metric"] = weights
     if rng.random() < 0.25 and one_unit:
         divisors = [b for b in range(1, n + 1) if n % b == 0]
         lists = np.array_split(rng.permutation(n), rng.integers(1, n + 1))

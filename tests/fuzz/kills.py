@@ -18,93 +18,20 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from functools import cache
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, checkpoint, ensemble, integrate
-from eip_scipy import Invariant as Inv
+from eip_scipy import checkpoint
 
-from . import families
+from .runs import KINDS, SINGLE, kept_in, whole, work
 
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
 LONGEST = 0.9  # seconds from the start of a run to its kill; a whole run takes about as long
 MOST = 4  # kills of one run before it may end
 PATIENCE = 30.0
-OFTEN = 0.02
-ORBIT = families.kepler(np.random.default_rng(5))
-KEPT = [Inv(k.fun, k.grad, name=k.name) for k in ORBIT.kept]
-STARTS = ORBIT.y0 * np.linspace(0.95, 1.05, 30)[:, None]
-
-
-def crossing(t: float, y: np.ndarray) -> float:
-    """An event."""
-    return y[1]
-
-
-def ending(t: float, y: np.ndarray) -> float:
-    """An event that ends a member."""
-    return y[0] - 1e3
-
-
-ending.terminal = True  # type: ignore[attr-defined]
-
-
-def fixed(**options: Any) -> Any:
-    """Fixed steps that save much."""
-    given = {"method": EIPRK4, "h": 0.01, "every": "auto", "invariants": KEPT, "save_every": 5}
-    return integrate(ORBIT.fun, (0, 60), ORBIT.y0, **given | options)
-
-
-def adaptive(**options: Any) -> Any:
-    """Adaptive steps with events and samples."""
-    given = {"method": EIPDOP853, "rtol": 1e-8, "invariants": KEPT, "events": crossing}
-    return integrate(ORBIT.fun, (0, 120), ORBIT.y0, t_eval=np.arange(0, 120, 0.5), **given | options)
-
-
-def nystrom(**options: Any) -> Any:
-    """Compensated steps that are projected now and then."""
-    given = {"method": EIPRKN12, "h": 0.05, "every": 7, "compensated": True, "invariants": KEPT, "save_every": 10}
-    return integrate(ORBIT.acc, (0, 200), ORBIT.y0, **given | options)
-
-
-def members(**options: Any) -> Any:
-    """An ensemble, a few members at a time."""
-    given = {"method": EIPRK4, "h": 0.02, "invariants": KEPT, "chunk": 2, "save_every": 20, "reduce": "state"}
-    return ensemble(ORBIT.fun, (0, 3), STARTS, **given | options)
-
-
-def trajectories(**options: Any) -> Any:
-    """An ensemble that writes to a Zarr group."""
-    given = {"method": EIPRK4, "rtol": 1e-6, "invariants": KEPT, "chunk": 2, "events": ending}
-    return ensemble(ORBIT.fun, (0, 3), STARTS, t_eval=[0.0, 1.0, 2.5], **given | options)
-
-
-SINGLE = {run.__name__: run for run in (fixed, adaptive, nystrom)}
-KINDS: dict[str, Callable[..., Any]] = SINGLE | {run.__name__: run for run in (members, trajectories)}
-
-
-def kept_in(kind: str, path: Path) -> dict[str, Any]:
-    """The options that keep a run of that kind in `path`."""
-    if kind == "trajectories":
-        return {"out": path, "resume": True, "compiled": False}
-    return {"checkpoint": path, "checkpoint_every": OFTEN, "resume": True, "compiled": False}
-
-
-def work(kind: str, path: Path) -> None:
-    """What runs in the process that is killed."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # Ctrl-C prints where it came
-    KINDS[kind](**kept_in(kind, path))
-
-
-@cache
-def whole(kind: str) -> Any:
-    """The run that nobody kills."""
-    return KINDS[kind](compiled=False)
 
 
 def differences(kind: str, run: Any) -> Iterator[str]:

@@ -35,7 +35,7 @@ FACTOR = 1e3
 # Errors of the true states and rounding, in units of what the motion makes of a small change.
 FLOOR = 1e-10
 DIFFERENCES = "has no grad and allows no complex step"
-NO_INVARIANT = "is no invariant of this system"
+NO_INVARIANT, WRONG_GRADIENT = "is no invariant of this system", "gradient of invariant"
 CLOCK_STEP = 0.3  # seconds
 MOST_BREAKS = 3
 
@@ -325,10 +325,14 @@ def members(runs: Runs, **options: Any) -> Iterator[str]:
     given = {**case.options, "t_eval": case.times, **options}
     run, _ = observed(lambda: ensemble(case.fun, case.t_span, starts, **given))
     alone = runs.whole
-    end = alone.t[-1], alone.status, alone.message.split(" (")[0], alone.trusted
-    found = run.t[1], run.status[1], run.message[1].split(" (")[0], run.trusted[1]
+    end = alone.t[-1], alone.status, alone.message.split(" (")[0]
+    found = run.t[1], run.status[1], run.message[1].split(" (")[0]
     if found != end or not same(run.y[1], alone.y[:, -1]):
         yield f"the last member: {found}, {run.y[1]}; alone: {end}, {alone.y[:, -1]}"
+    # Checks after the start are made in single runs only.
+    later = not alone.trusted and any(text in alone.message for text in (NO_INVARIANT, WRONG_GRADIENT))
+    if run.trusted[1] != alone.trusted and not (later and run.trusted[1]):
+        yield f"the last member: trusted is {run.trusted[1]}, {run.message[1]!r}; alone: {alone.message!r}"
     if alone.status == 0 and not case.events and not same(run.trajectories[1], runs.sampled.y):
         yield "other trajectories"
 

@@ -5,7 +5,7 @@ import zarr  # noqa: F401
 
 tqdm.tqdm.monitor_interval = 0  # no thread: it would be lost by a fork, with what it holds
 
-from . import kills  # noqa: E402
+from . import runs  # noqa: E402
 
-for kind in kills.SINGLE:
-    kills.whole(kind)
+for kind in runs.SINGLE:
+    runs.whole(kind)
