@@ -2,12 +2,16 @@
 
 Arrays are copied by loops: these wrappers are compiled in every process, and a slice assignment alone takes Numba more
 than a second.
+
+The state, and f where a gradient takes it, are the driver's own buffers. They are handed on as arrays that cannot be
+written to; a function that does write to them, which does not compile then, gets copies, as in interpreted runs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
+from math import nan
 from types import FunctionType
 from typing import Any, NamedTuple
 
@@ -21,7 +25,19 @@ from .invariants import Invariant, InvariantSet
 
 WRONG_FUN = "fun returned an array of another shape than at the start"
 
-__all__ = ["CompiledFunctions", "NotCompilableError", "compile_functions", "signatures", "with_inlined"]
+__all__ = [
+    "ChangedShapeError",
+    "CompiledFunctions",
+    "Handed",
+    "NotCompilableError",
+    "compile_functions",
+    "signatures",
+    "with_inlined",
+]
+
+
+class ChangedShapeError(ValueError):
+    """A compiled function returned an array of another shape than at the start."""
 
 
 class NotCompilableError(TypeError):
@@ -60,20 +76,22 @@ def signatures(dtype: np.dtype) -> Signatures:
     """Signatures of rhs, inv and grad for states of `dtype`."""
     real, scalar = types.float64, from_dtype(np.dtype(dtype))
     state, rows, floats = scalar[::1], scalar[:, ::1], real[::1]
+    given = state.copy(readonly=True)
     return Signatures(
-        rhs=types.void(real, state, state, floats),
-        inv=types.void(real, state, floats, floats),
-        grad=types.void(real, state, state, rows, floats),
+        rhs=types.void(real, given, state, floats),
+        inv=types.void(real, given, floats, floats),
+        grad=types.void(real, given, given, rows, floats),
     )
 
 
 def signatures_of_octets() -> Signatures:
     """The same for the members of an octet."""
     real, state, rows = types.float64, *(types.Array(OCTET, ndim, "A", aligned=False) for ndim in (1, 2))
+    given = state.copy(readonly=True)
     return Signatures(
-        rhs=types.void(real, state, state, state),
-        inv=types.void(real, state, state, state),
-        grad=types.void(real, state, state, rows, state),
+        rhs=types.void(real, given, state, state),
+        inv=types.void(real, given, state, state),
+        grad=types.void(real, given, given, rows, state),
     )
 
 
@@ -85,6 +103,42 @@ def signatures_of_batches() -> Signatures:
         inv=types.void(real, lanes, lanes, lanes),
         grad=types.void(real, lanes, lanes, rows, lanes),
     )
+
+
+class Handed:
+    """A user's jitted function as Python calls it: on arrays that it cannot write to, as compiled runs call it.
+
+    So that one version of it is compiled, not two. Where it writes to them it gets them writable, as do interpreted
+    runs, whose calls take less time then, once `read_only` is False.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(t, y, ...)``.
+    arrays : int
+        How many of the arguments after t: the state, and f where a gradient takes it.
+    """
+
+    __slots__ = ("_arrays", "_fun", "read_only")
+
+    def __init__(self, fun: Callable[..., Any], arrays: int) -> None:
+        self._fun, self._arrays, self.read_only = fun, arrays, True
+
+    def __call__(self, t: float, *arguments: Any) -> Any:
+        """The function's value."""
+        if self.read_only:
+            given = (_read_only(a) for a in arguments[: self._arrays])
+            try:
+                return self._fun(t, *given, *arguments[self._arrays :])
+            except NumbaError:
+                self.read_only = False
+        return self._fun(t, *arguments)
+
+
+def _read_only(a: np.ndarray) -> np.ndarray:
+    a = a[:]
+    a.flags.writeable = False
+    return a
 
 
 def compile_functions(
@@ -147,16 +201,17 @@ def _compile_parts(
     sigs: Signatures,
 ) -> CompiledFunctions:
     """The wrappers of the same functions are compiled once in a process."""
-    rhs = _compiled(WRAPPERS[form](fun, has_params), sigs.rhs, "fun")
+    rhs = _compiled(lambda f: WRAPPERS[form](f, has_params), fun, sigs.rhs, "fun")
     inv, grad = _no_values, _no_gradients
     for part in parts:
-        inv = _compiled(_chain_value(inv, part, has_params), sigs.inv, f"invariant {part.label!r}")
-        gradient = _chain_gradient(grad, _wrap_gradient(part, has_params), part)
-        grad = _compiled(gradient, sigs.grad, f"gradient of invariant {part.label!r}")
+        chain = partial(_chain_value, inv, part, has_params)
+        inv = _compiled(chain, part.fun, sigs.inv, f"invariant {part.label!r}")
+        chain = partial(_chain_gradient, grad, part, has_params)
+        grad = _compiled(chain, part.grad, sigs.grad, f"gradient of invariant {part.label!r}", part.uses_f)
     event = _no_values
     for k, function in enumerate(events):
         one = _Part(function, function, f"event {k}", True, k, k + 1, False, False)
-        event = _compiled(_chain_value(event, one, has_params), sigs.inv, f"event {k}")
+        event = _compiled(partial(_chain_value, event, one, has_params), function, sigs.inv, f"event {k}")
     return CompiledFunctions(rhs, inv, grad, event)
 
 
@@ -182,9 +237,9 @@ def _for_batches(one: CompiledFunctions) -> CompiledFunctions:
 
     sigs = signatures_of_batches()
     return CompiledFunctions(
-        _compiled(all_rhs, sigs.rhs, "fun"),
-        _compiled(all_inv, sigs.inv, "an invariant"),
-        _compiled(all_grad, sigs.grad, "a gradient"),
+        _compile(all_rhs, sigs.rhs),
+        _compile(all_inv, sigs.inv),
+        _compile(all_grad, sigs.grad),
         event,
     )
 
@@ -203,13 +258,35 @@ def _invariant_functions(item: Invariant, label: str) -> tuple[Callable[..., Any
     return _jitted(item.fun, f"invariant {label!r}"), _jitted(item.grad, f"gradient of invariant {label!r}")
 
 
-def _compiled(wrapper: Any, signature: Any, name: str) -> Any:
+def _compiled(
+    make: Callable[[Any], Any], fun: Any, signature: Any, name: str, takes_f: bool = False
+) -> Callable[..., None]:
+    """The wrapper that `make` puts around a user's function, compiled: around one that copies first, if need be."""
     try:
-        wrapper.compile(signature.args)
-    except NumbaError as error:
-        first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        raise NotCompilableError(f"{name} does not compile for this state: {first}") from error
+        wrapper = _compile(make(fun), signature)
+    except NumbaError:
+        try:
+            wrapper = _compile(make(_with_copies(fun, takes_f)), signature)
+        except NumbaError as error:
+            first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+            raise NotCompilableError(f"{name} does not compile for this state: {first}") from error
+    if any(isinstance(known.return_type, types.Optional) for known in fun.nopython_signatures):
+        raise NotCompilableError(f"{name} returns None in some places, and a number or an array in others")
     return wrapper
+
+
+def _compile(wrapper: Any, signature: Any) -> Any:
+    """A wrapper for this signature only: others' arguments are converted to it."""
+    wrapper.compile(signature.args)
+    wrapper.disable_compile()
+    return wrapper
+
+
+def _with_copies(fun: Any, takes_f: bool) -> Any:
+    """A user's function that writes to the state, or to f, on copies of them."""
+    if takes_f:
+        return njit(lambda t, y, f, *rest: fun(t, y.copy(), f.copy(), *rest))
+    return njit(lambda t, y, *rest: fun(t, y.copy(), *rest))
 
 
 def _wrap_value(fun: Any, has_params: bool) -> Any:
@@ -222,8 +299,20 @@ def _wrap_value(fun: Any, has_params: bool) -> Any:
 def _wrap_in_place(fun: Any, has_params: bool) -> Any:
     """From fun(t, y, out[, params])."""
     if has_params:
-        return fun
-    return njit(lambda t, y, out, params: fun(t, y, out))
+
+        @njit
+        def rhs(t, y, out, params):
+            _clear(out)
+            fun(t, y, out, params)
+
+    else:
+
+        @njit
+        def rhs(t, y, out, params):
+            _clear(out)
+            fun(t, y, out)
+
+    return rhs
 
 
 def _wrap_acceleration(fun: Any, has_params: bool) -> Any:
@@ -236,10 +325,23 @@ def _wrap_acceleration_in_place(fun: Any, has_params: bool) -> Any:
     return njit(_second_order(_wrap_in_place(fun, has_params)))
 
 
+@njit(cache=True)
+def _clear(out):
+    """Where a function in place leaves a part as it was, NaN ends the run: not the value of another call."""
+    for i in range(out.size):
+        out[i] = nan
+
+
+@njit(cache=True)
+def _clear_rows(out):
+    for row in out:
+        _clear(row)
+
+
 @njit
 def _fill(out, f):
     if f.size != out.size:
-        raise ValueError(WRONG_FUN)
+        raise ChangedShapeError(WRONG_FUN)
     for i in range(out.size):
         out[i] = f[i]
 
@@ -272,9 +374,9 @@ def _no_gradients(t, y, f, G, params):
     pass
 
 
-def _chain_value(before: Any, part: _Part, has_params: bool) -> Any:
-    """`before`, then the values of one more invariant."""
-    fun, start, stop, scalar = part.fun, part.start, part.stop, part.scalar
+def _chain_value(before: Any, part: _Part, has_params: bool, fun: Any) -> Any:
+    """`before`, then the values of one more invariant, by the function `fun`."""
+    start, stop, scalar = part.start, part.stop, part.scalar
     wrong = f"invariant {part.label!r} returned an array of another shape than at the start"
     if scalar and has_params:
 
@@ -297,7 +399,7 @@ def _chain_value(before: Any, part: _Part, has_params: bool) -> Any:
             before(t, y, values, params)
             found = fun(t, y, params)
             if len(found) != stop - start:
-                raise ValueError(wrong)
+                raise ChangedShapeError(wrong)
             for i in range(stop - start):
                 values[start + i] = found[i]
 
@@ -308,7 +410,7 @@ def _chain_value(before: Any, part: _Part, has_params: bool) -> Any:
             before(t, y, values, params)
             found = fun(t, y)
             if len(found) != stop - start:
-                raise ValueError(wrong)
+                raise ChangedShapeError(wrong)
             for i in range(stop - start):
                 values[start + i] = found[i]
 
@@ -335,15 +437,17 @@ def _wrap_gradient(part: _Part, has_params: bool) -> Any:
     return njit(lambda t, y, f, params: grad(t, y))
 
 
-def _chain_gradient(before: Any, gradient: Any, part: _Part) -> Any:
-    """`before`, then the gradient of one more invariant in its row or rows."""
+def _chain_gradient(before: Any, part: _Part, has_params: bool, given: Any) -> Any:
+    """`before`, then the gradient of one more invariant, by the function `given`, in its row or rows."""
     start, stop, rows = part.start, part.stop, part.stop - part.start
+    gradient = _wrap_gradient(part._replace(grad=given), has_params)
     wrong = f"gradient of invariant {part.label!r} has another shape than at the start"
     if part.in_place and not part.scalar:
 
         @njit
         def grad(t, y, f, G, params):
             before(t, y, f, G, params)
+            _clear_rows(G[start:stop])
             gradient(t, y, f, G[start:stop], params)
 
     elif part.in_place:
@@ -351,6 +455,7 @@ def _chain_gradient(before: Any, gradient: Any, part: _Part) -> Any:
         @njit
         def grad(t, y, f, G, params):
             before(t, y, f, G, params)
+            _clear(G[start])
             gradient(t, y, f, G[start], params)
 
     elif not part.scalar:
@@ -360,7 +465,7 @@ def _chain_gradient(before: Any, gradient: Any, part: _Part) -> Any:
             before(t, y, f, G, params)
             found = gradient(t, y, f, params)
             if found.shape[0] != rows or found.shape[1] != G.shape[1]:
-                raise ValueError(wrong)
+                raise ChangedShapeError(wrong)
             for i in range(rows):
                 for j in range(G.shape[1]):
                     G[start + i, j] = found[i, j]
@@ -372,7 +477,7 @@ def _chain_gradient(before: Any, gradient: Any, part: _Part) -> Any:
             before(t, y, f, G, params)
             found = gradient(t, y, f, params)
             if found.size != G.shape[1]:
-                raise ValueError(wrong)
+                raise ChangedShapeError(wrong)
             for j in range(G.shape[1]):
                 G[start, j] = found[j]
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from scipy.integrate import DenseOutput
 from scipy.optimize import brentq
 
+from ._inputs import is_number, reals, refuse_units, require_arguments, shown
 from ._kernels import EPS
+from .invariants import as_it_is
 
 __all__ = ["Events"]
 
@@ -25,23 +27,23 @@ class Events:
         the run ends) and ``direction`` of SciPy's `solve_ivp`.
     extra : tuple
         ``(params,)`` or nothing.
+    hand : callable
+        Makes of an event, and the number of its arrays that are ours, what is called.
 
     Raises
     ------
     TypeError
         When an event is not callable.
     ValueError
-        When ``terminal`` is no number of times.
+        When ``terminal`` is no number of times, or ``direction`` no number.
     """
 
-    def __init__(self, events: Any, extra: tuple = ()) -> None:
-        items: Sequence[Any] = () if events is None else (events,) if callable(events) else tuple(events)
-        for item in items:
-            if not callable(item):
-                raise TypeError(f"events must be callable, got {item!r}.")
+    def __init__(self, events: Any, extra: tuple = (), hand: Any = as_it_is) -> None:
+        items = _as_events(events)
         self.functions: list[Callable[..., Any]] = list(items)
+        self._called = [hand(item, 1) for item in items]
         self._extra = extra
-        self.directions = np.array([float(getattr(item, "direction", 0)) for item in items])
+        self.directions = np.array([_direction(getattr(item, "direction", 0)) for item in items])
         self._allowed = [_allowed(getattr(item, "terminal", None)) for item in items]
         self._counts = [0] * len(items)
         self.t: list[list[float]] = [[] for _ in items]
@@ -64,9 +66,8 @@ class Events:
 
     def fill(self, t: float, y: np.ndarray, values: np.ndarray, params: Any = None) -> None:
         """Values of all events."""
-        y = y.copy()
-        for k, function in enumerate(self.functions):
-            values[k] = function(t, y, *self._extra)
+        for k in range(len(self.functions)):
+            values[k] = self._value(k, t, y.copy())
 
     def handle(self, old: np.ndarray, new: np.ndarray, sol: DenseOutput) -> float | None:
         """Locate the events between the ends of a step; returns the time at which the run ends, if it does."""
@@ -85,16 +86,62 @@ class Events:
         return None
 
     def _root(self, k: int, sol: DenseOutput) -> float:
-        function = self.functions[k]
-        return float(brentq(lambda t: function(t, sol(t), *self._extra), sol.t_old, sol.t, xtol=4 * EPS, rtol=4 * EPS))
+        return float(brentq(lambda t: self._value(k, t, sol(t)), sol.t_old, sol.t, xtol=4 * EPS, rtol=4 * EPS))
+
+    def _value(self, k: int, t: float, y: np.ndarray) -> float:
+        """Event k at (t, y), which it may keep or overwrite."""
+        try:
+            value = self._called[k](t, y, *self._extra)
+        except TypeError:
+            given, mend = ("t", "y", *("params" for _ in self._extra)), "It takes params if the run has them."
+            require_arguments(self.functions[k], given, f"event {k}", mend)
+            raise
+        if isinstance(value, float):
+            return value
+        refuse_units(**{f"event {k} returned": value})
+        found = reals(value)
+        if found is None or found.ndim:
+            raise TypeError(f"event {k} returned {shown(value)} at t={t:.10g}, expected a real number.")
+        return float(found)
+
+
+def _as_events(events: Any) -> tuple[Callable[..., Any], ...]:
+    """One event or a sequence of them, as a tuple.
+
+    Raises
+    ------
+    TypeError
+        For anything else.
+    """
+    if events is None or callable(events):
+        return () if events is None else (events,)
+    try:
+        items = tuple(events)
+    except TypeError:
+        raise TypeError(f"events must be callable, or a sequence of callables, got {shown(events)}.") from None
+    for item in items:
+        if not callable(item):
+            raise TypeError(f"events must be callable, got {shown(item)}.")
+    return items
+
+
+def _direction(direction: Any) -> float:
+    """The sign that an event's change must have, 0 for both."""
+    if not (is_number(direction) or isinstance(direction, (bool, np.bool_))) or math.isnan(direction):
+        raise ValueError(
+            f"The `direction` attribute of each event must be a number: positive, negative or 0, got "
+            f"{shown(direction)}."
+        )
+    return float(direction)
 
 
 def _allowed(terminal: Any) -> float:
     """How many times an event may happen before it ends the run."""
-    if terminal is None or terminal is False or terminal == 0:
+    if terminal is None:
         return math.inf
-    if not isinstance(terminal, (bool, np.bool_, int, np.integer)) or terminal < 0:
+    known = isinstance(terminal, (bool, np.bool_)) or (is_number(terminal) and float(terminal).is_integer())
+    if not known or terminal < 0:
         raise ValueError(
-            f"The `terminal` attribute of each event must be a boolean or positive integer, got {terminal!r}."
+            f"The `terminal` attribute of each event must be a boolean or positive integer, got {shown(terminal)}."
         )
-    return float(int(terminal))
+    return float(terminal) if terminal else math.inf

@@ -21,7 +21,7 @@ from numba import njit, typeof, types
 
 from . import _kernels as kn
 from . import _setup
-from ._compile import NotCompilableError, signatures
+from ._compile import ChangedShapeError, NotCompilableError, signatures
 from ._kernels import OK
 from ._resume import Keeper, settings
 from ._setup import Stepping
@@ -495,6 +495,9 @@ class _Driver:
             reason, code = None, OK
             try:
                 code = self._sweep(last, each, out)
+            except ChangedShapeError as error:
+                driver.place(error)
+                reason = _reason(error)
             except Exception as error:
                 reason = _reason(error)
             done = int(where[0])

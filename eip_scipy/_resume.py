@@ -15,9 +15,10 @@ import numpy as np
 
 from . import checkpoint
 from ._events import Events
+from ._inputs import is_number
 from ._interrupts import TerminatedError
 from ._own_file import OwnFile, unlocked
-from ._setup import DIRECTIONS, Run, Stepping, is_number
+from ._setup import DIRECTIONS, Run, Stepping
 from ._step import AUTO, ERROR, EUCLIDEAN, H_ABS, T
 from .checkpoint import CheckpointError
 

@@ -13,6 +13,7 @@ from scipy.integrate import OdeSolver
 from scipy.linalg import block_diag
 
 from . import _kernels as kn
+from ._inputs import count, flag, is_number, real_array, reals, refuse_units, shown
 from ._kernels import BAND, BAND_COMPENSATED, EPS, NOT_FINITE, FrameRows, Grouping
 from ._step import (
     AUTO,
@@ -34,7 +35,7 @@ from ._step import (
     project_step,
 )
 from ._trust import LARGE_SHARE, Trust
-from .invariants import InvariantSet, JointInvariants
+from .invariants import InvariantSet, JointInvariants, as_it_is
 from .nystrom import NystromTableau
 from .one_step import OneStep, as_vector
 from .result import LAST_RANK, Diagnostics
@@ -51,6 +52,7 @@ START_ITERATIONS = 50
 LOOKS = (10, 100)
 UNBOUNDED = 2**62
 LEAST_RTOL = 100 * EPS  # SciPy's
+MOST_ITERATIONS = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,19 +88,35 @@ class Stepping:
         f0: np.ndarray,
         tableau: AnyMethod,
     ) -> float:
-        """Length of the first step."""
+        """Length of the first step.
+
+        Raises
+        ------
+        ValueError
+            When it is to be estimated and the error of a component has no scale.
+        """
         if self.h is not None:
             return self.h
         if self.first_step is not None:
             return self.first_step
+        self.require_scale(y0)
         t0, t_bound, max_step = self.span.t0, self.span.t_bound, self.span.max_step
         order = tableau.error_estimator_order or 0
         return initial_step(rhs, t0, y0, t_bound, max_step, f0, order, self.rtol, self.atol)
 
+    def require_scale(self, y0: np.ndarray) -> None:
+        """Refuse tolerances that leave the error of a component at the start without a scale."""
+        none = np.flatnonzero(self.atol + self.rtol * np.abs(y0) == 0)
+        if none.size:
+            raise ValueError(
+                f"the tolerances of component {none[0]} are 0: y0 is 0 there, and so is `atol`. Its error has no "
+                "scale; give atol > 0, or a fixed step h."
+            )
+
 
 @dataclass
 class Run:
-    """All that a driver needs besides the user's functions."""
+    """All that a driver needs besides the user's functions; `in_place` says what the right-hand side is."""
 
     y0: np.ndarray
     method: Method | OneStep
@@ -109,6 +127,7 @@ class Run:
     trust: Trust
     check: bool
     tau: float
+    in_place: bool = False
 
     def look(self, steps: int, ended: bool, t: float, y: np.ndarray, derivative: Callable[[], np.ndarray]) -> bool:
         """Look at a run after so many steps, or where it ends: whether something speaks against it, to be said now.
@@ -143,24 +162,64 @@ class Counted:
         return self._rhs(t, y).copy()
 
 
-def as_derivative(value: Any, n: int, dtype: np.dtype) -> np.ndarray:
-    """The value of a user's right-hand side as an array (n,), or an error; see `as_vector`."""
-    return as_vector(value, n, dtype, "fun returned")
+def as_derivative(value: Any, n: int, dtype: np.dtype, t: float) -> np.ndarray:
+    """The value of a user's right-hand side at t as an array (n,), or an error; see `as_vector`."""
+    return as_vector(value, n, dtype, "fun returned", t)
 
 
-def initial_state(y0: Any) -> np.ndarray:
+def initial_state(y0: Any, name: str = "y0") -> np.ndarray:
     """y0 as a new float64 or complex128 array (n,), with SciPy's messages for what is no state."""
-    if np.ma.isMaskedArray(y0) and np.ma.is_masked(y0):
-        raise ValueError("masked values in y0; fill or drop them first.")
-    y = np.asarray(y0)
-    if y.dtype.kind not in "fiubc":
-        raise TypeError(f"`y0` must hold numbers, got dtype {y.dtype}.")
-    y = np.array(y, dtype=complex if y.dtype.kind == "c" else float, order="C")
+    y = states(name, y0)
     if y.ndim != 1:
-        raise ValueError("`y0` must be 1-dimensional.")
+        raise ValueError(f"`{name}` must be 1-dimensional.")
     if not np.isfinite(y).all():
-        raise ValueError("All components of the initial state `y0` must be finite.")
+        raise ValueError(f"All components of the initial state `{name}` must be finite.")
     return y
+
+
+def states(name: str, value: Any) -> np.ndarray:
+    """A state, or several, as a new float64 or complex128 array of any shape.
+
+    Raises
+    ------
+    TypeError
+        For what holds no numbers, or numbers with a unit.
+    ValueError
+        For masked values.
+    """
+    refuse_units(**{name: value})
+    if np.ma.isMaskedArray(value) and np.ma.is_masked(value):
+        raise ValueError(f"masked values in {name}; fill or drop them first.")
+    found = reals(value)
+    if found is not None:
+        return found
+    try:
+        y = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        raise ValueError(f"`{name}` must be an array of numbers, got {shown(value)}.") from None
+    if y.dtype.kind != "c":
+        raise TypeError(f"`{name}` must hold numbers, got {shown(value)}, dtype {y.dtype}.")
+    return np.array(y, dtype=complex, order="C")
+
+
+def interval(t_span: Any) -> tuple[float, float]:
+    """Start and end of an interval, whose end may be infinite.
+
+    Raises
+    ------
+    TypeError
+        For values with a unit, and dates.
+    ValueError
+        For what are not two real numbers, NaN, and an infinite start.
+    """
+    refuse_units(t_span=t_span)
+    ends = reals(t_span)
+    if ends is None or ends.shape != (2,):
+        raise ValueError(f"t_span must hold two numbers, got {shown(t_span)}.")
+    t0, t_bound = ends.tolist()
+    if not math.isfinite(t0) or math.isnan(t_bound):
+        raise ValueError(f"t_span must be finite, got {shown(t_span)}; only its end may be infinite.")
+    return t0, t_bound
 
 
 def check_halves(n: int) -> None:
@@ -201,26 +260,28 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
 
     Raises
     ------
+    TypeError
+        For values with a unit.
     ValueError
-        For NaN, negative values or a wrong shape.
+        For NaN, infinite or negative values or a wrong shape.
     """
+    refuse_units(rtol=rtol, atol=atol)
     out = []
     for name, value in (("rtol", rtol), ("atol", atol)):
-        try:
-            a = np.asarray(value, dtype=float)
-        except (TypeError, ValueError):
-            raise ValueError(f"`{name}` must be a number or an array of {n} numbers. Got {value!r}.") from None
+        a = reals(value)
+        if a is None:
+            raise ValueError(f"`{name}` must be a number or an array of {n} numbers. Got {shown(value)}.")
         if a.ndim > 0 and a.shape != (n,):
             raise ValueError(f"`{name}` has wrong shape. It has {a.shape}, the state ({n},).")
         if not np.all(a >= 0):
-            raise ValueError(f"`{name}` must be positive. Got {value!r}.")
+            raise ValueError(f"`{name}` must be positive. Got {shown(value)}.")
+        if not np.all(np.isfinite(a)):
+            raise ValueError(
+                f"`{name}` must be finite. Got {shown(value)}; a large number such as 1e30 leaves a component out of "
+                "the step control."
+            )
         out.append(np.array(np.broadcast_to(a, (n,)), order="C"))
     return out[0], out[1]
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value is a real number (no bool, no array)."""
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
 
 
 def check_fixed_step(h: Any, t0: float, t_bound: float) -> float:
@@ -228,11 +289,14 @@ def check_fixed_step(h: Any, t0: float, t_bound: float) -> float:
 
     Raises
     ------
+    TypeError
+        When it has a unit.
     ValueError
         When it is no positive number, longer than the interval, or below ten spacings of t.
     """
+    refuse_units(h=h)
     if not is_number(h) or not 0 < h < math.inf:
-        raise ValueError(f"`h` must be positive. Got {h!r}.")
+        raise ValueError(f"`h` must be positive. Got {shown(h)}; give a real number > 0.")
     h = float(h)
     span = abs(t_bound - t0)
     if span == 0:
@@ -269,12 +333,13 @@ def fixed_steps(h: float, t0: float, t_bound: float) -> int:
 
 def step_bounds(first_step: Any, max_step: Any, t0: float, t_bound: float) -> tuple[float | None, float]:
     """first_step and max_step, with SciPy's messages for what they must not be."""
-    if not isinstance(max_step, (int, float, np.integer, np.floating)) or not max_step > 0:
-        raise ValueError(f"`max_step` must be positive. Got {max_step!r}.")
+    refuse_units(first_step=first_step, max_step=max_step)
+    if not is_number(max_step) or not max_step > 0:
+        raise ValueError(f"`max_step` must be positive. Got {shown(max_step)}; give a real number > 0.")
     if first_step is None:
         return None, float(max_step)
     if not is_number(first_step) or not first_step > 0:
-        raise ValueError(f"`first_step` must be positive. Got {first_step!r}.")
+        raise ValueError(f"`first_step` must be positive. Got {shown(first_step)}; give a real number > 0.")
     if first_step > abs(t_bound - t0):
         raise ValueError(
             f"`first_step` exceeds bounds. Got {first_step:g} for an interval of length {abs(t_bound - t0):g}."
@@ -305,7 +370,10 @@ def stepping(
         has no error estimate.
     """
     if h is None and not tableau.has_estimate:
-        raise ValueError(f"{name} has no error estimate and needs the step h=...")
+        raise ValueError(
+            f"{name} has no error estimate and needs the step h=...: without it, and where rtol, atol, first_step or "
+            "max_step ask for them, steps are adaptive."
+        )
     if h is not None and (first_step is not None or max_step != np.inf):
         raise ValueError(
             "h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other."
@@ -359,13 +427,6 @@ def initial_step(
     return min(100 * h0, h1, length, max_step)
 
 
-def count(name: str, value: Any) -> int:
-    """An integer option >= 1."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"{name} must be an integer >= 1, got {value!r}.")
-    return int(value)
-
-
 def _every(value: Any, tableau: AnyMethod) -> int:
     if not isinstance(value, str):
         return count("every", value)
@@ -374,12 +435,6 @@ def _every(value: Any, tableau: AnyMethod) -> int:
     if not tableau.has_estimate:
         raise ValueError(f"every='auto' needs an error estimate, and {tableau.name} has none; give an integer.")
     return AUTO
-
-
-def _flag(name: str, value: Any) -> bool:
-    if not isinstance(value, (bool, np.bool_)):
-        raise ValueError(f"{name} must be True or False, got {value!r}.")
-    return bool(value)
 
 
 def _metric(metric: Any, tableau: AnyMethod, n: int, width: int) -> tuple[int, np.ndarray | None]:
@@ -395,7 +450,7 @@ def _metric(metric: Any, tableau: AnyMethod, n: int, width: int) -> tuple[int, n
 
 
 def weights(name: str, sigma: Any, n: int) -> np.ndarray:
-    a = np.asarray(sigma, dtype=float)
+    a = real_array(name, sigma)
     if a.shape != (n,):
         raise ValueError(f"{name}: weights have shape {a.shape}, the state has {n} components.")
     if not np.all(np.isfinite(a)) or np.any(a < 0) or not np.any(a > 0):
@@ -404,6 +459,7 @@ def weights(name: str, sigma: Any, n: int) -> np.ndarray:
 
 
 def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
+    refuse_units(blocks=blocks)
     if blocks is None:
         return _consecutive(1, n, width)
     if isinstance(blocks, (int, np.integer)) and not isinstance(blocks, bool):
@@ -429,12 +485,12 @@ def _consecutive(size: int, n: int, width: int) -> Grouping:
 def _block_lists(blocks: Any, n: int) -> list[np.ndarray]:
     try:
         groups = [np.atleast_1d(np.asarray(b)) for b in blocks]
-    except TypeError:
-        raise ValueError(f"blocks must be an integer or a sequence of index arrays, got {blocks!r}.") from None
+    except (TypeError, ValueError):
+        raise ValueError(f"blocks must be an integer or a sequence of index arrays, got {shown(blocks)}.") from None
     groups = [g for g in groups if g.size]
     for g in groups:
         if g.dtype.kind not in "iu" or g.ndim != 1 or g.min() < 0 or g.max() >= n:
-            raise ValueError(f"blocks: {g!r} is no array of indices from 0 to {n - 1}.")
+            raise ValueError(f"blocks: {shown(g)} is no array of indices from 0 to {n - 1}.")
     used = np.concatenate([*groups, np.array([], dtype=int)]).astype(int)
     if np.unique(used).size != used.size:
         raise ValueError("blocks: a component stands in two blocks.")
@@ -461,6 +517,7 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
 
 
 def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    refuse_units(frame=frame)
     try:
         C, S = (np.atleast_2d(np.asarray(a)) for a in frame)
     except (TypeError, ValueError):
@@ -569,6 +626,7 @@ def prepare(
     extra: tuple = (),
     compensated: bool = False,
     check_start: bool = True,
+    hand: Any = as_it_is,
 ) -> Run:
     """Validate a run's options and make its buffers; the invariants are checked at the start.
 
@@ -588,6 +646,8 @@ def prepare(
     compensated : bool
     check_start : bool
         False: the invariants have been checked at the start of another run like this.
+    hand : callable
+        See `InvariantSet`.
     """
     if compensated and isinstance(tableau, OneStep):
         raise ValueError(f"compensated=True carries the rounding of a tableau's sums; {tableau.name} is no tableau.")
@@ -597,7 +657,7 @@ def prepare(
         raise ValueError(f"direction must be 'new', 'old' or 'midpoint', got {projection.direction!r}.")
     rtol, atol = stepping.rtol, stepping.atol
     groups = blocks_of(projection.blocks, n, width)
-    invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra)
+    invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra, hand)
     options = Options(
         rtol=np.repeat(rtol, width),
         atol=atol,
@@ -611,15 +671,15 @@ def prepare(
         kappa=tableau.kappa,
         metric=kind,
         direction=DIRECTIONS[projection.direction],
-        iterations=count("iterations", projection.iterations),
+        iterations=count("iterations", projection.iterations, MOST_ITERATIONS),
         every=_every(projection.every, tableau),
         # The steps of a one-step method do not take f: there is nothing to evaluate in the place of f(y_hat).
-        reuse_f=_flag("reuse_f", projection.reuse_f) or isinstance(tableau, OneStep),
+        reuse_f=flag("reuse_f", projection.reuse_f) or isinstance(tableau, OneStep),
         uses_f=invariants.uses_f,
-        compensated=_flag("compensated", compensated),
+        compensated=flag("compensated", compensated),
         adaptive=stepping.h is None,
         per_band=1.0 / ((BAND_COMPENSATED if compensated else BAND) * EPS),
-        watched=_flag("check", projection.check) and invariants.size > 0,
+        watched=flag("check", projection.check) and invariants.size > 0,
         limit=(LARGE_SHARE if stepping.h is None else 1.0) if projection.check else np.inf,
     )
     if _can_project_jointly(options, invariants):
@@ -631,7 +691,7 @@ def prepare(
     check = bool(projection.check)
     trust = Trust(invariants.names, work.trust)
     run = Run(y0, arrays, options, work, invariants, projection.frame, trust, check, tau)
-    if _flag("project_initial", projection.project_initial):
+    if flag("project_initial", projection.project_initial):
         run.y0 = projected_start(run, rhs, t0, f0)
         f0 = rhs(t0, run.y0)
     violation = invariants.start_violation(t0, run.y0, f0)
@@ -697,27 +757,50 @@ def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
     """Which invariant a failed projection left worst, by how much, and the rank it had."""
     excess = np.abs(work.defect) / np.maximum(work.band, np.finfo(float).tiny)
     worst = int(np.argmax(np.where(np.isfinite(excess), excess, np.inf)))
+    broken = [name for name, row in zip(invariants.names, work.G, strict=True) if not np.isfinite(row).all()]
+    because = f"; the gradient of {broken[0]!r} is not finite there" if broken else ""
     return (
         f"projection failed at t={t:g}: invariant {invariants.names[worst]!r}, residual {work.defect[worst]:.3g}, "
-        f"rank {int(work.counters[LAST_RANK])} of {invariants.size}"
+        f"rank {int(work.counters[LAST_RANK])} of {invariants.size}{because}"
     )
 
 
 def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
     """Why a step failed."""
     if status == NOT_FINITE:
-        return not_finite(run.work, run.method, clock[T], clock[H])
+        return not_finite(run, clock[T], clock[H])
     if status == TOO_SMALL:
         return OdeSolver.TOO_SMALL_STEP
     return projection_failure(run.invariants, run.work, clock[T_NEW])
 
 
-def not_finite(work: Work, method: Method | OneStep, t: float, h: float) -> str:
-    """Why a raw step was not finite: the first stage that was not, or overflow of the sum."""
+def not_finite(run: Run, t: float, h: float) -> str:
+    """Why a step was not finite: the first stage that was not, overflow of the sum, or an error without a scale."""
+    work, method = run.work, run.method
     for i in range(method.b.size):
         if not np.isfinite(work.K[i]).all():
-            return f"fun returned a non-finite value at t={t + method.c[i] * h:.10g}"
-    return f"the state is no longer finite at t={t + h:.10g}: it overflowed, or h is too large"
+            return _bad_value(run, work.K[i], t + method.c[i] * h)
+    if not np.isfinite(work.y_hat).all():
+        return f"the state is no longer finite at t={t + h:.10g}: it overflowed, or h is too large"
+    if not np.isfinite(work.K[-1]).all():
+        return _bad_value(run, work.K[-1], t + h)
+    unscaled = np.flatnonzero((run.options.atol == 0) & (work.y_hat == 0))
+    if unscaled.size:
+        return without_scale(int(unscaled[0]), t + h)
+    return f"the error estimate is not finite at t={t + h:.10g}: it overflowed"
+
+
+def _bad_value(run: Run, f: np.ndarray, t: float) -> str:
+    unset = np.flatnonzero(np.isnan(f))
+    hint = ""
+    if run.in_place and unset.size:
+        hint = f" (component {unset[0]} is NaN; with in_place=True it must fill all of out)"
+    return f"fun returned a non-finite value at t={t:.10g}{hint}"
+
+
+def without_scale(component: int, t: float) -> str:
+    """That the error of a component cannot be measured."""
+    return f"the error of component {component} has no scale at t={t:.10g}: y and `atol` are 0 there; give atol > 0"
 
 
 def attach(diagnostics: Any, run: Run) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.integrate import DOP853 as SCIPY_DOP853
 from scipy.integrate import DenseOutput
 
+from ._inputs import refuse_units, shown
 from ._kernels import OK, Grouping
 from ._setup import Run
 from ._step import ERROR, GIVEN, NEW, make_work, project_step
@@ -57,7 +58,26 @@ def dense_output(
     return ManifoldDenseOutput(rhs, run, t_old, t, y_old.copy(), y.copy(), f_old, f, base, params)
 
 
-class ExactEnds(DenseOutput):
+class _AtRealTimes(DenseOutput):
+    """A dense output that says what is wrong with times that are no real numbers."""
+
+    def __call__(self, t: Any) -> Array:
+        """The states at a time or at times (m,), as (n,) or (n, m).
+
+        Raises
+        ------
+        TypeError
+            For times that are no real numbers, or have a unit.
+        """
+        real = np.asarray(t).dtype.kind in "fiub"
+        if not real or type(t) not in (float, np.float64, Array):
+            refuse_units(t=t)
+        if not real:
+            raise TypeError(f"dense output is defined at real times, got {shown(t)}.")
+        return super().__call__(t)
+
+
+class ExactEnds(_AtRealTimes):
     """Another dense output, but for the step's own states at both ends, which interpolants miss by their rounding."""
 
     def __init__(self, inner: DenseOutput, y_old: Array, y: Array) -> None:
@@ -70,7 +90,7 @@ class ExactEnds(DenseOutput):
         return np.where(t == self.t, self._y[column], out)
 
 
-class ManifoldDenseOutput(DenseOutput):
+class ManifoldDenseOutput(_AtRealTimes):
     """An interpolant, projected onto the invariants' levels between those of the step's two ends.
 
     The levels are linear between the defects of the two ends, which are 1e-15 to 1e-12 after a projection, and what
@@ -96,8 +116,8 @@ class ManifoldDenseOutput(DenseOutput):
         self._sigma = run.work.sigma
         if run.invariants.size and run.options.metric == ERROR:
             self._sigma = _travelled(y_old, y, (t - t_old) * f_old, (t - t_old) * f, run.options.groups)
-        fixed = {"metric": GIVEN, "direction": NEW, "iterations": ITERATIONS, "every": 1, "compensated": False}
-        self._options = run.options._replace(**fixed, watched=False, limit=math.inf)
+        plain = run.options._replace(metric=GIVEN, direction=NEW, every=1, compensated=False)
+        self._options = plain._replace(iterations=ITERATIONS, watched=False, limit=math.inf)
         self._counters = run.work.counters
         self._levels: tuple[Array, Array] | None = None
         self._work: Any = None

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ._inputs import refuse_units
 from .invariants import Invariant, as_invariants
 
 __all__ = ["DriftSlope", "drift_slope", "invariants_along", "observed_order"]
@@ -56,6 +57,7 @@ def drift_slope(t: Any, defects: Any) -> DriftSlope:
     >>> drift_slope([0, 1, 2, 3], [0.0, 2.1, 3.9, 6.0]).slope
     1.98
     """
+    refuse_units(t=t, defects=defects)
     t = np.asarray(t, dtype=float)
     d = np.asarray(defects, dtype=float)
     if t.ndim != 1 or d.ndim not in (1, 2) or d.shape[-1] != t.size:
@@ -101,6 +103,7 @@ def observed_order(errors: Any, steps: Any) -> np.ndarray:
     >>> observed_order([1e-2, 6.25e-4], [0.1, 0.05])
     array([4.])
     """
+    refuse_units(errors=errors, steps=steps)
     e = np.abs(np.asarray(errors, dtype=float))
     h = np.asarray(steps, dtype=float)
     if h.ndim != 1 or e.ndim not in (1, 2) or len(e) != h.size or h.size < 2:
@@ -137,6 +140,7 @@ def invariants_along(invariants: Any, t: Any, y: Any, *, params: Any = None) -> 
     ValueError
         When shapes disagree.
     """
+    refuse_units(t=t, y=y, params=params)
     t, states = np.asarray(t, dtype=float), np.asarray(y)
     if t.ndim != 1 or states.ndim != 2 or states.shape[1] != t.size:
         raise ValueError(f"invariants_along: t has shape {t.shape} and y {states.shape}; expected (m,) and (n, m).")
@@ -146,5 +150,5 @@ def invariants_along(invariants: Any, t: Any, y: Any, *, params: Any = None) -> 
 
 
 def _along(item: Invariant, t: np.ndarray, states: np.ndarray, extra: tuple[Any, ...]) -> np.ndarray:
-    values = [item.fun(float(at), state, *item.args, *extra) for at, state in zip(t, states, strict=True)]
+    values = [item.fun(float(at), state.copy(), *item.args, *extra) for at, state in zip(t, states, strict=True)]
     return np.array(values, dtype=float).reshape(t.size, -1).T if values else np.zeros((1, 0))

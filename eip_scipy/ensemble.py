@@ -20,6 +20,8 @@ from numba.extending import is_jitted
 from scipy.optimize import OptimizeResult
 
 from . import _setup
+from ._events import Events
+from ._inputs import count, flag, is_number, real_array, refuse_units, shown
 from ._interrupts import ended_by_sigterm, kept_ctrl_c
 from ._members import FAILED, NOT_RUN, Members, Plan, Task
 from ._names import nearest
@@ -30,7 +32,7 @@ from ._statistics import Statistics, merge
 from ._store import CheckpointStore, Store, ZarrStore, location, require_same_functions
 from ._trust import ProjectionWarning
 from .invariants import as_invariants
-from .longrun import DEFAULT, free_memory, integrate
+from .longrun import DEFAULT, check_bytes, free_memory, integrate
 from .problems._problem import Problem
 from .result import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from .solvers import EIPRK4, EIPSolver
@@ -122,7 +124,7 @@ def ensemble(
     *,
     params: Any = None,
     method: type[EIPSolver] = EIPRK4,
-    h: float | None = None,
+    h: float | None = DEFAULT,
     invariants: Any = DEFAULT,
     executor: Any = None,
     save_every: int | None = None,
@@ -156,7 +158,8 @@ def ensemble(
     method : type, optional
         As for `integrate`.
     h : float, optional
-        As for `integrate`: the step; a problem's own, or adaptive steps, without it.
+        As for `integrate`: the step; None: adaptive steps; without it, adaptive steps where rtol, atol, first_step or
+        max_step ask for them, else a problem's own step.
     invariants : Invariant or sequence of Invariant, optional
         What to keep: each member keeps the values at its own start. Where `params` differ, their functions take them
         as the last argument and have no args.
@@ -229,21 +232,26 @@ def ensemble(
     ((5, 4), True, True)
     """
     known = _check_options(options)
-    given = {"method": method, "h": h, "invariants": invariants, "save_every": save_every, "t_eval": t_eval}
-    given = {name: value for name, value in given.items() if value is not None and value is not DEFAULT} | known
-    starts, parameters = _inputs(fun, y0s, params, given)
+    given = {name: value for name, value in (("h", h), ("invariants", invariants)) if value is not DEFAULT}
+    given |= {name: value for name, value in (("save_every", save_every), ("t_eval", t_eval)) if value is not None}
+    given |= {"method": method, **known}
     if not (reduce is None or reduce == "state" or callable(reduce)):
-        raise ValueError(f"reduce must be 'state' or a function reduce(t, y), got {reduce!r}.")
+        raise ValueError(f"reduce must be 'state' or a function reduce(t, y), got {shown(reduce)}.")
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback must be a function callback(part), got {shown(callback)}.")
+    flag("progress", progress)
+    check_bytes(max_bytes)
     _check_places(out, checkpoint, checkpoint_every, resume)
     out = None if out is None else location(out)
     checkpoint = None if checkpoint is None else absolute(checkpoint)
+    starts, parameters = _inputs(fun, y0s, params, given)
     keep = reduce is None or out is not None
     own = parameters[0] if parameters.shape[1] else None
     task = Task(_bare(fun), t_span, given, starts[0], own, reduce, keep, len(starts))
     task, doubts = _first_that_starts(task, starts, parameters)
     plan = Plan(task, compiled=False)
     starts = np.ascontiguousarray(starts, plan.dtype)
-    size = _chunk_size(plan, len(starts), fun) if chunk is None else _setup.count("chunk", chunk)
+    size = _chunk_size(plan, len(starts), fun) if chunk is None else count("chunk", chunk)
     held = plan.times.size if reduce is None and out is None else 0
     _check_memory(plan, len(starts), held, max_bytes)
     store: Store | None = None
@@ -414,16 +422,16 @@ def _check_options(options: dict[str, Any]) -> dict[str, Any]:
     for name in options:
         if name not in known:
             raise TypeError(f"ensemble() has no option {name!r}{nearest(name, own | known)}")
-    events = options.get("events")
-    for event in () if events is None else (events,) if callable(events) else tuple(events):
-        if not getattr(event, "terminal", False):
-            raise ValueError("ensemble: an event must be terminal: it ends a member; the times of others are not kept.")
+    if not all(math.isfinite(times) for _, times in Events(options.get("events")).ends):
+        raise ValueError("ensemble: an event must be terminal: it ends a member; the times of others are not kept.")
     return options
 
 
 def _check_places(out: Any, checkpoint: Any, every: Any, resume: Any) -> None:
-    if not _setup.is_number(every) or not every > 0:
-        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {every!r}.")
+    refuse_units(checkpoint_every=every)
+    if not is_number(every) or not every > 0:
+        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
+    flag("resume", resume)
     if out is not None and checkpoint is not None:
         raise ValueError("give out= or checkpoint=, not both: out keeps finished members already.")
     for name, path in (("out", out), ("checkpoint", checkpoint)):
@@ -440,13 +448,8 @@ def _inputs(fun: Any, y0s: Any, params: Any, given: dict[str, Any]) -> tuple[np.
         if problem is None:
             raise TypeError("ensemble: y0s is missing; only a Problem brings a start of its own.")
         y0s = problem.y0
-    if np.ma.isMaskedArray(y0s) and np.ma.is_masked(y0s):
-        raise ValueError("masked values in y0s; fill or drop them first.")
-    starts = np.asarray(y0s)
-    if starts.dtype.kind not in "fiubc":
-        raise TypeError(f"y0s must hold numbers, got dtype {starts.dtype}.")
-    starts = starts.astype(complex if starts.dtype.kind == "c" else float)
-    own = None if params is None else _numbers(params)
+    starts = _setup.states("y0s", y0s)
+    own = None if params is None else np.atleast_1d(real_array("params", params, TypeError))
     if starts.ndim == 1 and own is not None and own.ndim == 2:
         starts = np.tile(starts, (len(own), 1))
     if starts.ndim != 2 or starts.size == 0:
@@ -467,13 +470,6 @@ def _inputs(fun: Any, y0s: Any, params: Any, given: dict[str, Any]) -> tuple[np.
         )
     rows = own if own.ndim == 2 else np.broadcast_to(own, (len(starts), own.size))
     return starts, rows
-
-
-def _numbers(params: Any) -> np.ndarray:
-    try:
-        return np.atleast_1d(np.array(params, dtype=float, order="C"))
-    except (TypeError, ValueError):
-        raise TypeError(f"params must be an array of numbers, got {params!r}.") from None
 
 
 def _bare(fun: Any) -> Any:
@@ -545,7 +541,7 @@ def _pool(executor: Any, task: Task, progress: bool) -> Pool:
     key = uuid.uuid4().hex
     if executor is None or isinstance(executor, (int, np.integer)):
         plan = Plan(task, progress=progress)
-        workers = cores() if executor is None else _setup.count("executor", executor)
+        workers = cores() if executor is None else count("executor", executor)
         return ThreadPool(plan, workers if plan.why_not is None else 1)
     if isinstance(executor, Executor):
         return FuturesPool(executor, task, key)

@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ._inputs import filled, flag, is_number, reals, refuse_units, require_arguments, shown
 from ._kernels import EPS
 
 __all__ = ["Invariant", "InvariantSet", "JointInvariants", "as_invariants", "check_gradient"]
 
 Array = np.ndarray
+FLOAT = np.dtype(float)
 
 # Shorter ones have the last word where the first reaches too far.
 CHECK_STEPS = (6e-6, 6e-8, 6e-10)
@@ -77,15 +79,21 @@ class Invariant:
             raise TypeError(f"Invariant: fun must be callable, got {fun!r}.")
         if grad is not None and not callable(grad):
             raise TypeError(f"Invariant: grad must be callable or None, got {grad!r}.")
+        in_place, uses_f = flag("Invariant: in_place", in_place), flag("Invariant: uses_f", uses_f)
         if grad is None and (in_place or uses_f):
             raise ValueError("Invariant: in_place and uses_f describe grad; give grad or leave them out.")
-        if scale is not None and not (isinstance(scale, (int, float)) and 0 <= scale < np.inf):
-            raise ValueError(f"Invariant: scale must be a finite number >= 0, got {scale!r}.")
+        refuse_units(target=target, args=args, scale=scale)
+        if scale is not None and not (is_number(scale) and 0 <= scale < np.inf):
+            raise ValueError(f"Invariant: scale must be a finite number >= 0, got {shown(scale)}.")
         if not isinstance(args, tuple):
-            raise TypeError(f"Invariant: args must be a tuple, got {args!r}; write args=(x,) for a single argument.")
+            raise TypeError(
+                f"Invariant: args must be a tuple, got {shown(args)}; write args=(x,) for a single argument."
+            )
+        if name is not None and not isinstance(name, str):
+            raise TypeError(f"Invariant: name must be a string, got {shown(name)}.")
         self.fun = fun
         self.grad = grad
-        self.target = None if target is None else np.asarray(target, dtype=float)
+        self.target = None if target is None else _target(target)
         self.args = args
         self.name = name
         self.scale = scale
@@ -152,15 +160,68 @@ def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
     return items
 
 
-def _real_value(invariant: Invariant, label: str, t: float, y: Array, extra: tuple) -> Array:
-    value = np.asarray(invariant.fun(t, y, *invariant.args, *extra))
-    if value.dtype.kind == "c":
-        raise ValueError(f"invariant {label!r} returned complex values; expected a real number or a real array (l,).")
-    if value.dtype.kind not in "fiub":
-        raise TypeError(f"invariant {label!r} returned {value!r}; expected a real number or a real array (l,).")
+def _target(target: Any) -> Array:
+    found = reals(target)
+    if found is None:
+        raise ValueError(f"Invariant: target must be a number or an array of numbers, got {shown(target)}.")
+    return found
+
+
+def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array, extra: tuple) -> Array:
+    """The value at the start, a number or (l_i,), by `fun`, the invariant's own with its arguments."""
+    try:
+        value = fun(t, y.copy())
+    except TypeError:
+        _require_arguments(invariant.fun, f"invariant {label!r}", ("t", "y"), invariant.args, extra)
+        raise
+    value = _value(value, label, t)
     if value.ndim > 1:
         raise ValueError(f"invariant {label!r} returned shape {value.shape}; expected a number or one dimension (l,).")
     return value.astype(float)
+
+
+def _value(value: Any, label: str, t: float, expected: tuple[int, ...] | None = None) -> Array:
+    """What an invariant returned at t, real and of the expected shape."""
+    refuse_units(**{f"invariant {label!r} returned": value})
+    try:
+        found = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        found = np.asarray(None)
+    if found.dtype.kind == "c":
+        raise ValueError(
+            f"invariant {label!r} returned complex values at t={t:g}; expected a real number or a real array (l,)."
+        )
+    if found.dtype.kind not in "fiub":
+        raise TypeError(
+            f"invariant {label!r} returned {shown(value)} at t={t:g}; expected a real number or a real array (l,)."
+        )
+    if expected is not None and found.shape != expected:
+        raise ValueError(f"invariant {label!r} returned shape {found.shape} at t={t:g}, expected {expected}.")
+    return found
+
+
+def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype: np.dtype) -> Array:
+    """What a gradient returned at t, of the expected shape, and real where the state is."""
+    what = f"gradient of invariant {label!r}"
+    refuse_units(**{f"{what} returned": value})
+    try:
+        found = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        found = np.asarray(None)
+    if found.dtype.kind not in "fiubc":
+        raise TypeError(f"{what} returned {shown(value)} at t={t:g}, expected numbers of shape {expected}.")
+    if found.shape != expected:
+        raise ValueError(f"{what} has shape {found.shape}, expected {expected} for this state, at t={t:g}.")
+    if found.dtype.kind == "c" and dtype.kind != "c":
+        raise ValueError(f"{what} is complex, but y0 is real, at t={t:g}.")
+    return found
+
+
+def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple, extra: tuple) -> None:
+    given = (*first, *(f"args[{k}]" for k in range(len(args))), *("params" for _ in extra))
+    mend = "Give what it takes besides by Invariant(..., args=(...,))"
+    mend += ", or take the run's params as its last argument." if extra else "."
+    require_arguments(fun, given, what, mend)
 
 
 class NumericalGradient:
@@ -187,7 +248,7 @@ class NumericalGradient:
         return difference_gradient(lambda x: self._fun(t, x, extra), y, self._floor)
 
     def _fun(self, t: float, y: Array, extra: tuple) -> Array:
-        return np.asarray(self._invariant.fun(t, y, *self._invariant.args, *extra))
+        return np.asarray(self._invariant.fun(t, y.copy(), *self._invariant.args, *extra))
 
     def _by_complex_step(self, t: float, y: Array, extra: tuple) -> Array:
         columns = []
@@ -242,6 +303,11 @@ class Complaint(NamedTuple):
     text: str
 
 
+def as_it_is(fun: Any, arrays: int) -> Any:
+    """A user's function, called as it is."""
+    return fun
+
+
 def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
     """``fun`` with its last arguments given; itself where there are none."""
     return (lambda *first: fun(*first, *arguments)) if arguments else fun
@@ -250,14 +316,21 @@ def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
 class InvariantSet:
     """All invariants of a run as one: sizes, names, targets, scales, and the functions that the step calls.
 
-    Made at the start state, where values and shapes are checked. `extra` holds the run's `params`, if any.
+    Made at the start state, where values and shapes are checked. `extra` holds the run's `params`, if any; `hand` makes
+    of a user's function, and the number of its arrays that are ours, what is called.
     """
 
-    def __init__(self, invariants: Any, t0: float, y0: Array, f0: Array, tau: float, extra: tuple = ()) -> None:
+    def __init__(
+        self, invariants: Any, t0: float, y0: Array, f0: Array, tau: float, extra: tuple = (), hand: Any = as_it_is
+    ) -> None:
         self.items = as_invariants(invariants)
         self.extra = extra
         self.labels = [item.name or f"invariant {k}" for k, item in enumerate(self.items)]
-        values = [_real_value(item, label, t0, y0, extra) for item, label in zip(self.items, self.labels, strict=True)]
+        functions = [bound(hand(item.fun, 1), item.args + extra) for item in self.items]
+        values = [
+            _first_value(item, fun, label, t0, y0, extra)
+            for item, fun, label in zip(self.items, functions, self.labels, strict=True)
+        ]
         self.scalar = [value.ndim == 0 for value in values]
         sizes = [value.size for value in values]
         self.starts = [0, *np.cumsum(sizes, dtype=int).tolist()]
@@ -272,15 +345,25 @@ class InvariantSet:
         self.scales = np.repeat([float(item.scale or 0.0) for item in self.items], sizes)
         self.uses_f = any(item.uses_f for item in self.items)
         self.grads = [
-            item.grad or NumericalGradient(item, label, t0, y0, f0, tau, extra)
+            hand(item.grad, 2 if item.uses_f else 1)
+            if item.grad is not None
+            else NumericalGradient(item, label, t0, y0, f0, tau, extra)
             for item, label in zip(self.items, self.labels, strict=True)
         ]
         self.target = self._targets()
         self._shape = (self.size, y0.size)
-        places = list(zip(self.starts[:-1], self.starts[1:], self.scalar, strict=True))
-        functions = (bound(item.fun, item.args + extra) for item in self.items)
-        self._values = [(fun, *place) for fun, place in zip(functions, places, strict=True)]
-        self._gradients = [(*self._bound_gradient(k), *place) for k, place in enumerate(places)]
+        places = [
+            start if scalar else slice(start, stop)
+            for start, stop, scalar in zip(self.starts[:-1], self.starts[1:], self.scalar, strict=True)
+        ]
+        self._values = [
+            (fun, label, place, value.shape)
+            for fun, label, place, value in zip(functions, self.labels, places, values, strict=True)
+        ]
+        self._gradients = [
+            (*self._bound_gradient(k), label, place, value.shape + y0.shape)
+            for k, (label, place, value) in enumerate(zip(self.labels, places, values, strict=True))
+        ]
         self._gradients_at_start(t0, y0, f0)
 
     def _require_finite(self, values: Array, what: str) -> None:
@@ -309,23 +392,23 @@ class InvariantSet:
 
     def _gradients_at_start(self, t: float, y: Array, f: Array) -> None:
         """Shapes and finiteness of every gradient, once."""
-        for k, (gradient, takes_f, in_place, start, stop, scalar) in enumerate(self._gradients):
-            expected = y.shape if scalar else (stop - start, y.size)
-            first = (t, y, f) if takes_f else (t, y)
-            if in_place:
-                G = np.zeros(expected, y.dtype)
-                gradient(*first, G)
-            else:
-                G = np.asarray(gradient(*first))
-            if G.shape != expected:
-                raise ValueError(
-                    f"gradient of invariant {self.labels[k]!r} has shape {G.shape}, expected {expected} for a state of "
-                    f"{y.size} components."
-                )
-            if G.dtype.kind == "c" and y.dtype.kind != "c":
-                raise ValueError(f"gradient of invariant {self.labels[k]!r} is complex, but y0 is real.")
+        for item, (gradient, takes_f, in_place, label, _, expected) in zip(self.items, self._gradients, strict=True):
+            what = f"gradient of invariant {label!r}"
+
+            def call(*out: Array, gradient: Any = gradient, takes_f: bool = takes_f) -> Any:
+                return gradient(t, y.copy(), f.copy(), *out) if takes_f else gradient(t, y.copy(), *out)
+
+            try:
+                if in_place:
+                    G = filled(call, expected, y.dtype, what, t)
+                else:
+                    G = _gradient(call(), label, t, expected, y.dtype)
+            except TypeError:
+                first = ("t", "y", *(("f",) if takes_f else ()), *(("out",) if in_place else ()))
+                _require_arguments(item.grad or item.fun, what, first, item.args, self.extra)
+                raise
             if not np.all(np.isfinite(G)):
-                raise ValueError(f"gradient of invariant {self.labels[k]!r} is not finite at y0.")
+                raise ValueError(f"{what} is not finite at y0.")
 
     def _bound_gradient(self, k: int) -> tuple[Callable[..., Any], bool, bool]:
         """Gradient k as gradient(t, y), with f behind y if the second is true and `out` at the end if the third is."""
@@ -335,42 +418,28 @@ class InvariantSet:
 
     def inv(self, t: float, y: Array, values: Array, params: Any = None) -> None:
         """Fill `values` (l,)."""
-        # Copies here and in grad: a user's function may keep what it was given, and y and f are buffers.
-        y = y.copy()
-        for fun, start, stop, scalar in self._values:
-            value = fun(t, y)
-            if scalar and isinstance(value, float):
-                values[start] = value
-                continue
-            expected = () if scalar else (stop - start,)
-            if np.shape(value) != expected:
-                label = self.labels[self.starts.index(start)]
-                raise ValueError(
-                    f"invariant {label!r} returned shape {np.shape(value)} at t={t:g}, expected {expected}."
-                )
-            values[start:stop] = value
+        # A copy for each here and in grad: a user's function may keep or overwrite what it was given.
+        for fun, label, place, expected in self._values:
+            value = fun(t, y.copy())
+            if isinstance(value, float):
+                known = expected == ()
+            else:
+                known = type(value) is np.ndarray and value.dtype is FLOAT and value.shape == expected
+            values[place] = value if known else _value(value, label, t, expected)
 
     def grad(self, t: float, y: Array, f: Array, G: Array, params: Any = None) -> None:
         """Fill the gradients `G` (l, n)."""
-        y, shape = y.copy(), y.shape
-        if self.uses_f:
-            f = f.copy()
-        for gradient, takes_f, in_place, start, stop, scalar in self._gradients:
+        dtype = y.dtype
+        for gradient, takes_f, in_place, label, place, expected in self._gradients:
             if in_place:
-                out = G[start] if scalar else G[start:stop]
-                gradient(t, y, f, out) if takes_f else gradient(t, y, out)
+                out = G[place]
+                out.fill(np.nan)  # shows in the run where the gradient leaves a part of it as it was
+                gradient(t, y.copy(), f.copy(), out) if takes_f else gradient(t, y.copy(), out)
                 continue
-            row = gradient(t, y, f) if takes_f else gradient(t, y)
-            if scalar and type(row) is np.ndarray and row.shape == shape:
-                G[start] = row
-                continue
-            expected = shape if scalar else (stop - start, y.size)
-            if np.shape(row) != expected:
-                label = self.labels[self.starts.index(start)]
-                raise ValueError(
-                    f"gradient of invariant {label!r} has shape {np.shape(row)} at t={t:g}, expected {expected}."
-                )
-            G[start:stop] = row
+            row = gradient(t, y.copy(), f.copy()) if takes_f else gradient(t, y.copy())
+            if not (type(row) is np.ndarray and row.shape == expected and row.dtype is dtype):
+                row = _gradient(row, label, t, expected, dtype)
+            G[place] = row
 
     def values(self, t: float, y: Array) -> Array:
         """All values (l,)."""
@@ -522,10 +591,11 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     ValueError
         When the gradient has the wrong shape, or `fun` is missing for ``uses_f``.
     """
+    refuse_units(t=t, y=y)
     y = np.array(y, dtype=complex if np.iscomplexobj(y) else float)
     if invariant.uses_f and fun is None:
         raise ValueError("check_gradient: this invariant's grad uses f; pass fun=.")
-    f = np.asarray(fun(t, y), dtype=y.dtype) if fun is not None else np.zeros_like(y)
+    f = np.asarray(fun(t, y.copy()), dtype=y.dtype) if fun is not None else np.zeros_like(y)
     size = np.where(y == 0, np.max(np.abs(y), initial=0.0) or 1.0, np.abs(y))
     G = InvariantSet(invariant, t, y, f, 0.0).gradients(t, y, f)
     floor = np.where(y == 0, size, 0.0)

@@ -7,7 +7,8 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,8 +19,17 @@ from numba.extending import is_jitted
 
 from . import _kernels as kn
 from . import _resume, _setup
-from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures, with_inlined
+from ._compile import (
+    ChangedShapeError,
+    CompiledFunctions,
+    Handed,
+    NotCompilableError,
+    compile_functions,
+    signatures,
+    with_inlined,
+)
 from ._events import Events
+from ._inputs import count, filled, flag, is_number, real_array, refuse_units, require_arguments, shown
 from ._interrupts import ended_by_sigterm, kept_ctrl_c, look_for_signals
 from ._kernels import OK
 from ._names import nearest
@@ -49,6 +59,9 @@ FORMS = {  # (of a Nystrom method, in place) -> what a user's function is
     (True, False): "acceleration",
     (True, True): "acceleration in place",
 }
+
+
+CALLED = "fun", "It takes (t, y), out with in_place=True, and params where the run has them: params=..."
 
 
 class _Default:
@@ -183,7 +196,16 @@ class _Driver:
             self._advance = _compiled_advance(dtype, arguments)
 
     def advance(self, k_end: int) -> int:
-        return self._advance(*self.functions, self.params, self.grid, k_end, *self._tail, self.t, self.y.view(float))
+        arguments = (self.params, self.grid, k_end, *self._tail, self.t, self.y.view(float))
+        try:
+            return self._advance(*self.functions, *arguments)
+        except ChangedShapeError as error:
+            self.place(error)
+            raise
+
+    def place(self, error: ChangedShapeError) -> None:
+        """Add the step to an error that compiled code raises, which cannot put a number into it."""
+        error.args = (f"{error}, in the step from t={self.grid.clock[T]:.10g}",)
 
     @property
     def step(self) -> int:
@@ -301,7 +323,7 @@ def integrate(
     y0: Any = None,
     *,
     method: type[EIPSolver],
-    h: float | None = None,
+    h: float | None = DEFAULT,
     params: Any = None,
     in_place: bool = False,
     save_every: int | None = None,
@@ -326,8 +348,8 @@ def integrate(
     check: bool = True,
     project_initial: bool = False,
     diagnostics: Diagnostics | None = None,
-    rtol: Any = 1e-3,
-    atol: Any = 1e-6,
+    rtol: Any = DEFAULT,
+    atol: Any = DEFAULT,
     first_step: float | None = None,
     max_step: float = np.inf,
     **unknown: Any,
@@ -351,9 +373,9 @@ def integrate(
         `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, or a class made by
         `eip_method`; one on a one-step method runs interpreted.
     h : float, optional
-        Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter. Default: a problem's own
-        step; without one, adaptive steps by `rtol`, `atol`, `first_step` and `max_step`. To take adaptive steps on a
-        problem with a step of its own, give `first_step` or ``h=None`` through ``dataclasses.replace``.
+        Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter. None: adaptive steps by
+        `rtol`, `atol`, `first_step` and `max_step`. Default: adaptive where one of these is given, else a problem's
+        own step, if it has one.
     params : array_like of float, optional
         Passed on to `fun` and to the invariants' functions as the last argument.
     in_place : bool, optional
@@ -367,7 +389,8 @@ def integrate(
         ``event(t, y[, params]) -> float``, with ``terminal`` and ``direction`` as for `scipy.integrate.solve_ivp`; in
         compiled runs Numba functions.
     callback : callable, optional
-        ``callback(t, y, defects)`` at each saved point; return True to stop the run.
+        ``callback(t, y, defects)`` at each saved point; return True to stop the run. With `save_every` the interval
+        may then be endless, as with a terminal event.
     progress : bool, optional
         Show a progress bar with the time that is left.
     compensated : bool, optional
@@ -390,8 +413,10 @@ def integrate(
         As for the solver classes, see `EIPSolver`. Functions of invariants are called as
         ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` takes the run's
         `params` in its place.
-    diagnostics, rtol, atol
+    diagnostics, first_step, max_step
         Likewise.
+    rtol, atol : float or array_like, optional
+        Likewise, 1e-3 and 1e-6 by default. Beside a given `h` they only set the scale of the error metric.
 
     Returns
     -------
@@ -413,9 +438,12 @@ def integrate(
     Notes
     -----
     A step that fails ends the run with ``status=-1`` and everything up to there. Exceptions from user code and
-    KeyboardInterrupt pass through, with what the run had as ``exception.partial``, and with a note that says from
-    where its checkpoint goes on. A checkpoint that cannot be written later on is a RuntimeWarning and stands in
-    `message`; the former one stays.
+    KeyboardInterrupt pass through, with what the run had as ``exception.partial`` (one row, the start, before the first
+    step), and with a note that says from where its checkpoint goes on. A checkpoint that cannot be written later on is
+    a RuntimeWarning and stands in `message`; the former one stays.
+
+    The user's functions may keep or overwrite the states that they are given: compiled or not, they get copies where
+    they do.
 
     Examples
     --------
@@ -429,8 +457,10 @@ def integrate(
     for name in unknown:
         hint = nearest(name, integrate.__kwdefaults__ or ())
         raise TypeError(f"integrate() has no option {name!r}{hint}")
+    refuse_units(checkpoint_every=checkpoint_every)
     own = {name: arguments.pop(name) for name in ("checkpoint", "checkpoint_every", "resume")}
-    with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), _resume.kept(*own.values()) as keeper:
+    kept = _resume.kept(*own.values())
+    with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), kept as keeper, _start_kept(fun, t_span, y0, method):
         return prepared(**arguments, keeper=keeper).run()
 
 
@@ -461,16 +491,19 @@ def prepared(
     **projection: Any,
 ) -> Loop:
     """What `integrate` runs, by the same arguments, all of them validated; `projection`: those of the projection."""
+    refuse_units(first_step=first_step, max_step=max_step, max_bytes=max_bytes)
     given = {key: value for key, value in projection.items() if value is not DEFAULT}
     tableau = _tableau(method)
-    form = FORMS[isinstance(tableau, NystromTableau), bool(in_place)]
+    form = FORMS[isinstance(tableau, NystromTableau), flag("in_place", in_place)]
+    _check_choices(callback, progress, compiled, max_bytes)
+    no_bound = isinstance(max_step, float) and max_step == np.inf
+    adaptive = not (rtol is DEFAULT and atol is DEFAULT and first_step is None and no_bound)
+    t_span, y0 = _start(fun, t_span, y0)
     if isinstance(fun, Problem):
         problem = fun
         form = "value" if problem.rhs is None else "in place"
         fun = problem.fun if problem.rhs is None else problem.rhs
-        t_span = problem.t_span if t_span is None else t_span
-        y0 = problem.y0 if y0 is None else y0
-        if h is None and first_step is None and max_step == np.inf:
+        if h is DEFAULT and not adaptive:
             h = problem.h
         own = {key: getattr(problem, key) for key in ("invariants", "metric", "blocks", "frame")}
         given = {**own, **given}
@@ -481,23 +514,40 @@ def prepared(
         raise TypeError(f"integrate: fun must be callable or a Problem, got {fun!r}.")
     parameters = np.zeros(0) if params is None else _parameters(params)
     extra = () if params is None else (parameters,)
-    happenings = Events(events, extra)
-    t0, t_bound = _span(t_span, happenings.terminal)
-    start = _setup.initial_state(_required("y0", y0))
+    handed: list[Handed] = []
+    hand = partial(_hand, handed)
+    happenings = Events(events, extra, hand)
+    t0, t_bound = _span(t_span, happenings.terminal or (callback is not None and save_every is not None))
+    start = _state(y0)
     stepping = _setup.stepping(
-        method.__name__, tableau, t0, t_bound, start.size, h, first_step, max_step, rtol, atol, stacklevel=4
+        method.__name__,
+        tableau,
+        t0,
+        t_bound,
+        start.size,
+        None if h is DEFAULT else h,
+        first_step,
+        max_step,
+        1e-3 if rtol is DEFAULT else rtol,
+        1e-6 if atol is DEFAULT else atol,
+        stacklevel=4,
     )
     if "invariants" in given:
         given["invariants"] = _with_run_params(given["invariants"], params)
-    rhs = INTERPRETED[form](fun, extra, start)
+    rhs = INTERPRETED[form](hand(fun, 1), extra, start)
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
-        out = np.zeros_like(y)
+        out = np.empty_like(y)
         rhs(t, y, out, parameters)
         return out
 
     calls = _setup.Counted(derivative)
-    f0 = calls(t0, start)
+    try:
+        f0 = calls(t0, start)
+    except TypeError:
+        out = ("out",) if "in place" in form else ()
+        require_arguments(fun, ("t", "y", *out, *("params" for _ in extra)), *CALLED)
+        raise
     if isinstance(tableau, NystromTableau):
         _setup.check_second_order(calls, t0, start, f0, method.__name__)
     tau = stepping.first(calls, start, f0, tableau)
@@ -514,7 +564,9 @@ def prepared(
         extra=extra,
         compensated=compensated,
         check_start=check_start,
+        hand=hand,
     )
+    run.in_place = "in place" in form
     bound = 0.5 * free_memory() if max_bytes is None else max_bytes
     check_memory(saved_rows(grid), run, bound)
     record = Diagnostics() if diagnostics is None else diagnostics
@@ -526,6 +578,8 @@ def prepared(
     with _compiling(progress and compiled is not False and is_jitted(fun)):
         functions, why_not = _functions(fun, form, extra, run, happenings, compiled, rhs)
         driver = _Driver(run, grid, functions, parameters, compiled=why_not is None)
+    for function in handed:
+        function.read_only &= why_not is None
     run.work.K[0] = f0 if run.y0 is start else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
     keeper.begin(driver, happenings, bound)
@@ -620,7 +674,8 @@ class Loop:
             look_for_signals()
             self.keeper.keep()
             k, rows, begin = driver.step, driver.rows, time.perf_counter()
-            code = driver.advance(k + self._chunk(self.chunk))
+            steps = self._chunk(self.chunk)
+            code = driver.advance(k + steps)
             seconds = time.perf_counter() - begin
             ended = self._pause() if code == PAUSE else False
             bar.update(self._progress(bar.n, k))
@@ -637,8 +692,9 @@ class Loop:
             elif code == OK and driver.grid.clock[T] == driver.grid.span.t_bound:
                 return 0, ARRIVED
             if code == OK:
-                # At most a doubling, so that one fast chunk cannot make a slow one long.
-                self.chunk = max(1, min(2 * self.chunk, int(self.chunk * CHUNK_SECONDS / max(seconds, 1e-9))))
+                # At most a doubling, so that one fast chunk cannot make a slow one long; none of one that was cut.
+                longer = max(self.chunk, 2 * steps)
+                self.chunk = max(1, min(longer, int(steps * CHUNK_SECONDS / max(seconds, 1e-9))))
 
     def _progress(self, shown: float, k: int) -> float:
         """What the bar is to grow by: steps where their number is known, else time."""
@@ -766,21 +822,82 @@ def _tableau(method: Any) -> Any:
     return method.TABLEAU
 
 
-def _span(t_span: Any, unbounded: bool) -> tuple[float, float]:
+@contextmanager
+def _start_kept(fun: Any, t_span: Any, y0: Any, method: Any) -> Iterator[None]:
+    """Give an exception that comes before the first step the start as what the run had."""
+    begin = time.perf_counter()
     try:
-        t0, t_bound = map(float, _required("t_span", t_span))
-    except (TypeError, ValueError):
-        raise ValueError(f"t_span must hold two numbers, got {t_span!r}.") from None
-    if not math.isfinite(t0) or math.isnan(t_bound) or not (math.isfinite(t_bound) or unbounded):
-        raise ValueError(f"t_span must be finite unless a terminal event ends the run, got {t_span!r}.")
+        yield
+    except BaseException as error:
+        if not hasattr(error, "partial"):
+            with suppress(TypeError, ValueError):  # no start that could be read
+                t_span, y0 = _start(fun, t_span, y0)
+                t0, start = _setup.interval(t_span)[0], _state(y0)
+                error.partial = IntegrationResult(  # type: ignore[attr-defined]
+                    t=np.array([t0]),
+                    y=start[:, None],
+                    invariants=np.zeros((0, 1)),
+                    max_defect=np.zeros(0),
+                    diagnostics=Diagnostics(),
+                    t_events=None,
+                    y_events=None,
+                    nfev=0,
+                    njev=0,
+                    nlu=0,
+                    status=-1,
+                    message=f"interrupted by {type(error).__name__} at the start",
+                    success=False,
+                    wall_time=time.perf_counter() - begin,
+                    compiled=False,
+                    method=getattr(method, "__name__", str(method)),
+                    h=None,
+                )
+        raise
+
+
+def _start(fun: Any, t_span: Any, y0: Any) -> tuple[Any, Any]:
+    """t_span and y0 as they are given, else a problem's own."""
+    if isinstance(fun, Problem):
+        return fun.t_span if t_span is None else t_span, fun.y0 if y0 is None else y0
+    return t_span, y0
+
+
+def _state(y0: Any) -> np.ndarray:
+    start = _setup.initial_state(_required("y0", y0))
+    if start.size == 0:
+        raise ValueError("y0 is empty; integrate needs a state of at least one component.")
+    return start
+
+
+def _span(t_span: Any, ends: bool) -> tuple[float, float]:
+    """The interval; endless only where something `ends` the run."""
+    t0, t_bound = _setup.interval(t_span)
+    if math.isinf(t_bound) and not ends:
+        raise ValueError(
+            f"t_span must be finite unless a terminal event ends the run, got {shown(t_span)}; a callback may end it "
+            "too, at the steps that save_every=... saves."
+        )
     return t0, t_bound
 
 
+def _check_choices(callback: Any, progress: Any, compiled: Any, max_bytes: Any) -> None:
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback must be a function callback(t, y, defects), got {shown(callback)}.")
+    flag("progress", progress)
+    if compiled is not None and not isinstance(compiled, (bool, np.bool_)):
+        raise ValueError(f"compiled must be True, False or None (where possible), got {shown(compiled)}.")
+    check_bytes(max_bytes)
+
+
+def check_bytes(max_bytes: Any) -> None:
+    """The option ``max_bytes`` is None or a number."""
+    refuse_units(max_bytes=max_bytes)
+    if max_bytes is not None and not (is_number(max_bytes) and max_bytes >= 0):
+        raise ValueError(f"max_bytes must be a number of bytes >= 0, got {shown(max_bytes)}.")
+
+
 def _parameters(params: Any) -> np.ndarray:
-    try:
-        return np.array(params, dtype=float, order="C").reshape(-1)
-    except (TypeError, ValueError):
-        raise TypeError(f"params must be an array of numbers, got {params!r}.") from None
+    return real_array("params", params, TypeError).reshape(-1)
 
 
 def _with_run_params(invariants: Any, params: Any) -> tuple[Invariant, ...]:
@@ -810,7 +927,7 @@ def _grid(span: Span, tau: float, save_every: Any, t_eval: Any, events: Events) 
     n_events = len(events.functions)
     return Grid(
         span=span,
-        save_every=0 if save_every is None else _setup.count("save_every", save_every),
+        save_every=0 if save_every is None else count("save_every", save_every),
         t_eval=times,
         place=np.zeros(3, np.int64),
         clock=np.array([span.t0, span.t0, 0.0, tau]),
@@ -821,7 +938,7 @@ def _grid(span: Span, tau: float, save_every: Any, t_eval: Any, events: Events) 
 
 
 def _evaluation_times(t_eval: Any, span: Span) -> np.ndarray:
-    times = np.array(t_eval, dtype=float)
+    times = real_array("t_eval", t_eval)
     if times.ndim != 1 or times.size == 0:
         raise ValueError("`t_eval` must be 1-dimensional and not empty.")
     if not np.isfinite(times).all():
@@ -869,16 +986,24 @@ def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) ->
 
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
         f = fun(t, y.copy(), *extra)
-        out[:] = (
-            f if type(f) is np.ndarray and f.shape == shape and f.dtype == dtype else _setup.as_derivative(f, n, dtype)
-        )
+        known = type(f) is np.ndarray and f.shape == shape and f.dtype == dtype
+        out[:] = f if known else _setup.as_derivative(f, n, dtype, t)
 
     return rhs
 
 
 def _interpreted_in_place(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
+    """The user's right-hand side in place, looked at in its first call; NaN in `out` then shows what it leaves out."""
+    first = True
+
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
-        fun(t, y, out, *extra)
+        nonlocal first
+        if first:
+            first = False
+            out[:] = filled(lambda part: fun(t, y.copy(), part, *extra), out.shape, out.dtype, "fun", t)
+        else:
+            out.fill(math.nan)
+            fun(t, y.copy(), out, *extra)
 
     return rhs
 
@@ -913,6 +1038,14 @@ INTERPRETED = {
     "acceleration": _interpreted_acceleration,
     "acceleration in place": _interpreted_acceleration_in_place,
 }
+
+
+def _hand(handed: list[Handed], fun: Callable[..., Any], arrays: int) -> Callable[..., Any]:
+    """What is called in the place of a user's function; those that are jitted are listed."""
+    if not is_jitted(fun):
+        return fun
+    handed.append(Handed(fun, arrays))
+    return handed[-1]
 
 
 def _functions(

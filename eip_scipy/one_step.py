@@ -8,11 +8,14 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from . import _kernels as kn
+from ._inputs import refuse_units, shown
 from ._kernels import NOT_FINITE, OK
 from ._step import OLD, Options, Work, is_sampled
 from .result import HAVE_ERROR, HAVE_F, NFEV
 
 __all__ = ["OneStep", "OneStepMethod", "as_vector"]
+
+NUMBERS = (float, np.float64, int, complex, np.complex128)
 
 
 @runtime_checkable
@@ -116,8 +119,8 @@ class OneStep:
         result = self._one_step(t, y.copy(), h)
         if self.has_estimate:
             result, estimate = self._pair(result)
-            w.err[:] = self._vector(estimate, "an estimate", y).view(float)
-        w.y_hat[:] = self._vector(result, "a state", y)
+            w.err[:] = self._vector(estimate, "an estimate", t, y).view(float)
+        w.y_hat[:] = self._vector(result, "a state", t, y)
         if not kn.all_finite(w.y_hat_r):
             return NOT_FINITE
         if project and o.uses_f:
@@ -145,8 +148,8 @@ class OneStep:
             )
         return result
 
-    def _vector(self, value: Any, what: str, y: np.ndarray) -> np.ndarray:
-        vector = as_vector(value, y.size, y.dtype, f"{self.name}.one_step returned {what}:")
+    def _vector(self, value: Any, what: str, t: float, y: np.ndarray) -> np.ndarray:
+        vector = as_vector(value, y.size, y.dtype, f"{self.name}.one_step returned {what}:", t)
         return np.ascontiguousarray(vector, dtype=y.dtype)
 
 
@@ -156,23 +159,29 @@ def _order(name: str, what: str, value: Any) -> int:
     return int(value)
 
 
-def as_vector(value: Any, n: int, dtype: np.dtype, came: str) -> np.ndarray:
-    """What a user's function returned as an array (n,), or an error that says what `came`.
+def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.ndarray:
+    """What a user's function returned at t as an array (n,), or an error that says what `came`.
 
     Raises
     ------
     TypeError
-        For None or values that are no numbers.
+        For None, values that are no numbers, and numbers with a unit.
     ValueError
         For a wrong shape, or complex values where the state is real.
     """
     if value is None:
-        raise TypeError(f"{came} None, expected {n} numbers (does it end without a return?).")
-    a = np.asarray(value)
+        raise TypeError(f"{came} None, expected {n} numbers, at t={t:.10g} (does it end without a return?).")
+    # Of a list the first item tells: a look at all of them, at every stage, would take longer than the function.
+    if not (type(value) is list and value and type(value[0]) in NUMBERS):
+        refuse_units(**{came.removesuffix(":"): value})
+    try:
+        a = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        raise ValueError(f"{came} {shown(value)}, expected {n} numbers, at t={t:.10g}.") from None
     if a.dtype.kind not in "fiubc":
-        raise TypeError(f"{came} {value!r}, expected {n} numbers.")
+        raise TypeError(f"{came} {shown(value)}, expected {n} numbers, at t={t:.10g}.")
     if a.shape != (n,):
-        raise ValueError(f"{came} shape {a.shape}, expected ({n},).")
+        raise ValueError(f"{came} shape {a.shape}, expected ({n},), at t={t:.10g}.")
     if a.dtype.kind == "c" and dtype.kind != "c":
-        raise ValueError(f"{came} complex values, but y0 is real; pass y0.astype(complex).")
+        raise ValueError(f"{came} complex values at t={t:.10g}, but y0 is real; pass y0.astype(complex).")
     return a

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -9,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from . import _setup
+from ._inputs import count, is_number, reals, refuse_units, shown
 from ._kernels import BAND, EPS
 from ._step import EUCLIDEAN, NEW, Options, make_work, project_step
 from ._trust import LARGE_SHARE, ProjectionWarning
 from .invariants import InvariantSet
+from .one_step import as_vector
 from .result import LAST_RANK, ProjectionResult
 
 __all__ = ["project"]
@@ -80,14 +83,17 @@ def project(
     >>> project(np.array([0.6, 0.81]), length, iterations=3).defect
     array([0.])
     """
-    y = _setup.initial_state(y_hat)
+    refuse_units(t=t, sigma=sigma, f=f)
+    if not is_number(t) or not math.isfinite(t):
+        raise ValueError(f"project: t must be a finite number, got {shown(t)}.")
+    t, y = float(t), _setup.initial_state(y_hat, "y_hat")
     n, width = y.size, 2 if y.dtype.kind == "c" else 1
-    derivative = _derivative(f, y)
+    derivative = _derivative(f, t, y)
     f_hat = derivative(t, y)
     known = InvariantSet(invariants, t, y, f_hat, 0.0)
     if known.uses_f and f is None:
         raise ValueError("project: a gradient uses f; pass f=, the derivative at y_hat or a function f(t, y).")
-    iterations = _setup.count("iterations", iterations)
+    iterations = count("iterations", iterations, _setup.MOST_ITERATIONS)
     if known.uses_f and iterations > 1 and not callable(f):
         raise ValueError(
             "project: a gradient uses f at each Newton step; with iterations > 1 pass f as a function f(t, y)."
@@ -136,19 +142,20 @@ def project(
     return ProjectionResult(out, work.defect.copy(), int(work.counters[LAST_RANK]), out - y)
 
 
-def _derivative(f: Any, y: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
+def _derivative(f: Any, t: float, y: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
     if callable(f):
-        return lambda t, state: _setup.as_derivative(f(t, state), y.size, y.dtype)
-    fixed = np.zeros_like(y) if f is None else _setup.as_derivative(f, y.size, y.dtype)
+        return lambda t, state: _setup.as_derivative(f(t, state.copy()), y.size, y.dtype, t)
+    fixed = np.zeros_like(y) if f is None else as_vector(f, y.size, y.dtype, "project: f has", t)
     return lambda t, state: fixed
 
 
 def _targets(known: InvariantSet, target: Any) -> np.ndarray:
     if target is not None:
-        values = np.atleast_1d(np.asarray(target, dtype=float))
-        if values.shape != (known.size,) or not np.isfinite(values).all():
-            raise ValueError(f"project: target must be {known.size} finite numbers, got {target!r}.")
-        return values
+        refuse_units(target=target)
+        values = reals(target)
+        if values is None or values.size != known.size or values.ndim > 1 or not np.isfinite(values).all():
+            raise ValueError(f"project: target must be {known.size} finite numbers, got {shown(target)}.")
+        return values.reshape(-1)
     for item, label in zip(known.items, known.labels, strict=True):
         if item.target is None:
             raise ValueError(f"project: invariant {label!r} has no target; give it one, or pass target=.")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,6 +11,7 @@ import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
 from . import _setup
+from ._inputs import refuse_units
 from ._kernels import FAILED_PROJECTION, OK
 from ._names import nearest
 from ._setup import ProjectionOptions, Stepping
@@ -148,15 +148,11 @@ class EIPSolver(OdeSolver):
         diagnostics: Any = None,
         **extraneous: Any,
     ) -> None:
-        for name in extraneous:
-            hint = nearest(name, OPTIONS)
-            warnings.warn(
-                f"{type(self).__name__} has no option {name!r}; it is ignored{hint}", UserWarning, stacklevel=3
-            )
+        if extraneous:
+            warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=3)
         if not hasattr(self, "TABLEAU"):
             raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
-        if math.isnan(t0) or math.isnan(t_bound):
-            raise ValueError(f"t_span must hold two numbers, got ({t0}, {t_bound}).")
+        t0, t_bound = _setup.interval((t0, t_bound))
         start = _setup.initial_state(y0)
         self._calls = [0]
         derivative, self._rhs = _checked(fun, start.size, start.dtype, vectorized, self._calls)
@@ -169,8 +165,10 @@ class EIPSolver(OdeSolver):
         self.rtol, self.atol = stepping.rtol, stepping.atol
         self._k, self._span = 0, stepping.span
         kept = as_invariants(invariants)
+        if self.h is None and stepping.first_step is None:
+            stepping.require_scale(start)
         self._scipy = self._scipy_solver(derivative, start, stepping, kept)
-        f0 = derivative(t0, start.copy()).copy() if self._scipy is None else np.zeros_like(start)
+        f0 = derivative(t0, start).copy() if self._scipy is None else np.zeros_like(start)
         if isinstance(self.TABLEAU, NystromTableau):
             _setup.check_second_order(lambda t, y: derivative(t, y).copy(), t0, start, f0, type(self).__name__)
         self.h_abs = stepping.first_step
@@ -205,7 +203,7 @@ class EIPSolver(OdeSolver):
         self._project_now, self._projection_status, self._last = False, OK, False
         self._buffer = self._accepted = run.y0
         if run.y0 is not start:
-            f0 = derivative(t0, run.y0.copy()).copy()
+            f0 = derivative(t0, run.y0).copy()
         self.y, self.f = run.y0, f0
         self._work.counters[NFEV] = self._calls[0]
         self._count()
@@ -244,6 +242,8 @@ class EIPSolver(OdeSolver):
         if not success:
             if not np.isfinite(solver.K).all():
                 message = f"fun returned a non-finite value at t={self.t:.10g}"
+            elif (unscaled := np.flatnonzero((self.atol == 0) & (solver.y == 0) & (solver.f == 0))).size:
+                message = _setup.without_scale(int(unscaled[0]), self.t)
             return False, message
         # SciPy keeps the value itself, and a user's function may return the same buffer again.
         solver.f = solver.f.copy()
@@ -352,35 +352,45 @@ class EIPSolver(OdeSolver):
         return out
 
 
+def _without_effect(names: Iterable[str]) -> str:
+    """What SciPy's own solvers warn of, in their words: filters made for theirs hold here too."""
+    listed = ", ".join(f"`{name}`" for name in names)
+    hints = ((name, nearest(name, OPTIONS).removeprefix("; ")) for name in names)
+    meant = "".join(f" `{name}`: {hint}" for name, hint in hints if hint)
+    return f"The following arguments have no effect for a chosen solver: {listed}.{meant}"
+
+
 def _checked(
     fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool, calls: list[int]
 ) -> tuple[Callable[[float, np.ndarray], np.ndarray], Callable[..., None]]:
     """The user's right-hand side with clear errors: as (t, y) -> (n,), maybe their buffer, and as the step calls it.
 
     The first counts in `calls`; the step counts its own. Both test the common case, an array of the right shape and
-    type, in place: this runs at every stage.
+    type, in place, and both hand out copies, because a user's function may keep or overwrite what it was given: this
+    runs at every stage.
     """
     shape = (n,)
 
     def flat(t: float, y: np.ndarray) -> np.ndarray:
-        return np.asarray(fun(t, y[:, None])).reshape(-1)
+        f = fun(t, y[:, None])
+        refuse_units(**{"fun returned": f})
+        return np.asarray(f).reshape(-1)
 
     call = flat if vectorized else fun
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
         calls[0] += 1
-        f = call(t, y)
+        f = call(t, y.copy())
         if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
             return f
-        return _setup.as_derivative(f, n, dtype).astype(dtype)
+        return _setup.as_derivative(f, n, dtype, t).astype(dtype)
 
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: Any) -> None:
-        # A copy, because a user's function may keep what it was given and `y` is a buffer.
         f = call(t, y.copy())
         if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
             out[:] = f
         else:
-            out[:] = _setup.as_derivative(f, n, dtype)
+            out[:] = _setup.as_derivative(f, n, dtype, t)
 
     return derivative, rhs
 

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from eip_scipy._inputs import refuse_units
+
 try:
     import heyoka
 except ModuleNotFoundError as error:
@@ -68,6 +70,7 @@ def run(gm: Any, y0: Any, *, t_end: float, tolerance: float | None = None) -> He
     ValueError
         When shapes disagree, `t_end` or the tolerance is no positive number, or the integration does not arrive.
     """
+    refuse_units(gm=gm, y0=y0, t_end=t_end, tolerance=tolerance)
     gm, y0 = np.array(gm, dtype=float), np.array(y0, dtype=float)
     if gm.ndim != 1 or y0.shape != (6 * gm.size,):
         raise ValueError(f"gm has shape {gm.shape} and the state {y0.shape}; expected (N,) and (6 N,)")

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from eip_scipy._inputs import refuse_units
 from eip_scipy.problems.solar_data import AU_KM, SOLAR_SYSTEM_JSON, SolarSystemData, gm_from_km3_s2, to_barycentre
 
 __all__ = ["constants", "heliocentric", "initial_data", "kernel_path", "main", "mass_parameters"]
@@ -228,6 +229,7 @@ def heliocentric(
         A time is outside the kernel's span, which is named, or the kernel lacks a body.
     """
     day, rest = _two_part(epoch_jd_tdb)
+    refuse_units(days=days)
     path = kernel_path(path)
     whole = np.round(days)
     with _open(path) as kernel:
@@ -258,6 +260,11 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _two_part(epoch: float | tuple[float, float]) -> tuple[float, float]:
     """Whole and fractional day: the kernel keeps their seconds apart."""
+    if hasattr(epoch, "jd1"):
+        raise TypeError(
+            f"epoch_jd_tdb: got the time {epoch!r}, expected a Julian date in TDB; with astropy (t.tdb.jd1, t.tdb.jd2)."
+        )
+    refuse_units(epoch_jd_tdb=epoch)
     first, second = epoch if isinstance(epoch, tuple | list) else (epoch, 0.0)
     if not (math.isfinite(first) and math.isfinite(second)):
         raise ValueError(f"expected a finite Julian date, got {epoch!r}")

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from eip_scipy._inputs import refuse_units
+
 try:
     import rebound
 except ModuleNotFoundError as error:
@@ -321,8 +323,8 @@ def problem_from_simulation(
 
 
 def _check_state(gm: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-    gm = np.array(gm, dtype=float)
-    y = np.array(y, dtype=float)
+    refuse_units(gm=gm, y=y)
+    gm, y = np.array(gm, dtype=float), np.array(y, dtype=float)
     if gm.ndim != 1 or gm.size < 2:
         raise ValueError(f"gm must hold at least two bodies in one dimension, got shape {gm.shape}")
     if y.shape != (6 * gm.size,):
@@ -342,6 +344,7 @@ def _check_integrator(integrator: str, gm: np.ndarray) -> None:
 
 
 def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
+    refuse_units(h=h, t_end=t_end)
     if not (h > 0 and math.isfinite(h)):
         raise ValueError(f"h must be positive and finite, got {h!r}")
     if (n_steps is None) == (t_end is None):

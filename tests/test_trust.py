@@ -414,9 +414,7 @@ def test_what_a_resumed_run_says_is_what_a_whole_one_says(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         integrate(pendulum(0.2), (0, 20), [2.0, 0.0], checkpoint=tmp_path / "run.npz", callback=stop, **options)
     with pytest.warns(ProjectionWarning):
-        resumed = integrate(
-            pendulum(0.2), (0, 20), [2.0, 0.0], checkpoint=tmp_path / "run.npz", resume=True, **options
-        )
+        resumed = integrate(pendulum(0.2), (0, 20), [2.0, 0.0], checkpoint=tmp_path / "run.npz", resume=True, **options)
     np.testing.assert_array_equal(resumed.y, whole.y)
     assert resumed.diagnostics.worst == whole.diagnostics.worst
     assert resumed.diagnostics.message == whole.diagnostics.message

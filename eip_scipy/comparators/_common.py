@@ -14,6 +14,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 
+from .._inputs import reals, refuse_units, shown
 from .._setup import check_fixed_step, fixed_steps
 
 __all__ = [
@@ -58,14 +59,16 @@ class FixedStepResult:
 
 def check_span(t_span: Any) -> tuple[float, float]:
     """Start and end as floats; ValueError for anything but two finite numbers."""
-    span = np.asarray(t_span, dtype=float)
-    if span.shape != (2,) or not np.isfinite(span).all():
-        raise ValueError(f"t_span must hold two finite numbers, got {t_span!r}")
+    refuse_units(t_span=t_span)
+    span = reals(t_span)
+    if span is None or span.shape != (2,) or not np.isfinite(span).all():
+        raise ValueError(f"t_span must hold two finite numbers, got {shown(t_span)}")
     return float(span[0]), float(span[1])
 
 
 def real_vector(values: Any, name: str) -> np.ndarray:
     """Copy a 1-D array of real numbers to contiguous float64."""
+    refuse_units(**{name: values})
     if np.iscomplexobj(values):
         raise TypeError(f"{name} must be real, got complex numbers")
     if np.ma.is_masked(values):

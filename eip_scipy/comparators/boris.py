@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numba.extending import register_jitable
 
+from .._inputs import refuse_units
 from ._common import FixedStepResult, check_state, drive_signature, drive_steps, integrate_in_place
 
 __all__ = ["boris"]
@@ -79,6 +80,7 @@ def boris(
     y = check_state(y0)
     if y.size != 6:
         raise ValueError(f"y0 must hold position and velocity, 6 components, got {y.size}")
+    refuse_units(mass=mass, charge=charge)
     if not (mass > 0 and np.isfinite(mass) and np.isfinite(charge)):
         raise ValueError(f"mass must be positive and charge finite, got {mass!r} and {charge!r}")
     constants = np.array([charge / mass])

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from .._inputs import refuse_units
+
 __all__ = ["Problem"]
 
 
@@ -64,6 +66,9 @@ class Problem:
     units: str = ""
     reference: Callable[[float], np.ndarray | None] | None = None
     source: str = ""
+
+    def __post_init__(self) -> None:
+        refuse_units(y0=self.y0, t_span=self.t_span, h=self.h, params=self.params, metric=self.metric, frame=self.frame)
 
 
 def bind(rhs: Callable[..., None], params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .._inputs import refuse_units
 from .._names import nearest
 from ..invariants import Invariant
 from . import _einstein, _gravity
@@ -67,6 +68,9 @@ class ForceConstants:
     pole: Sequence[float] | None = None
     moon_body: int | None = None
     moon: float | None = None
+
+    def __post_init__(self) -> None:
+        refuse_units(c=self.c, j2=self.j2, pole=self.pole, moon=self.moon)
 
 
 NEEDS = {

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .._inputs import refuse_units
 from ..invariants import Invariant
 from ._problem import Problem, bind
 
@@ -46,6 +47,7 @@ def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: f
     Problem
         With the closed form as `reference`.
     """
+    refuse_units(omega=omega, y0=y0, t_end=t_end, h=h)
     start = np.array(y0, dtype=float)
     params = np.array([omega], dtype=float)
 

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from scipy.optimize import brentq
 
+from .._inputs import refuse_units
 from ..invariants import Invariant
 from ._problem import Problem, bind
 
@@ -82,6 +83,7 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
     ValueError
         When the eccentricity is not in [0, 1).
     """
+    refuse_units(eccentricity=eccentricity, relativistic=relativistic, t_end=t_end, h=h)
     e = float(eccentricity)
     if not 0 <= e < 1:
         raise ValueError(f"eccentricity must be in [0, 1), got {eccentricity!r}.")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .._inputs import refuse_units
 from ..invariants import Invariant
 from . import _gravity
 from . import forces as _forces
@@ -107,6 +108,7 @@ def nbody(
     frame only keeps corrections from moving the centre of mass. With "1pn" and "eih" accelerations depend on
     velocities: `acc` is None, and Nystrom methods do not apply.
     """
+    refuse_units(gm=gm, position=position, velocity=velocity, t_span=t_span, h=h)
     masses, q, v = _checked(gm, position, velocity)
     chosen = _forces.check_forces(forces)
     y0 = np.concatenate([q.ravel(), v.ravel()])

@@ -12,6 +12,7 @@ from importlib.resources import files
 
 import numpy as np
 
+from .._inputs import refuse_units
 from . import solar_data
 from ._problem import Problem
 from .nbody import nbody
@@ -79,6 +80,7 @@ def figure_eight(periods: float = 100.0) -> Problem:
     A. Chenciner, R. Montgomery, A remarkable periodic solution of the three-body problem in the case of equal masses,
     Annals of Mathematics 152 (2000) 881-901; initial data by C. Simó, there.
     """
+    refuse_units(periods=periods)
     if not (periods > 0 and np.isfinite(periods)):
         raise ValueError(f"figure_eight: periods must be positive and finite, got {periods!r}.")
     q = np.array([0.97000436, -0.24308753, 0.0])

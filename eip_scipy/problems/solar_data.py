@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from .._inputs import refuse_units
+
 __all__ = [
     "AU_KM",
     "DAY_S",
@@ -77,6 +79,9 @@ class SolarSystemData:
     axes: str
     source: str
     units: str = "AU, day"
+
+    def __post_init__(self) -> None:
+        refuse_units(gm=self.gm, position=self.position, velocity=self.velocity, epoch_jd_tdb=self.epoch_jd_tdb)
 
     @property
     def y0(self) -> np.ndarray:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .._inputs import refuse_units
 from ._problem import Problem
 from .forces import ForceConstants, check_forces
 from .nbody import nbody
@@ -62,6 +63,7 @@ def solar_system(
     ValueError
         For unknown data, units or forces, or "moon-quadrupole" with data that have no EMB.
     """
+    refuse_units(years=years, h=h)
     known = load(data) if isinstance(data, str) else data
     chosen = check_forces(forces)
     length, time = _units(units)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .._inputs import refuse_units
 from ..invariants import Invariant
 from ._problem import Problem, bind
 
@@ -78,6 +79,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
     which dt / ds is the local time scale: S. Mikkola, K. Tanikawa, Celestial Mechanics and Dynamical Astronomy 74
     (1999) 287-295.
     """
+    refuse_units(s_end=s_end)
     if problem.rhs is None:
         raise ValueError(
             f"time_transformed: the problem {problem.name!r} has no compiled right-hand side in place (rhs); "
@@ -103,6 +105,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
 
 def reaches(t: float) -> Callable[..., float]:
     """Make a terminal event for `integrate` on a transformed problem: the time is `t`."""
+    refuse_units(t=t)
     t = float(t)
 
     @njit

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..._inputs import refuse_units
 from ..._names import nearest
 from ...invariants import Invariant, JointInvariants
 from .._problem import Problem
@@ -108,6 +109,7 @@ class GrossPitaevskii:
         fft: str = "auto",
         threads: int = 1,
     ) -> None:
+        refuse_units(potential=potential, Omega=Omega, beta=beta)
         if nyquist not in NYQUIST:
             raise ValueError(f"nyquist must be 'true' or 'zero', got {nyquist!r}.")
         for name, value in (("Omega", Omega), ("beta", beta)):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..._inputs import refuse_units
 from .pointwise import float_rows, multiply, weighted_square
 from .transforms import Axes, Transforms
 
@@ -47,6 +48,7 @@ class Grid:
     """
 
     def __init__(self, shape: Any, lower: Any, upper: Any) -> None:
+        refuse_units(lower=lower, upper=upper)
         given = np.atleast_1d(np.asarray(shape))
         if given.ndim != 1 or not 1 <= given.size <= MOST_AXES or given.dtype.kind not in "iu" or np.any(given < 2):
             raise ValueError(f"Grid: shape must be one to three integers >= 2, got {shape!r}.")

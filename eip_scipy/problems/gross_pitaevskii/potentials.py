@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ..._inputs import refuse_units
+
 __all__ = ["harmonic_trap", "quartic_trap"]
 
 Potential = Callable[..., Any]
@@ -30,6 +32,7 @@ def harmonic_trap(*gamma: float) -> Potential:
     ValueError
         When called with another number of coordinates.
     """
+    refuse_units(gamma=gamma)
     return lambda *x: 0.5 * _squares(gamma, x)
 
 
@@ -47,6 +50,7 @@ def quartic_trap(alpha: float, kappa: float, *gamma: float) -> Potential:
     callable
         ``V(x[, y[, z]])``.
     """
+    refuse_units(alpha=alpha, kappa=kappa, gamma=gamma)
 
     def potential(*x: np.ndarray) -> np.ndarray:
         s = _squares(gamma, x)

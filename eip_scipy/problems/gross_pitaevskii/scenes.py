@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..._inputs import refuse_units
 from .equation import FieldProblem, GrossPitaevskii
 from .grid import Grid
 from .potentials import harmonic_trap, quartic_trap
@@ -53,6 +54,7 @@ def soliton(
     ValueError
         When beta is not negative or the amplitude not positive.
     """
+    refuse_units(amplitude=amplitude, velocity=velocity, beta=beta, length=length, t_end=t_end, h=h)
     if not beta < 0 or not amplitude > 0:
         raise ValueError(f"a bright soliton needs beta < 0 and amplitude > 0, got {beta!r} and {amplitude!r}.")
     gpe = GrossPitaevskii(Grid(points, -length / 2, length / 2), beta=beta, **options)
@@ -105,6 +107,7 @@ def plane_wave(
     ValueError
         When the modes are not whole numbers, one for each axis.
     """
+    refuse_units(amplitude=amplitude, beta=beta, t_end=t_end, h=h)
     gpe = GrossPitaevskii(Grid(shape, 0.0, 2 * pi), beta=beta, **options)
     k = np.atleast_1d(modes)
     if k.shape != (gpe.grid.dim,) or np.any(k != np.round(k)):
@@ -141,6 +144,7 @@ def rotating_packet(
     -------
     FieldProblem
     """
+    refuse_units(Omega=Omega, t_end=t_end, h=h)
     grid = Grid((points, points), -2.0, 2.0)
     gpe = GrossPitaevskii(grid, harmonic_trap(1.0, 1.0), Omega=Omega, beta=1.0, **options)
     x, y = grid.mesh()

@@ -1,0 +1,149 @@
+"""Runs with a callback at every step: as long as one likes, whatever stops them, and endless intervals."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from numba import njit
+from systems import SQUARE, oscillator
+
+from eip_scipy import EIPRK4, EIPRK45, CheckpointError, Invariant, ensemble, integrate
+
+Y0 = [1.0, 2.0]
+# Beyond a thousand doublings of a number of steps, where no float holds it any more.
+MANY = 1200
+
+
+@njit
+def jit_oscillator(t, y):
+    return np.array([y[1], -y[0]])
+
+
+@njit
+def jit_square(t, y):
+    return y[0] * y[0] + y[1] * y[1]
+
+
+@njit
+def jit_square_gradient(t, y):
+    return 2 * y
+
+
+@njit
+def passage(t, y):
+    return y[0]
+
+
+JIT_SQUARE = Invariant(jit_square, jit_square_gradient, name="S")
+FUNCTIONS = {
+    "interpreted": {"fun": oscillator, "invariants": SQUARE},
+    "compiled": {"fun": jit_oscillator, "invariants": JIT_SQUARE},
+}
+STEPS = {
+    "fixed": {"method": EIPRK4, "h": 0.01},
+    "adaptive": {"method": EIPRK45, "max_step": 0.01, "rtol": 1e-3},
+}
+
+
+def run(steps, how="interpreted", n=MANY, **options):
+    options = {**FUNCTIONS[how], **STEPS[steps], "save_every": 1, **options}
+    return integrate(options.pop("fun"), (0.0, 0.01 * n), Y0, **options)
+
+
+def many(steps, how, n, tmp_path, **options):
+    """A run of n steps with a callback at each, whole and resumed half way; returns the number of calls in each."""
+    calls = itertools.count()
+    plain = run(steps, how, n, callback=lambda t, y, d: next(calls) and None, **options)
+    assert plain.status == 0
+    assert plain.t.size >= n
+    assert next(calls) == plain.t.size
+
+    class StopError(Exception):
+        pass
+
+    def stop(t, y, d):
+        if t > 0.005 * n:
+            raise StopError
+
+    path = tmp_path / f"{steps}.npz"
+    with pytest.raises(StopError):
+        run(steps, how, n, callback=stop, checkpoint=path, **options)
+    calls = itertools.count()
+    resumed = run(steps, how, n, callback=lambda t, y, d: next(calls) and None, checkpoint=path, resume=True, **options)
+    assert resumed.status == 0
+    assert next(calls) >= 0.4 * n
+    np.testing.assert_array_equal(resumed.t, plain.t)
+    np.testing.assert_array_equal(resumed.y, plain.y)
+    return plain
+
+
+@pytest.mark.parametrize("steps", STEPS)
+@pytest.mark.parametrize("how", [pytest.param("compiled", marks=pytest.mark.needs_jit), "interpreted"])
+def test_a_callback_at_every_step(steps, how, tmp_path):
+    many(steps, how, MANY, tmp_path)
+
+
+@pytest.mark.needs_jit
+def test_a_callback_at_every_step_and_events(tmp_path):
+    found = many("fixed", "compiled", MANY, tmp_path, events=passage)
+    np.testing.assert_allclose(np.diff(found.t_events[0]), math.pi, rtol=1e-7)
+    assert found.t_events[0].size == int((0.01 * MANY + math.atan2(2, 1)) / math.pi + 0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.slow_without_jit
+@pytest.mark.parametrize(
+    ("steps", "how", "options"),
+    [
+        ("fixed", "interpreted", {}),
+        ("adaptive", "interpreted", {}),
+        ("fixed", "interpreted", {"events": lambda t, y: y[0]}),
+        pytest.param("adaptive", "compiled", {}, marks=pytest.mark.needs_jit),
+    ],
+    ids=["fixed", "adaptive", "events", "compiled"],
+)
+def test_a_hundred_thousand_callbacks(steps, how, options, tmp_path):
+    assert many(steps, how, 100_000, tmp_path, **options).t.size > 100_000
+
+
+@pytest.mark.parametrize("steps", STEPS)
+def test_endless_until_a_callback_stops_it(steps):
+    options = STEPS[steps] | {"invariants": SQUARE, "compiled": False}
+    found = integrate(oscillator, (0, math.inf), Y0, save_every=5, callback=lambda t, y, d: t > 3, **options)
+    assert found.status == 1
+    assert found.message.startswith("stopped by the callback")
+    assert 3 < found.t[-1] <= 3.06
+    np.testing.assert_allclose(found.y[0], np.cos(found.t) + 2 * np.sin(found.t), atol=1e-3)
+
+
+@pytest.mark.parametrize("options", [{}, {"t_eval": [1.0, 2.0]}, {"save_every": 1}])
+def test_endless_needs_a_callback_at_saved_steps(options):
+    """Without them it would not be called after the start, or not after the last of the times."""
+    callback = None if "save_every" in options else lambda t, y, d: t > 3
+    with pytest.raises(ValueError, match=r"t_span must be finite unless .*callback.*save_every"):
+        integrate(oscillator, (0, math.inf), Y0, method=EIPRK4, h=0.1, callback=callback, **options)
+
+
+@pytest.mark.parametrize("value", [1, "stop", [print]])
+def test_wrong_callbacks(value):
+    with pytest.raises(TypeError, match=r"callback must be a function callback\(t, y, defects\), got"):
+        integrate(oscillator, (0, 1), Y0, method=EIPRK4, h=0.1, callback=value)
+    with pytest.raises(TypeError, match=r"callback must be a function callback\(part\), got"):
+        ensemble(oscillator, (0, 1), [Y0], method=EIPRK4, h=0.1, callback=value)
+
+
+def test_a_callback_that_overwrites_its_state():
+    def callback(t, y, defects):
+        y[:] = math.nan
+        defects[:] = math.nan
+
+    plain = run("fixed", n=10)
+    np.testing.assert_array_equal(run("fixed", n=10, callback=callback).y, plain.y)
+
+
+def test_checkpoint_is_there_already(tmp_path):
+    """The harness above resumes what it means to."""
+    run("fixed", n=10, checkpoint=tmp_path / "a.npz")
+    with pytest.raises(CheckpointError):
+        run("fixed", n=10, checkpoint=tmp_path / "a.npz")
