@@ -16,6 +16,7 @@ from numba import config, from_dtype, njit, types
 from numba.core.errors import NumbaError
 from numba.extending import is_jitted
 
+from ._caching import cached_njit
 from ._octets import LANES, OCTET, octets
 from .invariants import Invariant, InvariantSet
 
@@ -262,12 +263,12 @@ WRAPPERS = {
 }
 
 
-@njit(cache=True)
+@cached_njit()
 def _no_values(t, y, values, params):
     pass
 
 
-@njit(cache=True)
+@cached_njit()
 def _no_gradients(t, y, f, G, params):
     pass
 

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, typeof, types
+from numba import typeof, types
 from numba.extending import is_jitted
 
 from . import _kernels as kn
 from . import _resume, _setup
+from ._caching import cached_njit
 from ._compile import CompiledFunctions, NotCompilableError, compile_functions, signatures, with_inlined
 from ._events import Events
 from ._interrupts import ended_by_sigterm, kept_ctrl_c, look_for_signals
@@ -143,13 +144,13 @@ def _compiled_advance(dtype: np.dtype, arguments: tuple[Any, ...]) -> Callable[.
     functions = [types.FunctionType(s) for s in (rhs, inv, grad, inv)]
     signature = types.int64(*functions, *arguments)
     whole = with_inlined(advance, next_step, finish_step)
-    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(whole)
+    return cached_njit([signature], error_model="numpy", nogil=True, _nrt=False)(whole)
 
 
 @cache
 def _compiled_values(dtype: np.dtype, arguments: tuple[Any, ...]) -> Callable[..., None]:
     inv = types.FunctionType(signatures(dtype).inv)
-    return njit([types.void(inv, *arguments)], cache=True, error_model="numpy", _nrt=False)(fill_values)
+    return cached_njit([types.void(inv, *arguments)], error_model="numpy", _nrt=False)(fill_values)
 
 
 class _Driver:
