@@ -20,6 +20,7 @@ from numba import config, from_dtype, njit, types
 from numba.core.errors import NumbaError
 from numba.extending import is_jitted
 
+from ._caching import cached_njit
 from ._octets import LANES, OCTET, octets
 from .invariants import Invariant, InvariantSet
 
@@ -325,14 +326,14 @@ def _wrap_acceleration_in_place(fun: Any, has_params: bool) -> Any:
     return njit(_second_order(_wrap_in_place(fun, has_params)))
 
 
-@njit(cache=True)
+@cached_njit()
 def _clear(out):
     """Where a function in place leaves a part as it was, NaN ends the run: not the value of another call."""
     for i in range(out.size):
         out[i] = nan
 
 
-@njit(cache=True)
+@cached_njit()
 def _clear_rows(out):
     for row in out:
         _clear(row)
@@ -364,12 +365,12 @@ WRAPPERS = {
 }
 
 
-@njit(cache=True)
+@cached_njit()
 def _no_values(t, y, values, params):
     pass
 
 
-@njit(cache=True)
+@cached_njit()
 def _no_gradients(t, y, f, G, params):
     pass
 

@@ -11,8 +11,8 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ._caching import cached_njit
 from ._lanes import abs_dot, combined_rows, dot, largest, out_of_line, remove_component, weighted_rows
 from ._octets import is_not, no_lane, where
 from ._triples import shift_and_weigh, shift_bodies, sum_bodies
@@ -100,8 +100,8 @@ def make_inner(size: int) -> Inner:
     )
 
 
-_jit = njit(cache=True, error_model="numpy", _nrt=False)
-_jit_inline = njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+_jit = cached_njit(error_model="numpy", _nrt=False)
+_jit_inline = cached_njit(error_model="numpy", _nrt=False, forceinline=True)
 
 
 @_jit

@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import config, njit, types
+from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic, lower_builtin, type_callable
 
+from ._caching import cached_njit
 from ._octets import OCTET, in_octets, over_members, spread, where
 
 __all__ = ["abs_dot", "combined_rows", "dot", "largest", "out_of_line", "remove_component", "weighted_rows"]
@@ -298,7 +299,7 @@ if config.DISABLE_JIT:
         return _numpy_sum(row[:n] * row[:n])
 
 
-_jit = njit(cache=True, error_model="numpy", _nrt=False)
+_jit = cached_njit(error_model="numpy", _nrt=False)
 
 
 @_jit

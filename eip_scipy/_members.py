@@ -17,10 +17,11 @@ from math import isnan
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, typeof, types
+from numba import typeof, types
 
 from . import _kernels as kn
 from . import _setup
+from ._caching import cached_njit
 from ._compile import ChangedShapeError, NotCompilableError, signatures
 from ._kernels import OK
 from ._resume import Keeper, settings
@@ -419,7 +420,7 @@ def _compiled_sweep(dtype: np.dtype, advance: Any, arguments: tuple[Any, ...]) -
     rhs, inv, grad = signatures(dtype)
     functions = [types.FunctionType(s) for s in (types.int64(*advance), rhs, inv, grad, inv)]
     signature = types.int64(*functions, *arguments)
-    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(sweep)
+    return cached_njit([signature], error_model="numpy", nogil=True, _nrt=False)(sweep)
 
 
 def _batch(loop: Loop) -> Batch | None:

@@ -6,7 +6,7 @@ import os
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -17,6 +17,10 @@ from ._statistics import Statistics, statistics_of
 
 __all__ = ["Chunk", "FuturesPool", "Part", "Pool", "ThreadPool", "in_order", "run_chunk", "run_elsewhere"]
 
+KEPT = (
+    "What was done is in this exception's .partial; with out= or checkpoint= the same call with resume=True goes on "
+    "from there, on another executor."
+)
 KEPT_PLANS = 4
 AHEAD = 3
 
@@ -115,19 +119,37 @@ class FuturesPool:
         return cores()
 
     def submit(self, chunk: Chunk) -> Future[Part]:
-        future = self._executor.submit(run_elsewhere, self._task, self._key, chunk)
+        try:
+            future = self._executor.submit(run_elsewhere, self._task, self._key, chunk)
+        except BrokenExecutor as error:
+            raise _broken(error, chunk) from error
+        except RuntimeError as error:
+            raise RuntimeError(f"the executor given as executor= is closed ({error}). {KEPT}") from error
         self._open.add(future)
         return future
 
     def collect(self, chunk: Chunk, ticket: Future[Part]) -> Part:
         try:
             return ticket.result()
+        except BrokenExecutor as error:
+            raise _broken(error, chunk) from error
+        except CancelledError as error:
+            raise RuntimeError(f"the executor given as executor= was closed while members ran. {KEPT}") from error
         finally:
             self._open.discard(ticket)
 
     def close(self) -> None:
         for future in self._open:
             future.cancel()
+
+
+def _broken(error: BrokenExecutor, chunk: Chunk) -> BrokenExecutor:
+    """An executor gives all up when a process dies, and does not say which of the members under way did it."""
+    last = chunk.first + len(chunk.y0s) - 1
+    return type(error)(
+        f"a worker of the executor died before members {chunk.first} to {last} came back: it was killed, or ran out of "
+        "memory, or a member ends its process (executor='dask' finds such a member and runs the others). " + KEPT
+    )
 
 
 def cores() -> int:

@@ -12,10 +12,11 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, typeof, types
+from numba import typeof, types
 
 from . import _setup
 from ._batch import finish_batch, make_advance_batch, make_lanes, make_lanes_work
+from ._caching import cached_njit
 from ._compile import NotCompilableError, signatures_of_batches, with_inlined
 from ._kernels import OK
 from ._octets import LANES
@@ -41,7 +42,7 @@ def _compiled(arguments: tuple[Any, ...]) -> Callable[..., int]:
     functions = [types.FunctionType(s) for s in signatures_of_batches()]
     signature = types.int64(*functions, *arguments)
     whole = with_inlined(advance_batch, finish_batch)
-    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(whole)
+    return cached_njit([signature], error_model="numpy", nogil=True, _nrt=False)(whole)
 
 
 def lanes_of(n: int) -> int:

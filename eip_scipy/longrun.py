@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, typeof, types
+from numba import typeof, types
 from numba.extending import is_jitted
 
 from . import _kernels as kn
 from . import _resume, _setup
+from ._caching import cached_njit
 from ._compile import (
     ChangedShapeError,
     CompiledFunctions,
@@ -158,13 +159,13 @@ def _compiled_advance(dtype: np.dtype, arguments: tuple[Any, ...]) -> Callable[.
     functions = [types.FunctionType(s) for s in (rhs, inv, grad, inv)]
     signature = types.int64(*functions, *arguments)
     whole = with_inlined(advance, next_step, finish_step)
-    return njit([signature], cache=True, error_model="numpy", nogil=True, _nrt=False)(whole)
+    return cached_njit([signature], error_model="numpy", nogil=True, _nrt=False)(whole)
 
 
 @cache
 def _compiled_values(dtype: np.dtype, arguments: tuple[Any, ...]) -> Callable[..., None]:
     inv = types.FunctionType(signatures(dtype).inv)
-    return njit([types.void(inv, *arguments)], cache=True, error_model="numpy", _nrt=False)(fill_values)
+    return cached_njit([types.void(inv, *arguments)], error_model="numpy", _nrt=False)(fill_values)
 
 
 class _Driver:

@@ -12,7 +12,10 @@ from __future__ import annotations
 import ipaddress
 import time
 import uuid
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -34,8 +37,15 @@ __all__ = ["DaskExecutor", "local_client", "pool"]
 
 ENCRYPTED = ("tls", "wss")
 WITHIN_A_PROCESS = "inproc"
+RUNNING = "running"
 # Seconds: between two looks at whether there are workers, and before a member is tried that may kill one.
 PATIENCE, GRACE = 20.0, 1.0
+# How often all workers of this machine may be lost without a result in between.
+LOSSES = 3
+KEPT = (
+    "What was done is in this exception's .partial; with out= or checkpoint= the same call with resume=True goes on "
+    "from there"
+)
 
 
 class DaskExecutor:
@@ -71,16 +81,28 @@ def local_client(workers: int | None = None) -> distributed.Client:
     Returns
     -------
     distributed.Client
+
+    Raises
+    ------
+    RuntimeError
+        When a process dies while it starts.
     """
     loopback = "127.0.0.1"
-    cluster = distributed.LocalCluster(
-        n_workers=cores() if workers is None else workers,
-        threads_per_worker=1,
-        processes=True,
-        host=loopback,
-        dashboard_address=f"{loopback}:0",
-        worker_dashboard_address=f"{loopback}:0",
-    )
+    try:
+        cluster = distributed.LocalCluster(
+            n_workers=cores() if workers is None else workers,
+            threads_per_worker=1,
+            processes=True,
+            host=loopback,
+            dashboard_address=f"{loopback}:0",
+            worker_dashboard_address=f"{loopback}:0",
+        )
+    except RuntimeError as error:
+        # Dask's own traceback shows a hundred lines of its machinery, and no more than this.
+        raise RuntimeError(
+            f"a Dask worker of this machine died while it started ({error}): was it killed, is there too little memory "
+            "for so many, or does what Dask's configuration makes it load fail? Try fewer with local_client(workers)."
+        ) from None
     return distributed.Client(cluster)
 
 
@@ -91,7 +113,10 @@ def require_secure(client: distributed.Client) -> None:
     ------
     PermissionError
         With its address, and what to do.
+    RuntimeError
+        When the client is closed.
     """
+    _require_open(client)
     information = client.scheduler_info(n_workers=-1)
     for address in (information["address"], *information["workers"]):
         if not _is_secure(address):
@@ -101,6 +126,11 @@ def require_secure(client: distributed.Client) -> None:
                 "(distributed.Security), or, on a network that nobody else reaches, pass "
                 "executor=DaskExecutor(client, allow_insecure=True)."
             )
+
+
+def _require_open(client: distributed.Client) -> None:
+    if client.status != RUNNING:
+        raise RuntimeError(f"the Dask client given as executor= is {client.status}; give an open one.")
 
 
 def _is_secure(address: str) -> bool:
@@ -128,6 +158,7 @@ def pool(executor: Any, task: Task, key: str) -> DaskPool:
     DaskPool
     """
     if isinstance(executor, DaskExecutor):
+        _require_open(executor.client)
         return DaskPool(executor.client, task, key, own=False)
     if isinstance(executor, distributed.Client):
         return DaskPool(DaskExecutor(executor).client, task, key, own=False)
@@ -143,10 +174,13 @@ class DaskPool:
     def __init__(self, client: distributed.Client, task: Task, key: str, *, own: bool) -> None:
         self._client, self._task, self._key, self._own = client, task, key, own
         self._open: set[distributed.Future] = set()
+        self._losses = 0
+        self._warned = False
 
     def capacity(self) -> int:
         """Threads of the workers that are there now; at least one, for those to come."""
-        return max(1, sum(self._client.nthreads().values()))
+        with self._connected():
+            return max(1, sum(self._client.nthreads().values()))
 
     def submit(self, chunk: Chunk) -> distributed.Future:
         return self._submit(self._task, chunk)
@@ -161,41 +195,86 @@ class DaskPool:
             return finished(self._task, plan, members)
 
     def close(self) -> None:
-        self._client.cancel(list(self._open))
+        if self._client.status == RUNNING:
+            self._client.cancel(list(self._open))
         if self._own:
             cluster = self._client.cluster
             self._client.close()
             if cluster is not None:
                 cluster.close()
 
+    @contextmanager
+    def _connected(self) -> Iterator[None]:
+        """Let errors say that the cluster is gone, where it is."""
+        try:
+            yield
+        except Exception as error:
+            if self._client.status != RUNNING:
+                what = "the Dask client was closed, or lost its scheduler,"
+            elif isinstance(error, CancelledError):
+                what = "the tasks on the Dask cluster were cancelled"
+            else:
+                raise
+            raise RuntimeError(f"{what} while members ran. {KEPT}, with an open client.") from error
+
     def _submit(self, task: Task, chunk: Chunk) -> distributed.Future:
         name = f"eip-ensemble-{chunk.first}-{uuid.uuid4().hex}"
         key = self._key if task is self._task else f"{self._key}-again"
-        future = self._client.submit(run_elsewhere, task, key, chunk, key=name, pure=False)
+        with self._connected():
+            future = self._client.submit(run_elsewhere, task, key, chunk, key=name, pure=False)
         self._open.add(future)
         return future
 
     def _result(self, future: distributed.Future) -> Part:
         try:
-            while True:
-                try:
-                    return future.result(timeout=PATIENCE)
-                except TimeoutError:
-                    self._replace_lost_workers()
+            with self._connected():
+                while True:
+                    try:
+                        part: Part = future.result(timeout=PATIENCE)
+                    except TimeoutError:
+                        self._look_after_workers()
+                    else:
+                        self._losses = 0
+                        return part
         finally:
             self._open.discard(future)
 
-    def _replace_lost_workers(self) -> None:
-        """New processes where all local ones are gone: a nanny gives up on one that dies while it starts."""
+    def _look_after_workers(self) -> bool:
+        """Whether there are any; new processes where all local ones are gone.
+
+        A nanny gives up on a process that dies while it starts, and Dask waits then without end.
+        """
+        if self._client.nthreads():
+            return True
         cluster = self._client.cluster
-        if not isinstance(cluster, distributed.LocalCluster) or self._client.nthreads():
-            return
+        if not isinstance(cluster, distributed.LocalCluster):
+            if not self._warned:
+                self._warned = True
+                warnings.warn("the Dask cluster has no workers; waiting for some", RuntimeWarning, stacklevel=2)
+            return False
+        self._losses += 1
+        if self._losses > LOSSES:
+            raise RuntimeError(
+                f"all Dask workers of this machine died, {self._losses} times in a row: while they started, or by "
+                f"the members that they ran. {KEPT}, with fewer workers perhaps: local_client(workers)."
+            )
         workers = len(cluster.worker_spec)
         cluster.scale(0)
         until = time.monotonic() + PATIENCE
         while cluster.workers and time.monotonic() < until:
             time.sleep(0.1)
         cluster.scale(workers)
+        return False
+
+    def _wait_for_workers(self) -> None:
+        """A worker that dies before its nanny knows that it has started is not replaced by it."""
+        until = time.monotonic() + PATIENCE
+        while not self._client.nthreads():
+            if time.monotonic() > until:
+                self._look_after_workers()
+                until = time.monotonic() + PATIENCE
+            time.sleep(0.1)
+        time.sleep(GRACE)
 
     def _one_by_one(self, task: Task, plan: Plan, chunk: Chunk, error: Exception) -> Iterable[Members]:
         """A chunk that killed its workers, in halves of halves: the member that does it is found, the others run."""
@@ -207,9 +286,8 @@ class DaskPool:
             return [members]
         found: list[Members] = []
         for first, last in ((0, m // 2), (m // 2, m)):
-            # A worker that dies before its nanny knows that it has started is not replaced.
-            self._client.wait_for_workers(1)
-            time.sleep(GRACE)
+            with self._connected():
+                self._wait_for_workers()
             half = Chunk(chunk.first + first, chunk.y0s[first:last], chunk.params[first:last])
             try:
                 found.append(self._result(self._submit(task, half)).members)

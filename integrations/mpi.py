@@ -9,7 +9,8 @@ Needs ``pip install "eip_scipy[mpi]"`` and an MPI library.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -35,9 +36,16 @@ except RuntimeError as error:
         "mpi4py finds no MPI library: load or install the machine's, or pip install mpich", name="mpi4py"
     ) from error
 
-__all__ = ["MPI", "gathered", "over_ranks", "total"]
+__all__ = ["MPI", "RankError", "gathered", "over_ranks", "together", "total"]
+
+# Floats of each rank that travel in one message with the flag that says whether it has failed.
+ROOM = 15
 
 OPTIONS = ("h", "vectorized", "invariants", "metric", "iterations", "every", "reuse_f", "check", "diagnostics")
+
+
+class RankError(RuntimeError):
+    """Another rank raised an error; the message is its own, with its number."""
 
 
 def gathered(comm: MPI.Comm, a: Any) -> np.ndarray:
@@ -51,11 +59,70 @@ def gathered(comm: MPI.Comm, a: Any) -> np.ndarray:
     Returns
     -------
     ndarray, shape (ranks, ...)
+
+    Raises
+    ------
+    RankError
+        When another rank has raised an error in what all do `together`.
     """
     part = np.array(a, dtype=float, order="C")  # "ascontiguousarray" would give a number an axis
-    parts = np.empty((comm.size, *part.shape))
+    size, shape = part.size, (comm.size, *part.shape)
+    # Always of one size: a rank that has failed does not know for which sum the others wait.
+    message, messages = np.zeros(1 + ROOM), np.empty((comm.size, 1 + ROOM))
+    if size <= ROOM:
+        message[1 : 1 + size] = part.reshape(-1)
+    comm.Allgather(message, messages)
+    if any(messages[:, 0].tolist()):
+        _raise_that_of_another(comm)
+    if size <= ROOM:
+        return messages[:, 1 : 1 + size].copy().reshape(shape)
+    parts = np.empty(shape)
     comm.Allgather(part, parts)
     return parts
+
+
+def _raise_that_of_another(comm: MPI.Comm) -> None:
+    texts = comm.allgather(None)
+    rank = next(rank for rank, text in enumerate(texts) if text is not None)
+    raise RankError(f"rank {rank} raised {texts[rank]}")
+
+
+@contextmanager
+def together(comm: MPI.Comm) -> Iterator[None]:
+    """What all ranks do: an error that one of them raises here ends it on all, instead of letting the others wait.
+
+    The flag travels with the sums of `total` and `gathered`, one of which stands at the end of the block too. Steps of
+    `over_ranks` are such blocks already.
+
+    Parameters
+    ----------
+    comm : mpi4py.MPI.Comm
+        That of the sums.
+
+    Raises
+    ------
+    RankError
+        On the ranks that have no error of their own, at their next sum.
+
+    Examples
+    --------
+    >>> from eip_scipy.integrations.mpi import MPI, together, total
+    >>> with together(MPI.COMM_WORLD):
+    ...     ranks = total(MPI.COMM_WORLD, 1)
+    >>> ranks == MPI.COMM_WORLD.size
+    True
+    """
+    try:
+        yield
+        gathered(comm, ())
+    except (RankError, MPI.Exception):
+        raise
+    except BaseException as error:
+        if not getattr(error, "_is_known_to_ranks", False):
+            comm.Allgather(np.ones(1 + ROOM), np.empty((comm.size, 1 + ROOM)))
+            comm.allgather(f"{type(error).__name__}: {error}")
+            error._is_known_to_ranks = True  # type: ignore[attr-defined]
+        raise
 
 
 def total(comm: MPI.Comm, a: Any) -> Any:
@@ -135,14 +202,19 @@ class _OverRanks(EIPSolver):
     COMM: MPI.Comm
 
     def __init__(self, fun: Callable[..., Any], t0: float, y0: Any, t_bound: float, **options: Any) -> None:
-        _refuse(type(self).__name__, options)
-        super().__init__(fun, t0, y0, t_bound, **options | {"metric": "euclidean", "check": False})
+        with together(self.COMM):
+            _refuse(type(self).__name__, options)
+            super().__init__(fun, t0, y0, t_bound, **options | {"metric": "euclidean", "check": False})
+            if options.get("check", True) and self._run.invariants.size:
+                _check(self.COMM, self._run.invariants, t0, self.y, self.f, options["h"])
         run = self._run
-        if options.get("check", True) and run.invariants.size:
-            _check(self.COMM, run.invariants, t0, self.y, self.f, options["h"])
         # In the place of the tableau, as a user's one-step method would be.
         run.method = _Tableau(self.COMM, run.method)  # type: ignore[arg-type, assignment]
         self._coordinates = _Coordinates(self.COMM, run, self._rhs)
+
+    def _step_impl(self) -> tuple[bool, str | None]:
+        with together(self.COMM):
+            return super()._step_impl()
 
     def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
         if not self._project_now:

@@ -106,7 +106,8 @@ class Transposition:
         ]
 
     def turn(self, field: np.ndarray) -> None:
-        """Fill `here` with the turned field."""
+        """Fill `here` with the turned field, where no rank has failed."""
+        gathered(self._comm, ())
         for y, block in self._blocks:
             np.copyto(block, field[:, y])
         self.here[self.slab.part] = field[:, self.turned.part]

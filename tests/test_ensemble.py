@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -486,6 +487,66 @@ def test_threads_of_the_user():
     with ThreadPoolExecutor(2) as executor:
         run = ensemble(oscillator, (0, 1), np.ones((9, 2)), h=0.1, executor=executor, chunk=2)
     same(run, ensemble(oscillator, (0, 1), np.ones((9, 2)), h=0.1))
+
+
+def ends_its_process(t, y):
+    if y[0] > 100.0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return np.array([y[1], -y[0]])
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
+def test_a_process_that_dies(tmp_path):
+    """The executor is beyond repair then; what came back is kept, and the rest runs on another one."""
+    y0s = np.ones((12, 2))
+    y0s[7] = [99.9, 10.0]  # dies after its start, which is tried here too
+    options = {"h": 0.1, "chunk": 3, "checkpoint": tmp_path / "kept", "compiled": False}
+    with (
+        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as executor,
+        pytest.raises(BrokenProcessPool, match=r"worker of the executor died before members \d to \d+ came") as info,
+    ):
+        ensemble(ends_its_process, (0, 1), y0s, executor=executor, **options)
+    done = int((info.value.partial.status == 0).sum())
+    assert done in (0, 3, 6)  # those that had come back before
+    with pytest.raises(BrokenProcessPool, match=r"died before members .*resume=True goes on from there, on another"):
+        ensemble(ends_its_process, (0, 1), y0s, executor=executor, resume=True, **options)
+    y0s[7] = 1.0
+    ran = []
+    del options["checkpoint"]
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as executor:
+        run = ensemble(
+            ends_its_process, (0, 1), y0s, executor=executor, callback=lambda part: ran.append(part.first), **options
+        )
+    assert run.success
+    assert ran == [0, 3, 6, 9]
+
+
+def test_a_closed_executor():
+    executor = ThreadPoolExecutor(1)
+    executor.shutdown()
+    with pytest.raises(RuntimeError, match=r"the executor given as executor= is closed \(cannot schedule") as info:
+        ensemble(oscillator, (0, 1), np.ones((4, 2)), h=0.1, executor=executor)
+    assert info.value.partial.status.tolist() == [-2] * 4
+
+
+@pytest.mark.parametrize("cancel", [True, False])
+def test_an_executor_that_is_closed_meanwhile(cancel, tmp_path):
+    """Where what was handed to it still comes back, that is kept too."""
+    executor = ThreadPoolExecutor(1)
+    options = {"h": 0.1, "chunk": 1, "checkpoint": tmp_path / "kept", "compiled": False}
+    y0s = np.ones((100, 2))
+
+    def callback(part):
+        executor.shutdown(wait=False, cancel_futures=cancel)
+
+    with pytest.raises(RuntimeError, match=r"the executor given as executor= (is|was) closed") as info:
+        ensemble(oscillator, (0, 1), y0s, executor=executor, callback=callback, **options)
+    done = int((info.value.partial.status == 0).sum())
+    assert 1 <= done < 100
+    ran = []
+    run = ensemble(oscillator, (0, 1), y0s, resume=True, callback=lambda part: ran.append(part.first), **options)
+    assert run.success
+    assert ran[0] == done
 
 
 # Stores.

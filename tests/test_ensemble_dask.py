@@ -1,9 +1,12 @@
 """Ensembles on Dask: the same bits on any number of workers, lost workers, poisonous members, who may connect."""
 
+import itertools
 import os
 import signal
 import threading
 import time
+import traceback
+from concurrent.futures import CancelledError
 from types import SimpleNamespace
 
 import numpy as np
@@ -134,6 +137,49 @@ def test_a_member_that_kills_its_workers_is_found(pair):
 
 
 @slow
+def test_a_member_that_kills_its_workers_as_dask_is_set_up():
+    """Three tries of the chunk, and of each of its parts; the workers are new each time."""
+    y0s = np.ones((4, 2))
+    y0s[2] = [99.9, 10.0]
+    client = local_client(1)
+    try:
+        run = ensemble(deadly, (0, 1), y0s, h=0.1, chunk=2, executor=client)
+    finally:
+        client.close()
+        client.cluster.close()
+    assert run.failed.tolist() == [2]
+
+
+def slow_oscillator(t, y):
+    time.sleep(2e-3)
+    return np.array([y[1], -y[0]])
+
+
+@slow
+def test_all_workers_are_killed_in_the_middle_of_their_tasks(pair):
+    y0s = np.random.default_rng(0).standard_normal((12, 2))
+    options = {"h": 0.05, "chunk": 3, "compiled": False}
+    timer = threading.Timer(1.0, lambda: [os.kill(pid, signal.SIGKILL) for pid in pids])
+    pids = list(pair.run(os.getpid).values())
+    timer.start()
+    there = ensemble(slow_oscillator, (0, 10), y0s, executor=pair, **options)
+    timer.join()
+    same(ensemble(oscillator, (0, 10), y0s, **options), there)
+
+
+@slow
+def test_workers_that_die_while_they_start(tmp_path):
+    (tmp_path / "die.py").write_text("import os; os._exit(3)", encoding="utf-8")
+    with (
+        dask.config.set({"distributed.worker.preload": [str(tmp_path / "die.py")]}),
+        pytest.raises(RuntimeError, match="a Dask worker of this machine died while it started") as info,
+    ):
+        ensemble(oscillator, (0, 1), np.ones((4, 2)), h=0.1, executor="dask")
+    assert info.value.__suppress_context__
+    assert info.value.partial.status.tolist() == [-2] * 4
+
+
+@slow
 def test_nothing_listens_beyond_this_machine(pair, others):
     found = listening() - others
     assert found
@@ -161,6 +207,38 @@ def oscillator(t, y):
     return np.array([y[1], -y[0]])
 
 
+def test_a_short_error_for_workers_that_die_while_they_start(monkeypatch):
+    def cluster(**options):
+        raise RuntimeError("Nanny failed to start.")
+
+    monkeypatch.setattr(integration.distributed, "LocalCluster", cluster)
+    with pytest.raises(RuntimeError, match=r"died while it started \(Nanny failed to start\.\).*Try fewer") as info:
+        local_client(2)
+    assert "\n" not in "".join(traceback.format_exception_only(info.value)).strip()
+    assert info.value.__suppress_context__
+
+
+def test_a_closed_client(tmp_path):
+    client = distributed.Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None)
+    executor, y0s = DaskExecutor(client), np.ones((40, 2))
+    options = {"h": 0.1, "chunk": 1, "compiled": False, "checkpoint": tmp_path / "kept"}
+    with pytest.raises(RuntimeError, match="the Dask client was closed, or lost its scheduler, while members") as info:
+        ensemble(oscillator, (0, 1), y0s, executor=client, callback=lambda part: client.close(), **options)
+    done = int((info.value.partial.status == 0).sum())
+    assert 1 <= done < 40
+    for closed in (client, executor):
+        with pytest.raises(
+            RuntimeError, match="the Dask client given as executor= is closed; give an open one"
+        ) as info:
+            ensemble(oscillator, (0, 1), y0s, executor=closed, resume=True, **options)
+        assert (info.value.partial.status == 0).sum() == done
+    ran = []
+    assert ensemble(
+        oscillator, (0, 1), y0s, resume=True, callback=lambda part: ran.append(part.first), **options
+    ).success
+    assert ran[0] == done
+
+
 def test_workers_in_this_process():
     y0s = np.random.default_rng(0).standard_normal((20, 2))
     y0s[7] = np.nan
@@ -186,7 +264,7 @@ class Asked:
 class Lost:
     """A client whose workers die of the member 13, and of nothing else; results come at the second asking."""
 
-    cluster = None
+    cluster, status = None, "running"
 
     def submit(self, function, task, plan, chunk, *, key, pure):
         late = []
@@ -202,10 +280,7 @@ class Lost:
         return Asked(result)
 
     def nthreads(self):
-        return {}
-
-    def wait_for_workers(self, n):
-        assert n == 1
+        return {"tcp://127.0.0.1:1": 1}
 
     def cancel(self, futures):
         assert not futures
@@ -225,8 +300,86 @@ def test_halves_of_halves(monkeypatch):
     assert run.statistics.count.tolist() == [19]
 
 
+class Cluster:
+    """A local cluster whose workers are gone, and do not come back; it counts how often they were asked to."""
+
+    worker_spec, workers = (0, 1), ()
+
+    def __init__(self):
+        self.scaled = []
+
+    def scale(self, workers):
+        self.scaled.append(workers)
+
+
+class Deserted:
+    """A client without workers, whose results do not come for a while."""
+
+    status = "running"
+
+    def __init__(self, cluster, results):
+        self.cluster, self._results, self._first = cluster, results, True
+
+    def submit(self, function, task, plan, chunk, *, key, pure):
+        def result(timeout):
+            answer = next(self._results)
+            if isinstance(answer, Exception):
+                raise answer
+            return function(task, plan, chunk)
+
+        return Asked(result)
+
+    def nthreads(self):
+        return {}
+
+    def cancel(self, futures):
+        pass
+
+
+def in_turn(*answers):
+    return itertools.chain(answers, itertools.repeat(None))
+
+
+def deserted(cluster, *answers):
+    return ensemble(
+        oscillator, (0, 1), np.ones((4, 2)), h=0.1, chunk=2, compiled=False,
+        executor=DaskExecutor(Deserted(cluster, in_turn(*answers)), allow_insecure=True),
+    )  # fmt: skip
+
+
+def test_workers_that_do_not_come_back(monkeypatch):
+    monkeypatch.setattr(integration.distributed, "LocalCluster", Cluster)
+    cluster = Cluster()
+    with pytest.raises(RuntimeError, match="all Dask workers of this machine died, 4 times in a row") as info:
+        deserted(cluster, *[TimeoutError()] * 10)
+    assert cluster.scaled == [0, 2] * 3
+    assert info.value.partial.status.tolist() == [-2] * 4
+    assert deserted(Cluster(), *[TimeoutError()] * 3).success
+    assert deserted(Cluster(), *[TimeoutError()] * 3, None, *[TimeoutError()] * 3).success
+
+
+def test_a_cluster_without_workers_is_waited_for():
+    """As one that waits for its jobs to start; told once."""
+    with pytest.warns(RuntimeWarning, match="the Dask cluster has no workers; waiting for some") as record:
+        assert deserted(None, *[TimeoutError()] * 10).success
+    assert len(record) == 1
+
+
+def test_tasks_that_are_cancelled():
+    with pytest.raises(RuntimeError, match="the tasks on the Dask cluster were cancelled while members ran") as info:
+        deserted(None, None, CancelledError("by the user"))
+    assert info.value.partial.status.tolist() == [0, 0, -2, -2]
+
+
+def test_other_errors_stay_what_they_are():
+    with pytest.raises(TypeError, match="a number"):
+        deserted(None, TypeError("expected a number"))
+
+
 class Client:
     """What `require_secure` asks a client."""
+
+    status = "running"
 
     def __init__(self, scheduler, *workers):
         self._found = {"address": scheduler, "workers": dict.fromkeys(workers)}

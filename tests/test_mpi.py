@@ -104,6 +104,97 @@ def test_a_sum_that_is_missing(tmp_path):
     assert on_ranks(2, "run.py", cwd=tmp_path).count(message) == 2
 
 
+FAILING = """
+    import numpy as np
+    from scipy.integrate import solve_ivp
+    from eip_scipy import EIPRK4, Invariant
+    from eip_scipy.integrations.mpi import MPI, RankError, over_ranks, together, total
+    from eip_scipy.integrations.mpi_fields import SlabGrossPitaevskii
+    from eip_scipy.problems import Grid
+
+    comm = MPI.COMM_WORLD
+    calls = {}
+
+    def at(where, value):
+        # Rank 1 raises in the so many-th call of one function.
+        if where != failing[0] or comm.rank != 1:
+            return value
+        calls[where] = calls.get(where, 0) + 1
+        if calls[where] == failing[1]:
+            raise failing[2]("beyond the data")
+        return value
+
+    def fun(t, y):
+        return at("fun", np.array([y[1], -y[0]]))
+
+    def mass(t, y):
+        own = at("before the sum", y @ y)
+        return at("after the sum", total(comm, own))
+
+    def gradient(t, y):
+        return at("gradient", 2 * y)
+
+    gpe = SlabGrossPitaevskii(Grid((8, 6), -3, 3), beta=1.0)
+
+    def field(t, y):
+        return at("field", gpe.fun(t, y))
+
+    def run():
+        if failing[0] == "field":
+            psi = np.exp(-sum(x * x for x in gpe.grid.mesh())).astype(complex).ravel()
+            kept = gpe.invariants("mass")
+            return solve_ivp(field, (0, 0.05), psi, method=over_ranks(EIPRK4), h=0.01, invariants=kept)
+        kept = Invariant(mass, gradient, name="mass")
+        with together(comm):
+            sol = solve_ivp(fun, (0, 0.5), [1.0, 0.0], method=over_ranks(EIPRK4), h=0.1, invariants=kept)
+            at("the loop", None)
+        return sol
+
+    def outcome():
+        try:
+            return run().message
+        except BaseException as error:
+            return f"{type(error).__name__}: {error}"
+
+    failing = ("nowhere", 1, ValueError)
+    run()
+    # In the first call, in the middle, in the last one.
+    for where, last in (("fun", 21), ("before the sum", 12), ("after the sum", 12), ("gradient", 6), ("field", 21),
+                        ("the loop", 1)):
+        for call in sorted({1, 2, 3, last // 2, last - 1, last} - {0}):
+            for kind in (ValueError, KeyboardInterrupt) if call == last else (ValueError,):
+                calls.clear()
+                failing = where, call, kind
+                texts = comm.gather(outcome())
+                if comm.rank == 0:
+                    print(where, call, kind.__name__, *texts, sep="|")
+    failing = ("nowhere", 1, ValueError)
+    texts = comm.gather(outcome())
+    if comm.rank == 0:
+        print(*texts, sep="|")
+"""
+
+
+@pytest.mark.needs_jit
+@needs_mpirun
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_a_rank_that_raises(ranks, tmp_path):
+    """Wherever it is: the others end with its message, nobody waits, and the communicator is as good as before."""
+    (tmp_path / "run.py").write_text(textwrap.dedent(FAILING), encoding="utf-8")
+    *lines, last = on_ranks(ranks, "run.py", cwd=tmp_path).strip().split("\n")
+    assert len(lines) > 20
+    for line in lines:
+        _, call, kind, *texts = line.split("|")
+        own = f"{kind}: beyond the data"
+        if texts[1] != own:  # fewer calls than that
+            assert len(set(texts)) == 1, line
+            assert int(call) > 1, line
+            continue
+        assert texts[0] == f"RankError: rank 1 raised {own}", line
+        assert set(texts[2:]) <= {texts[0]}, line
+    assert set(last.split("|")) == {"The solver successfully reached the end of the integration interval."}
+
+
 # On one rank.
 
 
@@ -183,9 +274,24 @@ def test_parts_cover_the_grid():
     np.testing.assert_array_equal(gpe.part(psi), gpe.gather(psi))
 
 
-def test_sums_are_in_the_order_of_the_ranks():
-    assert gathered(MPI.COMM_SELF, [[1, 2]]).shape == (1, 1, 2)
+@pytest.mark.parametrize("shape", [(), (0,), (1, 2), (15,), (16,), (3, 7)])
+def test_sums_are_in_the_order_of_the_ranks(shape):
+    """Of the sizes that travel with the flag, and of larger ones."""
+    a = np.random.default_rng(0).standard_normal(shape)
+    found = gathered(MPI.COMM_SELF, a)
+    assert found.shape == (1, *shape)
+    np.testing.assert_array_equal(found[0], a)
     assert total(MPI.COMM_SELF, 0.1) == 0.1
+
+
+def test_an_error_on_a_single_rank():
+    def fun(t, y):
+        if t > 0.5:
+            raise ValueError("beyond the data")
+        return -y
+
+    with pytest.raises(ValueError, match="beyond the data"):
+        solve_ivp(fun, (0, 1), [1.0], method=ALONE, h=0.1)
 
 
 @pytest.mark.parametrize(("grid", "ranks"), [(Grid(8, 0, 1), 1), (Grid((8, 3), 0, 1), 4)])

@@ -12,8 +12,8 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from .._caching import cached_njit
 from .._setup import check_fixed_step, fixed_steps
 from ..problems import GrossPitaevskii
 from ._common import check_span, saved_steps
@@ -23,7 +23,7 @@ __all__ = ["FieldResult", "FixedPoint", "Scheme", "march", "multiply_modes"]
 MOST_ITERATIONS = 100
 WARM_STEPS = 3  # after which each branch of a scheme has been taken
 
-jit = njit(cache=True, error_model="numpy")
+jit = cached_njit(error_model="numpy")
 
 
 @dataclass(frozen=True)

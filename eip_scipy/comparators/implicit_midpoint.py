@@ -7,9 +7,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 
+from .._caching import cached_njit
 from ._common import FixedStepResult, check_state, drive_signature, drive_steps, integrate_in_place
 
 __all__ = ["implicit_midpoint"]
@@ -118,4 +118,4 @@ def _drive(rhs, extra, t0, h, last_step, saved, constants, work, count, y, ys):
 @cache
 def _compiled_drive(n_extra: int) -> Callable[..., None]:
     """`_drive` compiled once for all functions, typed as first-class functions; found in Numba's cache afterwards."""
-    return njit(drive_signature(n_extra), cache=True, error_model="numpy")(_drive)
+    return cached_njit(drive_signature(n_extra), error_model="numpy")(_drive)

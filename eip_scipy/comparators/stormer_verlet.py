@@ -9,10 +9,11 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
+from .._caching import cached_njit
 from .._setup import check_fixed_step, fixed_steps
 from ._common import FixedStepResult, check_span, check_state, message, real_vector, saved_steps
 
@@ -182,10 +183,10 @@ def _compiled_drive(n_extra: int) -> Callable[..., None]:
         vector,
         types.float64[:, ::1],
     )
-    return njit(signature, cache=True, error_model="numpy")(_drive)
+    return cached_njit(signature, error_model="numpy")(_drive)
 
 
-@njit(cache=True, error_model="numpy")
+@cached_njit(error_model="numpy")
 def _add(x: np.ndarray, c: float, dx: np.ndarray) -> None:
     """Add c dx to x. Compiled in interpreted runs as well, so that both give the same bits."""
     for i in range(x.size):

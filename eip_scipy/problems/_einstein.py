@@ -18,8 +18,8 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba import njit
 
+from .._caching import cached_njit
 from . import _gravity
 
 __all__ = [
@@ -33,8 +33,8 @@ __all__ = [
     "momentum_gradient",
 ]
 
-_jit = njit(cache=True, error_model="numpy", _nrt=False)
-_jit_allocating = njit(cache=True, error_model="numpy")
+_jit = cached_njit(error_model="numpy", _nrt=False)
+_jit_allocating = cached_njit(error_model="numpy")
 
 
 @_jit

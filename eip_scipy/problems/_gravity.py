@@ -24,11 +24,12 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import config, njit, types
+from numba import config, types
 from numba.core import cgutils
 from numba.core.errors import TypingError
 from numba.extending import intrinsic
 
+from .._caching import cached_njit
 from .._octets import OCTET, in_octets, multiply_add, on_stack, over_members, spread
 
 __all__ = ["acc", "energy", "energy_gradient", "momentum", "momentum_gradient", "rhs"]
@@ -356,8 +357,8 @@ if config.DISABLE_JIT:
         return total
 
 
-_jit = njit(cache=True, error_model="numpy", _nrt=False)
-_jit_allocating = njit(cache=True, error_model="numpy")
+_jit = cached_njit(error_model="numpy", _nrt=False)
+_jit_allocating = cached_njit(error_model="numpy")
 
 
 @_jit

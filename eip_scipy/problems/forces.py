@@ -16,8 +16,8 @@ from math import exp, expm1, isfinite, sqrt
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from .._caching import cached_njit
 from .._inputs import refuse_units
 from .._names import nearest
 from ..invariants import Invariant
@@ -194,8 +194,8 @@ def _small_second_order(params: np.ndarray, y0: np.ndarray) -> bool:
     return bool(v2.max() * params[n + OVER_C2] * added.max(initial=0.0) < KEPT)
 
 
-_jit = njit(cache=True, error_model="numpy", _nrt=False)
-_jit_allocating = njit(cache=True, error_model="numpy")
+_jit = cached_njit(error_model="numpy", _nrt=False)
+_jit_allocating = cached_njit(error_model="numpy")
 
 
 @_jit

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from .._caching import cached_njit
 from .._inputs import refuse_units
 from ..invariants import Invariant
 from ._problem import Problem, bind
@@ -14,18 +14,18 @@ from ._problem import Problem, bind
 __all__ = ["harmonic"]
 
 
-@njit(cache=True)
+@cached_njit()
 def _rhs(t, y, out, params):
     out[0] = params[0] * y[1]
     out[1] = -params[0] * y[0]
 
 
-@njit(cache=True)
+@cached_njit()
 def _energy(t, y, params):
     return 0.5 * params[0] * (y[0] * y[0] + y[1] * y[1])
 
 
-@njit(cache=True)
+@cached_njit()
 def _energy_gradient(t, y, out, params):
     out[0] = params[0] * y[0]
     out[1] = params[0] * y[1]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba import njit
 from scipy.optimize import brentq
 
+from .._caching import cached_njit
 from .._inputs import refuse_units
 from ..invariants import Invariant
 from ._problem import Problem, bind
@@ -15,7 +15,7 @@ from ._problem import Problem, bind
 __all__ = ["kepler"]
 
 
-@njit(cache=True)
+@cached_njit()
 def _rhs(t, y, out, params):
     r2 = y[0] * y[0] + y[1] * y[1]
     w = 1.0 / (r2 * sqrt(r2))
@@ -26,21 +26,21 @@ def _rhs(t, y, out, params):
     out[3] = -w * y[1]
 
 
-@njit(cache=True)
+@cached_njit()
 def _acc(t, q, params):
     r2 = q[0] * q[0] + q[1] * q[1]
     w = 1.0 / (r2 * sqrt(r2))
     return -(w + 1.5 * params[0] * w / r2) * q
 
 
-@njit(cache=True)
+@cached_njit()
 def _energy(t, y, params):
     r2 = y[0] * y[0] + y[1] * y[1]
     r = sqrt(r2)
     return 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1.0 / r - 0.5 * params[0] / (r * r2)
 
 
-@njit(cache=True)
+@cached_njit()
 def _energy_gradient(t, y, f, out, params):
     out[0] = -f[2]
     out[1] = -f[3]
@@ -48,12 +48,12 @@ def _energy_gradient(t, y, f, out, params):
     out[3] = y[3]
 
 
-@njit(cache=True)
+@cached_njit()
 def _momentum(t, y, params):
     return y[0] * y[3] - y[1] * y[2]
 
 
-@njit(cache=True)
+@cached_njit()
 def _momentum_gradient(t, y, out, params):
     out[0] = y[3]
     out[1] = -y[2]

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numba.extending import is_jitted
 
+from .._caching import cached_njit
 from ._particle_equations import (
     FieldFunctions,
     curl,
@@ -25,7 +26,7 @@ from ._particle_equations import (
 
 __all__ = ["TOKAMAK", "UNIFORM", "ParticleField"]
 
-_jit = njit(cache=True, error_model="numpy", _nrt=False)
+_jit = cached_njit(error_model="numpy", _nrt=False)
 DIFFERENCE_STEP = 2.0**-7  # of the field's length
 AGREEMENT = 1e-6  # of functions of the field that must go together
 ROUND_OFF = 1e-10  # of a difference, where the true one is 0

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .._caching import cached_njit
 from .._inputs import refuse_units
 from ..invariants import Invariant
 from ._problem import Problem, bind
@@ -21,7 +22,7 @@ from ._problem import Problem, bind
 __all__ = ["centre_time", "pair_time", "reaches", "time_transformed"]
 
 
-@njit(cache=True)
+@cached_njit()
 def centre_time(y, params):
     """Time scale r^(3/2) of motion around one centre with G M = 1: the choice of g for `kepler`."""
     r2 = 0.0
@@ -31,7 +32,7 @@ def centre_time(y, params):
     return r * sqrt(r)
 
 
-@njit(cache=True)
+@cached_njit()
 def pair_time(y, params):
     """Time scale of the closest pair of N bodies, smooth in all: (sum over pairs of (Gm_i + Gm_j) / r^3)^(-1/2)."""
     rate2 = 0.0

@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from ..._caching import cached_njit
 
 __all__ = ["Moments", "expansion", "moments", "shifted", "total_mass"]
 
 # Sums in the order that suits the processor's vectors; called from Python only, so that they have one order each.
-_jit = njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+_jit = cached_njit(error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 
 
 class Moments(NamedTuple):

@@ -7,7 +7,8 @@ numbers, not of one over all.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from ..._caching import cached_njit
 
 __all__ = [
     "add_potential",
@@ -23,7 +24,7 @@ __all__ = [
     "weighted_square",
 ]
 
-_jit = njit(cache=True, error_model="numpy")
+_jit = cached_njit(error_model="numpy")
 
 # pi / 2 in two parts (Cody & Waite): whole multiples of the first, up to 2^20 of them, are exact.
 QUARTER = float.fromhex("0x1.921fb544p+0")
