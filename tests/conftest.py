@@ -19,6 +19,11 @@ hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if config.option.markexpr == "not slow":
+        terminalreporter.write_line("slow tests were left out; to run them: python -m pytest -m slow")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if not numba.config.DISABLE_JIT:
         return
