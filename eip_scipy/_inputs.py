@@ -159,22 +159,25 @@ def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any
     ValueError
         When it leaves a part as it is, or reads what was there.
     """
-    out = np.full(shape, complex(math.nan, math.nan) if dtype.kind == "c" else math.nan, dtype)
+    out, ones = np.empty(shape, dtype), np.empty(shape, dtype)
+    found, other = out.view(float), ones.view(float)
+    found.fill(math.nan)
     returned = call(out)
     if returned is not None and not (isinstance(returned, np.ndarray) and np.may_share_memory(returned, out)):
         raise TypeError(
             f"{what} returned {shown(returned)}, but with in_place=True it must fill its argument out and return "
             f"nothing, at t={t:.10g}. Write out[:] = ..., or leave in_place=True out."
         )
-    if not np.isnan(out).any():
+    if not np.isnan(found).any():
         return out
-    ones = np.ones(shape, dtype)
+    other.fill(1.0)
     call(ones)
     for places, does in (
-        (np.isnan(out) & (ones == 1), "does not fill all of its argument out"),
-        (np.isnan(out) & ~np.isnan(ones), "reads its argument out, which holds anything, before it fills it"),
+        (np.isnan(found) & (other == 1), "does not fill all of its argument out"),
+        (np.isnan(found) & ~np.isnan(other), "reads its argument out, which holds anything, before it fills it"),
     ):
         if places.any():
-            first = ", ".join(map(str, np.argwhere(places)[0]))
-            raise ValueError(f"{what} {does}, in component {first}, at t={t:.10g}.")
+            *row, component = np.argwhere(places)[0].tolist()
+            where = ", ".join(map(str, (*row, component * shape[-1] // found.shape[-1])))
+            raise ValueError(f"{what} {does}, in component {where}, at t={t:.10g}.")
     return out

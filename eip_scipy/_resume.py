@@ -15,7 +15,7 @@ import numpy as np
 
 from . import checkpoint
 from ._events import Events
-from ._inputs import is_number
+from ._inputs import is_number, shown
 from ._interrupts import TerminatedError
 from ._own_file import OwnFile, unlocked
 from ._setup import DIRECTIONS, Run, Stepping
@@ -86,7 +86,7 @@ def kept(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
     if not isinstance(resume, (bool, np.bool_)):
         raise ValueError(f"resume must be True or False, got {resume!r}.")
     if not is_number(every) or not every > 0:
-        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {every!r}.")
+        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
     if path is None:
         if resume:
             raise ValueError("resume=True needs the file to resume from: checkpoint=path.")

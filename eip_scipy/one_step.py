@@ -172,7 +172,7 @@ def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.nd
     if value is None:
         raise TypeError(f"{came} None, expected {n} numbers, at t={t:.10g} (does it end without a return?).")
     # Of a list the first item tells: a look at all of them, at every stage, would take longer than the function.
-    if not (type(value) is list and value and type(value[0]) in NUMBERS):
+    if not (type(value) in (list, tuple) and value and type(value[0]) in NUMBERS):
         refuse_units(**{came.removesuffix(":"): value})
     try:
         a = np.asarray(value)

@@ -243,7 +243,9 @@ class EIPSolver(OdeSolver):
             if not np.isfinite(solver.K).all():
                 message = f"fun returned a non-finite value at t={self.t:.10g}"
             elif (unscaled := np.flatnonzero((self.atol == 0) & (solver.y == 0) & (solver.f == 0))).size:
-                message = _setup.without_scale(int(unscaled[0]), self.t)
+                message = (
+                    f"the error of component {unscaled[0]} has no scale at t={self.t:.10g}: y and `atol` are 0 there"
+                )
             return False, message
         # SciPy keeps the value itself, and a user's function may return the same buffer again.
         solver.f = solver.f.copy()

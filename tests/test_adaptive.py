@@ -342,7 +342,7 @@ def test_invariants_from_an_iterator(driver):
 
 
 def test_unknown_options():
-    with pytest.warns(UserWarning, match="EIPRK45 has no option 'max_stepp'; it is ignored; did you mean 'max_step'"):
+    with pytest.warns(UserWarning, match=r"chosen solver: `max_stepp`\. `max_stepp`: did you mean 'max_step'\?"):
         EIPRK45(orbit, 0, Y0, 1.0, max_stepp=3)
     with pytest.raises(TypeError, match=r"no option 'first_stepp'; did you mean 'first_step'"):
         integrate(orbit, (0, 1), Y0, method=EIPRK45, first_stepp=3)

@@ -15,14 +15,17 @@ from scipy.integrate import RK45, solve_ivp
 from systems import oscillator
 
 from eip_scipy import (
+    EIPDOP853,
     EIPRK1,
     EIPRK3,
     EIPRK4,
+    EIPRK45,
     Diagnostics,
     EIPSolver,
     Invariant,
     ProjectionWarning,
     check_gradient,
+    ensemble,
     integrate,
     project,
 )
@@ -51,7 +54,13 @@ def by_integrate(fun=oscillator, t_span=(0, 1), y0=Y0, **options):
     return integrate(fun, t_span, y0, **{"method": EIPRK4, "h": 0.1, **options})
 
 
+def by_ensemble(fun=oscillator, t_span=(0, 1), y0=Y0, **options):
+    return ensemble(fun, t_span, [y0, y0], **{"method": EIPRK4, "h": 0.1, "compiled": False, **options})
+
+
 both = pytest.mark.parametrize("driver", [by_scipy, by_integrate], ids=["solve_ivp", "integrate"])
+runs = pytest.mark.parametrize("driver", [by_integrate, by_ensemble], ids=["integrate", "ensemble"])
+all_of_them = pytest.mark.parametrize("driver", [by_scipy, by_integrate, by_ensemble])
 
 
 # The state.
@@ -363,15 +372,37 @@ def test_t_span_of_two_numbers(span):
         by_integrate(t_span=span)
 
 
-@pytest.mark.parametrize("span", [(0, math.inf), (math.nan, 1), (0, math.nan), (-math.inf, 0)])
+@pytest.mark.parametrize("span", [(0, math.inf), (math.nan, 1), (0, math.nan), (-math.inf, 0), (math.inf, math.inf)])
 def test_t_span_finite(span):
     with pytest.raises(ValueError, match="t_span must be finite"):
         by_integrate(t_span=span)
 
 
-def test_t_bound_nan_through_the_solver_class():
-    with pytest.raises(ValueError, match="nan"):
-        by_scipy(t_span=(0, math.nan))
+@pytest.mark.parametrize("step", [{"h": 0.1}, {"h": None, "method": EIPRK45}])
+@pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
+@pytest.mark.parametrize(
+    "span", [(-math.inf, 0), (math.inf, 0), (-math.inf, math.inf), (math.inf, math.inf), (math.nan, 1), (0, math.nan)]
+)
+def test_start_of_t_span_finite_through_the_solver_class(span, invariants, step):
+    """It would never arrive; its end may be infinite, as a terminal event ends the run that it does not see."""
+    with pytest.raises(ValueError, match=r"t_span must be finite, got .*; only its end may be infinite"):
+        by_scipy(t_span=span, invariants=invariants, **step)
+
+
+@pytest.mark.parametrize("span", [(0j, 1), (0, 1j), np.array([0j, 1 + 0j]), (10**400, 1), (0, 10**5000), {0: 1, 1: 2}])
+def test_t_span_of_real_numbers(span):
+    with pytest.raises(ValueError, match="t_span must hold two numbers, got"):
+        by_integrate(t_span=span)
+    with pytest.raises(ValueError, match="t_span must hold two numbers, got"):
+        by_ensemble(t_span=span)
+
+
+@pytest.mark.parametrize(
+    "ends", [(0j, 1.0), (0.0, 1j), (np.complex128(0), 1.0), ("0", 1.0), (None, 1.0), (0.0, 10**400)]
+)
+def test_times_of_the_solver_class_are_real(ends):
+    with pytest.raises(ValueError, match="t_span must hold two numbers, got"):
+        EIPRK4(oscillator, ends[0], Y0, ends[1], h=0.1)
 
 
 def test_unbounded_interval_through_the_solver_class():
@@ -506,9 +537,53 @@ def test_tolerances_of_wrong_shape(driver, name, value):
 
 @both
 @pytest.mark.parametrize("name", ["rtol", "atol"])
-def test_tolerances_no_numbers(driver, name):
-    with pytest.raises((ValueError, TypeError), match=name):
-        driver(**{name: "tight"})
+@pytest.mark.parametrize("value", ["tight", None, 1j, np.array([1j, 1.0]), 10**400, [[1e-3], 1e-3]])
+def test_tolerances_no_numbers(driver, name, value):
+    with pytest.raises(ValueError, match=f"`{name}` must be a number or an array of 2 numbers. Got"):
+        driver(**{name: value})
+
+
+@both
+@pytest.mark.parametrize("step", [{"h": 0.1}, {"h": None, "method": EIPRK45}])
+@pytest.mark.parametrize("name", ["rtol", "atol"])
+@pytest.mark.parametrize("value", [math.inf, [1e-3, math.inf]])
+def test_tolerances_finite(driver, name, value, step):
+    with pytest.raises(ValueError, match=f"`{name}` must be finite. Got .*; a large number such as 1e30"):
+        driver(**{name: value, **step})
+    assert driver(**{name: 1e30, **step}).status == 0
+
+
+@both
+@pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853])
+@pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
+def test_tolerances_without_a_scale(driver, method, invariants):
+    """Where both the start and atol are 0 an error has no size; that is said, and nothing of overflow or of h."""
+    options = {"h": None, "method": method, "atol": [1e-6, 0.0], "invariants": invariants}
+    with pytest.raises(ValueError, match="tolerances of component 1 are 0: y0 is 0 there, and so is `atol`"):
+        driver(y0=[1.0, 0.0], **options)
+    assert driver(y0=[1.0, 0.0], **{**options, "first_step": 0.01}).status == 0
+    assert driver(y0=[1.0, 0.0], **{**options, "h": 0.1, "metric": "error"}).status == 0
+
+
+@both
+@pytest.mark.parametrize(("method", "invariants"), [(EIPRK4, ()), (EIPRK4, SQUARE), (EIPRK45, SQUARE), (EIPRK45, ())])
+def test_component_that_stays_without_a_scale(driver, method, invariants):
+    """It has no error either; only SciPy's own steps cannot go on, and that is told as what it is."""
+    options = {"h": None, "atol": 0, "first_step": 0.01, "invariants": invariants, "check": False}
+    with np.errstate(invalid="ignore"):
+        run = driver(lambda t, y: np.array([y[0], 0.0]), y0=[1.0, 0.0], method=method, **options)
+    if driver is by_scipy and method is EIPRK45 and not invariants:
+        assert run.status == -1
+        assert run.message == "the error of component 1 has no scale at t=0: y and `atol` are 0 there"
+    else:
+        assert run.status == 0
+
+
+def test_estimate_that_is_not_finite_is_named():
+    """f at the new point alone: neither a stage nor the sum of them."""
+    run = by_integrate(lambda t, y: np.array([1.0, 1.0]) if t < 1 else np.array([np.nan, 1.0]), h=None, first_step=1.0)
+    assert run.status == -1
+    assert run.message.startswith("fun returned a non-finite value at t=1")
 
 
 WRONG_OPTIONS = [
@@ -539,6 +614,11 @@ WRONG_OPTIONS = [
     ("direction", "newest", "direction must be 'new', 'old' or 'midpoint', got 'newest'"),
     ("direction", None, "direction must be 'new', 'old' or 'midpoint', got None"),
     ("direction", ["new"], "direction must be 'new', 'old' or 'midpoint'"),
+    ("metric", ["a", "b"], r"metric must be an array of numbers, got \['a', 'b'\]"),
+    ("metric", np.array([1j, 1.0]), "metric must be an array of numbers, got .*; expected real ones"),
+    ("blocks", [[0, [1]]], "blocks must be an integer or a sequence of index arrays"),
+    ("every", 2**70, "every must be at most 9223372036854775807, got 1180591620717411303424"),
+    ("iterations", 1001, "iterations must be at most 1000, got 1001"),
     *((key, v, f"{key} must be an integer >= 1") for key in ("iterations", "every") for v in (0, -1, 1.0, "2", True)),
     *((key, v, f"{key} must be True or False") for key in ("reuse_f", "check", "project_initial") for v in (1, None)),
 ]
@@ -565,16 +645,32 @@ def test_wrong_diagnostics(driver, value):
 def test_unknown_options_name_the_nearest(wrong, nearest):
     with pytest.raises(TypeError, match=f"no option '{wrong}'.*did you mean '{nearest}'"):
         by_integrate(**{wrong: 1})
-    with pytest.warns(UserWarning, match=f"EIPRK4 has no option '{wrong}'.*did you mean '{nearest}'") as record:
+    with pytest.warns(UserWarning, match=f"solver: `{wrong}`.*did you mean '{nearest}'") as record:
         by_scipy(**{wrong: 1})
     assert len(record) == 1
+    assert record[0].filename == __file__
 
 
 def test_unknown_option_like_no_other():
     with pytest.raises(TypeError, match=r"no option 'zzzz'$"):
         by_integrate(zzzz=1)
-    with pytest.warns(UserWarning, match="no option 'zzzz'"):
+    with pytest.warns(UserWarning, match=r"have no effect for a chosen solver: `zzzz`\.$"):
         by_scipy(zzzz=1)
+
+
+@pytest.mark.parametrize("names", [("jac",), ("jac", "lband"), ("uband", "jac", "jac_sparsity")])
+def test_options_of_other_solvers_warn_as_scipy_s(names):
+    """Word for word, so that what filters SciPy's warning filters this one."""
+    options = dict.fromkeys(names)
+    with pytest.warns(UserWarning, match="chosen solver") as theirs:
+        solve_ivp(oscillator, (0, 1), Y0, method=RK45, **options)
+    with pytest.warns(UserWarning, match="chosen solver") as ours:
+        by_scipy(**options)
+    (their,), (our,) = theirs, ours
+    assert (str(our.message), our.category) == (str(their.message), their.category)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The following arguments have no effect for a chosen solver", UserWarning)
+        by_scipy(**options, invarients=3)
 
 
 @pytest.mark.parametrize("method", ["RK45", "EIPRK4", RK45, None, EIPSolver, 4])
@@ -605,6 +701,172 @@ def test_missing_arguments():
         integrate(oscillator, (0, 1), method=EIPRK4, h=0.1)
     with pytest.raises(TypeError, match="fun must be callable or a Problem, got 3"):
         by_integrate(3)
+
+
+WRONG_OF_RUNS = [
+    *(("in_place", v, ValueError, "in_place must be True or False, got") for v in (1, "yes", None)),
+    *(("compiled", v, ValueError, "compiled must be True, False or None .where possible., got") for v in ("a", 1, 0)),
+    *(("progress", v, ValueError, "progress must be True or False, got") for v in (1, "yes", None)),
+    *(("compensated", v, ValueError, "compensated must be True or False, got") for v in (1, None)),
+    *(("resume", v, ValueError, "resume must be True or False, got") for v in (1, "yes", None)),
+    *(
+        ("max_bytes", v, ValueError, "max_bytes must be a number of bytes >= 0, got")
+        for v in ("a", math.nan, -1, 1j, True, [1])
+    ),
+    ("save_every", 10**30, ValueError, "save_every must be at most 9223372036854775807, got 1000"),
+    ("callback", 1, TypeError, "callback must be a function callback"),
+    ("events", 1, TypeError, "events must be callable, or a sequence of callables, got 1"),
+    ("events", "ab", TypeError, "events must be callable, got 'a'"),
+    ("events", [None], TypeError, "events must be callable, got None"),
+    ("checkpoint_every", 10**400, ValueError, "checkpoint_every must be a number of seconds > 0, got 1000"),
+    *(("h", v, ValueError, "`h` must be positive. Got") for v in (10**400, 1j, "0.1", np.array([0.1]))),
+    *(
+        ("params", v, TypeError, "params must be an array of numbers, got")
+        for v in (10**400, [10**400], [None], 1j, np.array([1j]), ["1"])
+    ),
+    *(
+        ("t_eval", v, ValueError, "t_eval must be an array of numbers, got")
+        for v in ([1j], [0.5 + 0j], np.array([0.5 + 0j]), "ab", ["0.5"], [None], [10**400])
+    ),
+    ("y0", [10**400, 1], TypeError, "must hold numbers, got"),
+    ("y0", [[1.0], [1.0, 2.0]], ValueError, "must be an array of numbers, got"),
+    ("y0", "ab", TypeError, "must hold numbers, got"),
+]
+
+
+@runs
+@pytest.mark.parametrize(("name", "value", "error", "match"), WRONG_OF_RUNS, ids=lambda v: str(v)[:12])
+def test_wrong_arguments_of_runs(driver, name, value, error, match):
+    with pytest.raises(error, match=match) as info:
+        driver(**{name: value})
+    assert len(str(info.value)) < 400
+
+
+@pytest.mark.parametrize("name", ["first_step", "max_step"])
+@pytest.mark.parametrize("value", [10**400, 1j, "a", np.array([0.1]), True, math.nan])
+@all_of_them
+def test_wrong_bounds_of_steps(driver, name, value):
+    with pytest.raises(ValueError, match=f"`{name}` must be positive. Got .*; give a real number > 0"):
+        driver(h=None, method=EIPRK45, **{name: value})
+
+
+@both
+def test_state_without_components(driver):
+    """SciPy's own suite asks for it of solve_ivp."""
+    if driver is by_scipy:
+        assert driver(lambda t, y: y, y0=[]).y.shape[0] == 0
+        return
+    for step in ({}, {"h": None, "method": EIPRK45}):
+        with pytest.raises(ValueError, match="y0 is empty"):
+            driver(lambda t, y: y, y0=[], **step)
+
+
+def event(terminal=None, direction=0):
+    def passing(t, y):
+        return y[0]
+
+    passing.terminal, passing.direction = terminal, direction
+    return passing
+
+
+@runs
+@pytest.mark.parametrize("value", [math.nan, math.inf, "a", -1, 1.5, [1], np.array([1, 2])])
+def test_wrong_terminal(driver, value):
+    with pytest.raises(ValueError, match="`terminal` attribute of each event must be a boolean or positive integer"):
+        driver(events=event(terminal=value))
+
+
+@pytest.mark.parametrize("value", [None, False, 0, True, 1, 2, 1.0, np.int64(3), np.True_])
+def test_terminal_as_scipy_takes_it(value):
+    run, sol = (driver(events=event(value), t_span=(0, 20)) for driver in (by_integrate, by_scipy))
+    assert run.status == sol.status
+    np.testing.assert_allclose(run.t_events[0], sol.t_events[0], atol=1e-10)
+
+
+@runs
+@pytest.mark.parametrize("value", [None, math.nan, "a", [1], 1j])
+def test_wrong_direction(driver, value):
+    with pytest.raises(ValueError, match="`direction` attribute of each event must be a number"):
+        driver(events=event(terminal=True, direction=value))
+
+
+def takes_more(t, y, m):
+    return m * (y @ y)
+
+
+def takes_more_gradient(t, y, m):
+    return 2 * m * y
+
+
+FORGOTTEN = [
+    (Invariant(takes_more, takes_more_gradient, name="M"), r"invariant 'M' is called with \(t, y\): .*'m'.*"),
+    (Invariant(takes_more, name="M"), r"invariant 'M' is called with \(t, y\): .*'m'.*"),
+    (Invariant(square, takes_more_gradient, name="M"), r"gradient of invariant 'M' is called with \(t, y\): .*'m'.*"),
+    (
+        Invariant(square, lambda t, y: 2 * y, name="M", args=(1.0,)),
+        r"invariant 'M' is called with \(t, y, args\[0\]\): too many.*",
+    ),
+    (
+        Invariant(square, lambda t, y: 2 * y, name="M", uses_f=True),
+        r"gradient of invariant 'M' is called with \(t, y, f\): too many.*",
+    ),
+]
+
+
+@all_of_them
+@pytest.mark.parametrize(("invariants", "match"), FORGOTTEN)
+def test_forgotten_args_of_an_invariant(driver, invariants, match):
+    with pytest.raises(TypeError, match=match + r"Invariant\(\.\.\., args=\(\.\.\.,\)\)"):
+        driver(invariants=invariants)
+
+
+def test_type_errors_within_an_invariant_pass_unchanged():
+    def broken(t, y):
+        return y @ y + takes_more(t, y)
+
+    with pytest.raises(TypeError, match=r"takes_more\(\) missing 1 required positional argument: 'm'$"):
+        by_integrate(invariants=Invariant(broken, square_gradient))
+
+
+@runs
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"fun": lambda t, y, p: y}, r"fun is called with \(t, y\): missing .* 'p'.*params=\.\.\."),
+        ({"params": [1.0]}, r"fun is called with \(t, y, params\): too many"),
+        ({"in_place": True}, r"fun is called with \(t, y, out\): too many"),
+        ({"in_place": True, "params": 1.0}, r"fun is called with \(t, y, out, params\): too many"),
+        ({"events": event(True), "params": 1.0, "fun": lambda t, y, p: y}, r"event 0 is called with \(t, y, params\)"),
+    ],
+)
+def test_functions_that_take_other_arguments(driver, options, match):
+    with pytest.raises(TypeError, match=match):
+        driver(**options)
+
+
+# Times of dense output.
+
+COMPLEX_TIMES = [0.05 + 0j, np.complex128(0.05), [0.05j], np.array([0.05 + 0j]), "0.05", ["a"]]
+
+
+@pytest.mark.parametrize("t", COMPLEX_TIMES)
+@pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
+@pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853])
+def test_times_of_dense_output_are_real(method, invariants, t):
+    """A complex one would write complex states into real buffers."""
+    sol = by_scipy(method=method, invariants=invariants, dense_output=True)
+    for call in (sol.sol, sol.sol.interpolants[0]):
+        with pytest.raises(TypeError, match=r"dense output is defined at real times, got|not supported for the input"):
+            call(t)
+    np.testing.assert_allclose(sol.sol.interpolants[0](0), Y0)
+    assert sol.sol([0, 1]).shape == (2, 2)
+
+
+@pytest.mark.parametrize("invariants", [(), SQUARE], ids=["plain", "kept"])
+@pytest.mark.parametrize("t_eval", [[0.5 + 0j], [1j], np.array([0.25j, 0.5])])
+def test_complex_t_eval_of_solve_ivp(t_eval, invariants):
+    with pytest.raises(TypeError, match="dense output is defined at real times, got"):
+        by_scipy(t_eval=t_eval, invariants=invariants)
 
 
 # Saving.
@@ -683,7 +945,17 @@ def test_invariants_of_wrong_kind(driver):
         ((square,), {"scale": -1.0}, ValueError, "scale must be a finite number >= 0"),
         ((square,), {"scale": math.nan}, ValueError, "scale must be a finite number >= 0"),
         ((square,), {"args": 3}, TypeError, r"args must be a tuple, got 3; write args=\(x,\)"),
-        ((square,), {"target": "x"}, (ValueError, TypeError), "target|string"),
+        *(
+            ((square,), {"target": v}, ValueError, "target must be a number or an array of numbers, got")
+            for v in ("x", 1j, [1j], np.array([1j]), 10**400, [[1], [1, 2]], [None])
+        ),
+        *(
+            ((square,), {"scale": v}, ValueError, "scale must be a finite number >= 0")
+            for v in ("x", 1j, True, 10**400)
+        ),
+        *(((square, square), {"in_place": v}, ValueError, "in_place must be True or False, got") for v in (1, None)),
+        *(((square, square), {"uses_f": v}, ValueError, "uses_f must be True or False, got") for v in (1, "no")),
+        ((square,), {"name": 3}, TypeError, "name must be a string, got 3"),
     ],
 )
 def test_wrong_invariants(arguments, options, error, match):
@@ -820,6 +1092,11 @@ def test_wrong_targets(driver, target, match):
         ({"target": 1.0, "sigma": [0.0, 0.0]}, "sigma: weights must be finite"),
         ({"target": 1.0, "iterations": 0}, "iterations must be an integer >= 1"),
         ({"target": 1.0, "frame": 3}, "frame must be a pair"),
+        *(({"target": v}, "target must be 1 finite numbers, got") for v in ("a", 1j, [1j], 10**400, [[1.0]])),
+        *(({"target": 1.0, "t": v}, "t must be a finite number, got") for v in ("a", None, math.nan, 1j, [0.0])),
+        *(({"target": 1.0, "sigma": v}, "sigma must be an array of numbers, got") for v in ("a", 1j, [None, 1.0])),
+        ({"target": 1.0, "iterations": 2**70}, "iterations must be at most 1000"),
+        ({"target": 1.0, "f": [1.0]}, r"f has shape \(1,\), expected \(2,\)"),
     ],
 )
 def test_wrong_arguments_of_project(options, match):

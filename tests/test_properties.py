@@ -360,7 +360,7 @@ def three_bodies(seed):
 
 def n_body_run(gm, q, v, steps=5, h=0.2, **options):
     problem = nbody(gm, q, v, t_span=(0.0, steps * h), h=h)
-    return integrate(problem, method=EIPRK4, **{"compiled": False, **options})
+    return integrate(problem, method=EIPRK4, **{"compiled": False, "h": h, **options})
 
 
 @given(seeds, st.sampled_from(["error", "euclidean"]), st.booleans())

@@ -14,7 +14,8 @@ SI = np.repeat([METRE_PER_AU, METRE_PER_AU / (YEAR_D * DAY_S)], 30)
 
 def in_au(years, units="AU, yr", **options):
     """Final state of the solar system in AU and AU/yr, run in either units."""
-    run = integrate(solar_system(units=units, years=years), method=EIPRK4, compiled=True, **options)
+    problem = solar_system(units=units, years=years)
+    run = integrate(problem, method=EIPRK4, h=problem.h, compiled=True, **options)
     assert run.status == 0
     return run.y[:, -1] / (SI if units == "SI" else 1.0)
 
@@ -30,9 +31,8 @@ def test_solar_system_in_si_and_in_au():
     there, si = in_au(10.0, atol=0), in_au(10.0, "SI", atol=0)
     problem = solar_system(years=10.0)
     signs = np.random.default_rng(0).choice([-1, 1], (8, 60))
-    nudged = [
-        integrate(problem, y0=problem.y0 * (1 + s * EPS), method=EIPRK4, atol=0, compiled=True).y[:, -1] for s in signs
-    ]
+    options = {"method": EIPRK4, "h": problem.h, "atol": 0, "compiled": True}
+    nudged = [integrate(problem, y0=problem.y0 * (1 + s * EPS), **options).y[:, -1] for s in signs]
     growth = np.max([planets(y - there) for y in nudged], axis=0)
     # One nudge against a rounding in each of the 5000 steps.
     assert (planets(si - there) < 30 * growth + 1e-14).all()
@@ -60,7 +60,7 @@ def scaled_run(length, time, steps, **options):
         t_span=(0.0, steps * 2.0**-9 * b),
         h=2.0**-9 * b,
     )
-    run = integrate(problem, method=EIPRK4, compiled=False, **options)
+    run = integrate(problem, method=EIPRK4, h=problem.h, compiled=False, **options)
     assert run.status == 0
     return run.y[:, -1] / np.repeat([a, a / b], 30)
 

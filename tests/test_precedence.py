@@ -1,0 +1,114 @@
+"""What the caller gives wins over what a problem brings."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from eip_scipy import EIPDOP853, EIPRK1, EIPRK4, EIPRK45, ensemble, integrate
+from eip_scipy.problems import harmonic, kepler
+
+PROBLEM = kepler(0.3, 0.0, t_end=2.0)
+BARE = dataclasses.replace(PROBLEM, h=None)
+
+# Each asks for adaptive steps.
+ASKED = [
+    {"h": None},
+    {"rtol": 1e-5},
+    {"rtol": 1e-3},  # its default, and asked for
+    {"atol": 1e-8},
+    {"atol": [1e-8] * 4},
+    {"rtol": 1e-9, "atol": 1e-12},
+    {"first_step": 1e-3},
+    {"max_step": 0.02},
+    {"h": None, "rtol": 1e-7, "max_step": 0.1},
+]
+
+
+def single(problem, **options):
+    run = integrate(problem, save_every=1, compiled=False, **options)
+    return run.h, run.t, run.y
+
+
+def members(problem, **options):
+    run = ensemble(problem, None, [problem.y0], t_eval=[0.5, 1.0], compiled=False, **options)
+    return run.h, run.nfev, run.y
+
+
+both = pytest.mark.parametrize("how", [single, members])
+
+
+@both
+@pytest.mark.parametrize("options", ASKED)
+@pytest.mark.parametrize("method", [EIPRK4, EIPDOP853])
+def test_adaptive_where_it_is_asked_for(how, method, options):
+    h, *found = how(PROBLEM, method=method, **options)
+    _, *expected = how(BARE, method=method, **{"h": None, **options})
+    assert h is None
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@both
+@pytest.mark.parametrize(
+    "options", [{}, {"first_step": None}, {"max_step": np.inf}, {"first_step": None, "max_step": np.inf}]
+)
+def test_a_problem_s_own_step_otherwise(how, options):
+    """None and inf are what first_step and max_step are anyway: they ask for nothing."""
+    h, *found = how(PROBLEM, method=EIPRK4, **options)
+    assert h == PROBLEM.h
+    _, *expected = how(BARE, method=EIPRK4, h=PROBLEM.h)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@both
+def test_a_given_step_is_fixed_and_tolerances_are_of_the_metric(how):
+    plain = how(PROBLEM, method=EIPRK4, h=0.02)
+    given = how(PROBLEM, method=EIPRK4, h=0.02, rtol=1e-3, atol=1e-6)
+    weighed = how(PROBLEM, method=EIPRK4, h=0.02, atol=0.0)
+    assert plain[0] == given[0] == weighed[0] == 0.02
+    np.testing.assert_array_equal(given[-1], plain[-1])
+    assert (weighed[-1] != plain[-1]).any()
+    np.testing.assert_allclose(weighed[-1], plain[-1], atol=1e-4)
+    euclidean = {"metric": "euclidean", "h": 0.02}
+    one, other = (how(PROBLEM, method=EIPRK4, **euclidean, **o) for o in ({}, {"atol": 0.0}))
+    np.testing.assert_array_equal(one[-1], other[-1])
+
+
+@both
+@pytest.mark.parametrize("options", ASKED)
+def test_methods_without_an_estimate_need_a_step(how, options):
+    options = {name: value[:2] if isinstance(value, list) else value for name, value in options.items()}
+    with pytest.raises(ValueError, match=r"EIPRK1 has no error estimate and needs the step h=\.\.\."):
+        how(harmonic(), method=EIPRK1, **options)
+    assert how(harmonic(), method=EIPRK1, check=False)[0] == harmonic().h
+
+
+@both
+def test_a_step_and_bounds_of_adaptive_ones_contradict(how):
+    for options in ({"first_step": 0.01}, {"max_step": 0.01}):
+        with pytest.raises(ValueError, match="h sets a fixed step; first_step and max_step belong to adaptive steps"):
+            how(PROBLEM, method=EIPRK4, h=0.02, **options)
+
+
+def test_rtol_is_obeyed():
+    """Not dropped in favour of the problem's own step."""
+    coarse, fine = (
+        integrate(PROBLEM, method=EIPDOP853, rtol=rtol, atol=1e-3 * rtol, compiled=False) for rtol in (1e-4, 1e-12)
+    )
+    assert fine.nfev > 3 * coarse.nfev
+    exact = PROBLEM.reference(2.0)
+    errors = [np.abs(run.y[:, -1] - exact).max() for run in (coarse, fine)]
+    assert errors[1] < 1e-10 < errors[0]
+
+
+@pytest.mark.needs_jit
+def test_compiled_runs_and_their_checkpoints(tmp_path):
+    """Resumed by the same arguments, not by those of the other kind of steps."""
+    options = {"method": EIPRK45, "rtol": 1e-6, "checkpoint": tmp_path / "a.npz"}
+    first = integrate(PROBLEM, **options)
+    again = integrate(PROBLEM, **options, resume=True)
+    np.testing.assert_array_equal(first.y, again.y)
+    assert first.h is again.h is None
+    assert first.compiled
