@@ -257,10 +257,12 @@ def watch_octet(c, done, o, w, s, defect):
         suspect = suspect | (done & (far | (abs(before[i]) > FAR * own)))
         if w.counters[HAVE_ERROR]:
             change = before[i] - trust[i, LEFT]
-            expected = errors * abs_dot(G[i], err) + kn.EPS * sqrt(steps) * terms + kn.TINY
-            trust[i, SUM] += where(done, abs(change), 0.0)
-            trust[i, EXPECTED] += where(done, expected, 0.0)
-            suspect = suspect | (done & (abs(change) > LARGE * expected))
+            local = abs_dot(G[i], err)
+            expected = errors * local + kn.EPS * sqrt(steps) * terms + kn.TINY
+            judged = done & (local > 0.0)
+            trust[i, SUM] += where(judged, abs(change), 0.0)
+            trust[i, EXPECTED] += where(judged, expected, 0.0)
+            suspect = suspect | (judged & (abs(change) > LARGE * expected))
         trust[i, LEFT] = where(done, defect[i], trust[i, LEFT])
     octets(s.suspect, c)[0] = where(suspect, 1.0, 0.0)
 

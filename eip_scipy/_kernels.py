@@ -769,8 +769,10 @@ def note(defect, max_defect, before, band, G, err, trust, per_band, t, errors, r
         else:
             known = trust[i, TERMS] if trust[i, TERMS] < np.inf else 0.0
             trust[i, TERMS] = max(known, terms)
-        if errors > 0.0:
-            expected = errors * abs_dot(G[i], err) + rounding * terms + TINY
+        # An estimate that vanishes tells nothing: that of RK4 does where f depends on t alone.
+        local = abs_dot(G[i], err) if errors > 0.0 else 0.0
+        if local > 0.0:
+            expected = errors * local + rounding * terms + TINY
             found += weigh_change(abs(before[i] - trust[i, LEFT]), expected, t, trust[i])
         trust[i, LEFT] = defect[i]
     return found

@@ -304,7 +304,7 @@ class _FileKeeper(Keeper):
         if now >= min(self._due, self._next_snapshot):
             self._take_snapshot()
         if now >= self._due:
-            self._write_or_warn(None, "running", stacklevel=6)
+            self._write_or_warn(None, "running", stacklevel=7)
 
     def end(self, status: int, message: str) -> None:
         if status == 0:

@@ -128,6 +128,7 @@ class Run:
     check: bool
     tau: float
     in_place: bool = False
+    looked: int = -1
 
     def look(self, steps: int, ended: bool, t: float, y: np.ndarray, derivative: Callable[[], np.ndarray]) -> bool:
         """Look at a run after so many steps, or where it ends: whether something speaks against it, to be said now.
@@ -137,10 +138,11 @@ class Run:
         """
         if not self.options.watched:
             return False
-        early = steps in LOOKS or (ended and steps < LOOKS[0])
+        early = steps != self.looked and (steps in LOOKS or (ended and steps < LOOKS[0]))
         doubtful = self.trust.beyond_doubt or (ended and bool(self.trust.sick.any()))
         found: list[str] = []
         if self.check and (early or doubtful) and not self.trust.doubts:
+            self.looked = steps
             f = derivative()
             if np.isfinite(f).all():
                 found = [complaint.text for complaint in self.invariants.complaints(t, y, f, self.tau)][:1]

@@ -337,7 +337,7 @@ def close_step(rhs, params, t_new, y_new, project, status, o, w):
             kn.copy(w.err, w.err_sum)
         elif project:
             kn.fill(w.err_sum, 0.0)
-        elif o.metric == ERROR or o.every == AUTO:
+        elif o.metric == ERROR or o.every == AUTO or o.adaptive:
             kn.quadrature(w.err, w.err_sum, w.err_sum)
     if w.counters[HAVE_F] == 0 or (project and status == OK and not o.reuse_f):
         rhs(t_new, y_new, w.K[-1], params)
@@ -404,7 +404,7 @@ def project_step(rhs, inv, grad, params, t_old, y, y_r, t, last, o, w, y_new, y_
     counters = w.counters
     grad(t, w.y_hat, w.K[-1], w.G, params)
     counters[NJEV] += 1
-    if o.every != 1 and (o.metric == ERROR or o.every == AUTO):
+    if o.every != 1 and (o.metric == ERROR or o.every == AUTO or o.adaptive):
         kn.quadrature(w.err, w.err_sum, w.err)
         if o.every == AUTO and not last and not kn.tells_more(w.err, w.G_r, w.y_hat_r):
             kn.copy(w.y_hat_r, y_new_r)
@@ -451,7 +451,8 @@ def take_note(t, o, w):
     errors = 1.0 if w.counters[HAVE_ERROR] else 0.0
     if waited > 0:
         rounding *= sqrt(1.0 + waited)
-        errors *= sqrt(1.0 + waited) if o.metric == ERROR or o.every == AUTO else 1.0 + waited
+        gathered = o.metric == ERROR or o.every == AUTO or o.adaptive
+        errors *= sqrt(1.0 + waited) if gathered else 1.0 + waited
     w.counters[FOUND] += kn.note(
         w.defect, w.max_defect, w.before, w.band, w.G_r, w.err, w.trust, o.per_band, t, errors, rounding
     )

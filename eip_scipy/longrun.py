@@ -768,9 +768,9 @@ class Loop:
     def explained(self, message: str) -> str:
         """With what speaks against the run, and what is to be said about checkpoints and not being compiled."""
         notes = [*self.keeper.notes, *([] if self.why_not is None else [f"interpreted: {self.why_not}"])]
-        message = f"{message} ({'; '.join(notes)})" if notes else message
         doubt = self.driver.run.trust.message
-        return f"{message}; {doubt}" if doubt else message
+        message = f"{message}; {doubt}" if doubt else message
+        return f"{message} ({'; '.join(notes)})" if notes else message
 
     def _values(self, broken: bool) -> np.ndarray:
         """Invariants of the saved states; NaN where the run was broken off by an invariant that still raises."""

@@ -345,6 +345,7 @@ def test_differences_take_the_fields_length():
     assert jacobian[0, 2] == pytest.approx(x[1] / small * math.sin(0.5), rel=1e-11)
 
 
+@pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")
 def test_a_wrong_claim_of_symmetry_is_seen():
     field = ParticleField(lambda x, y, z: (-y, x * (1 + 0.1 * x), 0.0), axisymmetric=True)
     problem = charged_particle(field, [0.2, 0.1, 0.0], [0.1, 0.3, 0.2], t_span=(0.0, 1.0), h=0.1)

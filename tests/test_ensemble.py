@@ -415,7 +415,7 @@ def test_ctrl_c_within_a_second():
 
 def test_memory_is_refused_before_it_is_taken():
     many = np.broadcast_to([1.0, 0.0], (1000, 2))
-    with pytest.raises(MemoryError, match=r"1000 members of 2 components need 0\.0161 GB.*save_every.*reduce=.*out="):
+    with pytest.raises(MemoryError, match=r"1000 members of 2 components need 0\.0162 GB.*save_every.*reduce=.*out="):
         ensemble(oscillator, (0, 1), many, h=0.001, save_every=1, max_bytes=1e7)
     with pytest.raises(MemoryError, match="run them in parts"):
         ensemble(oscillator, (0, 1), many, h=0.001, max_bytes=1e4)
@@ -437,7 +437,7 @@ def test_progress(capsys):
         ({"y0s": None}, TypeError, "y0s is missing"),
         ({"y0s": [1.0, 2.0]}, ValueError, r"y0s must have the shape \(members, n\), got \(2,\)"),
         ({"y0s": np.zeros((0, 2))}, ValueError, r"got \(0, 2\)"),
-        ({"y0s": [["a", "b"]]}, TypeError, "y0s must hold numbers"),
+        ({"y0s": [["a", "b"]]}, TypeError, "`y0s` must hold numbers"),
         ({"y0s": np.ma.array(np.ones((2, 2)), mask=np.eye(2))}, ValueError, "masked values in y0s"),
         ({"params": [[1.0], [2.0], [3.0]]}, ValueError, "params has 3 rows for 2 members"),
         ({"params": "abc"}, TypeError, "params must be an array of numbers"),

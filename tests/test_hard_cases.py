@@ -4,6 +4,7 @@ import csv
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -160,6 +161,7 @@ def test_a_case_that_raises_is_an_outcome():
     assert math.isnan(result.error)
 
 
+@pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")
 def test_projection_on_a_wrong_invariant_shows():
     """The comparison measures what it claims: a false invariant makes the error worse."""
     (case,) = hard_cases(["oscillator"])
@@ -271,7 +273,7 @@ def test_solar_figures_come_from_the_command(tmp_path, monkeypatch):
     from eip_scipy import reproduce
 
     monkeypatch.setattr(reproduce.solar_system, "run", run)
-    monkeypatch.setattr("eip_scipy.cli._rebound", lambda args: "REBOUND")
+    monkeypatch.setattr("eip_scipy.cli._rebound", lambda args: SimpleNamespace(run="REBOUND"))
     target = tmp_path / "run.json"
     assert main(["reproduce", "fig-solar", "--out", str(tmp_path), "--json", str(target), "--quiet"]) == 1
     assert seen == [(None, "EIPRK4", tmp_path, "REBOUND")]  # None: the command's own default

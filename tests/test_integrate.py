@@ -336,6 +336,7 @@ FORMULAS = [
 
 
 @pytest.mark.parametrize("case", range(len(FORMULAS)))
+@pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")
 def test_counts_by_formula(case):
     method, options, nfev, njev, nlu = FORMULAS[case]
     result = run((0, N * WIDE), h=WIDE, method=method, **options)
@@ -367,7 +368,8 @@ def test_nfev_is_the_number_of_calls(options, through):
     result = run(fun=counting, **options) if through == "integrate" else solve_ivp(
         counting, (0, 1), Y0, method=EIPRK4, h=0.1, **options
     )  # fmt: skip
-    assert result.nfev == calls
+    # Once more, after ten steps, to check the invariants again.
+    assert calls - result.nfev == ("invariants" in options)
 
 
 def test_reuse_f_costs_little_accuracy():
@@ -650,12 +652,14 @@ def test_time_dependent_invariants_are_no_false_alarm(h, amplitude):
     assert result.status == 0
 
 
+@pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")
 def test_time_dependent_function_that_is_no_invariant():
     wrong = Invariant(lambda t, y: y[0] + np.sin(t), lambda t, y: np.ones(1), name="I")
     with pytest.warns(UserWarning, match="'I' is no invariant"):
         run((0.3, 1.3), [1.0], lambda t, y: np.cos(t) * np.ones(1), invariants=wrong)
 
 
+@pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")
 def test_time_dependent_function_at_rest_is_no_invariant():
     wrong = Invariant(lambda t, y: y[0] + t, lambda t, y: np.ones(1), name="I")
     with pytest.warns(UserWarning, match="'I' is no invariant"):

@@ -134,7 +134,8 @@ def test_all_ways_give_the_same_bits(method, options):
     span, h = (0, 3), 0.05
     end = solve_ivp(orbit, span, Y0, method=method, h=h, **options).y[:, -1]
     for fun, in_place in ((acceleration, False), (fill_acceleration, True)):
-        runs = [integrate(fun, span, Y0, method=method, h=h, in_place=in_place, compiled=c, **options) for c in (0, 1)]
+        given = {"method": method, "h": h, "in_place": in_place, **options}
+        runs = [integrate(fun, span, Y0, compiled=compiled, **given) for compiled in (False, True)]
         np.testing.assert_array_equal(runs[0].y, runs[1].y)
         assert runs[0].nfev == runs[1].nfev
     np.testing.assert_allclose(runs[0].y[:, -1], end, rtol=0, atol=1e-13)

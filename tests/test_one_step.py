@@ -188,7 +188,7 @@ def returning(value, **attributes):
     [
         (returning(None), TypeError, "Mine.one_step returned a state: None, expected 2 numbers"),
         (returning([1.0]), ValueError, r"Mine.one_step returned a state: shape \(1,\), expected \(2,\)"),
-        (returning([1j, 0.0]), ValueError, "complex values, but y0 is real"),
+        (returning([1j, 0.0]), ValueError, "complex values at t=0, but y0 is real"),
         (returning("ab"), TypeError, "'ab', expected 2 numbers"),
         (returning([1.0, 0.0], error_estimator_order=1), TypeError, r"list, expected the pair \(y_hat, err\)"),
         (returning(([1.0, 0.0], 0.0), error_estimator_order=1), ValueError, r"an estimate: shape \(\)"),
