@@ -228,6 +228,7 @@ def test_second_projection_moves_by_offset_times_the_first(seed, size, offset):
     assert np.linalg.norm(first.correction) < 100 * offset
 
 
+@pytest.mark.filterwarnings("ignore:the projection left:eip_scipy.ProjectionWarning")
 def test_project_takes_one_newton_step_at_t_0_unless_told():
     """From y = 2 towards (1 + t) y^2 = 1: 2 - 3/4."""
     square = Invariant(lambda t, y: (1 + t) * y[0] ** 2, lambda t, y: 2 * (1 + t) * y, target=1.0)
