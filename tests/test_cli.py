@@ -213,7 +213,7 @@ def test_a_run_that_fails_is_reported_and_changes_the_status(tmp_path, capsys, n
         return integrate(problem, **options)
 
     monkeypatch.setattr(solar_run, "integrate", integrate_with_it)
-    status = main(["solar-system", "--years", "2", "--h", "0.125", "--method", "EIPRK5", "--out", str(tmp_path)])
+    status = main(["solar-system", "--years", "2", "--h", "0.01", "--method", "EIPRK5", "--out", str(tmp_path)])
     out = capsys.readouterr().out
     assert status == 1
     assert "FAILED EIPRK5 (error) reached the end" in out
