@@ -151,6 +151,7 @@ def test_a_step_that_is_far_too_long(driver):
     assert [w.category for w in caught] == [ProjectionWarning]
 
 
+@pytest.mark.needs_jit
 def test_no_success_with_a_defect_of_the_size_of_the_terms():
     @numba.njit
     def fast(t, y):
