@@ -32,7 +32,7 @@ def fields(make, method, whole):
     """The equation's parts and its steps, with and without rotation."""
     for name, grid in GRIDS.items():
         for Omega in (0.0, 0.6):
-            gpe = make(grid, harmonic_trap(*(1, 1, 0.9)[: grid.dim]), Omega=Omega, beta=20.0)
+            gpe = make(grid, harmonic_trap(*(1, 1, 0.9)[: grid.dim]), Omega=Omega, beta=1.0)
             psi, key = vortex(gpe), f"{name}, Omega {Omega}"
             values = (gpe.mass, gpe.energy, gpe.angular_momentum, gpe.chemical_potential)
             yield f"{key}: f", whole(gpe, gpe.fun(0.0, psi))

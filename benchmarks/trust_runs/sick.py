@@ -630,7 +630,7 @@ def long_steps() -> Iterator[Run]:
     )
     yield from too_long("stiff chain", stiff_chain, "RK4 h=0.05, RK45 10 atol=10", truth=False)
     yield from too_long(
-        "Schroedinger, beyond stability", partial(s.waves, "waves", 2.0), "RK4 h=0.05, RK4 h=0.05 metric=euclidean"
+        "Schroedinger, beyond stability", partial(s.waves, 2.0), "RK4 h=0.05, RK4 h=0.05 metric=euclidean"
     )
 
 
