@@ -11,8 +11,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache, partial
+from dataclasses import dataclass, replace
+from functools import cache
 from math import isnan
 from typing import Any, NamedTuple
 
@@ -23,13 +23,15 @@ from . import _kernels as kn
 from . import _setup
 from ._caching import cached_njit
 from ._compile import ChangedShapeError, NotCompilableError, signatures
+from ._driver import PENDING, ROW, STEP, Grid, saved_rows
 from ._kernels import OK
-from ._resume import Keeper, settings
-from ._setup import Stepping
+from ._prepare import Prepared, Request, prepared
+from ._resume import Keeper
 from ._side_by_side import Batch
 from ._step import H_ABS, T_NEW, T, Work
+from ._stepping import UNBOUNDED
 from ._trust import Trust, sick
-from .longrun import ARRIVED, PENDING, ROW, STEP, Grid, Loop, integrate, prepared, saved_rows
+from .longrun import ARRIVED, Loop
 from .result import N_COUNTERS, NFEV
 
 __all__ = ["COMPARED", "FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
@@ -51,13 +53,8 @@ class Task:
 
     Attributes
     ----------
-    fun : callable or Problem
-        As for `integrate`.
-    t_span : (float, float) or None
-    options : dict
-        The options of `integrate` that are not left at their defaults, `params` left out.
-    y0, params : ndarray
-        Start and parameters (None: the functions take none) of a member that `integrate` takes.
+    request : Request
+        What `integrate` is asked for a member whose start it takes: all that members share.
     reduce : callable, "state" or None
         What `Statistics` are wanted of.
     keep : bool
@@ -66,22 +63,14 @@ class Task:
         How many there are in all.
     """
 
-    fun: Any
-    t_span: Any
-    options: dict[str, Any]
-    y0: np.ndarray
-    params: np.ndarray | None
+    request: Request
     reduce: Any = None
     keep: bool = True
     members: int = 1
 
-    def loop(self, y0: np.ndarray, params: np.ndarray | None, **options: Any) -> Loop:
+    def prepared(self, y0: np.ndarray, params: np.ndarray | None, *, check_start: bool = False) -> Prepared:
         """The run of one member, as `integrate` prepares it."""
-        defaults: dict[str, Any] = dict(integrate.__kwdefaults__ or {})
-        for name in ("checkpoint", "checkpoint_every", "resume"):
-            del defaults[name]
-        every = {**defaults, **self.options, "params": params, **options}
-        return prepared(self.fun, self.t_span, y0, keeper=Keeper(), **every)
+        return prepared(replace(self.request, y0=y0, params=params), check_start=check_start)
 
 
 class Members(NamedTuple):
@@ -153,28 +142,34 @@ class Plan:
         Steps of one member, where that is known.
     """
 
-    def __init__(self, task: Task, *, compiled: bool | None = None, progress: bool = False) -> None:
-        options: dict[str, Any] = {"check_start": False}
-        if compiled is not None:
-            options["compiled"] = compiled
-        self.task, self._options = task, options
-        loop = task.loop(task.y0, task.params, **options, progress=progress)
-        grid, run = loop.driver.grid, loop.driver.run
-        self.why_not = loop.why_not
+    def __init__(self, task: Task, ready: Prepared | None = None) -> None:
+        """`ready`: the task's own member, where it is prepared already."""
+        self.task = task
+        self._ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
+        grid, run = self._ready.grid, self._ready.run
+        self.why_not: str | None = None
         self.names = tuple(run.invariants.names)
         self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, grid.span.t0
-        self.t_bound, self.h = grid.span.t_bound, abs(grid.span.h) or None
-        self.times = saved_times(loop)
-        self.n_steps = None if grid.span.n_steps >= _setup.UNBOUNDED else grid.span.n_steps
-        first = np.concatenate([loop.driver.run.work.K[0], run.invariants.start_values])
+        self.t_bound, self.h = grid.span.t_bound, self._ready.stepping.h
+        self.times = saved_times(grid)
+        self.n_steps = None if grid.span.n_steps >= UNBOUNDED else grid.span.n_steps
+        first = np.concatenate([run.work.K[0], run.invariants.start_values])
         self._start_values = [repr(value) for value in first[:COMPARED].tolist()]
-        self._settings = partial(_settings, loop, options=task.options)
-        own_targets = any(item.target is not None for item in run.invariants.items)
-        own_start = bool(task.options.get("project_initial", False)) or own_targets
-        self._together = self.why_not is None and not (own_start or loop.events.functions or grid.t_eval.size)
-        self._idle = [_Driver(loop, task.members)] if self._together else []
+        self._together, self._idle = False, list[Sweeper]()
+
+    def compile(self, *, progress: bool = False) -> Plan:
+        """Make the plan itself ready to run, before there are threads that would all compile."""
+        ready = self._ready
+        loop = Loop(replace(ready, request=replace(ready.request, progress=progress)), Keeper())
+        self.why_not = loop.why_not
+        own_targets = any(item.target is not None for item in ready.run.invariants.items)
+        own_start = ready.run.identity["project_initial"] or own_targets
+        single = own_start or loop.events.functions or ready.grid.t_eval.size
+        self._together = self.why_not is None and not single
+        self._idle = [Sweeper(loop, self.task.members)] if self._together else []
         none = np.zeros((0, self.size), self.dtype), np.zeros((0, loop.driver.params.size))
-        run_members(self, *none)  # compiles, before there are threads that would all do it
+        run_members(self, *none)
+        return self
 
     def empty(self, m: int) -> Members:
         """Room for `m` members."""
@@ -189,11 +184,14 @@ class Plan:
 
     def loop(self, y0: np.ndarray, params: np.ndarray) -> Loop:
         """The run of one member by itself."""
-        return self.task.loop(y0, None if self.task.params is None else params, **self._options)
+        return Loop(self._prepared(y0, params), Keeper())
+
+    def _prepared(self, y0: np.ndarray, params: np.ndarray) -> Prepared:
+        return self.task.prepared(y0, None if self.task.request.params is None else params)
 
     def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int) -> dict[str, Any]:
         """What makes two ensembles the same, as JSON holds it: settings, and what their functions give at one start."""
-        return {"settings": self._settings(starts, params) | {"chunk": chunk}, "start": self._start_values}
+        return {"settings": self._ready.identity(starts, params) | {"chunk": chunk}, "start": self._start_values}
 
     def known_by(self, y0s: np.ndarray, params: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
         """What the functions give at the end of the first of these members that came to one, and how large they are.
@@ -207,9 +205,8 @@ class Plan:
         k = int(ended[0])
         t, y = float(members.t[k]), members.y[k].copy()
         try:
-            loop = self.loop(y0s[k], params[k])
-            f, invariants = np.zeros_like(y), loop.driver.run.invariants
-            loop.rhs(t, y.copy(), f, params[k])
+            ready = self._prepared(y0s[k], params[k])
+            f, invariants = ready.system.derivative(t, y.copy()), ready.run.invariants
             values, sizes = invariants.values(t, y), invariants.term_sizes(t, y, f)
         except Exception:
             return nothing, nothing
@@ -219,7 +216,7 @@ class Plan:
         return found if np.isfinite(found).all() else (nothing, nothing)
 
     @contextmanager
-    def driver(self) -> Iterator[_Driver | None]:
+    def driver(self) -> Iterator[Sweeper | None]:
         """A driver that no other thread uses now; None where each member needs its own."""
         if not self._together:
             yield None
@@ -227,20 +224,13 @@ class Plan:
         try:
             mine = self._idle.pop()
         except IndexError:
-            loop = self.task.loop(self.task.y0, self.task.params, **self._options)
-            mine = _Driver(loop, self.task.members)
+            request = self.task.request
+            mine = Sweeper(Loop(self.task.prepared(request.y0, request.params), Keeper()), self.task.members)
         yield mine
         self._idle.append(mine)
 
 
-def _settings(loop: Loop, starts: np.ndarray, params: np.ndarray, options: dict[str, Any]) -> dict[str, Any]:
-    run, grid = loop.driver.run, loop.driver.grid
-    stepping = Stepping(grid.span, abs(grid.span.h) or None, options.get("first_step"), run.options.rtol, starts)
-    found = settings(loop.method, stepping, starts, params, run, grid, loop.events)
-    return found | {"project_initial": bool(options.get("project_initial", False))}
-
-
-def saved_times(loop: Loop) -> np.ndarray:
+def saved_times(grid: Grid) -> np.ndarray:
     """Times of the rows that a run saves; none where it saves its two ends only.
 
     Raises
@@ -248,7 +238,6 @@ def saved_times(loop: Loop) -> np.ndarray:
     ValueError
         Where each member would save at times of its own.
     """
-    grid = loop.driver.grid
     if grid.t_eval.size:
         return grid.t_eval.copy()
     if grid.save_every == 0:
@@ -446,12 +435,12 @@ class _Each(NamedTuple):
     figures: np.ndarray
 
 
-class _Driver:
+class Sweeper:
     """A compiled driver with its buffers, which runs member after member."""
 
     def __init__(self, loop: Loop, members: int) -> None:
         self.loop = loop
-        driver, options, span = loop.driver, loop.driver.run.options, loop.driver.grid.span
+        driver, span = loop.driver, loop.driver.grid.span
         buffers = _buffers(driver.run.work)
         self._buffers = tuple(a.reshape(-1).view(np.int64) for a in buffers)
         self._fresh = tuple(a.copy() for a in self._buffers)
@@ -459,9 +448,6 @@ class _Driver:
         self._G = np.zeros_like(driver.run.work.G)
         self._where = np.zeros(1, np.int64)
         self._compiled: Callable[..., int] | None = None
-        width = options.rtol.size // max(1, options.atol.size)
-        first = None if options.adaptive else float(driver.grid.clock[H_ABS])
-        self._stepping = Stepping(span, first, None, options.rtol[::width], options.atol)
         self._row_buffer = driver.y[None].view(float)
         self._batch = _batch(loop) if members * span.n_steps * driver.run.y0.size >= LEAST_WORK else None
 
@@ -617,10 +603,9 @@ class _Driver:
 
     def _first_steps(self, plan: Plan, y0s: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, int]:
         """Lengths of the first steps, and the evaluations before them."""
-        driver, stepping = self.loop.driver, self._stepping
-        first_step = plan.task.options.get("first_step")
-        if stepping.h is not None or first_step is not None:
-            return np.full(len(y0s), stepping.h or first_step, float), self._evaluations
+        driver, stepping = self.loop.driver, self.loop.stepping
+        if stepping.h is not None or stepping.first_step is not None:
+            return np.full(len(y0s), stepping.h or stepping.first_step, float), self._evaluations
         taus = np.empty(len(y0s))
         for k, (y0, p) in enumerate(zip(y0s, params, strict=True)):
             derivative = self._derivative(p)

@@ -80,7 +80,7 @@ def run_elsewhere(task: Task, key: str, chunk: Chunk) -> Part:
     with _making:
         plan = _plans.get(key)
         if plan is None:
-            plan = _plans[key] = Plan(task)
+            plan = _plans[key] = Plan(task).compile()
             while len(_plans) > KEPT_PLANS:
                 _plans.popitem(last=False)
     return run_chunk(plan, chunk)

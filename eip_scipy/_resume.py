@@ -18,8 +18,9 @@ from ._events import Events
 from ._inputs import is_number, shown
 from ._interrupts import TerminatedError
 from ._own_file import OwnFile, unlocked
-from ._setup import DIRECTIONS, Run, Stepping
-from ._step import AUTO, ERROR, EUCLIDEAN, H_ABS, T
+from ._setup import Run
+from ._step import H_ABS, T
+from ._stepping import Stepping
 from .checkpoint import CheckpointError
 
 __all__ = ["Keeper", "kept", "settings"]
@@ -111,34 +112,18 @@ def settings(
     method: str, stepping: Stepping, y0: np.ndarray, params: np.ndarray, run: Run, grid: Any, events: Events
 ) -> dict[str, Any]:
     """All that decides the bits of a run, but for the functions, under the names that users give."""
-    o, span = run.options, stepping.span
+    span = stepping.span
     # A one-step method of the user's own is known by its name and orders, as functions are by what they give.
     parts = run.method if isinstance(run.method, tuple) else (run.method.order, run.method.error_estimator_order)
-    metric = {EUCLIDEAN: "euclidean", ERROR: "error"}.get(o.metric, run.work.sigma)
     found = {
         "method": f"{method} {_digest(parts)[:8]}",
         "t_span": (span.t0, span.t_bound),
         "h": stepping.h,
         "first_step": stepping.first_step,
         "max_step": span.max_step,
-        "rtol": o.rtol,
-        "atol": o.atol,
         "y0": y0,
         "params": params,
-        "invariants": [
-            (label, item.target, item.scale)
-            for label, item in zip(run.invariants.labels, run.invariants.items, strict=True)
-        ],
-        "metric": metric,
-        "blocks": (o.groups.start, o.groups.member),
-        "frame": None if run.frame is None else [np.asarray(a, y0.dtype) for a in run.frame],
-        "direction": next(name for name, value in DIRECTIONS.items() if value == o.direction),
-        "iterations": o.iterations,
-        "every": "auto" if o.every == AUTO else o.every,
-        "reuse_f": o.reuse_f,
-        "uses_f": o.uses_f,
-        "project_initial": run.y0 is not y0,
-        "compensated": o.compensated,
+        **run.identity,
         "save_every": grid.save_every or None,
         "t_eval": grid.t_eval if grid.t_eval.size else None,
         "events": events.ends,

@@ -18,11 +18,13 @@ from . import _setup
 from ._batch import finish_batch, make_advance_batch, make_lanes, make_lanes_work
 from ._caching import cached_njit
 from ._compile import NotCompilableError, signatures_of_batches, with_inlined
+from ._driver import PENDING, ROW, STEP, source_stamp
 from ._kernels import OK
 from ._octets import LANES
 from ._step import AUTO, NEW, Options, Span, T
+from ._stepping import UNBOUNDED
 from ._trust import EXPECTED, START, SUM, TERMS, TOGETHER
-from .longrun import PENDING, ROW, STEP, Loop, source_stamp
+from .longrun import Loop
 from .result import FOUND, LAST_RANK, N_COUNTERS, NFEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
 
 __all__ = ["Batch", "Ended", "can_run", "lanes_of"]
@@ -63,7 +65,7 @@ class Ended(NamedTuple):
 
 def can_run(options: Options, span: Span, dtype: np.dtype) -> bool:
     """Whether members with these options take the same fixed steps, and a projection that a batch has."""
-    steps = not options.adaptive and span.n_steps < _setup.UNBOUNDED and np.dtype(dtype).kind != "c"
+    steps = not options.adaptive and span.n_steps < UNBOUNDED and np.dtype(dtype).kind != "c"
     projection = options.iterations == 1 and options.direction == NEW and options.every != AUTO
     return steps and projection and not options.compensated
 

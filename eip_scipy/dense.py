@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import DOP853 as SCIPY_DOP853
@@ -21,41 +21,45 @@ from .one_step import OneStep
 from .result import NFEV
 from .tableaux import DOP853, Tableau
 
-__all__ = ["ExactEnds", "ManifoldDenseOutput", "dense_output"]
+__all__ = ["End", "ExactEnds", "ManifoldDenseOutput", "dense_output"]
 
 Array = np.ndarray
 ITERATIONS = 5
+
+
+class End(NamedTuple):
+    """One end of a step: time, state and slope."""
+
+    t: float
+    y: Array
+    f: Array
 
 
 def dense_output(
     rhs: Callable[..., None],
     run: Run,
     tableau: Tableau | NystromTableau | OneStep,
-    t_old: float,
-    t: float,
-    y_old: Array,
-    y: Array,
-    f_old: Array,
-    f: Array,
+    old: End,
+    new: End,
     params: Any = None,
 ) -> ManifoldDenseOutput:
-    """Dense output over the step that `run` made last, from (t_old, y_old) to (t, y), with slopes f_old and f."""
-    h = t - t_old
+    """Dense output over the step that `run` made last, from its `old` end to its `new` one."""
     if isinstance(tableau, OneStep):  # whose steps do not take f
-        f_old, f = np.empty_like(y_old), np.empty_like(y)
-        rhs(t_old, y_old, f_old, params)
-        rhs(t, y, f, params)
+        old, new = (end._replace(f=np.empty_like(end.y)) for end in (old, new))
+        for t, y, f in (old, new):
+            rhs(t, y, f, params)
         run.work.counters[NFEV] += 2
     K = run.work.K.copy()
     if isinstance(tableau, NystromTableau):
-        base = _quintic(h, y_old, y, f_old, f)
+        base = _quintic(old, new)
     elif tableau is DOP853:
-        base = _dop853(rhs, params, t_old, h, y_old, y, f, K, run.work.counters)
+        base = _dop853(rhs, params, old, new, K, run.work.counters)
     elif isinstance(tableau, Tableau) and tableau.P is not None:
-        base = _polynomial(h, y_old, y, f, K, tableau.P)
+        base = _polynomial(old, new, K, tableau.P)
     else:
-        base = _hermite(h, y_old, y, f_old, f)
-    return ManifoldDenseOutput(rhs, run, t_old, t, y_old.copy(), y.copy(), f_old, f, base, params)
+        base = _hermite(old, new)
+    old, new = (end._replace(y=end.y.copy()) for end in (old, new))
+    return ManifoldDenseOutput(rhs, run, old, new, base, params)
 
 
 class _AtRealTimes(DenseOutput):
@@ -98,24 +102,15 @@ class ManifoldDenseOutput(_AtRealTimes):
     """
 
     def __init__(
-        self,
-        rhs: Callable[..., None],
-        run: Run,
-        t_old: float,
-        t: float,
-        y_old: Array,
-        y: Array,
-        f_old: Array,
-        f: Array,
-        base: Callable[[Array], Array],
-        params: Any,
+        self, rhs: Callable[..., None], run: Run, old: End, new: End, base: Callable[[Array], Array], params: Any
     ) -> None:
-        super().__init__(t_old, t)
+        super().__init__(old.t, new.t)
         self._rhs, self._invariants, self._params = rhs, run.invariants, params
-        self._y_old, self._y, self._base = y_old, y, base
+        self._y_old, self._y, self._base = old.y, new.y, base
         self._sigma = run.work.sigma
         if run.invariants.size and run.options.metric == ERROR:
-            self._sigma = _travelled(y_old, y, (t - t_old) * f_old, (t - t_old) * f, run.options.groups)
+            h = new.t - old.t
+            self._sigma = _travelled(old.y, new.y, h * old.f, h * new.f, run.options.groups)
         plain = run.options._replace(metric=GIVEN, direction=NEW, every=1, compensated=False)
         self._options = plain._replace(iterations=ITERATIONS, watched=False, limit=math.inf)
         self._counters = run.work.counters
@@ -185,8 +180,10 @@ def _travelled(y_old: Array, y: Array, step_old: Array, step: Array, groups: Gro
     return sigma / largest if largest > 0.0 else np.ones_like(sigma)
 
 
-def _hermite(h: float, y_old: Array, y: Array, f_old: Array, f: Array) -> Callable[[Array], Array]:
+def _hermite(old: End, new: End) -> Callable[[Array], Array]:
     """The cubic through both ends with their slopes."""
+    (t_old, y_old, f_old), (t, y, f) = old, new
+    h = t - t_old
     change = y - y_old
     left, right = (h * f_old - change)[:, None], (h * f - change)[:, None]
     y_old, change = y_old[:, None].copy(), change[:, None]
@@ -198,8 +195,10 @@ def _hermite(h: float, y_old: Array, y: Array, f_old: Array, f: Array) -> Callab
     return base
 
 
-def _quintic(h: float, y_old: Array, y: Array, f_old: Array, f: Array) -> Callable[[Array], Array]:
+def _quintic(old: End, new: End) -> Callable[[Array], Array]:
     """For y = (q, v): the quintic through positions, velocities and accelerations at both ends, and its slope."""
+    (t_old, y_old, f_old), (t, y, f) = old, new
+    h = t - t_old
     half = y.size // 2
     q, v, a = y_old[:half], y_old[half:], f_old[half:]
     # What the Taylor polynomial at the old end misses at the new one: in the position, the slope and the curvature.
@@ -224,8 +223,10 @@ def _quintic(h: float, y_old: Array, y: Array, f_old: Array, f: Array) -> Callab
     return base
 
 
-def _polynomial(h: float, y_old: Array, y: Array, f: Array, K: Array, P: Array) -> Callable[[Array], Array]:
+def _polynomial(old: End, new: End, K: Array, P: Array) -> Callable[[Array], Array]:
     """The tableau's interpolant, bent at its end to the projected state and the slope there."""
+    (t_old, y_old, _), (t, y, f) = old, new
+    h = t - t_old
     Q = h * (K.T @ P)
     moved = (y - y_old - Q.sum(axis=1))[:, None]
     turned = (h * (f - K[-1]))[:, None]
@@ -240,17 +241,11 @@ def _polynomial(h: float, y_old: Array, y: Array, f: Array, K: Array, P: Array) 
 
 
 def _dop853(
-    rhs: Callable[..., None],
-    params: Any,
-    t_old: float,
-    h: float,
-    y_old: Array,
-    y: Array,
-    f: Array,
-    K: Array,
-    counters: Array,
+    rhs: Callable[..., None], params: Any, old: End, new: End, K: Array, counters: Array
 ) -> Callable[[Array], Array]:
     """SciPy's interpolant of order 7, from three more evaluations of the right-hand side."""
+    (t_old, y_old, _), (t, y, f) = old, new
+    h = t - t_old
     stages = K.shape[0]
     K = np.concatenate([K, np.zeros((3, y.size), K.dtype)])
     rows = zip(SCIPY_DOP853.A_EXTRA, SCIPY_DOP853.C_EXTRA, strict=True)

@@ -24,15 +24,17 @@ from ._events import Events
 from ._inputs import count, flag, is_number, real_array, refuse_units, shown
 from ._interrupts import ended_by_sigterm, kept_ctrl_c
 from ._members import FAILED, NOT_RUN, Members, Plan, Task
+from ._memory import check_bytes, free_memory
 from ._names import nearest
+from ._options import ProjectionOptions
 from ._own_file import absolute
 from ._pools import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
+from ._prepare import DEFAULT, Request
 from ._side_by_side import lanes_of
 from ._statistics import Statistics, merge
 from ._store import CheckpointStore, Store, ZarrStore, location, require_same_functions
 from ._trust import ProjectionWarning
 from .invariants import as_invariants
-from .longrun import DEFAULT, check_bytes, free_memory, integrate
 from .problems._problem import Problem
 from .result import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from .solvers import EIPRK4, EIPSolver
@@ -47,6 +49,9 @@ LARGEST_CHUNK = 4096
 LEAST_CHUNKS = 16
 TRIED = 8
 SHOWN = 5
+# Of a request: what an ensemble has of its own, or not at all.
+ALONE = {"fun", "t_span", "y0", "params", "projection", "callback", "diagnostics", "max_bytes", "progress"}
+OWN = ("executor", "reduce", "callback", "out", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(ALONE))
 
 
 class EnsembleResult(OptimizeResult):
@@ -231,10 +236,9 @@ def ensemble(
     >>> run.y.shape, run.success, bool((run.max_defect < 1e-11).all())
     ((5, 4), True, True)
     """
-    known = _check_options(options)
-    given = {name: value for name, value in (("h", h), ("invariants", invariants)) if value is not DEFAULT}
-    given |= {name: value for name, value in (("save_every", save_every), ("t_eval", t_eval)) if value is not None}
-    given |= {"method": method, **known}
+    _check_options(options)
+    if invariants is not DEFAULT:
+        options["invariants"] = invariants
     if not (reduce is None or reduce == "state" or callable(reduce)):
         raise ValueError(f"reduce must be 'state' or a function reduce(t, y), got {shown(reduce)}.")
     if callback is not None and not callable(callback):
@@ -244,12 +248,13 @@ def ensemble(
     _check_places(out, checkpoint, checkpoint_every, resume)
     out = None if out is None else location(out)
     checkpoint = None if checkpoint is None else absolute(checkpoint)
-    starts, parameters = _inputs(fun, y0s, params, given)
+    starts, parameters = _inputs(fun, y0s, params, options.get("invariants", ()))
     keep = reduce is None or out is not None
-    own = parameters[0] if parameters.shape[1] else None
-    task = Task(_bare(fun), t_span, given, starts[0], own, reduce, keep, len(starts))
-    task, doubts = _first_that_starts(task, starts, parameters)
-    plan = Plan(task, compiled=False)
+    common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
+    request = Request.of(fun=_bare(fun), t_span=t_span, y0=starts[0], params=parameters[0], **common)
+    if not parameters.shape[1]:
+        request = dataclasses.replace(request, params=None)
+    plan, doubts = _first_that_starts(Task(request, reduce, keep, len(starts)), starts, parameters)
     starts = np.ascontiguousarray(starts, plan.dtype)
     size = _chunk_size(plan, len(starts), fun) if chunk is None else count("chunk", chunk)
     held = plan.times.size if reduce is None and out is None else 0
@@ -262,7 +267,7 @@ def ensemble(
         store = CheckpointStore(checkpoint, plan.identity(starts, parameters, size), checkpoint_every, resume)
     with ended_by_sigterm(store is not None), nullcontext() if store is None else closing(store):
         gathered = _Gathered(plan, len(starts), held, size, store, callback, doubts)
-        result = gathered.run(partial(_pool, executor, task, progress), _chunks(starts, parameters, size), progress)
+        result = gathered.run(partial(_pool, executor, plan, progress), _chunks(starts, parameters, size), progress)
     doubtful = np.flatnonzero((result.status >= 0) & ~result.trusted)
     if doubtful.size:
         _warn(result, doubtful)
@@ -304,7 +309,7 @@ class _Gathered:
         doubts: dict[int, str],
     ) -> None:
         self.plan, self.chunk, self.store, self.callback, self.doubts = plan, chunk, store, callback, doubts
-        self.method = plan.task.options["method"].__name__
+        self.method = plan.task.request.method.__name__
         self.whole = Members.empty(members, plan.size, plan.dtype, len(plan.names), held)
         self.statistics: Statistics | None = None
         self.stopped = False
@@ -414,17 +419,14 @@ class _Gathered:
         )
 
 
-def _check_options(options: dict[str, Any]) -> dict[str, Any]:
+def _check_options(options: dict[str, Any]) -> None:
     """The options that go on to `integrate`."""
-    own = set(ensemble.__kwdefaults__ or ())
-    alone = {"callback", "diagnostics", "max_bytes", "progress"}
-    known = set(integrate.__kwdefaults__ or ()) - alone - {"checkpoint", "checkpoint_every", "resume"}
+    known = {option.name for option in dataclasses.fields(Request)} - ALONE | set(ProjectionOptions.names())
     for name in options:
         if name not in known:
-            raise TypeError(f"ensemble() has no option {name!r}{nearest(name, own | known)}")
+            raise TypeError(f"ensemble() has no option {name!r}{nearest(name, (*OWN, *known))}")
     if not all(math.isfinite(times) for _, times in Events(options.get("events")).ends):
         raise ValueError("ensemble: an event must be terminal: it ends a member; the times of others are not kept.")
-    return options
 
 
 def _check_places(out: Any, checkpoint: Any, every: Any, resume: Any) -> None:
@@ -441,7 +443,7 @@ def _check_places(out: Any, checkpoint: Any, every: Any, resume: Any) -> None:
         raise ValueError("resume=True needs the place to go on from: out= or checkpoint=.")
 
 
-def _inputs(fun: Any, y0s: Any, params: Any, given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _inputs(fun: Any, y0s: Any, params: Any, invariants: Any) -> tuple[np.ndarray, np.ndarray]:
     """Starts (members, n) and parameters (members, p), p = 0 where there are none."""
     problem = fun if isinstance(fun, Problem) else None
     if y0s is None:
@@ -463,7 +465,7 @@ def _inputs(fun: Any, y0s: Any, params: Any, given: dict[str, Any]) -> tuple[np.
         )
     elif own.ndim > 2:
         raise ValueError(f"params must have the shape (p,) or (members, p), got {own.shape}.")
-    if own.ndim == 2 and any(item.args for item in as_invariants(given.get("invariants", ()))):
+    if own.ndim == 2 and any(item.args for item in as_invariants(invariants)):
         raise ValueError(
             "ensemble: invariants with args, and params for each member: leave args out; the functions receive each "
             "member's params as their last argument."
@@ -483,22 +485,24 @@ def _not_called(t: float, y: np.ndarray) -> np.ndarray:
     raise NotImplementedError("the problem's compiled right-hand side is in use")
 
 
-def _first_that_starts(task: Task, starts: np.ndarray, params: np.ndarray) -> tuple[Task, dict[int, str]]:
-    """The task with a member whose start `integrate` takes; its error where it takes none of some members.
+def _first_that_starts(task: Task, starts: np.ndarray, params: np.ndarray) -> tuple[Plan, dict[int, str]]:
+    """The plan by a member whose start `integrate` takes; its error where it takes none of some members.
 
     Also what the checks of the start found, by member: it holds for all that have the same parameters.
     """
     first: Exception | None = None
     for k in np.unique(np.linspace(0, len(starts) - 1, TRIED).astype(int)):
-        tried = dataclasses.replace(task, y0=starts[k].copy(), params=None if task.params is None else params[k].copy())
+        own = None if task.request.params is None else params[k].copy()
+        tried = dataclasses.replace(task, request=dataclasses.replace(task.request, y0=starts[k].copy(), params=own))
         try:
-            loop = tried.loop(tried.y0, tried.params, compiled=False)
+            ready = tried.prepared(tried.request.y0, own, check_start=True)
         except Exception as error:
             first = first or error
         else:
-            found = loop.driver.run.trust.message
+            found = ready.run.trust.message
+            ready.run.trust.doubts.clear()
             alike: list[int] = np.flatnonzero((params == params[k]).all(axis=1)).tolist() if found else []
-            return tried, dict.fromkeys(alike, found)
+            return Plan(tried, ready), dict.fromkeys(alike, found)
     assert first is not None
     raise first
 
@@ -506,7 +510,7 @@ def _first_that_starts(task: Task, starts: np.ndarray, params: np.ndarray) -> tu
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
     """Members in a chunk, by the problem alone: about a second's work, bounded in bytes, a multiple of the lanes."""
     rhs = fun.rhs or fun.fun if isinstance(fun, Problem) else fun
-    budget = CHUNK_STEPS if is_jitted(rhs) and plan.task.options.get("compiled") is not False else INTERPRETED_STEPS
+    budget = CHUNK_STEPS if is_jitted(rhs) and plan.task.request.compiled is not False else INTERPRETED_STEPS
     steps = plan.n_steps or UNKNOWN_STEPS
     by_work = budget * 4 / (steps * max(4, plan.size))
     by_bytes = CHUNK_BYTES / (plan.size * plan.dtype.itemsize * (1 + plan.times.size))
@@ -536,11 +540,11 @@ def _chunks(starts: np.ndarray, params: np.ndarray, size: int) -> Callable[[int]
     return chunks
 
 
-def _pool(executor: Any, task: Task, progress: bool) -> Pool:
+def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
     """Where the chunks run."""
-    key = uuid.uuid4().hex
+    task, key = plan.task, uuid.uuid4().hex
     if executor is None or isinstance(executor, (int, np.integer)):
-        plan = Plan(task, progress=progress)
+        plan.compile(progress=progress)
         workers = cores() if executor is None else count("executor", executor)
         return ThreadPool(plan, workers if plan.why_not is None else 1)
     if isinstance(executor, Executor):

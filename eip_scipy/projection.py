@@ -12,11 +12,14 @@ import numpy as np
 from . import _setup
 from ._inputs import count, is_number, reals, refuse_units, shown
 from ._kernels import BAND, EPS
-from ._step import EUCLIDEAN, NEW, Options, make_work, project_step
+from ._options import MOST_ITERATIONS, ProjectionOptions, weights
+from ._step import Span, make_work, project_step
+from ._stepping import Stepping
 from ._trust import LARGE_SHARE, ProjectionWarning
 from .invariants import InvariantSet
 from .one_step import as_vector
 from .result import LAST_RANK, ProjectionResult
+from .tableaux import RK1
 
 __all__ = ["project"]
 
@@ -87,39 +90,29 @@ def project(
     if not is_number(t) or not math.isfinite(t):
         raise ValueError(f"project: t must be a finite number, got {shown(t)}.")
     t, y = float(t), _setup.initial_state(y_hat, "y_hat")
-    n, width = y.size, 2 if y.dtype.kind == "c" else 1
+    n = y.size
     derivative = _derivative(f, t, y)
     f_hat = derivative(t, y)
     known = InvariantSet(invariants, t, y, f_hat, 0.0)
     if known.uses_f and f is None:
         raise ValueError("project: a gradient uses f; pass f=, the derivative at y_hat or a function f(t, y).")
-    iterations = count("iterations", iterations, _setup.MOST_ITERATIONS)
+    iterations = count("iterations", iterations, MOST_ITERATIONS)
     if known.uses_f and iterations > 1 and not callable(f):
         raise ValueError(
             "project: a gradient uses f at each Newton step; with iterations > 1 pass f as a function f(t, y)."
         )
-    options = Options(
-        rtol=np.zeros(n * width),
-        atol=np.zeros(n),
-        block_atol=np.zeros(n),
-        groups=_setup.blocks_of(None, n, width),
-        frame=_setup.frame_rows(frame, n, width),
-        target=_targets(known, target),
-        scales=known.scales,
-        kappa=1.0,
-        metric=EUCLIDEAN,
-        direction=NEW,
+    given = ProjectionOptions(
+        metric="euclidean" if sigma is None else weights("sigma", sigma, n),
+        frame=frame,
         iterations=iterations,
-        every=1,
-        reuse_f=True,
-        uses_f=known.uses_f,
-        compensated=False,
-        adaptive=False,
-        per_band=1.0 / (BAND * EPS),
+        check=False,
     )
+    nowhere = Stepping(Span(t, 0.0, t, 1.0, 0, np.inf), 0.0, None, np.zeros(n), np.zeros(n))
+    options, weight, _ = given.settled(RK1, nowhere, y, known)
+    options = options._replace(target=_targets(known, target))
     work = make_work(n, y.dtype, 0, known.size, n)
-    if sigma is not None:
-        work.sigma[:] = np.repeat(_setup.weights("sigma", sigma, n), width)
+    if weight is not None:
+        work.sigma[:] = weight
     work.y_hat[:], work.K[-1] = y, f_hat
     out = np.empty_like(y)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,10 +15,12 @@ from . import _setup
 from ._inputs import refuse_units
 from ._kernels import FAILED_PROJECTION, OK
 from ._names import nearest
-from ._setup import ProjectionOptions, Stepping
+from ._options import ProjectionOptions, takes_projection_options
+from ._setup import Start
 from ._step import T_NEW, T, close_step, next_step, project_any
+from ._stepping import StepOptions, Stepping, interval
 from ._trust import ProjectionWarning
-from .dense import ExactEnds, dense_output
+from .dense import End, ExactEnds, dense_output
 from .invariants import as_invariants
 from .nystrom import RKN86, RKN1210, NystromTableau
 from .one_step import OneStep, OneStepMethod
@@ -39,12 +42,10 @@ __all__ = [
     "eip_method",
 ]
 
-OPTIONS = (
-    *("h", "first_step", "max_step", "rtol", "atol", "vectorized", "invariants", "metric", "blocks", "frame"),
-    *("direction", "iterations", "every", "reuse_f", "check", "project_initial", "diagnostics"),
-)
+OPTIONS = ("h", "first_step", "max_step", "rtol", "atol", "vectorized", "diagnostics", *ProjectionOptions.names())
 
 
+@takes_projection_options
 class EIPSolver(OdeSolver):
     """Explicit invariants-preserving solver: a Runge-Kutta step, then one Newton step of projection.
 
@@ -68,34 +69,7 @@ class EIPSolver(OdeSolver):
         Whether `fun` takes (n, k) arrays, as in SciPy.
     h : float, optional
         A fixed step instead: its length, > 0 in either direction. The last step ends on `t_bound` and may be shorter.
-    invariants : Invariant or sequence of Invariant, optional
-        What to keep.
-    metric : {"error", "euclidean"} or array_like, shape (n,), optional
-        Weights of the correction's components. "error" (default where the method has an error estimate) makes the
-        least correction measured in local errors of the step; "euclidean" is the least correction in the plain
-        2-norm; an array gives the weights themselves (larger: moves more).
-    blocks : int or sequence of index arrays, optional
-        Components that the error metric weighs together: consecutive groups of that many, or index arrays. Bodies'
-        positions and velocities in 3 dimensions: ``blocks=3``. Default: each component by itself.
-    frame : (C, S), optional
-        Linear invariants C y, with C of shape (k, n), that corrections must not touch, and the shifts S, (n, k),
-        that compensate for it; C S must be invertible.
-    direction : {"new", "old", "midpoint"}, optional
-        Where the gradients that span the correction are taken: at the step's raw result (default), at its start or
-        in the middle.
-    iterations : int, optional
-        Newton steps of the projection. 1 (default) is the EIP method; more is the standard projection.
-    every : int or "auto", optional
-        Project each `every`-th step and the last one; "auto": when the error estimates, added in quadrature since the
-        last projection, make an invariant more uncertain than round-off (asked at each fifth step).
-    reuse_f : bool, optional
-        Where the step evaluates f at its raw result anyway, let it serve as the next step's first stage.
-    check : bool, optional
-        Check the invariants and their gradients at the start and again after some steps, watch whether the corrections
-        are those of the steps' errors, and fail where a projection leaves a defect as large as its invariant's terms.
-        False: none of these.
-    project_initial : bool, optional
-        Project y0 onto given targets before the first step.
+    {ProjectionOptions}
     diagnostics : Diagnostics, optional
         An empty `Diagnostics`, which the run fills.
 
@@ -135,66 +109,37 @@ class EIPSolver(OdeSolver):
         first_step: float | None = None,
         *,
         h: float | None = None,
-        invariants: Any = (),
-        metric: Any = None,
-        blocks: Any = None,
-        frame: Any = None,
-        direction: str = "new",
-        iterations: int = 1,
-        every: int | str = 1,
-        reuse_f: bool = True,
-        check: bool = True,
-        project_initial: bool = False,
         diagnostics: Any = None,
-        **extraneous: Any,
+        **options: Any,
     ) -> None:
+        projection, extraneous = ProjectionOptions.of(options)
         if extraneous:
             warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=3)
         if not hasattr(self, "TABLEAU"):
             raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
-        t0, t_bound = _setup.interval((t0, t_bound))
+        t0, t_bound = interval((t0, t_bound))
         start = _setup.initial_state(y0)
         self._calls = [0]
         derivative, self._rhs = _checked(fun, start.size, start.dtype, vectorized, self._calls)
         self._derivative = derivative
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
-        stepping = _setup.stepping(
-            type(self).__name__, self.TABLEAU, t0, t_bound, self.n, h, first_step, max_step, rtol, atol, stacklevel=4
-        )
+        steps = StepOptions(h=h, first_step=first_step, max_step=max_step, rtol=rtol, atol=atol)
+        stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, self.n, stacklevel=4)
         self.h, self.max_step = stepping.h, stepping.span.max_step
         self.rtol, self.atol = stepping.rtol, stepping.atol
         self._k, self._span = 0, stepping.span
-        kept = as_invariants(invariants)
+        kept = as_invariants(projection.invariants)
         if self.h is None and stepping.first_step is None:
             stepping.require_scale(start)
-        self._scipy = self._scipy_solver(derivative, start, stepping, kept)
+        self._scipy = self._scipy_solver(derivative, start, stepping, bool(kept) or bool(projection.compensated))
         f0 = derivative(t0, start).copy() if self._scipy is None else np.zeros_like(start)
         if isinstance(self.TABLEAU, NystromTableau):
             _setup.check_second_order(lambda t, y: derivative(t, y).copy(), t0, start, f0, type(self).__name__)
         self.h_abs = stepping.first_step
         if self._scipy is None:
             self.h_abs = stepping.first(derivative, start, f0, self.TABLEAU)
-        run = _setup.prepare(
-            self.TABLEAU,
-            derivative,
-            t0,
-            start,
-            f0,
-            self.h_abs or 0.0,
-            ProjectionOptions(
-                invariants=kept,
-                metric=metric,
-                blocks=blocks,
-                frame=frame,
-                direction=direction,
-                iterations=iterations,
-                every=every,
-                reuse_f=reuse_f,
-                check=check,
-                project_initial=project_initial,
-            ),
-            stepping,
-        )
+        projection = replace(projection, invariants=kept)
+        run = _setup.prepare(self.TABLEAU, derivative, Start(t0, start, f0, self.h_abs or 0.0), projection, stepping)
         # Lists: Python reads and writes their numbers several times faster than an array's.
         run.work = run.work._replace(counters=[0] * N_COUNTERS, norm=[0.0], max_correction=[0.0])  # type: ignore[arg-type]
         _setup.attach(diagnostics, run)
@@ -219,9 +164,9 @@ class EIPSolver(OdeSolver):
         derivative: Callable[[float, np.ndarray], np.ndarray],
         start: np.ndarray,
         stepping: Stepping,
-        invariants: tuple[Any, ...],
+        own_steps: bool,
     ) -> OdeSolver | None:
-        own_steps = invariants or type(self)._project_step is not EIPSolver._project_step
+        own_steps |= type(self)._project_step is not EIPSolver._project_step
         if self.SCIPY is None or stepping.h is not None or own_steps:
             return None
 
@@ -347,9 +292,8 @@ class EIPSolver(OdeSolver):
             out = ExactEnds(self._scipy.dense_output(), self.y_old, self.y)
             self.nfev = self._calls[0]
             return out
-        out = dense_output(
-            self._rhs, self._run, self.TABLEAU, self.t_old, self.t, self.y_old, self.y, self.f_old, self.f
-        )
+        old, new = End(self.t_old, self.y_old, self.f_old), End(self.t, self.y, self.f)
+        out = dense_output(self._rhs, self._run, self.TABLEAU, old, new)
         self._count()
         return out
 

@@ -164,7 +164,7 @@ def pool(executor: Any, task: Task, key: str) -> DaskPool:
         return DaskPool(DaskExecutor(executor).client, task, key, own=False)
     if dask.config.get("scheduler-address", None):
         return DaskPool(DaskExecutor(distributed.Client()).client, task, key, own=True)
-    Plan(task)  # compiled here, the workers find it on the disk instead of all compiling the same
+    Plan(task).compile()  # here, the workers find it on the disk instead of all compiling the same
     return DaskPool(local_client(), task, key, own=True)
 
 
@@ -190,7 +190,7 @@ class DaskPool:
             return self._result(ticket)
         except distributed.KilledWorker as error:
             task = replace(self._task, reduce=None, keep=True)
-            plan = Plan(self._task, compiled=False)
+            plan = Plan(self._task)
             members = _joined(self._one_by_one(task, plan, chunk, error))
             return finished(self._task, plan, members)
 

@@ -47,6 +47,7 @@ from eip_scipy import (
     CheckpointError,
     Diagnostics,
     Invariant,
+    _driver,
     _resume,
     checkpoint,
     integrate,
@@ -187,7 +188,7 @@ def fine(monkeypatch):
     monkeypatch.setattr(longrun, "CHUNK_SECONDS", 0.0)
     monkeypatch.setattr(_resume, "SNAPSHOT_SECONDS", 0.0)
     monkeypatch.setattr(_resume, "LEAST_RATIO", 0.0)
-    load = longrun._Driver.load
+    load = longrun.Driver.load
 
     def poisoned(driver, *rows):
         known = [a.copy() for a in driver.parts().values()]
@@ -198,13 +199,13 @@ def fine(monkeypatch):
             part[...] = value
         load(driver, *rows)
 
-    monkeypatch.setattr(longrun._Driver, "load", poisoned)
+    monkeypatch.setattr(longrun.Driver, "load", poisoned)
 
 
 @contextlib.contextmanager
 def broken_off(monkeypatch, calls):
     """Let the run be broken off before its so many-th chunk."""
-    advance, left = longrun._Driver.advance, [calls]
+    advance, left = longrun.Driver.advance, [calls]
 
     def stop(driver, k_end):
         left[0] -= 1
@@ -213,7 +214,7 @@ def broken_off(monkeypatch, calls):
         return advance(driver, k_end)
 
     with monkeypatch.context() as patch:
-        patch.setattr(longrun._Driver, "advance", stop)
+        patch.setattr(longrun.Driver, "advance", stop)
         yield
 
 
@@ -416,7 +417,7 @@ def test_a_failed_run_fails_again(tmp_path):
 @pytest.mark.usefixtures("fine")
 def test_an_endless_run(tmp_path, monkeypatch):
     """No known number of rows: they grow beyond what is allocated, before an interruption and after it."""
-    monkeypatch.setattr(longrun, "FIRST_ROWS", 4)
+    monkeypatch.setattr(_driver, "FIRST_ROWS", 4)
     options = FIXED | {"events": third, "save_every": 3}
     whole = integrate(orbit, (0, np.inf), Y0, **options)
     assert whole.status == 1
@@ -455,7 +456,7 @@ def test_a_problem(tmp_path, monkeypatch):
 
 def times_written(monkeypatch, path, every, seconds=0.0, **options):
     """How often a run of 200 chunks of 10 ms of a clock of its own writes, each in so many seconds."""
-    now, written, advance, write = [0.0], [], longrun._Driver.advance, checkpoint.put
+    now, written, advance, write = [0.0], [], longrun.Driver.advance, checkpoint.put
 
     def tick(driver, k_end):
         now[0] += 0.01
@@ -467,7 +468,7 @@ def times_written(monkeypatch, path, every, seconds=0.0, **options):
         write(path, header, arrays, place)
 
     with monkeypatch.context() as patch:
-        patch.setattr(longrun._Driver, "advance", tick)
+        patch.setattr(longrun.Driver, "advance", tick)
         patch.setattr(_resume.time, "perf_counter", lambda: now[0])
         patch.setattr(checkpoint, "put", note)
         integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=every, **FIXED | options)
@@ -1099,14 +1100,14 @@ def test_a_run_goes_on_while_the_disk_is_full(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("fine")
 def test_the_disk_stays_full(tmp_path, monkeypatch):
     whole, path = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run"
-    advance, patches = longrun._Driver.advance, []
+    advance, patches = longrun.Driver.advance, []
 
     def fill_after_a_while(driver, k_end):
         if driver.step > 100 and not patches:
             patches.append(fill_disk(monkeypatch, 1))
         return advance(driver, k_end)
 
-    monkeypatch.setattr(longrun._Driver, "advance", fill_after_a_while)
+    monkeypatch.setattr(longrun.Driver, "advance", fill_after_a_while)
     with pytest.warns(RuntimeWarning, match="no space left on device; it still holds step 10") as record:
         found = integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=1e-9, **FIXED)
     assert str(record[-1].message).endswith("The result is whole.")

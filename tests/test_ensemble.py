@@ -41,7 +41,8 @@ from eip_scipy import (
     ensemble,
     integrate,
 )
-from eip_scipy._members import Plan, Task, _Driver, _Watch, run_members, sweep
+from eip_scipy._members import Plan, Sweeper, Task, _Watch, run_members, sweep
+from eip_scipy._prepare import Request
 from eip_scipy.problems import kepler
 
 needs_jit = pytest.mark.needs_jit
@@ -214,7 +215,7 @@ def test_no_member_leaves_a_trace(options):
     """Whatever the buffers held before."""
     y0s = starts(6)
     shared = {"method": EIPRK4, "h": 0.03, "invariants": HL, **options}
-    plan = Plan(Task(jit_orbit, SPAN, shared, y0s[0], None))
+    plan = Plan(Task(Request.of(fun=jit_orbit, t_span=SPAN, y0=y0s[0], **shared))).compile()
     none = np.empty((6, 0))
     before = run_members(plan, y0s, none)
     with plan.driver() as driver:
@@ -250,10 +251,10 @@ def test_the_sweep_is_plain_python_too(options):
     y0s = starts(4)
     y0s[1] = np.nan
     shared = {"method": EIPRK4, "h": 0.1, "invariants": [H, L], "compiled": False, **options}
-    plan = Plan(Task(orbit, (0.0, 2.0), {k: v for k, v in shared.items() if v is not None}, y0s[0], None))
+    plan = Plan(Task(Request.of(fun=orbit, t_span=(0.0, 2.0), y0=y0s[0], **shared))).compile()
     none = np.zeros((4, 0))
     expected = run_members(plan, y0s, none)
-    driver = _Driver(plan.loop(y0s[0], none[0]), 1)
+    driver = Sweeper(plan.loop(y0s[0], none[0]), 1)
     driver._compiled = sweep
     found = plan.empty(4)
     driver.run(plan, y0s, none, found, _Watch(None))

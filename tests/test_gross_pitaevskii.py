@@ -399,12 +399,12 @@ def test_bad_states_and_names():
 
 def test_a_large_field_is_set_up_without_a_list_of_its_points(monkeypatch):
     """Its components stand alone in the metric's blocks: arrays say so, not a million little ones."""
-    from eip_scipy import _setup
+    from eip_scipy import _blocks
 
     called = []
-    monkeypatch.setattr(_setup, "_block_lists", lambda *args: called.append(args))
+    monkeypatch.setattr(_blocks, "_block_lists", lambda *args: called.append(args))
     for blocks, size in ((None, 2), (4, 8)):
-        groups = _setup.blocks_of(blocks, 64, 2)
+        groups = _blocks.blocks_of(blocks, 64, 2)
         assert (groups.size, groups.start.size) == (size, 128 // size + 1)
         np.testing.assert_array_equal(groups.member, np.arange(128))
         np.testing.assert_array_equal(groups.start, np.arange(0, 129, size))

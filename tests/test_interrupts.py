@@ -44,14 +44,14 @@ def test_integrate():
 
 @pytest.mark.needs_jit
 def test_integrate_while_it_compiles(monkeypatch):
-    from eip_scipy import longrun
+    from eip_scipy._prepare import System
 
     def compiles(*arguments):
         press()
         return real(*arguments)
 
-    real = longrun._functions
-    monkeypatch.setattr(longrun, "_functions", compiles)
+    real = System.compiled
+    monkeypatch.setattr(System, "compiled", compiles)
     with pytest.raises(KeyboardInterrupt) as info:
         integrate(jit_orbit, (0, 1e9), pericentre(0.6), method=EIPRK4, h=0.01)
     assert info.value.partial.compiled

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from eip_scipy import _kernels as kn
-from eip_scipy import _setup
+from eip_scipy._blocks import blocks_of
+from eip_scipy._frame import frame_rows
 from eip_scipy._trust import N_FIGURES, TERMS
 
 EPS = np.finfo(float).eps
@@ -26,7 +27,7 @@ def exact(x):
 
 
 def grouping(blocks, n, width=1):
-    return _setup.blocks_of(blocks, n, width)
+    return blocks_of(blocks, n, width)
 
 
 # Norms and finiteness.
@@ -472,7 +473,7 @@ def test_frame_is_a_projector_on_rows_and_moves(frame):
     n = C.shape[1]
     P = np.eye(n) - S @ np.linalg.solve(C @ S, C)
     rng = RNG(12)
-    rows, G, sigma = _setup.frame_rows(frame, n, 1), rng.standard_normal((2, n)), rng.uniform(0.1, 1.0, n)
+    rows, G, sigma = frame_rows(frame, n, 1), rng.standard_normal((2, n)), rng.uniform(0.1, 1.0, n)
     B = np.empty((2, n))
     kn.weigh_rows(G, sigma, rows, B)
     np.testing.assert_allclose(B, G @ P * sigma, atol=8 * EPS)
@@ -485,7 +486,7 @@ def test_frame_is_a_projector_on_rows_and_moves(frame):
 
 def test_no_directions_no_move():
     move, out = np.full(2, math.nan), np.empty(2)
-    free = _setup.frame_rows(None, 2, 1)
+    free = frame_rows(None, 2, 1)
     kn.move_along(np.zeros(2), np.ones((2, 2)), np.ones(2), free, np.array([1.0, 2.0]), move, out)
     np.testing.assert_array_equal(move, 0.0)
     np.testing.assert_array_equal(out, [1.0, 2.0])

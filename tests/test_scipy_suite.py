@@ -16,7 +16,9 @@ from pathlib import Path
 import pytest
 from scipy import integrate
 
-from eip_scipy import EIPDOP853, EIPRK23, EIPRK45, _setup, eip_method
+from eip_scipy import EIPDOP853, EIPRK23, EIPRK45, eip_method
+from eip_scipy._step import Span
+from eip_scipy._stepping import Stepping
 
 SCIPY = {"RK23": integrate.RK23, "RK45": integrate.RK45, "DOP853": integrate.DOP853}
 # The classes, and the same tableaux through `eip_method`, where the steps are always the package's own.
@@ -122,7 +124,8 @@ def suite(name, method, as_shipped=False):
 
     def select_initial_step(fun, t0, y0, t_bound, max_step, f0, direction, order, rtol, atol):
         used.append("initial_step")
-        return _setup.initial_step(fun, t0, y0, t_bound, max_step, f0, order, rtol, atol)
+        span = Span(t0, 0.0, t_bound, direction, 0, max_step)
+        return Stepping(span, None, None, rtol, atol).estimated(fun, y0, f0, order)
 
     solve = as_called if as_shipped else solve_ivp
     module.__dict__.update({"solve_ivp": solve, "select_initial_step": select_initial_step, name: Counting})

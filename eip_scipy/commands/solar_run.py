@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._setup import check_fixed_step
+from .._stepping import check_fixed_step
 from ..comparators import StormerVerletResult, stormer_verlet
 from ..diagnostics import invariants_along
 from ..longrun import integrate

@@ -15,7 +15,7 @@ from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 
 from .._inputs import reals, refuse_units, shown
-from .._setup import check_fixed_step, fixed_steps
+from .._stepping import check_fixed_step, fixed_steps
 
 __all__ = [
     "FixedStepResult",

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._caching import cached_njit
-from .._setup import check_fixed_step, fixed_steps
+from .._stepping import check_fixed_step, fixed_steps
 from ..problems import GrossPitaevskii
 from ._common import check_span, saved_steps
 

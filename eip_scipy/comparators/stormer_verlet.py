@@ -14,7 +14,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
 from .._caching import cached_njit
-from .._setup import check_fixed_step, fixed_steps
+from .._stepping import check_fixed_step, fixed_steps
 from ._common import FixedStepResult, check_span, check_state, message, real_vector, saved_steps
 
 __all__ = ["FORMS", "StormerVerletResult", "stormer_verlet"]
