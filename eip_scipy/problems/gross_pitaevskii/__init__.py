@@ -1,6 +1,5 @@
 """The rotating Gross-Pitaevskii equation in one, two and three dimensions."""
 
-from .array_api import ArrayGrossPitaevskii
 from .equation import FieldProblem, GrossPitaevskii
 from .flows import LinearFlow
 from .frames import at_rest, rotated
@@ -20,7 +19,6 @@ __all__ = [
     "RKN6",
     "S6",
     "STRANG",
-    "ArrayGrossPitaevskii",
     "FieldProblem",
     "Grid",
     "GrossPitaevskii",
