@@ -39,7 +39,6 @@ __all__ = [
 
 PACKAGES = (
     "eip_scipy", "numpy", "scipy", "numba", "tqdm", "rebound", "heyoka", "matplotlib", "astropy", "jplephem", "ducc0",
-    "pyfftw",
 )  # fmt: skip
 
 
