@@ -5,7 +5,6 @@ from .flows import LinearFlow
 from .frames import at_rest, rotated
 from .grid import Grid, Multiplier, SpectralSum
 from .ground_state import GroundState, ground_state
-from .lawson import Lawson4
 from .potentials import harmonic_trap, quartic_trap
 from .scenes import line_condensate, plane_wave, ring_condensate, rotating_packet, soliton
 from .search import lowest_ring, lowest_state
@@ -23,7 +22,6 @@ __all__ = [
     "Grid",
     "GrossPitaevskii",
     "GroundState",
-    "Lawson4",
     "LinearFlow",
     "Multiplier",
     "Scheme",
