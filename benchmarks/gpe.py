@@ -122,7 +122,7 @@ def save_figure(found, path):
     from eip_scipy.plotting import method_styles
 
     labels = {("ducc0", "f"): "f by ducc0", ("ducc0", "transforms"): "ducc0's transforms alone",
-              ("pyfftw", "f"): "f by FFTW", ("scipy", "f"): "f by SciPy"}  # fmt: skip
+              ("scipy", "f"): "f by SciPy"}  # fmt: skip
     labels = {key: label for key, label in labels.items() if key in found[FLAT[0]]}
     styles = method_styles(labels.values())
     figure = Figure(figsize=(9.5, 4.6), layout="constrained")

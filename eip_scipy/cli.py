@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
-from . import comparators, problems
+from . import comparators, problems, reproduce
 from .commands import (
     charged_particle,
     gpe,
@@ -98,7 +97,7 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
 
 def _commands() -> dict[str, tuple[str, Any, Any]]:
     """For each command a summary, what adds its options, and what runs it."""
-    commands: dict[str, tuple[str, Any, Any]] = {
+    return {
         "list": ("list commands, methods, problems and data sets", lambda parser: None, _list),
         "solar-system": (
             "run the solar system and compare with other methods (the paper's Experiment II)",
@@ -130,16 +129,12 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
             kepler_cost.add_arguments,
             kepler_cost.run,
         ),
-    }
-    name = "eip_scipy.reproduce"
-    if find_spec(name) is not None:
-        reproduce = import_module(name)
-        commands["reproduce"] = (
+        "reproduce": (
             "recompute the paper's tables and figures",
             reproduce.add_arguments,
             lambda args: reproduce.run(args, lambda: _runner(_rebound(args))),
-        )
-    return commands
+        ),
+    }
 
 
 def _rebound(args: argparse.Namespace) -> Any:

@@ -362,12 +362,7 @@ def _study(name: str, command: Any, found: Any, args: argparse.Namespace) -> tup
     checks = command.checks(found)
     if args.out is not None:
         folder = Path(args.out)
-        written = [report.write_csv(folder / f"{name}.csv", command.rows(found))]
-        try:
-            for file, figure in command.figures(found):
-                written.append(report.write_file(folder / file, figure.savefig))
-        except ImportError as error:
-            report.warn(f"no figures: {error}")
+        written = report.write_results(folder, {f"{name}.csv": command.rows(found)}, command.figures(found))
         _say_written(args, written)
     return 0 if all(check["matched"] for check in checks) else 1, {"checks": checks}
 
@@ -378,7 +373,8 @@ def _particle(name: str, args: argparse.Namespace) -> tuple[int, dict[str, Any]]
     if not args.quiet:
         report.say("\n\n".join(particle_report.text(found) for found in studies.values()))
     if args.out is not None:
-        _say_written(args, charged_particle.write(args, studies, name, paper_only=True))
+        results = charged_particle.results(studies, name, paper_only=True)
+        _say_written(args, report.write_results(args.out, *results))
     content = charged_particle.record(studies)
     return 0 if content["passed"] else 1, content
 

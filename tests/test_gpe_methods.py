@@ -1,13 +1,12 @@
-"""Splittings, Lawson's method and the exact flows of the Gross-Pitaevskii equation, by themselves and projected."""
+"""Splittings and the exact flows of the Gross-Pitaevskii equation, by themselves and projected."""
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from eip_scipy import EIPDOP853, eip_method, integrate
 from eip_scipy.diagnostics import observed_order
-from eip_scipy.problems import Grid, GrossPitaevskii, Lawson4, Splitting, harmonic_trap, soliton
+from eip_scipy.problems import Grid, GrossPitaevskii, Splitting, harmonic_trap, soliton
 from eip_scipy.problems.gross_pitaevskii import RKN6, S6, STRANG, LinearFlow, Scheme, at_rest, rotated
 from eip_scipy.problems.gross_pitaevskii.pointwise import local_flow
 
@@ -133,7 +132,6 @@ METHODS = {
     "strang": (lambda gpe: Splitting(gpe, "strang"), (0.1, 0.05)),
     "s6": (lambda gpe: Splitting(gpe, "s6"), (0.1, 0.05)),
     "rkn6": (lambda gpe: Splitting(gpe), (0.4, 0.2)),
-    "lawson4": (Lawson4, (0.04, 0.02)),
 }
 
 
@@ -173,7 +171,7 @@ def condensate():
     return problem, exact
 
 
-STEPS = {"strang": (0.025, 0.0125), "s6": (0.025, 0.0125), "rkn6": (0.05, 0.025), "lawson4": (0.0125, 0.00625)}
+STEPS = {"strang": (0.025, 0.0125), "s6": (0.025, 0.0125), "rkn6": (0.05, 0.025)}
 
 
 @pytest.mark.parametrize("kept", [(), KEPT], ids=["raw", "EIP"])
@@ -207,28 +205,6 @@ def test_the_frame_at_rest(condensate, kept):
     seen = rotated(gpe, run.y[:, -1], gpe.Omega * 0.5)
     np.testing.assert_allclose(seen.ravel(), exact, rtol=0, atol=2e-8)
     assert gpe.energy(seen) == pytest.approx(gpe.energy(problem.y0), abs=1e-7)
-
-
-def test_lawson_adapts_its_step(condensate):
-    """Its estimate is of order 3, and the error follows the tolerance."""
-    problem, exact = condensate
-    gpe = problem.equation
-    errors, method = [], Lawson4(gpe)
-    for rtol in (1e-5, 1e-7):
-        options = {
-            "rtol": rtol,
-            "atol": rtol,
-            "first_step": 0.01,
-            "invariants": gpe.invariants(),
-            "metric": "euclidean",
-        }
-        sol = solve_ivp(gpe.fun, (0, 0.5), problem.y0, method=eip_method(method), **options)
-        assert sol.success
-        errors.append(np.sqrt(gpe.mass(sol.y[:, -1] - exact)))
-    assert errors[1] < 0.03 * errors[0] < 1e-4
-    psi = problem.y0
-    estimates = [np.linalg.norm(method.one_step(0.0, psi.copy(), h)[1]) for h in (0.02, 0.01)]
-    assert observed_order(estimates, [0.02, 0.01])[0] == pytest.approx(4, abs=0.2)
 
 
 # What is refused.

@@ -68,7 +68,7 @@ def test_csv_of_work_and_precision_has_a_line_for_each_run(tmp_path, capsys):
 @pytest.mark.usefixtures("few_runs", "no_plotting")
 def test_work_and_precision_without_matplotlib(tmp_path, capsys):
     assert main(["work-precision", "--out", str(tmp_path), "--quiet"]) == 0
-    assert "eip-scipy: no figure: " in capsys.readouterr().err
+    assert "eip-scipy: no figures: " in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["work-precision.csv"]
 
 

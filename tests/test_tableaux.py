@@ -99,6 +99,17 @@ def test_trees_are_those_of_another_algorithm(order):
     assert set(ours) == grafted(order)
 
 
+@pytest.mark.parametrize("tableau", [RK23, RK45, DOP853], ids=name)
+def test_order_of_scipy_s_pairs(tableau):
+    """The package's own are not checked when they are made, a user's are."""
+    options = {key: getattr(tableau, key) for key in ("b_hat", "error_estimator_order", "c")}
+    paired = {"e_low": tableau.e_low} if tableau.paired else {}
+    same = Tableau(tableau.name, tableau.A.tolist(), tableau.b.tolist(), tableau.order, **options, **paired)
+    assert np.allclose(same.e, tableau.e, rtol=0, atol=1e-15)
+    with pytest.raises(ValueError, match=f"b is not of order {tableau.order + 1}"):
+        Tableau(tableau.name, tableau.A.tolist(), tableau.b.tolist(), tableau.order + 1)
+
+
 @pytest.mark.parametrize("tableau", METHODS, ids=name)
 def test_order_of_the_step_in_fractions(tableau):
     A, b = exact(tableau.A), exact(tableau.b)

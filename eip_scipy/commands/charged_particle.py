@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from ..problems.charged_particle import ORBITS
-from ..report import UsageError, check_outputs, document, say, warn, write_csv, write_file, write_json
+from ..report import UsageError, check_outputs, deliver, warn
 from . import particle_report
 from .particle_runs import METHODS, PAPER_METHODS, Study, study
 
-__all__ = ["add_arguments", "record", "run", "run_scenes", "write"]
+__all__ = ["add_arguments", "record", "results", "run", "run_scenes"]
 
 DONE, FAILED, INTERRUPTED = 0, 1, 130
 FIELDS = ("uniform", "tokamak")
@@ -47,16 +47,18 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         warn("interrupted; nothing was written")
         return INTERRUPTED
-    if not args.quiet:
-        say("\n\n".join(particle_report.text(found) for found in studies.values()))
-        say()
-    written = write(args, studies, "charged-particle", paper_only=False)
     content = record(studies)
-    if args.json is not None:
-        arguments = {"field": args.field, "orbit": args.orbit}
-        written.append(write_json(args.json, document("charged-particle", arguments, **content)))
-    if not args.quiet:
-        say("\n".join(f"wrote {path}" for path in written))
+    arguments = {"field": args.field, "orbit": args.orbit}
+    tables, figures = results(studies, "charged-particle", paper_only=False)
+    deliver(
+        args,
+        "charged-particle",
+        "\n\n".join(particle_report.text(found) for found in studies.values()),
+        tables,
+        figures,
+        arguments,
+        **content,
+    )
     return DONE if content["passed"] else FAILED
 
 
@@ -89,17 +91,14 @@ def run_scenes(scenes: Sequence[str], *, paper_only: bool, quiet: bool) -> dict[
         return {name: study(name, paper_only=paper_only, callback=bar.update) for name in scenes}
 
 
-def write(args: argparse.Namespace, studies: dict[str, Study], stem: str, *, paper_only: bool) -> list[Any]:
-    """Write ``STEM.csv`` and figures, ``STEM-FIELD.png`` or, for the paper's, ``STEM.png``; they need matplotlib."""
+def results(studies: dict[str, Study], stem: str, *, paper_only: bool) -> tuple[dict[str, Any], Iterator[Any]]:
+    """``STEM.csv`` and figures, ``STEM-FIELD.png`` or, for the paper's, ``STEM.png``, for `write_results`."""
     lines = [row for found in studies.values() for row in particle_report.rows(found)]
-    written = [write_csv(args.out / f"{stem}.csv", lines)]
-    try:
-        for name, figure in particle_report.figures(studies, paper_only=paper_only):
-            file = f"{stem}.png" if paper_only else f"{stem}-{name}.png"
-            written.append(write_file(args.out / file, figure.savefig))
-    except ImportError as error:
-        warn(f"no figures: {error}")
-    return written
+    figures = (
+        (f"{stem}.png" if paper_only else f"{stem}-{name}.png", figure)
+        for name, figure in particle_report.figures(studies, paper_only=paper_only)
+    )
+    return {f"{stem}.csv": lines}, figures
 
 
 def record(studies: dict[str, Study]) -> dict[str, Any]:

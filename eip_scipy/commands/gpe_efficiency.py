@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from ..comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
 from ..longrun import integrate
-from ..problems import Lawson4, Splitting, plane_wave
+from ..problems import Splitting, plane_wave
 from ..problems.gross_pitaevskii import FieldProblem, make_transforms
 from ..report import describe_machine, table
 from ..solvers import EIPRK4, eip_method
@@ -41,7 +41,7 @@ KEPT = ("mass", "energy")
 # Slopes in h that are known, to a tenth, those of CN and EIP-ME also drawn; and what EIP-ME may leave of both errors.
 ORDERS = {
     "RK4": 4, "EIP-M": 4, "EIP-E": 4, "EIP-ME": 4, "CN": 2, "LIC": 2, "SAV/CN": 2, "Strang": 2,
-    "Lawson4-EIP": 4, "splitting4-EIP": 4,
+    "splitting4-EIP": 4,
 }  # fmt: skip
 SLOPES, SLOPE_TOLERANCE, LEFT = ("CN", "EIP-ME"), 0.1, 1e-12
 DRAWN = {"h": "h", "cost": "seconds", "error": "error_max"}
@@ -107,7 +107,6 @@ METHODS = {
     "LIC": implicit(linearly_implicit),
     "SAV/CN": implicit(sav_crank_nicolson),
     "Strang": other(lambda gpe: Splitting(gpe, "strang"), 1, LONG),
-    "Lawson4-EIP": other(Lawson4, 4, (*FOURTH, T_END / 640), *KEPT),
     "splitting4-EIP": other(Splitting, 6, FOURTH, *KEPT),
 }
 

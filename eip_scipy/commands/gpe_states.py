@@ -31,14 +31,11 @@ from ..report import (
     UsageError,
     check_outputs,
     compact,
+    deliver,
     describe_machine,
-    document,
-    say,
     table,
     warn,
-    write_csv,
     write_file,
-    write_json,
 )
 
 __all__ = [
@@ -258,34 +255,36 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         warn("interrupted; nothing was written")
         return INTERRUPTED
-    if not args.quiet:
-        say(text(results, args.starts, describe_machine()))
-        say()
-    _write(args, results)
-    return DONE if all(check["matched"] for check in checks(results)) else FAILED
+    found, judged = rows(results), checks(results)
+    arguments = {"scenes": list(results), "starts": args.starts, "seed": args.seed}
+    tables = {"ground-states.csv": found}
+    deliver(
+        args,
+        "gpe ground-state",
+        text(results, args.starts, describe_machine()),
+        tables,
+        _figures(results),
+        arguments,
+        also=_states(args, results),
+        states=found,
+        checks=judged,
+    )
+    return DONE if all(check["matched"] for check in judged) else FAILED
 
 
-def _write(args: argparse.Namespace, results: Results) -> None:
-    written = [write_csv(args.out / "ground-states.csv", rows(results))]
+def _states(args: argparse.Namespace, results: Results) -> Iterator[Path]:
     for name, found in results.items():
-        best = min(found, key=lambda item: item.state.energy)
         if name != "trap":
-            written.append(save_state(args.out / f"{name}.npz", best))
-    if args.json is not None:
-        arguments = {"scenes": list(results), "starts": args.starts, "seed": args.seed}
-        content = {"states": rows(results), "checks": checks(results)}
-        written.append(write_json(args.json, document("gpe ground-state", arguments, **content)))
-    try:
-        from ..plotting import fields_figure
-    except ImportError as error:
-        warn(f"no figures: {error}")
-    else:
-        for name, found in results.items():
-            shown = panels(name, found)
-            figure = fields_figure(shown, title=TITLES[name].split(";")[0], columns=3 if len(shown) <= 6 else 4)
-            written.append(write_file(args.out / f"ground-state-{name}.png", figure.savefig))
-    if not args.quiet:
-        say("\n".join(f"wrote {path}" for path in written))
+            yield save_state(args.out / f"{name}.npz", min(found, key=lambda item: item.state.energy))
+
+
+def _figures(results: Results) -> Iterator[tuple[str, Any]]:
+    from ..plotting import fields_figure
+
+    for name, found in results.items():
+        shown = panels(name, found)
+        figure = fields_figure(shown, title=TITLES[name].split(";")[0], columns=3 if len(shown) <= 6 else 4)
+        yield f"ground-state-{name}.png", figure
 
 
 def panels(name: str, found: list[Found]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from textwrap import fill
 from typing import Any, NamedTuple
@@ -16,13 +16,9 @@ from ..problems.hard_cases import HardCase, hard_cases
 from ..report import (
     check_outputs,
     compact,
-    document,
-    say,
+    deliver,
     table,
     warn,
-    write_csv,
-    write_file,
-    write_json,
 )
 from ..result import Diagnostics
 from ..solvers import EIPSolver
@@ -421,32 +417,29 @@ def run(args: argparse.Namespace) -> int:
         warn("interrupted; nothing was written")
         return INTERRUPTED
     checks = bars(results, args.method, rtol, args.metric)
-    if not args.quiet:
-        say(text(results, checks, arguments))
-        say()
-    _write(args, results, checks, arguments)
+    stem = f"hard-cases-{args.method}-{args.metric}"
+    deliver(
+        args,
+        "hard-cases",
+        text(results, checks, arguments),
+        {f"{stem}.csv": rows(results)},
+        _figures(args, results, rtol, stem),
+        arguments,
+        cases=rows(results),
+        summary=summary(results),
+        checks=[check._asdict() for check in checks],
+    )
     return DONE if all(check.passed for check in checks) else CHECK_FAILED
 
 
-def _write(
-    args: argparse.Namespace, results: Sequence[Comparison], checks: Sequence[Bar], arguments: dict[str, Any]
-) -> None:
-    stem = f"hard-cases-{args.method}-{args.metric}"
-    written = [write_csv(args.out / f"{stem}.csv", rows(results))]
-    if args.json is not None:
-        content = {"cases": rows(results), "summary": summary(results), "checks": [check._asdict() for check in checks]}
-        written.append(write_json(args.json, document("hard-cases", arguments, **content)))
-    try:
-        from ..plotting import gains_figure
-    except ImportError as error:
-        warn(f"no figure: {error}")
-    else:
-        rtol = arguments["rtol"]
-        figure = gains_figure(
+def _figures(args: argparse.Namespace, results: Sequence[Comparison], rtol: float, stem: str) -> Iterator[Any]:
+    from ..plotting import gains_figure
+
+    yield (
+        f"{stem}.png",
+        gains_figure(
             {r.case.name: (r.plain.error / rtol, r.projected.error / rtol) for r in results},
             what="final error / rtol",
             title=f"{args.method}, metric {args.metric!r}, rtol = {rtol:g}: {len(results)} hard cases",
-        )
-        written.append(write_file(args.out / f"{stem}.png", figure.savefig))
-    if not args.quiet:
-        say("\n".join(f"wrote {path}" for path in written))
+        ),
+    )

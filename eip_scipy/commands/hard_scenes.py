@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,14 +12,10 @@ from .._names import nearest
 from ..report import (
     check_outputs,
     compact,
+    deliver,
     describe_machine,
-    document,
-    say,
     table,
     warn,
-    write_csv,
-    write_file,
-    write_json,
 )
 from ..work_precision import cost_to_reach
 from .kepler_cost import Work
@@ -148,10 +144,17 @@ def run(args: argparse.Namespace, rebound: Any) -> int:
         warn("interrupted; nothing was written")
         return INTERRUPTED
     machine = describe_machine()
-    if not args.quiet:
-        say(text(results, machine))
-        say()
-    _write(args, results, machine)
+    found = rows(results)
+    arguments = {"scenes": list(results)}
+    deliver(
+        args,
+        "hard-scenes",
+        text(results, machine),
+        {"hard-scenes.csv": found},
+        _figures(results, machine),
+        arguments,
+        points=found,
+    )
     return DONE
 
 
@@ -175,26 +178,19 @@ def rows(results: Results) -> list[dict[str, Any]]:
     ]
 
 
-def _write(args: argparse.Namespace, results: Results, machine: str) -> None:
-    written = [write_csv(args.out / "hard-scenes.csv", rows(results))]
-    if args.json is not None:
-        arguments = {"scenes": list(results)}
-        written.append(write_json(args.json, document("hard-scenes", arguments, points=rows(results))))
-    try:
-        from ..plotting import scenes_figure
-    except ImportError as error:
-        warn(f"no figure: {error}")
-    else:
-        panels: Mapping[str, Any] = {
-            of.title: {name: vars(work) for name, work in works(points).items()} for of, points in results.values()
-        }
-        figure = scenes_figure(
+def _figures(results: Results, machine: str) -> Iterator[Any]:
+    from ..plotting import scenes_figure
+
+    panels: Mapping[str, Any] = {
+        of.title: {name: vars(work) for name, work in works(points).items()} for of, points in results.values()
+    }
+    yield (
+        "hard-scenes.png",
+        scenes_figure(
             panels,
             error="error of position at the end",
             title="Hard scenes: error against cost (errors above 1 left out)",
             largest=1.0,
             footnote=f"{machine}; one thread, least of at most {REPEATS}",
-        )
-        written.append(write_file(args.out / "hard-scenes.png", figure.savefig))
-    if not args.quiet:
-        say("\n".join(f"wrote {path}" for path in written))
+        ),
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 
 from ..longrun import integrate
 from ..problems import Problem, kepler
-from ..report import check_outputs, compact, document, say, table, warn, write_csv, write_file, write_json
+from ..report import check_outputs, compact, deliver, table, warn
 from ..solvers import EIPDOP853, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPSolver
 from ..work_precision import Runner, cost_to_reach, work_precision
 from .long_runs import named
@@ -181,24 +181,28 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         warn("interrupted; nothing was written")
         return INTERRUPTED
-    if not args.quiet:
-        say(text(works, machine))
-        say()
-    written = [write_csv(args.out / "work-precision.csv", rows(works))]
-    if args.json is not None:
-        written.append(write_json(args.json, document("work-precision", {}, points=rows(works))))
-    try:
-        from ..plotting import work_figure
-    except ImportError as error:
-        warn(f"no figure: {error}")
-    else:
-        figure = work_figure(
+    found = rows(works)
+    deliver(
+        args,
+        "work-precision",
+        text(works, machine),
+        {"work-precision.csv": found},
+        _figures(works, machine),
+        {},
+        points=found,
+    )
+    return DONE
+
+
+def _figures(works: dict[str, Work], machine: str) -> Iterator[Any]:
+    from ..plotting import work_figure
+
+    yield (
+        "work-precision.png",
+        work_figure(
             {name: vars(work) for name, work in works.items()},
             error=f"error of position at t = {T_END:g}",
             title="Perturbed Kepler problem, e = 0.6, H and L kept: error against cost",
             footnote=f"{machine}; one thread, least of {REPEATS}",
-        )
-        written.append(write_file(args.out / "work-precision.png", figure.savefig))
-    if not args.quiet:
-        say("\n".join(f"wrote {path}" for path in written))
-    return DONE
+        ),
+    )

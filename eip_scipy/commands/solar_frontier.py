@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,14 +18,10 @@ from ..report import (
     UsageError,
     check_outputs,
     compact,
+    deliver,
     describe_machine,
-    document,
-    say,
     table,
     warn,
-    write_csv,
-    write_file,
-    write_json,
 )
 from ..solvers import EIPDOP853, EIPRK4, EIPRKN8, EIPRKN12
 from ..work_precision import Runner, cost_to_reach
@@ -230,26 +226,28 @@ def run(args: argparse.Namespace, judge: Judge | None, heyoka: Judge | None) -> 
         warn("interrupted; nothing was written")
         return INTERRUPTED
     machine = describe_machine()
-    if not args.quiet:
-        say(text(runs, args.years, machine))
-        say()
-    written = [write_csv(args.out / "frontier.csv", rows(runs))]
-    if args.json is not None:
-        written.append(
-            write_json(args.json, document("solar-system --frontier", {"years": args.years}, runs=rows(runs)))
-        )
-    try:
-        from ..plotting import frontier_figure
-    except ImportError as error:
-        warn(f"no figure: {error}")
-    else:
-        figure = frontier_figure(
+    found = rows(runs)
+    deliver(
+        args,
+        "solar-system --frontier",
+        text(runs, args.years, machine),
+        {"frontier.csv": found},
+        _figures(runs, args.years, machine),
+        {"years": args.years},
+        runs=found,
+    )
+    return DONE
+
+
+def _figures(runs: Sequence[TimedRun], years: float, machine: str) -> Iterator[Any]:
+    from ..plotting import frontier_figure
+
+    yield (
+        "frontier.png",
+        frontier_figure(
             by_method(runs),
             unit="AU",
-            title=f"Ten bodies, Newton, {args.years:g} years: error of position against cost",
+            title=f"Ten bodies, Newton, {years:g} years: error of position against cost",
             footnote=f"{machine}; one thread, least of {REPEATS}",
-        )
-        written.append(write_file(args.out / "frontier.png", figure.savefig))
-    if not args.quiet:
-        say("\n".join(f"wrote {path}" for path in written))
-    return DONE
+        ),
+    )

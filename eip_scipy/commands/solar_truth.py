@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,13 +18,9 @@ from ..report import (
     UsageError,
     check_outputs,
     compact,
-    document,
-    say,
+    deliver,
     table,
     warn,
-    write_csv,
-    write_file,
-    write_json,
 )
 from ..solvers import EIPDOP853
 from .solar_run import whole_number
@@ -256,19 +251,12 @@ def _failures(runs: Sequence[ModelRun]) -> list[str]:
 
 
 def _report(args: argparse.Namespace, runs: Sequence[ModelRun], start: str, step: float, failed: list[str]) -> None:
-    if not args.quiet:
-        say(text(runs, start, step))
     for failure in failed:
         warn(failure)
-    written = [write_csv(args.out / "solar-truth.csv", csv_rows(runs))]
-    if args.json is not None:
-        content = {"epoch": start, "step_yr": step, "errors": table_rows(runs), "failed": failed}
-        arguments = {"years": args.years, "h": args.h, "forces": args.forces}
-        written.append(write_json(args.json, document("solar-system --truth", arguments, **content)))
-    written += _figure(args.out, runs, start)
-    if not args.quiet:
-        for path in written:
-            say(f"wrote {path}")
+    arguments = {"years": args.years, "h": args.h, "forces": args.forces}
+    content: dict[str, Any] = {"epoch": start, "step_yr": step, "errors": table_rows(runs), "failed": failed}
+    tables = {"solar-truth.csv": csv_rows(runs)}
+    deliver(args, "solar-system --truth", text(runs, start, step), tables, _figures(runs, start), arguments, **content)
 
 
 def reported(years: np.ndarray) -> list[int]:
@@ -329,12 +317,9 @@ def csv_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
     ]
 
 
-def _figure(out: Path, runs: Sequence[ModelRun], start: str) -> list[Path]:
-    try:
-        from .. import plotting
-    except ImportError as error:
-        warn(f"no figure: {error}")
-        return []
+def _figures(runs: Sequence[ModelRun], start: str) -> Iterator[Any]:
+    from .. import plotting
+
     direction = "after" if runs[0].years[-1] > 0 else "before"
     figure = plotting.longitude_figure(
         np.abs(runs[0].years),
@@ -344,4 +329,4 @@ def _figure(out: Path, runs: Sequence[ModelRun], start: str) -> list[Path]:
         error="error against DE440 [km]",
         title="What each force is worth",
     )
-    return [write_file(out / "solar-truth.png", figure.savefig)]
+    yield "solar-truth.png", figure

@@ -18,7 +18,7 @@ from .._stepping import check_fixed_step, fixed_steps
 from ..problems import GrossPitaevskii
 from ._common import check_span, saved_steps
 
-__all__ = ["FieldResult", "FixedPoint", "Scheme", "march", "multiply_modes"]
+__all__ = ["FieldResult", "FixedPoint", "Implicit", "Scheme", "march", "multiply_modes"]
 
 MOST_ITERATIONS = 100
 WARM_STEPS = 3  # after which each branch of a scheme has been taken
@@ -167,10 +167,52 @@ class FixedPoint:
         return mean, f"the iteration left a residual of {residual:.1e}, expected {bound:.1e}; take a smaller h"
 
 
-def middle(V: np.ndarray, beta: float, psi: np.ndarray) -> float:
-    """Middle of the range of V + beta |psi|^2."""
-    W = V + beta * (psi.real**2 + psi.imag**2)
-    return 0.5 * float(W.min() + W.max())
+class Implicit(Scheme):
+    """A scheme whose step goes from a state to another, 2 c later, through their mean, which `FixedPoint` finds.
+
+    The mean fulfils ``mean = start - i c (K + W - Omega Lz) mean``, W pointwise.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+    psi : ndarray, shape (n,)
+        A typical state.
+    tol : float
+        See `FixedPoint`.
+    """
+
+    def __init__(self, gpe: GrossPitaevskii, psi: np.ndarray, tol: float) -> None:
+        super().__init__(gpe)
+        W = self.V + gpe.beta * (psi.real**2 + psi.imag**2)
+        self._w, self._tol = 0.5 * float(W.min() + W.max()), tol
+        self._W = np.empty_like(self.V)
+        self._solver: FixedPoint | None = None
+
+    def restart(self) -> None:
+        """See `Scheme`."""
+        self._solver = None
+
+    def solver(self, c: float) -> tuple[FixedPoint, bool]:
+        """The solver for c, and whether it is a new one, without solutions before."""
+        new = self._solver is None or self._solver.c != c
+        if self._solver is None or new:
+            self._solver = FixedPoint(self, self._tol, c, self._w)
+        return self._solver, new
+
+    def potential(self, start: np.ndarray, mean: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with W."""
+        raise NotImplementedError
+
+    def cross(self, solver: FixedPoint, start: np.ndarray) -> str:
+        """Replace `start` by the state at the other end; returns why that failed, or nothing."""
+
+        def rhs(mean: np.ndarray, values: np.ndarray) -> float:
+            self.potential(start, mean, self._W)
+            return float(right_side(start, mean, self.rotation(mean), self._W, solver.w, solver.c, values))
+
+        mean, failure = solver.solve(rhs, self.psi)
+        other_end(mean, start)
+        return failure
 
 
 def check_tol(tol: Any) -> float:
@@ -257,3 +299,26 @@ def multiply_modes(modes, factor):
     """Modes times a complex factor."""
     for i in range(modes.size):
         modes[i] *= factor[i]
+
+
+@jit
+def right_side(start, mean, rotation, W, w, c, out):
+    """Out <- start - i c ((W - w) mean + rotation), `rotation` may be empty; the norm of its change."""
+    total = 0.0
+    for i in range(start.size):
+        m = mean[i]
+        s = c * (W[i] - w)
+        value = complex(start[i].real + s * m.imag, start[i].imag - s * m.real)
+        if rotation.size > 0:
+            value += complex(c * rotation[i].imag, -c * rotation[i].real)
+        change = value - out[i]
+        total += change.real * change.real + change.imag * change.imag
+        out[i] = value
+    return np.sqrt(total)
+
+
+@jit
+def other_end(mean, start):
+    """Start <- 2 mean - start."""
+    for i in range(start.size):
+        start[i] = 2.0 * mean[i] - start[i]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..problems import GrossPitaevskii
-from ._fields import FieldResult, FixedPoint, Scheme, check_tol, jit, march, middle
+from ._fields import FieldResult, Implicit, check_tol, jit, march
 
 __all__ = ["CrankNicolson", "crank_nicolson"]
 
@@ -78,57 +78,23 @@ def crank_nicolson(
     return march(lambda gpe, psi: CrankNicolson(gpe, psi, tol), gpe, t_span, y0, h, save_every)[0]
 
 
-class CrankNicolson(Scheme):
-    """The scheme of `crank_nicolson`; psi (n,) is a typical state."""
-
-    def __init__(self, gpe: GrossPitaevskii, psi: np.ndarray, tol: float) -> None:
-        super().__init__(gpe)
-        self._tol, self._w = tol, middle(self.V, gpe.beta, psi)
-        self._solver: FixedPoint | None = None
-
-    def restart(self) -> None:
-        """See `Scheme`."""
-        self._solver = None
+class CrankNicolson(Implicit):
+    """The scheme of `crank_nicolson`."""
 
     def step(self, h: float) -> str:
         """See `Scheme`."""
-        if self._solver is None or self._solver.c != 0.5 * h:
-            self._solver = FixedPoint(self, self._tol, 0.5 * h, self._w)
-        solver = self._solver
+        solver, _ = self.solver(0.5 * h)
+        return self.cross(solver, self.psi)
 
-        def rhs(mean: np.ndarray, values: np.ndarray) -> float:
-            return float(
-                right_side(self.psi, mean, self.rotation(mean), self.V, self.gpe.beta, solver.w, solver.c, values)
-            )
-
-        mean, failure = solver.solve(rhs, self.psi)
-        other_end(mean, self.psi, self.psi)
-        return failure
+    def potential(self, start: np.ndarray, mean: np.ndarray, out: np.ndarray) -> None:
+        """See `Implicit`."""
+        mean_density(start, mean, self.V, self.gpe.beta, out)
 
 
 @jit
-def right_side(psi, mean, rotation, V, beta, w, c, out):
-    """Out <- psi - i c ((V + beta / 2 (|2 mean - psi|^2 + |psi|^2) - w) mean + rotation); the norm of its change.
-
-    `rotation` may be empty.
-    """
-    total = 0.0
-    for i in range(psi.size):
-        a, m = psi[i], mean[i]
-        b = 2.0 * m - a
-        density = a.real * a.real + a.imag * a.imag + b.real * b.real + b.imag * b.imag
-        s = c * (V[i] + 0.5 * beta * density - w)
-        value = complex(a.real + s * m.imag, a.imag - s * m.real)
-        if rotation.size > 0:
-            value += complex(c * rotation[i].imag, -c * rotation[i].real)
-        change = value - out[i]
-        total += change.real * change.real + change.imag * change.imag
-        out[i] = value
-    return np.sqrt(total)
-
-
-@jit
-def other_end(mean, psi, out):
-    """Out <- 2 mean - psi."""
-    for i in range(psi.size):
-        out[i] = 2.0 * mean[i] - psi[i]
+def mean_density(start, mean, V, beta, out):
+    """Out <- V + beta / 2 (|2 mean - start|^2 + |start|^2)."""
+    for i in range(start.size):
+        a = start[i]
+        b = 2.0 * mean[i] - a
+        out[i] = V[i] + 0.5 * beta * (a.real * a.real + a.imag * a.imag + b.real * b.real + b.imag * b.imag)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from ..problems import GrossPitaevskii
-from ._fields import FieldResult, FixedPoint, Scheme, check_tol, jit, march, middle
-from .crank_nicolson import CrankNicolson, other_end
+from ._fields import FieldResult, Implicit, check_tol, jit, march
+from .crank_nicolson import CrankNicolson
 
 __all__ = ["LinearlyImplicit", "linearly_implicit"]
 
@@ -69,39 +69,26 @@ def linearly_implicit(
     return march(lambda gpe, psi: LinearlyImplicit(gpe, psi, tol), gpe, t_span, y0, h, save_every)[0]
 
 
-class LinearlyImplicit(Scheme):
-    """The scheme of `linearly_implicit`; psi (n,) is a typical state."""
+class LinearlyImplicit(Implicit):
+    """The scheme of `linearly_implicit`."""
 
     def __init__(self, gpe: GrossPitaevskii, psi: np.ndarray, tol: float) -> None:
-        super().__init__(gpe)
-        self._tol, self._w = tol, middle(self.V, gpe.beta, psi)
+        super().__init__(gpe, psi, tol)
         self._starter = CrankNicolson(gpe, psi, tol)
         self._before = np.empty_like(self.psi)
-        self._solver: FixedPoint | None = None
-
-    def restart(self) -> None:
-        """See `Scheme`."""
-        self._solver = None
 
     def step(self, h: float) -> str:
         """See `Scheme`."""
-        # 2 h is the distance between the ends, c half of it.
-        if self._solver is None or self._solver.c != h:
-            self._solver = FixedPoint(self, self._tol, h, self._w)
+        solver, new = self.solver(h)  # 2 h is the distance between the ends
+        if new:
             return self._single_step(h)
-        solver, before = self._solver, self._before
-
-        def rhs(mean: np.ndarray, values: np.ndarray) -> float:
-            return float(
-                right_side(
-                    before, self.psi, mean, self.rotation(mean), self.V, self.gpe.beta, solver.w, solver.c, values
-                )
-            )
-
-        mean, failure = solver.solve(rhs, self.psi)
-        other_end(mean, before, before)
-        self.psi, self._before = before, self.psi
+        failure = self.cross(solver, self._before)
+        self.psi, self._before = self._before, self.psi
         return failure
+
+    def potential(self, start: np.ndarray, mean: np.ndarray, out: np.ndarray) -> None:
+        """See `Implicit`."""
+        density(self.psi, self.V, self.gpe.beta, out)
 
     def _single_step(self, h: float) -> str:
         self._before[:] = self.psi
@@ -113,16 +100,7 @@ class LinearlyImplicit(Scheme):
 
 
 @jit
-def right_side(before, psi, mean, rotation, V, beta, w, c, out):
-    """Out <- before - i c ((V + beta |psi|^2 - w) mean + rotation), `rotation` may be empty; the norm of its change."""
-    total = 0.0
+def density(psi, V, beta, out):
+    """Out <- V + beta |psi|^2."""
     for i in range(psi.size):
-        a, m = psi[i], mean[i]
-        s = c * (V[i] + beta * (a.real * a.real + a.imag * a.imag) - w)
-        value = complex(before[i].real + s * m.imag, before[i].imag - s * m.real)
-        if rotation.size > 0:
-            value += complex(c * rotation[i].imag, -c * rotation[i].real)
-        change = value - out[i]
-        total += change.real * change.real + change.imag * change.imag
-        out[i] = value
-    return np.sqrt(total)
+        out[i] = V[i] + beta * (psi[i].real * psi[i].real + psi[i].imag * psi[i].imag)

@@ -1,12 +1,10 @@
 """The rotating Gross-Pitaevskii equation in one, two and three dimensions."""
 
-from .array_api import ArrayGrossPitaevskii
 from .equation import FieldProblem, GrossPitaevskii
 from .flows import LinearFlow
 from .frames import at_rest, rotated
 from .grid import Grid, Multiplier, SpectralSum
 from .ground_state import GroundState, ground_state
-from .lawson import Lawson4
 from .potentials import harmonic_trap, quartic_trap
 from .scenes import line_condensate, plane_wave, ring_condensate, rotating_packet, soliton
 from .search import lowest_ring, lowest_state
@@ -20,12 +18,10 @@ __all__ = [
     "RKN6",
     "S6",
     "STRANG",
-    "ArrayGrossPitaevskii",
     "FieldProblem",
     "Grid",
     "GrossPitaevskii",
     "GroundState",
-    "Lawson4",
     "LinearFlow",
     "Multiplier",
     "Scheme",

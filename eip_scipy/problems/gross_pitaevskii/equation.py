@@ -59,7 +59,7 @@ class GrossPitaevskii:
     nyquist : {"true", "zero"}, optional
         The second derivative's factor of the Nyquist mode: its own, or 0 as where the second derivative is the first
         one applied twice (the paper's tables).
-    fft : {"auto", "scipy", "ducc0", "pyfftw"}, optional
+    fft : {"auto", "ducc0", "scipy"}, optional
         See `make_transforms`.
     threads : int, optional
         Threads of the transforms.

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, grey_closing, map_coordinates
-from scipy.signal import resample
+import scipy  # its parts load when they are used: scipy.signal, with statistics behind it, would take .9 s here
 
 from .equation import GrossPitaevskii
 from .vortices import core_size
@@ -67,9 +66,10 @@ def density_surface(gpe: GrossPitaevskii, psi: Any, level: float) -> Surface:
         message = 'surfaces of equal density need scikit-image: pip install "eip_scipy[surfaces]"'
         raise ImportError(message, name="skimage") from error
     for axis, n in enumerate(gpe.grid.shape):
-        psi = resample(psi, 2 * n, axis=axis)
+        psi = scipy.signal.resample(psi, 2 * n, axis=axis)
     density = np.abs(psi) ** 2
     points, triangles, _, _ = marching_cubes(density, level)
-    filled = gaussian_filter(grey_closing(density, size=[*(2 * n + 1 for n in core_size(gpe, top)), 1]), SMOOTH)
-    around = map_coordinates(filled, points[triangles].mean(axis=1).T, order=1)
+    closed = scipy.ndimage.grey_closing(density, size=[*(2 * n + 1 for n in core_size(gpe, top)), 1])
+    filled = scipy.ndimage.gaussian_filter(closed, SMOOTH)
+    around = scipy.ndimage.map_coordinates(filled, points[triangles].mean(axis=1).T, order=1)
     return Surface((gpe.grid.lower + 0.5 * gpe.grid.spacing * points)[triangles], around > DEEP * level)

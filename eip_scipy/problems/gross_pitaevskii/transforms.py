@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -68,42 +67,7 @@ class _Ducc(Transforms):
         self._c2c(field, axes=axes, forward=False, out=field, nthreads=self.threads)
 
 
-class _FFTW(Transforms):
-    """FFTW with measured plans: the fastest in 3D, but two runs may choose plans that round differently."""
-
-    name = "pyfftw"
-
-    def __init__(self, threads: int) -> None:
-        super().__init__(threads)
-        self._pyfftw = import_module("pyfftw")
-        self._plans: dict[tuple[tuple[int, ...], Axes, bool], Any] = {}
-
-    def forward(self, field: np.ndarray, axes: Axes, out: np.ndarray) -> None:
-        self._plan(field.shape, axes, True)(field, out)
-
-    def backward(self, field: np.ndarray, axes: Axes) -> None:
-        self._plan(field.shape, axes, False)(field, field, normalise_idft=False)
-
-    def _plan(self, shape: tuple[int, ...], axes: Axes, forward: bool) -> Any:
-        """Forward plans are from one array to another, backward plans in place, as they will be used."""
-        key = shape, axes, forward
-        if key not in self._plans:
-            target = np.zeros(shape, complex)
-            source = np.zeros(shape, complex) if forward else target
-            self._plans[key] = self._pyfftw.FFTW(
-                source,
-                target,
-                axes=axes,
-                direction="FFTW_FORWARD" if forward else "FFTW_BACKWARD",
-                flags=("FFTW_MEASURE", "FFTW_UNALIGNED"),
-                threads=self.threads,
-            )
-        return self._plans[key]
-
-
-LIBRARIES: dict[str, type[Transforms]] = {kind.name: kind for kind in (_SciPy, _Ducc, _FFTW)}
-# The first that is installed. By `python benchmarks/gpe.py` ducc0 is the fastest, but for the largest fields in 3D.
-PREFERENCE = ("ducc0", "pyfftw", "scipy")
+LIBRARIES: dict[str, type[Transforms]] = {kind.name: kind for kind in (_Ducc, _SciPy)}  # the first one wins
 
 
 def make_transforms(fft: str = "auto", threads: int = 1) -> Transforms:
@@ -111,8 +75,8 @@ def make_transforms(fft: str = "auto", threads: int = 1) -> Transforms:
 
     Parameters
     ----------
-    fft : {"auto", "scipy", "ducc0", "pyfftw"}, optional
-        "auto": the first of ducc0, pyfftw and scipy that is installed. The first two, both GPL, come with
+    fft : {"auto", "ducc0", "scipy"}, optional
+        "auto": ducc0 where it is installed, about twice as fast, else scipy. ducc0, under the GPL, comes with
         ``pip install "eip_scipy[fft]"``.
     threads : int, optional
         Threads of each transform. No other part of the right-hand side has threads, so that no two pools compete.
@@ -131,7 +95,7 @@ def make_transforms(fft: str = "auto", threads: int = 1) -> Transforms:
     if isinstance(threads, bool) or not isinstance(threads, (int, np.integer)) or threads < 1:
         raise ValueError(f"threads must be an integer >= 1, got {threads!r}.")
     if fft == "auto":
-        fft = next(name for name in PREFERENCE if find_spec(name) is not None)
+        fft = next(name for name in LIBRARIES if find_spec(name) is not None)
     if fft not in LIBRARIES:
         raise ValueError(f"fft must be 'auto' or one of {', '.join(map(repr, LIBRARIES))}, got {fft!r}.")
     if find_spec(fft) is None:

@@ -6,7 +6,7 @@ from math import ceil, pi, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import grey_closing
+import scipy  # its parts load when they are used
 
 from .equation import GrossPitaevskii
 
@@ -82,7 +82,7 @@ def vortices(
         psi = psi[:, :, gpe.grid.shape[2] // 2 if plane is None else plane]
     x, y = (gpe.grid.points(axis) for axis in (0, 1))
     dx, dy = gpe.grid.spacing[:2]
-    filled = grey_closing(np.abs(psi) ** 2, size=core_size(gpe, top, core), mode="wrap")
+    filled = scipy.ndimage.grey_closing(np.abs(psi) ** 2, size=core_size(gpe, top, core), mode="wrap")
     charge = _charges(psi, turning, x, y, dx, dy)
     i, j = np.nonzero((charge != 0) & (_least_of_corners(filled) > threshold * top))
     places = [_zero(psi[a : a + 2, b : b + 2], turning, x[a], y[b], dx, dy) for a, b in zip(i, j, strict=True)]
