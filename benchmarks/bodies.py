@@ -15,9 +15,9 @@ import argparse
 import numpy as np
 
 from eip_scipy import EIPRKN12, integrate
+from eip_scipy.app.report import describe_machine
 from eip_scipy.integrations import rebound
 from eip_scipy.problems import Problem, nbody
-from eip_scipy.report import describe_machine
 
 REPEATS = 3
 PERIOD = 2 * np.pi

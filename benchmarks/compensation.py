@@ -21,9 +21,9 @@ import numpy as np
 from numba import njit
 
 from eip_scipy import EIPRKN12, integrate
-from eip_scipy import _kernels as kn
+from eip_scipy.app.report import describe_machine
+from eip_scipy.engine import kernels as kn
 from eip_scipy.problems import Problem, solar_system
-from eip_scipy.report import describe_machine
 
 PLANETS = {"Mercury": 1, "Venus": 2, "Earth-Moon": 3, "Mars": 4, "Jupiter": 5, "Neptune": 8}
 two_sum, two_product = kn.two_sum, kn.two_product

@@ -8,8 +8,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from eip_scipy.commands import gpe_efficiency
-from eip_scipy.report import write_csv
+from eip_scipy.app.condensates import efficiency as gpe_efficiency
+from eip_scipy.app.report import write_csv
 
 
 def main() -> None:

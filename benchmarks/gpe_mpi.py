@@ -15,10 +15,10 @@ import numpy as np
 from mpi4py import MPI
 
 from eip_scipy import EIPRK4
+from eip_scipy.app.report import describe_machine, table
 from eip_scipy.integrations.mpi import over_ranks
 from eip_scipy.integrations.mpi_fields import SlabGrossPitaevskii
 from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
-from eip_scipy.report import describe_machine, table
 
 WORLD = MPI.COMM_WORLD
 SHAPES = ((256, 256), (64, 64, 64), (128, 128, 128))

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from eip_scipy import EIPRKN12, integrate
+from eip_scipy.app.report import describe_machine, write_csv
 from eip_scipy.integrations import rebound
 from eip_scipy.problems import solar_system
-from eip_scipy.problems.solar_data import YEAR_D
-from eip_scipy.report import describe_machine, write_csv
+from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 BODIES = {"Mercury": 1, "Earth-Moon": 3, "Jupiter": 5}
 COLOURS = {

@@ -16,7 +16,8 @@ import subprocess
 import sys
 from statistics import median
 
-from eip_scipy.report import describe_machine, versions
+from eip_scipy.app.report import describe_machine
+from eip_scipy.core.versions import versions
 
 ROUNDS = 7
 REFERENCE = "import scipy.integrate"

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from eip_scipy import EIPRK4, integrate
 from eip_scipy.comparators import stormer_verlet
 from eip_scipy.problems import nbody, solar_system
-from eip_scipy.problems.solar_data import load
+from eip_scipy.problems.gravity.solar_data import load
 
 STEP = 0.002
 SAVE_EVERY = 20

@@ -1,6 +1,6 @@
 """How many small faults in the projection and the step the tests notice: the mutation score.
 
-    python benchmarks/mutation_score.py [--count 400] [--seed 1] [--module _step] [--json FILE]
+    python benchmarks/mutation_score.py [--count 400] [--seed 1] [--module engine/step] [--json FILE]
 
 One fault at a time is written into a copy of the package: an operator or a number changed, a comparison moved by its
 boundary or turned round, a condition negated, a statement left out. Fast tests then run without the JIT until one
@@ -30,18 +30,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
-MODULES = ("_step", "_kernels", "projection")
+MODULES = ("engine/step", "engine/kernels", "core/project")
 TESTS = (
-    "kernels",
-    "second_tries",
-    "nystrom_methods",
-    "properties",
-    "guards",
-    "adaptive",
-    "integrate",
-    "tables",
-    "units",
-    "bad_input",
+    "engine/test_kernels",
+    "core/test_second_tries",
+    "core/test_nystrom_methods",
+    "core/test_properties",
+    "core/test_guards",
+    "core/test_adaptive",
+    "run/test_integrate",
+    "app/test_tables",
+    "core/test_units",
+    "acceptance/test_bad_input",
 )
 MARKERS = "not slow and not needs_jit and not slow_without_jit"
 PRELOADED = ("numba", "scipy.integrate", "scipy.optimize", "mpmath", "pytest")
@@ -209,7 +209,7 @@ def run_tests(folder: Path, killers: list[str], keep_bytecode: bool) -> None:
     with open(LOG, "w") as stream:
         os.dup2(stream.fileno(), 1)
         os.dup2(stream.fileno(), 2)
-    files = [f"tests/test_{name}.py" for name in TESTS]
+    files = [f"tests/{name}.py" for name in TESTS]
     options = ["-x", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider", "-m", MARKERS]
     sys.exit(pytest.main([*options, *files], [Order(killers, Path(KILLER))]))
 
@@ -250,7 +250,8 @@ def measure(chosen: list[Mutant]) -> list[dict]:
         state, seconds = outcome(folder, [], None, keep_bytecode=True)
         if state != "survived":
             sys.exit(f"The tests fail without any mutation:\n{(folder / LOG).read_text()}")
-        shutil.rmtree(folder / "eip_scipy" / "__pycache__")  # of the mutated modules it could be taken for theirs
+        for module in MODULES:  # bytecode of the mutated modules could be taken for theirs
+            shutil.rmtree((folder / "eip_scipy" / module).parent / "__pycache__", ignore_errors=True)
         print(f"Tests without a mutation: {seconds:.0f} s")
         results: list[dict] = []
         killers: dict[str, None] = {}

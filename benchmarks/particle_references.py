@@ -19,7 +19,7 @@ import heyoka
 import numpy as np
 
 from eip_scipy.problems import ParticleProblem, tokamak, uniform_field
-from eip_scipy.problems.charged_particle import ORBITS
+from eip_scipy.problems.particles.charged_particle import ORBITS
 
 TARGET = Path(__file__).parents[1] / "eip_scipy" / "data" / "particle_references.json"
 BITS, POINTS = 113, 100

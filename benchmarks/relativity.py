@@ -20,10 +20,10 @@ import rebound
 import reboundx
 
 from eip_scipy import EIPRKN12, integrate
+from eip_scipy.app.report import describe_machine
 from eip_scipy.integrations import rebound as peers
 from eip_scipy.problems import Problem, solar_system
-from eip_scipy.problems.solar_data import YEAR_D
-from eip_scipy.report import describe_machine
+from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 REPEATS = 3
 FLOAT = np.longdouble

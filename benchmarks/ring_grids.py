@@ -18,9 +18,10 @@ import numpy as np
 from scipy.signal import resample
 
 from eip_scipy import EIPRK4, eip_method, integrate
-from eip_scipy.commands.gpe_ring import KAPPA_AFTER, KAPPA_BEFORE, SAVED, SNAPSHOTS, STEP
-from eip_scipy.commands.gpe_runs import motion
-from eip_scipy.commands.gpe_states import load_state
+from eip_scipy.app.condensates.ring import KAPPA_AFTER, KAPPA_BEFORE, SAVED, SNAPSHOTS, STEP
+from eip_scipy.app.condensates.runs import motion
+from eip_scipy.app.condensates.states import load_state
+from eip_scipy.app.report import describe_machine, table, write_csv
 from eip_scipy.problems import Splitting
 from eip_scipy.problems.gross_pitaevskii import (
     at_rest,
@@ -29,7 +30,6 @@ from eip_scipy.problems.gross_pitaevskii import (
     ring_start,
     rotated,
 )
-from eip_scipy.report import describe_machine, table, write_csv
 
 START_POINTS = 256
 SPLITTING_STEP = 1.25e-3

@@ -22,9 +22,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eip_scipy import EIPRKN12, integrate
+from eip_scipy.app.report import describe_machine
 from eip_scipy.integrations import rebound
 from eip_scipy.problems import Problem, solar_system
-from eip_scipy.report import describe_machine
 
 REPEATS = 3
 LONG, SHORT = 1000.0, 100.0

@@ -18,10 +18,10 @@ from collections.abc import Callable
 import numpy as np
 
 from eip_scipy import EIPRKN12, ensemble, integrate
+from eip_scipy.app.report import describe_machine
 from eip_scipy.integrations import rebound as peers
 from eip_scipy.problems import Problem, solar_system
-from eip_scipy.problems.solar_data import YEAR_D
-from eip_scipy.report import describe_machine
+from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 REPEATS = 3
 STEPS = {"1/36 yr": 1 / 36, "1/38 yr": 1 / 38, "1/44 yr": 1 / 44}

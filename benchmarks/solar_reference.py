@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import heyoka
 import numpy as np
 
-from eip_scipy.problems.solar_data import YEAR_D, SolarSystemData, load, reference_states
+from eip_scipy.problems.gravity.solar_data import YEAR_D, SolarSystemData, load, reference_states
 
 FLOAT = np.longdouble
 

@@ -3,25 +3,18 @@
 Public names are imported when they are first asked for (PEP 562): what makes steps brings Numba, .3 s.
 """
 
-import sys
 from importlib import import_module as _import_module
-from types import ModuleType as _ModuleType
 from typing import TYPE_CHECKING, Any
 
-from . import _source_tree as _source_tree
+from .core import source_tree as _source_tree
 
 if TYPE_CHECKING:
-    from . import checkpoint as checkpoint
     from . import problems as problems
-    from .checkpoint import CheckpointError
-    from .ensemble import EnsembleResult, ensemble
-    from .invariants import Invariant, JointInvariants, check_gradient
-    from .longrun import integrate
-    from .nystrom import NystromTableau
-    from .one_step import OneStepMethod
-    from .projection import project
-    from .result import Diagnostics, IntegrationResult, ProjectionResult, ProjectionWarning
-    from .solvers import (
+    from .core.invariants import Invariant, JointInvariants, check_gradient
+    from .core.one_step import OneStepMethod
+    from .core.project import project
+    from .core.results import Diagnostics, IntegrationResult, ProjectionResult, ProjectionWarning
+    from .core.solvers import (
         EIPDOP853,
         EIPRK1,
         EIPRK2,
@@ -35,7 +28,12 @@ if TYPE_CHECKING:
         EIPSolver,
         eip_method,
     )
-    from .tableaux import Tableau
+    from .ensembles.ensemble import EnsembleResult, ensemble
+    from .methods.nystrom import NystromTableau
+    from .methods.runge_kutta import Tableau
+    from .run import checkpoint as checkpoint
+    from .run.checkpoint import CheckpointError
+    from .run.integrate import integrate
 
     __version__: str
 
@@ -70,31 +68,31 @@ __all__ = [
 ]
 
 _HOMES = {  # the module of each of these names, and the modules that are public themselves
-    "CheckpointError": "checkpoint",
-    "Diagnostics": "result",
-    "EnsembleResult": "ensemble",
-    "IntegrationResult": "result",
-    "Invariant": "invariants",
-    "JointInvariants": "invariants",
-    "NystromTableau": "nystrom",
-    "OneStepMethod": "one_step",
-    "ProjectionResult": "result",
-    "ProjectionWarning": "result",
-    "Tableau": "tableaux",
-    "check_gradient": "invariants",
-    "ensemble": "ensemble",
-    "integrate": "longrun",
-    "project": "projection",
-    **dict.fromkeys((name for name in __all__ if name.startswith("EIP") or name == "eip_method"), "solvers"),
+    "CheckpointError": "run.checkpoint",
+    "Diagnostics": "core.results",
+    "EnsembleResult": "ensembles.ensemble",
+    "IntegrationResult": "core.results",
+    "Invariant": "core.invariants",
+    "JointInvariants": "core.invariants",
+    "NystromTableau": "methods.nystrom",
+    "OneStepMethod": "core.one_step",
+    "ProjectionResult": "core.results",
+    "ProjectionWarning": "core.results",
+    "Tableau": "methods.runge_kutta",
+    "check_gradient": "core.invariants",
+    "ensemble": "ensembles.ensemble",
+    "integrate": "run.integrate",
+    "project": "core.project",
+    **dict.fromkeys((name for name in __all__ if name.startswith("EIP") or name == "eip_method"), "core.solvers"),
 }
-_MODULES = ("checkpoint", "problems")
+_MODULES = {"checkpoint": "run.checkpoint", "problems": "problems"}
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         value = getattr(_import_module(f".{_HOMES[name]}", __name__), name)
     elif name in _MODULES:
-        value = _import_module(f".{name}", __name__)
+        value = _import_module(f".{_MODULES[name]}", __name__)
     elif name == "__version__":
         from importlib.metadata import version
 
@@ -107,14 +105,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__, *_MODULES, "__version__"})
-
-
-class _Package(_ModuleType):
-    """The package, in which a public name stays what it is when the module of the same name is imported."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name not in _HOMES or not isinstance(value, _ModuleType):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy._members import FAILED, Members, Plan, Task
-from eip_scipy._pools import Chunk, Part, cores, finished, run_elsewhere
+from eip_scipy.ensembles.chunks import Chunk, Part, cores, finished, run_elsewhere
+from eip_scipy.ensembles.tasks import FAILED, Members, Plan, Task
 
 try:
     import dask

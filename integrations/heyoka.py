@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy._inputs import refuse_units
+from eip_scipy.core.inputs import refuse_units
 
 try:
     import heyoka

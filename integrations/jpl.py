@@ -24,8 +24,14 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy._inputs import refuse_units
-from eip_scipy.problems.solar_data import AU_KM, SOLAR_SYSTEM_JSON, SolarSystemData, gm_from_km3_s2, to_barycentre
+from eip_scipy.core.inputs import refuse_units
+from eip_scipy.problems.gravity.solar_data import (
+    AU_KM,
+    SOLAR_SYSTEM_JSON,
+    SolarSystemData,
+    gm_from_km3_s2,
+    to_barycentre,
+)
 
 __all__ = ["constants", "heliocentric", "initial_data", "kernel_path", "main", "mass_parameters"]
 

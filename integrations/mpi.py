@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy import _kernels as kn
-from eip_scipy import _setup
-from eip_scipy._joint import project_jointly
-from eip_scipy._lanes import abs_dot, dot
-from eip_scipy._names import nearest
-from eip_scipy._step import Method, Options, Work, advance_raw, look_back, make_work, project_step
-from eip_scipy.invariants import Invariant, InvariantSet, as_invariants
-from eip_scipy.one_step import OneStep
-from eip_scipy.solvers import EIPSolver
+from eip_scipy.core import setup
+from eip_scipy.core.invariants import Invariant, InvariantSet, as_invariants
+from eip_scipy.core.names import nearest
+from eip_scipy.core.one_step import OneStep
+from eip_scipy.core.solvers import EIPSolver
+from eip_scipy.engine import kernels as kn
+from eip_scipy.engine.joint import project_jointly
+from eip_scipy.engine.lanes import abs_dot, dot
+from eip_scipy.engine.step import Method, Options, Work, advance_raw, look_back, make_work, project_step
 
 try:
     from mpi4py import MPI
@@ -169,7 +169,7 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
     -----
     A correction is a combination of the gradients. On each rank their parts are written in an orthonormal basis of the
     space that they span there, l numbers each for l invariants; what all ranks have together, (l, ranks * l), holds
-    every product of the gradients to round-off, and `eip_scipy._step.project_step` projects on that, alike on all
+    every product of the gradients to round-off, and `eip_scipy.engine.step.project_step` projects on that, alike on all
     ranks. This is the first half of a QR factorisation of tall matrices (Demmel, Grigori, Hoemmen & Langou, SIAM J.
     Sci. Comput. 34 (2012) A206-A239).
 
@@ -298,7 +298,7 @@ class _Tableau:
         self, rhs: Any, params: Any, t: float, y: np.ndarray, y_r: np.ndarray, t_new: float, h: float, project: bool,
         o: Options, w: Work,
     ) -> int:  # fmt: skip
-        """What `eip_scipy._step.raw_step` does."""
+        """What `eip_scipy.engine.step.raw_step` does."""
         advance_raw(rhs, params, t, y, y_r, h, self._method, o, w)
         if not gathered(self._comm, kn.all_finite(w.y_hat_r)).all():
             return kn.NOT_FINITE
@@ -309,11 +309,11 @@ class _Tableau:
 class _Coordinates:
     """The projection in coordinates of the space that the gradients span, the raw result being its origin.
 
-    `eip_scipy._step` calls `rhs`, `inv` and `grad` with coordinates of all ranks, ``c[rank * l + i]`` along the basis'
-    row i of that rank.
+    `eip_scipy.engine.step` calls `rhs`, `inv` and `grad` with coordinates of all ranks, ``c[rank * l + i]`` along
+    the basis' row i of that rank.
     """
 
-    def __init__(self, comm: MPI.Comm, run: _setup.Run, rhs: Callable[..., None]) -> None:
+    def __init__(self, comm: MPI.Comm, run: setup.Run, rhs: Callable[..., None]) -> None:
         self._comm, self._run, self._rhs = comm, run, rhs
         w, size = run.work, run.invariants.size
         self._own = slice(comm.rank * size, (comm.rank + 1) * size)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from eip_scipy._inputs import refuse_units
+from eip_scipy.core.inputs import refuse_units
 
 try:
     import rebound
@@ -29,7 +29,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 if TYPE_CHECKING:
-    from eip_scipy.problems._problem import Problem
+    from eip_scipy.core.problem import Problem
 
 __all__ = ["INTEGRATORS", "ReboundRun", "ReboundSteps", "ias15_steps", "problem_from_simulation", "run", "simulation"]
 
@@ -306,7 +306,7 @@ def problem_from_simulation(
             "one in an archive is rebound.Simulation(path)"
         )
     _refuse_unsupported(sim)
-    from eip_scipy.problems.nbody import nbody
+    from eip_scipy.problems.gravity.nbody import nbody
 
     sim.synchronize()
     q, v = _state(sim).reshape(2, -1, 3)

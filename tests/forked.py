@@ -59,6 +59,8 @@ class Forked:
 
 
 def main():
+    sys.path.append(str(Path(__file__).parent / "run"))
+
     import systems  # noqa: F401  (and with it the package)
     import test_keeping  # noqa: F401
 

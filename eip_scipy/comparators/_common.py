@@ -14,8 +14,8 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 
-from .._inputs import reals, refuse_units, shown
-from .._stepping import check_fixed_step, fixed_steps
+from ..core.inputs import reals, refuse_units, shown
+from ..core.stepping import check_fixed_step, fixed_steps
 
 __all__ = [
     "FixedStepResult",

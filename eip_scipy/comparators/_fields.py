@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from .._caching import cached_njit
-from .._stepping import check_fixed_step, fixed_steps
+from ..core.stepping import check_fixed_step, fixed_steps
+from ..engine.caching import cached_njit
 from ..problems import GrossPitaevskii
 from ._common import check_span, saved_steps
 

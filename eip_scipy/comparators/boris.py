@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numba.extending import register_jitable
 
-from .._caching import cached_njit
-from .._inputs import refuse_units
+from ..core.inputs import refuse_units
+from ..engine.caching import cached_njit
 from ._common import FixedStepResult, check_state, drive_signature, drive_steps, integrate_in_place
 
 __all__ = ["boris"]

@@ -13,8 +13,8 @@ from numba import types
 from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
-from .._caching import cached_njit
-from .._stepping import check_fixed_step, fixed_steps
+from ..core.stepping import check_fixed_step, fixed_steps
+from ..engine.caching import cached_njit
 from ._common import FixedStepResult, check_span, check_state, message, real_vector, saved_steps
 
 __all__ = ["FORMS", "StormerVerletResult", "stormer_verlet"]

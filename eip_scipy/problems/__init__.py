@@ -1,8 +1,12 @@
 """Problems with invariants: functions that return a `Problem`, and `hard_cases`, which returns many with solutions."""
 
-from ._problem import Problem
-from .charged_particle import ParticleProblem, charged_particle, tokamak, uniform_field
-from .forces import ForceConstants
+from ..core.problem import Problem
+from .gravity import solar_data as solar_data
+from .gravity.forces import ForceConstants
+from .gravity.nbody import nbody
+from .gravity.scenes import comet, figure_eight, pythagorean
+from .gravity.solar_data import SolarSystemData
+from .gravity.solar_system import solar_system
 from .gross_pitaevskii import (
     FieldProblem,
     Grid,
@@ -17,11 +21,8 @@ from .gross_pitaevskii import (
 from .hard_cases import HardCase, hard_cases
 from .harmonic import harmonic
 from .kepler import kepler
-from .nbody import nbody
-from .particle_fields import TOKAMAK, UNIFORM, ParticleField
-from .scenes import comet, figure_eight, pythagorean
-from .solar_data import SolarSystemData
-from .solar_system import solar_system
+from .particles.charged_particle import ParticleProblem, charged_particle, tokamak, uniform_field
+from .particles.fields import TOKAMAK, UNIFORM, ParticleField
 from .time_transformed import centre_time, pair_time, reaches, time_transformed
 
 __all__ = [

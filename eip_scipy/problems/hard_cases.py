@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..invariants import Invariant
-from ._problem import Problem
+from ..core.invariants import Invariant
+from ..core.problem import Problem
 
 __all__ = ["HardCase", "hard_cases"]
 

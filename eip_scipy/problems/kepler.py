@@ -7,10 +7,10 @@ from math import sqrt
 import numpy as np
 from scipy.optimize import brentq
 
-from .._caching import cached_njit
-from .._inputs import refuse_units
-from ..invariants import Invariant
-from ._problem import Problem, bind
+from ..core.inputs import refuse_units
+from ..core.invariants import Invariant
+from ..core.problem import Problem, bind
+from ..engine.caching import cached_njit
 
 __all__ = ["kepler"]
 

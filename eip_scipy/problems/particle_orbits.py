@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .charged_particle import ParticleProblem
+from .particles.charged_particle import ParticleProblem
 
 __all__ = ["ParticleOrbit", "Tips", "radial_range"]
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .._caching import cached_njit
-from .._inputs import refuse_units
-from ..invariants import Invariant
-from ._problem import Problem, bind
+from ..core.inputs import refuse_units
+from ..core.invariants import Invariant
+from ..core.problem import Problem, bind
+from ..engine.caching import cached_njit
 
 __all__ = ["centre_time", "pair_time", "reaches", "time_transformed"]
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..._inputs import refuse_units
-from ..._names import nearest
-from ...invariants import Invariant, JointInvariants
-from .._problem import Problem
+from ...core.inputs import refuse_units
+from ...core.invariants import Invariant, JointInvariants
+from ...core.names import nearest
+from ...core.problem import Problem
 from .conserved import Energy, Joint
 from .grid import Grid, Multiplier, SpectralSum
 from .moments import Moments, moments, total_mass

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._inputs import refuse_units
+from ...core.inputs import refuse_units
 from .pointwise import float_rows, multiply, weighted_square
 from .transforms import Axes, Transforms
 

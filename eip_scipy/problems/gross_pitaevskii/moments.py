@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..._caching import cached_njit
+from ...engine.caching import cached_njit
 
 __all__ = ["Moments", "expansion", "moments", "shifted", "total_mass"]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..._caching import cached_njit
+from ...engine.caching import cached_njit
 
 __all__ = [
     "add_potential",

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._inputs import refuse_units
+from ...core.inputs import refuse_units
 from .equation import FieldProblem, GrossPitaevskii
 from .grid import Grid
 from .potentials import harmonic_trap, quartic_trap

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..._names import nearest
+from ...core.names import nearest
 from .equation import GrossPitaevskii
 from .flows import LinearFlow
 from .pointwise import local_flow

@@ -1,0 +1,1 @@
+"""``gpe``, and the condensates among the paper's figures."""

@@ -1,0 +1,444 @@
+"""Condensates after a quench, for `gpe ring` and `gpe vortex-lines`: runs, errors, vortices in time, checks, files."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.solvers import EIPDOP853, EIPRK4, EIPSolver
+from ...problems import FieldProblem, GrossPitaevskii
+from ...problems.gross_pitaevskii import Vortices, vortices
+from ...run.checkpoint import CheckpointError
+from ...run.integrate import integrate
+from .. import long_runs
+from ..report import compact, describe_machine, document, say, table, warn, write_csv, write_file, write_json
+
+__all__ = ["METHODS", "SHOWN", "Line", "Motion", "Quench", "Study", "check", "conclude", "motion", "study"]
+
+DONE, FAILED, INTERRUPTED = 0, 1, 130
+METHODS = {"EIP-M": ("mass",), "EIP-E": ("energy",), "EIP-ME": ("mass", "energy"), "RK4": ()}
+SHOWN = "EIP-ME"  # whose fields are kept, for the figures
+REFERENCE = "EIPDOP853"
+MASS_KEPT = 1e-14
+SMALL = 1e-3
+AXES = "seen from above, with x to the right and y up"
+SENSES = {1: "anticlockwise", -1: "clockwise"}
+Figures = Iterable[tuple[str, Callable[[Path], Any]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Quench:
+    """A condensate whose trap or rotation changes at t = 0, and what is to be seen of it.
+
+    Attributes
+    ----------
+    name : str
+        Of its files.
+    title : str
+    problem : FieldProblem
+        With the step of RK4, from the stationary state of the equation before.
+    reference_step : float
+        Of EIPDOP853, which the others are compared with.
+    interval : float
+        Time between two saved states, short enough to follow the vortices.
+    snapshots : tuple of float
+    sense : int
+        In which the vortices turn in the rotating frame: 1 anticlockwise, -1 clockwise.
+    energy_kept : float
+        Bound on the absolute error of the energy where it is kept.
+    """
+
+    name: str
+    title: str
+    problem: FieldProblem
+    reference_step: float
+    interval: float
+    snapshots: tuple[float, ...]
+    sense: int
+    energy_kept: float
+
+    @property
+    def equation(self) -> GrossPitaevskii:
+        """The equation after the quench."""
+        assert self.problem.equation is not None
+        return self.problem.equation
+
+    @property
+    def step(self) -> float:
+        """The step of RK4."""
+        assert self.problem.h is not None
+        return self.problem.h
+
+    @property
+    def t_end(self) -> float:
+        """End of the run."""
+        return self.problem.t_span[1]
+
+    def shown(self, t: np.ndarray) -> list[int]:
+        """Which of the saved times are those of the snapshots, as far as the run goes."""
+        return [int(np.argmin(np.abs(t - at))) for at in self.snapshots if at <= t[-1] + 1e-9]
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One method's run.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+    mass_error, energy_error, field_error : ndarray, shape (m,)
+        Absolute; the last is the norm of the difference from the reference.
+    wall_time : float
+    nfev : int
+    n_rank_reduced : int
+        Projections in which the gradients were parallel, as at a stationary state.
+    """
+
+    t: np.ndarray
+    mass_error: np.ndarray
+    energy_error: np.ndarray
+    field_error: np.ndarray
+    wall_time: float
+    nfev: int
+    n_rank_reduced: int
+
+
+@dataclass(eq=False)
+class Study:
+    """The runs of a quench, those of `METHODS` that were done.
+
+    Attributes
+    ----------
+    quench : Quench
+    lines : dict of str to Line
+    reference, fields : ndarray, shape (n, m), or None
+        States of the reference and of `SHOWN`.
+    interrupted : bool
+    """
+
+    quench: Quench
+    lines: dict[str, Line] = field(default_factory=dict)
+    reference: np.ndarray | None = None
+    fields: np.ndarray | None = None
+    interrupted: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The vortices in time, in three dimensions those of the middle plane.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+    found : list of Vortices
+    angle : ndarray, shape (m,)
+        By how much they have turned about the centre, on average, positive anticlockwise [rad].
+    """
+
+    t: np.ndarray
+    found: list[Vortices]
+    angle: np.ndarray
+
+    def off(self, k: int, x: Any, y: Any) -> Any:
+        """Angles of points from where one vortex, the rightmost at the start, is in the state k, in (-pi, pi]."""
+        a, b = self.found[0].positions[np.argmax(self.found[0].positions[:, 0])]
+        return np.angle(np.exp(1j * (np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])))
+
+    def followed(self, k: int) -> int | None:
+        """Which of the vortices in the state k that one is; None where there is none."""
+        if not (self.found[0].charges.size and self.found[k].charges.size):
+            return None
+        return int(np.abs(self.off(k, *self.found[k].positions.T)).argmin())
+
+
+def study(quench: Quench, *, progress: bool = False, kept: Callable[[str], dict[str, Any]] = lambda name: {}) -> Study:
+    """Run the reference and each of `METHODS`; Ctrl-C ends it with what was done.
+
+    Parameters
+    ----------
+    quench : Quench
+    progress : bool, optional
+        Show a bar with the time that is left of each run.
+    kept : callable, optional
+        ``kept(name)``: the options of `integrate` that keep checkpoints of the run of that name.
+
+    Returns
+    -------
+    Study
+
+    Raises
+    ------
+    UsageError
+        When the saved states do not fit the memory, or checkpoints are not of these runs.
+    RuntimeError
+        When a run fails.
+    """
+    made = Study(quench)
+    try:
+        made.reference = _run(quench, REFERENCE, EIPDOP853, quench.reference_step, METHODS[SHOWN], progress, kept).y
+        for name, invariants in METHODS.items():
+            run = _run(quench, name, EIPRK4, quench.step, invariants, progress, kept)
+            made.lines[name] = _line(quench, run, made.reference)
+            if name == SHOWN:
+                made.fields = run.y
+    except KeyboardInterrupt:
+        made.interrupted = True
+    except (MemoryError, CheckpointError) as error:
+        raise long_runs.unusable(error) from error
+    return made
+
+
+def _run(
+    quench: Quench,
+    name: str,
+    method: type[EIPSolver],
+    h: float,
+    invariants: Sequence[str],
+    progress: bool,
+    kept: Callable[[str], dict[str, Any]],
+) -> Any:
+    chosen = quench.equation.invariants(invariants)
+    run = integrate(
+        quench.problem,
+        method=long_runs.named(method, name),
+        h=h,
+        invariants=chosen,
+        save_every=round(quench.interval / h),
+        progress=progress,
+        **kept(name),
+    )
+    if not run.success:
+        raise RuntimeError(f"{name} failed: {run.message}")
+    return run
+
+
+def _line(quench: Quench, run: Any, reference: np.ndarray) -> Line:
+    gpe = quench.equation
+    mass, energy = (np.array([value(y) for y in run.y.T]) for value in (gpe.mass, gpe.energy))
+    difference = np.sqrt([gpe.mass(y - tight) for y, tight in zip(run.y.T, reference.T, strict=True)])
+    errors = np.abs(mass - mass[0]), np.abs(energy - energy[0])
+    return Line(run.t, *errors, difference, run.wall_time, run.nfev, run.diagnostics.n_rank_reduced)
+
+
+def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
+    """Follow the vortices: each goes on as before, then to the nearest one in the next state; the median counts.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+    t : ndarray, shape (m,)
+    fields : ndarray, shape (n, m)
+
+    Returns
+    -------
+    Motion
+    """
+    found = [vortices(gpe, y) for y in fields.T]
+    angles = [np.arctan2(*v.positions.T[::-1]) for v in found]
+    turned, step = [0.0], 0.0
+    for old, new in pairwise(angles):
+        step = _mean_turn(old, new, step)
+        turned.append(turned[-1] + step)
+    return Motion(t, found, np.array(turned))
+
+
+def _mean_turn(old: np.ndarray, new: np.ndarray, guess: float) -> float:
+    """Median of the turns from each old angle, `guess` added, to the nearest new one."""
+    if not (old.size and new.size):
+        return guess
+    difference = np.angle(np.exp(1j * (new[None, :] - old[:, None] - guess)))
+    nearest = np.abs(difference).argmin(axis=1)
+    return guess + float(np.median(difference[np.arange(old.size), nearest]))
+
+
+def check(what: str, value: Any, passed: bool) -> dict[str, Any]:
+    """What must hold, its value, and whether it does."""
+    return {"what": what, "value": value, "passed": bool(passed)}
+
+
+def checks(made: Study, moved: Motion | None) -> list[dict[str, Any]]:
+    """Vortices keep their count and turn as they should, and each invariant that is kept is kept.
+
+    Returns
+    -------
+    list of dict
+        With `what`, `value` and `passed`; of the runs that were done.
+    """
+    found, quench = [], made.quench
+    if moved is not None:
+        at = quench.shown(moved.t)
+        counts = [len(moved.found[k].charges) for k in at]
+        found.append(check("vortices in the snapshots", counts, counts[0] > 0 and len(set(counts)) == 1))
+        if len(at) > 1:
+            turned = float(moved.angle[at[-1]])
+            sense = f"vortices turn {SENSES[quench.sense]}, angle at t = {moved.t[at[-1]]:g} [rad]"
+            found.append(check(sense, turned, quench.sense * turned > 0))
+    for name, line in made.lines.items():
+        for item, bound in (("mass", MASS_KEPT), ("energy", quench.energy_kept)):
+            if item in METHODS[name]:
+                error = float(getattr(line, f"{item}_error").max())
+                found.append(check(f"{name}: error of the {item} below {bound:.0e}", error, error < bound))
+    return found
+
+
+def text(made: Study, moved: Motion | None, found: list[dict[str, Any]], notes: Sequence[str], machine: str) -> str:
+    """Lay out the errors, the vortices and the checks."""
+    quench = made.quench
+    head = [["wall time", "[s]"], ["evaluations", "of f"], ["error of", "mass"], ["error of", "energy"]]
+    head += [["error of", "psi"], ["rank", "reduced"]]
+    body = [(name, _cells(line)) for name, line in made.lines.items()]
+    out = [
+        f"{quench.title}, RK4, h = {quench.step:g}, to t = {quench.t_end:g}",
+        machine,
+        f"Largest errors, absolute; that of psi is the norm of the difference from {REFERENCE}, "
+        f"h = {quench.reference_step:g}",
+        *notes,
+        "",
+        table(head, body),
+        "",
+    ]
+    if moved is not None:
+        where = [
+            (f"t = {moved.t[k]:.2f}", [str(len(v.charges)), _radius(v), f"{moved.angle[k]:+.3f}"])
+            for k in quench.shown(moved.t)
+            for v in (moved.found[k],)
+        ]
+        out += [
+            f"Vortices, in the rotating frame; turned: positive anticlockwise, {AXES}",
+            "",
+            table([["number"], ["mean radius"], ["turned [rad]"]], where),
+            "",
+        ]
+    for item in found:
+        out.append(f"{'ok' if item['passed'] else 'FAILED':<6} {item['what']}: {_value(item['value'])}")
+    if moved is not None and len(quench.shown(moved.t)) < 2:
+        before = f"the run ends before t = {quench.snapshots[1]:g}"
+        out.append(f"{'-':<6} not checked: in which sense the vortices turn, for {before}")
+    return "\n".join(out)
+
+
+def _value(value: Any) -> str:
+    """A check's number, an error short and what is not small with the digits that it is compared in."""
+    if isinstance(value, float):
+        return compact(value, 3) if abs(value) < SMALL else f"{value:.6g}"
+    return str(value)
+
+
+def _cells(line: Line) -> list[str]:
+    errors = (compact(float(e.max())) for e in (line.mass_error, line.energy_error, line.field_error))
+    return [compact(line.wall_time, 3), str(line.nfev), *errors, str(line.n_rank_reduced)]
+
+
+def _radius(found: Vortices) -> str:
+    return f"{np.hypot(*found.positions.T).mean():.3f}" if found.charges.size else "-"
+
+
+def rows(made: Study) -> list[dict[str, Any]]:
+    """Make the lines of the CSV file."""
+    return [
+        {
+            "method": name,
+            "t": line.t[k],
+            "mass_error": line.mass_error[k],
+            "energy_error": line.energy_error[k],
+            "field_error": line.field_error[k],
+        }
+        for name, line in made.lines.items()
+        for k in range(line.t.size)
+    ]
+
+
+def conclude(
+    args: argparse.Namespace,
+    made: Study,
+    moved: Motion | None,
+    *,
+    more: Sequence[dict[str, Any]] = (),
+    notes: Sequence[str] = (),
+    figures: Callable[[], Figures] | None = None,
+) -> int:
+    """Print the tables and write the files.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        With ``task``, ``out``, ``json`` and ``quiet``.
+    made : Study
+    moved : Motion or None
+        None where the run of `SHOWN` is missing.
+    more : sequence of dict, optional
+        Checks beside those of `checks`.
+    notes : sequence of str, optional
+        Lines for the head of the table.
+    figures : callable, optional
+        ``figures()`` yields file names, and functions that write them, beside that of the errors; ImportError where a
+        library is missing.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
+    if made.interrupted:
+        long_runs.tell_how_to_resume(args)
+    if not made.lines:
+        warn("interrupted; no run was done")
+        return INTERRUPTED
+    found = [*checks(made, moved), *more]
+    if not args.quiet:
+        say(text(made, moved, found, notes, describe_machine()))
+        say()
+    _write_numbers(args, made, moved, found)
+    if made.interrupted:
+        warn("interrupted; the runs that were done are in the table and the files")
+        return INTERRUPTED
+    try:
+        for name, save in (*_errors_figure(made), *(figures() if figures is not None else ())):
+            _say(args, write_file(args.out / name, save))
+    except ImportError as error:
+        warn(f"no figures: {error}")
+    return DONE if all(item["passed"] for item in found) else FAILED
+
+
+def _write_numbers(args: argparse.Namespace, made: Study, moved: Motion | None, found: list[dict[str, Any]]) -> None:
+    _say(args, write_csv(args.out / f"{made.quench.name}.csv", rows(made)))
+    if args.json is None:
+        return
+    numbers: dict[str, Any] = {
+        "errors": rows(made),
+        "wall_time_s": {name: line.wall_time for name, line in made.lines.items()},
+        "rank_reduced": {name: line.n_rank_reduced for name, line in made.lines.items()},
+        "checks": found,
+    }
+    if moved is not None:
+        numbers |= {"vortices": [len(v.charges) for v in moved.found], "turned_rad": moved.angle}
+    arguments = {"h": made.quench.step, "t_end": made.quench.t_end}
+    _say(args, write_json(args.json, document(f"gpe {args.task}", arguments, **numbers)))
+
+
+def _errors_figure(made: Study) -> Figures:
+    from ...plotting import ErrorSeries, errors_figure
+
+    quench = made.quench
+    mass, energy = (abs(value(quench.problem.y0)) for value in (quench.equation.mass, quench.equation.energy))
+    series = {
+        name: ErrorSeries(
+            line.t, {"mass": line.mass_error / mass, "energy": line.energy_error / energy}, line.field_error
+        )
+        for name, line in made.lines.items()
+    }
+    title = f"{quench.title}, RK4, h = {quench.step:g}"
+    figure = errors_figure(series, time="t", trajectory=r"error of $\psi$ (norm)", title=title)
+    yield f"{quench.name}-errors.png", partial(figure.savefig)
+
+
+def _say(args: argparse.Namespace, path: Path) -> None:
+    if not args.quiet:
+        say(f"wrote {path}")

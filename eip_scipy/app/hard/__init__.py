@@ -1,0 +1,1 @@
+"""``hard-cases`` and ``hard-scenes``."""

@@ -1,0 +1,1 @@
+"""``work-precision``, and Kepler's problem among the paper's figures."""

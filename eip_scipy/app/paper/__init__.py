@@ -1,0 +1,1 @@
+"""``reproduce``: the paper's tables and figures."""

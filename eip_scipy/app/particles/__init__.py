@@ -1,0 +1,1 @@
+"""``charged-particle``."""

@@ -1,0 +1,1 @@
+"""``solar-system``, with ``--truth`` and ``--frontier``."""

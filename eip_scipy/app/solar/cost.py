@@ -1,0 +1,205 @@
+"""Error against cost for the solar system: what is timed, at which steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ...core.solvers import EIPRK4, EIPRK5, EIPRKN12, EIPSolver
+from ...problems.gravity.solar_data import YEAR_D
+from ...run.integrate import integrate
+from ..long_runs import named
+from ..work_precision import Runner, work_precision
+from .runs import (
+    HIGH_ORDER,
+    KEPT,
+    Judge,
+    Scene,
+    eip_name,
+    leapfrog,
+    metric_of,
+    rebound_run,
+    stored_state,
+    tight_run,
+    whole_number,
+)
+
+__all__ = ["MERCURY", "REPEATS", "TimedRun", "by_method", "cost", "cost_methods", "timed"]
+
+REPEATS = 3
+MERCURY = 0  # of the planets, which start behind the Sun
+
+
+@dataclass(frozen=True, eq=False)
+class TimedRun:
+    """One method at one step or tolerance.
+
+    Attributes
+    ----------
+    method : str
+    step : float
+        Years; for heyoka its tolerance; nan for IAS15, which has its own.
+    wall_time : float
+        Seconds.
+    errors : ndarray, shape (9,)
+        Distance of each planet from the reference [AU]; nan where the run failed.
+    """
+
+    method: str
+    step: float
+    wall_time: float
+    errors: np.ndarray
+
+    @property
+    def mercury(self) -> float:
+        """Mercury's error."""
+        return float(self.errors[MERCURY])
+
+    @property
+    def others(self) -> float:
+        """The largest error of another planet."""
+        return float(np.delete(self.errors, MERCURY).max())
+
+
+def timed(
+    methods: Mapping[str, tuple[Runner, Sequence[float]]],
+    truth: np.ndarray,
+    *,
+    repeats: int,
+    enough_seconds: float = 1.0,
+    callback: Callable[[], Any] | None = None,
+) -> list[TimedRun]:
+    """Run and time methods; see `work_precision`.
+
+    Parameters
+    ----------
+    methods : mapping
+        As `work_precision` takes it.
+    truth : ndarray, shape (60,)
+        The state at the end of all runs.
+    repeats, enough_seconds, callback
+        As for `work_precision`.
+
+    Returns
+    -------
+    list of TimedRun
+    """
+    done = work_precision(
+        methods, lambda y: math.nan, repeats=repeats, enough_seconds=enough_seconds, callback=callback
+    )
+
+    def errors(y: np.ndarray) -> np.ndarray:
+        return np.linalg.norm((y - truth)[: y.size // 2].reshape(-1, 3), axis=1)[1:]
+
+    return [
+        TimedRun(point.method, point.step, point.wall_time, errors(state))
+        for point, state in zip(done.points, done.states, strict=True)
+    ]
+
+
+def by_method(runs: Sequence[TimedRun]) -> dict[str, dict[str, list[float]]]:
+    """Series of times and errors, as `eip_scipy.plotting.frontier_figure` takes them."""
+    return {
+        name: {
+            "wall_time": [item.wall_time for item in runs if item.method == name],
+            "Mercury": [item.mercury for item in runs if item.method == name],
+            "the worst of the other planets": [item.others for item in runs if item.method == name],
+        }
+        for name in dict.fromkeys(item.method for item in runs)
+    }
+
+
+def cost(
+    scene: Scene,
+    methods: Mapping[str, tuple[Runner, Sequence[float]]],
+    judge: Judge | None,
+    callback: Callable[[], Any] | None = None,
+) -> list[TimedRun]:
+    """Final position errors against the time of the run, for several methods and steps.
+
+    Parameters
+    ----------
+    scene : Scene
+        Of the span to be timed.
+    methods : mapping
+        From `cost_methods`.
+    judge : callable or None
+        REBOUND, if it is there.
+    callback : callable, optional
+        ``callback()`` after each run; there are `REPEATS` of each method and step.
+
+    Returns
+    -------
+    list of TimedRun
+    """
+    truth = stored_state(scene, scene.years)
+    if truth is None:
+        truth = (tight_run(scene, False) if judge is None else rebound_run(scene, judge, "IAS15", "ias15", 1, False)).y[
+            :, -1
+        ]
+    return timed(methods, truth, repeats=REPEATS, callback=callback)
+
+
+def cost_methods(
+    scene: Scene, method: type[EIPSolver], metric: str, judge: Judge | None
+) -> dict[str, tuple[Runner, Sequence[float]]]:
+    """List what `cost` times, with the steps.
+
+    Parameters
+    ----------
+    scene : Scene
+    method : type
+        With its projection, and without; and beside it EIPRK5 (EIPRK4 beside EIPRK5) and EIPRKN12.
+    metric : {"error", "euclidean"}
+    judge : callable or None
+
+    Returns
+    -------
+    dict
+        As `work_precision` takes it.
+    """
+    other = EIPRK4 if method is EIPRK5 else EIPRK5
+    own = metric_of(method, metric)
+    steps = _steps(scene, [scene.h * factor for factor in (4, 2, 1, 0.5)])
+    methods: dict[str, tuple[Runner, Sequence[float]]] = {
+        eip_name(method, own): (partial(_time_eip, scene, method, {"metric": own}), steps),
+        method.TABLEAU.name: (partial(_time_eip, scene, method, {"invariants": ()}), steps),
+        eip_name(other, metric): (partial(_time_eip, scene, other, {"metric": metric}), steps),
+        "SV": (partial(_time_verlet, scene), _steps(scene, [scene.h * f for f in (2, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)])),
+        HIGH_ORDER: (partial(_time_eip, scene, EIPRKN12, KEPT), _steps(scene, [1 / n for n in (24, 32, 40, 48, 64)])),
+    }
+    if judge is None:
+        return methods
+    days = _steps(scene, [d / YEAR_D for d in (10.0, 5.0, 2.5, 1.25)])
+    methods["WHFast"] = (partial(_time_rebound, scene, judge, "whfast"), days)
+    methods["WHFast (c17)"] = (partial(_time_rebound, scene, judge, "whfast-c17"), days)
+    if stored_state(scene, scene.years) is not None:  # otherwise it is the reference
+        methods["IAS15"] = (partial(_time_rebound, scene, judge, "ias15"), [scene.years])
+    return methods
+
+
+def _steps(scene: Scene, wanted: Sequence[float]) -> list[float]:
+    """Shorten steps to divide the span: a shortened last one would spoil a symplectic method."""
+    return sorted({scene.years / whole_number(scene.years / h) for h in wanted}, reverse=True)
+
+
+def _time_eip(scene: Scene, method: type[EIPSolver], options: dict[str, Any], step: float) -> tuple[float, np.ndarray]:
+    name = f"{method.__name__}, h = {step:.4g} yr"
+    result = integrate(scene.problem, method=named(method, name), h=step, **options)
+    return result.wall_time, result.y[:, -1] if result.success else np.full_like(scene.problem.y0, np.nan)
+
+
+def _time_verlet(scene: Scene, step: float) -> tuple[float, np.ndarray]:
+    result = leapfrog(scene, step, None)
+    return result.wall_time, result.y[:, -1]
+
+
+def _time_rebound(scene: Scene, judge: Judge, integrator: str, step: float) -> tuple[float, np.ndarray]:
+    n_steps = whole_number(scene.years / step)
+    result = judge(scene.problem.params, scene.problem.y0, integrator, h=scene.years / n_steps, n_steps=n_steps)
+    return result.wall_time, result.y[:, -1]

@@ -1,0 +1,129 @@
+"""The start of ``eip-scipy solar-system``: a set that the package carries, or any epoch of a JPL kernel."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable
+from datetime import date
+from fractions import Fraction
+from pathlib import Path
+from typing import NamedTuple
+
+from ...problems.gravity.solar_data import SolarSystemData, available, load
+from ..report import UsageError
+
+__all__ = ["Ephemeris", "Epoch", "add_arguments", "initial_data", "parse_epoch"]
+
+Ephemeris = Callable[[tuple[float, float], Path | None], SolarSystemData]
+"""`eip_scipy.integrations.jpl.initial_data`."""
+
+DEFAULT = "de440"
+TEN_BODIES = [name for name in available() if len(load(name).bodies) == 10]  # what the tables and figures are made for
+FORMS = '"2014-02-02T20:18", "2000-01-01" (both TDB, Gregorian calendar), "JD2451545.0" or "2451545.0"'
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d):(\d\d)(?::(\d\d(?:\.\d+)?))?)?")
+_JULIAN_DATE = re.compile(r"(?:JD ?)?(-?\d{1,8}(?:\.\d*)?)", re.IGNORECASE)
+_TDB = re.compile(r" ?TDB$", re.IGNORECASE)
+_ORDINAL_ZERO_JD = Fraction(3442849, 2)  # of date.toordinal(), at midnight
+
+
+class Epoch(NamedTuple):
+    """A Julian date, TDB, in two parts: the last midnight and the rest of the day."""
+
+    midnight: float
+    rest: float
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add ``--data``, or instead ``--epoch`` with ``--kernel``."""
+    start = parser.add_mutually_exclusive_group()
+    start.add_argument("--data", choices=TEN_BODIES, help=f"initial data that the package carries ({DEFAULT})")
+    start.add_argument(
+        "--epoch", type=_epoch, help=f'start at any epoch of a JPL kernel: {FORMS}; needs "eip_scipy[jpl]"'
+    )
+    parser.add_argument(
+        "--kernel", type=Path, metavar="FILE", help="with --epoch: a kernel of your own (.bsp) instead of DE440"
+    )
+
+
+def parse_epoch(text: str) -> Epoch:
+    """Read an epoch without loss: both parts are the numbers nearest to what is written.
+
+    Parameters
+    ----------
+    text : str
+        A date of the proleptic Gregorian calendar with or without time, or a Julian date; "TDB" may follow.
+
+    Returns
+    -------
+    Epoch
+
+    Raises
+    ------
+    ValueError
+        With the accepted forms.
+
+    Examples
+    --------
+    >>> parse_epoch("2000-01-01T12:00")
+    Epoch(midnight=2451544.5, rest=0.5)
+    """
+    words = _TDB.sub("", text.strip())
+    try:
+        if written := _DATE.fullmatch(words):
+            return _from_date(*written.groups(default="0"))
+    except ValueError as error:
+        raise ValueError(f"no such date or time: {text!r} ({error})") from error
+    if written := _JULIAN_DATE.fullmatch(words):
+        return _two_parts(Fraction(written[1]))
+    raise ValueError(f"expected an epoch such as {FORMS}, got {text!r}")
+
+
+def _from_date(day: str, hour: str, minute: str, second: str) -> Epoch:
+    time = Fraction(int(hour) * 60 + int(minute)) * 60 + Fraction(second)
+    if int(hour) > 23 or int(minute) > 59 or Fraction(second) >= 60:
+        raise ValueError("a time is between 00:00 and 24:00, and TDB has no leap seconds")
+    return _two_parts(date.fromisoformat(day).toordinal() + _ORDINAL_ZERO_JD + time / 86400)
+
+
+def _two_parts(julian_date: Fraction) -> Epoch:
+    half = Fraction(1, 2)
+    midnight = (julian_date - half) // 1 + half
+    return Epoch(float(midnight), float(julian_date - midnight))
+
+
+def _epoch(text: str) -> Epoch:
+    try:
+        return parse_epoch(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def initial_data(args: argparse.Namespace, ephemeris: Ephemeris | None) -> SolarSystemData:
+    """Get the data that the options ask for.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Options of `add_arguments`.
+    ephemeris : callable or None
+        Reads a kernel; needed for ``--epoch`` only.
+
+    Returns
+    -------
+    SolarSystemData
+
+    Raises
+    ------
+    UsageError
+        When the epoch cannot be had; one line.
+    """
+    if args.epoch is None:
+        if args.kernel is not None:
+            raise UsageError("--kernel goes with --epoch, which says where in the kernel to start")
+        return load(args.data or DEFAULT)
+    assert ephemeris is not None  # whoever lets users choose an epoch brings a reader
+    try:
+        return ephemeris(args.epoch, args.kernel)
+    except (ImportError, OSError, ValueError) as error:
+        raise UsageError(" ".join(str(error).split())) from error

@@ -1,0 +1,198 @@
+"""How far the runs of the solar system are from the truth, and the checks of the command."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from .cost import MERCURY, TimedRun
+from .runs import TIGHT, MethodRun, Scene, report_times, stored_state
+
+__all__ = ["MERCURY", "Check", "PointErrors", "Study", "ecliptic", "errors_at", "longitude_errors"]
+
+OBLIQUITY = math.radians(84381.448 / 3600)  # IAU 1976, as the paper's data: from the axes of the ICRF to the ecliptic
+# A turn is counted right if the longitude error changes by less than half a turn between saved states. Two ellipses as
+# eccentric as Mercury's, out of phase, contribute up to 1.6 rad; a change above this bound means that counting is lost.
+COUNTABLE_CHANGE = 2.5
+ROUND_OFF = 1e-13
+FASTEST = 40.0  # rad/yr: Mercury at its perihelion
+TIGHT_POSITION = {"IAS15": 1e-8, TIGHT: 1e-7}  # AU, after 2000 years
+
+
+class PointErrors(NamedTuple):
+    """Errors of one run at one time; longitudes with their sign, in rad, nan where turns cannot be counted."""
+
+    year: float
+    reference: str
+    longitude: np.ndarray
+    position: np.ndarray
+
+
+class Check(NamedTuple):
+    """A condition that a sound run meets."""
+
+    passed: bool
+    text: str
+
+
+@dataclass
+class Study:
+    """The runs done so far and what follows from them; an interruption leaves it usable."""
+
+    scene: Scene
+    order: int
+    runs: list[MethodRun] = field(default_factory=list)
+    tight: MethodRun | None = None
+    cost: list[TimedRun] = field(default_factory=list)
+    cost_scene: Scene | None = None
+
+    def errors(self, year: float) -> dict[str, PointErrors]:
+        """Errors of the runs at a time, where they are known."""
+        found = {run.name: errors_at(self.scene, run, year, self.tight) for run in self.runs}
+        return {name: errors for name, errors in found.items() if errors is not None}
+
+    def checks(self) -> list[Check]:
+        """Do the command's checks, as far as there are runs for them."""
+        return checks(self.scene, self.order, self.runs[0], self.tight) if self.runs else []
+
+
+def ecliptic(scene: Scene, vectors: np.ndarray) -> np.ndarray:
+    """Turn vectors (k, 3, m) from the data's axes to those of the ecliptic."""
+    if scene.data.axes != "ICRF":
+        return vectors
+    c, s = math.cos(OBLIQUITY), math.sin(OBLIQUITY)
+    x, y, z = np.moveaxis(vectors, 1, 0)
+    return np.stack([x, c * y + s * z, c * z - s * y], axis=1)
+
+
+def longitude_errors(scene: Scene, run: MethodRun, truth: MethodRun) -> np.ndarray:
+    """Errors of the heliocentric ecliptic longitude along a run, with whole turns counted.
+
+    Parameters
+    ----------
+    scene : Scene
+    run, truth : MethodRun
+        The run, and the one it is compared with.
+
+    Returns
+    -------
+    ndarray, shape (9, m)
+        rad, at the times of `truth`. nan after the end of a run, and from where its longitude error changes too fast
+        between saved states for its turns to be counted.
+
+    Notes
+    -----
+    The difference of two longitudes changes slowly where the longitudes themselves do not: it is what is made
+    continuous in time.
+    """
+    n = _common_saves(run, truth)
+    error = np.full((len(scene.planets), truth.t.size), np.nan)
+    difference = _longitudes(scene, run.y[:, :n]) - _longitudes(scene, truth.y[:, :n])
+    error[:, :n] = np.unwrap(_wrap(difference), axis=1)
+    too_fast = np.abs(np.diff(error[:, :n], axis=1)) > COUNTABLE_CHANGE
+    lost = np.logical_or.accumulate(too_fast, axis=1)
+    error[:, 1:n][lost] = np.nan
+    return error
+
+
+def _common_saves(run: MethodRun, truth: MethodRun) -> int:
+    n = min(run.t.size, truth.t.size)
+    same = np.isclose(run.t[:n], truth.t[:n], rtol=1e-9, atol=1e-12)
+    return n if same.all() else int(np.argmin(same))
+
+
+def _longitudes(scene: Scene, y: np.ndarray) -> np.ndarray:
+    q = y[: len(y) // 2].reshape(-1, 3, y.shape[1])
+    heliocentric = ecliptic(scene, q[1:] - q[0])
+    return np.arctan2(heliocentric[:, 1], heliocentric[:, 0])
+
+
+def _wrap(angle: np.ndarray) -> np.ndarray:
+    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
+
+
+def errors_at(scene: Scene, run: MethodRun, year: float, tight: MethodRun | None) -> PointErrors | None:
+    """Errors of a run at one of the `report_times`.
+
+    Parameters
+    ----------
+    scene : Scene
+    run : MethodRun
+    year : float
+    tight : MethodRun or None
+        The run that counts the turns, and the reference where no state is stored.
+
+    Returns
+    -------
+    PointErrors or None
+        None where nothing is known: no reference at that time, the run is that reference, or it ended before.
+        Longitudes are nan without `tight`. Positions are relative to the centre of mass.
+    """
+    state, source = stored_state(scene, year), "stored states"
+    if state is None and tight is not None and tight is not run:
+        state, source = _state_at(tight, year), tight.name
+    own = _state_at(run, year)
+    if state is None or own is None:
+        return None
+    position = np.linalg.norm((own - state)[: own.size // 2].reshape(-1, 3)[1:], axis=1)
+    wrapped = _wrap(_longitudes(scene, own[:, None]) - _longitudes(scene, state[:, None]))[:, 0]
+    return PointErrors(year, source, wrapped + _turns(scene, run, year, tight, wrapped), position)
+
+
+def _turns(scene: Scene, run: MethodRun, year: float, tight: MethodRun | None, wrapped: np.ndarray) -> np.ndarray:
+    """Whole turns to be added to an error in (-pi, pi], as counted along the tightest run."""
+    if tight is None or _state_at(tight, year) is None:
+        return np.full_like(wrapped, np.nan)
+    counted = longitude_errors(scene, run, tight)[:, _index(tight, year)]
+    return 2 * np.pi * np.round((counted - wrapped) / (2 * np.pi))
+
+
+def _index(run: MethodRun, year: float) -> int:
+    return int(np.argmin(np.abs(run.t - year)))
+
+
+def _state_at(run: MethodRun, year: float) -> np.ndarray | None:
+    k = _index(run, year)
+    return run.y[:, k] if math.isclose(run.t[k], year, rel_tol=1e-9) else None
+
+
+def checks(scene: Scene, order: int, main: MethodRun, tight: MethodRun | None) -> list[Check]:
+    """Conditions that hold for any sensible arguments; one that fails says that the numbers are not to be trusted.
+
+    Parameters
+    ----------
+    scene : Scene
+    order : int
+        Order of the method asked for.
+    main : MethodRun
+        Its run.
+    tight : MethodRun or None
+        The tightest run.
+
+    Returns
+    -------
+    list of Check
+    """
+    done = [Check(not main.failure, f"{main.name} reached the end")]
+    # Defects are O(h^(2p + 2)): round-off for small steps; for large ones the factor is measured, with room of 10.
+    bound = max(ROUND_OFF, 1e-3 * (FASTEST * scene.h) ** (2 * order + 2))
+    for name, series in (("H", main.energy_error), ("L", main.momentum_error)):
+        value = float(series.max())
+        done.append(Check(value <= bound, f"{main.name} keeps {name}: relative error {value:.1e} (bound {bound:.1e})"))
+    if tight is not None:
+        done += _reference_checks(scene, tight)
+    return done
+
+
+def _reference_checks(scene: Scene, tight: MethodRun) -> list[Check]:
+    """Whether the run that counts turns follows the stored states, at the last of them."""
+    stored = [year for year in report_times(scene) if stored_state(scene, year) is not None]
+    at_end = errors_at(scene, tight, stored[-1], tight) if stored else None
+    if at_end is None:
+        return [Check(not tight.failure, f"{tight.name} reached the end")]
+    worst, bound = float(at_end.position.max()), TIGHT_POSITION[tight.name]
+    text = f"{tight.name} agrees with the stored states at {stored[-1]:g} yr to {worst:.1e} AU (bound {bound:g})"
+    return [Check(worst <= bound, text)]

@@ -1,0 +1,253 @@
+"""``eip-scipy solar-system --frontier``: error against cost of long runs at high accuracy, beside the peers at hand."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ...comparators import stormer_verlet
+from ...core.solvers import EIPDOP853, EIPRK4, EIPRKN8, EIPRKN12
+from ...problems import Problem, solar_system
+from ...problems.gravity.solar_data import YEAR_D, load, reference_states
+from ...run.integrate import integrate
+from ..long_runs import named
+from ..report import (
+    UsageError,
+    check_outputs,
+    compact,
+    deliver,
+    describe_machine,
+    table,
+    warn,
+)
+from ..work_precision import Runner, cost_to_reach
+from .cost import MERCURY, TimedRun, by_method, timed
+from .runs import KEPT, Judge, whole_number
+
+__all__ = ["measure", "methods", "run"]
+
+DONE, INTERRUPTED = 0, 130
+YEARS, REPEATS = 1000.0, 3
+PATIENCE = 30.0  # a run of so many seconds is not repeated
+LEVELS = (1e-6, 1e-7, 1e-8, 1e-9)
+
+
+def methods(problem: Problem, years: float, judge: Judge | None, heyoka: Judge | None) -> dict[str, Any]:
+    """List what is timed, with steps in years or tolerances.
+
+    Parameters
+    ----------
+    problem : Problem
+        The ten bodies, in AU and years.
+    years : float
+    judge, heyoka : callable or None
+        ``run`` of the integrations, where they are installed.
+
+    Returns
+    -------
+    dict of str to (callable, sequence of float)
+        As `work_precision` takes it.
+    """
+
+    def own(method: Any, *steps: float, **options: Any) -> tuple[Runner, Sequence[float]]:
+        return partial(_integrate, problem, years, method, options), _dividing(years, steps)
+
+    steps = (1 / 24, 1 / 32, 1 / 40, 1 / 48, 1 / 64, 1 / 80, 1 / 100)
+    found = {
+        "EIPRKN12": own(EIPRKN12, *steps, **KEPT),
+        "RKN12, no projection": own(EIPRKN12, *steps, compensated=True, invariants=()),
+        "EIPRKN8": own(EIPRKN8, 1 / 80, 1 / 100, 1 / 160, 1 / 240, **KEPT),
+        "EIPDOP853": own(EIPDOP853, 1 / 80, 1 / 120, 1 / 180, 1 / 240, **KEPT),
+        "EIPRK4": own(EIPRK4, 1 / 500, 1 / 1000),
+        "SV": (partial(_verlet, problem, years), _dividing(years, [1 / 500, 1 / 1000, 1 / 2000])),
+    }
+    if judge is not None:
+
+        def peer(name: str, *days: float) -> tuple[Runner, Sequence[float]]:
+            return partial(_rebound, judge, problem, years, name), _dividing(years, [d / YEAR_D for d in days])
+
+        found |= {
+            "WHFast (c17)": peer("whfast-c17", 10, 5, 3, 2, 1.4, 1, 0.7305),
+            "SABA(10,6,4)": peer("saba(10,6,4)", 20, 15, 10, 7.5, 5, 3),
+            "IAS15": (partial(_ias15, judge, problem, years), [math.nan]),
+        }
+    if heyoka is not None:
+        found["heyoka (double)"] = partial(_heyoka, heyoka, problem, years), [1e-9, 1e-11, 1e-13, 2.2e-16]
+    return found
+
+
+def measure(
+    years: float, judge: Judge | None, heyoka: Judge | None, callback: Callable[[], Any] | None = None
+) -> list[TimedRun]:
+    """Run and time all methods.
+
+    Raises
+    ------
+    ValueError
+        When the package holds no reference state at `years`.
+    """
+    if years not in reference_states():
+        known = ", ".join(f"{t:g}" for t in reference_states())
+        raise ValueError(f"--frontier needs a stored reference state: --years must be one of {known}, got {years:g}")
+    problem = solar_system(years=years)
+    assert problem.reference is not None
+    truth = problem.reference(years)
+    assert truth is not None
+    found = methods(problem, years, judge, heyoka)
+    return timed(found, truth, repeats=REPEATS, enough_seconds=PATIENCE, callback=callback)
+
+
+def _dividing(years: float, wanted: Sequence[float]) -> list[float]:
+    """Steps shortened to divide the span."""
+    return [years / whole_number(years / h) for h in wanted]
+
+
+def _integrate(
+    problem: Problem, years: float, method: Any, options: Mapping[str, Any], step: float
+) -> tuple[float, np.ndarray]:
+    name = f"{method.__name__}, h = {step:.4g} yr"
+    result = integrate(problem, (0.0, years), method=named(method, name), h=step, **options)
+    return result.wall_time, result.y[:, -1] if result.success else np.full(problem.y0.size, np.nan)
+
+
+def _verlet(problem: Problem, years: float, step: float) -> tuple[float, np.ndarray]:
+    assert problem.acc is not None
+    result = stormer_verlet(problem.acc, (0.0, years), problem.y0, step, params=problem.params)
+    return result.wall_time, result.y[:, -1]
+
+
+def _rebound(judge: Judge, problem: Problem, years: float, name: str, step: float) -> tuple[float, np.ndarray]:
+    n_steps = whole_number(years / step)
+    result = judge(problem.params, problem.y0, name, h=years / n_steps, n_steps=n_steps)
+    return result.wall_time, result.y[:, -1]
+
+
+def _ias15(judge: Judge, problem: Problem, years: float, step: float) -> tuple[float, np.ndarray]:
+    return _rebound(judge, problem, years, "ias15", years)
+
+
+def _heyoka(peer: Judge, problem: Problem, years: float, tolerance: float) -> tuple[float, np.ndarray]:
+    result = peer(problem.params, problem.y0, t_end=years, tolerance=tolerance)
+    return result.wall_time, result.y
+
+
+def _setting(item: TimedRun) -> str:
+    if math.isnan(item.step):
+        return "own"
+    return f"tol {item.step:.0e}" if item.method.startswith("heyoka") else f"{item.step * YEAR_D:.4g} d"
+
+
+def text(runs: Sequence[TimedRun], years: float, machine: str) -> str:
+    """Lay out all runs, and what it costs to reach a level of error."""
+    others = np.delete(np.array(load("de440").bodies[1:]), MERCURY)
+    body = []
+    for item in runs:
+        rest = np.delete(item.errors, MERCURY)
+        worst = f"{compact(rest.max())} {others[rest.argmax()]}" if np.isfinite(rest).all() else compact(math.nan)
+        cells = [_setting(item), f"{item.wall_time:.3g}", compact(item.errors[MERCURY]), worst]
+        body.append((item.method, cells))
+    parts = [
+        f"Ten bodies, Newton, {years:g} years: errors of position [AU] and wall time, least of {REPEATS}, one core",
+        machine,
+        "",
+        table([["step", ""], ["wall", "[s]"], ["Mercury", "[AU]"], ["worst of the", "others [AU]"]], body),
+        "",
+        "Seconds for an error of Mercury's position:",
+        table([["error [AU]", compact(level, 1)] for level in LEVELS], _costs(runs)),
+        '"<": the cheapest run is more accurate; "-": no run is as accurate.',
+    ]
+    return "\n".join(parts)
+
+
+def _costs(runs: Sequence[TimedRun]) -> list[tuple[str, list[str]]]:
+    lines = []
+    for name in dict.fromkeys(item.method for item in runs):
+        own = [item for item in runs if item.method == name]
+        seconds, errors = [item.wall_time for item in own], [item.mercury for item in own]
+        cells = [
+            ("<" if errors[0] <= level else "") + compact(cost_to_reach(seconds, errors, level)) for level in LEVELS
+        ]
+        lines.append((name, cells))
+    return lines
+
+
+def rows(runs: Sequence[TimedRun]) -> list[dict[str, Any]]:
+    """Make the lines of the CSV file."""
+    planets = load("de440").bodies[1:]
+    return [
+        {
+            "method": item.method,
+            "setting": _setting(item),
+            "wall_time_s": item.wall_time,
+            **{f"{name}_au": float(x) for name, x in zip(planets, item.errors, strict=True)},
+        }
+        for item in runs
+    ]
+
+
+def run(args: argparse.Namespace, judge: Judge | None, heyoka: Judge | None) -> int:
+    """Run the command.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        With ``years``, ``out``, ``json`` (Path or None) and ``quiet``.
+    judge, heyoka : callable or None
+        ``run`` of `eip_scipy.integrations.rebound` and of `eip_scipy.integrations.heyoka`.
+
+    Returns
+    -------
+    int
+        Exit status: 0 done, 130 interrupted.
+
+    Raises
+    ------
+    UsageError
+        For a span or data without a reference state, or files that cannot be written.
+    """
+    from tqdm import tqdm
+
+    args.years = YEARS if args.years is None else args.years
+    if args.data not in (None, "de440") or args.epoch is not None:
+        raise UsageError(f"--frontier has reference states for --data de440 only, got {args.data or args.epoch!r}")
+    check_outputs(args.out, args.json)
+    points = sum(len(steps) for _, steps in methods(solar_system(years=1.0), 1.0, judge, heyoka).values())
+    try:
+        with tqdm(total=REPEATS * points, desc="frontier", unit="run", disable=args.quiet, leave=False) as bar:
+            runs = measure(args.years, judge, heyoka, bar.update)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    except KeyboardInterrupt:
+        warn("interrupted; nothing was written")
+        return INTERRUPTED
+    machine = describe_machine()
+    found = rows(runs)
+    deliver(
+        args,
+        "solar-system --frontier",
+        text(runs, args.years, machine),
+        {"frontier.csv": found},
+        _figures(runs, args.years, machine),
+        {"years": args.years},
+        runs=found,
+    )
+    return DONE
+
+
+def _figures(runs: Sequence[TimedRun], years: float, machine: str) -> Iterator[Any]:
+    from ...plotting import frontier_figure
+
+    yield (
+        "frontier.png",
+        frontier_figure(
+            by_method(runs),
+            unit="AU",
+            title=f"Ten bodies, Newton, {years:g} years: error of position against cost",
+            footnote=f"{machine}; one thread, least of {REPEATS}",
+        ),
+    )

@@ -1,0 +1,1 @@
+"""Invariants, options, methods and results: what one step needs, whoever takes it."""

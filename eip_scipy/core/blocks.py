@@ -1,0 +1,63 @@
+"""Blocks: components that the error metric weighs together."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..engine.kernels import Grouping
+from .inputs import refuse_units, shown
+
+__all__ = ["INDEX", "blocks_of"]
+
+# Unsigned: Numba then leaves out the test for negative indices, which costs more than the access itself.
+INDEX = np.uint64
+
+
+def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
+    """The option ``blocks`` as groups of floats, `width` of them for each of n components.
+
+    Raises
+    ------
+    TypeError
+        For values with a unit.
+    ValueError
+        For blocks that do not divide the state, or are no lists of its components, or share one.
+    """
+    refuse_units(blocks=blocks)
+    if blocks is None:
+        return _consecutive(1, n, width)
+    if isinstance(blocks, (int, np.integer)) and not isinstance(blocks, bool):
+        if blocks < 1 or n % blocks:
+            raise ValueError(f"blocks = {blocks} does not divide the state's {n} components.")
+        return _consecutive(int(blocks), n, width)
+    groups = _block_lists(blocks, n)
+    if width == 2:
+        groups = [np.column_stack([2 * g, 2 * g + 1]).ravel() for g in groups]
+    start = np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(INDEX)
+    member = np.concatenate([*groups, []]).astype(INDEX)
+    regular = len({len(g) for g in groups}) == 1 and np.array_equal(member, np.arange(member.size))
+    return Grouping(member, start, width, len(groups[0]) if regular else 0)
+
+
+def _consecutive(size: int, n: int, width: int) -> Grouping:
+    """Blocks of `size` components each, in their order; no list of them, for a field has a million."""
+    floats = n * width
+    start = np.arange(0, floats + 1, size * width, dtype=INDEX)
+    return Grouping(np.arange(floats, dtype=INDEX), start, width, size * width if n else 0)
+
+
+def _block_lists(blocks: Any, n: int) -> list[np.ndarray]:
+    try:
+        groups = [np.atleast_1d(np.asarray(b)) for b in blocks]
+    except (TypeError, ValueError):
+        raise ValueError(f"blocks must be an integer or a sequence of index arrays, got {shown(blocks)}.") from None
+    groups = [g for g in groups if g.size]
+    for g in groups:
+        if g.dtype.kind not in "iu" or g.ndim != 1 or g.min() < 0 or g.max() >= n:
+            raise ValueError(f"blocks: {shown(g)} is no array of indices from 0 to {n - 1}.")
+    used = np.concatenate([*groups, np.array([], dtype=int)]).astype(int)
+    if np.unique(used).size != used.size:
+        raise ValueError("blocks: a component stands in two blocks.")
+    return groups + [np.array([i]) for i in np.setdiff1d(np.arange(n), used)]

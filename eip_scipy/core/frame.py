@@ -1,0 +1,80 @@
+"""The frame (C, S): linear invariants that corrections must not touch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from ..engine.kernels import FrameRows
+from .blocks import INDEX
+from .inputs import refuse_units
+
+__all__ = ["frame_rows"]
+
+
+def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
+    """The frame (C, S) as sparse rows of C and of the transpose of S (C S)^-1, over float views.
+
+    Raises
+    ------
+    ValueError
+        When the shapes disagree or C S is singular.
+    """
+    if frame is None:
+        C, M = np.zeros((0, n * width)), np.zeros((0, n * width))
+    else:
+        C, M = _frame_matrices(frame, n, width)
+    starts, index, value = _sparse_rows(np.concatenate([C, M]))
+    k = C.shape[0]
+    weights = _by_bodies(C), _by_bodies(M)
+    bodies = np.array(weights) if weights[0].size and weights[1].size else np.zeros((2, 0, 0))
+    return FrameRows(np.array([starts[: k + 1], starts[k:]]), index, value, np.zeros(k), bodies)
+
+
+def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    refuse_units(frame=frame)
+    try:
+        C, S = (np.atleast_2d(np.asarray(a)) for a in frame)
+    except (TypeError, ValueError):
+        raise ValueError("frame must be a pair (C, S) of matrices of shapes (k, n) and (n, k).") from None
+    k = C.shape[0]
+    if k == 0 or C.shape != (k, n) or S.shape != (n, k) or C.dtype.kind not in "fiuc" or S.dtype.kind not in "fiuc":
+        raise ValueError(f"frame: C has shape {C.shape} and S {S.shape}; expected (k, {n}) and ({n}, k).")
+    if width == 2:
+        C, S = _real_form(C), _real_form(S)
+    elif C.dtype.kind == "c" or S.dtype.kind == "c":
+        raise ValueError("frame: C and S must be real for a real state.")
+    # Rows of C and columns of S in units of their own: only then does the condition number tell singular from scaled.
+    C = C / np.maximum(np.abs(C).max(axis=1, keepdims=True), np.finfo(float).tiny)
+    S = S / np.maximum(np.abs(S).max(axis=0, keepdims=True), np.finfo(float).tiny)
+    product = C @ S
+    if not np.all(np.isfinite(product)) or not np.linalg.cond(product) < 1e12:
+        raise ValueError("frame: C S is singular; S must span shifts that change every row of C y.")
+    return C, np.ascontiguousarray(np.linalg.solve(product.T, S.T))
+
+
+def _real_form(a: np.ndarray) -> np.ndarray:
+    """The matrix that acts on (Re, Im) pairs as `a` does on complex components."""
+    out = np.empty((a.shape[0], 2, a.shape[1], 2))
+    out[:, 0, :, 0] = out[:, 1, :, 1] = a.real
+    out[:, 1, :, 0], out[:, 0, :, 1] = a.imag, -a.imag
+    return out.reshape(2 * a.shape[0], 2 * a.shape[1])
+
+
+def _by_bodies(a: np.ndarray) -> np.ndarray:
+    """Weights (k, b) of b bodies, where `a` (3 k, 3 k b) sums the x, y and z of k groups of them; else none."""
+    groups = a.shape[0] // 3
+    if groups == 0 or a.shape[1] % (3 * groups):
+        return np.zeros((0, 0))
+    weights = np.array([a[3 * k, part] for k, part in enumerate(np.arange(a.shape[1]).reshape(groups, -1)[:, ::3])])
+    return weights if np.array_equal(a, np.kron(block_diag(*weights), np.eye(3))) else np.zeros((0, 0))
+
+
+def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rows = [np.flatnonzero(row) for row in a]
+    start = np.concatenate([[0], np.cumsum([len(r) for r in rows])]).astype(INDEX)
+    index = np.concatenate([*rows, []]).astype(INDEX)
+    value = np.concatenate([*(row[r] for row, r in zip(a, rows, strict=True)), []]).astype(float)
+    return start, index, value

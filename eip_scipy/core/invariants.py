@@ -1,0 +1,605 @@
+"""Invariants, their gradients, and the checks that a run starts with."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..engine.kernels import EPS
+from .inputs import filled, flag, is_number, reals, refuse_units, require_arguments, shown
+
+__all__ = ["Invariant", "InvariantSet", "JointInvariants", "as_invariants", "check_gradient"]
+
+Array = np.ndarray
+FLOAT = np.dtype(float)
+
+# Shorter ones have the last word where the first reaches too far.
+CHECK_STEPS = (6e-6, 6e-8, 6e-10)
+CHECK_TOLERANCE, CHECK_NOISE = 1e-4, 6.0
+INVARIANCE_TOLERANCE = 1e-8
+TARGET_TOLERANCE = 1e-8
+COMPLEX_STEP = 1e-100
+# Central differences of order 6: weights of +-1, +-2, +-3 steps (Fornberg 1988, table 1).
+DIFFERENCE_WEIGHTS = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
+DIFFERENCE_STEP = 5e-3
+
+
+class Invariant:
+    """A conserved quantity of a system, or several at once.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(t, y, *args) -> float or (l_i,)``, real.
+    grad : callable, optional
+        ``grad(t, y, *args) -> (n,) or (l_i, n)``. For complex y, dI = Re sum_k conj(g_k) dy_k. Without it the
+        gradient comes from a complex step where `fun` allows one, else from central differences of order 6 (with a
+        warning; both cost n evaluations of `fun` and more, and neither is compiled).
+    target : float or array_like, shape (l_i,), optional
+        The value to keep. Default: the value at the start. A given target is a condition that the start must meet.
+    args : tuple, optional
+        Further arguments of `fun` and `grad`. (``solve_ivp(args=...)`` reaches only its own functions.)
+    name : str, optional
+        Name in messages and diagnostics.
+    scale : float, optional
+        Size of the terms that cancel in `fun`, in its own unit: defects below four rounding errors of it are left
+        alone. Needed only where neither the value nor ``sum_k |G_k y_k|`` shows that size.
+    in_place : bool, optional
+        ``grad(t, y, out, *args)`` fills ``out``, (n,) for a scalar invariant, else (l_i, n).
+    uses_f : bool, optional
+        ``grad(t, y, f, *args)`` also receives f = fun(t, y) of the system, which the step often has already.
+
+    Notes
+    -----
+    Linear invariants are kept by every Runge-Kutta method; keep the corrections out of them with the option ``frame``
+    rather than list them here.
+
+    Examples
+    --------
+    >>> from eip_scipy import Invariant
+    >>> energy = Invariant(lambda t, y: 0.5 * (y @ y), grad=lambda t, y: y, name="energy")
+    """
+
+    def __init__(
+        self,
+        fun: Callable[..., Any],
+        grad: Callable[..., Any] | None = None,
+        *,
+        target: Any = None,
+        args: Sequence[Any] = (),
+        name: str | None = None,
+        scale: float | None = None,
+        in_place: bool = False,
+        uses_f: bool = False,
+    ) -> None:
+        if not callable(fun):
+            raise TypeError(f"Invariant: fun must be callable, got {fun!r}.")
+        if grad is not None and not callable(grad):
+            raise TypeError(f"Invariant: grad must be callable or None, got {grad!r}.")
+        in_place, uses_f = flag("Invariant: in_place", in_place), flag("Invariant: uses_f", uses_f)
+        if grad is None and (in_place or uses_f):
+            raise ValueError("Invariant: in_place and uses_f describe grad; give grad or leave them out.")
+        refuse_units(target=target, args=args, scale=scale)
+        if scale is not None and not (is_number(scale) and 0 <= scale < np.inf):
+            raise ValueError(f"Invariant: scale must be a finite number >= 0, got {shown(scale)}.")
+        if not isinstance(args, tuple):
+            raise TypeError(
+                f"Invariant: args must be a tuple, got {shown(args)}; write args=(x,) for a single argument."
+            )
+        if name is not None and not isinstance(name, str):
+            raise TypeError(f"Invariant: name must be a string, got {shown(name)}.")
+        self.fun = fun
+        self.grad = grad
+        self.target = None if target is None else _target(target)
+        self.args = args
+        self.name = name
+        self.scale = scale
+        self.in_place = in_place
+        self.uses_f = uses_f
+
+    def __repr__(self) -> str:
+        name = self.name or getattr(self.fun, "__name__", "?")
+        return f"Invariant({name})"
+
+
+class JointInvariants(tuple[Invariant, ...]):
+    """Scalar invariants whose projection takes two passes over the state: for fields, whose gradients fill memory.
+
+    A tuple of `Invariant`, to be given as ``invariants=`` as it is. Interpreted runs with the euclidean metric,
+    ``direction="new"``, one Newton step and no frame call `moments` and `shift` in the place of the invariants'
+    values and gradients; all others, and steps whose gradients are nearly parallel, take those.
+
+    Parameters
+    ----------
+    items : iterable of Invariant
+    moments : callable
+        ``moments(t, y, f, values, gram, terms)`` fills, at the state `y`, the `values` (l,), the lower half of the
+        gradients' Gram matrix `gram` (l, l), Re <G_i, G_j>, and `terms` (l,), the sums of ``|G_ik y_k|`` over the
+        floats of the state. `f`, the derivative there, holds nothing unless an item `uses_f`.
+    shift : callable
+        ``shift(t, y, f, mu, out, values)`` fills `out` with ``y + sum_i mu_i G_i(y)``, and `values` with the
+        invariants there, not finite where `out` is not.
+    """
+
+    moments: Callable[..., None]
+    shift: Callable[..., None]
+
+    def __new__(
+        cls, items: Iterable[Invariant], moments: Callable[..., None], shift: Callable[..., None]
+    ) -> JointInvariants:
+        """The tuple of the items, with both functions."""
+        self = super().__new__(cls, items)
+        self.moments, self.shift = moments, shift
+        return self
+
+
+def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
+    """One Invariant or a sequence of them, as a tuple; `JointInvariants` as they are.
+
+    Raises
+    ------
+    TypeError
+        For anything else.
+    """
+    if isinstance(invariants, Invariant):
+        return (invariants,)
+    if callable(invariants):
+        raise TypeError(f"invariants: got the function {invariants!r}; wrap it: Invariant(fun, grad=...).")
+    try:
+        items = invariants if isinstance(invariants, JointInvariants) else tuple(invariants)
+    except TypeError:
+        raise TypeError(f"invariants: expected an Invariant or a sequence of them, got {invariants!r}.") from None
+    for item in items:
+        if not isinstance(item, Invariant):
+            raise TypeError(
+                f"invariants: expected Invariant objects, got {item!r}; wrap functions: Invariant(fun, grad=...)."
+            )
+    return items
+
+
+def _target(target: Any) -> Array:
+    found = reals(target)
+    if found is None:
+        raise ValueError(f"Invariant: target must be a number or an array of numbers, got {shown(target)}.")
+    return found
+
+
+def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array, extra: tuple) -> Array:
+    """The value at the start, a number or (l_i,), by `fun`, the invariant's own with its arguments."""
+    try:
+        value = fun(t, y.copy())
+    except TypeError:
+        _require_arguments(invariant.fun, f"invariant {label!r}", ("t", "y"), invariant.args, extra)
+        raise
+    value = _value(value, label, t)
+    if value.ndim > 1:
+        raise ValueError(f"invariant {label!r} returned shape {value.shape}; expected a number or one dimension (l,).")
+    return value.astype(float)
+
+
+def _value(value: Any, label: str, t: float, expected: tuple[int, ...] | None = None) -> Array:
+    """What an invariant returned at t, real and of the expected shape."""
+    refuse_units(**{f"invariant {label!r} returned": value})
+    try:
+        found = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        found = np.asarray(None)
+    if found.dtype.kind == "c":
+        raise ValueError(
+            f"invariant {label!r} returned complex values at t={t:g}; expected a real number or a real array (l,)."
+        )
+    if found.dtype.kind not in "fiub":
+        raise TypeError(
+            f"invariant {label!r} returned {shown(value)} at t={t:g}; expected a real number or a real array (l,)."
+        )
+    if expected is not None and found.shape != expected:
+        raise ValueError(f"invariant {label!r} returned shape {found.shape} at t={t:g}, expected {expected}.")
+    return found
+
+
+def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype: np.dtype) -> Array:
+    """What a gradient returned at t, of the expected shape, and real where the state is."""
+    what = f"gradient of invariant {label!r}"
+    refuse_units(**{f"{what} returned": value})
+    try:
+        found = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        found = np.asarray(None)
+    if found.dtype.kind not in "fiubc":
+        raise TypeError(f"{what} returned {shown(value)} at t={t:g}, expected numbers of shape {expected}.")
+    if found.shape != expected:
+        raise ValueError(f"{what} has shape {found.shape}, expected {expected} for this state, at t={t:g}.")
+    if found.dtype.kind == "c" and dtype.kind != "c":
+        raise ValueError(f"{what} is complex, but y0 is real, at t={t:g}.")
+    return found
+
+
+def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple, extra: tuple) -> None:
+    given = (*first, *(f"args[{k}]" for k in range(len(args))), *("params" for _ in extra))
+    mend = "Give what it takes besides by Invariant(..., args=(...,))"
+    mend += ", or take the run's params as its last argument." if extra else "."
+    require_arguments(fun, given, what, mend)
+
+
+class NumericalGradient:
+    """Gradient of an invariant without `grad`: complex step where it is valid, else differences of order 6."""
+
+    def __init__(
+        self, invariant: Invariant, label: str, t: float, y: Array, f: Array, tau: float, extra: tuple
+    ) -> None:
+        self._invariant, self._label = invariant, label
+        self._floor = np.where(np.isfinite(f), np.abs(tau * f), 0.0)
+        self._floor[(self._floor == 0) & (y == 0)] = 1.0
+        self.complex_step = y.dtype.kind == "f" and self._complex_step_is_valid(t, y, extra)
+        if not self.complex_step:
+            warnings.warn(
+                f"invariant {label!r} has no grad and allows no complex step: its gradient comes from central "
+                "differences of order 6 (about 1e-12 relative). Give grad for full accuracy and speed.",
+                UserWarning,
+                stacklevel=2,
+            )
+
+    def __call__(self, t: float, y: Array, *extra: Any) -> Array:
+        if self.complex_step:
+            return self._by_complex_step(t, y, extra)
+        return difference_gradient(lambda x: self._fun(t, x, extra), y, self._floor)
+
+    def _fun(self, t: float, y: Array, extra: tuple) -> Array:
+        return np.asarray(self._invariant.fun(t, y.copy(), *self._invariant.args, *extra))
+
+    def _by_complex_step(self, t: float, y: Array, extra: tuple) -> Array:
+        columns = []
+        for k in range(y.size):
+            shifted = y.astype(complex)
+            shifted[k] += 1j * COMPLEX_STEP
+            columns.append(np.imag(self._fun(t, shifted, extra)) / COMPLEX_STEP)
+        return np.stack(columns, axis=-1)
+
+    def _complex_step_is_valid(self, t: float, y: Array, extra: tuple) -> bool:
+        """Whether `fun` takes complex states and is analytic there: the real part unmoved, differences agree."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)
+                self._by_complex_step(t, y, extra)
+                plain = self._fun(t, y.astype(complex), extra)
+        except (TypeError, ValueError, np.exceptions.ComplexWarning):
+            return False
+        if np.any(np.imag(plain) != 0) or not np.allclose(np.real(plain), self._fun(t, y, extra), rtol=1e-12):
+            return False
+        # Beside y, which may be a point where the derivatives of |y_k| and the like happen to vanish.
+        size = np.abs(y) + self._floor
+        y = y + 0.01 * size * np.random.default_rng(20220).standard_normal(y.size)
+        G = self._by_complex_step(t, y, extra)
+        D = difference_gradient(lambda x: self._fun(t, x, extra), y, self._floor)
+        return bool(np.all(np.abs((G - D) * size) <= 1e-7 * np.max(np.abs(D * size), axis=-1, keepdims=True)))
+
+
+def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -> Array:
+    """Gradient of value(y) by central differences of order 6, steps in units of |y_k| + floor_k."""
+
+    def along(k: int, unit: complex) -> Any:
+        # A power of two: y + step and y - step then differ by the step exactly, but for their own rounding.
+        step = 2.0 ** np.round(np.log2(DIFFERENCE_STEP * (abs(y[k]) + floor[k])))
+        total: Any = 0.0
+        for multiple, weight in DIFFERENCE_WEIGHTS:
+            shift = np.zeros_like(y)
+            shift[k] = multiple * step * unit
+            total = total + weight * (np.asarray(value(y + shift)) - np.asarray(value(y - shift)))
+        return total / step
+
+    columns = [along(k, 1.0) for k in range(y.size)]
+    if y.dtype.kind == "c":
+        columns = [column + 1j * along(k, 1j) for k, column in enumerate(columns)]
+    return np.stack(columns, axis=-1)
+
+
+class Complaint(NamedTuple):
+    """What a check found, about a gradient or about the rate of an invariant."""
+
+    of_gradient: bool
+    text: str
+
+
+def as_it_is(fun: Any, arrays: int) -> Any:
+    """A user's function, called as it is."""
+    return fun
+
+
+def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
+    """``fun`` with its last arguments given; itself where there are none."""
+    return (lambda *first: fun(*first, *arguments)) if arguments else fun
+
+
+class InvariantSet:
+    """All invariants of a run as one: sizes, names, targets, scales, and the functions that the step calls.
+
+    Made at the start state, where values and shapes are checked. `extra` holds the run's `params`, if any; `hand` makes
+    of a user's function, and the number of its arrays that are ours, what is called.
+    """
+
+    def __init__(
+        self, invariants: Any, t0: float, y0: Array, f0: Array, tau: float, extra: tuple = (), hand: Any = as_it_is
+    ) -> None:
+        self.items = as_invariants(invariants)
+        self.extra = extra
+        self.labels = [item.name or f"invariant {k}" for k, item in enumerate(self.items)]
+        functions = [bound(hand(item.fun, 1), item.args + extra) for item in self.items]
+        values = [
+            _first_value(item, fun, label, t0, y0, extra)
+            for item, fun, label in zip(self.items, functions, self.labels, strict=True)
+        ]
+        self.scalar = [value.ndim == 0 for value in values]
+        sizes = [value.size for value in values]
+        self.starts = [0, *np.cumsum(sizes, dtype=int).tolist()]
+        self.size = self.starts[-1]
+        self.start_values = np.concatenate([np.atleast_1d(v) for v in values]) if values else np.zeros(0)
+        self.names = [
+            label if scalar else f"{label}[{j}]"
+            for label, scalar, size in zip(self.labels, self.scalar, sizes, strict=True)
+            for j in range(size)
+        ]
+        self._require_finite(self.start_values, "not finite at y0")
+        self.scales = np.repeat([float(item.scale or 0.0) for item in self.items], sizes)
+        self.uses_f = any(item.uses_f for item in self.items)
+        self.grads = [
+            hand(item.grad, 2 if item.uses_f else 1)
+            if item.grad is not None
+            else NumericalGradient(item, label, t0, y0, f0, tau, extra)
+            for item, label in zip(self.items, self.labels, strict=True)
+        ]
+        self.target = self._targets()
+        self._shape = (self.size, y0.size)
+        places = [
+            start if scalar else slice(start, stop)
+            for start, stop, scalar in zip(self.starts[:-1], self.starts[1:], self.scalar, strict=True)
+        ]
+        self._values = [
+            (fun, label, place, value.shape)
+            for fun, label, place, value in zip(functions, self.labels, places, values, strict=True)
+        ]
+        self._gradients = [
+            (*self._bound_gradient(k), label, place, value.shape + y0.shape)
+            for k, (label, place, value) in enumerate(zip(self.labels, places, values, strict=True))
+        ]
+        self._gradients_at_start(t0, y0, f0)
+
+    def _require_finite(self, values: Array, what: str) -> None:
+        for name, value in zip(self.names, values, strict=True):
+            if not np.isfinite(value):
+                raise ValueError(f"invariant {name!r} is {what}: it returned {value}.")
+
+    def _targets(self) -> Array:
+        target = self.start_values.copy()
+        for k, item in enumerate(self.items):
+            if item.target is None:
+                continue
+            part = target[self.starts[k] : self.starts[k + 1]]
+            if item.target.ndim > 1 or item.target.size not in (1, part.size):
+                raise ValueError(
+                    f"invariant {self.labels[k]!r}: target has shape {item.target.shape}, its value "
+                    f"{part.size} entries."
+                )
+            part[:] = item.target
+            self._require_finite_target(k, part)
+        return target
+
+    def _require_finite_target(self, k: int, part: Array) -> None:
+        if not np.all(np.isfinite(part)):
+            raise ValueError(f"invariant {self.labels[k]!r}: target must be finite, got {part}.")
+
+    def _gradients_at_start(self, t: float, y: Array, f: Array) -> None:
+        """Shapes and finiteness of every gradient, once."""
+        for item, (gradient, takes_f, in_place, label, _, expected) in zip(self.items, self._gradients, strict=True):
+            what = f"gradient of invariant {label!r}"
+
+            def call(*out: Array, gradient: Any = gradient, takes_f: bool = takes_f) -> Any:
+                return gradient(t, y.copy(), f.copy(), *out) if takes_f else gradient(t, y.copy(), *out)
+
+            try:
+                if in_place:
+                    G = filled(call, expected, y.dtype, what, t)
+                else:
+                    G = _gradient(call(), label, t, expected, y.dtype)
+            except TypeError:
+                first = ("t", "y", *(("f",) if takes_f else ()), *(("out",) if in_place else ()))
+                _require_arguments(item.grad or item.fun, what, first, item.args, self.extra)
+                raise
+            if not np.all(np.isfinite(G)):
+                raise ValueError(f"{what} is not finite at y0.")
+
+    def _bound_gradient(self, k: int) -> tuple[Callable[..., Any], bool, bool]:
+        """Gradient k as gradient(t, y), with f behind y if the second is true and `out` at the end if the third is."""
+        item, grad = self.items[k], self.grads[k]
+        arguments = self.extra if item.grad is None else item.args + self.extra
+        return bound(grad, arguments), item.uses_f and item.grad is not None, item.in_place
+
+    def inv(self, t: float, y: Array, values: Array, params: Any = None) -> None:
+        """Fill `values` (l,)."""
+        # A copy for each here and in grad: a user's function may keep or overwrite what it was given.
+        for fun, label, place, expected in self._values:
+            value = fun(t, y.copy())
+            if isinstance(value, float):
+                known = expected == ()
+            else:
+                known = type(value) is np.ndarray and value.dtype is FLOAT and value.shape == expected
+            values[place] = value if known else _value(value, label, t, expected)
+
+    def grad(self, t: float, y: Array, f: Array, G: Array, params: Any = None) -> None:
+        """Fill the gradients `G` (l, n)."""
+        dtype = y.dtype
+        for gradient, takes_f, in_place, label, place, expected in self._gradients:
+            if in_place:
+                out = G[place]
+                out.fill(np.nan)  # shows in the run where the gradient leaves a part of it as it was
+                gradient(t, y.copy(), f.copy(), out) if takes_f else gradient(t, y.copy(), out)
+                continue
+            row = gradient(t, y.copy(), f.copy()) if takes_f else gradient(t, y.copy())
+            if not (type(row) is np.ndarray and row.shape == expected and row.dtype is dtype):
+                row = _gradient(row, label, t, expected, dtype)
+            G[place] = row
+
+    def values(self, t: float, y: Array) -> Array:
+        """All values (l,)."""
+        out = np.empty(self.size)
+        self.inv(t, y, out)
+        return out
+
+    def gradients(self, t: float, y: Array, f: Array) -> Array:
+        """All gradients (l, n)."""
+        out = np.zeros(self._shape, dtype=y.dtype)
+        self.grad(t, y, f, out)
+        return out
+
+    def term_sizes(self, t: float, y: Array, f: Array) -> Array:
+        """Size of the terms in each invariant: max(|I|, |target|, sum_k |G_k y_k|, scale)."""
+        terms = np.sum(np.abs(self.gradients(t, y, f) * y), axis=1)
+        return np.max([np.abs(self.values(t, y)), np.abs(self.target), terms, self.scales], axis=0)
+
+    def start_violation(self, t: float, y: Array, f: Array) -> str | None:
+        """What is wrong with the start, where it misses a given target by more than 1e-8 of its terms."""
+        residual = self.values(t, y) - self.target
+        for name, r, size in zip(self.names, residual, self.term_sizes(t, y, f), strict=True):
+            if not abs(r) <= TARGET_TOLERANCE * size:
+                return f"the start violates invariant {name!r} by {r:.3g}"
+        return None
+
+    def check(self, t: float, y: Array, f: Array, tau: float) -> list[str]:
+        """Compare gradients with differences along two directions, and the invariance with the system.
+
+        Returns
+        -------
+        list of str
+            The texts of the warnings.
+
+        Raises
+        ------
+        ValueError
+            When a gradient disagrees with the difference of its invariant.
+
+        Warns
+        -----
+        UserWarning
+            When an invariant changes along the flow of this system.
+        """
+        found = list(self.complaints(t, y, f, tau))
+        for complaint in found:
+            if complaint.of_gradient:
+                raise ValueError(
+                    f"{complaint.text}. Mend grad, leave it out (it is then computed), or pass check=False to skip "
+                    "this check."
+                )
+            warnings.warn(
+                f"{complaint.text}. Projecting on it gives a wrong solution. (check=False skips this check.)",
+                UserWarning,
+                stacklevel=6,
+            )
+        return [complaint.text for complaint in found]
+
+    def complaints(self, t: float, y: Array, f: Array, tau: float) -> Iterator[Complaint]:
+        """What is wrong with gradients, and which quantities are no invariants, at a state with the derivative f."""
+        if self.size == 0:
+            return
+        rng = np.random.default_rng(20220)
+        # No further than the state moves while it changes by its own size: close to a singularity that is far less
+        # than a step.
+        moving, size = np.max(np.abs(f), initial=0.0), np.max(np.abs(y), initial=0.0)
+        span = np.abs(y) + (min(tau, size / moving) if size > 0 and moving > 0 else tau) * np.abs(f)
+        for _ in range(2):
+            d = rng.standard_normal(y.size) * span
+            if y.dtype.kind == "c":
+                d = d + 1j * rng.standard_normal(y.size) * span
+            found = list(self._wrong_gradients(t, y, f, d))
+            if found:
+                yield from found
+                return
+        yield from self._wrong_rates(t, y, f, tau)
+
+    def _wrong_gradients(self, t: float, y: Array, f: Array, d: Array) -> Iterator[Complaint]:
+        products = np.conj(self.gradients(t, y, f)) * d
+        along, terms = np.real(products).sum(axis=1), np.abs(products).sum(axis=1)
+        wrong = np.ones(self.size, bool)
+        for step in CHECK_STEPS:
+            plus, minus = self.values(t, y + step * d), self.values(t, y - step * d)
+            difference = (plus - minus) / (2 * step)
+            noise = CHECK_NOISE / step * (EPS * np.max([np.abs(plus), np.abs(minus)], axis=0) + 5e-324)
+            agrees = ~(np.abs(difference - along) > CHECK_TOLERANCE * terms + noise)
+            wrong &= ~(agrees & ((step == CHECK_STEPS[0]) | (noise <= CHECK_TOLERANCE * terms)))
+            if not wrong.any():
+                return
+        for k in np.flatnonzero(wrong):
+            yield Complaint(
+                True,
+                f"gradient of invariant {self.names[k]!r} is wrong: along a test direction at t={t:.6g} its derivative "
+                f"is {difference[k]:.6g} by differences and {along[k]:.6g} by grad",
+            )
+
+    def _wrong_rates(self, t: float, y: Array, f: Array, tau: float) -> Iterator[Complaint]:
+        # In units of the largest component of f: large states would overflow otherwise.
+        unit = np.max(np.abs(f), initial=0.0)
+        if 0 < unit < np.finfo(float).tiny / EPS:
+            return
+        unit = unit or 1.0
+        in_time, noise = (rates / unit for rates in self._time_derivative(t, y, f, tau))
+        products = np.conj(self.gradients(t, y, f)) * (f / unit)
+        rate = in_time + np.real(products).sum(axis=1)
+        terms = np.abs(in_time) + np.abs(products).sum(axis=1)
+        for k, name in enumerate(self.names):
+            if abs(rate[k]) > INVARIANCE_TOLERANCE * terms[k] + noise[k]:
+                yield Complaint(
+                    False,
+                    f"{name!r} is no invariant of this system: at t={t:.6g} it changes at the rate "
+                    f"{rate[k] * unit:.3g}, where the terms of that rate sum to {terms[k] * unit:.3g}",
+                )
+
+    def _time_derivative(self, t: float, y: Array, f: Array, tau: float) -> tuple[Array, Array]:
+        """The partial derivative in time, and the rounding in it."""
+        step = float(2.0 ** np.round(np.log2(0.01 * tau))) if tau > 0 else 0.0
+        if step == 0.0 or not abs(step) > 100 * np.spacing(abs(t)):
+            return np.zeros(self.size), np.zeros(self.size)
+        total = np.zeros(self.size)
+        for multiple, weight in DIFFERENCE_WEIGHTS:
+            total += weight * (self.values(t + multiple * step, y) - self.values(t - multiple * step, y))
+        with np.errstate(over="ignore"):
+            rates = np.where(np.isfinite(total), total, 0.0) / step
+            noise = np.where(rates == 0, 0.0, 10 * EPS * self.term_sizes(t, y, f) / step)
+        return rates, noise
+
+
+def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., Any] | None = None) -> float:
+    """Largest relative difference between an invariant's gradient and central differences of order 6.
+
+    Parameters
+    ----------
+    invariant : Invariant
+    t : float
+    y : array_like, shape (n,)
+        Where to compare; real or complex.
+    fun : callable, optional
+        ``fun(t, y)``, the system, needed by an invariant with ``uses_f=True``.
+
+    Returns
+    -------
+    float
+        max over the components k of ``|grad_k - difference_k| s_k / max_j |grad_j| s_j``, with s the sizes of y's
+        components (of the largest one, for components that are 0): about 1e-12 for a right gradient.
+
+    Raises
+    ------
+    ValueError
+        When the gradient has the wrong shape, or `fun` is missing for ``uses_f``.
+    """
+    refuse_units(t=t, y=y)
+    y = np.array(y, dtype=complex if np.iscomplexobj(y) else float)
+    if invariant.uses_f and fun is None:
+        raise ValueError("check_gradient: this invariant's grad uses f; pass fun=.")
+    f = np.asarray(fun(t, y.copy()), dtype=y.dtype) if fun is not None else np.zeros_like(y)
+    size = np.where(y == 0, np.max(np.abs(y), initial=0.0) or 1.0, np.abs(y))
+    G = InvariantSet(invariant, t, y, f, 0.0).gradients(t, y, f)
+    floor = np.where(y == 0, size, 0.0)
+    D = np.atleast_2d(difference_gradient(lambda x: invariant.fun(t, x, *invariant.args), y, floor))
+    largest = np.max(np.abs(G) * size, axis=1, keepdims=True)
+    largest[largest == 0] = 1.0
+    return float(np.max(np.abs(G - D) * size / largest))

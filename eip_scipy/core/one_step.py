@@ -1,0 +1,187 @@
+"""One-step methods of a user's own in the place of the Runge-Kutta step: their protocol, and the raw step by them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from ..engine import kernels as kn
+from ..engine.kernels import NOT_FINITE, OK
+from ..engine.step import OLD, Options, Work, is_sampled
+from .inputs import refuse_units, shown
+from .results import HAVE_ERROR, HAVE_F, NFEV
+
+__all__ = ["OneStep", "OneStepMethod", "as_vector"]
+
+NUMBERS = (float, np.float64, int, complex, np.complex128)
+
+
+@runtime_checkable
+class OneStepMethod(Protocol):
+    """A one-step method: what `eip_method` takes besides a tableau.
+
+    Any object with these members will do; nothing is inherited.
+
+    Attributes
+    ----------
+    order : int
+        Order p: the error of one step is O(h^(p + 1)).
+    error_estimator_order : int, optional
+        Order of the second result whose difference from the first is the error estimate. Only where `one_step`
+        returns an estimate; without one the step is fixed and the default metric euclidean.
+    name : str, optional
+        Default: the name of the object's class.
+    """
+
+    order: int
+
+    def one_step(self, t: float, y: np.ndarray, h: float) -> Any:
+        """One step from (t, y) to t + h.
+
+        Parameters
+        ----------
+        t : float
+        y : ndarray, shape (n,)
+            A copy for this call: it may be overwritten and returned.
+        h : float
+            Negative in backward runs; shorter than usual in the last step, and after a step that was rejected.
+
+        Returns
+        -------
+        y_hat : ndarray, shape (n,)
+            With `error_estimator_order` the pair ``(y_hat, err)``, the estimate of shape (n,). Both must depend on
+            the arguments only, not on the calls before.
+        """
+        ...  # pragma: no cover
+
+
+class OneStep:
+    """A user's one-step method, checked, in the roles of a tableau and of its arrays.
+
+    Parameters
+    ----------
+    method : OneStepMethod
+
+    Attributes
+    ----------
+    name, order, error_estimator_order
+        Of the method; the last is None without an estimate.
+    b, c, exponent
+        Those of a method of one stage, the derivative at the start, and the exponent of the step control.
+
+    Raises
+    ------
+    TypeError
+        When the object is no `OneStepMethod`.
+    ValueError
+        When an order is no integer >= 1.
+
+    Notes
+    -----
+    f is evaluated only where a gradient takes it: the steps themselves do not.
+    """
+
+    def __init__(self, method: OneStepMethod) -> None:
+        if not isinstance(method, OneStepMethod) or isinstance(method, type) or not callable(method.one_step):
+            raise TypeError(
+                f"expected a Tableau, a NystromTableau or an object with one_step(t, y, h) and order, got {method!r}."
+            )
+        self.name = str(getattr(method, "name", type(method).__name__))
+        self.order = _order(self.name, "order", method.order)
+        estimate = getattr(method, "error_estimator_order", None)
+        self.error_estimator_order = None if estimate is None else _order(self.name, "error_estimator_order", estimate)
+        self._one_step: Callable[[float, np.ndarray, float], Any] = method.one_step
+        self.b, self.c = np.ones(1), np.zeros(1)
+        self.exponent = -1.0 / ((self.error_estimator_order or 0) + 1)
+
+    @property
+    def has_estimate(self) -> bool:
+        """Whether the method returns an error estimate."""
+        return self.error_estimator_order is not None
+
+    @property
+    def kappa(self) -> float:
+        """Exponent of the error metric, (p + 1) / (p_hat + 1); 1 without an estimate."""
+        if self.error_estimator_order is None:
+            return 1.0
+        return (self.order + 1) / (self.error_estimator_order + 1)
+
+    def __repr__(self) -> str:
+        return f"<OneStep {self.name}: order {self.order}>"
+
+    def raw_step(
+        self, rhs: Any, params: Any, t: float, y: np.ndarray, y_r: np.ndarray, t_new: float, h: float, project: bool,
+        o: Options, w: Work,
+    ) -> int:  # fmt: skip
+        """What `raw_step` of a tableau does."""
+        result = self._one_step(t, y.copy(), h)
+        if self.has_estimate:
+            result, estimate = self._pair(result)
+            w.err[:] = self._vector(estimate, "an estimate", t, y).view(float)
+        w.y_hat[:] = self._vector(result, "a state", t, y)
+        if not kn.all_finite(w.y_hat_r):
+            return NOT_FINITE
+        if project and o.uses_f:
+            if o.direction == OLD:
+                rhs(t, y, w.K[0], params)
+                w.counters[NFEV] += 1
+            rhs(t_new, w.y_hat, w.K[-1], params)
+            w.counters[NFEV] += 1
+        w.counters[HAVE_F] = 1  # as far as anyone asks for it: the next step does not
+        w.counters[HAVE_ERROR] = self.has_estimate
+        if project and not self.has_estimate and is_sampled(o, w):
+            rhs(t, y, w.f_point, params)
+            rhs(t_new, w.y_hat, w.stage, params)
+            kn.trapezoid_error(y_r, w.y_hat_r, h, w.f_point.view(float), w.stage_r, w.err)
+            w.counters[HAVE_ERROR] = 1
+        if o.adaptive:
+            w.norm[0] = kn.error_norm(w.err, y_r, w.y_hat_r, o.rtol, o.atol, o.groups.width)
+        return OK
+
+    def _pair(self, result: Any) -> tuple[Any, Any]:
+        if not isinstance(result, tuple) or len(result) != 2:
+            raise TypeError(
+                f"{self.name}.one_step returned {type(result).__name__}, expected the pair (y_hat, err): "
+                f"it has error_estimator_order."
+            )
+        return result
+
+    def _vector(self, value: Any, what: str, t: float, y: np.ndarray) -> np.ndarray:
+        vector = as_vector(value, y.size, y.dtype, f"{self.name}.one_step returned {what}:", t)
+        return np.ascontiguousarray(vector, dtype=y.dtype)
+
+
+def _order(name: str, what: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"{name}: {what} must be an integer >= 1, got {value!r}.")
+    return int(value)
+
+
+def as_vector(value: Any, n: int, dtype: np.dtype, came: str, t: float) -> np.ndarray:
+    """What a user's function returned at t as an array (n,), or an error that says what `came`.
+
+    Raises
+    ------
+    TypeError
+        For None, values that are no numbers, and numbers with a unit.
+    ValueError
+        For a wrong shape, or complex values where the state is real.
+    """
+    if value is None:
+        raise TypeError(f"{came} None, expected {n} numbers, at t={t:.10g} (does it end without a return?).")
+    # Of a list the first item tells: a look at all of them, at every stage, would take longer than the function.
+    if not (type(value) in (list, tuple) and value and type(value[0]) in NUMBERS):
+        refuse_units(**{came.removesuffix(":"): value})
+    try:
+        a = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        raise ValueError(f"{came} {shown(value)}, expected {n} numbers, at t={t:.10g}.") from None
+    if a.dtype.kind not in "fiubc":
+        raise TypeError(f"{came} {shown(value)}, expected {n} numbers, at t={t:.10g}.")
+    if a.shape != (n,):
+        raise ValueError(f"{came} shape {a.shape}, expected ({n},), at t={t:.10g}.")
+    if a.dtype.kind == "c" and dtype.kind != "c":
+        raise ValueError(f"{came} complex values at t={t:.10g}, but y0 is real; pass y0.astype(complex).")
+    return a

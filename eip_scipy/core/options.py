@@ -1,0 +1,305 @@
+"""The options of the projection, in one place: names, defaults, documentation, checks, and what identifies a run.
+
+Whatever projects takes them as `ProjectionOptions` or as its keywords. A new option is a field here, a keyword, and,
+where the step is to know it, a field of the engine's `Options`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import textwrap
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple, TypedDict, TypeVar
+
+import numpy as np
+
+from ..engine.kernels import BAND, BAND_COMPENSATED, EPS
+from ..engine.step import AUTO, ERROR, EUCLIDEAN, GIVEN, MIDPOINT, NEW, OLD, Options
+from ..engine.trust import LARGE_SHARE
+from .blocks import blocks_of
+from .frame import frame_rows
+from .inputs import count, flag, real_array
+from .invariants import InvariantSet, JointInvariants
+from .one_step import OneStep
+from .stepping import AnyMethod, Stepping
+
+__all__ = ["ProjectionKeywords", "ProjectionOptions", "Settled", "takes_projection_options", "weights"]
+
+DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
+MOST_ITERATIONS = 1000
+WIDTH = 120
+# In docstrings: these lines become the options with their texts, or their names.
+WHOLE, NAMES = "{ProjectionOptions}", "{names of ProjectionOptions}"
+
+Documented = TypeVar("Documented", bound=Any)
+
+
+class ProjectionKeywords(TypedDict, total=False):
+    """The names of `ProjectionOptions` as keywords, for type checkers."""
+
+    invariants: Any
+    metric: Any
+    blocks: Any
+    frame: Any
+    direction: str
+    iterations: int
+    every: int | str | None
+    reuse_f: bool
+    compensated: bool | None
+    check: bool
+    project_initial: bool
+
+
+def _text(kind: str, text: str) -> dict[str, str]:
+    """An option's kind of value, and what it is, for docstrings."""
+    return {"kind": kind, "text": " ".join(text.split())}
+
+
+class Settled(NamedTuple):
+    """Options checked for one run: as the step takes them, weights given for the metric, and what identifies the run.
+
+    `identity` holds each option that decides bits, under its name, as the run came to take it.
+    """
+
+    options: Options
+    sigma: np.ndarray | None
+    identity: dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectionOptions:
+    """The options of the projection as a user gives them; checked where a run is known (`settled`)."""
+
+    invariants: Any = field(default=(), metadata=_text("Invariant or sequence of Invariant", "What to keep."))
+    metric: Any = field(
+        default=None,
+        metadata=_text(
+            '{"error", "euclidean"} or array_like, shape (n,)',
+            """Weights of the correction's components. "error" (default where the method has an error estimate) makes
+            the least correction measured in local errors of the step; "euclidean" is the least correction in the
+            plain 2-norm; an array gives the weights themselves (larger: moves more).""",
+        ),
+    )
+    blocks: Any = field(
+        default=None,
+        metadata=_text(
+            "int or sequence of index arrays",
+            """Components that the error metric weighs together: consecutive groups of that many, or index arrays.
+            Bodies' positions and velocities in 3 dimensions: ``blocks=3``. Default: each component by itself.""",
+        ),
+    )
+    frame: Any = field(
+        default=None,
+        metadata=_text(
+            "(C, S)",
+            """Linear invariants C y, with C of shape (k, n), that corrections must not touch, and the shifts S, (n, k),
+            that compensate for it; C S must be invertible.""",
+        ),
+    )
+    direction: str = field(
+        default="new",
+        metadata=_text(
+            '{"new", "old", "midpoint"}',
+            """Where the gradients that span the correction are taken: at the step's raw result (default), at its start
+            or in the middle.""",
+        ),
+    )
+    iterations: int = field(
+        default=1,
+        metadata=_text(
+            "int", "Newton steps of the projection. 1 (default) is the EIP method; more is the standard projection."
+        ),
+    )
+    every: int | str | None = field(
+        default=None,
+        metadata=_text(
+            'int or "auto"',
+            """Project each `every`-th step and the last one; "auto": when the error estimates, added in quadrature
+            since the last projection, make an invariant more uncertain than round-off (asked at each fifth step).
+            Default: the method's own, which is 1.""",
+        ),
+    )
+    reuse_f: bool = field(
+        default=True,
+        metadata=_text(
+            "bool",
+            "Where the step evaluates f at its raw result anyway, let it serve as the next step's first stage.",
+        ),
+    )
+    compensated: bool | None = field(
+        default=None,
+        metadata=_text(
+            "bool",
+            """Carry the rounding errors of the state along (for steps so small that round-off dominates). Default: the
+            method's own, which is False.""",
+        ),
+    )
+    check: bool = field(
+        default=True,
+        metadata=_text(
+            "bool",
+            """Check the invariants and their gradients at the start and again after some steps, watch whether the
+            corrections are those of the steps' errors, and fail where a projection leaves a defect as large as its
+            invariant's terms. False: none of these.""",
+        ),
+    )
+    project_initial: bool = field(
+        default=False, metadata=_text("bool", "Project y0 onto given targets before the first step.")
+    )
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """The names of the options."""
+        return tuple(option.name for option in fields(cls))
+
+    @classmethod
+    def of(cls, keywords: Mapping[str, Any]) -> tuple[ProjectionOptions, dict[str, Any]]:
+        """The options among some keywords, and the keywords that are none."""
+        own = {name: value for name, value in keywords.items() if name in cls.names()}
+        return cls(**own), {name: value for name, value in keywords.items() if name not in own}
+
+    def settled(self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, known: InvariantSet) -> Settled:
+        """The options checked for a run of the `known` invariants.
+
+        Raises
+        ------
+        TypeError, ValueError
+            For wrong values, and what the method cannot do.
+        """
+        n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
+        kind, sigma = self._metric(method, n, width)
+        if not isinstance(self.direction, str) or self.direction not in DIRECTIONS:
+            raise ValueError(f"direction must be 'new', 'old' or 'midpoint', got {self.direction!r}.")
+        compensated = self._compensated(method)
+        rtol, atol = stepping.rtol, stepping.atol
+        groups = blocks_of(self.blocks, n, width)
+        squares = np.repeat(atol, width)[groups.member] ** 2 / width
+        check = flag("check", self.check)
+        options = Options(
+            rtol=np.repeat(rtol, width),
+            atol=atol,
+            block_atol=np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp))),
+            groups=groups,
+            frame=frame_rows(self.frame, n, width),
+            target=known.target,
+            scales=known.scales,
+            kappa=method.kappa,
+            metric=kind,
+            direction=DIRECTIONS[self.direction],
+            iterations=count("iterations", self.iterations, MOST_ITERATIONS),
+            every=self._every(method),
+            # The steps of a one-step method do not take f: there is nothing to evaluate in the place of f(y_hat).
+            reuse_f=flag("reuse_f", self.reuse_f) or isinstance(method, OneStep),
+            uses_f=known.uses_f,
+            compensated=compensated,
+            adaptive=stepping.h is None,
+            per_band=1.0 / ((BAND_COMPENSATED if compensated else BAND) * EPS),
+            watched=check and known.size > 0,
+            limit=(LARGE_SHARE if stepping.h is None else 1.0) if check else np.inf,
+        )
+        if _can_project_jointly(options, known):
+            options = options._replace(joint=known.items)
+        flag("project_initial", self.project_initial)
+        return Settled(options, sigma, self._identity(options, sigma, y0, known))
+
+    def _identity(self, o: Options, sigma: np.ndarray | None, y0: np.ndarray, known: InvariantSet) -> dict[str, Any]:
+        return {
+            "rtol": o.rtol,
+            "atol": o.atol,
+            "invariants": [
+                (label, item.target, item.scale) for label, item in zip(known.labels, known.items, strict=True)
+            ],
+            "metric": {EUCLIDEAN: "euclidean", ERROR: "error"}.get(o.metric, sigma),
+            "blocks": (o.groups.start, o.groups.member),
+            # As it was given: what `o` holds comes from LAPACK, whose last bits differ from machine to machine.
+            "frame": None if self.frame is None else [np.asarray(a, y0.dtype) for a in self.frame],
+            "direction": self.direction,
+            "iterations": o.iterations,
+            "every": "auto" if o.every == AUTO else o.every,
+            "reuse_f": o.reuse_f,
+            "uses_f": o.uses_f,
+            "project_initial": bool(self.project_initial),
+            "compensated": o.compensated,
+        }
+
+    def _compensated(self, method: AnyMethod) -> bool:
+        if self.compensated is None:
+            return False
+        compensated = flag("compensated", self.compensated)
+        if compensated and isinstance(method, OneStep):
+            raise ValueError(f"compensated=True carries the rounding of a tableau's sums; {method.name} is no tableau.")
+        return compensated
+
+    def _every(self, method: AnyMethod) -> int:
+        if self.every is None:
+            return 1
+        if not isinstance(self.every, str):
+            return count("every", self.every)
+        if self.every != "auto":
+            raise ValueError(f"every must be an integer >= 1 or 'auto', got {self.every!r}.")
+        if not method.has_estimate:
+            raise ValueError(f"every='auto' needs an error estimate, and {method.name} has none; give an integer.")
+        return AUTO
+
+    def _metric(self, method: AnyMethod, n: int, width: int) -> tuple[int, np.ndarray | None]:
+        metric = self.metric
+        if metric is None:
+            return (ERROR if method.has_estimate else EUCLIDEAN), None
+        if isinstance(metric, str):
+            if metric == "euclidean":
+                return EUCLIDEAN, None
+            if metric == "error":
+                return (ERROR if method.has_estimate else EUCLIDEAN), None
+            raise ValueError(f"metric must be 'error', 'euclidean' or an array of n weights, got {metric!r}.")
+        return GIVEN, np.repeat(weights("metric", metric, n), width)
+
+
+def weights(name: str, sigma: Any, n: int) -> np.ndarray:
+    """Weights of n components, the largest 1.
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape, or weights that are not finite, negative or all 0.
+    """
+    a = real_array(name, sigma)
+    if a.shape != (n,):
+        raise ValueError(f"{name}: weights have shape {a.shape}, the state has {n} components.")
+    if not np.all(np.isfinite(a)) or np.any(a < 0) or not np.any(a > 0):
+        raise ValueError(f"{name}: weights must be finite, >= 0 and not all 0.")
+    return a / a.max()
+
+
+def _can_project_jointly(options: Options, known: InvariantSet) -> bool:
+    """Whether the step is the one that `JointInvariants` take a shorter way to."""
+    plain = (options.metric, options.direction, options.iterations) == (EUCLIDEAN, NEW, 1)
+    free = options.frame.products.size == 0 and options.every != AUTO and not options.compensated
+    return isinstance(known.items, JointInvariants) and plain and free
+
+
+def takes_projection_options(documented: Documented) -> Documented:
+    """Put the options into the signature and the docstring of a function, or a class, that takes them as keywords."""
+    function: Any = vars(documented)["__init__"] if isinstance(documented, type) else documented
+    signature = inspect.signature(function)
+    *own, rest = signature.parameters.values()
+    options = [
+        inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=option.default, annotation=option.type)
+        for option in fields(ProjectionOptions)
+    ]
+    others = [rest] if isinstance(documented, type) else []  # solvers take and ignore what other solvers know
+    function.__signature__ = signature.replace(parameters=[*own, *options, *others])
+    if documented.__doc__:  # python -OO leaves none
+        text = documented.__doc__.replace(NAMES, ", ".join(ProjectionOptions.names()))
+        documented.__doc__ = text.replace(f"    {WHOLE}", _documentation())
+    return documented
+
+
+def _documentation() -> str:
+    lines = []
+    for option in fields(ProjectionOptions):
+        lines.append(f"    {option.name} : {option.metadata['kind']}, optional")
+        lines += textwrap.wrap(
+            option.metadata["text"], WIDTH, initial_indent=" " * 8, subsequent_indent=" " * 8, break_long_words=False
+        )
+    return "\n".join(lines)

@@ -1,0 +1,155 @@
+"""`project`: the projection by itself, without a solver."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ..engine.kernels import BAND, EPS
+from ..engine.step import Span, make_work, project_step
+from ..engine.trust import LARGE_SHARE, ProjectionWarning
+from ..methods.runge_kutta import RK1
+from . import setup
+from .inputs import count, is_number, reals, refuse_units, shown
+from .invariants import InvariantSet
+from .one_step import as_vector
+from .options import MOST_ITERATIONS, ProjectionOptions, weights
+from .results import LAST_RANK, ProjectionResult
+from .stepping import Stepping
+
+__all__ = ["project"]
+
+
+def project(
+    y_hat: Any,
+    invariants: Any,
+    *,
+    t: float = 0.0,
+    sigma: Any = None,
+    frame: Any = None,
+    iterations: int = 1,
+    target: Any = None,
+    f: Any = None,
+) -> ProjectionResult:
+    """Project a state onto the targets of invariants.
+
+    Parameters
+    ----------
+    y_hat : array_like, shape (n,)
+        The state, real or complex.
+    invariants : Invariant or sequence of Invariant
+    t : float, optional
+        Time at which the invariants are taken.
+    sigma : array_like, shape (n,), optional
+        Weights of the components: those of larger weight move more. Default: all 1, the euclidean metric.
+    frame : (C, S), optional
+        Linear invariants C y that the correction must not touch; see `EIPSolver`.
+    iterations : int, optional
+        Newton steps. 1 leaves defects of the second order of those of y_hat.
+    target : array_like, shape (l,), optional
+        Values to meet. Default: each invariant's own `target`.
+    f : array_like, shape (n,), or callable, optional
+        The system's derivative at y_hat, or ``f(t, y)``, for invariants with ``uses_f=True``; a callable where
+        `iterations` is above 1.
+
+    Returns
+    -------
+    ProjectionResult
+        ``y`` (n,), ``defect`` (l,) = I(y) - target, ``rank``, ``correction`` (n,).
+
+    Raises
+    ------
+    ValueError
+        When an invariant has no target, an argument has a wrong shape or value, or the projection fails: a defect that
+        is not finite, or larger after it than before.
+
+    Warns
+    -----
+    ProjectionWarning
+        When a defect of more than a hundredth of an invariant's terms is left.
+
+    Notes
+    -----
+    The correction is y - y_hat = sigma * x (made neutral to the frame) with x of least 2-norm such that
+    (G sigma) x = -(I(y_hat) - target), G the gradients at y_hat; by column-pivoted QR, so that dependent gradients
+    lower the rank instead of failing. Defects within four rounding errors of an invariant's terms are left alone.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import Invariant, project
+    >>> length = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=1.0)
+    >>> project(np.array([0.6, 0.81]), length, iterations=3).defect
+    array([0.])
+    """
+    refuse_units(t=t, sigma=sigma, f=f)
+    if not is_number(t) or not math.isfinite(t):
+        raise ValueError(f"project: t must be a finite number, got {shown(t)}.")
+    t, y = float(t), setup.initial_state(y_hat, "y_hat")
+    n = y.size
+    derivative = _derivative(f, t, y)
+    f_hat = derivative(t, y)
+    known = InvariantSet(invariants, t, y, f_hat, 0.0)
+    if known.uses_f and f is None:
+        raise ValueError("project: a gradient uses f; pass f=, the derivative at y_hat or a function f(t, y).")
+    iterations = count("iterations", iterations, MOST_ITERATIONS)
+    if known.uses_f and iterations > 1 and not callable(f):
+        raise ValueError(
+            "project: a gradient uses f at each Newton step; with iterations > 1 pass f as a function f(t, y)."
+        )
+    given = ProjectionOptions(
+        metric="euclidean" if sigma is None else weights("sigma", sigma, n),
+        frame=frame,
+        iterations=iterations,
+        check=False,
+    )
+    nowhere = Stepping(Span(t, 0.0, t, 1.0, 0, np.inf), 0.0, None, np.zeros(n), np.zeros(n))
+    options, weight, _ = given.settled(RK1, nowhere, y, known)
+    options = options._replace(target=_targets(known, target))
+    work = make_work(n, y.dtype, 0, known.size, n)
+    if weight is not None:
+        work.sigma[:] = weight
+    work.y_hat[:], work.K[-1] = y, f_hat
+    out = np.empty_like(y)
+
+    def rhs(time: float, state: np.ndarray, f_out: np.ndarray, params: Any) -> None:
+        f_out[:] = derivative(time, state)
+
+    status = project_step(
+        rhs, known.inv, known.grad, None, t, y, y.view(float), t, True, options, work, out, out.view(float)
+    )
+    if status != 0:
+        raise ValueError(setup.projection_failure(known, work, t))
+    left = np.abs(work.defect) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)
+    for k in np.flatnonzero(left > LARGE_SHARE):
+        warnings.warn(
+            f"the projection left {known.names[k]!r} off by {work.defect[k]:.3g}, {left[k]:.2g} of its own terms: the "
+            "state was far from the target, or the gradient is wrong; raise iterations, or mend grad",
+            ProjectionWarning,
+            stacklevel=2,
+        )
+    return ProjectionResult(out, work.defect.copy(), int(work.counters[LAST_RANK]), out - y)
+
+
+def _derivative(f: Any, t: float, y: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
+    if callable(f):
+        return lambda t, state: setup.as_derivative(f(t, state.copy()), y.size, y.dtype, t)
+    fixed = np.zeros_like(y) if f is None else as_vector(f, y.size, y.dtype, "project: f has", t)
+    return lambda t, state: fixed
+
+
+def _targets(known: InvariantSet, target: Any) -> np.ndarray:
+    if target is not None:
+        refuse_units(target=target)
+        values = reals(target)
+        if values is None or values.size != known.size or values.ndim > 1 or not np.isfinite(values).all():
+            raise ValueError(f"project: target must be {known.size} finite numbers, got {shown(target)}.")
+        return values.reshape(-1)
+    for item, label in zip(known.items, known.labels, strict=True):
+        if item.target is None:
+            raise ValueError(f"project: invariant {label!r} has no target; give it one, or pass target=.")
+    return known.target

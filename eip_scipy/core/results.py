@@ -1,0 +1,196 @@
+"""Records that a run fills: diagnostics, the result of `integrate`, the result of `project`."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import OptimizeResult
+
+from ..engine.trust import N_FIGURES, ProjectionWarning, Trust
+
+__all__ = ["Diagnostics", "IntegrationResult", "ProjectionResult", "ProjectionWarning"]
+
+# Places of the counters that the step fills (see engine/step.py, which takes them from here).
+NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED = range(10)
+# Whether an estimate of the step's error is at hand, projections begun without one, steps since the last projection,
+# and what stood out in them.
+HAVE_ERROR, BEGUN, WAITED, FOUND = range(10, 14)
+N_COUNTERS = 14
+
+
+class Diagnostics:
+    """What the projection did in a run; pass an empty one as ``diagnostics=`` and read it during or after the run.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the l invariants, in order.
+    max_defect, last_defect : ndarray, shape (l,)
+        Largest and last ``|I - target|`` after a projection, in each invariant's own unit.
+    n_projections, n_skipped : int
+        Projections done, and those left out because every defect was round-off.
+    n_rank_reduced : int
+        Projections in which gradients were (nearly) dependent or zero and fewer corrections were made.
+    n_softened : int
+        Projections in which the error metric was not believed and its weights were brought nearer to one another,
+        because the correction would have been far larger than any error of the step or would have failed.
+    n_rejected_projections : int
+        Projections that failed.
+    max_correction : float
+        Largest correction in units of the step's local error: at most about 5 when all is well; nan where the run
+        has no error estimate (the euclidean metric at fixed steps). Where round-off exceeds the local errors, as in
+        compensated runs, it may be thousands and mean nothing; `worst` counts round-off too.
+    trusted : bool
+        Whether no step has failed, no check of the invariants has found anything, and all corrections are those of the
+        steps' errors. It says nothing about accuracy.
+    message : str
+        Why the run is not to be trusted; "" where nothing speaks against it.
+    worst : (str, float, float) or None
+        Invariant, time and size of the largest correction, in local errors (rounding counts as one): below 5 in most
+        healthy runs. None where none was measured.
+    """
+
+    def __init__(self) -> None:
+        none, trust = np.zeros(0), Trust((), np.zeros((0, N_FIGURES)))
+        self._attach(none, none, np.zeros(1), np.zeros(N_COUNTERS, np.int64), trust, estimated=False)
+
+    def _attach(
+        self,
+        max_defect: np.ndarray,
+        last_defect: np.ndarray,
+        max_correction: np.ndarray,
+        counters: np.ndarray,
+        trust: Trust,
+        *,
+        estimated: bool,
+    ) -> None:
+        """Take the buffers of a run, so that reading costs the run nothing."""
+        self.names = trust.names
+        self._trust = trust
+        self.max_defect = max_defect
+        self._defect = last_defect
+        self._max_correction = max_correction
+        self._counters = counters
+        self._estimated = estimated
+
+    @property
+    def last_defect(self) -> np.ndarray:
+        """Last ``|I - target|``, (l,)."""
+        return np.abs(self._defect)
+
+    @property
+    def n_projections(self) -> int:
+        """Projections done."""
+        return int(self._counters[PROJECTIONS])
+
+    @property
+    def n_skipped(self) -> int:
+        """Projections left out as round-off."""
+        return int(self._counters[SKIPPED])
+
+    @property
+    def n_rank_reduced(self) -> int:
+        """Projections of reduced rank."""
+        return int(self._counters[RANK_REDUCED])
+
+    @property
+    def n_softened(self) -> int:
+        """Projections with weights nearer to one another than the error metric's."""
+        return int(self._counters[SOFTENED])
+
+    @property
+    def n_rejected_projections(self) -> int:
+        """Projections that failed."""
+        return int(self._counters[REJECTED])
+
+    @property
+    def max_correction(self) -> float:
+        """Largest correction in local errors."""
+        return float(self._max_correction[0]) if self._estimated else float("nan")
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing speaks against the run."""
+        return self._trust.trusted
+
+    @property
+    def message(self) -> str:
+        """What speaks against the run."""
+        return self._trust.message
+
+    @property
+    def worst(self) -> tuple[str, float, float] | None:
+        """Invariant, time and size in local errors of the largest correction."""
+        return self._trust.worst
+
+    def __repr__(self) -> str:
+        if not self.names:
+            return "Diagnostics: no invariants"
+        lines = [
+            f"Diagnostics: {self.n_projections} projections ({self.n_rank_reduced} of reduced rank, {self.n_softened} "
+            f"softened), {self.n_skipped} skipped (round-off), {self.n_rejected_projections} rejected",
+        ]
+        width = max(len(name) for name in self.names)
+        for name, largest, last in zip(self.names, self.max_defect, self.last_defect, strict=True):
+            lines.append(f"  {name:<{width}}  max defect {largest:.2e}, last {last:.2e}")
+        if self._estimated:
+            lines.append(f"  largest correction: {self.max_correction:.3g} local errors")
+        if self.message:
+            lines.append(f"  {self.message}")
+        return "\n".join(lines)
+
+
+class IntegrationResult(OptimizeResult):
+    """Result of `integrate`; fields by name or by key, as in SciPy's own results.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+        Saved times.
+    y : ndarray, shape (n, m)
+        Saved states.
+    invariants : ndarray, shape (l, m)
+        Values of the invariants there.
+    max_defect : ndarray, shape (l,)
+        Largest ``|I - target|`` after a projection or at a saved step.
+    diagnostics : Diagnostics
+    t_events, y_events : list of ndarray or None
+        As in `scipy.integrate.solve_ivp`.
+    nfev, njev, nlu : int
+        Evaluations of the right-hand side and of the invariants' gradients, and factorisations.
+    status : int
+        0: the end was reached; 1: a callback or an event stopped the run; -1: a step failed.
+    message : str
+    success : bool
+        ``status >= 0``.
+    trusted : bool
+        Whether, besides, nothing speaks against the run; if not, `message` says what. See `Diagnostics`.
+    wall_time : float
+        Seconds in the integration, compilation left out.
+    compiled : bool
+        Whether the run was compiled; if not, `message` says why.
+    method : str
+    h : float or None
+    """
+
+
+class ProjectionResult(NamedTuple):
+    """Result of `project`.
+
+    Attributes
+    ----------
+    y : ndarray, shape (n,)
+        The projected state.
+    defect : ndarray, shape (l,)
+        I(y) - target.
+    rank : int
+        Rank that the gradients had (l when all invariants were independent; 0 when nothing was to be done).
+    correction : ndarray, shape (n,)
+        y - y_hat.
+    """
+
+    y: Any
+    defect: np.ndarray
+    rank: int
+    correction: Any

@@ -1,0 +1,359 @@
+"""From a user's options to what the step needs: validation, in one place for `solve_ivp` and `integrate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.integrate import OdeSolver
+
+from ..engine import kernels as kn
+from ..engine.kernels import NOT_FINITE
+from ..engine.step import ERROR, EUCLIDEAN, NEW, T_NEW, TOO_SMALL, H, Method, Options, T, Work, make_work, project_step
+from ..engine.trust import Trust
+from ..methods.nystrom import NystromTableau
+from .inputs import reals, refuse_units, shown
+from .invariants import InvariantSet, as_it_is
+from .one_step import OneStep, as_vector
+from .options import ProjectionOptions
+from .results import LAST_RANK, Diagnostics
+from .stepping import AnyMethod, Stepping
+
+__all__ = ["Run", "Start", "as_derivative", "prepare"]
+
+START_ITERATIONS = 50
+# Steps after which the invariants are checked once more.
+LOOKS = (10, 100)
+
+
+class Start(NamedTuple):
+    """Where a run starts: time, state, derivative there, and the scale of time, which is the step or the first one."""
+
+    t: float
+    y: np.ndarray
+    f: np.ndarray
+    tau: float
+
+
+@dataclass
+class Run:
+    """All that a driver needs besides the user's functions; `in_place` says what the right-hand side is."""
+
+    y0: np.ndarray
+    method: Method | OneStep
+    options: Options
+    work: Work
+    invariants: InvariantSet
+    identity: dict[str, Any]  # see `Settled`
+    trust: Trust
+    tau: float
+    in_place: bool = False
+    looked: int = -1
+
+    def look(self, steps: int, ended: bool, t: float, y: np.ndarray, derivative: Callable[[], np.ndarray]) -> bool:
+        """Look at a run after so many steps, or where it ends: whether something speaks against it, to be said now.
+
+        The invariants are checked at LOOKS (a run that ends before them: there), as their rates and gradients may
+        vanish at the start, and where the corrections are too large, to tell why.
+        """
+        if not self.options.watched:
+            return False
+        early = steps != self.looked and (steps in LOOKS or (ended and steps < LOOKS[0]))
+        doubtful = self.trust.beyond_doubt or (ended and bool(self.trust.sick.any()))
+        found: list[str] = []
+        if (early or doubtful) and not self.trust.doubts:
+            self.looked = steps
+            f = derivative()
+            if np.isfinite(f).all():
+                found = [complaint.text for complaint in self.invariants.complaints(t, y, f, self.tau)][:1]
+            self.trust.doubts += found
+        return doubtful or bool(found)
+
+
+class Counted:
+    """A right-hand side that counts its calls and returns new arrays."""
+
+    __slots__ = ("_rhs", "count")
+
+    def __init__(self, rhs: Callable[[float, np.ndarray], np.ndarray]) -> None:
+        self._rhs = rhs
+        self.count = 0
+
+    def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
+        self.count += 1
+        return self._rhs(t, y).copy()
+
+
+def as_derivative(value: Any, n: int, dtype: np.dtype, t: float) -> np.ndarray:
+    """The value of a user's right-hand side at t as an array (n,), or an error; see `as_vector`."""
+    return as_vector(value, n, dtype, "fun returned", t)
+
+
+def initial_state(y0: Any, name: str = "y0") -> np.ndarray:
+    """y0 as a new float64 or complex128 array (n,), with SciPy's messages for what is no state."""
+    y = states(name, y0)
+    if y.ndim != 1:
+        raise ValueError(f"`{name}` must be 1-dimensional.")
+    if not np.isfinite(y).all():
+        raise ValueError(f"All components of the initial state `{name}` must be finite.")
+    return y
+
+
+def states(name: str, value: Any) -> np.ndarray:
+    """A state, or several, as a new float64 or complex128 array of any shape.
+
+    Raises
+    ------
+    TypeError
+        For what holds no numbers, or numbers with a unit.
+    ValueError
+        For masked values.
+    """
+    refuse_units(**{name: value})
+    if np.ma.isMaskedArray(value) and np.ma.is_masked(value):
+        raise ValueError(f"masked values in {name}; fill or drop them first.")
+    found = reals(value)
+    if found is not None:
+        return found
+    try:
+        y = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        raise ValueError(f"`{name}` must be an array of numbers, got {shown(value)}.") from None
+    if y.dtype.kind != "c":
+        raise TypeError(f"`{name}` must hold numbers, got {shown(value)}, dtype {y.dtype}.")
+    return np.array(y, dtype=complex, order="C")
+
+
+def check_halves(n: int) -> None:
+    """A state (q, v) has an even number of components."""
+    if n % 2:
+        raise ValueError(f"a Nystrom method needs the state (q, v), an even number of components; y0 has {n}.")
+
+
+def check_second_order(
+    rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, y0: np.ndarray, f0: np.ndarray, method: str
+) -> None:
+    """Whether the right-hand side is that of q'' = a(t, q) for y = (q, v), by one more evaluation.
+
+    Raises
+    ------
+    ValueError
+        When the first half of the derivative is not v, or the second changes with v.
+    """
+    check_halves(y0.size)
+    half = y0.size // 2
+    other = y0.copy()
+    other[half:] = 1.5 * y0[half:] + 1.0
+    f = rhs(t0, other)
+    if not (np.array_equal(f0[:half], y0[half:]) and np.array_equal(f[:half], other[half:])):
+        raise ValueError(
+            f"{method} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be v, "
+            f"the second half of the state. Reorder the state, or take a Runge-Kutta method such as EIPDOP853."
+        )
+    if not np.array_equal(f[half:], f0[half:], equal_nan=True):
+        raise ValueError(
+            f"{method} integrates q'' = a(t, q), but fun's accelerations change with the velocity; take a Runge-Kutta "
+            f"method such as EIPDOP853."
+        )
+
+
+def method_arrays(tableau: AnyMethod) -> Method | OneStep:
+    """A tableau as the arrays that the step takes (writable copies: compiled code has one array type for all)."""
+    if isinstance(tableau, OneStep):
+        return tableau
+    exponent = -1.0 / ((tableau.error_estimator_order or 0) + 1)
+    if isinstance(tableau, NystromTableau):
+        return _nystrom_arrays(tableau, exponent)
+    none = np.zeros(tableau.b.size)
+    return Method(
+        A=tableau.A.copy(),
+        b=tableau.b.copy(),
+        b_low=tableau.b_low.copy(),
+        b_v=none,
+        b_v_low=none,
+        c=tableau.c.copy(),
+        e=tableau.e.copy(),
+        e_v=none,
+        e_low=tableau.e_low.copy(),
+        nystrom=False,
+        fsal=tableau.fsal,
+        paired=tableau.paired,
+        exponent=exponent,
+    )
+
+
+def _nystrom_arrays(tableau: NystromTableau, exponent: float) -> Method:
+    """A last stage that is the next step's first one is f at the new point, after the step."""
+    s = tableau.n_stages - tableau.fsal
+
+    def weights(e: np.ndarray) -> np.ndarray:
+        return np.concatenate([e, np.zeros(s + 1 - e.size)])
+
+    e, e_v = weights(tableau.e), weights(tableau.e_prime)
+    return Method(
+        A=tableau.A[:s, :s].copy(),
+        b=tableau.b[:s].copy(),
+        b_low=tableau.b_low[:s].copy(),
+        b_v=tableau.b_prime[:s].copy(),
+        b_v_low=tableau.b_prime_low[:s].copy(),
+        c=tableau.c[:s].copy(),
+        e=e,
+        e_v=e_v,
+        e_low=np.zeros(s + 1),
+        nystrom=True,
+        fsal=bool(e[-1] != 0.0 or e_v[-1] != 0.0),
+        paired=False,
+        exponent=exponent,
+    )
+
+
+def prepare(
+    method: AnyMethod,
+    rhs: Callable[[float, np.ndarray], np.ndarray],
+    start: Start,
+    projection: ProjectionOptions,
+    stepping: Stepping,
+    *,
+    extra: tuple = (),
+    check_start: bool = True,
+    hand: Any = as_it_is,
+) -> Run:
+    """Check a run's options and make its buffers; the invariants are checked at the start.
+
+    Parameters
+    ----------
+    method : Tableau, NystromTableau or OneStep
+    rhs : callable
+        ``rhs(t, y) -> (n,)``, checked; called only where an invariant's start must be projected.
+    start : Start
+    projection : ProjectionOptions
+    stepping : Stepping
+    extra : tuple
+        Further arguments of the invariants' functions (``(params,)`` or nothing).
+    check_start : bool
+        False: the invariants have been checked at the start of another run like this.
+    hand : callable
+        See `InvariantSet`.
+    """
+    t0, y0, f0, tau = start
+    invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra, hand)
+    options, sigma, identity = projection.settled(method, stepping, y0, invariants)
+    arrays = method_arrays(method)
+    work = make_work(y0.size, y0.dtype, arrays.b.size, invariants.size, options.groups.start.size - 1)
+    if sigma is not None:
+        work.sigma[:] = sigma
+    run = Run(y0, arrays, options, work, invariants, identity, Trust(invariants.names, work.trust), tau)
+    if projection.project_initial:
+        run.y0 = projected_start(run, rhs, t0, f0)
+        f0 = rhs(t0, run.y0)
+    violation = invariants.start_violation(t0, run.y0, f0)
+    if violation:
+        raise ValueError(f"{violation}; mend y0 or the target, or pass project_initial=True to project y0 first.")
+    if options.watched:
+        _note_terms(run, t0, f0)
+        if check_start and np.isfinite(f0).all():
+            run.trust.doubts += invariants.check(t0, run.y0, f0, tau)
+    return run
+
+
+def _note_terms(run: Run, t0: float, f0: np.ndarray) -> None:
+    """The invariants' terms at the start, by which defects are measured."""
+    known, y0 = run.invariants, run.y0
+    G = known.gradients(t0, y0, f0).view(float)
+    values, state, slope = known.values(t0, y0), y0.view(float), f0.view(float)
+    kn.start_figures(values, known.target, known.scales, G, state, slope, run.tau, run.work.trust)
+
+
+def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, f0: np.ndarray) -> np.ndarray:
+    """y0 on the targets, by full Newton steps in the euclidean metric."""
+    options = run.options._replace(
+        metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False, watched=False, limit=np.inf
+    )
+    work = make_work(run.y0.size, run.y0.dtype, 0, run.invariants.size, 0)
+    work.y_hat[:] = run.y0
+    work.K[-1] = f0
+    y = np.empty_like(run.y0)
+
+    def fill(t: float, state: np.ndarray, out: np.ndarray, params: Any) -> None:
+        out[:] = rhs(t, state)
+
+    status = project_step(
+        fill,
+        run.invariants.inv,
+        run.invariants.grad,
+        None,
+        t0,
+        run.y0,
+        run.y0.view(float),
+        t0,
+        True,
+        options,
+        work,
+        y,
+        y.view(float),
+    )
+    missed = np.abs(work.defect) > 1e-8 * run.invariants.term_sizes(t0, y, f0) if status == 0 else [True]
+    if np.any(missed):
+        raise ValueError(projection_failure(run.invariants, work, t0))
+    return y
+
+
+def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
+    """Which invariant a failed projection left worst, by how much, and the rank it had."""
+    excess = np.abs(work.defect) / np.maximum(work.band, np.finfo(float).tiny)
+    worst = int(np.argmax(np.where(np.isfinite(excess), excess, np.inf)))
+    broken = [name for name, row in zip(invariants.names, work.G, strict=True) if not np.isfinite(row).all()]
+    because = f"; the gradient of {broken[0]!r} is not finite there" if broken else ""
+    return (
+        f"projection failed at t={t:g}: invariant {invariants.names[worst]!r}, residual {work.defect[worst]:.3g}, "
+        f"rank {int(work.counters[LAST_RANK])} of {invariants.size}{because}"
+    )
+
+
+def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
+    """Why a step failed."""
+    if status == NOT_FINITE:
+        return not_finite(run, clock[T], clock[H])
+    if status == TOO_SMALL:
+        return OdeSolver.TOO_SMALL_STEP
+    return projection_failure(run.invariants, run.work, clock[T_NEW])
+
+
+def not_finite(run: Run, t: float, h: float) -> str:
+    """Why a step was not finite: the first stage that was not, overflow of the sum, or the error estimate."""
+    work, method = run.work, run.method
+    for i in range(method.b.size):
+        if not np.isfinite(work.K[i]).all():
+            return _bad_value(run, work.K[i], t + method.c[i] * h)
+    if not np.isfinite(work.y_hat).all():
+        return f"the state is no longer finite at t={t + h:.10g}: it overflowed, or h is too large"
+    if not np.isfinite(work.K[-1]).all():
+        return _bad_value(run, work.K[-1], t + h)
+    return f"the error estimate is not finite at t={t + h:.10g}: it overflowed, or y and `atol` are 0 in a component"
+
+
+def _bad_value(run: Run, f: np.ndarray, t: float) -> str:
+    unset = np.flatnonzero(np.isnan(f))
+    hint = ""
+    if run.in_place and unset.size:
+        hint = f" (component {unset[0]} is NaN; with in_place=True it must fill all of out)"
+    return f"fun returned a non-finite value at t={t:.10g}{hint}"
+
+
+def attach(diagnostics: Any, run: Run) -> None:
+    """Let `diagnostics` read the run's buffers."""
+    if diagnostics is None:
+        return
+    if not isinstance(diagnostics, Diagnostics):
+        raise TypeError(f"diagnostics must be a Diagnostics() object, got {diagnostics!r}.")
+    w = run.work
+    diagnostics._attach(
+        w.max_defect,
+        w.defect,
+        w.max_correction,
+        w.counters,
+        run.trust,
+        estimated=run.options.metric == ERROR,
+    )

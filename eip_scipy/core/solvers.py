@@ -1,0 +1,479 @@
+"""The solver classes: EIP methods that `scipy.integrate.solve_ivp` takes as ``method=``."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy.integrate
+from scipy.integrate import DenseOutput, OdeSolver
+
+from ..engine.kernels import FAILED_PROJECTION, OK
+from ..engine.step import T_NEW, T, close_step, next_step, project_any
+from ..engine.trust import ProjectionWarning
+from ..methods.nystrom import RKN86, RKN1210, NystromTableau
+from ..methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
+from . import setup
+from .dense import End, ExactEnds, dense_output
+from .inputs import refuse_units
+from .invariants import as_invariants
+from .names import nearest
+from .one_step import OneStep, OneStepMethod
+from .options import ProjectionOptions, takes_projection_options
+from .results import FOUND, N_COUNTERS, NFEV, NJEV, NLU, REJECTED
+from .setup import Start
+from .stepping import StepOptions, Stepping, interval
+
+__all__ = [
+    "EIPDOP853",
+    "EIPRK1",
+    "EIPRK2",
+    "EIPRK3",
+    "EIPRK4",
+    "EIPRK5",
+    "EIPRK23",
+    "EIPRK45",
+    "EIPRKN8",
+    "EIPRKN12",
+    "EIPSolver",
+    "eip_method",
+]
+
+OPTIONS = ("h", "first_step", "max_step", "rtol", "atol", "vectorized", "diagnostics", *ProjectionOptions.names())
+
+
+@takes_projection_options
+class EIPSolver(OdeSolver):
+    """Explicit invariants-preserving solver: a Runge-Kutta step, then one Newton step of projection.
+
+    Use one of the methods `EIPRK1` ... `EIPRK5`, or `eip_method` for a tableau of your own, with
+    `scipy.integrate.solve_ivp`.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(t, y) -> (n,)``, the right-hand side.
+    t0 : float
+        Start.
+    y0 : array_like, shape (n,)
+        Initial state, real or complex.
+    t_bound : float
+        End; before t0 to integrate backward.
+    max_step, rtol, atol, first_step
+        Step control, as in SciPy's own methods; the error estimate sees the step before its projection. `rtol` and
+        `atol` are also the scale of the error metric: ``|atol| + rtol |y|``, norms over a block.
+    vectorized : bool, optional
+        Whether `fun` takes (n, k) arrays, as in SciPy.
+    h : float, optional
+        A fixed step instead: its length, > 0 in either direction. The last step ends on `t_bound` and may be shorter.
+    {ProjectionOptions}
+    diagnostics : Diagnostics, optional
+        An empty `Diagnostics`, which the run fills.
+
+    Attributes
+    ----------
+    n, status, t_bound, direction, t, y, t_old, step_size, nfev, njev, nlu
+        As in `scipy.integrate.OdeSolver`; `njev` counts evaluations of the invariants' gradients and `nlu`
+        factorisations of the projection.
+
+    Notes
+    -----
+    The error estimate sees the step before its projection. Defects of the invariants after it are O(h^(2p + 2)) for a
+    method of order p (theorem 2.1 of [1]_), and the method keeps its order.
+
+    References
+    ----------
+    .. [1] W. Cai, Y. Gong, Y. Wang, "An explicit and practically invariants-preserving method for conservative
+       systems".
+    """
+
+    TABLEAU: ClassVar[Tableau | NystromTableau | OneStep]
+    # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
+    SCIPY: ClassVar[type[OdeSolver] | None] = None
+    t: float
+    t_old: float
+
+    def __init__(
+        self,
+        fun: Callable[..., Any],
+        t0: float,
+        y0: Any,
+        t_bound: float,
+        max_step: float = np.inf,
+        rtol: Any = 1e-3,
+        atol: Any = 1e-6,
+        vectorized: bool = False,
+        first_step: float | None = None,
+        *,
+        h: float | None = None,
+        diagnostics: Any = None,
+        **options: Any,
+    ) -> None:
+        projection, extraneous = ProjectionOptions.of(options)
+        if extraneous:
+            warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=3)
+        if not hasattr(self, "TABLEAU"):
+            raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
+        t0, t_bound = interval((t0, t_bound))
+        start = setup.initial_state(y0)
+        self._calls = [0]
+        derivative, self._rhs = _checked(fun, start.size, start.dtype, vectorized, self._calls)
+        self._derivative = derivative
+        super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
+        steps = StepOptions(h=h, first_step=first_step, max_step=max_step, rtol=rtol, atol=atol)
+        stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, self.n, stacklevel=4)
+        self.h, self.max_step = stepping.h, stepping.span.max_step
+        self.rtol, self.atol = stepping.rtol, stepping.atol
+        self._k, self._span = 0, stepping.span
+        kept = as_invariants(projection.invariants)
+        if self.h is None and stepping.first_step is None:
+            stepping.require_scale(start)
+        self._scipy = self._scipy_solver(derivative, start, stepping, bool(kept) or bool(projection.compensated))
+        f0 = derivative(t0, start).copy() if self._scipy is None else np.zeros_like(start)
+        if isinstance(self.TABLEAU, NystromTableau):
+            setup.check_second_order(lambda t, y: derivative(t, y).copy(), t0, start, f0, type(self).__name__)
+        self.h_abs = stepping.first_step
+        if self._scipy is None:
+            self.h_abs = stepping.first(derivative, start, f0, self.TABLEAU)
+        projection = replace(projection, invariants=kept)
+        run = setup.prepare(self.TABLEAU, derivative, Start(t0, start, f0, self.h_abs or 0.0), projection, stepping)
+        # Lists: Python reads and writes their numbers several times faster than an array's.
+        run.work = run.work._replace(counters=[0] * N_COUNTERS, norm=[0.0], max_correction=[0.0])  # type: ignore[arg-type]
+        setup.attach(diagnostics, run)
+        self._run, self._work = run, run.work
+        self._clock = [float(t0), float(t0), 0.0, float(self.h_abs or 0.0)]
+        self._project_now, self._projection_status, self._last = False, OK, False
+        self._buffer = self._accepted = run.y0
+        if run.y0 is not start:
+            f0 = derivative(t0, run.y0).copy()
+        self.y, self.f = run.y0, f0
+        self._work.counters[NFEV] = self._calls[0]
+        self._count()
+        self.y_old, self.f_old = self.y, self.f
+        self._found, self._told = 0, False
+
+    def _count(self) -> None:
+        counters = self._work.counters
+        self.nfev, self.njev, self.nlu = counters[NFEV], counters[NJEV], counters[NLU]
+
+    def _scipy_solver(
+        self,
+        derivative: Callable[[float, np.ndarray], np.ndarray],
+        start: np.ndarray,
+        stepping: Stepping,
+        own_steps: bool,
+    ) -> OdeSolver | None:
+        own_steps |= type(self)._project_step is not EIPSolver._project_step
+        if self.SCIPY is None or stepping.h is not None or own_steps:
+            return None
+
+        def fresh(t: float, y: np.ndarray) -> np.ndarray:
+            return derivative(t, y).copy()
+
+        control = {"first_step": stepping.first_step, "max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
+        solver = self.SCIPY(fresh, self.t, start, self.t_bound, **control)
+        if np.isnan(solver.h_abs):
+            return None  # SciPy's loop would never end
+        solver.fun = derivative  # in the place of SciPy's two wrappers, whose work it does
+        return solver
+
+    def _scipy_step(self, solver: OdeSolver) -> tuple[bool, str | None]:
+        # Not its step(), whose bookkeeping is done for this solver already.
+        success, message = solver._step_impl()
+        self.nfev = self._calls[0]
+        if not success:
+            if not np.isfinite(solver.K).all():
+                message = f"fun returned a non-finite value at t={self.t:.10g}"
+            elif (unscaled := np.flatnonzero((self.atol == 0) & (solver.y == 0) & (solver.f == 0))).size:
+                message = (
+                    f"the error of component {unscaled[0]} has no scale at t={self.t:.10g}: y and `atol` are 0 there"
+                )
+            return False, message
+        # SciPy keeps the value itself, and a user's function may return the same buffer again.
+        solver.f = solver.f.copy()
+        solver.t_old = self.t
+        self.y_old, self.y, self.t = self.y, solver.y, solver.t
+        return True, None
+
+    def _step_impl(self) -> tuple[bool, str | None]:
+        if self._scipy is not None:
+            return self._scipy_step(self._scipy)
+        run, w, clock = self._run, self._work, self._clock
+        y, y_new = self.y, np.empty_like(self.y)
+        w.K[0] = self.f
+        clock[T] = self.t
+        status = next_step(
+            self._finish, self._rhs, run.invariants.inv, run.invariants.grad, None, clock, self._k, self._span,
+            run.method, run.options, w, y, y.view(float), y_new, y_new.view(float),
+        )  # fmt: skip
+        self._count()
+        if status != OK:
+            run.trust.failed = True
+            return False, setup.failure(status, run, clock)
+        self._k += 1
+        self.y_old, self.f_old = y, self.f
+        self.y, self.t, self.f = self._accepted, clock[T_NEW], w.K[-1].copy()
+        if w.counters[FOUND] != self._found or self._k in setup.LOOKS or self.t == self.t_bound:
+            self._watch()
+        return True, None
+
+    def _watch(self) -> None:
+        """Look at the run where something stands out, early and at its end; warn once, and at once: it may end here."""
+        run, arrived = self._run, self.t == self.t_bound
+        self._found = self._work.counters[FOUND]
+        if not self._told and run.look(self._k, arrived, self.t, self.y, lambda: self._derivative(self.t, self.y)):
+            self._told = True
+            warnings.warn(f"{type(self).__name__}: {run.trust.message}", ProjectionWarning, stacklevel=5)
+
+    def _finish(
+        self, rhs: Any, inv: Any, grad: Any, params: Any, t: Any, y: Any, y_r: Any, t_new: Any, project: Any,
+        last: Any, m: Any, o: Any, w: Any, y_new: Any, y_new_r: Any,
+    ) -> int:  # fmt: skip
+        """What `finish_step` does, with the hook in its place."""
+        self._project_now, self._projection_status, self._last = project, OK, last
+        self._buffer = y_new
+        self._accepted = self._project_step(t_new, y, w.y_hat, w.err)
+        if self._projection_status == FAILED_PROJECTION:
+            w.counters[REJECTED] += 1
+            return FAILED_PROJECTION
+        close_step(rhs, params, t_new, self._accepted, project, self._projection_status, o, w)
+        return OK
+
+    def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
+        """The accepted state from a raw step; override to act after each step.
+
+        Parameters
+        ----------
+        t : float
+            Time of the new state.
+        y : ndarray, shape (n,)
+            The state that the step started from.
+        y_hat : ndarray, shape (n,)
+            The raw result; a buffer, valid during the call.
+        err : ndarray
+            Its local error estimate (float view: 2 n entries for a complex state), zero where there is none.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            A new array.
+        """
+        w, y_new = self._work, self._buffer
+        if not self._project_now:
+            y_new[:] = y_hat
+            return y_new
+        if y_hat is not w.y_hat:
+            w.y_hat[:] = y_hat
+        if err is not w.err:
+            w.err[:] = err
+        run = self._run
+        self._projection_status = project_any(
+            self._rhs,
+            run.invariants.inv,
+            run.invariants.grad,
+            None,
+            self.t,
+            y,
+            y.view(float),
+            t,
+            self._last,
+            run.options,
+            w,
+            y_new,
+            y_new.view(float),
+        )
+        return y_new
+
+    def _dense_output_impl(self) -> DenseOutput:
+        if self._scipy is not None:
+            out = ExactEnds(self._scipy.dense_output(), self.y_old, self.y)
+            self.nfev = self._calls[0]
+            return out
+        old, new = End(self.t_old, self.y_old, self.f_old), End(self.t, self.y, self.f)
+        out = dense_output(self._rhs, self._run, self.TABLEAU, old, new)
+        self._count()
+        return out
+
+
+def _without_effect(names: Iterable[str]) -> str:
+    """What SciPy's own solvers warn of, in their words: filters made for theirs hold here too."""
+    listed = ", ".join(f"`{name}`" for name in names)
+    hints = ((name, nearest(name, OPTIONS).removeprefix("; ")) for name in names)
+    meant = "".join(f" `{name}`: {hint}" for name, hint in hints if hint)
+    return f"The following arguments have no effect for a chosen solver: {listed}.{meant}"
+
+
+def _checked(
+    fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool, calls: list[int]
+) -> tuple[Callable[[float, np.ndarray], np.ndarray], Callable[..., None]]:
+    """The user's right-hand side with clear errors: as (t, y) -> (n,), maybe their buffer, and as the step calls it.
+
+    The first counts in `calls`; the step counts its own. Both test the common case, an array of the right shape and
+    type, in place, and both hand out copies, because a user's function may keep or overwrite what it was given: this
+    runs at every stage.
+    """
+    shape = (n,)
+
+    def flat(t: float, y: np.ndarray) -> np.ndarray:
+        f = fun(t, y[:, None])
+        refuse_units(**{"fun returned": f})
+        return np.asarray(f).reshape(-1)
+
+    call = flat if vectorized else fun
+
+    def derivative(t: float, y: np.ndarray) -> np.ndarray:
+        calls[0] += 1
+        f = call(t, y.copy())
+        if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
+            return f
+        return setup.as_derivative(f, n, dtype, t).astype(dtype)
+
+    def rhs(t: float, y: np.ndarray, out: np.ndarray, params: Any) -> None:
+        f = call(t, y.copy())
+        if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
+            out[:] = f
+        else:
+            out[:] = setup.as_derivative(f, n, dtype, t)
+
+    return derivative, rhs
+
+
+class EIPRK1(EIPSolver):
+    """EIP method on explicit Euler (order 1); it has no error estimate, so the metric is euclidean.
+
+    Options: see `EIPSolver`.
+    """
+
+    TABLEAU = RK1
+
+
+class EIPRK2(EIPSolver):
+    """EIP method on the explicit midpoint rule (order 2). Options: see `EIPSolver`."""
+
+    TABLEAU = RK2
+
+
+class EIPRK3(EIPSolver):
+    """EIP method on Heun's third-order method. Options: see `EIPSolver`."""
+
+    TABLEAU = RK3
+
+
+class EIPRK4(EIPSolver):
+    """EIP method on the classical Runge-Kutta method of order 4, the paper's choice.
+
+    Options: see `EIPSolver`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.integrate import solve_ivp
+    >>> from eip_scipy import EIPRK4, Invariant
+    >>> def fun(t, y):
+    ...     return [y[2], y[3], *(-y[:2] / np.hypot(*y[:2]) ** 3)]
+    >>> def energy(t, y):
+    ...     return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.hypot(*y[:2])
+    >>> def energy_gradient(t, y):
+    ...     return np.concatenate([y[:2] / np.hypot(*y[:2]) ** 3, y[2:]])
+    >>> H = Invariant(energy, energy_gradient, name="energy")
+    >>> sol = solve_ivp(fun, (0, 20), [0.4, 0, 0, 2], method=EIPRK4, h=0.03, invariants=H)
+    >>> bool(abs(energy(20, sol.y[:, -1]) - energy(0, sol.y[:, 0])) < 1e-11)
+    True
+    """
+
+    TABLEAU = RK4
+
+
+class EIPRK5(EIPSolver):
+    """EIP method on Fehlberg's method of order 5 (six stages). Options: see `EIPSolver`."""
+
+    TABLEAU = RK5
+
+
+class EIPRK23(EIPSolver):
+    """EIP method on SciPy's RK23, the pair of Bogacki and Shampine. Options: see `EIPSolver`."""
+
+    TABLEAU = RK23
+    SCIPY = scipy.integrate.RK23
+
+
+class EIPRK45(EIPSolver):
+    """EIP method on SciPy's RK45, the pair of Dormand and Prince.
+
+    Options: see `EIPSolver`. Without invariants it takes the steps of `scipy.integrate.RK45`.
+    """
+
+    TABLEAU = RK45
+    SCIPY = scipy.integrate.RK45
+
+
+class EIPDOP853(EIPSolver):
+    """EIP method on SciPy's DOP853, of order 8. Options: see `EIPSolver`."""
+
+    TABLEAU = DOP853
+    SCIPY = scipy.integrate.DOP853
+
+
+class EIPRKN8(EIPSolver):
+    """EIP method on the Runge-Kutta-Nystrom pair 8(6) of Dormand, El-Mikkawy and Prince, nine stages.
+
+    For q'' = a(t, q) as a first-order system: the state is (q, v), and the first half of `fun` must be v. With
+    `integrate`, `fun` is the acceleration. Options: see `EIPSolver`.
+    """
+
+    TABLEAU = RKN86
+
+
+class EIPRKN12(EIPSolver):
+    """EIP method on the Runge-Kutta-Nystrom pair 12(10) of Dormand, El-Mikkawy and Prince, 17 stages.
+
+    For q'' = a(t, q) as a first-order system: the state is (q, v), and the first half of `fun` must be v. With
+    `integrate`, `fun` is the acceleration. Options: see `EIPSolver`; at small steps ``every="auto"``.
+    """
+
+    TABLEAU = RKN1210
+
+
+def eip_method(method: Tableau | NystromTableau | OneStepMethod) -> type[EIPSolver]:
+    """A solver class on any explicit Runge-Kutta or Runge-Kutta-Nystrom tableau, or on a one-step method of your own.
+
+    Parameters
+    ----------
+    method : Tableau, NystromTableau or OneStepMethod
+        The last is any object with ``one_step(t, y, h) -> y_hat`` and ``order``; see `OneStepMethod`. Its steps are
+        projected like all others; `fun` serves gradients that take f and dense output (a cubic through both ends)
+        only, so that `nfev` does not count what `one_step` evaluates.
+
+    Returns
+    -------
+    type[EIPSolver]
+        To be passed as ``method=`` to `scipy.integrate.solve_ivp` or `integrate`.
+
+    Raises
+    ------
+    TypeError
+        When it is none of them.
+    ValueError
+        When a one-step method's order is no integer >= 1.
+
+    Examples
+    --------
+    >>> from scipy.integrate import solve_ivp
+    >>> from eip_scipy import Invariant, eip_method
+    >>> class SymplecticEuler:
+    ...     order = 1
+    ...     def one_step(self, t, y, h):
+    ...         q, p = y
+    ...         p = p - h * q
+    ...         return [q + h * p, p]
+    >>> energy = Invariant(lambda t, y: y @ y / 2, lambda t, y: y, name="energy")
+    >>> sol = solve_ivp(lambda t, y: [y[1], -y[0]], (0, 10), [1.0, 0.0], method=eip_method(SymplecticEuler()),
+    ...                 h=0.01, invariants=energy)
+    >>> bool(abs(sol.y[:, -1] @ sol.y[:, -1] - 1) < 1e-8)
+    True
+    """
+    tableau = method if isinstance(method, (Tableau, NystromTableau)) else OneStep(method)
+    return type(f"EIP_{tableau.name}", (EIPSolver,), {"TABLEAU": tableau, "__doc__": f"EIP method on {tableau!r}."})

@@ -1,0 +1,246 @@
+"""How a run steps: by a fixed length, or by tolerances; the options of that, checked."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..engine.kernels import EPS
+from ..engine.step import Span
+from ..methods.nystrom import NystromTableau
+from ..methods.runge_kutta import Tableau
+from .inputs import is_number, reals, refuse_units, shown
+from .one_step import OneStep
+
+__all__ = ["UNBOUNDED", "AnyMethod", "StepOptions", "Stepping", "check_fixed_step", "fixed_steps", "interval"]
+
+AnyMethod = Tableau | NystromTableau | OneStep
+UNBOUNDED = 2**62
+LEAST_RTOL = 100 * EPS  # SciPy's
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """How a run steps: by a fixed `h`, or, where that is None, by tolerances, from `first_step` (None: estimated)."""
+
+    span: Span
+    h: float | None
+    first_step: float | None
+    rtol: np.ndarray
+    atol: np.ndarray
+
+    def first(
+        self,
+        rhs: Callable[[float, np.ndarray], np.ndarray],
+        y0: np.ndarray,
+        f0: np.ndarray,
+        tableau: AnyMethod,
+    ) -> float:
+        """Length of the first step.
+
+        Raises
+        ------
+        ValueError
+            When it is to be estimated and the error of a component has no scale.
+        """
+        if self.h is not None:
+            return self.h
+        if self.first_step is not None:
+            return self.first_step
+        self.require_scale(y0)
+        return self.estimated(rhs, y0, f0, tableau.error_estimator_order or 0)
+
+    def estimated(
+        self, rhs: Callable[[float, np.ndarray], np.ndarray], y0: np.ndarray, f0: np.ndarray, order: int
+    ) -> float:
+        """First step of an adaptive run (Hairer, Norsett & Wanner I, II.4), one more call of `rhs`; NaN for NaN."""
+        span = self.span
+        if y0.size == 0:
+            return math.inf
+        length = abs(span.t_bound - span.t0)
+        if length == 0.0:
+            return 0.0
+        scale = self.atol + np.abs(y0) * self.rtol
+
+        def size(x: np.ndarray) -> float:
+            return float(np.linalg.norm(x / scale)) / math.sqrt(x.size)
+
+        d0, d1 = size(y0), size(f0)
+        if not math.isfinite(d1):
+            return math.nan
+        h0 = 1e-6 if d0 < 1e-5 or d1 < 1e-5 else 0.01 * d0 / d1
+        h0 = min(h0, length)
+        d2 = size(rhs(span.t0 + h0 * span.sign, y0 + h0 * span.sign * f0) - f0) / h0
+        if d1 <= 1e-15 and d2 <= 1e-15:
+            h1 = max(1e-6, h0 * 1e-3)
+        else:
+            h1 = (0.01 / max(d1, d2)) ** (1 / (order + 1))
+        return min(100 * h0, h1, length, span.max_step)
+
+    def require_scale(self, y0: np.ndarray) -> None:
+        """Refuse tolerances that leave the error of a component at the start without a scale."""
+        none = np.flatnonzero(self.atol + self.rtol * np.abs(y0) == 0)
+        if none.size:
+            raise ValueError(
+                f"the tolerances of component {none[0]} are 0: y0 is 0 there, and so is `atol`. Its error has no "
+                "scale; give atol > 0, or a fixed step h."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepOptions:
+    """The options of the step size as a user gives them."""
+
+    h: Any = None
+    first_step: Any = None
+    max_step: Any = np.inf
+    rtol: Any = 1e-3
+    atol: Any = 1e-6
+
+    def checked(self, name: str, method: AnyMethod, t0: float, t_bound: float, n: int, *, stacklevel: int) -> Stepping:
+        """How a run of n components steps; `stacklevel` is that of the user, for a warning.
+
+        Raises
+        ------
+        ValueError
+            For options with wrong values, for `h` beside those of adaptive steps, and without `h` where the method
+            `name` has no error estimate.
+        """
+        h = self.h
+        if h is None and not method.has_estimate:
+            raise ValueError(
+                f"{name} has no error estimate and needs the step h=...: without it, and where rtol, atol, first_step "
+                "or max_step ask for them, steps are adaptive."
+            )
+        if h is not None and (self.first_step is not None or self.max_step != np.inf):
+            raise ValueError(
+                "h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other."
+            )
+        first_step, max_step = step_bounds(self.first_step, self.max_step, t0, t_bound)
+        rtol, atol = tolerances(self.rtol, self.atol, n)
+        if h is not None:
+            h = check_fixed_step(h, t0, t_bound)
+        elif np.any(rtol < LEAST_RTOL):
+            message = f"At least one element of `rtol` is too small. Setting `rtol = np.maximum(rtol, {LEAST_RTOL})`."
+            warnings.warn(message, stacklevel=stacklevel)
+            rtol = np.maximum(rtol, LEAST_RTOL)
+        sign = -1.0 if t_bound < t0 else 1.0
+        n_steps = UNBOUNDED if h is None else fixed_steps(h, t0, t_bound)
+        return Stepping(Span(t0, sign * (h or 0.0), t_bound, sign, n_steps, max_step), h, first_step, rtol, atol)
+
+
+def interval(t_span: Any) -> tuple[float, float]:
+    """Start and end of an interval, whose end may be infinite.
+
+    Raises
+    ------
+    TypeError
+        For values with a unit, and dates.
+    ValueError
+        For what are not two real numbers, NaN, and an infinite start.
+    """
+    refuse_units(t_span=t_span)
+    ends = reals(t_span)
+    if ends is None or ends.shape != (2,):
+        raise ValueError(f"t_span must hold two numbers, got {shown(t_span)}.")
+    t0, t_bound = ends.tolist()
+    if not math.isfinite(t0) or math.isnan(t_bound):
+        raise ValueError(f"t_span must be finite, got {shown(t_span)}; only its end may be infinite.")
+    return t0, t_bound
+
+
+def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Both tolerances as arrays (n,).
+
+    Raises
+    ------
+    TypeError
+        For values with a unit.
+    ValueError
+        For NaN, infinite or negative values or a wrong shape.
+    """
+    refuse_units(rtol=rtol, atol=atol)
+    out = []
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        a = reals(value)
+        if a is None:
+            raise ValueError(f"`{name}` must be a number or an array of {n} numbers. Got {shown(value)}.")
+        if a.ndim > 0 and a.shape != (n,):
+            raise ValueError(f"`{name}` has wrong shape. It has {a.shape}, the state ({n},).")
+        if not np.all(a >= 0):
+            raise ValueError(f"`{name}` must be positive. Got {shown(value)}.")
+        if not np.all(np.isfinite(a)):
+            raise ValueError(
+                f"`{name}` must be finite. Got {shown(value)}; a large number such as 1e30 leaves a component out of "
+                "the step control."
+            )
+        out.append(np.array(np.broadcast_to(a, (n,)), order="C"))
+    return out[0], out[1]
+
+
+def check_fixed_step(h: Any, t0: float, t_bound: float) -> float:
+    """The step h as a positive float.
+
+    Raises
+    ------
+    TypeError
+        When it has a unit.
+    ValueError
+        When it is no positive number, longer than the interval, or below ten spacings of t.
+    """
+    refuse_units(h=h)
+    if not is_number(h) or not 0 < h < math.inf:
+        raise ValueError(f"`h` must be positive. Got {shown(h)}; give a real number > 0.")
+    h = float(h)
+    span = abs(t_bound - t0)
+    if span == 0:
+        return h
+    if h > span * (1 + _slack(h, t0, t_bound)):
+        raise ValueError(f"`h` exceeds bounds. Got h = {h:g} for an interval of length {span:g}.")
+    largest = max(abs(t0), abs(t_bound)) if math.isfinite(t_bound) else abs(t0)
+    spacing = float(np.spacing(largest))
+    if h < 10 * spacing:
+        raise ValueError(
+            f"`h` is too small: h = {h:g} is below 10 spacings of t, which are {spacing:.3g} at t = {largest:g}."
+        )
+    return h
+
+
+def _slack(h: float, t0: float, t_bound: float) -> float:
+    """How far T/h may be from a whole number and still count as one."""
+    if not math.isfinite(t_bound):
+        return 0.0
+    return max(1e-9, 8 * EPS * (abs(t_bound - t0) + abs(t0) + abs(t_bound)) / h)
+
+
+def fixed_steps(h: float, t0: float, t_bound: float) -> int:
+    """Number of steps of length h from t0 to t_bound, UNBOUNDED for an endless interval.
+
+    T/h rounded where it is a whole number but for round-off, else the next larger one; the last step is then shorter.
+    """
+    ratio = abs(t_bound - t0) / h
+    if not ratio < UNBOUNDED:
+        return UNBOUNDED
+    whole = round(ratio)
+    return whole if abs(ratio - whole) <= _slack(h, t0, t_bound) else math.ceil(ratio)
+
+
+def step_bounds(first_step: Any, max_step: Any, t0: float, t_bound: float) -> tuple[float | None, float]:
+    """first_step and max_step, with SciPy's messages for what they must not be."""
+    refuse_units(first_step=first_step, max_step=max_step)
+    if not is_number(max_step) or not max_step > 0:
+        raise ValueError(f"`max_step` must be positive. Got {shown(max_step)}; give a real number > 0.")
+    if first_step is None:
+        return None, float(max_step)
+    if not is_number(first_step) or not first_step > 0:
+        raise ValueError(f"`first_step` must be positive. Got {shown(first_step)}; give a real number > 0.")
+    if first_step > abs(t_bound - t0):
+        raise ValueError(
+            f"`first_step` exceeds bounds. Got {first_step:g} for an interval of length {abs(t_bound - t0):g}."
+        )
+    return float(first_step), float(max_step)

@@ -1,0 +1,132 @@
+"""What the corrections of a run say about it: whether the projection hides a failure.
+
+A projection moves a state by what the step's errors explain. Where it moves it by far more, the quantity is no
+invariant of the system, or its gradient is wrong, or the step is far too long; the projected run looks perfect all the
+same. The step notes the figures (`kernels.note`), a row for each invariant; what they mean is decided here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+__all__ = ["ProjectionWarning", "Trust"]
+
+# Columns of the figures. An invariant's terms at the start, and the largest on the manifold. The number of projections;
+# the defect that the last one left; the largest that one left, in these terms, and when. The largest defect before a
+# projection, in these terms, when, and how many were FAR. Between two projections an invariant changes: the largest
+# change in local errors, when, how many were LARGE, and when the first was; the sum of the changes, that of the local
+# errors, and their number.
+START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MANY = range(9)
+NU, AT, MANY, FIRST, SUM, EXPECTED, JUDGED = range(9, 16)
+N_FIGURES = 16
+
+# Noted are changes of so many local errors, and defects of such shares of their invariants' terms, before and after.
+LARGE, FAR, LARGE_SHARE = 50.0, 0.03, 1e-2
+# What no healthy run shows (docs/trust.md has the figures). One change of so many local errors (the estimates of pairs
+# of methods vanish by chance, which makes thousands), LARGE ones in such a share of the projections, changes that are
+# together so many times the errors; one defect of such a share of the terms, FAR ones in such a share of them.
+BEYOND_DOUBT, OFTEN, TOGETHER = 1e4, 0.1, 20.0
+TOO_FAR, FAR_OFTEN = 0.05, 0.01
+# So many changes make a share or a sum.
+ENOUGH = 5
+PAGE = '"When a run is not trusted" (docs/trust.md)'
+
+
+class ProjectionWarning(RuntimeWarning):
+    """The projection hides a failure: its corrections are not those of the step's errors.
+
+    Issued once a run by `solve_ivp` with an EIP method, `integrate`, `ensemble` and `project`; the same text is in
+    ``message``, and ``trusted`` is False. What it means and what to do: the page "When a run is not trusted".
+    """
+
+
+class Trust:
+    """The figures of a run's projections and the doubts of its checks.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the l invariants.
+    figures : ndarray, shape (l, N_FIGURES)
+        What the step notes.
+    doubts : list of str
+        What checks of the invariants found, in sentences.
+    failed : bool
+        Whether a step failed.
+    """
+
+    def __init__(self, names: Sequence[str], figures: np.ndarray) -> None:
+        self.names, self.figures = tuple(names), figures
+        self.doubts: list[str] = []
+        self.failed = False
+
+    @property
+    def trusted(self) -> bool:
+        """Whether no step failed, no check found anything and all corrections are those of the steps' errors."""
+        return not (self.failed or self.doubts or self.sick.any())
+
+    @property
+    def sick(self) -> np.ndarray:
+        """Which invariants' corrections or defects no healthy run has, (l,)."""
+        return sick(self.figures)
+
+    @property
+    def beyond_doubt(self) -> bool:
+        """Whether what was noted so far will not be outweighed by what is to come."""
+        return bool(_extreme(self.figures).any())
+
+    @property
+    def worst(self) -> tuple[str, float, float] | None:
+        """Invariant, time and size in local errors of the largest correction; None where none was measured."""
+        if not np.any(self.figures[:, JUDGED] > 0):
+            return None
+        k = int(np.argmax(self.figures[:, NU]))
+        return self.names[k], float(self.figures[k, AT]), float(self.figures[k, NU])
+
+    @property
+    def message(self) -> str:
+        """Why the run is not to be trusted; "" where nothing speaks against it."""
+        reasons = [_reason(self.names[k], self.figures[k]) for k in np.flatnonzero(self.sick)] + self.doubts
+        if not reasons:
+            return ""
+        cause = "" if self.doubts else (
+            " No invariant of this system, a wrong gradient, a step far too long or a passage that it does not resolve "
+            "does that."
+        )  # fmt: skip
+        return f"not to be trusted: {'; '.join(reasons)}.{cause} See {PAGE}"
+
+
+def sick(figures: np.ndarray) -> np.ndarray:
+    """Which rows of figures (..., N_FIGURES) no healthy run has."""
+    judged = figures[..., JUDGED]
+    often = (judged >= ENOUGH) & (figures[..., MANY] > OFTEN * judged)
+    together = (judged >= ENOUGH) & (figures[..., SUM] > TOGETHER * figures[..., EXPECTED])
+    far = figures[..., RAW_MANY] > FAR_OFTEN * figures[..., NOTED]
+    return _extreme(figures) | often | together | far
+
+
+def _extreme(figures: np.ndarray) -> np.ndarray:
+    """Which rows have a single projection that no healthy run has."""
+    return (figures[..., NU] > BEYOND_DOUBT) | (figures[..., RAW] > TOO_FAR) | (figures[..., SHARE] > 0)
+
+
+def _reason(name: str, row: np.ndarray) -> str:
+    """What is wrong with one invariant's corrections."""
+    parts = []
+    if row[NU] > LARGE:
+        parts.append(
+            f"{name!r} was corrected by up to {row[NU]:.2g} local errors, at t={row[AT]:.6g} (by more than {LARGE:g} "
+            f"in {row[MANY]:.0f} of {row[JUDGED]:.0f} projections, first at t={row[FIRST]:.6g})"
+        )
+    elif row[SUM] > TOGETHER * row[EXPECTED]:
+        parts.append(f"{name!r} was corrected by {row[SUM] / row[EXPECTED]:.2g} local errors a projection")
+    if row[RAW] > 0:
+        parts.append(
+            f"steps missed {name!r} by up to {row[RAW]:.2g} of its own terms, at t={row[RAW_AT]:.6g} (by more than "
+            f"{FAR:g} in {row[RAW_MANY]:.0f} of {row[NOTED]:.0f})"
+        )
+    if row[SHARE] > 0:
+        parts.append(f"the projection left {name!r} off by {row[SHARE]:.2g} of its own terms, at t={row[SHARE_AT]:.6g}")
+    return ", and ".join(parts)

@@ -1,0 +1,1 @@
+"""Many runs of one problem: tasks, chunks, stores, statistics, members in vectors."""

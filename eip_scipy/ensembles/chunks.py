@@ -1,0 +1,174 @@
+"""Where the chunks of an ensemble run: threads of this process, or executors of `concurrent.futures`."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from ..run.interrupts import look_for_signals
+from .statistics import Statistics, statistics_of
+from .tasks import Members, Plan, Task, run_members
+
+__all__ = ["Chunk", "FuturesPool", "Part", "Pool", "ThreadPool", "in_order", "run_chunk", "run_elsewhere"]
+
+KEPT = (
+    "What was done is in this exception's .partial; with out= or checkpoint= the same call with resume=True goes on "
+    "from there, on another executor."
+)
+KEPT_PLANS = 4
+AHEAD = 3
+
+
+class Chunk(NamedTuple):
+    """Members that run together: their starts (m, n) and parameters (m, p), from number `first` on."""
+
+    first: int
+    y0s: np.ndarray
+    params: np.ndarray
+
+
+class Part(NamedTuple):
+    """What comes back for a chunk."""
+
+    members: Members
+    statistics: Statistics | None
+
+
+class Pool(Protocol):
+    """Where chunks run."""
+
+    def capacity(self) -> int:
+        """How many chunks may run at once now."""
+
+    def submit(self, chunk: Chunk) -> Any:
+        """Start a chunk; what it returns is for `collect`."""
+
+    def collect(self, chunk: Chunk, ticket: Any) -> Part:
+        """Wait for a chunk."""
+
+    def close(self) -> None:
+        """Leave nothing running."""
+
+
+def run_chunk(plan: Plan, chunk: Chunk, stop: threading.Event | None = None) -> Part:
+    """Run the members of a chunk, and their statistics where they are wanted."""
+    return finished(plan.task, plan, run_members(plan, chunk.y0s, chunk.params, stop))
+
+
+def finished(task: Task, plan: Plan, members: Members) -> Part:
+    """Statistics of members, and the members without what is not kept of them."""
+    statistics = None
+    if task.reduce is not None:
+        statistics = statistics_of(task.reduce, *plan.states(members))
+    if not task.keep:
+        members = members._replace(saved=members.saved[:, :0].copy())
+    return Part(members, statistics)
+
+
+_plans: OrderedDict[str, Plan] = OrderedDict()
+_making = threading.Lock()
+
+
+def run_elsewhere(task: Task, key: str, chunk: Chunk) -> Part:
+    """`run_chunk` in a process that knows nothing yet: the plan is made once there, and kept under `key`."""
+    with _making:
+        plan = _plans.get(key)
+        if plan is None:
+            plan = _plans[key] = Plan(task).compile()
+            while len(_plans) > KEPT_PLANS:
+                _plans.popitem(last=False)
+    return run_chunk(plan, chunk)
+
+
+class ThreadPool:
+    """Threads of this process; compiled members run side by side."""
+
+    def __init__(self, plan: Plan, workers: int) -> None:
+        self._plan, self._workers = plan, workers
+        self._stop = threading.Event()
+        self._threads = ThreadPoolExecutor(workers, thread_name_prefix="eip-ensemble")
+
+    def capacity(self) -> int:
+        return self._workers
+
+    def submit(self, chunk: Chunk) -> Future[Part]:
+        return self._threads.submit(run_chunk, self._plan, chunk, self._stop)
+
+    def collect(self, chunk: Chunk, ticket: Future[Part]) -> Part:
+        return ticket.result()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._threads.shutdown(wait=True, cancel_futures=True)
+
+
+class FuturesPool:
+    """An executor of the user's, of `concurrent.futures` or like it; it stays open."""
+
+    def __init__(self, executor: Executor, task: Task, key: str) -> None:
+        self._executor, self._task, self._key = executor, task, key
+        self._open: set[Future[Part]] = set()
+
+    def capacity(self) -> int:
+        return cores()
+
+    def submit(self, chunk: Chunk) -> Future[Part]:
+        try:
+            future = self._executor.submit(run_elsewhere, self._task, self._key, chunk)
+        except BrokenExecutor as error:
+            raise _broken(error, chunk) from error
+        except RuntimeError as error:
+            raise RuntimeError(f"the executor given as executor= is closed ({error}). {KEPT}") from error
+        self._open.add(future)
+        return future
+
+    def collect(self, chunk: Chunk, ticket: Future[Part]) -> Part:
+        try:
+            return ticket.result()
+        except BrokenExecutor as error:
+            raise _broken(error, chunk) from error
+        except CancelledError as error:
+            raise RuntimeError(f"the executor given as executor= was closed while members ran. {KEPT}") from error
+        finally:
+            self._open.discard(ticket)
+
+    def close(self) -> None:
+        for future in self._open:
+            future.cancel()
+
+
+def _broken(error: BrokenExecutor, chunk: Chunk) -> BrokenExecutor:
+    """An executor gives all up when a process dies, and does not say which of the members under way did it."""
+    last = chunk.first + len(chunk.y0s) - 1
+    return type(error)(
+        f"a worker of the executor died before members {chunk.first} to {last} came back: it was killed, or ran out of "
+        "memory, or a member ends its process (executor='dask' finds such a member and runs the others). " + KEPT
+    )
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def in_order(pool: Pool, chunks: Iterable[Chunk]) -> Iterator[tuple[Chunk, Part]]:
+    """Run chunks and yield them in their own order; no more than a few per worker are under way at once."""
+    waiting = iter(chunks)
+    under_way: deque[tuple[Chunk, Any]] = deque()
+    while True:
+        room = AHEAD * pool.capacity() - len(under_way)
+        for _, chunk in zip(range(room), waiting, strict=False):
+            under_way.append((chunk, pool.submit(chunk)))
+        if not under_way:
+            return
+        look_for_signals()
+        chunk, ticket = under_way.popleft()
+        yield chunk, pool.collect(chunk, ticket)

@@ -1,0 +1,562 @@
+"""`ensemble`: many runs of one system, from many starts or with many parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import time
+import uuid
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from contextlib import ExitStack, closing, nullcontext
+from functools import partial
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numba.extending import is_jitted
+from scipy.optimize import OptimizeResult
+
+from ..core import setup
+from ..core.inputs import count, flag, is_number, real_array, refuse_units, shown
+from ..core.invariants import as_invariants
+from ..core.names import nearest
+from ..core.options import ProjectionOptions
+from ..core.problem import Problem
+from ..core.results import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
+from ..core.solvers import EIPRK4, EIPSolver
+from ..engine.trust import ProjectionWarning
+from ..run.events import Events
+from ..run.interrupts import ended_by_sigterm, kept_ctrl_c
+from ..run.memory import check_bytes, free_memory
+from ..run.own_file import absolute
+from ..run.prepare import DEFAULT, Request
+from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
+from .statistics import Statistics, merge
+from .store import CheckpointStore, Store, ZarrStore, location, require_same_functions
+from .tasks import FAILED, NOT_RUN, Members, Plan, Task
+from .vector_runs import lanes_of
+
+__all__ = ["EnsembleResult", "ensemble"]
+
+CHUNK_STEPS = 2_000_000
+INTERPRETED_STEPS = 20_000
+UNKNOWN_STEPS = 10_000
+CHUNK_BYTES = 4e6
+LARGEST_CHUNK = 4096
+LEAST_CHUNKS = 16
+TRIED = 8
+SHOWN = 5
+# Of a request: what an ensemble has of its own, or not at all.
+ALONE = {"fun", "t_span", "y0", "params", "projection", "callback", "diagnostics", "max_bytes", "progress"}
+OWN = ("executor", "reduce", "callback", "out", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(ALONE))
+
+
+class EnsembleResult(OptimizeResult):
+    """Result of `ensemble`; fields by name or by key, as in SciPy's own results.
+
+    Attributes
+    ----------
+    y : ndarray, shape (members, n)
+        Last states: at the end of the interval, or the last one before a member failed.
+    t : ndarray, shape (members,)
+        Their times.
+    status : ndarray, shape (members,)
+        0: the end was reached; 1: an event ended the member; -1: it failed; -2: it did not run (in what a broken off
+        ensemble leaves behind).
+    message : ndarray of str, shape (members,)
+        What ended each.
+    failed : ndarray
+        Indices of the members with status -1.
+    success : bool
+        Whether all members ran and none failed.
+    max_defect : ndarray, shape (members, l)
+        Largest ``|I - target|`` after a projection, where target is each member's own.
+    max_correction : ndarray, shape (members,)
+        Largest correction in local errors; nan where the method estimates none.
+    side_by_side : ndarray of bool, shape (members,)
+        Whether each ran in a vector with others, several times faster; the docs' page on ensembles says what it takes.
+    trusted : ndarray of bool, shape (members,)
+        Whether each did not fail and nothing speaks against it, as in `IntegrationResult`; else `message` says what.
+    names : tuple of str
+        Of the l invariants.
+    nfev, njev, nlu, n_rejected_projections : ndarray, shape (members,)
+    times : ndarray, shape (m,)
+        Times of saved states; empty where none were asked for.
+    trajectories : ndarray or zarr.Array or None, shape (members, n, m)
+        Saved states; nan after the end of a member that did not get there. None where they were reduced.
+    statistics : Statistics or None
+        Over all members, by ``reduce=``.
+    first : int
+        Number of the first member: 0, but for what a `callback` gets.
+    stopped : bool
+        Whether the callback stopped the ensemble.
+    wall_time : float
+        Seconds.
+    method : str
+    h : float or None
+    chunk : int
+        Members in a chunk.
+    """
+
+    def __repr__(self) -> str:
+        ran = int(np.count_nonzero(self.status != NOT_RUN))
+        step = "adaptive steps" if self.h is None else f"h = {self.h:g}"
+        members, n = self.y.shape
+        lines = [
+            f"Ensemble: {members} members of {n} components, {self.method}, {step}; {ran} ran in "
+            f"{self.wall_time:.3g} s, {np.count_nonzero(self.side_by_side)} side by side in vectors, "
+            f"{self.failed.size} failed",
+        ]
+        width = max((len(name) for name in self.names), default=0)
+        for name, defects in zip(self.names, self.max_defect[self.status >= 0].T, strict=True):
+            if defects.size:
+                lines.append(f"  {name:<{width}}  max defect {defects.max():.2e}, median {np.median(defects):.2e}")
+        doubtful = np.flatnonzero((self.status >= 0) & ~self.trusted)
+        for those, what in ((self.failed, ".failed"), (doubtful, ".trusted")):
+            lines += [f"  member {self.first + k}: {self.message[k]}" for k in those[:SHOWN]]
+            if those.size > SHOWN:
+                lines.append(f"  ... and {those.size - SHOWN} more: {what}, .message")
+        return "\n".join(lines)
+
+
+def ensemble(
+    fun: Callable[..., Any] | Problem,
+    t_span: Any = None,
+    y0s: Any = None,
+    *,
+    params: Any = None,
+    method: type[EIPSolver] = EIPRK4,
+    h: float | None = DEFAULT,
+    invariants: Any = DEFAULT,
+    executor: Any = None,
+    save_every: int | None = None,
+    t_eval: Any = None,
+    reduce: Any = None,
+    callback: Callable[[EnsembleResult], Any] | None = None,
+    out: Any = None,
+    checkpoint: Any = None,
+    checkpoint_every: float = 60.0,
+    resume: bool = False,
+    chunk: int | None = None,
+    progress: bool = False,
+    max_bytes: float | None = None,
+    **options: Any,
+) -> EnsembleResult:
+    """Integrate many members of one system: compiled, on all cores, or on a cluster.
+
+    Each member's result is that of its own `integrate`, bit for bit, on whatever and on however many workers it ran.
+    A member that fails is reported with its index and reason, and disturbs no other.
+
+    Parameters
+    ----------
+    fun : callable or Problem
+        As for `integrate`.
+    t_span : (float, float)
+        Start and end, the same for all.
+    y0s : array_like, shape (members, n)
+        Starts; one (n,) for all where `params` differ. Default: that of a `Problem`.
+    params : array_like of float, shape (p,) or (members, p), optional
+        Parameters of all members, or of each.
+    method : type, optional
+        As for `integrate`.
+    h : float, optional
+        As for `integrate`: the step; None: adaptive steps; without it, adaptive steps where rtol, atol, first_step or
+        max_step ask for them, else a problem's own step.
+    invariants : Invariant or sequence of Invariant, optional
+        What to keep: each member keeps the values at its own start. Where `params` differ, their functions take them
+        as the last argument and have no args.
+    executor : None, int, "dask", distributed.Client, DaskExecutor or concurrent.futures.Executor, optional
+        Where members run. None: threads on all cores (one, where functions are not compiled); a number: so many
+        threads. "dask": the Dask cluster of the configuration (``DASK_SCHEDULER_ADDRESS``), or a local one of a process
+        for each core; see `eip_scipy.integrations.dask`.
+    save_every : int, optional
+        Save each so many-th step of every member in ``.trajectories``; fixed steps only.
+    t_eval : array_like, optional
+        Times to save at instead.
+    reduce : "state" or callable, optional
+        Statistics over members (mean, variance, extremes) of the saved states, or of the last ones where none are
+        saved; a function ``reduce(t, y) -> float or (k,)``: of that. Trajectories are then kept in `out` only.
+    callback : callable, optional
+        ``callback(part)`` after each chunk of members, in their order, with an `EnsembleResult` of that chunk; return
+        True to stop.
+    out : path-like, optional
+        A Zarr group to write to, chunk by chunk, for trajectories that do not fit into memory; xarray opens it. The
+        path of a folder, or a URL.
+    checkpoint : path-like, optional
+        Without `out`: a file that keeps finished members, see `eip_scipy.checkpoint`; written every `checkpoint_every`
+        seconds, and when the ensemble ends or is broken off.
+    checkpoint_every : float, optional
+        Seconds; more where writing would take over a twentieth of the time.
+    resume : bool, optional
+        Go on with what is in `out` or `checkpoint`, with the same arguments: only members that are missing there run,
+        and the result has the same bits. Where there is nothing, start.
+    chunk : int, optional
+        Members that run together; results do not depend on it, but for the last bits of `reduce`.
+    progress : bool, optional
+        Show a progress bar with the time that is left.
+    max_bytes : float, optional
+        Bound on the memory for results; default: half of what is free.
+    **options
+        Those of `integrate`: in_place, events, compensated, compiled, metric, blocks, frame, direction, iterations,
+        every, reuse_f, check, project_initial, rtol, atol, first_step, max_step. Of events only terminal ones make
+        sense: they end a member, and their times are in ``.t``. `check` looks at one member.
+
+    Returns
+    -------
+    EnsembleResult
+        ``y`` (members, n), ``status``, ``message``, ``max_defect`` (members, l), ``t``, and more.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As by `integrate`, for what would fail in every member.
+    MemoryError
+        When results would need more than `max_bytes`.
+    CheckpointError
+        When `out` or `checkpoint` exists and is not to be resumed, or is damaged, or belongs to other arguments or
+        functions, or another ensemble has it, or `out` can no longer be written.
+
+    Notes
+    -----
+    Members run in chunks, whose size depends on the problem only, and chunks come back in their order, so that
+    statistics too have the same bits on any number of workers. When the ensemble is broken off (Ctrl-C, an exception of
+    the callback), the exception carries what there was as ``exception.partial``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import ensemble
+    >>> from eip_scipy.problems import kepler
+    >>> problem = kepler()
+    >>> starts = problem.y0 * np.linspace(0.99, 1.01, 5)[:, None]
+    >>> run = ensemble(problem, (0, 20), starts)
+    >>> run.y.shape, run.success, bool((run.max_defect < 1e-11).all())
+    ((5, 4), True, True)
+    """
+    _check_options(options)
+    if invariants is not DEFAULT:
+        options["invariants"] = invariants
+    if not (reduce is None or reduce == "state" or callable(reduce)):
+        raise ValueError(f"reduce must be 'state' or a function reduce(t, y), got {shown(reduce)}.")
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback must be a function callback(part), got {shown(callback)}.")
+    flag("progress", progress)
+    check_bytes(max_bytes)
+    _check_places(out, checkpoint, checkpoint_every, resume)
+    out = None if out is None else location(out)
+    checkpoint = None if checkpoint is None else absolute(checkpoint)
+    starts, parameters = _inputs(fun, y0s, params, options.get("invariants", ()))
+    keep = reduce is None or out is not None
+    common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
+    request = Request.of(fun=_bare(fun), t_span=t_span, y0=starts[0], params=parameters[0], **common)
+    if not parameters.shape[1]:
+        request = dataclasses.replace(request, params=None)
+    plan, doubts = _first_that_starts(Task(request, reduce, keep, len(starts)), starts, parameters)
+    starts = np.ascontiguousarray(starts, plan.dtype)
+    size = _chunk_size(plan, len(starts), fun) if chunk is None else count("chunk", chunk)
+    held = plan.times.size if reduce is None and out is None else 0
+    _check_memory(plan, len(starts), held, max_bytes)
+    store: Store | None = None
+    if out is not None:
+        identity = plan.identity(starts, parameters, size)
+        store = ZarrStore(out, identity, plan.empty(size), plan.times, len(starts), resume)
+    elif checkpoint is not None:
+        store = CheckpointStore(checkpoint, plan.identity(starts, parameters, size), checkpoint_every, resume)
+    with ended_by_sigterm(store is not None), nullcontext() if store is None else closing(store):
+        gathered = _Gathered(plan, len(starts), held, size, store, callback, doubts)
+        result = gathered.run(partial(_pool, executor, plan, progress), _chunks(starts, parameters, size), progress)
+    doubtful = np.flatnonzero((result.status >= 0) & ~result.trusted)
+    if doubtful.size:
+        _warn(result, doubtful)
+    return result
+
+
+def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
+    """Say that members are not to be trusted.
+
+    Raises
+    ------
+    ProjectionWarning
+        Where warnings are errors, with the result as ``partial``.
+    """
+    k = int(doubtful[0])
+    try:
+        warnings.warn(
+            f"{doubtful.size} of {result.t.size} members are not to be trusted (.trusted, .message), the first of them "
+            f"member {k}: {result.message[k]}",
+            ProjectionWarning,
+            stacklevel=3,
+        )
+    except ProjectionWarning as error:
+        error.partial = result  # type: ignore[attr-defined]
+        raise
+
+
+class _Gathered:
+    """What came back so far, and what is made of it at the end."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        members: int,
+        held: int,
+        chunk: int,
+        store: Store | None,
+        callback: Callable[[EnsembleResult], Any] | None,
+        doubts: dict[int, str],
+    ) -> None:
+        self.plan, self.chunk, self.store, self.callback, self.doubts = plan, chunk, store, callback, doubts
+        self.method = plan.task.request.method.__name__
+        self.whole = Members.empty(members, plan.size, plan.dtype, len(plan.names), held)
+        self.statistics: Statistics | None = None
+        self.stopped = False
+        self._begin = time.perf_counter()
+
+    def run(self, pool: Callable[[], Pool], chunks: Callable[[int], Iterator[Chunk]], progress: bool) -> EnsembleResult:
+        """All chunks that are not in the store yet."""
+        from tqdm import tqdm
+
+        done = self._stored(chunks)
+        total = len(self.whole.t)
+        try:
+            if done < total:
+                with (
+                    kept_ctrl_c(),
+                    tqdm(
+                        total=total,
+                        initial=done,
+                        desc=self.method,
+                        unit="member",
+                        unit_scale=True,
+                        disable=not progress,
+                    ) as bar,
+                ):
+                    self._gather(pool(), chunks(done), bar)
+        except BaseException as error:
+            error.partial = self.result()  # type: ignore[attr-defined]
+            raise
+        return self.result()
+
+    def _stored(self, chunks: Callable[[int], Iterator[Chunk]]) -> int:
+        """Take what the store has; returns the number of members."""
+        if self.store is None:
+            return 0
+        done, statistics = self.store.finished, self.store.statistics
+        for first in range(0, done, self.chunk):
+            members = self.store.read(first, min(first + self.chunk, done))
+            part = Part(members, None) if statistics is not None else finished(self.plan.task, self.plan, members)
+            self._take(first, part)
+            if first + self.chunk >= done:
+                last = next(chunks(first))
+                here = self.plan.known_by(last.y0s, last.params, members)
+                require_same_functions(self.store.path, self.store.known_by(first), *here, first)
+        self.statistics = self.statistics if statistics is None else statistics
+        return done
+
+    def _gather(self, pool: Pool, chunks: Iterator[Chunk], bar: Any) -> None:
+        with ExitStack() as stack:
+            stack.callback(pool.close)
+            if self.store is not None:
+                stack.callback(self.store.flush)  # first: whoever ends the process may not wait long
+            for chunk, part in in_order(pool, chunks):
+                self._take(chunk.first, part)
+                if self.store is not None:
+                    known_by, _ = self.plan.known_by(chunk.y0s, chunk.params, part.members)
+                    self.store.write(chunk.first, part.members, known_by, self.whole, self.statistics)
+                bar.update(len(part.members.t))
+                if self.callback is not None and self.callback(self._of(part.members, part.statistics, chunk.first)):
+                    self.stopped = True
+                    return
+
+    def _take(self, first: int, part: Part) -> None:
+        members, last = part.members, first + len(part.members.t)
+        for name, whole in self.whole._asdict().items():
+            if name != "saved" or whole.shape[1]:
+                whole[first:last] = getattr(members, name)
+        self.statistics = merge(self.statistics, part.statistics)
+
+    def result(self) -> EnsembleResult:
+        """The result as far as it is there."""
+        return self._of(self.whole, self.statistics, 0)
+
+    def _of(self, members: Members, statistics: Statistics | None, first: int) -> EnsembleResult:
+        plan, counters = self.plan, members.counters
+        trajectories = members.saved.swapaxes(1, 2) if members.saved.shape[1] else None
+        if members is self.whole and self.store is not None:
+            trajectories = self.store.states
+        trusted, message = members.trusted.copy(), np.array(members.message, dtype=object)
+        for k in range(len(trusted)) if self.doubts else ():
+            if trusted[k] and first + k in self.doubts:
+                trusted[k], message[k] = False, f"{message[k]}; {self.doubts[first + k]}"
+        return EnsembleResult(
+            y=members.y,
+            t=members.t,
+            status=members.status,
+            message=message,
+            failed=np.flatnonzero(members.status == FAILED),
+            success=bool((members.status >= 0).all()),
+            max_defect=members.max_defect,
+            max_correction=members.max_correction,
+            side_by_side=members.side_by_side,
+            trusted=trusted,
+            names=plan.names,
+            nfev=counters[:, NFEV],
+            njev=counters[:, NJEV],
+            nlu=counters[:, NLU],
+            n_rejected_projections=counters[:, REJECTED],
+            times=plan.times,
+            trajectories=trajectories,
+            statistics=statistics,
+            first=first,
+            stopped=self.stopped,
+            wall_time=time.perf_counter() - self._begin,
+            method=self.method,
+            h=plan.h,
+            chunk=self.chunk,
+        )
+
+
+def _check_options(options: dict[str, Any]) -> None:
+    """The options that go on to `integrate`."""
+    known = {option.name for option in dataclasses.fields(Request)} - ALONE | set(ProjectionOptions.names())
+    for name in options:
+        if name not in known:
+            raise TypeError(f"ensemble() has no option {name!r}{nearest(name, (*OWN, *known))}")
+    if not all(math.isfinite(times) for _, times in Events(options.get("events")).ends):
+        raise ValueError("ensemble: an event must be terminal: it ends a member; the times of others are not kept.")
+
+
+def _check_places(out: Any, checkpoint: Any, every: Any, resume: Any) -> None:
+    refuse_units(checkpoint_every=every)
+    if not is_number(every) or not every > 0:
+        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
+    flag("resume", resume)
+    if out is not None and checkpoint is not None:
+        raise ValueError("give out= or checkpoint=, not both: out keeps finished members already.")
+    for name, path in (("out", out), ("checkpoint", checkpoint)):
+        if path is not None and not isinstance(path, (str, os.PathLike)):
+            raise TypeError(f"{name} must be a path, got {path!r}.")
+    if resume and out is None and checkpoint is None:
+        raise ValueError("resume=True needs the place to go on from: out= or checkpoint=.")
+
+
+def _inputs(fun: Any, y0s: Any, params: Any, invariants: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Starts (members, n) and parameters (members, p), p = 0 where there are none."""
+    problem = fun if isinstance(fun, Problem) else None
+    if y0s is None:
+        if problem is None:
+            raise TypeError("ensemble: y0s is missing; only a Problem brings a start of its own.")
+        y0s = problem.y0
+    starts = setup.states("y0s", y0s)
+    own = None if params is None else np.atleast_1d(real_array("params", params, TypeError))
+    if starts.ndim == 1 and own is not None and own.ndim == 2:
+        starts = np.tile(starts, (len(own), 1))
+    if starts.ndim != 2 or starts.size == 0:
+        raise ValueError(f"y0s must have the shape (members, n), got {starts.shape}.")
+    if own is None:
+        brought = None if problem is None or problem.rhs is None else problem.params
+        own = np.zeros(0) if brought is None else np.asarray(brought, float).reshape(-1)
+    elif own.ndim == 2 and len(own) != len(starts):
+        raise ValueError(
+            f"params has {len(own)} rows for {len(starts)} members; give one row for each, or one for all."
+        )
+    elif own.ndim > 2:
+        raise ValueError(f"params must have the shape (p,) or (members, p), got {own.shape}.")
+    if own.ndim == 2 and any(item.args for item in as_invariants(invariants)):
+        raise ValueError(
+            "ensemble: invariants with args, and params for each member: leave args out; the functions receive each "
+            "member's params as their last argument."
+        )
+    rows = own if own.ndim == 2 else np.broadcast_to(own, (len(starts), own.size))
+    return starts, rows
+
+
+def _bare(fun: Any) -> Any:
+    """A problem without what members do not need and other processes may not be able to take."""
+    if not isinstance(fun, Problem) or fun.rhs is None:
+        return fun
+    return dataclasses.replace(fun, fun=_not_called, reference=None)
+
+
+def _not_called(t: float, y: np.ndarray) -> np.ndarray:
+    raise NotImplementedError("the problem's compiled right-hand side is in use")
+
+
+def _first_that_starts(task: Task, starts: np.ndarray, params: np.ndarray) -> tuple[Plan, dict[int, str]]:
+    """The plan by a member whose start `integrate` takes; its error where it takes none of some members.
+
+    Also what the checks of the start found, by member: it holds for all that have the same parameters.
+    """
+    first: Exception | None = None
+    for k in np.unique(np.linspace(0, len(starts) - 1, TRIED).astype(int)):
+        own = None if task.request.params is None else params[k].copy()
+        tried = dataclasses.replace(task, request=dataclasses.replace(task.request, y0=starts[k].copy(), params=own))
+        try:
+            ready = tried.prepared(tried.request.y0, own, check_start=True)
+        except Exception as error:
+            first = first or error
+        else:
+            found = ready.run.trust.message
+            ready.run.trust.doubts.clear()
+            alike: list[int] = np.flatnonzero((params == params[k]).all(axis=1)).tolist() if found else []
+            return Plan(tried, ready), dict.fromkeys(alike, found)
+    assert first is not None
+    raise first
+
+
+def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
+    """Members in a chunk, by the problem alone: about a second's work, bounded in bytes, a multiple of the lanes."""
+    rhs = fun.rhs or fun.fun if isinstance(fun, Problem) else fun
+    budget = CHUNK_STEPS if is_jitted(rhs) and plan.task.request.compiled is not False else INTERPRETED_STEPS
+    steps = plan.n_steps or UNKNOWN_STEPS
+    by_work = budget * 4 / (steps * max(4, plan.size))
+    by_bytes = CHUNK_BYTES / (plan.size * plan.dtype.itemsize * (1 + plan.times.size))
+    size = min(by_work, by_bytes, LARGEST_CHUNK, math.ceil(members / LEAST_CHUNKS))
+    lanes = lanes_of(plan.size)
+    return lanes * max(1, math.ceil(size / lanes))
+
+
+def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) -> None:
+    """Refuse to gather more than fits."""
+    bound = 0.5 * free_memory() if max_bytes is None else max_bytes
+    each = plan.size * plan.dtype.itemsize * (1 + rows) + 8 * (len(plan.names) + N_COUNTERS + 4)
+    if members * each > bound:
+        what = f"{rows} states each; raise save_every, take statistics (reduce=), write to a Zarr group (out=)"
+        mend = what if rows else "the last state of each; run them in parts"
+        raise MemoryError(
+            f"{members} members of {plan.size} components need {members * each / 1e9:.3g} GB, the bound is "
+            f"{bound / 1e9:.3g} GB. Kept are {mend}, or raise max_bytes."
+        )
+
+
+def _chunks(starts: np.ndarray, params: np.ndarray, size: int) -> Callable[[int], Iterator[Chunk]]:
+    def chunks(done: int) -> Iterator[Chunk]:
+        for first in range(done, len(starts), size):
+            yield Chunk(first, starts[first : first + size], np.ascontiguousarray(params[first : first + size]))
+
+    return chunks
+
+
+def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
+    """Where the chunks run."""
+    task, key = plan.task, uuid.uuid4().hex
+    if executor is None or isinstance(executor, (int, np.integer)):
+        plan.compile(progress=progress)
+        workers = cores() if executor is None else count("executor", executor)
+        return ThreadPool(plan, workers if plan.why_not is None else 1)
+    if isinstance(executor, Executor):
+        return FuturesPool(executor, task, key)
+    if executor == "dask" or _is_of_dask(executor):
+        # By name: the integrations are built on the package, and need what it does not.
+        return import_module("eip_scipy.integrations.dask").pool(executor, task, key)
+    raise TypeError(
+        f"executor must be None, a number of threads, 'dask', a dask.distributed Client or an executor of "
+        f"concurrent.futures, got {executor!r}."
+    )
+
+
+def _is_of_dask(executor: Any) -> bool:
+    return type(executor).__module__.partition(".")[0] == "distributed" or type(executor).__name__ == "DaskExecutor"

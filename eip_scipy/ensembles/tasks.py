@@ -1,0 +1,632 @@
+"""The members of an ensemble: one driver, set up once, that runs them one after the other.
+
+What the members share is a `Task`, which travels to other processes; in each of them it becomes a `Plan`, with
+compiled functions and buffers, which `run_members` runs. A member's result depends on nothing but the task, its start
+and its parameters: it is that of `integrate`, bit for bit, whatever ran before it and beside it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from math import isnan
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import typeof, types
+
+from ..core import setup
+from ..core.compiled_functions import ChangedShapeError, NotCompilableError, signatures
+from ..core.results import N_COUNTERS, NFEV
+from ..core.stepping import UNBOUNDED
+from ..engine import kernels as kn
+from ..engine.caching import cached_njit
+from ..engine.kernels import OK
+from ..engine.step import H_ABS, T_NEW, T, Work
+from ..engine.trust import Trust, sick
+from ..run.driver import PENDING, ROW, STEP, Grid, saved_rows
+from ..run.integrate import ARRIVED, Loop
+from ..run.prepare import Prepared, Request, prepared
+from ..run.resume import Keeper
+from .vector_runs import Batch
+
+__all__ = ["COMPARED", "FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
+
+FAILED, NOT_RUN = -1, -2
+DOUBTFUL = -1
+BATCH_SECONDS = 0.1
+LEAST_WORK = 3e7  # floats times steps, a second or two: compiling functions for vectors takes as long
+COMPARED = 16
+
+
+class StoppedError(Exception):
+    """The ensemble was stopped while members ran."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What all members share, as it travels to other processes.
+
+    Attributes
+    ----------
+    request : Request
+        What `integrate` is asked for a member whose start it takes: all that members share.
+    reduce : callable, "state" or None
+        What `Statistics` are wanted of.
+    keep : bool
+        Whether the saved states themselves are wanted.
+    members : int
+        How many there are in all.
+    """
+
+    request: Request
+    reduce: Any = None
+    keep: bool = True
+    members: int = 1
+
+    def prepared(self, y0: np.ndarray, params: np.ndarray | None, *, check_start: bool = False) -> Prepared:
+        """The run of one member, as `integrate` prepares it."""
+        return prepared(replace(self.request, y0=y0, params=params), check_start=check_start)
+
+
+class Members(NamedTuple):
+    """What some members came to.
+
+    Attributes
+    ----------
+    y : ndarray, shape (m, n)
+        Last states.
+    t : ndarray, shape (m,)
+        Their times.
+    status : ndarray, shape (m,)
+        As in `integrate`: 0, 1, or FAILED; NOT_RUN where nothing was computed.
+    message : list of str
+    max_defect : ndarray, shape (m, l)
+    counters : ndarray, shape (m, N_COUNTERS)
+        Those of the step, in the places that `result` names.
+    max_correction : ndarray, shape (m,)
+        In local errors.
+    side_by_side : ndarray of bool, shape (m,)
+        Whether the member ran in a vector with others.
+    trusted : ndarray of bool, shape (m,)
+        Whether it did not fail and nothing speaks against it.
+    saved : ndarray, shape (m, times, n)
+        States at the plan's `times`; nan after the end of a member that did not reach them. No times: shape (m, 0, n).
+    """
+
+    y: np.ndarray
+    t: np.ndarray
+    status: np.ndarray
+    message: list[str]
+    max_defect: np.ndarray
+    counters: np.ndarray
+    max_correction: np.ndarray
+    side_by_side: np.ndarray
+    trusted: np.ndarray
+    saved: np.ndarray
+
+    @classmethod
+    def empty(cls, m: int, n: int, dtype: Any, invariants: int, times: int) -> Members:
+        """Members that did not run."""
+        return cls(
+            y=np.full((m, n), np.nan, dtype),
+            t=np.full(m, np.nan),
+            status=np.full(m, NOT_RUN),
+            message=["not run"] * m,
+            max_defect=np.full((m, invariants), np.nan),
+            counters=np.zeros((m, N_COUNTERS), np.int64),
+            max_correction=np.full(m, np.nan),
+            side_by_side=np.zeros(m, bool),
+            trusted=np.zeros(m, bool),
+            saved=np.full((m, times, n), np.nan, dtype),
+        )
+
+
+class Plan:
+    """A task in one process: compiled where it can be, with a driver for each thread that asks for one.
+
+    Attributes
+    ----------
+    task : Task
+    why_not : str or None
+        Why the members run interpreted; None: they are compiled.
+    names : tuple of str
+        Of the l invariants.
+    times : ndarray, shape (rows,)
+        Times at which states are saved; none where only the last state is wanted.
+    n_steps : int or None
+        Steps of one member, where that is known.
+    """
+
+    def __init__(self, task: Task, ready: Prepared | None = None) -> None:
+        """`ready`: the task's own member, where it is prepared already."""
+        self.task = task
+        self._ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
+        grid, run = self._ready.grid, self._ready.run
+        self.why_not: str | None = None
+        self.names = tuple(run.invariants.names)
+        self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, grid.span.t0
+        self.t_bound, self.h = grid.span.t_bound, self._ready.stepping.h
+        self.times = saved_times(grid)
+        self.n_steps = None if grid.span.n_steps >= UNBOUNDED else grid.span.n_steps
+        first = np.concatenate([run.work.K[0], run.invariants.start_values])
+        self._start_values = [repr(value) for value in first[:COMPARED].tolist()]
+        self._together, self._idle = False, list[Sweeper]()
+
+    def compile(self, *, progress: bool = False) -> Plan:
+        """Make the plan itself ready to run, before there are threads that would all compile."""
+        ready = self._ready
+        loop = Loop(replace(ready, request=replace(ready.request, progress=progress)), Keeper())
+        self.why_not = loop.why_not
+        own_targets = any(item.target is not None for item in ready.run.invariants.items)
+        own_start = ready.run.identity["project_initial"] or own_targets
+        single = own_start or loop.events.functions or ready.grid.t_eval.size
+        self._together = self.why_not is None and not single
+        self._idle = [Sweeper(loop, self.task.members)] if self._together else []
+        none = np.zeros((0, self.size), self.dtype), np.zeros((0, loop.driver.params.size))
+        run_members(self, *none)
+        return self
+
+    def empty(self, m: int) -> Members:
+        """Room for `m` members."""
+        return Members.empty(m, self.size, self.dtype, len(self.names), self.times.size)
+
+    def states(self, members: Members) -> tuple[np.ndarray, np.ndarray]:
+        """Times (m,) and states (members, m, n) to look at: saved ones, else the last; nan where a member failed."""
+        if self.times.size:
+            return self.times, members.saved
+        last = np.where((members.status >= 0)[:, None], members.y, np.nan)
+        return np.array([self.t_bound]), last[:, None]
+
+    def loop(self, y0: np.ndarray, params: np.ndarray) -> Loop:
+        """The run of one member by itself."""
+        return Loop(self._prepared(y0, params), Keeper())
+
+    def _prepared(self, y0: np.ndarray, params: np.ndarray) -> Prepared:
+        return self.task.prepared(y0, None if self.task.request.params is None else params)
+
+    def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int) -> dict[str, Any]:
+        """What makes two ensembles the same, as JSON holds it: settings, and what their functions give at one start."""
+        return {"settings": self._ready.identity(starts, params) | {"chunk": chunk}, "start": self._start_values}
+
+    def known_by(self, y0s: np.ndarray, params: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
+        """What the functions give at the end of the first of these members that came to one, and how large they are.
+
+        By it they are recognised when an ensemble goes on, as by what they give at the start. Nothing where no member
+        came to an end, or the functions fail there.
+        """
+        nothing, ended = np.zeros(0), np.flatnonzero(members.status >= 0)
+        if not ended.size:
+            return nothing, nothing
+        k = int(ended[0])
+        t, y = float(members.t[k]), members.y[k].copy()
+        try:
+            ready = self._prepared(y0s[k], params[k])
+            f, invariants = ready.system.derivative(t, y.copy()), ready.run.invariants
+            values, sizes = invariants.values(t, y), invariants.term_sizes(t, y, f)
+        except Exception:
+            return nothing, nothing
+        f = f.view(float)
+        some = f[np.linspace(0, f.size - 1, min(f.size, COMPARED)).astype(int)]
+        found = np.append(some, values), np.append(np.full(some.size, np.abs(f).max()), sizes)
+        return found if np.isfinite(found).all() else (nothing, nothing)
+
+    @contextmanager
+    def driver(self) -> Iterator[Sweeper | None]:
+        """A driver that no other thread uses now; None where each member needs its own."""
+        if not self._together:
+            yield None
+            return
+        try:
+            mine = self._idle.pop()
+        except IndexError:
+            request = self.task.request
+            mine = Sweeper(Loop(self.task.prepared(request.y0, request.params), Keeper()), self.task.members)
+        yield mine
+        self._idle.append(mine)
+
+
+def saved_times(grid: Grid) -> np.ndarray:
+    """Times of the rows that a run saves; none where it saves its two ends only.
+
+    Raises
+    ------
+    ValueError
+        Where each member would save at times of its own.
+    """
+    if grid.t_eval.size:
+        return grid.t_eval.copy()
+    if grid.save_every == 0:
+        return np.zeros(0)
+    if saved_rows(grid) == 0:
+        raise ValueError(
+            "save_every in an ensemble needs fixed steps h and a finite interval: with adaptive steps each member "
+            "would save at times of its own; give t_eval."
+        )
+    times = grid.span.t0 + saved_steps(grid) * grid.span.h
+    times[-1] = grid.span.t_bound
+    return times
+
+
+def saved_steps(grid: Grid) -> np.ndarray:
+    """Steps after which a run of fixed steps saves its state, the start included."""
+    return np.unique([*range(0, grid.span.n_steps, grid.save_every or grid.span.n_steps), grid.span.n_steps])
+
+
+def run_members(plan: Plan, y0s: np.ndarray, params: np.ndarray, stop: threading.Event | None = None) -> Members:
+    """Run members one after the other.
+
+    Parameters
+    ----------
+    plan : Plan
+    y0s : ndarray, shape (m, n)
+        Starts, of the plan's dtype.
+    params : ndarray, shape (m, p)
+        Parameters of each; p = 0 where the functions take none.
+    stop : threading.Event, optional
+        Set it to stop within some tenths of a second.
+
+    Returns
+    -------
+    Members
+        In the order of the starts. A member that fails (also by an exception of the user's functions) has the status
+        FAILED and says why; the others are as if it were not there.
+
+    Raises
+    ------
+    StoppedError
+        When `stop` is set.
+    """
+    out = plan.empty(len(y0s))
+    watch = _Watch(stop)
+    with plan.driver() as driver:
+        if driver is not None:
+            driver.run(plan, y0s, params, out, watch)
+        else:
+            for k in range(len(y0s)):
+                _alone(plan, k, y0s[k], params[k], out, watch)
+    return out
+
+
+class _Watch:
+    """In the place of a progress bar: the one thing that a run calls now and then."""
+
+    n = 0.0
+
+    def __init__(self, stop: threading.Event | None) -> None:
+        self._stop = stop
+
+    def update(self, amount: float = 0.0) -> None:
+        if self._stop is not None and self._stop.is_set():
+            raise StoppedError
+
+
+def _alone(plan: Plan, k: int, y0: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
+    """One member as `integrate` runs it."""
+    try:
+        loop = plan.loop(y0, params)
+    except Exception as error:
+        out.y[k], out.t[k] = y0, plan.t0
+        _describe(out, k, FAILED, _reason(error))
+        return
+    _finish(plan, loop, k, out, watch)
+    rows = min(loop.driver.rows, plan.times.size)
+    same = np.flatnonzero(loop.driver.t[:rows] != plan.times[:rows])
+    rows = int(same[0]) if same.size else rows
+    out.saved[k, :rows] = loop.driver.y[:rows]
+
+
+def _finish(plan: Plan, loop: Loop, k: int, out: Members, watch: _Watch) -> None:
+    """Run a member to its end, and store what it came to."""
+    try:
+        status, message = loop.steps(watch)
+    except StoppedError:
+        raise
+    except Exception as error:
+        status, message = FAILED, _reason(error)
+    _store(loop, k, status, loop.explained(message), out)
+
+
+def _store(loop: Loop, k: int, status: int, message: str, out: Members) -> None:
+    driver, work = loop.driver, loop.driver.run.work
+    t, y = driver.now
+    if status == 1:
+        t, y = loop.events.last or (t, y)
+    out.y[k], out.t[k] = y, t
+    out.max_defect[k] = work.max_defect
+    out.counters[k] = work.counters
+    out.max_correction[k] = loop.diagnostics.max_correction
+    out.trusted[k] = driver.run.trust.trusted and status >= 0
+    _describe(out, k, status, message)
+
+
+def _describe(out: Members, k: int, status: int, message: str) -> None:
+    out.status[k] = status
+    out.message[k] = message
+
+
+def _reason(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def sweep(
+    advance, rhs, inv, grad, event, params, grid, m, o, w, y, y_r, y_new, y_new_r, t_saved,
+    buffers, fresh, G, G_r, where, last, k_end, starts, taus, evaluations, all_params, saved, ends, defects, counters,
+    corrections, figures,
+):  # fmt: skip
+    """Members from where[0] to `last`, by the driver `advance`.
+
+    Returns its code; where[0] is then `last`, or the member that it is about, which Python looks at: it failed, or is
+    not at its end after `k_end` steps, or (DOUBTFUL) its start is not finite in some part.
+    """
+    place, clock = grid.place, grid.clock
+    t0 = grid.span.t0
+    while where[0] < last:
+        k = where[0]
+        for i in range(len(buffers)):
+            kn.copy(fresh[i], buffers[i])
+        kn.copy(all_params[k], params)
+        kn.copy(starts[k], y)
+        place[STEP] = 0
+        place[PENDING] = 0
+        clock[T] = t0
+        clock[T_NEW] = t0
+        clock[H_ABS] = taus[k]
+        if isnan(taus[k]):
+            return DOUBTFUL
+        rhs(t0, y, w.K[0], params)
+        w.counters[NFEV] = evaluations
+        inv(t0, y, o.target, params)
+        grad(t0, y, w.K[0], G, params)
+        sound = kn.all_finite(y_r) and kn.all_finite(w.K_r[0]) and kn.all_finite(o.target)
+        if not (sound and kn.all_finite(G_r.reshape(-1))):
+            return DOUBTFUL
+        if o.watched:
+            kn.start_figures(o.target, o.target, o.scales, G_r, y_r, w.K_r[0], taus[k], w.trust)
+        rows = saved[min(k, saved.shape[0] - 1)]
+        t_saved[0] = t0
+        kn.copy(y_r, rows[0])
+        place[ROW] = 1
+        code = advance(rhs, inv, grad, event, params, grid, k_end, m, o, w, y, y_r, y_new, y_new_r, t_saved, rows)
+        if code != OK or clock[T] != grid.span.t_bound:
+            return code
+        kn.copy(y, ends[k])
+        kn.copy(w.max_defect, defects[k])
+        kn.copy(w.counters, counters[k])
+        corrections[k] = w.max_correction[0]
+        kn.copy(w.trust.reshape(-1), figures[k])
+        where[0] += 1
+    return OK
+
+
+@cache
+def _compiled_sweep(dtype: np.dtype, advance: Any, arguments: tuple[Any, ...]) -> Callable[..., int]:
+    """The sweep compiled for one type of driver, which it calls by its address: seconds, then cached on disk."""
+    rhs, inv, grad = signatures(dtype)
+    functions = [types.FunctionType(s) for s in (types.int64(*advance), rhs, inv, grad, inv)]
+    signature = types.int64(*functions, *arguments)
+    return cached_njit([signature], error_model="numpy", nogil=True, _nrt=False)(sweep)
+
+
+def _batch(loop: Loop) -> Batch | None:
+    """Buffers for members side by side; None where they cannot run so."""
+    try:
+        return Batch(loop)
+    except NotCompilableError:
+        return None
+
+
+class _Each(NamedTuple):
+    """What a driver needs of the members it runs, by member.
+
+    Starts and parameters, lengths of the first steps, evaluations before them, rows for saved states, and the figures
+    of `Trust`, flat.
+    """
+
+    y0s: np.ndarray
+    params: np.ndarray
+    taus: np.ndarray
+    evaluations: int
+    saved: np.ndarray | None
+    figures: np.ndarray
+
+
+class Sweeper:
+    """A compiled driver with its buffers, which runs member after member."""
+
+    def __init__(self, loop: Loop, members: int) -> None:
+        self.loop = loop
+        driver, span = loop.driver, loop.driver.grid.span
+        buffers = _buffers(driver.run.work)
+        self._buffers = tuple(a.reshape(-1).view(np.int64) for a in buffers)
+        self._fresh = tuple(a.copy() for a in self._buffers)
+        self._evaluations = int(driver.run.work.counters[NFEV])
+        self._G = np.zeros_like(driver.run.work.G)
+        self._where = np.zeros(1, np.int64)
+        self._compiled: Callable[..., int] | None = None
+        self._row_buffer = driver.y[None].view(float)
+        self._batch = _batch(loop) if members * span.n_steps * driver.run.y0.size >= LEAST_WORK else None
+
+    def run(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
+        """All members into `out`."""
+        loop, driver = self.loop, self.loop.driver
+        m, trust = len(y0s), driver.run.work.trust
+        taus, evaluations = self._first_steps(plan, y0s, params)
+        saved = np.empty((m, driver.t.size, plan.size), plan.dtype) if plan.times.size else None
+        y0s, params = (np.require(a, requirements=["C", "W"]) for a in (y0s, params))  # one type for compiled code
+        each = _Each(y0s, params, taus, evaluations, saved, np.zeros((m, trust.size)))
+        first, again = self._side_by_side(plan, each, out, watch)
+        if m == 0:
+            self._sweep(0, each, out)
+        self._one_by_one(plan, first, m, each, out, watch)
+        for k in again:
+            self._one_by_one(plan, k, k + 1, each, out, watch)
+        self._look_at_ends(each, out)
+        if saved is not None:
+            out.saved[:] = saved[:, : plan.times.size]
+        if np.isnan(loop.diagnostics.max_correction):  # no error estimate to measure by
+            out.max_correction[:] = np.nan
+
+    def _one_by_one(self, plan: Plan, first: int, m: int, each: _Each, out: Members, watch: _Watch) -> None:
+        """Members `first` to `m`."""
+        driver, where, batch = self.loop.driver, self._where, 1
+        where[0] = first
+        while where[0] < m:
+            watch.update()
+            last, begin = min(m, int(where[0]) + batch), time.perf_counter()
+            first = int(where[0])
+            reason, code = None, OK
+            try:
+                code = self._sweep(last, each, out)
+            except ChangedShapeError as error:
+                driver.place(error)
+                reason = _reason(error)
+            except Exception as error:
+                reason = _reason(error)
+            done = int(where[0])
+            self._arrived(slice(first, done), each, out)
+            if done < last:
+                if each.saved is not None:
+                    driver.y = each.saved[done]
+                self._look_at(plan, done, code, reason, each.y0s[done], each.params[done], out, watch)
+                if code == DOUBTFUL and each.saved is not None:
+                    each.saved[done, :-1] = out.saved[done]
+                elif each.saved is not None:
+                    each.saved[done, driver.rows :] = np.nan
+                where[0] += 1
+            elif time.perf_counter() - begin < BATCH_SECONDS:
+                batch *= 2
+
+    def _look_at_ends(self, each: _Each, out: Members) -> None:
+        """Check the invariants at the end of the first member that got there and, where they are none, of all."""
+        driver = self.loop.driver
+        run, t = driver.run, driver.grid.span.t_bound
+        arrived = np.flatnonzero(out.status == 0)
+        if not run.options.watched:
+            return
+        for k in arrived:
+            driver.params[:] = each.params[k]
+            f = self._derivative(each.params[k])(t, out.y[k])
+            found = next(run.invariants.complaints(t, out.y[k], f, each.taus[k]), None)
+            if found is not None:
+                trust = Trust(run.invariants.names, each.figures[k].reshape(run.work.trust.shape))
+                trust.doubts.append(found.text)
+                out.trusted[k] = False
+                out.message[k] = f"{ARRIVED}; {trust.message}"
+            elif k == arrived[0]:
+                return
+
+    def _arrived(self, those: slice, each: _Each, out: Members) -> None:
+        """Members that the sweep took to their ends, and what their corrections say."""
+        run = self.loop.driver.run
+        out.status[those] = 0
+        out.t[those] = self.loop.driver.grid.span.t_bound
+        figures = each.figures[those].reshape(those.stop - those.start, *run.work.trust.shape)
+        out.trusted[those] = ~sick(figures).any(axis=1)
+        out.message[those] = [
+            ARRIVED if trusted else f"{ARRIVED}; {Trust(run.invariants.names, rows).message}"
+            for trusted, rows in zip(out.trusted[those], figures, strict=True)
+        ]
+
+    def _side_by_side(self, plan: Plan, each: _Each, out: Members, watch: _Watch) -> tuple[int, list[int]]:
+        """Run members in batches, while there are enough; how many have run, and which are to run again alone."""
+        batch, m, saved = self._batch, len(each.y0s), each.saved
+        if batch is None:
+            return 0, []
+        if m == 0:
+            batch.compile()
+        meetings = saved_steps(self.loop.driver.grid)[1:].tolist()
+        first, again = 0, []
+        while m - first >= batch.lanes // 4:
+            group = slice(first, min(m, first + batch.lanes))
+
+            def save(row: int, states: np.ndarray, group: slice = group) -> None:
+                if saved is not None:
+                    saved[group, row + 1] = states
+
+            if saved is not None:
+                saved[group, 0] = each.y0s[group]
+            ends = batch.run(each.y0s[group], each.params[group], each.evaluations, meetings, save, watch.update)
+            for k, end in zip(range(group.start, group.stop), ends, strict=True):
+                if end is None:
+                    again.append(k)
+                    continue
+                out.y[k], out.t[k], out.max_defect[k] = end.y, end.t, end.max_defect
+                out.max_correction[k], out.counters[k] = end.max_correction, end.counters
+                out.side_by_side[k], out.trusted[k] = True, not end.reason
+                _describe(out, k, FAILED if end.reason else 0, end.reason or ARRIVED)
+            first = group.stop
+        return first, again
+
+    def _sweep(self, last: int, each: _Each, out: Members) -> int:
+        driver, G = self.loop.driver, self._G
+        rows = self._row_buffer if each.saved is None else each.saved.view(float)
+        passed = (
+            *(driver.params, driver.grid, *driver._tail, driver.t, self._buffers, self._fresh, G),
+            *(G.view(float), self._where, last, self.loop.chunk),
+            *(each.y0s, each.taus, each.evaluations, each.params, rows),
+            *(out.y, out.max_defect, out.counters, out.max_correction, each.figures),
+        )
+        advance: Any = driver._advance
+        if self._compiled is None:
+            signature = advance.nopython_signatures[0].args
+            self._compiled = _compiled_sweep(driver.run.y0.dtype, signature, tuple(typeof(a) for a in passed))
+        return self._compiled(advance, *driver.functions, *passed)
+
+    def _look_at(
+        self,
+        plan: Plan,
+        k: int,
+        code: int,
+        reason: str | None,
+        y0: np.ndarray,
+        params: np.ndarray,
+        out: Members,
+        watch: _Watch,
+    ) -> None:
+        """A member that the sweep came back with."""
+        loop = self.loop
+        if reason is not None:
+            _store(loop, k, FAILED, reason, out)
+        elif code == DOUBTFUL:
+            _alone(plan, k, y0, params, out, watch)
+        elif code == OK:
+            loop.chunk *= 2  # so that the next one ends within the sweep
+            loop.driver.run.trust.doubts.clear()
+            _finish(plan, loop, k, out, watch)
+        else:
+            _store(loop, k, FAILED, setup.failure(code, loop.driver.run, loop.driver.grid.clock), out)
+
+    def _first_steps(self, plan: Plan, y0s: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, int]:
+        """Lengths of the first steps, and the evaluations before them."""
+        driver, stepping = self.loop.driver, self.loop.stepping
+        if stepping.h is not None or stepping.first_step is not None:
+            return np.full(len(y0s), stepping.h or stepping.first_step, float), self._evaluations
+        taus = np.empty(len(y0s))
+        for k, (y0, p) in enumerate(zip(y0s, params, strict=True)):
+            derivative = self._derivative(p)
+            try:
+                taus[k] = stepping.first(derivative, y0, derivative(driver.grid.span.t0, y0), self.loop.tableau)
+            except Exception:
+                taus[k] = np.nan
+        return taus, self._evaluations
+
+    def _derivative(self, params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
+        rhs = self.loop.driver.functions.rhs
+
+        def derivative(t: float, y: np.ndarray) -> np.ndarray:
+            out = np.zeros_like(y)
+            rhs(t, y, out, params)
+            return out
+
+        return derivative
+
+
+def _buffers(work: Work) -> list[np.ndarray]:
+    """All arrays of a run's work, each once."""
+    own = [a for name, a in work._asdict().items() if name != "inner" and not name.endswith("_r")]
+    return [*own, *work.inner]

@@ -1,0 +1,200 @@
+"""Point masses: Newton's gravitation, and further forces by name."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...core.inputs import refuse_units
+from ...core.invariants import Invariant
+from ...core.problem import Problem, bind
+from . import _newton
+from . import forces as _forces
+from .forces import ForceConstants
+
+__all__ = ["nbody"]
+
+# Relative speeds in units of the escape speed beyond which all bodies are said to be in wrong units. AU/day taken for
+# AU/yr is a factor of 365; a close flyby reaches 30, an orbit of eccentricity 0.9999 is at 1/140 in its apocentre.
+TOO_FAST, TOO_SLOW = 80.0, 1 / 150
+
+
+def nbody(
+    gm: Any,
+    position: Any,
+    velocity: Any,
+    *,
+    t_span: tuple[float, float],
+    h: float | None = None,
+    forces: str | Sequence[str] = (),
+    constants: ForceConstants | None = None,
+    name: str = "nbody",
+    units: str = "",
+    source: str = "",
+    reference: Callable[[float], np.ndarray | None] | None = None,
+) -> Problem:
+    """N point masses under Newton's gravitation, with further forces where an accuracy asks for them.
+
+    Parameters
+    ----------
+    gm : array_like, shape (N,)
+        G times the masses, in the units of length and time of the state; 0 for test particles, which are attracted and
+        do not attract.
+    position, velocity : array_like, shape (N, 3)
+    t_span : (float, float)
+    h : float, optional
+    forces : str or sequence of str, optional
+        What is added to Newton's gravitation, all of it from the first body (the Sun) but for "eih":
+
+        "1pn"
+            First post-Newtonian terms of the Sun's field in harmonic coordinates, in positions and velocities relative
+            to the Sun.
+        "eih"
+            First post-Newtonian terms of all bodies, by Einstein, Infeld and Hoffmann.
+        "gr-potential"
+            The potential ``-3 (G M)^2 m / (c^2 r^2)``: the right advance of the perihelion, not the right period
+            (Nobili and Roxburgh 1986).
+        "j2"
+            The Sun's oblateness.
+        "moon-quadrupole"
+            The Moon smeared out along a circle around the Earth, for data with one body for the two.
+
+        At most one of the first three.
+    constants : ForceConstants, optional
+        The speed of light and what else the forces need, in the units of the state.
+    name, units, source : str, optional
+    reference : callable, optional
+
+    Returns
+    -------
+    Problem
+        State (q_1, ..., q_N, v_1, ..., v_N), each with 3 components. Invariants: "H", the energy times G, and "L", the
+        angular momentum times G. Momentum and centre of mass are in the `frame`; `blocks` are the bodies'
+        positions and velocities.
+
+    Raises
+    ------
+    ValueError
+        When shapes disagree, a mass is negative, all are 0, two bodies are in one place, or for unknown forces.
+
+    Warns
+    -----
+    UserWarning
+        When all relative speeds are far from orbital ones, as with units mixed up.
+
+    Notes
+    -----
+    A test particle's motion enters none of the invariants: their gradients are 0 there, and no correction moves it.
+
+    An invariant is given only where the equations have it:
+
+    ================================  ======================================================================
+    forces                            invariants
+    ================================  ======================================================================
+    none, "gr-potential",             "H" and "L", exact
+    "moon-quadrupole"
+    "j2", also with these two         "H" and "L_pole", the component of L along the Sun's pole, exact
+    "1pn" alone, two bodies           "H" and "L" of the relative motion, per reduced mass, exact
+    "1pn" otherwise                   none: no more bodies have an exact energy with it
+    "eih"                             "H" and "L" ("L_pole" with "j2") with their terms in 1/c^2. What is left
+                                      is of the order of 1/c^4; they are given where that is below 1e-13 at
+                                      the start, as in the solar system, and otherwise left out
+    ================================  ======================================================================
+
+    Momentum and centre of mass are Newton's, exact, with all but "eih", whose own momentum differs in 1/c^2; there the
+    frame only keeps corrections from moving the centre of mass. With "1pn" and "eih" accelerations depend on
+    velocities: `acc` is None, and Nystrom methods do not apply.
+    """
+    refuse_units(gm=gm, position=position, velocity=velocity, t_span=t_span, h=h)
+    masses, q, v = _checked(gm, position, velocity)
+    chosen = _forces.check_forces(forces)
+    y0 = np.concatenate([q.ravel(), v.ravel()])
+    params = _forces.parameters(masses, chosen, constants) if chosen else masses
+    rhs, acc = _forces.equations(chosen) if chosen else (_newton.rhs, _newton.acc)
+    return Problem(
+        name=name,
+        fun=bind(rhs, params),
+        rhs=rhs,
+        acc=acc,
+        y0=y0,
+        t_span=(float(t_span[0]), float(t_span[1])),
+        h=h,
+        params=params,
+        invariants=_forces.invariants(chosen, params, y0) if chosen else _newtonian(params),
+        blocks=3,
+        frame=recoil(masses),
+        units=units,
+        source=source,
+        reference=reference,
+    )
+
+
+def _newtonian(params: np.ndarray) -> tuple[Invariant, Invariant]:
+    return (
+        Invariant(_newton.energy, _newton.energy_gradient, args=(params,), in_place=True, uses_f=True, name="H"),
+        Invariant(_newton.momentum, _newton.momentum_gradient, args=(params,), in_place=True, name="L"),
+    )
+
+
+def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    masses, q, v = (np.array(x, dtype=float) for x in (gm, position, velocity))
+    n = masses.size
+    if masses.ndim != 1 or q.shape != (n, 3) or v.shape != (n, 3):
+        raise ValueError(
+            f"nbody: gm {masses.shape}, position {q.shape}, velocity {v.shape}; expected (N,), (N, 3), (N, 3)."
+        )
+    if not (np.all(masses >= 0) and np.isfinite(masses).all()):
+        k = int(np.argmax(~(np.isfinite(masses) & (masses >= 0))))
+        raise ValueError(f"nbody: every G m must be positive, or 0 for a test particle; gm[{k}] is {masses[k]}.")
+    if not masses.any():
+        raise ValueError("nbody: every G m is 0, so nothing attracts; at least one must be positive.")
+    if not (np.isfinite(q).all() and np.isfinite(v).all()):
+        raise ValueError("nbody: position and velocity must be finite.")
+    _check_speeds(_relative_speeds(masses, q, v))
+    return masses, q, v
+
+
+def _relative_speeds(gm: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Speeds relative to the body that binds each most, in units of the escape speed; those at rest are left out."""
+    found = []
+    for i in range(gm.size):  # row by row: all pairs at once would take the memory of N^2 distances
+        distance = np.linalg.norm(q - q[i], axis=1)
+        distance[i] = np.inf
+        if (distance == 0).any():
+            j = int(np.argmin(distance))
+            raise ValueError(
+                f"nbody: bodies {i} and {j} are at the same place, {q[i]}; move one, or make them one body."
+            )
+        pair = (gm + gm[i]) / distance
+        j = int(np.argmax(pair))
+        speed = np.linalg.norm(v[i] - v[j])
+        if speed > 0 and pair[j] > 0:
+            found.append(speed / np.sqrt(2 * pair[j]))
+    return np.array(found)
+
+
+def _check_speeds(ratio: np.ndarray) -> None:
+    """Warn when every body is far too fast, or too slow: units that do not go together."""
+    if ratio.size and (ratio.min() > TOO_FAST or ratio.max() < TOO_SLOW):
+        warnings.warn(
+            f"nbody: relative speeds are {ratio.min():.2g} to {ratio.max():.2g} times the escape speed; check that "
+            "position, velocity and gm are in the same units of length and time (AU/day taken for AU/yr is a factor of "
+            "365).",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The frame (C, S): centre of mass and momentum, kept by shifts of the bodies in proportion to their masses.
+
+    So the recoil of a planet's correction goes to its star. A common shift would move the outer planets as far.
+    """
+    axes = np.eye(3)
+    share = gm / gm.sum()
+    C = np.kron(np.eye(2), np.kron(share, axes))
+    S = np.kron(np.eye(2), np.kron(share[:, None], axes))
+    return C, S

@@ -1,0 +1,145 @@
+"""Hard scenes of celestial mechanics: close encounters, chaos, choreography; each with a reference state at its end.
+
+The starts are here; the reference states are data (``data/scene_references.json``), made in 160-bit arithmetic by
+``benchmarks/scene_references.py``.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+
+from ...core.inputs import refuse_units
+from ...core.problem import Problem
+from . import solar_data
+from .nbody import nbody
+
+__all__ = ["comet", "figure_eight", "pythagorean"]
+
+FIGURE_EIGHT_PERIOD = 6.32591398
+YEAR_DAYS = 365.25
+# 1e13 kg, a nucleus of about 3 km, in solar masses.
+COMET_MASS = 5e-18
+# From the Sun, at the epoch of the DE440 data; AU and AU per year.
+COMET_POSITION = np.array([1.002501036766, 3.897477161147, 2.176397333067])
+COMET_VELOCITY = np.array([-2.100710600073, -0.613156552068, 0.134394494981])
+
+
+def pythagorean() -> Problem:
+    """Burrau's three bodies: masses 3, 4 and 5 at rest in the corners of the triangle with these sides.
+
+    Returns
+    -------
+    Problem
+        To t = 70, G = 1. Near t = 15.83 the bodies 4 and 5 pass within 4e-4 of each other; from about t = 60 they are a
+        binary, and 3 leaves. Invariants as those of `nbody`; the angular momentum is zero. With `reference` states at
+        t = 10, 20, ..., 70.
+
+    References
+    ----------
+    C. Burrau, Numerische Berechnung eines Spezialfalles des Dreikörperproblems, Astronomische Nachrichten 195 (1913)
+    113-118. V. Szebehely, C. F. Peters, Complete solution of a general problem of three bodies, Astronomical Journal
+    72 (1967) 876-883.
+    """
+    return nbody(
+        [3.0, 4.0, 5.0],
+        [[1.0, 3.0, 0.0], [-2.0, -1.0, 0.0], [1.0, -1.0, 0.0]],
+        np.zeros((3, 3)),
+        t_span=(0.0, 70.0),
+        name="pythagorean",
+        units="G = 1",
+        source="Burrau (1913); Szebehely & Peters, AJ 72 (1967) 876",
+        reference=lambda t: _reference("pythagorean", t),
+    )
+
+
+def figure_eight(periods: float = 100.0) -> Problem:
+    """Three equal masses that chase each other along an eight.
+
+    Parameters
+    ----------
+    periods : float, optional
+        Length of the interval in periods, T = 6.32591398.
+
+    Returns
+    -------
+    Problem
+        With the eight digits of the start that were published: after T it returns to 1e-7. Invariants as those of
+        `nbody`; the angular momentum is zero. With `reference` states after 1, 10 and 100 periods.
+
+    Raises
+    ------
+    ValueError
+        When `periods` is not positive.
+
+    References
+    ----------
+    A. Chenciner, R. Montgomery, A remarkable periodic solution of the three-body problem in the case of equal masses,
+    Annals of Mathematics 152 (2000) 881-901; initial data by C. Simó, there.
+    """
+    refuse_units(periods=periods)
+    if not (periods > 0 and np.isfinite(periods)):
+        raise ValueError(f"figure_eight: periods must be positive and finite, got {periods!r}.")
+    q = np.array([0.97000436, -0.24308753, 0.0])
+    v = np.array([-0.93240737, -0.86473146, 0.0])
+    return nbody(
+        np.ones(3),
+        [q, -q, np.zeros(3)],
+        [-v / 2, -v / 2, v],
+        t_span=(0.0, periods * FIGURE_EIGHT_PERIOD),
+        h=FIGURE_EIGHT_PERIOD / 100,
+        name="figure-eight",
+        units="G = 1",
+        source="Chenciner & Montgomery, Ann. Math. 152 (2000) 881 (data by Simó)",
+        reference=lambda t: _reference("figure-eight", t),
+    )
+
+
+def comet() -> Problem:
+    """A short-period comet that one passage of Jupiter throws far out; Sun, Jupiter, Saturn and the comet.
+
+    Returns
+    -------
+    Problem
+        Twenty years, in AU and years, centre of mass at rest. Sun, Jupiter and Saturn start from the DE440 data of
+        `SolarSystemData` (2014-02-02); the comet is synthetic, a body of 1e13 kg placed so that after 10 years it
+        passes Jupiter's centre at 3.0 radii (0.0014 AU), about as near as Lexell's comet did in 1779. Before that its
+        semi-major axis is 3.2 AU, with perihelia at 1.3 AU; afterwards 500 AU. An error before the passage has grown
+        700-fold at the end. Invariants as those of `nbody`, to which the comet contributes 1e-17: they do not see it.
+        With the `reference` state at 20 years.
+    """
+    data = solar_data.load("de440")
+    rows = [data.bodies.index(name) for name in ("Sun", "Jupiter", "Saturn")]
+    gm = data.gm[rows] * YEAR_DAYS**2
+    q, v = data.position[rows], data.velocity[rows] * YEAR_DAYS
+    q = np.vstack([q, q[0] + COMET_POSITION])
+    v = np.vstack([v, v[0] + COMET_VELOCITY])
+    gm = np.append(gm, COMET_MASS * gm[0])
+    q, v = solar_data.to_barycentre(gm, q, v)
+    return nbody(
+        gm,
+        q,
+        v,
+        t_span=(0.0, 20.0),
+        name="comet",
+        units="AU, Julian year",
+        source="DE440; the comet is synthetic",
+        reference=lambda t: _reference("comet", t),
+    )
+
+
+def _reference(name: str, t: float) -> np.ndarray | None:
+    """The stored state, None at a time without one."""
+    for time, state in _references()[name]:
+        if abs(t - time) <= 1e-14 * abs(time):
+            return np.array(state)
+    return None
+
+
+@cache
+def _references() -> dict[str, list[tuple[float, list[float]]]]:
+    text = files("eip_scipy.data").joinpath("scene_references.json").read_text(encoding="utf-8")
+    return {name: [(row["t"], row["state"]) for row in rows] for name, rows in json.loads(text)["states"].items()}

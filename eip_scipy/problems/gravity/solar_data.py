@@ -1,0 +1,239 @@
+"""Initial data and reference states of the solar system: what the package carries, and no solver.
+
+Four sets travel with the package: ``"de440"``, the Sun and the nine system barycentres of JPL's DE440 at
+2014-02-02 20:18:00 TDB, the epoch of Cai, Gong and Wang; ``"de440-j2000"``, the same at JD 2451545.0 TDB;
+``"de440-moon"``, the first with Earth and Moon in place of their barycentre; and ``"paper"``, the table of their
+Appendix A. Any other epoch: `eip_scipy.integrations.jpl.initial_data`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from ...core.inputs import refuse_units
+
+__all__ = [
+    "AU_KM",
+    "DAY_S",
+    "YEAR_D",
+    "SolarSystemData",
+    "available",
+    "gm_from_km3_s2",
+    "load",
+    "reference_states",
+    "to_barycentre",
+]
+
+AU_KM = 149597870.7
+"""The astronomical unit in km (IAU 2012, exact)."""
+DAY_S = 86400.0
+"""The day in seconds."""
+YEAR_D = 365.25
+"""The Julian year in days."""
+
+SOLAR_SYSTEM_JSON = "solar_system.json"
+_REFERENCE_JSON = "solar_reference.json"
+
+
+@dataclass(frozen=True, eq=False)
+class SolarSystemData:
+    """Masses, positions and velocities of N bodies at one epoch; barycentre at rest at the origin.
+
+    Attributes
+    ----------
+    name : str
+        Name of the set.
+    bodies : tuple of str
+        Names of the N bodies, the Sun first.
+    gm : ndarray, shape (N,)
+        Mass times constant of gravitation, AU^3/day^2.
+    position : ndarray, shape (N, 3)
+        AU.
+    velocity : ndarray, shape (N, 3)
+        AU/day.
+    epoch_jd_tdb : float
+        Julian date, TDB. One float64 resolves 40 microseconds; the states belong to the exact epoch.
+    epoch : str
+        The same as a date of the (proleptic) Gregorian calendar.
+    axes : str
+        "ICRF" or "ecliptic J2000".
+    source : str
+        Where the numbers come from.
+    units : str
+        "AU, day".
+    """
+
+    name: str
+    bodies: tuple[str, ...]
+    gm: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    epoch_jd_tdb: float
+    epoch: str
+    axes: str
+    source: str
+    units: str = "AU, day"
+
+    def __post_init__(self) -> None:
+        refuse_units(gm=self.gm, position=self.position, velocity=self.velocity, epoch_jd_tdb=self.epoch_jd_tdb)
+
+    @property
+    def y0(self) -> np.ndarray:
+        """The state (q of all bodies, v of all bodies), shape (6 N,)."""
+        return np.concatenate([self.position.ravel(), self.velocity.ravel()])
+
+
+def available() -> tuple[str, ...]:
+    """Names of the data sets that `load` knows."""
+    return tuple(_read(SOLAR_SYSTEM_JSON))
+
+
+def load(name: str = "de440", *, as_printed: bool = False) -> SolarSystemData:
+    """Load initial data of the solar system that the package carries.
+
+    Parameters
+    ----------
+    name : {"de440", "de440-j2000", "de440-moon", "paper"}
+        ``"de440"``: Sun and nine system barycentres, ICRF axes, at 2014-02-02 20:18:00 TDB, the initial state of
+        `reference_states`. ``"de440-j2000"``: the same at JD 2451545.0 TDB. ``"de440-moon"``: as the first, with Earth
+        and Moon for their barycentre. ``"paper"``: the table of Cai, Gong and
+        Wang at the first of these epochs, ecliptic J2000 axes, with the Sun added. The table joins planet centres to
+        masses without satellites (Jupiter is 112 km from its system's barycentre, Earth lacks the Moon), hence is good
+        for reproducing the paper and not for predicting planets: Earth is 42 degrees off DE440 after 100 yr.
+    as_printed : bool, optional
+        Only with ``"paper"``: keep Mars's v_z = -3.71e-02 m/s as printed, a misprint for -3.71e+02 m/s that takes Mars
+        6.4 degrees off after 100 yr.
+
+    Returns
+    -------
+    SolarSystemData
+        Fresh arrays, AU and day, barycentre at rest at the origin.
+
+    Raises
+    ------
+    ValueError
+        Unknown name, or `as_printed` with another set than ``"paper"``.
+
+    Notes
+    -----
+    DE440: R. S. Park, W. M. Folkner, J. G. Williams and D. H. Boggs, The JPL planetary and lunar ephemerides DE440 and
+    DE441, Astron. J. 161 (2021) 105, doi:10.3847/1538-3881/abd414.
+    """
+    sets = _read(SOLAR_SYSTEM_JSON)
+    if name not in sets:
+        raise ValueError(_unknown(name, tuple(sets)))
+    if as_printed and name != "paper":
+        raise ValueError(f"as_printed=True is an option of the set 'paper', got name={name!r}")
+    entry = sets[name]
+    gm, position, velocity = _with_sun(entry, as_printed) if name == "paper" else _arrays(entry)
+    return SolarSystemData(
+        name=name,
+        bodies=("Sun", *entry["bodies"]) if name == "paper" else tuple(entry["bodies"]),
+        gm=gm,
+        position=position,
+        velocity=velocity,
+        epoch_jd_tdb=sum(entry["epoch_jd_tdb"]),
+        epoch=entry["epoch"],
+        axes=entry["axes"],
+        source=entry["source"],
+    )
+
+
+def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
+    """Accurate states of the Newtonian ten-body problem that starts from ``load("de440")``.
+
+    Parameters
+    ----------
+    name : {"de440"}
+        The set the states start from.
+
+    Returns
+    -------
+    dict of float to ndarray, shape (60,)
+        Time since the epoch in Julian years (1, 10, 100, 1000, 2000) to the state (q of all bodies, v of all bodies)
+        in AU and AU/day, on the axes of ``load("de440")``.
+
+    Raises
+    ------
+    ValueError
+        For another set, known or not.
+
+    Notes
+    -----
+    Integrated by heyoka (Taylor's method) in 80-bit arithmetic at a tolerance of 1e-24. With 1e-22 it agrees to
+    4e-13 AU at 1000 yr and 1.5e-12 AU at 2000 yr.
+    """
+    if name != "de440":
+        known = available()
+        raise ValueError(
+            f"reference states exist for 'de440' only, got {name!r}" if name in known else _unknown(name, known)
+        )
+    states = _read(_REFERENCE_JSON)["states"]
+    return {float(year): _state(np.array(rows, dtype=float)) for year, rows in states.items()}
+
+
+def gm_from_km3_s2(gm: Any) -> np.ndarray:
+    """Convert GM from km^3/s^2 to AU^3/day^2; any shape."""
+    return np.asarray(gm, dtype=float) * DAY_S**2 / AU_KM**3
+
+
+def to_barycentre(gm: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities relative to the centre of mass.
+
+    Parameters
+    ----------
+    gm : ndarray, shape (N,)
+    position, velocity : ndarray, shape (N, 3)
+        In any units.
+
+    Returns
+    -------
+    position, velocity : ndarray, shape (N, 3)
+        New arrays whose centre of mass rests at the origin, to the rounding of their elements.
+    """
+    return position - _centre(gm, position), velocity - _centre(gm, velocity)
+
+
+def _centre(gm: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    # fsum and no matrix product: the sum must not depend on the order in which some BLAS adds.
+    return np.array([math.fsum(gm * column) for column in rows.T]) / math.fsum(gm)
+
+
+def _state(rows: np.ndarray) -> np.ndarray:
+    """Rows (q, v) of each body as the state (q of all bodies, v of all bodies)."""
+    return rows.reshape(-1, 2, 3).swapaxes(0, 1).ravel()
+
+
+_Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _arrays(entry: dict[str, Any]) -> _Arrays:
+    gm, position, velocity = (np.array(entry[key], dtype=float) for key in ("gm", "position", "velocity"))
+    return gm, position, velocity
+
+
+def _with_sun(entry: dict[str, Any], as_printed: bool) -> _Arrays:
+    """Add the Sun, which the paper leaves out, to its table; AU and day, relative to the barycentre."""
+    gm, position, velocity = _arrays(entry)
+    if not as_printed:
+        misprint = entry["misprint"]
+        row = entry["bodies"].index(misprint["body"])
+        velocity[row, "xyz".index(misprint["component"])] = float(misprint["corrected"])
+    gm = gm_from_km3_s2(np.insert(gm, 0, float(entry["gm_sun"])) / 1e9)
+    position = np.insert(position / 1e3 / AU_KM, 0, 0.0, axis=0)
+    velocity = np.insert(velocity / 1e3 * DAY_S / AU_KM, 0, 0.0, axis=0)
+    return gm, *to_barycentre(gm, position, velocity)
+
+
+def _read(file: str) -> dict[str, Any]:
+    return json.loads(files("eip_scipy.data").joinpath(file).read_text(encoding="utf-8"))
+
+
+def _unknown(name: object, known: tuple[str, ...]) -> str:
+    return f"unknown solar system data {name!r}; available: {', '.join(map(repr, known))}"

@@ -1,0 +1,134 @@
+"""The solar system: Sun, eight planets (or their systems' barycentres) and Pluto, on request with the Moon."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...core.inputs import refuse_units
+from ...core.problem import Problem
+from .forces import ForceConstants, check_forces
+from .nbody import nbody
+from .solar_data import AU_KM, DAY_S, YEAR_D, SolarSystemData, load, reference_states
+
+__all__ = ["solar_system"]
+
+UNITS = ("AU, yr", "SI")
+
+C_KM_S = 299792.458
+# Of DE440: comments of the kernel. The Sun's pole: IAU Working Group on Cartographic Coordinates (2015), ICRF.
+J2_SUN, SUN_RADIUS_KM, EARTH_OVER_MOON = 2.1961391516529825e-07, 696000.0, 81.300568221497215
+POLE_RA_DEG, POLE_DEC_DEG = 286.13, 63.87
+MOON_ORBIT_KM = 384399.0
+OBLIQUITY_ARCSEC = 84381.448  # IAU 1976, of the axes "ecliptic J2000"
+
+
+def solar_system(
+    data: str | SolarSystemData = "de440",
+    *,
+    years: float = 2000.0,
+    h: float = 0.002,
+    units: str = "AU, yr",
+    forces: str | Sequence[str] = (),
+) -> Problem:
+    """The solar system from JPL initial data; by default under Newton's gravitation (the paper's Experiment II).
+
+    Parameters
+    ----------
+    data : str or SolarSystemData
+        "de440" (system barycentres at the paper's epoch), "de440-j2000", "de440-moon" (with Earth and Moon for their
+        barycentre), "paper" (the paper's own table), or data for another epoch from
+        `eip_scipy.integrations.jpl.initial_data`.
+    years : float
+        Length of the run in Julian years; negative to go back in time.
+    h : float
+        Step in years.
+    units : {"AU, yr", "SI"}
+        Units of the state, of time and of G m: AU and Julian years, or metres and seconds.
+    forces : str or sequence of str, optional
+        "1pn", "eih" or "gr-potential", "j2", "moon-quadrupole": see `nbody`, and for what each is worth the page
+        "Forces" of the documentation.
+
+    Returns
+    -------
+    Problem
+        Of 60 components (66 with the Moon), see `nbody`. With "de440", or the same data from a kernel, and no further
+        forces its `reference` gives stored states at 1, 10, 100, 1000 and 2000 years (Taylor integration in extended
+        precision).
+
+    Raises
+    ------
+    ValueError
+        For unknown data, units or forces, or "moon-quadrupole" with data that have no EMB.
+    """
+    refuse_units(years=years, h=h)
+    known = load(data) if isinstance(data, str) else data
+    chosen = check_forces(forces)
+    length, time = _units(units)
+    year = YEAR_D * time
+
+    def reference(t: float) -> np.ndarray | None:
+        state = references.get(round(t / year, 9))
+        if state is None:
+            return None
+        half = state.size // 2
+        return np.concatenate([state[:half] * length, state[half:] * (length / time)])
+
+    references = reference_states() if _starts_as_references(known) and not chosen else {}
+    return nbody(
+        known.gm * (length**3 / time**2),
+        known.position * length,
+        known.velocity * (length / time),
+        t_span=(0.0, years * year),
+        h=h * year,
+        forces=chosen,
+        constants=_constants(known, chosen, length, time) if chosen else None,
+        name="solar-system",
+        units="AU, Julian year" if units == "AU, yr" else "m, s",
+        source=known.source,
+        reference=reference,
+    )
+
+
+def _starts_as_references(data: SolarSystemData) -> bool:
+    """Whether these are the masses and states that the stored states start from; a name tells nothing of the epoch."""
+    start = load("de440")
+    return np.array_equal(data.gm, start.gm) and np.array_equal(data.y0, start.y0)
+
+
+def _constants(data: SolarSystemData, forces: tuple[str, ...], length: float, time: float) -> ForceConstants:
+    """The constants in units of `length` to the AU and `time` to the day."""
+    km = length / AU_KM
+    if "moon-quadrupole" in forces and "EMB" not in data.bodies:
+        raise ValueError(
+            f"the force 'moon-quadrupole' stands for the Moon in data with the body EMB; {data.name!r} has none. Leave "
+            "it out, or take 'de440'."
+        )
+    return ForceConstants(
+        c=C_KM_S * DAY_S * km / time,
+        j2=J2_SUN * (SUN_RADIUS_KM * km) ** 2,
+        pole=_pole(data.axes),
+        moon_body=data.bodies.index("EMB") if "EMB" in data.bodies else None,
+        moon=(MOON_ORBIT_KM * km / (1 + EARTH_OVER_MOON)) ** 2 * EARTH_OVER_MOON / 4,
+    )
+
+
+def _pole(axes: str) -> tuple[float, float, float]:
+    """The Sun's north pole on the axes of the data."""
+    ra, dec = math.radians(POLE_RA_DEG), math.radians(POLE_DEC_DEG)
+    x, y, z = math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)
+    if axes == "ICRF":
+        return x, y, z
+    c, s = math.cos(math.radians(OBLIQUITY_ARCSEC / 3600)), math.sin(math.radians(OBLIQUITY_ARCSEC / 3600))
+    return x, c * y + s * z, c * z - s * y
+
+
+def _units(units: str) -> tuple[float, float]:
+    """One AU and one day in the given units."""
+    if units == "AU, yr":
+        return 1.0, 1.0 / YEAR_D
+    if units == "SI":
+        return AU_KM * 1e3, DAY_S
+    raise ValueError(f"units must be one of {UNITS}, got {units!r}.")

@@ -1,0 +1,283 @@
+"""Equations of motion and invariants of a charged particle, from functions of its field.
+
+Each function here takes the field's functions first, and is plain Python when they are; `compose` binds them. Called
+from compiled code all is inlined, and what two of the field's functions have in common is computed once: the loop is as
+fast as one written out for the field. Components are written out, because Numba takes only constant indices of a tuple
+such as (-y, x, 0), whose types differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from numba import njit
+from numba.extending import is_jitted, register_jitable
+
+from ...core.invariants import DIFFERENCE_WEIGHTS
+
+__all__ = ["Equations", "FieldFunctions", "compose", "jit_like"]
+
+_jitable = register_jitable(error_model="numpy", _nrt=False)
+MASS, CHARGE = 0, 1  # places in the parameters
+
+
+class FieldFunctions(NamedTuple):
+    """Functions of the position (x, y, z); A with its jacobian, and phi, only where they are known."""
+
+    A: Callable[..., Any] | None
+    jacobian: Callable[..., Any] | None
+    phi: Callable[..., Any] | None
+    E: Callable[..., Any]
+    B: Callable[..., Any]
+
+
+class Equations(NamedTuple):
+    """What a problem needs; the invariants are None where the field does not give them."""
+
+    rhs: Callable[..., None]
+    energy: Callable[..., float] | None
+    energy_gradient: Callable[..., None]
+    momentum: Callable[..., float] | None
+    momentum_gradient: Callable[..., None] | None
+
+
+def jit_like(fun: Callable[..., Any], *others: Callable[..., Any] | None) -> Callable[..., Any]:
+    """`fun`, compiled if all of the others are Numba's functions, as it is if one is not."""
+    compiled = all(is_jitted(other) for other in others if other is not None)
+    return njit(fun, error_model="numpy") if compiled else fun
+
+
+def no_potential(x, y, z):
+    """A potential that is 0 everywhere."""
+    return 0.0
+
+
+def no_force(x, y, z):
+    """An electric field that is 0 everywhere."""
+    return 0.0, 0.0, 0.0
+
+
+def compose(field: FieldFunctions, form: str) -> Equations:
+    """Equations of motion and invariants in one form.
+
+    Parameters
+    ----------
+    field : FieldFunctions
+        With A, jacobian and E for the canonical form, with B and E for the other; the rest for the invariants.
+    form : {"canonical", "velocity"}
+
+    Returns
+    -------
+    Equations
+        Functions of ``(t, y, [f,] [out,] params)`` with ``params = [mass, charge]``.
+    """
+    return _canonical(field) if form == "canonical" else _velocity(field)
+
+
+# The canonical form, y = (x, p).
+
+
+def _canonical(field: FieldFunctions) -> Equations:
+    A, jacobian, phi, E = field.A, field.jacobian, field.phi, field.E
+
+    def rhs(t, y, out, params):
+        canonical_rhs(A, jacobian, E, y, out, params[MASS], params[CHARGE])
+
+    def energy(t, y, params):
+        return canonical_energy(A, phi, y, params[MASS], params[CHARGE])
+
+    return Equations(
+        jit_like(rhs, A, jacobian, E),
+        None if phi is None else jit_like(energy, A, phi),
+        jit_like(canonical_energy_gradient, A, jacobian, E),
+        jit_like(canonical_momentum, A),
+        jit_like(canonical_momentum_gradient, A),
+    )
+
+
+@_jitable
+def canonical_rhs(A, jacobian, E, y, out, m, q):
+    """Canonical: x' = v = (p - q A) / m, p_j' = q (sum_i v_i dA_i/dx_j + E_j)."""
+    a = A(y[0], y[1], y[2])
+    d = jacobian(y[0], y[1], y[2])
+    e = E(y[0], y[1], y[2])
+    inverse = 1.0 / m  # does not wait for the field, as a division of the velocity would
+    u = (y[3] - q * a[0]) * inverse
+    v = (y[4] - q * a[1]) * inverse
+    w = (y[5] - q * a[2]) * inverse
+    out[0] = u
+    out[1] = v
+    out[2] = w
+    out[3] = q * (u * d[0][0] + v * d[1][0] + w * d[2][0] + e[0])
+    out[4] = q * (u * d[0][1] + v * d[1][1] + w * d[2][1] + e[1])
+    out[5] = q * (u * d[0][2] + v * d[1][2] + w * d[2][2] + e[2])
+
+
+@_jitable
+def canonical_energy(A, phi, y, m, q):
+    """H = |p - q A|^2 / (2 m) + q phi (the paper's eq. 3.7)."""
+    a = A(y[0], y[1], y[2])
+    u = y[3] - q * a[0]
+    v = y[4] - q * a[1]
+    w = y[5] - q * a[2]
+    return 0.5 / m * (u * u + v * v + w * w) + q * phi(y[0], y[1], y[2])
+
+
+def canonical_energy_gradient(t, y, f, out, params):
+    """The equations are canonical: dH/dx = -p', dH/dp = x'."""
+    out[0] = -f[3]
+    out[1] = -f[4]
+    out[2] = -f[5]
+    out[3] = f[0]
+    out[4] = f[1]
+    out[5] = f[2]
+
+
+def canonical_momentum(t, y, params):
+    """L = x p_y - y p_x (the paper's eq. 3.9, its misprint corrected)."""
+    return y[0] * y[4] - y[1] * y[3]
+
+
+def canonical_momentum_gradient(t, y, out, params):
+    """Of L."""
+    out[0] = y[4]
+    out[1] = -y[3]
+    out[2] = 0.0
+    out[3] = -y[1]
+    out[4] = y[0]
+    out[5] = 0.0
+
+
+# The form y = (x, v).
+
+
+def _velocity(field: FieldFunctions) -> Equations:
+    A, jacobian, phi, E, B = field
+
+    def rhs(t, y, out, params):
+        velocity_rhs(E, B, y, out, params[CHARGE] / params[MASS])
+
+    def energy(t, y, params):
+        return velocity_energy(phi, y, params[MASS], params[CHARGE])
+
+    def energy_gradient(t, y, out, params):
+        velocity_energy_gradient(E, y, out, params[MASS], params[CHARGE])
+
+    def momentum(t, y, params):
+        return velocity_momentum(A, y, params[MASS], params[CHARGE])
+
+    def momentum_gradient(t, y, out, params):
+        velocity_momentum_gradient(A, jacobian, y, out, params[MASS], params[CHARGE])
+
+    known = A is not None
+    return Equations(
+        jit_like(rhs, E, B),
+        None if phi is None else jit_like(energy, phi),
+        jit_like(energy_gradient, E),
+        jit_like(momentum, A) if known else None,
+        jit_like(momentum_gradient, A, jacobian) if known else None,
+    )
+
+
+@_jitable
+def velocity_rhs(E, B, y, out, ratio):
+    """Newton's: x' = v, v' = (q / m) (E + v x B) (the paper's eq. 3.8)."""
+    e = E(y[0], y[1], y[2])
+    b = B(y[0], y[1], y[2])
+    u, v, w = y[3], y[4], y[5]
+    out[0] = u
+    out[1] = v
+    out[2] = w
+    out[3] = ratio * (e[0] + v * b[2] - w * b[1])
+    out[4] = ratio * (e[1] + w * b[0] - u * b[2])
+    out[5] = ratio * (e[2] + u * b[1] - v * b[0])
+
+
+@_jitable
+def velocity_energy(phi, y, m, q):
+    """H = m |v|^2 / 2 + q phi."""
+    return 0.5 * m * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5]) + q * phi(y[0], y[1], y[2])
+
+
+@_jitable
+def velocity_energy_gradient(E, y, out, m, q):
+    """Of H: (-q E, m v)."""
+    e = E(y[0], y[1], y[2])
+    out[0] = -q * e[0]
+    out[1] = -q * e[1]
+    out[2] = -q * e[2]
+    out[3] = m * y[3]
+    out[4] = m * y[4]
+    out[5] = m * y[5]
+
+
+@_jitable
+def velocity_momentum(A, y, m, q):
+    """L = x p_y - y p_x with p = m v + q A."""
+    a = A(y[0], y[1], y[2])
+    return y[0] * (m * y[4] + q * a[1]) - y[1] * (m * y[3] + q * a[0])
+
+
+@_jitable
+def velocity_momentum_gradient(A, jacobian, y, out, m, q):
+    """Of L."""
+    a = A(y[0], y[1], y[2])
+    d = jacobian(y[0], y[1], y[2])
+    out[0] = q * (y[0] * d[1][0] - y[1] * d[0][0] + a[1]) + m * y[4]
+    out[1] = q * (y[0] * d[1][1] - y[1] * d[0][1] - a[0]) - m * y[3]
+    out[2] = q * (y[0] * d[1][2] - y[1] * d[0][2])
+    out[3] = -m * y[1]
+    out[4] = m * y[0]
+    out[5] = 0.0
+
+
+# What a field does not give, from what it gives.
+
+
+def curl(jacobian: Callable[..., Any]) -> Callable[..., Any]:
+    """B = curl A from the rows of dA_i/dx_j."""
+
+    def magnetic(x, y, z):
+        d = jacobian(x, y, z)
+        return d[2][1] - d[1][2], d[0][2] - d[2][0], d[1][0] - d[0][1]
+
+    return jit_like(magnetic, jacobian)
+
+
+def difference_jacobian(A: Callable[..., Any], step: float) -> Callable[..., Any]:
+    """Rows of dA_i/dx_j by central differences of order 6."""
+
+    def along(x, y, z, dx, dy, dz):
+        d0 = d1 = d2 = 0.0
+        for k, weight in DIFFERENCE_WEIGHTS:
+            right = A(x + k * dx, y + k * dy, z + k * dz)
+            left = A(x - k * dx, y - k * dy, z - k * dz)
+            d0 += weight * (right[0] - left[0])
+            d1 += weight * (right[1] - left[1])
+            d2 += weight * (right[2] - left[2])
+        return d0 / step, d1 / step, d2 / step
+
+    along = jit_like(along, A)
+
+    def jacobian(x, y, z):
+        a = along(x, y, z, step, 0.0, 0.0)
+        b = along(x, y, z, 0.0, step, 0.0)
+        c = along(x, y, z, 0.0, 0.0, step)
+        return (a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[2], b[2], c[2])
+
+    return jit_like(jacobian, A)
+
+
+def difference_force(phi: Callable[..., Any], step: float) -> Callable[..., Any]:
+    """E = -grad phi by central differences of order 6."""
+
+    def force(x, y, z):
+        e0 = e1 = e2 = 0.0
+        for k, weight in DIFFERENCE_WEIGHTS:
+            e0 -= weight * (phi(x + k * step, y, z) - phi(x - k * step, y, z))
+            e1 -= weight * (phi(x, y + k * step, z) - phi(x, y - k * step, z))
+            e2 -= weight * (phi(x, y, z + k * step) - phi(x, y, z - k * step))
+        return e0 / step, e1 / step, e2 / step
+
+    return jit_like(force, phi)

@@ -1,0 +1,292 @@
+"""Charged particles in static electromagnetic fields: the paper's Experiment III, and fields of one's own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from importlib.resources import files
+from math import inf, pi
+from typing import Any
+
+import numpy as np
+
+from ...core.inputs import refuse_units
+from ...core.invariants import Invariant
+from ...core.names import nearest
+from ...core.problem import Problem, bind
+from ._equations import CHARGE, MASS, Equations, compose
+from .fields import TOKAMAK, UNIFORM, ParticleField
+
+__all__ = ["ORBITS", "ParticleProblem", "charged_particle", "tokamak", "uniform_field"]
+
+FORMS = ("canonical", "velocity")
+STEP = pi / 10  # a twentieth of the gyro-period
+UNIFORM_STEPS, TOKAMAK_STEPS = 270_000, 500_000
+ORBITS = {"banana": 1.0, "transit": 2.0}
+"""The tokamak's orbits, with the factor of the initial v_y."""
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleProblem(Problem):
+    """A `Problem` of one charged particle, with its field.
+
+    Attributes
+    ----------
+    field : ParticleField
+    form : {"canonical", "velocity"}
+        Whether the state is (x, p) or (x, v).
+    mass, charge : float
+    """
+
+    field: ParticleField = UNIFORM
+    form: str = "canonical"
+
+    @property
+    def mass(self) -> float:
+        """The particle's mass."""
+        assert self.params is not None
+        return float(self.params[MASS])
+
+    @property
+    def charge(self) -> float:
+        """The particle's charge."""
+        assert self.params is not None
+        return float(self.params[CHARGE])
+
+    def velocity(self, y: Any) -> np.ndarray:
+        """Velocities of states: (p - q A(x)) / m in the canonical form.
+
+        Parameters
+        ----------
+        y : array_like, shape (6, m)
+
+        Returns
+        -------
+        ndarray, shape (3, m)
+        """
+        y = np.asarray(y, dtype=float)
+        if self.form == "velocity":
+            return y[3:]
+        return (y[3:] - self.charge * self.field.along("A", y[:3])) / self.mass
+
+
+def charged_particle(
+    field: ParticleField,
+    position: Any,
+    velocity: Any,
+    *,
+    t_span: tuple[float, float],
+    h: float | None = None,
+    mass: float = 1.0,
+    charge: float = 1.0,
+    form: str = "canonical",
+    name: str = "charged-particle",
+    units: str = "",
+    source: str = "",
+    reference: Callable[[float], np.ndarray | None] | None = None,
+) -> ParticleProblem:
+    """One charged particle in a static field, m x'' = q (E(x) + x' x B(x)).
+
+    Parameters
+    ----------
+    field : ParticleField
+        `UNIFORM`, `TOKAMAK`, or one of your own.
+    position, velocity : array_like, shape (3,)
+        At the start; x' also where the state is (x, p).
+    t_span : (float, float)
+    h : float, optional
+        A step; a twentieth of the gyro-period 2 pi m / (q B) is a sensible one.
+    mass, charge : float, optional
+    form : {"canonical", "velocity"}, optional
+        The state: (x, p) with p = m x' + q A(x), or (x, x').
+    name, units, source : str, optional
+    reference : callable, optional
+
+    Returns
+    -------
+    ParticleProblem
+        Invariants "H", the energy, where the field has a potential or no electric field; and "L", the angular
+        momentum x p_y - y p_x, where the field is said to be axisymmetric and A is known. Blocks of 3: the error metric
+        does not depend on the orientation of the axes.
+
+    Raises
+    ------
+    TypeError
+        When `field` is no ParticleField.
+    ValueError
+        For an unknown form, a canonical form without A, a start or functions of the field that are not finite, a mass
+        that is not positive, a charge of 0, functions that contradict each other at the start, or a magnetic field with
+        a divergence there.
+
+    Notes
+    -----
+    The energy's gradient needs no evaluation of the field beyond that of the equations: in the canonical form it is
+    (-p', x'), in the other (-q E, m v).
+
+    Examples
+    --------
+    A magnetic mirror, B_z = 1 + z^2 on the axis, by its vector potential alone:
+
+    >>> import numpy as np
+    >>> from eip_scipy import EIPRK4, integrate
+    >>> from eip_scipy.problems import ParticleField, charged_particle
+    >>> mirror = ParticleField(lambda x, y, z: (-y / 2 * (1 + z * z), x / 2 * (1 + z * z), 0.0), axisymmetric=True)
+    >>> problem = charged_particle(mirror, [0.1, 0, 0], [0, 0.1, 0.05], t_span=(0, 20), h=0.1)
+    >>> run = integrate(problem, method=EIPRK4)
+    >>> [item.name for item in problem.invariants], bool(run.max_defect.max() < 1e-12)
+    (['H', 'L'], True)
+    """
+    refuse_units(position=position, velocity=velocity, t_span=t_span, h=h, mass=mass, charge=charge)
+    if not isinstance(field, ParticleField):
+        raise TypeError(f"charged_particle: field must be a ParticleField, got {field!r}.")
+    if form not in FORMS:
+        hint = nearest(form, FORMS)
+        raise ValueError(f"charged_particle: form must be one of {', '.join(FORMS)}, got {form!r}{hint}")
+    if form == "canonical" and field.vector_potential is None:
+        raise ValueError(
+            "charged_particle: the canonical form needs the field's vector_potential; give it, or take form='velocity'."
+        )
+    x, v = _vector("position", position), _vector("velocity", velocity)
+    params = np.array([mass, charge], dtype=float)
+    if not (0 < params[MASS] < inf and params[CHARGE] != 0 and np.isfinite(params[CHARGE])):
+        raise ValueError(f"charged_particle: mass must be positive and charge not 0, got {mass!r} and {charge!r}.")
+    field.check(x)
+    equations = _equations(field, form)
+    momentum = v if form == "velocity" else params[MASS] * v + params[CHARGE] * field.along("A", x[:, None])[:, 0]
+    return ParticleProblem(
+        name=name,
+        fun=bind(equations.rhs, params),
+        rhs=equations.rhs,
+        y0=np.concatenate([x, momentum]),
+        t_span=(float(t_span[0]), float(t_span[1])),
+        h=h,
+        params=params,
+        invariants=_invariants(equations, field, form, params),
+        blocks=3,
+        units=units,
+        source=source,
+        reference=reference,
+        field=field,
+        form=form,
+    )
+
+
+@lru_cache(maxsize=32)
+def _equations(field: ParticleField, form: str) -> Equations:
+    """The same functions for the same field: they are compiled once in a process."""
+    return compose(field.functions, form)
+
+
+def _invariants(equations: Equations, field: ParticleField, form: str, params: np.ndarray) -> tuple[Invariant, ...]:
+    found = []
+    if equations.energy is not None:
+        found.append(
+            Invariant(
+                equations.energy,
+                equations.energy_gradient,
+                args=(params,),
+                in_place=True,
+                uses_f=form == "canonical",
+                name="H",
+            )
+        )
+    if field.axisymmetric and equations.momentum is not None:
+        found.append(
+            Invariant(equations.momentum, equations.momentum_gradient, args=(params,), in_place=True, name="L")
+        )
+    return tuple(found)
+
+
+def _vector(name: str, value: Any) -> np.ndarray:
+    vector = np.asarray(value, dtype=float)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"charged_particle: {name} must be three finite numbers, got {value!r}.")
+    return vector
+
+
+def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STEP, h: float = STEP) -> ParticleProblem:
+    """Charged particle in B = e_z and the potential 1e-2 / R: a gyrating particle that drifts around the origin.
+
+    Parameters
+    ----------
+    form : {"canonical", "velocity"}, optional
+        The state: (x, p), as in the paper, or (x, v).
+    t_end, h : float, optional
+        End of the interval that starts at 0, and a step; the defaults are the paper's, 270 000 steps of pi / 10.
+
+    Returns
+    -------
+    ParticleProblem
+        With invariants "H" and "L", and `reference` states at each hundredth of the paper's interval.
+
+    Raises
+    ------
+    ValueError
+        For an unknown form.
+    """
+    refuse_units(t_end=t_end, h=h)
+    return _paper("uniform", UNIFORM, [0.0, -1.0, 0.0], [0.1, 0.01, 0.0], form, t_end, h)
+
+
+def tokamak(
+    orbit: str = "banana", *, form: str = "canonical", t_end: float = TOKAMAK_STEPS * STEP, h: float = STEP
+) -> ParticleProblem:
+    """Charged particle in the field of an axisymmetric tokamak, on a trapped (banana) or a passing (transit) orbit.
+
+    Parameters
+    ----------
+    orbit : {"banana", "transit"}, optional
+    form : {"canonical", "velocity"}, optional
+        The state: (x, p), as in the paper, or (x, v).
+    t_end, h : float, optional
+        End of the interval that starts at 0, and a step; the defaults are the paper's, 500 000 steps of pi / 10.
+
+    Returns
+    -------
+    ParticleProblem
+        With invariants "H" and "L", and `reference` states at each hundredth of the paper's interval.
+
+    Raises
+    ------
+    ValueError
+        For an unknown orbit or form.
+    """
+    refuse_units(t_end=t_end, h=h)
+    if orbit not in ORBITS:
+        raise ValueError(f"tokamak: orbit must be one of {', '.join(ORBITS)}, got {orbit!r}{nearest(orbit, ORBITS)}")
+    velocity = [0.0, ORBITS[orbit] * 4.816e-4, -2.059e-3]
+    return _paper(f"tokamak-{orbit}", TOKAMAK, [1.05, 0.0, 0.0], velocity, form, t_end, h)
+
+
+def _paper(
+    name: str, field: ParticleField, position: list[float], velocity: list[float], form: str, t_end: float, h: float
+) -> ParticleProblem:
+    return charged_particle(
+        field,
+        position,
+        velocity,
+        t_span=(0.0, t_end),
+        h=h,
+        form=form,
+        name=name,
+        units="system size 1, charge and mass 1, B_0 = 1: gyro-period 2 pi / B",
+        source="Cai, Gong & Wang, section 3.3",
+        reference=lambda t: _reference(name, form, t),
+    )
+
+
+def _reference(name: str, form: str, t: float) -> np.ndarray | None:
+    """The stored state, None at a time without one."""
+    for row in _references()[name]:
+        if abs(t - row["t"]) <= 1e-14 * row["t"]:
+            return np.array(row["position"] + row["momentum" if form == "canonical" else "velocity"])
+    return None
+
+
+@cache
+def _references() -> dict[str, list[dict[str, Any]]]:
+    text = files("eip_scipy.data").joinpath("particle_references.json").read_text(encoding="utf-8")
+    states: dict[str, list[dict[str, Any]]] = json.loads(text)["states"]
+    return states

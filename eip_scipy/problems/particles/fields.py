@@ -1,0 +1,354 @@
+"""Fields for charged particles: those of the paper's Experiment III, and the record for fields of one's own."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from math import isfinite, log, log2, sqrt
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numba.extending import is_jitted
+
+from ...engine.caching import cached_njit
+from ._equations import (
+    FieldFunctions,
+    curl,
+    difference_force,
+    difference_jacobian,
+    jit_like,
+    no_force,
+    no_potential,
+)
+
+__all__ = ["TOKAMAK", "UNIFORM", "ParticleField"]
+
+_jit = cached_njit(error_model="numpy", _nrt=False)
+DIFFERENCE_STEP = 2.0**-7  # of the field's length
+AGREEMENT = 1e-6  # of functions of the field that must go together
+ROUND_OFF = 1e-10  # of a difference, where the true one is 0
+TINY = 1e-300
+# Divergence of B in its largest derivative: beyond this a field is none, from AGREEMENT on it may be one from a table.
+NO_FIELD = 0.1
+FINER = (1.0, 0.25, 0.0625)  # steps of the differences, in the usual one
+# Where else than at the start, in steps: a field may be right at one point by symmetry.
+NEAR = ((0.0, 0.0, 0.0), (2.9, -1.7, 1.3), (-2.3, 2.1, 2.7), (1.1, 3.1, -2.2))
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleField:
+    """A static electromagnetic field, by functions of the position ``(x, y, z)``.
+
+    Give A, with its derivatives where they are known, or B; and phi and E where there is an electric field. With
+    Numba's functions (lazily jitted, three floats in, a float or a tuple of floats out) a particle's equations are
+    compiled; with any other callables everything works, interpreted.
+
+    Attributes
+    ----------
+    vector_potential : callable, optional
+        ``A(x, y, z) -> (A_x, A_y, A_z)``. Needed for the canonical form, and for L in the other.
+    jacobian : callable, optional
+        ``(x, y, z) -> 3 rows``, row i holding dA_i/dx, dA_i/dy, dA_i/dz. Default: differences of A.
+    potential : callable, optional
+        ``phi(x, y, z) -> float``. Default: 0, if there is no electric field either.
+    electric : callable, optional
+        ``E(x, y, z) -> (E_x, E_y, E_z)``, -grad phi. Default: differences of phi.
+    magnetic : callable, optional
+        ``B(x, y, z) -> (B_x, B_y, B_z)``, curl A. Default: from the jacobian.
+    axisymmetric : bool
+        Whether A and phi do not change under rotations about the z axis; then L = x p_y - y p_x is an invariant.
+    length : float
+        A length over which the field changes little (by some tens of per cent), in the unit of the positions: it sets
+        the step of the differences.
+    name : str
+
+    Raises
+    ------
+    TypeError
+        When something given is not callable.
+    ValueError
+        With neither A nor B, derivatives without their function, or a wrong length.
+
+    Notes
+    -----
+    Differences are central and of order 6, with step length / 128: relative errors of about 1e-12, and 18 evaluations
+    of A in each evaluation of the equations. With a jacobian and E of your own neither is needed.
+    """
+
+    vector_potential: Callable[..., Any] | None = None
+    jacobian: Callable[..., Any] | None = None
+    potential: Callable[..., Any] | None = None
+    electric: Callable[..., Any] | None = None
+    magnetic: Callable[..., Any] | None = None
+    axisymmetric: bool = False
+    length: float = 1.0
+    name: str = "field"
+
+    def __post_init__(self) -> None:
+        for key in ("vector_potential", "jacobian", "potential", "electric", "magnetic"):
+            given = getattr(self, key)
+            if not (given is None or callable(given)):
+                raise TypeError(f"ParticleField: {key} must be a function of (x, y, z) or None, got {given!r}.")
+        if self.vector_potential is None and self.magnetic is None:
+            raise ValueError("ParticleField: give vector_potential, or magnetic, or both; got neither.")
+        if self.vector_potential is None and self.jacobian is not None:
+            raise ValueError("ParticleField: jacobian is that of vector_potential; give vector_potential too.")
+        if not (self.length > 0 and isfinite(self.length)):
+            raise ValueError(f"ParticleField: length must be positive and finite, got {self.length!r}.")
+
+    @property
+    def _step(self) -> float:
+        """Of the differences: a power of two, so that it is added and subtracted nearly without rounding."""
+        return float(2.0 ** round(log2(DIFFERENCE_STEP * self.length)))
+
+    @cached_property
+    def functions(self) -> FieldFunctions:
+        """All functions of the field, those not given made from the others."""
+        step = self._step
+        A, jacobian, phi, E, B = self.vector_potential, self.jacobian, self.potential, self.electric, self.magnetic
+        if A is not None and jacobian is None:
+            jacobian = difference_jacobian(A, step)
+        if E is None and phi is None:
+            E, phi = jit_like(no_force, A, B), jit_like(no_potential, A, B)
+        if E is None:
+            assert phi is not None
+            E = difference_force(phi, step)
+        if B is None:
+            assert jacobian is not None
+            B = curl(jacobian)
+        return FieldFunctions(A, jacobian, phi, E, B)
+
+    @cached_property
+    def fill(self) -> Callable[..., None]:
+        """``fill(t, x, out)``: E in out[:3], B in out[3:]; what `eip_scipy.comparators.boris` takes."""
+        E, B = self.functions.E, self.functions.B
+
+        def fields(t: float, x: np.ndarray, out: np.ndarray) -> None:
+            e = E(x[0], x[1], x[2])
+            b = B(x[0], x[1], x[2])
+            out[0] = e[0]
+            out[1] = e[1]
+            out[2] = e[2]
+            out[3] = b[0]
+            out[4] = b[1]
+            out[5] = b[2]
+
+        return jit_like(fields, E, B)
+
+    def check(self, position: np.ndarray) -> None:
+        """See that the functions given go together at one point.
+
+        Parameters
+        ----------
+        position : ndarray, shape (3,)
+
+        Raises
+        ------
+        ValueError
+            When a function does not return so many finite real numbers; when the jacobian is not that of A, B not
+            curl A or E not -grad phi there; or when B has a divergence there or nearby.
+
+        Warns
+        -----
+        UserWarning
+            When B has a small divergence, as one that is interpolated in a table may have.
+        """
+        step = self._step
+        found = {key: self._value(key, shape, position) for key, shape in SHAPES.items() if getattr(self, key)}
+        A, phi = self.vector_potential, self.potential
+        if A is not None:
+            truth = np.array(difference_jacobian(lambda *x: A(*x), step)(*position))  # not worth compiling
+            slack = AGREEMENT * np.abs(truth).max() + ROUND_OFF * np.abs(found["vector_potential"]).max() / self.length
+            _compare("jacobian", found.get("jacobian"), truth, slack, "the derivatives of vector_potential")
+            expected = np.array([truth[2, 1] - truth[1, 2], truth[0, 2] - truth[2, 0], truth[1, 0] - truth[0, 1]])
+            _compare("magnetic", found.get("magnetic"), expected, slack, "the curl of vector_potential")
+        if phi is not None:
+            truth = np.array(difference_force(lambda *x: phi(*x), step)(*position))
+            slack = AGREEMENT * np.abs(truth).max() + ROUND_OFF * abs(found["potential"]) / self.length
+            _compare("electric", found.get("electric"), truth, slack, "minus the gradient of potential")
+        if self.magnetic is not None:
+            self._check_divergence(position)
+
+    def _check_divergence(self, position: np.ndarray) -> None:
+        points = [position + self._step * np.array(near) for near in NEAR]
+        share, divergence, largest, point = max((*self._divergence(point), tuple(point)) for point in points)
+        if not share > AGREEMENT:
+            return
+        said = (
+            f"ParticleField: the divergence of magnetic is {divergence:.3g} at {np.array(point)}, where its largest "
+            f"derivative is {largest:.3g}; a magnetic field has none."
+        )
+        if share > NO_FIELD:
+            raise ValueError(f"{said} Correct it (or `length`, if the field changes over shorter distances).")
+        warnings.warn(said, stacklevel=4)
+
+    def _divergence(self, point: np.ndarray) -> tuple[float, float, float]:
+        """The divergence of B: its share in the largest derivative, itself, and that derivative.
+
+        Of several steps of the differences the one with the smallest share: their errors shrink with it.
+        """
+        B = self.magnetic
+        assert B is not None
+        slack = ROUND_OFF * float(np.abs(B(*point)).max()) / self.length
+        found = []
+        for finer in FINER:
+            slopes = np.array(difference_jacobian(lambda *x: B(*x), finer * self._step)(*point))
+            divergence, largest = float(np.trace(slopes)), float(np.abs(slopes).max())
+            found.append(((abs(divergence) - slack) / max(largest, slack, TINY), divergence, largest))
+        return min(found)
+
+    def _value(self, key: str, shape: tuple[int, ...], position: np.ndarray) -> np.ndarray:
+        value = np.asarray(getattr(self, key)(*position))
+        if value.shape != shape or value.dtype.kind not in "fiu" or not np.isfinite(value).all():
+            raise ValueError(
+                f"ParticleField: {key} returned {value!r} at {position}; expected "
+                f"{'a finite number' if shape == () else f'finite numbers of shape {shape}'}."
+            )
+        return value
+
+    def along(self, key: str, position: Any) -> np.ndarray:
+        """One of the field's functions at many points.
+
+        Parameters
+        ----------
+        key : {"A", "phi", "E", "B"}
+        position : array_like, shape (3, m)
+
+        Returns
+        -------
+        ndarray, shape (3, m), or (m,) for phi
+        """
+        fun, points = getattr(self.functions, key), np.ascontiguousarray(np.transpose(position), dtype=float)
+        size = 1 if key == "phi" else 3
+        out = np.empty((len(points), size))
+        if is_jitted(fun):
+            (_scalars if size == 1 else _vectors)(fun, points, out)
+        else:
+            for row, point in zip(out, points, strict=True):
+                row[:] = fun(*point)
+        return out[:, 0] if size == 1 else out.T
+
+
+SHAPES = {"vector_potential": (3,), "jacobian": (3, 3), "potential": (), "electric": (3,), "magnetic": (3,)}
+
+
+def _compare(key: str, given: np.ndarray | None, expected: np.ndarray, slack: float, what: str) -> None:
+    if given is not None and np.abs(given - expected).max() > slack:
+        raise ValueError(
+            f"ParticleField: {key} returned {given.tolist()}, but {what} there is {expected.tolist()}; correct one of "
+            "them (or `length`, if the field changes over shorter distances)."
+        )
+
+
+@njit
+def _vectors(fun, points, out):
+    for k in range(points.shape[0]):
+        value = fun(points[k, 0], points[k, 1], points[k, 2])
+        out[k, 0] = value[0]
+        out[k, 1] = value[1]
+        out[k, 2] = value[2]
+
+
+@njit
+def _scalars(fun, points, out):
+    for k in range(points.shape[0]):
+        out[k, 0] = fun(points[k, 0], points[k, 1], points[k, 2])
+
+
+# Uniform B = e_z with the potential 1e-2 / R.
+
+POTENTIAL = 1e-2
+
+
+@_jit
+def _uniform_vector_potential(x, y, z):
+    return -0.5 * y, 0.5 * x, 0.0
+
+
+@_jit
+def _uniform_jacobian(x, y, z):
+    return (0.0, -0.5, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 0.0)
+
+
+@_jit
+def _uniform_potential(x, y, z):
+    return POTENTIAL / sqrt(x * x + y * y)
+
+
+@_jit
+def _uniform_electric(x, y, z):
+    r2 = x * x + y * y
+    w = POTENTIAL / (r2 * sqrt(r2))
+    return w * x, w * y, 0.0
+
+
+@_jit
+def _uniform_magnetic(x, y, z):
+    return 0.0, 0.0, 1.0
+
+
+# Tokamak: A = (a x - b y, a y + b x, -log(R) / 2) with a = z / (2 R^2), b = ((1 - R)^2 + z^2) / (4 R^2).
+
+
+@_jit
+def _tokamak_vector_potential(x, y, z):
+    r2 = x * x + y * y
+    u = 1.0 / r2
+    s = 1.0 - sqrt(r2)
+    a = 0.5 * z * u
+    b = 0.25 * (s * s + z * z) * u
+    return a * x - b * y, a * y + b * x, -0.25 * log(r2)
+
+
+@_jit
+def _tokamak_jacobian(x, y, z):
+    r2 = x * x + y * y
+    u = 1.0 / r2
+    r = sqrt(r2)
+    s = 1.0 - r
+    a = 0.5 * z * u
+    b = 0.25 * (s * s + z * z) * u
+    # With da/dx = da x and so on: a and b depend on x and y through R alone.
+    da = -2.0 * a * u
+    db = -u * (0.5 * s * r * u + 2.0 * b)
+    radial = da * x - db * y
+    across = da * y + db * x
+    c = 0.5 * u
+    d = c * z
+    return (
+        (a + x * radial, y * radial - b, c * x - d * y),
+        (b + x * across, a + y * across, c * y + d * x),
+        (-c * x, -c * y, 0.0),
+    )
+
+
+@_jit
+def _tokamak_magnetic(x, y, z):
+    r2 = x * x + y * y
+    c = 0.5 / r2
+    r = sqrt(r2)
+    return -c * (2.0 * y + x * z), c * (2.0 * x - y * z), c * (r2 - r)
+
+
+UNIFORM = ParticleField(
+    vector_potential=_uniform_vector_potential,
+    jacobian=_uniform_jacobian,
+    potential=_uniform_potential,
+    electric=_uniform_electric,
+    magnetic=_uniform_magnetic,
+    axisymmetric=True,
+    name="uniform",
+)
+"""Uniform magnetic field e_z and the potential 1e-2 / R (paper, section 3.3); invariant under rotations about z."""
+
+TOKAMAK = ParticleField(
+    vector_potential=_tokamak_vector_potential,
+    jacobian=_tokamak_jacobian,
+    magnetic=_tokamak_magnetic,
+    axisymmetric=True,
+    name="tokamak",
+)
+"""Axisymmetric tokamak of major radius 1 without inductive electric field (paper, section 3.3)."""

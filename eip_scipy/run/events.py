@@ -1,0 +1,147 @@
+"""Events of `integrate`, with the meaning that `scipy.integrate.solve_ivp` gives them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.integrate import DenseOutput
+from scipy.optimize import brentq
+
+from ..core.inputs import is_number, reals, refuse_units, require_arguments, shown
+from ..core.invariants import as_it_is
+from ..engine.kernels import EPS
+
+__all__ = ["Events"]
+
+
+class Events:
+    """The events of a run and the places where they happened.
+
+    Parameters
+    ----------
+    events : callable or sequence of callable or None
+        ``event(t, y[, params]) -> float``, with the attributes ``terminal`` (bool, or the number of times after which
+        the run ends) and ``direction`` of SciPy's `solve_ivp`.
+    extra : tuple
+        ``(params,)`` or nothing.
+    hand : callable
+        Makes of an event, and the number of its arrays that are ours, what is called.
+
+    Raises
+    ------
+    TypeError
+        When an event is not callable.
+    ValueError
+        When ``terminal`` is no number of times, or ``direction`` no number.
+    """
+
+    def __init__(self, events: Any, extra: tuple = (), hand: Any = as_it_is) -> None:
+        items = _as_events(events)
+        self.functions: list[Callable[..., Any]] = list(items)
+        self._called = [hand(item, 1) for item in items]
+        self._extra = extra
+        self.directions = np.array([_direction(getattr(item, "direction", 0)) for item in items])
+        self._allowed = [_allowed(getattr(item, "terminal", None)) for item in items]
+        self._counts = [0] * len(items)
+        self.t: list[list[float]] = [[] for _ in items]
+        self.y: list[list[np.ndarray]] = [[] for _ in items]
+        self.last: tuple[float, np.ndarray] | None = None
+
+    @property
+    def terminal(self) -> bool:
+        """Whether an event can end the run."""
+        return any(math.isfinite(allowed) for allowed in self._allowed)
+
+    @property
+    def ends(self) -> list[tuple[float, float]]:
+        """Of each event the direction and the number of times after which it ends the run."""
+        return list(zip(self.directions.tolist(), self._allowed, strict=True))
+
+    def restore(self, k: int, t: np.ndarray, y: np.ndarray) -> None:
+        """Let event `k` have happened at the times `t` (m,) in the states `y` (m, n)."""
+        self.t[k], self.y[k], self._counts[k] = t.tolist(), list(y), t.size
+
+    def fill(self, t: float, y: np.ndarray, values: np.ndarray, params: Any = None) -> None:
+        """Values of all events."""
+        for k in range(len(self.functions)):
+            values[k] = self._value(k, t, y.copy())
+
+    def handle(self, old: np.ndarray, new: np.ndarray, sol: DenseOutput) -> float | None:
+        """Locate the events between the ends of a step; returns the time at which the run ends, if it does."""
+        up, down = (old <= 0) & (new >= 0), (old >= 0) & (new <= 0)
+        rising, falling = up & (self.directions >= 0), down & (self.directions <= 0)
+        active = np.flatnonzero(rising | falling)
+        roots = [(self._root(int(k), sol), int(k)) for k in active]
+        roots.sort(reverse=bool(sol.t < sol.t_old))
+        for root, k in roots:
+            self._counts[k] += 1
+            self.t[k].append(root)
+            self.y[k].append(sol(root))
+            self.last = root, self.y[k][-1]
+            if self._counts[k] >= self._allowed[k]:
+                return root
+        return None
+
+    def _root(self, k: int, sol: DenseOutput) -> float:
+        return float(brentq(lambda t: self._value(k, t, sol(t)), sol.t_old, sol.t, xtol=4 * EPS, rtol=4 * EPS))
+
+    def _value(self, k: int, t: float, y: np.ndarray) -> float:
+        """Event k at (t, y), which it may keep or overwrite."""
+        try:
+            value = self._called[k](t, y, *self._extra)
+        except TypeError:
+            given, mend = ("t", "y", *("params" for _ in self._extra)), "It takes params if the run has them."
+            require_arguments(self.functions[k], given, f"event {k}", mend)
+            raise
+        if isinstance(value, float):
+            return value
+        refuse_units(**{f"event {k} returned": value})
+        found = reals(value)
+        if found is None or found.ndim:
+            raise TypeError(f"event {k} returned {shown(value)} at t={t:.10g}, expected a real number.")
+        return float(found)
+
+
+def _as_events(events: Any) -> tuple[Callable[..., Any], ...]:
+    """One event or a sequence of them, as a tuple.
+
+    Raises
+    ------
+    TypeError
+        For anything else.
+    """
+    if events is None or callable(events):
+        return () if events is None else (events,)
+    try:
+        items = tuple(events)
+    except TypeError:
+        raise TypeError(f"events must be callable, or a sequence of callables, got {shown(events)}.") from None
+    for item in items:
+        if not callable(item):
+            raise TypeError(f"events must be callable, got {shown(item)}.")
+    return items
+
+
+def _direction(direction: Any) -> float:
+    """The sign that an event's change must have, 0 for both."""
+    if not (is_number(direction) or isinstance(direction, (bool, np.bool_))) or math.isnan(direction):
+        raise ValueError(
+            f"The `direction` attribute of each event must be a number: positive, negative or 0, got "
+            f"{shown(direction)}."
+        )
+    return float(direction)
+
+
+def _allowed(terminal: Any) -> float:
+    """How many times an event may happen before it ends the run."""
+    if terminal is None:
+        return math.inf
+    known = isinstance(terminal, (bool, np.bool_)) or (is_number(terminal) and float(terminal).is_integer())
+    if not known or terminal < 0:
+        raise ValueError(
+            f"The `terminal` attribute of each event must be a boolean or positive integer, got {shown(terminal)}."
+        )
+    return float(terminal) if terminal else math.inf

@@ -1,0 +1,451 @@
+"""`integrate`: long runs with the compiled step, or with the same step interpreted."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import numpy as np
+from numba.extending import is_jitted
+
+from ..core import setup
+from ..core.compiled_functions import CompiledFunctions, compile_functions
+from ..core.inputs import refuse_units
+from ..core.names import nearest
+from ..core.options import ProjectionOptions, takes_projection_options
+from ..core.problem import Problem
+from ..core.results import NFEV, NJEV, NLU, Diagnostics, IntegrationResult
+from ..core.solvers import EIPSolver
+from ..core.stepping import UNBOUNDED
+from ..engine.kernels import OK
+from ..engine.step import T
+from ..engine.trust import ProjectionWarning
+from . import resume as _resume
+from .driver import FULL, PAUSE, ROW, STEP, Driver, Grid
+from .interrupts import ended_by_sigterm, kept_ctrl_c, look_for_signals
+from .prepare import DEFAULT, Prepared, Request, prepared, started_at
+
+__all__ = ["integrate"]
+
+CHUNK_SECONDS = 0.2
+FIRST_CHUNK = 64
+ARRIVED, STOPPED = "reached the end of the interval", "stopped by the callback"
+# Names that the projection's options stand beside, for hints.
+OWN = (
+    *("method", "h", "params", "in_place", "save_every", "t_eval", "events", "callback", "progress", "compiled"),
+    *("max_bytes", "checkpoint", "checkpoint_every", "resume", "diagnostics", "rtol", "atol", "first_step", "max_step"),
+)
+
+
+@takes_projection_options
+def integrate(
+    fun: Callable[..., Any] | Problem,
+    t_span: Any = None,
+    y0: Any = None,
+    *,
+    method: type[EIPSolver],
+    h: float | None = DEFAULT,
+    params: Any = None,
+    in_place: bool = False,
+    save_every: int | None = None,
+    t_eval: Any = None,
+    events: Any = None,
+    callback: Callable[[float, np.ndarray, np.ndarray], Any] | None = None,
+    progress: bool = False,
+    compiled: bool | None = None,
+    max_bytes: float | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    checkpoint_every: float = 60.0,
+    resume: bool = False,
+    diagnostics: Diagnostics | None = None,
+    rtol: Any = DEFAULT,
+    atol: Any = DEFAULT,
+    first_step: float | None = None,
+    max_step: float = np.inf,
+    **projection: Any,
+) -> IntegrationResult:
+    """Integrate with fixed or adaptive steps, compiled where the functions are Numba functions.
+
+    The step is that of the solver classes; with the same jitted functions the same bits come out, compiled or not.
+
+    Parameters
+    ----------
+    fun : callable or Problem
+        ``fun(t, y[, params]) -> (n,)``; with ``in_place=True``, ``fun(t, y, out[, params])``. For a compiled run a
+        lazily jitted Numba function. With a Nystrom method (`EIPRKN8`, `EIPRKN12`), whose state is (q, v), the
+        acceleration: ``acc(t, q[, params]) -> (n/2,)``, in place ``acc(t, q, out[, params])``. A `Problem` brings
+        everything else with it; options given here take precedence.
+    t_span : (float, float)
+        Start and end; backward if the end comes first.
+    y0 : array_like, shape (n,)
+        Initial state, real or complex.
+    method : type
+        `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, or a class made by
+        `eip_method`; one on a one-step method runs interpreted.
+    h : float, optional
+        Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter. None: adaptive steps by
+        `rtol`, `atol`, `first_step` and `max_step`. Default: adaptive where one of these is given, else a problem's
+        own step, if it has one.
+    params : array_like of float, optional
+        Passed on to `fun` and to the invariants' functions as the last argument.
+    in_place : bool, optional
+        Whether `fun` fills its third argument.
+    save_every : int, optional
+        Save each so many-th step, besides the first and the last state.
+    t_eval : array_like, optional
+        Times to save at instead, inside `t_span`, in its direction; states between steps come from dense output, on
+        the manifold. With neither, the first and the last state are saved.
+    events : callable or sequence of callable, optional
+        ``event(t, y[, params]) -> float``, with ``terminal`` and ``direction`` as for `scipy.integrate.solve_ivp`; in
+        compiled runs Numba functions.
+    callback : callable, optional
+        ``callback(t, y, defects)`` at each saved point; return True to stop the run. With `save_every` the interval
+        may then be endless, as with a terminal event.
+    progress : bool, optional
+        Show a progress bar with the time that is left.
+    compiled : bool, optional
+        None: compiled where possible, else interpreted, with the reason in ``.message``. True: TypeError where it is
+        not possible. False: interpreted.
+    max_bytes : float, optional
+        Bound on the memory for saved states; default: half of what is free.
+    checkpoint : path-like, optional
+        File that holds the run, saved states included, so that it can be resumed; written at the start, every
+        `checkpoint_every` seconds, and when the run ends or is broken off, by SIGTERM too. A file that is there already
+        is replaced only by the run that resumes it, and only one run at a time may have it.
+    checkpoint_every : float, optional
+        Seconds from one checkpoint to the next; more where writing would take over a twentieth of the time.
+    resume : bool, optional
+        Go on from the checkpoint, with the same arguments: the result is bit for bit that of a run without the
+        interruption. Where the file does not exist yet the run starts at the beginning; `message` tells which.
+    {names of ProjectionOptions}
+        As for the solver classes, see `EIPSolver`. Functions of invariants are called as
+        ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` takes the run's
+        `params` in its place.
+    diagnostics, first_step, max_step
+        Likewise.
+    rtol, atol : float or array_like, optional
+        Likewise, 1e-3 and 1e-6 by default. Beside a given `h` they only set the scale of the error metric.
+
+    Returns
+    -------
+    IntegrationResult
+        Times ``t`` (m,), states ``y`` (n, m), values ``invariants`` (l, m), ``max_defect`` (l,), and more.
+
+    Raises
+    ------
+    TypeError
+        Unknown options, values of a wrong kind, or ``compiled=True`` with functions that cannot be compiled.
+    ValueError
+        Options with wrong values, a start that misses a given target, a wrong gradient.
+    MemoryError
+        When the saved states would need more than `max_bytes`.
+    CheckpointError
+        When the file cannot be written at the start, or is there and not to be resumed, or is damaged, or belongs to a
+        run with other arguments or functions, or another run has it.
+
+    Notes
+    -----
+    A step that fails ends the run with ``status=-1`` and everything up to there. Exceptions from user code and
+    KeyboardInterrupt pass through, with what the run had as ``exception.partial`` (one row, the start, before the first
+    step), and with a note that says from where its checkpoint goes on. A checkpoint that cannot be written later on is
+    a RuntimeWarning and stands in `message`; the former one stays.
+
+    The user's functions may keep or overwrite the states that they are given: compiled or not, they get copies where
+    they do.
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPRK4, integrate
+    >>> from eip_scipy.problems import kepler
+    >>> run = integrate(kepler(), (0, 200), method=EIPRK4, h=0.03, save_every=100)
+    >>> run.y.shape, bool((run.max_defect < 1e-11).all())
+    ((4, 68), True)
+    """
+    for name in projection:
+        if name not in ProjectionOptions.names():
+            raise TypeError(f"integrate() has no option {name!r}{nearest(name, (*OWN, *ProjectionOptions.names()))}")
+    refuse_units(checkpoint_every=checkpoint_every)
+    request = Request(
+        fun=fun,
+        t_span=t_span,
+        y0=y0,
+        method=method,
+        h=h,
+        params=params,
+        in_place=in_place,
+        save_every=save_every,
+        t_eval=t_eval,
+        events=events,
+        callback=callback,
+        progress=progress,
+        compiled=compiled,
+        max_bytes=max_bytes,
+        diagnostics=diagnostics,
+        rtol=rtol,
+        atol=atol,
+        first_step=first_step,
+        max_step=max_step,
+        projection=projection,
+    )
+    kept = _resume.kept(checkpoint, checkpoint_every, resume)
+    with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), kept as keeper, _start_kept(request):
+        return Loop(prepared(request), keeper).run()
+
+
+class Loop:
+    """Drives chunks of steps: progress, samples, events, callbacks, and what is kept when something goes wrong."""
+
+    def __init__(self, prepared: Prepared, keeper: _resume.Keeper, *, compiled: bool | None = None) -> None:
+        """`compiled`: instead of what the request says."""
+        request, system, run, start = prepared.request, prepared.system, prepared.run, prepared.start
+        self.prepared, self.keeper = prepared, keeper
+        self.tableau, self.stepping, self.method = prepared.method, prepared.stepping, prepared.label
+        self.rhs, self.events, self.diagnostics = system.rhs, system.events, prepared.diagnostics
+        self.callback, self.progress, self.max_bytes = request.callback, request.progress, prepared.max_bytes
+        if keeper.keeps:
+            identity = prepared.identity(start.y, system.parameters)
+            keeper.identify(identity, run, system.derivative, start.t, start.y, start.f)
+        wanted = request.compiled if compiled is None else compiled
+        with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
+            functions, self.why_not = system.compiled(run, wanted)
+            self.driver = Driver(run, prepared.grid, functions, system.parameters, compiled=self.why_not is None)
+        for function in system.handed:
+            function.read_only &= self.why_not is None
+        keeper.begin(self.driver, self.events, self.max_bytes)
+        self.wall_time = keeper.seconds
+        self.chunk = FIRST_CHUNK
+        self.told = self._doubtful = False
+
+    def in_octets(self) -> CompiledFunctions:
+        """The functions for vectors of members."""
+        system, run = self.prepared.system, self.prepared.run
+        extra, dtype = bool(system.extra), run.y0.dtype
+        return compile_functions(system.fun, system.form, extra, run.invariants, (), dtype, in_octets=True)
+
+    def run(self) -> IntegrationResult:
+        driver = self.driver
+        begin = time.perf_counter()
+        try:
+            with _bar(self.progress, driver.grid, self.method) as bar:
+                status, message = self.steps(bar)
+            self.keeper.end(status, message)
+        except BaseException as error:
+            self.wall_time += time.perf_counter() - begin
+            self.keeper.interrupted(error)  # first: whoever ends the process may not wait long
+            driver.run.trust.failed = True
+            driver.save_now()
+            partial = self._result(-1, f"interrupted by {type(error).__name__}", broken=True)
+            error.partial = partial  # type: ignore[attr-defined]
+            raise
+        self.wall_time += time.perf_counter() - begin
+        if status < 0:
+            driver.save_now()
+        result = self._result(status, message)
+        if self.told:
+            try:
+                warnings.warn(f"{self.method}: {driver.run.trust.message}", ProjectionWarning, stacklevel=3)
+            except ProjectionWarning as error:
+                error.partial = result  # type: ignore[attr-defined]
+                raise
+        return result
+
+    def steps(self, bar: Any) -> tuple[int, str]:
+        """Run on to the end of the interval, or to what ends the run before it; returns status and message.
+
+        At the end `told` says whether something speaks against a run that has not failed.
+        """
+        self._doubtful = False
+        status, message = self._steps(bar)
+        self.driver.run.trust.failed = status < 0
+        self._look(ended=True)
+        self.told = self._doubtful and status >= 0
+        return status, message
+
+    def _look(self, *, ended: bool = False) -> None:
+        driver = self.driver
+        t, y = driver.now
+
+        def derivative() -> np.ndarray:
+            f = np.empty_like(y)
+            self.rhs(t, y, f, driver.params)
+            return f
+
+        self._doubtful |= driver.run.look(driver.step, ended, t, y.copy(), derivative)
+
+    def _steps(self, bar: Any) -> tuple[int, str]:
+        driver = self.driver
+        if driver.step == 0:
+            driver.save_start()
+            if self._stopped_by_callback(0):
+                return 1, STOPPED
+        while True:
+            look_for_signals()
+            self.keeper.keep()
+            k, rows, begin = driver.step, driver.rows, time.perf_counter()
+            steps = self._chunk(self.chunk)
+            code = driver.advance(k + steps)
+            seconds = time.perf_counter() - begin
+            ended = self._pause() if code == PAUSE else False
+            bar.update(self._progress(bar.n, k))
+            if self._stopped_by_callback(rows):
+                return 1, STOPPED
+            if ended:
+                return 1, "A termination event occurred."
+            if driver.step in setup.LOOKS:
+                self._look()
+            if code == FULL:
+                driver.grow(self.max_bytes)
+            elif code not in (OK, PAUSE):
+                return -1, setup.failure(code, driver.run, driver.grid.clock)
+            elif code == OK and driver.grid.clock[T] == driver.grid.span.t_bound:
+                return 0, ARRIVED
+            if code == OK:
+                # At most a doubling, so that one fast chunk cannot make a slow one long; none of one that was cut.
+                longer = max(self.chunk, 2 * steps)
+                self.chunk = max(1, min(longer, int(steps * CHUNK_SECONDS / max(seconds, 1e-9))))
+
+    def _progress(self, shown: float, k: int) -> float:
+        """What the bar is to grow by: steps where their number is known, else time."""
+        grid = self.driver.grid
+        if grid.span.h != 0.0:
+            return self.driver.step - k
+        return abs(self.driver.now[0] - grid.span.t0) - shown
+
+    def _pause(self) -> bool:
+        """Samples and events in the step that is pending; True where an event ends the run."""
+        driver, grid = self.driver, self.driver.grid
+        sol = driver.dense(self.tableau, self.rhs)
+        end = None
+        if grid.g.size:
+            end = self.events.handle(grid.g, grid.g_new, sol)
+        limit = sol.t if end is None else end
+        while driver.rows < grid.t_eval.size and grid.span.sign * (grid.t_eval[driver.rows] - limit) <= 0:
+            t = float(grid.t_eval[driver.rows])
+            driver.save(t, sol(t))
+        if end is None:
+            return False
+        if grid.t_eval.size == 0:
+            driver.cut(end, sol(end))
+        return True
+
+    def _chunk(self, chunk: int) -> int:
+        """Steps of the next call: none beyond the next look or, with a callback, the next saved one."""
+        grid, step = self.driver.grid, self.driver.step
+        chunk = min([chunk, *(look - step for look in setup.LOOKS if look > step)])
+        if self.callback is None or grid.save_every == 0:
+            return chunk
+        return min(chunk, grid.save_every - step % grid.save_every)
+
+    def _stopped_by_callback(self, first_row: int) -> bool:
+        if self.callback is None:
+            return False
+        driver = self.driver
+        for row in range(first_row, driver.rows):
+            t, y = float(driver.t[row]), driver.y[row].copy()
+            invariants = driver.run.invariants
+            if self.callback(t, y, invariants.values(t, y) - invariants.target):
+                driver.grid.place[ROW] = row + 1
+                return True
+        return False
+
+    def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
+        driver = self.driver
+        rows, counters, events = driver.rows, driver.run.work.counters, self.events
+        return IntegrationResult(
+            t=driver.t[:rows],
+            y=driver.y[:rows].T,
+            invariants=self._values(broken),
+            max_defect=driver.run.work.max_defect,
+            diagnostics=self.diagnostics,
+            t_events=[np.asarray(t) for t in events.t] if events.functions else None,
+            y_events=[np.asarray(y) for y in events.y] if events.functions else None,
+            nfev=int(counters[NFEV]),
+            njev=int(counters[NJEV]),
+            nlu=int(counters[NLU]),
+            status=status,
+            message=self.explained(message),
+            success=status >= 0,
+            trusted=driver.run.trust.trusted,
+            wall_time=self.wall_time,
+            compiled=self.why_not is None,
+            method=self.method,
+            h=abs(driver.grid.span.h) or None,
+        )
+
+    def explained(self, message: str) -> str:
+        """With what speaks against the run, and what is to be said about checkpoints and not being compiled."""
+        notes = [*self.keeper.notes, *([] if self.why_not is None else [f"interpreted: {self.why_not}"])]
+        doubt = self.driver.run.trust.message
+        message = f"{message}; {doubt}" if doubt else message
+        return f"{message} ({'; '.join(notes)})" if notes else message
+
+    def _values(self, broken: bool) -> np.ndarray:
+        """Invariants of the saved states; NaN where the run was broken off by an invariant that still raises."""
+        try:
+            return self.driver.values()
+        except BaseException:
+            if not broken:
+                raise
+            return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)
+
+
+def _compiling(shown: bool) -> Any:
+    """A line while the first run of an installation compiles, which takes longer than anyone waits without a word."""
+    from tqdm import tqdm
+
+    line = "compiling (about a minute in the first run, then kept on disk)"
+    return tqdm(total=0, desc=line, bar_format="{desc}", leave=False, disable=not shown)
+
+
+def _bar(progress: bool, grid: Grid, label: str) -> Any:
+    from tqdm import tqdm
+
+    fixed = grid.span.h != 0.0
+    total: float | None
+    if fixed:
+        total = grid.span.n_steps if grid.span.n_steps < UNBOUNDED else None
+    else:
+        total = abs(grid.span.t_bound - grid.span.t0) if math.isfinite(grid.span.t_bound) else None
+    unit = "step" if fixed else "time"
+    # Beyond 0 where the run is resumed.
+    initial = int(grid.place[STEP]) if fixed else abs(float(grid.clock[T]) - grid.span.t0)
+    return tqdm(
+        total=total, initial=initial, desc=label, unit=unit, unit_scale=True, disable=not progress, smoothing=0.05
+    )
+
+
+@contextmanager
+def _start_kept(request: Request) -> Iterator[None]:
+    """Give an exception that comes before the first step the start as what the run had."""
+    begin = time.perf_counter()
+    try:
+        yield
+    except BaseException as error:
+        if not hasattr(error, "partial"):
+            with suppress(TypeError, ValueError):  # no start that could be read
+                t0, start = started_at(request)
+                error.partial = IntegrationResult(  # type: ignore[attr-defined]
+                    t=np.array([t0]),
+                    y=start[:, None],
+                    invariants=np.zeros((0, 1)),
+                    max_defect=np.zeros(0),
+                    diagnostics=Diagnostics(),
+                    t_events=None,
+                    y_events=None,
+                    nfev=0,
+                    njev=0,
+                    nlu=0,
+                    status=-1,
+                    message=f"interrupted by {type(error).__name__} at the start",
+                    success=False,
+                    wall_time=time.perf_counter() - begin,
+                    compiled=False,
+                    method=getattr(request.method, "__name__", str(request.method)),
+                    h=None,
+                )
+        raise

@@ -1,0 +1,31 @@
+"""Memory for what a run saves: the option ``max_bytes``, and what is free."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from ..core.inputs import is_number, refuse_units, shown
+
+__all__ = ["check_bytes", "free_memory"]
+
+
+def check_bytes(max_bytes: Any) -> None:
+    """The option ``max_bytes`` is None or a number."""
+    refuse_units(max_bytes=max_bytes)
+    if max_bytes is not None and not (is_number(max_bytes) and max_bytes >= 0):
+        raise ValueError(f"max_bytes must be a number of bytes >= 0, got {shown(max_bytes)}.")
+
+
+def free_memory() -> float:
+    """Bytes that a process may still take."""
+    try:
+        with open("/proc/meminfo") as lines:
+            for line in lines:
+                if line.startswith("MemAvailable:"):
+                    return 1024.0 * int(line.split()[1])
+    except OSError:
+        pass
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        return 0.5 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return 4e9

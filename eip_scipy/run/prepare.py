@@ -1,0 +1,333 @@
+"""From what a user asks of `integrate` to a run that is ready to step, in steps that an ensemble shares."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ..core import setup
+from ..core.compiled_functions import CompiledFunctions, Handed, NotCompilableError, compile_functions
+from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
+from ..core.invariants import Invariant, as_invariants
+from ..core.one_step import OneStep
+from ..core.options import ProjectionOptions
+from ..core.problem import Problem
+from ..core.results import NFEV, Diagnostics
+from ..core.setup import Counted, Run, Start
+from ..core.solvers import EIPSolver
+from ..core.stepping import AnyMethod, StepOptions, Stepping, interval
+from ..engine.step import Span
+from ..methods.nystrom import NystromTableau
+from .driver import Grid, check_memory, saved_rows
+from .events import Events
+from .interpreted_functions import FORMS, INTERPRETED, hand
+from .memory import check_bytes, free_memory
+from .resume import settings
+
+__all__ = ["DEFAULT", "Prepared", "Request", "prepared", "started_at"]
+
+CALLED = "fun", "It takes (t, y), out with in_place=True, and params where the run has them: params=..."
+
+
+class _Default:
+    def __repr__(self) -> str:
+        return "<default>"
+
+    def __reduce__(self) -> str:
+        return "DEFAULT"
+
+
+DEFAULT: Any = _Default()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What `integrate` is asked for, as it was given; of the projection's options those that were."""
+
+    fun: Any
+    t_span: Any = None
+    y0: Any = None
+    method: Any
+    h: Any = DEFAULT
+    params: Any = None
+    in_place: bool = False
+    save_every: Any = None
+    t_eval: Any = None
+    events: Any = None
+    callback: Any = None
+    progress: bool = False
+    compiled: bool | None = None
+    max_bytes: Any = None
+    diagnostics: Any = None
+    rtol: Any = DEFAULT
+    atol: Any = DEFAULT
+    first_step: Any = None
+    max_step: Any = np.inf
+    projection: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, **keywords: Any) -> Request:
+        """A request from keywords, those of the projection among them."""
+        names = ProjectionOptions.names()
+        projection = {name: value for name, value in keywords.items() if name in names}
+        return cls(projection=projection, **{name: value for name, value in keywords.items() if name not in names})
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether an option of adaptive steps was given."""
+        no_bound = isinstance(self.max_step, float) and self.max_step == np.inf
+        return not (self.rtol is DEFAULT and self.atol is DEFAULT and self.first_step is None and no_bound)
+
+    @property
+    def steps(self) -> StepOptions:
+        """The options of the step size, with their defaults."""
+        return StepOptions(
+            h=None if self.h is DEFAULT else self.h,
+            first_step=self.first_step,
+            max_step=self.max_step,
+            rtol=1e-3 if self.rtol is DEFAULT else self.rtol,
+            atol=1e-6 if self.atol is DEFAULT else self.atol,
+        )
+
+
+class System:
+    """The user's functions of a run: `fun` as it was given, and `rhs`, interpreted, as the loop calls it."""
+
+    def __init__(self, request: Request, form: str) -> None:
+        self.fun, self.form = request.fun, form
+        if not callable(self.fun):
+            raise TypeError(f"integrate: fun must be callable or a Problem, got {self.fun!r}.")
+        params = request.params
+        self.parameters = np.zeros(0) if params is None else real_array("params", params, TypeError).reshape(-1)
+        self.extra = () if params is None else (self.parameters,)
+        self.handed: list[Handed] = []
+        self.hand = partial(hand, self.handed)
+        self.events = Events(request.events, self.extra, self.hand)
+        self.rhs: Callable[..., None]
+
+    def bind(self, y0: np.ndarray) -> None:
+        """Make `rhs` for states like y0."""
+        self.rhs = INTERPRETED[self.form](self.hand(self.fun, 1), self.extra, y0)
+
+    def derivative(self, t: float, y: np.ndarray) -> np.ndarray:
+        """The derivative as a new array."""
+        out = np.empty_like(y)
+        self.rhs(t, y, out, self.parameters)
+        return out
+
+    def first(self, calls: Counted, t0: float, y0: np.ndarray) -> np.ndarray:
+        """The derivative at the start, where a function that takes other arguments is told."""
+        try:
+            return calls(t0, y0)
+        except TypeError:
+            out = ("out",) if "in place" in self.form else ()
+            require_arguments(self.fun, ("t", "y", *out, *("params" for _ in self.extra)), *CALLED)
+            raise
+
+    def compiled(self, run: Run, wanted: bool | None) -> tuple[CompiledFunctions, str | None]:
+        """The functions of the loop, and why they are not compiled (None: they are)."""
+        interpreted = CompiledFunctions(self.rhs, run.invariants.inv, run.invariants.grad, self.events.fill)
+        if wanted is False:
+            return interpreted, "compiled=False"
+        try:
+            if isinstance(run.method, OneStep):
+                raise NotCompilableError(f"{run.method.name} is a one-step method in Python")
+            events = tuple(self.events.functions)
+            return compile_functions(self.fun, self.form, bool(self.extra), run.invariants, events, run.y0.dtype), None
+        except NotCompilableError as reason:
+            if wanted:
+                raise
+            return interpreted, str(reason)
+
+
+@dataclass
+class Prepared:
+    """A run that is ready but for its functions, which are compiled last; `max_bytes` bounds what it saves."""
+
+    request: Request
+    method: AnyMethod
+    system: System
+    stepping: Stepping
+    start: Start
+    grid: Grid
+    run: Run
+    diagnostics: Diagnostics
+    max_bytes: float
+
+    @property
+    def label(self) -> str:
+        """The name of the method's class."""
+        return str(self.request.method.__name__)
+
+    def identity(self, y0: Any, params: Any) -> dict[str, Any]:
+        """All that decides the bits of a run from y0, but for the functions, under the names that users give."""
+        return settings(self.label, self.stepping, y0, params, self.run, self.grid, self.system.events)
+
+
+def prepared(request: Request, *, check_start: bool = True) -> Prepared:
+    """A run as it is asked for, all that was given checked; `check_start`: see `_setup.prepare`."""
+    refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
+    method = _method(request.method)
+    form = FORMS[isinstance(method, NystromTableau), flag("in_place", request.in_place)]
+    _check_choices(request)
+    request, form = _with_problem(request, form)
+    system = System(request, form)
+    t0, t_bound = _span(request, system.events)
+    y0 = _state(request.y0)
+    name = request.method.__name__
+    stepping = request.steps.checked(name, method, t0, t_bound, y0.size, stacklevel=4)
+    projection = ProjectionOptions(**request.projection)
+    system.bind(y0)
+    calls = Counted(system.derivative)
+    f0 = system.first(calls, t0, y0)
+    if isinstance(method, NystromTableau):
+        setup.check_second_order(calls, t0, y0, f0, name)
+    start = Start(t0, y0, f0, stepping.first(calls, y0, f0, method))
+    grid = _grid(stepping.span, start.tau, request, system.events)
+    run = setup.prepare(
+        method, calls, start, projection, stepping, extra=system.extra, check_start=check_start, hand=system.hand
+    )
+    run.in_place = "in place" in form
+    bound = 0.5 * free_memory() if request.max_bytes is None else request.max_bytes
+    check_memory(saved_rows(grid), run, bound)
+    record = Diagnostics() if request.diagnostics is None else request.diagnostics
+    setup.attach(record, run)
+    system.events.fill(t0, run.y0, grid.g)
+    run.work.K[0] = f0 if run.y0 is y0 else calls(t0, run.y0)
+    run.work.counters[NFEV] = calls.count
+    return Prepared(request, method, system, stepping, start, grid, run, record, bound)
+
+
+def started_at(request: Request) -> tuple[float, np.ndarray]:
+    """Time and state at the start, a problem's own where none is given."""
+    t_span, y0 = _given_or_brought(request)
+    return interval(t_span)[0], _state(y0)
+
+
+def _method(method: Any) -> Any:
+    if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
+        raise TypeError(
+            f"integrate: method must be an EIP class such as EIPRK4, or one that eip_method made; got {method!r}."
+        )
+    if method._project_step is not EIPSolver._project_step:
+        raise TypeError(f"integrate does not call {method.__name__}._project_step; use it through solve_ivp.")
+    return method.TABLEAU
+
+
+def _check_choices(request: Request) -> None:
+    callback, compiled = request.callback, request.compiled
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback must be a function callback(t, y, defects), got {shown(callback)}.")
+    flag("progress", request.progress)
+    if compiled is not None and not isinstance(compiled, (bool, np.bool_)):
+        raise ValueError(f"compiled must be True, False or None (where possible), got {shown(compiled)}.")
+    check_bytes(request.max_bytes)
+
+
+def _given_or_brought(request: Request) -> tuple[Any, Any]:
+    """t_span and y0 as they are given, else a problem's own."""
+    problem, t_span, y0 = request.fun, request.t_span, request.y0
+    if isinstance(problem, Problem):
+        return problem.t_span if t_span is None else t_span, problem.y0 if y0 is None else y0
+    return t_span, y0
+
+
+def _with_problem(request: Request, form: str) -> tuple[Request, str]:
+    """The request with what a `Problem` brings where nothing else is given, and the form of its function."""
+    t_span, y0 = _given_or_brought(request)
+    projection, params = dict(request.projection), request.params
+    problem = request.fun
+    if not isinstance(problem, Problem):
+        projection |= _with_run_params(projection, params)
+        return replace(request, t_span=t_span, y0=y0, projection=projection), form
+    brought = {option.name for option in fields(problem)} & set(ProjectionOptions.names())
+    projection = {name: getattr(problem, name) for name in brought} | projection
+    projection |= _with_run_params(projection, problem.params)
+    if params is None and problem.rhs is not None:
+        params = problem.params
+    projection |= _with_run_params(projection, params)
+    form, fun = ("value", problem.fun) if problem.rhs is None else ("in place", problem.rhs)
+    h = problem.h if request.h is DEFAULT and not request.adaptive else request.h
+    return replace(request, fun=fun, t_span=t_span, y0=y0, params=params, h=h, projection=projection), form
+
+
+def _with_run_params(projection: Mapping[str, Any], params: Any) -> dict[str, Any]:
+    """The invariants with `params` taken out of their args, where they are all these hold: the run passes them."""
+    if "invariants" not in projection:
+        return {}
+    items = as_invariants(projection["invariants"])
+    if params is not None:
+        items = tuple(_bare(item) if _takes(item, params) else item for item in items)
+    return {"invariants": items}
+
+
+def _takes(item: Invariant, params: Any) -> bool:
+    return len(item.args) == 1 and np.array_equal(item.args[0], params)
+
+
+def _bare(item: Invariant) -> Invariant:
+    bare = Invariant.__new__(Invariant)
+    bare.__dict__.update(item.__dict__, args=())
+    return bare
+
+
+def _required(name: str, value: Any) -> Any:
+    if value is None:
+        raise TypeError(f"integrate: {name} is missing; only a Problem brings its own.")
+    return value
+
+
+def _state(y0: Any) -> np.ndarray:
+    start = setup.initial_state(_required("y0", y0))
+    if start.size == 0:
+        raise ValueError("y0 is empty; integrate needs a state of at least one component.")
+    return start
+
+
+def _span(request: Request, events: Events) -> tuple[float, float]:
+    """The interval; endless only where something may end the run."""
+    t0, t_bound = interval(request.t_span)
+    ends = events.terminal or (request.callback is not None and request.save_every is not None)
+    if math.isinf(t_bound) and not ends:
+        raise ValueError(
+            f"t_span must be finite unless a terminal event ends the run, got {shown(request.t_span)}; a callback may "
+            "end it too, at the steps that save_every=... saves."
+        )
+    return t0, t_bound
+
+
+def _grid(span: Span, tau: float, request: Request, events: Events) -> Grid:
+    save_every, t_eval, times = request.save_every, request.t_eval, np.zeros(0)
+    if t_eval is not None:
+        if save_every is not None:
+            raise ValueError("give save_every or t_eval, not both.")
+        times = _evaluation_times(t_eval, span)
+    n_events = len(events.functions)
+    return Grid(
+        span=span,
+        save_every=0 if save_every is None else count("save_every", save_every),
+        t_eval=times,
+        place=np.zeros(3, np.int64),
+        clock=np.array([span.t0, span.t0, 0.0, tau]),
+        g=np.zeros(n_events),
+        g_new=np.zeros(n_events),
+        g_direction=events.directions,
+    )
+
+
+def _evaluation_times(t_eval: Any, span: Span) -> np.ndarray:
+    times = real_array("t_eval", t_eval)
+    if times.ndim != 1 or times.size == 0:
+        raise ValueError("`t_eval` must be 1-dimensional and not empty.")
+    if not np.isfinite(times).all():
+        raise ValueError("t_eval must be finite.")
+    if np.any(times < min(span.t0, span.t_bound)) or np.any(times > max(span.t0, span.t_bound)):
+        raise ValueError("Values in `t_eval` are not within `t_span`.")
+    if np.any(span.sign * np.diff(times) <= 0):
+        raise ValueError("Values in `t_eval` are not properly sorted.")
+    return times

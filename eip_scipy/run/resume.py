@@ -1,0 +1,376 @@
+"""Checkpoints of `integrate`: what identifies a run, what is kept of it and when, and how it goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..core.inputs import is_number, shown
+from ..core.setup import Run
+from ..core.stepping import Stepping
+from ..engine.step import H_ABS, T
+from . import checkpoint
+from .checkpoint import CheckpointError
+from .events import Events
+from .interrupts import TerminatedError
+from .own_file import OwnFile, unlocked
+
+__all__ = ["Keeper", "kept", "settings"]
+
+KIND = "integrate"
+# A run goes on from its last snapshot: what came after it is done again.
+SNAPSHOT_SECONDS = 0.2
+# Copying and writing take at most a twentieth of a run's time each, however large the state or what was saved.
+LEAST_RATIO = 19.0
+# How far values of one function at one point may differ, on another machine too.
+SAME = 1e-9
+SHORT = 16
+STEP = 0
+
+
+class Keeper:
+    """What a run tells its checkpoints; this one keeps none."""
+
+    keeps = False
+    seconds = 0.0
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the message of the result says besides."""
+        return ()
+
+    def identify(
+        self,
+        settings: dict[str, Any],
+        run: Run,
+        derivative: Callable[[float, np.ndarray], np.ndarray],
+        t0: float,
+        y0: np.ndarray,
+        f0: np.ndarray,
+    ) -> None:
+        """Before anything is compiled: the settings of the run, and the derivative, f0 at the start."""
+
+    def begin(self, driver: Any, events: Events, max_bytes: float) -> None:
+        """All buffers are as at the start; a run that is resumed fills them."""
+
+    def keep(self) -> None:
+        """Between two chunks of steps."""
+
+    def end(self, status: int, message: str) -> None:
+        """The run has ended by itself."""
+
+    def interrupted(self, error: BaseException) -> None:
+        """`error` has broken the run off."""
+
+
+@contextmanager
+def kept(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
+    """The keeper for the options ``checkpoint``, ``checkpoint_every`` and ``resume`` of `integrate`.
+
+    Raises
+    ------
+    TypeError
+        When `path` is none.
+    ValueError
+        For other wrong values, and for `resume` without a path.
+    CheckpointError
+        When a file is there and the run is not to resume it, or it cannot be read, or another run has it.
+    """
+    if not isinstance(resume, (bool, np.bool_)):
+        raise ValueError(f"resume must be True or False, got {resume!r}.")
+    if not is_number(every) or not every > 0:
+        raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
+    if path is None:
+        if resume:
+            raise ValueError("resume=True needs the file to resume from: checkpoint=path.")
+        yield Keeper()
+        return
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"checkpoint must be the path of a file, got {path!r}.")
+    with OwnFile(path) as file:
+        if file.problem:
+            warnings.warn(unlocked(file.name, file.problem), RuntimeWarning, stacklevel=4)
+        found, origin = None, ""
+        if file.exists():
+            if not resume:
+                raise file.existing("run")
+            found = file.read(KIND)
+        elif resume:
+            origin = "no checkpoint was there: started at the beginning"
+        yield _FileKeeper(file, float(every), found, origin)
+
+
+def settings(
+    method: str, stepping: Stepping, y0: np.ndarray, params: np.ndarray, run: Run, grid: Any, events: Events
+) -> dict[str, Any]:
+    """All that decides the bits of a run, but for the functions, under the names that users give."""
+    span = stepping.span
+    # A one-step method of the user's own is known by its name and orders, as functions are by what they give.
+    parts = run.method if isinstance(run.method, tuple) else (run.method.order, run.method.error_estimator_order)
+    found = {
+        "method": f"{method} {_digest(parts)[:8]}",
+        "t_span": (span.t0, span.t_bound),
+        "h": stepping.h,
+        "first_step": stepping.first_step,
+        "max_step": span.max_step,
+        "y0": y0,
+        "params": params,
+        **run.identity,
+        "save_every": grid.save_every or None,
+        "t_eval": grid.t_eval if grid.t_eval.size else None,
+        "events": events.ends,
+    }
+    return {name: _plain(value) for name, value in found.items()}
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON holds it, long arrays by their digest."""
+    if isinstance(value, np.ndarray):
+        if value.size <= SHORT:
+            return _plain(value.tolist())
+        return f"{value.dtype} {value.shape} {_digest((value,))}"
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, complex) or (isinstance(value, float) and not math.isfinite(value)):
+        return repr(value)
+    return value
+
+
+def _digest(values: Iterable[Any]) -> str:
+    """Hash of arrays and numbers."""
+    digest = hashlib.sha256()
+    for value in values:
+        a = np.ascontiguousarray(value)
+        digest.update(f"{a.dtype} {a.shape} ".encode() + a.tobytes())
+    return digest.hexdigest()
+
+
+class _Snapshot(NamedTuple):
+    """A run after an accepted step: its small arrays, how often each event had happened, and the seconds it took."""
+
+    arrays: dict[str, np.ndarray]
+    happened: list[int]
+    seconds: float
+
+
+class _FileKeeper(Keeper):
+    """Checkpoints in a file, one each `every` seconds; `found` is what was read there.
+
+    What is written is always the last snapshot, never the buffers as they are: whoever breaks a run off may do so
+    inside a step. Saved rows and events only grow, so that a snapshot knows them by their number.
+    """
+
+    keeps = True
+
+    def __init__(
+        self,
+        file: OwnFile,
+        every: float,
+        found: tuple[dict[str, Any], dict[str, np.ndarray]] | None,
+        origin: str,
+    ) -> None:
+        self._file, self._every, self._found = file, every, found
+        self._origin = origin
+        self._failure = ""
+        self._ended: Any = None
+
+    def identify(
+        self,
+        settings: dict[str, Any],
+        run: Run,
+        derivative: Callable[[float, np.ndarray], np.ndarray],
+        t0: float,
+        y0: np.ndarray,
+        f0: np.ndarray,
+    ) -> None:
+        self._settings, self._names, self._derivative = settings, run.invariants.names, derivative
+        self._start = {"start_f": f0, "start_values": run.invariants.start_values}
+        if self._found is None:
+            return
+        header, arrays = self._found
+        checkpoint.require_same(self._file.name, header.get("settings"), settings)
+        self._require_same_functions(run, arrays, self._start, t0, y0, "at the start")
+        self._require_fitting(arrays, {"y": y0, "clock": np.zeros(H_ABS + 1)})
+        if "state_f" in arrays:
+            t, y = float(arrays["clock"][T]), arrays["y"]
+            here = self._known_by(run, t, y)
+            self._require_same_functions(run, arrays, here, t, y, f"at t = {t:.10g}, where it stands,")
+        checkpoint.warn_of_other_versions(self._file.name, header, stacklevel=4)
+
+    def _known_by(self, run: Run, t: float, y: np.ndarray) -> dict[str, np.ndarray]:
+        """What the functions are known by at a state of the run."""
+        return {"state_f": self._derivative(t, y.copy()), "state_values": run.invariants.values(t, y)}
+
+    def _require_same_functions(
+        self,
+        run: Run,
+        arrays: dict[str, np.ndarray],
+        known_by: dict[str, np.ndarray],
+        t: float,
+        y: np.ndarray,
+        where: str,
+    ) -> None:
+        self._require_fitting(arrays, known_by)
+        f, _ = known_by.values()
+        labels = ["fun"] * f.size + [f"invariant {name!r}" for name in self._names]
+        there, here = (np.concatenate([a[name] for name in known_by]) for a in (arrays, known_by))
+        with np.errstate(invalid="ignore"):
+            sizes = np.append(np.full(f.size, np.abs(f).max(initial=0.0)), run.invariants.term_sizes(t, y, f))
+            same = (there == here) | (np.abs(there - here) <= SAME * sizes) | (np.isnan(there) & np.isnan(here))
+        if not same.all():
+            k = int(np.flatnonzero(~same)[0])
+            raise CheckpointError(
+                f"the checkpoint {self._file.name!r} belongs to another run: {labels[k]} was {there[k]:.12g} {where} "
+                f"and is {here[k]:.12g} now. Resume with the functions of that run, or name another file to start anew."
+            )
+
+    def _require_fitting(self, arrays: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+        for name, a in expected.items():
+            found = arrays.get(name)
+            if found is None or (found.dtype, found.shape) != (a.dtype, a.shape):
+                what = "is missing" if found is None else f"is {found.dtype} {found.shape}"
+                raise CheckpointError(
+                    f"{self._file.name!r} is no checkpoint of this run: {name} {what}, expected {a.dtype} {a.shape}."
+                )
+
+    def begin(self, driver: Any, events: Events, max_bytes: float) -> None:
+        self._driver, self._events = driver, events
+        found, self._found = self._found, None
+        if found is not None:
+            self._restore(*found, max_bytes)
+        self._begin = time.perf_counter() - self.seconds
+        self._take_snapshot()
+        self._written = self._where()
+        self._due = time.perf_counter() + self._every
+        if found is None:
+            self._write(None, "running")
+
+    def _restore(self, header: dict[str, Any], arrays: dict[str, np.ndarray], max_bytes: float) -> None:
+        """Fill the run's buffers, after a look at all that is to go there."""
+        driver, events = self._driver, self._events
+        parts = driver.parts()
+        self._require_fitting(arrays, parts)
+        step, rows, pending = (int(k) for k in arrays["place"])
+        if step < 0 or rows < 0 or pending != 0 or not is_number(header.get("wall_time")):
+            where = f"it stands at step {step}, row {rows}"
+            raise CheckpointError(f"{self._file.name!r} is no checkpoint of this run: {where}.")
+        n, dtype = driver.run.y0.size, driver.run.y0.dtype
+        expected = {"saved_t": np.broadcast_to(0.0, rows), "saved_y": np.broadcast_to(dtype.type(0), (rows, n))}
+        for k in range(len(events.functions)):
+            times = f"event_{k}_t"
+            count = arrays[times].size if times in arrays else 0
+            expected[times] = np.broadcast_to(0.0, count)
+            expected[f"event_{k}_y"] = np.broadcast_to(dtype.type(0), (count, n))
+        self._require_fitting(arrays, expected)
+        driver.load(arrays["saved_t"], arrays["saved_y"], max_bytes)
+        for name, part in parts.items():
+            part[...] = arrays[name]
+        for k in range(len(events.functions)):
+            events.restore(k, arrays[f"event_{k}_t"], arrays[f"event_{k}_y"])
+        self.seconds = float(header["wall_time"])
+        driver.run.trust.doubts[:] = map(str, header.get("doubts") or ())
+        self._ended = (header.get("status"), header.get("message"), step)
+        self._origin = f"resumed at step {step}"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return tuple(note for note in (self._origin, self._file.moved, self._failure) if note)
+
+    def keep(self) -> None:
+        now = time.perf_counter()
+        if now >= min(self._due, self._next_snapshot):
+            self._take_snapshot()
+        if now >= self._due:
+            self._write_or_warn(None, "running", stacklevel=7)
+
+    def end(self, status: int, message: str) -> None:
+        if status == 0:
+            self._take_snapshot()
+        step = int(self._snapshot.arrays["place"][STEP])
+        if self._ended != (status, message, step):  # else the file says so already
+            self._write_or_warn(status, message, stacklevel=5)
+
+    def interrupted(self, error: BaseException) -> None:
+        try:
+            self._write(None, f"interrupted by {type(error).__name__}")
+        except CheckpointError as failure:
+            error.add_note(str(failure))
+        except (KeyboardInterrupt, TerminatedError):
+            error.add_note("interrupted again while the checkpoint was written")
+        again = "resume=True"
+        if self._file.moved:
+            error.add_note(self._file.moved)
+            again = f"checkpoint={self._file.name!r}, {again}"
+        error.add_note(
+            f"the checkpoint {self._file.name!r} holds {self._written}: the same call with {again} goes on from there"
+        )
+
+    def _state(self) -> dict[str, np.ndarray]:
+        """What the functions are known by at the snapshot; not counted among the run's evaluations."""
+        arrays = self._snapshot.arrays
+        try:
+            return self._known_by(self._driver.run, float(arrays["clock"][T]), arrays["y"])
+        except Exception:  # where a function has just broken the run off: the checkpoint matters more
+            return {}
+
+    def _take_snapshot(self) -> None:
+        begin = time.perf_counter()
+        happened = [len(times) for times in self._events.t]
+        self._snapshot = _Snapshot(self._driver.snapshot(), happened, begin - self._begin)
+        end = time.perf_counter()
+        self._next_snapshot = end + max(SNAPSHOT_SECONDS, LEAST_RATIO * (end - begin))
+
+    def _where(self) -> str:
+        arrays = self._snapshot.arrays
+        return f"step {arrays['place'][STEP]}, t = {arrays['clock'][T]:.10g}"
+
+    def _write_or_warn(self, status: int | None, message: str, *, stacklevel: int) -> None:
+        """Write; a disk that is full is no reason to end a long run, but one to speak."""
+        self._failure, name = "", self._file.name
+        try:
+            self._write(status, message)
+            if self._file.name != name:
+                warnings.warn(f"{self._file.moved}.", RuntimeWarning, stacklevel=stacklevel)
+        except CheckpointError as error:
+            self._due = time.perf_counter() + self._every
+            self._failure = f"{error}; it still holds {self._written}"
+            then = (
+                f"The run goes on and tries again in {self._every:g} s." if status is None else "The result is whole."
+            )
+            warnings.warn(f"{self._failure}. {then}", RuntimeWarning, stacklevel=stacklevel)
+
+    def _write(self, status: int | None, message: str) -> None:
+        driver, events, snapshot = self._driver, self._events, self._snapshot
+        y0, begin = driver.run.y0, time.perf_counter()
+        step, rows, _ = (int(k) for k in snapshot.arrays["place"])
+        header = {
+            "kind": KIND,
+            "method": self._settings["method"],
+            "n": y0.size,
+            "invariants": self._names,
+            "step": step,
+            "t": float(snapshot.arrays["clock"][T]),
+            "rows": rows,
+            "status": status,
+            "message": message,
+            "wall_time": snapshot.seconds,
+            "doubts": driver.run.trust.doubts,
+            "settings": self._settings,
+        }
+        saved = {"saved_t": driver.t[:rows], "saved_y": driver.y[:rows]}
+        arrays = {**self._start, **self._state(), **snapshot.arrays, **saved}
+        for k, count in enumerate(snapshot.happened):
+            arrays[f"event_{k}_t"] = np.array(events.t[k][:count])
+            arrays[f"event_{k}_y"] = np.array(events.y[k][:count], y0.dtype).reshape(count, y0.size)
+        self._file.write(header, arrays)
+        end = time.perf_counter()
+        self._due = end + max(self._every, LEAST_RATIO * (end - begin))
+        self._written = self._where()

@@ -1,0 +1,67 @@
+"""The Python code of the documentation runs as printed, and prints what stands below it."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.needs_jit
+
+ROOT = Path(__file__).parents[2]
+BLOCK = re.compile(r"^```(python|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
+ROUND_OFF = 1e-9
+
+
+def agree(found, printed):
+    """Numbers within a tenth, or both at the level of round-off, which differs from machine to machine."""
+    return math.isclose(found, printed, rel_tol=0.1) or max(abs(found), abs(printed)) < ROUND_OFF
+
+
+def assert_output(found, printed):
+    assert NUMBER.sub("#", found).split() == NUMBER.sub("#", printed).split()
+    for a, b in zip(NUMBER.findall(found), NUMBER.findall(printed), strict=True):
+        assert agree(float(a), float(b)), f"{a}, printed as {b}"
+
+
+PAGES = (
+    "quickstart", "adaptive", "own-methods", "hard-scenes", "checkpoints", "ensembles", "charged-particles",
+    "gross-pitaevskii",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{page}.md" for page in PAGES)])
+def test_page(page, capsys, tmp_path, monkeypatch):
+    """All blocks of a page in turn, in one namespace; a block of text is what the code before it prints."""
+    monkeypatch.chdir(tmp_path)  # where pages write their files
+    path = ROOT / page
+    text = path.read_text(encoding="utf-8")
+    namespace = {"__name__": path.stem}
+    for block in BLOCK.finditer(text):
+        language, code = block.groups()
+        if language == "text":
+            assert_output(capsys.readouterr().out, code)
+            continue
+        capsys.readouterr()
+        line = text.count("\n", 0, block.start(2))
+        exec(compile("\n" * line + code, str(path), "exec"), namespace)
+
+
+def test_a_wrong_output_is_seen():
+    assert_output("error 2.40e-05, defect 3e-15 [1, 2]\n", "error 2.4e-05, defect 8e-16  [1, 2]")
+    for wrong in ("error 2.7e-05, defect 8e-16 [1, 2]", "error 2.4e-05, defect 8e-8 [1, 2]", "error 2.4e-05"):
+        with pytest.raises(AssertionError):
+            assert_output("error 2.4e-05, defect 3e-15 [1, 2]", wrong)
+
+
+def test_notebooks_are_listed():
+    """Each notebook is on the documentation's page; `.ci/run` executes them."""
+    notebooks = sorted((ROOT / "examples").glob("*.md"))
+    assert notebooks
+    page = (ROOT / "docs" / "notebooks.md").read_text(encoding="utf-8")
+    for notebook in notebooks:
+        text = notebook.read_text(encoding="utf-8")
+        assert text.startswith("---\njupytext:\n")
+        title = re.search(r"^# (.+)$", text, re.MULTILINE)[1]
+        assert f"| {title}: `{notebook.name}` |" in page

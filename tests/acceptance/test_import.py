@@ -1,0 +1,58 @@
+"""What `import eip_scipy` brings, and that names come when they are asked for."""
+
+import subprocess
+import sys
+
+import pytest
+
+import eip_scipy
+
+HEAVY = ["matplotlib", "numba", "scipy", "tqdm"]
+HEAVY_FOR_STEPS = ["dask", "matplotlib", "scipy.ndimage", "scipy.signal", "scipy.stats", "skimage", "tqdm", "zarr"]
+
+
+def python(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+
+
+def loaded(code, names):
+    """Which of the modules there are in a fresh process after `code`."""
+    return python(f"{code}\nimport sys\nprint(*(name for name in {names} if name in sys.modules))")
+
+
+def test_the_package_alone_is_light():
+    assert loaded("import eip_scipy", HEAVY) == []
+    code = "import eip_scipy, sys\nprint(*(name for name in sys.modules if name.startswith('eip_scipy.')))"
+    assert set(python(code)) <= {"eip_scipy.core.source_tree", "eip_scipy.integrations"}
+
+
+@pytest.mark.parametrize("name", ["EIPRK4, Invariant", "integrate", "ensemble", "problems"])
+def test_names_bring_no_more_than_they_need(name):
+    assert loaded(f"from eip_scipy import {name}", HEAVY_FOR_STEPS) == []
+
+
+def test_steps_bring_no_ensembles():
+    names = ["eip_scipy.ensemble", "eip_scipy.ensembles.tasks", "eip_scipy.ensembles.chunks"]
+    assert loaded("from eip_scipy import EIPRK4, Invariant, integrate", names) == []
+
+
+def test_all_public_names_are_there():
+    for name in eip_scipy.__all__:
+        assert getattr(eip_scipy, name).__name__ == name
+    assert {*eip_scipy.__all__, "__version__", "checkpoint", "problems"} <= set(dir(eip_scipy))
+    assert python("from eip_scipy import *\nprint(EIPRK4.__name__, __name__)") == ["EIPRK4", "__main__"]
+
+
+def test_modules_and_version_come_by_name():
+    code = "import eip_scipy as e\nprint(e.problems.kepler.__name__, e.checkpoint.read.__name__, e.__version__)"
+    assert python(code) == ["kepler", "read", eip_scipy.__version__]
+
+
+def test_a_function_keeps_its_name_when_the_module_of_that_name_is_imported():
+    code = "import eip_scipy.core.diagnostics, eip_scipy.ensemble\nprint(type(eip_scipy.ensemble).__name__)"
+    assert python(code) == ["function"]
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'EIPRK7'"):
+        eip_scipy.EIPRK7  # noqa: B018

@@ -1,0 +1,232 @@
+"""SciPy's own suite for `solve_ivp`, test_ivp.py of its wheel, run over the adaptive classes.
+
+As it is shipped, but for the method's name: in the literal lists of methods that one is the class, and the others are
+left out. Those of the 25 tests that take the default method, RK45, or Radau, go on to do so, but for the class in the
+place of RK45. ``python -m pytest tests/acceptance/test_scipy_suite.py -k shipped -rP`` prints the count for each class.
+
+And more strictly: each of its tests once per class, which it gets too where it takes the default method, or an implicit
+one on the way to something else.
+"""
+
+import ast
+import importlib.util
+import types
+from pathlib import Path
+
+import pytest
+from scipy import integrate
+
+from eip_scipy import EIPDOP853, EIPRK23, EIPRK45, eip_method
+from eip_scipy.core.stepping import Stepping
+from eip_scipy.engine.step import Span
+
+SCIPY = {"RK23": integrate.RK23, "RK45": integrate.RK45, "DOP853": integrate.DOP853}
+# The classes, and the same tableaux through `eip_method`, where the steps are always the package's own.
+METHODS = {
+    "EIPRK23": ("RK23", EIPRK23),
+    "EIPRK45": ("RK45", EIPRK45),
+    "EIPDOP853": ("DOP853", EIPDOP853),
+    "own RK23": ("RK23", eip_method(EIPRK23.TABLEAU)),
+    "own RK45": ("RK45", eip_method(EIPRK45.TABLEAU)),
+    "own DOP853": ("DOP853", eip_method(EIPDOP853.TABLEAU)),
+}
+ALL = {*SCIPY, "Radau", "BDF", "LSODA"}
+
+DOES_NOT_APPLY = {
+    "test_integration_sparse_difference": "implicit methods: differences of a sparse Jacobian",
+    "test_integration_const_jac": "implicit methods: a constant Jacobian",
+    "test_integration_stiff": "implicit methods: stiffness",
+    "test_event_dense_output_LSODA": "LSODA's own interpolant",
+    "test_num_jac": "SciPy's numerical Jacobian, no method in it",
+    "test_num_jac_sparse": "SciPy's numerical Jacobian, no method in it",
+    "test_ConstantDenseOutput": "SciPy's own class, no method in it",
+    "test_OdeSolution": "SciPy's own class, no method in it",
+}
+# Written for one method, the default RK45 or Radau, with numbers that SciPy's own class of this name misses too.
+MISSED_BY_SCIPY = [
+    ("test_args", "RK23"),
+    ("test_args", "RK45"),
+    ("test_args", "DOP853"),
+    ("test_args_single_value", "RK23"),
+    ("test_duplicate_timestamps", "DOP853"),  # extrapolates an interpolant of degree 7 by 1600 steps
+    ("test_array_rtol", "DOP853"),  # both its errors are far below the tolerance
+]
+# None of these may be missing.
+EXPECTED = {
+    *("test_duplicate_timestamps", "test_integration", "test_integration_complex", "test_events", "test_max_step"),
+    *("test_event_terminal_integer", "test_event_terminal_iv", "test_first_step", "test_t_eval", "test_classes"),
+    *("test_t_eval_dense_output", "test_t_eval_early_event", "test_no_integration", "test_no_integration_class"),
+    *("test_empty", "test_args", "test_array_rtol", "test_integration_zero_rhs", "test_args_single_value"),
+    *("test_initial_state_finiteness", "test_zero_interval", "test_tbound_respected_small_interval"),
+    *("test_tbound_respected_larger_interval", "test_tbound_respected_oscillator", "test_inital_maxstep"),
+}
+
+
+def source():
+    try:
+        spec = importlib.util.find_spec("scipy.integrate._ivp.tests.test_ivp")
+    except ModuleNotFoundError:
+        spec = None
+    if spec is None or spec.origin is None:
+        pytest.skip("this build of SciPy ships without its tests", allow_module_level=True)
+    return Path(spec.origin).read_text(encoding="utf-8"), spec.origin
+
+
+class OneMethod(ast.NodeTransformer):
+    """Lists of methods cut down to one; decorators that only SciPy's test runner knows left out."""
+
+    def __init__(self, name):
+        self.name = name
+
+    def visit_List(self, node):
+        names = {e.value if isinstance(e, ast.Constant) else getattr(e, "id", None) for e in node.elts}
+        if names and names <= ALL and self.name in names:
+            first = node.elts[0]
+            new = ast.Constant(self.name) if isinstance(first, ast.Constant) else ast.Name(self.name, ast.Load())
+            return ast.copy_location(ast.List([new], ast.Load()), node)
+        return self.generic_visit(node)
+
+    def visit_FunctionDef(self, node):
+        node.decorator_list = [d for d in node.decorator_list if "parametrize" in ast.unparse(d)]
+        return self.generic_visit(node)
+
+
+def suite(name, method, as_shipped=False):
+    """SciPy's module with the class `method` in the place of `name`, and what counts its uses.
+
+    The class takes the place of all other methods too, unless the suite is left `as_shipped`.
+    """
+    text, path = SOURCE
+    tree = ast.fix_missing_locations(OneMethod(name).visit(ast.parse(text)))
+    module = types.ModuleType("scipy_suite_" + name)
+    exec(compile(tree, path, "exec"), module.__dict__)
+    used = []
+    order = method.TABLEAU.error_estimator_order if hasattr(method, "TABLEAU") else method.error_estimator_order
+
+    class Counting(method):
+        error_estimator_order = order  # what one of the tests reads
+
+        def __init__(self, *args, **options):
+            used.append(name)
+            super().__init__(*args, **options)
+
+    Counting.__name__ = method.__name__
+
+    def solve_ivp(*args, method=name, **options):
+        assert method in (name, Counting, "Radau"), f"{method} is not the method under test"
+        if "jac" not in options:
+            return integrate.solve_ivp(*args, method=Counting, **options)
+        with pytest.warns(UserWarning, match="have no effect for a chosen solver: `jac`"):
+            return integrate.solve_ivp(*args, method=Counting, **options)
+
+    def as_called(*args, method="RK45", **options):
+        return integrate.solve_ivp(*args, method=Counting if method == name else method, **options)
+
+    def select_initial_step(fun, t0, y0, t_bound, max_step, f0, direction, order, rtol, atol):
+        used.append("initial_step")
+        span = Span(t0, 0.0, t_bound, direction, 0, max_step)
+        return Stepping(span, None, None, rtol, atol).estimated(fun, y0, f0, order)
+
+    solve = as_called if as_shipped else solve_ivp
+    module.__dict__.update({"solve_ivp": solve, "select_initial_step": select_initial_step, name: Counting})
+    return module, used
+
+
+def call(module, key, name, case):
+    function = getattr(module, key)
+    arguments = function.__code__.co_varnames[: function.__code__.co_argcount]
+    known = {"method": name, "num_parallel_threads": 1, **case}
+    function(**{argument: known[argument] for argument in arguments})
+
+
+def cases_of(function):
+    """Arguments of a parametrised test, the method and SciPy's own fixture left out."""
+    marks = [m.args for m in getattr(function, "pytestmark", []) if m.args[0] != "method"]
+    assert len(marks) <= 1
+    return [{marks[0][0]: value} for value in marks[0][1]] if marks else [{}]
+
+
+SOURCE = source()
+SUITES = {label: (name, *suite(name, method)) for label, (name, method) in METHODS.items()}
+CASES = [
+    pytest.param(label, key, case, id="-".join([key, label, *map(str, case.values())]))
+    for label, (name, module, _) in SUITES.items()
+    for key, function in vars(module).items()
+    if key.startswith("test_") and key not in DOES_NOT_APPLY and (key, name) not in MISSED_BY_SCIPY
+    for case in cases_of(function)
+]
+
+
+@pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853], ids=lambda m: m.__name__)
+def test_as_shipped(method):
+    """All of them, for each class; the only allowances are the name, and two private functions of SciPy's."""
+    name = method.SCIPY.__name__
+    module, used = suite(name, method, as_shipped=True)
+    passed = []
+    for key in sorted(EXPECTED):
+        for case in cases_of(getattr(module, key)):
+            call(module, key, name, case)
+        passed.append(key)
+    print(f"{method.__name__}: {len(passed)} of {len(EXPECTED)} of SciPy's own tests pass")
+    assert len(passed) == len(EXPECTED) == 25
+    assert used.count(name) > 40
+
+
+@pytest.mark.parametrize(("label", "key", "case"), CASES)
+def test_of_scipy(label, key, case):
+    name, module, used = SUITES[label]
+    used.clear()
+    call(module, key, name, case)
+    assert used, f"{key} never used {label}"
+
+
+@pytest.mark.parametrize(("key", "name"), MISSED_BY_SCIPY)
+def test_what_is_left_out_is_missed_by_scipy_too(key, name):
+    """They were written for RK45 or Radau and ask for more accuracy than the pair of this name has."""
+    module, used = suite(name, SCIPY[name])
+    with pytest.raises(AssertionError):
+        call(module, key, name, {})
+    assert used
+
+
+@pytest.mark.parametrize("label", METHODS)
+def test_args_with_a_tolerance_for_explicit_pairs(label):
+    """test_args was written for Radau at rtol = 1e-10, atol = 1e-13; its growth by e^20 takes a bit more here."""
+    name, module, used = SUITES[label]
+    solve = module.solve_ivp
+    # RK23's steps are so short that its errors are well below the tolerance.
+    tighter = {"rtol": 1e-11, "atol": 1e-14} if name == "RK23" else {"rtol": 1e-12, "atol": 1e-16}
+    try:
+        module.solve_ivp = lambda *args, **options: solve(*args, **{**options, **tighter})
+        call(module, "test_args", name, {})
+    finally:
+        module.solve_ivp = solve
+    assert used
+
+
+def test_every_test_is_accounted_for():
+    """All of the wheel's tests run or have a reason; those that this SciPy has lost are noticed."""
+    present = {key for key in vars(SUITES["EIPRK45"][1]) if key.startswith("test_")}
+    assert present >= EXPECTED
+    assert not EXPECTED & set(DOES_NOT_APPLY)
+    run = {(label, key) for label, key, _ in (case.values for case in CASES)}
+    missed = {(label, key) for label, (name, _) in METHODS.items() for key, n in MISSED_BY_SCIPY if n == name}
+    assert run | missed >= {(label, key) for label in METHODS for key in EXPECTED}
+
+
+@pytest.mark.parametrize("key", ["test_first_step", "test_integration", "test_max_step"])
+@pytest.mark.parametrize("as_shipped", [True, False])
+def test_the_harness_can_fail(key, as_shipped):
+    """A class that takes no notice of first_step and max_step, and whose states are off, must not get through."""
+    module, used = suite("RK45", EIPRK45, as_shipped)
+    solve = module.solve_ivp
+
+    def spoiled(*args, first_step=None, max_step=None, **options):
+        res = solve(*args, **options)
+        res.y = res.y * (1 + 1e-2)
+        return res
+
+    module.solve_ivp = spoiled
+    with pytest.raises(AssertionError):
+        call(module, key, "RK45", {})
+    assert used

@@ -1,0 +1,317 @@
+"""Runge-Kutta-Nystrom methods through solve_ivp and integrate: orders, dense output, bits, what they refuse."""
+
+from fractions import Fraction
+
+import mpmath
+import numba
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from systems import energy, jit_energy, jit_energy_gradient, jit_momentum, jit_momentum_gradient
+
+from eip_scipy import EIPRKN8, EIPRKN12, Diagnostics, Invariant, NystromTableau, eip_method, integrate
+from eip_scipy.core.diagnostics import observed_order
+from eip_scipy.problems import solar_system
+
+Y0 = np.array([0.8, 0.1, -0.2, 1.1])
+both = pytest.mark.parametrize("method", [EIPRKN8, EIPRKN12])
+
+
+@numba.njit
+def acceleration(t, q):
+    return -q / (q[0] ** 2 + q[1] ** 2) ** 1.5
+
+
+@numba.njit
+def fill_acceleration(t, q, out):
+    w = -1.0 / (q[0] ** 2 + q[1] ** 2) ** 1.5
+    out[0], out[1] = w * q[0], w * q[1]
+
+
+def orbit(t, y):
+    return np.concatenate([y[2:], acceleration(t, y[:2])])
+
+
+INVARIANTS = [Invariant(jit_energy, jit_energy_gradient), Invariant(jit_momentum, jit_momentum_gradient)]
+TAYLOR = NystromTableau("Taylor 2", [[]], ["1/2"], [1], [0], 1, reference="q + h v + h^2 a / 2, v + h a")
+KEPT = {"invariants": INVARIANTS, "blocks": 2}
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """States at t = .25, .5, .75, 1 and 2 by Taylor series in 40 digits."""
+    with mpmath.workdps(40):
+
+        def f(t, y):
+            w = -((y[0] ** 2 + y[1] ** 2) ** mpmath.mpf(-1.5))
+            return [y[2], y[3], w * y[0], w * y[1]]
+
+        solution = mpmath.odefun(f, 0, [mpmath.mpf(float(x)) for x in Y0])
+        return {t: np.array([float(x) for x in solution(t)]) for t in (0.25, 0.5, 0.75, 1, 2)}
+
+
+@pytest.mark.parametrize("options", [{"invariants": ()}, KEPT, {**KEPT, "metric": "euclidean"}])
+@pytest.mark.parametrize(("method", "n"), [(EIPRKN8, (8, 12)), (EIPRKN12, (4, 5))])
+def test_order(method, n, options, exact):
+    """Of one interval in steps so large that truncation is all there is."""
+    errors = [
+        np.abs(
+            integrate(acceleration, (0, 2), Y0, method=method, h=2 / k, compiled=False, **options).y[:, -1] - exact[2]
+        )
+        for k in n
+    ]
+    (order,) = observed_order([e.max() for e in errors], [1 / k for k in n])
+    assert errors[1].max() > 3e-14
+    assert order > method.TABLEAU.order - 1.0
+
+
+def accelerations(tableau, h):
+    """Those of the stages of the first step, by the definition."""
+    q, v, k = Y0[:2], Y0[2:], []
+    for i in range(tableau.n_stages):
+        k.append(acceleration(0, q + tableau.c[i] * h * v + h * h * sum(tableau.A[i, j] * k[j] for j in range(i))))
+    return np.array(k)
+
+
+@both
+def test_one_step_is_the_tableau(method):
+    """Against a step written from the definition, in fractions' own floats."""
+    tableau, h = method.TABLEAU, 0.1
+    q, v, k = Y0[:2], Y0[2:], accelerations(tableau, h)
+    expected = np.concatenate([q + h * v + h * h * tableau.b @ k, v + h * tableau.b_prime @ k])
+    for compensated in (False, True):
+        run = integrate(acceleration, (0, h), Y0, method=method, h=h, compensated=compensated)
+        np.testing.assert_allclose(run.y[:, -1], expected, rtol=4e-16, atol=4e-16)
+
+
+@both
+def test_local_error_is_the_difference_of_the_tableau_s_weights(method):
+    """h^2 e . a in q, h e' . a in v, which the metric is made of."""
+    found, h, tableau = [], 0.5, method.TABLEAU
+
+    class Recorder(method):
+        def _project_step(self, t, y, y_hat, err):
+            found.append(err.copy())
+            return super()._project_step(t, y, y_hat, err)
+
+    solve_ivp(orbit, (0, h), Y0, method=Recorder, h=h, **KEPT)
+    k = accelerations(tableau, h)
+    expected = np.concatenate([h * h * tableau.e @ k, h * tableau.e_prime @ k])
+    assert np.abs(expected).min() > 1e-12
+    np.testing.assert_allclose(found, [expected], rtol=0, atol=1e-14)
+
+
+@both
+def test_stages_keep_the_velocity(method):
+    """The accelerations do not see it, but fun may."""
+    seen = []
+
+    def fun(t, y):
+        seen.append(y[2:].copy())
+        return orbit(t, y)
+
+    solve_ivp(fun, (0, 0.1), Y0, method=method, h=0.1)
+    # The last stage may be the first of the next step.
+    assert sum(np.array_equal(v, Y0[2:]) for v in seen) >= method.TABLEAU.n_stages - 1
+
+
+@both
+def test_time_reaches_every_stage(method):
+    """q'' = -9 sin 3t from t0 = 0.4: exact q = sin 3t."""
+    start, end = (np.array([np.sin(3 * t), 3 * np.cos(3 * t)]) for t in (0.4, 2.4))
+    for compensated in (False, True):
+        run = integrate(
+            lambda t, q: np.array([-9 * np.sin(3 * t)]), (0.4, 2.4), start, method=method, h=0.05,
+            compensated=compensated,
+        )  # fmt: skip
+        np.testing.assert_allclose(run.y[:, -1], end, rtol=0, atol=1e-10)
+
+
+@pytest.mark.needs_jit
+@both
+@pytest.mark.parametrize("options", [{"invariants": ()}, KEPT, {**KEPT, "every": 3}, {**KEPT, "every": "auto"}])
+def test_all_ways_give_the_same_bits(method, options):
+    span, h = (0, 3), 0.05
+    end = solve_ivp(orbit, span, Y0, method=method, h=h, **options).y[:, -1]
+    for fun, in_place in ((acceleration, False), (fill_acceleration, True)):
+        given = {"method": method, "h": h, "in_place": in_place, **options}
+        runs = [integrate(fun, span, Y0, compiled=compiled, **given) for compiled in (False, True)]
+        np.testing.assert_array_equal(runs[0].y, runs[1].y)
+        assert runs[0].nfev == runs[1].nfev
+    np.testing.assert_allclose(runs[0].y[:, -1], end, rtol=0, atol=1e-13)
+
+
+@numba.njit
+def string(t, u, params):
+    """Complex: u'' = -params[0]^2 u."""
+    return -(params[0] ** 2) * u
+
+
+@both
+def test_complex_states_and_params(method):
+    q, v = np.array([1.0 + 0.5j, -0.3j]), np.array([0.2j, 1.0 + 0j])
+    run = integrate(string, (0, 2), np.concatenate([q, v]), method=method, h=0.02, params=[1.5])
+    expected = q * np.cos(3.0) + v / 1.5 * np.sin(3.0)
+    assert run.compiled != numba.config.DISABLE_JIT
+    np.testing.assert_allclose(run.y[:2, -1], expected, rtol=0, atol=1e-13)
+
+
+@both
+@pytest.mark.parametrize("backward", [False, True])
+def test_adaptive(method, backward, exact):
+    start, span = (exact[2], (2, 0)) if backward else (Y0, (0, 2))
+    end = Y0 if backward else exact[2]
+    diagnostics = Diagnostics()
+    sol = solve_ivp(orbit, span, start, method=method, rtol=1e-9, atol=1e-11, diagnostics=diagnostics, **KEPT)
+    assert sol.status == 0
+    np.testing.assert_allclose(sol.y[:, -1], end, rtol=0, atol=2e-8)
+    assert diagnostics.max_defect.max() < 1e-14
+    run = integrate(acceleration, span, start, method=method, rtol=1e-9, atol=1e-11, **KEPT)
+    assert run.compiled != numba.config.DISABLE_JIT
+    np.testing.assert_allclose(run.y[:, -1], sol.y[:, -1], rtol=0, atol=1e-12)
+
+
+@both
+@pytest.mark.parametrize("options", [{"invariants": ()}, KEPT])
+def test_dense_output(method, options):
+    """Quintic in q: of order 6, of order 5 in v; exact at the nodes and on the manifold between them."""
+    errors = []
+    times = np.linspace(0, 2, 101)
+    fine = integrate(acceleration, (0, 2), Y0, method=EIPRKN12, h=0.02, save_every=1, compiled=False).y
+    for h in (0.2, 0.1):
+        sol = solve_ivp(orbit, (0, 2), Y0, method=method, h=h, dense_output=True, **options)
+        np.testing.assert_array_equal(sol.sol(sol.t), sol.y)
+        between = sol.sol(times)
+        errors.append(np.abs(between - fine))
+        if options is KEPT:
+            drift = [[item.fun(0, y) - item.fun(0, Y0) for y in between.T] for item in INVARIANTS]
+            assert np.abs(drift).max() < 1e-11
+    place, speed = (observed_order([e[part].max() for e in errors], [2, 1])[0] for part in (slice(2), slice(2, 4)))
+    # A projection mends v's error, of order 5, in q too.
+    assert place > (4.6 if options is KEPT else 5.6)
+    assert speed > 4.6
+
+
+@both
+def test_what_is_no_second_order_system(method):
+    """The wrong order of the state, an acceleration that sees the velocity, an odd number of components."""
+    with pytest.raises(ValueError, match="the first 2 components of fun must be v"):
+        solve_ivp(lambda t, y: np.concatenate([acceleration(t, y[2:]), y[:2]]), (0, 1), Y0, method=method, h=0.1)
+    with pytest.raises(ValueError, match="accelerations change with the velocity; take a Runge-Kutta"):
+        solve_ivp(lambda t, y: [y[2], y[3], -y[2], -y[3]], (0, 1), Y0, method=method, h=0.1)
+    for call in (
+        lambda: solve_ivp(lambda t, y: -y, (0, 1), Y0[:3], method=method, h=0.1),
+        lambda: integrate(acceleration, (0, 1), Y0[:3], method=method, h=0.1),
+    ):
+        with pytest.raises(ValueError, match="even number of components; y0 has 3"):
+            call()
+    with pytest.raises(ValueError, match=r"fun returned shape \(4,\), expected \(2,\)"):
+        integrate(lambda t, q: np.zeros(4), (0, 1), Y0, method=method, h=0.1)
+
+
+def test_events_and_samples():
+    """The pericentre by an event on the radial velocity, through both drivers."""
+
+    def radial(t, y):
+        return y[0] * y[2] + y[1] * y[3]
+
+    options = {"method": EIPRKN12, "h": 0.05, "events": radial, "t_eval": np.linspace(0, 20, 41), **KEPT}
+    sol = solve_ivp(orbit, (0, 20), Y0, **options)
+    run = integrate(acceleration, (0, 20), Y0, **options)
+    a = -0.5 / energy(0, Y0)
+    period = 2 * np.pi * a**1.5
+    for found in (sol, run):
+        np.testing.assert_allclose(np.diff(found.t_events[0][::2]), period, rtol=1e-7)
+        assert np.abs([energy(0, y) - energy(0, Y0) for y in found.y.T]).max() < 1e-11
+
+
+@pytest.mark.needs_jit
+def test_projection_pays_and_costs_little():
+    """Ten bodies over 100 years, h = .02: Mercury 200 times better, no other planet worse by 2x or 1e-11 AU."""
+    problem = solar_system()
+    reference = problem.reference(100.0)
+
+    def errors(**options):
+        run = integrate(problem, (0, 100), method=EIPRKN12, h=0.02, **options)
+        return np.linalg.norm((run.y[:, -1] - reference)[:30].reshape(10, 3), axis=1)[1:], run.nfev
+
+    plain, calls = errors(invariants=())
+    for every in (10, "auto"):
+        kept, calls_kept = errors(every=every)
+        assert plain[0] > 200 * kept[0]
+        assert np.all(kept[1:] < np.maximum(2 * plain[1:], plain[1:] + 1.5e-11))
+        assert calls_kept == calls
+
+
+@pytest.mark.needs_jit
+@pytest.mark.slow
+@pytest.mark.parametrize("h", [0.02, 1 / 64, 0.01, 0.005])
+def test_spacing_by_itself_never_spoils_a_small_step(h):
+    """every="auto" over 1000 years: no planet worse than twice without projection, or 3e-8 AU."""
+    problem = solar_system()
+    reference = problem.reference(1000.0)
+
+    def errors(**options):
+        run = integrate(problem, (0, 1000), method=EIPRKN12, h=h, compensated=True, **options)
+        return np.linalg.norm((run.y[:, -1] - reference)[:30].reshape(10, 3), axis=1)[1:]
+
+    assert np.all(errors(every="auto") < np.maximum(2 * errors(invariants=()), 3e-8))
+
+
+@pytest.mark.needs_jit
+def test_compensation_of_a_nystrom_step():
+    """Energy of a free rotation in steps with many bits: rounded increments drift, compensated ones do not."""
+    problem = solar_system(years=200)
+    drift = {}
+    for compensated in (False, True):
+        run = integrate(problem, method=EIPRKN12, h=0.0123, invariants=(), compensated=compensated, save_every=10)
+        error = run.y[:, -1] - integrate(problem, method=EIPRKN12, h=1 / 128, compensated=True, every=50).y[:, -1]
+        drift[compensated] = np.linalg.norm(error[:30].reshape(10, 3), axis=1)[2:]
+    assert np.all(drift[True] < 0.5 * drift[False])
+
+
+def test_compensated_sum_of_a_constant_acceleration():
+    """There and back in 3000 steps of a length with many bits, against fractions; one stage leaves no sum to round."""
+    h, steps, a = 0.1, 3_000, np.array([1 / 3, -0.7])
+    v0 = -0.5 * a * (steps * h)
+    last = Fraction(steps * h - (steps - 1) * h)
+    time = (steps - 1) * Fraction(h) + last
+    exact_end = [Fraction(v) * time + Fraction(x) * time**2 / 2 for v, x in zip(v0, a, strict=True)]
+
+    def error(compensated):
+        options = {"h": h, "method": eip_method(TAYLOR), "compensated": compensated, "compiled": False}
+        y = integrate(lambda t, q: a, (0, steps * h), np.concatenate([0 * v0, v0]), **options).y[:2, -1]
+        return max(abs(float(Fraction(x) - wanted)) for x, wanted in zip(y, exact_end, strict=True))
+
+    assert error(True) < 1e-14
+    assert error(False) > 100 * error(True)
+
+
+def test_a_tableau_of_ones_own():
+    method = eip_method(TAYLOR)
+    run = integrate(acceleration, (0, 1), Y0, method=method, h=0.001, **KEPT)
+    assert run.success
+    assert method.__doc__ == "EIP method on <NystromTableau Taylor 2: 1 stages, order 1>."
+    assert run.max_defect.max() < 1e-10
+
+
+@pytest.mark.parametrize("value", [0, -1, 2.5, True, "sometimes", None])
+def test_every_is_a_number_or_auto(value):
+    with pytest.raises(ValueError, match="every must be an integer >= 1"):
+        integrate(acceleration, (0, 1), Y0, method=EIPRKN12, h=0.1, **{**KEPT, "every": value})
+
+
+def test_auto_needs_an_estimate():
+    method = eip_method(TAYLOR)
+    with pytest.raises(ValueError, match="every='auto' needs an error estimate, and Taylor 2 has none"):
+        integrate(acceleration, (0, 1), Y0, method=method, h=0.1, every="auto", **KEPT)
+
+
+def test_auto_projects_where_it_pays():
+    """Large steps are projected at each fifth; small ones, whose error is below round-off, at the end only."""
+    counts = []
+    for h in (0.5, 0.005):
+        run = integrate(acceleration, (0, 10), Y0, method=EIPRKN12, h=h, every="auto", **KEPT)
+        counts.append((run.diagnostics.n_projections + run.diagnostics.n_skipped, round(10 / h)))
+    assert counts[0][0] == counts[0][1] // 5
+    assert counts[1][0] <= 3

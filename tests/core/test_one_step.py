@@ -1,0 +1,218 @@
+"""One-step methods of a user's own: the same projection as for tableaux, and what is refused."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPRK4, Diagnostics, Invariant, OneStepMethod, Tableau, eip_method, integrate
+from eip_scipy.core.diagnostics import observed_order
+from eip_scipy.problems import kepler
+
+
+class RK4:
+    """The classical method with the estimate of `EIPRK4`, written out."""
+
+    order = 4
+
+    def __init__(self, fun):
+        self.fun = fun
+
+    def one_step(self, t, y, h):
+        k1 = self.fun(t, y)
+        k2 = self.fun(t + h / 2, y + h / 2 * k1)
+        k3 = self.fun(t + h / 2, y + h / 2 * k2)
+        self.k4 = self.fun(t + h, y + h * k3)
+        return y + h / 6 * (k1 + 2 * k2 + 2 * k3 + self.k4)
+
+
+class RK43(RK4):
+    error_estimator_order = 3
+    name = "RK4(3)"
+
+    def one_step(self, t, y, h):
+        y_hat = super().one_step(t, y, h)
+        return y_hat, h / 6 * (self.k4 - self.fun(t + h, y_hat))
+
+
+class Verlet:
+    """Position Verlet for the unit oscillator, in place."""
+
+    order = 2
+
+    def one_step(self, t, y, h):
+        y[0] += h / 2 * y[1]
+        y[1] -= h * y[0]
+        y[0] += h / 2 * y[1]
+        return y
+
+
+def oscillator(t, y):
+    return np.array([y[1], -y[0]])
+
+
+LENGTH = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="length")
+FORCED = Invariant(lambda t, y: y @ y, lambda t, y, f: np.array([-2 * f[1], 2 * f[0]]), uses_f=True)
+
+
+def closed(t):
+    return np.array([np.cos(t), -np.sin(t)])
+
+
+def runs(method, **options):
+    """States at the end of both drivers."""
+    sol = solve_ivp(oscillator, (0, 10), [1.0, 0.0], method=method, **options)
+    run = integrate(oscillator, (0, 10), [1.0, 0.0], method=method, **options)
+    assert sol.success
+    assert run.success
+    np.testing.assert_array_equal(sol.y[:, -1], run.y[:, -1])
+    assert (sol.nfev, sol.njev, sol.nlu) == (run.nfev, run.njev, run.nlu)
+    return sol
+
+
+@pytest.mark.parametrize("invariants", [(), LENGTH, FORCED], ids=["none", "length", "uses f"])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"direction": "old"}, {"direction": "midpoint"}, {"iterations": 3}, {"every": 4}, {"reuse_f": False}],
+    ids=lambda o: next(iter(o), "default"),
+)
+def test_fixed_steps_are_those_of_the_tableau(invariants, options):
+    """But for the last bits: the sums run in another order. The written-out method never takes f of a raw result."""
+    options = {"h": 0.1, "metric": "euclidean", "invariants": invariants, **options}
+    ours, tableau = runs(eip_method(RK4(oscillator)), **options), runs(EIPRK4, **{**options, "reuse_f": False})
+    np.testing.assert_allclose(ours.y, tableau.y, rtol=0, atol=2e-14)
+    assert ours.njev == tableau.njev
+
+
+@pytest.mark.parametrize("metric", ["error", "euclidean"])
+def test_adaptive_steps_are_those_of_the_tableau(metric):
+    """The estimate controls the steps and weighs the correction."""
+    kepler_ = kepler()
+    options = {"rtol": 1e-8, "atol": 1e-8, "metric": metric, "invariants": kepler_.invariants, "reuse_f": False}
+    # reuse_f: the tableau's first stage may be f of the raw result, the written-out method takes that of the new state.
+    ours, tableau = (
+        solve_ivp(kepler_.fun, (0, 5), kepler_.y0, method=method, **options)
+        for method in (eip_method(RK43(lambda t, y: np.array(kepler_.fun(t, y)))), EIPRK4)
+    )
+    assert ours.t.size == tableau.t.size
+    np.testing.assert_allclose(ours.t, tableau.t, rtol=1e-8)
+    np.testing.assert_allclose(ours.y, tableau.y, rtol=0, atol=1e-8)
+
+
+def test_order_and_invariant_of_a_method_in_place():
+    errors, method = [], eip_method(Verlet())
+    for h in (0.1, 0.05):
+        diagnostics = Diagnostics()
+        sol = runs(method, h=h, invariants=LENGTH, diagnostics=diagnostics)
+        assert abs(sol.y[:, -1] @ sol.y[:, -1] - 1) < 1e-7
+        errors.append(np.abs(sol.y[:, -1] - closed(10)).max())
+    assert observed_order(errors, [0.1, 0.05])[0] == pytest.approx(2, abs=0.1)
+
+
+def test_backward_and_a_shorter_last_step():
+    for options in ({"h": 0.1, "iterations": 3}, {"h": 0.03, "iterations": 3}):
+        sol = solve_ivp(
+            oscillator, (0, -1), [1.0, 0.0], method=eip_method(RK4(oscillator)), invariants=LENGTH, **options
+        )
+        np.testing.assert_allclose(sol.y[:, -1], closed(-1), atol=1e-6)
+        assert abs(sol.y[:, -1] @ sol.y[:, -1] - 1) < 1e-15
+
+
+def test_dense_output_is_the_cubic_through_both_ends():
+    """Between the steps its own error is h^4 / 384 = 2.6e-7; events and t_eval are read from it."""
+    times = np.linspace(0, 10, 333)
+    reached = 8.5e-6  # by the steps, h^4 t / 120
+    for invariants in ((), LENGTH):
+        options = {"h": 0.1, "invariants": invariants, "method": eip_method(RK4(oscillator))}
+        sol = solve_ivp(oscillator, (0, 10), [1.0, 0.0], t_eval=times, events=lambda t, y: y[0], **options)
+        assert np.abs(sol.y - closed(sol.t)).max() < reached + 3e-7
+        np.testing.assert_allclose(sol.t_events[0], np.pi * np.arange(0.5, 3), atol=reached)
+        run = integrate(oscillator, (0, 10), [1.0, 0.0], t_eval=times, **options)
+        np.testing.assert_array_equal(run.y, sol.y)
+    assert np.abs((sol.y**2).sum(axis=0) - 1).max() < 1e-13
+
+
+def test_fun_is_called_only_where_someone_asks():
+    """At the start; for gradients that take f; for dense output."""
+    for invariants, each in (((), 0), (LENGTH, 0), (FORCED, 1)):
+        counts = [
+            solve_ivp(
+                oscillator, (0, n / 10), [1.0, 0.0], method=eip_method(Verlet()), h=0.1, invariants=invariants
+            ).nfev
+            for n in (10, 20)
+        ]
+        assert counts[1] - counts[0] == 10 * each
+
+
+def test_complex_states_keep_their_type():
+    class Exact:
+        order = 8
+
+        def one_step(self, t, y, h):
+            return y * np.exp(-1j * h) * (1 + h**3)
+
+    modulus = Invariant(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y)
+    run = integrate(
+        lambda t, y: -1j * y, (0, 1), [1 + 1j, 2.0], method=eip_method(Exact()), h=0.1, invariants=modulus, iterations=4
+    )
+    np.testing.assert_allclose(run.y[:, -1], np.array([1 + 1j, 2.0]) * np.exp(-1j), atol=1e-15)
+
+
+def test_an_own_step_runs_interpreted_and_says_so():
+    method = eip_method(Verlet())
+    run = integrate(oscillator, (0, 1), [1.0, 0.0], method=method, h=0.1)
+    assert not run.compiled
+    assert run.message == "reached the end of the interval (interpreted: Verlet is a one-step method in Python)"
+    with pytest.raises(TypeError, match="Verlet is a one-step method in Python"):
+        integrate(oscillator, (0, 1), [1.0, 0.0], method=method, h=0.1, compiled=True)
+    with pytest.raises(ValueError, match=r"compensated=True .* Verlet is no tableau"):
+        integrate(oscillator, (0, 1), [1.0, 0.0], method=method, h=0.1, compensated=True)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # inf - inf, by NumPy, without the JIT
+def test_failures_end_the_run():
+    class Overflow(Verlet):
+        def one_step(self, t, y, h):
+            return np.full(2, np.inf) if t > 0.45 else y
+
+    sol = solve_ivp(oscillator, (0, 1), [1.0, 0.0], method=eip_method(Overflow()), h=0.1)
+    assert sol.status == -1
+    assert "no longer finite at t=0.6" in sol.message
+
+
+def returning(value, **attributes):
+    return type("Mine", (), {"order": 2, "one_step": lambda self, t, y, h: value, **attributes})()
+
+
+@pytest.mark.parametrize(
+    ("method", "error", "match"),
+    [
+        (returning(None), TypeError, "Mine.one_step returned a state: None, expected 2 numbers"),
+        (returning([1.0]), ValueError, r"Mine.one_step returned a state: shape \(1,\), expected \(2,\)"),
+        (returning([1j, 0.0]), ValueError, "complex values at t=0, but y0 is real"),
+        (returning("ab"), TypeError, "'ab', expected 2 numbers"),
+        (returning([1.0, 0.0], error_estimator_order=1), TypeError, r"list, expected the pair \(y_hat, err\)"),
+        (returning(([1.0, 0.0], 0.0), error_estimator_order=1), ValueError, r"an estimate: shape \(\)"),
+    ],
+)
+def test_wrong_results_are_named(method, error, match):
+    with pytest.raises(error, match=match):
+        solve_ivp(oscillator, (0, 1), [1.0, 0.0], method=eip_method(method), h=0.1)
+
+
+def test_wrong_methods_are_refused():
+    for wrong in (Verlet, object(), returning([1.0, 0.0], one_step=3)):
+        with pytest.raises(TypeError, match=r"object with one_step\(t, y, h\) and order"):
+            eip_method(wrong)
+    for name in ("order", "error_estimator_order"):
+        with pytest.raises(ValueError, match=f"Mine: {name} must be an integer >= 1, got 0"):
+            eip_method(returning([1.0, 0.0], **{name: 0}))
+    with pytest.raises(ValueError, match="has no error estimate and needs the step"):
+        solve_ivp(oscillator, (0, 1), [1.0, 0.0], method=eip_method(Verlet()))
+    with pytest.raises(ValueError, match="every='auto' needs an error estimate, and Verlet has none"):
+        integrate(oscillator, (0, 1), [1.0, 0.0], method=eip_method(Verlet()), h=0.1, invariants=LENGTH, every="auto")
+
+
+def test_the_protocol_tells_methods_from_others():
+    assert isinstance(Verlet(), OneStepMethod)
+    assert not isinstance(EIPRK4.TABLEAU, OneStepMethod)
+    assert isinstance(EIPRK4.TABLEAU, Tableau)

@@ -1,0 +1,82 @@
+"""The options of the projection are known in one place: signatures, documentation, keywords."""
+
+import inspect
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPRK4, EIPRK45, EIPSolver, Invariant, ensemble, integrate
+from eip_scipy.core.options import ProjectionKeywords, ProjectionOptions
+from eip_scipy.problems import kepler
+
+NAMES = ProjectionOptions.names()
+
+
+def test_keywords_for_type_checkers_are_the_options():
+    assert tuple(ProjectionKeywords.__annotations__) == NAMES
+
+
+@pytest.mark.parametrize("function", [EIPSolver, EIPRK4, integrate])
+def test_signatures_show_the_options(function):
+    shown = inspect.signature(function).parameters
+    for name, option in inspect.signature(ProjectionOptions).parameters.items():
+        assert shown[name].default == option.default
+        assert shown[name].kind is inspect.Parameter.KEYWORD_ONLY
+
+
+def test_documentation_names_the_options():
+    for name in NAMES:
+        assert f"\n    {name} : " in EIPSolver.__doc__
+    assert ", ".join(NAMES) in integrate.__doc__
+    assert "{" + "ProjectionOptions" not in EIPSolver.__doc__ + integrate.__doc__
+
+
+def test_none_is_the_own_of_the_method():
+    p = kepler()
+    plain, none = (
+        integrate(p, (0, 3), method=EIPRK4, h=0.1, compiled=False, **options)
+        for options in ({"every": 1, "compensated": False}, {"every": None, "compensated": None})
+    )
+    np.testing.assert_array_equal(plain.y, none.y)
+
+
+@pytest.mark.parametrize("options", [{"h": 0.01}, {"rtol": 1e-10, "atol": 1e-12}])
+def test_solve_ivp_compensates_as_integrate_does(options):
+    p = kepler()
+    sol = solve_ivp(p.fun, (0, 3), p.y0, method=EIPRK45, invariants=p.invariants, compensated=True, **options)
+    run = integrate(
+        p.fun, (0, 3), p.y0, method=EIPRK45, invariants=p.invariants, compensated=True, compiled=False, **options
+    )
+    np.testing.assert_array_equal(sol.y[:, -1], run.y[:, -1])
+    without = solve_ivp(p.fun, (0, 3), p.y0, method=EIPRK45, invariants=p.invariants, **options)
+    assert np.any(without.y[:, -1] != sol.y[:, -1])
+
+
+def test_compensated_steps_without_invariants_are_not_scipys():
+    def fun(t, y):
+        return np.array([1.0 / 3.0])
+
+    ends = [
+        solve_ivp(fun, (0, 1), [1e6], method=EIPRK45, max_step=1e-3, first_step=1e-3, compensated=on).y[0, -1]
+        for on in (True, False)
+    ]
+    exact = 1e6 + 1.0 / 3.0
+    assert abs(ends[0] - exact) <= np.spacing(exact)
+    assert abs(ends[1] - exact) > np.spacing(exact)
+
+
+def test_an_ensemble_takes_the_same_options():
+    norm = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="norm")
+    given = {"metric": "euclidean", "iterations": 2, "direction": "old", "every": 3, "compensated": True}
+    y0s = np.array([[1.0, 0.0], [0.0, 2.0]])
+
+    def fun(t, y):
+        return np.array([y[1], -y[0]])
+
+    run = ensemble(fun, (0, 3), y0s, h=0.1, invariants=norm, compiled=False, **given)
+    for k, y0 in enumerate(y0s):
+        single = integrate(fun, (0, 3), y0, method=EIPRK4, h=0.1, invariants=norm, compiled=False, **given)
+        np.testing.assert_array_equal(run.y[k], single.y[:, -1])
+    with pytest.raises(TypeError, match=r"ensemble\(\) has no option 'metrik'; did you mean 'metric'"):
+        ensemble(fun, (0, 3), y0s, h=0.1, metrik=1)

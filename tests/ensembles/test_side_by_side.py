@@ -1,0 +1,315 @@
+"""Members of an ensemble in vectors: each gets the bits of a run of its own, whatever its neighbours do."""
+
+import math
+
+import numpy as np
+import pytest
+from numba import njit, types
+
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate
+from eip_scipy.engine.octets import is_not, multiply_add, octets, spread, where
+from eip_scipy.ensembles import tasks
+from eip_scipy.ensembles.vector_runs import Batch
+from eip_scipy.problems import harmonic, kepler, solar_system
+from eip_scipy.problems.gravity import _newton
+
+pytestmark = pytest.mark.needs_jit
+
+FIELDS = ("y", "max_defect", "nfev", "njev", "nlu")
+
+
+def spread_starts(y0, members, size=1e-3, seed=0):
+    return y0 * (1 + size * np.random.default_rng(seed).normal(size=(members, y0.size)))
+
+
+@pytest.fixture(autouse=True)
+def _small_ensembles_too(monkeypatch):
+    monkeypatch.setattr(tasks, "LEAST_WORK", 0)
+
+
+def test_little_work_is_not_worth_compiling_for(monkeypatch):
+    monkeypatch.undo()
+    run = ensemble(kepler(), (0, 1), spread_starts(kepler().y0, 40), executor=1)
+    assert not run.side_by_side.any()
+
+
+@pytest.fixture
+def batches(monkeypatch):
+    """Members that ran in batches, and those that had to leave one."""
+    seen = {"members": 0, "left": 0}
+    run, alone = Batch.run, Batch._alone
+
+    def counted_run(self, y0s, *rest):
+        seen["members"] += len(y0s)
+        return run(self, y0s, *rest)
+
+    def counted_alone(self, *rest):
+        seen["left"] += 1
+        return alone(self, *rest)
+
+    monkeypatch.setattr(Batch, "run", counted_run)
+    monkeypatch.setattr(Batch, "_alone", counted_alone)
+    return seen
+
+
+def check_bits(problem, t_span, starts, *, params=None, members=None, **options):
+    """An ensemble, some of its members compared with runs of their own."""
+    run = ensemble(problem, t_span, starts, params=params, executor=1, **options)
+    saved = "save_every" in options
+    for k in range(len(starts)) if members is None else members:
+        own = None if params is None else params[k]
+        single = integrate(problem, t_span, starts[k], params=own, check=False, **options)
+        assert (single.status, single.message) == (run.status[k], run.message[k])
+        np.testing.assert_array_equal(run.y[k], single.y[:, -1])
+        assert run.t[k] == single.t[-1]
+        if saved and single.success:
+            np.testing.assert_array_equal(run.trajectories[k], single.y)
+        np.testing.assert_array_equal(run.max_defect[k], single.max_defect)
+        assert [run[name][k] for name in FIELDS[2:]] == [single[name] for name in FIELDS[2:]]
+        np.testing.assert_array_equal(run.max_correction[k], single.diagnostics.max_correction)
+    return run
+
+
+@pytest.mark.parametrize("method", [EIPRK4, EIPRK5, EIPRK45, EIPDOP853])
+def test_members_get_the_bits_of_single_runs(method, batches):
+    starts = spread_starts(kepler().y0, 40)
+    check_bits(kepler(), (0, 15), starts, method=method, h=0.03)
+    assert batches["members"] == 40
+    assert batches["left"] == 0
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"metric": "euclidean"},
+        {"metric": np.array([1.0, 2.0, 0.5, 3.0])},
+        {"every": 3},
+        {"reuse_f": False},
+        {"blocks": None},
+        {"invariants": ()},
+        {"save_every": 7},
+        {"frame": (np.array([[1.0, 0, 0, 0.5]]), np.array([[1.0], [0], [0], [0]]))},
+    ],
+    ids=lambda options: next(iter(options)) + "-" + type(next(iter(options.values()))).__name__,
+)
+@pytest.mark.parametrize("span", [(0.0, 6.1), (2.0, -3.0)], ids=["forward", "backward"])
+def test_options(options, span, batches):
+    check_bits(kepler(), span, spread_starts(kepler().y0, 11), method=EIPRK4, h=0.05, **options)
+    assert batches["members"] == 11
+
+
+@pytest.mark.parametrize("members", [1, 2, 7, 8, 9, 33, 70])
+def test_any_number_of_members(members):
+    starts = spread_starts(kepler().y0, members)
+    check_bits(kepler(), (0, 3), starts, method=EIPRK4, h=0.05, members=range(max(0, members - 9), members))
+
+
+def test_parallel_gradients(batches):
+    """On a circular orbit the gradients of H and L are parallel: the rank falls, in some members at some steps."""
+    e = np.array([0.0, 0.0, 1e-9, 1e-8, 1e-6, 1e-4, 0.02, 0.3, 0.0, 0.6])
+    starts = np.stack([kepler(x, relativistic=0.0).y0 for x in e])
+    check_bits(kepler(relativistic=0.0), (0, 30), starts, method=EIPRK5, h=0.05)
+    assert batches["members"] == len(e)
+
+
+def test_members_leave_and_come_back(batches):
+    """Components that stand alone make projections with softened weights: more than a vector does."""
+    starts = spread_starts(np.array([1.0, 0.0, 0.0, 1.0]), 16, size=0.1)
+    run = check_bits(kepler(), (0, 60), starts, method=EIPRK5, h=0.1, blocks=None, save_every=50)
+    assert run.success
+    assert batches["left"] > 3
+
+
+def test_nystrom_with_parameters_of_each():
+    problem = solar_system(years=100.0)
+    starts = spread_starts(problem.y0, 9, size=1e-7)
+    check_bits(problem, (0, 3), starts, method=EIPRKN12, h=0.02, every=5, members=[0, 4, 8])
+    masses = problem.params * (1 + 1e-3 * np.random.default_rng(3).normal(size=(9, 10)))
+    run = check_bits(problem, (0, 1), starts, params=masses, method=EIPRKN8, h=0.02, members=[0, 8])
+    assert len(np.unique(run.y[:, 0])) == 9
+
+
+@njit
+def pendulums(t, y, out, params):
+    """A chain: loops, functions of one and two arguments, powers, a number that every member shares."""
+    half = y.size // 2
+    for i in range(half):
+        out[i] = y[half + i]
+        out[half + i] = -params[0] * math.sin(y[i])
+    for i in range(half - 1):
+        pull = 0.25 * (y[i + 1] - y[i]) ** 3
+        out[half + i] += pull
+        out[half + i + 1] -= pull
+
+
+@njit
+def chain_energy(t, y, params):
+    half = y.size // 2
+    total = 0.0
+    for i in range(half):
+        total += 0.5 * y[half + i] * y[half + i] - params[0] * math.cos(y[i])
+    for i in range(half - 1):
+        total += math.pow(y[i + 1] - y[i], 4.0) / 16
+    return total
+
+
+@njit
+def chain_gradient(t, y, out, params):
+    half = y.size // 2
+    for i in range(half):
+        out[i] = params[0] * math.sin(y[i])
+        out[half + i] = y[half + i]
+    for i in range(half - 1):
+        pull = 0.25 * (y[i + 1] - y[i]) ** 3
+        out[i] -= pull
+        out[i + 1] += pull
+
+
+def test_functions_of_the_users_own(batches):
+    starts = np.random.default_rng(5).normal(size=(12, 10))
+    params = np.linspace(0.5, 2, 12)[:, None]
+    energy = Invariant(chain_energy, chain_gradient, in_place=True, name="H")
+    check_bits(
+        pendulums, (0, 5), starts, params=params, method=EIPRK4, h=0.02, in_place=True, invariants=[energy],
+        metric="euclidean",
+    )  # fmt: skip
+    assert batches["members"] == 12
+
+
+@njit
+def with_a_branch(t, y, out):
+    out[0] = y[1]
+    out[1] = -y[0] if y[0] > 0 else -4 * y[0]
+
+
+@njit
+def with_an_array(t, y):
+    return np.array([y[1], -y[0]])
+
+
+@pytest.mark.parametrize(("fun", "in_place"), [(with_a_branch, True), (with_an_array, False)])
+def test_what_does_not_go_into_a_vector_runs_one_by_one(fun, in_place, batches):
+    starts = spread_starts(np.array([1.0, 0.5]), 9)
+    check_bits(fun, (0, 4), starts, method=EIPRK4, h=0.05, in_place=in_place, invariants=())
+    assert batches["members"] == 0
+
+
+@njit
+def explodes(t, y, out):
+    out[0] = y[0] * y[0]
+    out[1] = -y[1]
+
+
+def test_a_member_that_fails_disturbs_no_other(batches):
+    starts = np.ones((10, 2))
+    starts[:, 0] = 0.1
+    starts[3, 0], starts[7, 0] = 2.0, np.nan
+    run = check_bits(
+        explodes, (0, 5), starts, method=EIPRK4, h=0.01, in_place=True, invariants=(), save_every=100,
+        members=[0, 1, 2, 3, 4, 9],
+    )  # fmt: skip
+    assert list(run.failed) == [3, 7]
+    assert "non-finite" in run.message[3] or "no longer finite" in run.message[3]
+    assert "nan" in run.message[7].lower() or "finite" in run.message[7]
+    assert np.isnan(run.trajectories[3, 0, -1])
+    assert not np.isnan(run.trajectories[3, 0, 0])
+    assert batches["members"] == 10
+
+
+def test_exceptions_name_the_member():
+    """Division by zero raises in the single run; in a vector it gives inf, and the member leaves."""
+
+    @njit
+    def divides(t, y, out):
+        out[0] = 1.0 / (y[0] - y[1])
+        out[1] = 0.0 * y[1]
+
+    starts = np.tile([1.0, 0.0], (8, 1))
+    starts[5] = 2.0, 2.0
+    run = ensemble(divides, (0, 1), starts, method=EIPRK4, h=0.1, in_place=True, invariants=(), executor=1)
+    assert list(run.failed) == [5]
+    assert "ZeroDivisionError" in run.message[5]
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 16, 17, 21])
+def test_gravity_in_octets(n):
+    """Every order of summation that the number of bodies brings with it."""
+    rng = np.random.default_rng(n)
+    y, gm = rng.normal(size=(6 * n, 8)), 10.0 ** rng.uniform(-8, 0, size=(n, 8))
+    f, energy, gradient, momentum = np.zeros_like(y), np.zeros((1, 8)), np.zeros_like(y), np.zeros((3, 8))
+
+    @njit
+    def all_eight(y, gm, f, energy, gradient, momentum):
+        y, gm, f = octets(y, 0), octets(gm, 0), octets(f, 0)
+        _newton.rhs(0.0, y, f, gm)
+        octets(energy, 0)[0] = _newton.energy(0.0, y, gm)
+        _newton.energy_gradient(0.0, y, f, octets(gradient, 0), gm)
+        found = _newton.momentum(0.0, y, gm)
+        for k in range(3):
+            octets(momentum, 0)[k] = found[k]
+
+    all_eight(y, gm, f, energy, gradient, momentum)
+    for k in range(8):
+        state, masses, out, slope = y[:, k].copy(), gm[:, k].copy(), np.zeros(6 * n), np.zeros(6 * n)
+        _newton.rhs(0.0, state, slope, masses)
+        _newton.energy_gradient(0.0, state, slope, out, masses)
+        np.testing.assert_array_equal(f[:, k], slope)
+        np.testing.assert_array_equal(gradient[:, k], out)
+        assert energy[0, k] == _newton.energy(0.0, state, masses)
+        np.testing.assert_array_equal(momentum[:, k], _newton.momentum(0.0, state, masses))
+
+
+def test_octets_are_floats_lane_by_lane():
+    """All that functions of octets are made of, against the same functions of floats."""
+
+    @njit(error_model="numpy")
+    def values(a, b, out):
+        total = 0.0
+        for i in range(a.size):
+            total += a[i]
+        out[0] = total
+        out[1] = 2 * a[0] - b[0] / 3 + (-b[0])
+        out[2] = math.sqrt(abs(a[0])) + abs(b[0])
+        out[3] = max(a[0], b[0]) * min(a[0], 0.5)
+        out[4] = math.sin(a[0]) + math.exp(b[0]) + math.atan2(a[0], b[0]) + math.hypot(a[0], b[0])
+        out[5] = abs(a[0]) ** 1.3 + a[0] ** 2 + b[0] ** 3
+        out[6] = where((a[0] > b[0]) | is_not(a[0] >= 0.0), a[0], where((a[0] != b[0]) & (b[0] <= 1.0), b[0], 7.0))
+        out[7] = multiply_add(a[0], b[0], 1.0)
+        out[8] = 1
+        out[8] += b[0]
+        out[9] = a[0] / 0.0
+
+    @njit
+    def all_eight(a, b, out):
+        values(octets(a, 0), octets(b, 0), octets(out, 0))
+
+    rng = np.random.default_rng(11)
+    a, b = rng.normal(size=(2, 3, 8))
+    out = np.zeros((10, 8))
+    all_eight(a, b, out)
+    for k in range(8):
+        one = np.zeros(10)
+        values(a[:, k].copy(), b[:, k].copy(), one)
+        np.testing.assert_array_equal(out[:, k], one)
+
+
+def test_octets_are_typed_apart_from_floats():
+    @njit
+    def add(a, b):
+        return a + b
+
+    add(1.0, 2)
+    assert add.nopython_signatures[-1].return_type == types.float64
+
+    @njit
+    def lifted(x):
+        return spread(x) * 2.0 > 1.0
+
+    with pytest.raises(Exception, match="octet"):
+        lifted(1.0)
+
+
+def test_adaptive_members_run_one_by_one(batches):
+    starts = spread_starts(harmonic().y0, 9)
+    check_bits(harmonic(), (0, 1), starts, method=EIPRK45, first_step=0.1)
+    assert batches["members"] == 0

@@ -1,0 +1,403 @@
+"""Nystrom tableaux: order conditions by trees grown here, wrong coefficients, low parts, orders on Kepler's problem."""
+
+import math
+from fractions import Fraction
+from functools import cache
+
+import mpmath
+import numpy as np
+import pytest
+from mpmath import mpf
+
+from eip_scipy.methods.nystrom import RKN86, RKN1210, NystromTableau, Weights, nystrom_residuals, nystrom_trees
+
+DIGITS = 60
+HOLDS, FAILS = mpf("1e-30"), mpf("1e-9")
+
+# None is in the package: kick-drift-kick leapfrog, whose last stage is the next first; Nystrom's method of order 4.
+LEAPFROG = {"A": [[], ["1/2"]], "b": ["1/2", 0], "b_prime": ["1/2", "1/2"], "c": [0, 1], "order": 2}
+NYSTROM4 = {
+    "A": [[], ["1/8"], [0, "1/2"]],
+    "b": ["1/6", "1/3", 0],
+    "b_prime": ["1/6", "2/3", "1/6"],
+    "c": [0, "1/2", 1],
+    "order": 4,
+}
+PAIR = {**LEAPFROG, "b_hat": ["1/2", 0], "b_prime_hat": [1, 0], "error_estimator_order": 1}
+HIGH = [RKN86, RKN1210]
+# Its position weights meet no moment but the first.
+QUARTERS = NystromTableau("quarters", **{**LEAPFROG, "b": ["1/4", "1/4"]})
+METHODS = [NystromTableau("leapfrog", **PAIR), NystromTableau("nystrom4", **NYSTROM4), QUARTERS, *HIGH]
+
+
+def name(tableau):
+    return tableau.name
+
+
+# Trees as nested tuples of their branches; accelerations at even height, velocities, with one branch at most, at odd.
+@cache
+def special_trees(order):
+    """Each is one with a vertex less plus a leaf somewhere."""
+    return {()} if order == 1 else {grown for tree in special_trees(order - 1) for grown in graft(tree)}
+
+
+def graft(tree):
+    yield tuple(sorted((*tree, ())))
+    for i, velocity in enumerate(tree):
+        for grown in graft(velocity[0]) if velocity else [()]:
+            yield tuple(sorted((*tree[:i], (grown,), *tree[i + 1 :])))
+
+
+@cache
+def size(tree):
+    return 1 + sum(map(size, tree))
+
+
+@cache
+def density(tree):
+    return size(tree) * math.prod(map(density, tree))
+
+
+def from_package(tree):
+    """A tree of the package in the form above."""
+    return tuple(sorted([()] * tree.leaves + [(from_package(sub),) for sub in tree.subtrees]))
+
+
+class Conditions:
+    """Order conditions of a method whose coefficients are lists of numbers of any kind."""
+
+    def __init__(self, A, c, **weights):
+        self.A, self.c, self.weights = A, c, weights
+        self.factors, self.branches = {}, {}
+
+    def stage_factors(self, tree):
+        if tree not in self.factors:
+            branches = [self.branch(velocity) for velocity in tree]
+            self.factors[tree] = [math.prod((branch[i] for branch in branches), start=1) for i in range(len(self.c))]
+        return self.factors[tree]
+
+    def branch(self, velocity):
+        if not velocity:
+            return self.c
+        if velocity not in self.branches:
+            x = self.stage_factors(velocity[0])
+            self.branches[velocity] = [sum(row[j] * x[j] for j in range(i)) for i, row in enumerate(self.A)]
+        return self.branches[velocity]
+
+    def residual(self, key, tree):
+        total = sum(w * x for w, x in zip(self.weights[key], self.stage_factors(tree), strict=True))
+        # A position is the tree on one more vertex, its velocity.
+        whole = tree if "prime" in key else (tree,)
+        return total - Fraction(1, density(whole)) if isinstance(total, Fraction) else total - mpf(1) / density(whole)
+
+    def residuals(self, key, order):
+        """Those of exactly this order of the local error: a position has gained one by its velocity."""
+        return [abs(self.residual(key, tree)) for tree in special_trees(order if "prime" in key else order - 1)]
+
+
+def fractions(tableau):
+    values = {key: value.tolist() for key, value in tableau.exact.items()}
+    return Conditions(**values)
+
+
+@cache
+def digits(tableau):
+    def mp(values):
+        return [mp(x) if isinstance(x, list) else mpf(x.numerator) / x.denominator for x in values]
+
+    with mpmath.workdps(DIGITS):
+        return Conditions(**{key: mp(value.tolist()) for key, value in tableau.exact.items()})
+
+
+WEIGHTS = [
+    (t, key, p)
+    for t in HIGH
+    for p, keys in ((t.order, "b b_prime"), (t.error_estimator_order, "b_hat b_prime_hat"))
+    for key in keys.split()
+]
+
+
+def test_number_of_special_trees():
+    """Hairer, Norsett & Wanner I, section II.14."""
+    counts = [1, 1, 2, 3, 6, 10, 20, 36, 72, 137, 275]
+    assert [len(special_trees(k)) for k in range(1, 12)] == counts
+    assert [len(nystrom_trees(k)) for k in range(1, 12)] == counts
+
+
+@pytest.mark.parametrize("order", range(1, 13))
+def test_trees_are_those_of_another_algorithm(order):
+    assert {from_package(tree) for tree in nystrom_trees(order)} == special_trees(order)
+
+
+@pytest.mark.parametrize(("tableau", "key", "order"), WEIGHTS, ids=lambda x: getattr(x, "name", str(x)))
+def test_order_in_many_digits(tableau, key, order):
+    with mpmath.workdps(DIGITS):
+        conditions = digits(tableau)
+        for k in range(1 if "prime" in key else 2, order + 1):
+            assert max(conditions.residuals(key, k)) < HOLDS
+        assert max(conditions.residuals(key, order + 1)) > FAILS
+
+
+@pytest.mark.parametrize(("key", "order"), [("b", 8), ("b_prime", 8), ("b_hat", 6), ("b_prime_hat", 6)])
+def test_order_of_rkn86_in_fractions(key, order):
+    conditions = fractions(RKN86)
+    assert all(x == 0 for k in range(1 if "prime" in key else 2, order + 1) for x in conditions.residuals(key, k))
+    assert all(x != 0 for x in conditions.residuals(key, order + 1))
+
+
+@pytest.mark.parametrize("key", ["b", "b_prime"])
+def test_order_of_nystrom4_in_fractions(key):
+    conditions = fractions(METHODS[1])
+    assert all(x == 0 for k in range(2, 5) for x in conditions.residuals(key, k))
+    assert any(x != 0 for x in conditions.residuals(key, 5))
+
+
+@pytest.mark.parametrize("tableau", HIGH, ids=name)
+def test_stage_positions_are_of_second_order(tableau):
+    """Sum_j A_ij = c_i^2 / 2, which the constructor does not ask for."""
+    for row, node in zip(tableau.exact["A"], tableau.exact["c"], strict=True):
+        assert abs(sum(row) - node**2 / 2) < Fraction(1, 10**50)
+
+
+def test_the_package_s_residuals_agree_with_the_sums():
+    """With weights that are nobody's, so that the residuals are large."""
+    A, c = RKN86.exact["A"], RKN86.exact["c"]
+    weights = np.array([Fraction(i + 1, 7) for i in range(9)], dtype=object)
+    conditions = Conditions(A.tolist(), c.tolist(), b=weights.tolist(), b_prime=weights.tolist())
+    rows = [Weights("b", weights, 7, True), Weights("b_prime", weights, 7, False)]
+    ours = {
+        key: sorted(r for row, _, r in nystrom_residuals(A, c, rows) if row.label == key) for key in ("b", "b_prime")
+    }
+    for key, first, last in (("b", 2, 7), ("b_prime", 1, 7)):
+        trees = [t for k in range(first, last + 1) for t in special_trees(k - (key == "b"))]
+        assert ours[key] == pytest.approx(sorted(float(conditions.residual(key, t)) for t in trees), rel=1e-15)
+
+
+def arguments(tableau):
+    """What makes the same tableau again, with entries that may be changed."""
+    values = {key: value.tolist() for key, value in tableau.exact.items()}
+    return {**values, "order": tableau.order, "error_estimator_order": tableau.error_estimator_order}
+
+
+def places(tableau):
+    for key, values in tableau.exact.items():
+        for place, value in np.ndenumerate(values):
+            if value != 0:
+                yield key, place
+
+
+def changed(tableau, key, place, change):
+    values = arguments(tableau)
+    row = values[key] if len(place) == 1 else values[key][place[0]]
+    row[place[-1]] += change
+    return values
+
+
+@pytest.mark.parametrize(("key", "place"), list(places(RKN86)))
+def test_one_wrong_coefficient_is_found(key, place):
+    with pytest.raises(ValueError, match=r"bad: b\w* is not of order [68]: a condition of order \d+ misses by"):
+        NystromTableau("bad", **changed(RKN86, key, place, Fraction(1, 10**40)))
+
+
+@pytest.mark.parametrize(("key", "place"), list(places(RKN1210))[::9])
+def test_one_wrong_coefficient_of_rkn1210_is_found(key, place):
+    with pytest.raises(ValueError, match=r"bad: b\w* is not of order 1[02]"):
+        NystromTableau("bad", **changed(RKN1210, key, place, Fraction(1, 10**40)))
+
+
+@pytest.mark.parametrize(("key", "place"), [("A", (12, 4)), ("b", (7,)), ("b_prime", (15,)), ("c", (14,))])
+def test_the_sums_of_this_file_find_a_wrong_coefficient(key, place):
+    values = changed(RKN1210, key, place, Fraction(1, 10**25))
+    wrong = {k: values[k] for k in ("A", "c", "b", "b_prime")}
+    with mpmath.workdps(DIGITS):
+        to_mp = [[mpf(x.numerator) / x.denominator for x in row] for row in wrong.pop("A")]
+        rows = {k: [mpf(x.numerator) / x.denominator for x in row] for k, row in wrong.items()}
+        conditions = Conditions(to_mp, **rows)
+        assert max(x for k in range(2, 7) for w in ("b", "b_prime") for x in conditions.residuals(w, k)) > HOLDS
+
+
+def moment_residuals(tableau, key):
+    """Sum (b + b_low) c^k less its exact value, in fractions, for the doubles of the step, in units of the least.
+
+    That is half a unit in the last place of each low part, which are the sums' only numbers that can be chosen.
+    """
+    b, low = getattr(tableau, key), getattr(tableau, f"{key}_low")
+    weights = [Fraction(w) + Fraction(x) for w, x in zip(b, low, strict=True)]
+    nodes = [Fraction(x) for x in tableau.c]
+    count = min(7, tableau.order - (key == "b"), len({x for x, w in zip(nodes, b, strict=True) if w}))
+    for k in range(count):
+        missed = sum(w * c**k for w, c in zip(weights, nodes, strict=True))
+        missed -= Fraction(1, (k + 1) * (k + 2 if key == "b" else 1))
+        least = sum(Fraction(math.ulp(x)) / 2 * c**k for w, x, c in zip(b, low, nodes, strict=True) if w)
+        yield abs(missed) / least
+
+
+@pytest.mark.parametrize("key", ["b", "b_prime"])
+@pytest.mark.parametrize("tableau", METHODS, ids=name)
+def test_low_parts_make_the_moments_exact(tableau, key):
+    assert max(moment_residuals(tableau, key)) <= 1
+    low = getattr(tableau, f"{key}_low")
+    assert np.abs(low).max() < 1e-16
+    assert not low[getattr(tableau, key) == 0].any()
+
+
+def test_a_first_order_position_has_no_moment():
+    drift = NystromTableau("drift", [[]], ["1/3"], [1], [0], order=1)
+    assert drift.b_low[0] == float(Fraction(1, 3) - Fraction(1 / 3))
+
+
+def test_number_of_exact_moments():
+    counts = [len(list(moment_residuals(t, key))) for t in METHODS for key in ("b", "b_prime")]
+    assert counts == [1, 2, 2, 3, 1, 2, 6, 7, 7, 7]
+
+
+@pytest.mark.parametrize("key", ["b", "b_prime"])
+@pytest.mark.parametrize("tableau", HIGH, ids=name)
+def test_what_rounding_lost_is_not_enough(tableau, key):
+    """Even with exact weights, rounded nodes miss the moments by round-off."""
+    nodes = [Fraction(x) for x in tableau.c]
+    total = sum(w * c for w, c in zip(tableau.exact[key], nodes, strict=True))
+    assert abs(total - Fraction(1, 6 if key == "b" else 2)) > Fraction(1, 10**20)
+
+
+def test_low_parts_of_a_float_tableau():
+    values = {key: getattr(RKN86, key).tolist() for key in ("A", "b", "b_prime", "c", "b_hat", "b_prime_hat")}
+    floats = NystromTableau("floats", **values, order=8, error_estimator_order=6)
+    assert max(moment_residuals(floats, "b_prime")) <= 1
+    assert floats.fsal
+    values["A"][3][1] += 1e-10
+    with pytest.raises(ValueError, match="floats: b is not of order 8"):
+        NystromTableau("floats", **values, order=8, error_estimator_order=6)
+
+
+@pytest.mark.parametrize("tableau", METHODS, ids=name)
+def test_doubles_are_the_rounded_fractions(tableau):
+    for key, values in tableau.exact.items():
+        np.testing.assert_array_equal(getattr(tableau, key), values.astype(float))
+
+
+@pytest.mark.parametrize("key", ["b", "b_prime"])
+@pytest.mark.parametrize("tableau", HIGH, ids=name)
+def test_e_is_the_difference_of_the_weights(tableau, key):
+    pairs = zip(tableau.exact[key], tableau.exact[f"{key}_hat"], strict=True)
+    assert list(getattr(tableau, "e" if key == "b" else "e_prime")) == [float(x - y) for x, y in pairs]
+
+
+def test_attributes():
+    assert [t.n_stages for t in METHODS] == [2, 3, 2, 9, 17]
+    assert [t.order for t in METHODS] == [2, 4, 2, 8, 12]
+    assert [t.error_estimator_order for t in METHODS] == [1, None, None, 6, 10]
+    assert [t.has_estimate for t in METHODS] == [True, False, False, True, True]
+    assert [t.fsal for t in METHODS] == [True, False, False, True, False]
+    assert all("Dormand, El-Mikkawy & Prince" in t.reference for t in HIGH)
+    assert repr(RKN86) == "<NystromTableau RKN86: 9 stages, order 8, estimate of order 6>"
+    assert repr(METHODS[1]) == "<NystromTableau nystrom4: 3 stages, order 4>"
+    assert not METHODS[1].e.any()
+    assert METHODS[1].b_hat is None
+
+
+@pytest.mark.parametrize(
+    "key", ["A", "b", "b_prime", "c", "b_hat", "b_prime_hat", "e", "e_prime", "b_low", "b_prime_low"]
+)
+def test_arrays_are_read_only(key):
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(RKN86, key)[0] = 1.0
+
+
+def test_fractions_and_fields_are_read_only():
+    with pytest.raises(ValueError, match="read-only"):
+        RKN86.exact["b"][0] = 1
+    with pytest.raises(TypeError, match="item assignment"):
+        RKN86.exact["b"] = None
+    with pytest.raises(AttributeError, match="cannot assign"):
+        RKN86.order = 9
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"order": 3}, r"bad: b is not of order 3: a condition of order 3 misses by -0\.167"),
+        ({"b": ["1/3", 0]}, r"bad: b is not of order 2"),
+        ({"b_prime": ["1/2", "1/3"]}, r"bad: b_prime is not of order 2"),
+        ({"b_prime_hat": ["1/2", "1/3"]}, r"bad: b_prime_hat is not of order 1"),
+        ({"error_estimator_order": 2}, r"bad: b_prime_hat is not of order 2"),
+        ({"A": [["1/2"], ["1/2"]]}, r"bad: row 0 of A reaches its diagonal"),
+        ({"A": [[]]}, r"bad: A has 1 rows and b 2 entries"),
+        ({"c": [0]}, r"bad: c has 1 entries and b 2; they must agree"),
+        ({"b_prime": ["1/2", "1/2", 0]}, r"bad: b_prime has 3 entries and b 2"),
+        ({"b_hat": [1]}, r"bad: b_hat has 1 entries and b 2"),
+        ({"b_prime_hat": None}, r"bad: b_hat, b_prime_hat and error_estimator_order go together"),
+        ({"error_estimator_order": None}, r"bad: b_hat, b_prime_hat and error_estimator_order go together"),
+        ({"order": 0}, r"bad: order must be an integer >= 1, got 0"),
+        ({"order": True}, r"bad: order must be an integer >= 1, got True"),
+        ({"error_estimator_order": 1.0}, r"bad: error_estimator_order must be an integer >= 1, got 1\.0"),
+        ({"c": [0, float("nan")]}, r"bad: coefficients must be finite numbers"),
+    ],
+)
+def test_wrong_tableaux(changes, match):
+    with pytest.raises(ValueError, match=match):
+        NystromTableau("bad", **{**PAIR, **changes})
+
+
+ECCENTRICITY = Fraction(1, 10)
+
+
+def kepler(t):
+    """Position and velocity on the ellipse with unit period / 2 pi, from its pericentre."""
+    e = mpf(ECCENTRICITY.numerator) / ECCENTRICITY.denominator
+    E = mpmath.findroot(lambda x: x - e * mpmath.sin(x) - t, t)
+    root, rate = mpmath.sqrt(1 - e**2), 1 / (1 - e * mpmath.cos(E))
+    q = [mpmath.cos(E) - e, root * mpmath.sin(E)]
+    return q, [-mpmath.sin(E) * rate, root * mpmath.cos(E) * rate]
+
+
+def acceleration(q):
+    cube = mpmath.sqrt(q[0] ** 2 + q[1] ** 2) ** 3
+    return [-x / cube for x in q]
+
+
+def step(method, q, v, h):
+    """The new position and velocity, and the estimates."""
+    K = []
+    for row, node in zip(method.A, method.c, strict=True):
+        drift = [sum(a * k[i] for a, k in zip(row, K, strict=False)) for i in range(2)]
+        K.append(acceleration([q[i] + node * h * v[i] + h**2 * drift[i] for i in range(2)]))
+
+    def gain(key):
+        return [sum(w * k[i] for w, k in zip(method.weights[key], K, strict=True)) for i in range(2)]
+
+    ends = []
+    for position, velocity in (("b", "b_prime"), ("b_hat", "b_prime_hat")):
+        q_new = [x + h * y + h**2 * z for x, y, z in zip(q, v, gain(position), strict=True)]
+        ends.append([*q_new, *(y + h * z for y, z in zip(v, gain(velocity), strict=True))])
+    return ends
+
+
+def largest(a, b):
+    return max(abs(x - y) for x, y in zip(a, b, strict=True))
+
+
+@pytest.mark.parametrize("tableau", HIGH, ids=name)
+def test_order_on_keplers_problem(tableau):
+    """Global error of the step over a unit of time, in many digits, where the next term of the error is small."""
+
+    def error(n):
+        state = [*kepler(mpf(0))[0], *kepler(mpf(0))[1]]
+        for _ in range(n):
+            state, _ = step(digits(tableau), state[:2], state[2:], mpf(1) / n)
+        return largest(state, [*kepler(mpf(1))[0], *kepler(mpf(1))[1]])
+
+    with mpmath.workdps(DIGITS):
+        assert float(mpmath.log(error(64) / error(128), 2)) == pytest.approx(tableau.order, abs=0.1)
+
+
+@pytest.mark.parametrize("tableau", HIGH, ids=name)
+def test_estimate_is_of_its_order(tableau):
+    """The local estimate falls like h^(p_hat + 1)."""
+
+    def estimate(h):
+        return largest(*step(digits(tableau), *kepler(mpf(1)), h))
+
+    with mpmath.workdps(DIGITS):
+        ratio = estimate(mpf(1) / 64) / estimate(mpf(1) / 128)
+        assert float(mpmath.log(ratio, 2)) == pytest.approx(tableau.error_estimator_order + 1, abs=0.1)

@@ -1,0 +1,311 @@
+"""Tableaux: order conditions in fractions by independent trees and sums, wrong tableaux, low parts of the weights."""
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from eip_scipy import Invariant, Tableau, eip_method, integrate
+from eip_scipy.methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, order_residuals, rooted_trees
+
+EPS = np.finfo(float).eps
+
+CLASSICAL = {"A": [[], ["1/2"], [0, "1/2"], [0, 0, 1]], "b": ["1/6", "1/3", "1/3", "1/6"]}
+# Kutta's 3/8 rule, Ralston's rule, and Butcher's method of order 6: none of them in the package.
+THREE_EIGHTHS = Tableau("ThreeEighths", [[], ["1/3"], ["-1/3", 1], [1, -1, 1]], ["1/8", "3/8", "3/8", "1/8"], order=4)
+RALSTON = Tableau("Ralston", [[], ["2/3"]], ["1/4", "3/4"], order=2, b_hat=[1, 0], error_estimator_order=1)
+BUTCHER6 = Tableau(
+    "Butcher6",
+    [
+        [],
+        ["1/3"],
+        [0, "2/3"],
+        ["1/12", "1/3", "-1/12"],
+        ["-1/16", "9/8", "-3/16", "-3/8"],
+        [0, "9/8", "-3/8", "-3/4", "1/2"],
+        ["9/44", "-9/11", "63/44", "18/11", 0, "-16/11"],
+    ],
+    ["11/120", 0, "27/40", "27/40", "-4/15", "-4/15", "11/120"],
+    order=6,
+)
+METHODS = [RK1, RK2, RK3, RK4, RK5, THREE_EIGHTHS, RALSTON, BUTCHER6]
+PAIRS = [t for t in METHODS if t.has_estimate]
+
+
+def name(tableau):
+    return tableau.name
+
+
+def grafted(order):
+    """All rooted trees as sorted nested tuples: each is one with a vertex less plus a leaf somewhere."""
+
+    def graft(tree):
+        yield tuple(sorted((*tree, ())))
+        for i, sub in enumerate(tree):
+            for grown in graft(sub):
+                yield tuple(sorted((*tree[:i], grown, *tree[i + 1 :])))
+
+    trees = {()}
+    for _ in range(order - 1):
+        trees = {grown for tree in trees for grown in graft(tree)}
+    return trees
+
+
+def canonical(tree):
+    return tuple(sorted(map(canonical, tree)))
+
+
+def size(tree):
+    return 1 + sum(map(size, tree))
+
+
+def density(tree):
+    return size(tree) * math.prod(map(density, tree))
+
+
+def exact(values):
+    """The fractions behind an array of doubles, which must round to them."""
+    fractions = [Fraction(float(x)).limit_denominator(10**5) for x in np.ravel(values)]
+    assert [float(x) for x in fractions] == list(np.ravel(values))
+    return np.array(fractions, dtype=object).reshape(np.shape(values))
+
+
+def residual(tree, A, b):
+    """Sum_i b_i Phi_i(tree) - 1/density, written out with sums."""
+
+    def weight(tree, i):
+        return math.prod((sum(A[i][j] * weight(sub, j) for j in range(len(b))) for sub in tree), start=Fraction(1))
+
+    return sum(b[i] * weight(tree, i) for i in range(len(b))) - Fraction(1, density(tree))
+
+
+def with_row_b(tableau):
+    """The stage matrix with f at the new point as one more stage."""
+    s = tableau.n_stages
+    A = np.full((s + 1, s + 1), Fraction(0), dtype=object)
+    A[:s, :s], A[s, :s] = exact(tableau.A), exact(tableau.b)
+    return A
+
+
+def test_number_of_rooted_trees():
+    assert [len(rooted_trees(k)) for k in range(1, 10)] == [1, 1, 2, 4, 9, 20, 48, 115, 286]
+
+
+@pytest.mark.parametrize("order", range(1, 9))
+def test_trees_are_those_of_another_algorithm(order):
+    ours = [canonical(tree) for tree in rooted_trees(order)]
+    assert len(ours) == len(set(ours))
+    assert set(ours) == grafted(order)
+
+
+@pytest.mark.parametrize("tableau", [RK23, RK45, DOP853], ids=name)
+def test_order_of_scipy_s_pairs(tableau):
+    """The package's own are not checked when they are made, a user's are."""
+    options = {key: getattr(tableau, key) for key in ("b_hat", "error_estimator_order", "c")}
+    paired = {"e_low": tableau.e_low} if tableau.paired else {}
+    same = Tableau(tableau.name, tableau.A.tolist(), tableau.b.tolist(), tableau.order, **options, **paired)
+    assert np.allclose(same.e, tableau.e, rtol=0, atol=1e-15)
+    with pytest.raises(ValueError, match=f"b is not of order {tableau.order + 1}"):
+        Tableau(tableau.name, tableau.A.tolist(), tableau.b.tolist(), tableau.order + 1)
+
+
+@pytest.mark.parametrize("tableau", METHODS, ids=name)
+def test_order_of_the_step_in_fractions(tableau):
+    A, b = exact(tableau.A), exact(tableau.b)
+    assert all(residual(tree, A, b) == 0 for k in range(1, tableau.order + 1) for tree in grafted(k))
+    assert any(residual(tree, A, b) != 0 for tree in grafted(tableau.order + 1))
+
+
+@pytest.mark.parametrize("tableau", PAIRS, ids=name)
+def test_order_of_the_estimate_in_fractions(tableau):
+    A, b = with_row_b(tableau), exact(tableau.b_hat)
+    order = tableau.error_estimator_order
+    assert all(residual(tree, A, b) == 0 for k in range(1, order + 1) for tree in grafted(k))
+    assert any(residual(tree, A, b) != 0 for tree in grafted(order + 1))
+
+
+@pytest.mark.parametrize("tableau", METHODS, ids=name)
+def test_the_package_s_residuals_agree_with_the_sums(tableau):
+    A, b = exact(tableau.A), exact(tableau.b)
+    for tree, value in order_residuals(A, b, 5):
+        assert value == residual(tree, A, b)
+
+
+def test_attributes():
+    assert [t.n_stages for t in (RK1, RK2, RK3, RK4, RK5)] == [1, 2, 3, 4, 6]
+    assert [t.order for t in (RK1, RK2, RK3, RK4, RK5)] == [1, 2, 3, 4, 5]
+    assert [t.fsal for t in (RK1, RK2, RK3, RK4, RK5)] == [False, False, False, True, False]
+    assert [t.error_estimator_order for t in (RK1, RK2, RK3, RK4, RK5)] == [None, 1, 2, 3, 4]
+    assert [t.kappa for t in (RK1, RK2, RK4)] == [1.0, 1.5, 1.25]
+    assert all("section 2.1" in t.reference for t in (RK1, RK2, RK3, RK4))
+    assert "RK4" in repr(RK4)
+    assert "order 4" in repr(RK4)
+
+
+@pytest.mark.parametrize("tableau", PAIRS, ids=name)
+def test_e_is_the_difference_of_the_weights(tableau):
+    b = [*exact(tableau.b), Fraction(0)]
+    assert list(tableau.e) == [float(x - y) for x, y in zip(b, exact(tableau.b_hat), strict=True)]
+
+
+def test_rk4_estimate_is_the_documented_one():
+    """Design 2.1: err = (h/6)(k4 - f(new))."""
+    assert list(RK4.e) == [0, 0, 0, 1 / 6, -1 / 6]
+
+
+def test_arrays_are_read_only():
+    with pytest.raises(ValueError, match="read-only"):
+        RK4.b[0] = 1.0
+
+
+def moment_residuals(tableau):
+    """Sum (b + b_low) c^k - 1/(k + 1) in fractions, for the doubles that the step uses, in units of the least possible.
+
+    That is half a unit in the last place of each low part, which are the sums' only numbers that can be chosen.
+    """
+    weights = [Fraction(x) + Fraction(y) for x, y in zip(tableau.b, tableau.b_low, strict=True)]
+    nodes = [Fraction(x) for x in tableau.c]
+    for k in range(min(tableau.order, len(set(nodes)))):
+        missed = sum(w * x**k for w, x in zip(weights, nodes, strict=True)) - Fraction(1, k + 1)
+        least = sum(Fraction(math.ulp(y)) / 2 * x**k for y, x in zip(tableau.b_low, nodes, strict=True))
+        yield abs(missed) / least
+
+
+@pytest.mark.parametrize("tableau", [*METHODS, RK23, RK45, DOP853], ids=name)
+def test_b_low_makes_the_moments_exact(tableau):
+    assert max(moment_residuals(tableau)) <= 1
+    assert np.abs(tableau.b_low).max() < 3 * EPS * np.abs(tableau.b).max()
+
+
+def test_b_low_is_needed():
+    """Without low parts the rounded weights of Fehlberg's method miss the moments by round-off."""
+    nodes, weights = [Fraction(x) for x in RK5.c], [Fraction(x) for x in RK5.b]
+    missed = [sum(w * x**k for w, x in zip(weights, nodes, strict=True)) - Fraction(1, k + 1) for k in range(5)]
+    assert max(map(abs, missed)) > Fraction(1, 10**18)
+
+
+def test_low_parts_of_a_float_tableau():
+    floats = Tableau("floats", RK5.A.tolist(), RK5.b.tolist(), order=5)
+    assert max(moment_residuals(floats)) <= 1
+
+
+@pytest.mark.parametrize("moved", [0.0, 1e-16, -1e-16, 1e-14])
+def test_low_parts_of_nodes_that_rounding_tells_apart(moved):
+    """Gill's method in floats: its two nodes 1/2 are one, and no low part makes use of their difference."""
+    r = math.sqrt(2)
+    A = [[], [0.5], [(r - 1) / 2, (2 - r) / 2 + moved], [0, -r / 2, 1 + r / 2]]
+    gill = Tableau("Gill", A, [1 / 6, (2 - r) / 6, (2 + r) / 6, 1 / 6], order=4)
+    assert (gill.c[1] != gill.c[2]) == (moved != 0)
+    assert np.abs(gill.b_low).max() < 10 * EPS + 10 * abs(moved)
+
+
+def test_float_tableau_is_the_same_step():
+    floats = Tableau("floats", RK4.A, RK4.b, order=4, b_hat=RK4.b_hat, error_estimator_order=3)
+    for key in ("A", "b", "c", "b_hat"):
+        np.testing.assert_array_equal(getattr(floats, key), getattr(RK4, key))
+    np.testing.assert_allclose(floats.e, RK4.e, rtol=0, atol=1e-16)
+    assert floats.fsal
+
+
+def test_float_tableau_of_wrong_order():
+    A, b = RK4.A.copy(), RK4.b.copy()
+    A[1, 0] += 1e-11
+    with pytest.raises(ValueError, match="not of order 4"):
+        Tableau("floats", A, b, order=4)
+    A[1, 0] = RK4.A[1, 0] + 1e-14
+    Tableau("floats", A, b, order=4)
+
+
+@pytest.mark.parametrize("place", [*((i, j) for i in range(4) for j in range(i)), *range(4)])
+def test_one_wrong_coefficient_is_found(place):
+    """Rational tableaux are checked exactly: an error of 1e-30 in any coefficient fails."""
+    A = [[Fraction(x) for x in row] for row in CLASSICAL["A"]]
+    b = [Fraction(x) for x in CLASSICAL["b"]]
+    if isinstance(place, tuple):
+        A[place[0]][place[1]] += Fraction(1, 10**30)
+    else:
+        b[place] += Fraction(1, 10**30)
+    with pytest.raises(ValueError, match=r"bad: b is not of order 4: the condition of tree .* misses by"):
+        Tableau("bad", A, b, order=4)
+
+
+MIDPOINT = {"A": [[], ["1/2"]], "b": [0, 1], "order": 2}
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"order": 3}, r"bad: b is not of order 3: .* misses by"),
+        ({"b": [1, 1]}, r"bad: b is not of order 2"),
+        ({"A": [["1/2"], ["1/2"]]}, r"bad: row 0 of A reaches its diagonal"),
+        ({"A": [[], ["1/2", "1/2"]]}, r"bad: row 1 of A reaches its diagonal"),
+        ({"A": [[0, 1], ["1/2"]]}, r"bad: row 0 of A reaches its diagonal"),
+        ({"A": [[]]}, r"bad: A has 1 rows and b 2 entries"),
+        ({"b": [0, 1, 0]}, r"bad: A has 2 rows and b 3 entries"),
+        ({"c": [0, 1]}, r"bad: c = \['0', '1'\] differs from the row sums of A"),
+        ({"c": [0]}, r"bad: c = \['0'\] differs from the row sums of A"),
+        ({"b_hat": [1, 0]}, r"bad: b_hat was given without error_estimator_order"),
+        ({"b_hat": [1], "error_estimator_order": 1}, r"bad: b_hat has 1 entries; expected 2 or 3"),
+        ({"b_hat": [1, 0, 0, 0], "error_estimator_order": 1}, r"bad: b_hat has 4 entries"),
+        ({"b_hat": [1, 0], "error_estimator_order": 2}, r"bad: b_hat is not of order 2"),
+        ({"b_hat": [1, 0, "1/2"], "error_estimator_order": 1}, r"bad: b_hat is not of order 1"),
+    ],
+)
+def test_wrong_tableaux(changes, match):
+    with pytest.raises(ValueError, match=match):
+        Tableau("bad", **{**MIDPOINT, **changes})
+
+
+@pytest.mark.parametrize("order", [0, -1, 1.5, "2", None])
+def test_order_must_be_a_positive_integer(order):
+    with pytest.raises((ValueError, TypeError), match="order"):
+        Tableau("bad", MIDPOINT["A"], MIDPOINT["b"], order=order)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), "abc", None])
+@pytest.mark.parametrize("key", ["A", "b"])
+def test_entries_must_be_finite_numbers(key, value):
+    entries = {"A": [[], [value]], "b": [0, value]}
+    with pytest.raises((ValueError, TypeError), match="bad: "):
+        Tableau("bad", **{**MIDPOINT, key: entries[key]})
+
+
+def test_order_of_an_estimate_without_its_weights():
+    with pytest.raises(ValueError, match="b_hat"):
+        Tableau("bad", **MIDPOINT, error_estimator_order=1)
+
+
+def test_eip_method_needs_a_tableau():
+    with pytest.raises(
+        TypeError, match=r"expected a Tableau, a NystromTableau or an object with one_step.*, got 'RK4'"
+    ):
+        eip_method("RK4")
+
+
+@pytest.mark.parametrize("tableau", METHODS, ids=name)
+def test_observed_order(tableau):
+    """Global error of the raw step on y' = y cos t, which sees the nodes c as well."""
+
+    def error(h):
+        run = integrate(lambda t, y: y * np.cos(t), (0, 2), [1.0], method=eip_method(tableau), h=h)
+        return abs(run.y[0, -1] - np.exp(np.sin(2.0)))
+
+    h = 1 / 32 if tableau.order > 4 else 1 / 64
+    assert np.log2(error(h) / error(h / 2)) == pytest.approx(tableau.order, abs=0.2)
+
+
+@pytest.mark.parametrize("tableau", PAIRS, ids=name)
+def test_estimate_is_of_its_order(tableau):
+    """The local estimate that the metric sees falls like h^(p_hat + 1)."""
+    seen = []
+
+    class Spy(eip_method(tableau)):
+        def _project_step(self, t, y, y_hat, err):
+            seen.append(np.abs(err).max())
+            return super()._project_step(t, y, y_hat, err)
+
+    keep = Invariant(lambda t, y: y[0] - 1.0, lambda t, y: np.ones(1))
+    for h in (1 / 16, 1 / 32):
+        Spy(lambda t, y: y * np.cos(t), 0.5, [1.0], 1.0, h=h, invariants=keep, check=False).step()
+    assert np.log2(seen[0] / seen[1]) == pytest.approx(tableau.error_estimator_order + 1, abs=0.3)

@@ -1,0 +1,573 @@
+"""Forces beside Newton's: against formulas written anew in NumPy and mpmath, and against the sky."""
+
+import math
+import warnings
+from itertools import combinations, permutations
+
+import mpmath
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRKN12, check_gradient, integrate
+from eip_scipy.problems import nbody, solar_system
+from eip_scipy.problems.gravity import _einstein
+from eip_scipy.problems.gravity import forces as module
+from eip_scipy.problems.gravity.forces import FORCES, ForceConstants
+from eip_scipy.problems.gravity.solar_data import AU_KM, DAY_S, load
+
+GM = np.array([1.0, 0.3, 0.02, 0.4])
+POSITION = np.array([[0.1, 0.2, -0.1], [1.3, 0.4, 0.2], [-0.6, 1.1, 0.5], [-1.2, -0.9, 0.8]])
+VELOCITY = np.array([[0.1, -0.2, 0.05], [-0.2, 0.6, 0.1], [-0.5, -0.3, 0.2], [0.3, -0.3, -0.1]])
+POLE = np.array([1.0, 2.0, 3.0]) / math.sqrt(14)
+CONSTANTS = ForceConstants(c=10.0, j2=0.02, pole=3 * POLE, moon_body=2, moon=0.03)
+C_AU_YR = 299792.458 * DAY_S * 365.25 / AU_KM
+MERCURY = {"a": 0.38709893, "e": 0.20563069}  # J2000
+GM_SUN = (0.01720209895 * 365.25) ** 2  # Gauss
+CENTURY = 100.0
+
+
+def problem(forces, constants=CONSTANTS, gm=GM, position=POSITION, velocity=VELOCITY, **options):
+    return nbody(gm, position, velocity, t_span=(0.0, 1.0), forces=forces, constants=constants, **options)
+
+
+def accelerations(given):
+    out = np.empty_like(given.y0)
+    given.rhs(0.0, given.y0, out, given.params)
+    np.testing.assert_array_equal(out[: out.size // 2], given.y0[out.size // 2 :])
+    return out[out.size // 2 :].reshape(-1, 3)
+
+
+def added(forces, **options):
+    """What the forces add to Newton's accelerations."""
+    return accelerations(problem(forces, **options)) - accelerations(problem(()))
+
+
+def value_and_gradient(invariant, given, y):
+    value = np.atleast_1d(invariant.fun(0.0, y, given.params))
+    gradient = np.empty(y.size) if value.size == 1 else np.empty((value.size, y.size))
+    f = given.fun(0.0, y)
+    invariant.grad(*((0.0, y, f) if invariant.uses_f else (0.0, y)), gradient, given.params)
+    return value, np.atleast_2d(gradient)
+
+
+def rate(invariant, given, y=None):
+    """|dI/dt| in units of its terms."""
+    y = given.y0 if y is None else y
+    _, G = value_and_gradient(invariant, given, y)
+    f = given.fun(0.0, y)
+    return np.max(np.abs(G @ f) / (np.abs(G) @ np.abs(f)))
+
+
+# --- the accelerations ---
+
+
+def test_newton_alone_is_untouched():
+    plain = nbody(GM, POSITION, VELOCITY, t_span=(0.0, 1.0))
+    chosen = problem(())
+    assert chosen.rhs is plain.rhs
+    assert chosen.acc is plain.acc
+    np.testing.assert_array_equal(plain.params, GM)
+    assert plain.params.size == 4
+
+
+def potential(name, q):
+    """The potential energies times G, in mpmath."""
+    total = mpmath.mpf(0)
+    for i in range(1, 4):
+        x = [q[3 * i + c] - q[c] for c in range(3)]
+        r = mpmath.sqrt(sum(a * a for a in x))
+        if name == "gr-potential":
+            total += -3 * mpmath.mpf(GM[0]) ** 2 * GM[i] / (mpmath.mpf(CONSTANTS.c) ** 2 * r**2)
+        elif name == "j2":
+            sine = sum(mpmath.mpf(p) * a for p, a in zip(POLE, x, strict=True)) / r
+            total += GM[0] * GM[i] * CONSTANTS.j2 / r**3 * (3 * sine**2 - 1) / 2
+        elif i == CONSTANTS.moon_body:
+            total += -CONSTANTS.moon * GM[0] * GM[i] / r**3
+    return total
+
+
+@pytest.mark.parametrize("name", ["gr-potential", "j2", "moon-quadrupole"])
+def test_accelerations_come_from_the_potential(name):
+    found, q = added((name,)), POSITION.ravel()
+    with mpmath.workdps(40):
+        for k in range(12):
+            step = mpmath.mpf(10) ** -12
+            ends = [[mpmath.mpf(x) + (s * step if j == k else 0) for j, x in enumerate(q)] for s in (1, -1)]
+            force = -(potential(name, ends[0]) - potential(name, ends[1])) / (2 * step)
+            assert found.ravel()[k] == pytest.approx(float(force / mpmath.mpf(GM[k // 3])), rel=1e-12, abs=1e-15)
+    given = problem((name,))
+    newton = problem(())
+    more = given.invariants[0].fun(0.0, given.y0, given.params) - newton.invariants[0].fun(0.0, newton.y0, GM)
+    assert more == pytest.approx(float(potential(name, [mpmath.mpf(x) for x in q])), rel=1e-12)
+    np.testing.assert_allclose(given.acc(0.0, given.y0[:12], given.params), accelerations(given).ravel(), rtol=1e-15)
+
+
+def test_the_suns_post_newtonian_pull():
+    """The formula of the IERS conventions (10.12) with beta = gamma = 1, and the reaction on the Sun."""
+    expected = np.zeros((4, 3))
+    for i in (1, 2, 3):
+        r, v = POSITION[i] - POSITION[0], VELOCITY[i] - VELOCITY[0]
+        d = np.linalg.norm(r)
+        expected[i] = GM[0] / (CONSTANTS.c**2 * d**3) * ((4 * GM[0] / d - v @ v) * r + 4 * (r @ v) * v)
+    expected[0] = -(GM[1:] @ expected[1:]) / GM[0]
+    np.testing.assert_allclose(added("1pn"), expected, rtol=1e-12, atol=1e-15)
+
+
+def eih_lagrangian(q, v, over_c2):
+    """Landau & Lifshitz (106.17), as printed but for the masses, in mpmath."""
+    total = mpmath.mpf(0)
+    m = [mpmath.mpf(x) for x in GM]
+    d = {(a, b): [x - y for x, y in zip(q[a], q[b], strict=True)] for a, b in permutations(range(4), 2)}
+    r = {ab: mpmath.sqrt(sum(x * x for x in x3)) for ab, x3 in d.items()}
+
+    def dot(a, b):
+        return sum(x * y for x, y in zip(a, b, strict=True))
+
+    for a in range(4):
+        v2 = dot(v[a], v[a])
+        total += m[a] * v2 / 2 + over_c2 * m[a] * v2**2 / 8
+    for a, b in permutations(range(4), 2):
+        n = [x / r[a, b] for x in d[a, b]]
+        total += m[a] * m[b] / (2 * r[a, b]) + over_c2 * 3 * m[a] * m[b] * dot(v[a], v[a]) / (2 * r[a, b])
+        velocities = 7 * dot(v[a], v[b]) + dot(v[a], n) * dot(v[b], n)
+        total -= over_c2 * m[a] * m[b] / (4 * r[a, b]) * velocities
+    for a in range(4):
+        for b in range(4):
+            for c in range(4):
+                if b != a and c != a:
+                    total -= over_c2 * m[a] * m[b] * m[c] / (2 * r[a, b] * r[a, c])
+    return total
+
+
+def gradient_by_differences(fun, x, step):
+    out = []
+    for k in range(len(x)):
+        ends = [fun([*x[:k], x[k] + s * step, *x[k + 1 :]]) for s in (2, 1, -1, -2)]
+        out.append((-ends[0] + 8 * ends[1] - 8 * ends[2] + ends[3]) / (12 * step))
+    return out
+
+
+def rows(flat):
+    return [flat[3 * k : 3 * k + 3] for k in range(4)]
+
+
+def test_eih_energy_and_momenta_from_the_lagrangian():
+    given = problem("eih")
+    with mpmath.workdps(40):
+        q, v = ([mpmath.mpf(x) for x in part.ravel()] for part in (POSITION, VELOCITY))
+        over_c2 = 1 / mpmath.mpf(CONSTANTS.c) ** 2
+        p = gradient_by_differences(lambda w: eih_lagrangian(rows(q), rows(w), over_c2), v, mpmath.mpf(10) ** -8)
+        energy = sum(a * b for a, b in zip(p, v, strict=True)) - eih_lagrangian(rows(q), rows(v), over_c2)
+        p = np.array(p, dtype=float).reshape(4, 3)
+    assert module.eih_energy(0.0, given.y0, given.params) == pytest.approx(float(energy), rel=1e-14)
+    np.testing.assert_allclose(_einstein.linear_momentum(0.0, given.y0, given.params), p.sum(axis=0), atol=1e-14)
+    found = _einstein.momentum(0.0, given.y0, given.params)
+    np.testing.assert_allclose(found, np.cross(POSITION, p).sum(axis=0), atol=1e-14)
+
+
+def test_eih_accelerations_solve_the_euler_lagrange_equations():
+    """d/dt dL/dv = dL/dq along the flow, up to 1/c^4: the residual in units of 1/c^2 falls with 1/c^2."""
+    residuals = []
+    for c in (1e3, 1e4):
+        given = problem("eih", ForceConstants(c=c))
+        a = accelerations(given)
+        with mpmath.workdps(50):
+            over_c2, step = 1 / mpmath.mpf(c) ** 2, mpmath.mpf(10) ** -9
+            q, v, a = ([mpmath.mpf(x) for x in part.ravel()] for part in (POSITION, VELOCITY, a))
+
+            def momenta(s, q=q, v=v, a=a, over_c2=over_c2):
+                q_s = [x + s * y + s * s * z / 2 for x, y, z in zip(q, v, a, strict=True)]
+                v_s = [x + s * y for x, y in zip(v, a, strict=True)]
+                return gradient_by_differences(
+                    lambda w: eih_lagrangian(rows(q_s), rows(w), over_c2), v_s, mpmath.mpf(10) ** -9
+                )
+
+            change = [(x - y) / (2 * step) for x, y in zip(momenta(step), momenta(-step), strict=True)]
+            pull = gradient_by_differences(
+                lambda x, v=v, over_c2=over_c2: eih_lagrangian(rows(x), rows(v), over_c2), q, step
+            )
+            residuals.append(max(abs(float((x - y) / over_c2)) for x, y in zip(change, pull, strict=True)))
+    assert residuals[0] < 1e-4
+    assert residuals[1] < residuals[0] / 50
+
+
+def test_eih_of_a_test_particle_is_the_suns_pull():
+    gm = np.array([1.0, 0.0])
+    two = {"gm": gm, "position": POSITION[:2], "velocity": np.vstack([np.zeros(3), VELOCITY[1]])}
+    np.testing.assert_allclose(
+        accelerations(problem("eih", **two)), accelerations(problem("1pn", **two)), rtol=1e-14, atol=1e-16
+    )
+
+
+# --- invariants ---
+
+
+EXACT = [
+    ("gr-potential",),
+    ("j2",),
+    ("moon-quadrupole",),
+    ("gr-potential", "j2", "moon-quadrupole"),
+]
+
+
+@pytest.mark.parametrize("forces", EXACT)
+def test_exact_invariants(forces):
+    given = problem(forces)
+    names = [item.name for item in given.invariants]
+    assert names == ["H", "L_pole" if "j2" in forces else "L"]
+    for item in given.invariants:
+        assert rate(item, given) < 1e-15
+        assert check_gradient(item, 0.0, given.y0, given.fun) < 1e-7
+
+
+def test_oblateness_breaks_the_other_components():
+    given = problem("j2")
+    newton = problem(()).invariants[1]
+    G = np.empty((3, 24))
+    newton.grad(0.0, given.y0, G, GM)
+    torque = G @ given.fun(0.0, given.y0)
+    assert np.linalg.norm(torque) > 1e-4
+    assert abs(torque @ POLE) < 1e-14
+
+
+@pytest.mark.parametrize("mass", [0.0, 1e-3, 0.7])
+@pytest.mark.parametrize("c", [3.0, 100.0, 1e4])
+def test_two_bodies_have_exact_invariants_with_1pn(mass, c):
+    gm = np.array([1.0, mass])
+    given = problem("1pn", ForceConstants(c=c), gm, POSITION[:2], VELOCITY[:2])
+    assert [item.name for item in given.invariants] == ["H", "L"]
+    for item in given.invariants:
+        assert rate(item, given) < 3e-15
+        assert check_gradient(item, 0.0, given.y0, given.fun) < 1e-6
+
+
+def test_three_bodies_have_none_with_1pn():
+    assert problem("1pn").invariants == ()
+    assert problem("1pn", CONSTANTS, GM[:3], POSITION[:3], VELOCITY[:3]).invariants == ()
+
+
+@pytest.mark.parametrize("forces", [("eih",), ("eih", "j2", "moon-quadrupole")])
+def test_what_eih_leaves_falls_with_the_fourth_power_of_c(forces, monkeypatch):
+    monkeypatch.setattr(module, "KEPT", math.inf)
+    rates = []
+    for c in (100.0, 1000.0):
+        given = problem(forces, ForceConstants(c=c, j2=1e-9, pole=POLE, moon_body=2, moon=1e-9))
+        assert [item.name for item in given.invariants] == ["H", "L_pole" if "j2" in forces else "L"]
+        assert all(check_gradient(item, 0.0, given.y0, given.fun) < 1e-6 for item in given.invariants)
+        rates.append([rate(item, given) for item in given.invariants])
+    np.testing.assert_array_less(rates[0], 1e-6)
+    np.testing.assert_array_less(1e-15, rates[0])
+    np.testing.assert_allclose(np.divide(*rates), 1e4, rtol=0.2)
+
+
+def test_eih_offers_invariants_only_where_they_are_kept():
+    assert problem("eih", ForceConstants(c=100.0)).invariants == ()
+    assert len(problem("eih", ForceConstants(c=1e5)).invariants) == 2
+    solar = solar_system(forces=("eih", "j2"))
+    assert [item.name for item in solar.invariants] == ["H", "L_pole"]
+    assert max(rate(item, solar) for item in solar.invariants) < 1e-13
+
+
+@pytest.mark.parametrize("forces", [(), ("gr-potential",), ("1pn",), ("moon-quadrupole",), ("j2",)])
+def test_momentum_is_newtons(forces):
+    forces_on_all = GM[:, None] * accelerations(problem(forces))
+    assert np.abs(forces_on_all.sum(axis=0)).max() < 1e-15 * np.abs(forces_on_all).sum()
+
+
+@pytest.mark.parametrize("forces", ["1pn", "eih", "gr-potential", "moon-quadrupole", "j2"])
+def test_rotations(forces):
+    turn = Rotation.random(rng=3).as_matrix()
+    constants = ForceConstants(**{**CONSTANTS.__dict__, "pole": turn @ POLE})
+    turned = problem(forces, constants, GM, POSITION @ turn.T, VELOCITY @ turn.T)
+    np.testing.assert_allclose(accelerations(turned), accelerations(problem(forces)) @ turn.T, rtol=0, atol=3e-15)
+
+
+# --- runs ---
+
+
+def mercury(forces, mass=0.0, h=0.001, years=10.0):
+    """Mercury alone around the Sun, from its perihelion."""
+    a, e = MERCURY["a"], MERCURY["e"]
+    q, v = [a * (1 - e), 0, 0], [0, math.sqrt(GM_SUN * (1 + e) / (a * (1 - e))), 0]
+    return nbody(
+        [GM_SUN, mass],
+        [[0, 0, 0], q],
+        [[0, 0, 0], v],
+        t_span=(0.0, years),
+        h=h,
+        forces=forces,
+        constants=ForceConstants(c=C_AU_YR),
+    )
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("forces", ["1pn", "eih", "gr-potential"])
+def test_perihelion_of_mercury_advances_as_it_should(forces):
+    """42.98 arcsec a century: the slope of the eccentricity vector's angle beside its periodic terms."""
+    run = integrate(mercury(forces), method=EIPDOP853, save_every=10, invariants=())
+    x, w = run.y[3:6] - run.y[:3], run.y[9:12] - run.y[6:9]
+    r = np.linalg.norm(x, axis=0)
+    e = (np.sum(w * w, axis=0) / GM_SUN - 1 / r) * x - np.sum(x * w, axis=0) / GM_SUN * w
+    phase = math.sqrt(GM_SUN / MERCURY["a"] ** 3) * run.t
+    periodic = [g(k * phase) for k in range(1, 13) for g in (np.cos, np.sin)]
+    terms = np.stack([run.t, np.ones_like(run.t), *periodic], axis=1)
+    slope = np.linalg.lstsq(terms, np.arctan2(e[1], e[0]), rcond=None)[0][0]
+    assert math.degrees(slope) * 3600 * CENTURY == pytest.approx(42.98, abs=0.01)
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize(("years", "options"), [(5.0, {"invariants": ()}), (100.0, {})])
+def test_known_energy_and_momentum_of_a_test_particle(years, options):
+    """The first-order forms, to 2e-14 and 6e-15: without projection, and over 100 yr on the package's exact ones."""
+    given = mercury("1pn", h=1 / 1024, years=years)
+    run = integrate(given, method=EIPDOP853, save_every=64, compensated=True, **options)
+    x, v = run.y[3:6] - run.y[:3], run.y[9:12] - run.y[6:9]
+    r, v2 = np.linalg.norm(x, axis=0), np.sum(v * v, axis=0)
+    second = (3 / 8 * v2**2 + 1.5 * GM_SUN * v2 / r + 0.5 * (GM_SUN / r) ** 2) / C_AU_YR**2
+    E = v2 / 2 - GM_SUN / r + second
+    J = (x[0] * v[1] - x[1] * v[0]) * (1 + (v2 / 2 + 3 * GM_SUN / r) / C_AU_YR**2)
+    # Of the mean: what they leave out, terms in 1/c^4, varies with the phase by 1.9e-14 and 4.9e-15.
+    assert np.abs(E / E.mean() - 1).max() < 2e-14
+    assert np.abs(J / J.mean() - 1).max() < 6e-15
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize(
+    ("forces", "method"),
+    [(name, EIPRK5) for name in ("1pn", "eih", "gr-potential")] + [("gr-potential", EIPRKN12)],
+)
+def test_projection_keeps_the_invariants(forces, method):
+    given = mercury(forces, mass=1e-3, years=5.0, h=0.002)
+    run = integrate(given, method=method, save_every=1)
+    assert run.success
+    assert run.compiled
+    values = run.invariants
+    assert np.abs(values[0] / values[0, 0] - 1).max() < 2e-14
+    assert np.abs(values[3] / values[3, 0] - 1).max() < 2e-14
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("forces", [("1pn",), ("eih", "j2")])
+def test_compiled_and_interpreted_runs_are_the_same(forces):
+    given = solar_system("de440-moon", years=0.05, forces=forces)
+    runs = [integrate(given, method=EIPRK4, save_every=1, compiled=c) for c in (True, False)]
+    np.testing.assert_array_equal(runs[0].y, runs[1].y)
+
+
+def test_through_solve_ivp():
+    given = mercury("1pn", years=0.1, h=0.005)
+    sol = solve_ivp(
+        given.fun, given.t_span, given.y0, method=EIPRK4, h=given.h, invariants=given.invariants, blocks=given.blocks
+    )
+    end = [item.fun(0.0, np.ascontiguousarray(sol.y[:, -1]), given.params) for item in given.invariants[:1]]
+    assert end[0] == pytest.approx(given.invariants[0].fun(0.0, given.y0, given.params), rel=1e-14)
+
+
+@pytest.mark.parametrize("forces", ["1pn", "eih"])
+def test_nystrom_methods_say_why_they_cannot(forces):
+    given = mercury(forces)
+    assert given.acc is None
+    with pytest.raises(ValueError, match="accelerations change with the velocity; take a Runge-Kutta method"):
+        integrate(given, method=EIPRKN12)
+
+
+@pytest.mark.slow
+@pytest.mark.needs_jit
+def test_eih_energy_and_momenta_over_a_century_of_the_solar_system():
+    given = solar_system(years=100, h=1 / 1024, forces="eih")
+    run = integrate(given, method=EIPDOP853, save_every=64, invariants=(), compensated=True)
+    H, L = given.invariants
+    states = np.ascontiguousarray(run.y.T)
+    energy = np.array([H.fun(0.0, y, given.params) for y in states])
+    momentum = np.array([L.fun(0.0, y, given.params) for y in states])
+    linear = np.array([_einstein.linear_momentum(0.0, y, given.params) for y in states])
+    assert np.abs(energy / energy[0] - 1).max() < 1e-14
+    assert np.abs(momentum - momentum[0]).max() < 5e-15 * np.linalg.norm(momentum[0])
+    scale = GM_SUN * 1e-3  # of Jupiter's momentum
+    assert np.abs(linear - linear[0]).max() < 1e-14 * scale
+
+
+# --- the solar system's constants ---
+
+
+@pytest.mark.parametrize("units", ["AU, yr", "SI"])
+def test_solar_system_constants(units):
+    given = solar_system(units=units, forces=("1pn", "j2", "moon-quadrupole"))
+    length, time = (1.0, 1 / 365.25) if units == "AU, yr" else (AU_KM * 1e3, DAY_S)
+    entries = given.params[10:]
+    km = length / AU_KM
+    assert entries[module.OVER_C2] ** -0.5 == pytest.approx(299792.458 * DAY_S * km / time)
+    assert entries[module.OBLATENESS] == pytest.approx(2.1961391516529825e-07 * (696000 * km) ** 2)
+    assert entries[module.MOON_BODY] == 3
+    mass_ratio = 398600.435507 * 4902.800118 / 403503.235625**2
+    assert entries[module.MOON] == pytest.approx((384399 * km) ** 2 * mass_ratio / 4, rel=1e-9)
+
+
+def test_the_pole_turns_with_the_axes():
+    """The Sun's equator is inclined by 7.25 deg to the ecliptic (Carrington)."""
+    ecliptic = solar_system("paper", forces="j2").params[10 + module.POLE : 10 + module.POLE + 3]
+    assert math.degrees(math.acos(ecliptic[2])) == pytest.approx(7.25, abs=0.01)
+    icrf = solar_system("de440", forces="j2").params[10 + module.POLE : 10 + module.POLE + 3]
+    assert math.degrees(math.asin(icrf[2])) == pytest.approx(63.87)
+    assert ecliptic[0] == icrf[0]
+
+
+def test_smeared_moon_needs_the_barycentre():
+    for name in ("de440-moon", "paper"):
+        with pytest.raises(ValueError, match=f"'{name}' has none"):
+            solar_system(name, forces="moon-quadrupole")
+
+
+def test_no_stored_reference_with_forces():
+    assert solar_system().reference(1.0) is not None
+    assert solar_system(forces="1pn").reference(1.0) is None
+
+
+# --- bad input ---
+
+
+@pytest.mark.parametrize(
+    ("forces", "constants", "message"),
+    [
+        ("1PN", CONSTANTS, "unknown force '1PN'.*did you mean '1pn'"),
+        (("gr-potental",), CONSTANTS, "did you mean 'gr-potential'"),
+        (("tides",), CONSTANTS, "unknown force 'tides'; known: '1pn', 'eih'"),
+        (("eih", "1pn"), CONSTANTS, "'1pn' and 'eih' are the same relativity twice"),
+        ("1pn", None, "'1pn' needs constants=ForceConstants\\(c="),
+        ("j2", ForceConstants(j2=1.0), "pole=..."),
+        ("1pn", ForceConstants(c=-1.0), "c must be a positive number; got -1.0"),
+        ("1pn", ForceConstants(c=math.nan), "c must be a positive number; got nan"),
+        ("j2", ForceConstants(j2=1.0, pole=(0, 0, 0)), "pole must be three numbers, not all 0"),
+        ("moon-quadrupole", ForceConstants(moon_body=0, moon=1.0), "moon_body must be an index from 1 to 3; got 0"),
+        ("moon-quadrupole", ForceConstants(moon_body=4, moon=1.0), "moon_body must be an index from 1 to 3; got 4"),
+    ],
+)
+def test_bad_forces(forces, constants, message):
+    with pytest.raises(ValueError, match=message):
+        problem(forces, constants)
+
+
+def test_no_forces_is_an_empty_sequence():
+    with pytest.raises(TypeError, match="must be a name or a sequence of names, got None"):
+        problem(None)
+
+
+def test_the_first_body_is_the_sun():
+    with pytest.raises(ValueError, match="the first body must be the Sun"):
+        problem("1pn", gm=[0.0, 1.0, 1.0, 1.0])
+
+
+def test_every_force_has_its_line():
+    assert set(module.NEEDS) == set(FORCES)
+
+
+# --- N bodies: masses, places, speeds ---
+
+
+@pytest.mark.slow_without_jit
+def test_test_particles_are_moved_by_no_correction():
+    data = load("de440")
+    year = 365.25
+    gm = np.append(data.gm, 0.0) * year**2
+    q = np.vstack([data.position, [2.5, 0.3, 0.1]])
+    v = np.vstack([data.velocity * year, [0.1, 4.0, 0.2]])
+    given = nbody(gm, q, v, t_span=(0.0, 10.0), h=0.01)
+    G = np.empty((4, 66))
+    for item, part in zip(given.invariants, (slice(0, 1), slice(1, 4)), strict=True):
+        G[part] = value_and_gradient(item, given, given.y0)[1]
+    assert not G[:, [30, 31, 32, 63, 64, 65]].any()
+    run = integrate(given, method=EIPRK5, save_every=100)
+    assert run.success
+    assert run.diagnostics.n_projections > 0
+    assert np.abs(run.invariants[0] / run.invariants[0, 0] - 1).max() < 1e-12
+    # It keeps its own energy about as well as a heavy asteroid would, and its orbit.
+    small = nbody(np.append(gm[:-1], 1e-15), q, v, t_span=(0.0, 10.0), h=0.01)
+    other = integrate(small, method=EIPRK5)
+    np.testing.assert_allclose(run.y[30:33, -1], other.y[30:33, -1], atol=1e-6)
+
+
+def test_a_particle_around_one_mass():
+    """No invariant knows anything of it: H and L are those of a Sun at rest, 0."""
+    given = nbody([1.0, 0.0], np.eye(2, 3), [[0, 0, 0], [0, 0, 0.7]], t_span=(0.0, 10.0), h=0.01)
+    run = integrate(given, method=EIPRK4)
+    assert run.success
+    assert np.isfinite(run.y).all()
+
+
+@pytest.mark.parametrize(
+    ("gm", "message"),
+    [
+        ([1.0, -1.0], r"gm\[1\] is -1.0"),
+        ([math.nan, 1.0], r"gm\[0\] is nan"),
+        ([1.0, math.inf], r"gm\[1\] is inf"),
+        ([0.0, 0.0], "every G m is 0"),
+    ],
+)
+def test_bad_masses(gm, message):
+    with pytest.raises(ValueError, match=message):
+        nbody(gm, np.eye(2, 3), np.zeros((2, 3)), t_span=(0.0, 1.0))
+
+
+def test_bodies_at_the_same_place():
+    q = POSITION.copy()
+    q[3] = q[1]
+    with pytest.raises(ValueError, match="bodies 1 and 3 are at the same place"):
+        nbody(GM, q, VELOCITY, t_span=(0.0, 1.0))
+    with pytest.raises(ValueError, match="must be finite"):
+        nbody(GM, q * np.nan, VELOCITY, t_span=(0.0, 1.0))
+
+
+@pytest.mark.parametrize("factor", [365.25, 1 / 365.25, 86400.0, 1 / 86400.0])
+def test_mixed_units_are_noticed(factor):
+    data = load("de440")
+    with pytest.warns(UserWarning, match="times the escape speed; check that position, velocity and gm"):
+        nbody(data.gm, data.position, data.velocity * factor, t_span=(0.0, 1.0))
+
+
+FIGURE_EIGHT = (
+    np.ones(3),
+    [[0.97000436, -0.24308753, 0], [-0.97000436, 0.24308753, 0], [0, 0, 0]],
+    [[0.466203685, 0.43236573, 0], [0.466203685, 0.43236573, 0], [-0.93240737, -0.86473146, 0]],
+)
+PYTHAGOREAN = ([3.0, 4.0, 5.0], [[1, 3, 0], [-2, -1, 0], [1, -1, 0]], np.zeros((3, 3)))
+
+
+def two_bodies(eccentricity, apocentre=False, mass=1e-3):
+    side = -1 if apocentre else 1
+    r = 1 - side * eccentricity
+    speed = math.sqrt((1 + mass) * (1 + side * eccentricity) / (1 - side * eccentricity))
+    return [1.0, mass], [[0, 0, 0], [r, 0, 0]], [[0, 0, 0], [0, speed, 0]]
+
+
+def flyby(speed):
+    """So many times the escape speed, far from the other body."""
+    return [1.0, 1.0], [[0, 0, 0], [10.0, 3.0, 0]], [[0, 0, 0], [-speed * math.sqrt(0.4 / 1.044), 0, 0]]
+
+
+@pytest.mark.parametrize(
+    "bodies",
+    [
+        FIGURE_EIGHT,
+        PYTHAGOREAN,
+        two_bodies(0.0),
+        two_bodies(0.999),
+        two_bodies(0.999, apocentre=True),
+        flyby(30.0),
+        ([1.0], [[0, 0, 0]], [[1e9, 0, 0]]),
+        ([1.0, 0.0, 0.0], np.eye(3), np.eye(3)[::-1]),
+    ],
+)
+def test_no_false_alarms(bodies):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        nbody(*bodies, t_span=(0.0, 1.0))
+
+
+def test_distances_of_all_pairs_are_looked_at():
+    for i, j in combinations(range(4), 2):
+        q = POSITION.copy()
+        q[j] = q[i]
+        with pytest.raises(ValueError, match=f"bodies {i} and {j} "):
+            nbody(GM, q, VELOCITY, t_span=(0.0, 1.0))

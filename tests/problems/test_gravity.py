@@ -1,0 +1,251 @@
+"""The sums over pairs of N point masses: accuracy, symmetry, and the same bits however they are called."""
+
+import os
+import subprocess
+import sys
+from itertools import combinations
+
+import mpmath
+import numpy as np
+import pytest
+from llvmlite import binding
+from numba import njit
+from numba.core.errors import TypingError
+
+from eip_scipy import EIPRK4, integrate
+from eip_scipy.problems import solar_system
+from eip_scipy.problems.gravity import _newton
+
+ROUNDING = np.finfo(float).eps / 2
+SIZES = [1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 16, 17, 30, 100]
+
+
+def bodies(n, seed=0):
+    """Random masses, over six powers of ten, and a random state."""
+    rng = np.random.default_rng([n, seed])
+    return 10.0 ** rng.uniform(-6, 0, n), rng.standard_normal(6 * n)
+
+
+def accelerations(gm, y):
+    out = np.full(y.size, np.nan)
+    _newton.rhs(0.0, y, out, gm)
+    np.testing.assert_array_equal(out[: y.size // 2], y[y.size // 2 :])
+    return out[y.size // 2 :].reshape(-1, 3)
+
+
+def exact_sums(gm, y):
+    """Accelerations, the sums of their terms' sizes, and the energy with that of its terms, in 40 digits."""
+    n = gm.size
+    with mpmath.workdps(40):
+        m = [mpmath.mpf(x) for x in gm]
+        q, v = ([[mpmath.mpf(x) for x in row] for row in part] for part in y.reshape(2, n, 3))
+        a, size = [[mpmath.mpf(0)] * 3 for _ in m], np.zeros((n, 3))
+        kinetic = sum(mi * sum(x * x for x in row) for mi, row in zip(m, v, strict=True)) / 2
+        potential = mpmath.mpf(0)
+        for i, j in combinations(range(n), 2):
+            d = [x - z for x, z in zip(q[j], q[i], strict=True)]
+            r = mpmath.sqrt(sum(x * x for x in d))
+            potential += m[i] * m[j] / r
+            for c in range(3):
+                a[i][c] += m[j] * d[c] / r**3
+                a[j][c] -= m[i] * d[c] / r**3
+                size[i, c] += abs(m[j] * d[c] / r**3)
+                size[j, c] += abs(m[i] * d[c] / r**3)
+        return a, size, kinetic - potential, float(kinetic + potential)
+
+
+def check_against_exact(gm, y):
+    a, size, energy, energy_size = exact_sums(gm, y)
+    found = accelerations(gm, y)
+    # One pull is right to about 7 roundings (the old pair loop: 8), the sum of N grows like a random walk.
+    bound = (7 + np.sqrt(gm.size)) * ROUNDING * size
+    error = [float(mpmath.fsub(x, z, exact=True)) for x, z in zip(found.flat, np.array(a).flat, strict=True)]
+    assert (np.abs(error) <= bound.ravel()).all()
+    error = float(mpmath.fsub(_newton.energy(0.0, y, gm), energy, exact=True))
+    # From 8 bodies on, rounding errors of the sum are carried along.
+    assert abs(error) <= (3 if gm.size >= 8 else 4 + np.sqrt(gm.size)) * ROUNDING * energy_size
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_accuracy(n):
+    check_against_exact(*bodies(n))
+
+
+@pytest.mark.parametrize("n", [2, 3, 7, 10, 17])
+def test_close_pairs(n):
+    gm, y = bodies(n)
+    y[3:6] = y[:3] + 1e-9 * y[3:6]
+    if n > 6:
+        y[3 * n - 3 : 3 * n] = y[6:9] * (1 + 4e-16)
+        y[3 * n - 3] += 1e-13
+    check_against_exact(gm, y)
+
+
+@pytest.mark.parametrize("n", [2, 3, 7, 10, 17])
+def test_test_particles(n):
+    gm, y = bodies(n)
+    gm[1::2] = 0.0
+    check_against_exact(gm, y)
+    # They are attracted and do not attract.
+    assert (accelerations(gm, y)[1] != 0).all()
+    if n > 3:
+        massive = np.repeat(gm > 0, 3)
+        np.testing.assert_allclose(
+            accelerations(gm, y)[gm > 0], accelerations(gm[gm > 0], y[np.tile(massive, 2)]), rtol=0, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_action_is_reaction(n):
+    """Between two bodies of one mass among test particles, bit for bit, in whichever lanes they are."""
+    _, y = bodies(n)
+    for i, j in combinations(range(min(n, 17)), 2):
+        gm = np.zeros(n)
+        gm[[i, j]] = 0.7
+        a = accelerations(gm, y)
+        np.testing.assert_array_equal(a[i], -a[j])
+
+
+def test_momentum_is_kept_to_rounding():
+    worst = 0.0
+    for seed in range(200):
+        gm, y = bodies(10, seed)
+        forces = gm[:, None] * accelerations(gm, y)
+        worst = max(worst, np.abs(forces.sum(axis=0)).max() / np.abs(forces).sum())
+    assert worst < 4 * ROUNDING
+
+
+@pytest.mark.parametrize("n", [2, 7, 8, 10, 30])
+@pytest.mark.parametrize("power", [-150, -30, 1, 37, 150])
+def test_units_of_powers_of_two_change_no_bit(n, power):
+    gm, y = bodies(n)
+    factor = 2.0**power
+    one, other = accelerations(gm, y), accelerations(gm, y * factor)
+    np.testing.assert_array_equal(one, other * factor**2)
+    half = y.size // 2
+    still = np.concatenate([y[:half], np.zeros(half)])
+    assert _newton.energy(0.0, still, gm) == _newton.energy(0.0, still * factor, gm) * factor
+
+
+@pytest.mark.parametrize("n", [2, 5, 8, 10, 11, 13])
+def test_strided_arrays(n):
+    gm, y = bodies(n)
+    wide, wide_gm, out = np.zeros((6 * n, 3)), np.zeros((n, 2)), np.zeros((6 * n, 2))
+    wide[:, 1], wide_gm[:, 0] = y, gm
+    _newton.rhs(0.0, wide[:, 1], out[:, 1], wide_gm[:, 0])
+    np.testing.assert_array_equal(out[3 * n :, 1].reshape(-1, 3), accelerations(gm, y))
+    np.testing.assert_array_equal(out[:, 0], 0.0)
+    np.testing.assert_array_equal(_newton.acc(0.0, wide[: 3 * n, 1], gm), accelerations(gm, y).ravel())
+    assert _newton.energy(0.0, wide[:, 1], gm) == _newton.energy(0.0, y, gm)
+    np.testing.assert_array_equal(_newton.momentum(0.0, wide[:, 1], gm), _newton.momentum(0.0, y, gm))
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 8, 10, 17])
+def test_nothing_is_written_outside(n):
+    gm, y = bodies(n)
+    frame = np.full(6 * n + 20, 7.0)
+    _newton.rhs(0.0, y, frame[10:-10], gm)
+    assert (frame[:10] == 7.0).all()
+    assert (frame[-10:] == 7.0).all()
+    assert np.isfinite(frame).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8, 10])
+def test_gradients(n):
+    gm, y = bodies(n)
+    f, grad, grads = np.empty(6 * n), np.empty(6 * n), np.empty((3, 6 * n))
+    _newton.rhs(0.0, y, f, gm)
+    _newton.energy_gradient(0.0, y, f, grad, gm)
+    _newton.momentum_gradient(0.0, y, grads, gm)
+    q, v = y.reshape(2, n, 3)
+    np.testing.assert_allclose(_newton.momentum(0.0, y, gm), gm @ np.cross(q, v), rtol=0, atol=1e-14)
+    step = 1e-6 * np.random.default_rng(3).standard_normal(6 * n)
+    ahead, back = ((_newton.energy(0.0, z, gm), np.array(_newton.momentum(0.0, z, gm))) for z in (y + step, y - step))
+    assert grad @ step == pytest.approx((ahead[0] - back[0]) / 2, rel=1e-4, abs=1e-14)
+    np.testing.assert_allclose(grads @ step, (ahead[1] - back[1]) / 2, rtol=0, atol=1e-14)
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("n", [2, 5, 10])
+def test_bodies_at_one_place_are_not_finite(n):
+    gm, y = bodies(n)
+    y[3 * n - 3 : 3 * n] = y[:3]
+    a = accelerations(gm, y)
+    assert not np.isfinite(a[[0, -1]]).any()
+    assert np.isfinite(a[1:-1]).all()
+    assert not np.isfinite(_newton.energy(0.0, y, gm))
+
+
+@njit
+def _repeated(y, gm, times):
+    """Inlined in a loop, and into a larger function."""
+    out, total = np.empty(y.size), 0.0
+    for _ in range(times):
+        _newton.rhs(0.0, y, out, gm)
+        total += _newton.energy(0.0, y, gm)
+    return out, total / times
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("n", SIZES)
+def test_the_same_bits_inside_another_compiled_function(n):
+    gm, y = bodies(n)
+    inside, energy = _repeated(y, gm, 4)
+    np.testing.assert_array_equal(inside[3 * n :].reshape(-1, 3), accelerations(gm, y))
+    assert energy == _newton.energy(0.0, y, gm)
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("options", [{}, {"compensated": True, "every": 3}])
+def test_ten_bodies_compiled_and_interpreted(options):
+    problem = solar_system(years=0.2)
+    runs = [integrate(problem, method=EIPRK4, save_every=1, compiled=c, **options) for c in (True, False)]
+    assert [run.compiled for run in runs] == [True, False]
+    np.testing.assert_array_equal(runs[0].y, runs[1].y)
+    np.testing.assert_array_equal(runs[0].invariants, runs[1].invariants)
+
+
+PRINT = """
+import numpy as np
+from eip_scipy.problems.gravity import _newton
+for n in %r:
+    rng = np.random.default_rng([n, 0])
+    gm, y, out = 10.0 ** rng.uniform(-6, 0, n), rng.standard_normal(6 * n), np.empty(6 * n)
+    _newton.rhs(0.0, y, out, gm)
+    print(*(x.hex() for x in out[3 * n :].tolist()), float(_newton.energy(0.0, y, gm)).hex())
+"""
+
+
+def in_another_process(**environment):
+    """Accelerations and energies as another setting of Numba computes them."""
+    run = subprocess.run(
+        [sys.executable, "-c", PRINT % SIZES], env=os.environ | environment, capture_output=True, text=True, check=True
+    )
+    return [[float.fromhex(x) for x in line.split()] for line in run.stdout.splitlines()]
+
+
+def test_without_the_jit_equal_to_rounding():
+    for n, found in zip(SIZES, in_another_process(NUMBA_DISABLE_JIT="1"), strict=True):
+        gm, y = bodies(n)
+        a = accelerations(gm, y)
+        np.testing.assert_allclose(np.reshape(found[:-1], (-1, 3)), a, rtol=0, atol=3e-15 * np.abs(a).max())
+        assert found[-1] == pytest.approx(_newton.energy(0.0, y, gm), rel=1e-13)
+
+
+@pytest.mark.needs_jit
+def test_the_same_bits_with_and_without_avx512():
+    have = binding.get_host_cpu_features()
+    if not (have.get("avx2") and have.get("fma")):
+        pytest.skip("needs a processor with AVX2 and FMA")
+    other = in_another_process(NUMBA_CPU_NAME="haswell", NUMBA_CPU_FEATURES="+sse4.2,+popcnt,+avx,+avx2,+fma")
+    for n, found in zip(SIZES, other, strict=True):
+        gm, y = bodies(n)
+        np.testing.assert_array_equal(np.reshape(found[:-1], (-1, 3)), accelerations(gm, y))
+        assert found[-1] == _newton.energy(0.0, y, gm)
+
+
+@pytest.mark.needs_jit
+def test_other_arrays_are_refused():
+    gm, y = bodies(10)
+    with pytest.raises(TypingError, match=r"expected a vector of float64, got array\(float32"):
+        _newton.rhs(0.0, y.astype(np.float32), np.empty(60), gm)

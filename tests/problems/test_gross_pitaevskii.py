@@ -1,0 +1,411 @@
+"""The Gross-Pitaevskii equation: its parts against closed forms and dense matrices, its invariants, and its steps."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPRK4, EIPRK45, Diagnostics, integrate
+from eip_scipy.core.diagnostics import observed_order
+from eip_scipy.core.invariants import check_gradient
+from eip_scipy.problems import (
+    Grid,
+    GrossPitaevskii,
+    Problem,
+    harmonic_trap,
+    plane_wave,
+    quartic_trap,
+    rotating_packet,
+    soliton,
+)
+from eip_scipy.problems.gross_pitaevskii import Multiplier, SpectralSum, make_transforms
+from eip_scipy.problems.gross_pitaevskii.transforms import LIBRARIES
+
+
+def noise(grid):
+    return np.random.default_rng(7).standard_normal(2 * grid.size).view(complex).reshape(grid.shape)
+
+
+def first_derivative(n, length):
+    """Matrix of the spectral first derivative on n (even) points (Trefethen, Spectral methods in MATLAB, eq. 3.10)."""
+    j = np.arange(n)
+    d = j[:, None] - j
+    with np.errstate(divide="ignore"):
+        D = 0.5 * (-1.0) ** d / np.tan(d * np.pi / n)
+    D[j, j] = 0.0
+    return 2 * np.pi / length * D
+
+
+def second_derivative(n, length):
+    """Matrix of the spectral second derivative with the Nyquist mode's own factor (the same, eq. 3.12)."""
+    j = np.arange(n)
+    d = j[:, None] - j
+    with np.errstate(divide="ignore"):
+        D = -0.5 * (-1.0) ** d / np.sin(d * np.pi / n) ** 2
+    D[j, j] = -(n**2 + 2) / 12
+    return (2 * np.pi / length) ** 2 * D
+
+
+# The right-hand side.
+
+
+@pytest.mark.parametrize("nyquist", ["true", "zero"])
+@pytest.mark.parametrize("Omega", [0.0, 0.7])
+def test_two_dimensions_are_the_papers_dense_matrices(Omega, nyquist):
+    """Equation (3.10) with D1 of the y axis transposed; the paper's D2 is D1 applied twice."""
+    grid = Grid((12, 16), (-2, -3), (2, 4))
+    gpe = GrossPitaevskii(grid, quartic_trap(1.2, 0.3, 1, 2), Omega=Omega, beta=1.5, nyquist=nyquist)
+    psi, (x, y) = noise(grid), grid.mesh()
+    D1x, D1y = first_derivative(12, 4), first_derivative(16, 7)
+    D2x, D2y = (second_derivative(12, 4), second_derivative(16, 7)) if nyquist == "true" else (D1x @ D1x, D1y @ D1y)
+    s = x**2 + 4 * y**2
+    V = -0.1 * s + 0.075 * s**2
+    laplace = D2x @ psi + psi @ D2y.T
+    Lz = -1j * (x * (psi @ D1y.T) - (D1x @ psi) * y)
+    linear = -0.5 * laplace + V * psi - Omega * Lz
+    expected = linear + 1.5 * abs(psi) ** 2 * psi
+    size = np.abs(expected).max()
+    np.testing.assert_allclose(gpe.hamiltonian(psi), expected, atol=1e-13 * size)
+    np.testing.assert_allclose(gpe.fun(0, psi.ravel()), -1j * expected.ravel(), atol=1e-13 * size)
+    w = 4 / 12 * 7 / 16
+    assert gpe.mass(psi) == pytest.approx(w * np.sum(abs(psi) ** 2), rel=1e-14)
+    energy = w * (np.vdot(psi, linear).real + 0.75 * np.sum(abs(psi) ** 4))
+    assert gpe.energy(psi) == pytest.approx(energy, rel=1e-13)
+    assert gpe.angular_momentum(psi) == pytest.approx(w * np.vdot(psi, Lz).real, rel=1e-12)
+    mu = np.vdot(psi, expected).real / np.vdot(psi, psi).real
+    assert gpe.chemical_potential(psi) == pytest.approx(mu, rel=1e-13)
+
+
+@pytest.mark.parametrize("Omega", [0.0, 0.6])
+@pytest.mark.parametrize(("shape", "gamma"), [((32, 32), (1, 1)), ((24, 24, 24), (1, 1, 2))])
+def test_vortex_of_the_harmonic_trap(shape, gamma, Omega):
+    """(x + i y) exp(-V) is an eigenstate of energy 2 + gamma_z / 2 - Omega and angular momentum 1."""
+    ends = np.array([6.5, 6.5, 4.5])[: len(shape)]
+    grid = Grid(shape, -ends, ends)
+    gpe = GrossPitaevskii(grid, harmonic_trap(*gamma), Omega=Omega)
+    x, y, *_ = grid.mesh()
+    square = sum(g * a**2 for g, a in zip(gamma, grid.mesh(), strict=True))
+    psi = (x + 1j * y) * np.exp(-0.5 * square)
+    level = 2 + (gamma[2] / 2 if len(gamma) == 3 else 0) - Omega
+    tolerance = 1e-6  # what the grid resolves
+    np.testing.assert_allclose(gpe.hamiltonian(psi), level * psi, atol=tolerance)
+    assert gpe.energy(psi) / gpe.mass(psi) == pytest.approx(level, rel=tolerance)
+    assert gpe.angular_momentum(psi) / gpe.mass(psi) == pytest.approx(1, rel=tolerance)
+
+
+def test_three_dimensions_are_two_where_nothing_depends_on_z():
+    flat, full = Grid((8, 12), -2, 3), Grid((8, 12, 6), (-2, -2, 0), (3, 3, 1))
+    psi = noise(flat)
+    options = {"Omega": 0.4, "beta": 2.0}
+    two = GrossPitaevskii(flat, harmonic_trap(1, 2), **options)
+    three = GrossPitaevskii(full, harmonic_trap(1, 2, 0), **options)
+    lifted = np.repeat(psi[..., None], 6, axis=2)
+    expected = two.hamiltonian(psi)
+    np.testing.assert_allclose(three.hamiltonian(lifted), np.repeat(expected[..., None], 6, axis=2), atol=1e-12)
+    assert three.energy(lifted) == pytest.approx(two.energy(psi), rel=1e-13)
+    assert three.angular_momentum(lifted) == pytest.approx(two.angular_momentum(psi), rel=1e-12)
+
+
+def test_odd_numbers_of_points_and_one_dimension():
+    """exp(i k x) has the energy k^2 / 2 per mass, and the derivative of the highest mode of an odd grid has a sign."""
+    grid = Grid(9, 0, 2 * np.pi)
+    gpe = GrossPitaevskii(grid)
+    for k in range(-4, 5):
+        psi = np.exp(1j * k * grid.points(0))
+        np.testing.assert_allclose(gpe.hamiltonian(psi), 0.5 * k * k * psi, atol=1e-13)
+    np.testing.assert_array_equal(grid.wavenumbers(0, odd=True), grid.wavenumbers(0))
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+@pytest.mark.parametrize("shape", [(10,), (8, 6), (4, 6, 10)])
+def test_libraries_are_numpys_transform(library, shape):
+    pytest.importorskip(library)
+    grid = Grid(shape, -1, 1)
+    fft, psi = make_transforms(library), noise(grid)
+    for axes in [(0,), tuple(range(len(shape))), tuple(range(1, len(shape))) or (0,)]:
+        kept, out = psi.copy(), np.empty_like(psi)
+        fft.forward(psi, axes, out)
+        np.testing.assert_allclose(out, np.fft.fftn(psi, axes=axes), atol=1e-13)
+        fft.backward(out, axes)
+        np.testing.assert_allclose(out, psi * np.prod([shape[a] for a in axes]), atol=1e-12)
+        np.testing.assert_array_equal(psi, kept)
+
+
+def test_library_is_chosen_among_those_installed(monkeypatch):
+    module = "eip_scipy.problems.gross_pitaevskii.transforms.find_spec"
+    monkeypatch.setattr(module, lambda name: name == "scipy" or None)
+    assert make_transforms().name == "scipy"
+    assert GrossPitaevskii(Grid((8, 8), 0, 1)).fft == "scipy"
+    with pytest.raises(ImportError, match=r'ducc0.*pip install "eip_scipy\[fft\]"'):
+        make_transforms("ducc0")
+
+
+def test_threads_do_not_change_the_result():
+    grid = Grid((16, 16), -1, 1)
+    psi = noise(grid)
+    one, two = (GrossPitaevskii(grid, Omega=0.3, beta=1.0, threads=n).hamiltonian(psi) for n in (1, 2))
+    np.testing.assert_array_equal(one, two)
+
+
+def test_multipliers_of_one_axis_and_of_all_agree():
+    grid = Grid((6, 8, 10), -1, 1)
+    fft, psi = make_transforms("scipy"), noise(grid)
+    factors = [grid.wavenumbers(axis) ** 2 for axis in range(3)]
+    single = SpectralSum(grid, fft, [Multiplier(grid, (axis,), f) for axis, f in enumerate(factors)])
+    joint = SpectralSum(grid, fft, [Multiplier(grid, (0, 1, 2), sum(factors))])
+    out, expected = np.empty_like(psi), np.empty_like(psi)
+    single.apply(psi, out)
+    joint.apply(psi, expected)
+    np.testing.assert_allclose(out, expected, atol=1e-11)
+    assert single.expectation(psi) == pytest.approx(np.vdot(psi, expected).real, rel=1e-13)
+
+
+def test_quench_changes_what_is_named():
+    gpe = GrossPitaevskii(Grid((8, 8), -1, 1), harmonic_trap(1, 1), Omega=0.5, beta=3.0, nyquist="zero", fft="scipy")
+    other = gpe.changed(potential=harmonic_trap(2, 2), Omega=0.0)
+    assert (other.Omega, other.beta, other.nyquist, other.fft) == (0.0, 3.0, "zero", "scipy")
+    np.testing.assert_allclose(other.V, 4 * gpe.V)
+    np.testing.assert_array_equal(gpe.changed(beta=1.0).V, gpe.V)
+
+
+# Invariants.
+
+
+@pytest.mark.parametrize("shape", [(8,), (6, 8), (4, 6, 4)])
+def test_gradients(shape):
+    grid = Grid(shape, -2, 2)
+    rotation = 0.0 if grid.dim == 1 else 0.6
+    gpe = GrossPitaevskii(grid, harmonic_trap(*[1.0] * grid.dim), Omega=rotation, beta=-2.0)
+    names = ("mass", "energy") if grid.dim == 1 else ("mass", "energy", "angular_momentum")
+    for invariant in gpe.invariants(names):
+        assert check_gradient(invariant, 0.0, noise(grid).ravel(), gpe.fun) < 1e-10
+
+
+@pytest.fixture
+def near():
+    """An energy that knows its value and f at a state of unit size."""
+    grid = Grid((16, 16), -3, 3)
+    gpe = GrossPitaevskii(grid, harmonic_trap(1, 2), Omega=0.7, beta=30.0)
+    x, y = grid.mesh()
+    psi = ((x + 1j * y) * np.exp(-(x**2) - y**2) + 0.01 * noise(grid)).ravel()
+    (energy,) = gpe.invariants(["energy"])
+    energy.grad(0.0, psi, gpe.fun(0.0, psi), np.empty_like(psi))
+    assert energy.fun(0.0, psi) == gpe.energy(psi)
+    return gpe, psi, energy.fun
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-16, 1e-13, 1e-11, 1e-9, 1e-6, 1e-3, 1.0])
+def test_energy_near_a_known_one_is_the_energy(near, size):
+    gpe, psi, energy = near
+    other = psi + size * noise(gpe.grid).ravel()
+    assert energy(0.0, other) == pytest.approx(gpe.energy(other), rel=2e-15)
+
+
+def test_energy_near_a_known_one_needs_no_transform(near, monkeypatch):
+    gpe, psi, energy = near
+    calls = []
+    monkeypatch.setattr(gpe, "energy", lambda y: calls.append(1) or 0.0)
+    energy(0.0, psi)
+    energy(0.0, psi * (1 + 1e-12))
+    assert not calls
+    energy(0.0, psi * (1 + 1e-7))
+    assert calls
+
+
+def test_energy_keeps_no_arrays_of_others(near):
+    gpe, psi, energy = near
+    expected = gpe.energy(psi)
+    kept = psi.copy()
+    psi *= 2
+    assert energy(0.0, psi) == pytest.approx(gpe.energy(psi), rel=1e-13)
+    assert energy(0.0, kept) == pytest.approx(expected, rel=1e-13)
+
+
+def test_angular_momentum_is_kept_where_the_trap_is_round_and_refused_where_not():
+    grid = Grid((48, 48), -7, 7)  # 32 points do not resolve it: the angular momentum of the grid leaks
+    x, y = grid.mesh()
+    psi = (1 + x + (1 + 1j) * y) * np.exp(-0.5 * (x**2 + y**2))
+    names = ("mass", "energy", "angular_momentum")
+    gpe = GrossPitaevskii(grid, harmonic_trap(1, 1), Omega=0.4, beta=1.0)
+    p = gpe.problem(psi, 0.2, 0.01, invariants=names)
+    run = integrate(p, method=EIPRK4)
+    assert run.max_defect.max() < 1e-13
+    assert run.diagnostics.n_rank_reduced == 0
+    oval = gpe.changed(potential=harmonic_trap(1, 2)).problem(psi, 0.2, 0.01, invariants=names)
+    with pytest.warns(UserWarning, match="'angular_momentum' is no invariant of this system"):
+        integrate(oval, method=EIPRK4)
+
+
+# Steps.
+
+
+@pytest.fixture(scope="module")
+def travelling():
+    return soliton(points=320, velocity=4.0, length=48.0, t_end=0.48)
+
+
+def end_error(problem, h, **options):
+    run = integrate(problem, method=EIPRK4, h=h, **options)
+    assert run.success
+    return float(np.abs(run.y[:, -1] - problem.reference(problem.t_span[1])).max()), run
+
+
+@pytest.mark.needs_jit  # plain Python adds one number after the other, which rounds more
+def test_soliton_travels_at_order_four_with_mass_and_energy_kept(travelling):
+    steps = [0.012, 0.006, 0.003]
+    found = [end_error(travelling, h) for h in steps]
+    errors = [e for e, _ in found]
+    assert errors[-1] < 1e-6
+    np.testing.assert_allclose(observed_order(errors, steps), 4, atol=0.1)
+    assert max(run.max_defect.max() for _, run in found) < 2e-14
+    # Plain RK4 loses both.
+    run = integrate(travelling, method=EIPRK4, h=0.012, save_every=1)
+    bare = integrate(travelling, method=EIPRK4, h=0.012, invariants=())
+    gpe = travelling.equation
+    assert abs(gpe.mass(bare.y[:, -1]) - gpe.mass(bare.y[:, 0])) > 1e-6
+    assert np.ptp(run.invariants, axis=1).max() < 2e-14
+
+
+def test_soliton_closed_form_solves_the_equation():
+    p = soliton(points=512, length=60.0)
+    d = 1e-3
+    for t in (0.0, 17.0, 29.9):  # at 29.9 it crosses the end of the ring
+        c = [1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280]
+        rate = sum(a * p.reference(t + k * d) for a, k in zip(c, range(-4, 5), strict=True)) / d
+        np.testing.assert_allclose(rate, p.fun(t, p.reference(t)), atol=1e-9)
+
+
+def test_reuse_of_the_gradients_evaluation_is_harmless_and_saves_one_in_five(travelling):
+    """One evaluation of f serves grad E and the next first stage: order 4 is kept, and the error the same to 5 %."""
+    steps = [0.012, 0.006, 0.003]
+    found = {reuse: [end_error(travelling, h, reuse_f=reuse) for h in steps] for reuse in (True, False)}
+    errors = {reuse: np.array([e for e, _ in runs]) for reuse, runs in found.items()}
+    np.testing.assert_allclose(observed_order(errors[True], steps), 4, atol=0.1)
+    np.testing.assert_allclose(errors[True], errors[False], rtol=0.05)
+    n = 40
+    assert found[True][0][1].nfev == 1 + 4 * n
+    assert found[False][0][1].nfev == 1 + 5 * n
+    mass_only, run = end_error(travelling, 0.012, invariants=travelling.equation.invariants(["mass"]))
+    assert run.nfev == 1 + 4 * n  # its gradient needs no f: plain RK4's cost
+    assert mass_only > 0
+
+
+def test_solve_ivp_and_integrate_are_the_same_steps():
+    p = rotating_packet(0.9, points=16, t_end=0.02, h=0.004)
+    options = {"h": p.h, "invariants": p.invariants, "metric": p.metric}
+    sol = solve_ivp(p.fun, p.t_span, p.y0, method=EIPRK4, **options)
+    run = integrate(p, method=EIPRK4, save_every=1)
+    np.testing.assert_array_equal(sol.y, run.y)
+    assert "interpreted" in run.message
+    fields = p.equation.grid.field(sol.y)
+    assert fields.shape == (6, 16, 16)
+    assert np.shares_memory(fields, sol.y)
+    np.testing.assert_array_equal(p.equation.grid.field(sol.y[:, -1]), fields[-1])
+
+
+def test_adaptive_steps():
+    p = soliton(points=160, length=40.0, t_end=0.5)
+    sol = solve_ivp(p.fun, p.t_span, p.y0, method=EIPRK45, rtol=1e-8, atol=1e-10, invariants=p.invariants)
+    assert sol.success
+    np.testing.assert_allclose(sol.y[:, -1], p.reference(0.5), atol=1e-6)
+
+
+def test_the_frame_of_the_records():
+    p = soliton()
+    assert isinstance(p, Problem)
+    assert (p.name, p.metric) == ("soliton", "euclidean")
+    assert [i.name for i in p.invariants] == ["mass", "energy"]
+
+
+# Stationary states: the gradients of mass and energy are parallel.
+
+
+def test_plane_wave_has_rank_one():
+    p = plane_wave((12, 12), (2, 1), amplitude=1.5, t_end=1.0)
+    diagnostics = Diagnostics()
+    run = integrate(p, method=EIPRK4, diagnostics=diagnostics)
+    assert run.success
+    assert np.isfinite(run.y).all()
+    projections = diagnostics.n_projections
+    assert projections > 5
+    assert diagnostics.n_rank_reduced == projections
+    assert (run.max_defect < 1e-9 * np.abs(run.invariants[:, 0])).all()
+    # What is left is the error of RK4's phase: plain RK4's amplitude is wrong as well.
+    bare = integrate(p, method=EIPRK4, invariants=())
+    exact = p.reference(1.0)
+    assert np.abs(run.y[:, -1] - exact).max() <= 1.01 * np.abs(bare.y[:, -1] - exact).max()
+
+
+def test_plane_wave_needs_whole_modes():
+    with pytest.raises(ValueError, match="whole numbers"):
+        plane_wave((8, 8), (1, 0.5))
+    with pytest.raises(ValueError, match="one for each axis"):
+        plane_wave((8, 8), 1)
+
+
+# What a user may get wrong.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (((8, 8, 8, 8), 0, 1), "one to three integers"),
+        (((8, 1), 0, 1), "one to three integers"),
+        (((8.5, 8), 0, 1), "one to three integers"),
+        (((8, 8), 1, 0), "upper must be above lower"),
+        (((8, 8), (0, 0, 0), 1), "lower must be a finite number or 2"),
+        (((8, 8), 0, np.inf), "upper must be a finite number or 2"),
+    ],
+)
+def test_bad_grids(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Grid(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"potential": lambda x, y: x * 1j}, "potential must be real"),
+        ({"potential": lambda x, y: np.where(x > 0, np.nan, 1.0) + y}, "not finite"),
+        ({"potential": np.zeros((3, 3))}, r"shape \(3, 3\), which does not fit Grid\(\(8, 8\)"),
+        ({"potential": harmonic_trap(1, 1, 1)}, "3 frequencies does not fit 2"),
+        ({"Omega": np.nan}, "Omega must be a finite number"),
+        ({"beta": "1"}, "beta must be a finite number"),
+        ({"nyquist": "half"}, "nyquist must be 'true' or 'zero', got 'half'"),
+        ({"fft": "fftw"}, "fft must be 'auto' or one of"),
+        ({"threads": 0}, "threads must be an integer >= 1"),
+    ],
+)
+def test_bad_equations(options, message):
+    with pytest.raises(ValueError, match=message):
+        GrossPitaevskii(Grid((8, 8), -1, 1), **options)
+
+
+def test_bad_states_and_names():
+    gpe = GrossPitaevskii(Grid((8, 8), -1, 1))
+    line = GrossPitaevskii(Grid(8, -1, 1))
+    with pytest.raises(ValueError, match=r"psi has shape \(8, 7\), expected \(8, 8\) or \(64,\)"):
+        gpe.energy(np.zeros((8, 7)))
+    with pytest.raises(ValueError, match=r"got shape \(63,\), expected \(64,\)"):
+        gpe.grid.field(np.zeros(63))
+    with pytest.raises(ValueError, match="did you mean 'energy'"):
+        gpe.invariants(["energie"])
+    with pytest.raises(ValueError, match="a rotation needs two dimensions"):
+        GrossPitaevskii(Grid(8, -1, 1), Omega=0.5)
+    with pytest.raises(ValueError, match="no angular momentum"):
+        line.angular_momentum(np.zeros(8))
+    with pytest.raises(ValueError, match="beta < 0"):
+        soliton(beta=1.0)
+
+
+def test_a_large_field_is_set_up_without_a_list_of_its_points(monkeypatch):
+    """Its components stand alone in the metric's blocks: arrays say so, not a million little ones."""
+    from eip_scipy.core import blocks as _blocks
+
+    called = []
+    monkeypatch.setattr(_blocks, "_block_lists", lambda *args: called.append(args))
+    for blocks, size in ((None, 2), (4, 8)):
+        groups = _blocks.blocks_of(blocks, 64, 2)
+        assert (groups.size, groups.start.size) == (size, 128 // size + 1)
+        np.testing.assert_array_equal(groups.member, np.arange(128))
+        np.testing.assert_array_equal(groups.start, np.arange(0, 129, size))
+    assert not called

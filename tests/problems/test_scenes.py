@@ -1,0 +1,299 @@
+"""Hard scenes: their starts, invariants and references; fictitious time; ``eip-scipy hard-scenes``."""
+
+import csv
+import json
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import eip_scipy.integrations
+from eip_scipy import EIPDOP853, EIPRK4, check_gradient, integrate
+from eip_scipy.app.cli import main
+from eip_scipy.app.hard import runs as scene_runs
+from eip_scipy.app.hard import scenes as hard_scenes
+from eip_scipy.app.hard.runs import SCENES, scene
+from eip_scipy.problems import (
+    centre_time,
+    comet,
+    figure_eight,
+    harmonic,
+    kepler,
+    pair_time,
+    pythagorean,
+    reaches,
+    solar_data,
+    time_transformed,
+)
+from eip_scipy.problems.gravity.scenes import FIGURE_EIGHT_PERIOD
+
+PNG = b"\x89PNG\r\n\x1a\n"
+ROOT = Path(__file__).parents[2]
+TIGHT = {"method": EIPDOP853, "rtol": 1e-13, "atol": 1e-16}
+
+
+def values(problem, y):
+    return [np.atleast_1d(item.fun(0.0, y, *item.args)) for item in problem.invariants]
+
+
+def distance(problem, y, t):
+    half = y.size // 2
+    return np.linalg.norm((y - problem.reference(t))[:half].reshape(-1, 3), axis=1).max()
+
+
+# The scenes.
+
+
+def test_pythagorean_energy_and_momentum():
+    problem = pythagorean()
+    energy, momentum = values(problem, problem.y0)
+    # G sum m_i m_j / r_ij over the sides 3, 4, 5: 12 / 5 + 15 / 4 + 20 / 3.
+    assert energy[0] == pytest.approx(-769 / 60, rel=1e-15)
+    assert np.all(momentum == 0)
+    assert problem.reference(69.0) is None
+
+
+@pytest.mark.needs_jit
+def test_pythagorean_closest_approach_and_escape():
+    problem = pythagorean()
+    run = integrate(problem, (0, 20), save_every=1, **TIGHT)
+    q = run.y[:9].reshape(3, 3, -1)
+    pairs = {(i, j): np.linalg.norm(q[i] - q[j], axis=0) for i, j in ((0, 1), (0, 2), (1, 2))}
+    closest = min(pairs, key=lambda pair: pairs[pair].min())
+    k = pairs[closest].argmin()
+    assert closest == (1, 2)
+    assert run.t[k] == pytest.approx(15.83, abs=0.005)
+    assert 3e-4 < pairs[closest][k] < 6e-4
+    q, v = problem.reference(70.0).reshape(2, 3, 3)
+    outwards = q[0] - (4 * q[1] + 5 * q[2]) / 9
+    assert np.linalg.norm(outwards) > 20
+    # Body 3 leaves for good: the energy of its motion relative to the binary's centre is positive.
+    relative = v[0] - (4 * v[1] + 5 * v[2]) / 9
+    assert 0.5 * relative @ relative - 12 / np.linalg.norm(outwards) > 0
+    assert np.linalg.norm(q[1] - q[2]) < 2
+
+
+def test_figure_eight_returns_and_has_no_momentum():
+    problem = figure_eight(1)
+    energy, momentum = values(problem, problem.y0)
+    assert energy[0] == pytest.approx(-1.287142, abs=1e-6)
+    assert np.abs(momentum).max() < 1e-16
+    assert problem.t_span == (0.0, 6.32591398)
+    assert np.abs(problem.reference(FIGURE_EIGHT_PERIOD) - problem.y0).max() < 2e-7
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("periods", [1, 10])
+def test_figure_eight_meets_its_reference(periods):
+    problem = figure_eight(periods)
+    run = integrate(problem, first_step=1e-3, **TIGHT)
+    assert distance(problem, run.y[:, -1], problem.t_span[1]) < 1e-11
+
+
+@pytest.mark.parametrize("periods", [0, -1.0, math.inf, math.nan])
+def test_figure_eight_refuses(periods):
+    with pytest.raises(ValueError, match="periods must be positive and finite"):
+        figure_eight(periods)
+
+
+@pytest.mark.needs_jit
+def test_comet_passes_jupiter_and_is_thrown_out():
+    problem = comet()
+    run = integrate(problem, save_every=1, **TIGHT)
+    q, v = run.y.reshape(2, 4, 3, -1)
+    apart = np.linalg.norm(q[3] - q[1], axis=0)
+    k = apart.argmin()
+    assert run.t[k] == pytest.approx(10.0, abs=1e-4)
+    assert apart[k] * solar_data.AU_KM / 71492 == pytest.approx(3.0, abs=0.01)
+    axes = []
+    for column in (0, -1):
+        relative = v[3, :, column] - v[0, :, column]
+        energy = 0.5 * relative @ relative - problem.params[0] / np.linalg.norm(q[3, :, column] - q[0, :, column])
+        axes.append(-problem.params[0] / 2 / energy)
+    assert axes[0] == pytest.approx(3.17, abs=0.01)
+    assert axes[1] == pytest.approx(502, abs=1)
+    assert distance(problem, run.y[:, -1], 20.0) < 1e-7
+    centre = problem.frame[0] @ problem.y0
+    assert np.abs(centre).max() < 1e-15
+
+
+@pytest.mark.slow
+@pytest.mark.needs_jit
+def test_pythagorean_to_its_end():
+    problem = pythagorean()
+    kept = integrate(problem, **TIGHT)
+    plain = integrate(problem, invariants=(), **TIGHT)
+    assert distance(problem, kept.y[:, -1], 70.0) < 5e-3
+    assert distance(problem, plain.y[:, -1], 70.0) > 5 * distance(problem, kept.y[:, -1], 70.0)
+
+
+@pytest.mark.slow
+def test_reference_file_can_be_made_anew(tmp_path):
+    pytest.importorskip("heyoka")
+    target = tmp_path / "new.json"
+    command = [sys.executable, str(ROOT / "benchmarks" / "scene_references.py"), "--bits", "128", "--out", str(target)]
+    subprocess.run(command, check=True, capture_output=True)
+    stored = ROOT / "eip_scipy" / "data" / "scene_references.json"
+    assert json.loads(target.read_text())["states"] == json.loads(stored.read_text())["states"]
+
+
+# Fictitious time.
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize(("make", "g"), [(lambda: kepler(0.6, 0.0), centre_time), (pythagorean, pair_time)])
+def test_transformed_problem_has_the_same_invariants(make, g):
+    problem = make()
+    other = time_transformed(problem, 1.0, g)
+    rng = np.random.default_rng(1)
+    y = np.append(problem.y0 + 0.1 * rng.standard_normal(problem.y0.size), 3.0)
+    out = np.empty_like(y)
+    other.rhs(0.0, y, out, other.params)
+    weight = g(y[:-1], problem.params)
+    assert out[-1] == weight
+    np.testing.assert_allclose(out[:-1], weight * problem.fun(3.0, y[:-1]), rtol=1e-14)
+    for before, after in zip(values(problem, y[:-1]), values(other, y), strict=True):
+        np.testing.assert_array_equal(before, after)
+    for item in other.invariants:
+        assert check_gradient(item, 0.0, y, fun=other.fun) < 1e-6
+
+
+@pytest.mark.needs_jit
+def test_circular_orbit_takes_two_pi():
+    problem = kepler(0.0, 0.0)
+    run = integrate(time_transformed(problem, 2 * math.pi, centre_time), method=EIPRK4, h=0.01)
+    assert run.y[-1, -1] == pytest.approx(2 * math.pi, abs=1e-8)
+    two = scene("kepler-0.9")
+    gm, y0 = two.bodies()
+    assert pair_time(y0, gm) == pytest.approx(centre_time(two.problem.y0, two.problem.params), rel=1e-14)
+
+
+@pytest.mark.needs_jit
+def test_fixed_steps_in_fictitious_time_beat_fixed_steps():
+    problem = kepler(0.99, 0.0, t_end=20.0)
+    run = integrate(time_transformed(problem, 1e6, centre_time), method=EIPDOP853, h=0.1, events=reaches(20.0))
+    assert run.compiled
+    assert run.status == 1
+    assert run.y[-1, -1] == 20.0 or abs(run.y[-1, -1] - 20.0) < 1e-13
+    error = np.abs(run.y[:2, -1] - problem.reference(20.0)[:2]).max()
+    fixed = integrate(problem, method=EIPDOP853, h=20.0 / run.nfev * 12)
+    assert error < 1e-9
+    assert not np.abs(fixed.y[:2, -1] - problem.reference(20.0)[:2]).max() < 1e-2
+
+
+def test_a_problem_without_compiled_equations_is_refused():
+    with pytest.raises(ValueError, match="has no compiled right-hand side"):
+        time_transformed(replace(harmonic(), rhs=None), 1.0)
+
+
+# The command.
+
+
+@pytest.fixture
+def few_runs(monkeypatch):
+    monkeypatch.setattr(hard_scenes, "REPEATS", 1)
+    monkeypatch.setattr(scene_runs, "TOLERANCES", (1e-7, 1e-11))
+    monkeypatch.setattr(scene_runs, "STEPS_PER_TURN", (30, 60))
+    monkeypatch.setattr(scene_runs, "EPSILONS", {"prs23": (1e-5, 1e-7), "global": (1e-4,)})
+
+
+@pytest.fixture
+def no_rebound(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rebound", None)
+    monkeypatch.delitem(sys.modules, "eip_scipy.integrations.rebound", raising=False)
+    monkeypatch.delattr(eip_scipy.integrations, "rebound", raising=False)
+
+
+@pytest.mark.slow
+@pytest.mark.needs_jit
+@pytest.mark.usefixtures("few_runs")
+def test_command_compares_methods(tmp_path, capsys):
+    pytest.importorskip("rebound")
+    file = tmp_path / "run.json"
+    names = ["kepler-0.9", "comet"]
+    options = [option for name in names for option in ("--scene", name)]
+    assert main(["hard-scenes", *options, "--out", str(tmp_path), "--json", str(file)]) == 0
+    points = json.loads(file.read_text())["points"]
+    assert list(dict.fromkeys(p["scene"] for p in points)) == names
+    error = {(p["scene"], p["method"], p["value"]): p["position_error"] for p in points}
+    assert error["kepler-0.9", "EIPDOP853", 1e-11] < 1e-2 * error["kepler-0.9", "DOP853", 1e-11]
+    assert error["comet", "EIPDOP853", 1e-11] == pytest.approx(error["comet", "DOP853", 1e-11], rel=0.1)
+    assert error["kepler-0.9", "IAS15, prs23", 1e-7] < 1e-9
+    assert error["comet", "IAS15, prs23", 1e-7] < 1e-9
+    kept = [p for p in points if p["method"] == "EIPDOP853, fixed ds"]
+    assert all(max(p["error_H"], p["error_L"]) < 1e-12 for p in kept)
+    with open(tmp_path / "hard-scenes.csv", newline="") as stream:
+        assert len(list(csv.DictReader(stream))) == len(points)
+    assert (tmp_path / "hard-scenes.png").read_bytes().startswith(PNG)
+    out = capsys.readouterr().out
+    assert "comet past Jupiter" in out
+    assert out.count("least for comet") == 2
+    assert max(map(len, out.splitlines()[2:-4])) <= 110
+
+
+@pytest.fixture
+def small_scene(monkeypatch):
+    """One that is quick in plain Python, too."""
+    problem = replace(kepler(0.5, 0.0, t_end=2.0), h=None)
+    monkeypatch.setitem(SCENES, "small", lambda: scene_runs.Scene("small", "small", problem, centre_time, (40,), 1e-4))
+    monkeypatch.setattr(scene_runs, "TOLERANCES", (1e-3, 1e-5))
+    monkeypatch.setattr(scene_runs, "STEPS_PER_TURN", (10, 20))
+
+
+@pytest.mark.usefixtures("few_runs", "no_rebound", "small_scene")
+def test_command_without_rebound_says_what_to_install(tmp_path, capsys):
+    assert main(["hard-scenes", "--scene", "small", "--out", str(tmp_path)]) == 0
+    out, err = capsys.readouterr()
+    assert "no comparison with WHFast and IAS15" in err
+    assert 'pip install "eip_scipy[rebound]"' in err
+    assert "epsilon" not in out
+    with open(tmp_path / "hard-scenes.csv", newline="") as stream:
+        points = list(csv.DictReader(stream))
+    assert len(points) == 5 * 2 + 1
+    assert max(float(p["position_error"]) for p in points) < 0.1
+
+
+@pytest.mark.usefixtures("few_runs", "small_scene")
+def test_a_run_that_fails_is_listed(capsys):
+    of = scene("small")
+    failed = scene_runs.Point("small", "EIPRKN12", "h", 0.1, 7, 0.01, math.nan, 0.0, 0.0, "projection failed")
+    text = hard_scenes.text({"small": (of, [failed])}, "a machine")
+    assert "Did not reach the end:\n  small, EIPRKN12, h 0.10: projection failed" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("pythagoras", "; did you mean 'pythagorean'?"), ("kepler-0.9999", "; did you mean 'kepler-0.999'?"), ("x", "")],
+)
+def test_unknown_scene(name, hint, capsys):
+    assert main(["hard-scenes", "--scene", name]) == 2
+    err = capsys.readouterr().err
+    assert len(err.splitlines()) == 1
+    assert f"unknown scene {name!r}, expected one of {', '.join(SCENES)}{hint} (see" in err
+
+
+def test_interruption(tmp_path, capsys, monkeypatch):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(hard_scenes, "measure", interrupted)
+    assert main(["hard-scenes", "--scene", "comet", "--out", str(tmp_path), "--quiet"]) == 130
+    assert list(tmp_path.iterdir()) == []
+    assert "nothing was written" in capsys.readouterr().err
+
+
+def test_invariant_errors_and_bodies_of_a_scene():
+    of = scene("kepler-0.99")
+    gm, y0 = of.bodies()
+    assert gm.sum() == 1
+    np.testing.assert_allclose(of.from_bodies(y0[:, None])[:, 0], of.problem.y0, rtol=1e-15)
+    y = np.column_stack([of.problem.y0, of.problem.y0])
+    assert of.invariant_errors(y) == (0.0, 0.0)
+    y[3, 1] *= 1 + 1e-6
+    assert of.invariant_errors(y)[1] == pytest.approx(1e-6, rel=1e-6)
+    assert of.error(of.end) == 0
+    assert math.isnan(of.error(np.full(4, np.nan)))

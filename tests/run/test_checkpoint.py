@@ -1,0 +1,1243 @@
+"""Checkpoint files and runs that are broken off and resumed: bit for bit, whatever happens to process, disk or file."""
+
+import contextlib
+import errno
+import hashlib
+import io
+import json
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+import warnings
+import zipfile
+from pathlib import Path
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from numba import njit
+from numpy.lib import format as npy
+from systems import (
+    H_USES_F,
+    H,
+    L,
+    jit_energy,
+    jit_energy_gradient,
+    jit_momentum,
+    jit_momentum_gradient,
+    jit_orbit,
+    orbit,
+    pericentre,
+)
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPRK2,
+    EIPRK4,
+    EIPRK5,
+    EIPRK45,
+    EIPRKN8,
+    EIPRKN12,
+    CheckpointError,
+    Diagnostics,
+    Invariant,
+    checkpoint,
+    integrate,
+)
+from eip_scipy.problems import kepler
+from eip_scipy.run import driver as _driver
+from eip_scipy.run import integrate as longrun
+from eip_scipy.run import resume
+
+Y0 = pericentre(0.6)
+JIT_H = Invariant(jit_energy, jit_energy_gradient, name="energy")
+JIT_L = Invariant(jit_momentum, jit_momentum_gradient, name="momentum")
+
+
+class BrokenOffError(Exception):
+    pass
+
+
+# Resuming, bit for bit.
+
+
+def crossing(t, y):
+    return y[1]
+
+
+def attraction(t, q):
+    return -q / np.hypot(*q) ** 3
+
+
+def falling(t, y):
+    return y[0]
+
+
+def third(t, y):
+    return y[1]
+
+
+falling.direction = -1
+third.terminal = 2
+
+
+@njit
+def jit_crossing(t, y):
+    return y[1]
+
+
+@njit
+def precession(t, y):
+    return np.array([-1j * (y[0] + 0.3 * y[1]), -1j * (0.3 * y[0] - (1.0 + 0.1 * np.sin(t)) * y[1])])
+
+
+@njit
+def mass(t, y):
+    return y[0].real ** 2 + y[0].imag ** 2 + y[1].real ** 2 + y[1].imag ** 2
+
+
+@njit
+def mass_gradient(t, y):
+    return 2.0 * y
+
+
+MASS = Invariant(mass, mass_gradient, name="mass")
+SPAN, FRAME = (0.0, 6.0), (np.array([[1.0, 2.0, 0.0, 0.0]]), np.array([[0.5], [0.25], [0.0], [0.0]]))
+FIXED = {"method": EIPRK4, "h": 0.03, "invariants": [H, L], "save_every": 7}
+ADAPTIVE = {"method": EIPRK45, "rtol": 1e-7, "atol": 1e-10, "invariants": [H, L], "save_every": 3}
+COMPLEX = FIXED | {"invariants": MASS, "compensated": True}
+
+CASES = {
+    "fixed": (orbit, Y0, FIXED),
+    "only the ends": (orbit, Y0, FIXED | {"save_every": None}),
+    "a slope of its own": (orbit, Y0, FIXED | {"reuse_f": False}),
+    "the slope of the raw step": (orbit, Y0, FIXED | {"invariants": [H_USES_F, L]}),
+    "no invariants": (orbit, Y0, FIXED | {"invariants": ()}),
+    "no estimate": (orbit, Y0, FIXED | {"metric": "euclidean", "method": EIPRK2, "h": 0.01}),
+    "weights": (orbit, Y0, FIXED | {"metric": np.array([1.0, 1.0, 0.5, 0.5]), "frame": FRAME}),
+    "blocks and iterations": (orbit, Y0, FIXED | {"blocks": 2, "iterations": 2, "direction": "midpoint"}),
+    "spaced projections": (orbit, Y0, FIXED | {"every": 4, "method": EIPRK5}),
+    "every auto": (orbit, Y0, FIXED | {"every": "auto", "method": EIPDOP853, "h": 0.02}),
+    "compensated": (orbit, Y0, FIXED | {"compensated": True, "h": 0.01}),
+    "projected start": (
+        orbit,
+        Y0,
+        FIXED | {"invariants": Invariant(H.fun, H.grad, target=-0.4), "project_initial": True},
+    ),
+    "samples": (orbit, Y0, FIXED | {"save_every": None, "t_eval": np.linspace(0.1, 5.9, 100)}),
+    "adaptive": (orbit, Y0, ADAPTIVE),
+    "adaptive, pair": (orbit, Y0, ADAPTIVE | {"method": EIPDOP853, "first_step": 1e-3, "rtol": 1e-11, "atol": 1e-13}),
+    "adaptive, every auto": (orbit, Y0, ADAPTIVE | {"every": "auto"}),
+    "adaptive, samples": (orbit, Y0, ADAPTIVE | {"save_every": None, "t_eval": np.linspace(0, 6, 300)}),
+    "events": (orbit, Y0, FIXED | {"events": [crossing, falling]}),
+    "adaptive, events": (orbit, Y0, ADAPTIVE | {"events": [falling, crossing]}),
+    "an event that ends it": (orbit, Y0, FIXED | {"events": [crossing, third], "every": 45}),
+    "Nystrom": (attraction, Y0, FIXED | {"method": EIPRKN8}),
+    "Nystrom, all": (
+        attraction,
+        Y0,
+        FIXED | {"method": EIPRKN12, "h": 0.05, "every": "auto", "compensated": True, "save_every": 2},
+    ),
+    "complex": (
+        precession,
+        np.array([0.6, 0.8j]),
+        FIXED | {"invariants": MASS, "compensated": True, "compiled": False},
+    ),
+}
+JIT = {"invariants": [JIT_H, JIT_L], "compiled": True}
+COMPILED = {
+    "fixed": (jit_orbit, Y0, FIXED | JIT),
+    "compensated, every auto": (jit_orbit, Y0, FIXED | JIT | {"every": "auto", "compensated": True, "h": 0.01}),
+    "adaptive": (jit_orbit, Y0, ADAPTIVE | JIT),
+    "samples": (jit_orbit, Y0, ADAPTIVE | JIT | {"save_every": None, "t_eval": np.linspace(0, 6, 100)}),
+    "events": (jit_orbit, Y0, FIXED | JIT | {"events": jit_crossing}),
+    "Nystrom": (
+        njit(lambda t, q: -q / (q[0] * q[0] + q[1] * q[1]) ** 1.5),
+        Y0,
+        FIXED | JIT | {"method": EIPRKN12, "h": 0.05, "every": 5},
+    ),
+    "complex": (precession, np.array([0.6, 0.8j]), COMPLEX | {"compiled": True}),
+}
+
+
+def same(one, other):
+    """Every number of two results."""
+    for key in ("t", "y", "invariants", "max_defect", "status", "nfev", "njev", "nlu", "success", "method", "h"):
+        np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+    for key in ("t_events", "y_events"):
+        assert (one[key] is None) == (other[key] is None)
+        for a, b in zip(one[key] or (), other[key] or (), strict=True):
+            np.testing.assert_array_equal(a, b, err_msg=key)
+    for key in ("names", "n_projections", "n_skipped", "n_rank_reduced", "n_softened", "n_rejected_projections"):
+        assert getattr(one.diagnostics, key) == getattr(other.diagnostics, key), key
+    for key in ("last_defect", "max_defect", "max_correction"):
+        np.testing.assert_array_equal(getattr(one.diagnostics, key), getattr(other.diagnostics, key), err_msg=key)
+    assert one.message.split(" (")[0] == other.message.split(" (")[0]
+
+
+@pytest.fixture
+def fine(monkeypatch):
+    """Short chunks, and a snapshot after each; what a checkpoint does not hold is NaN in a run that is resumed."""
+    monkeypatch.setattr(longrun, "FIRST_CHUNK", 5)
+    monkeypatch.setattr(longrun, "CHUNK_SECONDS", 0.0)
+    monkeypatch.setattr(resume, "SNAPSHOT_SECONDS", 0.0)
+    monkeypatch.setattr(resume, "LEAST_RATIO", 0.0)
+    load = longrun.Driver.load
+
+    def poisoned(driver, *rows):
+        known = [a.copy() for a in driver.parts().values()]
+        w, grid = driver.run.work, driver.grid
+        for buffer in (*w[:-1], *w.inner, grid.g_new, driver.new, driver.t, driver.y):
+            buffer[...] = np.nan if buffer.dtype.kind in "fc" else 77
+        for part, value in zip(driver.parts().values(), known, strict=True):
+            part[...] = value
+        load(driver, *rows)
+
+    monkeypatch.setattr(longrun.Driver, "load", poisoned)
+
+
+@contextlib.contextmanager
+def broken_off(monkeypatch, calls):
+    """Let the run be broken off before its so many-th chunk."""
+    advance, left = longrun.Driver.advance, [calls]
+
+    def stop(driver, k_end):
+        left[0] -= 1
+        if left[0] < 0:
+            raise BrokenOffError
+        return advance(driver, k_end)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(longrun.Driver, "advance", stop)
+        yield
+
+
+def resumed(case, path, monkeypatch, first=7, more=9):
+    """A run broken off again and again; the result, and how often it was."""
+    fun, y0, options = case
+    for k in range(1000):
+        with contextlib.suppress(BrokenOffError), broken_off(monkeypatch, first if k == 0 else more):
+            return integrate(fun, SPAN, y0, checkpoint=path, resume=True, **options), k
+    raise AssertionError("the run does not advance")
+
+
+@pytest.mark.slow_without_jit
+@pytest.mark.usefixtures("fine")
+@pytest.mark.parametrize("name", CASES)
+def test_resumed_runs_are_the_same(name, tmp_path, monkeypatch):
+    fun, y0, options = CASES[name]
+    whole = integrate(fun, SPAN, y0, **options)
+    found, times = resumed(CASES[name], tmp_path / "run", monkeypatch)
+    assert times >= 4
+    same(whole, found)
+    assert found.status == (1 if "ends" in name and "event" in name else 0)
+
+
+@pytest.mark.needs_jit
+@pytest.mark.usefixtures("fine")
+@pytest.mark.parametrize("name", COMPILED)
+def test_resumed_compiled_runs_are_the_same(name, tmp_path, monkeypatch):
+    fun, y0, options = COMPILED[name]
+    whole = integrate(fun, SPAN, y0, **options)
+    found, times = resumed(COMPILED[name], tmp_path / "run", monkeypatch)
+    assert times >= 4
+    assert found.compiled
+    same(whole, found)
+    # A run may change its kind on the way: compiled and interpreted steps have the same bits.
+    interpreted = (fun, y0, options | {"compiled": False})
+    with contextlib.suppress(BrokenOffError), broken_off(monkeypatch, 6):
+        integrate(fun, SPAN, y0, checkpoint=tmp_path / "other", **options)
+    found, times = resumed(interpreted, tmp_path / "other", monkeypatch, first=1000)
+    assert times == 0
+    same(whole, found)
+
+
+@pytest.mark.slow_without_jit
+@pytest.mark.usefixtures("fine")
+@pytest.mark.parametrize("name", ["fixed", "compensated", "every auto", "adaptive", "adaptive, events", "Nystrom, all"])
+@pytest.mark.parametrize("error", [BrokenOffError, KeyboardInterrupt])
+def test_broken_off_inside_a_step(name, error, tmp_path):
+    """Wherever a step is left, its half-filled buffers are not what is kept."""
+    fun, y0, options = CASES[name]
+    whole = integrate(fun, SPAN, y0, **options)
+    for last in (9, *range(150, 158), whole.nfev - 10):
+        calls = [0]
+
+        def counted(t, y, last=last, calls=calls):
+            calls[0] += 1
+            if calls[0] == last:
+                raise error
+            return fun(t, y)
+
+        path = tmp_path / f"run-{last}"
+        with pytest.raises(error) as info:
+            integrate(counted, SPAN, y0, checkpoint=path, **options)
+        partial = info.value.partial
+        np.testing.assert_array_equal(partial.t[:-1], whole.t[: partial.t.size - 1])
+        found = integrate(fun, SPAN, y0, checkpoint=path, resume=True, **options)
+        step = checkpoint_step(info.value)
+        assert found.message.startswith(f"reached the end of the interval (resumed at step {step}")
+        assert step > 0 or last == 9
+        same(whole, found)
+
+
+@pytest.mark.needs_jit
+@pytest.mark.usefixtures("fine")
+def test_broken_off_inside_a_compiled_step(tmp_path):
+    @njit
+    def failing(t, y):
+        if t > 3.0:
+            raise ValueError("beyond the data")
+        return jit_orbit(t, y)
+
+    options = FIXED | JIT | {"compensated": True, "every": 4}
+    with pytest.raises(ValueError, match="beyond the data") as info:
+        integrate(failing, SPAN, Y0, checkpoint=tmp_path / "run", **options)
+    assert 90 < checkpoint_step(info.value) <= 100
+    found = integrate(jit_orbit, SPAN, Y0, checkpoint=tmp_path / "run", resume=True, **options)
+    assert found.compiled
+    same(integrate(jit_orbit, SPAN, Y0, **options), found)
+
+
+@pytest.mark.usefixtures("fine")
+@pytest.mark.parametrize(("name", "total"), [("fixed", 200), ("adaptive", 6.0)])
+def test_the_progress_bar_goes_on(name, total, tmp_path, monkeypatch):
+    fun, y0, options = CASES[name]
+    bars, bar = [], longrun._bar
+    monkeypatch.setattr(longrun, "_bar", lambda *args: bars.append(bar(*args)) or bars[-1])
+    with pytest.raises(BrokenOffError), broken_off(monkeypatch, 30):
+        integrate(fun, SPAN, y0, checkpoint=tmp_path / "run", progress=True, **options)
+    integrate(fun, SPAN, y0, checkpoint=tmp_path / "run", resume=True, progress=True, **options)
+    first, second = bars
+    assert first.initial == 0
+    assert first.n > 0.1 * total
+    assert second.initial == pytest.approx(first.n)
+    assert second.n == pytest.approx(total)
+
+
+def checkpoint_step(error):
+    """The step that the note of an exception names."""
+    (note,) = error.__notes__
+    return int(re.search(r"holds step (\d+), t = [-\d.e]+: the same call with resume=True goes on", note)[1])
+
+
+@pytest.mark.usefixtures("fine")
+def test_a_result_is_there_at_once(tmp_path):
+    """A finished run that is resumed calls nothing beyond its start and leaves the file alone."""
+    calls = [0]
+
+    def counted(t, y):
+        calls[0] += 1
+        return orbit(t, y)
+
+    path = tmp_path / "run.npz"
+    seen = []
+    options = FIXED | {"callback": lambda t, y, defects: seen.append(t), "checkpoint": path}
+    whole = integrate(counted, SPAN, Y0, **options)
+    before, content = calls[0], path.read_bytes()
+    seen.clear()
+    again = integrate(counted, SPAN, Y0, resume=True, **options)
+    same(whole, again)
+    assert calls[0] - before < 20
+    assert seen == []
+    assert path.read_bytes() == content
+    assert again.wall_time >= checkpoint.read(path)[0]["wall_time"] > 0
+    assert "resumed at step 200" in again.message
+    # Nor does it need a folder that can be written to.
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run.npz"]
+
+
+@pytest.mark.usefixtures("fine")
+def test_a_callback_that_stops_may_be_asked_again(tmp_path):
+    """A run that was stopped for lack of time goes on; one that was stopped for what it saw ends there again."""
+    whole = integrate(orbit, SPAN, Y0, **FIXED)
+    path = tmp_path / "run"
+    late = integrate(orbit, SPAN, Y0, checkpoint=path, callback=lambda t, y, defects: t > 3.0, **FIXED)
+    assert late.status == 1
+    assert late.t[-1] == whole.t[np.flatnonzero(whole.t > 3.0)[0]]
+    again = integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, callback=lambda t, y, defects: t > 3.0, **FIXED)
+    same(late, again)
+    same(whole, integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
+
+
+@pytest.mark.usefixtures("fine")
+def test_a_run_in_portions(tmp_path):
+    """Each stopped by its callback: every portion is kept, though all end alike."""
+    whole, path, steps = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", []
+    for portion in range(1, 6):
+        found = integrate(
+            orbit, SPAN, Y0, checkpoint=path, resume=True, callback=lambda t, *_, end=portion: t > end, **FIXED
+        )
+        assert found.status == 1
+        steps.append(checkpoint.read(path)[0]["step"])
+        assert portion - 0.5 < 0.03 * steps[-1] < portion + 0.5
+    same(whole, integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
+
+
+@pytest.mark.usefixtures("fine")
+def test_a_callback_may_stop_at_the_start(tmp_path):
+    path = tmp_path / "run"
+    stopped = integrate(orbit, SPAN, Y0, checkpoint=path, callback=lambda *_: True, **FIXED)
+    assert (stopped.status, stopped.t.tolist()) == (1, [0.0])
+    same(integrate(orbit, SPAN, Y0, **FIXED), integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
+
+
+@pytest.mark.usefixtures("fine")
+def test_each_saved_point_reaches_a_callback(tmp_path, monkeypatch):
+    """At least once: what came after the last snapshot is done again."""
+    whole, path, seen = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", []
+    case = (orbit, Y0, FIXED | {"callback": lambda t, y, defects: seen.append(t)})
+    found, times = resumed(case, path, monkeypatch)
+    assert times > 4
+    same(whole, found)
+    assert set(seen) == set(whole.t)
+    assert len(seen) <= whole.t.size + times
+
+
+@pytest.mark.usefixtures("fine")
+def test_a_failed_run_fails_again(tmp_path):
+    def fun(t, y):
+        return orbit(t, y) * (np.nan if t > 3.0 else 1.0)
+
+    path = tmp_path / "run"
+    failed = integrate(fun, SPAN, Y0, checkpoint=path, **FIXED)
+    assert failed.status == -1
+    assert checkpoint.read(path)[0]["status"] == -1
+    same(failed, integrate(fun, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
+    # And succeeds where the reason has gone.
+    same(integrate(orbit, SPAN, Y0, **FIXED), integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
+
+
+@pytest.mark.usefixtures("fine")
+def test_an_endless_run(tmp_path, monkeypatch):
+    """No known number of rows: they grow beyond what is allocated, before an interruption and after it."""
+    monkeypatch.setattr(_driver, "FIRST_ROWS", 4)
+    options = FIXED | {"events": third, "save_every": 3}
+    whole = integrate(orbit, (0, np.inf), Y0, **options)
+    assert whole.status == 1
+    with pytest.raises(BrokenOffError), broken_off(monkeypatch, 40):
+        integrate(orbit, (0, np.inf), Y0, checkpoint=tmp_path / "run", **options)
+    same(whole, integrate(orbit, (0, np.inf), Y0, checkpoint=tmp_path / "run", resume=True, **options))
+
+
+@pytest.mark.usefixtures("fine")
+def test_diagnostics_of_the_user_s(tmp_path, monkeypatch):
+    """An object given by the user shows the whole run, though a part of it ran elsewhere."""
+    whole, record = integrate(orbit, SPAN, Y0, **FIXED), Diagnostics()
+    case = (orbit, Y0, FIXED | {"diagnostics": record})
+    found, _ = resumed(case, tmp_path / "run", monkeypatch)
+    assert found.diagnostics is record
+    assert repr(record) == repr(whole.diagnostics)
+
+
+def test_the_bound_on_memory_holds(tmp_path):
+    path, options = tmp_path / "run", FIXED | {"save_every": 1}
+    integrate(orbit, SPAN, Y0, checkpoint=path, **options)
+    with pytest.raises(MemoryError, match="save_every"):
+        integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, max_bytes=5000, **options)
+
+
+def test_a_problem(tmp_path, monkeypatch):
+    problem = kepler(t_end=30.0)
+    with pytest.raises(BrokenOffError), broken_off(monkeypatch, 2):
+        integrate(problem, method=EIPRK4, checkpoint=tmp_path / "run", compiled=False)
+    found = integrate(problem, method=EIPRK4, checkpoint=tmp_path / "run", resume=True, compiled=False)
+    assert found.t[-1] == 30.0
+
+
+# When checkpoints are written.
+
+
+def times_written(monkeypatch, path, every, seconds=0.0, **options):
+    """How often a run of 200 chunks of 10 ms of a clock of its own writes, each in so many seconds."""
+    now, written, advance, write = [0.0], [], longrun.Driver.advance, checkpoint.put
+
+    def tick(driver, k_end):
+        now[0] += 0.01
+        return advance(driver, min(k_end, driver.step + 1))
+
+    def note(path, header, arrays, place):
+        now[0] += seconds
+        written.append((now[0], header["step"], header["status"]))
+        write(path, header, arrays, place)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(longrun.Driver, "advance", tick)
+        patch.setattr(resume.time, "perf_counter", lambda: now[0])
+        patch.setattr(checkpoint, "put", note)
+        integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=every, **FIXED | options)
+    return written
+
+
+def test_checkpoint_every(tmp_path, monkeypatch):
+    written = times_written(monkeypatch, tmp_path / "a", 0.5)
+    np.testing.assert_allclose([t for t, _, _ in written], [0.0, 0.5, 1.0, 1.5, 2.0], atol=0.025)
+    assert [status for _, _, status in written] == [None] * 4 + [0]
+    assert written[1][1] == pytest.approx(50, abs=1)
+    assert [step for _, step, _ in times_written(monkeypatch, tmp_path / "b", np.inf)] == [0, 200]
+
+
+def test_writing_takes_a_twentieth_of_the_time(tmp_path, monkeypatch):
+    written = times_written(monkeypatch, tmp_path / "a", 0.01, seconds=0.02)
+    gaps = np.diff([t for t, _, _ in written])[:-1]
+    assert gaps.size > 3
+    assert (gaps >= 0.4 - 1e-9).all()
+    assert (gaps <= 0.45).all()
+
+
+@pytest.mark.needs_jit
+def test_control_c_writes_a_checkpoint_within_a_second(tmp_path):
+    fun, path = njit(lambda t, y: np.array([y[1], -y[0]])), tmp_path / "run"
+    options = {"method": EIPRK4, "h": 1e-3, "save_every": 10**6, "compiled": True}
+
+    def interrupt(signum, frame):
+        raise KeyboardInterrupt
+
+    integrate(fun, (0, 1), [1.0, 2.0], **options)
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 1.5)
+        begin = time.perf_counter()
+        with pytest.raises(KeyboardInterrupt) as info:
+            integrate(fun, (0, 1e7), [1.0, 2.0], checkpoint=path, **options)
+        seconds = time.perf_counter() - begin
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert seconds < 2.5
+    header, arrays = checkpoint.read(path)
+    assert header["message"] == "interrupted by KeyboardInterrupt"
+    assert checkpoint_step(info.value) == header["step"] > 1000
+    # At most half a second of the run is lost.
+    assert info.value.partial.wall_time - header["wall_time"] < 0.6
+    t = header["t"]
+    np.testing.assert_allclose(arrays["y"], [np.cos(t) + 2 * np.sin(t), 2 * np.cos(t) - np.sin(t)], atol=1e-6)
+
+
+# Files that are there, that are not, and runs that do not fit.
+
+
+def test_a_file_that_is_there_is_not_replaced(tmp_path):
+    path = tmp_path / "run"
+    for content in (b"", b"my only copy"):
+        path.write_bytes(content)
+        with pytest.raises(CheckpointError, match=r"exists\. resume=True goes on .* delete this one"):
+            integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED)
+        with pytest.raises(CheckpointError, match="is no checkpoint of eip_scipy"):
+            integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
+        assert path.read_bytes() == content
+
+
+def test_no_file_yet(tmp_path):
+    found = integrate(orbit, SPAN, Y0, checkpoint=tmp_path / "run", resume=True, **FIXED)
+    assert "no checkpoint was there: started at the beginning" in found.message
+    same(integrate(orbit, SPAN, Y0, **FIXED), found)
+    assert "checkpoint" not in integrate(orbit, SPAN, Y0, checkpoint=tmp_path / "other", **FIXED).message
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "match"),
+    [
+        ({"resume": True}, ValueError, "resume=True needs the file to resume from: checkpoint=path"),
+        ({"resume": "yes", "checkpoint": "a"}, ValueError, "resume must be True or False, got 'yes'"),
+        ({"checkpoint": 3}, TypeError, "checkpoint must be the path of a file, got 3"),
+        ({"checkpoint": "a", "checkpoint_every": 0}, ValueError, "checkpoint_every must be a number of seconds > 0"),
+        ({"checkpoint": "a", "checkpoint_every": np.nan}, ValueError, "checkpoint_every .* got nan"),
+        ({"checkpoint": "a", "checkpoint_every": "1 min"}, ValueError, "checkpoint_every .* got '1 min'"),
+        ({"checkpoints": "a"}, TypeError, "did you mean 'checkpoint'"),
+        ({"checkpoint": "no/such/folder/a"}, CheckpointError, "cannot write .*no/such/folder/a'.* no such file or dir"),
+        ({"checkpoint": "."}, CheckpointError, "' exists"),
+        ({"checkpoint": ".", "resume": True}, CheckpointError, "cannot read the checkpoint '.*': is a directory"),
+    ],
+)
+def test_bad_options(options, error, match, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(error, match=match):
+        integrate(orbit, SPAN, Y0, **FIXED | options)
+    assert list(tmp_path.iterdir()) == []
+
+
+OTHERS = {
+    "method": {"method": EIPRK5},
+    "h": {"h": 0.02},
+    "rtol": {"rtol": 1e-4},
+    "invariants": {"invariants": [H]},
+    "metric": {"metric": "euclidean"},
+    "blocks": {"blocks": 2},
+    "frame": {"frame": FRAME},
+    "direction": {"direction": "midpoint"},
+    "iterations": {"iterations": 2},
+    "every": {"every": 2},
+    "reuse_f": {"reuse_f": False},
+    "compensated": {"compensated": True},
+    "save_every": {"save_every": 8},
+    "t_eval": {"save_every": None, "t_eval": [0.0, 1.0]},
+    "events": {"events": crossing},
+    "params": {"params": [1.0]},
+}
+
+
+@pytest.fixture(scope="module")
+def old_run(tmp_path_factory):
+    """A finished run of FIXED, and its file."""
+    path = tmp_path_factory.mktemp("checkpoint") / "run"
+    return integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED), path
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_arguments_are_named(name, old_run):
+    _, path = old_run
+    fun = (lambda t, y, p: orbit(t, y)) if name == "params" else orbit
+    options = FIXED | OTHERS[name]
+    if name == "params":
+        options["invariants"] = [Invariant(lambda t, y, p: H.fun(t, y), lambda t, y, p: H.grad(t, y), name="energy")]
+    with pytest.raises(
+        CheckpointError, match=rf"belongs to another run: (.*; )?{name} (is .* there and|differs)"
+    ) as info:
+        integrate(fun, SPAN, Y0, checkpoint=path, resume=True, **options)
+    assert "Resume with the arguments of that run, or name another file" in str(info.value)
+
+
+def test_another_start_end_or_method_of_stepping(old_run, tmp_path):
+    _, path = old_run
+    options = FIXED | {"checkpoint": path, "resume": True}
+    with pytest.raises(CheckpointError, match=r"another run: y0 is \[0.4, .* there and \[0.5, "):
+        integrate(orbit, SPAN, pericentre(0.5), **options)
+    with pytest.raises(CheckpointError, match=r"another run: t_span is \[0.0, 6.0\] there and \[0.0, 7.0\] here\."):
+        integrate(orbit, (0, 7), Y0, **options)
+    with pytest.raises(CheckpointError, match=r"another run: h is 0.03 there and null here"):
+        integrate(orbit, SPAN, Y0, **options | {"h": None})
+    path = tmp_path / "long"
+    integrate(orbit, SPAN, Y0, t_eval=np.linspace(0, 6, 50), method=EIPRK4, h=0.03, checkpoint=path)
+    with pytest.raises(CheckpointError, match=r"another run: t_eval differs\."):
+        integrate(orbit, SPAN, Y0, t_eval=np.linspace(0, 5, 50), method=EIPRK4, h=0.03, checkpoint=path, resume=True)
+
+
+def test_another_function_is_seen_by_its_value_at_the_start(old_run):
+    _, path = old_run
+    options = FIXED | {"checkpoint": path, "resume": True}
+    with pytest.raises(CheckpointError, match=r"belongs to another run: fun was 2 at the start and is 2.002 now"):
+        integrate(lambda t, y: 1.001 * orbit(t, y), SPAN, Y0, **options)
+    other = Invariant(lambda t, y: 2 * H.fun(t, y), lambda t, y: 2 * H.grad(t, y), name="energy")
+    with pytest.raises(CheckpointError, match=r"invariant 'energy' was -0.5 at the start and is -1 now"):
+        integrate(orbit, SPAN, Y0, **options | {"invariants": [other, L]})
+
+
+@pytest.mark.usefixtures("fine")
+def test_functions_may_differ_by_rounding(tmp_path, monkeypatch):
+    """As on another processor: the run goes on, and its targets stay what they were."""
+    path = tmp_path / "run"
+    with pytest.raises(BrokenOffError), broken_off(monkeypatch, 9):
+        integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED)
+    near = Invariant(lambda t, y: H.fun(t, y) * (1 + 1e-13), H.grad, name="energy")
+    options = FIXED | {"invariants": [near, L], "checkpoint": path, "resume": True}
+    assert integrate(lambda t, y: orbit(t, y) * (1 + 1e-15), SPAN, Y0, **options).status == 0
+    header, arrays = checkpoint.read(path)
+    assert header["status"] == 0
+    np.testing.assert_array_equal(arrays["target"], [H.fun(0, Y0), L.fun(0, Y0)])
+    assert near.fun(0, Y0) != H.fun(0, Y0)
+
+
+ON_ANOTHER_MACHINE = """
+import sys
+import numpy as np
+from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, integrate
+from eip_scipy.problems import nbody
+
+gm = [1.0, 1e-3, 0.3, 0.2, 0.1]
+q = [[0.0, 0, 0], [1, 0.1, 0], [0, 5, 0.3], [-8, 0, 1], [0, -12, 2]]
+v = [[0.0, 0, 0], [0, 1, 0], [-0.4, 0, 0.1], [0, -0.3, 0], [0.3, 0, 0]]
+problem = nbody(gm, q, v, t_span=(0.0, 2.0), h=0.1)
+rng = np.random.default_rng(0)
+frame = rng.standard_normal((6, 30)), rng.standard_normal((30, 6))
+runs = {"4": {"method": EIPRK4, "compensated": True, "frame": frame}, "12": {"method": EIPRKN12, "every": 2},
+        "853": {"method": EIPDOP853, "h": None, "max_step": 0.4}}
+
+def stop(t, y, d):
+    if stop.end and t > 1.0:
+        raise SystemExit
+
+stop.end = sys.argv[2] == "stop"
+ends = []
+for name, options in runs.items():
+    try:
+        run = integrate(problem, compiled=False, save_every=1, callback=stop, checkpoint=f"{sys.argv[1]}/{name}",
+                        resume=not stop.end, **options)
+    except SystemExit:
+        continue
+    assert run.success and "resumed at step" in run.message, run.message
+    ends.append(run.t[-1])
+print(ends)
+"""
+
+
+def test_a_run_goes_on_where_blas_rounds_otherwise(tmp_path):
+    """The method's low parts and the frame are the same run's whatever kernels OpenBLAS takes for the processor."""
+    for what, kernel in (("stop", {"OPENBLAS_CORETYPE": "Prescott"}), ("go on", {})):  # every x86-64 runs Prescott's
+        found = subprocess.run(
+            [sys.executable, "-c", ON_ANOTHER_MACHINE, tmp_path, what],
+            env={**os.environ, **kernel},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert found.returncode == 0, found.stderr
+    assert found.stdout == "[np.float64(2.0), np.float64(2.0), np.float64(2.0)]\n"
+
+
+def test_another_kind_of_checkpoint(tmp_path):
+    path = tmp_path / "members"
+    checkpoint.write(path, {"kind": "ensemble"}, {"y": np.zeros((3, 4))})
+    with pytest.raises(CheckpointError, match="is a checkpoint of 'ensemble', expected 'integrate'"):
+        integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
+
+
+def rewritten(path, change):
+    """The file with header and arrays changed, sealed again as `write` does it."""
+    header, arrays = checkpoint.read(path)
+    change(header, arrays)
+    checkpoint.write(path, header, arrays)
+
+
+CHANGES = {
+    "an array is missing": (lambda h, a: a.pop("clock"), "clock is missing"),
+    "another shape": (lambda h, a: a.update(carry=np.zeros(5)), r"carry is float64 \(5,\), expected float64 \(4,\)"),
+    "another type": (lambda h, a: a.update(y=a["y"] * 1j), "y is complex128"),
+    "rows are missing": (lambda h, a: a.update(saved_y=a["saved_y"][1:]), r"saved_y is float64 \(29, 4\), expected"),
+    "a negative number of rows": (lambda h, a: a.update(place=np.array([5, -1, 0])), "it stands at step 5, row -1"),
+    "no settings": (lambda h, a: h.pop("settings"), "belongs to another run: method is null there"),
+    "settings of another kind": (lambda h, a: h.update(settings=[1]), "belongs to another run"),
+    "no time": (lambda h, a: h.update(wall_time="long"), "is no checkpoint of this run"),
+    "no start": (lambda h, a: a.pop("start_f"), "start_f is missing"),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_files_that_others_made(name, old_run, tmp_path):
+    change, match = CHANGES[name]
+    path = tmp_path / "run"
+    path.write_bytes(old_run[1].read_bytes())
+    rewritten(path, change)
+    with pytest.raises(CheckpointError, match=match):
+        integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
+
+
+def test_other_versions_are_a_warning(old_run, tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    path.write_bytes(old_run[1].read_bytes())
+    monkeypatch.setattr(checkpoint, "_versions", lambda: {"numpy": "1.0", "numba": None})
+    with pytest.warns(
+        UserWarning, match=r"written with .*numpy 2\.\S+, here 1.0; numba .*: the last bits may"
+    ) as record:
+        found = integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
+    assert record[0].filename == __file__
+    same(old_run[0], found)
+
+
+# The file.
+
+
+def test_header_and_arrays(tmp_path):
+    path = tmp_path / "a.npz"
+    arrays = {
+        "x": np.linspace(0, 1, 7),
+        "none": np.zeros((0, 3)),
+        "z": np.array([[1 + 2j, np.nan]]),
+        "n": np.array(3),
+        "columns": np.arange(12.0).reshape(3, 4).T,
+        "bits": np.array([True, False]),
+        "extremes": np.array([-0.0, 5e-324, np.inf, 0.1 + 0.2]),
+    }
+    checkpoint.write(path, {"kind": "test", "a": [1, 2.5, None], "b": "ü"}, arrays)
+    header, found = checkpoint.read(path, "test")
+    assert (header["kind"], header["a"], header["b"]) == ("test", [1, 2.5, None], "ü")
+    assert header["schema"] == 2
+    assert header["versions"]["numpy"] == np.__version__
+    assert list(found) == list(arrays)
+    with np.load(path, allow_pickle=False) as plain:
+        for name, a in arrays.items():
+            assert found[name].dtype == plain[name].dtype == a.dtype
+            assert found[name].shape == a.shape
+            assert found[name].tobytes() == plain[name].tobytes() == a.tobytes()
+    with zipfile.ZipFile(path) as archive:
+        assert json.loads(archive.read("header.json")) == header
+    # Seal: SHA-256 of the file with zeros in its place.
+    raw = path.read_bytes()
+    assert raw[-64:].decode() == hashlib.sha256(raw[:-64] + b"0" * 64).hexdigest()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_the_same_content_gives_the_same_bytes(tmp_path):
+    for name in "ab":
+        checkpoint.write(tmp_path / name, {"kind": "test"}, {"x": np.arange(5)})
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_a_link_stays_a_link(tmp_path):
+    target, link = tmp_path / "target", tmp_path / "link"
+    link.symlink_to(target)
+    checkpoint.write(link, {"kind": "test"}, {})
+    assert link.is_symlink()
+    assert checkpoint.read(target) == checkpoint.read(link)
+
+
+def test_a_link_to_nowhere_yet(tmp_path):
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "target")
+    integrate(orbit, SPAN, Y0, checkpoint=link, **FIXED)
+    assert checkpoint.read(tmp_path / "target", "integrate")[0]["status"] == 0
+
+
+def test_leftovers_of_killed_processes_are_removed(tmp_path):
+    names = [".a-1.tmp", ".a-2.tmp", ".ab-1.tmp", "a-1.tmp", ".b-1.tmp"]
+    for name in names:
+        (tmp_path / name).touch()
+        if name != ".a-2.tmp":
+            os.utime(tmp_path / name, (time.time() - 4000,) * 2)
+    checkpoint.write(tmp_path / "a", {"kind": "test"}, {})
+    assert {entry.name for entry in tmp_path.iterdir()} == {"a", *names[1:]}
+
+
+def test_only_plain_json_and_numbers(tmp_path):
+    path = tmp_path / "a"
+    checkpoint.write(path, {"kind": "test"}, {})
+    before = path.read_bytes()
+    for header, arrays in (({"x": np.nan}, {}), ({"x": object()}, {}), ({}, {"x": np.array([object()])})):
+        with pytest.raises((TypeError, ValueError)):
+            checkpoint.write(path, header, arrays)
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a"]
+
+
+# Damage.
+
+
+def sealed(raw):
+    """The bytes of a file with a digest that fits."""
+    return raw[:-64] + hashlib.sha256(raw[:-64] + b"0" * 64).hexdigest().encode()
+
+
+def small_file(path):
+    checkpoint.write(path, {"kind": "test"}, {"x": np.arange(3.0), "n": np.array([7, 8], np.int32)})
+    return path.read_bytes()
+
+
+def test_each_changed_byte_is_seen(tmp_path):
+    path = tmp_path / "a"
+    raw = small_file(path)
+    for k in range(len(raw)):
+        damaged = bytearray(raw)
+        damaged[k] ^= 1 << k % 8
+        path.write_bytes(damaged)
+        with pytest.raises(CheckpointError, match=r"is damaged|is truncated|is no checkpoint"):
+            checkpoint.read(path)
+
+
+def test_a_run_does_not_go_on_from_a_damaged_file(old_run, tmp_path):
+    path, raw = tmp_path / "run", old_run[1].read_bytes()
+    for k in np.random.default_rng(1).integers(len(raw), size=40):
+        for damaged in (raw[:k], raw[:k] + bytes([raw[k] ^ 4]) + raw[k + 1 :]):
+            path.write_bytes(damaged)
+            with pytest.raises(CheckpointError, match=r"run' is (damaged|truncated|no checkpoint)"):
+                integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
+            assert path.read_bytes() == damaged
+
+
+def test_each_truncation_is_seen(tmp_path):
+    path = tmp_path / "a"
+    raw = small_file(path)
+    for k in range(len(raw)):
+        path.write_bytes(raw[:k])
+        with pytest.raises(CheckpointError, match=r"is truncated|is no checkpoint|is damaged"):
+            checkpoint.read(path)
+    path.write_bytes(raw + b"\n")
+    with pytest.raises(CheckpointError, match="is truncated"):
+        checkpoint.read(path)
+
+
+def test_each_changed_byte_below_a_digest_that_fits(tmp_path):
+    """Files made to look sound: what comes out is a header and arrays, or one kind of error; nothing is allocated."""
+    path = tmp_path / "a"
+    raw = small_file(path)
+    outcomes = set()
+    for k in range(len(raw) - 64):
+        for value in (raw[k] ^ 1, raw[k] ^ 255):
+            changed = bytearray(raw)
+            changed[k] = value
+            path.write_bytes(sealed(bytes(changed)))
+            outcomes.add(outcome(path))
+    assert outcomes == {"read", "refused"}
+
+
+def outcome(path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            header, arrays = checkpoint.read(path)
+        except CheckpointError:
+            return "refused"
+    assert isinstance(header, dict)
+    assert all(isinstance(a, np.ndarray) and a.nbytes < 10**4 for a in arrays.values())
+    return "read"
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_mutations(data, tmp_path):
+    """Pieces cut out, doubled, overwritten, moved."""
+    path = tmp_path / "a"
+    raw = small_file(path)
+    for _ in range(data.draw(st.integers(1, 4))):
+        i, j = sorted(data.draw(st.tuples(*[st.integers(0, len(raw))] * 2)))
+        new = data.draw(st.one_of(st.binary(max_size=40), st.just(raw[i:j] * 2), st.just(b"\xff" * (j - i))))
+        raw = raw[:i] + new + raw[j:]
+    path.write_bytes(raw)
+    assert outcome(path) == ("read" if raw == small_file(tmp_path / "b") else "refused")
+    if len(raw) > 64:
+        path.write_bytes(sealed(raw))
+        outcome(path)
+
+
+def forged(path, name, member, header=None):
+    """A sealed file with one member of given bytes beside the header."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        archive.comment = checkpoint.MARK + b"0" * 64
+        archive.writestr("header.json", json.dumps({"format": "eip_scipy checkpoint", "schema": 2, **(header or {})}))
+        archive.writestr(name, member)
+    path.write_bytes(sealed(stream.getvalue()))
+
+
+def npy_bytes(descr, shape, data, fortran=False):
+    stream = io.BytesIO()
+    npy.write_array_header_1_0(stream, {"descr": descr, "fortran_order": fortran, "shape": shape})
+    return stream.getvalue() + data
+
+
+class Bomb:
+    def __reduce__(self):
+        return Path.touch, (Path("exploded"),)
+
+
+def test_nothing_is_unpickled(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    data = pickle.dumps(Bomb())
+    pickle.loads(data)
+    assert Path("exploded").exists()  # the bomb works
+    Path("exploded").unlink()
+    path = tmp_path / "a"
+    forged(path, "x.npy", npy_bytes("|O", (1,), data))
+    with pytest.raises(CheckpointError, match=r"x\.npy holds object"):
+        checkpoint.read(path)
+    forged(path, "x.pkl", data)
+    with pytest.raises(CheckpointError, match="is no checkpoint"):
+        checkpoint.read(path)
+    assert not Path("exploded").exists()
+
+
+@pytest.mark.parametrize("shape", [(10**15,), (10**6, 10**6, 10**6), (2**62, 4), (3,), (-1, -1), (10**400,)])
+def test_declared_sizes_are_checked_before_they_are_allocated(shape, tmp_path):
+    path = tmp_path / "a"
+    forged(path, "x.npy", npy_bytes("<f8", shape, bytes(8)))
+    with pytest.raises(CheckpointError, match=r"x\.npy (declares|holds)|no checkpoint"):
+        checkpoint.read(path)
+
+
+def test_foreign_archives(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, x=np.arange(3))
+    with pytest.raises(CheckpointError, match="is truncated or no checkpoint of eip_scipy"):
+        checkpoint.read(path)
+    forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"schema": 3})
+    with pytest.raises(CheckpointError, match="has schema 3, expected 2; resume with the version of eip_scipy"):
+        checkpoint.read(path)
+    forged(path, "x.npy", npy_bytes("<f8", (1, 1), bytes(8), fortran=True))
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        checkpoint.read(path)
+    forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"format": "another"})
+    with pytest.raises(CheckpointError, match="its header is another"):
+        checkpoint.read(path)
+    old = io.BytesIO()
+    npy.write_array(old, np.zeros(1), version=(2, 0))
+    forged(path, "x.npy", old.getvalue())
+    with pytest.raises(CheckpointError, match=r"x\.npy has another format"):
+        checkpoint.read(path)
+    # Members of the same bytes: 40 arrays of 1 kB in a file of a few.
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        archive.comment = checkpoint.MARK + b"0" * 64
+        archive.writestr("header.json", json.dumps({"format": "eip_scipy checkpoint", "schema": 2}))
+        archive.writestr("x0.npy", npy_bytes("<f8", (128,), bytes(1024)))
+        first = archive.filelist[-1]
+        for k in range(1, 40):
+            twin = zipfile.ZipInfo(f"x{k}.npy")
+            for name in ("CRC", "compress_size", "file_size", "header_offset"):
+                setattr(twin, name, getattr(first, name))
+            archive.filelist.append(twin)
+    path.write_bytes(sealed(stream.getvalue()))
+    with pytest.raises(CheckpointError, match="its members claim more bytes than it has"):
+        checkpoint.read(path)
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.comment = checkpoint.MARK + b"0" * 64
+        archive.writestr("header.json", bytes(10**7))
+    path.write_bytes(sealed(stream.getvalue()))
+    with pytest.raises(CheckpointError, match="compressed"):
+        checkpoint.read(path)
+
+
+# Disks that are full.
+
+
+class FullDisk(io.FileIO):
+    """A file whose so many-th write finds the disk full, half of it done."""
+
+    def __init__(self, path, mode, room):
+        super().__init__(path, mode)
+        self.room = room
+
+    def write(self, data):
+        self.room[0] -= 1
+        if self.room[0] == 0:
+            super().write(bytes(data)[: len(data) // 2])
+        if self.room[0] <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return super().write(data)
+
+
+def fill_disk(patch, writes):
+    """From now on the disk is full at the so many-th write."""
+    room = [writes]
+    patch.setattr(
+        checkpoint, "open", lambda path, mode: io.BufferedWriter(FullDisk(path, mode, room), 16), raising=False
+    )
+    return room
+
+
+def test_a_full_disk_at_each_write(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    before, messages = small_file(path), set()
+    for writes in range(1, 10**6):
+        with monkeypatch.context() as patch:
+            room = fill_disk(patch, writes)
+            try:
+                checkpoint.write(path, {"kind": "new"}, {"x": np.arange(100)})
+                break
+            except CheckpointError as error:
+                messages.add(str(error))
+        assert path.read_bytes() == before
+        assert [entry.name for entry in tmp_path.iterdir()] == ["a"]
+    assert room[0] > 0
+    assert writes > 10
+    assert messages == {f"cannot write the checkpoint {str(path)!r}: no space left on device"}
+    assert checkpoint.read(path)[0]["kind"] == "new"
+
+
+@pytest.mark.parametrize("name", ["fsync", "replace"])
+def test_a_full_disk_at_the_last_moment(name, tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    before = small_file(path)
+
+    def full(*args):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, name, full)
+        with pytest.raises(CheckpointError, match="no space left on device"):
+            checkpoint.write(path, {"kind": "new"}, {})
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a"]
+
+
+def test_folders_that_cannot_be_synced(tmp_path, monkeypatch):
+    """Some network file systems know no fsync of a folder; other failures of it are told."""
+    path, fsync = tmp_path / "a", os.fsync
+    for number, fails in ((errno.EINVAL, False), (errno.EIO, True)):
+        calls = []
+
+        def second_fails(descriptor, number=number, calls=calls):
+            calls.append(descriptor)
+            if len(calls) == 2:
+                raise OSError(number, os.strerror(number))
+            fsync(descriptor)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", second_fails)
+            with pytest.raises(CheckpointError) if fails else contextlib.nullcontext():
+                checkpoint.write(path, {"kind": "test"}, {})
+        assert len(calls) == 2
+        assert checkpoint.read(path)[0]["kind"] == "test"
+
+
+@pytest.mark.usefixtures("fine")
+def test_a_run_goes_on_while_the_disk_is_full(tmp_path, monkeypatch):
+    whole, path = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run"
+    write, calls = checkpoint.put, []
+
+    def full_for_a_while(path, header, arrays, place):
+        calls.append(header["step"])
+        if 6 <= len(calls) <= 8:
+            raise CheckpointError("cannot write the checkpoint: no space left on device")
+        write(path, header, arrays, place)
+
+    monkeypatch.setattr(checkpoint, "put", full_for_a_while)
+    match = r"no space left on device; it still holds step 7, t = 0\.21\. The run goes on and tries again"
+    with pytest.warns(RuntimeWarning, match=match) as record:
+        found = integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=1e-9, **FIXED)
+    assert len(record) == 3
+    assert all(warning.filename == __file__ for warning in record)
+    same(whole, found)
+    assert "space" not in found.message
+    assert checkpoint.read(path)[0]["status"] == 0
+
+
+@pytest.mark.usefixtures("fine")
+def test_the_disk_stays_full(tmp_path, monkeypatch):
+    whole, path = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run"
+    advance, patches = longrun.Driver.advance, []
+
+    def fill_after_a_while(driver, k_end):
+        if driver.step > 100 and not patches:
+            patches.append(fill_disk(monkeypatch, 1))
+        return advance(driver, k_end)
+
+    monkeypatch.setattr(longrun.Driver, "advance", fill_after_a_while)
+    with pytest.warns(RuntimeWarning, match="no space left on device; it still holds step 10") as record:
+        found = integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=1e-9, **FIXED)
+    assert str(record[-1].message).endswith("The result is whole.")
+    assert record[-1].filename == __file__
+    same(whole, found)
+    assert "cannot write the checkpoint" in found.message
+    monkeypatch.undo()
+    same(whole, integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
+
+
+@pytest.mark.usefixtures("fine")
+@pytest.mark.parametrize("reason", ["disk", "impatience"])
+def test_interrupted_with_a_full_disk(reason, tmp_path, monkeypatch):
+    """Neither hides the first exception, its partial result, or the step of the checkpoint that is there."""
+    path, calls = tmp_path / "run", [0]
+
+    def fun(t, y):
+        calls[0] += 1
+        if calls[0] == 300:
+            if reason == "disk":
+                fill_disk(monkeypatch, 3)
+            else:
+                monkeypatch.setattr(checkpoint.os, "fsync", interrupt)
+            raise BrokenOffError
+        return orbit(t, y)
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    with pytest.raises(BrokenOffError) as info:
+        integrate(fun, SPAN, Y0, checkpoint=path, checkpoint_every=1e9, **FIXED)
+    assert info.value.partial.t[-1] > 1.0
+    first, second = info.value.__notes__
+    assert ("no space left" if reason == "disk" else "interrupted again") in first
+    assert f"{str(path)!r} holds step 0, t = 0: the same call with resume=True goes on from there" in second
+    monkeypatch.undo()
+    assert checkpoint.read(path)[0]["step"] == 0
+
+
+@pytest.mark.usefixtures("fine")
+def test_interrupted_while_the_result_is_written(tmp_path, monkeypatch):
+    """The run is done: all of it is in the partial result, and in the file after all."""
+    whole, path, write = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", checkpoint.put
+
+    def interrupt_once(path, header, arrays, place):
+        if header["status"] == 0:
+            raise KeyboardInterrupt
+        write(path, header, arrays, place)
+
+    monkeypatch.setattr(checkpoint, "put", interrupt_once)
+    with pytest.raises(KeyboardInterrupt) as info:
+        integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED)
+    np.testing.assert_array_equal(info.value.partial.y, whole.y)
+    assert checkpoint_step(info.value) == 200
+    monkeypatch.undo()
+    same(whole, integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED))
+
+
+def test_a_disk_that_is_full_at_the_start_is_an_error(tmp_path, monkeypatch):
+    fill_disk(monkeypatch, 1)
+    with pytest.raises(CheckpointError, match="no space left on device"):
+        integrate(orbit, SPAN, Y0, checkpoint=tmp_path / "run", **FIXED)
+    assert list(tmp_path.iterdir()) == []
+
+
+# Processes that are killed.
+
+
+def python(code, *arguments):
+    command = [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)]
+    return subprocess.Popen(command, cwd=Path(__file__).parents[1], stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.slow
+def test_sixty_writers_are_killed(tmp_path):
+    """kill -9 at any moment leaves the former checkpoint or the new one."""
+    code = """
+        import os, random, signal, sys, time
+        import numpy as np
+        from eip_scipy import checkpoint
+
+        path = sys.argv[1]
+        checkpoint.write(path, {"kind": "test", "k": 0}, {"x": np.zeros(50_000)})
+        for attempt in range(60):
+            before = checkpoint.read(path)[0]["k"]
+            child = os.fork()
+            if child == 0:
+                for k in range(before + 1, 10**9):
+                    checkpoint.write(path, {"kind": "test", "k": k}, {"x": np.full(50_000, k, float)})
+            time.sleep(random.Random(attempt).uniform(0.0, 0.1))
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            header, arrays = checkpoint.read(path)
+            assert header["k"] >= before
+            assert (arrays["x"] == header["k"]).all()
+        assert checkpoint.read(path)[0]["k"] > 20
+        torn = [name for name in os.listdir(os.path.dirname(path)) if name.endswith(".tmp")]
+        assert len(torn) > 10, torn
+    """
+    process = python(code, tmp_path / "run")
+    _, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+
+
+RUN = """
+    import sys
+    import numpy as np
+    from systems import H, L, orbit, pericentre
+    from eip_scipy import EIPRK4, integrate
+
+    integrate(orbit, (0, 300), pericentre(0.6), method=EIPRK4, h=0.01, invariants=[H, L], save_every=10, every="auto",
+              checkpoint=sys.argv[1], checkpoint_every=0.05, resume=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_a_run_is_killed_again_and_again(number, tmp_path):
+    options = {"method": EIPRK4, "h": 0.01, "invariants": [H, L], "save_every": 10, "every": "auto"}
+    whole, path, steps = integrate(orbit, (0, 300), Y0, **options), tmp_path / "run", [0]
+    for _ in range(3):
+        process = python(RUN, path)
+        deadline = time.monotonic() + 60
+        while (not path.exists() or checkpoint.read(path)[0]["step"] <= steps[-1]) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(0.1)
+        process.send_signal(number)
+        _, err = process.communicate(timeout=60)
+        steps.append(checkpoint.read(path)[0]["step"])
+        if number == signal.SIGINT:
+            assert f"KeyboardInterrupt\nthe checkpoint {str(path)!r} holds step {steps[-1]}, t = " in err
+    assert 0 < steps[1] < steps[2] < steps[3] < 30000
+    same(whole, integrate(orbit, (0, 300), Y0, checkpoint=path, resume=True, **options))

@@ -1,0 +1,900 @@
+"""What a run owns: its files, wherever it is, against other runs, files and functions, signals and full disks."""
+
+import errno
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from forked import Forker
+from systems import SQUARE, H, L, orbit, oscillator, pericentre
+
+from eip_scipy import EIPRK4, CheckpointError, Invariant, checkpoint, ensemble, integrate
+from eip_scipy.run import locks
+from eip_scipy.run import resume as _resume
+
+TESTS = Path(__file__).parents[1]
+Y0 = pericentre(0.6)
+SPAN = (0.0, 6.0)
+OPTIONS = {"method": EIPRK4, "h": 0.03, "invariants": [H, L], "save_every": 7, "compiled": False}
+needs_zarr = pytest.mark.skipif(find_spec("zarr") is None, reason="needs zarr")
+posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and file systems of POSIX")
+
+
+def run(place, fun=orbit, **more):
+    return integrate(fun, SPAN, Y0, checkpoint=place, **OPTIONS | more)
+
+
+def members(**more):
+    y0s = np.random.default_rng(3).standard_normal((11, 2))
+    options = {"h": 0.1, "invariants": SQUARE, "save_every": 4, "chunk": 3, "compiled": False}
+    return ensemble(more.pop("fun", oscillator), (0, 1), y0s, **options | more)
+
+
+def kept_by_integrate(place, **more):
+    return run(place, **more)
+
+
+def kept_by_ensemble(place, **more):
+    return members(checkpoint=place, **more)
+
+
+def kept_in_zarr(place, **more):
+    return members(out=place, **more)
+
+
+KEEPING = [kept_by_integrate, kept_by_ensemble, pytest.param(kept_in_zarr, marks=needs_zarr)]
+keeping = pytest.mark.parametrize("keep", KEEPING)
+
+
+def same(one, other):
+    for key in ("t", "y", "max_defect", "status", "nfev"):
+        np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+
+
+@pytest.fixture
+def often(monkeypatch):
+    """Checkpoints after each step or so."""
+    from eip_scipy.run import integrate as longrun
+
+    monkeypatch.setattr(longrun, "FIRST_CHUNK", 5)
+    monkeypatch.setattr(longrun, "CHUNK_SECONDS", 0.0)
+    monkeypatch.setattr(_resume, "SNAPSHOT_SECONDS", 0.0)
+    monkeypatch.setattr(_resume, "LEAST_RATIO", 0.0)
+
+
+def content(folder):
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+@pytest.fixture(scope="module")
+def forker(tmp_path_factory):
+    found = Forker(tmp_path_factory.mktemp("forked"))
+    yield found
+    found.close()
+
+
+def at_once(action):
+    """A callback that acts at its first call."""
+    calls = []
+
+    def callback(*_):
+        if not calls:
+            calls.append(action())
+
+    return callback
+
+
+# Where a file is.
+
+
+@keeping
+def test_a_relative_path_is_that_of_the_start(keep, tmp_path, monkeypatch):
+    here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
+    for folder in (here, elsewhere):
+        folder.mkdir()
+    (elsewhere / "kept").write_bytes(b"another's")
+    monkeypatch.chdir(here)
+    whole = keep("kept", callback=lambda *_: os.chdir(elsewhere), checkpoint_every=1e-9)
+    assert (elsewhere / "kept").read_bytes() == b"another's"
+    assert content(elsewhere) == content(here) == ["kept"]
+    monkeypatch.chdir(here)
+    same(whole, keep("kept", resume=True))
+
+
+def test_notes_name_the_file_wherever_one_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def callback(*_):
+        os.chdir("/")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as info:
+        run("kept", callback=callback)
+    assert f"the checkpoint {str(tmp_path / 'kept')!r} holds step 0" in info.value.__notes__[-1]
+
+
+@posix
+@keeping
+def test_a_relative_path_in_a_folder_that_is_gone(keep, tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    with pytest.raises(CheckpointError, match="'kept' is relative to a folder that is gone"):
+        keep("kept")
+
+
+@needs_zarr
+def test_a_zarr_group_may_need_new_folders(tmp_path):
+    whole = kept_in_zarr(tmp_path / "a" / "b" / "kept")
+    same(whole, kept_in_zarr(tmp_path / "a" / "b" / "kept", resume=True))
+
+
+@needs_zarr
+def test_a_zarr_group_at_a_url():
+    pytest.importorskip("fsspec", reason="needs fsspec, through which Zarr opens URLs")
+    place = f"memory://eip-scipy-{os.getpid()}/kept"
+    whole = kept_in_zarr(place)
+    with pytest.raises(CheckpointError, match="exists"):
+        kept_in_zarr(place)
+    same(whole, kept_in_zarr(place, resume=True))
+    assert not Path("memory:").exists()
+
+
+# One run at a time.
+
+IN_USE = rf"in use by another run, of process {os.getpid()} on \S+, this one\. Wait for its end"
+
+
+@keeping
+def test_a_second_call_is_refused(keep, tmp_path, monkeypatch):
+    """Also by another way to the same file; the first one is not disturbed, and leaves nothing behind."""
+    place, seen = tmp_path / "kept", []
+    link = tmp_path / "link"
+    monkeypatch.chdir(tmp_path)
+
+    def callback(*_):
+        link.unlink(missing_ok=True)
+        link.symlink_to(place)
+        for way in (place, "kept", str(tmp_path / "." / "kept"), link):
+            for resume in (False, True):
+                with pytest.raises(CheckpointError, match=IN_USE):
+                    keep(way, resume=resume)
+        seen.append(True)
+
+    whole = keep(place, callback=callback)
+    assert seen
+    assert content(tmp_path) == ["kept", "link"]
+    same(whole, keep(link, resume=True))
+
+
+def test_runs_of_different_kinds(tmp_path):
+    def callback(*_):
+        for other in (kept_by_ensemble, kept_in_zarr) if find_spec("zarr") else (kept_by_ensemble,):
+            with pytest.raises(CheckpointError, match=IN_USE):
+                other(tmp_path / "kept")
+
+    run(tmp_path / "kept", callback=callback)
+
+
+def test_a_second_thread_is_refused(tmp_path):
+    found = []
+
+    def other():
+        try:
+            run(tmp_path / "kept", resume=True)
+        except CheckpointError as error:
+            found.append(str(error))
+
+    def callback(*_):
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+
+    run(tmp_path / "kept", callback=callback)
+    assert found
+    assert all(re.search(IN_USE, text) for text in found)
+
+
+@pytest.mark.parametrize("wrong", [{"h": -1.0}, {"metric": "unknown"}, {"save_every": 0}, {"events": 3}])
+def test_a_call_that_fails_lets_go(wrong, tmp_path):
+    with pytest.raises((TypeError, ValueError)):
+        run(tmp_path / "kept", **wrong)
+    assert content(tmp_path) == []
+    run(tmp_path / "kept")
+
+
+HOLDER = """
+    import test_keeping, time
+
+    def callback(*_):
+        print("running", flush=True)
+        time.sleep(600)
+
+    getattr(test_keeping, keep)(place, callback=callback, checkpoint_every=1e-9)
+"""
+
+
+@posix
+@keeping
+def test_another_process(keep, tmp_path, forker):
+    """It is named, and its lock goes with it, by kill -9 too."""
+    place = tmp_path / "kept"
+    process = forker.start(HOLDER, keep=keep.__name__, place=str(place))
+    try:
+        process.until("running")
+        with pytest.raises(CheckpointError, match=rf"in use by another run, of process {process.pid} on \S+\. Wait"):
+            keep(place, resume=True)
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    assert keep(place, resume=True).success
+    assert content(tmp_path) == ["kept"]
+
+
+@posix
+@pytest.mark.parametrize("child", ["os.fork() or time.sleep(600)", "subprocess.Popen(['sleep', '600']).pid"])
+def test_children_do_not_keep_the_lock(child, tmp_path, forker):
+    code = f"""
+        import os, signal, subprocess, time
+        from test_keeping import at_once, run
+
+        def start():
+            print({child}, flush=True)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        run(place, callback=at_once(start))
+    """
+    process = forker.start(code, place=str(tmp_path / "kept"))
+    code, out, _ = process.wait()
+    assert code == -signal.SIGKILL
+    os.kill(int(out), 0)  # it is there
+    try:
+        assert run(tmp_path / "kept", resume=True).success
+    finally:
+        os.kill(int(out), signal.SIGKILL)
+
+
+@posix
+@keeping
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS])
+def test_where_locks_do_not_work(number, keep, tmp_path, monkeypatch):
+    def flock(descriptor, operation):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(locks.fcntl, "flock", flock)
+    with pytest.warns(RuntimeWarning, match=r"kept' could not be locked \(.*\): see to it yourself") as record:
+        whole = keep(tmp_path / "kept")
+    assert [warning.filename for warning in record] == [__file__]
+    assert content(tmp_path) == ["kept"]
+    with pytest.warns(RuntimeWarning, match="could not be locked"):
+        same(whole, keep(tmp_path / "kept", resume=True))
+
+
+@posix
+def test_a_folder_that_cannot_be_written_to(tmp_path, monkeypatch):
+    """A finished run is read there; a lock that somebody else left there is seen."""
+    whole, place = run(tmp_path / "kept"), tmp_path / "kept"
+    opened = os.open
+
+    def refuse(path, flags, *mode):
+        if flags & os.O_CREAT:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+        return opened(path, flags, *mode)
+
+    monkeypatch.setattr(os, "open", refuse)
+    same(whole, run(place, resume=True))
+    monkeypatch.undo()
+    lock = locks.Lock(place, "kept")
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(CheckpointError, match="in use by another run"):
+        run(place, resume=True)
+    lock.release()
+
+
+@posix
+def test_a_link_in_the_place_of_the_lock(tmp_path):
+    """Planted by another user of the folder: it is not followed."""
+    (tmp_path / "precious").write_bytes(b"precious")
+    (tmp_path / ".kept.eip_scipy-lock").symlink_to(tmp_path / "precious")
+    with pytest.raises(CheckpointError, match="cannot write"):
+        run(tmp_path / "kept")
+    assert (tmp_path / "precious").read_bytes() == b"precious"
+
+
+def test_one_holder_at_any_time(tmp_path):
+    """Though each removes the lock's file when it goes: those who have it open already find that out."""
+    inside, most, taken, end = [0], [0], [0], time.monotonic() + 2.0
+
+    def compete():
+        while time.monotonic() < end:
+            try:
+                lock = locks.Lock(tmp_path / "kept", "kept")
+            except locks.HeldError:
+                continue
+            inside[0] += 1
+            most[0] = max(most[0], inside[0])
+            taken[0] += 1
+            time.sleep(0)
+            inside[0] -= 1
+            lock.release()
+
+    threads = [threading.Thread(target=compete) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1]
+    assert taken[0] > 10
+    assert content(tmp_path) == []
+
+
+# Nothing is replaced that the run has not written.
+
+
+def replaced(place):
+    place.unlink()
+    place.write_bytes(b"my only copy")
+
+
+def overwritten(place):
+    place.write_bytes(b"my only copy")
+
+
+def another_run(place):
+    integrate(orbit, (0.0, 1.0), Y0, checkpoint=place.with_name("other"), **OPTIONS)
+    os.replace(place.with_name("other"), place)
+
+
+def a_folder(place):
+    place.unlink()
+    place.mkdir()
+
+
+def edited(place):
+    """One byte, with the size and the time that it had."""
+    status, raw = place.stat(), bytearray(place.read_bytes())
+    raw[len(raw) // 2] ^= 1
+    place.write_bytes(raw)
+    os.utime(place, ns=(status.st_atime_ns, status.st_mtime_ns + 1))
+
+
+def state_of(place):
+    return "folder" if place.is_dir() else place.read_bytes()
+
+
+FOREIGN = [replaced, overwritten, another_run, a_folder, edited]
+
+
+@pytest.mark.usefixtures("often")
+@pytest.mark.parametrize("change", FOREIGN)
+def test_another_file_has_come_to_be_there(change, tmp_path):
+    """It stays, and the run is kept beside it from then on."""
+    place, states = tmp_path / "kept.npz", []
+    whole = integrate(orbit, SPAN, Y0, **OPTIONS)
+    (tmp_path / "kept-1.npz").write_bytes(b"a name that is taken")
+
+    def action():
+        change(place)
+        states.append(state_of(place))
+
+    match = r"kept\.npz' is no longer the file that this run wrote, and stays as it is; its checkpoint is .*kept-2\.npz"
+    with pytest.warns(RuntimeWarning, match=match) as record:
+        found = run(place, callback=at_once(action), checkpoint_every=1e-9)
+    assert len(record) == 1
+    assert record[0].filename == __file__
+    same(whole, found)
+    assert "kept-2.npz' now" in found.message
+    assert [state_of(place)] == states
+    assert (tmp_path / "kept-1.npz").read_bytes() == b"a name that is taken"
+    assert content(tmp_path) == ["kept-1.npz", "kept-2.npz", "kept.npz"]
+    same(whole, run(tmp_path / "kept-2.npz", resume=True))
+
+
+@pytest.mark.parametrize("change", FOREIGN)
+def test_an_interrupted_run_is_kept_beside(change, tmp_path):
+    place = tmp_path / "kept"
+
+    def callback(t, *_):
+        if t > 3.0:
+            change(place)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as info:
+        run(place, callback=callback)
+    told, where = info.value.__notes__
+    assert "is no longer the file that this run wrote" in told
+    assert f"the same call with checkpoint={str(tmp_path / 'kept-1')!r}, resume=True goes on from there" in where
+    same(integrate(orbit, SPAN, Y0, **OPTIONS), run(tmp_path / "kept-1", resume=True))
+
+
+@pytest.mark.parametrize("change", FOREIGN)
+def test_another_file_after_a_resume(change, tmp_path):
+    """What was read is known as well as what was written."""
+    place = tmp_path / "kept"
+
+    def late(t, *_):
+        if t > 3.0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(place, callback=late)
+    states = []
+
+    def action():
+        change(place)
+        states.append(state_of(place))
+
+    with pytest.warns(RuntimeWarning, match="stays as it is"):
+        found = run(place, resume=True, callback=at_once(action))
+    same(integrate(orbit, SPAN, Y0, **OPTIONS), found)
+    assert [state_of(place)] == states
+
+
+def touched(place):
+    os.utime(place, (1, 1))
+
+
+def copied_back(place):
+    raw = place.read_bytes()
+    place.unlink()
+    place.write_bytes(raw)
+
+
+def taken_away(place):
+    os.replace(place, place.with_name("backup"))
+
+
+@pytest.mark.usefixtures("often")
+@pytest.mark.parametrize("change", [touched, copied_back, taken_away])
+def test_the_own_file_is_known_again(change, tmp_path):
+    place = tmp_path / "kept"
+    whole = run(place, callback=at_once(lambda: change(place)), checkpoint_every=1e-9)
+    assert set(content(tmp_path)) <= {"kept", "backup"}
+    assert checkpoint.read(place)[0]["status"] == 0
+    same(whole, run(place, resume=True))
+
+
+@pytest.mark.parametrize("links", [True, False])
+@pytest.mark.parametrize("keep", [kept_by_integrate, kept_by_ensemble])
+def test_a_file_that_comes_before_the_first_checkpoint(keep, links, tmp_path, monkeypatch):
+    place = tmp_path / "kept"
+    if not links:
+        monkeypatch.setattr(os, "link", no_links)
+    put = checkpoint.put
+
+    def late(*arguments):
+        place.write_bytes(b"my only copy")
+        put(*arguments)
+
+    monkeypatch.setattr(checkpoint, "put", late)
+    with pytest.raises(CheckpointError, match=r"kept' exists\. resume=True"):
+        keep(place)
+    assert place.read_bytes() == b"my only copy"
+    assert content(tmp_path) == ["kept"]
+
+
+def no_links(*_):
+    raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+
+@pytest.mark.parametrize("keep", [kept_by_integrate, kept_by_ensemble])  # Zarr itself needs them
+def test_where_there_are_no_hard_links(keep, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "link", no_links)
+    whole = keep(tmp_path / "kept")
+    same(whole, keep(tmp_path / "kept", resume=True))
+    assert content(tmp_path) == ["kept"]
+
+
+@pytest.mark.parametrize("change", FOREIGN)
+def test_another_file_in_the_place_of_an_ensemble_s(change, tmp_path):
+    place, states = tmp_path / "kept", []
+
+    def action():
+        change(place)
+        states.append(state_of(place))
+
+    with pytest.warns(RuntimeWarning, match=r"stays as it is; its checkpoint is .*kept-1' now"):
+        whole = kept_by_ensemble(place, callback=at_once(action), checkpoint_every=1e-9)
+    assert [state_of(place)] == states
+    same(whole, kept_by_ensemble(tmp_path / "kept-1", resume=True))
+
+
+@needs_zarr
+@pytest.mark.parametrize("then", ["another", "nothing"])
+def test_another_group(then, tmp_path):
+    place, states = tmp_path / "kept", []
+
+    def action():
+        os.rename(place, tmp_path / "ours")
+        if then == "another":
+            kept_in_zarr(tmp_path / "other", h=0.2)
+            os.rename(tmp_path / "other", place)
+            states.append(tree(place))
+
+    with pytest.raises(CheckpointError, match="no longer the group that this ensemble writes to") as info:
+        kept_in_zarr(place, callback=at_once(action))
+    assert info.value.partial.status.tolist() == [0] * 6 + [-2] * 5
+    assert place.exists() == (then == "another")
+    if states:
+        assert [tree(place)] == states
+    same(members(), kept_in_zarr(tmp_path / "ours", resume=True))
+
+
+def tree(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@needs_zarr
+def test_attributes_that_users_add(tmp_path):
+    import zarr
+
+    place = tmp_path / "kept"
+
+    def note():
+        zarr.open_group(place, mode="r+").attrs["comment"] = "a sweep"
+
+    assert kept_in_zarr(place, callback=at_once(note)).success
+    assert zarr.open_group(place, mode="r").attrs["comment"] == "a sweep"
+
+
+# Functions are compared where the checkpoint stands, too.
+
+
+def broken_off(place, **more):
+    def callback(t, *_):
+        if t > 3.0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(place, callback=callback, **more)
+
+
+def later(t, y):
+    return orbit(t, y) * (1.0 if t < 1.0 else 1.001)
+
+
+def energy_of_later(t, y):
+    return H.fun(t, y) + (0.0 if t < 1.0 else 1e-6)
+
+
+@pytest.mark.usefixtures("often")
+@pytest.mark.parametrize(
+    ("fun", "more", "match"),
+    [
+        (later, {}, r"fun was \S+ at t = 3\.\d+, where it stands, and is \S+ now\. Resume with the functions"),
+        (orbit, {"invariants": [Invariant(energy_of_later, H.grad, name="energy"), L], "check": False},
+         r"invariant 'energy' was \S+ at t = 3\.\d+, where it stands"),
+    ],
+)  # fmt: skip
+def test_a_function_that_differs_later_is_seen(fun, more, match, tmp_path):
+    place = tmp_path / "kept"
+    broken_off(place)
+    before = place.read_bytes()
+    with pytest.raises(CheckpointError, match=match):
+        run(place, fun, resume=True, **more)
+    assert place.read_bytes() == before
+    assert run(place, resume=True).success
+
+
+@pytest.mark.usefixtures("often")
+@pytest.mark.needs_jit
+def test_compiled_functions_are_compared_there_before_they_are_compiled(tmp_path):
+    from numba import njit
+    from systems import jit_orbit
+
+    @njit
+    def other(t, y):
+        out = jit_orbit(t, y)
+        return out if t < 1.0 else 1.001 * out
+
+    options = {"invariants": (), "compiled": None}
+    broken_off(tmp_path / "kept", fun=jit_orbit, **options)
+    with pytest.raises(CheckpointError, match=r"fun was .* where it stands"):
+        run(tmp_path / "kept", other, resume=True, **options)
+    whole = integrate(jit_orbit, SPAN, Y0, **OPTIONS | options)
+    same(whole, run(tmp_path / "kept", jit_orbit, resume=True, **options))
+
+
+@pytest.mark.usefixtures("often")
+def test_functions_may_differ_by_rounding_there(tmp_path):
+    broken_off(tmp_path / "kept")
+    assert run(tmp_path / "kept", lambda t, y: orbit(t, y) * (1 + 1e-14), resume=True).success
+
+
+def test_evaluations_for_it_are_not_counted(tmp_path):
+    assert run(tmp_path / "kept").nfev == integrate(orbit, SPAN, Y0, **OPTIONS).nfev
+
+
+def test_a_function_that_no_longer_answers(tmp_path):
+    """The one that breaks the run off cannot be asked again; the run is kept all the same."""
+    gone = []
+
+    def fun(t, y):
+        if gone or t > 3.0:
+            gone.append(t)
+            raise RuntimeError("the licence server is down")
+        return orbit(t, y)
+
+    with pytest.raises(RuntimeError, match="licence"):
+        run(tmp_path / "kept", fun)
+    assert "state_f" not in checkpoint.read(tmp_path / "kept")[1]
+    same(integrate(orbit, SPAN, Y0, **OPTIONS), run(tmp_path / "kept", resume=True))
+
+
+@pytest.mark.parametrize("keep", [kept_by_ensemble, pytest.param(kept_in_zarr, marks=needs_zarr)])
+def test_members_of_functions_that_differ_later(keep, tmp_path):
+    def other(t, y):
+        return oscillator(t, y) * (1.0 if t < 0.9 else 1.001)
+
+    def square(t, y):
+        return SQUARE.fun(t, y) + (0.0 if t < 0.9 else 1e-6)
+
+    def callback(part):
+        if part.first == 3:
+            raise KeyboardInterrupt
+
+    place = tmp_path / "kept"
+    with pytest.raises(KeyboardInterrupt):
+        keep(place, callback=callback)
+    for wrong in ({"fun": other}, {"invariants": Invariant(square, SQUARE.grad, name="S")}):
+        with pytest.raises(CheckpointError, match="had other values where a member from number 3 on ended"):
+            keep(place, resume=True, check=False, **wrong)
+    same(members(), keep(place, resume=True))
+    same(members(), keep(place, resume=True, fun=lambda t, y: oscillator(t, y) * (1 + 1e-14)))
+
+
+# SIGTERM.
+
+TERMINATED = """
+    import os, signal, test_keeping, threading, time
+
+    def callback(*_):
+        calls.append(0)
+        if len(calls) == 2:
+            time.sleep(0.3)  # until the next snapshot
+        if len(calls) == 3:
+            exec(action, globals())
+
+    calls = []
+    exec(before, globals())
+    getattr(test_keeping, keep)(place, callback=callback)
+    print("went on")
+"""
+TERM = "os.kill(os.getpid(), signal.SIGTERM)"
+
+
+@pytest.fixture
+def terminated(forker):
+    def found(place, keep=kept_by_integrate, action=TERM, before=""):
+        return forker.start(TERMINATED, place=str(place), keep=keep.__name__, action=action, before=before).wait()
+
+    return found
+
+
+@posix
+@keeping
+def test_sigterm_waits_for_the_checkpoint(keep, tmp_path, terminated):
+    """The process ends by it, as whoever sent it expects, and what was done is there."""
+    place, ran = tmp_path / "kept", []
+    code, out, err = terminated(place, keep)
+    assert (code, out) == (-signal.SIGTERM, "")
+    assert content(tmp_path) == ["kept"]
+    if keep is kept_by_integrate:
+        where = (
+            f"the checkpoint {str(place)!r} holds step 7, t = 0.21: the same call with resume=True goes on from there"
+        )
+        assert err == f"SIGTERM\n{where}\n"
+        found = keep(place, resume=True)
+        assert "resumed at step 7" in found.message
+        same(integrate(orbit, SPAN, Y0, **OPTIONS), found)
+    else:
+        assert err == "SIGTERM\n"
+        same(members(), keep(place, resume=True, callback=lambda part: ran.append(part.first)))
+        assert ran == [9]
+
+
+@posix
+@pytest.mark.parametrize(
+    "action",
+    [
+        f"for _ in range(3): {TERM}",
+        f"class Dropped:\n  def __del__(self): {TERM}\nDropped()",
+        f"try: {TERM}\nexcept BaseException: pass",
+        f"try: {TERM}\nexcept BaseException: raise ValueError",
+    ],
+    ids=["again and again", "in a destructor", "swallowed", "turned into another error"],
+)
+def test_sigterm_however_it_is_met(action, tmp_path, terminated):
+    code, out, _ = terminated(tmp_path / "kept", action=action)
+    assert (code, out) == (-signal.SIGTERM, "")
+    assert checkpoint.read(tmp_path / "kept")[0]["step"] >= 7
+    assert run(tmp_path / "kept", resume=True).success
+
+
+@posix
+@pytest.mark.parametrize("handler", ["signal.SIG_IGN", "lambda *_: None"])
+def test_a_handler_of_the_user_s_stays(handler, tmp_path, terminated):
+    found = terminated(tmp_path / "kept", before=f"signal.signal(signal.SIGTERM, {handler})")
+    assert found == (0, "went on\n", "")
+
+
+@posix
+def test_sigterm_in_a_thread(tmp_path, forker):
+    """No handler can be installed from there: the process ends at once, with the checkpoint that there is."""
+    code = """
+        import os, signal, threading, time
+        from test_keeping import run
+
+        def callback(t, *_):
+            if t > 3:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(60)
+
+        thread = threading.Thread(target=run, args=[place], kwargs={"callback": callback})
+        thread.start()
+        thread.join()
+    """
+    code, _, _ = forker.start(code, place=str(tmp_path / "kept")).wait()
+    assert code == -signal.SIGTERM
+    assert checkpoint.read(tmp_path / "kept")[0]["step"] == 0
+    assert run(tmp_path / "kept", resume=True).success
+
+
+@posix
+def test_sigterm_without_a_checkpoint(forker):
+    """There is nothing to keep: it does what it always does."""
+    code = """
+        import os, signal
+        from test_keeping import orbit, Y0
+        from eip_scipy import EIPRK4, integrate
+
+        def callback(*_):
+            assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        integrate(orbit, (0, 1), Y0, method=EIPRK4, h=0.1, save_every=1, callback=callback)
+    """
+    assert forker.start(code).wait() == (-signal.SIGTERM, "", "")
+
+
+def test_sigterm_is_as_it_was_afterwards(tmp_path):
+    run(tmp_path / "kept")
+    with pytest.raises(ValueError, match="positive"):
+        run(tmp_path / "other", h=-1)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@posix
+@pytest.mark.needs_jit
+def test_sigterm_inside_a_compiled_run(tmp_path, forker):
+    code = """
+        import numpy as np
+        from numba import njit
+        from eip_scipy import EIPRK4, integrate
+
+        fun = njit(lambda t, y: np.array([y[1], -y[0]]))
+        integrate(fun, (0, 1), [1.0, 2.0], method=EIPRK4, h=1e-3, compiled=True)
+        print("compiled", flush=True)
+        integrate(fun, (0, 1e7), [1.0, 2.0], method=EIPRK4, h=1e-3, compiled=True, checkpoint=place)
+    """
+    place = tmp_path / "kept"
+    process = forker.start(code, place=str(place))
+    process.until("compiled")
+    time.sleep(2.0)
+    os.kill(process.pid, signal.SIGTERM)
+    code, _, err = process.wait()
+    assert code == -signal.SIGTERM
+    header, _ = checkpoint.read(place)
+    assert header["step"] > 1000
+    assert f"holds step {header['step']}," in err
+
+
+# Disks that are really full.
+
+
+@pytest.fixture(params=["512k"])
+def small_disk(tmp_path, request):
+    """A file system of 512 kB, unless the test wants another."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={request.param}", "tmpfs", str(place)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        pytest.skip("there is no mount")
+    if done.returncode:
+        pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
+    yield place
+    subprocess.run(["umount", str(place)], check=True)
+
+
+def fill(folder):
+    """All that is left."""
+    with open(folder / "filler", "wb", buffering=0) as stream:
+        while True:
+            try:
+                stream.write(bytes(512))
+            except OSError:
+                return
+
+
+@pytest.mark.parametrize("small_disk", ["64k"], indirect=True)
+def test_a_disk_fills_up_while_the_run_grows(small_disk):
+    """No room for the former checkpoint and the next one: the run ends all the same, and the former one is whole."""
+    place, options = small_disk / "kept", {"save_every": 1, "h": 0.003}
+    whole = integrate(orbit, SPAN, Y0, **OPTIONS | options)
+    match = r"no space left on device; it still holds step .* The result is whole"
+    with pytest.warns(RuntimeWarning, match=match):
+        found = run(place, **options)
+    same(whole, found)
+    assert "no space left on device" in found.message
+    assert content(small_disk) == ["kept"]
+    with pytest.warns(RuntimeWarning, match="The result is whole"):
+        same(whole, run(place, resume=True, **options))
+
+
+@keeping
+def test_a_disk_that_is_full_at_the_start(keep, small_disk):
+    fill(small_disk)
+    with pytest.raises(CheckpointError, match=re.compile("no space left on device", re.IGNORECASE)):
+        keep(small_disk / "kept")
+    (small_disk / "filler").unlink()
+    assert keep(small_disk / "kept", resume=True).success
+
+
+def test_an_ensemble_on_a_disk_that_fills_up(small_disk):
+    place = small_disk / "kept"
+    with pytest.warns(RuntimeWarning, match="no space left on device; the former checkpoint stays"):
+        found = kept_by_ensemble(place, callback=at_once(lambda: fill(small_disk)), checkpoint_every=1e-9)
+    same(members(), found)
+    (small_disk / "filler").unlink()
+    same(members(), kept_by_ensemble(place, resume=True))
+
+
+@needs_zarr
+def test_a_group_on_a_disk_that_fills_up(small_disk):
+    place = small_disk / "kept"
+    with pytest.raises(CheckpointError, match=r"cannot write to .*kept': No space left on device") as info:
+        kept_in_zarr(place, callback=at_once(lambda: fill(small_disk)))
+    assert info.value.partial.status.tolist() == [0] * 6 + [-2] * 5
+    (small_disk / "filler").unlink()
+    same(members(), kept_in_zarr(place, resume=True))
+
+
+@posix
+def test_a_finished_run_on_a_read_only_disk(small_disk):
+    whole = run(small_disk / "kept")
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        same(whole, run(small_disk / "kept", resume=True))
+    with pytest.raises(CheckpointError, match=r"cannot write the checkpoint .*: read-only file system"):
+        run(small_disk / "other")
+
+
+@pytest.mark.parametrize("name", ["fsync", "replace"])
+def test_a_full_disk_at_the_last_moment(name, tmp_path, monkeypatch):
+    place, armed, real = tmp_path / "kept", [], getattr(os, name)
+    whole = integrate(orbit, SPAN, Y0, **OPTIONS)
+
+    def full(*arguments):
+        if armed:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(*arguments)
+
+    monkeypatch.setattr(os, name, full)
+    with pytest.warns(RuntimeWarning, match="no space left on device; it still holds step 0"):
+        same(whole, run(place, callback=at_once(lambda: armed.append(True))))
+    monkeypatch.undo()
+    assert checkpoint.read(place)[0]["step"] == 0
+    assert content(tmp_path) == ["kept"]
+    same(whole, run(place, resume=True))

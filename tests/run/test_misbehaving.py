@@ -1,0 +1,493 @@
+"""Functions that do what they should not: compiled runs, interpreted ones and solve_ivp give one answer.
+
+They write to the states they are given, leave `out` as it was, or return something else on the way than at the start.
+"""
+
+import math
+import re
+
+import numpy as np
+import pytest
+from numba import njit
+from scipy.integrate import RK45, solve_ivp
+from systems import SQUARE, oscillator
+
+from eip_scipy import EIPRK4, EIPRK45, EIPRKN8, Invariant, check_gradient, ensemble, integrate, project
+from eip_scipy.core.diagnostics import invariants_along
+
+Y0 = [1.0, 2.0]
+needs_jit = pytest.mark.needs_jit
+
+
+def square(t, y):
+    return y[0] * y[0] + y[1] * y[1]
+
+
+def square_gradient(t, y):
+    return 2 * y
+
+
+def filling(t, y, out):
+    out[0] = y[1]
+    out[1] = -y[0]
+
+
+def filling_gradient(t, y, out):
+    out[0] = 2 * y[0]
+    out[1] = 2 * y[1]
+
+
+def interpreted(fun=oscillator, invariants=(), **options):
+    options = {"method": EIPRK4, "h": 0.1, "save_every": 1, **options}
+    return integrate(fun, (0, 1), Y0, invariants=invariants, compiled=False, **options)
+
+
+def compiled(fun=oscillator, invariants=(), events=None, **options):
+    """The same of the same functions, jitted."""
+    items = [invariants] if isinstance(invariants, Invariant) else invariants
+    kept = [
+        Invariant(njit(i.fun), njit(i.grad), name=i.name, in_place=i.in_place, uses_f=i.uses_f, target=i.target)
+        for i in items
+    ]
+    options = {"method": EIPRK4, "h": 0.1, "save_every": 1, **options}
+    events = None if events is None else [njit(event) for event in events]
+    return integrate(njit(fun), (0, 1), Y0, invariants=kept, events=events, **options)
+
+
+def scipy_s(fun=oscillator, invariants=(), **options):
+    return solve_ivp(fun, (0, 1), Y0, **{"method": EIPRK4, "h": 0.1, "invariants": invariants, **options})
+
+
+both = pytest.mark.parametrize("how", [interpreted, pytest.param(compiled, marks=needs_jit)])
+all_of_them = pytest.mark.parametrize("how", [interpreted, pytest.param(compiled, marks=needs_jit), scipy_s])
+KEPT = Invariant(square, square_gradient, name="S")
+
+
+# Functions that write to what they are given.
+
+
+def writing(t, y):
+    f = np.array([y[1], -y[0]])
+    y[0] = 1e9
+    return f
+
+
+def writing_now_and_then(t, y):
+    if t > 0.55:
+        y[:] = 7.0 * y
+        return np.array([y[1] / 7, -y[0] / 7])
+    return np.array([y[1], -y[0]])
+
+
+def writing_by_a_view(t, y):
+    f = np.array([y[1], -y[0]])
+    half = y[1:]
+    half[0] = math.nan
+    return f
+
+
+@njit
+def scale(a, factor):
+    for k in range(a.size):
+        a[k] *= factor
+
+
+def writing_by_a_function(t, y):
+    f = np.array([y[1], -y[0]])
+    scale(y, 0.0)
+    return f
+
+
+def value_that_writes(t, y):
+    value = y[0] * y[0] + y[1] * y[1]
+    y[1] = 5.0
+    return value
+
+
+def gradient_that_writes(t, y):
+    y[0] *= 2
+    y[1] *= 2
+    return y
+
+
+def event_that_writes(t, y):
+    value = y[0]
+    y[1] = 100.0
+    return value
+
+
+WRITERS = [writing, writing_now_and_then, writing_by_a_view, writing_by_a_function]
+
+
+@all_of_them
+@pytest.mark.parametrize("method", [EIPRK4, EIPRK45])
+@pytest.mark.parametrize("fun", WRITERS)
+def test_right_hand_sides_that_write(how, fun, method):
+    """Also where SciPy takes the steps, whose own class lets them write to its state."""
+    options = {"method": method, "h": None if method is EIPRK45 else 0.1}
+    np.testing.assert_allclose(how(fun, **options).y, how(**options).y, rtol=1e-14)
+    run = how(fun, KEPT, **options)
+    np.testing.assert_allclose(run.y, how(invariants=KEPT, **options).y, rtol=1e-14)
+    if how is compiled:
+        assert run.compiled
+
+
+def test_scipy_s_class_is_changed_by_them():
+    """So the test above can fail."""
+    plain, written = (solve_ivp(f, (0, 1), Y0, method=RK45).y[:, -1] for f in (oscillator, writing))
+    assert np.abs(plain - written).max() > 1
+
+
+@both
+def test_writing_in_place(how):
+    def fun(t, y, out):
+        out[0], out[1] = y[1], -y[0]
+        y[0] = 0.0
+
+    options = {"invariants": KEPT, "in_place": True}
+    np.testing.assert_array_equal(how(fun, **options).y, how(filling, **options).y)
+
+
+@both
+@pytest.mark.parametrize("in_place", [False, True])
+def test_accelerations_that_write(how, in_place):
+    def acc(t, q):
+        a = -q
+        q[0] = 9.0
+        return a
+
+    def acc_in_place(t, q, out):
+        out[0] = -q[0]
+        q[0] = 9.0
+
+    options = {"method": EIPRKN8, "invariants": KEPT, "in_place": in_place}
+    run = how(acc_in_place if in_place else acc, **options)
+    np.testing.assert_allclose(run.y[0], np.cos(run.t) + 2 * np.sin(run.t), atol=1e-11)
+
+
+@all_of_them
+@pytest.mark.parametrize(
+    "items",
+    [
+        [Invariant(value_that_writes, square_gradient, name="S")],
+        [Invariant(square, gradient_that_writes, name="S")],
+        [Invariant(value_that_writes, gradient_that_writes, name="S")],
+        [Invariant(value_that_writes, gradient_that_writes, name="A"), KEPT],
+    ],
+    ids=["value", "gradient", "both", "before another"],
+)
+def test_invariants_that_write(how, items):
+    run = how(invariants=items)
+    np.testing.assert_array_equal(run.y, how(invariants=[KEPT] * len(items)).y)
+    if how is compiled:
+        assert run.compiled
+        np.testing.assert_allclose(run.invariants, 5.0, rtol=1e-14)
+
+
+@all_of_them
+def test_gradients_that_write_to_f(how):
+    """f is the first stage of the step to come."""
+
+    def grad(t, y, f):
+        G = np.array([-2 * f[1], 2 * f[0]])
+        f[0] = f[1] = 1e9
+        return G
+
+    good = Invariant(square, lambda t, y, f: np.array([-2 * f[1], 2 * f[0]]), uses_f=True, name="S")
+    np.testing.assert_array_equal(
+        how(invariants=Invariant(square, grad, uses_f=True, name="S")).y, how(invariants=good).y
+    )
+
+
+def test_invariants_without_gradients_that_write():
+    run = interpreted(invariants=Invariant(value_that_writes, name="S"))
+    np.testing.assert_allclose(run.invariants, 5.0, rtol=1e-13)
+
+
+@both
+def test_events_that_write(how):
+    """Neither the state nor what the next event sees."""
+    events = [event_that_writes, lambda t, y: y[1] - 1.0]
+    found, plain = (how(invariants=KEPT, events=e) for e in (events, [lambda t, y: y[0], events[1]]))
+    np.testing.assert_array_equal(found.y, plain.y)
+    assert plain.t_events[1].size == 1
+    for mine, other in zip(found.t_events, plain.t_events, strict=True):
+        np.testing.assert_array_equal(mine, other)
+
+
+@needs_jit
+def test_members_of_writers_are_single_runs():
+    fun, kept = njit(writing_now_and_then), Invariant(njit(value_that_writes), njit(gradient_that_writes), name="S")
+    starts = np.array(Y0) * np.linspace(1, 2, 20)[:, None]
+    run = ensemble(fun, (0, 1), starts, method=EIPRK4, h=0.1, invariants=kept)
+    assert run.success
+    for start, end in zip(starts, run.y, strict=True):
+        one = integrate(fun, (0, 1), start, method=EIPRK4, h=0.1, invariants=kept)
+        np.testing.assert_array_equal(end, one.y[:, -1])
+        plain = integrate(oscillator, (0, 1), start, method=EIPRK4, h=0.1, invariants=KEPT)
+        np.testing.assert_allclose(end, plain.y[:, -1], rtol=1e-14)
+
+
+def test_helpers_keep_what_they_are_given():
+    writer = Invariant(value_that_writes, gradient_that_writes, target=5.1, name="S")
+    y = np.array(Y0)
+    result = project(y, writer, f=writing)
+    np.testing.assert_array_equal(y, Y0)
+    np.testing.assert_array_equal(result.y, project(y, Invariant(square, square_gradient, target=5.1)).y)
+    assert check_gradient(writer, 0.0, y, writing) < 1e-9
+    np.testing.assert_array_equal(y, Y0)
+    run = interpreted()
+    states = run.y.copy()
+    np.testing.assert_array_equal(invariants_along(writer, run.t, run.y), invariants_along(KEPT, run.t, run.y))
+    np.testing.assert_array_equal(run.y, states)
+
+
+# Functions in place that do not fill.
+
+
+def returning(t, y, out):
+    return np.array([y[1], -y[0]])
+
+
+def half(t, y, out):
+    out[0] = y[1]
+
+
+def nothing(t, y, out):
+    pass
+
+
+def adding(t, y, out):
+    out[0] += y[1]
+    out[1] = -y[0]
+
+
+def returning_what_it_fills(t, y, out):
+    out[0] = y[1]
+    out[1] = -y[0]
+    return out
+
+
+NOT_FILLING = [
+    (returning, TypeError, r"fun returned array\(.*in_place=True it must fill its argument out"),
+    (half, ValueError, "fun does not fill all of its argument out, in component 1, at t=0"),
+    (nothing, ValueError, "fun does not fill all of its argument out, in component 0, at t=0"),
+    (adding, ValueError, "fun reads its argument out, which holds anything, before it fills it, in component 0"),
+]
+
+
+@both
+@pytest.mark.parametrize(("fun", "error", "match"), NOT_FILLING)
+def test_functions_that_do_not_fill(how, fun, error, match):
+    with pytest.raises(error, match=match):
+        how(fun, in_place=True)
+
+
+@both
+def test_functions_that_fill_and_return_it(how):
+    np.testing.assert_array_equal(how(returning_what_it_fills, in_place=True).y, how(filling, in_place=True).y)
+
+
+@both
+def test_functions_whose_values_are_not_finite_at_the_start(how):
+    """What is not finite is not mistaken for what is not filled."""
+
+    def fun(t, y, out):
+        out[0] = y[1]
+        out[1] = np.log(y[0] - 2)
+
+    with np.errstate(invalid="ignore"):
+        run = how(fun, in_place=True)
+    assert run.status == -1
+    assert run.message.startswith("fun returned a non-finite value at t=0")
+
+
+def test_complex_functions_that_fill_the_real_parts():
+    def fun(t, y, out):
+        out.real[:] = -y.imag
+
+    with pytest.raises(ValueError, match="fun does not fill all of its argument out, in component 0"):
+        integrate(fun, (0, 1), np.array([1j, 2.0]), method=EIPRK4, h=0.1, in_place=True)
+
+
+@both
+def test_functions_that_stop_filling(how):
+    def fun(t, y, out):
+        out[0] = y[1]
+        if t < 0.5:
+            out[1] = -y[0]
+
+    run = how(fun, in_place=True)
+    assert run.status == -1
+    assert run.message.startswith("fun returned a non-finite value at t=0.5 (component 1 is NaN; with in_place=True")
+    np.testing.assert_array_equal(run.y, interpreted().y[:, : run.t.size])
+
+
+@both
+def test_accelerations_that_do_not_fill(how):
+    with pytest.raises(ValueError, match="fun does not fill all of its argument out"):
+        how(nothing, method=EIPRKN8, in_place=True)
+
+
+@both
+@pytest.mark.parametrize(
+    ("grad", "error", "match"),
+    [
+        (returning, TypeError, "gradient of invariant 'S' returned array"),
+        (half, ValueError, "gradient of invariant 'S' does not fill all of its argument out, in component 1"),
+        (adding, ValueError, "gradient of invariant 'S' reads its argument out"),
+    ],
+)
+def test_gradients_that_do_not_fill(how, grad, error, match):
+    with pytest.raises(error, match=match):
+        how(invariants=Invariant(square, grad, name="S", in_place=True))
+
+
+@both
+def test_gradients_that_stop_filling(how):
+    def grad(t, y, out):
+        out[0] = 2 * y[0]
+        if t < 0.5:
+            out[1] = 2 * y[1]
+
+    run = how(invariants=Invariant(square, grad, name="S", in_place=True))
+    assert run.status == -1
+    assert "projection failed at t=0.5: invariant 'S'" in run.message
+    assert "the gradient of 'S' is not finite there" in run.message
+
+
+# Values that change on the way.
+
+CHANGES = {
+    "complex": (lambda y: y + 0j, ValueError, "complex"),
+    "text": (lambda y: "1.0", TypeError, "'1.0'"),
+    "texts": (lambda y: ["1.0", "2.0"], TypeError, r"\['1.0', '2.0'\]"),
+    "None": (lambda y: None, TypeError, "None"),
+    "no numbers": (lambda y: [1.0, None], TypeError, "None"),
+    "shape": (lambda y: np.ones((3, 1)), ValueError, r"shape \(3, 1\)"),
+    "ragged": (lambda y: [1.0, [2.0, 3.0]], (TypeError, ValueError), r"\[1.0, \[2.0, 3.0\]\]"),
+}
+changes = pytest.mark.parametrize(("change", "error", "match"), CHANGES.values(), ids=CHANGES)
+interpreters = pytest.mark.parametrize("how", [interpreted, scipy_s])
+
+
+def late(good, change):
+    return lambda t, y: good(t, y) if t < 0.5 else change(y)
+
+
+def check_error(how, info):
+    """It names the time, and what had been computed is kept."""
+    assert re.search(r"at t=0\.5\b", str(info.value))
+    if how is interpreted:
+        assert info.value.partial.t[-1] == 0.4
+
+
+@interpreters
+@changes
+def test_right_hand_sides_that_change(how, change, error, match):
+    with pytest.raises(error, match=f"fun returned .*{match}") as info:
+        how(late(oscillator, change))
+    check_error(how, info)
+
+
+@interpreters
+@changes
+@pytest.mark.parametrize("of", [lambda v: v, lambda v: v[0] if isinstance(v, np.ndarray) else v], ids=["all", "one"])
+def test_invariants_that_change(how, change, error, match, of):
+    kept = Invariant(late(square, lambda y: of(change(y))), square_gradient, name="S")
+    with pytest.raises((TypeError, ValueError), match="invariant 'S' returned") as info:
+        how(invariants=kept)
+    check_error(how, info)
+
+
+@interpreters
+@changes
+def test_gradients_that_change(how, change, error, match):
+    with pytest.raises((TypeError, ValueError), match="gradient of invariant 'S'") as info:
+        how(invariants=Invariant(square, late(square_gradient, change), name="S"))
+    check_error(how, info)
+
+
+@pytest.mark.parametrize("value", [None, 1j, "1.0", np.array([1.0]), [1.0], np.ones(2)])
+@pytest.mark.parametrize("start", [-1.0, 0.5])
+def test_events_that_change(value, start):
+    with pytest.raises(TypeError, match=r"event 0 returned .*expected a real number") as info:
+        interpreted(events=lambda t, y: y[0] if t < start else value)
+    assert info.value.partial.t[-1] == pytest.approx(max(start, 0.0))
+
+
+@needs_jit
+@pytest.mark.parametrize("part", ["fun", "value", "gradient"])
+def test_compiled_functions_that_return_none(part):
+    """Such a function does not enter compiled code, and what is interpreted says what is wrong."""
+
+    def fun(t, y):
+        return np.array([y[1], -y[0]]) if t < 0.5 or part != "fun" else None
+
+    def value(t, y):
+        return y[0] * y[0] + y[1] * y[1] if t < 0.5 or part != "value" else None
+
+    def grad(t, y):
+        return 2 * y if t < 0.5 or part != "gradient" else None
+
+    kept = Invariant(njit(value), njit(grad), name="S")
+    with pytest.raises(TypeError, match=r"returned None .*at t=0\.5|returned None, expected 2 numbers, at t=0\.5"):
+        integrate(njit(fun), (0, 1), Y0, method=EIPRK4, h=0.1, invariants=kept)
+    with pytest.raises(TypeError, match="returns None in some places"):
+        integrate(njit(fun), (0, 1), Y0, method=EIPRK4, h=0.1, invariants=kept, compiled=True)
+
+
+@needs_jit
+@pytest.mark.parametrize("part", ["fun", "value", "gradient"])
+def test_compiled_shapes_that_change(part):
+    number = ["fun", "value", "gradient"].index(part)
+
+    @njit
+    def size(place, t):
+        return 3 if place == number and t > 0.55 else 2
+
+    fun = njit(lambda t, y: np.array([y[1], -y[0], 0.0])[: size(0, t)])
+    value = njit(lambda t, y: np.full(size(1, t), y @ y))
+    grad = njit(lambda t, y: np.ones((size(2, t), 1)) * (2 * y))
+    name = {"fun": "fun", "value": "invariant 'S'", "gradient": "gradient of invariant 'S'"}[part]
+    with pytest.raises(ValueError, match=f"{name} .*another shape than at the start, in the step from t=0.5") as info:
+        integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.1, invariants=Invariant(value, grad, name="S"), compiled=True)
+    assert info.value.partial.t[-1] == 0.5
+
+
+# Exceptions before the first step.
+
+
+class MineError(Exception):
+    pass
+
+
+def raising(*args):
+    raise MineError
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"fun": raising},
+        {"invariants": Invariant(raising, square_gradient)},
+        {"invariants": Invariant(square, raising)},
+        {"events": raising},
+        {"callback": raising},
+    ],
+    ids=["fun", "value", "gradient", "event", "callback"],
+)
+def test_exceptions_at_the_start_keep_the_start(options):
+    with pytest.raises(MineError) as info:
+        interpreted(**options)
+    partial = info.value.partial
+    assert partial.t.tolist() == [0.0]
+    np.testing.assert_array_equal(partial.y, np.array(Y0)[:, None])
+    assert (partial.status, partial.success) == (-1, False)
+    assert "interrupted by MineError" in partial.message
+
+
+def test_ensembles_have_no_start_to_keep():
+    with pytest.raises(MineError) as info:
+        ensemble(raising, (0, 1), [Y0, Y0], method=EIPRK4, h=0.1, invariants=SQUARE)
+    assert not hasattr(info.value, "partial")
