@@ -12,13 +12,13 @@ import numpy as np
 from scipy.integrate import DOP853 as SCIPY_DOP853
 from scipy.integrate import DenseOutput
 
+from ..engine.counters import NFEV
 from ..engine.kernels import OK, Grouping
 from ..engine.step import ERROR, GIVEN, NEW, make_work, project_step
 from ..methods.nystrom import NystromTableau
 from ..methods.runge_kutta import DOP853, Tableau
 from .inputs import refuse_units, shown
 from .one_step import OneStep
-from .results import NFEV
 from .setup import Run
 
 __all__ = ["End", "ExactEnds", "ManifoldDenseOutput", "dense_output"]

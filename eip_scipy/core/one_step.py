@@ -8,10 +8,10 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ..engine import kernels as kn
+from ..engine.counters import HAVE_ERROR, HAVE_F, NFEV
 from ..engine.kernels import NOT_FINITE, OK
 from ..engine.step import OLD, Options, Work, is_sampled
 from .inputs import refuse_units, shown
-from .results import HAVE_ERROR, HAVE_F, NFEV
 
 __all__ = ["OneStep", "OneStepMethod", "as_vector"]
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..engine.counters import LAST_RANK
 from ..engine.kernels import BAND, EPS
 from ..engine.step import Span, make_work, project_step
 from ..engine.trust import LARGE_SHARE, ProjectionWarning
@@ -18,7 +19,7 @@ from .inputs import count, is_number, reals, refuse_units, shown
 from .invariants import InvariantSet
 from .one_step import as_vector
 from .options import MOST_ITERATIONS, ProjectionOptions, weights
-from .results import LAST_RANK, ProjectionResult
+from .results import ProjectionResult
 from .stepping import Stepping
 
 __all__ = ["project"]

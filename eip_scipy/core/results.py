@@ -7,16 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import OptimizeResult
 
+from ..engine.counters import N_COUNTERS, PROJECTIONS, RANK_REDUCED, REJECTED, SKIPPED, SOFTENED
 from ..engine.trust import N_FIGURES, ProjectionWarning, Trust
 
 __all__ = ["Diagnostics", "IntegrationResult", "ProjectionResult", "ProjectionWarning"]
-
-# Places of the counters that the step fills (see engine/step.py, which takes them from here).
-NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED = range(10)
-# Whether an estimate of the step's error is at hand, projections begun without one, steps since the last projection,
-# and what stood out in them.
-HAVE_ERROR, BEGUN, WAITED, FOUND = range(10, 14)
-N_COUNTERS = 14
 
 
 class Diagnostics:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.integrate import OdeSolver
 
 from ..engine import kernels as kn
+from ..engine.counters import LAST_RANK
 from ..engine.kernels import NOT_FINITE
 from ..engine.step import ERROR, EUCLIDEAN, NEW, T_NEW, TOO_SMALL, H, Method, Options, T, Work, make_work, project_step
 from ..engine.trust import Trust
@@ -18,7 +19,7 @@ from .inputs import reals, refuse_units, shown
 from .invariants import InvariantSet, as_it_is
 from .one_step import OneStep, as_vector
 from .options import ProjectionOptions
-from .results import LAST_RANK, Diagnostics
+from .results import Diagnostics
 from .stepping import AnyMethod, Stepping
 
 __all__ = ["Run", "Start", "as_derivative", "prepare"]

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
+from ..engine.counters import FOUND, N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.kernels import FAILED_PROJECTION, OK
 from ..engine.step import T_NEW, T, close_step, next_step, project_any
 from ..engine.trust import ProjectionWarning
@@ -23,7 +24,6 @@ from .invariants import as_invariants
 from .names import nearest
 from .one_step import OneStep, OneStepMethod
 from .options import ProjectionOptions, takes_projection_options
-from .results import FOUND, N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from .setup import Start
 from .stepping import StepOptions, Stepping, interval
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.results import FOUND, HAVE_ERROR, LAST_RANK, NJEV, NLU, PROJECTIONS, SKIPPED, WAITED
 from . import kernels as kn
+from .counters import FOUND, HAVE_ERROR, LAST_RANK, NJEV, NLU, PROJECTIONS, SKIPPED, WAITED
 
 __all__ = ["project_jointly"]
 

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba.extending import overload, register_jitable
 
-from ..core.results import (
+from . import kernels as kn
+from .counters import (
     BEGUN,
     FOUND,
     HAVE_ERROR,
@@ -33,7 +34,6 @@ from ..core.results import (
     SOFTENED,
     WAITED,
 )
-from . import kernels as kn
 from .joint import project_jointly
 from .kernels import FAILED_PROJECTION, NOT_FINITE, OK, POSTPONED, FrameRows, Grouping
 from .lanes import out_of_line

@@ -25,8 +25,8 @@ from ..core.invariants import as_invariants
 from ..core.names import nearest
 from ..core.options import ProjectionOptions
 from ..core.problem import Problem
-from ..core.results import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..core.solvers import EIPRK4, EIPSolver
+from ..engine.counters import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
 from ..run.events import Events
 from ..run.interrupts import ended_by_sigterm, kept_ctrl_c

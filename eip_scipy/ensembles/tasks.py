@@ -21,10 +21,10 @@ from numba import typeof, types
 
 from ..core import setup
 from ..core.compiled_functions import ChangedShapeError, NotCompilableError, signatures
-from ..core.results import N_COUNTERS, NFEV
 from ..core.stepping import UNBOUNDED
 from ..engine import kernels as kn
 from ..engine.caching import cached_njit
+from ..engine.counters import N_COUNTERS, NFEV
 from ..engine.kernels import OK
 from ..engine.step import H_ABS, T_NEW, T, Work
 from ..engine.trust import Trust, sick

@@ -16,9 +16,9 @@ from numba import typeof, types
 
 from ..core import setup
 from ..core.compiled_functions import NotCompilableError, signatures_of_batches, with_inlined
-from ..core.results import FOUND, LAST_RANK, N_COUNTERS, NFEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
 from ..core.stepping import UNBOUNDED
 from ..engine.caching import cached_njit
+from ..engine.counters import FOUND, LAST_RANK, N_COUNTERS, NFEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
 from ..engine.kernels import OK
 from ..engine.octets import LANES
 from ..engine.step import AUTO, NEW, Options, Span, T

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.results import HAVE_ERROR, N_COUNTERS, NJEV, WAITED
 from ..engine import kernels as kn
+from ..engine.counters import HAVE_ERROR, N_COUNTERS, NJEV, WAITED
 from ..engine.kernels import OK, FrameRows
 from ..engine.lanes import abs_dot, dot, largest, out_of_line
 from ..engine.octets import LANES, any_lane, is_not, lane_of, octets, spread, where

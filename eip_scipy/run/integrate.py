@@ -19,9 +19,10 @@ from ..core.inputs import refuse_units
 from ..core.names import nearest
 from ..core.options import ProjectionOptions, takes_projection_options
 from ..core.problem import Problem
-from ..core.results import NFEV, NJEV, NLU, Diagnostics, IntegrationResult
+from ..core.results import Diagnostics, IntegrationResult
 from ..core.solvers import EIPSolver
 from ..core.stepping import UNBOUNDED
+from ..engine.counters import NFEV, NJEV, NLU
 from ..engine.kernels import OK
 from ..engine.step import T
 from ..engine.trust import ProjectionWarning

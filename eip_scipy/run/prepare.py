@@ -17,10 +17,11 @@ from ..core.invariants import Invariant, as_invariants
 from ..core.one_step import OneStep
 from ..core.options import ProjectionOptions
 from ..core.problem import Problem
-from ..core.results import NFEV, Diagnostics
+from ..core.results import Diagnostics
 from ..core.setup import Counted, Run, Start
 from ..core.solvers import EIPSolver
 from ..core.stepping import AnyMethod, StepOptions, Stepping, interval
+from ..engine.counters import NFEV
 from ..engine.step import Span
 from ..methods.nystrom import NystromTableau
 from .driver import Grid, check_memory, saved_rows
