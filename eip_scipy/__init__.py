@@ -6,7 +6,7 @@ Public names are imported when they are first asked for (PEP 562): what makes st
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING, Any
 
-from .core import source_tree as _source_tree
+from .core import source_tree as source_tree
 
 if TYPE_CHECKING:
     from . import problems as problems

@@ -153,6 +153,7 @@ class Driver:
             self._advance = _compiled_advance(dtype, arguments)
 
     def advance(self, k_end: int) -> int:
+        """Step on to step `k_end`, or to what stops the loop before it; returns the loop's code."""
         arguments = (self.params, self.grid, k_end, *self._tail, self.t, self.y.view(float))
         try:
             return self._advance(*self.functions, *arguments)
@@ -166,10 +167,12 @@ class Driver:
 
     @property
     def step(self) -> int:
+        """Steps made so far."""
         return int(self.grid.place[STEP])
 
     @property
     def rows(self) -> int:
+        """Rows saved so far."""
         return int(self.grid.place[ROW])
 
     @property
