@@ -22,8 +22,8 @@ from eip_scipy.core.one_step import OneStep
 from eip_scipy.core.solvers import EIPSolver
 from eip_scipy.engine import kernels as kn
 from eip_scipy.engine.joint import project_jointly
-from eip_scipy.engine.lanes import abs_dot, dot
 from eip_scipy.engine.step import Method, Options, Work, advance_raw, look_back, make_work, project_step
+from eip_scipy.engine.sums import abs_dot, dot
 
 try:
     from mpi4py import MPI
@@ -354,7 +354,7 @@ class _Coordinates:
             np.maximum(self._run.options.scales, parts[:, :, -1].sum(axis=0), out=self._options.scales)
 
     def _choose_basis(self) -> None:
-        """Orthonormal rows of Q, in the place of gradients that depend on the others rows of zeros."""
+        """Orthonormal rows of Q, in place of gradients that depend on the others rows of zeros."""
         w = self._run.work
         w.Q[:] = w.G_r
         rank = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)

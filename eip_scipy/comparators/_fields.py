@@ -18,7 +18,7 @@ from ..engine.caching import cached_njit
 from ..problems import GrossPitaevskii
 from ._common import check_span, saved_steps
 
-__all__ = ["FieldResult", "FixedPoint", "Implicit", "Scheme", "march", "multiply_modes"]
+__all__ = ["FieldResult", "FieldScheme", "FixedPoint", "Implicit", "march", "multiply_modes"]
 
 MOST_ITERATIONS = 100
 WARM_STEPS = 3  # after which each branch of a scheme has been taken
@@ -51,7 +51,7 @@ class FieldResult:
     message: str
 
 
-class Scheme:
+class FieldScheme:
     """A scheme on its way; its subclasses implement `restart` and `step`.
 
     Parameters
@@ -116,14 +116,14 @@ class FixedPoint:
 
     Parameters
     ----------
-    scheme : Scheme
+    scheme : FieldScheme
     tol : float
         Bound of the residual's norm relative to that of the state.
     c, w : float
         w is best the middle of the range of W.
     """
 
-    def __init__(self, scheme: Scheme, tol: float, c: float, w: float) -> None:
+    def __init__(self, scheme: FieldScheme, tol: float, c: float, w: float) -> None:
         self.scheme, self.tol, self.c, self.w = scheme, tol, c, w
         self._inverse = (1 / (1 + 1j * c * (scheme.kinetic + w)) / scheme.psi.size).reshape(-1)
         self._rhs = np.empty_like(scheme.psi)
@@ -167,7 +167,7 @@ class FixedPoint:
         return mean, f"the iteration left a residual of {residual:.1e}, expected {bound:.1e}; take a smaller h"
 
 
-class Implicit(Scheme):
+class Implicit(FieldScheme):
     """A scheme whose step goes from a state to another, 2 c later, through their mean, which `FixedPoint` finds.
 
     The mean fulfils ``mean = start - i c (K + W - Omega Lz) mean``, W pointwise.
@@ -189,7 +189,7 @@ class Implicit(Scheme):
         self._solver: FixedPoint | None = None
 
     def restart(self) -> None:
-        """See `Scheme`."""
+        """See `FieldScheme`."""
         self._solver = None
 
     def solver(self, c: float) -> tuple[FixedPoint, bool]:
@@ -242,7 +242,7 @@ def check_equation(gpe: Any) -> GrossPitaevskii:
 
 
 def march(
-    make: Callable[[GrossPitaevskii, np.ndarray], Scheme],
+    make: Callable[[GrossPitaevskii, np.ndarray], FieldScheme],
     gpe: GrossPitaevskii,
     t_span: Any,
     y0: Any,
@@ -303,7 +303,7 @@ def multiply_modes(modes, factor):
 
 @jit
 def right_side(start, mean, rotation, W, w, c, out):
-    """Out <- start - i c ((W - w) mean + rotation), `rotation` may be empty; the norm of its change."""
+    """out <- start - i c ((W - w) mean + rotation), `rotation` may be empty; the norm of its change."""
     total = 0.0
     for i in range(start.size):
         m = mean[i]

@@ -82,7 +82,7 @@ class CrankNicolson(Implicit):
     """The scheme of `crank_nicolson`."""
 
     def step(self, h: float) -> str:
-        """See `Scheme`."""
+        """See `FieldScheme`."""
         solver, _ = self.solver(0.5 * h)
         return self.cross(solver, self.psi)
 
@@ -93,7 +93,7 @@ class CrankNicolson(Implicit):
 
 @jit
 def mean_density(start, mean, V, beta, out):
-    """Out <- V + beta / 2 (|2 mean - start|^2 + |start|^2)."""
+    """out <- V + beta / 2 (|2 mean - start|^2 + |start|^2)."""
     for i in range(start.size):
         a = start[i]
         b = 2.0 * mean[i] - a

@@ -26,7 +26,7 @@ def linearly_implicit(
 
     ``i (psi'' - psi) / (2 h) = (K + V - Omega Lz + beta |psi'|^2) (psi'' + psi) / 2`` with K = -Laplace / 2: one linear
     system a step, with coefficients that vary in space. Order 2; keeps the mass, and a form of two neighbours
-    in the place of the energy.
+    in place of the energy.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class LinearlyImplicit(Implicit):
         self._before = np.empty_like(self.psi)
 
     def step(self, h: float) -> str:
-        """See `Scheme`."""
+        """See `FieldScheme`."""
         solver, new = self.solver(h)  # 2 h is the distance between the ends
         if new:
             return self._single_step(h)
@@ -101,6 +101,6 @@ class LinearlyImplicit(Implicit):
 
 @jit
 def density(psi, V, beta, out):
-    """Out <- V + beta |psi|^2."""
+    """out <- V + beta |psi|^2."""
     for i in range(psi.size):
         out[i] = V[i] + beta * (psi[i].real * psi[i].real + psi[i].imag * psi[i].imag)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..problems import GrossPitaevskii
 from ..problems.gross_pitaevskii.pointwise import float_rows, interaction_energy
-from ._fields import FieldResult, Scheme, jit, march
+from ._fields import FieldResult, FieldScheme, jit, march
 
 __all__ = ["SAVResult", "sav_crank_nicolson"]
 
@@ -85,7 +85,7 @@ def sav_crank_nicolson(
     True
     """
 
-    def make(gpe: GrossPitaevskii, psi: np.ndarray) -> Scheme:
+    def make(gpe: GrossPitaevskii, psi: np.ndarray) -> FieldScheme:
         if gpe.Omega:
             raise ValueError(
                 f"SAV/CN needs Omega = 0, where the linear part is diagonal in the modes; got Omega = {gpe.Omega:g}. "
@@ -116,7 +116,7 @@ def _shift(gpe: GrossPitaevskii, psi: np.ndarray, shift: Any) -> float:
     return float(shift)
 
 
-class _SAV(Scheme):
+class _SAV(FieldScheme):
     """The scheme of `sav_crank_nicolson`, with its variable `r`."""
 
     def __init__(self, gpe: GrossPitaevskii, shift: float) -> None:

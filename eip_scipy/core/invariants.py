@@ -109,7 +109,7 @@ class JointInvariants(tuple[Invariant, ...]):
     """Scalar invariants whose projection takes two passes over the state: for fields, whose gradients fill memory.
 
     A tuple of `Invariant`, to be given as ``invariants=`` as it is. Interpreted runs with the euclidean metric,
-    ``direction="new"``, one Newton step and no frame call `moments` and `shift` in the place of the invariants'
+    ``direction="new"``, one Newton step and no frame call `moments` and `shift` in place of the invariants'
     values and gradients; all others, and steps whose gradients are nearly parallel, take those.
 
     Parameters

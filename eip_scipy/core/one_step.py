@@ -1,4 +1,4 @@
-"""One-step methods of a user's own in the place of the Runge-Kutta step: their protocol, and the raw step by them."""
+"""One-step methods of a user's own in place of the Runge-Kutta step: their protocol, and the raw step by them."""
 
 from __future__ import annotations
 

@@ -140,7 +140,7 @@ class ProjectionOptions:
         metadata=_text(
             "bool",
             """Check the invariants and their gradients at the start and again after some steps, watch whether the
-            corrections are those of the steps' errors, and fail where a projection leaves a defect as large as its
+            steps' errors explain the corrections, and fail where a projection leaves a defect as large as its
             invariant's terms. False: none of these.""",
         ),
     )
@@ -189,7 +189,7 @@ class ProjectionOptions:
             direction=DIRECTIONS[self.direction],
             iterations=count("iterations", self.iterations, MOST_ITERATIONS),
             every=self._every(method),
-            # The steps of a one-step method do not take f: there is nothing to evaluate in the place of f(y_hat).
+            # The steps of a one-step method do not take f: there is nothing to evaluate in place of f(y_hat).
             reuse_f=flag("reuse_f", self.reuse_f) or isinstance(method, OneStep),
             uses_f=known.uses_f,
             compensated=compensated,

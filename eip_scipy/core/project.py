@@ -46,11 +46,11 @@ def project(
     t : float, optional
         Time at which the invariants are taken.
     sigma : array_like, shape (n,), optional
-        Weights of the components: those of larger weight move more. Default: all 1, the euclidean metric.
+        Weights of the components: larger weights move more. Default: all 1, the euclidean metric.
     frame : (C, S), optional
         Linear invariants C y that the correction must not touch; see `EIPSolver`.
     iterations : int, optional
-        Newton steps. 1 leaves defects of the second order of those of y_hat.
+        Newton steps. 1 leaves defects of second order in the defects of y_hat.
     target : array_like, shape (l,), optional
         Values to meet. Default: each invariant's own `target`.
     f : array_like, shape (n,), or callable, optional

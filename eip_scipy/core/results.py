@@ -36,8 +36,8 @@ class Diagnostics:
         has no error estimate (the euclidean metric at fixed steps). Where round-off exceeds the local errors, as in
         compensated runs, it may be thousands and mean nothing; `worst` counts round-off too.
     trusted : bool
-        Whether no step has failed, no check of the invariants has found anything, and all corrections are those of the
-        steps' errors. It says nothing about accuracy.
+        Whether no step has failed, no check of the invariants has found anything, and the steps' errors explain all
+        corrections. It says nothing about accuracy.
     message : str
         Why the run is not to be trusted; "" where nothing speaks against it.
     worst : (str, float, float) or None

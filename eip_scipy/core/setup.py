@@ -12,7 +12,20 @@ from scipy.integrate import OdeSolver
 from ..engine import kernels as kn
 from ..engine.counters import LAST_RANK
 from ..engine.kernels import NOT_FINITE
-from ..engine.step import ERROR, EUCLIDEAN, NEW, T_NEW, TOO_SMALL, H, Method, Options, T, Work, make_work, project_step
+from ..engine.step import (
+    ERROR,
+    EUCLIDEAN,
+    LENGTH,
+    NEW,
+    TIME,
+    TIME_NEW,
+    TOO_SMALL,
+    Method,
+    Options,
+    Work,
+    make_work,
+    project_step,
+)
 from ..engine.trust import Trust
 from ..methods.nystrom import NystromTableau
 from .inputs import reals, refuse_units, shown
@@ -316,10 +329,10 @@ def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
 def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
     """Why a step failed."""
     if status == NOT_FINITE:
-        return not_finite(run, clock[T], clock[H])
+        return not_finite(run, clock[TIME], clock[LENGTH])
     if status == TOO_SMALL:
         return OdeSolver.TOO_SMALL_STEP
-    return projection_failure(run.invariants, run.work, clock[T_NEW])
+    return projection_failure(run.invariants, run.work, clock[TIME_NEW])
 
 
 def not_finite(run: Run, t: float, h: float) -> str:

@@ -13,7 +13,7 @@ from scipy.integrate import DenseOutput, OdeSolver
 
 from ..engine.counters import FOUND, N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.kernels import FAILED_PROJECTION, OK
-from ..engine.step import T_NEW, T, close_step, next_step, project_any
+from ..engine.step import TIME, TIME_NEW, close_step, next_step, project_any
 from ..engine.trust import ProjectionWarning
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
@@ -177,7 +177,7 @@ class EIPSolver(OdeSolver):
         solver = self.SCIPY(fresh, self.t, start, self.t_bound, **control)
         if np.isnan(solver.h_abs):
             return None  # SciPy's loop would never end
-        solver.fun = derivative  # in the place of SciPy's two wrappers, whose work it does
+        solver.fun = derivative  # in place of SciPy's two wrappers, whose work it does
         return solver
 
     def _scipy_step(self, solver: OdeSolver) -> tuple[bool, str | None]:
@@ -204,7 +204,7 @@ class EIPSolver(OdeSolver):
         run, w, clock = self._run, self._work, self._clock
         y, y_new = self.y, np.empty_like(self.y)
         w.K[0] = self.f
-        clock[T] = self.t
+        clock[TIME] = self.t
         status = next_step(
             self._finish, self._rhs, run.invariants.inv, run.invariants.grad, None, clock, self._k, self._span,
             run.method, run.options, w, y, y.view(float), y_new, y_new.view(float),
@@ -215,7 +215,7 @@ class EIPSolver(OdeSolver):
             return False, setup.failure(status, run, clock)
         self._k += 1
         self.y_old, self.f_old = y, self.f
-        self.y, self.t, self.f = self._accepted, clock[T_NEW], w.K[-1].copy()
+        self.y, self.t, self.f = self._accepted, clock[TIME_NEW], w.K[-1].copy()
         if w.counters[FOUND] != self._found or self._k in setup.LOOKS or self.t == self.t_bound:
             self._watch()
         return True, None

@@ -45,7 +45,7 @@ def project_jointly(t: float, o: Any, w: Any, y_new: np.ndarray, y_new_r: np.nda
 
 
 def _take_note(t: float, lengths: np.ndarray | None, o: Any, w: Any) -> None:
-    """As `take_note` of the step does, with |G_i| |err| in the place of the sum over all components."""
+    """As `take_note` of the step does, with |G_i| |err| in place of the sum over all components."""
     if not o.watched:
         kn.raise_to(w.defect, w.max_defect)
         return

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .caching import cached_njit
-from .lanes import abs_dot, combined_rows, dot, largest, out_of_line, remove_component, weighted_rows
 from .octets import is_not, no_lane, where
+from .sums import abs_dot, combined_rows, dot, largest, out_of_line, remove_component, weighted_rows
 from .triples import shift_and_weigh, shift_bodies, sum_bodies
 from .trust import (
     AT,
@@ -106,7 +106,7 @@ _jit_inline = cached_njit(error_model="numpy", _nrt=False, forceinline=True)
 
 @_jit
 def copy(a, out):
-    """Out = a."""
+    """out = a."""
     for i in range(a.size):
         out[i] = a[i]
 
@@ -153,13 +153,13 @@ def all_finite(a):
 
 @_jit_inline
 def combine(y, h, weights, K, stages, out):
-    """Out = y + h sum_j weights[j] K[j] over the first `stages` rows, zero weights skipped."""
+    """out = y + h sum_j weights[j] K[j] over the first `stages` rows, zero weights skipped."""
     combined_rows(y, h, weights, K, stages, 0, out)
 
 
 @_jit_inline
 def weighted_sum(weights, K, first, scale, out):
-    """Out = scale sum_j weights[j] K[j, first:]."""
+    """out = scale sum_j weights[j] K[j, first:]."""
     weighted_rows(scale, weights, K, weights.size, first, out)
 
 
@@ -238,7 +238,7 @@ def compensated_nystrom(y, carry, h, b, b_low, b_v, b_v_low, K, out, carry_out):
 
 @_jit
 def compensated_add(y, carry, move):
-    """Y + carry += move, in place."""
+    """y + carry += move, in place."""
     for i in range(y.size):
         s, lost = two_sum(y[i], move[i])
         y[i], carry[i] = two_sum(s, lost + carry[i])
@@ -246,7 +246,7 @@ def compensated_add(y, carry, move):
 
 @_jit
 def quadrature(a, b, out):
-    """Out = sqrt(a^2 + b^2), by component; components whose squares would vanish or overflow by hypot."""
+    """out = sqrt(a^2 + b^2), by component; components whose squares would vanish or overflow by hypot."""
     lost = 0
     for i in range(out.size):
         size = abs(a[i]) + abs(b[i])
@@ -263,13 +263,13 @@ def quadrature(a, b, out):
 
 @_jit
 def positive(x):
-    """X, or 1 in the place of 0: a divisor where the quotient does not count."""
+    """x, or 1 in place of 0: a divisor where the quotient does not count."""
     return where(x > 0.0, x, 1.0)
 
 
 @_jit
 def powers(x, exponent):
-    """X <- x**exponent, x in [0, 1]; for RK4 and DOP853 by square roots, several times faster than pow."""
+    """x <- x**exponent, x in [0, 1]; for RK4 and DOP853 by square roots, several times faster than pow."""
     if exponent == 1.25:
         for i in range(x.size):
             x[i] *= sqrt(sqrt(x[i]))
@@ -312,7 +312,7 @@ def block_sums(a, groups, out):
 
 @_jit
 def weighted_squares(weights, a, out):
-    """Out = (weights a)^2, by component."""
+    """out = (weights a)^2, by component."""
     for i in range(a.size):
         x = weights[i] * a[i]
         out[i] = x * x
@@ -448,7 +448,7 @@ def defects(values, target, G, y_hat, scales, compensated, g, band, raw):
 
 @_jit
 def sparse_products(frame, which, a, out):
-    """Out[k] = row k of C (`which` = 0) or of M^T (1) times a."""
+    """out[k] = row k of C (`which` = 0) or of M^T (1) times a."""
     for k in range(out.size):
         total = 0.0
         for p in range(frame.start[which, k], frame.start[which, k + 1]):
@@ -488,7 +488,7 @@ def weigh_rows(G, sigma, frame, B):
 
 @_jit_inline
 def keep_frame(move, frame, out):
-    """Out = move - M C move, neutral to the frame."""
+    """out = move - M C move, neutral to the frame."""
     _, groups, bodies = frame.bodies.shape
     for k in range(groups):
         first = 3 * bodies * k
@@ -688,7 +688,7 @@ def weighted_move(
 
 @_jit
 def add_products(rows, a, out):
-    """Out[i] += rows[i] . a."""
+    """out[i] += rows[i] . a."""
     for i in range(out.size):
         out[i] += dot(rows[i], a)
 
@@ -806,7 +806,7 @@ def weigh_change(size, expected, t, trust):
 
 @_jit
 def trapezoid_error(y, y_hat, h, f, f_hat, err):
-    """Err = y_hat - y - h (f + f_hat) / 2: the size of the local error for orders 1 and 2, above it for others."""
+    """err = y_hat - y - h (f + f_hat) / 2: the size of the local error for orders 1 and 2, above it for others."""
     for i in range(err.size):
         err[i] = y_hat[i] - y[i] - 0.5 * h * (f[i] + f_hat[i])
 
@@ -833,7 +833,7 @@ def raise_to(sizes, record):
 
 @_jit
 def midpoint(a, b, out):
-    """Out = (a + b) / 2."""
+    """out = (a + b) / 2."""
     for i in range(a.size):
         out[i] = 0.5 * (a[i] + b[i])
 

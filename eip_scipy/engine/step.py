@@ -36,7 +36,7 @@ from .counters import (
 )
 from .joint import project_jointly
 from .kernels import FAILED_PROJECTION, NOT_FINITE, OK, POSTPONED, FrameRows, Grouping
-from .lanes import out_of_line
+from .sums import out_of_line
 from .trust import N_FIGURES, TERMS
 
 # Without reference counting and inlined, the driver runs 20 times faster: it hands records of some 40 arrays down.
@@ -58,7 +58,7 @@ HEALTHY, MAX_SOFTENED = 5.0, 3
 TOO_SMALL = 3
 
 # Places in the clock of a run: the current time, the time and length of the step tried last, the length to try next.
-T, T_NEW, H, H_ABS = range(4)
+TIME, TIME_NEW, LENGTH, NEXT_LENGTH = range(4)
 
 
 class Span(NamedTuple):
@@ -572,10 +572,10 @@ def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y
     adaptive = span.h == 0.0
     spacing = AUTO_SPACING if o.every == AUTO else o.every
     if not adaptive:
-        clock[T] = span.t0 + k * span.h
-    t = clock[T]
+        clock[TIME] = span.t0 + k * span.h
+    t = clock[TIME]
     least = kn.least_step(t, span.sign) if adaptive else 0.0
-    h_abs = clock[H_ABS]
+    h_abs = clock[NEXT_LENGTH]
     if h_abs > span.max_step:
         h_abs = span.max_step
     elif h_abs < least:
@@ -590,19 +590,19 @@ def next_step(finish, rhs, inv, grad, params, clock, k, span, m, o, w, y, y_r, y
         else:
             t_new = span.t0 + (k + 1) * span.h
             last = k + 1 >= span.n_steps
-        clock[T_NEW] = span.t_bound if last else t_new
-        clock[H] = span.h if not (adaptive or last) else clock[T_NEW] - t
-        h_abs = abs(clock[H])
+        clock[TIME_NEW] = span.t_bound if last else t_new
+        clock[LENGTH] = span.h if not (adaptive or last) else clock[TIME_NEW] - t
+        h_abs = abs(clock[LENGTH])
         project = o.target.size > 0 and (last or spacing == 1 or (k + 1) % spacing == 0)
-        status = any_raw_step(rhs, params, t, y, y_r, clock[T_NEW], clock[H], project, m, o, w)
+        status = any_raw_step(rhs, params, t, y, y_r, clock[TIME_NEW], clock[LENGTH], project, m, o, w)
         norm = w.norm[0] if adaptive else 0.0
         if status == OK and not isfinite(norm):
             status = NOT_FINITE
         if status == OK and norm < 1.0:
-            status = finish(rhs, inv, grad, params, t, y, y_r, clock[T_NEW], project, last, m, o, w, y_new, y_new_r)
+            status = finish(rhs, inv, grad, params, t, y, y_r, clock[TIME_NEW], project, last, m, o, w, y_new, y_new_r)
             if status == OK:
                 factor = MAX_FACTOR if norm == 0.0 else min(MAX_FACTOR, SAFETY * norm**m.exponent)
-                clock[H_ABS] = h_abs * (min(1.0, factor) if rejected else factor)
+                clock[NEXT_LENGTH] = h_abs * (min(1.0, factor) if rejected else factor)
                 return OK
             if retries == MAX_RETRIES:
                 return status

@@ -155,7 +155,7 @@ def _emit_shift(context: Any, builder: Any, signature: Any, arguments: Any, weig
 
 @intrinsic  # emits LLVM
 def shift_bodies(typingctx, row, weights, x, y, z, out, first, count):
-    """Out = row - weights[j] (x, y, z) for `count` >= 1 bodies j; `out` and `row` must not overlap."""
+    """out = row - weights[j] (x, y, z) for `count` >= 1 bodies j; `out` and `row` must not overlap."""
 
     def codegen(context, builder, signature, arguments):
         return _emit_shift(context, builder, signature, arguments, False)

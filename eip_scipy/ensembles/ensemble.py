@@ -147,7 +147,7 @@ def ensemble(
 ) -> EnsembleResult:
     """Integrate many members of one system: compiled, on all cores, or on a cluster.
 
-    Each member's result is that of its own `integrate`, bit for bit, on whatever and on however many workers it ran.
+    Each member comes out as from its own `integrate`, bit for bit, on whatever and on however many workers it ran.
     A member that fails is reported with its index and reason, and disturbs no other.
 
     Parameters
@@ -157,7 +157,7 @@ def ensemble(
     t_span : (float, float)
         Start and end, the same for all.
     y0s : array_like, shape (members, n)
-        Starts; one (n,) for all where `params` differ. Default: that of a `Problem`.
+        Starts; one (n,) for all where `params` differ. Default: the start of a `Problem`.
     params : array_like of float, shape (p,) or (members, p), optional
         Parameters of all members, or of each.
     method : type, optional

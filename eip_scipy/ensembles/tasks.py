@@ -26,9 +26,9 @@ from ..engine import kernels as kn
 from ..engine.caching import cached_njit
 from ..engine.counters import N_COUNTERS, NFEV
 from ..engine.kernels import OK
-from ..engine.step import H_ABS, T_NEW, T, Work
+from ..engine.step import NEXT_LENGTH, TIME, TIME_NEW, Work
 from ..engine.trust import Trust, sick
-from ..run.driver import PENDING, ROW, STEP, Grid, saved_rows
+from ..run.driver import PENDING, ROW, STEP, Schedule, saved_rows
 from ..run.integrate import ARRIVED, Loop
 from ..run.prepare import Prepared, Request, prepared
 from ..run.resume import Keeper
@@ -146,13 +146,13 @@ class Plan:
         """`ready`: the task's own member, where it is prepared already."""
         self.task = task
         self._ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
-        grid, run = self._ready.grid, self._ready.run
+        schedule, run = self._ready.schedule, self._ready.run
         self.why_not: str | None = None
         self.names = tuple(run.invariants.names)
-        self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, grid.span.t0
-        self.t_bound, self.h = grid.span.t_bound, self._ready.stepping.h
-        self.times = saved_times(grid)
-        self.n_steps = None if grid.span.n_steps >= UNBOUNDED else grid.span.n_steps
+        self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, schedule.span.t0
+        self.t_bound, self.h = schedule.span.t_bound, self._ready.stepping.h
+        self.times = saved_times(schedule)
+        self.n_steps = None if schedule.span.n_steps >= UNBOUNDED else schedule.span.n_steps
         first = np.concatenate([run.work.K[0], run.invariants.start_values])
         self._start_values = [repr(value) for value in first[:COMPARED].tolist()]
         self._together, self._idle = False, list[Sweeper]()
@@ -164,7 +164,7 @@ class Plan:
         self.why_not = loop.why_not
         own_targets = any(item.target is not None for item in ready.run.invariants.items)
         own_start = ready.run.identity["project_initial"] or own_targets
-        single = own_start or loop.events.functions or ready.grid.t_eval.size
+        single = own_start or loop.events.functions or ready.schedule.t_eval.size
         self._together = self.why_not is None and not single
         self._idle = [Sweeper(loop, self.task.members)] if self._together else []
         none = np.zeros((0, self.size), self.dtype), np.zeros((0, loop.driver.params.size))
@@ -230,7 +230,7 @@ class Plan:
         self._idle.append(mine)
 
 
-def saved_times(grid: Grid) -> np.ndarray:
+def saved_times(schedule: Schedule) -> np.ndarray:
     """Times of the rows that a run saves; none where it saves its two ends only.
 
     Raises
@@ -238,23 +238,25 @@ def saved_times(grid: Grid) -> np.ndarray:
     ValueError
         Where each member would save at times of its own.
     """
-    if grid.t_eval.size:
-        return grid.t_eval.copy()
-    if grid.save_every == 0:
+    if schedule.t_eval.size:
+        return schedule.t_eval.copy()
+    if schedule.save_every == 0:
         return np.zeros(0)
-    if saved_rows(grid) == 0:
+    if saved_rows(schedule) == 0:
         raise ValueError(
             "save_every in an ensemble needs fixed steps h and a finite interval: with adaptive steps each member "
             "would save at times of its own; give t_eval."
         )
-    times = grid.span.t0 + saved_steps(grid) * grid.span.h
-    times[-1] = grid.span.t_bound
+    times = schedule.span.t0 + saved_steps(schedule) * schedule.span.h
+    times[-1] = schedule.span.t_bound
     return times
 
 
-def saved_steps(grid: Grid) -> np.ndarray:
+def saved_steps(schedule: Schedule) -> np.ndarray:
     """Steps after which a run of fixed steps saves its state, the start included."""
-    return np.unique([*range(0, grid.span.n_steps, grid.save_every or grid.span.n_steps), grid.span.n_steps])
+    return np.unique(
+        [*range(0, schedule.span.n_steps, schedule.save_every or schedule.span.n_steps), schedule.span.n_steps]
+    )
 
 
 def run_members(plan: Plan, y0s: np.ndarray, params: np.ndarray, stop: threading.Event | None = None) -> Members:
@@ -354,7 +356,7 @@ def _reason(error: BaseException) -> str:
 
 
 def sweep(
-    advance, rhs, inv, grad, event, params, grid, m, o, w, y, y_r, y_new, y_new_r, t_saved,
+    advance, rhs, inv, grad, event, params, schedule, m, o, w, y, y_r, y_new, y_new_r, t_saved,
     buffers, fresh, G, G_r, where, last, k_end, starts, taus, evaluations, all_params, saved, ends, defects, counters,
     corrections, figures,
 ):  # fmt: skip
@@ -363,8 +365,8 @@ def sweep(
     Returns its code; where[0] is then `last`, or the member that it is about, which Python looks at: it failed, or is
     not at its end after `k_end` steps, or (DOUBTFUL) its start is not finite in some part.
     """
-    place, clock = grid.place, grid.clock
-    t0 = grid.span.t0
+    place, clock = schedule.place, schedule.clock
+    t0 = schedule.span.t0
     while where[0] < last:
         k = where[0]
         for i in range(len(buffers)):
@@ -373,9 +375,9 @@ def sweep(
         kn.copy(starts[k], y)
         place[STEP] = 0
         place[PENDING] = 0
-        clock[T] = t0
-        clock[T_NEW] = t0
-        clock[H_ABS] = taus[k]
+        clock[TIME] = t0
+        clock[TIME_NEW] = t0
+        clock[NEXT_LENGTH] = taus[k]
         if isnan(taus[k]):
             return DOUBTFUL
         rhs(t0, y, w.K[0], params)
@@ -391,8 +393,8 @@ def sweep(
         t_saved[0] = t0
         kn.copy(y_r, rows[0])
         place[ROW] = 1
-        code = advance(rhs, inv, grad, event, params, grid, k_end, m, o, w, y, y_r, y_new, y_new_r, t_saved, rows)
-        if code != OK or clock[T] != grid.span.t_bound:
+        code = advance(rhs, inv, grad, event, params, schedule, k_end, m, o, w, y, y_r, y_new, y_new_r, t_saved, rows)
+        if code != OK or clock[TIME] != schedule.span.t_bound:
             return code
         kn.copy(y, ends[k])
         kn.copy(w.max_defect, defects[k])
@@ -440,7 +442,7 @@ class Sweeper:
 
     def __init__(self, loop: Loop, members: int) -> None:
         self.loop = loop
-        driver, span = loop.driver, loop.driver.grid.span
+        driver, span = loop.driver, loop.driver.schedule.span
         buffers = _buffers(driver.run.work)
         self._buffers = tuple(a.reshape(-1).view(np.int64) for a in buffers)
         self._fresh = tuple(a.copy() for a in self._buffers)
@@ -504,7 +506,7 @@ class Sweeper:
     def _look_at_ends(self, each: _Each, out: Members) -> None:
         """Check the invariants at the end of the first member that got there and, where they are none, of all."""
         driver = self.loop.driver
-        run, t = driver.run, driver.grid.span.t_bound
+        run, t = driver.run, driver.schedule.span.t_bound
         arrived = np.flatnonzero(out.status == 0)
         if not run.options.watched:
             return
@@ -524,7 +526,7 @@ class Sweeper:
         """Members that the sweep took to their ends, and what their corrections say."""
         run = self.loop.driver.run
         out.status[those] = 0
-        out.t[those] = self.loop.driver.grid.span.t_bound
+        out.t[those] = self.loop.driver.schedule.span.t_bound
         figures = each.figures[those].reshape(those.stop - those.start, *run.work.trust.shape)
         out.trusted[those] = ~sick(figures).any(axis=1)
         out.message[those] = [
@@ -539,7 +541,7 @@ class Sweeper:
             return 0, []
         if m == 0:
             batch.compile()
-        meetings = saved_steps(self.loop.driver.grid)[1:].tolist()
+        meetings = saved_steps(self.loop.driver.schedule)[1:].tolist()
         first, again = 0, []
         while m - first >= batch.lanes // 4:
             group = slice(first, min(m, first + batch.lanes))
@@ -566,7 +568,7 @@ class Sweeper:
         driver, G = self.loop.driver, self._G
         rows = self._row_buffer if each.saved is None else each.saved.view(float)
         passed = (
-            *(driver.params, driver.grid, *driver._tail, driver.t, self._buffers, self._fresh, G),
+            *(driver.params, driver.schedule, *driver._tail, driver.t, self._buffers, self._fresh, G),
             *(G.view(float), self._where, last, self.loop.chunk),
             *(each.y0s, each.taus, each.evaluations, each.params, rows),
             *(out.y, out.max_defect, out.counters, out.max_correction, each.figures),
@@ -599,7 +601,7 @@ class Sweeper:
             loop.driver.run.trust.doubts.clear()
             _finish(plan, loop, k, out, watch)
         else:
-            _store(loop, k, FAILED, setup.failure(code, loop.driver.run, loop.driver.grid.clock), out)
+            _store(loop, k, FAILED, setup.failure(code, loop.driver.run, loop.driver.schedule.clock), out)
 
     def _first_steps(self, plan: Plan, y0s: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, int]:
         """Lengths of the first steps, and the evaluations before them."""
@@ -610,7 +612,7 @@ class Sweeper:
         for k, (y0, p) in enumerate(zip(y0s, params, strict=True)):
             derivative = self._derivative(p)
             try:
-                taus[k] = stepping.first(derivative, y0, derivative(driver.grid.span.t0, y0), self.loop.tableau)
+                taus[k] = stepping.first(derivative, y0, derivative(driver.schedule.span.t0, y0), self.loop.tableau)
             except Exception:
                 taus[k] = np.nan
         return taus, self._evaluations

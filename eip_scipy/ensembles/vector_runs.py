@@ -21,7 +21,7 @@ from ..engine.caching import cached_njit
 from ..engine.counters import FOUND, LAST_RANK, N_COUNTERS, NFEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
 from ..engine.kernels import OK
 from ..engine.octets import LANES
-from ..engine.step import AUTO, NEW, Options, Span, T
+from ..engine.step import AUTO, NEW, TIME, Options, Span
 from ..engine.trust import EXPECTED, START, SUM, TERMS, TOGETHER
 from ..run.driver import PENDING, ROW, STEP, source_stamp
 from ..run.integrate import Loop
@@ -87,7 +87,7 @@ class Batch:
 
     def __init__(self, loop: Loop) -> None:
         driver = loop.driver
-        run, span = driver.run, driver.grid.span
+        run, span = driver.run, driver.schedule.span
         if not can_run(run.options, span, run.y0.dtype):
             raise NotCompilableError("members with these options run one by one")
         self.functions = loop.in_octets()
@@ -119,7 +119,7 @@ class Batch:
         save: Callable[[int, np.ndarray], None],
         watch: Callable[[], None],
     ) -> list[Ended | None]:
-        """Run up to `lanes` members; None for one that is to run alone.
+        """Run up to `sums` members; None for one that is to run alone.
 
         These are members whose start is not finite in some part, and those of whom something stands out.
         `meetings` are the steps (the last one at the end) at which ``save(row, states (m, n))`` is called; `watch` is
@@ -221,7 +221,7 @@ class Batch:
     def _alone(self, lane: int, end: int, params: np.ndarray) -> None:
         """A member that left: by the driver of single runs to step `end`, and back into its lane."""
         s, left, driver = self._s, self._s.left, self.loop.driver
-        w, grid = driver.run.work, driver.grid
+        w, schedule = driver.run.work, driver.schedule
         for a, fresh in zip(self._single_work, self._fresh, strict=True):
             a[...] = fresh
         driver.state[:], w.K[0], w.err_sum[:] = left.y[:, lane], left.f[:, lane], left.err_sum[:, lane]
@@ -232,11 +232,11 @@ class Batch:
         w.counters[:] = self._counters(lane, left.counters[:, lane])
         w.trust[:] = s.trust[:, :, lane]
         k = int(left.step[lane])
-        grid.place[STEP], grid.place[ROW], grid.place[PENDING] = k, 0, 0
-        grid.clock[T] = grid.span.t0 + k * grid.span.h
+        schedule.place[STEP], schedule.place[ROW], schedule.place[PENDING] = k, 0, 0
+        schedule.clock[TIME] = schedule.span.t0 + k * schedule.span.h
         try:
             code = driver.advance(end)
-            reason = "" if code == OK else setup.failure(code, driver.run, grid.clock)
+            reason = "" if code == OK else setup.failure(code, driver.run, schedule.clock)
         except Exception as error:
             reason = f"{type(error).__name__}: {error}"
         left.step[lane] = -1

@@ -20,9 +20,9 @@ import numpy as np
 from ..engine import kernels as kn
 from ..engine.counters import HAVE_ERROR, N_COUNTERS, NJEV, WAITED
 from ..engine.kernels import OK, FrameRows
-from ..engine.lanes import abs_dot, dot, largest, out_of_line
 from ..engine.octets import LANES, any_lane, is_not, lane_of, octets, spread, where
 from ..engine.step import ERROR, HEALTHY, Work, _jitable, advance_raw, close_step, look_back, make_work
+from ..engine.sums import abs_dot, dot, largest, out_of_line
 from ..engine.trust import EXPECTED, FAR, LARGE, LARGE_SHARE, LEFT, N_FIGURES, START, SUM, TERMS
 
 __all__ = ["Lanes", "Leavers", "finish_batch", "make_advance_batch", "make_lanes", "make_lanes_work"]

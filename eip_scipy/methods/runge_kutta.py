@@ -349,7 +349,7 @@ RK4 = _Published(
     order=4,
     b_hat=["1/6", "1/3", "1/3", 0, "1/6"],
     error_estimator_order=3,
-    reference=f"{_PAPER} (the classical method); estimate: f at the new point in the place of the fourth stage",
+    reference=f"{_PAPER} (the classical method); estimate: f at the new point in place of the fourth stage",
 )
 RK5 = _Published(
     "RK5",

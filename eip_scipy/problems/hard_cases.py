@@ -66,7 +66,7 @@ class HardCase:
         return float(np.max(np.abs(values - values[0]) / np.maximum(sizes, 1e-3 * sizes.max())))
 
 
-class Equations(NamedTuple):
+class CaseEquations(NamedTuple):
     """``fun(t, y) -> (n,)``, ``values(t, y) -> (l,)`` and ``gradients(t, y) -> (l, n)``."""
 
     fun: Callable[..., np.ndarray]
@@ -138,7 +138,7 @@ def _state(record: dict[str, Any], key: str) -> np.ndarray:
 # --- planar motion, y = (x, z, u, v) with velocity (u, v) ---
 
 
-def kepler(mu: float) -> Equations:
+def kepler(mu: float) -> CaseEquations:
     """Kepler problem; energy, angular momentum."""
 
     def fun(t, y):
@@ -157,10 +157,10 @@ def kepler(mu: float) -> Equations:
         r3 = r2 * np.sqrt(r2)
         return np.array([[mu * x / r3, mu * z / r3, u, v], [v, -u, -z, x]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def perturbed_kepler(delta: float) -> Equations:
+def perturbed_kepler(delta: float) -> CaseEquations:
     """Potential -1 / r - delta / (2 r^3); energy, angular momentum."""
 
     def attraction(r2):
@@ -183,10 +183,10 @@ def perturbed_kepler(delta: float) -> Equations:
         w = attraction(x * x + z * z)
         return np.array([[w * x, w * z, u, v], [v, -u, -z, x]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def arenstorf(mu: float) -> Equations:
+def arenstorf(mu: float) -> CaseEquations:
     """Restricted three-body problem in the rotating frame; Jacobi's integral."""
     rest = 1 - mu
 
@@ -211,10 +211,10 @@ def arenstorf(mu: float) -> Equations:
         a, b = attractions(x, z)
         return np.array([[2 * (x - a * (x + mu) - b * (x - rest)), 2 * (z - (a + b) * z), -2 * u, -2 * v]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def henon_heiles() -> Equations:
+def henon_heiles() -> CaseEquations:
     """Hénon and Heiles; energy."""
 
     def fun(t, y):
@@ -229,10 +229,10 @@ def henon_heiles() -> Equations:
         x, z, u, v = y
         return np.array([[x + 2 * x * z, z + x * x - z * z, u, v]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def boris_2d(charge: float) -> Equations:
+def boris_2d(charge: float) -> CaseEquations:
     """Charged particle in B = r e_z and the potential charge / r; energy, canonical angular momentum."""
 
     def fun(t, y):
@@ -255,13 +255,13 @@ def boris_2d(charge: float) -> Equations:
         e = charge / (r2 * r)
         return np.array([[-e * x, -e * z, u, v], [v + r * x, -u + r * z, -z, x]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
 # --- bodies, pendulums, particles ---
 
 
-def n_body(masses: list[float], G: float, dimension: int) -> Equations:
+def n_body(masses: list[float], G: float, dimension: int) -> CaseEquations:
     """N bodies, y = (q, v) body by body; energy, momentum, angular momentum."""
     m = np.array(masses)
     planes = [(0, 1)] if dimension == 2 else [(1, 2), (2, 0), (0, 1)]
@@ -299,42 +299,42 @@ def n_body(masses: list[float], G: float, dimension: int) -> Equations:
             row[1, :, b], row[1, :, a] = m * q[:, a], -m * q[:, b]
         return rows.reshape(len(rows), -1)
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def pendulum() -> Equations:
+def pendulum() -> CaseEquations:
     """Mathematical pendulum; energy."""
-    return Equations(
+    return CaseEquations(
         lambda t, y: np.array([y[1], -np.sin(y[0])]),
         lambda t, y: np.array([y[1] * y[1] / 2 - np.cos(y[0])]),
         lambda t, y: np.array([[np.sin(y[0]), y[1]]]),
     )
 
 
-def duffing() -> Equations:
+def duffing() -> CaseEquations:
     """The equation x'' = x - x^3; energy."""
 
     def values(t, y):
         q, p = y
         return np.array([p * p / 2 - q * q / 2 + q * q * q * q / 4])
 
-    return Equations(
+    return CaseEquations(
         lambda t, y: np.array([y[1], y[0] - y[0] * y[0] * y[0]]),
         values,
         lambda t, y: np.array([[y[0] * y[0] * y[0] - y[0], y[1]]]),
     )
 
 
-def oscillator() -> Equations:
+def oscillator() -> CaseEquations:
     """Harmonic oscillator; energy."""
-    return Equations(
+    return CaseEquations(
         lambda t, y: np.array([y[1], -y[0]]),
         lambda t, y: np.array([(y[1] * y[1] + y[0] * y[0]) / 2]),
         lambda t, y: np.array([[y[0], y[1]]]),
     )
 
 
-def double_pendulum(g: float) -> Equations:
+def double_pendulum(g: float) -> CaseEquations:
     """Two equal pendulums, y = (angles, momenta); energy."""
 
     def fun(t, y):
@@ -355,10 +355,10 @@ def double_pendulum(g: float) -> Equations:
         f = fun(t, y)
         return np.array([[-f[2], -f[3], f[0], f[1]]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def spherical_pendulum(g: float) -> Equations:
+def spherical_pendulum(g: float) -> CaseEquations:
     """Pendulum in space in Cartesian coordinates; its constraints, energy, angular momentum."""
 
     def fun(t, y):
@@ -374,10 +374,10 @@ def spherical_pendulum(g: float) -> Equations:
         a, b, c, u, v, w = y
         return np.array([[a, b, c, 0, 0, 0], [u, v, w, a, b, c], [0, 0, g, u, v, w], [v, -u, 0, -b, a, 0]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def fput(omega: float) -> Equations:
+def fput(omega: float) -> CaseEquations:
     """Fermi, Pasta, Ulam and Tsingou with stiff springs; energy."""
 
     def soft(y):
@@ -396,10 +396,10 @@ def fput(omega: float) -> Equations:
     def gradients(t, y):
         return np.array([np.concatenate([-fun(t, y)[6:], y[6:]])])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def vortices(strengths: list[float]) -> Equations:
+def vortices(strengths: list[float]) -> CaseEquations:
     """Point vortices, y = (x, y) vortex by vortex; energy, momenta, angular impulse."""
     k = np.array(strengths)
     first, second = np.triu_indices(k.size, 1)
@@ -426,10 +426,10 @@ def vortices(strengths: list[float]) -> Equations:
         rows[3] = 2 * k[:, None] * z
         return rows.reshape(4, -1)
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def tokamak() -> Equations:
+def tokamak() -> CaseEquations:
     """Charged particle in an axisymmetric field, R0 = B0 = 1, q = 2; energy, toroidal momentum."""
 
     def fun(t, y):
@@ -450,10 +450,10 @@ def tokamak() -> Equations:
         k = (R - 1) / (2 * R)
         return np.array([[0, 0, 0, a, b, c], [b + k * x, -a + k * w, z / 2, -w, x, 0]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def schwarzschild() -> Equations:
+def schwarzschild() -> CaseEquations:
     """Geodesic, M = 1, y = (t, r, phi, E, p_r, L); mass shell, energy, angular momentum."""
 
     def fun(t, y):
@@ -473,13 +473,13 @@ def schwarzschild() -> Equations:
         radial = E * E / (a * a * r * r) + p * p / (r * r) - L * L / (r * r * r)
         return np.array([[0, radial, 0, -E / a, a * p, L / (r * r)], [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, 1]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
 # --- tops, spins, attitude ---
 
 
-def rigid_body(i1: float, i2: float, i3: float) -> Equations:
+def rigid_body(i1: float, i2: float, i3: float) -> CaseEquations:
     """Euler's top, y = the angular momentum; Casimir, energy."""
 
     def fun(t, y):
@@ -494,10 +494,10 @@ def rigid_body(i1: float, i2: float, i3: float) -> Equations:
         a, b, c = y
         return np.array([[a, b, c], [a / i1, b / i2, c / i3]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def euler_detest(k2: float) -> Equations:
+def euler_detest(k2: float) -> CaseEquations:
     """Problem B5 of DETEST: Jacobi's elliptic functions; two quadratic invariants."""
 
     def fun(t, y):
@@ -512,10 +512,10 @@ def euler_detest(k2: float) -> Equations:
         a, b, c = y
         return np.array([[2 * a, 2 * b, 0], [2 * k2 * a, 0, 2 * c]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def quaternion(w3: float) -> Equations:
+def quaternion(w3: float) -> CaseEquations:
     """Attitude under the angular velocity (sin t, cos 2t, w3); norm."""
 
     def fun(t, y):
@@ -524,10 +524,10 @@ def quaternion(w3: float) -> Equations:
         turned = [-(a * u + b * v + c * w), s * u + b * w - c * v, s * v + c * u - a * w, s * w + a * v - b * u]
         return np.array(turned) / 2
 
-    return Equations(fun, lambda t, y: np.array([y @ y]), lambda t, y: np.array([2 * y]))
+    return CaseEquations(fun, lambda t, y: np.array([y @ y]), lambda t, y: np.array([2 * y]))
 
 
-def heisenberg(anisotropy: float) -> Equations:
+def heisenberg(anisotropy: float) -> CaseEquations:
     """Ring of spins (Landau and Lifshitz); their lengths, energy, total spin along z."""
     axis = np.array([0.0, 0.0, anisotropy])
 
@@ -549,22 +549,22 @@ def heisenberg(anisotropy: float) -> Equations:
         rows[n + 1, :, 2] = 1
         return rows.reshape(n + 2, -1)
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
 # --- populations, lattices, fields ---
 
 
-def lotka_volterra() -> Equations:
+def lotka_volterra() -> CaseEquations:
     """Predator and prey; ln u - u + 2 ln v - v."""
-    return Equations(
+    return CaseEquations(
         lambda t, y: np.array([y[0] * (y[1] - 2), y[1] * (1 - y[0])]),
         lambda t, y: np.array([np.log(y[0]) - y[0] + 2 * np.log(y[1]) - y[1]]),
         lambda t, y: np.array([[1 / y[0] - 1, 2 / y[1] - 1]]),
     )
 
 
-def sir(infection: float, recovery: float) -> Equations:
+def sir(infection: float, recovery: float) -> CaseEquations:
     """Epidemic of Kermack and McKendrick, y = (S, I, R); S + I + R and I + S - (recovery / infection) ln S."""
     ratio = recovery / infection
 
@@ -576,33 +576,33 @@ def sir(infection: float, recovery: float) -> Equations:
         s, i, r = y
         return np.array([s + i + r, i + s - ratio * np.log(s)])
 
-    return Equations(fun, values, lambda t, y: np.array([[1, 1, 1], [1 - ratio / y[0], 1, 0]]))
+    return CaseEquations(fun, values, lambda t, y: np.array([[1, 1, 1], [1 - ratio / y[0], 1, 0]]))
 
 
-def volterra_lattice() -> Equations:
+def volterra_lattice() -> CaseEquations:
     """Kac and van Moerbeke's lattice; sum, quadratic invariant, logarithm of the product."""
 
     def values(t, y):
         return np.array([y.sum(), (y * y / 2 + y * np.roll(y, -1)).sum(), np.log(y).sum()])
 
-    return Equations(
+    return CaseEquations(
         lambda t, y: y * (np.roll(y, -1) - np.roll(y, 1)),
         values,
         lambda t, y: np.array([np.ones(y.size), y + np.roll(y, -1) + np.roll(y, 1), 1 / y]),
     )
 
 
-def zabusky_kruskal(c1: float, c2: float) -> Equations:
+def zabusky_kruskal(c1: float, c2: float) -> CaseEquations:
     """Korteweg and de Vries's equation in Zabusky and Kruskal's scheme; sum of u, sum of u^2."""
 
     def fun(t, y):
         a, b = np.roll(y, -1), np.roll(y, 1)
         return -(a + y + b) * (a - b) * c1 - c2 * (np.roll(y, -2) - 2 * a + 2 * b - np.roll(y, 2))
 
-    return Equations(fun, lambda t, y: np.array([y.sum(), y @ y]), lambda t, y: np.array([np.ones(y.size), 2 * y]))
+    return CaseEquations(fun, lambda t, y: np.array([y.sum(), y @ y]), lambda t, y: np.array([np.ones(y.size), 2 * y]))
 
 
-def sine_gordon(coupling: float) -> Equations:
+def sine_gordon(coupling: float) -> CaseEquations:
     """Periodic chain of Frenkel and Kontorova, y = (u, v); energy."""
 
     def fun(t, y):
@@ -618,10 +618,10 @@ def sine_gordon(coupling: float) -> Equations:
         v, force = y[y.size // 2 :], fun(t, y)[y.size // 2 :]
         return np.array([np.concatenate([-force, v])])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def three_wave() -> Equations:
+def three_wave() -> CaseEquations:
     """Resonant interaction of three waves, complex; two of Manley and Rowe's relations, energy."""
 
     def fun(t, y):
@@ -637,10 +637,10 @@ def three_wave() -> Equations:
         a, b, c = y
         return 2 * np.array([[a, 0, c], [0, b, c], [np.conj(b) * c, np.conj(a) * c, a * b]])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def ablowitz_ladik() -> Equations:
+def ablowitz_ladik() -> CaseEquations:
     """Ablowitz and Ladik's periodic lattice, complex; mass, real and imaginary part of the correlation."""
 
     def square(y):
@@ -657,10 +657,10 @@ def ablowitz_ladik() -> Equations:
         right, left = np.roll(y, -1), np.roll(y, 1)
         return np.array([2 * y / (1 + square(y)), right + left, 1j * (right - left)])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-def brockett() -> Equations:
+def brockett() -> CaseEquations:
     """Double-bracket flow L' = [L, [L, diag(1, 2, 3)]], y = (diagonal, off-diagonals); traces of L, L^2, L^3."""
     where = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2]])
     levels = np.diag([1.0, 2.0, 3.0])
@@ -681,10 +681,10 @@ def brockett() -> Equations:
         index = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])
         return np.array([(k + 1) * counted * power[index] for k, power in enumerate(powers)])
 
-    return Equations(fun, values, gradients)
+    return CaseEquations(fun, values, gradients)
 
 
-EQUATIONS: dict[str, Callable[..., Equations]] = {
+EQUATIONS: dict[str, Callable[..., CaseEquations]] = {
     make.__name__: make
     for make in (
         *(kepler, perturbed_kepler, arenstorf, henon_heiles, boris_2d, n_body, pendulum, duffing, oscillator),

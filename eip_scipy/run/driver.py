@@ -19,16 +19,27 @@ from ..core.stepping import UNBOUNDED, AnyMethod
 from ..engine import kernels as kn
 from ..engine.caching import cached_njit
 from ..engine.kernels import OK
-from ..engine.step import T_NEW, Span, T, finish_step, next_step
+from ..engine.step import TIME, TIME_NEW, Span, finish_step, next_step
 
-__all__ = ["FULL", "PAUSE", "PENDING", "ROW", "STEP", "Driver", "Grid", "check_memory", "saved_rows", "source_stamp"]
+__all__ = [
+    "FULL",
+    "PAUSE",
+    "PENDING",
+    "ROW",
+    "STEP",
+    "Driver",
+    "Schedule",
+    "check_memory",
+    "saved_rows",
+    "source_stamp",
+]
 
 FIRST_ROWS = 1024
 STEP, ROW, PENDING = 0, 1, 2
 PAUSE, FULL = 10, 11
 
 
-class Grid(NamedTuple):
+class Schedule(NamedTuple):
     """Where a run steps and what it saves.
 
     `place` holds [step, row, pending]: pending is 1 between a step and its becoming the current state, so that whoever
@@ -52,7 +63,7 @@ def source_stamp(*names: str) -> str:
     would leave the old driver, with the old kernel inlined, in use.
     """
     folder = Path(__file__).parents[1]
-    engine = ("octets", "lanes", "triples", "trust", "kernels", "step")
+    engine = ("octets", "sums", "triples", "trust", "kernels", "step")
     names = (*(f"engine/{name}.py" for name in engine), *names)
     return hashlib.sha256(b"".join((folder / name).read_bytes() for name in names)).hexdigest()
 
@@ -60,40 +71,40 @@ def source_stamp(*names: str) -> str:
 def make_advance(stamp):
     """The loop over steps; `stamp` enters the key of its cache."""
 
-    def advance(rhs, inv, grad, event, params, grid, k_end, m, o, w, y, y_r, y_new, y_new_r, t_saved, y_saved):
+    def advance(rhs, inv, grad, event, params, schedule, k_end, m, o, w, y, y_r, y_new, y_new_r, t_saved, y_saved):
         """Steps up to `k_end`; the one loop of compiled and interpreted runs. Returns OK or why it stopped."""
         _ = stamp
-        place, clock = grid.place, grid.clock
+        place, clock = schedule.place, schedule.clock
         while True:
             if place[PENDING] == 1:
-                clock[T] = clock[T_NEW]
+                clock[TIME] = clock[TIME_NEW]
                 kn.copy(w.K_r[-1], w.K_r[0])
                 kn.copy(y_new_r, y_r)
-                kn.copy(grid.g_new, grid.g)
+                kn.copy(schedule.g_new, schedule.g)
                 place[PENDING] = 0
             k = place[STEP]
-            if clock[T] == grid.span.t_bound or k >= k_end:
+            if clock[TIME] == schedule.span.t_bound or k >= k_end:
                 return OK
             if place[ROW] + 2 > t_saved.size:
                 return FULL
             status = next_step(
-                finish_step, rhs, inv, grad, params, clock, k, grid.span, m, o, w, y, y_r, y_new, y_new_r
+                finish_step, rhs, inv, grad, params, clock, k, schedule.span, m, o, w, y, y_r, y_new, y_new_r
             )
             if status != OK:
                 return status
             place[STEP] = k + 1
             place[PENDING] = 1
-            t_new = clock[T_NEW]
-            saved = t_new == grid.span.t_bound or (grid.save_every > 0 and (k + 1) % grid.save_every == 0)
-            if grid.t_eval.size == 0 and saved:
+            t_new = clock[TIME_NEW]
+            saved = t_new == schedule.span.t_bound or (schedule.save_every > 0 and (k + 1) % schedule.save_every == 0)
+            if schedule.t_eval.size == 0 and saved:
                 t_saved[place[ROW]] = t_new
                 kn.copy(y_new_r, y_saved[place[ROW]])
                 place[ROW] += 1
-            if grid.g.size > 0:
-                event(t_new, y_new, grid.g_new, params)
-                if kn.crossed(grid.g, grid.g_new, grid.g_direction):
+            if schedule.g.size > 0:
+                event(t_new, y_new, schedule.g_new, params)
+                if kn.crossed(schedule.g, schedule.g_new, schedule.g_direction):
                     return PAUSE
-            if place[ROW] < grid.t_eval.size and grid.span.sign * (grid.t_eval[place[ROW]] - t_new) <= 0.0:
+            if place[ROW] < schedule.t_eval.size and schedule.span.sign * (schedule.t_eval[place[ROW]] - t_new) <= 0.0:
                 return PAUSE
 
     return advance
@@ -127,9 +138,11 @@ def _compiled_values(dtype: np.dtype, arguments: tuple[Any, ...]) -> Callable[..
 class Driver:
     """One run: its functions, buffers and the rows saved so far."""
 
-    def __init__(self, run: Run, grid: Grid, functions: CompiledFunctions, params: np.ndarray, compiled: bool) -> None:
-        self.run, self.grid, self.functions, self.params, self.compiled = run, grid, functions, params, compiled
-        rows = saved_rows(grid) or FIRST_ROWS
+    def __init__(
+        self, run: Run, schedule: Schedule, functions: CompiledFunctions, params: np.ndarray, compiled: bool
+    ) -> None:
+        self.run, self.schedule, self.functions, self.params, self.compiled = run, schedule, functions, params, compiled
+        rows = saved_rows(schedule) or FIRST_ROWS
         n, dtype = run.y0.size, run.y0.dtype
         # One row to spare for the last state of a run that ends early.
         self.t = np.empty(rows + 1)
@@ -149,12 +162,12 @@ class Driver:
         )
         self._advance: Callable[..., int] = advance
         if compiled:
-            arguments = tuple(typeof(a) for a in (params, grid, 0, *self._tail, self.t, self.y.view(float)))
+            arguments = tuple(typeof(a) for a in (params, schedule, 0, *self._tail, self.t, self.y.view(float)))
             self._advance = _compiled_advance(dtype, arguments)
 
     def advance(self, k_end: int) -> int:
         """Step on to step `k_end`, or to what stops the loop before it; returns the loop's code."""
-        arguments = (self.params, self.grid, k_end, *self._tail, self.t, self.y.view(float))
+        arguments = (self.params, self.schedule, k_end, *self._tail, self.t, self.y.view(float))
         try:
             return self._advance(*self.functions, *arguments)
         except ChangedShapeError as error:
@@ -163,34 +176,34 @@ class Driver:
 
     def place(self, error: ChangedShapeError) -> None:
         """Add the step to an error that compiled code raises, which cannot put a number into it."""
-        error.args = (f"{error}, in the step from t={self.grid.clock[T]:.10g}",)
+        error.args = (f"{error}, in the step from t={self.schedule.clock[TIME]:.10g}",)
 
     @property
     def step(self) -> int:
         """Steps made so far."""
-        return int(self.grid.place[STEP])
+        return int(self.schedule.place[STEP])
 
     @property
     def rows(self) -> int:
         """Rows saved so far."""
-        return int(self.grid.place[ROW])
+        return int(self.schedule.place[ROW])
 
     @property
     def now(self) -> tuple[float, np.ndarray]:
         """Time and state after the last step that was accepted."""
-        pending = self.grid.place[PENDING] == 1
-        return float(self.grid.clock[T_NEW if pending else T]), self.new if pending else self.state
+        pending = self.schedule.place[PENDING] == 1
+        return float(self.schedule.clock[TIME_NEW if pending else TIME]), self.new if pending else self.state
 
     def parts(self) -> dict[str, np.ndarray]:
         """The buffers that decide the steps to come, or count; all others are filled before they are read."""
-        w, grid = self.run.work, self.grid
+        w, schedule = self.run.work, self.schedule
         kept = ("carry", "err_sum", "sigma", "defect", "max_defect", "max_correction", "trust", "counters")
         return {
-            "place": grid.place,
-            "clock": grid.clock,
+            "place": schedule.place,
+            "clock": schedule.clock,
             "y": self.state,
             "slope": w.K[0],
-            "g": grid.g,
+            "g": schedule.g,
             "target": self.run.options.target,
             **{name: getattr(w, name) for name in kept},
         }
@@ -198,11 +211,11 @@ class Driver:
     def snapshot(self) -> dict[str, np.ndarray]:
         """Copies of these after the last accepted step, made current as the loop does it."""
         copies = {name: part.copy() for name, part in self.parts().items()}
-        if self.grid.place[PENDING] == 1:
+        if self.schedule.place[PENDING] == 1:
             copies["place"][PENDING] = 0
-            copies["clock"][T] = self.grid.clock[T_NEW]
+            copies["clock"][TIME] = self.schedule.clock[TIME_NEW]
             copies["y"], copies["slope"] = self.new.copy(), self.run.work.K[-1].copy()
-            copies["g"] = self.grid.g_new.copy()
+            copies["g"] = self.schedule.g_new.copy()
         return copies
 
     def load(self, t: np.ndarray, y: np.ndarray, max_bytes: float) -> None:
@@ -214,12 +227,12 @@ class Driver:
     def save(self, t: float, y: np.ndarray) -> None:
         """One more row."""
         self.t[self.rows], self.y[self.rows] = t, y
-        self.grid.place[ROW] += 1
+        self.schedule.place[ROW] += 1
 
     def save_start(self) -> None:
         """The first row: the start, where it is asked for and not there already."""
-        if self.rows == 0 and (self.grid.t_eval.size == 0 or self.grid.t_eval[0] == self.grid.span.t0):
-            self.save(self.grid.span.t0, self.state)
+        if self.rows == 0 and (self.schedule.t_eval.size == 0 or self.schedule.t_eval[0] == self.schedule.span.t0):
+            self.save(self.schedule.span.t0, self.state)
 
     def save_now(self) -> None:
         """After an early end: the last accepted state too."""
@@ -229,8 +242,8 @@ class Driver:
 
     def cut(self, t: float, y: np.ndarray) -> None:
         """End the rows with the state at which an event ended the run inside the last step."""
-        while self.rows and self.grid.span.sign * (self.t[self.rows - 1] - t) >= 0:
-            self.grid.place[ROW] -= 1
+        while self.rows and self.schedule.span.sign * (self.t[self.rows - 1] - t) >= 0:
+            self.schedule.place[ROW] -= 1
         self.save(t, y)
 
     def grow(self, max_bytes: float) -> None:
@@ -248,7 +261,7 @@ class Driver:
 
     def dense(self, tableau: AnyMethod, rhs: Callable[..., None]) -> ManifoldDenseOutput:
         """Dense output over the step that is pending."""
-        t_old, t = (float(self.grid.clock[place]) for place in (T, T_NEW))
+        t_old, t = (float(self.schedule.clock[place]) for place in (TIME, TIME_NEW))
         K = self.run.work.K
         old, end = End(t_old, self.state, K[0].copy()), End(t, self.new, K[-1].copy())
         return dense_output(rhs, self.run, tableau, old, end, self.params)
@@ -265,15 +278,15 @@ class Driver:
         return out.T
 
 
-def saved_rows(grid: Grid) -> int:
+def saved_rows(schedule: Schedule) -> int:
     """States that a run saves, its start included; 0 where that is not known before."""
-    if grid.t_eval.size:
-        return grid.t_eval.size
-    if grid.save_every == 0:
+    if schedule.t_eval.size:
+        return schedule.t_eval.size
+    if schedule.save_every == 0:
         return 2
-    if grid.span.h == 0.0 or grid.span.n_steps == UNBOUNDED:
+    if schedule.span.h == 0.0 or schedule.span.n_steps == UNBOUNDED:
         return 0
-    return 1 + math.ceil(grid.span.n_steps / grid.save_every)
+    return 1 + math.ceil(schedule.span.n_steps / schedule.save_every)
 
 
 def check_memory(rows: int, run: Run, max_bytes: float) -> None:

@@ -24,10 +24,10 @@ from ..core.solvers import EIPSolver
 from ..core.stepping import UNBOUNDED
 from ..engine.counters import NFEV, NJEV, NLU
 from ..engine.kernels import OK
-from ..engine.step import T
+from ..engine.step import TIME
 from ..engine.trust import ProjectionWarning
 from . import resume as _resume
-from .driver import FULL, PAUSE, ROW, STEP, Driver, Grid
+from .driver import FULL, PAUSE, ROW, STEP, Driver, Schedule
 from .interrupts import ended_by_sigterm, kept_ctrl_c, look_for_signals
 from .prepare import DEFAULT, Prepared, Request, prepared, started_at
 
@@ -72,7 +72,7 @@ def integrate(
 ) -> IntegrationResult:
     """Integrate with fixed or adaptive steps, compiled where the functions are Numba functions.
 
-    The step is that of the solver classes; with the same jitted functions the same bits come out, compiled or not.
+    The solver classes take the same step; with the same jitted functions the same bits come out, compiled or not.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def integrate(
     checkpoint_every : float, optional
         Seconds from one checkpoint to the next; more where writing would take over a twentieth of the time.
     resume : bool, optional
-        Go on from the checkpoint, with the same arguments: the result is bit for bit that of a run without the
+        Go on from the checkpoint, with the same arguments: the result has the same bits as a run without the
         interruption. Where the file does not exist yet the run starts at the beginning; `message` tells which.
     {names of ProjectionOptions}
         As for the solver classes, see `EIPSolver`. Functions of invariants are called as
@@ -214,7 +214,7 @@ class Loop:
         wanted = request.compiled if compiled is None else compiled
         with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
             functions, self.why_not = system.compiled(run, wanted)
-            self.driver = Driver(run, prepared.grid, functions, system.parameters, compiled=self.why_not is None)
+            self.driver = Driver(run, prepared.schedule, functions, system.parameters, compiled=self.why_not is None)
         for function in system.handed:
             function.read_only &= self.why_not is None
         keeper.begin(self.driver, self.events, self.max_bytes)
@@ -232,7 +232,7 @@ class Loop:
         driver = self.driver
         begin = time.perf_counter()
         try:
-            with _bar(self.progress, driver.grid, self.method) as bar:
+            with _bar(self.progress, driver.schedule, self.method) as bar:
                 status, message = self.steps(bar)
             self.keeper.end(status, message)
         except BaseException as error:
@@ -302,8 +302,8 @@ class Loop:
             if code == FULL:
                 driver.grow(self.max_bytes)
             elif code not in (OK, PAUSE):
-                return -1, setup.failure(code, driver.run, driver.grid.clock)
-            elif code == OK and driver.grid.clock[T] == driver.grid.span.t_bound:
+                return -1, setup.failure(code, driver.run, driver.schedule.clock)
+            elif code == OK and driver.schedule.clock[TIME] == driver.schedule.span.t_bound:
                 return 0, ARRIVED
             if code == OK:
                 # At most a doubling, so that one fast chunk cannot make a slow one long; none of one that was cut.
@@ -312,35 +312,35 @@ class Loop:
 
     def _progress(self, shown: float, k: int) -> float:
         """What the bar is to grow by: steps where their number is known, else time."""
-        grid = self.driver.grid
-        if grid.span.h != 0.0:
+        schedule = self.driver.schedule
+        if schedule.span.h != 0.0:
             return self.driver.step - k
-        return abs(self.driver.now[0] - grid.span.t0) - shown
+        return abs(self.driver.now[0] - schedule.span.t0) - shown
 
     def _pause(self) -> bool:
         """Samples and events in the step that is pending; True where an event ends the run."""
-        driver, grid = self.driver, self.driver.grid
+        driver, schedule = self.driver, self.driver.schedule
         sol = driver.dense(self.tableau, self.rhs)
         end = None
-        if grid.g.size:
-            end = self.events.handle(grid.g, grid.g_new, sol)
+        if schedule.g.size:
+            end = self.events.handle(schedule.g, schedule.g_new, sol)
         limit = sol.t if end is None else end
-        while driver.rows < grid.t_eval.size and grid.span.sign * (grid.t_eval[driver.rows] - limit) <= 0:
-            t = float(grid.t_eval[driver.rows])
+        while driver.rows < schedule.t_eval.size and schedule.span.sign * (schedule.t_eval[driver.rows] - limit) <= 0:
+            t = float(schedule.t_eval[driver.rows])
             driver.save(t, sol(t))
         if end is None:
             return False
-        if grid.t_eval.size == 0:
+        if schedule.t_eval.size == 0:
             driver.cut(end, sol(end))
         return True
 
     def _chunk(self, chunk: int) -> int:
         """Steps of the next call: none beyond the next look or, with a callback, the next saved one."""
-        grid, step = self.driver.grid, self.driver.step
+        schedule, step = self.driver.schedule, self.driver.step
         chunk = min([chunk, *(look - step for look in setup.LOOKS if look > step)])
-        if self.callback is None or grid.save_every == 0:
+        if self.callback is None or schedule.save_every == 0:
             return chunk
-        return min(chunk, grid.save_every - step % grid.save_every)
+        return min(chunk, schedule.save_every - step % schedule.save_every)
 
     def _stopped_by_callback(self, first_row: int) -> bool:
         if self.callback is None:
@@ -350,7 +350,7 @@ class Loop:
             t, y = float(driver.t[row]), driver.y[row].copy()
             invariants = driver.run.invariants
             if self.callback(t, y, invariants.values(t, y) - invariants.target):
-                driver.grid.place[ROW] = row + 1
+                driver.schedule.place[ROW] = row + 1
                 return True
         return False
 
@@ -375,7 +375,7 @@ class Loop:
             wall_time=self.wall_time,
             compiled=self.why_not is None,
             method=self.method,
-            h=abs(driver.grid.span.h) or None,
+            h=abs(driver.schedule.span.h) or None,
         )
 
     def explained(self, message: str) -> str:
@@ -403,18 +403,18 @@ def _compiling(shown: bool) -> Any:
     return tqdm(total=0, desc=line, bar_format="{desc}", leave=False, disable=not shown)
 
 
-def _bar(progress: bool, grid: Grid, label: str) -> Any:
+def _bar(progress: bool, schedule: Schedule, label: str) -> Any:
     from tqdm import tqdm
 
-    fixed = grid.span.h != 0.0
+    fixed = schedule.span.h != 0.0
     total: float | None
     if fixed:
-        total = grid.span.n_steps if grid.span.n_steps < UNBOUNDED else None
+        total = schedule.span.n_steps if schedule.span.n_steps < UNBOUNDED else None
     else:
-        total = abs(grid.span.t_bound - grid.span.t0) if math.isfinite(grid.span.t_bound) else None
+        total = abs(schedule.span.t_bound - schedule.span.t0) if math.isfinite(schedule.span.t_bound) else None
     unit = "step" if fixed else "time"
     # Beyond 0 where the run is resumed.
-    initial = int(grid.place[STEP]) if fixed else abs(float(grid.clock[T]) - grid.span.t0)
+    initial = int(schedule.place[STEP]) if fixed else abs(float(schedule.clock[TIME]) - schedule.span.t0)
     return tqdm(
         total=total, initial=initial, desc=label, unit=unit, unit_scale=True, disable=not progress, smoothing=0.05
     )

@@ -84,7 +84,7 @@ INTERPRETED = {
 
 
 def hand(handed: list[Handed], fun: Callable[..., Any], arrays: int) -> Callable[..., Any]:
-    """What is called in the place of a user's function; those that are jitted are listed."""
+    """What is called in place of a user's function; those that are jitted are listed."""
     if not is_jitted(fun):
         return fun
     handed.append(Handed(fun, arrays))

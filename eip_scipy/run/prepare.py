@@ -24,7 +24,7 @@ from ..core.stepping import AnyMethod, StepOptions, Stepping, interval
 from ..engine.counters import NFEV
 from ..engine.step import Span
 from ..methods.nystrom import NystromTableau
-from .driver import Grid, check_memory, saved_rows
+from .driver import Schedule, check_memory, saved_rows
 from .events import Events
 from .interpreted_functions import FORMS, INTERPRETED, hand
 from .memory import check_bytes, free_memory
@@ -155,7 +155,7 @@ class Prepared:
     system: System
     stepping: Stepping
     start: Start
-    grid: Grid
+    schedule: Schedule
     run: Run
     diagnostics: Diagnostics
     max_bytes: float
@@ -167,7 +167,7 @@ class Prepared:
 
     def identity(self, y0: Any, params: Any) -> dict[str, Any]:
         """All that decides the bits of a run from y0, but for the functions, under the names that users give."""
-        return settings(self.label, self.stepping, y0, params, self.run, self.grid, self.system.events)
+        return settings(self.label, self.stepping, y0, params, self.run, self.schedule, self.system.events)
 
 
 def prepared(request: Request, *, check_start: bool = True) -> Prepared:
@@ -189,19 +189,19 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     if isinstance(method, NystromTableau):
         setup.check_second_order(calls, t0, y0, f0, name)
     start = Start(t0, y0, f0, stepping.first(calls, y0, f0, method))
-    grid = _grid(stepping.span, start.tau, request, system.events)
+    schedule = _schedule(stepping.span, start.tau, request, system.events)
     run = setup.prepare(
         method, calls, start, projection, stepping, extra=system.extra, check_start=check_start, hand=system.hand
     )
     run.in_place = "in place" in form
     bound = 0.5 * free_memory() if request.max_bytes is None else request.max_bytes
-    check_memory(saved_rows(grid), run, bound)
+    check_memory(saved_rows(schedule), run, bound)
     record = Diagnostics() if request.diagnostics is None else request.diagnostics
     setup.attach(record, run)
-    system.events.fill(t0, run.y0, grid.g)
+    system.events.fill(t0, run.y0, schedule.g)
     run.work.K[0] = f0 if run.y0 is y0 else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
-    return Prepared(request, method, system, stepping, start, grid, run, record, bound)
+    return Prepared(request, method, system, stepping, start, schedule, run, record, bound)
 
 
 def started_at(request: Request) -> tuple[float, np.ndarray]:
@@ -302,14 +302,14 @@ def _span(request: Request, events: Events) -> tuple[float, float]:
     return t0, t_bound
 
 
-def _grid(span: Span, tau: float, request: Request, events: Events) -> Grid:
+def _schedule(span: Span, tau: float, request: Request, events: Events) -> Schedule:
     save_every, t_eval, times = request.save_every, request.t_eval, np.zeros(0)
     if t_eval is not None:
         if save_every is not None:
             raise ValueError("give save_every or t_eval, not both.")
         times = _evaluation_times(t_eval, span)
     n_events = len(events.functions)
-    return Grid(
+    return Schedule(
         span=span,
         save_every=0 if save_every is None else count("save_every", save_every),
         t_eval=times,

@@ -16,7 +16,7 @@ import numpy as np
 from ..core.inputs import is_number, shown
 from ..core.setup import Run
 from ..core.stepping import Stepping
-from ..engine.step import H_ABS, T
+from ..engine.step import NEXT_LENGTH, TIME
 from . import checkpoint
 from .checkpoint import CheckpointError
 from .events import Events
@@ -109,7 +109,7 @@ def kept(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
 
 
 def settings(
-    method: str, stepping: Stepping, y0: np.ndarray, params: np.ndarray, run: Run, grid: Any, events: Events
+    method: str, stepping: Stepping, y0: np.ndarray, params: np.ndarray, run: Run, schedule: Any, events: Events
 ) -> dict[str, Any]:
     """All that decides the bits of a run, but for the functions, under the names that users give."""
     span = stepping.span
@@ -124,8 +124,8 @@ def settings(
         "y0": y0,
         "params": params,
         **run.identity,
-        "save_every": grid.save_every or None,
-        "t_eval": grid.t_eval if grid.t_eval.size else None,
+        "save_every": schedule.save_every or None,
+        "t_eval": schedule.t_eval if schedule.t_eval.size else None,
         "events": events.ends,
     }
     return {name: _plain(value) for name, value in found.items()}
@@ -198,9 +198,9 @@ class _FileKeeper(Keeper):
         header, arrays = self._found
         checkpoint.require_same(self._file.name, header.get("settings"), settings)
         self._require_same_functions(run, arrays, self._start, t0, y0, "at the start")
-        self._require_fitting(arrays, {"y": y0, "clock": np.zeros(H_ABS + 1)})
+        self._require_fitting(arrays, {"y": y0, "clock": np.zeros(NEXT_LENGTH + 1)})
         if "state_f" in arrays:
-            t, y = float(arrays["clock"][T]), arrays["y"]
+            t, y = float(arrays["clock"][TIME]), arrays["y"]
             here = self._known_by(run, t, y)
             self._require_same_functions(run, arrays, here, t, y, f"at t = {t:.10g}, where it stands,")
         checkpoint.warn_of_other_versions(self._file.name, header, stacklevel=4)
@@ -317,7 +317,7 @@ class _FileKeeper(Keeper):
         """What the functions are known by at the snapshot; not counted among the run's evaluations."""
         arrays = self._snapshot.arrays
         try:
-            return self._known_by(self._driver.run, float(arrays["clock"][T]), arrays["y"])
+            return self._known_by(self._driver.run, float(arrays["clock"][TIME]), arrays["y"])
         except Exception:  # where a function has just broken the run off: the checkpoint matters more
             return {}
 
@@ -330,7 +330,7 @@ class _FileKeeper(Keeper):
 
     def _where(self) -> str:
         arrays = self._snapshot.arrays
-        return f"step {arrays['place'][STEP]}, t = {arrays['clock'][T]:.10g}"
+        return f"step {arrays['place'][STEP]}, t = {arrays['clock'][TIME]:.10g}"
 
     def _write_or_warn(self, status: int | None, message: str, *, stacklevel: int) -> None:
         """Write; a disk that is full is no reason to end a long run, but one to speak."""
@@ -357,7 +357,7 @@ class _FileKeeper(Keeper):
             "n": y0.size,
             "invariants": self._names,
             "step": step,
-            "t": float(snapshot.arrays["clock"][T]),
+            "t": float(snapshot.arrays["clock"][TIME]),
             "rows": rows,
             "status": status,
             "message": message,

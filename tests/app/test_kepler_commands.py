@@ -27,7 +27,7 @@ def read(file):
         return list(csv.DictReader(stream))
 
 
-# Work and precision.
+# CostCurve and precision.
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from eip_scipy.app.cli import main
 from eip_scipy.app.particles import charged_particle
 from eip_scipy.app.particles import report as particle_report
 from eip_scipy.app.particles import runs as particle_runs
-from eip_scipy.app.particles.report import Check
+from eip_scipy.app.particles.report import RangeCheck
 
 PNG = b"\x89PNG\r\n\x1a\n"
 STEPS = 60
@@ -77,11 +77,11 @@ def test_checks_fail_on_a_run_too_short_for_them(short):
 
 def test_checks_and_their_words():
     nan = float("nan")
-    assert not Check("s", "w", nan, 0.0, 1.0).passed
-    assert Check("s", "tips", 8, 8, 8).text == "ok     tips: 8, expected 8"
-    assert Check("s", "error", 0.5, 0.0, 0.1).text == "FAILED error: 0.5000, at most 0.10"
-    assert Check("s", "error", 0.5, 0.1, np.inf).text == "ok     error: 0.5000, at least 0.10"
-    assert "between 1.0093 and 1.0097" in Check("s", "R of the tip", 1.0095, 1.0093, 1.0097).text
+    assert not RangeCheck("s", "w", nan, 0.0, 1.0).passed
+    assert RangeCheck("s", "tips", 8, 8, 8).text == "ok     tips: 8, expected 8"
+    assert RangeCheck("s", "error", 0.5, 0.0, 0.1).text == "FAILED error: 0.5000, at most 0.10"
+    assert RangeCheck("s", "error", 0.5, 0.1, np.inf).text == "ok     error: 0.5000, at least 0.10"
+    assert "between 1.0093 and 1.0097" in RangeCheck("s", "R of the tip", 1.0095, 1.0093, 1.0097).text
 
 
 @pytest.mark.usefixtures("short_runs")

@@ -27,7 +27,7 @@ from ...run.integrate import integrate
 from ..report import describe_machine, table
 from ..work_precision import cost_to_reach, work_precision
 
-__all__ = ["METHODS", "Study", "Trial", "checks", "figures", "rows", "runs_text", "study", "text"]
+__all__ = ["METHODS", "QuenchStudy", "Trial", "checks", "figures", "rows", "runs_text", "study", "text"]
 
 POINTS, REPEATS, T_END = 64, 3, 1.0
 SHARES = (0.9, 0.64, 0.45, 0.32, 0.225)  # of the step above which RK4 is unstable
@@ -47,7 +47,7 @@ SLOPES, SLOPE_TOLERANCE, LEFT = ("CN", "EIP-ME"), 0.1, 1e-12
 DRAWN = {"h": "h", "cost": "seconds", "error": "error_max"}
 
 
-class Method(NamedTuple):
+class Contender(NamedTuple):
     """A method of the test.
 
     ``run(problem, h, t_end)`` returns the two ends, the pairs of transforms and a remark; ``steps(problem)`` the steps.
@@ -74,28 +74,28 @@ def _own(problem: FieldProblem, h: float, t_end: float, base: Any, names: Sequen
     return result.y, result.nfev + pairs * round(t_end / h), remark
 
 
-def runge_kutta(*names: str) -> Method:
+def runge_kutta(*names: str) -> Contender:
     """EIP on RK4."""
-    return Method(lambda problem, h, t_end: _own(problem, h, t_end, lambda gpe: EIPRK4, names, 0), stable_steps)
+    return Contender(lambda problem, h, t_end: _own(problem, h, t_end, lambda gpe: EIPRK4, names, 0), stable_steps)
 
 
-def other(base: Callable[..., Any], pairs: int, steps: Sequence[float], *names: str) -> Method:
+def other(base: Callable[..., Any], pairs: int, steps: Sequence[float], *names: str) -> Contender:
     """EIP on another one-step method, or without `names` that alone."""
 
     def run(problem: FieldProblem, h: float, t_end: float) -> Any:
         return _own(problem, h, t_end, lambda gpe: eip_method(base(gpe)), names, pairs)
 
-    return Method(run, lambda problem: steps)
+    return Contender(run, lambda problem: steps)
 
 
-def implicit(scheme: Callable[..., Any]) -> Method:
+def implicit(scheme: Callable[..., Any]) -> Contender:
     """One of the paper's schemes."""
 
     def run(problem: FieldProblem, h: float, t_end: float) -> tuple[np.ndarray, int, str]:
         result = scheme(problem.equation, (0.0, t_end), problem.y0, h)
         return result.y, result.nfev, "" if result.message == "completed" else result.message
 
-    return Method(run, lambda problem: LONG)
+    return Contender(run, lambda problem: LONG)
 
 
 METHODS = {
@@ -196,10 +196,10 @@ class Trial:
         return float(np.polyfit(np.log(h[clean]), np.log(error[clean]), 1)[0]) if clean.size > 1 else float("nan")
 
 
-Study = dict[str, Trial]
+QuenchStudy = dict[str, Trial]
 
 
-def study(points: int = POINTS, repeats: int = REPEATS, quiet: bool = True) -> Study:
+def study(points: int = POINTS, repeats: int = REPEATS, quiet: bool = True) -> QuenchStudy:
     """Run all methods on both waves.
 
     Parameters
@@ -227,7 +227,7 @@ def study(points: int = POINTS, repeats: int = REPEATS, quiet: bool = True) -> S
     return trials
 
 
-def checks(trials: Study) -> list[dict[str, Any]]:
+def checks(trials: QuenchStudy) -> list[dict[str, Any]]:
     """Compare the slopes with the methods' orders, and what EIP-ME leaves of its invariants with round-off.
 
     Returns
@@ -249,7 +249,7 @@ def checks(trials: Study) -> list[dict[str, Any]]:
     return found
 
 
-def text(trials: Study) -> str:
+def text(trials: QuenchStudy) -> str:
     """Lay out slopes and costs, and what is not as it should be."""
     parts = [describe_machine()]
     for wave, trial in trials.items():
@@ -271,7 +271,7 @@ def _number(value: float, form: str) -> str:
     return "-" if np.isnan(value) else f"{value:{form}}"
 
 
-def runs_text(trials: Study) -> str:
+def runs_text(trials: QuenchStudy) -> str:
     """Lay out all runs."""
     parts = []
     for wave, trial in trials.items():
@@ -285,12 +285,12 @@ def runs_text(trials: Study) -> str:
     return "\n\n".join(parts)
 
 
-def rows(trials: Study) -> list[dict[str, Any]]:
+def rows(trials: QuenchStudy) -> list[dict[str, Any]]:
     """Make the lines of the CSV file."""
     return [{"wave": wave, **row} for wave, trial in trials.items() for row in trial.rows.values()]
 
 
-def figures(trials: Study) -> Iterator[tuple[str, Any]]:
+def figures(trials: QuenchStudy) -> Iterator[tuple[str, Any]]:
     """Make the figure.
 
     Yields
@@ -322,7 +322,7 @@ def figures(trials: Study) -> Iterator[tuple[str, Any]]:
     )
 
 
-def _grid(trials: Study) -> tuple[int, ...]:
+def _grid(trials: QuenchStudy) -> tuple[int, ...]:
     equation = trials[WAVES[0]].problem.equation
     assert equation is not None
     return equation.grid.shape

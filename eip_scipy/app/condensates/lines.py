@@ -12,7 +12,7 @@ from ...problems import GrossPitaevskii
 from ...problems.gross_pitaevskii import density_surface, line_condensate, rotated, vortices
 from .. import long_runs
 from ..report import check_outputs, compact, warn
-from .runs import REFERENCE, SHOWN, Figures, Motion, Quench, Study, check, conclude, motion, study
+from .runs import REFERENCE, SHOWN, Figures, Motion, Quench, QuenchStudy, check, conclude, motion, study
 from .states import (
     LINE_POINTS,
     LINES,
@@ -110,7 +110,7 @@ def _state_notes(gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[
     ]
 
 
-def _grid_note(before: GrossPitaevskii, made: Study, t: np.ndarray) -> str:
+def _grid_note(before: GrossPitaevskii, made: QuenchStudy, t: np.ndarray) -> str:
     """How far the reference ends from the closed form, the start turned and with the phase of mu t."""
     assert made.reference is not None
     start = made.quench.problem.y0
@@ -122,7 +122,7 @@ def _grid_note(before: GrossPitaevskii, made: Study, t: np.ndarray) -> str:
     )
 
 
-def _figures(made: Study, moved: Motion) -> Figures:
+def _figures(made: QuenchStudy, moved: Motion) -> Figures:
     from ...plotting import fields_figure, surfaces_figure
 
     title, times = f"{made.quench.title}, {SHOWN}", made.quench.shown(moved.t)
@@ -138,7 +138,7 @@ def _figures(made: Study, moved: Motion) -> Figures:
     yield "vortex-lines-surfaces.png", figure.savefig
 
 
-def _slice(made: Study, moved: Motion, k: int) -> Any:
+def _slice(made: QuenchStudy, moved: Motion, k: int) -> Any:
     from ...plotting import FieldPanel
 
     grid = made.quench.equation.grid
@@ -147,7 +147,7 @@ def _slice(made: Study, moved: Motion, k: int) -> Any:
     return FieldPanel(*shown, ("x", "y"), moved.found[k].positions, moved.followed(k))
 
 
-def _surface(made: Study, moved: Motion, k: int) -> Any:
+def _surface(made: QuenchStudy, moved: Motion, k: int) -> Any:
     """The surface, and the sector of it in which the line is that is followed."""
     from ...plotting import SurfacePanel
 
@@ -157,6 +157,6 @@ def _surface(made: Study, moved: Motion, k: int) -> Any:
     return SurfacePanel(surface.corners, np.where(surface.inside, 1 + followed, 0))
 
 
-def _field(made: Study, k: int) -> np.ndarray:
+def _field(made: QuenchStudy, k: int) -> np.ndarray:
     assert made.fields is not None
     return made.quench.equation.as_field(made.fields[:, k])

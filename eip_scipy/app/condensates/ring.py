@@ -13,7 +13,7 @@ from ...problems import GrossPitaevskii
 from ...problems.gross_pitaevskii import ring_condensate
 from .. import long_runs
 from ..report import UsageError, check_outputs, warn
-from .runs import SHOWN, Figures, Motion, Quench, Study, conclude, motion, study
+from .runs import SHOWN, Figures, Motion, Quench, QuenchStudy, conclude, motion, study
 from .states import cropped, kept_state, load_state, search_ring
 
 __all__ = ["T_END", "run"]
@@ -67,7 +67,7 @@ def _start(args: argparse.Namespace) -> np.ndarray:
     return kept_state(args, before, partial(search_ring, args.seed))
 
 
-def _figures(args: argparse.Namespace, made: Study, moved: Motion) -> Figures:
+def _figures(args: argparse.Namespace, made: QuenchStudy, moved: Motion) -> Figures:
     from ...plotting import fields_figure, fields_movie
 
     quench, fields = made.quench, made.fields

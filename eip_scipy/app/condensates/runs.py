@@ -20,7 +20,7 @@ from ...run.integrate import integrate
 from .. import long_runs
 from ..report import compact, describe_machine, document, say, table, warn, write_csv, write_file, write_json
 
-__all__ = ["METHODS", "SHOWN", "Line", "Motion", "Quench", "Study", "check", "conclude", "motion", "study"]
+__all__ = ["METHODS", "SHOWN", "FieldRun", "Motion", "Quench", "QuenchStudy", "check", "conclude", "motion", "study"]
 
 DONE, FAILED, INTERRUPTED = 0, 1, 130
 METHODS = {"EIP-M": ("mass",), "EIP-E": ("energy",), "EIP-ME": ("mass", "energy"), "RK4": ()}
@@ -87,7 +87,7 @@ class Quench:
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class FieldRun:
     """One method's run.
 
     Attributes
@@ -111,20 +111,20 @@ class Line:
 
 
 @dataclass(eq=False)
-class Study:
+class QuenchStudy:
     """The runs of a quench, those of `METHODS` that were done.
 
     Attributes
     ----------
     quench : Quench
-    lines : dict of str to Line
+    lines : dict of str to FieldRun
     reference, fields : ndarray, shape (n, m), or None
         States of the reference and of `SHOWN`.
     interrupted : bool
     """
 
     quench: Quench
-    lines: dict[str, Line] = field(default_factory=dict)
+    lines: dict[str, FieldRun] = field(default_factory=dict)
     reference: np.ndarray | None = None
     fields: np.ndarray | None = None
     interrupted: bool = False
@@ -158,7 +158,9 @@ class Motion:
         return int(np.abs(self.off(k, *self.found[k].positions.T)).argmin())
 
 
-def study(quench: Quench, *, progress: bool = False, kept: Callable[[str], dict[str, Any]] = lambda name: {}) -> Study:
+def study(
+    quench: Quench, *, progress: bool = False, kept: Callable[[str], dict[str, Any]] = lambda name: {}
+) -> QuenchStudy:
     """Run the reference and each of `METHODS`; Ctrl-C ends it with what was done.
 
     Parameters
@@ -171,7 +173,7 @@ def study(quench: Quench, *, progress: bool = False, kept: Callable[[str], dict[
 
     Returns
     -------
-    Study
+    QuenchStudy
 
     Raises
     ------
@@ -180,7 +182,7 @@ def study(quench: Quench, *, progress: bool = False, kept: Callable[[str], dict[
     RuntimeError
         When a run fails.
     """
-    made = Study(quench)
+    made = QuenchStudy(quench)
     try:
         made.reference = _run(quench, REFERENCE, EIPDOP853, quench.reference_step, METHODS[SHOWN], progress, kept).y
         for name, invariants in METHODS.items():
@@ -219,12 +221,12 @@ def _run(
     return run
 
 
-def _line(quench: Quench, run: Any, reference: np.ndarray) -> Line:
+def _line(quench: Quench, run: Any, reference: np.ndarray) -> FieldRun:
     gpe = quench.equation
     mass, energy = (np.array([value(y) for y in run.y.T]) for value in (gpe.mass, gpe.energy))
     difference = np.sqrt([gpe.mass(y - tight) for y, tight in zip(run.y.T, reference.T, strict=True)])
     errors = np.abs(mass - mass[0]), np.abs(energy - energy[0])
-    return Line(run.t, *errors, difference, run.wall_time, run.nfev, run.diagnostics.n_rank_reduced)
+    return FieldRun(run.t, *errors, difference, run.wall_time, run.nfev, run.diagnostics.n_rank_reduced)
 
 
 def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
@@ -263,7 +265,7 @@ def check(what: str, value: Any, passed: bool) -> dict[str, Any]:
     return {"what": what, "value": value, "passed": bool(passed)}
 
 
-def checks(made: Study, moved: Motion | None) -> list[dict[str, Any]]:
+def checks(made: QuenchStudy, moved: Motion | None) -> list[dict[str, Any]]:
     """Vortices keep their count and turn as they should, and each invariant that is kept is kept.
 
     Returns
@@ -288,7 +290,9 @@ def checks(made: Study, moved: Motion | None) -> list[dict[str, Any]]:
     return found
 
 
-def text(made: Study, moved: Motion | None, found: list[dict[str, Any]], notes: Sequence[str], machine: str) -> str:
+def text(
+    made: QuenchStudy, moved: Motion | None, found: list[dict[str, Any]], notes: Sequence[str], machine: str
+) -> str:
     """Lay out the errors, the vortices and the checks."""
     quench = made.quench
     head = [["wall time", "[s]"], ["evaluations", "of f"], ["error of", "mass"], ["error of", "energy"]]
@@ -331,7 +335,7 @@ def _value(value: Any) -> str:
     return str(value)
 
 
-def _cells(line: Line) -> list[str]:
+def _cells(line: FieldRun) -> list[str]:
     errors = (compact(float(e.max())) for e in (line.mass_error, line.energy_error, line.field_error))
     return [compact(line.wall_time, 3), str(line.nfev), *errors, str(line.n_rank_reduced)]
 
@@ -340,7 +344,7 @@ def _radius(found: Vortices) -> str:
     return f"{np.hypot(*found.positions.T).mean():.3f}" if found.charges.size else "-"
 
 
-def rows(made: Study) -> list[dict[str, Any]]:
+def rows(made: QuenchStudy) -> list[dict[str, Any]]:
     """Make the lines of the CSV file."""
     return [
         {
@@ -357,7 +361,7 @@ def rows(made: Study) -> list[dict[str, Any]]:
 
 def conclude(
     args: argparse.Namespace,
-    made: Study,
+    made: QuenchStudy,
     moved: Motion | None,
     *,
     more: Sequence[dict[str, Any]] = (),
@@ -370,7 +374,7 @@ def conclude(
     ----------
     args : argparse.Namespace
         With ``task``, ``out``, ``json`` and ``quiet``.
-    made : Study
+    made : QuenchStudy
     moved : Motion or None
         None where the run of `SHOWN` is missing.
     more : sequence of dict, optional
@@ -407,7 +411,9 @@ def conclude(
     return DONE if all(item["passed"] for item in found) else FAILED
 
 
-def _write_numbers(args: argparse.Namespace, made: Study, moved: Motion | None, found: list[dict[str, Any]]) -> None:
+def _write_numbers(
+    args: argparse.Namespace, made: QuenchStudy, moved: Motion | None, found: list[dict[str, Any]]
+) -> None:
     _say(args, write_csv(args.out / f"{made.quench.name}.csv", rows(made)))
     if args.json is None:
         return
@@ -423,7 +429,7 @@ def _write_numbers(args: argparse.Namespace, made: Study, moved: Motion | None, 
     _say(args, write_json(args.json, document(f"gpe {args.task}", arguments, **numbers)))
 
 
-def _errors_figure(made: Study) -> Figures:
+def _errors_figure(made: QuenchStudy) -> Figures:
     from ...plotting import ErrorSeries, errors_figure
 
     quench = made.quench

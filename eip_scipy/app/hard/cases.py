@@ -26,7 +26,7 @@ from ..report import (
 )
 from ..solar.solar_system import METRICS, fixed_step_methods
 
-__all__ = ["Bar", "Comparison", "Outcome", "adaptive_methods", "add_arguments", "bars", "compare", "run"]
+__all__ = ["Bar", "CaseOutcome", "Comparison", "adaptive_methods", "add_arguments", "bars", "compare", "run"]
 
 DONE, CHECK_FAILED, INTERRUPTED = 0, 1, 130
 TOLERANCES = {"EIPDOP853": 1e-9}
@@ -60,7 +60,7 @@ CAUSES = {
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CaseOutcome:
     """One run.
 
     Attributes
@@ -92,14 +92,14 @@ class Comparison:
     Attributes
     ----------
     case : HardCase
-    plain, projected : Outcome
+    plain, projected : CaseOutcome
     nearby : tuple of float
         For a case that gets worse: the gain at rtol times and divided by sqrt(10), and with the euclidean metric.
     """
 
     case: HardCase
-    plain: Outcome
-    projected: Outcome
+    plain: CaseOutcome
+    projected: CaseOutcome
     nearby: tuple[float, ...] = ()
 
     @property
@@ -149,7 +149,7 @@ def _tolerance(text: str) -> float:
     return value
 
 
-def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | None) -> Outcome:
+def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | None) -> CaseOutcome:
     """Run one case.
 
     Parameters
@@ -162,7 +162,7 @@ def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | No
 
     Returns
     -------
-    Outcome
+    CaseOutcome
         Also where the run raised, with the exception as its failure.
     """
     problem, record = case.problem, Diagnostics()
@@ -181,11 +181,11 @@ def solve(case: HardCase, method: type[EIPSolver], rtol: float, metric: str | No
             )
             drift = case.drift(sol.y)
     except Exception as error:  # whatever it is, the other cases are still to be run
-        return Outcome(math.nan, math.nan, 0, 0, f"{type(error).__name__}: {error}")
+        return CaseOutcome(math.nan, math.nan, 0, 0, f"{type(error).__name__}: {error}")
     failure = "" if sol.success else sol.message
     if not (failure or np.isfinite(sol.y).all()):
         failure = "the states are not finite"
-    return Outcome(
+    return CaseOutcome(
         math.nan if failure else case.error(sol.y[:, -1]),
         drift,
         sol.t.size - 1,

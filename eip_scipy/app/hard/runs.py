@@ -21,7 +21,7 @@ from ...problems.time_transformed import time_transformed
 from ...run.integrate import integrate
 from ..long_runs import named
 
-__all__ = ["SCENES", "Method", "Outcome", "Point", "Scene", "measure", "methods", "scene"]
+__all__ = ["SCENES", "Contender", "HardScene", "Outcome", "Point", "measure", "methods", "scene"]
 
 TOLERANCES = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 # Of IAS15, by its step criterion; each starts where the steps are about as long as its corrector converges with.
@@ -36,7 +36,7 @@ FAR = 1e6
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class HardScene:
     """A problem with a known state at its end, and what the methods need to know.
 
     Attributes
@@ -105,8 +105,8 @@ class Scene:
         return np.concatenate([(q1 - q2)[:2], (v1 - v2)[:2]])
 
 
-def _kepler(eccentricity: float, steps: tuple[int, ...]) -> Scene:
-    return Scene(
+def _kepler(eccentricity: float, steps: tuple[int, ...]) -> HardScene:
+    return HardScene(
         f"kepler-{eccentricity:g}",
         f"Kepler, e = {eccentricity:g}, 31.8 periods",
         replace(kepler(eccentricity, relativistic=0.0, t_end=200.0), h=None),
@@ -116,14 +116,14 @@ def _kepler(eccentricity: float, steps: tuple[int, ...]) -> Scene:
     )
 
 
-SCENES: dict[str, Callable[[], Scene]] = {
+SCENES: dict[str, Callable[[], HardScene]] = {
     "kepler-0.9": partial(_kepler, 0.9, (10_000, 20_000, 40_000)),
     "kepler-0.99": partial(_kepler, 0.99, (100_000, 200_000, 400_000)),
     "kepler-0.999": partial(_kepler, 0.999, (1_000_000,)),
-    "pythagorean": lambda: Scene(
+    "pythagorean": lambda: HardScene(
         "pythagorean", "Burrau's three bodies, t = 70", pythagorean(), pair_time, (700_000,), 1e-2
     ),
-    "figure-eight": lambda: Scene(
+    "figure-eight": lambda: HardScene(
         "figure-eight",
         "figure eight, 100 periods",
         replace(figure_eight(), h=None),
@@ -131,7 +131,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
         (2_000, 4_000, 8_000, 16_000),
         1e-8,
     ),
-    "comet": lambda: Scene(
+    "comet": lambda: HardScene(
         "comet",
         "comet past Jupiter at 3 radii, 20 yr",
         comet(),
@@ -142,7 +142,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
 }
 
 
-def scene(name: str) -> Scene:
+def scene(name: str) -> HardScene:
     """Make a scene by its name, a key of `SCENES`."""
     return SCENES[name]()
 
@@ -166,7 +166,7 @@ class Outcome(NamedTuple):
     failure: str = ""
 
 
-class Method(NamedTuple):
+class Contender(NamedTuple):
     """A way to run a scene.
 
     Attributes
@@ -198,7 +198,7 @@ class Point(NamedTuple):
     error : float
         Largest distance of a body from its true position at the end; nan for a run that failed.
     energy_error, momentum_error : float
-        Largest along the run, see `Scene.invariant_errors`.
+        Largest along the run, see `HardScene.invariant_errors`.
     failure : str
     """
 
@@ -214,45 +214,45 @@ class Point(NamedTuple):
     failure: str
 
 
-def methods(of: Scene, rebound: Any = None) -> dict[str, Method]:
+def methods(of: HardScene, rebound: Any = None) -> dict[str, Contender]:
     """Set up the methods for a scene.
 
     Parameters
     ----------
-    of : Scene
+    of : HardScene
     rebound : module, optional
         `eip_scipy.integrations.rebound`; without it there is no IAS15.
 
     Returns
     -------
-    dict of str to Method
+    dict of str to Contender
         "DOP853" is EIPDOP853 without invariants, which is SciPy's DOP853 compiled.
     """
     transformed, end = time_transformed(of.problem, FAR, of.g), reaches(of.problem.t_span[1])
     in_s = tuple(2 * math.pi / n for n in STEPS_PER_TURN)
     t0, t_end = of.problem.t_span
     found = {
-        "EIPDOP853": Method("rtol", TOLERANCES, partial(_adaptive, of.problem, {})),
-        "DOP853": Method("rtol", TOLERANCES, partial(_adaptive, of.problem, {"invariants": ()})),
-        "EIPDOP853, fixed ds": Method("ds", in_s, partial(_fictitious, transformed, end, {})),
-        "DOP853, fixed ds": Method("ds", in_s, partial(_fictitious, transformed, end, {"invariants": ()})),
-        "EIPRKN12": Method("h", tuple((t_end - t0) / n for n in of.steps), partial(_fixed, of.problem)),
-        "SciPy's DOP853": Method("rtol", TOLERANCES, partial(_scipy, of.problem)),
+        "EIPDOP853": Contender("rtol", TOLERANCES, partial(_adaptive, of.problem, {})),
+        "DOP853": Contender("rtol", TOLERANCES, partial(_adaptive, of.problem, {"invariants": ()})),
+        "EIPDOP853, fixed ds": Contender("ds", in_s, partial(_fictitious, transformed, end, {})),
+        "DOP853, fixed ds": Contender("ds", in_s, partial(_fictitious, transformed, end, {"invariants": ()})),
+        "EIPRKN12": Contender("h", tuple((t_end - t0) / n for n in of.steps), partial(_fixed, of.problem)),
+        "SciPy's DOP853": Contender("rtol", TOLERANCES, partial(_scipy, of.problem)),
     }
     if rebound is not None:
         for criterion, epsilons in EPSILONS.items():
-            found[f"IAS15, {criterion}"] = Method("epsilon", epsilons, partial(_ias15, of, rebound, criterion))
+            found[f"IAS15, {criterion}"] = Contender("epsilon", epsilons, partial(_ias15, of, rebound, criterion))
     return found
 
 
 def measure(
-    of: Scene, rebound: Any = None, repeats: int = REPEATS, callback: Callable[[], Any] = lambda: None
+    of: HardScene, rebound: Any = None, repeats: int = REPEATS, callback: Callable[[], Any] = lambda: None
 ) -> Iterator[Point]:
     """Run all methods on a scene.
 
     Parameters
     ----------
-    of : Scene
+    of : HardScene
     rebound : module, optional
     repeats : int, optional
         Timed runs of each point at most, the least time of which counts; fewer of one that takes long.
@@ -321,7 +321,7 @@ def _scipy(problem: Problem, rtol: float, look: bool) -> Outcome:
     return Outcome(run.y, run.nfev, perf_counter() - start, "" if run.success else run.message)
 
 
-def _ias15(of: Scene, rebound: Any, criterion: str, epsilon: float, look: bool) -> Outcome:
+def _ias15(of: HardScene, rebound: Any, criterion: str, epsilon: float, look: bool) -> Outcome:
     gm, y0 = of.bodies()
     t_end = of.problem.t_span[1]
     if look:

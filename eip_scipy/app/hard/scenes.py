@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...core.names import nearest
-from ..kepler.cost import Work
+from ..kepler.cost import CostCurve
 from ..report import (
     check_outputs,
     compact,
@@ -19,13 +19,13 @@ from ..report import (
     warn,
 )
 from ..work_precision import cost_to_reach
-from .runs import ATOL_PER_RTOL, REPEATS, SCENES, Point, Scene, measure, methods, scene
+from .runs import ATOL_PER_RTOL, REPEATS, SCENES, HardScene, Point, measure, methods, scene
 
 __all__ = ["add_arguments", "run", "text", "works"]
 
 DONE, INTERRUPTED = 0, 130
 
-Results = dict[str, tuple[Scene, list[Point]]]
+Results = dict[str, tuple[HardScene, list[Point]]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,13 +47,15 @@ def _known(name: str) -> str:
     )
 
 
-def works(points: Sequence[Point]) -> dict[str, Work]:
+def works(points: Sequence[Point]) -> dict[str, CostCurve]:
     """Group a scene's points by their methods."""
     found: dict[str, list[Point]] = {}
     for point in points:
         found.setdefault(point.method, []).append(point)
     return {
-        name: Work(*(np.array([getattr(p, key) for p in group]) for key in ("value", "nfev", "wall_time", "error")))
+        name: CostCurve(
+            *(np.array([getattr(p, key) for p in group]) for key in ("value", "nfev", "wall_time", "error"))
+        )
         for name, group in found.items()
     }
 
@@ -92,7 +94,7 @@ def _failures(failures: list[str]) -> list[str]:
     return ["Did not reach the end:", *(f"  {line}" for line in failures), ""] if failures else []
 
 
-def _cost(work: Work, level: float, key: str) -> float:
+def _cost(work: CostCurve, level: float, key: str) -> float:
     return cost_to_reach(getattr(work, key), work.error, level)
 
 

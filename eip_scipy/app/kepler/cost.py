@@ -18,7 +18,7 @@ from ..long_runs import named
 from ..report import check_outputs, compact, deliver, table, warn
 from ..work_precision import Runner, cost_to_reach, work_precision
 
-__all__ = ["Work", "add_arguments", "measure", "run", "text"]
+__all__ = ["CostCurve", "add_arguments", "measure", "run", "text"]
 
 DONE, INTERRUPTED = 0, 130
 T_END, REPEATS = 200.0, 5
@@ -40,7 +40,7 @@ LEVELS = (1e-2, 1e-4, 1e-6, 1e-8)
 
 
 @dataclass(frozen=True, eq=False)
-class Work:
+class CostCurve:
     """One method's runs, from the cheapest to the dearest.
 
     Attributes
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``work-precision``: none."""
 
 
-def measure(repeats: int = REPEATS, callback: Any = None) -> tuple[dict[str, Work], str]:
+def measure(repeats: int = REPEATS, callback: Any = None) -> tuple[dict[str, CostCurve], str]:
     """Run all methods.
 
     Parameters
@@ -73,7 +73,7 @@ def measure(repeats: int = REPEATS, callback: Any = None) -> tuple[dict[str, Wor
 
     Returns
     -------
-    dict of str to Work, and str
+    dict of str to CostCurve, and str
         By the methods' names, and the machine.
     """
     problem = kepler(t_end=T_END)
@@ -89,7 +89,7 @@ def measure(repeats: int = REPEATS, callback: Any = None) -> tuple[dict[str, Wor
     works = {}
     for name in methods:
         points = [point for point in result.points if point.method == name]
-        works[name] = Work(
+        works[name] = CostCurve(
             np.array([p.step for p in points]),
             np.array([nfev[name, p.step] for p in points]),
             np.array([p.wall_time for p in points]),
@@ -113,9 +113,9 @@ def _noted(result: Any, method: type[EIPSolver], nfev: dict[Any, int], step: flo
     return result.wall_time, result.y[:, -1] if result.success else np.full(4, np.nan)
 
 
-def text(works: dict[str, Work], machine: str) -> str:
+def text(works: dict[str, CostCurve], machine: str) -> str:
     """Lay out the cost of each method at some errors."""
-    parts = [f"Work and precision: perturbed Kepler problem, e = 0.6, H and L kept, t = {T_END:g}", machine]
+    parts = [f"CostCurve and precision: perturbed Kepler problem, e = 0.6, H and L kept, t = {T_END:g}", machine]
     for cost, unit, factor in (("nfev", "1000 evaluations of f", 1e-3), ("wall_time", "milliseconds", 1e3)):
         body = []
         for name, work in works.items():
@@ -141,7 +141,7 @@ def _cheapest(known: dict[str, float]) -> str:
     return min(finite, key=finite.__getitem__) if finite else "-"
 
 
-def rows(works: dict[str, Work]) -> list[dict[str, Any]]:
+def rows(works: dict[str, CostCurve]) -> list[dict[str, Any]]:
     """Make the lines of the CSV file."""
     fixed = {method.__name__ for method in FIXED}
     return [
@@ -194,7 +194,7 @@ def run(args: argparse.Namespace) -> int:
     return DONE
 
 
-def _figures(works: dict[str, Work], machine: str) -> Iterator[Any]:
+def _figures(works: dict[str, CostCurve], machine: str) -> Iterator[Any]:
     from ...plotting import work_figure
 
     yield (

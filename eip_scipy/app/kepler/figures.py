@@ -13,7 +13,7 @@ from ...problems import kepler
 from ...run.integrate import integrate
 from ..report import compact, table
 
-__all__ = ["KeplerStudy", "Line", "checks", "figures", "rows", "study", "text"]
+__all__ = ["KeplerRun", "KeplerStudy", "checks", "figures", "rows", "study", "text"]
 
 STEP, T_END = 0.03, 2000.0
 ORBIT_END = 100.0
@@ -40,7 +40,7 @@ KNOWN = (
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class KeplerRun:
     """One method's run, saved at each step.
 
     Attributes
@@ -58,7 +58,7 @@ class Line:
     position_error: np.ndarray
 
 
-KeplerStudy = dict[str, Line]
+KeplerStudy = dict[str, KeplerRun]
 
 
 def study(t_end: float = T_END) -> KeplerStudy:
@@ -70,7 +70,7 @@ def study(t_end: float = T_END) -> KeplerStudy:
 
     Returns
     -------
-    dict of str to Line
+    dict of str to KeplerRun
         By the names in the figures.
 
     Notes
@@ -87,7 +87,7 @@ def study(t_end: float = T_END) -> KeplerStudy:
     }
 
 
-def _line(method: type[EIPSolver], kept: str, problem: Any, span: tuple[float, float], tight: np.ndarray) -> Line:
+def _line(method: type[EIPSolver], kept: str, problem: Any, span: tuple[float, float], tight: np.ndarray) -> KeplerRun:
     chosen = [item for item in problem.invariants if item.name in kept]
     run = integrate(problem, span, method=method, h=STEP, save_every=1, invariants=chosen, **PAPER_SETTING)
     q, v = run.y[:2], run.y[2:]
@@ -95,7 +95,7 @@ def _line(method: type[EIPSolver], kept: str, problem: Any, span: tuple[float, f
     energy = 0.5 * (v * v).sum(axis=0) - 1 / r - 0.5 * problem.params[0] / r**3
     momentum = q[0] * v[1] - q[1] * v[0]
     position_error = np.hypot(*(q - tight[:2]))
-    return Line(run.t, run.y, np.abs(energy - energy[0]), np.abs(momentum - momentum[0]), position_error)
+    return KeplerRun(run.t, run.y, np.abs(energy - energy[0]), np.abs(momentum - momentum[0]), position_error)
 
 
 def checks(lines: KeplerStudy) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from typing import Any
 from ...problems.particles.charged_particle import ORBITS
 from ..report import UsageError, check_outputs, deliver, warn
 from . import report as particle_report
-from .runs import METHODS, PAPER_METHODS, Study, study
+from .runs import METHODS, PAPER_METHODS, ParticleStudy, study
 
 __all__ = ["add_arguments", "record", "results", "run", "run_scenes"]
 
@@ -69,7 +69,7 @@ def _scenes(field: str | None, orbit: str | None) -> list[str]:
     return ["uniform"] if field == "uniform" else ["uniform", *orbits]
 
 
-def run_scenes(scenes: Sequence[str], *, paper_only: bool, quiet: bool) -> dict[str, Study]:
+def run_scenes(scenes: Sequence[str], *, paper_only: bool, quiet: bool) -> dict[str, ParticleStudy]:
     """Run scenes with a progress bar.
 
     Parameters
@@ -82,7 +82,7 @@ def run_scenes(scenes: Sequence[str], *, paper_only: bool, quiet: bool) -> dict[
 
     Returns
     -------
-    dict of str to Study
+    dict of str to ParticleStudy
     """
     from tqdm import tqdm
 
@@ -91,7 +91,7 @@ def run_scenes(scenes: Sequence[str], *, paper_only: bool, quiet: bool) -> dict[
         return {name: study(name, paper_only=paper_only, callback=bar.update) for name in scenes}
 
 
-def results(studies: dict[str, Study], stem: str, *, paper_only: bool) -> tuple[dict[str, Any], Iterator[Any]]:
+def results(studies: dict[str, ParticleStudy], stem: str, *, paper_only: bool) -> tuple[dict[str, Any], Iterator[Any]]:
     """``STEM.csv`` and figures, ``STEM-FIELD.png`` or, for the paper's, ``STEM.png``, for `write_results`."""
     lines = [row for found in studies.values() for row in particle_report.rows(found)]
     figures = (
@@ -101,7 +101,7 @@ def results(studies: dict[str, Study], stem: str, *, paper_only: bool) -> tuple[
     return {f"{stem}.csv": lines}, figures
 
 
-def record(studies: dict[str, Study]) -> dict[str, Any]:
+def record(studies: dict[str, ParticleStudy]) -> dict[str, Any]:
     """Numbers and checks as plain data: ``scenes`` (by scene and method), ``checks`` and ``passed``."""
     checks = [check for found in studies.values() for check in particle_report.checks(found)]
     return {

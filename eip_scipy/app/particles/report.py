@@ -9,9 +9,9 @@ import numpy as np
 
 from ...problems.particle_orbits import ParticleOrbit
 from ..report import compact, table
-from .runs import PAPER_METHODS, Line, Study
+from .runs import PAPER_METHODS, ParticleRun, ParticleStudy
 
-__all__ = ["Check", "checks", "figures", "rows", "text"]
+__all__ = ["RangeCheck", "checks", "figures", "rows", "text"]
 
 CURVE_POINTS = 40_000  # at most about so many of an orbit's curve in a figure
 ROWS = 1000  # of each run in the CSV file
@@ -24,7 +24,7 @@ TITLES = {
 }
 
 
-class Check(NamedTuple):
+class RangeCheck(NamedTuple):
     """A number that must lie between two bounds."""
 
     scene: str
@@ -54,64 +54,64 @@ class Check(NamedTuple):
         return f"{'ok' if self.passed else 'FAILED':<6} {self.what}: {number}, {expected}"
 
 
-def checks(found: Study) -> list[Check]:
+def checks(found: ParticleStudy) -> list[RangeCheck]:
     """Compare with the reference and with what the methods are known to do over the paper's interval."""
     got = found.numbers
     kept = [
-        Check(found.scene, f"{name}, largest relative error of {symbol}", got[name][key], 0.0, ROUND_OFF)
+        RangeCheck(found.scene, f"{name}, largest relative error of {symbol}", got[name][key], 0.0, ROUND_OFF)
         for name in _keepers(found)
         for symbol, key in (("H", "energy_error"), ("L", "momentum_error"))
     ]
-    reference = Check(found.scene, "reference, distance from the stored states", found.reference_error, 0.0, 2e-9)
+    reference = RangeCheck(found.scene, "reference, distance from the stored states", found.reference_error, 0.0, 2e-9)
     special = {"uniform": _uniform_checks, "tokamak-banana": _banana_checks, "tokamak-transit": _transit_checks}
     return [reference, *kept, *special[found.scene](found.scene, got, _keepers(found))]
 
 
-def _keepers(found: Study) -> list[str]:
+def _keepers(found: ParticleStudy) -> list[str]:
     """The methods that keep both invariants."""
     return [name for name in found.lines if name.startswith("EIP-HL")]
 
 
-def _uniform_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[Check]:
+def _uniform_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[RangeCheck]:
     true = got["reference"]["gyroradius_first"]
-    found = [Check(scene, "RK4, gyroradius in the last turn", got["RK4"]["gyroradius_last"], 0.0, 0.02)]
+    found = [RangeCheck(scene, "RK4, gyroradius in the last turn", got["RK4"]["gyroradius_last"], 0.0, 0.02)]
     for name in keepers:
         for turn in ("first", "last"):
             value = got[name][f"gyroradius_{turn}"]
-            found.append(Check(scene, f"{name}, gyroradius in the {turn} turn", value, true - 1e-4, true + 1e-4))
+            found.append(RangeCheck(scene, f"{name}, gyroradius in the {turn} turn", value, true - 1e-4, true + 1e-4))
         found.append(
-            Check(scene, f"{name}, error of the guiding centre's angle [rad]", got[name]["angle_error"], 0.0, 2e-3)
+            RangeCheck(scene, f"{name}, error of the guiding centre's angle [rad]", got[name]["angle_error"], 0.0, 2e-3)
         )
     lost = "EIP-H, error of the guiding centre's angle [rad]: one invariant of two is not enough"
-    return [*found, Check(scene, lost, got["EIP-H"]["angle_error"], 5.0, np.inf)]
+    return [*found, RangeCheck(scene, lost, got["EIP-H"]["angle_error"], 5.0, np.inf)]
 
 
-def _banana_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[Check]:
+def _banana_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[RangeCheck]:
     found = [
-        Check(scene, "RK4, banana tips: then it circulates", got["RK4"]["tips"], 2, 2),
-        Check(scene, "EIP-H, banana tips", got["EIP-H"]["tips"], 3, 3),
+        RangeCheck(scene, "RK4, banana tips: then it circulates", got["RK4"]["tips"], 2, 2),
+        RangeCheck(scene, "EIP-H, banana tips", got["EIP-H"]["tips"], 3, 3),
     ]
     for name in keepers:
-        found.append(Check(scene, f"{name}, banana tips", got[name]["tips"], 8, 8))
+        found.append(RangeCheck(scene, f"{name}, banana tips", got[name]["tips"], 8, 8))
         for end in ("nearest", "farthest"):
             value = got[name][f"tip_{end}"]
-            found.append(Check(scene, f"{name}, R of the {end} tip", value, TIP - 2e-4, TIP + 2e-4))
+            found.append(RangeCheck(scene, f"{name}, R of the {end} tip", value, TIP - 2e-4, TIP + 2e-4))
         found.append(_moment(scene, name, got))
     return found
 
 
-def _transit_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[Check]:
+def _transit_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[RangeCheck]:
     what = "error of the extrema of R and z in a turn"
-    found = [Check(scene, f"RK4, {what}", got["RK4"]["extrema_error"], 5e-3, np.inf)]
+    found = [RangeCheck(scene, f"RK4, {what}", got["RK4"]["extrema_error"], 5e-3, np.inf)]
     for name in keepers:
-        found.append(Check(scene, f"{name}, {what}", got[name]["extrema_error"], 0.0, 5e-4))
+        found.append(RangeCheck(scene, f"{name}, {what}", got[name]["extrema_error"], 0.0, 5e-4))
         found.append(_moment(scene, name, got))
     return found
 
 
-def _moment(scene: str, name: str, got: Mapping[str, Mapping[str, float]]) -> Check:
+def _moment(scene: str, name: str, got: Mapping[str, Mapping[str, float]]) -> RangeCheck:
     value = abs(got[name]["moment_change"])
-    return Check(scene, f"{name}, change of the magnetic moment", value, 0.0, 5e-4)
+    return RangeCheck(scene, f"{name}, change of the magnetic moment", value, 0.0, 5e-4)
 
 
 COMMON = {
@@ -151,7 +151,7 @@ LEGEND = {
 }
 
 
-def text(found: Study) -> str:
+def text(found: ParticleStudy) -> str:
     """Lay out the numbers and the checks of one scene."""
     got, problem = found.numbers, found.problem
     columns = {**SPECIAL[found.scene], **COMMON}
@@ -174,7 +174,7 @@ def _cell(key: str, value: float) -> str:
     return str(int(value)) if key in ("nfev", "tips") else compact(value, PRECISE.get(key, 2))
 
 
-def rows(found: Study) -> Iterator[dict[str, Any]]:
+def rows(found: ParticleStudy) -> Iterator[dict[str, Any]]:
     """Make the lines of the CSV file, about a thousand of each method."""
     for name, line in {"reference": found.reference, **found.lines}.items():
         every = max((line.orbit.t.size - 1) // ROWS, 1)
@@ -190,12 +190,12 @@ def rows(found: Study) -> Iterator[dict[str, Any]]:
             }
 
 
-def figures(studies: Mapping[str, Study], *, paper_only: bool = False) -> Iterator[tuple[str, Any]]:
+def figures(studies: Mapping[str, ParticleStudy], *, paper_only: bool = False) -> Iterator[tuple[str, Any]]:
     """Make the figures one by one: that of the uniform field, and one of both of the tokamak's orbits.
 
     Parameters
     ----------
-    studies : mapping of str to Study
+    studies : mapping of str to ParticleStudy
         By their scenes.
     paper_only : bool, optional
         Only the rows of the paper's figures, RK4 and EIP-HL, besides EIP-H in the uniform field.
@@ -232,7 +232,7 @@ def figures(studies: Mapping[str, Study], *, paper_only: bool = False) -> Iterat
         )
 
 
-def _uniform_row(found: Study, line: Line) -> Any:
+def _uniform_row(found: ParticleStudy, line: ParticleRun) -> Any:
     from ...plotting import Curves, ParticleRow
 
     turns, reference = line.orbit.turns(), found.reference.orbit
@@ -252,7 +252,7 @@ def _uniform_row(found: Study, line: Line) -> Any:
     return ParticleRow(orbits, _invariant_errors({"": line}), "error of angle [rad]", trajectory)
 
 
-def _tokamak_row(orbits: Mapping[str, Study], name: str) -> Any:
+def _tokamak_row(orbits: Mapping[str, ParticleStudy], name: str) -> Any:
     from ...plotting import Curves, ParticleRow
 
     lines = {scene.removeprefix("tokamak-"): found.lines[name] for scene, found in orbits.items()}
@@ -271,7 +271,7 @@ def _thin(orbit: ParticleOrbit) -> np.ndarray:
     return np.stack([orbit.R[::every], orbit.z[::every]])
 
 
-def _invariant_errors(lines: Mapping[str, Line]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _invariant_errors(lines: Mapping[str, ParticleRun]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     found = {}
     for kind, line in lines.items():
         end = f", {kind}" if kind else ""

@@ -17,7 +17,7 @@ from ...problems.particles.charged_particle import ORBITS
 from ...run.integrate import integrate
 from ..long_runs import named
 
-__all__ = ["METHODS", "PAPER_METHODS", "SCENES", "Line", "Study", "scene", "study"]
+__all__ = ["METHODS", "PAPER_METHODS", "SCENES", "ParticleRun", "ParticleStudy", "scene", "study"]
 
 PAPER_SETTING: dict[str, Any] = {"metric": "euclidean", "reuse_f": False}
 REFINEMENT = 4  # steps of the reference in one
@@ -28,7 +28,7 @@ Runner = Callable[[ParticleProblem], Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class ParticleRun:
     """One method's run, saved at each step.
 
     Attributes
@@ -48,26 +48,26 @@ class Line:
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
+class ParticleStudy:
     """All runs of one scene.
 
     Attributes
     ----------
     scene : str
     problem : ParticleProblem
-    reference : Line
+    reference : ParticleRun
         DOP853 with a quarter of the step, compensated.
     reference_error : float
         Its largest distance from the states stored with the problem; nan where the run has none.
-    lines : dict of str to Line
+    lines : dict of str to ParticleRun
         By the methods' names.
     """
 
     scene: str
     problem: ParticleProblem
-    reference: Line
+    reference: ParticleRun
     reference_error: float
-    lines: dict[str, Line]
+    lines: dict[str, ParticleRun]
 
     @cached_property
     def numbers(self) -> dict[str, dict[str, float]]:
@@ -135,7 +135,9 @@ def _boris(problem: ParticleProblem) -> Any:
     return boris(problem.field.fill, problem.t_span, problem.y0, problem.h, save_every=1)
 
 
-def study(name: str, *, paper_only: bool = False, callback: Callable[[], Any] = lambda: None, **options: Any) -> Study:
+def study(
+    name: str, *, paper_only: bool = False, callback: Callable[[], Any] = lambda: None, **options: Any
+) -> ParticleStudy:
     """Run the methods on one scene, in the canonical form but for Boris, which is a method for (x, v).
 
     Parameters
@@ -151,7 +153,7 @@ def study(name: str, *, paper_only: bool = False, callback: Callable[[], Any] = 
 
     Returns
     -------
-    Study
+    ParticleStudy
     """
     problem, other = scene(name, **options), scene(name, form="velocity", **options)
     assert problem.h is not None
@@ -172,13 +174,13 @@ def study(name: str, *, paper_only: bool = False, callback: Callable[[], Any] = 
     if not paper_only:
         lines[BORIS] = _line(other, _boris(other))
         callback()
-    return Study(name, problem, reference, _distance(problem, reference.orbit), lines)
+    return ParticleStudy(name, problem, reference, _distance(problem, reference.orbit), lines)
 
 
-def _line(problem: ParticleProblem, run: Any) -> Line:
+def _line(problem: ParticleProblem, run: Any) -> ParticleRun:
     orbit = ParticleOrbit(problem, run.t, run.y)
     energy, momentum = (np.abs(values / values[0] - 1) for values in (orbit.energy, orbit.momentum))
-    return Line(orbit, energy, momentum, run.nfev, run.wall_time)
+    return ParticleRun(orbit, energy, momentum, run.nfev, run.wall_time)
 
 
 def _distance(problem: ParticleProblem, orbit: ParticleOrbit) -> float:
@@ -190,7 +192,7 @@ def _distance(problem: ParticleProblem, orbit: ParticleOrbit) -> float:
     return float(max(apart)) if apart else float("nan")
 
 
-def _common_numbers(found: Study, line: Line) -> dict[str, float]:
+def _common_numbers(found: ParticleStudy, line: ParticleRun) -> dict[str, float]:
     truth = found.reference.orbit
     return {
         "energy_error": float(line.energy_error.max()),
@@ -202,7 +204,7 @@ def _common_numbers(found: Study, line: Line) -> dict[str, float]:
     }
 
 
-def _uniform_numbers(found: Study, line: Line) -> dict[str, float]:
+def _uniform_numbers(found: ParticleStudy, line: ParticleRun) -> dict[str, float]:
     error = line.orbit.averaged(line.orbit.guiding_angle - found.reference.orbit.guiding_angle)
     return {
         "gyroradius_first": radial_range(line.orbit, min(1.0, float(line.orbit.turns()[-1]))),
@@ -211,7 +213,7 @@ def _uniform_numbers(found: Study, line: Line) -> dict[str, float]:
     }
 
 
-def _tokamak_numbers(found: Study, line: Line) -> dict[str, float]:
+def _tokamak_numbers(found: ParticleStudy, line: ParticleRun) -> dict[str, float]:
     orbit, truth = line.orbit, found.reference.orbit
     parts = list(truth.poloidal_turns())
     tips = orbit.banana_tips().R

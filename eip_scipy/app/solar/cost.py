@@ -19,7 +19,7 @@ from .runs import (
     HIGH_ORDER,
     KEPT,
     Judge,
-    Scene,
+    SolarScene,
     eip_name,
     leapfrog,
     metric_of,
@@ -115,7 +115,7 @@ def by_method(runs: Sequence[TimedRun]) -> dict[str, dict[str, list[float]]]:
 
 
 def cost(
-    scene: Scene,
+    scene: SolarScene,
     methods: Mapping[str, tuple[Runner, Sequence[float]]],
     judge: Judge | None,
     callback: Callable[[], Any] | None = None,
@@ -124,7 +124,7 @@ def cost(
 
     Parameters
     ----------
-    scene : Scene
+    scene : SolarScene
         Of the span to be timed.
     methods : mapping
         From `cost_methods`.
@@ -146,13 +146,13 @@ def cost(
 
 
 def cost_methods(
-    scene: Scene, method: type[EIPSolver], metric: str, judge: Judge | None
+    scene: SolarScene, method: type[EIPSolver], metric: str, judge: Judge | None
 ) -> dict[str, tuple[Runner, Sequence[float]]]:
     """List what `cost` times, with the steps.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SolarScene
     method : type
         With its projection, and without; and beside it EIPRK5 (EIPRK4 beside EIPRK5) and EIPRKN12.
     metric : {"error", "euclidean"}
@@ -183,23 +183,25 @@ def cost_methods(
     return methods
 
 
-def _steps(scene: Scene, wanted: Sequence[float]) -> list[float]:
+def _steps(scene: SolarScene, wanted: Sequence[float]) -> list[float]:
     """Shorten steps to divide the span: a shortened last one would spoil a symplectic method."""
     return sorted({scene.years / whole_number(scene.years / h) for h in wanted}, reverse=True)
 
 
-def _time_eip(scene: Scene, method: type[EIPSolver], options: dict[str, Any], step: float) -> tuple[float, np.ndarray]:
+def _time_eip(
+    scene: SolarScene, method: type[EIPSolver], options: dict[str, Any], step: float
+) -> tuple[float, np.ndarray]:
     name = f"{method.__name__}, h = {step:.4g} yr"
     result = integrate(scene.problem, method=named(method, name), h=step, **options)
     return result.wall_time, result.y[:, -1] if result.success else np.full_like(scene.problem.y0, np.nan)
 
 
-def _time_verlet(scene: Scene, step: float) -> tuple[float, np.ndarray]:
+def _time_verlet(scene: SolarScene, step: float) -> tuple[float, np.ndarray]:
     result = leapfrog(scene, step, None)
     return result.wall_time, result.y[:, -1]
 
 
-def _time_rebound(scene: Scene, judge: Judge, integrator: str, step: float) -> tuple[float, np.ndarray]:
+def _time_rebound(scene: SolarScene, judge: Judge, integrator: str, step: float) -> tuple[float, np.ndarray]:
     n_steps = whole_number(scene.years / step)
     result = judge(scene.problem.params, scene.problem.y0, integrator, h=scene.years / n_steps, n_steps=n_steps)
     return result.wall_time, result.y[:, -1]

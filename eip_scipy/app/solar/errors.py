@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .cost import MERCURY, TimedRun
-from .runs import TIGHT, MethodRun, Scene, report_times, stored_state
+from .runs import TIGHT, MethodRun, SolarScene, report_times, stored_state
 
-__all__ = ["MERCURY", "Check", "PointErrors", "Study", "ecliptic", "errors_at", "longitude_errors"]
+__all__ = ["MERCURY", "Check", "PointErrors", "SolarStudy", "ecliptic", "errors_at", "longitude_errors"]
 
 OBLIQUITY = math.radians(84381.448 / 3600)  # IAU 1976, as the paper's data: from the axes of the ICRF to the ecliptic
 # A turn is counted right if the longitude error changes by less than half a turn between saved states. Two ellipses as
@@ -39,15 +39,15 @@ class Check(NamedTuple):
 
 
 @dataclass
-class Study:
+class SolarStudy:
     """The runs done so far and what follows from them; an interruption leaves it usable."""
 
-    scene: Scene
+    scene: SolarScene
     order: int
     runs: list[MethodRun] = field(default_factory=list)
     tight: MethodRun | None = None
     cost: list[TimedRun] = field(default_factory=list)
-    cost_scene: Scene | None = None
+    cost_scene: SolarScene | None = None
 
     def errors(self, year: float) -> dict[str, PointErrors]:
         """Errors of the runs at a time, where they are known."""
@@ -59,7 +59,7 @@ class Study:
         return checks(self.scene, self.order, self.runs[0], self.tight) if self.runs else []
 
 
-def ecliptic(scene: Scene, vectors: np.ndarray) -> np.ndarray:
+def ecliptic(scene: SolarScene, vectors: np.ndarray) -> np.ndarray:
     """Turn vectors (k, 3, m) from the data's axes to those of the ecliptic."""
     if scene.data.axes != "ICRF":
         return vectors
@@ -68,12 +68,12 @@ def ecliptic(scene: Scene, vectors: np.ndarray) -> np.ndarray:
     return np.stack([x, c * y + s * z, c * z - s * y], axis=1)
 
 
-def longitude_errors(scene: Scene, run: MethodRun, truth: MethodRun) -> np.ndarray:
+def longitude_errors(scene: SolarScene, run: MethodRun, truth: MethodRun) -> np.ndarray:
     """Errors of the heliocentric ecliptic longitude along a run, with whole turns counted.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SolarScene
     run, truth : MethodRun
         The run, and the one it is compared with.
 
@@ -104,7 +104,7 @@ def _common_saves(run: MethodRun, truth: MethodRun) -> int:
     return n if same.all() else int(np.argmin(same))
 
 
-def _longitudes(scene: Scene, y: np.ndarray) -> np.ndarray:
+def _longitudes(scene: SolarScene, y: np.ndarray) -> np.ndarray:
     q = y[: len(y) // 2].reshape(-1, 3, y.shape[1])
     heliocentric = ecliptic(scene, q[1:] - q[0])
     return np.arctan2(heliocentric[:, 1], heliocentric[:, 0])
@@ -114,12 +114,12 @@ def _wrap(angle: np.ndarray) -> np.ndarray:
     return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
 
 
-def errors_at(scene: Scene, run: MethodRun, year: float, tight: MethodRun | None) -> PointErrors | None:
+def errors_at(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun | None) -> PointErrors | None:
     """Errors of a run at one of the `report_times`.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SolarScene
     run : MethodRun
     year : float
     tight : MethodRun or None
@@ -142,7 +142,7 @@ def errors_at(scene: Scene, run: MethodRun, year: float, tight: MethodRun | None
     return PointErrors(year, source, wrapped + _turns(scene, run, year, tight, wrapped), position)
 
 
-def _turns(scene: Scene, run: MethodRun, year: float, tight: MethodRun | None, wrapped: np.ndarray) -> np.ndarray:
+def _turns(scene: SolarScene, run: MethodRun, year: float, tight: MethodRun | None, wrapped: np.ndarray) -> np.ndarray:
     """Whole turns to be added to an error in (-pi, pi], as counted along the tightest run."""
     if tight is None or _state_at(tight, year) is None:
         return np.full_like(wrapped, np.nan)
@@ -159,12 +159,12 @@ def _state_at(run: MethodRun, year: float) -> np.ndarray | None:
     return run.y[:, k] if math.isclose(run.t[k], year, rel_tol=1e-9) else None
 
 
-def checks(scene: Scene, order: int, main: MethodRun, tight: MethodRun | None) -> list[Check]:
+def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | None) -> list[Check]:
     """Conditions that hold for any sensible arguments; one that fails says that the numbers are not to be trusted.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SolarScene
     order : int
         Order of the method asked for.
     main : MethodRun
@@ -187,7 +187,7 @@ def checks(scene: Scene, order: int, main: MethodRun, tight: MethodRun | None) -
     return done
 
 
-def _reference_checks(scene: Scene, tight: MethodRun) -> list[Check]:
+def _reference_checks(scene: SolarScene, tight: MethodRun) -> list[Check]:
     """Whether the run that counts turns follows the stored states, at the last of them."""
     stored = [year for year in report_times(scene) if stored_state(scene, year) is not None]
     at_end = errors_at(scene, tight, stored[-1], tight) if stored else None

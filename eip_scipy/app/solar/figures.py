@@ -1,4 +1,4 @@
-"""The figures of ``eip-scipy solar-system``: from a `Study` to the functions of `eip_scipy.plotting`."""
+"""The figures of ``eip-scipy solar-system``: from a `SolarStudy` to the functions of `eip_scipy.plotting`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from ... import plotting
 from ...problems.gravity.solar_data import YEAR_D
 from ..report import describe_machine
 from .cost import REPEATS, by_method
-from .errors import MERCURY, Study, ecliptic, longitude_errors
-from .runs import MethodRun, Scene
+from .errors import MERCURY, SolarStudy, ecliptic, longitude_errors
+from .runs import MethodRun, SolarScene
 
 __all__ = ["figures", "jacobi", "osculating_orbits"]
 
@@ -20,12 +20,12 @@ OUTER, INNER = slice(4, 9), slice(0, 4)
 ELLIPSES = 40
 
 
-def figures(study: Study) -> Iterator[tuple[str, Any]]:
+def figures(study: SolarStudy) -> Iterator[tuple[str, Any]]:
     """Make the figures one by one.
 
     Parameters
     ----------
-    study : Study
+    study : SolarStudy
         Complete, with its reference run and the timings.
 
     Yields
@@ -44,12 +44,12 @@ def figures(study: Study) -> Iterator[tuple[str, Any]]:
     yield "error-against-cost.png", _cost_figure(study, styles)
 
 
-def jacobi(scene: Scene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def jacobi(scene: SolarScene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities of the planets relative to the centre of mass of all bodies further in.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SolarScene
     y : ndarray, shape (60, m)
 
     Returns
@@ -63,12 +63,12 @@ def jacobi(scene: Scene, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return tuple(ecliptic(scene, x[1:] - np.cumsum(gm * x, axis=0)[:-1] / inside) for x in (q, v))  # type: ignore
 
 
-def osculating_orbits(scene: Scene, y: np.ndarray, n_points: int = 200) -> np.ndarray:
+def osculating_orbits(scene: SolarScene, y: np.ndarray, n_points: int = 200) -> np.ndarray:
     """Compute the ellipses that the planets would follow around the bodies further in, if those were one.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SolarScene
     y : ndarray, shape (60, m)
     n_points : int, optional
         Points on an ellipse.
@@ -96,11 +96,11 @@ def _norm(vectors: np.ndarray) -> np.ndarray:
     return np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _span(study: Study) -> str:
+def _span(study: SolarStudy) -> str:
     return f"{study.scene.years:g} yr, {study.scene.data.name}"
 
 
-def _longitudes(study: Study) -> dict[str, np.ndarray]:
+def _longitudes(study: SolarStudy) -> dict[str, np.ndarray]:
     """Longitude errors along each run but the reference."""
     tight = study.tight
     if tight is None:
@@ -108,7 +108,7 @@ def _longitudes(study: Study) -> dict[str, np.ndarray]:
     return {run.name: longitude_errors(study.scene, run, tight) for run in study.runs if run is not tight}
 
 
-def _errors_figure(study: Study, styles: Any) -> Any:
+def _errors_figure(study: SolarStudy, styles: Any) -> Any:
     longitude = _longitudes(study)
     series = {}
     for run in study.runs:
@@ -123,11 +123,11 @@ def _errors_figure(study: Study, styles: Any) -> Any:
     )
 
 
-def _reference_name(study: Study) -> str:
+def _reference_name(study: SolarStudy) -> str:
     return study.tight.name if study.tight else "reference"
 
 
-def _longitude_figure(study: Study, styles: Any) -> Any:
+def _longitude_figure(study: SolarStudy, styles: Any) -> Any:
     return plotting.longitude_figure(
         study.tight.t if study.tight else (),
         _longitudes(study),
@@ -138,7 +138,7 @@ def _longitude_figure(study: Study, styles: Any) -> Any:
     )
 
 
-def _shown(study: Study) -> dict[str, MethodRun]:
+def _shown(study: SolarStudy) -> dict[str, MethodRun]:
     """Stoermer-Verlet and the method asked for, as in the paper, and the reference."""
     verlet = next(run for run in study.runs if run.name == "SV")
     shown = {"Störmer-Verlet": verlet, study.runs[0].name: study.runs[0]}
@@ -153,7 +153,7 @@ def _sample(run: MethodRun) -> np.ndarray:
     return np.unique(np.append((golden * run.t.size).astype(int), [0, run.t.size - 1]))
 
 
-def _orbits_figure(study: Study, which: slice, title: str) -> Any:
+def _orbits_figure(study: SolarStudy, which: slice, title: str) -> Any:
     scene = study.scene
     panels = {}
     for name, run in _shown(study).items():
@@ -167,7 +167,7 @@ def _orbits_figure(study: Study, which: slice, title: str) -> Any:
     )
 
 
-def _mercury_figure(study: Study) -> Any:
+def _mercury_figure(study: SolarStudy) -> Any:
     panels = {}
     for name, run in _shown(study).items():
         sample = _sample(run)
@@ -180,7 +180,7 @@ def _mercury_figure(study: Study) -> Any:
     )
 
 
-def _cost_figure(study: Study, styles: Any) -> Any:
+def _cost_figure(study: SolarStudy, styles: Any) -> Any:
     assert study.cost_scene is not None
     return plotting.frontier_figure(
         by_method(study.cost),

@@ -12,19 +12,19 @@ import numpy as np
 
 from ...problems.gravity.solar_data import YEAR_D
 from ..report import compact, document, table
-from .errors import PointErrors, Study
+from .errors import PointErrors, SolarStudy
 from .runs import HIGH_ORDER, TIGHT, MethodRun, report_times
 
 __all__ = ["cost_rows", "csv_rows", "json_content", "text"]
 
 
-def text(study: Study, args: argparse.Namespace) -> str:
+def text(study: SolarStudy, args: argparse.Namespace) -> str:
     """Lay out the head, the table, the notes and the checks, at most 79 columns for the usual names."""
     parts = [_head(study, args), _table(study), _notes(study), *_check_lines(study)]
     return "\n".join(["", *parts])
 
 
-def _head(study: Study, args: argparse.Namespace) -> str:
+def _head(study: SolarStudy, args: argparse.Namespace) -> str:
     scene = study.scene
     asked = "" if math.isclose(scene.h, args.h, rel_tol=1e-12) else f", shortened from {args.h:g} to divide the run"
     return "\n".join(
@@ -37,7 +37,7 @@ def _head(study: Study, args: argparse.Namespace) -> str:
     )
 
 
-def _reference_line(study: Study) -> str:
+def _reference_line(study: SolarStudy) -> str:
     sources = {errors.reference for errors in study.errors(study.scene.years).values()}
     if not sources:
         return "No reference: the runs did not get to the end."
@@ -47,7 +47,7 @@ def _reference_line(study: Study) -> str:
     return f"Reference: the tightest run at hand, {sources.pop()}"
 
 
-def _table(study: Study) -> str:
+def _table(study: SolarStudy) -> str:
     end = study.errors(study.scene.years)
     rows: list[tuple[str, Sequence[str]]] = [
         ("step [d]", [_step(run) for run in study.runs]),
@@ -66,7 +66,7 @@ def _step(run: MethodRun) -> str:
     return "adaptive" if run.step is None else f"{run.step * YEAR_D:.4g}"
 
 
-def _cell(study: Study, run: MethodRun, errors: PointErrors | None, quantity: str, k: int) -> str:
+def _cell(study: SolarStudy, run: MethodRun, errors: PointErrors | None, quantity: str, k: int) -> str:
     if errors is None:
         return "failed" if run.failure else "ref." if run is study.tight else "-"
     value = float(getattr(errors, quantity)[k])
@@ -78,7 +78,7 @@ def _counts(tight: MethodRun | None) -> bool:
     return tight is not None and not tight.failure
 
 
-def _notes(study: Study) -> str:
+def _notes(study: SolarStudy) -> str:
     shown = {run.name for run in study.runs}
     notes = [
         "dH, dL: largest along the saved states.",
@@ -96,11 +96,11 @@ def _notes(study: Study) -> str:
     return "\n".join(["", fill(" ".join(filter(None, notes)), 79, break_on_hyphens=False), *failures])
 
 
-def _check_lines(study: Study) -> list[str]:
+def _check_lines(study: SolarStudy) -> list[str]:
     return ["", *(f"{'ok    ' if check.passed else 'FAILED'} {check.text}" for check in study.checks())]
 
 
-def cost_rows(study: Study) -> list[dict[str, Any]]:
+def cost_rows(study: SolarStudy) -> list[dict[str, Any]]:
     """Make a row for each method and step that was timed."""
     if study.cost_scene is None:
         return []
@@ -117,7 +117,7 @@ def cost_rows(study: Study) -> list[dict[str, Any]]:
     ]
 
 
-def csv_rows(study: Study) -> list[dict[str, Any]]:
+def csv_rows(study: SolarStudy) -> list[dict[str, Any]]:
     """Make a row for each method and time with a reference, all planets in it."""
     rows = []
     planets = study.scene.planets
@@ -143,14 +143,14 @@ def csv_rows(study: Study) -> list[dict[str, Any]]:
     return rows
 
 
-def _arguments(study: Study, args: argparse.Namespace) -> dict[str, Any]:
+def _arguments(study: SolarStudy, args: argparse.Namespace) -> dict[str, Any]:
     known = {key: getattr(args, key) for key in ("years", "h", "method", "metric")}
     if args.epoch is None:
         return {**known, "data": study.scene.data.name}
     return {**known, "epoch": args.epoch, "kernel": args.kernel}
 
 
-def json_content(study: Study, args: argparse.Namespace) -> dict[str, Any]:
+def json_content(study: SolarStudy, args: argparse.Namespace) -> dict[str, Any]:
     """Collect all numbers, for `write_json`."""
     scene = study.scene
     times = {year: study.errors(year) for year in report_times(scene)}

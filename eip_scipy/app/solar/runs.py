@@ -28,8 +28,8 @@ __all__ = [
     "TIGHT",
     "Judge",
     "MethodRun",
-    "Scene",
-    "Task",
+    "PendingRun",
+    "SolarScene",
     "eip_name",
     "leapfrog",
     "make_scene",
@@ -54,7 +54,7 @@ KEPT: dict[str, Any] = {"every": 10, "compensated": True}
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class SolarScene:
     """What all methods share: the problem, its data, and the times at which states are saved.
 
     Attributes
@@ -119,7 +119,7 @@ class MethodRun:
     failure: str = ""
 
 
-class Task(NamedTuple):
+class PendingRun(NamedTuple):
     """A run still to be done: ``start(progress)``; `has_bar`: whether it shows a progress bar by itself."""
 
     name: str
@@ -127,7 +127,7 @@ class Task(NamedTuple):
     has_bar: bool
 
 
-def make_scene(data: str | SolarSystemData, years: float, h: float) -> Scene:
+def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScene:
     """Set the scene for a run of so many years.
 
     Parameters
@@ -141,7 +141,7 @@ def make_scene(data: str | SolarSystemData, years: float, h: float) -> Scene:
 
     Returns
     -------
-    Scene
+    SolarScene
 
     Raises
     ------
@@ -153,7 +153,7 @@ def make_scene(data: str | SolarSystemData, years: float, h: float) -> Scene:
     every = whole_number(years / (n_saves * h))
     step = years / (n_saves * every)
     known = load(data) if isinstance(data, str) else data
-    return Scene(solar_system(known, years=years, h=step), known, years, step, n_saves, every)
+    return SolarScene(solar_system(known, years=years, h=step), known, years, step, n_saves, every)
 
 
 def _save_interval(years: float) -> float:
@@ -171,17 +171,17 @@ def whole_number(ratio: float) -> int:
 
 
 def plan(
-    scene: Scene,
+    scene: SolarScene,
     method: type[EIPSolver],
     metric: str,
     judge: Judge | None,
     kept: Callable[[str], dict[str, Any]] = lambda name: {},
-) -> list[Task]:
+) -> list[PendingRun]:
     """List the runs of the comparison: first the method asked for, last the tightest, which serves as reference.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SolarScene
     method : type
         `EIPRK1` ... `EIPRK5` or another fixed-step class.
     metric : {"error", "euclidean"}
@@ -192,25 +192,28 @@ def plan(
 
     Returns
     -------
-    list of Task
+    list of PendingRun
     """
     metrics = {metric_of(method, metric), metric_of(method, "error"), "euclidean"}
     ordered = sorted(metrics, key=lambda m: m != metric_of(method, metric))
     names = [eip_name(method, m) for m in ordered]
     tasks = [
-        Task(name, partial(_eip, scene, method, m, **kept(name)), True) for name, m in zip(names, ordered, strict=True)
+        PendingRun(name, partial(_eip, scene, method, m, **kept(name)), True)
+        for name, m in zip(names, ordered, strict=True)
     ]
     name = method.TABLEAU.name
-    tasks.append(Task(name, partial(_plain, scene, method, **kept(name)), True))
-    tasks.append(Task("SV", lambda progress: _verlet(scene), False))
-    tasks.append(Task(HIGH_ORDER, partial(_high_order, scene, HIGH_ORDER, "every 10", 1, **kept(HIGH_ORDER)), True))
+    tasks.append(PendingRun(name, partial(_plain, scene, method, **kept(name)), True))
+    tasks.append(PendingRun("SV", lambda progress: _verlet(scene), False))
+    tasks.append(
+        PendingRun(HIGH_ORDER, partial(_high_order, scene, HIGH_ORDER, "every 10", 1, **kept(HIGH_ORDER)), True)
+    )
     if judge is None:
-        tasks.append(Task(TIGHT, partial(tight_run, scene, **kept(TIGHT)), True))
+        tasks.append(PendingRun(TIGHT, partial(tight_run, scene, **kept(TIGHT)), True))
         return tasks
     per_save = max(1, round(scene.interval * YEAR_D / WHFAST_DAYS))
     for name, integrator, steps in (("WHFast", "whfast", per_save), ("WHFast (c17)", "whfast-c17", per_save)):
-        tasks.append(Task(name, partial(rebound_run, scene, judge, name, integrator, steps), False))
-    tasks.append(Task("IAS15", partial(rebound_run, scene, judge, "IAS15", "ias15", 1), False))
+        tasks.append(PendingRun(name, partial(rebound_run, scene, judge, name, integrator, steps), False))
+    tasks.append(PendingRun("IAS15", partial(rebound_run, scene, judge, "IAS15", "ias15", 1), False))
     return tasks
 
 
@@ -224,7 +227,7 @@ def eip_name(method: type[EIPSolver], metric: str) -> str:
     return f"{method.__name__} ({metric})"
 
 
-def _eip(scene: Scene, method: type[EIPSolver], metric: str, progress: bool, **kept: Any) -> MethodRun:
+def _eip(scene: SolarScene, method: type[EIPSolver], metric: str, progress: bool, **kept: Any) -> MethodRun:
     name = eip_name(method, metric)
     head = (method.__name__, "euclid." if metric == "euclidean" else metric)
     result = integrate(
@@ -233,7 +236,7 @@ def _eip(scene: Scene, method: type[EIPSolver], metric: str, progress: bool, **k
     return _finished(scene, name, head, scene.h, result, "" if result.success else result.message)
 
 
-def _plain(scene: Scene, method: type[EIPSolver], progress: bool, **kept: Any) -> MethodRun:
+def _plain(scene: SolarScene, method: type[EIPSolver], progress: bool, **kept: Any) -> MethodRun:
     name = method.TABLEAU.name
     result = integrate(
         scene.problem, method=named(method, name), invariants=(), save_every=scene.every, progress=progress, **kept
@@ -241,12 +244,12 @@ def _plain(scene: Scene, method: type[EIPSolver], progress: bool, **kept: Any) -
     return _finished(scene, name, (name, "alone"), scene.h, result, "" if result.success else result.message)
 
 
-def tight_run(scene: Scene, progress: bool, **kept: Any) -> MethodRun:
+def tight_run(scene: SolarScene, progress: bool, **kept: Any) -> MethodRun:
     """Run the tightest at hand without REBOUND: the method of order 12 with half of its step."""
     return _high_order(scene, TIGHT, "tight", 2, progress, **kept)
 
 
-def _high_order(scene: Scene, name: str, word: str, shorter: int, progress: bool, **kept: Any) -> MethodRun:
+def _high_order(scene: SolarScene, name: str, word: str, shorter: int, progress: bool, **kept: Any) -> MethodRun:
     """Run the method for small errors over long times, its step divided by `shorter`."""
     per_save = shorter * whole_number(scene.interval / HIGH_ORDER_STEP)
     step = scene.interval / per_save
@@ -262,20 +265,22 @@ def _high_order(scene: Scene, name: str, word: str, shorter: int, progress: bool
     return _finished(scene, name, ("EIPRKN12", word), step, result, "" if result.success else result.message)
 
 
-def _verlet(scene: Scene) -> MethodRun:
+def _verlet(scene: SolarScene) -> MethodRun:
     result = leapfrog(scene, scene.h, scene.every)
     failure = "" if np.isfinite(result.y).all() else result.message
     return _finished(scene, "SV", ("SV",), scene.h, result, failure)
 
 
-def leapfrog(scene: Scene, step: float, save_every: int | None) -> StormerVerletResult:
+def leapfrog(scene: SolarScene, step: float, save_every: int | None) -> StormerVerletResult:
     """Run Stoermer-Verlet in its kick-drift-kick form."""
     problem = scene.problem
     assert problem.acc is not None  # N bodies have accelerations
     return stormer_verlet(problem.acc, problem.t_span, problem.y0, step, params=problem.params, save_every=save_every)
 
 
-def rebound_run(scene: Scene, judge: Judge, name: str, integrator: str, per_save: int, progress: bool) -> MethodRun:
+def rebound_run(
+    scene: SolarScene, judge: Judge, name: str, integrator: str, per_save: int, progress: bool
+) -> MethodRun:
     """Run REBOUND; with fixed steps timed in a run without saves, each of which costs a synchronisation."""
     step = scene.interval / per_save
     run = partial(judge, scene.problem.params, scene.problem.y0, integrator, h=step, n_steps=scene.n_saves * per_save)
@@ -287,7 +292,7 @@ def rebound_run(scene: Scene, judge: Judge, name: str, integrator: str, per_save
 
 
 def _finished(
-    scene: Scene,
+    scene: SolarScene,
     name: str,
     head: tuple[str, ...],
     step: float | None,
@@ -312,13 +317,13 @@ def _finished(
     )
 
 
-def stored_state(scene: Scene, year: float) -> np.ndarray | None:
+def stored_state(scene: SolarScene, year: float) -> np.ndarray | None:
     """Return the reference state that the package carries for a time, if there is one."""
     known = scene.problem.reference
     return None if known is None else known(round(float(year), 9))
 
 
-def report_times(scene: Scene) -> list[float]:
+def report_times(scene: SolarScene) -> list[float]:
     """Years at which errors are reported: those with a stored reference state that were saved, and the end."""
     times = np.linspace(0.0, scene.years, scene.n_saves + 1)[1:]
     stored = [round(float(t), 9) for t in times if stored_state(scene, t) is not None]

@@ -16,7 +16,7 @@ from ..report import UsageError, check_outputs, say, warn, write_csv, write_file
 from . import epoch as solar_epoch
 from . import truth as solar_truth
 from .cost import REPEATS, cost, cost_methods
-from .errors import Study
+from .errors import SolarStudy
 from .report import cost_rows, csv_rows, json_content, text
 from .runs import Judge, make_scene, plan
 
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ep
     long_runs.check(args)
     data = solar_epoch.initial_data(args, ephemeris)
     try:
-        study = Study(make_scene(data, args.years, args.h), fixed_step_methods()[args.method].TABLEAU.order)
+        study = SolarStudy(make_scene(data, args.years, args.h), fixed_step_methods()[args.method].TABLEAU.order)
     except ValueError as error:
         raise UsageError(str(error)) from error
     check_outputs(args.out, args.json)
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ep
     return status
 
 
-def _integrate(study: Study, args: argparse.Namespace, judge: Judge | None) -> bool:
+def _integrate(study: SolarStudy, args: argparse.Namespace, judge: Judge | None) -> bool:
     """Do the runs one by one; True if the user interrupted them."""
     tasks = plan(study.scene, fixed_step_methods()[args.method], args.metric, judge, partial(long_runs.kept, args))
     try:
@@ -151,7 +151,7 @@ def _waiting(label: str, *, shown: bool) -> Iterator[None]:
         bar.update()
 
 
-def _time_methods(study: Study, args: argparse.Namespace, judge: Judge | None) -> None:
+def _time_methods(study: SolarStudy, args: argparse.Namespace, judge: Judge | None) -> None:
     from tqdm import tqdm
 
     years = min(study.scene.years, COST_YEARS)
@@ -163,7 +163,7 @@ def _time_methods(study: Study, args: argparse.Namespace, judge: Judge | None) -
     study.cost_scene = scene
 
 
-def _write_numbers(study: Study, args: argparse.Namespace) -> None:
+def _write_numbers(study: SolarStudy, args: argparse.Namespace) -> None:
     """Write what is known; a second time when the timings are there, too."""
     again = bool(study.cost)
     _say(args, write_csv(args.out / "solar-system.csv", csv_rows(study)), again=again)
@@ -173,7 +173,7 @@ def _write_numbers(study: Study, args: argparse.Namespace) -> None:
         _say(args, write_json(args.json, json_content(study, args)), again=again)
 
 
-def _write_figures(study: Study, args: argparse.Namespace) -> None:
+def _write_figures(study: SolarStudy, args: argparse.Namespace) -> None:
     try:
         from .figures import figures
     except ImportError as error:

@@ -170,7 +170,7 @@ def _momenta(y, params):
 
 @_jit_allocating
 def energy_gradient(t, y, out, params):
-    """Out (6 N,). By a velocity: the momentum and m v^2 v / c^2."""
+    """out (6 N,). By a velocity: the momentum and m v^2 v / c^2."""
     half = y.size // 2
     n = half // 3
     over_c2, q, v, phi = params[n + 1], y[:half], y[half:], _potentials(y[:half], params)
@@ -238,7 +238,7 @@ def _add_pair_momentum(out, a, b, half, w, qa, qb, va, vb):
 
 @_jit
 def momentum_gradient(t, y, out, params):
-    """Out (3, 6 N)."""
+    """out (3, 6 N)."""
     half = y.size // 2
     n = half // 3
     over_c2, q, v = params[n + 1], y[:half], y[half:]

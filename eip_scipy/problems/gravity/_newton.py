@@ -387,7 +387,7 @@ def _accelerations_of_few(q, gm, out):
 
 @_jit
 def _accelerations(q, gm, out):
-    """Out (3 N,) = sum over the other bodies of gm_j (q_j - q_i) / r^3."""
+    """out (3 N,) = sum over the other bodies of gm_j (q_j - q_i) / r^3."""
     n = gm.size
     if n < 4:
         _accelerations_of_few(q, gm, out)
@@ -654,7 +654,7 @@ def energy(t, y, params):
 
 @_jit
 def energy_gradient(t, y, f, out, params):
-    """Out (6 N,) from the derivative f of the state."""
+    """out (6 N,) from the derivative f of the state."""
     half = y.size // 2
     for i in range(half):
         gm = params[i // 3]
@@ -679,7 +679,7 @@ def momentum(t, y, params):
 
 @_jit
 def momentum_gradient(t, y, out, params):
-    """Out (3, 6 N): row c holds the component c of d(q x v), +-gm times the other two components of v and q."""
+    """out (3, 6 N): row c holds the component c of d(q x v), +-gm times the other two components of v and q."""
     half = y.size // 2
     for i in range(params.size):
         gm, a = params[i], 3 * i

@@ -311,7 +311,7 @@ def momentum(t, y, params):
 
 @_jit
 def momentum_gradient(t, y, out, params):
-    """Out (3, 6 N)."""
+    """out (3, 6 N)."""
     _newton.momentum_gradient(t, y, out, params[: y.size // 6])
 
 
@@ -325,7 +325,7 @@ def axial_momentum(t, y, params):
 
 @_jit
 def axial_momentum_gradient(t, y, out, params):
-    """Out (6 N,): G m v x pole and G m pole x q."""
+    """out (6 N,): G m v x pole and G m pole x q."""
     half = y.size // 2
     n = half // 3
     px, py, pz = params[n + POLE], params[n + POLE + 1], params[n + POLE + 2]
@@ -347,7 +347,7 @@ def eih_energy(t, y, params):
 
 @_jit_allocating
 def eih_energy_gradient(t, y, out, params):
-    """Out (6 N,)."""
+    """out (6 N,)."""
     _einstein.energy_gradient(t, y, out, params)
     n = y.size // 6
     pulls = np.zeros(3 * n)
@@ -366,7 +366,7 @@ def eih_axial_momentum(t, y, params):
 
 @_jit_allocating
 def eih_axial_momentum_gradient(t, y, out, params):
-    """Out (6 N,)."""
+    """out (6 N,)."""
     k, rows = params[y.size // 6 :], np.empty((3, y.size))
     _einstein.momentum_gradient(t, y, rows, params)
     for i in range(y.size):
@@ -399,7 +399,7 @@ def pair_energy(t, y, params):
 
 @_jit
 def pair_energy_gradient(t, y, out, params):
-    """Out (12,)."""
+    """out (12,)."""
     gm_sun, mu, over_c2 = params[0], params[0] + params[1], params[2 + OVER_C2]
     r, v, u, x = _relative(y, over_c2, mu)
     w = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
@@ -426,7 +426,7 @@ def pair_momentum(t, y, params):
 
 @_jit_allocating
 def pair_momentum_gradient(t, y, out, params):
-    """Out (3, 12)."""
+    """out (3, 12)."""
     r, v, u, x = _relative(y, params[2 + OVER_C2], params[0] + params[1])
     growth, (lx, ly, lz) = exp(4.0 * x), pair_momentum(t, y, params)
     out[:] = 0.0

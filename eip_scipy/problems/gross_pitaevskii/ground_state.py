@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...engine.lanes import dot
+from ...engine.sums import dot
 from .equation import GrossPitaevskii
 from .grid import Multiplier
 from .pointwise import add_potential, divide_by_root, float_rows, quartic_sums, rotate

@@ -110,7 +110,7 @@ def interaction_energy(psi, V, beta):
 
 @_jit
 def derivative(first, rest, psi, V, beta, out):
-    """Out = ``-i (out + rest + (V + beta |psi|^2) psi)``, in as many rows from `first` on as `rest` has.
+    """out = ``-i (out + rest + (V + beta |psi|^2) psi)``, in as many rows from `first` on as `rest` has.
 
     Out and psi (rows, 2 m), V (rows, m), rest (some rows, 2 m).
     """
@@ -125,7 +125,7 @@ def derivative(first, rest, psi, V, beta, out):
 
 @_jit
 def derivative_at_once(psi, V, beta, out):
-    """Out = ``-i (out + (V + beta |psi|^2) psi)``; psi and out (rows, 2 m), V (rows, m)."""
+    """out = ``-i (out + (V + beta |psi|^2) psi)``; psi and out (rows, 2 m), V (rows, m)."""
     for r in range(V.shape[0]):
         field, potential, image = psi[r], V[r], out[r]
         for i in range(potential.size):
@@ -137,7 +137,7 @@ def derivative_at_once(psi, V, beta, out):
 
 @_jit
 def add_potential(psi, V, beta, out):
-    """Out += ``(V + beta |psi|^2) psi``, all flat."""
+    """out += ``(V + beta |psi|^2) psi``, all flat."""
     for i in range(V.size):
         a, b = psi[2 * i], psi[2 * i + 1]
         v = V[i] + beta * (a * a + b * b)
@@ -147,7 +147,7 @@ def add_potential(psi, V, beta, out):
 
 @_jit
 def local_flow(psi, V, beta, h):
-    """Psi <- ``exp(-i h (V + beta |psi|^2)) psi``, flat.
+    """psi <- ``exp(-i h (V + beta |psi|^2)) psi``, flat.
 
     The sine and cosine are their Taylor polynomials on [-pi/4, pi/4], without a branch: the loop becomes vector code,
     three times as fast as with the library's functions. To 1e-15 for angles up to 1e6.
@@ -172,7 +172,7 @@ def local_flow(psi, V, beta, h):
 
 @_jit
 def turn(f, factor, out):
-    """Out = i factor f, flat."""
+    """out = i factor f, flat."""
     for i in range(f.size // 2):
         re, im = f[2 * i], f[2 * i + 1]
         out[2 * i], out[2 * i + 1] = -factor * im, factor * re
@@ -205,7 +205,7 @@ def quartic_sums(psi, p, out):
 
 @_jit
 def divide_by_root(a, psi, V, beta, shift, out):
-    """Out = ``a / sqrt(shift + V + beta |psi|^2)``, all flat."""
+    """out = ``a / sqrt(shift + V + beta |psi|^2)``, all flat."""
     for i in range(V.size):
         x, y = psi[2 * i], psi[2 * i + 1]
         weight = 1 / np.sqrt(shift + V[i] + beta * (x * x + y * y))

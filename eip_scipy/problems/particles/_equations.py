@@ -1,4 +1,4 @@
-"""Equations of motion and invariants of a charged particle, from functions of its field.
+"""ParticleEquations of motion and invariants of a charged particle, from functions of its field.
 
 Each function here takes the field's functions first, and is plain Python when they are; `compose` binds them. Called
 from compiled code all is inlined, and what two of the field's functions have in common is computed once: the loop is as
@@ -16,7 +16,7 @@ from numba.extending import is_jitted, register_jitable
 
 from ...core.invariants import DIFFERENCE_WEIGHTS
 
-__all__ = ["Equations", "FieldFunctions", "compose", "jit_like"]
+__all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like"]
 
 _jitable = register_jitable(error_model="numpy", _nrt=False)
 MASS, CHARGE = 0, 1  # places in the parameters
@@ -32,7 +32,7 @@ class FieldFunctions(NamedTuple):
     B: Callable[..., Any]
 
 
-class Equations(NamedTuple):
+class ParticleEquations(NamedTuple):
     """What a problem needs; the invariants are None where the field does not give them."""
 
     rhs: Callable[..., None]
@@ -58,8 +58,8 @@ def no_force(x, y, z):
     return 0.0, 0.0, 0.0
 
 
-def compose(field: FieldFunctions, form: str) -> Equations:
-    """Equations of motion and invariants in one form.
+def compose(field: FieldFunctions, form: str) -> ParticleEquations:
+    """ParticleEquations of motion and invariants in one form.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def compose(field: FieldFunctions, form: str) -> Equations:
 
     Returns
     -------
-    Equations
+    ParticleEquations
         Functions of ``(t, y, [f,] [out,] params)`` with ``params = [mass, charge]``.
     """
     return _canonical(field) if form == "canonical" else _velocity(field)
@@ -78,7 +78,7 @@ def compose(field: FieldFunctions, form: str) -> Equations:
 # The canonical form, y = (x, p).
 
 
-def _canonical(field: FieldFunctions) -> Equations:
+def _canonical(field: FieldFunctions) -> ParticleEquations:
     A, jacobian, phi, E = field.A, field.jacobian, field.phi, field.E
 
     def rhs(t, y, out, params):
@@ -87,7 +87,7 @@ def _canonical(field: FieldFunctions) -> Equations:
     def energy(t, y, params):
         return canonical_energy(A, phi, y, params[MASS], params[CHARGE])
 
-    return Equations(
+    return ParticleEquations(
         jit_like(rhs, A, jacobian, E),
         None if phi is None else jit_like(energy, A, phi),
         jit_like(canonical_energy_gradient, A, jacobian, E),
@@ -152,7 +152,7 @@ def canonical_momentum_gradient(t, y, out, params):
 # The form y = (x, v).
 
 
-def _velocity(field: FieldFunctions) -> Equations:
+def _velocity(field: FieldFunctions) -> ParticleEquations:
     A, jacobian, phi, E, B = field
 
     def rhs(t, y, out, params):
@@ -171,7 +171,7 @@ def _velocity(field: FieldFunctions) -> Equations:
         velocity_momentum_gradient(A, jacobian, y, out, params[MASS], params[CHARGE])
 
     known = A is not None
-    return Equations(
+    return ParticleEquations(
         jit_like(rhs, E, B),
         None if phi is None else jit_like(energy, phi),
         jit_like(energy_gradient, E),

@@ -16,7 +16,7 @@ from ...core.inputs import refuse_units
 from ...core.invariants import Invariant
 from ...core.names import nearest
 from ...core.problem import Problem, bind
-from ._equations import CHARGE, MASS, Equations, compose
+from ._equations import CHARGE, MASS, ParticleEquations, compose
 from .fields import TOKAMAK, UNIFORM, ParticleField
 
 __all__ = ["ORBITS", "ParticleProblem", "charged_particle", "tokamak", "uniform_field"]
@@ -174,12 +174,14 @@ def charged_particle(
 
 
 @lru_cache(maxsize=32)
-def _equations(field: ParticleField, form: str) -> Equations:
+def _equations(field: ParticleField, form: str) -> ParticleEquations:
     """The same functions for the same field: they are compiled once in a process."""
     return compose(field.functions, form)
 
 
-def _invariants(equations: Equations, field: ParticleField, form: str, params: np.ndarray) -> tuple[Invariant, ...]:
+def _invariants(
+    equations: ParticleEquations, field: ParticleField, form: str, params: np.ndarray
+) -> tuple[Invariant, ...]:
     found = []
     if equations.energy is not None:
         found.append(

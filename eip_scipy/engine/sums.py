@@ -229,7 +229,7 @@ def _emit_all_rows(context: Any, builder: Any, kinds: Any, y: Any, arguments: An
 
 @intrinsic  # emits LLVM
 def weighted_rows(typingctx, scale, weights, K, rows, first, out):
-    """Out = scale * sum_j weights[j] K[j, first:] over the first `rows` rows, in their order, zero weights skipped."""
+    """out = scale * sum_j weights[j] K[j, first:] over the first `rows` rows, in their order, zero weights skipped."""
 
     def codegen(context, builder, signature, arguments):
         return _emit_all_rows(context, builder, (weights, K, out), None, arguments)
@@ -239,7 +239,7 @@ def weighted_rows(typingctx, scale, weights, K, rows, first, out):
 
 @intrinsic  # emits LLVM
 def combined_rows(typingctx, y, scale, weights, K, rows, first, out):
-    """Out = y + scale * that sum; y is not out."""
+    """out = y + scale * that sum; y is not out."""
 
     def codegen(context, builder, signature, arguments):
         start = context.make_array(y)(context, builder, arguments[0]).data
