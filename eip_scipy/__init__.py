@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 from .core import source_tree as source_tree
 
 if TYPE_CHECKING:
+    from . import checkpoint as checkpoint
     from . import problems as problems
+    from .checkpoint import CheckpointError
     from .core.invariants import Invariant, JointInvariants, check_gradient
     from .core.one_step import OneStepMethod
     from .core.project import project
@@ -31,8 +33,6 @@ if TYPE_CHECKING:
     from .ensembles.ensemble import EnsembleResult, ensemble
     from .methods.nystrom import NystromTableau
     from .methods.runge_kutta import Tableau
-    from .run import checkpoint as checkpoint
-    from .run.checkpoint import CheckpointError
     from .run.integrate import integrate
 
     __version__: str
@@ -68,7 +68,7 @@ __all__ = [
 ]
 
 _HOMES = {  # the module of each of these names, and the modules that are public themselves
-    "CheckpointError": "run.checkpoint",
+    "CheckpointError": "checkpoint",
     "Diagnostics": "core.results",
     "EnsembleResult": "ensembles.ensemble",
     "IntegrationResult": "core.results",
@@ -85,14 +85,14 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "project": "core.project",
     **dict.fromkeys((name for name in __all__ if name.startswith("EIP") or name == "eip_method"), "core.solvers"),
 }
-_MODULES = {"checkpoint": "run.checkpoint", "problems": "problems"}
+_MODULES = ("checkpoint", "problems")
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         value = getattr(_import_module(f".{_HOMES[name]}", __name__), name)
     elif name in _MODULES:
-        value = _import_module(f".{_MODULES[name]}", __name__)
+        value = _import_module(f".{name}", __name__)
     elif name == "__version__":
         from importlib.metadata import version
 

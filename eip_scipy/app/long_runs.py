@@ -8,8 +8,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from ..checkpoint import CheckpointError
 from ..core.solvers import EIPSolver
-from ..run.checkpoint import CheckpointError
 from .report import UsageError, check_folder, warn
 
 __all__ = ["add_arguments", "check", "kept", "named", "positive", "tell_how_to_resume", "unusable"]

@@ -19,6 +19,7 @@ import numpy as np
 from numba.extending import is_jitted
 from scipy.optimize import OptimizeResult
 
+from ..checkpoint.own_file import absolute
 from ..core import setup
 from ..core.inputs import count, flag, is_number, real_array, refuse_units, shown
 from ..core.invariants import as_invariants
@@ -31,7 +32,6 @@ from ..engine.trust import ProjectionWarning
 from ..run.events import Events
 from ..run.interrupts import ended_by_sigterm, kept_ctrl_c
 from ..run.memory import check_bytes, free_memory
-from ..run.own_file import absolute
 from ..run.prepare import DEFAULT, Request
 from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
 from .statistics import Statistics, merge

@@ -13,10 +13,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..run import checkpoint
-from ..run.checkpoint import CheckpointError
-from ..run.locks import Lock
-from ..run.own_file import OwnFile, absolute, unlocked
+from .. import checkpoint
+from ..checkpoint import CheckpointError
+from ..checkpoint.locks import Lock
+from ..checkpoint.own_file import OwnFile, absolute, unlocked
 from .statistics import Statistics
 from .tasks import COMPARED, NOT_RUN, Members
 

@@ -13,15 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .. import checkpoint
+from ..checkpoint import CheckpointError
+from ..checkpoint.own_file import OwnFile, unlocked
 from ..core.inputs import is_number, shown
 from ..core.setup import Run
 from ..core.stepping import Stepping
 from ..engine.step import NEXT_LENGTH, TIME
-from . import checkpoint
-from .checkpoint import CheckpointError
 from .events import Events
 from .interrupts import TerminatedError
-from .own_file import OwnFile, unlocked
 
 __all__ = ["Keeper", "kept", "settings"]
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from ...checkpoint import CheckpointError
 from ...core.solvers import EIPDOP853, EIPRK4, EIPSolver
 from ...problems import FieldProblem, GrossPitaevskii
 from ...problems.gross_pitaevskii import Vortices, vortices
-from ...run.checkpoint import CheckpointError
 from ...run.integrate import integrate
 from .. import long_runs
 from ..report import compact, describe_machine, document, say, table, warn, write_csv, write_file, write_json

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+from ...checkpoint import CheckpointError
 from ...core import solvers
-from ...run.checkpoint import CheckpointError
 from .. import long_runs
 from ..long_runs import positive
 from ..report import UsageError, check_outputs, say, warn, write_csv, write_file, write_json

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from . import checkpoint
-from .checkpoint import CheckpointError
+from .. import checkpoint
+from . import CheckpointError
 from .locks import HeldError, Lock
 
 __all__ = ["OwnFile", "absolute", "unlocked"]

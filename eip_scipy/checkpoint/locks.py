@@ -9,7 +9,7 @@ import platform
 import sys
 from pathlib import Path
 
-from .checkpoint import CheckpointError
+from . import CheckpointError
 
 __all__ = ["HeldError", "Lock"]
 
