@@ -7,8 +7,10 @@ import numpy as np
 from eip_scipy import EIPRK4, Diagnostics, Invariant
 from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
 
-# Neither x nor y is a multiple of the number of ranks.
-GRIDS = {"2D": Grid((46, 42), -7, 7.5), "3D": Grid((22, 21, 10), -5, 5.5)}
+# Neither x nor y is a multiple of the number of ranks. In two dimensions the grid resolves the field: only then does it
+# keep the angular momentum.
+GRIDS = {"2D": Grid((62, 58), -7, 7.5), "3D": Grid((22, 21, 10), -5, 5.5)}
+BETA = {"2D": 5.0, "3D": 20.0}
 OPTIONS = {"plain": {}, "twice": {"iterations": 2}, "seldom": {"every": 3, "reuse_f": False}}
 
 
@@ -32,7 +34,7 @@ def fields(make, method, whole):
     """The equation's parts and its steps, with and without rotation."""
     for name, grid in GRIDS.items():
         for Omega in (0.0, 0.6):
-            gpe = make(grid, harmonic_trap(*(1, 1, 0.9)[: grid.dim]), Omega=Omega, beta=1.0)
+            gpe = make(grid, harmonic_trap(*(1, 1, 0.9)[: grid.dim]), Omega=Omega, beta=BETA[name])
             psi, key = vortex(gpe), f"{name}, Omega {Omega}"
             values = (gpe.mass, gpe.energy, gpe.angular_momentum, gpe.chemical_potential)
             yield f"{key}: f", whole(gpe, gpe.fun(0.0, psi))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK4, EIPRK45, Diagnostics, integrate
+from eip_scipy import EIPRK4, EIPRK45, Diagnostics, ProjectionWarning, integrate
 from eip_scipy.core.diagnostics import observed_order
 from eip_scipy.core.invariants import check_gradient
 from eip_scipy.problems import (
@@ -231,7 +231,10 @@ def test_angular_momentum_is_kept_where_the_trap_is_round_and_refused_where_not(
     assert run.max_defect.max() < 1e-13
     assert run.diagnostics.n_rank_reduced == 0
     oval = gpe.changed(potential=harmonic_trap(1, 2)).problem(psi, 0.2, 0.01, invariants=names)
-    with pytest.warns(UserWarning, match="'angular_momentum' is no invariant of this system"):
+    with (
+        pytest.warns(UserWarning, match="'angular_momentum' is no invariant of this system"),
+        pytest.warns(ProjectionWarning, match="'angular_momentum'"),
+    ):
         integrate(oval, method=EIPRK4)
 
 

@@ -30,7 +30,7 @@ from eip_scipy import (
 )
 from eip_scipy.methods.runge_kutta import RK4
 from eip_scipy.problems import Problem, harmonic, kepler
-from eip_scipy.run import integrate as longrun
+from eip_scipy.run import driver
 
 EPS = np.finfo(float).eps
 Y0 = np.array([1.0, 2.0])
@@ -753,7 +753,7 @@ def test_one_compiled_loop_serves_all_options(monkeypatch):
         kinds.add(arguments)
         raise KnownError
 
-    monkeypatch.setattr(longrun, "_compiled_advance", note)
+    monkeypatch.setattr(driver, "_compiled_advance", note)
     problem, four = kepler(), np.full(4, 1e-5)
     read_only = problem.params.copy()
     read_only.flags.writeable = False
