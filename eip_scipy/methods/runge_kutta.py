@@ -342,13 +342,6 @@ RK3 = _Published(
     error_estimator_order=2,
     reference=f"{_PAPER} (Heun's third-order method); estimate: the second-order rule on its last two stages",
 )
-RALSTON3 = Tableau(
-    "RALSTON3",
-    [[], ["1/2"], [0, "3/4"]],
-    ["2/9", "1/3", "4/9"],
-    order=3,
-    reference="A. Ralston, Math. Comp. 16 (1962) 431-437, the formula of order 3 with the least bound of the error",
-)
 RK4 = _Published(
     "RK4",
     [[], ["1/2"], [0, "1/2"], [0, 0, 1]],
