@@ -19,7 +19,7 @@ from ..engine.step import AUTO, ERROR, EUCLIDEAN, GIVEN, MIDPOINT, NEW, OLD, Opt
 from ..engine.trust import LARGE_SHARE
 from .blocks import blocks_of
 from .frame import frame_rows
-from .inputs import count, flag, is_number, real_array
+from .inputs import count, flag, real_array
 from .invariants import InvariantSet, JointInvariants
 from .one_step import OneStep
 from .stepping import AnyMethod, Stepping
@@ -48,7 +48,6 @@ class ProjectionKeywords(TypedDict, total=False):
     reuse_f: bool
     compensated: bool | None
     check: bool
-    largest_share: float
     project_initial: bool
 
 
@@ -145,12 +144,6 @@ class ProjectionOptions:
             invariant's terms. False: none of these.""",
         ),
     )
-    largest_share: float = field(
-        default=1.0,
-        metadata=_text(
-            "float", "The share of an invariant's own terms that a projection of fixed steps may leave before it fails."
-        ),
-    )
     project_initial: bool = field(
         default=False, metadata=_text("bool", "Project y0 onto given targets before the first step.")
     )
@@ -203,7 +196,7 @@ class ProjectionOptions:
             adaptive=stepping.h is None,
             per_band=1.0 / ((BAND_COMPENSATED if compensated else BAND) * EPS),
             watched=check and known.size > 0,
-            limit=(LARGE_SHARE if stepping.h is None else self._largest_share()) if check else np.inf,
+            limit=(LARGE_SHARE if stepping.h is None else 1.0) if check else np.inf,
         )
         if _can_project_jointly(options, known):
             options = options._replace(joint=known.items)
@@ -228,7 +221,6 @@ class ProjectionOptions:
             "uses_f": o.uses_f,
             "project_initial": bool(self.project_initial),
             "compensated": o.compensated,
-            "largest_share": self.largest_share,
         }
 
     def _compensated(self, method: AnyMethod) -> bool:
@@ -238,11 +230,6 @@ class ProjectionOptions:
         if compensated and isinstance(method, OneStep):
             raise ValueError(f"compensated=True carries the rounding of a tableau's sums; {method.name} is no tableau.")
         return compensated
-
-    def _largest_share(self) -> float:
-        if not is_number(self.largest_share) or not self.largest_share > 0:
-            raise ValueError(f"largest_share must be a number > 0, got {self.largest_share!r}.")
-        return float(self.largest_share)
 
     def _every(self, method: AnyMethod) -> int:
         if self.every is None:
