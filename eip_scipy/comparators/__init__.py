@@ -14,7 +14,6 @@ from eip_scipy.comparators.implicit_midpoint import implicit_midpoint
 from eip_scipy.comparators.linearly_implicit import linearly_implicit
 from eip_scipy.comparators.scalar_auxiliary import SAVResult, sav_crank_nicolson
 from eip_scipy.comparators.stormer_verlet import StormerVerletResult, stormer_verlet
-from eip_scipy.comparators.symplectic_euler import symplectic_euler
 
 __all__ = [
     "FieldResult",
@@ -27,5 +26,4 @@ __all__ = [
     "linearly_implicit",
     "sav_crank_nicolson",
     "stormer_verlet",
-    "symplectic_euler",
 ]
