@@ -117,7 +117,7 @@ def test_bars(method, rtol):
 
 
 def outcome(error=1e-8, drift=1e-13, failure=""):
-    return command.Outcome(math.nan if failure else error, drift, 10, 70, failure)
+    return command.CaseOutcome(math.nan if failure else error, drift, 10, 70, failure)
 
 
 def made_up(**projected):
@@ -204,7 +204,7 @@ def test_command_prints_and_writes(tmp_path, capsys):
 
 def test_a_case_without_known_cause_is_judged_by_its_neighbours():
     case = next(case for case in CASES if case.name not in command.CAUSES)
-    plain, projected = (command.Outcome(error, drift=0.0, steps=1, nfev=1) for error in (1e-6, 2e-6))
+    plain, projected = (command.CaseOutcome(error, drift=0.0, steps=1, nfev=1) for error in (1e-6, 2e-6))
     worse = command.Comparison(case, plain, projected, nearby=(1.5, 1.5, 0.1))
     assert "scatter" in command.cause(worse)  # 0.5 * 1.5 * 1.5 > 1; the third is the euclidean metric's
     assert "not known" in command.cause(replace(worse, nearby=(1.5, 1.2, 9.0)))

@@ -86,7 +86,7 @@ def test_work_and_precision_interrupted(tmp_path, capsys, monkeypatch):
 def test_cheapest_methods_of_the_text():
     def work(*errors):
         n = np.arange(1.0, len(errors) + 1)
-        return kepler_cost.Work(n, 1000 * n, n / 1000, np.array(errors))
+        return kepler_cost.CostCurve(n, 1000 * n, n / 1000, np.array(errors))
 
     names = {method.__name__: work(np.nan) for method in kepler_cost.FIXED}
     text = kepler_cost.text({**names, "EIPRK2": work(0.1, 1e-2, 1e-4), "EIPRK45": work(1e-2, 1e-3)}, "a machine")

@@ -239,7 +239,9 @@ def test_command_compares_methods(tmp_path, capsys):
 def small_scene(monkeypatch):
     """One that is quick in plain Python, too."""
     problem = replace(kepler(0.5, 0.0, t_end=2.0), h=None)
-    monkeypatch.setitem(SCENES, "small", lambda: scene_runs.Scene("small", "small", problem, centre_time, (40,), 1e-4))
+    monkeypatch.setitem(
+        SCENES, "small", lambda: scene_runs.HardScene("small", "small", problem, centre_time, (40,), 1e-4)
+    )
     monkeypatch.setattr(scene_runs, "TOLERANCES", (1e-3, 1e-5))
     monkeypatch.setattr(scene_runs, "STEPS_PER_TURN", (10, 20))
 

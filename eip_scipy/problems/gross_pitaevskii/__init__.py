@@ -8,7 +8,7 @@ from .ground_state import GroundState, ground_state
 from .potentials import harmonic_trap, quartic_trap
 from .scenes import line_condensate, plane_wave, ring_condensate, rotating_packet, soliton
 from .search import lowest_ring, lowest_state
-from .splitting import RKN6, S6, STRANG, Splitting, SplittingScheme
+from .splitting import RKN6, S6, STRANG, Scheme, Splitting
 from .starts import imprint, polygon, ring_start, thomas_fermi, vortex_starts, with_noise
 from .surfaces import Surface, density_surface
 from .transforms import make_transforms
@@ -24,9 +24,9 @@ __all__ = [
     "GroundState",
     "LinearFlow",
     "Multiplier",
+    "Scheme",
     "SpectralSum",
     "Splitting",
-    "SplittingScheme",
     "Surface",
     "Vortices",
     "at_rest",

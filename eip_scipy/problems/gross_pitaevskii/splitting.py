@@ -11,10 +11,10 @@ from .equation import GrossPitaevskii
 from .flows import LinearFlow
 from .pointwise import local_flow
 
-__all__ = ["RKN6", "S6", "STRANG", "Splitting", "SplittingScheme"]
+__all__ = ["RKN6", "S6", "STRANG", "Scheme", "Splitting"]
 
 
-class SplittingScheme(NamedTuple):
+class Scheme(NamedTuple):
     """Coefficients of a symmetric splitting: flows of the local part and of the linear part in turn.
 
     Attributes
@@ -41,15 +41,15 @@ def _palindrome(half: tuple[float, ...], *, odd: bool, total: float = 1.0) -> tu
     return (*half, rest, *half[::-1]) if odd else (*half, rest / 2, rest / 2, *half[::-1])
 
 
-STRANG = SplittingScheme("strang", 2, (0.5, 0.5), (1.0,), "Strang, SIAM J. Numer. Anal. 5 (1968) 506")
-S6 = SplittingScheme(
+STRANG = Scheme("strang", 2, (0.5, 0.5), (1.0,), "Strang, SIAM J. Numer. Anal. 5 (1968) 506")
+S6 = Scheme(
     "s6",
     4,
     _palindrome((0.0792036964311957, 0.353172906049774, -0.0420650803577195), odd=True),
     _palindrome((0.209515106613362, -0.143851773179818), odd=False),
     "Blanes & Moan, J. Comput. Appl. Math. 142 (2002) 313, table 2, S6 of order 4",
 )
-RKN6 = SplittingScheme(
+RKN6 = Scheme(
     "rkn6",
     4,
     _palindrome((0.0829844064174052, 0.396309801498368, -0.0390563049223486), odd=True),
@@ -66,7 +66,7 @@ class Splitting:
     ----------
     gpe : GrossPitaevskii
         The equation; its buffers and transforms are used.
-    scheme : {"rkn6", "s6", "strang"} or SplittingScheme, optional
+    scheme : {"rkn6", "s6", "strang"} or Scheme, optional
         "rkn6" and "s6": of order 4, by Blanes and Moan; the former is made for Hamiltonians whose one part is quadratic
         in the momenta, as here. "strang": of order 2.
 
@@ -96,13 +96,11 @@ class Splitting:
     (True, True)
     """
 
-    def __init__(self, gpe: GrossPitaevskii, scheme: str | SplittingScheme = "rkn6") -> None:
-        if not isinstance(scheme, SplittingScheme):
+    def __init__(self, gpe: GrossPitaevskii, scheme: str | Scheme = "rkn6") -> None:
+        if not isinstance(scheme, Scheme):
             if scheme not in SCHEMES:
                 names = ", ".join(map(repr, SCHEMES))
-                raise ValueError(
-                    f"unknown scheme {scheme!r}, expected {names} or a SplittingScheme{nearest(scheme, SCHEMES)}"
-                )
+                raise ValueError(f"unknown scheme {scheme!r}, expected {names} or a Scheme{nearest(scheme, SCHEMES)}")
             scheme = SCHEMES[scheme]
         self.gpe, self.scheme = gpe, scheme
         self.order, self.name = scheme.order, f"splitting-{scheme.name}"
