@@ -145,6 +145,7 @@ def test_order_shows_in_the_errors(short):
         assert best < max(1e-3 * error["EIPRK4 (error)"][planet], 1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("little_to_time")
 def test_one_year_against_the_stored_states(tmp_path, capsys):
@@ -164,6 +165,7 @@ def test_one_year_against_the_stored_states(tmp_path, capsys):
     assert abs(float(rows["SV"]["longitude_Mercury_rad"])) == pytest.approx(0.05, rel=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_euclidean_metric_comes_first_when_asked_for(tmp_path, capsys, no_rebound):
     assert main(["solar-system", *SPAN, "--metric", "euclidean", "--data", "paper", "--out", str(tmp_path)]) == 0
@@ -174,6 +176,7 @@ def test_euclidean_metric_comes_first_when_asked_for(tmp_path, capsys, no_reboun
     assert "ok     EIPRK4 (euclidean) keeps H" in out
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_a_method_without_estimate_has_one_metric(tmp_path, capsys, no_rebound):
     assert main(["solar-system", *SPAN, "--method", "EIPRK1", "--out", str(tmp_path)]) == 0
@@ -207,6 +210,7 @@ def test_without_matplotlib_the_numbers_are_there(tmp_path, capsys, no_rebound, 
 # --- runs that go wrong ---
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("little_to_time")
 def test_a_run_that_fails_is_reported_and_changes_the_status(tmp_path, capsys, no_rebound, monkeypatch):
@@ -227,6 +231,7 @@ def test_a_run_that_fails_is_reported_and_changes_the_status(tmp_path, capsys, n
     assert (tmp_path / "orbits-inner.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_a_failed_check_changes_the_status(tmp_path, capsys, no_rebound, monkeypatch):
     monkeypatch.setattr(solar_errors, "ROUND_OFF", 1e-30)
@@ -235,6 +240,7 @@ def test_a_failed_check_changes_the_status(tmp_path, capsys, no_rebound, monkeyp
     assert "FAILED EIPRK4 (error) keeps H" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_a_run_that_is_not_to_be_trusted_is_told(tmp_path, capsys, no_rebound, monkeypatch):
     """At the end, once, by its name; in the JSON and the exit status too. Other warnings are shown as usual."""
@@ -291,6 +297,7 @@ def test_an_interruption_while_timing_keeps_the_table(tmp_path, capsys, no_rebou
     assert [path.name for path in tmp_path.iterdir()] == ["solar-system.csv"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_an_interrupted_command_goes_on(tmp_path, capsys, no_rebound, monkeypatch):
     """With --checkpoint, runs that were done are not done again; the numbers are those of an uninterrupted command."""
@@ -345,6 +352,7 @@ def test_an_interruption_anywhere_is_one_line(capsys, monkeypatch):
     assert lines(capsys.readouterr().err) == ["eip-scipy: interrupted"]
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 def test_control_c(tmp_path):
     out = tmp_path / "out"

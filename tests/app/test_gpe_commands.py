@@ -226,6 +226,7 @@ def test_a_stationary_state(start, tmp_path, monkeypatch):
     assert all(row["field_error"] < 1e-6 for row in content["errors"])  # null, were it not finite
 
 
+@pytest.mark.slow
 @pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize(("run", "evaluation", "done"), [(0, 207, []), (2, 93, ["EIP-M"])])

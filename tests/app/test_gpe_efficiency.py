@@ -16,6 +16,7 @@ def trials():
     return gpe_efficiency.study(points=16, repeats=1)
 
 
+@pytest.mark.slow
 def test_orders_are_those_of_the_methods(trials):
     """On the plane wave, where splittings are exact and RK4 is at round-off; on the modulated one all have theirs."""
     for name, order in {"CN": 2, "LIC": 2, "SAV/CN": 2, "Strang": 2, "splitting4-EIP": 4}.items():

@@ -39,6 +39,7 @@ def read(file):
         return list(csv.DictReader(stream))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", particle_runs.SCENES)
 def test_numbers_of_a_short_run(short, name):
     found = short[name]
@@ -84,6 +85,7 @@ def test_checks_and_their_words():
     assert "between 1.0093 and 1.0097" in RangeCheck("s", "R of the tip", 1.0095, 1.0093, 1.0097).text
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_runs")
 def test_command(tmp_path, capsys):
     file = tmp_path / "run.json"

@@ -61,6 +61,7 @@ def test_what_each_force_is_worth_after_a_century(tmp_path):
     assert (tmp_path / "solar-truth.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("years", ["1.05", "-1.05"])
 def test_both_ways_in_time(tmp_path, years):

@@ -300,6 +300,7 @@ def passing(component, value):
 LEVELS = {"default": {}, "backward": {"t_span": (8.0, 0.0)}, "every 3": {"every": 3}, "reuse_f off": {"reuse_f": False}}
 
 
+@pytest.mark.slow
 @pytest.mark.slow_without_jit
 @pairs
 @pytest.mark.parametrize("kind", LEVELS)
@@ -387,6 +388,7 @@ def test_an_invariant_as_an_event(method):
     assert all(len(t) > 0 for t in found.t_events)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "compiled",
     [pytest.param(True, marks=pytest.mark.needs_jit), pytest.param(False, marks=pytest.mark.slow_without_jit)],

@@ -127,6 +127,7 @@ def test_time_reaches_every_stage(method):
         np.testing.assert_allclose(run.y[:, -1], end, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @both
 @pytest.mark.parametrize("options", [{"invariants": ()}, KEPT, {**KEPT, "every": 3}, {**KEPT, "every": "auto"}])
@@ -147,6 +148,7 @@ def string(t, u, params):
     return -(params[0] ** 2) * u
 
 
+@pytest.mark.slow
 @both
 def test_complex_states_and_params(method):
     q, v = np.array([1.0 + 0.5j, -0.3j]), np.array([0.2j, 1.0 + 0j])

@@ -100,6 +100,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @needs_jit
 @pytest.mark.parametrize("case", CASES)
 def test_members_are_single_runs(case):
@@ -110,6 +111,7 @@ def test_members_are_single_runs(case):
     assert run.success
 
 
+@pytest.mark.slow
 @needs_jit
 def test_backward_and_nothing_to_do():
     y0s = starts(3)
@@ -118,6 +120,7 @@ def test_backward_and_nothing_to_do():
         same_members(run, lambda k, span=span: integrate(jit_orbit, span, y0s[k], method=EIPRK4, invariants=HL, h=0.03))
 
 
+@pytest.mark.slow
 @needs_jit
 def test_problem_with_params_for_each_member():
     problem, params = kepler(), np.linspace(0.0, 0.01, 6)[:, None]
@@ -126,6 +129,7 @@ def test_problem_with_params_for_each_member():
     assert len({tuple(y) for y in run.y}) == 6
 
 
+@pytest.mark.slow
 @needs_jit
 def test_one_set_of_params():
     problem = kepler()
@@ -137,6 +141,7 @@ def _acceleration(t, q):
     return -q / np.sqrt(q[0] * q[0] + q[1] * q[1]) ** 3
 
 
+@pytest.mark.slow
 @needs_jit
 def test_nystrom():
     y0s, options = starts(4), {"method": EIPRKN8, "h": 0.05, "invariants": HL}
@@ -159,6 +164,7 @@ def _norm_gradient(t, y):
     return 2 * y
 
 
+@pytest.mark.slow
 @needs_jit
 def test_complex_states():
     y0s = np.random.default_rng(0).standard_normal((3, 4)).view(complex)
@@ -175,6 +181,7 @@ def _height(t, y):
 _height.terminal, _height.direction = True, -1
 
 
+@pytest.mark.slow
 @needs_jit
 def test_events_end_members():
     y0s = starts(4)
@@ -187,6 +194,7 @@ def test_events_end_members():
             np.testing.assert_array_equal(run.y[k], own.y_events[0][0])
 
 
+@pytest.mark.slow
 @needs_jit
 def test_given_target_and_projected_start():
     target = [Invariant(jit_energy, jit_energy_gradient, target=-0.5, name="H")]
@@ -209,6 +217,7 @@ def test_interpreted_members():
 # Nothing passes from member to member, nor from worker to worker.
 
 
+@pytest.mark.slow
 @needs_jit
 @pytest.mark.parametrize("options", [{}, {"compensated": True, "every": 3}, {"direction": "old", "iterations": 2}])
 def test_no_member_leaves_a_trace(options):
@@ -227,6 +236,7 @@ def test_no_member_leaves_a_trace(options):
         np.testing.assert_array_equal(getattr(before, name), getattr(after, name)[::-1])
 
 
+@pytest.mark.slow
 @needs_jit
 @pytest.mark.parametrize("more", [{}, {"save_every": 10, "reduce": "state"}])
 def test_bits_do_not_depend_on_the_number_of_threads(more):
@@ -239,6 +249,7 @@ def test_bits_do_not_depend_on_the_number_of_threads(more):
         same(runs[0], run)
 
 
+@pytest.mark.slow
 @needs_jit
 def test_members_do_not_depend_on_the_chunk():
     same(ensemble(kepler(), SPAN, starts(40), chunk=3), ensemble(kepler(), SPAN, starts(40), chunk=40))
@@ -302,6 +313,7 @@ def jit_broken(t, y):
     return np.array([y[1], -y[0]])
 
 
+@pytest.mark.slow
 @needs_jit
 @pytest.mark.parametrize("more", [{}, {"save_every": 5}])
 def test_a_failing_member_of_compiled_functions(more):
@@ -321,6 +333,7 @@ def test_a_failing_member_of_compiled_functions(more):
         assert np.isnan(run.trajectories[[1, 2, 4, 5], :, -1]).all()
 
 
+@pytest.mark.slow
 @needs_jit
 def test_projection_fails_in_one_member():
     y0s = starts(20)
@@ -403,6 +416,7 @@ def test_what_was_there_survives_an_exception():
     assert info.value.partial.status.tolist() == [0] * 6 + [-2] * 3
 
 
+@pytest.mark.slow
 @needs_jit
 def test_ctrl_c_within_a_second():
     timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
@@ -473,6 +487,7 @@ def test_what_fails_in_every_member_is_raised():
 # Executors of concurrent.futures.
 
 
+@pytest.mark.slow
 @needs_jit
 def test_processes():
     y0s = starts(40)

@@ -27,6 +27,7 @@ def _small_ensembles_too(monkeypatch):
     monkeypatch.setattr(tasks, "LEAST_WORK", 0)
 
 
+@pytest.mark.slow
 def test_little_work_is_not_worth_compiling_for(monkeypatch):
     monkeypatch.undo()
     run = ensemble(kepler(), (0, 1), spread_starts(kepler().y0, 40), executor=1)
@@ -70,6 +71,7 @@ def check_bits(problem, t_span, starts, *, params=None, members=None, **options)
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [EIPRK4, EIPRK5, EIPRK45, EIPDOP853])
 def test_members_get_the_bits_of_single_runs(method, batches):
     starts = spread_starts(kepler().y0, 40)
@@ -78,6 +80,7 @@ def test_members_get_the_bits_of_single_runs(method, batches):
     assert batches["left"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -98,12 +101,14 @@ def test_options(options, span, batches):
     assert batches["members"] == 11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("members", [1, 2, 7, 8, 9, 33, 70])
 def test_any_number_of_members(members):
     starts = spread_starts(kepler().y0, members)
     check_bits(kepler(), (0, 3), starts, method=EIPRK4, h=0.05, members=range(max(0, members - 9), members))
 
 
+@pytest.mark.slow
 def test_parallel_gradients(batches):
     """On a circular orbit the gradients of H and L are parallel: the rank falls, in some members at some steps."""
     e = np.array([0.0, 0.0, 1e-9, 1e-8, 1e-6, 1e-4, 0.02, 0.3, 0.0, 0.6])
@@ -112,6 +117,7 @@ def test_parallel_gradients(batches):
     assert batches["members"] == len(e)
 
 
+@pytest.mark.slow
 def test_members_leave_and_come_back(batches):
     """Components that stand alone make projections with softened weights: more than a vector does."""
     starts = spread_starts(np.array([1.0, 0.0, 0.0, 1.0]), 16, size=0.1)
@@ -120,6 +126,7 @@ def test_members_leave_and_come_back(batches):
     assert batches["left"] > 3
 
 
+@pytest.mark.slow
 def test_nystrom_with_parameters_of_each():
     problem = solar_system(years=100.0)
     starts = spread_starts(problem.y0, 9, size=1e-7)
@@ -165,6 +172,7 @@ def chain_gradient(t, y, out, params):
         out[i + 1] += pull
 
 
+@pytest.mark.slow
 def test_functions_of_the_users_own(batches):
     starts = np.random.default_rng(5).normal(size=(12, 10))
     params = np.linspace(0.5, 2, 12)[:, None]
@@ -187,6 +195,7 @@ def with_an_array(t, y):
     return np.array([y[1], -y[0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fun", "in_place"), [(with_a_branch, True), (with_an_array, False)])
 def test_what_does_not_go_into_a_vector_runs_one_by_one(fun, in_place, batches):
     starts = spread_starts(np.array([1.0, 0.5]), 9)
@@ -200,6 +209,7 @@ def explodes(t, y, out):
     out[1] = -y[1]
 
 
+@pytest.mark.slow
 def test_a_member_that_fails_disturbs_no_other(batches):
     starts = np.ones((10, 2))
     starts[:, 0] = 0.1
@@ -216,6 +226,7 @@ def test_a_member_that_fails_disturbs_no_other(batches):
     assert batches["members"] == 10
 
 
+@pytest.mark.slow
 def test_exceptions_name_the_member():
     """Division by zero raises in the single run; in a vector it gives inf, and the member leaves."""
 
@@ -231,6 +242,7 @@ def test_exceptions_name_the_member():
     assert "ZeroDivisionError" in run.message[5]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 16, 17, 21])
 def test_gravity_in_octets(n):
     """Every order of summation that the number of bodies brings with it."""
@@ -259,6 +271,7 @@ def test_gravity_in_octets(n):
         np.testing.assert_array_equal(momentum[:, k], _newton.momentum(0.0, state, masses))
 
 
+@pytest.mark.slow
 def test_octets_are_floats_lane_by_lane():
     """All that functions of octets are made of, against the same functions of floats."""
 
@@ -293,6 +306,7 @@ def test_octets_are_floats_lane_by_lane():
         np.testing.assert_array_equal(out[:, k], one)
 
 
+@pytest.mark.slow
 def test_octets_are_typed_apart_from_floats():
     @njit
     def add(a, b):
@@ -309,6 +323,7 @@ def test_octets_are_typed_apart_from_floats():
         lifted(1.0)
 
 
+@pytest.mark.slow
 def test_adaptive_members_run_one_by_one(batches):
     starts = spread_starts(harmonic().y0, 9)
     check_bits(harmonic(), (0, 1), starts, method=EIPRK45, first_step=0.1)

@@ -7,10 +7,12 @@ from . import kills, systems
 pytestmark = pytest.mark.needs_jit  # interpreted kernels would take minutes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(0, 20, 4))
 def test_random_systems(seed, capsys):
     assert systems.main(["--seed", str(seed), "--count", "4"]) == 0, capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_runs_are_killed(capsys):
     assert kills.main(["--kills", "8"]) == 0, capsys.readouterr().out

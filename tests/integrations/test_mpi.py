@@ -73,6 +73,7 @@ def test_results_are_the_serial_ones(ranks, serial, tmp_path):
                 np.testing.assert_array_equal(found, expected, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @needs_mpirun
 def test_the_page(tmp_path):
@@ -175,6 +176,7 @@ FAILING = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @needs_mpirun
 @pytest.mark.parametrize("ranks", [2, 3])

@@ -300,6 +300,7 @@ def mirror_run(field, form, **options):
     return problem, run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MIRRORS)
 def test_own_field(name):
     field, form, kept = MIRRORS[name]
@@ -353,6 +354,7 @@ def test_a_wrong_claim_of_symmetry_is_seen():
         integrate(problem, method=EIPRK4)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("form", ["canonical", "velocity"])
 def test_compiled_functions_may_return_integers_and_arrays(form):

@@ -232,6 +232,7 @@ def test_without_the_jit_equal_to_rounding():
         assert found[-1] == pytest.approx(_newton.energy(0.0, y, gm), rel=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 def test_the_same_bits_with_and_without_avx512():
     have = binding.get_host_cpu_features()

@@ -292,6 +292,7 @@ COMPLEX_CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", COMPLEX_CASES)
 def test_complex(case):
     run = compare(lattice, (0.0, 2.0), Z0, check=False, **COMPLEX_CASES[case])
@@ -299,6 +300,7 @@ def test_complex(case):
     assert run.y.dtype == complex
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("span", [(0.0, 2.0), (2.0, 0.0)])
 def test_complex_in_place(span):
     options = {"invariants": [MASS, ENERGY_IN_PLACE], "in_place": True, "check": False, "method": EIPRK5}

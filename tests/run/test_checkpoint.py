@@ -239,6 +239,7 @@ def test_resumed_runs_are_the_same(name, tmp_path, monkeypatch):
     assert found.status == (1 if "ends" in name and "event" in name else 0)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("fine")
 @pytest.mark.parametrize("name", COMPILED)
@@ -258,6 +259,7 @@ def test_resumed_compiled_runs_are_the_same(name, tmp_path, monkeypatch):
     same(whole, found)
 
 
+@pytest.mark.slow
 @pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("fine")
 @pytest.mark.parametrize("name", ["fixed", "compensated", "every auto", "adaptive", "adaptive, events", "Nystrom, all"])
@@ -677,6 +679,7 @@ print(ends)
 """
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_blas_rounds_otherwise(tmp_path):
     """The method's low parts and the frame are the same run's whatever kernels OpenBLAS takes for the processor."""
     for what, kernel in (("stop", {"OPENBLAS_CORETYPE": "Prescott"}), ("go on", {})):  # every x86-64 runs Prescott's

@@ -119,6 +119,7 @@ def event_that_writes(t, y):
 WRITERS = [writing, writing_now_and_then, writing_by_a_view, writing_by_a_function]
 
 
+@pytest.mark.slow
 @all_of_them
 @pytest.mark.parametrize("method", [EIPRK4, EIPRK45])
 @pytest.mark.parametrize("fun", WRITERS)
@@ -165,6 +166,7 @@ def test_accelerations_that_write(how, in_place):
     np.testing.assert_allclose(run.y[0], np.cos(run.t) + 2 * np.sin(run.t), atol=1e-11)
 
 
+@pytest.mark.slow
 @all_of_them
 @pytest.mark.parametrize(
     "items",
@@ -437,6 +439,7 @@ def test_compiled_functions_that_return_none(part):
         integrate(njit(fun), (0, 1), Y0, method=EIPRK4, h=0.1, invariants=kept, compiled=True)
 
 
+@pytest.mark.slow
 @needs_jit
 @pytest.mark.parametrize("part", ["fun", "value", "gradient"])
 def test_compiled_shapes_that_change(part):
