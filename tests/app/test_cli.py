@@ -601,6 +601,7 @@ def test_every_method_of_the_solvers_is_offered():
     assert "EIPSolver" not in methods
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_two_thousand_years():

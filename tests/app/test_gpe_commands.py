@@ -275,6 +275,7 @@ def coarse(monkeypatch):
     monkeypatch.setattr(gpe_lines, "SNAPSHOTS", (0.0, 0.2))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("coarse")

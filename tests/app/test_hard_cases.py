@@ -106,6 +106,7 @@ def test_drift_is_relative_and_sees_the_largest_change():
 # --- the bars ---
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "rtol"), [("EIPRK45", 1e-6), ("EIPDOP853", 1e-9)])
 def test_bars(method, rtol):

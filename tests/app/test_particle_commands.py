@@ -176,6 +176,7 @@ def full(request):
     return particle_runs.study(request.param)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_the_papers_claims(full):

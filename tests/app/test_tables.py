@@ -125,6 +125,7 @@ def table5(name):
     return stored
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_table5_from_its_longest_steps():

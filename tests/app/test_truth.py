@@ -39,6 +39,7 @@ def options(tmp_path, **given):
     return SimpleNamespace(**{**known, **given})
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_what_each_force_is_worth_after_a_century(tmp_path):

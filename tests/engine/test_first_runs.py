@@ -172,6 +172,7 @@ RUNS = (
 )
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_whole_first_runs_at_once(tmp_path):
     """Of different kinds, so that the same functions are compiled for different types; then from the cache."""

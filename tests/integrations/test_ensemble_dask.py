@@ -72,6 +72,7 @@ def pair(others):
         client.cluster.close()
 
 
+@pytest.mark.nightly
 @slow
 def test_bits_do_not_depend_on_the_number_of_workers(workers):
     y0s = starts(100)
@@ -94,6 +95,7 @@ def test_functions_without_a_module(pair):
         np.testing.assert_array_equal(run.trajectories[k], own.y)
 
 
+@pytest.mark.nightly
 @slow
 @pytest.mark.parametrize("allowed_failures", [0, 3])
 def test_a_killed_worker_loses_nothing(allowed_failures):
@@ -124,6 +126,7 @@ def deadly(t, y):
     return np.array([y[1], -y[0]])
 
 
+@pytest.mark.nightly
 @slow
 def test_a_member_that_kills_its_workers_is_found(pair):
     y0s = np.ones((24, 2))
@@ -136,6 +139,7 @@ def test_a_member_that_kills_its_workers_is_found(pair):
     assert run.statistics.count.tolist() == [23]
 
 
+@pytest.mark.nightly
 @slow
 def test_a_member_that_kills_its_workers_as_dask_is_set_up():
     """Three tries of the chunk, and of each of its parts; the workers are new each time."""
@@ -155,6 +159,7 @@ def slow_oscillator(t, y):
     return np.array([y[1], -y[0]])
 
 
+@pytest.mark.nightly
 @slow
 def test_all_workers_are_killed_in_the_middle_of_their_tasks(pair):
     y0s = np.random.default_rng(0).standard_normal((12, 2))
@@ -167,6 +172,7 @@ def test_all_workers_are_killed_in_the_middle_of_their_tasks(pair):
     same(ensemble(oscillator, (0, 10), y0s, **options), there)
 
 
+@pytest.mark.nightly
 @slow
 def test_workers_that_die_while_they_start(tmp_path):
     (tmp_path / "die.py").write_text("import os; os._exit(3)", encoding="utf-8")

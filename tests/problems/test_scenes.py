@@ -208,6 +208,7 @@ def no_rebound(monkeypatch):
     monkeypatch.delattr(eip_scipy.integrations, "rebound", raising=False)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("few_runs")

@@ -91,6 +91,7 @@ def test_a_callback_at_every_step_and_events(tmp_path):
     assert found.t_events[0].size == int((0.01 * MANY + math.atan2(1, 2)) / math.pi)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.slow_without_jit
 @pytest.mark.parametrize(

@@ -1226,6 +1226,7 @@ RUN = """
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_a_run_is_killed_again_and_again(number, tmp_path):
