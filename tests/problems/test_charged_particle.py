@@ -115,6 +115,7 @@ def test_both_forms_are_the_same_motion(make):
     assert np.linalg.norm(ends[0][:3] - problem.y0[:3]) > 0.01
 
 
+@pytest.mark.slow_without_jit
 @pytest.mark.parametrize("make", [uniform_field, tokamak])
 @pytest.mark.parametrize("form", ["canonical", "velocity"])
 def test_first_reference_state_is_met(make, form):
