@@ -27,7 +27,7 @@ def read(file):
         return list(csv.DictReader(stream))
 
 
-# CostCurve and precision.
+# Work and precision.
 
 
 @pytest.fixture

@@ -115,7 +115,7 @@ def _noted(result: Any, method: type[EIPSolver], nfev: dict[Any, int], step: flo
 
 def text(works: dict[str, CostCurve], machine: str) -> str:
     """Lay out the cost of each method at some errors."""
-    parts = [f"CostCurve and precision: perturbed Kepler problem, e = 0.6, H and L kept, t = {T_END:g}", machine]
+    parts = [f"Work and precision: perturbed Kepler problem, e = 0.6, H and L kept, t = {T_END:g}", machine]
     for cost, unit, factor in (("nfev", "1000 evaluations of f", 1e-3), ("wall_time", "milliseconds", 1e3)):
         body = []
         for name, work in works.items():

@@ -1,4 +1,4 @@
-"""ParticleEquations of motion and invariants of a charged particle, from functions of its field.
+"""Equations of motion and invariants of a charged particle, from functions of its field.
 
 Each function here takes the field's functions first, and is plain Python when they are; `compose` binds them. Called
 from compiled code all is inlined, and what two of the field's functions have in common is computed once: the loop is as
@@ -59,7 +59,7 @@ def no_force(x, y, z):
 
 
 def compose(field: FieldFunctions, form: str) -> ParticleEquations:
-    """ParticleEquations of motion and invariants in one form.
+    """Equations of motion and invariants in one form.
 
     Parameters
     ----------
