@@ -165,6 +165,7 @@ def test_one_year_against_the_stored_states(tmp_path, capsys):
     assert abs(float(rows["SV"]["longitude_Mercury_rad"])) == pytest.approx(0.05, rel=0.5)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_euclidean_metric_comes_first_when_asked_for(tmp_path, capsys, no_rebound):
@@ -176,6 +177,7 @@ def test_euclidean_metric_comes_first_when_asked_for(tmp_path, capsys, no_reboun
     assert "ok     EIPRK4 (euclidean) keeps H" in out
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_a_method_without_estimate_has_one_metric(tmp_path, capsys, no_rebound):
@@ -231,6 +233,7 @@ def test_a_run_that_fails_is_reported_and_changes_the_status(tmp_path, capsys, n
     assert (tmp_path / "orbits-inner.png").exists()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_a_failed_check_changes_the_status(tmp_path, capsys, no_rebound, monkeypatch):
@@ -297,6 +300,7 @@ def test_an_interruption_while_timing_keeps_the_table(tmp_path, capsys, no_rebou
     assert [path.name for path in tmp_path.iterdir()] == ["solar-system.csv"]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_an_interrupted_command_goes_on(tmp_path, capsys, no_rebound, monkeypatch):

@@ -388,6 +388,7 @@ def test_an_invariant_as_an_event(method):
     assert all(len(t) > 0 for t in found.t_events)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "compiled",

@@ -148,6 +148,7 @@ def string(t, u, params):
     return -(params[0] ** 2) * u
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @both
 def test_complex_states_and_params(method):

@@ -27,6 +27,7 @@ def _small_ensembles_too(monkeypatch):
     monkeypatch.setattr(tasks, "LEAST_WORK", 0)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_little_work_is_not_worth_compiling_for(monkeypatch):
     monkeypatch.undo()
@@ -80,6 +81,7 @@ def test_members_get_the_bits_of_single_runs(method, batches):
     assert batches["left"] == 0
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
@@ -101,6 +103,7 @@ def test_options(options, span, batches):
     assert batches["members"] == 11
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("members", [1, 2, 7, 8, 9, 33, 70])
 def test_any_number_of_members(members):
@@ -108,6 +111,7 @@ def test_any_number_of_members(members):
     check_bits(kepler(), (0, 3), starts, method=EIPRK4, h=0.05, members=range(max(0, members - 9), members))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_parallel_gradients(batches):
     """On a circular orbit the gradients of H and L are parallel: the rank falls, in some members at some steps."""
@@ -117,6 +121,7 @@ def test_parallel_gradients(batches):
     assert batches["members"] == len(e)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_members_leave_and_come_back(batches):
     """Components that stand alone make projections with softened weights: more than a vector does."""
@@ -126,6 +131,7 @@ def test_members_leave_and_come_back(batches):
     assert batches["left"] > 3
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_nystrom_with_parameters_of_each():
     problem = solar_system(years=100.0)
@@ -172,6 +178,7 @@ def chain_gradient(t, y, out, params):
         out[i + 1] += pull
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_functions_of_the_users_own(batches):
     starts = np.random.default_rng(5).normal(size=(12, 10))
@@ -195,6 +202,7 @@ def with_an_array(t, y):
     return np.array([y[1], -y[0]])
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(("fun", "in_place"), [(with_a_branch, True), (with_an_array, False)])
 def test_what_does_not_go_into_a_vector_runs_one_by_one(fun, in_place, batches):
@@ -209,6 +217,7 @@ def explodes(t, y, out):
     out[1] = -y[1]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_member_that_fails_disturbs_no_other(batches):
     starts = np.ones((10, 2))
@@ -226,6 +235,7 @@ def test_a_member_that_fails_disturbs_no_other(batches):
     assert batches["members"] == 10
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_exceptions_name_the_member():
     """Division by zero raises in the single run; in a vector it gives inf, and the member leaves."""
@@ -242,6 +252,7 @@ def test_exceptions_name_the_member():
     assert "ZeroDivisionError" in run.message[5]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 16, 17, 21])
 def test_gravity_in_octets(n):
@@ -271,6 +282,7 @@ def test_gravity_in_octets(n):
         np.testing.assert_array_equal(momentum[:, k], _newton.momentum(0.0, state, masses))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_octets_are_floats_lane_by_lane():
     """All that functions of octets are made of, against the same functions of floats."""
@@ -306,6 +318,7 @@ def test_octets_are_floats_lane_by_lane():
         np.testing.assert_array_equal(out[:, k], one)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_octets_are_typed_apart_from_floats():
     @njit
@@ -323,6 +336,7 @@ def test_octets_are_typed_apart_from_floats():
         lifted(1.0)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_adaptive_members_run_one_by_one(batches):
     starts = spread_starts(harmonic().y0, 9)

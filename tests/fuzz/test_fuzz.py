@@ -13,6 +13,7 @@ def test_random_systems(seed, capsys):
     assert systems.main(["--seed", str(seed), "--count", "4"]) == 0, capsys.readouterr().out
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_runs_are_killed(capsys):
     assert kills.main(["--kills", "8"]) == 0, capsys.readouterr().out

@@ -301,6 +301,7 @@ def mirror_run(field, form, **options):
     return problem, run
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MIRRORS)
 def test_own_field(name):

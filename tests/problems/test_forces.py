@@ -248,6 +248,7 @@ def test_three_bodies_have_none_with_1pn():
     assert problem("1pn", CONSTANTS, GM[:3], POSITION[:3], VELOCITY[:3]).invariants == ()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("forces", [("eih",), ("eih", "j2", "moon-quadrupole")])
 def test_what_eih_leaves_falls_with_the_fourth_power_of_c(forces, monkeypatch):
@@ -334,6 +335,7 @@ def test_known_energy_and_momentum_of_a_test_particle(years, options):
     assert np.abs(J / J.mean() - 1).max() < 6e-15
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.parametrize(

@@ -166,6 +166,7 @@ def test_accelerations_that_write(how, in_place):
     np.testing.assert_allclose(run.y[0], np.cos(run.t) + 2 * np.sin(run.t), atol=1e-11)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @all_of_them
 @pytest.mark.parametrize(
