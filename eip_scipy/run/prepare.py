@@ -171,7 +171,7 @@ class Prepared:
 
 
 def prepared(request: Request, *, check_start: bool = True) -> Prepared:
-    """A run as it is asked for, all that was given checked; `check_start`: see `_setup.prepare`."""
+    """A run as it is asked for, all that was given checked; `check_start`: see `setup.prepare`."""
     refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
     method = _method(request.method)
     form = FORMS[isinstance(method, NystromTableau), flag("in_place", request.in_place)]
