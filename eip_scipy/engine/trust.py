@@ -29,7 +29,7 @@ LARGE, FAR, LARGE_SHARE = 50.0, 0.03, 1e-2
 # together so many times the errors; one defect of such a share of the terms, FAR ones in such a share of them.
 BEYOND_DOUBT, OFTEN, TOGETHER = 1e4, 0.1, 20.0
 TOO_FAR, FAR_OFTEN = 0.05, 0.01
-# So many changes make a share or a sum.
+# So many changes make a share or a sum, where more than one is LARGE.
 ENOUGH = 5
 PAGE = '"When a run is not trusted" (docs/trust.md)'
 
@@ -101,7 +101,7 @@ class Trust:
 def sick(figures: np.ndarray) -> np.ndarray:
     """Which rows of figures (..., N_FIGURES) no healthy run has."""
     judged = figures[..., JUDGED]
-    often = (judged >= ENOUGH) & (figures[..., MANY] > OFTEN * judged)
+    often = (judged >= ENOUGH) & (figures[..., MANY] > np.maximum(1, OFTEN * judged))
     together = (judged >= ENOUGH) & (figures[..., SUM] > TOGETHER * figures[..., EXPECTED])
     far = figures[..., RAW_MANY] > FAR_OFTEN * figures[..., NOTED]
     return _extreme(figures) | often | together | far
