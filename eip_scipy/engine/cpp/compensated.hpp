@@ -1,0 +1,82 @@
+// Sums that carry their rounding along: states as pairs of floats.
+#pragma once
+
+#include "data.hpp"
+
+namespace eip {
+
+struct Pair {
+    double value, rest;
+};
+
+inline Pair two_sum(double a, double b) {
+    const double s = a + b, v = s - a;
+    return {s, (a - (s - v)) + (b - v)};
+}
+
+inline Pair two_product(double a, double b) {
+    constexpr double SPLITTER = 134217729.0;  // 2^27 + 1 (Dekker)
+    const double p = a * b;
+    double x = SPLITTER * a;
+    const double a_high = x - (x - a), a_low = a - a_high;
+    x = SPLITTER * b;
+    const double b_high = x - (x - b), b_low = b - b_high;
+    return {p, ((a_high * b_high - p) + a_high * b_low + a_low * b_high) + a_low * b_low};
+}
+
+// (y_hat, carry_hat) = y + carry + h sum_j (b + b_low)[j] K[j], rounded once to two floats.
+template <class W>
+inline void compensated_step(const double *y, double h, const Method &m, const W &w) {
+    for (int64_t i = 0; i < w.m; ++i) {
+        double main = 0.0, low = 0.0;
+        for (int64_t j = 0; j < m.stages; ++j) {
+            const double f = w.row(j)[i];
+            main += m.b[j] * f;
+            low += m.b_low[j] * f;
+        }
+        const Pair increment = two_product(h, main), s = two_sum(y[i], increment.value);
+        const Pair sum = two_sum(s.value, s.rest + (increment.rest + h * low + w.carry[i]));
+        w.y_hat[i] = sum.value;
+        w.carry_hat[i] = sum.rest;
+    }
+}
+
+// The same for q + h v + h^2 sum_j (b + b_low)[j] a_j and v + h sum_j (b_v + b_v_low)[j] a_j.
+template <class W>
+inline void compensated_nystrom(const double *y, double h, const Method &m, const W &w) {
+    const int64_t half = w.m / 2;
+    for (int64_t i = 0; i < half; ++i) {
+        const int64_t k = half + i;
+        double place = 0.0, place_low = 0.0, speed = 0.0, speed_low = 0.0;
+        for (int64_t j = 0; j < m.stages; ++j) {
+            const double a = w.row(j)[k];
+            place += m.b[j] * a;
+            place_low += m.b_low[j] * a;
+            speed += m.b_v[j] * a;
+            speed_low += m.b_v_low[j] * a;
+        }
+        const Pair drift = two_product(h, y[k]), half_kick = two_product(h, place);
+        const Pair kick = two_product(h, half_kick.value);
+        const double rest =
+            drift.rest + kick.rest + h * (w.carry[k] + half_kick.rest + h * place_low) + w.carry[i];
+        const Pair first = two_sum(y[i], drift.value), second = two_sum(first.value, kick.value);
+        const Pair q = two_sum(second.value, first.rest + second.rest + rest);
+        w.y_hat[i] = q.value;
+        w.carry_hat[i] = q.rest;
+        const Pair increment = two_product(h, speed), s = two_sum(y[k], increment.value);
+        const Pair v = two_sum(s.value, s.rest + (increment.rest + h * speed_low + w.carry[k]));
+        w.y_hat[k] = v.value;
+        w.carry_hat[k] = v.rest;
+    }
+}
+
+// y + carry += move, in place.
+inline void compensated_add(double *y, double *carry, const double *move, int64_t n) {
+    for (int64_t i = 0; i < n; ++i) {
+        const Pair s = two_sum(y[i], move[i]), sum = two_sum(s.value, s.rest + carry[i]);
+        y[i] = sum.value;
+        carry[i] = sum.rest;
+    }
+}
+
+}  // namespace eip

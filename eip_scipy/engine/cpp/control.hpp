@@ -1,0 +1,150 @@
+// A whole step: the raw one, the projection, and the control of its length, which is SciPy's.
+#pragma once
+
+#include "correction.hpp"
+#include "stages.hpp"
+
+namespace eip {
+
+constexpr double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
+// A failed projection shrinks the step as CVODE does.
+constexpr double RETRY_FACTOR = 0.25;
+constexpr int MAX_RETRIES = 10;
+// every = AUTO: each so many-th step asks whether a projection is worth it.
+constexpr int64_t AUTO_SPACING = 5;
+
+// y_hat; f there in w.last(), the local error in w.err and its norm in w.norm where they are wanted.
+template <class AnyRun>
+inline Code raw_step(AnyRun &run, const Step &step) {
+    const Method &m = run.method;
+    const Options &o = run.options;
+    const auto &w = run.work;
+    if (m.nystrom)
+        rkn_stages(run, step);
+    else
+        rk_stages(run, step);
+    w.counters[NFEV] += m.stages - 1;
+    if (!all_finite(w.y_hat, w.m)) return NOT_FINITE;
+    const bool estimate = o.adaptive || ((o.metric == ERROR || o.every == AUTO) && w.l > 0);
+    w.counters[HAVE_F] = (estimate && m.fsal) || (step.project && o.uses_f);
+    w.counters[HAVE_ERROR] = estimate;
+    if (w.counters[HAVE_F]) {
+        run.system.rhs(w, step.t_new, w.y_hat, w.last());
+        ++w.counters[NFEV];
+    }
+    if (estimate)
+        estimate_error(run, step);
+    else if (step.project && is_sampled(run))
+        sample_error(run, step);
+    return OK;
+}
+
+template <class AnyRun>
+inline Code any_raw_step(AnyRun &run, const Step &step) {
+    return run.hooks && run.hooks->raw ? static_cast<Code>(run.hooks->raw_step(step)) : raw_step(run, step);
+}
+
+// After the projection: the carry, the errors gathered, and f for the next step's first stage in w.last().
+template <class AnyRun>
+inline void close_step(AnyRun &run, const Step &step, Code status) {
+    const Options &o = run.options;
+    const auto &w = run.work;
+    if (o.compensated) copy(w.carry_hat, w.carry, w.m);
+    if (!step.project || status == POSTPONED)
+        ++w.counters[WAITED];
+    else
+        w.counters[WAITED] = 0;
+    if (o.every != 1) {
+        if (status == POSTPONED)
+            copy(w.err, w.err_sum, w.m);
+        else if (step.project)
+            fill(w.err_sum, 0.0, w.m);
+        else if (o.metric == ERROR || o.every == AUTO || o.adaptive)
+            quadrature(w.err, w.err_sum, w.err_sum, w.m);
+    }
+    if (!w.counters[HAVE_F] || (step.project && status == OK && !o.reuse_f)) {
+        run.system.rhs(w, step.t_new, step.y_new, w.last());
+        ++w.counters[NFEV];
+    }
+}
+
+// The rest of a step whose raw result is accepted; OK or FAILED_PROJECTION.
+template <class AnyRun>
+inline Code finish_step(AnyRun &run, const Step &step) {
+    Code status = OK;
+    if (step.project) {
+        status = project_any(run, step);
+        if (status == FAILED_PROJECTION) {
+            ++run.work.counters[REJECTED];
+            return status;
+        }
+    } else {
+        copy(run.work.y_hat, step.y_new, run.work.m);
+    }
+    close_step(run, step, status);
+    return OK;
+}
+
+template <class AnyRun>
+inline Code any_finish_step(AnyRun &run, const Step &step) {
+    return run.hooks && run.hooks->finish ? static_cast<Code>(run.hooks->finish_step(step)) : finish_step(run, step);
+}
+
+// SciPy's: ten spacings of the numbers at t.
+inline double least_step(double t, double sign) { return 10.0 * std::abs(std::nextafter(t, sign * INFINITE) - t); }
+
+// Step k: fixed, or the first one that the error control accepts; K[0] = f(t, y) on entry, w.last() = f at its end.
+//
+// A failed projection shortens the step, at most MAX_RETRIES times in a row. Returns OK, NOT_FINITE, FAILED_PROJECTION or
+// TOO_SMALL.
+template <class AnyRun>
+inline Code next_step(AnyRun &run, const Span &span, double *clock, int64_t k, const double *y, double *y_new) {
+    const Options &o = run.options;
+    const auto &w = run.work;
+    const bool adaptive = span.h == 0.0;
+    const int64_t spacing = o.every == AUTO ? AUTO_SPACING : o.every;
+    if (!adaptive) clock[TIME] = span.t0 + k * span.h;
+    const double t = clock[TIME], least = adaptive ? least_step(t, span.sign) : 0.0;
+    double h_abs = clock[NEXT_LENGTH];
+    if (h_abs > span.max_step)
+        h_abs = span.max_step;
+    else if (h_abs < least)
+        h_abs = least;
+    bool rejected = false;
+    int retries = 0;
+    Code status = std::isnan(h_abs) ? NOT_FINITE : TOO_SMALL;
+    while (h_abs >= least) {
+        const double t_new = adaptive ? t + h_abs * span.sign : span.t0 + (k + 1) * span.h;
+        const bool last = adaptive ? span.sign * (t_new - span.t_bound) >= 0 : k + 1 >= span.n_steps;
+        clock[TIME_NEW] = last ? span.t_bound : t_new;
+        clock[LENGTH] = adaptive || last ? clock[TIME_NEW] - t : span.h;
+        h_abs = std::abs(clock[LENGTH]);
+        const bool project = w.l > 0 && (last || spacing == 1 || (k + 1) % spacing == 0);
+        const Step step{t, clock[TIME_NEW], clock[LENGTH], y, y_new, project, last};
+        status = any_raw_step(run, step);
+        const double norm = adaptive ? w.norm[0] : 0.0;
+        if (status == OK && !std::isfinite(norm)) status = NOT_FINITE;
+        if (status == OK && norm < 1.0) {
+            status = any_finish_step(run, step);
+            if (status == OK) {
+                const double factor =
+                    norm == 0.0 ? MAX_FACTOR : std::min(MAX_FACTOR, SAFETY * std::pow(norm, run.method.exponent));
+                clock[NEXT_LENGTH] = h_abs * (rejected ? std::min(1.0, factor) : factor);
+                return OK;
+            }
+            if (retries == MAX_RETRIES) return status;
+            ++retries;
+            h_abs *= RETRY_FACTOR;
+        } else if (status == OK) {
+            h_abs *= std::max(MIN_FACTOR, SAFETY * std::pow(norm, run.method.exponent));
+            status = TOO_SMALL;
+        } else {
+            h_abs *= MIN_FACTOR;
+        }
+        if (!adaptive) return status;
+        rejected = true;
+    }
+    return status;
+}
+
+}  // namespace eip

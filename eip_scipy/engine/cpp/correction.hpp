@@ -1,0 +1,265 @@
+// The projection: from y_hat along the gradients onto the targets.
+#pragma once
+
+#include "compensated.hpp"
+#include "estimate.hpp"
+#include "frame.hpp"
+#include "linear_algebra.hpp"
+#include "trust.hpp"
+
+namespace eip {
+
+constexpr double HEALTHY = 5.0;
+constexpr int MAX_SOFTENED = 3;
+
+// A Newton step: its rank, -1 where gradients are not finite, the largest relative error, and its size in local errors.
+struct Moved {
+    int64_t rank;
+    double largest_error, correction;
+};
+
+template <class W>
+inline Matrix rows_of(double *a, const W &w) { return {a, w.l, w.m, w.m}; }
+template <class W>
+inline Matrix small(double *a, int64_t size, const W &w) { return {a, size, size, w.l}; }
+
+// w.values = I(y); compensated runs add what the carry is worth, by the gradients at hand.
+template <class AnyRun>
+inline void evaluate_invariants(AnyRun &run, double t, const double *y) {
+    const auto &w = run.work;
+    run.system.inv(w, t, y, w.values);
+    if (run.options.compensated)
+        for (int64_t i = 0; i < w.l; ++i) w.values[i] += dot(w.gradient(i), w.carry_hat, w.m);
+}
+
+// w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction, neutral to the frame; out = y_hat + move.
+template <class W>
+inline void move_along(const Options &o, const W &w, double *out) {
+    const int64_t m = w.m;
+    for (int64_t j = 0; j < m; ++j) out[j] = w.mu[0] * w.Q[j];
+    for (int64_t k = 1; k < w.l; ++k) {
+        const double *row = w.Q + k * m;
+        for (int64_t j = 0; j < m; ++j) out[j] += w.mu[k] * row[j];
+    }
+    if (o.frame.rows > 0) {
+        for (int64_t j = 0; j < m; ++j) out[j] *= w.sigma[j];
+        keep_frame(o.frame, out, w.move, m);
+        for (int64_t j = 0; j < m; ++j) out[j] = w.y_hat[j] + w.move[j];
+        return;
+    }
+    for (int64_t j = 0; j < m; ++j) {
+        const double x = w.sigma[j] * out[j];
+        w.move[j] = x;
+        out[j] = w.y_hat[j] + x;
+    }
+}
+
+// The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal.
+template <class W>
+inline int64_t first_move(const Options &o, const W &w, double *out, bool more) {
+    weigh_rows(o.frame, w, w.Q);
+    const Matrix Q = rows_of(w.Q, w), R = small(w.R, w.l, w);
+    int64_t rank = w.l;
+    if (more || !solve_gram(Q, w.g, R, w.mu)) {
+        rank = factor(Q, w.inverse_norms, R, w.pivots);
+        least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
+    }
+    if (rank >= 0) move_along(o, w, out);
+    return rank;
+}
+
+// Add to w.mu the Newton step of (B . Q) step = -g, on the rows that the first factorisation chose.
+template <class W>
+inline void newton_matrix_solve(int64_t rank, const W &w) {
+    const Inner &inner = w.inner;
+    const Matrix matrix = small(inner.matrix, rank, w), R = small(inner.R, w.l, w);
+    for (int64_t k = 0; k < rank; ++k) {
+        for (int64_t q = 0; q < rank; ++q)
+            matrix(k, q) = dot(w.B + w.pivots[k] * w.m, w.Q + w.pivots[q] * w.m, w.m);
+        inner.g[k] = w.g[w.pivots[k]];
+    }
+    const int64_t inner_rank = factor(matrix, inner.inverse_norms, R, inner.pivots);
+    if (inner_rank < 0) fill(w.mu, NOT_A_NUMBER, w.l);
+    least_norm(inner.g, inner.inverse_norms, R, inner.pivots, inner_rank, inner.mu);
+    for (int64_t k = 0; k < rank; ++k)
+        for (int64_t q = 0; q < rank; ++q) w.mu[w.pivots[q]] += inner.mu[k] * matrix(k, q);
+    ++w.counters[NLU];
+}
+
+// The first Newton step along the gradients at y or at the midpoint; w.G holds those at y_hat. Returns the rank.
+template <class AnyRun>
+[[gnu::noinline]] inline int64_t other_directions(AnyRun &run, const Step &step) {
+    const Options &o = run.options;
+    const auto &w = run.work;
+    weigh_rows(o.frame, w, w.B);
+    if (o.direction == OLD) {
+        run.system.grad(w, step.t, step.y, w.row(0), w.G);
+    } else {
+        midpoint(step.y, w.y_hat, w.stage, w.m);
+        const double t = 0.5 * (step.t + step.t_new);
+        if (o.uses_f) {
+            run.system.rhs(w, t, w.stage, w.f_point);
+            ++w.counters[NFEV];
+        }
+        run.system.grad(w, t, w.stage, w.f_point, w.G);
+    }
+    ++w.counters[NJEV];
+    weigh_rows(o.frame, w, w.Q);
+    const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, small(w.R, w.l, w), w.pivots);
+    if (rank >= 0) {
+        fill(w.mu, 0.0, w.l);
+        newton_matrix_solve(rank, w);
+        move_along(o, w, step.y_new);
+    }
+    return rank;
+}
+
+// The first Newton step; `largest_error` >= 0: by the weights that stand, for this one.
+template <class AnyRun>
+inline Moved move(AnyRun &run, const Step &step, double largest_error = -1.0) {
+    const Options &o = run.options;
+    const auto &w = run.work;
+    ++w.counters[NLU];
+    // The state's own rounding is an error of the step, and at small steps the largest, unless it is carried along.
+    if (largest_error < 0.0)
+        largest_error = o.metric == ERROR ? error_metric(step.y, o.compensated ? 0.0 : EPS, o, w) : 0.0;
+    const int64_t rank = o.direction == NEW ? first_move(o, w, step.y_new, o.iterations > 1)
+                                            : other_directions(run, step);
+    return {rank, largest_error, correction_in_local_errors(largest_error, o, w)};
+}
+
+// One more Newton step along the same directions; false when every defect is inside its dead band.
+template <class AnyRun>
+[[gnu::noinline]] inline bool newton_iteration(AnyRun &run, const Step &step, int64_t rank) {
+    const Options &o = run.options;
+    const auto &w = run.work;
+    run.system.inv(w, step.t_new, step.y_new, w.values);
+    if (o.uses_f) {
+        run.system.rhs(w, step.t_new, step.y_new, w.f_point);
+        ++w.counters[NFEV];
+    }
+    run.system.grad(w, step.t_new, step.y_new, w.f_point, w.G);
+    ++w.counters[NJEV];
+    if (!defects(nullptr, step.y_new, o, w, w.defect)) return false;
+    weigh_rows(o.frame, w, w.B);
+    newton_matrix_solve(rank, w);
+    move_along(o, w, step.y_new);
+    return true;
+}
+
+// What follows the first Newton step: further ones, and whether the projection holds.
+template <class AnyRun>
+inline Code correct(AnyRun &run, const Step &step, int64_t rank) {
+    const Options &o = run.options;
+    const auto &w = run.work;
+    if (rank < 0) {
+        copy(w.before, w.defect, w.l);
+        return FAILED_PROJECTION;
+    }
+    for (int64_t k = 1; k < o.iterations; ++k)
+        if (!newton_iteration(run, step, rank)) break;
+    if (o.compensated) {
+        copy(w.y_hat, step.y_new, w.m);
+        compensated_add(step.y_new, w.carry_hat, w.move, w.m);
+    }
+    evaluate_invariants(run, step.t_new, step.y_new);
+    return judge(w.before, step.y_new, o, w);
+}
+
+// Further tries with weights ever nearer to equal relative errors; at most MAX_SOFTENED.
+//
+// An estimate can vanish in a component, by symmetry, where the error does not; the others then carry a correction far
+// larger than any error of the step. Components that stand alone are prone to it; a block's length is not.
+template <class AnyRun>
+[[gnu::cold, gnu::noinline]] inline Code correct_softly(AnyRun &run, const Step &step, bool alone, Moved &moved) {
+    ++run.work.counters[SOFTENED];
+    Code status = FAILED_PROJECTION;
+    for (int k = 0; k < MAX_SOFTENED; ++k) {
+        soften(run.options, run.work);
+        moved = move(run, step, moved.largest_error);
+        status = correct(run, step, moved.rank);
+        if (status == OK && !(alone && moved.correction > HEALTHY)) break;
+    }
+    return status;
+}
+
+// A last try with the first `rank` directions only.
+//
+// Where gradients are nearly parallel, as on a nearly circular orbit, states near y_hat may not reach a target at all:
+// the distance is of second order, and no shorter step mends it. What the directions left out would have corrected
+// stays, so that a defect may grow to the sum of all.
+template <class AnyRun>
+[[gnu::cold, gnu::noinline]] inline Code correct_with_fewer(AnyRun &run, const Step &step, int64_t &rank) {
+    const Options &o = run.options;
+    const auto &w = run.work;
+    const Matrix R = small(w.R, w.l, w);
+    weigh_rows(o.frame, w, w.Q);
+    const int64_t found = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
+    rank = std::max<int64_t>(0, std::min(rank, found));
+    least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
+    move_along(o, w, step.y_new);
+    evaluate_invariants(run, step.t_new, step.y_new);
+    shared_defects(w, w.g);
+    return judge(w.g, step.y_new, o, w);
+}
+
+// y_hat lies in all dead bands: nothing is moved.
+template <class W>
+inline Code stay(const Step &step, const Options &o, const W &w) {
+    ++w.counters[SKIPPED];
+    copy(w.y_hat, step.y_new, w.m);
+    const Code status = judge(w.before, step.y_new, o, w);
+    if (status == OK) take_note(step.t_new, nullptr, o, w);
+    return status;
+}
+
+// Project w.y_hat into y_new by o.iterations Newton steps; returns OK, FAILED_PROJECTION or POSTPONED.
+//
+// w.err holds the local error of y_hat where the metric wants it, w.last() f there where a gradient does. POSTPONED:
+// with every = AUTO, while the invariants know no more than round-off (y_new is then y_hat).
+template <class AnyRun>
+inline Code project_step(AnyRun &run, const Step &step) {
+    const Options &o = run.options;
+    const auto &w = run.work;
+    run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
+    ++w.counters[NJEV];
+    if (o.every != 1 && (o.metric == ERROR || o.every == AUTO || o.adaptive)) {
+        quadrature(w.err, w.err_sum, w.err, w.m);
+        if (o.every == AUTO && !step.last && !tells_more(w)) {
+            copy(w.y_hat, step.y_new, w.m);
+            return POSTPONED;
+        }
+    }
+    evaluate_invariants(run, step.t_new, w.y_hat);
+    if (!defects(nullptr, w.y_hat, o, w, w.before)) return stay(step, o, w);
+    Moved moved = move(run, step);
+    Code status = correct(run, step, moved.rank);
+    if (o.direction == NEW && o.iterations == 1 && !o.compensated) {
+        const bool alone = o.blocks.count * o.blocks.width == w.m;
+        const bool doubtful = status != OK ? all_finite(w.defect, w.l) : alone && moved.correction > HEALTHY;
+        if (moved.largest_error > 0.0 && doubtful) status = correct_softly(run, step, alone, moved);
+        if (status != OK && moved.rank > 1) {
+            --moved.rank;
+            status = correct_with_fewer(run, step, moved.rank);
+        }
+    }
+    w.counters[LAST_RANK] = std::max<int64_t>(moved.rank, 0);
+    if (moved.rank >= 0) {
+        ++w.counters[PROJECTIONS];
+        w.counters[RANK_REDUCED] += moved.rank < w.l;
+    }
+    if (status == OK) {
+        take_note(step.t_new, nullptr, o, w);
+        w.max_correction[0] = std::max(w.max_correction[0], moved.correction);
+    }
+    return status;
+}
+
+// The same, or the shorter way of joint invariants where that will do.
+template <class AnyRun>
+inline Code project_any(AnyRun &run, const Step &step) {
+    if (run.hooks && run.hooks->joint && run.hooks->project_jointly(step)) return OK;
+    return project_step(run, step);
+}
+
+}  // namespace eip

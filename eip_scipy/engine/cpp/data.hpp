@@ -1,0 +1,101 @@
+// What a run holds: its method, options, buffers and clock. All memory is that of NumPy arrays, which Python reads while
+// the run goes on; a complex state of n components stands here as 2 n floats, so that Re<., .> is the ordinary product.
+#pragma once
+
+#include <cstdint>
+#include <limits>
+
+namespace eip {
+
+// Codes of a step. PAUSE and FULL are the loop's.
+enum Code : int { OK = 0, NOT_FINITE = 1, FAILED_PROJECTION = 2, TOO_SMALL = 3, POSTPONED = 4, PAUSE = 10, FULL = 11 };
+
+enum Direction : int { NEW, OLD, MIDPOINT };
+enum Metric : int { EUCLIDEAN, ERROR, GIVEN };
+constexpr int64_t AUTO = 0;  // the option `every`
+
+// Places in the counters (counters.py), in the clock and in the place of a run.
+enum Counter : int {
+    NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED, HAVE_ERROR, BEGUN,
+    WAITED, FOUND, N_COUNTERS
+};
+enum Clock : int { TIME, TIME_NEW, LENGTH, NEXT_LENGTH };
+enum Place : int { STEP, ROW, PENDING };
+
+// Columns of the figures of a run's projections (trust.py says what they mean).
+enum Figure : int {
+    START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MANY, NU, AT, MANY, FIRST, SUM, EXPECTED, JUDGED,
+    N_FIGURES
+};
+
+constexpr double EPS = 2.220446049250313e-16;
+constexpr double INFINITE = std::numeric_limits<double>::infinity();
+constexpr double NOT_A_NUMBER = std::numeric_limits<double>::quiet_NaN();
+
+// Where a run steps: t_k = t0 + k h (h = 0: adaptive steps), the last one on t_bound.
+struct Span {
+    double t0, h, t_bound, sign;
+    int64_t n_steps;
+    double max_step;
+};
+
+// A tableau; rows of A are `columns` long. e weighs the rows of K in the error estimate, e_low in DOP853's second one;
+// names ending in _v are a Nystrom method's weights of the velocity.
+struct Method {
+    int64_t stages, columns;
+    const double *A, *b, *b_low, *b_v, *b_v_low, *c, *e, *e_v, *e_low;
+    int64_t n_e, n_e_v;
+    bool nystrom, fsal, paired;
+    double exponent;
+};
+
+// Blocks of floats: member[start[b]] to member[start[b + 1]]. `size` is that of consecutive blocks alike, else 0.
+struct Blocks {
+    const uint64_t *member, *start;
+    int64_t count, width, size;
+};
+
+// Linear invariants that corrections must not touch: non-zeros of C and, after them, of M^T, M = S (C S)^-1. Where x, y
+// and z of bodies have rows alike, `bodies` (2, groups, count) holds their weights instead.
+struct Frame {
+    const uint64_t *start, *place;
+    const double *value;
+    double *products;
+    int64_t rows;
+    const double *bodies;
+    int64_t groups, count;
+};
+
+struct Options {
+    const double *rtol, *atol, *block_atol;  // by float, by component, by block
+    Blocks blocks;
+    Frame frame;
+    const double *target, *scales;
+    double kappa;
+    int64_t metric, direction, iterations, every;
+    bool reuse_f, uses_f, compensated, adaptive, watched;
+    double per_band, limit;  // an invariant's terms are per_band dead bands; `limit`: the share of them that may be left
+};
+
+// Scratch of the small Newton systems.
+struct Inner {
+    double *matrix, *g, *inverse_norms, *R, *mu;
+    int64_t *pivots;
+};
+
+// Buffers of a run of m floats, l invariants and `stages` + 1 rows of K.
+struct Work {
+    int64_t n, m, l, stages;
+    double *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *move, *carry, *carry_hat,
+        *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *defect, *max_defect, *max_correction, *trust,
+        *norm;
+    int64_t *pivots, *counters;
+    Inner inner;
+
+    double *row(int64_t i) const { return K + i * m; }        // f of stage i
+    double *last() const { return K + stages * m; }           // f at the raw result, or at the end of the step
+    double *gradient(int64_t i) const { return G + i * m; }
+    double *figures(int64_t i) const { return trust + i * N_FIGURES; }
+};
+
+}  // namespace eip

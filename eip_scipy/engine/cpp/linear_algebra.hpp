@@ -1,0 +1,130 @@
+// Least-norm solutions of a few equations with long rows.
+#pragma once
+
+#include <utility>
+
+#include "floats.hpp"
+
+namespace eip {
+
+constexpr double RANK_TOLERANCE = 1.4901161193847656e-08;  // sqrt(EPS)
+// Below this length one Gram-Schmidt pass would leave errors of 1e-13 and more of the defects uncorrected.
+constexpr double REORTHOGONALISE = 0.05;
+
+// Rows of a matrix, `stride` floats from one to the next.
+struct Matrix {
+    double *data;
+    int64_t rows, columns, stride;
+
+    double *row(int64_t i) const { return data + i * stride; }
+    double &operator()(int64_t i, int64_t j) const { return data[i * stride + j]; }
+};
+
+// Pivoted QR of the normalised rows of B, in place; returns the numerical rank, -1 where B is not finite.
+//
+// `inverse_norms` normalise the rows (0 for a zero row). Row pivots[k] of B becomes the k-th orthonormal direction;
+// R(k, i) is the component of normalised row i along it, but for i = pivots[k] its reciprocal. By modified
+// Gram-Schmidt, with a second pass where cancellation would have spoilt the first.
+[[gnu::noinline]] inline int64_t factor(const Matrix &B, double *inverse_norms, const Matrix &R, int64_t *pivots) {
+    const int64_t rows = B.rows, n = B.columns;
+    int64_t first = 0;
+    for (int64_t i = 0; i < rows; ++i) {
+        pivots[i] = i;
+        const double length = norm(B.row(i), n);
+        if (!std::isfinite(length)) return -1;
+        inverse_norms[i] = length > 0.0 ? 1.0 / length : 0.0;
+        scale_by(B.row(i), inverse_norms[i], n);
+        if (inverse_norms[first] == 0.0) first = i;
+    }
+    if (rows == 0 || inverse_norms[first] == 0.0) return 0;
+    pivots[0] = first;
+    pivots[first] = 0;
+    R(0, first) = 1.0;
+    for (int64_t k = 1; k < rows; ++k) {
+        int64_t best = k;
+        double left = -1.0;
+        for (int64_t p = k; p < rows; ++p) {
+            const Removed removed = remove_component(B.row(pivots[p]), B.row(pivots[k - 1]), n);
+            R(k - 1, pivots[p]) = removed.product;
+            if (removed.square > left) {
+                best = p;
+                left = removed.square;
+            }
+        }
+        double length = std::sqrt(left);
+        std::swap(pivots[k], pivots[best]);
+        const int64_t row = pivots[k];
+        if (RANK_TOLERANCE < length && length < REORTHOGONALISE) {
+            for (int64_t q = 0; q < k; ++q) {
+                const Removed removed = remove_component(B.row(row), B.row(pivots[q]), n);
+                R(q, row) += removed.product;
+                left = removed.square;
+            }
+            length = std::sqrt(left);
+        }
+        if (length <= RANK_TOLERANCE) return k;
+        R(k, row) = 1.0 / length;
+        scale_by(B.row(row), R(k, row), n);
+    }
+    return rows;
+}
+
+// Coefficients mu of the rows that `factor` left, of the least-norm x with row_i . x = -g_i; 0 beyond the rank.
+inline void least_norm(const double *g, const double *inverse_norms, const Matrix &R, const int64_t *pivots,
+                       int64_t rank, double *mu) {
+    fill(mu, 0.0, R.rows);
+    for (int64_t k = 0; k < rank; ++k) {
+        const int64_t row = pivots[k];
+        double value = -g[row] * inverse_norms[row];
+        for (int64_t q = 0; q < k; ++q) value -= R(q, row) * mu[pivots[q]];
+        mu[row] = value * R(k, row);
+    }
+}
+
+// Coefficients mu of rows in the least-norm x with rows . x = -g, if they are far from dependent, from their Gram matrix
+// in the lower half of R, which is overwritten.
+//
+// By its factorisation L D L^T, which costs a third of `factor` and squares the condition number: whether it will do
+// shows on the way, by the same bound below which one pass of Gram-Schmidt would not. The diagonal of R then holds 1/D.
+// Two rows, the usual case, by Cramer's rule: one division to wait for.
+inline bool gram_solution(const Matrix &R, const double *g, double *mu) {
+    const int64_t rows = R.rows;
+    constexpr double LEAST = REORTHOGONALISE * REORTHOGONALISE;
+    for (int64_t i = 0; i < rows; ++i)
+        if (!(R(i, i) > 1e-140 && R(i, i) < 1e140)) return false;
+    if (rows == 2) {
+        const double determinant = R(0, 0) * R(1, 1) - R(1, 0) * R(1, 0);
+        const double inverse = 1.0 / positive(determinant);
+        mu[0] = (R(1, 0) * g[1] - R(1, 1) * g[0]) * inverse;
+        mu[1] = (R(1, 0) * g[0] - R(0, 0) * g[1]) * inverse;
+        return determinant > LEAST * (R(0, 0) * R(1, 1));
+    }
+    for (int64_t i = 0; i < rows; ++i) {
+        for (int64_t j = 1; j < i; ++j)
+            for (int64_t k = 0; k < j; ++k) R(i, j) -= R(i, k) * R(j, k);
+        double square = R(i, i);
+        const double least = LEAST * square;
+        mu[i] = -g[i];
+        for (int64_t j = 0; j < i; ++j) {
+            const double x = R(i, j) * R(j, j);
+            square -= x * R(i, j);
+            mu[i] -= x * mu[j];
+            R(i, j) = x;
+        }
+        if (!(square > least)) return false;
+        R(i, i) = 1.0 / square;
+    }
+    for (int64_t i = rows - 1; i >= 0; --i) {
+        mu[i] *= R(i, i);
+        for (int64_t j = i + 1; j < rows; ++j) mu[i] -= R(j, i) * mu[j];
+    }
+    return true;
+}
+
+inline bool solve_gram(const Matrix &B, const double *g, const Matrix &R, double *mu) {
+    for (int64_t i = 0; i < B.rows; ++i)
+        for (int64_t j = 0; j <= i; ++j) R(i, j) = dot(B.row(i), B.row(j), B.columns);
+    return gram_solution(R, g, mu);
+}
+
+}  // namespace eip

@@ -1,0 +1,49 @@
+// The raw step: stages and their sum, y_hat.
+#pragma once
+
+#include "compensated.hpp"
+#include "system.hpp"
+
+namespace eip {
+
+// out's first half = q + c h v + h^2 sum_j weights[j] a_j, for y = (q, v); a_j is the second half of K[j].
+inline void nystrom_position(const double *y, double h, double c, const Rows &rows, double *out, int64_t half) {
+    weighted_sum(1.0, rows, out, half);
+    for (int64_t i = 0; i < half; ++i) out[i] = y[i] + h * (c * y[half + i] + h * out[i]);
+}
+
+template <class AnyRun>
+inline void rk_stages(AnyRun &run, const Step &step) {
+    const Method &m = run.method;
+    const auto &w = run.work;
+    for (int64_t i = 1; i < m.stages; ++i) {
+        combine(step.y, step.h, {m.A + i * m.columns, w.K, i, w.m}, w.stage, w.m);
+        run.system.rhs_of_scratch(w, step.t + m.c[i] * step.h, w.stage, w.row(i));
+    }
+    if (run.options.compensated)
+        compensated_step(step.y, step.h, m, w);
+    else
+        combine(step.y, step.h, {m.b, w.K, m.stages, w.m}, w.y_hat, w.m);
+}
+
+// Stages keep v, which the accelerations do not see.
+template <class AnyRun>
+inline void rkn_stages(AnyRun &run, const Step &step) {
+    const Method &m = run.method;
+    const auto &w = run.work;
+    const int64_t half = w.m / 2;
+    const double *accelerations = w.K + half;
+    copy(step.y + half, w.stage + half, half);
+    for (int64_t i = 1; i < m.stages; ++i) {
+        nystrom_position(step.y, step.h, m.c[i], {m.A + i * m.columns, accelerations, i, w.m}, w.stage, half);
+        run.system.rhs_of_scratch(w, step.t + m.c[i] * step.h, w.stage, w.row(i));
+    }
+    if (run.options.compensated) {
+        compensated_nystrom(step.y, step.h, m, w);
+        return;
+    }
+    nystrom_position(step.y, step.h, 1.0, {m.b, accelerations, m.stages, w.m}, w.y_hat, half);
+    combine(step.y + half, step.h, {m.b_v, accelerations, m.stages, w.m}, w.y_hat + half, half);
+}
+
+}  // namespace eip

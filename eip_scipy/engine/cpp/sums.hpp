@@ -1,0 +1,163 @@
+// Sums in an order of their own: lane k sums the entries k, k + 8, k + 16, ...; the lanes are added in pairs, the entries
+// beyond the last multiple of eight come last. The same bits on every processor, whatever its vectors' length.
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+
+namespace eip {
+
+constexpr int64_t LANES = 8;
+
+// No wider than the processor's registers: GCC lowers wider ones through memory.
+#if defined(__AVX__)
+constexpr int WIDTH = 4;
+#else
+constexpr int WIDTH = 2;
+#endif
+typedef double Vector __attribute__((vector_size(WIDTH * sizeof(double))));
+constexpr int VECTORS = LANES / WIDTH;
+
+inline Vector load(const double *a) {
+    Vector v;
+    std::memcpy(&v, a, sizeof v);
+    return v;
+}
+
+inline void store(Vector v, double *a) { std::memcpy(a, &v, sizeof v); }
+
+struct Lanes {
+    Vector part[VECTORS] = {};
+
+    double sum() const {
+        double lane[LANES];
+        std::memcpy(lane, part, sizeof lane);
+        return ((lane[0] + lane[4]) + (lane[2] + lane[6])) + ((lane[1] + lane[5]) + (lane[3] + lane[7]));
+    }
+};
+
+inline Vector absolute(Vector v) {
+    for (int k = 0; k < WIDTH; ++k) v[k] = __builtin_fabs(v[k]);
+    return v;
+}
+
+inline double dot(const double *a, const double *b, int64_t n) {
+    const int64_t whole = n - n % LANES;
+    double rest = 0.0;
+    for (int64_t i = whole; i < n; ++i) rest += a[i] * b[i];
+    if (whole == 0) return 0.0 + rest;
+    Lanes lanes;
+    for (int64_t i = 0; i < whole; i += LANES)
+        for (int k = 0; k < VECTORS; ++k) lanes.part[k] += load(a + i + k * WIDTH) * load(b + i + k * WIDTH);
+    return lanes.sum() + rest;
+}
+
+// Sum of |a_i b_i|.
+inline double abs_dot(const double *a, const double *b, int64_t n) {
+    const int64_t whole = n - n % LANES;
+    double rest = 0.0;
+    for (int64_t i = whole; i < n; ++i) rest += __builtin_fabs(a[i] * b[i]);
+    if (whole == 0) return 0.0 + rest;
+    Lanes lanes;
+    for (int64_t i = 0; i < whole; i += LANES)
+        for (int k = 0; k < VECTORS; ++k)
+            lanes.part[k] += absolute(load(a + i + k * WIDTH) * load(b + i + k * WIDTH));
+    return lanes.sum() + rest;
+}
+
+// Largest entry of non-negative ones, 0 for none; NaN is passed over.
+inline double largest(const double *a, int64_t n) {
+    double top = 0.0;
+    for (int64_t i = 0; i < n; ++i) top = a[i] > top ? a[i] : top;
+    return top;
+}
+
+// row -= (unit . row) unit; that product, and the square of what is left.
+struct Removed {
+    double product, square;
+};
+
+inline Removed remove_component(double *row, const double *unit, int64_t n) {
+    const double r = dot(unit, row, n);
+    const int64_t whole = n - n % LANES;
+    double rest = 0.0;
+    for (int64_t i = whole; i < n; ++i) {
+        const double left = row[i] - r * unit[i];
+        row[i] = left;
+        rest += left * left;
+    }
+    if (whole == 0) return {r, 0.0 + rest};
+    Lanes lanes;
+    for (int64_t i = 0; i < whole; i += LANES)
+        for (int k = 0; k < VECTORS; ++k) {
+            const int64_t at = i + k * WIDTH;
+            const Vector left = load(row + at) - r * load(unit + at);
+            store(left, row + at);
+            lanes.part[k] += left * left;
+        }
+    return {r, lanes.sum() + rest};
+}
+
+// Rows of stages and their weights: sum_j weights[j] rows[j], in this order, weights of 0 skipped.
+struct Rows {
+    const double *weights, *first;
+    int64_t count, stride;
+};
+
+// COUNT vectors, or floats, from i on of out = y + scale sum, or of scale sum where there is no y.
+template <typename Float, int COUNT, bool ADD>
+inline void combine_part(const double *y, double scale, const Rows &rows, double *out, int64_t i) {
+    constexpr int LENGTH = sizeof(Float) / sizeof(double);
+    Float total[COUNT] = {};
+    for (int64_t j = 0; j < rows.count; ++j) {
+        const double weight = rows.weights[j];
+        if (weight == 0.0) continue;
+        const double *row = rows.first + j * rows.stride + i;
+        for (int k = 0; k < COUNT; ++k) {
+            Float value;
+            std::memcpy(&value, row + k * LENGTH, sizeof value);
+            total[k] += weight * value;
+        }
+    }
+    for (int k = 0; k < COUNT; ++k) {
+        Float value = scale * total[k];
+        if constexpr (ADD) {
+            Float start;
+            std::memcpy(&start, y + i + k * LENGTH, sizeof start);
+            value = start + value;
+        }
+        std::memcpy(out + i + k * LENGTH, &value, sizeof value);
+    }
+}
+
+// Blocks of one length; the last one ends with the array and may overlap the one before it.
+template <typename Float, int COUNT, bool ADD>
+inline void combine_blocks(const double *y, double scale, const Rows &rows, double *out, int64_t n) {
+    constexpr int64_t LENGTH = COUNT * sizeof(Float) / sizeof(double);
+    for (int64_t i = 0; i < n; i += LENGTH)
+        combine_part<Float, COUNT, ADD>(y, scale, rows, out, i < n - LENGTH ? i : n - LENGTH);
+}
+
+template <bool ADD>
+inline void combine_rows(const double *y, double scale, const Rows &rows, double *out, int64_t n) {
+    if (n >= 4 * WIDTH)
+        combine_blocks<Vector, 4, ADD>(y, scale, rows, out, n);
+    else if (n >= 2 * WIDTH)
+        combine_blocks<Vector, 2, ADD>(y, scale, rows, out, n);
+    else if (n >= WIDTH)
+        combine_blocks<Vector, 1, ADD>(y, scale, rows, out, n);
+    else
+        combine_blocks<double, 1, ADD>(y, scale, rows, out, n);
+}
+
+// out = y + scale sum; out is neither y nor a row.
+inline void combine(const double *y, double scale, const Rows &rows, double *out, int64_t n) {
+    combine_rows<true>(y, scale, rows, out, n);
+}
+
+// out = scale sum.
+inline void weighted_sum(double scale, const Rows &rows, double *out, int64_t n) {
+    combine_rows<false>(nullptr, scale, rows, out, n);
+}
+
+}  // namespace eip

@@ -1,0 +1,172 @@
+// The user's functions as the step calls them, and what a step knows of its run.
+#pragma once
+
+#include <utility>
+#include <vector>
+
+#include "data.hpp"
+#include "floats.hpp"
+
+namespace eip {
+
+// A function that failed, or raised; what it said is kept by whoever called it.
+struct Broken {
+    int status;
+};
+
+// Functions by pointer. They return 0; > 0: no value here, a shorter step may have one; < 0: the run is to end. Complex
+// states are pairs of floats. `y` and `f` are scratch.
+using ValuePointer = int (*)(double t, const double *y, double *out, const double *params);
+using GradientPointer = int (*)(double t, const double *y, const double *f, double *G, const double *params);
+
+// Functions in Python.
+class Functions {
+  public:
+    virtual ~Functions() = default;
+    virtual void rhs(double t, const double *y, double *out) = 0;
+    virtual void inv(double t, const double *y, double *values) = 0;
+    virtual void grad(double t, const double *y, const double *f, double *G) = 0;
+    virtual void event(double t, const double *y, double *values) = 0;
+};
+
+struct Step;
+
+// Parts of a step that are replaced: one-step methods of a user's own, the projection of a subclass, and the one of
+// `JointInvariants`, which may decline. Codes as the step's own.
+class Hooks {
+  public:
+    virtual ~Hooks() = default;
+    bool raw = false, finish = false, joint = false;
+    virtual int raw_step(const Step &step) = 0;
+    virtual int finish_step(const Step &step) = 0;
+    virtual bool project_jointly(const Step &step) = 0;
+};
+
+// A function by pointer, and how many floats it fills.
+template <typename Pointer>
+struct Native {
+    Pointer pointer;
+    int64_t floats;
+};
+
+// A call by pointer that failed: of which functions, which one, and where.
+struct FailedCall {
+    const char *functions = "";
+    int64_t index = 0;
+    double t = 0.0;
+    std::vector<double> y, f;
+};
+
+// The functions of a run, by pointer or in Python.
+struct System {
+    ValuePointer rhs_pointer = nullptr;
+    std::vector<Native<ValuePointer>> inv_pointers, event_pointers;
+    std::vector<Native<GradientPointer>> grad_pointers;
+    Functions *python = nullptr;
+    bool second_order = false;  // rhs_pointer gives the accelerations of y = (q, v)
+    const double *params = nullptr;
+    std::vector<double> scratch, scratch_f;
+    FailedCall failed;
+
+    // The derivative at a state that is kept.
+    template <class W>
+    void rhs(const W &w, double t, const double *y, double *out) {
+        if (!rhs_pointer) return python->rhs(t, y, out);
+        call_rhs(w, t, copied(y, scratch, w.m), out);
+    }
+
+    // The derivative at a state that is made anew for each call.
+    template <class W>
+    void rhs_of_scratch(const W &w, double t, const double *y, double *out) {
+        if (!rhs_pointer) return python->rhs(t, y, out);
+        call_rhs(w, t, y, out);
+    }
+
+    template <class W>
+    void inv(const W &w, double t, const double *y, double *values) {
+        if (!rhs_pointer) return python->inv(t, y, values);
+        call_each(w, inv_pointers, "inv", t, y, values);
+    }
+
+    template <class W>
+    void event(const W &w, double t, const double *y, double *values) {
+        if (!rhs_pointer) return python->event(t, y, values);
+        call_each(w, event_pointers, "event", t, y, values);
+    }
+
+    template <class W>
+    void grad(const W &w, double t, const double *y, const double *f, double *G) {
+        if (!rhs_pointer) return python->grad(t, y, f, G);
+        for (int64_t k = 0; k < std::ssize(grad_pointers); ++k) {
+            const auto &[pointer, floats] = grad_pointers[k];
+            fill(G, NOT_A_NUMBER, floats);  // shows where a gradient leaves a part of it as it was
+            const int status = pointer(t, copied(y, scratch, w.m), copied(f, scratch_f, w.m), G, params);
+            if (status) [[unlikely]] gave_up(status, {"grad", k, t, {y, y + w.m}, {f, f + w.m}}, G, floats);
+            G += floats;
+        }
+    }
+
+  private:
+    static const double *copied(const double *y, std::vector<double> &own, int64_t m) {
+        copy(y, own.data(), m);
+        return own.data();
+    }
+
+    template <class W>
+    void call_rhs(const W &w, double t, const double *y, double *out) {
+        const int64_t half = w.m / 2, floats = second_order ? half : w.m;
+        if (second_order) {
+            copy(y + half, out, half);
+            out += half;
+        }
+        fill(out, NOT_A_NUMBER, floats);
+        const int status = rhs_pointer(t, y, out, params);
+        if (status) [[unlikely]] gave_up(status, {"rhs", 0, t, {y, y + w.m}, {}}, out, floats);
+    }
+
+    template <class W>
+    void call_each(const W &w, const std::vector<Native<ValuePointer>> &functions, const char *name, double t,
+                   const double *y, double *values) {
+        for (int64_t k = 0; k < std::ssize(functions); ++k) {
+            const auto &[pointer, floats] = functions[k];
+            const int status = pointer(t, copied(y, scratch, w.m), values, params);
+            if (status) [[unlikely]] gave_up(status, {name, k, t, {y, y + w.m}, {}}, values, floats);
+            values += floats;
+        }
+    }
+
+    [[gnu::cold, gnu::noinline]] void gave_up(int status, FailedCall call, double *out, int64_t floats) {
+        if (status > 0) return fill(out, NOT_A_NUMBER, floats);
+        failed = std::move(call);
+        throw Broken{status};
+    }
+};
+
+// One run: K[0] holds f(t, y) when a step begins. W is Work, or one of a length that the compiler knows.
+template <class W>
+struct RunOf {
+    const Method &method;
+    const Options &options;
+    const W &work;
+    System &system;
+    Hooks *hooks;
+};
+
+using Run = RunOf<Work>;
+
+// Short states take most of their time in loops' beginnings and ends.
+template <int64_t M>
+struct Sized : Work {
+    explicit Sized(const Work &w) : Work(w) {}
+    static constexpr int64_t n = M, m = M;
+};
+
+// One try of a step from (t, y).
+struct Step {
+    double t, t_new, h;
+    const double *y;
+    double *y_new;
+    bool project, last;
+};
+
+}  // namespace eip

@@ -1,0 +1,184 @@
+// Whether a projection holds, and what it leaves: figures by which a run is judged (trust.py).
+#pragma once
+
+#include "metric.hpp"
+
+namespace eip {
+
+// Dead band in roundings of an invariant's terms; where the state's own roundings are carried, the values' remain.
+constexpr double BAND = 4.0, BAND_COMPENSATED = 1.0;
+constexpr double FAILURE_BANDS = 100.0, NOISE_BANDS = 3.0;
+// Terms that vanish for a moment, where an invariant's own pass through zero, count as this share of those at the start.
+constexpr double LEAST_SHARE = 1e-3;
+constexpr double LARGE = 50.0, FAR = 0.03, LARGE_SHARE = 1e-2;
+
+// Defects w.g = values - target and their dead bands; inside its band a defect is set to 0, `raw` keeps all. Returns
+// whether anything is left to project. `terms`: sums of |G_k y_k|, else they are taken at `y`.
+template <class W>
+inline bool defects(const double *terms, const double *y, const Options &o, const W &w, double *raw) {
+    bool outside = false;
+    for (int64_t i = 0; i < w.l; ++i) {
+        double size = std::max(std::abs(w.values[i]), std::abs(o.target[i]));
+        size = std::max(std::max(size, o.scales[i]), terms ? terms[i] : abs_dot(w.gradient(i), y, w.m));
+        w.band[i] = (o.compensated ? BAND_COMPENSATED : BAND) * EPS * size;
+        raw[i] = w.values[i] - o.target[i];
+        const bool inside = w.band[i] < INFINITE && std::abs(raw[i]) <= w.band[i];
+        w.g[i] = inside ? 0.0 : raw[i];
+        outside |= !inside;
+    }
+    return outside;
+}
+
+// The first figures of a run: its invariants' terms; those that vanish at the start, as they are a step later.
+template <class W>
+inline void start_figures(const double *y, const double *f, double tau, const Options &o, const W &w) {
+    for (int64_t i = 0; i < w.l; ++i) {
+        const double *G = w.gradient(i);
+        double terms = std::max(std::max(std::abs(w.values[i]), std::abs(o.target[i])),
+                                std::max(o.scales[i], abs_dot(G, y, w.m)));
+        terms = std::max(terms, tau * abs_dot(G, f, w.m));
+        double *figures = w.figures(i);
+        fill(figures, 0.0, N_FIGURES);
+        figures[LEFT] = w.values[i] - o.target[i];
+        figures[START] = terms < INFINITE ? terms : 0.0;
+        figures[TERMS] = terms > 0.0 ? terms : INFINITE;
+    }
+}
+
+// Terms of invariant i to measure a defect by: those now, at most the largest of a state that was on the manifold. A
+// state that blows up carries terms as large as its defect. TINY, for what underflows.
+template <class W>
+inline double own_terms(int64_t i, const Options &o, const W &w) {
+    const double *figures = w.figures(i);
+    const double now = std::max(o.per_band * w.band[i], LEAST_SHARE * figures[START]);
+    return std::min(now, figures[TERMS]) + TINY;
+}
+
+// Note the defects; whether all are finite and none has grown beyond what round-off explains.
+template <class W>
+inline bool defects_held(const double *before, const Options &o, const W &w) {
+    bool good = true;
+    for (int64_t i = 0; i < w.l; ++i) {
+        w.defect[i] = w.values[i] - o.target[i];
+        const double size = std::abs(w.defect[i]);
+        const bool grown = size > std::abs(before[i]) && size > FAILURE_BANDS * w.band[i];
+        good &= size < INFINITE && !grown;
+    }
+    return good;
+}
+
+// Whether no defect is more than o.limit times its invariant's terms.
+template <class W>
+inline bool small_shares(const Options &o, const W &w) {
+    for (int64_t i = 0; i < w.l; ++i)
+        if (!(std::abs(w.defect[i]) <= o.limit * own_terms(i, o, w))) return false;
+    return true;
+}
+
+// Note the defects after a projection. It has failed where something is not finite, or a defect has grown and stands
+// above FAILURE_BANDS dead bands, or is more than the limit.
+template <class W>
+inline Code judge(const double *before, const double *y, const Options &o, const W &w) {
+    const bool held = defects_held(before, o, w);
+    return all_finite(y, w.m) && held && small_shares(o, w) ? OK : FAILED_PROJECTION;
+}
+
+// A defect that is large beside its invariant's terms.
+inline void note_share(double share, double t, double *figures, Figure largest_so_far, Figure at) {
+    if (share > figures[largest_so_far]) {
+        figures[largest_so_far] = share;
+        figures[at] = t;
+    }
+}
+
+// What an invariant changed by since its last projection beside what the steps' errors explain; 1 if LARGE.
+inline int64_t weigh_change(double size, double expected, double t, double *figures) {
+    figures[JUDGED] += 1.0;
+    figures[SUM] += size;
+    figures[EXPECTED] += expected;
+    if (size > figures[NU] * expected) {
+        figures[NU] = size / expected;
+        figures[AT] = t;
+    }
+    if (!(size > LARGE * expected)) return 0;
+    if (figures[MANY] == 0.0) figures[FIRST] = t;
+    figures[MANY] += 1.0;
+    return 1;
+}
+
+// What an accepted projection leaves: its defects, and whether the errors of the steps explain its corrections.
+//
+// An invariant's local errors since the last projection are worth `errors` sum_k |G_k err_k| (`local`, or taken here),
+// their rounding `rounding` times its terms; with errors = 0 nothing is known of them.
+template <class W>
+inline void note(double t, double errors, double rounding, const double *local, const Options &o, const W &w) {
+    for (int64_t i = 0; i < w.l; ++i) {
+        double *figures = w.figures(i);
+        const double size = std::abs(w.defect[i]), raw = std::abs(w.before[i]);
+        w.max_defect[i] = std::max(w.max_defect[i], size);
+        const double terms = o.per_band * w.band[i], own = own_terms(i, o, w);
+        figures[NOTED] += 1.0;
+        if (raw > FAR * own) {
+            note_share(raw / own, t, figures, RAW, RAW_AT);
+            figures[RAW_MANY] += 1.0;
+            ++w.counters[FOUND];
+        }
+        if (size > LARGE_SHARE * own) {
+            note_share(size / own, t, figures, SHARE, SHARE_AT);
+            ++w.counters[FOUND];
+        } else {
+            const double known = figures[TERMS] < INFINITE ? figures[TERMS] : 0.0;
+            figures[TERMS] = std::max(known, terms);
+        }
+        // An estimate that vanishes tells nothing: that of RK4 does where f depends on t alone.
+        double worth = 0.0;
+        if (errors > 0.0) worth = local ? local[i] : abs_dot(w.gradient(i), w.err, w.m);
+        if (worth > 0.0) {
+            const double expected = errors * worth + rounding * terms + TINY;
+            w.counters[FOUND] += weigh_change(std::abs(w.before[i] - figures[LEFT]), expected, t, figures);
+        }
+        figures[LEFT] = w.defect[i];
+    }
+}
+
+// The same for a step, whose estimates, where they are gathered in quadrature, are of errors that add.
+template <class W>
+inline void take_note(double t, const double *local, const Options &o, const W &w) {
+    if (!o.watched) return raise_to(w.defect, w.max_defect, w.l);
+    const double waited = w.counters[WAITED];
+    double rounding = EPS, errors = w.counters[HAVE_ERROR] ? 1.0 : 0.0;
+    if (waited > 0) {
+        rounding *= std::sqrt(1.0 + waited);
+        const bool gathered = o.metric == ERROR || o.every == AUTO || o.adaptive;
+        errors *= gathered ? std::sqrt(1.0 + waited) : 1.0 + waited;
+    }
+    note(t, errors, rounding, local, o, w);
+}
+
+// Whether the errors gathered make some invariant more uncertain than NOISE_BANDS roundings of its terms.
+template <class W>
+inline bool tells_more(const W &w) {
+    for (int64_t i = 0; i < w.l; ++i) {
+        const double *G = w.gradient(i);
+        double error = 0.0, noise = 0.0;
+        for (int64_t j = 0; j < w.m; ++j) {
+            const double x = w.err[j] * G[j];
+            error += x * x;
+            noise += std::abs(G[j] * w.y_hat[j]);
+        }
+        if (std::sqrt(error) > NOISE_BANDS * EPS * noise) return true;
+    }
+    return false;
+}
+
+// Per row, twice the defects of all rows in its own unit: what a projection of lower rank may move between them. Twice,
+// because what one row loses to second order another may gain.
+template <class W>
+inline void shared_defects(const W &w, double *shared) {
+    double total = 0.0;
+    for (int64_t i = 0; i < w.l; ++i) total += std::abs(w.before[i]) * w.inverse_norms[i];
+    for (int64_t i = 0; i < w.l; ++i)
+        shared[i] = w.inverse_norms[i] > 0.0 ? 2.0 * total / w.inverse_norms[i] : std::abs(w.before[i]);
+}
+
+}  // namespace eip

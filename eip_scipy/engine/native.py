@@ -1,0 +1,118 @@
+"""The step in C++: the build of it that this processor takes, and a user's functions as it takes them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["BUILD", "Call", "Engine", "FailedCallError", "Hooks", "NativeFunctions", "PythonFunctions", "call"]
+
+# Names one of the builds, _native or _native_v3, in place of the best one that the processor takes.
+VARIABLE = "EIP_SCIPY_ENGINE"
+AGAIN = "python -m pip install --no-build-isolation --no-deps --editable ."
+# Further arguments that the engine hands on itself.
+MOST_ARGUMENTS = 8
+
+
+class Call(NamedTuple):
+    """A user's function in Python: ``fun(t, y[, f][, out], *args)``.
+
+    Its value is taken as it is where it is an array of that shape (a float for ``()``), of the state's type or, where
+    it is `real`, of floats; else ``convert(value, t)`` makes such an array of it, or raises.
+    """
+
+    fun: Callable[..., Any]
+    args: tuple[Any, ...]
+    shape: tuple[int, ...]
+    convert: Callable[[Any, float], np.ndarray]
+    real: bool = False
+    takes_f: bool = False
+    in_place: bool = False
+
+
+def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...], convert: Any, **kind: bool) -> Call:
+    """A `Call` with as many further arguments as there are."""
+    if len(args) > MOST_ARGUMENTS:
+        return Call(lambda *first: fun(*first, *args), (), shape, convert, **kind)
+    return Call(fun, args, shape, convert, **kind)
+
+
+class PythonFunctions(NamedTuple):
+    """A run's functions in Python; `second_order`: `rhs` gives the accelerations of (q, v)."""
+
+    rhs: Call
+    inv: tuple[Call, ...]
+    grad: tuple[Call, ...]
+    event: tuple[Call, ...]
+    second_order: bool
+    native: bool = False
+
+
+class NativeFunctions(NamedTuple):
+    """A run's functions by their addresses, with the signatures in cpp/system.hpp; `owner` keeps them alive.
+
+    Of each invariant, gradient and event the address, and how many floats it fills.
+    """
+
+    rhs: int
+    inv: tuple[tuple[int, int], ...]
+    grad: tuple[tuple[int, int], ...]
+    event: tuple[tuple[int, int], ...]
+    params: np.ndarray
+    second_order: bool
+    owner: Any
+    native: bool = True
+
+
+class Hooks(NamedTuple):
+    """Parts of a step in Python, in place of the engine's own.
+
+    ``one_step(t, y, h)`` fills work.y_hat, and work.err if it `estimates`. ``raw(t, y, t_new, h, project)`` does all
+    that the engine's raw step does, and returns its code; so does ``finish(t_new, project, last)`` for the rest of the
+    step. `joint` are `JointInvariants`.
+    """
+
+    one_step: Callable[..., Any] | None = None
+    estimates: bool = False
+    raw: Callable[..., Any] | None = None
+    finish: Callable[..., Any] | None = None
+    joint: Any = None
+
+
+def _build(name: str) -> Any:
+    try:
+        return import_module(f"{__package__}.{name}")
+    except ModuleNotFoundError:
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        raise ImportError(
+            f"eip_scipy's engine is not built for Python {version} here ({Path(__file__).parent} has no {name}). In a "
+            "clone of the sources: python -m pip install -e . ; else leave the clone's folder, or install the package."
+        ) from None
+
+
+def _best() -> Any:
+    """The build that was asked for, or the best one that the processor takes."""
+    if name := os.environ.get(VARIABLE):
+        return _build(name)
+    plain = _build("_native")
+    return _build("_native_v3") if plain.HAS_V3 else plain
+
+
+def _require_current(build: Any) -> None:
+    """In a clone: the build is that of the sources beside it."""
+    folder = Path(__file__).parent / "cpp"
+    files = sorted(path for path in folder.glob("*pp")) if folder.is_dir() else []
+    if files and hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest() != build.SOURCES:
+        raise ImportError(f"the sources in {folder} have changed since the engine was built. Build it: {AGAIN}")
+
+
+BUILD = _best()
+_require_current(BUILD)
+Engine, FailedCallError = BUILD.Engine, BUILD.FailedCallError

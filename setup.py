@@ -1,0 +1,65 @@
+"""Builds the native engine (pyproject.toml has all else).
+
+One module for every processor, and on x86-64 another for those with AVX2 and FMA; eip_scipy/engine/native.py chooses.
+"""
+
+import hashlib
+import platform
+import sys
+from pathlib import Path
+
+import numpy
+from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+
+FOLDER = Path("eip_scipy/engine/cpp")
+if sys.platform == "win32":
+    FLAGS, V3 = ["/std:c++20", "/O2", "/fp:precise"], ["/arch:AVX2"]
+else:
+    # No fused operation but those that are written, no reordering: the same bits from every build. The warnings that are
+    # left out are about Python's own interface.
+    FLAGS = ["-std=c++20", "-O3", "-g0", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
+    FLAGS += ["-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-cast-function-type", "-Wno-missing-field-initializers"]
+    V3 = ["-march=x86-64-v3"]
+MISSING = """\
+eip_scipy's engine is written in C++20, and no compiler built it. Install one: g++ 11 or newer (Debian, Ubuntu: apt
+install g++; Fedora: dnf install gcc-c++), clang 14 or newer, or on macOS Xcode's tools (xcode-select --install)."""
+
+
+def stamp() -> str:
+    """Hash of the engine's sources, by which a build that is older than they are is known."""
+    files = sorted(path for path in FOLDER.iterdir() if path.suffix in (".cpp", ".hpp"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+
+
+def module(name: str, *flags: str) -> Extension:
+    """One build of the engine."""
+    return Extension(
+        f"eip_scipy.engine.{name}",
+        sources=[str(path) for path in sorted(FOLDER.glob("*.cpp"))],
+        depends=[str(path) for path in sorted(FOLDER.glob("*.hpp"))],
+        include_dirs=[numpy.get_include()],
+        define_macros=[("EIP_INIT", f"PyInit_{name}"), ("EIP_NAME", f'"{name}"'), ("EIP_SOURCES", f'"{stamp()}"')],
+        extra_compile_args=[*FLAGS, *flags],
+        language="c++",
+    )
+
+
+class Build(build_ext):
+    """Builds, each module with objects of its own, and says what is missing where no compiler can be had."""
+
+    def build_extension(self, ext: Extension) -> None:
+        """One module."""
+        folder, self.build_temp = self.build_temp, str(Path(self.build_temp) / ext.name)
+        try:
+            super().build_extension(ext)
+        except Exception as error:
+            raise SystemExit(f"{MISSING}\nWhat the build said: {error}") from error
+        finally:
+            self.build_temp = folder
+
+
+modules = [module("_native")]
+if platform.machine().lower() in ("x86_64", "amd64"):
+    modules.append(module("_native_v3", *V3))
+setup(ext_modules=modules, cmdclass={"build_ext": Build})
