@@ -21,8 +21,10 @@ from eip_scipy.core.names import nearest
 from eip_scipy.core.one_step import OneStep
 from eip_scipy.core.solvers import EIPSolver
 from eip_scipy.engine import kernels as kn
+from eip_scipy.engine.data import NOT_FINITE, OK, make_work
 from eip_scipy.engine.joint import project_jointly
-from eip_scipy.engine.step import Method, Options, Work, advance_raw, look_back, make_work, project_step
+from eip_scipy.engine.native import Engine, PythonFunctions
+from eip_scipy.engine.step import advance_raw, look_back, project_step
 from eip_scipy.engine.sums import abs_dot, dot
 
 try:
@@ -208,21 +210,32 @@ class _OverRanks(EIPSolver):
             if options.get("check", True) and self._run.invariants.size:
                 _check(self.COMM, self._run.invariants, t0, self.y, self.f, options["h"])
         run = self._run
-        # In the place of the tableau, as a user's one-step method would be.
-        run.method = _Tableau(self.COMM, run.method)  # type: ignore[arg-type, assignment]
         self._coordinates = _Coordinates(self.COMM, run, self._rhs)
+
+    def _make_engine(self) -> Engine:
+        functions = PythonFunctions(self._call, *self._run.invariants.calls, (), second_order=False)
+        return self._run.engine(functions, self._schedule, raw=self._raw_step, finish=self._finish)
 
     def _step_impl(self) -> tuple[bool, str | None]:
         with together(self.COMM):
             return super()._step_impl()
 
+    def _raw_step(self, t: float, y: np.ndarray, t_new: float, h: float, project: bool) -> int:
+        """The engine's, but that it fails on all ranks if it fails on one: the others would wait for it in a sum."""
+        m, o, w, y_r = self._run.method, self._run.options, self._work, y.view(float)
+        advance_raw(self._rhs, None, t, y, y_r, h, m, o, w)
+        if not gathered(self.COMM, kn.all_finite(w.y_hat_r)).all():
+            return NOT_FINITE
+        look_back(self._rhs, None, t_new, y_r, h, project, m, o, w)
+        return OK
+
     def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
         if not self._project_now:
             return super()._project_step(t, y, y_hat, err)
-        options, y_new = self._run.options, self._buffer
+        options, y_new = self._run.options, np.empty_like(y)
         # Joint invariants sum over the ranks themselves.
         if options.joint is not None and project_jointly(t, options, self._work, y_new, y_new.view(float)):
-            self._projection_status = kn.OK
+            self._projection_status = OK
         else:
             self._projection_status = self._coordinates.project(self.t, t, self._last, y_new)
         return y_new
@@ -285,25 +298,6 @@ def _check(comm: MPI.Comm, known: InvariantSet, t: float, y: np.ndarray, f: np.n
     ]
     here, nowhere = np.ones(2), np.zeros(2)
     InvariantSet(plane, t, here, nowhere, 0.0).check(t, here, nowhere, 0.0)
-
-
-class _Tableau:
-    """A tableau whose step fails on all ranks if it fails on one: the others would wait for it in a sum."""
-
-    def __init__(self, comm: MPI.Comm, method: Method) -> None:
-        self._comm, self._method = comm, method
-        self.b, self.c, self.exponent = method.b, method.c, method.exponent
-
-    def raw_step(
-        self, rhs: Any, params: Any, t: float, y: np.ndarray, y_r: np.ndarray, t_new: float, h: float, project: bool,
-        o: Options, w: Work,
-    ) -> int:  # fmt: skip
-        """What `eip_scipy.engine.step.raw_step` does."""
-        advance_raw(rhs, params, t, y, y_r, h, self._method, o, w)
-        if not gathered(self._comm, kn.all_finite(w.y_hat_r)).all():
-            return kn.NOT_FINITE
-        look_back(rhs, params, t_new, y_r, h, project, self._method, o, w)
-        return kn.OK
 
 
 class _Coordinates:

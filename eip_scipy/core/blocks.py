@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.kernels import Grouping
+from ..engine.data import Grouping
 from .inputs import refuse_units, shown
 
 __all__ = ["INDEX", "blocks_of"]

@@ -23,26 +23,16 @@ from numba.extending import is_jitted
 from ..engine.caching import cached_njit
 from ..engine.octets import LANES, OCTET, octets
 from .invariants import Invariant, InvariantSet
+from .jitted import ChangedShapeError, NotCompilableError
 
 WRONG_FUN = "fun returned an array of another shape than at the start"
 
 __all__ = [
-    "ChangedShapeError",
     "CompiledFunctions",
-    "Handed",
-    "NotCompilableError",
     "compile_functions",
     "signatures",
     "with_inlined",
 ]
-
-
-class ChangedShapeError(ValueError):
-    """A compiled function returned an array of another shape than at the start."""
-
-
-class NotCompilableError(TypeError):
-    """A run cannot be compiled; the message names the function and says why."""
 
 
 class CompiledFunctions(NamedTuple):
@@ -104,42 +94,6 @@ def signatures_of_batches() -> Signatures:
         inv=types.void(real, lanes, lanes, lanes),
         grad=types.void(real, lanes, lanes, rows, lanes),
     )
-
-
-class Handed:
-    """A user's jitted function as Python calls it: on arrays that it cannot write to, as compiled runs call it.
-
-    So that one version of it is compiled, not two. Where it writes to them it gets them writable, as do interpreted
-    runs, whose calls take less time then, once `read_only` is False.
-
-    Parameters
-    ----------
-    fun : callable
-        ``fun(t, y, ...)``.
-    arrays : int
-        How many of the arguments after t: the state, and f where a gradient takes it.
-    """
-
-    __slots__ = ("_arrays", "_fun", "read_only")
-
-    def __init__(self, fun: Callable[..., Any], arrays: int) -> None:
-        self._fun, self._arrays, self.read_only = fun, arrays, True
-
-    def __call__(self, t: float, *arguments: Any) -> Any:
-        """The function's value."""
-        if self.read_only:
-            given = (_read_only(a) for a in arguments[: self._arrays])
-            try:
-                return self._fun(t, *given, *arguments[self._arrays :])
-            except NumbaError:
-                self.read_only = False
-        return self._fun(t, *arguments)
-
-
-def _read_only(a: np.ndarray) -> np.ndarray:
-    a = a[:]
-    a.flags.writeable = False
-    return a
 
 
 def compile_functions(

@@ -13,13 +13,12 @@ from scipy.integrate import DOP853 as SCIPY_DOP853
 from scipy.integrate import DenseOutput
 
 from ..engine.counters import NFEV
-from ..engine.kernels import OK, Grouping
-from ..engine.step import ERROR, GIVEN, NEW, make_work, project_step
+from ..engine.data import ERROR, GIVEN, NEW, OK, Grouping
 from ..methods.nystrom import NystromTableau
 from ..methods.runge_kutta import DOP853, Tableau
 from .inputs import refuse_units, shown
 from .one_step import OneStep
-from .setup import Run
+from .setup import Projection, Run
 
 __all__ = ["End", "ExactEnds", "ManifoldDenseOutput", "dense_output"]
 
@@ -112,10 +111,12 @@ class ManifoldDenseOutput(_AtRealTimes):
             h = new.t - old.t
             self._sigma = _travelled(old.y, new.y, h * old.f, h * new.f, run.options.groups)
         plain = run.options._replace(metric=GIVEN, direction=NEW, every=1, compensated=False)
-        self._options = plain._replace(iterations=ITERATIONS, watched=False, limit=math.inf)
+        self._options = plain._replace(
+            iterations=ITERATIONS, watched=False, limit=math.inf, target=np.zeros(run.invariants.size)
+        )
         self._counters = run.work.counters
         self._levels: tuple[Array, Array] | None = None
-        self._work: Any = None
+        self._projection: Projection
 
     def _call_impl(self, t: Array) -> Array:
         times = np.atleast_1d(t)
@@ -135,23 +136,18 @@ class ManifoldDenseOutput(_AtRealTimes):
             self._levels = self._prepare()
         at_old, at_new = self._levels
         share = min(1.0, max(0.0, theta))
-        options = self._options._replace(target=(1 - share) * at_old + share * at_new)
-        w = self._work
-        w.y_hat[:] = y
-        if options.uses_f:
-            self._rhs(t, y, w.K[-1], self._params)
+        projection = self._projection
+        self._options.target[:] = (1 - share) * at_old + share * at_new
+        if self._options.uses_f:
+            self._rhs(t, y, projection.work.K[-1], self._params)
             self._counters[NFEV] += 1
-        out = np.empty_like(y)
-        inv, grad = self._invariants.inv, self._invariants.grad
-        status = project_step(
-            self._rhs, inv, grad, self._params, t, y, y.view(float), t, True, options, w, out, out.view(float)
-        )
+        out, status = projection(t, y)
         if status == OK:
             return out
         if theta == share:  # an extrapolation may lead anywhere
             warnings.warn(
                 f"dense output at t={t}: no state near the interpolant meets the invariants' levels "
-                f"(they miss by {w.defect}); it is given as it is",
+                f"(they miss by {projection.work.defect}); it is given as it is",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -159,8 +155,14 @@ class ManifoldDenseOutput(_AtRealTimes):
 
     def _prepare(self) -> tuple[Array, Array]:
         invariants = self._invariants
-        self._work = make_work(self._y.size, self._y.dtype, 0, invariants.size, 0)
-        self._work.sigma[:] = self._sigma
+
+        def rhs(t: float, y: Array) -> Array:
+            f = np.empty_like(y)
+            self._rhs(t, y, f, self._params)
+            return f
+
+        self._projection = Projection(invariants, self._options, rhs)
+        self._projection.work.sigma[:] = self._sigma
         return invariants.values(self.t_old, self._y_old), invariants.values(self.t, self._y)
 
 

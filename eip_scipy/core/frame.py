@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from ..engine.kernels import FrameRows
+from ..engine.data import FrameRows
 from .blocks import INDEX
 from .inputs import refuse_units
 

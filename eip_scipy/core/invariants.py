@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..engine.kernels import EPS
+from ..engine.data import EPS
+from ..engine.native import Call, call
 from .inputs import filled, flag, is_number, reals, refuse_units, require_arguments, shown
 
 __all__ = ["Invariant", "InvariantSet", "JointInvariants", "as_invariants", "check_gradient"]
@@ -326,7 +327,8 @@ class InvariantSet:
         self.items = as_invariants(invariants)
         self.extra = extra
         self.labels = [item.name or f"invariant {k}" for k, item in enumerate(self.items)]
-        functions = [bound(hand(item.fun, 1), item.args + extra) for item in self.items]
+        self.funs = [hand(item.fun, 1) for item in self.items]
+        functions = [bound(fun, item.args + extra) for fun, item in zip(self.funs, self.items, strict=True)]
         values = [
             _first_value(item, fun, label, t0, y0, extra)
             for item, fun, label in zip(self.items, functions, self.labels, strict=True)
@@ -351,7 +353,7 @@ class InvariantSet:
             for item, label in zip(self.items, self.labels, strict=True)
         ]
         self.target = self._targets()
-        self._shape = (self.size, y0.size)
+        self.shape, self.dtype = (self.size, y0.size), y0.dtype
         places = [
             start if scalar else slice(start, stop)
             for start, stop, scalar in zip(self.starts[:-1], self.starts[1:], self.scalar, strict=True)
@@ -365,6 +367,29 @@ class InvariantSet:
             for k, (label, place, value) in enumerate(zip(self.labels, places, values, strict=True))
         ]
         self._gradients_at_start(t0, y0, f0)
+        self.calls = self._calls(y0)
+
+    def _calls(self, y0: Array) -> tuple[tuple[Call, ...], tuple[Call, ...]]:
+        """Values and gradients, as the engine calls them."""
+
+        def value(k: int) -> Call:
+            _, label, _, shape = self._values[k]
+
+            def convert(found: Any, t: float) -> Array:
+                return np.array(_value(found, label, t, shape), float, order="C")
+
+            return call(self.funs[k], self.items[k].args + self.extra, shape, convert, real=True)
+
+        def gradient(k: int) -> Call:
+            _, takes_f, in_place, label, _, shape = self._gradients[k]
+
+            def convert(found: Any, t: float) -> Array:
+                return np.array(_gradient(found, label, t, shape, y0.dtype), y0.dtype, order="C")
+
+            arguments = self._gradient_arguments(k)
+            return call(self.grads[k], arguments, shape, convert, takes_f=takes_f, in_place=in_place)
+
+        return tuple(map(value, range(len(self.items)))), tuple(map(gradient, range(len(self.items))))
 
     def _require_finite(self, values: Array, what: str) -> None:
         for name, value in zip(self.names, values, strict=True):
@@ -412,9 +437,12 @@ class InvariantSet:
 
     def _bound_gradient(self, k: int) -> tuple[Callable[..., Any], bool, bool]:
         """Gradient k as gradient(t, y), with f behind y if the second is true and `out` at the end if the third is."""
-        item, grad = self.items[k], self.grads[k]
-        arguments = self.extra if item.grad is None else item.args + self.extra
-        return bound(grad, arguments), item.uses_f and item.grad is not None, item.in_place
+        item = self.items[k]
+        return bound(self.grads[k], self._gradient_arguments(k)), item.uses_f and item.grad is not None, item.in_place
+
+    def _gradient_arguments(self, k: int) -> tuple[Any, ...]:
+        item = self.items[k]
+        return self.extra if item.grad is None else item.args + self.extra
 
     def inv(self, t: float, y: Array, values: Array, params: Any = None) -> None:
         """Fill `values` (l,)."""
@@ -449,7 +477,7 @@ class InvariantSet:
 
     def gradients(self, t: float, y: Array, f: Array) -> Array:
         """All gradients (l, n)."""
-        out = np.zeros(self._shape, dtype=y.dtype)
+        out = np.zeros(self.shape, dtype=y.dtype)
         self.grad(t, y, f, out)
         return out
 

@@ -7,10 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..engine import kernels as kn
-from ..engine.counters import HAVE_ERROR, HAVE_F, NFEV
-from ..engine.kernels import NOT_FINITE, OK
-from ..engine.step import OLD, Options, Work, is_sampled
+from ..engine.data import Work
 from .inputs import refuse_units, shown
 
 __all__ = ["OneStep", "OneStepMethod", "as_vector"]
@@ -111,34 +108,13 @@ class OneStep:
     def __repr__(self) -> str:
         return f"<OneStep {self.name}: order {self.order}>"
 
-    def raw_step(
-        self, rhs: Any, params: Any, t: float, y: np.ndarray, y_r: np.ndarray, t_new: float, h: float, project: bool,
-        o: Options, w: Work,
-    ) -> int:  # fmt: skip
-        """What `raw_step` of a tableau does."""
-        result = self._one_step(t, y.copy(), h)
+    def fill(self, w: Work, t: float, y: np.ndarray, h: float) -> None:
+        """One step into the buffers `w`: the state, and the estimate where there is one."""
+        result = self._one_step(float(t), y.copy(), float(h))
         if self.has_estimate:
             result, estimate = self._pair(result)
             w.err[:] = self._vector(estimate, "an estimate", t, y).view(float)
         w.y_hat[:] = self._vector(result, "a state", t, y)
-        if not kn.all_finite(w.y_hat_r):
-            return NOT_FINITE
-        if project and o.uses_f:
-            if o.direction == OLD:
-                rhs(t, y, w.K[0], params)
-                w.counters[NFEV] += 1
-            rhs(t_new, w.y_hat, w.K[-1], params)
-            w.counters[NFEV] += 1
-        w.counters[HAVE_F] = 1  # as far as anyone asks for it: the next step does not
-        w.counters[HAVE_ERROR] = self.has_estimate
-        if project and not self.has_estimate and is_sampled(o, w):
-            rhs(t, y, w.f_point, params)
-            rhs(t_new, w.y_hat, w.stage, params)
-            kn.trapezoid_error(y_r, w.y_hat_r, h, w.f_point.view(float), w.stage_r, w.err)
-            w.counters[HAVE_ERROR] = 1
-        if o.adaptive:
-            w.norm[0] = kn.error_norm(w.err, y_r, w.y_hat_r, o.rtol, o.atol, o.groups.width)
-        return OK
 
     def _pair(self, result: Any) -> tuple[Any, Any]:
         if not isinstance(result, tuple) or len(result) != 2:

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple, TypedDict, TypeVar
 
 import numpy as np
 
-from ..engine.kernels import BAND, BAND_COMPENSATED, EPS
-from ..engine.step import AUTO, ERROR, EUCLIDEAN, GIVEN, MIDPOINT, NEW, OLD, Options
+from ..engine.data import AUTO, BAND, BAND_COMPENSATED, EPS, ERROR, EUCLIDEAN, GIVEN, MIDPOINT, NEW, OLD, Options
 from ..engine.trust import LARGE_SHARE
 from .blocks import blocks_of
 from .frame import frame_rows

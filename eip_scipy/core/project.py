@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..engine.counters import LAST_RANK
-from ..engine.kernels import BAND, EPS
-from ..engine.step import Span, make_work, project_step
+from ..engine.data import BAND, EPS, Span
 from ..engine.trust import LARGE_SHARE, ProjectionWarning
 from ..methods.runge_kutta import RK1
 from . import setup
@@ -111,18 +110,12 @@ def project(
     nowhere = Stepping(Span(t, 0.0, t, 1.0, 0, np.inf), 0.0, None, np.zeros(n), np.zeros(n))
     options, weight, _ = given.settled(RK1, nowhere, y, known)
     options = options._replace(target=_targets(known, target))
-    work = make_work(n, y.dtype, 0, known.size, n)
+    projection = setup.Projection(known, options, derivative)
+    work = projection.work
     if weight is not None:
         work.sigma[:] = weight
-    work.y_hat[:], work.K[-1] = y, f_hat
-    out = np.empty_like(y)
-
-    def rhs(time: float, state: np.ndarray, f_out: np.ndarray, params: Any) -> None:
-        f_out[:] = derivative(time, state)
-
-    status = project_step(
-        rhs, known.inv, known.grad, None, t, y, y.view(float), t, True, options, work, out, out.view(float)
-    )
+    work.K[-1] = f_hat
+    out, status = projection(t, y)
     if status != 0:
         raise ValueError(setup.projection_failure(known, work, t))
     left = np.abs(work.defect) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)

@@ -4,28 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import OdeSolver
 
-from ..engine import kernels as kn
 from ..engine.counters import LAST_RANK
-from ..engine.kernels import NOT_FINITE
-from ..engine.step import (
+from ..engine.data import (
     ERROR,
     EUCLIDEAN,
     LENGTH,
     NEW,
+    NO_METHOD,
+    NOT_FINITE,
     TIME,
     TIME_NEW,
     TOO_SMALL,
     Method,
     Options,
+    Schedule,
     Work,
     make_work,
-    project_step,
 )
+from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
 from ..methods.nystrom import NystromTableau
 from .inputs import reals, refuse_units, shown
@@ -35,7 +37,7 @@ from .options import ProjectionOptions
 from .results import Diagnostics
 from .stepping import AnyMethod, Stepping
 
-__all__ = ["Run", "Start", "as_derivative", "prepare"]
+__all__ = ["Projection", "Run", "Start", "as_derivative", "prepare"]
 
 START_ITERATIONS = 50
 # Steps after which the invariants are checked once more.
@@ -65,6 +67,25 @@ class Run:
     tau: float
     in_place: bool = False
     looked: int = -1
+
+    def engine(
+        self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, raw: Any = None, finish: Any = None
+    ) -> Engine:
+        """The engine of the run, which begins where work.K[0] is the derivative; for the hooks see `Hooks`."""
+        one_step = self.method if isinstance(self.method, OneStep) else None
+        hooks = Hooks(
+            one_step=None if one_step is None else partial(one_step.fill, self.work),
+            estimates=one_step is not None and one_step.has_estimate,
+            raw=raw,
+            finish=finish,
+            joint=None if functions.native else self.options.joint,
+        )
+        engine, w = Engine(self.method, self.options, self.work, functions, schedule, _if_any(hooks)), self.work
+        if self.options.watched:
+            t, f = schedule.span.t0, w.K[0]
+            w.values[:], w.G[:] = self.invariants.values(t, self.y0), self.invariants.gradients(t, self.y0, f)
+            engine.start(self.y0, f, self.tau)
+        return engine
 
     def look(self, steps: int, ended: bool, t: float, y: np.ndarray, derivative: Callable[[], np.ndarray]) -> bool:
         """Look at a run after so many steps, or where it ends: whether something speaks against it, to be said now.
@@ -98,6 +119,10 @@ class Counted:
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         self.count += 1
         return self._rhs(t, y).copy()
+
+
+def _if_any(hooks: Hooks) -> Hooks | None:
+    return hooks if hooks != Hooks() else None
 
 
 def as_derivative(value: Any, n: int, dtype: np.dtype, t: float) -> np.ndarray:
@@ -265,19 +290,9 @@ def prepare(
     violation = invariants.start_violation(t0, run.y0, f0)
     if violation:
         raise ValueError(f"{violation}; mend y0 or the target, or pass project_initial=True to project y0 first.")
-    if options.watched:
-        _note_terms(run, t0, f0)
-        if check_start and np.isfinite(f0).all():
-            run.trust.doubts += invariants.check(t0, run.y0, f0, tau)
+    if options.watched and check_start and np.isfinite(f0).all():
+        run.trust.doubts += invariants.check(t0, run.y0, f0, tau)
     return run
-
-
-def _note_terms(run: Run, t0: float, f0: np.ndarray) -> None:
-    """The invariants' terms at the start, by which defects are measured."""
-    known, y0 = run.invariants, run.y0
-    G = known.gradients(t0, y0, f0).view(float)
-    values, state, slope = known.values(t0, y0), y0.view(float), f0.view(float)
-    kn.start_figures(values, known.target, known.scales, G, state, slope, run.tau, run.work.trust)
 
 
 def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, f0: np.ndarray) -> np.ndarray:
@@ -285,33 +300,41 @@ def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0
     options = run.options._replace(
         metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False, watched=False, limit=np.inf
     )
-    work = make_work(run.y0.size, run.y0.dtype, 0, run.invariants.size, 0)
-    work.y_hat[:] = run.y0
-    work.K[-1] = f0
-    y = np.empty_like(run.y0)
-
-    def fill(t: float, state: np.ndarray, out: np.ndarray, params: Any) -> None:
-        out[:] = rhs(t, state)
-
-    status = project_step(
-        fill,
-        run.invariants.inv,
-        run.invariants.grad,
-        None,
-        t0,
-        run.y0,
-        run.y0.view(float),
-        t0,
-        True,
-        options,
-        work,
-        y,
-        y.view(float),
-    )
+    projection = Projection(run.invariants, options, rhs)
+    projection.work.K[-1] = f0
+    y, status = projection(t0, run.y0)
+    work = projection.work
     missed = np.abs(work.defect) > 1e-8 * run.invariants.term_sizes(t0, y, f0) if status == 0 else [True]
     if np.any(missed):
         raise ValueError(projection_failure(run.invariants, work, t0))
     return y
+
+
+class Projection:
+    """The projection by itself; `work` may be filled before a call: K[-1] with f there, sigma with weights.
+
+    Parameters
+    ----------
+    invariants : InvariantSet
+    options : Options
+    rhs : callable
+        ``rhs(t, y) -> (n,)``, checked, for gradients that take f in iterations.
+    """
+
+    def __init__(
+        self, invariants: InvariantSet, options: Options, rhs: Callable[[float, np.ndarray], np.ndarray]
+    ) -> None:
+        n, dtype = invariants.shape[1], invariants.dtype
+        self.work = make_work(n, dtype, 0, invariants.size, options.groups.start.size - 1)
+        derivative = Call(rhs, (), (n,), lambda value, t: np.array(value, dtype))
+        functions = PythonFunctions(derivative, *invariants.calls, (), second_order=False)
+        self._engine = Engine(NO_METHOD, options._replace(joint=None), self.work, functions)
+
+    def __call__(self, t: float, y: np.ndarray) -> tuple[np.ndarray, int]:
+        """The state projected, and the engine's code."""
+        self.work.y_hat[:] = y
+        out = np.empty_like(self.work.y_hat)
+        return out, self._engine.project(t, y, t, True, out)
 
 
 def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:

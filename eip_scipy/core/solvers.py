@@ -11,9 +11,9 @@ import numpy as np
 import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
-from ..engine.counters import FOUND, N_COUNTERS, NFEV, NJEV, NLU, REJECTED
-from ..engine.kernels import FAILED_PROJECTION, OK
-from ..engine.step import TIME, TIME_NEW, close_step, next_step, project_any
+from ..engine.counters import FOUND, NFEV, NJEV, NLU, REJECTED
+from ..engine.data import FAILED_PROJECTION, OK, bare_schedule
+from ..engine.native import Call, Engine, PythonFunctions
 from ..engine.trust import ProjectionWarning
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
@@ -120,7 +120,7 @@ class EIPSolver(OdeSolver):
         t0, t_bound = interval((t0, t_bound))
         start = setup.initial_state(y0)
         self._calls = [0]
-        derivative, self._rhs = _checked(fun, start.size, start.dtype, vectorized, self._calls)
+        derivative, self._rhs, self._call = _checked(fun, start.size, start.dtype, vectorized, self._calls)
         self._derivative = derivative
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
         steps = StepOptions(h=h, first_step=first_step, max_step=max_step, rtol=rtol, atol=atol)
@@ -140,13 +140,10 @@ class EIPSolver(OdeSolver):
             self.h_abs = stepping.first(derivative, start, f0, self.TABLEAU)
         projection = replace(projection, invariants=kept)
         run = setup.prepare(self.TABLEAU, derivative, Start(t0, start, f0, self.h_abs or 0.0), projection, stepping)
-        # Lists: Python reads and writes their numbers several times faster than an array's.
-        run.work = run.work._replace(counters=[0] * N_COUNTERS, norm=[0.0], max_correction=[0.0])  # type: ignore[arg-type]
         setup.attach(diagnostics, run)
         self._run, self._work = run, run.work
-        self._clock = [float(t0), float(t0), 0.0, float(self.h_abs or 0.0)]
         self._project_now, self._projection_status, self._last = False, OK, False
-        self._buffer = self._accepted = run.y0
+        self._accepted = run.y0
         if run.y0 is not start:
             f0 = derivative(t0, run.y0).copy()
         self.y, self.f = run.y0, f0
@@ -154,9 +151,22 @@ class EIPSolver(OdeSolver):
         self._count()
         self.y_old, self.f_old = self.y, self.f
         self._found, self._told = 0, False
+        if self._scipy is None:
+            self._work.K[0] = f0
+            self._schedule = bare_schedule(stepping.span, float(self.h_abs or 0.0))
+            self._engine = self._make_engine()
+
+    def _make_engine(self) -> Engine:
+        functions = PythonFunctions(self._call, *self._run.invariants.calls, (), second_order=False)
+        return self._run.engine(functions, self._schedule, finish=self._finish if self._finishes else None)
+
+    @property
+    def _finishes(self) -> bool:
+        """Whether a subclass ends the steps, by the hook."""
+        return type(self)._project_step is not EIPSolver._project_step
 
     def _count(self) -> None:
-        counters = self._work.counters
+        counters = self._work.counters.tolist()
         self.nfev, self.njev, self.nlu = counters[NFEV], counters[NJEV], counters[NLU]
 
     def _scipy_solver(
@@ -166,8 +176,7 @@ class EIPSolver(OdeSolver):
         stepping: Stepping,
         own_steps: bool,
     ) -> OdeSolver | None:
-        own_steps |= type(self)._project_step is not EIPSolver._project_step
-        if self.SCIPY is None or stepping.h is not None or own_steps:
+        if self.SCIPY is None or stepping.h is not None or own_steps or self._finishes:
             return None
 
         def fresh(t: float, y: np.ndarray) -> np.ndarray:
@@ -201,21 +210,17 @@ class EIPSolver(OdeSolver):
     def _step_impl(self) -> tuple[bool, str | None]:
         if self._scipy is not None:
             return self._scipy_step(self._scipy)
-        run, w, clock = self._run, self._work, self._clock
-        y, y_new = self.y, np.empty_like(self.y)
-        w.K[0] = self.f
-        clock[TIME] = self.t
-        status = next_step(
-            self._finish, self._rhs, run.invariants.inv, run.invariants.grad, None, clock, self._k, self._span,
-            run.method, run.options, w, y, y.view(float), y_new, y_new.view(float),
-        )  # fmt: skip
+        run, w = self._run, self._work
+        status, t, y_new, f_new = self._engine.step(self._k, self.t, self.y, self.f)
         self._count()
         if status != OK:
             run.trust.failed = True
-            return False, setup.failure(status, run, clock)
+            return False, setup.failure(status, run, self._schedule.clock)
         self._k += 1
-        self.y_old, self.f_old = y, self.f
-        self.y, self.t, self.f = self._accepted, clock[TIME_NEW], w.K[-1].copy()
+        self.y_old, self.f_old = self.y, self.f
+        self.y, self.t, self.f = y_new, t, f_new
+        if self._finishes:
+            self.y = self._accepted
         if w.counters[FOUND] != self._found or self._k in setup.LOOKS or self.t == self.t_bound:
             self._watch()
         return True, None
@@ -228,18 +233,15 @@ class EIPSolver(OdeSolver):
             self._told = True
             warnings.warn(f"{type(self).__name__}: {run.trust.message}", ProjectionWarning, stacklevel=5)
 
-    def _finish(
-        self, rhs: Any, inv: Any, grad: Any, params: Any, t: Any, y: Any, y_r: Any, t_new: Any, project: Any,
-        last: Any, m: Any, o: Any, w: Any, y_new: Any, y_new_r: Any,
-    ) -> int:  # fmt: skip
-        """What `finish_step` does, with the hook in its place."""
+    def _finish(self, t_new: float, project: bool, last: bool) -> int:
+        """What the engine's `finish_step` does, with the hook in its place."""
+        w = self._work
         self._project_now, self._projection_status, self._last = project, OK, last
-        self._buffer = y_new
-        self._accepted = self._project_step(t_new, y, w.y_hat, w.err)
+        self._accepted = self._project_step(t_new, self.y, w.y_hat, w.err)
         if self._projection_status == FAILED_PROJECTION:
             w.counters[REJECTED] += 1
             return FAILED_PROJECTION
-        close_step(rhs, params, t_new, self._accepted, project, self._projection_status, o, w)
+        self._engine.close(t_new, self._accepted, project, self._projection_status)
         return OK
 
     def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
@@ -261,7 +263,7 @@ class EIPSolver(OdeSolver):
         ndarray, shape (n,)
             A new array.
         """
-        w, y_new = self._work, self._buffer
+        w, y_new = self._work, np.empty_like(y)
         if not self._project_now:
             y_new[:] = y_hat
             return y_new
@@ -269,22 +271,7 @@ class EIPSolver(OdeSolver):
             w.y_hat[:] = y_hat
         if err is not w.err:
             w.err[:] = err
-        run = self._run
-        self._projection_status = project_any(
-            self._rhs,
-            run.invariants.inv,
-            run.invariants.grad,
-            None,
-            self.t,
-            y,
-            y.view(float),
-            t,
-            self._last,
-            run.options,
-            w,
-            y_new,
-            y_new.view(float),
-        )
+        self._projection_status = self._engine.project(self.t, y, t, self._last, y_new)
         return y_new
 
     def _dense_output_impl(self) -> DenseOutput:
@@ -308,12 +295,11 @@ def _without_effect(names: Iterable[str]) -> str:
 
 def _checked(
     fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool, calls: list[int]
-) -> tuple[Callable[[float, np.ndarray], np.ndarray], Callable[..., None]]:
-    """The user's right-hand side with clear errors: as (t, y) -> (n,), maybe their buffer, and as the step calls it.
+) -> tuple[Callable[[float, np.ndarray], np.ndarray], Callable[..., None], Call]:
+    """The user's right-hand side with clear errors: as (t, y) -> (n,), maybe their buffer; in place; for the engine.
 
-    The first counts in `calls`; the step counts its own. Both test the common case, an array of the right shape and
-    type, in place, and both hand out copies, because a user's function may keep or overwrite what it was given: this
-    runs at every stage.
+    The first counts in `calls`; the step counts its own. All hand out copies, because a user's function may keep or
+    overwrite what it was given, and test the common case, an array of the right shape and type, first.
     """
     shape = (n,)
 
@@ -322,23 +308,22 @@ def _checked(
         refuse_units(**{"fun returned": f})
         return np.asarray(f).reshape(-1)
 
-    call = flat if vectorized else fun
+    called = flat if vectorized else fun
+
+    def convert(f: Any, t: float) -> np.ndarray:
+        return np.array(setup.as_derivative(f, n, dtype, t), dtype, order="C")
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
         calls[0] += 1
-        f = call(t, y.copy())
+        f = called(t, y.copy())
         if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
             return f
-        return setup.as_derivative(f, n, dtype, t).astype(dtype)
+        return convert(f, t)
 
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: Any) -> None:
-        f = call(t, y.copy())
-        if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
-            out[:] = f
-        else:
-            out[:] = setup.as_derivative(f, n, dtype, t)
+        out[:] = convert(called(t, y.copy()), t)
 
-    return derivative, rhs
+    return derivative, rhs, Call(called, (), shape, convert)
 
 
 class EIPRK1(EIPSolver):

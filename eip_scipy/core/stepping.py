@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.kernels import EPS
-from ..engine.step import Span
+from ..engine.data import EPS, Span
 from ..methods.nystrom import NystromTableau
 from ..methods.runge_kutta import Tableau
 from .inputs import is_number, reals, refuse_units, shown

@@ -8,6 +8,7 @@ import numpy as np
 
 from . import kernels as kn
 from .counters import FOUND, HAVE_ERROR, LAST_RANK, NJEV, NLU, PROJECTIONS, SKIPPED, WAITED
+from .data import EPS
 
 __all__ = ["project_jointly"]
 
@@ -54,5 +55,5 @@ def _take_note(t: float, lengths: np.ndarray | None, o: Any, w: Any) -> None:
     err = np.full(1, 0.0 if lengths is None else kn.norm(w.err))
     w.counters[FOUND] += kn.note(
         w.defect, w.max_defect, w.before, w.band, G, err, w.trust, o.per_band, t,
-        0.0 if lengths is None else steps, kn.EPS * steps**0.5,
+        0.0 if lengths is None else steps, EPS * steps**0.5,
     )  # fmt: skip

@@ -8,11 +8,11 @@ kernel is called from Python or inlined in a compiled driver.
 from __future__ import annotations
 
 from math import sqrt
-from typing import NamedTuple
 
 import numpy as np
 
 from .caching import cached_njit
+from .data import BAND, BAND_COMPENSATED, EPS, FAILED_PROJECTION, OK
 from .octets import is_not, no_lane, where
 from .sums import abs_dot, combined_rows, dot, largest, out_of_line, remove_component, weighted_rows
 from .triples import shift_and_weigh, shift_bodies, sum_bodies
@@ -38,11 +38,6 @@ from .trust import (
     TERMS,
 )
 
-OK, NOT_FINITE, FAILED_PROJECTION, POSTPONED = 0, 1, 2, 4
-
-EPS = 2.220446049250313e-16
-# Dead band in roundings of an invariant's terms; where the state's own roundings are carried, the values' remain.
-BAND, BAND_COMPENSATED = 4.0, 1.0
 METRIC_FLOOR = 1e-7
 RANK_TOLERANCE = sqrt(EPS)
 # Below this length one Gram-Schmidt pass would leave errors of 1e-13 and more of the defects uncorrected.
@@ -53,51 +48,6 @@ NOISE_BANDS = 3.0
 # Terms that vanish for a moment, where an invariant's own pass through zero, count as this share of those at the start.
 LEAST_SHARE = 1e-3
 SPLITTER = 134217729.0  # 2**27 + 1 (Dekker)
-
-
-class Grouping(NamedTuple):
-    """Blocks as lists of floats' indices: ``member[start[b]:start[b + 1]]``; width 2 for a complex state.
-
-    `size` is that of consecutive blocks of one size, 0 for others.
-    """
-
-    member: np.ndarray
-    start: np.ndarray
-    width: int
-    size: int
-
-
-class FrameRows(NamedTuple):
-    """Non-zeros of C and, after them, of M^T, M = S (C S)^-1: row k of the first is ``start[0, k]:start[0, k + 1]``.
-
-    Where x, y and z of bodies have rows alike, `bodies` (2, groups, bodies) holds the weights of a state of (groups,
-    bodies, 3) floats instead; else it is empty. `products` is scratch.
-    """
-
-    start: np.ndarray
-    place: np.ndarray
-    value: np.ndarray
-    products: np.ndarray
-    bodies: np.ndarray
-
-
-class Inner(NamedTuple):
-    """Scratch of the small Newton systems."""
-
-    matrix: np.ndarray
-    g: np.ndarray
-    inverse_norms: np.ndarray
-    R: np.ndarray
-    pivots: np.ndarray
-    mu: np.ndarray
-
-
-def make_inner(size: int) -> Inner:
-    """Scratch for systems of up to `size` invariants."""
-    square = (size, size)
-    return Inner(
-        np.zeros(square), np.zeros(size), np.zeros(size), np.zeros(square), np.zeros(size, np.int64), np.zeros(size)
-    )
 
 
 _jit = cached_njit(error_model="numpy", _nrt=False)

@@ -11,7 +11,6 @@ The functions here take callables. They are plain Python when called from Python
 from __future__ import annotations
 
 from math import isfinite, isnan, sqrt
-from typing import Any, NamedTuple
 
 import numpy as np
 from numba.extending import overload, register_jitable
@@ -23,7 +22,6 @@ from .counters import (
     HAVE_ERROR,
     HAVE_F,
     LAST_RANK,
-    N_COUNTERS,
     NFEV,
     NJEV,
     NLU,
@@ -34,180 +32,40 @@ from .counters import (
     SOFTENED,
     WAITED,
 )
+from .data import (
+    AUTO,
+    EPS,
+    ERROR,
+    FAILED_PROJECTION,
+    LENGTH,
+    NEW,
+    NEXT_LENGTH,
+    NOT_FINITE,
+    OK,
+    OLD,
+    POSTPONED,
+    TIME,
+    TIME_NEW,
+    TOO_SMALL,
+    Method,
+)
 from .joint import project_jointly
-from .kernels import FAILED_PROJECTION, NOT_FINITE, OK, POSTPONED, FrameRows, Grouping
 from .sums import out_of_line
-from .trust import N_FIGURES, TERMS
 
 # Without reference counting and inlined, the driver runs 20 times faster: it hands records of some 40 arrays down.
 _INLINED = {"_nrt": False, "error_model": "numpy", "forceinline": True}
 _jitable = register_jitable(**_INLINED)
 
-NEW, OLD, MIDPOINT = 0, 1, 2
 # every="auto": each AUTO_SPACING-th step asks whether a projection is worth it.
-AUTO, AUTO_SPACING = 0, 5
+AUTO_SPACING = 5
 # Without an estimate of their own, the first so many projections are compared with one, then one in as many.
 SAMPLED_FIRST, SAMPLED_EACH = 8, 16
-EUCLIDEAN, ERROR, GIVEN = 0, 1, 2
 
 
 # Step control, as in SciPy's Runge-Kutta classes; a failed projection shrinks the step as CVODE does.
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 RETRY_FACTOR, MAX_RETRIES = 0.25, 10
 HEALTHY, MAX_SOFTENED = 5.0, 3
-TOO_SMALL = 3
-
-# Places in the clock of a run: the current time, the time and length of the step tried last, the length to try next.
-TIME, TIME_NEW, LENGTH, NEXT_LENGTH = range(4)
-
-
-class Span(NamedTuple):
-    """Where a run steps: t_k = t0 + k h (h = 0: adaptive steps), the last one on t_bound."""
-
-    t0: float
-    h: float
-    t_bound: float
-    sign: float
-    n_steps: int
-    max_step: float
-
-
-class Method(NamedTuple):
-    """A tableau as arrays. `e` weighs the rows of K in the error estimate; `fsal` when it uses f at the new point.
-
-    Names ending in _v are a Nystrom method's weights of the velocity.
-    """
-
-    A: np.ndarray
-    b: np.ndarray
-    b_low: np.ndarray
-    b_v: np.ndarray
-    b_v_low: np.ndarray
-    c: np.ndarray
-    e: np.ndarray
-    e_v: np.ndarray
-    e_low: np.ndarray
-    nystrom: bool
-    fsal: bool
-    paired: bool
-    exponent: float
-
-
-class Options(NamedTuple):
-    """What a run fixes: `rtol` by float of the state, `atol` by component, `block_atol` by block.
-
-    `watched`: whether corrections are compared with the errors of the steps. `limit`: the share of an invariant's terms
-    that a projection may leave as its defect; the terms are `per_band` dead bands.
-    `joint`: in interpreted runs the `JointInvariants` whose functions serve, else None.
-    """
-
-    rtol: np.ndarray
-    atol: np.ndarray
-    block_atol: np.ndarray
-    groups: Grouping
-    frame: FrameRows
-    target: np.ndarray
-    scales: np.ndarray
-    kappa: float
-    metric: int
-    direction: int
-    iterations: int
-    every: int
-    reuse_f: bool
-    uses_f: bool
-    compensated: bool
-    adaptive: bool
-    per_band: float
-    watched: bool = False
-    limit: float = np.inf
-    joint: Any = None
-
-
-class Work(NamedTuple):
-    """Buffers of a run; names ending in _r are the float64 views of those before them."""
-
-    K: np.ndarray
-    K_r: np.ndarray
-    stage: np.ndarray
-    stage_r: np.ndarray
-    y_hat: np.ndarray
-    y_hat_r: np.ndarray
-    f_point: np.ndarray
-    G: np.ndarray
-    G_r: np.ndarray
-    err: np.ndarray
-    err_low: np.ndarray
-    err_sum: np.ndarray
-    sigma: np.ndarray
-    scale: np.ndarray
-    ratio: np.ndarray
-    move: np.ndarray
-    carry: np.ndarray
-    carry_hat: np.ndarray
-    B: np.ndarray
-    Q: np.ndarray
-    R: np.ndarray
-    inverse_norms: np.ndarray
-    pivots: np.ndarray
-    mu: np.ndarray
-    values: np.ndarray
-    g: np.ndarray
-    band: np.ndarray
-    before: np.ndarray
-    defect: np.ndarray
-    max_defect: np.ndarray
-    max_correction: np.ndarray
-    trust: np.ndarray
-    norm: np.ndarray
-    counters: np.ndarray
-    inner: kn.Inner
-
-
-def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks: int) -> Work:
-    """All buffers of a run of n components and n_invariants invariants."""
-
-    def pair(*shape: int) -> tuple[np.ndarray, np.ndarray]:
-        a = np.zeros(shape, dtype=dtype)
-        return a, a.view(np.float64)
-
-    width = 2 if np.dtype(dtype).kind == "c" else 1
-    m = n * width
-    K, K_r = pair(stages + 1, n)
-    stage, stage_r = pair(n)
-    y_hat, y_hat_r = pair(n)
-    G, G_r = pair(n_invariants, n)
-    floats = {name: np.zeros(m) for name in ("err", "err_low", "err_sum", "sigma", "move", "carry", "carry_hat")}
-    small = {
-        name: np.zeros(n_invariants) for name in ("inverse_norms", "mu", "values", "g", "band", "before", "defect")
-    }
-    floats["sigma"][:] = 1.0
-    trust = np.zeros((n_invariants, N_FIGURES))
-    trust[:, TERMS] = np.inf
-    return Work(
-        K=K,
-        K_r=K_r,
-        stage=stage,
-        stage_r=stage_r,
-        y_hat=y_hat,
-        y_hat_r=y_hat_r,
-        f_point=np.zeros(n, dtype),
-        G=G,
-        G_r=G_r,
-        **floats,
-        **small,
-        scale=np.zeros(n_blocks),
-        ratio=np.zeros(n_blocks),
-        B=np.zeros((n_invariants, m)),
-        Q=np.zeros((n_invariants, m)),
-        R=np.zeros((n_invariants, n_invariants)),
-        pivots=np.zeros(n_invariants, np.int64),
-        max_defect=np.zeros(n_invariants),
-        max_correction=np.zeros(1),
-        trust=trust,
-        norm=np.zeros(1),
-        counters=np.zeros(N_COUNTERS, np.int64),
-        inner=kn.make_inner(n_invariants),
-    )
 
 
 @_jitable
@@ -447,7 +305,7 @@ def take_note(t, o, w):
         kn.raise_to(w.defect, w.max_defect)
         return
     waited = w.counters[WAITED]
-    rounding = kn.EPS
+    rounding = EPS
     errors = 1.0 if w.counters[HAVE_ERROR] else 0.0
     if waited > 0:
         rounding *= sqrt(1.0 + waited)
@@ -478,7 +336,7 @@ def move(rhs, grad, params, t_old, y, y_r, t, weigh, largest_error, o, w, y_new_
     """
     w.counters[NLU] += 1
     # The state's own rounding is an error of the step, and at small steps the largest, unless it is carried along.
-    rounding = 0.0 if o.compensated else kn.EPS
+    rounding = 0.0 if o.compensated else EPS
     if o.direction == NEW:
         return kn.weighted_move(
             weigh, largest_error, w.err, rounding, y_r, w.y_hat_r, o.rtol, o.block_atol, o.groups, o.kappa, w.sigma,

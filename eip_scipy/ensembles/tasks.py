@@ -20,18 +20,19 @@ import numpy as np
 from numba import typeof, types
 
 from ..core import setup
-from ..core.compiled_functions import ChangedShapeError, NotCompilableError, signatures
+from ..core.compiled_functions import signatures
+from ..core.jitted import ChangedShapeError, NotCompilableError
 from ..core.stepping import UNBOUNDED
 from ..engine import kernels as kn
 from ..engine.caching import cached_njit
 from ..engine.counters import N_COUNTERS, NFEV
-from ..engine.kernels import OK
-from ..engine.step import NEXT_LENGTH, TIME, TIME_NEW, Work
+from ..engine.data import NEXT_LENGTH, OK, PENDING, ROW, STEP, TIME, TIME_NEW, Schedule, Work
 from ..engine.trust import Trust, sick
-from ..run.driver import PENDING, ROW, STEP, Schedule, saved_rows
+from ..run.driver import saved_rows
 from ..run.integrate import ARRIVED, Loop
 from ..run.prepare import Prepared, Request, prepared
 from ..run.resume import Keeper
+from .numba_driver import NumbaDriver
 from .vector_runs import Batch
 
 __all__ = ["COMPARED", "FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
@@ -451,6 +452,7 @@ class Sweeper:
         self._where = np.zeros(1, np.int64)
         self._compiled: Callable[..., int] | None = None
         self._row_buffer = driver.y[None].view(float)
+        self._numba = NumbaDriver(loop)
         self._batch = _batch(loop) if members * span.n_steps * driver.run.y0.size >= LEAST_WORK else None
 
     def run(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
@@ -568,16 +570,16 @@ class Sweeper:
         driver, G = self.loop.driver, self._G
         rows = self._row_buffer if each.saved is None else each.saved.view(float)
         passed = (
-            *(driver.params, driver.schedule, *driver._tail, driver.t, self._buffers, self._fresh, G),
+            *(driver.params, driver.schedule, *self._numba.tail, driver.t, self._buffers, self._fresh, G),
             *(G.view(float), self._where, last, self.loop.chunk),
             *(each.y0s, each.taus, each.evaluations, each.params, rows),
             *(out.y, out.max_defect, out.counters, out.max_correction, each.figures),
         )
-        advance: Any = driver._advance
+        advance = self._numba.advance
         if self._compiled is None:
             signature = advance.nopython_signatures[0].args
             self._compiled = _compiled_sweep(driver.run.y0.dtype, signature, tuple(typeof(a) for a in passed))
-        return self._compiled(advance, *driver.functions, *passed)
+        return self._compiled(advance, *self._numba.functions, *passed)
 
     def _look_at(
         self,
@@ -618,7 +620,7 @@ class Sweeper:
         return taus, self._evaluations
 
     def _derivative(self, params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
-        rhs = self.loop.driver.functions.rhs
+        rhs = self._numba.functions.rhs
 
         def derivative(t: float, y: np.ndarray) -> np.ndarray:
             out = np.zeros_like(y)

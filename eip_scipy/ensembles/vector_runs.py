@@ -15,16 +15,16 @@ import numpy as np
 from numba import typeof, types
 
 from ..core import setup
-from ..core.compiled_functions import NotCompilableError, signatures_of_batches, with_inlined
+from ..core.compiled_functions import signatures_of_batches, with_inlined
+from ..core.jitted import NotCompilableError
 from ..core.stepping import UNBOUNDED
 from ..engine.caching import cached_njit
 from ..engine.counters import FOUND, LAST_RANK, N_COUNTERS, NFEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
-from ..engine.kernels import OK
+from ..engine.data import AUTO, NEW, OK, PENDING, ROW, STEP, TIME, Options, Span
 from ..engine.octets import LANES
-from ..engine.step import AUTO, NEW, TIME, Options, Span
 from ..engine.trust import EXPECTED, START, SUM, TERMS, TOGETHER
-from ..run.driver import PENDING, ROW, STEP, source_stamp
 from ..run.integrate import Loop
+from .numba_driver import compiled_by_numba, source_stamp
 from .vector_step import finish_batch, make_advance_batch, make_lanes, make_lanes_work
 
 __all__ = ["Batch", "Ended", "can_run", "lanes_of"]
@@ -90,7 +90,7 @@ class Batch:
         run, span = driver.run, driver.schedule.span
         if not can_run(run.options, span, run.y0.dtype):
             raise NotCompilableError("members with these options run one by one")
-        self.functions = loop.in_octets()
+        self.functions = compiled_by_numba(loop, in_octets=True)
         self.loop, self.span = loop, span
         n, rows = run.y0.size, run.invariants.size
         self.lanes = lanes = lanes_of(n)

@@ -19,9 +19,9 @@ import numpy as np
 
 from ..engine import kernels as kn
 from ..engine.counters import HAVE_ERROR, N_COUNTERS, NJEV, WAITED
-from ..engine.kernels import OK, FrameRows
+from ..engine.data import EPS, ERROR, OK, FrameRows, Work, make_work
 from ..engine.octets import LANES, any_lane, is_not, lane_of, octets, spread, where
-from ..engine.step import ERROR, HEALTHY, Work, _jitable, advance_raw, close_step, look_back, make_work
+from ..engine.step import HEALTHY, _jitable, advance_raw, close_step, look_back
 from ..engine.sums import abs_dot, dot, largest, out_of_line
 from ..engine.trust import EXPECTED, FAR, LARGE, LARGE_SHARE, LEFT, N_FIGURES, START, SUM, TERMS
 
@@ -175,7 +175,7 @@ def correct_octet(c, o, w, s, y, all_new):
     largest_error = spread(0.0)
     if o.metric == ERROR:
         err = octets(s.err, c)
-        doubtful = doubtful | kn.block_sizes(y, y_hat, err, kn.EPS, s.rtol, o.groups, sigma, scale, ratio)
+        doubtful = doubtful | kn.block_sizes(y, y_hat, err, EPS, s.rtol, o.groups, sigma, scale, ratio)
         largest_error = kn.weights_from_sizes(o.block_atol, o.groups, o.kappa, sigma, scale, ratio)
     kn.weigh_rows(G, sigma, frame, Q)
     dependent = outside & is_not(kn.solve_gram(Q, g, R, mu))
@@ -258,7 +258,7 @@ def watch_octet(c, done, o, w, s, defect):
         if w.counters[HAVE_ERROR]:
             change = before[i] - trust[i, LEFT]
             local = abs_dot(G[i], err)
-            expected = errors * local + kn.EPS * sqrt(steps) * terms + kn.TINY
+            expected = errors * local + EPS * sqrt(steps) * terms + kn.TINY
             judged = done & (local > 0.0)
             trust[i, SUM] += where(judged, abs(change), 0.0)
             trust[i, EXPECTED] += where(judged, expected, 0.0)

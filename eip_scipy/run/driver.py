@@ -1,147 +1,34 @@
-"""One run's steps: where it steps and what it saves, and the loop that makes them, compiled or not."""
+"""One run's steps: the engine, its buffers, and what it saves."""
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Callable
-from functools import cache
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
-from numba import typeof, types
 
-from ..core.compiled_functions import ChangedShapeError, CompiledFunctions, signatures, with_inlined
 from ..core.dense import End, ManifoldDenseOutput, dense_output
+from ..core.jitted import ChangedShapeError
 from ..core.setup import Run
 from ..core.stepping import UNBOUNDED, AnyMethod
-from ..engine import kernels as kn
-from ..engine.caching import cached_njit
-from ..engine.kernels import OK
-from ..engine.step import TIME, TIME_NEW, Span, finish_step, next_step
+from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Schedule
+from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
 
-__all__ = [
-    "FULL",
-    "PAUSE",
-    "PENDING",
-    "ROW",
-    "STEP",
-    "Driver",
-    "Schedule",
-    "check_memory",
-    "saved_rows",
-    "source_stamp",
-]
+__all__ = ["Driver", "check_memory", "saved_rows"]
 
 FIRST_ROWS = 1024
-STEP, ROW, PENDING = 0, 1, 2
-PAUSE, FULL = 10, 11
-
-
-class Schedule(NamedTuple):
-    """Where a run steps and what it saves.
-
-    `place` holds [step, row, pending]: pending is 1 between a step and its becoming the current state, so that whoever
-    is called in between sees both of its ends. `clock` is that of the step.
-    """
-
-    span: Span
-    save_every: int
-    t_eval: np.ndarray
-    place: np.ndarray
-    clock: np.ndarray
-    g: np.ndarray
-    g_new: np.ndarray
-    g_direction: np.ndarray
-
-
-def source_stamp(*names: str) -> str:
-    """Hash of all source that goes into a compiled driver, that of the files `names` too.
-
-    Numba's cache on disk looks only at the file of the function itself: without this, an upgraded or edited kernel
-    would leave the old driver, with the old kernel inlined, in use.
-    """
-    folder = Path(__file__).parents[1]
-    engine = ("octets", "sums", "triples", "trust", "kernels", "step")
-    names = (*(f"engine/{name}.py" for name in engine), *names)
-    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in names)).hexdigest()
-
-
-def make_advance(stamp):
-    """The loop over steps; `stamp` enters the key of its cache."""
-
-    def advance(rhs, inv, grad, event, params, schedule, k_end, m, o, w, y, y_r, y_new, y_new_r, t_saved, y_saved):
-        """Steps up to `k_end`; the one loop of compiled and interpreted runs. Returns OK or why it stopped."""
-        _ = stamp
-        place, clock = schedule.place, schedule.clock
-        while True:
-            if place[PENDING] == 1:
-                clock[TIME] = clock[TIME_NEW]
-                kn.copy(w.K_r[-1], w.K_r[0])
-                kn.copy(y_new_r, y_r)
-                kn.copy(schedule.g_new, schedule.g)
-                place[PENDING] = 0
-            k = place[STEP]
-            if clock[TIME] == schedule.span.t_bound or k >= k_end:
-                return OK
-            if place[ROW] + 2 > t_saved.size:
-                return FULL
-            status = next_step(
-                finish_step, rhs, inv, grad, params, clock, k, schedule.span, m, o, w, y, y_r, y_new, y_new_r
-            )
-            if status != OK:
-                return status
-            place[STEP] = k + 1
-            place[PENDING] = 1
-            t_new = clock[TIME_NEW]
-            saved = t_new == schedule.span.t_bound or (schedule.save_every > 0 and (k + 1) % schedule.save_every == 0)
-            if schedule.t_eval.size == 0 and saved:
-                t_saved[place[ROW]] = t_new
-                kn.copy(y_new_r, y_saved[place[ROW]])
-                place[ROW] += 1
-            if schedule.g.size > 0:
-                event(t_new, y_new, schedule.g_new, params)
-                if kn.crossed(schedule.g, schedule.g_new, schedule.g_direction):
-                    return PAUSE
-            if place[ROW] < schedule.t_eval.size and schedule.span.sign * (schedule.t_eval[place[ROW]] - t_new) <= 0.0:
-                return PAUSE
-
-    return advance
-
-
-advance = make_advance(source_stamp("run/driver.py"))
-
-
-def fill_values(inv, params, t, y, values):
-    """Invariants of saved states, row by row."""
-    for k in range(t.size):
-        inv(t[k], y[k], values[k], params)
-
-
-@cache
-def _compiled_advance(dtype: np.dtype, arguments: tuple[Any, ...]) -> Callable[..., int]:
-    """The driver compiled for one type of state, its callables as first-class functions: cached on disk."""
-    rhs, inv, grad = signatures(dtype)
-    functions = [types.FunctionType(s) for s in (rhs, inv, grad, inv)]
-    signature = types.int64(*functions, *arguments)
-    whole = with_inlined(advance, next_step, finish_step)
-    return cached_njit([signature], error_model="numpy", nogil=True, _nrt=False)(whole)
-
-
-@cache
-def _compiled_values(dtype: np.dtype, arguments: tuple[Any, ...]) -> Callable[..., None]:
-    inv = types.FunctionType(signatures(dtype).inv)
-    return cached_njit([types.void(inv, *arguments)], error_model="numpy", _nrt=False)(fill_values)
 
 
 class Driver:
     """One run: its functions, buffers and the rows saved so far."""
 
     def __init__(
-        self, run: Run, schedule: Schedule, functions: CompiledFunctions, params: np.ndarray, compiled: bool
+        self, run: Run, schedule: Schedule, functions: PythonFunctions | NativeFunctions, params: np.ndarray
     ) -> None:
-        self.run, self.schedule, self.functions, self.params, self.compiled = run, schedule, functions, params, compiled
+        self.run, self.schedule, self.params = run, schedule, params
+        self.functions: Any = functions
         rows = saved_rows(schedule) or FIRST_ROWS
         n, dtype = run.y0.size, run.y0.dtype
         # One row to spare for the last state of a run that ends early.
@@ -149,29 +36,28 @@ class Driver:
         self.y = np.empty((rows + 1, n), dtype)
         self.state = run.y0.copy()
         self.new = np.empty_like(self.state)
-        if compiled:
-            run.options = run.options._replace(joint=None)
-        self._tail = (
-            run.method,
-            run.options,
-            run.work,
-            self.state,
-            self.state.view(float),
-            self.new,
-            self.new.view(float),
-        )
-        self._advance: Callable[..., int] = advance
-        if compiled:
-            arguments = tuple(typeof(a) for a in (params, schedule, 0, *self._tail, self.t, self.y.view(float)))
-            self._advance = _compiled_advance(dtype, arguments)
+        self.engine = run.engine(functions, schedule)
 
     def advance(self, k_end: int) -> int:
         """Step on to step `k_end`, or to what stops the loop before it; returns the loop's code."""
-        arguments = (self.params, self.schedule, k_end, *self._tail, self.t, self.y.view(float))
+        with self._own_errors():
+            return int(self.engine.advance(k_end, self.state, self.new, self.t, self.y))
+
+    @contextmanager
+    def _own_errors(self) -> Iterator[None]:
+        """What compiled functions raise, which C does not see, in place of the engine's error."""
         try:
-            return self._advance(*self.functions, *arguments)
-        except ChangedShapeError as error:
-            self.place(error)
+            yield
+        except FailedCallError as error:
+            failed = error.args
+        else:
+            return
+        from ..core.native_functions import raise_again
+
+        try:
+            raise_again(self.functions, *failed)
+        except ChangedShapeError as changed:
+            self.place(changed)
             raise
 
     def place(self, error: ChangedShapeError) -> None:
@@ -270,11 +156,8 @@ class Driver:
         """Invariants of the saved states, (l, m)."""
         t, y = self.t[: self.rows], self.y[: self.rows]
         out = np.empty((self.rows, self.run.invariants.size))
-        arguments = (self.params, t, y, out)
-        fill = fill_values
-        if self.compiled:
-            fill = _compiled_values(self.run.y0.dtype, tuple(typeof(a) for a in arguments))
-        fill(self.functions.inv, *arguments)
+        with self._own_errors():
+            self.engine.values(t, y, out)
         return out.T
 
 

@@ -12,7 +12,8 @@ from scipy.optimize import brentq
 
 from ..core.inputs import is_number, reals, refuse_units, require_arguments, shown
 from ..core.invariants import as_it_is
-from ..engine.kernels import EPS
+from ..engine.data import EPS
+from ..engine.native import Call, call
 
 __all__ = ["Events"]
 
@@ -56,6 +57,17 @@ class Events:
         return any(math.isfinite(allowed) for allowed in self._allowed)
 
     @property
+    def calls(self) -> tuple[Call, ...]:
+        """The events as the engine calls them."""
+
+        def one(k: int) -> Call:
+            return call(
+                self._called[k], self._extra, (), lambda value, t: np.array(self._number(k, t, value)), real=True
+            )
+
+        return tuple(map(one, range(len(self.functions))))
+
+    @property
     def ends(self) -> list[tuple[float, float]]:
         """Of each event the direction and the number of times after which it ends the run."""
         return list(zip(self.directions.tolist(), self._allowed, strict=True))
@@ -96,6 +108,9 @@ class Events:
             given, mend = ("t", "y", *("params" for _ in self._extra)), "It takes params if the run has them."
             require_arguments(self.functions[k], given, f"event {k}", mend)
             raise
+        return self._number(k, t, value)
+
+    def _number(self, k: int, t: float, value: Any) -> float:
         if isinstance(value, float):
             return value
         refuse_units(**{f"event {k} returned": value})

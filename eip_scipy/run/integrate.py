@@ -11,11 +11,10 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
-from numba.extending import is_jitted
 
 from ..core import setup
-from ..core.compiled_functions import CompiledFunctions, compile_functions
 from ..core.inputs import refuse_units
+from ..core.jitted import is_jitted
 from ..core.names import nearest
 from ..core.options import ProjectionOptions, takes_projection_options
 from ..core.problem import Problem
@@ -23,11 +22,10 @@ from ..core.results import Diagnostics, IntegrationResult
 from ..core.solvers import EIPSolver
 from ..core.stepping import UNBOUNDED
 from ..engine.counters import NFEV, NJEV, NLU
-from ..engine.kernels import OK
-from ..engine.step import TIME
+from ..engine.data import FULL, OK, PAUSE, ROW, STEP, TIME, Schedule
 from ..engine.trust import ProjectionWarning
 from . import resume as _resume
-from .driver import FULL, PAUSE, ROW, STEP, Driver, Schedule
+from .driver import Driver
 from .interrupts import ended_by_sigterm, kept_ctrl_c, look_for_signals
 from .prepare import DEFAULT, Prepared, Request, prepared, started_at
 
@@ -213,20 +211,14 @@ class Loop:
             keeper.identify(identity, run, system.derivative, start.t, start.y, start.f)
         wanted = request.compiled if compiled is None else compiled
         with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
-            functions, self.why_not = system.compiled(run, wanted)
-            self.driver = Driver(run, prepared.schedule, functions, system.parameters, compiled=self.why_not is None)
+            functions, self.why_not = system.functions(run, wanted)
+            self.driver = Driver(run, prepared.schedule, functions, system.parameters)
         for function in system.handed:
             function.read_only &= self.why_not is None
         keeper.begin(self.driver, self.events, self.max_bytes)
         self.wall_time = keeper.seconds
         self.chunk = FIRST_CHUNK
         self.told = self._doubtful = False
-
-    def in_octets(self) -> CompiledFunctions:
-        """The functions for vectors of members."""
-        system, run = self.prepared.system, self.prepared.run
-        extra, dtype = bool(system.extra), run.y0.dtype
-        return compile_functions(system.fun, system.form, extra, run.invariants, (), dtype, in_octets=True)
 
     def run(self) -> IntegrationResult:
         driver = self.driver

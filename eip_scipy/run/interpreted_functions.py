@@ -7,13 +7,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba.extending import is_jitted
 
 from ..core import setup
-from ..core.compiled_functions import Handed
 from ..core.inputs import filled
+from ..core.jitted import is_jitted
 
-__all__ = ["FORMS", "INTERPRETED", "hand"]
+__all__ = ["FORMS", "INTERPRETED", "Handed", "hand"]
 
 FORMS = {  # (of a Nystrom method, in place) -> what a user's function is
     (False, False): "value",
@@ -89,3 +88,45 @@ def hand(handed: list[Handed], fun: Callable[..., Any], arrays: int) -> Callable
         return fun
     handed.append(Handed(fun, arrays))
     return handed[-1]
+
+
+class Handed:
+    """A user's jitted function as Python calls it: on arrays that it cannot write to, as compiled runs call it.
+
+    So that one version of it is compiled, not two. Where it writes to them it gets them writable, as do interpreted
+    runs, whose calls take less time then, once `read_only` is False.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(t, y, ...)``.
+    arrays : int
+        How many of the arguments after t: the state, and f where a gradient takes it.
+    """
+
+    __slots__ = ("_arrays", "_fun", "read_only")
+
+    def __init__(self, fun: Callable[..., Any], arrays: int) -> None:
+        self._fun, self._arrays, self.read_only = fun, arrays, True
+
+    def __call__(self, t: float, *arguments: Any) -> Any:
+        """The function's value."""
+        if self.read_only:
+            given = (_read_only(a) for a in arguments[: self._arrays])
+            try:
+                return self._fun(t, *given, *arguments[self._arrays :])
+            except _numba_error():
+                self.read_only = False
+        return self._fun(t, *arguments)
+
+
+def _read_only(a: np.ndarray) -> np.ndarray:
+    a = a[:]
+    a.flags.writeable = False
+    return a
+
+
+def _numba_error() -> type[Exception]:
+    from numba.core.errors import NumbaError
+
+    return NumbaError

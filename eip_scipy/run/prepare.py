@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from ..core import setup
-from ..core.compiled_functions import CompiledFunctions, Handed, NotCompilableError, compile_functions
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import Invariant, as_invariants
+from ..core.jitted import NotCompilableError, is_jitted, jit_is_off
 from ..core.one_step import OneStep
 from ..core.options import ProjectionOptions
 from ..core.problem import Problem
@@ -22,11 +22,12 @@ from ..core.setup import Counted, Run, Start
 from ..core.solvers import EIPSolver
 from ..core.stepping import AnyMethod, StepOptions, Stepping, interval
 from ..engine.counters import NFEV
-from ..engine.step import Span
+from ..engine.data import Schedule, Span
+from ..engine.native import NativeFunctions, PythonFunctions, call
 from ..methods.nystrom import NystromTableau
-from .driver import Schedule, check_memory, saved_rows
+from .driver import check_memory, saved_rows
 from .events import Events
-from .interpreted_functions import FORMS, INTERPRETED, hand
+from .interpreted_functions import FORMS, INTERPRETED, Handed, hand
 from .memory import check_bytes, free_memory
 from .resume import settings
 
@@ -109,11 +110,13 @@ class System:
         self.handed: list[Handed] = []
         self.hand = partial(hand, self.handed)
         self.events = Events(request.events, self.extra, self.hand)
+        self.called: Callable[..., Any]
         self.rhs: Callable[..., None]
 
     def bind(self, y0: np.ndarray) -> None:
         """Make `rhs` for states like y0."""
-        self.rhs = INTERPRETED[self.form](self.hand(self.fun, 1), self.extra, y0)
+        self.called = self.hand(self.fun, 1)
+        self.rhs = INTERPRETED[self.form](self.called, self.extra, y0)
 
     def derivative(self, t: float, y: np.ndarray) -> np.ndarray:
         """The derivative as a new array."""
@@ -130,20 +133,40 @@ class System:
             require_arguments(self.fun, ("t", "y", *out, *("params" for _ in self.extra)), *CALLED)
             raise
 
-    def compiled(self, run: Run, wanted: bool | None) -> tuple[CompiledFunctions, str | None]:
+    def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
         """The functions of the loop, and why they are not compiled (None: they are)."""
-        interpreted = CompiledFunctions(self.rhs, run.invariants.inv, run.invariants.grad, self.events.fill)
+        interpreted = self._interpreted(run)
         if wanted is False:
             return interpreted, "compiled=False"
         try:
-            if isinstance(run.method, OneStep):
-                raise NotCompilableError(f"{run.method.name} is a one-step method in Python")
-            events = tuple(self.events.functions)
-            return compile_functions(self.fun, self.form, bool(self.extra), run.invariants, events, run.y0.dtype), None
+            return self._compiled(run), None
         except NotCompilableError as reason:
             if wanted:
                 raise
             return interpreted, str(reason)
+
+    def _compiled(self, run: Run) -> NativeFunctions:
+        if isinstance(run.method, OneStep):
+            raise NotCompilableError(f"{run.method.name} is a one-step method in Python")
+        if jit_is_off():
+            raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
+        if not is_jitted(self.fun):  # else Numba would be loaded to say so
+            raise NotCompilableError("fun is not a Numba function; decorate it with @numba.njit")
+        from ..core.native_functions import compiled_functions
+
+        params = self.parameters if self.extra else None
+        return compiled_functions(self.fun, self.form, params, run.invariants, self.events.functions, run.y0)
+
+    def _interpreted(self, run: Run) -> PythonFunctions:
+        n, dtype = run.y0.size, run.y0.dtype
+        second_order, in_place = self.form.startswith("acceleration"), "in place" in self.form
+        size = n // 2 if second_order else n
+
+        def convert(f: Any, t: float) -> np.ndarray:
+            return np.array(setup.as_derivative(f, size, dtype, t), dtype, order="C")
+
+        rhs = call(self.called, self.extra, (size,), convert, in_place=in_place)
+        return PythonFunctions(rhs, *run.invariants.calls, self.events.calls, second_order)
 
 
 @dataclass

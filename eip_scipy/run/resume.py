@@ -19,7 +19,7 @@ from ..checkpoint.own_file import OwnFile, unlocked
 from ..core.inputs import is_number, shown
 from ..core.setup import Run
 from ..core.stepping import Stepping
-from ..engine.step import NEXT_LENGTH, TIME
+from ..engine.data import NEXT_LENGTH, TIME
 from .events import Events
 from .interrupts import TerminatedError
 

@@ -27,6 +27,11 @@ def test_the_package_alone_is_light():
     assert set(python(code)) <= {"eip_scipy.core", "eip_scipy.core.source_tree", "eip_scipy.integrations"}
 
 
+@pytest.mark.parametrize("name", ["EIPRK4, Invariant, project", "EIPDOP853, Diagnostics", "integrate"])
+def test_single_runs_do_without_numba(name):
+    assert loaded(f"from eip_scipy import {name}", ["numba", "llvmlite"]) == []
+
+
 @pytest.mark.parametrize("name", ["EIPRK4, Invariant", "integrate", "ensemble", "problems"])
 def test_names_bring_no_more_than_they_need(name):
     assert loaded(f"from eip_scipy import {name}", HEAVY_FOR_STEPS) == []

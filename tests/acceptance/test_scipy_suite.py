@@ -18,7 +18,7 @@ from scipy import integrate
 
 from eip_scipy import EIPDOP853, EIPRK23, EIPRK45, eip_method
 from eip_scipy.core.stepping import Stepping
-from eip_scipy.engine.step import Span
+from eip_scipy.engine.data import Span
 
 SCIPY = {"RK23": integrate.RK23, "RK45": integrate.RK45, "DOP853": integrate.DOP853}
 # The classes, and the same tableaux through `eip_method`, where the steps are always the package's own.

@@ -9,6 +9,7 @@ import pytest
 from eip_scipy.core.blocks import blocks_of
 from eip_scipy.core.frame import frame_rows
 from eip_scipy.engine import kernels as kn
+from eip_scipy.engine.data import make_inner
 from eip_scipy.engine.trust import N_FIGURES, TERMS
 
 EPS = np.finfo(float).eps
@@ -432,7 +433,7 @@ def newton(rows, directions, g, start):
     size = len(rows)
     mu = np.array(start, dtype=float)
     kn.newton_matrix_solve(
-        np.array(rows), g, np.array(directions), np.arange(size)[::-1].copy(), size, kn.make_inner(size), mu
+        np.array(rows), g, np.array(directions), np.arange(size)[::-1].copy(), size, make_inner(size), mu
     )
     return mu
 

@@ -4,21 +4,17 @@ import math
 from fractions import Fraction
 
 import mpmath
-import numba
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from systems import SQUARE, oscillator
 
 from eip_scipy import (
-    EIPDOP853,
     EIPRK1,
     EIPRK2,
     EIPRK3,
     EIPRK4,
     EIPRK5,
-    EIPRK45,
-    EIPRKN12,
     Diagnostics,
     IntegrationResult,
     Invariant,
@@ -30,7 +26,6 @@ from eip_scipy import (
 )
 from eip_scipy.methods.runge_kutta import RK4
 from eip_scipy.problems import Problem, harmonic, kepler
-from eip_scipy.run import driver
 
 EPS = np.finfo(float).eps
 Y0 = np.array([1.0, 2.0])
@@ -739,34 +734,3 @@ def test_scale_of_an_invariant():
     result = run(invariants=wide)
     assert result.diagnostics.n_skipped == 10
     np.testing.assert_array_equal(result.y, run().y)
-
-
-@pytest.mark.needs_jit
-def test_one_compiled_loop_serves_all_options(monkeypatch):
-    """An option that changed the type of an array would cost its first user a minute or two of compilation."""
-    kinds = set()
-
-    class KnownError(Exception):
-        """Enough is known."""
-
-    def note(dtype, arguments):
-        kinds.add(arguments)
-        raise KnownError
-
-    monkeypatch.setattr(driver, "_compiled_advance", note)
-    problem, four = kepler(), np.full(4, 1e-5)
-    read_only = problem.params.copy()
-    read_only.flags.writeable = False
-    frame = np.eye(4)[:1], np.eye(4)[:, :1]
-    for options in (
-        {},
-        {"method": EIPRKN12},
-        {"method": EIPRK45, "first_step": 0.01, "rtol": four, "atol": four},
-        {"method": EIPDOP853, "every": "auto", "compensated": True, "save_every": 3},
-        {"metric": four, "blocks": [[0, 1]], "frame": frame},
-        {"invariants": (), "t_eval": [0.0, 1.0], "params": read_only},
-        {"events": numba.njit(lambda t, y, params: y[0]), "iterations": 2, "direction": "old"},
-    ):
-        with pytest.raises(KnownError):
-            integrate(problem, **{"method": EIPRK4, **options})
-    assert len(kinds) == 1

@@ -50,8 +50,8 @@ def test_integrate_while_it_compiles(monkeypatch):
         press()
         return real(*arguments)
 
-    real = System.compiled
-    monkeypatch.setattr(System, "compiled", compiles)
+    real = System.functions
+    monkeypatch.setattr(System, "functions", compiles)
     with pytest.raises(KeyboardInterrupt) as info:
         integrate(jit_orbit, (0, 1e9), pericentre(0.6), method=EIPRK4, h=0.01)
     assert info.value.partial.compiled

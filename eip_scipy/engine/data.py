@@ -1,0 +1,253 @@
+"""What a run holds, as the engine reads it: its method, options, buffers, clock and schedule."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .counters import N_COUNTERS
+from .trust import N_FIGURES, TERMS
+
+# Codes of a step; those of the loop.
+OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED = range(5)
+PAUSE, FULL = 10, 11
+
+EPS = 2.220446049250313e-16
+# Dead band in roundings of an invariant's terms; where the state's own roundings are carried, the values' remain.
+BAND, BAND_COMPENSATED = 4.0, 1.0
+
+NEW, OLD, MIDPOINT = range(3)
+EUCLIDEAN, ERROR, GIVEN = range(3)
+# every="auto".
+AUTO = 0
+
+# Places in the clock of a run: the current time, the time and length of the step tried last, the length to try next.
+TIME, TIME_NEW, LENGTH, NEXT_LENGTH = range(4)
+# Places in the place of a run.
+STEP, ROW, PENDING = range(3)
+
+
+class Span(NamedTuple):
+    """Where a run steps: t_k = t0 + k h (h = 0: adaptive steps), the last one on t_bound."""
+
+    t0: float
+    h: float
+    t_bound: float
+    sign: float
+    n_steps: int
+    max_step: float
+
+
+class Schedule(NamedTuple):
+    """Where a run steps and what it saves.
+
+    `place` holds [step, row, pending]: pending is 1 between a step and its becoming the current state, so that whoever
+    is called in between sees both of its ends. `clock` is that of the step.
+    """
+
+    span: Span
+    save_every: int
+    t_eval: np.ndarray
+    place: np.ndarray
+    clock: np.ndarray
+    g: np.ndarray
+    g_new: np.ndarray
+    g_direction: np.ndarray
+
+
+def bare_schedule(span: Span, first: float) -> Schedule:
+    """One that saves nothing; `first` is the length of the first step."""
+    none = np.zeros(0)
+    return Schedule(span, 0, none, np.zeros(3, np.int64), np.array([span.t0, span.t0, 0.0, first]), none, none, none)
+
+
+class Method(NamedTuple):
+    """A tableau as arrays. `e` weighs the rows of K in the error estimate; `fsal` when it uses f at the new point.
+
+    Names ending in _v are a Nystrom method's weights of the velocity.
+    """
+
+    A: np.ndarray
+    b: np.ndarray
+    b_low: np.ndarray
+    b_v: np.ndarray
+    b_v_low: np.ndarray
+    c: np.ndarray
+    e: np.ndarray
+    e_v: np.ndarray
+    e_low: np.ndarray
+    nystrom: bool
+    fsal: bool
+    paired: bool
+    exponent: float
+
+
+# That of an engine which only projects.
+_none = np.zeros(0)
+NO_METHOD = Method(
+    A=np.zeros((0, 0)), b=_none, b_low=_none, b_v=_none, b_v_low=_none, c=_none, e=_none, e_v=_none, e_low=_none,
+    nystrom=False, fsal=False, paired=False, exponent=0.0,
+)  # fmt: skip
+
+
+class Grouping(NamedTuple):
+    """Blocks as lists of floats' indices: ``member[start[b]:start[b + 1]]``; width 2 for a complex state.
+
+    `size` is that of consecutive blocks of one size, 0 for others.
+    """
+
+    member: np.ndarray
+    start: np.ndarray
+    width: int
+    size: int
+
+
+class FrameRows(NamedTuple):
+    """Non-zeros of C and, after them, of M^T, M = S (C S)^-1: row k of the first is ``start[0, k]:start[0, k + 1]``.
+
+    Where x, y and z of bodies have rows alike, `bodies` (2, groups, bodies) holds the weights of a state of (groups,
+    bodies, 3) floats instead; else it is empty. `products` is scratch.
+    """
+
+    start: np.ndarray
+    place: np.ndarray
+    value: np.ndarray
+    products: np.ndarray
+    bodies: np.ndarray
+
+
+class Options(NamedTuple):
+    """What a run fixes: `rtol` by float of the state, `atol` by component, `block_atol` by block.
+
+    `watched`: whether corrections are compared with the errors of the steps. `limit`: the share of an invariant's terms
+    that a projection may leave as its defect; the terms are `per_band` dead bands.
+    `joint`: in interpreted runs the `JointInvariants` whose functions serve, else None.
+    """
+
+    rtol: np.ndarray
+    atol: np.ndarray
+    block_atol: np.ndarray
+    groups: Grouping
+    frame: FrameRows
+    target: np.ndarray
+    scales: np.ndarray
+    kappa: float
+    metric: int
+    direction: int
+    iterations: int
+    every: int
+    reuse_f: bool
+    uses_f: bool
+    compensated: bool
+    adaptive: bool
+    per_band: float
+    watched: bool = False
+    limit: float = np.inf
+    joint: Any = None
+
+
+class Inner(NamedTuple):
+    """Scratch of the small Newton systems."""
+
+    matrix: np.ndarray
+    g: np.ndarray
+    inverse_norms: np.ndarray
+    R: np.ndarray
+    pivots: np.ndarray
+    mu: np.ndarray
+
+
+def make_inner(size: int) -> Inner:
+    """Scratch for systems of up to `size` invariants."""
+    square = (size, size)
+    return Inner(
+        np.zeros(square), np.zeros(size), np.zeros(size), np.zeros(square), np.zeros(size, np.int64), np.zeros(size)
+    )
+
+
+class Work(NamedTuple):
+    """Buffers of a run; names ending in _r are the float64 views of those before them."""
+
+    K: np.ndarray
+    K_r: np.ndarray
+    stage: np.ndarray
+    stage_r: np.ndarray
+    y_hat: np.ndarray
+    y_hat_r: np.ndarray
+    f_point: np.ndarray
+    G: np.ndarray
+    G_r: np.ndarray
+    err: np.ndarray
+    err_low: np.ndarray
+    err_sum: np.ndarray
+    sigma: np.ndarray
+    scale: np.ndarray
+    ratio: np.ndarray
+    move: np.ndarray
+    carry: np.ndarray
+    carry_hat: np.ndarray
+    B: np.ndarray
+    Q: np.ndarray
+    R: np.ndarray
+    inverse_norms: np.ndarray
+    pivots: np.ndarray
+    mu: np.ndarray
+    values: np.ndarray
+    g: np.ndarray
+    band: np.ndarray
+    before: np.ndarray
+    defect: np.ndarray
+    max_defect: np.ndarray
+    max_correction: np.ndarray
+    trust: np.ndarray
+    norm: np.ndarray
+    counters: np.ndarray
+    inner: Inner
+
+
+def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks: int) -> Work:
+    """All buffers of a run of n components and n_invariants invariants."""
+
+    def pair(*shape: int) -> tuple[np.ndarray, np.ndarray]:
+        a = np.zeros(shape, dtype=dtype)
+        return a, a.view(np.float64)
+
+    width = 2 if np.dtype(dtype).kind == "c" else 1
+    m = n * width
+    K, K_r = pair(stages + 1, n)
+    stage, stage_r = pair(n)
+    y_hat, y_hat_r = pair(n)
+    G, G_r = pair(n_invariants, n)
+    floats = {name: np.zeros(m) for name in ("err", "err_low", "err_sum", "sigma", "move", "carry", "carry_hat")}
+    small = {
+        name: np.zeros(n_invariants) for name in ("inverse_norms", "mu", "values", "g", "band", "before", "defect")
+    }
+    floats["sigma"][:] = 1.0
+    trust = np.zeros((n_invariants, N_FIGURES))
+    trust[:, TERMS] = np.inf
+    return Work(
+        K=K,
+        K_r=K_r,
+        stage=stage,
+        stage_r=stage_r,
+        y_hat=y_hat,
+        y_hat_r=y_hat_r,
+        f_point=np.zeros(n, dtype),
+        G=G,
+        G_r=G_r,
+        **floats,
+        **small,
+        scale=np.zeros(n_blocks),
+        ratio=np.zeros(n_blocks),
+        B=np.zeros((n_invariants, m)),
+        Q=np.zeros((n_invariants, m)),
+        R=np.zeros((n_invariants, n_invariants)),
+        pivots=np.zeros(n_invariants, np.int64),
+        max_defect=np.zeros(n_invariants),
+        max_correction=np.zeros(1),
+        trust=trust,
+        norm=np.zeros(1),
+        counters=np.zeros(N_COUNTERS, np.int64),
+        inner=make_inner(n_invariants),
+    )

@@ -1,0 +1,270 @@
+"""The engine's binding: what it refuses, and that both of its builds give the same bits."""
+
+import gc
+import os
+import subprocess
+import sys
+import weakref
+
+import numpy as np
+import pytest
+
+from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, Invariant
+from eip_scipy.engine import native
+from eip_scipy.engine.native import Engine
+from eip_scipy.problems import kepler
+from eip_scipy.run.prepare import Request, prepared
+
+H = Invariant(
+    lambda t, y: 0.5 * (y[2:] @ y[2:]) - 1 / np.hypot(y[0], y[1]),
+    lambda t, y: np.append(y[:2] / np.hypot(y[0], y[1]) ** 3, y[2:]),
+    name="H",
+)
+
+
+def parts(method=EIPRK4, **options):
+    """Arguments of an engine that is ready to step."""
+    problem = kepler(relativistic=0)
+    fun, y0 = problem.fun, problem.y0
+    if method is EIPRKN12:
+        fun = lambda t, q: -q / np.hypot(*q) ** 3  # noqa: E731
+    if options.pop("dtype", None):
+        fun, y0 = lambda t, y: -1j * y, np.ones(3, complex)
+    ready = prepared(Request.of(fun=fun, t_span=(0, 1), y0=y0, method=method, compiled=False, **options))
+    functions, _ = ready.system.functions(ready.run, False)
+    return {
+        "method": ready.run.method,
+        "options": ready.run.options,
+        "work": ready.run.work,
+        "functions": functions,
+        "schedule": ready.schedule,
+    }
+
+
+def arrays(record, path=()):
+    """Paths of all arrays in records of records."""
+    for name, value in record._asdict().items():
+        if isinstance(value, np.ndarray):
+            yield (*path, name)
+        elif hasattr(value, "_asdict") and name != "owner":
+            yield from arrays(value, (*path, name))
+
+
+def replaced(record, path, value):
+    """The record with another array at that path."""
+    name, *rest = path
+    return record._replace(**{name: replaced(getattr(record, name), rest, value) if rest else value})
+
+
+def spoilt(a):
+    """What an array must not be."""
+    yield a.tolist()
+    yield None
+    yield a.astype(np.float32 if a.dtype.kind == "f" else np.complex64 if a.dtype.kind == "c" else np.int32)
+    yield a.astype(a.dtype.newbyteorder())
+    yield np.zeros((*a.shape, 1), a.dtype)
+    yield np.zeros(tuple(2 * n + 3 for n in a.shape), a.dtype)[tuple(slice(None, None, 2) for _ in a.shape)]
+    if len(a) > 1 and a.size:
+        yield np.zeros_like(a)[::-1]
+    if a.size:
+        still = a.copy()
+        still.flags.writeable = False
+        yield still
+        odd = np.frombuffer(bytearray(a.nbytes + 1), np.uint8, a.nbytes, 1)
+        yield odd.view(a.dtype).reshape(a.shape) if a.flags.c_contiguous else None
+
+
+CASES = [
+    ("kepler", {"h": 0.1, "invariants": H, "blocks": [[0, 1]], "frame": (np.eye(4)[2:], np.eye(4)[:, 2:])}),
+    ("nystrom", {"h": 0.1, "invariants": H, "method": EIPRKN12}),
+    ("adaptive", {"rtol": 1e-3, "invariants": H, "method": EIPDOP853}),
+    (
+        "complex",
+        {"h": 0.1, "dtype": complex, "invariants": Invariant(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y)},
+    ),
+]
+
+
+@pytest.mark.parametrize("case", [options for _, options in CASES], ids=[name for name, _ in CASES])
+def test_arrays_that_do_not_fit_are_refused(case):
+    given = parts(**case)
+    Engine(**given)
+    refused = 0
+    for part in ("method", "options", "work", "schedule"):
+        for path in arrays(given[part]):
+            if path[-1].endswith("_r"):  # views for Numba
+                continue
+            right = given[part]
+            for name in path:
+                right = getattr(right, name)
+            for wrong in spoilt(right):
+                if path[-1] in ("t_eval", "e_low", "e", "e_v") and getattr(wrong, "ndim", 0) == 1:
+                    continue  # may have other lengths
+                with pytest.raises((TypeError, ValueError), match="engine: "):
+                    Engine(**given | {part: replaced(given[part], path, wrong)})
+                refused += 1
+    assert refused > 300
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [
+        ("options", "groups", lambda g: g._replace(member=g.member + np.uint64(9))),
+        ("options", "groups", lambda g: g._replace(start=g.start[::-1].copy())),
+        ("options", "groups", lambda g: g._replace(width=3)),
+        ("options", "groups", lambda g: g._replace(size=2)),
+        ("options", "frame", lambda f: f._replace(place=f.place + np.uint64(4))),
+        ("options", "frame", lambda f: f._replace(start=f.start + np.uint64(1))),
+        ("options", "every", lambda every: -1),
+        ("options", "every", lambda every: 2**70),
+        ("options", "kappa", lambda kappa: "much"),
+        ("method", "A", lambda A: A[:, :1].copy()),
+        ("method", "e", lambda e: np.zeros(9)),
+        ("functions", "inv", lambda inv: ()),
+        ("functions", "grad", lambda grad: 3),
+        ("functions", "rhs", lambda rhs: rhs._replace(args=[1])),
+        ("functions", "rhs", lambda rhs: rhs._replace(shape=(-4,))),
+        ("functions", "rhs", lambda rhs: rhs._replace(shape=(5,))),
+        ("functions", "rhs", lambda rhs: rhs._replace(shape=4)),
+        ("functions", "rhs", lambda rhs: rhs._replace(args=tuple(range(99)))),
+    ],
+)
+def test_records_that_do_not_fit_are_refused(part, name, value):
+    given = parts(**CASES[0][1])
+    changed = given[part]._replace(**{name: value(getattr(given[part], name))})
+    with pytest.raises((TypeError, ValueError, OverflowError)):
+        Engine(**given | {part: changed})
+
+
+def test_addresses_are_looked_at():
+    given = parts(h=0.1, invariants=H)
+    none = native.NativeFunctions(0, (), (), (), np.zeros(0), False, None)
+    for functions in (none, none._replace(inv=((1, 1),)), none._replace(inv=((0, 1),)), none._replace(inv=(5,))):
+        with pytest.raises((TypeError, ValueError)):
+            Engine(**given | {"functions": functions})
+
+
+def test_calls_with_wrong_arguments():
+    given = parts(h=0.1, invariants=H)
+    engine, y, two = Engine(**given), np.zeros(4), np.zeros(2)
+    for call in (
+        lambda: engine.step(0, 0.0, y),
+        lambda: engine.step(0, 0.0, y, y[:3]),
+        lambda: engine.step(0, 0.0, y.astype(complex), y),
+        lambda: engine.step("a", 0.0, y, y),
+        lambda: engine.step(0, "a", y, y),
+        lambda: engine.advance(1, y, y, two),
+        lambda: engine.advance(1, y, y, two, np.zeros((3, 4))),
+        lambda: engine.advance(1, y, y, two, np.zeros((2, 4), order="F")),
+        lambda: engine.advance(2**80, y, y, two, np.zeros((2, 4))),
+        lambda: engine.values(two, np.zeros((2, 4)), np.zeros((1, 1))),
+        lambda: engine.project(0.0, y, 1.0, True, [0.0] * 4),
+        lambda: engine.close(0.0, y, True, "no code"),
+        lambda: engine.start(y, y, None),
+    ):
+        with pytest.raises((TypeError, ValueError, OverflowError)):
+            call()
+    given["schedule"].place[1] = 9
+    with pytest.raises(ValueError, match="rows"):
+        engine.advance(1, y, y, two, np.zeros((2, 4)))
+    with pytest.raises(RuntimeError, match="schedule"):
+        Engine(**given | {"schedule": None}).step(0, 0.0, y, y)
+
+
+def test_a_run_is_not_stepped_from_its_own_functions():
+    problem, engines = kepler(relativistic=0), []
+
+    def fun(t, y):
+        if engines:
+            engines[0].step(0, 0.0, y, y)
+        return problem.fun(t, y)
+
+    given = parts(h=0.1, invariants=H)
+    functions = given["functions"]
+    engines.append(Engine(**given | {"functions": functions._replace(rhs=functions.rhs._replace(fun=fun))}))
+    with pytest.raises(RuntimeError, match="own functions"):
+        engines[0].step(0, 0.0, problem.y0, problem.y0)
+
+
+def test_an_engine_and_what_it_holds_are_freed():
+    class Fun:
+        def __call__(self, t, y):
+            return -y
+
+    fun = Fun()
+    given = parts(h=0.1, invariants=H)
+    functions = given["functions"]
+    fun.engine = Engine(**given | {"functions": functions._replace(rhs=functions.rhs._replace(fun=fun))})
+    gone = weakref.ref(fun)
+    del fun
+    gc.collect()
+    assert gone() is None
+
+
+def test_views_handed_out_outlive_the_run():
+    kept = []
+
+    def gradient(t, y, out):
+        kept.append(out)
+        out[:] = 2 * y
+
+    length = Invariant(lambda t, y: y @ y, gradient, in_place=True)
+    given = parts(h=0.1, invariants=length, check=False)
+    engine = Engine(**given)
+    engine.step(0, 0.0, kepler().y0, np.zeros(4))
+    del given, engine
+    gc.collect()
+    assert all(np.isfinite(view).all() for view in kept)
+
+
+RUNS = """
+    import hashlib
+    import numpy as np
+    from eip_scipy import *
+    from eip_scipy.engine.native import BUILD
+    from eip_scipy.problems import kepler
+    from eip_scipy.problems import figure_eight
+    seen = hashlib.sha256()
+    problem, bodies = kepler(t_end=20.0), figure_eight()
+    weights = np.array([1.0, 0.5, 0.2, 1.0])
+    for options in (
+        {"h": 0.05}, {"rtol": 1e-7, "method": EIPDOP853}, {"h": 0.05, "every": "auto", "compensated": True},
+        {"h": 0.05, "metric": weights, "direction": "old", "iterations": 2}, {"h": 0.05, "method": EIPRKN12},
+    ):
+        given = {"method": EIPRK4, "compiled": False} | options
+        fun = problem.fun if given["method"] is not EIPRKN12 else lambda t, q: -q / np.hypot(*q) ** 3
+        more = {"invariants": problem.invariants} if given["method"] is not EIPRKN12 else {}
+        run = integrate(fun, (0, 20), problem.y0, **given, **more)
+        seen.update(run.y.tobytes() + run.max_defect.tobytes())
+    run = integrate(bodies, (0, 2.0), method=EIPRK4, compiled=False, h=0.01)
+    seen.update(run.y.tobytes() + run.max_defect.tobytes())
+    print(BUILD.__name__.rpartition(".")[2], seen.hexdigest())
+"""
+
+
+def test_the_builds_give_the_same_bits():
+    def run(build):
+        environment = os.environ | {native.VARIABLE: build}
+        code = "\n".join(line.removeprefix("    ") for line in RUNS.splitlines())
+        return subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", code], env=environment, capture_output=True, text=True, check=True
+        ).stdout.split()
+
+    if native.BUILD.__name__.endswith("_native"):
+        pytest.skip("the processor takes one build only")
+    (plain, bits), (fast, same) = run("_native"), run("_native_v3")
+    assert (plain, fast) == ("_native", "_native_v3")
+    assert bits == same
+
+
+def test_a_build_older_than_its_sources_is_refused():
+    class Old:
+        SOURCES = "0" * 64
+
+    with pytest.raises(ImportError, match="have changed since the engine was built"):
+        native._require_current(Old)
+
+
+def test_a_missing_build_is_told():
+    with pytest.raises(ImportError, match="not built for Python"):
+        native._build("_native_v9")
