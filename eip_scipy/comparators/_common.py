@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -15,18 +15,17 @@ from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 
 from ..core.inputs import reals, refuse_units, shown
-from ..core.stepping import check_fixed_step, fixed_steps
+from ..core.stepping import check_fixed_step, fixed_steps, saved_steps
 
 __all__ = [
     "FixedStepResult",
-    "check_span",
+    "FixedSteps",
     "check_state",
     "drive_signature",
     "drive_steps",
     "integrate_in_place",
     "message",
     "real_vector",
-    "saved_steps",
 ]
 
 VECTOR = types.float64[::1]
@@ -87,13 +86,38 @@ def check_state(y0: Any) -> np.ndarray:
     return y
 
 
-def saved_steps(n_steps: int, save_every: int | None) -> np.ndarray:
-    """Numbers of the steps after which the state is saved; 0, the start, is the first of them."""
-    if save_every is None:
-        save_every = max(n_steps, 1)
-    if isinstance(save_every, bool) or not isinstance(save_every, (int, np.integer)) or save_every < 1:
-        raise ValueError(f"save_every must be a positive integer or None, got {save_every!r}")
-    return np.unique(np.append(np.arange(0, n_steps + 1, save_every, dtype=np.int64), np.int64(n_steps)))
+class FixedSteps(NamedTuple):
+    """The steps of a run and what it saves.
+
+    `h` and `last` are the lengths of a step and of the last one, with their sign; `saved` holds the numbers of the
+    steps after which the state is saved, 0, the start, the first of them.
+    """
+
+    t0: float
+    t_bound: float
+    h: float
+    last: float
+    saved: np.ndarray
+
+    @classmethod
+    def of(cls, t_span: Any, h: Any, save_every: Any) -> FixedSteps:
+        """From what the user gave, checked."""
+        t0, t_bound = check_span(t_span)
+        h = check_fixed_step(h, t0, t_bound)
+        if save_every is None:
+            save_every = 0
+        elif isinstance(save_every, bool) or not isinstance(save_every, (int, np.integer)) or save_every < 1:
+            raise ValueError(f"save_every must be a positive integer or None, got {save_every!r}")
+        n_steps = fixed_steps(h, t0, t_bound)
+        step = math.copysign(h, t_bound - t0)
+        return cls(t0, t_bound, step, t_bound - (t0 + (n_steps - 1) * step), saved_steps(n_steps, int(save_every)))
+
+    @property
+    def t(self) -> np.ndarray:
+        """The saved times."""
+        t = self.t0 + self.saved * self.h
+        t[-1] = self.t_bound
+        return t
 
 
 def message(reason: str, t: np.ndarray, ys: np.ndarray) -> str:
@@ -165,30 +189,23 @@ def integrate_in_place(
     """
     if not callable(fun):
         raise TypeError(f"{name} must be callable, got {fun!r}")
-    t0, t_bound = check_span(t_span)
+    steps = FixedSteps.of(t_span, h, save_every)
     extra = () if params is None else (real_vector(params, "params"),)
-    h = check_fixed_step(h, t0, t_bound)
-    n_steps = fixed_steps(h, t0, t_bound)
-    saved = saved_steps(n_steps, save_every)
-    step = math.copysign(h, t_bound - t0)
-    last_step = t_bound - (t0 + (n_steps - 1) * step)
     reason = _why_interpreted(fun, name, len(extra))
     run = drive if reason else compiled_drive(len(extra))
     count = np.zeros(1, dtype=np.int64)
-    ys = np.full((saved.size, y.size), np.nan)
+    ys = np.full((steps.saved.size, y.size), np.nan)
     ys[0] = y
 
     def advance(to_save: np.ndarray) -> None:
-        run(fun, extra, t0, step, last_step, to_save, constants, work, count, y, ys)
+        run(fun, extra, steps.t0, steps.h, steps.last, to_save, constants, work, count, y, ys)
 
     # Saving nothing but the start takes no step: whatever is still to be compiled or bound is so before the clock runs.
-    advance(saved[:1])
+    advance(steps.saved[:1])
     start = perf_counter()
-    advance(saved)
+    advance(steps.saved)
     wall_time = perf_counter() - start
-    t = t0 + saved * step
-    t[-1] = t_bound
-    return FixedStepResult(t, ys.T, int(count[0]), wall_time, message(reason, t, ys))
+    return FixedStepResult(steps.t, ys.T, int(count[0]), wall_time, message(reason, steps.t, ys))
 
 
 @register_jitable

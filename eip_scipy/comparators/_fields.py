@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ..core.stepping import check_fixed_step, fixed_steps
 from ..engine.caching import cached_njit
 from ..problems import GrossPitaevskii
-from ._common import check_span, saved_steps
+from ._common import FixedSteps
 
 __all__ = ["FieldResult", "FieldScheme", "FixedPoint", "Implicit", "march", "multiply_modes"]
 
@@ -251,40 +250,34 @@ def march(
     observe: Callable[[Any], float] = lambda scheme: math.nan,
 ) -> tuple[FieldResult, np.ndarray]:
     """Take all steps; also returns what `observe` says of the scheme at each saved state."""
-    t0, t_bound = check_span(t_span)
+    steps = FixedSteps.of(t_span, h, save_every)
     psi = check_equation(gpe).as_field(y0).reshape(-1)
     if not np.isfinite(psi).all():
         raise ValueError("All components of the initial state `y0` must be finite.")
-    h = check_fixed_step(h, t0, t_bound)
-    n_steps = fixed_steps(h, t0, t_bound)
-    saved = saved_steps(n_steps, save_every)
-    step = math.copysign(h, t_bound - t0)
-    last_step = t_bound - (t0 + (n_steps - 1) * step)
-    if math.isclose(step, last_step, rel_tol=1e-9):
-        last_step = step  # what differs by round-off only is no step of another length
-    ys = np.full((saved.size, psi.size), np.nan, complex)
-    observed = np.full(saved.size, np.nan)
+    if math.isclose(steps.h, steps.last, rel_tol=1e-9):
+        steps = steps._replace(last=steps.h)  # what differs by round-off only is no step of another length
+    ys = np.full((steps.saved.size, psi.size), np.nan, complex)
+    observed = np.full(steps.saved.size, np.nan)
 
     scheme = make(gpe, psi)
     scheme.start(psi)
     for _ in range(WARM_STEPS):  # compiles, and measures plans of transforms
-        scheme.step(step)
+        scheme.step(steps.h)
     scheme.start(psi)
     ys[0], observed[0] = scheme.psi, observe(scheme)
     message, row = "completed", 1
     begin = perf_counter()
+    n_steps = int(steps.saved[-1])
     for k in range(n_steps):
-        failure = scheme.step(last_step if k == n_steps - 1 else step)
+        failure = scheme.step(steps.last if k == n_steps - 1 else steps.h)
         if failure:
-            message = f"failed in the step from t={t0 + k * step!r}: {failure}"
+            message = f"failed in the step from t={steps.t0 + k * steps.h!r}: {failure}"
             break
-        if k + 1 == saved[row]:
+        if k + 1 == steps.saved[row]:
             ys[row], observed[row] = scheme.psi, observe(scheme)
             row += 1
     wall_time = perf_counter() - begin
-    t = t0 + saved * step
-    t[-1] = t_bound
-    return FieldResult(t, ys.T, scheme.nfev, wall_time, message), observed
+    return FieldResult(steps.t, ys.T, scheme.nfev, wall_time, message), observed
 
 
 @jit

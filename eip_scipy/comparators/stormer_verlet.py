@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import cache
 from time import perf_counter
@@ -13,9 +12,8 @@ from numba import types
 from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
-from ..core.stepping import check_fixed_step, fixed_steps
 from ..engine.caching import cached_njit
-from ._common import FixedStepResult, check_span, check_state, message, real_vector, saved_steps
+from ._common import FixedStepResult, FixedSteps, check_state, message, real_vector
 
 __all__ = ["FORMS", "StormerVerletResult", "stormer_verlet"]
 
@@ -90,36 +88,29 @@ def stormer_verlet(
     >>> bool(abs(run.y[0, -1] - np.cos(10.0)) < 1e-4)
     True
     """
-    t0, t_bound = check_span(t_span)
+    steps = FixedSteps.of(t_span, h, save_every)
     y = _check_halves(y0)
     if form not in FORMS:
         raise ValueError(f"unknown form {form!r}: expected one of {', '.join(map(repr, FORMS))}")
     extra = () if params is None else (real_vector(params, "params"),)
-    h = check_fixed_step(h, t0, t_bound)
-    n_steps = fixed_steps(h, t0, t_bound)
-    saved = saved_steps(n_steps, save_every)
 
     checked = _checked(acc, y.size // 2)
-    a = checked(t0, y[: y.size // 2], *extra).copy()
+    a = checked(steps.t0, y[: y.size // 2], *extra).copy()
     reason = _why_interpreted(acc, len(extra))
     drive = _drive if reason else _compiled_drive(len(extra))
-    step = math.copysign(h, t_bound - t0)
-    last_step = t_bound - (t0 + (n_steps - 1) * step)
-    ys = np.empty((saved.size, y.size))
+    ys = np.empty((steps.saved.size, y.size))
     ys[0] = y
 
     def advance(to_save: np.ndarray) -> None:
-        drive(checked if reason else acc, extra, t0, step, last_step, form == FORMS[0], to_save, y, a, ys)
+        drive(checked if reason else acc, extra, steps.t0, steps.h, steps.last, form == FORMS[0], to_save, y, a, ys)
 
     # Saving nothing but the start takes no step: whatever is still to be compiled or bound is so before the clock runs.
-    advance(saved[:1])
+    advance(steps.saved[:1])
     start = perf_counter()
-    advance(saved)
+    advance(steps.saved)
     wall_time = perf_counter() - start
-
-    t = t0 + saved * step
-    t[-1] = t_bound
-    return StormerVerletResult(t, ys.T, n_steps + 1, wall_time, message(reason, t, ys))
+    nfev = int(steps.saved[-1]) + 1
+    return StormerVerletResult(steps.t, ys.T, nfev, wall_time, message(reason, steps.t, ys))
 
 
 def _check_halves(y0: Any) -> np.ndarray:

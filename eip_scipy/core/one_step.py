@@ -8,6 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ..engine.data import Work
+from ..methods.orders import Ordered
 from .inputs import refuse_units, shown
 
 __all__ = ["OneStep", "OneStepMethod", "as_vector"]
@@ -54,7 +55,7 @@ class OneStepMethod(Protocol):
         ...  # pragma: no cover
 
 
-class OneStep:
+class OneStep(Ordered):
     """A user's one-step method, checked, in the roles of a tableau and of its arrays.
 
     Parameters
@@ -92,18 +93,6 @@ class OneStep:
         self._one_step: Callable[[float, np.ndarray, float], Any] = method.one_step
         self.b, self.c = np.ones(1), np.zeros(1)
         self.exponent = -1.0 / ((self.error_estimator_order or 0) + 1)
-
-    @property
-    def has_estimate(self) -> bool:
-        """Whether the method returns an error estimate."""
-        return self.error_estimator_order is not None
-
-    @property
-    def kappa(self) -> float:
-        """Exponent of the error metric, (p + 1) / (p_hat + 1); 1 without an estimate."""
-        if self.error_estimator_order is None:
-            return 1.0
-        return (self.order + 1) / (self.error_estimator_order + 1)
 
     def __repr__(self) -> str:
         return f"<OneStep {self.name}: order {self.order}>"

@@ -155,8 +155,14 @@ class ProjectionOptions:
     @classmethod
     def of(cls, keywords: Mapping[str, Any]) -> tuple[ProjectionOptions, dict[str, Any]]:
         """The options among some keywords, and the keywords that are none."""
+        own, others = cls.split(keywords)
+        return cls(**own), others
+
+    @classmethod
+    def split(cls, keywords: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The keywords that are options, and the others."""
         own = {name: value for name, value in keywords.items() if name in cls.names()}
-        return cls(**own), {name: value for name, value in keywords.items() if name not in own}
+        return own, {name: value for name, value in keywords.items() if name not in own}
 
     def settled(self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, known: InvariantSet) -> Settled:
         """The options checked for a run of the `known` invariants.

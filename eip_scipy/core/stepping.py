@@ -16,7 +16,16 @@ from ..methods.runge_kutta import Tableau
 from .inputs import is_number, reals, refuse_units, shown
 from .one_step import OneStep
 
-__all__ = ["UNBOUNDED", "AnyMethod", "StepOptions", "Stepping", "check_fixed_step", "fixed_steps", "interval"]
+__all__ = [
+    "UNBOUNDED",
+    "AnyMethod",
+    "StepOptions",
+    "Stepping",
+    "check_fixed_step",
+    "fixed_steps",
+    "interval",
+    "saved_steps",
+]
 
 AnyMethod = Tableau | NystromTableau | OneStep
 UNBOUNDED = 2**62
@@ -227,6 +236,11 @@ def fixed_steps(h: float, t0: float, t_bound: float) -> int:
         return UNBOUNDED
     whole = round(ratio)
     return whole if abs(ratio - whole) <= _slack(h, t0, t_bound) else math.ceil(ratio)
+
+
+def saved_steps(n_steps: int, save_every: int) -> np.ndarray:
+    """Numbers of the steps after which a state is saved: 0, each `save_every`-th one (0: none), and the last."""
+    return np.append(np.arange(0, n_steps, save_every or max(n_steps, 1)), n_steps)
 
 
 def step_bounds(first_step: Any, max_step: Any, t0: float, t_bound: float) -> tuple[float | None, float]:

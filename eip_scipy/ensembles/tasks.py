@@ -22,7 +22,7 @@ from numba import typeof, types
 from ..core import setup
 from ..core.compiled_functions import signatures
 from ..core.jitted import ChangedShapeError, NotCompilableError
-from ..core.stepping import UNBOUNDED
+from ..core.stepping import UNBOUNDED, saved_steps
 from ..engine import kernels as kn
 from ..engine.caching import cached_njit
 from ..engine.counters import N_COUNTERS, NFEV
@@ -248,16 +248,9 @@ def saved_times(schedule: Schedule) -> np.ndarray:
             "save_every in an ensemble needs fixed steps h and a finite interval: with adaptive steps each member "
             "would save at times of its own; give t_eval."
         )
-    times = schedule.span.t0 + saved_steps(schedule) * schedule.span.h
+    times = schedule.span.t0 + saved_steps(schedule.span.n_steps, schedule.save_every) * schedule.span.h
     times[-1] = schedule.span.t_bound
     return times
-
-
-def saved_steps(schedule: Schedule) -> np.ndarray:
-    """Steps after which a run of fixed steps saves its state, the start included."""
-    return np.unique(
-        [*range(0, schedule.span.n_steps, schedule.save_every or schedule.span.n_steps), schedule.span.n_steps]
-    )
 
 
 def run_members(plan: Plan, y0s: np.ndarray, params: np.ndarray, stop: threading.Event | None = None) -> Members:
@@ -543,7 +536,8 @@ class Sweeper:
             return 0, []
         if m == 0:
             batch.compile()
-        meetings = saved_steps(self.loop.driver.schedule)[1:].tolist()
+        schedule = self.loop.driver.schedule
+        meetings = saved_steps(schedule.span.n_steps, schedule.save_every)[1:].tolist()
         first, again = 0, []
         while m - first >= batch.lanes // 4:
             group = slice(first, min(m, first + batch.lanes))

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .orders import Ordered
 from .runge_kutta import FLOAT_TOLERANCE, Number, _low_parts, _stage_matrix, _vector
 
 __all__ = ["RKN86", "RKN1210", "NystromTableau"]
@@ -114,7 +115,7 @@ def nystrom_residuals(A: np.ndarray, c: np.ndarray, rows: Sequence[Weights]) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class NystromTableau:
+class NystromTableau(Ordered):
     """Coefficients of an explicit Runge-Kutta-Nystrom method for q'' = a(t, q).
 
     With the accelerations k_i = a(t + c_i h, Q_i) at the stages Q_i = q + c_i h v + h^2 sum_j A_ij k_j, a step is
@@ -235,16 +236,6 @@ class NystromTableau:
                     f"{name}: {row.label} is not of order {row.order}: a condition of order {vertices + row.position} "
                     f"misses by {residual:.3g}."
                 )
-
-    @property
-    def has_estimate(self) -> bool:
-        """Whether there is an embedded error estimate."""
-        return self.b_hat is not None
-
-    @property
-    def kappa(self) -> float:
-        """Exponent of the error metric, (p + 1) / (p_hat + 1); 1 without an estimate."""
-        return (self.order + 1) / ((self.error_estimator_order or self.order) + 1)
 
     def __repr__(self) -> str:
         estimate = f", estimate of order {self.error_estimator_order}" if self.has_estimate else ""

@@ -14,6 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from .orders import Ordered
+
 __all__ = ["DOP853", "RK1", "RK2", "RK3", "RK4", "RK5", "RK23", "RK45", "Tableau"]
 
 # What passes for rounding in tableaux of floats.
@@ -79,7 +81,7 @@ def _exact(name: str, value: Number) -> Fraction | float:
 
 
 @dataclass(frozen=True, eq=False)
-class Tableau:
+class Tableau(Ordered):
     """Coefficients of an explicit Runge-Kutta method.
 
     Parameters
@@ -224,18 +226,6 @@ class Tableau:
                     f"{name}: {label} is not of order {order}: the condition of tree {tree} of order {_size(tree)} "
                     f"misses by {float(residual):.3g}."
                 )
-
-    @property
-    def has_estimate(self) -> bool:
-        """Whether there is an embedded error estimate."""
-        return self.b_hat is not None
-
-    @property
-    def kappa(self) -> float:
-        """Exponent of the error metric, (p + 1) / (p_hat + 1); 1 without an estimate."""
-        if self.error_estimator_order is None:
-            return 1.0
-        return (self.order + 1) / (self.error_estimator_order + 1)
 
     @property
     def paired(self) -> bool:

@@ -75,9 +75,8 @@ class Request:
     @classmethod
     def of(cls, **keywords: Any) -> Request:
         """A request from keywords, those of the projection among them."""
-        names = ProjectionOptions.names()
-        projection = {name: value for name, value in keywords.items() if name in names}
-        return cls(projection=projection, **{name: value for name, value in keywords.items() if name not in names})
+        projection, others = ProjectionOptions.split(keywords)
+        return cls(projection=projection, **others)
 
     @property
     def adaptive(self) -> bool:

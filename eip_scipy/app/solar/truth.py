@@ -287,14 +287,7 @@ def text(runs: Sequence[ModelRun], start: str, step: float) -> str:
 def table_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
     """The numbers of the table."""
     return [
-        {
-            "model": run.model.name,
-            "years": float(run.years[place]),
-            "body": body,
-            "km": float(run.km[body][place]),
-            "arcsec": float(run.arcsec[body][place]),
-            "step_km": run.step_km[body] if place == run.years.size - 1 else None,
-        }
+        _row(run, place, body) | {"step_km": run.step_km[body] if place == run.years.size - 1 else None}
         for run in runs
         for place in reported(run.years)
         for body in run.km
@@ -303,18 +296,18 @@ def table_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
 
 def csv_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
     """All saved times but the start, where there is no error."""
-    return [
-        {
-            "model": run.model.name,
-            "years": float(run.years[k]),
-            "body": body,
-            "km": float(run.km[body][k]),
-            "arcsec": float(run.arcsec[body][k]),
-        }
-        for run in runs
-        for k in range(1, run.years.size)
-        for body in run.km
-    ]
+    return [_row(run, k, body) for run in runs for k in range(1, run.years.size) for body in run.km]
+
+
+def _row(run: ModelRun, k: int, body: str) -> dict[str, Any]:
+    """The errors of a body at a saved time."""
+    return {
+        "model": run.model.name,
+        "years": float(run.years[k]),
+        "body": body,
+        "km": float(run.km[body][k]),
+        "arcsec": float(run.arcsec[body][k]),
+    }
 
 
 def _figures(runs: Sequence[ModelRun], start: str) -> Iterator[Any]:

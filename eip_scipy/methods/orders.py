@@ -1,0 +1,24 @@
+"""What every method has: an order, and perhaps an embedded error estimate of another one."""
+
+from __future__ import annotations
+
+__all__ = ["Ordered"]
+
+
+class Ordered:
+    """A method with an `order`, and an `error_estimator_order` that is None without an estimate."""
+
+    order: int
+    error_estimator_order: int | None
+
+    @property
+    def has_estimate(self) -> bool:
+        """Whether there is an error estimate."""
+        return self.error_estimator_order is not None
+
+    @property
+    def kappa(self) -> float:
+        """Exponent of the error metric, (p + 1) / (p_hat + 1); 1 without an estimate."""
+        if self.error_estimator_order is None:
+            return 1.0
+        return (self.order + 1) / (self.error_estimator_order + 1)
