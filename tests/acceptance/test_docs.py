@@ -31,7 +31,9 @@ PAGES = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("page", ["README.md", *(f"docs/{page}.md" for page in PAGES)])
+@pytest.mark.parametrize(
+    "page", ["README.md", *(pytest.param(f"docs/{page}.md", marks=pytest.mark.slow) for page in PAGES)]
+)
 def test_page(page, capsys, tmp_path, monkeypatch):
     """All blocks of a page in turn, in one namespace; a block of text is what the code before it prints."""
     monkeypatch.chdir(tmp_path)  # where pages write their files

@@ -362,6 +362,7 @@ def pendulum_gradient(t, y, params):
     return np.array([np.sin(y[0]), y[1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiled", [None, False])
 def test_members_are_flagged_as_single_runs_are(compiled):
     energy = Invariant(pendulum_energy, pendulum_gradient, name="energy")

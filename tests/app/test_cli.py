@@ -188,6 +188,7 @@ def test_a_method_without_estimate_has_one_metric(tmp_path, capsys, no_rebound):
 # --- what is missing ---
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_without_rebound_the_command_runs_and_says_what_to_install(tmp_path, capsys, no_rebound):
     assert main(["solar-system", *SPAN, "--out", str(tmp_path), "--quiet"]) == 0

@@ -45,6 +45,7 @@ def small(monkeypatch):
     monkeypatch.setattr(gpe_states, "PUBLISHED", {0.0: 3.9459469, 0.65: 3.6506129})
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("small")
 def test_trap(tmp_path, capsys):
@@ -170,6 +171,7 @@ def test_ring(tmp_path, start, capsys):
     assert all((out / name).read_bytes().startswith(PNG) for name in ("ring-snapshots.png", "ring-errors.png"))
 
 
+@pytest.mark.slow
 @pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch):
@@ -178,6 +180,7 @@ def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch)
     assert "FAILED vortices turn anticlockwise" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 def test_another_end(tmp_path, start, capsys):
@@ -191,6 +194,7 @@ def test_another_end(tmp_path, start, capsys):
     np.testing.assert_allclose(times, [0, 0.05, 0.1, 0.12], atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("end", ["0.05", "0.005"])
@@ -208,6 +212,7 @@ def test_an_end_before_the_first_step(tmp_path, start, capsys):
     assert "--t-end: expected at least 0.005, the reference's step, got 0.004" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 def test_a_stationary_state(start, tmp_path, monkeypatch):

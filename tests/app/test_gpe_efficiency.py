@@ -9,6 +9,8 @@ import pytest
 from eip_scipy.app.cli import main
 from eip_scipy.app.condensates import efficiency as gpe_efficiency
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def trials():
@@ -16,7 +18,6 @@ def trials():
     return gpe_efficiency.study(points=16, repeats=1)
 
 
-@pytest.mark.slow
 def test_orders_are_those_of_the_methods(trials):
     """On the plane wave, where splittings are exact and RK4 is at round-off; on the modulated one all have theirs."""
     for name, order in {"CN": 2, "LIC": 2, "SAV/CN": 2, "Strang": 2, "splitting4-EIP": 4}.items():

@@ -155,6 +155,7 @@ def test_interrupted(tmp_path, capsys, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_runs")
 def test_paper_figures(tmp_path, capsys):
     file = tmp_path / "run.json"

@@ -81,6 +81,7 @@ def test_both_ways_in_time(tmp_path, years):
     assert float(lines[-1]["years"]) == float(years)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 def test_any_epoch(tmp_path, capsys):
     given = options(tmp_path, years=0.5, forces=["1pn"], epoch=(2451544.5, 0.5), kernel=None, quiet=False)

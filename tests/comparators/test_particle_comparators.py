@@ -120,6 +120,7 @@ def test_midpoint_takes_time_and_parameters():
     assert run.y[0, -1] == pytest.approx(math.sin(6.0), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_midpoint_keeps_the_quadratic_invariant_and_not_the_energy():
     problem = uniform_field(t_end=500 * math.pi / 10)
     run = implicit_midpoint(problem.rhs, problem.t_span, problem.y0, problem.h, params=problem.params, save_every=1)

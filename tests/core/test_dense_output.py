@@ -29,7 +29,7 @@ EPS = np.finfo(float).eps
 PAIRS = [EIPRK23, EIPRK45, EIPDOP853]
 OWN = {cls: eip_method(cls.TABLEAU) for cls in PAIRS}
 pairs = pytest.mark.parametrize("method", PAIRS, ids=lambda m: m.__name__)
-second_order = pytest.param(EIPRK2, marks=pytest.mark.slow_without_jit)  # in thousands of steps
+second_order = pytest.param(EIPRK2, marks=pytest.mark.slow)  # in thousands of steps
 every_class = pytest.mark.parametrize("method", [*PAIRS, second_order, EIPRK4, EIPRK5], ids=lambda m: m.__name__)
 
 Y0 = pericentre(0.6)
@@ -350,7 +350,7 @@ def test_thresholds_one_by_one_and_terminal(method):
 
 
 @pytest.mark.parametrize("method", [*PAIRS, *OWN.values()], ids=lambda m: m.__name__)
-@pytest.mark.parametrize("variant", ["plain", "complex plain"])
+@pytest.mark.parametrize("variant", [pytest.param("plain", marks=pytest.mark.slow), "complex plain"])
 def test_thresholds_without_invariants(method, variant):
     """SciPy's own RK45 raises here: its interpolant misses the end of a step by an ulp."""
     sol = solve(method, **VARIANTS[variant])
@@ -436,7 +436,7 @@ def jit_with_params():
 
 
 @pairs
-@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
+@pytest.mark.parametrize("rtol", [1e-4, pytest.param(1e-8, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("t_span", [(0.0, 8.0), (8.0, 0.0)], ids=["forward", "backward"])
 @pytest.mark.parametrize("driver", ["solve_ivp", "integrate"])
 def test_samples_on_the_manifold(method, rtol, t_span, driver):

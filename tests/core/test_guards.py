@@ -76,7 +76,10 @@ def test_circular_kepler(driver, metric, eccentricity):
 
 @metrics
 @pytest.mark.parametrize("eccentricity", [0.0, 1e-12, 1e-8, 1e-4])
-@pytest.mark.parametrize(("method", "h"), [(EIPRK1, 0.005), (EIPRK2, 0.02), (EIPRK3, 0.02), (EIPRK5, 0.05)])
+@pytest.mark.parametrize(
+    ("method", "h"),
+    [pytest.param(EIPRK1, 0.005, marks=pytest.mark.slow), (EIPRK2, 0.02), (EIPRK3, 0.02), (EIPRK5, 0.05)],
+)
 def test_circular_kepler_by_other_methods(metric, eccentricity, method, h):
     """Their truncation errors make parallel gradients nearly so: a poor correction must not end a healthy run."""
     problem = kepler(eccentricity, 0.0)
@@ -224,6 +227,7 @@ def sizes_of_h_and_l(problem):
     return np.array([energy, *momentum])
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @metrics
 def test_solar_system_in_si_units(metric):

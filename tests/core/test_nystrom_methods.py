@@ -228,6 +228,7 @@ def test_events_and_samples():
         assert np.abs([energy(0, y) - energy(0, Y0) for y in found.y.T]).max() < 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 def test_projection_pays_and_costs_little():
     """Ten bodies over 100 years, h = .02: Mercury 200 times better, no other planet worse by 2x or 1e-11 AU."""

@@ -61,7 +61,9 @@ def order_of(method, end, options):
 
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", [pytest.param(m, marks=pytest.mark.slow) if m in (EIPRK1, EIPRK3) else m for m in METHODS]
+)
 def test_order_of_the_solution(method, options, end):
     assert order_of(method, end, options) == pytest.approx(method.TABLEAU.order, abs=TOLERANCE)
 

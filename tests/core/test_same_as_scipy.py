@@ -293,7 +293,10 @@ RUNS = {
     "complex": (jit_spin, (0.0, 15.0), np.array([1.0 + 0j, 0.2j]), NORM),
     "complex backward": (jit_spin, (3.0, -9.0), np.array([1.0 + 0j, 0.2j]), NORM),
 }
-runs = pytest.mark.parametrize("case", RUNS)
+# Complex states take a driver of their own.
+runs = pytest.mark.parametrize(
+    "case", [pytest.param(name, marks=pytest.mark.slow) if "complex" in name else name for name in RUNS]
+)
 projected = pytest.mark.parametrize("projected", [True, False], ids=["projected", "plain"])
 drivers = pytest.mark.parametrize(
     "compiled", [pytest.param(True, marks=pytest.mark.needs_jit), False], ids=["compiled", "interpreted"]

@@ -65,6 +65,7 @@ def installed(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_a_read_only_install_and_no_home(installed):
     assert right(python(SMALL, installed, HOME="/dev/null"))
 
@@ -75,6 +76,7 @@ def test_a_read_only_install(installed, tmp_path):
     assert list(home.rglob("*.nbi"))
 
 
+@pytest.mark.slow
 def test_a_folder_mounted_read_only(tmp_path):
     folder = tmp_path / "installed"
     shutil.copytree(PACKAGE, folder / "eip_scipy", ignore=shutil.ignore_patterns("__pycache__"))
@@ -152,6 +154,7 @@ def test_a_disk_that_is_full_when_a_function_is_kept(doubled, tmp_path, monkeypa
     assert doubled() == 0
 
 
+@pytest.mark.slow
 def test_two_first_runs_at_once(tmp_path):
     assert [right(process) for process in [python(SMALL, NUMBA_CACHE_DIR=tmp_path) for _ in range(2)]] == [False] * 2
     assert not right(python(SMALL, NUMBA_CACHE_DIR=tmp_path))

@@ -54,7 +54,7 @@ needs_mpirun = pytest.mark.skipif(MPIRUN is None, reason="there is no mpirun")
 
 @pytest.mark.needs_jit
 @needs_mpirun
-@pytest.mark.parametrize("ranks", [1, 2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("ranks", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)])
 def test_results_are_the_serial_ones(ranks, serial, tmp_path):
     on_ranks(ranks, TESTS / "mpi_runs.py", "results.npz", cwd=tmp_path)
     with np.load(tmp_path / "results.npz") as results:
@@ -84,6 +84,7 @@ def test_the_page(tmp_path):
     assert np.load(tmp_path / "condensate.npy").shape == (32, 32, 24)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @needs_mpirun
 def test_a_sum_that_is_missing(tmp_path):

@@ -83,6 +83,7 @@ def test_whfast_agrees_with_ias15_where_no_reference_is_stored():
     assert distance[1] > 1e-9
 
 
+@pytest.mark.slow
 def test_leapfrog_is_the_drift_kick_drift_form():
     h, n_steps = 0.7305, 1000
     result = run("leapfrog", h=h, n_steps=n_steps)

@@ -88,8 +88,14 @@ def test_fields_along_many_points():
 
 # --- equations and invariants ---
 
+problems = pytest.mark.parametrize(
+    "problem",
+    [pytest.param(p, marks=pytest.mark.slow) if "velocity" in name else p for name, p in PROBLEMS.items()],
+    ids=list(PROBLEMS),
+)
 
-@pytest.mark.parametrize("problem", PROBLEMS.values(), ids=list(PROBLEMS))
+
+@problems
 def test_invariants_have_their_gradients_and_do_not_change(problem):
     rng = np.random.default_rng(5)
     for point in POINTS:
@@ -102,6 +108,7 @@ def test_invariants_have_their_gradients_and_do_not_change(problem):
             assert abs(gradient @ f) < 1e-15 + 1e-13 * (np.abs(gradient) * np.abs(f)).sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [uniform_field, tokamak])
 def test_both_forms_are_the_same_motion(make):
     t_end = 40.0
@@ -117,7 +124,7 @@ def test_both_forms_are_the_same_motion(make):
 
 @pytest.mark.slow_without_jit
 @pytest.mark.parametrize("make", [uniform_field, tokamak])
-@pytest.mark.parametrize("form", ["canonical", "velocity"])
+@pytest.mark.parametrize("form", ["canonical", pytest.param("velocity", marks=pytest.mark.slow)])
 def test_first_reference_state_is_met(make, form):
     problem = make(form=form)
     t = problem.t_span[1] / 100
@@ -126,7 +133,7 @@ def test_first_reference_state_is_met(make, form):
     assert problem.reference(1.5 * t) is None
 
 
-@pytest.mark.parametrize("problem", PROBLEMS.values(), ids=list(PROBLEMS))
+@problems
 def test_order_four_with_the_invariants_kept(problem):
     t = 300 * problem.h
     truth = integrate(problem, (0.0, t), method=EIPDOP853, h=problem.h / 4).y[:, -1]
@@ -172,7 +179,7 @@ def slope_phi(x, y, z):
     return -0.3 * y
 
 
-@pytest.mark.parametrize("charge", [3.0, -3.0])
+@pytest.mark.parametrize("charge", [3.0, pytest.param(-3.0, marks=pytest.mark.slow)])
 def test_gyration_in_a_constant_field(charge):
     """B = 2 e_z, m = 1.5: frequency |q| B / m, radius m v / (|q| B), and the E x B drift (0.15, 0, 0)."""
     field = ParticleField(vector_potential=constant_a, magnetic=constant_b, electric=constant_e, potential=slope_phi)
@@ -316,7 +323,9 @@ def test_own_field(name):
 
 
 @pytest.mark.needs_jit
-@pytest.mark.parametrize("name", MIRRORS)
+@pytest.mark.parametrize(
+    "name", [name if name == "B alone" else pytest.param(name, marks=pytest.mark.slow) for name in MIRRORS]
+)
 def test_own_field_compiles(name):
     field, form, _ = MIRRORS[name]
     assert mirror_run(field, form, compiled=True)[1].compiled
@@ -493,6 +502,7 @@ def test_energy_and_momentum_need_their_potentials():
         _ = orbit.momentum
 
 
+@pytest.mark.slow
 def test_further_invariants_can_be_added():
     """p_z in the uniform field, which the problem does not list: RK keeps it."""
     problem = charged_particle(UNIFORM, [1, 0, 0], [0.1, 0, 0.2], t_span=(0, 20), h=math.pi / 10)

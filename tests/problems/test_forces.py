@@ -153,6 +153,7 @@ def rows(flat):
     return [flat[3 * k : 3 * k + 3] for k in range(4)]
 
 
+@pytest.mark.slow
 def test_eih_energy_and_momenta_from_the_lagrangian():
     given = problem("eih")
     with mpmath.workdps(40):
@@ -264,6 +265,7 @@ def test_what_eih_leaves_falls_with_the_fourth_power_of_c(forces, monkeypatch):
     np.testing.assert_allclose(np.divide(*rates), 1e4, rtol=0.2)
 
 
+@pytest.mark.slow
 def test_eih_offers_invariants_only_where_they_are_kept():
     assert problem("eih", ForceConstants(c=100.0)).invariants == ()
     assert len(problem("eih", ForceConstants(c=1e5)).invariants) == 2
@@ -319,6 +321,7 @@ def test_perihelion_of_mercury_advances_as_it_should(forces):
     assert math.degrees(slope) * 3600 * CENTURY == pytest.approx(42.98, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.parametrize(("years", "options"), [(5.0, {"invariants": ()}), (100.0, {})])
 def test_known_energy_and_momentum_of_a_test_particle(years, options):

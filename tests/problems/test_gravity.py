@@ -127,6 +127,7 @@ def test_units_of_powers_of_two_change_no_bit(n, power):
     assert _newton.energy(0.0, still, gm) == _newton.energy(0.0, still * factor, gm) * factor
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 5, 8, 10, 11, 13])
 def test_strided_arrays(n):
     gm, y = bodies(n)
@@ -224,6 +225,7 @@ def in_another_process(**environment):
     return [[float.fromhex(x) for x in line.split()] for line in run.stdout.splitlines()]
 
 
+@pytest.mark.slow
 def test_without_the_jit_equal_to_rounding():
     for n, found in zip(SIZES, in_another_process(NUMBA_DISABLE_JIT="1"), strict=True):
         gm, y = bodies(n)

@@ -172,6 +172,7 @@ def test_circular_orbit_takes_two_pi():
     assert pair_time(y0, gm) == pytest.approx(centre_time(two.problem.y0, two.problem.params), rel=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 def test_fixed_steps_in_fictitious_time_beat_fixed_steps():
     problem = kepler(0.99, 0.0, t_end=20.0)
@@ -247,6 +248,7 @@ def small_scene(monkeypatch):
     monkeypatch.setattr(scene_runs, "STEPS_PER_TURN", (10, 20))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_runs", "no_rebound", "small_scene")
 def test_command_without_rebound_says_what_to_install(tmp_path, capsys):
     assert main(["hard-scenes", "--scene", "small", "--out", str(tmp_path)]) == 0

@@ -167,9 +167,15 @@ CASES = {
     "RK3": {"invariants": [H, L], "method": EIPRK3},
     "RK5, compensated": {"invariants": [H, L], "method": EIPRK5, "compensated": True, "reuse_f": False},
 }
+# Their invariants are compiled for them alone.
+ALONE = "one of two values", "duplicates", "one", "euclidean, uses f"
 
 
-@pytest.mark.parametrize("case", CASES)
+def cases(names):
+    return [pytest.param(name, marks=pytest.mark.slow) if name in ALONE else name for name in names]
+
+
+@pytest.mark.parametrize("case", cases(CASES))
 def test_real(case):
     run = compare(fun, (0.0, 6.0), Y0, **CASES[case])
     assert run.status == 0
@@ -313,7 +319,7 @@ def test_complex_in_place(span):
 IVP_CASES = [name for name, options in CASES.items() if not {"compensated", "save_every"} & options.keys()]
 
 
-@pytest.mark.parametrize("case", IVP_CASES)
+@pytest.mark.parametrize("case", cases(IVP_CASES))
 @pytest.mark.parametrize("span", [(0.0, 6.0), (0.0, -6.0)])
 def test_solve_ivp_is_the_same_step(case, span):
     options = {"method": EIPRK4, "h": 0.03} | CASES[case]
@@ -324,6 +330,7 @@ def test_solve_ivp_is_the_same_step(case, span):
     assert (sol.nfev, sol.njev, sol.nlu) == (run.nfev, run.njev, run.nlu)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["no invariants", "mass and energy", "blocks, every", "frame"])
 def test_solve_ivp_is_the_same_complex_step(case):
     options = {"method": EIPRK4, "h": 0.03, "check": False} | COMPLEX_CASES[case]

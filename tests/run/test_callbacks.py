@@ -84,6 +84,7 @@ def test_a_callback_at_every_step(steps, how, tmp_path):
     many(steps, how, MANY, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 def test_a_callback_at_every_step_and_events(tmp_path):
     found = many("fixed", "compiled", MANY, tmp_path, events=passage)

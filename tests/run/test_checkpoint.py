@@ -289,6 +289,7 @@ def test_broken_off_inside_a_step(name, error, tmp_path):
         same(whole, found)
 
 
+@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("fine")
 def test_broken_off_inside_a_compiled_step(tmp_path):
@@ -864,6 +865,7 @@ def test_each_truncation_is_seen(tmp_path):
         checkpoint.read(path)
 
 
+@pytest.mark.slow
 def test_each_changed_byte_below_a_digest_that_fits(tmp_path):
     """Files made to look sound: what comes out is a header and arrays, or one kind of error; nothing is allocated."""
     path = tmp_path / "a"

@@ -223,6 +223,7 @@ HOLDER = """
 """
 
 
+@pytest.mark.slow
 @posix
 @keeping
 def test_another_process(keep, tmp_path, forker):
@@ -310,6 +311,7 @@ def test_a_link_in_the_place_of_the_lock(tmp_path):
     assert (tmp_path / "precious").read_bytes() == b"precious"
 
 
+@pytest.mark.slow
 def test_one_holder_at_any_time(tmp_path):
     """Though each removes the lock's file when it goes: those who have it open already find that out."""
     inside, most, taken, end = [0], [0], [0], time.monotonic() + 2.0
@@ -681,7 +683,14 @@ def terminated(forker):
 
 
 @posix
-@keeping
+@pytest.mark.parametrize(
+    "keep",
+    [
+        kept_by_ensemble,
+        pytest.param(kept_by_integrate, marks=pytest.mark.slow),
+        pytest.param(kept_in_zarr, marks=[needs_zarr, pytest.mark.slow]),
+    ],
+)
 def test_sigterm_waits_for_the_checkpoint(keep, tmp_path, terminated):
     """The process ends by it, as whoever sent it expects, and what was done is there."""
     place, ran = tmp_path / "kept", []
@@ -702,6 +711,7 @@ def test_sigterm_waits_for_the_checkpoint(keep, tmp_path, terminated):
         assert ran == [9]
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize(
     "action",
@@ -773,6 +783,7 @@ def test_sigterm_is_as_it_was_afterwards(tmp_path):
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.needs_jit
 def test_sigterm_inside_a_compiled_run(tmp_path, forker):

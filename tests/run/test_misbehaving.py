@@ -149,6 +149,7 @@ def test_writing_in_place(how):
     np.testing.assert_array_equal(how(fun, **options).y, how(filling, **options).y)
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize("in_place", [False, True])
 def test_accelerations_that_write(how, in_place):
@@ -207,6 +208,7 @@ def test_invariants_without_gradients_that_write():
     np.testing.assert_allclose(run.invariants, 5.0, rtol=1e-13)
 
 
+@pytest.mark.slow
 @both
 def test_events_that_write(how):
     """Neither the state nor what the next event sees."""
@@ -218,6 +220,7 @@ def test_events_that_write(how):
         np.testing.assert_array_equal(mine, other)
 
 
+@pytest.mark.slow
 @needs_jit
 def test_members_of_writers_are_single_runs():
     fun, kept = njit(writing_now_and_then), Invariant(njit(value_that_writes), njit(gradient_that_writes), name="S")
@@ -420,7 +423,9 @@ def test_events_that_change(value, start):
 
 
 @needs_jit
-@pytest.mark.parametrize("part", ["fun", "value", "gradient"])
+@pytest.mark.parametrize(
+    "part", ["fun", *(pytest.param(part, marks=pytest.mark.slow) for part in ("value", "gradient"))]
+)
 def test_compiled_functions_that_return_none(part):
     """Such a function does not enter compiled code, and what is interpreted says what is wrong."""
 
