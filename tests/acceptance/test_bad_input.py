@@ -12,7 +12,7 @@ import warnings
 import numpy as np
 import pytest
 from scipy.integrate import RK45, solve_ivp
-from systems import oscillator
+from systems import orbit, oscillator
 
 from eip_scipy import (
     EIPDOP853,
@@ -1049,6 +1049,28 @@ def test_wrong_component_of_a_small_part_is_found(driver):
     )
     with pytest.raises(ValueError, match=r"gradient of invariant .* is wrong"):
         driver(lambda t, y: np.array([y[1], -y[0], y[3], -y[2]]), y0=y0, invariants=wrong)
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi / 2, np.pi, 0.3])
+def test_gradients_vanish_at_an_extremum(angle):
+    """Squares of what is 0 at the start but for rounding, which is all that differences see."""
+    c, s = np.cos(angle), np.sin(angle)
+
+    def lenz(t, y):
+        q, v = y[:2], y[2:]
+        return (v @ v) * q - (q @ v) * v - q / np.sqrt(q @ q)
+
+    def gradient(t, y):
+        q, v = y[:2], y[2:]
+        by_q = (v @ v - (q @ q) ** -0.5) * np.eye(2) - np.outer(v, v) + np.outer(q, q) / (q @ q) ** 1.5
+        by_v = 2 * np.outer(q, v) - np.outer(v, q) - (q @ v) * np.eye(2)
+        return 2 * lenz(t, y)[:, None] * np.hstack([by_q, by_v])
+
+    circle, squares = np.array([c, s, -s, c]), Invariant(lambda t, y: lenz(t, y) ** 2, gradient)
+    assert integrate(orbit, (0.0, 0.01), circle, method=EIPRK4, h=0.01, invariants=squares).success
+    wrong = Invariant(squares.fun, lambda t, y: gradient(t, y) + [1e-6, 0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match=r"gradient of invariant .* is wrong"):
+        integrate(orbit, (0.0, 0.01), circle, method=EIPRK4, h=0.01, invariants=wrong)
 
 
 @both

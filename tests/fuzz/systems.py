@@ -398,7 +398,7 @@ def main(arguments: list[str] | None = None) -> int:
         used[runs.case.method] += 1
         count["regular"] += runs.case.regular
         count["sick"] += runs.case.sick
-        if runs.healthy and not runs.whole.trusted:
+        if not wrong and runs.healthy and not runs.whole.trusted:
             doubted.append(seed)
         count["healthy"] += runs.healthy
         for name, text in wrong:
