@@ -21,7 +21,7 @@ hypothesis.settings.load_profile("ci")
 # The loop over steps takes more than a minute to compile. Of two processes the first starts with that, the second with
 # files that do without it, and finds it in the cache afterwards.
 WITHOUT_LOOP = (
-    "test_tableaux", "test_nystrom", "test_one_step", "test_properties", "test_dense_output", "test_order",
+    "test_tableaux", "test_nystrom", "test_one_step", "test_dense_output", "test_order",
     "test_scipy_suite", "test_gpe_commands", "test_implicit_schemes", "test_gpe_methods", "test_plain_numbers",
 )  # fmt: skip
 

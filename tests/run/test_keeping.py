@@ -242,11 +242,20 @@ def test_another_process(keep, tmp_path, forker):
 
 
 @posix
-@pytest.mark.parametrize("child", ["os.fork() or time.sleep(600)", "subprocess.Popen(['sleep', '600']).pid"])
+@pytest.mark.parametrize("child", ["forked()", "subprocess.Popen(['sleep', '600']).pid"])
 def test_children_do_not_keep_the_lock(child, tmp_path, forker):
     code = f"""
         import os, signal, subprocess, time
         from test_keeping import at_once, run
+
+        def forked():
+            out, into = os.pipe()
+            pid = os.fork()
+            if pid == 0:
+                os.write(into, b"I run")
+                time.sleep(600)
+            os.read(out, 5)
+            return pid
 
         def start():
             print({child}, flush=True)
