@@ -11,7 +11,9 @@ from ..engine.data import FrameRows
 from .blocks import INDEX
 from .inputs import refuse_units
 
-__all__ = ["frame_rows"]
+__all__ = ["frame_rows", "spanned"]
+
+SPANNED = 1e-9
 
 
 def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
@@ -31,6 +33,20 @@ def frame_rows(frame: Any, n: int, width: int) -> FrameRows:
     weights = _by_bodies(C), _by_bodies(M)
     bodies = np.array(weights) if weights[0].size and weights[1].size else np.zeros((2, 0, 0))
     return FrameRows(np.array([starts[: k + 1], starts[k:]]), index, value, np.zeros(k), bodies)
+
+
+def spanned(frame: FrameRows, G: np.ndarray) -> np.ndarray:
+    """Which gradients, rows of G, are sums of rows of C, so that nothing but rounding is left of them."""
+    C, M = (_dense_rows(start, frame, G.shape[1]) for start in frame.start)
+    size = np.abs(G).max(axis=1)
+    return (size > 0) & (np.abs(G - (G @ M.T) @ C).max(axis=1) <= SPANNED * size)
+
+
+def _dense_rows(start: np.ndarray, frame: FrameRows, n: int) -> np.ndarray:
+    a = np.zeros((start.size - 1, n))
+    for row, first, last in zip(a, start[:-1], start[1:], strict=True):
+        row[frame.place[first:last]] = frame.value[first:last]
+    return a
 
 
 def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from scipy.integrate import OdeSolver
 
 from ..engine.counters import LAST_RANK
 from ..engine.data import (
+    EPS,
     ERROR,
     EUCLIDEAN,
     LENGTH,
@@ -30,6 +31,7 @@ from ..engine.data import (
 from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
 from ..methods.nystrom import NystromTableau
+from .frame import spanned
 from .inputs import reals, refuse_units, shown
 from .invariants import InvariantSet, as_it_is
 from .one_step import OneStep, as_vector
@@ -40,6 +42,7 @@ from .stepping import AnyMethod, Stepping
 __all__ = ["Projection", "Run", "Start", "as_derivative", "prepare"]
 
 START_ITERATIONS = 50
+FRAME_DISTANCE = 1e-4
 # Steps after which the invariants are checked once more.
 LOOKS = (10, 100)
 
@@ -279,6 +282,7 @@ def prepare(
     t0, y0, f0, tau = start
     invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra, hand)
     options, sigma, identity = projection.settled(method, stepping, y0, invariants)
+    options = options._replace(scales=_scales(options, invariants, start))
     arrays = method_arrays(method)
     work = make_work(y0.size, y0.dtype, arrays.b.size, invariants.size, options.groups.start.size - 1)
     if sigma is not None:
@@ -293,6 +297,20 @@ def prepare(
     if options.watched and check_start and np.isfinite(f0).all():
         run.trust.doubts += invariants.check(t0, run.y0, f0, tau)
     return run
+
+
+def _scales(options: Options, invariants: InvariantSet, start: Start) -> np.ndarray:
+    """Scales of the invariants' dead bands: endless ones for what is a function of the frame's C y.
+
+    Corrections do not touch these, and nothing but rounding is left of their gradients once the frame is taken out.
+    At two states, for a gradient may lie in the frame by chance.
+    """
+    t0, y0, f0, tau = start
+    if options.frame.products.size == 0:
+        return options.scales
+    away = FRAME_DISTANCE * (np.abs(y0) + tau * np.abs(f0)) * np.cos(np.arange(y0.size))
+    held = [spanned(options.frame, invariants.gradients(t0, y, f0).view(float)) for y in (y0, y0 + away)]
+    return np.where(np.all(held, axis=0), invariants.term_sizes(t0, y0, f0) / EPS, options.scales)
 
 
 def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, f0: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 from systems import SQUARE, VOLTERRA, lotka_volterra, oscillator
 
 from eip_scipy import (
+    EIPDOP853,
     EIPRK1,
     EIPRK2,
     EIPRK3,
@@ -609,3 +610,35 @@ def test_no_flood_of_warnings(driver):
         driver(lambda t, y: 1e200 * y, (0, 2), [1.0], h=0.01)
     assert len(record) <= 4
     assert all(w.filename == __file__ for w in record)
+
+
+# Frames.
+
+
+@metrics
+def test_an_invariant_that_the_frame_holds(metric):
+    """Of its gradient rounding is left, which points anywhere; a compensated run sees its defects in every step."""
+    n = 6
+    total = np.repeat([0.0, 1.0], n)
+    frame = np.kron(np.eye(2), np.ones((1, n))), np.kron(np.eye(2), np.ones((n, 1)))
+
+    def forces(t, y):
+        pull = np.exp(y[:n] - np.roll(y[:n], -1))
+        return np.concatenate([y[n:], np.roll(pull, 1) - pull])
+
+    def energy(t, y):
+        return y[n:] @ y[n:] / 2 + np.exp(y[:n] - np.roll(y[:n], -1)).sum()
+
+    def slope(t, y):
+        f = forces(t, y)
+        return np.concatenate([-f[n:], f[:n]])
+
+    kept = Invariant(lambda t, y: total @ y, lambda t, y: total, name="P"), Invariant(energy, slope, name="H")
+    y0 = np.random.default_rng(4).standard_normal(2 * n)
+    options = {"method": EIPDOP853, "h": 0.05, "frame": frame, "metric": metric, "compensated": True}
+    run = integrate(forces, (0, 20), y0, invariants=kept, **options)
+    assert run.success
+    assert run.trusted
+    alone = integrate(forces, (0, 20), y0, invariants=kept[1], **options)
+    np.testing.assert_allclose(run.y[:, -1], alone.y[:, -1], rtol=0, atol=1e-9)
+    assert run.max_defect.max() < 1e-13
