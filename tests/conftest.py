@@ -1,4 +1,4 @@
-"""What holds for every test: the meaning of ``needs_jit``, plotting without a screen, Ctrl-C, hypothesis' profile."""
+"""What holds for every test: order, ``needs_jit``, plotting without a screen, Ctrl-C, the profile of hypothesis."""
 
 import os
 import signal
