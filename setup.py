@@ -16,8 +16,8 @@ FOLDER = Path("eip_scipy/engine/cpp")
 if sys.platform == "win32":
     FLAGS, V3 = ["/std:c++20", "/O2", "/fp:precise"], ["/arch:AVX2"]
 else:
-    # No fused operation but those that are written, no reordering: the same bits from every build. The warnings that are
-    # left out are about Python's own interface.
+    # No fused operation but those that are written, no reordering: the same bits from every build. The warnings left
+    # out are about Python's own interface.
     FLAGS = ["-std=c++20", "-O3", "-g0", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
     FLAGS += ["-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-cast-function-type", "-Wno-missing-field-initializers"]
     V3 = ["-march=x86-64-v3"]
