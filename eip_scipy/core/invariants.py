@@ -304,11 +304,6 @@ class Complaint(NamedTuple):
     text: str
 
 
-def as_it_is(fun: Any, arrays: int) -> Any:
-    """A user's function, called as it is."""
-    return fun
-
-
 def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
     """``fun`` with its last arguments given; itself where there are none."""
     return (lambda *first: fun(*first, *arguments)) if arguments else fun
@@ -317,18 +312,14 @@ def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
 class InvariantSet:
     """All invariants of a run as one: sizes, names, targets, scales, and the functions that the step calls.
 
-    Made at the start state, where values and shapes are checked. `extra` holds the run's `params`, if any; `hand` makes
-    of a user's function, and the number of its arrays that are ours, what is called.
+    Made at the start state, where values and shapes are checked. `extra` holds the run's `params`, if any.
     """
 
-    def __init__(
-        self, invariants: Any, t0: float, y0: Array, f0: Array, tau: float, extra: tuple = (), hand: Any = as_it_is
-    ) -> None:
+    def __init__(self, invariants: Any, t0: float, y0: Array, f0: Array, tau: float, extra: tuple = ()) -> None:
         self.items = as_invariants(invariants)
         self.extra = extra
         self.labels = [item.name or f"invariant {k}" for k, item in enumerate(self.items)]
-        self.funs = [hand(item.fun, 1) for item in self.items]
-        functions = [bound(fun, item.args + extra) for fun, item in zip(self.funs, self.items, strict=True)]
+        functions = [bound(item.fun, item.args + extra) for item in self.items]
         values = [
             _first_value(item, fun, label, t0, y0, extra)
             for item, fun, label in zip(self.items, functions, self.labels, strict=True)
@@ -347,9 +338,7 @@ class InvariantSet:
         self.scales = np.repeat([float(item.scale or 0.0) for item in self.items], sizes)
         self.uses_f = any(item.uses_f for item in self.items)
         self.grads = [
-            hand(item.grad, 2 if item.uses_f else 1)
-            if item.grad is not None
-            else NumericalGradient(item, label, t0, y0, f0, tau, extra)
+            item.grad if item.grad is not None else NumericalGradient(item, label, t0, y0, f0, tau, extra)
             for item, label in zip(self.items, self.labels, strict=True)
         ]
         self.target = self._targets()
@@ -378,7 +367,7 @@ class InvariantSet:
             def convert(found: Any, t: float) -> Array:
                 return np.array(_value(found, label, t, shape), float, order="C")
 
-            return call(self.funs[k], self.items[k].args + self.extra, shape, convert, real=True)
+            return call(self.items[k].fun, self.items[k].args + self.extra, shape, convert, real=True)
 
         def gradient(k: int) -> Call:
             _, takes_f, in_place, label, _, shape = self._gradients[k]

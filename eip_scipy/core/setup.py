@@ -33,7 +33,7 @@ from ..engine.trust import Trust
 from ..methods.nystrom import NystromTableau
 from .frame import spanned
 from .inputs import reals, refuse_units, shown
-from .invariants import InvariantSet, as_it_is
+from .invariants import InvariantSet
 from .one_step import OneStep, as_vector
 from .options import ProjectionOptions
 from .results import Diagnostics
@@ -260,7 +260,6 @@ def prepare(
     *,
     extra: tuple = (),
     check_start: bool = True,
-    hand: Any = as_it_is,
 ) -> Run:
     """Check a run's options and make its buffers; the invariants are checked at the start.
 
@@ -276,11 +275,9 @@ def prepare(
         Further arguments of the invariants' functions (``(params,)`` or nothing).
     check_start : bool
         False: the invariants have been checked at the start of another run like this.
-    hand : callable
-        See `InvariantSet`.
     """
     t0, y0, f0, tau = start
-    invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra, hand)
+    invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra)
     options, sigma, identity = projection.settled(method, stepping, y0, invariants)
     options = options._replace(scales=_scales(options, invariants, start))
     arrays = method_arrays(method)

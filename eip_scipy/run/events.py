@@ -11,7 +11,6 @@ from scipy.integrate import DenseOutput
 from scipy.optimize import brentq
 
 from ..core.inputs import is_number, reals, refuse_units, require_arguments, shown
-from ..core.invariants import as_it_is
 from ..engine.data import EPS
 from ..engine.native import Call, call
 
@@ -28,8 +27,6 @@ class Events:
         the run ends) and ``direction`` of SciPy's `solve_ivp`.
     extra : tuple
         ``(params,)`` or nothing.
-    hand : callable
-        Makes of an event, and the number of its arrays that are ours, what is called.
 
     Raises
     ------
@@ -39,10 +36,9 @@ class Events:
         When ``terminal`` is no number of times, or ``direction`` no number.
     """
 
-    def __init__(self, events: Any, extra: tuple = (), hand: Any = as_it_is) -> None:
+    def __init__(self, events: Any, extra: tuple = ()) -> None:
         items = _as_events(events)
         self.functions: list[Callable[..., Any]] = list(items)
-        self._called = [hand(item, 1) for item in items]
         self._extra = extra
         self.directions = np.array([_direction(getattr(item, "direction", 0)) for item in items])
         self._allowed = [_allowed(getattr(item, "terminal", None)) for item in items]
@@ -62,7 +58,7 @@ class Events:
 
         def one(k: int) -> Call:
             return call(
-                self._called[k], self._extra, (), lambda value, t: np.array(self._number(k, t, value)), real=True
+                self.functions[k], self._extra, (), lambda value, t: np.array(self._number(k, t, value)), real=True
             )
 
         return tuple(map(one, range(len(self.functions))))
@@ -103,7 +99,7 @@ class Events:
     def _value(self, k: int, t: float, y: np.ndarray) -> float:
         """Event k at (t, y), which it may keep or overwrite."""
         try:
-            value = self._called[k](t, y, *self._extra)
+            value = self.functions[k](t, y, *self._extra)
         except TypeError:
             given, mend = ("t", "y", *("params" for _ in self._extra)), "It takes params if the run has them."
             require_arguments(self.functions[k], given, f"event {k}", mend)

@@ -213,8 +213,6 @@ class Loop:
         with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
             functions, self.why_not = system.functions(run, wanted)
             self.driver = Driver(run, prepared.schedule, functions, system.parameters)
-        for function in system.handed:
-            function.read_only &= self.why_not is None
         keeper.begin(self.driver, self.events, self.max_bytes)
         self.wall_time = keeper.seconds
         self.chunk = FIRST_CHUNK

@@ -10,9 +10,8 @@ import numpy as np
 
 from ..core import setup
 from ..core.inputs import filled
-from ..core.jitted import is_jitted
 
-__all__ = ["FORMS", "INTERPRETED", "Handed", "hand"]
+__all__ = ["FORMS", "INTERPRETED"]
 
 FORMS = {  # (of a Nystrom method, in place) -> what a user's function is
     (False, False): "value",
@@ -80,53 +79,3 @@ INTERPRETED = {
     "acceleration": _interpreted_acceleration,
     "acceleration in place": _interpreted_acceleration_in_place,
 }
-
-
-def hand(handed: list[Handed], fun: Callable[..., Any], arrays: int) -> Callable[..., Any]:
-    """What is called in place of a user's function; those that are jitted are listed."""
-    if not is_jitted(fun):
-        return fun
-    handed.append(Handed(fun, arrays))
-    return handed[-1]
-
-
-class Handed:
-    """A user's jitted function as Python calls it: on arrays that it cannot write to, as compiled runs call it.
-
-    So that one version of it is compiled, not two. Where it writes to them it gets them writable, as do interpreted
-    runs, whose calls take less time then, once `read_only` is False.
-
-    Parameters
-    ----------
-    fun : callable
-        ``fun(t, y, ...)``.
-    arrays : int
-        How many of the arguments after t: the state, and f where a gradient takes it.
-    """
-
-    __slots__ = ("_arrays", "_fun", "read_only")
-
-    def __init__(self, fun: Callable[..., Any], arrays: int) -> None:
-        self._fun, self._arrays, self.read_only = fun, arrays, True
-
-    def __call__(self, t: float, *arguments: Any) -> Any:
-        """The function's value."""
-        if self.read_only:
-            given = (_read_only(a) for a in arguments[: self._arrays])
-            try:
-                return self._fun(t, *given, *arguments[self._arrays :])
-            except _numba_error():
-                self.read_only = False
-        return self._fun(t, *arguments)
-
-
-def _read_only(a: np.ndarray) -> np.ndarray:
-    a = a[:]
-    a.flags.writeable = False
-    return a
-
-
-def _numba_error() -> type[Exception]:
-    from numba.core.errors import NumbaError
-
-    return NumbaError

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from ..engine.native import NativeFunctions, PythonFunctions, call
 from ..methods.nystrom import NystromTableau
 from .driver import check_memory, saved_rows
 from .events import Events
-from .interpreted_functions import FORMS, INTERPRETED, Handed, hand
+from .interpreted_functions import FORMS, INTERPRETED
 from .memory import check_bytes, free_memory
 from .resume import settings
 
@@ -106,16 +105,12 @@ class System:
         params = request.params
         self.parameters = np.zeros(0) if params is None else real_array("params", params, TypeError).reshape(-1)
         self.extra = () if params is None else (self.parameters,)
-        self.handed: list[Handed] = []
-        self.hand = partial(hand, self.handed)
-        self.events = Events(request.events, self.extra, self.hand)
-        self.called: Callable[..., Any]
+        self.events = Events(request.events, self.extra)
         self.rhs: Callable[..., None]
 
     def bind(self, y0: np.ndarray) -> None:
         """Make `rhs` for states like y0."""
-        self.called = self.hand(self.fun, 1)
-        self.rhs = INTERPRETED[self.form](self.called, self.extra, y0)
+        self.rhs = INTERPRETED[self.form](self.fun, self.extra, y0)
 
     def derivative(self, t: float, y: np.ndarray) -> np.ndarray:
         """The derivative as a new array."""
@@ -164,7 +159,7 @@ class System:
         def convert(f: Any, t: float) -> np.ndarray:
             return np.array(setup.as_derivative(f, size, dtype, t), dtype, order="C")
 
-        rhs = call(self.called, self.extra, (size,), convert, in_place=in_place)
+        rhs = call(self.fun, self.extra, (size,), convert, in_place=in_place)
         return PythonFunctions(rhs, *run.invariants.calls, self.events.calls, second_order)
 
 
@@ -212,9 +207,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
         setup.check_second_order(calls, t0, y0, f0, name)
     start = Start(t0, y0, f0, stepping.first(calls, y0, f0, method))
     schedule = _schedule(stepping.span, start.tau, request, system.events)
-    run = setup.prepare(
-        method, calls, start, projection, stepping, extra=system.extra, check_start=check_start, hand=system.hand
-    )
+    run = setup.prepare(method, calls, start, projection, stepping, extra=system.extra, check_start=check_start)
     run.in_place = "in place" in form
     bound = 0.5 * free_memory() if request.max_bytes is None else request.max_bytes
     check_memory(saved_rows(schedule), run, bound)

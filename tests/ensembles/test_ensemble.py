@@ -41,6 +41,8 @@ from eip_scipy import (
     ensemble,
     integrate,
 )
+from eip_scipy.core.compiled_functions import CompiledFunctions
+from eip_scipy.ensembles import numba_driver, tasks
 from eip_scipy.ensembles.tasks import Plan, Sweeper, Task, _Watch, run_members, sweep
 from eip_scipy.problems import kepler
 from eip_scipy.run.prepare import Request
@@ -256,10 +258,22 @@ def test_members_do_not_depend_on_the_chunk():
     same(ensemble(kepler(), SPAN, starts(40), chunk=3), ensemble(kepler(), SPAN, starts(40), chunk=40))
 
 
+class Interpreted:
+    """In place of what Numba compiles."""
+
+    def __init__(self, loop):
+        system, driver = loop.prepared.system, loop.driver
+        run, state, new = driver.run, driver.state, driver.new
+        self.functions = CompiledFunctions(system.rhs, run.invariants.inv, run.invariants.grad, system.events.fill)
+        self.tail = run.method, run.options, run.work, state, state.view(float), new, new.view(float)
+        self.advance = numba_driver.advance
+
+
 @pytest.mark.slow_without_jit
 @pytest.mark.parametrize("options", [{}, {"save_every": 4}, {"h": None, "method": EIPRK45}])
-def test_the_sweep_is_plain_python_too(options):
+def test_the_sweep_is_plain_python_too(monkeypatch, options):
     """What is compiled, interpreted: the same bits as member by member."""
+    monkeypatch.setattr(tasks, "NumbaDriver", Interpreted)
     y0s = starts(4)
     y0s[1] = np.nan
     shared = {"method": EIPRK4, "h": 0.1, "invariants": [H, L], "compiled": False, **options}
