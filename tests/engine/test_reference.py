@@ -1,0 +1,118 @@
+"""The engine beside the method in plain NumPy, `reference_step`."""
+
+import numpy as np
+import pytest
+from reference_step import Step
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPRK1,
+    EIPRK2,
+    EIPRK3,
+    EIPRK4,
+    EIPRK5,
+    EIPRK23,
+    EIPRK45,
+    Invariant,
+)
+
+CLASSES = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]
+Y0 = np.array([0.7, 0.1, -0.3, 1.2, -0.2, 0.4])
+SPINS = np.array([0.6 + 0.2j, -0.3 + 0.5j, 0.4 - 0.1j])
+
+
+def pull(t, y):
+    """A body in three dimensions under a force towards the origin."""
+    return np.concatenate([y[3:], -y[:3] / (y[:3] @ y[:3]) ** 1.5])
+
+
+def energy(t, y):
+    return 0.5 * y[3:] @ y[3:] - 1 / np.sqrt(y[:3] @ y[:3])
+
+
+def energy_gradient(t, y):
+    return np.concatenate([y[:3] / (y[:3] @ y[:3]) ** 1.5, y[3:]])
+
+
+def momentum(t, y):
+    return np.cross(y[:3], y[3:])
+
+
+def momentum_gradient(t, y):
+    return np.hstack([np.cross(np.eye(3), y[3:]).T, np.cross(y[:3], np.eye(3)).T])
+
+
+def precess(t, y):
+    return -1j * (np.array([1.0, 2.0, 3.5]) * y + 0.5 * np.abs(y) ** 2 * y)
+
+
+def mass(t, y):
+    return np.vdot(y, y).real
+
+
+def mass_gradient(t, y):
+    return 2 * y
+
+
+REAL = pull, [(energy, energy_gradient), (momentum, momentum_gradient)], Y0
+COMPLEX = precess, [(mass, mass_gradient)], SPINS
+FRAME = np.eye(6)[:1], np.eye(6)[:, :1] + 0.25 * np.eye(6)[:, 1:2]
+
+
+def length(cls):
+    """Of the step: its error is larger than what the targets are beside the start's values."""
+    return 0.5 if cls is EIPDOP853 else 0.05
+
+
+def both(cls, problem, y0, **options):
+    """One step from y0 by the engine and by the reference; the targets are a little beside the start's values."""
+    (fun, pairs, _), h = problem, length(cls)
+    invariants, first = [], []
+    for value, gradient in pairs:
+        target = np.asarray(value(0.0, y0)) * (1 + 1e-9)
+        first.append(np.atleast_1d(target))
+        invariants.append(Invariant(value, gradient, target=target))
+    given = {"rtol": 1e-3, "atol": 1e-6} | options
+    solver = cls(fun, 0.0, y0.copy(), 10.0, h=h, invariants=invariants, check=False, **given)
+    assert solver.step() is None
+
+    def values(t, y):
+        return np.concatenate([np.atleast_1d(value(t, y)) for value, _ in pairs])
+
+    def gradients(t, y):
+        return np.concatenate([np.atleast_2d(gradient(t, y)) for _, gradient in pairs])
+
+    step = Step(cls.TABLEAU, fun, values, gradients, np.concatenate(first), **given)
+    return solver.y, step(0.0, y0, h), step
+
+
+OPTIONS = [
+    {},
+    {"metric": "euclidean"},
+    {"metric": np.array([1.0, 0.5, 0.2, 0.7, 0.9, 0.3])},
+    {"blocks": [[0, 1, 2], [3, 4, 5]]},
+    {"blocks": [[0, 3], [1, 4], [2, 5]], "rtol": 1e-5, "atol": 1e-9},
+    {"direction": "old"},
+    {"direction": "midpoint"},
+    {"iterations": 3},
+    {"direction": "midpoint", "iterations": 2, "blocks": [[0, 1, 2], [3, 4, 5]]},
+    {"frame": FRAME},
+    {"frame": FRAME, "blocks": [[0, 1, 2], [3, 4, 5]], "iterations": 2},
+]
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=lambda o: "-".join(o) or "plain")
+@pytest.mark.parametrize("cls", CLASSES)
+def test_a_step_is_that_of_the_method(cls, options):
+    found, expected, step = both(cls, REAL, Y0, **options)
+    moved = np.abs(expected - Y0).max()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14 * moved + 3e-16)
+    if options.get("iterations", 1) > 2:
+        assert np.abs(step.defects(length(cls), found)).max() <= 1e-15
+
+
+@pytest.mark.parametrize("options", [{}, {"metric": "euclidean"}, {"blocks": [[0, 2], [1]]}, {"direction": "old"}])
+@pytest.mark.parametrize("cls", CLASSES)
+def test_complex_states_too(cls, options):
+    found, expected, _ = both(cls, COMPLEX, SPINS, **options)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)

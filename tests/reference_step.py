@@ -1,0 +1,141 @@
+"""The method on one page, in plain NumPy: one explicit Runge-Kutta step, then one Newton step onto the invariants.
+
+For reading, and to test the engine against. Nothing is caught here that rounding, singular gradients or failing functions
+do, and nothing is fast. Complex states are pairs of floats throughout: Re <a, b> is then the ordinary product.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+EPS = np.finfo(float).eps
+FLOOR = 1e-7
+
+Array = np.ndarray
+
+
+@dataclass
+class Step:
+    """What a step is made with.
+
+    `fun` is f(t, y), `values` I(t, y) and `gradients` G(t, y) (l, n) of all invariants. `blocks` are lists of
+    components; `frame` is (C, S); the metric is "error", "euclidean" or n weights.
+    """
+
+    tableau: Any
+    fun: Callable[[float, Array], Array]
+    values: Callable[[float, Array], Array]
+    gradients: Callable[[float, Array], Array]
+    target: Array
+    rtol: float = 1e-3
+    atol: float = 1e-6
+    metric: Any = "error"
+    blocks: Sequence[Sequence[int]] | None = None
+    frame: tuple[Array, Array] | None = None
+    direction: str = "new"
+    iterations: int = 1
+
+    def __call__(self, t: float, y: Array, h: float) -> Array:
+        """The state at t + h."""
+        y_hat, K = runge_kutta(self.tableau, self.fun, t, y, h)
+        return self.projected(t, y, t + h, y_hat, local_error(self.tableau, K, h))
+
+    def projected(self, t_old: float, y: Array, t: float, y_hat: Array, err: Array | None) -> Array:
+        """y_hat on the invariants' targets."""
+        g = self.defects(t, y_hat)
+        if not g.any():
+            return y_hat
+        sigma = self.weights(y, y_hat, err)
+        # Newton's matrix has the gradients where the defects are taken; corrections go along those of the direction.
+        along = {"new": (t, y_hat), "old": (t_old, y), "midpoint": ((t_old + t) / 2, (y + y_hat) / 2)}[self.direction]
+        Q = sigma * self.neutral(floats(self.gradients(*along)))
+        mu, now = np.zeros(len(g)), y_hat
+        for _ in range(self.iterations):
+            B = sigma * self.neutral(floats(self.gradients(t, now)))
+            mu += np.linalg.lstsq(B @ Q.T, -self.defects(t, now), rcond=None)[0]
+            now = states(floats(y_hat) + self.kept(sigma * (Q.T @ mu)), y)
+        return now
+
+    def defects(self, t: float, y: Array) -> Array:
+        """I - target; 0 where that is the rounding of four of an invariant's terms."""
+        values = self.values(t, y)
+        terms = np.abs(floats(self.gradients(t, y)) * floats(y)).sum(axis=1)
+        size = np.max([np.abs(values), np.abs(self.target), terms], axis=0)
+        g = values - self.target
+        return np.where(np.abs(g) <= 4 * EPS * size, 0.0, g)
+
+    def weights(self, y: Array, y_hat: Array, err: Array | None) -> Array:
+        """Sigma: how far each float may move, the largest 1. By blocks, scale_b ((r_b / max r)^kappa + floor)."""
+        width = floats(y).size // y.size
+        if not isinstance(self.metric, str):
+            return np.repeat(self.metric / np.max(self.metric), width)
+        if self.metric == "euclidean" or err is None:
+            return np.ones(floats(y).size)
+        blocks = self.blocks if self.blocks is not None else [[k] for k in range(y.size)]
+        places = [np.concatenate([np.arange(width) + width * k for k in block]) for block in blocks]
+
+        def norms(a: Array) -> Array:
+            return np.array([np.linalg.norm(a[place]) for place in places])
+
+        old, new, error = (norms(floats(a)) for a in (y, y_hat, err))
+        scale = self.atol * np.sqrt([len(block) for block in blocks]) + self.rtol * np.maximum(old, new)
+        ratio = np.hypot(error, EPS * new) / scale
+        if not ratio.any():
+            return np.ones(floats(y).size)
+        by_block = scale * ((ratio / ratio.max()) ** self.tableau.kappa + FLOOR)
+        sigma = np.empty(floats(y).size)
+        for place, weight in zip(places, by_block / by_block.max(), strict=True):
+            sigma[place] = weight
+        return sigma
+
+    def neutral(self, G: Array) -> Array:
+        """Rows G without what the frame's C y sees of them: G (1 - M C), M = S (C S)^-1."""
+        if self.frame is None:
+            return G
+        C, S = self.frame
+        return G - (G @ S) @ np.linalg.solve(C @ S, C)
+
+    def kept(self, move: Array) -> Array:
+        """A correction that leaves C y alone: (1 - M C) move."""
+        if self.frame is None:
+            return move
+        C, S = self.frame
+        return move - S @ np.linalg.solve(C @ S, C @ move)
+
+
+def runge_kutta(
+    tableau: Any, fun: Callable[[float, Array], Array], t: float, y: Array, h: float
+) -> tuple[Array, Array]:
+    """The raw result, and f at the stages and there."""
+    K = []
+    for a, c in zip(tableau.A, tableau.c, strict=True):
+        K.append(fun(t + c * h, y + h * sum((a_j * k for a_j, k in zip(a, K, strict=False)), 0 * y)))
+    y_hat = y + h * (np.array(K).T @ tableau.b)
+    return y_hat, np.array([*K, fun(t + h, y_hat)])
+
+
+def local_error(tableau: Any, K: Array, h: float) -> Array | None:
+    """The estimate; DOP853 damps its own by the other one of its pair."""
+    if tableau.error_estimator_order is None:
+        return None
+    e = np.asarray(tableau.e)
+    err = h * (K[: e.size].T @ e)
+    if tableau.paired:
+        low = h * (K[: e.size].T @ np.asarray(tableau.e_low))
+        size = np.hypot(np.abs(err), 0.1 * np.abs(low))
+        err = np.where(size > 0, err * np.abs(err) / np.where(size > 0, size, 1.0), 0.0)
+    return err
+
+
+def floats(a: Array) -> Array:
+    """Numbers as floats, real and imaginary parts side by side."""
+    return np.ascontiguousarray(a).view(float)
+
+
+def states(a: Array, like: Array) -> Array:
+    """Floats as numbers of that kind."""
+    return np.ascontiguousarray(a).view(like.dtype)
