@@ -227,7 +227,7 @@ RUNS = """
     import numpy as np
     from eip_scipy import *
     from eip_scipy.engine.native import BUILD
-        from eip_scipy.problems import figure_eight
+    from eip_scipy.problems import figure_eight, kepler
     seen = hashlib.sha256()
     problem, bodies = kepler(t_end=20.0), figure_eight()
     weights = np.array([1.0, 0.5, 0.2, 1.0])
