@@ -146,6 +146,7 @@ def start(tmp_path):
     return gpe_states.save_state(tmp_path / "start.npz", gpe_states.Found("", gpe, state))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_ring(tmp_path, start, capsys):
     out, file = tmp_path / "out", tmp_path / "ring.json"

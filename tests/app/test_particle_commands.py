@@ -56,6 +56,7 @@ def test_numbers_of_a_short_run(short, name):
     assert got["Boris"]["nfev"] == STEPS
 
 
+@pytest.mark.slow
 def test_figures_have_a_row_for_each_method(short):
     figures = dict(particle_report.figures(short))
     assert {name: len(figure.axes) for name, figure in figures.items()} == {"uniform": 7 * 4, "tokamak": 7 * 4}
@@ -66,6 +67,7 @@ def test_figures_have_a_row_for_each_method(short):
     np.testing.assert_array_equal(orbit, np.stack([line.R, line.z], axis=1))
 
 
+@pytest.mark.slow
 def test_checks_fail_on_a_run_too_short_for_them(short):
     for found in short.values():
         checks = particle_report.checks(found)
@@ -107,6 +109,7 @@ def test_command(tmp_path, capsys):
     assert float(rows[0]["v_x"]) == pytest.approx(0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_runs", "no_plotting")
 @pytest.mark.parametrize(
     ("options", "scenes"),
@@ -138,6 +141,7 @@ def test_wrong_usage(options, words, tmp_path, capsys):
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_runs", "no_plotting")
 def test_without_matplotlib(tmp_path, capsys):
     assert main(["charged-particle", "--field", "uniform", "--out", str(tmp_path), "--quiet"]) == 1
