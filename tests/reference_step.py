@@ -1,7 +1,7 @@
 """The method on one page, in plain NumPy: one explicit Runge-Kutta step, then one Newton step onto the invariants.
 
-For reading, and to test the engine against. What rounding, singular gradients or failing functions do is not caught here,
-and nothing is fast. Complex states are pairs of floats throughout: Re <a, b> is then the ordinary product.
+For reading, and to test the engine against. What rounding, singular gradients or failing functions do is not caught
+here, and nothing is fast. Complex states are pairs of floats throughout: Re <a, b> is then the ordinary product.
 """
 
 from __future__ import annotations

@@ -244,7 +244,8 @@ def dense(runs: Runs) -> Iterator[str]:
     run, case = runs.scipy, runs.case
     if run.t.size < 2:  # no step was taken: nothing in between
         return
-    # One by one: several times in one step, the end by an event among them, are a matrix product, which rounds otherwise.
+    # One by one: several times in one step, the end by an event among them, are a matrix product, which rounds
+    # otherwise.
     alone, together = np.column_stack([run.sol(t) for t in run.t]), run.sol(run.t)
     if not same(alone, run.y):
         yield f"sol(t) is not y at the times {run.t[np.flatnonzero((alone != run.y).any(axis=0))[:3]]}"
