@@ -11,7 +11,7 @@ from numba import njit
 
 from eip_scipy import Invariant
 from eip_scipy.problems import Problem
-from eip_scipy.problems.hard_cases import Equations
+from eip_scipy.problems.hard_cases import CaseEquations
 
 Array = np.ndarray
 
@@ -24,7 +24,7 @@ def claimed(name: str, fun: Callable[..., Any], y0: Any, end: float, *kept: Inva
     )
 
 
-def equations(name: str, system: Equations, y0: Any, end: float, of: Equations | None = None) -> Problem:
+def equations(name: str, system: CaseEquations, y0: Any, end: float, of: CaseEquations | None = None) -> Problem:
     """One of the hard cases' systems; `of`: the system whose invariants are claimed, when it is another one."""
     of = of or system
     return claimed(name, system.fun, y0, end, Invariant(of.values, of.gradients, name="I"))
