@@ -271,7 +271,8 @@ def test_compensation_of_a_nystrom_step():
         run = integrate(problem, method=EIPRKN12, h=0.0123, invariants=(), compensated=compensated, save_every=10)
         error = run.y[:, -1] - integrate(problem, method=EIPRKN12, h=1 / 128, compensated=True, every=50).y[:, -1]
         drift[compensated] = np.linalg.norm(error[:30].reshape(10, 3), axis=1)[2:]
-    assert np.all(drift[True] < 0.5 * drift[False])
+    # In the mean: rounding may cancel by luck in a planet, on some processor.
+    assert np.exp(np.mean(np.log(drift[True] / drift[False]))) < 0.2
 
 
 def test_compensated_sum_of_a_constant_acceleration():
