@@ -372,7 +372,7 @@ def look_at(seed: int) -> tuple[Runs | None, list[tuple[str, str]]]:
         if runs.plain.status < 0 and "h" not in case.steps:
             return None, []
         if case.sick:  # each step may be moved off by far more than the tolerance: they get ever shorter
-            _ = runs.whole
+            _ = runs.whole, runs.sampled, runs.scipy
     except TooManyCallsError:
         return None, []
     for check in CHECKS:
