@@ -12,7 +12,7 @@ from ..checkpoint import CheckpointError
 from ..core.solvers import EIPSolver
 from .report import UsageError, check_folder, warn
 
-__all__ = ["add_arguments", "check", "kept", "named", "positive", "tell_how_to_resume", "unusable"]
+__all__ = ["add_arguments", "check", "checkpoint_options", "named", "positive", "tell_how_to_resume", "unusable"]
 
 
 def add_arguments(parser: Any, runs: str) -> None:
@@ -57,7 +57,7 @@ def check(args: argparse.Namespace) -> None:
         check_folder(args.checkpoint)
 
 
-def kept(args: argparse.Namespace, name: str) -> dict[str, Any]:
+def checkpoint_options(args: argparse.Namespace, name: str) -> dict[str, Any]:
     """Options of `integrate` for the checkpoints of the run of that name: one file each."""
     if args.checkpoint is None:
         return {}

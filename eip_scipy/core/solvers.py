@@ -150,7 +150,7 @@ class EIPSolver(OdeSolver):
         self._work.counters[NFEV] = self._calls[0]
         self._count()
         self.y_old, self.f_old = self.y, self.f
-        self._found, self._told = 0, False
+        self._noted, self._told = 0, False
         if self._scipy is None:
             self._work.K[0] = f0
             self._schedule = bare_schedule(stepping.span, float(self.h_abs or 0.0))
@@ -221,14 +221,14 @@ class EIPSolver(OdeSolver):
         self.y, self.t, self.f = y_new, t, f_new
         if self._finishes:
             self.y = self._accepted
-        if w.counters[FOUND] != self._found or self._k in setup.LOOKS or self.t == self.t_bound:
+        if w.counters[FOUND] != self._noted or self._k in setup.LOOKS or self.t == self.t_bound:
             self._watch()
         return True, None
 
     def _watch(self) -> None:
         """Look at the run where something stands out, early and at its end; warn once, and at once: it may end here."""
         run, arrived = self._run, self.t == self.t_bound
-        self._found = self._work.counters[FOUND]
+        self._noted = self._work.counters[FOUND]
         if not self._told and run.look(self._k, arrived, self.t, self.y, lambda: self._derivative(self.t, self.y)):
             self._told = True
             warnings.warn(f"{type(self).__name__}: {run.trust.message}", ProjectionWarning, stacklevel=5)

@@ -160,7 +160,7 @@ class ZarrStore:
                     f"{self.path!r} exists. resume=True goes on with the ensemble that it holds; to start anew, name "
                     "another place or delete this one."
                 )
-            found = self._found(zarr)
+            found = self._existing(zarr)
             if found is not None:
                 require_identity(self.path, found, identity)
                 checkpoint.warn_of_other_versions(self.path, found, stacklevel=4)
@@ -187,7 +187,7 @@ class ZarrStore:
             return False
         return True
 
-    def _found(self, zarr: Any) -> dict[str, Any] | None:
+    def _existing(self, zarr: Any) -> dict[str, Any] | None:
         """What the group that is there says of itself; None where it was left before it was whole."""
         try:
             self._group = zarr.open_group(self._place, mode="r+")

@@ -191,8 +191,8 @@ def integrate(
         max_step=max_step,
         projection=projection,
     )
-    kept = _resume.kept(checkpoint, checkpoint_every, resume)
-    with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), kept as keeper, _start_kept(request):
+    keeping = _resume.keeping(checkpoint, checkpoint_every, resume)
+    with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), keeping as keeper, _start_kept(request):
         return Loop(prepared(request), keeper).run()
 
 

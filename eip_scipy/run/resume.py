@@ -23,7 +23,7 @@ from ..engine.data import NEXT_LENGTH, TIME
 from .events import Events
 from .interrupts import TerminatedError
 
-__all__ = ["Keeper", "kept", "settings"]
+__all__ = ["Keeper", "keeping", "settings"]
 
 KIND = "integrate"
 # A run goes on from its last snapshot: what came after it is done again.
@@ -72,7 +72,7 @@ class Keeper:
 
 
 @contextmanager
-def kept(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
+def keeping(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
     """The keeper for the options ``checkpoint``, ``checkpoint_every`` and ``resume`` of `integrate`.
 
     Raises
@@ -177,7 +177,7 @@ class _FileKeeper(Keeper):
         found: tuple[dict[str, Any], dict[str, np.ndarray]] | None,
         origin: str,
     ) -> None:
-        self._file, self._every, self._found = file, every, found
+        self._file, self._every, self._read = file, every, found
         self._origin = origin
         self._failure = ""
         self._ended: Any = None
@@ -193,9 +193,9 @@ class _FileKeeper(Keeper):
     ) -> None:
         self._settings, self._names, self._derivative = settings, run.invariants.names, derivative
         self._start = {"start_f": f0, "start_values": run.invariants.start_values}
-        if self._found is None:
+        if self._read is None:
             return
-        header, arrays = self._found
+        header, arrays = self._read
         checkpoint.require_same(self._file.name, header.get("settings"), settings)
         self._require_same_functions(run, arrays, self._start, t0, y0, "at the start")
         self._require_fitting(arrays, {"y": y0, "clock": np.zeros(NEXT_LENGTH + 1)})
@@ -243,7 +243,7 @@ class _FileKeeper(Keeper):
 
     def begin(self, driver: Any, events: Events, max_bytes: float) -> None:
         self._driver, self._events = driver, events
-        found, self._found = self._found, None
+        found, self._read = self._read, None
         if found is not None:
             self._restore(*found, max_bytes)
         self._begin = time.perf_counter() - self.seconds

@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         sense=SENSE,
         energy_kept=ENERGY_KEPT,
     )
-    made = study(quench, progress=not args.quiet, kept=partial(long_runs.kept, args))
+    made = study(quench, progress=not args.quiet, checkpoint_of=partial(long_runs.checkpoint_options, args))
     if made.fields is None:
         return conclude(args, made, None)
     moved = motion(after, made.lines[SHOWN].t, made.fields)
@@ -144,7 +144,7 @@ def _slice(made: QuenchStudy, moved: Motion, k: int) -> Any:
     grid = made.quench.equation.grid
     density = np.abs(_field(made, k)[:, :, grid.shape[2] // 2]) ** 2
     shown = cropped(density, grid, (0, 1), SLICE)
-    return FieldPanel(*shown, ("x", "y"), moved.found[k].positions, moved.followed(k))
+    return FieldPanel(*shown, ("x", "y"), moved.vortices[k].positions, moved.followed(k))
 
 
 def _surface(made: QuenchStudy, moved: Motion, k: int) -> Any:
@@ -153,7 +153,7 @@ def _surface(made: QuenchStudy, moved: Motion, k: int) -> Any:
 
     surface = density_surface(made.quench.equation, _field(made, k), LEVEL)
     x, y, _ = surface.corners.mean(axis=1).T
-    followed = np.abs(moved.off(k, x, y)) < np.pi / len(moved.found[k].charges)
+    followed = np.abs(moved.off(k, x, y)) < np.pi / len(moved.vortices[k].charges)
     return SurfacePanel(surface.corners, np.where(surface.inside, 1 + followed, 0))
 
 

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         sense=SENSE,
         energy_kept=ENERGY_KEPT,
     )
-    made = study(quench, progress=not args.quiet, kept=partial(long_runs.kept, args))
+    made = study(quench, progress=not args.quiet, checkpoint_of=partial(long_runs.checkpoint_options, args))
     if made.fields is None:
         return conclude(args, made, None)
     moved = motion(after, made.lines[SHOWN].t, made.fields)
@@ -97,6 +97,6 @@ def _panels(gpe: GrossPitaevskii, y: np.ndarray, moved: Motion) -> list[Any]:
         for axis in (0, 1)
     ]
     return [
-        FieldPanel(field[np.ix_(*keep)], ends, ("x", "y"), moved.found[k].positions, moved.followed(k))
+        FieldPanel(field[np.ix_(*keep)], ends, ("x", "y"), moved.vortices[k].positions, moved.followed(k))
         for k, field in enumerate(fields)
     ]

@@ -137,29 +137,29 @@ class Motion:
     Attributes
     ----------
     t : ndarray, shape (m,)
-    found : list of Vortices
+    vortices : list of Vortices
     angle : ndarray, shape (m,)
         By how much they have turned about the centre, on average, positive anticlockwise [rad].
     """
 
     t: np.ndarray
-    found: list[Vortices]
+    vortices: list[Vortices]
     angle: np.ndarray
 
     def off(self, k: int, x: Any, y: Any) -> Any:
         """Angles of points from where one vortex, the rightmost at the start, is in the state k, in (-pi, pi]."""
-        a, b = self.found[0].positions[np.argmax(self.found[0].positions[:, 0])]
+        a, b = self.vortices[0].positions[np.argmax(self.vortices[0].positions[:, 0])]
         return np.angle(np.exp(1j * (np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])))
 
     def followed(self, k: int) -> int | None:
         """Which of the vortices in the state k that one is; None where there is none."""
-        if not (self.found[0].charges.size and self.found[k].charges.size):
+        if not (self.vortices[0].charges.size and self.vortices[k].charges.size):
             return None
-        return int(np.abs(self.off(k, *self.found[k].positions.T)).argmin())
+        return int(np.abs(self.off(k, *self.vortices[k].positions.T)).argmin())
 
 
 def study(
-    quench: Quench, *, progress: bool = False, kept: Callable[[str], dict[str, Any]] = lambda name: {}
+    quench: Quench, *, progress: bool = False, checkpoint_of: Callable[[str], dict[str, Any]] = lambda name: {}
 ) -> QuenchStudy:
     """Run the reference and each of `METHODS`; Ctrl-C ends it with what was done.
 
@@ -168,8 +168,8 @@ def study(
     quench : Quench
     progress : bool, optional
         Show a bar with the time that is left of each run.
-    kept : callable, optional
-        ``kept(name)``: the options of `integrate` that keep checkpoints of the run of that name.
+    checkpoint_of : callable, optional
+        ``checkpoint_of(name)``: the options of `integrate` that keep checkpoints of the run of that name.
 
     Returns
     -------
@@ -184,9 +184,11 @@ def study(
     """
     made = QuenchStudy(quench)
     try:
-        made.reference = _run(quench, REFERENCE, EIPDOP853, quench.reference_step, METHODS[SHOWN], progress, kept).y
+        made.reference = _run(
+            quench, REFERENCE, EIPDOP853, quench.reference_step, METHODS[SHOWN], progress, checkpoint_of
+        ).y
         for name, invariants in METHODS.items():
-            run = _run(quench, name, EIPRK4, quench.step, invariants, progress, kept)
+            run = _run(quench, name, EIPRK4, quench.step, invariants, progress, checkpoint_of)
             made.lines[name] = _line(quench, run, made.reference)
             if name == SHOWN:
                 made.fields = run.y
@@ -204,7 +206,7 @@ def _run(
     h: float,
     invariants: Sequence[str],
     progress: bool,
-    kept: Callable[[str], dict[str, Any]],
+    checkpoint_of: Callable[[str], dict[str, Any]],
 ) -> Any:
     chosen = quench.equation.invariants(invariants)
     run = integrate(
@@ -214,7 +216,7 @@ def _run(
         invariants=chosen,
         save_every=round(quench.interval / h),
         progress=progress,
-        **kept(name),
+        **checkpoint_of(name),
     )
     if not run.success:
         raise RuntimeError(f"{name} failed: {run.message}")
@@ -276,7 +278,7 @@ def checks(made: QuenchStudy, moved: Motion | None) -> list[dict[str, Any]]:
     found, quench = [], made.quench
     if moved is not None:
         at = quench.shown(moved.t)
-        counts = [len(moved.found[k].charges) for k in at]
+        counts = [len(moved.vortices[k].charges) for k in at]
         found.append(check("vortices in the snapshots", counts, counts[0] > 0 and len(set(counts)) == 1))
         if len(at) > 1:
             turned = float(moved.angle[at[-1]])
@@ -312,7 +314,7 @@ def text(
         where = [
             (f"t = {moved.t[k]:.2f}", [str(len(v.charges)), _radius(v), f"{moved.angle[k]:+.3f}"])
             for k in quench.shown(moved.t)
-            for v in (moved.found[k],)
+            for v in (moved.vortices[k],)
         ]
         out += [
             f"Vortices, in the rotating frame; turned: positive anticlockwise, {AXES}",
@@ -424,7 +426,7 @@ def _write_numbers(
         "checks": found,
     }
     if moved is not None:
-        numbers |= {"vortices": [len(v.charges) for v in moved.found], "turned_rad": moved.angle}
+        numbers |= {"vortices": [len(v.charges) for v in moved.vortices], "turned_rad": moved.angle}
     arguments = {"h": made.quench.step, "t_end": made.quench.t_end}
     _say(args, write_json(args.json, document(f"gpe {args.task}", arguments, **numbers)))
 

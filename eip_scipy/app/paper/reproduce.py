@@ -293,15 +293,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace, judge: Callable[[], Any] = lambda: None) -> int:
+def run(args: argparse.Namespace, peer: Callable[[], Any] = lambda: None) -> int:
     """Print the tables and figures' numbers, write them where that is asked for, and return the exit status.
 
     Parameters
     ----------
     args : argparse.Namespace
         With `table` (list of str), `out`, `json` and `quiet`.
-    judge : callable, optional
-        ``judge()`` finds REBOUND's integrators or returns None; called for the solar figures only.
+    peer : callable, optional
+        ``peer()`` finds REBOUND's integrators or returns None; called for the solar figures only.
 
     Returns
     -------
@@ -326,7 +326,7 @@ def run(args: argparse.Namespace, judge: Callable[[], Any] = lambda: None) -> in
         if name in FIGURES:
             if not args.quiet and name != wanted[0]:
                 report.say()
-            worse, content[name] = _figure(name, args, judge)
+            worse, content[name] = _figure(name, args, peer)
             status = max(status, worse)
     content["passed"] = status == 0
     if args.json is not None:
@@ -340,13 +340,13 @@ def _say_written(args: argparse.Namespace, written: list[Path]) -> None:
         report.say("\n".join(["", *(f"wrote {path}" for path in written)]))
 
 
-def _figure(name: str, args: argparse.Namespace, judge: Callable[[], Any]) -> tuple[int, dict[str, Any]]:
+def _figure(name: str, args: argparse.Namespace, peer: Callable[[], Any]) -> tuple[int, dict[str, Any]]:
     """Make one of the paper's figures; exit status and content of the JSON."""
     if name == "fig-kepler":
         return _kepler(args)
     if name == "fig-efficiency":
         return _efficiency(args)
-    return _solar(args, judge) if name == "fig-solar" else _particle(name, args)
+    return _solar(args, peer) if name == "fig-solar" else _particle(name, args)
 
 
 def _kepler(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
@@ -383,7 +383,7 @@ def _particle(name: str, args: argparse.Namespace) -> tuple[int, dict[str, Any]]
     return 0 if content["passed"] else 1, content
 
 
-def _solar(args: argparse.Namespace, judge: Callable[[], Any]) -> tuple[int, dict[str, Any]]:
+def _solar(args: argparse.Namespace, peer: Callable[[], Any]) -> tuple[int, dict[str, Any]]:
     """Make the figures of Experiment II by the command ``solar-system``; exit status and content of the JSON."""
     parser = argparse.ArgumentParser()
     solar_system.add_arguments(parser)
@@ -391,7 +391,7 @@ def _solar(args: argparse.Namespace, judge: Callable[[], Any]) -> tuple[int, dic
     own.out, own.quiet = Path("." if args.out is None else args.out), args.quiet
     own.json = own.out / "solar-system.json"
     own.json.unlink(missing_ok=True)  # one that is there afterwards is of this run
-    status = solar_system.run(own, judge())
+    status = solar_system.run(own, peer())
     return status, json.loads(own.json.read_text(encoding="utf-8")) if own.json.exists() else {}
 
 

@@ -18,7 +18,7 @@ from ..work_precision import Runner, work_precision
 from .runs import (
     HIGH_ORDER,
     KEPT,
-    Judge,
+    Peer,
     SolarScene,
     eip_name,
     leapfrog,
@@ -117,7 +117,7 @@ def by_method(runs: Sequence[TimedRun]) -> dict[str, dict[str, list[float]]]:
 def cost(
     scene: SolarScene,
     methods: Mapping[str, tuple[Runner, Sequence[float]]],
-    judge: Judge | None,
+    peer: Peer | None,
     callback: Callable[[], Any] | None = None,
 ) -> list[TimedRun]:
     """Final position errors against the time of the run, for several methods and steps.
@@ -128,7 +128,7 @@ def cost(
         Of the span to be timed.
     methods : mapping
         From `cost_methods`.
-    judge : callable or None
+    peer : callable or None
         REBOUND, if it is there.
     callback : callable, optional
         ``callback()`` after each run; there are `REPEATS` of each method and step.
@@ -139,14 +139,14 @@ def cost(
     """
     truth = stored_state(scene, scene.years)
     if truth is None:
-        truth = (tight_run(scene, False) if judge is None else rebound_run(scene, judge, "IAS15", "ias15", 1, False)).y[
+        truth = (tight_run(scene, False) if peer is None else rebound_run(scene, peer, "IAS15", "ias15", 1, False)).y[
             :, -1
         ]
     return timed(methods, truth, repeats=REPEATS, callback=callback)
 
 
 def cost_methods(
-    scene: SolarScene, method: type[EIPSolver], metric: str, judge: Judge | None
+    scene: SolarScene, method: type[EIPSolver], metric: str, peer: Peer | None
 ) -> dict[str, tuple[Runner, Sequence[float]]]:
     """List what `cost` times, with the steps.
 
@@ -156,7 +156,7 @@ def cost_methods(
     method : type
         With its projection, and without; and beside it EIPRK5 (EIPRK4 beside EIPRK5) and EIPRKN12.
     metric : {"error", "euclidean"}
-    judge : callable or None
+    peer : callable or None
 
     Returns
     -------
@@ -173,13 +173,13 @@ def cost_methods(
         "SV": (partial(_time_verlet, scene), _steps(scene, [scene.h * f for f in (2, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)])),
         HIGH_ORDER: (partial(_time_eip, scene, EIPRKN12, KEPT), _steps(scene, [1 / n for n in (24, 32, 40, 48, 64)])),
     }
-    if judge is None:
+    if peer is None:
         return methods
     days = _steps(scene, [d / YEAR_D for d in (10.0, 5.0, 2.5, 1.25)])
-    methods["WHFast"] = (partial(_time_rebound, scene, judge, "whfast"), days)
-    methods["WHFast (c17)"] = (partial(_time_rebound, scene, judge, "whfast-c17"), days)
+    methods["WHFast"] = (partial(_time_rebound, scene, peer, "whfast"), days)
+    methods["WHFast (c17)"] = (partial(_time_rebound, scene, peer, "whfast-c17"), days)
     if stored_state(scene, scene.years) is not None:  # otherwise it is the reference
-        methods["IAS15"] = (partial(_time_rebound, scene, judge, "ias15"), [scene.years])
+        methods["IAS15"] = (partial(_time_rebound, scene, peer, "ias15"), [scene.years])
     return methods
 
 
@@ -201,7 +201,7 @@ def _time_verlet(scene: SolarScene, step: float) -> tuple[float, np.ndarray]:
     return result.wall_time, result.y[:, -1]
 
 
-def _time_rebound(scene: SolarScene, judge: Judge, integrator: str, step: float) -> tuple[float, np.ndarray]:
+def _time_rebound(scene: SolarScene, peer: Peer, integrator: str, step: float) -> tuple[float, np.ndarray]:
     n_steps = whole_number(scene.years / step)
-    result = judge(scene.problem.params, scene.problem.y0, integrator, h=scene.years / n_steps, n_steps=n_steps)
+    result = peer(scene.problem.params, scene.problem.y0, integrator, h=scene.years / n_steps, n_steps=n_steps)
     return result.wall_time, result.y[:, -1]

@@ -27,7 +27,7 @@ from ..report import (
 )
 from ..work_precision import Runner, cost_to_reach
 from .cost import MERCURY, TimedRun, by_method, timed
-from .runs import KEPT, Judge, whole_number
+from .runs import KEPT, Peer, whole_number
 
 __all__ = ["measure", "methods", "run"]
 
@@ -37,7 +37,7 @@ PATIENCE = 30.0  # a run of so many seconds is not repeated
 LEVELS = (1e-6, 1e-7, 1e-8, 1e-9)
 
 
-def methods(problem: Problem, years: float, judge: Judge | None, heyoka: Judge | None) -> dict[str, Any]:
+def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | None) -> dict[str, Any]:
     """List what is timed, with steps in years or tolerances.
 
     Parameters
@@ -45,7 +45,7 @@ def methods(problem: Problem, years: float, judge: Judge | None, heyoka: Judge |
     problem : Problem
         The ten bodies, in AU and years.
     years : float
-    judge, heyoka : callable or None
+    peer, heyoka : callable or None
         ``run`` of the integrations, where they are installed.
 
     Returns
@@ -66,15 +66,15 @@ def methods(problem: Problem, years: float, judge: Judge | None, heyoka: Judge |
         "EIPRK4": own(EIPRK4, 1 / 500, 1 / 1000),
         "SV": (partial(_verlet, problem, years), _dividing(years, [1 / 500, 1 / 1000, 1 / 2000])),
     }
-    if judge is not None:
+    if peer is not None:
 
         def peer(name: str, *days: float) -> tuple[Runner, Sequence[float]]:
-            return partial(_rebound, judge, problem, years, name), _dividing(years, [d / YEAR_D for d in days])
+            return partial(_rebound, peer, problem, years, name), _dividing(years, [d / YEAR_D for d in days])
 
         found |= {
             "WHFast (c17)": peer("whfast-c17", 10, 5, 3, 2, 1.4, 1, 0.7305),
             "SABA(10,6,4)": peer("saba(10,6,4)", 20, 15, 10, 7.5, 5, 3),
-            "IAS15": (partial(_ias15, judge, problem, years), [math.nan]),
+            "IAS15": (partial(_ias15, peer, problem, years), [math.nan]),
         }
     if heyoka is not None:
         found["heyoka (double)"] = partial(_heyoka, heyoka, problem, years), [1e-9, 1e-11, 1e-13, 2.2e-16]
@@ -82,7 +82,7 @@ def methods(problem: Problem, years: float, judge: Judge | None, heyoka: Judge |
 
 
 def measure(
-    years: float, judge: Judge | None, heyoka: Judge | None, callback: Callable[[], Any] | None = None
+    years: float, peer: Peer | None, heyoka: Peer | None, callback: Callable[[], Any] | None = None
 ) -> list[TimedRun]:
     """Run and time all methods.
 
@@ -98,7 +98,7 @@ def measure(
     assert problem.reference is not None
     truth = problem.reference(years)
     assert truth is not None
-    found = methods(problem, years, judge, heyoka)
+    found = methods(problem, years, peer, heyoka)
     return timed(found, truth, repeats=REPEATS, enough_seconds=PATIENCE, callback=callback)
 
 
@@ -121,17 +121,17 @@ def _verlet(problem: Problem, years: float, step: float) -> tuple[float, np.ndar
     return result.wall_time, result.y[:, -1]
 
 
-def _rebound(judge: Judge, problem: Problem, years: float, name: str, step: float) -> tuple[float, np.ndarray]:
+def _rebound(peer: Peer, problem: Problem, years: float, name: str, step: float) -> tuple[float, np.ndarray]:
     n_steps = whole_number(years / step)
-    result = judge(problem.params, problem.y0, name, h=years / n_steps, n_steps=n_steps)
+    result = peer(problem.params, problem.y0, name, h=years / n_steps, n_steps=n_steps)
     return result.wall_time, result.y[:, -1]
 
 
-def _ias15(judge: Judge, problem: Problem, years: float, step: float) -> tuple[float, np.ndarray]:
-    return _rebound(judge, problem, years, "ias15", years)
+def _ias15(peer: Peer, problem: Problem, years: float, step: float) -> tuple[float, np.ndarray]:
+    return _rebound(peer, problem, years, "ias15", years)
 
 
-def _heyoka(peer: Judge, problem: Problem, years: float, tolerance: float) -> tuple[float, np.ndarray]:
+def _heyoka(peer: Peer, problem: Problem, years: float, tolerance: float) -> tuple[float, np.ndarray]:
     result = peer(problem.params, problem.y0, t_end=years, tolerance=tolerance)
     return result.wall_time, result.y
 
@@ -190,14 +190,14 @@ def rows(runs: Sequence[TimedRun]) -> list[dict[str, Any]]:
     ]
 
 
-def run(args: argparse.Namespace, judge: Judge | None, heyoka: Judge | None) -> int:
+def run(args: argparse.Namespace, peer: Peer | None, heyoka: Peer | None) -> int:
     """Run the command.
 
     Parameters
     ----------
     args : argparse.Namespace
         With ``years``, ``out``, ``json`` (Path or None) and ``quiet``.
-    judge, heyoka : callable or None
+    peer, heyoka : callable or None
         ``run`` of `eip_scipy.integrations.rebound` and of `eip_scipy.integrations.heyoka`.
 
     Returns
@@ -216,10 +216,10 @@ def run(args: argparse.Namespace, judge: Judge | None, heyoka: Judge | None) -> 
     if args.data not in (None, "de440") or args.epoch is not None:
         raise UsageError(f"--frontier has reference states for --data de440 only, got {args.data or args.epoch!r}")
     check_outputs(args.out, args.json)
-    points = sum(len(steps) for _, steps in methods(solar_system(years=1.0), 1.0, judge, heyoka).values())
+    points = sum(len(steps) for _, steps in methods(solar_system(years=1.0), 1.0, peer, heyoka).values())
     try:
         with tqdm(total=REPEATS * points, desc="frontier", unit="run", disable=args.quiet, leave=False) as bar:
-            runs = measure(args.years, judge, heyoka, bar.update)
+            runs = measure(args.years, peer, heyoka, bar.update)
     except ValueError as error:
         raise UsageError(str(error)) from error
     except KeyboardInterrupt:

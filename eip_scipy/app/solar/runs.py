@@ -1,6 +1,6 @@
 """The solar system run by several methods: the scene that they share, the runs, and their states.
 
-Nothing is printed or written here. REBOUND comes in as a function (`Judge`), so that this module needs no extra.
+Nothing is printed or written here. REBOUND comes in as a function (`Peer`), so that this module needs no extra.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ __all__ = [
     "HIGH_ORDER",
     "KEPT",
     "TIGHT",
-    "Judge",
     "MethodRun",
+    "Peer",
     "PendingRun",
     "SolarScene",
     "eip_name",
@@ -42,7 +42,7 @@ __all__ = [
     "whole_number",
 ]
 
-Judge = Callable[..., Any]
+Peer = Callable[..., Any]
 """`eip_scipy.integrations.rebound.run`."""
 
 WHFAST_DAYS = 5.0
@@ -174,8 +174,8 @@ def plan(
     scene: SolarScene,
     method: type[EIPSolver],
     metric: str,
-    judge: Judge | None,
-    kept: Callable[[str], dict[str, Any]] = lambda name: {},
+    peer: Peer | None,
+    checkpoint_of: Callable[[str], dict[str, Any]] = lambda name: {},
 ) -> list[PendingRun]:
     """List the runs of the comparison: first the method asked for, last the tightest, which serves as reference.
 
@@ -185,10 +185,10 @@ def plan(
     method : type
         `EIPRK1` ... `EIPRK5` or another fixed-step class.
     metric : {"error", "euclidean"}
-    judge : callable or None
+    peer : callable or None
         REBOUND, if it is there.
-    kept : callable, optional
-        ``kept(name)``: the options of `integrate` that keep checkpoints of the run of that name.
+    checkpoint_of : callable, optional
+        ``checkpoint_of(name)``: the options of `integrate` that keep checkpoints of the run of that name.
 
     Returns
     -------
@@ -198,22 +198,24 @@ def plan(
     ordered = sorted(metrics, key=lambda m: m != metric_of(method, metric))
     names = [eip_name(method, m) for m in ordered]
     tasks = [
-        PendingRun(name, partial(_eip, scene, method, m, **kept(name)), True)
+        PendingRun(name, partial(_eip, scene, method, m, **checkpoint_of(name)), True)
         for name, m in zip(names, ordered, strict=True)
     ]
     name = method.TABLEAU.name
-    tasks.append(PendingRun(name, partial(_plain, scene, method, **kept(name)), True))
+    tasks.append(PendingRun(name, partial(_plain, scene, method, **checkpoint_of(name)), True))
     tasks.append(PendingRun("SV", lambda progress: _verlet(scene), False))
     tasks.append(
-        PendingRun(HIGH_ORDER, partial(_high_order, scene, HIGH_ORDER, "every 10", 1, **kept(HIGH_ORDER)), True)
+        PendingRun(
+            HIGH_ORDER, partial(_high_order, scene, HIGH_ORDER, "every 10", 1, **checkpoint_of(HIGH_ORDER)), True
+        )
     )
-    if judge is None:
-        tasks.append(PendingRun(TIGHT, partial(tight_run, scene, **kept(TIGHT)), True))
+    if peer is None:
+        tasks.append(PendingRun(TIGHT, partial(tight_run, scene, **checkpoint_of(TIGHT)), True))
         return tasks
     per_save = max(1, round(scene.interval * YEAR_D / WHFAST_DAYS))
     for name, integrator, steps in (("WHFast", "whfast", per_save), ("WHFast (c17)", "whfast-c17", per_save)):
-        tasks.append(PendingRun(name, partial(rebound_run, scene, judge, name, integrator, steps), False))
-    tasks.append(PendingRun("IAS15", partial(rebound_run, scene, judge, "IAS15", "ias15", 1), False))
+        tasks.append(PendingRun(name, partial(rebound_run, scene, peer, name, integrator, steps), False))
+    tasks.append(PendingRun("IAS15", partial(rebound_run, scene, peer, "IAS15", "ias15", 1), False))
     return tasks
 
 
@@ -227,29 +229,39 @@ def eip_name(method: type[EIPSolver], metric: str) -> str:
     return f"{method.__name__} ({metric})"
 
 
-def _eip(scene: SolarScene, method: type[EIPSolver], metric: str, progress: bool, **kept: Any) -> MethodRun:
+def _eip(scene: SolarScene, method: type[EIPSolver], metric: str, progress: bool, **checkpoint: Any) -> MethodRun:
     name = eip_name(method, metric)
     head = (method.__name__, "euclid." if metric == "euclidean" else metric)
     result = integrate(
-        scene.problem, method=named(method, name), metric=metric, save_every=scene.every, progress=progress, **kept
+        scene.problem,
+        method=named(method, name),
+        metric=metric,
+        save_every=scene.every,
+        progress=progress,
+        **checkpoint,
     )
     return _finished(scene, name, head, scene.h, result, "" if result.success else result.message)
 
 
-def _plain(scene: SolarScene, method: type[EIPSolver], progress: bool, **kept: Any) -> MethodRun:
+def _plain(scene: SolarScene, method: type[EIPSolver], progress: bool, **checkpoint: Any) -> MethodRun:
     name = method.TABLEAU.name
     result = integrate(
-        scene.problem, method=named(method, name), invariants=(), save_every=scene.every, progress=progress, **kept
+        scene.problem,
+        method=named(method, name),
+        invariants=(),
+        save_every=scene.every,
+        progress=progress,
+        **checkpoint,
     )
     return _finished(scene, name, (name, "alone"), scene.h, result, "" if result.success else result.message)
 
 
-def tight_run(scene: SolarScene, progress: bool, **kept: Any) -> MethodRun:
+def tight_run(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
     """Run the tightest at hand without REBOUND: the method of order 12 with half of its step."""
-    return _high_order(scene, TIGHT, "tight", 2, progress, **kept)
+    return _high_order(scene, TIGHT, "tight", 2, progress, **checkpoint)
 
 
-def _high_order(scene: SolarScene, name: str, word: str, shorter: int, progress: bool, **kept: Any) -> MethodRun:
+def _high_order(scene: SolarScene, name: str, word: str, shorter: int, progress: bool, **checkpoint: Any) -> MethodRun:
     """Run the method for small errors over long times, its step divided by `shorter`."""
     per_save = shorter * whole_number(scene.interval / HIGH_ORDER_STEP)
     step = scene.interval / per_save
@@ -260,7 +272,7 @@ def _high_order(scene: SolarScene, name: str, word: str, shorter: int, progress:
         save_every=per_save,
         progress=progress,
         **KEPT,
-        **kept,
+        **checkpoint,
     )
     return _finished(scene, name, ("EIPRKN12", word), step, result, "" if result.success else result.message)
 
@@ -278,12 +290,10 @@ def leapfrog(scene: SolarScene, step: float, save_every: int | None) -> StormerV
     return stormer_verlet(problem.acc, problem.t_span, problem.y0, step, params=problem.params, save_every=save_every)
 
 
-def rebound_run(
-    scene: SolarScene, judge: Judge, name: str, integrator: str, per_save: int, progress: bool
-) -> MethodRun:
+def rebound_run(scene: SolarScene, peer: Peer, name: str, integrator: str, per_save: int, progress: bool) -> MethodRun:
     """Run REBOUND; with fixed steps timed in a run without saves, each of which costs a synchronisation."""
     step = scene.interval / per_save
-    run = partial(judge, scene.problem.params, scene.problem.y0, integrator, h=step, n_steps=scene.n_saves * per_save)
+    run = partial(peer, scene.problem.params, scene.problem.y0, integrator, h=step, n_steps=scene.n_saves * per_save)
     result = run(save_every=per_save)
     fixed = integrator != "ias15"
     wall_time = run().wall_time if fixed else result.wall_time

@@ -18,7 +18,7 @@ from . import truth as solar_truth
 from .cost import REPEATS, cost, cost_methods
 from .errors import SolarStudy
 from .report import cost_rows, csv_rows, json_content, text
-from .runs import Judge, make_scene, plan
+from .runs import Peer, make_scene, plan
 
 __all__ = ["add_arguments", "fixed_step_methods", "run"]
 
@@ -68,14 +68,14 @@ def _span(text: str) -> float:
     return -positive(text[1:]) if text.startswith("-") else positive(text)
 
 
-def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ephemeris | None = None) -> int:
+def run(args: argparse.Namespace, peer: Peer | None, ephemeris: solar_epoch.Ephemeris | None = None) -> int:
     """Run the command.
 
     Parameters
     ----------
     args : argparse.Namespace
         Options of `add_arguments`, and ``out``, ``json`` (Path or None) and ``quiet``.
-    judge : callable or None
+    peer : callable or None
         `eip_scipy.integrations.rebound.run`, None without REBOUND.
     ephemeris : callable, optional
         `eip_scipy.integrations.jpl.initial_data`, for ``--epoch``.
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ep
     except ValueError as error:
         raise UsageError(str(error)) from error
     check_outputs(args.out, args.json)
-    interrupted = _integrate(study, args, judge)
+    interrupted = _integrate(study, args, peer)
     if interrupted:
         long_runs.tell_how_to_resume(args)
     if not study.runs:
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ep
         warn("interrupted; the runs that were done are in the table and the files")
         return INTERRUPTED
     try:
-        _time_methods(study, args, judge)
+        _time_methods(study, args, peer)
         _write_numbers(study, args)
     except KeyboardInterrupt:
         warn("interrupted; the table is complete, error against cost and the figures are missing")
@@ -126,9 +126,11 @@ def run(args: argparse.Namespace, judge: Judge | None, ephemeris: solar_epoch.Ep
     return status
 
 
-def _integrate(study: SolarStudy, args: argparse.Namespace, judge: Judge | None) -> bool:
+def _integrate(study: SolarStudy, args: argparse.Namespace, peer: Peer | None) -> bool:
     """Do the runs one by one; True if the user interrupted them."""
-    tasks = plan(study.scene, fixed_step_methods()[args.method], args.metric, judge, partial(long_runs.kept, args))
+    tasks = plan(
+        study.scene, fixed_step_methods()[args.method], args.metric, peer, partial(long_runs.checkpoint_options, args)
+    )
     try:
         for task in tasks:
             with _waiting(task.name, shown=not (args.quiet or task.has_bar)):
@@ -151,15 +153,15 @@ def _waiting(label: str, *, shown: bool) -> Iterator[None]:
         bar.update()
 
 
-def _time_methods(study: SolarStudy, args: argparse.Namespace, judge: Judge | None) -> None:
+def _time_methods(study: SolarStudy, args: argparse.Namespace, peer: Peer | None) -> None:
     from tqdm import tqdm
 
     years = min(study.scene.years, COST_YEARS)
     scene = study.scene if years == study.scene.years else make_scene(study.scene.data, years, min(args.h, years))
-    methods = cost_methods(scene, fixed_step_methods()[args.method], args.metric, judge)
+    methods = cost_methods(scene, fixed_step_methods()[args.method], args.metric, peer)
     total = REPEATS * sum(len(steps) for _, steps in methods.values())
     with tqdm(total=total, desc="error against cost", unit="run", disable=args.quiet) as bar:
-        study.cost = cost(scene, methods, judge, bar.update)
+        study.cost = cost(scene, methods, peer, bar.update)
     study.cost_scene = scene
 
 
