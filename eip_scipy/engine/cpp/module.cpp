@@ -361,7 +361,7 @@ Code stepped(Engine *self, Call call) {
     Code code = OK;
     bool broken = false;
     try {
-        if (d.work.m == 4 && !python) {
+        if (d.work.n == 4 && d.work.m == 4 && !python) {
             const Sized<4> work(d.work);
             RunOf<Sized<4>> run{d.method, d.options, work, d.system, nullptr};
             code = call(run);

@@ -154,7 +154,7 @@ struct RunOf {
 
 using Run = RunOf<Work>;
 
-// Short states take most of their time in loops' beginnings and ends.
+// A short real state, most of whose time goes into loops' beginnings and ends.
 template <int64_t M>
 struct Sized : Work {
     explicit Sized(const Work &w) : Work(w) {}
