@@ -62,7 +62,7 @@ def compiled_functions(
         The right-hand side, of the `form` "value", "in place", "acceleration" or "acceleration in place".
     form : str
     params : ndarray or None
-        Their last argument, where they take one.
+        Their last argument, where they take one; the functions read this array.
     invariants : InvariantSet
     events : sequence of callable
     y0 : ndarray, shape (n,)
@@ -93,7 +93,7 @@ def compiled_functions(
         inv=_addresses(inv),
         grad=_addresses(grad),
         event=_addresses(event),
-        params=np.zeros(0) if params is None else np.array(params, dtype=float),
+        params=np.zeros(0) if params is None else params,  # itself: an ensemble writes each member's there
         second_order=second_order,
         owner={"rhs": [rhs], "inv": inv, "grad": grad, "event": event},
     )
