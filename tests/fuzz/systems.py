@@ -206,7 +206,8 @@ def told(runs: Runs) -> Iterator[str]:
         record = run.diagnostics
         doubts = [str(w.message) for w in warned if issubclass(w.category, ProjectionWarning)]
         early = [w for w in warned if NO_INVARIANT in str(w.message)]
-        # A solver does not see that an event has ended its run: what all corrections say together is in the diagnostics.
+        # A solver does not see that an event has ended its run: what all corrections say together stands in the
+        # diagnostics.
         unseen = name == "solve_ivp" and run.status == 1 and not record.trusted
         if record.trusted != (run.status >= 0 and not doubts and not early) and not unseen:
             yield (
