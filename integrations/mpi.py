@@ -23,7 +23,7 @@ from eip_scipy.core.solvers import EIPSolver
 from eip_scipy.engine import kernels as kn
 from eip_scipy.engine.data import NOT_FINITE, OK, make_work
 from eip_scipy.engine.joint import project_jointly
-from eip_scipy.engine.native import Engine, PythonFunctions
+from eip_scipy.engine.native import Engine
 from eip_scipy.engine.step import advance_raw, look_back, project_step
 from eip_scipy.engine.sums import abs_dot, dot
 
@@ -212,9 +212,8 @@ class _OverRanks(EIPSolver):
         run = self._run
         self._coordinates = _Coordinates(self.COMM, run, self._rhs)
 
-    def _make_engine(self) -> Engine:
-        functions = PythonFunctions(self._call, *self._run.invariants.calls, (), second_order=False)
-        return self._run.engine(functions, self._schedule, raw=self._raw_step, finish=self._finish)
+    def _make_engine(self, raw: Any = None) -> Engine:
+        return super()._make_engine(raw or self._raw_step)
 
     def _step_impl(self) -> tuple[bool, str | None]:
         with together(self.COMM):

@@ -156,9 +156,9 @@ class EIPSolver(OdeSolver):
             self._schedule = bare_schedule(stepping.span, float(self.h_abs or 0.0))
             self._engine = self._make_engine()
 
-    def _make_engine(self) -> Engine:
+    def _make_engine(self, raw: Any = None) -> Engine:
         functions = PythonFunctions(self._call, *self._run.invariants.calls, (), second_order=False)
-        return self._run.engine(functions, self._schedule, finish=self._finish if self._finishes else None)
+        return self._run.engine(functions, self._schedule, raw, self._finish if self._finishes else None)
 
     @property
     def _finishes(self) -> bool:
@@ -313,15 +313,18 @@ def _checked(
     def convert(f: Any, t: float) -> np.ndarray:
         return np.array(setup.as_derivative(f, n, dtype, t), dtype, order="C")
 
-    def derivative(t: float, y: np.ndarray) -> np.ndarray:
-        calls[0] += 1
+    def checked(t: float, y: np.ndarray) -> np.ndarray:
         f = called(t, y.copy())
         if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
             return f
         return convert(f, t)
 
+    def derivative(t: float, y: np.ndarray) -> np.ndarray:
+        calls[0] += 1
+        return checked(t, y)
+
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: Any) -> None:
-        out[:] = convert(called(t, y.copy()), t)
+        out[:] = checked(t, y)
 
     return derivative, rhs, Call(called, (), shape, convert)
 
