@@ -151,6 +151,8 @@ class IntegrationResult(OptimizeResult):
     diagnostics : Diagnostics
     t_events, y_events : list of ndarray or None
         As in `scipy.integrate.solve_ivp`.
+    sol : OdeSolution or None
+        Likewise: the run as a function of time, with ``dense_output=True``.
     nfev, njev, nlu : int
         Evaluations of the right-hand side and of the invariants' gradients, and factorisations.
     status : int

@@ -18,7 +18,7 @@ from ..engine.trust import ProjectionWarning
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
 from . import setup
-from .dense import End, ExactEnds, dense_output
+from .dense import ExactEnds, Interpolants
 from .inputs import refuse_units
 from .invariants import as_invariants
 from .names import nearest
@@ -149,8 +149,9 @@ class EIPSolver(OdeSolver):
         self.y, self.f = run.y0, f0
         self._work.counters[NFEV] = self._calls[0]
         self._count()
-        self.y_old, self.f_old = self.y, self.f
+        self.y_old = self.y
         self._noted, self._told = 0, False
+        self._interpolants: Interpolants | None = None
         if self._scipy is None:
             self._work.K[0] = f0
             self._schedule = bare_schedule(stepping.span, float(self.h_abs or 0.0))
@@ -217,7 +218,7 @@ class EIPSolver(OdeSolver):
             run.trust.failed = True
             return False, setup.failure(status, run, self._schedule.clock)
         self._k += 1
-        self.y_old, self.f_old = self.y, self.f
+        self.y_old = self.y
         self.y, self.t, self.f = y_new, t, f_new
         if self._finishes:
             self.y = self._accepted
@@ -279,8 +280,9 @@ class EIPSolver(OdeSolver):
             out = ExactEnds(self._scipy.dense_output(), self.y_old, self.y)
             self.nfev = self._calls[0]
             return out
-        old, new = End(self.t_old, self.y_old, self.f_old), End(self.t, self.y, self.f)
-        out = dense_output(self._rhs, self._run, self.TABLEAU, old, new)
+        if self._interpolants is None:
+            self._interpolants = Interpolants(self._run, self.TABLEAU, self._engine)
+        out = self._interpolants.over(self.t_old, self.y_old, self.t, self.y)
         self._count()
         return out
 

@@ -11,7 +11,9 @@ from .trust import N_FIGURES, TERMS
 
 # Codes of a step; those of the loop.
 OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED = range(5)
-PAUSE, FULL = 10, 11
+PAUSE, FULL, ENDED = 10, 11, 12
+# Interpolants of dense output.
+CUBIC, QUINTIC, POLYNOMIAL, SEVENTH = range(4)
 
 EPS = 2.220446049250313e-16
 # Dead band in roundings of an invariant's terms; where the state's own roundings are carried, the values' remain.
@@ -251,3 +253,30 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
         counters=np.zeros(N_COUNTERS, np.int64),
         inner=make_inner(n_invariants),
     )
+
+
+class Dense(NamedTuple):
+    """What dense output is made with, and what the loop samples by it.
+
+    `weights` are rows over the stages, of a tableau's own polynomial or of DOP853's, which has further stages, A and c.
+    `own_slopes`: the steps leave no f at their ends. `by_travel`: corrections are weighed by what each block travels
+    within the step, else by the run's weights. `missed`: how many states were left unprojected, and the time of the
+    first. `event`, `t`, `y`: roots of events that the loop has found, ``counts[0]`` of them; ``counts[1]`` interpolants
+    are kept. `left`: how often each event may still happen before it ends the run.
+    """
+
+    kind: int
+    weights: np.ndarray
+    A: np.ndarray
+    c: np.ndarray
+    own_slopes: bool
+    by_travel: bool
+    options: Options
+    work: Work
+    missed: np.ndarray
+    piece: np.ndarray
+    event: np.ndarray
+    t: np.ndarray
+    y: np.ndarray
+    counts: np.ndarray
+    left: np.ndarray

@@ -331,7 +331,7 @@ def _store(loop: Loop, k: int, status: int, message: str, out: Members) -> None:
     driver, work = loop.driver, loop.driver.run.work
     t, y = driver.now
     if status == 1:
-        t, y = loop.events.last or (t, y)
+        t, y = loop.events.last
     out.y[k], out.t[k] = y, t
     out.max_defect[k] = work.max_defect
     out.counters[k] = work.counters

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from scipy.integrate import DenseOutput, OdeSolution
 
-from ..core.dense import End, ManifoldDenseOutput, dense_output
+from ..core.dense import Interpolants, ManifoldDenseOutput, solution
 from ..core.jitted import ChangedShapeError
 from ..core.setup import Run
 from ..core.stepping import UNBOUNDED, AnyMethod
 from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
+from .events import Events
 
 __all__ = ["Driver", "check_memory", "saved_rows"]
 
@@ -22,13 +24,23 @@ FIRST_ROWS = 1024
 
 
 class Driver:
-    """One run: its functions, buffers and the rows saved so far."""
+    """One run: its functions, buffers and the rows saved so far; `keeps_steps`: their interpolants too."""
 
     def __init__(
-        self, run: Run, schedule: Schedule, functions: PythonFunctions | NativeFunctions, params: np.ndarray
+        self,
+        run: Run,
+        schedule: Schedule,
+        functions: PythonFunctions | NativeFunctions,
+        params: np.ndarray,
+        *,
+        tableau: AnyMethod,
+        events: Events,
+        keeps_steps: bool,
+        max_bytes: float,
     ) -> None:
-        self.run, self.schedule, self.params = run, schedule, params
+        self.run, self.schedule, self.params, self._events = run, schedule, params, events
         self.functions: Any = functions
+        self._max_bytes = max_bytes
         rows = saved_rows(schedule) or FIRST_ROWS
         n, dtype = run.y0.size, run.y0.dtype
         # One row to spare for the last state of a run that ends early.
@@ -37,11 +49,23 @@ class Driver:
         self.state = run.y0.copy()
         self.new = np.empty_like(self.state)
         self.engine = run.engine(functions, schedule)
+        self._interpolants = None
+        self._pieces = np.empty((0, 0))
+        if schedule.t_eval.size or schedule.g.size or keeps_steps:
+            self._interpolants = Interpolants(run, tableau, self.engine, schedule.g.size)
+            self._pieces = self._more_pieces(expected_steps(schedule) or FIRST_ROWS if keeps_steps else 0)
 
     def advance(self, k_end: int) -> int:
         """Step on to step `k_end`, or to what stops the loop before it; returns the loop's code."""
-        with self._own_errors():
-            return int(self.engine.advance(k_end, self.state, self.new, self.t, self.y))
+        interpolants = self._interpolants
+        if interpolants is not None:
+            interpolants.record.left[:] = self._events.left
+        try:
+            with self._own_errors():
+                return int(self.engine.advance(k_end, self.state, self.new, self.t, self.y, self._pieces))
+        finally:
+            if interpolants is not None:
+                self._events.take(*interpolants.roots())
 
     @contextmanager
     def _own_errors(self) -> Iterator[None]:
@@ -107,7 +131,7 @@ class Driver:
     def load(self, t: np.ndarray, y: np.ndarray, max_bytes: float) -> None:
         """Rows of a run that is resumed."""
         while self.t.size <= t.size:
-            self.grow(max_bytes)
+            self._more_rows(max_bytes)
         self.t[: t.size], self.y[: t.size] = t, y
 
     def save(self, t: float, y: np.ndarray) -> None:
@@ -133,24 +157,53 @@ class Driver:
         self.save(t, y)
 
     def grow(self, max_bytes: float) -> None:
-        """Room for twice as many rows.
+        """Room for twice as many rows, or interpolants, where there is none left.
 
         Raises
         ------
         MemoryError
             When they would need more than `max_bytes`.
         """
+        if self._kept and self._kept == len(self._pieces):
+            self._pieces = np.concatenate([self._pieces, self._more_pieces(self._kept)])
+        if self.rows + 2 > self.t.size:
+            self._more_rows(max_bytes)
+
+    def _more_rows(self, max_bytes: float) -> None:
         rows = 2 * self.t.size
         check_memory(rows, self.run, max_bytes)
         self.t = np.resize(self.t, rows)
         self.y = np.concatenate([self.y, np.empty_like(self.y)])
 
-    def dense(self, tableau: AnyMethod, rhs: Callable[..., None]) -> ManifoldDenseOutput:
+    def _more_pieces(self, count: int) -> np.ndarray:
+        floats = 0 if self._interpolants is None else self._interpolants.floats
+        require_memory((self._kept + count) * 8.0 * floats, "dense_output=True", self._max_bytes, "use t_eval")
+        return np.empty((count, floats))
+
+    @property
+    def _kept(self) -> int:
+        """Interpolants kept so far."""
+        return 0 if self._interpolants is None else int(self._interpolants.record.counts[1])
+
+    def dense(self) -> DenseOutput:
         """Dense output over the step that is pending."""
+        interpolants = self._interpolants
+        assert interpolants is not None  # the loop pauses for nothing else
+        if self._kept:
+            return ManifoldDenseOutput(interpolants, self._pieces[self._kept - 1])
         t_old, t = (float(self.schedule.clock[place]) for place in (TIME, TIME_NEW))
-        K = self.run.work.K
-        old, end = End(t_old, self.state, K[0].copy()), End(t, self.new, K[-1].copy())
-        return dense_output(rhs, self.run, tableau, old, end, self.params)
+        return interpolants.over(t_old, self.state, t, self.new)
+
+    def warn(self) -> None:
+        """Of states between steps that the loop could not project."""
+        if self._interpolants is not None:
+            self._interpolants.warn()
+
+    def solution(self, t_end: float) -> OdeSolution | None:
+        """Dense output over the whole run, where its steps are kept."""
+        if self._interpolants is None or not self._pieces.size:
+            return None
+        return solution(self._interpolants, self._pieces[: self._kept], t_end)
 
     def values(self) -> np.ndarray:
         """Invariants of the saved states, (l, m)."""
@@ -167,22 +220,29 @@ def saved_rows(schedule: Schedule) -> int:
         return schedule.t_eval.size
     if schedule.save_every == 0:
         return 2
-    if schedule.span.h == 0.0 or schedule.span.n_steps == UNBOUNDED:
-        return 0
-    return 1 + math.ceil(schedule.span.n_steps / schedule.save_every)
+    return 1 + math.ceil(steps / schedule.save_every) if (steps := expected_steps(schedule)) else 0
+
+
+def expected_steps(schedule: Schedule) -> int:
+    """Steps of a run; 0 where that is not known before."""
+    return 0 if schedule.span.h == 0.0 or schedule.span.n_steps == UNBOUNDED else schedule.span.n_steps
 
 
 def check_memory(rows: int, run: Run, max_bytes: float) -> None:
-    """Refuse to save more than fits.
+    """Refuse to save more than fits."""
+    needed = rows * (run.y0.nbytes + 8.0 * (1 + run.invariants.size))
+    require_memory(needed, f"saving {rows:.3g} states of {run.y0.size} components", max_bytes, "raise save_every")
+
+
+def require_memory(needed: float, what: str, max_bytes: float, mend: str) -> None:
+    """Refuse to keep more than fits.
 
     Raises
     ------
     MemoryError
         With the number of bytes and what to do.
     """
-    needed = rows * (run.y0.nbytes + 8 * (1 + run.invariants.size))
     if needed > max_bytes:
         raise MemoryError(
-            f"saving {rows:.3g} states of {run.y0.size} components needs {needed / 1e9:.3g} GB, the bound is "
-            f"{max_bytes / 1e9:.3g} GB; raise save_every (or max_bytes)."
+            f"{what} needs {needed / 1e9:.3g} GB, the bound is {max_bytes / 1e9:.3g} GB; {mend} (or max_bytes)."
         )

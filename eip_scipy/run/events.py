@@ -45,7 +45,7 @@ class Events:
         self._counts = [0] * len(items)
         self.t: list[list[float]] = [[] for _ in items]
         self.y: list[list[np.ndarray]] = [[] for _ in items]
-        self.last: tuple[float, np.ndarray] | None = None
+        self.last: tuple[float, np.ndarray] = math.nan, np.zeros(0)
 
     @property
     def terminal(self) -> bool:
@@ -72,6 +72,22 @@ class Events:
         """Let event `k` have happened at the times `t` (m,) in the states `y` (m, n)."""
         self.t[k], self.y[k], self._counts[k] = t.tolist(), list(y), t.size
 
+    @property
+    def left(self) -> list[float]:
+        """Of each event how often it may still happen before it ends the run."""
+        return [allowed - count for allowed, count in zip(self._allowed, self._counts, strict=True)]
+
+    def take(self, which: np.ndarray, times: np.ndarray, states: np.ndarray) -> None:
+        """Events that the loop has found, in the order in which they happened."""
+        for k, t, y in zip(which.tolist(), times.tolist(), states, strict=True):
+            self._note(k, t, y.copy())
+
+    def _note(self, k: int, t: float, y: np.ndarray) -> None:
+        self._counts[k] += 1
+        self.t[k].append(t)
+        self.y[k].append(y)
+        self.last = t, y
+
     def fill(self, t: float, y: np.ndarray, values: np.ndarray, params: Any = None) -> None:
         """Values of all events."""
         for k in range(len(self.functions)):
@@ -83,12 +99,9 @@ class Events:
         rising, falling = up & (self.directions >= 0), down & (self.directions <= 0)
         active = np.flatnonzero(rising | falling)
         roots = [(self._root(int(k), sol), int(k)) for k in active]
-        roots.sort(reverse=bool(sol.t < sol.t_old))
+        roots.sort(key=lambda found: found[0], reverse=bool(sol.t < sol.t_old))
         for root, k in roots:
-            self._counts[k] += 1
-            self.t[k].append(root)
-            self.y[k].append(sol(root))
-            self.last = root, self.y[k][-1]
+            self._note(k, root, sol(root))
             if self._counts[k] >= self._allowed[k]:
                 return root
         return None

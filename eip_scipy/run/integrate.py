@@ -22,7 +22,7 @@ from ..core.results import Diagnostics, IntegrationResult
 from ..core.solvers import EIPSolver
 from ..core.stepping import UNBOUNDED
 from ..engine.counters import NFEV, NJEV, NLU
-from ..engine.data import FULL, OK, PAUSE, ROW, STEP, TIME, Schedule
+from ..engine.data import ENDED, FULL, OK, PAUSE, ROW, STEP, TIME, Schedule
 from ..engine.trust import ProjectionWarning
 from . import resume as _resume
 from .driver import Driver
@@ -36,8 +36,9 @@ FIRST_CHUNK = 64
 ARRIVED, STOPPED = "reached the end of the interval", "stopped by the callback"
 # Names that the projection's options stand beside, for hints.
 OWN = (
-    *("method", "h", "params", "in_place", "save_every", "t_eval", "events", "callback", "progress", "compiled"),
-    *("max_bytes", "checkpoint", "checkpoint_every", "resume", "diagnostics", "rtol", "atol", "first_step", "max_step"),
+    *("method", "h", "params", "in_place", "save_every", "t_eval", "events", "dense_output", "callback", "progress"),
+    *("compiled", "max_bytes", "checkpoint", "checkpoint_every", "resume", "diagnostics", "rtol", "atol"),
+    *("first_step", "max_step"),
 )
 
 
@@ -54,6 +55,7 @@ def integrate(
     save_every: int | None = None,
     t_eval: Any = None,
     events: Any = None,
+    dense_output: bool = False,
     callback: Callable[[float, np.ndarray, np.ndarray], Any] | None = None,
     progress: bool = False,
     compiled: bool | None = None,
@@ -102,6 +104,8 @@ def integrate(
     events : callable or sequence of callable, optional
         ``event(t, y[, params]) -> float``, with ``terminal`` and ``direction`` as for `scipy.integrate.solve_ivp`; in
         compiled runs Numba functions.
+    dense_output : bool, optional
+        Whether to keep the interpolants of all steps, as ``.sol``, a function of time; not with a checkpoint.
     callback : callable, optional
         ``callback(t, y, defects)`` at each saved point; return True to stop the run. With `save_every` the interval
         may then be endless, as with a terminal event.
@@ -180,6 +184,7 @@ def integrate(
         save_every=save_every,
         t_eval=t_eval,
         events=events,
+        dense_output=dense_output,
         callback=callback,
         progress=progress,
         compiled=compiled,
@@ -191,6 +196,8 @@ def integrate(
         max_step=max_step,
         projection=projection,
     )
+    if request.dense_output and checkpoint is not None:
+        raise ValueError("a checkpoint does not keep what dense_output=True needs; give t_eval or save_every instead.")
     keeping = _resume.keeping(checkpoint, checkpoint_every, resume)
     with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), keeping as keeper, _start_kept(request):
         return Loop(prepared(request), keeper).run()
@@ -212,11 +219,20 @@ class Loop:
         wanted = request.compiled if compiled is None else compiled
         with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
             functions, self.why_not = system.functions(run, wanted)
-            self.driver = Driver(run, prepared.schedule, functions, system.parameters)
+            self.driver = Driver(
+                run,
+                prepared.schedule,
+                functions,
+                system.parameters,
+                tableau=prepared.method,
+                events=system.events,
+                keeps_steps=request.dense_output,
+                max_bytes=prepared.max_bytes,
+            )
         keeper.begin(self.driver, self.events, self.max_bytes)
         self.wall_time = keeper.seconds
         self.chunk = FIRST_CHUNK
-        self.told = self._doubtful = False
+        self.told = self._doubtful = self._event_ended = False
 
     def run(self) -> IntegrationResult:
         driver = self.driver
@@ -281,7 +297,8 @@ class Loop:
             steps = self._chunk(self.chunk)
             code = driver.advance(k + steps)
             seconds = time.perf_counter() - begin
-            ended = self._pause() if code == PAUSE else False
+            driver.warn()
+            ended = self._ended(code)
             bar.update(self._progress(bar.n, k))
             if self._stopped_by_callback(rows):
                 return 1, STOPPED
@@ -291,7 +308,7 @@ class Loop:
                 self._look()
             if code == FULL:
                 driver.grow(self.max_bytes)
-            elif code not in (OK, PAUSE):
+            elif code not in (OK, PAUSE, ENDED):
                 return -1, setup.failure(code, driver.run, driver.schedule.clock)
             elif code == OK and driver.schedule.clock[TIME] == driver.schedule.span.t_bound:
                 return 0, ARRIVED
@@ -307,30 +324,42 @@ class Loop:
             return self.driver.step - k
         return abs(self.driver.now[0] - schedule.span.t0) - shown
 
+    def _ended(self, code: int) -> bool:
+        """Whether an event ends the run; after a pause, what is asked for in the step that is pending."""
+        driver, schedule = self.driver, self.driver.schedule
+        self._event_ended = self._pause() if code == PAUSE else code == ENDED
+        if self._event_ended and schedule.t_eval.size == 0:
+            driver.cut(*self.events.last)
+        return self._event_ended
+
     def _pause(self) -> bool:
         """Samples and events in the step that is pending; True where an event ends the run."""
         driver, schedule = self.driver, self.driver.schedule
-        sol = driver.dense(self.tableau, self.rhs)
-        end = None
-        if schedule.g.size:
-            end = self.events.handle(schedule.g, schedule.g_new, sol)
+        sol = driver.dense()
+        end = self.events.handle(schedule.g, schedule.g_new, sol)
         limit = sol.t if end is None else end
         while driver.rows < schedule.t_eval.size and schedule.span.sign * (schedule.t_eval[driver.rows] - limit) <= 0:
             t = float(schedule.t_eval[driver.rows])
             driver.save(t, sol(t))
-        if end is None:
-            return False
-        if schedule.t_eval.size == 0:
-            driver.cut(end, sol(end))
-        return True
+        return end is not None
 
     def _chunk(self, chunk: int) -> int:
         """Steps of the next call: none beyond the next look or, with a callback, the next saved one."""
-        schedule, step = self.driver.schedule, self.driver.step
-        chunk = min([chunk, *(look - step for look in setup.LOOKS if look > step)])
-        if self.callback is None or schedule.save_every == 0:
+        driver, schedule = self.driver, self.driver.schedule
+        chunk = min([chunk, *(look - driver.step for look in setup.LOOKS if look > driver.step)])
+        if self.callback is None:
             return chunk
-        return min(chunk, schedule.save_every - step % schedule.save_every)
+        if schedule.t_eval.size:
+            return max(1, min(chunk, self._steps_to_next_time()))
+        return min(chunk, schedule.save_every - driver.step % schedule.save_every) if schedule.save_every else chunk
+
+    def _steps_to_next_time(self) -> int:
+        """Steps that are surely made before the next time in t_eval."""
+        driver, schedule = self.driver, self.driver.schedule
+        h = abs(schedule.span.h)
+        if h == 0.0 or driver.rows == schedule.t_eval.size:
+            return 1
+        return int(abs(schedule.t_eval[driver.rows] - driver.now[0]) / h)
 
     def _stopped_by_callback(self, first_row: int) -> bool:
         if self.callback is None:
@@ -355,6 +384,7 @@ class Loop:
             diagnostics=self.diagnostics,
             t_events=[np.asarray(t) for t in events.t] if events.functions else None,
             y_events=[np.asarray(y) for y in events.y] if events.functions else None,
+            sol=driver.solution(self.events.last[0] if self._event_ended else driver.now[0]),
             nfev=int(counters[NFEV]),
             njev=int(counters[NJEV]),
             nlu=int(counters[NLU]),
@@ -428,6 +458,7 @@ def _start_kept(request: Request) -> Iterator[None]:
                     diagnostics=Diagnostics(),
                     t_events=None,
                     y_events=None,
+                    sol=None,
                     nfev=0,
                     njev=0,
                     nlu=0,

@@ -60,6 +60,7 @@ class Request:
     save_every: Any = None
     t_eval: Any = None
     events: Any = None
+    dense_output: bool = False
     callback: Any = None
     progress: bool = False
     compiled: bool | None = None
@@ -240,6 +241,7 @@ def _check_choices(request: Request) -> None:
     if callback is not None and not callable(callback):
         raise TypeError(f"callback must be a function callback(t, y, defects), got {shown(callback)}.")
     flag("progress", request.progress)
+    flag("dense_output", request.dense_output)
     if compiled is not None and not isinstance(compiled, (bool, np.bool_)):
         raise ValueError(f"compiled must be True, False or None (where possible), got {shown(compiled)}.")
     check_bytes(request.max_bytes)

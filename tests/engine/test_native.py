@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, EIPRKN12, Invariant, integrate
+from eip_scipy.core.dense import Interpolants
 from eip_scipy.engine import native
+from eip_scipy.engine.data import CUBIC, POLYNOMIAL, make_work
 from eip_scipy.engine.native import Engine
 from eip_scipy.run.prepare import Request, prepared
 
@@ -142,6 +144,69 @@ def test_records_that_do_not_fit_are_refused(part, name, value):
         Engine(**given | {part: changed})
 
 
+def dense_parts(**case):
+    """An engine, and what its dense output is made with."""
+    engine, method = Engine(**parts(**case)), case.pop("method", EIPRK4)
+    ready = prepared(Request.of(fun=pull, t_span=(0, 1), y0=Y0, method=method, **case))
+    return engine, Interpolants(ready.run, ready.method, engine).record
+
+
+@pytest.mark.parametrize(
+    "case", [{"h": 0.1, "invariants": H}, {"rtol": 1e-3, "invariants": H, "method": EIPDOP853}], ids=["RK4", "DOP853"]
+)
+def test_arrays_of_dense_output_that_do_not_fit_are_refused(case):
+    engine, record = dense_parts(**case)
+    refused = 0
+    for path in arrays(record):
+        if path[-1].endswith("_r"):
+            continue
+        right = record
+        for name in path:
+            right = getattr(right, name)
+        for wrong in spoilt(right):
+            with pytest.raises((TypeError, ValueError), match="engine: "):
+                engine.sample(replaced(record, path, wrong))
+            refused += 1
+    assert refused > 250
+
+
+def test_records_of_dense_output_that_do_not_fit_are_refused():
+    engine, record = dense_parts(rtol=1e-3, invariants=H, method=EIPDOP853)
+    for changed in (
+        {"kind": 4},
+        {"kind": -1},
+        {"kind": POLYNOMIAL},
+        {"kind": CUBIC},
+        {"weights": record.weights[:, :-1].copy()},
+        {"A": record.A[:, 1:].copy()},
+        {"c": record.c[1:].copy()},
+        {"work": make_work(4, np.dtype(float), 14, 1, 4)},
+        {"work": make_work(5, np.dtype(float), 15, 1, 5)},
+        {"work": make_work(4, np.dtype(float), 15, 2, 4)},
+        {"work": make_work(4, np.dtype(complex), 15, 1, 4)},
+        {"left": np.zeros(3)},
+        {"piece": record.piece[1:].copy()},
+    ):
+        with pytest.raises((TypeError, ValueError), match="engine: "):
+            engine.sample(record._replace(**changed))
+
+
+def test_counts_are_looked_at():
+    engine, record = dense_parts(h=0.1, invariants=H)
+    y, pieces = np.zeros(4), np.zeros((2, record.piece.size))
+    for counts in ([-1, 0], [0, -1], [0, 3]):
+        record.counts[:] = counts
+        with pytest.raises(ValueError, match="counts"):
+            engine.advance(1, y, y, np.zeros(9), np.zeros((9, 4)), pieces)
+    record.counts[:] = 0
+    with pytest.raises(ValueError, match="pieces"):
+        engine.advance(1, y, y, np.zeros(9), np.zeros((9, 4)), pieces[:, 1:].copy())
+    two = np.zeros((2, 4))
+    for times, out in ((np.zeros(3), two), (np.zeros(2, int), two), ([0.0, 1.0], two)):
+        with pytest.raises((TypeError, ValueError), match="engine: "):
+            engine.interpolate(pieces[0], times, out)
+
+
 def test_addresses_are_looked_at():
     given = parts(h=0.1, invariants=H)
     none = native.NativeFunctions(0, (), (), (), np.zeros(0), False, None)
@@ -160,19 +225,22 @@ def test_calls_with_wrong_arguments():
         lambda: engine.step("a", 0.0, y, y),
         lambda: engine.step(0, "a", y, y),
         lambda: engine.advance(1, y, y, two),
-        lambda: engine.advance(1, y, y, two, np.zeros((3, 4))),
-        lambda: engine.advance(1, y, y, two, np.zeros((2, 4), order="F")),
-        lambda: engine.advance(2**80, y, y, two, np.zeros((2, 4))),
+        lambda: engine.advance(1, y, y, two, np.zeros((3, 4)), None),
+        lambda: engine.advance(1, y, y, two, np.zeros((2, 4), order="F"), None),
+        lambda: engine.advance(2**80, y, y, two, np.zeros((2, 4)), None),
+        lambda: engine.sample(given["work"]),
+        lambda: engine.describe(0.0, y, 1.0, y, np.zeros(31)),
+        lambda: engine.interpolate(np.zeros(31), two, np.zeros((2, 4))),
         lambda: engine.values(two, np.zeros((2, 4)), np.zeros((1, 1))),
         lambda: engine.project(0.0, y, 1.0, True, [0.0] * 4),
         lambda: engine.close(0.0, y, True, "no code"),
         lambda: engine.start(y, y, None),
     ):
-        with pytest.raises((TypeError, ValueError, OverflowError)):
+        with pytest.raises((TypeError, ValueError, OverflowError, AttributeError, RuntimeError)):
             call()
     given["schedule"].place[1] = 9
     with pytest.raises(ValueError, match="rows"):
-        engine.advance(1, y, y, two, np.zeros((2, 4)))
+        engine.advance(1, y, y, two, np.zeros((2, 4)), None)
     with pytest.raises(RuntimeError, match="schedule"):
         Engine(**given | {"schedule": None}).step(0, 0.0, y, y)
 

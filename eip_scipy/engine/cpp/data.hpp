@@ -7,8 +7,10 @@
 
 namespace eip {
 
-// Codes of a step. PAUSE and FULL are the loop's.
-enum Code : int { OK = 0, NOT_FINITE = 1, FAILED_PROJECTION = 2, TOO_SMALL = 3, POSTPONED = 4, PAUSE = 10, FULL = 11 };
+// Codes of a step; the last three are the loop's.
+enum Code : int {
+    OK = 0, NOT_FINITE = 1, FAILED_PROJECTION = 2, TOO_SMALL = 3, POSTPONED = 4, PAUSE = 10, FULL = 11, ENDED = 12
+};
 
 enum Direction : int { NEW, OLD, MIDPOINT };
 enum Metric : int { EUCLIDEAN, ERROR, GIVEN };

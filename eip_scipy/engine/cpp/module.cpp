@@ -46,10 +46,11 @@ struct Engine {
     PyObject *kept;  // every object that the run uses
     Data *data;
     Schedule *schedule;
+    Samples *samples;
     PythonFunctions *functions;
     PythonHooks *hooks;
     int type;
-    bool busy;
+    bool busy, interpolating;
 };
 
 Method method_of(PyObject *method, Arrays &arrays) {
@@ -226,6 +227,63 @@ Schedule schedule_of(PyObject *schedule, Arrays &arrays) {
     return s;
 }
 
+// Rows of weights over the stages, of the lengths that the kind of interpolant has.
+void read_interpolant(PyObject *dense, int64_t stages, Arrays &arrays, Dense &d) {
+    d.kind = integer(dense, "kind");
+    d.polynomials = Arrays::length(dense, "weights");
+    d.columns = Arrays::length(dense, "weights", 1);
+    d.further = Arrays::length(dense, "c");
+    d.weights = arrays.floats(dense, "weights", {d.polynomials, d.columns});
+    d.A = arrays.floats(dense, "A", {d.further, ANY});
+    d.c = arrays.floats(dense, "c", {d.further});
+    const bool known = d.kind >= CUBIC && d.kind <= SEVENTH;
+    const bool fits = d.kind == POLYNOMIAL ? d.columns == stages + 1
+                    : d.kind == SEVENTH    ? d.columns == stages + 1 + d.further && d.columns <= d.work.stages + 1
+                                           : true;
+    if (!known || !fits || (d.further > 0 && Arrays::length(dense, "A", 1) != d.columns)) {
+        PyErr_SetString(PyExc_ValueError, "engine: the interpolant does not fit the method");
+        throw PythonError{};
+    }
+}
+
+Dense dense_of(PyObject *dense, const Data &run, Arrays &arrays, int type) {
+    Dense d{};
+    const Ref work = attribute(dense, "work"), options = attribute(dense, "options");
+    d.work = work_of(work.get(), Arrays::length(work.get(), "K") - 1, run.options.blocks.count, arrays, type);
+    d.own_slopes = truth(dense, "own_slopes");
+    if (d.work.n != run.work.n || d.work.l != run.work.l || (d.own_slopes && d.work.stages < 1)) {
+        PyErr_SetString(PyExc_ValueError, "engine: the buffers for dense output do not fit the run");
+        throw PythonError{};
+    }
+    d.options = options_of(options.get(), d.work, arrays);
+    d.target = arrays.floats(options.get(), "target", {d.work.l});
+    d.by_travel = truth(dense, "by_travel");
+    d.missed = arrays.floats(dense, "missed", {2});
+    read_interpolant(dense, run.work.stages, arrays, d);
+    if (d.kind == QUINTIC && d.work.m % 2) {
+        PyErr_SetString(PyExc_ValueError, "engine: a state of positions and velocities has an even length");
+        throw PythonError{};
+    }
+    return d;
+}
+
+Samples samples_of(PyObject *dense, const Data &run, int64_t events, Arrays &arrays, int type) {
+    Samples samples{};
+    samples.dense = dense_of(dense, run, arrays, type);
+    const Dense &d = samples.dense;
+    Roots &roots = samples.roots;
+    roots.capacity = Arrays::length(dense, "event");
+    roots.event = arrays.integers<int64_t>(dense, "event", {roots.capacity});
+    roots.t = arrays.floats(dense, "t", {roots.capacity});
+    roots.y = static_cast<double *>(arrays.memory_of(dense, "y", type, {roots.capacity, d.work.n}));
+    roots.left = arrays.floats(dense, "left", {events});
+    samples.piece = arrays.floats(dense, "piece", {d.floats()});
+    auto *counts = arrays.integers<int64_t>(dense, "counts", {2});
+    roots.count = counts;
+    samples.interpolants.count = counts + 1;
+    return samples;
+}
+
 // Functions by pointer: the address of `rhs`, and (address, floats) of each of inv, grad and event.
 template <typename Pointer>
 std::vector<Native<Pointer>> pointers_of(PyObject *functions, const char *name, int64_t expected) {
@@ -310,33 +368,30 @@ void engine_setup(Engine *self, PyObject *method, PyObject *options, PyObject *w
     }
 }
 
-// The engine works for one caller at a time: a function that steps the run it belongs to is refused.
+// The engine steps for one caller at a time, and interpolates for one: a function that does so with the run it belongs to
+// is refused. Hooks come back to it while it works, to project and to close the step at hand.
 class Busy {
   public:
-    explicit Busy(Engine *engine) : engine_(engine) {
-        if (!engine->data || engine->busy) {
-            PyErr_SetString(PyExc_RuntimeError, engine->data ? "engine: a run cannot be stepped from its own functions"
-                                                            : "engine: not set up");
+    explicit Busy(bool &flag) : flag_(flag) {
+        if (flag) {
+            PyErr_SetString(PyExc_RuntimeError,
+                            "engine: a run cannot be stepped, nor its dense output evaluated, from its own functions");
             throw PythonError{};
         }
-        engine_->busy = true;
+        flag = true;
     }
-    ~Busy() { engine_->busy = false; }
+    ~Busy() { flag_ = false; }
 
   private:
-    Engine *engine_;
+    bool &flag_;
 };
 
-// Whether a hook may come back to the engine while it works: only to project and to close the step at hand.
-class Within {
-  public:
-    explicit Within(Engine *engine) {
-        if (!engine->data) {
-            PyErr_SetString(PyExc_RuntimeError, "engine: not set up");
-            throw PythonError{};
-        }
-    }
-};
+// A method's arguments: as many as `names` says, of an engine that is set up.
+void expect(Engine *self, Py_ssize_t count, Py_ssize_t expected, const char *names) {
+    if (!self->data) PyErr_SetString(PyExc_RuntimeError, "engine: not set up");
+    else if (count != expected) PyErr_Format(PyExc_TypeError, "engine: expected the arguments %s", names);
+    if (PyErr_Occurred()) throw PythonError{};
+}
 
 // FailedCallError(which functions, which of them, t, bytes of y, of f): whoever made them calls it once more.
 PyObject *failed_call_error = nullptr;
@@ -395,16 +450,27 @@ double *state_of(PyObject *object, const char *name, Engine *self, PyObject *kep
     return static_cast<double *>(arrays.memory(object, name, self->type, {self->data->work.n}, read_only));
 }
 
+// Counts that Python may have written, before the loop goes by them.
+void check_room(const Schedule &schedule, const Saved &saved, const Samples *samples) {
+    const int64_t row = schedule.place[ROW];
+    bool good = row >= 0 && row <= saved.rows && schedule.n_eval < std::max<int64_t>(saved.rows, 1);
+    if (samples) {
+        const int64_t roots = *samples->roots.count, pieces = *samples->interpolants.count;
+        good &= roots >= 0 && pieces >= 0 && pieces <= samples->interpolants.capacity;
+    }
+    if (good) return;
+    PyErr_SetString(PyExc_ValueError, "engine: place or counts are outside the rows, or there are too few");
+    throw PythonError{};
+}
+
 PyDoc_STRVAR(advance_doc,
-             "advance(k_end, y, y_new, t_saved, y_saved) -> int\n\nStep on to step k_end, or to what stops the loop.");
+             "advance(k_end, y, y_new, t_saved, y_saved, pieces) -> int\n\nStep on to step k_end, or to what stops the "
+             "loop. pieces (rows, floats) receives the interpolants of all steps if it has rows.");
 
 PyObject *engine_advance(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
-        const Busy busy(self);
-        if (count != 5) {
-            PyErr_SetString(PyExc_TypeError, "advance takes k_end, y, y_new, t_saved, y_saved");
-            return nullptr;
-        }
+        expect(self, count, 6, "k_end, y, y_new, t_saved, y_saved, pieces");
+        const Busy busy(self->busy);
         const Ref kept(PyList_New(0));
         const Schedule &schedule = scheduled(self);
         const long long k_end = PyLong_AsLongLong(args[0]);
@@ -416,14 +482,90 @@ PyObject *engine_advance(Engine *self, PyObject *const *args, Py_ssize_t count) 
         saved.rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[3]), 0);
         saved.y = static_cast<double *>(
             arrays.memory(args[4], "y_saved", self->type, {saved.rows, self->data->work.n}));
-        const int64_t row = schedule.place[ROW];
-        if (row < 0 || row > saved.rows) {
-            PyErr_SetString(PyExc_ValueError, "engine: place is outside the rows");
-            return nullptr;
+        Samples *samples = self->samples;
+        if (samples) {
+            Pieces &pieces = samples->interpolants;
+            pieces.first = static_cast<double *>(
+                arrays.memory(args[5], "pieces", NPY_DOUBLE, {ANY, samples->dense.floats()}));
+            pieces.capacity = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[5]), 0);
         }
+        check_room(schedule, saved, samples);
         if (self->hooks) self->hooks->set_states(args[1], args[2]);
         return PyLong_FromLong(
-            stepped(self, [&](auto &run) { return advance(run, schedule, k_end, y, y_new, saved); }));
+            stepped(self, [&](auto &run) { return advance(run, samples, schedule, k_end, y, y_new, saved); }));
+    });
+}
+
+PyDoc_STRVAR(sample_doc, "sample(dense) -> None\n\nDense output from now on; `dense` is a record of data.py.");
+
+PyObject *engine_sample(Engine *self, PyObject *const *args, Py_ssize_t count) {
+    return guarded([&]() -> PyObject * {
+        expect(self, count, 1, "dense");
+        const Busy busy(self->busy), interpolating(self->interpolating);
+        Arrays arrays(self->kept);
+        if (PyList_Append(self->kept, args[0]) < 0) return nullptr;
+        const int64_t events = self->schedule ? self->schedule->n_events : 0;
+        const Samples samples = samples_of(args[0], *self->data, events, arrays, self->type);
+        if (self->functions) self->functions->add_buffers(attribute(args[0], "work").get(), self->kept);
+        delete std::exchange(self->samples, new Samples(samples));
+        Py_RETURN_NONE;
+    });
+}
+
+const Dense &dense_output(Engine *self) {
+    if (!self->samples) {
+        PyErr_SetString(PyExc_RuntimeError, "engine: no dense output");
+        throw PythonError{};
+    }
+    return self->samples->dense;
+}
+
+PyDoc_STRVAR(describe_doc,
+             "describe(t_old, y_old, t, y, piece) -> None\n\nThe interpolant over the step made last, as numbers.");
+
+PyObject *engine_describe(Engine *self, PyObject *const *args, Py_ssize_t count) {
+    return guarded([&]() -> PyObject * {
+        expect(self, count, 5, "t_old, y_old, t, y, piece");
+        const Busy busy(self->busy), interpolating(self->interpolating);
+        const Dense &d = dense_output(self);
+        const Ref kept(PyList_New(0));
+        const double t_old = PyFloat_AsDouble(args[0]), t = PyFloat_AsDouble(args[2]);
+        if (PyErr_Occurred()) return nullptr;
+        const double *y_old = state_of(args[1], "y_old", self, kept.get(), true);
+        const double *y = state_of(args[3], "y", self, kept.get(), true);
+        Arrays arrays(kept.get());
+        auto *piece = static_cast<double *>(arrays.memory(args[4], "piece", NPY_DOUBLE, {d.floats()}));
+        stepped(self, [&](auto &run) {
+            const DenseRun<std::decay_t<decltype(run.work)>> dense(d, run.system);
+            describe(dense, run.work, t_old, y_old, t, y, piece);
+            count_calls(dense, run.work);
+            return OK;
+        });
+        Py_RETURN_NONE;
+    });
+}
+
+PyDoc_STRVAR(interpolate_doc,
+             "interpolate(piece, t, out) -> None\n\nFill out (m, n) with the states at times t (m,) by an interpolant.");
+
+PyObject *engine_interpolate(Engine *self, PyObject *const *args, Py_ssize_t count) {
+    return guarded([&]() -> PyObject * {
+        expect(self, count, 3, "piece, t, out");
+        const Busy interpolating(self->interpolating);
+        const Dense &d = dense_output(self);
+        const Ref kept(PyList_New(0));
+        Arrays arrays(kept.get());
+        auto *piece = static_cast<double *>(arrays.memory(args[0], "piece", NPY_DOUBLE, {d.floats()}));
+        const auto *t = static_cast<const double *>(arrays.memory(args[1], "t", NPY_DOUBLE, {ANY}, true));
+        const npy_intp rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[1]), 0);
+        auto *out = static_cast<double *>(arrays.memory(args[2], "out", self->type, {rows, d.work.n}));
+        stepped(self, [&](auto &run) {
+            const DenseRun<std::decay_t<decltype(run.work)>> dense(d, run.system);
+            for (npy_intp k = 0; k < rows; ++k) interpolate(dense, piece, t[k], out + k * d.work.m);
+            count_calls(dense, run.work);
+            return OK;
+        });
+        Py_RETURN_NONE;
     });
 }
 
@@ -432,11 +574,8 @@ PyDoc_STRVAR(step_doc,
 
 PyObject *engine_step(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
-        const Busy busy(self);
-        if (count != 4) {
-            PyErr_SetString(PyExc_TypeError, "step takes k, t, y, f");
-            return nullptr;
-        }
+        expect(self, count, 4, "k, t, y, f");
+        const Busy busy(self->busy);
         const Work &w = self->data->work;
         const Ref kept(PyList_New(0));
         const Schedule &s = scheduled(self);
@@ -461,11 +600,7 @@ PyDoc_STRVAR(project_doc, "project(t_old, y, t, last, y_new) -> int\n\nProject w
 
 PyObject *engine_project(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
-        const Within within(self);
-        if (count != 5) {
-            PyErr_SetString(PyExc_TypeError, "project takes t_old, y, t, last, y_new");
-            return nullptr;
-        }
+        expect(self, count, 5, "t_old, y, t, last, y_new");
         const Ref kept(PyList_New(0));
         Step step{};
         step.t = PyFloat_AsDouble(args[0]);
@@ -486,11 +621,7 @@ PyDoc_STRVAR(close_doc,
 
 PyObject *engine_close(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
-        const Within within(self);
-        if (count != 4) {
-            PyErr_SetString(PyExc_TypeError, "close takes t_new, y_new, project, status");
-            return nullptr;
-        }
+        expect(self, count, 4, "t_new, y_new, project, status");
         const Ref kept(PyList_New(0));
         Step step{};
         step.t_new = PyFloat_AsDouble(args[0]);
@@ -510,11 +641,8 @@ PyDoc_STRVAR(values_doc, "values(t, y, out) -> None\n\nFill out (m, l) with the 
 
 PyObject *engine_values(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
-        const Busy busy(self);
-        if (count != 3) {
-            PyErr_SetString(PyExc_TypeError, "values takes t, y, out");
-            return nullptr;
-        }
+        expect(self, count, 3, "t, y, out");
+        const Busy busy(self->busy);
         const Ref kept(PyList_New(0));
         Arrays arrays(kept.get());
         const Work &w = self->data->work;
@@ -534,11 +662,8 @@ PyDoc_STRVAR(start_doc, "start(y, f, tau) -> None\n\nThe invariants' terms at th
 
 PyObject *engine_start(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
-        const Busy busy(self);
-        if (count != 3) {
-            PyErr_SetString(PyExc_TypeError, "start takes y, f, tau");
-            return nullptr;
-        }
+        expect(self, count, 3, "y, f, tau");
+        const Busy busy(self->busy);
         const Ref kept(PyList_New(0));
         const double *y = state_of(args[0], "y", self, kept.get(), true), *f = state_of(args[1], "f", self, kept.get(), true);
         const double tau = PyFloat_AsDouble(args[2]);
@@ -556,6 +681,7 @@ int engine_traverse(Engine *self, visitproc visit, void *arg) {
 void engine_release(Engine *self) {
     delete std::exchange(self->data, nullptr);
     delete std::exchange(self->schedule, nullptr);
+    delete std::exchange(self->samples, nullptr);
     delete std::exchange(self->functions, nullptr);
     delete std::exchange(self->hooks, nullptr);
 }
@@ -596,6 +722,9 @@ PyMethodDef engine_methods[] = {
     {"close", reinterpret_cast<PyCFunction>(engine_close), METH_FASTCALL, close_doc},
     {"values", reinterpret_cast<PyCFunction>(engine_values), METH_FASTCALL, values_doc},
     {"start", reinterpret_cast<PyCFunction>(engine_start), METH_FASTCALL, start_doc},
+    {"sample", reinterpret_cast<PyCFunction>(engine_sample), METH_FASTCALL, sample_doc},
+    {"describe", reinterpret_cast<PyCFunction>(engine_describe), METH_FASTCALL, describe_doc},
+    {"interpolate", reinterpret_cast<PyCFunction>(engine_interpolate), METH_FASTCALL, interpolate_doc},
     {nullptr, nullptr, 0, nullptr},
 };
 

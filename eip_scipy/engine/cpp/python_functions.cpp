@@ -146,6 +146,10 @@ PythonFunctions::PythonFunctions(PyObject *functions, PyObject *work, const Work
         PyErr_SetString(PyExc_ValueError, "engine: rhs must give as many numbers as the state has");
         throw PythonError{};
     }
+    add_buffers(work, kept);
+}
+
+void PythonFunctions::add_buffers(PyObject *work, PyObject *kept) {
     for (const char *name : {"K", "stage", "f_point", "G"}) {
         PyObject *array = kept_attribute(work, name, kept);
         auto *first = static_cast<const double *>(PyArray_DATA(reinterpret_cast<PyArrayObject *>(array)));

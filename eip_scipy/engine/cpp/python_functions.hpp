@@ -45,6 +45,9 @@ class PythonFunctions final : public Functions {
     void event(double t, const double *y, double *values) override;
     int64_t events() const { return static_cast<int64_t>(event_.size()); }
 
+    // More arrays that functions in place fill.
+    void add_buffers(PyObject *work, PyObject *kept);
+
   private:
     struct Owner {
         const double *first, *last;

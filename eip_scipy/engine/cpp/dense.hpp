@@ -1,0 +1,246 @@
+// Dense output: over each step an interpolant of SciPy's order, projected onto the invariants' levels between those of the
+// step's two ends, which are met exactly.
+#pragma once
+
+#include "correction.hpp"
+
+namespace eip {
+
+enum Interpolant : int { CUBIC, QUINTIC, POLYNOMIAL, SEVENTH };
+
+// What the interpolants of a run are made with, and the buffers of their projections. `weights` are rows over the stages:
+// those of a tableau's own polynomial, or of DOP853's, which has `further` stages besides.
+struct Dense {
+    int64_t kind, polynomials, columns, further;
+    const double *weights, *A, *c;
+    bool own_slopes;  // the steps leave no f at their ends
+    bool by_travel;   // weights of the projection by what each block travels within the step, else those of the run
+    Options options;
+    Work work;
+    double *target, *missed;  // missed: how many states were left unprojected, and the time of the first
+
+    // States that make up an interpolant, besides those of the two ends and the weights.
+    int64_t rows() const { return kind == POLYNOMIAL ? polynomials + 1 : kind == SEVENTH ? 3 + polynomials : 3; }
+    int64_t floats() const { return 3 + (3 + rows()) * work.m + 2 * work.l; }
+};
+
+// One step's interpolant, in floats() numbers that outlive the step.
+struct Piece {
+    double *t_old, *t, *known, *y_old, *y, *rows, *sigma, *levels_old, *levels;
+
+    Piece(double *first, const Dense &d)
+        : t_old(first), t(first + 1), known(first + 2), y_old(first + 3), y(y_old + d.work.m), rows(y + d.work.m),
+          sigma(rows + d.rows() * d.work.m), levels_old(sigma + d.work.m), levels(levels_old + d.work.l) {}
+};
+
+// Dense output by code for states of W's length.
+template <class W>
+struct DenseRun {
+    const Dense &dense;
+    const Method none{};
+    const W work;
+    RunOf<W> run;
+
+    DenseRun(const Dense &d, System &system) : dense(d), work(d.work), run{none, d.options, work, system, nullptr} {}
+};
+
+// The evaluations made since, among those of the run.
+template <class W>
+inline void count_calls(const DenseRun<W> &dense, const Work &step) {
+    step.counters[NFEV] += std::exchange(dense.work.counters[NFEV], 0);
+}
+
+// The 2-norm of block b of a, or of a - minus.
+template <class W>
+inline double block_norm(const double *a, const double *minus, int64_t b, const Blocks &blocks, const W &w) {
+    int64_t count = 0;
+    for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p, ++count)
+        w.move[count] = a[blocks.member[p]] - (minus ? minus[blocks.member[p]] : 0.0);
+    return norm(w.move, count);
+}
+
+// How far each block goes within the step, as weights of the interpolant's correction.
+//
+// Those of the step do not fit: an interpolant errs in other components than the end of a step does. A slope that passes
+// through zero within the step does not make a block immobile, hence the second term.
+template <class W>
+inline void travelled(const Piece &piece, double h, const double *f_old, const double *f, const Blocks &blocks,
+                      const W &w) {
+    double largest_weight = 0.0;
+    for (int64_t b = 0; b < blocks.count; ++b) {
+        const auto size_of = [&](const double *a, const double *minus) { return block_norm(a, minus, b, blocks, w); };
+        const double size = std::max(size_of(piece.y_old, nullptr), size_of(piece.y, nullptr));
+        const double slope = std::abs(h) * std::max(size_of(f_old, nullptr), size_of(f, nullptr));
+        const double turn = std::abs(h) * size_of(f_old, f);
+        const double weight = std::hypot(slope, std::sqrt(size) * std::sqrt(turn));
+        for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) piece.sigma[blocks.member[p]] = weight;
+        largest_weight = std::max(largest_weight, weight);
+    }
+    if (largest_weight > 0.0)
+        for (int64_t i = 0; i < w.m; ++i) piece.sigma[i] /= largest_weight;
+    else
+        fill(piece.sigma, 1.0, w.m);
+}
+
+// The cubic through both ends with their slopes: rows change, h f_old - change, h f - change.
+template <class W>
+inline void cubic(const Piece &piece, double h, const double *f_old, const double *f, const W &w) {
+    double *change = piece.rows, *left = change + w.m, *right = left + w.m;
+    for (int64_t i = 0; i < w.m; ++i) {
+        change[i] = piece.y[i] - piece.y_old[i];
+        left[i] = h * f_old[i] - change[i];
+        right[i] = h * f[i] - change[i];
+    }
+}
+
+// For y = (q, v) the quintic through positions, velocities and accelerations at both ends; v is its slope. Its rows are
+// the coefficients of theta^0 to theta^5, by what the Taylor polynomial at the old end misses at the new one.
+template <class W>
+inline void quintic(const Piece &piece, double h, const double *f_old, const double *f, const W &w) {
+    const int64_t half = w.m / 2;
+    double *rows = piece.rows;
+    for (int64_t i = 0; i < half; ++i) {
+        const double q = piece.y_old[i], v = piece.y_old[half + i], a = f_old[half + i];
+        const double place = piece.y[i] - q - h * v - 0.5 * h * h * a;
+        const double slope = h * (piece.y[half + i] - v - h * a);
+        const double curvature = h * h * (f[half + i] - a);
+        const double coefficients[] = {q, h * v, 0.5 * h * h * a, 10 * place - 4 * slope + 0.5 * curvature,
+                                       -15 * place + 7 * slope - curvature, 6 * place - 3 * slope + 0.5 * curvature};
+        for (int k = 0; k < 6; ++k) rows[k * half + i] = coefficients[k];
+    }
+}
+
+// The tableau's own: rows h K^T P, and last what this misses at the end of the step, the projection's move.
+template <class W>
+inline void polynomial(const Dense &d, const Piece &piece, double h, const Work &step, const W &w) {
+    double *missing = piece.rows + d.polynomials * w.m;
+    for (int64_t i = 0; i < w.m; ++i) missing[i] = piece.y[i] - piece.y_old[i];
+    for (int64_t j = 0; j < d.polynomials; ++j) {
+        double *row = piece.rows + j * w.m;
+        weighted_sum(h, {d.weights + j * d.columns, step.K, d.columns, w.m}, row, w.m);
+        for (int64_t i = 0; i < w.m; ++i) missing[i] -= row[i];
+    }
+}
+
+// DOP853's of order 7, from three more evaluations: rows change, h f_old - change, 2 change - h (f + f_old), h D K.
+template <class W>
+inline void seventh(const DenseRun<W> &dense, const Piece &piece, double h, const Work &step) {
+    const Dense &d = dense.dense;
+    const W &w = dense.work;
+    const int64_t known = step.stages + 1, m = w.m;
+    copy(step.K, w.K, known * m);
+    for (int64_t k = 0; k < d.further; ++k) {
+        combine(piece.y_old, h, {d.A + k * d.columns, w.K, known + k, m}, w.stage, m);
+        dense.run.system.rhs_of_scratch(w, *piece.t_old + d.c[k] * h, w.stage, w.row(known + k));
+        ++w.counters[NFEV];
+    }
+    double *change = piece.rows, *left = change + m, *bend = left + m;
+    for (int64_t i = 0; i < m; ++i) {
+        change[i] = piece.y[i] - piece.y_old[i];
+        left[i] = h * w.K[i] - change[i];
+        bend[i] = 2 * change[i] - h * (step.last()[i] + w.K[i]);
+    }
+    for (int64_t j = 0; j < d.polynomials; ++j)
+        weighted_sum(h, {d.weights + j * d.columns, w.K, d.columns, m}, bend + (1 + j) * m, m);
+}
+
+// The interpolant over a step from y_old at t_old to y at t, from the buffers that it left.
+template <class W>
+inline void describe(const DenseRun<W> &dense, const Work &step, double t_old, const double *y_old, double t,
+                     const double *y, double *out) {
+    const Dense &d = dense.dense;
+    const W &w = dense.work;
+    const Piece piece(out, d);
+    const double h = t - t_old;
+    *piece.t_old = t_old;
+    *piece.t = t;
+    *piece.known = 0.0;
+    copy(y_old, piece.y_old, w.m);
+    copy(y, piece.y, w.m);
+    const double *f_old = step.row(0), *f = step.last();
+    if (d.own_slopes) {
+        f_old = w.row(0);
+        f = w.last();
+        dense.run.system.rhs(w, t_old, y_old, w.row(0));
+        dense.run.system.rhs(w, t, y, w.last());
+        w.counters[NFEV] += 2;
+    }
+    if (d.kind == CUBIC) cubic(piece, h, f_old, f, w);
+    if (d.kind == QUINTIC) quintic(piece, h, f_old, f, w);
+    if (d.kind == POLYNOMIAL) polynomial(d, piece, h, step, w);
+    if (d.kind == SEVENTH) seventh(dense, piece, h, step);
+    if (d.by_travel)
+        travelled(piece, h, f_old, f, d.options.blocks, w);
+    else
+        copy(step.sigma, piece.sigma, w.m);
+}
+
+// The interpolant itself, at t_old + theta h.
+template <class W>
+inline void evaluate(const Dense &d, const Piece &piece, double theta, double *out, const W &w) {
+    const int64_t m = w.m, half = m / 2;
+    const double rest = 1.0 - theta;
+    const double *rows = piece.rows;
+    if (d.kind == CUBIC) {
+        for (int64_t i = 0; i < m; ++i)
+            out[i] = piece.y_old[i] + theta * rows[i] + theta * rest * (rest * rows[m + i] - theta * rows[2 * m + i]);
+    } else if (d.kind == QUINTIC) {
+        const double h = *piece.t - *piece.t_old;
+        for (int64_t i = 0; i < half; ++i) {
+            double place = rows[5 * half + i], slope = 5.0 * place;
+            for (int k = 4; k >= 0; --k) place = place * theta + rows[k * half + i];
+            for (int k = 4; k >= 1; --k) slope = slope * theta + k * rows[k * half + i];
+            out[i] = place;
+            out[half + i] = slope / h;
+        }
+    } else if (d.kind == POLYNOMIAL) {
+        const double *missing = rows + d.polynomials * m, share = theta * theta * (3.0 - 2.0 * theta);
+        for (int64_t i = 0; i < m; ++i) {
+            double total = 0.0;
+            for (int64_t j = d.polynomials - 1; j >= 0; --j) total = (total + rows[j * m + i]) * theta;
+            out[i] = piece.y_old[i] + total + share * missing[i];
+        }
+    } else {
+        for (int64_t i = 0; i < m; ++i) {
+            double total = 0.0;
+            for (int64_t k = d.rows() - 1, odd = 0; k >= 0; --k, odd = !odd)
+                total = (total + rows[k * m + i]) * (odd ? rest : theta);
+            out[i] = total + piece.y_old[i];
+        }
+    }
+}
+
+// The state at t: an end of the step, or the interpolant's projected. Where no state near it meets the levels it is given
+// as it is, and counted; beyond the step, where an extrapolation may lead anywhere, without a count.
+template <class W>
+inline void interpolate(const DenseRun<W> &dense, double *floats, double t, double *out) {
+    const Dense &d = dense.dense;
+    const W &w = dense.work;
+    const Piece piece(floats, d);
+    if (t == *piece.t) return copy(piece.y, out, w.m);
+    if (t == *piece.t_old) return copy(piece.y_old, out, w.m);
+    const double theta = (t - *piece.t_old) / (*piece.t - *piece.t_old);
+    evaluate(d, piece, theta, out, w);
+    if (w.l == 0) return;
+    System &system = dense.run.system;
+    if (*piece.known == 0.0) {
+        system.inv(w, *piece.t_old, piece.y_old, piece.levels_old);
+        system.inv(w, *piece.t, piece.y, piece.levels);
+        *piece.known = 1.0;
+    }
+    const double share = std::min(1.0, std::max(0.0, theta));
+    for (int64_t i = 0; i < w.l; ++i) d.target[i] = (1.0 - share) * piece.levels_old[i] + share * piece.levels[i];
+    copy(piece.sigma, w.sigma, w.m);
+    copy(out, w.y_hat, w.m);
+    if (d.options.uses_f) {
+        system.rhs(w, t, w.y_hat, w.last());
+        ++w.counters[NFEV];
+    }
+    if (project_step(dense.run, Step{t, t, 0.0, w.y_hat, out, true, true}) == OK) return;
+    copy(w.y_hat, out, w.m);
+    if (theta != share) return;
+    if (d.missed[0] == 0.0) d.missed[1] = t;
+    d.missed[0] += 1.0;
+}
+
+}  // namespace eip

@@ -1,0 +1,339 @@
+"""States between steps and roots of events in the compiled loop: those of solve_ivp, and of SciPy's root finder."""
+
+import warnings
+
+import numpy as np
+import pytest
+from numba import njit
+from scipy.integrate import solve_ivp
+from scipy.interpolate import BPoly
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPRK4,
+    EIPRK23,
+    EIPRK45,
+    EIPRKN8,
+    EIPRKN12,
+    Invariant,
+    eip_method,
+    integrate,
+)
+from eip_scipy.problems import kepler
+
+pytestmark = pytest.mark.needs_jit
+
+STEPS = {
+    "RK4": (EIPRK4, {"h": 0.05}),
+    "RK23": (EIPRK23, {"rtol": 1e-4}),
+    "RK45": (EIPRK45, {"rtol": 1e-6}),
+    "RK45, fixed": (EIPRK45, {"h": 0.05, "every": 3}),
+    "DOP853": (EIPDOP853, {"rtol": 1e-7}),
+    "RKN8": (EIPRKN8, {"h": 0.1}),
+    "RKN12": (EIPRKN12, {"h": 0.3}),
+}
+methods = pytest.mark.parametrize(("method", "steps"), list(STEPS.values()), ids=list(STEPS))
+NYSTROM = EIPRKN8, EIPRKN12
+PROBLEM = kepler(t_end=30.0)
+
+
+@njit
+def crossing(t, y, params):
+    return y[1]
+
+
+@njit
+def apsis(t, y, params):
+    return y[0] * y[2] + y[1] * y[3]
+
+
+@njit
+def clock(t, y, params):
+    return np.sin(3.0 * t + 0.1)
+
+
+apsis.direction = 1.0
+EVENTS = [crossing, apsis, clock]
+
+
+@njit
+def acceleration(t, q, params):
+    r2 = q[0] * q[0] + q[1] * q[1]
+    w = 1.0 / (r2 * np.sqrt(r2))
+    return -(w + 1.5 * params[0] * w / r2) * q
+
+
+@njit
+def spin(t, y):
+    return -1j * np.array([0.3 * y[1] + abs(y[0]) ** 2 * y[0], 0.3 * y[0] + 0.7 * y[1]])
+
+
+@njit
+def spin_norm(t, y):
+    return abs(y[0]) ** 2 + abs(y[1]) ** 2
+
+
+@njit
+def spin_gradient(t, y):
+    return 2 * y
+
+
+@njit
+def upright(t, y):
+    return y[0].real
+
+
+def run(method, events=None, span=(0.0, 30.0), **options):
+    """Kepler by Numba functions; a Nystrom method gets its acceleration."""
+    if method in NYSTROM:
+        given = {"y0": PROBLEM.y0, "params": PROBLEM.params, "invariants": PROBLEM.invariants, "blocks": 2}
+        return integrate(acceleration, span, method=method, events=events, **given, **options)
+    return integrate(PROBLEM, span, method=method, events=events, **options)
+
+
+def assert_same(one, other):
+    """The same bits, everywhere; nfev too."""
+    np.testing.assert_array_equal(one.t, other.t)
+    np.testing.assert_array_equal(one.y, other.y)
+    for name in ("t_events", "y_events"):
+        for a, b in zip(getattr(one, name) or (), getattr(other, name) or (), strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert (one.status, one.nfev, one.njev) == (other.status, other.nfev, other.njev)
+
+
+@methods
+@pytest.mark.parametrize("span", [(0.0, 30.0), (30.0, 0.0)], ids=["forward", "backward"])
+def test_roots_in_the_loop_are_scipy_s(method, steps, span):
+    """Interpreted, SciPy's own root finder is at work."""
+    times = np.linspace(*span, 500)
+    options = {"t_eval": times, "events": EVENTS, "span": span, "dense_output": True, **steps}
+    compiled, interpreted = run(method, **options), run(method, compiled=False, **options)
+    assert compiled.compiled
+    assert not interpreted.compiled
+    assert [len(t) > 4 for t in compiled.t_events] == [True, True, True]
+    assert_same(compiled, interpreted)
+    np.testing.assert_array_equal(compiled.sol(times), interpreted.sol(times))
+
+
+def test_roots_of_a_complex_state():
+    norm = Invariant(spin_norm, spin_gradient, name="N")
+    options = {"method": EIPRK4, "h": 0.1, "invariants": norm, "events": upright, "t_eval": np.linspace(0, 40, 333)}
+    y0 = np.array([0.8, 0.6j])
+    compiled = integrate(spin, (0.0, 40.0), y0, **options)
+    assert compiled.compiled
+    assert len(compiled.t_events[0]) > 4
+    assert_same(compiled, integrate(spin, (0.0, 40.0), y0, compiled=False, **options))
+
+
+@pytest.mark.parametrize(("method", "steps"), [STEPS["RK4"], STEPS["RK45"], STEPS["DOP853"]])
+def test_integrate_and_solve_ivp_agree(method, steps):
+    """Values at t_eval, roots and states there: SciPy's loop and this one, with the same functions in Python."""
+    p = PROBLEM.params
+    events = [lambda t, y, f=event: f(t, y, p) for event in EVENTS]
+    events[1].direction = 1.0
+    common = {"t_eval": np.linspace(0, 30, 500), "events": events, **steps}
+    options = {"invariants": PROBLEM.invariants, "blocks": 2}
+    sol = solve_ivp(PROBLEM.fun, (0, 30), PROBLEM.y0, method=method, dense_output=True, **common, **options)
+    ours = integrate(PROBLEM.fun, (0, 30), PROBLEM.y0, method=method, dense_output=True, **common, **options)
+    for name in ("t", "y"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(sol, name))
+    for k in range(3):
+        np.testing.assert_array_equal(ours.t_events[k], sol.t_events[k])
+        np.testing.assert_array_equal(ours.y_events[k], sol.y_events[k])
+    np.testing.assert_array_equal(ours.sol.ts, sol.sol.ts)
+    np.testing.assert_array_equal(ours.sol(common["t_eval"]), sol.sol(common["t_eval"]))
+
+
+@pytest.mark.parametrize("terminal", [True, 3])
+@pytest.mark.parametrize("span", [(0.0, 30.0), (30.0, 0.0)], ids=["forward", "backward"])
+@pytest.mark.parametrize("saved", [{}, {"save_every": 1}, {"t_eval": True}], ids=["ends", "steps", "times"])
+def test_terminal_events(terminal, span, saved):
+    def ending(t, y, params):
+        return y[1] - 0.1
+
+    event = njit(ending)
+    event.terminal = ending.terminal = terminal
+    if "t_eval" in saved:
+        saved = {"t_eval": np.linspace(*span, 400)}
+    options = {"span": span, "h": 0.05, "dense_output": True, **saved}
+    compiled = run(EIPRK4, [event, clock], **options)
+    assert compiled.compiled
+    assert compiled.status == 1
+    assert len(compiled.t_events[0]) == int(terminal)
+    interpreted = run(EIPRK4, [ending, clock], compiled=False, **options)
+    assert_same(compiled, interpreted)
+    end = compiled.t_events[0][-1]
+    assert compiled.sol.ts[-1] == end
+    np.testing.assert_array_equal(compiled.sol(end), compiled.y_events[0][-1])
+    if "t_eval" not in saved:
+        assert compiled.t[-1] == end
+        np.testing.assert_array_equal(compiled.y[:, -1], compiled.y_events[0][-1])
+
+
+def test_more_roots_than_the_loop_has_room_for():
+    @njit
+    def often(t, y, params):
+        return np.sin(200.0 * t + 0.5)
+
+    found = run(EIPRK4, often, h=0.01)
+    roots = (np.pi * np.arange(1, found.t_events[0].size + 1) - 0.5) / 200.0
+    assert roots.size > 1900
+    assert roots[-1] <= 30.0 < roots[-1] + np.pi / 200.0
+    np.testing.assert_allclose(found.t_events[0], roots, rtol=1e-15, atol=1e-14)
+
+
+def test_an_event_that_is_nan_in_between():
+    """SciPy's own error, as interpreted."""
+
+    @njit
+    def broken(t, y, params):
+        return np.nan if 1.0 < t < 1.04 else t - 1.02
+
+    for compiled in (None, False):
+        with pytest.raises(ValueError, match="NaN"):
+            run(EIPRK4, broken, h=0.05, compiled=compiled)
+
+
+def test_an_event_that_raises_in_between():
+    @njit
+    def angry(t, y, params):
+        if 1.0 < t < 1.04:
+            raise ValueError("not there")
+        return t - 1.02
+
+    with pytest.raises(ValueError, match="not there") as raised:
+        run(EIPRK4, [clock, angry], h=0.05, save_every=1)
+    assert raised.value.partial.t[-1] == 1.05
+    assert raised.value.partial.t_events[0].size == 0
+
+
+@methods
+def test_solution_over_the_run(method, steps):
+    plain = run(method, save_every=1, **steps)
+    kept = run(method, save_every=1, dense_output=True, **steps)
+    np.testing.assert_array_equal(kept.y, plain.y)
+    np.testing.assert_array_equal(kept.sol.ts, kept.t)
+    np.testing.assert_array_equal(kept.sol(kept.t), kept.y)
+    assert len(kept.sol.interpolants) == kept.t.size - 1
+    assert plain.sol is None
+    first, *_, last = kept.sol.interpolants
+    assert (first.t_old, last.t) == (0.0, 30.0)
+    assert kept.sol(5.0).shape == (4,)
+    times = np.linspace(0, 30, 777)
+    np.testing.assert_array_equal(kept.sol(times), run(method, t_eval=times, **steps).y)
+    assert [piece.t for piece in kept.sol.interpolants[1:3]] == kept.t[2:4].tolist()
+
+
+@pytest.mark.parametrize("method", [EIPRK4, EIPRKN8])
+def test_interpolants_are_hermite_s(method):
+    """SciPy's, through values and slopes at both ends; positions of a Nystrom method through accelerations too."""
+    y0, params = PROBLEM.y0, PROBLEM.params
+    fun = acceleration if method is EIPRKN8 else PROBLEM.fun
+    given = {"params": params} if method is EIPRKN8 else {}
+    found = integrate(fun, (0, 1), y0, method=method, h=0.1, save_every=1, dense_output=True, **given)
+    slopes = np.array([PROBLEM.fun(t, y) for t, y in zip(found.t, found.y.T, strict=True)])
+    times = np.linspace(0, 1, 97)
+    if method is EIPRK4:
+        expected = BPoly.from_derivatives(found.t, np.stack([found.y.T, slopes], axis=1))(times).T
+    else:
+        places = np.stack([found.y[:2].T, found.y[2:].T, slopes[:, 2:]], axis=1)
+        spline = BPoly.from_derivatives(found.t, places)
+        expected = np.concatenate([spline(times).T, spline.derivative()(times).T])
+    np.testing.assert_allclose(found.sol(times), expected, rtol=0, atol=2e-14)
+
+
+@pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853])
+def test_interpolants_are_scipy_s(method):
+    """The pair's own interpolant, where nothing is projected, over the same steps."""
+    own = eip_method(method.TABLEAU)
+    options = {"rtol": 1e-2, "first_step": 0.05, "max_step": 0.05, "dense_output": True}
+    theirs = solve_ivp(PROBLEM.fun, (0, 3), PROBLEM.y0, method=method.SCIPY, **options)
+    ours = integrate(PROBLEM.fun, (0, 3), PROBLEM.y0, method=own, **options)
+    np.testing.assert_array_equal(ours.sol.ts, theirs.sol.ts)
+    times = np.linspace(0, 3, 501)
+    np.testing.assert_allclose(ours.sol(times), theirs.sol(times), rtol=0, atol=2e-13)
+
+
+def test_an_event_at_the_very_start_ends_the_run():
+    event = njit(lambda t, y, params: y[1])
+    event.terminal = True
+    found = run(EIPRK4, event, h=0.05, dense_output=True)
+    assert found.t.tolist() == [0.0]
+    assert found.status == 1
+    np.testing.assert_array_equal(found.sol(0.0), PROBLEM.y0)
+
+
+def test_memory_of_the_solution():
+    with pytest.raises(MemoryError, match="dense_output=True needs"):
+        run(EIPRK4, h=1e-3, dense_output=True, max_bytes=1e6)
+    with pytest.raises(MemoryError, match="dense_output=True needs"):
+        run(EIPRK45, rtol=1e-12, span=(0.0, 500.0), dense_output=True, max_bytes=1e6)
+    assert len(run(EIPRK45, rtol=1e-10, span=(0.0, 900.0), dense_output=True).sol.interpolants) > 2048
+
+
+def test_a_checkpoint_keeps_no_solution(tmp_path):
+    with pytest.raises(ValueError, match="save_every"):
+        run(EIPRK4, h=0.1, dense_output=True, checkpoint=tmp_path / "run.npz")
+    with pytest.raises(ValueError, match="dense_output"):
+        run(EIPRK4, h=0.1, dense_output="yes")
+
+
+def test_roots_and_times_of_a_resumed_run(tmp_path):
+    """What the loop has found and counted goes on from a checkpoint."""
+    event = njit(lambda t, y, params: y[1])
+    event.terminal = 7
+    options = {"h": 0.01, "t_eval": np.linspace(0, 30, 4000), "events": [event, clock]}
+    whole = run(EIPRK4, **options)
+    assert len(whole.t_events[0]) == 7
+
+    class BrokenError(Exception):
+        pass
+
+    def stop(t, y, defects):
+        if t > 12:
+            raise BrokenError
+
+    kept = {"checkpoint": tmp_path / "run.npz", "checkpoint_every": 1e-9}
+    with pytest.raises(BrokenError):
+        run(EIPRK4, callback=stop, **options, **kept)
+    assert_same(run(EIPRK4, resume=True, **options, **kept), whole)
+
+
+def test_an_unprojected_state_is_told():
+    """A level that no state near the interpolant meets: told once, the state given as it is."""
+
+    @njit
+    def turn(t, y):
+        return np.array([-y[1], y[0]])
+
+    # In between the gradient leads away.
+    value = njit(lambda t, y: y[0] ** 2 + y[1] ** 2)
+    gradient = njit(lambda t, y: 2.0 * y if t % 0.5 == 0.0 else -0.2 * y)
+    false = Invariant(value, gradient, name="norm")
+    options = {"method": EIPRK4, "h": 0.5, "invariants": false, "check": False, "t_eval": [0.0, 0.25, 0.75, 1.0]}
+    for compiled in (None, False):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            integrate(turn, (0.0, 1.0), [1.0, 0.0], compiled=compiled, **options)
+        told = [str(warning.message) for warning in told]
+        assert any(line.startswith("dense output at t=0.25, and 1 more: ") for line in told)
+
+
+@pytest.mark.parametrize("steps", [{"h": 0.01}, {"rtol": 1e-6}], ids=["fixed", "adaptive"])
+def test_a_callback_stops_at_the_time_it_sees(steps):
+    """Nothing is done beyond: no event noted, no step counted."""
+    seen = []
+
+    def stop(t, y, defects):
+        seen.append(t)
+        return t >= 7.0
+
+    times = np.linspace(0.0, 30.0, 31)
+    method = EIPRK4 if "h" in steps else EIPRK45
+    found = run(method, clock, t_eval=times, callback=stop, **steps)
+    np.testing.assert_array_equal(found.t, times[:8])
+    assert seen == times[:8].tolist()
+    longest = 0.01 if "h" in steps else 0.5
+    assert found.t_events[0][-1] <= 7.0 + longest
+    rest = run(method, clock, t_eval=times[:8], span=(0.0, 7.0), **steps)
+    assert found.nfev <= rest.nfev + 30
