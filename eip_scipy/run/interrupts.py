@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import _thread
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -16,17 +18,23 @@ class TerminatedError(BaseException):
     """SIGTERM has come, in a run that has something to keep first."""
 
 
+# Seconds after which a Ctrl-C is tried again that came where Python would drop it.
+AGAIN = 0.02
+
+
 class _Came:
     ctrl_c = False
     sigterm = False
+    put_off: object = None
 
 
 @contextmanager
 def kept_ctrl_c() -> Iterator[None]:
     """Let `look_for_signals` know of a Ctrl-C that comes from now on.
 
-    An exception that is raised inside a destructor is printed and dropped, KeyboardInterrupt too, and compilation makes
-    and drops objects of LLVM all the time: a Ctrl-C then would do nothing. A handler of the user's own stays in place.
+    An exception that is raised inside a destructor or a callback from C is printed and dropped, KeyboardInterrupt too,
+    and compilation makes and drops objects of LLVM all the time: a Ctrl-C then would do nothing. Where it can be seen
+    to come there it is put off until Python is out of it. A handler of the user's own stays in place.
     """
     if not _is_ours(signal.SIGINT, signal.default_int_handler):
         yield
@@ -36,6 +44,7 @@ def kept_ctrl_c() -> Iterator[None]:
     try:
         yield
     finally:
+        _Came.put_off = None
         signal.signal(signal.SIGINT, signal.default_int_handler)
         _Came.ctrl_c = False
 
@@ -78,6 +87,7 @@ def look_for_signals() -> None:
     """
     if not (_Came.ctrl_c or _Came.sigterm) or threading.current_thread() is not threading.main_thread():
         return
+    _Came.put_off = None
     raise TerminatedError if _Came.sigterm else KeyboardInterrupt
 
 
@@ -88,7 +98,26 @@ def _is_ours(number: int, usual: object) -> bool:
 
 def _note_ctrl_c(number: int, frame: FrameType | None) -> None:
     _Came.ctrl_c = True
-    signal.default_int_handler(number, frame)
+    if _would_be_dropped(frame):
+        _Came.put_off = this = object()
+        _thread.start_new_thread(_press_again, (this,))  # not threading's, which takes locks
+    else:
+        signal.default_int_handler(number, frame)
+
+
+def _would_be_dropped(frame: FrameType | None) -> bool:
+    """Whether Python is in a destructor, or in LLVM, which calls back."""
+    while frame is not None:
+        if frame.f_code.co_name == "__del__" or frame.f_globals.get("__name__", "").startswith("llvmlite."):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _press_again(this: object) -> None:
+    time.sleep(AGAIN)
+    if _Came.put_off is this:
+        _thread.interrupt_main()
 
 
 def _note_sigterm(number: int, frame: FrameType | None) -> None:

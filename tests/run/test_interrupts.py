@@ -1,7 +1,10 @@
 """Ctrl-C where Python drops it, in a destructor: a run ends all the same, with what it had."""
 
 import signal
+import subprocess
+import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -54,8 +57,7 @@ def test_integrate_while_it_compiles(monkeypatch):
     monkeypatch.setattr(System, "functions", compiles)
     with pytest.raises(KeyboardInterrupt) as info:
         integrate(jit_orbit, (0, 1e9), pericentre(0.6), method=EIPRK4, h=0.01)
-    assert info.value.partial.compiled
-    assert info.value.partial.t[-1] == 0.0
+    assert info.value.partial.t.tolist() == [0.0]
 
 
 def test_ensemble():
@@ -107,3 +109,51 @@ def test_other_threads():
         with pytest.raises(KeyboardInterrupt):
             look_for_signals()
     assert found == [True]
+
+
+COMPILES = """
+import time
+import numpy as np
+from numba import njit
+from eip_scipy import EIPRK4, Invariant, integrate
+
+fun = njit(lambda t, y, params: np.append(y[2:], -y[:2] / np.hypot(y[0], y[1]) ** 3))
+energy = njit(lambda t, y, params: 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.hypot(y[0], y[1]))
+gradient = njit(lambda t, y, params: np.append(y[:2] / np.hypot(y[0], y[1]) ** 3, y[2:]))
+event = njit(lambda t, y, params: np.linalg.norm(y) - 1)
+
+def run(t_end):
+    options = {"h": 0.01, "params": [1.0], "invariants": Invariant(energy, gradient), "events": event}
+    return integrate(fun, (0, t_end), [0.4, 0, 0, 2.0], method=EIPRK4, **options)
+
+print("compiles", flush=True)
+try:
+    run(1e9)
+except KeyboardInterrupt as error:
+    print(time.time(), flush=True)
+    assert error.partial.t[0] == 0.0
+    assert run(1.0).compiled
+    print("and again", flush=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("seed", [*range(3), *(pytest.param(k, marks=pytest.mark.nightly) for k in range(3, 30))])
+def test_at_any_instant_of_compilation(seed):
+    """KeyboardInterrupt within three seconds, nothing on the terminal, and the next run compiles."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMPILES], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout.readline() == "compiles\n"
+        time.sleep(np.random.default_rng(seed).uniform(0.0, 6.0))
+        pressed = time.time()
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert (process.returncode, err) == (0, "")
+    seconds, again = out.splitlines()
+    assert float(seconds) - pressed < 3.0
+    assert again == "and again"
