@@ -10,7 +10,8 @@ import numpy as np
 
 from ..engine.data import EPS
 from ..engine.native import Call, call
-from .inputs import filled, flag, is_number, reals, refuse_units, require_arguments, shown
+from .inputs import count, filled, flag, is_number, reals, refuse_units, require_arguments, shown
+from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 
 __all__ = ["Invariant", "InvariantSet", "JointInvariants", "as_invariants", "check_gradient"]
 
@@ -34,7 +35,7 @@ class Invariant:
     Parameters
     ----------
     fun : callable
-        ``fun(t, y, *args) -> float or (l_i,)``, real.
+        ``fun(t, y, *args) -> float or (l_i,)``, real. Or, like `grad`, a C function by pointer (see Notes).
     grad : callable, optional
         ``grad(t, y, *args) -> (n,) or (l_i, n)``. For complex y, dI = Re sum_k conj(g_k) dy_k. Without it the
         gradient comes from a complex step where `fun` allows one, else from central differences of order 6 (with a
@@ -43,6 +44,8 @@ class Invariant:
         The value to keep. Default: the value at the start. A given target is a condition that the start must meet.
     args : tuple, optional
         Further arguments of `fun` and `grad`. (``solve_ivp(args=...)`` reaches only its own functions.)
+    size : int, optional
+        Number l_i of the values of `fun`, which a C function does not show; without it, a C function gives one number.
     name : str, optional
         Name in messages and diagnostics.
     scale : float, optional
@@ -58,6 +61,11 @@ class Invariant:
     Linear invariants are kept by every Runge-Kutta method; keep the corrections out of them with the option ``frame``
     rather than list them here.
 
+    C functions are given as `scipy.LowLevelCallable`, ctypes or cffi function pointers, of the signatures
+    ``int I(double t, const double *y, double *values, const double *params)`` and
+    ``int G(double t, const double *y, const double *f, double *out, const double *params)``; f is the derivative with
+    ``uses_f=True`` and holds nothing else. A C function needs a `grad`. See :doc:`/c-functions`.
+
     Examples
     --------
     >>> from eip_scipy import Invariant
@@ -71,16 +79,23 @@ class Invariant:
         *,
         target: Any = None,
         args: Sequence[Any] = (),
+        size: int | None = None,
         name: str | None = None,
         scale: float | None = None,
         in_place: bool = False,
         uses_f: bool = False,
     ) -> None:
-        if not callable(fun):
-            raise TypeError(f"Invariant: fun must be callable, got {fun!r}.")
-        if grad is not None and not callable(grad):
-            raise TypeError(f"Invariant: grad must be callable or None, got {grad!r}.")
         in_place, uses_f = flag("Invariant: in_place", in_place), flag("Invariant: uses_f", uses_f)
+        size = None if size is None else count("Invariant: size", size)
+        what = "an invariant" if name is None else f"invariant {name!r}"
+        fun = by_pointer(fun, what, shape=(size,) if size and size > 1 else ())
+        grad = by_pointer(grad, f"gradient of {what}", GRADIENT, takes_f=uses_f)
+        if not callable(fun):
+            raise TypeError(f"Invariant: fun must be callable, got {fun!r}{address_hint(fun)}.")
+        if grad is not None and not callable(grad):
+            raise TypeError(f"Invariant: grad must be callable or None, got {grad!r}{address_hint(grad)}.")
+        if grad is None and isinstance(fun, PointerFunction):
+            raise TypeError(f"{what} is a C function by pointer, and comes without grad; give one, in C or not.")
         if grad is None and (in_place or uses_f):
             raise ValueError("Invariant: in_place and uses_f describe grad; give grad or leave them out.")
         refuse_units(target=target, args=args, scale=scale)
@@ -96,9 +111,10 @@ class Invariant:
         self.grad = grad
         self.target = None if target is None else _target(target)
         self.args = args
+        self.size = size
         self.name = name
         self.scale = scale
-        self.in_place = in_place
+        self.in_place = in_place or isinstance(grad, PointerFunction)
         self.uses_f = uses_f
 
     def __repr__(self) -> str:
@@ -178,6 +194,8 @@ def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array,
     value = _value(value, label, t)
     if value.ndim > 1:
         raise ValueError(f"invariant {label!r} returned shape {value.shape}; expected a number or one dimension (l,).")
+    if invariant.size not in (None, value.size):
+        raise ValueError(f"invariant {label!r} returned {value.size} values, but has size={invariant.size}.")
     return value.astype(float)
 
 

@@ -1,22 +1,21 @@
-"""A user's functions as the native engine takes them: Numba functions by C pointers."""
+"""A user's functions as the native engine takes them, by their addresses: C functions by pointer, and Numba's."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import numpy as np
-from llvmlite import ir
-from numba import carray, cfunc, from_dtype, njit, types
-from numba.core.errors import NumbaError
-from numba.extending import intrinsic, is_jitted
 
 from ..engine.native import NativeFunctions
 from .invariants import InvariantSet
-from .jitted import ChangedShapeError, NotCompilableError
+from .jitted import NotCompilableError, is_jitted, jit_is_off
+from .pointers import PointerFunction
 
-__all__ = ["compiled_functions", "raise_again"]
+if TYPE_CHECKING:
+    from .numba_pointers import Compiled
+
+__all__ = ["Kind", "native_functions", "raise_again", "with_events"]
 
 
 class Kind(NamedTuple):
@@ -37,24 +36,17 @@ class Kind(NamedTuple):
     gradient: bool = False
 
 
-class Compiled(NamedTuple):
-    """A function as C calls it, and as Python does to see what it raises, both with all arguments."""
+class Native(NamedTuple):
+    """A function that has an address, and how many floats it fills."""
 
-    pointer: Any
-    call: Any
-    name: str
-    kind: Kind
+    function: PointerFunction | Compiled
+    floats: int
 
 
-def compiled_functions(
-    fun: Callable[..., Any],
-    form: str,
-    params: np.ndarray | None,
-    invariants: InvariantSet,
-    events: Sequence[Callable[..., Any]],
-    y0: np.ndarray,
+def native_functions(
+    fun: Callable[..., Any], form: str, params: np.ndarray | None, invariants: InvariantSet, y0: np.ndarray
 ) -> NativeFunctions:
-    """C pointers to a run's functions.
+    """The addresses of a run's functions, but for its events.
 
     Parameters
     ----------
@@ -64,19 +56,19 @@ def compiled_functions(
     params : ndarray or None
         Their last argument, where they take one; the functions read this array.
     invariants : InvariantSet
-    events : sequence of callable
     y0 : ndarray, shape (n,)
 
     Raises
     ------
     NotCompilableError
-        When one of them is no lazily jitted Numba function of the arguments that `integrate` documents.
+        When one of them is neither a C function by pointer nor a lazily jitted Numba function of the arguments that
+        `integrate` documents.
     """
     n, second_order = y0.size, form.startswith("acceleration")
     size = n // 2 if second_order else n
-    number = Kind((), n, -1 if params is None else params.size, y0.dtype.char, real=True)
-    rhs = _compiled(fun, number._replace(shape=(size,), size=size, real=False, in_place=form.endswith("place")), "fun")
-    inv, grad = list[Compiled](), list[Compiled]()
+    number = _number(params, y0)
+    rhs = _native(fun, number._replace(shape=(size,), size=size, real=False, in_place=form.endswith("place")), "fun")
+    inv, grad = list[Native](), list[Native]()
     for k, (item, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
         name = f"invariant {label!r}"
         if item.args:
@@ -84,145 +76,66 @@ def compiled_functions(
         if item.grad is None:
             raise NotCompilableError(f"{name} has no grad")
         shape = () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
-        inv.append(_compiled(item.fun, number._replace(shape=shape), name))
+        inv.append(_native(item.fun, number._replace(shape=shape), name))
         rows = Kind((*shape, n), n, number.p, number.dtype, False, item.uses_f, item.in_place, gradient=True)
-        grad.append(_compiled(item.grad, rows, f"gradient of {name}"))
-    event = [_compiled(function, number, f"event {k}") for k, function in enumerate(events)]
+        grad.append(_native(item.grad, rows, f"gradient of {name}"))
     return NativeFunctions(
-        rhs=rhs.pointer.address,
+        rhs=rhs.function.address,
         inv=_addresses(inv),
         grad=_addresses(grad),
-        event=_addresses(event),
+        event=(),
         params=np.zeros(0) if params is None else params,  # itself: an ensemble writes each member's there
         second_order=second_order,
-        owner={"rhs": [rhs], "inv": inv, "grad": grad, "event": event},
+        owner={"rhs": [rhs], "inv": inv, "grad": grad, "event": []},
     )
 
 
-def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: bytes, f: bytes | None) -> None:
-    """Raise what the function that failed in the engine raises, from the arguments of its `FailedCallError`.
+def with_events(
+    functions: NativeFunctions, events: Sequence[Callable[..., Any]], params: np.ndarray | None, y0: np.ndarray
+) -> NativeFunctions:
+    """The same with the addresses of the events.
+
+    Raises
+    ------
+    NotCompilableError
+        As by `native_functions`.
+    """
+    number = _number(params, y0)
+    event = [_native(function, number, f"event {k}") for k, function in enumerate(events)]
+    return functions._replace(event=_addresses(event), owner=functions.owner | {"event": event})
+
+
+def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: bytes, f: bytes, status: int) -> NoReturn:
+    """Raise what a failed call in the engine is to a run, from the arguments of its `FailedCallError`.
 
     Raises
     ------
     RuntimeError
-        When it raises nothing in a second call.
+        For the status of a C function; for a Numba function what it raises, whatever that is.
     """
-    compiled = functions.owner[group][k]
-    kind = compiled.kind
-    state = np.frombuffer(y, kind.dtype)[: kind.size].copy()
-    out = np.empty(kind.shape or (1,), float if kind.real else kind.dtype)
-    try:
-        compiled.call(t, state, np.frombuffer(f or bytes(len(y)), kind.dtype).copy(), out, functions.params)
-    except ChangedShapeError:
-        raise ChangedShapeError(f"{compiled.name} returned an array of another shape than at the start") from None
-    raise RuntimeError(f"{compiled.name} raised an exception at t={t:.10g}, but not when it was called again there.")
+    function = functions.owner[group][k].function
+    if isinstance(function, PointerFunction):
+        raise function.failure(t, status)
+    raise function.failure(t, y, f, functions.params)
 
 
-def _addresses(functions: list[Compiled]) -> tuple[tuple[int, int], ...]:
-    return tuple((found.pointer.address, _floats(found.kind)) for found in functions)
+def _number(params: np.ndarray | None, y0: np.ndarray) -> Kind:
+    return Kind((), y0.size, -1 if params is None else params.size, y0.dtype.char, real=True)
 
 
-def _floats(kind: Kind) -> int:
+def _native(fun: Any, kind: Kind, name: str) -> Native:
     width = 2 if np.dtype(kind.dtype).kind == "c" and not kind.real else 1
-    return int(np.prod(kind.shape, dtype=int)) * width
-
-
-def _compiled(fun: Any, kind: Kind, name: str) -> Compiled:
-    if not is_jitted(fun):
+    floats = int(np.prod(kind.shape, dtype=int)) * width
+    if isinstance(fun, PointerFunction):
+        return Native(fun, floats)
+    if jit_is_off():
+        raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
+    if not is_jitted(fun):  # else Numba would be loaded to say so
         raise NotCompilableError(f"{name} is not a Numba function; decorate it with @numba.njit")
-    try:
-        call, pointer = _compile(fun, kind)
-    except NumbaError as error:
-        first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        raise NotCompilableError(f"{name} does not compile for this state: {first}") from error
-    if any(isinstance(known.return_type, types.Optional) for known in fun.nopython_signatures):
-        raise NotCompilableError(f"{name} returns None in some places, and a number or an array in others")
-    return Compiled(pointer, call, name, kind)
+    from .numba_pointers import compiled
+
+    return Native(compiled(fun, kind, name), floats)
 
 
-@lru_cache(maxsize=256)
-def _compile(fun: Any, kind: Kind) -> tuple[Any, Any]:
-    """For the same function and kind of state once in a process."""
-    call = _with_all_arguments(fun, kind)
-    scalar = from_dtype(np.dtype(kind.dtype))
-    state, floats = types.CPointer(scalar), types.CPointer(types.float64)
-    size, p, shape = kind.size, max(kind.p, 0), kind.shape or (1,)
-
-    def value(t, y, out, params):
-        given = carray(y, (size,))
-        return _status_of(call, t, given, given, carray(out, shape), carray(params, (p,)))
-
-    def rows(t, y, f, out, params):
-        return _status_of(call, t, carray(y, (size,)), carray(f, (size,)), carray(out, shape), carray(params, (p,)))
-
-    out = floats if kind.real else state
-    if kind.gradient:
-        return call, cfunc(types.int32(types.float64, state, state, out, floats))(rows)
-    return call, cfunc(types.int32(types.float64, state, out, floats))(value)
-
-
-@intrinsic  # emits LLVM
-def _status_of(typingctx, function, t, y, f, out, params):
-    """0 after a call of a Numba function, -1 where it raised an exception."""
-    arguments = t, y, f, out, params
-    resolved = function.get_call_type(typingctx, arguments, {})
-
-    def codegen(context, builder, signature, values):
-        compiled = function.dispatcher.get_compile_result(resolved)
-        context.active_code_library.add_linking_library(compiled.library)
-        status, _ = context.call_internal_no_propagate(builder, compiled.fndesc, resolved, values[1:])
-        return builder.sext(status.is_error, ir.IntType(32))
-
-    return types.int32(function, *arguments), codegen
-
-
-def _with_all_arguments(fun: Any, kind: Kind) -> Any:
-    """``call(t, y, f, out, params)``, which puts the function's value into out."""
-    has_params = kind.p >= 0
-    # Inlined: that an array is nobody's, and needs no counting of references, shows only there.
-    bare = njit(forceinline=True)(
-        {
-            (False, False, False): lambda t, y, f, out, params: fun(t, y),
-            (False, False, True): lambda t, y, f, out, params: fun(t, y, params),
-            (False, True, False): lambda t, y, f, out, params: fun(t, y, out),
-            (False, True, True): lambda t, y, f, out, params: fun(t, y, out, params),
-            (True, False, False): lambda t, y, f, out, params: fun(t, y, f),
-            (True, False, True): lambda t, y, f, out, params: fun(t, y, f, params),
-            (True, True, False): lambda t, y, f, out, params: fun(t, y, f, out),
-            (True, True, True): lambda t, y, f, out, params: fun(t, y, f, out, params),
-        }[kind.takes_f, kind.in_place, has_params]
-    )
-    if kind.in_place:
-        return bare
-    put = {0: _put_number, 1: _put_values if kind.real else _put_array, 2: _put_rows}[len(kind.shape)]
-    return njit(forceinline=True)(lambda t, y, f, out, params: put(bare(t, y, f, out, params), out))
-
-
-@njit
-def _put_number(value, out):
-    out[0] = value
-
-
-@njit
-def _put_values(values, out):
-    if len(values) != out.size:
-        raise ChangedShapeError
-    for i in range(out.size):
-        out[i] = values[i]
-
-
-@njit
-def _put_array(values, out):
-    if values.size != out.size:
-        raise ChangedShapeError
-    for i in range(out.size):
-        out[i] = values[i]
-
-
-@njit
-def _put_rows(rows, out):
-    if rows.shape[0] != out.shape[0] or rows.shape[1] != out.shape[1]:
-        raise ChangedShapeError
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[i, j] = rows[i, j]
+def _addresses(functions: list[Native]) -> tuple[tuple[int, int], ...]:
+    return tuple((found.function.address, found.floats) for found in functions)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .inputs import refuse_units
+from .pointers import by_pointer
 
 __all__ = ["Problem"]
 
@@ -34,7 +35,7 @@ class Problem:
     invariants : tuple of Invariant
         The invariants that the equations have (linear ones in `frame`), with ``args=(params,)``.
     rhs : callable, optional
-        Compiled right-hand side in place: ``rhs(t, y, out, params)``.
+        Compiled right-hand side in place: ``rhs(t, y, out, params)``, or a C function by pointer.
     acc : callable, optional
         For q'' = a(t, q): ``acc(t, q, params) -> (n/2,)``, compiled; the state is (q, v).
     h : float, optional
@@ -69,6 +70,7 @@ class Problem:
 
     def __post_init__(self) -> None:
         refuse_units(y0=self.y0, t_span=self.t_span, h=self.h, params=self.params, metric=self.metric, frame=self.frame)
+        object.__setattr__(self, "rhs", by_pointer(self.rhs, "rhs"))
 
 
 def bind(rhs: Callable[..., None], params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:

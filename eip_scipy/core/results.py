@@ -165,7 +165,11 @@ class IntegrationResult(OptimizeResult):
     wall_time : float
         Seconds in the integration, compilation left out.
     compiled : bool
-        Whether the run was compiled; if not, `message` says why.
+        Whether all functions were called natively; if not, `message` says which were not, and why.
+    calls : dict of str
+        How each was called: "python", "jitted" (a Numba function, as a C pointer) or "pointer" (a C function). The keys
+        are "fun", the name of each invariant ("invariant 0" for the first one, if it has none), "gradient of " and that
+        name, "event 0", "event 1" and so on.
     method : str
     h : float or None
     """

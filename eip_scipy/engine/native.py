@@ -58,7 +58,8 @@ class PythonFunctions(NamedTuple):
 class NativeFunctions(NamedTuple):
     """A run's functions by their addresses, with the signatures in cpp/system.hpp; `owner` keeps them alive.
 
-    Of each invariant, gradient and event the address, and how many floats it fills.
+    Of each invariant, gradient and event the address, and how many floats it fills. `python`: the functions in Python,
+    of which the events are called; there are none by address then.
     """
 
     rhs: int
@@ -68,6 +69,7 @@ class NativeFunctions(NamedTuple):
     params: np.ndarray
     second_order: bool
     owner: Any
+    python: PythonFunctions | None = None
     native: bool = True
 
 

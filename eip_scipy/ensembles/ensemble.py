@@ -25,6 +25,7 @@ from ..core.inputs import count, flag, is_number, real_array, refuse_units, show
 from ..core.invariants import as_invariants
 from ..core.names import nearest
 from ..core.options import ProjectionOptions
+from ..core.pointers import PointerFunction
 from ..core.problem import Problem
 from ..core.solvers import EIPRK4, EIPSolver
 from ..engine.counters import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
@@ -251,12 +252,12 @@ def ensemble(
     starts, parameters = _inputs(fun, y0s, params, options.get("invariants", ()))
     keep = reduce is None or out is not None
     common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
-    request = Request.of(fun=_bare(fun), t_span=t_span, y0=starts[0], params=parameters[0], **common)
+    request = Request.of(fun=_bare(fun), t_span=t_span, y0=starts[0], params=parameters[0], **common).with_pointers()
     if not parameters.shape[1]:
         request = dataclasses.replace(request, params=None)
     plan, doubts = _first_that_starts(Task(request, reduce, keep, len(starts)), starts, parameters)
     starts = np.ascontiguousarray(starts, plan.dtype)
-    size = _chunk_size(plan, len(starts), fun) if chunk is None else count("chunk", chunk)
+    size = _chunk_size(plan, len(starts), request.fun) if chunk is None else count("chunk", chunk)
     held = plan.times.size if reduce is None and out is None else 0
     _check_memory(plan, len(starts), held, max_bytes)
     store: Store | None = None
@@ -510,7 +511,8 @@ def _first_that_starts(task: Task, starts: np.ndarray, params: np.ndarray) -> tu
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
     """Members in a chunk, by the problem alone: about a second's work, bounded in bytes, a multiple of the lanes."""
     rhs = fun.rhs or fun.fun if isinstance(fun, Problem) else fun
-    budget = CHUNK_STEPS if is_jitted(rhs) and plan.task.request.compiled is not False else INTERPRETED_STEPS
+    native = is_jitted(rhs) or isinstance(rhs, PointerFunction)
+    budget = CHUNK_STEPS if native and plan.task.request.compiled is not False else INTERPRETED_STEPS
     steps = plan.n_steps or UNKNOWN_STEPS
     by_work = budget * 4 / (steps * max(4, plan.size))
     by_bytes = CHUNK_BYTES / (plan.size * plan.dtype.itemsize * (1 + plan.times.size))
@@ -550,6 +552,8 @@ def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
     if isinstance(executor, Executor):
         return FuturesPool(executor, task, key)
     if executor == "dask" or _is_of_dask(executor):
+        if plan.pointers:
+            raise plan.pointers[0].unpicklable()  # Dask would bury it in pages of its own
         # By name: the integrations are built on the package, and need what it does not.
         return import_module("eip_scipy.integrations.dask").pool(executor, task, key)
     raise TypeError(

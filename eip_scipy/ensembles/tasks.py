@@ -141,6 +141,8 @@ class Plan:
         Times at which states are saved; none where only the last state is wanted.
     n_steps : int or None
         Steps of one member, where that is known.
+    pointers : list of PointerFunction
+        The C functions by pointer, which Numba's loop does not take, nor another process.
     """
 
     def __init__(self, task: Task, ready: Prepared | None = None) -> None:
@@ -150,6 +152,7 @@ class Plan:
         schedule, run = self._ready.schedule, self._ready.run
         self.why_not: str | None = None
         self.names = tuple(run.invariants.names)
+        self.pointers = self._ready.pointers
         self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, schedule.span.t0
         self.t_bound, self.h = schedule.span.t_bound, self._ready.stepping.h
         self.times = saved_times(schedule)
@@ -165,7 +168,7 @@ class Plan:
         self.why_not = loop.why_not
         own_targets = any(item.target is not None for item in ready.run.invariants.items)
         own_start = ready.run.identity["project_initial"] or own_targets
-        single = own_start or loop.events.functions or ready.schedule.t_eval.size
+        single = own_start or loop.events.functions or ready.schedule.t_eval.size or self.pointers
         self._together = self.why_not is None and not single
         self._idle = [Sweeper(loop, self.task.members)] if self._together else []
         none = np.zeros((0, self.size), self.dtype), np.zeros((0, loop.driver.params.size))

@@ -11,10 +11,11 @@ from scipy.integrate import DenseOutput
 from scipy.optimize import brentq
 
 from ..core.inputs import is_number, reals, refuse_units, require_arguments, shown
+from ..core.pointers import address_hint, by_pointer, is_pointer
 from ..engine.data import EPS
 from ..engine.native import Call, call
 
-__all__ = ["Events"]
+__all__ = ["Events", "as_events"]
 
 
 class Events:
@@ -37,7 +38,7 @@ class Events:
     """
 
     def __init__(self, events: Any, extra: tuple = ()) -> None:
-        items = _as_events(events)
+        items = as_events(events)
         self.functions: list[Callable[..., Any]] = list(items)
         self._extra = extra
         self.directions = np.array([_direction(getattr(item, "direction", 0)) for item in items])
@@ -129,24 +130,36 @@ class Events:
         return float(found)
 
 
-def _as_events(events: Any) -> tuple[Callable[..., Any], ...]:
-    """One event or a sequence of them, as a tuple.
+def as_events(events: Any) -> tuple[Callable[..., Any], ...]:
+    """One event or a sequence of them, as a tuple; C functions by pointer as Python calls them.
 
     Raises
     ------
     TypeError
         For anything else.
     """
-    if events is None or callable(events):
-        return () if events is None else (events,)
+    if events is None:
+        return ()
+    if callable(events) or is_pointer(events):
+        events = (events,)
     try:
-        items = tuple(events)
+        given = tuple(events)
     except TypeError:
-        raise TypeError(f"events must be callable, or a sequence of callables, got {shown(events)}.") from None
+        what = f"{shown(events)}{address_hint(events)}"
+        raise TypeError(f"events must be callable, or a sequence of callables, got {what}.") from None
+    items = tuple(_adapted(event, k) for k, event in enumerate(given))
     for item in items:
         if not callable(item):
-            raise TypeError(f"events must be callable, got {shown(item)}.")
+            raise TypeError(f"events must be callable, got {shown(item)}{address_hint(item)}.")
     return items
+
+
+def _adapted(event: Any, k: int) -> Any:
+    """A C function by pointer as Python calls it, with its attributes as an event."""
+    found = by_pointer(event, f"event {k}", shape=())
+    if found is not event:
+        found.terminal, found.direction = getattr(event, "terminal", None), getattr(event, "direction", 0)
+    return found
 
 
 def _direction(direction: Any) -> float:

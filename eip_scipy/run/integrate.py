@@ -78,9 +78,11 @@ def integrate(
     ----------
     fun : callable or Problem
         ``fun(t, y[, params]) -> (n,)``; with ``in_place=True``, ``fun(t, y, out[, params])``. For a compiled run a
-        lazily jitted Numba function. With a Nystrom method (`EIPRKN8`, `EIPRKN12`), whose state is (q, v), the
-        acceleration: ``acc(t, q[, params]) -> (n/2,)``, in place ``acc(t, q, out[, params])``. A `Problem` brings
-        everything else with it; options given here take precedence.
+        lazily jitted Numba function, or a C function as `scipy.LowLevelCallable`, ctypes or cffi pointer,
+        ``int fun(double t, const double *y, double *out, const double *params)``, see :doc:`/c-functions`. With a
+        Nystrom method (`EIPRKN8`, `EIPRKN12`), whose state is (q, v), the acceleration: ``acc(t, q[, params]) ->
+        (n/2,)``, in place ``acc(t, q, out[, params])``. A `Problem` brings everything else with it; options given here
+        take precedence.
     t_span : (float, float)
         Start and end; backward if the end comes first.
     y0 : array_like, shape (n,)
@@ -102,8 +104,8 @@ def integrate(
         Times to save at instead, inside `t_span`, in its direction; states between steps come from dense output, on
         the manifold. With neither, the first and the last state are saved.
     events : callable or sequence of callable, optional
-        ``event(t, y[, params]) -> float``, with ``terminal`` and ``direction`` as for `scipy.integrate.solve_ivp`; in
-        compiled runs Numba functions.
+        ``event(t, y[, params]) -> float``, with ``terminal`` and ``direction`` as for `scipy.integrate.solve_ivp`;
+        Numba functions or C functions, or Python functions, which Python then calls beside native ones.
     dense_output : bool, optional
         Whether to keep the interpolants of all steps, as ``.sol``, a function of time; not with a checkpoint.
     callback : callable, optional
@@ -113,7 +115,7 @@ def integrate(
         Show a progress bar with the time that is left.
     compiled : bool, optional
         None: compiled where possible, else interpreted, with the reason in ``.message``. True: TypeError where it is
-        not possible. False: interpreted.
+        not possible for all functions. False: interpreted.
     max_bytes : float, optional
         Bound on the memory for saved states; default: half of what is free.
     checkpoint : path-like, optional
@@ -394,13 +396,14 @@ class Loop:
             trusted=driver.run.trust.trusted,
             wall_time=self.wall_time,
             compiled=self.why_not is None,
+            calls=self.prepared.system.calls(driver.run, driver.functions),
             method=self.method,
             h=abs(driver.schedule.span.h) or None,
         )
 
     def explained(self, message: str) -> str:
         """With what speaks against the run, and what is to be said about checkpoints and not being compiled."""
-        notes = [*self.keeper.notes, *([] if self.why_not is None else [f"interpreted: {self.why_not}"])]
+        notes = [*self.keeper.notes, *([] if self.why_not is None else [self.why_not])]
         doubt = self.driver.run.trust.message
         message = f"{message}; {doubt}" if doubt else message
         return f"{message} ({'; '.join(notes)})" if notes else message
@@ -467,6 +470,7 @@ def _start_kept(request: Request) -> Iterator[None]:
                     success=False,
                     wall_time=time.perf_counter() - begin,
                     compiled=False,
+                    calls={},
                     method=getattr(request.method, "__name__", str(request.method)),
                     h=None,
                 )

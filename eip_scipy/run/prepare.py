@@ -12,9 +12,11 @@ import numpy as np
 from ..core import setup
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import Invariant, as_invariants
-from ..core.jitted import NotCompilableError, is_jitted, jit_is_off
+from ..core.jitted import NotCompilableError
+from ..core.native_functions import native_functions, with_events
 from ..core.one_step import OneStep
 from ..core.options import ProjectionOptions
+from ..core.pointers import PointerFunction, address_hint, by_pointer
 from ..core.problem import Problem
 from ..core.results import Diagnostics
 from ..core.setup import Counted, Run, Start
@@ -25,7 +27,7 @@ from ..engine.data import Schedule, Span
 from ..engine.native import NativeFunctions, PythonFunctions, call
 from ..methods.nystrom import NystromTableau
 from .driver import check_memory, saved_rows
-from .events import Events
+from .events import Events, as_events
 from .interpreted_functions import FORMS, INTERPRETED
 from .memory import check_bytes, free_memory
 from .resume import settings
@@ -78,6 +80,10 @@ class Request:
         projection, others = ProjectionOptions.split(keywords)
         return cls(projection=projection, **others)
 
+    def with_pointers(self) -> Request:
+        """The request with its C functions by pointer as Python calls them."""
+        return replace(self, fun=by_pointer(self.fun, "fun"), events=as_events(self.events))
+
     @property
     def adaptive(self) -> bool:
         """Whether an option of adaptive steps was given."""
@@ -102,7 +108,7 @@ class System:
     def __init__(self, request: Request, form: str) -> None:
         self.fun, self.form = request.fun, form
         if not callable(self.fun):
-            raise TypeError(f"integrate: fun must be callable or a Problem, got {self.fun!r}.")
+            raise TypeError(f"integrate: fun must be callable or a Problem, got {self.fun!r}{address_hint(self.fun)}.")
         params = request.params
         self.parameters = np.zeros(0) if params is None else real_array("params", params, TypeError).reshape(-1)
         self.extra = () if params is None else (self.parameters,)
@@ -129,30 +135,42 @@ class System:
             raise
 
     def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
-        """The functions of the loop, and why they are not compiled (None: they are)."""
-        interpreted = self._interpreted(run)
+        """The functions of the loop, and which of them Python calls and why (None: none)."""
+        in_python, params = self._in_python(run), self.parameters if self.extra else None
         if wanted is False:
-            return interpreted, "compiled=False"
+            return in_python, "interpreted: compiled=False"
         try:
-            return self._compiled(run), None
+            if isinstance(run.method, OneStep):
+                raise NotCompilableError(f"{run.method.name} is a one-step method in Python")
+            functions = native_functions(self.fun, self.form, params, run.invariants, run.y0)
         except NotCompilableError as reason:
             if wanted:
                 raise
-            return interpreted, str(reason)
+            return in_python, f"interpreted: {reason}"
+        try:
+            return with_events(functions, self.events.functions, params, run.y0), None
+        except NotCompilableError as reason:
+            if wanted:
+                raise
+            return functions._replace(python=in_python), f"events are called from Python: {reason}"
 
-    def _compiled(self, run: Run) -> NativeFunctions:
-        if isinstance(run.method, OneStep):
-            raise NotCompilableError(f"{run.method.name} is a one-step method in Python")
-        if jit_is_off():
-            raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
-        if not is_jitted(self.fun):  # else Numba would be loaded to say so
-            raise NotCompilableError("fun is not a Numba function; decorate it with @numba.njit")
-        from ..core.native_functions import compiled_functions
+    def calls(self, run: Run, functions: PythonFunctions | NativeFunctions) -> dict[str, str]:
+        """Which kind of call is made of each function; see `IntegrationResult`."""
 
-        params = self.parameters if self.extra else None
-        return compiled_functions(self.fun, self.form, params, run.invariants, self.events.functions, run.y0)
+        def kind(fun: Any, in_python: bool) -> str:
+            if in_python:
+                return "python"
+            return "pointer" if isinstance(fun, PointerFunction) else "jitted"
 
-    def _interpreted(self, run: Run) -> PythonFunctions:
+        in_python = isinstance(functions, PythonFunctions)
+        found = {"fun": kind(self.fun, in_python)}
+        for item, label in zip(run.invariants.items, run.invariants.labels, strict=True):
+            found[label] = kind(item.fun, in_python)
+            found[f"gradient of {label}"] = kind(item.grad, in_python)
+        in_python = isinstance(functions, PythonFunctions) or functions.python is not None
+        return found | {f"event {k}": kind(event, in_python) for k, event in enumerate(self.events.functions)}
+
+    def _in_python(self, run: Run) -> PythonFunctions:
         n, dtype = run.y0.size, run.y0.dtype
         second_order, in_place = self.form.startswith("acceleration"), "in place" in self.form
         size = n // 2 if second_order else n
@@ -183,6 +201,14 @@ class Prepared:
         """The name of the method's class."""
         return str(self.request.method.__name__)
 
+    @property
+    def pointers(self) -> list[PointerFunction]:
+        """The C functions by pointer."""
+        items = self.run.invariants.items
+        functions = [self.system.fun, *self.system.events.functions]
+        functions += [function for item in items for function in (item.fun, item.grad)]
+        return [function for function in functions if isinstance(function, PointerFunction)]
+
     def identity(self, y0: Any, params: Any) -> dict[str, Any]:
         """All that decides the bits of a run from y0, but for the functions, under the names that users give."""
         return settings(self.label, self.stepping, y0, params, self.run, self.schedule, self.system.events)
@@ -192,9 +218,11 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     """A run as it is asked for, all that was given checked; `check_start`: see `setup.prepare`."""
     refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
     method = _method(request.method)
-    form = FORMS[isinstance(method, NystromTableau), flag("in_place", request.in_place)]
+    in_place = flag("in_place", request.in_place)
     _check_choices(request)
-    request, form = _with_problem(request, form)
+    request = request.with_pointers()
+    in_place = in_place or isinstance(request.fun, PointerFunction)
+    request, form = _with_problem(request, FORMS[isinstance(method, NystromTableau), in_place])
     system = System(request, form)
     t0, t_bound = _span(request, system.events)
     y0 = _state(request.y0)

@@ -347,10 +347,12 @@ void engine_setup(Engine *self, PyObject *method, PyObject *options, PyObject *w
     const int64_t events = self->schedule ? self->schedule->n_events : 0;
     for (PyObject *object : {method, options, work, functions, schedule, hooks})
         if (PyList_Append(self->kept, object) < 0) throw PythonError{};
-    if (truth(functions, "native")) {
-        read_pointers(functions, run.work, events, arrays, system);
-    } else {
-        self->functions = new PythonFunctions(functions, work, run.work, self->type, self->kept);
+    const bool native = truth(functions, "native");
+    const Ref python = native ? attribute(functions, "python") : Ref::borrowed(functions);
+    const bool by_python = python.get() != Py_None;
+    if (native) read_pointers(functions, run.work, by_python ? 0 : events, arrays, system);
+    if (by_python) {
+        self->functions = new PythonFunctions(python.get(), work, run.work, self->type, self->kept);
         system.python = self->functions;
         if (self->functions->events() != events) {
             PyErr_SetString(PyExc_ValueError, "engine: another number of events than their values have room for");
@@ -393,15 +395,15 @@ void expect(Engine *self, Py_ssize_t count, Py_ssize_t expected, const char *nam
     if (PyErr_Occurred()) throw PythonError{};
 }
 
-// FailedCallError(which functions, which of them, t, bytes of y, of f): whoever made them calls it once more.
+// FailedCallError(which functions, which of them, t, bytes of y, of f, status): whoever made them says what it means.
 PyObject *failed_call_error = nullptr;
 
 void raise_broken(const System &system) {
     if (PyErr_Occurred()) return;
     const FailedCall &call = system.failed;
     const auto bytes = [](const std::vector<double> &a) { return static_cast<Py_ssize_t>(a.size() * sizeof(double)); };
-    const Ref arguments(Py_BuildValue("(sLdy#y#)", call.functions, static_cast<long long>(call.index), call.t,
-                                      call.y.data(), bytes(call.y), call.f.data(), bytes(call.f)));
+    const Ref arguments(Py_BuildValue("(sLdy#y#i)", call.functions, static_cast<long long>(call.index), call.t,
+                                      call.y.data(), bytes(call.y), call.f.data(), bytes(call.f), call.status));
     PyErr_SetObject(failed_call_error, arguments.get());
 }
 

@@ -9,10 +9,8 @@
 
 namespace eip {
 
-// A function that failed, or raised; what it said is kept by whoever called it.
-struct Broken {
-    int status;
-};
+// A function that failed; see `System::failed`.
+struct Broken {};
 
 // Functions by pointer. They return 0; > 0: no value here, a shorter step may have one; < 0: the run is to end. Complex
 // states are pairs of floats. `y` and `f` are scratch.
@@ -49,15 +47,16 @@ struct Native {
     int64_t floats;
 };
 
-// A call by pointer that failed: of which functions, which one, and where.
+// A call by pointer that failed: of which functions, which one, where, and the status that it returned.
 struct FailedCall {
     const char *functions = "";
     int64_t index = 0;
     double t = 0.0;
     std::vector<double> y, f;
+    int status = 0;
 };
 
-// The functions of a run, by pointer or in Python.
+// The functions of a run, by pointer or in Python: all of them, or of a run by pointer the events.
 struct System {
     ValuePointer rhs_pointer = nullptr;
     std::vector<Native<ValuePointer>> inv_pointers, event_pointers;
@@ -90,7 +89,7 @@ struct System {
 
     template <class W>
     void event(const W &w, double t, const double *y, double *values) {
-        if (!rhs_pointer) return python->event(t, y, values);
+        if (python) return python->event(t, y, values);
         call_each(w, event_pointers, "event", t, y, values);
     }
 
@@ -129,6 +128,7 @@ struct System {
                    const double *y, double *values) {
         for (int64_t k = 0; k < std::ssize(functions); ++k) {
             const auto &[pointer, floats] = functions[k];
+            fill(values, NOT_A_NUMBER, floats);  // shows where a function leaves a value as it was
             const int status = pointer(t, copied(y, scratch, w.m), values, params);
             if (status) [[unlikely]] gave_up(status, {name, k, t, {y, y + w.m}, {}}, values, floats);
             values += floats;
@@ -138,7 +138,8 @@ struct System {
     [[gnu::cold, gnu::noinline]] void gave_up(int status, FailedCall call, double *out, int64_t floats) {
         if (status > 0) return fill(out, NOT_A_NUMBER, floats);
         failed = std::move(call);
-        throw Broken{status};
+        failed.status = status;
+        throw Broken{};
     }
 };
 

@@ -1,0 +1,178 @@
+"""C functions by pointer: `scipy.LowLevelCallable`, and function pointers of ctypes and of cffi."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import sys
+from typing import Any, NoReturn
+
+import numpy as np
+
+__all__ = ["GRADIENT", "VALUE", "PointerFunction", "address_hint", "by_pointer", "is_pointer"]
+
+VALUE = "int (double t, const double *y, double *out, const double *params)"
+GRADIENT = "int (double t, const double *y, const double *f, double *out, const double *params)"
+TYPES = {  # as LowLevelCallable writes them, without spaces and const
+    VALUE: "int(double,double*,double*,double*)",
+    GRADIENT: "int(double,double*,double*,double*,double*)",
+}
+# Of the C functions as Python calls them; the GIL is released, as in a run whose functions are all native.
+PROTOTYPES = {
+    kind: ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[ctypes.c_void_p] * types.count("*"))
+    for kind, types in TYPES.items()
+}
+NONE = np.zeros(0)
+# The class of all function pointers of ctypes, under the name that its documentation gives.
+FROM_CTYPES: Any = ctypes._CFuncPtr  # type: ignore[attr-defined]
+_capsule_name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(("PyCapsule_GetName", ctypes.pythonapi))
+_capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
+    ("PyCapsule_GetPointer", ctypes.pythonapi)
+)
+
+
+class PointerFunction:
+    """A C function as Python calls it: ``(t, y[, f], out[, params])``, f for gradients that take it.
+
+    Parameters
+    ----------
+    pointer : LowLevelCallable, ctypes or cffi function pointer
+        Kept, so that what it points to lives as long as this does.
+    name : str
+        Of the function in messages.
+    kind : str
+        VALUE or GRADIENT, what the C function is to be.
+    takes_f : bool, optional
+        Whether f is given from Python. From the engine a gradient gets it always; here it gets NaN in its place.
+    shape : tuple of int, optional
+        With it, there is no argument `out`: a new array of that shape is returned, a float for ``()``.
+
+    Raises
+    ------
+    TypeError
+        When the pointer is of another signature, or comes with user_data.
+    """
+
+    def __init__(
+        self,
+        pointer: Any,
+        name: str,
+        kind: str = VALUE,
+        *,
+        takes_f: bool = False,
+        shape: tuple[int, ...] | None = None,
+    ) -> None:
+        _require_signature(pointer, name, kind)
+        self.pointer, self.name, self.kind = pointer, name, kind
+        self.takes_f, self.shape = takes_f, shape
+        self.address = _address(pointer)
+        if not self.address:
+            raise TypeError(f"{name} is a null pointer; expected a C function {kind}.")
+        self._function = PROTOTYPES[kind](self.address)
+
+    def __call__(self, t: float, y: np.ndarray, *others: Any) -> Any:
+        """Call it: what is in `out`, or returned, is NaN where it has no value.
+
+        Raises
+        ------
+        RuntimeError
+            When it returns a status below 0.
+        """
+        rest = list(others)
+        state = np.ascontiguousarray(y, complex if np.iscomplexobj(y) else float)
+        given = [state]
+        if self.kind == GRADIENT:
+            f = rest.pop(0) if self.takes_f else np.full_like(state, np.nan)
+            given.append(np.ascontiguousarray(f, state.dtype))
+        out = rest.pop(0) if self.shape is None else np.full(self.shape, np.nan)
+        given += [out, np.ascontiguousarray(rest.pop(0), float) if rest else NONE]
+        if rest:
+            raise TypeError(f"{self.name} is a C function by pointer: besides t and y it takes params only.")
+        status = self._function(t, *(array.ctypes.data for array in given))
+        if status < 0:
+            raise self.failure(t, status)
+        if status > 0:
+            out.fill(np.nan)
+        if self.shape is None:
+            return None
+        return out if self.shape else float(out)
+
+    def __reduce__(self) -> NoReturn:
+        raise self.unpicklable()
+
+    def unpicklable(self) -> TypeError:
+        """What an attempt to pickle it is."""
+        return TypeError(
+            f"{self.name} is a C function by pointer, which cannot be pickled: its address means nothing in another "
+            "process. Ensembles on Dask and on processes, and all else that pickles, need functions in Python or Numba."
+        )
+
+    def failure(self, t: float, status: int) -> RuntimeError:
+        """What a negative status is to a run."""
+        return RuntimeError(f"{self.name} returned the status {status} at t={t:.10g}; below 0 it ends the run.")
+
+
+def is_pointer(fun: Any) -> bool:
+    """Whether a function is a C function by pointer.
+
+    SciPy and cffi are not loaded to find out: where they are not loaded, none is theirs.
+    """
+    return isinstance(fun, FROM_CTYPES) or _is_low_level(fun) or _is_of_cffi(fun)
+
+
+def by_pointer(fun: Any, name: str, kind: str = VALUE, **form: Any) -> Any:
+    """A C function by pointer as a `PointerFunction`, with its keywords; all else as it is.
+
+    Raises
+    ------
+    TypeError
+        As by `PointerFunction`.
+    """
+    return PointerFunction(fun, name, kind, **form) if is_pointer(fun) else fun
+
+
+def address_hint(fun: Any) -> str:
+    """What is to be said besides of an integer where a function belongs."""
+    if isinstance(fun, bool) or not isinstance(fun, (int, np.integer)):
+        return ""
+    return "; an address says nothing of its signature: give a ctypes or cffi pointer, or a scipy.LowLevelCallable"
+
+
+def _is_low_level(fun: Any) -> bool:
+    return "scipy" in sys.modules and isinstance(fun, sys.modules["scipy"].LowLevelCallable)
+
+
+def _is_of_cffi(fun: Any) -> bool:
+    return "_cffi_backend" in sys.modules and isinstance(fun, sys.modules["_cffi_backend"].FFI.CData)
+
+
+def _require_signature(pointer: Any, name: str, kind: str) -> None:
+    found = _signature(pointer)
+    if _normalised(found) != TYPES[kind]:
+        raise TypeError(f"{name} is a C function of the signature {found!r}, expected {kind}.")
+    if _is_low_level(pointer) and pointer.user_data is not None:
+        raise TypeError(f"{name} is a LowLevelCallable with user_data, which no argument takes; pass it by params.")
+
+
+def _signature(pointer: Any) -> str:
+    if isinstance(pointer, FROM_CTYPES) and pointer.argtypes is None:
+        return "unknown: its argtypes are not set"
+    from scipy import LowLevelCallable
+
+    return str((pointer if _is_low_level(pointer) else LowLevelCallable(pointer)).signature)
+
+
+def _normalised(signature: str) -> str:
+    return re.sub(r"\bconst\b|\s", "", signature)
+
+
+def _address(pointer: Any) -> int:
+    if isinstance(pointer, FROM_CTYPES):
+        return ctypes.cast(pointer, ctypes.c_void_p).value or 0
+    if _is_of_cffi(pointer):
+        from cffi import FFI
+
+        return int(FFI().cast("uintptr_t", pointer))
+    if _is_low_level(pointer):
+        return _address(pointer.function)
+    return int(_capsule_pointer(pointer, _capsule_name(pointer)))

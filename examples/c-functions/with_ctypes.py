@@ -1,0 +1,26 @@
+"""Kepler's problem by the functions of kepler.c."""
+
+import ctypes
+
+from eip_scipy import EIPRK4, Invariant, integrate
+
+library = ctypes.CDLL("./libkepler.so")
+floats = ctypes.POINTER(ctypes.c_double)
+for function in (library.kepler, library.kept, library.turn):
+    function.argtypes = [ctypes.c_double, floats, floats, floats]
+library.kept_gradient.argtypes = [ctypes.c_double, floats, floats, floats, floats]
+
+turn = library.turn
+turn.direction = 1  # from approach to departure: the pericentre
+run = integrate(
+    library.kepler,
+    (0, 200),
+    [1.6, 0, 0, 0.5],
+    method=EIPRK4,
+    h=0.03,
+    params=[1.0],
+    invariants=Invariant(library.kept, library.kept_gradient, size=2, name="HL"),
+    events=turn,
+)
+print(run.compiled, set(run.calls.values()))
+print(f"{run.t_events[0].size} pericentres, energy and angular momentum kept: {run.max_defect.max() < 1e-11}")

@@ -1,0 +1,23 @@
+"""An oscillator by the functions of oscillator.pyx."""
+
+import oscillator
+from scipy import LowLevelCallable
+
+from eip_scipy import EIPRK4, Invariant, integrate
+
+
+def function(name):
+    return LowLevelCallable.from_cython(oscillator, name)
+
+
+run = integrate(
+    function("oscillator"),
+    (0, 100),
+    [1, 0, 0, 0.5],
+    method=EIPRK4,
+    h=0.03,
+    params=[2.0],
+    invariants=Invariant(function("energy"), function("energy_gradient"), name="H"),
+)
+print(run.compiled, run.calls)
+print(f"energy kept: {run.max_defect.max() < 1e-12}")
