@@ -62,12 +62,12 @@ class PointerFunction:
         takes_f: bool = False,
         shape: tuple[int, ...] | None = None,
     ) -> None:
-        _require_signature(pointer, name, kind)
         self.pointer, self.name, self.kind = pointer, name, kind
         self.takes_f, self.shape = takes_f, shape
         self.address = _address(pointer)
         if not self.address:
-            raise TypeError(f"{name} is a null pointer; expected a C function {kind}.")
+            raise TypeError(f"{name} is a null pointer, expected {kind}.")
+        _require_signature(pointer, name, kind)
         self._function = PROTOTYPES[kind](self.address)
 
     def __call__(self, t: float, y: np.ndarray, *others: Any) -> Any:

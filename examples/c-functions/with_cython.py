@@ -5,19 +5,17 @@ from scipy import LowLevelCallable
 
 from eip_scipy import EIPRK4, Invariant, integrate
 
-
-def function(name):
-    return LowLevelCallable.from_cython(oscillator, name)
-
-
+fun, energy, energy_gradient = (
+    LowLevelCallable.from_cython(oscillator, name) for name in ("oscillator", "energy", "energy_gradient")
+)
 run = integrate(
-    function("oscillator"),
+    fun,
     (0, 100),
     [1, 0, 0, 0.5],
     method=EIPRK4,
     h=0.03,
     params=[2.0],
-    invariants=Invariant(function("energy"), function("energy_gradient"), name="H"),
+    invariants=Invariant(energy, energy_gradient, name="H"),
 )
 print(run.compiled, run.calls)
 print(f"energy kept: {run.max_defect.max() < 1e-12}")

@@ -1,0 +1,534 @@
+"""C functions by pointer: the bits of the same functions in Python and Numba, their statuses, what is refused."""
+
+import ctypes
+import gc
+import math
+import pickle
+import re
+from pathlib import Path
+
+import cffi
+import numpy as np
+import pytest
+from c_compiler import shared_library
+from numba import njit
+from scipy import LowLevelCallable
+from scipy.integrate import solve_ivp
+
+from eip_scipy import (
+    EIPRK4,
+    EIPRK45,
+    EIPRKN12,
+    CheckpointError,
+    Invariant,
+    check_gradient,
+    ensemble,
+    integrate,
+    project,
+)
+from eip_scipy.problems import Problem
+
+HERE = Path(__file__).parent
+KEPLER = HERE.parents[1] / "examples" / "c-functions" / "kepler.c"
+NUMBERS = ctypes.POINTER(ctypes.c_double)
+VALUE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, NUMBERS, NUMBERS, NUMBERS)
+Y0, MU = np.array([1.6, 0.0, 0.0, 0.5]), [1.0]
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """The name of the C functions' library."""
+    return str(shared_library(tmp_path_factory.mktemp("pointers") / "functions.so", HERE / "pointers.c", KEPLER))
+
+
+@pytest.fixture(scope="module")
+def c(library):
+    """The C functions, by ctypes; gradients are known by their names."""
+    found = ctypes.CDLL(library)
+
+    class Functions:
+        def __getattr__(self, name):
+            function = found[name]  # a new one each time, without attributes of another test
+            arrays = 4 if name.endswith("gradient") or name == "reads_f" else 3
+            function.argtypes = [ctypes.c_double, *[NUMBERS] * arrays]
+            return function
+
+    return Functions()
+
+
+# The same functions in Python, with the same arithmetic.
+
+
+def orbit(t, y, p):
+    r2 = y[0] * y[0] + y[1] * y[1]
+    r3 = r2 * math.sqrt(r2)
+    return np.array([y[2], y[3], -p[0] * y[0] / r3, -p[0] * y[1] / r3])
+
+
+def acceleration(t, q, p):
+    r2 = q[0] * q[0] + q[1] * q[1]
+    r3 = r2 * math.sqrt(r2)
+    return np.array([-p[0] * q[0] / r3, -p[0] * q[1] / r3])
+
+
+def energy(t, y, p):
+    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - p[0] / math.sqrt(y[0] * y[0] + y[1] * y[1])
+
+
+def energy_gradient(t, y, f, p):
+    return np.array([-f[2], -f[3], y[2], y[3]])
+
+
+def momentum(t, y, p):
+    return y[0] * y[3] - y[1] * y[2]
+
+
+def momentum_gradient(t, y, p):
+    return np.array([y[3], -y[2], -y[1], y[0]])
+
+
+def turn(t, y, p):
+    return y[0] * y[2] + y[1] * y[3]
+
+
+def phases(t, y):
+    out = np.empty_like(y)
+    for k in range(3):
+        out[k] = complex((1 + k) * y[k].imag, -(1 + k) * y[k].real)
+    return out
+
+
+def mass(t, y):
+    total = 0.0
+    for k in range(3):
+        total += y[k].real * y[k].real + y[k].imag * y[k].imag
+    return total
+
+
+def mass_gradient(t, y):
+    return 2 * y
+
+
+def kepler_s(fun, H, dH, L, dL, event):
+    """Arguments of `integrate`: Kepler's problem by these functions."""
+    invariants = [Invariant(H, dH, name="H", uses_f=True), Invariant(L, dL, name="L")]
+    return {"fun": fun, "t_span": (0, 30), "y0": Y0, "params": MU, "invariants": invariants, "events": event}
+
+
+IN_PYTHON = orbit, energy, energy_gradient, momentum, momentum_gradient, turn
+
+
+def in_c(c):
+    return c.kepler, c.energy, c.energy_gradient, c.momentum, c.momentum_gradient, c.turn
+
+
+def same_bits(*runs):
+    one = runs[0]
+    for other in runs[1:]:
+        for name in ("t", "y", "invariants", "max_defect"):
+            np.testing.assert_array_equal(one[name], other[name])
+        assert (one.nfev, one.njev, one.nlu) == (other.nfev, other.njev, other.nlu)
+        for ours, theirs in zip(one.t_events or [], other.t_events or [], strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+BOTH = [{"h": 0.05, "save_every": 7}, {"rtol": 1e-8, "atol": 1e-8, "t_eval": np.linspace(0, 30, 41), "method": EIPRK45}]
+both = pytest.mark.parametrize("options", BOTH, ids=["fixed", "adaptive"])
+
+
+@pytest.mark.needs_jit
+@both
+def test_the_bits_are_those_of_python_and_of_numba(c, options):
+    options = {"method": EIPRK4} | options
+    jitted = [njit(function) for function in IN_PYTHON]
+    runs = [integrate(**kepler_s(*functions), **options) for functions in (IN_PYTHON, jitted, in_c(c))]
+    runs.append(integrate(**kepler_s(*in_c(c)), **options, compiled=False))
+    same_bits(*runs)
+    kinds = [set(run.calls.values()) for run in runs]
+    assert kinds == [{"python"}, {"jitted"}, {"pointer"}, {"python"}]
+    assert [run.compiled for run in runs] == [False, True, True, False]
+    assert list(runs[2].calls) == ["fun", "H", "gradient of H", "L", "gradient of L", "event 0"]
+    assert runs[2].t_events[0].size > 5
+
+
+@pytest.mark.needs_jit
+def test_a_nystrom_method(c):
+    options = {"method": EIPRKN12, "h": 0.2, "save_every": 3}
+    jitted = [njit(function) for function in (acceleration, *IN_PYTHON[1:])]
+    by_c = (c.acceleration, *in_c(c)[1:])
+    every = ((acceleration, *IN_PYTHON[1:]), jitted, by_c)
+    runs = [integrate(**kepler_s(*functions), **options) for functions in every]
+    same_bits(*runs, integrate(**kepler_s(*by_c), **options, compiled=False))
+    assert set(runs[2].calls.values()) == {"pointer"}
+
+
+@pytest.mark.needs_jit
+def test_complex_states(c):
+    y0 = np.array([1 + 1j, 0.5 - 1j, 2j])
+    plain = phases, mass, mass_gradient
+    every = (plain, [njit(function) for function in plain], (c.phases, c.mass, c.mass_gradient))
+    for options in ({"h": 0.05}, {"rtol": 1e-6, "method": EIPRK45}):
+        options = {"method": EIPRK4, "save_every": 1} | options
+        runs = [integrate(fun, (0, 3), y0, invariants=Invariant(N, dN), **options) for fun, N, dN in every]
+        fun, N, dN = every[2]
+        runs.append(integrate(fun, (0, 3), y0, invariants=Invariant(N, dN), compiled=False, **options))
+        same_bits(*runs)
+        assert runs[2].calls == {"fun": "pointer", "invariant 0": "pointer", "gradient of invariant 0": "pointer"}
+
+
+@both
+def test_invariants_of_several_values(c, options):
+    """By one C function, with two rows of gradients, or by two."""
+    options = {"method": EIPRK4} | options
+    together = [Invariant(c.kept, c.kept_gradient, size=2, name="HL")]
+    one = integrate(c.kepler, (0, 30), Y0, params=MU, invariants=together, **options)
+    same_bits(one, integrate(c.kepler, (0, 30), Y0, params=MU, invariants=together, compiled=False, **options))
+    apart = integrate(**kepler_s(*in_c(c)) | {"events": None}, **options)
+    np.testing.assert_allclose(one.y, apart.y, rtol=1e-7)
+    assert one.compiled
+    assert one.diagnostics.names == ("HL[0]", "HL[1]")
+    assert one.max_defect.max() < 1e-10
+
+
+@pytest.mark.needs_jit
+def test_numba_functions_and_c_functions_go_together(c):
+    _, H, _, _, dL, _ = in_c(c)
+    mixed = njit(orbit), H, njit(energy_gradient), njit(momentum), dL, njit(turn)
+    run = integrate(**kepler_s(*mixed), method=EIPRK4, h=0.05, save_every=7)
+    same_bits(run, integrate(**kepler_s(*in_c(c)), method=EIPRK4, h=0.05, save_every=7))
+    assert run.compiled
+    assert list(run.calls.values()) == ["jitted", "pointer", "jitted", "jitted", "pointer", "jitted"]
+
+
+def test_an_invariant_in_python_makes_all_calls_python_s(c):
+    fun, H, dH, _, _, event = in_c(c)
+    mixed = fun, H, dH, momentum, momentum_gradient, event
+    run = integrate(**kepler_s(*mixed), method=EIPRK4, h=0.05, save_every=7)
+    same_bits(run, integrate(**kepler_s(*in_c(c)), method=EIPRK4, h=0.05, save_every=7))
+    assert set(run.calls.values()) == {"python"}
+    assert "(interpreted: invariant 'L' is not a Numba function" in run.message
+    with pytest.raises(TypeError, match="invariant 'L' is not a Numba function"):
+        integrate(**kepler_s(*mixed), method=EIPRK4, h=0.05, compiled=True)
+
+
+# Ways to hand them over.
+
+
+def declared(name):
+    return f"int {name}(double, const double *, double *, const double *);"
+
+
+def test_all_kinds_of_pointers(c, library):
+    options = {"method": EIPRK4, "h": 0.05, "params": MU}
+    ffi = cffi.FFI()
+    ffi.cdef(declared("kepler"))
+    opened = ffi.dlopen(library)
+    spaced = LowLevelCallable(c.kepler, signature="int(double,const double*, double  *,double const *)")
+    kinds = [c.kepler, LowLevelCallable(c.kepler), spaced, opened.kepler, LowLevelCallable(opened.kepler)]
+    kinds += [VALUE(ctypes.cast(c.kepler, ctypes.c_void_p).value)]
+    runs = [integrate(fun, (0, 5), Y0, **options) for fun in kinds]
+    same_bits(*runs)
+    assert all(run.calls == {"fun": "pointer"} for run in runs)
+    same_bits(runs[0], integrate(c.kepler, (0, 5), Y0, in_place=True, **options))
+    brought = Problem("two bodies", orbit, Y0, (0, 5), rhs=LowLevelCallable(c.kepler), params=np.array(MU), h=0.05)
+    same_bits(runs[0], integrate(brought, method=EIPRK4))
+
+
+def test_the_run_holds_the_only_reference():
+    """To a function that is gone with its ctypes object, or with that of cffi."""
+
+    def circle(t, y, out, params):
+        out[0], out[1] = y[1], -y[0]
+        return 0
+
+    def square(t, y, value, params):
+        value[0] = y[0] * y[0] + y[1] * y[1]
+        return 0
+
+    def gradient(t, y, f, out, params):
+        out[0], out[1] = 2 * y[0], 2 * y[1]
+        return 0
+
+    more = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[NUMBERS] * 4)
+    ffi = cffi.FFI()
+    made = {
+        "ctypes": lambda: VALUE(circle),
+        "cffi": lambda: ffi.callback("int(double, double *, double *, double *)")(circle),
+        "LowLevelCallable": lambda: LowLevelCallable(VALUE(circle)),
+    }
+    plain = integrate(lambda t, y: np.array([y[1], -y[0]]), (0, 2), [1, 2], method=EIPRK4, h=0.1, save_every=1)
+    for fun in made.values():
+        kept = Invariant(LowLevelCallable(VALUE(square)), more(gradient))
+        gc.collect()
+        events = [LowLevelCallable(VALUE(square))]
+        run = integrate(fun(), (0, 2), [1, 2], method=EIPRK4, h=0.1, save_every=1, invariants=kept, events=events)
+        np.testing.assert_allclose(run.y, plain.y, atol=1e-5)
+        assert run.compiled
+        assert run.max_defect[0] < 1e-14
+
+
+def test_elsewhere_they_are_called_from_python(c):
+    kept = Invariant(c.ending_square, c.ending_gradient, args=([9.0, 0.0],), name="S")
+    assert kept.fun(0.0, np.array([1.0, 2.0]), [9.0, 0.0]) == 5.0
+    assert check_gradient(kept, 0.0, [1.0, 2.0]) < 1e-11
+    assert project([1.0, 2.0], Invariant(kept.fun, kept.grad, args=kept.args, target=5.000001)).defect[0] < 1e-12
+    circle = {"fun": lambda t, y: [y[1], -y[0]], "t_span": (0, 3), "y0": [1, 2], "method": EIPRK4, "h": 0.1}
+    assert solve_ivp(**circle, invariants=kept).success
+    assert integrate(**circle, invariants=kept).max_defect[0] < 1e-14
+
+
+def test_columns_of_an_array_are_states_too(c):
+    kept = Invariant(c.ending_square, c.ending_gradient)
+    states = np.array([[1.0, 3.0], [2.0, 4.0]])
+    assert [kept.fun(0.0, y, [1.0, 0.0]) for y in states.T] == [5.0, 25.0]
+
+
+# Statuses.
+
+
+NAMES = ["fun", "invariant 'S'", "gradient of invariant 'S'", "event 0"]
+which = pytest.mark.parametrize("k", range(4), ids=["fun", "value", "gradient", "event"])
+native_or_not = pytest.mark.parametrize("compiled", [True, False], ids=["native", "called from Python"])
+
+
+def ending(c, k, status, **options):
+    """The oscillator to t = 3, the k-th of its functions with a status after t = 1 (99: it fills nothing)."""
+    params = np.zeros(5)
+    params[[0, 1 + k]] = 1.0, status
+    kept = Invariant(c.ending_square, c.ending_gradient, name="S")
+    options = {"method": EIPRK4, "h": 0.1, "save_every": 1, "events": c.ending_event} | options
+    return integrate(c.ending, (0, 3), [1, 2], params=params, invariants=kept, **options)
+
+
+@native_or_not
+@which
+def test_a_negative_status_ends_the_run(c, k, compiled):
+    with pytest.raises(RuntimeError) as caught:
+        ending(c, k, -7, compiled=compiled)
+    told = str(caught.value)
+    assert told.startswith(f"{NAMES[k]} returned the status -7 at t=1.")
+    partial = caught.value.partial
+    assert 0.9 < partial.t[-1] < 1.2
+    assert partial.status == -1
+    whole = ending(c, k, 0)
+    np.testing.assert_array_equal(partial.y, whole.y[:, : partial.t.size])
+
+
+@native_or_not
+@which
+def test_at_the_start_too(c, k, compiled):
+    params = [-1.0, *np.where(np.arange(4) == k, -3.0, 0.0)]
+    options = {"method": EIPRK4, "h": 0.1, "events": c.ending_event}
+    kept = Invariant(c.ending_square, c.ending_gradient, name="S")
+    with pytest.raises(RuntimeError, match=f"{NAMES[k]} returned the status -3 at t=0") as caught:
+        integrate(c.ending, (0, 3), [1, 2], compiled=compiled, params=params, invariants=kept, **options)
+    assert caught.value.partial.t.tolist() == [0.0]
+
+
+@native_or_not
+@pytest.mark.parametrize("status", [1, 99], ids=["no value", "nothing filled"])
+@which
+def test_no_value(c, k, status, compiled):
+    """At fixed steps a step without values is the last one; an event without a value has no sign."""
+    run = ending(c, k, status, compiled=compiled)
+    if k == 3:
+        assert run.status == 0
+        assert (run.t_events[0] < 1.2).all()
+        return
+    assert run.status == -1
+    assert 0.9 < run.t[-1] < 1.2
+    assert np.isfinite(run.y).all()
+    assert "t=1" in run.message
+    with_python = ending(c, k, status, compiled=not compiled)
+    assert with_python.message.partition(" (")[0] == run.message.partition(" (")[0]
+
+
+@native_or_not
+def test_a_shorter_step_may_have_a_value(c, compiled):
+    options = {"method": EIPRK45, "rtol": 1e-6, "first_step": 1.0, "compiled": compiled, "save_every": 1}
+    run = integrate(c.decay, (0, 1), [1.0], **options)
+    assert run.success
+    assert run.t[1] < 0.1
+    np.testing.assert_allclose(run.y[0], np.exp(-50 * run.t), atol=1e-5)
+    same_bits(run, integrate(c.decay, (0, 1), [1.0], **options | {"compiled": not compiled}))
+
+
+def test_a_gradient_without_uses_f_has_no_f(c):
+    options = {"method": EIPRK4, "h": 0.1, "params": np.zeros(5)}
+    with pytest.raises(ValueError, match="gradient of invariant 'S' is not finite at y0"):
+        integrate(c.ending, (0, 1), [1, 2], invariants=Invariant(c.ending_square, c.reads_f, name="S"), **options)
+
+
+# What is refused.
+
+
+def refused(c):
+    """What is given as fun, and what the error says."""
+    arrays = [NUMBERS] * 3
+    bare = ctypes.CDLL(None).sin
+    double = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double, *arrays)(lambda *arguments: 0.0)
+    void = ctypes.CFUNCTYPE(None, ctypes.c_double, *arrays)(lambda *arguments: None)
+    floats = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_float, *[ctypes.POINTER(ctypes.c_float)] * 3)(lambda *a: 0)
+    anything = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[ctypes.c_void_p] * 3)(lambda *a: 0)
+    ffi = cffi.FFI()
+    return [
+        (bare, "its argtypes are not set"),
+        (double, "'double (double, double *, double *, double *)'"),
+        (void, "'void (double, double *, double *, double *)'"),
+        (floats, "'int (float, float *, float *, float *)'"),
+        (anything, "'int (double, void *, void *, void *)'"),
+        (c.kept_gradient, "'int (double, double *, double *, double *, double *)'"),
+        (LowLevelCallable(c.kepler, signature="int (double)"), "'int (double)'"),
+        (ffi.callback("int(int, double *)")(lambda *a: 0), "'int (int, double *)'"),
+        (ffi.new("double *"), "'double *'"),
+        (LowLevelCallable(c.kepler, ctypes.c_void_p(1)), "LowLevelCallable with user_data"),
+        (VALUE(), "null pointer"),
+        (ctypes.cast(c.kepler, ctypes.c_void_p).value, "an address says nothing of its signature"),
+    ]
+
+
+def test_other_signatures(c):
+    for fun, reason in refused(c):
+        with pytest.raises(TypeError) as caught:
+            integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.1, params=MU)
+        told = str(caught.value)
+        assert re.match("(integrate: )?fun ", told)
+        assert reason in told
+        assert caught.value.partial.t.tolist() == [0.0]
+        if "signature '" in told:
+            assert told.endswith("expected int (double t, const double *y, double *out, const double *params).")
+        for wrap in (lambda f: Invariant(f, c.kept_gradient), lambda f: Invariant(c.kept, c.kept, name="H")):
+            with pytest.raises(TypeError):
+                wrap(fun)
+        with pytest.raises(TypeError, match="event"):
+            integrate(c.kepler, (0, 1), Y0, method=EIPRK4, h=0.1, params=MU, events=[fun])
+
+
+def test_a_gradient_s_signature_is_another_one(c):
+    with pytest.raises(TypeError, match=r"gradient of invariant 'H' is a C .* expected int .*const double \*f"):
+        Invariant(c.energy, c.energy, name="H")
+
+
+def test_invariants_say_their_gradient_and_size(c):
+    with pytest.raises(TypeError, match="invariant 'H' is a C function by pointer, and comes without grad"):
+        Invariant(c.energy, name="H")
+    for size in (0, 1.5, "2"):
+        with pytest.raises(ValueError, match="size"):
+            Invariant(c.kept, c.kept_gradient, size=size)
+    wrong = Invariant(lambda t, y: y[:2], lambda t, y: np.eye(2), size=3, name="I")
+    with pytest.raises(ValueError, match="invariant 'I' returned 2 values, but has size=3"):
+        integrate(lambda t, y: np.zeros(2), (0, 1), [1, 2], method=EIPRK4, h=0.1, invariants=wrong)
+
+
+def test_they_do_not_pickle(c):
+    kept = Invariant(c.energy, energy_gradient, name="H", uses_f=True)
+    with pytest.raises(TypeError, match=r"invariant 'H' is a C function by pointer, which cannot be pickled.*Dask"):
+        pickle.dumps(kept)
+
+
+# Events.
+
+
+def nearest(t, y, p):
+    return y[0] * y[2] + y[1] * y[3]
+
+
+nearest.direction, nearest.terminal = 1, 3
+
+
+class Nearest(LowLevelCallable):
+    direction, terminal = 1, 3
+
+
+def test_events_carry_their_attributes(c):
+    by_ctypes = c.turn
+    by_ctypes.direction, by_ctypes.terminal = 1, 3
+    ends = []
+    for event in (by_ctypes, Nearest(c.turn), nearest, [nearest, c.turn], [c.turn, nearest]):
+        for compiled in (None, False):
+            run = integrate(
+                c.kepler, (0, np.inf), Y0, method=EIPRK4, h=0.05, params=MU, events=event, compiled=compiled
+            )
+            assert run.status == 1
+            ends.append((run.t[-1], *run.y[:, -1]))
+    assert len(set(ends)) == 1
+
+
+@both
+@pytest.mark.parametrize("alone", [True, False], ids=["alone", "beside one in C"])
+def test_events_in_python_beside_native_functions(c, options, alone):
+    options = {"method": EIPRK4} | options
+    events = [turn] if alone else [c.turn, turn]
+    given = kepler_s(*in_c(c)) | {"events": events}
+    run = integrate(**given, **options)
+    same_bits(run, integrate(**given, **options, compiled=False))
+    assert not run.compiled
+    assert "(events are called from Python: event " in run.message
+    assert "interpreted" not in run.message
+    kinds = dict(run.calls)
+    assert [kinds.pop(f"event {k}") for k in range(len(events))] == ["python"] * len(events)
+    assert set(kinds.values()) == {"pointer"}
+    with pytest.raises(TypeError, match="is not a Numba function"):
+        integrate(**given, **options, compiled=True)
+
+
+@pytest.mark.needs_jit
+def test_events_in_python_beside_numba_functions():
+    given = kepler_s(*map(njit, IN_PYTHON[:-1]), turn)
+    run = integrate(**given, method=EIPRK4, h=0.05)
+    same_bits(run, integrate(**given, method=EIPRK4, h=0.05, compiled=False))
+    assert set(run.calls.values()) == {"jitted", "python"}
+
+
+def test_what_an_event_in_python_raises_ends_the_run(c):
+    def event(t, y, p):
+        if t > 1:
+            raise ZeroDivisionError("by the event")
+        return y[0]
+
+    with pytest.raises(ZeroDivisionError, match="by the event") as caught:
+        integrate(c.kepler, (0, 3), Y0, method=EIPRK4, h=0.1, params=MU, events=event)
+    assert 0.9 < caught.value.partial.t[-1] < 1.2
+
+
+def test_an_event_in_python_may_integrate(c):
+    def event(t, y, p):
+        return integrate(c.kepler, (t, t + 0.1), y, method=EIPRK4, h=0.1, params=p).y[0, -1]
+
+    run = integrate(c.kepler, (0, 10), Y0, method=EIPRK4, h=0.1, params=MU, events=event)
+    assert run.t_events[0].size > 2
+
+
+# Ensembles and checkpoints.
+
+
+def test_members_are_single_runs(c):
+    starts = Y0 * np.linspace(0.9, 1.1, 5)[:, None]
+    masses = np.linspace(0.9, 1.1, 5)[:, None]
+    invariants = kepler_s(*in_c(c))["invariants"]
+    options = {"method": EIPRK4, "h": 0.05, "invariants": invariants}
+    run = ensemble(c.kepler, (0, 10), starts, params=masses, executor=2, **options)
+    for k in range(5):
+        alone = integrate(c.kepler, (0, 10), starts[k], params=masses[k], **options)
+        np.testing.assert_array_equal(run.y[k], alone.y[:, -1])
+    assert not any("interpreted" in message for message in run.message)
+    assert not run.side_by_side.any()
+    with pytest.raises(TypeError, match="fun is a C function by pointer, which cannot be pickled"):
+        ensemble(c.kepler, (0, 10), starts, params=masses, executor="dask", **options)
+
+
+def test_a_checkpoint_knows_them_by_what_they_do(c, tmp_path):
+    path, options = tmp_path / "run.npz", {"method": EIPRK4, "h": 0.05, "params": MU, "save_every": 10}
+    calls = []
+
+    def stopping(t, y, defects):
+        calls.append(t)
+        if t > 5:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        integrate(c.kepler, (0, 10), Y0, checkpoint=path, callback=stopping, **options)
+    with pytest.raises(CheckpointError, match="fun was"):
+        integrate(c.repelled, (0, 10), Y0, checkpoint=path, resume=True, **options)
+    resumed = integrate(LowLevelCallable(c.kepler), (0, 10), Y0, checkpoint=path, resume=True, **options)
+    same_bits(resumed, integrate(c.kepler, (0, 10), Y0, **options))
