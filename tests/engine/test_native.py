@@ -1,5 +1,6 @@
 """The engine's binding: what it refuses, and that both of its builds give the same bits."""
 
+import ctypes
 import gc
 import os
 import subprocess
@@ -213,6 +214,28 @@ def test_addresses_are_looked_at():
     for functions in (none, none._replace(inv=((1, 1),)), none._replace(inv=((0, 1),)), none._replace(inv=(5,))):
         with pytest.raises((TypeError, ValueError)):
             Engine(**given | {"functions": functions})
+
+
+def test_events_in_python_are_looked_at():
+    """Beside functions by address: as many as there is room for, and none by address then."""
+
+    @ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4)
+    def never(*arguments):
+        return -1
+
+    address = ctypes.cast(never, ctypes.c_void_p).value
+    given = parts(h=0.1, events=[lambda t, y: y[0], lambda t, y: y[1]])
+    in_python = given["functions"]
+    fitting = native.NativeFunctions(address, (), (), (), np.zeros(0), False, never, in_python)
+    Engine(**given | {"functions": fitting})
+    for wrong in (
+        {"event": ((address, 1), (address, 1))},
+        {"python": in_python._replace(event=in_python.event[:1])},
+        {"python": None},
+        {"python": 3},
+    ):
+        with pytest.raises((TypeError, ValueError, AttributeError)):
+            Engine(**given | {"functions": fitting._replace(**wrong)})
 
 
 def test_calls_with_wrong_arguments():
