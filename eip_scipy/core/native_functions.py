@@ -130,9 +130,9 @@ def _native(fun: Any, kind: Kind, name: str) -> Native:
         return Native(fun, floats)
     if jit_is_off():
         raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
-    if not is_jitted(fun):  # else Numba would be loaded to say so
+    if not is_jitted(fun):
         raise NotCompilableError(f"{name} is not a Numba function; decorate it with @numba.njit")
-    from .numba_pointers import compiled
+    from .numba_pointers import compiled  # which loads Numba
 
     return Native(compiled(fun, kind, name), floats)
 

@@ -58,7 +58,7 @@ class Start(NamedTuple):
 
 @dataclass
 class Run:
-    """All that a driver needs besides the user's functions; `in_place` says what the right-hand side is."""
+    """All that a driver needs besides the user's functions; `left_out`: what NaN in the derivative may come from."""
 
     y0: np.ndarray
     method: Method | OneStep
@@ -68,7 +68,7 @@ class Run:
     identity: dict[str, Any]  # see `Settled`
     trust: Trust
     tau: float
-    in_place: bool = False
+    left_out: str = ""
     looked: int = -1
 
     def engine(
@@ -389,8 +389,8 @@ def not_finite(run: Run, t: float, h: float) -> str:
 def _bad_value(run: Run, f: np.ndarray, t: float) -> str:
     unset = np.flatnonzero(np.isnan(f))
     hint = ""
-    if run.in_place and unset.size:
-        hint = f" (component {unset[0]} is NaN; with in_place=True it must fill all of out)"
+    if run.left_out and unset.size:
+        hint = f" (component {unset[0]} is NaN; {run.left_out})"
     return f"fun returned a non-finite value at t={t:.10g}{hint}"
 
 

@@ -125,6 +125,13 @@ class System:
         self.rhs(t, y, out, self.parameters)
         return out
 
+    @property
+    def left_out(self) -> str:
+        """What NaN in its value may come from, besides NaN."""
+        if isinstance(self.fun, PointerFunction):
+            return "a C function leaves NaN where it fills nothing, or returns a status above 0"
+        return "with in_place=True it must fill all of out" if "in place" in self.form else ""
+
     def first(self, calls: Counted, t0: float, y0: np.ndarray) -> np.ndarray:
         """The derivative at the start, where a function that takes other arguments is told."""
         try:
@@ -237,7 +244,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     start = Start(t0, y0, f0, stepping.first(calls, y0, f0, method))
     schedule = _schedule(stepping.span, start.tau, request, system.events)
     run = setup.prepare(method, calls, start, projection, stepping, extra=system.extra, check_start=check_start)
-    run.in_place = "in place" in form
+    run.left_out = system.left_out
     bound = 0.5 * free_memory() if request.max_bytes is None else request.max_bytes
     check_memory(saved_rows(schedule), run, bound)
     record = Diagnostics() if request.diagnostics is None else request.diagnostics

@@ -201,13 +201,13 @@ def test_numba_functions_and_c_functions_go_together(c):
 
 
 def test_an_invariant_in_python_makes_all_calls_python_s(c):
-    fun, H, dH, _, _, event = in_c(c)
-    mixed = fun, H, dH, momentum, momentum_gradient, event
+    fun, H, _, _, dL, event = in_c(c)
+    mixed = fun, H, energy_gradient, momentum, dL, event
     run = integrate(**kepler_s(*mixed), method=EIPRK4, h=0.05, save_every=7)
     same_bits(run, integrate(**kepler_s(*in_c(c)), method=EIPRK4, h=0.05, save_every=7))
     assert set(run.calls.values()) == {"python"}
-    assert "(interpreted: invariant 'L' is not a Numba function" in run.message
-    with pytest.raises(TypeError, match="invariant 'L' is not a Numba function"):
+    assert "(interpreted: gradient of invariant 'H' is not a Numba function" in run.message
+    with pytest.raises(TypeError, match="gradient of invariant 'H' is not a Numba function"):
         integrate(**kepler_s(*mixed), method=EIPRK4, h=0.05, compiled=True)
 
 
@@ -339,6 +339,7 @@ def test_no_value(c, k, status, compiled):
     assert 0.9 < run.t[-1] < 1.2
     assert np.isfinite(run.y).all()
     assert "t=1" in run.message
+    assert ("or returns a status above 0" in run.message) == (k == 0)
     with_python = ending(c, k, status, compiled=not compiled)
     assert with_python.message.partition(" (")[0] == run.message.partition(" (")[0]
 
