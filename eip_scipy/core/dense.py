@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -43,11 +44,20 @@ class Interpolants:
         That of the run, which has dense output from now on.
     events : int
         How many events the loop looks at.
+    errors : callable
+        A context that says what a failed call by pointer means, as `Driver.own_errors`.
     """
 
-    def __init__(self, run: Run, tableau: AnyMethod, engine: Engine, events: int = 0) -> None:
+    def __init__(
+        self,
+        run: Run,
+        tableau: AnyMethod,
+        engine: Engine,
+        events: int = 0,
+        errors: Callable[[], AbstractContextManager[None]] = nullcontext,
+    ) -> None:
         self.record = _record(run, tableau, events)
-        self._engine, self._dtype, self._n = engine, run.y0.dtype, run.y0.size
+        self._engine, self._dtype, self._n, self._errors = engine, run.y0.dtype, run.y0.size, errors
         engine.sample(self.record)
 
     @property
@@ -58,13 +68,15 @@ class Interpolants:
     def over(self, t_old: float, y_old: Array, t: float, y: Array) -> ManifoldDenseOutput:
         """Dense output over the step that was made last."""
         piece = np.empty(self.floats)
-        self._engine.describe(t_old, y_old, t, y, piece)
+        with self._errors():
+            self._engine.describe(t_old, y_old, t, y, piece)
         return ManifoldDenseOutput(self, piece)
 
     def states(self, piece: Array, times: Array) -> Array:
         """The states (n, m) at times (m,) by an interpolant."""
         out = np.empty((times.size, self._n), self._dtype)
-        self._engine.interpolate(piece, times, out)
+        with self._errors():
+            self._engine.interpolate(piece, times, out)
         self.warn()
         return out.T
 

@@ -12,6 +12,7 @@ from scipy.integrate import DenseOutput, OdeSolution
 
 from ..core.dense import Interpolants, ManifoldDenseOutput, solution
 from ..core.jitted import ChangedShapeError
+from ..core.native_functions import raise_again
 from ..core.setup import Run
 from ..core.stepping import UNBOUNDED, AnyMethod
 from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Schedule
@@ -52,7 +53,7 @@ class Driver:
         self._interpolants = None
         self._pieces = np.empty((0, 0))
         if schedule.t_eval.size or schedule.g.size or keeps_steps:
-            self._interpolants = Interpolants(run, tableau, self.engine, schedule.g.size)
+            self._interpolants = Interpolants(run, tableau, self.engine, schedule.g.size, self.own_errors)
             self._pieces = self._more_pieces(expected_steps(schedule) or FIRST_ROWS if keeps_steps else 0)
 
     def advance(self, k_end: int) -> int:
@@ -61,23 +62,21 @@ class Driver:
         if interpolants is not None:
             interpolants.record.left[:] = self._events.left
         try:
-            with self._own_errors():
+            with self.own_errors():
                 return int(self.engine.advance(k_end, self.state, self.new, self.t, self.y, self._pieces))
         finally:
             if interpolants is not None:
                 self._events.take(*interpolants.roots())
 
     @contextmanager
-    def _own_errors(self) -> Iterator[None]:
-        """What compiled functions raise, which C does not see, in place of the engine's error."""
+    def own_errors(self) -> Iterator[None]:
+        """What compiled functions raise, which C does not see, or mean by a status, in place of the engine's error."""
         try:
             yield
         except FailedCallError as error:
             failed = error.args
         else:
             return
-        from ..core.native_functions import raise_again
-
         try:
             raise_again(self.functions, *failed)
         except ChangedShapeError as changed:
@@ -209,7 +208,7 @@ class Driver:
         """Invariants of the saved states, (l, m)."""
         t, y = self.t[: self.rows], self.y[: self.rows]
         out = np.empty((self.rows, self.run.invariants.size))
-        with self._own_errors():
+        with self.own_errors():
             self.engine.values(t, y, out)
         return out.T
 

@@ -35,6 +35,14 @@ VALUE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, NUMBERS, NUMBERS, NUMBER
 Y0, MU = np.array([1.6, 0.0, 0.0, 0.5]), [1.0]
 
 
+GRADIENT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[NUMBERS] * 4)
+
+
+def twice(t, y, f, out, params):
+    out[0], out[1] = 2 * y[0], 2 * y[1]
+    return 0
+
+
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
     """The name of the C functions' library."""
@@ -245,11 +253,6 @@ def test_the_run_holds_the_only_reference():
         value[0] = y[0] * y[0] + y[1] * y[1]
         return 0
 
-    def gradient(t, y, f, out, params):
-        out[0], out[1] = 2 * y[0], 2 * y[1]
-        return 0
-
-    more = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[NUMBERS] * 4)
     ffi = cffi.FFI()
     made = {
         "ctypes": lambda: VALUE(circle),
@@ -258,7 +261,7 @@ def test_the_run_holds_the_only_reference():
     }
     plain = integrate(lambda t, y: np.array([y[1], -y[0]]), (0, 2), [1, 2], method=EIPRK4, h=0.1, save_every=1)
     for fun in made.values():
-        kept = Invariant(LowLevelCallable(VALUE(square)), more(gradient))
+        kept = Invariant(LowLevelCallable(VALUE(square)), GRADIENT(twice))
         gc.collect()
         events = [LowLevelCallable(VALUE(square))]
         run = integrate(fun(), (0, 2), [1, 2], method=EIPRK4, h=0.1, save_every=1, invariants=kept, events=events)
@@ -342,6 +345,29 @@ def test_no_value(c, k, status, compiled):
     assert ("or returns a status above 0" in run.message) == (k == 0)
     with_python = ending(c, k, status, compiled=not compiled)
     assert with_python.message.partition(" (")[0] == run.message.partition(" (")[0]
+
+
+@native_or_not
+def test_a_negative_status_between_the_steps(compiled):
+    """Of a function that is called when dense output is evaluated, after the run."""
+    status = 0
+
+    def circle(t, y, out, params):
+        out[0], out[1] = y[1], -y[0]
+        return 0
+
+    def square(t, y, value, params):
+        value[0] = y[0] * y[0] + y[1] * y[1]
+        return status
+
+    kept = Invariant(VALUE(square), GRADIENT(twice), name="S")
+    options = {"method": EIPRK4, "h": 0.1, "dense_output": True, "compiled": compiled}
+    run = integrate(VALUE(circle), (0, 1), [1, 2], invariants=kept, **options)
+    assert run.compiled == compiled
+    assert np.isfinite(run.sol(0.55)).all()
+    status = -2
+    with pytest.raises(RuntimeError, match=r"^invariant 'S' returned the status -2 at t=0\.[67]"):
+        run.sol(0.65)
 
 
 @native_or_not
@@ -458,11 +484,12 @@ def test_events_carry_their_attributes(c):
 @both
 @pytest.mark.parametrize("alone", [True, False], ids=["alone", "beside one in C"])
 def test_events_in_python_beside_native_functions(c, options, alone):
-    options = {"method": EIPRK4} | options
+    options = {"method": EIPRK4, "dense_output": True} | options
     events = [turn] if alone else [c.turn, turn]
     given = kepler_s(*in_c(c)) | {"events": events}
-    run = integrate(**given, **options)
-    same_bits(run, integrate(**given, **options, compiled=False))
+    run, other = integrate(**given, **options), integrate(**given, **options, compiled=False)
+    same_bits(run, other)
+    np.testing.assert_array_equal(run.sol(np.linspace(0, 30, 77)), other.sol(np.linspace(0, 30, 77)))
     assert not run.compiled
     assert "(events are called from Python: event " in run.message
     assert "interpreted" not in run.message
