@@ -17,11 +17,17 @@ from .native_functions import Kind
 __all__ = ["Compiled", "compiled"]
 
 
+# Called from compiled code alone. Inlined, for that an array is nobody's and needs no counting of references shows only
+# there.
+_called = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)
+_inlined = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
 class Compiled(NamedTuple):
-    """A function as C calls it, and as Python does to see what it raises, both with all arguments."""
+    """A function as C calls it, with all arguments."""
 
     pointer: Any
-    call: Any
+    fun: Any
     name: str
     kind: Kind
 
@@ -34,9 +40,11 @@ class Compiled(NamedTuple):
         """What it raises is raised here, in a second call; returned is the error that it raises nothing."""
         kind = self.kind
         state = np.frombuffer(y, kind.dtype)[: kind.size].copy()
+        slope = np.frombuffer(f or bytes(len(y)), kind.dtype).copy()
         out = np.empty(kind.shape or (1,), float if kind.real else kind.dtype)
+        call = _with_all_arguments(self.fun, kind, njit)
         try:
-            self.call(t, state, np.frombuffer(f or bytes(len(y)), kind.dtype).copy(), out, params)
+            call(t, state, slope, out, params)
         except ChangedShapeError:
             raise ChangedShapeError(f"{self.name} returned an array of another shape than at the start") from None
         return RuntimeError(f"{self.name} raised an exception at t={t:.10g}, but not when it was called again there.")
@@ -51,19 +59,19 @@ def compiled(fun: Any, kind: Kind, name: str) -> Compiled:
         When it does not compile for the arguments that `integrate` documents.
     """
     try:
-        call, pointer = _compile(fun, kind)
+        pointer = _compile(fun, kind)
     except NumbaError as error:
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
         raise NotCompilableError(f"{name} does not compile for this state: {first}") from error
     if any(isinstance(known.return_type, types.Optional) for known in fun.nopython_signatures):
         raise NotCompilableError(f"{name} returns None in some places, and a number or an array in others")
-    return Compiled(pointer, call, name, kind)
+    return Compiled(pointer, fun, name, kind)
 
 
 @lru_cache(maxsize=256)
-def _compile(fun: Any, kind: Kind) -> tuple[Any, Any]:
-    """For the same function and kind of state once in a process."""
-    call = _with_all_arguments(fun, kind)
+def _compile(fun: Any, kind: Kind) -> Any:
+    """The C function; for the same function and kind of state once in a process."""
+    call = _with_all_arguments(fun, kind, _inlined)
     scalar = from_dtype(np.dtype(kind.dtype))
     state, floats = types.CPointer(scalar), types.CPointer(types.float64)
     size, p, shape = kind.size, max(kind.p, 0), kind.shape or (1,)
@@ -77,8 +85,8 @@ def _compile(fun: Any, kind: Kind) -> tuple[Any, Any]:
 
     out = floats if kind.real else state
     if kind.gradient:
-        return call, cfunc(types.int32(types.float64, state, state, out, floats))(rows)
-    return call, cfunc(types.int32(types.float64, state, out, floats))(value)
+        return cfunc(types.int32(types.float64, state, state, out, floats))(rows)
+    return cfunc(types.int32(types.float64, state, out, floats))(value)
 
 
 @intrinsic  # emits LLVM
@@ -96,11 +104,10 @@ def _status_of(typingctx, function, t, y, f, out, params):
     return types.int32(function, *arguments), codegen
 
 
-def _with_all_arguments(fun: Any, kind: Kind) -> Any:
+def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
     """``call(t, y, f, out, params)``, which puts the function's value into out."""
     has_params = kind.p >= 0
-    # Inlined: that an array is nobody's, and needs no counting of references, shows only there.
-    bare = njit(forceinline=True)(
+    bare = jit(
         {
             (False, False, False): lambda t, y, f, out, params: fun(t, y),
             (False, False, True): lambda t, y, f, out, params: fun(t, y, params),
@@ -115,15 +122,15 @@ def _with_all_arguments(fun: Any, kind: Kind) -> Any:
     if kind.in_place:
         return bare
     put = {0: _put_number, 1: _put_values if kind.real else _put_array, 2: _put_rows}[len(kind.shape)]
-    return njit(forceinline=True)(lambda t, y, f, out, params: put(bare(t, y, f, out, params), out))
+    return jit(lambda t, y, f, out, params: put(bare(t, y, f, out, params), out))
 
 
-@njit
+@_called
 def _put_number(value, out):
     out[0] = value
 
 
-@njit
+@_called
 def _put_values(values, out):
     if len(values) != out.size:
         raise ChangedShapeError
@@ -131,7 +138,7 @@ def _put_values(values, out):
         out[i] = values[i]
 
 
-@njit
+@_called
 def _put_array(values, out):
     if values.size != out.size:
         raise ChangedShapeError
@@ -139,7 +146,7 @@ def _put_array(values, out):
         out[i] = values[i]
 
 
-@njit
+@_called
 def _put_rows(rows, out):
     if rows.shape[0] != out.shape[0] or rows.shape[1] != out.shape[1]:
         raise ChangedShapeError
