@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
-from numba import carray, cfunc, from_dtype, njit, types
+from numba import from_dtype, njit, types
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.errors import NumbaError
-from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
 
 from .jitted import ChangedShapeError, NotCompilableError
 from .native_functions import Kind
@@ -17,16 +19,25 @@ from .native_functions import Kind
 __all__ = ["Compiled", "compiled"]
 
 
+# Of the names of C functions.
+_serial = count()
 # Called from compiled code alone. Inlined, for that an array is nobody's and needs no counting of references shows only
 # there.
 _called = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)
 _inlined = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
+class Pointer(NamedTuple):
+    """The address of a function, and what keeps its code."""
+
+    address: int
+    library: Any
+
+
 class Compiled(NamedTuple):
     """A function as C calls it, with all arguments."""
 
-    pointer: Any
+    pointer: Pointer
     fun: Any
     name: str
     kind: Kind
@@ -34,7 +45,7 @@ class Compiled(NamedTuple):
     @property
     def address(self) -> int:
         """Of the C function."""
-        return int(self.pointer.address)
+        return self.pointer.address
 
     def failure(self, t: float, y: bytes, f: bytes, params: np.ndarray) -> RuntimeError:
         """What it raises is raised here, in a second call; returned is the error that it raises nothing."""
@@ -69,39 +80,53 @@ def compiled(fun: Any, kind: Kind, name: str) -> Compiled:
 
 
 @lru_cache(maxsize=256)
-def _compile(fun: Any, kind: Kind) -> Any:
-    """The C function; for the same function and kind of state once in a process."""
+def _compile(fun: Any, kind: Kind) -> Pointer:
+    """For the same function and kind of state once in a process."""
     call = _with_all_arguments(fun, kind, _inlined)
     scalar = from_dtype(np.dtype(kind.dtype))
-    state, floats = types.CPointer(scalar), types.CPointer(types.float64)
-    size, p, shape = kind.size, max(kind.p, 0), kind.shape or (1,)
-
-    def value(t, y, out, params):
-        given = carray(y, (size,))
-        return _status_of(call, t, given, given, carray(out, shape), carray(params, (p,)))
-
-    def rows(t, y, f, out, params):
-        return _status_of(call, t, carray(y, (size,)), carray(f, (size,)), carray(out, shape), carray(params, (p,)))
-
-    out = floats if kind.real else state
-    if kind.gradient:
-        return cfunc(types.int32(types.float64, state, state, out, floats))(rows)
-    return cfunc(types.int32(types.float64, state, out, floats))(value)
+    state, floats = types.Array(scalar, 1, "C"), types.Array(types.float64, 1, "C")
+    out = floats if kind.real else types.Array(scalar, max(1, len(kind.shape)), "C")
+    arguments = types.float64, state, state, out, floats
+    with global_compiler_lock:
+        call.compile(arguments)
+        return _c_function(call.overloads[arguments], kind)
 
 
-@intrinsic  # emits LLVM
-def _status_of(typingctx, function, t, y, f, out, params):
-    """0 after a call of a Numba function, -1 where it raised an exception."""
-    arguments = t, y, f, out, params
-    resolved = function.get_call_type(typingctx, arguments, {})
+def _c_function(compiled: Any, kind: Kind) -> Pointer:
+    """What has been compiled for (t, y, f, out, params), as a C function that returns 0, or -1 after an exception.
 
-    def codegen(context, builder, signature, values):
-        compiled = function.dispatcher.get_compile_result(resolved)
-        context.active_code_library.add_linking_library(compiled.library)
-        status, _ = context.call_internal_no_propagate(builder, compiled.fndesc, resolved, values[1:])
-        return builder.sext(status.is_error, ir.IntType(32))
+    Written in LLVM's own language: Numba's `cfunc` would take twice as long to compile, and each call of it be two.
+    """
+    name = f"eip_scipy.{next(_serial)}"
+    context = compiled.target_context
+    library = context.codegen().create_library(name)
+    module = library.create_ir_module(name)
+    number, status = ir.DoubleType(), ir.IntType(32)
+    pointers = [number.as_pointer()] * (4 if kind.gradient else 3)
+    builder = ir.IRBuilder(ir.Function(module, ir.FunctionType(status, [number, *pointers]), name).append_basic_block())
+    t, y, *others = builder.function.args
+    given = (y, *others) if kind.gradient else (y, y, *others)
+    lengths = ((kind.size,), (kind.size,), kind.shape or (1,), (max(kind.p, 0),))
+    arrays = zip(compiled.signature.args[1:], given, lengths, strict=True)
+    values = [t, *(_array(context, builder, *array) for array in arrays)]
+    found, _ = context.call_internal_no_propagate(builder, compiled.fndesc, compiled.signature, values)
+    builder.ret(builder.sext(found.is_error, status))
+    library.add_ir_module(module)
+    library.add_linking_library(compiled.library)
+    library.finalize()
+    return Pointer(library.get_pointer_to_function(name), library)
 
-    return types.int32(function, *arguments), codegen
+
+def _array(context: Any, builder: Any, kind: types.Array, data: Any, shape: tuple[int, ...]) -> Any:
+    """A C array at `data` as a value of Numba's array type, which nobody owns."""
+    array = context.make_array(kind)(context, builder)
+    item = context.get_abi_sizeof(context.get_data_type(kind.dtype))
+    strides = np.cumprod((item, *shape[:0:-1]))[::-1].tolist()
+    sizes = [[context.get_constant(types.intp, size) for size in found] for found in (shape, strides)]
+    data = builder.bitcast(data, array.data.type)
+    itemsize = context.get_constant(types.intp, item)
+    populate_array(array, data=data, shape=sizes[0], strides=sizes[1], itemsize=itemsize, meminfo=None, parent=None)
+    return array._getvalue()
 
 
 def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:

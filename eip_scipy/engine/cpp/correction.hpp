@@ -34,23 +34,23 @@ inline void evaluate_invariants(AnyRun &run, double t, const double *y) {
 
 // w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction, neutral to the frame; out = y_hat + move.
 template <class W>
-inline void move_along(const Options &o, const W &w, double *out) {
+inline void move_along(const Options &o, const W &w, double *__restrict out) {
     const int64_t m = w.m;
-    for (int64_t j = 0; j < m; ++j) out[j] = w.mu[0] * w.Q[j];
-    for (int64_t k = 1; k < w.l; ++k) {
-        const double *row = w.Q + k * m;
-        for (int64_t j = 0; j < m; ++j) out[j] += w.mu[k] * row[j];
-    }
+    const double *__restrict mu = w.mu, *__restrict Q = w.Q, *__restrict sigma = w.sigma, *__restrict y_hat = w.y_hat;
+    double *__restrict move = w.move;
+    for (int64_t j = 0; j < m; ++j) out[j] = mu[0] * Q[j];
+    for (int64_t k = 1; k < w.l; ++k)
+        for (int64_t j = 0; j < m; ++j) out[j] += mu[k] * Q[k * m + j];
     if (o.frame.rows > 0) {
-        for (int64_t j = 0; j < m; ++j) out[j] *= w.sigma[j];
-        keep_frame(o.frame, out, w.move, m);
-        for (int64_t j = 0; j < m; ++j) out[j] = w.y_hat[j] + w.move[j];
+        for (int64_t j = 0; j < m; ++j) out[j] *= sigma[j];
+        keep_frame(o.frame, out, move, m);
+        for (int64_t j = 0; j < m; ++j) out[j] = y_hat[j] + move[j];
         return;
     }
     for (int64_t j = 0; j < m; ++j) {
-        const double x = w.sigma[j] * out[j];
-        w.move[j] = x;
-        out[j] = w.y_hat[j] + x;
+        const double x = sigma[j] * out[j];
+        move[j] = x;
+        out[j] = y_hat[j] + x;
     }
 }
 

@@ -32,12 +32,10 @@ inline double block_square(const double *a, int64_t b, double unit, const Blocks
     return total;
 }
 
-// Per block the sum of a; consecutive blocks of one or three without looking places up.
+// Per block the sum of a; consecutive blocks of three without looking places up.
 inline void block_sums(const double *a, const Blocks &blocks, double *out) {
     if (blocks.size == 3) {
         for (int64_t b = 0; b < blocks.count; ++b) out[b] = a[3 * b] + a[3 * b + 1] + a[3 * b + 2];
-    } else if (blocks.size == 1) {
-        copy(a, out, blocks.count);
     } else {
         for (int64_t b = 0; b < blocks.count; ++b) {
             double total = 0.0;
@@ -52,6 +50,22 @@ inline void weighted_squares(const double *weights, const double *a, double *out
         const double x = weights[i] * a[i];
         out[i] = x * x;
     }
+}
+
+// Per component, where each stands alone: what `block_sizes` does.
+template <class W>
+inline bool component_sizes(const double *__restrict y, double rounding, const Options &o, const W &w) {
+    const double *__restrict rtol = o.rtol, *__restrict y_hat = w.y_hat, *__restrict err = w.err;
+    double *__restrict scale = w.scale, *__restrict ratio = w.ratio;
+    bool extreme = false;
+    for (int64_t i = 0; i < w.m; ++i) {
+        const double before = rtol[i] * y[i], after = rtol[i] * y_hat[i], x = rounding * y_hat[i];
+        const double square = std::max(after * after, before * before);
+        extreme |= !(square > 1e-280 && square < 1e280);
+        scale[i] = std::sqrt(square);
+        ratio[i] = std::sqrt(err[i] * err[i] + x * x);
+    }
+    return extreme;
 }
 
 // Per block: w.scale = max(|rtol y|, |rtol y_hat|), w.ratio = |(err, rounding y_hat)|; whether some are too extreme.
@@ -108,16 +122,11 @@ template <class W>
     }
 }
 
-// Weights w.sigma of the error metric and the blocks' scales; returns the largest relative error r. The error is the
-// estimate and `rounding` times the state, in quadrature. r = 0 (no error at all) leaves the euclidean metric.
-template <class W>
-inline double error_metric(const double *y, double rounding, const Options &o, const W &w) {
-    const Blocks &blocks = o.blocks;
-    const int64_t n = blocks.count;
-    double *scale = w.scale, *ratio = w.ratio;
-    if (block_sizes(y, rounding, o, w)) extreme_block_sizes(y, rounding, o, w);
+// From the sizes of n blocks and of their errors the weights, in `ratio`; returns the largest relative error.
+inline double block_weights(double *__restrict scale, double *__restrict ratio, const Options &o, int64_t n) {
+    const double *__restrict atol = o.block_atol;
     for (int64_t b = 0; b < n; ++b) {
-        scale[b] += o.block_atol[b];
+        scale[b] += atol[b];
         // Over a scale of 0 there is no error to speak of.
         ratio[b] = (scale[b] > 0.0 ? ratio[b] : 0.0) / std::max(scale[b], TINY);
     }
@@ -127,14 +136,28 @@ inline double error_metric(const double *y, double rounding, const Options &o, c
     powers(ratio, o.kappa, n);
     for (int64_t b = 0; b < n; ++b) ratio[b] = scale[b] * (ratio[b] + METRIC_FLOOR);
     inverse = 1.0 / positive(largest(ratio, n));
-    for (int64_t b = 0; b < n; ++b) {
-        const double weight = largest_ratio > 0.0 ? ratio[b] * inverse : 1.0;
-        if (blocks.size == 1)
-            w.sigma[b] = weight;
-        else if (blocks.size == 3)
-            w.sigma[3 * b] = w.sigma[3 * b + 1] = w.sigma[3 * b + 2] = weight;
+    for (int64_t b = 0; b < n; ++b) ratio[b] = largest_ratio > 0.0 ? ratio[b] * inverse : 1.0;
+    return largest_ratio;
+}
+
+// Weights w.sigma of the error metric and the blocks' scales; returns the largest relative error r. The error is the
+// estimate and `rounding` times the state, in quadrature. r = 0 (no error at all) leaves the euclidean metric.
+template <class W>
+inline double error_metric(const double *y, double rounding, const Options &o, const W &w) {
+    const Blocks &blocks = o.blocks;
+    if (blocks.size == 1) {
+        if (component_sizes(y, rounding, o, w)) extreme_block_sizes(y, rounding, o, w);
+        const double largest_ratio = block_weights(w.scale, w.ratio, o, w.m);
+        copy(w.ratio, w.sigma, w.m);
+        return largest_ratio;
+    }
+    if (block_sizes(y, rounding, o, w)) extreme_block_sizes(y, rounding, o, w);
+    const double largest_ratio = block_weights(w.scale, w.ratio, o, blocks.count);
+    for (int64_t b = 0; b < blocks.count; ++b) {
+        if (blocks.size == 3)
+            w.sigma[3 * b] = w.sigma[3 * b + 1] = w.sigma[3 * b + 2] = w.ratio[b];
         else
-            for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) w.sigma[blocks.member[p]] = weight;
+            for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) w.sigma[blocks.member[p]] = w.ratio[b];
     }
     return largest_ratio;
 }
@@ -144,6 +167,13 @@ template <class W>
 inline double correction_in_local_errors(double largest_error, const Options &o, const W &w) {
     if (!(largest_error > 0.0)) return 0.0 * largest_error;
     double top = 0.0;
+    if (o.blocks.size == 1) {
+        for (int64_t i = 0; i < w.m; ++i) {
+            const double x = w.move[i] * (1.0 / positive(w.scale[i]));
+            if (w.scale[i] > 0.0) top = std::max(top, x * x);
+        }
+        return std::sqrt(top) / largest_error;
+    }
     for (int64_t b = 0; b < o.blocks.count; ++b) {
         const double square = block_square(w.move, b, 1.0 / positive(w.scale[b]), o.blocks);
         if (w.scale[b] > 0.0) top = std::max(top, square);

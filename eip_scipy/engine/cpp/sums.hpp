@@ -138,16 +138,22 @@ inline void combine_blocks(const double *y, double scale, const Rows &rows, doub
         combine_part<Float, COUNT, ADD>(y, scale, rows, out, i < n - LENGTH ? i : n - LENGTH);
 }
 
+// The same for short rows, float by float: the last row has just been written so, and a load of several floats would wait
+// until all those stores are done.
+template <bool ADD, int COUNT = 2 * WIDTH - 1>
+inline void combine_short(const double *y, double scale, const Rows &rows, double *out, int64_t n) {
+    if (n == COUNT) return combine_part<double, COUNT, ADD>(y, scale, rows, out, 0);
+    if constexpr (COUNT > 1) combine_short<ADD, COUNT - 1>(y, scale, rows, out, n);
+}
+
 template <bool ADD>
 inline void combine_rows(const double *y, double scale, const Rows &rows, double *out, int64_t n) {
     if (n >= 4 * WIDTH)
         combine_blocks<Vector, 4, ADD>(y, scale, rows, out, n);
     else if (n >= 2 * WIDTH)
         combine_blocks<Vector, 2, ADD>(y, scale, rows, out, n);
-    else if (n >= WIDTH)
-        combine_blocks<Vector, 1, ADD>(y, scale, rows, out, n);
     else
-        combine_blocks<double, 1, ADD>(y, scale, rows, out, n);
+        combine_short<ADD>(y, scale, rows, out, n);
 }
 
 // out = y + scale sum; out is neither y nor a row.
