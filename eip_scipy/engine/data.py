@@ -199,6 +199,7 @@ class Work(NamedTuple):
     g: np.ndarray
     band: np.ndarray
     before: np.ndarray
+    worth: np.ndarray
     defect: np.ndarray
     max_defect: np.ndarray
     max_correction: np.ndarray
@@ -222,9 +223,8 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
     y_hat, y_hat_r = pair(n)
     G, G_r = pair(n_invariants, n)
     floats = {name: np.zeros(m) for name in ("err", "err_low", "err_sum", "sigma", "move", "carry", "carry_hat")}
-    small = {
-        name: np.zeros(n_invariants) for name in ("inverse_norms", "mu", "values", "g", "band", "before", "defect")
-    }
+    names = "inverse_norms", "mu", "values", "g", "band", "before", "worth", "defect"
+    small = {name: np.zeros(n_invariants) for name in names}
     floats["sigma"][:] = 1.0
     trust = np.zeros((n_invariants, N_FIGURES))
     trust[:, TERMS] = np.inf

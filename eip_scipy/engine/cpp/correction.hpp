@@ -209,7 +209,7 @@ inline Code stay(const Step &step, const Options &o, const W &w) {
     ++w.counters[SKIPPED];
     copy(w.y_hat, step.y_new, w.m);
     const Code status = judge(w.before, step.y_new, o, w);
-    if (status == OK) take_note(step.t_new, nullptr, o, w);
+    if (status == OK) take_note(step.t_new, o, w);
     return status;
 }
 
@@ -249,7 +249,7 @@ inline Code project_step(AnyRun &run, const Step &step) {
         w.counters[RANK_REDUCED] += moved.rank < w.l;
     }
     if (status == OK) {
-        take_note(step.t_new, nullptr, o, w);
+        take_note(step.t_new, o, w);
         w.max_correction[0] = std::max(w.max_correction[0], moved.correction);
     }
     return status;

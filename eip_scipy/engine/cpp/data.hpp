@@ -89,7 +89,7 @@ struct Inner {
 struct Work {
     int64_t n, m, l, stages;
     double *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *move, *carry, *carry_hat,
-        *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *defect, *max_defect, *max_correction, *trust,
+        *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *worth, *defect, *max_defect, *max_correction, *trust,
         *norm;
     int64_t *pivots, *counters;
     Inner inner;

@@ -109,7 +109,7 @@ Work work_of(PyObject *work, int64_t stages, int64_t blocks, Arrays &arrays, int
         *place = arrays.floats(work, name, {m});
     for (const auto &[name, place] : std::initializer_list<std::pair<const char *, double **>>{
              {"inverse_norms", &w.inverse_norms}, {"mu", &w.mu}, {"values", &w.values}, {"g", &w.g}, {"band", &w.band},
-             {"before", &w.before}, {"defect", &w.defect}, {"max_defect", &w.max_defect}})
+             {"before", &w.before}, {"worth", &w.worth}, {"defect", &w.defect}, {"max_defect", &w.max_defect}})
         *place = arrays.floats(work, name, {l});
     w.scale = arrays.floats(work, "scale", {blocks});
     w.ratio = arrays.floats(work, "ratio", {blocks});

@@ -279,10 +279,9 @@ bool PythonHooks::project_jointly(const Step &step) {
     const Ref t = time(step.t_new);
     Ref(PyObject_CallFunctionObjArgs(moments_, t.get(), y_hat_, f_hat_, values_, R_, terms_, nullptr));
     const bool measured = o.watched && w.counters[HAVE_ERROR];
-    double *local = w.Q;  // nothing else is in it on this way
     if (measured) {
         const double err = norm(w.err, w.m);
-        for (int64_t i = 0; i < w.l; ++i) local[i] = std::abs(std::sqrt(w.R[i * w.l + i]) * err);
+        for (int64_t i = 0; i < w.l; ++i) w.worth[i] = std::abs(std::sqrt(w.R[i * w.l + i]) * err);
     }
     const bool outside = defects(w.inverse_norms, nullptr, o, w, w.before);
     if (outside) {
@@ -306,7 +305,7 @@ bool PythonHooks::project_jointly(const Step &step) {
         raise_to(w.defect, w.max_defect, w.l);
     } else {
         const double steps = 1.0 + static_cast<double>(w.counters[WAITED]);
-        note(step.t_new, measured ? steps : 0.0, EPS * std::sqrt(steps), local, o, w);
+        note(step.t_new, measured ? steps : 0.0, EPS * std::sqrt(steps), o, w);
     }
     return true;
 }

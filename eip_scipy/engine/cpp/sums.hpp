@@ -65,6 +65,30 @@ inline double abs_dot(const double *a, const double *b, int64_t n) {
     return lanes.sum() + rest;
 }
 
+// Sums of |a_i b_i| and of |a_i c_i|, each as by `abs_dot`.
+struct AbsDots {
+    double b, c;
+};
+
+inline AbsDots abs_dots(const double *a, const double *b, const double *c, int64_t n) {
+    const int64_t whole = n - n % LANES;
+    double rest_b = 0.0, rest_c = 0.0;
+    for (int64_t i = whole; i < n; ++i) {
+        rest_b += __builtin_fabs(a[i] * b[i]);
+        rest_c += __builtin_fabs(a[i] * c[i]);
+    }
+    if (whole == 0) return {0.0 + rest_b, 0.0 + rest_c};
+    Lanes lanes_b, lanes_c;
+    for (int64_t i = 0; i < whole; i += LANES)
+        for (int k = 0; k < VECTORS; ++k) {
+            const int64_t at = i + k * WIDTH;
+            const Vector x = load(a + at);
+            lanes_b.part[k] += absolute(x * load(b + at));
+            lanes_c.part[k] += absolute(x * load(c + at));
+        }
+    return {lanes_b.sum() + rest_b, lanes_c.sum() + rest_c};
+}
+
 // Largest entry of non-negative ones, 0 for none; NaN is passed over.
 inline double largest(const double *a, int64_t n) {
     double top = 0.0;

@@ -13,13 +13,23 @@ constexpr double LEAST_SHARE = 1e-3;
 constexpr double LARGE = 50.0, FAR = 0.03, LARGE_SHARE = 1e-2;
 
 // Defects w.g = values - target and their dead bands; inside its band a defect is set to 0, `raw` keeps all. Returns
-// whether anything is left to project. `terms`: sums of |G_k y_k|, else they are taken at `y`.
+// whether anything is left to project. `terms`: sums of |G_k y_k|, else they are taken at `y`; then, where the step's
+// errors are known, w.worth = sums of |G_k err_k| too.
 template <class W>
 inline bool defects(const double *terms, const double *y, const Options &o, const W &w, double *raw) {
+    const bool measured = o.watched && w.counters[HAVE_ERROR] && !terms;
     bool outside = false;
     for (int64_t i = 0; i < w.l; ++i) {
         double size = std::max(std::abs(w.values[i]), std::abs(o.target[i]));
-        size = std::max(std::max(size, o.scales[i]), terms ? terms[i] : abs_dot(w.gradient(i), y, w.m));
+        double own;
+        if (measured) {
+            const AbsDots sums = abs_dots(w.gradient(i), y, w.err, w.m);
+            own = sums.b;
+            w.worth[i] = sums.c;
+        } else {
+            own = terms ? terms[i] : abs_dot(w.gradient(i), y, w.m);
+        }
+        size = std::max(std::max(size, o.scales[i]), own);
         w.band[i] = (o.compensated ? BAND_COMPENSATED : BAND) * EPS * size;
         raw[i] = w.values[i] - o.target[i];
         const bool inside = w.band[i] < INFINITE && std::abs(raw[i]) <= w.band[i];
@@ -108,10 +118,10 @@ inline int64_t weigh_change(double size, double expected, double t, double *figu
 
 // What an accepted projection leaves: its defects, and whether the errors of the steps explain its corrections.
 //
-// An invariant's local errors since the last projection are worth `errors` sum_k |G_k err_k| (`local`, or taken here),
-// their rounding `rounding` times its terms; with errors = 0 nothing is known of them.
+// An invariant's local errors since the last projection are worth `errors` times w.worth, their rounding `rounding` times
+// its terms; with errors = 0 nothing is known of them.
 template <class W>
-inline void note(double t, double errors, double rounding, const double *local, const Options &o, const W &w) {
+inline void note(double t, double errors, double rounding, const Options &o, const W &w) {
     for (int64_t i = 0; i < w.l; ++i) {
         double *figures = w.figures(i);
         const double size = std::abs(w.defect[i]), raw = std::abs(w.before[i]);
@@ -131,10 +141,8 @@ inline void note(double t, double errors, double rounding, const double *local, 
             figures[TERMS] = std::max(known, terms);
         }
         // An estimate that vanishes tells nothing: that of RK4 does where f depends on t alone.
-        double worth = 0.0;
-        if (errors > 0.0) worth = local ? local[i] : abs_dot(w.gradient(i), w.err, w.m);
-        if (worth > 0.0) {
-            const double expected = errors * worth + rounding * terms + TINY;
+        if (errors > 0.0 && w.worth[i] > 0.0) {
+            const double expected = errors * w.worth[i] + rounding * terms + TINY;
             w.counters[FOUND] += weigh_change(std::abs(w.before[i] - figures[LEFT]), expected, t, figures);
         }
         figures[LEFT] = w.defect[i];
@@ -143,7 +151,7 @@ inline void note(double t, double errors, double rounding, const double *local, 
 
 // The same for a step, whose estimates, where they are gathered in quadrature, are of errors that add.
 template <class W>
-inline void take_note(double t, const double *local, const Options &o, const W &w) {
+inline void take_note(double t, const Options &o, const W &w) {
     if (!o.watched) return raise_to(w.defect, w.max_defect, w.l);
     const double waited = w.counters[WAITED];
     double rounding = EPS, errors = w.counters[HAVE_ERROR] ? 1.0 : 0.0;
@@ -152,7 +160,7 @@ inline void take_note(double t, const double *local, const Options &o, const W &
         const bool gathered = o.metric == ERROR || o.every == AUTO || o.adaptive;
         errors *= gathered ? std::sqrt(1.0 + waited) : 1.0 + waited;
     }
-    note(t, errors, rounding, local, o, w);
+    note(t, errors, rounding, o, w);
 }
 
 // Whether the errors gathered make some invariant more uncertain than NOISE_BANDS roundings of its terms.
