@@ -208,6 +208,7 @@ def test_numba_functions_and_c_functions_go_together(c):
     assert list(run.calls.values()) == ["jitted", "pointer", "jitted", "jitted", "pointer", "jitted"]
 
 
+@pytest.mark.needs_jit
 def test_an_invariant_in_python_makes_all_calls_python_s(c):
     fun, H, _, _, dL, event = in_c(c)
     mixed = fun, H, energy_gradient, momentum, dL, event
@@ -481,6 +482,7 @@ def test_events_carry_their_attributes(c):
     assert len(set(ends)) == 1
 
 
+@pytest.mark.needs_jit  # else the JIT is to blame
 @both
 @pytest.mark.parametrize("alone", [True, False], ids=["alone", "beside one in C"])
 def test_events_in_python_beside_native_functions(c, options, alone):
