@@ -41,6 +41,8 @@ class Step:
 
     def __call__(self, t: float, y: Array, h: float) -> Array:
         """The state at t + h."""
+        if hasattr(self.tableau, "b_prime"):
+            return self.projected(t, y, t + h, *nystrom(self.tableau, self.fun, t, y, h))
         y_hat, K = runge_kutta(self.tableau, self.fun, t, y, h)
         return self.projected(t, y, t + h, y_hat, local_error(self.tableau, K, h))
 
@@ -116,6 +118,22 @@ def runge_kutta(
         K.append(fun(t + c * h, y + h * sum((a_j * k for a_j, k in zip(a, K, strict=False)), 0 * y)))
     y_hat = y + h * (np.array(K).T @ tableau.b)
     return y_hat, np.array([*K, fun(t + h, y_hat)])
+
+
+def nystrom(
+    tableau: Any, fun: Callable[[float, Array], Array], t: float, y: Array, h: float
+) -> tuple[Array, Array | None]:
+    """For y = (q, v) and q'' = a(t, q): the raw result, and its estimated error."""
+    q, v = np.split(y, 2)
+    accelerations: list[Array] = []
+    for row, c in zip(tableau.A, tableau.c, strict=True):
+        pulled = sum((a_j * a for a_j, a in zip(row, accelerations, strict=False)), 0 * q)
+        accelerations.append(np.split(fun(t + c * h, np.concatenate([q + c * h * v + h * h * pulled, v])), 2)[1])
+    a = np.array(accelerations).T
+    y_hat = np.concatenate([q + h * v + h * h * (a @ tableau.b), v + h * (a @ tableau.b_prime)])
+    if tableau.error_estimator_order is None:
+        return y_hat, None
+    return y_hat, np.concatenate([h * h * (a @ tableau.e), h * (a @ tableau.e_prime)])
 
 
 def local_error(tableau: Any, K: Array, h: float) -> Array | None:

@@ -419,11 +419,10 @@ class Loop:
 
 
 def _compiling(shown: bool) -> Any:
-    """A line while the first run of an installation compiles, which takes longer than anyone waits without a word."""
+    """A line while a user's functions compile, which can take some seconds."""
     from tqdm import tqdm
 
-    line = "compiling (about a minute in the first run, then kept on disk)"
-    return tqdm(total=0, desc=line, bar_format="{desc}", leave=False, disable=not shown)
+    return tqdm(total=0, desc="compiling the functions", bar_format="{desc}", leave=False, disable=not shown)
 
 
 def _bar(progress: bool, schedule: Schedule, label: str) -> Any:

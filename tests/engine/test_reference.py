@@ -13,6 +13,8 @@ from eip_scipy import (
     EIPRK5,
     EIPRK23,
     EIPRK45,
+    EIPRKN8,
+    EIPRKN12,
     Invariant,
 )
 
@@ -61,7 +63,7 @@ FRAME = np.eye(6)[:1], np.eye(6)[:, :1] + 0.25 * np.eye(6)[:, 1:2]
 
 def length(cls):
     """Of the step: its error is larger than what the targets are beside the start's values."""
-    return 0.5 if cls is EIPDOP853 else 0.05
+    return 0.5 if cls in (EIPDOP853, EIPRKN8, EIPRKN12) else 0.05
 
 
 def both(cls, problem, y0, **options):
@@ -82,6 +84,7 @@ def both(cls, problem, y0, **options):
     def gradients(t, y):
         return np.concatenate([np.atleast_2d(gradient(t, y)) for _, gradient in pairs])
 
+    given = {name: value for name, value in given.items() if name not in ("every", "compensated")}
     step = Step(cls.TABLEAU, fun, values, gradients, np.concatenate(first), **given)
     return solver.y, step(0.0, y0, h), step
 
@@ -109,6 +112,14 @@ def test_a_step_is_that_of_the_method(cls, options):
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14 * moved + 3e-16)
     if options.get("iterations", 1) > 2:
         assert np.abs(step.defects(length(cls), found)).max() <= 1e-15
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=lambda o: "-".join(o) or "plain")
+@pytest.mark.parametrize("cls", [EIPRKN8, EIPRKN12])
+def test_a_step_of_a_nystrom_method(cls, options):
+    found, expected, _ = both(cls, REAL, Y0, every=1, compensated=False, **options)
+    moved = np.abs(expected - Y0).max()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14 * moved + 3e-16)
 
 
 @pytest.mark.parametrize("options", [{}, {"metric": "euclidean"}, {"blocks": [[0, 2], [1]]}, {"direction": "old"}])

@@ -1,0 +1,278 @@
+#include "records.hpp"
+
+namespace eip {
+
+Method method_of(PyObject *method, Arrays &arrays) {
+    Method m{};
+    m.stages = Arrays::length(method, "b");
+    m.exponent = number(method, "exponent");
+    m.c = arrays.floats(method, "c", {m.stages});
+    m.b = arrays.floats(method, "b", {m.stages});
+    return m;
+}
+
+// Coefficients of a tableau, which a one-step method of a user's own has none of.
+void read_tableau(PyObject *method, Arrays &arrays, Method &m) {
+    m.columns = Arrays::length(method, "A", 1);
+    m.A = arrays.floats(method, "A", {m.stages, m.columns});
+    if (m.columns < m.stages - 1) {
+        PyErr_SetString(PyExc_ValueError, "engine: A has too few columns");
+        throw PythonError{};
+    }
+    m.b_low = arrays.floats(method, "b_low", {m.stages});
+    m.b_v = arrays.floats(method, "b_v", {m.stages});
+    m.b_v_low = arrays.floats(method, "b_v_low", {m.stages});
+    m.n_e = Arrays::length(method, "e");
+    m.n_e_v = Arrays::length(method, "e_v");
+    m.e = arrays.floats(method, "e", {m.n_e});
+    m.e_v = arrays.floats(method, "e_v", {m.n_e_v});
+    m.e_low = arrays.floats(method, "e_low", {ANY});
+    m.nystrom = truth(method, "nystrom");
+    m.fsal = truth(method, "fsal");
+    m.paired = truth(method, "paired");
+    if (m.n_e > m.stages + 1 || m.n_e_v > m.stages + 1 || (m.paired && Arrays::length(method, "e_low") < m.n_e)) {
+        PyErr_SetString(PyExc_ValueError, "engine: the weights of the error estimate do not fit the stages");
+        throw PythonError{};
+    }
+}
+
+Work work_of(PyObject *work, int64_t stages, int64_t blocks, Arrays &arrays, int type) {
+    Work w{};
+    const int64_t width = type == NPY_CDOUBLE ? 2 : 1;
+    const int64_t n = Arrays::length(work, "y_hat"), l = Arrays::length(work, "values"), m = n * width;
+    w.n = n;
+    w.m = m;
+    w.l = l;
+    w.stages = stages;
+    const auto state = [&](const char *name, std::initializer_list<npy_intp> shape) {
+        return static_cast<double *>(arrays.memory_of(work, name, type, shape));
+    };
+    w.K = state("K", {stages + 1, n});
+    w.stage = state("stage", {n});
+    w.y_hat = state("y_hat", {n});
+    w.f_point = state("f_point", {n});
+    w.G = state("G", {l, n});
+    for (const auto &[name, place] : std::initializer_list<std::pair<const char *, double **>>{
+             {"err", &w.err}, {"err_low", &w.err_low}, {"err_sum", &w.err_sum}, {"sigma", &w.sigma},
+             {"move", &w.move}, {"carry", &w.carry}, {"carry_hat", &w.carry_hat}})
+        *place = arrays.floats(work, name, {m});
+    for (const auto &[name, place] : std::initializer_list<std::pair<const char *, double **>>{
+             {"inverse_norms", &w.inverse_norms}, {"mu", &w.mu}, {"values", &w.values}, {"g", &w.g}, {"band", &w.band},
+             {"before", &w.before}, {"worth", &w.worth}, {"defect", &w.defect}, {"max_defect", &w.max_defect}})
+        *place = arrays.floats(work, name, {l});
+    w.scale = arrays.floats(work, "scale", {blocks});
+    w.ratio = arrays.floats(work, "ratio", {blocks});
+    w.B = arrays.floats(work, "B", {l, m});
+    w.Q = arrays.floats(work, "Q", {l, m});
+    w.R = arrays.floats(work, "R", {l, l});
+    w.max_correction = arrays.floats(work, "max_correction", {1});
+    w.norm = arrays.floats(work, "norm", {1});
+    w.trust = arrays.floats(work, "trust", {l, N_FIGURES});
+    w.pivots = arrays.integers<int64_t>(work, "pivots", {l});
+    w.counters = arrays.integers<int64_t>(work, "counters", {N_COUNTERS});
+    const Ref inner = attribute(work, "inner");
+    w.inner.matrix = arrays.floats(inner.get(), "matrix", {l, l});
+    w.inner.R = arrays.floats(inner.get(), "R", {l, l});
+    w.inner.g = arrays.floats(inner.get(), "g", {l});
+    w.inner.inverse_norms = arrays.floats(inner.get(), "inverse_norms", {l});
+    w.inner.mu = arrays.floats(inner.get(), "mu", {l});
+    w.inner.pivots = arrays.integers<int64_t>(inner.get(), "pivots", {l});
+    return w;
+}
+
+// Places that a list of indices names: all below `bound`, their starts in order.
+static void check_places(const uint64_t *start, int64_t count, const uint64_t *place, int64_t size, int64_t bound,
+                         const char *name) {
+    bool good = true;
+    for (int64_t k = 0; k + 1 < count; ++k) good &= start[k] <= start[k + 1];
+    good &= count == 0 || start[count - 1] <= static_cast<uint64_t>(size);
+    for (int64_t p = 0; p < size; ++p) good &= place[p] < static_cast<uint64_t>(bound);
+    if (good) return;
+    PyErr_Format(PyExc_ValueError, "engine: %s names places outside the state", name);
+    throw PythonError{};
+}
+
+static Blocks blocks_of(PyObject *groups, int64_t m, Arrays &arrays) {
+    Blocks blocks{};
+    const int64_t members = Arrays::length(groups, "member"), starts = Arrays::length(groups, "start");
+    blocks.member = arrays.integers<uint64_t>(groups, "member", {members});
+    blocks.start = arrays.integers<uint64_t>(groups, "start", {starts});
+    blocks.count = starts - 1;
+    blocks.width = integer(groups, "width");
+    blocks.size = integer(groups, "size");
+    check_places(blocks.start, starts, blocks.member, members, m, "groups");
+    const bool consecutive = blocks.size == 0 || blocks.size * blocks.count == m;
+    if (starts < 1 || (blocks.width != 1 && blocks.width != 2) || !consecutive) {
+        PyErr_SetString(PyExc_ValueError, "engine: groups do not fit the state");
+        throw PythonError{};
+    }
+    return blocks;
+}
+
+static Frame frame_of(PyObject *rows, int64_t m, Arrays &arrays) {
+    Frame frame{};
+    frame.rows = Arrays::length(rows, "products");
+    const int64_t values = Arrays::length(rows, "value");
+    frame.start = arrays.integers<uint64_t>(rows, "start", {2, frame.rows + 1});
+    frame.place = arrays.integers<uint64_t>(rows, "place", {values});
+    frame.value = arrays.floats(rows, "value", {values});
+    frame.products = arrays.floats(rows, "products", {frame.rows});
+    frame.groups = Arrays::length(rows, "bodies", 1);
+    frame.count = Arrays::length(rows, "bodies", 2);
+    frame.bodies = arrays.floats(rows, "bodies", {2, frame.groups, frame.count});
+    check_places(frame.start, 2 * (frame.rows + 1), frame.place, values, m, "frame");
+    if (frame.groups > 0 && 3 * frame.groups * frame.count != m) {
+        PyErr_SetString(PyExc_ValueError, "engine: the frame's bodies do not fit the state");
+        throw PythonError{};
+    }
+    return frame;
+}
+
+Options options_of(PyObject *options, const Work &w, Arrays &arrays) {
+    Options o{};
+    o.rtol = arrays.floats(options, "rtol", {w.m});
+    o.atol = arrays.floats(options, "atol", {w.n});
+    o.blocks = blocks_of(attribute(options, "groups").get(), w.m, arrays);
+    o.block_atol = arrays.floats(options, "block_atol", {o.blocks.count});
+    o.frame = frame_of(attribute(options, "frame").get(), w.m, arrays);
+    o.target = arrays.floats(options, "target", {w.l});
+    o.scales = arrays.floats(options, "scales", {w.l});
+    o.kappa = number(options, "kappa");
+    o.metric = integer(options, "metric");
+    o.direction = integer(options, "direction");
+    o.iterations = integer(options, "iterations");
+    o.every = integer(options, "every");
+    o.reuse_f = truth(options, "reuse_f");
+    o.uses_f = truth(options, "uses_f");
+    o.compensated = truth(options, "compensated");
+    o.adaptive = truth(options, "adaptive");
+    o.watched = truth(options, "watched");
+    o.per_band = number(options, "per_band");
+    o.limit = number(options, "limit");
+    if (o.every < 0) {
+        PyErr_SetString(PyExc_ValueError, "engine: every must not be negative");
+        throw PythonError{};
+    }
+    return o;
+}
+
+static Span span_of(PyObject *span) {
+    return {number(span, "t0"), number(span, "h"), number(span, "t_bound"), number(span, "sign"),
+            integer(span, "n_steps"), number(span, "max_step")};
+}
+
+Schedule schedule_of(PyObject *schedule, Arrays &arrays) {
+    Schedule s{};
+    s.span = span_of(attribute(schedule, "span").get());
+    s.save_every = integer(schedule, "save_every");
+    s.n_eval = Arrays::length(schedule, "t_eval");
+    s.n_events = Arrays::length(schedule, "g");
+    s.t_eval = arrays.floats(schedule, "t_eval", {s.n_eval});
+    s.place = arrays.integers<int64_t>(schedule, "place", {3});
+    s.clock = arrays.floats(schedule, "clock", {4});
+    s.g = arrays.floats(schedule, "g", {s.n_events});
+    s.g_new = arrays.floats(schedule, "g_new", {s.n_events});
+    s.g_direction = arrays.floats(schedule, "g_direction", {s.n_events});
+    return s;
+}
+
+// Rows of weights over the stages, of the lengths that the kind of interpolant has.
+static void read_interpolant(PyObject *dense, int64_t stages, Arrays &arrays, Dense &d) {
+    d.kind = integer(dense, "kind");
+    d.polynomials = Arrays::length(dense, "weights");
+    d.columns = Arrays::length(dense, "weights", 1);
+    d.further = Arrays::length(dense, "c");
+    d.weights = arrays.floats(dense, "weights", {d.polynomials, d.columns});
+    d.A = arrays.floats(dense, "A", {d.further, ANY});
+    d.c = arrays.floats(dense, "c", {d.further});
+    const bool known = d.kind >= CUBIC && d.kind <= SEVENTH;
+    const bool fits = d.kind == POLYNOMIAL ? d.columns == stages + 1
+                    : d.kind == SEVENTH    ? d.columns == stages + 1 + d.further && d.columns <= d.work.stages + 1
+                                           : true;
+    if (!known || !fits || (d.further > 0 && Arrays::length(dense, "A", 1) != d.columns)) {
+        PyErr_SetString(PyExc_ValueError, "engine: the interpolant does not fit the method");
+        throw PythonError{};
+    }
+}
+
+static Dense dense_of(PyObject *dense, const Data &run, Arrays &arrays, int type) {
+    Dense d{};
+    const Ref work = attribute(dense, "work"), options = attribute(dense, "options");
+    d.work = work_of(work.get(), Arrays::length(work.get(), "K") - 1, run.options.blocks.count, arrays, type);
+    d.own_slopes = truth(dense, "own_slopes");
+    if (d.work.n != run.work.n || d.work.l != run.work.l || (d.own_slopes && d.work.stages < 1)) {
+        PyErr_SetString(PyExc_ValueError, "engine: the buffers for dense output do not fit the run");
+        throw PythonError{};
+    }
+    d.options = options_of(options.get(), d.work, arrays);
+    d.target = arrays.floats(options.get(), "target", {d.work.l});
+    d.by_travel = truth(dense, "by_travel");
+    d.missed = arrays.floats(dense, "missed", {2});
+    read_interpolant(dense, run.work.stages, arrays, d);
+    if (d.kind == QUINTIC && d.work.m % 2) {
+        PyErr_SetString(PyExc_ValueError, "engine: a state of positions and velocities has an even length");
+        throw PythonError{};
+    }
+    return d;
+}
+
+Samples samples_of(PyObject *dense, const Data &run, int64_t events, Arrays &arrays, int type) {
+    Samples samples{};
+    samples.dense = dense_of(dense, run, arrays, type);
+    const Dense &d = samples.dense;
+    Roots &roots = samples.roots;
+    roots.capacity = Arrays::length(dense, "event");
+    roots.event = arrays.integers<int64_t>(dense, "event", {roots.capacity});
+    roots.t = arrays.floats(dense, "t", {roots.capacity});
+    roots.y = static_cast<double *>(arrays.memory_of(dense, "y", type, {roots.capacity, d.work.n}));
+    roots.left = arrays.floats(dense, "left", {events});
+    samples.piece = arrays.floats(dense, "piece", {d.floats()});
+    auto *counts = arrays.integers<int64_t>(dense, "counts", {2});
+    roots.count = counts;
+    samples.interpolants.count = counts + 1;
+    return samples;
+}
+
+// Functions by pointer: the address of `rhs`, and (address, floats) of each of inv, grad and event.
+template <typename Pointer>
+static std::vector<Native<Pointer>> pointers_of(PyObject *functions, const char *name, int64_t expected) {
+    std::vector<Native<Pointer>> out;
+    const Ref items(PySequence_Fast(attribute(functions, name).get(), "engine: expected a sequence of pairs"));
+    int64_t total = 0;
+    for (Py_ssize_t k = 0; k < PySequence_Fast_GET_SIZE(items.get()); ++k) {
+        unsigned long long address;
+        long long floats;
+        PyObject *pair = PySequence_Fast_GET_ITEM(items.get(), k);
+        if (!PyTuple_Check(pair)) PyErr_Format(PyExc_TypeError, "engine: %s must hold pairs, got %.80R", name, pair);
+        if (PyErr_Occurred() || !PyArg_ParseTuple(pair, "KL", &address, &floats)) throw PythonError{};
+        if (!address || floats < 0) {
+            PyErr_Format(PyExc_ValueError, "engine: function %zd of %s is missing", k, name);
+            throw PythonError{};
+        }
+        out.push_back({reinterpret_cast<Pointer>(static_cast<uintptr_t>(address)), floats});
+        total += floats;
+    }
+    if (total != expected) {
+        PyErr_Format(PyExc_ValueError, "engine: the values of %s are %lld floats, expected %lld", name,
+                     static_cast<long long>(total), static_cast<long long>(expected));
+        throw PythonError{};
+    }
+    return out;
+}
+
+void read_pointers(PyObject *functions, const Work &w, int64_t events, Arrays &arrays, System &system) {
+    system.rhs_pointer = reinterpret_cast<ValuePointer>(static_cast<uintptr_t>(integer(functions, "rhs")));
+    system.inv_pointers = pointers_of<ValuePointer>(functions, "inv", w.l);
+    system.grad_pointers = pointers_of<GradientPointer>(functions, "grad", w.l * w.m);
+    system.event_pointers = pointers_of<ValuePointer>(functions, "event", events);
+    system.second_order = truth(functions, "second_order");
+    system.params = arrays.floats(functions, "params", {ANY});
+    system.scratch.resize(w.m);
+    system.scratch_f.resize(w.m);
+    if (!system.rhs_pointer) {
+        PyErr_SetString(PyExc_ValueError, "engine: rhs is missing");
+        throw PythonError{};
+    }
+}
+
+}  // namespace eip

@@ -1,0 +1,28 @@
+// From the records of data.py to what the steps take. What comes from Python is looked at here, once; all arrays of a run
+// keep their memory, so that Python reads what the engine writes.
+#pragma once
+
+#include "loop.hpp"
+#include "python.hpp"
+
+namespace eip {
+
+// What the steps of a run refer to.
+struct Data {
+    Method method;
+    Options options;
+    Work work;
+    System system;
+};
+
+Method method_of(PyObject *method, Arrays &arrays);
+// Coefficients, which a one-step method of a user's own has none of.
+void read_tableau(PyObject *method, Arrays &arrays, Method &m);
+Work work_of(PyObject *work, int64_t stages, int64_t blocks, Arrays &arrays, int type);
+Options options_of(PyObject *options, const Work &w, Arrays &arrays);
+Schedule schedule_of(PyObject *schedule, Arrays &arrays);
+Samples samples_of(PyObject *dense, const Data &run, int64_t events, Arrays &arrays, int type);
+// Functions by pointer.
+void read_pointers(PyObject *functions, const Work &w, int64_t events, Arrays &arrays, System &system);
+
+}  // namespace eip
