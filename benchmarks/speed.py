@@ -5,8 +5,9 @@
 1. Compiled Kepler EIP-RK4 with H and L against a loop in which the same step (stages, metric, projection) is fused by
    hand for this one problem; per step also against solve_ivp with SciPy's RK45, and so EIP-RK45 with adaptive steps.
 2. Compiled solar system, EIP-RK4 (H, L, blocks, frame) against plain compiled RK4.
-3. A second process: from its start to its first compiled step, with a user's functions that no cache knows.
-4. Importing eip_scipy against importing scipy.integrate and numba.
+3. Compiled Kepler to t = 300 with 3001 times in t_eval against saving each step; a section of 1600 crossings against the
+   run without it. Whole calls.
+4. A process: from its start to its first compiled step, with a user's functions that no cache knows.
 """
 
 from __future__ import annotations
@@ -212,6 +213,26 @@ def solar_speed() -> dict[str, float]:
     }
 
 
+@njit
+def crossing(t, y, params):
+    return y[1]
+
+
+def sampling_speed() -> dict[str, float]:
+    problem = kepler(relativistic=MU)
+    short, long = (0.0, 300.0), (0.0, 5100.0)
+    times = np.linspace(*short, 3001)
+    found = integrate(problem, long, method=EIPRK4, h=H, events=crossing).t_events[0].size
+    every = least(lambda: integrate(problem, short, method=EIPRK4, h=H, save_every=1))
+    sampled = least(lambda: integrate(problem, short, method=EIPRK4, h=H, t_eval=times))
+    plain = least(lambda: integrate(problem, long, method=EIPRK4, h=H))
+    section = least(lambda: integrate(problem, long, method=EIPRK4, h=H, events=crossing))
+    return {
+        "3001 times in t_eval / save_every=1": sampled / every,
+        f"section of {found} crossings / run without": section / plain,
+    }
+
+
 USER = """
 import time
 begin = time.perf_counter()
@@ -240,19 +261,10 @@ def process_times() -> dict[str, float]:
         code = USER % ((1.0 + 0.001 * k,) * 3)
         printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
         firsts.append([float(x) for x in printed.split()])
-    # The first one may compile the driver itself; it is not counted.
-    rest = np.median(np.array(firsts[1:]), axis=0)
-    imports = {}
-    for label, code in (
-        ("eip_scipy", "import eip_scipy"),
-        ("scipy.integrate and numba", "import scipy.integrate, numba"),
-    ):
-        imports[label] = least(lambda code=code: subprocess.run([sys.executable, "-c", code], check=True))
+    rest = np.median(np.array(firsts[1:]), axis=0)  # the first one may write bytecode
     return {
-        "second process: import [s]": float(rest[0]),
-        "second process: start to the end of its first compiled run [s]": float(rest[1]),
-        "import eip_scipy / import scipy.integrate and numba": imports["eip_scipy"]
-        / imports["scipy.integrate and numba"],
+        "a process: import [s]": float(rest[0]),
+        "a process: start to the end of its first compiled run [s]": float(rest[1]),
     }
 
 
@@ -260,7 +272,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", metavar="FILE")
     arguments = parser.parse_args()
-    results = {**kepler_speed(), **solar_speed(), **process_times()}
+    results = {**kepler_speed(), **solar_speed(), **sampling_speed(), **process_times()}
     width = max(map(len, results))
     print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, least of {REPEATS} runs")
     for name, value in results.items():

@@ -125,8 +125,15 @@ void raise_broken(const System &system) {
     PyErr_SetObject(failed_call_error, arguments.get());
 }
 
-// A step or more by `call`, which takes a RunOf; without the GIL where no function is Python's, and then by code for short
-// states where there is any.
+template <int64_t M, typename Call>
+Code with_length(Data &d, Call call) {
+    const Sized<M> work(d.work);
+    RunOf<Sized<M>> run{d.method, d.options, work, d.system, nullptr};
+    return call(run);
+}
+
+// A step or more by `call`, which takes a RunOf; without the GIL where no function is Python's, and then by code of its own
+// for the short states of bodies in two and three dimensions.
 template <typename Call>
 Code stepped(Engine *self, Call call) {
     const FloatingPoint mode;
@@ -136,10 +143,11 @@ Code stepped(Engine *self, Call call) {
     Code code = OK;
     bool broken = false;
     try {
-        if (d.work.n == 4 && d.work.m == 4 && !python) {
-            const Sized<4> work(d.work);
-            RunOf<Sized<4>> run{d.method, d.options, work, d.system, nullptr};
-            code = call(run);
+        const bool real = d.work.n == d.work.m;
+        if (!python && real && d.work.m == 4) {
+            code = with_length<4>(d, call);
+        } else if (!python && real && d.work.m == 6) {
+            code = with_length<6>(d, call);
         } else {
             Run run{d.method, d.options, d.work, d.system, self->hooks};
             code = call(run);
