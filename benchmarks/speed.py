@@ -5,8 +5,8 @@
 1. Compiled Kepler EIP-RK4 with H and L against a loop in which the same step (stages, metric, projection) is fused by
    hand for this one problem; per step also against solve_ivp with SciPy's RK45, and so EIP-RK45 with adaptive steps.
 2. Compiled solar system, EIP-RK4 (H, L, blocks, frame) against plain compiled RK4.
-3. Compiled Kepler to t = 300 with 3001 times in t_eval against saving each step; a section of 1600 crossings against the
-   run without it. Whole calls.
+3. Compiled Kepler to t = 300 with 3001 times in t_eval against saving each step; a section of 1600 crossings against
+   the run without it. Whole calls.
 4. A process: from its start to its first compiled step, with a user's functions that no cache knows.
 """
 
