@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -25,8 +26,8 @@ __all__ = ["ExactEnds", "Interpolants", "ManifoldDenseOutput", "solution"]
 
 Array = np.ndarray
 ITERATIONS = 5
-# Roots of events that the loop finds before someone looks at them.
-MOST_ROOTS = 1024
+# Roots of events that the loop finds before someone looks at them, and the numbers that their states may be.
+MOST_ROOTS, ROOT_NUMBERS = 1024, 2**17
 
 
 class Interpolants:
@@ -58,6 +59,7 @@ class Interpolants:
     ) -> None:
         self.record = _record(run, tableau, events)
         self._engine, self._dtype, self._n, self._errors = engine, run.y0.dtype, run.y0.size, errors
+        self._lock = threading.RLock()  # one buffer for all threads that ask
         engine.sample(self.record)
 
     @property
@@ -68,14 +70,14 @@ class Interpolants:
     def over(self, t_old: float, y_old: Array, t: float, y: Array) -> ManifoldDenseOutput:
         """Dense output over the step that was made last."""
         piece = np.empty(self.floats)
-        with self._errors():
+        with self._lock, self._errors():
             self._engine.describe(t_old, y_old, t, y, piece)
         return ManifoldDenseOutput(self, piece)
 
     def states(self, piece: Array, times: Array) -> Array:
         """The states (n, m) at times (m,) by an interpolant."""
         out = np.empty((times.size, self._n), self._dtype)
-        with self._errors():
+        with self._lock, self._errors():
             self._engine.interpolate(piece, times, out)
         self.warn()
         return out.T
@@ -102,7 +104,7 @@ class Interpolants:
 
 
 def _record(run: Run, tableau: AnyMethod, events: int) -> Dense:
-    roots = MOST_ROOTS if events else 0
+    roots = min(MOST_ROOTS, ROOT_NUMBERS // run.y0.size) if events else 0
     none = np.zeros((0, 0))
     kind, weights, A, c = CUBIC, none, none, np.zeros(0)
     stages, rows = run.method.b.size, 3

@@ -1,6 +1,7 @@
 """States between steps and roots of events in the compiled loop: those of solve_ivp, and of SciPy's root finder."""
 
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -337,3 +338,31 @@ def test_a_callback_stops_at_the_time_it_sees(steps):
     assert found.t_events[0][-1] <= 7.0 + longest
     rest = run(method, clock, t_eval=times[:8], span=(0.0, 7.0), **steps)
     assert found.nfev <= rest.nfev + 30
+
+
+def test_threads_may_ask_at_once():
+    """Of compiled functions, without the GIL, and of Python's."""
+    times = np.linspace(0, 30, 3001)
+    for compiled in (None, False):
+        found = run(EIPRK4, h=0.05, dense_output=True, compiled=compiled)
+        expected = found.sol(times)
+        with ThreadPoolExecutor(4) as pool:
+            parts = list(pool.map(found.sol, np.split(times[:3000], 30)))
+        np.testing.assert_array_equal(np.concatenate(parts, axis=1), expected[:, :3000])
+
+
+def test_events_of_long_states():
+    """More numbers than the loop has room for among its roots."""
+
+    @njit
+    def decay(t, y):
+        return -y
+
+    @njit
+    def level(t, y):
+        return y[0] - 0.5
+
+    found = integrate(decay, (0, 1), np.ones(200_000), method=EIPRK4, h=0.25, events=level)
+    assert found.compiled
+    np.testing.assert_allclose(found.t_events[0], [np.log(2)], rtol=1e-3)
+    assert found.y_events[0].shape == (1, 200_000)
