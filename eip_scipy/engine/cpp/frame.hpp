@@ -1,6 +1,10 @@
 // Gradients and corrections made neutral to a frame of linear invariants.
 #pragma once
 
+#if defined(__FMA__)
+#include <immintrin.h>
+#endif
+
 #include "system.hpp"
 
 namespace eip {
@@ -26,28 +30,57 @@ inline void remove_sparse(const Frame &frame, int measure, double *a) {
     subtract_sparse(frame, 1 - measure, a);
 }
 
-// Weighted sum over bodies of their x, y and z, each product and sum rounded once.
+// x, y and z of a body, and a fourth number that means nothing; each product and sum rounded once.
+#if defined(__FMA__)
 struct Triple {
-    double x = 0.0, y = 0.0, z = 0.0;
+    __m256d part = _mm256_setzero_pd();
+
+    static Triple spread(double weight) { return {_mm256_set1_pd(weight)}; }
+    static Triple load(const double *a) { return {_mm256_loadu_pd(a)}; }
+    static Triple load_last(const double *a) { return {_mm256_set_pd(0.0, a[2], a[1], a[0])}; }
+    void store(double *out) const { _mm256_storeu_pd(out, part); }
+    void store_last(double *out) const {
+        _mm_storeu_pd(out, _mm256_castpd256_pd128(part));
+        _mm_store_sd(out + 2, _mm256_extractf128_pd(part, 1));
+    }
+    Triple operator-() const { return {_mm256_xor_pd(part, _mm256_set1_pd(-0.0))}; }
 };
 
+inline Triple multiply_add(const Triple &a, const Triple &b, const Triple &c) {
+    return {_mm256_fmadd_pd(a.part, b.part, c.part)};
+}
+#else
+struct Triple {
+    double x = 0.0, y = 0.0, z = 0.0;
+
+    static Triple spread(double weight) { return {weight, weight, weight}; }
+    static Triple load(const double *a) { return {a[0], a[1], a[2]}; }
+    static Triple load_last(const double *a) { return load(a); }
+    void store(double *out) const { out[0] = x, out[1] = y, out[2] = z; }
+    void store_last(double *out) const { store(out); }
+    Triple operator-() const { return {-x, -y, -z}; }
+};
+
+inline Triple multiply_add(const Triple &a, const Triple &b, const Triple &c) {
+    return {std::fma(a.x, b.x, c.x), std::fma(a.y, b.y, c.y), std::fma(a.z, b.z, c.z)};
+}
+#endif
+
+// Weighted sum over bodies of their x, y and z.
 inline Triple sum_bodies(const double *weights, const double *row, int64_t count) {
     Triple sum;
-    for (int64_t j = 0; j < count; ++j) {
-        sum.x = std::fma(weights[j], row[3 * j], sum.x);
-        sum.y = std::fma(weights[j], row[3 * j + 1], sum.y);
-        sum.z = std::fma(weights[j], row[3 * j + 2], sum.z);
-    }
-    return sum;
+    for (int64_t j = 0; j + 1 < count; ++j)
+        sum = multiply_add(Triple::spread(weights[j]), Triple::load(row + 3 * j), sum);
+    return multiply_add(Triple::spread(weights[count - 1]), Triple::load_last(row + 3 * (count - 1)), sum);
 }
 
-// out = row - weights[j] (x, y, z) for each body j.
+// out = row - weights[j] (x, y, z) for each body j; what is stored behind a body is overwritten by the next one.
 inline void shift_bodies(const double *row, const double *weights, const Triple &by, double *out, int64_t count) {
-    for (int64_t j = 0; j < count; ++j) {
-        out[3 * j] = std::fma(weights[j], -by.x, row[3 * j]);
-        out[3 * j + 1] = std::fma(weights[j], -by.y, row[3 * j + 1]);
-        out[3 * j + 2] = std::fma(weights[j], -by.z, row[3 * j + 2]);
-    }
+    const Triple back = -by;
+    for (int64_t j = 0; j + 1 < count; ++j)
+        multiply_add(Triple::spread(weights[j]), back, Triple::load(row + 3 * j)).store(out + 3 * j);
+    const int64_t last = count - 1;
+    multiply_add(Triple::spread(weights[last]), back, Triple::load_last(row + 3 * last)).store_last(out + 3 * last);
 }
 
 // Rows B_i = sigma * (G_i projected along the frame).

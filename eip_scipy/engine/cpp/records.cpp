@@ -121,7 +121,7 @@ static Frame frame_of(PyObject *rows, int64_t m, Arrays &arrays) {
     frame.count = Arrays::length(rows, "bodies", 2);
     frame.bodies = arrays.floats(rows, "bodies", {2, frame.groups, frame.count});
     check_places(frame.start, 2 * (frame.rows + 1), frame.place, values, m, "frame");
-    if (frame.groups > 0 && 3 * frame.groups * frame.count != m) {
+    if (frame.groups > 0 && (frame.count < 1 || 3 * frame.groups * frame.count != m)) {
         PyErr_SetString(PyExc_ValueError, "engine: the frame's bodies do not fit the state");
         throw PythonError{};
     }
