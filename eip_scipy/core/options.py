@@ -1,7 +1,7 @@
 """The options of the projection, in one place: names, defaults, documentation, checks, and what identifies a run.
 
 Whatever projects takes them as `ProjectionOptions` or as its keywords. A new option is a field here, a keyword, and,
-where the step is to know it, a field of the engine's `Options`.
+where the step is to know it, a field of `Options`, and the same in engine/cpp/data.hpp.
 """
 
 from __future__ import annotations
@@ -14,7 +14,20 @@ from typing import Any, NamedTuple, TypedDict, TypeVar
 
 import numpy as np
 
-from ..engine.data import AUTO, BAND, BAND_COMPENSATED, EPS, ERROR, EUCLIDEAN, GIVEN, MIDPOINT, NEW, OLD, Options
+from ..engine.data import (
+    AUTO,
+    BAND,
+    BAND_COMPENSATED,
+    EPS,
+    ERROR,
+    EUCLIDEAN,
+    GIVEN,
+    MIDPOINT,
+    NEW,
+    OLD,
+    FrameRows,
+    Grouping,
+)
 from ..engine.trust import LARGE_SHARE
 from .blocks import blocks_of
 from .frame import frame_rows
@@ -53,6 +66,37 @@ class ProjectionKeywords(TypedDict, total=False):
 def _text(kind: str, text: str) -> dict[str, str]:
     """An option's kind of value, and what it is, for docstrings."""
     return {"kind": kind, "text": " ".join(text.split())}
+
+
+class Options(NamedTuple):
+    """The options as the engine reads them (cpp/data.hpp).
+
+    `rtol` by float of the state, `atol` by component, `block_atol` by block.
+    `watched`: whether corrections are compared with the errors of the steps. `limit`: the share of an invariant's terms
+    that a projection may leave as its defect; the terms are `per_band` dead bands.
+    `joint`: in interpreted runs the `JointInvariants` whose functions serve, else None.
+    """
+
+    rtol: np.ndarray
+    atol: np.ndarray
+    block_atol: np.ndarray
+    groups: Grouping
+    frame: FrameRows
+    target: np.ndarray
+    scales: np.ndarray
+    kappa: float
+    metric: int
+    direction: int
+    iterations: int
+    every: int
+    reuse_f: bool
+    uses_f: bool
+    compensated: bool
+    adaptive: bool
+    per_band: float
+    watched: bool = False
+    limit: float = np.inf
+    joint: Any = None
 
 
 class Settled(NamedTuple):

@@ -23,7 +23,6 @@ from ..engine.data import (
     TIME_NEW,
     TOO_SMALL,
     Method,
-    Options,
     Schedule,
     Work,
     make_work,
@@ -35,7 +34,7 @@ from .frame import spanned
 from .inputs import reals, refuse_units, shown
 from .invariants import InvariantSet
 from .one_step import OneStep, as_vector
-from .options import ProjectionOptions
+from .options import Options, ProjectionOptions
 from .results import Diagnostics
 from .stepping import AnyMethod, Stepping
 

@@ -119,36 +119,6 @@ class FrameRows(NamedTuple):
     bodies: np.ndarray
 
 
-class Options(NamedTuple):
-    """What a run fixes: `rtol` by float of the state, `atol` by component, `block_atol` by block.
-
-    `watched`: whether corrections are compared with the errors of the steps. `limit`: the share of an invariant's terms
-    that a projection may leave as its defect; the terms are `per_band` dead bands.
-    `joint`: in interpreted runs the `JointInvariants` whose functions serve, else None.
-    """
-
-    rtol: np.ndarray
-    atol: np.ndarray
-    block_atol: np.ndarray
-    groups: Grouping
-    frame: FrameRows
-    target: np.ndarray
-    scales: np.ndarray
-    kappa: float
-    metric: int
-    direction: int
-    iterations: int
-    every: int
-    reuse_f: bool
-    uses_f: bool
-    compensated: bool
-    adaptive: bool
-    per_band: float
-    watched: bool = False
-    limit: float = np.inf
-    joint: Any = None
-
-
 class Inner(NamedTuple):
     """Scratch of the small Newton systems."""
 
@@ -271,7 +241,7 @@ class Dense(NamedTuple):
     c: np.ndarray
     own_slopes: bool
     by_travel: bool
-    options: Options
+    options: Any
     work: Work
     missed: np.ndarray
     piece: np.ndarray

@@ -17,10 +17,11 @@ from numba import typeof, types
 from ..core import setup
 from ..core.compiled_functions import signatures_of_batches, with_inlined
 from ..core.jitted import NotCompilableError
+from ..core.options import Options
 from ..core.stepping import UNBOUNDED
 from ..engine.caching import cached_njit
 from ..engine.counters import FOUND, LAST_RANK, N_COUNTERS, NFEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
-from ..engine.data import AUTO, NEW, OK, PENDING, ROW, STEP, TIME, Options, Span
+from ..engine.data import AUTO, NEW, OK, PENDING, ROW, STEP, TIME, Span
 from ..engine.octets import LANES
 from ..engine.trust import EXPECTED, START, SUM, TERMS, TOGETHER
 from ..run.integrate import Loop

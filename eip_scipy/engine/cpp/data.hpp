@@ -79,6 +79,23 @@ struct Options {
     double per_band, limit;  // an invariant's terms are per_band dead bands; `limit`: the share of them that may be left
 };
 
+// Its numbers and flags, for whoever reads them by their names.
+template <class Read>
+inline void read_each(Options &o, Read read) {
+    read("kappa", o.kappa);
+    read("metric", o.metric);
+    read("direction", o.direction);
+    read("iterations", o.iterations);
+    read("every", o.every);
+    read("reuse_f", o.reuse_f);
+    read("uses_f", o.uses_f);
+    read("compensated", o.compensated);
+    read("adaptive", o.adaptive);
+    read("watched", o.watched);
+    read("per_band", o.per_band);
+    read("limit", o.limit);
+}
+
 // Scratch of the small Newton systems.
 struct Inner {
     double *matrix, *g, *inverse_norms, *R, *mu;

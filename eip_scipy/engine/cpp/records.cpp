@@ -137,18 +137,15 @@ Options options_of(PyObject *options, const Work &w, Arrays &arrays) {
     o.frame = frame_of(attribute(options, "frame").get(), w.m, arrays);
     o.target = arrays.floats(options, "target", {w.l});
     o.scales = arrays.floats(options, "scales", {w.l});
-    o.kappa = number(options, "kappa");
-    o.metric = integer(options, "metric");
-    o.direction = integer(options, "direction");
-    o.iterations = integer(options, "iterations");
-    o.every = integer(options, "every");
-    o.reuse_f = truth(options, "reuse_f");
-    o.uses_f = truth(options, "uses_f");
-    o.compensated = truth(options, "compensated");
-    o.adaptive = truth(options, "adaptive");
-    o.watched = truth(options, "watched");
-    o.per_band = number(options, "per_band");
-    o.limit = number(options, "limit");
+    read_each(o, [options](const char *name, auto &value) {
+        using Value = std::decay_t<decltype(value)>;
+        if constexpr (std::is_same_v<Value, bool>)
+            value = truth(options, name);
+        else if constexpr (std::is_same_v<Value, double>)
+            value = number(options, name);
+        else
+            value = integer(options, name);
+    });
     if (o.every < 0) {
         PyErr_SetString(PyExc_ValueError, "engine: every must not be negative");
         throw PythonError{};
