@@ -7,7 +7,7 @@ import threading
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from scipy.integrate import DOP853 as SCIPY_DOP853
@@ -61,6 +61,14 @@ class Interpolants:
         self._engine, self._dtype, self._n, self._errors = engine, run.y0.dtype, run.y0.size, errors
         self._lock = threading.RLock()  # one buffer for all threads that ask
         engine.sample(self.record)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Interpolants:
+        return self  # nothing that a copy could change
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "dense output calls the functions of its run, and cannot be pickled; send its values, sol(times), instead."
+        )
 
     @property
     def floats(self) -> int:
