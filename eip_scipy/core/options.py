@@ -36,7 +36,7 @@ from .invariants import InvariantSet, JointInvariants
 from .one_step import OneStep
 from .stepping import AnyMethod, Stepping
 
-__all__ = ["ProjectionKeywords", "ProjectionOptions", "Settled", "takes_projection_options", "weights"]
+__all__ = ["Options", "ProjectionKeywords", "ProjectionOptions", "Settled", "takes_projection_options", "weights"]
 
 DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
 MOST_ITERATIONS = 1000
