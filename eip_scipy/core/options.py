@@ -31,7 +31,7 @@ from ..engine.data import (
 from ..engine.trust import LARGE_SHARE
 from .blocks import blocks_of
 from .frame import frame_rows
-from .inputs import count, flag, is_number, real_array, shown
+from .inputs import count, flag, real_array
 from .invariants import InvariantSet, JointInvariants
 from .one_step import OneStep
 from .stepping import AnyMethod, Stepping
@@ -59,7 +59,6 @@ class ProjectionKeywords(TypedDict, total=False):
     every: int | str | None
     reuse_f: bool
     compensated: bool | None
-    least_weight: float
     check: bool
     project_initial: bool
 
@@ -86,7 +85,6 @@ class Options(NamedTuple):
     target: np.ndarray
     scales: np.ndarray
     kappa: float
-    least_weight: float
     metric: int
     direction: int
     iterations: int
@@ -155,10 +153,6 @@ class ProjectionOptions:
         metadata=_text(
             "int", "Newton steps of the projection. 1 (default) is the EIP method; more is the standard projection."
         ),
-    )
-    least_weight: float = field(
-        default=1e-7,
-        metadata=_text("float", "Weight that the error metric leaves to a block without error, in units of the largest."),
     )
     every: int | str | None = field(
         default=None,
@@ -240,7 +234,6 @@ class ProjectionOptions:
             target=known.target,
             scales=known.scales,
             kappa=method.kappa,
-            least_weight=self._least_weight(),
             metric=kind,
             direction=DIRECTIONS[self.direction],
             iterations=count("iterations", self.iterations, MOST_ITERATIONS),
@@ -277,7 +270,6 @@ class ProjectionOptions:
             "uses_f": o.uses_f,
             "project_initial": bool(self.project_initial),
             "compensated": o.compensated,
-            "least_weight": o.least_weight,
         }
 
     def _compensated(self, method: AnyMethod) -> bool:
@@ -287,12 +279,6 @@ class ProjectionOptions:
         if compensated and isinstance(method, OneStep):
             raise ValueError(f"compensated=True carries the rounding of a tableau's sums; {method.name} is no tableau.")
         return compensated
-
-    def _least_weight(self) -> float:
-        value = self.least_weight
-        if not is_number(value) or not 0 < value <= 1:
-            raise ValueError(f"least_weight must be a number in (0, 1], got {shown(value)}.")
-        return float(value)
 
     def _every(self, method: AnyMethod) -> int:
         if self.every is None:

@@ -73,7 +73,7 @@ struct Options {
     Blocks blocks;
     Frame frame;
     const double *target, *scales;
-    double kappa, least_weight;
+    double kappa;
     int64_t metric, direction, iterations, every;
     bool reuse_f, uses_f, compensated, adaptive, watched;
     double per_band, limit;  // an invariant's terms are per_band dead bands; `limit`: the share of them that may be left
@@ -83,7 +83,6 @@ struct Options {
 template <class Read>
 inline void read_each(Options &o, Read read) {
     read("kappa", o.kappa);
-    read("least_weight", o.least_weight);
     read("metric", o.metric);
     read("direction", o.direction);
     read("iterations", o.iterations);

@@ -5,7 +5,7 @@
 
 namespace eip {
 
-constexpr double TINY = 1e-290;
+constexpr double METRIC_FLOOR = 1e-7, TINY = 1e-290;
 
 // x <- x^exponent, x in [0, 1]; for RK4 and DOP853 by square roots, several times faster than pow.
 inline void powers(double *x, double exponent, int64_t n) {
@@ -134,7 +134,7 @@ inline double block_weights(double *__restrict scale, double *__restrict ratio, 
     double inverse = 1.0 / positive(largest_ratio);
     for (int64_t b = 0; b < n; ++b) ratio[b] = std::min(1.0, ratio[b] * inverse);
     powers(ratio, o.kappa, n);
-    for (int64_t b = 0; b < n; ++b) ratio[b] = scale[b] * (ratio[b] + o.least_weight);
+    for (int64_t b = 0; b < n; ++b) ratio[b] = scale[b] * (ratio[b] + METRIC_FLOOR);
     inverse = 1.0 / positive(largest(ratio, n));
     for (int64_t b = 0; b < n; ++b) ratio[b] = largest_ratio > 0.0 ? ratio[b] * inverse : 1.0;
     return largest_ratio;
