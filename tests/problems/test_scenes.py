@@ -181,7 +181,8 @@ def test_fixed_steps_in_fictitious_time_beat_fixed_steps():
     assert run.status == 1
     assert run.y[-1, -1] == 20.0 or abs(run.y[-1, -1] - 20.0) < 1e-13
     error = np.abs(run.y[:2, -1] - problem.reference(20.0)[:2]).max()
-    fixed = integrate(problem, method=EIPDOP853, h=20.0 / run.nfev * 12)
+    # Far too long at the pericentre: not to be told so here.
+    fixed = integrate(problem, method=EIPDOP853, h=20.0 / run.nfev * 12, check=False)
     assert error < 1e-9
     assert not np.abs(fixed.y[:2, -1] - problem.reference(20.0)[:2]).max() < 1e-2
 
