@@ -282,7 +282,7 @@ def march(
 
 @jit
 def extrapolate(last, before, first):
-    """First <- the parabola through first, before, last, equally spaced, one spacing further."""
+    """Put into `first` the parabola through first, before and last, equally spaced, one spacing further."""
     for i in range(first.size):
         first[i] = first[i] + 3.0 * (last[i] - before[i])
 
@@ -312,6 +312,6 @@ def right_side(start, mean, rotation, W, w, c, out):
 
 @jit
 def other_end(mean, start):
-    """Start <- 2 mean - start."""
+    """Replace `start` by 2 mean - start."""
     for i in range(start.size):
         start[i] = 2.0 * mean[i] - start[i]

@@ -189,7 +189,7 @@ def projections(force, modes, inverse, c):
 
 @jit
 def advance(modes, inverse, factor, new_modes, force):
-    """New_modes <- 2 inverse (modes - i factor force) - modes; force <- the same over the number of points."""
+    """Put into new_modes 2 inverse (modes - i factor force) - modes; into force the same over the number of points."""
     for i in range(modes.size):
         g = force[i]
         source = modes[i] + complex(factor * g.imag, -factor * g.real)

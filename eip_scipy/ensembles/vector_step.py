@@ -314,7 +314,7 @@ def finish_batch(rhs, inv, grad, params, k, t_new, project, o, w, s, y, y_new, y
 
 
 def make_advance_batch(stamp):
-    """The loop over steps; `stamp` enters the key of its cache (see `run.driver.source_stamp`)."""
+    """The loop over steps; `stamp` enters the key of its cache (see `numba_driver.source_stamp`)."""
 
     def advance_batch(rhs, inv, grad, params, span, k, k_end, m, o, w, s, y, y_r, y_new, y_new_r):
         """Steps k ... k_end - 1 while a member is alive; K[0] = f(t, y) on entry and at the end."""

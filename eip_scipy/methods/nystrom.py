@@ -268,12 +268,12 @@ def _difference(exact: Mapping[str, np.ndarray], key: str) -> np.ndarray:
 
 
 def _velocity_moments(order: int) -> list[Fraction]:
-    """Sum_i b'_i c_i^k for k = 0, 1, ..."""
+    """The sums of b'_i c_i^k for k = 0, 1, ..."""
     return [Fraction(1, k + 1) for k in range(min(order, MOMENTS))]
 
 
 def _position_moments(order: int) -> list[Fraction]:
-    """Sum_i b_i c_i^k for k = 0, 1, ...: one less, since the position gains an order from the velocity."""
+    """The sums of b_i c_i^k for k = 0, 1, ...: one less, since the position gains an order from the velocity."""
     return [Fraction(1, (k + 1) * (k + 2)) for k in range(min(order - 1, MOMENTS))]
 
 
