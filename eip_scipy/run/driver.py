@@ -127,10 +127,10 @@ class Driver:
             copies["g"] = self.schedule.g_new.copy()
         return copies
 
-    def load(self, t: np.ndarray, y: np.ndarray, max_bytes: float) -> None:
+    def load(self, t: np.ndarray, y: np.ndarray) -> None:
         """Rows of a run that is resumed."""
         while self.t.size <= t.size:
-            self._more_rows(max_bytes)
+            self._more_rows()
         self.t[: t.size], self.y[: t.size] = t, y
 
     def save(self, t: float, y: np.ndarray) -> None:
@@ -155,22 +155,22 @@ class Driver:
             self.schedule.place[ROW] -= 1
         self.save(t, y)
 
-    def grow(self, max_bytes: float) -> None:
+    def grow(self) -> None:
         """Room for twice as many rows, or interpolants, where there is none left.
 
         Raises
         ------
         MemoryError
-            When they would need more than `max_bytes`.
+            When they would need more than the run's `max_bytes`.
         """
         if self._kept and self._kept == len(self._pieces):
             self._pieces = np.concatenate([self._pieces, self._more_pieces(self._kept)])
         if self.rows + 2 > self.t.size:
-            self._more_rows(max_bytes)
+            self._more_rows()
 
-    def _more_rows(self, max_bytes: float) -> None:
+    def _more_rows(self) -> None:
         rows = 2 * self.t.size
-        check_memory(rows, self.run, max_bytes)
+        check_memory(rows, self.run, self._max_bytes)
         self.t = np.resize(self.t, rows)
         self.y = np.concatenate([self.y, np.empty_like(self.y)])
 

@@ -214,7 +214,7 @@ class Loop:
         self.prepared, self.keeper = prepared, keeper
         self.tableau, self.stepping, self.method = prepared.method, prepared.stepping, prepared.label
         self.rhs, self.events, self.diagnostics = system.rhs, system.events, prepared.diagnostics
-        self.callback, self.progress, self.max_bytes = request.callback, request.progress, prepared.max_bytes
+        self.callback, self.progress = request.callback, request.progress
         if keeper.keeps:
             identity = prepared.identity(start.y, system.parameters)
             keeper.identify(identity, run, system.derivative, start.t, start.y, start.f)
@@ -231,7 +231,7 @@ class Loop:
                 keeps_steps=request.dense_output,
                 max_bytes=prepared.max_bytes,
             )
-        keeper.begin(self.driver, self.events, self.max_bytes)
+        keeper.begin(self.driver, self.events)
         self.wall_time = keeper.seconds
         self.chunk = FIRST_CHUNK
         self.told = self._doubtful = self._event_ended = False
@@ -309,7 +309,7 @@ class Loop:
             if driver.step in setup.LOOKS:
                 self._look()
             if code == FULL:
-                driver.grow(self.max_bytes)
+                driver.grow()
             elif code not in (OK, PAUSE, ENDED):
                 return -1, setup.failure(code, driver.run, driver.schedule.clock)
             elif code == OK and driver.schedule.clock[TIME] == driver.schedule.span.t_bound:

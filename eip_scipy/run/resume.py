@@ -58,7 +58,7 @@ class Keeper:
     ) -> None:
         """Before anything is compiled: the settings of the run, and the derivative, f0 at the start."""
 
-    def begin(self, driver: Any, events: Events, max_bytes: float) -> None:
+    def begin(self, driver: Any, events: Events) -> None:
         """All buffers are as at the start; a run that is resumed fills them."""
 
     def keep(self) -> None:
@@ -241,11 +241,11 @@ class _FileKeeper(Keeper):
                     f"{self._file.name!r} is no checkpoint of this run: {name} {what}, expected {a.dtype} {a.shape}."
                 )
 
-    def begin(self, driver: Any, events: Events, max_bytes: float) -> None:
+    def begin(self, driver: Any, events: Events) -> None:
         self._driver, self._events = driver, events
         found, self._read = self._read, None
         if found is not None:
-            self._restore(*found, max_bytes)
+            self._restore(*found)
         self._begin = time.perf_counter() - self.seconds
         self._take_snapshot()
         self._written = self._where()
@@ -253,7 +253,7 @@ class _FileKeeper(Keeper):
         if found is None:
             self._write(None, "running")
 
-    def _restore(self, header: dict[str, Any], arrays: dict[str, np.ndarray], max_bytes: float) -> None:
+    def _restore(self, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         """Fill the run's buffers, after a look at all that is to go there."""
         driver, events = self._driver, self._events
         parts = driver.parts()
@@ -270,7 +270,7 @@ class _FileKeeper(Keeper):
             expected[times] = np.broadcast_to(0.0, count)
             expected[f"event_{k}_y"] = np.broadcast_to(dtype.type(0), (count, n))
         self._require_fitting(arrays, expected)
-        driver.load(arrays["saved_t"], arrays["saved_y"], max_bytes)
+        driver.load(arrays["saved_t"], arrays["saved_y"])
         for name, part in parts.items():
             part[...] = arrays[name]
         for k in range(len(events.functions)):

@@ -248,6 +248,17 @@ const Dense &dense_output(Engine *self) {
     return self->samples->dense;
 }
 
+// What `call` does with the run's dense output, its evaluations counted among those of the run.
+template <typename Call>
+void between_steps(Engine *self, const Dense &d, Call call) {
+    stepped(self, [&](auto &run) {
+        const DenseRun<std::decay_t<decltype(run.work)>> dense(d, run.system);
+        call(dense, run.work);
+        count_calls(dense, run.work);
+        return OK;
+    });
+}
+
 PyDoc_STRVAR(describe_doc,
              "describe(t_old, y_old, t, y, piece) -> None\n\nThe interpolant over the step made last, as numbers.");
 
@@ -263,11 +274,8 @@ PyObject *engine_describe(Engine *self, PyObject *const *args, Py_ssize_t count)
         const double *y = state_of(args[3], "y", self, kept.get(), true);
         Arrays arrays(kept.get());
         auto *piece = static_cast<double *>(arrays.memory(args[4], "piece", NPY_DOUBLE, {d.floats()}));
-        stepped(self, [&](auto &run) {
-            const DenseRun<std::decay_t<decltype(run.work)>> dense(d, run.system);
-            describe(dense, run.work, t_old, y_old, t, y, piece);
-            count_calls(dense, run.work);
-            return OK;
+        between_steps(self, d, [&](const auto &dense, const Work &step) {
+            describe(dense, step, t_old, y_old, t, y, piece);
         });
         Py_RETURN_NONE;
     });
@@ -287,11 +295,8 @@ PyObject *engine_interpolate(Engine *self, PyObject *const *args, Py_ssize_t cou
         const auto *t = static_cast<const double *>(arrays.memory(args[1], "t", NPY_DOUBLE, {ANY}, true));
         const npy_intp rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[1]), 0);
         auto *out = static_cast<double *>(arrays.memory(args[2], "out", self->type, {rows, d.work.n}));
-        stepped(self, [&](auto &run) {
-            const DenseRun<std::decay_t<decltype(run.work)>> dense(d, run.system);
+        between_steps(self, d, [&](const auto &dense, const Work &) {
             for (npy_intp k = 0; k < rows; ++k) interpolate(dense, piece, t[k], out + k * d.work.m);
-            count_calls(dense, run.work);
-            return OK;
         });
         Py_RETURN_NONE;
     });
