@@ -28,7 +28,7 @@ install g++; Fedora: dnf install gcc-c++), clang 14 or newer, or on macOS Xcode'
 
 def stamp() -> str:
     """Hash of the engine's sources, by which a build that is older than they are is known."""
-    files = sorted(path for path in FOLDER.iterdir() if path.suffix in (".cpp", ".hpp"))
+    files = sorted(path for path in FOLDER.rglob("*") if path.suffix in (".cpp", ".hpp"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
@@ -36,8 +36,8 @@ def module(name: str, *flags: str) -> Extension:
     """One build of the engine."""
     return Extension(
         f"eip_scipy.engine.{name}",
-        sources=[str(path) for path in sorted(FOLDER.glob("*.cpp"))],
-        depends=[str(path) for path in sorted(FOLDER.glob("*.hpp"))],
+        sources=[str(path) for path in sorted(FOLDER.rglob("*.cpp"))],
+        depends=[str(path) for path in sorted(FOLDER.rglob("*.hpp"))],
         include_dirs=[numpy.get_include()],
         define_macros=[("EIP_INIT", f"PyInit_{name}"), ("EIP_NAME", f'"{name}"'), ("EIP_SOURCES", f'"{stamp()}"')],
         extra_compile_args=[*FLAGS, *flags],

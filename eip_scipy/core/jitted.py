@@ -3,9 +3,23 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from collections.abc import Callable
+from functools import cache
+from importlib.util import find_spec
+from typing import Any, cast
 
-__all__ = ["ChangedShapeError", "NotCompilableError", "is_jitted", "jit_is_off"]
+from ..engine.native import LibraryFunction
+
+__all__ = [
+    "ChangedShapeError",
+    "NotCompilableError",
+    "compilable",
+    "compiled_like",
+    "is_compiled",
+    "is_jitted",
+    "jit_is_off",
+    "jitted",
+]
 
 
 class ChangedShapeError(ValueError):
@@ -32,3 +46,31 @@ def jit_is_off() -> bool:
     from numba import config
 
     return bool(config.DISABLE_JIT)
+
+
+def compilable(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """Mark a function of ours as one that `jitted` may compile."""
+    fun.compilable = True  # type: ignore[attr-defined]
+    return fun
+
+
+@cache
+def jitted(fun: Any) -> Any:
+    """A `compilable` function as Numba's, where Numba is installed; all else, and without Numba, as it is."""
+    if not getattr(fun, "compilable", False) or find_spec("numba") is None:
+        return fun
+    from numba import njit
+
+    return njit(fun, error_model="numpy")
+
+
+def is_compiled(fun: Any) -> bool:
+    """Whether Numba's functions may call it: one of them, or one of the library's."""
+    return is_jitted(fun) or isinstance(fun, LibraryFunction)
+
+
+def compiled_like(fun: Callable[..., Any], *others: Callable[..., Any]) -> Callable[..., Any]:
+    """`fun` as Numba's if all of the others, which it calls, are compiled, and Numba is installed; else as it is."""
+    if not all(is_compiled(other) for other in others):
+        return fun
+    return cast(Callable[..., Any], jitted(compilable(fun)))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from ..engine.native import NativeFunctions
+from ..engine.native import LibraryFunction, NativeFunctions
 from .invariants import InvariantSet
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import PointerFunction
@@ -39,8 +39,13 @@ class Kind(NamedTuple):
 class Native(NamedTuple):
     """A function that has an address, and how many floats it fills."""
 
-    function: PointerFunction | Compiled
+    function: PointerFunction | Compiled | LibraryFunction
     floats: int
+
+    @property
+    def entry(self) -> Any:
+        """What the engine takes: a function of the library's itself, the address of any other."""
+        return self.function if isinstance(self.function, LibraryFunction) else self.function.address
 
 
 def native_functions(
@@ -61,8 +66,8 @@ def native_functions(
     Raises
     ------
     NotCompilableError
-        When one of them is neither a C function by pointer nor a lazily jitted Numba function of the arguments that
-        `integrate` documents.
+        When one of them is neither a function of the library's problems, nor a C function by pointer, nor a lazily
+        jitted Numba function of the arguments that `integrate` documents.
     """
     n, second_order = y0.size, form.startswith("acceleration")
     size = n // 2 if second_order else n
@@ -80,7 +85,7 @@ def native_functions(
         rows = Kind((*shape, n), n, number.p, number.dtype, False, item.uses_f, item.in_place, gradient=True)
         grad.append(_native(item.grad, rows, f"gradient of {name}"))
     return NativeFunctions(
-        rhs=rhs.function.address,
+        rhs=rhs.entry,
         inv=_addresses(inv),
         grad=_addresses(grad),
         event=(),
@@ -126,7 +131,7 @@ def _number(params: np.ndarray | None, y0: np.ndarray) -> Kind:
 def _native(fun: Any, kind: Kind, name: str) -> Native:
     width = 2 if np.dtype(kind.dtype).kind == "c" and not kind.real else 1
     floats = int(np.prod(kind.shape, dtype=int)) * width
-    if isinstance(fun, PointerFunction):
+    if isinstance(fun, (PointerFunction, LibraryFunction)):
         return Native(fun, floats)
     if jit_is_off():
         raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
@@ -138,4 +143,4 @@ def _native(fun: Any, kind: Kind, name: str) -> Native:
 
 
 def _addresses(functions: list[Native]) -> tuple[tuple[int, int], ...]:
-    return tuple((found.function.address, found.floats) for found in functions)
+    return tuple((found.entry, found.floats) for found in functions)

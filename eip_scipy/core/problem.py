@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from ..engine.native import library
 from .inputs import refuse_units
+from .invariants import Invariant
 from .pointers import by_pointer
 
-__all__ = ["Problem"]
+__all__ = ["Problem", "bind", "native_invariant"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,3 +85,9 @@ def bind(rhs: Callable[..., None], params: np.ndarray) -> Callable[[float, np.nd
         return out
 
     return fun
+
+
+def native_invariant(function: str, name: str, params: np.ndarray) -> Invariant:
+    """An invariant by the function of `library` of that name and its gradient."""
+    fun, grad = library[function], library[f"{function}_gradient"]
+    return Invariant(fun, grad, args=(params,), in_place=True, uses_f=grad.takes_f, name=name)

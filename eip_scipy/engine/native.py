@@ -12,7 +12,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["BUILD", "Call", "Engine", "FailedCallError", "Hooks", "NativeFunctions", "PythonFunctions", "call"]
+__all__ = [
+    "BUILD",
+    "Call",
+    "Engine",
+    "FailedCallError",
+    "Hooks",
+    "LibraryFunction",
+    "NativeFunctions",
+    "PythonFunctions",
+    "call",
+    "library",
+    "library_function",
+]
 
 # Names one of the builds, _native or _native_v3, in place of the best one that the processor takes.
 VARIABLE = "EIP_SCIPY_ENGINE"
@@ -58,14 +70,15 @@ class PythonFunctions(NamedTuple):
 class NativeFunctions(NamedTuple):
     """A run's functions by their addresses, with the signatures in cpp/system.hpp; `owner` keeps them alive.
 
-    Of each invariant, gradient and event the address, and how many floats it fills. `python`: the functions in Python,
+    A function of the library's stands for itself. Of each invariant, gradient and event the address, and how many
+    floats it fills. `python`: the functions in Python,
     of which the events are called; there are none by address then.
     """
 
-    rhs: int
-    inv: tuple[tuple[int, int], ...]
-    grad: tuple[tuple[int, int], ...]
-    event: tuple[tuple[int, int], ...]
+    rhs: Any
+    inv: tuple[tuple[Any, int], ...]
+    grad: tuple[tuple[Any, int], ...]
+    event: tuple[tuple[Any, int], ...]
     params: np.ndarray
     second_order: bool
     owner: Any
@@ -110,7 +123,7 @@ def _best() -> Any:
 def _require_current(build: Any) -> None:
     """In a clone: the build is that of the sources beside it."""
     folder = Path(__file__).parent / "cpp"
-    files = sorted(path for path in folder.glob("*pp")) if folder.is_dir() else []
+    files = sorted(folder.rglob("*.?pp"))
     if files and hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest() != build.SOURCES:
         raise ImportError(f"the sources in {folder} have changed since the engine was built. Build it: {AGAIN}")
 
@@ -118,3 +131,11 @@ def _require_current(build: Any) -> None:
 BUILD = _best()
 _require_current(BUILD)
 Engine, FailedCallError = BUILD.Engine, BUILD.FailedCallError
+LibraryFunction = BUILD.LibraryFunction
+library: dict[str, Any] = BUILD.LIBRARY
+"""The functions of the library's own problems that are in C++, by name."""
+
+
+def library_function(name: str) -> Any:
+    """The function of that name, as it comes back from a pickle."""
+    return library[name]

@@ -7,28 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..core.inputs import refuse_units
-from ..core.invariants import Invariant
-from ..core.problem import Problem, bind
-from ..engine.caching import cached_njit
+from ..core.problem import Problem, bind, native_invariant
+from ..engine.native import library
 
 __all__ = ["harmonic"]
-
-
-@cached_njit()
-def _rhs(t, y, out, params):
-    out[0] = params[0] * y[1]
-    out[1] = -params[0] * y[0]
-
-
-@cached_njit()
-def _energy(t, y, params):
-    return 0.5 * params[0] * (y[0] * y[0] + y[1] * y[1])
-
-
-@cached_njit()
-def _energy_gradient(t, y, out, params):
-    out[0] = params[0] * y[0]
-    out[1] = params[0] * y[1]
 
 
 def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: float = 0.1) -> Problem:
@@ -57,13 +39,13 @@ def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: f
 
     return Problem(
         name="harmonic",
-        fun=bind(_rhs, params),
-        rhs=_rhs,
+        fun=bind(library["harmonic.rhs"], params),
+        rhs=library["harmonic.rhs"],
         y0=start,
         t_span=(0.0, t_end),
         h=h,
         params=params,
-        invariants=(Invariant(_energy, _energy_gradient, args=(params,), in_place=True, name="H"),),
+        invariants=(native_invariant("harmonic.energy", "H", params),),
         reference=reference,
         units="dimensionless",
         source="Cai, Gong & Wang, section 2.1",

@@ -8,57 +8,10 @@ import numpy as np
 from scipy.optimize import brentq
 
 from ..core.inputs import refuse_units
-from ..core.invariants import Invariant
-from ..core.problem import Problem, bind
-from ..engine.caching import cached_njit
+from ..core.problem import Problem, bind, native_invariant
+from ..engine.native import library
 
 __all__ = ["kepler"]
-
-
-@cached_njit()
-def _rhs(t, y, out, params):
-    r2 = y[0] * y[0] + y[1] * y[1]
-    w = 1.0 / (r2 * sqrt(r2))
-    w += 1.5 * params[0] * w / r2
-    out[0] = y[2]
-    out[1] = y[3]
-    out[2] = -w * y[0]
-    out[3] = -w * y[1]
-
-
-@cached_njit()
-def _acc(t, q, params):
-    r2 = q[0] * q[0] + q[1] * q[1]
-    w = 1.0 / (r2 * sqrt(r2))
-    return -(w + 1.5 * params[0] * w / r2) * q
-
-
-@cached_njit()
-def _energy(t, y, params):
-    r2 = y[0] * y[0] + y[1] * y[1]
-    r = sqrt(r2)
-    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1.0 / r - 0.5 * params[0] / (r * r2)
-
-
-@cached_njit()
-def _energy_gradient(t, y, f, out, params):
-    out[0] = -f[2]
-    out[1] = -f[3]
-    out[2] = y[2]
-    out[3] = y[3]
-
-
-@cached_njit()
-def _momentum(t, y, params):
-    return y[0] * y[3] - y[1] * y[2]
-
-
-@cached_njit()
-def _momentum_gradient(t, y, out, params):
-    out[0] = y[3]
-    out[1] = -y[2]
-    out[2] = -y[1]
-    out[3] = y[0]
 
 
 def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float = 200.0, h: float = 0.03) -> Problem:
@@ -90,17 +43,14 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
     params = np.array([relativistic], dtype=float)
     return Problem(
         name="kepler",
-        fun=bind(_rhs, params),
-        rhs=_rhs,
-        acc=_acc,
+        fun=bind(library["kepler.rhs"], params),
+        rhs=library["kepler.rhs"],
+        acc=library["kepler.acc"],
         y0=np.array([1 - e, 0.0, 0.0, sqrt((1 + e) / (1 - e))]),
         t_span=(0.0, t_end),
         h=h,
         params=params,
-        invariants=(
-            Invariant(_energy, _energy_gradient, args=(params,), in_place=True, uses_f=True, name="H"),
-            Invariant(_momentum, _momentum_gradient, args=(params,), in_place=True, name="L"),
-        ),
+        invariants=(native_invariant("kepler.energy", "H", params), native_invariant("kepler.momentum", "L", params)),
         reference=(lambda t: _orbit(e, t)) if relativistic == 0 else None,
         blocks=2,
         units="G M = 1, semi-major axis 1: period 2 pi",

@@ -24,7 +24,7 @@ from ..core.solvers import EIPSolver
 from ..core.stepping import AnyMethod, StepOptions, Stepping, interval
 from ..engine.counters import NFEV
 from ..engine.data import Schedule, Span
-from ..engine.native import NativeFunctions, PythonFunctions, call
+from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
 from ..methods.nystrom import NystromTableau
 from .driver import check_memory, saved_rows
 from .events import Events, as_events
@@ -167,6 +167,8 @@ class System:
         def kind(fun: Any, in_python: bool) -> str:
             if in_python:
                 return "python"
+            if isinstance(fun, LibraryFunction):
+                return "native"
             return "pointer" if isinstance(fun, PointerFunction) else "jitted"
 
         in_python = isinstance(functions, PythonFunctions)

@@ -1,5 +1,6 @@
 // The binding: an Engine holds a run's arrays and functions, and steps.
 #define EIP_IMPORTS_NUMPY
+#include "library_functions.hpp"
 #include "python_functions.hpp"
 #include "records.hpp"
 
@@ -491,7 +492,7 @@ PyMODINIT_FUNC EIP_INIT() {
     if (!module) return nullptr;
     eip::failed_call_error =
         PyErr_NewExceptionWithDoc("eip_scipy.engine.FailedCallError", "A function by pointer failed.", nullptr, nullptr);
-    if (!eip::failed_call_error || PyModule_AddObjectRef(module, "FailedCallError", eip::failed_call_error) < 0 ||
+    if (!eip::failed_call_error || !eip::add_library(module) || PyModule_AddObjectRef(module, "FailedCallError", eip::failed_call_error) < 0 ||
         PyModule_AddObjectRef(module, "Engine", reinterpret_cast<PyObject *>(&type)) < 0 ||
         PyModule_AddStringConstant(module, "SOURCES", EIP_SOURCES) < 0 ||
         PyModule_AddIntConstant(module, "HAS_V3", eip::has_v3()) < 0) {

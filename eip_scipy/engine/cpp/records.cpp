@@ -1,5 +1,7 @@
 #include "records.hpp"
 
+#include "library_functions.hpp"
+
 namespace eip {
 
 Method method_of(PyObject *method, Arrays &arrays) {
@@ -230,23 +232,39 @@ Samples samples_of(PyObject *dense, const Data &run, int64_t events, Arrays &arr
     return samples;
 }
 
-// Functions by pointer: the address of `rhs`, and (address, floats) of each of inv, grad and event.
+// An address, or a function of the library's that takes these sizes and fills so many floats.
 template <typename Pointer>
-static std::vector<Native<Pointer>> pointers_of(PyObject *functions, const char *name, int64_t expected) {
+static Native<Pointer> pointer_of(PyObject *object, const char *name, int64_t floats, int64_t n, int64_t p) {
+    if (const LibraryFunction *function = library_function_of(object)) {
+        require_sizes(*function, n, p);
+        if (function->filled(n) == floats) return {nullptr, function->one, floats};
+        PyErr_Format(PyExc_ValueError, "engine: %s fills %lld floats where %lld are expected", function->name,
+                     static_cast<long long>(function->filled(n)), static_cast<long long>(floats));
+        throw PythonError{};
+    }
+    const auto address = static_cast<uintptr_t>(PyLong_AsUnsignedLongLong(object));
+    if (PyErr_Occurred()) throw PythonError{};
+    if (!address || floats < 0) {
+        PyErr_Format(PyExc_ValueError, "engine: a function of %s is missing", name);
+        throw PythonError{};
+    }
+    return {reinterpret_cast<Pointer>(address), nullptr, floats};
+}
+
+// Functions by pointer: (function, floats) of each of inv, grad and event.
+template <typename Pointer>
+static std::vector<Native<Pointer>> pointers_of(PyObject *functions, const char *name, int64_t expected, int64_t n,
+                                                int64_t p) {
     std::vector<Native<Pointer>> out;
     const Ref items(PySequence_Fast(attribute(functions, name).get(), "engine: expected a sequence of pairs"));
     int64_t total = 0;
     for (Py_ssize_t k = 0; k < PySequence_Fast_GET_SIZE(items.get()); ++k) {
-        unsigned long long address;
+        PyObject *function;
         long long floats;
         PyObject *pair = PySequence_Fast_GET_ITEM(items.get(), k);
         if (!PyTuple_Check(pair)) PyErr_Format(PyExc_TypeError, "engine: %s must hold pairs, got %.80R", name, pair);
-        if (PyErr_Occurred() || !PyArg_ParseTuple(pair, "KL", &address, &floats)) throw PythonError{};
-        if (!address || floats < 0) {
-            PyErr_Format(PyExc_ValueError, "engine: function %zd of %s is missing", k, name);
-            throw PythonError{};
-        }
-        out.push_back({reinterpret_cast<Pointer>(static_cast<uintptr_t>(address)), floats});
+        if (PyErr_Occurred() || !PyArg_ParseTuple(pair, "OL", &function, &floats)) throw PythonError{};
+        out.push_back(pointer_of<Pointer>(function, name, floats, n, p));
         total += floats;
     }
     if (total != expected) {
@@ -258,18 +276,17 @@ static std::vector<Native<Pointer>> pointers_of(PyObject *functions, const char 
 }
 
 void read_pointers(PyObject *functions, const Work &w, int64_t events, Arrays &arrays, System &system) {
-    system.rhs_pointer = reinterpret_cast<ValuePointer>(static_cast<uintptr_t>(integer(functions, "rhs")));
-    system.inv_pointers = pointers_of<ValuePointer>(functions, "inv", w.l);
-    system.grad_pointers = pointers_of<GradientPointer>(functions, "grad", w.l * w.m);
-    system.event_pointers = pointers_of<ValuePointer>(functions, "event", events);
+    system.by_pointer = true;
     system.second_order = truth(functions, "second_order");
-    system.params = arrays.floats(functions, "params", {ANY});
+    system.n_params = Arrays::length(functions, "params");
+    system.params = arrays.floats(functions, "params", {system.n_params});
+    const int64_t size = system.second_order ? w.m / 2 : w.m, p = system.n_params;
+    system.rhs_pointer = pointer_of<ValuePointer>(attribute(functions, "rhs").get(), "rhs", size, size, p);
+    system.inv_pointers = pointers_of<ValuePointer>(functions, "inv", w.l, w.m, p);
+    system.grad_pointers = pointers_of<GradientPointer>(functions, "grad", w.l * w.m, w.m, p);
+    system.event_pointers = pointers_of<ValuePointer>(functions, "event", events, w.m, p);
     system.scratch.resize(w.m);
     system.scratch_f.resize(w.m);
-    if (!system.rhs_pointer) {
-        PyErr_SetString(PyExc_ValueError, "engine: rhs is missing");
-        throw PythonError{};
-    }
 }
 
 }  // namespace eip

@@ -6,6 +6,7 @@
 
 #include "data.hpp"
 #include "floats.hpp"
+#include "library.hpp"
 
 namespace eip {
 
@@ -40,10 +41,11 @@ class Hooks {
     virtual bool project_jointly(const Step &step) = 0;
 };
 
-// A function by pointer, and how many floats it fills.
+// A function by pointer, or the library's own in its place, and how many floats it fills.
 template <typename Pointer>
 struct Native {
     Pointer pointer;
+    LibraryPointer<double> library;
     int64_t floats;
 };
 
@@ -58,32 +60,34 @@ struct FailedCall {
 
 // The functions of a run, by pointer or in Python: all of them, or of a run by pointer the events.
 struct System {
-    ValuePointer rhs_pointer = nullptr;
+    Native<ValuePointer> rhs_pointer{};
     std::vector<Native<ValuePointer>> inv_pointers, event_pointers;
     std::vector<Native<GradientPointer>> grad_pointers;
     Functions *python = nullptr;
+    bool by_pointer = false;
     bool second_order = false;  // rhs_pointer gives the accelerations of y = (q, v)
     const double *params = nullptr;
+    int64_t n_params = 0;
     std::vector<double> scratch, scratch_f;
     FailedCall failed;
 
     // The derivative at a state that is kept.
     template <class W>
     void rhs(const W &w, double t, const double *y, double *out) {
-        if (!rhs_pointer) return python->rhs(t, y, out);
-        call_rhs(w, t, copied(y, scratch, w.m), out);
+        if (!by_pointer) return python->rhs(t, y, out);
+        call_rhs(w, t, rhs_pointer.library ? y : copied(y, scratch, w.m), out);
     }
 
     // The derivative at a state that is made anew for each call.
     template <class W>
     void rhs_of_scratch(const W &w, double t, const double *y, double *out) {
-        if (!rhs_pointer) return python->rhs(t, y, out);
+        if (!by_pointer) return python->rhs(t, y, out);
         call_rhs(w, t, y, out);
     }
 
     template <class W>
     void inv(const W &w, double t, const double *y, double *values) {
-        if (!rhs_pointer) return python->inv(t, y, values);
+        if (!by_pointer) return python->inv(t, y, values);
         call_each(w, inv_pointers, "inv", t, y, values);
     }
 
@@ -95,9 +99,14 @@ struct System {
 
     template <class W>
     void grad(const W &w, double t, const double *y, const double *f, double *G) {
-        if (!rhs_pointer) return python->grad(t, y, f, G);
+        if (!by_pointer) return python->grad(t, y, f, G);
         for (int64_t k = 0; k < std::ssize(grad_pointers); ++k) {
-            const auto &[pointer, floats] = grad_pointers[k];
+            const auto &[pointer, library, floats] = grad_pointers[k];
+            if (library) {
+                library(t, y, f, G, params, w.m, n_params);
+                G += floats;
+                continue;
+            }
             fill(G, NOT_A_NUMBER, floats);  // shows where a gradient leaves a part of it as it was
             const int status = pointer(t, copied(y, scratch, w.m), copied(f, scratch_f, w.m), G, params);
             if (status) [[unlikely]] gave_up(status, {"grad", k, t, {y, y + w.m}, {f, f + w.m}}, G, floats);
@@ -118,8 +127,9 @@ struct System {
             copy(y + half, out, half);
             out += half;
         }
+        if (rhs_pointer.library) return rhs_pointer.library(t, y, nullptr, out, params, floats, n_params);
         fill(out, NOT_A_NUMBER, floats);
-        const int status = rhs_pointer(t, y, out, params);
+        const int status = rhs_pointer.pointer(t, y, out, params);
         if (status) [[unlikely]] gave_up(status, {"rhs", 0, t, {y, y + w.m}, {}}, out, floats);
     }
 
@@ -127,7 +137,12 @@ struct System {
     void call_each(const W &w, const std::vector<Native<ValuePointer>> &functions, const char *name, double t,
                    const double *y, double *values) {
         for (int64_t k = 0; k < std::ssize(functions); ++k) {
-            const auto &[pointer, floats] = functions[k];
+            const auto &[pointer, library, floats] = functions[k];
+            if (library) {
+                library(t, y, nullptr, values, params, w.m, n_params);
+                values += floats;
+                continue;
+            }
             fill(values, NOT_A_NUMBER, floats);  // shows where a function leaves a value as it was
             const int status = pointer(t, copied(y, scratch, w.m), values, params);
             if (status) [[unlikely]] gave_up(status, {name, k, t, {y, y + w.m}, {}}, values, floats);

@@ -10,8 +10,8 @@ import numpy as np
 
 from ...core.inputs import refuse_units
 from ...core.invariants import Invariant
-from ...core.problem import Problem, bind
-from . import _newton
+from ...core.problem import Problem, bind, native_invariant
+from ...engine.native import library
 from . import forces as _forces
 from .forces import ForceConstants
 
@@ -113,7 +113,7 @@ def nbody(
     chosen = _forces.check_forces(forces)
     y0 = np.concatenate([q.ravel(), v.ravel()])
     params = _forces.parameters(masses, chosen, constants) if chosen else masses
-    rhs, acc = _forces.equations(chosen) if chosen else (_newton.rhs, _newton.acc)
+    rhs, acc = _forces.equations(chosen) if chosen else (library["gravity.rhs"], library["gravity.acc"])
     return Problem(
         name=name,
         fun=bind(rhs, params),
@@ -133,10 +133,7 @@ def nbody(
 
 
 def _newtonian(params: np.ndarray) -> tuple[Invariant, Invariant]:
-    return (
-        Invariant(_newton.energy, _newton.energy_gradient, args=(params,), in_place=True, uses_f=True, name="H"),
-        Invariant(_newton.momentum, _newton.momentum_gradient, args=(params,), in_place=True, name="L"),
-    )
+    return native_invariant("gravity.energy", "H", params), native_invariant("gravity.momentum", "L", params)
 
 
 def _checked(gm: Any, position: Any, velocity: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

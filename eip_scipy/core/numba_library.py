@@ -1,0 +1,74 @@
+"""The library's own functions inside Numba functions: `problem.rhs` may be called from a user's compiled code.
+
+Numba finds `register` by the package's entry point ``numba_extensions``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+from numba.extending import typeof_impl
+
+from ..engine.native import LibraryFunction
+
+__all__ = ["register"]
+
+FUNCTION = ctypes.CFUNCTYPE(None, ctypes.c_double, *[ctypes.c_void_p] * 4, *[ctypes.c_int64] * 2)
+FITS = ctypes.CFUNCTYPE(ctypes.c_bool, *[ctypes.c_int64] * 2)
+
+
+def register() -> None:
+    """Let Numba take a function of the library's for one of its own."""
+    typeof_impl.register(LibraryFunction)(lambda function, context: types.Dispatcher(_jitted(function)))
+
+
+@cache
+def _jitted(function: Any) -> Any:
+    """It as a Numba function, on copies of its arguments, which need be neither contiguous nor checked before."""
+    value = njit(_value_of(function))
+    if function.in_place and function.takes_f:
+        return njit(lambda t, y, f, out, params: _fill(out, value(t, y, f, params)))
+    if function.in_place:
+        return njit(lambda t, y, out, params: _fill(out, value(t, y, y, params)))
+    if function.numbers == 1:
+        return njit(lambda t, y, params: value(t, y, y, params)[0])
+    return njit(lambda t, y, params: value(t, y, y, params))
+
+
+def _value_of(function: Any) -> Callable[..., Any]:
+    call, fits = FUNCTION(function.address), FITS(function.fits_address)
+    numbers, of_state = function.numbers, function.fills_states
+    wrong = f"{function.__name__} takes another number of states or parameters"
+
+    def value(t, y, f, params):
+        n, p = y.size, params.size
+        if not (fits(n, p) and f.size == n):
+            raise ValueError(wrong)
+        out = np.empty(numbers * (n if of_state else 1))
+        state, slope, parameters = _floats(y), _floats(f), _floats(params)
+        call(t, state.ctypes.data, slope.ctypes.data, out.ctypes.data, parameters.ctypes.data, n, p)
+        return out
+
+    return value
+
+
+@njit
+def _floats(values):
+    out = np.empty(values.size)
+    for i in range(out.size):
+        out[i] = values[i]
+    return out
+
+
+@njit
+def _fill(out, values):
+    if out.size != values.size:
+        raise ValueError("out has another shape than what a function of eip_scipy fills")
+    flat = out.flat
+    for i in range(values.size):
+        flat[i] = values[i]

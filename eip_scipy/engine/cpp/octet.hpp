@@ -1,0 +1,115 @@
+// One float of each of eight members of an ensemble, or of eight bodies, in vector registers: it adds, multiplies and
+// compares lane by lane as a float does, so that a template takes either, and every lane has the bits of the float.
+#pragma once
+
+#include <cmath>
+
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
+#include "sums.hpp"
+
+namespace eip {
+
+typedef int64_t Bits __attribute__((vector_size(sizeof(Vector))));
+
+inline Vector spread_vector(double x) {
+#if defined(__AVX__)
+    return Vector{x, x, x, x};
+#else
+    return Vector{x, x};
+#endif
+}
+
+inline Vector root(Vector v) {
+#if defined(__AVX__)
+    return (Vector)_mm256_sqrt_pd((__m256d)v);
+#elif defined(__SSE2__)
+    return (Vector)_mm_sqrt_pd((__m128d)v);
+#else
+    for (int k = 0; k < WIDTH; ++k) v[k] = std::sqrt(v[k]);
+    return v;
+#endif
+}
+
+// a b + c, rounded once.
+inline Vector fused(Vector a, Vector b, Vector c) {
+#if defined(__FMA__)
+    return (Vector)_mm256_fmadd_pd((__m256d)a, (__m256d)b, (__m256d)c);
+#else
+    for (int k = 0; k < WIDTH; ++k) c[k] = std::fma(a[k], b[k], c[k]);
+    return c;
+#endif
+}
+
+// A truth value for each of eight.
+struct Mask {
+    Bits part[VECTORS];
+
+    bool lane(int k) const { return part[k / WIDTH][k % WIDTH] != 0; }
+    bool any() const {
+        Bits all = part[0];
+        for (int v = 1; v < VECTORS; ++v) all |= part[v];
+        bool found = false;
+        for (int k = 0; k < WIDTH; ++k) found |= all[k] != 0;
+        return found;
+    }
+};
+
+struct Octet {
+    Vector part[VECTORS];
+
+    Octet() = default;
+    Octet(double x) {  // NOLINT: a number stands for itself in every lane
+        for (Vector &v : part) v = spread_vector(x);
+    }
+
+    static Octet load(const double *a) {
+        Octet x;
+        for (int v = 0; v < VECTORS; ++v) x.part[v] = eip::load(a + v * WIDTH);
+        return x;
+    }
+    void store(double *a) const {
+        for (int v = 0; v < VECTORS; ++v) eip::store(part[v], a + v * WIDTH);
+    }
+    double lane(int k) const { return part[k / WIDTH][k % WIDTH]; }
+};
+
+#define EIP_FOR_PARTS(Result, expression)                       \
+    Result out;                                                 \
+    for (int v = 0; v < VECTORS; ++v) out.part[v] = expression; \
+    return out
+
+inline Octet operator+(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Octet, a.part[v] + b.part[v]); }
+inline Octet operator-(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Octet, a.part[v] - b.part[v]); }
+inline Octet operator*(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Octet, a.part[v] * b.part[v]); }
+inline Octet operator/(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Octet, a.part[v] / b.part[v]); }
+inline Octet operator-(const Octet &a) { EIP_FOR_PARTS(Octet, -a.part[v]); }
+inline Octet &operator+=(Octet &a, const Octet &b) { return a = a + b; }
+inline Octet &operator-=(Octet &a, const Octet &b) { return a = a - b; }
+inline Octet &operator*=(Octet &a, const Octet &b) { return a = a * b; }
+inline Mask operator<(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Mask, a.part[v] < b.part[v]); }
+inline Mask operator<=(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Mask, a.part[v] <= b.part[v]); }
+inline Mask operator>(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Mask, a.part[v] > b.part[v]); }
+inline Mask operator>=(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Mask, a.part[v] >= b.part[v]); }
+inline Mask operator==(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Mask, a.part[v] == b.part[v]); }
+inline Mask operator&(const Mask &a, const Mask &b) { EIP_FOR_PARTS(Mask, a.part[v] & b.part[v]); }
+inline Mask operator|(const Mask &a, const Mask &b) { EIP_FOR_PARTS(Mask, a.part[v] | b.part[v]); }
+inline Mask operator!(const Mask &a) { EIP_FOR_PARTS(Mask, ~a.part[v]); }
+inline Octet where(const Mask &mask, const Octet &a, const Octet &b) {
+    EIP_FOR_PARTS(Octet, mask.part[v] ? a.part[v] : b.part[v]);
+}
+inline Octet sqrt(const Octet &a) { EIP_FOR_PARTS(Octet, root(a.part[v])); }
+inline Octet abs(const Octet &a) { EIP_FOR_PARTS(Octet, absolute(a.part[v])); }
+inline Octet multiply_add(const Octet &a, const Octet &b, const Octet &c) {
+    EIP_FOR_PARTS(Octet, fused(a.part[v], b.part[v], c.part[v]));
+}
+
+#undef EIP_FOR_PARTS
+
+inline Octet max(const Octet &a, const Octet &b) { return where(b > a, b, a); }
+inline Octet min(const Octet &a, const Octet &b) { return where(b < a, b, a); }
+inline double multiply_add(double a, double b, double c) { return std::fma(a, b, c); }
+
+}  // namespace eip

@@ -1,0 +1,249 @@
+// N bodies with further forces. After every G m the parameters hold the entries of forces.py.
+#include <cmath>
+
+#include "einstein.hpp"
+
+namespace eip {
+namespace {
+
+// Entries after the G m, and which relativity the first one names.
+enum Entry { KIND, OVER_C2, OBLATENESS, POLE, MOON_BODY = 6, MOON, N_ENTRIES };
+constexpr double ONE_PN = 1.0, EIH = 2.0, POTENTIAL = 3.0;
+
+struct Bodies {
+    int64_t n;
+    const double *gm, *k;
+
+    explicit Bodies(const Given<double> &g) : n(g.p - N_ENTRIES), gm(g.params), k(g.params + n) {}
+    Three pole() const { return {k[POLE], k[POLE + 1], k[POLE + 2]}; }
+    Einstein einstein(const double *y) const { return {y, gm, n, k[OVER_C2]}; }
+};
+
+// Acceleration of body i at x from the Sun by the terms that depend on positions.
+Three pull(const Three &x, const Bodies &b, int64_t i) {
+    const double gm_sun = b.gm[0], r2 = dot(x, x);
+    double w = 0.0, along = 0.0;
+    if (b.k[KIND] == POTENTIAL) w += 6.0 * gm_sun * gm_sun * b.k[OVER_C2] / (r2 * r2);
+    if (b.k[MOON_BODY] == i) w += 3.0 * gm_sun * b.k[MOON] / (r2 * r2 * std::sqrt(r2));
+    const Three pole = b.pole();
+    if (b.k[OBLATENESS] > 0.0) {
+        const double s = dot(x, pole), u = 1.5 * gm_sun * b.k[OBLATENESS] / (r2 * r2 * std::sqrt(r2));
+        w += u * (1.0 - 5.0 * s * s / r2);
+        along = 2.0 * u * s;
+    }
+    return {-w * x[0] - along * pole[0], -w * x[1] - along * pole[1], -w * x[2] - along * pole[2]};
+}
+
+// The Sun's first post-Newtonian pull on a body at x with the velocity v, both relative.
+Three pull_1pn(const Three &x, const Three &v, const Bodies &b) {
+    const double gm_sun = b.gm[0], r2 = dot(x, x), r = std::sqrt(r2), w = gm_sun * b.k[OVER_C2] / (r2 * r);
+    return sum(w * (4.0 * gm_sun / r - dot(v, v)), x, 4.0 * w * dot(x, v), v);
+}
+
+// Add to out (3 N) the Sun's further pulls on all others, and their reactions on it; v is null where none depends on it.
+void add_pulls(const double *q, const double *v, const Bodies &b, double *out) {
+    Three back{};
+    for (int64_t i = 1; i < b.n; ++i) {
+        const Three x = body(q, i) - body(q, 0);
+        Three a = pull(x, b, i);
+        if (v && b.k[KIND] == ONE_PN) a = sum(1.0, a, 1.0, pull_1pn(x, body(v, i) - body(v, 0), b));
+        add(out, i, 1.0, a);
+        const double share = b.gm[i] / b.gm[0];
+        for (int c = 0; c < 3; ++c) back[c] += share * a[c];
+    }
+    for (int c = 0; c < 3; ++c) out[c] -= back[c];
+}
+
+void rhs(const Given<double> &g) {
+    const Bodies b(g);
+    double *a = g.out + 3 * b.n;
+    newton_rhs(g.y, b.gm, b.n, g.out);
+    if (b.k[KIND] == EIH) b.einstein(g.y).add_accelerations(a);
+    add_pulls(g.y, g.y + 3 * b.n, b, a);
+}
+
+void acc(const Given<double> &g) {
+    const Bodies b(g);
+    accelerate(g.y, b.gm, b.n, g.out);
+    add_pulls(g.y, nullptr, b, g.out);
+}
+
+// G times the potential energy of `pull`.
+double potential(const double *y, const Bodies &b) {
+    double total = 0.0;
+    for (int64_t i = 1; i < b.n; ++i) {
+        const Three x = body(y, i) - body(y, 0);
+        const double r2 = dot(x, x), over_r3 = 1.0 / (r2 * std::sqrt(r2));
+        double part = 0.0;
+        if (b.k[KIND] == POTENTIAL) part -= 3.0 * b.gm[0] * b.k[OVER_C2] / r2;
+        if (b.k[MOON_BODY] == i) part -= b.k[MOON] * over_r3;
+        if (b.k[OBLATENESS] > 0.0) {
+            const double s = dot(x, b.pole());
+            part += 0.5 * b.k[OBLATENESS] * over_r3 * (3.0 * s * s / r2 - 1.0);
+        }
+        total += b.gm[i] * part;
+    }
+    return b.gm[0] * total;
+}
+
+// For forces that do not depend on velocities.
+void energy(const Given<double> &g) {
+    const Bodies b(g);
+    g.out[0] = energy_sum(g.y, b.gm, b.n) + potential(g.y, b);
+}
+
+void gradient_of_energy(const Given<double> &g) { energy_gradient(g.y, g.f, g.params, g.p - N_ENTRIES, g.out); }
+
+void momentum(const Given<double> &g) { angular_momentum(g.y, g.params, g.p - N_ENTRIES, g.out); }
+
+void momentum_gradient(const Given<double> &g) { angular_momentum_gradient(g.y, g.params, g.p - N_ENTRIES, g.out); }
+
+// Along the Sun's pole.
+void axial_momentum(const Given<double> &g) {
+    const Bodies b(g);
+    Three L;
+    angular_momentum(g.y, b.gm, b.n, L.data());
+    g.out[0] = dot(L, b.pole());
+}
+
+// G m v x pole and G m pole x q.
+void axial_momentum_gradient(const Given<double> &g) {
+    const Bodies b(g);
+    for (int64_t i = 0; i < b.n; ++i) {
+        const Three by_q = cross(body(g.y, b.n + i), b.pole()), by_v = cross(b.pole(), body(g.y, i));
+        for (int c = 0; c < 3; ++c) {
+            g.out[3 * i + c] = b.gm[i] * by_q[c];
+            g.out[3 * (b.n + i) + c] = b.gm[i] * by_v[c];
+        }
+    }
+}
+
+void eih_energy(const Given<double> &g) {
+    const Bodies b(g);
+    g.out[0] = b.einstein(g.y).energy() + potential(g.y, b);
+}
+
+void eih_energy_gradient(const Given<double> &g) {
+    const Bodies b(g);
+    b.einstein(g.y).energy_gradient(g.out);
+    std::vector<double> pulls(3 * b.n);
+    add_pulls(g.y, nullptr, b, pulls.data());
+    for (int64_t i = 0; i < 3 * b.n; ++i) g.out[i] -= b.gm[i / 3] * pulls[i];
+}
+
+void eih_momentum(const Given<double> &g) {
+    const Three L = Bodies(g).einstein(g.y).momentum();
+    std::copy(L.begin(), L.end(), g.out);
+}
+
+void eih_momentum_gradient(const Given<double> &g) { Bodies(g).einstein(g.y).momentum_gradient(g.out); }
+
+void eih_axial_momentum(const Given<double> &g) {
+    const Bodies b(g);
+    g.out[0] = dot(b.einstein(g.y).momentum(), b.pole());
+}
+
+void eih_axial_momentum_gradient(const Given<double> &g) {
+    const Bodies b(g);
+    std::vector<double> rows(3 * g.n);
+    b.einstein(g.y).momentum_gradient(rows.data());
+    for (int64_t i = 0; i < g.n; ++i) g.out[i] = dot({rows[i], rows[g.n + i], rows[2 * g.n + i]}, b.pole());
+}
+
+// Two bodies' relative motion with "1pn", per reduced mass; no order is left out.
+struct Pair {
+    double gm_sun, mu, over_c2, u, x;
+    Three r, v;
+
+    // r and v of the second body from the first, u = 1/r and x = mu / (c^2 r).
+    explicit Pair(const Given<double> &g)
+        : gm_sun(g.params[0]), mu(g.params[0] + g.params[1]), over_c2(g.params[2 + OVER_C2]),
+          r(body(g.y, 1) - body(g.y, 0)), v(body(g.y, 3) - body(g.y, 2)) {
+        u = 1.0 / std::sqrt(dot(r, r));
+        x = over_c2 * mu * u;
+    }
+};
+
+// With w = v^2 and u = 1/r the equations give dw/du + 6 mu/c^2 w = 2 mu - 8 mu M u/c^2, linear; this is the constant of
+// its solution. For a test particle it is, to first order in 1/c^2, the known energy
+// v^2/2 - M/r + c^-2 (3/8 v^4 + 3/2 M v^2/r + M^2/(2 r^2)), but for 3/(2 c^2) (v^2/2 - M/r)^2, which is constant too.
+void pair_energy(const Given<double> &g) {
+    const Pair p(g);
+    const double third = 2.0 / 3.0 * p.gm_sun;
+    g.out[0] = (0.5 * dot(p.v, p.v) + third * p.u) * std::exp(6.0 * p.x) -
+               (p.mu + third) / (6.0 * p.mu * p.over_c2) * std::expm1(6.0 * p.x);
+}
+
+void pair_energy_gradient(const Given<double> &g) {
+    const Pair p(g);
+    const double growth = std::exp(6.0 * p.x);
+    const double by_u = growth * (3.0 * p.over_c2 * p.mu * (dot(p.v, p.v) + 4.0 / 3.0 * p.gm_sun * p.u) - p.mu);
+    for (int i = 0; i < 3; ++i) {
+        g.out[3 + i] = -by_u * p.u * p.u * p.u * p.r[i];
+        g.out[9 + i] = growth * p.v[i];
+        g.out[i] = -g.out[3 + i];
+        g.out[6 + i] = -g.out[9 + i];
+    }
+}
+
+// r x v exp(4 mu / (c^2 r)).
+Three momentum_of(const Pair &p) {
+    const double growth = std::exp(4.0 * p.x);
+    const Three L = cross(p.r, p.v);
+    return {growth * L[0], growth * L[1], growth * L[2]};
+}
+
+void pair_momentum(const Given<double> &g) {
+    const Three L = momentum_of(Pair(g));
+    std::copy(L.begin(), L.end(), g.out);
+}
+
+void pair_momentum_gradient(const Given<double> &g) {
+    const Pair p(g);
+    const double growth = std::exp(4.0 * p.x);
+    const Three L = momentum_of(p);
+    std::fill(g.out, g.out + 36, 0.0);
+    for (int i = 0; i < 2; ++i) {
+        const double sign = i == 0 ? -1.0 : 1.0;
+        const Columns by_q{g.out + 3 * i, 12}, by_v{g.out + 6 + 3 * i, 12};
+        by_q.add_cross(-sign * growth, p.v);
+        by_v.add_cross(sign * growth, p.r);
+        by_q.add_outer(-4.0 * sign * p.x * p.u * p.u, L, p.r);
+    }
+}
+
+bool of_bodies(int64_t n, int64_t p) { return p > N_ENTRIES && n == 6 * (p - N_ENTRIES); }
+bool at_positions(int64_t n, int64_t p) { return p > N_ENTRIES && n == 3 * (p - N_ENTRIES); }
+bool of_two(int64_t n, int64_t p) { return n == 12 && p == 2 + N_ENTRIES; }
+constexpr const char *BODIES = "positions and velocities, 6 numbers a body, every G m and 8 entries";
+constexpr const char *POSITIONS = "positions, 3 numbers a body, every G m and 8 entries";
+constexpr const char *TWO = "12 numbers, two G m and 8 entries";
+
+const LibraryFunction functions[] = {
+    {"forces.rhs", Value::DERIVATIVE, 0, plain<double, rhs>, nullptr, of_bodies, BODIES},
+    {"forces.acc", Value::ACCELERATION, 0, plain<double, acc>, nullptr, at_positions, POSITIONS},
+    {"forces.energy", Value::NUMBERS, 1, plain<double, energy>, nullptr, of_bodies, BODIES},
+    {"forces.energy_gradient", Value::GRADIENT_BY_F, 1, plain<double, gradient_of_energy>, nullptr, of_bodies, BODIES},
+    {"forces.momentum", Value::NUMBERS, 3, plain<double, momentum>, nullptr, of_bodies, BODIES},
+    {"forces.momentum_gradient", Value::GRADIENT, 3, plain<double, momentum_gradient>, nullptr, of_bodies, BODIES},
+    {"forces.axial_momentum", Value::NUMBERS, 1, plain<double, axial_momentum>, nullptr, of_bodies, BODIES},
+    {"forces.axial_momentum_gradient", Value::GRADIENT, 1,
+     plain<double, axial_momentum_gradient>, nullptr, of_bodies, BODIES},
+    {"eih.energy", Value::NUMBERS, 1, plain<double, eih_energy>, nullptr, of_bodies, BODIES},
+    {"eih.energy_gradient", Value::GRADIENT, 1, plain<double, eih_energy_gradient>, nullptr, of_bodies, BODIES},
+    {"eih.momentum", Value::NUMBERS, 3, plain<double, eih_momentum>, nullptr, of_bodies, BODIES},
+    {"eih.momentum_gradient", Value::GRADIENT, 3, plain<double, eih_momentum_gradient>, nullptr, of_bodies, BODIES},
+    {"eih.axial_momentum", Value::NUMBERS, 1, plain<double, eih_axial_momentum>, nullptr, of_bodies, BODIES},
+    {"eih.axial_momentum_gradient", Value::GRADIENT, 1,
+     plain<double, eih_axial_momentum_gradient>, nullptr, of_bodies, BODIES},
+    {"pair.energy", Value::NUMBERS, 1, plain<double, pair_energy>, nullptr, of_two, TWO},
+    {"pair.energy_gradient", Value::GRADIENT, 1, plain<double, pair_energy_gradient>, nullptr, of_two, TWO},
+    {"pair.momentum", Value::NUMBERS, 3, plain<double, pair_momentum>, nullptr, of_two, TWO},
+    {"pair.momentum_gradient", Value::GRADIENT, 3, plain<double, pair_momentum_gradient>, nullptr, of_two, TWO},
+};
+
+}  // namespace
+
+std::span<const LibraryFunction> force_functions() { return functions; }
+
+}  // namespace eip

@@ -1,0 +1,56 @@
+// Powers of 1/r without square root and division, which are slow in vectors: an estimate from the bits of r^2, a
+// polynomial, a correction to full precision. All of it is integer arithmetic, multiplication, addition and fused
+// multiply-add: the same bits on every processor, and multiplying all lengths by a power of two stays exact. Distances
+// between 1e-100 and 1e150 will do in any unit; bodies at one place give NaN.
+#pragma once
+
+#include "../octet.hpp"
+
+namespace eip {
+
+// x^-1/2 to 6.3e-7: y from the bits of x, times a minimax cubic in x y^2. The constant is the one that leaves the least
+// range of x y^2, [0.912, 1.040]; the cubic is that of Remez for it.
+constexpr uint64_t ESTIMATE = 0x5FE6996542967F58;
+constexpr double CUBIC[] = {2.216453840039739, -2.274298221857139, 1.3991927078645605, -0.3413483382980669};
+
+inline Vector root_estimate(Vector x) {
+    typedef uint64_t Words __attribute__((vector_size(sizeof(Vector))));
+    const Vector y = (Vector)(ESTIMATE - ((Words)x >> 1));
+    const Vector c = x * y * y;
+    Vector p = spread_vector(CUBIC[3]);
+    for (int k = 2; k >= 0; --k) p = fused(p, c, spread_vector(CUBIC[k]));
+    return y * p;
+}
+
+// x^-1/2, nearly always rounded correctly: y (1 + h/2 + 3/8 h^2), h = 1 - x y^2 without the rounding of y^2.
+inline Vector over_root(Vector x) {
+    const Vector y = root_estimate(x), y2 = y * y;
+    const Vector h = fused(-x, fused(y, y, -y2), fused(-x, y2, spread_vector(1.0)));
+    return fused(y * h, fused(spread_vector(3.0 / 8.0), h, spread_vector(1.0 / 2.0)), y);
+}
+
+inline Octet over_root(const Octet &x) {
+    Octet out;
+    for (int v = 0; v < VECTORS; ++v) out.part[v] = over_root(x.part[v]);
+    return out;
+}
+
+// Of x^-3/2 what the two bodies of a pair share: y and y^2 for y near x^-1/2, h = 1 - x y^2, and 3/2 + 15/8 h.
+struct Cube {
+    Octet y, y2, h, p;
+
+    explicit Cube(const Octet &x) {
+        for (int v = 0; v < VECTORS; ++v) y.part[v] = root_estimate(x.part[v]);
+        y2 = y * y;
+        h = multiply_add(-x, y2, 1.0);
+        p = multiply_add(Octet(15.0 / 8.0), h, Octet(3.0 / 2.0));
+    }
+
+    // m x^-3/2 = m y^3 (1 + 3/2 h + 15/8 h^2).
+    Octet times(const Octet &m) const {
+        const Octet w = m * y * y2;
+        return multiply_add(w * h, p, w);
+    }
+};
+
+}  // namespace eip

@@ -1,0 +1,100 @@
+// The Kepler problem with its relativistic term, and the harmonic oscillator.
+#include "../library.hpp"
+
+namespace eip {
+namespace {
+
+using std::sqrt;
+
+// The pull over r: r^-3 + 3/2 eps r^-5, from 1/r^2, so that a step waits for one division.
+template <class T>
+T pull(const T *q, const T &eps) {
+    const T u = 1.0 / (q[0] * q[0] + q[1] * q[1]);
+    return u * sqrt(u) * (1.0 + 1.5 * eps * u);
+}
+
+template <class T>
+void kepler_rhs(const Given<T> &g) {
+    const T *y = g.y;
+    const T w = pull(y, g.params[0]);
+    g.out[0] = y[2];
+    g.out[1] = y[3];
+    g.out[2] = -w * y[0];
+    g.out[3] = -w * y[1];
+}
+
+template <class T>
+void kepler_acc(const Given<T> &g) {
+    const T w = pull(g.y, g.params[0]);
+    g.out[0] = -w * g.y[0];
+    g.out[1] = -w * g.y[1];
+}
+
+template <class T>
+void kepler_energy(const Given<T> &g) {
+    const T *y = g.y;
+    const T u = 1.0 / sqrt(y[0] * y[0] + y[1] * y[1]);
+    g.out[0] = 0.5 * (y[2] * y[2] + y[3] * y[3]) - u - 0.5 * g.params[0] * (u * u * u);
+}
+
+template <class T>
+void kepler_energy_gradient(const Given<T> &g) {
+    g.out[0] = -g.f[2];
+    g.out[1] = -g.f[3];
+    g.out[2] = g.y[2];
+    g.out[3] = g.y[3];
+}
+
+template <class T>
+void kepler_momentum(const Given<T> &g) {
+    g.out[0] = g.y[0] * g.y[3] - g.y[1] * g.y[2];
+}
+
+template <class T>
+void kepler_momentum_gradient(const Given<T> &g) {
+    g.out[0] = g.y[3];
+    g.out[1] = -g.y[2];
+    g.out[2] = -g.y[1];
+    g.out[3] = g.y[0];
+}
+
+template <class T>
+void harmonic_rhs(const Given<T> &g) {
+    g.out[0] = g.params[0] * g.y[1];
+    g.out[1] = -g.params[0] * g.y[0];
+}
+
+template <class T>
+void harmonic_energy(const Given<T> &g) {
+    g.out[0] = 0.5 * g.params[0] * (g.y[0] * g.y[0] + g.y[1] * g.y[1]);
+}
+
+template <class T>
+void harmonic_energy_gradient(const Given<T> &g) {
+    g.out[0] = g.params[0] * g.y[0];
+    g.out[1] = g.params[0] * g.y[1];
+}
+
+bool of_four(int64_t n, int64_t p) { return n == 4 && p == 1; }
+bool of_two(int64_t n, int64_t p) { return n == 2 && p == 1; }
+constexpr const char *FOUR = "a state of 4 numbers and 1 parameter", *TWO = "2 numbers and 1 parameter";
+
+#define EIP_BOTH(function) plain<double, function<double>>, plain<Octet, function<Octet>>
+const LibraryFunction functions[] = {
+    {"kepler.rhs", Value::DERIVATIVE, 0, EIP_BOTH(kepler_rhs), of_four, FOUR},
+    {"kepler.acc", Value::ACCELERATION, 0, EIP_BOTH(kepler_acc), of_two, TWO},
+    {"kepler.energy", Value::NUMBERS, 1, EIP_BOTH(kepler_energy), of_four, FOUR},
+    {"kepler.energy_gradient", Value::GRADIENT_BY_F, 1, EIP_BOTH(kepler_energy_gradient), of_four, FOUR},
+    {"kepler.momentum", Value::NUMBERS, 1, EIP_BOTH(kepler_momentum), of_four, FOUR},
+    {"kepler.momentum_gradient", Value::GRADIENT, 1, EIP_BOTH(kepler_momentum_gradient), of_four, FOUR},
+    {"harmonic.rhs", Value::DERIVATIVE, 0, EIP_BOTH(harmonic_rhs), of_two, TWO},
+    {"harmonic.energy", Value::NUMBERS, 1, EIP_BOTH(harmonic_energy), of_two, TWO},
+    {"harmonic.energy_gradient", Value::GRADIENT, 1, EIP_BOTH(harmonic_energy_gradient), of_two, TWO},
+};
+#undef EIP_BOTH
+
+}  // namespace
+
+std::span<const LibraryFunction> kepler_functions() { return functions; }
+
+}  // namespace eip

@@ -1,0 +1,401 @@
+// Sums over the pairs of N bodies: Newton's accelerations and the energy, of one state or of eight members.
+//
+// Of one state a block of 8, 4 or 2 targets meets all bodies as sources. With less than 8 targets the lanes form 2 or 4
+// streams, each with its share of the sources, added at the end. The last block overlaps the one before it, so that no
+// lane reads past the arrays. Accelerations take every pair twice, once for each body: that costs less than sums across
+// lanes for the reactions, and keeps the momentum as well, for r_ij and 1/r_ij^3 are the same in both, bit for bit.
+//
+// The energy, in which large terms nearly cancel, is summed with the rounding errors carried along: what a projection
+// cannot see it cannot correct.
+#pragma once
+
+#include <algorithm>
+
+#include "inverse_roots.hpp"
+
+namespace eip {
+
+// x, y and z of as many bodies as a vector has lanes, from (x, y, z, x, y, ...).
+#if defined(__AVX__)
+inline void load_bodies(const double *a, Vector *xyz) {
+    const Vector u = load(a), v = load(a + 4), w = load(a + 8);
+    xyz[0] = __builtin_shuffle(__builtin_shuffle(u, v, Bits{0, 3, 6, 6}), w, Bits{0, 1, 2, 5});
+    xyz[1] = __builtin_shuffle(__builtin_shuffle(u, v, Bits{1, 4, 7, 7}), w, Bits{0, 1, 2, 6});
+    xyz[2] = __builtin_shuffle(__builtin_shuffle(u, v, Bits{2, 5, 5, 5}), w, Bits{0, 1, 4, 7});
+}
+
+// The first `count` of them, 2 or 4. In vectors, as they are read: what is read must not wait for two stores.
+template <int COUNT>
+inline void store_bodies(const Vector *xyz, double *a) {
+    const Vector first = __builtin_shuffle(xyz[0], xyz[1], Bits{0, 4, 1, 5});
+    const Vector rest = __builtin_shuffle(first, xyz[2], Bits{3, 5, 3, 5});
+    store(__builtin_shuffle(first, xyz[2], Bits{0, 1, 4, 2}), a);
+    if constexpr (COUNT == 2) {
+        _mm_storeu_pd(a + 4, _mm256_castpd256_pd128((__m256d)rest));
+    } else {
+        const Vector last = __builtin_shuffle(xyz[0], xyz[1], Bits{2, 6, 3, 7});
+        store(__builtin_shuffle(rest, last, Bits{0, 1, 4, 5}), a + 4);
+        store(__builtin_shuffle(last, xyz[2], Bits{6, 2, 3, 7}), a + 8);
+    }
+}
+
+inline Vector swapped_halves(Vector v) { return __builtin_shuffle(v, Bits{2, 3, 0, 1}); }
+#else
+inline void load_bodies(const double *a, Vector *xyz) {
+    const Vector u = load(a), v = load(a + 2), w = load(a + 4);
+    xyz[0] = Vector{u[0], v[1]};
+    xyz[1] = Vector{u[1], w[0]};
+    xyz[2] = Vector{v[0], w[1]};
+}
+
+template <int COUNT>
+inline void store_bodies(const Vector *xyz, double *a) {
+    for (int k = 0; k < COUNT; ++k)
+        for (int c = 0; c < 3; ++c) a[3 * k + c] = xyz[c][k];
+}
+#endif
+
+// x, y and z of the bodies `first` to first + TARGETS - 1, that of target k % TARGETS in lane k.
+template <int TARGETS>
+inline void load_targets(const double *q, int64_t first, Octet *xyz) {
+    const double *a = q + 3 * first;
+    if constexpr (TARGETS < WIDTH) {
+        for (int c = 0; c < 3; ++c)
+            for (Vector &part : xyz[c].part)
+                for (int k = 0; k < WIDTH; ++k) part[k] = a[3 * (k % TARGETS) + c];
+    } else {
+        for (int v = 0; v < VECTORS; ++v) {
+            Vector parts[3];
+            load_bodies(a + 3 * (v * WIDTH % TARGETS), parts);
+            for (int c = 0; c < 3; ++c) xyz[c].part[v] = parts[c];
+        }
+    }
+}
+
+// x, y, z and G m of the bodies j, j + 1, ..., those of stream k / TARGETS in lane k.
+template <int TARGETS>
+inline void load_sources(const double *q, const double *gm, int64_t j, Octet *xyz, Octet &m) {
+    const double *a = q + 3 * j;
+#if defined(__AVX__)
+    if constexpr (TARGETS == 2) {
+        Vector of[4];
+        load_bodies(a, of);
+        of[3] = load(gm + j);
+        Octet *out[4] = {xyz, xyz + 1, xyz + 2, &m};
+        for (int c = 0; c < 4; ++c) {
+            out[c]->part[0] = __builtin_shuffle(of[c], Bits{0, 0, 1, 1});
+            out[c]->part[1] = __builtin_shuffle(of[c], Bits{2, 2, 3, 3});
+        }
+        return;
+    }
+#endif
+    for (int v = 0; v < VECTORS; ++v) {
+        const int stream = v * WIDTH / TARGETS;
+        for (int c = 0; c < 3; ++c) xyz[c].part[v] = spread_vector(a[3 * stream + c]);
+        m.part[v] = spread_vector(gm[j + stream]);
+    }
+}
+
+// The streams of each target added by halves, in the first lanes.
+template <int TARGETS>
+inline Octet folded(Octet sums) {
+    for (int width = LANES / 2; width >= std::max(TARGETS, WIDTH); width /= 2)
+        for (int v = 0; v < width / WIDTH; ++v) sums.part[v] += sums.part[v + width / WIDTH];
+#if defined(__AVX__)
+    if constexpr (TARGETS == 2) sums.part[0] += swapped_halves(sums.part[0]);
+#endif
+    return sums;
+}
+
+template <int TARGETS>
+inline void store_targets(const Octet *xyz, double *out, int64_t first) {
+    Octet sums[3];
+    for (int c = 0; c < 3; ++c) sums[c] = folded<TARGETS>(xyz[c]);
+    for (int k = 0; k < TARGETS; k += WIDTH) {
+        const Vector parts[3] = {sums[0].part[k / WIDTH], sums[1].part[k / WIDTH], sums[2].part[k / WIDTH]};
+        store_bodies<std::min(TARGETS, WIDTH)>(parts, out + 3 * (first + k));
+    }
+}
+
+// Rows of eight lanes of 0 and 1, by number; beyond the ends as at the end.
+template <int ROWS>
+struct Choices {
+    double row[ROWS][LANES];
+
+    Octet operator()(int64_t k) const { return Octet::load(row[std::clamp<int64_t>(k, 0, ROWS - 1)]); }
+};
+
+// 1 where source j of the first stream, j + 1 of the next, ... is the target in that lane; by j - first target + STREAMS.
+template <int TARGETS, int STREAMS = LANES / TARGETS>
+constexpr Choices<TARGETS + STREAMS + 1> ITSELF = [] {
+    Choices<TARGETS + STREAMS + 1> rows{};
+    for (int r = 0; r < TARGETS + STREAMS + 1; ++r)
+        for (int k = 0; k < LANES; ++k) rows.row[r][k] = k % TARGETS == r - STREAMS + k / TARGETS;
+    return rows;
+}();
+
+// 1 in the streams below r.
+template <int TARGETS>
+constexpr Choices<LANES / TARGETS + 1> STREAMS_BELOW = [] {
+    Choices<LANES / TARGETS + 1> rows{};
+    for (int r = 0; r <= LANES / TARGETS; ++r)
+        for (int k = 0; k < LANES; ++k) rows.row[r][k] = k / TARGETS < r;
+    return rows;
+}();
+
+// 1 in the lanes from k on.
+constexpr Choices<LANES + 1> LANES_FROM = [] {
+    Choices<LANES + 1> rows{};
+    for (int r = 0; r <= LANES; ++r)
+        for (int k = 0; k < LANES; ++k) rows.row[r][k] = k >= r;
+    return rows;
+}();
+
+inline Octet squares(const Octet &x, const Octet &y, const Octet &z, const Octet &start) {
+    return multiply_add(z, z, multiply_add(y, y, multiply_add(x, x, start)));
+}
+
+// Adds to `sums` the pulls of the sources j, j + 1, ..., each times `used`.
+template <int TARGETS>
+inline void add_sources(const double *q, const double *gm, const Octet *own, int64_t j, int64_t first, Octet *sums,
+                        const Octet &used) {
+    Octet d[3], m;
+    load_sources<TARGETS>(q, gm, j, d, m);
+    for (int c = 0; c < 3; ++c) d[c] -= own[c];
+    // A body's own pull is 0 / 1.
+    const Octet itself = ITSELF<TARGETS>(j - first + LANES / TARGETS);
+    const Octet w = Cube(squares(d[0], d[1], d[2], itself)).times(m * used);
+    for (int c = 0; c < 3; ++c) sums[c] = multiply_add(w, d[c], sums[c]);
+}
+
+// Accelerations of the bodies `first` to first + TARGETS - 1.
+template <int TARGETS>
+inline void accelerate_block(const double *q, const double *gm, int64_t n, int64_t first, double *out) {
+    constexpr int STREAMS = LANES / TARGETS;
+    Octet own[3], sums[3] = {0.0, 0.0, 0.0};
+    load_targets<TARGETS>(q, first, own);
+    const int64_t start = n % STREAMS;
+    if (start > 0) add_sources<TARGETS>(q, gm, own, 0, first, sums, STREAMS_BELOW<TARGETS>(start));
+#pragma GCC unroll 2
+    for (int64_t j = start; j < n; j += STREAMS) add_sources<TARGETS>(q, gm, own, j, first, sums, 1.0);
+    store_targets<TARGETS>(sums, out, first);
+}
+
+// Every pair once, with its reaction: for less than four bodies.
+template <class T>
+inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out) {
+    using std::sqrt;
+    for (int64_t i = 0; i < 3 * n; ++i) out[i] = 0.0;
+    for (int64_t i = 0; i < n; ++i) {
+        T ax = 0.0, ay = 0.0, az = 0.0;
+        for (int64_t j = i + 1; j < n; ++j) {
+            const T dx = q[3 * j] - q[3 * i], dy = q[3 * j + 1] - q[3 * i + 1], dz = q[3 * j + 2] - q[3 * i + 2];
+            const T r2 = dx * dx + dy * dy + dz * dz;
+            const T w = 1.0 / (r2 * sqrt(r2));
+            const T wi = w * gm[j], wj = w * gm[i];
+            ax += wi * dx;
+            ay += wi * dy;
+            az += wi * dz;
+            out[3 * j] -= wj * dx;
+            out[3 * j + 1] -= wj * dy;
+            out[3 * j + 2] -= wj * dz;
+        }
+        out[3 * i] += ax;
+        out[3 * i + 1] += ay;
+        out[3 * i + 2] += az;
+    }
+}
+
+// out (3 n) = sum over the other bodies of gm_j (q_j - q_i) / r^3.
+// As one function: of those that it calls the compiler would leave some by themselves, and their sums in memory.
+[[gnu::flatten, gnu::noinline]] inline void accelerate(const double *q, const double *gm, int64_t n, double *out) {
+    if (n < 4) return accelerate_few(q, gm, n, out);
+    if (n < 8) {
+        accelerate_block<4>(q, gm, n, 0, out);
+        if (n > 4) accelerate_block<4>(q, gm, n, n - 4, out);
+        return;
+    }
+    const int64_t rest = n % 8;
+    for (int64_t k = 0; k < n / 8 + (rest > 4); ++k) accelerate_block<8>(q, gm, n, std::min(8 * k, n - 8), out);
+    if (2 < rest && rest <= 4)
+        accelerate_block<4>(q, gm, n, n - 4, out);
+    else if (0 < rest && rest <= 2)
+        accelerate_block<2>(q, gm, n, n - 2, out);
+}
+
+// Where the bodies begin whose sources `accelerate` takes in streams, and the number of streams.
+struct Streams {
+    int64_t first, count;
+
+    explicit Streams(int64_t n) : first(n), count(1) {
+        const int64_t rest = n % 8;
+        if (n < 8)
+            first = 0, count = 2;
+        else if (2 < rest && rest <= 4)
+            first = n - 4, count = 2;
+        else if (0 < rest && rest <= 2)
+            first = n - 2, count = 4;
+    }
+};
+
+inline void add_pull(const Octet &w, const Octet *d, Octet *out) {
+    for (int c = 0; c < 3; ++c) out[c] = multiply_add(w, d[c], out[c]);
+}
+
+inline Octet difference(const Octet *q, int64_t i, int64_t j, Octet *d) {
+    for (int c = 0; c < 3; ++c) d[c] = q[3 * j + c] - q[3 * i + c];
+    return multiply_add(d[2], d[2], multiply_add(d[1], d[1], d[0] * d[0]));
+}
+
+// The same for eight members: every pair once, sums in the same order. Bodies that one state leaves to its last block get
+// their sums in streams: those of body i stand in `sums` from 3 streams (i - first) on.
+inline void accelerate(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
+    if (n < 4) return accelerate_few(q, gm, n, out);
+    const Streams streams(n);
+    const int64_t start = n % streams.count;
+    Octet sums[3 * 2 * 7];  // in streams, at seven bodies
+    const auto place = [&](int64_t body, int64_t other) {
+        if (body < streams.first) return out + 3 * body;
+        const int64_t stream = other < start ? other : (other - start) % streams.count;
+        return sums + 3 * (streams.count * (body - streams.first) + stream);
+    };
+    std::fill(out, out + 3 * n, 0.0);
+    std::fill(sums, sums + 3 * streams.count * (n - streams.first), 0.0);
+    for (int64_t i = 0; i < n; ++i)
+        for (int64_t j = i + 1; j < n; ++j) {
+            Octet d[3];
+            const Cube cube(difference(q, i, j, d));
+            add_pull(cube.times(gm[j]), d, place(i, j));
+            add_pull(-cube.times(gm[i]), d, place(j, i));
+        }
+    for (int64_t i = streams.first; i < n; ++i)
+        for (int c = 0; c < 3; ++c) {
+            const Octet *s = sums + 3 * streams.count * (i - streams.first) + c;
+            out[3 * i + c] = streams.count == 4 ? (s[0] + s[6]) + (s[3] + s[9]) : s[0] + s[3];
+        }
+}
+
+// A number and what its rounding left.
+struct Carried {
+    Octet total = 0.0, carry = 0.0;
+
+    void add_product(const Octet &a, const Octet &b) {
+        const Octet sum = multiply_add(a, b, total);
+        carry += multiply_add(a, b, total - sum);
+        total = sum;
+    }
+};
+
+// a + b, and its rounding error (Knuth) in `lost`.
+template <class T>
+inline T carried_sum(const T &a, const T &b, T &lost) {
+    const T total = a + b, part = total - a;
+    lost = (a - (total - part)) + (b - part);
+    return total;
+}
+
+// gm (square / 2 - potential) with its carry.
+inline Carried energy_of(const Octet &gm, const Carried &square, const Carried &potential) {
+    Octet lost;
+    const Octet energy = carried_sum<Octet>(0.5 * square.total, -potential.total, lost);
+    lost += 0.5 * square.carry - potential.carry;
+    Carried out;
+    out.add_product(gm, energy);
+    out.carry = multiply_add(gm, lost, out.carry);
+    return out;
+}
+
+// All lanes of total + carry, added by halves.
+inline double carried_fold(const Carried &sum) {
+    double total[LANES], carry[LANES];
+    sum.total.store(total);
+    sum.carry.store(carry);
+    for (int width = LANES / 2; width > 0; width /= 2)
+        for (int k = 0; k < width; ++k) {
+            double lost;
+            total[k] = carried_sum(total[k], total[k + width], lost);
+            carry[k] = (carry[k] + carry[k + width]) + lost;
+        }
+    return total[0] + carry[0];
+}
+
+// Energy of the bodies first + skip ... first + 7, with the pairs that they make with later ones.
+inline double energy_block(const double *y, const double *gm, int64_t n, int64_t first, int64_t skip) {
+    Octet x[3], u[3];
+    Carried square, potential;
+    load_targets<LANES>(y, first, x);
+    load_targets<LANES>(y + 3 * n, first, u);
+    for (const Octet &part : u) square.add_product(part, part);
+    for (int64_t j = first + skip + 1; j < n; ++j) {
+        // Not the body itself, nor those after it in the block, which meet this one as a source.
+        const Octet done = LANES_FROM(j - first);
+        const Octet dx = Octet(y[3 * j]) - x[0], dy = Octet(y[3 * j + 1]) - x[1], dz = Octet(y[3 * j + 2]) - x[2];
+        potential.add_product(multiply_add(Octet(-gm[j]), done, Octet(gm[j])), over_root(squares(dx, dy, dz, done)));
+    }
+    return carried_fold(energy_of(Octet::load(gm + first) * LANES_FROM(skip), square, potential));
+}
+
+template <class T>
+inline T energy_of_few(const T *y, const T *gm, int64_t n) {
+    using std::sqrt;
+    const T *v = y + 3 * n;
+    T kinetic = 0.0, potential = 0.0;
+    for (int64_t i = 0; i < n; ++i) {
+        const T vx = v[3 * i], vy = v[3 * i + 1], vz = v[3 * i + 2];
+        kinetic += gm[i] * (vx * vx + vy * vy + vz * vz);
+        T partial = 0.0;
+        for (int64_t j = i + 1; j < n; ++j) {
+            const T dx = y[3 * j] - y[3 * i], dy = y[3 * j + 1] - y[3 * i + 1], dz = y[3 * j + 2] - y[3 * i + 2];
+            partial += gm[j] / sqrt(dx * dx + dy * dy + dz * dz);
+        }
+        potential += gm[i] * partial;
+    }
+    return 0.5 * kinetic - potential;
+}
+
+// G times the energy.
+[[gnu::flatten, gnu::noinline]] inline double energy_sum(const double *y, const double *gm, int64_t n) {
+    if (n < 8) return energy_of_few(y, gm, n);
+    double total = 0.0;
+    for (int64_t first = 0; first < n - 7; first += 8) total += energy_block(y, gm, n, first, 0);
+    if (n % 8 > 0) total += energy_block(y, gm, n, n - 8, 8 - n % 8);
+    return total;
+}
+
+// The same for eight members: the bodies' energies added as one state adds its lanes.
+inline Carried energy_of_body(const Octet *y, const Octet *gm, int64_t n, int64_t i) {
+    Carried square, potential;
+    for (int64_t j = i + 1; j < n; ++j) {
+        Octet d[3];
+        const Octet r2 = difference(y, i, j, d);
+        potential.add_product(gm[j], over_root(r2));
+    }
+    for (int64_t k = 3 * (n + i); k < 3 * (n + i) + 3; ++k) square.add_product(y[k], y[k]);
+    return energy_of(gm[i], square, potential);
+}
+
+// Bodies k, k + stride, ... of a block of eight, added by halves.
+inline Carried energy_of_some(const Octet *y, const Octet *gm, int64_t n, int64_t first, int64_t skip, int k, int stride) {
+    if (stride == LANES) return k >= skip ? energy_of_body(y, gm, n, first + k) : Carried{};
+    const Carried a = energy_of_some(y, gm, n, first, skip, k, 2 * stride);
+    const Carried b = energy_of_some(y, gm, n, first, skip, k + stride, 2 * stride);
+    Carried out;
+    Octet lost;
+    out.total = carried_sum(a.total, b.total, lost);
+    out.carry = (a.carry + b.carry) + lost;
+    return out;
+}
+
+inline Octet energy_sum(const Octet *y, const Octet *gm, int64_t n) {
+    if (n < 8) return energy_of_few(y, gm, n);
+    Octet total = 0.0;
+    const auto block = [&](int64_t first, int64_t skip) {
+        const Carried sum = energy_of_some(y, gm, n, first, skip, 0, 1);
+        total += sum.total + sum.carry;
+    };
+    for (int64_t first = 0; first < n - 7; first += 8) block(first, 0);
+    if (n % 8 > 0) block(n - 8, 8 - n % 8);
+    return total;
+}
+
+}  // namespace eip
