@@ -12,17 +12,16 @@ from math import sqrt
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from ..core.inputs import refuse_units
 from ..core.invariants import Invariant
+from ..core.jitted import compilable, compiled_like, jitted
 from ..core.problem import Problem, bind
-from ..engine.caching import cached_njit
 
 __all__ = ["centre_time", "pair_time", "reaches", "time_transformed"]
 
 
-@cached_njit()
+@compilable
 def centre_time(y, params):
     """Time scale r^(3/2) of motion around one centre with G M = 1: the choice of g for `kepler`."""
     r2 = 0.0
@@ -32,7 +31,7 @@ def centre_time(y, params):
     return r * sqrt(r)
 
 
-@cached_njit()
+@compilable
 def pair_time(y, params):
     """Time scale of the closest pair of N bodies, smooth in all: (sum over pairs of (Gm_i + Gm_j) / r^3)^(-1/2)."""
     rate2 = 0.0
@@ -87,7 +86,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
             "expected one such as kepler() or nbody(...)."
         )
     params = np.zeros(0) if problem.params is None else problem.params
-    rhs = _transformed_rhs(problem.rhs, g)
+    rhs = _transformed_rhs(problem.rhs, jitted(g))
     n = problem.y0.size
     return Problem(
         name=f"{problem.name} in fictitious time",
@@ -109,18 +108,17 @@ def reaches(t: float) -> Callable[..., float]:
     refuse_units(t=t)
     t = float(t)
 
-    @njit
     def event(s, y, params):
         return y[-1] - t
 
-    event.terminal = True
-    return event
+    made = jitted(compilable(event))
+    made.terminal = True
+    return made
 
 
 # Cached, so that two problems of the same functions are one to the compiler.
 @cache
 def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callable[..., None]:
-    @njit
     def transformed(s, y, out, params):
         n = y.size - 1
         rhs(y[n], y[:n], out[:n], params)
@@ -129,7 +127,7 @@ def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callabl
             out[k] *= weight
         out[n] = weight
 
-    return transformed
+    return compiled_like(transformed, rhs, g)
 
 
 def _transformed_invariant(item: Invariant) -> Invariant:
@@ -143,21 +141,18 @@ def _transformed_functions(
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The functions of an invariant for the state (y, t); those that want f = dy/dt get it from dy/ds and dt/ds."""
 
-    @njit
     def value(s, y, params):
         return fun(y[-1], y[:-1], params)
 
-    @njit
     def gradient(s, y, out, params):
         grad(y[-1], y[:-1], out[..., :-1], params)
         out[..., -1] = 0.0
 
-    @njit
     def gradient_of_f(s, y, f, out, params):
         grad(y[-1], y[:-1], f[:-1] / f[-1], out[..., :-1], params)
         out[..., -1] = 0.0
 
-    return value, gradient_of_f if uses_f else gradient
+    return compiled_like(value, fun), compiled_like(gradient_of_f if uses_f else gradient, grad)
 
 
 def _blocks(blocks: Any, n: int) -> Any:

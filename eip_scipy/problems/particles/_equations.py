@@ -9,16 +9,14 @@ such as (-y, x, 0), whose types differ.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
-from numba import njit
-from numba.extending import is_jitted, register_jitable
-
 from ...core.invariants import DIFFERENCE_WEIGHTS
+from ...core.jitted import compiled_like, is_compiled
 
 __all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like"]
 
-_jitable = register_jitable(error_model="numpy", _nrt=False)
 MASS, CHARGE = 0, 1  # places in the parameters
 
 
@@ -43,9 +41,28 @@ class ParticleEquations(NamedTuple):
 
 
 def jit_like(fun: Callable[..., Any], *others: Callable[..., Any] | None) -> Callable[..., Any]:
-    """`fun`, compiled if all of the others are Numba's functions, as it is if one is not."""
-    compiled = all(is_jitted(other) for other in others if other is not None)
-    return njit(fun, error_model="numpy") if compiled else fun
+    """`fun`, compiled if all of the others are, with what it calls here."""
+    if all(is_compiled(other) for other in others if other is not None):
+        _register()
+    return compiled_like(fun, *(other for other in others if other is not None))
+
+
+_inlined: list[Callable[..., Any]] = []
+
+
+def _jitable(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """Mark a function that compiled ones call."""
+    _inlined.append(fun)
+    return fun
+
+
+@cache
+def _register() -> None:
+    """Let Numba compile these into their callers."""
+    from numba.extending import register_jitable
+
+    for fun in _inlined:
+        register_jitable(error_model="numpy", _nrt=False)(fun)
 
 
 def no_potential(x, y, z):

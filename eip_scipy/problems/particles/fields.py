@@ -10,10 +10,8 @@ from math import isfinite, log, log2, sqrt
 from typing import Any
 
 import numpy as np
-from numba import njit
-from numba.extending import is_jitted
 
-from ...engine.caching import cached_njit
+from ...core.jitted import compilable, jitted
 from ._equations import (
     FieldFunctions,
     curl,
@@ -26,7 +24,6 @@ from ._equations import (
 
 __all__ = ["TOKAMAK", "UNIFORM", "ParticleField"]
 
-_jit = cached_njit(error_model="numpy", _nrt=False)
 DIFFERENCE_STEP = 2.0**-7  # of the field's length
 AGREEMENT = 1e-6  # of functions of the field that must go together
 ROUND_OFF = 1e-10  # of a difference, where the true one is 0
@@ -108,7 +105,8 @@ class ParticleField:
     def functions(self) -> FieldFunctions:
         """All functions of the field, those not given made from the others."""
         step = self._step
-        A, jacobian, phi, E, B = self.vector_potential, self.jacobian, self.potential, self.electric, self.magnetic
+        given = self.vector_potential, self.jacobian, self.potential, self.electric, self.magnetic
+        A, jacobian, phi, E, B = map(jitted, given)
         if A is not None and jacobian is None:
             jacobian = difference_jacobian(A, step)
         if E is None and phi is None:
@@ -224,11 +222,8 @@ class ParticleField:
         fun, points = getattr(self.functions, key), np.ascontiguousarray(np.transpose(position), dtype=float)
         size = 1 if key == "phi" else 3
         out = np.empty((len(points), size))
-        if is_jitted(fun):
-            (_scalars if size == 1 else _vectors)(fun, points, out)
-        else:
-            for row, point in zip(out, points, strict=True):
-                row[:] = fun(*point)
+        for row, point in zip(out, points, strict=True):
+            row[:] = fun(*point)
         return out[:, 0] if size == 1 else out.T
 
 
@@ -243,49 +238,34 @@ def _compare(key: str, given: np.ndarray | None, expected: np.ndarray, slack: fl
         )
 
 
-@njit
-def _vectors(fun, points, out):
-    for k in range(points.shape[0]):
-        value = fun(points[k, 0], points[k, 1], points[k, 2])
-        out[k, 0] = value[0]
-        out[k, 1] = value[1]
-        out[k, 2] = value[2]
-
-
-@njit
-def _scalars(fun, points, out):
-    for k in range(points.shape[0]):
-        out[k, 0] = fun(points[k, 0], points[k, 1], points[k, 2])
-
-
 # Uniform B = e_z with the potential 1e-2 / R.
 
 POTENTIAL = 1e-2
 
 
-@_jit
+@compilable
 def _uniform_vector_potential(x, y, z):
     return -0.5 * y, 0.5 * x, 0.0
 
 
-@_jit
+@compilable
 def _uniform_jacobian(x, y, z):
     return (0.0, -0.5, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 0.0)
 
 
-@_jit
+@compilable
 def _uniform_potential(x, y, z):
     return POTENTIAL / sqrt(x * x + y * y)
 
 
-@_jit
+@compilable
 def _uniform_electric(x, y, z):
     r2 = x * x + y * y
     w = POTENTIAL / (r2 * sqrt(r2))
     return w * x, w * y, 0.0
 
 
-@_jit
+@compilable
 def _uniform_magnetic(x, y, z):
     return 0.0, 0.0, 1.0
 
@@ -293,7 +273,7 @@ def _uniform_magnetic(x, y, z):
 # Tokamak: A = (a x - b y, a y + b x, -log(R) / 2) with a = z / (2 R^2), b = ((1 - R)^2 + z^2) / (4 R^2).
 
 
-@_jit
+@compilable
 def _tokamak_vector_potential(x, y, z):
     r2 = x * x + y * y
     u = 1.0 / r2
@@ -303,7 +283,7 @@ def _tokamak_vector_potential(x, y, z):
     return a * x - b * y, a * y + b * x, -0.25 * log(r2)
 
 
-@_jit
+@compilable
 def _tokamak_jacobian(x, y, z):
     r2 = x * x + y * y
     u = 1.0 / r2
@@ -325,7 +305,7 @@ def _tokamak_jacobian(x, y, z):
     )
 
 
-@_jit
+@compilable
 def _tokamak_magnetic(x, y, z):
     r2 = x * x + y * y
     c = 0.5 / r2
