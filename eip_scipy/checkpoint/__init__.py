@@ -16,6 +16,7 @@ import math
 import os
 import platform
 import secrets
+import sys
 import time
 import warnings
 import zipfile
@@ -38,6 +39,7 @@ DIGITS = 64
 ZIP = b"PK\x03\x04"
 BLOCK = 2**20
 LEFT_OVER = 3600.0
+# Numba's, where it is loaded: else no function of the run is its.
 DECIDING = ("python", "eip_scipy", "numpy", "scipy", "numba")
 # One date for all members: the same content gives the same bytes.
 DATE = (1980, 1, 1, 0, 0, 0)
@@ -205,7 +207,11 @@ def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, An
 def warn_of_other_versions(path: str | os.PathLike[str], header: Mapping[str, Any], *, stacklevel: int) -> None:
     """Warn where a checkpoint comes from other versions or another kind of machine: the last bits may differ then."""
     there, here = ({**(header.get("versions") or {}), "machine": header.get("machine")}, _here())
-    other = [f"{name} {there.get(name)}, here {here[name]}" for name in here if there.get(name) != here[name]]
+    other = [
+        f"{name} {there.get(name)}, here {here[name]}"
+        for name in here
+        if there.get(name) != here[name] and (name in there or name != "numba")
+    ]
     if other:
         warnings.warn(
             f"the checkpoint {_name(path)} was written with {'; '.join(other)}: the last bits may differ from those of "
@@ -242,7 +248,8 @@ def _machine() -> str:
 
 def origin() -> dict[str, Any]:
     """Versions and machine, as the header of every checkpoint has them."""
-    return {"versions": _versions(), "machine": _machine()}
+    decide = {name: version for name, version in _versions().items() if name != "numba" or name in sys.modules}
+    return {"versions": decide, "machine": _machine()}
 
 
 def _here() -> dict[str, str | None]:

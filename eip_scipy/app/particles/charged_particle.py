@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from typing import Any
 
 from ...problems.particles.charged_particle import ORBITS
@@ -41,6 +42,8 @@ def run(args: argparse.Namespace) -> int:
     if args.orbit is not None and args.field == "uniform":
         raise UsageError("--orbit is for the tokamak; leave it out, or take --field tokamak")
     check_outputs(args.out, args.json)
+    if find_spec("numba") is None:
+        warn('the fields are Python here, which takes hours; with pip install "eip_scipy[numba]" it is a minute')
     scenes = _scenes(args.field, args.orbit)
     try:
         studies = run_scenes(scenes, paper_only=False, quiet=args.quiet)
