@@ -7,7 +7,7 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
 import numpy as np
@@ -420,12 +420,25 @@ class Loop:
 
 def _compiling(shown: bool) -> Any:
     """A line while a user's functions compile, which can take some seconds."""
+    if not shown:
+        return nullcontext()
     from tqdm import tqdm
 
-    return tqdm(total=0, desc="compiling the functions", bar_format="{desc}", leave=False, disable=not shown)
+    return tqdm(total=0, desc="compiling the functions", bar_format="{desc}", leave=False)
+
+
+class _NoBar:
+    """In the place of a progress bar that is not shown."""
+
+    n = 0.0
+
+    def update(self, amount: float = 0.0) -> None:
+        pass
 
 
 def _bar(progress: bool, schedule: Schedule, label: str) -> Any:
+    if not progress:
+        return nullcontext(_NoBar())
     from tqdm import tqdm
 
     fixed = schedule.span.h != 0.0
@@ -437,9 +450,7 @@ def _bar(progress: bool, schedule: Schedule, label: str) -> Any:
     unit = "step" if fixed else "time"
     # Beyond 0 where the run is resumed.
     initial = int(schedule.place[STEP]) if fixed else abs(float(schedule.clock[TIME]) - schedule.span.t0)
-    return tqdm(
-        total=total, initial=initial, desc=label, unit=unit, unit_scale=True, disable=not progress, smoothing=0.05
-    )
+    return tqdm(total=total, initial=initial, desc=label, unit=unit, unit_scale=True, smoothing=0.05)
 
 
 @contextmanager
