@@ -3,7 +3,9 @@
 One module for every processor, and on x86-64 another for those with AVX2 and FMA; eip_scipy/engine/native.py chooses.
 """
 
+import copy
 import hashlib
+import os
 import platform
 import sys
 from pathlib import Path
@@ -46,20 +48,28 @@ def module(name: str, *flags: str) -> Extension:
 
 
 class Build(build_ext):
-    """Builds, each module with objects of its own, and says what is missing where no compiler can be had."""
+    """Builds the modules side by side, and says what is missing where no compiler can be had."""
+
+    def finalize_options(self) -> None:
+        """A process for each core, unless another number is asked for."""
+        super().finalize_options()
+        if self.parallel is None:
+            self.parallel = True
 
     def build_extension(self, ext: Extension) -> None:
-        """One module."""
-        folder, self.build_temp = self.build_temp, str(Path(self.build_temp) / ext.name)
+        """One module, with objects of its own."""
+        own = copy.copy(self)
+        own.build_temp = str(Path(self.build_temp) / ext.name)
         try:
-            super().build_extension(ext)
+            build_ext.build_extension(own, ext)
         except Exception as error:
             raise SystemExit(f"{MISSING}\nWhat the build said: {error}") from error
-        finally:
-            self.build_temp = folder
 
 
-modules = [module("_native")]
+builds: dict[str, list[str]] = {"_native": []}
 if platform.machine().lower() in ("x86_64", "amd64"):
-    modules.append(module("_native_v3", *V3))
-setup(ext_modules=modules, cmdclass={"build_ext": Build})
+    builds["_native_v3"] = V3
+if only := os.environ.get("EIP_SCIPY_BUILD"):  # for .ci/sanitize and .ci/coverage: one of them, and further flags
+    name, *further = only.split()
+    builds = {name: [*builds[name], *further]}
+setup(ext_modules=[module(name, *flags) for name, flags in builds.items()], cmdclass={"build_ext": Build})
