@@ -1,0 +1,49 @@
+"""What an installation must do, with its dependencies and nothing else: `.ci/wheel` and cibuildwheel run it.
+
+By assertions, since there is no pytest where it runs.
+"""
+
+import re
+import subprocess
+import sys
+import sysconfig
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+import eip_scipy
+from eip_scipy import EIPRK4, ensemble, integrate
+from eip_scipy.engine.native import BUILD
+from eip_scipy.problems import kepler, solar_system, soliton
+
+MEGABYTES = 5
+# Of the defects; without projection those of the first example are 9e-5.
+BOUND = 1e-11
+
+package = Path(eip_scipy.__file__).parent
+assert package == Path(sysconfig.get_path("platlib")) / "eip_scipy", f"{package} is not the installed package"
+files = metadata.files("eip_scipy")
+assert files is not None
+size = sum(Path(file.locate()).stat().st_size for file in files if file.suffix != ".pyc")
+assert size < MEGABYTES * 1e6, f"our own files take {size / 1e6:.1f} MB"
+assert not any(file.suffix in (".cpp", ".hpp") for file in files)
+
+# The README's first example; the README is the wheel's description.
+example = re.search(r"^```python\n(.*?)^```$", metadata.metadata("eip_scipy").get_payload(), re.MULTILINE | re.DOTALL)
+names: dict = {}
+exec(example[1], names)
+assert np.ptp(names["H"](0, names["sol"].y)) < BOUND
+
+
+for problem, t_span in (kepler(), (0, 100)), (solar_system(), (0, 100)), (soliton(), (0, 1)):
+    run = integrate(problem, t_span, method=EIPRK4)
+    assert run.success, run.message
+    assert run.trusted, run.message
+    assert max(run.diagnostics.max_defect) < BOUND, run.diagnostics
+starts = np.array([[0.4, 0, 0, 2], [0.5, 0, 0, 1.7]])
+members = ensemble(kepler(), (0, 10), starts, method=EIPRK4, compiled=False)
+assert members.success, members.message
+
+subprocess.run([Path(sysconfig.get_path("scripts")) / "eip-scipy", "--help"], check=True, stdout=subprocess.DEVNULL)
+print(f"eip_scipy {eip_scipy.__version__} ({BUILD.__name__}) on {sys.version.split()[0]}: {size / 1e6:.2f} MB, works")
