@@ -307,6 +307,7 @@ class TestCompiledExceptions:
             integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.01, **options)
         check_partial(info.value.partial)
 
+    @pytest.mark.nightly
     @pytest.mark.slow
     @pytest.mark.parametrize("wrong", ["fun", "grad", "value"])
     @pytest.mark.parametrize("late", [1, 3])

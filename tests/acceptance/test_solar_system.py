@@ -29,6 +29,7 @@ def relative_drift(run):
     return energy, momentum
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_thousand_years():
     problem = solar_system(years=2000)

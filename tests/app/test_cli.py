@@ -187,6 +187,7 @@ def test_a_method_without_estimate_has_one_metric(tmp_path, capsys, no_rebound):
 # --- what is missing ---
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_without_rebound_the_command_runs_and_says_what_to_install(tmp_path, capsys, no_rebound):
@@ -212,6 +213,7 @@ def test_without_matplotlib_the_numbers_are_there(tmp_path, capsys, no_rebound, 
 # --- runs that go wrong ---
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("little_to_time")
@@ -243,6 +245,7 @@ def test_a_failed_check_changes_the_status(tmp_path, capsys, no_rebound, monkeyp
     assert "FAILED EIPRK4 (error) keeps H" in capsys.readouterr().out
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.usefixtures("little_to_time")
 def test_a_run_that_is_not_to_be_trusted_is_told(tmp_path, capsys, no_rebound, monkeypatch):

@@ -232,6 +232,7 @@ def test_a_stationary_state(start, tmp_path, monkeypatch):
     assert all(row["field_error"] < 1e-6 for row in content["errors"])  # null, were it not finite
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")

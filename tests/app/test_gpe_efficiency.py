@@ -9,7 +9,7 @@ import pytest
 from eip_scipy.app.cli import main
 from eip_scipy.app.condensates import efficiency as gpe_efficiency
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.nightly, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

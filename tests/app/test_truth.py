@@ -62,6 +62,7 @@ def test_what_each_force_is_worth_after_a_century(tmp_path):
     assert (tmp_path / "solar-truth.png").stat().st_size > 10_000
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("years", ["1.05", "-1.05"])

@@ -761,6 +761,7 @@ def test_hook_may_project_another_raw_state():
     assert moves[:, :3].max() < 1e-11  # by the metric's floor
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 @methods

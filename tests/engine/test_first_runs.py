@@ -154,6 +154,7 @@ def test_a_disk_that_is_full_when_a_function_is_kept(doubled, tmp_path, monkeypa
     assert doubled() == 0
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_first_runs_at_once(tmp_path):
     assert [right(process) for process in [python(SMALL, NUMBA_CACHE_DIR=tmp_path) for _ in range(2)]] == [False] * 2

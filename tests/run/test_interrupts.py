@@ -139,7 +139,7 @@ except KeyboardInterrupt as error:
 
 @pytest.mark.slow
 @pytest.mark.needs_jit
-@pytest.mark.parametrize("seed", [*range(3), *(pytest.param(k, marks=pytest.mark.nightly) for k in range(3, 30))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.nightly) for k in range(1, 30))])
 def test_at_any_instant_of_compilation(seed):
     """KeyboardInterrupt within three seconds, nothing on the terminal, and the next run compiles."""
     process = subprocess.Popen(

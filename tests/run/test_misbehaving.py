@@ -119,6 +119,7 @@ def event_that_writes(t, y):
 WRITERS = [writing, writing_now_and_then, writing_by_a_view, writing_by_a_function]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @all_of_them
 @pytest.mark.parametrize("method", [EIPRK4, EIPRK45])
@@ -220,6 +221,7 @@ def test_events_that_write(how):
         np.testing.assert_array_equal(mine, other)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @needs_jit
 def test_members_of_writers_are_single_runs():
@@ -445,6 +447,7 @@ def test_compiled_functions_that_return_none(part):
         integrate(njit(fun), (0, 1), Y0, method=EIPRK4, h=0.1, invariants=kept, compiled=True)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @needs_jit
 @pytest.mark.parametrize("part", ["fun", "value", "gradient"])
