@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.caching import cached_njit
+from ..engine.native import BUILD
 from ..problems import GrossPitaevskii
 from ._common import FixedSteps
 
-__all__ = ["FieldResult", "FieldScheme", "FixedPoint", "Implicit", "march", "multiply_modes"]
+__all__ = ["FieldResult", "FieldScheme", "FixedPoint", "Implicit", "march"]
 
 MOST_ITERATIONS = 100
 WARM_STEPS = 3  # after which each branch of a scheme has been taken
 
-jit = cached_njit(error_model="numpy")
+_native = BUILD.fields  # the schemes' loops over the points, see engine/cpp/comparators/fields.cpp
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class FieldResult:
     nfev : int
         Evaluations of the nonlinear term, each with a pair of transforms: linear solves, in other words.
     wall_time : float
-        Seconds spent in the integration, compilation and plans of transforms excluded.
+        Seconds spent in the integration, plans of transforms excluded.
     message : str
         "completed", or why and where the scheme failed.
     """
@@ -148,13 +148,13 @@ class FixedPoint:
             mean = guess.copy()
         else:
             mean = self._means.pop(0)
-            extrapolate(self._means[1], self._means[0], mean)
+            _native.extrapolate(self._means[1], self._means[0], mean)
         bound = self.tol * float(np.linalg.norm(scheme.psi))
         rhs(mean, values)
         residual = math.inf
         for _ in range(MOST_ITERATIONS):
             scheme.forward(values, mean)
-            multiply_modes(mean, self._inverse)
+            _native.multiply_modes(mean, self._inverse)
             scheme.backward(mean)
             scheme.nfev += 1
             residual = rhs(mean, values)
@@ -207,10 +207,10 @@ class Implicit(FieldScheme):
 
         def rhs(mean: np.ndarray, values: np.ndarray) -> float:
             self.potential(start, mean, self._W)
-            return float(right_side(start, mean, self.rotation(mean), self._W, solver.w, solver.c, values))
+            return float(_native.right_side(start, mean, self.rotation(mean), self._W, solver.w, solver.c, values))
 
         mean, failure = solver.solve(rhs, self.psi)
-        other_end(mean, start)
+        _native.other_end(mean, start)
         return failure
 
 
@@ -261,7 +261,7 @@ def march(
 
     scheme = make(gpe, psi)
     scheme.start(psi)
-    for _ in range(WARM_STEPS):  # compiles, and measures plans of transforms
+    for _ in range(WARM_STEPS):  # measures plans of transforms
         scheme.step(steps.h)
     scheme.start(psi)
     ys[0], observed[0] = scheme.psi, observe(scheme)
@@ -278,40 +278,3 @@ def march(
             row += 1
     wall_time = perf_counter() - begin
     return FieldResult(steps.t, ys.T, scheme.nfev, wall_time, message), observed
-
-
-@jit
-def extrapolate(last, before, first):
-    """Put into `first` the parabola through first, before and last, equally spaced, one spacing further."""
-    for i in range(first.size):
-        first[i] = first[i] + 3.0 * (last[i] - before[i])
-
-
-@jit
-def multiply_modes(modes, factor):
-    """Modes times a complex factor."""
-    for i in range(modes.size):
-        modes[i] *= factor[i]
-
-
-@jit
-def right_side(start, mean, rotation, W, w, c, out):
-    """out <- start - i c ((W - w) mean + rotation), `rotation` may be empty; the norm of its change."""
-    total = 0.0
-    for i in range(start.size):
-        m = mean[i]
-        s = c * (W[i] - w)
-        value = complex(start[i].real + s * m.imag, start[i].imag - s * m.real)
-        if rotation.size > 0:
-            value += complex(c * rotation[i].imag, -c * rotation[i].real)
-        change = value - out[i]
-        total += change.real * change.real + change.imag * change.imag
-        out[i] = value
-    return np.sqrt(total)
-
-
-@jit
-def other_end(mean, start):
-    """Replace `start` by 2 mean - start."""
-    for i in range(start.size):
-        start[i] = 2.0 * mean[i] - start[i]

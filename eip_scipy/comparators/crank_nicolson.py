@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from ..engine.native import BUILD
 from ..problems import GrossPitaevskii
-from ._fields import FieldResult, Implicit, check_tol, jit, march
+from ._fields import FieldResult, Implicit, check_tol, march
 
 __all__ = ["CrankNicolson", "crank_nicolson"]
 
@@ -88,13 +89,4 @@ class CrankNicolson(Implicit):
 
     def potential(self, start: np.ndarray, mean: np.ndarray, out: np.ndarray) -> None:
         """See `Implicit`."""
-        mean_density(start, mean, self.V, self.gpe.beta, out)
-
-
-@jit
-def mean_density(start, mean, V, beta, out):
-    """out <- V + beta / 2 (|2 mean - start|^2 + |start|^2)."""
-    for i in range(start.size):
-        a = start[i]
-        b = 2.0 * mean[i] - a
-        out[i] = V[i] + 0.5 * beta * (a.real * a.real + a.imag * a.imag + b.real * b.real + b.imag * b.imag)
+        BUILD.fields.mean_density(start, mean, self.V, self.gpe.beta, out)

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from ..engine.native import BUILD
 from ..problems import GrossPitaevskii
-from ._fields import FieldResult, Implicit, check_tol, jit, march
+from ._fields import FieldResult, Implicit, check_tol, march
 from .crank_nicolson import CrankNicolson
 
 __all__ = ["LinearlyImplicit", "linearly_implicit"]
@@ -88,7 +89,7 @@ class LinearlyImplicit(Implicit):
 
     def potential(self, start: np.ndarray, mean: np.ndarray, out: np.ndarray) -> None:
         """See `Implicit`."""
-        density(self.psi, self.V, self.gpe.beta, out)
+        BUILD.fields.density(self.psi, self.V, self.gpe.beta, out)
 
     def _single_step(self, h: float) -> str:
         self._before[:] = self.psi
@@ -97,10 +98,3 @@ class LinearlyImplicit(Implicit):
         self.nfev += self._starter.nfev
         self.psi[:] = self._starter.psi
         return failure
-
-
-@jit
-def density(psi, V, beta, out):
-    """out <- V + beta |psi|^2."""
-    for i in range(psi.size):
-        out[i] = V[i] + beta * (psi[i].real * psi[i].real + psi[i].imag * psi[i].imag)

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from ..engine.native import BUILD
 from ..problems import GrossPitaevskii
-from ..problems.gross_pitaevskii.pointwise import float_rows, interaction_energy
-from ._fields import FieldResult, FieldScheme, jit, march
+from ..problems.gross_pitaevskii.pointwise import interaction_energy
+from ._fields import FieldResult, FieldScheme, march
 
 __all__ = ["SAVResult", "sav_crank_nicolson"]
 
@@ -100,9 +101,7 @@ def sav_crank_nicolson(
 
 def interaction(gpe: GrossPitaevskii, psi: np.ndarray) -> float:
     """E1, the potential and the interaction energy."""
-    columns = gpe.grid.shape[-1]
-    rows = float_rows(gpe.as_field(psi), columns)
-    return gpe.grid.cell * float(interaction_energy(rows, gpe.V.reshape(-1, columns), gpe.beta))
+    return gpe.grid.cell * float(interaction_energy(gpe.as_field(psi), gpe.V, gpe.beta))
 
 
 def _shift(gpe: GrossPitaevskii, psi: np.ndarray, shift: Any) -> float:
@@ -149,50 +148,15 @@ class _SAV(FieldScheme):
     def _new_state(self, other: np.ndarray, a: float) -> tuple[float, str]:
         """The step with b* of psi + a (psi - other), into `_new` and `_new_modes`; returns r' and a failure."""
         gpe, force = self.gpe, self._force
-        square = gpe.grid.cell * nonlinear_force(self.psi, other, a, self.V, gpe.beta, force) + self.shift
+        square = gpe.grid.cell * BUILD.fields.nonlinear_force(self.psi, other, a, self.V, gpe.beta, force) + self.shift
         if not square > 0:
             return math.nan, f"E1 + C is {square:.2g}, which must be positive; take a larger shift"
         s = 1 / math.sqrt(square)
         self.forward(force, self._new)
-        along, norm = projections(self._new, self._modes, self._inverse, self._c)
+        along, norm = BUILD.fields.projections(self._new, self._modes, self._inverse, self._c)
         weight = gpe.grid.cell / self.psi.size  # Parseval
         r_mean = (self.r + s * weight * along) / (1 + s * s * weight * norm)
-        advance(self._modes, self._inverse, self._c * r_mean * s, self._new_modes, self._new)
+        BUILD.fields.advance(self._modes, self._inverse, self._c * r_mean * s, self._new_modes, self._new)
         self.backward(self._new)
         self.nfev += 1
         return 2 * r_mean - self.r, ""
-
-
-@jit
-def nonlinear_force(psi, other, a, V, beta, out):
-    """``out <- (V + beta |p|^2) p``, ``p = psi + a (psi - other)``; returns the sum of ``V |p|^2 + beta / 2 |p|^4``."""
-    total = 0.0
-    for i in range(psi.size):
-        p = psi[i] + a * (psi[i] - other[i])
-        n = p.real * p.real + p.imag * p.imag
-        out[i] = (V[i] + beta * n) * p
-        total += (V[i] + 0.5 * beta * n) * n
-    return total
-
-
-@jit
-def projections(force, modes, inverse, c):
-    """Sums of Re conj(force) (inverse - 1) modes and of Re conj(force) i c inverse force."""
-    along = norm = 0.0
-    for i in range(force.size):
-        g, q = force[i], inverse[i]
-        d = q * modes[i] - modes[i]
-        along += g.real * d.real + g.imag * d.imag
-        norm -= c * q.imag * (g.real * g.real + g.imag * g.imag)
-    return along, norm
-
-
-@jit
-def advance(modes, inverse, factor, new_modes, force):
-    """Put into new_modes 2 inverse (modes - i factor force) - modes; into force the same over the number of points."""
-    for i in range(modes.size):
-        g = force[i]
-        source = modes[i] + complex(factor * g.imag, -factor * g.real)
-        value = 2.0 * (inverse[i] * source) - modes[i]
-        new_modes[i] = value
-        force[i] = value / modes.size

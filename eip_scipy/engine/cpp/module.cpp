@@ -1,5 +1,6 @@
 // The binding: an Engine holds a run's arrays and functions, and steps.
 #define EIP_IMPORTS_NUMPY
+#include "functions.hpp"
 #include "library_functions.hpp"
 #include "python_functions.hpp"
 #include "records.hpp"
@@ -472,6 +473,15 @@ PyModuleDef module = {
     .m_base = PyModuleDef_HEAD_INIT, .m_name = EIP_NAME, .m_doc = "The step in C++.", .m_size = -1,
 };
 
+// Functions by subject, as a module in this one.
+int add_functions(PyObject *module, const char *subject, PyMethodDef *functions) {
+    PyObject *found = PyModule_New(subject);
+    const int status = found ? PyModule_AddFunctions(found, functions) : -1;
+    const int added = status < 0 ? -1 : PyModule_AddObjectRef(module, subject, found);
+    Py_XDECREF(found);
+    return added;
+}
+
 }  // namespace
 }  // namespace eip
 
@@ -492,8 +502,11 @@ PyMODINIT_FUNC EIP_INIT() {
     if (!module) return nullptr;
     eip::failed_call_error =
         PyErr_NewExceptionWithDoc("eip_scipy.engine.FailedCallError", "A function by pointer failed.", nullptr, nullptr);
-    if (!eip::failed_call_error || !eip::add_library(module) || PyModule_AddObjectRef(module, "FailedCallError", eip::failed_call_error) < 0 ||
+    if (!eip::failed_call_error || !eip::add_library(module) ||
+        PyModule_AddObjectRef(module, "FailedCallError", eip::failed_call_error) < 0 ||
         PyModule_AddObjectRef(module, "Engine", reinterpret_cast<PyObject *>(&type)) < 0 ||
+        eip::add_functions(module, "condensates", eip::condensate_functions) < 0 ||
+        eip::add_functions(module, "fields", eip::field_functions) < 0 ||
         PyModule_AddStringConstant(module, "SOURCES", EIP_SOURCES) < 0 ||
         PyModule_AddIntConstant(module, "HAS_V3", eip::has_v3()) < 0) {
         Py_DECREF(module);

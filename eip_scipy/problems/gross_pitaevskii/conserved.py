@@ -63,13 +63,13 @@ class Energy:
         gpe = self._gpe
         energy = None
         if self._near is not None:
-            sums = expansion(*(gpe.rows(a) for a in (gpe.as_field(y), *self._near)))
+            sums = expansion(gpe.as_field(y), *self._near)
             energy = self._known.beside(*gpe._total(sums))
         return gpe.energy(y) if energy is None else energy
 
     def gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with the gradient at `y`, where the right-hand side is `f`."""
-        turn(f.view(float), 2 * self._gpe.grid.cell, out.view(float))  # 2 w H psi, and H psi = i f
+        turn(f, 2 * self._gpe.grid.cell, out)  # 2 w H psi, and H psi = i f
         # Copies: the caller may use its arrays for something else.
         if self._near is None:
             self._near = np.empty_like(y), np.empty_like(f)
@@ -140,7 +140,7 @@ class Joint:
         """
         gpe, w = self._gpe, self._gpe.grid.cell
         a, b = (0.0 if k is None else 2 * w * mu[k] for k in (self._mass, self._energy))
-        mass, square, slope = gpe._total(shifted(gpe.rows(y), gpe.rows(f), a, b, gpe.rows(out)))
+        mass, square, slope = gpe._total(shifted(y, f, a, b, out))
         if self._mass is not None:
             values[self._mass] = w * mass
         if self._energy is not None:

@@ -16,7 +16,7 @@ from ...core.problem import Problem
 from .conserved import Energy, Joint
 from .grid import Grid, Multiplier, SpectralSum
 from .moments import Moments, moments, total_mass
-from .pointwise import add_potential, derivative, derivative_at_once, float_rows
+from .pointwise import add_potential, derivative, derivative_at_once
 from .transforms import Axes, make_transforms
 
 __all__ = ["FieldProblem", "GrossPitaevskii"]
@@ -196,19 +196,14 @@ class GrossPitaevskii:
             raise ValueError(f"psi has shape {psi.shape}, expected {self.grid.shape} or ({self.grid.size},).")
         return psi.reshape(self.grid.shape)
 
-    def rows(self, psi: np.ndarray) -> np.ndarray:
-        """A contiguous field or flat state as floats (Re, Im, Re ...), a row of the grid in each row; no copy."""
-        return float_rows(psi, self.grid.shape[-1])
-
     def rhs(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
         """Fill `out` with -i H(psi) psi; both flat and contiguous, and not the same array."""
-        shape, linear = self.grid.shape, self._linear
-        psi, V, image = self.rows(y), self.V.reshape(-1, shape[-1]), self.rows(out)
-        rows_of_x = len(V) // shape[0]
-        for begin, rest in linear.parts(y.reshape(shape), out.reshape(shape)):
-            derivative(begin * rows_of_x, self.rows(rest), psi, V, self.beta, image)
+        linear, psi, image = self._linear, y.reshape(self.grid.shape), out.reshape(self.grid.shape)
+        for begin, rest in linear.parts(psi, image):
+            part = slice(begin, begin + len(rest))
+            derivative(rest, psi[part], self.V[part], self.beta, image[part])
         if linear.single:
-            derivative_at_once(psi, V, self.beta, image)
+            derivative_at_once(psi, self.V, self.beta, image)
 
     def fun(self, t: float, y: np.ndarray) -> np.ndarray:
         """-i H(psi) psi, flat: what `solve_ivp` takes."""
@@ -236,13 +231,12 @@ class GrossPitaevskii:
         psi = self.as_field(psi)
         out = np.empty_like(psi)
         self.linear(psi, out)
-        flat = (a.reshape(-1).view(float) for a in (psi, out))
-        add_potential(next(flat), self.V.reshape(-1), self.beta, next(flat))
+        add_potential(psi, self.V, self.beta, out)
         return out
 
     def mass(self, psi: Any) -> float:
         """Sum of ``|psi|^2`` over the grid, times the cell: 1 for a normalised state."""
-        return float(self.grid.cell * self._total(total_mass(self.rows(self.as_field(psi)))))
+        return float(self.grid.cell * self._total(total_mass(self.as_field(psi))))
 
     def energy(self, psi: Any) -> float:
         """Kinetic, potential, rotational and interaction energy, the last beta / 2 times the sum of ``|psi|^4``."""
@@ -251,7 +245,7 @@ class GrossPitaevskii:
 
     def moments(self, psi: np.ndarray, f: np.ndarray) -> Moments:
         """Sums over the grid that mass, energy and their gradients' products are made of; `f` as `fun` gives it."""
-        return Moments(*map(float, self._total(moments(self.rows(psi), self.rows(f)))))
+        return Moments(*map(float, self._total(moments(psi, f))))
 
     def angular_momentum(self, psi: Any) -> float:
         """Mean of Lz times the mass.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...core.inputs import refuse_units
-from .pointwise import float_rows, multiply, weighted_square
+from .pointwise import multiply, weighted_square
 from .transforms import Axes, Transforms
 
 __all__ = ["Grid", "Multiplier", "SpectralSum"]
@@ -141,7 +141,7 @@ class Multiplier:
         columns = 1 if np.shape(factor)[-1:] in ((), (1,)) and grid.dim > 1 else grid.shape[-1]
         full = np.broadcast_to(factor, (*grid.shape[:-1], columns))
         points = int(np.prod([grid.shape[axis] for axis in axes]))
-        self._columns, self._rows = grid.shape[-1], int(np.prod(grid.shape[1:-1]))  # the latter of one x
+        self._rows = int(np.prod(grid.shape[1:-1]))  # of one x
         self._factor = np.ascontiguousarray(full, dtype=float).reshape(-1, columns) / points
 
     def apply(self, fft: Transforms, psi: np.ndarray, out: np.ndarray, first: int = 0) -> None:
@@ -150,13 +150,14 @@ class Multiplier:
         Both may be a slab of the field from index `first` of x on, if x is not among the axes transformed.
         """
         fft.forward(psi, self.axes, out)
-        multiply(first * self._rows, float_rows(out, self._columns), self._factor)
+        begin = first * self._rows
+        multiply(out, self._factor[begin : begin + len(out) * self._rows])
         fft.backward(out, self.axes)
 
     def expectation(self, fft: Transforms, psi: np.ndarray, work: np.ndarray) -> float:
         """Sum over the grid of conj(psi) times the multiplied field, by Parseval's theorem one transform only."""
         fft.forward(psi, self.axes, work)
-        return float(weighted_square(float_rows(work, self._columns), self._factor))
+        return float(weighted_square(work, self._factor))
 
 
 class SpectralSum:

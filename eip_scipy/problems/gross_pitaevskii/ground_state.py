@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ...engine.sums import dot
 from .equation import GrossPitaevskii
 from .grid import Multiplier
-from .pointwise import add_potential, divide_by_root, float_rows, quartic_sums, rotate
+from .pointwise import add_potential, divide_by_root, inner, quartic_sums, rotate
 
 __all__ = ["GroundState", "ground_state"]
 
@@ -103,10 +102,6 @@ def ground_state(
     return _Descent(gpe, psi / sqrt(mass)).run(tol, max_iterations, progress)
 
 
-def _floats(field: np.ndarray) -> np.ndarray:
-    return field.reshape(-1).view(np.float64)
-
-
 class _Descent:
     """The search: psi, the direction p, and the images of both under the linear part with the potential."""
 
@@ -115,17 +110,16 @@ class _Descent:
         self.residual, self.old_residual = np.empty_like(psi), np.zeros_like(psi)
         self.p, self.image, self.p_image = np.zeros_like(psi), np.empty_like(psi), np.empty_like(psi)
         self.slope = 0.0  # <residual, preconditioned residual> of the last iteration
-        self.sums = np.zeros(5)
         self.preconditioner = _Preconditioner(gpe)
 
     def inner(self, a: np.ndarray, b: np.ndarray) -> float:
         """Re <a, b>."""
-        return self.gpe.grid.cell * float(dot(_floats(a), _floats(b)))
+        return self.gpe.grid.cell * float(inner(a, b))
 
     def apply(self, field: np.ndarray, out: np.ndarray) -> None:
         """Linear part and potential."""
         self.gpe.linear(field, out)
-        add_potential(_floats(field), self.gpe.V.reshape(-1), 0.0, _floats(out))
+        add_potential(field, self.gpe.V, 0.0, out)
 
     def run(self, tol: float, max_iterations: int, progress: Progress | None) -> GroundState:
         message, iteration = "", 0
@@ -160,9 +154,9 @@ class _Descent:
         """Fill the residual H psi - mu psi; returns mu and its norm."""
         r = self.residual
         np.copyto(r, self.image)
-        add_potential(_floats(self.psi), self.preconditioner.zero, self.gpe.beta, _floats(r))
+        add_potential(self.psi, self.preconditioner.zero, self.gpe.beta, r)
         mu = self.inner(self.psi, r)
-        rotate(_floats(r), _floats(self.psi), 1.0, -mu)
+        rotate(r, self.psi, 1.0, -mu)
         return mu, sqrt(self.inner(r, r))
 
     def turn(self) -> bool:
@@ -173,8 +167,8 @@ class _Descent:
         factor = max((slope - self.inner(old, d)) / self.slope, 0.0) if self.slope > 0 else 0.0
         self.slope, self.residual, self.old_residual = slope, old, r
         for weight in (factor, 0.0):
-            rotate(_floats(self.p), _floats(d), weight, -1.0)
-            rotate(_floats(self.p), _floats(self.psi), 1.0, -self.inner(self.psi, self.p))
+            rotate(self.p, d, weight, -1.0)
+            rotate(self.p, self.psi, 1.0, -self.inner(self.psi, self.p))
             if self.inner(r, self.p) < 0:
                 return True
         return False
@@ -183,10 +177,8 @@ class _Descent:
         """To the least energy along the great circle through psi and p; False where that does not move psi."""
         r, norm = self.old_residual, sqrt(self.inner(self.p, self.p))
         self.apply(self.p, self.p_image)
-        columns = self.psi.shape[-1]
-        quartic_sums(float_rows(self.psi, columns), float_rows(self.p, columns), self.sums)
         g = 0.5 * self.gpe.beta * self.gpe.grid.cell
-        nn, nq, mm, mq, qq = g * self.sums / norm ** np.array([0, 2, 2, 3, 4])
+        nn, nq, mm, mq, qq = g * np.array(quartic_sums(self.psi, self.p)) / norm ** np.array([0, 2, 2, 3, 4])
         a, b = self.inner(self.psi, self.image), self.inner(self.p, self.image) / norm
         c = self.inner(self.p, self.p_image) / norm**2
         tangent = _least_energy(
@@ -194,8 +186,8 @@ class _Descent:
         )
         cosine = 1 / hypot(1.0, tangent)
         sine = tangent * cosine / norm
-        rotate(_floats(self.psi), _floats(self.p), cosine, sine)
-        rotate(_floats(self.image), _floats(self.p_image), cosine, sine)
+        rotate(self.psi, self.p, cosine, sine)
+        rotate(self.image, self.p_image, cosine, sine)
         return tangent != 0.0
 
 
@@ -233,8 +225,8 @@ class _Preconditioner:
 
     def __call__(self, r: np.ndarray, psi: np.ndarray) -> np.ndarray:
         """The preconditioned residual, in a buffer."""
-        local = (_floats(psi), self._V.reshape(-1), abs(self._gpe.beta), self._a)
-        divide_by_root(_floats(r), *local, _floats(self._scaled))
+        local = (psi, self._V, abs(self._gpe.beta), self._a)
+        divide_by_root(r, *local, self._scaled)
         self._inverse.apply(self._gpe.transforms, self._scaled, self._out)
-        divide_by_root(_floats(self._out), *local, _floats(self._out))
+        divide_by_root(self._out, *local, self._out)
         return self._out

@@ -6,12 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...engine.caching import cached_njit
+from ...engine.native import BUILD
 
 __all__ = ["Moments", "expansion", "moments", "shifted", "total_mass"]
 
-# Sums in the order that suits the processor's vectors; called from Python only, so that they have one order each.
-_jit = cached_njit(error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+_native = BUILD.condensates
 
 
 class Moments(NamedTuple):
@@ -43,81 +42,16 @@ class Moments(NamedTuple):
 
 
 def moments(psi: np.ndarray, f: np.ndarray) -> Moments:
-    """The moments of a field and f there; both float views (rows, 2 m)."""
-    return Moments(*_moments(psi, f))
+    """The moments of a field and f there."""
+    return Moments(*_native.moments(psi, f))
 
 
-@_jit
-def _moments(psi, f):
-    mass = along = square = quartic = sizes = 0.0
-    for r in range(psi.shape[0]):
-        a, b = psi[r], f[r]
-        row_mass = row_along = row_square = row_quartic = row_sizes = 0.0
-        for i in range(a.size // 2):
-            x, y, u, v = a[2 * i], a[2 * i + 1], b[2 * i], b[2 * i + 1]
-            n = x * x + y * y
-            first, second = y * u, x * v
-            row_mass += n
-            row_quartic += n * n
-            row_along += first - second
-            row_sizes += abs(first) + abs(second)
-            row_square += u * u + v * v
-        mass += row_mass
-        along += row_along
-        square += row_square
-        quartic += row_quartic
-        sizes += row_sizes
-    return mass, along, square, quartic, sizes
+total_mass = _native.total_mass
+"""``total_mass(psi)``: the moment `mass` alone."""
+expansion = _native.expansion
+"""``expansion(psi, near, f)``: the sums of ``|d|^2`` and Re(conj(i f) d) for d = psi - near."""
+shifted = _native.shifted
+"""``shifted(psi, f, a, b, out)``: fill out = psi + a psi + b i f.
 
-
-@_jit
-def total_mass(psi):
-    """The moment `mass` alone."""
-    mass = 0.0
-    for r in range(psi.shape[0]):
-        row, part = psi[r], 0.0
-        for i in range(row.size):
-            part += row[i] * row[i]
-        mass += part
-    return mass
-
-
-@_jit
-def expansion(psi, near, f):
-    """Sums of ``|d|^2`` and Re(conj(i f) d) for d = psi - near; all float views (rows, 2 m)."""
-    square = slope = 0.0
-    for r in range(psi.shape[0]):
-        a, b, c = psi[r], near[r], f[r]
-        row_square = row_slope = 0.0
-        for i in range(a.size // 2):
-            x, y = a[2 * i] - b[2 * i], a[2 * i + 1] - b[2 * i + 1]
-            row_square += x * x + y * y
-            row_slope += y * c[2 * i] - x * c[2 * i + 1]
-        square += row_square
-        slope += row_slope
-    return square, slope
-
-
-@_jit
-def shifted(psi, f, a, b, out):
-    """Fill out = psi + a psi + b i f, all float views (rows, 2 m).
-
-    Returns the sums of ``|out|^2``, and of ``|d|^2`` and Re(conj(i f) d) for the difference d from psi.
-    """
-    mass = square = slope = 0.0
-    for r in range(psi.shape[0]):
-        source, image, target = psi[r], f[r], out[r]
-        row_mass = row_square = row_slope = 0.0
-        for i in range(source.size // 2):
-            x, y, u, v = source[2 * i], source[2 * i + 1], image[2 * i], image[2 * i + 1]
-            p = a * x - b * v
-            q = a * y + b * u
-            x, y = x + p, y + q
-            target[2 * i], target[2 * i + 1] = x, y
-            row_mass += x * x + y * y
-            row_square += p * p + q * q
-            row_slope += q * u - p * v
-        mass += row_mass
-        square += row_square
-        slope += row_slope
-    return mass, square, slope
+Returns the sums of ``|out|^2``, and of ``|d|^2`` and Re(conj(i f) d) for the difference d from psi.
+"""

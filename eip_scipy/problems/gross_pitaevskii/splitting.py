@@ -115,12 +115,12 @@ class Splitting:
         if h != self._h:
             self._flows, self._h = self._linear_flows(h), h
         gpe, scheme = self.gpe, self.scheme
-        V, psi = gpe.V.reshape(-1), y.reshape(gpe.grid.shape)
+        psi = y.reshape(gpe.grid.shape)
         field, work = psi, np.empty_like(psi)
         for part, flow in zip(scheme.local, self._flows, strict=False):
-            local_flow(field.reshape(-1).view(float), V, gpe.beta, part * h)
+            local_flow(field, gpe.V, gpe.beta, part * h)
             field, work = flow.apply(field, work)
-        local_flow(field.reshape(-1).view(float), V, gpe.beta, scheme.local[-1] * h)
+        local_flow(field, gpe.V, gpe.beta, scheme.local[-1] * h)
         if field is not psi:
             psi[...] = field
         return y

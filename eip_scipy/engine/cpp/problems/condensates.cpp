@@ -1,0 +1,388 @@
+// The Gross-Pitaevskii equation point by point, and sums over its fields.
+//
+// Sums are those of blocks of a few hundred points, each in lanes of its own: the same bits on every machine, and the
+// error of a sum over a few hundred numbers, not of one over all.
+#include <cmath>
+
+#include "../arguments.hpp"
+#include "../functions.hpp"
+#include "../pairs.hpp"
+
+namespace eip {
+namespace {
+
+constexpr npy_intp BLOCK = 512;  // floats
+
+// Pointwise terms.
+
+// Times real factors, as many or, one for each row, (rows, 1).
+void multiply(Field field, ConstReals factor) {
+    const npy_intp columns = field.columns;
+    const bool by_rows = factor.columns == 1 && factor.points * columns == field.points;
+    require(by_rows || factor.points == field.points, "multiply: expected a factor for each point, or for each row");
+    const Released released(field.points);
+    double *z = field.data;
+    if (!by_rows) {
+        for (npy_intp i = 0; i < field.points; ++i) {
+            z[2 * i] *= factor.data[i];
+            z[2 * i + 1] *= factor.data[i];
+        }
+        return;
+    }
+    for (npy_intp r = 0; r < factor.points; ++r, z += 2 * columns)
+        for (npy_intp i = 0; i < 2 * columns; ++i) z[i] *= factor.data[r];
+}
+
+// out = -i (out + rest + (V + beta |psi|^2) psi).
+void derivative(ConstField rest, ConstField psi, ConstReals V, double beta, Field out) {
+    require_one_length(rest, psi, V, out);
+    const Released released(psi.points);
+    for (npy_intp i = 0; i < psi.points; ++i) {
+        const double a = psi.data[2 * i], b = psi.data[2 * i + 1];
+        const double v = V.data[i] + beta * (a * a + b * b);
+        const double re = out.data[2 * i] + rest.data[2 * i] + v * a;
+        const double im = out.data[2 * i + 1] + rest.data[2 * i + 1] + v * b;
+        out.data[2 * i] = im;
+        out.data[2 * i + 1] = -re;
+    }
+}
+
+// out = -i (out + (V + beta |psi|^2) psi).
+void derivative_at_once(ConstField psi, ConstReals V, double beta, Field out) {
+    require_one_length(psi, V, out);
+    const Released released(psi.points);
+    for (npy_intp i = 0; i < psi.points; ++i) {
+        const double a = psi.data[2 * i], b = psi.data[2 * i + 1];
+        const double v = V.data[i] + beta * (a * a + b * b);
+        const double re = out.data[2 * i] + v * a, im = out.data[2 * i + 1] + v * b;
+        out.data[2 * i] = im;
+        out.data[2 * i + 1] = -re;
+    }
+}
+
+// out += (V + beta |psi|^2) psi.
+void add_potential(ConstField psi, ConstReals V, double beta, Field out) {
+    require_one_length(psi, V, out);
+    const Released released(psi.points);
+    for (npy_intp i = 0; i < psi.points; ++i) {
+        const double a = psi.data[2 * i], b = psi.data[2 * i + 1];
+        const double v = V.data[i] + beta * (a * a + b * b);
+        out.data[2 * i] += v * a;
+        out.data[2 * i + 1] += v * b;
+    }
+}
+
+// pi / 2 in two parts (Cody & Waite): whole multiples of the first, up to 2^20 of them, are exact.
+constexpr double QUARTER = 0x1.921fb544p+0, QUARTER_LOW = 0x1.0b4611a626331p-34, QUARTERS = 0x1.45f306dc9c883p-1;
+
+// The nearest whole number, below 2^51: for vectors of every processor, as std::floor is not.
+inline double whole(double x) {
+    constexpr double SHIFT = 0x1.8p52;
+    return (x + SHIFT) - SHIFT;
+}
+
+// The phase exp(-i angle). Sine and cosine are their Taylor polynomials on [-pi/4, pi/4], without a branch: a loop over
+// angles becomes vector code. To 1e-15 for angles up to 1e6.
+inline void put_phase(double angle, double *phase) {
+    const double k = whole(angle * QUARTERS);
+    const double r = (angle - k * QUARTER) - k * QUARTER_LOW;
+    const double q = r * r;
+    double s = 1.0 / 362880 + q * (-1.0 / 39916800 + q * (1.0 / 6227020800 + q * (-1.0 / 1307674368000)));
+    s = r * (1 + q * (-1.0 / 6 + q * (1.0 / 120 + q * (-1.0 / 5040 + q * s))));
+    double c = -1.0 / 3628800 + q * (1.0 / 479001600 + q * (-1.0 / 87178291200 + q * (1.0 / 20922789888000)));
+    c = 1 - q * (0.5 - q * (1.0 / 24 + q * (-1.0 / 720 + q * (1.0 / 40320 + q * c))));
+    const double turn = k - 4 * whole(0.25 * k - 0.375);  // 0, 1, 2 or 3 quarters
+    const bool odd = (turn == 1.0) | (turn == 3.0);
+    const double cosine = odd ? s : c, sine = odd ? c : s;
+    phase[0] = (turn == 1.0) | (turn == 2.0) ? -cosine : cosine;
+    phase[1] = turn >= 2.0 ? sine : -sine;
+}
+
+// psi <- exp(-i h (V + beta |psi|^2)) psi.
+void local_flow(Field psi, ConstReals V, double beta, double h) {
+    require_one_length(psi, V);
+    const Released released(psi.points);
+    double phases[BLOCK];
+    const npy_intp floats = 2 * psi.points;
+    for (npy_intp begin = 0; begin < floats; begin += BLOCK) {
+        double *z = psi.data + begin;
+        const double *v = V.data + begin / 2;
+        const npy_intp count = std::min(BLOCK, floats - begin);
+        for (npy_intp i = 0; i < count; i += 2)
+            put_phase(h * (v[i / 2] + beta * (z[i] * z[i] + z[i + 1] * z[i + 1])), phases + i);
+        for (npy_intp i = 0; i < count; i += WIDTH)
+            store_some(times(load_some(phases + i, count - i), load_some(z + i, count - i)), z + i, count - i);
+    }
+}
+
+// out = i factor f.
+void turn(ConstField f, double factor, Field out) {
+    require_one_length(f, out);
+    const Released released(f.points);
+    for (npy_intp i = 0; i < f.points; ++i) {
+        const double re = f.data[2 * i], im = f.data[2 * i + 1];
+        out.data[2 * i] = -factor * im;
+        out.data[2 * i + 1] = factor * re;
+    }
+}
+
+// out = a / sqrt(shift + V + beta |psi|^2).
+void divide_by_root(ConstField a, ConstField psi, ConstReals V, double beta, double shift, Field out) {
+    require_one_length(a, psi, V, out);
+    const Released released(psi.points);
+    for (npy_intp i = 0; i < psi.points; ++i) {
+        const double x = psi.data[2 * i], y = psi.data[2 * i + 1];
+        const double weight = 1 / std::sqrt(shift + V.data[i] + beta * (x * x + y * y));
+        out.data[2 * i] = weight * a.data[2 * i];
+        out.data[2 * i + 1] = weight * a.data[2 * i + 1];
+    }
+}
+
+// a <- c a + s b.
+void rotate(Field a, ConstField b, double c, double s) {
+    require_one_length(a, b);
+    const Released released(a.points);
+    for (npy_intp i = 0; i < 2 * a.points; ++i) a.data[i] = c * a.data[i] + s * b.data[i];
+}
+
+// Sums.
+
+// Those of a block or more.
+template <class Term, std::size_t N>
+void sum_blocks(npy_intp floats, std::array<double, N> &total, Term part) {
+    for (npy_intp begin = 0; begin < floats; begin += BLOCK) {
+        const std::array<double, N> sums = part(begin, std::min(begin + BLOCK, floats));
+        for (std::size_t k = 0; k < N; ++k) total[k] += sums[k];
+    }
+}
+
+// The sum over the imaginary parts, the odd lanes, less that over the real ones.
+inline double odd_less_even(const Lanes &lanes) {
+    double lane[LANES];
+    std::memcpy(lane, lanes.part, sizeof lane);
+    return ((lane[1] + lane[5]) + (lane[3] + lane[7])) - ((lane[0] + lane[4]) + (lane[2] + lane[6]));
+}
+
+// The last floats of up to three fields, filled up with zeros, whose terms are 0.
+struct Tail {
+    double of[3][LANES] = {};
+    Tail(npy_intp count, std::initializer_list<const double *> from) {
+        double(*copy)[LANES] = of;
+        for (const double *first : from) std::copy_n(first, count, *copy++);
+    }
+};
+
+struct MomentSums {
+    Lanes mass, along, square, quartic, sizes;
+
+    void add(const double *psi, const double *f) {
+        for (int k = 0; k < VECTORS; ++k) {
+            const Vector z = load(psi + k * WIDTH), g = load(f + k * WIDTH);
+            const Vector squares = z * z, density = squares + swapped(squares), crossed = z * swapped(g);
+            mass.part[k] += squares;
+            square.part[k] += g * g;
+            quartic.part[k] += density * density;
+            along.part[k] += crossed;
+            sizes.part[k] += absolute(crossed);
+        }
+    }
+
+    // Each |psi|^4 stands in two lanes.
+    std::array<double, 5> sums() const {
+        return {mass.sum(), odd_less_even(along), square.sum(), 0.5 * quartic.sum(), sizes.sum()};
+    }
+};
+
+// Of psi and f = -i H psi the sums of |psi|^2, Re(conj(psi) H psi), |H psi|^2 and |psi|^4, and of the sizes of the second
+// one's terms.
+std::array<double, 5> moments(ConstField psi, ConstField f) {
+    require_one_length(psi, f);
+    const Released released(psi.points);
+    std::array<double, 5> total{};
+    sum_blocks(2 * psi.points, total, [&](npy_intp begin, npy_intp end) {
+        MomentSums block;
+        npy_intp i = begin;
+        for (; i + LANES <= end; i += LANES) block.add(psi.data + i, f.data + i);
+        if (i < end) {
+            const Tail tail(end - i, {psi.data + i, f.data + i});
+            block.add(tail.of[0], tail.of[1]);
+        }
+        return block.sums();
+    });
+    return total;
+}
+
+// The sum of |psi|^2.
+double total_mass(ConstField psi) {
+    const Released released(psi.points);
+    std::array<double, 1> total{};
+    sum_blocks(2 * psi.points, total, [&](npy_intp begin, npy_intp end) {
+        return std::array{dot(psi.data + begin, psi.data + begin, end - begin)};
+    });
+    return total[0];
+}
+
+struct ExpansionSums {
+    Lanes square, slope;
+
+    void add(const double *psi, const double *near, const double *f) {
+        for (int k = 0; k < VECTORS; ++k) {
+            const Vector d = load(psi + k * WIDTH) - load(near + k * WIDTH);
+            square.part[k] += d * d;
+            slope.part[k] += d * swapped(load(f + k * WIDTH));
+        }
+    }
+};
+
+// Sums of |d|^2 and Re(conj(i f) d) for d = psi - near.
+std::array<double, 2> expansion(ConstField psi, ConstField near, ConstField f) {
+    require_one_length(psi, near, f);
+    const Released released(psi.points);
+    std::array<double, 2> total{};
+    sum_blocks(2 * psi.points, total, [&](npy_intp begin, npy_intp end) {
+        ExpansionSums block;
+        npy_intp i = begin;
+        for (; i + LANES <= end; i += LANES) block.add(psi.data + i, near.data + i, f.data + i);
+        if (i < end) {
+            const Tail tail(end - i, {psi.data + i, near.data + i, f.data + i});
+            block.add(tail.of[0], tail.of[1], tail.of[2]);
+        }
+        return std::array{block.square.sum(), odd_less_even(block.slope)};
+    });
+    return total;
+}
+
+struct ShiftSums {
+    Lanes mass, square, slope;
+
+    void add(const double *psi, const double *f, double a, Vector b, double *out) {
+        for (int k = 0; k < VECTORS; ++k) {
+            const Vector z = load(psi + k * WIDTH), turned = swapped(load(f + k * WIDTH));
+            const Vector d = a * z + b * turned, shifted = z + d;
+            store(shifted, out + k * WIDTH);
+            mass.part[k] += shifted * shifted;
+            square.part[k] += d * d;
+            slope.part[k] += d * turned;
+        }
+    }
+};
+
+// out = psi + a psi + b i f; the sums of |out|^2, and of |d|^2 and Re(conj(i f) d) for the difference d from psi.
+std::array<double, 3> shifted(ConstField psi, ConstField f, double a, double b, Field out) {
+    require_one_length(psi, f, out);
+    const Released released(psi.points);
+    const Vector factor = turning(b);
+    std::array<double, 3> total{};
+    sum_blocks(2 * psi.points, total, [&](npy_intp begin, npy_intp end) {
+        ShiftSums block;
+        npy_intp i = begin;
+        for (; i + LANES <= end; i += LANES) block.add(psi.data + i, f.data + i, a, factor, out.data + i);
+        if (i < end) {
+            const Tail tail(end - i, {psi.data + i, f.data + i});
+            double last[LANES];
+            block.add(tail.of[0], tail.of[1], a, factor, last);
+            std::copy_n(last, end - i, out.data + i);
+        }
+        return std::array{block.mass.sum(), block.square.sum(), odd_less_even(block.slope)};
+    });
+    return total;
+}
+
+// Re <a, b>.
+double inner(ConstField a, ConstField b) {
+    require_one_length(a, b);
+    const Released released(a.points);
+    return dot(a.data, b.data, 2 * a.points);
+}
+
+// The sum of a term of each point, in four lanes.
+template <class Term>
+double sum_of_points(npy_intp points, Term term) {
+    std::array<double, 1> total{};
+    sum_blocks(points, total, [&](npy_intp begin, npy_intp end) {
+        double a = 0.0, b = 0.0, c = 0.0, d = 0.0;
+        npy_intp i = begin;
+        for (; i + 4 <= end; i += 4) {
+            a += term(i);
+            b += term(i + 1);
+            c += term(i + 2);
+            d += term(i + 3);
+        }
+        for (; i < end; ++i) a += term(i);
+        return std::array{(a + b) + (c + d)};
+    });
+    return total[0];
+}
+
+// Sum of weight |field|^2; a weight for each point or, (rows, 1), for each row.
+double weighted_square(ConstField field, ConstReals weight) {
+    const npy_intp columns = field.columns;
+    const bool by_rows = weight.columns == 1 && weight.points * columns == field.points;
+    require(by_rows || weight.points == field.points, "weighted_square: expected a weight for each point, or row");
+    const Released released(field.points);
+    const double *z = field.data, *w = weight.data;
+    if (by_rows) {
+        double total = 0.0;
+        for (npy_intp r = 0; r < weight.points; ++r, z += 2 * columns) total += w[r] * dot(z, z, 2 * columns);
+        return total;
+    }
+    return sum_of_points(field.points, [=](npy_intp i) {
+        return w[i] * (z[2 * i] * z[2 * i] + z[2 * i + 1] * z[2 * i + 1]);
+    });
+}
+
+// Sum of V |psi|^2 + beta / 2 |psi|^4.
+double interaction_energy(ConstField psi, ConstReals V, double beta) {
+    require_one_length(psi, V);
+    const Released released(psi.points);
+    const double half = 0.5 * beta, *z = psi.data;
+    return sum_of_points(psi.points, [=](npy_intp i) {
+        const double n = z[2 * i] * z[2 * i] + z[2 * i + 1] * z[2 * i + 1];
+        return (V.data[i] + half * n) * n;
+    });
+}
+
+// Sums of nn, nq, mm, mq and qq, where n = |psi|^2, m = Re(conj(psi) p), q = |p|^2.
+std::array<double, 5> quartic_sums(ConstField psi, ConstField p) {
+    require_one_length(psi, p);
+    const Released released(psi.points);
+    std::array<double, 5> total{};
+    sum_blocks(psi.points, total, [&](npy_intp begin, npy_intp end) {
+        std::array<double, 5> part{};
+        for (npy_intp i = begin; i < end; ++i) {
+            const double x = psi.data[2 * i], y = psi.data[2 * i + 1], u = p.data[2 * i], v = p.data[2 * i + 1];
+            const double n = x * x + y * y, m = x * u + y * v, q = u * u + v * v;
+            part[0] += n * n;
+            part[1] += n * q;
+            part[2] += m * m;
+            part[3] += m * q;
+            part[4] += q * q;
+        }
+        return part;
+    });
+    return total;
+}
+
+}  // namespace
+
+PyMethodDef condensate_functions[] = {
+    bound<"multiply", multiply>("multiply(field, factor)"),
+    bound<"derivative", derivative>("derivative(rest, psi, V, beta, out)"),
+    bound<"derivative_at_once", derivative_at_once>("derivative_at_once(psi, V, beta, out)"),
+    bound<"add_potential", add_potential>("add_potential(psi, V, beta, out)"),
+    bound<"local_flow", local_flow>("local_flow(psi, V, beta, h)"),
+    bound<"turn", turn>("turn(f, factor, out)"),
+    bound<"divide_by_root", divide_by_root>("divide_by_root(a, psi, V, beta, shift, out)"),
+    bound<"rotate", rotate>("rotate(a, b, c, s)"),
+    bound<"moments", moments>("moments(psi, f) -> mass, along, square, quartic, sizes"),
+    bound<"total_mass", total_mass>("total_mass(psi) -> float"),
+    bound<"expansion", expansion>("expansion(psi, near, f) -> square, slope"),
+    bound<"shifted", shifted>("shifted(psi, f, a, b, out) -> mass, square, slope"),
+    bound<"inner", inner>("inner(a, b) -> float"),
+    bound<"weighted_square", weighted_square>("weighted_square(field, weight) -> float"),
+    bound<"interaction_energy", interaction_energy>("interaction_energy(psi, V, beta) -> float"),
+    bound<"quartic_sums", quartic_sums>("quartic_sums(psi, p) -> nn, nq, mm, mq, qq"),
+    {nullptr, nullptr, 0, nullptr},
+};
+
+}  // namespace eip

@@ -1,0 +1,116 @@
+"""The engine's functions of whole arrays: what they refuse, and the same bits from both builds."""
+
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+from eip_scipy.engine.native import BUILD
+
+CALLS = {  # z: complex and written, w: complex, V: real, n: real and written
+    "condensates.add_potential": ("w", "V", 0.7, "z"),
+    "condensates.derivative": ("w", "w", "V", 0.7, "z"),
+    "condensates.derivative_at_once": ("w", "V", 0.7, "z"),
+    "condensates.divide_by_root": ("w", "w", "V", 0.7, 9.0, "z"),
+    "condensates.expansion": ("w", "w", "w"),
+    "condensates.inner": ("w", "w"),
+    "condensates.interaction_energy": ("w", "V", 0.7),
+    "condensates.local_flow": ("z", "V", 0.7, 30.0),
+    "condensates.moments": ("w", "w"),
+    "condensates.multiply": ("z", "V"),
+    "condensates.quartic_sums": ("w", "w"),
+    "condensates.rotate": ("z", "w", 0.3, -0.4),
+    "condensates.shifted": ("w", "w", 0.1, 0.2, "z"),
+    "condensates.total_mass": ("w",),
+    "condensates.turn": ("w", 0.3, "z"),
+    "condensates.weighted_square": ("w", "V"),
+    "fields.advance": ("w", "w", 0.3, "z", "z"),
+    "fields.density": ("w", "V", 0.7, "n"),
+    "fields.extrapolate": ("w", "w", "z"),
+    "fields.mean_density": ("w", "w", "V", 0.7, "n"),
+    "fields.multiply_modes": ("z", "w"),
+    "fields.nonlinear_force": ("w", "w", 0.3, "V", 0.7, "z"),
+    "fields.other_end": ("w", "z"),
+    "fields.projections": ("w", "w", "w", 0.3),
+    "fields.right_side": ("w", "w", "w", "V", 0.3, 0.1, "z"),
+}
+
+
+def functions(build):
+    return {f"{subject}.{name}": value for subject in ("condensates", "fields")
+            for name, value in vars(getattr(build, subject)).items() if callable(value)}  # fmt: skip
+
+
+def arguments(kinds, n):
+    rng = np.random.default_rng(11)
+    made = {"z": lambda: rng.standard_normal(2 * n).view(complex), "n": lambda: rng.standard_normal(n)}
+    return [made["z" if kind in "zw" else "n"]() if isinstance(kind, str) else kind for kind in kinds]
+
+
+def test_every_function_is_listed_here():
+    names = {name for name, value in functions(BUILD).items() if not name.rpartition(".")[2].startswith("__")}
+    assert names == set(CALLS)
+
+
+@pytest.mark.skipif(not BUILD.HAS_V3, reason="needs a processor with AVX2 and FMA")
+@pytest.mark.parametrize("n", [1, 7, 64, 1027])
+@pytest.mark.parametrize("name", CALLS)
+def test_both_builds_give_the_same_bits(name, n):
+    found = []
+    for build in ("_native", "_native_v3"):
+        given = arguments(CALLS[name], n)
+        value = functions(import_module(f"eip_scipy.engine.{build}"))[name](*given)
+        found.append([() if value is None else value, *given])
+    for plain, fast in zip(*found, strict=True):
+        np.testing.assert_array_equal(plain, fast)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_what_is_no_such_array_is_refused(name):
+    """In each place: no array, another type, gaps, no axis, and read-only where it is written."""
+    function, kinds = functions(BUILD)[name], CALLS[name]
+    for k, kind in enumerate(kinds):
+        if not isinstance(kind, str):
+            continue
+        good = arguments(kinds, 6)
+        frozen = good[k].copy()
+        frozen.flags.writeable = False
+        wrong = [good[k].tolist(), good[k].astype(np.complex64), np.repeat(good[k], 2)[::2], good[k][0]]
+        wrong += [np.zeros(3)] if kind in "zw" else [good[k].astype(complex)]
+        wrong += [frozen] if kind in "zn" else []
+        for array in wrong:
+            with pytest.raises((TypeError, ValueError), match=f"{name.partition('.')[2]}: argument {k + 1} is"):
+                function(*good[:k], array, *good[k + 1 :])
+
+
+@pytest.mark.parametrize("name", [name for name, kinds in CALLS.items() if sum(map(str.isalpha, map(str, kinds))) > 1])
+def test_arrays_of_different_lengths_are_refused(name):
+    function, kinds = functions(BUILD)[name], CALLS[name]
+    given = arguments(kinds, 6)
+    last = max(k for k, kind in enumerate(kinds) if isinstance(kind, str))
+    given[last] = given[last][:4].copy()
+    with pytest.raises(ValueError, match="expected"):
+        function(*given)
+
+
+def test_arguments_are_counted_and_numbers_are_numbers():
+    multiply, turn = BUILD.condensates.multiply, BUILD.condensates.turn
+    with pytest.raises(TypeError, match="multiply takes 2 arguments, got 1"):
+        multiply(np.zeros(3, complex))
+    with pytest.raises(TypeError, match="real number"):
+        turn(np.zeros(3, complex), "1", np.zeros(3, complex))
+
+
+@pytest.mark.parametrize("name", ["multiply", "weighted_square"])
+def test_factors_of_rows(name):
+    field = np.arange(24.0).view(complex).reshape(3, 4)
+    rows = np.array([[1.0], [2.0], [-3.0]])
+    each, by_row = (
+        (getattr(BUILD.condensates, name)(copy, factor), copy)
+        for factor in (np.repeat(rows, 4, axis=1), rows)
+        for copy in [field.copy()]
+    )
+    assert each[0] == by_row[0]
+    np.testing.assert_array_equal(each[1], by_row[1])
+    with pytest.raises(ValueError, match=f"{name}: expected a"):
+        getattr(BUILD.condensates, name)(field, np.ones((2, 1)))
