@@ -1,4 +1,4 @@
-"""What the comparators share: arguments, the loop over fixed steps, and the record that comes back."""
+"""What the comparators share: arguments, functions as the engine takes them, and the record that comes back."""
 
 from __future__ import annotations
 
@@ -9,26 +9,24 @@ from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import types
-from numba.core.dispatcher import Dispatcher
-from numba.core.errors import NumbaError
-from numba.extending import register_jitable
 
 from ..core.inputs import reals, refuse_units, shown
+from ..core.jitted import NotCompilableError
+from ..core.native_functions import Kind, function_alone, raise_again
+from ..core.pointers import by_pointer, is_pointer
 from ..core.stepping import check_fixed_step, fixed_steps, saved_steps
+from ..engine.data import make_work
+from ..engine.native import BUILD, Call, FailedCallError, NativeFunctions, PythonFunctions, call
 
 __all__ = [
     "FixedStepResult",
     "FixedSteps",
     "check_state",
-    "drive_signature",
-    "drive_steps",
-    "integrate_in_place",
-    "message",
+    "fill_in_place",
+    "functions_of",
     "real_vector",
+    "take_steps",
 ]
-
-VECTOR = types.float64[::1]
 
 
 @dataclass(frozen=True)
@@ -129,98 +127,66 @@ def message(reason: str, t: np.ndarray, ys: np.ndarray) -> str:
     return f"{text}; the saved states from t={t[np.argmin(finite)].item()!r} on are not finite"
 
 
-def _in_place_signature(n_extra: int) -> Any:
-    """Signature of ``fun(t, y, out[, params]) -> None``."""
-    return types.void(types.float64, VECTOR, VECTOR, *[VECTOR] * n_extra)
-
-
-def drive_signature(n_extra: int) -> Any:
-    """Signature of a loop over `drive_steps`.
-
-    With the function typed as a first-class function the machine code does not depend on it and is found in Numba's
-    cache by the next process.
-    """
-    fun, counts = types.FunctionType(_in_place_signature(n_extra)), types.int64[::1]
-    steps = [types.float64] * 3
-    return types.void(
-        fun, types.UniTuple(VECTOR, n_extra), *steps, counts, VECTOR, VECTOR, counts, VECTOR, types.float64[:, ::1]
-    )
-
-
-def _why_interpreted(fun: Callable[..., Any], name: str, n_extra: int) -> str:
-    """Why a function that fills its third argument cannot enter the compiled loop; empty when it can."""
-    if not isinstance(fun, Dispatcher):
-        return f"{name} is not jitted by Numba"
-    signature = _in_place_signature(n_extra)
+def functions_of(
+    fun: Callable[..., Any],
+    in_python: Call,
+    kind: Kind,
+    name: str,
+    params: np.ndarray | None,
+    *,
+    second_order: bool = False,
+) -> tuple[NativeFunctions | PythonFunctions, str]:
+    """A user's function as the engine takes it, by its address or `in_python`; and why not by its address, if not."""
     try:
-        fun.compile(signature.args)
-    except (NumbaError, RuntimeError):
-        return f"{name} does not compile as {name}{signature}"
-    returned = {known.args: known.return_type for known in fun.nopython_signatures}.get(signature.args)
-    return "" if returned == types.none else f"{name} returns {returned}, expected to fill its third argument"
+        return function_alone(fun, kind, name, params, second_order=second_order), ""
+    except NotCompilableError as error:
+        return PythonFunctions(in_python, (), (), (), second_order), str(error)
 
 
-def integrate_in_place(
+def fill_in_place(
+    scheme: str,
     fun: Callable[..., Any],
     name: str,
-    compiled_drive: Callable[[int], Callable[..., None]],
-    drive: Callable[..., None],
-    t_span: tuple[float, float],
+    kind: Kind,
+    steps: FixedSteps,
     y: np.ndarray,
-    h: float,
     params: Any,
-    save_every: int | None,
-    constants: np.ndarray,
-    work: np.ndarray,
+    constant: float = 0.0,
 ) -> FixedStepResult:
-    """Run a comparator whose function is ``fun(t, y, out[, params])``; arguments checked, compiled where possible.
-
-    Parameters
-    ----------
-    fun, name
-        The user's function, and what the messages call it.
-    compiled_drive, drive
-        ``drive(fun, extra, t0, h, last_step, saved, constants, work, count, y, ys)``, compiled for so many extra
-        arguments, and as it is.
-    t_span, y, h, params, save_every
-        As the user gave them; `y` from `check_state`.
-    constants, work : ndarray
-        Of the step; `work` is all zero at its first call.
-    """
-    if not callable(fun):
+    """Run a comparator whose function is ``fun(t, x, out[, params])``, x the state's first ``kind.size`` numbers."""
+    if not callable(fun) and not is_pointer(fun):
         raise TypeError(f"{name} must be callable, got {fun!r}")
-    steps = FixedSteps.of(t_span, h, save_every)
-    extra = () if params is None else (real_vector(params, "params"),)
-    reason = _why_interpreted(fun, name, len(extra))
-    run = drive if reason else compiled_drive(len(extra))
-    count = np.zeros(1, dtype=np.int64)
+    given = None if params is None else real_vector(params, "params")
+    fun, size = by_pointer(fun, name), kind.size
+
+    def called(t: float, y: np.ndarray, out: np.ndarray, *extra: np.ndarray) -> None:
+        fun(t, y[:size], out, *extra)
+
+    in_python = call(called, () if given is None else (given,), kind.shape, None, in_place=True)
+    kind = kind._replace(p=-1 if given is None else given.size)
+    functions, reason = functions_of(fun, in_python, kind, name, given)
+    return take_steps(scheme, functions, steps, y, reason, constant)
+
+
+def take_steps(
+    scheme: str,
+    functions: NativeFunctions | PythonFunctions,
+    steps: FixedSteps,
+    y: np.ndarray,
+    reason: str,
+    constant: float = 0.0,
+) -> FixedStepResult:
+    """All steps from y, which moves, by a scheme of engine/cpp/comparators; `reason` says why they are interpreted."""
     ys = np.full((steps.saved.size, y.size), np.nan)
     ys[0] = y
-
-    def advance(to_save: np.ndarray) -> None:
-        run(fun, extra, steps.t0, steps.h, steps.last, to_save, constants, work, count, y, ys)
-
-    # Saving nothing but the start takes no step: whatever is still to be compiled or bound is so before the clock runs.
-    advance(steps.saved[:1])
+    work = make_work(y.size, np.dtype(float), 1, 0, 0)
     start = perf_counter()
-    advance(steps.saved)
-    wall_time = perf_counter() - start
-    return FixedStepResult(steps.t, ys.T, int(count[0]), wall_time, message(reason, steps.t, ys))
-
-
-@register_jitable
-def drive_steps(step, fun, extra, t0, h, last_step, saved, constants, work, count, y, ys):
-    """Take saved[-1] steps; ys[row] receives the state after step saved[row]. `extra` is () or (params,).
-
-    ``step(fun, extra, t, h, constants, work, count, y) -> bool`` moves `y` by one step; False: it could not, and the
-    rest of `ys` is left as it is.
-    """
-    n_steps = saved[-1]
-    row = 1
-    for k in range(n_steps):
-        length = last_step if k == n_steps - 1 else h
-        if not step(fun, extra, t0 + k * h, length, constants, work, count, y):
-            return
-        if k + 1 == saved[row]:
-            ys[row] = y
-            row += 1
+    try:
+        evaluations = BUILD.comparators.take_steps(scheme, constant, functions, work, steps, y, ys)
+    except FailedCallError as error:
+        failed = error.args
+    else:
+        wall_time = perf_counter() - start
+        return FixedStepResult(steps.t, ys.T, evaluations, wall_time, message(reason, steps.t, ys))
+    assert isinstance(functions, NativeFunctions)  # those in Python raise their own errors
+    raise_again(functions, *failed)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
-from numba.extending import register_jitable
 
 from ..core.inputs import refuse_units
-from ..engine.caching import cached_njit
-from ._common import FixedStepResult, check_state, drive_signature, drive_steps, integrate_in_place
+from ..core.native_functions import Kind
+from ._common import FixedStepResult, FixedSteps, check_state, fill_in_place
 
 __all__ = ["boris"]
 
@@ -37,7 +35,7 @@ def boris(
     ----------
     fields : callable
         ``fields(t, x, out[, params])`` fills out[:3] with E and out[3:] with B; see `ParticleField.fill`. A function
-        jitted lazily by Numba runs compiled, any other callable interpreted, through the same loop.
+        jitted by Numba and a C function by pointer run compiled, any other callable interpreted, in the same loop.
     t_span : tuple of float
         Start and end; a smaller end integrates backward.
     y0 : array_like, shape (6,)
@@ -83,43 +81,6 @@ def boris(
     refuse_units(mass=mass, charge=charge)
     if not (mass > 0 and np.isfinite(mass) and np.isfinite(charge)):
         raise ValueError(f"mass must be positive and charge finite, got {mass!r} and {charge!r}")
-    constants = np.array([charge / mass])
-    return integrate_in_place(
-        fields, "fields", _compiled_drive, _drive, t_span, y, h, params, save_every, constants, np.zeros(6)
-    )
-
-
-@register_jitable
-def _step(fields, extra, t, h, constants, work, count, y):
-    """One step in place."""
-    half = 0.5 * h
-    kick = constants[0] * half
-    for i in range(3):
-        y[i] += half * y[i + 3]
-    fields(t + half, y[:3], work, *extra)
-    count[0] += 1
-    u = y[3] + kick * work[0]
-    v = y[4] + kick * work[1]
-    w = y[5] + kick * work[2]
-    a, b, c = kick * work[3], kick * work[4], kick * work[5]
-    s = 2.0 / (1.0 + a * a + b * b + c * c)
-    # v' = v + v x t, then v + v' x s.
-    p = u + v * c - w * b
-    q = v + w * a - u * c
-    r = w + u * b - v * a
-    y[3] = u + s * (q * c - r * b) + kick * work[0]
-    y[4] = v + s * (r * a - p * c) + kick * work[1]
-    y[5] = w + s * (p * b - q * a) + kick * work[2]
-    for i in range(3):
-        y[i] += half * y[i + 3]
-    return True
-
-
-def _drive(fields, extra, t0, h, last_step, saved, constants, work, count, y, ys):
-    drive_steps(_step, fields, extra, t0, h, last_step, saved, constants, work, count, y, ys)
-
-
-@cache
-def _compiled_drive(n_extra: int) -> Callable[..., None]:
-    """`_drive` compiled once for all functions, typed as first-class functions; found in Numba's cache afterwards."""
-    return cached_njit(drive_signature(n_extra), error_model="numpy")(_drive)
+    steps = FixedSteps.of(t_span, h, save_every)
+    kind = Kind((6,), 3, -1, "d", in_place=True)
+    return fill_in_place("boris", fields, "fields", kind, steps, y, params, charge / mass)

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
-import numpy as np
-from numba.extending import register_jitable
-
-from ..engine.caching import cached_njit
-from ._common import FixedStepResult, check_state, drive_signature, drive_steps, integrate_in_place
+from ..core.native_functions import Kind
+from ._common import FixedStepResult, FixedSteps, check_state, fill_in_place
 
 __all__ = ["implicit_midpoint"]
-
-MOST_ITERATIONS = 100
-SOLVED = 1e-12  # relative change of the slope below which an iteration that no longer improves has converged
 
 
 def implicit_midpoint(
@@ -36,8 +29,8 @@ def implicit_midpoint(
     Parameters
     ----------
     rhs : callable
-        ``rhs(t, y, out[, params])`` fills out. A function jitted lazily by Numba runs compiled, any other callable
-        interpreted, through the same loop.
+        ``rhs(t, y, out[, params])`` fills out. A function jitted by Numba and a C function by pointer run compiled,
+        any other callable interpreted, in the same loop.
     t_span : tuple of float
         Start and end; a smaller end integrates backward.
     y0 : array_like, shape (n,)
@@ -77,45 +70,5 @@ def implicit_midpoint(
     True
     """
     y = check_state(y0)
-    return integrate_in_place(
-        rhs, "rhs", _compiled_drive, _drive, t_span, y, h, params, save_every, np.zeros(0), np.zeros(4 * y.size)
-    )
-
-
-@register_jitable
-def _step(rhs, extra, t, h, constants, work, count, y):
-    """One step in place; work holds k, the k of the step before, a stage, and f there."""
-    n = y.size
-    k, before, stage, f = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n :]
-    for i in range(n):
-        guess = 2.0 * k[i] - before[i]
-        before[i] = k[i]
-        k[i] = guess
-    last = np.inf
-    for _ in range(MOST_ITERATIONS):
-        for i in range(n):
-            stage[i] = y[i] + 0.5 * h * k[i]
-        rhs(t + 0.5 * h, stage, f, *extra)
-        count[0] += 1
-        change = 0.0
-        size = 0.0
-        for i in range(n):
-            change = max(change, abs(f[i] - k[i]))
-            size = max(size, abs(f[i]))
-            k[i] = f[i]
-        if change == 0.0 or (change >= last and change <= SOLVED * size):
-            for i in range(n):
-                y[i] += h * k[i]
-            return True
-        last = change
-    return False
-
-
-def _drive(rhs, extra, t0, h, last_step, saved, constants, work, count, y, ys):
-    drive_steps(_step, rhs, extra, t0, h, last_step, saved, constants, work, count, y, ys)
-
-
-@cache
-def _compiled_drive(n_extra: int) -> Callable[..., None]:
-    """`_drive` compiled once for all functions, typed as first-class functions; found in Numba's cache afterwards."""
-    return cached_njit(drive_signature(n_extra), error_model="numpy")(_drive)
+    kind = Kind((y.size,), y.size, -1, "d", in_place=True)
+    return fill_in_place("implicit-midpoint", rhs, "rhs", kind, FixedSteps.of(t_span, h, save_every), y, params)

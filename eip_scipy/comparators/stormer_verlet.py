@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numba import types
-from numba.core.dispatcher import Dispatcher
-from numba.extending import register_jitable
 
-from ..engine.caching import cached_njit
-from ._common import FixedStepResult, FixedSteps, check_state, message, real_vector
+from ..core.native_functions import Kind
+from ..core.pointers import by_pointer
+from ..engine.native import call
+from ._common import FixedStepResult, FixedSteps, check_state, functions_of, real_vector, take_steps
 
 __all__ = ["FORMS", "StormerVerletResult", "stormer_verlet"]
 
@@ -42,8 +39,8 @@ def stormer_verlet(
     Parameters
     ----------
     acc : callable
-        ``acc(t, q[, params]) -> (n/2,)``. A function jitted lazily by Numba that returns a new C-contiguous float64
-        array runs compiled; any other callable runs interpreted, through the same loop.
+        ``acc(t, q[, params]) -> (n/2,)``. A function jitted by Numba and a C function by pointer run compiled, any
+        other callable interpreted, in the same loop.
     t_span : tuple of float
         Start and end; a smaller end integrates backward.
     y0 : array_like, shape (n,)
@@ -92,25 +89,18 @@ def stormer_verlet(
     y = _check_halves(y0)
     if form not in FORMS:
         raise ValueError(f"unknown form {form!r}: expected one of {', '.join(map(repr, FORMS))}")
-    extra = () if params is None else (real_vector(params, "params"),)
+    given = None if params is None else real_vector(params, "params")
 
-    checked = _checked(acc, y.size // 2)
-    a = checked(steps.t0, y[: y.size // 2], *extra).copy()
-    reason = _why_interpreted(acc, len(extra))
-    drive = _drive if reason else _compiled_drive(len(extra))
-    ys = np.empty((steps.saved.size, y.size))
-    ys[0] = y
-
-    def advance(to_save: np.ndarray) -> None:
-        drive(checked if reason else acc, extra, steps.t0, steps.h, steps.last, form == FORMS[0], to_save, y, a, ys)
-
-    # Saving nothing but the start takes no step: whatever is still to be compiled or bound is so before the clock runs.
-    advance(steps.saved[:1])
-    start = perf_counter()
-    advance(steps.saved)
-    wall_time = perf_counter() - start
-    nfev = int(steps.saved[-1]) + 1
-    return StormerVerletResult(steps.t, ys.T, nfev, wall_time, message(reason, steps.t, ys))
+    half = y.size // 2
+    extra = () if given is None else (given,)
+    convert = _converter(half)
+    acc = by_pointer(acc, "acc", shape=(half,))
+    convert(acc(steps.t0, y[:half].copy(), *extra), steps.t0)
+    kind = Kind((half,), half, -1 if given is None else given.size, "d")
+    in_python = call(acc, extra, (half,), convert)
+    functions, reason = functions_of(acc, in_python, kind, "acc", given, second_order=True)
+    run = take_steps(form, functions, steps, y, reason)
+    return StormerVerletResult(run.t, run.y, int(steps.saved[-1]) + 1, run.wall_time, run.message)
 
 
 def _check_halves(y0: Any) -> np.ndarray:
@@ -120,102 +110,16 @@ def _check_halves(y0: Any) -> np.ndarray:
     return y
 
 
-def _checked(acc: Callable[..., Any], size: int) -> Callable[..., np.ndarray]:
-    """`acc` with its result checked: NumPy would broadcast a scalar and drop an imaginary part silently."""
+def _converter(size: int) -> Callable[[Any, float], np.ndarray]:
+    """What makes of a value of `acc` an array: NumPy would broadcast a scalar and drop an imaginary part silently."""
 
-    def checked(*args: Any) -> np.ndarray:
-        value = acc(*args)
+    def convert(value: Any, t: float) -> np.ndarray:
         if value is None:
             raise TypeError(f"acc returned None, expected {size} numbers")
         if np.iscomplexobj(value):
             raise TypeError("acc returned complex numbers, expected real ones")
-        array = np.ascontiguousarray(value, dtype=float)
         if np.shape(value) != (size,):
             raise ValueError(f"acc returned shape {np.shape(value)}, expected ({size},)")
-        return array
+        return np.array(value, dtype=float)
 
-    return checked
-
-
-def _why_interpreted(acc: Callable[..., Any], n_extra: int) -> str:
-    """Why `acc` cannot enter the compiled loop; empty when it can."""
-    if not isinstance(acc, Dispatcher):
-        return "acc is not jitted by Numba"
-    signature = _acc_signature(n_extra)
-    # The checked first call compiled a lazily jitted acc for these types.
-    returned = {known.args: known.return_type for known in acc.nopython_signatures}.get(signature.args)
-    if returned is None:
-        return f"acc is jitted for other signatures than {signature}"
-    return "" if returned == signature.return_type else f"acc returns {returned}, not {signature.return_type}"
-
-
-def _acc_signature(n_extra: int) -> Any:
-    vector = types.float64[::1]
-    return vector(types.float64, vector, *[vector] * n_extra)
-
-
-@cache
-def _compiled_drive(n_extra: int) -> Callable[..., None]:
-    """`_drive` compiled for any jitted acceleration.
-
-    With the acceleration typed as a first-class function and the signature given, the machine code does not depend on
-    the user's function and is found in Numba's cache by the next process.
-    """
-    vector = types.float64[::1]
-    signature = types.void(
-        types.FunctionType(_acc_signature(n_extra)),
-        types.UniTuple(vector, n_extra),
-        types.float64,
-        types.float64,
-        types.float64,
-        types.boolean,
-        types.int64[::1],
-        vector,
-        vector,
-        types.float64[:, ::1],
-    )
-    return cached_njit(signature, error_model="numpy")(_drive)
-
-
-@cached_njit(error_model="numpy")
-def _add(x: np.ndarray, c: float, dx: np.ndarray) -> None:
-    """Add c dx to x. Compiled in interpreted runs as well, so that both give the same bits."""
-    for i in range(x.size):
-        x[i] += c * dx[i]
-
-
-@register_jitable
-def _kick_drift_kick(acc, extra, t, h, q, v, a):
-    """One step in place; `a` holds a(t, q) before and after it."""
-    _add(v, 0.5 * h, a)
-    _add(q, h, v)
-    a[:] = acc(t + h, q, *extra)
-    _add(v, 0.5 * h, a)
-
-
-@register_jitable
-def _drift_kick_drift(acc, extra, t, h, q, v, a):
-    """One step in place; `a` is work space."""
-    _add(q, 0.5 * h, v)
-    a[:] = acc(t + 0.5 * h, q, *extra)
-    _add(v, h, a)
-    _add(q, 0.5 * h, v)
-
-
-def _drive(acc, extra, t0, h, last_step, kick_first, saved, y, a, ys):
-    """Take saved[-1] steps; ys[row] receives the state after step saved[row]. `extra` is () or (params,)."""
-    half = y.size // 2
-    q = y[:half]
-    v = y[half:]
-    n_steps = saved[-1]
-    row = 1
-    for k in range(n_steps):
-        t = t0 + k * h
-        step = last_step if k == n_steps - 1 else h
-        if kick_first:
-            _kick_drift_kick(acc, extra, t, step, q, v, a)
-        else:
-            _drift_kick_drift(acc, extra, t, step, q, v, a)
-        if k + 1 == saved[row]:
-            ys[row] = y
-            row += 1
+    return convert

@@ -15,7 +15,7 @@ from .pointers import PointerFunction
 if TYPE_CHECKING:
     from .numba_pointers import Compiled
 
-__all__ = ["Kind", "native_functions", "raise_again", "with_events"]
+__all__ = ["Kind", "function_alone", "native_functions", "raise_again", "with_events"]
 
 
 class Kind(NamedTuple):
@@ -92,6 +92,28 @@ def native_functions(
         params=np.zeros(0) if params is None else params,  # itself: an ensemble writes each member's there
         second_order=second_order,
         owner={"rhs": [rhs], "inv": inv, "grad": grad, "event": []},
+    )
+
+
+def function_alone(
+    fun: Callable[..., Any], kind: Kind, name: str, params: np.ndarray | None, *, second_order: bool = False
+) -> NativeFunctions:
+    """The address of a right-hand side without invariants and events, which takes and gives what `kind` says.
+
+    Raises
+    ------
+    NotCompilableError
+        As by `native_functions`.
+    """
+    rhs = _native(fun, kind, name)
+    return NativeFunctions(
+        rhs=rhs.entry,
+        inv=(),
+        grad=(),
+        event=(),
+        params=np.zeros(0) if params is None else params,
+        second_order=second_order,
+        owner={"rhs": [rhs]},
     )
 
 

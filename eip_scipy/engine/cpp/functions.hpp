@@ -1,10 +1,10 @@
-// Functions of the module beside the engine: of arrays, by subject.
+// Functions of the module beside the engine, by subject.
 #pragma once
 
 #include "python.hpp"
 
 namespace eip {
 
-extern PyMethodDef condensate_functions[], field_functions[];
+extern PyMethodDef condensate_functions[], field_functions[], comparator_functions[];
 
 }  // namespace eip

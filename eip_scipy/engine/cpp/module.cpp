@@ -1,28 +1,26 @@
 // The binding: an Engine holds a run's arrays and functions, and steps.
 #define EIP_IMPORTS_NUMPY
+#include "calls.hpp"
 #include "functions.hpp"
 #include "library_functions.hpp"
 #include "python_functions.hpp"
 #include "records.hpp"
 
-#if defined(__SSE2__)
-#include <xmmintrin.h>
-#endif
-
 namespace eip {
+
+// FailedCallError(which functions, which of them, t, bytes of y, of f, status): whoever made them says what it means.
+static PyObject *failed_call_error = nullptr;
+
+void raise_broken(const System &system) {
+    if (PyErr_Occurred()) return;
+    const FailedCall &call = system.failed;
+    const auto bytes = [](const std::vector<double> &a) { return static_cast<Py_ssize_t>(a.size() * sizeof(double)); };
+    const Ref arguments(Py_BuildValue("(sLdy#y#i)", call.functions, static_cast<long long>(call.index), call.t,
+                                      call.y.data(), bytes(call.y), call.f.data(), bytes(call.f), call.status));
+    PyErr_SetObject(failed_call_error, arguments.get());
+}
+
 namespace {
-
-// Subnormal numbers are numbers here, whatever another library left in the processor's mode.
-class FloatingPoint {
-  public:
-#if defined(__SSE2__)
-    FloatingPoint() : mode_(_mm_getcsr()) { _mm_setcsr(mode_ & ~0x8040u); }
-    ~FloatingPoint() { _mm_setcsr(mode_); }
-
-  private:
-    unsigned mode_;
-#endif
-};
 
 // Whether the processor takes the other build, for x86-64-v3.
 bool has_v3() {
@@ -113,18 +111,6 @@ void expect(Engine *self, Py_ssize_t count, Py_ssize_t expected, const char *nam
     if (!self->data) PyErr_SetString(PyExc_RuntimeError, "engine: not set up");
     else if (count != expected) PyErr_Format(PyExc_TypeError, "engine: expected the arguments %s", names);
     if (PyErr_Occurred()) throw PythonError{};
-}
-
-// FailedCallError(which functions, which of them, t, bytes of y, of f, status): whoever made them says what it means.
-PyObject *failed_call_error = nullptr;
-
-void raise_broken(const System &system) {
-    if (PyErr_Occurred()) return;
-    const FailedCall &call = system.failed;
-    const auto bytes = [](const std::vector<double> &a) { return static_cast<Py_ssize_t>(a.size() * sizeof(double)); };
-    const Ref arguments(Py_BuildValue("(sLdy#y#i)", call.functions, static_cast<long long>(call.index), call.t,
-                                      call.y.data(), bytes(call.y), call.f.data(), bytes(call.f), call.status));
-    PyErr_SetObject(failed_call_error, arguments.get());
 }
 
 template <int64_t M, typename Call>
@@ -507,6 +493,7 @@ PyMODINIT_FUNC EIP_INIT() {
         PyModule_AddObjectRef(module, "Engine", reinterpret_cast<PyObject *>(&type)) < 0 ||
         eip::add_functions(module, "condensates", eip::condensate_functions) < 0 ||
         eip::add_functions(module, "fields", eip::field_functions) < 0 ||
+        eip::add_functions(module, "comparators", eip::comparator_functions) < 0 ||
         PyModule_AddStringConstant(module, "SOURCES", EIP_SOURCES) < 0 ||
         PyModule_AddIntConstant(module, "HAS_V3", eip::has_v3()) < 0) {
         Py_DECREF(module);
