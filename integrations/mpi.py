@@ -15,17 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.core import setup
 from eip_scipy.core.invariants import Invariant, InvariantSet, as_invariants
 from eip_scipy.core.names import nearest
 from eip_scipy.core.one_step import OneStep
+from eip_scipy.core.parts import SolverOfParts
 from eip_scipy.core.solvers import EIPSolver
-from eip_scipy.engine import kernels as kn
-from eip_scipy.engine.data import NOT_FINITE, OK, make_work
-from eip_scipy.engine.joint import project_jointly
-from eip_scipy.engine.native import Engine
-from eip_scipy.engine.step import advance_raw, look_back, project_step
-from eip_scipy.engine.sums import abs_dot, dot
 
 try:
     from mpi4py import MPI
@@ -171,9 +165,9 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
     -----
     A correction is a combination of the gradients. On each rank their parts are written in an orthonormal basis of the
     space that they span there, l numbers each for l invariants; what all ranks have together, (l, ranks * l), holds
-    every product of the gradients to round-off, and `eip_scipy.engine.step.project_step` projects on that, alike on all
-    ranks. This is the first half of a QR factorisation of tall matrices (Demmel, Grigori, Hoemmen & Langou, SIAM J.
-    Sci. Comput. 34 (2012) A206-A239).
+    every product of the gradients to round-off, and the engine projects on that, alike on all ranks. This is the first
+    half of a QR factorisation of tall matrices (Demmel, Grigori, Hoemmen & Langou, SIAM J. Sci. Comput. 34 (2012)
+    A206-A239).
 
     Examples
     --------
@@ -192,13 +186,13 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
         raise TypeError(f"over_ranks: method must be an EIP class such as EIPRK4, got {method!r}.")
     if isinstance(method.TABLEAU, OneStep):
         raise TypeError(f"over_ranks: {method.__name__} is no Runge-Kutta method; its step would see one rank's part.")
-    if method._project_step is not EIPSolver._project_step:
+    if method._project_step is not EIPSolver._project_step or issubclass(method, SolverOfParts):
         raise TypeError(f"over_ranks: {method.__name__} has a _project_step of its own, or is on ranks already.")
     members = {"COMM": MPI.COMM_WORLD if comm is None else comm, "__doc__": f"`{method.__name__}` over ranks."}
     return type(f"{method.__name__}OverRanks", (_OverRanks, method), members)
 
 
-class _OverRanks(EIPSolver):
+class _OverRanks(SolverOfParts):
     """What `over_ranks` puts before a method."""
 
     COMM: MPI.Comm
@@ -207,37 +201,21 @@ class _OverRanks(EIPSolver):
         with together(self.COMM):
             _refuse(type(self).__name__, options)
             super().__init__(fun, t0, y0, t_bound, **options | {"metric": "euclidean", "check": False})
-            if options.get("check", True) and self._run.invariants.size:
-                _check(self.COMM, self._run.invariants, t0, self.y, self.f, options["h"])
-        run = self._run
-        self._coordinates = _Coordinates(self.COMM, run, self._rhs)
-
-    def _make_engine(self, raw: Any = None) -> Engine:
-        return super()._make_engine(raw or self._raw_step)
+            if options.get("check", True) and self.known.size:
+                _check(self.COMM, self.known, t0, self.y, self.f, options["h"])
 
     def _step_impl(self) -> tuple[bool, str | None]:
         with together(self.COMM):
             return super()._step_impl()
 
-    def _raw_step(self, t: float, y: np.ndarray, t_new: float, h: float, project: bool) -> int:
-        """The engine's, but that it fails on all ranks if it fails on one: the others would wait for it in a sum."""
-        m, o, w, y_r = self._run.method, self._run.options, self._work, y.view(float)
-        advance_raw(self._rhs, None, t, y, y_r, h, m, o, w)
-        if not gathered(self.COMM, kn.all_finite(w.y_hat_r)).all():
-            return NOT_FINITE
-        look_back(self._rhs, None, t_new, y_r, h, project, m, o, w)
-        return OK
+    @property
+    def place(self) -> tuple[int, int]:
+        """See `SolverOfParts`."""
+        return self.COMM.rank, self.COMM.size
 
-    def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
-        if not self._project_now:
-            return super()._project_step(t, y, y_hat, err)
-        options, y_new = self._run.options, np.empty_like(y)
-        # Joint invariants sum over the ranks themselves.
-        if options.joint is not None and project_jointly(t, options, self._work, y_new, y_new.view(float)):
-            self._projection_status = OK
-        else:
-            self._projection_status = self._coordinates.project(self.t, t, self._last, y_new)
-        return y_new
+    def gathered(self, a: Any) -> np.ndarray:
+        """See `SolverOfParts`."""
+        return gathered(self.COMM, a)
 
     def _dense_output_impl(self) -> Any:
         raise NotImplementedError(
@@ -297,67 +275,3 @@ def _check(comm: MPI.Comm, known: InvariantSet, t: float, y: np.ndarray, f: np.n
     ]
     here, nowhere = np.ones(2), np.zeros(2)
     InvariantSet(plane, t, here, nowhere, 0.0).check(t, here, nowhere, 0.0)
-
-
-class _Coordinates:
-    """The projection in coordinates of the space that the gradients span, the raw result being its origin.
-
-    `eip_scipy.engine.step` calls `rhs`, `inv` and `grad` with coordinates of all ranks, ``c[rank * l + i]`` along
-    the basis' row i of that rank.
-    """
-
-    def __init__(self, comm: MPI.Comm, run: setup.Run, rhs: Callable[..., None]) -> None:
-        self._comm, self._run, self._rhs = comm, run, rhs
-        w, size = run.work, run.invariants.size
-        self._own = slice(comm.rank * size, (comm.rank + 1) * size)
-        # Sizes of the invariants' terms stand in for those that the step would find at the state itself.
-        self._options = run.options._replace(scales=np.empty(size))
-        names = ("values", "g", "band", "before", "defect", "max_defect", "max_correction", "norm", "counters")
-        work = make_work(comm.size * size, np.dtype(float), 0, size, 0)
-        self._work = work._replace(**{name: getattr(w, name) for name in names})
-        self._new = np.zeros(comm.size * size)
-
-    def project(self, t_old: float, t: float, last: bool, y_new: np.ndarray) -> int:
-        """Project the run's raw result into `y_new`; returns a status of the step."""
-        w, new = self._work, self._new
-        status = project_step(self.rhs, self.inv, self.grad, None, t_old, new, new, t, last, self._options, w, new, new)
-        y_new[:] = self._state(new)
-        return status
-
-    def rhs(self, t: float, c: np.ndarray, out: np.ndarray, params: Any) -> None:
-        """The derivative at c, kept for `grad`; its coordinates are of no use."""
-        self._rhs(t, self._state(c), self._run.work.f_point, params)
-
-    def inv(self, t: float, c: np.ndarray, values: np.ndarray, params: Any) -> None:
-        """Fill `values` (l,)."""
-        self._run.invariants.inv(t, self._state(c), values)
-
-    def grad(self, t: float, c: np.ndarray, f: np.ndarray, G: np.ndarray, params: Any) -> None:
-        """Fill the gradients' coordinates `G` (l, ranks * l); at the raw result the basis is chosen."""
-        w, start = self._run.work, c is self._work.y_hat
-        self._run.invariants.grad(t, self._state(c), w.K[-1] if start else w.f_point, w.G)
-        if start:
-            self._choose_basis()
-        part = np.empty((self._options.scales.size, self._options.scales.size + 1))
-        part[:, :-1] = [[dot(row, direction) for direction in w.Q] for row in w.G_r]
-        part[:, -1] = [abs_dot(row, w.y_hat_r) for row in w.G_r]
-        parts = gathered(self._comm, part)
-        G[:] = parts[:, :, :-1].swapaxes(0, 1).reshape(G.shape)
-        if start:
-            np.maximum(self._run.options.scales, parts[:, :, -1].sum(axis=0), out=self._options.scales)
-
-    def _choose_basis(self) -> None:
-        """Orthonormal rows of Q, in place of gradients that depend on the others rows of zeros."""
-        w = self._run.work
-        w.Q[:] = w.G_r
-        rank = kn.factor(w.Q, w.inverse_norms, w.R, w.pivots)
-        # A gradient that is not finite makes its products so, and all ranks see them.
-        w.Q[w.pivots[max(rank, 0) :].astype(int)] = 0.0 if rank >= 0 else np.nan
-
-    def _state(self, c: np.ndarray) -> np.ndarray:
-        """The rank's part of the state at c; a buffer."""
-        w = self._run.work
-        if c is self._work.y_hat:
-            return w.y_hat
-        kn.combine(w.y_hat_r, 1.0, c[self._own], w.Q, w.Q.shape[0], w.stage_r)
-        return w.stage

@@ -70,17 +70,14 @@ class Run:
     left_out: str = ""
     looked: int = -1
 
-    def engine(
-        self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, raw: Any = None, finish: Any = None
-    ) -> Engine:
-        """The engine of the run, which begins where work.K[0] is the derivative; for the hooks see `Hooks`."""
+    def engine(self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, **others: Any) -> Engine:
+        """The engine of the run, which begins where work.K[0] is the derivative; `others` are further `Hooks`."""
         one_step = self.method if isinstance(self.method, OneStep) else None
         hooks = Hooks(
             one_step=None if one_step is None else partial(one_step.fill, self.work),
             estimates=one_step is not None and one_step.has_estimate,
-            raw=raw,
-            finish=finish,
             joint=None if functions.native else self.options.joint,
+            **others,
         )
         engine, w = Engine(self.method, self.options, self.work, functions, schedule, _if_any(hooks)), self.work
         if self.options.watched:

@@ -13,7 +13,7 @@ from scipy.integrate import DenseOutput, OdeSolver
 
 from ..engine.counters import FOUND, NFEV, NJEV, NLU, REJECTED
 from ..engine.data import FAILED_PROJECTION, OK, bare_schedule
-from ..engine.native import Call, Engine, PythonFunctions
+from ..engine.native import Call, PythonFunctions
 from ..engine.trust import ProjectionWarning
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
@@ -120,7 +120,7 @@ class EIPSolver(OdeSolver):
         t0, t_bound = interval((t0, t_bound))
         start = setup.initial_state(y0)
         self._calls = [0]
-        derivative, self._rhs, self._call = _checked(fun, start.size, start.dtype, vectorized, self._calls)
+        derivative, self._call = _checked(fun, start.size, start.dtype, vectorized, self._calls)
         self._derivative = derivative
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
         steps = StepOptions(h=h, first_step=first_step, max_step=max_step, rtol=rtol, atol=atol)
@@ -155,11 +155,12 @@ class EIPSolver(OdeSolver):
         if self._scipy is None:
             self._work.K[0] = f0
             self._schedule = bare_schedule(stepping.span, float(self.h_abs or 0.0))
-            self._engine = self._make_engine()
+            functions = PythonFunctions(self._call, *run.invariants.calls, (), second_order=False)
+            self._engine = run.engine(functions, self._schedule, **self._hooks())
 
-    def _make_engine(self, raw: Any = None) -> Engine:
-        functions = PythonFunctions(self._call, *self._run.invariants.calls, (), second_order=False)
-        return self._run.engine(functions, self._schedule, raw, self._finish if self._finishes else None)
+    def _hooks(self) -> dict[str, Any]:
+        """Parts of the steps that a subclass takes itself, see `Hooks`."""
+        return {"finish": self._finish} if self._finishes else {}
 
     @property
     def _finishes(self) -> bool:
@@ -297,8 +298,8 @@ def _without_effect(names: Iterable[str]) -> str:
 
 def _checked(
     fun: Callable[..., Any], n: int, dtype: np.dtype, vectorized: bool, calls: list[int]
-) -> tuple[Callable[[float, np.ndarray], np.ndarray], Callable[..., None], Call]:
-    """The user's right-hand side with clear errors: as (t, y) -> (n,), maybe their buffer; in place; for the engine.
+) -> tuple[Callable[[float, np.ndarray], np.ndarray], Call]:
+    """The user's right-hand side with clear errors: as (t, y) -> (n,), maybe their buffer, and for the engine.
 
     The first counts in `calls`; the step counts its own. All hand out copies, because a user's function may keep or
     overwrite what it was given, and test the common case, an array of the right shape and type, first.
@@ -325,10 +326,7 @@ def _checked(
         calls[0] += 1
         return checked(t, y)
 
-    def rhs(t: float, y: np.ndarray, out: np.ndarray, params: Any) -> None:
-        out[:] = checked(t, y)
-
-    return derivative, rhs, Call(called, (), shape, convert)
+    return derivative, Call(called, (), shape, convert)
 
 
 class EIPRK1(EIPSolver):

@@ -89,15 +89,17 @@ class NativeFunctions(NamedTuple):
 class Hooks(NamedTuple):
     """Parts of a step in Python, in place of the engine's own.
 
-    ``one_step(t, y, h)`` fills work.y_hat, and work.err if it `estimates`. ``raw(t, y, t_new, h, project)`` does all
-    that the engine's raw step does, and returns its code; so does ``finish(t_new, project, last)`` for the rest of the
-    step. `joint` are `JointInvariants`.
+    ``one_step(t, y, h)`` fills work.y_hat, and work.err if it `estimates`. ``finish(t_new, project, last)`` does all
+    that follows on the raw step, and returns the engine's code; so does ``project(t_old, t, last, y_new)`` for the
+    projection alone. `joint` are `JointInvariants`, which come before that. ``agree(here)``: whether the raw result is
+    finite on all processes that have a part of the state, as it is `here`.
     """
 
     one_step: Callable[..., Any] | None = None
     estimates: bool = False
-    raw: Callable[..., Any] | None = None
     finish: Callable[..., Any] | None = None
+    project: Callable[..., Any] | None = None
+    agree: Callable[..., Any] | None = None
     joint: Any = None
 
 

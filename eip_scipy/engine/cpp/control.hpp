@@ -24,7 +24,8 @@ inline Code raw_step(AnyRun &run, const Step &step) {
     else
         rk_stages(run, step);
     w.counters[NFEV] += m.stages - 1;
-    if (!all_finite(w.y_hat, w.m)) return NOT_FINITE;
+    const bool finite = all_finite(w.y_hat, w.m);
+    if (!(run.hooks && run.hooks->agree ? run.hooks->all_agree(finite) : finite)) return NOT_FINITE;
     const bool estimate = o.adaptive || ((o.metric == ERROR || o.every == AUTO) && w.l > 0);
     w.counters[HAVE_F] = (estimate && m.fsal) || (step.project && o.uses_f);
     w.counters[HAVE_ERROR] = estimate;

@@ -255,10 +255,11 @@ inline Code project_step(AnyRun &run, const Step &step) {
     return status;
 }
 
-// The same, or the shorter way of joint invariants where that will do.
+// The same, or the shorter way of joint invariants where that will do, or a hook's.
 template <class AnyRun>
 inline Code project_any(AnyRun &run, const Step &step) {
     if (run.hooks && run.hooks->joint && run.hooks->project_jointly(step)) return OK;
+    if (run.hooks && run.hooks->project) return static_cast<Code>(run.hooks->project_elsewhere(step));
     return project_step(run, step);
 }
 

@@ -206,7 +206,7 @@ PyObject *engine_advance(Engine *self, PyObject *const *args, Py_ssize_t count) 
             pieces.capacity = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[5]), 0);
         }
         check_room(schedule, saved, samples);
-        if (self->hooks) self->hooks->set_states(args[1], args[2]);
+        if (self->hooks) self->hooks->set_state(args[2]);
         return PyLong_FromLong(
             stepped(self, [&](auto &run) { return advance(run, samples, schedule, k_end, y, y_new, saved); }));
     });
@@ -308,7 +308,7 @@ PyObject *engine_step(Engine *self, PyObject *const *args, Py_ssize_t count) {
         npy_intp n = w.n;
         Ref y_new(PyArray_SimpleNew(1, &n, self->type));
         double *end = static_cast<double *>(PyArray_DATA(reinterpret_cast<PyArrayObject *>(y_new.get())));
-        if (self->hooks) self->hooks->set_states(args[2], y_new.get());
+        if (self->hooks) self->hooks->set_state(y_new.get());
         const Code code = stepped(self, [&](auto &run) { return next_step(run, s.span, s.clock, k, y, end); });
         Ref f_new(PyArray_SimpleNew(1, &n, self->type));
         copy(w.last(), static_cast<double *>(PyArray_DATA(reinterpret_cast<PyArrayObject *>(f_new.get()))), w.m);
@@ -332,7 +332,7 @@ PyObject *engine_project(Engine *self, PyObject *const *args, Py_ssize_t count) 
         step.last = PyObject_IsTrue(args[3]);
         step.project = true;
         if (PyErr_Occurred()) return nullptr;
-        if (self->hooks) self->hooks->set_states(args[1], args[4]);
+        if (self->hooks) self->hooks->set_state(args[4]);
         return PyLong_FromLong(stepped(self, [&](auto &run) { return project_any(run, step); }));
     });
 }

@@ -198,11 +198,14 @@ PythonHooks::PythonHooks(PyObject *hooks, PyObject *work, const Run &run, int ty
         return found == Py_None ? nullptr : found;
     };
     one_step_ = given("one_step");
-    raw_ = given("raw");
     finish_ = given("finish");
+    project_ = given("project");
+    agree_ = given("agree");
     estimates_ = truth(hooks, "estimates");
-    raw = one_step_ || raw_;
+    raw = one_step_ != nullptr;
     finish = finish_ != nullptr;
+    project = project_ != nullptr;
+    agree = agree_ != nullptr;
     if (PyObject *joint_invariants = given("joint")) {
         joint = true;
         moments_ = kept_attribute(joint_invariants, "moments", kept);
@@ -230,15 +233,8 @@ PyObject *truth_of(bool value) { return value ? Py_True : Py_False; }
 
 }  // namespace
 
-int PythonHooks::raw_step(const Step &step) {
-    if (!raw_) return by_one_step(step);
-    const Ref t = time(step.t), t_new = time(step.t_new), h = time(step.h);
-    return code_of(Ref(PyObject_CallFunctionObjArgs(raw_, t.get(), from_, t_new.get(), h.get(), truth_of(step.project),
-                                                    nullptr)));
-}
-
 // What `raw_step` does, by a method of the user's own. f is evaluated only where a gradient takes it: the steps do not.
-int PythonHooks::by_one_step(const Step &step) {
+int PythonHooks::raw_step(const Step &step) {
     const Options &o = run_.options;
     const Work &w = run_.work;
     const Ref t = time(step.t), y = copied(step.y, w.n, type_), h = time(step.h);
@@ -262,6 +258,21 @@ int PythonHooks::by_one_step(const Step &step) {
     }
     if (o.adaptive) w.norm[0] = error_norm(w.err, step.y, w.y_hat, o, w.n);
     return OK;
+}
+
+int PythonHooks::project_elsewhere(const Step &step) {
+    const Ref t_old = time(step.t), t = time(step.t_new);
+    const npy_intp n = run_.work.n;
+    const Ref y_new = view(step.y_new, 1, &n, type_, to_);
+    return code_of(Ref(PyObject_CallFunctionObjArgs(project_, t_old.get(), t.get(), truth_of(step.last), y_new.get(),
+                                                    nullptr)));
+}
+
+bool PythonHooks::all_agree(bool here) {
+    const Ref found(PyObject_CallFunctionObjArgs(agree_, truth_of(here), nullptr));
+    const int value = PyObject_IsTrue(found.get());
+    if (value < 0) throw PythonError{};
+    return value;
 }
 
 int PythonHooks::finish_step(const Step &step) {

@@ -70,20 +70,17 @@ class PythonHooks final : public Hooks {
     int raw_step(const Step &step) override;
     int finish_step(const Step &step) override;
     bool project_jointly(const Step &step) override;
+    int project_elsewhere(const Step &step) override;
+    bool all_agree(bool here) override;
 
-    // The arrays that the steps to come lead from and to.
-    void set_states(PyObject *from, PyObject *to) {
-        from_ = from;
-        to_ = to;
-    }
+    // The array that the steps to come lead to.
+    void set_state(PyObject *to) { to_ = to; }
 
   private:
-    int by_one_step(const Step &step);
-
     Run run_;
     int type_;
-    PyObject *from_ = nullptr, *to_ = nullptr;
-    PyObject *one_step_ = nullptr, *raw_ = nullptr, *finish_ = nullptr, *moments_ = nullptr, *shift_ = nullptr;
+    PyObject *to_ = nullptr;
+    PyObject *one_step_ = nullptr, *finish_ = nullptr, *project_ = nullptr, *agree_ = nullptr, *moments_ = nullptr, *shift_ = nullptr;
     PyObject *y_hat_ = nullptr, *f_hat_ = nullptr, *values_ = nullptr, *R_ = nullptr, *terms_ = nullptr, *mu_ = nullptr;
     bool estimates_ = false;
 };

@@ -30,15 +30,18 @@ class Functions {
 
 struct Step;
 
-// Parts of a step that are replaced: one-step methods of a user's own, the projection of a subclass, and the one of
-// `JointInvariants`, which may decline. Codes as the step's own.
+// Parts of a step that are replaced: one-step methods of a user's own, the end of the step by a subclass, the projection of
+// `JointInvariants`, which may decline, and then that of a state whose parts lie on several processes. These have to agree
+// whether a raw result is finite, too. Codes as the step's own.
 class Hooks {
   public:
     virtual ~Hooks() = default;
-    bool raw = false, finish = false, joint = false;
+    bool raw = false, finish = false, joint = false, project = false, agree = false;
     virtual int raw_step(const Step &step) = 0;
     virtual int finish_step(const Step &step) = 0;
     virtual bool project_jointly(const Step &step) = 0;
+    virtual int project_elsewhere(const Step &step) = 0;
+    virtual bool all_agree(bool here) = 0;
 };
 
 // A function by pointer, or the library's own in its place, and how many floats it fills.

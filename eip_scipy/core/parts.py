@@ -1,0 +1,157 @@
+"""Solvers of a state whose parts lie on several processes: the step on each part, the projection on all together.
+
+The seam for libraries that carry messages: a subclass says where it stands and gathers numbers.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..engine.data import NO_METHOD, make_work
+from ..engine.native import Call, Engine, PythonFunctions
+from .blocks import blocks_of
+from .invariants import InvariantSet
+from .solvers import EIPSolver
+
+__all__ = ["SolverOfParts"]
+
+DEPENDENT = 2.0**-26  # what is left of a normalised gradient that is a combination of others, to round-off
+SCALARS = ("values", "g", "band", "before", "defect", "max_defect", "max_correction", "norm", "counters")
+
+
+class SolverOfParts(EIPSolver):
+    """What stands before a method: every process calls it with its part of the state.
+
+    The right-hand side fills a part of the derivative; an invariant returns the same number everywhere and the
+    gradient's part. For fixed steps in the Euclidean metric.
+
+    Attributes
+    ----------
+    place : (int, int)
+        Which process this is, and of how many.
+    known : InvariantSet
+        The run's invariants.
+    """
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """Which process this is, and of how many."""
+        raise NotImplementedError
+
+    def gathered(self, a: Any) -> np.ndarray:
+        """An array of floats of every process, in their order."""
+        raise NotImplementedError
+
+    @property
+    def known(self) -> InvariantSet:
+        """The run's invariants."""
+        return self._run.invariants
+
+    def _hooks(self) -> dict[str, Any]:
+        return {"agree": self._all_agree, "project": _Coordinates(self).project}
+
+    def _all_agree(self, here: bool) -> bool:
+        """A step fails everywhere if it fails in one place: the others would wait for it in a sum."""
+        return bool(self.gathered(here).all())
+
+
+class _Coordinates:
+    """The projection in coordinates of the space that the gradients span, the raw result being its origin.
+
+    The engine calls `rhs`, `inv` and `grad` with coordinates of all processes, ``c[rank * l + i]`` along the basis'
+    row i of that one.
+    """
+
+    def __init__(self, solver: SolverOfParts) -> None:
+        run, size = solver._run, solver.known.size
+        rank, ranks = solver.place
+        self._gathered, self._derivative, self._run = solver.gathered, solver._derivative, run
+        self._own, n = slice(rank * size, (rank + 1) * size), ranks * size
+        # Sizes of the invariants' terms stand in for those that the step would find at the state itself.
+        self._options = run.options._replace(
+            rtol=np.zeros(n), atol=np.zeros(n), block_atol=np.zeros(n), groups=blocks_of(None, n, 1), joint=None,
+            scales=np.empty(size),
+        )  # fmt: skip
+        self._work = make_work(n, np.dtype(float), 0, size, n)._replace(**{k: getattr(run.work, k) for k in SCALARS})
+        functions = PythonFunctions(
+            Call(self.rhs, (), (n,), _given),
+            (Call(self.inv, (), (size,), _given),),
+            (Call(self.grad, (), (size, n), _given),),
+            (),
+            second_order=False,
+        )
+        self._engine = Engine(NO_METHOD, self._options, self._work, functions)
+        self._origin, self._moved = np.zeros(n), np.zeros(n)
+        self._basis = run.work.Q
+        self._begins = False
+
+    def project(self, t_old: float, t: float, last: bool, y_new: np.ndarray) -> int:
+        """Project the run's raw result into `y_new`; returns the engine's code."""
+        self._begins = True
+        status: int = self._engine.project(t_old, self._origin, t, last, self._moved)
+        y_new[:] = self._at(self._moved)
+        return status
+
+    def rhs(self, t: float, c: np.ndarray) -> np.ndarray:
+        """The derivative at c, kept for `grad`; its coordinates are of no use."""
+        self._run.work.f_point[:] = self._derivative(t, self._at(c))
+        return self._origin
+
+    def inv(self, t: float, c: np.ndarray) -> np.ndarray:
+        """The invariants (l,)."""
+        return self._run.invariants.values(t, self._at(c))
+
+    def grad(self, t: float, c: np.ndarray) -> np.ndarray:
+        """The gradients' coordinates (l, ranks * l); a basis is chosen at the raw result, where a projection begins."""
+        w, size = self._run.work, self._options.scales.size
+        begins, self._begins = self._begins, False
+        self._run.invariants.grad(t, self._at(c), w.K[-1] if begins else w.f_point, w.G)
+        if begins:
+            _orthonormal_rows(w.G_r, self._basis)
+        part = np.empty((size, size + 1))
+        # By loops of NumPy's own: threads of BLAS on each of the ranks would compete.
+        np.einsum("ij,kj->ik", w.G_r, self._basis, out=part[:, :-1])
+        np.einsum("ij,j->i", np.abs(w.G_r), np.abs(w.y_hat_r), out=part[:, -1])
+        parts = self._gathered(part)
+        if begins:
+            np.maximum(self._run.options.scales, parts[:, :, -1].sum(axis=0), out=self._options.scales)
+        return parts[:, :, :-1].swapaxes(0, 1).reshape(size, -1)
+
+    def _at(self, c: np.ndarray) -> np.ndarray:
+        """The part of the state that is here, at c; a buffer."""
+        w = self._run.work
+        if not c.any():
+            return w.y_hat
+        np.einsum("i,ij->j", c[self._own], self._basis, out=w.stage_r)
+        np.add(w.y_hat_r, w.stage_r, out=w.stage_r)
+        return w.stage
+
+
+def _given(value: Any, t: float) -> np.ndarray:
+    return np.ascontiguousarray(value, float)
+
+
+def _orthonormal_rows(rows: np.ndarray, out: np.ndarray) -> None:
+    """Fill `out` with an orthonormal basis of the rows' space, zeros for rows that depend on those before them.
+
+    Where they are not finite, NaN. Two passes of Gram-Schmidt leave them orthogonal to round-off.
+    """
+    for k, row in enumerate(rows):
+        unit, before = out[k], out[:k]
+        unit[:] = row
+        length = _length(unit)
+        if not np.isfinite(length):
+            out[:] = np.nan
+            return
+        if length > 0.0:
+            unit /= length
+        for _ in range(2):
+            unit -= np.einsum("i,ij->j", np.einsum("ij,j->i", before, unit), before)
+            length = _length(unit)
+            unit *= 1.0 / length if length > DEPENDENT else 0.0
+
+
+def _length(row: np.ndarray) -> float:
+    return float(np.sqrt(np.einsum("i,i->", row, row)))
