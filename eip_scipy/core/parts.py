@@ -35,6 +35,8 @@ class SolverOfParts(EIPSolver):
         The run's invariants.
     """
 
+    _fails_elsewhere = False
+
     @property
     def place(self) -> tuple[int, int]:
         """Which process this is, and of how many."""
@@ -54,7 +56,15 @@ class SolverOfParts(EIPSolver):
 
     def _all_agree(self, here: bool) -> bool:
         """A step fails everywhere if it fails in one place: the others would wait for it in a sum."""
-        return bool(self.gathered(here).all())
+        agreed = bool(self.gathered(here).all())
+        self._fails_elsewhere = here and not agreed
+        return agreed
+
+    def _step_impl(self) -> tuple[bool, str | None]:
+        done, message = super()._step_impl()
+        if self._fails_elsewhere:
+            message = f"the state is no longer finite on another process, in the step from t={self.t:.10g}"
+        return done, message
 
 
 class _Coordinates:

@@ -96,7 +96,7 @@ def in_parts(kept, count, fun=fun, **options):
     (first, counts, message), (second, same, other) = processes.run(work)
     assert counts == same
     assert (message is None) == (other is None)
-    return np.append(first, second), counts, other
+    return np.append(first, second), counts, [message, other]
 
 
 @pytest.mark.parametrize("options", [{}, {"iterations": 2}, {"every": 3}], ids=str)
@@ -112,9 +112,9 @@ def in_parts(kept, count, fun=fun, **options):
 )
 def test_parts_step_as_the_whole_does(kept, options):
     y, counts, message = whole(kept, 99, **options)
-    found, same, none = in_parts(kept, 99, **options)
+    found, same, messages = in_parts(kept, 99, **options)
     np.testing.assert_allclose(found, y, rtol=0, atol=1e-13)
-    assert (same, none) == (counts, message)
+    assert (same, messages) == (counts, [message] * 2)
     for value, _ in kept:
         np.testing.assert_allclose(value(found), value(START), rtol=0, atol=1e-13)
 
@@ -127,17 +127,18 @@ def test_a_part_that_is_not_finite_fails_all():
         f[3] = np.inf if y[1] > 0.1 else f[3]
         return f
 
-    found, _, message = in_parts([(energy, energy_gradient)], 5, overflowing)
+    found, _, (there, here) = in_parts([(energy, energy_gradient)], 5, overflowing)
     assert np.isfinite(found).all()
-    assert "fun returned a non-finite value" in message
+    assert here == "fun returned a non-finite value at t=0.06"
+    assert there == "the state is no longer finite on another process, in the step from t=0.04"
 
 
 def test_a_gradient_that_is_not_finite_fails_the_projection():
     def broken(y):
         return energy_gradient(y) * (np.nan if y[1] > 0.1 else 1.0)
 
-    _, _, message = in_parts([(energy, broken)], 5)
-    assert "projection failed" in message
+    _, _, messages = in_parts([(energy, broken)], 5)
+    assert all("projection failed" in message for message in messages)
 
 
 def test_the_seam_is_to_be_filled_in():

@@ -52,7 +52,6 @@ def on_ranks(ranks, script, *arguments, cwd):
 needs_mpirun = pytest.mark.skipif(MPIRUN is None, reason="there is no mpirun")
 
 
-@pytest.mark.needs_jit
 @needs_mpirun
 @pytest.mark.parametrize("ranks", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)])
 def test_results_are_the_serial_ones(ranks, serial, tmp_path):
@@ -74,7 +73,6 @@ def test_results_are_the_serial_ones(ranks, serial, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.needs_jit
 @needs_mpirun
 def test_the_page(tmp_path):
     """The script of the documentation's page, on two ranks."""
@@ -85,7 +83,6 @@ def test_the_page(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.needs_jit
 @needs_mpirun
 def test_a_sum_that_is_missing(tmp_path):
     """Ranks that know different values would decide differently, and wait for each other."""
@@ -178,7 +175,6 @@ FAILING = """
 
 
 @pytest.mark.slow
-@pytest.mark.needs_jit
 @needs_mpirun
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_a_rank_that_raises(ranks, tmp_path):
