@@ -412,3 +412,13 @@ def test_a_large_field_is_set_up_without_a_list_of_its_points(monkeypatch):
         np.testing.assert_array_equal(groups.member, np.arange(128))
         np.testing.assert_array_equal(groups.start, np.arange(0, 129, size))
     assert not called
+
+
+def test_transforms_in_strips_are_those_of_the_whole_field(monkeypatch):
+    """Along x of some columns at a time, the last strip a narrower one."""
+    grid = Grid((24, 150), -4, 5)
+    gpe = GrossPitaevskii(grid, harmonic_trap(1, 1), Omega=0.4, beta=2.0, fft="scipy")
+    psi = np.random.default_rng(5).standard_normal(2 * grid.size).view(complex)
+    found = gpe.fun(0.0, psi)
+    monkeypatch.setattr(type(gpe.transforms), "gains_by_strips", False)
+    np.testing.assert_allclose(found, gpe.fun(0.0, psi), rtol=0, atol=1e-15 * abs(found).max())

@@ -14,6 +14,7 @@ from .transforms import Axes, Transforms
 __all__ = ["Grid", "Multiplier", "SpectralSum"]
 
 MOST_AXES = 3
+STRIP = 64  # columns of a field of two dimensions that are transformed together along x
 SLAB = 2**19  # bytes of a field that stay in a processor's cache, with others beside them
 
 
@@ -143,12 +144,22 @@ class Multiplier:
         points = int(np.prod([grid.shape[axis] for axis in axes]))
         self._rows = int(np.prod(grid.shape[1:-1]))  # of one x
         self._factor = np.ascontiguousarray(full, dtype=float).reshape(-1, columns) / points
+        self._strips: list[tuple[slice, np.ndarray, np.ndarray]] = []
+        if axes == (0,) and self._factor.shape == grid.shape and columns > STRIP:
+            self._strips = _in_strips(self._factor)
 
     def apply(self, fft: Transforms, psi: np.ndarray, out: np.ndarray, first: int = 0) -> None:
         """Fill `out` with the multiplied field; `psi` stays.
 
         Both may be a slab of the field from index `first` of x on, if x is not among the axes transformed.
         """
+        if self._strips and fft.gains_by_strips:
+            for columns, factor, work in self._strips:
+                fft.forward(psi[:, columns], self.axes, work)
+                multiply(work, factor)
+                fft.backward(work, self.axes)
+                out[:, columns] = work
+            return
         fft.forward(psi, self.axes, out)
         begin = first * self._rows
         multiply(out, self._factor[begin : begin + len(out) * self._rows])
@@ -158,6 +169,14 @@ class Multiplier:
         """Sum over the grid of conj(psi) times the multiplied field, by Parseval's theorem one transform only."""
         fft.forward(psi, self.axes, work)
         return float(weighted_square(work, self._factor))
+
+
+def _in_strips(factor: np.ndarray) -> list[tuple[slice, np.ndarray, np.ndarray]]:
+    """Some columns at a time: which, their factor, and room for the field there, one for all strips of a width."""
+    strips = [slice(begin, begin + STRIP) for begin in range(0, factor.shape[1], STRIP)]
+    factors = [np.ascontiguousarray(factor[:, columns]) for columns in strips]
+    rooms = {part.shape: np.empty(part.shape, complex) for part in factors}
+    return [(columns, part, rooms[part.shape]) for columns, part in zip(strips, factors, strict=True)]
 
 
 class SpectralSum:

@@ -23,6 +23,8 @@ class Transforms:
     """
 
     name = ""
+    # Whether transforms along x are faster of some columns at a time, copied together, than of a whole field.
+    gains_by_strips = False
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
@@ -38,6 +40,7 @@ class Transforms:
 
 class _SciPy(Transforms):
     name = "scipy"
+    gains_by_strips = True
 
     def forward(self, field: np.ndarray, axes: Axes, out: np.ndarray) -> None:
         np.copyto(out, field)
