@@ -11,7 +11,7 @@ from .trust import N_FIGURES, TERMS
 
 # Codes of a step; those of the loop.
 OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED = range(5)
-PAUSE, FULL, ENDED = 10, 11, 12
+PAUSE, FULL, ENDED, DOUBTFUL = 10, 11, 12, 13
 # Interpolants of dense output.
 CUBIC, QUINTIC, POLYNOMIAL, SEVENTH = range(4)
 
@@ -223,6 +223,34 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
         counters=np.zeros(N_COUNTERS, np.int64),
         inner=make_inner(n_invariants),
     )
+
+
+class Members(NamedTuple):
+    """Members of an ensemble as the engine runs them, on the buffers of one run; by member, what each brings and gets.
+
+    They bring `starts` (m, n), `params` (m, p) and `first_steps` (m,), and share the number of `evaluations` before the
+    first step, the weights `sigma` at the start and, of each event, how often it may happen before it ends a member,
+    `left`. They get last states `y` (m, n) and times `t`, `status` (0 or 1), saved `rows` (m, rows, n), or if they are
+    not `kept` scratch (1, rows, n), and what a run's `Work` has: `figures` are its `trust`. `where` holds the member at
+    hand, and 1 where it has begun.
+    """
+
+    starts: np.ndarray
+    params: np.ndarray
+    first_steps: np.ndarray
+    evaluations: int
+    sigma: np.ndarray
+    left: np.ndarray
+    kept: bool
+    rows: np.ndarray
+    y: np.ndarray
+    t: np.ndarray
+    status: np.ndarray
+    max_defect: np.ndarray
+    counters: np.ndarray
+    max_correction: np.ndarray
+    figures: np.ndarray
+    where: np.ndarray
 
 
 class Dense(NamedTuple):

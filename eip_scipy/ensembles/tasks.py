@@ -12,34 +12,32 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
-from math import isnan
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import typeof, types
 
 from ..core import setup
-from ..core.compiled_functions import signatures
-from ..core.jitted import ChangedShapeError, NotCompilableError
+from ..core.jitted import NotCompilableError
 from ..core.stepping import UNBOUNDED, saved_steps
-from ..engine import kernels as kn
-from ..engine.caching import cached_njit
+from ..engine import data
 from ..engine.counters import N_COUNTERS, NFEV
-from ..engine.data import NEXT_LENGTH, OK, PENDING, ROW, STEP, TIME, TIME_NEW, Schedule, Work
+from ..engine.data import DOUBTFUL, OK, PAUSE, Schedule
 from ..engine.trust import Trust, sick
 from ..run.driver import saved_rows
-from ..run.integrate import ARRIVED, Loop
+from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop
 from ..run.prepare import Prepared, Request, prepared
 from ..run.resume import Keeper
-from .numba_driver import NumbaDriver
 from .vector_runs import Batch
 
 __all__ = ["COMPARED", "FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
 
 FAILED, NOT_RUN = -1, -2
-DOUBTFUL = -1
-BATCH_SECONDS = 0.1
+# Steps of the first call of the engine; how long one may take.
+FIRST_STEPS, SWEEP_SECONDS = 1024, 0.1
+ENDS = (ARRIVED, ENDED_BY_EVENT)
+BY_MEMBER = (
+    *("starts", "params", "first_steps", "y", "t", "status", "max_defect", "counters", "max_correction", "figures"),
+)
 LEAST_WORK = 3e7  # floats times steps, a second or two: compiling functions for vectors takes as long
 COMPARED = 16
 
@@ -142,7 +140,7 @@ class Plan:
     n_steps : int or None
         Steps of one member, where that is known.
     pointers : list of PointerFunction
-        The C functions by pointer, which Numba's loop does not take, nor another process.
+        The C functions by pointer, which no other process takes.
     """
 
     def __init__(self, task: Task, ready: Prepared | None = None) -> None:
@@ -168,11 +166,10 @@ class Plan:
         self.why_not = loop.why_not
         own_targets = any(item.target is not None for item in ready.run.invariants.items)
         own_start = ready.run.identity["project_initial"] or own_targets
-        single = own_start or loop.events.functions or ready.schedule.t_eval.size or self.pointers
-        self._together = self.why_not is None and not single
+        self._together = self.why_not is None and not own_start
         self._idle = [Sweeper(loop, self.task.members)] if self._together else []
         none = np.zeros((0, self.size), self.dtype), np.zeros((0, loop.driver.params.size))
-        run_members(self, *none)
+        run_members(self, *none)  # which compiles functions of members side by side
         return self
 
     def empty(self, m: int) -> Members:
@@ -312,15 +309,6 @@ def _alone(plan: Plan, k: int, y0: np.ndarray, params: np.ndarray, out: Members,
         out.y[k], out.t[k] = y0, plan.t0
         _describe(out, k, FAILED, _reason(error))
         return
-    _finish(plan, loop, k, out, watch)
-    rows = min(loop.driver.rows, plan.times.size)
-    same = np.flatnonzero(loop.driver.t[:rows] != plan.times[:rows])
-    rows = int(same[0]) if same.size else rows
-    out.saved[k, :rows] = loop.driver.y[:rows]
-
-
-def _finish(plan: Plan, loop: Loop, k: int, out: Members, watch: _Watch) -> None:
-    """Run a member to its end, and store what it came to."""
     try:
         status, message = loop.steps(watch)
     except StoppedError:
@@ -328,6 +316,10 @@ def _finish(plan: Plan, loop: Loop, k: int, out: Members, watch: _Watch) -> None
     except Exception as error:
         status, message = FAILED, _reason(error)
     _store(loop, k, status, loop.explained(message), out)
+    rows = min(loop.driver.rows, plan.times.size)
+    same = np.flatnonzero(loop.driver.t[:rows] != plan.times[:rows])
+    rows = int(same[0]) if same.size else rows
+    out.saved[k, :rows] = loop.driver.y[:rows]
 
 
 def _store(loop: Loop, k: int, status: int, message: str, out: Members) -> None:
@@ -352,65 +344,6 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def sweep(
-    advance, rhs, inv, grad, event, params, schedule, m, o, w, y, y_r, y_new, y_new_r, t_saved,
-    buffers, fresh, G, G_r, where, last, k_end, starts, taus, evaluations, all_params, saved, ends, defects, counters,
-    corrections, figures,
-):  # fmt: skip
-    """Members from where[0] to `last`, by the driver `advance`.
-
-    Returns its code; where[0] is then `last`, or the member that it is about, which Python looks at: it failed, or is
-    not at its end after `k_end` steps, or (DOUBTFUL) its start is not finite in some part.
-    """
-    place, clock = schedule.place, schedule.clock
-    t0 = schedule.span.t0
-    while where[0] < last:
-        k = where[0]
-        for i in range(len(buffers)):
-            kn.copy(fresh[i], buffers[i])
-        kn.copy(all_params[k], params)
-        kn.copy(starts[k], y)
-        place[STEP] = 0
-        place[PENDING] = 0
-        clock[TIME] = t0
-        clock[TIME_NEW] = t0
-        clock[NEXT_LENGTH] = taus[k]
-        if isnan(taus[k]):
-            return DOUBTFUL
-        rhs(t0, y, w.K[0], params)
-        w.counters[NFEV] = evaluations
-        inv(t0, y, o.target, params)
-        grad(t0, y, w.K[0], G, params)
-        sound = kn.all_finite(y_r) and kn.all_finite(w.K_r[0]) and kn.all_finite(o.target)
-        if not (sound and kn.all_finite(G_r.reshape(-1))):
-            return DOUBTFUL
-        if o.watched:
-            kn.start_figures(o.target, o.target, o.scales, G_r, y_r, w.K_r[0], taus[k], w.trust)
-        rows = saved[min(k, saved.shape[0] - 1)]
-        t_saved[0] = t0
-        kn.copy(y_r, rows[0])
-        place[ROW] = 1
-        code = advance(rhs, inv, grad, event, params, schedule, k_end, m, o, w, y, y_r, y_new, y_new_r, t_saved, rows)
-        if code != OK or clock[TIME] != schedule.span.t_bound:
-            return code
-        kn.copy(y, ends[k])
-        kn.copy(w.max_defect, defects[k])
-        kn.copy(w.counters, counters[k])
-        corrections[k] = w.max_correction[0]
-        kn.copy(w.trust.reshape(-1), figures[k])
-        where[0] += 1
-    return OK
-
-
-@cache
-def _compiled_sweep(dtype: np.dtype, advance: Any, arguments: tuple[Any, ...]) -> Callable[..., int]:
-    """The sweep compiled for one type of driver, which it calls by its address: seconds, then cached on disk."""
-    rhs, inv, grad = signatures(dtype)
-    functions = [types.FunctionType(s) for s in (types.int64(*advance), rhs, inv, grad, inv)]
-    signature = types.int64(*functions, *arguments)
-    return cached_njit([signature], error_model="numpy", nogil=True, _nrt=False)(sweep)
-
-
 def _batch(loop: Loop) -> Batch | None:
     """Buffers for members side by side; None where they cannot run so."""
     try:
@@ -419,122 +352,104 @@ def _batch(loop: Loop) -> Batch | None:
         return None
 
 
-class _Each(NamedTuple):
-    """What a driver needs of the members it runs, by member.
-
-    Starts and parameters, lengths of the first steps, evaluations before them, rows for saved states, and the figures
-    of `Trust`, flat.
-    """
-
-    y0s: np.ndarray
-    params: np.ndarray
-    taus: np.ndarray
-    evaluations: int
-    saved: np.ndarray | None
-    figures: np.ndarray
-
-
 class Sweeper:
-    """A compiled driver with its buffers, which runs member after member."""
+    """A native run with its buffers, on which the engine runs member after member."""
 
     def __init__(self, loop: Loop, members: int) -> None:
         self.loop = loop
-        driver, span = loop.driver, loop.driver.schedule.span
-        buffers = _buffers(driver.run.work)
-        self._buffers = tuple(a.reshape(-1).view(np.int64) for a in buffers)
-        self._fresh = tuple(a.copy() for a in self._buffers)
-        self._evaluations = int(driver.run.work.counters[NFEV])
-        self._G = np.zeros_like(driver.run.work.G)
-        self._where = np.zeros(1, np.int64)
-        self._compiled: Callable[..., int] | None = None
-        self._row_buffer = driver.y[None].view(float)
-        self._numba = NumbaDriver(loop)
-        self._batch = _batch(loop) if members * span.n_steps * driver.run.y0.size >= LEAST_WORK else None
+        run, span = loop.driver.run, loop.driver.schedule.span
+        self._sigma, self._evaluations = run.work.sigma.copy(), int(run.work.counters[NFEV])
+        self._left = np.array(loop.events.left)
+        self._steps = FIRST_STEPS
+        self._batch = _batch(loop) if members * span.n_steps * run.y0.size >= LEAST_WORK else None
 
     def run(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
         """All members into `out`."""
-        loop, driver = self.loop, self.loop.driver
-        m, trust = len(y0s), driver.run.work.trust
-        taus, evaluations = self._first_steps(plan, y0s, params)
-        saved = np.empty((m, driver.t.size, plan.size), plan.dtype) if plan.times.size else None
-        y0s, params = (np.require(a, requirements=["C", "W"]) for a in (y0s, params))  # one type for compiled code
-        each = _Each(y0s, params, taus, evaluations, saved, np.zeros((m, trust.size)))
+        m, each = len(y0s), self._each(plan, y0s, params, out)
         first, again = self._side_by_side(plan, each, out, watch)
-        if m == 0:
-            self._sweep(0, each, out)
-        self._one_by_one(plan, first, m, each, out, watch)
+        self._one_by_one(plan, slice(first, m), each, out, watch)
         for k in again:
-            self._one_by_one(plan, k, k + 1, each, out, watch)
+            self._one_by_one(plan, slice(k, k + 1), each, out, watch)
         self._look_at_ends(each, out)
-        if saved is not None:
-            out.saved[:] = saved[:, : plan.times.size]
-        if np.isnan(loop.diagnostics.max_correction):  # no error estimate to measure by
+        if each.kept:
+            out.saved[:] = each.rows[:, : plan.times.size]
+        if np.isnan(self.loop.diagnostics.max_correction):  # no error estimate to measure by
             out.max_correction[:] = np.nan
 
-    def _one_by_one(self, plan: Plan, first: int, m: int, each: _Each, out: Members, watch: _Watch) -> None:
-        """Members `first` to `m`."""
-        driver, where, batch = self.loop.driver, self._where, 1
-        where[0] = first
+    def _each(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members) -> data.Members:
+        """What the members bring and where their results go."""
+        driver, m = self.loop.driver, len(y0s)
+        y0s, params = (np.require(a, requirements=["C", "W"]) for a in (y0s, params))
+        kept = plan.times.size > 0
+        return data.Members(
+            starts=y0s,
+            params=params,
+            first_steps=self._first_steps(y0s, params),
+            evaluations=self._evaluations,
+            sigma=self._sigma,
+            left=self._left,
+            kept=kept,
+            rows=np.empty((m if kept else 1, *driver.y.shape), plan.dtype),
+            y=out.y,
+            t=out.t,
+            status=out.status,
+            max_defect=out.max_defect,
+            counters=out.counters,
+            max_correction=out.max_correction,
+            figures=np.zeros((m, *driver.run.work.trust.shape)),
+            where=np.zeros(2, np.int64),
+        )
+
+    def _one_by_one(self, plan: Plan, those: slice, each: data.Members, out: Members, watch: _Watch) -> None:
+        part = _part(each, those)
+        m, where = len(part.t), part.where
         while where[0] < m:
             watch.update()
-            last, begin = min(m, int(where[0]) + batch), time.perf_counter()
-            first = int(where[0])
+            first, begin = int(where[0]), time.perf_counter()
             reason, code = None, OK
             try:
-                code = self._sweep(last, each, out)
-            except ChangedShapeError as error:
-                driver.place(error)
-                reason = _reason(error)
+                code = self.loop.driver.sweep(part, self._steps)
             except Exception as error:
                 reason = _reason(error)
             done = int(where[0])
-            self._arrived(slice(first, done), each, out)
-            if done < last:
-                if each.saved is not None:
-                    driver.y = each.saved[done]
-                self._look_at(plan, done, code, reason, each.y0s[done], each.params[done], out, watch)
-                if code == DOUBTFUL and each.saved is not None:
-                    each.saved[done, :-1] = out.saved[done]
-                elif each.saved is not None:
-                    each.saved[done, driver.rows :] = np.nan
-                where[0] += 1
-            elif time.perf_counter() - begin < BATCH_SECONDS:
-                batch *= 2
+            self._arrived(slice(those.start + first, those.start + done), each, out)
+            if reason is not None or code != OK:
+                self._look_at(plan, those.start + done, code, reason, each, out, watch)
+                where[:] = done + 1, 0
+            elif done < m:
+                seconds = max(time.perf_counter() - begin, 1e-9)
+                self._steps = max(1, min(2 * self._steps, int(self._steps * SWEEP_SECONDS / seconds)))
 
-    def _look_at_ends(self, each: _Each, out: Members) -> None:
+    def _look_at_ends(self, each: data.Members, out: Members) -> None:
         """Check the invariants at the end of the first member that got there and, where they are none, of all."""
-        driver = self.loop.driver
-        run, t = driver.run, driver.schedule.span.t_bound
-        arrived = np.flatnonzero(out.status == 0)
+        run = self.loop.driver.run
+        arrived = np.flatnonzero(out.status >= 0)
         if not run.options.watched:
             return
         for k in arrived:
-            driver.params[:] = each.params[k]
+            t = float(out.t[k])
             f = self._derivative(each.params[k])(t, out.y[k])
-            found = next(run.invariants.complaints(t, out.y[k], f, each.taus[k]), None)
+            found = next(run.invariants.complaints(t, out.y[k], f, each.first_steps[k]), None)
             if found is not None:
-                trust = Trust(run.invariants.names, each.figures[k].reshape(run.work.trust.shape))
+                trust = Trust(run.invariants.names, each.figures[k])
                 trust.doubts.append(found.text)
                 out.trusted[k] = False
-                out.message[k] = f"{ARRIVED}; {trust.message}"
+                out.message[k] = f"{ENDS[out.status[k]]}; {trust.message}"
             elif k == arrived[0]:
                 return
 
-    def _arrived(self, those: slice, each: _Each, out: Members) -> None:
-        """Members that the sweep took to their ends, and what their corrections say."""
-        run = self.loop.driver.run
-        out.status[those] = 0
-        out.t[those] = self.loop.driver.schedule.span.t_bound
-        figures = each.figures[those].reshape(those.stop - those.start, *run.work.trust.shape)
+    def _arrived(self, those: slice, each: data.Members, out: Members) -> None:
+        """Members that the engine took to their ends, and what their corrections say."""
+        names, figures = self.loop.driver.run.invariants.names, each.figures[those]
         out.trusted[those] = ~sick(figures).any(axis=1)
         out.message[those] = [
-            ARRIVED if trusted else f"{ARRIVED}; {Trust(run.invariants.names, rows).message}"
-            for trusted, rows in zip(out.trusted[those], figures, strict=True)
+            ENDS[status] if trusted else f"{ENDS[status]}; {Trust(names, rows).message}"
+            for status, trusted, rows in zip(out.status[those], out.trusted[those], figures, strict=True)
         ]
 
-    def _side_by_side(self, plan: Plan, each: _Each, out: Members, watch: _Watch) -> tuple[int, list[int]]:
+    def _side_by_side(self, plan: Plan, each: data.Members, out: Members, watch: _Watch) -> tuple[int, list[int]]:
         """Run members in batches, while there are enough; how many have run, and which are to run again alone."""
-        batch, m, saved = self._batch, len(each.y0s), each.saved
+        batch, m = self._batch, len(each.t)
         if batch is None:
             return 0, []
         if m == 0:
@@ -546,12 +461,12 @@ class Sweeper:
             group = slice(first, min(m, first + batch.lanes))
 
             def save(row: int, states: np.ndarray, group: slice = group) -> None:
-                if saved is not None:
-                    saved[group, row + 1] = states
+                if each.kept:
+                    each.rows[group, row + 1] = states
 
-            if saved is not None:
-                saved[group, 0] = each.y0s[group]
-            ends = batch.run(each.y0s[group], each.params[group], each.evaluations, meetings, save, watch.update)
+            if each.kept:
+                each.rows[group, 0] = each.starts[group]
+            ends = batch.run(each.starts[group], each.params[group], each.evaluations, meetings, save, watch.update)
             for k, end in zip(range(group.start, group.stop), ends, strict=True):
                 if end is None:
                     again.append(k)
@@ -563,71 +478,43 @@ class Sweeper:
             first = group.stop
         return first, again
 
-    def _sweep(self, last: int, each: _Each, out: Members) -> int:
-        driver, G = self.loop.driver, self._G
-        rows = self._row_buffer if each.saved is None else each.saved.view(float)
-        passed = (
-            *(driver.params, driver.schedule, *self._numba.tail, driver.t, self._buffers, self._fresh, G),
-            *(G.view(float), self._where, last, self.loop.chunk),
-            *(each.y0s, each.taus, each.evaluations, each.params, rows),
-            *(out.y, out.max_defect, out.counters, out.max_correction, each.figures),
-        )
-        advance = self._numba.advance
-        if self._compiled is None:
-            signature = advance.nopython_signatures[0].args
-            self._compiled = _compiled_sweep(driver.run.y0.dtype, signature, tuple(typeof(a) for a in passed))
-        return self._compiled(advance, *self._numba.functions, *passed)
-
     def _look_at(
-        self,
-        plan: Plan,
-        k: int,
-        code: int,
-        reason: str | None,
-        y0: np.ndarray,
-        params: np.ndarray,
-        out: Members,
-        watch: _Watch,
+        self, plan: Plan, k: int, code: int, reason: str | None, each: data.Members, out: Members, watch: _Watch
     ) -> None:
-        """A member that the sweep came back with."""
+        """A member that the engine came back with."""
         loop = self.loop
-        if reason is not None:
-            _store(loop, k, FAILED, reason, out)
-        elif code == DOUBTFUL:
-            _alone(plan, k, y0, params, out, watch)
-        elif code == OK:
-            loop.chunk *= 2  # so that the next one ends within the sweep
-            loop.driver.run.trust.doubts.clear()
-            _finish(plan, loop, k, out, watch)
-        else:
-            _store(loop, k, FAILED, setup.failure(code, loop.driver.run, loop.driver.schedule.clock), out)
+        driver = loop.driver
+        if code in (DOUBTFUL, PAUSE):
+            _alone(plan, k, each.starts[k], each.params[k], out, watch)
+            if each.kept:
+                each.rows[k, :-1] = out.saved[k]
+            return
+        _store(loop, k, FAILED, reason or setup.failure(code, driver.run, driver.schedule.clock), out)
+        if each.kept:
+            each.rows[k, driver.rows :] = np.nan
 
-    def _first_steps(self, plan: Plan, y0s: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, int]:
-        """Lengths of the first steps, and the evaluations before them."""
-        driver, stepping = self.loop.driver, self.loop.stepping
+    def _first_steps(self, y0s: np.ndarray, params: np.ndarray) -> np.ndarray:
+        """Lengths of the first steps; NaN where none can be estimated."""
+        t0, stepping = self.loop.driver.schedule.span.t0, self.loop.stepping
         if stepping.h is not None or stepping.first_step is not None:
-            return np.full(len(y0s), stepping.h or stepping.first_step, float), self._evaluations
+            return np.full(len(y0s), stepping.h or stepping.first_step, float)
         taus = np.empty(len(y0s))
         for k, (y0, p) in enumerate(zip(y0s, params, strict=True)):
             derivative = self._derivative(p)
             try:
-                taus[k] = stepping.first(derivative, y0, derivative(driver.schedule.span.t0, y0), self.loop.tableau)
+                taus[k] = stepping.first(derivative, y0, derivative(t0, y0), self.loop.tableau)
             except Exception:
                 taus[k] = np.nan
-        return taus, self._evaluations
+        return taus
 
     def _derivative(self, params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
-        rhs = self._numba.functions.rhs
-
-        def derivative(t: float, y: np.ndarray) -> np.ndarray:
-            out = np.zeros_like(y)
-            rhs(t, y, out, params)
-            return out
-
-        return derivative
+        """The derivative of a member with these parameters."""
+        self.loop.driver.params[:] = params
+        return self.loop.prepared.system.derivative
 
 
-def _buffers(work: Work) -> list[np.ndarray]:
-    """All arrays of a run's work, each once."""
-    own = [a for name, a in work._asdict().items() if name != "inner" and not name.endswith("_r")]
-    return [*own, *work.inner]
+def _part(each: data.Members, those: slice) -> data.Members:
+    """Some of the members, none of which has begun."""
+    own = {name: getattr(each, name)[those] for name in BY_MEMBER}
+    rows = each.rows[those] if each.kept else each.rows
+    return each._replace(**own, rows=rows, where=np.zeros(2, np.int64))

@@ -6,26 +6,27 @@ runs, and comes back there.
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import typeof, types
 
 from ..core import setup
-from ..core.compiled_functions import signatures_of_batches, with_inlined
+from ..core.compiled_functions import CompiledFunctions, compile_functions, signatures_of_batches, with_inlined
 from ..core.jitted import NotCompilableError
 from ..core.options import Options
 from ..core.stepping import UNBOUNDED
 from ..engine.caching import cached_njit
 from ..engine.counters import FOUND, LAST_RANK, N_COUNTERS, NFEV, NLU, PROJECTIONS, RANK_REDUCED, SKIPPED
-from ..engine.data import AUTO, NEW, OK, PENDING, ROW, STEP, TIME, Span
+from ..engine.data import AUTO, NEW, OK, PENDING, ROW, STEP, TIME, Schedule
 from ..engine.octets import LANES
 from ..engine.trust import EXPECTED, START, SUM, TERMS, TOGETHER
 from ..run.integrate import Loop
-from .numba_driver import compiled_by_numba, source_stamp
 from .vector_step import finish_batch, make_advance_batch, make_lanes, make_lanes_work
 
 __all__ = ["Batch", "Ended", "can_run", "lanes_of"]
@@ -35,6 +36,22 @@ MOST_LANES = 32
 # Steps from one meeting to the next: longer while none leaves, never longer than some tenths of a second.
 FIRST_MEETING, LEAST_MEETING = 32, 32
 MEETING_SECONDS = 0.1
+
+
+def source_stamp(*names: str) -> str:
+    """Hash of all source that goes into the loop, as Numba looks only at the file of the function itself."""
+    folder = Path(__file__).parents[1]
+    engine = ("octets", "sums", "triples", "trust", "data", "kernels", "step")
+    names = (*(f"engine/{name}.py" for name in engine), *names)
+    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in names)).hexdigest()
+
+
+def compiled_for_octets(loop: Loop) -> CompiledFunctions:
+    """The functions of a run for vectors of members."""
+    system, run = loop.prepared.system, loop.prepared.run
+    extra, dtype = bool(system.extra), run.y0.dtype
+    return compile_functions(system.fun, system.form, extra, run.invariants, (), dtype, in_octets=True)
+
 
 advance_batch = make_advance_batch(source_stamp("ensembles/vector_step.py"))
 
@@ -64,9 +81,10 @@ class Ended(NamedTuple):
     reason: str
 
 
-def can_run(options: Options, span: Span, dtype: np.dtype) -> bool:
+def can_run(options: Options, schedule: Schedule, dtype: np.dtype) -> bool:
     """Whether members with these options take the same fixed steps, and a projection that a batch has."""
-    steps = not options.adaptive and span.n_steps < UNBOUNDED and np.dtype(dtype).kind != "c"
+    steps = not options.adaptive and schedule.span.n_steps < UNBOUNDED and np.dtype(dtype).kind != "c"
+    steps = steps and not (schedule.t_eval.size or schedule.g.size)
     projection = options.iterations == 1 and options.direction == NEW and options.every != AUTO
     return steps and projection and not options.compensated
 
@@ -89,9 +107,9 @@ class Batch:
     def __init__(self, loop: Loop) -> None:
         driver = loop.driver
         run, span = driver.run, driver.schedule.span
-        if not can_run(run.options, span, run.y0.dtype):
+        if not can_run(run.options, driver.schedule, run.y0.dtype):
             raise NotCompilableError("members with these options run one by one")
-        self.functions = compiled_by_numba(loop, in_octets=True)
+        self.functions = compiled_for_octets(loop)
         self.loop, self.span = loop, span
         n, rows = run.y0.size, run.invariants.size
         self.lanes = lanes = lanes_of(n)

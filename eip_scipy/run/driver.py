@@ -15,7 +15,7 @@ from ..core.jitted import ChangedShapeError
 from ..core.native_functions import raise_again
 from ..core.setup import Run
 from ..core.stepping import UNBOUNDED, AnyMethod
-from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Schedule
+from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
 from .events import Events
 
@@ -67,6 +67,16 @@ class Driver:
         finally:
             if interpolants is not None:
                 self._events.take(*interpolants.roots())
+
+    def sweep(self, members: Members, steps: int) -> int:
+        """Run members of an ensemble from members.where on, so many steps in all, on the buffers of this run.
+
+        Returns OK where all are at their ends or it is to be called again, else the code of the member at hand.
+        """
+        with self.own_errors():
+            code = int(self.engine.sweep(members, steps, self.state, self.new, self.t))
+        self.warn()
+        return code
 
     @contextmanager
     def own_errors(self) -> Iterator[None]:

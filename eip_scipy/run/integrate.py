@@ -34,6 +34,7 @@ __all__ = ["integrate"]
 CHUNK_SECONDS = 0.2
 FIRST_CHUNK = 64
 ARRIVED, STOPPED = "reached the end of the interval", "stopped by the callback"
+ENDED_BY_EVENT = "A termination event occurred."
 # Names that the projection's options stand beside, for hints.
 OWN = (
     *("method", "h", "params", "in_place", "save_every", "t_eval", "events", "dense_output", "callback", "progress"),
@@ -305,7 +306,7 @@ class Loop:
             if self._stopped_by_callback(rows):
                 return 1, STOPPED
             if ended:
-                return 1, "A termination event occurred."
+                return 1, ENDED_BY_EVENT
             if driver.step in setup.LOOKS:
                 self._look()
             if code == FULL:

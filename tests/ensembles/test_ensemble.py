@@ -41,9 +41,7 @@ from eip_scipy import (
     ensemble,
     integrate,
 )
-from eip_scipy.core.compiled_functions import CompiledFunctions
-from eip_scipy.ensembles import numba_driver, tasks
-from eip_scipy.ensembles.tasks import Plan, Sweeper, Task, _Watch, run_members, sweep
+from eip_scipy.ensembles.tasks import Plan, Task, run_members
 from eip_scipy.problems import kepler
 from eip_scipy.run.prepare import Request
 
@@ -197,6 +195,32 @@ def test_events_end_members():
             np.testing.assert_array_equal(run.y[k], own.y_events[0][0])
 
 
+@njit
+def _second_height(t, y):
+    return y[1]
+
+
+_second_height.terminal, _second_height.direction = 2, -1
+
+
+@pytest.mark.slow
+@needs_jit
+@pytest.mark.parametrize("more", [{"t_eval": np.linspace(0.5, 16.0, 9)}, {"save_every": 7}, {"h": None, "rtol": 1e-6}])
+def test_events_that_end_members_at_the_second_time(more):
+    """The first time goes by within the engine's loop; rows beyond the end are nan."""
+    y0s, options = starts(4), {"method": EIPRK45, "h": 0.03, "invariants": HL, "events": _second_height, **more}
+    run = ensemble(jit_orbit, (0, 16), y0s, compiled=True, **options)
+    for k in range(4):
+        own = integrate(jit_orbit, (0, 16), y0s[k], **options)
+        assert (run.status[k], run.t[k], run.message[k]) == (1, own.t_events[0][1], own.message)
+        np.testing.assert_array_equal(run.y[k], own.y_events[0][1])
+        assert (run.nfev[k], run.njev[k], run.nlu[k]) == (own.nfev, own.njev, own.nlu)
+        if run.trajectories is not None:
+            rows = own.t.size - ("save_every" in more)  # where the last row of the run is that of the event
+            np.testing.assert_array_equal(run.trajectories[k, :, :rows], own.y[:, :rows])
+            assert np.isnan(run.trajectories[k, :, rows:]).all()
+
+
 @pytest.mark.slow
 @needs_jit
 def test_given_target_and_projected_start():
@@ -231,9 +255,9 @@ def test_no_member_leaves_a_trace(options):
     none = np.empty((6, 0))
     before = run_members(plan, y0s, none)
     with plan.driver() as driver:
-        for buffer in driver._buffers:
-            buffer[:] = np.array(np.nan).view(np.int64)
-        driver.loop.driver.new[:] = np.nan
+        run, work = driver.loop.driver, driver.loop.driver.run.work
+        for buffer in [*(a for a in work if isinstance(a, np.ndarray)), *work.inner, run.state, run.new]:
+            buffer.reshape(-1).view(np.int64)[:] = np.array(np.nan).view(np.int64)
     after = run_members(plan, y0s[::-1].copy(), none)
     for name in ("y", "t", "status", "max_defect", "counters", "max_correction"):
         np.testing.assert_array_equal(getattr(before, name), getattr(after, name)[::-1])
@@ -256,36 +280,6 @@ def test_bits_do_not_depend_on_the_number_of_threads(more):
 @needs_jit
 def test_members_do_not_depend_on_the_chunk():
     same(ensemble(kepler(), SPAN, starts(40), chunk=3), ensemble(kepler(), SPAN, starts(40), chunk=40))
-
-
-class Interpreted:
-    """In place of what Numba compiles."""
-
-    def __init__(self, loop):
-        system, driver = loop.prepared.system, loop.driver
-        run, state, new = driver.run, driver.state, driver.new
-        self.functions = CompiledFunctions(system.rhs, run.invariants.inv, run.invariants.grad, system.events.fill)
-        self.tail = run.method, run.options, run.work, state, state.view(float), new, new.view(float)
-        self.advance = numba_driver.advance
-
-
-@pytest.mark.slow_without_jit
-@pytest.mark.parametrize("options", [{}, {"save_every": 4}, {"h": None, "method": EIPRK45}])
-def test_the_sweep_is_plain_python_too(monkeypatch, options):
-    """What is compiled, interpreted: the same bits as member by member."""
-    monkeypatch.setattr(tasks, "NumbaDriver", Interpreted)
-    y0s = starts(4)
-    y0s[1] = np.nan
-    shared = {"method": EIPRK4, "h": 0.1, "invariants": [H, L], "compiled": False, **options}
-    plan = Plan(Task(Request.of(fun=orbit, t_span=(0.0, 2.0), y0=y0s[0], **shared))).compile()
-    none = np.zeros((4, 0))
-    expected = run_members(plan, y0s, none)
-    driver = Sweeper(plan.loop(y0s[0], none[0]), 1)
-    driver._compiled = sweep
-    found = plan.empty(4)
-    driver.run(plan, y0s, none, found, _Watch(None))
-    for name in ("y", "t", "status", "max_defect", "counters", "max_correction", "saved"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
 
 # Failures.

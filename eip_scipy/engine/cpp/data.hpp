@@ -7,9 +7,10 @@
 
 namespace eip {
 
-// Codes of a step; the last three are the loop's.
+// Codes of a step; the last four are the loops'.
 enum Code : int {
-    OK = 0, NOT_FINITE = 1, FAILED_PROJECTION = 2, TOO_SMALL = 3, POSTPONED = 4, PAUSE = 10, FULL = 11, ENDED = 12
+    OK = 0, NOT_FINITE = 1, FAILED_PROJECTION = 2, TOO_SMALL = 3, POSTPONED = 4, PAUSE = 10, FULL = 11, ENDED = 12,
+    DOUBTFUL = 13
 };
 
 enum Direction : int { NEW, OLD, MIDPOINT };
@@ -72,7 +73,8 @@ struct Options {
     const double *rtol, *atol, *block_atol;  // by float, by component, by block
     Blocks blocks;
     Frame frame;
-    const double *target, *scales;
+    double *target;
+    const double *scales;
     double kappa;
     int64_t metric, direction, iterations, every;
     bool reuse_f, uses_f, compensated, adaptive, watched;

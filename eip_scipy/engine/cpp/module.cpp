@@ -212,6 +212,36 @@ PyObject *engine_advance(Engine *self, PyObject *const *args, Py_ssize_t count) 
     });
 }
 
+PyDoc_STRVAR(sweep_doc,
+             "sweep(members, steps, y, y_new, t_saved) -> int\n\nRun members of an ensemble one after the other, so many "
+             "steps in all; `members` is a record of data.py, whose `where` says how far they are.");
+
+PyObject *engine_sweep(Engine *self, PyObject *const *args, Py_ssize_t count) {
+    return guarded([&]() -> PyObject * {
+        expect(self, count, 5, "members, steps, y, y_new, t_saved");
+        const Busy busy(self->busy);
+        const Ref kept(PyList_New(0));
+        const Schedule &schedule = scheduled(self);
+        Data &d = *self->data;
+        const long long steps = PyLong_AsLongLong(args[1]);
+        if (steps == -1 && PyErr_Occurred()) return nullptr;
+        double *y = state_of(args[2], "y", self, kept.get()), *y_new = state_of(args[3], "y_new", self, kept.get());
+        Arrays arrays(kept.get());
+        auto *t_saved = static_cast<double *>(arrays.memory(args[4], "t_saved", NPY_DOUBLE, {ANY}));
+        const npy_intp rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[4]), 0);
+        Members members = members_of(args[0], d, schedule, rows, arrays, self->type);
+        members.t_saved = t_saved;
+        if (d.system.python || self->hooks || (schedule.n_events > 0 && !self->samples) || rows < 1) {
+            PyErr_SetString(PyExc_ValueError, "engine: members are swept by native functions, with room for their rows");
+            return nullptr;
+        }
+        check_room(schedule, members.saved(0, d.work), self->samples);
+        if (self->samples) self->samples->interpolants.capacity = 0;
+        return PyLong_FromLong(stepped(
+            self, [&](auto &run) { return sweep(run, self->samples, schedule, members, steps, y, y_new); }));
+    });
+}
+
 PyDoc_STRVAR(sample_doc, "sample(dense) -> None\n\nDense output from now on; `dense` is a record of data.py.");
 
 PyObject *engine_sample(Engine *self, PyObject *const *args, Py_ssize_t count) {
@@ -438,6 +468,7 @@ PyObject *engine_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
 
 PyMethodDef engine_methods[] = {
     {"advance", reinterpret_cast<PyCFunction>(engine_advance), METH_FASTCALL, advance_doc},
+    {"sweep", reinterpret_cast<PyCFunction>(engine_sweep), METH_FASTCALL, sweep_doc},
     {"step", reinterpret_cast<PyCFunction>(engine_step), METH_FASTCALL, step_doc},
     {"project", reinterpret_cast<PyCFunction>(engine_project), METH_FASTCALL, project_doc},
     {"close", reinterpret_cast<PyCFunction>(engine_close), METH_FASTCALL, close_doc},

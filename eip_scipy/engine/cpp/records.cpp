@@ -232,6 +232,37 @@ Samples samples_of(PyObject *dense, const Data &run, int64_t events, Arrays &arr
     return samples;
 }
 
+Members members_of(PyObject *members, const Data &run, const Schedule &schedule, int64_t rows, Arrays &arrays, int type) {
+    Members m{};
+    const Work &w = run.work;
+    m.count = Arrays::length(members, "starts");
+    m.n_rows = rows;
+    m.kept = truth(members, "kept");
+    m.evaluations = integer(members, "evaluations");
+    const auto states = [&](const char *name, std::initializer_list<npy_intp> shape) {
+        return static_cast<double *>(arrays.memory_of(members, name, type, shape));
+    };
+    m.starts = states("starts", {m.count, w.n});
+    m.y = states("y", {m.count, w.n});
+    m.rows = states("rows", {m.kept ? m.count : 1, rows, w.n});
+    m.params = arrays.floats(members, "params", {m.count, run.system.n_params});
+    m.first_steps = arrays.floats(members, "first_steps", {m.count});
+    m.sigma = arrays.floats(members, "sigma", {w.m});
+    m.left = arrays.floats(members, "left", {schedule.n_events});
+    m.t = arrays.floats(members, "t", {m.count});
+    m.max_defect = arrays.floats(members, "max_defect", {m.count, w.l});
+    m.max_correction = arrays.floats(members, "max_correction", {m.count});
+    m.figures = arrays.floats(members, "figures", {m.count, w.l, N_FIGURES});
+    m.status = arrays.integers<int64_t>(members, "status", {m.count});
+    m.counters = arrays.integers<int64_t>(members, "counters", {m.count, N_COUNTERS});
+    m.where = arrays.integers<int64_t>(members, "where", {2});
+    if (m.where[0] < 0 || m.where[0] > m.count) {
+        PyErr_SetString(PyExc_ValueError, "engine: where is outside the members");
+        throw PythonError{};
+    }
+    return m;
+}
+
 // An address, or a function of the library's that takes these sizes and fills so many floats.
 template <typename Pointer>
 static Native<Pointer> pointer_of(PyObject *object, const char *name, int64_t floats, int64_t n, int64_t p) {

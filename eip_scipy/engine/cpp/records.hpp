@@ -2,7 +2,7 @@
 // keep their memory, so that Python reads what the engine writes.
 #pragma once
 
-#include "loop.hpp"
+#include "members.hpp"
 #include "python.hpp"
 
 namespace eip {
@@ -22,6 +22,8 @@ Work work_of(PyObject *work, int64_t stages, int64_t blocks, Arrays &arrays, int
 Options options_of(PyObject *options, const Work &w, Arrays &arrays);
 Schedule schedule_of(PyObject *schedule, Arrays &arrays);
 Samples samples_of(PyObject *dense, const Data &run, int64_t events, Arrays &arrays, int type);
+// `rows` are saved of each member.
+Members members_of(PyObject *members, const Data &run, const Schedule &schedule, int64_t rows, Arrays &arrays, int type);
 // Functions by pointer.
 void read_pointers(PyObject *functions, const Work &w, int64_t events, Arrays &arrays, System &system);
 

@@ -69,7 +69,7 @@ struct System {
     Functions *python = nullptr;
     bool by_pointer = false;
     bool second_order = false;  // rhs_pointer gives the accelerations of y = (q, v)
-    const double *params = nullptr;
+    double *params = nullptr;
     int64_t n_params = 0;
     std::vector<double> scratch, scratch_f;
     FailedCall failed;

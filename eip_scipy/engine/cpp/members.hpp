@@ -1,0 +1,119 @@
+// Members of an ensemble one after the other, on the buffers of one run.
+#pragma once
+
+#include "loop.hpp"
+
+namespace eip {
+
+// All members: `count` starts, parameters and lengths of the first steps, and what each comes to. `where` holds the member
+// at hand and whether it has begun; rows are saved for each member, or where `kept` is false for none.
+struct Members {
+    int64_t count, n_rows, evaluations;
+    bool kept;
+    double *starts, *params, *first_steps, *sigma, *left, *t_saved;
+    double *y, *t, *rows, *max_defect, *max_correction, *figures;
+    int64_t *status, *counters, *where;
+
+    template <class W>
+    Saved saved(int64_t k, const W &w) const {
+        return {t_saved, rows + (kept ? k * n_rows * w.m : 0), n_rows};
+    }
+};
+
+// Everything as at the start of a run; false where it has none that is finite, which is then to be explained.
+template <class AnyRun>
+inline bool begin_member(AnyRun &run, Samples *samples, const Schedule &s, const Members &members, double *y) {
+    const auto &w = run.work;
+    const Options &o = run.options;
+    System &system = run.system;
+    const int64_t k = members.where[0];
+    const double t0 = s.span.t0;
+    copy(members.params + k * system.n_params, system.params, system.n_params);
+    copy(members.starts + k * w.m, y, w.m);
+    copy(members.sigma, w.sigma, w.m);
+    for (double *buffer : {w.carry, w.err_sum}) fill(buffer, 0.0, w.m);
+    for (double *buffer : {w.defect, w.max_defect}) fill(buffer, 0.0, w.l);
+    w.max_correction[0] = 0.0;
+    std::fill_n(w.counters, static_cast<int64_t>(N_COUNTERS), 0);
+    w.counters[NFEV] = members.evaluations;
+    std::fill_n(s.place, 3, 0);
+    s.clock[TIME] = s.clock[TIME_NEW] = t0;
+    s.clock[NEXT_LENGTH] = members.first_steps[k];
+    if (std::isnan(members.first_steps[k])) return false;
+    system.rhs(w, t0, y, w.row(0));
+    system.inv(w, t0, y, o.target);
+    copy(o.target, w.values, w.l);
+    system.grad(w, t0, y, w.row(0), w.G);
+    if (!(all_finite(y, w.m) && all_finite(w.row(0), w.m) && all_finite(o.target, w.l) && all_finite(w.G, w.l * w.m)))
+        return false;
+    fill(w.trust, 0.0, w.l * N_FIGURES);
+    for (int64_t i = 0; i < w.l; ++i) w.figures(i)[TERMS] = INFINITE;
+    if (o.watched) start_figures(y, w.row(0), members.first_steps[k], o, w);
+    if (s.n_events > 0) system.event(w, t0, y, s.g);
+    if (samples) {
+        *samples->roots.count = 0;
+        copy(members.left, samples->roots.left, s.n_events);
+    }
+    if (s.n_eval > 0 && s.t_eval[0] != t0) return true;
+    const Saved saved = members.saved(k, w);
+    saved.t[0] = t0;
+    copy(y, saved.y, w.m);
+    s.place[ROW] = 1;
+    return true;
+}
+
+// After an event: its time and state are the member's last ones, and no row lies beyond it.
+template <class W>
+inline void end_by_event(const Roots &roots, const Schedule &s, const Members &members, const W &w) {
+    const int64_t k = members.where[0], root = *roots.count - 1;
+    const double t = roots.t[root], *y = roots.y + root * w.m;
+    const Saved saved = members.saved(k, w);
+    int64_t row = s.place[ROW];
+    if (s.n_eval == 0) {
+        while (row > 0 && s.span.sign * (saved.t[row - 1] - t) > 0.0) --row;
+        if (row > 0 && saved.t[row - 1] == t) copy(y, saved.y + (row - 1) * w.m, w.m);
+    }
+    if (members.kept) fill(saved.y + row * w.m, NOT_A_NUMBER, (saved.rows - row) * w.m);
+    members.status[k] = 1;
+    members.t[k] = t;
+    copy(y, members.y + k * w.m, w.m);
+}
+
+template <class AnyRun>
+inline void end_member(AnyRun &run, Samples *samples, const Schedule &s, const Members &members, const double *y,
+                       Code code) {
+    const auto &w = run.work;
+    const int64_t k = members.where[0];
+    if (code == ENDED) {
+        end_by_event(samples->roots, s, members, w);
+    } else {
+        members.status[k] = 0;
+        members.t[k] = s.span.t_bound;
+        copy(y, members.y + k * w.m, w.m);
+    }
+    copy(w.max_defect, members.max_defect + k * w.l, w.l);
+    copy(w.trust, members.figures + k * w.l * N_FIGURES, w.l * N_FIGURES);
+    std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), members.counters + k * N_COUNTERS);
+    members.max_correction[k] = w.max_correction[0];
+}
+
+// Members from where[0] on, so many steps in all. OK: all are at their ends, or it is to be called again; else what has
+// happened to the member at hand: a code of the step, DOUBTFUL for a start that is not finite, PAUSE as by `advance`.
+template <class AnyRun>
+inline Code sweep(AnyRun &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps, double *y,
+                  double *y_new) {
+    int64_t &k = members.where[0], &begun = members.where[1];
+    for (; k < members.count; ++k, begun = 0) {
+        if (!begun && !begin_member(run, samples, s, members, y)) return DOUBTFUL;
+        begun = 1;
+        const int64_t before = s.place[STEP];
+        const Code code = advance(run, samples, s, before + steps, y, y_new, members.saved(k, run.work));
+        steps -= s.place[STEP] - before;
+        if (code == OK && s.clock[TIME] != s.span.t_bound) return OK;
+        if (code != OK && code != ENDED) return code;
+        end_member(run, samples, s, members, y, code);
+    }
+    return OK;
+}
+
+}  // namespace eip
