@@ -61,8 +61,8 @@ class Compiled(NamedTuple):
         return RuntimeError(f"{self.name} raised an exception at t={t:.10g}, but not when it was called again there.")
 
 
-def compiled(fun: Any, kind: Kind, name: str) -> Compiled:
-    """A Numba function compiled for states of one kind.
+def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
+    """A Numba function compiled for states of one kind, of numbers of the type that `kind` names, or of `number`.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def compiled(fun: Any, kind: Kind, name: str) -> Compiled:
         When it does not compile for the arguments that `integrate` documents.
     """
     try:
-        pointer = _compile(fun, kind)
+        pointer = _compile(fun, kind, number)
     except NumbaError as error:
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
         raise NotCompilableError(f"{name} does not compile for this state: {first}") from error
@@ -80,12 +80,16 @@ def compiled(fun: Any, kind: Kind, name: str) -> Compiled:
 
 
 @lru_cache(maxsize=256)
-def _compile(fun: Any, kind: Kind) -> Pointer:
+def _compile(fun: Any, kind: Kind, number: Any) -> Pointer:
     """For the same function and kind of state once in a process."""
     call = _with_all_arguments(fun, kind, _inlined)
+
+    def array(scalar: Any, ndim: int) -> Any:
+        return types.Array(number or scalar, ndim, "C", aligned=number is None)
+
     scalar = from_dtype(np.dtype(kind.dtype))
-    state, floats = types.Array(scalar, 1, "C"), types.Array(types.float64, 1, "C")
-    out = floats if kind.real else types.Array(scalar, max(1, len(kind.shape)), "C")
+    state, floats = array(scalar, 1), array(types.float64, 1)
+    out = floats if kind.real else array(scalar, max(1, len(kind.shape)))
     arguments = types.float64, state, state, out, floats
     with global_compiler_lock:
         call.compile(arguments)

@@ -20,6 +20,7 @@ __all__ = [
     "Hooks",
     "LibraryFunction",
     "NativeFunctions",
+    "OctetFunctions",
     "PythonFunctions",
     "call",
     "library",
@@ -84,6 +85,15 @@ class NativeFunctions(NamedTuple):
     owner: Any
     python: PythonFunctions | None = None
     native: bool = True
+
+
+class OctetFunctions(NamedTuple):
+    """The same functions for eight members of an ensemble: for each number of their arrays there are eight."""
+
+    rhs: Any
+    inv: tuple[tuple[Any, int], ...]
+    grad: tuple[tuple[Any, int], ...]
+    owner: Any
 
 
 class Hooks(NamedTuple):

@@ -34,10 +34,11 @@ class Chunk(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What comes back for a chunk."""
+    """What comes back for a chunk; `one_by_one` is the plan's."""
 
     members: Members
     statistics: Statistics | None
+    one_by_one: str = ""
 
 
 class Pool(Protocol):
@@ -68,7 +69,7 @@ def finished(task: Task, plan: Plan, members: Members) -> Part:
         statistics = statistics_of(task.reduce, *plan.states(members))
     if not task.keep:
         members = members._replace(saved=members.saved[:, :0].copy())
-    return Part(members, statistics)
+    return Part(members, statistics, plan.one_by_one)
 
 
 _plans: OrderedDict[str, Plan] = OrderedDict()

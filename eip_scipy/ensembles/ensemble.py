@@ -35,10 +35,10 @@ from ..run.interrupts import ended_by_sigterm, kept_ctrl_c
 from ..run.memory import check_bytes, free_memory
 from ..run.prepare import DEFAULT, Request
 from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
+from .side_by_side import LANES
 from .statistics import Statistics, merge
 from .store import CheckpointStore, Store, ZarrStore, location, require_same_functions
 from .tasks import FAILED, NOT_RUN, Members, Plan, Task
-from .vector_runs import lanes_of
 
 __all__ = ["EnsembleResult", "ensemble"]
 
@@ -48,6 +48,7 @@ UNKNOWN_STEPS = 10_000
 CHUNK_BYTES = 4e6
 LARGEST_CHUNK = 4096
 LEAST_CHUNKS = 16
+LEAST_OCTETS = 4  # of members in a chunk
 TRIED = 8
 SHOWN = 5
 # Of a request: what an ensemble has of its own, or not at all.
@@ -79,6 +80,8 @@ class EnsembleResult(OptimizeResult):
         Largest correction in local errors; nan where the method estimates none.
     side_by_side : ndarray of bool, shape (members,)
         Whether each ran in a vector with others, several times faster; the docs' page on ensembles says what it takes.
+    one_by_one : str
+        Why members ran one after the other instead; "" where they did not, or only those did that had to.
     trusted : ndarray of bool, shape (members,)
         Whether each did not fail and nothing speaks against it, as in `IntegrationResult`; else `message` says what.
     names : tuple of str
@@ -111,6 +114,8 @@ class EnsembleResult(OptimizeResult):
             f"{self.wall_time:.3g} s, {np.count_nonzero(self.side_by_side)} side by side in vectors, "
             f"{self.failed.size} failed",
         ]
+        if self.one_by_one:
+            lines.append(f"  one by one: {self.one_by_one}")
         width = max((len(name) for name in self.names), default=0)
         for name, defects in zip(self.names, self.max_defect[self.status >= 0].T, strict=True):
             if defects.size:
@@ -313,7 +318,7 @@ class _Gathered:
         self.method = plan.task.request.method.__name__
         self.whole = Members.empty(members, plan.size, plan.dtype, len(plan.names), held)
         self.statistics: Statistics | None = None
-        self.stopped = False
+        self.stopped, self.one_by_one = False, ""
         self._begin = time.perf_counter()
 
     def run(self, pool: Callable[[], Pool], chunks: Callable[[int], Iterator[Chunk]], progress: bool) -> EnsembleResult:
@@ -378,6 +383,7 @@ class _Gathered:
             if name != "saved" or whole.shape[1]:
                 whole[first:last] = getattr(members, name)
         self.statistics = merge(self.statistics, part.statistics)
+        self.one_by_one = part.one_by_one or self.one_by_one
 
     def result(self) -> EnsembleResult:
         """The result as far as it is there."""
@@ -402,6 +408,7 @@ class _Gathered:
             max_defect=members.max_defect,
             max_correction=members.max_correction,
             side_by_side=members.side_by_side,
+            one_by_one=self.one_by_one,
             trusted=trusted,
             names=plan.names,
             nfev=counters[:, NFEV],
@@ -517,8 +524,7 @@ def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
     by_work = budget * 4 / (steps * max(4, plan.size))
     by_bytes = CHUNK_BYTES / (plan.size * plan.dtype.itemsize * (1 + plan.times.size))
     size = min(by_work, by_bytes, LARGEST_CHUNK, math.ceil(members / LEAST_CHUNKS))
-    lanes = lanes_of(plan.size)
-    return lanes * max(1, math.ceil(size / lanes))
+    return LANES * max(LEAST_OCTETS, math.ceil(size / LANES))
 
 
 def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) -> None:

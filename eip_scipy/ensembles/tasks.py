@@ -27,7 +27,7 @@ from ..run.driver import saved_rows
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop
 from ..run.prepare import Prepared, Request, prepared
 from ..run.resume import Keeper
-from .vector_runs import Batch
+from .side_by_side import need_compiling, octet_functions, why_one_by_one
 
 __all__ = ["COMPARED", "FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
 
@@ -38,7 +38,7 @@ ENDS = (ARRIVED, ENDED_BY_EVENT)
 BY_MEMBER = (
     *("starts", "params", "first_steps", "y", "t", "status", "max_defect", "counters", "max_correction", "figures"),
 )
-LEAST_WORK = 3e7  # floats times steps, a second or two: compiling functions for vectors takes as long
+LEAST_WORK = 3e7  # floats times steps, a second or two: compiling functions for eight members takes as long
 COMPARED = 16
 
 
@@ -133,6 +133,8 @@ class Plan:
     task : Task
     why_not : str or None
         Why the members run interpreted; None: they are compiled.
+    one_by_one : str
+        Why the members run one after the other; "" where they run side by side. Known when the plan is compiled.
     names : tuple of str
         Of the l invariants.
     times : ndarray, shape (rows,)
@@ -149,6 +151,7 @@ class Plan:
         self._ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
         schedule, run = self._ready.schedule, self._ready.run
         self.why_not: str | None = None
+        self.one_by_one = ""
         self.names = tuple(run.invariants.names)
         self.pointers = self._ready.pointers
         self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, schedule.span.t0
@@ -167,9 +170,10 @@ class Plan:
         own_targets = any(item.target is not None for item in ready.run.invariants.items)
         own_start = ready.run.identity["project_initial"] or own_targets
         self._together = self.why_not is None and not own_start
-        self._idle = [Sweeper(loop, self.task.members)] if self._together else []
-        none = np.zeros((0, self.size), self.dtype), np.zeros((0, loop.driver.params.size))
-        run_members(self, *none)  # which compiles functions of members side by side
+        self.one_by_one = self.why_not or "the start of each member is projected, or an invariant has a target"
+        if self._together:
+            sweeper = Sweeper(loop, self.task.members)
+            self.one_by_one, self._idle = sweeper.one_by_one, [sweeper]
         return self
 
     def empty(self, m: int) -> Members:
@@ -344,37 +348,52 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _batch(loop: Loop) -> Batch | None:
-    """Buffers for members side by side; None where they cannot run so."""
-    try:
-        return Batch(loop)
-    except NotCompilableError:
-        return None
-
-
 class Sweeper:
-    """A native run with its buffers, on which the engine runs member after member."""
+    """A native run with its buffers, on which the engine runs members.
+
+    Attributes
+    ----------
+    one_by_one : str
+        Why they run one after the other; "" where they run side by side.
+    """
 
     def __init__(self, loop: Loop, members: int) -> None:
         self.loop = loop
-        run, span = loop.driver.run, loop.driver.schedule.span
+        run = loop.driver.run
         self._sigma, self._evaluations = run.work.sigma.copy(), int(run.work.counters[NFEV])
         self._left = np.array(loop.events.left)
         self._steps = FIRST_STEPS
-        self._batch = _batch(loop) if members * span.n_steps * run.y0.size >= LEAST_WORK else None
+        self.one_by_one = self._go_side_by_side(members)
 
     def run(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
         """All members into `out`."""
-        m, each = len(y0s), self._each(plan, y0s, params, out)
-        first, again = self._side_by_side(plan, each, out, watch)
-        self._one_by_one(plan, slice(first, m), each, out, watch)
-        for k in again:
-            self._one_by_one(plan, slice(k, k + 1), each, out, watch)
+        each = self._each(plan, y0s, params, out)
+        if self.one_by_one:
+            self._one_by_one(plan, slice(0, len(y0s)), each, out, watch)
+        else:
+            self._side_by_side(each, out, watch)
+            for k in np.flatnonzero(out.status == NOT_RUN).tolist():
+                self._one_by_one(plan, slice(k, k + 1), each, out, watch)
         self._look_at_ends(each, out)
         if each.kept:
             out.saved[:] = each.rows[:, : plan.times.size]
         if np.isnan(self.loop.diagnostics.max_correction):  # no error estimate to measure by
             out.max_correction[:] = np.nan
+
+    def _go_side_by_side(self, members: int) -> str:
+        driver = self.loop.driver
+        run, schedule = driver.run, driver.schedule
+        reason = why_one_by_one(run.options, schedule, run.y0.dtype)
+        little = members * schedule.span.n_steps * run.y0.size < LEAST_WORK
+        if not reason and little and need_compiling(driver.functions):
+            reason = "there is less to do than functions for eight members take to compile"
+        if reason:
+            return reason
+        try:
+            driver.engine.side_by_side(octet_functions(driver.functions))
+        except NotCompilableError as error:
+            return str(error)
+        return ""
 
     def _each(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members) -> data.Members:
         """What the members bring and where their results go."""
@@ -412,13 +431,12 @@ class Sweeper:
             except Exception as error:
                 reason = _reason(error)
             done = int(where[0])
-            self._arrived(slice(those.start + first, those.start + done), each, out)
+            self._arrived(np.arange(those.start + first, those.start + done), each, out)
             if reason is not None or code != OK:
                 self._look_at(plan, those.start + done, code, reason, each, out, watch)
                 where[:] = done + 1, 0
             elif done < m:
-                seconds = max(time.perf_counter() - begin, 1e-9)
-                self._steps = max(1, min(2 * self._steps, int(self._steps * SWEEP_SECONDS / seconds)))
+                self._adapt(time.perf_counter() - begin)
 
     def _look_at_ends(self, each: data.Members, out: Members) -> None:
         """Check the invariants at the end of the first member that got there and, where they are none, of all."""
@@ -438,45 +456,30 @@ class Sweeper:
             elif k == arrived[0]:
                 return
 
-    def _arrived(self, those: slice, each: data.Members, out: Members) -> None:
+    def _arrived(self, those: np.ndarray, each: data.Members, out: Members) -> None:
         """Members that the engine took to their ends, and what their corrections say."""
         names, figures = self.loop.driver.run.invariants.names, each.figures[those]
         out.trusted[those] = ~sick(figures).any(axis=1)
-        out.message[those] = [
-            ENDS[status] if trusted else f"{ENDS[status]}; {Trust(names, rows).message}"
-            for status, trusted, rows in zip(out.status[those], out.trusted[those], figures, strict=True)
-        ]
+        for k, rows in zip(those.tolist(), figures, strict=True):
+            end = ENDS[out.status[k]]
+            out.message[k] = end if out.trusted[k] else f"{end}; {Trust(names, rows).message}"
 
-    def _side_by_side(self, plan: Plan, each: data.Members, out: Members, watch: _Watch) -> tuple[int, list[int]]:
-        """Run members in batches, while there are enough; how many have run, and which are to run again alone."""
-        batch, m = self._batch, len(each.t)
-        if batch is None:
-            return 0, []
-        if m == 0:
-            batch.compile()
-        schedule = self.loop.driver.schedule
-        meetings = saved_steps(schedule.span.n_steps, schedule.save_every)[1:].tolist()
-        first, again = 0, []
-        while m - first >= batch.lanes // 4:
-            group = slice(first, min(m, first + batch.lanes))
+    def _side_by_side(self, each: data.Members, out: Members, watch: _Watch) -> None:
+        """All members in octets, but for those that have to run by themselves."""
+        m, where = len(each.t), each.where
+        while where[0] < m:
+            watch.update()
+            begin = time.perf_counter()
+            self.loop.driver.sweep_octets(each, self._steps)
+            if where[0] < m:
+                self._adapt(time.perf_counter() - begin)
+        done = np.flatnonzero(out.status != NOT_RUN)
+        out.side_by_side[done] = True
+        self._arrived(done, each, out)
 
-            def save(row: int, states: np.ndarray, group: slice = group) -> None:
-                if each.kept:
-                    each.rows[group, row + 1] = states
-
-            if each.kept:
-                each.rows[group, 0] = each.starts[group]
-            ends = batch.run(each.starts[group], each.params[group], each.evaluations, meetings, save, watch.update)
-            for k, end in zip(range(group.start, group.stop), ends, strict=True):
-                if end is None:
-                    again.append(k)
-                    continue
-                out.y[k], out.t[k], out.max_defect[k] = end.y, end.t, end.max_defect
-                out.max_correction[k], out.counters[k] = end.max_correction, end.counters
-                out.side_by_side[k], out.trusted[k] = True, not end.reason
-                _describe(out, k, FAILED if end.reason else 0, end.reason or ARRIVED)
-            first = group.stop
-        return first, again
+    def _adapt(self, seconds: float) -> None:
+        """The steps of the next call, after one that made all of its own."""
+        self._steps = max(1, min(2 * self._steps, int(self._steps * SWEEP_SECONDS / max(seconds, 1e-9))))
 
     def _look_at(
         self, plan: Plan, k: int, code: int, reason: str | None, each: data.Members, out: Members, watch: _Watch

@@ -78,6 +78,13 @@ class Driver:
         self.warn()
         return code
 
+    def sweep_octets(self, members: Members, steps: int) -> None:
+        """The same, eight members side by side, until all are through or so many steps are made.
+
+        Whose status is not set then has to run by itself.
+        """
+        self.engine.sweep_octets(members, steps, self.state, self.new, self.t)
+
     @contextmanager
     def own_errors(self) -> Iterator[None]:
         """What compiled functions raise, which C does not see, or mean by a status, in place of the engine's error."""

@@ -13,19 +13,22 @@ constexpr int MAX_RETRIES = 10;
 // every = AUTO: each so many-th step asks whether a projection is worth it.
 constexpr int64_t AUTO_SPACING = 5;
 
-// y_hat; f there in w.last(), the local error in w.err and its norm in w.norm where they are wanted.
+// The stages and their sum, y_hat.
 template <class AnyRun>
-inline Code raw_step(AnyRun &run, const Step &step) {
-    const Method &m = run.method;
-    const Options &o = run.options;
-    const auto &w = run.work;
-    if (m.nystrom)
+inline void make_stages(AnyRun &run, const Step &step) {
+    if (run.method.nystrom)
         rkn_stages(run, step);
     else
         rk_stages(run, step);
-    w.counters[NFEV] += m.stages - 1;
-    const bool finite = all_finite(w.y_hat, w.m);
-    if (!(run.hooks && run.hooks->agree ? run.hooks->all_agree(finite) : finite)) return NOT_FINITE;
+    run.work.counters[NFEV] += run.method.stages - 1;
+}
+
+// What follows the stages: f at y_hat in w.last(), the local error in w.err and its norm in w.norm where they are wanted.
+template <class AnyRun>
+inline void look_back(AnyRun &run, const Step &step) {
+    const Method &m = run.method;
+    const Options &o = run.options;
+    const auto &w = run.work;
     const bool estimate = o.adaptive || ((o.metric == ERROR || o.every == AUTO) && w.l > 0);
     w.counters[HAVE_F] = (estimate && m.fsal) || (step.project && o.uses_f);
     w.counters[HAVE_ERROR] = estimate;
@@ -37,6 +40,14 @@ inline Code raw_step(AnyRun &run, const Step &step) {
         estimate_error(run, step);
     else if (step.project && is_sampled(run))
         sample_error(run, step);
+}
+
+template <class AnyRun>
+inline Code raw_step(AnyRun &run, const Step &step) {
+    make_stages(run, step);
+    const bool finite = all_finite(run.work.y_hat, run.work.m);
+    if (!(run.hooks && run.hooks->agree ? run.hooks->all_agree(finite) : finite)) return NOT_FINITE;
+    look_back(run, step);
     return OK;
 }
 

@@ -18,10 +18,10 @@ struct Moved {
     double largest_error, correction;
 };
 
-template <class W>
-inline Matrix rows_of(double *a, const W &w) { return {a, w.l, w.m, w.m}; }
-template <class W>
-inline Matrix small(double *a, int64_t size, const W &w) { return {a, size, size, w.l}; }
+template <class Value, class W>
+inline MatrixOf<Value> rows_of(Value *a, const W &w) { return {a, w.l, w.m, w.m}; }
+template <class Value, class W>
+inline MatrixOf<Value> small(Value *a, int64_t size, const W &w) { return {a, size, size, w.l}; }
 
 // w.values = I(y); compensated runs add what the carry is worth, by the gradients at hand.
 template <class AnyRun>
@@ -33,22 +33,22 @@ inline void evaluate_invariants(AnyRun &run, double t, const double *y) {
 }
 
 // w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction, neutral to the frame; out = y_hat + move.
-template <class W>
-inline void move_along(const Options &o, const W &w, double *__restrict out) {
+template <class Value, class W>
+inline void move_along(const Options &o, const W &w, Value *__restrict out) {
     const int64_t m = w.m;
-    const double *__restrict mu = w.mu, *__restrict Q = w.Q, *__restrict sigma = w.sigma, *__restrict y_hat = w.y_hat;
-    double *__restrict move = w.move;
+    const Value *__restrict mu = w.mu, *__restrict Q = w.Q, *__restrict sigma = w.sigma, *__restrict y_hat = w.y_hat;
+    Value *__restrict move = w.move;
     for (int64_t j = 0; j < m; ++j) out[j] = mu[0] * Q[j];
     for (int64_t k = 1; k < w.l; ++k)
         for (int64_t j = 0; j < m; ++j) out[j] += mu[k] * Q[k * m + j];
     if (o.frame.rows > 0) {
         for (int64_t j = 0; j < m; ++j) out[j] *= sigma[j];
-        keep_frame(o.frame, out, move, m);
+        keep_frame(o.frame, w, out, move);
         for (int64_t j = 0; j < m; ++j) out[j] = y_hat[j] + move[j];
         return;
     }
     for (int64_t j = 0; j < m; ++j) {
-        const double x = sigma[j] * out[j];
+        const Value x = sigma[j] * out[j];
         move[j] = x;
         out[j] = y_hat[j] + x;
     }
@@ -140,7 +140,7 @@ template <class AnyRun>
     }
     run.system.grad(w, step.t_new, step.y_new, w.f_point, w.G);
     ++w.counters[NJEV];
-    if (!defects(nullptr, step.y_new, o, w, w.defect)) return false;
+    if (!defects<double>(nullptr, step.y_new, o, w, w.defect)) return false;
     weigh_rows(o.frame, w, w.B);
     newton_matrix_solve(rank, w);
     move_along(o, w, step.y_new);
@@ -231,7 +231,7 @@ inline Code project_step(AnyRun &run, const Step &step) {
         }
     }
     evaluate_invariants(run, step.t_new, w.y_hat);
-    if (!defects(nullptr, w.y_hat, o, w, w.before)) return stay(step, o, w);
+    if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) return stay(step, o, w);
     Moved moved = move(run, step);
     Code status = correct(run, step, moved.rank);
     if (o.direction == NEW && o.iterations == 1 && !o.compensated) {

@@ -63,7 +63,6 @@ struct Blocks {
 struct Frame {
     const uint64_t *start, *place;
     const double *value;
-    double *products;
     int64_t rows;
     const double *bodies;
     int64_t groups, count;
@@ -73,7 +72,6 @@ struct Options {
     const double *rtol, *atol, *block_atol;  // by float, by component, by block
     Blocks blocks;
     Frame frame;
-    double *target;
     const double *scales;
     double kappa;
     int64_t metric, direction, iterations, every;
@@ -104,19 +102,24 @@ struct Inner {
     int64_t *pivots;
 };
 
-// Buffers of a run of m floats, l invariants and `stages` + 1 rows of K.
-struct Work {
+// Buffers of a run of m values (floats, or those of eight members), l invariants and `stages` + 1 rows of K.
+template <class V>
+struct WorkOf {
+    using Value = V;
     int64_t n, m, l, stages;
-    double *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *move, *carry, *carry_hat,
+    Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *move, *carry, *carry_hat,
         *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *worth, *defect, *max_defect, *max_correction, *trust,
-        *norm;
+        *target, *products;  // the invariants' levels; scratch of the frame
+    double *norm;
     int64_t *pivots, *counters;
     Inner inner;
 
-    double *row(int64_t i) const { return K + i * m; }        // f of stage i
-    double *last() const { return K + stages * m; }           // f at the raw result, or at the end of the step
-    double *gradient(int64_t i) const { return G + i * m; }
-    double *figures(int64_t i) const { return trust + i * N_FIGURES; }
+    Value *row(int64_t i) const { return K + i * m; }        // f of stage i
+    Value *last() const { return K + stages * m; }           // f at the raw result, or at the end of the step
+    Value *gradient(int64_t i) const { return G + i * m; }
+    Value *figures(int64_t i) const { return trust + i * N_FIGURES; }
 };
+
+using Work = WorkOf<double>;
 
 }  // namespace eip

@@ -17,7 +17,7 @@ struct Dense {
     bool by_travel;   // weights of the projection by what each block travels within the step, else those of the run
     Options options;
     Work work;
-    double *target, *missed;  // missed: how many states were left unprojected, and the time of the first
+    double *missed;  // how many states were left unprojected, and the time of the first
 
     // States that make up an interpolant, besides those of the two ends and the weights.
     int64_t rows() const { return kind == POLYNOMIAL ? polynomials + 1 : kind == SEVENTH ? 3 + polynomials : 3; }
@@ -229,7 +229,7 @@ inline void interpolate(const DenseRun<W> &dense, double *floats, double t, doub
         *piece.known = 1.0;
     }
     const double share = std::min(1.0, std::max(0.0, theta));
-    for (int64_t i = 0; i < w.l; ++i) d.target[i] = (1.0 - share) * piece.levels_old[i] + share * piece.levels[i];
+    for (int64_t i = 0; i < w.l; ++i) w.target[i] = (1.0 - share) * piece.levels_old[i] + share * piece.levels[i];
     copy(piece.sigma, w.sigma, w.m);
     copy(out, w.y_hat, w.m);
     if (d.options.uses_f) {

@@ -4,15 +4,17 @@
 #include <algorithm>
 #include <cmath>
 
-#include "sums.hpp"
+#include "values.hpp"
 
 namespace eip {
 
-inline void copy(const double *a, double *out, int64_t n) {
+template <class Value>
+inline void copy(const Value *a, Value *out, int64_t n) {
     for (int64_t i = 0; i < n; ++i) out[i] = a[i];
 }
 
-inline void fill(double *a, double value, int64_t n) {
+template <class Value>
+inline void fill(Value *a, double value, int64_t n) {
     for (int64_t i = 0; i < n; ++i) a[i] = value;
 }
 
@@ -61,8 +63,5 @@ inline void quadrature(const double *a, const double *b, double *out, int64_t n)
         out[i] = extreme ? std::hypot(a[i], b[i]) : std::sqrt(a[i] * a[i] + b[i] * b[i]);
     }
 }
-
-// x, or 1 in place of 0: a divisor where the quotient does not count.
-inline double positive(double x) { return x > 0.0 ? x : 1.0; }
 
 }  // namespace eip

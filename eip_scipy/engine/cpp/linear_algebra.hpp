@@ -11,14 +11,17 @@ constexpr double RANK_TOLERANCE = 1.4901161193847656e-08;  // sqrt(EPS)
 // Below this length one Gram-Schmidt pass would leave errors of 1e-13 and more of the defects uncorrected.
 constexpr double REORTHOGONALISE = 0.05;
 
-// Rows of a matrix, `stride` floats from one to the next.
-struct Matrix {
-    double *data;
+// Rows of a matrix, `stride` values from one to the next.
+template <class Value>
+struct MatrixOf {
+    Value *data;
     int64_t rows, columns, stride;
 
-    double *row(int64_t i) const { return data + i * stride; }
-    double &operator()(int64_t i, int64_t j) const { return data[i * stride + j]; }
+    Value *row(int64_t i) const { return data + i * stride; }
+    Value &operator()(int64_t i, int64_t j) const { return data[i * stride + j]; }
 };
+
+using Matrix = MatrixOf<double>;
 
 // Pivoted QR of the normalised rows of B, in place; returns the numerical rank, -1 where B is not finite.
 //
@@ -87,41 +90,45 @@ inline void least_norm(const double *g, const double *inverse_norms, const Matri
 // By its factorisation L D L^T, which costs a third of `factor` and squares the condition number: whether it will do
 // shows on the way, by the same bound below which one pass of Gram-Schmidt would not. The diagonal of R then holds 1/D.
 // Two rows, the usual case, by Cramer's rule: one division to wait for.
-inline bool gram_solution(const Matrix &R, const double *g, double *mu) {
+template <class Value>
+inline Truth<Value> gram_solution(const MatrixOf<Value> &R, const Value *g, Value *mu) {
     const int64_t rows = R.rows;
     constexpr double LEAST = REORTHOGONALISE * REORTHOGONALISE;
-    for (int64_t i = 0; i < rows; ++i)
-        if (!(R(i, i) > 1e-140 && R(i, i) < 1e140)) return false;
+    Truth<Value> bad{};
+    for (int64_t i = 0; i < rows; ++i) bad = bad | !((R(i, i) > 1e-140) & (R(i, i) < 1e140));
+    if (!any(!bad)) return !bad;
     if (rows == 2) {
-        const double determinant = R(0, 0) * R(1, 1) - R(1, 0) * R(1, 0);
-        const double inverse = 1.0 / positive(determinant);
+        const Value determinant = R(0, 0) * R(1, 1) - R(1, 0) * R(1, 0);
+        const Value inverse = 1.0 / positive(determinant);
         mu[0] = (R(1, 0) * g[1] - R(1, 1) * g[0]) * inverse;
         mu[1] = (R(1, 0) * g[0] - R(0, 0) * g[1]) * inverse;
-        return determinant > LEAST * (R(0, 0) * R(1, 1));
+        return (!bad) & (determinant > LEAST * (R(0, 0) * R(1, 1)));
     }
     for (int64_t i = 0; i < rows; ++i) {
         for (int64_t j = 1; j < i; ++j)
             for (int64_t k = 0; k < j; ++k) R(i, j) -= R(i, k) * R(j, k);
-        double square = R(i, i);
-        const double least = LEAST * square;
+        Value square = R(i, i);
+        const Value least = LEAST * square;
         mu[i] = -g[i];
         for (int64_t j = 0; j < i; ++j) {
-            const double x = R(i, j) * R(j, j);
+            const Value x = R(i, j) * R(j, j);
             square -= x * R(i, j);
             mu[i] -= x * mu[j];
             R(i, j) = x;
         }
-        if (!(square > least)) return false;
+        bad = bad | !(square > least);
+        if (!any(!bad)) return !bad;
         R(i, i) = 1.0 / square;
     }
     for (int64_t i = rows - 1; i >= 0; --i) {
         mu[i] *= R(i, i);
         for (int64_t j = i + 1; j < rows; ++j) mu[i] -= R(j, i) * mu[j];
     }
-    return true;
+    return !bad;
 }
 
-inline bool solve_gram(const Matrix &B, const double *g, const Matrix &R, double *mu) {
+template <class Value>
+inline Truth<Value> solve_gram(const MatrixOf<Value> &B, const Value *g, const MatrixOf<Value> &R, Value *mu) {
     for (int64_t i = 0; i < B.rows; ++i)
         for (int64_t j = 0; j <= i; ++j) R(i, j) = dot(B.row(i), B.row(j), B.columns);
     return gram_solution(R, g, mu);

@@ -41,10 +41,10 @@ inline bool begin_member(AnyRun &run, Samples *samples, const Schedule &s, const
     s.clock[NEXT_LENGTH] = members.first_steps[k];
     if (std::isnan(members.first_steps[k])) return false;
     system.rhs(w, t0, y, w.row(0));
-    system.inv(w, t0, y, o.target);
-    copy(o.target, w.values, w.l);
+    system.inv(w, t0, y, w.target);
+    copy(w.target, w.values, w.l);
     system.grad(w, t0, y, w.row(0), w.G);
-    if (!(all_finite(y, w.m) && all_finite(w.row(0), w.m) && all_finite(o.target, w.l) && all_finite(w.G, w.l * w.m)))
+    if (!(all_finite(y, w.m) && all_finite(w.row(0), w.m) && all_finite(w.target, w.l) && all_finite(w.G, w.l * w.m)))
         return false;
     fill(w.trust, 0.0, w.l * N_FIGURES);
     for (int64_t i = 0; i < w.l; ++i) w.figures(i)[TERMS] = INFINITE;

@@ -8,86 +8,98 @@ namespace eip {
 constexpr double METRIC_FLOOR = 1e-7, TINY = 1e-290;
 
 // x <- x^exponent, x in [0, 1]; for RK4 and DOP853 by square roots, several times faster than pow.
-inline void powers(double *x, double exponent, int64_t n) {
+template <class Value>
+inline void powers(Value *x, double exponent, int64_t n) {
     if (exponent == 1.25) {
-        for (int64_t i = 0; i < n; ++i) x[i] *= std::sqrt(std::sqrt(x[i]));
+        for (int64_t i = 0; i < n; ++i) x[i] *= sqrt(sqrt(x[i]));
     } else if (exponent == 1.125) {
-        for (int64_t i = 0; i < n; ++i) x[i] *= std::sqrt(std::sqrt(std::sqrt(x[i])));
+        for (int64_t i = 0; i < n; ++i) x[i] *= sqrt(sqrt(sqrt(x[i])));
     } else {
-        for (int64_t i = 0; i < n; ++i) x[i] = std::pow(x[i], exponent);
+        for (int64_t i = 0; i < n; ++i) x[i] = power(x[i], exponent);
     }
 }
 
 // Squared norm of block b of a, in units of 1 / unit.
-inline double block_square(const double *a, int64_t b, double unit, const Blocks &blocks) {
+template <class Value>
+inline Value block_square(const Value *a, int64_t b, const Value &unit, const Blocks &blocks) {
     if (blocks.size == 3) {
-        const double x = a[3 * b] * unit, y = a[3 * b + 1] * unit, z = a[3 * b + 2] * unit;
+        const Value x = a[3 * b] * unit, y = a[3 * b + 1] * unit, z = a[3 * b + 2] * unit;
         return x * x + y * y + z * z;
     }
-    double total = 0.0;
+    Value total = 0.0;
     for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) {
-        const double x = a[blocks.member[p]] * unit;
+        const Value x = a[blocks.member[p]] * unit;
         total += x * x;
     }
     return total;
 }
 
 // Per block the sum of a; consecutive blocks of three without looking places up.
-inline void block_sums(const double *a, const Blocks &blocks, double *out) {
+template <class Value>
+inline void block_sums(const Value *a, const Blocks &blocks, Value *out) {
     if (blocks.size == 3) {
         for (int64_t b = 0; b < blocks.count; ++b) out[b] = a[3 * b] + a[3 * b + 1] + a[3 * b + 2];
     } else {
         for (int64_t b = 0; b < blocks.count; ++b) {
-            double total = 0.0;
+            Value total = 0.0;
             for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) total += a[blocks.member[p]];
             out[b] = total;
         }
     }
 }
 
-inline void weighted_squares(const double *weights, const double *a, double *out, int64_t n) {
+template <class Value>
+inline void weighted_squares(const double *weights, const Value *a, Value *out, int64_t n) {
     for (int64_t i = 0; i < n; ++i) {
-        const double x = weights[i] * a[i];
+        const Value x = weights[i] * a[i];
         out[i] = x * x;
     }
 }
 
+// Squares so small or large that they are not to be trusted.
+template <class Value>
+inline Truth<Value> is_extreme(const Value &square) {
+    return !((square > 1e-280) & (square < 1e280));
+}
+
 // Per component, where each stands alone: what `block_sizes` does.
-template <class W>
-inline bool component_sizes(const double *__restrict y, double rounding, const Options &o, const W &w) {
-    const double *__restrict rtol = o.rtol, *__restrict y_hat = w.y_hat, *__restrict err = w.err;
-    double *__restrict scale = w.scale, *__restrict ratio = w.ratio;
-    bool extreme = false;
+template <class Value, class W>
+inline Truth<Value> component_sizes(const Value *__restrict y, double rounding, const Options &o, const W &w) {
+    const double *__restrict rtol = o.rtol;
+    const Value *__restrict y_hat = w.y_hat, *__restrict err = w.err;
+    Value *__restrict scale = w.scale, *__restrict ratio = w.ratio;
+    Truth<Value> extreme{};
     for (int64_t i = 0; i < w.m; ++i) {
-        const double before = rtol[i] * y[i], after = rtol[i] * y_hat[i], x = rounding * y_hat[i];
-        const double square = std::max(after * after, before * before);
-        extreme |= !(square > 1e-280 && square < 1e280);
-        scale[i] = std::sqrt(square);
-        ratio[i] = std::sqrt(err[i] * err[i] + x * x);
+        const Value before = rtol[i] * y[i], after = rtol[i] * y_hat[i], x = rounding * y_hat[i];
+        const Value square = max(after * after, before * before);
+        extreme = extreme | is_extreme(square);
+        scale[i] = sqrt(square);
+        ratio[i] = sqrt(err[i] * err[i] + x * x);
     }
     return extreme;
 }
 
 // Per block: w.scale = max(|rtol y|, |rtol y_hat|), w.ratio = |(err, rounding y_hat)|; whether some are too extreme.
-template <class W>
-inline bool block_sizes(const double *y, double rounding, const Options &o, const W &w) {
-    double *scratch = w.sigma, *sizes = w.scale, *errors = w.ratio;
+template <class Value, class W>
+inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &o, const W &w) {
+    if (o.blocks.size == 1) return component_sizes(y, rounding, o, w);
+    Value *scratch = w.sigma, *sizes = w.scale, *errors = w.ratio;
     weighted_squares(o.rtol, y, scratch, w.m);
     block_sums(scratch, o.blocks, errors);
     weighted_squares(o.rtol, w.y_hat, scratch, w.m);
     block_sums(scratch, o.blocks, sizes);
-    bool extreme = false;
+    Truth<Value> extreme{};
     for (int64_t b = 0; b < o.blocks.count; ++b) {
-        const double square = std::max(sizes[b], errors[b]);
-        extreme |= !(square > 1e-280 && square < 1e280);
-        sizes[b] = std::sqrt(square);
+        const Value square = max(sizes[b], errors[b]);
+        extreme = extreme | is_extreme(square);
+        sizes[b] = sqrt(square);
     }
     for (int64_t i = 0; i < w.m; ++i) {
-        const double x = rounding * w.y_hat[i];
+        const Value x = rounding * w.y_hat[i];
         scratch[i] = w.err[i] * w.err[i] + x * x;
     }
     block_sums(scratch, o.blocks, errors);
-    for (int64_t b = 0; b < o.blocks.count; ++b) errors[b] = std::sqrt(errors[b]);
+    for (int64_t b = 0; b < o.blocks.count; ++b) errors[b] = sqrt(errors[b]);
     return extreme;
 }
 
@@ -123,36 +135,33 @@ template <class W>
 }
 
 // From the sizes of n blocks and of their errors the weights, in `ratio`; returns the largest relative error.
-inline double block_weights(double *__restrict scale, double *__restrict ratio, const Options &o, int64_t n) {
+template <class Value>
+inline Value block_weights(Value *__restrict scale, Value *__restrict ratio, const Options &o, int64_t n) {
     const double *__restrict atol = o.block_atol;
     for (int64_t b = 0; b < n; ++b) {
         scale[b] += atol[b];
         // Over a scale of 0 there is no error to speak of.
-        ratio[b] = (scale[b] > 0.0 ? ratio[b] : 0.0) / std::max(scale[b], TINY);
+        ratio[b] = where(scale[b] > 0.0, ratio[b], 0.0) / max(scale[b], Value(TINY));
     }
-    const double largest_ratio = largest(ratio, n);
-    double inverse = 1.0 / positive(largest_ratio);
-    for (int64_t b = 0; b < n; ++b) ratio[b] = std::min(1.0, ratio[b] * inverse);
+    const Value largest_ratio = largest(ratio, n);
+    Value inverse = 1.0 / positive(largest_ratio);
+    for (int64_t b = 0; b < n; ++b) ratio[b] = min(Value(1.0), ratio[b] * inverse);
     powers(ratio, o.kappa, n);
     for (int64_t b = 0; b < n; ++b) ratio[b] = scale[b] * (ratio[b] + METRIC_FLOOR);
     inverse = 1.0 / positive(largest(ratio, n));
-    for (int64_t b = 0; b < n; ++b) ratio[b] = largest_ratio > 0.0 ? ratio[b] * inverse : 1.0;
+    for (int64_t b = 0; b < n; ++b) ratio[b] = where(largest_ratio > 0.0, ratio[b] * inverse, 1.0);
     return largest_ratio;
 }
 
-// Weights w.sigma of the error metric and the blocks' scales; returns the largest relative error r. The error is the
-// estimate and `rounding` times the state, in quadrature. r = 0 (no error at all) leaves the euclidean metric.
+// The weights w.sigma from what `block_sizes` has found, and the blocks' scales; returns the largest relative error.
 template <class W>
-inline double error_metric(const double *y, double rounding, const Options &o, const W &w) {
+inline auto weights_from_sizes(const Options &o, const W &w) {
     const Blocks &blocks = o.blocks;
+    const auto largest_ratio = block_weights(w.scale, w.ratio, o, blocks.size == 1 ? w.m : blocks.count);
     if (blocks.size == 1) {
-        if (component_sizes(y, rounding, o, w)) extreme_block_sizes(y, rounding, o, w);
-        const double largest_ratio = block_weights(w.scale, w.ratio, o, w.m);
         copy(w.ratio, w.sigma, w.m);
         return largest_ratio;
     }
-    if (block_sizes(y, rounding, o, w)) extreme_block_sizes(y, rounding, o, w);
-    const double largest_ratio = block_weights(w.scale, w.ratio, o, blocks.count);
     for (int64_t b = 0; b < blocks.count; ++b) {
         if (blocks.size == 3)
             w.sigma[3 * b] = w.sigma[3 * b + 1] = w.sigma[3 * b + 2] = w.ratio[b];
@@ -162,23 +171,31 @@ inline double error_metric(const double *y, double rounding, const Options &o, c
     return largest_ratio;
 }
 
-// Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none.
+// Weights w.sigma of the error metric and the blocks' scales; returns the largest relative error r. The error is the
+// estimate and `rounding` times the state, in quadrature. r = 0 (no error at all) leaves the euclidean metric.
 template <class W>
-inline double correction_in_local_errors(double largest_error, const Options &o, const W &w) {
-    if (!(largest_error > 0.0)) return 0.0 * largest_error;
-    double top = 0.0;
-    if (o.blocks.size == 1) {
-        for (int64_t i = 0; i < w.m; ++i) {
-            const double x = w.move[i] * (1.0 / positive(w.scale[i]));
-            if (w.scale[i] > 0.0) top = std::max(top, x * x);
+inline double error_metric(const double *y, double rounding, const Options &o, const W &w) {
+    if (block_sizes(y, rounding, o, w)) extreme_block_sizes(y, rounding, o, w);
+    return weights_from_sizes(o, w);
+}
+
+// Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none.
+template <class Value, class W>
+inline Value correction_in_local_errors(const Value &largest_error, const Options &o, const W &w) {
+    if (!any(largest_error > 0.0)) return 0.0 * largest_error;
+    Value top = 0.0;
+    for (int64_t b = 0; b < (o.blocks.size == 1 ? w.m : o.blocks.count); ++b) {
+        const Value unit = 1.0 / positive(w.scale[b]);
+        Value square;
+        if (o.blocks.size == 1) {
+            const Value x = w.move[b] * unit;
+            square = x * x;
+        } else {
+            square = block_square(w.move, b, unit, o.blocks);
         }
-        return std::sqrt(top) / largest_error;
+        top = where(w.scale[b] > 0.0, max(top, square), top);
     }
-    for (int64_t b = 0; b < o.blocks.count; ++b) {
-        const double square = block_square(w.move, b, 1.0 / positive(w.scale[b]), o.blocks);
-        if (w.scale[b] > 0.0) top = std::max(top, square);
-    }
-    return std::sqrt(top) / largest_error;
+    return where(largest_error > 0.0, sqrt(top) / largest_error, 0.0 * largest_error);
 }
 
 // Half way, on a log scale, from the error metric to equal relative errors; blocks without error stay put.

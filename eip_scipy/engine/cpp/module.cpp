@@ -38,6 +38,7 @@ struct Engine {
     Data *data;
     Schedule *schedule;
     Samples *samples;
+    Eight *eight;
     PythonFunctions *functions;
     PythonHooks *hooks;
     int type;
@@ -212,6 +213,31 @@ PyObject *engine_advance(Engine *self, PyObject *const *args, Py_ssize_t count) 
     });
 }
 
+// What both sweeps take: the members, how many steps, and the states of the run.
+struct SweepArguments {
+    Members members;
+    int64_t steps;
+    double *y, *y_new;
+};
+
+SweepArguments sweep_arguments(Engine *self, PyObject *const *args, PyObject *kept) {
+    SweepArguments given{};
+    given.steps = PyLong_AsLongLong(args[1]);
+    if (given.steps == -1 && PyErr_Occurred()) throw PythonError{};
+    given.y = state_of(args[2], "y", self, kept);
+    given.y_new = state_of(args[3], "y_new", self, kept);
+    Arrays arrays(kept);
+    auto *t_saved = static_cast<double *>(arrays.memory(args[4], "t_saved", NPY_DOUBLE, {ANY}));
+    const npy_intp rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[4]), 0);
+    given.members = members_of(args[0], *self->data, scheduled(self), rows, arrays, self->type);
+    given.members.t_saved = t_saved;
+    if (given.steps < 1 || rows < 2) {
+        PyErr_SetString(PyExc_ValueError, "engine: members need a step or more, and two rows or more");
+        throw PythonError{};
+    }
+    return given;
+}
+
 PyDoc_STRVAR(sweep_doc,
              "sweep(members, steps, y, y_new, t_saved) -> int\n\nRun members of an ensemble one after the other, so many "
              "steps in all; `members` is a record of data.py, whose `where` says how far they are.");
@@ -222,23 +248,52 @@ PyObject *engine_sweep(Engine *self, PyObject *const *args, Py_ssize_t count) {
         const Busy busy(self->busy);
         const Ref kept(PyList_New(0));
         const Schedule &schedule = scheduled(self);
-        Data &d = *self->data;
-        const long long steps = PyLong_AsLongLong(args[1]);
-        if (steps == -1 && PyErr_Occurred()) return nullptr;
-        double *y = state_of(args[2], "y", self, kept.get()), *y_new = state_of(args[3], "y_new", self, kept.get());
-        Arrays arrays(kept.get());
-        auto *t_saved = static_cast<double *>(arrays.memory(args[4], "t_saved", NPY_DOUBLE, {ANY}));
-        const npy_intp rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[4]), 0);
-        Members members = members_of(args[0], d, schedule, rows, arrays, self->type);
-        members.t_saved = t_saved;
-        if (d.system.python || self->hooks || (schedule.n_events > 0 && !self->samples) || rows < 1) {
-            PyErr_SetString(PyExc_ValueError, "engine: members are swept by native functions, with room for their rows");
+        const auto [members, steps, y, y_new] = sweep_arguments(self, args, kept.get());
+        if (self->functions || self->hooks || (schedule.n_events > 0 && !self->samples)) {
+            PyErr_SetString(PyExc_ValueError, "engine: members are swept by native functions");
             return nullptr;
         }
-        check_room(schedule, members.saved(0, d.work), self->samples);
+        check_room(schedule, members.saved(0, self->data->work), self->samples);
         if (self->samples) self->samples->interpolants.capacity = 0;
         return PyLong_FromLong(stepped(
             self, [&](auto &run) { return sweep(run, self->samples, schedule, members, steps, y, y_new); }));
+    });
+}
+
+PyDoc_STRVAR(eight_doc,
+             "side_by_side(functions) -> None\n\nFunctions of eight members, by which `sweep_octets` runs them from now "
+             "on; `functions` holds addresses, as those of the run.");
+
+PyObject *engine_side_by_side(Engine *self, PyObject *const *args, Py_ssize_t count) {
+    return guarded([&]() -> PyObject * {
+        expect(self, count, 1, "functions");
+        const Busy busy(self->busy);
+        if (PyList_Append(self->kept, args[0]) < 0) return nullptr;
+        const Data &d = *self->data;
+        delete std::exchange(self->eight, new Eight(d.method, d.options, d.work, octet_system_of(args[0], d)));
+        Py_RETURN_NONE;
+    });
+}
+
+PyDoc_STRVAR(sweep_octets_doc,
+             "sweep_octets(members, steps, y, y_new, t_saved) -> int\n\nThe same, eight members side by side, by steps of "
+             "all eight. Whose status is not set has to run by itself.");
+
+PyObject *engine_sweep_octets(Engine *self, PyObject *const *args, Py_ssize_t count) {
+    return guarded([&]() -> PyObject * {
+        expect(self, count, 5, "members, steps, y, y_new, t_saved");
+        const Busy busy(self->busy);
+        const Ref kept(PyList_New(0));
+        const Schedule &s = scheduled(self);
+        const auto [members, steps, y, y_new] = sweep_arguments(self, args, kept.get());
+        const bool fixed = s.span.h != 0.0 && s.n_eval == 0 && s.n_events == 0;
+        const int64_t saved = s.save_every > 0 ? s.span.n_steps / s.save_every + 2 : 2;
+        if (!self->eight || !fixed || (members.kept && members.n_rows < saved)) {
+            PyErr_SetString(PyExc_ValueError, "engine: members side by side take fixed steps, and need room for all rows");
+            return nullptr;
+        }
+        return PyLong_FromLong(stepped(
+            self, [&](auto &run) { return sweep_octets(run, *self->eight, s, members, steps, y, y_new); }));
     });
 }
 
@@ -433,6 +488,7 @@ void engine_release(Engine *self) {
     delete std::exchange(self->data, nullptr);
     delete std::exchange(self->schedule, nullptr);
     delete std::exchange(self->samples, nullptr);
+    delete std::exchange(self->eight, nullptr);
     delete std::exchange(self->functions, nullptr);
     delete std::exchange(self->hooks, nullptr);
 }
@@ -469,6 +525,8 @@ PyObject *engine_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
 PyMethodDef engine_methods[] = {
     {"advance", reinterpret_cast<PyCFunction>(engine_advance), METH_FASTCALL, advance_doc},
     {"sweep", reinterpret_cast<PyCFunction>(engine_sweep), METH_FASTCALL, sweep_doc},
+    {"side_by_side", reinterpret_cast<PyCFunction>(engine_side_by_side), METH_FASTCALL, eight_doc},
+    {"sweep_octets", reinterpret_cast<PyCFunction>(engine_sweep_octets), METH_FASTCALL, sweep_octets_doc},
     {"step", reinterpret_cast<PyCFunction>(engine_step), METH_FASTCALL, step_doc},
     {"project", reinterpret_cast<PyCFunction>(engine_project), METH_FASTCALL, project_doc},
     {"close", reinterpret_cast<PyCFunction>(engine_close), METH_FASTCALL, close_doc},

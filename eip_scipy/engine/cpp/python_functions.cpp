@@ -294,16 +294,16 @@ bool PythonHooks::project_jointly(const Step &step) {
         const double err = norm(w.err, w.m);
         for (int64_t i = 0; i < w.l; ++i) w.worth[i] = std::abs(std::sqrt(w.R[i * w.l + i]) * err);
     }
-    const bool outside = defects(w.inverse_norms, nullptr, o, w, w.before);
+    const bool outside = defects<double>(w.inverse_norms, nullptr, o, w, w.before);
     if (outside) {
-        if (!gram_solution({w.R, w.l, w.l, w.l}, w.g, w.mu)) return false;
+        if (!gram_solution(Matrix{w.R, w.l, w.l, w.l}, w.g, w.mu)) return false;
         const npy_intp n = w.n;
         const Ref y_new = view(step.y_new, 1, &n, type_, to_);
         Ref(PyObject_CallFunctionObjArgs(shift_, t.get(), y_hat_, f_hat_, mu_, y_new.get(), values_, nullptr));
     } else {
         copy(w.y_hat, step.y_new, w.m);
     }
-    if (!defects_held(w.before, o, w) || !small_shares(o, w)) return false;
+    if (!defects_held<double>(w.before, w) || !small_shares(o, w)) return false;
     ++w.counters[NJEV];
     if (outside) {
         ++w.counters[NLU];

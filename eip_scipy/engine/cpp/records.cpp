@@ -118,7 +118,6 @@ static Frame frame_of(PyObject *rows, int64_t m, Arrays &arrays) {
     frame.start = arrays.integers<uint64_t>(rows, "start", {2, frame.rows + 1});
     frame.place = arrays.integers<uint64_t>(rows, "place", {values});
     frame.value = arrays.floats(rows, "value", {values});
-    frame.products = arrays.floats(rows, "products", {frame.rows});
     frame.groups = Arrays::length(rows, "bodies", 1);
     frame.count = Arrays::length(rows, "bodies", 2);
     frame.bodies = arrays.floats(rows, "bodies", {2, frame.groups, frame.count});
@@ -130,14 +129,15 @@ static Frame frame_of(PyObject *rows, int64_t m, Arrays &arrays) {
     return frame;
 }
 
-Options options_of(PyObject *options, const Work &w, Arrays &arrays) {
+Options options_of(PyObject *options, Work &w, Arrays &arrays) {
     Options o{};
     o.rtol = arrays.floats(options, "rtol", {w.m});
     o.atol = arrays.floats(options, "atol", {w.n});
     o.blocks = blocks_of(attribute(options, "groups").get(), w.m, arrays);
     o.block_atol = arrays.floats(options, "block_atol", {o.blocks.count});
     o.frame = frame_of(attribute(options, "frame").get(), w.m, arrays);
-    o.target = arrays.floats(options, "target", {w.l});
+    w.target = arrays.floats(options, "target", {w.l});
+    w.products = arrays.floats(attribute(options, "frame").get(), "products", {o.frame.rows});
     o.scales = arrays.floats(options, "scales", {w.l});
     read_each(o, [options](const char *name, auto &value) {
         using Value = std::decay_t<decltype(value)>;
@@ -204,7 +204,6 @@ static Dense dense_of(PyObject *dense, const Data &run, Arrays &arrays, int type
         throw PythonError{};
     }
     d.options = options_of(options.get(), d.work, arrays);
-    d.target = arrays.floats(options.get(), "target", {d.work.l});
     d.by_travel = truth(dense, "by_travel");
     d.missed = arrays.floats(dense, "missed", {2});
     read_interpolant(dense, run.work.stages, arrays, d);
@@ -263,14 +262,21 @@ Members members_of(PyObject *members, const Data &run, const Schedule &schedule,
     return m;
 }
 
+// A function of the library's for one state or for eight.
+static void take(const LibraryFunction &function, LibraryPointer<double> &place) { place = function.one; }
+static void take(const LibraryFunction &function, LibraryPointer<Octet> &place) { place = function.eight; }
+
 // An address, or a function of the library's that takes these sizes and fills so many floats.
-template <typename Pointer>
-static Native<Pointer> pointer_of(PyObject *object, const char *name, int64_t floats, int64_t n, int64_t p) {
+template <class Function>
+static Function pointer_of(PyObject *object, const char *name, int64_t floats, int64_t n, int64_t p) {
+    Function out{};
+    out.floats = floats;
     if (const LibraryFunction *function = library_function_of(object)) {
         require_sizes(*function, n, p);
-        if (function->filled(n) == floats) return {nullptr, function->one, floats};
+        take(*function, out.library);
+        if (out.library && function->filled(n) == floats) return out;
         PyErr_Format(PyExc_ValueError, "engine: %s fills %lld floats where %lld are expected", function->name,
-                     static_cast<long long>(function->filled(n)), static_cast<long long>(floats));
+                     static_cast<long long>(out.library ? function->filled(n) : 0), static_cast<long long>(floats));
         throw PythonError{};
     }
     const auto address = static_cast<uintptr_t>(PyLong_AsUnsignedLongLong(object));
@@ -279,14 +285,14 @@ static Native<Pointer> pointer_of(PyObject *object, const char *name, int64_t fl
         PyErr_Format(PyExc_ValueError, "engine: a function of %s is missing", name);
         throw PythonError{};
     }
-    return {reinterpret_cast<Pointer>(address), nullptr, floats};
+    out.pointer = reinterpret_cast<decltype(out.pointer)>(address);
+    return out;
 }
 
 // Functions by pointer: (function, floats) of each of inv, grad and event.
-template <typename Pointer>
-static std::vector<Native<Pointer>> pointers_of(PyObject *functions, const char *name, int64_t expected, int64_t n,
-                                                int64_t p) {
-    std::vector<Native<Pointer>> out;
+template <class Function>
+static std::vector<Function> pointers_of(PyObject *functions, const char *name, int64_t expected, int64_t n, int64_t p) {
+    std::vector<Function> out;
     const Ref items(PySequence_Fast(attribute(functions, name).get(), "engine: expected a sequence of pairs"));
     int64_t total = 0;
     for (Py_ssize_t k = 0; k < PySequence_Fast_GET_SIZE(items.get()); ++k) {
@@ -295,7 +301,7 @@ static std::vector<Native<Pointer>> pointers_of(PyObject *functions, const char 
         PyObject *pair = PySequence_Fast_GET_ITEM(items.get(), k);
         if (!PyTuple_Check(pair)) PyErr_Format(PyExc_TypeError, "engine: %s must hold pairs, got %.80R", name, pair);
         if (PyErr_Occurred() || !PyArg_ParseTuple(pair, "OL", &function, &floats)) throw PythonError{};
-        out.push_back(pointer_of<Pointer>(function, name, floats, n, p));
+        out.push_back(pointer_of<Function>(function, name, floats, n, p));
         total += floats;
     }
     if (total != expected) {
@@ -312,12 +318,33 @@ void read_pointers(PyObject *functions, const Work &w, int64_t events, Arrays &a
     system.n_params = Arrays::length(functions, "params");
     system.params = arrays.floats(functions, "params", {system.n_params});
     const int64_t size = system.second_order ? w.m / 2 : w.m, p = system.n_params;
-    system.rhs_pointer = pointer_of<ValuePointer>(attribute(functions, "rhs").get(), "rhs", size, size, p);
-    system.inv_pointers = pointers_of<ValuePointer>(functions, "inv", w.l, w.m, p);
-    system.grad_pointers = pointers_of<GradientPointer>(functions, "grad", w.l * w.m, w.m, p);
-    system.event_pointers = pointers_of<ValuePointer>(functions, "event", events, w.m, p);
+    system.rhs_pointer = pointer_of<Native<ValuePointer>>(attribute(functions, "rhs").get(), "rhs", size, size, p);
+    system.inv_pointers = pointers_of<Native<ValuePointer>>(functions, "inv", w.l, w.m, p);
+    system.grad_pointers = pointers_of<Native<GradientPointer>>(functions, "grad", w.l * w.m, w.m, p);
+    system.event_pointers = pointers_of<Native<ValuePointer>>(functions, "event", events, w.m, p);
     system.scratch.resize(w.m);
     system.scratch_f.resize(w.m);
+}
+
+OctetSystem octet_system_of(PyObject *functions, const Data &run) {
+    OctetSystem system;
+    const Work &w = run.work;
+    const int64_t size = run.system.second_order ? w.n / 2 : w.n, p = run.system.n_params;
+    using Values = Native<ValuePointer, Octet>;
+    system.rhs_pointer = pointer_of<Values>(attribute(functions, "rhs").get(), "rhs", size, size, p);
+    system.inv_pointers = pointers_of<Values>(functions, "inv", w.l, w.n, p);
+    system.grad_pointers = pointers_of<Native<GradientPointer, Octet>>(functions, "grad", w.l * w.n, w.n, p);
+    system.second_order = run.system.second_order;
+    system.params.resize(p);
+    system.scratch.resize(w.n);
+    system.scratch_f.resize(w.n);
+    const Options &o = run.options;
+    const bool plain = w.n == w.m && !o.compensated && !o.adaptive && o.every >= 1 && o.direction == NEW;
+    if (run.system.python || !plain || o.iterations != 1) {
+        PyErr_SetString(PyExc_ValueError, "engine: a run of this kind does not go side by side with others");
+        throw PythonError{};
+    }
+    return system;
 }
 
 }  // namespace eip

@@ -2,7 +2,7 @@
 // keep their memory, so that Python reads what the engine writes.
 #pragma once
 
-#include "members.hpp"
+#include "side_by_side.hpp"
 #include "python.hpp"
 
 namespace eip {
@@ -19,11 +19,14 @@ Method method_of(PyObject *method, Arrays &arrays);
 // Coefficients, which a one-step method of a user's own has none of.
 void read_tableau(PyObject *method, Arrays &arrays, Method &m);
 Work work_of(PyObject *work, int64_t stages, int64_t blocks, Arrays &arrays, int type);
-Options options_of(PyObject *options, const Work &w, Arrays &arrays);
+// Sets what the buffers hold of them too: targets, scratch of the frame.
+Options options_of(PyObject *options, Work &w, Arrays &arrays);
 Schedule schedule_of(PyObject *schedule, Arrays &arrays);
 Samples samples_of(PyObject *dense, const Data &run, int64_t events, Arrays &arrays, int type);
 // `rows` are saved of each member.
 Members members_of(PyObject *members, const Data &run, const Schedule &schedule, int64_t rows, Arrays &arrays, int type);
+// Functions of eight members of the run.
+OctetSystem octet_system_of(PyObject *functions, const Data &run);
 // Functions by pointer.
 void read_pointers(PyObject *functions, const Work &w, int64_t events, Arrays &arrays, System &system);
 

@@ -45,10 +45,10 @@ class Hooks {
 };
 
 // A function by pointer, or the library's own in its place, and how many floats it fills.
-template <typename Pointer>
+template <typename Pointer, class Value = double>
 struct Native {
     Pointer pointer;
-    LibraryPointer<double> library;
+    LibraryPointer<Value> library;
     int64_t floats;
 };
 
@@ -162,12 +162,12 @@ struct System {
 };
 
 // One run: K[0] holds f(t, y) when a step begins. W is Work, or one of a length that the compiler knows.
-template <class W>
+template <class W, class Called = System>
 struct RunOf {
     const Method &method;
     const Options &options;
     const W &work;
-    System &system;
+    Called &system;
     Hooks *hooks;
 };
 

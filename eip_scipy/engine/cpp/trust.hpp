@@ -15,81 +15,78 @@ constexpr double LARGE = 50.0, FAR = 0.03, LARGE_SHARE = 1e-2;
 // Defects w.g = values - target and their dead bands; inside its band a defect is set to 0, `raw` keeps all. Returns
 // whether anything is left to project. `terms`: sums of |G_k y_k|, else they are taken at `y`; then, where the step's
 // errors are known, w.worth = sums of |G_k err_k| too.
-template <class W>
-inline bool defects(const double *terms, const double *y, const Options &o, const W &w, double *raw) {
+template <class Value, class W>
+inline Truth<Value> defects(const double *terms, const Value *y, const Options &o, const W &w, Value *raw) {
     const bool measured = o.watched && w.counters[HAVE_ERROR] && !terms;
-    bool outside = false;
+    Truth<Value> outside{};
     for (int64_t i = 0; i < w.l; ++i) {
-        double size = std::max(std::abs(w.values[i]), std::abs(o.target[i]));
-        double own;
+        Value size = max(abs(w.values[i]), abs(w.target[i])), own;
         if (measured) {
-            const AbsDots sums = abs_dots(w.gradient(i), y, w.err, w.m);
+            const auto sums = abs_dots(w.gradient(i), y, w.err, w.m);
             own = sums.b;
             w.worth[i] = sums.c;
         } else {
-            own = terms ? terms[i] : abs_dot(w.gradient(i), y, w.m);
+            own = terms ? Value(terms[i]) : abs_dot(w.gradient(i), y, w.m);
         }
-        size = std::max(std::max(size, o.scales[i]), own);
+        size = max(max(size, Value(o.scales[i])), own);
         w.band[i] = (o.compensated ? BAND_COMPENSATED : BAND) * EPS * size;
-        raw[i] = w.values[i] - o.target[i];
-        const bool inside = w.band[i] < INFINITE && std::abs(raw[i]) <= w.band[i];
-        w.g[i] = inside ? 0.0 : raw[i];
-        outside |= !inside;
+        raw[i] = w.values[i] - w.target[i];
+        const Truth<Value> inside = (w.band[i] < INFINITE) & (abs(raw[i]) <= w.band[i]);
+        w.g[i] = where(inside, 0.0, raw[i]);
+        outside = outside | !inside;
     }
     return outside;
 }
 
 // The first figures of a run: its invariants' terms; those that vanish at the start, as they are a step later.
-template <class W>
-inline void start_figures(const double *y, const double *f, double tau, const Options &o, const W &w) {
+template <class Value, class W>
+inline void start_figures(const Value *y, const Value *f, double tau, const Options &o, const W &w) {
     for (int64_t i = 0; i < w.l; ++i) {
-        const double *G = w.gradient(i);
-        double terms = std::max(std::max(std::abs(w.values[i]), std::abs(o.target[i])),
-                                std::max(o.scales[i], abs_dot(G, y, w.m)));
-        terms = std::max(terms, tau * abs_dot(G, f, w.m));
-        double *figures = w.figures(i);
+        const Value *G = w.gradient(i);
+        Value terms = max(max(abs(w.values[i]), abs(w.target[i])), max(Value(o.scales[i]), abs_dot(G, y, w.m)));
+        terms = max(terms, tau * abs_dot(G, f, w.m));
+        Value *figures = w.figures(i);
         fill(figures, 0.0, N_FIGURES);
-        figures[LEFT] = w.values[i] - o.target[i];
-        figures[START] = terms < INFINITE ? terms : 0.0;
-        figures[TERMS] = terms > 0.0 ? terms : INFINITE;
+        figures[LEFT] = w.values[i] - w.target[i];
+        figures[START] = where(terms < INFINITE, terms, 0.0);
+        figures[TERMS] = where(terms > 0.0, terms, INFINITE);
     }
 }
 
 // Terms of invariant i to measure a defect by: those now, at most the largest of a state that was on the manifold. A
 // state that blows up carries terms as large as its defect. TINY, for what underflows.
 template <class W>
-inline double own_terms(int64_t i, const Options &o, const W &w) {
-    const double *figures = w.figures(i);
-    const double now = std::max(o.per_band * w.band[i], LEAST_SHARE * figures[START]);
-    return std::min(now, figures[TERMS]) + TINY;
+inline auto own_terms(int64_t i, const Options &o, const W &w) {
+    const auto *figures = w.figures(i);
+    const auto now = max(o.per_band * w.band[i], LEAST_SHARE * figures[START]);
+    return min(now, figures[TERMS]) + TINY;
 }
 
 // Note the defects; whether all are finite and none has grown beyond what round-off explains.
-template <class W>
-inline bool defects_held(const double *before, const Options &o, const W &w) {
-    bool good = true;
+template <class Value, class W>
+inline Truth<Value> defects_held(const Value *before, const W &w) {
+    Truth<Value> bad{};
     for (int64_t i = 0; i < w.l; ++i) {
-        w.defect[i] = w.values[i] - o.target[i];
-        const double size = std::abs(w.defect[i]);
-        const bool grown = size > std::abs(before[i]) && size > FAILURE_BANDS * w.band[i];
-        good &= size < INFINITE && !grown;
+        w.defect[i] = w.values[i] - w.target[i];
+        const Value size = abs(w.defect[i]);
+        bad = bad | !(size < INFINITE) | ((size > abs(before[i])) & (size > FAILURE_BANDS * w.band[i]));
     }
-    return good;
+    return !bad;
 }
 
 // Whether no defect is more than o.limit times its invariant's terms.
 template <class W>
-inline bool small_shares(const Options &o, const W &w) {
-    for (int64_t i = 0; i < w.l; ++i)
-        if (!(std::abs(w.defect[i]) <= o.limit * own_terms(i, o, w))) return false;
-    return true;
+inline auto small_shares(const Options &o, const W &w) {
+    Truth<typename W::Value> bad{};
+    for (int64_t i = 0; i < w.l; ++i) bad = bad | !(abs(w.defect[i]) <= o.limit * own_terms(i, o, w));
+    return !bad;
 }
 
 // Note the defects after a projection. It has failed where something is not finite, or a defect has grown and stands
 // above FAILURE_BANDS dead bands, or is more than the limit.
 template <class W>
 inline Code judge(const double *before, const double *y, const Options &o, const W &w) {
-    const bool held = defects_held(before, o, w);
+    const bool held = defects_held(before, w);
     return all_finite(y, w.m) && held && small_shares(o, w) ? OK : FAILED_PROJECTION;
 }
 

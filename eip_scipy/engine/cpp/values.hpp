@@ -1,0 +1,82 @@
+// One source for a float and for the floats of eight members: what the templates of the projection choose by a condition
+// they choose lane by lane, and go another way only where no lane needs this one.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <utility>
+
+#include "octet.hpp"
+
+namespace eip {
+
+// What a comparison of two values is; false as it is made.
+template <class Value>
+using Truth = decltype(std::declval<Value>() < std::declval<Value>());
+
+inline double max(double a, double b) { return std::max(a, b); }
+inline double min(double a, double b) { return std::min(a, b); }
+inline double abs(double x) { return std::abs(x); }
+inline double sqrt(double x) { return std::sqrt(x); }
+inline double where(bool condition, double a, double b) { return condition ? a : b; }
+inline double power(double x, double exponent) { return std::pow(x, exponent); }
+inline bool any(bool condition) { return condition; }
+inline bool any(const Mask &mask) { return mask.any(); }
+
+inline Octet power(const Octet &x, double exponent) {
+    double lanes[LANES];
+    x.store(lanes);
+    for (double &lane : lanes) lane = std::pow(lane, exponent);
+    return Octet::load(lanes);
+}
+
+// Sum of so many terms, each lane in the order of sums.hpp.
+template <class Term>
+inline Octet sum_of(int64_t n, Term term) {
+    const int64_t whole = n - n % LANES;
+    Octet rest(0.0);
+    for (int64_t i = whole; i < n; ++i) rest += term(i);
+    if (whole == 0) return rest;
+    Octet sums[LANES];
+    for (Octet &sum : sums) sum = 0.0;
+    for (int64_t i = 0; i < whole; i += LANES)
+        for (int k = 0; k < LANES; ++k) sums[k] += term(i + k);
+    return ((sums[0] + sums[4]) + (sums[2] + sums[6])) + ((sums[1] + sums[5]) + (sums[3] + sums[7])) + rest;
+}
+
+inline Octet dot(const Octet *a, const Octet *b, int64_t n) {
+    return sum_of(n, [=](int64_t i) { return a[i] * b[i]; });
+}
+
+inline Octet abs_dot(const Octet *a, const Octet *b, int64_t n) {
+    return sum_of(n, [=](int64_t i) { return abs(a[i] * b[i]); });
+}
+
+struct AbsDotsOfOctets {
+    Octet b, c;
+};
+
+inline AbsDotsOfOctets abs_dots(const Octet *a, const Octet *b, const Octet *c, int64_t n) {
+    return {abs_dot(a, b, n), abs_dot(a, c, n)};
+}
+
+inline Octet largest(const Octet *a, int64_t n) {
+    Octet top = 0.0;
+    for (int64_t i = 0; i < n; ++i) top = max(top, a[i]);
+    return top;
+}
+
+// Whether the sum of squares is finite: of a state so large that it overflows this says no.
+inline Mask all_finite(const Octet *a, int64_t n) {
+    const Octet square = dot(a, a, n);
+    return square - square == 0.0;
+}
+
+// x, or 1 in place of 0: a divisor where the quotient does not count.
+template <class Value>
+inline Value positive(const Value &x) {
+    return where(x > 0.0, x, 1.0);
+}
+
+}  // namespace eip

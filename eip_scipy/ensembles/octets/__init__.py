@@ -1,0 +1,1 @@
+"""Functions jitted by Numba for eight members of an ensemble at once; loaded only where a function is jitted."""

@@ -1,0 +1,71 @@
+"""Which members of an ensemble go side by side, eight in a vector, and by which functions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..core.jitted import NotCompilableError
+from ..core.native_functions import Native
+from ..core.options import Options
+from ..core.pointers import PointerFunction
+from ..core.stepping import UNBOUNDED
+from ..engine.data import AUTO, NEW, Schedule
+from ..engine.native import LibraryFunction, NativeFunctions, OctetFunctions
+
+__all__ = ["LANES", "need_compiling", "octet_functions", "why_one_by_one"]
+
+LANES = 8
+
+
+def why_one_by_one(options: Options, schedule: Schedule, dtype: np.dtype) -> str:
+    """Why members with these options have to run one by one; "" where they take the same fixed steps."""
+    reasons = {
+        "steps are adaptive": options.adaptive,
+        "the interval is endless": schedule.span.n_steps >= UNBOUNDED,
+        "the state is complex": np.dtype(dtype).kind == "c",
+        "t_eval asks for states between steps": schedule.t_eval.size > 0,
+        "events may end members at different times": schedule.g.size > 0,
+        "compensated=True": options.compensated,
+        "every='auto'": options.every == AUTO,
+        "iterations > 1": options.iterations > 1,
+        "direction is not 'new'": options.direction != NEW,
+    }
+    return next((reason for reason, holds in reasons.items() if holds), "")
+
+
+def octet_functions(functions: NativeFunctions) -> OctetFunctions:
+    """The functions of a run for eight members.
+
+    Raises
+    ------
+    NotCompilableError
+        Where there are none, with the name of the function and the reason.
+    """
+    owner = functions.owner
+    found = {name: [_of_eight(native) for native in owner[name]] for name in ("rhs", "inv", "grad")}
+    return OctetFunctions(rhs=found["rhs"][0][0], inv=tuple(found["inv"]), grad=tuple(found["grad"]), owner=functions)
+
+
+def need_compiling(functions: NativeFunctions) -> bool:
+    """Whether some of them are Numba functions, which are compiled once more for eight members."""
+    return any(
+        not isinstance(native.function, (PointerFunction, LibraryFunction))
+        for name in ("rhs", "inv", "grad")
+        for native in functions.owner[name]
+    )
+
+
+def _of_eight(native: Native) -> tuple[Any, int]:
+    """A function of eight members as the engine takes it, and how many octets it fills."""
+    one = native.function
+    if isinstance(one, LibraryFunction):
+        if not one.octet_address:
+            raise NotCompilableError(f"{one.__name__} of this package is written for one member at a time")
+        return one, native.floats
+    if isinstance(one, PointerFunction):
+        raise NotCompilableError(f"{one.name} is a C function of one member, without another one of eight")
+    from .octets.functions import compiled_for_octets  # which loads Numba
+
+    return compiled_for_octets(one).address, native.floats
