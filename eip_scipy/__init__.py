@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .checkpoint import CheckpointError
     from .core.invariants import Invariant, JointInvariants, check_gradient
     from .core.one_step import OneStepMethod
+    from .core.pointers import CFunctions
     from .core.project import project
     from .core.results import Diagnostics, IntegrationResult, ProjectionResult, ProjectionWarning
     from .core.solvers import (
@@ -48,6 +49,7 @@ __all__ = [
     "EIPRK45",
     "EIPRKN8",
     "EIPRKN12",
+    "CFunctions",
     "CheckpointError",
     "Diagnostics",
     "EIPSolver",
@@ -68,6 +70,7 @@ __all__ = [
 ]
 
 _HOMES = {  # the module of each of these names, and the modules that are public themselves
+    "CFunctions": "core.pointers",
     "CheckpointError": "checkpoint",
     "Diagnostics": "core.results",
     "EnsembleResult": "ensembles.ensemble",

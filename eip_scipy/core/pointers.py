@@ -5,11 +5,12 @@ from __future__ import annotations
 import ctypes
 import re
 import sys
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
 
-__all__ = ["GRADIENT", "VALUE", "PointerFunction", "address_hint", "by_pointer", "is_pointer"]
+__all__ = ["GRADIENT", "VALUE", "CFunctions", "PointerFunction", "address_hint", "by_pointer", "is_pointer"]
 
 VALUE = "int (double t, const double *y, double *out, const double *params)"
 GRADIENT = "int (double t, const double *y, const double *f, double *out, const double *params)"
@@ -31,12 +32,33 @@ _capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c
 )
 
 
+@dataclass(frozen=True)
+class CFunctions:
+    """A C function by pointer, and the same for eight members of an ensemble; it stands wherever a C function does.
+
+    Parameters
+    ----------
+    one, eight : LowLevelCallable, ctypes or cffi function pointer
+        Both of the same signature, that of :doc:`/c-functions`. For `eight`, each number of the arrays is eight numbers,
+        one of each member: component i of member k is ``y[8 * i + k]``, and alike in `f`, `out` and `params`; t is that
+        of all. Each member has to get the bits that `one` gives it.
+
+    Examples
+    --------
+    >>> from eip_scipy import CFunctions, ensemble
+    >>> ensemble(CFunctions(library.rhs, library.rhs_of_eight), (0, 1), starts, h=0.1)  # doctest: +SKIP
+    """
+
+    one: Any
+    eight: Any
+
+
 class PointerFunction:
     """A C function as Python calls it: ``(t, y[, f], out[, params])``, f for gradients that take it.
 
     Parameters
     ----------
-    pointer : LowLevelCallable, ctypes or cffi function pointer
+    pointer : LowLevelCallable, ctypes or cffi function pointer, or CFunctions
         Kept, so that what it points to lives as long as this does.
     name : str
         Of the function in messages.
@@ -64,10 +86,10 @@ class PointerFunction:
     ) -> None:
         self.pointer, self.name, self.kind = pointer, name, kind
         self.takes_f, self.shape = takes_f, shape
-        self.address = _address(pointer)
-        if not self.address:
-            raise TypeError(f"{name} is a null pointer, expected {kind}.")
-        _require_signature(pointer, name, kind)
+        both = isinstance(pointer, CFunctions)
+        self.address = _checked_address(pointer.one if both else pointer, name, kind)
+        # Of the function of eight members; 0 where there is none.
+        self.octet_address = _checked_address(pointer.eight, f"{name} for eight members", kind) if both else 0
         self._function = PROTOTYPES[kind](self.address)
 
     def __call__(self, t: float, y: np.ndarray, *others: Any) -> Any:
@@ -117,7 +139,7 @@ def is_pointer(fun: Any) -> bool:
 
     SciPy and cffi are not loaded to find out: where they are not loaded, none is theirs.
     """
-    return isinstance(fun, FROM_CTYPES) or _is_low_level(fun) or _is_of_cffi(fun)
+    return isinstance(fun, (CFunctions, FROM_CTYPES)) or _is_low_level(fun) or _is_of_cffi(fun)
 
 
 def by_pointer(fun: Any, name: str, kind: str = VALUE, **form: Any) -> Any:
@@ -144,6 +166,16 @@ def _is_low_level(fun: Any) -> bool:
 
 def _is_of_cffi(fun: Any) -> bool:
     return "_cffi_backend" in sys.modules and isinstance(fun, sys.modules["_cffi_backend"].FFI.CData)
+
+
+def _checked_address(pointer: Any, name: str, kind: str) -> int:
+    if isinstance(pointer, CFunctions) or not is_pointer(pointer):
+        raise TypeError(f"{name} must be a C function by pointer, got {pointer!r}{address_hint(pointer)}.")
+    address = _address(pointer)
+    if not address:
+        raise TypeError(f"{name} is a null pointer, expected {kind}.")
+    _require_signature(pointer, name, kind)
+    return address
 
 
 def _require_signature(pointer: Any, name: str, kind: str) -> None:

@@ -65,7 +65,9 @@ def _of_eight(native: Native) -> tuple[Any, int]:
             raise NotCompilableError(f"{one.__name__} of this package is written for one member at a time")
         return one, native.floats
     if isinstance(one, PointerFunction):
-        raise NotCompilableError(f"{one.name} is a C function of one member, without another one of eight")
+        if not one.octet_address:
+            raise NotCompilableError(f"{one.name} is a C function of one member, without that of eight (CFunctions)")
+        return one.octet_address, native.floats
     from .octets.functions import compiled_for_octets  # which loads Numba
 
     return compiled_for_octets(one).address, native.floats

@@ -141,3 +141,47 @@ int repelled(double t, const double *y, double *out, const double *params)
     out[3] = params[0] * y[1] / r3;
     return 0;
 }
+
+/* The same for eight members: each number is eight. */
+typedef int value_function(double, const double *, double *, const double *);
+typedef int gradient_function(double, const double *, const double *, double *, const double *);
+value_function kepler, kept;
+gradient_function kept_gradient;
+
+static int values_of_eight(value_function *one, int size, double t, const double *y, double *out, const double *params)
+{
+    for (int k = 0; k < 8; ++k) {
+        double own[4], found[4];
+        for (int i = 0; i < 4; ++i)
+            own[i] = y[8 * i + k];
+        int status = one(t, own, found, params + k);
+        if (status)
+            return status;
+        for (int i = 0; i < size; ++i)
+            out[8 * i + k] = found[i];
+    }
+    return 0;
+}
+
+int kepler_of_eight(double t, const double *y, double *out, const double *params)
+{
+    return values_of_eight(kepler, 4, t, y, out, params);
+}
+
+int kept_of_eight(double t, const double *y, double *out, const double *params)
+{
+    return values_of_eight(kept, 2, t, y, out, params);
+}
+
+int kept_of_eight_gradient(double t, const double *y, const double *f, double *out, const double *params)
+{
+    for (int k = 0; k < 8; ++k) {
+        double own[4], found[8];
+        for (int i = 0; i < 4; ++i)
+            own[i] = y[8 * i + k];
+        kept_gradient(t, own, f, found, params + k);
+        for (int i = 0; i < 8; ++i)
+            out[8 * i + k] = found[i];
+    }
+    return 0;
+}

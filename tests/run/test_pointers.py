@@ -19,6 +19,7 @@ from eip_scipy import (
     EIPRK4,
     EIPRK45,
     EIPRKN12,
+    CFunctions,
     CheckpointError,
     Invariant,
     check_gradient,
@@ -545,6 +546,59 @@ def test_members_are_single_runs(c):
     assert not run.side_by_side.any()
     with pytest.raises(TypeError, match="fun is a C function by pointer, which cannot be pickled"):
         ensemble(c.kepler, (0, 10), starts, params=masses, executor="dask", **options)
+
+
+def of_eight(c):
+    """Kepler's problem for one member and for eight."""
+    kept = Invariant(
+        CFunctions(c.kept, c.kept_of_eight), CFunctions(c.kept_gradient, c.kept_of_eight_gradient), size=2, name="H L"
+    )
+    return CFunctions(c.kepler, c.kepler_of_eight), kept
+
+
+@pytest.mark.parametrize("more", [{}, {"metric": "euclidean", "save_every": 30}])
+def test_members_in_vectors_are_single_runs(c, more):
+    starts = Y0 * np.linspace(0.9, 1.1, 19)[:, None]
+    masses = np.linspace(0.9, 1.1, 19)[:, None]
+    starts[4] = [1.0, 0.0, 0.0, 0.0]  # falls into the centre
+    starts[7] = 0.0  # has no derivative, nor have its neighbours' eight then a value
+    fun, kept = of_eight(c)
+    options = {"method": EIPRK4, "h": 0.05, "check": False, **more}
+    run = ensemble(fun, (0, 10), starts, params=masses, invariants=kept, executor=2, **options)
+    for k in range(19):
+        if k == 7:
+            assert "non-finite" in run.message[k] or "finite" in run.message[k]
+            continue
+        single = integrate(c.kepler, (0, 10), starts[k], params=masses[k], invariants=alone(c), **options)
+        np.testing.assert_array_equal(run.y[k], single.y[:, -1])
+        assert (run.status[k], run.nfev[k], run.nlu[k]) == (single.status, single.nfev, single.nlu)
+        np.testing.assert_array_equal(run.max_defect[k], single.max_defect)
+    assert list(run.side_by_side) == [False] * 8 + [True] * 11
+    assert run.one_by_one == ""
+
+
+def alone(c):
+    return Invariant(c.kept, c.kept_gradient, size=2, name="H L")
+
+
+def test_what_has_no_function_of_eight_is_named(c):
+    fun, kept = of_eight(c)
+    options = {"params": MU, "method": EIPRK4, "h": 0.05}
+    run = ensemble(c.kepler, (0, 1), [Y0, Y0], invariants=kept, **options)
+    assert run.one_by_one == "fun is a C function of one member, without that of eight (CFunctions)"
+    run = ensemble(fun, (0, 1), [Y0, Y0], invariants=alone(c), **options)
+    assert run.one_by_one.startswith("invariant 'H L' is a C function of one member")
+    run = ensemble(fun, (0, 1), [Y0, Y0], invariants=kept, **options)
+    assert run.side_by_side.all()
+
+
+def test_functions_of_eight_are_looked_at(c):
+    with pytest.raises(TypeError, match="fun for eight members is a C function of the signature"):
+        integrate(CFunctions(c.kepler, c.kept_gradient), (0, 1), Y0, method=EIPRK4, h=0.1, params=MU)
+    with pytest.raises(
+        TypeError, match="fun for eight members must be a C function by pointer, got 17"
+    ):
+        integrate(CFunctions(c.kepler, 17), (0, 1), Y0, method=EIPRK4, h=0.1, params=MU)
 
 
 def test_a_checkpoint_knows_them_by_what_they_do(c, tmp_path):
