@@ -16,13 +16,13 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numba.extending import is_jitted
 from scipy.optimize import OptimizeResult
 
 from ..checkpoint.own_file import absolute
 from ..core import setup
 from ..core.inputs import count, flag, is_number, real_array, refuse_units, shown
 from ..core.invariants import as_invariants
+from ..core.jitted import is_jitted
 from ..core.names import nearest
 from ..core.options import ProjectionOptions
 from ..core.pointers import PointerFunction

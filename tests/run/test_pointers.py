@@ -595,9 +595,7 @@ def test_what_has_no_function_of_eight_is_named(c):
 def test_functions_of_eight_are_looked_at(c):
     with pytest.raises(TypeError, match="fun for eight members is a C function of the signature"):
         integrate(CFunctions(c.kepler, c.kept_gradient), (0, 1), Y0, method=EIPRK4, h=0.1, params=MU)
-    with pytest.raises(
-        TypeError, match="fun for eight members must be a C function by pointer, got 17"
-    ):
+    with pytest.raises(TypeError, match="fun for eight members must be a C function by pointer, got 17"):
         integrate(CFunctions(c.kepler, 17), (0, 1), Y0, method=EIPRK4, h=0.1, params=MU)
 
 
