@@ -548,6 +548,31 @@ def test_members_are_single_runs(c):
         ensemble(c.kepler, (0, 10), starts, params=masses, executor="dask", **options)
 
 
+@pytest.mark.parametrize("more", [{"t_eval": np.linspace(0, 9.9, 7)}, {"h": None, "rtol": 1e-6}, {"save_every": 20}])
+def test_members_end_by_an_event_within_the_loop(c, more):
+    starts = Y0 * np.linspace(0.9, 1.1, 5)[:, None]
+    event = c.turn
+    event.terminal = 3
+    options = {
+        "method": EIPRK45,
+        "h": 0.05,
+        "params": MU,
+        "invariants": alone(c),
+        "events": event,
+        "check": False,
+        **more,
+    }
+    run = ensemble(c.kepler, (0, 10), starts, executor=1, **options)
+    for k in range(5):
+        single = integrate(c.kepler, (0, 10), starts[k], **options)
+        assert (run.status[k], run.t[k], run.nfev[k]) == (1, single.t_events[0][-1], single.nfev)
+        np.testing.assert_array_equal(run.y[k], single.y_events[0][-1])
+        if run.trajectories is not None:
+            rows = single.t.size - ("save_every" in more)  # where the run's last row is that of the event
+            np.testing.assert_array_equal(run.trajectories[k, :, :rows], single.y[:, :rows])
+            assert np.isnan(run.trajectories[k, :, rows:]).all()
+
+
 def of_eight(c):
     """Kepler's problem for one member and for eight."""
     kept = Invariant(
