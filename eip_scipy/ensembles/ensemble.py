@@ -22,7 +22,7 @@ from ..checkpoint.own_file import absolute
 from ..core import setup
 from ..core.inputs import count, flag, is_number, real_array, refuse_units, shown
 from ..core.invariants import as_invariants
-from ..core.jitted import is_jitted
+from ..core.jitted import is_compiled
 from ..core.names import nearest
 from ..core.options import ProjectionOptions
 from ..core.pointers import PointerFunction
@@ -518,7 +518,7 @@ def _first_that_starts(task: Task, starts: np.ndarray, params: np.ndarray) -> tu
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
     """Members in a chunk, by the problem alone: about a second's work, bounded in bytes, a multiple of the lanes."""
     rhs = fun.rhs or fun.fun if isinstance(fun, Problem) else fun
-    native = is_jitted(rhs) or isinstance(rhs, PointerFunction)
+    native = is_compiled(rhs) or isinstance(rhs, PointerFunction)
     budget = CHUNK_STEPS if native and plan.task.request.compiled is not False else INTERPRETED_STEPS
     steps = plan.n_steps or UNKNOWN_STEPS
     by_work = budget * 4 / (steps * max(4, plan.size))

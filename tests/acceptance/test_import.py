@@ -27,8 +27,8 @@ def test_the_package_alone_is_light():
     assert set(python(code)) <= {"eip_scipy.core", "eip_scipy.core.source_tree", "eip_scipy.integrations"}
 
 
-@pytest.mark.parametrize("name", ["EIPRK4, Invariant, project", "EIPDOP853, Diagnostics", "integrate"])
-def test_single_runs_do_without_numba(name):
+@pytest.mark.parametrize("name", ["EIPRK4, Invariant, project", "EIPDOP853, Diagnostics", "integrate", "ensemble"])
+def test_runs_do_without_numba(name):
     assert loaded(f"from eip_scipy import {name}", ["numba", "llvmlite"]) == []
 
 

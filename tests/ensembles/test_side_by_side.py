@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from numba import njit, types
+from numba import njit
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate
-from eip_scipy.engine.octets import is_not, multiply_add, octets, spread, where
 from eip_scipy.ensembles import tasks
 from eip_scipy.problems import harmonic, kepler, solar_system
+from eip_scipy.problems.gravity.nbody import nbody
 
 pytestmark = pytest.mark.needs_jit
 
@@ -23,15 +23,6 @@ def spread_starts(y0, members, size=1e-3, seed=0):
 @pytest.fixture(autouse=True)
 def _small_ensembles_too(monkeypatch):
     monkeypatch.setattr(tasks, "LEAST_WORK", 0)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_little_work_is_not_worth_compiling_for(monkeypatch):
-    monkeypatch.undo()
-    run = ensemble(kepler(), (0, 1), spread_starts(kepler().y0, 40), executor=1)
-    assert not run.side_by_side.any()
-    assert "less to do than functions for eight members take to compile" in repr(run)
 
 
 def check_bits(problem, t_span, starts, *, params=None, members=None, **options):
@@ -173,6 +164,17 @@ def test_functions_of_the_users_own():
     assert run.side_by_side.all()
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_little_work_is_not_worth_compiling_for(monkeypatch):
+    monkeypatch.undo()
+    starts, options = np.ones((9, 10)), {"h": 0.1, "in_place": True, "invariants": (), "executor": 1}
+    run = ensemble(pendulums, (0, 1), starts, params=[1.0], **options)
+    assert not run.side_by_side.any()
+    assert "less to do than functions for eight members take to compile" in repr(run)
+    assert ensemble(kepler(), (0, 1), spread_starts(kepler().y0, 9), executor=1).side_by_side.all()
+
+
 @njit
 def with_a_branch(t, y, out):
     out[0] = y[1]
@@ -235,58 +237,41 @@ def test_exceptions_name_the_member():
     assert "ZeroDivisionError" in run.message[5]
 
 
+@njit(error_model="numpy")
+def all_that_octets_do(t, y, out):
+    a, b, total = y[0], y[1], 0.0
+    for i in range(y.size):
+        total += y[i]
+    out[0] = total - 0.1 * y[0]
+    out[1] = 2 * a - b / 3 + (-b)
+    out[2] = math.sqrt(abs(a)) + math.fabs(b)
+    out[3] = max(a, b) * min(a, 0.5)
+    out[4] = math.sin(a) + math.exp(-abs(b)) + math.atan2(a, b) + math.hypot(a, b)
+    out[5] = abs(a) ** 1.3 + a**2 - b**3
+    out[6] = 1
+    out[6] += b
+    out[7] = math.log1p(abs(a)) - math.pow(abs(b), 0.5)
+
+
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_octets_are_floats_lane_by_lane():
-    """All that functions of octets are made of, against the same functions of floats."""
-
-    @njit(error_model="numpy")
-    def values(a, b, out):
-        total = 0.0
-        for i in range(a.size):
-            total += a[i]
-        out[0] = total
-        out[1] = 2 * a[0] - b[0] / 3 + (-b[0])
-        out[2] = math.sqrt(abs(a[0])) + abs(b[0])
-        out[3] = max(a[0], b[0]) * min(a[0], 0.5)
-        out[4] = math.sin(a[0]) + math.exp(b[0]) + math.atan2(a[0], b[0]) + math.hypot(a[0], b[0])
-        out[5] = abs(a[0]) ** 1.3 + a[0] ** 2 + b[0] ** 3
-        out[6] = where((a[0] > b[0]) | is_not(a[0] >= 0.0), a[0], where((a[0] != b[0]) & (b[0] <= 1.0), b[0], 7.0))
-        out[7] = multiply_add(a[0], b[0], 1.0)
-        out[8] = 1
-        out[8] += b[0]
-        out[9] = a[0] / 0.0
-
-    @njit
-    def all_eight(a, b, out):
-        values(octets(a, 0), octets(b, 0), octets(out, 0))
-
-    rng = np.random.default_rng(11)
-    a, b = rng.normal(size=(2, 3, 8))
-    out = np.zeros((10, 8))
-    all_eight(a, b, out)
-    for k in range(8):
-        one = np.zeros(10)
-        values(a[:, k].copy(), b[:, k].copy(), one)
-        np.testing.assert_array_equal(out[:, k], one)
+    """All that functions of octets are made of."""
+    starts = np.random.default_rng(11).normal(size=(8, 8))
+    run = check_bits(all_that_octets_do, (0, 0.5), starts, method=EIPRK4, h=0.1, in_place=True, invariants=())
+    assert run.side_by_side.all()
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
-def test_octets_are_typed_apart_from_floats():
-    @njit
-    def add(a, b):
-        return a + b
-
-    add(1.0, 2)
-    assert add.nopython_signatures[-1].return_type == types.float64
-
-    @njit
-    def lifted(x):
-        return spread(x) * 2.0 > 1.0
-
-    with pytest.raises(Exception, match="octet"):
-        lifted(1.0)
+@pytest.mark.parametrize("n", [2, 3, 5, 8, 11])
+def test_any_number_of_bodies(n):
+    """Every order of summation that the number of bodies brings with it, and frames of bodies."""
+    rng = np.random.default_rng(n)
+    problem = nbody(10.0 ** rng.uniform(-3, 0, n), rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), t_span=(0, 1))
+    starts = spread_starts(problem.y0, 9)
+    run = check_bits(problem, (0, 0.05), starts, method=EIPRK4, h=0.005)
+    assert run.side_by_side.all()
 
 
 @pytest.mark.nightly

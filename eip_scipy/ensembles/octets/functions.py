@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ...core.numba_pointers import Compiled, compiled
-from ...engine.octets import OCTET
+from .type import OCTET
 
 __all__ = ["compiled_for_octets"]
 
