@@ -25,7 +25,6 @@ def why_one_by_one(options: Options, schedule: Schedule, dtype: np.dtype) -> str
         "steps are adaptive": options.adaptive,
         "the interval is endless": schedule.span.n_steps >= UNBOUNDED,
         "the state is complex": np.dtype(dtype).kind == "c",
-        "t_eval asks for states between steps": schedule.t_eval.size > 0,
         "events may end members at different times": schedule.g.size > 0,
         "compensated=True": options.compensated,
         "every='auto'": options.every == AUTO,

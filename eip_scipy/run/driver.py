@@ -84,6 +84,7 @@ class Driver:
         Whose status is not set then has to run by itself.
         """
         self.engine.sweep_octets(members, steps, self.state, self.new, self.t)
+        self.warn()
 
     @contextmanager
     def own_errors(self) -> Iterator[None]:

@@ -28,7 +28,7 @@ def _small_ensembles_too(monkeypatch):
 def check_bits(problem, t_span, starts, *, params=None, members=None, **options):
     """An ensemble, some of its members compared with runs of their own."""
     run = ensemble(problem, t_span, starts, params=params, executor=1, **options)
-    saved = "save_every" in options
+    saved = run.times.size > 0
     for k in range(len(starts)) if members is None else members:
         own = None if params is None else params[k]
         single = integrate(problem, t_span, starts[k], params=own, check=False, **options)
@@ -72,6 +72,22 @@ def test_members_get_the_bits_of_single_runs(method):
 def test_options(options, span):
     run = check_bits(kepler(), span, spread_starts(kepler().y0, 11), method=EIPRK4, h=0.05, **options)
     assert run.side_by_side.all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [{"method": EIPRK4}, {"method": EIPRK45, "every": 3}, {"method": EIPDOP853}, {"method": EIPRK5, "invariants": ()}],
+    ids=["cubic", "quartic", "seventh", "without invariants"],
+)
+@pytest.mark.parametrize("start", [0.0, 0.02])
+def test_times_between_steps(options, start):
+    """From the start or not, several in one step, at the end of one, at the end of all."""
+    times = np.array([start, 0.11, 0.12, 0.5, 1.234, 6.1])
+    run = check_bits(kepler(), (0, 6.1), spread_starts(kepler().y0, 11), h=0.05, t_eval=times, **options)
+    assert run.side_by_side.all()
+    back = check_bits(kepler(), (0, -6.1), spread_starts(kepler().y0, 9), h=0.05, t_eval=-times, **options)
+    assert back.side_by_side.all()
 
 
 @pytest.mark.nightly

@@ -286,14 +286,16 @@ PyObject *engine_sweep_octets(Engine *self, PyObject *const *args, Py_ssize_t co
         const Ref kept(PyList_New(0));
         const Schedule &s = scheduled(self);
         const auto [members, steps, y, y_new] = sweep_arguments(self, args, kept.get());
-        const bool fixed = s.span.h != 0.0 && s.n_eval == 0 && s.n_events == 0;
-        const int64_t saved = s.save_every > 0 ? s.span.n_steps / s.save_every + 2 : 2;
+        const bool fixed = s.span.h != 0.0 && s.n_events == 0 && (s.n_eval == 0 || (self->samples && members.kept));
+        const int64_t saved = s.n_eval > 0 ? s.n_eval : s.save_every > 0 ? s.span.n_steps / s.save_every + 2 : 2;
         if (!self->eight || !fixed || (members.kept && members.n_rows < saved)) {
             PyErr_SetString(PyExc_ValueError, "engine: members side by side take fixed steps, and need room for all rows");
             return nullptr;
         }
+        Samples *samples = self->samples;
+        if (samples) samples->interpolants.capacity = 0;
         return PyLong_FromLong(stepped(
-            self, [&](auto &run) { return sweep_octets(run, *self->eight, s, members, steps, y, y_new); }));
+            self, [&](auto &run) { return sweep_octets(run, samples, *self->eight, s, members, steps, y, y_new); }));
     });
 }
 

@@ -97,6 +97,7 @@ struct Eight {
     Octet *y, *y_new, *projections, *skips, *reduced;
     // Members that are still here; their counters beyond those of all; rank of the last projection.
     bool alive[LANES] = {};
+    int64_t row = 0;  // the next one to be saved
     int64_t own[LANES][N_COUNTERS] = {}, rank[LANES] = {};
 
     Eight(const Method &method, const Options &o, const Work &w, OctetSystem functions)
@@ -278,6 +279,11 @@ inline void count_of(const Eight &eight, int64_t lane, const int64_t *shared, in
     out[LAST_RANK] = eight.rank[lane];
 }
 
+// The parameters of one member, for the functions of the single run.
+inline void take_params(const Eight &eight, int64_t lane, System &system) {
+    eight.take(eight.system.params.data(), lane, system.params, system.n_params);
+}
+
 // Step k of one member on the buffers of the single run, up to its new state; false where it fails. `shared`: what all
 // had counted before the step.
 template <class AnyRun>
@@ -292,8 +298,7 @@ template <class AnyRun>
     eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
     eight.take(eights.max_defect, lane, w.max_defect, w.l);
     w.max_correction[0] = eight.at(eights.max_correction, lane);
-    for (int64_t i = 0; i < run.system.n_params; ++i)
-        run.system.params[i] = OctetSystem::floats_of(eight.system.params.data())[LANES * i + lane];
+    take_params(eight, lane, run.system);
     count_of(eight, lane, shared, w.counters);
     s.clock[NEXT_LENGTH] = std::abs(s.span.h);
     try {
@@ -317,9 +322,44 @@ inline Mask alive_of(const Eight &eight) {
     return Octet::load(lanes) > 0.0;
 }
 
+// Whether a time of t_eval lies in the step that ends at t_new.
+inline bool is_due(const Schedule &s, int64_t row, double t_new) {
+    return row < s.n_eval && s.span.sign * (s.t_eval[row] - t_new) <= 0.0;
+}
+
+// States at the times of t_eval within the step just made, member by member as in a single run.
+template <class AnyRun>
+[[gnu::noinline]] inline void sample_octet(AnyRun &run, Samples &samples, Eight &eight, const Schedule &s,
+                                           const Members &members, const Step &step, double *y, double *y_new) {
+    const auto &w = run.work;
+    const WorkOf<Octet> &eights = eight.work;
+    const int64_t row = eight.row;
+    s.clock[TIME] = step.t;
+    s.clock[TIME_NEW] = step.t_new;
+    for (int64_t lane = 0; lane < LANES; ++lane) {
+        if (!eight.alive[lane]) continue;
+        eight.take(eights.K, lane, w.K, (w.stages + 1) * w.m);
+        eight.take(eights.sigma, lane, w.sigma, w.m);
+        eight.take(eight.y, lane, y, w.m);
+        eight.take(eight.y_new, lane, y_new, w.m);
+        take_params(eight, lane, run.system);
+        w.counters[NFEV] = 0;
+        s.place[ROW] = row;
+        const Saved saved = members.saved(members.where[0] + lane, w);
+        try {
+            if (wants_samples(run, &samples, s, y_new, saved)) sample(run, samples, s, y, y_new, saved);
+        } catch (const Broken &) {
+            eight.alive[lane] = false;
+        }
+        eight.own[lane][NFEV] += w.counters[NFEV];
+    }
+    while (is_due(s, eight.row, step.t_new)) ++eight.row;
+}
+
 // Step k of all eight.
 template <class AnyRun>
-inline void step_octet(AnyRun &run, Eight &eight, const Schedule &s, int64_t k, double *y, double *y_new) {
+inline void step_octet(AnyRun &run, Samples *samples, Eight &eight, const Schedule &s, const Members &members, int64_t k,
+                       double *y, double *y_new) {
     const Span &span = s.span;
     const Options &o = eight.options;
     WorkOf<Octet> &w = eight.work;
@@ -350,6 +390,7 @@ inline void step_octet(AnyRun &run, Eight &eight, const Schedule &s, int64_t k, 
     close_step(all, step, OK);
     for (int64_t lane = 0; lane < LANES; ++lane)
         for (int c = 0; returned[lane] && c < N_COUNTERS; ++c) eight.own[lane][c] -= w.counters[c];
+    if (is_due(s, eight.row, t_new)) sample_octet(run, *samples, eight, s, members, step, y, y_new);
     copy(w.last(), w.row(0), w.m);
     std::swap(eight.y, eight.y_new);
 }
@@ -386,11 +427,10 @@ inline void begin_octet(AnyRun &run, Eight &eight, const Schedule &s, const Memb
     for (int64_t lane = 0; lane < LANES; ++lane) eight.alive[lane] = first + lane < members.count && sound.lane(lane);
 }
 
-// States of all members at a row.
-inline void save_octet(const Eight &eight, const Members &members, int64_t row) {
-    if (!members.kept) return;
-    const int64_t n = eight.work.n;
-    for (int64_t lane = 0; lane < LANES && members.where[0] + lane < members.count; ++lane)
+// States of all members as their next row.
+inline void save_octet(Eight &eight, const Members &members) {
+    const int64_t n = eight.work.n, row = eight.row++;
+    for (int64_t lane = 0; members.kept && lane < LANES && members.where[0] + lane < members.count; ++lane)
         eight.take(eight.y, lane, members.rows + ((members.where[0] + lane) * members.n_rows + row) * n, n);
 }
 
@@ -413,22 +453,22 @@ inline void end_octet(const Eight &eight, const Schedule &s, const Members &memb
 // Octets of members from where[0] on, so many steps in all; where[1] is one more than the step they are at. OK when none
 // is left, or it is to be called again. Whose status is not set has to run by itself.
 template <class AnyRun>
-inline Code sweep_octets(AnyRun &run, Eight &eight, const Schedule &s, const Members &members, int64_t steps, double *y,
-                         double *y_new) {
+inline Code sweep_octets(AnyRun &run, Samples *samples, Eight &eight, const Schedule &s, const Members &members,
+                         int64_t steps, double *y, double *y_new) {
     int64_t &first = members.where[0], &begun = members.where[1];
     for (; first < members.count; first += LANES, begun = 0) {
         try {
             if (begun == 0) {
                 begin_octet(run, eight, s, members);
-                save_octet(eight, members, 0);
+                eight.row = 0;
+                if (s.n_eval == 0 || s.t_eval[0] == s.span.t0) save_octet(eight, members);
                 begun = 1;
             }
             for (int64_t k = begun - 1; k < s.span.n_steps && any(alive_of(eight)); begun = ++k + 1) {
                 if (steps-- == 0) return OK;
-                step_octet(run, eight, s, k, y, y_new);
-                const bool last = k + 1 == s.span.n_steps;
-                if (last || (s.save_every > 0 && (k + 1) % s.save_every == 0))
-                    save_octet(eight, members, s.save_every > 0 ? (k + s.save_every) / s.save_every : 1);
+                step_octet(run, samples, eight, s, members, k, y, y_new);
+                const bool due = k + 1 == s.span.n_steps || (s.save_every > 0 && (k + 1) % s.save_every == 0);
+                if (s.n_eval == 0 && due) save_octet(eight, members);
             }
             end_octet(eight, s, members);
         } catch (const GaveUp &) {
