@@ -282,6 +282,31 @@ def test_members_do_not_depend_on_the_chunk():
     same(ensemble(kepler(), SPAN, starts(40), chunk=3), ensemble(kepler(), SPAN, starts(40), chunk=40))
 
 
+def test_what_the_engine_gets_is_looked_at():
+    """Arrays of other shapes, places outside the members, rows without room: refused before they are used."""
+    y0s = starts(9)
+    plan = Plan(Task(Request.of(fun=kepler(), t_span=SPAN, y0=y0s[0], method=EIPRK4, save_every=10))).compile()
+    out = plan.empty(9)
+    with plan.driver() as sweeper:
+        driver = sweeper.loop.driver
+        members = sweeper._each(plan, y0s, np.zeros((9, 1)), out)
+        for advance in (driver.sweep, driver.sweep_octets):
+            for wrong, message in (
+                ({"starts": y0s[:, :3].copy()}, "starts is float64 of shape"),
+                ({"params": np.zeros((9, 2))}, "params is float64 of shape"),
+                ({"y": out.y[:4]}, "y is float64 of shape"),
+                ({"counters": out.counters.astype(float)}, "counters is float64"),
+                ({"where": np.array([10, 0])}, "where is outside the members"),
+            ):
+                with pytest.raises(ValueError, match=message):
+                    advance(members._replace(**wrong), 10)
+            with pytest.raises(ValueError, match="members need a step or more"):
+                advance(members, 0)
+        driver.t = driver.t[:5].copy()
+        with pytest.raises(ValueError, match="need room for all rows"):
+            driver.sweep_octets(members._replace(rows=np.zeros((9, 5, 4))), 10)
+
+
 # Failures.
 
 

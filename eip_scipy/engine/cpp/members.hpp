@@ -5,8 +5,8 @@
 
 namespace eip {
 
-// All members: `count` starts, parameters and lengths of the first steps, and what each comes to. `where` holds the member
-// at hand and whether it has begun; rows are saved for each member, or where `kept` is false for none.
+// All members: `count` starts, parameters and lengths of the first steps, and what each comes to. `where` holds the
+// member at hand and whether it has begun; rows are saved for each member, or where `kept` is false for none.
 struct Members {
     int64_t count, n_rows, evaluations;
     bool kept;

@@ -1,5 +1,5 @@
-// One source for a float and for the floats of eight members: what the templates of the projection choose by a condition
-// they choose lane by lane, and go another way only where no lane needs this one.
+// One source for a float and for the floats of eight members: what the templates of the projection choose by a
+// condition they choose lane by lane, and go another way only where no lane needs this one.
 #pragma once
 
 #include <algorithm>

@@ -1,0 +1,88 @@
+// Eight members of an ensemble: their buffers and counters.
+#pragma once
+
+#include "octet_system.hpp"
+
+namespace eip {
+
+// Eight members: their buffers, as octets and as 8 n floats, and what each has done.
+struct Eight {
+    using Run = RunOf<Work, OctetSystem>;
+
+    const Method &method;
+    Options options;  // those of the run, tolerances for 8 n floats
+    OctetSystem system;
+    std::vector<Octet> memory;
+    std::vector<double> tolerances, no_norm;
+    int64_t counters[N_COUNTERS] = {};
+    Work flat{};
+    WorkOf<Octet> work{};
+    Octet *y, *y_new, *projections, *skips, *reduced;
+    // Members that are still here; their counters beyond those of all; rank of the last projection.
+    bool alive[LANES] = {};
+    int64_t first = -1, count = 0;  // the first of them, of how many in all
+    int64_t step = 0, row = 0;      // the next step, and the next row to be saved
+    int64_t own[LANES][N_COUNTERS] = {}, rank[LANES] = {};
+
+    Eight(const Method &method, const Options &o, const Work &w, OctetSystem functions)
+        : method(method), options(o), system(std::move(functions)), no_norm(1) {
+        const int64_t n = w.n, l = w.l, blocks = o.blocks.count, products = o.frame.rows;
+        work.n = work.m = n;
+        work.l = l;
+        work.stages = w.stages;
+        const std::pair<Octet **, int64_t> places[] = {
+            {&work.K, (w.stages + 1) * n}, {&work.G, l * n}, {&work.Q, l * n}, {&work.R, l * l}, {&work.stage, n},
+            {&work.y_hat, n}, {&work.err, n}, {&work.err_low, n}, {&work.err_sum, n},
+            {&work.sigma, n}, {&work.move, n}, {&work.scale, blocks}, {&work.ratio, blocks}, {&work.mu, l},
+            {&work.values, l}, {&work.g, l}, {&work.band, l}, {&work.before, l}, {&work.worth, l}, {&work.defect, l},
+            {&work.max_defect, l}, {&work.target, l}, {&work.trust, l * N_FIGURES}, {&work.products, products},
+            {&work.max_correction, 1}, {&y, n}, {&y_new, n}, {&projections, 1}, {&skips, 1}, {&reduced, 1}};
+        int64_t total = 0;
+        for (const auto &[place, count] : places) total += count;
+        memory.resize(total, Octet(0.0));
+        Octet *next = memory.data();
+        for (const auto &[place, count] : places) {
+            *place = next;
+            next += count;
+        }
+        work.counters = counters;
+        tolerances.resize(2 * LANES * n);
+        for (int64_t i = 0; i < LANES * n; ++i) {
+            tolerances[i] = o.rtol[i / LANES];
+            tolerances[LANES * n + i] = o.atol[i / LANES];
+        }
+        flatten(w);
+    }
+
+    Run run() { return {method, flat_options_, flat, system, nullptr}; }
+    double &at(Octet *a, int64_t lane) const { return OctetSystem::floats_of(a)[lane]; }
+
+    // One member's part of n octets, to floats and back.
+    void take(const Octet *a, int64_t lane, double *out, int64_t n) const {
+        for (int64_t i = 0; i < n; ++i) out[i] = OctetSystem::floats_of(a)[LANES * i + lane];
+    }
+    void give(const double *a, int64_t lane, Octet *out, int64_t n) const {
+        for (int64_t i = 0; i < n; ++i) OctetSystem::floats_of(out)[LANES * i + lane] = a[i];
+    }
+
+  private:
+    Options flat_options_{};
+
+    // The same buffers as those of one state of 8 n floats, as far as the raw step needs them.
+    void flatten(const Work &w) {
+        flat.n = flat.m = LANES * w.n;
+        flat.l = w.l;
+        flat.stages = w.stages;
+        for (const auto &[place, octets] : std::initializer_list<std::pair<double **, Octet *>>{
+                 {&flat.K, work.K}, {&flat.stage, work.stage}, {&flat.y_hat, work.y_hat}, {&flat.err, work.err},
+                 {&flat.err_low, work.err_low}, {&flat.err_sum, work.err_sum}})
+            *place = OctetSystem::floats_of(octets);
+        flat.norm = no_norm.data();
+        flat.counters = counters;
+        flat_options_ = options;
+        flat_options_.rtol = tolerances.data();
+        flat_options_.atol = tolerances.data() + LANES * w.n;
+    }
+};
+
+}  // namespace eip

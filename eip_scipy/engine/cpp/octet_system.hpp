@@ -1,0 +1,79 @@
+// The functions of eight members of an ensemble.
+#pragma once
+
+#include "system.hpp"
+
+namespace eip {
+
+// A function of eight members gave up: they run one by one.
+struct GaveUp {};
+
+// The functions of eight members: those of a single run on arrays of octets.
+struct OctetSystem {
+    Native<ValuePointer, Octet> rhs_pointer{};
+    std::vector<Native<ValuePointer, Octet>> inv_pointers;
+    std::vector<Native<GradientPointer, Octet>> grad_pointers;
+    bool second_order = false;
+    std::vector<Octet> params, scratch, scratch_f;
+
+    template <class W>
+    void rhs(const W &w, double t, const double *y, double *out) {
+        rhs_of_scratch(w, t, rhs_pointer.library ? y : copied(y, scratch), out);
+    }
+
+    template <class W>
+    void rhs_of_scratch(const W &w, double t, const double *y, double *out) {
+        const int64_t half = w.m / 2, floats = second_order ? half : w.m;
+        if (second_order) {
+            copy(y + half, out, half);
+            out += half;
+        }
+        if (rhs_pointer.library)
+            return rhs_pointer.library(t, octets_of(y), nullptr, octets_of(out), params.data(), floats / LANES, p());
+        fill(out, NOT_A_NUMBER, floats);
+        require(rhs_pointer.pointer(t, y, out, floats_of(params.data())));
+    }
+
+    void inv(double t, const Octet *y, Octet *values) {
+        for (const auto &[pointer, library, octets] : inv_pointers) {
+            if (library) {
+                library(t, y, nullptr, values, params.data(), n(), p());
+            } else {
+                fill(values, NOT_A_NUMBER, octets);
+                require(pointer(t, copied(floats_of(y), scratch), floats_of(values), floats_of(params.data())));
+            }
+            values += octets;
+        }
+    }
+
+    void grad(double t, const Octet *y, const Octet *f, Octet *G) {
+        for (const auto &[pointer, library, octets] : grad_pointers) {
+            if (library) {
+                library(t, y, f, G, params.data(), n(), p());
+            } else {
+                fill(G, NOT_A_NUMBER, octets);
+                const double *state = copied(floats_of(y), scratch), *slope = copied(floats_of(f), scratch_f);
+                require(pointer(t, state, slope, floats_of(G), floats_of(params.data())));
+            }
+            G += octets;
+        }
+    }
+
+    static Octet *octets_of(double *a) { return reinterpret_cast<Octet *>(a); }
+    static const Octet *octets_of(const double *a) { return reinterpret_cast<const Octet *>(a); }
+    static double *floats_of(Octet *a) { return reinterpret_cast<double *>(a); }
+    static const double *floats_of(const Octet *a) { return reinterpret_cast<const double *>(a); }
+
+  private:
+    int64_t n() const { return std::ssize(scratch); }
+    int64_t p() const { return std::ssize(params); }
+    static const double *copied(const double *a, std::vector<Octet> &own) {
+        copy(a, floats_of(own.data()), LANES * static_cast<int64_t>(own.size()));
+        return floats_of(own.data());
+    }
+    static void require(int status) {
+        if (status) throw GaveUp{};
+    }
+};
+
+}  // namespace eip

@@ -1,0 +1,116 @@
+// The projection of eight members: that of a single run on octets, but for what only some of them need.
+#pragma once
+
+#include "correction.hpp"
+#include "eight.hpp"
+
+namespace eip {
+
+// The Newton step of one member, whose gradients are nearly parallel or vanish, by pivoted QR.
+template <class W>
+[[gnu::noinline]] inline void solve_alone(Eight &eight, int64_t lane, const Options &o, const W &w) {
+    const WorkOf<Octet> &eights = eight.work;
+    eight.take(eights.sigma, lane, w.sigma, w.m);
+    eight.take(eights.y_hat, lane, w.y_hat, w.m);
+    eight.take(eights.G, lane, w.G, w.l * w.m);
+    eight.take(eights.g, lane, w.g, w.l);
+    weigh_rows(o.frame, w, w.Q);
+    const Matrix R = small(w.R, w.l, w);
+    const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
+    eight.rank[lane] = std::max<int64_t>(rank, 0);
+    if (rank >= 0) {
+        least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
+        move_along(o, w, w.stage);
+    } else {
+        fill(w.stage, NOT_A_NUMBER, w.m);
+    }
+    eight.give(w.move, lane, eights.move, w.m);
+    eight.give(w.stage, lane, eight.y_new, w.m);
+}
+
+// What `note` does for one member, for those in `done`; returns those for whom there is more to be noted, untouched.
+inline Mask note_octet(double t, const Mask &done, const Options &o, const WorkOf<Octet> &w) {
+    const double waited = static_cast<double>(w.counters[WAITED]), many = std::sqrt(1.0 + waited);
+    const double rounding = waited > 0 ? EPS * many : EPS;
+    const double errors = !w.counters[HAVE_ERROR] ? 0.0 : waited == 0 ? 1.0 : o.metric == ERROR ? many : 1.0 + waited;
+    const auto expected_of = [&](int64_t i) {
+        return errors * w.worth[i] + rounding * (o.per_band * w.band[i]) + TINY;
+    };
+    Mask more{};
+    for (int64_t i = 0; i < w.l; ++i) {
+        const Octet *figures = w.figures(i);
+        const Octet own = own_terms(i, o, w);
+        more = more | (abs(w.before[i]) > FAR * own) | (abs(w.defect[i]) > LARGE_SHARE * own);
+        if (errors > 0.0)
+            more = more | ((w.worth[i] > 0.0) & (abs(w.before[i] - figures[LEFT]) > LARGE * expected_of(i)));
+    }
+    more = more & done;
+    const Mask noted = done & !more;
+    for (int64_t i = 0; i < w.l; ++i) {
+        Octet *figures = w.figures(i);
+        const auto set = [&](Figure figure, const Mask &those, const Octet &value) {
+            figures[figure] = where(those, value, figures[figure]);
+        };
+        set(NOTED, noted, figures[NOTED] + 1.0);
+        set(TERMS, noted, max(where(figures[TERMS] < INFINITE, figures[TERMS], 0.0), o.per_band * w.band[i]));
+        if (errors > 0.0) {
+            const Octet size = abs(w.before[i] - figures[LEFT]), expected = expected_of(i);
+            const Mask judged = noted & (w.worth[i] > 0.0);
+            set(JUDGED, judged, figures[JUDGED] + 1.0);
+            set(SUM, judged, figures[SUM] + size);
+            set(EXPECTED, judged, figures[EXPECTED] + expected);
+            const Mask record = judged & (size > figures[NU] * expected);
+            if (any(record)) {
+                set(NU, record, size / expected);
+                set(AT, record, t);
+            }
+        }
+        set(LEFT, noted, w.defect[i]);
+    }
+    return more;
+}
+
+// Projects eight members; returns those of `alive` who have to make this step by themselves. As `project_step`.
+template <class W>
+inline Mask project_octet(Eight &eight, const Step &step, const Mask &alive, const W &single) {
+    const Options &o = eight.options;
+    const WorkOf<Octet> &w = eight.work;
+    eight.system.grad(step.t_new, w.y_hat, w.last(), w.G);
+    ++w.counters[NJEV];
+    if (o.every != 1 && o.metric == ERROR) quadrature(eight.flat.err, eight.flat.err_sum, eight.flat.err, eight.flat.m);
+    eight.system.inv(step.t_new, w.y_hat, w.values);
+    const Mask outside = defects<Octet>(nullptr, w.y_hat, o, w, w.before);
+    Mask leave{};
+    Octet largest_error = 0.0;
+    if (o.metric == ERROR) {
+        leave = outside & block_sizes<Octet>(eight.y, EPS, o, w);
+        largest_error = weights_from_sizes(o, w);
+    }
+    weigh_rows(o.frame, w, w.Q);
+    const Mask dependent = outside & alive & !solve_gram(rows_of(w.Q, w), w.g, small(w.R, w.l, w), w.mu);
+    move_along(o, w, eight.y_new);
+    const Mask moved = outside & alive;
+    for (int64_t lane = 0; lane < LANES; ++lane)
+        if (moved.lane(lane)) eight.rank[lane] = w.l;
+    if (any(dependent))
+        for (int64_t lane = 0; lane < LANES; ++lane)
+            if (dependent.lane(lane)) solve_alone(eight, lane, o, single);
+    const Octet correction = correction_in_local_errors(largest_error, o, w);
+    if (o.blocks.count * o.blocks.width == w.m) leave = leave | (outside & (correction > HEALTHY));
+    for (int64_t j = 0; j < w.m; ++j) eight.y_new[j] = where(outside, eight.y_new[j], w.y_hat[j]);
+    eight.system.inv(step.t_new, eight.y_new, w.values);
+    const Mask held = defects_held<Octet>(w.before, w) & small_shares(o, w) & all_finite(eight.y_new, w.m);
+    Mask done = alive & held & !leave;
+    if (o.watched) done = done & !note_octet(step.t_new, done, o, w);
+    for (int64_t i = 0; i < w.l; ++i)
+        w.max_defect[i] = where(done, max(w.max_defect[i], abs(w.defect[i])), w.max_defect[i]);
+    const Mask corrected = done & outside;
+    *w.max_correction = where(corrected, max(*w.max_correction, correction), *w.max_correction);
+    *eight.projections += where(corrected, 1.0, 0.0);
+    *eight.skips += where(done & !outside, 1.0, 0.0);
+    for (int64_t lane = 0; lane < LANES; ++lane)
+        if (corrected.lane(lane) && eight.rank[lane] < w.l) eight.at(eight.reduced, lane) += 1.0;
+    return alive & !done;
+}
+
+}  // namespace eip
