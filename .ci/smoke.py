@@ -8,6 +8,7 @@ import subprocess
 import sys
 import sysconfig
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ assert files is not None
 size = sum(Path(file.locate()).stat().st_size for file in files if file.suffix != ".pyc")
 assert size < MEGABYTES * 1e6, f"our own files take {size / 1e6:.1f} MB"
 assert not any(file.suffix in (".cpp", ".hpp") for file in files)
+assert find_spec("numba") is None, "Numba came along, which is an extra"
 
 # The README's first example; the README is the wheel's description.
 example = re.search(r"^```python\n(.*?)^```$", metadata.metadata("eip_scipy").get_payload(), re.MULTILINE | re.DOTALL)
@@ -42,7 +44,7 @@ for problem, t_span in (kepler(), (0, 100)), (solar_system(), (0, 100)), (solito
     assert run.trusted, run.message
     assert max(run.diagnostics.max_defect) < BOUND, run.diagnostics
 starts = np.array([[0.4, 0, 0, 2], [0.5, 0, 0, 1.7]])
-members = ensemble(kepler(), (0, 10), starts, method=EIPRK4, compiled=False)
+members = ensemble(kepler(), (0, 10), starts, method=EIPRK4)
 assert members.success, members.message
 
 subprocess.run([Path(sysconfig.get_path("scripts")) / "eip-scipy", "--help"], check=True, stdout=subprocess.DEVNULL)

@@ -2,7 +2,7 @@
 
 A projection moves a state by what the step's errors explain. Where it moves it by far more, the quantity is no
 invariant of the system, or its gradient is wrong, or the step is far too long; the projected run looks perfect all the
-same. The step notes the figures (`kernels.note`), a row for each invariant; what they mean is decided here.
+same. The step notes the figures (`note` in cpp/trust.hpp), a row for each invariant; what they mean is decided here.
 """
 
 from __future__ import annotations

@@ -122,7 +122,6 @@ def test_stored_states_belong_to_their_epoch(kernel):
     assert problem_of(other).reference(100.0) is None
 
 
-@pytest.mark.slow_without_jit
 def test_the_command_at_the_packages_epoch(kernel, tmp_path, nothing_to_time):
     """The same numbers as from the packaged set, the errors against stored states included."""
     span = ("solar-system", "--years", "1", "--h", "0.01", "--quiet")

@@ -173,7 +173,6 @@ def test_ring(tmp_path, start, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch):
     monkeypatch.setattr(gpe_ring, "SENSE", 1)
@@ -182,7 +181,6 @@ def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch)
 
 
 @pytest.mark.slow
-@pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 def test_another_end(tmp_path, start, capsys):
     """Snapshots and movie are those of the times that the run has."""
@@ -196,7 +194,6 @@ def test_another_end(tmp_path, start, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("end", ["0.05", "0.005"])
 def test_an_end_before_the_vortices_have_turned(end, tmp_path, start, capsys):
@@ -214,7 +211,6 @@ def test_an_end_before_the_first_step(tmp_path, start, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 def test_a_stationary_state(start, tmp_path, monkeypatch):
     """Without a quench the gradients are parallel: that is counted, and nothing is nan."""
@@ -234,7 +230,6 @@ def test_a_stationary_state(start, tmp_path, monkeypatch):
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize(("run", "evaluation", "done"), [(0, 207, []), (2, 93, ["EIP-M"])])
 def test_an_interrupted_command_goes_on(run, evaluation, done, tmp_path, start, capsys, monkeypatch):

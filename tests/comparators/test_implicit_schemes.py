@@ -31,7 +31,6 @@ def largest(values):
 # Order.
 
 
-@pytest.mark.slow_without_jit
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_order_two_on_the_plane_wave(scheme):
     problem = plane_wave((16, 16), modes=(1, 2), beta=1.5)
@@ -42,7 +41,6 @@ def test_order_two_on_the_plane_wave(scheme):
     np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 2, atol=0.05)
 
 
-@pytest.mark.slow_without_jit
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_order_two_on_the_soliton(scheme):
     problem = soliton()
@@ -103,7 +101,6 @@ def test_crank_nicolson_solves_the_papers_equation():
     np.testing.assert_allclose(run.y[:, -1], solution.x.view(complex), rtol=0, atol=1e-11)
 
 
-@pytest.mark.slow_without_jit
 @pytest.mark.parametrize("scheme", ITERATED)
 def test_order_two_in_a_rotating_trap(scheme):
     """The packet of the paper's table 5, with mass and energy kept as without rotation."""

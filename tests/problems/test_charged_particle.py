@@ -122,7 +122,6 @@ def test_both_forms_are_the_same_motion(make):
     assert np.linalg.norm(ends[0][:3] - problem.y0[:3]) > 0.01
 
 
-@pytest.mark.slow_without_jit
 @pytest.mark.parametrize("make", [uniform_field, tokamak])
 @pytest.mark.parametrize("form", ["canonical", pytest.param("velocity", marks=pytest.mark.slow)])
 def test_first_reference_state_is_met(make, form):
@@ -215,7 +214,6 @@ def test_drifting_gyration_in_the_papers_field():
     np.testing.assert_allclose(orbit.momentum, orbit.momentum[0], rtol=1e-11)
 
 
-@pytest.mark.slow_without_jit
 def test_banana_tip():
     """The first tip at a tenth of the paper's interval, by a method of order 8."""
     problem = tokamak("banana", t_end=16_000)
@@ -228,7 +226,6 @@ def test_banana_tip():
     assert tips.z[0] == pytest.approx(orbit.guiding_centre[2, k], abs=1e-5)
 
 
-@pytest.mark.slow_without_jit
 def test_poloidal_turns_of_the_transit_orbit():
     problem = tokamak("transit", t_end=60_000)
     run = integrate(problem, method=EIPDOP853, h=2 * problem.h, save_every=1)

@@ -483,7 +483,6 @@ def test_every_force_has_its_line():
 # --- N bodies: masses, places, speeds ---
 
 
-@pytest.mark.slow_without_jit
 def test_test_particles_are_moved_by_no_correction():
     data = load("de440")
     year = 365.25

@@ -174,7 +174,6 @@ def condensate():
 STEPS = {"strang": (0.025, 0.0125), "s6": (0.025, 0.0125), "rkn6": (0.05, 0.025)}
 
 
-@pytest.mark.slow_without_jit
 @pytest.mark.parametrize("kept", [(), KEPT], ids=["raw", "EIP"])
 @pytest.mark.parametrize("method", METHODS)
 def test_rotating_condensate(condensate, method, kept):
@@ -192,7 +191,6 @@ def test_rotating_condensate(condensate, method, kept):
     assert errors[-1] < 2e-3
 
 
-@pytest.mark.slow_without_jit
 @pytest.mark.parametrize("kept", [(), KEPT], ids=["raw", "EIP"])
 def test_the_frame_at_rest(condensate, kept):
     """Its field, rotated, is that of the rotating frame, as far as the grid resolves it; and so is its energy."""

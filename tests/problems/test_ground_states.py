@@ -88,7 +88,6 @@ def test_soliton_is_the_ground_state_of_attraction():
     assert (state.energy - 7, state.mu - 7) == (pytest.approx(-1 / 6, abs=1e-9), pytest.approx(-1 / 2, abs=1e-9))
 
 
-@pytest.mark.slow_without_jit
 def test_a_stalled_or_short_search_says_so():
     gpe = trap(points=32)
     start = np.sqrt(thomas_fermi(gpe))

@@ -94,7 +94,6 @@ def test_a_callback_at_every_step_and_events(tmp_path):
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.slow_without_jit
 @pytest.mark.parametrize(
     ("steps", "how", "options"),
     [

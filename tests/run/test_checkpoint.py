@@ -227,7 +227,6 @@ def resumed(case, path, monkeypatch, first=7, more=9):
     raise AssertionError("the run does not advance")
 
 
-@pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("fine")
 @pytest.mark.parametrize("name", CASES)
 def test_resumed_runs_are_the_same(name, tmp_path, monkeypatch):
@@ -260,7 +259,6 @@ def test_resumed_compiled_runs_are_the_same(name, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.slow_without_jit
 @pytest.mark.usefixtures("fine")
 @pytest.mark.parametrize("name", ["fixed", "compensated", "every auto", "adaptive", "adaptive, events", "Nystrom, all"])
 @pytest.mark.parametrize("error", [BrokenOffError, KeyboardInterrupt])
