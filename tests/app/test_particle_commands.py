@@ -190,6 +190,7 @@ def test_the_papers_claims(full):
     assert failed == []
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_what_the_documentation_says_of_the_peers(full):

@@ -164,7 +164,6 @@ def _norm_gradient(t, y):
     return 2 * y
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 @needs_jit
 def test_complex_states():
@@ -521,7 +520,6 @@ def test_what_fails_in_every_member_is_raised():
 # Executors of concurrent.futures.
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 @needs_jit
 def test_processes():

@@ -52,7 +52,6 @@ def test_members_get_the_bits_of_single_runs(method):
     assert run.one_by_one == ""
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
@@ -90,7 +89,6 @@ def test_times_between_steps(options, start):
     assert back.side_by_side.all()
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("members", [1, 2, 7, 8, 9, 33, 70])
 def test_any_number_of_members(members):
@@ -98,7 +96,6 @@ def test_any_number_of_members(members):
     check_bits(kepler(), (0, 3), starts, method=EIPRK4, h=0.05, members=range(max(0, members - 9), members))
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_parallel_gradients():
     """On a circular orbit the gradients of H and L are parallel: the rank falls, in some members at some steps."""
@@ -108,7 +105,6 @@ def test_parallel_gradients():
     assert run.side_by_side.all()
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_members_leave_and_come_back():
     """Components that stand alone make projections with softened weights: more than a vector does."""
@@ -120,7 +116,6 @@ def test_members_leave_and_come_back():
     assert sum(softened) > 3
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_nystrom_with_parameters_of_each():
     problem = solar_system(years=100.0)
@@ -167,7 +162,6 @@ def chain_gradient(t, y, out, params):
         out[i + 1] += pull
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_functions_of_the_users_own():
     starts = np.random.default_rng(5).normal(size=(12, 10))
@@ -180,7 +174,6 @@ def test_functions_of_the_users_own():
     assert run.side_by_side.all()
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_little_work_is_not_worth_compiling_for(monkeypatch):
     monkeypatch.undo()
@@ -202,7 +195,6 @@ def with_an_array(t, y):
     return np.array([y[1], -y[0]])
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(("fun", "in_place"), [(with_a_branch, True), (with_an_array, False)])
 def test_what_does_not_go_into_a_vector_runs_one_by_one(fun, in_place):
@@ -218,7 +210,6 @@ def explodes(t, y, out):
     out[1] = -y[1]
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_member_that_fails_disturbs_no_other():
     starts = np.ones((10, 2))
@@ -236,7 +227,6 @@ def test_a_member_that_fails_disturbs_no_other():
     assert list(np.flatnonzero(~run.side_by_side)) == [3, 7]
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_exceptions_name_the_member():
     """Division by zero raises in the single run; in a vector it gives inf, and the member leaves."""
@@ -269,7 +259,6 @@ def all_that_octets_do(t, y, out):
     out[7] = math.log1p(abs(a)) - math.pow(abs(b), 0.5)
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_octets_are_floats_lane_by_lane():
     """All that functions of octets are made of."""
@@ -278,7 +267,6 @@ def test_octets_are_floats_lane_by_lane():
     assert run.side_by_side.all()
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 3, 5, 8, 11])
 def test_any_number_of_bodies(n):
@@ -290,7 +278,6 @@ def test_any_number_of_bodies(n):
     assert run.side_by_side.all()
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_adaptive_members_run_one_by_one():
     starts = spread_starts(harmonic().y0, 9)
