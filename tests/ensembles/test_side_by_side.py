@@ -11,8 +11,6 @@ from eip_scipy.ensembles import tasks
 from eip_scipy.problems import harmonic, kepler, solar_system
 from eip_scipy.problems.gravity.nbody import nbody
 
-pytestmark = pytest.mark.needs_jit
-
 FIELDS = ("y", "max_defect", "nfev", "njev", "nlu")
 
 
@@ -43,7 +41,6 @@ def check_bits(problem, t_span, starts, *, params=None, members=None, **options)
     return run
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", [EIPRK4, EIPRK5, EIPRK45, EIPDOP853])
 def test_members_get_the_bits_of_single_runs(method):
     starts = spread_starts(kepler().y0, 40)
@@ -52,7 +49,6 @@ def test_members_get_the_bits_of_single_runs(method):
     assert run.one_by_one == ""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -73,7 +69,6 @@ def test_options(options, span):
     assert run.side_by_side.all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [{"method": EIPRK4}, {"method": EIPRK45, "every": 3}, {"method": EIPDOP853}, {"method": EIPRK5, "invariants": ()}],
@@ -89,14 +84,12 @@ def test_times_between_steps(options, start):
     assert back.side_by_side.all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("members", [1, 2, 7, 8, 9, 33, 70])
 def test_any_number_of_members(members):
     starts = spread_starts(kepler().y0, members)
     check_bits(kepler(), (0, 3), starts, method=EIPRK4, h=0.05, members=range(max(0, members - 9), members))
 
 
-@pytest.mark.slow
 def test_parallel_gradients():
     """On a circular orbit the gradients of H and L are parallel: the rank falls, in some members at some steps."""
     e = np.array([0.0, 0.0, 1e-9, 1e-8, 1e-6, 1e-4, 0.02, 0.3, 0.0, 0.6])
@@ -105,7 +98,6 @@ def test_parallel_gradients():
     assert run.side_by_side.all()
 
 
-@pytest.mark.slow
 def test_members_leave_and_come_back():
     """Components that stand alone make projections with softened weights: more than a vector does."""
     starts = spread_starts(np.array([1.0, 0.0, 0.0, 1.0]), 16, size=0.1)
@@ -116,7 +108,6 @@ def test_members_leave_and_come_back():
     assert sum(softened) > 3
 
 
-@pytest.mark.slow
 def test_nystrom_with_parameters_of_each():
     problem = solar_system(years=100.0)
     starts = spread_starts(problem.y0, 9, size=1e-7)
@@ -163,6 +154,7 @@ def chain_gradient(t, y, out, params):
 
 
 @pytest.mark.slow
+@pytest.mark.needs_jit
 def test_functions_of_the_users_own():
     starts = np.random.default_rng(5).normal(size=(12, 10))
     params = np.linspace(0.5, 2, 12)[:, None]
@@ -175,6 +167,7 @@ def test_functions_of_the_users_own():
 
 
 @pytest.mark.slow
+@pytest.mark.needs_jit
 def test_little_work_is_not_worth_compiling_for(monkeypatch):
     monkeypatch.undo()
     starts, options = np.ones((9, 10)), {"h": 0.1, "in_place": True, "invariants": (), "executor": 1}
@@ -196,6 +189,7 @@ def with_an_array(t, y):
 
 
 @pytest.mark.slow
+@pytest.mark.needs_jit
 @pytest.mark.parametrize(("fun", "in_place"), [(with_a_branch, True), (with_an_array, False)])
 def test_what_does_not_go_into_a_vector_runs_one_by_one(fun, in_place):
     starts = spread_starts(np.array([1.0, 0.5]), 9)
@@ -211,6 +205,7 @@ def explodes(t, y, out):
 
 
 @pytest.mark.slow
+@pytest.mark.needs_jit
 def test_a_member_that_fails_disturbs_no_other():
     starts = np.ones((10, 2))
     starts[:, 0] = 0.1
@@ -228,6 +223,7 @@ def test_a_member_that_fails_disturbs_no_other():
 
 
 @pytest.mark.slow
+@pytest.mark.needs_jit
 def test_exceptions_name_the_member():
     """Division by zero raises in the single run; in a vector it gives inf, and the member leaves."""
 
@@ -260,6 +256,7 @@ def all_that_octets_do(t, y, out):
 
 
 @pytest.mark.slow
+@pytest.mark.needs_jit
 def test_octets_are_floats_lane_by_lane():
     """All that functions of octets are made of."""
     starts = np.random.default_rng(11).normal(size=(8, 8))
@@ -267,7 +264,6 @@ def test_octets_are_floats_lane_by_lane():
     assert run.side_by_side.all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 3, 5, 8, 11])
 def test_any_number_of_bodies(n):
     """Every order of summation that the number of bodies brings with it, and frames of bodies."""
@@ -278,7 +274,6 @@ def test_any_number_of_bodies(n):
     assert run.side_by_side.all()
 
 
-@pytest.mark.slow
 def test_adaptive_members_run_one_by_one():
     starts = spread_starts(harmonic().y0, 9)
     run = check_bits(harmonic(), (0, 1), starts, method=EIPRK45, first_step=0.1)
