@@ -29,7 +29,6 @@ from eip_scipy import (
     integrate,
     project,
 )
-from eip_scipy.problems import kepler
 
 EPS = np.finfo(float).eps
 Y0 = [1.0, 2.0]
@@ -1209,15 +1208,17 @@ class TestNotCompilable:
         assert "interpreted" not in run.message
 
 
+@pytest.mark.needs_jit
 def test_jit_disabled_is_a_reason(monkeypatch):
     import numba
 
+    fun = numba.njit(lambda t, y: np.array([y[1], -y[0]]))
     monkeypatch.setattr(numba.config, "DISABLE_JIT", True)
-    run = integrate(kepler(), (0, 1), method=EIPRK4)
+    run = by_integrate(fun)
     assert not run.compiled
     assert "NUMBA_DISABLE_JIT" in run.message
     with pytest.raises(TypeError, match="NUMBA_DISABLE_JIT"):
-        integrate(kepler(), (0, 1), method=EIPRK4, compiled=True)
+        by_integrate(fun, compiled=True)
 
 
 @pytest.mark.parametrize("value", ["x", [[1], [2, 3]], {"a": 1}])

@@ -6,11 +6,11 @@ namespace {
 
 using std::sqrt;
 
-// The pull over r: r^-3 + 3/2 eps r^-5. The root and the division of r^2 do not wait for each other.
+// The pull over r: r^-3 + 3/2 eps r^-5, by divisions that do not wait for each other.
 template <class T>
 T pull(const T *q, const T &eps) {
-    const T r2 = q[0] * q[0] + q[1] * q[1], w = 1.0 / r2;
-    return w * w * sqrt(r2) * (1.0 + 1.5 * eps * w);
+    const T r2 = q[0] * q[0] + q[1] * q[1], w = 1.0 / (r2 * sqrt(r2));
+    return w + 1.5 * eps * w * (1.0 / r2);
 }
 
 template <class T>
@@ -33,8 +33,8 @@ void kepler_acc(const Given<T> &g) {
 template <class T>
 void kepler_energy(const Given<T> &g) {
     const T *y = g.y;
-    const T r2 = y[0] * y[0] + y[1] * y[1], w = 1.0 / r2;
-    g.out[0] = 0.5 * (y[2] * y[2] + y[3] * y[3]) - w * sqrt(r2) * (1.0 + 0.5 * g.params[0] * w);
+    const T r2 = y[0] * y[0] + y[1] * y[1], r = sqrt(r2);
+    g.out[0] = 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1.0 / r - 0.5 * g.params[0] / (r * r2);
 }
 
 template <class T>
