@@ -47,7 +47,7 @@ def moments(psi: np.ndarray, f: np.ndarray) -> Moments:
 
 
 total_mass = _native.total_mass
-"""``total_mass(psi)``: the moment `mass` alone."""
+"""``total_mass(psi)``: the sum of ``|psi|^2`` alone."""
 expansion = _native.expansion
 """``expansion(psi, near, f)``: the sums of ``|d|^2`` and Re(conj(i f) d) for d = psi - near."""
 shifted = _native.shifted

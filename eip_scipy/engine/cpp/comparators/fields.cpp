@@ -129,7 +129,7 @@ PyMethodDef field_functions[] = {
     bound<"mean_density", mean_density>("mean_density(start, mean, V, beta, out)"),
     bound<"density", density>("density(psi, V, beta, out)"),
     bound<"nonlinear_force", nonlinear_force>("nonlinear_force(psi, other, a, V, beta, out) -> float"),
-    bound<"projections", projections>("projections(force, modes, inverse, c) -> along, norm"),
+    bound<"projections", projections>("projections(force, modes, inverse, c) -> tuple"),
     bound<"advance", advance>("advance(modes, inverse, factor, new_modes, force)"),
     {nullptr, nullptr, 0, nullptr},
 };

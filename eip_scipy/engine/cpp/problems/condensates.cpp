@@ -374,14 +374,14 @@ PyMethodDef condensate_functions[] = {
     bound<"turn", turn>("turn(f, factor, out)"),
     bound<"divide_by_root", divide_by_root>("divide_by_root(a, psi, V, beta, shift, out)"),
     bound<"rotate", rotate>("rotate(a, b, c, s)"),
-    bound<"moments", moments>("moments(psi, f) -> mass, along, square, quartic, sizes"),
+    bound<"moments", moments>("moments(psi, f) -> tuple"),
     bound<"total_mass", total_mass>("total_mass(psi) -> float"),
-    bound<"expansion", expansion>("expansion(psi, near, f) -> square, slope"),
-    bound<"shifted", shifted>("shifted(psi, f, a, b, out) -> mass, square, slope"),
+    bound<"expansion", expansion>("expansion(psi, near, f) -> tuple"),
+    bound<"shifted", shifted>("shifted(psi, f, a, b, out) -> tuple"),
     bound<"inner", inner>("inner(a, b) -> float"),
     bound<"weighted_square", weighted_square>("weighted_square(field, weight) -> float"),
     bound<"interaction_energy", interaction_energy>("interaction_energy(psi, V, beta) -> float"),
-    bound<"quartic_sums", quartic_sums>("quartic_sums(psi, p) -> nn, nq, mm, mq, qq"),
+    bound<"quartic_sums", quartic_sums>("quartic_sums(psi, p) -> tuple"),
     {nullptr, nullptr, 0, nullptr},
 };
 
