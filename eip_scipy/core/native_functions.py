@@ -72,7 +72,8 @@ def native_functions(
     n, second_order = y0.size, form.startswith("acceleration")
     size = n // 2 if second_order else n
     number = _number(params, y0)
-    rhs = _native(fun, number._replace(shape=(size,), size=size, real=False, in_place=form.endswith("place")), "fun")
+    kind = number._replace(shape=(size,), size=size, real=False, in_place=form.endswith("place"))
+    rhs = function_alone(fun, kind, "fun", params, second_order=second_order)
     inv, grad = list[Native](), list[Native]()
     for k, (item, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
         name = f"invariant {label!r}"
@@ -84,15 +85,7 @@ def native_functions(
         inv.append(_native(item.fun, number._replace(shape=shape), name))
         rows = Kind((*shape, n), n, number.p, number.dtype, False, item.uses_f, item.in_place, gradient=True)
         grad.append(_native(item.grad, rows, f"gradient of {name}"))
-    return NativeFunctions(
-        rhs=rhs.entry,
-        inv=_addresses(inv),
-        grad=_addresses(grad),
-        event=(),
-        params=np.zeros(0) if params is None else params,  # itself: an ensemble writes each member's there
-        second_order=second_order,
-        owner={"rhs": [rhs], "inv": inv, "grad": grad, "event": []},
-    )
+    return rhs._replace(inv=_addresses(inv), grad=_addresses(grad), owner=rhs.owner | {"inv": inv, "grad": grad})
 
 
 def function_alone(
@@ -111,9 +104,9 @@ def function_alone(
         inv=(),
         grad=(),
         event=(),
-        params=np.zeros(0) if params is None else params,
+        params=np.zeros(0) if params is None else params,  # itself: an ensemble writes each member's there
         second_order=second_order,
-        owner={"rhs": [rhs]},
+        owner={"rhs": [rhs], "inv": [], "grad": [], "event": []},
     )
 
 

@@ -35,7 +35,7 @@ def _jitted(function: Any) -> Any:
         return njit(lambda t, y, f, out, params: _fill(out, value(t, y, f, params)))
     if function.in_place:
         return njit(lambda t, y, out, params: _fill(out, value(t, y, y, params)))
-    if function.numbers == 1:
+    if function.numbers == 1 and not function.fills_states:
         return njit(lambda t, y, params: value(t, y, y, params)[0])
     return njit(lambda t, y, params: value(t, y, y, params))
 

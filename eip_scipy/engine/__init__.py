@@ -1,1 +1,1 @@
-"""The step and all it is made of: in C++, and for ensembles compiled by Numba."""
+"""The step and all it is made of, in C++."""

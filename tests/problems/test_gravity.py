@@ -200,6 +200,13 @@ def test_the_same_bits_inside_another_compiled_function(n):
 
 
 @pytest.mark.needs_jit
+def test_accelerations_inside_another_compiled_function():
+    gm, y = bodies(5)
+    inside = njit(lambda q, gm: acc(0.0, q, gm))(y[:15], gm)
+    np.testing.assert_array_equal(inside, acc(0.0, y[:15], gm))
+
+
+@pytest.mark.needs_jit
 @pytest.mark.parametrize("options", [{}, {"compensated": True, "every": 3}])
 def test_ten_bodies_compiled_and_interpreted(options):
     problem = solar_system(years=0.2)
