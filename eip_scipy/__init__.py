@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from .core.results import Diagnostics, IntegrationResult, ProjectionResult, ProjectionWarning
     from .core.solvers import (
         EIPDOP853,
+        EIPGJ12,
+        EIPGJ14,
         EIPRK1,
         EIPRK2,
         EIPRK3,
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
         eip_method,
     )
     from .ensembles.ensemble import EnsembleResult, ensemble
+    from .methods.multistep import GaussJackson
     from .methods.nystrom import NystromTableau
     from .methods.runge_kutta import Tableau
     from .run.integrate import integrate
@@ -40,6 +43,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EIPDOP853",
+    "EIPGJ12",
+    "EIPGJ14",
     "EIPRK1",
     "EIPRK2",
     "EIPRK3",
@@ -54,6 +59,7 @@ __all__ = [
     "Diagnostics",
     "EIPSolver",
     "EnsembleResult",
+    "GaussJackson",
     "IntegrationResult",
     "Invariant",
     "JointInvariants",
@@ -74,6 +80,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "CheckpointError": "checkpoint",
     "Diagnostics": "core.results",
     "EnsembleResult": "ensembles.ensemble",
+    "GaussJackson": "methods.multistep",
     "IntegrationResult": "core.results",
     "Invariant": "core.invariants",
     "JointInvariants": "core.invariants",

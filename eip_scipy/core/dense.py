@@ -13,8 +13,9 @@ import numpy as np
 from scipy.integrate import DOP853 as SCIPY_DOP853
 from scipy.integrate import DenseOutput, OdeSolution
 
-from ..engine.data import CUBIC, ERROR, GIVEN, NEW, POLYNOMIAL, QUINTIC, SEVENTH, Dense, make_work
+from ..engine.data import CUBIC, ERROR, GIVEN, HISTORY, NEW, POLYNOMIAL, QUINTIC, SEVENTH, Dense, make_work
 from ..engine.native import Engine
+from ..methods.multistep import GaussJackson, interpolation_weights
 from ..methods.nystrom import NystromTableau
 from ..methods.runge_kutta import DOP853
 from .inputs import refuse_units, shown
@@ -118,6 +119,9 @@ def _record(run: Run, tableau: AnyMethod, events: int) -> Dense:
     stages, rows = run.method.b.size, 3
     if isinstance(tableau, NystromTableau):
         kind = QUINTIC
+    elif isinstance(tableau, GaussJackson):
+        kind, weights = HISTORY, interpolation_weights(tableau.order).reshape(-1, tableau.order)
+        rows = max(3, (tableau.order + 1) // 2) + 1
     elif tableau is DOP853:
         kind, weights, A, c = SEVENTH, SCIPY_DOP853.D, SCIPY_DOP853.A_EXTRA, SCIPY_DOP853.C_EXTRA
         rows = 3 + weights.shape[0]

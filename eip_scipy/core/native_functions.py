@@ -15,7 +15,7 @@ from .pointers import PointerFunction
 if TYPE_CHECKING:
     from .numba_pointers import Compiled
 
-__all__ = ["Kind", "function_alone", "native_functions", "raise_again", "with_events"]
+__all__ = ["Kind", "function_alone", "native_functions", "raise_again", "with_events", "with_jacobian"]
 
 
 class Kind(NamedTuple):
@@ -123,6 +123,22 @@ def with_events(
     number = _number(params, y0)
     event = [_native(function, number, f"event {k}") for k, function in enumerate(events)]
     return functions._replace(event=_addresses(event), owner=functions.owner | {"event": event})
+
+
+def with_jacobian(
+    functions: NativeFunctions, jacobian: Callable[..., Any], params: np.ndarray | None, y0: np.ndarray
+) -> NativeFunctions:
+    """The same with the address of the accelerations' Jacobian times a vector, ``jacobian(t, q, dq, out[, params])``.
+
+    Raises
+    ------
+    NotCompilableError
+        As by `native_functions`.
+    """
+    half = y0.size // 2
+    kind = _number(params, y0)._replace(shape=(half,), size=half, real=False)
+    found = _native(jacobian, kind._replace(takes_f=True, in_place=True, gradient=True), "jacobian")
+    return functions._replace(jacobian=found.entry, owner=functions.owner | {"jacobian": [found]})
 
 
 def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: bytes, f: bytes, status: int) -> NoReturn:

@@ -93,6 +93,7 @@ class OneStep(Ordered):
         self._one_step: Callable[[float, np.ndarray, float], Any] = method.one_step
         self.b, self.c = np.ones(1), np.zeros(1)
         self.exponent = -1.0 / ((self.error_estimator_order or 0) + 1)
+        self.multistep = None
 
     def __repr__(self) -> str:
         return f"<OneStep {self.name}: order {self.order}>"

@@ -18,6 +18,7 @@ from ..engine.data import (
     AUTO,
     BAND,
     BAND_COMPENSATED,
+    BAND_MULTISTEP,
     EPS,
     ERROR,
     EUCLIDEAN,
@@ -29,6 +30,7 @@ from ..engine.data import (
     Grouping,
 )
 from ..engine.trust import LARGE_SHARE
+from ..methods.multistep import GaussJackson
 from .blocks import blocks_of
 from .frame import frame_rows
 from .inputs import count, flag, real_array
@@ -160,7 +162,7 @@ class ProjectionOptions:
             'int or "auto"',
             """Project each `every`-th step and the last one; "auto": when the error estimates, added in quadrature
             since the last projection, make an invariant more uncertain than round-off (asked at each fifth step).
-            Default: the method's own, which is 1.""",
+            Default: the method's own, "auto" for a multistep method and 1 for others.""",
         ),
     )
     reuse_f: bool = field(
@@ -175,7 +177,7 @@ class ProjectionOptions:
         metadata=_text(
             "bool",
             """Carry the rounding errors of the state along (for steps so small that round-off dominates). Default: the
-            method's own, which is False.""",
+            method's own, True for a multistep method and False for others.""",
         ),
     )
     check: bool = field(
@@ -220,6 +222,10 @@ class ProjectionOptions:
         kind, sigma = self._metric(method, n, width)
         if not isinstance(self.direction, str) or self.direction not in DIRECTIONS:
             raise ValueError(f"direction must be 'new', 'old' or 'midpoint', got {self.direction!r}.")
+        if isinstance(method, GaussJackson) and self.direction != "new":
+            raise ValueError(
+                f"direction={self.direction!r}: {method.name} has no step that starts at a state; leave it out."
+            )
         compensated = self._compensated(method)
         rtol, atol = stepping.rtol, stepping.atol
         groups = blocks_of(self.blocks, n, width)
@@ -243,7 +249,7 @@ class ProjectionOptions:
             uses_f=known.uses_f,
             compensated=compensated,
             adaptive=stepping.h is None,
-            per_band=1.0 / ((BAND_COMPENSATED if compensated else BAND) * EPS),
+            per_band=1.0 / (_band(method, compensated) * EPS),
             watched=check and known.size > 0,
             limit=(LARGE_SHARE if stepping.h is None else 1.0) if check else np.inf,
         )
@@ -273,16 +279,19 @@ class ProjectionOptions:
         }
 
     def _compensated(self, method: AnyMethod) -> bool:
+        multistep = isinstance(method, GaussJackson)
         if self.compensated is None:
-            return False
+            return multistep
         compensated = flag("compensated", self.compensated)
+        if multistep and not compensated:
+            raise ValueError(f"compensated=False: the sums of {method.name} always carry their rounding; leave it out.")
         if compensated and isinstance(method, OneStep):
             raise ValueError(f"compensated=True carries the rounding of a tableau's sums; {method.name} is no tableau.")
         return compensated
 
     def _every(self, method: AnyMethod) -> int:
         if self.every is None:
-            return 1
+            return AUTO if isinstance(method, GaussJackson) else 1
         if not isinstance(self.every, str):
             return count("every", self.every)
         if self.every != "auto":
@@ -302,6 +311,13 @@ class ProjectionOptions:
                 return (ERROR if method.has_estimate else EUCLIDEAN), None
             raise ValueError(f"metric must be 'error', 'euclidean' or an array of n weights, got {metric!r}.")
         return GIVEN, np.repeat(weights("metric", metric, n), width)
+
+
+def _band(method: AnyMethod, compensated: bool) -> float:
+    """The dead band of an invariant, in roundings of its terms."""
+    if isinstance(method, GaussJackson):  # takes a part only of what is within rounding
+        return BAND_MULTISTEP
+    return BAND_COMPENSATED if compensated else BAND
 
 
 def weights(name: str, sigma: Any, n: int) -> np.ndarray:

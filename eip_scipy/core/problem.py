@@ -48,6 +48,12 @@ class Problem:
         Options of the projection that suit the problem (see `EIPSolver`).
     units : str
         Units of the state and of time.
+    jacobian : callable, optional
+        For q'' = a(t, q): ``jacobian(t, q, dq, out, params)`` fills `out` with the derivative of the accelerations
+        along dq, or with its largest part; for multistep methods such as `EIPGJ14`.
+    frequencies : callable, optional
+        ``frequencies(y) -> (bodies, others)``: the largest angular frequency of each body on its orbit about the body
+        that the Jacobian takes as the centre, which has 0 itself, and the largest of all other motions.
     reference : callable, optional
         ``reference(t) -> y``: a closed form, or stored reference states; None at times without one.
     source : str
@@ -69,6 +75,8 @@ class Problem:
     units: str = ""
     reference: Callable[[float], np.ndarray | None] | None = None
     source: str = ""
+    jacobian: Callable[..., None] | None = None
+    frequencies: Callable[[np.ndarray], tuple[np.ndarray, float]] | None = None
 
     def __post_init__(self) -> None:
         refuse_units(y0=self.y0, t_span=self.t_span, h=self.h, params=self.params, metric=self.metric, frame=self.frame)

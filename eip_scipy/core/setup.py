@@ -15,13 +15,16 @@ from ..engine.data import (
     EPS,
     ERROR,
     EUCLIDEAN,
+    HAVE_NODES,
     LENGTH,
     NEW,
+    NEWEST,
     NO_METHOD,
     NOT_FINITE,
     TIME,
     TIME_NEW,
     TOO_SMALL,
+    UNSTABLE,
     Method,
     Schedule,
     Work,
@@ -29,7 +32,9 @@ from ..engine.data import (
 )
 from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
-from ..methods.nystrom import NystromTableau
+from ..methods.multistep import GaussJackson
+from ..methods.nystrom import RKN1210, NystromTableau
+from ..methods.runge_kutta import DOP853
 from .frame import spanned
 from .inputs import reals, refuse_units, shown
 from .invariants import InvariantSet
@@ -201,6 +206,8 @@ def method_arrays(tableau: AnyMethod) -> Method | OneStep:
     """A tableau as the arrays that the step takes (writable copies: compiled code has one array type for all)."""
     if isinstance(tableau, OneStep):
         return tableau
+    if isinstance(tableau, GaussJackson):  # what makes its first states
+        return method_arrays(DOP853 if tableau.velocities else RKN1210)
     exponent = -1.0 / ((tableau.error_estimator_order or 0) + 1)
     if isinstance(tableau, NystromTableau):
         return _nystrom_arrays(tableau, exponent)
@@ -366,12 +373,30 @@ def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
         return not_finite(run, clock[TIME], clock[LENGTH])
     if status == TOO_SMALL:
         return OdeSolver.TOO_SMALL_STEP
+    if status == UNSTABLE:
+        return _unstable(run)
     return projection_failure(run.invariants, run.work, clock[TIME_NEW])
+
+
+def _unstable(run: Run) -> str:
+    """Where a multistep method's step does not do."""
+    history = run.method.multistep
+    assert history is not None  # whose code it is
+    t = history.t0 + int(history.place[NEWEST]) * history.h
+    return (
+        f"the step is too long, or the motion not smooth, at t={t:.10g}: differences of the accelerations of order "
+        f"{history.predict_q.size} are not small beside them, as they are where h={abs(history.h):g} is stable and "
+        "resolves the motion. Take a shorter step, or where bodies meet or forces jump a method of single steps such as "
+        "EIPRKN12"
+    )
 
 
 def not_finite(run: Run, t: float, h: float) -> str:
     """Why a step was not finite: the first stage that was not, overflow of the sum, or the error estimate."""
     work, method = run.work, run.method
+    history = method.multistep
+    if history is not None and history.place[HAVE_NODES] and not np.isfinite(work.K[1]).all():
+        return _bad_value(run, work.K[1], history.t0 + (int(history.place[NEWEST]) + 1) * history.h)
     for i in range(method.b.size):
         if not np.isfinite(work.K[i]).all():
             return _bad_value(run, work.K[i], t + method.c[i] * h)

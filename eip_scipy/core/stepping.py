@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..engine.data import EPS, Span
+from ..methods.multistep import GaussJackson
 from ..methods.nystrom import NystromTableau
 from ..methods.runge_kutta import Tableau
 from .inputs import is_number, reals, refuse_units, shown
@@ -27,7 +28,7 @@ __all__ = [
     "saved_steps",
 ]
 
-AnyMethod = Tableau | NystromTableau | OneStep
+AnyMethod = Tableau | NystromTableau | GaussJackson | OneStep
 UNBOUNDED = 2**62
 LEAST_RTOL = 100 * EPS  # SciPy's
 
@@ -120,9 +121,10 @@ class StepOptions:
             `name` has no error estimate.
         """
         h = self.h
-        if h is None and not method.has_estimate:
+        if h is None and method.fixed_steps_only:
+            why = "takes fixed steps" if method.has_estimate else "has no error estimate"
             raise ValueError(
-                f"{name} has no error estimate and needs the step h=...: without it, and where rtol, atol, first_step "
+                f"{name} {why} and needs the step h=...: without it, and where rtol, atol, first_step "
                 "or max_step ask for them, steps are adaptive."
             )
         if h is not None and (self.first_step is not None or self.max_step != np.inf):

@@ -10,14 +10,14 @@ from .counters import N_COUNTERS
 from .trust import N_FIGURES, TERMS
 
 # Codes of a step; those of the loop.
-OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED = range(5)
+OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED, UNSTABLE = range(6)
 PAUSE, FULL, ENDED, DOUBTFUL = 10, 11, 12, 13
 # Interpolants of dense output.
-CUBIC, QUINTIC, POLYNOMIAL, SEVENTH = range(4)
+CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY = range(5)
 
 EPS = 2.220446049250313e-16
 # Dead band in roundings of an invariant's terms; where the state's own roundings are carried, the values' remain.
-BAND, BAND_COMPENSATED = 4.0, 1.0
+BAND, BAND_COMPENSATED, BAND_MULTISTEP = 4.0, 1.0, 1 / 64
 
 NEW, OLD, MIDPOINT = range(3)
 EUCLIDEAN, ERROR, GIVEN = range(3)
@@ -28,6 +28,9 @@ AUTO = 0
 TIME, TIME_NEW, LENGTH, NEXT_LENGTH = range(4)
 # Places in the place of a run.
 STEP, ROW, PENDING = range(3)
+# Places in that of a multistep method's history: whether there is one, the newest node and its row, nodes since the
+# last projection, estimates collected.
+HAVE_NODES, NEWEST, NEWEST_ROW, SINCE, SEEN, N_NODE_PLACES = range(6)
 
 
 class Span(NamedTuple):
@@ -64,10 +67,49 @@ def bare_schedule(span: Span, first: float) -> Schedule:
     return Schedule(span, 0, none, np.zeros(3, np.int64), np.array([span.t0, span.t0, 0.0, first]), none, none, none)
 
 
+class Multistep(NamedTuple):
+    """What a multistep method holds of a run (engine/cpp/multistep.hpp); weights go from the oldest node to the newest.
+
+    `states_q` and `states_v` are rows of weights for the state so many nodes before the newest one. `correction` is
+    the corrector less the predictor. `shape_q`, `shape_v`: differences that have the errors' shape; `size`: the highest
+    one, which beside the accelerations must stay below `growth`. `brief`: too few steps for a history. `level`: states
+    are those of the newest node, else `middle` nodes behind it. `substeps`: of the method that starts, in a step.
+    `spacing`: nodes from one projection to the next. `corrected_first`, `corrected_count`: the floats of the
+    accelerations that the Jacobian corrects.
+    """
+
+    predict_q: np.ndarray
+    predict_v: np.ndarray
+    states_q: np.ndarray
+    states_v: np.ndarray
+    correction: np.ndarray
+    shape_q: np.ndarray
+    shape_v: np.ndarray
+    size: np.ndarray
+    error_constant: float
+    growth: float
+    middle: int
+    brief: bool
+    level: bool
+    uses_v: bool
+    t0: float
+    h: float
+    substeps: int
+    spacing: int
+    corrected_first: int
+    corrected_count: int
+    nodes: np.ndarray
+    sums: np.ndarray
+    moved: np.ndarray
+    levels: np.ndarray
+    place: np.ndarray
+
+
 class Method(NamedTuple):
     """A tableau as arrays. `e` weighs the rows of K in the error estimate; `fsal` when it uses f at the new point.
 
-    Names ending in _v are a Nystrom method's weights of the velocity.
+    Names ending in _v are a Nystrom method's weights of the velocity. With `multistep` it makes that one's first
+    states.
     """
 
     A: np.ndarray
@@ -83,6 +125,7 @@ class Method(NamedTuple):
     fsal: bool
     paired: bool
     exponent: float
+    multistep: Multistep | None = None
 
 
 # That of an engine which only projects.

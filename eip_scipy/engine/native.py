@@ -65,6 +65,7 @@ class PythonFunctions(NamedTuple):
     grad: tuple[Call, ...]
     event: tuple[Call, ...]
     second_order: bool
+    jacobian: Call | None = None
     native: bool = False
 
 
@@ -84,6 +85,7 @@ class NativeFunctions(NamedTuple):
     second_order: bool
     owner: Any
     python: PythonFunctions | None = None
+    jacobian: Any = None
     native: bool = True
 
 

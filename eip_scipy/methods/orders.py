@@ -17,6 +17,11 @@ class Ordered:
         return self.error_estimator_order is not None
 
     @property
+    def fixed_steps_only(self) -> bool:
+        """Whether the estimate, or its lack, leaves no way to control the step."""
+        return not self.has_estimate
+
+    @property
     def kappa(self) -> float:
         """Exponent of the error metric, (p + 1) / (p_hat + 1); 1 without an estimate."""
         if self.error_estimator_order is None:

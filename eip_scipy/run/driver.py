@@ -124,6 +124,12 @@ class Driver:
     def parts(self) -> dict[str, np.ndarray]:
         """The buffers that decide the steps to come, or count; all others are filled before they are read."""
         w, schedule = self.run.work, self.schedule
+        history = self.run.method.multistep
+        nodes = (
+            {}
+            if history is None
+            else {"nodes": history.nodes, "sums": history.sums, "node": history.place, "levels": history.levels}
+        )
         kept = ("carry", "err_sum", "sigma", "defect", "max_defect", "max_correction", "trust", "counters")
         return {
             "place": schedule.place,
@@ -132,6 +138,7 @@ class Driver:
             "slope": w.K[0],
             "g": schedule.g,
             "target": self.run.options.target,
+            **nodes,
             **{name: getattr(w, name) for name in kept},
         }
 

@@ -37,7 +37,19 @@ ARRIVED, STOPPED = "reached the end of the interval", "stopped by the callback"
 ENDED_BY_EVENT = "A termination event occurred."
 # Names that the projection's options stand beside, for hints.
 OWN = (
-    *("method", "h", "params", "in_place", "save_every", "t_eval", "events", "dense_output", "callback", "progress"),
+    *(
+        "method",
+        "h",
+        "params",
+        "in_place",
+        "jacobian",
+        "save_every",
+        "t_eval",
+        "events",
+        "dense_output",
+        "callback",
+        "progress",
+    ),
     *("compiled", "max_bytes", "checkpoint", "checkpoint_every", "resume", "diagnostics", "rtol", "atol"),
     *("first_step", "max_step"),
 )
@@ -53,6 +65,7 @@ def integrate(
     h: float | None = DEFAULT,
     params: Any = None,
     in_place: bool = False,
+    jacobian: Any = None,
     save_every: int | None = None,
     t_eval: Any = None,
     events: Any = None,
@@ -81,7 +94,8 @@ def integrate(
         ``fun(t, y[, params]) -> (n,)``; with ``in_place=True``, ``fun(t, y, out[, params])``. For a compiled run a
         lazily jitted Numba function, or a C function as `scipy.LowLevelCallable`, ctypes or cffi pointer,
         ``int fun(double t, const double *y, double *out, const double *params)``, see :doc:`/c-functions`. With a
-        Nystrom method (`EIPRKN8`, `EIPRKN12`), whose state is (q, v), the acceleration: ``acc(t, q[, params]) ->
+        Nystrom method (`EIPRKN8`, `EIPRKN12`) or a multistep one (`EIPGJ12`, `EIPGJ14`), whose state is (q, v), the
+        acceleration: ``acc(t, q[, params]) ->
         (n/2,)``, in place ``acc(t, q, out[, params])``. A `Problem` brings everything else with it; options given here
         take precedence.
     t_span : (float, float)
@@ -89,8 +103,8 @@ def integrate(
     y0 : array_like, shape (n,)
         Initial state, real or complex.
     method : type
-        `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, or a class made by
-        `eip_method`; one on a one-step method runs interpreted.
+        `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, `EIPGJ12`, `EIPGJ14`, or a
+        class made by `eip_method`; one on a one-step method runs interpreted.
     h : float, optional
         Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter. None: adaptive steps by
         `rtol`, `atol`, `first_step` and `max_step`. Default: adaptive where one of these is given, else a problem's
@@ -99,6 +113,9 @@ def integrate(
         Passed on to `fun` and to the invariants' functions as the last argument.
     in_place : bool, optional
         Whether `fun` fills its third argument.
+    jacobian : callable, optional
+        For a multistep method that takes it (`EIPGJ14`): ``jacobian(t, q, dq, out[, params])`` fills `out` with the
+        derivative of the accelerations along dq, a Numba or C function for a compiled run. A problem may bring its own.
     save_every : int, optional
         Save each so many-th step, besides the first and the last state.
     t_eval : array_like, optional
@@ -184,6 +201,7 @@ def integrate(
         h=h,
         params=params,
         in_place=in_place,
+        jacobian=jacobian,
         save_every=save_every,
         t_eval=t_eval,
         events=events,

@@ -13,10 +13,11 @@ from ..core import setup
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import Invariant, as_invariants
 from ..core.jitted import NotCompilableError
-from ..core.native_functions import native_functions, with_events
+from ..core.multistep import SecondOrder, attach_history, known_system
+from ..core.native_functions import native_functions, with_events, with_jacobian
 from ..core.one_step import OneStep
 from ..core.options import ProjectionOptions
-from ..core.pointers import PointerFunction, address_hint, by_pointer
+from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 from ..core.problem import Problem
 from ..core.results import Diagnostics
 from ..core.setup import Counted, Run, Start
@@ -25,6 +26,7 @@ from ..core.stepping import AnyMethod, StepOptions, Stepping, interval
 from ..engine.counters import NFEV
 from ..engine.data import Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
+from ..methods.multistep import GaussJackson
 from ..methods.nystrom import NystromTableau
 from .driver import check_memory, saved_rows
 from .events import Events, as_events
@@ -59,6 +61,7 @@ class Request:
     h: Any = DEFAULT
     params: Any = None
     in_place: bool = False
+    jacobian: Any = None
     save_every: Any = None
     t_eval: Any = None
     events: Any = None
@@ -82,7 +85,8 @@ class Request:
 
     def with_pointers(self) -> Request:
         """The request with its C functions by pointer as Python calls them."""
-        return replace(self, fun=by_pointer(self.fun, "fun"), events=as_events(self.events))
+        jacobian = by_pointer(self.jacobian, "jacobian", GRADIENT, takes_f=True)
+        return replace(self, fun=by_pointer(self.fun, "fun"), events=as_events(self.events), jacobian=jacobian)
 
     @property
     def adaptive(self) -> bool:
@@ -113,6 +117,11 @@ class System:
         self.parameters = np.zeros(0) if params is None else real_array("params", params, TypeError).reshape(-1)
         self.extra = () if params is None else (self.parameters,)
         self.events = Events(request.events, self.extra)
+        self.jacobian = request.jacobian
+        if self.jacobian is not None and not callable(self.jacobian):
+            raise TypeError(
+                f"jacobian must be a function jacobian(t, q, dq, out[, params]), got {shown(self.jacobian)}."
+            )
         self.rhs: Callable[..., None]
 
     def bind(self, y0: np.ndarray) -> None:
@@ -123,6 +132,12 @@ class System:
         """The derivative as a new array."""
         out = np.empty_like(y)
         self.rhs(t, y, out, self.parameters)
+        return out
+
+    def moved(self, t: float, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """The Jacobian of the accelerations times dq."""
+        out = np.full_like(q, np.nan)
+        self.jacobian(t, q.copy(), dq.copy(), out, *self.extra)
         return out
 
     @property
@@ -150,6 +165,8 @@ class System:
             if isinstance(run.method, OneStep):
                 raise NotCompilableError(f"{run.method.name} is a one-step method in Python")
             functions = native_functions(self.fun, self.form, params, run.invariants, run.y0)
+            if self._corrects(run):
+                functions = with_jacobian(functions, self.jacobian, params, run.y0)
         except NotCompilableError as reason:
             if wanted:
                 raise
@@ -176,8 +193,14 @@ class System:
         for item, label in zip(run.invariants.items, run.invariants.labels, strict=True):
             found[label] = kind(item.fun, in_python)
             found[f"gradient of {label}"] = kind(item.grad, in_python)
+        if self._corrects(run):
+            found["jacobian"] = kind(self.jacobian, in_python)
         in_python = isinstance(functions, PythonFunctions) or functions.python is not None
         return found | {f"event {k}": kind(event, in_python) for k, event in enumerate(self.events.functions)}
+
+    def _corrects(self, run: Run) -> bool:
+        history = run.method.multistep
+        return history is not None and history.corrected_count > 0
 
     def _in_python(self, run: Run) -> PythonFunctions:
         n, dtype = run.y0.size, run.y0.dtype
@@ -188,7 +211,10 @@ class System:
             return np.array(setup.as_derivative(f, size, dtype, t), dtype, order="C")
 
         rhs = call(self.fun, self.extra, (size,), convert, in_place=in_place)
-        return PythonFunctions(rhs, *run.invariants.calls, self.events.calls, second_order)
+        jacobian = None
+        if self._corrects(run):
+            jacobian = call(self.jacobian, self.extra, (n // 2,), convert, in_place=True, takes_f=True)
+        return PythonFunctions(rhs, *run.invariants.calls, self.events.calls, second_order, jacobian)
 
 
 @dataclass
@@ -231,7 +257,8 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     _check_choices(request)
     request = request.with_pointers()
     in_place = in_place or isinstance(request.fun, PointerFunction)
-    request, form = _with_problem(request, FORMS[isinstance(method, NystromTableau), in_place])
+    frequencies = request.fun.frequencies if isinstance(request.fun, Problem) else None
+    request, form = _with_problem(request, FORMS[isinstance(method, (NystromTableau, GaussJackson)), in_place])
     system = System(request, form)
     t0, t_bound = _span(request, system.events)
     y0 = _state(request.y0)
@@ -243,10 +270,16 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     f0 = system.first(calls, t0, y0)
     if isinstance(method, NystromTableau):
         setup.check_second_order(calls, t0, y0, f0, name)
+    elif isinstance(method, GaussJackson):
+        method = known_system(method, calls, t0, y0, f0, name)
     start = Start(t0, y0, f0, stepping.first(calls, y0, f0, method))
     schedule = _schedule(stepping.span, start.tau, request, system.events)
     run = setup.prepare(method, calls, start, projection, stepping, extra=system.extra, check_start=check_start)
     run.left_out = system.left_out
+    if isinstance(method, GaussJackson):
+        moved = None if system.jacobian is None else system.moved
+        seen = SecondOrder(calls, start, moved, None if frequencies is None else frequencies(y0))
+        attach_history(run, method, name, seen, stepping, level=False)
     bound = 0.5 * free_memory() if request.max_bytes is None else request.max_bytes
     check_memory(saved_rows(schedule), run, bound)
     record = Diagnostics() if request.diagnostics is None else request.diagnostics
@@ -307,8 +340,10 @@ def _with_problem(request: Request, form: str) -> tuple[Request, str]:
         params = problem.params
     projection |= _with_run_params(projection, params)
     form, fun = ("value", problem.fun) if problem.rhs is None else ("in place", problem.rhs)
+    jacobian = problem.jacobian if request.jacobian is None else request.jacobian
     h = problem.h if request.h is DEFAULT and not request.adaptive else request.h
-    return replace(request, fun=fun, t_span=t_span, y0=y0, params=params, h=h, projection=projection), form
+    found = replace(request, fun=fun, t_span=t_span, y0=y0, params=params, h=h, projection=projection)
+    return replace(found, jacobian=jacobian), form
 
 
 def _with_run_params(projection: Mapping[str, Any], params: Any) -> dict[str, Any]:

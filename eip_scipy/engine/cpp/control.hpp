@@ -2,7 +2,7 @@
 #pragma once
 
 #include "correction.hpp"
-#include "stages.hpp"
+#include "multistep.hpp"
 
 namespace eip {
 
@@ -108,9 +108,10 @@ inline double least_step(double t, double sign) { return 10.0 * std::abs(std::ne
 // Step k: fixed, or the first one that the error control accepts; K[0] = f(t, y) on entry, w.last() = f at its end.
 //
 // A failed projection shortens the step, at most MAX_RETRIES times in a row. Returns OK, NOT_FINITE, FAILED_PROJECTION or
-// TOO_SMALL.
+// TOO_SMALL; of a multistep method UNSTABLE too.
 template <class AnyRun>
 inline Code next_step(AnyRun &run, const Span &span, double *clock, int64_t k, const double *y, double *y_new) {
+    if (run.method.multistep) return next_states(run, span, clock, k, k + 1, y, y_new);
     const Options &o = run.options;
     const auto &w = run.work;
     const bool adaptive = span.h == 0.0;

@@ -213,6 +213,9 @@ inline Code stay(const Step &step, const Options &o, const W &w) {
     return status;
 }
 
+template <class AnyRun>
+inline Code project_evaluated(AnyRun &run, const Step &step);
+
 // Project w.y_hat into y_new by o.iterations Newton steps; returns OK, FAILED_PROJECTION or POSTPONED.
 //
 // w.err holds the local error of y_hat where the metric wants it, w.last() f there where a gradient does. POSTPONED:
@@ -231,6 +234,14 @@ inline Code project_step(AnyRun &run, const Step &step) {
         }
     }
     evaluate_invariants(run, step.t_new, w.y_hat);
+    return project_evaluated(run, step);
+}
+
+// The rest of it, where the gradients at w.y_hat and the invariants' values are known.
+template <class AnyRun>
+inline Code project_evaluated(AnyRun &run, const Step &step) {
+    const Options &o = run.options;
+    const auto &w = run.work;
     if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) return stay(step, o, w);
     Moved moved = move(run, step);
     Code status = correct(run, step, moved.rank);

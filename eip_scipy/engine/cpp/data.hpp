@@ -9,8 +9,8 @@ namespace eip {
 
 // Codes of a step; the last four are the loops'.
 enum Code : int {
-    OK = 0, NOT_FINITE = 1, FAILED_PROJECTION = 2, TOO_SMALL = 3, POSTPONED = 4, PAUSE = 10, FULL = 11, ENDED = 12,
-    DOUBTFUL = 13
+    OK = 0, NOT_FINITE = 1, FAILED_PROJECTION = 2, TOO_SMALL = 3, POSTPONED = 4, UNSTABLE = 5, PAUSE = 10, FULL = 11,
+    ENDED = 12, DOUBTFUL = 13
 };
 
 enum Direction : int { NEW, OLD, MIDPOINT };
@@ -42,6 +42,22 @@ struct Span {
     double max_step;
 };
 
+// What a multistep method knows of a run besides the state (multistep.hpp); weights go from the oldest node to the newest.
+struct Multistep {
+    int64_t order, middle, half, pitch, rows;  // numbers of an acceleration, of a row for it, and rows
+    const double *predict_q, *predict_v;       // (order)
+    const double *states_q, *states_v;         // (order, order): of the state so many nodes before the newest
+    const double *correction;                  // (order + 1)
+    const double *shape_q, *shape_v, *size;    // (order + 1): differences that tell the errors' shape, and their size
+    double error_constant, growth;
+    bool brief, level, uses_v;  // no history at all; states not `middle` nodes behind it; accelerations take velocities
+    double t0, h;
+    int64_t substeps, spacing;                 // of the method that starts; nodes from one projection to the next
+    int64_t first, count;                      // components that the Jacobian corrects
+    double *nodes, *sums, *moved, *levels;     // (rows, pitch), (4, pitch), (pitch), (3, l)
+    int64_t *place;
+};
+
 // A tableau; rows of A are `columns` long. e weighs the rows of K in the error estimate, e_low in DOP853's second one;
 // names ending in _v are a Nystrom method's weights of the velocity.
 struct Method {
@@ -50,6 +66,7 @@ struct Method {
     int64_t n_e, n_e_v;
     bool nystrom, fsal, paired;
     double exponent;
+    const Multistep *multistep;  // whose first states the tableau makes, else null
 };
 
 // Blocks of floats: member[start[b]] to member[start[b + 1]]. `size` is that of consecutive blocks alike, else 0.

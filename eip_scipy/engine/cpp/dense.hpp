@@ -2,14 +2,17 @@
 // step's two ends, which are met exactly.
 #pragma once
 
-#include "correction.hpp"
+#include <vector>
+
+#include "multistep.hpp"
 
 namespace eip {
 
-enum Interpolant : int { CUBIC, QUINTIC, POLYNOMIAL, SEVENTH };
+enum Interpolant : int { CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY };
 
 // What the interpolants of a run are made with, and the buffers of their projections. `weights` are rows over the stages:
-// those of a tableau's own polynomial, or of DOP853's, which has `further` stages besides.
+// those of a tableau's own polynomial, or of DOP853's, which has `further` stages besides, or Lagrange's for the nodes of a
+// multistep method, [interval, node, power].
 struct Dense {
     int64_t kind, polynomials, columns, further;
     const double *weights, *A, *c;
@@ -17,10 +20,14 @@ struct Dense {
     bool by_travel;   // weights of the projection by what each block travels within the step, else those of the run
     Options options;
     Work work;
+    const Multistep *multistep;
     double *missed;  // how many states were left unprojected, and the time of the first
 
     // States that make up an interpolant, besides those of the two ends and the weights.
-    int64_t rows() const { return kind == POLYNOMIAL ? polynomials + 1 : kind == SEVENTH ? 3 + polynomials : 3; }
+    int64_t rows() const {
+        if (kind == HISTORY) return std::max<int64_t>(3, (columns + 1) / 2) + 1;
+        return kind == POLYNOMIAL ? polynomials + 1 : kind == SEVENTH ? 3 + polynomials : 3;
+    }
     int64_t floats() const { return 3 + (3 + rows()) * work.m + 2 * work.l; }
 };
 
@@ -144,6 +151,49 @@ inline void seventh(const DenseRun<W> &dense, const Piece &piece, double h, cons
         weighted_sum(h, {d.weights + j * d.columns, w.K, d.columns, m}, bend + (1 + j) * m, m);
 }
 
+// For the nodes of a multistep method: the accelerations of the whole history, and behind them how many nodes before the
+// newest the step begins, and its length in nodes' distances. A run too short for a history has the quintic, and -1 there.
+template <class W>
+inline void history(const Dense &d, const Piece &piece, double *f_old, double *f, const W &w) {
+    const Multistep &ms = *d.multistep;
+    double *about = piece.rows + (d.rows() - 1) * w.m;
+    const double h = *piece.t - *piece.t_old;
+    about[0] = -1.0;
+    if (ms.brief) return quintic(piece, h, f_old, f, w);
+    const int64_t back = ms.place[NEWEST] - std::llround((*piece.t_old - ms.t0) / ms.h);
+    about[0] = static_cast<double>(back);
+    about[1] = h / ms.h;
+    for (int64_t j = 0; j < ms.order; ++j) copy(newest(ms) - j * ms.pitch, piece.rows + j * ms.half, ms.half);
+    slope_of(ms, back, piece.y_old, f_old);
+    if (back > 0) slope_of(ms, back - 1, piece.y, f);
+}
+
+// Its value: the state at the step's start, and the polynomial through the accelerations integrated twice.
+template <class W>
+inline void from_history(const Dense &d, const Piece &piece, double theta, double *out, const W &w) {
+    const double *about = piece.rows + (d.rows() - 1) * w.m;
+    const int64_t order = d.columns, half = w.m / 2;
+    const double x = theta * about[1], h = (*piece.t - *piece.t_old) / about[1];
+    std::vector<double> weights(2 * order);
+    for (int64_t j = 0; j < order; ++j) {
+        const double *polynomial = d.weights + (static_cast<int64_t>(about[0]) * order + j) * order;
+        double place = 0.0, speed = 0.0;
+        for (int64_t k = order - 1; k >= 0; --k) {
+            place = place * x + polynomial[k] / static_cast<double>((k + 1) * (k + 2));
+            speed = speed * x + polynomial[k] / static_cast<double>(k + 1);
+        }
+        weights[j] = place * x * x;
+        weights[order + j] = speed * x;
+    }
+    weighted_sum(h * h, {weights.data(), piece.rows, order, half}, out, half);
+    weighted_sum(h, {weights.data() + order, piece.rows, order, half}, out + half, half);
+    for (int64_t i = 0; i < half; ++i) {
+        const double v = piece.y_old[half + i];
+        out[i] = piece.y_old[i] + (h * x * v + out[i]);
+        out[half + i] = v + out[half + i];
+    }
+}
+
 // The interpolant over a step from y_old at t_old to y at t, from the buffers that it left.
 template <class W>
 inline void describe(const DenseRun<W> &dense, const Work &step, double t_old, const double *y_old, double t,
@@ -169,6 +219,13 @@ inline void describe(const DenseRun<W> &dense, const Work &step, double t_old, c
     if (d.kind == QUINTIC) quintic(piece, h, f_old, f, w);
     if (d.kind == POLYNOMIAL) polynomial(d, piece, h, step, w);
     if (d.kind == SEVENTH) seventh(dense, piece, h, step);
+    if (d.kind == HISTORY) {
+        copy(step.row(0), w.row(0), w.m);
+        copy(step.last(), w.last(), w.m);
+        history(d, piece, w.row(0), w.last(), w);
+        f_old = w.row(0);
+        f = w.last();
+    }
     if (d.by_travel)
         travelled(piece, h, f_old, f, d.options.blocks, w);
     else
@@ -181,10 +238,13 @@ inline void evaluate(const Dense &d, const Piece &piece, double theta, double *o
     const int64_t m = w.m, half = m / 2;
     const double rest = 1.0 - theta;
     const double *rows = piece.rows;
-    if (d.kind == CUBIC) {
+    const bool nodes = d.kind == HISTORY && rows[(d.rows() - 1) * m] >= 0.0;
+    if (nodes) {
+        from_history(d, piece, theta, out, w);
+    } else if (d.kind == CUBIC) {
         for (int64_t i = 0; i < m; ++i)
             out[i] = piece.y_old[i] + theta * rows[i] + theta * rest * (rest * rows[m + i] - theta * rows[2 * m + i]);
-    } else if (d.kind == QUINTIC) {
+    } else if (d.kind == QUINTIC || d.kind == HISTORY) {
         const double h = *piece.t - *piece.t_old;
         for (int64_t i = 0; i < half; ++i) {
             double place = rows[5 * half + i], slope = 5.0 * place;

@@ -140,6 +140,20 @@ inline bool wants_samples(AnyRun &run, const Samples *samples, const Schedule &s
     return false;
 }
 
+// How far the steps go before someone looks: a multistep method makes many at once.
+template <class AnyRun>
+inline int64_t next_stop(const AnyRun &run, const Samples *samples, const Schedule &s, int64_t k, int64_t k_end) {
+    const bool each = s.n_events > 0 || (samples && samples->interpolants.capacity > 0);
+    if (!run.method.multistep || run.method.multistep->brief || each) return k + 1;
+    int64_t stop = std::min(k_end, s.span.n_steps);
+    if (s.save_every > 0) stop = std::min(stop, (k / s.save_every + 1) * s.save_every);
+    if (s.place[ROW] < s.n_eval) {  // the step before the one with the next time in it
+        const double steps = (s.t_eval[s.place[ROW]] - s.span.t0) / s.span.h;
+        stop = std::min(stop, static_cast<int64_t>(std::floor(steps)) - 1);
+    }
+    return std::max(stop, k + 1);
+}
+
 // Steps up to `k_end`; returns OK or why it stopped. Without `samples` it pauses where there is something to sample.
 template <class AnyRun>
 inline Code advance(AnyRun &run, Samples *samples, const Schedule &s, int64_t k_end, double *y, double *y_new,
@@ -160,12 +174,14 @@ inline Code advance(AnyRun &run, Samples *samples, const Schedule &s, int64_t k_
         if (samples && samples->interpolants.capacity > 0 &&
             *samples->interpolants.count == samples->interpolants.capacity)
             return FULL;
-        const Code status = next_step(run, s.span, s.clock, k, y, y_new);
+        const int64_t stop = next_stop(run, samples, s, k, k_end);
+        const Code status = stop == k + 1 ? next_step(run, s.span, s.clock, k, y, y_new)
+                                          : next_states(run, s.span, s.clock, k, stop, y, y_new);
         if (status != OK) return status;
-        place[STEP] = k + 1;
+        place[STEP] = stop;
         place[PENDING] = 1;
         const double t_new = s.clock[TIME_NEW];
-        const bool due = t_new == s.span.t_bound || (s.save_every > 0 && (k + 1) % s.save_every == 0);
+        const bool due = t_new == s.span.t_bound || (s.save_every > 0 && stop % s.save_every == 0);
         if (s.n_eval == 0 && due) {
             saved.t[place[ROW]] = t_new;
             copy(y_new, saved.y + place[ROW] * w.m, w.m);

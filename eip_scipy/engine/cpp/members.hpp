@@ -37,6 +37,7 @@ inline bool begin_member(AnyRun &run, Samples *samples, const Schedule &s, const
     std::fill_n(w.counters, static_cast<int64_t>(N_COUNTERS), 0);
     w.counters[NFEV] = members.evaluations;
     std::fill_n(s.place, 3, 0);
+    if (run.method.multistep) std::fill_n(run.method.multistep->place, static_cast<int64_t>(N_NODE_PLACES), 0);
     s.clock[TIME] = s.clock[TIME_NEW] = t0;
     s.clock[NEXT_LENGTH] = members.first_steps[k];
     if (std::isnan(members.first_steps[k])) return false;

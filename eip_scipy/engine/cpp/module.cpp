@@ -83,6 +83,17 @@ void engine_setup(Engine *self, PyObject *method, PyObject *options, PyObject *w
         self->hooks = new PythonHooks(hooks, work, steps, self->type, self->kept);
     }
     if (!self->hooks || !self->hooks->raw) read_tableau(method, arrays, run.method);
+    const Ref multistep = attribute(method, "multistep");
+    if (multistep.get() != Py_None) {
+        run.multistep = multistep_of(multistep.get(), run.work, arrays);
+        run.method.multistep = &run.multistep;
+        const bool jacobian = native ? system.jacobian_pointer.pointer || system.jacobian_pointer.library
+                                     : self->functions->has_jacobian();
+        if (self->hooks || !run.options.compensated || (run.multistep.count > 0 && !jacobian)) {
+            PyErr_SetString(PyExc_ValueError, "engine: the options do not fit a multistep method");
+            throw PythonError{};
+        }
+    }
     if ((run.method.nystrom || system.second_order) && run.work.m % 2) {
         PyErr_SetString(PyExc_ValueError, "engine: a state of positions and velocities has an even length");
         throw PythonError{};
@@ -168,9 +179,10 @@ double *state_of(PyObject *object, const char *name, Engine *self, PyObject *kep
 }
 
 // Counts that Python may have written, before the loop goes by them.
-void check_room(const Schedule &schedule, const Saved &saved, const Samples *samples) {
+void check_room(const Schedule &schedule, const Saved &saved, const Samples *samples, const Multistep *multistep) {
     const int64_t row = schedule.place[ROW];
     bool good = row >= 0 && row <= saved.rows && schedule.n_eval < std::max<int64_t>(saved.rows, 1);
+    if (multistep) check_history(*multistep);
     if (samples) {
         const int64_t roots = *samples->roots.count, pieces = *samples->interpolants.count;
         good &= roots >= 0 && pieces >= 0 && pieces <= samples->interpolants.capacity;
@@ -206,7 +218,7 @@ PyObject *engine_advance(Engine *self, PyObject *const *args, Py_ssize_t count) 
                 arrays.memory(args[5], "pieces", NPY_DOUBLE, {ANY, samples->dense.floats()}));
             pieces.capacity = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[5]), 0);
         }
-        check_room(schedule, saved, samples);
+        check_room(schedule, saved, samples, self->data->method.multistep);
         if (self->hooks) self->hooks->set_state(args[2]);
         return PyLong_FromLong(
             stepped(self, [&](auto &run) { return advance(run, samples, schedule, k_end, y, y_new, saved); }));
@@ -253,7 +265,7 @@ PyObject *engine_sweep(Engine *self, PyObject *const *args, Py_ssize_t count) {
             PyErr_SetString(PyExc_ValueError, "engine: members are swept by native functions");
             return nullptr;
         }
-        check_room(schedule, members.saved(0, self->data->work), self->samples);
+        check_room(schedule, members.saved(0, self->data->work), self->samples, self->data->method.multistep);
         if (self->samples) self->samples->interpolants.capacity = 0;
         return PyLong_FromLong(stepped(
             self, [&](auto &run) { return sweep(run, self->samples, schedule, members, steps, y, y_new); }));

@@ -146,6 +146,14 @@ PythonFunctions::PythonFunctions(PyObject *functions, PyObject *work, const Work
         PyErr_SetString(PyExc_ValueError, "engine: rhs must give as many numbers as the state has");
         throw PythonError{};
     }
+    const Ref jacobian = attribute(functions, "jacobian");
+    if (jacobian.get() != Py_None) {
+        jacobian_ = std::make_unique<PythonCall>(jacobian.get(), type, sizes.n / 2, kept);
+        if (jacobian_->floats() != m_ / 2) {
+            PyErr_SetString(PyExc_ValueError, "engine: jacobian must fill half as many numbers as the state has");
+            throw PythonError{};
+        }
+    }
     add_buffers(work, kept);
 }
 
@@ -189,6 +197,10 @@ void PythonFunctions::event(double t, const double *y, double *values) {
         call(t, y, nullptr, values, nullptr);
         values += call.floats();
     }
+}
+
+void PythonFunctions::jacobian(double t, const double *q, const double *dq, double *out) {
+    (*jacobian_)(t, q, dq, out, owner_of(out));
 }
 
 PythonHooks::PythonHooks(PyObject *hooks, PyObject *work, const Run &run, int type, PyObject *kept)

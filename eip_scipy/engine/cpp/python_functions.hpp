@@ -43,6 +43,8 @@ class PythonFunctions final : public Functions {
     void inv(double t, const double *y, double *values) override;
     void grad(double t, const double *y, const double *f, double *G) override;
     void event(double t, const double *y, double *values) override;
+    void jacobian(double t, const double *q, const double *dq, double *out) override;
+    bool has_jacobian() const { return jacobian_ != nullptr; }
     int64_t events() const { return static_cast<int64_t>(event_.size()); }
 
     // More arrays that functions in place fill.
@@ -55,7 +57,7 @@ class PythonFunctions final : public Functions {
     };
     PyObject *owner_of(const double *out) const;
 
-    std::unique_ptr<PythonCall> rhs_;
+    std::unique_ptr<PythonCall> rhs_, jacobian_;
     std::vector<PythonCall> inv_, grad_, event_;
     std::vector<Owner> owners_;
     int64_t m_;

@@ -94,6 +94,53 @@ static void check_places(const uint64_t *start, int64_t count, const uint64_t *p
     throw PythonError{};
 }
 
+Multistep multistep_of(PyObject *record, const Work &w, Arrays &arrays) {
+    Multistep ms{};
+    ms.order = Arrays::length(record, "predict_q");
+    ms.middle = integer(record, "middle");
+    ms.half = w.m / 2;
+    ms.pitch = Arrays::length(record, "nodes", 1);
+    ms.rows = Arrays::length(record, "nodes");
+    ms.predict_q = arrays.floats(record, "predict_q", {ms.order});
+    ms.predict_v = arrays.floats(record, "predict_v", {ms.order});
+    ms.states_q = arrays.floats(record, "states_q", {ms.order, ms.order});
+    ms.states_v = arrays.floats(record, "states_v", {ms.order, ms.order});
+    for (const auto &[name, place] : std::initializer_list<std::pair<const char *, const double **>>{
+             {"correction", &ms.correction}, {"shape_q", &ms.shape_q}, {"shape_v", &ms.shape_v}, {"size", &ms.size}})
+        *place = arrays.floats(record, name, {ms.order + 1});
+    ms.error_constant = number(record, "error_constant");
+    ms.growth = number(record, "growth");
+    ms.brief = truth(record, "brief");
+    ms.level = truth(record, "level");
+    ms.uses_v = truth(record, "uses_v");
+    ms.t0 = number(record, "t0");
+    ms.h = number(record, "h");
+    ms.substeps = integer(record, "substeps");
+    ms.spacing = integer(record, "spacing");
+    ms.first = integer(record, "corrected_first");
+    ms.count = integer(record, "corrected_count");
+    ms.nodes = arrays.floats(record, "nodes", {ms.rows, ms.pitch});
+    ms.sums = arrays.floats(record, "sums", {4, ms.pitch});
+    ms.moved = arrays.floats(record, "moved", {ms.pitch});
+    ms.levels = arrays.floats(record, "levels", {3, w.l});
+    ms.place = arrays.integers<int64_t>(record, "place", {N_NODE_PLACES});
+    check_history(ms);
+    const bool fits = ms.first >= 0 && ms.count >= 0 && ms.first <= ms.half && ms.count <= ms.half - ms.first;
+    const bool sizes = fits && ms.order >= 4 && ms.rows > 2 * ms.order && ms.pitch >= ms.half && ms.middle >= 0;
+    if (w.m % 2 || !sizes || ms.middle >= ms.order || ms.substeps < 1 || ms.spacing < 1 || ms.h == 0.0) {
+        PyErr_SetString(PyExc_ValueError, "engine: the record of the multistep method does not fit the run");
+        throw PythonError{};
+    }
+    return ms;
+}
+
+void check_history(const Multistep &ms) {
+    const int64_t at = ms.place[NEWEST_ROW];
+    if (!ms.place[HAVE_NODES] || (at >= ms.order - 1 && at < ms.rows)) return;
+    PyErr_SetString(PyExc_ValueError, "engine: the newest node is in none of the history's rows");
+    throw PythonError{};
+}
+
 static Blocks blocks_of(PyObject *groups, int64_t m, Arrays &arrays) {
     Blocks blocks{};
     const int64_t members = Arrays::length(groups, "member"), starts = Arrays::length(groups, "start");
@@ -180,11 +227,13 @@ static void read_interpolant(PyObject *dense, int64_t stages, Arrays &arrays, De
     d.kind = integer(dense, "kind");
     d.polynomials = Arrays::length(dense, "weights");
     d.columns = Arrays::length(dense, "weights", 1);
+    if (d.multistep && (d.kind != HISTORY || d.columns != d.multistep->order || d.polynomials != d.columns * d.columns))
+        d.kind = -1;
     d.further = Arrays::length(dense, "c");
     d.weights = arrays.floats(dense, "weights", {d.polynomials, d.columns});
     d.A = arrays.floats(dense, "A", {d.further, ANY});
     d.c = arrays.floats(dense, "c", {d.further});
-    const bool known = d.kind >= CUBIC && d.kind <= SEVENTH;
+    const bool known = d.kind >= CUBIC && (d.multistep ? d.kind == HISTORY : d.kind < HISTORY);
     const bool fits = d.kind == POLYNOMIAL ? d.columns == stages + 1
                     : d.kind == SEVENTH    ? d.columns == stages + 1 + d.further && d.columns <= d.work.stages + 1
                                            : true;
@@ -206,8 +255,9 @@ static Dense dense_of(PyObject *dense, const Data &run, Arrays &arrays, int type
     d.options = options_of(options.get(), d.work, arrays);
     d.by_travel = truth(dense, "by_travel");
     d.missed = arrays.floats(dense, "missed", {2});
+    d.multistep = run.method.multistep;
     read_interpolant(dense, run.work.stages, arrays, d);
-    if (d.kind == QUINTIC && d.work.m % 2) {
+    if ((d.kind == QUINTIC || d.kind == HISTORY) && (d.work.m % 2 || d.work.stages < 1)) {
         PyErr_SetString(PyExc_ValueError, "engine: a state of positions and velocities has an even length");
         throw PythonError{};
     }
@@ -322,6 +372,9 @@ void read_pointers(PyObject *functions, const Work &w, int64_t events, Arrays &a
     system.inv_pointers = pointers_of<Native<ValuePointer>>(functions, "inv", w.l, w.m, p);
     system.grad_pointers = pointers_of<Native<GradientPointer>>(functions, "grad", w.l * w.m, w.m, p);
     system.event_pointers = pointers_of<Native<ValuePointer>>(functions, "event", events, w.m, p);
+    const Ref jacobian = attribute(functions, "jacobian");
+    if (jacobian.get() != Py_None)
+        system.jacobian_pointer = pointer_of<Native<GradientPointer>>(jacobian.get(), "jacobian", w.m / 2, w.m / 2, p);
     system.scratch.resize(w.m);
     system.scratch_f.resize(w.m);
 }

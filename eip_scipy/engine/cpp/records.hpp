@@ -10,6 +10,7 @@ namespace eip {
 // What the steps of a run refer to.
 struct Data {
     Method method;
+    Multistep multistep;
     Options options;
     Work work;
     System system;
@@ -18,6 +19,9 @@ struct Data {
 Method method_of(PyObject *method, Arrays &arrays);
 // Coefficients, which a one-step method of a user's own has none of.
 void read_tableau(PyObject *method, Arrays &arrays, Method &m);
+// What a multistep method holds besides the run's buffers; its history, which Python may fill.
+Multistep multistep_of(PyObject *record, const Work &w, Arrays &arrays);
+void check_history(const Multistep &multistep);
 Work work_of(PyObject *work, int64_t stages, int64_t blocks, Arrays &arrays, int type);
 // Sets what the buffers hold of them too: targets, scratch of the frame.
 Options options_of(PyObject *options, Work &w, Arrays &arrays);

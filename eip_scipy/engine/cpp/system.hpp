@@ -26,6 +26,7 @@ class Functions {
     virtual void inv(double t, const double *y, double *values) = 0;
     virtual void grad(double t, const double *y, const double *f, double *G) = 0;
     virtual void event(double t, const double *y, double *values) = 0;
+    virtual void jacobian(double t, const double *q, const double *dq, double *out) = 0;
 };
 
 struct Step;
@@ -66,6 +67,7 @@ struct System {
     Native<ValuePointer> rhs_pointer{};
     std::vector<Native<ValuePointer>> inv_pointers, event_pointers;
     std::vector<Native<GradientPointer>> grad_pointers;
+    Native<GradientPointer> jacobian_pointer{};
     Functions *python = nullptr;
     bool by_pointer = false;
     bool second_order = false;  // rhs_pointer gives the accelerations of y = (q, v)
@@ -115,6 +117,17 @@ struct System {
             if (status) [[unlikely]] gave_up(status, {"grad", k, t, {y, y + w.m}, {f, f + w.m}}, G, floats);
             G += floats;
         }
+    }
+
+    // Of the accelerations at positions q, times dq; all three of half a state's length, and q and dq scratch.
+    template <class W>
+    void jacobian(const W &w, double t, const double *q, const double *dq, double *out) {
+        if (!by_pointer) return python->jacobian(t, q, dq, out);
+        const auto &[pointer, library, floats] = jacobian_pointer;
+        if (library) return library(t, q, dq, out, params, w.m / 2, n_params);
+        fill(out, NOT_A_NUMBER, floats);
+        const int status = pointer(t, q, dq, out, params);
+        if (status) [[unlikely]] gave_up(status, {"jacobian", 0, t, {q, q + w.m / 2}, {dq, dq + w.m / 2}}, out, floats);
     }
 
   private:

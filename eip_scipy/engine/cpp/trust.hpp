@@ -5,8 +5,6 @@
 
 namespace eip {
 
-// Dead band in roundings of an invariant's terms; where the state's own roundings are carried, the values' remain.
-constexpr double BAND = 4.0, BAND_COMPENSATED = 1.0;
 constexpr double FAILURE_BANDS = 100.0, NOISE_BANDS = 3.0;
 // Terms that vanish for a moment, where an invariant's own pass through zero, count as this share of those at the start.
 constexpr double LEAST_SHARE = 1e-3;
@@ -18,6 +16,7 @@ constexpr double LARGE = 50.0, FAR = 0.03, LARGE_SHARE = 1e-2;
 template <class Value, class W>
 inline Truth<Value> defects(const double *terms, const Value *y, const Options &o, const W &w, Value *raw) {
     const bool measured = o.watched && w.counters[HAVE_ERROR] && !terms;
+    const double band = 1.0 / o.per_band;
     Truth<Value> outside{};
     for (int64_t i = 0; i < w.l; ++i) {
         Value size = max(abs(w.values[i]), abs(w.target[i])), own;
@@ -29,7 +28,7 @@ inline Truth<Value> defects(const double *terms, const Value *y, const Options &
             own = terms ? Value(terms[i]) : abs_dot(w.gradient(i), y, w.m);
         }
         size = max(max(size, Value(o.scales[i])), own);
-        w.band[i] = (o.compensated ? BAND_COMPENSATED : BAND) * EPS * size;
+        w.band[i] = band * size;
         raw[i] = w.values[i] - w.target[i];
         const Truth<Value> inside = (w.band[i] < INFINITE) & (abs(raw[i]) <= w.band[i]);
         w.g[i] = where(inside, 0.0, raw[i]);

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from ...core.problem import Problem, bind, native_invariant
 from ...engine.native import library
 from . import forces as _forces
 from .forces import ForceConstants
+from .frequencies import orbital_frequencies
 
 __all__ = ["nbody"]
 
@@ -129,6 +131,8 @@ def nbody(
         units=units,
         source=source,
         reference=reference,
+        jacobian=library["gravity.central"],
+        frequencies=partial(orbital_frequencies, masses),
     )
 
 

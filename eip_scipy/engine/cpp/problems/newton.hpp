@@ -12,6 +12,35 @@ inline void newton_rhs(const T *y, const T *gm, int64_t bodies, T *out) {
     accelerate(y, gm, bodies, out + 3 * bodies);
 }
 
+// The accelerations' derivative along dq, as far as the heaviest body makes it, for the bodies that dq moves; with their
+// reactions on that body.
+inline void central_jacobian(const double *q, const double *dq, const double *gm, int64_t bodies, double *out) {
+    const int64_t centre = std::max_element(gm, gm + bodies) - gm;
+    double *reaction = out + 3 * centre;
+    for (int c = 0; c < 3; ++c) reaction[c] = 0.0;
+    for (int64_t k = 0; k < bodies; ++k) {
+        const double *d = dq + 3 * k;
+        double *change = out + 3 * k;
+        if (k == centre) continue;
+        if (d[0] == 0.0 && d[1] == 0.0 && d[2] == 0.0) {
+            for (int c = 0; c < 3; ++c) change[c] = 0.0;
+            continue;
+        }
+        double r[3], moved[3], square = 0.0, along = 0.0;
+        for (int c = 0; c < 3; ++c) {
+            r[c] = q[3 * k + c] - q[3 * centre + c];
+            moved[c] = d[c] - dq[3 * centre + c];
+            square += r[c] * r[c];
+            along += r[c] * moved[c];
+        }
+        const double tidal = gm[centre] / (square * std::sqrt(square)), radial = 3.0 * along / square;
+        for (int c = 0; c < 3; ++c) {
+            change[c] = tidal * (radial * r[c] - moved[c]);
+            reaction[c] -= gm[k] / gm[centre] * change[c];
+        }
+    }
+}
+
 // From the derivative f of the state.
 template <class T>
 inline void energy_gradient(const T *y, const T *f, const T *gm, int64_t bodies, T *out) {

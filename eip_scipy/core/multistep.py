@@ -1,0 +1,191 @@
+"""Multistep methods in a run: what they hold of it, whether its step is stable, and what the Jacobian is to correct."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..engine.data import AUTO, N_NODE_PLACES, Method, Multistep
+from ..methods.multistep import GaussJackson, damping_limit, stability_limit, weights
+from .setup import Run, Start, check_halves
+from .stepping import Stepping
+
+__all__ = ["SecondOrder", "attach_history", "known_system"]
+
+Array = np.ndarray
+AUTO_SPACING = 50
+# Steps of DOP853, which starts where accelerations depend on velocities, in one step.
+SUBSTEPS = 4
+ROWS = 4  # of the history's window, in orders of the method
+ALIGNMENT = 64
+# Bodies whose frequency is above this share of what is stable without the Jacobian are corrected by it.
+CORRECTED_SHARE = 0.8
+# The largest differences of a history that is smooth, beside the accelerations; for low orders, in units of those that
+# the largest stable step has.
+SMOOTH, SMOOTH_LOW = 1e-2, 30.0
+ROUNDS = 12  # of the power iterations
+DIFFERENCE = 1e-6
+
+
+class SecondOrder(NamedTuple):
+    """A system q'' = a(t, q[, v]) as a multistep method sees it.
+
+    `jacobian`: ``jacobian(t, q, dq) -> (n/2,)``, the derivative of the accelerations along dq, or None. `frequencies`:
+    see `Problem`, or None where only the accelerations are known.
+    """
+
+    rhs: Callable[[float, Array], Array]
+    start: Start
+    jacobian: Callable[[float, Array, Array], Array] | None
+    frequencies: tuple[Array, float] | None
+
+
+def known_system(
+    method: GaussJackson, rhs: Callable[[float, Array], Array], t0: float, y0: Array, f0: Array, name: str
+) -> GaussJackson:
+    """The method, which knows now whether accelerations depend on velocities, by one more evaluation.
+
+    Raises
+    ------
+    ValueError
+        When the first half of the derivative is not v.
+    """
+    check_halves(y0.size)
+    half = y0.size // 2
+    other = y0.copy()
+    other[half:] = 1.5 * y0[half:] + 1.0
+    f = rhs(t0, other)
+    if not (np.array_equal(f0[:half], y0[half:]) and np.array_equal(f[:half], other[half:])):
+        raise ValueError(
+            f"{name} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be v, the "
+            "second half of the state. Reorder the state, or take a Runge-Kutta method such as EIPDOP853."
+        )
+    return replace(method, velocities=not np.array_equal(f[half:], f0[half:], equal_nan=True))
+
+
+def attach_history(
+    run: Run, method: GaussJackson, name: str, system: SecondOrder, stepping: Stepping, *, level: bool
+) -> None:
+    """Give a run of a multistep method its history, after a look at its step.
+
+    Raises
+    ------
+    ValueError
+        When the step is longer than what is stable at the start, with one that would do.
+    """
+    assert stepping.h is not None
+    brief = stepping.span.n_steps - 1 < method.order
+    corrected = slice(0, 0) if brief else _stable(method, name, system, stepping.h)
+    assert isinstance(run.method, Method)  # of the method that starts
+    run.method = run.method._replace(multistep=_record(run, method, corrected, stepping, brief=brief, level=level))
+
+
+def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float) -> slice:
+    """Which floats of the accelerations the Jacobian is to correct, where the step is stable."""
+    y0 = system.start.y
+    half = y0.size // 2
+    plain = stability_limit(method.order, False)
+    corrects = method.corrected and system.jacobian is not None
+    limit = stability_limit(method.order, True) if corrects else plain
+    corrected = np.full(half, corrects)
+    if system.frequencies is None:
+        fastest = _largest_frequency(system)
+    else:
+        bodies, moons = system.frequencies
+        fastest = max(float(bodies.max(initial=0.0)), moons * limit / plain)  # which nothing corrects
+        if corrects:
+            fast = h * bodies > CORRECTED_SHARE * plain
+            corrected = np.repeat(fast | (fast.any() & (bodies == 0.0)), half // bodies.size)
+    if not h * fastest <= limit:
+        raise ValueError(
+            f"{name}: h = {h:g} is not stable for a motion as fast as the fastest one at the start, of frequency "
+            f"{fastest:.4g} (period {2 * np.pi / fastest:.4g}). Take h <= {limit / fastest:.3g}, or a method whose "
+            "steps are less bound, such as EIPRKN12."
+        )
+    if method.velocities:
+        strongest, limit = _largest_damping(system), damping_limit(method.order)
+        if not h * strongest <= limit:
+            raise ValueError(
+                f"{name}: h = {h:g} is not stable for accelerations that change with the velocity as much as here, by "
+                f"{strongest:.4g} per unit of time at the start. Take h <= {limit / strongest:.3g}, or a Runge-Kutta "
+                "method such as EIPDOP853."
+            )
+    width = 2 if y0.dtype.kind == "c" else 1
+    places = np.flatnonzero(corrected)
+    return slice(width * int(places[0]), width * int(places[-1] + 1)) if places.size else slice(0, 0)
+
+
+def _largest_frequency(system: SecondOrder) -> float:
+    """The largest frequency of small changes of the state at the start: of the Jacobian's most negative eigenvalue."""
+    t, y, _, _ = system.start
+    half = y.size // 2
+
+    def along(d: Array) -> Array:
+        return _difference(system, d, slice(0, half)) if system.jacobian is None else system.jacobian(t, y[:half], d)
+
+    top = _largest(along, y)
+    return float(np.sqrt(max(0.0, _largest(lambda d: top * d - along(d), y) - top))) if top else 0.0
+
+
+def _largest_damping(system: SecondOrder) -> float:
+    """The largest eigenvalue, by its size, of the accelerations' derivative by the velocities at the start."""
+    y = system.start.y
+    return _largest(lambda d: _difference(system, d, slice(y.size // 2, None)), y)
+
+
+def _difference(system: SecondOrder, d: Array, part: slice) -> Array:
+    """What the accelerations change by along a change d of a part of the state."""
+    t, y, f, _ = system.start
+    half, length = y.size // 2, DIFFERENCE * (float(np.linalg.norm(y[part])) or 1.0)
+    moved = y.copy()
+    moved[part] += length * d
+    return np.asarray((system.rhs(t, moved)[half:] - f[half:]) / length)
+
+
+def _largest(product: Callable[[Array], Array], y: Array) -> float:
+    """The largest eigenvalue of a matrix, by its size, to some per cent: from its products with vectors."""
+    d, found = np.random.default_rng(0).standard_normal(y.size // 2).astype(y.dtype), 0.0
+    for _ in range(ROUNDS):
+        d = product(d / np.linalg.norm(d))
+        found = float(np.linalg.norm(d))
+        if not np.isfinite(found) or found == 0.0:
+            return 0.0
+    return found
+
+
+def _record(
+    run: Run, method: GaussJackson, corrected: slice, stepping: Stepping, *, brief: bool, level: bool
+) -> Multistep:
+    order, half = method.order, run.work.err.size // 2
+    pitch = -(-half // 8) * 8
+    limit = stability_limit(order, method.corrected)
+    return Multistep(
+        **weights(order)._asdict(),
+        growth=max(SMOOTH, min(SMOOTH_LOW * limit**order, 2.0 ** (order - 2))),
+        middle=method.middle,
+        brief=brief,
+        level=level,
+        uses_v=method.velocities,
+        t0=stepping.span.t0,
+        h=stepping.span.h,
+        substeps=SUBSTEPS if method.velocities else 1,
+        spacing=AUTO_SPACING if run.options.every == AUTO else run.options.every,
+        corrected_first=corrected.start,
+        corrected_count=corrected.stop - corrected.start,
+        nodes=_aligned((ROWS * order, pitch)),
+        sums=_aligned((4, pitch)),
+        moved=_aligned((pitch,)),
+        levels=np.zeros((3, run.invariants.size)),
+        place=np.zeros(N_NODE_PLACES, np.int64),
+    )
+
+
+def _aligned(shape: tuple[int, ...]) -> Array:
+    """Zeros from the beginning of a cache line on: else each load of a vector may take two."""
+    size = int(np.prod(shape))
+    memory = np.zeros(size * 8 + ALIGNMENT, np.uint8)
+    first = -memory.ctypes.data % ALIGNMENT
+    return memory[first : first + size * 8].view(np.float64).reshape(shape)

@@ -1,0 +1,401 @@
+"""Multistep methods through integrate and solve_ivp: orders, what lies between steps, bits, and what they refuse."""
+
+import mpmath
+import numba
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from systems import jit_energy, jit_energy_gradient, jit_momentum, jit_momentum_gradient
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ12,
+    EIPGJ14,
+    EIPRKN12,
+    Diagnostics,
+    GaussJackson,
+    Invariant,
+    ProjectionWarning,
+    eip_method,
+    ensemble,
+    integrate,
+)
+from eip_scipy.problems import Problem, nbody, solar_system
+
+both = pytest.mark.parametrize("method", [EIPGJ12, EIPGJ14])
+E = 0.2
+Y0 = np.array([1 - E, 0.0, 0.0, np.sqrt((1 + E) / (1 - E))])
+STEP = 2 * np.pi / 256
+
+
+@numba.njit
+def acceleration(t, q):
+    return -q / (q[0] ** 2 + q[1] ** 2) ** 1.5
+
+
+@numba.njit
+def jacobian(t, q, dq, out):
+    square = q[0] ** 2 + q[1] ** 2
+    along = 3 * (q[0] * dq[0] + q[1] * dq[1]) / square
+    for k in range(2):
+        out[k] = (along * q[k] - dq[k]) / square**1.5
+
+
+def orbit(t, y):
+    return np.concatenate([y[2:], acceleration(t, y[:2])])
+
+
+INVARIANTS = (Invariant(jit_energy, jit_energy_gradient), Invariant(jit_momentum, jit_momentum_gradient))
+KEPT = {"invariants": INVARIANTS, "blocks": 2}
+
+
+def exact(times, y0=Y0):
+    """States of Kepler's problem from the pericentre of this start, in 30 digits."""
+    out = []
+    with mpmath.workdps(30):
+        q, v = (mpmath.mpf(float(x)) for x in (y0[0], y0[3]))
+        axis = 1 / (2 / q - v * v)
+        e, n = 1 - q / axis, axis ** mpmath.mpf(-1.5)
+        side = mpmath.sqrt(1 - e * e)
+        for t in np.atleast_1d(times):
+            mean = n * mpmath.mpf(float(t))
+            angle = mpmath.findroot(lambda u, mean=mean: u - e * mpmath.sin(u) - mean, mean)
+            c, s = mpmath.cos(angle), mpmath.sin(angle)
+            speed = n * axis / (1 - e * c)
+            out.append([float(x) for x in (axis * (c - e), axis * side * s, -speed * s, speed * side * c)])
+    return np.array(out).T
+
+
+@pytest.mark.parametrize("order", range(8, 15))
+def test_order(order):
+    """The error after ten revolutions falls with the order, in steps that truncation decides."""
+    method = eip_method(GaussJackson(order=order, corrected=True))
+    counts = {
+        8: (160, 200),
+        9: (160, 200),
+        10: (140, 180),
+        11: (80, 100),
+        12: (80, 100),
+        13: (100, 130),
+        14: (100, 140),
+    }
+    end = 20 * np.pi
+    errors = [
+        np.abs(
+            integrate(acceleration, (0, end), Y0, method=method, h=2 * np.pi / n, jacobian=jacobian, compiled=False).y[
+                :, -1
+            ]
+            - exact(end)[:, 0]
+        ).max()
+        for n in counts[order]
+    ]
+    found = np.log(errors[0] / errors[1]) / np.log(counts[order][1] / counts[order][0])
+    assert errors[1] > 1e-13
+    assert order - 1 < found < order + 4
+
+
+@both
+def test_a_long_run_keeps_its_invariants_and_its_orbit(method):
+    """A hundred revolutions, both errors near round-off; the result says so."""
+    record = Diagnostics()
+    run = integrate(
+        acceleration,
+        (0, 200 * np.pi),
+        Y0,
+        method=method,
+        h=STEP,
+        jacobian=jacobian,
+        diagnostics=record,
+        save_every=999,
+        **KEPT,
+    )
+    assert run.success
+    assert run.trusted
+    assert run.compiled
+    assert run.calls["jacobian"] == "jitted" if method is EIPGJ14 else "jacobian" not in run.calls
+    assert np.all(run.max_defect < 1e-15)
+    assert np.abs(run.y - exact(run.t)).max() < 2e-11
+    assert run.nfev < 256 * 100 + 600
+    assert record.n_projections + record.n_skipped > 100
+
+
+@both
+def test_projection_is_what_keeps_the_orbit(method):
+    """Without invariants the truncation of long steps adds up."""
+    h = 2 * np.pi / (190 if method is EIPGJ12 else 90)
+    given = {"method": method, "h": h, "jacobian": jacobian}
+    end = 400 * np.pi
+    kept, left = (integrate(acceleration, (0, end), Y0, **given, **options).y[:, -1] for options in (KEPT, {}))
+    assert np.abs(kept - exact(end)[:, 0]).max() < 0.3 * np.abs(left - exact(end)[:, 0]).max()
+
+
+@both
+@pytest.mark.parametrize("sign", [1, -1])
+def test_between_steps(method, sign):
+    """t_eval, dense output and saved steps, backward too, to 1e-12 of the closed form; the two agree in bits."""
+    end = 20.3
+    y0 = Y0 if sign > 0 else Y0 * [1, 1, -1, -1]
+    times = np.linspace(0, end, 333)
+    given = {"method": method, "h": STEP, "jacobian": jacobian, **KEPT}
+    run = integrate(acceleration, (0, sign * end), y0, dense_output=True, save_every=1, **given)
+    flip = np.array([1, 1, sign, sign])[:, None]
+    assert np.abs(run.y * flip - exact(np.abs(run.t))).max() < 2e-13
+    assert np.abs(run.sol(sign * times) * flip - exact(times)).max() < 1e-12
+    sampled = integrate(acceleration, (0, sign * end), y0, t_eval=sign * times, **given)
+    assert np.array_equal(sampled.y, run.sol(sign * times))
+    assert np.array_equal(run.sol(run.t), run.y)
+
+
+@both
+def test_few_steps(method):
+    """Runs shorter than a history are those of the method that starts."""
+    for count in (1, 2, 5, 11, 12, 13, 14, 15, 16, 17, 20, 27):
+        for extra in (0.0, 0.3):
+            end = (count + extra) * STEP
+            run = integrate(acceleration, (0, end), Y0, method=method, h=STEP, save_every=1, jacobian=jacobian, **KEPT)
+            assert run.t.size == count + 1 + (extra > 0)
+            assert np.abs(run.y - exact(run.t)).max() < 3e-15
+
+
+def test_bits_do_not_depend_on_what_is_saved():
+    """Nor on chunks: rows, times and events are looked at, and change nothing."""
+    given = {"method": EIPGJ14, "h": STEP, "jacobian": jacobian, **KEPT}
+    last = [
+        integrate(acceleration, (0, 60), Y0, **given, **options).y[:, -1]
+        for options in (
+            {},
+            {"save_every": 1},
+            {"save_every": 77},
+            {"dense_output": True},
+            {"events": lambda t, y: y[0]},
+        )
+    ]
+    assert all(np.array_equal(state, last[0]) for state in last)
+
+
+def test_python_jitted_and_native_functions_give_the_same_bits():
+    """Of Kepler's problem in three dimensions, the library's functions beside Python's."""
+    problem = nbody([1.0, 1e-3], [[0, 0, 0], [0.8, 0, 0.1]], [[0, -1e-3, 0], [0, 1.2, 0.1]], t_span=(0, 20), h=0.05)
+    native = integrate(problem, method=EIPGJ14)
+    assert native.calls["jacobian"] == "native"
+    interpreted = integrate(problem, method=EIPGJ14, compiled=False)
+    assert np.array_equal(native.y, interpreted.y)
+    given = {"method": EIPGJ14, "h": STEP, **KEPT}
+    compiled = integrate(acceleration, (0, 20), Y0, jacobian=jacobian, **given)
+    python = integrate(acceleration, (0, 20), Y0, jacobian=jacobian, compiled=False, **given)
+    assert compiled.compiled
+    assert not python.compiled
+    assert np.array_equal(compiled.y, python.y)
+
+
+def test_events():
+    """Passages through the pericentre, and an end at one."""
+
+    def pericentre(t, y):
+        return y[0] * y[2] + y[1] * y[3]
+
+    pericentre.direction = 1
+    run = integrate(acceleration, (0, 40), Y0, method=EIPGJ14, h=STEP, jacobian=jacobian, events=pericentre, **KEPT)
+    period = 2 * np.pi
+    later = run.t_events[0][run.t_events[0] > 1]
+    assert np.allclose(later, period * np.arange(1, 7), rtol=0, atol=1e-11)
+    pericentre.terminal = run.t_events[0].size - 3
+    run = integrate(acceleration, (0, 40), Y0, method=EIPGJ14, h=STEP, jacobian=jacobian, events=pericentre, **KEPT)
+    assert run.status == 1
+    assert abs(run.t[-1] - 3 * period) < 1e-11
+
+
+@both
+def test_a_resumed_run_has_the_same_bits(method, tmp_path):
+    """Broken off in the start, early, and late."""
+    problem = solar_system(years=30)
+    given = {"method": method, "h": 1 / 600, "save_every": 500}
+    whole = integrate(problem, **given)
+    for stop in (1, 4, 30):
+        path, seen = tmp_path / f"{stop}.npz", []
+
+        def broken(t, y, defects, seen=seen, stop=stop):
+            seen.append(t)
+            if len(seen) > stop:
+                raise RuntimeError("power cut")
+
+        with pytest.raises(RuntimeError, match="power cut"):
+            integrate(problem, checkpoint=path, callback=broken, **given)
+        again = integrate(problem, checkpoint=path, resume=True, **given)
+        assert "resumed at step" in again.message
+        assert np.array_equal(again.y, whole.y)
+        assert np.array_equal(again.max_defect, whole.max_defect)
+        assert again.nfev == whole.nfev
+
+
+def test_members_have_the_bits_of_single_runs():
+    """In an ensemble, one after the other."""
+    problem = solar_system(years=3)
+    starts = problem.y0 * (1 + 1e-6 * np.arange(3)[:, None])
+    result = ensemble(problem, None, starts, method=EIPGJ14, h=1 / 500)
+    for member, start in zip(result.y, starts, strict=True):
+        assert np.array_equal(member, integrate(problem, y0=start, method=EIPGJ14, h=1 / 500).y[:, -1])
+
+
+@pytest.mark.parametrize("forces", ["gr-potential", "1pn", "eih", ("gr-potential", "j2")])
+def test_forces(forces):
+    """Relativity by velocities too, beside a tight run of another method."""
+    problem = solar_system(years=2, forces=forces)
+    run = integrate(problem, method=EIPGJ14, h=1 / 600)
+    other = integrate(problem, method=EIPDOP853, h=1 / 2000, compensated=True)
+    assert run.trusted
+    # The energy of "eih", kept to 1e-13, is Mercury's to 4e-11.
+    assert np.abs(run.y[:30, -1] - other.y[:30, -1]).max() < (2e-11 if forces == "eih" else 3e-13)
+
+
+def test_velocities_are_found_in_solve_ivp():
+    """A damped oscillator: of the order that the method has, whatever the forces see."""
+
+    def damped(t, y):
+        return np.array([y[1], -y[0] - 0.1 * y[1]])
+
+    errors, method = [], eip_method(GaussJackson(order=8))
+    for h in (0.1, 0.08):
+        solution = solve_ivp(damped, (0, 20), [1.0, 0.0], method=method, h=h)
+        w = np.sqrt(1 - 0.05**2)
+        t = solution.t
+        exact = np.exp(-0.05 * t) * (np.cos(w * t) + 0.05 / w * np.sin(w * t))
+        errors.append(np.abs(solution.y[0] - exact).max())
+    assert 8 < np.log(errors[0] / errors[1]) / np.log(0.1 / 0.08) < 12
+    with pytest.raises(
+        ValueError, match=r"change with the velocity as much as here, by 0\.1 .* Take h <= 0\.00887, or"
+    ):
+        solve_ivp(damped, (0, 20), [1.0, 0.0], method=EIPGJ12, h=0.05)
+
+
+def test_solve_ivp():
+    """Its states are those at the newest end of the history; events and dense output as of any solver."""
+    times = np.linspace(0, 20, 101)
+    solution = solve_ivp(
+        orbit,
+        (0, 20),
+        Y0,
+        method=EIPGJ14,
+        h=STEP,
+        jacobian=jacobian,
+        dense_output=True,
+        t_eval=times,
+        events=lambda t, y: y[1],
+        **KEPT,
+    )
+    assert solution.success
+    assert np.abs(solution.y - exact(times)).max() < 1e-12
+    assert np.abs(solution.sol(times) - exact(times)).max() < 1e-12
+    found = solution.t_events[0][solution.t_events[0] > 1]
+    assert np.allclose(found, np.pi * np.arange(1, found.size + 1), rtol=0, atol=1e-11)
+    assert solution.nfev < 20 / STEP + 600
+
+
+def test_a_step_that_is_not_stable_is_refused_with_one_that_is():
+    """At the start, from the orbits or from the accelerations alone."""
+    problem = solar_system(years=10)
+    with pytest.raises(ValueError, match=r"EIPGJ12: h = 0\.004 is not stable .* Take h <= (0\.00\d+)") as error:
+        integrate(problem, method=EIPGJ12, h=0.004)
+    longest = float(str(error.value).split("Take h <= ")[1].split(",")[0])
+    assert integrate(problem, method=EIPGJ12, h=0.99 * longest).trusted
+    with pytest.raises(ValueError, match=r"of frequency 3 \(period 2\.094\)\. Take h <= 0\.0217"):
+        integrate(lambda t, q: -np.array([1.0, 9.0]) * q, (0, 10), [1.0, 1.0, 0.0, 0.0], method=EIPGJ12, h=0.05)
+    with pytest.raises(ValueError, match="is not stable"):
+        solve_ivp(orbit, (0, 20), Y0, method=EIPGJ14, h=STEP)  # which has no Jacobian here
+
+
+def test_what_becomes_unstable_is_told():
+    """A close passage that the start does not show ends the run, with what it had."""
+    start = np.array([1.0, 0.0, 0.0, 0.02])
+    run = integrate(acceleration, (0, 5), start, method=EIPGJ12, h=0.005, save_every=10)
+    assert run.status == -1
+    assert not run.trusted
+    assert "the step is too long, or the motion not smooth" in run.message
+    assert "EIPRKN12" in run.message
+    assert 0.5 < run.t[-1] < 1.3
+    assert np.isfinite(run.y).all()
+
+
+def test_a_force_that_jumps_is_told():
+    """Differences of its history do not fall."""
+    run = integrate(lambda t, q: -q * (1.0 if t < 3 else 1.5), (0, 20), [1.0, 0.0], method=EIPGJ12, h=0.03)
+    assert run.status == -1
+    assert "or forces jump" in run.message
+    assert 3 <= float(run.message.split("at t=")[1].split(":")[0]) < 6
+
+
+def test_a_false_invariant_is_told():
+    """As of other methods."""
+    false = Invariant(lambda t, y: y[0] ** 2 + y[3], lambda t, y: np.array([2 * y[0], 0, 0, 1.0]))
+    with pytest.warns(ProjectionWarning, match="is no invariant of this system"):
+        run = integrate(acceleration, (0, 30), Y0, method=EIPGJ12, h=STEP, invariants=false)
+    assert not run.trusted
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"direction": "old"}, ValueError, "has no step that starts at a state"),
+        ({"compensated": False}, ValueError, "always carry their rounding"),
+        ({"h": None}, ValueError, "takes fixed steps and needs the step h"),
+        ({"rtol": 1e-6, "h": None}, ValueError, "takes fixed steps"),
+        ({"jacobian": 3}, TypeError, r"jacobian must be a function jacobian\(t, q, dq, out"),
+    ],
+)
+def test_bad_options(options, error, message):
+    """What came, and what to do."""
+    with pytest.raises(error, match=message):
+        integrate(acceleration, (0, 1), Y0, **{"method": EIPGJ12, "h": 0.01, **KEPT, **options})
+
+
+def test_states_that_are_none():
+    """Not (q, v), or an odd number of components."""
+    with pytest.raises(ValueError, match="first 2 components of fun must be v"):
+        solve_ivp(lambda t, y: -y, (0, 1), np.ones(4), method=EIPGJ12, h=0.01)
+    with pytest.raises(ValueError, match="an even number of components"):
+        solve_ivp(lambda t, y: -y, (0, 1), np.ones(3), method=EIPGJ12, h=0.01)
+
+
+def test_no_step_to_override():
+    """A subclass cannot end what is no step."""
+
+    class Mine(EIPGJ12):
+        def _project_step(self, t, y, y_hat, err):
+            return y_hat
+
+    with pytest.raises(TypeError, match="has no step that _project_step could end"):
+        solve_ivp(orbit, (0, 1), Y0, method=Mine, h=0.01)
+
+
+def test_what_is_not_finite():
+    """Where it was, as of other methods."""
+    run = integrate(lambda t, q: -q if t < 1 else q * np.nan, (0, 3), [1.0, 0.0], method=EIPGJ12, h=0.03)
+    assert run.status == -1
+    assert "fun returned a non-finite value at t=1.02" in run.message
+
+
+@both
+def test_test_particles_and_many_bodies(method):
+    """A ring of test particles about a star and a planet: each on the orbit that EIPRKN12 gives it."""
+    rng = np.random.default_rng(1)
+    count = 40
+    angle, radius = 2 * np.pi * rng.random(count), 1 + 0.3 * rng.random(count)
+    place = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.05 * rng.standard_normal(count)], 1)
+    speed = np.stack([-np.sin(angle), np.cos(angle), np.zeros(count)], 1) / np.sqrt(radius)[:, None]
+    problem = nbody(
+        [1.0, 1e-3, *np.zeros(count)],
+        [[0, 0, 0], [5.0, 0, 0], *place],
+        [[0, -1e-3 / np.sqrt(5), 0], [0, 1 / np.sqrt(5), 0], *speed],
+        t_span=(0, 30),
+    )
+    run = integrate(problem, method=method, h=0.02)
+    other = integrate(problem, method=EIPRKN12, h=0.1, compensated=True)
+    assert run.trusted
+    assert np.abs(run.y[:, -1] - other.y[:, -1]).max() < 1e-12
+
+
+def test_a_problem_of_ones_own():
+    """Velocities in `fun` of a Problem, which has the whole derivative."""
+    problem = Problem(name="orbit", fun=orbit, y0=Y0, t_span=(0, 10), invariants=INVARIANTS, h=STEP)
+    run = integrate(problem, method=EIPGJ12)
+    assert np.abs(run.y[:, -1] - exact(10)[:, 0]).max() < 2e-14

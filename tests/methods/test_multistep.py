@@ -1,0 +1,157 @@
+"""The coefficients of Gauss-Jackson's methods, and the limits of their stability."""
+
+from fractions import Fraction
+from math import comb
+
+import numpy as np
+import pytest
+
+from eip_scipy import GaussJackson, eip_method
+from eip_scipy.methods.multistep import (
+    correction_weights,
+    interpolation_weights,
+    position_series,
+    position_weights,
+    stability_limit,
+    velocity_series,
+    velocity_weights,
+    weights,
+)
+
+ORDERS = (4, 7, 10, 12, 14, 16)
+
+
+def test_published_coefficients():
+    """Henrici (1962), tables 5.1, 6.1 and 6.2, and Berry and Healy (2004): of Stoermer, Cowell and Adams-Moulton."""
+    stormer = ["1/12", "1/12", "19/240", "3/40", "863/12096", "275/4032", "33953/518400", "8183/129600"]
+    cowell = ["1/12", "0", "-1/240", "-1/240", "-221/60480", "-19/6048", "-9829/3628800", "-407/172800"]
+    moulton = ["-1/2", "-1/12", "-1/24", "-19/720", "-3/160", "-863/60480", "-275/24192", "-33953/3628800"]
+    assert position_series(-1, 8) == [Fraction(c) for c in stormer]
+    assert position_series(0, 8) == [Fraction(c) for c in cowell]
+    assert velocity_series(0, 8) == [Fraction(c) for c in moulton]
+
+
+def missed_by_position(back, order, k):
+    """What the formula misses of q = t^(k + 2), by second differences, which take the sums out: exact fractions."""
+
+    def a(n):
+        return (k + 2) * (k + 1) * Fraction(n) ** k
+
+    def q(n):
+        return Fraction(n) ** (k + 2)
+
+    sums = a(0) - (1 + back) * (a(0) - a(-1))  # of S - (1 + back) s
+    formula = position_weights(back, order)
+    rest = sum(w * (a(-j) - 2 * a(-j - 1) + a(-j - 2)) for j, w in enumerate(formula))
+    return q(-back) - 2 * q(-back - 1) + q(-back - 2) - sums - rest
+
+
+def missed_by_velocity(back, order, k):
+    """The same of v = t^(k + 1) / (k + 1), by first differences."""
+    change = sum(w * (Fraction(-j) ** k - Fraction(-j - 1) ** k) for j, w in enumerate(velocity_weights(back, order)))
+    later, earlier = (Fraction(n) ** (k + 1) / (k + 1) for n in (-back, -back - 1))
+    return later - earlier - Fraction(0) ** k - change
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_exact_for_polynomials_up_to_the_order(order):
+    """All formulas are exact for accelerations t^k, k < order; the predictor and the velocity's for no higher ones."""
+    for k in range(order):
+        assert [missed_by_position(back, order, k) for back in (-1, 0, 1, order // 2, order - 1)] == [0] * 5
+        assert [missed_by_velocity(back, order, k) for back in (0, 1, order // 2, order - 1)] == [0] * 4
+    assert missed_by_position(-1, order, order + 2) != 0  # what is missed of t^(order + 2) the differences take out
+    assert missed_by_velocity(0, order, order + 1) != 0
+
+
+@pytest.mark.parametrize("order", [8, 12, 14])
+def test_correction_is_a_difference(order):
+    """Corrector less predictor is a multiple of the difference of the accelerations of that order."""
+    found = correction_weights(order)
+    assert found[0] != 0
+    assert found == [found[0] * (-1) ** j * comb(order, j) for j in range(order + 1)]
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_rounded_weights_keep_their_moments(order):
+    """Each rounded up or down, all together miss their moments by far less than the nearest floats would."""
+    exact = position_weights(-1, order)[::-1]
+    rounded = weights(order).predict_q
+
+    def missed(values):
+        return [
+            abs(
+                float(
+                    sum(
+                        (Fraction(v) - e) * (order - i) ** k for i, (v, e) in enumerate(zip(values, exact, strict=True))
+                    )
+                )
+            )
+            for k in range(3)
+        ]
+
+    nearest = [float(e) for e in exact]
+    assert all(abs(r - n) <= np.spacing(abs(n)) for r, n in zip(rounded, nearest, strict=True))
+    scale = np.array([1, 1 / 16, 1 / 256])
+    assert np.dot(missed(rounded), scale) <= np.dot(missed(nearest), scale)
+    assert np.dot(missed(rounded), scale) < 5e-15
+
+
+@pytest.mark.parametrize("order", [4, 7, 14])
+def test_interpolation(order):
+    """Each polynomial is 1 at its node and 0 at the others."""
+    for back in range(order):
+        nodes = [back - j for j in range(order)]
+        table = interpolation_weights(order)[back]
+        values = [[sum(Fraction(c) * Fraction(x) ** p for p, c in enumerate(row)) for x in nodes] for row in table]
+        assert np.allclose(np.array(values, float), np.eye(order), atol=1e-5)
+
+
+def amplitude(order, corrected, x, steps=3000):
+    """Of the recursion itself for q'' = -q after so many steps of length x, from an exact start."""
+    z = x * x
+    P, D = (np.array([float(w) for w in f(order)]) for f in (lambda k: position_weights(-1, k), correction_weights))
+    a = list(-np.cos(x * np.arange(-2, order)))
+    q = [np.cos(x * (order - 2)), np.cos(x * (order - 1))]
+    for _ in range(steps):
+        recent = np.array(a[: -order - 3 : -1])
+        second = recent[:-2] - 2 * recent[1:-1] + recent[2:]
+        # q = h^2 (S + sum P a), whose second difference has no sum left.
+        q = [q[1], 2 * q[1] - q[0] + z * (recent[0] + P @ second)]
+        value = -q[1]
+        if corrected:
+            value -= z * (D[0] * value + D[1:] @ recent[:order])
+        a.append(value)
+        if abs(value) > 1e6:
+            return np.inf
+    return max(abs(v) for v in a[-100:])
+
+
+@pytest.mark.parametrize("order", [4, 6, 8, 10, 12, 14])
+@pytest.mark.parametrize("corrected", [False, True])
+def test_stability_limit(order, corrected):
+    """The recursion in plain floats is bounded below the limit, and grows above it."""
+    limit = stability_limit(order, corrected)
+    assert amplitude(order, corrected, 0.97 * limit) < 2
+    assert amplitude(order, corrected, 1.3 * limit) > (1e3 if order >= 10 else 1.05)
+
+
+def test_limits_fall_with_the_order():
+    """Higher orders are less stable; the corrected ones far more than those that are not."""
+    plain = np.array([stability_limit(order, False) for order in range(8, 17)])
+    corrected = np.array([stability_limit(order, True) for order in range(8, 17)])
+    assert np.all(np.diff(plain) < 0)
+    assert np.all(np.diff(corrected)[1:] < 0)
+    assert np.all(corrected > 3 * plain)
+
+
+@pytest.mark.parametrize("order", [3, 17, 4.0, True, "12"])
+def test_orders(order):
+    """What came, and what is known."""
+    with pytest.raises(ValueError, match=r"order must be an integer from 4 to 16, got"):
+        GaussJackson(order=order)
+
+
+def test_names():
+    """A class of any order."""
+    assert eip_method(GaussJackson(order=10)).__name__ == "EIP_GJ10"
+    assert repr(GaussJackson(order=14, corrected=True)) == "<GaussJackson GJ14: order 14, corrected by the Jacobian>"
