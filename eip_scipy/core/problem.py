@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -76,15 +77,15 @@ class Problem:
 
 
 def bind(rhs: Callable[..., None], params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
-    """``fun(t, y)`` from ``rhs(t, y, out, params)``."""
+    """``fun(t, y)`` from ``rhs(t, y, out, params)``; it pickles where `rhs` does."""
+    return partial(_derivative, rhs, params)
 
-    def fun(t: float, y: np.ndarray) -> np.ndarray:
-        y = np.ascontiguousarray(y)
-        out = np.empty_like(y)
-        rhs(t, y, out, params)
-        return out
 
-    return fun
+def _derivative(rhs: Callable[..., None], params: np.ndarray, t: float, y: np.ndarray) -> np.ndarray:
+    y = np.ascontiguousarray(y)
+    out = np.empty_like(y)
+    rhs(t, y, out, params)
+    return out
 
 
 def native_invariant(function: str, name: str, params: np.ndarray) -> Invariant:
