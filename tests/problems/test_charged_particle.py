@@ -321,7 +321,11 @@ def test_own_field(name):
 
 @pytest.mark.needs_jit
 @pytest.mark.parametrize(
-    "name", [name if name == "B alone" else pytest.param(name, marks=pytest.mark.slow) for name in MIRRORS]
+    "name",
+    [
+        name if name == "B alone" else pytest.param(name, marks=[pytest.mark.nightly, pytest.mark.slow])
+        for name in MIRRORS
+    ],
 )
 def test_own_field_compiles(name):
     field, form, _ = MIRRORS[name]
@@ -364,7 +368,7 @@ def test_a_wrong_claim_of_symmetry_is_seen():
 
 @pytest.mark.slow
 @pytest.mark.needs_jit
-@pytest.mark.parametrize("form", ["canonical", "velocity"])
+@pytest.mark.parametrize("form", ["velocity", pytest.param("canonical", marks=[pytest.mark.nightly, pytest.mark.slow])])
 def test_compiled_functions_may_return_integers_and_arrays(form):
     @njit
     def mixed_a(x, y, z):
