@@ -90,7 +90,10 @@ def test_fields_along_many_points():
 
 problems = pytest.mark.parametrize(
     "problem",
-    [pytest.param(p, marks=pytest.mark.slow) if "velocity" in name else p for name, p in PROBLEMS.items()],
+    [
+        pytest.param(p, marks=[pytest.mark.nightly, pytest.mark.slow]) if "velocity" in name else p
+        for name, p in PROBLEMS.items()
+    ],
     ids=list(PROBLEMS),
 )
 

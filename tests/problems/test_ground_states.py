@@ -177,6 +177,7 @@ def test_ring_search_wants_a_hole():
         lowest_ring(trap(0.5))
 
 
+@pytest.mark.nightly
 @pytest.mark.needs_jit
 @pytest.mark.slow
 def test_small_ring_search_ends_below_all_its_neighbours():
