@@ -190,7 +190,7 @@ def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch)
 @pytest.mark.usefixtures("short")
 def test_another_end(tmp_path, start, capsys):
     """Snapshots and movie are those of the times that the run has."""
-    command = ["gpe", "ring", "--start", str(start), "--t-end", "0.12", "--out", str(tmp_path / "out")]
+    command = ["gpe", "ring", "--start", str(start), "--t-end", "0.12", "--movie", "--out", str(tmp_path / "out")]
     assert main(command) == 0
     text = capsys.readouterr().out
     assert "to t = 0.12" in text
@@ -200,6 +200,7 @@ def test_another_end(tmp_path, start, capsys):
     assert all(
         (tmp_path / "out" / name).read_bytes().startswith(PNG) for name in ("ring-snapshots.png", "ring-errors.png")
     )
+    assert (tmp_path / "out" / "ring.gif").read_bytes().startswith(GIF)
 
 
 @pytest.mark.slow
