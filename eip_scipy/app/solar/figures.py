@@ -194,7 +194,7 @@ def _cost_figure(study: SolarStudy, styles: Any) -> Any:
         unit="AU",
         styles=styles,
         title=f"Error against cost: runs of {study.cost_scene.years:g} yr, {study.scene.data.name}",
-        footnote=f"{describe_machine()}; one thread, least of {REPEATS} timings, one above {ENOUGH_SECONDS} s",
+        footnote=f"{describe_machine()}; one thread, least of {REPEATS} timings, or one above {ENOUGH_SECONDS} s",
     )
 
 
