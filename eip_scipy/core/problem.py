@@ -76,15 +76,15 @@ class Problem:
         object.__setattr__(self, "rhs", by_pointer(self.rhs, "rhs"))
 
 
-def bind(rhs: Callable[..., None], params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
-    """``fun(t, y)`` from ``rhs(t, y, out, params)``; it pickles where `rhs` does."""
-    return partial(_derivative, rhs, params)
+def bind(rhs: Callable[..., None], params: np.ndarray | None) -> Callable[[float, np.ndarray], np.ndarray]:
+    """``fun(t, y)`` from ``rhs(t, y, out, params)``, or ``rhs(t, y, out)`` without; it pickles where `rhs` does."""
+    return partial(_derivative, rhs, () if params is None else (params,))
 
 
-def _derivative(rhs: Callable[..., None], params: np.ndarray, t: float, y: np.ndarray) -> np.ndarray:
+def _derivative(rhs: Callable[..., None], extra: tuple[np.ndarray, ...], t: float, y: np.ndarray) -> np.ndarray:
     y = np.ascontiguousarray(y)
     out = np.empty_like(y)
-    rhs(t, y, out, params)
+    rhs(t, y, out, *extra)
     return out
 
 
