@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -83,16 +84,16 @@ class Problem:
         object.__setattr__(self, "rhs", by_pointer(self.rhs, "rhs"))
 
 
-def bind(rhs: Callable[..., None], params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
-    """``fun(t, y)`` from ``rhs(t, y, out, params)``."""
+def bind(rhs: Callable[..., None], params: np.ndarray | None) -> Callable[[float, np.ndarray], np.ndarray]:
+    """``fun(t, y)`` from ``rhs(t, y, out, params)``, or ``rhs(t, y, out)`` without; it pickles where `rhs` does."""
+    return partial(_derivative, rhs, () if params is None else (params,))
 
-    def fun(t: float, y: np.ndarray) -> np.ndarray:
-        y = np.ascontiguousarray(y)
-        out = np.empty_like(y)
-        rhs(t, y, out, params)
-        return out
 
-    return fun
+def _derivative(rhs: Callable[..., None], extra: tuple[np.ndarray, ...], t: float, y: np.ndarray) -> np.ndarray:
+    y = np.ascontiguousarray(y)
+    out = np.empty_like(y)
+    rhs(t, y, out, *extra)
+    return out
 
 
 def native_invariant(function: str, name: str, params: np.ndarray) -> Invariant:

@@ -228,8 +228,9 @@ def orbits_figure(panels: Mapping[str, Orbits], bodies: Sequence[str], *, unit: 
     for axis, (name, orbits) in zip(axes, panels.items(), strict=True):
         for k, body in enumerate(bodies):
             colour = PALETTE[k % len(PALETTE)]
-            for path in np.asarray(orbits.paths)[k]:
-                axis.plot(*path, color=colour, lw=0.5)
+            axis.add_collection(
+                LineCollection(list(np.swapaxes(np.asarray(orbits.paths)[k], 1, 2)), colors=colour, lw=0.5)
+            )
             mark = {"marker": MARKERS[k % len(MARKERS)], "mec": "white", "ms": 7, "zorder": 3}
             axis.plot(*np.asarray(orbits.last)[k], ls="", color=colour, label=body, **mark)
         _plane(axis, name, unit)

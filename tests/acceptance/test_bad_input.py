@@ -298,7 +298,14 @@ class TestCompiledExceptions:
 
         return (in_place if where == "in place" else fun), Invariant(value, grad, name="S")
 
-    @pytest.mark.parametrize("where", ["fun", "in place", "value", "grad"])
+    @pytest.mark.parametrize(
+        "where",
+        [
+            "fun",
+            "grad",
+            *(pytest.param(name, marks=[pytest.mark.nightly, pytest.mark.slow]) for name in ("in place", "value")),
+        ],
+    )
     def test_propagate(self, where):
         fun, kept = self.functions(where)
         options = {"in_place": where == "in place", "invariants": kept, "compiled": True, "save_every": 10}

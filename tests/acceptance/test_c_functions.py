@@ -18,7 +18,10 @@ PRINTED = re.compile(r"^```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMANDS = {"cc": compiler(), "cythonize": [sys.executable, "-m", "Cython.Build.Cythonize"]}
 
 
-@pytest.mark.parametrize(("k", "script"), [(0, "with_ctypes.py"), (1, "with_cython.py")])
+@pytest.mark.parametrize(
+    ("k", "script"),
+    [(0, "with_ctypes.py"), pytest.param(1, "with_cython.py", marks=[pytest.mark.nightly, pytest.mark.slow])],
+)
 def test_example(k, script, tmp_path):
     shutil.copytree(ROOT / "examples" / "c-functions", tmp_path, dirs_exist_ok=True)
     first, *rest = shlex.split(BUILD.findall(PAGE)[k])

@@ -25,14 +25,17 @@ def assert_output(found, printed):
         assert agree(float(a), float(b)), f"{a}, printed as {b}"
 
 
-PAGES = (
-    "quickstart", "adaptive", "own-methods", "hard-scenes", "checkpoints", "ensembles", "charged-particles",
-    "gross-pitaevskii",
-)  # fmt: skip
+PAGES = ("quickstart", "adaptive", "own-methods", "checkpoints", "ensembles")
+NIGHTLY = ("hard-scenes", "charged-particles", "gross-pitaevskii")
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", *(pytest.param(f"docs/{page}.md", marks=pytest.mark.slow) for page in PAGES)]
+    "page",
+    [
+        "README.md",
+        *(pytest.param(f"docs/{page}.md", marks=pytest.mark.slow) for page in PAGES),
+        *(pytest.param(f"docs/{page}.md", marks=[pytest.mark.nightly, pytest.mark.slow]) for page in NIGHTLY),
+    ],
 )
 def test_page(page, capsys, tmp_path, monkeypatch):
     """All blocks of a page in turn, in one namespace; a block of text is what the code before it prints."""

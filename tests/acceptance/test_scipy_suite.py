@@ -189,6 +189,7 @@ def test_what_is_left_out_is_missed_by_scipy_too(key, name):
     assert used
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("label", METHODS)
 def test_args_with_a_tolerance_for_explicit_pairs(label):

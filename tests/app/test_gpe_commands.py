@@ -139,6 +139,11 @@ def short(monkeypatch):
 
 
 @pytest.fixture
+def no_plotting(monkeypatch):
+    monkeypatch.setitem(sys.modules, "eip_scipy.plotting", None)
+
+
+@pytest.fixture
 def start(tmp_path):
     """A stationary state in a file as `ground-state` writes it."""
     gpe = small_ring()
@@ -146,6 +151,7 @@ def start(tmp_path):
     return gpe_states.save_state(tmp_path / "start.npz", gpe_states.Found("", gpe, state))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_ring(tmp_path, start, capsys):
@@ -173,7 +179,7 @@ def test_ring(tmp_path, start, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("short")
+@pytest.mark.usefixtures("short", "no_plotting")
 def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch):
     monkeypatch.setattr(gpe_ring, "SENSE", 1)
     assert main(["gpe", "ring", "--start", str(start), "--out", str(tmp_path)]) == 1
@@ -184,17 +190,21 @@ def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch)
 @pytest.mark.usefixtures("short")
 def test_another_end(tmp_path, start, capsys):
     """Snapshots and movie are those of the times that the run has."""
-    command = ["gpe", "ring", "--start", str(start), "--t-end", "0.12", "--out", str(tmp_path / "out")]
+    command = ["gpe", "ring", "--start", str(start), "--t-end", "0.12", "--movie", "--out", str(tmp_path / "out")]
     assert main(command) == 0
     text = capsys.readouterr().out
     assert "to t = 0.12" in text
     assert "vortices in the snapshots: [2, 2]" in text
     times = [float(row["t"]) for row in read(tmp_path / "out" / "ring.csv") if row["method"] == "RK4"]
     np.testing.assert_allclose(times, [0, 0.05, 0.1, 0.12], atol=1e-15)
+    assert all(
+        (tmp_path / "out" / name).read_bytes().startswith(PNG) for name in ("ring-snapshots.png", "ring-errors.png")
+    )
+    assert (tmp_path / "out" / "ring.gif").read_bytes().startswith(GIF)
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("short")
+@pytest.mark.usefixtures("short", "no_plotting")
 @pytest.mark.parametrize("end", ["0.05", "0.005"])
 def test_an_end_before_the_vortices_have_turned(end, tmp_path, start, capsys):
     """What cannot be checked is said, and fails nothing."""
@@ -211,7 +221,7 @@ def test_an_end_before_the_first_step(tmp_path, start, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("short")
+@pytest.mark.usefixtures("short", "no_plotting")
 def test_a_stationary_state(start, tmp_path, monkeypatch):
     """Without a quench the gradients are parallel: that is counted, and nothing is nan."""
     monkeypatch.setattr(gpe_ring, "KAPPA_AFTER", 0.3)

@@ -239,6 +239,7 @@ def test_interrupt(tmp_path, monkeypatch, capsys):
 # --- the paper's figures, work and precision ---
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_figures_of_the_kepler_problem(tmp_path, capsys):

@@ -154,6 +154,7 @@ def test_figures_have_a_row_for_each_method(lines):
     np.testing.assert_array_equal(orbit, lines["EIP-H"].y[:2])
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_command_for_the_figures(lines, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(kepler_figures, "study", lambda: lines)

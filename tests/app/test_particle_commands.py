@@ -87,6 +87,7 @@ def test_checks_and_their_words():
     assert "between 1.0093 and 1.0097" in RangeCheck("s", "R of the tip", 1.0095, 1.0093, 1.0097).text
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.usefixtures("short_runs")
 def test_command(tmp_path, capsys):

@@ -98,7 +98,10 @@ def test_paper_is_as_far_from_the_50_digit_values_as_we_are(cells):
 
 @pytest.mark.parametrize(
     "series",
-    [pytest.param(s, marks=pytest.mark.slow) if (s["table"], s["method"]) == (3, "RK4") else s for s in EXACT],
+    [
+        pytest.param(s, marks=[pytest.mark.nightly, pytest.mark.slow]) if (s["table"], s["method"]) == (3, "RK4") else s
+        for s in EXACT
+    ],
     ids=lambda s: f"table{s['table']}-{s['method']}-{s['name']}",
 )
 def test_stored_50_digit_values(series):

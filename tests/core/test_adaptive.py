@@ -28,7 +28,7 @@ from eip_scipy.problems import kepler, solar_system
 
 EPS = np.finfo(float).eps
 METHODS = [EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]
-second_order = pytest.param(EIPRK2, marks=pytest.mark.slow)  # in thousands of steps
+second_order = pytest.param(EIPRK2, marks=[pytest.mark.nightly, pytest.mark.slow])  # in thousands of steps
 methods = pytest.mark.parametrize("method", [second_order, *METHODS[1:]], ids=lambda m: m.__name__)
 E = 0.6
 Y0 = pericentre(E)

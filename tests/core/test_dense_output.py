@@ -31,7 +31,7 @@ EPS = np.finfo(float).eps
 PAIRS = [EIPRK23, EIPRK45, EIPDOP853]
 OWN = {cls: eip_method(cls.TABLEAU) for cls in PAIRS}
 pairs = pytest.mark.parametrize("method", PAIRS, ids=lambda m: m.__name__)
-second_order = pytest.param(EIPRK2, marks=pytest.mark.slow)  # in thousands of steps
+second_order = pytest.param(EIPRK2, marks=[pytest.mark.nightly, pytest.mark.slow])  # in thousands of steps
 every_class = pytest.mark.parametrize("method", [*PAIRS, second_order, EIPRK4, EIPRK5], ids=lambda m: m.__name__)
 
 Y0 = pericentre(0.6)
@@ -306,7 +306,7 @@ LEVELS = {"default": {}, "backward": {"t_span": (8.0, 0.0)}, "every 3": {"every"
 @pytest.mark.slow_without_jit
 @pairs
 @pytest.mark.parametrize("kind", LEVELS)
-@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
+@pytest.mark.parametrize("rtol", [1e-4, pytest.param(1e-8, marks=[pytest.mark.nightly, pytest.mark.slow])])
 def test_adversarial_thresholds(method, kind, rtol):
     """None raises "f(a) and f(b) must have different signs", none is lost, and all stand on the manifold."""
     options = {"invariants": [H, L], "rtol": rtol, "atol": rtol * 1e-3, **LEVELS[kind]}
@@ -352,7 +352,9 @@ def test_thresholds_one_by_one_and_terminal(method):
 
 
 @pytest.mark.parametrize("method", [*PAIRS, *OWN.values()], ids=lambda m: m.__name__)
-@pytest.mark.parametrize("variant", [pytest.param("plain", marks=pytest.mark.slow), "complex plain"])
+@pytest.mark.parametrize(
+    "variant", [pytest.param("plain", marks=[pytest.mark.nightly, pytest.mark.slow]), "complex plain"]
+)
 def test_thresholds_without_invariants(method, variant):
     """SciPy's own RK45 raises here: its interpolant misses the end of a step by an ulp."""
     sol = solve(method, **VARIANTS[variant])

@@ -249,7 +249,9 @@ def test_projection_pays_and_costs_little():
 
 @pytest.mark.needs_jit
 @pytest.mark.slow
-@pytest.mark.parametrize("h", [0.02, 1 / 64, 0.01, 0.005])
+@pytest.mark.parametrize(
+    "h", [0.02, *(pytest.param(h, marks=[pytest.mark.nightly, pytest.mark.slow]) for h in (1 / 64, 0.01, 0.005))]
+)
 def test_spacing_by_itself_never_spoils_a_small_step(h):
     """every="auto" over 1000 years: no planet worse than twice without projection, or 3e-8 AU."""
     problem = solar_system()

@@ -295,7 +295,8 @@ RUNS = {
 }
 # Complex states take a driver of their own.
 runs = pytest.mark.parametrize(
-    "case", [pytest.param(name, marks=pytest.mark.slow) if "complex" in name else name for name in RUNS]
+    "case",
+    [pytest.param(name, marks=[pytest.mark.nightly, pytest.mark.slow]) if "complex" in name else name for name in RUNS],
 )
 projected = pytest.mark.parametrize("projected", [True, False], ids=["projected", "plain"])
 drivers = pytest.mark.parametrize(

@@ -346,7 +346,9 @@ def size_gradient(t, y, out):
 
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("fun", [oscillators, phases], ids=["real", "complex"])
-@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 9])
+@pytest.mark.parametrize(
+    "n", [1, 4, 9, *(pytest.param(n, marks=[pytest.mark.nightly, pytest.mark.slow]) for n in (2, 3, 5))]
+)
 def test_pointers_give_the_bits_of_calls_in_python(n, fun):
     y0 = np.linspace(1, 2, n).astype(float if fun is oscillators else complex)
     kept = Invariant(size, size_gradient, in_place=True)

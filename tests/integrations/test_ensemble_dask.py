@@ -82,6 +82,8 @@ def test_bits_do_not_depend_on_the_number_of_workers(workers):
         assert here.failed.tolist() == [33]
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 @slow
 def test_functions_without_a_module(pair):
     @njit

@@ -53,7 +53,9 @@ needs_mpirun = pytest.mark.skipif(MPIRUN is None, reason="there is no mpirun")
 
 
 @needs_mpirun
-@pytest.mark.parametrize("ranks", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "ranks", [2, *(pytest.param(n, marks=[pytest.mark.nightly, pytest.mark.slow]) for n in (1, 4))]
+)
 def test_results_are_the_serial_ones(ranks, serial, tmp_path):
     on_ranks(ranks, TESTS / "mpi_runs.py", "results.npz", cwd=tmp_path)
     with np.load(tmp_path / "results.npz") as results:
@@ -72,6 +74,7 @@ def test_results_are_the_serial_ones(ranks, serial, tmp_path):
                 np.testing.assert_array_equal(found, expected, err_msg=name)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @needs_mpirun
 def test_the_page(tmp_path):
@@ -176,7 +179,7 @@ FAILING = """
 
 @pytest.mark.slow
 @needs_mpirun
-@pytest.mark.parametrize("ranks", [2, 3])
+@pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=[pytest.mark.nightly, pytest.mark.slow])])
 def test_a_rank_that_raises(ranks, tmp_path):
     """Wherever it is: the others end with its message, nobody waits, and the communicator is as good as before."""
     (tmp_path / "run.py").write_text(textwrap.dedent(FAILING), encoding="utf-8")

@@ -38,8 +38,11 @@ def attraction(t, q, gm):
     for i in range(gm.size):
         for j in range(gm.size):
             if i != j:
-                d = q[3 * j : 3 * j + 3] - q[3 * i : 3 * i + 3]
-                a[3 * i : 3 * i + 3] += gm[j] * d / (d[0] ** 2 + d[1] ** 2 + d[2] ** 2) ** 1.5
+                x, y, z = q[3 * j] - q[3 * i], q[3 * j + 1] - q[3 * i + 1], q[3 * j + 2] - q[3 * i + 2]
+                pull = gm[j] / (x**2 + y**2 + z**2) ** 1.5
+                a[3 * i] += pull * x
+                a[3 * i + 1] += pull * y
+                a[3 * i + 2] += pull * z
     return a
 
 

@@ -90,7 +90,10 @@ def test_fields_along_many_points():
 
 problems = pytest.mark.parametrize(
     "problem",
-    [pytest.param(p, marks=pytest.mark.slow) if "velocity" in name else p for name, p in PROBLEMS.items()],
+    [
+        pytest.param(p, marks=[pytest.mark.nightly, pytest.mark.slow]) if "velocity" in name else p
+        for name, p in PROBLEMS.items()
+    ],
     ids=list(PROBLEMS),
 )
 
@@ -321,7 +324,11 @@ def test_own_field(name):
 
 @pytest.mark.needs_jit
 @pytest.mark.parametrize(
-    "name", [name if name == "B alone" else pytest.param(name, marks=pytest.mark.slow) for name in MIRRORS]
+    "name",
+    [
+        name if name == "B alone" else pytest.param(name, marks=[pytest.mark.nightly, pytest.mark.slow])
+        for name in MIRRORS
+    ],
 )
 def test_own_field_compiles(name):
     field, form, _ = MIRRORS[name]
@@ -364,7 +371,7 @@ def test_a_wrong_claim_of_symmetry_is_seen():
 
 @pytest.mark.slow
 @pytest.mark.needs_jit
-@pytest.mark.parametrize("form", ["canonical", "velocity"])
+@pytest.mark.parametrize("form", ["velocity", pytest.param("canonical", marks=[pytest.mark.nightly, pytest.mark.slow])])
 def test_compiled_functions_may_return_integers_and_arrays(form):
     @njit
     def mixed_a(x, y, z):

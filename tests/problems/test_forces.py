@@ -390,6 +390,7 @@ def test_nystrom_methods_say_why_they_cannot(forces):
         integrate(given, method=EIPRKN12)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_eih_energy_and_momenta_over_a_century_of_the_solar_system():

@@ -67,7 +67,12 @@ def test_without_rotation_it_is_the_radial_solution():
 @pytest.mark.needs_jit
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("Omega", "published", "count"), [(0.65, 3.6506129, 3), (0.71, 3.4997148, 4), (0.76, 3.3475310, 5)]
+    ("Omega", "published", "count"),
+    [
+        (0.65, 3.6506129, 3),
+        pytest.param(0.71, 3.4997148, 4, marks=pytest.mark.nightly),
+        pytest.param(0.76, 3.3475310, 5, marks=pytest.mark.nightly),
+    ],
 )
 def test_published_energies_and_their_vortices(Omega, published, count):
     gpe = trap(Omega)
@@ -172,6 +177,7 @@ def test_ring_search_wants_a_hole():
         lowest_ring(trap(0.5))
 
 
+@pytest.mark.nightly
 @pytest.mark.needs_jit
 @pytest.mark.slow
 def test_small_ring_search_ends_below_all_its_neighbours():

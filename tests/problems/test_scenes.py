@@ -145,7 +145,13 @@ def test_reference_file_can_be_made_anew(tmp_path):
 
 
 @pytest.mark.needs_jit
-@pytest.mark.parametrize(("make", "g"), [(lambda: kepler(0.6, 0.0), centre_time), (pythagorean, pair_time)])
+@pytest.mark.parametrize(
+    ("make", "g"),
+    [
+        pytest.param(lambda: kepler(0.6, 0.0), centre_time, marks=[pytest.mark.nightly, pytest.mark.slow]),
+        (pythagorean, pair_time),
+    ],
+)
 def test_transformed_problem_has_the_same_invariants(make, g):
     problem = make()
     other = time_transformed(problem, 1.0, g)

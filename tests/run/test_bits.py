@@ -306,6 +306,7 @@ def test_complex(case):
     assert run.y.dtype == complex
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("span", [(0.0, 2.0), (2.0, 0.0)])
 def test_complex_in_place(span):

@@ -261,7 +261,9 @@ def test_resumed_compiled_runs_are_the_same(name, tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.usefixtures("fine")
 @pytest.mark.parametrize("name", ["fixed", "compensated", "every auto", "adaptive", "adaptive, events", "Nystrom, all"])
-@pytest.mark.parametrize("error", [BrokenOffError, KeyboardInterrupt])
+@pytest.mark.parametrize(
+    "error", [BrokenOffError, pytest.param(KeyboardInterrupt, marks=[pytest.mark.nightly, pytest.mark.slow])]
+)
 def test_broken_off_inside_a_step(name, error, tmp_path):
     """Wherever a step is left, its half-filled buffers are not what is kept."""
     fun, y0, options = CASES[name]
@@ -863,6 +865,7 @@ def test_each_truncation_is_seen(tmp_path):
         checkpoint.read(path)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_each_changed_byte_below_a_digest_that_fits(tmp_path):
     """Files made to look sound: what comes out is a header and arrays, or one kind of error; nothing is allocated."""
@@ -1184,6 +1187,7 @@ def python(code, *arguments):
     return subprocess.Popen(command, cwd=Path(__file__).parents[1], stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_sixty_writers_are_killed(tmp_path):
     """kill -9 at any moment leaves the former checkpoint or the new one."""

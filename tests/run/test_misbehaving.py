@@ -59,6 +59,9 @@ def scipy_s(fun=oscillator, invariants=(), **options):
 
 
 both = pytest.mark.parametrize("how", [interpreted, pytest.param(compiled, marks=needs_jit)])
+compiled_at_night = pytest.mark.parametrize(
+    "how", [interpreted, pytest.param(compiled, marks=[needs_jit, pytest.mark.nightly, pytest.mark.slow])]
+)
 all_of_them = pytest.mark.parametrize("how", [interpreted, pytest.param(compiled, marks=needs_jit), scipy_s])
 KEPT = Invariant(square, square_gradient, name="S")
 
@@ -150,8 +153,7 @@ def test_writing_in_place(how):
     np.testing.assert_array_equal(how(fun, **options).y, how(filling, **options).y)
 
 
-@pytest.mark.slow
-@both
+@compiled_at_night
 @pytest.mark.parametrize("in_place", [False, True])
 def test_accelerations_that_write(how, in_place):
     def acc(t, q):
@@ -209,8 +211,7 @@ def test_invariants_without_gradients_that_write():
     np.testing.assert_allclose(run.invariants, 5.0, rtol=1e-13)
 
 
-@pytest.mark.slow
-@both
+@compiled_at_night
 def test_events_that_write(how):
     """Neither the state nor what the next event sees."""
     events = [event_that_writes, lambda t, y: y[1] - 1.0]
@@ -426,7 +427,8 @@ def test_events_that_change(value, start):
 
 @needs_jit
 @pytest.mark.parametrize(
-    "part", ["fun", *(pytest.param(part, marks=pytest.mark.slow) for part in ("value", "gradient"))]
+    "part",
+    ["fun", *(pytest.param(part, marks=[pytest.mark.nightly, pytest.mark.slow]) for part in ("value", "gradient"))],
 )
 def test_compiled_functions_that_return_none(part):
     """Such a function does not enter compiled code, and what is interpreted says what is wrong."""

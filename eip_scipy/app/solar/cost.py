@@ -29,9 +29,10 @@ from .runs import (
     whole_number,
 )
 
-__all__ = ["MERCURY", "REPEATS", "TimedRun", "by_method", "cost", "cost_methods", "timed"]
+__all__ = ["ENOUGH_SECONDS", "MERCURY", "REPEATS", "TimedRun", "by_method", "cost", "cost_methods", "timed"]
 
 REPEATS = 3
+ENOUGH_SECONDS = 0.2  # what disturbs so long a run is not seen on axes of many powers of ten
 MERCURY = 0  # of the planets, which start behind the Sun
 
 
@@ -131,7 +132,8 @@ def cost(
     peer : callable or None
         REBOUND, if it is there.
     callback : callable, optional
-        ``callback()`` after each run; there are `REPEATS` of each method and step.
+        ``callback()`` after each run; there are `REPEATS` of each method and step, those that are left out since one
+        took more than `ENOUGH_SECONDS` included.
 
     Returns
     -------
@@ -142,7 +144,7 @@ def cost(
         truth = (tight_run(scene, False) if peer is None else rebound_run(scene, peer, "IAS15", "ias15", 1, False)).y[
             :, -1
         ]
-    return timed(methods, truth, repeats=REPEATS, callback=callback)
+    return timed(methods, truth, repeats=REPEATS, enough_seconds=ENOUGH_SECONDS, callback=callback)
 
 
 def cost_methods(

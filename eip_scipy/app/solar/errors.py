@@ -48,6 +48,8 @@ class SolarStudy:
     tight: MethodRun | None = None
     cost: list[TimedRun] = field(default_factory=list)
     cost_scene: SolarScene | None = None
+    beside: str = ""
+    """Name of the run that was done beside the others, on another core; empty: one after the other."""
 
     def errors(self, year: float) -> dict[str, PointErrors]:
         """Errors of the runs at a time, where they are known."""

@@ -85,6 +85,7 @@ def _notes(study: SolarStudy) -> str:
         "Longitude: heliocentric, ecliptic, with whole turns. Position: from the centre of mass.",
         "SV: Stoermer-Verlet, kick-drift-kick." if "SV" in shown else "",
         "WHFast (c17: corrector of order 17), IAS15: REBOUND." if "IAS15" in shown else "",
+        f"{study.beside} ran beside the others, on another core." if study.beside in shown else "",
         f"{HIGH_ORDER}: Nystroem, order 12, projected at each tenth step, compensated." if HIGH_ORDER in shown else "",
         f"{TIGHT}: half of its step." if TIGHT in shown else "",
         "EMB: barycentre of Earth and Moon." if "EMB" in study.scene.planets else "",
@@ -181,6 +182,7 @@ def json_content(study: SolarStudy, args: argparse.Namespace) -> dict[str, Any]:
         step_yr=scene.h,
         data={"epoch": scene.data.epoch, "axes": scene.data.axes, "source": scene.data.source},
         methods=methods,
+        ran_beside_the_others=study.beside or None,
         error_against_cost={
             "error": "Mercury's position [AU]",
             "error_others": "largest error of another planet's position [AU]",

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Iterator
+import io
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 from ...checkpoint import CheckpointError
 from ...core import solvers
+from ...ensembles.chunks import cores
 from .. import long_runs
+from ..beside import Beside
 from ..long_runs import positive
 from ..report import UsageError, check_outputs, say, warn, write_csv, write_file, write_json
 from . import epoch as solar_epoch
@@ -18,13 +21,15 @@ from . import truth as solar_truth
 from .cost import REPEATS, cost, cost_methods
 from .errors import SolarStudy
 from .report import cost_rows, csv_rows, json_content, text
-from .runs import Peer, make_scene, plan
+from .runs import MethodRun, Peer, make_scene, plan
 
 __all__ = ["add_arguments", "fixed_step_methods", "run"]
 
 YEARS, STEP = 2000.0, 0.002
 METRICS = ("error", "euclidean")
 COST_YEARS = 100.0
+BESIDE_YEARS = 200.0  # in shorter runs a second process would cost what it saves
+BESIDE_FIGURES, OWN_FIGURES = slice(None, 4), slice(4, None)  # they take as long as the timings and the others
 DONE, CHECK_FAILED, INTERRUPTED = 0, 1, 130
 
 
@@ -103,7 +108,15 @@ def run(args: argparse.Namespace, peer: Peer | None, ephemeris: solar_epoch.Ephe
     except ValueError as error:
         raise UsageError(str(error)) from error
     check_outputs(args.out, args.json)
-    interrupted = _integrate(study, args, peer)
+    if peer is None or args.years < BESIDE_YEARS or cores() < 2:
+        return _compare(study, args, peer, None)
+    with Beside() as beside:
+        return _compare(study, args, peer, beside)
+
+
+def _compare(study: SolarStudy, args: argparse.Namespace, peer: Peer | None, beside: Beside | None) -> int:
+    """The command in its order: runs, table, timings, figures; `beside` takes the longest run, and then figures."""
+    interrupted = _integrate(study, args, peer, beside)
     if interrupted:
         long_runs.tell_how_to_resume(args)
     if not study.runs:
@@ -117,24 +130,30 @@ def run(args: argparse.Namespace, peer: Peer | None, ephemeris: solar_epoch.Ephe
         warn("interrupted; the runs that were done are in the table and the files")
         return INTERRUPTED
     try:
+        if beside is not None:
+            beside.start(partial(images, study, BESIDE_FIGURES))
         _time_methods(study, args, peer)
         _write_numbers(study, args)
     except KeyboardInterrupt:
         warn("interrupted; the table is complete, error against cost and the figures are missing")
         return INTERRUPTED
-    _write_figures(study, args)
+    _write_figures(study, args, beside)
     return status
 
 
-def _integrate(study: SolarStudy, args: argparse.Namespace, peer: Peer | None) -> bool:
-    """Do the runs one by one; True if the user interrupted them."""
+def _integrate(study: SolarStudy, args: argparse.Namespace, peer: Peer | None, beside: Beside | None) -> bool:
+    """Do the runs, the last of them beside the others if it may; True if the user interrupted them."""
     tasks = plan(
         study.scene, fixed_step_methods()[args.method], args.metric, peer, partial(long_runs.checkpoint_options, args)
     )
+    starts: list[Callable[[], MethodRun]] = [partial(task.start, not args.quiet) for task in tasks]
     try:
-        for task in tasks:
+        if beside is not None:
+            beside.start(partial(tasks[-1].start, False))
+            starts[-1], study.beside = beside.result, tasks[-1].name
+        for task, start in zip(tasks, starts, strict=True):
             with _waiting(task.name, shown=not (args.quiet or task.has_bar)):
-                study.runs.append(task.start(not args.quiet))
+                study.runs.append(start())
         study.tight = study.runs[-1]
     except KeyboardInterrupt:
         return True
@@ -175,14 +194,32 @@ def _write_numbers(study: SolarStudy, args: argparse.Namespace) -> None:
         _say(args, write_json(args.json, json_content(study, args)), again=again)
 
 
-def _write_figures(study: SolarStudy, args: argparse.Namespace) -> None:
+def images(study: SolarStudy, part: slice) -> dict[str, bytes]:
+    """Some of the figures as PNG files, by their names."""
+    from .figures import figures
+
+    found = {}
+    for name, figure in figures(study, part):
+        stream = io.BytesIO()
+        figure.savefig(stream, format="png")
+        found[name] = stream.getvalue()
+    return found
+
+
+def _write_figures(study: SolarStudy, args: argparse.Namespace, beside: Beside | None) -> None:
     try:
-        from .figures import figures
+        drawn = images(study, slice(None) if beside is None else OWN_FIGURES)
+        if beside is not None:
+            drawn = beside.result() | drawn
     except ImportError as error:
         warn(f"no figures: {error}")
         return
-    for name, figure in figures(study):
-        _say(args, write_file(args.out / name, figure.savefig))
+    for name, image in drawn.items():
+        _say(args, write_file(args.out / name, partial(_write, image)))
+
+
+def _write(image: bytes, path: Path) -> None:
+    path.write_bytes(image)
 
 
 def _say(args: argparse.Namespace, path: Path, *, again: bool = False) -> None:

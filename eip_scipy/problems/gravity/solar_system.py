@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -68,14 +69,6 @@ def solar_system(
     chosen = check_forces(forces)
     length, time = _units(units)
     year = YEAR_D * time
-
-    def reference(t: float) -> np.ndarray | None:
-        state = references.get(round(t / year, 9))
-        if state is None:
-            return None
-        half = state.size // 2
-        return np.concatenate([state[:half] * length, state[half:] * (length / time)])
-
     references = reference_states() if _starts_as_references(known) and not chosen else {}
     return nbody(
         known.gm * (length**3 / time**2),
@@ -88,8 +81,16 @@ def solar_system(
         name="solar-system",
         units="AU, Julian year" if units == "AU, yr" else "m, s",
         source=known.source,
-        reference=reference,
+        reference=partial(_reference, references, length, time),
     )
+
+
+def _reference(references: dict[float, np.ndarray], length: float, time: float, t: float) -> np.ndarray | None:
+    state = references.get(round(t / (YEAR_D * time), 9))
+    if state is None:
+        return None
+    half = state.size // 2
+    return np.concatenate([state[:half] * length, state[half:] * (length / time)])
 
 
 def _starts_as_references(data: SolarSystemData) -> bool:
