@@ -386,8 +386,8 @@ def _unstable(run: Run) -> str:
     return (
         f"the step is too long, or the motion not smooth, at t={t:.10g}: differences of the accelerations of order "
         f"{history.predict_q.size} are not small beside them, as they are where h={abs(history.h):g} is stable and "
-        "resolves the motion. Take a shorter step, or where bodies meet or forces jump a method of single steps such as "
-        "EIPRKN12"
+        "resolves the motion. Take a shorter step, or where bodies meet or forces jump a method of single steps such "
+        "as EIPRKN12"
     )
 
 
