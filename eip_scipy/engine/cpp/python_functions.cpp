@@ -125,7 +125,7 @@ void PythonCall::take(PyObject *value, PyObject *t, double *out) const {
 PythonFunctions::PythonFunctions(PyObject *functions, PyObject *work, const Work &sizes, int type, PyObject *kept)
     : m_(sizes.m), second_order_(truth(functions, "second_order")) {
     const int64_t components = second_order_ ? sizes.n / 2 : sizes.n;
-    rhs_ = std::make_unique<PythonCall>(attribute(functions, "rhs").get(), type, components, kept);
+    rhs_.emplace(attribute(functions, "rhs").get(), type, components, kept);
     const auto calls = [&](const char *name, std::vector<PythonCall> &out, int64_t expected) {
         const Ref items(PySequence_Fast(attribute(functions, name).get(), "engine: expected a sequence of functions"));
         int64_t total = 0;

@@ -1,7 +1,7 @@
 // A user's functions in Python, called with arrays of their own, as SciPy calls them.
 #pragma once
 
-#include <memory>
+#include <optional>
 #include <vector>
 
 #include "python.hpp"
@@ -55,7 +55,7 @@ class PythonFunctions final : public Functions {
     };
     PyObject *owner_of(const double *out) const;
 
-    std::unique_ptr<PythonCall> rhs_;
+    std::optional<PythonCall> rhs_;
     std::vector<PythonCall> inv_, grad_, event_;
     std::vector<Owner> owners_;
     int64_t m_;
