@@ -46,6 +46,7 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
         fun=bind(library["kepler.rhs"], params),
         rhs=library["kepler.rhs"],
         acc=library["kepler.acc"],
+        jacobian=library["kepler.jacobian"],
         y0=np.array([1 - e, 0.0, 0.0, sqrt((1 + e) / (1 - e))]),
         t_span=(0.0, t_end),
         h=h,

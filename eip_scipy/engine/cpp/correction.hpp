@@ -25,18 +25,26 @@ inline MatrixOf<Value> small(Value *a, int64_t size, const W &w) { return {a, si
 
 // w.values = I(y); compensated runs add what the carry is worth, by the gradients at hand.
 template <class AnyRun>
-inline void evaluate_invariants(AnyRun &run, double t, const double *y) {
+inline void evaluate_invariants(const AnyRun &run, double t, const double *y) {
     const auto &w = run.work;
     run.system.inv(w, t, y, w.values);
     if (run.options.compensated)
         for (int64_t i = 0; i < w.l; ++i) w.values[i] += dot(w.gradient(i), w.carry_hat, w.m);
 }
 
-// w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction, neutral to the frame; out = y_hat + move.
+// Rows along which a correction goes: w.Q, or the gradients as they are where the weights are 1.
+template <class W>
+inline auto *weighed_gradients(const Options &o, const W &w) {
+    if (o.metric == EUCLIDEAN && o.frame.rows == 0) return w.G;
+    weigh_rows(o.frame, w, w.Q);
+    return w.Q;
+}
+
+// w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction along rows Q, neutral to the frame; out = y_hat + move.
 template <class Value, class W>
-inline void move_along(const Options &o, const W &w, Value *__restrict out) {
+inline void move_along(const Options &o, const W &w, const Value *__restrict Q, Value *__restrict out) {
     const int64_t m = w.m;
-    const Value *__restrict mu = w.mu, *__restrict Q = w.Q, *__restrict sigma = w.sigma, *__restrict y_hat = w.y_hat;
+    const Value *__restrict mu = w.mu, *__restrict sigma = w.sigma, *__restrict y_hat = w.y_hat;
     Value *__restrict move = w.move;
     for (int64_t j = 0; j < m; ++j) out[j] = mu[0] * Q[j];
     for (int64_t k = 1; k < w.l; ++k)
@@ -57,20 +65,21 @@ inline void move_along(const Options &o, const W &w, Value *__restrict out) {
 // The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal.
 template <class W>
 inline int64_t first_move(const Options &o, const W &w, double *out, bool more) {
-    weigh_rows(o.frame, w, w.Q);
-    const Matrix Q = rows_of(w.Q, w), R = small(w.R, w.l, w);
-    int64_t rank = w.l;
-    if (more || !solve_gram(Q, w.g, R, w.mu)) {
-        rank = factor(Q, w.inverse_norms, R, w.pivots);
-        least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
+    const Matrix R = small(w.R, w.l, w);
+    double *rows = more ? nullptr : weighed_gradients(o, w);
+    if (rows && solve_gram(rows_of(rows, w), w.g, R, w.mu)) {
+        move_along(o, w, rows, out);
+        return w.l;
     }
-    if (rank >= 0) move_along(o, w, out);
+    if (rows != w.Q) weigh_rows(o.frame, w, w.Q);
+    const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
+    least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
+    if (rank >= 0) move_along(o, w, w.Q, out);
     return rank;
 }
 
 // Add to w.mu the Newton step of (B . Q) step = -g, on the rows that the first factorisation chose.
-template <class W>
-inline void newton_matrix_solve(int64_t rank, const W &w) {
+inline void newton_matrix_solve(int64_t rank, const Work &w) {
     const Inner &inner = w.inner;
     const Matrix matrix = small(inner.matrix, rank, w), R = small(inner.R, w.l, w);
     for (int64_t k = 0; k < rank; ++k) {
@@ -87,8 +96,7 @@ inline void newton_matrix_solve(int64_t rank, const W &w) {
 }
 
 // The first Newton step along the gradients at y or at the midpoint; w.G holds those at y_hat. Returns the rank.
-template <class AnyRun>
-[[gnu::noinline]] inline int64_t other_directions(AnyRun &run, const Step &step) {
+[[gnu::noinline]] inline int64_t other_directions(const Run &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
     weigh_rows(o.frame, w, w.B);
@@ -109,14 +117,14 @@ template <class AnyRun>
     if (rank >= 0) {
         fill(w.mu, 0.0, w.l);
         newton_matrix_solve(rank, w);
-        move_along(o, w, step.y_new);
+        move_along(o, w, w.Q, step.y_new);
     }
     return rank;
 }
 
 // The first Newton step; `largest_error` >= 0: by the weights that stand, for this one.
 template <class AnyRun>
-inline Moved move(AnyRun &run, const Step &step, double largest_error = -1.0) {
+inline Moved move(const AnyRun &run, const Step &step, double largest_error = -1.0) {
     const Options &o = run.options;
     const auto &w = run.work;
     ++w.counters[NLU];
@@ -124,13 +132,12 @@ inline Moved move(AnyRun &run, const Step &step, double largest_error = -1.0) {
     if (largest_error < 0.0)
         largest_error = o.metric == ERROR ? error_metric(step.y, o.compensated ? 0.0 : EPS, o, w) : 0.0;
     const int64_t rank = o.direction == NEW ? first_move(o, w, step.y_new, o.iterations > 1)
-                                            : other_directions(run, step);
+                                            : other_directions(of_any_length(run), step);
     return {rank, largest_error, correction_in_local_errors(largest_error, o, w)};
 }
 
 // One more Newton step along the same directions; false when every defect is inside its dead band.
-template <class AnyRun>
-[[gnu::noinline]] inline bool newton_iteration(AnyRun &run, const Step &step, int64_t rank) {
+[[gnu::noinline]] inline bool newton_iteration(const Run &run, const Step &step, int64_t rank) {
     const Options &o = run.options;
     const auto &w = run.work;
     run.system.inv(w, step.t_new, step.y_new, w.values);
@@ -143,13 +150,13 @@ template <class AnyRun>
     if (!defects<double>(nullptr, step.y_new, o, w, w.defect)) return false;
     weigh_rows(o.frame, w, w.B);
     newton_matrix_solve(rank, w);
-    move_along(o, w, step.y_new);
+    move_along(o, w, w.Q, step.y_new);
     return true;
 }
 
 // What follows the first Newton step: further ones, and whether the projection holds.
 template <class AnyRun>
-inline Code correct(AnyRun &run, const Step &step, int64_t rank) {
+inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     const Options &o = run.options;
     const auto &w = run.work;
     if (rank < 0) {
@@ -157,7 +164,7 @@ inline Code correct(AnyRun &run, const Step &step, int64_t rank) {
         return FAILED_PROJECTION;
     }
     for (int64_t k = 1; k < o.iterations; ++k)
-        if (!newton_iteration(run, step, rank)) break;
+        if (!newton_iteration(of_any_length(run), step, rank)) break;
     if (o.compensated) {
         copy(w.y_hat, step.y_new, w.m);
         compensated_add(step.y_new, w.carry_hat, w.move, w.m);
@@ -170,8 +177,7 @@ inline Code correct(AnyRun &run, const Step &step, int64_t rank) {
 //
 // An estimate can vanish in a component, by symmetry, where the error does not; the others then carry a correction far
 // larger than any error of the step. Components that stand alone are prone to it; a block's length is not.
-template <class AnyRun>
-[[gnu::cold, gnu::noinline]] inline Code correct_softly(AnyRun &run, const Step &step, bool alone, Moved &moved) {
+[[gnu::cold, gnu::noinline]] inline Code correct_softly(const Run &run, const Step &step, bool alone, Moved &moved) {
     ++run.work.counters[SOFTENED];
     Code status = FAILED_PROJECTION;
     for (int k = 0; k < MAX_SOFTENED; ++k) {
@@ -188,8 +194,7 @@ template <class AnyRun>
 // Where gradients are nearly parallel, as on a nearly circular orbit, states near y_hat may not reach a target at all:
 // the distance is of second order, and no shorter step mends it. What the directions left out would have corrected
 // stays, so that a defect may grow to the sum of all.
-template <class AnyRun>
-[[gnu::cold, gnu::noinline]] inline Code correct_with_fewer(AnyRun &run, const Step &step, int64_t &rank) {
+[[gnu::cold, gnu::noinline]] inline Code correct_with_fewer(const Run &run, const Step &step, int64_t &rank) {
     const Options &o = run.options;
     const auto &w = run.work;
     const Matrix R = small(w.R, w.l, w);
@@ -197,7 +202,7 @@ template <class AnyRun>
     const int64_t found = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
     rank = std::max<int64_t>(0, std::min(rank, found));
     least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
-    move_along(o, w, step.y_new);
+    move_along(o, w, w.Q, step.y_new);
     evaluate_invariants(run, step.t_new, step.y_new);
     shared_defects(w, w.g);
     return judge(w.g, step.y_new, o, w);
@@ -221,7 +226,7 @@ inline Code project_evaluated(AnyRun &run, const Step &step);
 // w.err holds the local error of y_hat where the metric wants it, w.last() f there where a gradient does. POSTPONED:
 // with every = AUTO, while the invariants know no more than round-off (y_new is then y_hat).
 template <class AnyRun>
-inline Code project_step(AnyRun &run, const Step &step) {
+inline Code project_step(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
     run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
@@ -248,10 +253,10 @@ inline Code project_evaluated(AnyRun &run, const Step &step) {
     if (o.direction == NEW && o.iterations == 1 && !o.compensated) {
         const bool alone = o.blocks.count * o.blocks.width == w.m;
         const bool doubtful = status != OK ? all_finite(w.defect, w.l) : alone && moved.correction > HEALTHY;
-        if (moved.largest_error > 0.0 && doubtful) status = correct_softly(run, step, alone, moved);
+        if (moved.largest_error > 0.0 && doubtful) status = correct_softly(of_any_length(run), step, alone, moved);
         if (status != OK && moved.rank > 1) {
             --moved.rank;
-            status = correct_with_fewer(run, step, moved.rank);
+            status = correct_with_fewer(of_any_length(run), step, moved.rank);
         }
     }
     w.counters[LAST_RANK] = std::max<int64_t>(moved.rank, 0);
@@ -268,7 +273,7 @@ inline Code project_evaluated(AnyRun &run, const Step &step) {
 
 // The same, or the shorter way of joint invariants where that will do, or a hook's.
 template <class AnyRun>
-inline Code project_any(AnyRun &run, const Step &step) {
+inline Code project_any(const AnyRun &run, const Step &step) {
     if (run.hooks && run.hooks->joint && run.hooks->project_jointly(step)) return OK;
     if (run.hooks && run.hooks->project) return static_cast<Code>(run.hooks->project_elsewhere(step));
     return project_step(run, step);

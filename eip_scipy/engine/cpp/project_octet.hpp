@@ -7,8 +7,7 @@
 namespace eip {
 
 // The Newton step of one member, whose gradients are nearly parallel or vanish, by pivoted QR.
-template <class W>
-[[gnu::noinline]] inline void solve_alone(Eight &eight, int64_t lane, const Options &o, const W &w) {
+[[gnu::noinline]] inline void solve_alone(Eight &eight, int64_t lane, const Options &o, const Work &w) {
     const WorkOf<Octet> &eights = eight.work;
     eight.take(eights.sigma, lane, w.sigma, w.m);
     eight.take(eights.y_hat, lane, w.y_hat, w.m);
@@ -20,7 +19,7 @@ template <class W>
     eight.rank[lane] = std::max<int64_t>(rank, 0);
     if (rank >= 0) {
         least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
-        move_along(o, w, w.stage);
+        move_along(o, w, w.Q, w.stage);
     } else {
         fill(w.stage, NOT_A_NUMBER, w.m);
     }
@@ -71,8 +70,7 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const WorkO
 }
 
 // Projects eight members; returns those of `alive` who have to make this step by themselves. As `project_step`.
-template <class W>
-inline Mask project_octet(Eight &eight, const Step &step, const Mask &alive, const W &single) {
+inline Mask project_octet(Eight &eight, const Step &step, const Mask &alive, const Work &single) {
     const Options &o = eight.options;
     const WorkOf<Octet> &w = eight.work;
     eight.system.grad(step.t_new, w.y_hat, w.last(), w.G);
@@ -86,9 +84,9 @@ inline Mask project_octet(Eight &eight, const Step &step, const Mask &alive, con
         leave = outside & block_sizes<Octet>(eight.y, EPS, o, w);
         largest_error = weights_from_sizes(o, w);
     }
-    weigh_rows(o.frame, w, w.Q);
-    const Mask dependent = outside & alive & !solve_gram(rows_of(w.Q, w), w.g, small(w.R, w.l, w), w.mu);
-    move_along(o, w, eight.y_new);
+    Octet *rows = weighed_gradients(o, w);
+    const Mask dependent = outside & alive & !solve_gram(rows_of(rows, w), w.g, small(w.R, w.l, w), w.mu);
+    move_along(o, w, rows, eight.y_new);
     const Mask moved = outside & alive;
     for (int64_t lane = 0; lane < LANES; ++lane)
         if (moved.lane(lane)) eight.rank[lane] = w.l;

@@ -30,6 +30,17 @@ void kepler_acc(const Given<T> &g) {
     g.out[1] = -w * g.y[1];
 }
 
+// The accelerations' derivative along dq, which stands in f.
+template <class T>
+void kepler_jacobian(const Given<T> &g) {
+    const T *q = g.y, *d = g.f;
+    const T r2 = q[0] * q[0] + q[1] * q[1], inverse = 1.0 / r2, w = inverse / sqrt(r2);
+    const T over = 1.5 * g.params[0] * inverse, pull = w + w * over;
+    const T along = (3.0 * w + 5.0 * w * over) * inverse * (q[0] * d[0] + q[1] * d[1]);
+    g.out[0] = along * q[0] - pull * d[0];
+    g.out[1] = along * q[1] - pull * d[1];
+}
+
 template <class T>
 void kepler_energy(const Given<T> &g) {
     const T *y = g.y;
@@ -83,6 +94,7 @@ constexpr const char *FOUR = "a state of 4 numbers and 1 parameter", *TWO = "2 n
 const LibraryFunction functions[] = {
     {"kepler.rhs", Value::DERIVATIVE, 0, EIP_BOTH(kepler_rhs), of_four, FOUR},
     {"kepler.acc", Value::ACCELERATION, 0, EIP_BOTH(kepler_acc), of_two, TWO},
+    {"kepler.jacobian", Value::GRADIENT_BY_F, 1, EIP_BOTH(kepler_jacobian), of_two, TWO},
     {"kepler.energy", Value::NUMBERS, 1, EIP_BOTH(kepler_energy), of_four, FOUR},
     {"kepler.energy_gradient", Value::GRADIENT_BY_F, 1, EIP_BOTH(kepler_energy_gradient), of_four, FOUR},
     {"kepler.momentum", Value::NUMBERS, 1, EIP_BOTH(kepler_momentum), of_four, FOUR},
