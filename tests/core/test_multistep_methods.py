@@ -1,9 +1,13 @@
 """Multistep methods through integrate and solve_ivp: orders, what lies between steps, bits, and what they refuse."""
 
+import ctypes
+import math
+
 import mpmath
 import numba
 import numpy as np
 import pytest
+from c_compiler import shared_library
 from scipy.integrate import solve_ivp
 from systems import jit_energy, jit_energy_gradient, jit_momentum, jit_momentum_gradient
 
@@ -186,6 +190,54 @@ def test_python_jitted_and_native_functions_give_the_same_bits():
     assert compiled.compiled
     assert not python.compiled
     assert np.array_equal(compiled.y, python.y)
+
+
+C_FUNCTIONS = """
+#include <math.h>
+
+int acceleration(double t, const double *q, double *out, const double *params) {
+    const double r = sqrt(q[0] * q[0] + q[1] * q[1]), w = params[0] / (r * r * r);
+    out[0] = -w * q[0];
+    out[1] = -w * q[1];
+    return 0;
+}
+
+int jacobian(double t, const double *q, const double *dq, double *out, const double *params) {
+    const double square = q[0] * q[0] + q[1] * q[1], w = params[0] / (square * sqrt(square));
+    const double along = 3 * (q[0] * dq[0] + q[1] * dq[1]) / square;
+    for (int k = 0; k < 2; ++k) out[k] = w * (along * q[k] - dq[k]);
+    return dq[0] > 1 ? -7 : 0;
+}
+"""
+
+
+def test_c_functions(tmp_path):
+    """By pointer, with params: the bits of Python's functions that compute the same."""
+    source = tmp_path / "functions.c"
+    source.write_text(C_FUNCTIONS)
+    library = ctypes.CDLL(str(shared_library(tmp_path / "functions.so", source)))
+    pointer = ctypes.POINTER(ctypes.c_double)
+    for name, count in (("acceleration", 3), ("jacobian", 4)):
+        getattr(library, name).argtypes = [ctypes.c_double, *[pointer] * count]
+
+    def in_python(t, q, out, params):
+        r = math.sqrt(q[0] * q[0] + q[1] * q[1])
+        w = params[0] / (r * r * r)
+        out[:] = [-w * q[0], -w * q[1]]
+
+    def times(t, q, dq, out, params):
+        square = q[0] * q[0] + q[1] * q[1]
+        w = params[0] / (square * math.sqrt(square))
+        along = 3 * (q[0] * dq[0] + q[1] * dq[1]) / square
+        out[:] = [w * (along * q[k] - dq[k]) for k in range(2)]
+
+    given = {"method": EIPGJ14, "h": STEP, "params": [1.0], "in_place": True}
+    native = integrate(library.acceleration, (0, 20), Y0, jacobian=library.jacobian, **given)
+    python = integrate(in_python, (0, 20), Y0, jacobian=times, **given)
+    assert native.calls == {"fun": "pointer", "jacobian": "pointer"}
+    assert np.array_equal(native.y, python.y)
+    with pytest.raises(TypeError, match="jacobian is a C function of the signature"):
+        integrate(library.acceleration, (0, 20), Y0, jacobian=library.acceleration, **given)
 
 
 def test_events():
