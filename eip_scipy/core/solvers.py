@@ -117,12 +117,12 @@ class EIPSolver(OdeSolver):
         diagnostics: Any = None,
         **options: Any,
     ) -> None:
+        if not hasattr(self, "TABLEAU"):
+            raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
         jacobian = options.pop("jacobian", None) if isinstance(self.TABLEAU, GaussJackson) else None
         projection, extraneous = ProjectionOptions.of(options)
         if extraneous:
             warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=3)
-        if not hasattr(self, "TABLEAU"):
-            raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
         t0, t_bound = interval((t0, t_bound))
         start = setup.initial_state(y0)
         self._calls = [0]
