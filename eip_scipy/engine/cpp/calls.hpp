@@ -1,10 +1,6 @@
 // What stands around the engine's work when Python calls it.
 #pragma once
 
-#if defined(__SSE2__)
-#include <xmmintrin.h>
-#endif
-
 #include "system.hpp"
 
 namespace eip {
@@ -13,8 +9,8 @@ namespace eip {
 class FloatingPoint {
   public:
 #if defined(__SSE2__)
-    FloatingPoint() : mode_(_mm_getcsr()) { _mm_setcsr(mode_ & ~0x8040u); }
-    ~FloatingPoint() { _mm_setcsr(mode_); }
+    FloatingPoint() : mode_(__builtin_ia32_stmxcsr()) { __builtin_ia32_ldmxcsr(mode_ & ~0x8040u); }
+    ~FloatingPoint() { __builtin_ia32_ldmxcsr(mode_); }
 
   private:
     unsigned mode_;

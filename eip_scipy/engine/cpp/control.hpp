@@ -15,7 +15,7 @@ constexpr int64_t AUTO_SPACING = 5;
 
 // The stages and their sum, y_hat.
 template <class AnyRun>
-inline void make_stages(AnyRun &run, const Step &step) {
+inline void make_stages(const AnyRun &run, const Step &step) {
     if (run.method.nystrom)
         rkn_stages(run, step);
     else
@@ -25,7 +25,7 @@ inline void make_stages(AnyRun &run, const Step &step) {
 
 // What follows the stages: f at y_hat in w.last(), the local error in w.err and its norm in w.norm where they are wanted.
 template <class AnyRun>
-inline void look_back(AnyRun &run, const Step &step) {
+inline void look_back(const AnyRun &run, const Step &step) {
     const Method &m = run.method;
     const Options &o = run.options;
     const auto &w = run.work;
@@ -39,11 +39,11 @@ inline void look_back(AnyRun &run, const Step &step) {
     if (estimate)
         estimate_error(run, step);
     else if (step.project && is_sampled(run))
-        sample_error(run, step);
+        sample_error(of_any_length(run), step);
 }
 
 template <class AnyRun>
-inline Code raw_step(AnyRun &run, const Step &step) {
+inline Code raw_step(const AnyRun &run, const Step &step) {
     make_stages(run, step);
     const bool finite = all_finite(run.work.y_hat, run.work.m);
     if (!(run.hooks && run.hooks->agree ? run.hooks->all_agree(finite) : finite)) return NOT_FINITE;
@@ -52,13 +52,13 @@ inline Code raw_step(AnyRun &run, const Step &step) {
 }
 
 template <class AnyRun>
-inline Code any_raw_step(AnyRun &run, const Step &step) {
+inline Code any_raw_step(const AnyRun &run, const Step &step) {
     return run.hooks && run.hooks->raw ? static_cast<Code>(run.hooks->raw_step(step)) : raw_step(run, step);
 }
 
 // After the projection: the carry, the errors gathered, and f for the next step's first stage in w.last().
 template <class AnyRun>
-inline void close_step(AnyRun &run, const Step &step, Code status) {
+inline void close_step(const AnyRun &run, const Step &step, Code status) {
     const Options &o = run.options;
     const auto &w = run.work;
     if (o.compensated) copy(w.carry_hat, w.carry, w.m);
@@ -82,7 +82,7 @@ inline void close_step(AnyRun &run, const Step &step, Code status) {
 
 // The rest of a step whose raw result is accepted; OK or FAILED_PROJECTION.
 template <class AnyRun>
-inline Code finish_step(AnyRun &run, const Step &step) {
+inline Code finish_step(const AnyRun &run, const Step &step) {
     Code status = OK;
     if (step.project) {
         status = project_any(run, step);
@@ -98,7 +98,7 @@ inline Code finish_step(AnyRun &run, const Step &step) {
 }
 
 template <class AnyRun>
-inline Code any_finish_step(AnyRun &run, const Step &step) {
+inline Code any_finish_step(const AnyRun &run, const Step &step) {
     return run.hooks && run.hooks->finish ? static_cast<Code>(run.hooks->finish_step(step)) : finish_step(run, step);
 }
 
@@ -110,8 +110,8 @@ inline double least_step(double t, double sign) { return 10.0 * std::abs(std::ne
 // A failed projection shortens the step, at most MAX_RETRIES times in a row. Returns OK, NOT_FINITE, FAILED_PROJECTION or
 // TOO_SMALL; of a multistep method UNSTABLE too.
 template <class AnyRun>
-inline Code next_step(AnyRun &run, const Span &span, double *clock, int64_t k, const double *y, double *y_new) {
-    if (run.method.multistep) return next_states(run, span, clock, k, k + 1, y, y_new);
+inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_t k, const double *y, double *y_new) {
+    if (run.method.multistep) return next_states(of_any_length(run), span, clock, k, k + 1, y, y_new);
     const Options &o = run.options;
     const auto &w = run.work;
     const bool adaptive = span.h == 0.0;

@@ -25,7 +25,7 @@ inline MatrixOf<Value> small(Value *a, int64_t size, const W &w) { return {a, si
 
 // w.values = I(y); compensated runs add what the carry is worth, by the gradients at hand.
 template <class AnyRun>
-inline void evaluate_invariants(AnyRun &run, double t, const double *y) {
+inline void evaluate_invariants(const AnyRun &run, double t, const double *y) {
     const auto &w = run.work;
     run.system.inv(w, t, y, w.values);
     if (run.options.compensated)
@@ -69,8 +69,7 @@ inline int64_t first_move(const Options &o, const W &w, double *out, bool more) 
 }
 
 // Add to w.mu the Newton step of (B . Q) step = -g, on the rows that the first factorisation chose.
-template <class W>
-inline void newton_matrix_solve(int64_t rank, const W &w) {
+inline void newton_matrix_solve(int64_t rank, const Work &w) {
     const Inner &inner = w.inner;
     const Matrix matrix = small(inner.matrix, rank, w), R = small(inner.R, w.l, w);
     for (int64_t k = 0; k < rank; ++k) {
@@ -87,8 +86,7 @@ inline void newton_matrix_solve(int64_t rank, const W &w) {
 }
 
 // The first Newton step along the gradients at y or at the midpoint; w.G holds those at y_hat. Returns the rank.
-template <class AnyRun>
-[[gnu::noinline]] inline int64_t other_directions(AnyRun &run, const Step &step) {
+[[gnu::noinline]] inline int64_t other_directions(const Run &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
     weigh_rows(o.frame, w, w.B);
@@ -116,7 +114,7 @@ template <class AnyRun>
 
 // The first Newton step; `largest_error` >= 0: by the weights that stand, for this one.
 template <class AnyRun>
-inline Moved move(AnyRun &run, const Step &step, double largest_error = -1.0) {
+inline Moved move(const AnyRun &run, const Step &step, double largest_error = -1.0) {
     const Options &o = run.options;
     const auto &w = run.work;
     ++w.counters[NLU];
@@ -124,13 +122,12 @@ inline Moved move(AnyRun &run, const Step &step, double largest_error = -1.0) {
     if (largest_error < 0.0)
         largest_error = o.metric == ERROR ? error_metric(step.y, o.compensated ? 0.0 : EPS, o, w) : 0.0;
     const int64_t rank = o.direction == NEW ? first_move(o, w, step.y_new, o.iterations > 1)
-                                            : other_directions(run, step);
+                                            : other_directions(of_any_length(run), step);
     return {rank, largest_error, correction_in_local_errors(largest_error, o, w)};
 }
 
 // One more Newton step along the same directions; false when every defect is inside its dead band.
-template <class AnyRun>
-[[gnu::noinline]] inline bool newton_iteration(AnyRun &run, const Step &step, int64_t rank) {
+[[gnu::noinline]] inline bool newton_iteration(const Run &run, const Step &step, int64_t rank) {
     const Options &o = run.options;
     const auto &w = run.work;
     run.system.inv(w, step.t_new, step.y_new, w.values);
@@ -149,7 +146,7 @@ template <class AnyRun>
 
 // What follows the first Newton step: further ones, and whether the projection holds.
 template <class AnyRun>
-inline Code correct(AnyRun &run, const Step &step, int64_t rank) {
+inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     const Options &o = run.options;
     const auto &w = run.work;
     if (rank < 0) {
@@ -157,7 +154,7 @@ inline Code correct(AnyRun &run, const Step &step, int64_t rank) {
         return FAILED_PROJECTION;
     }
     for (int64_t k = 1; k < o.iterations; ++k)
-        if (!newton_iteration(run, step, rank)) break;
+        if (!newton_iteration(of_any_length(run), step, rank)) break;
     if (o.compensated) {
         copy(w.y_hat, step.y_new, w.m);
         compensated_add(step.y_new, w.carry_hat, w.move, w.m);
@@ -170,8 +167,7 @@ inline Code correct(AnyRun &run, const Step &step, int64_t rank) {
 //
 // An estimate can vanish in a component, by symmetry, where the error does not; the others then carry a correction far
 // larger than any error of the step. Components that stand alone are prone to it; a block's length is not.
-template <class AnyRun>
-[[gnu::cold, gnu::noinline]] inline Code correct_softly(AnyRun &run, const Step &step, bool alone, Moved &moved) {
+[[gnu::cold, gnu::noinline]] inline Code correct_softly(const Run &run, const Step &step, bool alone, Moved &moved) {
     ++run.work.counters[SOFTENED];
     Code status = FAILED_PROJECTION;
     for (int k = 0; k < MAX_SOFTENED; ++k) {
@@ -188,8 +184,7 @@ template <class AnyRun>
 // Where gradients are nearly parallel, as on a nearly circular orbit, states near y_hat may not reach a target at all:
 // the distance is of second order, and no shorter step mends it. What the directions left out would have corrected
 // stays, so that a defect may grow to the sum of all.
-template <class AnyRun>
-[[gnu::cold, gnu::noinline]] inline Code correct_with_fewer(AnyRun &run, const Step &step, int64_t &rank) {
+[[gnu::cold, gnu::noinline]] inline Code correct_with_fewer(const Run &run, const Step &step, int64_t &rank) {
     const Options &o = run.options;
     const auto &w = run.work;
     const Matrix R = small(w.R, w.l, w);
@@ -214,14 +209,14 @@ inline Code stay(const Step &step, const Options &o, const W &w) {
 }
 
 template <class AnyRun>
-inline Code project_evaluated(AnyRun &run, const Step &step);
+inline Code project_evaluated(const AnyRun &run, const Step &step);
 
 // Project w.y_hat into y_new by o.iterations Newton steps; returns OK, FAILED_PROJECTION or POSTPONED.
 //
 // w.err holds the local error of y_hat where the metric wants it, w.last() f there where a gradient does. POSTPONED:
 // with every = AUTO, while the invariants know no more than round-off (y_new is then y_hat).
 template <class AnyRun>
-inline Code project_step(AnyRun &run, const Step &step) {
+inline Code project_step(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
     run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
@@ -239,7 +234,7 @@ inline Code project_step(AnyRun &run, const Step &step) {
 
 // The rest of it, where the gradients at w.y_hat and the invariants' values are known.
 template <class AnyRun>
-inline Code project_evaluated(AnyRun &run, const Step &step) {
+inline Code project_evaluated(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
     if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) return stay(step, o, w);
@@ -248,10 +243,10 @@ inline Code project_evaluated(AnyRun &run, const Step &step) {
     if (o.direction == NEW && o.iterations == 1 && !o.compensated) {
         const bool alone = o.blocks.count * o.blocks.width == w.m;
         const bool doubtful = status != OK ? all_finite(w.defect, w.l) : alone && moved.correction > HEALTHY;
-        if (moved.largest_error > 0.0 && doubtful) status = correct_softly(run, step, alone, moved);
+        if (moved.largest_error > 0.0 && doubtful) status = correct_softly(of_any_length(run), step, alone, moved);
         if (status != OK && moved.rank > 1) {
             --moved.rank;
-            status = correct_with_fewer(run, step, moved.rank);
+            status = correct_with_fewer(of_any_length(run), step, moved.rank);
         }
     }
     w.counters[LAST_RANK] = std::max<int64_t>(moved.rank, 0);
@@ -268,7 +263,7 @@ inline Code project_evaluated(AnyRun &run, const Step &step) {
 
 // The same, or the shorter way of joint invariants where that will do, or a hook's.
 template <class AnyRun>
-inline Code project_any(AnyRun &run, const Step &step) {
+inline Code project_any(const AnyRun &run, const Step &step) {
     if (run.hooks && run.hooks->joint && run.hooks->project_jointly(step)) return OK;
     if (run.hooks && run.hooks->project) return static_cast<Code>(run.hooks->project_elsewhere(step));
     return project_step(run, step);

@@ -40,26 +40,23 @@ struct Piece {
           sigma(rows + d.rows() * d.work.m), levels_old(sigma + d.work.m), levels(levels_old + d.work.l) {}
 };
 
-// Dense output by code for states of W's length.
-template <class W>
+// Dense output as a run of its own.
 struct DenseRun {
     const Dense &dense;
     const Method none{};
-    const W work;
-    RunOf<W> run;
+    const Work work;
+    Run run;
 
     DenseRun(const Dense &d, System &system) : dense(d), work(d.work), run{none, d.options, work, system, nullptr} {}
 };
 
 // The evaluations made since, among those of the run.
-template <class W>
-inline void count_calls(const DenseRun<W> &dense, const Work &step) {
+inline void count_calls(const DenseRun &dense, const Work &step) {
     step.counters[NFEV] += std::exchange(dense.work.counters[NFEV], 0);
 }
 
 // The 2-norm of block b of a, or of a - minus.
-template <class W>
-inline double block_norm(const double *a, const double *minus, int64_t b, const Blocks &blocks, const W &w) {
+inline double block_norm(const double *a, const double *minus, int64_t b, const Blocks &blocks, const Work &w) {
     int64_t count = 0;
     for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p, ++count)
         w.move[count] = a[blocks.member[p]] - (minus ? minus[blocks.member[p]] : 0.0);
@@ -70,9 +67,8 @@ inline double block_norm(const double *a, const double *minus, int64_t b, const 
 //
 // Those of the step do not fit: an interpolant errs in other components than the end of a step does. A slope that passes
 // through zero within the step does not make a block immobile, hence the second term.
-template <class W>
 inline void travelled(const Piece &piece, double h, const double *f_old, const double *f, const Blocks &blocks,
-                      const W &w) {
+                      const Work &w) {
     double largest_weight = 0.0;
     for (int64_t b = 0; b < blocks.count; ++b) {
         const auto size_of = [&](const double *a, const double *minus) { return block_norm(a, minus, b, blocks, w); };
@@ -90,8 +86,7 @@ inline void travelled(const Piece &piece, double h, const double *f_old, const d
 }
 
 // The cubic through both ends with their slopes: rows change, h f_old - change, h f - change.
-template <class W>
-inline void cubic(const Piece &piece, double h, const double *f_old, const double *f, const W &w) {
+inline void cubic(const Piece &piece, double h, const double *f_old, const double *f, const Work &w) {
     double *change = piece.rows, *left = change + w.m, *right = left + w.m;
     for (int64_t i = 0; i < w.m; ++i) {
         change[i] = piece.y[i] - piece.y_old[i];
@@ -102,8 +97,7 @@ inline void cubic(const Piece &piece, double h, const double *f_old, const doubl
 
 // For y = (q, v) the quintic through positions, velocities and accelerations at both ends; v is its slope. Its rows are
 // the coefficients of theta^0 to theta^5, by what the Taylor polynomial at the old end misses at the new one.
-template <class W>
-inline void quintic(const Piece &piece, double h, const double *f_old, const double *f, const W &w) {
+inline void quintic(const Piece &piece, double h, const double *f_old, const double *f, const Work &w) {
     const int64_t half = w.m / 2;
     double *rows = piece.rows;
     for (int64_t i = 0; i < half; ++i) {
@@ -118,8 +112,7 @@ inline void quintic(const Piece &piece, double h, const double *f_old, const dou
 }
 
 // The tableau's own: rows h K^T P, and last what this misses at the end of the step, the projection's move.
-template <class W>
-inline void polynomial(const Dense &d, const Piece &piece, double h, const Work &step, const W &w) {
+inline void polynomial(const Dense &d, const Piece &piece, double h, const Work &step, const Work &w) {
     double *missing = piece.rows + d.polynomials * w.m;
     for (int64_t i = 0; i < w.m; ++i) missing[i] = piece.y[i] - piece.y_old[i];
     for (int64_t j = 0; j < d.polynomials; ++j) {
@@ -130,10 +123,9 @@ inline void polynomial(const Dense &d, const Piece &piece, double h, const Work 
 }
 
 // DOP853's of order 7, from three more evaluations: rows change, h f_old - change, 2 change - h (f + f_old), h D K.
-template <class W>
-inline void seventh(const DenseRun<W> &dense, const Piece &piece, double h, const Work &step) {
+inline void seventh(const DenseRun &dense, const Piece &piece, double h, const Work &step) {
     const Dense &d = dense.dense;
-    const W &w = dense.work;
+    const Work &w = dense.work;
     const int64_t known = step.stages + 1, m = w.m;
     copy(step.K, w.K, known * m);
     for (int64_t k = 0; k < d.further; ++k) {
@@ -153,8 +145,7 @@ inline void seventh(const DenseRun<W> &dense, const Piece &piece, double h, cons
 
 // For the nodes of a multistep method: the accelerations of the whole history, and behind them how many nodes before the
 // newest the step begins, and its length in nodes' distances. A run too short for a history has the quintic, and -1 there.
-template <class W>
-inline void history(const Dense &d, const Piece &piece, double *f_old, double *f, const W &w) {
+inline void history(const Dense &d, const Piece &piece, double *f_old, double *f, const Work &w) {
     const Multistep &ms = *d.multistep;
     double *about = piece.rows + (d.rows() - 1) * w.m;
     const double h = *piece.t - *piece.t_old;
@@ -169,8 +160,7 @@ inline void history(const Dense &d, const Piece &piece, double *f_old, double *f
 }
 
 // Its value: the state at the step's start, and the polynomial through the accelerations integrated twice.
-template <class W>
-inline void from_history(const Dense &d, const Piece &piece, double theta, double *out, const W &w) {
+inline void from_history(const Dense &d, const Piece &piece, double theta, double *out, const Work &w) {
     const double *about = piece.rows + (d.rows() - 1) * w.m;
     const int64_t order = d.columns, half = w.m / 2;
     const double x = theta * about[1], h = (*piece.t - *piece.t_old) / about[1];
@@ -195,11 +185,10 @@ inline void from_history(const Dense &d, const Piece &piece, double theta, doubl
 }
 
 // The interpolant over a step from y_old at t_old to y at t, from the buffers that it left.
-template <class W>
-inline void describe(const DenseRun<W> &dense, const Work &step, double t_old, const double *y_old, double t,
+inline void describe(const DenseRun &dense, const Work &step, double t_old, const double *y_old, double t,
                      const double *y, double *out) {
     const Dense &d = dense.dense;
-    const W &w = dense.work;
+    const Work &w = dense.work;
     const Piece piece(out, d);
     const double h = t - t_old;
     *piece.t_old = t_old;
@@ -233,8 +222,7 @@ inline void describe(const DenseRun<W> &dense, const Work &step, double t_old, c
 }
 
 // The interpolant itself, at t_old + theta h.
-template <class W>
-inline void evaluate(const Dense &d, const Piece &piece, double theta, double *out, const W &w) {
+inline void evaluate(const Dense &d, const Piece &piece, double theta, double *out, const Work &w) {
     const int64_t m = w.m, half = m / 2;
     const double rest = 1.0 - theta;
     const double *rows = piece.rows;
@@ -272,10 +260,9 @@ inline void evaluate(const Dense &d, const Piece &piece, double theta, double *o
 
 // The state at t: an end of the step, or the interpolant's projected. Where no state near it meets the levels it is given
 // as it is, and counted; beyond the step, where an extrapolation may lead anywhere, without a count.
-template <class W>
-inline void interpolate(const DenseRun<W> &dense, double *floats, double t, double *out) {
+inline void interpolate(const DenseRun &dense, double *floats, double t, double *out) {
     const Dense &d = dense.dense;
-    const W &w = dense.work;
+    const Work &w = dense.work;
     const Piece piece(floats, d);
     if (t == *piece.t) return copy(piece.y, out, w.m);
     if (t == *piece.t_old) return copy(piece.y_old, out, w.m);

@@ -52,7 +52,7 @@ inline double paired_error_norm(double *err, const double *low, const double *y,
 
 // The estimate into w.err, and its norm for the step control.
 template <class AnyRun>
-inline void estimate_error(AnyRun &run, const Step &step) {
+inline void estimate_error(const AnyRun &run, const Step &step) {
     const Method &m = run.method;
     const Options &o = run.options;
     const auto &w = run.work;
@@ -79,14 +79,14 @@ inline void trapezoid_error(const double *y, const double *y_hat, double h, cons
 
 // Whether this projection, which needs no estimate, is compared with one all the same.
 template <class AnyRun>
-inline bool is_sampled(AnyRun &run) {
+inline bool is_sampled(const AnyRun &run) {
     const int64_t begun = ++run.work.counters[BEGUN];
     return run.options.watched && (begun <= SAMPLED_FIRST || begun % SAMPLED_EACH == 0);
 }
 
 // The local error in w.err, by an evaluation of f that is not counted and serves nothing else.
 template <class AnyRun>
-[[gnu::cold, gnu::noinline]] inline void sample_error(AnyRun &run, const Step &step) {
+[[gnu::cold, gnu::noinline]] inline void sample_error(const AnyRun &run, const Step &step) {
     const Method &m = run.method;
     const auto &w = run.work;
     if (!w.counters[HAVE_F]) run.system.rhs(w, step.t_new, w.y_hat, w.last());

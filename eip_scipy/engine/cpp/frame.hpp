@@ -51,22 +51,19 @@ inline Triple<Value> multiply_add(const Triple<Value> &a, const Triple<Value> &b
 // With a fourth number that means nothing.
 template <>
 struct Triple<double> {
-    __m256d part = _mm256_setzero_pd();
+    Vector part = {};
 
-    static Triple spread(double weight) { return {_mm256_set1_pd(weight)}; }
-    static Triple load(const double *a) { return {_mm256_loadu_pd(a)}; }
-    static Triple load_last(const double *a) { return {_mm256_set_pd(0.0, a[2], a[1], a[0])}; }
-    void store(double *out) const { _mm256_storeu_pd(out, part); }
-    void store_last(double *out) const {
-        _mm_storeu_pd(out, _mm256_castpd256_pd128(part));
-        _mm_store_sd(out + 2, _mm256_extractf128_pd(part, 1));
-    }
-    Triple operator-() const { return {_mm256_xor_pd(part, _mm256_set1_pd(-0.0))}; }
+    static Triple spread(double weight) { return {spread_vector(weight)}; }
+    static Triple load(const double *a) { return {eip::load(a)}; }
+    static Triple load_last(const double *a) { return {Vector{a[0], a[1], a[2], 0.0}}; }
+    void store(double *out) const { eip::store(part, out); }
+    void store_last(double *out) const { std::memcpy(out, &part, 3 * sizeof(double)); }
+    Triple operator-() const { return {-part}; }
 };
 
 template <>
 inline Triple<double> multiply_add(const Triple<double> &a, const Triple<double> &b, const Triple<double> &c) {
-    return {_mm256_fmadd_pd(a.part, b.part, c.part)};
+    return {fused(a.part, b.part, c.part)};
 }
 #endif
 

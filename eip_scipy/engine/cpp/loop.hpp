@@ -67,8 +67,7 @@ inline bool any_crossed(const Schedule &s) {
 
 // Notes the events that happen in a step, in the order of their times. ENDED where one of them ends the run, at `end`: what
 // comes after it does not count. PAUSE, and nothing noted, where one has no root to be found.
-template <class AnyRun, class W>
-inline Code locate(AnyRun &run, const DenseRun<W> &dense, const Schedule &s, Roots &roots, double *piece, double &end) {
+inline Code locate(const Run &run, const DenseRun &dense, const Schedule &s, Roots &roots, double *piece, double &end) {
     const auto &w = run.work;
     std::vector<double> values(s.n_events), state(w.m);
     std::vector<std::pair<double, int64_t>> found;
@@ -80,10 +79,10 @@ inline Code locate(AnyRun &run, const DenseRun<W> &dense, const Schedule &s, Roo
             return values[i];
         });
         if (std::isnan(root)) return PAUSE;
-        found.emplace_back(root, i);
+        const auto place = std::find_if(found.begin(), found.end(),
+                                        [&](const auto &other) { return s.span.sign * (root - other.first) < 0.0; });
+        found.emplace(place, root, i);
     }
-    std::stable_sort(found.begin(), found.end(),
-                     [&](const auto &a, const auto &b) { return s.span.sign * (a.first - b.first) < 0.0; });
     for (const auto &[t, event] : found) {
         int64_t &count = *roots.count;
         roots.event[count] = event;
@@ -101,11 +100,10 @@ inline Code locate(AnyRun &run, const DenseRun<W> &dense, const Schedule &s, Roo
 
 // What is asked for within the step that is pending: its interpolant, roots of events, states at given times. OK, ENDED by
 // an event, or PAUSE where the caller has to do it: events in Python, one without a root, no room for more.
-template <class AnyRun>
-inline Code sample(AnyRun &run, Samples &samples, const Schedule &s, const double *y, const double *y_new,
+inline Code sample(const Run &run, Samples &samples, const Schedule &s, const double *y, const double *y_new,
                    const Saved &saved) {
     const auto &w = run.work;
-    const DenseRun<std::decay_t<decltype(w)>> dense(samples.dense, run.system);
+    const DenseRun dense(samples.dense, run.system);
     Pieces &kept = samples.interpolants;
     Roots &roots = samples.roots;
     double end = s.clock[TIME_NEW];
@@ -126,8 +124,7 @@ inline Code sample(AnyRun &run, Samples &samples, const Schedule &s, const doubl
 }
 
 // Whether something within the step is asked for: more than a time that is its end, whose state is saved here.
-template <class AnyRun>
-inline bool wants_samples(AnyRun &run, const Samples *samples, const Schedule &s, const double *y_new,
+inline bool wants_samples(const Work &w, const Samples *samples, const Schedule &s, const double *y_new,
                           const Saved &saved) {
     int64_t &row = s.place[ROW];
     if (any_crossed(s) || (samples && samples->interpolants.capacity > 0)) return true;
@@ -135,16 +132,15 @@ inline bool wants_samples(AnyRun &run, const Samples *samples, const Schedule &s
     if (row >= s.n_eval || s.span.sign * (s.t_eval[row] - t_new) > 0.0) return false;
     if (s.t_eval[row] != t_new) return true;
     saved.t[row] = t_new;
-    copy(y_new, saved.y + row * run.work.m, run.work.m);
+    copy(y_new, saved.y + row * w.m, w.m);
     ++row;
     return false;
 }
 
 // How far the steps go before someone looks: a multistep method makes many at once.
-template <class AnyRun>
-inline int64_t next_stop(const AnyRun &run, const Samples *samples, const Schedule &s, int64_t k, int64_t k_end) {
+inline int64_t next_stop(const Method &method, const Samples *samples, const Schedule &s, int64_t k, int64_t k_end) {
     const bool each = s.n_events > 0 || (samples && samples->interpolants.capacity > 0);
-    if (!run.method.multistep || run.method.multistep->brief || each) return k + 1;
+    if (!method.multistep || method.multistep->brief || each) return k + 1;
     int64_t stop = std::min(k_end, s.span.n_steps);
     if (s.save_every > 0) stop = std::min(stop, (k / s.save_every + 1) * s.save_every);
     if (s.place[ROW] < s.n_eval) {  // the step before the one with the next time in it
@@ -156,7 +152,7 @@ inline int64_t next_stop(const AnyRun &run, const Samples *samples, const Schedu
 
 // Steps up to `k_end`; returns OK or why it stopped. Without `samples` it pauses where there is something to sample.
 template <class AnyRun>
-inline Code advance(AnyRun &run, Samples *samples, const Schedule &s, int64_t k_end, double *y, double *y_new,
+[[gnu::noinline]] inline Code advance(const AnyRun &run, Samples *samples, const Schedule &s, int64_t k_end, double *y, double *y_new,
                     const Saved &saved) {
     const auto &w = run.work;
     int64_t *place = s.place;
@@ -174,9 +170,9 @@ inline Code advance(AnyRun &run, Samples *samples, const Schedule &s, int64_t k_
         if (samples && samples->interpolants.capacity > 0 &&
             *samples->interpolants.count == samples->interpolants.capacity)
             return FULL;
-        const int64_t stop = next_stop(run, samples, s, k, k_end);
+        const int64_t stop = next_stop(run.method, samples, s, k, k_end);
         const Code status = stop == k + 1 ? next_step(run, s.span, s.clock, k, y, y_new)
-                                          : next_states(run, s.span, s.clock, k, stop, y, y_new);
+                                          : next_states(of_any_length(run), s.span, s.clock, k, stop, y, y_new);
         if (status != OK) return status;
         place[STEP] = stop;
         place[PENDING] = 1;
@@ -188,8 +184,8 @@ inline Code advance(AnyRun &run, Samples *samples, const Schedule &s, int64_t k_
             ++place[ROW];
         }
         if (s.n_events > 0) run.system.event(w, t_new, y_new, s.g_new);
-        if (!wants_samples(run, samples, s, y_new, saved)) continue;
-        const Code code = samples ? sample(run, *samples, s, y, y_new, saved) : PAUSE;
+        if (!wants_samples(w, samples, s, y_new, saved)) continue;
+        const Code code = samples ? sample(of_any_length(run), *samples, s, y, y_new, saved) : PAUSE;
         if (code != OK) return code;
     }
 }

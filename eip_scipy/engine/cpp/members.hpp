@@ -14,15 +14,13 @@ struct Members {
     double *y, *t, *rows, *max_defect, *max_correction, *figures;
     int64_t *status, *counters, *where;
 
-    template <class W>
-    Saved saved(int64_t k, const W &w) const {
+    Saved saved(int64_t k, const Work &w) const {
         return {t_saved, rows + (kept ? k * n_rows * w.m : 0), n_rows};
     }
 };
 
 // Everything as at the start of a run; false where it has none that is finite, which is then to be explained.
-template <class AnyRun>
-inline bool begin_member(AnyRun &run, Samples *samples, const Schedule &s, const Members &members, double *y) {
+inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, const Members &members, double *y) {
     const auto &w = run.work;
     const Options &o = run.options;
     System &system = run.system;
@@ -64,8 +62,7 @@ inline bool begin_member(AnyRun &run, Samples *samples, const Schedule &s, const
 }
 
 // After an event: its time and state are the member's last ones, and no row lies beyond it.
-template <class W>
-inline void end_by_event(const Roots &roots, const Schedule &s, const Members &members, const W &w) {
+inline void end_by_event(const Roots &roots, const Schedule &s, const Members &members, const Work &w) {
     const int64_t k = members.where[0], root = *roots.count - 1;
     const double t = roots.t[root], *y = roots.y + root * w.m;
     const Saved saved = members.saved(k, w);
@@ -80,8 +77,7 @@ inline void end_by_event(const Roots &roots, const Schedule &s, const Members &m
     copy(y, members.y + k * w.m, w.m);
 }
 
-template <class AnyRun>
-inline void end_member(AnyRun &run, Samples *samples, const Schedule &s, const Members &members, const double *y,
+inline void end_member(const Run &run, Samples *samples, const Schedule &s, const Members &members, const double *y,
                        Code code) {
     const auto &w = run.work;
     const int64_t k = members.where[0];
@@ -101,18 +97,18 @@ inline void end_member(AnyRun &run, Samples *samples, const Schedule &s, const M
 // Members from where[0] on, so many steps in all. OK: all are at their ends, or it is to be called again; else what has
 // happened to the member at hand: a code of the step, DOUBTFUL for a start that is not finite, PAUSE as by `advance`.
 template <class AnyRun>
-inline Code sweep(AnyRun &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps, double *y,
-                  double *y_new) {
+inline Code sweep(const AnyRun &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps,
+                  double *y, double *y_new) {
     int64_t &k = members.where[0], &begun = members.where[1];
     for (; k < members.count; ++k, begun = 0) {
-        if (!begun && !begin_member(run, samples, s, members, y)) return DOUBTFUL;
+        if (!begun && !begin_member(of_any_length(run), samples, s, members, y)) return DOUBTFUL;
         begun = 1;
         const int64_t before = s.place[STEP];
         const Code code = advance(run, samples, s, before + steps, y, y_new, members.saved(k, run.work));
         steps -= s.place[STEP] - before;
         if (code == OK && s.clock[TIME] != s.span.t_bound) return OK;
         if (code != OK && code != ENDED) return code;
-        end_member(run, samples, s, members, y, code);
+        end_member(of_any_length(run), samples, s, members, y, code);
     }
     return OK;
 }

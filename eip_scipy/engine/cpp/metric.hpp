@@ -104,9 +104,8 @@ inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &
 }
 
 // The same, squares taken in a unit of each block's own, so that they neither vanish nor overflow.
-template <class W>
 [[gnu::cold, gnu::noinline]] inline void extreme_block_sizes(const double *y, double rounding, const Options &o,
-                                                             const W &w) {
+                                                             const Work &w) {
     for (int64_t b = 0; b < o.blocks.count; ++b) {
         const uint64_t first = o.blocks.start[b], last = o.blocks.start[b + 1];
         double top = 0.0;
@@ -199,8 +198,7 @@ inline Value correction_in_local_errors(const Value &largest_error, const Option
 }
 
 // Half way, on a log scale, from the error metric to equal relative errors; blocks without error stay put.
-template <class W>
-inline void soften(const Options &o, const W &w) {
+inline void soften(const Options &o, const Work &w) {
     const double inverse = 1.0 / largest(w.scale, o.blocks.count);
     for (int64_t b = 0; b < o.blocks.count; ++b) {
         if (w.scale[b] == 0.0 || block_square(w.err, b, 1.0 / w.scale[b], o.blocks) == 0.0) continue;

@@ -125,33 +125,16 @@ void expect(Engine *self, Py_ssize_t count, Py_ssize_t expected, const char *nam
     if (PyErr_Occurred()) throw PythonError{};
 }
 
-template <int64_t M, typename Call>
-Code with_length(Data &d, Call call) {
-    const Sized<M> work(d.work);
-    RunOf<Sized<M>> run{d.method, d.options, work, d.system, nullptr};
-    return call(run);
-}
-
-// A step or more by `call`, which takes a RunOf; without the GIL where no function is Python's, and then by code of its own
-// for the short states of bodies in two and three dimensions.
+// A step or more by `call`, which takes a Run; without the GIL where no function is Python's.
 template <typename Call>
 Code stepped(Engine *self, Call call) {
     const FloatingPoint mode;
     Data &d = *self->data;
-    const bool python = d.system.python || self->hooks;
-    PyThreadState *released = python ? nullptr : PyEval_SaveThread();
+    PyThreadState *released = d.system.python || self->hooks ? nullptr : PyEval_SaveThread();
     Code code = OK;
     bool broken = false;
     try {
-        const bool real = d.work.n == d.work.m;
-        if (!python && real && d.work.m == 4) {
-            code = with_length<4>(d, call);
-        } else if (!python && real && d.work.m == 6) {
-            code = with_length<6>(d, call);
-        } else {
-            Run run{d.method, d.options, d.work, d.system, self->hooks};
-            code = call(run);
-        }
+        code = call(Run{d.method, d.options, d.work, d.system, self->hooks});
     } catch (const Broken &) {
         broken = true;
     } catch (const PythonError &) {
@@ -220,8 +203,8 @@ PyObject *engine_advance(Engine *self, PyObject *const *args, Py_ssize_t count) 
         }
         check_room(schedule, saved, samples, self->data->method.multistep);
         if (self->hooks) self->hooks->set_state(args[2]);
-        return PyLong_FromLong(
-            stepped(self, [&](auto &run) { return advance(run, samples, schedule, k_end, y, y_new, saved); }));
+        return PyLong_FromLong(stepped(
+            self, [&](const Run &run) { return advance_run(run, samples, schedule, k_end, y, y_new, saved); }));
     });
 }
 
@@ -267,8 +250,9 @@ PyObject *engine_sweep(Engine *self, PyObject *const *args, Py_ssize_t count) {
         }
         check_room(schedule, members.saved(0, self->data->work), self->samples, self->data->method.multistep);
         if (self->samples) self->samples->interpolants.capacity = 0;
-        return PyLong_FromLong(stepped(
-            self, [&](auto &run) { return sweep(run, self->samples, schedule, members, steps, y, y_new); }));
+        return PyLong_FromLong(stepped(self, [&](const Run &run) {
+            return sweep_members(run, self->samples, schedule, members, steps, y, y_new);
+        }));
     });
 }
 
@@ -306,8 +290,9 @@ PyObject *engine_sweep_octets(Engine *self, PyObject *const *args, Py_ssize_t co
         }
         Samples *samples = self->samples;
         if (samples) samples->interpolants.capacity = 0;
+        const Octets octets{*self->eight, samples};
         return PyLong_FromLong(stepped(
-            self, [&](auto &run) { return sweep_octets(run, samples, *self->eight, s, members, steps, y, y_new); }));
+            self, [&](const Run &run) { return sweep_eights(run, octets, s, members, steps, y, y_new); }));
     });
 }
 
@@ -335,17 +320,6 @@ const Dense &dense_output(Engine *self) {
     return self->samples->dense;
 }
 
-// What `call` does with the run's dense output, its evaluations counted among those of the run.
-template <typename Call>
-void between_steps(Engine *self, const Dense &d, Call call) {
-    stepped(self, [&](auto &run) {
-        const DenseRun<std::decay_t<decltype(run.work)>> dense(d, run.system);
-        call(dense, run.work);
-        count_calls(dense, run.work);
-        return OK;
-    });
-}
-
 PyDoc_STRVAR(describe_doc,
              "describe(t_old, y_old, t, y, piece) -> None\n\nThe interpolant over the step made last, as numbers.");
 
@@ -361,8 +335,9 @@ PyObject *engine_describe(Engine *self, PyObject *const *args, Py_ssize_t count)
         const double *y = state_of(args[3], "y", self, kept.get(), true);
         Arrays arrays(kept.get());
         auto *piece = static_cast<double *>(arrays.memory(args[4], "piece", NPY_DOUBLE, {d.floats()}));
-        between_steps(self, d, [&](const auto &dense, const Work &step) {
-            describe(dense, step, t_old, y_old, t, y, piece);
+        stepped(self, [&](const Run &run) {
+            describe_step(run, d, t_old, y_old, t, y, piece);
+            return OK;
         });
         Py_RETURN_NONE;
     });
@@ -382,8 +357,9 @@ PyObject *engine_interpolate(Engine *self, PyObject *const *args, Py_ssize_t cou
         const auto *t = static_cast<const double *>(arrays.memory(args[1], "t", NPY_DOUBLE, {ANY}, true));
         const npy_intp rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[1]), 0);
         auto *out = static_cast<double *>(arrays.memory(args[2], "out", self->type, {rows, d.work.n}));
-        between_steps(self, d, [&](const auto &dense, const Work &) {
-            for (npy_intp k = 0; k < rows; ++k) interpolate(dense, piece, t[k], out + k * d.work.m);
+        stepped(self, [&](const Run &run) {
+            interpolate_step(run, d, piece, t, rows, out);
+            return OK;
         });
         Py_RETURN_NONE;
     });
@@ -408,7 +384,7 @@ PyObject *engine_step(Engine *self, PyObject *const *args, Py_ssize_t count) {
         Ref y_new(PyArray_SimpleNew(1, &n, self->type));
         double *end = static_cast<double *>(PyArray_DATA(reinterpret_cast<PyArrayObject *>(y_new.get())));
         if (self->hooks) self->hooks->set_state(y_new.get());
-        const Code code = stepped(self, [&](auto &run) { return next_step(run, s.span, s.clock, k, y, end); });
+        const Code code = stepped(self, [&](const Run &run) { return step_once(run, s, k, y, end); });
         Ref f_new(PyArray_SimpleNew(1, &n, self->type));
         copy(w.last(), static_cast<double *>(PyArray_DATA(reinterpret_cast<PyArrayObject *>(f_new.get()))), w.m);
         return Py_BuildValue("(idNN)", static_cast<int>(code), s.clock[TIME_NEW], y_new.release(), f_new.release());
@@ -432,7 +408,7 @@ PyObject *engine_project(Engine *self, PyObject *const *args, Py_ssize_t count) 
         step.project = true;
         if (PyErr_Occurred()) return nullptr;
         if (self->hooks) self->hooks->set_state(args[4]);
-        return PyLong_FromLong(stepped(self, [&](auto &run) { return project_any(run, step); }));
+        return PyLong_FromLong(stepped(self, [&](const Run &run) { return project_once(run, step); }));
     });
 }
 
@@ -449,8 +425,8 @@ PyObject *engine_close(Engine *self, PyObject *const *args, Py_ssize_t count) {
         step.project = PyObject_IsTrue(args[2]);
         const auto status = static_cast<Code>(PyLong_AsLong(args[3]));
         if (PyErr_Occurred()) return nullptr;
-        stepped(self, [&](auto &run) {
-            close_step(run, step, status);
+        stepped(self, [&](const Run &run) {
+            close_once(run, step, status);
             return OK;
         });
         Py_RETURN_NONE;
@@ -470,7 +446,7 @@ PyObject *engine_values(Engine *self, PyObject *const *args, Py_ssize_t count) {
         const npy_intp rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[0]), 0);
         const auto *y = static_cast<const double *>(arrays.memory(args[1], "y", self->type, {rows, w.n}, true));
         auto *out = static_cast<double *>(arrays.memory(args[2], "out", NPY_DOUBLE, {rows, w.l}));
-        stepped(self, [&](auto &run) {
+        stepped(self, [&](const Run &run) {
             for (npy_intp k = 0; k < rows; ++k) run.system.inv(run.work, t[k], y + k * w.m, out + k * w.l);
             return OK;
         });

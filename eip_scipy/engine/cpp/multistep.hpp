@@ -112,8 +112,7 @@ inline void begin_sums(const Multistep &ms, int64_t back, double *scratch) {
 }
 
 // A step of the method that starts, from (y, w.carry) at t, with the derivative in w.row(0); into w.y_hat, w.carry_hat.
-template <class AnyRun>
-inline void start_step(AnyRun &run, double t, double h, const double *y) {
+inline void start_step(const Run &run, double t, double h, const double *y) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     const double part = h / static_cast<double>(ms.substeps);
@@ -135,8 +134,7 @@ inline void start_step(AnyRun &run, double t, double h, const double *y) {
 }
 
 // The first `order` nodes, from y at the start with the derivative in w.row(0); `y` is overwritten.
-template <class AnyRun>
-inline Code begin_history(AnyRun &run, double *y) {
+inline Code begin_history(const Run &run, double *y) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     double *S = ms.sums;
@@ -165,8 +163,7 @@ inline Code begin_history(AnyRun &run, double *y) {
 }
 
 // What the corrector would change of the newest position, times the Jacobian, is added to the newest acceleration.
-template <class AnyRun>
-inline void correct_node(AnyRun &run, double t, double *a) {
+inline void correct_node(const Run &run, double t, double *a) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     // At least a few vectors: a sum of as many rows float by float takes as long as one of ten bodies.
@@ -179,8 +176,7 @@ inline void correct_node(AnyRun &run, double t, double *a) {
 }
 
 // One more node.
-template <class AnyRun>
-inline Code add_node(AnyRun &run) {
+inline Code add_node(const Run &run) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     const int64_t half = ms.half;
@@ -240,8 +236,7 @@ inline Code estimate_nodes(const Multistep &ms, const Options &o, double &size, 
 }
 
 // (scratch, w.carry_hat): the state in the middle of the history; the invariants there in w.values, their gradients in w.G.
-template <class AnyRun>
-inline void values_in_the_middle(AnyRun &run, double *scratch) {
+inline void values_in_the_middle(const Run &run, double *scratch) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] - ms.middle) * ms.h;
@@ -254,8 +249,7 @@ inline void values_in_the_middle(AnyRun &run, double *scratch) {
 
 // How far the first values are from the targets in the mean, into the second row of ms.levels. One value, at the start, is
 // off by its rounding, which is more than the motion's own errors come to in a long time. What is more than rounding is not.
-template <class AnyRun>
-[[gnu::noinline]] inline void collect_levels(AnyRun &run, double *scratch) {
+[[gnu::noinline]] inline void collect_levels(const Run &run, double *scratch) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     const int64_t count = (ms.place[NEWEST] - ms.order) / LEVEL_SPACING;
@@ -270,8 +264,7 @@ template <class AnyRun>
 
 // What is to be corrected at the newest state, into w.target: the defects in the middle of the history, where the formula for
 // the state is the most accurate. Gradients and values at the newest state are left in w.G and w.values.
-template <class AnyRun>
-inline void defects_in_the_middle(AnyRun &run, double *scratch) {
+inline void defects_in_the_middle(const Run &run, double *scratch) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     values_in_the_middle(run, scratch);
@@ -287,8 +280,7 @@ inline void defects_in_the_middle(AnyRun &run, double *scratch) {
 // The projection of w.y_hat by the defects in w.target, with the targets in the first row of ms.levels. Of a defect as small
 // as its rounding only a part is taken, the less the smaller it is: each correction turns the orbit a little, in a direction
 // that no invariant holds.
-template <class AnyRun>
-inline Code project_softly(AnyRun &run, const Step &step) {
+inline Code project_softly(const Run &run, const Step &step) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     double *left = ms.levels + 2 * w.l;
@@ -318,8 +310,7 @@ inline void gather_errors(const Multistep &ms, double size, const W &w) {
 }
 
 // The projection, whose correction goes into the sums; the history stays as it is.
-template <class AnyRun>
-[[gnu::noinline]] inline Code project_nodes(AnyRun &run, double *scratch) {
+[[gnu::noinline]] inline Code project_nodes(const Run &run, double *scratch) {
     const Multistep &ms = *run.method.multistep;
     const Options &o = run.options;
     const auto &w = run.work;
@@ -355,8 +346,7 @@ template <class AnyRun>
 }
 
 // The history up to node `last`.
-template <class AnyRun>
-inline Code advance_history(AnyRun &run, int64_t last, double *scratch) {
+inline Code advance_history(const Run &run, int64_t last, double *scratch) {
     const Multistep &ms = *run.method.multistep;
     while (ms.place[NEWEST] < last) {
         Code status = add_node(run);
@@ -370,8 +360,7 @@ inline Code advance_history(AnyRun &run, int64_t last, double *scratch) {
 }
 
 // A look at the history, and the projection of the last state, w.y_hat, which a step from `from` has made.
-template <class AnyRun>
-inline Code project_last(AnyRun &run, const Step &step, double from) {
+inline Code project_last(const Run &run, const Step &step, double from) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     if (ms.brief) {
@@ -398,8 +387,7 @@ inline Code project_last(AnyRun &run, const Step &step, double from) {
 
 // The state at t, beyond what the history can be centred on, by the method that starts: from the middle of the history, or
 // in a run without one from y at t_old. The last one is projected.
-template <class AnyRun>
-[[gnu::noinline]] inline Code finish_nodes(AnyRun &run, const Step &step) {
+[[gnu::noinline]] inline Code finish_nodes(const Run &run, const Step &step) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     double from = step.t;
@@ -423,8 +411,7 @@ template <class AnyRun>
 
 // From the state y at step k to that at step `stop`, whose derivative is left in w.last(). The last step of a run is never a
 // node: it may be shorter.
-template <class AnyRun>
-inline Code next_states(AnyRun &run, const Span &span, double *clock, int64_t k, int64_t stop, const double *y,
+inline Code next_states(const Run &run, const Span &span, double *clock, int64_t k, int64_t stop, const double *y,
                         double *y_new) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;

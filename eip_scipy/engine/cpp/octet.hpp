@@ -4,10 +4,6 @@
 
 #include <cmath>
 
-#if defined(__SSE2__)
-#include <immintrin.h>
-#endif
-
 #include "sums.hpp"
 
 namespace eip {
@@ -22,26 +18,25 @@ inline Vector spread_vector(double x) {
 #endif
 }
 
+// One instruction, and below by the compiler's own name for it: the header with the processor's takes longer to compile than
+// most of these files.
 inline Vector root(Vector v) {
-#if defined(__AVX__)
-    return (Vector)_mm256_sqrt_pd((__m256d)v);
-#elif defined(__SSE2__)
-    return (Vector)_mm_sqrt_pd((__m128d)v);
-#else
     for (int k = 0; k < WIDTH; ++k) v[k] = std::sqrt(v[k]);
     return v;
-#endif
 }
 
 // a b + c, rounded once.
-inline Vector fused(Vector a, Vector b, Vector c) {
-#if defined(__FMA__)
-    return (Vector)_mm256_fmadd_pd((__m256d)a, (__m256d)b, (__m256d)c);
+#if defined(__FMA__) && !defined(__clang__)
+inline Vector fused(Vector a, Vector b, Vector c) { return __builtin_ia32_vfmaddpd256(a, b, c); }
 #else
+#if !defined(__FMA__) && !defined(__ARM_FEATURE_FMA)
+[[gnu::noinline]]  // calls a function lane by lane
+#endif
+inline Vector fused(Vector a, Vector b, Vector c) {
     for (int k = 0; k < WIDTH; ++k) c[k] = std::fma(a[k], b[k], c[k]);
     return c;
-#endif
 }
+#endif
 
 // A truth value for each of eight.
 struct Mask {

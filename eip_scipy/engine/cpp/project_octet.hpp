@@ -7,8 +7,7 @@
 namespace eip {
 
 // The Newton step of one member, whose gradients are nearly parallel or vanish, by pivoted QR.
-template <class W>
-[[gnu::noinline]] inline void solve_alone(Eight &eight, int64_t lane, const Options &o, const W &w) {
+[[gnu::noinline]] inline void solve_alone(Eight &eight, int64_t lane, const Options &o, const Work &w) {
     const WorkOf<Octet> &eights = eight.work;
     eight.take(eights.sigma, lane, w.sigma, w.m);
     eight.take(eights.y_hat, lane, w.y_hat, w.m);
@@ -71,8 +70,7 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const WorkO
 }
 
 // Projects eight members; returns those of `alive` who have to make this step by themselves. As `project_step`.
-template <class W>
-inline Mask project_octet(Eight &eight, const Step &step, const Mask &alive, const W &single) {
+inline Mask project_octet(Eight &eight, const Step &step, const Mask &alive, const Work &single) {
     const Options &o = eight.options;
     const WorkOf<Octet> &w = eight.work;
     eight.system.grad(step.t_new, w.y_hat, w.last(), w.G);

@@ -125,7 +125,7 @@ void PythonCall::take(PyObject *value, PyObject *t, double *out) const {
 PythonFunctions::PythonFunctions(PyObject *functions, PyObject *work, const Work &sizes, int type, PyObject *kept)
     : m_(sizes.m), second_order_(truth(functions, "second_order")) {
     const int64_t components = second_order_ ? sizes.n / 2 : sizes.n;
-    rhs_ = std::make_unique<PythonCall>(attribute(functions, "rhs").get(), type, components, kept);
+    rhs_.emplace(attribute(functions, "rhs").get(), type, components, kept);
     const auto calls = [&](const char *name, std::vector<PythonCall> &out, int64_t expected) {
         const Ref items(PySequence_Fast(attribute(functions, name).get(), "engine: expected a sequence of functions"));
         int64_t total = 0;
@@ -148,7 +148,7 @@ PythonFunctions::PythonFunctions(PyObject *functions, PyObject *work, const Work
     }
     const Ref jacobian = attribute(functions, "jacobian");
     if (jacobian.get() != Py_None) {
-        jacobian_ = std::make_unique<PythonCall>(jacobian.get(), type, sizes.n / 2, kept);
+        jacobian_.emplace(jacobian.get(), type, sizes.n / 2, kept);
         if (jacobian_->floats() != m_ / 2) {
             PyErr_SetString(PyExc_ValueError, "engine: jacobian must fill half as many numbers as the state has");
             throw PythonError{};

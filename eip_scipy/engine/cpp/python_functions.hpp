@@ -1,7 +1,7 @@
 // A user's functions in Python, called with arrays of their own, as SciPy calls them.
 #pragma once
 
-#include <memory>
+#include <optional>
 #include <vector>
 
 #include "python.hpp"
@@ -44,7 +44,7 @@ class PythonFunctions final : public Functions {
     void grad(double t, const double *y, const double *f, double *G) override;
     void event(double t, const double *y, double *values) override;
     void jacobian(double t, const double *q, const double *dq, double *out) override;
-    bool has_jacobian() const { return jacobian_ != nullptr; }
+    bool has_jacobian() const { return jacobian_.has_value(); }
     int64_t events() const { return static_cast<int64_t>(event_.size()); }
 
     // More arrays that functions in place fill.
@@ -57,7 +57,7 @@ class PythonFunctions final : public Functions {
     };
     PyObject *owner_of(const double *out) const;
 
-    std::unique_ptr<PythonCall> rhs_, jacobian_;
+    std::optional<PythonCall> rhs_, jacobian_;
     std::vector<PythonCall> inv_, grad_, event_;
     std::vector<Owner> owners_;
     int64_t m_;

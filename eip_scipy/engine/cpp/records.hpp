@@ -2,7 +2,7 @@
 // keep their memory, so that Python reads what the engine writes.
 #pragma once
 
-#include "side_by_side.hpp"
+#include "engine.hpp"
 #include "python.hpp"
 
 namespace eip {

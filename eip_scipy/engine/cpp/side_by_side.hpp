@@ -30,8 +30,7 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
 
 // The step of one member on the buffers of the single run, up to its new state; false where it fails. `shared`: what all
 // had counted before the step.
-template <class AnyRun>
-[[gnu::noinline]] inline bool step_alone(AnyRun &run, Eight &eight, int64_t lane, const Schedule &s,
+[[gnu::noinline]] inline bool step_alone(const Run &run, Eight &eight, int64_t lane, const Schedule &s,
                                                     const int64_t *shared, double *y, double *y_new) {
     const auto &w = run.work;
     const WorkOf<Octet> &eights = eight.work;
@@ -72,8 +71,7 @@ inline bool is_due(const Schedule &s, int64_t row, double t_new) {
 }
 
 // States at the times of t_eval within the step just made, member by member as in a single run.
-template <class AnyRun>
-[[gnu::noinline]] inline void sample_octet(AnyRun &run, Samples &samples, Eight &eight, const Schedule &s,
+[[gnu::noinline]] inline void sample_octet(const Run &run, Samples &samples, Eight &eight, const Schedule &s,
                                            const Members &members, const Step &step, double *y, double *y_new) {
     const auto &w = run.work;
     const WorkOf<Octet> &eights = eight.work;
@@ -91,7 +89,7 @@ template <class AnyRun>
         s.place[ROW] = row;
         const Saved saved = members.saved(members.where[0] + lane, w);
         try {
-            if (wants_samples(run, &samples, s, y_new, saved)) sample(run, samples, s, y, y_new, saved);
+            if (wants_samples(w, &samples, s, y_new, saved)) sample(run, samples, s, y, y_new, saved);
         } catch (const Broken &) {
             eight.alive[lane] = false;
         }
@@ -101,8 +99,7 @@ template <class AnyRun>
 }
 
 // The next step of all eight.
-template <class AnyRun>
-inline void step_octet(AnyRun &run, Samples *samples, Eight &eight, const Schedule &s, const Members &members,
+inline void step_octet(const Run &run, Samples *samples, Eight &eight, const Schedule &s, const Members &members,
                        double *y, double *y_new) {
     const Span &span = s.span;
     const Options &o = eight.options;
@@ -141,8 +138,7 @@ inline void step_octet(AnyRun &run, Samples *samples, Eight &eight, const Schedu
 }
 
 // Eight members, the last one repeated where there are fewer, as at the start of a run.
-template <class AnyRun>
-inline void begin_octet(AnyRun &run, Eight &eight, const Schedule &s, const Members &members) {
+inline void begin_octet(const Run &run, Eight &eight, const Schedule &s, const Members &members) {
     const int64_t first = members.where[0], n = eight.work.n, p = run.system.n_params;
     WorkOf<Octet> &w = eight.work;
     const double t0 = s.span.t0;
@@ -200,9 +196,9 @@ inline void end_octet(const Eight &eight, const Schedule &s, const Members &memb
 
 // Octets of members from where[0] on, so many steps in all. OK when none is left, or it is to be called again. Whose
 // status is not set has to run by itself.
-template <class AnyRun>
-inline Code sweep_octets(AnyRun &run, Samples *samples, Eight &eight, const Schedule &s, const Members &members,
-                         int64_t steps, double *y, double *y_new) {
+inline Code sweep_octets(const Run &run, const Octets &octets, const Schedule &s, const Members &members, int64_t steps,
+                         double *y, double *y_new) {
+    const auto &[eight, samples] = octets;
     int64_t &first = members.where[0], &begun = members.where[1];
     for (; first < members.count; first += LANES, begun = 0) {
         try {

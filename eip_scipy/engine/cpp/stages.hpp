@@ -13,7 +13,7 @@ inline void nystrom_position(const double *y, double h, double c, const Rows &ro
 }
 
 template <class AnyRun>
-inline void rk_stages(AnyRun &run, const Step &step) {
+inline void rk_stages(const AnyRun &run, const Step &step) {
     const Method &m = run.method;
     const auto &w = run.work;
     for (int64_t i = 1; i < m.stages; ++i) {
@@ -28,7 +28,7 @@ inline void rk_stages(AnyRun &run, const Step &step) {
 
 // Stages keep v, which the accelerations do not see.
 template <class AnyRun>
-inline void rkn_stages(AnyRun &run, const Step &step) {
+inline void rkn_stages(const AnyRun &run, const Step &step) {
     const Method &m = run.method;
     const auto &w = run.work;
     const int64_t half = w.m / 2;

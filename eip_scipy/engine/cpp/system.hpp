@@ -186,6 +186,12 @@ struct RunOf {
 
 using Run = RunOf<Work>;
 
+// By the code for states of any length.
+template <class W, class Called>
+inline RunOf<Work, Called> of_any_length(const RunOf<W, Called> &run) {
+    return {run.method, run.options, run.work, run.system, run.hooks};
+}
+
 // A short real state, most of whose time goes into loops' beginnings and ends.
 template <int64_t M>
 struct Sized : Work {

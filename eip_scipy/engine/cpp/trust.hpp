@@ -177,8 +177,7 @@ inline bool tells_more(const W &w) {
 
 // Per row, twice the defects of all rows in its own unit: what a projection of lower rank may move between them. Twice,
 // because what one row loses to second order another may gain.
-template <class W>
-inline void shared_defects(const W &w, double *shared) {
+inline void shared_defects(const Work &w, double *shared) {
     double total = 0.0;
     for (int64_t i = 0; i < w.l; ++i) total += std::abs(w.before[i]) * w.inverse_norms[i];
     for (int64_t i = 0; i < w.l; ++i)

@@ -1,6 +1,6 @@
 // The loop over steps of one length that the comparators share.
 #include <chrono>
-#include <memory>
+#include <optional>
 #include <string_view>
 
 #include "../calls.hpp"
@@ -113,12 +113,12 @@ PyObject *take_steps(PyObject *, PyObject *args) {
         require_scheme(name, work.n);
         const FixedSteps steps = steps_of(record, rows, work.n, arrays);
         System system;
-        std::unique_ptr<PythonFunctions> in_python;
+        std::optional<PythonFunctions> in_python;
         if (truth(functions, "native")) {
             read_pointers(functions, work, 0, arrays, system);
         } else {
-            in_python = std::make_unique<PythonFunctions>(functions, work_object, work, NPY_DOUBLE, kept.get());
-            system.python = in_python.get();
+            in_python.emplace(functions, work_object, work, NPY_DOUBLE, kept.get());
+            system.python = &*in_python;
         }
         const FloatingPoint mode;
         Callee callee{system, work};

@@ -31,7 +31,7 @@ inline void store_bodies(const Vector *xyz, double *a) {
     const Vector rest = __builtin_shuffle(first, xyz[2], Bits{3, 5, 3, 5});
     store(__builtin_shuffle(first, xyz[2], Bits{0, 1, 4, 2}), a);
     if constexpr (COUNT == 2) {
-        _mm_storeu_pd(a + 4, _mm256_castpd256_pd128((__m256d)rest));
+        std::memcpy(a + 4, &rest, 2 * sizeof(double));
     } else {
         const Vector last = __builtin_shuffle(xyz[0], xyz[1], Bits{2, 6, 3, 7});
         store(__builtin_shuffle(rest, last, Bits{0, 1, 4, 5}), a + 4);

@@ -1,0 +1,61 @@
+#include "engine.hpp"
+
+#include "side_by_side.hpp"
+
+namespace eip {
+namespace {
+
+template <int64_t M, typename Call>
+Code with_length(const Run &run, Call call) {
+    const Sized<M> work(run.work);
+    return call(RunOf<Sized<M>>{run.method, run.options, work, run.system, nullptr});
+}
+
+// Many steps by `call`, which takes a RunOf: where no function is Python's by code of its own for the short states of
+// bodies in two and three dimensions.
+template <typename Call>
+Code by_length(const Run &run, Call call) {
+    const bool able = !run.system.python && !run.hooks && run.work.n == run.work.m;
+    if (able && run.work.m == 4) return with_length<4>(run, call);
+    return able && run.work.m == 6 ? with_length<6>(run, call) : call(run);
+}
+
+}  // namespace
+
+Code advance_run(const Run &run, Samples *samples, const Schedule &s, int64_t k_end, double *y, double *y_new,
+                 const Saved &saved) {
+    return by_length(run, [&](const auto &sized) { return advance(sized, samples, s, k_end, y, y_new, saved); });
+}
+
+Code sweep_members(const Run &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps, double *y,
+                   double *y_new) {
+    return by_length(run, [&](const auto &sized) { return sweep(sized, samples, s, members, steps, y, y_new); });
+}
+
+Code sweep_eights(const Run &run, const Octets &octets, const Schedule &s, const Members &members, int64_t steps,
+                  double *y, double *y_new) {
+    return sweep_octets(run, octets, s, members, steps, y, y_new);
+}
+
+Code step_once(const Run &run, const Schedule &s, int64_t k, const double *y, double *y_new) {
+    return next_step(run, s.span, s.clock, k, y, y_new);
+}
+
+Code project_once(const Run &run, const Step &step) { return project_any(run, step); }
+
+void close_once(const Run &run, const Step &step, Code status) { close_step(run, step, status); }
+
+void describe_step(const Run &run, const Dense &d, double t_old, const double *y_old, double t, const double *y,
+                   double *piece) {
+    const DenseRun dense(d, run.system);
+    describe(dense, run.work, t_old, y_old, t, y, piece);
+    count_calls(dense, run.work);
+}
+
+void interpolate_step(const Run &run, const Dense &d, double *piece, const double *t, int64_t rows, double *out) {
+    const DenseRun dense(d, run.system);
+    for (int64_t k = 0; k < rows; ++k) interpolate(dense, piece, t[k], out + k * d.work.m);
+    count_calls(dense, run.work);
+}
+
+}  // namespace eip

@@ -1,0 +1,33 @@
+// What the binding asks of the engine: templates that are compiled once, in engine.cpp.
+#pragma once
+
+#include "eight.hpp"
+#include "members.hpp"
+
+namespace eip {
+
+// As `advance`, `sweep` and `sweep_octets`, which say what comes back.
+Code advance_run(const Run &run, Samples *samples, const Schedule &s, int64_t k_end, double *y, double *y_new,
+                 const Saved &saved);
+Code sweep_members(const Run &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps, double *y,
+                   double *y_new);
+
+// What octets of members are swept with.
+struct Octets {
+    Eight &eight;
+    Samples *samples;
+};
+Code sweep_eights(const Run &run, const Octets &octets, const Schedule &s, const Members &members, int64_t steps,
+                  double *y, double *y_new);
+
+// Step k of a run, and parts of a step: its projection, and what follows it.
+Code step_once(const Run &run, const Schedule &s, int64_t k, const double *y, double *y_new);
+Code project_once(const Run &run, const Step &step);
+void close_once(const Run &run, const Step &step, Code status);
+
+// The interpolant over a step of a run from y_old at t_old to y at t, and states at some times by it.
+void describe_step(const Run &run, const Dense &dense, double t_old, const double *y_old, double t, const double *y,
+                   double *piece);
+void interpolate_step(const Run &run, const Dense &dense, double *piece, const double *t, int64_t rows, double *out);
+
+}  // namespace eip
