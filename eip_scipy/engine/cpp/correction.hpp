@@ -32,11 +32,19 @@ inline void evaluate_invariants(const AnyRun &run, double t, const double *y) {
         for (int64_t i = 0; i < w.l; ++i) w.values[i] += dot(w.gradient(i), w.carry_hat, w.m);
 }
 
-// w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction, neutral to the frame; out = y_hat + move.
+// Rows along which a correction goes: w.Q, or the gradients as they are where the weights are 1.
+template <class W>
+inline auto *weighed_gradients(const Options &o, const W &w) {
+    if (o.metric == EUCLIDEAN && o.frame.rows == 0) return w.G;
+    weigh_rows(o.frame, w, w.Q);
+    return w.Q;
+}
+
+// w.move = (1 - S (C S)^-1 C) sigma * (Q^T mu), the correction along rows Q, neutral to the frame; out = y_hat + move.
 template <class Value, class W>
-inline void move_along(const Options &o, const W &w, Value *__restrict out) {
+inline void move_along(const Options &o, const W &w, const Value *__restrict Q, Value *__restrict out) {
     const int64_t m = w.m;
-    const Value *__restrict mu = w.mu, *__restrict Q = w.Q, *__restrict sigma = w.sigma, *__restrict y_hat = w.y_hat;
+    const Value *__restrict mu = w.mu, *__restrict sigma = w.sigma, *__restrict y_hat = w.y_hat;
     Value *__restrict move = w.move;
     for (int64_t j = 0; j < m; ++j) out[j] = mu[0] * Q[j];
     for (int64_t k = 1; k < w.l; ++k)
@@ -57,14 +65,16 @@ inline void move_along(const Options &o, const W &w, Value *__restrict out) {
 // The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal.
 template <class W>
 inline int64_t first_move(const Options &o, const W &w, double *out, bool more) {
-    weigh_rows(o.frame, w, w.Q);
-    const Matrix Q = rows_of(w.Q, w), R = small(w.R, w.l, w);
-    int64_t rank = w.l;
-    if (more || !solve_gram(Q, w.g, R, w.mu)) {
-        rank = factor(Q, w.inverse_norms, R, w.pivots);
-        least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
+    const Matrix R = small(w.R, w.l, w);
+    double *rows = more ? nullptr : weighed_gradients(o, w);
+    if (rows && solve_gram(rows_of(rows, w), w.g, R, w.mu)) {
+        move_along(o, w, rows, out);
+        return w.l;
     }
-    if (rank >= 0) move_along(o, w, out);
+    if (rows != w.Q) weigh_rows(o.frame, w, w.Q);
+    const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
+    least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
+    if (rank >= 0) move_along(o, w, w.Q, out);
     return rank;
 }
 
@@ -107,7 +117,7 @@ inline void newton_matrix_solve(int64_t rank, const Work &w) {
     if (rank >= 0) {
         fill(w.mu, 0.0, w.l);
         newton_matrix_solve(rank, w);
-        move_along(o, w, step.y_new);
+        move_along(o, w, w.Q, step.y_new);
     }
     return rank;
 }
@@ -140,7 +150,7 @@ inline Moved move(const AnyRun &run, const Step &step, double largest_error = -1
     if (!defects<double>(nullptr, step.y_new, o, w, w.defect)) return false;
     weigh_rows(o.frame, w, w.B);
     newton_matrix_solve(rank, w);
-    move_along(o, w, step.y_new);
+    move_along(o, w, w.Q, step.y_new);
     return true;
 }
 
@@ -192,7 +202,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     const int64_t found = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
     rank = std::max<int64_t>(0, std::min(rank, found));
     least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
-    move_along(o, w, step.y_new);
+    move_along(o, w, w.Q, step.y_new);
     evaluate_invariants(run, step.t_new, step.y_new);
     shared_defects(w, w.g);
     return judge(w.g, step.y_new, o, w);

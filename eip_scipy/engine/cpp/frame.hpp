@@ -40,6 +40,7 @@ struct Triple {
     void store(Value *out) const { out[0] = x, out[1] = y, out[2] = z; }
     void store_last(Value *out) const { store(out); }
     Triple operator-() const { return {-x, -y, -z}; }
+    Triple operator*(const Triple &other) const { return {x * other.x, y * other.y, z * other.z}; }
 };
 
 template <class Value>
@@ -57,8 +58,12 @@ struct Triple<double> {
     static Triple load(const double *a) { return {eip::load(a)}; }
     static Triple load_last(const double *a) { return {Vector{a[0], a[1], a[2], 0.0}}; }
     void store(double *out) const { eip::store(part, out); }
-    void store_last(double *out) const { std::memcpy(out, &part, 3 * sizeof(double)); }
+    void store_last(double *out) const {
+        std::memcpy(out, &part, 2 * sizeof(double));
+        out[2] = part[2];
+    }
     Triple operator-() const { return {-part}; }
+    Triple operator*(const Triple &other) const { return {part * other.part}; }
 };
 
 template <>
@@ -67,38 +72,60 @@ inline Triple<double> multiply_add(const Triple<double> &a, const Triple<double>
 }
 #endif
 
-// Weighted sum over bodies of their x, y and z.
-template <class Value>
-inline Triple<Value> sum_bodies(const double *weights, const Value *row, int64_t count) {
+// Weighted sums over bodies of their x, y and z, of so many rows side by side: each addition waits for the one before it.
+template <int ROWS, class Value>
+inline void sum_bodies(const double *weights, const Value *rows, int64_t stride, int64_t count, Triple<Value> *out) {
     using Body = Triple<Value>;
-    Body sum;
-    for (int64_t j = 0; j + 1 < count; ++j) sum = multiply_add(Body::spread(weights[j]), Body::load(row + 3 * j), sum);
-    return multiply_add(Body::spread(weights[count - 1]), Body::load_last(row + 3 * (count - 1)), sum);
+    Body sums[ROWS];
+    for (int64_t j = 0; j + 1 < count; ++j)
+        for (int i = 0; i < ROWS; ++i)
+            sums[i] = multiply_add(Body::spread(weights[j]), Body::load(rows + i * stride + 3 * j), sums[i]);
+    const int64_t last = count - 1;
+    for (int i = 0; i < ROWS; ++i)
+        out[i] = multiply_add(Body::spread(weights[last]), Body::load_last(rows + i * stride + 3 * last), sums[i]);
 }
 
-// out = row - weights[j] (x, y, z) for each body j; what is stored behind a body is overwritten by the next one.
+// out = factors (row - weights[j] (x, y, z)) for each body j, where there are factors; what is stored behind a body is
+// overwritten by the next one.
 template <class Value>
-inline void shift_bodies(const Value *row, const double *weights, const Triple<Value> &by, Value *out, int64_t count) {
+inline void shift_bodies(const Value *row, const double *weights, const Triple<Value> &by, const Value *factors, Value *out,
+                         int64_t count) {
     using Body = Triple<Value>;
     const Body back = -by;
-    for (int64_t j = 0; j + 1 < count; ++j)
-        multiply_add(Body::spread(weights[j]), back, Body::load(row + 3 * j)).store(out + 3 * j);
-    const int64_t last = count - 1;
-    multiply_add(Body::spread(weights[last]), back, Body::load_last(row + 3 * last)).store_last(out + 3 * last);
+    for (int64_t j = 0; j + 1 < count; ++j) {
+        const Body body = multiply_add(Body::spread(weights[j]), back, Body::load(row + 3 * j));
+        (factors ? body * Body::load(factors + 3 * j) : body).store(out + 3 * j);
+    }
+    const int64_t last = 3 * (count - 1);
+    const Body body = multiply_add(Body::spread(weights[count - 1]), back, Body::load_last(row + last));
+    (factors ? body * Body::load_last(factors + last) : body).store_last(out + last);
+}
+
+// Of `ROWS` rows from G on, sigma * (the row projected along the frame of bodies), from B on.
+template <int ROWS, class Value, class W>
+inline void project_rows(const Frame &frame, const W &w, const Value *G, Value *B) {
+    for (int64_t k = 0; k < frame.groups; ++k) {
+        const int64_t first = 3 * frame.count * k;
+        const double *C = frame.bodies + k * frame.count, *M = C + frame.groups * frame.count;
+        Triple<Value> sums[ROWS];
+        sum_bodies<ROWS>(M, G + first, w.m, frame.count, sums);
+        for (int i = 0; i < ROWS; ++i)
+            shift_bodies(G + i * w.m + first, C, sums[i], w.sigma + first, B + i * w.m + first, frame.count);
+    }
 }
 
 // Rows B_i = sigma * (G_i projected along the frame).
 template <class Value, class W>
 inline void weigh_rows(const Frame &frame, const W &w, Value *B) {
+    constexpr int ROWS = sizeof(Value) > sizeof(double) ? 1 : 4;  // as many as registers take
+    int64_t first = 0;
+    for (; first + ROWS <= w.l; first += ROWS) project_rows<ROWS>(frame, w, w.gradient(first), B + first * w.m);
+    for (; first < w.l; ++first) project_rows<1>(frame, w, w.gradient(first), B + first * w.m);
+    if (frame.groups > 0) return;
     for (int64_t i = 0; i < w.l; ++i) {
         const Value *G = w.gradient(i);
         Value *row = B + i * w.m;
-        for (int64_t k = 0; k < frame.groups; ++k) {
-            const int64_t first = 3 * frame.count * k;
-            const double *C = frame.bodies + k * frame.count, *M = C + frame.groups * frame.count;
-            shift_bodies(G + first, C, sum_bodies(M, G + first, frame.count), row + first, frame.count);
-        }
-        if (frame.groups == 0 && frame.rows > 0) {
+        if (frame.rows > 0) {
             copy(G, row, w.m);
             remove_sparse(frame, 1, w.products, row);
         }
@@ -113,7 +140,9 @@ inline void keep_frame(const Frame &frame, const W &w, const Value *move, Value 
     for (int64_t k = 0; k < frame.groups; ++k) {
         const int64_t first = 3 * frame.count * k;
         const double *C = frame.bodies + k * frame.count, *M = C + frame.groups * frame.count;
-        shift_bodies(move + first, M, sum_bodies(C, move + first, frame.count), out + first, frame.count);
+        Triple<Value> sum;
+        sum_bodies<1>(C, move + first, w.m, frame.count, &sum);
+        shift_bodies<Value>(move + first, M, sum, nullptr, out + first, frame.count);
     }
     if (frame.groups == 0) {
         copy(move, out, w.m);

@@ -19,7 +19,7 @@ namespace eip {
     eight.rank[lane] = std::max<int64_t>(rank, 0);
     if (rank >= 0) {
         least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
-        move_along(o, w, w.stage);
+        move_along(o, w, w.Q, w.stage);
     } else {
         fill(w.stage, NOT_A_NUMBER, w.m);
     }
@@ -84,9 +84,9 @@ inline Mask project_octet(Eight &eight, const Step &step, const Mask &alive, con
         leave = outside & block_sizes<Octet>(eight.y, EPS, o, w);
         largest_error = weights_from_sizes(o, w);
     }
-    weigh_rows(o.frame, w, w.Q);
-    const Mask dependent = outside & alive & !solve_gram(rows_of(w.Q, w), w.g, small(w.R, w.l, w), w.mu);
-    move_along(o, w, eight.y_new);
+    Octet *rows = weighed_gradients(o, w);
+    const Mask dependent = outside & alive & !solve_gram(rows_of(rows, w), w.g, small(w.R, w.l, w), w.mu);
+    move_along(o, w, rows, eight.y_new);
     const Mask moved = outside & alive;
     for (int64_t lane = 0; lane < LANES; ++lane)
         if (moved.lane(lane)) eight.rank[lane] = w.l;

@@ -199,6 +199,13 @@ struct Sized : Work {
     static constexpr int64_t n = M, m = M;
 };
 
+// The same with a number of invariants that the compiler knows.
+template <int64_t M, int64_t L>
+struct SizedWith : Sized<M> {
+    explicit SizedWith(const Work &w) : Sized<M>(w) {}
+    static constexpr int64_t l = L;
+};
+
 // One try of a step from (t, y).
 struct Step {
     double t, t_new, h;

@@ -181,6 +181,65 @@ inline void accelerate_block(const double *q, const double *gm, int64_t n, int64
     store_targets<TARGETS>(sums, out, first);
 }
 
+#if defined(__AVX__)
+// The last two of 8 k + 2 bodies, by what the blocks of eight have of their pairs: r_ij changes its sign, 1/r_ij^3 is the
+// same. Sums in streams, in the order in which accelerate_block<2> adds them, and so the same bits.
+struct LastTwo {
+    Vector sums[2][3] = {}, w[2] = {}, d[2][3] = {};  // of the sources behind those that were added last: their w and r_ij
+
+    // Adds the reactions of eight sources to target t.
+    void take(int t, bool begin, const Octet &reaction, const Octet *distance) {
+        const auto across = [=](Vector before, Vector v) {
+            return begin ? __builtin_shuffle(v, Vector{}, Bits{0, 1, 4, 5}) : __builtin_shuffle(before, v, Bits{2, 3, 4, 5});
+        };
+        const auto within = [](const Octet &v) { return __builtin_shuffle(v.part[0], v.part[1], Bits{2, 3, 4, 5}); };
+        for (int c = 0; c < 3; ++c) {
+            const Vector first = fused(-across(w[t], reaction.part[0]), across(d[t][c], distance[c].part[0]), sums[t][c]);
+            sums[t][c] = fused(-within(reaction), within(distance[c]), first);
+            d[t][c] = distance[c].part[1];
+        }
+        w[t] = reaction.part[1];
+    }
+
+    // Adds what is left, with the pull of the two on each other, and stores both accelerations.
+    void store(const double *q, const double *gm, int64_t first, double *out) const {
+        Octet between[3];
+        for (int c = 0; c < 3; ++c) between[c] = q[3 * (first + 1) + c] - q[3 * first + c];
+        const Cube cube(squares(between[0], between[1], between[2], 0.0));
+        for (int t = 0; t < 2; ++t) {
+            // A body's own pull is 0: in the third stream that of the first, in the fourth that of the second.
+            const auto behind = [=](Vector before, Vector v) {
+                const Vector all = __builtin_shuffle(before, v, Bits{2, 3, 4, 5});
+                return __builtin_shuffle(all, Vector{}, t == 0 ? Bits{0, 1, 4, 3} : Bits{0, 1, 2, 4});
+            };
+            const Vector pull = behind(w[t], cube.times(gm[first + 1 - t]).part[0]);
+            for (int c = 0; c < 3; ++c) {
+                const Vector away = t == 0 ? -between[c].part[0] : between[c].part[0];
+                const Vector s = fused(-pull, behind(d[t][c], away), sums[t][c]);
+                out[3 * (first + t) + c] = (s[0] + s[2]) + (s[1] + s[3]);
+            }
+        }
+    }
+};
+
+inline void accelerate_block(const double *q, const double *gm, int64_t n, int64_t first, double *out, LastTwo &last) {
+    Octet own[3], sums[3] = {0.0, 0.0, 0.0};
+    load_targets<LANES>(q, first, own);
+#pragma GCC unroll 2
+    for (int64_t j = 0; j < n - 2; ++j) add_sources<LANES>(q, gm, own, j, first, sums, 1.0);
+    for (int t = 0; t < 2; ++t) {
+        Octet d[3], m;
+        load_sources<LANES>(q, gm, n - 2 + t, d, m);
+        for (int c = 0; c < 3; ++c) d[c] -= own[c];
+        const Cube cube(squares(d[0], d[1], d[2], 0.0));
+        const Octet w = cube.times(m);
+        for (int c = 0; c < 3; ++c) sums[c] = multiply_add(w, d[c], sums[c]);
+        last.take(t, first == 0, cube.times(Octet::load(gm + first)), d);
+    }
+    store_targets<LANES>(sums, out, first);
+}
+#endif
+
 // Every pair once, with its reaction: for less than four bodies.
 template <class T>
 inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out) {
@@ -216,6 +275,13 @@ inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out) {
         return;
     }
     const int64_t rest = n % 8;
+#if defined(__AVX__)
+    if (rest == 2) {
+        LastTwo last;
+        for (int64_t first = 0; first < n - 2; first += 8) accelerate_block(q, gm, n, first, out, last);
+        return last.store(q, gm, n - 2, out);
+    }
+#endif
     for (int64_t k = 0; k < n / 8 + (rest > 4); ++k) accelerate_block<8>(q, gm, n, std::min(8 * k, n - 8), out);
     if (2 < rest && rest <= 4)
         accelerate_block<4>(q, gm, n, n - 4, out);
