@@ -152,8 +152,8 @@ inline int64_t next_stop(const Method &method, const Samples *samples, const Sch
 
 // Steps up to `k_end`; returns OK or why it stopped. Without `samples` it pauses where there is something to sample.
 template <class AnyRun>
-[[gnu::noinline]] inline Code advance(const AnyRun &run, Samples *samples, const Schedule &s, int64_t k_end, double *y, double *y_new,
-                    const Saved &saved) {
+[[gnu::noinline]] inline Code advance(const AnyRun &run, Samples *samples, const Schedule &s, int64_t k_end, double *y,
+                                      double *y_new, const Saved &saved) {
     const auto &w = run.work;
     int64_t *place = s.place;
     while (true) {

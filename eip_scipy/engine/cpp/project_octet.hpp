@@ -70,8 +70,8 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w)
     return more;
 }
 
-// Projects eight members; returns those of `alive` who have to make this step by themselves. As `project_step`. W is the
-// work of all eight, or one of a length that the compiler knows.
+// Projects eight members; returns those of `alive` who have to make this step by themselves. As `project_step`. W is
+// the work of all eight, or the same of a length that the compiler knows.
 template <class W>
 inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask &alive, const Work &single) {
     const Options &o = eight.options;
