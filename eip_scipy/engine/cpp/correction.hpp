@@ -219,7 +219,7 @@ inline Code stay(const Step &step, const Options &o, const W &w) {
 }
 
 template <class AnyRun>
-inline Code project_evaluated(AnyRun &run, const Step &step);
+inline Code project_evaluated(const AnyRun &run, const Step &step);
 
 // Project w.y_hat into y_new by o.iterations Newton steps; returns OK, FAILED_PROJECTION or POSTPONED.
 //
@@ -244,7 +244,7 @@ inline Code project_step(const AnyRun &run, const Step &step) {
 
 // The rest of it, where the gradients at w.y_hat and the invariants' values are known.
 template <class AnyRun>
-inline Code project_evaluated(AnyRun &run, const Step &step) {
+inline Code project_evaluated(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
     if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) return stay(step, o, w);

@@ -4,7 +4,6 @@
 
 #include <vector>
 
-#include "correction.hpp"
 #include "multistep.hpp"
 
 namespace eip {
@@ -146,8 +145,7 @@ inline void seventh(const DenseRun &dense, const Piece &piece, double h, const W
 
 // For the nodes of a multistep method: the accelerations of the whole history, and behind them how many nodes before the
 // newest the step begins, and its length in nodes' distances. A run too short for a history has the quintic, and -1 there.
-template <class W>
-inline void history(const Dense &d, const Piece &piece, double *f_old, double *f, const W &w) {
+inline void history(const Dense &d, const Piece &piece, double *f_old, double *f, const Work &w) {
     const Multistep &ms = *d.multistep;
     double *about = piece.rows + (d.rows() - 1) * w.m;
     const double h = *piece.t - *piece.t_old;
@@ -162,8 +160,7 @@ inline void history(const Dense &d, const Piece &piece, double *f_old, double *f
 }
 
 // Its value: the state at the step's start, and the polynomial through the accelerations integrated twice.
-template <class W>
-inline void from_history(const Dense &d, const Piece &piece, double theta, double *out, const W &w) {
+inline void from_history(const Dense &d, const Piece &piece, double theta, double *out, const Work &w) {
     const double *about = piece.rows + (d.rows() - 1) * w.m;
     const int64_t order = d.columns, half = w.m / 2;
     const double x = theta * about[1], h = (*piece.t - *piece.t_old) / about[1];

@@ -17,6 +17,7 @@ struct Eight {
     int64_t counters[N_COUNTERS] = {};
     Work flat{};
     WorkOf<Octet> work{};
+    SizedWith<4, 2, Octet> short_work{work};  // the same where it is of that length
     Octet *y, *y_new, *projections, *skips, *reduced;
     // Members that are still here; their counters beyond those of all; rank of the last projection.
     bool alive[LANES] = {};
@@ -46,6 +47,7 @@ struct Eight {
             next += count;
         }
         work.counters = counters;
+        short_work = SizedWith<4, 2, Octet>(work);
         tolerances.resize(2 * LANES * n);
         for (int64_t i = 0; i < LANES * n; ++i) {
             tolerances[i] = o.rtol[i / LANES];

@@ -1,6 +1,5 @@
 #include "engine.hpp"
 
-#include "nodes.hpp"
 #include "side_by_side.hpp"
 
 namespace eip {
@@ -29,8 +28,8 @@ Code advance_run(const Run &run, Samples *samples, const Schedule &s, int64_t k_
     return by_length(run, [&](const auto &sized) { return advance(sized, samples, s, k_end, y, y_new, saved); });
 }
 
-Code sweep_members(const Run &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps, double *y,
-                   double *y_new) {
+Code sweep_members(const Run &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps,
+                   double *y, double *y_new) {
     return by_length(run, [&](const auto &sized) { return sweep(sized, samples, s, members, steps, y, y_new); });
 }
 

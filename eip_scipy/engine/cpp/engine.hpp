@@ -9,8 +9,8 @@ namespace eip {
 // As `advance`, `sweep` and `sweep_octets`, which say what comes back.
 Code advance_run(const Run &run, Samples *samples, const Schedule &s, int64_t k_end, double *y, double *y_new,
                  const Saved &saved);
-Code sweep_members(const Run &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps, double *y,
-                   double *y_new);
+Code sweep_members(const Run &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps,
+                   double *y, double *y_new);
 
 // What octets of members are swept with.
 struct Octets {

@@ -72,7 +72,7 @@ inline Triple<double> multiply_add(const Triple<double> &a, const Triple<double>
 }
 #endif
 
-// Weighted sums over bodies of their x, y and z, of so many rows side by side: each addition waits for the one before it.
+// Weighted sums over bodies of their x, y and z, of so many rows side by side: each addition waits for the last one.
 template <int ROWS, class Value>
 inline void sum_bodies(const double *weights, const Value *rows, int64_t stride, int64_t count, Triple<Value> *out) {
     using Body = Triple<Value>;
@@ -88,8 +88,8 @@ inline void sum_bodies(const double *weights, const Value *rows, int64_t stride,
 // out = factors (row - weights[j] (x, y, z)) for each body j, where there are factors; what is stored behind a body is
 // overwritten by the next one.
 template <class Value>
-inline void shift_bodies(const Value *row, const double *weights, const Triple<Value> &by, const Value *factors, Value *out,
-                         int64_t count) {
+inline void shift_bodies(const Value *row, const double *weights, const Triple<Value> &by, const Value *factors,
+                         Value *out, int64_t count) {
     using Body = Triple<Value>;
     const Body back = -by;
     for (int64_t j = 0; j + 1 < count; ++j) {

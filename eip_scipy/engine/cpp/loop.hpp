@@ -138,10 +138,9 @@ inline bool wants_samples(const Work &w, const Samples *samples, const Schedule 
 }
 
 // How far the steps go before someone looks: a multistep method makes many at once.
-template <class AnyRun>
-inline int64_t next_stop(const AnyRun &run, const Samples *samples, const Schedule &s, int64_t k, int64_t k_end) {
+inline int64_t next_stop(const Method &method, const Samples *samples, const Schedule &s, int64_t k, int64_t k_end) {
     const bool each = s.n_events > 0 || (samples && samples->interpolants.capacity > 0);
-    if (!run.method.multistep || run.method.multistep->brief || each) return k + 1;
+    if (!method.multistep || method.multistep->brief || each) return k + 1;
     int64_t stop = std::min(k_end, s.span.n_steps);
     if (s.save_every > 0) stop = std::min(stop, (k / s.save_every + 1) * s.save_every);
     if (s.place[ROW] < s.n_eval) {  // the step before the one with the next time in it
@@ -153,8 +152,8 @@ inline int64_t next_stop(const AnyRun &run, const Samples *samples, const Schedu
 
 // Steps up to `k_end`; returns OK or why it stopped. Without `samples` it pauses where there is something to sample.
 template <class AnyRun>
-[[gnu::noinline]] inline Code advance(const AnyRun &run, Samples *samples, const Schedule &s, int64_t k_end, double *y, double *y_new,
-                    const Saved &saved) {
+[[gnu::noinline]] inline Code advance(const AnyRun &run, Samples *samples, const Schedule &s, int64_t k_end, double *y,
+                                      double *y_new, const Saved &saved) {
     const auto &w = run.work;
     int64_t *place = s.place;
     while (true) {
@@ -171,9 +170,9 @@ template <class AnyRun>
         if (samples && samples->interpolants.capacity > 0 &&
             *samples->interpolants.count == samples->interpolants.capacity)
             return FULL;
-        const int64_t stop = next_stop(run, samples, s, k, k_end);
+        const int64_t stop = next_stop(run.method, samples, s, k, k_end);
         const Code status = stop == k + 1 ? next_step(run, s.span, s.clock, k, y, y_new)
-                                          : next_states(in_general(run), s.span, s.clock, k, stop, y, y_new);
+                                          : next_states(of_any_length(run), s.span, s.clock, k, stop, y, y_new);
         if (status != OK) return status;
         place[STEP] = stop;
         place[PENDING] = 1;

@@ -182,20 +182,17 @@ inline double error_metric(const double *y, double rounding, const Options &o, c
 template <class Value, class W>
 inline Value correction_in_local_errors(const Value &largest_error, const Options &o, const W &w) {
     if (!any(largest_error > 0.0)) return 0.0 * largest_error;
-    const int64_t n = o.blocks.size == 1 ? w.m : o.blocks.count;
-    const Value *__restrict scale = w.scale;
-    Value *__restrict unit = w.ratio;
-    for (int64_t b = 0; b < n; ++b) unit[b] = 1.0 / positive(scale[b]);
     Value top = 0.0;
-    for (int64_t b = 0; b < n; ++b) {
+    for (int64_t b = 0; b < (o.blocks.size == 1 ? w.m : o.blocks.count); ++b) {
+        const Value unit = 1.0 / positive(w.scale[b]);
         Value square;
         if (o.blocks.size == 1) {
-            const Value x = w.move[b] * unit[b];
+            const Value x = w.move[b] * unit;
             square = x * x;
         } else {
-            square = block_square(w.move, b, unit[b], o.blocks);
+            square = block_square(w.move, b, unit, o.blocks);
         }
-        top = where(scale[b] > 0.0, max(top, square), top);
+        top = where(w.scale[b] > 0.0, max(top, square), top);
     }
     return where(largest_error > 0.0, sqrt(top) / largest_error, 0.0 * largest_error);
 }

@@ -1,25 +1,446 @@
-// Multistep steps for q'' = a(t, q): what the rest of the engine knows of them (nodes.hpp has the steps).
+// Multistep steps for q'' = a(t, q): Gauss-Jackson's method, summed, one evaluation a step, with the projection in its sums
+// (methods/multistep.py has the formulas). The history is `middle` nodes ahead of the states that a run shows: formulas
+// centred on it lose nothing to rounding, those at its newest end do.
 #pragma once
 
-#include "floats.hpp"
-#include "system.hpp"
+#include "correction.hpp"
+#include "stages.hpp"
 
 namespace eip {
 
 // Places in Multistep::place: whether there is a history, the newest node and its row, nodes since the last projection,
 // and estimates collected.
 enum Node : int { HAVE_NODES, NEWEST, NEWEST_ROW, SINCE, SEEN, N_NODE_PLACES };
+// Estimates that are collected before one is used, and what is left of each a turn later.
+constexpr int64_t COLLECTED = 20;
+constexpr double MEMORY = 0.9;
+// Values of the invariants at the start that are averaged, nodes from one to the next, and how many roundings of an
+// invariant's terms their mean may be off.
+constexpr int64_t LEVELS = 32, LEVEL_SPACING = 4;
+constexpr double LEVEL_BANDS = 4.0;
+
+inline Pair quotient(const Pair &a, const Pair &b) {
+    const double first = a.value / b.value;
+    const Pair product = two_product(first, b.value);
+    const double rest = (a.value - product.value) - product.rest + a.rest - first * b.rest;
+    return two_sum(first, rest / b.value);
+}
+
+inline Pair product(const Pair &a, const Pair &b) {
+    const Pair p = two_product(a.value, b.value);
+    return two_sum(p.value, p.rest + (a.value * b.rest + a.rest * b.value));
+}
+
+inline Pair sum(const Pair &a, const Pair &b) {
+    const Pair s = two_sum(a.value, b.value);
+    return two_sum(s.value, s.rest + (a.rest + b.rest));
+}
+
 inline double *newest(const Multistep &ms) { return ms.nodes + ms.place[NEWEST_ROW] * ms.pitch; }
 
-// The derivative of a state so many nodes before the newest: its velocity, and its acceleration as the history has it.
+// The `count` newest nodes under their weights.
+inline Rows latest(const Multistep &ms, const double *weights, int64_t count) {
+    return {weights, newest(ms) - (count - 1) * ms.pitch, count, ms.pitch};
+}
+
+// Room for one more node; the others move to the first rows where there is none.
+inline double *next_row(const Multistep &ms) {
+    int64_t &at = ms.place[NEWEST_ROW];
+    if (at + 1 == ms.rows) {
+        std::copy(newest(ms) - (ms.order - 1) * ms.pitch, newest(ms) + ms.pitch, ms.nodes);
+        at = ms.order - 1;
+    }
+    return ms.nodes + ++at * ms.pitch;
+}
+
+// S += s + a, s += a; what rounding leaves is added up beside them.
+inline void add_to_sums(const Multistep &ms, const double *__restrict a) {
+    double *__restrict S = ms.sums, *__restrict S_rest = S + ms.pitch, *__restrict s = S_rest + ms.pitch,
+           *__restrict s_rest = s + ms.pitch;
+    for (int64_t i = 0; i < ms.half; ++i) {
+        const Pair first = two_sum(s[i], a[i]);
+        s[i] = first.value;
+        s_rest[i] += first.rest;
+        const Pair second = two_sum(S[i], first.value);
+        S[i] = second.value;
+        S_rest[i] += second.rest + s_rest[i];
+    }
+}
+
+// (y, rest): the state `back` nodes before the newest.
+inline void state_of(const Multistep &ms, int64_t back, double *y, double *rest) {
+    const int64_t half = ms.half, n = ms.order;
+    const Pair h{ms.h, 0.0}, square = two_product(ms.h, ms.h);
+    const double lag = 1.0 + static_cast<double>(back);
+    const double *S = ms.sums, *s = S + 2 * ms.pitch;
+    weighted_sum(1.0, latest(ms, ms.states_q + back * n, n), y, half);
+    weighted_sum(1.0, latest(ms, ms.states_v + back * n, n), y + half, half);
+    for (int64_t i = 0; i < half; ++i) {
+        const Pair first{s[i], s[ms.pitch + i]}, moved = two_product(-lag, first.value);
+        const Pair lagged = sum({S[i], S[ms.pitch + i]}, {moved.value, moved.rest - lag * first.rest});
+        const Pair q = product(square, sum(lagged, {y[i], 0.0})), v = product(h, sum(first, {y[half + i], 0.0}));
+        y[i] = q.value;
+        rest[i] = q.rest;
+        y[half + i] = v.value;
+        rest[half + i] = v.rest;
+    }
+}
+
+// The derivative at that node: its velocity, and its acceleration as the history has it.
 inline void slope_of(const Multistep &ms, int64_t back, const double *y, double *f) {
     copy(y + ms.half, f, ms.half);
     copy(newest(ms) - back * ms.pitch, f + ms.half, ms.half);
 }
 
-// From the state y at step k to that at step `stop`, whose derivative is left in w.last(). OK, NOT_FINITE,
-// FAILED_PROJECTION or UNSTABLE.
-Code next_states(const Run &run, const Span &span, double *clock, int64_t k, int64_t stop, const double *y,
-                 double *y_new);
+// The sums, from the state (q, v) that they hold as pairs of floats, `back` nodes before the newest.
+inline void begin_sums(const Multistep &ms, int64_t back, double *scratch) {
+    const int64_t half = ms.half, n = ms.order;
+    const Pair h{ms.h, 0.0}, square = two_product(ms.h, ms.h);
+    const double lag = 1.0 + static_cast<double>(back);
+    double *S = ms.sums, *s = S + 2 * ms.pitch;
+    weighted_sum(1.0, latest(ms, ms.states_q + back * n, n), scratch, half);
+    weighted_sum(1.0, latest(ms, ms.states_v + back * n, n), scratch + half, half);
+    for (int64_t i = 0; i < half; ++i) {
+        const Pair v = quotient({s[i], s[ms.pitch + i]}, h), q = quotient({S[i], S[ms.pitch + i]}, square);
+        const Pair first = sum(v, {-scratch[half + i], 0.0}), moved = product(first, {lag, 0.0});
+        const Pair second = sum(sum(q, moved), {-scratch[i], 0.0});
+        s[i] = first.value;
+        s[ms.pitch + i] = first.rest;
+        S[i] = second.value;
+        S[ms.pitch + i] = second.rest;
+    }
+}
+
+// A step of the method that starts, from (y, w.carry) at t, with the derivative in w.row(0); into w.y_hat, w.carry_hat.
+inline void start_step(const Run &run, double t, double h, const double *y) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    const double part = h / static_cast<double>(ms.substeps);
+    for (int64_t k = 0; k < ms.substeps; ++k) {
+        const double here = t + static_cast<double>(k) * part;
+        if (k > 0) {
+            copy(w.y_hat, w.move, w.m);
+            copy(w.carry_hat, w.carry, w.m);
+            run.system.rhs(w, here, w.move, w.row(0));
+            ++w.counters[NFEV];
+        }
+        const Step step{here, here + part, part, k > 0 ? w.move : y, w.y_hat, false, false};
+        if (run.method.nystrom)
+            rkn_stages(run, step);
+        else
+            rk_stages(run, step);
+        w.counters[NFEV] += run.method.stages - 1;
+    }
+}
+
+// The first `order` nodes, from y at the start with the derivative in w.row(0); `y` is overwritten.
+inline Code begin_history(const Run &run, double *y) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    double *S = ms.sums;
+    ms.place[NEWEST_ROW] = -1;
+    fill(w.carry, 0.0, w.m);
+    fill(w.err_sum, 0.0, w.m);
+    for (int64_t k = 0; k < ms.order; ++k) {
+        if (k > 0) {
+            start_step(run, ms.t0 + static_cast<double>(k - 1) * ms.h, ms.h, y);
+            copy(w.y_hat, y, w.m);
+            copy(w.carry_hat, w.carry, w.m);
+            run.system.rhs(w, ms.t0 + static_cast<double>(k) * ms.h, y, w.row(0));
+            ++w.counters[NFEV];
+        }
+        if (!all_finite(w.row(0), w.m)) return NOT_FINITE;
+        copy(w.row(0) + ms.half, next_row(ms), ms.half);
+        if (k != ms.order - 1 - ms.middle) continue;
+        for (int64_t part = 0; part < 2; ++part) {
+            copy(y + part * ms.half, S + 2 * part * ms.pitch, ms.half);
+            copy(w.carry + part * ms.half, S + (2 * part + 1) * ms.pitch, ms.half);
+        }
+    }
+    begin_sums(ms, ms.middle, w.stage);
+    ms.place[NEWEST] = ms.order - 1;
+    return OK;
+}
+
+// What the corrector would change of the newest position, times the Jacobian, is added to the newest acceleration.
+inline void correct_node(const Run &run, double t, double *a) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    // At least a few vectors: a sum of as many rows float by float takes as long as one of ten bodies.
+    const int64_t count = std::min(ms.pitch - ms.first, std::max(ms.count, LANES));
+    const double *oldest = a - ms.order * ms.pitch + ms.first;
+    weighted_sum(ms.h * ms.h, {ms.correction, oldest, ms.order + 1, ms.pitch}, ms.moved + ms.first, count);
+    for (int64_t i = ms.first + ms.count; i < ms.first + count; ++i) ms.moved[i] = 0.0;
+    run.system.jacobian(w, t, w.stage, ms.moved, w.f_point);
+    for (int64_t i = ms.first; i < ms.first + ms.count; ++i) a[i] += w.f_point[i];
+}
+
+// One more node.
+inline Code add_node(const Run &run) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    const int64_t half = ms.half;
+    const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] + 1) * ms.h, square = ms.h * ms.h;
+    const double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
+    double *q = w.stage, *v = q + half;
+    weighted_sum(1.0, latest(ms, ms.predict_q, ms.order), q, half);
+    for (int64_t i = 0; i < half; ++i) q[i] = square * (S[i] + (S_rest[i] + q[i]));
+    if (ms.uses_v) {
+        weighted_sum(1.0, latest(ms, ms.predict_v, ms.order), v, half);
+        for (int64_t i = 0; i < half; ++i) v[i] = ms.h * (s[i] + (s_rest[i] + v[i]));
+    }
+    run.system.rhs_of_scratch(w, t, w.stage, w.row(1));
+    ++w.counters[NFEV];
+    double *a = next_row(ms);
+    copy(w.row(1) + half, a, half);
+    if (!all_finite(a, half)) return NOT_FINITE;
+    if (ms.count > 0) correct_node(run, t, a);
+    add_to_sums(ms, a);
+    ++ms.place[NEWEST];
+    ++ms.place[SINCE];
+    return OK;
+}
+
+// Whether the highest difference of the newest nodes is small beside the accelerations, in each body or in all together: it
+// is that of a smooth motion in steps that resolve it.
+inline bool is_smooth(const Multistep &ms, const Options &o, const double *highest) {
+    const int64_t size = o.blocks.size == 3 && ms.half % 3 == 0 ? 3 : ms.half;
+    for (int64_t i = 0; i < ms.half; i += size) {
+        double top = 0.0;
+        for (const int64_t back : {int64_t{0}, ms.middle, ms.order - 1})
+            top = std::max(top, norm(newest(ms) - back * ms.pitch + i, size));
+        if (!(norm(highest + i, size) <= ms.growth * top)) return false;
+    }
+    return true;
+}
+
+// The shape of the steps' errors into w.err_sum, collected over the last turns, and their size now; UNSTABLE where the
+// history is not smooth.
+template <class W>
+inline Code estimate_nodes(const Multistep &ms, const Options &o, double &size, const W &w) {
+    const int64_t half = ms.half, n = ms.order + 1;
+    double *shape = w.move, *highest = w.stage;
+    weighted_sum(1.0, latest(ms, ms.size, n), highest, half);
+    if (!is_smooth(ms, o, highest)) return UNSTABLE;
+    weighted_sum(ms.h * ms.h, latest(ms, ms.shape_q, n), shape, half);
+    weighted_sum(ms.h, latest(ms, ms.shape_v, n), shape + half, half);
+    const double *last = newest(ms), *before = last - ms.pitch;
+    for (int64_t i = 0; i < half; ++i) w.f_point[i] = last[i] - before[i];
+    const double faster = norm(shape + half, half) * norm(last, half) * ms.h, slower = norm(shape, half) * norm(w.f_point, half);
+    if (faster > 0.0) scale_by(shape + half, std::min(1.0, slower / faster), half);
+    const double lower = norm(shape, half), upper = ms.h * ms.h * norm(highest, half);
+    size = lower > 0.0 ? ms.error_constant * upper / lower : 0.0;
+    for (int64_t i = 0; i < w.m; ++i) w.err_sum[i] = MEMORY * w.err_sum[i] + std::abs(shape[i]);
+    ++ms.place[SEEN];
+    return OK;
+}
+
+// (scratch, w.carry_hat): the state in the middle of the history; the invariants there in w.values, their gradients in w.G.
+inline void values_in_the_middle(const Run &run, double *scratch) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] - ms.middle) * ms.h;
+    state_of(ms, ms.middle, scratch, w.carry_hat);
+    slope_of(ms, ms.middle, scratch, w.f_point);
+    run.system.grad(w, t, scratch, w.f_point, w.G);
+    evaluate_invariants(run, t, scratch);
+    ++w.counters[NJEV];
+}
+
+// How far the first values are from the targets in the mean, into the second row of ms.levels. One value, at the start, is
+// off by its rounding, which is more than the motion's own errors come to in a long time. What is more than rounding is not.
+[[gnu::noinline]] inline void collect_levels(const Run &run, double *scratch) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    const int64_t count = (ms.place[NEWEST] - ms.order) / LEVEL_SPACING;
+    values_in_the_middle(run, scratch);
+    for (int64_t i = 0; i < w.l; ++i) {
+        double &mean = ms.levels[w.l + i];
+        mean += ((w.values[i] - w.target[i]) - mean) / static_cast<double>(count);
+        const double terms = std::max(std::abs(w.values[i]), abs_dot(w.gradient(i), scratch, w.m));
+        if (count == LEVELS && !(std::abs(mean) <= LEVEL_BANDS * EPS * terms)) mean = 0.0;
+    }
+}
+
+// What is to be corrected at the newest state, into w.target: the defects in the middle of the history, where the formula for
+// the state is the most accurate. Gradients and values at the newest state are left in w.G and w.values.
+inline void defects_in_the_middle(const Run &run, double *scratch) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    values_in_the_middle(run, scratch);
+    for (int64_t i = 0; i < w.l; ++i) w.target[i] = (w.values[i] - ms.levels[i]) - ms.levels[w.l + i];
+    const double t = ms.t0 + static_cast<double>(ms.place[NEWEST]) * ms.h;
+    state_of(ms, 0, w.y_hat, w.carry_hat);
+    slope_of(ms, 0, w.y_hat, w.last());
+    run.system.grad(w, t, w.y_hat, w.last(), w.G);
+    evaluate_invariants(run, t, w.y_hat);
+    ++w.counters[NJEV];
+}
+
+// The projection of w.y_hat by the defects in w.target, with the targets in the first row of ms.levels. Of a defect as small
+// as its rounding only a part is taken, the less the smaller it is: each correction turns the orbit a little, in a direction
+// that no invariant holds.
+inline Code project_softly(const Run &run, const Step &step) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    double *left = ms.levels + 2 * w.l;
+    for (int64_t i = 0; i < w.l; ++i) {
+        const double defect = w.target[i], square = defect * defect;
+        const double noise = EPS * abs_dot(w.gradient(i), w.y_hat, w.m);
+        const double part = square > 0.0 ? square / (square + noise * noise) : 0.0;
+        w.target[i] = w.values[i] - part * defect;
+        left[i] = (defect - part * defect) + ms.levels[w.l + i];
+    }
+    const Code status = project_evaluated(run, step);
+    copy(ms.levels, w.target, w.l);
+    for (int64_t i = 0; i < w.l; ++i) {
+        w.defect[i] += left[i];
+        w.max_defect[i] = std::max(w.max_defect[i], std::abs(w.defect[i]));
+    }
+    return status;
+}
+
+// The estimates of errors since the last projection into w.err.
+template <class W>
+inline void gather_errors(const Multistep &ms, double size, const W &w) {
+    const double factor = size * std::sqrt(1.0 + static_cast<double>(ms.place[SINCE]));
+    for (int64_t i = 0; i < w.m; ++i) w.err[i] = factor * w.err_sum[i];
+    w.counters[HAVE_ERROR] = 1;
+    w.counters[WAITED] = 0;
+}
+
+// The projection, whose correction goes into the sums; the history stays as it is.
+[[gnu::noinline]] inline Code project_nodes(const Run &run, double *scratch) {
+    const Multistep &ms = *run.method.multistep;
+    const Options &o = run.options;
+    const auto &w = run.work;
+    double size;
+    const Code smooth = estimate_nodes(ms, o, size, w);
+    if (smooth != OK || w.l == 0 || ms.place[SEEN] <= COLLECTED) return smooth;
+    const double t = ms.t0 + static_cast<double>(ms.place[NEWEST]) * ms.h;
+    gather_errors(ms, size, w);
+    if (o.every == AUTO) {
+        state_of(ms, 0, w.y_hat, w.carry_hat);
+        slope_of(ms, 0, w.y_hat, w.last());
+        run.system.grad(w, t, w.y_hat, w.last(), w.G);
+        ++w.counters[NJEV];
+        if (!tells_more(w)) return OK;
+    }
+    copy(w.target, ms.levels, w.l);
+    defects_in_the_middle(run, scratch);
+    const int64_t before = w.counters[PROJECTIONS];
+    const Code status = project_softly(run, Step{t, t, ms.h, w.y_hat, scratch, true, true});
+    if (status != OK) return status;
+    ms.place[SINCE] = 0;
+    if (w.counters[PROJECTIONS] == before) return OK;
+    double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
+    for (int64_t i = 0; i < ms.half; ++i) {
+        const double kick = w.move[ms.half + i] / ms.h, shift = w.move[i] / (ms.h * ms.h) + kick;
+        const Pair first = two_sum(s[i], kick), second = two_sum(S[i], shift);
+        s[i] = first.value;
+        s_rest[i] += first.rest;
+        S[i] = second.value;
+        S_rest[i] += second.rest;
+    }
+    return OK;
+}
+
+// The history up to node `last`.
+inline Code advance_history(const Run &run, int64_t last, double *scratch) {
+    const Multistep &ms = *run.method.multistep;
+    while (ms.place[NEWEST] < last) {
+        Code status = add_node(run);
+        const int64_t after = ms.place[NEWEST] - ms.order;
+        if (status == OK && run.work.l > 0 && after > 0 && after <= LEVELS * LEVEL_SPACING && after % LEVEL_SPACING == 0)
+            collect_levels(run, scratch);
+        if (status == OK && ms.place[NEWEST] % ms.spacing == 0) status = project_nodes(run, scratch);
+        if (status != OK) return status;
+    }
+    return OK;
+}
+
+// A look at the history, and the projection of the last state, w.y_hat, which a step from `from` has made.
+inline Code project_last(const Run &run, const Step &step, double from) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    if (ms.brief) {
+        estimate_error(run, Step{from, step.t_new, step.t_new - from, step.y_new, step.y_new, true, true});
+        w.counters[HAVE_ERROR] = 1;
+    } else {
+        double size;
+        const Code smooth = estimate_nodes(ms, run.options, size, w);
+        if (smooth != OK) return smooth;
+        gather_errors(ms, size, w);
+    }
+    if (w.l == 0) return OK;
+    run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
+    evaluate_invariants(run, step.t_new, w.y_hat);
+    ++w.counters[NJEV];
+    copy(w.target, ms.levels, w.l);
+    for (int64_t i = 0; i < w.l; ++i) w.target[i] = (w.values[i] - ms.levels[i]) - ms.levels[w.l + i];
+    const Code status = project_softly(run, step);
+    if (status != OK || run.options.reuse_f) return status;
+    run.system.rhs(w, step.t_new, step.y_new, w.last());
+    ++w.counters[NFEV];
+    return OK;
+}
+
+// The state at t, beyond what the history can be centred on, by the method that starts: from the middle of the history, or
+// in a run without one from y at t_old. The last one is projected.
+[[gnu::noinline]] inline Code finish_nodes(const Run &run, const Step &step) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    double from = step.t;
+    if (!ms.brief) {
+        state_of(ms, ms.middle, step.y_new, w.carry);
+        slope_of(ms, ms.middle, step.y_new, w.row(0));
+        from = ms.t0 + static_cast<double>(ms.place[NEWEST] - ms.middle) * ms.h;
+    } else {
+        copy(step.y, step.y_new, w.m);
+    }
+    start_step(run, from, step.t_new - from, step.y_new);
+    if (!all_finite(w.y_hat, w.m)) return NOT_FINITE;
+    run.system.rhs(w, step.t_new, w.y_hat, w.last());
+    ++w.counters[NFEV];
+    Code status = OK;
+    copy(w.y_hat, step.y_new, w.m);
+    if (step.last) status = project_last(run, Step{step.t, step.t_new, step.h, w.y_hat, step.y_new, true, true}, from);
+    copy(w.carry_hat, w.carry, w.m);
+    return status;
+}
+
+// From the state y at step k to that at step `stop`, whose derivative is left in w.last(). The last step of a run is never a
+// node: it may be shorter.
+inline Code next_states(const Run &run, const Span &span, double *clock, int64_t k, int64_t stop, const double *y,
+                        double *y_new) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    int64_t *place = ms.place;
+    const int64_t last_node = span.n_steps - 1;
+    const bool last = stop >= span.n_steps;
+    clock[TIME] = span.t0 + static_cast<double>(k) * span.h;
+    clock[TIME_NEW] = last ? span.t_bound : span.t0 + static_cast<double>(stop) * span.h;
+    clock[LENGTH] = clock[TIME_NEW] - clock[TIME];
+    const Step step{clock[TIME], clock[TIME_NEW], clock[LENGTH], y, y_new, last, last};
+    if (ms.brief) {
+        w.counters[WAITED] = k;
+        return finish_nodes(run, step);
+    }
+    if (!place[HAVE_NODES]) {
+        copy(y, y_new, w.m);
+        const Code status = begin_history(run, y_new);
+        if (status != OK) return status;
+        place[HAVE_NODES] = 1;
+    }
+    const int64_t ahead = ms.level ? 0 : ms.middle;
+    const Code status = advance_history(run, std::min(stop + ahead, last_node), y_new);
+    if (status != OK) return status;
+    const int64_t back = place[NEWEST] - stop;
+    if (last || back < ahead) return finish_nodes(run, step);
+    state_of(ms, back, y_new, w.carry_hat);
+    if (!all_finite(y_new, w.m)) return NOT_FINITE;
+    slope_of(ms, back, y_new, w.last());
+    return OK;
+}
 
 }  // namespace eip

@@ -18,8 +18,8 @@ inline Vector spread_vector(double x) {
 #endif
 }
 
-// One instruction, and below by the compiler's own name for it: the header with the processor's takes longer to compile than
-// most of these files.
+// One instruction, and below by the compiler's own name for it: the header with the processor's takes longer to compile
+// than most of these files.
 inline Vector root(Vector v) {
     for (int k = 0; k < WIDTH; ++k) v[k] = std::sqrt(v[k]);
     return v;

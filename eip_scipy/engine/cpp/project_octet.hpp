@@ -28,7 +28,8 @@ namespace eip {
 }
 
 // What `note` does for one member, for those in `done`; returns those for whom there is more to be noted, untouched.
-inline Mask note_octet(double t, const Mask &done, const Options &o, const WorkOf<Octet> &w) {
+template <class W>
+inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w) {
     const double waited = static_cast<double>(w.counters[WAITED]), many = std::sqrt(1.0 + waited);
     const double rounding = waited > 0 ? EPS * many : EPS;
     const double errors = !w.counters[HAVE_ERROR] ? 0.0 : waited == 0 ? 1.0 : o.metric == ERROR ? many : 1.0 + waited;
@@ -69,10 +70,11 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const WorkO
     return more;
 }
 
-// Projects eight members; returns those of `alive` who have to make this step by themselves. As `project_step`.
-inline Mask project_octet(Eight &eight, const Step &step, const Mask &alive, const Work &single) {
+// Projects eight members; returns those of `alive` who have to make this step by themselves. As `project_step`. W is
+// the work of all eight, or the same of a length that the compiler knows.
+template <class W>
+inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask &alive, const Work &single) {
     const Options &o = eight.options;
-    const WorkOf<Octet> &w = eight.work;
     eight.system.grad(step.t_new, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
     if (o.every != 1 && o.metric == ERROR) quadrature(eight.flat.err, eight.flat.err_sum, eight.flat.err, eight.flat.m);

@@ -119,7 +119,8 @@ inline void step_octet(const Run &run, Samples *samples, Eight &eight, const Sch
     const Mask alive = alive_of(eight);
     Mask leave;
     if (project) {
-        leave = project_octet(eight, step, alive, run.work);
+        leave = w.m == 4 && w.l == 2 ? project_octet(eight, eight.short_work, step, alive, run.work)
+                                     : project_octet(eight, w, step, alive, run.work);
     } else {
         copy(w.y_hat, eight.y_new, w.m);
         leave = alive & !all_finite(w.y_hat, w.m);

@@ -186,12 +186,6 @@ struct RunOf {
 
 using Run = RunOf<Work>;
 
-// The same run, for code that does not ask how long its states are.
-template <class AnyRun>
-inline Run in_general(const AnyRun &run) {
-    return {run.method, run.options, run.work, run.system, run.hooks};
-}
-
 // By the code for states of any length.
 template <class W, class Called>
 inline RunOf<Work, Called> of_any_length(const RunOf<W, Called> &run) {
@@ -199,16 +193,16 @@ inline RunOf<Work, Called> of_any_length(const RunOf<W, Called> &run) {
 }
 
 // A short real state, most of whose time goes into loops' beginnings and ends.
-template <int64_t M>
-struct Sized : Work {
-    explicit Sized(const Work &w) : Work(w) {}
+template <int64_t M, class Value = double>
+struct Sized : WorkOf<Value> {
+    explicit Sized(const WorkOf<Value> &w) : WorkOf<Value>(w) {}
     static constexpr int64_t n = M, m = M;
 };
 
 // The same with a number of invariants that the compiler knows.
-template <int64_t M, int64_t L>
-struct SizedWith : Sized<M> {
-    explicit SizedWith(const Work &w) : Sized<M>(w) {}
+template <int64_t M, int64_t L, class Value = double>
+struct SizedWith : Sized<M, Value> {
+    explicit SizedWith(const WorkOf<Value> &w) : Sized<M, Value>(w) {}
     static constexpr int64_t l = L;
 };
 

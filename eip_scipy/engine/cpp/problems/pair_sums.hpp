@@ -182,19 +182,21 @@ inline void accelerate_block(const double *q, const double *gm, int64_t n, int64
 }
 
 #if defined(__AVX__)
-// The last two of 8 k + 2 bodies, by what the blocks of eight have of their pairs: r_ij changes its sign, 1/r_ij^3 is the
-// same. Sums in streams, in the order in which accelerate_block<2> adds them, and so the same bits.
+// The last two of 8 k + 2 bodies, by what the blocks of eight have of their pairs: r_ij changes its sign, 1/r_ij^3 is
+// the same. Sums in streams, in the order in which accelerate_block<2> adds them, and so the same bits.
 struct LastTwo {
-    Vector sums[2][3] = {}, w[2] = {}, d[2][3] = {};  // of the sources behind those that were added last: their w and r_ij
+    Vector sums[2][3] = {}, w[2] = {}, d[2][3] = {};  // w and r_ij: of the sources behind those that were added last
 
     // Adds the reactions of eight sources to target t.
     void take(int t, bool begin, const Octet &reaction, const Octet *distance) {
         const auto across = [=](Vector before, Vector v) {
-            return begin ? __builtin_shuffle(v, Vector{}, Bits{0, 1, 4, 5}) : __builtin_shuffle(before, v, Bits{2, 3, 4, 5});
+            return begin ? __builtin_shuffle(v, Vector{}, Bits{0, 1, 4, 5})
+                         : __builtin_shuffle(before, v, Bits{2, 3, 4, 5});
         };
         const auto within = [](const Octet &v) { return __builtin_shuffle(v.part[0], v.part[1], Bits{2, 3, 4, 5}); };
         for (int c = 0; c < 3; ++c) {
-            const Vector first = fused(-across(w[t], reaction.part[0]), across(d[t][c], distance[c].part[0]), sums[t][c]);
+            const Vector pull = -across(w[t], reaction.part[0]);
+            const Vector first = fused(pull, across(d[t][c], distance[c].part[0]), sums[t][c]);
             sums[t][c] = fused(-within(reaction), within(distance[c]), first);
             d[t][c] = distance[c].part[1];
         }
