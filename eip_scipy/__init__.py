@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from .methods.multistep import GaussJackson
     from .methods.nystrom import NystromTableau
     from .methods.runge_kutta import Tableau
+    from .problems.symbolic import equations, hamiltonian
     from .run.integrate import integrate
 
     __version__: str
@@ -71,6 +72,8 @@ __all__ = [
     "check_gradient",
     "eip_method",
     "ensemble",
+    "equations",
+    "hamiltonian",
     "integrate",
     "project",
 ]
@@ -91,6 +94,8 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "Tableau": "methods.runge_kutta",
     "check_gradient": "core.invariants",
     "ensemble": "ensembles.ensemble",
+    "equations": "problems.symbolic",
+    "hamiltonian": "problems.symbolic",
     "integrate": "run.integrate",
     "project": "core.project",
     **dict.fromkeys((name for name in __all__ if name.startswith("EIP") or name == "eip_method"), "core.solvers"),

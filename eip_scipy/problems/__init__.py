@@ -23,6 +23,7 @@ from .harmonic import harmonic
 from .kepler import kepler
 from .particles.charged_particle import ParticleProblem, charged_particle, tokamak, uniform_field
 from .particles.fields import TOKAMAK, UNIFORM, ParticleField
+from .symbolic import equations, hamiltonian
 from .time_transformed import centre_time, pair_time, reaches, time_transformed
 
 __all__ = [
@@ -41,7 +42,9 @@ __all__ = [
     "centre_time",
     "charged_particle",
     "comet",
+    "equations",
     "figure_eight",
+    "hamiltonian",
     "hard_cases",
     "harmonic",
     "harmonic_trap",
