@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from .methods.multistep import GaussJackson
     from .methods.nystrom import NystromTableau
     from .methods.runge_kutta import Tableau
+    from .problems.invariant_search import find_invariants
     from .problems.symbolic import equations, hamiltonian
     from .run.integrate import integrate
 
@@ -73,6 +74,7 @@ __all__ = [
     "eip_method",
     "ensemble",
     "equations",
+    "find_invariants",
     "hamiltonian",
     "integrate",
     "project",
@@ -95,6 +97,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "check_gradient": "core.invariants",
     "ensemble": "ensembles.ensemble",
     "equations": "problems.symbolic",
+    "find_invariants": "problems.invariant_search",
     "hamiltonian": "problems.symbolic",
     "integrate": "run.integrate",
     "project": "core.project",

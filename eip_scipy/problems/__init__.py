@@ -20,6 +20,7 @@ from .gross_pitaevskii import (
 )
 from .hard_cases import HardCase, hard_cases
 from .harmonic import harmonic
+from .invariant_search import find_invariants
 from .kepler import kepler
 from .particles.charged_particle import ParticleProblem, charged_particle, tokamak, uniform_field
 from .particles.fields import TOKAMAK, UNIFORM, ParticleField
@@ -44,6 +45,7 @@ __all__ = [
     "comet",
     "equations",
     "figure_eight",
+    "find_invariants",
     "hamiltonian",
     "hard_cases",
     "harmonic",
