@@ -277,6 +277,27 @@ def test_second_order_methods_take_it():
         assert hamiltonian(H).acc is None
 
 
+def test_second_order_of_masses():
+    problem = hamiltonian("p1**2/(2*m) + p2**2/4 + p1*p2/10 + q1**2/2 + q2**2*cos(q1)**2", params={"m": 3.0})
+    other = problem.second_order()
+    assert other.component_names == ("q1", "q2", "v_q1", "v_q2")
+    y0 = np.array([0.3, 0.2, 0.1, -0.4])
+    W = np.array([[1 / 3, 0.1], [0.1, 0.5]])
+    start = np.concatenate([y0[:2], W @ y0[2:]])
+    run = integrate(other, (0, 5), start, method=EIPRKN12, h=0.05)
+    expected = integrate(problem, (0, 5), y0, method=EIPDOP853, rtol=1e-11, atol=1e-11)
+    assert run.y[:2, -1] == pytest.approx(expected.y[:2, -1], abs=1e-8)
+    assert other.invariants[0].fun(0.0, start, other.params) == pytest.approx(
+        problem.invariants[0].fun(0.0, y0, problem.params)
+    )
+    assert other.acc is not None
+    for H in ("p**2*q", "(p - q)**2/2", "p**4", "sqrt(1 + p**2)"):
+        with pytest.raises(ValueError, match="as second order needs"):
+            hamiltonian(H).second_order()
+    with pytest.raises(ValueError, match="as second order needs"):
+        equations(["v", "-x"], "x v").second_order()
+
+
 def test_henon_heiles_as_written_by_hand():
     @njit
     def rhs(t, y, out):

@@ -69,7 +69,7 @@ class SymbolicProblem(Problem):
     system : System
         ``components`` and ``parameters``, their names; ``rates``, the derivatives in time, and ``invariants``, pairs of
         name and expression, of SymPy's, in real symbols.
-    checks : dict
+    checks : mapping
         How it is known that each invariant is one: "by construction", "symbolically" or "numerically, at 8 points".
     pairs : tuple of (str, str)
         Coordinates and their momenta, of a canonical system.
@@ -89,6 +89,43 @@ class SymbolicProblem(Problem):
         """Values of the parameters by name."""
         values = [] if self.params is None else self.params.tolist()
         return dict(zip(self.system.parameters, values, strict=True))
+
+    def second_order(self) -> SymbolicProblem:
+        """The same problem in (q, v) with v = q', as Nystrom methods take it, where H is p W p / 2 + V(t, q).
+
+        Returns
+        -------
+        SymbolicProblem
+            With velocities named ``v_x`` for a coordinate ``x``, without start and interval.
+
+        Raises
+        ------
+        ValueError
+            Where q' is no constant matrix W times p, or p' depends on p.
+        """
+        names, rates = self.component_names, self.system.rates
+        half = len(self.pairs)
+        q, p = names[:half], [symbol(item) for item in names[half:]]
+        W = sympy.Matrix(rates[:half]).jacobian(p) if half else sympy.zeros(1)
+        moving = [symbol(item) for item in (*names, "t")]
+        linear = half and sympy.simplify(sympy.Matrix(rates[:half]) - W * sympy.Matrix(p)).is_zero_matrix
+        if not linear or W.has(*moving) or any(rate.has(*p) for rate in rates[half:]) or W.det() == 0:
+            raise ValueError(
+                f"{self.name}: {_cut(rates)} is not q' = W p, p' = a(t, q) with a constant matrix W, as second order "
+                "needs."
+            )
+        new = as_names("the state", (*q, *(f"v_{item}" for item in q)))
+        v = sympy.Matrix([symbol(item) for item in new[half:]])
+        momenta = dict(zip(p, W.inv() * v, strict=True))
+        kept = tuple((label, item.xreplace(momenta)) for label, item in self.system.invariants)
+        system = System(new, self.system.parameters, (*v, *(W * sympy.Matrix(rates[half:]))), kept)
+        return _problem(
+            name=self.name,
+            system=system,
+            params=self.params,
+            checks=self.checks,
+            invariants=_invariants(system, self.params),
+        )
 
     def __repr__(self) -> str:
         pairs = ", ".join(f"{q} with {p}" for q, p in self.pairs)
