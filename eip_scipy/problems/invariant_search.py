@@ -30,7 +30,7 @@ FRESH = 60
 ROUND_OFF = 1e-3
 SMALLEST_PIVOT, INDEPENDENT = 1e-6, 1e-6
 NEGLIGIBLE = (1e-6, 1e-8, 1e-10, 0.0)  # coefficients that are left out, if the rest is still kept
-LARGEST_DENOMINATOR, RATIONAL = 64, 1e-8
+LARGEST_DENOMINATOR, LARGEST_INTEGER, RATIONAL = 64, 1000, 1e-8
 STEPS, DRIFT = 200, 1e-8
 LONGEST_NAME = 200
 
@@ -386,21 +386,17 @@ class Search:
         return row
 
     def _rational(self, row: Array) -> Array:
-        """With fractions of small denominators for the coefficients of y, where those are near, the largest being 1."""
+        """With small fractions for the coefficients of y where all are near to some, in units of one of them."""
         raw = row * self.units
         raw = raw / raw[np.argmax(np.abs(row))]
-        near = [Fraction(float(value)).limit_denominator(LARGEST_DENOMINATOR) for value in raw]
-        close = [
-            abs(float(fraction) - value) <= RATIONAL * abs(value) for fraction, value in zip(near, raw, strict=True)
-        ]
-        if all(close):
-            common = math.lcm(*(fraction.denominator for fraction in near))
-            factor = common if max(abs(fraction) * common for fraction in near) <= LARGEST_DENOMINATOR else 1
-            raw = np.array([float(fraction * factor) for fraction in near])
-        else:
-            raw = np.array([float(a) if yes else b for a, b, yes in zip(near, raw, close, strict=True)])
-        first = raw[np.flatnonzero(raw)[0]]
-        return raw * np.sign(first) / self.units
+        for unit in (1.0, np.min(np.abs(raw[raw != 0]))):
+            near = [Fraction(float(value)).limit_denominator(LARGEST_DENOMINATOR) for value in raw / unit]
+            if all(abs(float(a) - b) <= RATIONAL * abs(b) for a, b in zip(near, raw / unit, strict=True)):
+                common = math.lcm(*(fraction.denominator for fraction in near))
+                factor = common if max(map(abs, near)) * common <= LARGEST_INTEGER else 1
+                raw = np.array([float(fraction * factor) for fraction in near])
+                break
+        return raw * np.sign(raw[np.flatnonzero(raw)[0]]) / self.units
 
     def _is_new(self, row: Array) -> bool:
         """Whether its gradient is independent of the others', at some point."""
