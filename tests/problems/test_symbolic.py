@@ -296,6 +296,8 @@ def test_second_order_of_masses():
             hamiltonian(H).second_order()
     with pytest.raises(ValueError, match="as second order needs"):
         equations(["v", "-x"], "x v").second_order()
+    with pytest.raises(ValueError, match="as second order needs"):
+        hamiltonian(DRIVEN, extended=True).second_order()
 
 
 def test_henon_heiles_as_written_by_hand():

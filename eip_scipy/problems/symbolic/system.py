@@ -106,10 +106,11 @@ class SymbolicProblem(Problem):
         names, rates = self.component_names, self.system.rates
         half = len(self.pairs)
         q, p = names[:half], [symbol(item) for item in names[half:]]
-        W = sympy.Matrix(rates[:half]).jacobian(p) if half else sympy.zeros(1)
-        moving = [symbol(item) for item in (*names, "t")]
-        linear = half and sympy.simplify(sympy.Matrix(rates[:half]) - W * sympy.Matrix(p)).is_zero_matrix
-        if not linear or W.has(*moving) or any(rate.has(*p) for rate in rates[half:]) or W.det() == 0:
+        canonical = half > 0 and len(names) == 2 * half
+        W = sympy.Matrix(rates[:half]).jacobian(p) if canonical else sympy.zeros(1)
+        constant = canonical and not W.has(*(symbol(item) for item in (*names, "t")))
+        linear = constant and sympy.simplify(sympy.Matrix(rates[:half]) - W * sympy.Matrix(p)).is_zero_matrix
+        if not linear or any(rate.has(*p) for rate in rates[half:]) or W.det() == 0:
             raise ValueError(
                 f"{self.name}: {_cut(rates)} is not q' = W p, p' = a(t, q) with a constant matrix W, as second order "
                 "needs."
