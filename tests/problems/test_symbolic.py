@@ -18,6 +18,7 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy import (
     EIPDOP853,
+    EIPGJ12,
     EIPRK4,
     EIPRK45,
     EIPRKN12,
@@ -275,6 +276,18 @@ def test_second_order_methods_take_it():
     assert oscillator.acc(0.0, np.array([3.0])).tolist() == [-3.0]
     for H in ("p**2/4 + q**2", "p**2*q", "p**2/2 + p*q"):  # q' is not p, or p' depends on it
         assert hamiltonian(H).acc is None
+
+
+def test_multistep_methods_take_their_jacobian():
+    problem = hamiltonian(KEPLER, params={"eps": 0.005}, invariants=L)
+    q, dq, out, step = np.array([0.7, -0.4]), np.array([0.3, 0.9]), np.empty(2), 1e-5
+    problem.jacobian(0.0, q, dq, out, problem.params)
+    ends = [problem.acc(0.0, q + sign * step * dq, problem.params) for sign in (1, -1)]
+    assert out == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-8)
+    own = kepler()
+    run = integrate(problem, (0, 20), own.y0, method=EIPGJ12, h=0.01)
+    assert run.y[:, -1] == pytest.approx(integrate(own, (0, 20), method=EIPRKN12, h=0.01).y[:, -1], abs=1e-10)
+    assert hamiltonian("p**2/2 + abs(q)").jacobian is None  # it has no derivative at 0
 
 
 def test_second_order_of_masses():

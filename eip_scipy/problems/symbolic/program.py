@@ -1,8 +1,9 @@
 """SymPy expressions as functions: one operation a statement, what is common to several computed once.
 
-The code is a tree of `ast` nodes made here, compiled, and its code object made a function. No text is run: not even
-SymPy's `lambdify`, which writes the source with the user's names in it and calls `exec`. The nodes are assignments of
-sums, products, powers and calls from the list below; the names are `y`, `p` and `v` with a number; all else is numbers.
+The code is a tree of `ast` nodes made here, compiled, and its code object made a function. No text is run, as SymPy's
+`lambdify` would: it writes source with the user's names in it and calls `exec`. The nodes are assignments of sums,
+products, powers and calls from the list below; the names are those of the arguments and `v` with a number; all else is
+numbers.
 """
 
 from __future__ import annotations
@@ -49,21 +50,20 @@ LARGEST_PRODUCT = 64  # of a power by multiplications
 
 
 class Arguments:
-    """What a function reads: the state's components, the parameters, and whether it takes any."""
+    """The names in the arrays that a function reads: y, params, and dy, along which a Jacobian is taken."""
 
-    def __init__(self, components: Sequence[str], parameters: Sequence[str]) -> None:
-        self.components, self.parameters = tuple(components), tuple(parameters)
+    def __init__(self, components: Sequence[str], parameters: Sequence[str], directions: Sequence[str] = ()) -> None:
+        self.arrays = {"y": tuple(components), "dy": tuple(directions), "params": tuple(parameters)}
 
     @property
-    def names(self) -> dict[str, tuple[str, int | None]]:
+    def places(self) -> dict[str, tuple[str, int | None]]:
         """Of each name the array and the place in it; the time is a number."""
-        places = {name: ("y", k) for k, name in enumerate(self.components)}
-        places |= {name: ("params", k) for k, name in enumerate(self.parameters)}
+        places = {name: (array, k) for array, names in self.arrays.items() for k, name in enumerate(names)}
         return {**places, "t": ("t", None)}
 
 
 def function(what: str, expressions: Sequence[Any], arguments: Arguments, *, in_place: bool) -> Callable[..., Any]:
-    """A function of ``(t, y, [out,] [params])``, Numba's where Numba is installed.
+    """A function of ``(t, y[, dy][, out][, params])``, Numba's where Numba is installed.
 
     Parameters
     ----------
@@ -89,7 +89,8 @@ def _made(code: CodeType, functions: Mapping[str, Any]) -> FunctionType:
 
 
 def _compiled(what: str, body: list[ast.stmt], arguments: Arguments, in_place: bool) -> CodeType:
-    names = ["t", "y", *(["out"] if in_place else []), *(["params"] if arguments.parameters else [])]
+    given = {"t": True, "y": True, "dy": arguments.arrays["dy"], "out": in_place, "params": arguments.arrays["params"]}
+    names = [name for name, there in given.items() if there]
     parameters = ast.arguments(
         posonlyargs=[], args=[ast.arg(arg=name) for name in names], kwonlyargs=[], kw_defaults=[], defaults=[]
     )
@@ -114,7 +115,7 @@ def _statements(what: str, expressions: Sequence[Any], arguments: Arguments, in_
 
 def _checks(arguments: Arguments) -> Iterable[ast.stmt]:
     """Compiled code does not look whether an index is one of the array's. Sizes cost nothing: they are known to it."""
-    for array, names in (("y", arguments.components), ("params", arguments.parameters)):
+    for array, names in arguments.arrays.items():
         if names:
             size = ast.Attribute(value=_load(array), attr="size", ctx=ast.Load())
             wrong = ast.Compare(left=size, ops=[ast.NotEq()], comparators=[ast.Constant(value=len(names))])
@@ -143,7 +144,7 @@ class Writer:
         self.body: list[ast.stmt] = []
         self.known: dict[Any, ast.expr] = {}
         self._written: dict[str, ast.expr] = {}
-        self._places = arguments.names
+        self._places = arguments.places
 
     def value(self, expression: Any) -> ast.expr:
         """The name, or the constant, that stands for an expression."""

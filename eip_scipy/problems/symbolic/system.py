@@ -25,6 +25,9 @@ from .program import Arguments, function
 __all__ = ["SymbolicProblem", "equations_problem", "hamiltonian_problem"]
 
 
+LARGEST_JACOBIAN = 16  # coordinates; there are as many second derivatives as their square
+
+
 class System(NamedTuple):
     """What is written: names, derivatives, invariants. Equal systems share their functions."""
 
@@ -54,6 +57,7 @@ class Functions(NamedTuple):
 
     rhs: Callable[..., None]
     acc: Callable[..., np.ndarray] | None
+    jacobian: Callable[..., None] | None
     invariants: tuple[tuple[Callable[..., float], Callable[..., None]], ...]
 
 
@@ -145,7 +149,7 @@ class SymbolicProblem(Problem):
         """Functions are made again from the expressions where it is read."""
         own = [fun for fun, _ in _functions(self.system).invariants]
         kept = [own.index(item.fun) if item.fun in own else item for item in self.invariants]
-        left = {"fun", "rhs", "acc", "invariants"}
+        left = {"fun", "rhs", "acc", "jacobian", "invariants"}
         return _again, (kept, {item.name: getattr(self, item.name) for item in fields(self) if item.name not in left})
 
 
@@ -272,7 +276,13 @@ def _problem(*, system: System, params: np.ndarray | None, **others: Any) -> Sym
     rhs = functions.rhs
     unset: dict[str, Any] = {"y0": None, "t_span": None}  # a run is given them
     return SymbolicProblem(
-        **(unset | others), system=system, params=params, fun=bind(rhs, params), rhs=rhs, acc=functions.acc
+        **(unset | others),
+        system=system,
+        params=params,
+        fun=bind(rhs, params),
+        rhs=rhs,
+        acc=functions.acc,
+        jacobian=functions.jacobian,
     )
 
 
@@ -294,7 +304,7 @@ def _functions(system: System) -> Functions:
         gradient = [sympy.diff(quantity, variable) for variable in system.variables]
         value = function(f"invariant {name}", [quantity], arguments, in_place=False)
         invariants.append((value, function(f"gradient of {name}", gradient, arguments, in_place=True)))
-    return Functions(rhs, _acceleration(system), tuple(invariants))
+    return Functions(rhs, _acceleration(system), _jacobian(system), tuple(invariants))
 
 
 def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
@@ -315,6 +325,20 @@ def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
         return out
 
     return compiled_like(with_params if system.parameters else without, fill)
+
+
+def _jacobian(system: System) -> Callable[..., None] | None:
+    """Of the accelerations, times a vector; where it has one that is soon made."""
+    found = system.accelerations
+    if found is None or len(found) > LARGEST_JACOBIAN:
+        return None
+    names = system.components[: len(found)]
+    along = [f"d {name}" for name in names]  # which is nobody's name
+    pairs = [(symbol(q), symbol(d)) for q, d in zip(names, along, strict=True)]
+    rows = [sympy.Add(*(sympy.diff(a, q) * d for q, d in pairs)) for a in found]
+    if any(row.has(sympy.DiracDelta) for row in rows):  # of absolute values, and the larger of two
+        return None
+    return function("Jacobian", rows, Arguments(names, system.parameters, along), in_place=True)
 
 
 def _parameters(params: Any) -> dict[str, float]:
