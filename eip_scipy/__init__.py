@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from .methods.multistep import GaussJackson
     from .methods.nystrom import NystromTableau
     from .methods.runge_kutta import Tableau
+    from .problems.invariant_search import find_invariants
+    from .problems.symbolic import equations, hamiltonian
     from .run.integrate import integrate
 
     __version__: str
@@ -71,6 +73,9 @@ __all__ = [
     "check_gradient",
     "eip_method",
     "ensemble",
+    "equations",
+    "find_invariants",
+    "hamiltonian",
     "integrate",
     "project",
 ]
@@ -91,6 +96,9 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "Tableau": "methods.runge_kutta",
     "check_gradient": "core.invariants",
     "ensemble": "ensembles.ensemble",
+    "equations": "problems.symbolic",
+    "find_invariants": "problems.invariant_search",
+    "hamiltonian": "problems.symbolic",
     "integrate": "run.integrate",
     "project": "core.project",
     **dict.fromkeys((name for name in __all__ if name.startswith("EIP") or name == "eip_method"), "core.solvers"),

@@ -455,9 +455,9 @@ def _inputs(fun: Any, y0s: Any, params: Any, invariants: Any) -> tuple[np.ndarra
     """Starts (members, n) and parameters (members, p), p = 0 where there are none."""
     problem = fun if isinstance(fun, Problem) else None
     if y0s is None:
-        if problem is None:
-            raise TypeError("ensemble: y0s is missing; only a Problem brings a start of its own.")
-        y0s = problem.y0
+        y0s = None if problem is None else problem.y0
+        if y0s is None:
+            raise TypeError("ensemble: y0s is missing; only a Problem brings a start of its own, and not each does.")
     starts = setup.states("y0s", y0s)
     own = None if params is None else np.atleast_1d(real_array("params", params, TypeError))
     if starts.ndim == 1 and own is not None and own.ndim == 2:

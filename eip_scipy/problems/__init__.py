@@ -20,9 +20,11 @@ from .gross_pitaevskii import (
 )
 from .hard_cases import HardCase, hard_cases
 from .harmonic import harmonic
+from .invariant_search import find_invariants
 from .kepler import kepler
 from .particles.charged_particle import ParticleProblem, charged_particle, tokamak, uniform_field
 from .particles.fields import TOKAMAK, UNIFORM, ParticleField
+from .symbolic import equations, hamiltonian
 from .time_transformed import centre_time, pair_time, reaches, time_transformed
 
 __all__ = [
@@ -41,7 +43,10 @@ __all__ = [
     "centre_time",
     "charged_particle",
     "comet",
+    "equations",
     "figure_eight",
+    "find_invariants",
+    "hamiltonian",
     "hard_cases",
     "harmonic",
     "harmonic_trap",

@@ -368,7 +368,7 @@ def _bare(item: Invariant) -> Invariant:
 
 def _required(name: str, value: Any) -> Any:
     if value is None:
-        raise TypeError(f"integrate: {name} is missing; only a Problem brings its own.")
+        raise TypeError(f"integrate: {name} is missing; only a Problem brings its own, and not each does.")
     return value
 
 

@@ -25,7 +25,7 @@ def assert_output(found, printed):
         assert agree(float(a), float(b)), f"{a}, printed as {b}"
 
 
-PAGES = ("quickstart", "adaptive", "own-methods", "checkpoints", "ensembles")
+PAGES = ("quickstart", "adaptive", "own-methods", "checkpoints", "ensembles", "written", "finding-invariants")
 NIGHTLY = ("hard-scenes", "charged-particles", "gross-pitaevskii")
 
 

@@ -1,0 +1,130 @@
+"""Invariants from the vector field alone: combinations of monomials, and of functions given, whose rate is zero."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...core.inputs import count, is_number, refuse_units, shown
+from ...core.invariants import Invariant
+from ...core.jitted import compiled_like
+from ...core.problem import Problem
+from .points import Surroundings
+from .polynomials import Term, functions, written
+from .search import Search
+
+__all__ = ["find_invariants"]
+
+LARGEST_BASIS = 2000  # the factorisation takes some ten seconds
+
+
+def find_invariants(
+    fun: Callable[..., Any] | Problem,
+    y0: Any,
+    *,
+    degree: int = 2,
+    terms: Sequence[Any] | Mapping[str, Any] = (),
+    t: float = 0.0,
+    rtol: float = 1e-9,
+    seed: int = 0,
+) -> list[Invariant]:
+    """Find what y' = f(t, y) keeps among polynomials of the state and functions given.
+
+    The rate of a sum of monomials is linear in its coefficients: those of an invariant are a null vector of the rates
+    at random points. What is found is tried at fresh points and times, and along a trajectory.
+
+    Parameters
+    ----------
+    fun : callable or Problem
+        ``fun(t, y) -> (n,)``, for real states.
+    y0 : array_like, shape (n,)
+        A state; points are drawn around it, about as far as its components are large. Where `fun` or a term raises an
+        error or is not finite, the points come closer.
+    degree : int, optional
+        Largest degree of the polynomials.
+    terms : sequence or mapping, optional
+        Further functions of the state that may take part: pairs ``(g, grad)`` with ``g(y) -> float`` and ``grad(y) ->
+        (n,)``, or both of (t, y), but not changing with t; their names are those of the functions. Or a mapping of
+        names to pairs.
+    t : float, optional
+        First time at which `fun` may be called; a trajectory goes on from there.
+    rtol : float, optional
+        Largest rate of what is returned, in units of the sum of its terms, at each fresh point; a thousandth of it in
+        units of the sum of all products in it, which is what rounding leaves of zero.
+    seed : int, optional
+        Of the random points.
+
+    Returns
+    -------
+    list of Invariant
+        Functionally independent ones, the simplest first, with readable names (``"y0*y3 - y1*y2"``), gradients, and
+        coefficients that are small fractions where those are kept too; jitted where `fun` is. Empty where there are
+        none. Polynomials and other functions of them are left out.
+
+    Raises
+    ------
+    ValueError
+        For wrong arguments, and where `fun` is finite at too few points.
+
+    Notes
+    -----
+    Invariants that hold on a manifold only (of unit quaternions, say) are none at random points, and not found. A
+    quantity whose rate is below 1e-12 of its terms cannot be told from an invariant.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import find_invariants
+    >>> def kepler(t, y):
+    ...     r = np.hypot(y[0], y[1])
+    ...     return np.array([y[2], y[3], -y[0] / r**3, -y[1] / r**3])
+    >>> find_invariants(kepler, [1.0, 0.0, 0.0, 1.2])
+    [Invariant(y0*y3 - y1*y2)]
+    """
+    refuse_units(y0=y0, t=t)
+    degree = count("find_invariants: degree", degree)
+    start = np.array(y0)
+    if start.ndim != 1 or start.size == 0 or start.dtype.kind not in "iuf" or not np.isfinite(start).all():
+        raise ValueError(f"find_invariants: y0 must be a real, finite state (n,), got {shown(y0)}.")
+    for name, value in (("t", t), ("rtol", rtol)):
+        if not (is_number(value) and math.isfinite(value)) or (name == "rtol" and not 0 < value < 1):
+            raise ValueError(f"find_invariants: {name} has the wrong value {shown(value)}.")
+    size = math.comb(start.size + degree, degree) - 1 + len(terms)
+    if size > LARGEST_BASIS:
+        raise ValueError(
+            f"find_invariants: {start.size} components make {size} monomials up to degree {degree}; at most "
+            f"{LARGEST_BASIS} are tried. Take a smaller degree, or give what may take part as terms."
+        )
+    given = terms.items() if isinstance(terms, Mapping) else [(None, item) for item in terms]
+    further = [_term(item, k, name) for k, (name, item) in enumerate(given)]
+    field = fun.fun if isinstance(fun, Problem) else fun
+    like = fun.rhs or field if isinstance(fun, Problem) else fun
+    names = getattr(fun, "component_names", None) or [f"y{k}" for k in range(start.size)]
+    with np.errstate(all="ignore"):  # of points where the field is not defined
+        found = Search(Surroundings(field, start.astype(float), further, t, seed), degree, rtol).found
+    return [
+        Invariant(*functions(polynomial, terms, start.size, like), name=written(polynomial, terms, names))
+        for polynomial, terms in found
+    ]
+
+
+def _term(item: Any, k: int, name: str | None) -> Term:
+    if not (isinstance(item, (tuple, list)) and len(item) == 2 and all(map(callable, item))):
+        raise ValueError(
+            f"find_invariants: terms[{k if name is None else repr(name)}] must be a pair of functions (g, grad) of y, "
+            f"got {shown(item)}."
+        )
+    own = str(getattr(item[0], "__name__", ""))
+    name = name or (f"{own}(y)" if own.isidentifier() else f"term{k}(y)")
+    return Term(_of_state(item[0]), _of_state(item[1]), name)
+
+
+def _of_state(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of y from one of (t, y), or of y."""
+    if isinstance(fun, np.ufunc) or len(inspect.signature(fun).parameters) != 2:
+        return fun
+    return compiled_like(lambda y: fun(0.0, y), fun)

@@ -1,0 +1,132 @@
+"""A vector field at random points around a state: the rates there of monomials and further functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.integrate import DOP853
+
+from .polynomials import Monomial, Term
+
+__all__ = ["Sample", "Surroundings"]
+
+Array = np.ndarray
+
+SPREADS = (1.0, 0.3, 0.1, 0.03, 0.01)  # of the points, in units of the components' sizes
+STEPS = 200
+
+
+class Sample(NamedTuple):
+    """Points z = y / scale, dz/dt there made of size 1, and by columns rates of functions, with their products' sizes.
+
+    The size of a rate's products is the sum of ``|dI/dz_i dz_i/dt|``, for a monomial with each of its factors in turn.
+    """
+
+    points: Array
+    slopes: Array
+    rates: Array
+    sizes: Array
+
+
+class Surroundings:
+    """Where invariants are looked for.
+
+    `scale` are the sizes of the components, `tau` a time in which the state moves by its own size, `trajectory` states
+    that follow y0.
+    """
+
+    def __init__(self, fun: Callable[..., Any], y0: Array, terms: Sequence[Term], t: float, seed: int) -> None:
+        self.fun, self.y0, self.terms, self.t = fun, y0, terms, t
+        self.rng = np.random.default_rng(seed)
+        self.failure: Exception | None = None
+        self._look_around()
+        self.trajectory = self._follow()
+
+    def _slope(self, t: float, y: Array) -> Array:
+        """f, NaN where it cannot be computed."""
+        try:
+            found = np.asarray(self.fun(t, y.copy()), dtype=float)
+        except (ArithmeticError, ValueError) as error:
+            self.failure = self.failure or error
+            return np.full_like(y, np.nan)
+        if found.shape != y.shape:
+            raise ValueError(f"find_invariants: fun returned shape {found.shape} for a state of shape {y.shape}.")
+        return found
+
+    def term_gradients(self, y: Array) -> Array:
+        """Of each term, a row; NaN where it cannot be computed."""
+        try:
+            return np.array([item.grad(y.copy()) for item in self.terms], dtype=float).reshape(-1, y.size)
+        except (ArithmeticError, ValueError) as error:
+            self.failure = self.failure or error
+            return np.full((len(self.terms), y.size), np.nan)
+
+    def _look_around(self) -> None:
+        """Sizes of the components, and a time in which the state moves by its own size."""
+        here, self.scale, self.tau = self.y0, np.abs(self.y0), 0.0
+        for _ in range(3):  # a component may start to move only where others have moved
+            f = np.abs(self._slope(self.t, here))
+            f[~np.isfinite(f)] = 0.0
+            if self.tau == 0.0 and f.any():
+                self.tau = float(np.max(self.scale, initial=0.0) or 1.0) / float(np.max(f))
+            self.scale = np.maximum(self.scale, self.tau * f)
+            here = self.y0 + 0.1 * self.scale * self.rng.standard_normal(self.y0.size)
+        self.scale[self.scale == 0.0] = np.max(self.scale) or 1.0
+
+    def sample(self, wanted: int, basis: Sequence[Monomial]) -> Sample:
+        """Rates at random points of the monomials of a basis, and of the terms.
+
+        Raises
+        ------
+        ValueError
+            Where the vector field, or a term, is finite at too few points.
+        """
+        for spread in SPREADS:
+            points, slopes, gradients = [], [], []
+            for k in range(4 * wanted):
+                y = self.y0 + spread * self.scale * self.rng.standard_normal(self.y0.size)
+                # What depends on time is to be kept at all times.
+                t = self.t + self.tau * self.rng.random() * (k % 2)
+                f, g = self._slope(t, y), self.term_gradients(y)
+                if np.isfinite(f).all() and np.isfinite(g).all():
+                    points.append(y / self.scale)
+                    slopes.append(f / self.scale)
+                    gradients.append(g * self.scale)
+                if len(points) == wanted:
+                    return _rates(np.array(points), np.array(slopes), np.array(gradients), basis)
+        raise ValueError(
+            f"find_invariants: fun or a term is finite at less than a quarter of the points around y0, even within "
+            f"{SPREADS[-1]} of its components' sizes."
+        ) from self.failure
+
+    def _follow(self) -> Array:
+        """States along a trajectory from y0."""
+        solver = DOP853(self._slope, self.t, self.y0, self.t + 3 * self.tau, rtol=1e-12, atol=1e-12 * self.scale)
+        states = [self.y0]
+        while solver.status == "running" and len(states) <= STEPS:
+            solver.step()
+            if solver.status != "failed":
+                states.append(solver.y.copy())
+        return np.array(states)
+
+
+def _rates(points: Array, slopes: Array, gradients: Array, basis: Sequence[Monomial]) -> Sample:
+    speed = np.abs(slopes).sum(axis=1, keepdims=True)
+    slopes = slopes / np.where(speed == 0, 1.0, speed)
+    m, column = len(points), {item: k for k, item in enumerate(basis)}
+    values, rates, sizes = [np.empty((m, len(basis))) for _ in range(3)]
+    for k, (*rest, last) in enumerate(basis):
+        z, f = points[:, last], slopes[:, last]
+        if not rest:
+            values[:, k], rates[:, k], sizes[:, k] = z, f, np.abs(f)
+            continue
+        j = column[tuple(rest)]
+        values[:, k] = z * values[:, j]
+        rates[:, k] = f * values[:, j] + z * rates[:, j]
+        sizes[:, k] = np.abs(f * values[:, j]) + np.abs(z) * sizes[:, j]
+    products = gradients * slopes[:, None, :]
+    rates = np.hstack([rates, products.sum(axis=2)])
+    sizes = np.hstack([sizes, np.abs(products).sum(axis=2)])
+    return Sample(points, slopes, rates, sizes)

@@ -1,0 +1,115 @@
+"""Sums of monomials, and of further functions: products, names, and functions for runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+
+from ...core.jitted import compiled_like
+
+__all__ = ["LARGEST_DENOMINATOR", "Functions", "Monomial", "Polynomial", "Term", "functions", "product_of", "written"]
+
+Monomial = tuple[int, ...]  # the variables that it is the product of: (0, 0, 3) is y0**2 y3
+Polynomial = dict[Monomial, float]
+
+LARGEST_DENOMINATOR = 64
+LONGEST_NAME = 200
+
+
+class Term(NamedTuple):
+    """A function of the state that is no monomial."""
+
+    fun: Callable[..., float]
+    grad: Callable[..., np.ndarray]
+    name: str
+
+
+class Functions(NamedTuple):
+    """Value and gradient as functions of (t, y)."""
+
+    value: Callable[..., float]
+    gradient: Callable[..., np.ndarray]
+
+
+def product_of(a: Polynomial, b: Polynomial) -> Polynomial:
+    """The product of two polynomials."""
+    out: Polynomial = {}
+    for x, u in a.items():
+        for y, v in b.items():
+            item = tuple(sorted(x + y))
+            out[item] = out.get(item, 0.0) + u * v
+    return out
+
+
+def functions(
+    polynomial: Polynomial, terms: Sequence[tuple[Term, float]], n: int, like: Callable[..., object]
+) -> Functions:
+    """A polynomial of n variables plus multiples of terms; jitted where `like` and the terms are."""
+    found = _of_polynomial(polynomial, n)
+    compiled = [like]
+    for term, coefficient in terms:
+        found = _with_term(Functions(*(compiled_like(item, *compiled) for item in found)), term, coefficient)
+        compiled += [term.fun, term.grad]
+    return Functions(*(compiled_like(item, *compiled) for item in found))
+
+
+def _of_polynomial(polynomial: Polynomial, n: int) -> Functions:
+    coefficients = np.array(list(polynomial.values()))
+    factors = np.array([variable for item in polynomial for variable in item], dtype=np.int64)
+    starts = np.cumsum([0, *map(len, polynomial)])
+
+    def value(t, y):
+        total = 0.0
+        for k in range(coefficients.size):
+            product = coefficients[k]
+            for i in range(starts[k], starts[k + 1]):
+                product *= y[factors[i]]
+            total += product
+        return total
+
+    def gradient(t, y):
+        out = np.zeros(n)
+        for k in range(coefficients.size):
+            for j in range(starts[k], starts[k + 1]):
+                product = coefficients[k]
+                for i in range(starts[k], starts[k + 1]):
+                    if i != j:
+                        product *= y[factors[i]]
+                out[factors[j]] += product
+        return out
+
+    return Functions(value, gradient)
+
+
+def _with_term(others: Functions, term: Term, coefficient: float) -> Functions:
+    fun, grad = others
+    g, slope = term.fun, term.grad
+
+    def value(t, y):
+        return fun(t, y) + coefficient * g(y)
+
+    def gradient(t, y):
+        return grad(t, y) + coefficient * slope(y)
+
+    return Functions(value, gradient)
+
+
+def written(polynomial: Polynomial, terms: Sequence[tuple[Term, float]], names: Sequence[str]) -> str:
+    """As one would write it, "y0*y3 - y1*y2"."""
+    factors = [(_product(item, names), c) for item, c in polynomial.items()] + [(term.name, c) for term, c in terms]
+    text = ""
+    for name, coefficient in factors:
+        fraction = Fraction(abs(coefficient)).limit_denominator(LARGEST_DENOMINATOR)
+        number = str(fraction) if float(fraction) == abs(coefficient) else f"{abs(coefficient):.6g}"
+        sign = "-" if coefficient < 0 else "+"
+        text += f" {sign} " if text else sign.strip("+")
+        text += name if number == "1" else f"{number}*{name}"
+    return text if len(text) <= LONGEST_NAME else f"{text[:LONGEST_NAME]}..."
+
+
+def _product(item: Monomial, names: Sequence[str]) -> str:
+    powers = {variable: item.count(variable) for variable in item}
+    return "*".join(names[k] if power == 1 else f"{names[k]}**{power}" for k, power in powers.items())

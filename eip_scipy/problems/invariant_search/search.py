@@ -1,0 +1,228 @@
+"""The null space of the rates, and in it invariants that are simple and independent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+
+from .points import Surroundings
+from .polynomials import LARGEST_DENOMINATOR, Polynomial, Term, product_of
+
+__all__ = ["Search"]
+
+Array = np.ndarray
+
+FRESH = 60
+# Of a rate computed in floats, to the sum of its products, in units of rtol: 1e-12 where rtol is 1e-9.
+ROUND_OFF = 1e-3
+FAIR_PIVOT, INDEPENDENT = 1e-2, 1e-6
+NEGLIGIBLE = (1e-6, 1e-8, 1e-10, 0.0)  # coefficients that are left out, if the rest is still kept
+LARGEST_INTEGER, RATIONAL = 1000, 1e-8
+DRIFT = 1e-8
+
+
+class Search:
+    """One search.
+
+    A function is a row of coefficients: of monomials of z = y / scale, then of the terms.
+    """
+
+    def __init__(self, around: Surroundings, degree: int, rtol: float) -> None:
+        self.around, self.terms, self.rtol = around, around.terms, rtol
+        variables = range(around.y0.size)
+        self.basis = [item for d in range(1, degree + 1) for item in combinations_with_replacement(variables, d)]
+        self.column = {item: k for k, item in enumerate(self.basis)}
+        # What turns a coefficient of z into one of y.
+        of_monomials = [1 / np.prod(around.scale[list(item)]) for item in self.basis]
+        self.units = np.array([*of_monomials, *(1.0 for _ in self.terms)])
+        self.sample = around.sample(self._width + self._width // 4 + 30, self.basis)
+        self.fresh = around.sample(FRESH, self.basis)
+        self.accepted: list[Array] = []
+        for d in range(1, degree + 1):
+            self._search([k for k, item in enumerate(self.basis) if len(item) <= d])
+        if self.terms:
+            self._search(list(range(self._width)))
+
+    @property
+    def found(self) -> list[tuple[Polynomial, list[tuple[Term, float]]]]:
+        """Invariants as polynomials of y, and multiples of terms."""
+        rows = [row * self.units for row in self.accepted]
+        of_terms = [zip(self.terms, row[len(self.basis) :].tolist(), strict=True) for row in rows]
+        return [
+            (self._polynomial(row), [(term, c) for term, c in terms if c])
+            for row, terms in zip(rows, of_terms, strict=True)
+        ]
+
+    def _search(self, columns: list[int]) -> None:
+        """Take in what is kept among some columns, and does not depend on what is there already."""
+        null = self._null_space(columns)
+        known = np.array([self._row(item) for item in self._products(columns)]).reshape(-1, self._width)
+        rows = self._reduced(known, null)
+        for row in sorted(rows, key=self._simplicity):
+            nice = self._nice(row)
+            if nice is not None and self._is_new(nice) and self._stays(nice):
+                self.accepted.append(nice)
+
+    @property
+    def _width(self) -> int:
+        return len(self.basis) + len(self.terms)
+
+    def _null_space(self, columns: Any) -> Array:
+        """Rows that span it: singular vectors from the smallest on, as long as they are kept at the fresh points."""
+        A, columns = self.sample.rates[:, columns], np.asarray(columns)
+        weights = np.sqrt(np.mean(self.sample.sizes[:, columns] ** 2, axis=0))
+        # What does not move at all is kept; beside columns of that size no rounding is small.
+        still = weights == 0
+        found = [self._spread(np.ones(1), [k]) for k in columns[still]]
+        vectors = np.linalg.svd(np.linalg.qr(A[:, ~still] / weights[~still], mode="r"))[2]
+        for vector in vectors[::-1]:
+            row = self._spread(vector / weights[~still], columns[~still])
+            if not self._is_kept(row):
+                break
+            found.append(row / np.linalg.norm(row))
+        return np.array(found).reshape(-1, self._width)
+
+    def _is_kept(self, row: Array) -> bool:
+        """Whether the rate is 0 at the fresh points: relative to the products in it, and to the terms of dI/dy . f."""
+        rate = np.abs(self.fresh.rates @ row)
+        if np.any(rate > ROUND_OFF * self.rtol * (self.fresh.sizes @ np.abs(row))):
+            return False
+        gradients = self._gradients(row, self.fresh.points)
+        return bool(np.all(rate <= self.rtol * np.abs(gradients * self.fresh.slopes).sum(axis=1)))
+
+    def _gradients(self, row: Array, points: Array, part: Callable[[Array], Array] = np.positive) -> Array:
+        """dI/dz at points z (m, n); with `part` np.abs the sizes of what it is the sum of."""
+        out = np.zeros_like(points)
+        for k in np.flatnonzero(row[: len(self.basis)]):
+            item = self.basis[k]
+            for place, variable in enumerate(item):
+                others = item[:place] + item[place + 1 :]
+                out[:, variable] += part(row[k] * points[:, others].prod(axis=1))
+        for k in np.flatnonzero(row[len(self.basis) :]):
+            grads = [self.around.term_gradients(z * self.around.scale)[k] * self.around.scale for z in points]
+            out += part(row[len(self.basis) + k] * np.array(grads))
+        return out
+
+    def _products(self, columns: list[int]) -> Iterator[Polynomial]:
+        """Polynomials of those accepted, up to the degree of the columns."""
+        degree = max(len(self.basis[k]) for k in columns if k < len(self.basis))
+        polynomials = [self._polynomial(row) for row in self.accepted if not row[len(self.basis) :].any()]
+        stack: list[tuple[int, Polynomial]] = [(0, {(): 1.0})]
+        while stack:
+            first, product = stack.pop()
+            for k in range(first, len(polynomials)):
+                longer = product_of(product, polynomials[k])
+                if max(map(len, longer)) <= degree:
+                    yield longer
+                    stack.append((k, longer))
+
+    def _polynomial(self, row: Array) -> Polynomial:
+        return {item: float(row[k]) for k, item in enumerate(self.basis) if row[k]}
+
+    def _row(self, polynomial: Polynomial) -> Array:
+        row = np.zeros(self._width)
+        for item, coefficient in polynomial.items():
+            row[self.column[item]] = coefficient
+        return row / np.linalg.norm(row)
+
+    def _reduced(self, known: Array, null: Array) -> list[Array]:
+        """Rows of the null space beyond what is known, with as many zeros as elimination makes."""
+        # Products of several variables are eliminated first: what is left are squares, as in an energy.
+        free = sorted(range(self._width), key=self._mixed)
+        reduced: list[tuple[Array, int]] = []
+        for source in (known, null):
+            rows = [row.copy() for row in source]
+            while rows:
+                for row, pivot in reduced:
+                    rows = [other - other[pivot] * row for other in rows]
+                rows = [row for row in rows if np.max(np.abs(row)) > NEGLIGIBLE[0]]
+                if not rows:
+                    break
+                largest = np.max(np.abs(rows), axis=0)
+                pivot = next(k for k in free if largest[k] > FAIR_PIVOT * largest.max())
+                best = max(range(len(rows)), key=lambda j: abs(rows[j][pivot]))
+                row = rows.pop(best)
+                row = row / row[pivot]
+                reduced = [(other - other[pivot] * row, place) for other, place in reduced] + [(row, pivot)]
+                free.remove(pivot)
+            if source is known:
+                count_known = len(reduced)
+        return [row / np.max(np.abs(row)) for row, _ in reduced[count_known:]]
+
+    def _simplicity(self, row: Array) -> tuple[int, int, int, list[int]]:
+        """How many terms a row has, how many are differences, as in angular momenta, how many mixed, and which."""
+        support = np.flatnonzero(np.abs(row) > NEGLIGIBLE[0]).tolist()
+        negative = sum(row[k] < 0 for k in support)
+        mixed = sum(k < len(self.basis) and len(set(self.basis[k])) > 1 for k in support)
+        return len(support), -int(min(negative, len(support) - negative)), mixed, support
+
+    def _mixed(self, k: int) -> tuple[int, int, int]:
+        if k >= len(self.basis):
+            return 0, 0, k
+        return -len(set(self.basis[k])), -len(self.basis[k]), k
+
+    def _nice(self, row: Array) -> Array | None:
+        """The same with few terms and simple coefficients, as far as that is kept; None if it is not kept at all."""
+        for bound in NEGLIGIBLE:
+            null = self._null_space(np.flatnonzero(np.abs(row) > bound * np.max(np.abs(row))))
+            if not len(null):
+                continue
+            nearest = np.linalg.lstsq(null.T, row)[0] @ null
+            if self._is_kept(nearest):
+                simple = self._rational(nearest)
+                return simple if self._is_kept(simple) else nearest
+        return None
+
+    def _spread(self, values: Array, columns: Any) -> Array:
+        row = np.zeros(self._width)
+        row[columns] = values
+        return row
+
+    def _rational(self, row: Array) -> Array:
+        """With small fractions for the coefficients of y where all are near to some, in units of one of them."""
+        raw = row * self.units
+        raw = raw / raw[np.argmax(np.abs(row))]
+        for unit in (1.0, np.min(np.abs(raw[raw != 0]))):
+            near = [Fraction(float(value)).limit_denominator(LARGEST_DENOMINATOR) for value in raw / unit]
+            if all(abs(float(a) - b) <= RATIONAL * abs(b) for a, b in zip(near, raw / unit, strict=True)):
+                common = math.lcm(*(fraction.denominator for fraction in near))
+                factor = common if max(map(abs, near)) * common <= LARGEST_INTEGER else 1
+                raw = np.array([float(fraction * factor) for fraction in near])
+                break
+        return raw * np.sign(raw[np.flatnonzero(raw)[0]]) / self.units
+
+    def _is_new(self, row: Array) -> bool:
+        """Whether its gradient is independent of the others', at some point."""
+        points = self.fresh.points[:10]
+        own, sizes = self._gradients(row, points), self._gradients(row, points, np.abs)
+        others = [self._gradients(item, points) for item in self.accepted]
+        for k, gradient in enumerate(own):
+            size = np.linalg.norm(gradient)
+            if size <= INDEPENDENT * np.linalg.norm(sizes[k]):  # a constant, as y0**2 less a term that is y0**2
+                continue
+            left = gradient / size
+            if others:
+                Q = np.linalg.qr(np.array([_unit(item[k]) for item in others]).T)[0]
+                left = left - Q @ (Q.T @ left)
+            if np.linalg.norm(left) > INDEPENDENT:
+                return True
+        return False
+
+    def _stays(self, row: Array) -> bool:
+        """Whether it is constant along the trajectory."""
+        points = self.around.trajectory / self.around.scale
+        parts = [row[k] * points[:, item].prod(axis=1) for k, item in enumerate(self.basis) if row[k]]
+        for term, coefficient in zip(self.terms, row[len(self.basis) :], strict=True):
+            if coefficient:
+                parts.append(coefficient * np.array([float(term.fun(y.copy())) for y in self.around.trajectory]))
+        values, size = sum(parts), np.max(sum(map(np.abs, parts)))
+        return bool(np.all(np.abs(values - values[0]) <= DRIFT * size))
+
+
+def _unit(vector: Array) -> Array:
+    return vector / (np.linalg.norm(vector) or 1.0)

@@ -1,0 +1,130 @@
+"""Problems written as expressions: `hamiltonian` from H alone, `equations` from y' = f(t, y).
+
+SymPy is loaded when one of them is called, and nowhere else in the package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .system import SymbolicProblem
+
+__all__ = ["equations", "hamiltonian"]
+
+
+def hamiltonian(
+    H: Any,
+    q: Any = None,
+    p: Any = None,
+    *,
+    params: Mapping[Any, float] | None = None,
+    invariants: Mapping[str, Any] | None = None,
+    name: str | None = None,
+    poisson: Any = None,
+    extended: bool = False,
+) -> SymbolicProblem:
+    """The problem of a Hamiltonian: equations of motion, energy, gradients, from one expression.
+
+    Parameters
+    ----------
+    H : str or sympy.Expr
+        The Hamiltonian. Text is read as Python's arithmetic of numbers, names, pi and functions such as sqrt and cos,
+        by a reader that runs nothing of it; every name is yours, E, I, S, N, beta and gamma too, but for t, the time.
+    q, p : str or sequence, optional
+        Names of coordinates and momenta, ``"q1 q2"``, a list of them, or SymPy symbols. The state is (q, p). Default:
+        the names in `H` that are no parameters, x with px, q1 with p1, theta with p_theta and so on; the result's repr
+        shows the pairs.
+    params : mapping, optional
+        Values of the constants by their names. ``problem.params`` holds them in this order, and so do the rows that
+        `ensemble` takes.
+    invariants : mapping, optional
+        Expressions of further invariants by name; each is checked by its Poisson bracket with H.
+    name : str, optional
+    poisson : sequence of sequences or sympy.Matrix, optional
+        Of a non-canonical system: the matrix B of ``y' = B(y) grad H(y)``, antisymmetric, its entries expressions. `q`
+        then names the whole state y, and `p` is left out. Casimirs are given as `invariants`.
+    extended : bool, optional
+        For an H that depends on t: add a component p_t to the state, with p_t' = -dH/dt, so that H + p_t is kept. Start
+        it at 0.
+
+    Returns
+    -------
+    SymbolicProblem
+        A `Problem` with the invariant "H" first, without start and interval, which a run is given:
+        ``integrate(problem, t_span, y0, method=EIPDOP853, rtol=1e-10)``.
+
+    Warns
+    -----
+    UserWarning
+        When H depends on t, and is no invariant then.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For what cannot be read, paired or computed, and for an invariant that is none.
+    ImportError
+        Without SymPy.
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPDOP853, hamiltonian, integrate
+    >>> problem = hamiltonian("(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3")
+    >>> run = integrate(problem, (0, 100), [0.0, 0.1, 0.5, 0.0], method=EIPDOP853, rtol=1e-10, atol=1e-10)
+    >>> bool(run.max_defect[0] < 1e-14)
+    True
+    """
+    _require_sympy("hamiltonian")
+    from .system import hamiltonian_problem
+
+    return hamiltonian_problem(H, q, p, params, invariants, name, poisson, extended)
+
+
+def equations(
+    f: Any,
+    y: Any = None,
+    *,
+    params: Mapping[Any, float] | None = None,
+    invariants: Mapping[str, Any] | None = None,
+    name: str | None = None,
+) -> SymbolicProblem:
+    """The problem y' = f(t, y), written as expressions, with its invariants.
+
+    Parameters
+    ----------
+    f : sequence or mapping
+        The derivatives as text or SymPy expressions, in the order of `y`; or a mapping of each component to its own.
+    y : str or sequence, optional
+        Names of the components, ``"x v"``, a list of them, or SymPy symbols. Default: the mapping's keys.
+    params, invariants, name
+        As for `hamiltonian`. An invariant may depend on t; it is checked by its rate along the equations.
+
+    Returns
+    -------
+    SymbolicProblem
+
+    Raises
+    ------
+    ValueError, TypeError, ImportError
+        As by `hamiltonian`.
+
+    Examples
+    --------
+    >>> from eip_scipy import equations
+    >>> spin = {"m1": "m2*m3*(1/I3 - 1/I2)", "m2": "m3*m1*(1/I1 - 1/I3)", "m3": "m1*m2*(1/I2 - 1/I1)"}
+    >>> keeps = {"energy": "(m1**2/I1 + m2**2/I2 + m3**2/I3)/2", "|m|^2": "m1**2 + m2**2 + m3**2"}
+    >>> problem = equations(spin, params={"I1": 1.0, "I2": 2.0, "I3": 3.0}, invariants=keeps)
+    >>> problem.checks
+    {'energy': 'symbolically', '|m|^2': 'symbolically'}
+    """
+    _require_sympy("equations")
+    from .system import equations_problem
+
+    return equations_problem(f, y, params, invariants, name)
+
+
+def _require_sympy(what: str) -> None:
+    if find_spec("sympy") is None:
+        raise ImportError(f'{what} needs SymPy: python -m pip install "eip_scipy[sympy]".')

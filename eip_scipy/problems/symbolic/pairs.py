@@ -1,0 +1,58 @@
+"""Which names in a Hamiltonian are coordinates, and which are their momenta."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+__all__ = ["paired"]
+
+# Whose momenta may stand alone in H: a coordinate that H does not depend on is cyclic, but it is there.
+KNOWN = ("x", "y", "z", "r", "rho", "theta", "phi", "psi", "X", "Y", "Z", "R")
+
+
+def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Coordinates and momenta among names: x and px, q1 and p1, theta and p_theta or ptheta, the last one left and p.
+
+    Raises
+    ------
+    ValueError
+        For a name without a partner.
+    """
+    free = set(names)
+    pairs = []
+    for momentum in sorted(free, key=_natural):
+        coordinate = _coordinate(momentum, free)
+        if coordinate is not None:
+            pairs.append((coordinate, momentum))
+    left = sorted(free - {name for pair in pairs for name in pair}, key=_natural)
+    if "p" in left:
+        others = [name for name in left if name != "p"] or ["q"]
+        if len(others) == 1:
+            pairs.append((others[0], "p"))
+            left = []
+    if left or not pairs:
+        known = "; ".join(f"{q} with {p}" for q, p in pairs) or "no pairs"
+        raise ValueError(
+            f"hamiltonian: {', '.join(left) or 'H'} has no partner among coordinates and momenta (found: {known}). "
+            "Names are paired as x with px, q1 with p1, theta with p_theta. Give q and p, as in hamiltonian(H, 'a b', "
+            "'pa pb'), and the values of what is constant, as in params={'k': 1.0}."
+        )
+    pairs.sort(key=lambda pair: _natural(pair[0]))
+    return tuple(q for q, _ in pairs), tuple(p for _, p in pairs)
+
+
+def _coordinate(momentum: str, free: set[str]) -> str | None:
+    """Of which coordinate a name is the momentum, if of one."""
+    if not momentum.startswith("p") or momentum == "p":
+        return None
+    rest = momentum[1:].removeprefix("_")
+    if rest.isdigit():
+        likely = (f"q{momentum[1:]}", f"q{rest}", f"x{momentum[1:]}", f"x{rest}")
+        return next((name for name in likely if name in free), likely[0])
+    return rest if rest in free or rest in KNOWN or (momentum.startswith("p_") and rest.isidentifier()) else None
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """q2 before q10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]

@@ -1,0 +1,268 @@
+"""SymPy expressions as functions: one operation a statement, what is common to several computed once.
+
+The code is a tree of `ast` nodes made here, compiled, and its code object made a function. No text is run, as SymPy's
+`lambdify` would: it writes source with the user's names in it and calls `exec`. The nodes are assignments of sums,
+products, powers and calls from the list below; the names are those of the arguments and `v` with a number; all else is
+numbers.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import reduce
+from types import CodeType, FunctionType
+from typing import Any
+
+import numpy as np
+import sympy
+
+from ...core.jitted import compilable, is_jitted, jitted
+
+__all__ = ["Arguments", "function"]
+
+# SymPy's functions, and the names that math and NumPy have for them.
+CALLS: dict[Any, tuple[str, str]] = {
+    sympy.exp: ("exp", "exp"),
+    sympy.log: ("log", "log"),
+    sympy.sin: ("sin", "sin"),
+    sympy.cos: ("cos", "cos"),
+    sympy.tan: ("tan", "tan"),
+    sympy.asin: ("asin", "arcsin"),
+    sympy.acos: ("acos", "arccos"),
+    sympy.atan: ("atan", "arctan"),
+    sympy.atan2: ("atan2", "arctan2"),
+    sympy.sinh: ("sinh", "sinh"),
+    sympy.cosh: ("cosh", "cosh"),
+    sympy.tanh: ("tanh", "tanh"),
+    sympy.asinh: ("asinh", "arcsinh"),
+    sympy.acosh: ("acosh", "arccosh"),
+    sympy.atanh: ("atanh", "arctanh"),
+}
+OTHERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside, sympy.erf)
+COMMON = {name: getattr(builtins, name) for name in ("abs", "max", "min", "ValueError")} | {"erf": math.erf}
+COMPILED = {name: getattr(math, name) for name in ("sqrt", *(name for name, _ in CALLS.values()))} | COMMON
+# Without Numba NumPy's: math's would raise where a step reaches too far, instead of giving the NaN that shortens it.
+INTERPRETED = {name: getattr(np, of_numpy) for name, of_numpy in CALLS.values()} | {"sqrt": np.sqrt} | COMMON
+LARGEST_PRODUCT = 64  # of a power by multiplications
+
+
+class Arguments:
+    """The names in the arrays that a function reads: y, params, and dy, along which a Jacobian is taken."""
+
+    def __init__(self, components: Sequence[str], parameters: Sequence[str], directions: Sequence[str] = ()) -> None:
+        self.arrays = {"y": tuple(components), "dy": tuple(directions), "params": tuple(parameters)}
+
+    @property
+    def places(self) -> dict[str, tuple[str, int | None]]:
+        """Of each name the array and the place in it; the time is a number."""
+        places = {name: (array, k) for array, names in self.arrays.items() for k, name in enumerate(names)}
+        return {**places, "t": ("t", None)}
+
+
+def function(what: str, expressions: Sequence[Any], arguments: Arguments, *, in_place: bool) -> Callable[..., Any]:
+    """A function of ``(t, y[, dy][, out][, params])``, Numba's where Numba is installed.
+
+    Parameters
+    ----------
+    what : str
+        What it computes, for tracebacks and errors.
+    expressions : sequence of sympy.Expr
+        What it fills `out` with, or the one number that it returns.
+    arguments : Arguments
+    in_place : bool
+
+    Raises
+    ------
+    ValueError
+        For what has no function here.
+    """
+    code = _compiled(what, _statements(what, expressions, arguments, in_place), arguments, in_place)
+    fast = jitted(compilable(_made(code, COMPILED)))
+    return fast if is_jitted(fast) else _made(code, INTERPRETED)
+
+
+def _made(code: CodeType, functions: Mapping[str, Any]) -> FunctionType:
+    return FunctionType(code, {"__name__": __name__, "__builtins__": {}, **functions})
+
+
+def _compiled(what: str, body: list[ast.stmt], arguments: Arguments, in_place: bool) -> CodeType:
+    given = {"t": True, "y": True, "dy": arguments.arrays["dy"], "out": in_place, "params": arguments.arrays["params"]}
+    names = [name for name, there in given.items() if there]
+    parameters = ast.arguments(
+        posonlyargs=[], args=[ast.arg(arg=name) for name in names], kwonlyargs=[], kw_defaults=[], defaults=[]
+    )
+    definition = ast.FunctionDef(name="written", args=parameters, body=body, decorator_list=[])
+    module = ast.fix_missing_locations(ast.Module(body=[definition], type_ignores=[]))
+    (code,) = (item for item in compile(module, f"<{what}>", "exec").co_consts if isinstance(item, CodeType))
+    return code
+
+
+def _statements(what: str, expressions: Sequence[Any], arguments: Arguments, in_place: bool) -> list[ast.stmt]:
+    writer = Writer(what, arguments)
+    common, reduced = sympy.cse(expressions, symbols=sympy.numbered_symbols(cls=sympy.Dummy), list=True)
+    for name, expression in common:
+        writer.known[name] = writer.value(expression)
+    values = [writer.value(expression) for expression in reduced]
+    body = [*_checks(arguments), *writer.body]
+    if in_place:
+        return body + [_set(_item("out", k, ast.Store()), value) for k, value in enumerate(values)]
+    (value,) = values
+    return [*body, ast.Return(value=value)]
+
+
+def _checks(arguments: Arguments) -> Iterable[ast.stmt]:
+    """Compiled code does not look whether an index is one of the array's. Sizes cost nothing: they are known to it."""
+    for array, names in arguments.arrays.items():
+        if names:
+            size = ast.Attribute(value=_load(array), attr="size", ctx=ast.Load())
+            wrong = ast.Compare(left=size, ops=[ast.NotEq()], comparators=[ast.Constant(value=len(names))])
+            text = f"{array} must hold as many numbers as there are in ({', '.join(names)}): {len(names)}"
+            error = ast.Call(func=_load("ValueError"), args=[ast.Constant(value=text)], keywords=[])
+            yield ast.If(test=wrong, body=[ast.Raise(exc=error)], orelse=[])
+
+
+def _load(name: str) -> ast.expr:
+    return ast.Name(id=name, ctx=ast.Load())
+
+
+def _item(array: str, k: int, context: ast.expr_context) -> ast.expr:
+    return ast.Subscript(value=_load(array), slice=ast.Constant(value=k), ctx=context)
+
+
+def _set(target: ast.expr, value: ast.expr) -> ast.stmt:
+    return ast.Assign(targets=[target], value=value)
+
+
+class Writer:
+    """Statements that compute expressions; the same operation on the same values is written once."""
+
+    def __init__(self, what: str, arguments: Arguments) -> None:
+        self.what = what
+        self.body: list[ast.stmt] = []
+        self.known: dict[Any, ast.expr] = {}
+        self._written: dict[str, ast.expr] = {}
+        self._places = arguments.places
+
+    def value(self, expression: Any) -> ast.expr:
+        """The name, or the constant, that stands for an expression."""
+        if expression not in self.known:
+            self.known[expression] = self._write(expression)
+        return self.known[expression]
+
+    def _write(self, expression: Any) -> ast.expr:
+        match expression:
+            case sympy.Symbol():
+                return self._variable(expression.name)
+            case sympy.Rational():
+                return ast.Constant(value=int(expression.p) / int(expression.q))
+            case sympy.Float() | sympy.NumberSymbol():
+                return ast.Constant(value=float(expression))
+            case sympy.Add():
+                return self._sum(expression.args)
+            case sympy.Mul():
+                return self._product(expression)
+            case sympy.Pow():
+                return self._power(*expression.args)
+            case sympy.Function() | sympy.Max() | sympy.Min():
+                return self._call(expression)
+        raise self._unknown(expression)
+
+    def _unknown(self, expression: Any) -> ValueError:
+        allowed = ", ".join(sorted(item.__name__ for item in (*CALLS, *OTHERS)))
+        kind = type(expression).__name__
+        return ValueError(f"{self.what}: {kind} in {expression} is not known here. Known are {allowed}.")
+
+    def _name(self, operation: ast.expr) -> ast.expr:
+        """A new name for an operation on names and constants, or the one that it has."""
+        text = ast.dump(operation)
+        if text not in self._written:
+            name = f"v{len(self._written)}"
+            self.body.append(_set(ast.Name(id=name, ctx=ast.Store()), operation))
+            self._written[text] = _load(name)
+        return self._written[text]
+
+    def _variable(self, name: str) -> ast.expr:
+        array, place = self._places[name]
+        return _load(array) if place is None else self._name(_item(array, place, ast.Load()))
+
+    def _binary(self, left: ast.expr, operator: ast.operator, right: ast.expr) -> ast.expr:
+        return self._name(ast.BinOp(left=left, op=operator, right=right))
+
+    def _sum(self, terms: Sequence[Any]) -> ast.expr:
+        # Differences last: a sum that begins with one would first be negated.
+        signed = sorted(((term.could_extract_minus_sign(), term) for term in terms), key=lambda item: item[0])
+        (negative, first), *others = signed
+        total = self.value(first)
+        for negative, term in others:
+            total = self._binary(total, ast.Sub() if negative else ast.Add(), self.value(-term if negative else term))
+        return total
+
+    def _product(self, expression: Any) -> ast.expr:
+        factor, rest = expression.as_coeff_Mul()
+        if factor < 0:
+            return self._name(ast.UnaryOp(op=ast.USub(), operand=self.value(-expression)))
+        over, under = [], []
+        for item in sympy.Mul.make_args(rest):
+            base, exponent = item.as_base_exp()
+            if exponent.is_Rational and exponent < 0:
+                under.append(self.value(base**-exponent))
+            else:
+                over.append(self.value(item))
+        if factor != 1:
+            over.append(self.value(factor))
+        top = self._all(over) if over else ast.Constant(value=1.0)
+        return self._binary(top, ast.Div(), self._all(under)) if under else top
+
+    def _all(self, factors: Sequence[ast.expr]) -> ast.expr:
+        return reduce(lambda a, b: self._binary(a, ast.Mult(), b), factors)
+
+    def _power(self, base: Any, exponent: Any) -> ast.expr:
+        whole = 2 * exponent if exponent.is_Rational else exponent
+        if not (whole.is_Integer and abs(whole) <= LARGEST_PRODUCT):
+            return self._binary(self.value(base), ast.Pow(), self.value(exponent))
+        if whole < 0:
+            return self._binary(ast.Constant(value=1.0), ast.Div(), self.value(base**-exponent))
+        value = self.value(base)
+        count, half = divmod(int(whole), 2)
+        root = [self._function("sqrt", value)] if half else []
+        return self._all([*([self._repeated(value, count)] if count else []), *root])
+
+    def _repeated(self, value: ast.expr, count: int) -> ast.expr:
+        if count == 1:
+            return value
+        half = self._repeated(value, count // 2)
+        square = self._binary(half, ast.Mult(), half)
+        return self._binary(square, ast.Mult(), value) if count % 2 else square
+
+    def _function(self, name: str, *arguments: ast.expr) -> ast.expr:
+        return self._name(ast.Call(func=_load(name), args=list(arguments), keywords=[]))
+
+    def _call(self, expression: Any) -> ast.expr:
+        kind, arguments = type(expression), [self.value(item) for item in expression.args]
+        if kind in CALLS:
+            return self._function(CALLS[kind][0], *arguments)
+        match expression:
+            case sympy.Abs():
+                return self._function("abs", *arguments)
+            case sympy.erf():
+                return self._function("erf", *arguments)
+            case sympy.Max() | sympy.Min():
+                name = kind.__name__.lower()
+                return reduce(lambda a, b: self._function(name, a, b), arguments)
+            case sympy.sign():
+                return self._by_sign(arguments[0], -1.0, 0.0)
+            case sympy.Heaviside():
+                return self._by_sign(arguments[0], 0.0, 0.5)
+        raise self._unknown(expression)
+
+    def _by_sign(self, value: ast.expr, below: float, at_zero: float) -> ast.expr:
+        """1 for positive values, `below` for negative ones."""
+
+        def choice(test: ast.cmpop, yes: float, no: ast.expr) -> ast.expr:
+            compared = ast.Compare(left=value, ops=[test], comparators=[ast.Constant(value=0.0)])
+            return ast.IfExp(test=compared, body=ast.Constant(value=yes), orelse=no)
+
+        return self._name(choice(ast.Gt(), 1.0, choice(ast.Lt(), below, ast.Constant(value=at_zero))))

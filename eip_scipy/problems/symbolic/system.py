@@ -1,0 +1,369 @@
+"""From expressions to a `Problem`."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy
+
+from ...core.inputs import is_number, refuse_units, shown
+from ...core.invariants import Invariant
+from ...core.jitted import compiled_like, is_jitted
+from ...core.problem import Problem, bind
+from .brackets import how_kept
+from .pairs import paired
+from .parser import as_expression, as_names, symbol
+from .program import Arguments, function
+
+__all__ = ["SymbolicProblem", "equations_problem", "hamiltonian_problem"]
+
+
+LARGEST_JACOBIAN = 16  # coordinates; there are as many second derivatives as their square
+
+
+class System(NamedTuple):
+    """What is written: names, derivatives, invariants. Equal systems share their functions."""
+
+    components: tuple[str, ...]
+    parameters: tuple[str, ...]
+    rates: tuple[Any, ...]
+    invariants: tuple[tuple[str, Any], ...]
+
+    @property
+    def variables(self) -> list[Any]:
+        """The symbols of the state."""
+        return [symbol(name) for name in self.components]
+
+    @property
+    def accelerations(self) -> tuple[Any, ...] | None:
+        """Those of q'' = a(t, q), where the equations are of that kind for the state (q, q')."""
+        variables, half = self.variables, len(self.components) // 2
+        velocities = variables[half:]
+        found = self.rates[half:]
+        if len(variables) % 2 or list(self.rates[:half]) != velocities:
+            return None
+        return None if any(rate.has(*velocities) for rate in found) else found
+
+
+class Functions(NamedTuple):
+    """A system's functions; of each invariant the value and the gradient in place."""
+
+    rhs: Callable[..., None]
+    acc: Callable[..., np.ndarray] | None
+    jacobian: Callable[..., None] | None
+    invariants: tuple[tuple[Callable[..., float], Callable[..., None]], ...]
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class SymbolicProblem(Problem):
+    """A `Problem` written as expressions.
+
+    It has neither start nor interval until it is given them:
+    ``dataclasses.replace(problem, y0=np.array([...]), t_span=(0.0, 100.0))``, or as arguments of a run.
+
+    Attributes
+    ----------
+    system : System
+        ``components`` and ``parameters``, their names; ``rates``, the derivatives in time, and ``invariants``, pairs of
+        name and expression, of SymPy's, in real symbols.
+    checks : mapping
+        How it is known that each invariant is one: "by construction", "symbolically" or "numerically, at 8 points".
+    pairs : tuple of (str, str)
+        Coordinates and their momenta, of a canonical system.
+    """
+
+    system: System
+    checks: Mapping[str, str]
+    pairs: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def component_names(self) -> tuple[str, ...]:
+        """Names of the components of the state."""
+        return self.system.components
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values of the parameters by name."""
+        values = [] if self.params is None else self.params.tolist()
+        return dict(zip(self.system.parameters, values, strict=True))
+
+    def second_order(self) -> SymbolicProblem:
+        """The same problem in (q, v) with v = q', as Nystrom methods take it, where H is p W p / 2 + V(t, q).
+
+        Returns
+        -------
+        SymbolicProblem
+            With velocities named ``v_x`` for a coordinate ``x``, without start and interval.
+
+        Raises
+        ------
+        ValueError
+            Where q' is no constant matrix W times p, or p' depends on p.
+        """
+        names, rates = self.component_names, self.system.rates
+        half = len(self.pairs)
+        q, p = names[:half], [symbol(item) for item in names[half:]]
+        canonical = half > 0 and len(names) == 2 * half
+        W = sympy.Matrix(rates[:half]).jacobian(p) if canonical else sympy.zeros(1)
+        constant = canonical and not W.has(*(symbol(item) for item in (*names, "t")))
+        linear = constant and sympy.simplify(sympy.Matrix(rates[:half]) - W * sympy.Matrix(p)).is_zero_matrix
+        if not linear or any(rate.has(*p) for rate in rates[half:]) or W.det() == 0:
+            raise ValueError(
+                f"{self.name}: {_cut(rates)} is not q' = W p, p' = a(t, q) with a constant matrix W, as second order "
+                "needs."
+            )
+        new = as_names("the state", (*q, *(f"v_{item}" for item in q)))
+        v = sympy.Matrix([symbol(item) for item in new[half:]])
+        momenta = dict(zip(p, W.inv() * v, strict=True))
+        kept = tuple((label, item.xreplace(momenta)) for label, item in self.system.invariants)
+        system = System(new, self.system.parameters, (*v, *(W * sympy.Matrix(rates[half:]))), kept)
+        return _problem(
+            name=self.name,
+            system=system,
+            params=self.params,
+            checks=self.checks,
+            invariants=_invariants(system, self.params),
+        )
+
+    def __repr__(self) -> str:
+        pairs = ", ".join(f"{q} with {p}" for q, p in self.pairs)
+        kept = [f"{name} = {_cut(expression)} ({self.checks[name]})" for name, expression in self.system.invariants]
+        rates = [f"{k}' = {_cut(f)}" for k, f in zip(self.component_names, self.system.rates, strict=True)]
+        lines = [
+            f"{self.name}: y = ({', '.join(self.component_names)})" + (f", pairs {pairs}" if pairs else ""),
+            f"  equations   {_cut('; '.join(rates), 400)}",
+            f"  invariants  {'; '.join(kept) or 'none'}",
+            f"  parameters  {', '.join(f'{k} = {v:g}' for k, v in self.parameters.items()) or 'none'}",
+            f"  functions   {'jitted by Numba' if is_jitted(self.rhs) else 'plain Python'}",
+        ]
+        return "\n".join(lines)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Functions are made again from the expressions where it is read."""
+        own = [fun for fun, _ in _functions(self.system).invariants]
+        kept = [own.index(item.fun) if item.fun in own else item for item in self.invariants]
+        left = {"fun", "rhs", "acc", "jacobian", "invariants"}
+        return _again, (kept, {item.name: getattr(self, item.name) for item in fields(self) if item.name not in left})
+
+
+def _again(kept: Sequence[Any], others: dict[str, Any]) -> SymbolicProblem:
+    own = _invariants(others["system"], others["params"])
+    return _problem(invariants=tuple(own[item] if isinstance(item, int) else item for item in kept), **others)
+
+
+def hamiltonian_problem(
+    H: Any, q: Any, p: Any, params: Any, invariants: Any, name: str | None, poisson: Any, extended: bool
+) -> SymbolicProblem:
+    """See `hamiltonian`."""
+    energy, values = as_expression("H", H), _parameters(params)
+    names, rates, pairs = _canonical(energy, q, p, values) if poisson is None else _lie(energy, q, p, poisson)
+    if not energy.has(*map(symbol, names)):
+        raise ValueError(f"hamiltonian: H = {energy} does not depend on {', '.join(names)}.")
+    checks = {"H": "by construction"}
+    kept = {"H": energy}
+    time = symbol("t")
+    if energy.has(time) and extended:
+        names, rates = (*names, "p_t"), (*rates, -sympy.diff(energy, time))
+        kept = {"H + p_t": energy + symbol("p_t")}
+        checks = {"H + p_t": "by construction"}
+    elif energy.has(time):
+        warnings.warn(
+            "H depends on t: it is no invariant, and is not kept. hamiltonian(..., extended=True) adds p_t' = -dH/dt "
+            "to the state and keeps H + p_t.",
+            UserWarning,
+            stacklevel=3,
+        )
+        kept, checks = {}, {}
+    return _checked("H", name or "hamiltonian", names, rates, values, kept, checks, invariants, pairs)
+
+
+def equations_problem(f: Any, y: Any, params: Any, invariants: Any, name: str | None) -> SymbolicProblem:
+    """See `equations`."""
+    if isinstance(f, Mapping):
+        keys = as_names("the keys of f", list(f))
+        names = keys if y is None else as_names("y", y)
+        if set(keys) != set(names):
+            raise ValueError(f"equations: f has derivatives of {', '.join(keys)}, but y is {', '.join(names)}.")
+        by_name = dict(zip(keys, f.values(), strict=True))
+        given = [by_name[item] for item in names]
+    else:
+        if y is None:
+            raise TypeError("equations: y is missing; give the components' names, or f as a mapping of them.")
+        names = as_names("y", y)
+        given = [f] if isinstance(f, (str, sympy.Expr)) else list(f)
+    if len(given) != len(names):
+        raise ValueError(f"equations: {len(given)} derivatives for the {len(names)} components {', '.join(names)}.")
+    rates = tuple(as_expression(f"the derivative of {k}", item) for k, item in zip(names, given, strict=True))
+    return _checked("f", name or "equations", names, rates, _parameters(params), {}, {}, invariants, ())
+
+
+def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
+    """Names, derivatives and pairs of q' = dH/dp, p' = -dH/dq."""
+    if q is None and p is None:
+        q, p = paired({item.name for item in energy.free_symbols} - {"t", *values})
+    elif q is None or p is None:
+        raise TypeError("hamiltonian: give q and p, or neither; with poisson=, the state as q.")
+    q, p = as_names("q", q), as_names("p", p)
+    if len(q) != len(p) or not q:
+        raise ValueError(f"hamiltonian: {len(q)} coordinates ({', '.join(q)}) and {len(p)} momenta ({', '.join(p)}).")
+    names = as_names("q and p", (*q, *p))
+    forward = [sympy.diff(energy, symbol(item)) for item in p]
+    back = [-sympy.diff(energy, symbol(item)) for item in q]
+    return names, (*forward, *back), tuple(zip(q, p, strict=True))
+
+
+def _lie(energy: Any, y: Any, p: Any, poisson: Any) -> tuple[Any, Any, Any]:
+    """The same of y' = B(y) grad H."""
+    if y is None or p is not None:
+        raise TypeError("hamiltonian: with poisson= the names of the state are given as q, and p is left out.")
+    names = as_names("q", y)
+    rows = poisson.tolist() if hasattr(poisson, "tolist") else [list(row) for row in poisson]
+    n = len(names)
+    if len(rows) != n or any(len(row) != n for row in rows):
+        raise ValueError(f"hamiltonian: poisson must have the shape ({n}, {n}), for {', '.join(names)}.")
+    B = sympy.Matrix(n, n, lambda i, j: as_expression(f"poisson[{i}][{j}]", rows[i][j]))
+    for i, j in product(range(n), repeat=2):
+        total = sympy.simplify(B[i, j] + B[j, i])
+        if total != 0:
+            raise ValueError(f"hamiltonian: poisson must be antisymmetric, but [{i}][{j}] + [{j}][{i}] = {total}.")
+    gradient = sympy.Matrix([sympy.diff(energy, symbol(item)) for item in names])
+    return names, tuple(B * gradient), ()
+
+
+def _checked(
+    what: str, name: str, names: Any, rates: Any, values: Any, kept: Any, checks: Any, further: Any, pairs: Any
+) -> SymbolicProblem:
+    """The problem, once all names are known and further invariants are seen to be some."""
+    if not isinstance(name, str):
+        raise TypeError(f"name must be a string, got {shown(name)}.")
+    if further is not None and not isinstance(further, Mapping):
+        raise TypeError(f"invariants must be a mapping of names to expressions, got {shown(further)}.")
+    both = [item for item in names if item in values]
+    if both:
+        raise ValueError(f"{both[0]} is a component of the state and a parameter.")
+    parameters = {symbol(item): value for item, value in values.items()}
+    known = {*names, *values, "t"}
+    for rate in rates:
+        _require_known(what, rate, known)
+    variables = [symbol(item) for item in names]
+    for label, given in (further or {}).items():
+        if not isinstance(label, str):
+            raise TypeError(f"invariants: names must be strings, got {shown(label)}.")
+        if label in kept:
+            raise ValueError(f"invariants: {label} is there already.")
+        quantity = as_expression(f"invariant {label!r}", given)
+        _require_known(f"invariant {label!r}", quantity, known)
+        if not quantity.has(*variables):
+            raise ValueError(f"invariant {label!r} is {quantity}, which does not depend on {', '.join(names)}.")
+        checks[label] = how_kept(label, quantity, variables, rates, parameters)
+        kept[label] = quantity
+    system = System(tuple(names), tuple(values), tuple(rates), tuple(kept.items()))
+    params = np.array(list(values.values())) if values else None
+    return _problem(
+        name=name, system=system, params=params, checks=checks, pairs=pairs, invariants=_invariants(system, params)
+    )
+
+
+def _problem(*, system: System, params: np.ndarray | None, **others: Any) -> SymbolicProblem:
+    functions = _functions(system)
+    rhs = functions.rhs
+    unset: dict[str, Any] = {"y0": None, "t_span": None}  # a run is given them
+    return SymbolicProblem(
+        **(unset | others),
+        system=system,
+        params=params,
+        fun=bind(rhs, params),
+        rhs=rhs,
+        acc=functions.acc,
+        jacobian=functions.jacobian,
+    )
+
+
+def _invariants(system: System, params: np.ndarray | None) -> tuple[Invariant, ...]:
+    args = () if params is None else (params,)
+    return tuple(
+        Invariant(fun, grad, args=args, in_place=True, name=name)
+        for (name, _), (fun, grad) in zip(system.invariants, _functions(system).invariants, strict=True)
+    )
+
+
+@lru_cache(maxsize=64)
+def _functions(system: System) -> Functions:
+    """A system's functions: made, and compiled, once."""
+    arguments = Arguments(system.components, system.parameters)
+    rhs = function("derivative", system.rates, arguments, in_place=True)
+    invariants = []
+    for name, quantity in system.invariants:
+        gradient = [sympy.diff(quantity, variable) for variable in system.variables]
+        value = function(f"invariant {name}", [quantity], arguments, in_place=False)
+        invariants.append((value, function(f"gradient of {name}", gradient, arguments, in_place=True)))
+    return Functions(rhs, _acceleration(system), _jacobian(system), tuple(invariants))
+
+
+def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
+    found = system.accelerations
+    if found is None:
+        return None
+    half = len(found)
+    fill = function("acceleration", found, Arguments(system.components[:half], system.parameters), in_place=True)
+
+    def with_params(t, q, params):
+        out = np.empty(half)
+        fill(t, q, out, params)
+        return out
+
+    def without(t, q):
+        out = np.empty(half)
+        fill(t, q, out)
+        return out
+
+    return compiled_like(with_params if system.parameters else without, fill)
+
+
+def _jacobian(system: System) -> Callable[..., None] | None:
+    """Of the accelerations, times a vector; where it has one that is soon made."""
+    found = system.accelerations
+    if found is None or len(found) > LARGEST_JACOBIAN:
+        return None
+    names = system.components[: len(found)]
+    along = [f"d {name}" for name in names]  # which is nobody's name
+    pairs = [(symbol(q), symbol(d)) for q, d in zip(names, along, strict=True)]
+    rows = [sympy.Add(*(sympy.diff(a, q) * d for q, d in pairs)) for a in found]
+    if any(row.has(sympy.DiracDelta) for row in rows):  # of absolute values, and the larger of two
+        return None
+    return function("Jacobian", rows, Arguments(names, system.parameters, along), in_place=True)
+
+
+def _parameters(params: Any) -> dict[str, float]:
+    """Finite values by name."""
+    if params is None:
+        return {}
+    if not isinstance(params, Mapping):
+        raise TypeError(f"params must be a mapping of names to values, got {shown(params)}.")
+    refuse_units(params=list(params.values()))
+    names = as_names("the keys of params", list(params))
+    for name, value in zip(names, params.values(), strict=True):
+        if not (is_number(value) and math.isfinite(value)):
+            raise ValueError(f"params: {name} must be a finite number, got {shown(value)}.")
+    return dict(zip(names, map(float, params.values()), strict=True))
+
+
+def _require_known(what: str, expression: Any, known: set[str]) -> None:
+    unknown = sorted({item.name for item in expression.free_symbols} - known)
+    if unknown:
+        raise ValueError(
+            f"{what} contains {unknown[0]}, which is neither a component of the state nor a parameter; give its value: "
+            f"params={{{unknown[0]!r}: ...}}. Known are {', '.join(sorted(known))}."
+        )
+
+
+def _cut(expression: Any, length: int = 100) -> str:
+    text = str(expression)
+    return text if len(text) <= length else f"{text[:length]}..."

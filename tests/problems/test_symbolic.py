@@ -1,0 +1,604 @@
+"""Problems written as expressions: the reader, the functions, the brackets, runs against other ways to the same."""
+
+import copy
+import dataclasses
+import math
+import pickle
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor
+
+import numpy as np
+import pytest
+import sympy
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from numba import config, njit
+from scipy.integrate import solve_ivp
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ12,
+    EIPRK4,
+    EIPRK45,
+    EIPRKN12,
+    Invariant,
+    check_gradient,
+    ensemble,
+    equations,
+    hamiltonian,
+    integrate,
+)
+from eip_scipy.comparators import stormer_verlet
+from eip_scipy.problems import kepler
+from eip_scipy.problems.symbolic.parser import as_expression, as_names
+
+HENON_HEILES = "(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3"
+KEPLER = "(px**2 + py**2)/2 - 1/sqrt(x**2 + y**2) - eps/(2*(x**2 + y**2)**1.5)"
+L = {"L": "x*py - y*px"}
+SO3 = [[0, "-m3", "m2"], ["m3", 0, "-m1"], ["-m2", "m1", 0]]
+TOP = "(m1**2/I1 + m2**2/I2 + m3**2/I3)/2"
+INERTIA = {"I1": 1.0, "I2": 2.0, "I3": 3.0}
+DOUBLE_PENDULUM = (
+    "(m2*l2**2*p1**2 + (m1 + m2)*l1**2*p2**2 - 2*m2*l1*l2*p1*p2*cos(th1 - th2))"
+    " / (2*m2*l1**2*l2**2*(m1 + m2*sin(th1 - th2)**2)) - (m1 + m2)*g*l1*cos(th1) - m2*g*l2*cos(th2)"
+)
+PENDULUM_PARAMS = {"m1": 1.0, "m2": 0.5, "l1": 1.0, "l2": 0.7, "g": 9.81}
+
+
+def read(text):
+    return as_expression("H", text)
+
+
+# --- the reader ---
+
+
+@pytest.mark.parametrize("name", "E,I,S,N,Q,O,C,beta,gamma,zeta,pi_,lamda,oo,nan,zoo,true,Symbol,cos,exp".split(","))  # noqa: SIM905
+def test_names_that_are_not_called_are_the_users(name):
+    assert read(f"2*{name}") == 2 * sympy.Symbol(name, real=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("2*pi", 2 * sympy.pi),
+        (".1 + .2", sympy.Rational(3, 10)),
+        ("1e-3", sympy.Rational(1, 1000)),
+        ("2**0.5", sympy.sqrt(2)),
+        ("-2**2", -4),
+        ("2 - 3 - 4", -5),
+        ("8/4/2", 1),
+        ("2**3**2", 512),
+        ("+1_000", 1000),
+        ("exp(0) + ln(1) + hypot(3, 4) + abs(-2) + max(1, 2) + min(1, 2)", 11),
+        ("arcsin(1) - asin(1)", 0),
+        ("1 +\n 2", 3),
+        ("+".join(["1"] * 700), 700),
+    ],
+)
+def test_values_of_text(text, value):
+    assert read(text) == value
+
+
+HOSTILE = [
+    "__import__('os').system('true')", "x.__class__", "(1).real", "lambda: 1", "lambda*x", "[x for x in y]", "{x: y}",
+    "x if y else z", "x < y", "x == y", "x and y", "not x", "~x", "x // y", "x % y", "x @ y", "x << 2", "x ^ 2", "x[0]",
+    "x, y", "(x := 3)", "*x", "f'{x}'", "'x'", "b'x'", "True", "None", "...", "1j", "sqrt(*x)", "sqrt(x=1)",
+    "sqrt(**x)", "sqrt(x, y)", "sqrt()", "f(x)", "eval('1')", "(sqrt)(x)(y)", "x(y)", "await x", "(yield)", "x; y",
+    "x\ny", "x) + (y", "2x", "", "   ", "# only this", "x\0", "x = 1", "import os", "1/0", "0**-1", "log(0)",
+    "sqrt(-1)", "x # y", "# x\n+ y",
+    "asin(2)", "(-1)**0.5", "1e999", "10**400", "9**9**9", "9**99**9", "2**2**2**2**2", "x**(10**9)", "exp(1000)",
+    "exp(exp(exp(9)))", "2**sqrt(-1)", "x**(1/0)", "10**200*10**200", "(9**300)**9", "atan2(0, 0)",
+    "(" * 500 + "x" + ")" * 500, "-" * 100_000 + "x", "x" + "**x" * 5000, "sin(" * 150 + "x" + ")" * 150,
+    "x+" * 90_000 + "x", "1" * 5000, "x*" * 110_000 + "x",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", HOSTILE, ids=lambda text: text[:20])
+def test_what_is_not_allowed_is_refused(text):
+    if text == "(sqrt)(x)(y)":
+        match = "no function"
+    else:
+        match = "^H: "
+    with pytest.raises(ValueError, match=match) as found:
+        read(text)
+    assert len(str(found.value)) < 700
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("x^2", r"'x\^2' has \^; powers are written \*\*"),
+        ("lambda*x", "lambda is a word of Python's; call it otherwise"),
+        ("x.real", "'x.real' is not allowed. Allowed are numbers, names, pi"),
+        ("gamma(x)", "'gamma' is no function known here"),
+        ("sin(x, y)", "not as sin is called, with 1 argument"),
+        ("9**9**9", r"'9\*\*9' is an exponent beyond 1000"),
+    ],
+)
+def test_errors_say_what_came_and_what_is_allowed(text, says):
+    with pytest.raises(ValueError, match=says):
+        read(text)
+
+
+@given(st.text(alphabet="xyp12.+-*/()e _,sincoqrtlambda[]{}='\"\\\n#:@%^&|<>", max_size=40))
+def test_any_text_is_read_or_refused(text):
+    try:
+        found = read(text)
+    except ValueError:
+        return
+    assert isinstance(found, sympy.Expr)
+
+
+LEAVES = st.sampled_from(["x", "y", "k", "2", "0.25", "pi", "(-3)"])
+TREES = st.recursive(
+    LEAVES,
+    lambda inner: st.one_of(
+        st.tuples(inner, st.sampled_from("+-*"), inner).map(lambda part: f"({part[0]} {part[1]} {part[2]})"),
+        inner.map(lambda part: f"sin({part})"),
+        inner.map(lambda part: f"sqrt(1 + {part}**2)"),
+        inner.map(lambda part: f"({part} / (2 + cos({part})))"),
+        inner.map(lambda part: f"exp(-{part}**2)"),
+        inner.map(lambda part: f"(1 + {part}**2)**-1.5"),
+        inner.map(lambda part: f"(-{part}**3)"),
+        inner.map(lambda part: f"abs({part})"),
+        inner.map(lambda part: f"max({part}, atan({part}))"),
+    ),
+    max_leaves=8,
+)
+
+
+@given(TREES)
+def test_functions_compute_what_the_text_says(text):
+    """Against Python's own arithmetic of the text, which is one of ours; not compiled, for there are many."""
+    from eip_scipy.problems.symbolic import program
+
+    try:
+        expression = read(text)
+    except ValueError as error:
+        assume("too large" not in str(error) and "that a float holds" not in str(error))
+        raise
+    arguments = program.Arguments(["x", "y"], ["k"])
+    code = program._compiled("test", program._statements("test", [expression], arguments, False), arguments, False)
+    y, params = np.array([0.7, -1.3]), np.array([0.9])
+    functions = {name: getattr(np, name) for name in ("sin", "cos", "sqrt", "exp", "pi")}
+    functions |= {"atan": np.arctan, "x": y[0], "y": y[1], "k": params[0], "abs": abs, "max": max}
+    expected = eval(text, functions)
+    for known in (program.COMPILED, program.INTERPRETED):
+        found = program._made(code, known)(0.0, y, params)
+        assert found == pytest.approx(expected, rel=1e-11, abs=1e-11)
+    assert set(code.co_names) <= {"size", *program.COMPILED}
+
+
+def test_names():
+    assert as_names("q", "a, b  c") == as_names("q", ["a", sympy.Symbol("b"), "c"]) == ("a", "b", "c")
+    for wrong in (["a", "a"], "a-b", "lambda", ["x y"], "t", ["2x"], [""]):
+        with pytest.raises(ValueError, match=r"^q: "):
+            as_names("q", wrong)
+    for wrong in (3, [3], None):
+        with pytest.raises(TypeError, match=r"^q: expected names"):
+            as_names("q", wrong)
+
+
+def test_a_name_is_spelled_as_python_spells_it():
+    """Python reads the sign for micro as the Greek letter."""
+    problem = hamiltonian("p**2/2 + µ*q**2", params={"μ": 2.0})
+    assert problem.fun(0.0, [1.0, 0.5]).tolist() == [0.5, -4.0]
+
+
+def test_expressions_of_sympy():
+    x, p, k = sympy.symbols("x p k", positive=True)
+    problem = hamiltonian(p**2 / 2 + k * sympy.sqrt(x**2 + 1), [x], [p], params={k: 2.0})
+    assert problem.fun(0.0, [-1.0, 0.5]) == pytest.approx([0.5, 2 / math.sqrt(2)])
+    for wrong, kind, says in [
+        (sympy.I * x, ValueError, "expected a finite real expression"),
+        (sympy.Symbol("x") * x, ValueError, "two different symbols called x"),
+        (sympy.Function("f")(x) * p**2, ValueError, "is not known here. Known are"),
+        (sympy.Symbol("a b"), ValueError, "no name"),
+        ([x], TypeError, "expected an expression"),
+        (True, TypeError, "expected an expression"),
+        (1j, TypeError, "expected an expression"),
+        (None, TypeError, "expected an expression"),
+    ]:
+        with pytest.raises(kind, match=says):
+            hamiltonian(wrong, [x], [p])
+
+
+# --- what is paired ---
+
+
+@pytest.mark.parametrize(
+    ("H", "names"),
+    [
+        (HENON_HEILES, "x y px py"),
+        ("p1**2/q1 + p2**2*q2 + p10*q10", "q1 q2 q10 p1 p2 p10"),
+        ("p1**2 + p2**2", "q1 q2 p1 p2"),
+        ("p_1**2 + p_2**2*q_1", "q_1 q_2 p_1 p_2"),
+        ("p**2 - cos(theta)", "theta p"),
+        ("p**2", "q p"),
+        ("pr**2 + ptheta**2/r**2", "r theta pr ptheta"),
+        ("p_r**2 + p_theta**2/r**2", "r theta p_r p_theta"),
+        ("p_a**2 + b*p_b", "a b p_a p_b"),
+        ("E*pE + I*pI", "E I pE pI"),
+    ],
+)
+def test_pairs(H, names):
+    problem = hamiltonian(H)
+    half = len(names.split()) // 2
+    assert problem.component_names == tuple(names.split())
+    assert problem.pairs == tuple(zip(names.split()[:half], names.split()[half:], strict=True))
+    assert all(f"{q} with {p}" in repr(problem) for q, p in problem.pairs)
+
+
+@pytest.mark.parametrize("H", ["px**2 + k*x**2", "px**2 + y", "p**2 + a*b", "3", "k"])
+def test_names_without_a_partner(H):
+    with pytest.raises(ValueError, match=r"no partner among coordinates and momenta .*params={'k': 1.0}"):
+        hamiltonian(H)
+
+
+# --- equations, energies, gradients ---
+
+
+def test_kepler_as_the_packages_own():
+    own, problem = kepler(), hamiltonian(KEPLER, params={"eps": 0.005}, invariants=L)
+    rng = np.random.default_rng(1)
+    for y in rng.normal(size=(20, 4)):
+        assert problem.fun(0.0, y) == pytest.approx(own.fun(0.0, y), rel=1e-13)
+        for written, known in zip(problem.invariants, own.invariants, strict=True):
+            assert written.fun(0.0, y, *written.args) == pytest.approx(known.fun(0.0, y, *known.args), rel=1e-13)
+            assert check_gradient(written, 0.0, y) < 1e-10
+    run, expected = (
+        integrate(problem, own.t_span, own.y0, method=EIPRK4, h=0.03, blocks=2),
+        integrate(own, method=EIPRK4),
+    )
+    assert run.y[:, -1] == pytest.approx(expected.y[:, -1], abs=1e-10)
+    assert run.compiled == (not config.DISABLE_JIT)
+    assert [item.name for item in problem.invariants] == ["H", "L"]
+    assert dict(problem.checks) == {"H": "by construction", "L": "symbolically"}
+
+
+def test_solve_ivp_and_integrate_take_the_same_steps():
+    own, problem = kepler(), hamiltonian(KEPLER, params={"eps": 0.005}, invariants=L)
+    sol = solve_ivp(problem.fun, (0, 20), own.y0, method=EIPRK4, h=0.03, invariants=problem.invariants)
+    run = integrate(problem, (0, 20), own.y0, method=EIPRK4, h=0.03)
+    assert np.array_equal(sol.y[:, -1], run.y[:, -1])
+
+
+def test_second_order_methods_take_it():
+    own, problem = kepler(), hamiltonian(KEPLER, params={"eps": 0.005}, invariants=L)
+    run = integrate(problem, (0, 50), own.y0, method=EIPRKN12, h=0.05)
+    expected = integrate(own, (0, 50), method=EIPRKN12, h=0.05, blocks=None)
+    assert run.y[:, -1] == pytest.approx(expected.y[:, -1], abs=1e-11)
+    steps = stormer_verlet(problem.acc, (0, 5), own.y0, 0.01, params=problem.params)
+    others = stormer_verlet(own.acc, (0, 5), own.y0, 0.01, params=own.params)
+    assert steps.y[:, -1] == pytest.approx(others.y[:, -1], abs=1e-12)
+    oscillator = hamiltonian("(p**2 + q**2)/2")
+    assert oscillator.acc(0.0, np.array([3.0])).tolist() == [-3.0]
+    for H in ("p**2/4 + q**2", "p**2*q", "p**2/2 + p*q"):  # q' is not p, or p' depends on it
+        assert hamiltonian(H).acc is None
+
+
+def test_multistep_methods_take_their_jacobian():
+    problem = hamiltonian(KEPLER, params={"eps": 0.005}, invariants=L)
+    q, dq, out, step = np.array([0.7, -0.4]), np.array([0.3, 0.9]), np.empty(2), 1e-5
+    problem.jacobian(0.0, q, dq, out, problem.params)
+    ends = [problem.acc(0.0, q + sign * step * dq, problem.params) for sign in (1, -1)]
+    assert out == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-8)
+    own = kepler()
+    run = integrate(problem, (0, 20), own.y0, method=EIPGJ12, h=0.01)
+    assert run.y[:, -1] == pytest.approx(integrate(own, (0, 20), method=EIPRKN12, h=0.01).y[:, -1], abs=1e-10)
+    assert hamiltonian("p**2/2 + abs(q)").jacobian is None  # it has no derivative at 0
+
+
+def test_second_order_of_masses():
+    problem = hamiltonian("p1**2/(2*m) + p2**2/4 + p1*p2/10 + q1**2/2 + q2**2*cos(q1)**2", params={"m": 3.0})
+    other = problem.second_order()
+    assert other.component_names == ("q1", "q2", "v_q1", "v_q2")
+    y0 = np.array([0.3, 0.2, 0.1, -0.4])
+    W = np.array([[1 / 3, 0.1], [0.1, 0.5]])
+    start = np.concatenate([y0[:2], W @ y0[2:]])
+    run = integrate(other, (0, 5), start, method=EIPRKN12, h=0.05)
+    expected = integrate(problem, (0, 5), y0, method=EIPDOP853, rtol=1e-11, atol=1e-11)
+    assert run.y[:2, -1] == pytest.approx(expected.y[:2, -1], abs=1e-8)
+    assert other.invariants[0].fun(0.0, start, other.params) == pytest.approx(
+        problem.invariants[0].fun(0.0, y0, problem.params)
+    )
+    assert other.acc is not None
+    for H in ("p**2*q", "(p - q)**2/2", "p**4", "sqrt(1 + p**2)"):
+        with pytest.raises(ValueError, match="as second order needs"):
+            hamiltonian(H).second_order()
+    with pytest.raises(ValueError, match="as second order needs"):
+        equations(["v", "-x"], "x v").second_order()
+    with pytest.raises(ValueError, match="as second order needs"):
+        hamiltonian(DRIVEN, extended=True).second_order()
+
+
+def test_henon_heiles_as_written_by_hand():
+    @njit
+    def rhs(t, y, out):
+        out[0], out[1] = y[2], y[3]
+        out[2], out[3] = -y[0] - 2 * y[0] * y[1], -y[1] - y[0] * y[0] + y[1] * y[1]
+
+    @njit
+    def H(t, y):
+        return (y[2] ** 2 + y[3] ** 2 + y[0] ** 2 + y[1] ** 2) / 2 + y[0] ** 2 * y[1] - y[1] ** 3 / 3
+
+    @njit
+    def grad(t, y):
+        return np.array([y[0] + 2 * y[0] * y[1], y[1] + y[0] * y[0] - y[1] * y[1], y[2], y[3]])
+
+    options = {"method": EIPDOP853, "rtol": 1e-10, "atol": 1e-10}
+    y0 = [0.0, 0.1, 0.5, 0.0]
+    run = integrate(hamiltonian(HENON_HEILES), (0, 100), y0, **options)
+    expected = integrate(rhs, (0, 100), y0, in_place=True, invariants=Invariant(H, grad), **options)
+    assert run.y[:, -1] == pytest.approx(expected.y[:, -1], abs=1e-8)
+    assert run.trusted
+    assert run.max_defect[0] < 1e-14
+
+
+def test_double_pendulum_against_scipy():
+    problem = hamiltonian(DOUBLE_PENDULUM, "th1 th2", "p1 p2", params=PENDULUM_PARAMS)
+    y0 = np.array([1.0, 0.5, 0.2, -0.1])
+    (energy,) = problem.invariants
+    grad = np.empty(4)
+    energy.grad(0.0, y0, grad, *energy.args)
+    assert problem.fun(0.0, y0) == pytest.approx([grad[2], grad[3], -grad[0], -grad[1]], rel=1e-13)
+    assert check_gradient(energy, 0.0, y0) < 1e-10
+    run = integrate(problem, (0, 5), y0, method=EIPDOP853, rtol=1e-11, atol=1e-11)
+    sol = solve_ivp(problem.fun, (0, 5), y0, method="DOP853", rtol=1e-12, atol=1e-12)
+    assert run.y[:, -1] == pytest.approx(sol.y[:, -1], abs=1e-8)
+
+
+def test_rigid_body_by_its_poisson_matrix():
+    problem = hamiltonian(TOP, "m1 m2 m3", poisson=SO3, params=INERTIA, invariants={"C": "m1**2 + m2**2 + m3**2"})
+    euler = equations(
+        {"m1": "m2*m3*(1/I3 - 1/I2)", "m2": "m3*m1*(1/I1 - 1/I3)", "m3": "m1*m2*(1/I2 - 1/I1)"},
+        params=INERTIA,
+        invariants={"H": TOP, "C": "m1**2 + m2**2 + m3**2"},
+    )
+    y0 = np.array([1.0, 0.2, 0.3])
+    assert problem.fun(0.0, y0) == pytest.approx(euler.fun(0.0, y0), rel=1e-14)
+    assert dict(euler.checks) == {"H": "symbolically", "C": "symbolically"}
+    runs = [integrate(item, (0, 100), y0, method=EIPDOP853, rtol=1e-9, atol=1e-9) for item in (problem, euler)]
+    assert runs[0].y[:, -1] == pytest.approx(runs[1].y[:, -1], abs=1e-6)
+    assert (runs[0].max_defect < 1e-13).all()
+    for poisson, says in [
+        ([[0, 1], [-1, 0]], r"shape \(3, 3\)"),
+        ([[0, 1, 0], [1, 0, 0], [0, 0, 0]], "must be antisymmetric"),
+        ([[1, 0, 0], [0, 0, 0], [0, 0, 0]], "must be antisymmetric"),
+    ]:
+        with pytest.raises(ValueError, match=says):
+            hamiltonian(TOP, "m1 m2 m3", poisson=poisson, params=INERTIA)
+    for names in ({}, {"q": "m1 m2 m3", "p": "a b c"}):
+        with pytest.raises(TypeError, match="names of the state are given as q"):
+            hamiltonian(TOP, poisson=SO3, params=INERTIA, **names)
+
+
+# A driven oscillator, x'' = -x + cos(2 t) from rest: x = (cos t - cos 2t) / 3.
+DRIVEN = "p**2/2 + x**2/2 - x*cos(2*t)"
+
+
+def test_h_that_depends_on_time():
+    with pytest.warns(UserWarning, match=r"H depends on t: it is no invariant.*extended=True") as told:
+        problem = hamiltonian(DRIVEN)
+    assert told[0].filename == __file__
+    assert problem.invariants == ()
+    assert "invariants  none" in repr(problem)
+    run = integrate(problem, (0, 3), [0.0, 0.0], method=EIPDOP853, rtol=1e-10, atol=1e-12)
+    assert run.y[0, -1] == pytest.approx((math.cos(3) - math.cos(6)) / 3, abs=1e-9)
+
+
+def test_h_that_depends_on_time_extended():
+    problem = hamiltonian(DRIVEN, extended=True)
+    assert problem.component_names == ("x", "p", "p_t")
+    run = integrate(problem, (0, 3), [0.0, 0.0, 0.0], method=EIPDOP853, rtol=1e-10, atol=1e-12)
+    assert run.y[0, -1] == pytest.approx((math.cos(3) - math.cos(6)) / 3, abs=1e-9)
+    assert run.max_defect[0] < 1e-14
+    assert run.trusted
+
+
+def test_invariants_of_time():
+    """x - v t of a free particle."""
+    problem = equations(["v", "0"], "x v", invariants={"start": "x - v*t"})
+    run = integrate(problem, (1, 3), [0.5, 2.0], method=EIPRK4, h=0.1)
+    assert run.y[:, -1] == pytest.approx([4.5, 2.0])
+    assert run.max_defect[0] < 1e-14
+
+
+# --- invariants by their brackets ---
+
+
+@pytest.mark.parametrize(
+    ("H", "invariants", "params", "how"),
+    [
+        (KEPLER, L, {"eps": 0.1}, "symbolically"),
+        ("(p1**2 + p2**2)/2 + exp(q1 - q2)", {"P": "p1 + p2"}, None, "symbolically"),
+        ("(px**2 + py**2)/2 + (x**2 + k*y**2)/2", L, {"k": 1.0}, "numerically, at 8 points with the parameters given"),
+        # A function of the energy, whose bracket would take minutes to expand.
+        (HENON_HEILES, {"H^20": f"({HENON_HEILES} + 1)**20"}, None, "numerically, at 8 points"),
+    ],
+)
+def test_how_invariants_are_known(H, invariants, params, how):
+    problem = hamiltonian(H, params=params, invariants=invariants)
+    (name,) = invariants
+    assert problem.checks[name] == how
+    assert how in repr(problem)
+
+
+@pytest.mark.parametrize(
+    ("H", "invariants", "says"),
+    [
+        ("(px**2 + py**2)/2 + x**2 + 2*y**2", L, "'L' is no invariant of these equations: its rate is .*, at x="),
+        (HENON_HEILES, {"I": f"({HENON_HEILES})**13 + 1e-9*x"}, "'I' is no invariant"),
+        (HENON_HEILES, {"I": "z"}, "contains z, which is neither a component of the state nor a parameter"),
+        (HENON_HEILES, {"I": "3"}, "does not depend on x, y, px, py"),
+        (HENON_HEILES, {"H": "x"}, "H is there already"),
+        (HENON_HEILES, {"I": "sqrt(-2 - x**2)"}, "finite and real at no point tried"),
+    ],
+)
+def test_what_is_no_invariant_is_refused(H, invariants, says):
+    with pytest.raises(ValueError, match=says):
+        hamiltonian(H, invariants=invariants)
+
+
+# --- errors of the arguments ---
+
+
+@pytest.mark.parametrize(
+    ("call", "kind", "says"),
+    [
+        (lambda: hamiltonian("p**2", "q"), TypeError, "give q and p, or neither"),
+        (lambda: hamiltonian("p**2", "q r", "p"), ValueError, "2 coordinates"),
+        (lambda: hamiltonian("p**2", "q", "q"), ValueError, "stands twice"),
+        (lambda: hamiltonian("p**2*k", "q", "p"), ValueError, "contains k, which is neither"),
+        (lambda: hamiltonian("a**2", "q", "p", params={"a": 1}), ValueError, "does not depend on q, p"),
+        (
+            lambda: hamiltonian("p**2", "q", "p", params={"q": 1}),
+            ValueError,
+            "a component of the state and a parameter",
+        ),
+        (lambda: hamiltonian("p**2", params=3), TypeError, "params must be a mapping"),
+        (lambda: hamiltonian("p**2", params={"k": math.inf}), ValueError, "k must be a finite number, got inf"),
+        (lambda: hamiltonian("p**2", params={"k": "1"}), ValueError, "k must be a finite number, got '1'"),
+        (lambda: hamiltonian("p**2", invariants=["p"]), TypeError, "invariants must be a mapping"),
+        (lambda: hamiltonian("p**2", invariants={1: "p"}), TypeError, "names must be strings"),
+        (lambda: hamiltonian("p**2", name=3), TypeError, "name must be a string"),
+        (lambda: equations(["y", "-x"]), TypeError, "y is missing"),
+        (lambda: equations(["y"], "x y"), ValueError, "1 derivatives for the 2 components"),
+        (lambda: equations({"x": "y", "y": "-x"}, "x z"), ValueError, "f has derivatives of x, y, but y is x, z"),
+        (lambda: equations({"x": "y", "y": "-z"}), ValueError, "contains z, which is neither"),
+    ],
+)
+def test_wrong_arguments(call, kind, says):
+    with pytest.raises(kind, match=says):
+        call()
+
+
+def test_states_and_parameters_of_another_length():
+    """Compiled code would read what lies beside them."""
+    problem = hamiltonian(KEPLER, params={"eps": 0.005})
+    for y0, params in (([1.0, 0.0, 0.0], None), (np.ones(6), None), (np.ones(4), [1.0, 2.0]), (np.ones(4), [])):
+        with pytest.raises(ValueError, match="must hold as many numbers as there are in"):
+            integrate(problem, (0, 1), y0, params=params, method=EIPRK4, h=0.1)
+
+
+def test_a_start_and_an_interval_are_for_the_run():
+    problem = hamiltonian(HENON_HEILES, name="Henon-Heiles")
+    with pytest.raises(TypeError, match="y0 is missing"):
+        integrate(problem, (0, 1), method=EIPRK4, h=0.1)
+    with pytest.raises(TypeError, match="y0s is missing"):
+        ensemble(problem, (0, 1), method=EIPRK4, h=0.1)
+    start = dataclasses.replace(problem, y0=np.array([0.0, 0.1, 0.5, 0.0]), t_span=(0.0, 1.0))
+    assert integrate(start, method=EIPRK4, h=0.1).success
+    assert repr(start).startswith("Henon-Heiles: y = (x, y, px, py), pairs x with px, y with py\n")
+
+
+# --- functions: jitted or not, in ensembles, in other processes ---
+
+
+def test_without_numba(monkeypatch):
+    H = "(px**2 + py**2)/2 + log(x) + atan2(y, x) + sqrt(1 + y**2) + abs(y) + max(x, y) + cbrt(x)"
+    y = np.array([1.2, -0.4, 0.3, 0.1])
+    compiled = hamiltonian(H, name="one")
+    from eip_scipy.core import jitted as module
+    from eip_scipy.problems.symbolic import system
+
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    system._functions.cache_clear()
+    plain = hamiltonian(H, name="one")
+    system._functions.cache_clear()
+    assert "plain Python" in repr(plain)
+    assert plain.fun(0.0, y) == pytest.approx(compiled.fun(0.0, y), rel=1e-14)
+    assert plain.invariants[0].fun(0.0, y) == pytest.approx(compiled.invariants[0].fun(0.0, y), rel=1e-14)
+    runs = [integrate(item, (0, 0.5), y, method=EIPRK45, rtol=1e-9) for item in (plain, compiled)]
+    assert not runs[0].compiled
+    assert runs[0].y[:, -1] == pytest.approx(runs[1].y[:, -1], rel=1e-9)
+    with np.errstate(all="ignore"):  # where a step reaches too far there is no exception
+        assert np.isnan(plain.invariants[0].fun(0.0, np.array([-1.0, 0.1, 0.0, 0.0])))
+
+
+def test_equal_systems_share_their_functions():
+    a, b = (hamiltonian(KEPLER, params={"eps": eps}, invariants=L) for eps in (0.005, 0.1))
+    assert a.rhs is b.rhs
+    assert a.fun(0.0, np.ones(4)).tolist() != b.fun(0.0, np.ones(4)).tolist()
+
+
+def test_problems_pickle_and_copy():
+    y0 = kepler().y0
+    problem = dataclasses.replace(hamiltonian(KEPLER, params={"eps": 0.005}, invariants=L), y0=y0, t_span=(0.0, 5.0))
+    own = dataclasses.replace(problem, invariants=(problem.invariants[1],))
+    for item in (problem, own):
+        for other in (pickle.loads(pickle.dumps(item)), copy.deepcopy(item)):
+            assert repr(other) == repr(item)
+            runs = [integrate(one, method=EIPRK4, h=0.03) for one in (item, other)]
+            assert np.array_equal(runs[0].y, runs[1].y)
+            assert len(other.invariants) == len(item.invariants)
+
+
+@pytest.mark.parametrize("H", [KEPLER, KEPLER.replace("1/sqrt(x**2 + y**2)", "cos(x**2 + y**2)")])
+def test_members_of_an_ensemble(H):
+    problem = hamiltonian(H, params={"eps": 0.005}, invariants=L)
+    y0s = kepler().y0 * np.linspace(0.99, 1.01, 16)[:, None]
+    params = np.linspace(0.0, 0.01, 16)[:, None]
+    options = {"method": EIPRK4, "h": 0.03}
+    found = ensemble(problem, (0, 10), y0s, params=params, **options)
+    single = integrate(problem, (0, 10), y0s[5], params=params[5], **options)
+    assert np.array_equal(found.y[5], single.y[:, -1])
+    assert (found.status == 0).all()
+
+
+@pytest.mark.slow
+def test_members_side_by_side_and_in_other_processes():
+    problem = hamiltonian(KEPLER, params={"eps": 0.005}, invariants=L)
+    y0s = kepler().y0 * np.linspace(0.99, 1.01, 256)[:, None]
+    options = {"method": EIPRK4, "h": 0.01}
+    found = ensemble(problem, (0, 400), y0s, **options)
+    assert found.one_by_one == ""
+    single = integrate(problem, (0, 400), y0s[5], **options)
+    assert np.array_equal(found.y[5], single.y[:, -1])
+    with ProcessPoolExecutor(2) as executor:
+        other = ensemble(problem, (0, 400), y0s, executor=executor, **options)
+    assert np.array_equal(found.y, other.y)
+
+
+@pytest.mark.slow
+def test_code_is_the_same_in_every_process():
+    code = (
+        "import sys, dis; from eip_scipy import hamiltonian\n"
+        f"rhs = hamiltonian({DOUBLE_PENDULUM!r}, 'th1 th2', 'p1 p2', params={PENDULUM_PARAMS!r}).rhs\n"
+        "rhs = getattr(rhs, 'py_func', rhs)\n"
+        "print(rhs.__code__.co_code.hex(), rhs.__code__.co_consts)"
+    )
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", code], env={"PYTHONHASHSEED": str(k)}, capture_output=True, text=True, check=True
+        ).stdout
+        for k in range(3)
+    }
+    assert len(found) == 1
+
+
+def test_a_lattice_of_many_names():
+    n = 24
+    H = " + ".join(f"p{k}**2/2 + (q{(k + 1) % n} - q{k})**2/2 + (q{(k + 1) % n} - q{k})**4/4" for k in range(n))
+    problem = hamiltonian(H, invariants={"P": " + ".join(f"p{k}" for k in range(n))})
+    rng = np.random.default_rng(3)
+    y = rng.normal(size=2 * n)
+    stretch = np.roll(y[:n], -1) - y[:n]
+    force = stretch + stretch**3
+    assert problem.component_names[:3] == ("q0", "q1", "q2")
+    assert problem.fun(0.0, y) == pytest.approx(np.concatenate([y[n:], force - np.roll(force, 1)]), rel=1e-12)
+
+
+def test_sympy_is_loaded_by_its_callers_alone():
+    code = "import sys; from eip_scipy import hamiltonian, equations, problems; print('sympy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+
+
+def test_without_sympy(monkeypatch):
+    from eip_scipy.problems import symbolic
+
+    monkeypatch.setattr(symbolic, "find_spec", lambda name: None)
+    for call in (lambda: hamiltonian("p**2"), lambda: equations(["x"], "x")):
+        with pytest.raises(ImportError, match=r'needs SymPy: python -m pip install "eip_scipy\[sympy\]"'):
+            call()
