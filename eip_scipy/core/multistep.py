@@ -149,8 +149,8 @@ def _largest(product: Callable[[Array], Array], y: Array) -> float:
     """The largest eigenvalue of a matrix, by its size, to some per cent: from its products with vectors."""
     d, found = np.random.default_rng(0).standard_normal(y.size // 2).astype(y.dtype), 0.0
     for _ in range(ROUNDS):
-        d = product(d / np.linalg.norm(d))
-        found = float(np.linalg.norm(d))
+        d = product(d / np.sqrt(np.vdot(d, d).real))
+        found = float(np.sqrt(np.vdot(d, d).real))
         if not np.isfinite(found) or found == 0.0:
             return 0.0
     return found
@@ -177,7 +177,7 @@ def _record(
         corrected_count=corrected.stop - corrected.start,
         nodes=_aligned((ROWS * order, pitch)),
         sums=_aligned((4, pitch)),
-        moved=_aligned((pitch,)),
+        moved=_aligned((half,)),
         levels=np.zeros((3, run.invariants.size)),
         place=np.zeros(N_NODE_PLACES, np.int64),
     )

@@ -43,6 +43,17 @@ inline Rows latest(const Multistep &ms, const double *weights, int64_t count) {
     return {weights, newest(ms) - (count - 1) * ms.pitch, count, ms.pitch};
 }
 
+// scale times the sum of rows under their weights; of short rows in two parts, which do not wait for each other.
+inline void history_sum(double scale, const Rows &rows, double *out, int64_t n) {
+    if (n >= LANES) return weighted_sum(scale, rows, out, n);
+    for (int64_t i = 0; i < n; ++i) {
+        const double *entry = rows.first + i;
+        double even = 0.0, odd = 0.0;
+        for (int64_t j = 0; j < rows.count; ++j, entry += rows.stride) (j % 2 ? odd : even) += rows.weights[j] * *entry;
+        out[i] = scale * (even + odd);
+    }
+}
+
 // Room for one more node; the others move to the first rows where there is none.
 inline double *next_row(const Multistep &ms) {
     int64_t &at = ms.place[NEWEST_ROW];
@@ -166,11 +177,8 @@ inline Code begin_history(const Run &run, double *y) {
 inline void correct_node(const Run &run, double t, double *a) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
-    // At least a few vectors: a sum of as many rows float by float takes as long as one of ten bodies.
-    const int64_t count = std::min(ms.pitch - ms.first, std::max(ms.count, LANES));
     const double *oldest = a - ms.order * ms.pitch + ms.first;
-    weighted_sum(ms.h * ms.h, {ms.correction, oldest, ms.order + 1, ms.pitch}, ms.moved + ms.first, count);
-    for (int64_t i = ms.first + ms.count; i < ms.first + count; ++i) ms.moved[i] = 0.0;
+    history_sum(ms.h * ms.h, {ms.correction, oldest, ms.order + 1, ms.pitch}, ms.moved + ms.first, ms.count);
     run.system.jacobian(w, t, w.stage, ms.moved, w.f_point);
     for (int64_t i = ms.first; i < ms.first + ms.count; ++i) a[i] += w.f_point[i];
 }
@@ -183,10 +191,10 @@ inline Code add_node(const Run &run) {
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] + 1) * ms.h, square = ms.h * ms.h;
     const double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
     double *q = w.stage, *v = q + half;
-    weighted_sum(1.0, latest(ms, ms.predict_q, ms.order), q, half);
+    history_sum(1.0, latest(ms, ms.predict_q, ms.order), q, half);
     for (int64_t i = 0; i < half; ++i) q[i] = square * (S[i] + (S_rest[i] + q[i]));
     if (ms.uses_v) {
-        weighted_sum(1.0, latest(ms, ms.predict_v, ms.order), v, half);
+        history_sum(1.0, latest(ms, ms.predict_v, ms.order), v, half);
         for (int64_t i = 0; i < half; ++i) v[i] = ms.h * (s[i] + (s_rest[i] + v[i]));
     }
     run.system.rhs_of_scratch(w, t, w.stage, w.row(1));
@@ -373,6 +381,7 @@ inline Code project_last(const Run &run, const Step &step, double from) {
         gather_errors(ms, size, w);
     }
     if (w.l == 0) return OK;
+    if (ms.brief || ms.place[NEWEST] < ms.order + LEVELS * LEVEL_SPACING) fill(ms.levels + w.l, 0.0, w.l);
     run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
     evaluate_invariants(run, step.t_new, w.y_hat);
     ++w.counters[NJEV];

@@ -121,7 +121,7 @@ Multistep multistep_of(PyObject *record, const Work &w, Arrays &arrays) {
     ms.count = integer(record, "corrected_count");
     ms.nodes = arrays.floats(record, "nodes", {ms.rows, ms.pitch});
     ms.sums = arrays.floats(record, "sums", {4, ms.pitch});
-    ms.moved = arrays.floats(record, "moved", {ms.pitch});
+    ms.moved = arrays.floats(record, "moved", {ms.half});
     ms.levels = arrays.floats(record, "levels", {3, w.l});
     ms.place = arrays.integers<int64_t>(record, "place", {N_NODE_PLACES});
     check_history(ms);
