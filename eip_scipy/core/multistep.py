@@ -95,10 +95,12 @@ def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float) -> s
         fastest = _largest_frequency(system)
     else:
         bodies, moons = system.frequencies
-        fastest = max(float(bodies.max(initial=0.0)), moons * limit / plain)  # which nothing corrects
         if corrects:
             fast = h * bodies > CORRECTED_SHARE * plain
             corrected = np.repeat(fast | (fast.any() & (bodies == 0.0)), half // bodies.size)
+        planets = float(bodies.max(initial=0.0))
+        # Nothing corrects moons.
+        fastest, limit = (planets, limit) if planets * plain >= moons * limit else (moons, plain)
     if not h * fastest <= limit:
         raise ValueError(
             f"{name}: h = {h:g} is not stable for a motion as fast as the fastest one at the start, of frequency "

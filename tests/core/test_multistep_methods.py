@@ -25,6 +25,7 @@ from eip_scipy import (
     integrate,
 )
 from eip_scipy.problems import Problem, nbody, solar_system
+from eip_scipy.problems.gravity import solar_data
 
 both = pytest.mark.parametrize("method", [EIPGJ12, EIPGJ14])
 E = 0.2
@@ -354,6 +355,14 @@ def test_a_step_that_is_not_stable_is_refused_with_one_that_is():
         integrate(lambda t, q: -np.array([1.0, 9.0]) * q, (0, 10), [1.0, 1.0, 0.0, 0.0], method=EIPGJ12, h=0.05)
     with pytest.raises(ValueError, match="is not stable"):
         solve_ivp(orbit, (0, 20), Y0, method=EIPGJ14, h=STEP)  # which has no Jacobian here
+
+
+def test_a_moon_is_named_by_its_own_frequency():
+    """No Jacobian of the Sun corrects it: 27 days, and a step that it bounds."""
+    with pytest.raises(
+        ValueError, match=r"EIPGJ14: h = 0\.001 is not stable .* \(period 0\.07\d+\)\. Take h <= 0\.0003"
+    ):
+        integrate(solar_system(solar_data.load("de440-moon"), years=1), method=EIPGJ14, h=0.001)
 
 
 def test_what_becomes_unstable_is_told():
