@@ -114,7 +114,8 @@ def test_json_holds_numbers_versions_and_machine(short):
     assert run["versions"]["numpy"] == np.__version__
     assert run["machine"]["cpus"] == os.cpu_count()
     names = [method["method"] for method in run["methods"]]
-    assert names == ["EIPRK4 (error)", "EIPRK4 (euclidean)", "RK4", "SV", "EIPRKN12", "WHFast", "WHFast (c17)", "IAS15"]
+    own = ["EIPRK4 (error)", "EIPRK4 (euclidean)", "RK4", "SV", "EIPRKN12", "EIPGJ14"]
+    assert names == [*own, "WHFast", "WHFast (c17)", "IAS15"]
     for method in run["methods"][:-1]:
         (errors,) = method["errors"]
         assert errors["reference"] == "IAS15"
@@ -123,7 +124,7 @@ def test_json_holds_numbers_versions_and_machine(short):
     assert run["methods"][-1]["errors"] == []  # it is the reference
     assert run["ran_beside_the_others"] == ("IAS15" if cores() > 1 else None)
     points = run["error_against_cost"]["points"]
-    assert {point["method"] for point in points} >= {"EIPRK5 (error)", "EIPRKN12", "WHFast (c17)"}
+    assert {point["method"] for point in points} >= {"EIPRK5 (error)", "EIPRKN12", "EIPGJ14", "WHFast (c17)"}
     assert all(point["error"] > 0 and point["error_others"] > 0 for point in points)
 
 
@@ -143,8 +144,9 @@ def test_order_shows_in_the_errors(short):
     error = {method["method"]: method["errors"][0]["position_AU"] for method in short.json["methods"][:-1]}
     assert error["EIPRK4 (error)"]["Mercury"] < error["SV"]["Mercury"] / 10
     assert error["WHFast (c17)"]["Mercury"] < error["WHFast"]["Mercury"] / 10
-    for planet, best in error["EIPRKN12"].items():
-        assert best < max(1e-3 * error["EIPRK4 (error)"][planet], 1e-13)
+    for name in ("EIPRKN12", "EIPGJ14"):
+        for planet, best in error[name].items():
+            assert best < max(1e-3 * error["EIPRK4 (error)"][planet], 1e-13)
 
 
 @pytest.mark.slow
@@ -158,12 +160,14 @@ def test_one_year_against_the_stored_states(tmp_path, capsys, monkeypatch):
     assert "Reference: stored states (Taylor, 80 bits) at 1 yr; turns counted along IAS15" in text
     assert "IAS15 agrees with the stored states at 1 yr" in text
     assert "FAILED" not in text
-    assert max(map(len, text.splitlines()[:-3])) <= 85  # the table and its notes fit a terminal
+    assert max(map(len, text.splitlines()[:-3])) <= 92  # nine columns
     with open(tmp_path / "solar-system.csv", newline="") as stream:
         rows = {row["method"]: row for row in csv.DictReader(stream)}
     assert {row["reference"] for row in rows.values()} == {"stored states"}
     assert abs(float(rows["IAS15"]["longitude_Mercury_rad"])) < 1e-12
     assert abs(float(rows["EIPRKN12"]["longitude_Mercury_rad"])) < 1e-9
+    assert abs(float(rows["EIPGJ14"]["longitude_Mercury_rad"])) < 1e-11
+    assert float(rows["EIPGJ14"]["step_yr"]) == 0.1 / 60
     assert float(rows["EIPRKN12"]["step_yr"]) == 0.1 / 7  # of the steps that divide the time between saved states
     assert abs(float(rows["SV"]["longitude_Mercury_rad"])) == pytest.approx(0.05, rel=0.5)
 
@@ -174,7 +178,7 @@ def test_one_year_against_the_stored_states(tmp_path, capsys, monkeypatch):
 def test_euclidean_metric_comes_first_when_asked_for(tmp_path, capsys, no_rebound):
     assert main(["solar-system", *SPAN, "--metric", "euclidean", "--data", "paper", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    assert lines(out)[4].split() == ["euclid.", "error", "alone", "every", "10", "tight"]
+    assert lines(out)[4].split() == ["euclid.", "error", "alone", "every", "10", "auto", "tight"]
     assert "initial data 'paper'" in out
     assert "Earth" in out
     assert "ok     EIPRK4 (euclidean) keeps H" in out
@@ -185,7 +189,7 @@ def test_euclidean_metric_comes_first_when_asked_for(tmp_path, capsys, no_reboun
 @pytest.mark.usefixtures("little_to_time")
 def test_a_method_without_estimate_has_one_metric(tmp_path, capsys, no_rebound):
     assert main(["solar-system", *SPAN, "--method", "EIPRK1", "--out", str(tmp_path)]) == 0
-    assert lines(capsys.readouterr().out)[3].split() == ["EIPRK1", "RK1", "SV", "EIPRKN12", "EIPRKN12"]
+    assert lines(capsys.readouterr().out)[3].split() == ["EIPRK1", "RK1", "SV", "EIPRKN12", "EIPGJ14", "EIPRKN12"]
 
 
 # --- what is missing ---
@@ -329,7 +333,7 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, no_rebound, monkeypatc
     assert main([*command, "--out", str(tmp_path / "again")]) == 2
     assert "exists. resume=True goes on with the run that it holds" in capsys.readouterr().err
     assert main([*command, "--out", str(tmp_path / "second"), "--resume", "--quiet"]) == 0
-    assert {path.name for path in folder.iterdir()} == {*done, "EIPRKN12.npz", "EIPRKN12-tight.npz"}
+    assert {path.name for path in folder.iterdir()} == {*done, "EIPRKN12.npz", "EIPGJ14.npz", "EIPRKN12-tight.npz"}
     assert {name: (folder / name).read_bytes() for name in done} == before
 
     def numbers(name):
@@ -619,7 +623,7 @@ def test_two_thousand_years():
 
     scene = solar_run.make_scene("de440", 2000.0, 0.002)
     tasks = {task.name: task for task in solar_run.plan(scene, EIPRK4, "error", rebound.run)}
-    runs = {name: tasks[name].start(False) for name in ("EIPRK4 (error)", "RK4", "SV", "EIPRKN12", "IAS15")}
+    runs = {name: tasks[name].start(False) for name in ("EIPRK4 (error)", "RK4", "SV", "EIPRKN12", "EIPGJ14", "IAS15")}
     study = solar_errors.SolarStudy(scene, 4, list(runs.values()), runs["IAS15"])
     longitude = {name: errors.longitude for name, errors in study.errors(2000.0).items()}
     assert longitude["RK4"][0] == pytest.approx(70.5, abs=0.5)
@@ -628,7 +632,10 @@ def test_two_thousand_years():
     assert np.abs(longitude["IAS15"]).max() < 1e-8
     assert np.abs(longitude["EIPRKN12"]).max() < 1e-7
     assert np.abs(longitude["EIPRKN12"][1:]).max() < 1e-9
-    assert runs["EIPRKN12"].energy_error.max() < 1e-14
+    for name in ("EIPRKN12", "EIPGJ14"):
+        assert runs[name].energy_error.max() < 1e-14
+    assert np.abs(longitude["EIPGJ14"]).max() < 2e-8
+    assert np.abs(longitude["EIPGJ14"][1:]).max() < 1e-9
     assert (np.abs(longitude["EIPRK4 (error)"]) <= np.maximum(2 * np.abs(longitude["RK4"]), 1e-7)).all()
     assert all(check.passed for check in study.checks())
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ def two_methods(monkeypatch):
     everything = solar_frontier.methods
 
     def few(problem, years, judge, heyoka):
-        assert set(everything(problem, years, judge, heyoka)) >= {"EIPRKN12", "EIPDOP853", "SV"}
+        assert set(everything(problem, years, judge, heyoka)) >= {"EIPRKN12", "EIPGJ14", "EIPDOP853", "SV"}
 
         def near(step):
             return step, problem.reference(years) + 1e-7 * (np.arange(60) < 30)
@@ -74,8 +75,25 @@ def test_methods_of_the_frontier_run(monkeypatch):
     runs = solar_frontier.measure(1.0, None, None)
     best = {run.method: min(r.errors.max() for r in runs if r.method == run.method) for run in runs}
     assert max(best[name] for name in ("EIPRKN12", "EIPRKN8", "EIPDOP853", "RKN12, no projection")) < 1e-9
-    assert best["EIPRKN12"] < 1e-12
+    assert max(best[name] for name in ("EIPRKN12", "EIPGJ12", "EIPGJ14")) < 1e-12
     assert best["EIPRK4"] < 1e-5
+
+
+def test_peers_of_the_frontier_are_called():
+    """Each with its name and steps that divide the span."""
+    problem, called = solar_system(years=1.0), []
+
+    def peer(gm, y0, name, *, h, n_steps):
+        called.append((name, h * n_steps))
+        return SimpleNamespace(wall_time=0.5, y=np.stack([y0, y0 + 1], axis=1))
+
+    methods = solar_frontier.methods(problem, 1.0, peer, None)
+    for name in ("WHFast (c17)", "SABA(10,6,4)", "IAS15"):
+        run, steps = methods[name]
+        seconds, y = run(steps[-1])
+        assert seconds == 0.5
+        assert np.array_equal(y, problem.y0 + 1)
+    assert called == [("whfast-c17", 1.0), ("saba(10,6,4)", 1.0), ("ias15", 1.0)]
 
 
 def test_heyoka_on_our_states():

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.solvers import EIPRK4, EIPRK5, EIPRKN12, EIPSolver
+from ...core.solvers import EIPGJ14, EIPRK4, EIPRK5, EIPRKN12, EIPSolver
 from ...problems.gravity.solar_data import YEAR_D
 from ...run.integrate import integrate
 from ..long_runs import named
@@ -18,6 +18,7 @@ from ..work_precision import Runner, work_precision
 from .runs import (
     HIGH_ORDER,
     KEPT,
+    MULTISTEP,
     Peer,
     SolarScene,
     eip_name,
@@ -33,6 +34,7 @@ __all__ = ["ENOUGH_SECONDS", "MERCURY", "REPEATS", "TimedRun", "by_method", "cos
 
 REPEATS = 3
 ENOUGH_SECONDS = 0.2  # what disturbs so long a run is not seen on axes of many powers of ten
+MULTISTEP_COUNTS = (255, 300, 412, 600)  # steps a year; half of the first would not be stable
 MERCURY = 0  # of the planets, which start behind the Sun
 
 
@@ -156,7 +158,8 @@ def cost_methods(
     ----------
     scene : SolarScene
     method : type
-        With its projection, and without; and beside it EIPRK5 (EIPRK4 beside EIPRK5) and EIPRKN12.
+        With its projection, and without; and beside it EIPRK5 (EIPRK4 beside EIPRK5), EIPRKN12 and
+        EIPGJ14.
     metric : {"error", "euclidean"}
     peer : callable or None
 
@@ -174,6 +177,7 @@ def cost_methods(
         eip_name(other, metric): (partial(_time_eip, scene, other, {"metric": metric}), steps),
         "SV": (partial(_time_verlet, scene), _steps(scene, [scene.h * f for f in (2, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)])),
         HIGH_ORDER: (partial(_time_eip, scene, EIPRKN12, KEPT), _steps(scene, [1 / n for n in (24, 32, 40, 48, 64)])),
+        MULTISTEP: (partial(_time_eip, scene, EIPGJ14, {}), _steps(scene, [1 / n for n in MULTISTEP_COUNTS])),
     }
     if peer is None:
         return methods

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...comparators import stormer_verlet
-from ...core.solvers import EIPDOP853, EIPRK4, EIPRKN8, EIPRKN12
+from ...core.solvers import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK4, EIPRKN8, EIPRKN12
 from ...problems import Problem, solar_system
 from ...problems.gravity.solar_data import YEAR_D, load, reference_states
 from ...run.integrate import integrate
@@ -61,6 +61,8 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
     found = {
         "EIPRKN12": own(EIPRKN12, *steps, **KEPT),
         "RKN12, no projection": own(EIPRKN12, *steps, compensated=True, invariants=()),
+        "EIPGJ14": own(EIPGJ14, 1 / 255, 1 / 275, 1 / 300, 1 / 350, 1 / 412, 1 / 500, 1 / 600, 1 / 768),
+        "EIPGJ12": own(EIPGJ12, 1 / 500, 1 / 550, 1 / 592, 1 / 700, 1 / 850),
         "EIPRKN8": own(EIPRKN8, 1 / 80, 1 / 100, 1 / 160, 1 / 240, **KEPT),
         "EIPDOP853": own(EIPDOP853, 1 / 80, 1 / 120, 1 / 180, 1 / 240, **KEPT),
         "EIPRK4": own(EIPRK4, 1 / 500, 1 / 1000),
@@ -68,12 +70,12 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
     }
     if peer is not None:
 
-        def peer(name: str, *days: float) -> tuple[Runner, Sequence[float]]:
+        def by_rebound(name: str, *days: float) -> tuple[Runner, Sequence[float]]:
             return partial(_rebound, peer, problem, years, name), _dividing(years, [d / YEAR_D for d in days])
 
         found |= {
-            "WHFast (c17)": peer("whfast-c17", 10, 5, 3, 2, 1.4, 1, 0.7305),
-            "SABA(10,6,4)": peer("saba(10,6,4)", 20, 15, 10, 7.5, 5, 3),
+            "WHFast (c17)": by_rebound("whfast-c17", 10, 5, 3, 2, 1.4, 1, 0.7305),
+            "SABA(10,6,4)": by_rebound("saba(10,6,4)", 20, 15, 10, 7.5, 5, 3),
             "IAS15": (partial(_ias15, peer, problem, years), [math.nan]),
         }
     if heyoka is not None:

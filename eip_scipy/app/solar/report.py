@@ -13,13 +13,13 @@ import numpy as np
 from ...problems.gravity.solar_data import YEAR_D
 from ..report import compact, document, table
 from .errors import PointErrors, SolarStudy
-from .runs import HIGH_ORDER, TIGHT, MethodRun, report_times
+from .runs import HIGH_ORDER, MULTISTEP, TIGHT, MethodRun, report_times
 
 __all__ = ["cost_rows", "csv_rows", "json_content", "text"]
 
 
 def text(study: SolarStudy, args: argparse.Namespace) -> str:
-    """Lay out the head, the table, the notes and the checks, at most 79 columns for the usual names."""
+    """Lay out the head, the table, the notes and the checks, 90 columns for the usual names."""
     parts = [_head(study, args), _table(study), _notes(study), *_check_lines(study)]
     return "\n".join(["", *parts])
 
@@ -87,6 +87,9 @@ def _notes(study: SolarStudy) -> str:
         "WHFast (c17: corrector of order 17), IAS15: REBOUND." if "IAS15" in shown else "",
         f"{study.beside} ran beside the others, on another core." if study.beside in shown else "",
         f"{HIGH_ORDER}: Nystroem, order 12, projected at each tenth step, compensated." if HIGH_ORDER in shown else "",
+        f"{MULTISTEP}: multistep, order 14, one evaluation a step, projected when it pays."
+        if MULTISTEP in shown
+        else "",
         f"{TIGHT}: half of its step." if TIGHT in shown else "",
         "EMB: barycentre of Earth and Moon." if "EMB" in study.scene.planets else "",
     ]

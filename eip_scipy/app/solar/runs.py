@@ -15,7 +15,7 @@ import numpy as np
 
 from ...comparators import StormerVerletResult, stormer_verlet
 from ...core.diagnostics import invariants_along
-from ...core.solvers import EIPRKN12, EIPSolver
+from ...core.solvers import EIPGJ14, EIPRKN12, EIPSolver
 from ...core.stepping import check_fixed_step
 from ...problems import Problem, SolarSystemData, solar_system
 from ...problems.gravity.solar_data import YEAR_D, load
@@ -25,6 +25,7 @@ from ..long_runs import named
 __all__ = [
     "HIGH_ORDER",
     "KEPT",
+    "MULTISTEP",
     "TIGHT",
     "MethodRun",
     "Peer",
@@ -51,6 +52,8 @@ HIGH_ORDER, TIGHT = "EIPRKN12", "EIPRKN12 (tight)"
 HIGH_ORDER_STEP = 1 / 64  # years: rounding, not the step, makes what errors are left
 KEPT: dict[str, Any] = {"every": 10, "compensated": True}
 """How long runs of high order keep their invariants."""
+MULTISTEP = "EIPGJ14"
+MULTISTEP_STEP = 1 / 600  # years
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +212,7 @@ def plan(
             HIGH_ORDER, partial(_high_order, scene, HIGH_ORDER, "every 10", 1, **checkpoint_of(HIGH_ORDER)), True
         )
     )
+    tasks.append(PendingRun(MULTISTEP, partial(_multistep, scene, **checkpoint_of(MULTISTEP)), True))
     if peer is None:
         tasks.append(PendingRun(TIGHT, partial(tight_run, scene, **checkpoint_of(TIGHT)), True))
         return tasks
@@ -264,17 +268,23 @@ def tight_run(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun
 def _high_order(scene: SolarScene, name: str, word: str, shorter: int, progress: bool, **checkpoint: Any) -> MethodRun:
     """Run the method for small errors over long times, its step divided by `shorter`."""
     per_save = shorter * whole_number(scene.interval / HIGH_ORDER_STEP)
+    return _long(scene, EIPRKN12, name, word, per_save, progress, **KEPT, **checkpoint)
+
+
+def _multistep(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
+    per_save = whole_number(scene.interval / MULTISTEP_STEP)
+    return _long(scene, EIPGJ14, MULTISTEP, "auto", per_save, progress, **checkpoint)
+
+
+def _long(
+    scene: SolarScene, method: type[EIPSolver], name: str, word: str, per_save: int, progress: bool, **options: Any
+) -> MethodRun:
     step = scene.interval / per_save
     result = integrate(
-        scene.problem,
-        method=named(EIPRKN12, name),
-        h=step,
-        save_every=per_save,
-        progress=progress,
-        **KEPT,
-        **checkpoint,
+        scene.problem, method=named(method, name), h=step, save_every=per_save, progress=progress, **options
     )
-    return _finished(scene, name, ("EIPRKN12", word), step, result, "" if result.success else result.message)
+    head = (method.__name__, word)
+    return _finished(scene, name, head, step, result, "" if result.success else result.message)
 
 
 def _verlet(scene: SolarScene) -> MethodRun:
