@@ -1,4 +1,4 @@
-"""Ten bodies over 1000 years by the Nystrom method of order 12: what projection, its spacing and compensation bring.
+"""Ten bodies over 1000 years by EIPRKN12: what projection, its spacing and compensation bring; EIPGJ14 beside it.
 
     python benchmarks/long_orbits.py [--years 100|1000] [--json FILE]
 
@@ -17,12 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy import EIPRKN12, integrate
+from eip_scipy import EIPGJ14, EIPRKN12, integrate
+from eip_scipy.core.solvers import EIPSolver
 from eip_scipy.problems import Problem, solar_system
 
 PLANETS = ("Mercury", "Venus", "EMB", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune", "Pluto")
 REPEATS = 3
 STEPS = (1 / 128, 0.01, 1 / 64, 0.02)
+MULTISTEP = (1 / 412, 1 / 500, 1 / 600)
 WAYS: dict[str, dict[str, Any]] = {
     "no projection": {"invariants": ()},
     "no projection, compensated": {"invariants": (), "compensated": True},
@@ -41,9 +43,9 @@ def position_errors(problem: Problem, t: float, y: np.ndarray) -> list[float]:
     return [float(x) for x in np.linalg.norm((y - reference)[:30].reshape(10, 3), axis=1)[1:]]
 
 
-def nystrom(problem: Problem, t: float, h: float, options: dict[str, Any]) -> dict[str, Any]:
+def timed(problem: Problem, t: float, method: type[EIPSolver], h: float, options: dict[str, Any]) -> dict[str, Any]:
     """One way, timed."""
-    runs = [integrate(problem, (0, t), method=EIPRKN12, h=h, **options) for _ in range(REPEATS)]
+    runs = [integrate(problem, (0, t), method=method, h=h, **options) for _ in range(REPEATS)]
     wall = min(run.wall_time for run in runs)
     return {"wall": wall, "errors": position_errors(problem, t, runs[0].y[:, -1])}
 
@@ -75,10 +77,11 @@ def main() -> None:
     args = parser.parse_args()
     problem = solar_system(years=args.years)
     rows = {
-        f"h = {h:.5g} yr, {name}": nystrom(problem, args.years, h, options)
+        f"h = {h:.5g} yr, {name}": timed(problem, args.years, EIPRKN12, h, options)
         for h in STEPS
         for name, options in WAYS.items()
     }
+    rows |= {f"EIPGJ14, h = {h:.5g} yr": timed(problem, args.years, EIPGJ14, h, {}) for h in MULTISTEP}
     rows |= peers(problem, args.years)
     print(f"{platform.machine()}, Python {platform.python_version()}; {args.years:g} years, errors of position [AU]\n")
     print(f"{'':40}{'wall [s]':>9}" + "".join(f"{name:>9}" for name in PLANETS))

@@ -1,4 +1,4 @@
-"""Ten bodies with relativity: EIPRKN12 beside WHFast, SABA and IAS15 with REBOUNDx.
+"""Ten bodies with relativity: EIPGJ14 and EIPRKN12 beside WHFast, SABA and IAS15 with REBOUNDx.
 
     python benchmarks/relativity.py [--years 100] [--json FILE]
 
@@ -11,34 +11,35 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
+import math
 from typing import Any
 
 import heyoka
 import numpy as np
 import rebound
 import reboundx
+from runners import Methods, by_rebound, by_us, one_each, rows, show
 
-from eip_scipy import EIPRKN12, integrate
+from eip_scipy import EIPGJ14, EIPRKN12
 from eip_scipy.app.report import describe_machine
-from eip_scipy.integrations import rebound as peers
+from eip_scipy.app.solar.cost import timed
 from eip_scipy.problems import Problem, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 REPEATS = 3
 FLOAT = np.longdouble
 C = 299792.458 * 86400 * YEAR_D / 149597870.7  # AU/yr
-STEPS = (1 / 32, 1 / 40, 1 / 48, 1 / 64, 1 / 80)
-DAYS = {"whfast": (5, 2, 1), "whfast-c17": (5, 3, 2, 1, 0.5), "saba(10,6,4)": (10, 5, 3)}
+MULTISTEP, NYSTROM = (360, 412, 500, 600), (32, 40, 48, 64, 80)  # steps a year
+DAYS = {"whfast-c17": (5, 3, 2, 1, 0.5), "saba(10,6,4)": (10, 5, 3)}
 
 
-def reference(gm: np.ndarray, y0: np.ndarray, years: float) -> np.ndarray:
-    """The positions (30,) at the end, by heyoka in 80 bits."""
+def reference(gm: np.ndarray, y0: np.ndarray, years: float, c: float | None = C) -> np.ndarray:
+    """The positions (3 N,) at the end, by heyoka in 80 bits; `c`: the speed of light, None for Newton alone."""
     n = gm.size
     equations = list(heyoka.model.nbody(n, masses=list(gm.astype(FLOAT)), Gconst=FLOAT(1)))
     places = [heyoka.make_vars(f"x_{i}", f"y_{i}", f"z_{i}") for i in range(n)]
-    strength = FLOAT(6) * FLOAT(gm[0]) ** 2 / FLOAT(C) ** 2
-    for i in range(1, n):
+    strength = None if c is None else FLOAT(6) * FLOAT(gm[0]) ** 2 / FLOAT(c) ** 2
+    for i in () if strength is None else range(1, n):
         d = [a - b for a, b in zip(places[i], places[0], strict=True)]
         r2 = heyoka.sum([x * x for x in d])
         for axis in range(3):
@@ -63,27 +64,25 @@ def potential(sim: rebound.Simulation) -> reboundx.Extras:
     return extras
 
 
-def least(run: Callable[[], Any]) -> Any:
-    """The fastest of several runs."""
-    return min((run() for _ in range(REPEATS)), key=lambda result: result.wall_time)
-
-
-def runs(problem: Problem, years: float) -> dict[str, tuple[float, np.ndarray]]:
-    """Wall time and final state of every method and step."""
-    found = {}
-    for h in STEPS:
-        result = least(lambda h=h: integrate(problem, (0.0, years), method=EIPRKN12, h=h, every=10, compensated=True))
-        found[f"EIPRKN12, {h * YEAR_D:.3g} d"] = (result.wall_time, result.y[:, -1])
-    gm = problem.params[:10]
+def methods(problem: Problem) -> Methods:
+    """A row for each method and step."""
+    found = one_each(lambda h: f"EIPGJ14, 1/{round(1 / h)} yr", by_us(problem, EIPGJ14), [1 / n for n in MULTISTEP])
+    nystrom = by_us(problem, EIPRKN12, every=10, compensated=True)
+    found |= one_each(lambda h: f"EIPRKN12, 1/{round(1 / h)} yr", nystrom, [1 / n for n in NYSTROM])
     for name, days in DAYS.items():
-        for d in days:
-            n = round(years * YEAR_D / d)
-            result = least(
-                lambda name=name, n=n: peers.run(gm, problem.y0, name, h=years / n, n_steps=n, prepare=potential)
-            )
-            found[f"{name}, {d} d"] = (result.wall_time, result.y[:, -1])
-    result = least(lambda: peers.run(gm, problem.y0, "ias15", h=years, n_steps=1, prepare=potential))
-    found["ias15"] = (result.wall_time, result.y[:, -1])
+        run = by_rebound(problem, name, potential)
+        found |= one_each(lambda h, name=name: f"{name}, {h * YEAR_D:.3g} d", run, [d / YEAR_D for d in days])
+    return found | {"ias15": (by_rebound(problem, "ias15", potential), [math.nan])}
+
+
+def table(years: float) -> dict[str, Any]:
+    """Print and return it."""
+    problem = solar_system(years=years, forces="gr-potential")
+    truth = np.zeros_like(problem.y0)
+    truth[:30] = reference(problem.params[:10], problem.y0, years)
+    found = rows([timed(methods(problem), truth, repeats=REPEATS)])
+    print(f"\nTen bodies, {years:g} years, potential in 1/r^2 on both sides")
+    show(found, "Mercury")
     return found
 
 
@@ -92,18 +91,11 @@ def main() -> None:
     parser.add_argument("--years", type=float, default=100.0)
     parser.add_argument("--json", metavar="FILE")
     args = parser.parse_args()
-    problem = solar_system(years=args.years, forces="gr-potential")
-    truth = reference(problem.params[:10], problem.y0, args.years)
-    print(f"{describe_machine()}; {args.years:g} years; errors of position [AU]")
-    print(f"{'':24}{'wall [s]':>10}{'Mercury':>10}{'others':>10}")
-    rows = {}
-    for name, (wall, y) in runs(problem, args.years).items():
-        errors = np.linalg.norm((y[:30] - truth).reshape(10, 3), axis=1)[1:]
-        rows[name] = {"wall": wall, "Mercury": errors[0], "others": errors[1:].max()}
-        print(f"{name:24}{wall:10.4f}{errors[0]:10.1e}{errors[1:].max():10.1e}")
+    print(describe_machine())
+    found = table(args.years)
     if args.json:
         with open(args.json, "w") as file:
-            json.dump({"machine": describe_machine(), "years": args.years, "rows": rows}, file, indent=1, default=float)
+            json.dump({"machine": describe_machine(), "years": args.years, "rows": found}, file, indent=1)
 
 
 if __name__ == "__main__":
