@@ -25,7 +25,9 @@ def assert_output(found, printed):
         assert agree(float(a), float(b)), f"{a}, printed as {b}"
 
 
-PAGES = ("quickstart", "adaptive", "own-methods", "checkpoints", "ensembles", "written", "finding-invariants")
+PAGES = (
+    "quickstart", "adaptive", "own-methods", "multistep", "checkpoints", "ensembles", "written", "finding-invariants",
+)  # fmt: skip
 NIGHTLY = ("hard-scenes", "charged-particles", "gross-pitaevskii")
 
 
