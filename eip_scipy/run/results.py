@@ -147,7 +147,7 @@ class IntegrationResult(OptimizeResult):
         >>> from eip_scipy.problems import kepler
         >>> run = integrate(kepler(), (0, 10), method=EIPRK4, save_every=10)
         >>> longer = run.continue_to(20)
-        >>> longer.t[-1], bool((longer.max_defect < 1e-11).all())
+        >>> float(longer.t[-1]), bool((longer.max_defect < 1e-11).all())
         (20.0, True)
         """
         from .continuation import continued
