@@ -131,7 +131,9 @@ class IntegrationResult(OptimizeResult):
         Raises
         ------
         ValueError
-            When `t` is not beyond the end, or the result was loaded, unpickled or copied.
+            When `t` is not beyond the end; when the result was loaded, unpickled or copied; when the last state misses
+            an invariant by more than 1e-8 of its terms, as after a run that is not to be trusted or was not checked:
+            ``project_initial=True`` then projects it first.
 
         Notes
         -----
