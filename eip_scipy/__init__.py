@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .core.one_step import OneStepMethod
     from .core.pointers import CFunctions
     from .core.project import project
-    from .core.results import Diagnostics, IntegrationResult, ProjectionResult, ProjectionWarning
+    from .core.results import Diagnostics, ProjectionResult, ProjectionWarning
     from .core.solvers import (
         EIPDOP853,
         EIPGJ12,
@@ -39,7 +39,11 @@ if TYPE_CHECKING:
     from .methods.runge_kutta import Tableau
     from .problems.invariant_search import find_invariants
     from .problems.symbolic import equations, hamiltonian
+    from .run.figures import plot
     from .run.integrate import integrate
+    from .run.results import IntegrationResult
+    from .run.saving import load, save
+    from .run.tables import to_dataframe, to_xarray
 
     __version__: str
 
@@ -77,7 +81,12 @@ __all__ = [
     "find_invariants",
     "hamiltonian",
     "integrate",
+    "load",
+    "plot",
     "project",
+    "save",
+    "to_dataframe",
+    "to_xarray",
 ]
 
 _HOMES = {  # the module of each of these names, and the modules that are public themselves
@@ -86,7 +95,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "Diagnostics": "core.results",
     "EnsembleResult": "ensembles.ensemble",
     "GaussJackson": "methods.multistep",
-    "IntegrationResult": "core.results",
+    "IntegrationResult": "run.results",
     "Invariant": "core.invariants",
     "JointInvariants": "core.invariants",
     "NystromTableau": "methods.nystrom",
@@ -100,7 +109,12 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "find_invariants": "problems.invariant_search",
     "hamiltonian": "problems.symbolic",
     "integrate": "run.integrate",
+    "load": "run.saving",
+    "plot": "run.figures",
     "project": "core.project",
+    "save": "run.saving",
+    "to_dataframe": "run.tables",
+    "to_xarray": "run.tables",
     **dict.fromkeys((name for name in __all__ if name.startswith("EIP") or name == "eip_method"), "core.solvers"),
 }
 _MODULES = ("checkpoint", "problems")

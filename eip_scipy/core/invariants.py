@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -151,6 +152,9 @@ class JointInvariants(tuple[Invariant, ...]):
         self = super().__new__(cls, items)
         self.moments, self.shift = moments, shift
         return self
+
+    def __getnewargs__(self) -> tuple[Any, ...]:
+        return tuple(self), self.moments, self.shift
 
 
 def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
@@ -375,6 +379,17 @@ class InvariantSet:
         ]
         self._gradients_at_start(t0, y0, f0)
         self.calls = self._calls(y0)
+
+    def with_targets(self) -> tuple[Invariant, ...]:
+        """The invariants with the values that are kept as their targets."""
+        kept = [copy(item) for item in self.items]
+        for k, item in enumerate(kept):
+            item.target = self.target[self.starts[k] : self.starts[k + 1]].copy()
+        return (
+            JointInvariants(kept, self.items.moments, self.items.shift)
+            if isinstance(self.items, JointInvariants)
+            else tuple(kept)
+        )
 
     def _calls(self, y0: Array) -> tuple[tuple[Call, ...], tuple[Call, ...]]:
         """Values and gradients, as the engine calls them."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -10,20 +10,22 @@ from typing import Any
 import numpy as np
 
 from ..engine.native import library
-from .inputs import refuse_units
+from .inputs import refuse_units, shown
 from .invariants import Invariant
 from .pointers import by_pointer
 
-__all__ = ["Problem", "bind", "native_invariant"]
+__all__ = ["Problem", "bind", "component_names", "native_invariant"]
+
+MOST = 12  # components that are printed
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Problem:
     """A conservative initial value problem.
 
     A problem knows no solver. `integrate` takes it whole: ``integrate(problem, method=EIPRK4)``; through SciPy it is
-    ``solve_ivp(problem.fun, problem.t_span, problem.y0, method=EIPRK4, h=problem.h, invariants=problem.invariants,
-    blocks=problem.blocks, frame=problem.frame)``.
+    ``problem.solve_ivp(method=EIPRK4)``. It prints in five lines, and pickles where its functions do: all of the
+    package's, and functions of a module; not C functions by pointer and lambdas.
 
     Attributes
     ----------
@@ -59,6 +61,8 @@ class Problem:
         ``reference(t) -> y``: a closed form, or stored reference states; None at times without one.
     source : str
         Where the equations and data come from.
+    component_names : tuple of str, optional
+        Names of the components of the state, for tables and figures.
     """
 
     name: str
@@ -78,10 +82,101 @@ class Problem:
     source: str = ""
     jacobian: Callable[..., None] | None = None
     frequencies: Callable[[np.ndarray], tuple[np.ndarray, float]] | None = None
+    component_names: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         refuse_units(y0=self.y0, t_span=self.t_span, h=self.h, params=self.params, metric=self.metric, frame=self.frame)
         object.__setattr__(self, "rhs", by_pointer(self.rhs, "rhs"))
+        if self.component_names is not None:
+            n = None if self.y0 is None else np.size(self.y0)
+            object.__setattr__(self, "component_names", component_names(self.component_names, n))
+
+    def solve_ivp(self, t_span: Any = None, y0: Any = None, *, method: Any, **options: Any) -> Any:
+        """Solve it by `scipy.integrate.solve_ivp`, with all that the problem brings and the method takes.
+
+        Parameters
+        ----------
+        t_span, y0 : optional
+            Default: the problem's own.
+        method : type or str
+            An EIP method, which gets the invariants, metric, blocks and frame, and the step `h` unless rtol, atol,
+            first_step, max_step or h are given; or another of SciPy's, which gets none of these.
+        **options
+            Of `solve_ivp` and of the method; they take precedence.
+
+        Returns
+        -------
+        OdeResult
+            SciPy's, and ``component_names`` where the problem names them.
+
+        Examples
+        --------
+        >>> from eip_scipy import EIPRK4
+        >>> from eip_scipy.problems import kepler
+        >>> sol = kepler().solve_ivp((0, 20), method=EIPRK4)
+        >>> sol.success, sol.y.shape
+        (True, (4, 668))
+        """
+        from scipy.integrate import solve_ivp
+
+        t_span, y0 = self.t_span if t_span is None else t_span, self.y0 if y0 is None else y0
+        if t_span is None or y0 is None:
+            raise TypeError(f"{self.name}: the problem has no {'interval' if t_span is None else 'start'}; give one.")
+        brought: dict[str, Any] = {}
+        if hasattr(method, "TABLEAU"):  # an EIP method; the problem knows no solver
+            names = ("invariants", "metric", "blocks", "frame")
+            brought = {name: value for name in names if (value := getattr(self, name)) is not None}
+            if self.h is not None and not {"rtol", "atol", "first_step", "max_step"} & options.keys():
+                brought["h"] = self.h
+        sol = solve_ivp(self.fun, t_span, y0, method=method, **brought | options)
+        if self.component_names is not None and len(self.component_names) == len(sol.y):
+            sol.component_names = self.component_names
+        return sol
+
+    def __repr__(self) -> str:
+        def having(names: Iterable[str]) -> list[str]:
+            return [name for name in names if getattr(self, name) is not None]
+
+        n = MOST if self.y0 is None else np.size(self.y0)
+        names = self.component_names or tuple(f"y{k}" for k in range(min(n, MOST + 1)))
+        state = ", ".join(names[:MOST]) + (", ..." if len(names) > MOST else "")
+        start = "without a start" if self.y0 is None else f"{n} components, {np.asarray(self.y0).dtype}"
+        interval = [] if self.t_span is None else ["t from {:g} to {:g}".format(*self.t_span)]
+        interval += [] if self.h is None else [f"h = {self.h:g}"]
+        kept = ", ".join(item.name or "one without a name" for item in self.invariants)
+        functions = ", ".join(["fun", *having(("rhs", "acc", "jacobian", "reference"))])
+        lines = [
+            f"{self.name}: y = ({state}), {start}",
+            f"  interval    {', '.join(interval) or 'none'}" + (f"; {self.units}" if self.units else ""),
+            f"  invariants  {kept or 'none'}",
+            f"  functions   {functions}; options {', '.join(having(('metric', 'blocks', 'frame'))) or 'none'}",
+            f"  source      {self.source or 'not given'}",
+        ]
+        return "\n".join(lines)
+
+
+def component_names(names: Any, n: int | None) -> tuple[str, ...]:
+    """Names of n components, of as many as there are for None, from a sequence or from text such as "x y".
+
+    Raises
+    ------
+    TypeError, ValueError
+        For what are no strings, another number of them, or two that are the same.
+    """
+    if isinstance(names, str):
+        names = names.replace(",", " ").split()
+    if not isinstance(names, Iterable):
+        raise TypeError(f"names of components must be a sequence of strings, got {shown(names)}.")
+    found = tuple(names)
+    wrong = [name for name in found if not isinstance(name, str)]
+    if wrong:
+        raise TypeError(f"names of components must be strings, got {shown(wrong[0])}.")
+    if n is not None and len(found) != n:
+        raise ValueError(f"there are {len(found)} names for {n} components: {shown(found)}.")
+    if len(set(found)) < len(found):
+        twice = next(name for k, name in enumerate(found) if name in found[:k])
+        raise ValueError(f"{twice!r} names two components; each needs a name of its own.")
+    return found
 
 
 def bind(rhs: Callable[..., None], params: np.ndarray | None) -> Callable[[float, np.ndarray], np.ndarray]:

@@ -1,16 +1,15 @@
-"""Records that a run fills: diagnostics, the result of `integrate`, the result of `project`."""
+"""Records that a run fills: diagnostics, and the result of `project`."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import OptimizeResult
 
 from ..engine.counters import N_COUNTERS, PROJECTIONS, RANK_REDUCED, REJECTED, SKIPPED, SOFTENED
 from ..engine.trust import N_FIGURES, ProjectionWarning, Trust
 
-__all__ = ["Diagnostics", "IntegrationResult", "ProjectionResult", "ProjectionWarning"]
+__all__ = ["Diagnostics", "ProjectionResult", "ProjectionWarning"]
 
 
 class Diagnostics:
@@ -43,6 +42,8 @@ class Diagnostics:
     worst : (str, float, float) or None
         Invariant, time and size of the largest correction, in local errors (rounding counts as one): below 5 in most
         healthy runs. None where none was measured.
+    corrections : ndarray, shape (l,)
+        The largest correction of each invariant, in the same unit; nan where none was measured.
     """
 
     def __init__(self) -> None:
@@ -118,6 +119,11 @@ class Diagnostics:
         """Invariant, time and size in local errors of the largest correction."""
         return self._trust.worst
 
+    @property
+    def corrections(self) -> np.ndarray:
+        """Largest correction of each invariant in local errors, (l,)."""
+        return self._trust.corrections
+
     def __repr__(self) -> str:
         if not self.names:
             return "Diagnostics: no invariants"
@@ -133,46 +139,6 @@ class Diagnostics:
         if self.message:
             lines.append(f"  {self.message}")
         return "\n".join(lines)
-
-
-class IntegrationResult(OptimizeResult):
-    """Result of `integrate`; fields by name or by key, as in SciPy's own results.
-
-    Attributes
-    ----------
-    t : ndarray, shape (m,)
-        Saved times.
-    y : ndarray, shape (n, m)
-        Saved states.
-    invariants : ndarray, shape (l, m)
-        Values of the invariants there.
-    max_defect : ndarray, shape (l,)
-        Largest ``|I - target|`` after a projection or at a saved step.
-    diagnostics : Diagnostics
-    t_events, y_events : list of ndarray or None
-        As in `scipy.integrate.solve_ivp`.
-    sol : OdeSolution or None
-        Likewise: the run as a function of time, with ``dense_output=True``.
-    nfev, njev, nlu : int
-        Evaluations of the right-hand side and of the invariants' gradients, and factorisations.
-    status : int
-        0: the end was reached; 1: a callback or an event stopped the run; -1: a step failed.
-    message : str
-    success : bool
-        ``status >= 0``.
-    trusted : bool
-        Whether, besides, nothing speaks against the run; if not, `message` says what. See `Diagnostics`.
-    wall_time : float
-        Seconds in the integration, compilation left out.
-    compiled : bool
-        Whether all functions were called natively; if not, `message` says which were not, and why.
-    calls : dict of str
-        How each was called: "python", "jitted" (a Numba function, as a C pointer) or "pointer" (a C function). The keys
-        are "fun", the name of each invariant ("invariant 0" for the first one, if it has none), "gradient of " and that
-        name, "event 0", "event 1" and so on.
-    method : str
-    h : float or None
-    """
 
 
 class ProjectionResult(NamedTuple):

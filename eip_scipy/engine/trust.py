@@ -86,6 +86,27 @@ class Trust:
         return self.names[k], float(self.figures[k, AT]), float(self.figures[k, NU])
 
     @property
+    def corrections(self) -> np.ndarray:
+        """Size in local errors of each invariant's largest correction, (l,); nan where none was measured."""
+        return np.where(self.figures[:, JUDGED] > 0, self.figures[:, NU], np.nan)
+
+    def followed_by(self, other: Trust) -> Trust:
+        """That of a run and of the one that went on from its end, together."""
+        one, two = self.figures, other.figures
+        both = two.copy()  # START, TERMS, LEFT: of the last
+        both[:, TERMS] = np.maximum(one[:, TERMS], two[:, TERMS])
+        counts = [NOTED, RAW_MANY, MANY, SUM, EXPECTED, JUDGED]
+        both[:, counts] = one[:, counts] + two[:, counts]
+        for size, at in ((SHARE, SHARE_AT), (RAW, RAW_AT), (NU, AT)):
+            larger = one[:, size] > two[:, size]
+            both[larger, size], both[larger, at] = one[larger, size], one[larger, at]
+        both[:, FIRST] = np.where(one[:, MANY] > 0, one[:, FIRST], two[:, FIRST])
+        trust = Trust(self.names, both)
+        trust.doubts = list(dict.fromkeys(self.doubts + other.doubts))
+        trust.failed = self.failed or other.failed
+        return trust
+
+    @property
     def message(self) -> str:
         """Why the run is not to be trusted; "" where nothing speaks against it."""
         reasons = [_reason(self.names[k], self.figures[k]) for k in np.flatnonzero(self.sick)] + self.doubts

@@ -26,7 +26,7 @@ from ..core.jitted import is_compiled
 from ..core.names import nearest
 from ..core.options import ProjectionOptions
 from ..core.pointers import PointerFunction
-from ..core.problem import Problem
+from ..core.problem import Problem, component_names
 from ..core.solvers import EIPRK4, EIPSolver
 from ..engine.counters import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
@@ -34,6 +34,7 @@ from ..run.events import Events
 from ..run.interrupts import ended_by_sigterm, kept_ctrl_c
 from ..run.memory import check_bytes, free_memory
 from ..run.prepare import DEFAULT, Request
+from ..run.tables import dataset, default_names
 from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
 from .side_by_side import LANES
 from .statistics import Statistics, merge
@@ -103,7 +104,56 @@ class EnsembleResult(OptimizeResult):
     h : float or None
     chunk : int
         Members in a chunk.
+    component_names : tuple of str
+        Those of the `Problem`, or "y0", "y1" and so on.
     """
+
+    @property
+    def component_names(self) -> tuple[str, ...]:
+        """Names of the components of the state, (n,)."""
+        given = self.get("component_names")
+        return default_names(self.y.shape[1]) if given is None else tuple(given)
+
+    def to_xarray(self, names: Any = None) -> Any:
+        """The members as an `xarray.Dataset`.
+
+        Parameters
+        ----------
+        names : sequence of str or str, optional
+            As for `eip_scipy.to_xarray`.
+
+        Returns
+        -------
+        xarray.Dataset
+            The names of a Zarr group that `out` asks for, and more: ``y`` (member, component), ``t_end``, ``status``,
+            ``message``, ``trusted``, ``max_correction`` (member), ``max_defect`` (member, invariant), the counts; and
+            ``states`` (member, component, time) where trajectories are in memory. What `out` holds is opened by
+            ``xarray.open_zarr(out, consolidated=False)``.
+
+        Raises
+        ------
+        ImportError
+            Without xarray: ``pip install "eip_scipy[xarray]"``.
+        """
+        by_member = ("status", "trusted", "max_correction", "nfev", "njev", "nlu", "n_rejected_projections")
+        variables: dict[str, Any] = {name: (("member",), self[name]) for name in by_member}
+        variables["y"] = ("member", "component"), self.y
+        variables["t_end"] = ("member",), self.t
+        variables["message"] = ("member",), self.message.astype(str)
+        variables["max_defect"] = ("member", "invariant"), self.max_defect
+        coordinates: dict[str, Any] = {
+            "member": self.first + np.arange(self.t.size),
+            "component": list(component_names(self.component_names if names is None else names, self.y.shape[1])),
+            "invariant": list(self.names),
+        }
+        if isinstance(self.trajectories, np.ndarray):
+            variables["states"] = ("member", "component", "time"), self.trajectories
+            coordinates["time"] = self.times
+        attributes = {name: self[name] for name in ("method", "h", "success", "stopped", "wall_time")}
+        return dataset(variables, coordinates, attributes)
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), "to_xarray"]
 
     def __repr__(self) -> str:
         ran = int(np.count_nonzero(self.status != NOT_RUN))
@@ -424,6 +474,7 @@ class _Gathered:
             method=self.method,
             h=plan.h,
             chunk=self.chunk,
+            component_names=plan.component_names,
         )
 
 

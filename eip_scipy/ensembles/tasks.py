@@ -137,6 +137,8 @@ class Plan:
         Why the members run one after the other; "" where they run side by side. Known when the plan is compiled.
     names : tuple of str
         Of the l invariants.
+    component_names : tuple of str or None
+        Of the state, where a problem names them.
     times : ndarray, shape (rows,)
         Times at which states are saved; none where only the last state is wanted.
     n_steps : int or None
@@ -152,7 +154,7 @@ class Plan:
         schedule, run = self._ready.schedule, self._ready.run
         self.why_not: str | None = None
         self.one_by_one = ""
-        self.names = tuple(run.invariants.names)
+        self.names, self.component_names = tuple(run.invariants.names), self._ready.component_names
         self.pointers = self._ready.pointers
         self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, schedule.span.t0
         self.t_bound, self.h = schedule.span.t_bound, self._ready.stepping.h

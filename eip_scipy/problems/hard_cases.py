@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from typing import Any, NamedTuple
 
@@ -74,6 +75,20 @@ class CaseEquations(NamedTuple):
     gradients: Callable[..., np.ndarray]
 
 
+class _Function:
+    """One of a case's functions, which pickles by what it is made from."""
+
+    def __init__(self, equations: str, params: dict[str, Any], which: str) -> None:
+        self._made = equations, params, which
+        self._function = getattr(EQUATIONS[equations](**params), which)
+
+    def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
+        return self._function(t, y)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Function, self._made
+
+
 def hard_cases(names: Sequence[str] | None = None) -> tuple[HardCase, ...]:
     """Hard cases for integrators that project.
 
@@ -106,16 +121,17 @@ def hard_cases(names: Sequence[str] | None = None) -> tuple[HardCase, ...]:
 
 
 def _case(record: dict[str, Any]) -> HardCase:
-    equations = EQUATIONS[record["equations"]](**record["params"])
+    made = record["equations"], record["params"]
+    fun, values, gradients = (_Function(*made, which) for which in CaseEquations._fields)
     y0, end = (_state(record, key) for key in ("y0", "reference"))
     t_end = record["t_span"][1]
     problem = Problem(
         name=record["name"],
-        fun=equations.fun,
+        fun=fun,
         y0=y0,
         t_span=(record["t_span"][0], t_end),
-        invariants=(Invariant(equations.values, equations.gradients, name=", ".join(record["invariants"])),),
-        reference=lambda t: end.copy() if t == t_end else None,
+        invariants=(Invariant(values, gradients, name=", ".join(record["invariants"])),),
+        reference=partial(_at_end, t_end, end),
         source=record["source"],
     )
     return HardCase(
@@ -128,6 +144,10 @@ def _case(record: dict[str, Any]) -> HardCase:
         growth=record["growth"],
         note=record["note"],
     )
+
+
+def _at_end(t_end: float, end: np.ndarray, t: float) -> np.ndarray | None:
+    return end.copy() if t == t_end else None
 
 
 def _state(record: dict[str, Any], key: str) -> np.ndarray:

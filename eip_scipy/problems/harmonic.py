@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,10 +34,6 @@ def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: f
     start = np.array(y0, dtype=float)
     params = np.array([omega], dtype=float)
 
-    def reference(t: float) -> np.ndarray:
-        c, s = np.cos(omega * t), np.sin(omega * t)
-        return np.array([c * start[0] + s * start[1], c * start[1] - s * start[0]])
-
     return Problem(
         name="harmonic",
         fun=bind(library["harmonic.rhs"], params),
@@ -46,7 +43,13 @@ def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: f
         h=h,
         params=params,
         invariants=(native_invariant("harmonic.energy", "H", params),),
-        reference=reference,
+        reference=partial(_rotated, omega, start),
+        component_names=("q", "p"),
         units="dimensionless",
         source="Cai, Gong & Wang, section 2.1",
     )
+
+
+def _rotated(omega: float, start: np.ndarray, t: float) -> np.ndarray:
+    c, s = np.cos(omega * t), np.sin(omega * t)
+    return np.array([c * start[0] + s * start[1], c * start[1] - s * start[0]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from math import sqrt
 
 import numpy as np
@@ -52,8 +53,9 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
         h=h,
         params=params,
         invariants=(native_invariant("kepler.energy", "H", params), native_invariant("kepler.momentum", "L", params)),
-        reference=(lambda t: _orbit(e, t)) if relativistic == 0 else None,
+        reference=partial(_orbit, e) if relativistic == 0 else None,
         blocks=2,
+        component_names=("x", "y", "vx", "vy"),
         units="G M = 1, semi-major axis 1: period 2 pi",
         source="Cai, Gong & Wang, section 3.1 (eq. 3.2, with L = q1 p2 - q2 p1)",
     )

@@ -96,6 +96,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
         t_span=(0.0, float(s_end)),
         params=params,
         invariants=tuple(_transformed_invariant(item) for item in problem.invariants),
+        component_names=None if problem.component_names is None else (*problem.component_names, "t"),
         blocks=_blocks(problem.blocks, n),
         frame=_frame(problem.frame),
         units=problem.units,

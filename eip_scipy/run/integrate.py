@@ -18,7 +18,7 @@ from ..core.jitted import is_jitted
 from ..core.names import nearest
 from ..core.options import ProjectionOptions, takes_projection_options
 from ..core.problem import Problem
-from ..core.results import Diagnostics, IntegrationResult
+from ..core.results import Diagnostics
 from ..core.solvers import EIPSolver
 from ..core.stepping import UNBOUNDED
 from ..engine.counters import NFEV, NJEV, NLU
@@ -28,6 +28,7 @@ from . import resume as _resume
 from .driver import Driver
 from .interrupts import ended_by_sigterm, kept_ctrl_c, look_for_signals
 from .prepare import DEFAULT, Prepared, Request, prepared, started_at
+from .results import IntegrationResult, Origin
 
 __all__ = ["integrate"]
 
@@ -397,10 +398,11 @@ class Loop:
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
         driver = self.driver
         rows, counters, events = driver.rows, driver.run.work.counters, self.events
-        return IntegrationResult(
+        result = IntegrationResult(
             t=driver.t[:rows],
             y=driver.y[:rows].T,
             invariants=self._values(broken),
+            target=driver.run.invariants.target,
             max_defect=driver.run.work.max_defect,
             diagnostics=self.diagnostics,
             t_events=[np.asarray(t) for t in events.t] if events.functions else None,
@@ -418,7 +420,13 @@ class Loop:
             calls=self.prepared.system.calls(driver.run, driver.functions),
             method=self.method,
             h=abs(driver.schedule.span.h) or None,
+            component_names=self.prepared.component_names,
         )
+        t, y = events.last if self._event_ended else driver.now
+        kept = driver.run.invariants.with_targets()
+        origin = Origin(self.prepared.asked, t, y.copy(), driver.schedule.span.sign, kept)
+        object.__setattr__(result, "_origin", origin)  # beside the fields, which are items
+        return result
 
     def explained(self, message: str) -> str:
         """With what speaks against the run, and what is to be said about checkpoints and not being compiled."""
@@ -486,6 +494,7 @@ def _start_kept(request: Request) -> Iterator[None]:
                     t=np.array([t0]),
                     y=start[:, None],
                     invariants=np.zeros((0, 1)),
+                    target=np.zeros(0),
                     max_defect=np.zeros(0),
                     diagnostics=Diagnostics(),
                     t_events=None,
@@ -497,10 +506,12 @@ def _start_kept(request: Request) -> Iterator[None]:
                     status=-1,
                     message=f"interrupted by {type(error).__name__} at the start",
                     success=False,
+                    trusted=False,
                     wall_time=time.perf_counter() - begin,
                     compiled=False,
                     calls={},
                     method=getattr(request.method, "__name__", str(request.method)),
                     h=None,
+                    component_names=None,
                 )
         raise

@@ -219,8 +219,12 @@ class System:
 
 @dataclass
 class Prepared:
-    """A run that is ready but for its functions, which are compiled last; `max_bytes` bounds what it saves."""
+    """A run that is ready but for its functions, which are compiled last; `max_bytes` bounds what it saves.
 
+    `asked` is the request as it came, `request` with what a problem brings.
+    """
+
+    asked: Request
     request: Request
     method: AnyMethod
     system: System
@@ -235,6 +239,12 @@ class Prepared:
     def label(self) -> str:
         """The name of the method's class."""
         return str(self.request.method.__name__)
+
+    @property
+    def component_names(self) -> tuple[str, ...] | None:
+        """Those of the problem, where it has the run's components."""
+        names = self.asked.fun.component_names if isinstance(self.asked.fun, Problem) else None
+        return names if names is not None and len(names) == self.run.y0.size else None
 
     @property
     def pointers(self) -> list[PointerFunction]:
@@ -255,7 +265,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     method = _method(request.method)
     in_place = flag("in_place", request.in_place)
     _check_choices(request)
-    request = request.with_pointers()
+    asked, request = request, request.with_pointers()
     in_place = in_place or isinstance(request.fun, PointerFunction)
     frequencies = request.fun.frequencies if isinstance(request.fun, Problem) else None
     request, form = _with_problem(request, FORMS[isinstance(method, (NystromTableau, GaussJackson)), in_place])
@@ -287,7 +297,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     system.events.fill(t0, run.y0, schedule.g)
     run.work.K[0] = f0 if run.y0 is y0 else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
-    return Prepared(request, method, system, stepping, start, schedule, run, record, bound)
+    return Prepared(asked, request, method, system, stepping, start, schedule, run, record, bound)
 
 
 def started_at(request: Request) -> tuple[float, np.ndarray]:

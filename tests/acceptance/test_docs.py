@@ -26,7 +26,8 @@ def assert_output(found, printed):
 
 
 PAGES = (
-    "quickstart", "adaptive", "own-methods", "multistep", "checkpoints", "ensembles", "written", "finding-invariants",
+    "quickstart", "results", "adaptive", "own-methods", "multistep", "checkpoints", "ensembles", "written",
+    "finding-invariants",
 )  # fmt: skip
 NIGHTLY = ("hard-scenes", "charged-particles", "gross-pitaevskii")
 

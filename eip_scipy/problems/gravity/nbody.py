@@ -127,6 +127,7 @@ def nbody(
         params=params,
         invariants=_forces.invariants(chosen, params, y0) if chosen else _newtonian(params),
         blocks=3,
+        component_names=_component_names(masses.size),
         frame=recoil(masses),
         units=units,
         source=source,
@@ -134,6 +135,11 @@ def nbody(
         jacobian=library["gravity.central"],
         frequencies=partial(orbital_frequencies, masses),
     )
+
+
+def _component_names(n: int) -> tuple[str, ...]:
+    """x_0, y_0, z_0, x_1, ... and then vx_0, vy_0, vz_0, vx_1, ..."""
+    return tuple(f"{axis}_{k}" for axes in (("x", "y", "z"), ("vx", "vy", "vz")) for k in range(n) for axis in axes)
 
 
 def _newtonian(params: np.ndarray) -> tuple[Invariant, Invariant]:

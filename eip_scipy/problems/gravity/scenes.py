@@ -7,7 +7,7 @@ The starts are here; the reference states are data (``data/scene_references.json
 from __future__ import annotations
 
 import json
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 
 import numpy as np
@@ -52,7 +52,7 @@ def pythagorean() -> Problem:
         name="pythagorean",
         units="G = 1",
         source="Burrau (1913); Szebehely & Peters, AJ 72 (1967) 876",
-        reference=lambda t: _reference("pythagorean", t),
+        reference=partial(_reference, "pythagorean"),
     )
 
 
@@ -94,7 +94,7 @@ def figure_eight(periods: float = 100.0) -> Problem:
         name="figure-eight",
         units="G = 1",
         source="Chenciner & Montgomery, Ann. Math. 152 (2000) 881 (data by Simó)",
-        reference=lambda t: _reference("figure-eight", t),
+        reference=partial(_reference, "figure-eight"),
     )
 
 
@@ -127,7 +127,7 @@ def comet() -> Problem:
         name="comet",
         units="AU, Julian year",
         source="DE440; the comet is synthetic",
-        reference=lambda t: _reference("comet", t),
+        reference=partial(_reference, "comet"),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ INVARIANTS = ("mass", "energy", "angular_momentum")
 SOURCE = "Cai, Gong & Wang, section 3.4 (eq. 3.9, 3.10), the quartic term as the sum of |psi|^4"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FieldProblem(Problem):
     """A `Problem` whose state is a field on a grid.
 
@@ -308,7 +308,7 @@ class GrossPitaevskii:
         if name not in made:
             raise ValueError(f"unknown invariant {name!r}, expected {', '.join(INVARIANTS)}{nearest(name, INVARIANTS)}")
         value, gradient = made[name]
-        return Invariant(lambda t, y: value(y), gradient, name=name, in_place=True, uses_f=name == "energy")
+        return Invariant(partial(_at, value), gradient, name=name, in_place=True, uses_f=name == "energy")
 
     def problem(
         self,
@@ -382,6 +382,10 @@ class GrossPitaevskii:
         # Twice the interaction: the linearised term is 2 beta |psi|^2 u + beta psi^2 conj(u).
         local = 2 * abs(self.beta) * self._largest(self.as_field(psi)) ** 2
         return float(limit / (self.largest_frequency() + local))
+
+
+def _at(value: Callable[[np.ndarray], float], t: float, y: np.ndarray) -> float:
+    return value(y)
 
 
 def _on_grid(potential: Any, grid: Grid) -> np.ndarray:

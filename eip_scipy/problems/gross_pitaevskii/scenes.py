@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from math import pi, sqrt
 from typing import Any
 
@@ -59,13 +60,7 @@ def soliton(
         raise ValueError(f"a bright soliton needs beta < 0 and amplitude > 0, got {beta!r} and {amplitude!r}.")
     gpe = GrossPitaevskii(Grid(points, -length / 2, length / 2), beta=beta, **options)
     x = gpe.grid.points(0)
-
-    def exact(t: float) -> np.ndarray:
-        # The distance from the centre, the short way round; the phase follows it, so that nothing jumps where it turns.
-        s = np.remainder(x - velocity * t + length / 2, length) - length / 2
-        phase = velocity * (s + velocity * t) + 0.5 * (amplitude**2 - velocity**2) * t
-        return amplitude / sqrt(-beta) / np.cosh(amplitude * s) * np.exp(1j * phase)
-
+    exact = partial(_soliton, x, length, amplitude, velocity, beta)
     start = exact(0.0)
     step = 0.5 * gpe.largest_step(start) if h is None else h
     return gpe.problem(start, t_end, step, name="soliton", reference=exact, source="Zakharov & Shabat 1972, eq. 2")
@@ -114,10 +109,7 @@ def plane_wave(
         raise ValueError(f"modes must be whole numbers, one for each axis of {gpe.grid!r}; got {modes!r}.")
     phase = sum(n * x for n, x in zip(k, gpe.grid.mesh(), strict=True))
     omega = 0.5 * float(k @ k) + beta * amplitude**2
-
-    def exact(t: float) -> np.ndarray:
-        return (amplitude * np.exp(1j * (phase - omega * t))).ravel()
-
+    exact = partial(_plane_wave, amplitude, phase, omega)
     start = exact(0.0)
     step = 0.5 * gpe.largest_step(start) if h is None else h
     return gpe.problem(start, t_end, step, name="plane-wave", reference=exact)
@@ -192,3 +184,14 @@ def line_condensate(Omega: float = 0.7, points: int = 64, **options: Any) -> Gro
     """
     grid = Grid((points, points, points), (-10.0, -10.0, -15.0), (10.0, 10.0, 15.0))
     return GrossPitaevskii(grid, harmonic_trap(1.0, 1.0, 0.5), Omega=Omega, beta=400.0, **options)
+
+
+def _soliton(x: np.ndarray, length: float, amplitude: float, velocity: float, beta: float, t: float) -> np.ndarray:
+    # The distance from the centre, the short way round; the phase follows it, so that nothing jumps where it turns.
+    s = np.remainder(x - velocity * t + length / 2, length) - length / 2
+    phase = velocity * (s + velocity * t) + 0.5 * (amplitude**2 - velocity**2) * t
+    return amplitude / sqrt(-beta) / np.cosh(amplitude * s) * np.exp(1j * phase)
+
+
+def _plane_wave(amplitude: float, phase: np.ndarray, omega: float, t: float) -> np.ndarray:
+    return (amplitude * np.exp(1j * (phase - omega * t))).ravel()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from importlib.resources import files
 from math import inf, pi
 from typing import Any
@@ -28,7 +28,7 @@ ORBITS = {"banana": 1.0, "transit": 2.0}
 """The tokamak's orbits, with the factor of the initial v_y."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ParticleProblem(Problem):
     """A `Problem` of one charged particle, with its field.
 
@@ -165,6 +165,7 @@ def charged_particle(
         params=params,
         invariants=_invariants(equations, field, form, params),
         blocks=3,
+        component_names=("x", "y", "z", *(("vx", "vy", "vz") if form == "velocity" else ("px", "py", "pz"))),
         units=units,
         source=source,
         reference=reference,
@@ -275,7 +276,7 @@ def _paper(
         name=name,
         units="system size 1, charge and mass 1, B_0 = 1: gyro-period 2 pi / B",
         source="Cai, Gong & Wang, section 3.3",
-        reference=lambda t: _reference(name, form, t),
+        reference=partial(_reference, name, form),
     )
 
 

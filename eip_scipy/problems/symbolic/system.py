@@ -84,11 +84,6 @@ class SymbolicProblem(Problem):
     pairs: tuple[tuple[str, str], ...] = ()
 
     @property
-    def component_names(self) -> tuple[str, ...]:
-        """Names of the components of the state."""
-        return self.system.components
-
-    @property
     def parameters(self) -> dict[str, float]:
         """Values of the parameters by name."""
         values = [] if self.params is None else self.params.tolist()
@@ -107,7 +102,7 @@ class SymbolicProblem(Problem):
         ValueError
             Where q' is no constant matrix W times p, or p' depends on p.
         """
-        names, rates = self.component_names, self.system.rates
+        names, rates = self.system.components, self.system.rates
         half = len(self.pairs)
         q, p = names[:half], [symbol(item) for item in names[half:]]
         canonical = half > 0 and len(names) == 2 * half
@@ -135,9 +130,9 @@ class SymbolicProblem(Problem):
     def __repr__(self) -> str:
         pairs = ", ".join(f"{q} with {p}" for q, p in self.pairs)
         kept = [f"{name} = {_cut(expression)} ({self.checks[name]})" for name, expression in self.system.invariants]
-        rates = [f"{k}' = {_cut(f)}" for k, f in zip(self.component_names, self.system.rates, strict=True)]
+        rates = [f"{k}' = {_cut(f)}" for k, f in zip(self.system.components, self.system.rates, strict=True)]
         lines = [
-            f"{self.name}: y = ({', '.join(self.component_names)})" + (f", pairs {pairs}" if pairs else ""),
+            f"{self.name}: y = ({', '.join(self.system.components)})" + (f", pairs {pairs}" if pairs else ""),
             f"  equations   {_cut('; '.join(rates), 400)}",
             f"  invariants  {'; '.join(kept) or 'none'}",
             f"  parameters  {', '.join(f'{k} = {v:g}' for k, v in self.parameters.items()) or 'none'}",
@@ -275,6 +270,7 @@ def _problem(*, system: System, params: np.ndarray | None, **others: Any) -> Sym
     functions = _functions(system)
     rhs = functions.rhs
     unset: dict[str, Any] = {"y0": None, "t_span": None}  # a run is given them
+    unset["component_names"] = system.components
     return SymbolicProblem(
         **(unset | others),
         system=system,

@@ -1,0 +1,92 @@
+"""A run that goes on from its end, and two runs as one."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from scipy.integrate import OdeSolution
+
+from ..core.inputs import is_number, shown
+from ..core.results import Diagnostics
+from .integrate import integrate
+from .prepare import Request
+from .results import IntegrationResult, Origin
+
+__all__ = ["continued"]
+
+# What comes from the run's end, or holds for the first run only.
+OWN = {"t_span", "y0", "t_eval", "diagnostics", "projection"}
+FIXED = ("fun", "t_span", "y0", "invariants")
+
+
+def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> IntegrationResult:
+    """See `IntegrationResult.continue_to`."""
+    origin: Origin | None = vars(result).get("_origin")
+    if origin is None:
+        raise ValueError(
+            "continue_to: this result does not know its functions, for it was loaded, unpickled or copied. Go on from "
+            "its last state: integrate(fun, (result.t[-1], t), result.y[:, -1], ...)."
+        )
+    for name in FIXED:
+        if name in options:
+            raise TypeError(f"continue_to: {name} is that of the run; start a new one with integrate.")
+    if not is_number(t) or not origin.sign * (t - origin.t) > 0:
+        raise ValueError(f"continue_to: t must lie beyond the end of the run, {origin.t:.10g}, got {shown(t)}.")
+    request = origin.request
+    asked = {item.name: getattr(request, item.name) for item in fields(Request) if item.name not in OWN}
+    asked |= {**request.projection, "invariants": origin.invariants}
+    if options.get("t_eval") is not None:
+        asked["save_every"] = None
+    try:
+        more = integrate(**(asked | {"t_span": (origin.t, t), "y0": origin.y} | options))
+    except BaseException as error:
+        partial = getattr(error, "partial", None)
+        if isinstance(partial, IntegrationResult):
+            started = len(partial.invariants) == len(result.invariants)
+            error.partial = _joined(result, partial) if started else result  # type: ignore[attr-defined]
+        raise
+    return _joined(result, more)
+
+
+def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult:
+    """Both runs as one."""
+    new = slice(1 if one.t.size and two.t.size and two.t[0] == one.t[-1] else 0, None)
+    both = IntegrationResult(two)
+    for name in ("t", "y", "invariants"):
+        both[name] = np.concatenate([one[name], two[name][..., new]], axis=-1)
+    for name in ("nfev", "njev", "nlu", "wall_time"):
+        both[name] = one[name] + two[name]
+    for name in ("t_events", "y_events"):
+        if one[name] is not None and two[name] is not None and len(one[name]) == len(two[name]):
+            both[name] = [
+                np.concatenate([a, b]) if a.size and b.size else b if b.size else a
+                for a, b in zip(one[name], two[name], strict=True)
+            ]
+    both["diagnostics"] = _diagnostics(one.diagnostics, two.diagnostics)
+    both["max_defect"] = both.diagnostics.max_defect
+    both["trusted"] = both.diagnostics.trusted
+    both["sol"] = _solution(one.sol, two.sol)
+    if "_origin" in vars(two):
+        object.__setattr__(both, "_origin", vars(two)["_origin"])
+    return both
+
+
+def _diagnostics(one: Diagnostics, two: Diagnostics) -> Diagnostics:
+    both = Diagnostics()
+    both._attach(
+        np.maximum(one.max_defect, two.max_defect),
+        two._defect.copy(),
+        np.maximum(one._max_correction, two._max_correction),
+        one._counters + two._counters,
+        one._trust.followed_by(two._trust),
+        estimated=one._estimated and two._estimated,
+    )
+    return both
+
+
+def _solution(one: OdeSolution | None, two: OdeSolution | None) -> OdeSolution | None:
+    if one is None or two is None:
+        return None
+    return OdeSolution(np.append(one.ts, two.ts[1:]), [*one.interpolants, *two.interpolants])

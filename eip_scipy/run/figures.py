@@ -1,0 +1,84 @@
+"""The figure of a run, of `integrate` or of `solve_ivp`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .tables import component_names, invariant_rows
+
+__all__ = ["plot"]
+
+
+def plot(result: Any, names: Any = None, *, orbit: bool | None = None) -> Any:
+    """Draw a run: the components or the orbit, the invariants' errors, and the largest corrections.
+
+    A flat line of errors says that the projection works, and nothing about the orbit: that is what the panel of
+    corrections is for.
+
+    Parameters
+    ----------
+    result : IntegrationResult or OdeResult
+        From `integrate` or from `scipy.integrate.solve_ivp`. What was saved is drawn: give `save_every` or `t_eval`.
+    names : sequence of str or str, optional
+        As for `to_xarray`.
+    orbit : bool, optional
+        Whether to draw paths in the plane in place of components in time. Default: where components are named x and y,
+        or x_0 and y_0, x_1 and y_1 and so on.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        ``figure.savefig("run.png")``; a notebook shows it.
+
+    Raises
+    ------
+    ImportError
+        Without matplotlib: ``pip install "eip_scipy[plot]"``.
+    ValueError
+        When an orbit is asked for and no components are named so.
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPRK4, integrate
+    >>> from eip_scipy.problems import kepler
+    >>> run = integrate(kepler(), (0, 20), method=EIPRK4, save_every=2)
+    >>> run.plot().savefig("kepler.png")  # doctest: +SKIP
+    """
+    from ..plotting.runs import run_figure
+
+    labels = component_names(result, names)
+    pairs = _planes(labels)
+    if orbit and not pairs:
+        raise ValueError("plot: an orbit needs components named x and y, or x_0 and y_0 and so on; give names=...")
+    y, diagnostics = np.asarray(result.y), result.get("diagnostics")
+    paths = {name: (y[i], y[j]) for name, (i, j) in pairs.items()} if orbit is not False else {}
+    invariants = invariant_rows(result)
+    corrections = {} if diagnostics is None else dict(zip(invariants, diagnostics.corrections, strict=True))
+    return run_figure(
+        result.t,
+        dict(zip(labels, y, strict=True)),
+        paths=paths,
+        errors={name: errors for name, (_, errors) in invariants.items()},
+        corrections={name: size for name, size in corrections.items() if np.isfinite(size)},
+        title=_title(result),
+    )
+
+
+def _planes(names: tuple[str, ...]) -> dict[str, tuple[int, int]]:
+    """Of each body the places of x and y."""
+    place = {name: k for k, name in enumerate(names)}
+    bodies = [name[1:] for name in names if name[:1] == "x" and name[1:2] in ("", "_")]
+    return {
+        body.removeprefix("_") or "orbit": (place[f"x{body}"], place[f"y{body}"])
+        for body in bodies
+        if f"y{body}" in place
+    }
+
+
+def _title(result: Any) -> str:
+    if "method" not in result:
+        return ""
+    step = "adaptive steps" if result.h is None else f"h = {result.h:g}"
+    return f"{result.method}, {step}" + ("" if result.trusted else ": not to be trusted")

@@ -1,0 +1,164 @@
+"""The result of `integrate`, and what can be done with it: tables, files, figures, a run that goes on."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import OptimizeResult
+
+from .tables import default_names, to_dataframe, to_xarray
+
+__all__ = ["IntegrationResult", "Origin"]
+
+
+class Origin(NamedTuple):
+    """Where a result comes from, so that its run can go on.
+
+    Attributes
+    ----------
+    request : Request
+        What `integrate` was asked for.
+    t : float
+    y : ndarray, shape (n,)
+        The last state of the run, saved or not.
+    sign : float
+        The direction of time, 1 or -1.
+    invariants : tuple of Invariant
+        Those of the run, with the values that it keeps as their targets.
+    """
+
+    request: Any
+    t: float
+    y: np.ndarray
+    sign: float
+    invariants: Any
+
+
+class IntegrationResult(OptimizeResult):
+    """Result of `integrate`; fields by name or by key, as in SciPy's own results.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+        Saved times.
+    y : ndarray, shape (n, m)
+        Saved states.
+    invariants : ndarray, shape (l, m)
+        Values of the invariants there.
+    target : ndarray, shape (l,)
+        The values that were kept.
+    max_defect : ndarray, shape (l,)
+        Largest ``|I - target|`` after a projection or at a saved step.
+    diagnostics : Diagnostics
+    t_events, y_events : list of ndarray or None
+        As in `scipy.integrate.solve_ivp`.
+    sol : OdeSolution or None
+        Likewise: the run as a function of time, with ``dense_output=True``.
+    nfev, njev, nlu : int
+        Evaluations of the right-hand side and of the invariants' gradients, and factorisations.
+    status : int
+        0: the end was reached; 1: a callback or an event stopped the run; -1: a step failed.
+    message : str
+    success : bool
+        ``status >= 0``.
+    trusted : bool
+        Whether, besides, nothing speaks against the run; if not, `message` says what. See `Diagnostics`.
+    wall_time : float
+        Seconds in the integration, compilation left out.
+    compiled : bool
+        Whether all functions were called natively; if not, `message` says which were not, and why.
+    calls : dict of str
+        How each was called: "python", "jitted" (a Numba function, as a C pointer) or "pointer" (a C function). The keys
+        are "fun", the name of each invariant ("invariant 0" for the first one, if it has none), "gradient of " and that
+        name, "event 0", "event 1" and so on.
+    method : str
+    h : float or None
+    component_names : tuple of str
+        Those of the `Problem`, or "y0", "y1" and so on; assign others as you like.
+
+    Notes
+    -----
+    The result pickles, but for ``sol``. What was pickled or loaded knows the functions of its run no more, and cannot
+    `continue_to`.
+    """
+
+    @property
+    def component_names(self) -> tuple[str, ...]:
+        """Names of the components of the state, (n,)."""
+        given = self.get("component_names")
+        return default_names(len(self.y)) if given is None else tuple(given)
+
+    def to_xarray(self, names: Any = None) -> Any:
+        """The run as an `xarray.Dataset`, see `eip_scipy.to_xarray`."""
+        return to_xarray(self, names)
+
+    def to_dataframe(self, names: Any = None) -> Any:
+        """The run as a `pandas.DataFrame`, see `eip_scipy.to_dataframe`."""
+        return to_dataframe(self, names)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.save`."""
+        from .saving import save
+
+        save(self, path)
+
+    def plot(self, names: Any = None, *, orbit: bool | None = None) -> Any:
+        """Draw the run, see `eip_scipy.plot`."""
+        from .figures import plot
+
+        return plot(self, names, orbit=orbit)
+
+    def continue_to(self, t: float, **options: Any) -> IntegrationResult:
+        """Go on from the last state to a later time, with the functions and options of the run.
+
+        Parameters
+        ----------
+        t : float
+            The new end, beyond the present one in the direction of the run.
+        **options
+            Options of `integrate` that are to be others than before. Times in `t_eval` are not asked for again: give
+            new ones, or the states at both ends are saved. An event that ended the run may end it again at once;
+            ``events=None`` leaves it out.
+
+        Returns
+        -------
+        IntegrationResult
+            Both runs as one: rows, events and interpolants in order, counts and seconds summed, defects and corrections
+            the largest of both, `trusted` where both are; status, message, method and h are those of the second.
+
+        Raises
+        ------
+        ValueError
+            When `t` is not beyond the end; when the result was loaded, unpickled or copied; when the last state misses
+            an invariant by more than 1e-8 of its terms, as after a run that is not to be trusted or was not checked:
+            ``project_initial=True`` then projects it first.
+
+        Notes
+        -----
+        The second run is an `integrate` from the last state, and has its bits, but that each invariant keeps the value
+        of the first start: defects do not add up. It is not bit for bit the run that had gone through: times are
+        counted from the new start, `save_every` too; adaptive steps begin with a first step again; compensated sums,
+        and the history of multistep methods, start anew, which costs a rounding error and a new start of the method.
+        For a run that is to have the same bits, checkpoint it (``checkpoint=``, ``resume=True``).
+
+        Examples
+        --------
+        >>> from eip_scipy import EIPRK4, integrate
+        >>> from eip_scipy.problems import kepler
+        >>> run = integrate(kepler(), (0, 10), method=EIPRK4, save_every=10)
+        >>> longer = run.continue_to(20)
+        >>> float(longer.t[-1]), bool((longer.max_defect < 1e-11).all())
+        (20.0, True)
+        """
+        from .continuation import continued
+
+        return continued(self, t, options)
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray"]
+
+    def __getstate__(self) -> None:
+        """Of attributes beside the fields there is the origin alone, whose functions stay here."""
+        return None

@@ -1,0 +1,157 @@
+"""Results in files: arrays and JSON in an npz archive, nothing pickled, written as checkpoints are."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from scipy.optimize import OptimizeResult
+
+from .. import checkpoint
+from ..checkpoint import CheckpointError
+from ..core.inputs import shown
+from ..core.results import Diagnostics
+from ..engine.trust import Trust
+from .results import IntegrationResult
+
+__all__ = ["load", "save"]
+
+KIND = "result"
+# Buffers of Diagnostics, in the order in which it takes them.
+BUFFERS = ("_max_defect", "_last_defect", "_max_correction", "_counters", "_figures")
+
+
+def save(result: Any, path: str | os.PathLike[str]) -> None:
+    """Write a result to a file that `load` reads.
+
+    Parameters
+    ----------
+    result : IntegrationResult or OdeResult
+        From `integrate` or from `scipy.integrate.solve_ivp`. All its fields are kept, those that you have added too,
+        but for functions: ``sol``, and the run's own.
+    path : path-like
+        Taken as it is; a file that is there is replaced in one step, once the new one is whole. The file is an npz
+        archive, which `numpy.load` opens too, with ``header.json`` for all that is no array, and a SHA-256.
+
+    Raises
+    ------
+    TypeError
+        For a field that is neither numbers nor what JSON holds.
+    CheckpointError
+        When the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from eip_scipy import EIPRK4, integrate, load
+    >>> from eip_scipy.problems import kepler
+    >>> run = integrate(kepler(), (0, 10), method=EIPRK4, save_every=10)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     run.save(f"{folder}/kepler.npz")
+    ...     again = load(f"{folder}/kepler.npz")
+    >>> bool((again.y == run.y).all()), again.message
+    (True, 'reached the end of the interval')
+    """
+    if not isinstance(result, OptimizeResult):
+        raise TypeError(f"save: expected a result of integrate or solve_ivp, got {shown(result)}.")
+    arrays: dict[str, np.ndarray] = {}
+    values: dict[str, Any] = {}
+    lists: dict[str, int] = {}
+    told: dict[str, Any] | None = None
+    for name, value in result.items():
+        if isinstance(value, Diagnostics):
+            told = _described(value, arrays)
+        elif isinstance(value, np.ndarray):
+            arrays[name] = _numbers(name, value)
+        elif isinstance(value, list) and value and all(isinstance(item, np.ndarray) for item in value):
+            lists[name] = len(value)
+            arrays |= {f"{name}.{k}": _numbers(name, item) for k, item in enumerate(value)}
+        else:
+            values[name] = None if callable(value) else _plain(name, value)
+    header = {"kind": KIND, "class": type(result).__name__, "values": values, "lists": lists, "diagnostics": told}
+    checkpoint.write(path, header, arrays)
+
+
+def load(path: str | os.PathLike[str]) -> Any:
+    """Read a result that `save` has written.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    IntegrationResult
+        As it was saved, but without functions: ``sol`` is None, and `IntegrationResult.continue_to` says how to go on.
+        A result of `solve_ivp` comes back as an `scipy.optimize.OptimizeResult`, of which its own class is one.
+
+    Raises
+    ------
+    OSError
+        When the file cannot be read, for instance because it is not there.
+    ValueError
+        For a file that `save` has not written, or that is damaged.
+
+    Examples
+    --------
+    >>> from eip_scipy import load
+    >>> run = load("kepler.npz")  # doctest: +SKIP
+    """
+    try:
+        header, arrays = checkpoint.read(path, KIND)
+    except CheckpointError as error:
+        if isinstance(error.__cause__, OSError):
+            raise error.__cause__ from None
+        raise ValueError(f"load: {os.fspath(path)!r} is no result that save has written: {error}") from error
+    made = IntegrationResult if header["class"] == IntegrationResult.__name__ else OptimizeResult
+    result = made(header["values"])
+    for name, length in header["lists"].items():
+        result[name] = [arrays.pop(f"{name}.{k}") for k in range(length)]
+    if header["diagnostics"] is not None:
+        result["diagnostics"] = _diagnostics(header["diagnostics"], arrays)
+    result.update(arrays)
+    if result.get("component_names") is not None:
+        result["component_names"] = tuple(result["component_names"])
+    return result
+
+
+def _described(diagnostics: Diagnostics, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """What JSON holds of it; its buffers are added to `arrays`."""
+    trust = diagnostics._trust
+    buffers = (diagnostics.max_defect, diagnostics._defect, diagnostics._max_correction, diagnostics._counters)
+    arrays |= zip(BUFFERS, (*buffers, trust.figures), strict=True)
+    return {
+        "names": list(trust.names),
+        "doubts": trust.doubts,
+        "failed": bool(trust.failed),
+        "estimated": bool(diagnostics._estimated),
+    }
+
+
+def _diagnostics(told: dict[str, Any], arrays: dict[str, np.ndarray]) -> Diagnostics:
+    largest, last, correction, counters, figures = (arrays.pop(name) for name in BUFFERS)
+    trust = Trust(told["names"], figures)
+    trust.doubts, trust.failed = told["doubts"], told["failed"]
+    diagnostics = Diagnostics()
+    diagnostics._attach(largest, last, correction, counters, trust, estimated=told["estimated"])
+    return diagnostics
+
+
+def _numbers(name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype.kind not in "biufc":
+        raise TypeError(f"save: the field {name!r} holds {array.dtype}, and only numbers can be kept.")
+    return array
+
+
+def _plain(name: str, value: Any) -> Any:
+    """What JSON holds of a value."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, dict):
+        return {str(key): _plain(f"{name}[{key!r}]", item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(name, item) for item in value]
+    if value is None or isinstance(value, (str, bool, int)) or (isinstance(value, float) and np.isfinite(value)):
+        return value
+    raise TypeError(f"save: the field {name!r} is {shown(value)}, which cannot be kept.")

@@ -1,0 +1,86 @@
+"""The record itself: how it prints, pickles, names its components, and goes through SciPy."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
+from eip_scipy.problems import Problem, comet, hard_cases, harmonic, kepler, plane_wave, rotating_packet, soliton
+from eip_scipy.problems.gravity.nbody import nbody
+from eip_scipy.problems.gravity.scenes import pythagorean
+from eip_scipy.problems.time_transformed import centre_time, time_transformed
+
+MAKERS = [kepler, lambda: kepler(relativistic=0), harmonic, pythagorean, comet, soliton]
+MAKERS += [lambda: plane_wave((8, 8)), lambda: rotating_packet(points=8)]
+
+
+@pytest.mark.parametrize("problem", [*(make() for make in MAKERS), *(case.problem for case in hard_cases())], ids=str)
+def test_prints_in_five_lines_and_pickles(problem):
+    lines = repr(problem).splitlines()
+    assert len(lines) == 5
+    assert lines[0].startswith(f"{problem.name}: y = (")
+    again = pickle.loads(pickle.dumps(problem))
+    assert repr(again) == repr(problem)
+    t, y = problem.t_span[0], problem.y0
+    np.testing.assert_array_equal(again.y0, y)
+    np.testing.assert_array_equal(again.fun(t, y), problem.fun(t, y))
+    for one, other in zip(problem.invariants, again.invariants, strict=True):
+        np.testing.assert_array_equal(one.fun(t, y, *one.args), other.fun(t, y, *other.args))
+    if problem.reference is not None:
+        np.testing.assert_array_equal(again.reference(problem.t_span[1]), problem.reference(problem.t_span[1]))
+
+
+def test_a_pickled_problem_runs():
+    problem = rotating_packet(points=8)
+    runs = [integrate(p, (0, 0.01), method=EIPRK4, h=0.002) for p in (problem, pickle.loads(pickle.dumps(problem)))]
+    np.testing.assert_array_equal(*(run.y for run in runs))
+
+
+def test_repr():
+    assert repr(kepler()) == (
+        "kepler: y = (x, y, vx, vy), 4 components, float64\n"
+        "  interval    t from 0 to 200, h = 0.03; G M = 1, semi-major axis 1: period 2 pi\n"
+        "  invariants  H, L\n"
+        "  functions   fun, rhs, acc, jacobian; options blocks\n"
+        "  source      Cai, Gong & Wang, section 3.1 (eq. 3.2, with L = q1 p2 - q2 p1)"
+    )
+    own = Problem("own", lambda t, y: -y, np.ones(20), (0.0, 1.0), invariants=(Invariant(lambda t, y: y[0]),))
+    assert "y9, y10, y11, ...), 20 components" in repr(own)
+    assert "invariants  one without a name" in repr(own)
+
+
+def test_component_names():
+    assert harmonic().component_names == ("q", "p")
+    body = nbody([1.0, 1e-3], np.eye(3)[:2], np.eye(3)[1:] * 0.9, t_span=(0, 1))
+    assert body.component_names[:6] == ("x_0", "y_0", "z_0", "x_1", "y_1", "z_1")
+    assert body.component_names[6:9] == ("vx_0", "vy_0", "vz_0")
+    assert soliton().component_names is None
+    assert replace(kepler(), component_names="a b c d").component_names == ("a", "b", "c", "d")
+    with pytest.raises(ValueError, match="2 names for 4 components"):
+        replace(kepler(), component_names=["a", "b"])
+
+
+@pytest.mark.needs_jit
+def test_component_names_in_fictitious_time():
+    assert time_transformed(kepler(), 1.0, centre_time).component_names == ("x", "y", "vx", "vy", "t")
+
+
+def test_solve_ivp():
+    problem = kepler()
+    sol = problem.solve_ivp((0, 3), method=EIPRK4)
+    run = integrate(problem, (0, 3), method=EIPRK4, save_every=1)
+    np.testing.assert_array_equal(sol.t, run.t)
+    np.testing.assert_array_equal(sol.y, run.y)
+    assert sol.component_names == problem.component_names
+    adaptive = problem.solve_ivp((0, 3), method=EIPRK45, rtol=1e-9, t_eval=[1.0, 3.0])
+    assert np.all(np.abs(adaptive.y[:, -1] - sol.y[:, -1]) < 1e-4)
+    assert adaptive.t.tolist() == [1.0, 3.0]
+    with pytest.raises(TypeError, match="no start"):
+        replace(problem, y0=None).solve_ivp(method=EIPRK4)
+
+
+def test_solve_ivp_by_a_method_of_scipy_gets_no_options_of_ours():
+    sol = harmonic().solve_ivp((0, 1), method="DOP853", rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(sol.y[:, -1], harmonic().reference(1.0), rtol=1e-9)

@@ -1,0 +1,471 @@
+"""What is done with a result: tables, files, figures, a run that goes on; of integrate, solve_ivp and ensembles."""
+
+import pickle
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from systems import SQUARE, oscillator
+
+import eip_scipy
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ12,
+    EIPRK4,
+    EIPRK45,
+    EIPRKN12,
+    IntegrationResult,
+    Invariant,
+    ProjectionWarning,
+    ensemble,
+    integrate,
+    load,
+    plot,
+    save,
+    to_dataframe,
+    to_xarray,
+)
+from eip_scipy.problems import harmonic, kepler, soliton
+
+Y0 = np.array([1.0, 2.0])
+NAMES = ("x", "y", "vx", "vy")
+FIELDS = {"t", "y", "invariants", "target", "max_defect"}
+
+
+def crossing(t, y, params=None):
+    return y[1]
+
+
+def kepler_run(t_end=3.0, **options):
+    return integrate(kepler(), (0, t_end), **{"method": EIPRK4, "save_every": 10, **options})
+
+
+def of_solve_ivp(**options):
+    return solve_ivp(oscillator, (0, 2), Y0, method="RK45", events=crossing, **options)
+
+
+def failed_run():
+    """A step that fails, at t = 1."""
+    return integrate(lambda t, y: y if t < 1 else np.full(2, np.nan), (0, 2), Y0, method=EIPRK4, h=0.1)
+
+
+# Names.
+
+
+def test_component_names():
+    assert kepler_run().component_names == NAMES
+    assert integrate(oscillator, (0, 1), Y0, method=EIPRK4, h=0.1).component_names == ("y0", "y1")
+    run = kepler_run()
+    run.component_names = ["a", "b", "c", "d"]
+    assert run.component_names == ("a", "b", "c", "d")
+    assert run.to_dataframe().columns[0] == "a"
+
+
+def test_names_of_another_size_are_left():
+    """A problem's function may be run from a start of another size."""
+    run = integrate(harmonic(), (0, 1), np.ones(2), method=EIPRK4, h=0.1)
+    assert run.component_names == ("q", "p")
+
+
+@pytest.mark.parametrize(
+    ("names", "error", "match"),
+    [
+        (["a", "b"], ValueError, "2 names for 4 components"),
+        ("a b b c", ValueError, "'b' names two components"),
+        ([1, 2, 3, 4], TypeError, "must be strings, got 1"),
+        (4, TypeError, "sequence of strings, got 4"),
+    ],
+)
+@pytest.mark.parametrize("table", [to_xarray, to_dataframe, plot])
+def test_wrong_names(names, error, match, table):
+    with pytest.raises(error, match=match):
+        table(kepler_run(), names)
+
+
+# Tables.
+
+
+def test_to_xarray():
+    run = kepler_run()
+    data = run.to_xarray()
+    assert data.y.dims == ("component", "t")
+    np.testing.assert_array_equal(data.y.sel(component="vx"), run.y[2])
+    np.testing.assert_array_equal(data.y.sel(t=run.t[3]), run.y[:, 3])
+    np.testing.assert_array_equal(data.invariants.sel(invariant="L"), run.invariants[1])
+    np.testing.assert_array_equal(data.invariant_errors, run.invariants - run.target[:, None])
+    np.testing.assert_array_equal(data.max_defect, run.max_defect)
+    for name in ("method", "h", "message", "trusted", "nfev"):
+        assert data.attrs[name] == run[name]
+    assert to_xarray(run, "a b c d").component.values.tolist() == ["a", "b", "c", "d"]
+
+
+def test_errors_are_from_the_target():
+    """Which the first saved row need not show."""
+    energy = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, target=5.0, name="S")
+    run = integrate(oscillator, (0, 2), Y0, method=EIPRK4, h=0.1, invariants=energy, t_eval=[1.0, 2.0])
+    np.testing.assert_array_equal(run.target, [5.0])
+    np.testing.assert_array_equal(run.to_xarray().invariant_errors[0], run.invariants[0] - 5.0)
+
+
+def test_xarray_of_a_run_without_invariants_and_with_adaptive_steps():
+    data = integrate(oscillator, (0, 1), Y0, method=EIPRK45).to_xarray()
+    assert set(data.variables) == {"y", "t", "component"}
+    assert np.isnan(data.attrs["h"])
+
+
+def test_xarray_goes_to_netcdf(tmp_path):
+    xarray = pytest.importorskip("xarray", reason="needs xarray")
+    data = kepler_run().to_xarray()
+    data.to_netcdf(tmp_path / "run.nc", engine="scipy")
+    with xarray.open_dataset(tmp_path / "run.nc", engine="scipy") as again:
+        np.testing.assert_array_equal(again.y, data.y)
+
+
+def test_to_dataframe():
+    run = kepler_run()
+    frame = run.to_dataframe()
+    assert list(frame.columns) == [*NAMES, "H", "H error", "L", "L error"]
+    assert frame.index.name == "t"
+    np.testing.assert_array_equal(frame.index, run.t)
+    np.testing.assert_array_equal(frame["vy"], run.y[3])
+    np.testing.assert_array_equal(frame["L error"], run.invariants[1] - run.target[1])
+    assert list(to_dataframe(run, "H L a b").columns[4:6]) == ["invariant H", "invariant H error"]
+
+
+def test_invariants_of_one_name_stay_apart():
+    run = integrate(oscillator, (0, 1), Y0, method=EIPRK4, h=0.1, invariants=[SQUARE, SQUARE])
+    assert list(run.to_dataframe().columns)[2:] == ["S", "S error", "S (1)", "S (1) error"]
+
+
+def test_tables_of_solve_ivp():
+    sol = of_solve_ivp()
+    data, frame = to_xarray(sol, names=["q", "p"]), to_dataframe(sol)
+    np.testing.assert_array_equal(data.y.sel(component="p"), sol.y[1])
+    assert data.attrs["message"] == sol.message
+    assert "method" not in data.attrs
+    assert list(frame.columns) == ["y0", "y1"]
+
+
+def test_ensemble_to_xarray():
+    problem = kepler()
+    result = ensemble(problem, (0, 3), problem.y0 * np.linspace(0.99, 1.01, 5)[:, None], save_every=50)
+    data = result.to_xarray()
+    assert data.states.dims == ("member", "component", "time")
+    np.testing.assert_array_equal(data.states.sel(component="vy"), result.trajectories[:, 3])
+    np.testing.assert_array_equal(data.time, result.times)
+    np.testing.assert_array_equal(data.y.sel(member=3), result.y[3])
+    np.testing.assert_array_equal(data.t_end, result.t)
+    np.testing.assert_array_equal(data.max_defect.sel(invariant="H"), result.max_defect[:, 0])
+    assert data.message[4] == result.message[4]
+    last = ensemble(oscillator, (0, 1), np.ones((3, 2)), h=0.1).to_xarray("q p")
+    assert "states" not in last
+    assert last.component.values.tolist() == ["q", "p"]
+
+
+@pytest.mark.parametrize(("table", "library"), [("to_xarray", "xarray"), ("to_dataframe", "pandas")])
+def test_a_missing_library_is_named_with_its_extra(table, library, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ImportError, match=rf'{table} needs {library}: pip install "eip_scipy\[{library}\]"'):
+        getattr(kepler_run(), table)()
+
+
+# Files.
+
+
+def assert_same(one, other):
+    assert {*one} == {*other}
+    for name, value in one.items():
+        if name == "diagnostics":
+            assert repr(value) == repr(other[name])
+            assert value.trusted == other[name].trusted
+            assert value.worst == other[name].worst
+            np.testing.assert_array_equal(value.corrections, other[name].corrections)
+        elif name == "sol":
+            assert other[name] is None
+        elif isinstance(value, list):
+            assert len(value) == len(other[name])
+            for a, b in zip(value, other[name], strict=True):
+                np.testing.assert_array_equal(a, b)
+        elif isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, other[name])
+            assert value.dtype == other[name].dtype
+        else:
+            assert value == other[name]
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        kepler_run,
+        failed_run,
+        lambda: kepler_run(events=[crossing, lambda t, y, params: y[0] - 9], dense_output=True),
+        lambda: integrate(soliton(points=16), (0, 0.01), method=EIPRK4, h=0.001),
+        lambda: integrate(kepler(), (0, 3), method=EIPDOP853, rtol=1e-9),
+    ],
+)
+def test_save_and_load(run, tmp_path):
+    result = run()
+    result.save(tmp_path / "run.npz")
+    again = load(tmp_path / "run.npz")
+    assert isinstance(again, IntegrationResult)
+    assert_same(result, again)
+    assert again.component_names == result.component_names
+
+
+def test_an_untrusted_run_says_so_when_it_is_loaded(tmp_path):
+    damped = Invariant(lambda t, y: 0.5 * y[1] ** 2 - np.cos(y[0]), name="E")
+    with pytest.warns(ProjectionWarning):
+        run = integrate(
+            lambda t, y: np.array([y[1], -np.sin(y[0]) - 0.2 * y[1]]),
+            (0, 20),
+            [2.0, 0.0],
+            method=EIPRK45,
+            rtol=1e-8,
+            invariants=damped,
+        )
+    run.save(tmp_path / "run.npz")
+    again = load(tmp_path / "run.npz")
+    assert again.trusted is again.diagnostics.trusted is False
+    assert again.diagnostics.message == run.diagnostics.message != ""
+
+
+def test_save_and_load_of_solve_ivp(tmp_path):
+    sol = of_solve_ivp(dense_output=True)
+    save(sol, tmp_path / "sol.npz")
+    again = load(tmp_path / "sol.npz")
+    assert_same(sol, again)
+    assert not isinstance(again, IntegrationResult)
+    assert to_dataframe(again).equals(to_dataframe(sol))
+
+
+def test_files_hold_plain_arrays(tmp_path):
+    run = kepler_run()
+    run.note = {"why": ["a test", 1]}
+    run.save(tmp_path / "run.npz")
+    with np.load(tmp_path / "run.npz", allow_pickle=False) as data:
+        np.testing.assert_array_equal(data["y"], run.y)
+    assert load(tmp_path / "run.npz").note == run.note
+
+
+def test_a_field_that_cannot_be_kept(tmp_path):
+    run = kepler_run()
+    run.what = {1, 2}
+    with pytest.raises(TypeError, match="field 'what' is"):
+        run.save(tmp_path / "run.npz")
+    run.what = np.array([None])
+    with pytest.raises(TypeError, match="field 'what' holds object"):
+        run.save(tmp_path / "run.npz")
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(TypeError, match="expected a result"):
+        save({"t": 1}, tmp_path / "run.npz")
+
+
+def test_load_refuses_other_files(tmp_path):
+    path = tmp_path / "other.npz"
+    with pytest.raises(FileNotFoundError):
+        load(path)
+    np.savez(path, t=np.zeros(2))
+    with pytest.raises(ValueError, match="no result that save has written"):
+        load(path)
+    path.write_text("text")
+    with pytest.raises(ValueError, match="no result that save has written"):
+        load(path)
+    kepler_run(checkpoint=tmp_path / "checkpoint.npz")
+    with pytest.raises(ValueError, match="is a checkpoint of"):
+        load(tmp_path / "checkpoint.npz")
+    kepler_run().save(path)
+    damaged = bytearray(path.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    path.write_bytes(damaged)
+    with pytest.raises(ValueError, match="damaged"):
+        load(path)
+
+
+def test_a_failed_save_leaves_the_file_that_was_there(tmp_path, monkeypatch):
+    path = tmp_path / "run.npz"
+    kepler_run().save(path)
+    before = path.read_bytes()
+
+    def full(*arguments, **keywords):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(zipfile.ZipFile, "writestr", full)
+    with pytest.raises(eip_scipy.CheckpointError, match="no space left"):
+        kepler_run(6.0).save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+# Pickles.
+
+
+def test_results_pickle():
+    run = kepler_run()
+    again = pickle.loads(pickle.dumps(run))
+    assert_same(run, again)
+    with pytest.raises(ValueError, match="does not know its functions"):
+        again.continue_to(10)
+
+
+# Runs that go on.
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        (EIPRK4, {}),
+        (EIPRKN12, {"every": 7}),
+        (EIPRKN12, {"compensated": True}),
+        (EIPDOP853, {"rtol": 1e-10, "atol": 1e-12}),
+        (EIPGJ12, {"h": 0.01}),
+    ],
+)
+def test_continue_to(method, options):
+    whole = kepler_run(6.0, method=method, **options)
+    first = kepler_run(method=method, **options)
+    joined = first.continue_to(6.0)
+    assert joined.t[-1] == 6.0
+    assert np.all(np.diff(joined.t) > 0)
+    np.testing.assert_array_equal(joined.y[:, : first.t.size], first.y)
+    np.testing.assert_allclose(joined.y[:, -1], whole.y[:, -1], rtol=0, atol=3e-6 if method is EIPRK4 else 1e-8)
+    # The second run keeps the values of the first start.
+    np.testing.assert_array_equal(joined.target, first.target)
+    assert np.all(joined.max_defect <= 2 * whole.max_defect + 1e-14)
+    assert joined.trusted
+    assert joined.nfev > first.nfev
+    assert joined.method == first.method
+    assert joined.h == first.h
+
+
+def test_the_second_run_has_the_bits_of_one_from_there():
+    first = kepler_run(invariants=())
+    joined = first.continue_to(6.0)
+    second = integrate(kepler(), (3.0, 6.0), first.y[:, -1], method=EIPRK4, save_every=10, invariants=())
+    np.testing.assert_array_equal(joined.y, np.concatenate([first.y, second.y[:, 1:]], axis=1))
+    np.testing.assert_array_equal(joined.t, np.concatenate([first.t, second.t[1:]]))
+    assert joined.nfev == first.nfev + second.nfev
+
+
+def test_figures_of_both_runs():
+    first = kepler_run(events=crossing, dense_output=True)
+    second = first.continue_to(9.0)
+    assert second.diagnostics.n_projections == 300
+    assert second.diagnostics.max_correction >= first.diagnostics.max_correction
+    np.testing.assert_array_equal(second.max_defect, second.diagnostics.max_defect)
+    assert second.t_events[0].size == second.y_events[0].shape[0] > first.t_events[0].size
+    assert np.all(np.diff(second.t_events[0]) > 0)
+    assert (second.sol.t_min, second.sol.t_max) == (0.0, 9.0)
+    np.testing.assert_allclose(second.sol(second.t), second.y, rtol=0, atol=1e-14)
+    third = second.continue_to(12.0)
+    assert third.t[-1] == 12.0
+    assert third.diagnostics.n_projections == 400
+
+
+def test_from_the_last_state_though_it_was_not_saved():
+    whole = integrate(kepler(), (0, 6), method=EIPRK4, t_eval=[1.0, 4.0, 5.0])
+    first = integrate(kepler(), (0, 3), method=EIPRK4, t_eval=[1.0])
+    joined = first.continue_to(6.0, t_eval=[4.0, 5.0])
+    np.testing.assert_array_equal(joined.t, whole.t)
+    np.testing.assert_allclose(joined.y, whole.y, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(first.continue_to(6.0).t, [1.0, 3.0, 6.0])
+    np.testing.assert_array_equal(kepler_run().continue_to(6.0, t_eval=[5.0]).t[-2:], [3.0, 5.0])
+
+
+def test_from_an_event_on():
+    def down(t, y, params):
+        return y[1]
+
+    down.terminal, down.direction = True, -1
+    first = kepler_run(20.0, events=down)
+    assert first.status == 1
+    joined = first.continue_to(20.0, events=None)
+    assert joined.status == 0
+    assert joined.t[-1] == 20.0
+    np.testing.assert_allclose(joined.y[:, -1], kepler_run(20.0).y[:, -1], rtol=0, atol=1e-3)
+
+
+def test_backward():
+    first = integrate(oscillator, (0, -1), Y0, method=EIPRK4, h=0.1, invariants=SQUARE)
+    joined = first.continue_to(-2.0)
+    np.testing.assert_array_equal(joined.t, [0.0, -1.0, -2.0])
+
+
+@pytest.mark.parametrize("t", [3.0, 1.0, float("nan"), "6"])
+def test_an_end_that_is_not_beyond(t):
+    with pytest.raises(ValueError, match="must lie beyond the end of the run, 3, got"):
+        kepler_run().continue_to(t)
+
+
+def test_what_cannot_be_another():
+    with pytest.raises(TypeError, match="y0 is that of the run"):
+        kepler_run().continue_to(6.0, y0=[1.0])
+    with pytest.raises(TypeError, match="no option 'mehtod'"):
+        kepler_run().continue_to(6.0, mehtod=EIPRK4)
+
+
+def test_an_interrupted_run_goes_on_and_what_breaks_it_off_again_keeps_both():
+    calls = []
+
+    def broken(t, y, defects):
+        calls.append(t)
+        if len(calls) in (3, 6):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        kepler_run(callback=broken)
+    partial = caught.value.partial
+    with pytest.raises(KeyboardInterrupt) as caught:
+        partial.continue_to(6.0)
+    both = caught.value.partial
+    assert both.t.size > partial.t.size
+    assert np.all(np.diff(both.t) > 0)
+    np.testing.assert_array_equal(both.y[:, : partial.t.size], partial.y)
+    assert not both.trusted
+
+
+# Figures.
+
+
+def axes_of(figure):
+    return [axis for axis in figure.axes if axis.get_visible()]
+
+
+def test_plot_of_an_orbit():
+    run = kepler_run(12.0, save_every=1)
+    orbit, errors, corrections = axes_of(run.plot())
+    np.testing.assert_array_equal(orbit.lines[0].get_xydata(), run.y[:2].T)
+    assert errors.get_yscale() == "log"
+    assert [line.get_label() for line in errors.lines] == ["H", "L"]
+    shown = errors.lines[0].get_ydata()
+    wanted = np.abs(run.invariants[0] - run.target[0])
+    np.testing.assert_array_equal(shown[wanted > 0], wanted[wanted > 0])
+    assert np.all(shown > 0)
+    heights = [bar.get_height() for bar in corrections.patches]
+    np.testing.assert_array_equal(heights, run.diagnostics.corrections)
+
+
+def test_plot_of_components():
+    run = kepler_run()
+    components, *_ = axes_of(run.plot(orbit=False))
+    assert [line.get_label() for line in components.lines] == list(NAMES)
+    sol = of_solve_ivp()
+    (alone,) = axes_of(plot(sol))
+    np.testing.assert_array_equal(alone.lines[1].get_ydata(), sol.y[1])
+    with pytest.raises(ValueError, match="an orbit needs components named x and y"):
+        plot(sol, orbit=True)
+    field = integrate(soliton(points=16), (0, 0.01), method=EIPRK4, h=0.001)
+    first, *_ = axes_of(field.plot())
+    assert first.get_title() == "the first 9 of 16"
+    np.testing.assert_array_equal(first.lines[3].get_ydata(), np.abs(field.y[3]))
+
+
+def test_plot_is_saved(tmp_path):
+    failed_run().plot().savefig(tmp_path / "run.png")
+    assert (tmp_path / "run.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_methods_are_listed():
+    assert {"continue_to", "plot", "save", "to_xarray", "t", "y"} <= set(dir(kepler_run()))
+    assert set(kepler_run()) >= FIELDS
