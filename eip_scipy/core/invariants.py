@@ -12,6 +12,7 @@ import numpy as np
 from ..engine.data import EPS
 from ..engine.native import Call, call
 from .inputs import count, filled, flag, is_number, reals, refuse_units, require_arguments, shown
+from .jitted import NotCompilableError, is_jitted, jit_is_off, numba_errors
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 
 __all__ = ["Invariant", "InvariantSet", "JointInvariants", "as_invariants", "check_gradient"]
@@ -38,9 +39,10 @@ class Invariant:
     fun : callable
         ``fun(t, y, *args) -> float or (l_i,)``, real. Or, like `grad`, a C function by pointer (see Notes).
     grad : callable, optional
-        ``grad(t, y, *args) -> (n,) or (l_i, n)``. For complex y, dI = Re sum_k conj(g_k) dy_k. Without it the
-        gradient comes from a complex step where `fun` allows one, else from central differences of order 6 (with a
-        warning; both cost n evaluations of `fun` and more, and neither is compiled).
+        ``grad(t, y, *args) -> (n,) or (l_i, n)``. For complex y, dI = Re sum_k conj(g_k) dy_k. Without it a function
+        jitted by Numba, of a real state and without `args`, gets a compiled one by dual numbers, exact to rounding.
+        For any other, the gradient comes from a complex step where `fun` allows one, else from central differences of
+        order 6 (with a warning; both cost n evaluations of `fun` and more, and neither is compiled).
     target : float or array_like, shape (l_i,), optional
         The value to keep. Default: the value at the start. A given target is a condition that the start must meet.
     args : tuple, optional
@@ -181,6 +183,11 @@ def as_invariants(invariants: Any) -> tuple[Invariant, ...]:
     return items
 
 
+def _lacks_gradient(item: Invariant) -> bool:
+    """Whether an invariant is jitted, as a compiled run takes it, but for its gradient."""
+    return item.grad is None and not item.args and is_jitted(item.fun) and not jit_is_off()
+
+
 def _target(target: Any) -> Array:
     found = reals(target)
     if found is None:
@@ -283,12 +290,14 @@ class NumericalGradient:
 
     def _complex_step_is_valid(self, t: float, y: Array, extra: tuple) -> bool:
         """Whether `fun` takes complex states and is analytic there: the real part unmoved, differences agree."""
+        refusals: tuple[type[BaseException], ...] = (TypeError, ValueError, np.exceptions.ComplexWarning)
+        refusals += numba_errors()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", np.exceptions.ComplexWarning)
                 self._by_complex_step(t, y, extra)
                 plain = self._fun(t, y.astype(complex), extra)
-        except (TypeError, ValueError, np.exceptions.ComplexWarning):
+        except refusals:
             return False
         if np.any(np.imag(plain) != 0) or not np.allclose(np.real(plain), self._fun(t, y, extra), rtol=1e-12):
             return False
@@ -340,6 +349,8 @@ class InvariantSet:
     def __init__(self, invariants: Any, t0: float, y0: Array, f0: Array, tau: float, extra: tuple = ()) -> None:
         self.items = as_invariants(invariants)
         self.extra = extra
+        # Why a jitted invariant has no compiled gradient, by its label.
+        self.why_not: dict[str, str] = {}
         self.labels = [item.name or f"invariant {k}" for k, item in enumerate(self.items)]
         functions = [bound(item.fun, item.args + extra) for item in self.items]
         values = [
@@ -347,6 +358,9 @@ class InvariantSet:
             for item, fun, label in zip(self.items, functions, self.labels, strict=True)
         ]
         self.scalar = [value.ndim == 0 for value in values]
+        if y0.dtype == FLOAT and any(_lacks_gradient(item) for item in self.items):
+            shapes = zip(self.items, self.labels, values, strict=True)
+            self.items = tuple(self._with_gradient(item, label, y0.size, v.shape) for item, label, v in shapes)
         sizes = [value.size for value in values]
         self.starts = [0, *np.cumsum(sizes, dtype=int).tolist()]
         self.size = self.starts[-1]
@@ -390,6 +404,19 @@ class InvariantSet:
             if isinstance(self.items, JointInvariants)
             else tuple(kept)
         )
+
+    def _with_gradient(self, item: Invariant, label: str, n: int, shape: tuple[int, ...]) -> Invariant:
+        """A jitted invariant with a compiled gradient, where it comes without one; any other, as it is."""
+        if not _lacks_gradient(item):
+            return item
+        from .jitted_gradients import gradient_by_duals  # which loads Numba
+
+        item = copy(item)
+        try:
+            item.grad, item.in_place = gradient_by_duals(item.fun, n, shape, bool(self.extra)), True
+        except NotCompilableError as error:
+            self.why_not[label] = str(error)
+        return item
 
     def _calls(self, y0: Array) -> tuple[tuple[Call, ...], tuple[Call, ...]]:
         """Values and gradients, as the engine calls them."""

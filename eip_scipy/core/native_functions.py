@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 __all__ = ["Kind", "function_alone", "native_functions", "raise_again", "with_events", "with_jacobian"]
 
 
+NO_DUALS = "only jitted functions of real states get one compiled"
+
+
 class Kind(NamedTuple):
     """What a function takes and gives.
 
@@ -79,10 +82,10 @@ def native_functions(
         name = f"invariant {label!r}"
         if item.args:
             raise NotCompilableError(f"{name} has args; pass its parameters through params")
-        if item.grad is None:
-            raise NotCompilableError(f"{name} has no grad")
         shape = () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
         inv.append(_native(item.fun, number._replace(shape=shape), name))
+        if item.grad is None:
+            raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
         rows = Kind((*shape, n), n, number.p, number.dtype, False, item.uses_f, item.in_place, gradient=True)
         grad.append(_native(item.grad, rows, f"gradient of {name}"))
     return rhs._replace(inv=_addresses(inv), grad=_addresses(grad), owner=rhs.owner | {"inv": inv, "grad": grad})

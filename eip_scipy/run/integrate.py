@@ -14,15 +14,17 @@ import numpy as np
 
 from ..core import setup
 from ..core.inputs import refuse_units
-from ..core.jitted import is_jitted
+from ..core.jitted import is_compiled, is_jitted
 from ..core.names import nearest
 from ..core.options import ProjectionOptions, takes_projection_options
+from ..core.pointers import PointerFunction
 from ..core.problem import Problem
 from ..core.results import Diagnostics
 from ..core.solvers import EIPSolver
 from ..core.stepping import UNBOUNDED
 from ..engine.counters import NFEV, NJEV, NLU
 from ..engine.data import ENDED, FULL, OK, PAUSE, ROW, STEP, TIME, Schedule
+from ..engine.native import PythonFunctions
 from ..engine.trust import ProjectionWarning
 from . import resume as _resume
 from .driver import Driver
@@ -34,6 +36,8 @@ __all__ = ["integrate"]
 
 CHUNK_SECONDS = 0.2
 FIRST_CHUNK = 64
+# After which a run says that it could be compiled.
+SLOW_SECONDS = 2.0
 ARRIVED, STOPPED = "reached the end of the interval", "stopped by the callback"
 ENDED_BY_EVENT = "A termination event occurred."
 # Names that the projection's options stand beside, for hints.
@@ -252,8 +256,10 @@ class Loop:
                 max_bytes=prepared.max_bytes,
             )
         keeper.begin(self.driver, self.events)
+        self._slowed = wanted is None and _slowed_by_invariants(system.fun, functions, run)
         self.wall_time = keeper.seconds
         self.chunk = FIRST_CHUNK
+        self._seconds = 0.0
         self.told = self._doubtful = self._event_ended = False
 
     def run(self) -> IntegrationResult:
@@ -320,6 +326,7 @@ class Loop:
             code = driver.advance(k + steps)
             seconds = time.perf_counter() - begin
             driver.warn()
+            self._tell_why_slow(seconds)
             ended = self._ended(code)
             bar.update(self._progress(bar.n, k))
             if self._stopped_by_callback(rows):
@@ -338,6 +345,18 @@ class Loop:
                 # At most a doubling, so that one fast chunk cannot make a slow one long; none of one that was cut.
                 longer = max(self.chunk, 2 * steps)
                 self.chunk = max(1, min(longer, int(steps * CHUNK_SECONDS / max(seconds, 1e-9))))
+
+    def _tell_why_slow(self, seconds: float) -> None:
+        """After a chunk of so many seconds: once, in a run that its invariants alone keep from being compiled."""
+        self._seconds += seconds
+        if self._slowed and self._seconds > SLOW_SECONDS:
+            self._slowed = False
+            warnings.warn(
+                f"{self.method}: fun is jitted, and the run could be many times faster, but it is {self.why_not}. "
+                "(compiled=False says that this is meant.)",
+                UserWarning,
+                stacklevel=5,
+            )
 
     def _progress(self, shown: float, k: int) -> float:
         """What the bar is to grow by: steps where their number is known, else time."""
@@ -443,6 +462,13 @@ class Loop:
             if not broken:
                 raise
             return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)
+
+
+def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:
+    """Whether a jitted right-hand side is called from Python for the sake of invariants that are not jitted."""
+    kept = [found for item in run.invariants.items for found in (item.fun, item.grad)]
+    native = all(is_compiled(found) or isinstance(found, PointerFunction) for found in kept)
+    return isinstance(functions, PythonFunctions) and is_jitted(fun) and not native
 
 
 def _compiling(shown: bool) -> Any:

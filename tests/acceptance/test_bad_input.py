@@ -1182,7 +1182,11 @@ class TestNotCompilable:
             "plain fun": (oscillator, (), "fun is not a Numba function"),
             "plain value": (fun, Invariant(square, grad, name="V"), "invariant 'V' is not a Numba function"),
             "plain grad": (fun, Invariant(value, square_gradient, name="V"), "gradient of invariant 'V' is not"),
-            "no grad": (fun, Invariant(value, name="V"), "invariant 'V' has no grad"),
+            "no grad": (
+                fun,
+                Invariant(njit(lambda t, y: 2 * np.mean(y * y)), name="V"),
+                "invariant 'V' has no grad, and it does not compile for dual numbers",
+            ),
             "args": (fun, Invariant(lambda t, y, a: y @ y, lambda t, y, a: 2 * y, args=(1,), name="V"), "'V' has args"),
             "arguments": (fun, Invariant(value, two_arguments, name="V"), None),
         }

@@ -1,0 +1,164 @@
+"""A jitted function's source for dual numbers: the arrays that it makes hold duals too.
+
+`np.empty(3)` is an array of floats, which no dual fits in, and Numba rewrites `np.array([a, b])` by the name that its
+type has in NumPy. In a copy of the function these names stand for the functions here, in what it calls as well.
+"""
+
+from __future__ import annotations
+
+import types as python_types
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+from numba.extending import is_jitted, overload
+
+from .dual_numbers import Dual
+
+__all__ = ["for_duals", "inside"]
+
+# Options of Numba that change what is computed, or how fast.
+KEPT = ("fastmath", "error_model", "boundscheck", "inline", "forceinline")
+# Called from compiled code alone: Python knows no arrays of duals, and Numba no way to hand them to it.
+inside = partial(njit, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
+class _NumPy(python_types.ModuleType):
+    """NumPy, but for some functions."""
+
+    def __init__(self, others: dict[str, Any]) -> None:
+        super().__init__("numpy")
+        self.__dict__.update(others)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(np, name)
+
+
+def for_duals(fun: Any, dual: Dual) -> Any:
+    """A copy of a jitted function, and of what it calls, that makes arrays of duals where it made arrays of floats."""
+    by_name = _array_functions(dual)
+    others = {id(getattr(np, name)): function for name, function in by_name.items()}
+    return _replaced(fun, others | {id(np): _NumPy(by_name)})
+
+
+def _replaced(item: Any, others: dict[int, Any]) -> Any:
+    """What stands for a variable from outside a function in its copy; `others` knows what has been replaced."""
+    if id(item) in others or not is_jitted(item):
+        return others.get(id(item), item)
+    source = item.py_func
+    names, cells = source.__globals__.copy(), [python_types.CellType() for _ in source.__closure__ or ()]
+    copied = python_types.FunctionType(source.__code__, names, source.__name__, source.__defaults__, tuple(cells))
+    others[id(item)] = inside(copied, **{name: item.targetoptions[name] for name in KEPT if name in item.targetoptions})
+    # After that: a function may call itself.
+    for name in _names(source.__code__) & names.keys():
+        names[name] = _replaced(names[name], others)
+    for cell, known in zip(cells, source.__closure__ or (), strict=True):
+        cell.cell_contents = _replaced(known.cell_contents, others)
+    return others[id(item)]
+
+
+def _names(code: python_types.CodeType) -> set[str]:
+    """The names in a function's source and in that of the functions inside."""
+    inside = (_names(item) for item in code.co_consts if isinstance(item, python_types.CodeType))
+    return set(code.co_names).union(*inside)
+
+
+def _of_floats(dtype: Any) -> bool:
+    """Whether an argument dtype, as Numba types it, asks for floats, or is missing."""
+    if isinstance(dtype, types.NumberClass):
+        return isinstance(dtype.dtype, types.Float)
+    return not (isinstance(dtype, types.Function) and dtype.typing_key is not float)
+
+
+@cache
+def _array_functions(dual: Dual) -> dict[str, Callable[..., Any]]:
+    """The functions of NumPy that make arrays, by their names, to be called from compiled code alone."""
+
+    def empty(shape, dtype=float):
+        pass
+
+    def zeros(shape, dtype=float):
+        pass
+
+    def ones(shape, dtype=float):
+        pass
+
+    for name, function in (("empty", empty), ("zeros", zeros)):
+        _overload_maker(function, getattr(np, name), dual)
+
+    @overload(ones)
+    def _ones(shape, dtype=float):
+        def filled(shape, dtype=float):
+            out = np.empty(shape, dual)
+            for i in range(out.size):
+                out.flat[i] = 1.0
+            return out
+
+        return filled if _of_floats(dtype) else lambda shape, dtype=float: np.ones(shape, dtype)
+
+    return {"empty": empty, "zeros": zeros, "ones": ones, "array": array, "cross": cross}
+
+
+def _overload_maker(function: Any, numpy_function: Any, dual: Dual) -> None:
+    @overload(function)
+    def typed(shape, dtype=float):
+        if _of_floats(dtype):
+            return lambda shape, dtype=float: numpy_function(shape, dual)
+        return lambda shape, dtype=float: numpy_function(shape, dtype)
+
+
+def array(object):
+    """In the place of `np.array`; for compiled code alone."""
+
+
+def cross(a, b):
+    """In the place of `np.cross`; for compiled code alone."""
+
+
+@overload(array)
+def _array(object):
+    sequences = types.List | types.UniTuple
+    inner = getattr(object, "dtype", None)
+    if isinstance(object, sequences) and isinstance(inner, Dual):
+        dual = inner
+
+        def of_numbers(object):
+            out = np.empty(len(object), dual)
+            for i in range(len(object)):
+                out[i] = object[i]
+            return out
+
+        return of_numbers
+    if isinstance(object, sequences) and isinstance(inner, sequences) and isinstance(inner.dtype, Dual):
+        dual = inner.dtype
+
+        def of_rows(object):
+            out = np.empty((len(object), len(object[0])), dual)
+            for i in range(out.shape[0]):
+                for j in range(out.shape[1]):
+                    out[i, j] = object[i][j]
+            return out
+
+        return of_rows
+    return lambda object: np.array(object)
+
+
+@overload(cross)
+def _cross(a, b):
+    duals = [k.dtype for k in (a, b) if isinstance(k, types.Array) and isinstance(k.dtype, Dual)]
+    if not duals or not (a.ndim == b.ndim == 1):
+        return (lambda a, b: np.cross(a, b)) if not duals else None
+    dual = duals[0]
+
+    def of_vectors(a, b):
+        if a.size != 3 or b.size != 3:
+            raise ValueError("np.cross: vectors of three components are expected")
+        out = np.empty(3, dual)
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            out[i] = a[j] * b[k] - a[k] * b[j]
+        return out
+
+    return of_vectors
