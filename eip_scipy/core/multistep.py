@@ -177,7 +177,7 @@ def _record(
         spacing=AUTO_SPACING if run.options.every == AUTO else run.options.every,
         corrected_first=corrected.start,
         corrected_count=corrected.stop - corrected.start,
-        nodes=_aligned((ROWS * order, pitch)),
+        nodes=_aligned((ROWS * order + 1, pitch)),  # one beyond the window
         sums=_aligned((4, pitch)),
         moved=_aligned((half,)),
         levels=np.zeros((3, run.invariants.size)),

@@ -162,7 +162,12 @@ def computed(fun, y, extra=()):
     return InvariantSet(Invariant(fun), 0.0, y, np.ones_like(y), 1.0, extra).gradients(0.0, y, y)
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+# Each takes some seconds to compile: a third of them in the gate.
+NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
+NAMES = [name if k % 3 == 0 else pytest.param(name, marks=NIGHTLY) for k, name in enumerate(FUNCTIONS)]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_gradients_are_exact_to_rounding(name):
     fun, exact, shape = FUNCTIONS[name]
     with mpmath.workdps(40):
@@ -179,7 +184,7 @@ def test_gradients_are_exact_to_rounding(name):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * np.max(np.abs(expected)))
 
 
-@pytest.mark.parametrize("n", [1, 7, 12, 13, 70])
+@pytest.mark.parametrize("n", [7, 13, *(pytest.param(n, marks=NIGHTLY) for n in (1, 12, 70))])
 def test_any_number_of_components(n):
     y = np.linspace(0.5, 1.5, n)
     weights = np.arange(1.0, n + 1)

@@ -100,6 +100,7 @@ def test_order(order):
 
 
 @both
+@pytest.mark.needs_jit
 def test_a_long_run_keeps_its_invariants_and_its_orbit(method):
     """A hundred revolutions, both errors near round-off; the result says so."""
     record = Diagnostics()
@@ -178,6 +179,7 @@ def test_bits_do_not_depend_on_what_is_saved():
     assert all(np.array_equal(state, last[0]) for state in last)
 
 
+@pytest.mark.needs_jit
 def test_python_jitted_and_native_functions_give_the_same_bits():
     """Of Kepler's problem in three dimensions, the library's functions beside Python's."""
     problem = nbody([1.0, 1e-3], [[0, 0, 0], [0.8, 0, 0.1]], [[0, -1e-3, 0], [0, 1.2, 0.1]], t_span=(0, 20), h=0.05)

@@ -46,12 +46,22 @@ inline Rows latest(const Multistep &ms, const double *weights, int64_t count) {
 // scale times the sum of rows under their weights; of short rows in two parts, which do not wait for each other.
 inline void history_sum(double scale, const Rows &rows, double *out, int64_t n) {
     if (n >= LANES) return weighted_sum(scale, rows, out, n);
-    for (int64_t i = 0; i < n; ++i) {
-        const double *entry = rows.first + i;
-        double even = 0.0, odd = 0.0;
-        for (int64_t j = 0; j < rows.count; ++j, entry += rows.stride) (j % 2 ? odd : even) += rows.weights[j] * *entry;
-        out[i] = scale * (even + odd);
+    if (n <= 4) {  // float by float, as the newest row has just been written
+        for (int64_t i = 0; i < n; ++i) {
+            double even = 0.0, odd = 0.0;
+            const double *entry = rows.first + i;
+            for (int64_t j = 0; j < rows.count; ++j, entry += rows.stride) (j % 2 ? odd : even) += rows.weights[j] * *entry;
+            out[i] = scale * (even + odd);
+        }
+        return;
     }
+    Vector sums[2][VECTORS] = {};
+    const double *row = rows.first;  // of which eight entries are read: no row is the last one of its array
+    for (int64_t j = 0; j < rows.count; ++j, row += rows.stride)
+        for (int k = 0; k < VECTORS; ++k) sums[j % 2][k] += rows.weights[j] * load(row + k * WIDTH);
+    double total[LANES];
+    for (int k = 0; k < VECTORS; ++k) store(scale * (sums[0][k] + sums[1][k]), total + k * WIDTH);
+    copy(total, out, n);
 }
 
 // Room for one more node; the others move to the first rows where there is none.
