@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ..engine.data import AUTO, N_NODE_PLACES, Method, Multistep
 from ..methods.multistep import GaussJackson, damping_limit, stability_limit, weights
-from .setup import Run, Start, check_halves
+from .setup import Run, Start
 from .stepping import Stepping
 
-__all__ = ["SecondOrder", "attach_history", "known_system"]
+__all__ = ["SecondOrder", "attach_history", "times"]
 
 Array = np.ndarray
 AUTO_SPACING = 50
@@ -43,27 +42,15 @@ class SecondOrder(NamedTuple):
     frequencies: tuple[Array, float] | None
 
 
-def known_system(
-    method: GaussJackson, rhs: Callable[[float, Array], Array], t0: float, y0: Array, f0: Array, name: str
-) -> GaussJackson:
-    """The method, which knows now whether accelerations depend on velocities, by one more evaluation.
+def times(jacobian: Callable[..., None], *extra: Array) -> Callable[[float, Array, Array], Array]:
+    """A user's ``jacobian(t, q, dq, out, *extra)`` as a function that returns its product with dq."""
 
-    Raises
-    ------
-    ValueError
-        When the first half of the derivative is not v.
-    """
-    check_halves(y0.size)
-    half = y0.size // 2
-    other = y0.copy()
-    other[half:] = 1.5 * y0[half:] + 1.0
-    f = rhs(t0, other)
-    if not (np.array_equal(f0[:half], y0[half:]) and np.array_equal(f[:half], other[half:])):
-        raise ValueError(
-            f"{name} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be v, the "
-            "second half of the state. Reorder the state, or take a Runge-Kutta method such as EIPDOP853."
-        )
-    return replace(method, velocities=not np.array_equal(f[half:], f0[half:], equal_nan=True))
+    def product(t: float, q: Array, dq: Array) -> Array:
+        out = np.full_like(q, np.nan)
+        jacobian(t, q.copy(), dq.copy(), out, *extra)
+        return out
+
+    return product
 
 
 def attach_history(

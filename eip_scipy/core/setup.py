@@ -175,15 +175,15 @@ def check_halves(n: int) -> None:
         raise ValueError(f"a Nystrom method needs the state (q, v), an even number of components; y0 has {n}.")
 
 
-def check_second_order(
+def depends_on_velocity(
     rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, y0: np.ndarray, f0: np.ndarray, method: str
-) -> None:
-    """Whether the right-hand side is that of q'' = a(t, q) for y = (q, v), by one more evaluation.
+) -> bool:
+    """Whether the accelerations of q'' = a(t, q, v), y = (q, v), change with v, by one more evaluation.
 
     Raises
     ------
     ValueError
-        When the first half of the derivative is not v, or the second changes with v.
+        When the first half of the derivative is not v.
     """
     check_halves(y0.size)
     half = y0.size // 2
@@ -195,7 +195,20 @@ def check_second_order(
             f"{method} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be v, "
             f"the second half of the state. Reorder the state, or take a Runge-Kutta method such as EIPDOP853."
         )
-    if not np.array_equal(f[half:], f0[half:], equal_nan=True):
+    return not np.array_equal(f[half:], f0[half:], equal_nan=True)
+
+
+def check_second_order(
+    rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, y0: np.ndarray, f0: np.ndarray, method: str
+) -> None:
+    """Whether the right-hand side is that of q'' = a(t, q) for y = (q, v), by one more evaluation.
+
+    Raises
+    ------
+    ValueError
+        When the first half of the derivative is not v, or the second changes with v.
+    """
+    if depends_on_velocity(rhs, t0, y0, f0, method):
         raise ValueError(
             f"{method} integrates q'' = a(t, q), but fun's accelerations change with the velocity; take a Runge-Kutta "
             f"method such as EIPDOP853."

@@ -23,7 +23,7 @@ from . import setup
 from .dense import ExactEnds, Interpolants
 from .inputs import refuse_units, shown
 from .invariants import as_invariants
-from .multistep import SecondOrder, attach_history, known_system
+from .multistep import SecondOrder, attach_history, times
 from .names import nearest
 from .one_step import OneStep, OneStepMethod
 from .options import ProjectionOptions, takes_projection_options
@@ -139,14 +139,15 @@ class EIPSolver(OdeSolver):
             stepping.require_scale(start)
         self._scipy = self._scipy_solver(derivative, start, stepping, bool(kept) or bool(projection.compensated))
         f0 = derivative(t0, start).copy() if self._scipy is None else np.zeros_like(start)
+        fresh = partial(_copied, derivative)
         if isinstance(self.TABLEAU, NystromTableau):
-            setup.check_second_order(lambda t, y: derivative(t, y).copy(), t0, start, f0, type(self).__name__)
+            setup.check_second_order(fresh, t0, start, f0, type(self).__name__)
         self._method = self.TABLEAU
         if isinstance(self.TABLEAU, GaussJackson):
             if self._finishes:
                 raise TypeError(f"{type(self).__name__}: a multistep method has no step that _project_step could end.")
-            fresh = partial(_copied, derivative)
-            self._method = known_system(self.TABLEAU, fresh, t0, start, f0, type(self).__name__)
+            velocities = setup.depends_on_velocity(fresh, t0, start, f0, type(self).__name__)
+            self._method = replace(self.TABLEAU, velocities=velocities)
         self.h_abs = stepping.first_step
         if self._scipy is None:
             self.h_abs = stepping.first(derivative, start, f0, self.TABLEAU)
@@ -183,13 +184,8 @@ class EIPSolver(OdeSolver):
         if jacobian is not None and not callable(jacobian):
             raise TypeError(f"jacobian must be a function jacobian(t, q, dq, out), got {shown(jacobian)}.")
 
-        def moved(t: float, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-            out = np.full_like(q, np.nan)
-            jacobian(t, q.copy(), dq.copy(), out)
-            return out
-
-        fresh = partial(_copied, self._derivative)
-        seen = SecondOrder(fresh, begin, None if jacobian is None else moved, None)
+        moved = None if jacobian is None else times(jacobian)
+        seen = SecondOrder(partial(_copied, self._derivative), begin, moved, None)
         attach_history(run, method, type(self).__name__, seen, stepping, level=True)
         if jacobian is None:
             return None
@@ -218,11 +214,8 @@ class EIPSolver(OdeSolver):
         if self.SCIPY is None or stepping.h is not None or own_steps or self._finishes:
             return None
 
-        def fresh(t: float, y: np.ndarray) -> np.ndarray:
-            return derivative(t, y).copy()
-
         control = {"first_step": stepping.first_step, "max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
-        solver = self.SCIPY(fresh, self.t, start, self.t_bound, **control)
+        solver = self.SCIPY(partial(_copied, derivative), self.t, start, self.t_bound, **control)
         if np.isnan(solver.h_abs):
             return None  # SciPy's loop would never end
         solver.fun = derivative  # in place of SciPy's two wrappers, whose work it does

@@ -13,7 +13,7 @@ from ..core import setup
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import Invariant, as_invariants
 from ..core.jitted import NotCompilableError
-from ..core.multistep import SecondOrder, attach_history, known_system
+from ..core.multistep import SecondOrder, attach_history, times
 from ..core.native_functions import native_functions, with_events, with_jacobian
 from ..core.one_step import OneStep
 from ..core.options import ProjectionOptions
@@ -132,12 +132,6 @@ class System:
         """The derivative as a new array."""
         out = np.empty_like(y)
         self.rhs(t, y, out, self.parameters)
-        return out
-
-    def moved(self, t: float, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-        """The Jacobian of the accelerations times dq."""
-        out = np.full_like(q, np.nan)
-        self.jacobian(t, q.copy(), dq.copy(), out, *self.extra)
         return out
 
     @property
@@ -281,13 +275,13 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     if isinstance(method, NystromTableau):
         setup.check_second_order(calls, t0, y0, f0, name)
     elif isinstance(method, GaussJackson):
-        method = known_system(method, calls, t0, y0, f0, name)
+        method = replace(method, velocities=setup.depends_on_velocity(calls, t0, y0, f0, name))
     start = Start(t0, y0, f0, stepping.first(calls, y0, f0, method))
     schedule = _schedule(stepping.span, start.tau, request, system.events)
     run = setup.prepare(method, calls, start, projection, stepping, extra=system.extra, check_start=check_start)
     run.left_out = system.left_out
     if isinstance(method, GaussJackson):
-        moved = None if system.jacobian is None else system.moved
+        moved = None if system.jacobian is None else times(system.jacobian, *system.extra)
         seen = SecondOrder(calls, start, moved, None if frequencies is None else frequencies(y0))
         attach_history(run, method, name, seen, stepping, level=False)
     bound = 0.5 * free_memory() if request.max_bytes is None else request.max_bytes
