@@ -149,7 +149,7 @@ def _record(
     run: Run, method: GaussJackson, corrected: slice, stepping: Stepping, *, brief: bool, level: bool
 ) -> Multistep:
     order, half = method.order, run.work.err.size // 2
-    pitch = -(-half // 8) * 8
+    pitch = -(-half // 4) * 4  # whole vectors
     limit = stability_limit(order, method.corrected)
     return Multistep(
         **weights(order)._asdict(),
@@ -164,9 +164,10 @@ def _record(
         spacing=AUTO_SPACING if run.options.every == AUTO else run.options.every,
         corrected_first=corrected.start,
         corrected_count=corrected.stop - corrected.start,
-        nodes=_aligned((ROWS * order + 1, pitch)),  # one beyond the window
+        nodes=_aligned((ROWS * order, pitch)),
         sums=_aligned((4, pitch)),
-        moved=_aligned((half,)),
+        predicted=_aligned((3, pitch)),
+        change=_aligned((half,)),
         levels=np.zeros((3, run.invariants.size)),
         place=np.zeros(N_NODE_PLACES, np.int64),
     )

@@ -100,7 +100,8 @@ class Multistep(NamedTuple):
     corrected_count: int
     nodes: np.ndarray
     sums: np.ndarray
-    moved: np.ndarray
+    predicted: np.ndarray
+    change: np.ndarray
     levels: np.ndarray
     place: np.ndarray
 

@@ -5,22 +5,28 @@
 
 namespace eip {
 
-struct Pair {
-    double value, rest;
+// A number as the sum of two floats, or so many as a vector holds.
+template <class Value>
+struct PairOf {
+    Value value, rest;
 };
 
-inline Pair two_sum(double a, double b) {
-    const double s = a + b, v = s - a;
+using Pair = PairOf<double>;
+
+template <class Value>
+inline PairOf<Value> two_sum(const Value &a, const Value &b) {
+    const Value s = a + b, v = s - a;
     return {s, (a - (s - v)) + (b - v)};
 }
 
-inline Pair two_product(double a, double b) {
+template <class Value>
+inline PairOf<Value> two_product(const Value &a, const Value &b) {
     constexpr double SPLITTER = 134217729.0;  // 2^27 + 1 (Dekker)
-    const double p = a * b;
-    double x = SPLITTER * a;
-    const double a_high = x - (x - a), a_low = a - a_high;
+    const Value p = a * b;
+    Value x = SPLITTER * a;
+    const Value a_high = x - (x - a), a_low = a - a_high;
     x = SPLITTER * b;
-    const double b_high = x - (x - b), b_low = b - b_high;
+    const Value b_high = x - (x - b), b_low = b - b_high;
     return {p, ((a_high * b_high - p) + a_high * b_low + a_low * b_high) + a_low * b_low};
 }
 

@@ -54,7 +54,8 @@ struct Multistep {
     double t0, h;
     int64_t substeps, spacing;                 // of the method that starts; nodes from one projection to the next
     int64_t first, count;                      // components that the Jacobian corrects
-    double *nodes, *sums, *moved, *levels;     // (rows, pitch), (4, pitch), (half), (3, l)
+    double *nodes, *sums;                      // (rows, pitch), (4, pitch)
+    double *predicted, *change, *levels;       // (3, pitch), (half), (3, l)
     int64_t *place;
 };
 

@@ -26,14 +26,16 @@ inline Pair quotient(const Pair &a, const Pair &b) {
     return two_sum(first, rest / b.value);
 }
 
-inline Pair product(const Pair &a, const Pair &b) {
-    const Pair p = two_product(a.value, b.value);
-    return two_sum(p.value, p.rest + (a.value * b.rest + a.rest * b.value));
+template <class Value>
+inline PairOf<Value> product(const PairOf<Value> &a, const PairOf<Value> &b) {
+    const PairOf<Value> p = two_product(a.value, b.value);
+    return two_sum<Value>(p.value, p.rest + (a.value * b.rest + a.rest * b.value));
 }
 
-inline Pair sum(const Pair &a, const Pair &b) {
-    const Pair s = two_sum(a.value, b.value);
-    return two_sum(s.value, s.rest + (a.rest + b.rest));
+template <class Value>
+inline PairOf<Value> sum(const PairOf<Value> &a, const PairOf<Value> &b) {
+    const PairOf<Value> s = two_sum(a.value, b.value);
+    return two_sum<Value>(s.value, s.rest + (a.rest + b.rest));
 }
 
 inline double *newest(const Multistep &ms) { return ms.nodes + ms.place[NEWEST_ROW] * ms.pitch; }
@@ -43,68 +45,97 @@ inline Rows latest(const Multistep &ms, const double *weights, int64_t count) {
     return {weights, newest(ms) - (count - 1) * ms.pitch, count, ms.pitch};
 }
 
-// scale times the sum of rows under their weights; of short rows in two parts, which do not wait for each other.
-inline void history_sum(double scale, const Rows &rows, double *out, int64_t n) {
-    if (n >= LANES) return weighted_sum(scale, rows, out, n);
-    if (n <= 4) {  // float by float, as the newest row has just been written
-        for (int64_t i = 0; i < n; ++i) {
-            double even = 0.0, odd = 0.0;
-            const double *entry = rows.first + i;
-            for (int64_t j = 0; j < rows.count; ++j, entry += rows.stride) (j % 2 ? odd : even) += rows.weights[j] * *entry;
-            out[i] = scale * (even + odd);
-        }
-        return;
-    }
-    Vector sums[2][VECTORS] = {};
-    const double *row = rows.first;  // of which eight entries are read: no row is the last one of its array
-    for (int64_t j = 0; j < rows.count; ++j, row += rows.stride)
-        for (int k = 0; k < VECTORS; ++k) sums[j % 2][k] += rows.weights[j] * load(row + k * WIDTH);
-    double total[LANES];
-    for (int k = 0; k < VECTORS; ++k) store(scale * (sums[0][k] + sums[1][k]), total + k * WIDTH);
-    copy(total, out, n);
+// Their sums from entry i on, in two parts that do not wait for each other.
+template <class Value, int COUNT>
+inline void row_sums(const Rows &rows, int64_t i, Value *out) {
+    constexpr int LENGTH = sizeof(Value) / sizeof(double);
+    Value even[COUNT] = {}, odd[COUNT] = {};
+    const double *row = rows.first + i;
+    const auto add = [&](int64_t j, Value *sums) {
+        for (int k = 0; k < COUNT; ++k) sums[k] += rows.weights[j] * load_as<Value>(row + j * rows.stride + k * LENGTH);
+    };
+    for (int64_t j = 0; j + 1 < rows.count; j += 2) add(j, even), add(j + 1, odd);
+    if (rows.count % 2) add(rows.count - 1, even);
+    for (int k = 0; k < COUNT; ++k) out[k] = even[k] + odd[k];
 }
 
-// Room for one more node; the others move to the first rows where there is none.
+// The vectors that hold the entries `first` to `end` - 1.
+inline void row_sums(const Rows &rows, double *out, int64_t first, int64_t end) {
+    for (int64_t i = first - first % WIDTH; i < end; i += WIDTH) {
+        Vector sum;
+        row_sums<Vector, 1>(rows, i, &sum);
+        store(sum, out + i);
+    }
+}
+
+// out = scale (total + (rest + what the rows add)), to the rows' ends.
+inline void predict(const Rows &rows, double scale, const double *total, const double *rest, double *out) {
+    in_blocks(rows.stride, [&]<class Value, int COUNT>(int64_t i) {
+        Value sums[COUNT];
+        row_sums<Value, COUNT>(rows, i, sums);
+        for (int k = 0; k < COUNT; ++k, i += sizeof(Value) / sizeof(double))
+            store_as<Value>(scale * (load_as<Value>(total + i) + (load_as<Value>(rest + i) + sums[k])), out + i);
+    });
+}
+
+// The row of the next node; the others move to the first rows where there is none left.
 inline double *next_row(const Multistep &ms) {
     int64_t &at = ms.place[NEWEST_ROW];
     if (at + 1 == ms.rows) {
         std::copy(newest(ms) - (ms.order - 1) * ms.pitch, newest(ms) + ms.pitch, ms.nodes);
         at = ms.order - 1;
     }
-    return ms.nodes + ++at * ms.pitch;
+    return ms.nodes + (at + 1) * ms.pitch;
 }
 
-// S += s + a, s += a; what rounding leaves is added up beside them.
-inline void add_to_sums(const Multistep &ms, const double *__restrict a) {
-    double *__restrict S = ms.sums, *__restrict S_rest = S + ms.pitch, *__restrict s = S_rest + ms.pitch,
-           *__restrict s_rest = s + ms.pitch;
-    for (int64_t i = 0; i < ms.half; ++i) {
-        const Pair first = two_sum(s[i], a[i]);
-        s[i] = first.value;
-        s_rest[i] += first.rest;
-        const Pair second = two_sum(S[i], first.value);
-        S[i] = second.value;
-        S_rest[i] += second.rest + s_rest[i];
+// S += s + a, s += a; what rounding leaves is added up beside them. Rows' ends are 0.
+inline void add_to_sums(const Multistep &ms, const double *a) {
+    double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
+    for (int64_t i = 0; i < ms.pitch; i += WIDTH) {
+        const PairOf<Vector> first = two_sum(load(s + i), load(a + i)), second = two_sum(load(S + i), first.value);
+        const Vector rest = load(s_rest + i) + first.rest;
+        store(first.value, s + i);
+        store(rest, s_rest + i);
+        store(second.value, S + i);
+        store(load(S_rest + i) + (second.rest + rest), S_rest + i);
     }
+}
+
+// Whether no entry of a row is NaN or infinite, which times 0 are NaN.
+inline bool is_finite_row(const Multistep &ms, const double *a) {
+    Vector zeros{};
+    for (int64_t i = 0; i < ms.pitch; i += WIDTH) zeros += 0.0 * load(a + i);
+    for (int k = 0; k < WIDTH; ++k)
+        if (!(zeros[k] == 0.0)) return false;
+    return true;
 }
 
 // (y, rest): the state `back` nodes before the newest.
 inline void state_of(const Multistep &ms, int64_t back, double *y, double *rest) {
     const int64_t half = ms.half, n = ms.order;
-    const Pair h{ms.h, 0.0}, square = two_product(ms.h, ms.h);
-    const double lag = 1.0 + static_cast<double>(back);
-    const double *S = ms.sums, *s = S + 2 * ms.pitch;
-    weighted_sum(1.0, latest(ms, ms.states_q + back * n, n), y, half);
-    weighted_sum(1.0, latest(ms, ms.states_v + back * n, n), y + half, half);
-    for (int64_t i = 0; i < half; ++i) {
-        const Pair first{s[i], s[ms.pitch + i]}, moved = two_product(-lag, first.value);
-        const Pair lagged = sum({S[i], S[ms.pitch + i]}, {moved.value, moved.rest - lag * first.rest});
-        const Pair q = product(square, sum(lagged, {y[i], 0.0})), v = product(h, sum(first, {y[half + i], 0.0}));
-        y[i] = q.value;
-        rest[i] = q.rest;
-        y[half + i] = v.value;
-        rest[half + i] = v.rest;
-    }
+    const Pair step{ms.h, 0.0}, step_squared = two_product(ms.h, ms.h);
+    const double lag = -(1.0 + static_cast<double>(back));
+    const double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
+    const Rows rows_q = latest(ms, ms.states_q + back * n, n), rows_v = latest(ms, ms.states_v + back * n, n);
+    in_blocks(half, [&]<class Value, int COUNT>(int64_t i) {
+        const auto both = [](const Pair &a) { return PairOf<Value>{Value{} + a.value, Value{} + a.rest}; };
+        const PairOf<Value> h = both(step), square = both(step_squared);
+        Value shift[COUNT], kick[COUNT];
+        row_sums<Value, COUNT>(rows_q, i, shift);
+        row_sums<Value, COUNT>(rows_v, i, kick);
+        for (int k = 0; k < COUNT; ++k, i += sizeof(Value) / sizeof(double)) {
+            const PairOf<Value> first{load_as<Value>(s + i), load_as<Value>(s_rest + i)};
+            const PairOf<Value> second{load_as<Value>(S + i), load_as<Value>(S_rest + i)};
+            const PairOf<Value> moved = two_product<Value>(Value{} + lag, first.value);
+            const PairOf<Value> lagged = sum<Value>(second, {moved.value, moved.rest + lag * first.rest});
+            const PairOf<Value> q = product(square, sum<Value>(lagged, {shift[k], Value{}}));
+            const PairOf<Value> v = product(h, sum<Value>(first, {kick[k], Value{}}));
+            store_as<Value>(q.value, y + i);
+            store_as<Value>(q.rest, rest + i);
+            store_as<Value>(v.value, y + half + i);
+            store_as<Value>(v.rest, rest + half + i);
+        }
+    });
 }
 
 // The derivative at that node: its velocity, and its acceleration as the history has it.
@@ -172,6 +203,7 @@ inline Code begin_history(const Run &run, double *y) {
         }
         if (!all_finite(w.row(0), w.m)) return NOT_FINITE;
         copy(w.row(0) + ms.half, next_row(ms), ms.half);
+        ++ms.place[NEWEST_ROW];
         if (k != ms.order - 1 - ms.middle) continue;
         for (int64_t part = 0; part < 2; ++part) {
             copy(y + part * ms.half, S + 2 * part * ms.pitch, ms.half);
@@ -183,37 +215,36 @@ inline Code begin_history(const Run &run, double *y) {
     return OK;
 }
 
-// What the corrector would change of the newest position, times the Jacobian, is added to the newest acceleration.
-inline void correct_node(const Run &run, double t, double *a) {
+// What the corrector would change of the newest position, times the Jacobian, is added to the newest acceleration; `older`
+// is the older nodes' part of it.
+inline void correct_node(const Run &run, double t, double *q, const double *older, double *a) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
-    const double *oldest = a - ms.order * ms.pitch + ms.first;
-    history_sum(ms.h * ms.h, {ms.correction, oldest, ms.order + 1, ms.pitch}, ms.moved + ms.first, ms.count);
-    run.system.jacobian(w, t, w.stage, ms.moved, w.f_point);
-    for (int64_t i = ms.first; i < ms.first + ms.count; ++i) a[i] += w.f_point[i];
+    const int64_t end = ms.first + ms.count;
+    for (int64_t i = ms.first; i < end; ++i) ms.change[i] = ms.h * ms.h * (older[i] + ms.correction[ms.order] * a[i]);
+    run.system.jacobian(w, t, q, ms.change, w.f_point, end);
+    // Float by float: they have just been written so, and a load of several would wait until all those stores are done.
+    const volatile double *product = w.f_point;
+    for (int64_t i = ms.first; i < end; ++i) a[i] += product[i];
 }
 
 // One more node.
 inline Code add_node(const Run &run) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
-    const int64_t half = ms.half;
-    const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] + 1) * ms.h, square = ms.h * ms.h;
+    const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] + 1) * ms.h;
     const double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
-    double *q = w.stage, *v = q + half;
-    history_sum(1.0, latest(ms, ms.predict_q, ms.order), q, half);
-    for (int64_t i = 0; i < half; ++i) q[i] = square * (S[i] + (S_rest[i] + q[i]));
-    if (ms.uses_v) {
-        history_sum(1.0, latest(ms, ms.predict_v, ms.order), v, half);
-        for (int64_t i = 0; i < half; ++i) v[i] = ms.h * (s[i] + (s_rest[i] + v[i]));
-    }
-    run.system.rhs_of_scratch(w, t, w.stage, w.row(1));
-    ++w.counters[NFEV];
+    double *y = ms.predicted, *older = y + 2 * ms.pitch;
+    predict(latest(ms, ms.predict_q, ms.order), ms.h * ms.h, S, S_rest, y);
+    if (ms.uses_v) predict(latest(ms, ms.predict_v, ms.order), ms.h, s, s_rest, y + ms.half);
+    if (ms.count > 0) row_sums(latest(ms, ms.correction, ms.order), older, ms.first, ms.first + ms.count);
     double *a = next_row(ms);
-    copy(w.row(1) + half, a, half);
-    if (!all_finite(a, half)) return NOT_FINITE;
-    if (ms.count > 0) correct_node(run, t, a);
+    run.system.acceleration(w, t, y, w.row(1), a);
+    ++w.counters[NFEV];
+    if (!is_finite_row(ms, a)) return NOT_FINITE;
+    if (ms.count > 0) correct_node(run, t, y, older, a);
     add_to_sums(ms, a);
+    ++ms.place[NEWEST_ROW];
     ++ms.place[NEWEST];
     ++ms.place[SINCE];
     return OK;
@@ -280,19 +311,28 @@ inline void values_in_the_middle(const Run &run, double *scratch) {
     }
 }
 
-// What is to be corrected at the newest state, into w.target: the defects in the middle of the history, where the formula for
-// the state is the most accurate. Gradients and values at the newest state are left in w.G and w.values.
-inline void defects_in_the_middle(const Run &run, double *scratch) {
+// (w.y_hat, w.carry_hat): the newest state, with the gradients there in w.G.
+inline void newest_state(const Run &run, double t) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
-    values_in_the_middle(run, scratch);
-    for (int64_t i = 0; i < w.l; ++i) w.target[i] = (w.values[i] - ms.levels[i]) - ms.levels[w.l + i];
-    const double t = ms.t0 + static_cast<double>(ms.place[NEWEST]) * ms.h;
     state_of(ms, 0, w.y_hat, w.carry_hat);
     slope_of(ms, 0, w.y_hat, w.last());
     run.system.grad(w, t, w.y_hat, w.last(), w.G);
-    evaluate_invariants(run, t, w.y_hat);
     ++w.counters[NJEV];
+}
+
+// What is to be corrected at the newest state, into w.target: the defects in the middle of the history, where the formula for
+// the state is the most accurate. Values and gradients at the newest state are left in w.values and w.G.
+inline void defects_in_the_middle(const Run &run, double t, double *scratch) {
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    copy(w.G, w.Q, w.l * w.m);
+    copy(w.carry_hat, w.carry, w.m);
+    values_in_the_middle(run, scratch);
+    for (int64_t i = 0; i < w.l; ++i) w.target[i] = (w.values[i] - ms.levels[i]) - ms.levels[w.l + i];
+    copy(w.Q, w.G, w.l * w.m);
+    copy(w.carry, w.carry_hat, w.m);
+    evaluate_invariants(run, t, w.y_hat);
 }
 
 // The projection of w.y_hat by the defects in w.target, with the targets in the first row of ms.levels. Of a defect as small
@@ -337,15 +377,10 @@ inline void gather_errors(const Multistep &ms, double size, const W &w) {
     if (smooth != OK || w.l == 0 || ms.place[SEEN] <= COLLECTED) return smooth;
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST]) * ms.h;
     gather_errors(ms, size, w);
-    if (o.every == AUTO) {
-        state_of(ms, 0, w.y_hat, w.carry_hat);
-        slope_of(ms, 0, w.y_hat, w.last());
-        run.system.grad(w, t, w.y_hat, w.last(), w.G);
-        ++w.counters[NJEV];
-        if (!tells_more(w)) return OK;
-    }
+    newest_state(run, t);
+    if (o.every == AUTO && !tells_more(w)) return OK;
     copy(w.target, ms.levels, w.l);
-    defects_in_the_middle(run, scratch);
+    defects_in_the_middle(run, t, scratch);
     const int64_t before = w.counters[PROJECTIONS];
     const Code status = project_softly(run, Step{t, t, ms.h, w.y_hat, scratch, true, true});
     if (status != OK) return status;

@@ -100,7 +100,7 @@ Multistep multistep_of(PyObject *record, const Work &w, Arrays &arrays) {
     ms.middle = integer(record, "middle");
     ms.half = w.m / 2;
     ms.pitch = Arrays::length(record, "nodes", 1);
-    ms.rows = Arrays::length(record, "nodes") - 1;  // the last one stays free: sums over short rows read beyond them
+    ms.rows = Arrays::length(record, "nodes");
     ms.predict_q = arrays.floats(record, "predict_q", {ms.order});
     ms.predict_v = arrays.floats(record, "predict_v", {ms.order});
     ms.states_q = arrays.floats(record, "states_q", {ms.order, ms.order});
@@ -119,14 +119,15 @@ Multistep multistep_of(PyObject *record, const Work &w, Arrays &arrays) {
     ms.spacing = integer(record, "spacing");
     ms.first = integer(record, "corrected_first");
     ms.count = integer(record, "corrected_count");
-    ms.nodes = arrays.floats(record, "nodes", {ms.rows + 1, ms.pitch});
+    ms.nodes = arrays.floats(record, "nodes", {ms.rows, ms.pitch});
     ms.sums = arrays.floats(record, "sums", {4, ms.pitch});
-    ms.moved = arrays.floats(record, "moved", {ms.half});
+    ms.predicted = arrays.floats(record, "predicted", {3, ms.pitch});
+    ms.change = arrays.floats(record, "change", {ms.half});
     ms.levels = arrays.floats(record, "levels", {3, w.l});
     ms.place = arrays.integers<int64_t>(record, "place", {N_NODE_PLACES});
     check_history(ms);
     const bool fits = ms.first >= 0 && ms.count >= 0 && ms.first <= ms.half && ms.count <= ms.half - ms.first;
-    const bool sizes = fits && ms.order >= 4 && ms.pitch >= 8 && ms.rows > 2 * ms.order && ms.pitch >= ms.half && ms.middle >= 0;
+    const bool sizes = fits && ms.order >= 4 && ms.pitch % 4 == 0 && ms.rows > 2 * ms.order && ms.pitch >= ms.half && ms.middle >= 0;
     if (w.m % 2 || !sizes || ms.middle >= ms.order || ms.substeps < 1 || ms.spacing < 1 || ms.h == 0.0) {
         PyErr_SetString(PyExc_ValueError, "engine: the record of the multistep method does not fit the run");
         throw PythonError{};

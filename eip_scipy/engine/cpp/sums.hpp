@@ -26,6 +26,30 @@ inline Vector load(const double *a) {
 
 inline void store(Vector v, double *a) { std::memcpy(a, &v, sizeof v); }
 
+// One float, or a vector of them.
+template <class Value>
+inline Value load_as(const double *a) {
+    Value v;
+    std::memcpy(&v, a, sizeof v);
+    return v;
+}
+
+template <class Value>
+inline void store_as(Value v, double *a) {
+    std::memcpy(a, &v, sizeof v);
+}
+
+// part.template operator()<Value, COUNT>(i): COUNT vectors, or floats, from i on, until n. No entry is met twice, and
+// vectors begin at multiples of their length: what has just been written in such vectors is read at once.
+template <class Part>
+inline void in_blocks(int64_t n, const Part &part) {
+    int64_t i = 0;
+    for (; i + 4 * WIDTH <= n; i += 4 * WIDTH) part.template operator()<Vector, 4>(i);
+    if (i + 2 * WIDTH <= n) part.template operator()<Vector, 2>(i), i += 2 * WIDTH;
+    if (i + WIDTH <= n) part.template operator()<Vector, 1>(i), i += WIDTH;
+    for (; i < n; ++i) part.template operator()<double, 1>(i);
+}
+
 struct Lanes {
     Vector part[VECTORS] = {};
 

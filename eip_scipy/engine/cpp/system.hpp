@@ -90,6 +90,14 @@ struct System {
         call_rhs(w, t, y, out);
     }
 
+    // The second half of the derivative at such a state (q, v) into `a`, by way of `f` where it comes with the first.
+    template <class W>
+    void acceleration(const W &w, double t, const double *y, double *f, double *a) {
+        if (by_pointer && second_order) return call_rhs_pointer(w, t, y, a, w.m / 2);
+        rhs_of_scratch(w, t, y, f);
+        copy(f + w.m / 2, a, w.m / 2);
+    }
+
     template <class W>
     void inv(const W &w, double t, const double *y, double *values) {
         if (!by_pointer) return python->inv(t, y, values);
@@ -119,12 +127,13 @@ struct System {
         }
     }
 
-    // Of the accelerations at positions q, times dq; all three of half a state's length, and q and dq scratch.
+    // Of the accelerations at positions q, times dq; all three of half a state's length, and q and dq scratch. Only the
+    // first `count` entries of dq are not 0, and only these of the product are wanted.
     template <class W>
-    void jacobian(const W &w, double t, const double *q, const double *dq, double *out) {
+    void jacobian(const W &w, double t, const double *q, const double *dq, double *out, int64_t count) {
         if (!by_pointer) return python->jacobian(t, q, dq, out);
         const auto &[pointer, library, floats] = jacobian_pointer;
-        if (library) return library(t, q, dq, out, params, w.m / 2, n_params);
+        if (library) return library(t, q, dq, out, params, count, n_params);
         fill(out, NOT_A_NUMBER, floats);
         const int status = pointer(t, q, dq, out, params);
         if (status) [[unlikely]] gave_up(status, {"jacobian", 0, t, {q, q + w.m / 2}, {dq, dq + w.m / 2}}, out, floats);
@@ -138,11 +147,13 @@ struct System {
 
     template <class W>
     void call_rhs(const W &w, double t, const double *y, double *out) {
-        const int64_t half = w.m / 2, floats = second_order ? half : w.m;
-        if (second_order) {
-            copy(y + half, out, half);
-            out += half;
-        }
+        if (!second_order) return call_rhs_pointer(w, t, y, out, w.m);
+        copy(y + w.m / 2, out, w.m / 2);
+        call_rhs_pointer(w, t, y, out + w.m / 2, w.m / 2);
+    }
+
+    template <class W>
+    void call_rhs_pointer(const W &w, double t, const double *y, double *out, int64_t floats) {
         if (rhs_pointer.library) return rhs_pointer.library(t, y, nullptr, out, params, floats, n_params);
         fill(out, NOT_A_NUMBER, floats);
         const int status = rhs_pointer.pointer(t, y, out, params);

@@ -208,6 +208,7 @@ struct LastTwo {
         Octet between[3];
         for (int c = 0; c < 3; ++c) between[c] = q[3 * (first + 1) + c] - q[3 * first + c];
         const Cube cube(squares(between[0], between[1], between[2], 0.0));
+        Vector streams[6];
         for (int t = 0; t < 2; ++t) {
             // A body's own pull is 0: in the third stream that of the first, in the fourth that of the second.
             const auto behind = [=](Vector before, Vector v) {
@@ -217,10 +218,19 @@ struct LastTwo {
             const Vector pull = behind(w[t], cube.times(gm[first + 1 - t]).part[0]);
             for (int c = 0; c < 3; ++c) {
                 const Vector away = t == 0 ? -between[c].part[0] : between[c].part[0];
-                const Vector s = fused(-pull, behind(d[t][c], away), sums[t][c]);
-                out[3 * (first + t) + c] = (s[0] + s[2]) + (s[1] + s[3]);
+                streams[3 * t + c] = fused(-pull, behind(d[t][c], away), sums[t][c]);
             }
         }
+        // (s[0] + s[2]) + (s[1] + s[3]) of each; stored in vectors, as they are read.
+        const auto halves = [&](int k) {
+            const Vector u = streams[k], v = streams[k + 1];
+            return __builtin_shuffle(u, v, Bits{0, 1, 4, 5}) + __builtin_shuffle(u, v, Bits{2, 3, 6, 7});
+        };
+        const Vector a = halves(0), b = halves(2), c = halves(4);
+        eip::store(__builtin_shuffle(a, b, Bits{0, 2, 4, 6}) + __builtin_shuffle(a, b, Bits{1, 3, 5, 7}), out + 3 * first);
+        const Vector rest = c + __builtin_shuffle(c, Bits{1, 0, 3, 2});
+        out[3 * first + 4] = rest[0];
+        out[3 * first + 5] = rest[2];
     }
 };
 
