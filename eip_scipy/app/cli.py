@@ -12,6 +12,7 @@ from .. import comparators, problems
 from ..core.results import ProjectionWarning
 from ..core.versions import versions
 from ..problems.gravity import solar_data
+from . import doctor
 from .condensates import gpe
 from .hard import cases as hard_cases
 from .hard import scenes as hard_scenes
@@ -99,6 +100,11 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
     """For each command a summary, what adds its options, and what runs it."""
     return {
         "list": ("list commands, methods, problems and data sets", lambda parser: None, _list),
+        "doctor": (
+            "what is installed, and a test of it in seconds",
+            doctor.add_arguments,
+            doctor.run,
+        ),
         "solar-system": (
             "run the solar system and compare with other methods (the paper's Experiment II)",
             solar_system.add_arguments,
