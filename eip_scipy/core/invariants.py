@@ -11,6 +11,7 @@ import numpy as np
 
 from ..engine.data import EPS
 from ..engine.native import Call, call
+from .arguments import names, scalars
 from .inputs import count, filled, flag, is_number, reals, refuse_units, require_arguments, shown
 from .jitted import NotCompilableError, is_jitted, jit_is_off, numba_errors
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
@@ -248,9 +249,9 @@ def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype
 
 
 def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple, extra: tuple) -> None:
-    given = (*first, *(f"args[{k}]" for k in range(len(args))), *("params" for _ in extra))
+    given = (*first, *(f"args[{k}]" for k in range(len(args))), *names(extra))
     mend = "Give what it takes besides by Invariant(..., args=(...,))"
-    mend += ", or take the run's params as its last argument." if extra else "."
+    mend += f", or take the run's {names(extra)[0].partition('[')[0]} as its last arguments." if extra else "."
     require_arguments(fun, given, what, mend)
 
 
@@ -407,13 +408,14 @@ class InvariantSet:
 
     def _with_gradient(self, item: Invariant, label: str, n: int, shape: tuple[int, ...]) -> Invariant:
         """A jitted invariant with a compiled gradient, where it comes without one; any other, as it is."""
-        if not _lacks_gradient(item):
+        numbers = scalars(self.extra)
+        if not _lacks_gradient(item) or numbers is None:
             return item
         from .jitted_gradients import gradient_by_duals  # which loads Numba
 
         item = copy(item)
         try:
-            item.grad, item.in_place = gradient_by_duals(item.fun, n, shape, bool(self.extra)), True
+            item.grad, item.in_place = gradient_by_duals(item.fun, n, shape, bool(self.extra), numbers), True
         except NotCompilableError as error:
             self.why_not[label] = str(error)
         return item

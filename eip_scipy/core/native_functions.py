@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 import numpy as np
 
 from ..engine.native import LibraryFunction, NativeFunctions
+from .arguments import Packed
 from .invariants import InvariantSet
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import PointerFunction
@@ -26,7 +27,7 @@ class Kind(NamedTuple):
 
     `shape` of its value, () for a number; `size` of the state it gets; `p` of its params, -1 where it takes none; the
     type of the state's numbers; whether the value is real, the function takes f, fills an argument `out`, or is a
-    gradient.
+    gradient. `scalars`: the types of the numbers that it takes instead of params, see `Packed`.
     """
 
     shape: tuple[int, ...]
@@ -37,6 +38,7 @@ class Kind(NamedTuple):
     takes_f: bool = False
     in_place: bool = False
     gradient: bool = False
+    scalars: str = ""
 
 
 class Native(NamedTuple):
@@ -52,7 +54,7 @@ class Native(NamedTuple):
 
 
 def native_functions(
-    fun: Callable[..., Any], form: str, params: np.ndarray | None, invariants: InvariantSet, y0: np.ndarray
+    fun: Callable[..., Any], form: str, params: Packed | None, invariants: InvariantSet, y0: np.ndarray
 ) -> NativeFunctions:
     """The addresses of a run's functions, but for its events.
 
@@ -61,8 +63,8 @@ def native_functions(
     fun : callable
         The right-hand side, of the `form` "value", "in place", "acceleration" or "acceleration in place".
     form : str
-    params : ndarray or None
-        Their last argument, where they take one; the functions read this array.
+    params : Packed or None
+        Their last arguments, where they take any; the functions read its array.
     invariants : InvariantSet
     y0 : ndarray, shape (n,)
 
@@ -76,7 +78,8 @@ def native_functions(
     size = n // 2 if second_order else n
     number = _number(params, y0)
     kind = number._replace(shape=(size,), size=size, real=False, in_place=form.endswith("place"))
-    rhs = function_alone(fun, kind, "fun", params, second_order=second_order)
+    values = None if params is None else params.values
+    rhs = function_alone(fun, kind, "fun", values, second_order=second_order)
     inv, grad = list[Native](), list[Native]()
     for k, (item, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
         name = f"invariant {label!r}"
@@ -86,7 +89,8 @@ def native_functions(
         inv.append(_native(item.fun, number._replace(shape=shape), name))
         if item.grad is None:
             raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
-        rows = Kind((*shape, n), n, number.p, number.dtype, False, item.uses_f, item.in_place, gradient=True)
+        rows = number._replace(shape=(*shape, n), real=False, takes_f=item.uses_f)
+        rows = rows._replace(in_place=item.in_place, gradient=True)
         grad.append(_native(item.grad, rows, f"gradient of {name}"))
     return rhs._replace(inv=_addresses(inv), grad=_addresses(grad), owner=rhs.owner | {"inv": inv, "grad": grad})
 
@@ -114,7 +118,7 @@ def function_alone(
 
 
 def with_events(
-    functions: NativeFunctions, events: Sequence[Callable[..., Any]], params: np.ndarray | None, y0: np.ndarray
+    functions: NativeFunctions, events: Sequence[Callable[..., Any]], params: Packed | None, y0: np.ndarray
 ) -> NativeFunctions:
     """The same with the addresses of the events.
 
@@ -129,7 +133,7 @@ def with_events(
 
 
 def with_jacobian(
-    functions: NativeFunctions, jacobian: Callable[..., Any], params: np.ndarray | None, y0: np.ndarray
+    functions: NativeFunctions, jacobian: Callable[..., Any], params: Packed | None, y0: np.ndarray
 ) -> NativeFunctions:
     """The same with the address of the accelerations' Jacobian times a vector, ``jacobian(t, q, dq, out[, params])``.
 
@@ -158,8 +162,10 @@ def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: byt
     raise function.failure(t, y, f, functions.params)
 
 
-def _number(params: np.ndarray | None, y0: np.ndarray) -> Kind:
-    return Kind((), y0.size, -1 if params is None else params.size, y0.dtype.char, real=True)
+def _number(params: Packed | None, y0: np.ndarray) -> Kind:
+    if params is None:
+        return Kind((), y0.size, -1, y0.dtype.char, real=True)
+    return Kind((), y0.size, params.values.size, y0.dtype.char, real=True, scalars=params.scalars)
 
 
 def _native(fun: Any, kind: Kind, name: str) -> Native:
