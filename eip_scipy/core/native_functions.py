@@ -42,15 +42,17 @@ class Kind(NamedTuple):
 
 
 class Native(NamedTuple):
-    """A function that has an address, and how many floats it fills."""
+    """A function that has an address, and how many floats it fills; None for a gradient by differences."""
 
-    function: PointerFunction | Compiled | LibraryFunction
+    function: PointerFunction | Compiled | LibraryFunction | None
     floats: int
 
     @property
     def entry(self) -> Any:
         """What the engine takes: a function of the library's itself, the address of any other."""
-        return self.function if isinstance(self.function, LibraryFunction) else self.function.address
+        if self.function is None or isinstance(self.function, LibraryFunction):
+            return self.function
+        return self.function.address
 
 
 def native_functions(
@@ -87,12 +89,20 @@ def native_functions(
             raise NotCompilableError(f"{name} has args; pass its parameters through params")
         shape = () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
         inv.append(_native(item.fun, number._replace(shape=shape), name))
+        if item.grad is None and isinstance(item.fun, PointerFunction):
+            grad.append(Native(None, inv[-1].floats * n * (2 if y0.dtype.kind == "c" else 1)))
+            continue
         if item.grad is None:
             raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
         rows = number._replace(shape=(*shape, n), real=False, takes_f=item.uses_f)
         rows = rows._replace(in_place=item.in_place, gradient=True)
         grad.append(_native(item.grad, rows, f"gradient of {name}"))
-    return rhs._replace(inv=_addresses(inv), grad=_addresses(grad), owner=rhs.owner | {"inv": inv, "grad": grad})
+    return rhs._replace(
+        inv=_addresses(inv),
+        grad=_addresses(grad),
+        floors=invariants.floors,
+        owner=rhs.owner | {"inv": inv, "grad": grad},
+    )
 
 
 def function_alone(

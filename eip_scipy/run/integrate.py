@@ -458,6 +458,9 @@ class Loop:
     def explained(self, message: str) -> str:
         """With what speaks against the run, and what is to be said about checkpoints and not being compiled."""
         notes = [*self.keeper.notes, *([] if self.why_not is None else [self.why_not])]
+        if labels := self.driver.run.invariants.by_differences:
+            names = ", ".join(map(repr, labels))
+            notes.append(f"the gradient of {names} comes from differences: one of its own would be faster and exact")
         doubt = self.driver.run.trust.message
         message = f"{message}; {doubt}" if doubt else message
         return f"{message} ({'; '.join(notes)})" if notes else message

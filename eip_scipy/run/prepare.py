@@ -190,7 +190,8 @@ class System:
         found = {"fun": kind(self.fun, in_python)}
         for item, label in zip(run.invariants.items, run.invariants.labels, strict=True):
             found[label] = kind(item.fun, in_python)
-            found[f"gradient of {label}"] = kind(item.grad, in_python)
+            differences = item.grad is None and not in_python
+            found[f"gradient of {label}"] = "differences" if differences else kind(item.grad, in_python)
         if self._corrects(run):
             found["jacobian"] = kind(self.jacobian, in_python)
         in_python = isinstance(functions, PythonFunctions) or functions.python is not None
