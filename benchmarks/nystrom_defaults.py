@@ -6,12 +6,13 @@ Ten bodies over 100 and 1000 years, orbits of exoplanets, the hard scenes and al
 with the velocity; fixed steps that bring EIPRKN12 to about 1e-3, 1e-6, 1e-9 and 1e-12, and three tolerances. Each
 figure is over three neighbouring steps or tolerances, for a single run's last digits are luck: the geometric mean of
 the errors at the end and of the largest changes of an invariant along the run (up to 4000 of its rows), the sum of the
-times, and how many runs were not trusted. Exoplanets need heyoka and
-REBOUNDx.
+times, and how many runs were not trusted. Exoplanets need
+heyoka and REBOUNDx.
 
 What came of it: the error is that of projecting each step, compensated or not, but where rounding is most of it, and
-there compensation divides it by up to 40. But compensation takes 10 to 40 % more time in all runs, and "auto" leaves
-invariants at 1e-9 to 1e-7 between projections at loose tolerances. Neither is never worse, so neither is a default.
+there both together divide it by up to 1000 (1000 years). But compensation takes 10 to 40 % more time in most runs,
+"auto" leaves invariants at 1e-9 to 1e-7 between projections at loose tolerances, and with either members of an ensemble
+do not go side by side. Neither is never worse, so neither is a default.
 """
 
 from __future__ import annotations
