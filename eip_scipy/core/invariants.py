@@ -11,6 +11,7 @@ import numpy as np
 
 from ..engine.data import EPS
 from ..engine.native import Call, call
+from .arguments import names, scalars
 from .inputs import count, filled, flag, is_number, reals, refuse_units, require_arguments, shown
 from .jitted import NotCompilableError, is_jitted, jit_is_off, numba_errors
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
@@ -26,9 +27,12 @@ CHECK_TOLERANCE, CHECK_NOISE = 1e-4, 6.0
 INVARIANCE_TOLERANCE = 1e-8
 TARGET_TOLERANCE = 1e-8
 COMPLEX_STEP = 1e-100
-# Central differences of order 6: weights of +-1, +-2, +-3 steps (Fornberg 1988, table 1).
+# Central differences of order 6: weights of +-1, +-2, +-3 steps (Fornberg 1988, table 1); those of order 4, to compare.
 DIFFERENCE_WEIGHTS = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
-DIFFERENCE_STEP = 5e-3
+LOWER_WEIGHTS = (2 / 3, -1 / 12, 0.0)
+# As in engine/cpp/differences.hpp.
+FIRST_SHIFT, SHORTER, MOST_SHIFTS = 5e-3, 1 / 16, 5
+DIFFER, ROUNDINGS, LEAST = 1e-8, 1e3, np.finfo(float).tiny
 
 
 class Invariant:
@@ -41,8 +45,9 @@ class Invariant:
     grad : callable, optional
         ``grad(t, y, *args) -> (n,) or (l_i, n)``. For complex y, dI = Re sum_k conj(g_k) dy_k. Without it a function
         jitted by Numba, of a real state and without `args`, gets a compiled one by dual numbers, exact to rounding.
-        For any other, the gradient comes from a complex step where `fun` allows one, else from central differences of
-        order 6 (with a warning; both cost n evaluations of `fun` and more, and neither is compiled).
+        That of a C function comes from central differences of order 6, in the engine; for any other, from a complex
+        step where `fun` allows one, else from such differences (with a warning; not compiled). A complex step takes n
+        evaluations of `fun`, differences 6 n and more.
     target : float or array_like, shape (l_i,), optional
         The value to keep. Default: the value at the start. A given target is a condition that the start must meet.
     args : tuple, optional
@@ -67,7 +72,7 @@ class Invariant:
     C functions are given as `scipy.LowLevelCallable`, ctypes or cffi function pointers, of the signatures
     ``int I(double t, const double *y, double *values, const double *params)`` and
     ``int G(double t, const double *y, const double *f, double *out, const double *params)``; f is the derivative with
-    ``uses_f=True`` and holds nothing else. A C function needs a `grad`. See :doc:`/c-functions`.
+    ``uses_f=True`` and holds nothing else. See :doc:`/c-functions`.
 
     Examples
     --------
@@ -97,8 +102,6 @@ class Invariant:
             raise TypeError(f"Invariant: fun must be callable, got {fun!r}{address_hint(fun)}.")
         if grad is not None and not callable(grad):
             raise TypeError(f"Invariant: grad must be callable or None, got {grad!r}{address_hint(grad)}.")
-        if grad is None and isinstance(fun, PointerFunction):
-            raise TypeError(f"{what} is a C function by pointer, and comes without grad; give one, in C or not.")
         if grad is None and (in_place or uses_f):
             raise ValueError("Invariant: in_place and uses_f describe grad; give grad or leave them out.")
         refuse_units(target=target, args=args, scale=scale)
@@ -248,23 +251,21 @@ def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype
 
 
 def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple, extra: tuple) -> None:
-    given = (*first, *(f"args[{k}]" for k in range(len(args))), *("params" for _ in extra))
+    given = (*first, *(f"args[{k}]" for k in range(len(args))), *names(extra))
     mend = "Give what it takes besides by Invariant(..., args=(...,))"
-    mend += ", or take the run's params as its last argument." if extra else "."
+    mend += f", or take the run's {names(extra)[0].partition('[')[0]} as its last arguments." if extra else "."
     require_arguments(fun, given, what, mend)
 
 
 class NumericalGradient:
     """Gradient of an invariant without `grad`: complex step where it is valid, else differences of order 6."""
 
-    def __init__(
-        self, invariant: Invariant, label: str, t: float, y: Array, f: Array, tau: float, extra: tuple
-    ) -> None:
+    def __init__(self, invariant: Invariant, label: str, t: float, y: Array, floors: Array, extra: tuple) -> None:
         self._invariant, self._label = invariant, label
-        self._floor = np.where(np.isfinite(f), np.abs(tau * f), 0.0)
-        self._floor[(self._floor == 0) & (y == 0)] = 1.0
-        self.complex_step = y.dtype.kind == "f" and self._complex_step_is_valid(t, y, extra)
-        if not self.complex_step:
+        self.floors = floors
+        by_pointer = isinstance(invariant.fun, PointerFunction)
+        self.complex_step = y.dtype.kind == "f" and not by_pointer and self._complex_step_is_valid(t, y, extra)
+        if not self.complex_step and not by_pointer:
             warnings.warn(
                 f"invariant {label!r} has no grad and allows no complex step: its gradient comes from central "
                 "differences of order 6 (about 1e-12 relative). Give grad for full accuracy and speed.",
@@ -275,7 +276,7 @@ class NumericalGradient:
     def __call__(self, t: float, y: Array, *extra: Any) -> Array:
         if self.complex_step:
             return self._by_complex_step(t, y, extra)
-        return difference_gradient(lambda x: self._fun(t, x, extra), y, self._floor)
+        return difference_gradient(lambda x: self._fun(t, x, extra), y, self.floors)
 
     def _fun(self, t: float, y: Array, extra: tuple) -> Array:
         return np.asarray(self._invariant.fun(t, y.copy(), *self._invariant.args, *extra))
@@ -302,30 +303,64 @@ class NumericalGradient:
         if np.any(np.imag(plain) != 0) or not np.allclose(np.real(plain), self._fun(t, y, extra), rtol=1e-12):
             return False
         # Beside y, which may be a point where the derivatives of |y_k| and the like happen to vanish.
-        size = np.abs(y) + self._floor
+        size = np.abs(y) + self.floors
         y = y + 0.01 * size * np.random.default_rng(20220).standard_normal(y.size)
         G = self._by_complex_step(t, y, extra)
-        D = difference_gradient(lambda x: self._fun(t, x, extra), y, self._floor)
+        D = difference_gradient(lambda x: self._fun(t, x, extra), y, self.floors)
         return bool(np.all(np.abs((G - D) * size) <= 1e-7 * np.max(np.abs(D * size), axis=-1, keepdims=True)))
 
 
 def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -> Array:
-    """Gradient of value(y) by central differences of order 6, steps in units of |y_k| + floor_k."""
+    """Gradient of value(y) by central differences of order 6, shifts in units of |y_k| + floor_k.
+
+    Where those of order 4 do not agree, as beside a singularity that is nearer than the state's size, the shifts are
+    shortened while that helps. The engine computes the same bits (engine/cpp/differences.hpp).
+    """
 
     def along(k: int, unit: complex) -> Any:
-        # A power of two: y + step and y - step then differ by the step exactly, but for their own rounding.
-        step = 2.0 ** np.round(np.log2(DIFFERENCE_STEP * (abs(y[k]) + floor[k])))
-        total: Any = 0.0
-        for multiple, weight in DIFFERENCE_WEIGHTS:
-            shift = np.zeros_like(y)
-            shift[k] = multiple * step * unit
-            total = total + weight * (np.asarray(value(y + shift)) - np.asarray(value(y - shift)))
-        return total / step
+        # A power of two: y + shift and y - shift then differ by the shift exactly, but for their own rounding.
+        shift = 2.0 ** np.round(np.log2(FIRST_SHIFT * (abs(y[k]) + floor[k])))
+        found, least = None, np.inf
+        for _ in range(MOST_SHIFTS):
+            sums, excess = _shifted_sums(value, y, k, shift * unit)
+            found = np.full_like(sums, np.nan) if found is None else found
+            if excess < least:
+                found, least = sums / shift, excess
+            elif least < np.inf:
+                break
+            if least <= 1:
+                break
+            shift *= SHORTER
+        return found
 
     columns = [along(k, 1.0) for k in range(y.size)]
     if y.dtype.kind == "c":
         columns = [column + 1j * along(k, 1j) for k, column in enumerate(columns)]
     return np.stack(columns, axis=-1)
+
+
+def _shifted_sums(value: Callable[[Array], Any], y: Array, k: int, shift: complex) -> tuple[Array, float]:
+    """The sums of order 6 over shifts of y_k, and by how much more than they may those of order 4 differ."""
+    sums, lower, largest = np.zeros(()), np.zeros(()), np.zeros(())
+    for (multiple, weight), lower_weight in zip(DIFFERENCE_WEIGHTS, LOWER_WEIGHTS, strict=True):
+        ends = [y.copy(), y.copy()]
+        ends[0][k] += multiple * shift
+        ends[1][k] -= multiple * shift
+        above, below = (np.asarray(value(end)) for end in ends)
+        with np.errstate(invalid="ignore"):
+            sums, lower = sums + weight * (above - below), lower + lower_weight * (above - below)
+            largest = np.max([np.broadcast_to(largest, above.shape), np.abs(above), np.abs(below)], axis=0)
+    with np.errstate(invalid="ignore"):
+        excess = np.abs(sums - lower) / (DIFFER * np.abs(sums) + ROUNDINGS * EPS * largest + LEAST)
+    return sums, float(np.max(excess, initial=0.0))
+
+
+def _floors(y: Array, f: Array, tau: float) -> Array:
+    """By component: as if of what size one is to be shifted that is small now; 1 where nothing is known."""
+    floors = np.where(np.isfinite(f), np.abs(tau * f), 0.0)
+    floors = np.maximum(floors, 1e-3 * np.abs(y))
+    floors[floors == 0] = 1.0
+    return floors
 
 
 class Complaint(NamedTuple):
@@ -351,6 +386,7 @@ class InvariantSet:
         self.extra = extra
         # Why a jitted invariant has no compiled gradient, by its label.
         self.why_not: dict[str, str] = {}
+        self.floors = _floors(y0, f0, tau)
         self.labels = [item.name or f"invariant {k}" for k, item in enumerate(self.items)]
         functions = [bound(item.fun, item.args + extra) for item in self.items]
         values = [
@@ -374,7 +410,7 @@ class InvariantSet:
         self.scales = np.repeat([float(item.scale or 0.0) for item in self.items], sizes)
         self.uses_f = any(item.uses_f for item in self.items)
         self.grads = [
-            item.grad if item.grad is not None else NumericalGradient(item, label, t0, y0, f0, tau, extra)
+            item.grad if item.grad is not None else NumericalGradient(item, label, t0, y0, self.floors, extra)
             for item, label in zip(self.items, self.labels, strict=True)
         ]
         self.target = self._targets()
@@ -394,6 +430,12 @@ class InvariantSet:
         self._gradients_at_start(t0, y0, f0)
         self.calls = self._calls(y0)
 
+    @property
+    def by_differences(self) -> list[str]:
+        """The C functions by pointer without a gradient, by their labels."""
+        known = zip(self.items, self.labels, strict=True)
+        return [label for item, label in known if item.grad is None and isinstance(item.fun, PointerFunction)]
+
     def with_targets(self) -> tuple[Invariant, ...]:
         """The invariants with the values that are kept as their targets."""
         kept = [copy(item) for item in self.items]
@@ -407,13 +449,14 @@ class InvariantSet:
 
     def _with_gradient(self, item: Invariant, label: str, n: int, shape: tuple[int, ...]) -> Invariant:
         """A jitted invariant with a compiled gradient, where it comes without one; any other, as it is."""
-        if not _lacks_gradient(item):
+        numbers = scalars(self.extra)
+        if not _lacks_gradient(item) or numbers is None:
             return item
         from .jitted_gradients import gradient_by_duals  # which loads Numba
 
         item = copy(item)
         try:
-            item.grad, item.in_place = gradient_by_duals(item.fun, n, shape, bool(self.extra)), True
+            item.grad, item.in_place = gradient_by_duals(item.fun, n, shape, bool(self.extra), numbers), True
         except NotCompilableError as error:
             self.why_not[label] = str(error)
         return item

@@ -20,13 +20,16 @@ __all__ = ["gradient_by_duals"]
 LANES = 12
 # Duals on the stack, at most.
 STACK = 64
+NUMBERS = {"d": types.float64, "q": types.int64, "?": types.boolean}
 # How the line of Numba's errors begins that names what is missing.
 SAYING = ("No implementation", "Cannot", "Unknown")
 
 
 @lru_cache(maxsize=256)
-def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool) -> Any:
+def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, scalars: str = "") -> Any:
     """The gradient ``grad(t, y, out[, params])`` of a jitted invariant, by dual numbers: exact but for rounding.
+
+    With `scalars`, the types of some numbers, it is ``grad(t, y, out, *numbers)``.
 
     Raises
     ------
@@ -36,7 +39,7 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
     passes = -(-n // LANES)
     lanes = -(-n // passes)
     dual = Dual(lanes)
-    call = _with_params(for_duals(fun, dual), has_params)
+    call = _with_params(for_duals(fun, dual), has_params, bool(scalars))
 
     made = (lambda: np.empty(n, dual)) if n > STACK else (lambda: stack_array(dual, n))
     new_state = inside(made, forceinline=True)
@@ -48,18 +51,23 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
                 x[i] = seed(dual, y[i], i - first)
             put_slopes(call(t, x, params), out, first, min(lanes, n - first))
 
-    return _compiled(filled, shape, has_params)
+    return _compiled(filled, shape, has_params, scalars)
 
 
-def _with_params(fun: Any, has_params: bool) -> Any:
+def _with_params(fun: Any, has_params: bool, one_by_one: bool) -> Any:
+    if one_by_one:
+        return inside(lambda t, x, numbers: fun(t, x, *numbers))
     return inside((lambda t, x, params: fun(t, x, params)) if has_params else (lambda t, x, params: fun(t, x)))
 
 
-def _compiled(filled: Callable[..., None], shape: tuple[int, ...], has_params: bool) -> Any:
+def _compiled(filled: Callable[..., None], shape: tuple[int, ...], has_params: bool, scalars: str) -> Any:
     """A gradient compiled for real states, as it is called from Python; from the engine it takes the same types."""
     filled = inside(filled)
     floats, out = (types.Array(types.float64, ndim, "C") for ndim in (1, 1 + len(shape)))
-    if has_params:
+    if scalars:
+        numbers = types.BaseTuple.from_types([NUMBERS[scalar] for scalar in scalars])
+        gradient, arguments = njit(lambda t, y, out, *numbers: filled(t, y, out, numbers)), [floats, out, numbers]
+    elif has_params:
         gradient, arguments = njit(lambda t, y, out, params: filled(t, y, out, params)), [floats, out, floats]
     else:
         gradient, arguments = njit(lambda t, y, out: filled(t, y, out, y)), [floats, out]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 import numpy as np
 
 from ..engine.native import LibraryFunction, NativeFunctions
+from .arguments import Packed
 from .invariants import InvariantSet
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import PointerFunction
@@ -26,7 +27,7 @@ class Kind(NamedTuple):
 
     `shape` of its value, () for a number; `size` of the state it gets; `p` of its params, -1 where it takes none; the
     type of the state's numbers; whether the value is real, the function takes f, fills an argument `out`, or is a
-    gradient.
+    gradient. `scalars`: the types of the numbers that it takes instead of params, see `Packed`.
     """
 
     shape: tuple[int, ...]
@@ -37,22 +38,25 @@ class Kind(NamedTuple):
     takes_f: bool = False
     in_place: bool = False
     gradient: bool = False
+    scalars: str = ""
 
 
 class Native(NamedTuple):
-    """A function that has an address, and how many floats it fills."""
+    """A function that has an address, and how many floats it fills; None for a gradient by differences."""
 
-    function: PointerFunction | Compiled | LibraryFunction
+    function: PointerFunction | Compiled | LibraryFunction | None
     floats: int
 
     @property
     def entry(self) -> Any:
         """What the engine takes: a function of the library's itself, the address of any other."""
-        return self.function if isinstance(self.function, LibraryFunction) else self.function.address
+        if self.function is None or isinstance(self.function, LibraryFunction):
+            return self.function
+        return self.function.address
 
 
 def native_functions(
-    fun: Callable[..., Any], form: str, params: np.ndarray | None, invariants: InvariantSet, y0: np.ndarray
+    fun: Callable[..., Any], form: str, params: Packed | None, invariants: InvariantSet, y0: np.ndarray
 ) -> NativeFunctions:
     """The addresses of a run's functions, but for its events.
 
@@ -61,8 +65,8 @@ def native_functions(
     fun : callable
         The right-hand side, of the `form` "value", "in place", "acceleration" or "acceleration in place".
     form : str
-    params : ndarray or None
-        Their last argument, where they take one; the functions read this array.
+    params : Packed or None
+        Their last arguments, where they take any; the functions read its array.
     invariants : InvariantSet
     y0 : ndarray, shape (n,)
 
@@ -76,7 +80,8 @@ def native_functions(
     size = n // 2 if second_order else n
     number = _number(params, y0)
     kind = number._replace(shape=(size,), size=size, real=False, in_place=form.endswith("place"))
-    rhs = function_alone(fun, kind, "fun", params, second_order=second_order)
+    values = None if params is None else params.values
+    rhs = function_alone(fun, kind, "fun", values, second_order=second_order)
     inv, grad = list[Native](), list[Native]()
     for k, (item, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
         name = f"invariant {label!r}"
@@ -84,11 +89,20 @@ def native_functions(
             raise NotCompilableError(f"{name} has args; pass its parameters through params")
         shape = () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
         inv.append(_native(item.fun, number._replace(shape=shape), name))
+        if item.grad is None and isinstance(item.fun, PointerFunction):
+            grad.append(Native(None, inv[-1].floats * n * (2 if y0.dtype.kind == "c" else 1)))
+            continue
         if item.grad is None:
             raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
-        rows = Kind((*shape, n), n, number.p, number.dtype, False, item.uses_f, item.in_place, gradient=True)
+        rows = number._replace(shape=(*shape, n), real=False, takes_f=item.uses_f)
+        rows = rows._replace(in_place=item.in_place, gradient=True)
         grad.append(_native(item.grad, rows, f"gradient of {name}"))
-    return rhs._replace(inv=_addresses(inv), grad=_addresses(grad), owner=rhs.owner | {"inv": inv, "grad": grad})
+    return rhs._replace(
+        inv=_addresses(inv),
+        grad=_addresses(grad),
+        floors=invariants.floors,
+        owner=rhs.owner | {"inv": inv, "grad": grad},
+    )
 
 
 def function_alone(
@@ -114,7 +128,7 @@ def function_alone(
 
 
 def with_events(
-    functions: NativeFunctions, events: Sequence[Callable[..., Any]], params: np.ndarray | None, y0: np.ndarray
+    functions: NativeFunctions, events: Sequence[Callable[..., Any]], params: Packed | None, y0: np.ndarray
 ) -> NativeFunctions:
     """The same with the addresses of the events.
 
@@ -129,7 +143,7 @@ def with_events(
 
 
 def with_jacobian(
-    functions: NativeFunctions, jacobian: Callable[..., Any], params: np.ndarray | None, y0: np.ndarray
+    functions: NativeFunctions, jacobian: Callable[..., Any], params: Packed | None, y0: np.ndarray
 ) -> NativeFunctions:
     """The same with the address of the accelerations' Jacobian times a vector, ``jacobian(t, q, dq, out[, params])``.
 
@@ -158,8 +172,10 @@ def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: byt
     raise function.failure(t, y, f, functions.params)
 
 
-def _number(params: np.ndarray | None, y0: np.ndarray) -> Kind:
-    return Kind((), y0.size, -1 if params is None else params.size, y0.dtype.char, real=True)
+def _number(params: Packed | None, y0: np.ndarray) -> Kind:
+    if params is None:
+        return Kind((), y0.size, -1, y0.dtype.char, real=True)
+    return Kind((), y0.size, params.values.size, y0.dtype.char, real=True, scalars=params.scalars)
 
 
 def _native(fun: Any, kind: Kind, name: str) -> Native:

@@ -136,8 +136,16 @@ def _array(context: Any, builder: Any, kind: types.Array, data: Any, shape: tupl
 def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
     """``call(t, y, f, out, params)``, which puts the function's value into out."""
     has_params = kind.p >= 0
+    numbers = _numbers(kind.scalars, jit)
     bare = jit(
         {
+            (False, False): lambda t, y, f, out, params: fun(t, y, *numbers(params)),
+            (False, True): lambda t, y, f, out, params: fun(t, y, out, *numbers(params)),
+            (True, False): lambda t, y, f, out, params: fun(t, y, f, *numbers(params)),
+            (True, True): lambda t, y, f, out, params: fun(t, y, f, out, *numbers(params)),
+        }[kind.takes_f, kind.in_place]
+        if kind.scalars
+        else {
             (False, False, False): lambda t, y, f, out, params: fun(t, y),
             (False, False, True): lambda t, y, f, out, params: fun(t, y, params),
             (False, True, False): lambda t, y, f, out, params: fun(t, y, out),
@@ -152,6 +160,20 @@ def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
         return bare
     put = {0: _put_number, 1: _put_values if kind.real else _put_array, 2: _put_rows}[len(kind.shape)]
     return jit(lambda t, y, f, out, params: put(bare(t, y, f, out, params), out))
+
+
+def _numbers(types: str, jit: Any, k: int = 0) -> Any:
+    """``numbers(params)``: those from the kth on as a tuple, of these types."""
+    if k == len(types):
+        return jit(lambda params: ())
+    rest = _numbers(types, jit, k + 1)
+    return jit(
+        {
+            "d": lambda params: (params[k],) + rest(params),
+            "q": lambda params: (int(params[k]),) + rest(params),
+            "?": lambda params: (params[k] != 0,) + rest(params),
+        }[types[k]]
+    )
 
 
 @_called

@@ -161,7 +161,8 @@ class ProjectionOptions:
         metadata=_text(
             'int or "auto"',
             """Project each `every`-th step and the last one; "auto": when the error estimates, added in quadrature
-            since the last projection, make an invariant more uncertain than round-off (asked at each fifth step).
+            since the last projection, make an invariant more uncertain than round-off (asked at each fifth step
+            and after a projection).
             Default: the method's own, "auto" for a multistep method and 1 for others.""",
         ),
     )

@@ -10,6 +10,9 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from .arguments import floats, scalars
+from .inputs import reals, shown
+
 __all__ = ["GRADIENT", "VALUE", "CFunctions", "PointerFunction", "address_hint", "by_pointer", "is_pointer"]
 
 VALUE = "int (double t, const double *y, double *out, const double *params)"
@@ -23,7 +26,6 @@ PROTOTYPES = {
     kind: ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[ctypes.c_void_p] * types.count("*"))
     for kind, types in TYPES.items()
 }
-NONE = np.zeros(0)
 # The class of all function pointers of ctypes, under the name that its documentation gives.
 FROM_CTYPES: Any = ctypes._CFuncPtr  # type: ignore[attr-defined]
 _capsule_name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(("PyCapsule_GetName", ctypes.pythonapi))
@@ -107,9 +109,13 @@ class PointerFunction:
             f = rest.pop(0) if self.takes_f else np.full_like(state, np.nan)
             given.append(np.ascontiguousarray(f, state.dtype))
         out = rest.pop(0) if self.shape is None else np.full(self.shape, np.nan)
-        given += [out, np.ascontiguousarray(rest.pop(0), float) if rest else NONE]
-        if rest:
-            raise TypeError(f"{self.name} is a C function by pointer: besides t and y it takes params only.")
+        numbers = reals(rest[0]) if len(rest) == 1 else _as_params(tuple(rest))
+        if numbers is None:
+            raise TypeError(
+                f"{self.name} is a C function by pointer: besides t and y it takes numbers or one array of floats, as "
+                f"its params; it got {', '.join(map(shown, rest))}."
+            )
+        given += [out, np.ascontiguousarray(numbers)]
         status = self._function(t, *(array.ctypes.data for array in given))
         if status < 0:
             raise self.failure(t, status)
@@ -132,6 +138,10 @@ class PointerFunction:
     def failure(self, t: float, status: int) -> RuntimeError:
         """What a negative status is to a run."""
         return RuntimeError(f"{self.name} returned the status {status} at t={t:.10g}; below 0 it ends the run.")
+
+
+def _as_params(rest: tuple[Any, ...]) -> np.ndarray | None:
+    return None if scalars(rest) is None else floats(rest)
 
 
 def is_pointer(fun: Any) -> bool:

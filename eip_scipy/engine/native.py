@@ -74,7 +74,8 @@ class NativeFunctions(NamedTuple):
 
     A function of the library's stands for itself. Of each invariant, gradient and event the address, and how many
     floats it fills. `python`: the functions in Python,
-    of which the events are called; there are none by address then.
+    of which the events are called; there are none by address then. None for a gradient: by differences, with shifts in
+    units of the size of a component and of its floor, `floors` (n,).
     """
 
     rhs: Any
@@ -86,6 +87,7 @@ class NativeFunctions(NamedTuple):
     owner: Any
     python: PythonFunctions | None = None
     jacobian: Any = None
+    floors: np.ndarray | None = None
     native: bool = True
 
 

@@ -20,6 +20,7 @@ from scipy.optimize import OptimizeResult
 
 from ..checkpoint.own_file import absolute
 from ..core import setup
+from ..core.arguments import extra_arguments, floats
 from ..core.inputs import count, flag, is_number, real_array, refuse_units, shown
 from ..core.invariants import as_invariants
 from ..core.jitted import is_compiled
@@ -256,9 +257,9 @@ def ensemble(
     max_bytes : float, optional
         Bound on the memory for results; default: half of what is free.
     **options
-        Those of `integrate`: in_place, events, compensated, compiled, metric, blocks, frame, direction, iterations,
-        every, reuse_f, check, project_initial, rtol, atol, first_step, max_step. Of events only terminal ones make
-        sense: they end a member, and their times are in ``.t``. `check` looks at one member.
+        Those of `integrate`: args (the same for all), in_place, events, compensated, compiled, metric, blocks, frame,
+        direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step. Of events only
+        terminal ones make sense: they end a member, and their times are in ``.t``. `check` looks at one member.
 
     Returns
     -------
@@ -305,10 +306,13 @@ def ensemble(
     out = None if out is None else location(out)
     checkpoint = None if checkpoint is None else absolute(checkpoint)
     starts, parameters = _inputs(fun, y0s, params, options.get("invariants", ()))
+    if options.get("args") is not None:
+        shared = floats(extra_arguments(options["args"], params))
+        parameters = np.broadcast_to(shared, (len(starts), shared.size))
     keep = reduce is None or out is not None
     common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
     request = Request.of(fun=_bare(fun), t_span=t_span, y0=starts[0], params=parameters[0], **common).with_pointers()
-    if not parameters.shape[1]:
+    if request.args is not None or not parameters.shape[1]:
         request = dataclasses.replace(request, params=None)
     plan, doubts = _first_that_starts(Task(request, reduce, keep, len(starts)), starts, parameters)
     starts = np.ascontiguousarray(starts, plan.dtype)

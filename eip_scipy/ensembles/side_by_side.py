@@ -59,6 +59,8 @@ def need_compiling(functions: NativeFunctions) -> bool:
 def _of_eight(native: Native) -> tuple[Any, int]:
     """A function of eight members as the engine takes it, and how many octets it fills."""
     one = native.function
+    if one is None:
+        raise NotCompilableError("the gradient of an invariant comes from differences")
     if isinstance(one, LibraryFunction):
         if not one.octet_address:
             raise NotCompilableError(f"{one.__name__} of this package is written for one member at a time")

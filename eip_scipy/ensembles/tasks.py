@@ -171,8 +171,13 @@ class Plan:
         self.why_not = loop.why_not
         own_targets = any(item.target is not None for item in ready.run.invariants.items)
         own_start = ready.run.identity["project_initial"] or own_targets
-        self._together = self.why_not is None and not own_start
-        self.one_by_one = self.why_not or "the start of each member is projected, or an invariant has a target"
+        by_differences = bool(ready.run.invariants.by_differences)  # whose shifts depend on the start
+        self._together = self.why_not is None and not own_start and not by_differences
+        if by_differences:
+            own = "the gradient of an invariant comes from differences"
+        else:
+            own = "the start of each member is projected, or an invariant has a target"
+        self.one_by_one = self.why_not or own
         if self._together:
             sweeper = Sweeper(loop, self.task.members)
             self.one_by_one, self._idle = sweeper.one_by_one, [sweeper]

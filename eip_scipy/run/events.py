@@ -10,6 +10,7 @@ import numpy as np
 from scipy.integrate import DenseOutput
 from scipy.optimize import brentq
 
+from ..core.arguments import names
 from ..core.inputs import is_number, reals, refuse_units, require_arguments, shown
 from ..core.pointers import address_hint, by_pointer, is_pointer
 from ..engine.data import EPS
@@ -27,7 +28,7 @@ class Events:
         ``event(t, y[, params]) -> float``, with the attributes ``terminal`` (bool, or the number of times after which
         the run ends) and ``direction`` of SciPy's `solve_ivp`.
     extra : tuple
-        ``(params,)`` or nothing.
+        ``(params,)``, args, or nothing.
 
     Raises
     ------
@@ -115,7 +116,7 @@ class Events:
         try:
             value = self.functions[k](t, y, *self._extra)
         except TypeError:
-            given, mend = ("t", "y", *("params" for _ in self._extra)), "It takes params if the run has them."
+            given, mend = ("t", "y", *names(self._extra)), "It takes the run's params or args, if there are any."
             require_arguments(self.functions[k], given, f"event {k}", mend)
             raise
         return self._number(k, t, value)

@@ -45,6 +45,7 @@ OWN = (
     *(
         "method",
         "h",
+        "args",
         "params",
         "in_place",
         "jacobian",
@@ -68,6 +69,7 @@ def integrate(
     *,
     method: type[EIPSolver],
     h: float | None = DEFAULT,
+    args: Any = None,
     params: Any = None,
     in_place: bool = False,
     jacobian: Any = None,
@@ -114,8 +116,13 @@ def integrate(
         Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter. None: adaptive steps by
         `rtol`, `atol`, `first_step` and `max_step`. Default: adaptive where one of these is given, else a problem's
         own step, if it has one.
+    args : tuple, optional
+        As in `scipy.integrate.solve_ivp`: passed on as the last arguments, to `fun`, events and `jacobian`, and to the
+        invariants' functions behind their own. Numbers reach Numba functions as such (a float, an int, a bool) and C
+        functions as `params`; a single array of floats is the same as ``params``. With anything else Python calls the
+        functions.
     params : array_like of float, optional
-        Passed on to `fun` and to the invariants' functions as the last argument.
+        In place of `args`: passed on as the last argument, one array of floats.
     in_place : bool, optional
         Whether `fun` fills its third argument.
     jacobian : callable, optional
@@ -204,6 +211,7 @@ def integrate(
         y0=y0,
         method=method,
         h=h,
+        args=args,
         params=params,
         in_place=in_place,
         jacobian=jacobian,
@@ -450,6 +458,9 @@ class Loop:
     def explained(self, message: str) -> str:
         """With what speaks against the run, and what is to be said about checkpoints and not being compiled."""
         notes = [*self.keeper.notes, *([] if self.why_not is None else [self.why_not])]
+        if labels := self.driver.run.invariants.by_differences:
+            names = ", ".join(map(repr, labels))
+            notes.append(f"the gradient of {names} comes from differences: one of its own would be faster and exact")
         doubt = self.driver.run.trust.message
         message = f"{message}; {doubt}" if doubt else message
         return f"{message} ({'; '.join(notes)})" if notes else message

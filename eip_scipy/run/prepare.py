@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..core import setup
+from ..core.arguments import Packed, extra_arguments, floats, names, scalars
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import Invariant, as_invariants
 from ..core.jitted import NotCompilableError
@@ -36,7 +37,7 @@ from .resume import settings
 
 __all__ = ["DEFAULT", "Prepared", "Request", "prepared", "started_at"]
 
-CALLED = "fun", "It takes (t, y), out with in_place=True, and params where the run has them: params=..."
+CALLED = "fun", "It takes (t, y), out with in_place=True, and what the run has of params=... or args=(...)."
 
 
 class _Default:
@@ -59,6 +60,7 @@ class Request:
     y0: Any = None
     method: Any
     h: Any = DEFAULT
+    args: Any = None
     params: Any = None
     in_place: bool = False
     jacobian: Any = None
@@ -113,9 +115,8 @@ class System:
         self.fun, self.form = request.fun, form
         if not callable(self.fun):
             raise TypeError(f"integrate: fun must be callable or a Problem, got {self.fun!r}{address_hint(self.fun)}.")
-        params = request.params
-        self.parameters = np.zeros(0) if params is None else real_array("params", params, TypeError).reshape(-1)
-        self.extra = () if params is None else (self.parameters,)
+        self.extra = extra_arguments(request.args, request.params)
+        self.parameters = floats(self.extra)
         self.events = Events(request.events, self.extra)
         self.jacobian = request.jacobian
         if self.jacobian is not None and not callable(self.jacobian):
@@ -147,17 +148,20 @@ class System:
             return calls(t0, y0)
         except TypeError:
             out = ("out",) if "in place" in self.form else ()
-            require_arguments(self.fun, ("t", "y", *out, *("params" for _ in self.extra)), *CALLED)
+            require_arguments(self.fun, ("t", "y", *out, *names(self.extra)), *CALLED)
             raise
 
     def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
         """The functions of the loop, and which of them Python calls and why (None: none)."""
-        in_python, params = self._in_python(run), self.parameters if self.extra else None
+        in_python, numbers = self._in_python(run), scalars(self.extra)
         if wanted is False:
             return in_python, "interpreted: compiled=False"
         try:
             if isinstance(run.method, OneStep):
                 raise NotCompilableError(f"{run.method.name} is a one-step method in Python")
+            if numbers is None:
+                raise NotCompilableError("args are neither numbers nor one array of floats")
+            params = Packed(self.parameters, numbers) if self.extra else None
             functions = native_functions(self.fun, self.form, params, run.invariants, run.y0)
             if self._corrects(run):
                 functions = with_jacobian(functions, self.jacobian, params, run.y0)
@@ -186,7 +190,8 @@ class System:
         found = {"fun": kind(self.fun, in_python)}
         for item, label in zip(run.invariants.items, run.invariants.labels, strict=True):
             found[label] = kind(item.fun, in_python)
-            found[f"gradient of {label}"] = kind(item.grad, in_python)
+            differences = item.grad is None and not in_python
+            found[f"gradient of {label}"] = "differences" if differences else kind(item.grad, in_python)
         if self._corrects(run):
             found["jacobian"] = kind(self.jacobian, in_python)
         in_python = isinstance(functions, PythonFunctions) or functions.python is not None
@@ -333,10 +338,13 @@ def _with_problem(request: Request, form: str) -> tuple[Request, str]:
     """The request with what a `Problem` brings where nothing else is given, and the form of its function."""
     t_span, y0 = _given_or_brought(request)
     projection, params = dict(request.projection), request.params
+    extra_arguments(request.args, params)  # which raises for what is wrong with them
     problem = request.fun
     if not isinstance(problem, Problem):
-        projection |= _with_run_params(projection, params)
+        projection |= _with_run_params(projection, params, request.args)
         return replace(request, t_span=t_span, y0=y0, projection=projection), form
+    if request.args is not None:
+        raise TypeError("args: a Problem has params; give params=..., or its functions in place of the Problem.")
     brought = {option.name for option in fields(problem)} & set(ProjectionOptions.names())
     projection = {name: getattr(problem, name) for name in brought} | projection
     projection |= _with_run_params(projection, problem.params)
@@ -350,18 +358,20 @@ def _with_problem(request: Request, form: str) -> tuple[Request, str]:
     return replace(found, jacobian=jacobian), form
 
 
-def _with_run_params(projection: Mapping[str, Any], params: Any) -> dict[str, Any]:
-    """The invariants with `params` taken out of their args, where they are all these hold: the run passes them."""
+def _with_run_params(projection: Mapping[str, Any], params: Any, args: Any = None) -> dict[str, Any]:
+    """The invariants without their args, where these are what the run passes on itself."""
     if "invariants" not in projection:
         return {}
     items = as_invariants(projection["invariants"])
-    if params is not None:
-        items = tuple(_bare(item) if _takes(item, params) else item for item in items)
+    extra = (() if params is None else (params,)) if args is None else tuple(args)
+    if extra:
+        items = tuple(_bare(item) if _takes(item, extra) else item for item in items)
     return {"invariants": items}
 
 
-def _takes(item: Invariant, params: Any) -> bool:
-    return len(item.args) == 1 and np.array_equal(item.args[0], params)
+def _takes(item: Invariant, extra: tuple[Any, ...]) -> bool:
+    same = (a is b or np.array_equal(a, b) for a, b in zip(item.args, extra, strict=False))
+    return len(item.args) == len(extra) and all(same)
 
 
 def _bare(item: Invariant) -> Invariant:

@@ -10,7 +10,7 @@ constexpr double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
 // A failed projection shrinks the step as CVODE does.
 constexpr double RETRY_FACTOR = 0.25;
 constexpr int MAX_RETRIES = 10;
-// every = AUTO: each so many-th step asks whether a projection is worth it.
+// every = AUTO: each so many-th step asks whether a projection is worth it, and the step after one that was.
 constexpr int64_t AUTO_SPACING = 5;
 
 // The stages and their sum, y_hat.
@@ -132,7 +132,8 @@ inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_
         clock[TIME_NEW] = last ? span.t_bound : t_new;
         clock[LENGTH] = adaptive || last ? clock[TIME_NEW] - t : span.h;
         h_abs = std::abs(clock[LENGTH]);
-        const bool project = w.l > 0 && (last || spacing == 1 || (k + 1) % spacing == 0);
+        const bool again = o.every == AUTO && !run.method.multistep && w.counters[WAITED] == 0;
+        const bool project = w.l > 0 && (last || again || spacing == 1 || (k + 1) % spacing == 0);
         const Step step{t, clock[TIME_NEW], clock[LENGTH], y, y_new, project, last};
         status = any_raw_step(run, step);
         const double norm = adaptive ? w.norm[0] : 0.0;

@@ -340,9 +340,10 @@ static Function pointer_of(PyObject *object, const char *name, int64_t floats, i
     return out;
 }
 
-// Functions by pointer: (function, floats) of each of inv, grad and event.
+// Functions by pointer: (function, floats) of each of inv, grad and event; None where one `may_lack` it.
 template <class Function>
-static std::vector<Function> pointers_of(PyObject *functions, const char *name, int64_t expected, int64_t n, int64_t p) {
+static std::vector<Function> pointers_of(PyObject *functions, const char *name, int64_t expected, int64_t n, int64_t p,
+                                         bool may_lack = false) {
     std::vector<Function> out;
     const Ref items(PySequence_Fast(attribute(functions, name).get(), "engine: expected a sequence of pairs"));
     int64_t total = 0;
@@ -352,7 +353,10 @@ static std::vector<Function> pointers_of(PyObject *functions, const char *name, 
         PyObject *pair = PySequence_Fast_GET_ITEM(items.get(), k);
         if (!PyTuple_Check(pair)) PyErr_Format(PyExc_TypeError, "engine: %s must hold pairs, got %.80R", name, pair);
         if (PyErr_Occurred() || !PyArg_ParseTuple(pair, "OL", &function, &floats)) throw PythonError{};
-        out.push_back(pointer_of<Function>(function, name, floats, n, p));
+        if (may_lack && function == Py_None)
+            out.push_back({{}, {}, floats});
+        else
+            out.push_back(pointer_of<Function>(function, name, floats, n, p));
         total += floats;
     }
     if (total != expected) {
@@ -363,6 +367,27 @@ static std::vector<Function> pointers_of(PyObject *functions, const char *name, 
     return out;
 }
 
+// For gradients without a function: by differences of an invariant that has one.
+static void read_shifts(PyObject *functions, const Work &w, Arrays &arrays, System &system) {
+    bool wanted = false, good = system.grad_pointers.size() == system.inv_pointers.size();
+    for (size_t k = 0; good && k < system.grad_pointers.size(); ++k) {
+        const auto &grad = system.grad_pointers[k];
+        const auto &inv = system.inv_pointers[k];
+        if (grad.pointer || grad.library) continue;
+        wanted = true;
+        good = inv.pointer && inv.floats * w.m == grad.floats;
+    }
+    if (!good) {
+        PyErr_SetString(PyExc_ValueError, "engine: the gradients do not fit the invariants");
+        throw PythonError{};
+    }
+    if (!wanted) return;
+    system.shifts.m = w.m;
+    system.shifts.width = w.m / w.n;
+    system.shifts.floors = arrays.floats(functions, "floors", {w.n});
+    system.shifts.state.resize(w.m);
+}
+
 void read_pointers(PyObject *functions, const Work &w, int64_t events, Arrays &arrays, System &system) {
     system.by_pointer = true;
     system.second_order = truth(functions, "second_order");
@@ -371,7 +396,8 @@ void read_pointers(PyObject *functions, const Work &w, int64_t events, Arrays &a
     const int64_t size = system.second_order ? w.m / 2 : w.m, p = system.n_params;
     system.rhs_pointer = pointer_of<Native<ValuePointer>>(attribute(functions, "rhs").get(), "rhs", size, size, p);
     system.inv_pointers = pointers_of<Native<ValuePointer>>(functions, "inv", w.l, w.m, p);
-    system.grad_pointers = pointers_of<Native<GradientPointer>>(functions, "grad", w.l * w.m, w.m, p);
+    system.grad_pointers = pointers_of<Native<GradientPointer>>(functions, "grad", w.l * w.m, w.m, p, true);
+    read_shifts(functions, w, arrays, system);
     system.event_pointers = pointers_of<Native<ValuePointer>>(functions, "event", events, w.m, p);
     const Ref jacobian = attribute(functions, "jacobian");
     if (jacobian.get() != Py_None)

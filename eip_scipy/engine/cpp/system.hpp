@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "data.hpp"
+#include "differences.hpp"
 #include "floats.hpp"
 #include "library.hpp"
 
@@ -74,6 +75,7 @@ struct System {
     double *params = nullptr;
     int64_t n_params = 0;
     std::vector<double> scratch, scratch_f;
+    Shifts shifts;  // for gradients without a function
     FailedCall failed;
 
     // The derivative at a state that is kept.
@@ -117,6 +119,11 @@ struct System {
             const auto &[pointer, library, floats] = grad_pointers[k];
             if (library) {
                 library(t, y, f, G, params, w.m, n_params);
+                G += floats;
+                continue;
+            }
+            if (!pointer) {
+                grad_by_differences(w, k, t, y, G);
                 G += floats;
                 continue;
             }
@@ -175,6 +182,17 @@ struct System {
             if (status) [[unlikely]] gave_up(status, {name, k, t, {y, y + w.m}, {}}, values, floats);
             values += floats;
         }
+    }
+
+    template <class W>
+    void grad_by_differences(const W &w, int64_t k, double t, const double *y, double *G) {
+        const Native<ValuePointer> &inv = inv_pointers[k];
+        const auto values_at = [&](double *state, double *out) {
+            fill(out, NOT_A_NUMBER, inv.floats);
+            const int status = inv.pointer(t, state, out, params);
+            if (status) [[unlikely]] gave_up(status, {"inv", k, t, {state, state + w.m}, {}}, out, inv.floats);
+        };
+        difference_gradient(values_at, y, inv.floats, shifts, G);
     }
 
     [[gnu::cold, gnu::noinline]] void gave_up(int status, FailedCall call, double *out, int64_t floats) {

@@ -1,0 +1,210 @@
+"""`args` of integrate and ensemble: as SciPy hands them on, natively where they are numbers."""
+
+import ctypes
+from pathlib import Path
+
+import numpy as np
+import pytest
+from c_compiler import shared_library
+from numba import njit
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPGJ14, EIPRK4, CheckpointError, Invariant, ensemble, integrate
+from eip_scipy.ensembles import tasks
+from eip_scipy.problems import kepler
+
+Y0, SPAN, K, M = np.array([1.0, 0.5]), (0.0, 10.0), 2.0, 3
+NUMBERS = ctypes.POINTER(ctypes.c_double)
+VALUE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, NUMBERS, NUMBERS, NUMBERS)
+GRADIENT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[NUMBERS] * 4)
+
+
+def oscillator(t, y, k, m):
+    return np.array([y[1], -k * y[0] / m])
+
+
+def energy(t, y, k, m):
+    return 0.5 * (m * y[1] * y[1] + k * y[0] * y[0])
+
+
+def energy_gradient(t, y, k, m):
+    return np.array([k * y[0], m * y[1]])
+
+
+def crosses(t, y, k, m):
+    return k * y[0]
+
+
+crosses.terminal, crosses.direction = 1, -1.0
+jit_oscillator, jit_energy, jit_gradient = njit(oscillator), njit(energy), njit(energy_gradient)
+jit_crosses = njit(crosses)
+jit_crosses.terminal, jit_crosses.direction = 1, -1.0
+
+PYTHON = oscillator, Invariant(energy, energy_gradient, name="H"), crosses
+JITTED = jit_oscillator, Invariant(jit_energy, jit_gradient, name="H"), jit_crosses
+NO_GRADIENT = jit_oscillator, Invariant(jit_energy, name="H"), jit_crosses
+OWN = jit_oscillator, Invariant(jit_energy, jit_gradient, args=(K, M), name="H"), jit_crosses
+PYTHON_EVENT = jit_oscillator, Invariant(jit_energy, jit_gradient, name="H"), crosses
+
+
+def run(functions, **options):
+    fun, kept, event = functions
+    options = {"method": EIPRK4, "h": 0.05, "args": (K, M), "invariants": kept, "events": event} | options
+    return integrate(fun, SPAN, Y0, **options)
+
+
+@pytest.mark.parametrize(
+    ("functions", "kind"),
+    [(PYTHON, "python"), (JITTED, "jitted"), (NO_GRADIENT, "jitted"), (OWN, "jitted"), (PYTHON_EVENT, "jitted")],
+    ids=["Python", "Numba", "without gradient", "args of the invariant's own", "event in Python"],
+)
+def test_the_bits_of_solve_ivp(functions, kind):
+    kept = Invariant(energy, energy_gradient, args=(K, M))
+    expected = solve_ivp(
+        oscillator, SPAN, Y0, method=EIPRK4, h=0.05, args=(K, M), events=crosses, invariants=kept, t_eval=None
+    )
+    result = run(functions)
+    assert result.status == 1
+    assert result.calls["fun"] == result.calls["H"] == result.calls["gradient of H"] == kind
+    np.testing.assert_allclose(result.y[:, -1], expected.y_events[0][-1], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(result.t_events[0], expected.t_events[0], rtol=1e-15)
+    np.testing.assert_array_equal(
+        run(functions, events=None, save_every=1).y,
+        solve_ivp(oscillator, SPAN, Y0, method=EIPRK4, h=0.05, args=(K, M), invariants=kept).y,
+    )
+
+
+def test_numbers_keep_their_types():
+    @njit
+    def fun(t, y, power, weights, backward):
+        return -(y**power) * weights if not backward else y[: power - 1] * 1.0
+
+    result = integrate(fun, (0, 1), [1.0, 2.0], method=EIPRK4, h=0.1, args=(2, 0.5, False))
+    np.testing.assert_allclose(result.y[:, -1], 1 / (1 / np.array([1.0, 2.0]) + 0.5), rtol=1e-5)
+    assert result.compiled
+
+
+def test_one_array_is_params():
+    fun = njit(lambda t, y, p: oscillator_of(t, y, p))
+    by_args = integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(np.array([K, M]),))
+    by_params = integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, params=[K, M])
+    assert by_args.compiled
+    np.testing.assert_array_equal(by_args.y, by_params.y)
+
+
+@njit
+def oscillator_of(t, y, p):
+    return np.array([y[1], -p[0] * y[0] / p[1]])
+
+
+@njit
+def oscillator_of_both(t, y, p, m):
+    return np.array([y[1], -p[0] * y[0] / m])
+
+
+def test_other_arguments_are_python_s():
+    arguments = (np.array([K]), M)
+    result = integrate(oscillator_of_both, SPAN, Y0, method=EIPRK4, h=0.05, args=arguments)
+    assert not result.compiled
+    assert "args are neither numbers nor one array of floats" in result.message
+    np.testing.assert_array_equal(result.y, run(JITTED, invariants=(), events=None).y)
+    with pytest.raises(TypeError, match="args are neither numbers"):
+        integrate(oscillator_of_both, SPAN, Y0, method=EIPRK4, h=0.05, args=arguments, compiled=True)
+    seen = []
+    by_name = {"k": K}
+    integrate(lambda t, y, a: seen.append(a) or -a["k"] * y, SPAN, Y0, method=EIPRK4, h=0.5, args=(by_name,))
+    assert all(a is by_name for a in seen)
+
+
+def test_second_order_in_place_and_jacobian():
+    @njit
+    def acc(t, q, out, k, m):
+        out[:] = -k / m * q
+
+    @njit
+    def jacobian(t, q, dq, out, k, m):
+        out[:] = -k / m * dq
+
+    exact = np.cos(np.sqrt(K / M) * SPAN[1]) + 0.5 * np.sqrt(M / K) * np.sin(np.sqrt(K / M) * SPAN[1])
+    options = {"h": 0.05, "args": (K, M), "in_place": True, "jacobian": jacobian}
+    result = integrate(acc, SPAN, Y0, method=EIPGJ14, **options)
+    assert set(result.calls.values()) == {"jitted"}
+    np.testing.assert_allclose(result.y[0, -1], exact, rtol=1e-12)
+
+
+C_SOURCE = """
+int rhs(double t, const double *y, double *out, const double *p) {
+    out[0] = y[1]; out[1] = -p[0] * y[0] / p[1]; return 0; }
+int energy(double t, const double *y, double *out, const double *p) {
+    out[0] = 0.5 * (p[1] * y[1] * y[1] + p[0] * y[0] * y[0]); return 0; }
+int gradient(double t, const double *y, const double *f, double *out, const double *p) {
+    out[0] = p[0] * y[0]; out[1] = p[1] * y[1]; return 0; }
+"""
+
+
+def test_c_functions_get_numbers_as_params(tmp_path):
+    (tmp_path / "oscillator.c").write_text(C_SOURCE)
+    c = ctypes.CDLL(str(shared_library(Path(tmp_path) / "oscillator.so", tmp_path / "oscillator.c")))
+    pointers = [kind((name, c)) for name, kind in (("rhs", VALUE), ("energy", VALUE), ("gradient", GRADIENT))]
+    functions = pointers[0], Invariant(*pointers[1:], name="H"), None
+    expected = run(JITTED, events=None)
+    np.testing.assert_array_equal(run(functions).y, expected.y)
+    np.testing.assert_array_equal(run(functions, compiled=False).y, expected.y)
+    with pytest.raises(TypeError, match="fun is a C function by pointer: besides t and y it takes numbers"):
+        run(functions, args=(K, "steel"))
+
+
+@pytest.mark.parametrize("work", [0.0, np.inf])
+def test_members_of_an_ensemble_share_them(work, monkeypatch):
+    monkeypatch.setattr(tasks, "LEAST_WORK", work)
+
+    @njit
+    def rhs(t, y, out, k, m):
+        out[0], out[1] = y[1], -k * y[0] / m
+
+    @njit
+    def gradient(t, y, out, k, m):
+        out[0], out[1] = k * y[0], m * y[1]
+
+    starts, kept = Y0 * np.linspace(0.9, 1.1, 11)[:, None], Invariant(jit_energy, gradient, in_place=True)
+    options = {"h": 0.05, "args": (K, float(M)), "invariants": kept, "in_place": True}
+    members = ensemble(rhs, SPAN, starts, **options)
+    assert members.success
+    assert bool(members.one_by_one) == (work > 0)
+    for start, y in zip(starts, members.y, strict=True):
+        alone = integrate(rhs, SPAN, start, method=EIPRK4, **options)
+        np.testing.assert_array_equal(alone.y[:, -1], y)
+
+
+def test_an_array_for_all_members():
+    starts = Y0 * np.linspace(0.9, 1.1, 3)[:, None]
+    members = ensemble(oscillator_of, SPAN, starts, h=0.05, args=(np.array([K, M]),))
+    alone = integrate(oscillator_of, SPAN, starts[2], method=EIPRK4, h=0.05, params=[K, M])
+    np.testing.assert_array_equal(members.y[2], alone.y[:, -1])
+
+
+def test_they_belong_to_a_run(tmp_path):
+    path = tmp_path / "run"
+    whole = run(JITTED, events=None, checkpoint=path)
+    np.testing.assert_array_equal(run(JITTED, events=None, checkpoint=path, resume=True).y, whole.y)
+    with pytest.raises(CheckpointError, match="params"):
+        run(JITTED, events=None, checkpoint=path, resume=True, args=(K, 4))
+    half = integrate(jit_oscillator, (0, 5), Y0, method=EIPRK4, h=0.05, args=(K, M)).continue_to(10)
+    np.testing.assert_allclose(half.y[:, -1], run(JITTED, events=None, invariants=()).y[:, -1], atol=1e-12)
+
+
+def test_what_is_refused():
+    fun = oscillator
+    with pytest.raises(TypeError, match=r"args must be a tuple, got 2.0; write args=\(x,\)"):
+        integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=K)
+    with pytest.raises(TypeError, match="args or params, not both"):
+        integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K,), params=[K])
+    with pytest.raises(TypeError, match="give params="):
+        integrate(kepler(), method=EIPRK4, args=(K,))
+    with pytest.raises(TypeError, match=r"fun is called with \(t, y, args\[0\]\): missing a required argument: 'm'"):
+        integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K,))
+    deaf = Invariant(lambda t, y: y @ y, name="S")
+    with pytest.raises(TypeError, match=r"'S' is called with \(t, y, args\[0\], args\[1\]\).* take the run's args"):
+        integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K, M), invariants=deaf)
+    with pytest.raises(TypeError, match=r"event 0 is called with \(t, y, args\[0\], args\[1\]\)"):
+        integrate(fun, SPAN, Y0, method=EIPRK4, h=0.1, args=(K, M), events=lambda t, y: y[0])

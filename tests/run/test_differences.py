@@ -1,0 +1,178 @@
+"""C functions without gradients: what the differences are worth, and the bits of both ways to compute them."""
+
+import ctypes
+
+import numpy as np
+import pytest
+from c_compiler import shared_library
+from numba import njit
+from systems import jit_orbit, orbit, pericentre
+
+from eip_scipy import EIPRK4, EIPRK45, EIPRKN12, Invariant, ensemble, integrate, project
+from eip_scipy.core.invariants import InvariantSet
+
+NUMBERS = ctypes.POINTER(ctypes.c_double)
+VALUE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, NUMBERS, NUMBERS, NUMBERS)
+
+# In C, and in Python for complex steps.
+FUNCTIONS = {
+    "kinetic": ("0.5*(y[2]*y[2] + y[3]*y[3])", lambda y: 0.5 * (y[2] ** 2 + y[3] ** 2)),
+    "kepler": (
+        "0.5*(y[2]*y[2] + y[3]*y[3]) - 1/sqrt(y[0]*y[0] + y[1]*y[1])",
+        lambda y: 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2),
+    ),
+    "momentum": ("y[0]*y[3] - y[1]*y[2]", lambda y: y[0] * y[3] - y[1] * y[2]),
+    "pendulum": ("0.5*y[1]*y[1] - cos(3*y[0])", lambda y: 0.5 * y[1] ** 2 - np.cos(3 * y[0])),
+    "henon_heiles": ("y[0]*y[0]*y[1] - y[1]*y[1]*y[1]/3", lambda y: y[0] ** 2 * y[1] - y[1] ** 3 / 3),
+    "lotka_volterra": (
+        "y[0] - log(y[0]) + y[1] - 2*log(y[1])",
+        lambda y: y[0] - np.log(y[0]) + y[1] - 2 * np.log(y[1]),
+    ),
+    "toda": ("exp(y[0] - y[1]) + exp(y[1] - y[2])", lambda y: np.exp(y[0] - y[1]) + np.exp(y[1] - y[2])),
+    "lennard_jones": ("pow(y[0], -12) - pow(y[0], -6)", lambda y: y[0] ** -12 - y[0] ** -6),
+    "root": ("sqrt(1 + y[0]*y[0] + y[1]*y[1])", lambda y: np.sqrt(1 + y[0] ** 2 + y[1] ** 2)),
+    "hyperbolic": ("tanh(y[0]*y[2])", lambda y: np.tanh(y[0] * y[2])),
+    "quotient": ("y[0]*y[1]/(1 + y[2]*y[2])", lambda y: y[0] * y[1] / (1 + y[2] ** 2)),
+    "near": ("1/sqrt((y[0] - 1)*(y[0] - 1) + 1e-8)", lambda y: 1 / np.sqrt((y[0] - 1) ** 2 + 1e-8)),
+    "moon": ("y[2]*y[3] - 1e-6/fabs(y[0] - y[1])", lambda y: y[2] * y[3] - 1e-6 / (y[0] - y[1])),
+}
+STATES = {
+    "near": [1.0003, 0.0, 0.0, 0.0],
+    "moon": [1.0026, 1.0, 0.3, 0.2],
+}
+SYSTEM = """
+#include <math.h>
+int orbit(double t, const double *y, double *out, const double *p) {
+    double r2 = y[0]*y[0] + y[1]*y[1], r3 = r2 * sqrt(r2);
+    out[0] = y[2]; out[1] = y[3]; out[2] = -y[0]/r3; out[3] = -y[1]/r3; return 0; }
+int both(double t, const double *y, double *out, const double *p) {
+    out[0] = 0.5*(y[2]*y[2] + y[3]*y[3]) - 1/sqrt(y[0]*y[0] + y[1]*y[1]);
+    out[1] = y[0]*y[3] - y[1]*y[2]; return 0; }
+int mass(double t, const double *y, double *out, const double *p) {
+    out[0] = y[0]*y[0] + y[1]*y[1] + y[2]*y[2] + y[3]*y[3]; return 0; }
+int overwrites(double t, double *y, double *out, const double *p) {
+    out[0] = y[0]*y[3] - y[1]*y[2]; y[0] = y[1] = y[2] = y[3] = 1e99; return 0; }
+int logarithm(double t, const double *y, double *out, const double *p) {
+    if (y[0] <= 0) return p[0] > 0 ? 1 : -7;
+    out[0] = y[0] - log(y[0]) + y[1] - log(y[1]); return 0; }
+"""
+
+
+@pytest.fixture(scope="module")
+def c(tmp_path_factory):
+    """The C functions by their names; a new pointer each time."""
+    folder = tmp_path_factory.mktemp("differences")
+    text = "int {}(double t, const double *y, double *out, const double *p) {{ out[0] = {}; return 0; }}\n"
+    source = SYSTEM + "".join(text.format(name, given) for name, (given, _) in FUNCTIONS.items())
+    (folder / "functions.c").write_text(source)
+    library = ctypes.CDLL(str(shared_library(folder / "functions.so", folder / "functions.c")))
+    return lambda name: VALUE((name, library))
+
+
+def gradient(invariant, y):
+    y = np.asarray(y, float)
+    return InvariantSet(invariant, 0.0, y, np.ones_like(y), 0.01).gradients(0.0, y, y)[0]
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_accuracy(c, name):
+    y = np.array(STATES.get(name, [0.7, 1.1, -0.4, 0.9]))
+    _, fun = FUNCTIONS[name]
+    exact = np.array([fun(y + 1e-100j * unit).imag / 1e-100 for unit in np.eye(4)])
+    np.testing.assert_allclose(gradient(Invariant(c(name)), y), exact, rtol=0, atol=2e-11 * np.abs(exact).max())
+
+
+def test_a_component_that_is_small_for_a_while(c):
+    y = np.array([1e-30, 1.0, 1.0, 0.0])
+    assert np.abs(gradient(Invariant(c("kepler")), y) - [1e-30, 1.0, 1.0, 0.0]).max() < 1e-11
+
+
+ORBIT = {"method": EIPRK4, "h": 0.02}
+
+
+def by_hand(c):
+    def grad(t, y):
+        r3 = np.hypot(y[0], y[1]) ** 3
+        return np.array([[y[0] / r3, y[1] / r3, y[2], y[3]], [y[3], -y[2], -y[1], y[0]]])
+
+    return Invariant(c("both"), grad, size=2, name="H, L")
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"metric": "euclidean"}, {"h": 0.1}, {"method": EIPRK45, "h": None, "rtol": 1e-7}]
+)
+def test_invariants_hold_as_with_gradients(c, options):
+    start, options = pericentre(0.5), ORBIT | options
+    kept = Invariant(c("both"), size=2, name="H, L")
+    run = integrate(c("orbit"), (0, 60), start, invariants=kept, **options)
+    expected = integrate(c("orbit"), (0, 60), start, invariants=by_hand(c), **options)
+    assert run.compiled
+    assert (run.max_defect < 1.1 * expected.max_defect + 1e-14).all()
+    np.testing.assert_allclose(run.y[:, -1], expected.y[:, -1], rtol=0, atol=1e-9)
+
+
+def test_bits_and_what_is_said(c):
+    start, kept = pericentre(0.5), Invariant(c("both"), size=2, name="H, L")
+    native = integrate(c("orbit"), (0, 30), start, invariants=kept, save_every=1, **ORBIT)
+    interpreted = integrate(c("orbit"), (0, 30), start, invariants=kept, save_every=1, compiled=False, **ORBIT)
+    np.testing.assert_array_equal(native.y, interpreted.y)
+    assert (native.nfev, native.njev) == (interpreted.nfev, interpreted.njev)
+    assert native.calls == {"fun": "pointer", "H, L": "pointer", "gradient of H, L": "differences"}
+    for run in (native, interpreted):
+        assert "the gradient of 'H, L' comes from differences" in run.message
+
+
+def test_complex_states(c):
+    def fun(t, y):
+        return 1j * np.abs(y) ** 2 * y
+
+    start, options = np.array([1 + 1j, 0.5]), {"method": EIPRK4, "h": 0.05}
+    native = integrate(njit(fun), (0, 5), start, invariants=Invariant(c("mass")), **options)
+    by_python = integrate(fun, (0, 5), start, invariants=Invariant(c("mass")), **options)
+    expected = integrate(fun, (0, 5), start, invariants=Invariant(c("mass"), lambda t, y: 2 * y), **options)
+    assert native.compiled
+    np.testing.assert_allclose(native.y, by_python.y, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(native.y, expected.y, rtol=0, atol=1e-13)
+
+
+def test_beside_other_functions(c):
+    start, momentum = pericentre(0.3), Invariant(c("overwrites"), name="L")
+    native = integrate(jit_orbit, (0, 10), start, invariants=momentum, **ORBIT)
+    assert set(native.calls.values()) == {"jitted", "pointer", "differences"}
+    assert native.max_defect[0] < 1e-14
+    interpreted = integrate(orbit, (0, 10), start, invariants=momentum, **ORBIT)
+    np.testing.assert_allclose(native.y, interpreted.y, rtol=0, atol=1e-12)
+    moved = start * [1.01, 1, 1, 1]
+    found = project(moved, momentum, target=1.0, iterations=4)
+    assert abs(found.defect[0]) < 1e-15
+
+
+def test_members_are_the_single_runs(c):
+    starts = pericentre(0.5) * np.linspace(0.98, 1.02, 5)[:, None]
+    options = {"h": 0.02, "invariants": Invariant(c("both"), size=2)}
+    members = ensemble(c("orbit"), (0, 10), starts, **options)
+    assert members.one_by_one == "the gradient of an invariant comes from differences"
+    for start, y in zip(starts, members.y, strict=True):
+        np.testing.assert_array_equal(integrate(c("orbit"), (0, 10), start, method=EIPRK4, **options).y[:, -1], y)
+
+
+def test_a_status_where_a_shift_leaves_the_domain(c):
+    # 5e-3 of the first component's floor reaches beyond 0, where there is no logarithm.
+    fun = njit(lambda t, y, p: np.array([y[0] * (y[1] - 1), y[1] * (1 - y[0])]))
+    start = np.array([3.0, 1e-4])
+    options = {"method": EIPRK45, "rtol": 1e-8, "atol": 1e-12}
+    kept = Invariant(c("logarithm"), name="V")
+    run = integrate(fun, (0, 40), start, invariants=kept, params=[1.0], **options)
+    assert run.success
+    assert run.max_defect[0] < 1e-13
+    other = Invariant(c("logarithm"), name="V")
+    with pytest.raises(RuntimeError, match="invariant 'V' returned the status -7"):
+        integrate(fun, (0, 40), np.array([1e-4, 3.0]), invariants=other, params=[-1.0], method=EIPRK4, h=1.5)
+
+
+def test_nystrom(c):
+    acceleration = njit(lambda t, q: -q / (q[0] * q[0] + q[1] * q[1]) ** 1.5)
+    kept = Invariant(c("both"), size=2)
+    run = integrate(acceleration, (0, 60), pericentre(0.5), method=EIPRKN12, h=0.05, invariants=kept)
+    assert run.compiled
+    assert (run.max_defect < 1e-14).all()
