@@ -101,8 +101,8 @@ def _check(error: Any, max_nfev: Any, options: Mapping[str, Any]) -> None:
     for name in options:
         if name not in COMMON:
             raise TypeError(
-                f"recommend() has no option {name!r}{nearest(name, COMMON) or '.'} Method, step and tolerances are what "
-                "it finds; options of saving, events and the like belong to run()."
+                f"recommend() has no option {name!r}{nearest(name, COMMON) or '.'} Method, step and tolerances are "
+                "what it finds; options of saving, events and the like belong to run()."
             )
     if not is_number(error) or not 0 < error < 1:
         raise ValueError(f"error must be a number between 0 and 1, got {shown(error)}.")

@@ -281,13 +281,12 @@ class Search:
         else:
             form = "The accelerations depend on velocities" if look.velocities else "The equations are q'' = a(t, q)"
         kind = self.kinds[id(chosen)]
-        words = (
-            f"{form}, and the steps vary by a factor of {look.variation:.2g}: {kind.name} needs the fewest evaluations"
-        )
         rivals = [trial for trial in self.trials if self._name(trial) not in ("", kind.name)]
         rival = best(rivals, self.wanted)
-        if rival is not None:
-            words += f", {self._name(rival)} {rival.nfev / chosen.nfev:.3g} times as many"
+        ratio = math.inf if rival is None else rival.nfev / chosen.nfev
+        nearly = "nearly " if ratio < 1 else ""  # the more usual way is taken then
+        words = f"{form}, and the steps vary by a factor of {look.variation:.2g}: {kind.name} needs {nearly}the fewest "
+        words += "evaluations" if rival is None else f"evaluations, {self._name(rival)} {ratio:.3g} times as many"
         return f"{words}."
 
     def _name(self, trial: Trial) -> str:

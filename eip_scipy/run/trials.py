@@ -168,7 +168,10 @@ def difference(y: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _power(errors: np.ndarray) -> float:
-    """As which power of time errors at equidistant times grow: by the largest of each half."""
-    half = len(errors) // 2
-    early, late = errors[:half].max(), errors[half:].max()
-    return math.log2(late / early) if early > 0 and late > 0 else LEAST_POWER
+    """As which power of time errors at equidistant times grow: the slope of the largest so far, on logarithmic axes."""
+    largest = np.maximum.accumulate(errors)
+    seen = largest > 0
+    if seen.sum() < 2:
+        return LEAST_POWER
+    times = np.arange(1, len(errors) + 1)[seen]
+    return float(np.polyfit(np.log(times), np.log(largest[seen]), 1)[0])
