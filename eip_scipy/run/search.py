@@ -18,7 +18,7 @@ from ..core.solvers import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN
 from .integrate import integrate
 from .prepare import Request, prepared
 from .recommendation import Recommendation, called
-from .trials import Bench, Trial, difference
+from .trials import Bench, Outcome, Trial, difference
 from .tuning import AIM, COARSEST_RTOL, FINEST_RTOL, WINDOW, Kind, best, tune
 
 __all__ = ["Search"]
@@ -151,30 +151,37 @@ class Search:
         method, options = (EIPRKN12, LONG) if self.look.velocities is False else (EIPDOP853, {})
         if found[0][0] > enough and self.keeps:
             kept = self._reference(Kind(method, size=size, options=options), FINE_START)
-            if difference(kept[1], found[0][1]).max() <= SAME * found[0][0]:
+            apart = difference(kept[1].y, found[0][1].y).max()
+            if apart <= SAME * self.bench.share * found[0][0]:  # the latter was extrapolated to the interval's end
                 found.append(kept)
         if min(item[0] for item in found) > enough and method is EIPRKN12:
             found.append(self._reference(Kind(method, size=size, options=options | PLAIN), FINE_START))
-        agreement, self.bench.truth = min(found, key=lambda item: item[0])
-        if not agreement <= LEAST_AGREEMENT * self.wanted:
+        agreement, reference = min(found, key=lambda item: item[0])
+        least = agreement / LEAST_AGREEMENT
+        if least > self.wanted:
+            hint = (
+                f"Ask for {least:.0e} or more, or for a shorter interval." if least < 0.1 else "Shorten the interval."
+            )
             raise ValueError(
                 f"recommend: an error of {self.wanted:g} cannot be reached, or not be told from others: two runs with "
                 f"the smallest tolerances differ by {agreement:.1e} at the end. Rounding errors have grown to that, or "
-                f"the motion is chaotic. Ask for {agreement / LEAST_AGREEMENT:.0e} or more, or for a shorter interval."
+                f"the motion is chaotic. {hint}"
             )
+        self.bench.truth = reference.y
 
-    def _reference(self, kind: Kind, rtol: float) -> tuple[float, np.ndarray]:
-        """How well two runs agree at the end, going down in tolerance from `rtol`, and the states of the tighter."""
+    def _reference(self, kind: Kind, rtol: float) -> tuple[float, Outcome]:
+        """How well two runs agree at the end, going down in tolerance from `rtol`, and the tighter one."""
         rtol, wider, agreement = max(rtol, FINE_START), None, math.inf
         while True:
             settings = kind.settings(kind.near(rtol))
             done, before = self.bench.run(settings), agreement
             self.longest = max(self.longest, done.nfev)
-            if wider is not None and wider.y.shape == done.y.shape:
+            if done.trouble:
+                return agreement, done if wider is None else wider
+            if wider is not None:
                 agreement = self.bench.judged(settings, wider, done.y).error
-            ended = rtol <= FINEST_RTOL or agreement > ROUNDED * before
-            if agreement <= AGREEMENT * self.wanted or ended:
-                return (min(agreement, before) if math.isfinite(agreement) else math.inf), done.y
+            if agreement <= AGREEMENT * self.wanted or rtol <= FINEST_RTOL or agreement > ROUNDED * before:
+                return min(agreement, before), done
             wider, rtol = done, max(rtol * REFERENCE_STEP, FINEST_RTOL)
 
     # --- the ways to run ---

@@ -16,7 +16,7 @@ from ..methods.multistep import GaussJackson
 from .integrate import integrate
 from .results import IntegrationResult
 
-__all__ = ["Bench", "Trial", "difference"]
+__all__ = ["Bench", "Outcome", "Trial", "difference"]
 
 # Errors that grow as a higher power of time than this do so exponentially, as far as a trial can tell.
 WILD_POWER = 4.0
