@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from .problems.symbolic import equations, hamiltonian
     from .run.figures import plot
     from .run.integrate import integrate
+    from .run.recommend import recommend
+    from .run.recommendation import Recommendation
     from .run.results import IntegrationResult
     from .run.saving import load, save
     from .run.tables import to_dataframe, to_xarray
@@ -73,6 +75,7 @@ __all__ = [
     "OneStepMethod",
     "ProjectionResult",
     "ProjectionWarning",
+    "Recommendation",
     "Tableau",
     "check_gradient",
     "eip_method",
@@ -84,6 +87,7 @@ __all__ = [
     "load",
     "plot",
     "project",
+    "recommend",
     "save",
     "to_dataframe",
     "to_xarray",
@@ -102,6 +106,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "OneStepMethod": "core.one_step",
     "ProjectionResult": "core.results",
     "ProjectionWarning": "core.results",
+    "Recommendation": "run.recommendation",
     "Tableau": "methods.runge_kutta",
     "check_gradient": "core.invariants",
     "ensemble": "ensembles.ensemble",
@@ -112,6 +117,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "load": "run.saving",
     "plot": "run.figures",
     "project": "core.project",
+    "recommend": "run.recommend",
     "save": "run.saving",
     "to_dataframe": "run.tables",
     "to_xarray": "run.tables",

@@ -1,0 +1,145 @@
+"""`recommend`: method, step or tolerance, metric and blocks for a wanted error, by trial runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from ..core import setup
+from ..core.inputs import flag, is_number, refuse_units, shown
+from ..core.invariants import as_invariants
+from ..core.names import nearest
+from ..core.pointers import PointerFunction, by_pointer
+from ..core.problem import Problem, bind
+from ..core.stepping import interval
+from .recommendation import Recommendation
+from .search import Search
+
+__all__ = ["recommend"]
+
+# What else a call may say of the problem; all runs have it.
+COMMON = ("params", "in_place", "jacobian", "metric", "blocks", "frame", "compiled")
+
+
+def recommend(
+    fun: Callable[..., Any] | Problem,
+    t_span: Any = None,
+    y0: Any = None,
+    *,
+    error: float = 1e-6,
+    invariants: Any = None,
+    max_nfev: int | None = None,
+    **options: Any,
+) -> Recommendation:
+    """Find method, step or tolerance, metric and blocks for a wanted error, by trial runs.
+
+    Parameters
+    ----------
+    fun : callable or Problem
+        As for `integrate`, a function of the first order: ``fun(t, y) -> (n,)``. Systems q'' = a(t, q) are recognised
+        by it, where y = (q, v).
+    t_span : (float, float)
+        Start and end, which must be finite; default: those of the problem.
+    y0 : array_like, shape (n,)
+        Likewise.
+    error : float, optional
+        Wanted error of the state at the end: largest component of the difference to the exact one, relative to the
+        largest component.
+    invariants : Invariant or sequence of Invariant, optional
+        What to keep; default: what the problem brings, of a function nothing.
+    max_nfev : int, optional
+        Evaluations that one trial may take, about; default: 50 000, and 300 000 of compiled functions. A longer run
+        is tried on the first part of its interval, and its error extrapolated.
+    params, in_place, jacobian, metric, blocks, frame, compiled
+        As for `integrate`, for all runs. With `jacobian`, or a problem that brings it, `EIPGJ14` is tried.
+
+    Returns
+    -------
+    Recommendation
+        ``method`` and ``options`` for `integrate`, the expected ``error`` and ``nfev``, the ``reason``, all ``trials``,
+        and ``run()``. It prints as a table.
+
+    Raises
+    ------
+    TypeError
+        For options that are not among those above.
+    ValueError
+        Where no trial has the wanted error, with the least that was found; where the right-hand side cannot be
+        integrated; for options with wrong values, and a wrong gradient.
+
+    Warns
+    -----
+    ProjectionWarning
+        Where the projection onto the invariants is not to be trusted, or keeps the error above the wanted one, so that
+        the run without them is recommended.
+
+    Notes
+    -----
+    Errors of trials are measured against a run with so much smaller tolerances that the next larger one agrees with
+    it to a fiftieth of the wanted error, by `EIPDOP853` without projection where that is possible. The cheapest trial
+    between a seventh of the wanted error and the wanted error itself, by evaluations, is recommended; one that is
+    cheaper still may be more accurate.
+
+    Examples
+    --------
+    >>> from eip_scipy import recommend
+    >>> from eip_scipy.problems import kepler
+    >>> choice = recommend(kepler(0.6), (0, 50), error=1e-8)
+    >>> run = choice.run()
+    >>> choice.trusted, choice.error <= 1e-8, run.nfev <= 1.1 * choice.nfev
+    (True, True, True)
+    """
+    _check(error, max_nfev, options)
+    problem, common = _problem(fun, t_span, y0, invariants, options)
+    return Search(problem, common, float(error), max_nfev).recommendation()
+
+
+def _check(error: Any, max_nfev: Any, options: Mapping[str, Any]) -> None:
+    refuse_units(error=error)
+    for name in options:
+        if name not in COMMON:
+            raise TypeError(
+                f"recommend() has no option {name!r}{nearest(name, COMMON) or '.'} Method, step and tolerances are "
+                "what it finds; options of saving, events and the like belong to run()."
+            )
+    if not is_number(error) or not 0 < error < 1:
+        raise ValueError(f"error must be a number between 0 and 1, got {shown(error)}.")
+    if max_nfev is not None and (not is_number(max_nfev) or not max_nfev >= 1000):
+        raise ValueError(f"max_nfev must be at least 1000, got {shown(max_nfev)}.")
+
+
+def _problem(
+    fun: Any, t_span: Any, y0: Any, invariants: Any, options: dict[str, Any]
+) -> tuple[Problem, dict[str, Any]]:
+    """The problem with the start and interval of the call, and the options that all runs have."""
+    common = {name: value for name, value in options.items() if value is not None}
+    if not isinstance(fun, Problem):
+        if t_span is None or y0 is None:
+            raise TypeError(
+                f"recommend: {'t_span' if t_span is None else 'y0'} is missing; only a Problem brings its own."
+            )
+        fun = _made(fun, t_span, y0, common)
+    brought = {} if t_span is None else {"t_span": t_span}
+    brought |= {} if y0 is None else {"y0": y0}
+    problem = replace(fun, **brought)
+    t0, t_end = interval(problem.t_span)
+    if not math.isfinite(t_end) or t_end == t0:
+        raise ValueError(f"recommend needs an interval of finite length, got t_span={shown(problem.t_span)}.")
+    problem = replace(problem, t_span=(t0, t_end), y0=setup.initial_state(problem.y0))
+    if invariants is not None:
+        common["invariants"] = as_invariants(invariants)
+    return problem, common
+
+
+def _made(fun: Any, t_span: Any, y0: Any, common: dict[str, Any]) -> Problem:
+    """A problem of a function, which takes `in_place` and `params` out of the options where it holds them itself."""
+    if not callable(by_pointer(fun, "fun")):
+        raise TypeError(f"recommend: fun must be callable or a Problem, got {shown(fun)}.")
+    name = getattr(fun, "__name__", "problem")
+    pointer = by_pointer(fun, "fun")
+    if not (flag("in_place", common.pop("in_place", False)) or isinstance(pointer, PointerFunction)):
+        return Problem(name=name, fun=fun, y0=y0, t_span=t_span)
+    params = common.pop("params", None)
+    return Problem(name=name, fun=bind(pointer, params), rhs=fun, params=params, y0=y0, t_span=t_span)

@@ -1,0 +1,155 @@
+"""What `recommend` returns: method and options for a wanted error, the trials that speak for them, and the reason."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ..core.problem import Problem
+from .integrate import integrate
+from .results import IntegrationResult
+from .trials import Trial
+
+__all__ = ["Recommendation", "called"]
+
+# What a trial that failed says, in the table.
+WIDTH = 90
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Recommendation:
+    """A method and its options for a wanted error; prints as a table of trials and a sentence.
+
+    Attributes
+    ----------
+    problem : Problem
+        The one given, with the start and the interval of the call; made from the function where one was given.
+    options : dict
+        For `integrate`, ``method`` among them: ``integrate(recommendation.problem, **recommendation.options)``.
+    method : type
+        The solver class.
+    trial : Trial
+        That of the recommended run.
+    wanted : float
+        The error that was asked for.
+    error, nfev : float, int
+        What is expected of the run: the error at the end of the interval, largest component of the difference relative
+        to the largest component, and evaluations of the right-hand side.
+    share : float
+        The part of the interval that the trials cover; below 1 both numbers are extrapolated.
+    trusted : bool
+        Whether the recommended run showed nothing in its trial that speaks against it, with all invariants kept that
+        were asked for.
+    message : str
+        What speaks against it; empty where nothing does.
+    reason : str
+    trials : tuple of Trial
+        All trials: ``options``, ``error``, ``nfev``, ``seconds``, and ``trouble`` of those that failed.
+    """
+
+    problem: Problem
+    options: Mapping[str, Any]
+    trial: Trial
+    wanted: float
+    share: float
+    message: str
+    reason: str
+    trials: tuple[Trial, ...]
+
+    @property
+    def method(self) -> Any:
+        """The solver class."""
+        return self.options["method"]
+
+    @property
+    def error(self) -> float:
+        """What is expected at the end of the interval."""
+        return self.trial.error
+
+    @property
+    def nfev(self) -> int:
+        """Evaluations that are expected."""
+        return self.trial.nfev
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing speaks against the run."""
+        return not self.message
+
+    def run(self, **options: Any) -> IntegrationResult:
+        """Integrate as recommended.
+
+        Parameters
+        ----------
+        **options
+            Of `integrate`, such as ``save_every`` or ``events``; they take precedence.
+
+        Returns
+        -------
+        IntegrationResult
+        """
+        return integrate(self.problem, **{**self.options, **options})
+
+    def __repr__(self) -> str:
+        t0, t_end = self.problem.t_span
+        part = "" if self.share == 1 else f", extrapolated from {self.share:.2g} of the interval"
+        lines = [
+            f"{self.problem.name}: error {self.wanted:g} at the end of t from {t0:g} to {t_end:g}",
+            f"  integrate(problem, {called(self.options)})",
+            f"  expected: error {self.error:.1e}, {self.nfev} evaluations{part}",
+            *([f"  WARNING: {self.message}"] if self.message else []),
+            *_table(self.trials, self.trial),
+            f"  {self.reason}",
+        ]
+        return "\n".join(lines)
+
+
+def called(options: Mapping[str, Any]) -> str:
+    """Options as they stand in a call; what takes long to write as its name alone."""
+    return ", ".join(f"{name}={_shown(value)}" for name, value in options.items())
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, type):
+        return value.__name__
+    if isinstance(value, float):
+        return f"{value:g}"
+    return repr(value) if isinstance(value, (str, int)) or value is None or _empty(value) else "..."
+
+
+def _empty(value: Any) -> bool:
+    return isinstance(value, tuple) and not value
+
+
+def _table(trials: tuple[Trial, ...], chosen: Trial) -> Iterator[str]:
+    """A row for each way to run; "->" before the one recommended."""
+    rows = []
+    for trial in _one_each(trials, chosen):
+        cost = f"{trial.error:9.1e} {trial.nfev:11d}" if math.isfinite(trial.error) else f"{'-':>9} {'-':>11}"
+        trouble = textwrap.shorten(trial.trouble, WIDTH, placeholder=" ...")
+        rows.append(("->" if trial is chosen else "", _telling(trial.options), cost, f"  {trouble}".rstrip()))
+    width = max(len(row[1]) for row in rows)
+    yield f"     {'trials':<{width}}     error evaluations"
+    for mark, name, cost, trouble in rows:
+        yield f"  {mark:>2} {name:<{width}} {cost}{trouble}"
+
+
+def _telling(options: Mapping[str, Any]) -> str:
+    """The method and the options that do not follow from others."""
+    others = {name: value for name, value in options.items() if name not in ("method", "atol", "compensated")}
+    return f"{options['method'].__name__}, {called(others)}"
+
+
+def _one_each(trials: tuple[Trial, ...], chosen: Trial) -> list[Trial]:
+    """The last trial of each way to run, a good one if there is one; those alike but for the numbers are one way."""
+    ways: dict[str, Trial] = {}
+    for trial in trials:
+        options = {name: value for name, value in trial.options.items() if name not in ("h", "rtol", "atol")}
+        way = f"{called(options)}, {'h' in trial.options}"
+        known = ways.get(way)
+        if known is None or (known is not chosen and (trial.good or not known.good)):
+            ways[way] = trial
+    return list(ways.values())

@@ -1,0 +1,323 @@
+"""The search of `recommend`: which ways to run suit a problem, what each costs at the wanted error, and why."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..core import setup
+from ..core.problem import Problem
+from ..core.results import ProjectionWarning
+from ..core.setup import Counted
+from ..core.solvers import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12
+from .integrate import integrate
+from .prepare import Request, prepared
+from .recommendation import Recommendation, called
+from .trials import Bench, Outcome, Trial, difference
+from .tuning import AIM, COARSEST_RTOL, FINEST_RTOL, WINDOW, Kind, best, tune
+
+__all__ = ["Search"]
+
+PLAIN: dict[str, Any] = {"invariants": ()}
+# For Nystrom methods, whose steps are so accurate that rounding counts.
+LONG: dict[str, Any] = {"every": "auto", "compensated": True}
+# Evaluations of one trial: by Python functions, and by native ones.
+MOST_NFEV = {False: 100_000, True: 500_000}
+# The first run may take one part in so many of these: the tightest takes some times as many.
+FIRST_PART = 4
+# Numbers that the first run keeps at most, about.
+MOST_SAVED = 4_000_000
+# A trial that covers a part of the interval is looked at so many times.
+LOOKS = 8
+# The tolerances of a reference, going down; it is good enough where two of them agree to this part of the wanted error.
+REFERENCE_START, REFERENCE_STEP, FINE_START = 1e-2, 1e-2, 1e-12
+AGREEMENT, LEAST_AGREEMENT = 0.02, 0.3
+# A trial that takes so many times the evaluations of the longest reference is broken off.
+LONGEST = 3
+# Rounding is all that is left where a smaller tolerance leaves so much of the difference.
+ROUNDED = 0.5
+# Runs with and without projection are the same where they differ by so many times what is uncertain of the latter.
+SAME = 10.0
+# Methods of low orders, and from which error on they are tried.
+LOW_ORDERS = (EIPRK45, 1e-7), (EIPRK23, 1e-3)
+# Where the steps of an adaptive run vary by less, equal ones are tried, and those of multistep methods.
+EVEN, VERY_EVEN = 5.0, 2.5
+# Multistep methods are tried on runs of so many steps of EIPDOP853 at least: their start takes 200 evaluations.
+LEAST_MULTISTEP = 100
+# An interval holds so many equal steps at least.
+LEAST_STEPS = 40
+# Another metric or other blocks are tuned where the error is so many times less.
+BETTER = 3.0
+# What comes later in the search, less usual, is taken where it takes so few evaluations of what came before.
+CHEAPER = 0.9
+# A run is bound by stability where so many times the tolerance takes no fewer evaluations.
+LOOSER, FEWER = 10.0, 0.9
+# What takes fewer evaluations than this is not worth the remark.
+LEAST_BOUND = 1000
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a first run shows: the size of the state, the typical step, by what factor the steps vary, the second order.
+
+    `velocities` tells whether the accelerations of q'' = a(t, q, v) change with v; None: no such system.
+    """
+
+    size: float
+    step: float
+    variation: float
+    velocities: bool | None
+
+
+class Search:
+    """The search for one problem: all trials, in the order in which they were run."""
+
+    def __init__(self, problem: Problem, common: Mapping[str, Any], wanted: float, max_nfev: int | None) -> None:
+        self.bench, self.wanted = Bench(problem, common), wanted
+        self.asked = bool(common.get("invariants", problem.invariants))
+        self.keeps = self.asked
+        self.trials: list[Trial] = []
+        self.kinds: dict[int, Kind] = {}
+        self.notes: list[str] = []
+        self.message, self.longest = "", 0
+        self.look = self._look(max_nfev)
+        self._find_truth()
+        self.bench.most = LONGEST * self.longest
+
+    def recommendation(self) -> Recommendation:
+        """The cheapest way found, tuned, with the reason."""
+        chosen = self._cheapest()
+        if chosen is None and self.keeps:
+            self._leave_out_invariants()
+            chosen = self._cheapest()
+        if chosen is None:
+            raise ValueError(self._unreached())
+        if self.keeps:
+            chosen = self._other_metric(chosen)
+            self._say_what_projection_does(chosen)
+        self._say_what_binds(chosen)
+        if self.message:
+            warnings.warn(f"recommend: {self.message}", ProjectionWarning, stacklevel=3)
+        return Recommendation(
+            problem=self.bench.problem,
+            options={**chosen.options, **{k: v for k, v in self.bench.common.items() if k not in chosen.options}},
+            trial=chosen,
+            wanted=self.wanted,
+            share=self.bench.share,
+            message=self.message,
+            reason=" ".join([self._why(chosen), *self.notes]),
+            trials=tuple(self.trials),
+        )
+
+    # --- what is known before: size, steps, a truth to compare with ---
+
+    def _look(self, max_nfev: int | None) -> Look:
+        """A first run without projection, over as much of the interval as trials may take."""
+        bench, problem = self.bench, self.bench.problem
+        rtol = min(max(self.wanted, 1e-10), 1e-4)
+        atol = 1e-3 * rtol * min(1.0, float(np.abs(problem.y0).max()) or 1.0)
+        options = {**bench.common, "method": EIPDOP853, "rtol": rtol, "atol": atol}
+        velocities, native = _asked_of_the_field(Request.of(fun=problem, **options))
+        most = MOST_NFEV[native] if max_nfev is None else max_nfev
+        steps = max(most // (FIRST_PART * EIPDOP853.TABLEAU.n_stages), 10)
+        every = max(1, steps * problem.y0.size // MOST_SAVED)
+        rows = iter(range(steps // every))
+
+        def enough(t: float, y: np.ndarray, defects: np.ndarray) -> bool:
+            return next(rows, None) is None
+
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            run = integrate(problem, **{**options, **PLAIN}, save_every=every, callback=enough)
+        if not run.success:
+            raise ValueError(f"recommend: a trial by EIPDOP853 with rtol={rtol:g} failed: {run.message}")
+        if run.status == 1:
+            bench.shorten(float(run.t[-1]), LOOKS)
+        lengths = np.abs(np.diff(run.t)) / every
+        lengths = lengths[2:-1] if lengths.size > 5 else lengths
+        short, long = np.percentile(lengths, [5, 95])
+        size = min(1.0, float(np.abs(run.y).max())) or 1.0
+        return Look(size, float(np.median(lengths)), float(long / short), velocities)
+
+    def _find_truth(self) -> None:
+        """States to compare with: of the tighter of two runs that agree well enough."""
+        size, plain = self.look.size, Kind(EIPDOP853, size=self.look.size, options=PLAIN)
+        found, enough = [self._reference(plain, REFERENCE_START * self.wanted)], AGREEMENT * self.wanted
+        method, options = (EIPRKN12, LONG) if self.look.velocities is False else (EIPDOP853, {})
+        if found[0][0] > enough and self.keeps:
+            kept = self._reference(Kind(method, size=size, options=options), FINE_START)
+            apart = difference(kept[1].y, found[0][1].y).max()
+            if apart <= SAME * self.bench.share * found[0][0]:  # the latter was extrapolated to the interval's end
+                found.append(kept)
+        if min(item[0] for item in found) > enough and method is EIPRKN12:
+            found.append(self._reference(Kind(method, size=size, options=options | PLAIN), FINE_START))
+        agreement, reference = min(found, key=lambda item: item[0])
+        least = agreement / LEAST_AGREEMENT
+        if least > self.wanted:
+            hint = (
+                f"Ask for {least:.0e} or more, or for a shorter interval." if least < 0.1 else "Shorten the interval."
+            )
+            raise ValueError(
+                f"recommend: an error of {self.wanted:g} cannot be reached, or not be told from others: two runs with "
+                f"the smallest tolerances differ by {agreement:.1e} at the end. Rounding errors have grown to that, or "
+                f"the motion is chaotic. {hint}"
+            )
+        self.bench.truth = reference.y
+
+    def _reference(self, kind: Kind, rtol: float) -> tuple[float, Outcome]:
+        """How well two runs agree at the end, going down in tolerance from `rtol`, and the tighter one."""
+        rtol, wider, agreement = max(rtol, FINE_START), None, math.inf
+        while True:
+            settings = kind.settings(kind.near(rtol))
+            done, before = self.bench.run(settings), agreement
+            self.longest = max(self.longest, done.nfev)
+            if done.trouble:
+                return agreement, done if wider is None else wider
+            if wider is not None:
+                agreement = self.bench.judged(settings, wider, done.y).error
+            if agreement <= AGREEMENT * self.wanted or rtol <= FINEST_RTOL or agreement > ROUNDED * before:
+                return min(agreement, before), done
+            wider, rtol = done, max(rtol * REFERENCE_STEP, FINEST_RTOL)
+
+    # --- the ways to run ---
+
+    def _cheapest(self) -> Trial | None:
+        """The cheapest trial of all kinds that suit the problem; None where none has the wanted error."""
+        first = self._kind(EIPDOP853)
+        chosen = self._tuned(first, self.wanted)
+        if self.keeps and not any(trial.good for trial in self.trials):
+            return None  # whatever speaks against the invariants does so for all methods
+        rtol = self.wanted if chosen is None else chosen.options["rtol"]
+        for kind, value in self._others(rtol):
+            other = self._tuned(kind, value, math.inf if chosen is None else chosen.nfev)
+            if other is not None and (chosen is None or other.nfev < CHEAPER * chosen.nfev):
+                chosen = other
+        return chosen
+
+    def _others(self, rtol: float) -> list[tuple[Kind, float]]:
+        """Kinds beside the first, with the number that each starts from."""
+        look, found = self.look, []
+        if look.velocities is False:
+            found += [(self._kind(EIPRKN8, **LONG), rtol), (self._kind(EIPRKN12, **LONG), rtol)]
+            if look.variation <= EVEN:
+                found.append((self._kind(EIPRKN12, fixed=True, **LONG), 2 * look.step))
+        else:
+            found += [(self._kind(method), rtol) for method, least in LOW_ORDERS if self.wanted >= least]
+        length = abs(self.bench.t_end - self.bench.t0)
+        if look.velocities is not None and look.variation <= VERY_EVEN and length > LEAST_MULTISTEP * look.step:
+            jacobian = self.bench.common.get("jacobian", self.bench.problem.jacobian)
+            method, step = (EIPGJ12, look.step / 12) if jacobian is None else (EIPGJ14, look.step / 6)
+            found.append((self._kind(method, fixed=True), step))
+        return found
+
+    def _kind(self, method: Any, *, fixed: bool = False, **options: Any) -> Kind:
+        if self.asked and not self.keeps:
+            options |= PLAIN
+        length = abs(self.bench.times[-1] - self.bench.t0)
+        return Kind(method, fixed, self.look.size, length / LEAST_STEPS if fixed else COARSEST_RTOL, options)
+
+    def _tuned(self, kind: Kind, value: float, bound: float = math.inf) -> Trial | None:
+        """The best trial of a kind, or None where it does not get there."""
+        tried = tune(kind, value, self.wanted, self._trial, bound)
+        for trial in tried:
+            self.kinds[id(trial)] = kind
+        return best(tried, self.wanted)
+
+    def _trial(self, options: Mapping[str, Any]) -> Trial:
+        self.trials.append(self.bench.trial(options))
+        return self.trials[-1]
+
+    def _other_metric(self, chosen: Trial) -> Trial:
+        """The same with another metric or blocks, where that makes the error much smaller and then the run cheaper."""
+        for options in self._metrics():
+            kind, trial = self.kinds[id(chosen)], self._trial({**chosen.options, **options})
+            if not (trial.good and BETTER * trial.error <= chosen.error):
+                continue
+            value = chosen.options[kind.knob] * (AIM * self.wanted / max(trial.error, 1e-17)) ** (1 / kind.slope)
+            better = self._tuned(replace(kind, options={**kind.options, **options}), value)
+            if better is not None and better.nfev < CHEAPER * chosen.nfev:
+                self.notes.append(f"{called(options)} divides the error by {chosen.error / trial.error:.2g}.")
+                chosen = better
+        return chosen
+
+    def _metrics(self) -> list[dict[str, Any]]:
+        """Options of the metric that are left open."""
+        problem, n = self.bench.problem, self.bench.problem.y0.size
+        if problem.metric is not None or "metric" in self.bench.common:
+            return []
+        found: list[dict[str, Any]] = []
+        if problem.blocks is None and "blocks" not in self.bench.common and self.look.velocities is not None:
+            found += [{"blocks": size} for size in (3, 2) if n % (2 * size) == 0 and n > 2 * size]
+        return [*found, {"metric": "euclidean"}]
+
+    # --- what is said of it ---
+
+    def _leave_out_invariants(self) -> None:
+        """Go on without projection, and say why."""
+        self.keeps = False
+        good = [trial.error for trial in self.trials if trial.good]
+        why = f"with the projection the error stays at {min(good):.1e}" if good else self.trials[-1].trouble
+        self.message = f"the invariants are left out, for no trial that keeps them has the wanted error: {why}"
+
+    def _say_what_projection_does(self, chosen: Trial) -> None:
+        plain = self._trial({**chosen.options, **PLAIN})
+        if math.isfinite(plain.error):
+            self.notes.append(f"Without the projection the error is {plain.error:.1e}.")
+
+    def _say_what_binds(self, chosen: Trial) -> None:
+        """Whether stability bounds the steps, where the run is more accurate than wanted."""
+        kind = self.kinds[id(chosen)]
+        if chosen.error >= WINDOW * self.wanted or kind.fixed or chosen.nfev < LEAST_BOUND:
+            return
+        looser = self._trial(kind.settings(kind.near(LOOSER * chosen.options["rtol"])))
+        if looser.nfev > FEWER * chosen.nfev:
+            self.notes.append(
+                "Stability bounds the steps, not accuracy: an implicit method, or a splitting, may cost much less."
+            )
+
+    def _why(self, chosen: Trial) -> str:
+        """The choice of the method in a sentence."""
+        look = self.look
+        if look.velocities is None:
+            form = "The equations are not of the form q'' = a(t, q) with y = (q, v)"
+        else:
+            form = "The accelerations depend on velocities" if look.velocities else "The equations are q'' = a(t, q)"
+        kind = self.kinds[id(chosen)]
+        rivals = [trial for trial in self.trials if self._name(trial) not in ("", kind.name)]
+        rival = best(rivals, self.wanted)
+        ratio = math.inf if rival is None else rival.nfev / chosen.nfev
+        nearly = "nearly " if ratio < 1 else ""  # the more usual way is taken then
+        words = f"{form}, and the steps vary by a factor of {look.variation:.2g}: {kind.name} needs {nearly}the fewest "
+        words += "evaluations" if rival is None else f"evaluations, {self._name(rival)} {ratio:.3g} times as many"
+        return f"{words}."
+
+    def _name(self, trial: Trial) -> str:
+        """The kind of a trial in words; empty where it is a comparison only."""
+        kind = self.kinds.get(id(trial))
+        return "" if kind is None else kind.name
+
+    def _unreached(self) -> str:
+        good = [trial.error for trial in self.trials if trial.good]
+        found = f"the least found is {min(good):.1e}" if good else self.trials[-1].trouble
+        return f"recommend: no trial has an error of {self.wanted:g}: {found}. Ask for more, or for a shorter interval."
+
+
+def _asked_of_the_field(request: Request) -> tuple[bool | None, bool]:
+    """Whether it is of second order and by velocities (see `Look`), and whether its functions are native.
+
+    The start is checked as for a run with the invariants: a wrong gradient raises, and what is no invariant warns.
+    """
+    ready = prepared(request)
+    _, why_not = ready.system.functions(ready.run, None)
+    calls, start = Counted(ready.system.derivative), ready.start
+    with np.errstate(all="ignore"):
+        try:
+            velocities = setup.depends_on_velocity(calls, start.t, start.y, start.f, "")
+        except ValueError:
+            velocities = None
+    return velocities, why_not is None

@@ -1,0 +1,202 @@
+"""`recommend`: the run that it recommends has the error that was wanted, and whatever speaks against it is told."""
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from systems import H, L, orbit, pericentre
+
+from eip_scipy import EIPGJ14, Invariant, ProjectionWarning, integrate, recommend
+from eip_scipy.problems import kepler, solar_system
+from eip_scipy.problems.hard_cases import hard_cases
+
+FACTOR = 10.0
+
+
+def error(y, exact):
+    """As `recommend` means it."""
+    return np.abs(y - exact).max() / np.abs(exact).max()
+
+
+def assert_near(found, wanted):
+    assert wanted / FACTOR <= found <= wanted * FACTOR, f"{found:.1e} where {wanted:.0e} was wanted"
+
+
+def pendulum(t, y):
+    return np.array([y[1], -math.sin(y[0])])
+
+
+def damped(t, y):
+    return np.array([y[1], -math.sin(y[0]) - 0.2 * y[1]])
+
+
+ENERGY = Invariant(lambda t, y: 0.5 * y[1] ** 2 - np.cos(y[0]), lambda t, y: np.array([np.sin(y[0]), y[1]]), name="E")
+
+
+@pytest.mark.parametrize("wanted", [1e-4, 1e-9])
+def test_kepler_by_its_closed_form(wanted):
+    problem = kepler(0.6, relativistic=0)
+    choice = recommend(problem, (0, 50), error=wanted)
+    run = choice.run()
+    assert_near(error(run.y[:, -1], problem.reference(50)), wanted)
+    assert choice.trusted
+    assert run.trusted
+    assert choice.error <= wanted
+    assert run.nfev == choice.nfev
+    assert choice.method.__name__.startswith("EIPRKN")  # q'' = a(q)
+    same = integrate(choice.problem, **choice.options)
+    assert np.array_equal(same.y, run.y)
+
+
+@pytest.mark.parametrize("name", ["euler_top", "three_wave", "kepler_e0999"])
+@pytest.mark.parametrize("wanted", [1e-5, 1e-8])
+def test_hard_cases(name, wanted):
+    (case,) = hard_cases([name])
+    choice = recommend(case.problem, error=wanted)
+    found = case.error(choice.run().y[:, -1])
+    assert_near(found, wanted)
+    assert 0.5 * choice.error < found < 2 * choice.error
+
+
+def test_it_finds_the_multistep_method_for_planets():
+    problem = solar_system()
+    choice = recommend(problem, (0, 10), error=1e-8)
+    assert choice.method is EIPGJ14
+    assert error(choice.run().y[:, -1], problem.reference(10)) < 1e-8
+    others = [trial for trial in choice.trials if trial.options["method"] is not EIPGJ14 and trial.good]
+    assert choice.nfev < min(trial.nfev for trial in others if trial.error <= 1e-8)
+
+
+def test_no_equal_steps_where_the_speed_varies():
+    choice = recommend(orbit, (0, 20), pericentre(0.9), invariants=[H, L], error=1e-7)
+    assert not any("h" in trial.options for trial in choice.trials)
+    assert_near(error(choice.run().y[:, -1], kepler(0.9, relativistic=0).reference(20)), 1e-7)
+
+
+def test_a_long_run_is_tried_on_a_part():
+    problem, wanted = kepler(0.3, relativistic=0), 1e-6
+    choice = recommend(problem, (0, 3000), error=wanted, max_nfev=10_000)
+    assert choice.share < 0.2
+    assert "extrapolated" in repr(choice)
+    assert choice.error <= wanted
+    run = choice.run()
+    assert_near(error(run.y[:, -1], problem.reference(3000)), choice.error)
+    assert run.nfev == pytest.approx(choice.nfev, rel=0.1)
+    assert max(trial.nfev * choice.share for trial in choice.trials) < 100_000
+
+
+def test_the_other_form_of_functions():
+    def spring(t, y, params):
+        return np.array([y[1], -params[0] * y[0]])
+
+    def spring_in_place(t, y, out, params):
+        out[:] = spring(t, y, params)
+
+    exact = np.array([math.cos(40), -2 * math.sin(40)])
+    for fun, options in ((spring, {}), (spring_in_place, {"in_place": True})):
+        choice = recommend(fun, (0, 20), [1, 0], params=[4.0], error=1e-6, **options)
+        assert_near(error(choice.run().y[:, -1], exact), 1e-6)
+        assert "invariants" not in choice.options
+
+
+def test_backward():
+    choice = recommend(pendulum, (3, -20), [1.0, 0.5], invariants=ENERGY, error=1e-7)
+    exact = solve_ivp(pendulum, (3, -20), [1.0, 0.5], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    assert_near(error(choice.run().y[:, -1], exact), 1e-7)
+
+
+def test_what_is_no_invariant_is_left_out_and_told():
+    exact = solve_ivp(damped, (0, 20), [2.0, 0.0], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    with pytest.warns(ProjectionWarning, match="invariants are left out.*'E'"):
+        choice = recommend(damped, (0, 20), [2.0, 0.0], invariants=ENERGY)
+    assert choice.options["invariants"] == ()
+    assert not choice.trusted
+    assert "'E'" in choice.message
+    assert choice.message in repr(choice)
+    assert_near(error(choice.run().y[:, -1], exact), 1e-6)
+    failed = [trial for trial in choice.trials if "invariants" not in trial.options]
+    assert failed
+    assert not any(trial.good for trial in failed)
+
+
+def test_a_wrong_gradient_is_an_error():
+    wrong = Invariant(ENERGY.fun, lambda t, y: np.array([np.sin(y[0]), 2 * y[1]]), name="E")
+    with pytest.raises(ValueError, match="gradient of invariant 'E' is wrong"):
+        recommend(pendulum, (0, 20), [1.0, 0.5], invariants=wrong)
+
+
+def test_errors_that_cannot_be_reached():
+    with pytest.raises(ValueError, match=r"error of 1e-15 cannot be reached.*Ask for \de-1[34] or more"):
+        recommend(kepler(0.6, relativistic=0), (0, 50), error=1e-15)
+
+    def lorenz(t, y):
+        return np.array([10 * (y[1] - y[0]), y[0] * (28 - y[2]) - y[1], y[0] * y[1] - 8 / 3 * y[2]])
+
+    with pytest.raises(ValueError, match=r"chaotic\. Shorten the interval"):
+        recommend(lorenz, (0, 60), [1.0, 1.0, 1.0])
+
+
+def test_stability_is_named():
+    choice = recommend(lambda t, y: np.array([-2000 * (y[0] - math.cos(t))]), (0, 2), [1.0], error=1e-4)
+    assert "Stability bounds the steps" in choice.reason
+
+
+def test_a_run_that_fails_at_once():
+    with pytest.raises(ValueError, match=r"trial by EIPDOP853.*non-finite value at t=0"):
+        recommend(lambda t, y: y * math.nan, (0, 1), [1.0])
+
+
+def test_exceptions_of_the_function_pass_through():
+    def broken(t, y):
+        raise KeyError("broken")
+
+    with pytest.raises(KeyError, match="broken"):
+        recommend(broken, (0, 1), [1.0])
+
+
+def test_what_is_printed():
+    choice = recommend(pendulum, (0, 20), [1.0, 0.5], invariants=ENERGY, error=1e-6)
+    lines = repr(choice).splitlines()
+    assert lines[0] == "pendulum: error 1e-06 at the end of t from 0 to 20"
+    assert lines[1].startswith(f"  integrate(problem, method={choice.method.__name__}, ")
+    assert f"{choice.nfev} evaluations" in lines[2]
+    assert sum(line.startswith("  -> ") for line in lines) == 1
+    assert any("invariants=()" in line for line in lines)  # what the projection does is shown
+    assert lines[-1].strip() == choice.reason
+    assert "Without the projection the error is" in choice.reason
+
+
+def test_options_of_the_run_take_precedence():
+    run = recommend(pendulum, (0, 20), [1.0, 0.5], invariants=ENERGY).run(t_eval=[5.0, 10.0])
+    assert run.t.tolist() == [5.0, 10.0]
+
+
+def test_it_pickles():
+    choice = recommend(pendulum, (0, 5), [1.0, 0.5], error=1e-4)
+    again = pickle.loads(pickle.dumps(choice))
+    assert repr(again) == repr(choice)
+    assert np.array_equal(again.run().y, choice.run().y)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        ({"error": 0}, ValueError, "error must be a number between 0 and 1, got 0"),
+        ({"error": "a"}, ValueError, "error must be a number between 0 and 1"),
+        ({"error": math.nan}, ValueError, "error must be"),
+        ({"max_nfev": 10}, ValueError, "max_nfev must be at least 1000, got 10"),
+        ({"rtol": 1e-3}, TypeError, "no option 'rtol'"),
+        ({"metrik": "euclidean"}, TypeError, "did you mean 'metric'"),
+        ({"t_span": (0, math.inf)}, ValueError, "finite length"),
+        ({"t_span": (1, 1)}, ValueError, "finite length"),
+        ({"t_span": None}, TypeError, "t_span is missing"),
+        ({"y0": None}, TypeError, "y0 is missing"),
+        ({"fun": 3}, TypeError, "callable or a Problem, got 3"),
+    ],
+)
+def test_arguments(arguments, kind, message):
+    given = {"fun": pendulum, "t_span": (0, 1), "y0": [1.0, 0.0]} | arguments
+    with pytest.raises(kind, match=message):
+        recommend(**given)
