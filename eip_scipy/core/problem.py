@@ -13,7 +13,7 @@ from ..engine.native import library
 from .inputs import has_unit, refuse_units, shown
 from .invariants import Invariant
 from .pointers import by_pointer
-from .units import DAY_S, Epoch, Unit, as_epoch, in_unit, is_time, moment, shown_epoch
+from .units import DAY_S, Epoch, Unit, apart, as_epoch, in_unit, is_time, moment, shown_epoch
 from .units import units as known_units
 
 __all__ = ["Problem", "bind", "component_names", "native_invariant"]
@@ -188,7 +188,7 @@ class Problem:
         for name in DURATIONS:
             if name in given:
                 out[name] = in_unit(name, given[name], (0, 1), known)
-        span, start = given.get("t_span"), given.get("y0")
+        span, start = apart(given.get("t_span")), given.get("y0")
         if start is not None:
             out["y0"] = self._plain_state(start)
         elif isinstance(span, tuple | list) and span and is_time(span[0]):

@@ -12,8 +12,8 @@ import numpy as np
 from .inputs import has_unit, is_date, refuse_units, shown
 
 __all__ = [
-    "DAY_S", "LENGTHS", "TIMES", "Epoch", "Unit", "as_epoch", "days_since", "exact_sum", "in_unit", "is_time", "moment",
-    "shown_epoch", "units",
+    "DAY_S", "LENGTHS", "TIMES", "Epoch", "Unit", "apart", "as_epoch", "days_since", "exact_sum", "in_unit", "is_time",
+    "moment", "shown_epoch", "units",
 ]  # fmt: skip
 
 Epoch = tuple[float, float]
@@ -126,6 +126,11 @@ def moment(name: str, value: Any, known: tuple[Unit, Unit] | None, epoch: Epoch 
 def is_time(value: Any) -> bool:
     """Whether a value is a time of astropy, a moment and not a duration."""
     return hasattr(value, "jd1") and hasattr(value, "jd2") and hasattr(value, "mjd")
+
+
+def apart(span: Any) -> Any:
+    """The ends of a span as a pair, where they are one array of times of astropy."""
+    return tuple(span) if is_time(span) and np.shape(span.jd1) else span
 
 
 def as_epoch(name: str, value: Any) -> Epoch:

@@ -110,7 +110,8 @@ def test_what_does_not_fit(changes, error, message):
 def test_spans_and_steps():
     """In units and as dates the same bits as in plain numbers of the problem's unit."""
     plain = solar((0, 2), save_every=10)
-    for span in ((0 * YR, 2 * YR), (0, 2 * YR), (EPOCH, EPOCH + 2 * YR), (0, TimeDelta(2 * YR))):
+    dates = EPOCH + [0, 2] * YR
+    for span in ((0 * YR, 2 * YR), [0, 2] * YR, (0, 2 * YR), (0, TimeDelta(2 * YR)), tuple(dates), dates):
         run = solar(span, h=(0.01 * YR).to(DAY), save_every=10)
         np.testing.assert_allclose(run.t, plain.t, rtol=1e-15)
         np.testing.assert_allclose(run.y, plain.y, rtol=0, atol=1e-13)
@@ -153,6 +154,8 @@ def test_another_start_needs_its_state():
     later = EPOCH + 10 * DAY
     with pytest.raises(ValueError, match=r"t_span: the run is to start at .*is that of JD 2456691\.345833 TDB"):
         solar((later, later + 1 * YR))
+    with pytest.raises(ValueError, match=r"t_span: the run is to start at"):
+        solar(later + [0, 1] * YR)
     run = solar((later, later + 1 * YR), y0=solar_system().y0)
     assert run.t[0] == pytest.approx(10 / 365.25, rel=1e-12)
     assert solar((10 * DAY, 1 * YR)).t[0] == 10 / 365.25  # a duration is a number
@@ -212,6 +215,7 @@ def test_problems_without_units_or_epoch():
 def test_epochs():
     bodies = {name: SUN_AND_JUPITER[name] for name in ("gm", "position", "velocity")}
     by_span = nbody(**bodies, t_span=(EPOCH, EPOCH + 1 * YR), units="AU, yr")
+    assert nbody(**bodies, t_span=EPOCH + [0, 1] * YR, units="AU, yr").t_span == (0.0, 1.0)
     by_time = nbody(**bodies, t_span=(0 * YR, 1 * YR), epoch=EPOCH.tt)
     by_number = nbody(**bodies, t_span=(0 * YR, 1 * YR), epoch=2456691.345833333)
     assert by_span.t_span == by_time.t_span == (0.0, 1.0)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...core.invariants import Invariant
 from ...core.problem import Problem, bind, native_invariant
-from ...core.units import Epoch, as_epoch, in_unit, is_time, moment
+from ...core.units import Epoch, apart, as_epoch, in_unit, is_time, moment
 from ...core.units import units as known_units
 from ...engine.native import library
 from . import forces as _forces
@@ -129,6 +129,7 @@ def nbody(
     frame only keeps corrections from moving the centre of mass. With "1pn" and "eih" accelerations depend on
     velocities: `acc` is None, and Nystrom methods do not apply.
     """
+    t_span = apart(t_span)
     units = units or default_units(gm, position, velocity, t_span)
     known = known_units(units)
     gm, position, velocity = in_units(gm, position, velocity, known)
