@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import re
 import struct
@@ -25,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from eip_scipy.core.inputs import refuse_units
+from eip_scipy.core.units import as_epoch, exact_sum
 from eip_scipy.problems.gravity.solar_data import (
     AU_KM,
     SOLAR_SYSTEM_JSON,
@@ -150,16 +150,14 @@ def mass_parameters(path: _StrPath | None = None) -> dict[str, float]:
     return {name: float(value) for name, value in found}
 
 
-def initial_data(
-    epoch_jd_tdb: float | tuple[float, float], path: _StrPath | None = None, *, moon: bool = False
-) -> SolarSystemData:
+def initial_data(epoch_jd_tdb: Any, path: _StrPath | None = None, *, moon: bool = False) -> SolarSystemData:
     """Sun and nine system barycentres (Mercury, ..., EMB, ..., Pluto) at an epoch.
 
     Parameters
     ----------
-    epoch_jd_tdb : float or (float, float)
+    epoch_jd_tdb : float or (float, float) or astropy.time.Time
         Julian date, TDB. One float64 resolves 40 microseconds; two parts are added without loss, e.g.
-        ``(2456690.5, 20.3 / 24)``.
+        ``(2456690.5, 20.3 / 24)``. Or a time of astropy, in any scale: it is converted to TDB.
     path : path-like, optional
         See `kernel_path`.
     moon : bool, optional
@@ -195,27 +193,27 @@ def initial_data(
     # only once would move Mercury by 5e-12 AU after 1000 yr, ten times the reference's own error.
     position, velocity = to_barycentre(gm, km / AU_KM, km_per_day / AU_KM)
     apart = ", Earth and Moon" if moon else ""
+    jd, lost = exact_sum(day, rest)
     return SolarSystemData(
         name=path.stem,
         bodies=tuple(bodies),
         gm=gm,
         position=position,
         velocity=velocity,
-        epoch_jd_tdb=day + rest,
+        epoch_jd_tdb=jd,
         epoch=_date(day, rest),
         axes="ICRF",
         source=f"JPL {ephemeris}, system barycentres{apart}; GM in km^3/s^2 from the kernel's comments",
+        epoch_rest=lost,
     )
 
 
-def heliocentric(
-    epoch_jd_tdb: float | tuple[float, float], days: np.ndarray, path: _StrPath | None = None
-) -> dict[str, np.ndarray]:
+def heliocentric(epoch_jd_tdb: Any, days: np.ndarray, path: _StrPath | None = None) -> dict[str, np.ndarray]:
     """Positions of the planets' barycentres relative to the Sun, at times counted from an epoch.
 
     Parameters
     ----------
-    epoch_jd_tdb : float or (float, float)
+    epoch_jd_tdb : float or (float, float) or astropy.time.Time
         See `initial_data`.
     days : ndarray, shape (m,)
         Days since the epoch; negative before it.
@@ -264,16 +262,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     options.out.write_text(_dumps(sets), encoding="utf-8")
 
 
-def _two_part(epoch: float | tuple[float, float]) -> tuple[float, float]:
+def _two_part(epoch: Any) -> tuple[float, float]:
     """Whole and fractional day: the kernel keeps their seconds apart."""
-    if hasattr(epoch, "jd1"):
-        raise TypeError(
-            f"epoch_jd_tdb: got the time {epoch!r}, expected a Julian date in TDB; with astropy (t.tdb.jd1, t.tdb.jd2)."
-        )
-    refuse_units(epoch_jd_tdb=epoch)
-    first, second = epoch if isinstance(epoch, tuple | list) else (epoch, 0.0)
-    if not (math.isfinite(first) and math.isfinite(second)):
-        raise ValueError(f"expected a finite Julian date, got {epoch!r}")
+    first, second = as_epoch("epoch_jd_tdb", epoch)
     day = float(round(first))
     return day, (first - day) + second
 

@@ -1,8 +1,9 @@
-"""REBOUND as a judge: its integrators on our states, run so that a comparison is fair.
+"""REBOUND both ways: its simulations as problems, our runs as simulations and archives; and REBOUND as a judge.
 
-Masses enter as G m with G = 1, the Sun first, in the frame of the centre of mass. Fixed steps are counted and not
-timed: REBOUND's own clock accumulates rounding, which at 1000 years is more than WHFast's own error. WHFast and SABA
-run without safe mode and are synchronised before each reading, in a way that leaves the run itself untouched.
+As a judge its integrators run on our states, so that a comparison is fair. Masses enter as G m with G = 1, the Sun
+first, in the frame of the centre of mass. Fixed steps are counted and not timed: REBOUND's own clock accumulates
+rounding, which at 1000 years is more than WHFast's own error. WHFast and SABA run without safe mode and are
+synchronised before each reading, in a way that leaves the run itself untouched.
 
 REBOUND (H. Rein, S.-F. Liu, Astronomy & Astrophysics 537 (2012) A128) is free software under the GPL and is not
 distributed with this package; versions 4.6 and 5 are supported.
@@ -15,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,10 +29,13 @@ except ModuleNotFoundError as error:
         'eip_scipy.integrations.rebound needs REBOUND: pip install "eip_scipy[rebound]"', name="rebound"
     ) from error
 
-if TYPE_CHECKING:
-    from eip_scipy.core.problem import Problem
+from ._rebound_exchange import problem_from_simulation, read_archive, to_archive, to_simulation
+from ._rebound_exchange import state as _state
 
-__all__ = ["INTEGRATORS", "ReboundRun", "ReboundSteps", "ias15_steps", "problem_from_simulation", "run", "simulation"]
+__all__ = [
+    "INTEGRATORS", "ReboundRun", "ReboundSteps", "ias15_steps", "problem_from_simulation", "read_archive", "run",
+    "simulation", "to_archive", "to_simulation",
+]  # fmt: skip
 
 INTEGRATORS = ("whfast", "whfast-c17", "ias15", "leapfrog", "saba(10,6,4)")
 
@@ -273,55 +277,6 @@ def ias15_steps(
     return ReboundSteps(np.array(times), np.array(states).T, evaluations[0])
 
 
-def problem_from_simulation(
-    sim: rebound.Simulation, *, t_span: tuple[float, float] | None = None, h: float | None = None
-) -> Problem:
-    """Build an N-body problem from a REBOUND simulation, at its present state.
-
-    Parameters
-    ----------
-    sim : rebound.Simulation
-        Point masses under their mutual Newtonian gravity. It is synchronised, as before any reading of a simulation.
-    t_span : tuple of float, optional
-        Start and end; default: from sim.t over 1000 steps sim.dt.
-    h : float, optional
-        A sensible fixed step; default: the magnitude of sim.dt.
-
-    Returns
-    -------
-    Problem
-        In the simulation's units of length and time, with params = sim.G times the masses.
-
-    Raises
-    ------
-    TypeError
-        For something else than a simulation, such as the path of an archive.
-    ValueError
-        The simulation has what the N-body problem lacks (test or variational particles, softening, further forces,
-        collisions, boundaries ...); the message says which and why it is not supported.
-    """
-    if not isinstance(sim, rebound.Simulation):
-        raise TypeError(
-            f"problem_from_simulation: expected a rebound.Simulation, got {sim!r}; "
-            "one in an archive is rebound.Simulation(path)"
-        )
-    _refuse_unsupported(sim)
-    from eip_scipy.problems.gravity.nbody import nbody
-
-    sim.synchronize()
-    q, v = _state(sim).reshape(2, -1, 3)
-    return nbody(
-        np.array([sim.G * p.m for p in sim.particles]),
-        q,
-        v,
-        t_span=(sim.t, sim.t + 1000 * sim.dt) if t_span is None else t_span,
-        h=abs(sim.dt) if h is None else h,
-        name="rebound",
-        units="as in the REBOUND simulation",
-        source=f"REBOUND {rebound.__version__} simulation of {sim.N} bodies at t = {sim.t!r}",
-    )
-
-
 def _check_state(gm: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
     refuse_units(gm=gm, y=y)
     gm, y = np.array(gm, dtype=float), np.array(y, dtype=float)
@@ -412,13 +367,6 @@ def _take_steps(sim: rebound.Simulation, n: int) -> None:
         sim.steps(min(_CHUNK, n - done))
 
 
-def _state(sim: rebound.Simulation) -> np.ndarray:
-    q = np.empty((sim.N, 3))
-    v = np.empty((sim.N, 3))
-    sim.serialize_particle_data(xyz=q, vxvyvz=v)
-    return np.concatenate((q, v), axis=None)
-
-
 def _invariant_errors(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Relative errors of energy and angular momentum along y (m, 6 N); absolute where the initial value is 0."""
     q, v = np.moveaxis(y.reshape(len(y), 2, -1, 3), 1, 0)
@@ -429,27 +377,3 @@ def _invariant_errors(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nda
     energy_error = np.abs(energy - energy[0])
     momentum_error = np.linalg.norm(momentum - momentum[0], axis=1)
     return energy_error / (abs(energy[0]) or 1.0), momentum_error / (np.linalg.norm(momentum[0]) or 1.0)
-
-
-def _refuse_unsupported(sim: rebound.Simulation) -> None:
-    callbacks = (sim._additional_forces, sim._pre_timestep_modifications, sim._post_timestep_modifications)
-    obstacles = (
-        (sim.N_var > 0, "variational particles: they are no bodies, and our state has no place for them"),
-        (sim.N < 2, f"{sim.N} particles: gravity needs at least two"),
-        (
-            0 <= sim.N_active < sim.N or any(p.m == 0 for p in sim.particles),
-            "test particles: without mass they have no part in the invariants that are to be preserved",
-        ),
-        (any(map(bool, callbacks)), "additional forces or modifications of a step: their invariants are unknown"),
-        (sim._N_odes > 0, "further differential equations: our state has no place for them"),
-        (sim.softening != 0, "softened gravity: the problem's potential is 1/r"),
-        (sim.gravity in ("none", "tree", "custom"), f"gravity {sim.gravity!r}: the problem sums 1/r over all pairs"),
-        (sim.collision != "none", "collisions: they change the number of bodies or the invariants"),
-        (
-            sim.boundary != "none" or str(sim.integrator) == "sei",
-            "boundaries or a shearing sheet: the problem's space is open and inertial",
-        ),
-    )
-    for present, what in obstacles:
-        if present:
-            raise ValueError(f"the simulation has what an N-body problem of eip_scipy does not support: {what}")

@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["count", "filled", "flag", "is_number", "real_array", "reals", "refuse_units", "require_arguments", "shown"]
+__all__ = [
+    "count", "filled", "flag", "has_unit", "is_date", "is_number", "real_array", "reals", "refuse_units",
+    "require_arguments", "shown",
+]  # fmt: skip
 
 PLAIN = (int, float, complex, str, bool, type(None), np.float64, np.complex128)
 DATES = (datetime.date, datetime.timedelta, np.datetime64, np.timedelta64)
@@ -42,12 +45,12 @@ def refuse_units(**arguments: Any) -> None:
     """
     for name, value in arguments.items():
         for item in _leaves(value):
-            if _is_date(item):
+            if is_date(item):
                 raise TypeError(
                     f"{name}: {shown(item)} is a date or a duration; expected plain numbers. Count time in the unit of "
                     "the equations, for instance (t - t0).to_value('day') with astropy."
                 )
-            if _has_unit(item):
+            if has_unit(item):
                 raise TypeError(
                     f"{name}: {shown(item)} has a unit; expected plain numbers, in the units of the equations. Convert "
                     "it first: x.to_value('AU') with astropy, x.m_as('AU') with pint."
@@ -66,13 +69,15 @@ def _leaves(value: Any) -> Any:
         yield value
 
 
-def _is_date(value: Any) -> bool:
+def is_date(value: Any) -> bool:
+    """Whether a value is a date, a time or a duration."""
     if isinstance(value, DATES) or getattr(getattr(value, "dtype", None), "kind", "") in ("m", "M"):
         return True
     return hasattr(value, "jd1") and hasattr(value, "jd2")  # times of astropy have no unit of their own
 
 
-def _has_unit(value: Any) -> bool:
+def has_unit(value: Any) -> bool:
+    """Whether a value has a unit, as quantities of astropy, pint and unyt do."""
     numeric = hasattr(value, "__float__") or hasattr(type(value), "__array__")
     return numeric and any(getattr(value, name, None) is not None for name in ("unit", "units"))
 

@@ -10,13 +10,18 @@ from typing import Any
 import numpy as np
 
 from ..engine.native import library
-from .inputs import refuse_units, shown
+from .inputs import has_unit, refuse_units, shown
 from .invariants import Invariant
 from .pointers import by_pointer
+from .units import DAY_S, Epoch, Unit, apart, as_epoch, in_unit, is_time, moment, shown_epoch
+from .units import units as known_units
 
 __all__ = ["Problem", "bind", "component_names", "native_invariant"]
 
 MOST = 12  # components that are printed
+MOMENTS, DURATIONS = ("t_span", "t_eval", "t"), ("h", "first_step", "max_step")
+# A start this near that of the problem is the same: a Julian date in one float is up to 20 microseconds off.
+SAME_S = 1e-4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,7 +55,9 @@ class Problem:
     metric, blocks, frame
         Options of the projection that suit the problem (see `EIPSolver`).
     units : str
-        Units of the state and of time.
+        Units of the state and of time. Of the form "AU, yr" (a length and a time: m, cm, km, AU, pc; s, min, h, d, yr,
+        kyr, Myr, Gyr, or a number of m or s) they are more than a note: quantities of astropy are converted to them
+        where `integrate` takes times and steps.
     jacobian : callable, optional
         For q'' = a(t, q): ``jacobian(t, q, dq, out, params)`` fills `out` with the derivative of the accelerations
         along dq, or with its largest part; for multistep methods such as `EIPGJ14`.
@@ -63,6 +70,11 @@ class Problem:
         Where the equations and data come from.
     component_names : tuple of str, optional
         Names of the components of the state, for tables and figures.
+    epoch : (float, float), optional
+        When t is 0: a Julian date in TDB, in two parts. One number, or a Time of astropy in any scale, becomes such a
+        pair.
+    G : float, optional
+        Of bodies: the constant of gravitation by which their masses are multiplied in `params`, where it is known.
     """
 
     name: str
@@ -83,9 +95,14 @@ class Problem:
     jacobian: Callable[..., None] | None = None
     frequencies: Callable[[np.ndarray], tuple[np.ndarray, float]] | None = None
     component_names: tuple[str, ...] | None = None
+    epoch: Epoch | None = None
+    G: float | None = None
 
     def __post_init__(self) -> None:
         refuse_units(y0=self.y0, t_span=self.t_span, h=self.h, params=self.params, metric=self.metric, frame=self.frame)
+        refuse_units(G=self.G)
+        if self.epoch is not None:
+            object.__setattr__(self, "epoch", as_epoch("epoch", self.epoch))
         object.__setattr__(self, "rhs", by_pointer(self.rhs, "rhs"))
         if self.component_names is not None:
             n = None if self.y0 is None else np.size(self.y0)
@@ -97,7 +114,7 @@ class Problem:
         Parameters
         ----------
         t_span, y0 : optional
-            Default: the problem's own.
+            Default: the problem's own. Quantities and times of astropy are converted as by `integrate`.
         method : type or str
             An EIP method, which gets the invariants, metric, blocks and frame, and the step `h` unless rtol, atol,
             first_step, max_step or h are given; or another of SciPy's, which gets none of these.
@@ -107,7 +124,7 @@ class Problem:
         Returns
         -------
         OdeResult
-            SciPy's, and ``component_names`` where the problem names them.
+            SciPy's, with the problem's ``units`` and ``epoch``, and ``component_names`` where it names them.
 
         Examples
         --------
@@ -119,6 +136,10 @@ class Problem:
         """
         from scipy.integrate import solve_ivp
 
+        times = {name: options[name] for name in (*MOMENTS, *DURATIONS) if name in options}
+        given = self.plain(t_span=t_span, y0=y0, **times)
+        t_span, y0 = given.pop("t_span"), given.pop("y0")
+        options |= given
         t_span, y0 = self.t_span if t_span is None else t_span, self.y0 if y0 is None else y0
         if t_span is None or y0 is None:
             raise TypeError(f"{self.name}: the problem has no {'interval' if t_span is None else 'start'}; give one.")
@@ -131,7 +152,77 @@ class Problem:
         sol = solve_ivp(self.fun, t_span, y0, method=method, **brought | options)
         if self.component_names is not None and len(self.component_names) == len(sol.y):
             sol.component_names = self.component_names
+        sol.units, sol.epoch = self.units, self.epoch
         return sol
+
+    @property
+    def unit_system(self) -> tuple[Unit, Unit] | None:
+        """The units of length and time, where `units` names two."""
+        return known_units(self.units)
+
+    def plain(self, **given: Any) -> dict[str, Any]:
+        """Arguments of a run as plain numbers in the units of the problem, by the names that `integrate` has for them.
+
+        Parameters
+        ----------
+        **given
+            Of ``t_span``, ``t_eval``, ``t`` (times: numbers, durations, or moments where the problem has an `epoch`),
+            ``h``, ``first_step``, ``max_step`` (durations) and ``y0``, which is a pair (positions, velocities) where it
+            has units. What is plain stays as it is, and None.
+
+        Returns
+        -------
+        dict
+
+        Raises
+        ------
+        TypeError
+            For units or dates that the problem cannot convert, for its own `units` name none, or it has no `epoch`.
+        ValueError
+            When a moment is given as the start and the problem's own state is that of another, and no `y0` is given.
+        """
+        known, out = self.unit_system, dict(given)
+        for name in MOMENTS:
+            if name in given:
+                out[name] = moment(name, given[name], known, self.epoch, f"the problem {self.name!r}")
+        for name in DURATIONS:
+            if name in given:
+                out[name] = in_unit(name, given[name], (0, 1), known)
+        span, start = apart(given.get("t_span")), given.get("y0")
+        if start is not None:
+            out["y0"] = self._plain_state(start)
+        elif isinstance(span, tuple | list) and span and is_time(span[0]):
+            out["t_span"] = (self._own_start(span[0], out["t_span"][0]), *out["t_span"][1:])
+        return out
+
+    def _plain_state(self, y0: Any) -> Any:
+        """Positions and velocities with units as the state; anything else as it is."""
+        names, known = self.component_names or (), self.unit_system
+        half = len(names) // 2
+        pair = isinstance(y0, tuple | list) and len(y0) == 2 and all(map(has_unit, y0))
+        if not pair or known is None or any(f"v{a}" != b for a, b in zip(names[:half], names[half:], strict=False)):
+            return y0
+        q, v = (np.ravel(in_unit("y0", part, (1, k), known)) for part, k in zip(y0, (0, -1), strict=True))
+        if not q.size == v.size == half:
+            raise ValueError(
+                f"y0: {q.size} components of positions and {v.size} of velocities; expected {half} of each."
+            )
+        return np.concatenate([q, v])
+
+    def _own_start(self, time: Any, t0: float) -> float:
+        """The problem's own start, where it is this moment."""
+        known = self.unit_system
+        if known is None or self.epoch is None or self.t_span is None:
+            return t0
+        own = self.t_span[0]
+        if abs(t0 - own) * known[1].si > SAME_S:
+            held = (self.epoch[0], self.epoch[1] + own * known[1].si / DAY_S)
+            raise ValueError(
+                f"t_span: the run is to start at {shown(time)}, but the state of the problem {self.name!r} is that of "
+                f"{shown_epoch(held)}. Start there, or give the state of that moment, y0=..., or initial data of it, "
+                "such as those of eip_scipy.integrations.jpl.initial_data(time)."
+            )
+        return own
 
     def __repr__(self) -> str:
         def having(names: Iterable[str]) -> list[str]:
@@ -143,11 +234,12 @@ class Problem:
         start = "without a start" if self.y0 is None else f"{n} components, {np.asarray(self.y0).dtype}"
         interval = [] if self.t_span is None else ["t from {:g} to {:g}".format(*self.t_span)]
         interval += [] if self.h is None else [f"h = {self.h:g}"]
+        zero = "" if self.epoch is None else f"t = 0 at {shown_epoch(self.epoch)}"
         kept = ", ".join(item.name or "one without a name" for item in self.invariants)
         functions = ", ".join(["fun", *having(("rhs", "acc", "jacobian", "reference"))])
         lines = [
             f"{self.name}: y = ({state}), {start}",
-            f"  interval    {', '.join(interval) or 'none'}" + (f"; {self.units}" if self.units else ""),
+            f"  interval    {'; '.join(filter(None, (', '.join(interval) or 'none', self.units, zero)))}",
             f"  invariants  {kept or 'none'}",
             f"  functions   {functions}; options {', '.join(having(('metric', 'blocks', 'frame'))) or 'none'}",
             f"  source      {self.source or 'not given'}",

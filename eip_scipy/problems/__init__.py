@@ -4,6 +4,7 @@ from ..core.problem import Problem
 from .gravity import solar_data as solar_data
 from .gravity.forces import ForceConstants
 from .gravity.nbody import nbody
+from .gravity.orbital_elements import OrbitalElements, orbital_elements
 from .gravity.scenes import comet, figure_eight, pythagorean
 from .gravity.solar_data import SolarSystemData
 from .gravity.solar_system import solar_system
@@ -35,6 +36,7 @@ __all__ = [
     "Grid",
     "GrossPitaevskii",
     "HardCase",
+    "OrbitalElements",
     "ParticleField",
     "ParticleProblem",
     "Problem",
@@ -52,6 +54,7 @@ __all__ = [
     "harmonic_trap",
     "kepler",
     "nbody",
+    "orbital_elements",
     "pair_time",
     "plane_wave",
     "pythagorean",

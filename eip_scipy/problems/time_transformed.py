@@ -99,7 +99,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
         component_names=None if problem.component_names is None else (*problem.component_names, "t"),
         blocks=_blocks(problem.blocks, n),
         frame=_frame(problem.frame),
-        units=problem.units,
+        units=problem.units and f"state in {problem.units}",  # fictitious time has no unit
         source=problem.source,
     )
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.integrate import OdeSolution
 
 from ..core.inputs import is_number, shown
+from ..core.problem import Problem
 from ..core.results import Diagnostics
 from .integrate import integrate
 from .prepare import Request
@@ -32,6 +33,8 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
     for name in FIXED:
         if name in options:
             raise TypeError(f"continue_to: {name} is that of the run; start a new one with integrate.")
+    if isinstance(origin.request.fun, Problem):
+        t = origin.request.fun.plain(t=t)["t"]
     if not is_number(t) or not origin.sign * (t - origin.t) > 0:
         raise ValueError(f"continue_to: t must lie beyond the end of the run, {origin.t:.10g}, got {shown(t)}.")
     request = origin.request

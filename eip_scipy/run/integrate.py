@@ -106,7 +106,9 @@ def integrate(
         (n/2,)``, in place ``acc(t, q, out[, params])``. A `Problem` brings everything else with it; options given here
         take precedence.
     t_span : (float, float)
-        Start and end; backward if the end comes first.
+        Start and end; backward if the end comes first. Of a `Problem` with units also durations of astropy, and with an
+        epoch its times, in any scale, see :doc:`/astronomy`; the same goes for `t_eval`, and durations for `h`,
+        `first_step` and `max_step`.
     y0 : array_like, shape (n,)
         Initial state, real or complex.
     method : type
@@ -448,6 +450,8 @@ class Loop:
             method=self.method,
             h=abs(driver.schedule.span.h) or None,
             component_names=self.prepared.component_names,
+            units=self.prepared.units,
+            epoch=self.prepared.epoch,
         )
         t, y = events.last if self._event_ended else driver.now
         kept = driver.run.invariants.with_targets()
@@ -550,5 +554,7 @@ def _start_kept(request: Request) -> Iterator[None]:
                     method=getattr(request.method, "__name__", str(request.method)),
                     h=None,
                     component_names=None,
+                    units="",
+                    epoch=None,
                 )
         raise

@@ -246,6 +246,16 @@ class Prepared:
         return names if names is not None and len(names) == self.run.y0.size else None
 
     @property
+    def units(self) -> str:
+        """Those of the problem."""
+        return self.asked.fun.units if isinstance(self.asked.fun, Problem) else ""
+
+    @property
+    def epoch(self) -> tuple[float, float] | None:
+        """That of the problem."""
+        return self.asked.fun.epoch if isinstance(self.asked.fun, Problem) else None
+
+    @property
     def pointers(self) -> list[PointerFunction]:
         """The C functions by pointer."""
         items = self.run.invariants.items
@@ -260,6 +270,7 @@ class Prepared:
 
 def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     """A run as it is asked for, all that was given checked; `check_start`: see `setup.prepare`."""
+    request = _plain(request)
     refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
     method = _method(request.method)
     in_place = flag("in_place", request.in_place)
@@ -301,8 +312,17 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
 
 def started_at(request: Request) -> tuple[float, np.ndarray]:
     """Time and state at the start, a problem's own where none is given."""
-    t_span, y0 = _given_or_brought(request)
+    t_span, y0 = _given_or_brought(_plain(request))
     return interval(t_span)[0], _state(y0)
+
+
+def _plain(request: Request) -> Request:
+    """The request with times and lengths that have units as numbers; only a problem knows the units of a state."""
+    problem = request.fun
+    if not isinstance(problem, Problem):
+        return request
+    names = ("t_span", "y0", "t_eval", "h", "first_step", "max_step")
+    return replace(request, **problem.plain(**{name: getattr(request, name) for name in names}))
 
 
 def _method(method: Any) -> Any:

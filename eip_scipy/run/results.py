@@ -77,6 +77,10 @@ class IntegrationResult(OptimizeResult):
     h : float or None
     component_names : tuple of str
         Those of the `Problem`, or "y0", "y1" and so on; assign others as you like.
+    units : str
+        Those of the `Problem`, "" without one.
+    epoch : (float, float) or None
+        When t is 0, see `Problem`.
 
     Notes
     -----
@@ -116,7 +120,9 @@ class IntegrationResult(OptimizeResult):
         Parameters
         ----------
         t : float
-            The new end, beyond the present one in the direction of the run.
+            The new end, beyond the present one in the direction of the run; as in `t_span` of `integrate` also a
+            duration
+            from t = 0, or a time.
         **options
             Options of `integrate` that are to be others than before. Times in `t_eval` are not asked for again: give
             new ones, or the states at both ends are saved. An event that ended the run may end it again at once;

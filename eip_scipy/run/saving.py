@@ -111,8 +111,9 @@ def load(path: str | os.PathLike[str]) -> Any:
     if header["diagnostics"] is not None:
         result["diagnostics"] = _diagnostics(header["diagnostics"], arrays)
     result.update(arrays)
-    if result.get("component_names") is not None:
-        result["component_names"] = tuple(result["component_names"])
+    for name in ("component_names", "epoch"):
+        if result.get(name) is not None:
+            result[name] = tuple(result[name])
     return result
 
 

@@ -16,7 +16,9 @@ __all__ = ["component_names", "dataset", "default_names", "invariant_rows", "to_
 
 TABLES = {"xarray": "xarray", "pandas": "dataframe"}
 # Of a result what describes the whole run, in the order of an attribute list.
-DESCRIBED = ("method", "h", "message", "trusted", "status", "success", "nfev", "njev", "nlu", "wall_time", "compiled")
+DESCRIBED = (
+    "method", "h", "message", "trusted", "status", "success", "nfev", "njev", "nlu", "wall_time", "compiled", "units",
+)  # fmt: skip
 
 
 def to_xarray(result: Any, names: Any = None) -> Dataset:

@@ -27,7 +27,7 @@ def assert_output(found, printed):
 
 PAGES = (
     "quickstart", "results", "adaptive", "own-methods", "multistep", "checkpoints", "ensembles", "written",
-    "finding-invariants", "recommend",
+    "finding-invariants", "recommend", "astronomy",
 )  # fmt: skip
 NIGHTLY = ("hard-scenes", "charged-particles", "gross-pitaevskii")
 

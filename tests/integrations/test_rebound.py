@@ -242,16 +242,16 @@ def add_variation(sim):
     sim.add_variation()
 
 
-def add_test_particle(sim):
-    sim.add(m=0.0, x=3.0, vy=1.0)
-
-
 def add_force(sim):
     sim.additional_forces = lambda pointer: None
 
 
 def modify_steps(sim):
     sim.post_timestep_modifications = lambda pointer: None
+
+
+def add_active_test_particles(sim):
+    sim.N_active, sim.testparticle_type = 1, 1
 
 
 def set_attribute(name, value):
@@ -262,9 +262,8 @@ def set_attribute(name, value):
     ("change", "message"),
     [
         (add_variation, "variational particles"),
-        (add_test_particle, "test particles"),
-        (set_attribute("N_active", 2), "test particles"),
-        (add_force, "additional forces"),
+        (add_active_test_particles, "test particles with masses.*testparticle_type 1"),
+        (add_force, "additional forces that are not REBOUNDx's.*forces='gr-potential'"),
         (modify_steps, "additional forces or modifications"),
         (lambda sim: sim.create_ode(1), "differential equations"),
         (set_attribute("softening", 0.1), "softened"),

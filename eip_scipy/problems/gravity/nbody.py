@@ -9,15 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import refuse_units
 from ...core.invariants import Invariant
 from ...core.problem import Problem, bind, native_invariant
+from ...core.units import Epoch, apart, as_epoch, in_unit, is_time, moment
+from ...core.units import units as known_units
 from ...engine.native import library
 from . import forces as _forces
+from .bodies import body_names, default_units, in_units
 from .forces import ForceConstants
 from .frequencies import orbital_frequencies
 
-__all__ = ["nbody"]
+__all__ = ["component_names", "nbody"]
 
 # Relative speeds in units of the escape speed beyond which all bodies are said to be in wrong units. AU/day taken for
 # AU/yr is a factor of 365; a close flyby reaches 30, an orbit of eccentricity 0.9999 is at 1/140 in its apocentre.
@@ -37,6 +39,9 @@ def nbody(
     units: str = "",
     source: str = "",
     reference: Callable[[float], np.ndarray | None] | None = None,
+    bodies: Sequence[str] | None = None,
+    epoch: Any = None,
+    G: float | None = None,
 ) -> Problem:
     """N point masses under Newton's gravitation, with further forces where an accuracy asks for them.
 
@@ -44,10 +49,14 @@ def nbody(
     ----------
     gm : array_like, shape (N,)
         G times the masses, in the units of length and time of the state; 0 for test particles, which are attracted and
-        do not attract.
+        do not attract. With units of astropy: G m, or the masses, which are then multiplied by the constant of
+        gravitation.
     position, velocity : array_like, shape (N, 3)
+        Plain numbers, or with units of astropy, then all three of `gm`, `position` and `velocity`.
     t_span : (float, float)
+        Numbers, durations, or moments (Time of astropy, in any scale), where the units are known.
     h : float, optional
+        A number or a duration.
     forces : str or sequence of str, optional
         What is added to Newton's gravitation, all of it from the first body (the Sun) but for "eih":
 
@@ -67,8 +76,18 @@ def nbody(
         At most one of the first three.
     constants : ForceConstants, optional
         The speed of light and what else the forces need, in the units of the state.
-    name, units, source : str, optional
+    name, source : str, optional
+    units : str, optional
+        Of length and time, such as "AU, yr" (see `Problem`). Default where there are quantities: the unit of
+        `position`, and that of `t_span`, days for moments, or else that of `velocity`.
     reference : callable, optional
+    bodies : sequence of str, optional
+        Names of the bodies: components are then x_Sun, y_Sun, ...; default: x_0, y_0, ...
+    epoch : Time or float or (float, float), optional
+        When t is 0: a Time of astropy in any scale, or a Julian date in TDB, in one or two numbers. Default: the start
+        of a `t_span` of moments.
+    G : float, optional
+        The constant of gravitation in `gm`, where masses of their own are to be told from it, as for REBOUND.
 
     Returns
     -------
@@ -110,7 +129,13 @@ def nbody(
     frame only keeps corrections from moving the centre of mass. With "1pn" and "eih" accelerations depend on
     velocities: `acc` is None, and Nystrom methods do not apply.
     """
-    refuse_units(gm=gm, position=position, velocity=velocity, t_span=t_span, h=h)
+    t_span = apart(t_span)
+    units = units or default_units(gm, position, velocity, t_span)
+    known = known_units(units)
+    gm, position, velocity = in_units(gm, position, velocity, known)
+    epoch = _epoch(t_span) if epoch is None else as_epoch("epoch", epoch)
+    t_span = moment("t_span", t_span, known, epoch, "nbody")
+    h = in_unit("h", h, (0, 1), known)
     masses, q, v = _checked(gm, position, velocity)
     chosen = _forces.check_forces(forces)
     y0 = np.concatenate([q.ravel(), v.ravel()])
@@ -127,19 +152,27 @@ def nbody(
         params=params,
         invariants=_forces.invariants(chosen, params, y0) if chosen else _newtonian(params),
         blocks=3,
-        component_names=_component_names(masses.size),
+        component_names=component_names(masses.size, bodies),
         frame=recoil(masses),
         units=units,
         source=source,
         reference=reference,
         jacobian=library["gravity.central"],
         frequencies=partial(orbital_frequencies, masses),
+        epoch=epoch,
+        G=G,
     )
 
 
-def _component_names(n: int) -> tuple[str, ...]:
-    """x_0, y_0, z_0, x_1, ... and then vx_0, vy_0, vz_0, vx_1, ..."""
-    return tuple(f"{axis}_{k}" for axes in (("x", "y", "z"), ("vx", "vy", "vz")) for k in range(n) for axis in axes)
+def component_names(n: int, bodies: Sequence[str] | None) -> tuple[str, ...]:
+    """x_0, y_0, z_0, x_1, ... and then vx_0, vy_0, vz_0, vx_1, ..., or with the bodies' names."""
+    names = tuple(map(str, range(n))) if bodies is None else body_names(bodies, n)
+    return tuple(f"{axis}_{body}" for axes in (("x", "y", "z"), ("vx", "vy", "vz")) for body in names for axis in axes)
+
+
+def _epoch(t_span: Any) -> Epoch | None:
+    start = t_span[0] if isinstance(t_span, tuple | list) and t_span else None
+    return as_epoch("t_span", start) if is_time(start) else None
 
 
 def _newtonian(params: np.ndarray) -> tuple[Invariant, Invariant]:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...core.inputs import refuse_units
+from ...core.units import exact_sum
 
 __all__ = [
     "AU_KM",
@@ -67,6 +68,8 @@ class SolarSystemData:
         Where the numbers come from.
     units : str
         "AU, day".
+    epoch_rest : float
+        Days that the rounding of `epoch_jd_tdb` lost.
     """
 
     name: str
@@ -79,6 +82,7 @@ class SolarSystemData:
     axes: str
     source: str
     units: str = "AU, day"
+    epoch_rest: float = 0.0
 
     def __post_init__(self) -> None:
         refuse_units(gm=self.gm, position=self.position, velocity=self.velocity, epoch_jd_tdb=self.epoch_jd_tdb)
@@ -132,16 +136,18 @@ def load(name: str = "de440", *, as_printed: bool = False) -> SolarSystemData:
         raise ValueError(f"as_printed=True is an option of the set 'paper', got name={name!r}")
     entry = sets[name]
     gm, position, velocity = _with_sun(entry, as_printed) if name == "paper" else _arrays(entry)
+    epoch, rest = exact_sum(*entry["epoch_jd_tdb"])
     return SolarSystemData(
         name=name,
         bodies=("Sun", *entry["bodies"]) if name == "paper" else tuple(entry["bodies"]),
         gm=gm,
         position=position,
         velocity=velocity,
-        epoch_jd_tdb=sum(entry["epoch_jd_tdb"]),
+        epoch_jd_tdb=epoch,
         epoch=entry["epoch"],
         axes=entry["axes"],
         source=entry["source"],
+        epoch_rest=rest,
     )
 
 

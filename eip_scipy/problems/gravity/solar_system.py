@@ -55,9 +55,9 @@ def solar_system(
     Returns
     -------
     Problem
-        Of 60 components (66 with the Moon), see `nbody`. With "de440", or the same data from a kernel, and no further
-        forces its `reference` gives stored states at 1, 10, 100, 1000 and 2000 years (Taylor integration in extended
-        precision).
+        Of 60 components (66 with the Moon), see `nbody`, named x_Sun, y_Sun and so on, with the data's epoch as its
+        `epoch`. With "de440", or the same data from a kernel, and no further forces its `reference` gives stored states
+        at 1, 10, 100, 1000 and 2000 years (Taylor integration in extended precision).
 
     Raises
     ------
@@ -82,6 +82,8 @@ def solar_system(
         units="AU, Julian year" if units == "AU, yr" else "m, s",
         source=known.source,
         reference=partial(_reference, references, length, time),
+        bodies=known.bodies,
+        epoch=(known.epoch_jd_tdb, known.epoch_rest),
     )
 
 

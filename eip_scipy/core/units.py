@@ -1,0 +1,212 @@
+"""Quantities and times of astropy as plain numbers in the units of a problem; nothing is imported for it."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .inputs import has_unit, is_date, refuse_units, shown
+
+__all__ = [
+    "DAY_S", "LENGTHS", "TIMES", "Epoch", "Unit", "apart", "as_epoch", "days_since", "exact_sum", "in_unit", "is_time",
+    "moment", "shown_epoch", "units",
+]  # fmt: skip
+
+Epoch = tuple[float, float]
+"""A Julian date in TDB, in two parts, whose sum a single float would round to 20 microseconds."""
+
+DAY_S = 86400.0
+LENGTHS = {"m": 1.0, "cm": 0.01, "km": 1e3, "AU": 149597870700.0, "pc": 648000 / math.pi * 149597870700.0}
+TIMES = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": DAY_S, "yr": 365.25 * DAY_S}
+TIMES |= {f"{prefix}yr": factor * TIMES["yr"] for prefix, factor in (("k", 1e3), ("M", 1e6), ("G", 1e9))}
+ALIASES = {"au": "AU", "day": "d", "days": "d", "year": "yr", "years": "yr", "Julian year": "yr", "hr": "h"}
+NUMBERED = re.compile(r"(\d+(?:\.\d*)?(?:e[-+]?\d+)?) (m|s)")
+
+
+class Unit(NamedTuple):
+    """A unit of length or time.
+
+    Attributes
+    ----------
+    name : str
+        Of a unit that astropy knows by it.
+    scale : float
+        How many of that unit it has.
+    si : float
+        Metres or seconds.
+    """
+
+    name: str
+    scale: float
+    si: float
+
+
+def units(text: str) -> tuple[Unit, Unit] | None:
+    """The units of length and time that a text such as "AU, yr" or "km, 5022642.9 s" names; None for others."""
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) != 2:
+        return None
+    length, time = _unit(parts[0], LENGTHS), _unit(parts[1], TIMES)
+    return None if length is None or time is None else (length, time)
+
+
+def _unit(text: str, known: dict[str, float]) -> Unit | None:
+    name = ALIASES.get(text, text)
+    if name in known:
+        return Unit(name, 1.0, known[name])
+    numbered = NUMBERED.fullmatch(text)
+    if numbered is None or numbered[2] not in known:
+        return None
+    return Unit(numbered[2], float(numbered[1]), float(numbered[1]))
+
+
+def in_unit(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, Unit] | None) -> Any:
+    """A value with a unit, or a list of them, as plain numbers in the unit length**a time**b; plain ones as they are.
+
+    Parameters
+    ----------
+    name : str
+        How the user knows the value.
+    value : object
+    powers : (int, int)
+        The exponents a and b.
+    known : (Unit, Unit) or None
+        Units of length and time; None refuses all that has one.
+
+    Raises
+    ------
+    TypeError
+        For a value with a unit where no units are known, and for what has a unit that is not astropy's.
+    TypeError and ValueError
+        astropy's UnitConversionError, when the dimensions do not fit.
+    """
+    if known is None:
+        refuse_units(**{name: value})
+        return value
+
+    def convert(item: Any) -> Any:
+        if is_time(item):
+            raise TypeError(f"{name}: {shown(item)} is a moment; expected {_expected(powers, known)}.")
+        if powers != (0, 1) and not has_unit(item) and np.any(item):
+            raise TypeError(f"{name}: {shown(item)} has no unit, and others beside it have one; give it one too.")
+        return _converted(name, item, powers, known)
+
+    return _each(name, value, convert)
+
+
+def moment(name: str, value: Any, known: tuple[Unit, Unit] | None, epoch: Epoch | None, whose: str) -> Any:
+    """Times as numbers in the unit of time, counted from the epoch; durations, and plain numbers, count from 0.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As by `in_unit`; TypeError for a moment where there is no epoch to count from.
+    """
+    if known is None:
+        refuse_units(**{name: value})
+        return value
+
+    def convert(item: Any) -> Any:
+        if not is_time(item):
+            return _converted(name, item, (0, 1), known)
+        if epoch is None:
+            raise TypeError(
+                f"{name}: {shown(item)} is a date, and {whose} does not say at which one t is 0; expected plain "
+                f"numbers, durations, or a problem made with epoch=..., such as nbody(..., epoch=...)."
+            )
+        return days_since(name, epoch, item) * (DAY_S / known[1].si)
+
+    return _each(name, value, convert)
+
+
+def is_time(value: Any) -> bool:
+    """Whether a value is a time of astropy, a moment and not a duration."""
+    return hasattr(value, "jd1") and hasattr(value, "jd2") and hasattr(value, "mjd")
+
+
+def apart(span: Any) -> Any:
+    """The ends of a span as a pair, where they are one array of times of astropy."""
+    return tuple(span) if is_time(span) and np.shape(span.jd1) else span
+
+
+def as_epoch(name: str, value: Any) -> Epoch:
+    """A moment as a Julian date in TDB, in two parts: one of astropy's in any scale, or a number, or two.
+
+    Raises
+    ------
+    TypeError
+        For a number with a unit, a date of Python's, or what is no number.
+    ValueError
+        For more than one moment, and for what is not finite.
+    """
+    if is_time(value):
+        dynamic = value.tdb
+        value = (dynamic.jd1, dynamic.jd2)
+        if np.shape(value[0]) != ():
+            raise ValueError(f"{name}: expected one moment, got times of shape {np.shape(value[0])}.")
+        value = (float(value[0]), float(value[1]))
+    refuse_units(**{name: value})
+    parts = tuple(value) if isinstance(value, tuple | list) else (value, 0.0)
+    try:
+        first, second = (float(part) for part in parts)
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"{name}: expected a Julian date in TDB, as a number or as two that are added up, or a Time of astropy; "
+            f"got {shown(value)}."
+        ) from None
+    if not (math.isfinite(first) and math.isfinite(second)):
+        raise ValueError(f"{name}: expected a finite Julian date, got {shown(value)}.")
+    return first, second
+
+
+def days_since(name: str, epoch: Epoch, time: Any) -> Any:
+    """Days of TDB from the epoch to a moment, or to each of an array of them."""
+    dynamic = time.tdb
+    days = (np.asarray(dynamic.jd1, dtype=float) - epoch[0]) + (np.asarray(dynamic.jd2, dtype=float) - epoch[1])
+    return float(days) if days.shape == () else days
+
+
+def exact_sum(a: float, b: float) -> tuple[float, float]:
+    """The rounded sum and what the rounding lost."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)
+
+
+def shown_epoch(epoch: Epoch) -> str:
+    """JD and its scale."""
+    return f"JD {epoch[0] + epoch[1]:.13g} TDB"
+
+
+def _each(name: str, value: Any, convert: Callable[[Any], Any]) -> Any:
+    if isinstance(value, tuple | list):
+        converted = [_each(name, item, convert) for item in value]
+        return tuple(converted) if isinstance(value, tuple) else converted
+    if type(value) is np.ndarray and value.dtype.kind == "O":
+        return np.array([_each(name, item, convert) for item in value.tolist()])
+    return convert(value)
+
+
+def _converted(name: str, value: Any, powers: tuple[int, int], known: tuple[Unit, Unit]) -> Any:
+    duration = is_date(value) and hasattr(value, "to_value") and powers == (0, 1)
+    if not duration and not (has_unit(value) and hasattr(value, "to_value")):
+        refuse_units(**{name: value})
+        return value
+    length, time = known
+    a, b = powers
+    expression = " ".join(
+        unit.name if power == 1 else f"{unit.name}{power}" for unit, power in ((length, a), (time, b)) if power
+    )
+    try:
+        number = value.to_value(expression)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{name}: {shown(value)} is not in units of {expression}: {error}.") from None
+    return number / (length.scale**a * time.scale**b)
+
+
+def _expected(powers: tuple[int, int], known: tuple[Unit, Unit]) -> str:
+    return f"a number, or a quantity in units of {known[1].name}" if powers == (0, 1) else "a number or a quantity"

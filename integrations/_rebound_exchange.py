@@ -1,0 +1,490 @@
+"""Problems and runs from REBOUND's simulations and archives, and back; public in `eip_scipy.integrations.rebound`."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import rebound
+from rebound import units as rebound_units
+from scipy.optimize import OptimizeResult
+
+from eip_scipy.core.inputs import count, refuse_units, shown
+from eip_scipy.core.units import LENGTHS, TIMES
+from eip_scipy.problems.gravity.bodies import Bodies, bodies_of
+from eip_scipy.problems.gravity.forces import ForceConstants, check_forces
+from eip_scipy.problems.gravity.nbody import component_names, nbody
+
+if TYPE_CHECKING:
+    from eip_scipy.core.problem import Problem
+
+# REBOUNDx's forces by ours.
+REBOUNDX = {"gr": "1pn", "gr_full": "eih", "gr_potential": "gr-potential"}
+OURS = {ours: theirs for theirs, ours in REBOUNDX.items()} | {"j2": "gravitational_harmonics"}
+MAGIC = b"REBOUND Binary File"
+UNKNOWN_UNITS = "as in the REBOUND simulation"
+# G times a template's mass is a G m of ours to the rounding of one product and one quotient.
+SAME = 1e-15
+
+
+def problem_from_simulation(
+    sim: rebound.Simulation,
+    *,
+    t_span: tuple[float, float] | None = None,
+    h: float | None = None,
+    forces: str | Sequence[str] | None = None,
+    constants: ForceConstants | None = None,
+    names: Sequence[str] | None = None,
+) -> Problem:
+    """Build an N-body problem from a REBOUND simulation, at its present state.
+
+    Parameters
+    ----------
+    sim : rebound.Simulation
+        Point masses under their mutual gravity. It is synchronised, as before any reading of a simulation.
+    t_span : tuple of float, optional
+        Start and end; default: from sim.t over 1000 steps sim.dt.
+    h : float, optional
+        A sensible fixed step; default: the magnitude of sim.dt.
+    forces : str or sequence of str, optional
+        What the simulation's additional forces are, by the names that `nbody` has for them; () for none that matter.
+        Default: what REBOUNDx has attached, where it is known: "gr" (here "1pn"), "gr_full" ("eih") and "gr_potential"
+        ("gr-potential").
+    constants : ForceConstants, optional
+        As for `nbody`, with `forces`.
+    names : sequence of str, optional
+        Names of the bodies; default: those of the particles (REBOUND 5), and numbers for others. Snapshots of an
+        archive after the first may have lost them.
+
+    Returns
+    -------
+    Problem
+        In the simulation's units of length and time, with params = sim.G times the masses, and `G`. Test particles have
+        the mass 0. Where ``sim.units`` are set, quantities of astropy are converted to them.
+
+    Raises
+    ------
+    TypeError
+        For something else than a simulation, such as the path of an archive.
+    ValueError
+        The simulation has what the N-body problem lacks (variational particles, softening, forces that are not known,
+        collisions, boundaries ...); the message says which and why it is not supported.
+
+    Notes
+    -----
+    Particles from ``sim.N_active`` on attract nothing, with ``sim.testparticle_type`` 0: masses that they have are
+    dropped, which changes no motion. With 1 they act on the active ones but not on each other; energy and angular
+    momentum are then those of another system, and only masses of 0, or a single one, are taken.
+
+    "gr" of REBOUNDx takes positions and velocities in Jacobi's coordinates, "1pn" relative to the Sun: they differ in
+    the planets' masses, by a part in a thousand of the effect.
+    """
+    if not isinstance(sim, rebound.Simulation):
+        raise TypeError(
+            f"problem_from_simulation: expected a rebound.Simulation, got {sim!r}; "
+            "one in an archive is rebound.Simulation(path)"
+        )
+    _refuse_unsupported(sim)
+    chosen, known = (check_forces(forces), constants) if forces is not None else _attached(sim)
+    if forces is None and constants is not None:
+        raise ValueError("problem_from_simulation: constants belong to forces=...; REBOUNDx's forces bring their own.")
+    sim.synchronize()
+    q, v = state(sim).reshape(2, -1, 3)
+    return nbody(
+        sim.G * _attracting_masses(sim),
+        q,
+        v,
+        t_span=(sim.t, sim.t + 1000 * sim.dt) if t_span is None else t_span,
+        h=abs(sim.dt) if h is None else h,
+        forces=chosen,
+        constants=known,
+        name="rebound",
+        units=_units(sim),
+        source=f"REBOUND {rebound.__version__} simulation of {sim.N} bodies at t = {sim.t!r}",
+        bodies=_names(sim) if names is None else names,
+        G=sim.G,
+    )
+
+
+def to_simulation(
+    run: Any,
+    y: Any = None,
+    *,
+    row: int | None = None,
+    t: float | None = None,
+    template: rebound.Simulation | None = None,
+) -> rebound.Simulation:
+    """Build a REBOUND simulation from a problem of bodies or a row of its run.
+
+    Parameters
+    ----------
+    run : Problem or IntegrationResult
+        Of `nbody`, `solar_system`, `problem_from_simulation` and the like, or a run of one by `integrate`.
+    y : array_like, shape (6 N,), optional
+        The state (q, v); default: the start of a problem, the `row` of a run.
+    row : int, optional
+        Which saved state of a run; default: -1, the last one.
+    t : float, optional
+        The simulation's time; default: that of the row, or the start of the problem; with `y` of a run the time of the
+        row that is equal to it.
+    template : rebound.Simulation, optional
+        A simulation of as many bodies, a copy of which gets the state and the time: integrator, step, units, names,
+        radii, and the masses of test particles are its own.
+
+    Returns
+    -------
+    rebound.Simulation
+        With the bodies' names (REBOUND 5; hashes before). Without a `template` masses and G are those of the simulation
+        that the problem came from; else in solar masses where the problem has units that REBOUND knows; else G = 1 and
+        m = G m. Where the last bodies have no mass, ``N_active`` leaves them out. The centre of mass is left where it
+        is.
+
+    Raises
+    ------
+    TypeError
+        For what is no problem of bodies or a run of one.
+    ValueError
+        When shapes or masses do not fit, or there is no such row.
+
+    Warns
+    -----
+    UserWarning
+        When the problem has forces besides Newton's, which a simulation has from REBOUNDx only: attach them there.
+    """
+    bodies = bodies_of(run)
+    at, start = _chosen(run, bodies, y, row, t)
+    if bodies.forces and template is None:
+        theirs = ", ".join(f"{name} (REBOUNDx: {OURS.get(name, 'none')})" for name in bodies.forces)
+        warnings.warn(
+            f"to_simulation: the simulation has Newton's gravitation only, the problem also {theirs}. Attach it by "
+            "REBOUNDx for a run that is to have it.",
+            UserWarning,
+            stacklevel=2,
+        )
+    sim = _new(bodies) if template is None else _like(template, bodies)
+    sim.t = at
+    _set_state(sim, start)
+    return sim
+
+
+def to_archive(run: Any, path: str | os.PathLike[str], *, template: rebound.Simulation | None = None) -> None:
+    """Write the saved states of a run as the snapshots of a REBOUND Simulationarchive.
+
+    Parameters
+    ----------
+    run : IntegrationResult
+        Of a problem of bodies. What was saved is written: give `save_every` or `t_eval`.
+    path : path-like
+        A new file; one that is there is not replaced.
+    template : rebound.Simulation, optional
+        As for `to_simulation`.
+
+    Raises
+    ------
+    FileExistsError
+        When there is something at `path`.
+    TypeError, ValueError
+        As by `to_simulation`.
+
+    Notes
+    -----
+    ``rebound.Simulationarchive(path)[k]`` is row k, from which REBOUND may go on; `read_archive` reads all of them at
+    once.
+    """
+    place = os.fspath(path)
+    if os.path.lexists(place):
+        raise FileExistsError(f"to_archive: {place} is there already; REBOUND would add to it. Give a new path.")
+    if not (hasattr(run, "t") and hasattr(run, "y")):
+        raise TypeError(f"to_archive: expected a run by integrate, got {shown(run)}.")
+    sim = to_simulation(run, row=0, template=template)
+    for t, y in zip(run.t, run.y.T, strict=True):
+        sim.t = t
+        _set_state(sim, y)
+        sim.save_to_file(place)
+
+
+def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequence[str] | None = None) -> OptimizeResult:
+    """Read the snapshots of a REBOUND Simulationarchive as one run.
+
+    Parameters
+    ----------
+    path : path-like
+    every : int, optional
+        Read each so many-th snapshot.
+    names : sequence of str, optional
+        Names of the bodies; default: those of the particles in the first snapshot (REBOUND 5), or their numbers.
+
+    Returns
+    -------
+    OptimizeResult
+        Times ``t`` (m,), states (q, v) ``y`` (6 N, m), ``gm`` (N,), ``component_names``, ``units`` and ``message``;
+        `eip_scipy.to_xarray`, `eip_scipy.plot`, `orbital_elements` and the like take it. One snapshot with all of its
+        settings is ``rebound.Simulation(path, snapshot=k)``, which `problem_from_simulation` takes.
+
+    Raises
+    ------
+    FileNotFoundError
+        When there is no file.
+    ValueError
+        When REBOUND cannot read it, or bodies or masses change from one snapshot to another.
+    """
+    place, every = os.fspath(path), count("every", every)
+    if not os.path.isfile(place):
+        raise FileNotFoundError(f"read_archive: no file at {place}")
+    with open(place, "rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise ValueError(f"read_archive: {place} is no archive of REBOUND.")
+    times, states, first = [], [], None
+    with warnings.catch_warnings():
+        # Functions of a simulation are never in a file, and here nothing is integrated.
+        warnings.filterwarnings("ignore", "You have to reset function pointers", RuntimeWarning)
+        try:
+            archive = rebound.Simulationarchive(place)
+        except RuntimeError as error:
+            raise ValueError(f"read_archive: REBOUND cannot read {place}: {error}") from error
+        own = _archived_names(archive)
+        for k in range(0, len(archive), every):
+            sim = archive[k]
+            sim.synchronize()
+            gm = sim.G * _attracting_masses(sim)
+            first = (gm, _units(sim)) if first is None else first
+            if not np.array_equal(gm, first[0]):
+                raise ValueError(
+                    f"read_archive: bodies or masses at snapshot {k} of {place} are others than at the first."
+                )
+            times.append(sim.t)
+            states.append(state(sim))
+    gm, units = first if first is not None else (np.zeros(0), "")
+    return OptimizeResult(
+        t=np.array(times),
+        y=np.array(states).T,
+        gm=gm,
+        component_names=component_names(gm.size, own if names is None else names),
+        units=units,
+        message=f"{len(times)} snapshots of a REBOUND archive",
+        success=True,
+        status=0,
+    )
+
+
+def state(sim: rebound.Simulation) -> np.ndarray:
+    """The state (q, v) of all particles."""
+    q = np.empty((sim.N, 3))
+    v = np.empty((sim.N, 3))
+    sim.serialize_particle_data(xyz=q, vxvyvz=v)
+    return np.concatenate((q, v), axis=None)
+
+
+def _set_state(sim: rebound.Simulation, y: np.ndarray) -> None:
+    q, v = np.ascontiguousarray(y, dtype=float).reshape(2, -1, 3)
+    sim.set_serialized_particle_data(xyz=q, vxvyvz=v)
+
+
+def _active(sim: rebound.Simulation) -> int:
+    """How many particles, from the first, attract the others; N_active is -1 for all, as unsigned too."""
+    return int(sim.N_active) if 0 <= sim.N_active < sim.N else int(sim.N)
+
+
+def _attracting_masses(sim: rebound.Simulation) -> np.ndarray:
+    masses = np.array([particle.m for particle in sim.particles][: sim.N], dtype=float)
+    if sim.testparticle_type == 0:
+        masses[_active(sim) :] = 0.0
+    return masses
+
+
+def _names(sim: rebound.Simulation) -> tuple[str, ...]:
+    """The particles' names; a number for one without, or whose name another one has too."""
+    given = [getattr(particle, "name", None) for particle in sim.particles][: sim.N]
+    return tuple(name if name is not None and given.count(name) == 1 else str(k) for k, name in enumerate(given))
+
+
+def _archived_names(archive: rebound.Simulationarchive) -> tuple[str, ...]:
+    """The names in the first snapshot.
+
+    REBOUND 5.2 finds them by their addresses in the process that wrote them, one after the other: where a new address
+    is an old one of another name, one particle gets that of the other. With the wrong ones still there the next are
+    elsewhere.
+    """
+    held: list[rebound.Simulation] = []
+    while len(held) < 4:
+        held.append(archive[0])
+        given = [getattr(particle, "name", None) for particle in held[-1].particles]
+        named = [name for name in given if name is not None]
+        if len(set(named)) == len(named):
+            break
+    return _names(held[-1])
+
+
+def _units(sim: rebound.Simulation) -> str:
+    """The units of length and time, as a `Problem` knows them."""
+    names = sim.units
+    if names["length"] is None or names["time"] is None:
+        return UNKNOWN_UNITS
+    length, time = rebound_units.lengths_SI[names["length"]], rebound_units.times_SI[names["time"]]
+    return f"{_named(length, LENGTHS, 'm')}, {_named(time, TIMES, 's')}"
+
+
+def _named(size: float, known: dict[str, float], base: str) -> str:
+    """A unit by its name, or as a number of metres or seconds."""
+    return next((name for name, own in known.items() if own == size), f"{float(size)!r} {base}")
+
+
+def _attached(sim: rebound.Simulation) -> tuple[tuple[str, ...], ForceConstants | None]:
+    """What REBOUNDx adds, by our names, and the constants of it."""
+    if not sim._additional_forces:
+        return (), None
+    extras = getattr(sim, "_extras_ref", None)
+    if extras is None:
+        raise ValueError(
+            "the simulation has what an N-body problem of eip_scipy does not support: additional forces that are not "
+            "REBOUNDx's, whose invariants are unknown. If they are one of nbody's, say so: forces='gr-potential', "
+            "constants=ForceConstants(c=...); forces=() leaves them out."
+        )
+    names = _force_names(extras)
+    unknown = [name for name in names if name not in REBOUNDX]
+    if unknown or len(names) > 1:
+        raise ValueError(
+            "the simulation has what an N-body problem of eip_scipy does not support: REBOUNDx's additional forces "
+            f"{', '.join(names)}; known: one of {', '.join(REBOUNDX)}. Say forces=... to have others in their place."
+        )
+    if not names:
+        return (), None
+    for k in range(1, sim.N):
+        if _parameter(sim.particles[k], "gr_source") is not None:
+            raise ValueError(f"REBOUNDx's {names[0]}: particle {k} is its source; only the first one is supported.")
+    return (REBOUNDX[names[0]],), ForceConstants(c=_parameter(extras.get_force(names[0]), "c"))
+
+
+def _parameter(thing: Any, name: str) -> Any:
+    """A parameter of REBOUNDx's, None where it is not set."""
+    try:
+        return thing.params[name]
+    except AttributeError:
+        return None
+
+
+def _force_names(extras: Any) -> list[str]:
+    """Names of the forces that REBOUNDx has attached: a list in C, which it has no function for."""
+    import reboundx
+
+    names, node = [], extras._additional_forces
+    while node:
+        force = ctypes.cast(node.contents.object, ctypes.POINTER(reboundx.Force)).contents
+        names.append(force.name.decode())
+        node = node.contents.next
+    return names
+
+
+def _chosen(run: Any, bodies: Bodies, y: Any, row: int | None, t: float | None) -> tuple[float, np.ndarray]:
+    """Time and state that are asked for."""
+    refuse_units(y=y, t=t)
+    problem = bodies.problem
+    rows = 0 if run is problem else len(run.t)
+    if row is not None and y is not None:
+        raise ValueError("to_simulation: give y or row, not both.")
+    if row is not None and run is problem:
+        raise ValueError("to_simulation: row is for runs; a problem has its start only.")
+    if row is not None and not -rows <= row < rows:
+        raise ValueError(f"to_simulation: no row {row}, the run has {rows} saved states.")
+    if y is None:
+        k = -1 if row is None else row
+        at, y = (problem.t_span[0], problem.y0) if run is problem else (run.t[k], run.y[:, k])
+    else:
+        at = problem.t_span[0] if run is problem else _time_of(run, y, t)
+    y = np.array(y, dtype=float)
+    if y.shape != (6 * bodies.gm.size,):
+        raise ValueError(f"to_simulation: the state of {bodies.gm.size} bodies is (6 N,), got {y.shape}.")
+    return float(at if t is None else t), y
+
+
+def _time_of(run: Any, y: Any, t: float | None) -> float:
+    if t is not None:
+        return t
+    equal = (run.y == np.reshape(y, (-1, 1))).all(axis=0)
+    if not equal.any():
+        raise ValueError("to_simulation: y is no saved state of the run; say at which time: t=...")
+    return float(run.t[np.argmax(equal)])
+
+
+def _new(bodies: Bodies) -> rebound.Simulation:
+    """A simulation with the masses and names, at rest in the origin."""
+    sim, n = rebound.Simulation(), bodies.gm.size
+    G = bodies.problem.G
+    if names := _rebound_units(bodies.problem, G):
+        sim.units = names
+    if G is not None:
+        sim.G = G
+    labels = bodies.names if len(bodies.names) == n else tuple(map(str, range(n)))
+    label = "name" if hasattr(rebound.Particle, "name") else "hash"
+    for k, (m, name) in enumerate(zip((bodies.gm / sim.G).tolist(), labels, strict=True)):
+        sim.add(m=m, **({} if name == str(k) else {label: name}))
+    last = int(np.flatnonzero(bodies.gm)[-1]) + 1
+    if last < n:
+        sim.N_active = last
+    return sim
+
+
+def _rebound_units(problem: Problem, G: float | None) -> tuple[str, str, str] | None:
+    """REBOUND's names of the problem's units, with the unit of mass that makes G what it is."""
+    known = problem.unit_system
+    if known is None:
+        return None
+    tables = rebound_units.lengths_SI, rebound_units.times_SI
+    found = [
+        next((name for name, si in table.items() if math.isclose(si, unit.si, rel_tol=1e-9)), None)
+        for table, unit in zip(tables, known, strict=True)
+    ]
+    if None in found:
+        return None
+    length, time = found
+    masses = ["msun"] if G is None else list(rebound_units.masses_SI)
+    for mass in masses:
+        if G is None or math.isclose(rebound_units.convert_G((length, time, mass)), G, rel_tol=1e-12):
+            return str(length), str(time), mass
+    return None
+
+
+def _like(template: rebound.Simulation, bodies: Bodies) -> rebound.Simulation:
+    """A copy of the template, if it has these bodies."""
+    if not isinstance(template, rebound.Simulation):
+        raise TypeError(f"to_simulation: template must be a rebound.Simulation, got {shown(template)}.")
+    own = template.G * _attracting_masses(template)
+    if own.shape != bodies.gm.shape or not np.allclose(own, bodies.gm, rtol=SAME, atol=0):
+        raise ValueError(
+            f"to_simulation: the template has other bodies: its G times the masses are {shown(own)}, those of the "
+            f"problem {shown(bodies.gm)}."
+        )
+    return template.copy()
+
+
+def _refuse_unsupported(sim: rebound.Simulation) -> None:
+    passive = [particle.m for particle in sim.particles][_active(sim) : sim.N]
+    obstacles = (
+        (sim.N_var > 0, "variational particles: they are no bodies, and our state has no place for them"),
+        (sim.N < 2, f"{sim.N} particles: gravity needs at least two"),
+        (
+            sim.testparticle_type != 0 and len(passive) > 1 and any(passive),
+            "test particles with masses that act on active ones and not on each other (testparticle_type 1): the "
+            "invariants are those of another system. Set their masses to 0, or testparticle_type to 0",
+        ),
+        (
+            any(map(bool, (sim._pre_timestep_modifications, sim._post_timestep_modifications))),
+            "additional forces or modifications of a step: their invariants are unknown",
+        ),
+        (sim._N_odes > 0, "further differential equations: our state has no place for them"),
+        (sim.softening != 0, "softened gravity: the problem's potential is 1/r"),
+        (sim.gravity in ("none", "tree", "custom"), f"gravity {sim.gravity!r}: the problem sums 1/r over all pairs"),
+        (sim.collision != "none", "collisions: they change the number of bodies or the invariants"),
+        (
+            sim.boundary != "none" or str(sim.integrator) == "sei",
+            "boundaries or a shearing sheet: the problem's space is open and inertial",
+        ),
+    )
+    for present, what in obstacles:
+        if present:
+            raise ValueError(f"the simulation has what an N-body problem of eip_scipy does not support: {what}")

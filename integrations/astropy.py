@@ -1,0 +1,180 @@
+"""Quantities and times of astropy, in and out.
+
+In: `eip_scipy.problems.nbody` takes masses, positions, velocities, spans and steps with units, and epochs; `integrate`
+and `Problem.solve_ivp` take them for ``t_span``, ``t_eval``, ``h``, ``first_step``, ``max_step`` and ``y0`` of a
+problem that knows its units, and times (`astropy.time.Time`, in any scale) of one that has an epoch;
+`eip_scipy.integrations.jpl.initial_data` takes a time. That needs no import of this module. Elsewhere a value with a
+unit is a TypeError that names the argument: no unit is dropped.
+
+Out: `times`, `positions` and `velocities` of a run. `span` makes a ``t_span`` of Julian dates whose scale is said.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from eip_scipy.core.inputs import shown
+from eip_scipy.core.units import DAY_S, Unit, is_time
+from eip_scipy.core.units import units as known_units
+
+try:
+    from astropy import units
+    from astropy.time import Time
+except ModuleNotFoundError as error:
+    raise ImportError(
+        'eip_scipy.integrations.astropy needs astropy: pip install "eip_scipy[astro]"', name="astropy"
+    ) from error
+
+__all__ = ["positions", "span", "times", "velocities"]
+
+
+def span(start: Any, end: Any, *, scale: str | None = None) -> tuple[Time, Time]:
+    """A ``t_span`` from Julian dates on a stated time scale.
+
+    Parameters
+    ----------
+    start, end : float or (float, float) or Time or Quantity
+        Julian dates, in one number (good to 20 microseconds) or in two that are added up without loss; times of
+        astropy, which have a scale of their own; `end` also a duration, counted from the start.
+    scale : {"tdb", "tt", "tai", "utc", "tcb", "tcg", "ut1"}, optional
+        Of the Julian dates; it must be given where there are some.
+
+    Returns
+    -------
+    (Time, Time)
+        For ``t_span`` of `eip_scipy.integrate`, which converts it to TDB.
+
+    Raises
+    ------
+    TypeError
+        For a Julian date without a scale.
+    ValueError
+        For a scale that astropy does not know.
+
+    Examples
+    --------
+    >>> from eip_scipy.integrations.astropy import span
+    >>> start, end = span(2456690.5, 2456700.5, scale="utc")
+    >>> start.scale, start.tdb.isot, f"{(end.tdb - start.tdb).to_value('s'):.3f} s"
+    ('utc', '2014-02-02T00:01:07.185', '864000.000 s')
+    """
+    first = _time("start", start, scale)
+    return first, first + end if _is_duration(end) else _time("end", end, scale)
+
+
+def times(run: Any, *, scale: str = "tdb") -> Time:
+    """The saved times of a run as times of astropy.
+
+    Parameters
+    ----------
+    run : IntegrationResult or OdeResult
+        Of a `Problem` that has an `epoch`, by `integrate` or `Problem.solve_ivp`; loaded ones too.
+    scale : str, optional
+        "tdb" (the default), "utc" or another that astropy knows.
+
+    Returns
+    -------
+    Time, shape (m,)
+
+    Raises
+    ------
+    TypeError
+        When the run has no epoch or no unit of time.
+    """
+    epoch = getattr(run, "epoch", None)
+    if epoch is None:
+        raise TypeError(
+            "times: the run has no epoch, so its times are no dates; give one to the problem: nbody(..., epoch=...)."
+        )
+    time = _units(run)[1]
+    dates = Time(epoch[0], epoch[1] + np.asarray(run.t) * (time.si / DAY_S), format="jd", scale="tdb")
+    return getattr(dates, scale)
+
+
+def positions(run: Any, unit: Any = None) -> units.Quantity:
+    """Positions of all bodies of a run, with their unit.
+
+    Parameters
+    ----------
+    run : IntegrationResult or OdeResult or OptimizeResult
+        Of bodies, in a problem that knows its units, by `integrate` or `Problem.solve_ivp`; or what
+        `eip_scipy.integrations.rebound.read_archive` has read.
+    unit : str or Unit, optional
+        Default: that of the problem.
+
+    Returns
+    -------
+    Quantity, shape (N, 3, m)
+
+    Raises
+    ------
+    TypeError
+        When the run has no units, or is not one of bodies.
+    """
+    return _part(run, 0, _as_astropy(_units(run)[0]), unit)
+
+
+def velocities(run: Any, unit: Any = None) -> units.Quantity:
+    """Velocities of all bodies of a run, with their unit.
+
+    Parameters
+    ----------
+    run, unit
+        As for `positions`.
+
+    Returns
+    -------
+    Quantity, shape (N, 3, m)
+
+    Raises
+    ------
+    TypeError
+        As by `positions`.
+    """
+    length, time = map(_as_astropy, _units(run))
+    return _part(run, 1, length / time, unit)
+
+
+def _part(run: Any, part: int, own: Any, unit: Any) -> units.Quantity:
+    names = getattr(run, "component_names", None) or ()
+    half = len(names) // 2
+    if half % 3 or not half or any(f"v{a}" != b for a, b in zip(names[:half], names[half:], strict=False)):
+        raise TypeError("expected a run of bodies, whose components are x_..., y_..., z_... and then vx_... and so on.")
+    rows = np.asarray(run.y).reshape(2, half // 3, 3, -1)[part]
+    found = units.Quantity(rows, own)
+    return found if unit is None else found.to(unit)
+
+
+def _units(run: Any) -> tuple[Unit, Unit]:
+    text = getattr(run, "units", "")
+    found = known_units(text)
+    if found is None:
+        raise TypeError(
+            f"the run's units are {text!r}, which name no units of length and time; give them to the problem, such as "
+            "nbody(..., units='AU, yr')."
+        )
+    return found
+
+
+def _as_astropy(unit: Unit) -> Any:
+    return units.Unit(unit.name) if unit.scale == 1 else units.Unit(f"{unit.scale!r} {unit.name}")
+
+
+def _time(name: str, value: Any, scale: str | None) -> Time:
+    if is_time(value):
+        return value
+    if scale is None:
+        raise TypeError(
+            f"span: {name} is {shown(value)}, a Julian date without a time scale; say scale='tdb', scale='utc' or "
+            "another, or give a Time of astropy."
+        )
+    if scale not in Time.SCALES:
+        raise ValueError(f"span: unknown time scale {scale!r}; expected one of {', '.join(sorted(Time.SCALES))}.")
+    first, second = value if isinstance(value, tuple | list) else (value, 0.0)
+    return Time(first, second, format="jd", scale=scale)
+
+
+def _is_duration(value: Any) -> bool:
+    return isinstance(value, units.Quantity) or (hasattr(value, "jd1") and not is_time(value))

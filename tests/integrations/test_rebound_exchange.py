@@ -1,0 +1,308 @@
+"""REBOUND's simulations and archives as problems and runs, and back."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+rebound = pytest.importorskip("rebound")
+
+from eip_scipy import EIPDOP853, EIPRKN12, integrate, load, plot, to_xarray  # noqa: E402
+from eip_scipy.integrations import rebound as exchange  # noqa: E402
+from eip_scipy.problems import ForceConstants, kepler, nbody, orbital_elements, solar_system  # noqa: E402
+
+VERSION_5 = hasattr(rebound.Particle, "name")
+UNITS = {
+    None: (1.0, 1.0),
+    ("yr", "AU", "Msun"): (1.0, 1.0),
+    ("yr2pi", "AU", "Msun"): (1.0, 1.0),
+    ("d", "km", "Mjupiter"): (1047.0, 1.5e8),
+    ("sidereal_yr", "pc", "kg"): (2e30, 5e-6),
+}
+
+
+def planets(units=None, *, test_mass=0.0):
+    """A star, two planets of which one has no name, and a test particle."""
+    sim = rebound.Simulation()
+    if units:
+        sim.units = units
+    mass, length = UNITS[units]
+    label = "name" if VERSION_5 else "hash"
+    sim.add(m=mass, **{label: "star"})
+    sim.add(m=1e-3 * mass, a=length, e=0.1, **{label: "b"})
+    sim.add(m=1e-4 * mass, a=2 * length)
+    sim.add(m=test_mass, a=5 * length, inc=0.1, **{label: "dust"})
+    sim.N_active = 3
+    sim.testparticle_hidewarnings = 1
+    sim.move_to_com()
+    sim.dt = 0.01 * sim.particles[1].P
+    return sim
+
+
+def state(sim):
+    q, v = np.empty((sim.N, 3)), np.empty((sim.N, 3))
+    sim.serialize_particle_data(xyz=q, vxvyvz=v)
+    return np.concatenate([q, v], axis=None)
+
+
+def short_run(**options):
+    problem = exchange.problem_from_simulation(planets())
+    return integrate(problem, (0, 3), method=EIPRKN12, **{"save_every": 20, **options})
+
+
+@pytest.mark.parametrize("units", UNITS)
+def test_there_and_back(units):
+    sim = planets(units)
+    problem = exchange.problem_from_simulation(sim)
+    assert problem.G == sim.G
+    back = exchange.to_simulation(problem)
+    np.testing.assert_array_equal(state(back), state(sim))
+    assert (back.G, back.t, back.N_active) == (sim.G, sim.t, 3)
+    assert exchange.problem_from_simulation(back).units == problem.units  # "d" and "day" are one unit
+    assert back.units["mass"] == sim.units["mass"]
+    np.testing.assert_allclose([p.m for p in back.particles], [p.m for p in sim.particles], rtol=4e-16)
+    if VERSION_5:
+        assert [p.name for p in back.particles] == ["star", "b", None, "dust"]
+        assert problem.component_names[:6] == ("x_star", "y_star", "z_star", "x_b", "y_b", "z_b")
+        assert problem.component_names[6] == "x_2"
+
+
+@pytest.mark.parametrize(
+    ("units", "expected"),
+    [
+        (None, None),
+        (("yr", "AU", "Msun"), (149597870700.0, 31557600.0)),
+        (("yr2pi", "AU", "Msun"), (149597870700.0, 5022642.890913)),
+        (("d", "km", "Mjupiter"), (1000.0, 86400.0)),
+        (("sidereal_yr", "pc", "kg"), (3.085677581e16, 31558149.7635)),
+    ],
+)
+def test_units(units, expected):
+    found = exchange.problem_from_simulation(planets(units)).unit_system
+    assert (found is None) == (expected is None)
+    if expected is not None:
+        np.testing.assert_allclose([unit.si for unit in found], expected, rtol=1e-12)
+
+
+def test_the_motion_is_that_of_rebound():
+    sim = planets(("yr", "AU", "Msun"), test_mass=1e-2)  # type 0: it attracts nothing
+    problem = exchange.problem_from_simulation(sim)
+    run = integrate(problem, (0, 3), method=EIPRKN12, save_every=30)
+    assert problem.params[3] == 0.0
+    sim.integrate(3.0)
+    np.testing.assert_allclose(run.y[:, -1], state(sim), rtol=0, atol=1e-11)
+
+
+def test_a_single_test_particle_of_type_1_is_a_body():
+    sim = planets(test_mass=1e-2)
+    sim.testparticle_type = 1
+    problem = exchange.problem_from_simulation(sim)
+    assert problem.params[3] == 1e-2
+    run = integrate(problem, (0, 3), method=EIPRKN12)
+    sim.integrate(3.0)
+    np.testing.assert_allclose(run.y[:, -1], state(sim), rtol=0, atol=1e-11)
+
+
+def test_names_may_be_given():
+    problem = exchange.problem_from_simulation(planets(), names=["A", "B", "C", "D"])
+    assert problem.component_names[::3] == ("x_A", "x_B", "x_C", "x_D", "vx_A", "vx_B", "vx_C", "vx_D")
+    with pytest.raises(ValueError, match="expected 4 names, all different"):
+        exchange.problem_from_simulation(planets(), names=["A", "A", "C", "D"])
+
+
+def test_any_row_of_a_run():
+    run = short_run()
+    for k in (0, 2, -1):
+        sim = exchange.to_simulation(run, row=k)
+        assert sim.t == run.t[k]
+        np.testing.assert_array_equal(state(sim), run.y[:, k])
+    by_state = exchange.to_simulation(run, run.y[:, 2])
+    assert by_state.t == run.t[2]
+    np.testing.assert_array_equal(state(exchange.to_simulation(run)), run.y[:, -1])
+    moved = exchange.to_simulation(run, 2 * run.y[:, 1], t=7.0)
+    assert moved.t == 7.0
+
+
+def test_a_template_gives_all_but_state_and_time():
+    template = planets(("yr", "AU", "Msun"), test_mass=1e-9)
+    template.integrator = "whfast"
+    template.particles[1].r = 1e-4
+    problem = exchange.problem_from_simulation(template)
+    run = integrate(problem, (0, 1), method=EIPRKN12)
+    sim = exchange.to_simulation(run, template=template)
+    assert (sim.dt, str(sim.integrator), sim.particles[1].r) == (template.dt, "whfast", 1e-4)
+    assert [p.m for p in sim.particles] == [p.m for p in template.particles]
+    assert (sim.t, template.t) == (1.0, 0.0)
+    np.testing.assert_array_equal(state(sim), run.y[:, -1])
+    with pytest.raises(ValueError, match="template has other bodies"):
+        exchange.to_simulation(solar_system(), template=template)
+    with pytest.raises(TypeError, match=r"template must be a rebound\.Simulation"):
+        exchange.to_simulation(run, template="archive.bin")
+
+
+def test_the_solar_system():
+    """Units that REBOUND knows: solar masses, and G m as it was to a rounding."""
+    problem = solar_system()
+    sim = exchange.to_simulation(problem)
+    assert sim.units == {"length": "au", "time": "yr", "mass": "msun"}
+    assert sim.particles[0].m == pytest.approx(1.0, rel=1e-9)
+    np.testing.assert_allclose([sim.G * p.m for p in sim.particles], problem.params, rtol=4e-16)
+    assert not 0 <= sim.N_active < sim.N
+    if VERSION_5:
+        assert sim.particles["Jupiter"].m == sim.particles[5].m
+    plain = exchange.to_simulation(nbody([1, 1e-3], np.eye(2, 3), np.eye(2, 3)[::-1], t_span=(2, 3)))
+    assert (plain.G, plain.t, plain.particles[1].m) == (1.0, 2.0, 1e-3)
+
+
+def test_archive(tmp_path):
+    run = short_run()
+    path = tmp_path / "run.bin"
+    exchange.to_archive(run, path)
+    archive = rebound.Simulationarchive(str(path))
+    assert len(archive) == run.t.size
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        np.testing.assert_array_equal(state(archive[3]), run.y[:, 3])
+    found = exchange.read_archive(path)
+    np.testing.assert_array_equal(found.t, run.t)
+    np.testing.assert_array_equal(found.y, run.y)
+    if VERSION_5:
+        assert found.component_names == run.component_names
+    np.testing.assert_array_equal(orbital_elements(found).a, orbital_elements(run).a)
+    every = exchange.read_archive(path, every=2, names=["A", "B", "C", "D"])
+    np.testing.assert_array_equal(every.t, run.t[::2])
+    assert every.component_names[0] == "x_A"
+    with pytest.raises(FileExistsError, match="is there already"):
+        exchange.to_archive(run, path)
+
+
+def test_what_was_read_is_drawn_and_tabled(tmp_path):
+    pytest.importorskip("xarray")
+    pytest.importorskip("matplotlib")
+    exchange.to_archive(short_run(), tmp_path / "run.bin")
+    found = exchange.read_archive(tmp_path / "run.bin", names=["A", "B", "C", "D"])
+    assert to_xarray(found).y.sel(component="x_B").shape == found.t.shape
+    assert plot(found).axes
+
+
+def test_archives_of_rebound(tmp_path):
+    sim = planets(("yr", "AU", "Msun"))
+    path = tmp_path / "sim.bin"
+    sim.save_to_file(str(path), interval=0.5)
+    sim.integrate(2.0)
+    found = exchange.read_archive(path)
+    assert found.y.shape == (24, found.t.size)
+    assert found.t[-1] >= 1.5
+    assert found.units == "AU, yr"
+    assert found.gm[3] == 0.0
+    again = exchange.problem_from_simulation(rebound.Simulation(str(path), snapshot=1))
+    np.testing.assert_array_equal(again.y0, found.y[:, 1])
+
+
+def test_archives_that_are_none(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no file at"):
+        exchange.read_archive(tmp_path / "none.bin")
+    (tmp_path / "text.bin").write_text("not an archive")
+    with pytest.raises(ValueError, match="is no archive of REBOUND"):
+        exchange.read_archive(tmp_path / "text.bin")
+
+
+def test_archives_whose_bodies_change(tmp_path):
+    sim = planets()
+    sim.save_to_file(str(tmp_path / "sim.bin"))
+    sim.particles[1].m *= 2
+    sim.save_to_file(str(tmp_path / "sim.bin"))
+    with pytest.raises(ValueError, match="masses at snapshot 1"):
+        exchange.read_archive(tmp_path / "sim.bin")
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda run: exchange.to_simulation(kepler()), TypeError, "expected a problem of bodies"),
+        (lambda run: exchange.to_simulation(run, row=99), ValueError, "no row 99, the run has"),
+        (lambda run: exchange.to_simulation(run, run.y[:, 0], row=0), ValueError, "y or row, not both"),
+        (lambda run: exchange.to_simulation(run, run.y[:, 0] + 1), ValueError, "no saved state of the run; say"),
+        (lambda run: exchange.to_simulation(run, run.y[:6, 0], t=0), ValueError, r"4 bodies is \(6 N,\), got \(6,\)"),
+        (lambda run: exchange.to_simulation(solar_system(), row=0), ValueError, "row is for runs"),
+        (lambda run: exchange.to_archive(solar_system(), "x.bin"), TypeError, "expected a run by integrate"),
+        (lambda run: exchange.read_archive("x.bin", every=0), ValueError, "every must be an integer >= 1"),
+    ],
+)
+def test_bad_input_is_named(call, error, message):
+    with pytest.raises(error, match=message):
+        call(short_run())
+
+
+def test_a_loaded_result_needs_its_problem(tmp_path):
+    run = short_run()
+    run.save(tmp_path / "run.npz")
+    again = load(tmp_path / "run.npz")
+    with pytest.raises(TypeError, match="A result that was loaded"):
+        exchange.to_simulation(again)
+    problem = exchange.problem_from_simulation(planets())
+    sim = exchange.to_simulation(problem, again.y[:, 1], t=again.t[1])
+    np.testing.assert_array_equal(state(sim), run.y[:, 1])
+
+
+def pull(sim):
+    sim.additional_forces = lambda pointer: None
+
+
+def test_forces_may_be_named():
+    sim = planets()
+    pull(sim)
+    constants = ForceConstants(c=1e4)
+    problem = exchange.problem_from_simulation(sim, forces="gr-potential", constants=constants)
+    expected = nbody(
+        [1.0, 1e-3, 1e-4, 0.0], *state(sim).reshape(2, 4, 3), t_span=(0, 1), forces="gr-potential", constants=constants
+    )
+    np.testing.assert_array_equal(problem.params, expected.params)
+    plain = exchange.problem_from_simulation(sim, forces=())
+    assert plain.params.size == 4
+    with pytest.raises(ValueError, match="constants belong to forces"):
+        exchange.problem_from_simulation(planets(), constants=constants)
+    with pytest.warns(UserWarning, match=r"also gr-potential \(REBOUNDx: gr_potential\)"):
+        exchange.to_simulation(problem)
+
+
+def with_force(name, **parameters):
+    reboundx = pytest.importorskip("reboundx")
+    sim = rebound.Simulation()
+    sim.units = ("yr", "AU", "Msun")
+    sim.add(m=1.0)
+    sim.add(m=1e-7, a=0.38, e=0.2)
+    sim.add(m=1e-3, a=5.2, e=0.05, inc=0.1)
+    sim.move_to_com()
+    extras = reboundx.Extras(sim)
+    force = extras.load_force(name)
+    extras.add_force(force)
+    for key, value in parameters.items():
+        force.params[key] = value
+    return sim
+
+
+@pytest.mark.parametrize(
+    ("theirs", "ours"), [("gr", ["1pn"]), ("gr_full", ["eih"]), ("gr_potential", ["gr-potential"])]
+)
+def test_forces_of_reboundx(theirs, ours):
+    sim = with_force(theirs, c=63241.0)
+    problem = exchange.problem_from_simulation(sim, t_span=(0, 5), h=2e-3)
+    run = integrate(problem, method=EIPDOP853, h=2e-3)
+    newton = integrate(nbody(problem.params[:3], *problem.y0.reshape(2, 3, 3), t_span=(0, 5)), method=EIPDOP853, h=2e-3)
+    sim.integrate(5.0)
+    error, effect = (np.abs(r.y[:, -1] - state(sim))[3:6].max() for r in (run, newton))
+    assert error < 1e-3 * effect
+    with pytest.warns(UserWarning, match=ours[0]):
+        exchange.to_simulation(problem)
+
+
+def test_forces_of_reboundx_that_are_not_known():
+    with pytest.raises(ValueError, match="REBOUNDx's additional forces radiation_forces; known: one of gr"):
+        exchange.problem_from_simulation(with_force("radiation_forces", c=1e4))
+    with pytest.raises(ValueError, match="'1pn' needs constants"):
+        exchange.problem_from_simulation(with_force("gr"))
+    sim = with_force("gr", c=1e4)
+    sim.particles[2].params["gr_source"] = 1
+    with pytest.raises(ValueError, match="particle 2 is its source"):
+        exchange.problem_from_simulation(sim)
