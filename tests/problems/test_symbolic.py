@@ -573,7 +573,7 @@ def test_code_is_the_same_in_every_process():
         subprocess.run(
             [sys.executable, "-c", code], env={"PYTHONHASHSEED": str(k)}, capture_output=True, text=True, check=True
         ).stdout
-        for k in range(3)
+        for k in (1, 2)
     }
     assert len(found) == 1
 
