@@ -26,10 +26,9 @@ def assert_output(found, printed):
 
 
 PAGES = (
-    "quickstart", "results", "adaptive", "own-methods", "multistep", "checkpoints", "ensembles", "written",
-    "finding-invariants",
+    "quickstart", "results", "adaptive", "own-methods", "multistep", "checkpoints", "ensembles", "finding-invariants",
 )  # fmt: skip
-NIGHTLY = ("hard-scenes", "charged-particles", "gross-pitaevskii")
+NIGHTLY = ("hard-scenes", "charged-particles", "gross-pitaevskii", "written")
 
 
 @pytest.mark.parametrize(
