@@ -1,7 +1,9 @@
-"""What holds for every test: ``needs_jit``, plotting without a screen, Ctrl-C, the profile of hypothesis."""
+"""What holds for every test: order, ``needs_jit``, plotting without a screen, Ctrl-C, the profile of hypothesis."""
 
 import os
 import signal
+from collections import Counter
+from pathlib import Path
 
 import hypothesis
 import numba
@@ -19,12 +21,22 @@ hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
 
 
+# Seconds that tests take, roughly.
+SLOW, FAST = 1.0, 0.03
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     if config.option.markexpr == "not slow":
         terminalreporter.write_line("slow tests were left out; to run them: python -m pytest -m slow")
 
 
+@pytest.hookimpl(trylast=True)  # of the tests that were chosen
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    # A file that starts last keeps one process busy alone: those that take long go first.
+    seconds: Counter[Path] = Counter()
+    for item in items:
+        seconds[item.path] += SLOW if item.get_closest_marker("slow") else FAST
+    items.sort(key=lambda item: -seconds[item.path])
     if not numba.config.DISABLE_JIT:
         return
     skip = pytest.mark.skip(reason="needs compiled code; NUMBA_DISABLE_JIT is set")

@@ -26,10 +26,10 @@ def assert_output(found, printed):
 
 
 PAGES = (
-    "quickstart", "results", "adaptive", "own-methods", "multistep", "checkpoints", "ensembles", "written",
-    "finding-invariants", "recommend", "astronomy",
+    "quickstart", "results", "adaptive", "own-methods", "multistep", "checkpoints", "ensembles", "finding-invariants",
+    "recommend", "astronomy",
 )  # fmt: skip
-NIGHTLY = ("hard-scenes", "charged-particles", "gross-pitaevskii")
+NIGHTLY = ("hard-scenes", "charged-particles", "gross-pitaevskii", "written")
 
 
 @pytest.mark.parametrize(

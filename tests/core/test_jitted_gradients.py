@@ -162,9 +162,10 @@ def computed(fun, y, extra=()):
     return InvariantSet(Invariant(fun), 0.0, y, np.ones_like(y), 1.0, extra).gradients(0.0, y, y)
 
 
-# Each takes some seconds to compile: a third of them in the gate.
+# Each takes some seconds to compile: in the gate one of each kind.
+GATE = {"kepler_by_arrays", "exponentials", "hyperbolic", "branch_of_another_type", "array_filled_in_another_function"}
 NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
-NAMES = [name if k % 3 == 0 else pytest.param(name, marks=NIGHTLY) for k, name in enumerate(FUNCTIONS)]
+NAMES = [name if name in GATE else pytest.param(name, marks=NIGHTLY) for name in FUNCTIONS]
 
 
 @pytest.mark.parametrize("name", NAMES)

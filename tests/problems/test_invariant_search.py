@@ -361,10 +361,13 @@ def dissipative_system(seed):
     return f, rng.normal(size=2 * n)
 
 
-SAMPLE = [*range(0, 200, 9), *(pytest.param(k, marks=pytest.mark.slow) for k in range(200) if k % 9)]
+def kept_for(k):
+    """A ninth of the systems for the fast tests, as many again for the gate, the others for the nights."""
+    marks = {0: [], 4: [pytest.mark.slow]}.get(k % 9, [pytest.mark.slow, pytest.mark.nightly])
+    return pytest.param(k, marks=marks)
 
 
-@pytest.mark.parametrize("seed", SAMPLE)
+@pytest.mark.parametrize("seed", map(kept_for, range(200)))
 def test_none_in_random_systems(seed):
     f, y0 = random_system(seed)
     assert [names(f, y0, degree=degree) for degree in (2, 3, 4)] == [[], [], []]
