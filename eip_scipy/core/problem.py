@@ -49,6 +49,9 @@ class Problem:
         Parameters of `rhs`, `acc` and the invariants' functions.
     metric, blocks, frame
         Options of the projection that suit the problem (see `EIPSolver`).
+    method : Tableau, NystromTableau, GaussJackson or OneStepMethod, optional
+        What `eip_method` takes, of a kind that suits the problem: what `integrate` steps with where it is given no
+        method.
     units : str
         Units of the state and of time.
     jacobian : callable, optional
@@ -83,6 +86,7 @@ class Problem:
     jacobian: Callable[..., None] | None = None
     frequencies: Callable[[np.ndarray], tuple[np.ndarray, float]] | None = None
     component_names: tuple[str, ...] | None = None
+    method: Any = None
 
     def __post_init__(self) -> None:
         refuse_units(y0=self.y0, t_span=self.t_span, h=self.h, params=self.params, metric=self.metric, frame=self.frame)

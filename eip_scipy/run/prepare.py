@@ -22,7 +22,7 @@ from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 from ..core.problem import Problem
 from ..core.results import Diagnostics
 from ..core.setup import Counted, Run, Start
-from ..core.solvers import EIPSolver
+from ..core.solvers import EIPSolver, eip_method
 from ..core.stepping import AnyMethod, StepOptions, Stepping, interval
 from ..engine.counters import NFEV
 from ..engine.data import Schedule, Span
@@ -261,6 +261,8 @@ class Prepared:
 def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     """A run as it is asked for, all that was given checked; `check_start`: see `setup.prepare`."""
     refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
+    if request.method is None and isinstance(request.fun, Problem) and request.fun.method is not None:
+        request = replace(request, method=eip_method(request.fun.method))
     method = _method(request.method)
     in_place = flag("in_place", request.in_place)
     _check_choices(request)
@@ -306,6 +308,7 @@ def started_at(request: Request) -> tuple[float, np.ndarray]:
 
 
 def _method(method: Any) -> Any:
+    _required("method", method)
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
         raise TypeError(
             f"integrate: method must be an EIP class such as EIPRK4, or one that eip_method made; got {method!r}."
