@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-from eip_scipy import EIPDOP853, EIPRKN8, Invariant, check_gradient, eip_method, integrate
+from eip_scipy import EIPDOP853, EIPRKN12, Invariant, ProjectionWarning, check_gradient, eip_method, integrate
 from eip_scipy.core.diagnostics import observed_order
 from eip_scipy.methods.runge_kutta import DOP853, RK3, RK4, RK45
 from eip_scipy.problems import (
@@ -31,8 +31,8 @@ SCENES = {
     "sine-Gordon breather": lambda: sine_gordon_breather(points=1024),
     "sine-Gordon breather that moves": lambda: sine_gordon_breather(points=1024, velocity=-0.4),
     "kinks": lambda: sine_gordon_kinks(points=1024),
-    "KdV soliton": lambda: korteweg_de_vries_solitons(2.0, 5.0),
-    "KdV solitons": korteweg_de_vries_solitons,
+    "KdV soliton": lambda: korteweg_de_vries_solitons(2.0, 5.0, 384),
+    "KdV solitons": lambda: korteweg_de_vries_solitons(points=384, length=80.0),
     "three KdV solitons": lambda: korteweg_de_vries_solitons((2.0, 1.4, 0.8), (-14.0, 0.0, 12.0), 512, 110.0),
 }
 WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
@@ -175,6 +175,13 @@ def test_gradients(made):
         check_gradient(Invariant(item.fun, gradient), 0.0, y)
 
 
+def test_momentum_of_a_field_that_the_grid_does_not_resolve_is_not_trusted():
+    scene = breather(points=256, velocity=1.3, t_end=1.0)
+    with pytest.warns(ProjectionWarning, match="'momentum_x' is no invariant of this system"):
+        run = integrate(scene, invariants=scene.equation.invariants(("mass", "energy", "momentum_x")))
+    assert not run.trusted
+
+
 def test_momentum_of_plane_waves():
     scene = plane_wave((8, 12, 10), (1, -2, 3), amplitude=0.5)
     gpe = scene.equation
@@ -230,7 +237,7 @@ def test_methods_that_problems_bring():
     assert integrate(soliton(), (0, 0.1)).method == "EIP_splitting-rkn6"
     assert integrate(soliton(), (0, 0.1), method=EIPDOP853).method == "EIPDOP853"
     scene = sine_gordon_kinks()
-    mine, named = integrate(scene, (0, 0.2)), integrate(scene, (0, 0.2), method=EIPRKN8)
+    mine, named = integrate(scene, (0, 0.2)), integrate(scene, (0, 0.2), method=EIPRKN12)
     np.testing.assert_array_equal(mine.y, named.y)
 
 

@@ -73,7 +73,7 @@ class KortewegDeVries:
         self._fine = scipy.fft.next_fast_len(3 * most + 1, real=True)
         self._k = grid.wavenumbers(0)[: self._kept]
         self.frequencies = -(self._k**3)
-        self._flux = -3j * self._k * (self._n / self._fine)
+        self._flux = -3j * self._k
 
     def __repr__(self) -> str:
         return f"KortewegDeVries({self.grid!r})"
@@ -81,25 +81,26 @@ class KortewegDeVries:
     # In modes: what `Lawson` takes.
 
     def modes(self, u: np.ndarray) -> np.ndarray:
-        """The modes with k >= 0 that take part, ``sum_j u_j exp(-i k x_j)``."""
-        return scipy.fft.rfft(u)[: self._kept]
+        """The modes with k >= 0 that take part, the means of ``u_j exp(-i k x_j)``."""
+        return scipy.fft.rfft(u, norm="forward")[: self._kept]
 
     def field(self, modes: np.ndarray) -> np.ndarray:
         """The field with these modes."""
-        return scipy.fft.irfft(modes, self._n)
+        return scipy.fft.irfft(modes, self._n, norm="forward")
 
     def nonlinear(self, modes: np.ndarray) -> np.ndarray:
         """The modes of ``-3 (u^2)_x``."""
         return self._flux * self._square(modes)
 
     def _square(self, modes: np.ndarray) -> np.ndarray:
-        """The modes of u^2, as a transform of the finer grid gives them."""
+        """The modes of u^2."""
         u = self._finer(modes)
-        return scipy.fft.rfft(u * u)[: self._kept]
+        u *= u
+        return scipy.fft.rfft(u, norm="forward")[: self._kept]
 
     def _finer(self, modes: np.ndarray) -> np.ndarray:
         """The field on the finer grid."""
-        return scipy.fft.irfft(modes, self._fine) * (self._fine / self._n)
+        return scipy.fft.irfft(modes, self._fine, norm="forward")
 
     # In points.
 
@@ -124,11 +125,11 @@ class KortewegDeVries:
 
     def energy(self, u: np.ndarray) -> float:
         """The integral of u_x^2 / 2 - u^3, exact for the modes that take part."""
-        modes, n = self.modes(u), self._n
+        modes = self.modes(u)
         fine = self._finer(modes)
         slope = self.field(1j * self._k * modes)
-        cubic = np.sum(fine * fine * fine) * (n / self._fine)
-        return float(self.grid.cell * (0.5 * (slope @ slope) - cubic))
+        cubic = (fine * fine) @ fine / self._fine
+        return float(self.grid.cell * (0.5 * (slope @ slope) - self._n * cubic))
 
     def _mass_gradient(self, t: float, u: np.ndarray, out: np.ndarray) -> None:
         out[:] = self.grid.cell
@@ -138,7 +139,7 @@ class KortewegDeVries:
 
     def _energy_gradient(self, t: float, u: np.ndarray, out: np.ndarray) -> None:
         modes = self.modes(u)
-        found = self._k**2 * modes - 3 * (self._n / self._fine) * self._square(modes)
+        found = self._k**2 * modes - 3 * self._square(modes)
         np.multiply(self.field(found), self.grid.cell, out=out)
 
     def invariants(self, names: Sequence[str] = ("momentum", "energy")) -> tuple[Invariant, ...]:

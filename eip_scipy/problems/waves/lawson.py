@@ -65,6 +65,7 @@ class Lawson:
         self.name = f"Lawson-{tableau.name}"
         self._h: float | None = None
         self._turns: list[np.ndarray] = []
+        self._back: list[np.ndarray] = []
 
     def __repr__(self) -> str:
         return f"Lawson({self.equation!r}, {self.tableau!r})"
@@ -74,13 +75,13 @@ class Lawson:
         if h != self._h:
             nodes = (*self.tableau.c, 1.0)
             self._turns, self._h = [np.exp(-1j * h * c * self.equation.frequencies) for c in nodes], h
+            self._back = [turn.conj() for turn in self._turns]
         equation, tableau = self.equation, self.tableau
         modes = equation.modes(y)
         slopes = np.empty((tableau.n_stages + tableau.fsal, modes.size), complex)
 
         def slope(stage: int, moved: np.ndarray) -> None:
-            turn = self._turns[stage]
-            np.multiply(equation.nonlinear(turn * moved), turn.conj(), out=slopes[stage])
+            np.multiply(equation.nonlinear(self._turns[stage] * moved), self._back[stage], out=slopes[stage])
 
         slope(0, modes)
         for stage in range(1, tableau.n_stages):

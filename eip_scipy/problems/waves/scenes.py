@@ -42,7 +42,7 @@ def sine_gordon_breather(
         Of the ring; exp(-b length / 2) is the error of the closed form there.
     t_end : float
     h : float, optional
-        Default: two fifths of `SineGordon.largest_step`.
+        Default: half of `SineGordon.largest_step`.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def sine_gordon_kinks(
         Of the ring; the error of the closed form there is exp(-c (length - v t_end) / 2).
     t_end : float
     h : float, optional
-        Default: two fifths of `SineGordon.largest_step`.
+        Default: half of `SineGordon.largest_step`.
 
     Returns
     -------
@@ -99,7 +99,7 @@ def _sine_gordon(name: str, closed: Any, points: int, length: float, t_end: floa
     equation = SineGordon(Grid(points, -length / 2, length / 2))
     exact = partial(closed, equation.grid.points(0), length)
     start = exact(0.0)
-    step = 0.4 * equation.largest_step() if h is None else h
+    step = 0.5 * equation.largest_step() if h is None else h
     return equation.problem(start[:points], start[points:], t_end, step, name=name, reference=exact)
 
 
@@ -126,8 +126,8 @@ def _kinks(velocity: float, middle: float, x: np.ndarray, length: float, t: floa
 def korteweg_de_vries_solitons(
     speeds: Any = (2.0, 1.0),
     places: Any = (-8.0, 4.0),
-    points: int = 320,
-    length: float = 70.0,
+    points: int = 256,
+    length: float = 64.0,
     t_end: float = 20.0,
     h: float | None = None,
 ) -> WaveProblem:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...core.invariants import Invariant
 from ...core.names import nearest
-from ...methods.nystrom import RKN86
+from ...methods.nystrom import RKN1210
 from ..gross_pitaevskii.grid import Grid
 from .modes import RealModes
 from .record import WaveProblem
@@ -148,13 +148,13 @@ class SineGordon:
         value, gradient = made[name]
         return Invariant(partial(_at, value), gradient, name=name, in_place=True, uses_f=name == "energy")
 
-    def largest_step(self, limit: float = 3.3) -> float:
+    def largest_step(self, limit: float = 8.0) -> float:
         """The step above which an explicit method is unstable.
 
         Parameters
         ----------
         limit : float, optional
-            The method's bound on h times the largest frequency; default: that of `EIPRKN8`.
+            The method's bound on h times the largest frequency; default: for `EIPRKN12`. That of `EIPRKN8` is 3.3.
 
         Returns
         -------
@@ -194,7 +194,7 @@ class SineGordon:
         Returns
         -------
         WaveProblem
-            Its method is the Nystrom method of `EIPRKN8`.
+            Its method is the Nystrom method of `EIPRKN12`.
 
         Raises
         ------
@@ -214,7 +214,7 @@ class SineGordon:
             h=h,
             invariants=self.invariants(invariants),
             metric="euclidean",
-            method=RKN86,
+            method=RKN1210,
             reference=reference,
             units="dimensionless",
             source=source,
