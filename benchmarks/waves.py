@@ -30,6 +30,7 @@ from eip_scipy.app.report import describe_machine, table
 from eip_scipy.problems import breather, korteweg_de_vries_solitons, sine_gordon_breather, sine_gordon_kinks
 
 OWN, RAW, EIP, SCIPY = "own method, projected", "own method alone", "EIPDOP853", "SciPy's DOP853"
+METHODS = (OWN, RAW, EIP, SCIPY)
 REPEATS, SHORT = 3, 1.0  # of runs below so many seconds; others run once
 # Problem, fixed steps, tolerances.
 SCENES: dict[str, tuple[Any, tuple[float, ...], tuple[float, ...]]] = {
@@ -116,7 +117,7 @@ def show_costs(name: str, found: dict[tuple[str, float], dict[str, Any]]) -> Non
             method,
             [f"{x:g}", f"{r['field']:.1e}", f"{r['invariants']:.0e}", f"{r['seconds']:.2f}", str(r["calls"] or "")],
         )
-        for (method, x), r in sorted(found.items(), key=lambda item: (list(METHODS).index(item[0][0]), -item[0][1]))
+        for (method, x), r in sorted(found.items(), key=lambda item: (METHODS.index(item[0][0]), -item[0][1]))
     ]
     print(table([["h or", "rtol"], ["field"], ["invariants"], ["time [s]"], ["f"]], rows))
 
@@ -131,9 +132,6 @@ def show_growth(name: str, found: dict[tuple[str, float], dict[str, Any]]) -> No
     print(table([["h or", "rtol"], *([f"{x:g}"] for x in t), ["invariants"], ["time [s]"]], rows))
 
 
-METHODS = (OWN, RAW, EIP, SCIPY)
-
-
 def save_figure(found: dict[str, Any], path: str) -> None:
     """Draw the waves in space and time, and below each the errors against the processor's time."""
     from matplotlib.figure import Figure
@@ -141,27 +139,28 @@ def save_figure(found: dict[str, Any], path: str) -> None:
     from eip_scipy.plotting import method_styles
 
     styles = method_styles(METHODS)
-    figure = Figure(figsize=(11, 10), layout="constrained")
+    figure = Figure(figsize=(12, 10.5), layout="constrained")
     panels = figure.subplots(3, len(SCENES), height_ratios=(1.1, 1, 1))
+    widths = {"NLS breather": 5, "sine-Gordon kinks": 20, "KdV solitons": 32}
     labels = {"NLS breather": "|ψ|", "sine-Gordon kinks": "q", "KdV solitons": "u"}
     for (name, (problem, *_)), column in zip(SCENES.items(), panels.T, strict=True):
         grid = problem.equation.grid
         x, t = grid.points(0), np.linspace(*problem.t_span, 240)
         field = np.array([problem.reference(at)[: grid.size] for at in t])
-        middle = np.abs(x) < 0.5 * x.max() if name != "NLS breather" else np.abs(x) < 5
+        middle = np.abs(x) < widths[name]
         shown = np.abs(field) if np.iscomplexobj(field) else field
         image = column[0].pcolormesh(x[middle], t, shown[:, middle], cmap="cividis", rasterized=True)
         figure.colorbar(image, ax=column[0], label=labels[name])
         column[0].set(title=name, xlabel="x", ylabel="t")
         for axis, what in zip(column[1:], ("field", "invariants"), strict=True):
             for method in METHODS:
-                rows = sorted((r["seconds"], r[what]) for (m, _), r in found[name].items() if m == method)
+                rows = [(r["seconds"], r[what]) for (m, _), r in found[name].items() if m == method]
                 axis.plot(*np.maximum(np.array(rows), 1e-16).T, ms=5, lw=1.3, **styles[method])
             axis.set(xscale="log", yscale="log", xlabel="processor time [s]")
             axis.grid(alpha=0.3)
     panels[1, 0].set_ylabel("largest error of the field at the end")
     panels[2, 0].set_ylabel("largest relative error of an invariant")
-    panels[1, 0].legend(fontsize="small", frameon=False)
+    figure.legend(*panels[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(path, dpi=130)
     print(f"wrote {path}")
 
