@@ -38,9 +38,9 @@ SCENES: dict[str, tuple[Any, tuple[float, ...], tuple[float, ...]]] = {
     "sine-Gordon kinks": (sine_gordon_kinks(), (0.4, 0.35, 0.3, 0.25, 0.2), (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)),
     "KdV solitons": (korteweg_de_vries_solitons(), (0.03, 0.02, 0.015, 0.01, 0.007), (1e-4, 1e-8, 1e-10)),
 }
-LONG: dict[str, tuple[Any, float, float]] = {  # problem, end, step
+LONG: dict[str, tuple[Any, float, float]] = {  # problem, end, step, which the times below are multiples of
     "NLS breather": (breather(fft="scipy"), 25.0, 0.01),
-    "sine-Gordon breather": (sine_gordon_breather(), 1000.0, 0.15),
+    "sine-Gordon breather": (sine_gordon_breather(), 1000.0, 0.125),
     "KdV solitons": (korteweg_de_vries_solitons((1.0, 0.6), (-20.0, 20.0), 256, 120.0), 160.0, 0.04),
 }
 TIMES = (0.1, 0.3, 1.0)  # of the longer runs, in parts of their length
