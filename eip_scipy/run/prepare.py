@@ -308,7 +308,6 @@ def started_at(request: Request) -> tuple[float, np.ndarray]:
 
 
 def _method(method: Any) -> Any:
-    _required("method", method)
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
         raise TypeError(
             f"integrate: method must be an EIP class such as EIPRK4, or one that eip_method made; got {method!r}."
