@@ -226,6 +226,9 @@ class SlabGrossPitaevskii(GrossPitaevskii):
         self.comm.Gatherv(field, None if whole is None else [whole, sizes])
         return whole
 
+    def _method(self) -> None:
+        return None
+
     def _total(self, sums: Any) -> Any:
         return total(self.comm, sums)
 

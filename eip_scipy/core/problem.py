@@ -54,6 +54,9 @@ class Problem:
         Parameters of `rhs`, `acc` and the invariants' functions.
     metric, blocks, frame
         Options of the projection that suit the problem (see `EIPSolver`).
+    method : Tableau, NystromTableau, GaussJackson or OneStepMethod, optional
+        What `eip_method` takes, of a kind that suits the problem: what `integrate` steps with where it is given no
+        method.
     units : str
         Units of the state and of time. Of the form "AU, yr" (a length and a time: m, cm, km, AU, pc; s, min, h, d, yr,
         kyr, Myr, Gyr, or a number of m or s) they are more than a note: quantities of astropy are converted to them
@@ -97,6 +100,7 @@ class Problem:
     component_names: tuple[str, ...] | None = None
     epoch: Epoch | None = None
     G: float | None = None
+    method: Any = None
 
     def __post_init__(self) -> None:
         refuse_units(y0=self.y0, t_span=self.t_span, h=self.h, params=self.params, metric=self.metric, frame=self.frame)

@@ -292,6 +292,9 @@ class _Published(NystromTableau):
     def _check_order(name: str, A: np.ndarray, c: np.ndarray, rows: Sequence[Weights]) -> None:
         pass
 
+    def __reduce__(self) -> str:
+        return self.name  # of the variable too: exact fractions need not travel, and problems that have one pickle
+
 
 RKN86 = _Published(
     "RKN86",

@@ -13,6 +13,7 @@ from .gross_pitaevskii import (
     Grid,
     GrossPitaevskii,
     Splitting,
+    breather,
     harmonic_trap,
     plane_wave,
     quartic_trap,
@@ -27,6 +28,15 @@ from .particles.charged_particle import ParticleProblem, charged_particle, tokam
 from .particles.fields import TOKAMAK, UNIFORM, ParticleField
 from .symbolic import equations, hamiltonian
 from .time_transformed import centre_time, pair_time, reaches, time_transformed
+from .waves import (
+    KortewegDeVries,
+    Lawson,
+    SineGordon,
+    WaveProblem,
+    korteweg_de_vries_solitons,
+    sine_gordon_breather,
+    sine_gordon_kinks,
+)
 
 __all__ = [
     "TOKAMAK",
@@ -36,12 +46,17 @@ __all__ = [
     "Grid",
     "GrossPitaevskii",
     "HardCase",
+    "KortewegDeVries",
+    "Lawson",
     "OrbitalElements",
     "ParticleField",
     "ParticleProblem",
     "Problem",
+    "SineGordon",
     "SolarSystemData",
     "Splitting",
+    "WaveProblem",
+    "breather",
     "centre_time",
     "charged_particle",
     "comet",
@@ -53,6 +68,7 @@ __all__ = [
     "harmonic",
     "harmonic_trap",
     "kepler",
+    "korteweg_de_vries_solitons",
     "nbody",
     "orbital_elements",
     "pair_time",
@@ -61,6 +77,8 @@ __all__ = [
     "quartic_trap",
     "reaches",
     "rotating_packet",
+    "sine_gordon_breather",
+    "sine_gordon_kinks",
     "solar_system",
     "soliton",
     "time_transformed",

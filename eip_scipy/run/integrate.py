@@ -67,7 +67,7 @@ def integrate(
     t_span: Any = None,
     y0: Any = None,
     *,
-    method: type[EIPSolver],
+    method: type[EIPSolver] | None = None,
     h: float | None = DEFAULT,
     args: Any = None,
     params: Any = None,
@@ -111,9 +111,10 @@ def integrate(
         `first_step` and `max_step`.
     y0 : array_like, shape (n,)
         Initial state, real or complex.
-    method : type
+    method : type, optional
         `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, `EIPGJ12`, `EIPGJ14`, or a
-        class made by `eip_method`; one on a one-step method runs interpreted.
+        class made by `eip_method`; one on a one-step method runs interpreted. Default: the problem's
+        own, if it has one.
     h : float, optional
         Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter. None: adaptive steps by
         `rtol`, `atol`, `first_step` and `max_step`. Default: adaptive where one of these is given, else a problem's

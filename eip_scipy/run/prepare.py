@@ -22,7 +22,7 @@ from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 from ..core.problem import Problem
 from ..core.results import Diagnostics
 from ..core.setup import Counted, Run, Start
-from ..core.solvers import EIPSolver
+from ..core.solvers import EIPSolver, eip_method
 from ..core.stepping import AnyMethod, StepOptions, Stepping, interval
 from ..engine.counters import NFEV
 from ..engine.data import Schedule, Span
@@ -272,6 +272,8 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     """A run as it is asked for, all that was given checked; `check_start`: see `setup.prepare`."""
     request = _plain(request)
     refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
+    if request.method is None and isinstance(request.fun, Problem) and request.fun.method is not None:
+        request = replace(request, method=eip_method(request.fun.method))
     method = _method(request.method)
     in_place = flag("in_place", request.in_place)
     _check_choices(request)

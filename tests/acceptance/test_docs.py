@@ -27,7 +27,7 @@ def assert_output(found, printed):
 
 PAGES = (
     "quickstart", "results", "adaptive", "own-methods", "multistep", "checkpoints", "ensembles", "finding-invariants",
-    "recommend", "astronomy",
+    "recommend", "astronomy", "waves",
 )  # fmt: skip
 NIGHTLY = ("hard-scenes", "charged-particles", "gross-pitaevskii", "written")
 

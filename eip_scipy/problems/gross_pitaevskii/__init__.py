@@ -6,7 +6,7 @@ from .frames import at_rest, rotated
 from .grid import Grid, Multiplier, SpectralSum
 from .ground_state import GroundState, ground_state
 from .potentials import harmonic_trap, quartic_trap
-from .scenes import line_condensate, plane_wave, ring_condensate, rotating_packet, soliton
+from .scenes import breather, line_condensate, plane_wave, ring_condensate, rotating_packet, soliton
 from .search import lowest_ring, lowest_state
 from .splitting import RKN6, S6, STRANG, Scheme, Splitting
 from .starts import imprint, polygon, ring_start, thomas_fermi, vortex_starts, with_noise
@@ -30,6 +30,7 @@ __all__ = [
     "Surface",
     "Vortices",
     "at_rest",
+    "breather",
     "density_surface",
     "ground_state",
     "harmonic_trap",

@@ -17,12 +17,14 @@ from .conserved import Energy, Joint
 from .grid import Grid, Multiplier, SpectralSum
 from .moments import Moments, moments, total_mass
 from .pointwise import add_potential, derivative, derivative_at_once
+from .splitting import Splitting
 from .transforms import Axes, make_transforms
 
 __all__ = ["FieldProblem", "GrossPitaevskii"]
 
 NYQUIST = ("true", "zero")
-INVARIANTS = ("mass", "energy", "angular_momentum")
+MOMENTA = ("momentum_x", "momentum_y", "momentum_z")
+INVARIANTS = ("mass", "energy", *MOMENTA, "angular_momentum")
 SOURCE = "Cai, Gong & Wang, section 3.4 (eq. 3.9, 3.10), the quartic term as the sum of |psi|^4"
 
 
@@ -159,7 +161,18 @@ class GrossPitaevskii:
         terms = [self._multiplier((axis,), factor) for axis, factor in enumerate(self.rotation_factors())]
         return SpectralSum(self.grid, self.transforms, terms)
 
-    # These three a field on several ranks does in another way (`eip_scipy.integrations.mpi_fields`).
+    @cached_property
+    def _moving(self) -> tuple[SpectralSum, ...]:
+        """Minus i times the first derivative along each axis."""
+        factors = [self.grid.wavenumbers(axis, odd=True) for axis in range(self.grid.dim)]
+        terms = [self._multiplier((axis,), factor) for axis, factor in enumerate(factors)]
+        return tuple(SpectralSum(self.grid, self.transforms, [term]) for term in terms)
+
+    # These four a field on several ranks does in another way (`eip_scipy.integrations.mpi_fields`).
+
+    def _method(self) -> Splitting | None:
+        """The method that suits the equation."""
+        return Splitting(self)
 
     def _total(self, sums: Any) -> Any:
         """Sums over the whole grid from those over the part that is here."""
@@ -257,6 +270,11 @@ class GrossPitaevskii:
         """
         return float(self.grid.cell * self._total(self._turning.expectation(self.as_field(psi))))
 
+    def momentum(self, psi: Any) -> np.ndarray:
+        """Means of -i d_x, -i d_y and -i d_z, of those that the grid has, times the mass."""
+        psi = self.as_field(psi)
+        return self.grid.cell * np.array([self._total(along.expectation(psi)) for along in self._moving])
+
     def chemical_potential(self, psi: Any) -> float:
         """Mean of H: mu = Re <H(psi) psi, psi> / <psi, psi>."""
         psi = self.as_field(psi)
@@ -270,21 +288,31 @@ class GrossPitaevskii:
         self.angular(y.reshape(self.grid.shape), out.reshape(self.grid.shape))
         out *= 2 * self.grid.cell
 
+    def _momentum_along(self, axis: int, psi: np.ndarray) -> float:
+        return float(self.grid.cell * self._total(self._moving[axis].expectation(self.as_field(psi))))
+
+    def _momentum_gradient(self, axis: int, t: float, y: np.ndarray, out: np.ndarray) -> None:
+        self._moving[axis].apply(y.reshape(self.grid.shape), out.reshape(self.grid.shape))
+        out *= 2 * self.grid.cell
+
     def invariants(self, names: Sequence[str] = ("mass", "energy")) -> tuple[Invariant, ...]:
         """Make the invariants of the equation.
 
         Parameters
         ----------
-        names : sequence of {"mass", "energy", "angular_momentum"}, optional
-            The angular momentum is conserved where the potential is symmetric about the z axis and the field vanishes
-            at the ends of the box; on the grid to spectral accuracy only.
+        names : sequence of {"mass", "energy", "momentum_x", "momentum_y", "momentum_z", "angular_momentum"}, optional
+            Mass and energy are invariants of the equations on the grid, whatever the field. The others are so to
+            spectral accuracy only, as far as the grid resolves the field: a momentum where the potential does not
+            change along its axis and nothing rotates, the angular momentum where the potential is symmetric about the
+            z axis and the field vanishes at the ends of the box.
 
         Returns
         -------
         tuple of Invariant
-            Their gradients are 2 w psi, 2 w H psi and 2 w Lz psi, w the cell. That of the energy is a multiple of the
-            right-hand side, which the step evaluates once for it and for the next step's first stage (`reuse_f`). Mass
-            and energy are `JointInvariants`: handed on as they are, their projection takes two passes over the field.
+            Their gradients are 2 w psi, 2 w H psi, -2 i w d psi and 2 w Lz psi, w the cell. That of the energy is a
+            multiple of the right-hand side, which the step evaluates once for it and for the next step's first stage
+            (`reuse_f`). Mass and energy are `JointInvariants`: handed on as they are, their projection takes two passes
+            over the field.
 
         Raises
         ------
@@ -293,7 +321,7 @@ class GrossPitaevskii:
         """
         names = (names,) if isinstance(names, str) else tuple(names)
         items = tuple(self._invariant(name) for name in names)
-        if not items or "angular_momentum" in names or len(set(names)) < len(names):
+        if not items or not {"mass", "energy"}.issuperset(names) or len(set(names)) < len(names):
             return items
         joint = Joint(self, names)
         return JointInvariants(items, joint.moments, joint.shift)
@@ -305,6 +333,10 @@ class GrossPitaevskii:
             "energy": (energy.value, energy.gradient),
             "angular_momentum": (self.angular_momentum, self._angular_momentum_gradient),
         }
+        for axis, along in enumerate(MOMENTA[: self.grid.dim]):
+            made[along] = partial(self._momentum_along, axis), partial(self._momentum_gradient, axis)
+        if name in MOMENTA and name not in made:
+            raise ValueError(f"{name!r} is an invariant of more dimensions than {self.grid!r} has.")
         if name not in made:
             raise ValueError(f"unknown invariant {name!r}, expected {', '.join(INVARIANTS)}{nearest(name, INVARIANTS)}")
         value, gradient = made[name]
@@ -341,7 +373,8 @@ class GrossPitaevskii:
         Returns
         -------
         FieldProblem
-            Its metric is "euclidean": the grid's points are alike, and the norm is that of the field.
+            Its metric is "euclidean": the grid's points are alike, and the norm is that of the field. Its method is
+            `Splitting`, of order 4.
         """
         return FieldProblem(
             name=name,
@@ -352,6 +385,7 @@ class GrossPitaevskii:
             h=h,
             invariants=self.invariants(invariants),
             metric="euclidean",
+            method=self._method(),
             reference=reference,
             units="dimensionless",
             source=source,

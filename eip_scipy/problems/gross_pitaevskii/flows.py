@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from math import cos, pi, sin, tan
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .equation import GrossPitaevskii
 from .transforms import Axes
+
+if TYPE_CHECKING:
+    from .equation import GrossPitaevskii
 
 __all__ = ["LinearFlow"]
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ...core.names import nearest
-from .equation import GrossPitaevskii
 from .flows import LinearFlow
 from .pointwise import local_flow
+
+if TYPE_CHECKING:
+    from .equation import GrossPitaevskii
 
 __all__ = ["RKN6", "S6", "STRANG", "Scheme", "Splitting"]
 
@@ -91,7 +93,7 @@ class Splitting:
     >>> from eip_scipy import eip_method, integrate
     >>> from eip_scipy.problems import Splitting, soliton
     >>> scene = soliton(t_end=1.0, h=0.02)
-    >>> run = integrate(scene, method=eip_method(Splitting(scene.equation)))
+    >>> run = integrate(scene, method=eip_method(Splitting(scene.equation, "s6")))
     >>> bool((run.max_defect < 4e-13).all()), bool(abs(run.y[:, -1] - scene.reference(1.0)).max() < 1e-6)
     (True, True)
     """

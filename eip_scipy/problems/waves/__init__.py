@@ -1,0 +1,19 @@
+"""Waves on periodic grids, by lines: the sine-Gordon and the Korteweg-de Vries equation."""
+
+from .korteweg_de_vries import KortewegDeVries
+from .lawson import Lawson
+from .modes import RealModes
+from .record import WaveProblem
+from .scenes import korteweg_de_vries_solitons, sine_gordon_breather, sine_gordon_kinks
+from .sine_gordon import SineGordon
+
+__all__ = [
+    "KortewegDeVries",
+    "Lawson",
+    "RealModes",
+    "SineGordon",
+    "WaveProblem",
+    "korteweg_de_vries_solitons",
+    "sine_gordon_breather",
+    "sine_gordon_kinks",
+]

@@ -1,0 +1,252 @@
+"""The Korteweg-de Vries equation on a ring: right-hand side, invariants, and the problem they make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import scipy.fft
+
+from ...core.invariants import Invariant
+from ...core.names import nearest
+from ..gross_pitaevskii.grid import Grid
+from .lawson import Lawson
+from .record import WaveProblem
+
+__all__ = ["KortewegDeVries"]
+
+INVARIANTS = ("mass", "momentum", "energy")
+SOURCE = "Gardner, Greene, Kruskal & Miura, Phys. Rev. Lett. 19 (1967) 1095"
+
+
+class KortewegDeVries:
+    """The equation ``u_t + 6 u u_x + u_xxx = 0`` on a ring, by Galerkin's method in Fourier modes.
+
+    The state is u at the grid's points. The square is taken on a finer grid, on which its modes are not mistaken for
+    others (the 3/2 rule), so that the equations for the modes are exact projections of the equation's.
+
+    Parameters
+    ----------
+    grid : Grid
+        Of one dimension.
+
+    Attributes
+    ----------
+    grid : Grid
+    frequencies : ndarray
+        Of the linear part: modes of u_t = -u_xxx turn as exp(-i frequency t).
+
+    Raises
+    ------
+    ValueError
+        When the grid has more dimensions than one.
+
+    Notes
+    -----
+    With the square so taken the mass ``w sum u``, the momentum ``w sum u^2`` and the energy ``int u_x^2 / 2 - u^3``, w
+    the cell, are all invariants of the equations on the grid, whatever the field: ``u_t = d_x grad H`` with a skew d_x,
+    and H does not change when u is moved along the ring. (At the grid's points alone the square is wrong in its
+    highest modes, and the momentum is not kept.) The highest of an even number of modes has no derivative and takes
+    no part: `problem` leaves it out of the start.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import integrate
+    >>> from eip_scipy.problems import Grid, KortewegDeVries
+    >>> equation = KortewegDeVries(Grid(64, 0, 20))
+    >>> start = 1 / np.cosh(equation.grid.points(0) - 10) ** 2
+    >>> run = integrate(equation.problem(start, t_end=1.0, h=0.02))
+    >>> run.success, bool((run.max_defect < 1e-12).all())
+    (True, True)
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        if grid.dim != 1:
+            raise ValueError(f"the Korteweg-de Vries equation has one dimension, got {grid!r}.")
+        self.grid = grid
+        self._n = grid.size
+        most = (self._n - 1) // 2  # the highest mode that has a sign
+        self._kept = most + 1
+        self._fine = scipy.fft.next_fast_len(3 * most + 1, real=True)
+        self._k = grid.wavenumbers(0)[: self._kept]
+        self.frequencies = -(self._k**3)
+        self._flux = -3j * self._k
+
+    def __repr__(self) -> str:
+        return f"KortewegDeVries({self.grid!r})"
+
+    # In modes: what `Lawson` takes.
+
+    def modes(self, u: np.ndarray) -> np.ndarray:
+        """The modes with k >= 0 that take part, the means of ``u_j exp(-i k x_j)``."""
+        return scipy.fft.rfft(u, norm="forward")[: self._kept]
+
+    def field(self, modes: np.ndarray) -> np.ndarray:
+        """The field with these modes."""
+        return scipy.fft.irfft(modes, self._n, norm="forward")
+
+    def nonlinear(self, modes: np.ndarray) -> np.ndarray:
+        """The modes of ``-3 (u^2)_x``."""
+        return self._flux * self._square(modes)
+
+    def _square(self, modes: np.ndarray) -> np.ndarray:
+        """The modes of u^2."""
+        u = self._finer(modes)
+        u *= u
+        return scipy.fft.rfft(u, norm="forward")[: self._kept]
+
+    def _finer(self, modes: np.ndarray) -> np.ndarray:
+        """The field on the finer grid."""
+        return scipy.fft.irfft(modes, self._fine, norm="forward")
+
+    # In points.
+
+    def rhs(self, t: float, u: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with -6 u u_x - u_xxx."""
+        modes = self.modes(u)
+        out[:] = self.field(self.nonlinear(modes) - 1j * self.frequencies * modes)
+
+    def fun(self, t: float, u: np.ndarray) -> np.ndarray:
+        """The same as a new array: what `solve_ivp` takes."""
+        out = np.empty_like(u)
+        self.rhs(t, u, out)
+        return out
+
+    def mass(self, u: np.ndarray) -> float:
+        """``w sum u``."""
+        return float(self.grid.cell * np.sum(u))
+
+    def momentum(self, u: np.ndarray) -> float:
+        """``w sum u^2``."""
+        return float(self.grid.cell * (u @ u))
+
+    def energy(self, u: np.ndarray) -> float:
+        """The integral of u_x^2 / 2 - u^3, exact for the modes that take part."""
+        modes = self.modes(u)
+        fine = self._finer(modes)
+        slope = self.field(1j * self._k * modes)
+        cubic = (fine * fine) @ fine / self._fine
+        return float(self.grid.cell * (0.5 * (slope @ slope) - self._n * cubic))
+
+    def _mass_gradient(self, t: float, u: np.ndarray, out: np.ndarray) -> None:
+        out[:] = self.grid.cell
+
+    def _momentum_gradient(self, t: float, u: np.ndarray, out: np.ndarray) -> None:
+        np.multiply(u, 2 * self.grid.cell, out=out)
+
+    def _energy_gradient(self, t: float, u: np.ndarray, out: np.ndarray) -> None:
+        modes = self.modes(u)
+        found = self._k**2 * modes - 3 * self._square(modes)
+        np.multiply(self.field(found), self.grid.cell, out=out)
+
+    def invariants(self, names: Sequence[str] = ("momentum", "energy")) -> tuple[Invariant, ...]:
+        """Make the invariants of the equation.
+
+        Parameters
+        ----------
+        names : sequence of {"mass", "momentum", "energy"}, optional
+            The mass is linear: every method keeps it, and `problem` keeps the corrections out of it by its `frame`.
+
+        Returns
+        -------
+        tuple of Invariant
+
+        Raises
+        ------
+        ValueError
+            For other names.
+        """
+        names = (names,) if isinstance(names, str) else tuple(names)
+        return tuple(self._invariant(name) for name in names)
+
+    def _invariant(self, name: str) -> Invariant:
+        made: dict[str, tuple[Callable[..., float], Callable[..., None]]] = {
+            "mass": (self.mass, self._mass_gradient),
+            "momentum": (self.momentum, self._momentum_gradient),
+            "energy": (self.energy, self._energy_gradient),
+        }
+        if name not in made:
+            raise ValueError(f"unknown invariant {name!r}, expected {', '.join(made)}{nearest(name, tuple(made))}")
+        value, gradient = made[name]
+        return Invariant(partial(_at, value), gradient, name=name, in_place=True)
+
+    def largest_step(self, u: Any, limit: float = 2.8) -> float:
+        """The step above which `Lawson` is unstable: a bound by the nonlinear term alone, for the linear one is exact.
+
+        Parameters
+        ----------
+        u : array_like
+            A typical field.
+        limit : float, optional
+            The method's bound on h times the largest frequency; default: about that of RK4.
+
+        Returns
+        -------
+        float
+        """
+        return float(limit / (6 * np.abs(u).max() * self._k[-1]))
+
+    def problem(
+        self,
+        u0: Any,
+        t_end: float,
+        h: float | None = None,
+        *,
+        name: str = "korteweg-de-vries",
+        invariants: Sequence[str] = ("momentum", "energy"),
+        reference: Callable[[float], np.ndarray | None] | None = None,
+        source: str = SOURCE,
+    ) -> WaveProblem:
+        """Make the initial value problem.
+
+        Parameters
+        ----------
+        u0 : array_like
+            The field at t = 0, which loses the highest of an even number of modes.
+        t_end : float
+            End of the interval that starts at 0.
+        h : float, optional
+            A step; `largest_step` bounds it.
+        name : str, optional
+        invariants : sequence of str, optional
+            See `invariants`.
+        reference : callable, optional
+            ``reference(t) -> u``: a closed form.
+        source : str, optional
+
+        Returns
+        -------
+        WaveProblem
+            Its method is `Lawson` on DOP853, its `frame` keeps the mass.
+
+        Raises
+        ------
+        ValueError
+            When the field is not of the grid's shape.
+        """
+        start = np.asarray(u0, dtype=float)
+        if start.shape != self.grid.shape:
+            raise ValueError(f"u0 has shape {start.shape}, expected {self.grid.shape}.")
+        return WaveProblem(
+            name=name,
+            fun=self.fun,
+            rhs=self.rhs,
+            y0=self.field(self.modes(start)),
+            t_span=(0.0, t_end),
+            h=h,
+            invariants=self.invariants(invariants),
+            metric="euclidean",
+            frame=(np.ones((1, self._n)), np.ones((self._n, 1))),
+            method=Lawson(self),
+            reference=reference,
+            units="dimensionless",
+            source=source,
+            equation=self,
+        )
+
+
+def _at(value: Callable[[np.ndarray], float], t: float, u: np.ndarray) -> float:
+    return value(u)

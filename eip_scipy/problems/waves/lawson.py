@@ -1,0 +1,99 @@
+"""Lawson's method, or that of the integrating factor: the linear part exact, the rest by a Runge-Kutta tableau."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...methods.runge_kutta import DOP853, Tableau
+
+if TYPE_CHECKING:
+    from .korteweg_de_vries import KortewegDeVries
+
+__all__ = ["Lawson"]
+
+
+class Lawson:
+    """A Runge-Kutta step for the modes ``exp(i w t) u``, in which only the nonlinear term moves: a one-step method.
+
+    Parameters
+    ----------
+    equation : KortewegDeVries
+        Or another object with its `frequencies` w, `modes`, `field` and `nonlinear`.
+    tableau : Tableau, optional
+        Default: that of `EIPDOP853`. Its error estimate, if it has one, is the step's.
+
+    Attributes
+    ----------
+    equation, tableau
+    order : int
+    error_estimator_order : int or None
+    name : str
+
+    Raises
+    ------
+    TypeError
+        For another kind of tableau.
+
+    Notes
+    -----
+    The linear part, the stiff one, turns each mode and sets no bound on the step; the nonlinear term does. For the
+    equation's frequencies the change of variables has no growing factors.
+
+    References
+    ----------
+    J. D. Lawson, "Generalized Runge-Kutta processes for stable systems with large Lipschitz constants", SIAM J. Numer.
+    Anal. 4 (1967) 372-380.
+
+    Examples
+    --------
+    >>> from eip_scipy import eip_method, integrate
+    >>> from eip_scipy.methods.runge_kutta import RK4
+    >>> from eip_scipy.problems import Lawson, korteweg_de_vries_solitons
+    >>> scene = korteweg_de_vries_solitons(t_end=1.0)
+    >>> run = integrate(scene, h=0.01, method=eip_method(Lawson(scene.equation, RK4)))
+    >>> bool(abs(run.y[:, -1] - scene.reference(1.0)).max() < 1e-5)
+    True
+    """
+
+    def __init__(self, equation: KortewegDeVries, tableau: Tableau = DOP853) -> None:
+        if not isinstance(tableau, Tableau):
+            raise TypeError(f"Lawson: expected a Tableau, such as that of EIPDOP853, got {tableau!r}.")
+        self.equation, self.tableau = equation, tableau
+        self.order, self.error_estimator_order = tableau.order, tableau.error_estimator_order
+        self.name = f"Lawson-{tableau.name}"
+        self._h: float | None = None
+        self._turns: list[np.ndarray] = []
+        self._back: list[np.ndarray] = []
+
+    def __repr__(self) -> str:
+        return f"Lawson({self.equation!r}, {self.tableau!r})"
+
+    def one_step(self, t: float, y: np.ndarray, h: float) -> Any:
+        """One step of length h; with the tableau's error estimate where it has one."""
+        if h != self._h:
+            nodes = (*self.tableau.c, 1.0)
+            self._turns, self._h = [np.exp(-1j * h * c * self.equation.frequencies) for c in nodes], h
+            self._back = [turn.conj() for turn in self._turns]
+        equation, tableau = self.equation, self.tableau
+        modes = equation.modes(y)
+        slopes = np.empty((tableau.n_stages + tableau.fsal, modes.size), complex)
+
+        def slope(stage: int, moved: np.ndarray) -> None:
+            np.multiply(equation.nonlinear(self._turns[stage] * moved), self._back[stage], out=slopes[stage])
+
+        slope(0, modes)
+        for stage in range(1, tableau.n_stages):
+            slope(stage, modes + (h * tableau.A[stage, :stage]) @ slopes[:stage])
+        new = modes + (h * tableau.b) @ slopes[: tableau.n_stages]
+        end = self._turns[-1]
+        if not tableau.has_estimate:
+            return equation.field(end * new)
+        if tableau.fsal:
+            slope(tableau.n_stages, new)
+        err, rough = (equation.field(end * ((h * e[: len(slopes)]) @ slopes)) for e in (tableau.e, tableau.e_low))
+        if tableau.paired:
+            size = np.hypot(err, 0.1 * rough)
+            err *= np.divide(np.abs(err), size, out=np.zeros_like(size), where=size > 0)
+        return equation.field(end * new), err

@@ -1,0 +1,42 @@
+"""Fourier modes of real fields on periodic grids: half of them, for the others are their conjugates."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.fft
+
+from ..gross_pitaevskii.grid import Grid
+
+__all__ = ["RealModes"]
+
+
+class RealModes:
+    """Transforms of real fields on a grid, and the modes' wavenumbers.
+
+    Parameters
+    ----------
+    grid : Grid
+
+    Attributes
+    ----------
+    grid : Grid
+    shape : tuple of int
+        Of the modes: along the last axis those with wavenumbers >= 0 alone.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        self.grid = grid
+        self.shape = (*grid.shape[:-1], grid.shape[-1] // 2 + 1)
+
+    def forward(self, field: np.ndarray) -> np.ndarray:
+        """The modes of a field, given flat or as a field: sum_j field_j exp(-i k x_j)."""
+        return scipy.fft.rfftn(field.reshape(self.grid.shape))
+
+    def backward(self, modes: np.ndarray) -> np.ndarray:
+        """The field with these modes, flat."""
+        return scipy.fft.irfftn(modes, s=self.grid.shape, overwrite_x=True).ravel()
+
+    def wavenumbers(self, axis: int, *, odd: bool = False) -> np.ndarray:
+        """Wavenumbers along one axis that broadcast to modes; with `odd` that of the Nyquist mode is 0."""
+        k = self.grid.wavenumbers(axis, odd=odd)
+        return np.abs(k[..., : self.shape[-1]]) if axis == self.grid.dim - 1 else k

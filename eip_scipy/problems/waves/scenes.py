@@ -1,0 +1,196 @@
+"""Solitons with closed forms: breathers and kinks of the sine-Gordon equation, solitons of Korteweg and de Vries."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import combinations, product
+from math import sqrt
+from typing import Any
+
+import numpy as np
+
+from ...core.inputs import refuse_units
+from ..gross_pitaevskii.grid import Grid
+from .korteweg_de_vries import KortewegDeVries
+from .record import WaveProblem
+from .sine_gordon import SineGordon
+
+__all__ = ["korteweg_de_vries_solitons", "sine_gordon_breather", "sine_gordon_kinks"]
+
+
+def sine_gordon_breather(
+    points: int = 512,
+    frequency: float = 0.6,
+    velocity: float = 0.0,
+    length: float = 80.0,
+    t_end: float = 20.0,
+    h: float | None = None,
+) -> WaveProblem:
+    """Breather of the sine-Gordon equation, at rest or moving, with its closed form.
+
+    ``tan(q / 4) = b / w sin(w s) / cosh(b z)``, b = sqrt(1 - w^2), with s and z the time and place in the frame that
+    moves with the breather, on a ring of the given length.
+
+    Parameters
+    ----------
+    points : int
+    frequency : float
+        w, between 0 and 1.
+    velocity : float
+        Between -1 and 1.
+    length : float
+        Of the ring; exp(-b length / 2) is the error of the closed form there.
+    t_end : float
+    h : float, optional
+        Default: half of `SineGordon.largest_step`.
+
+    Returns
+    -------
+    WaveProblem
+        With the closed form as `reference`.
+
+    Raises
+    ------
+    ValueError
+        For another frequency or velocity.
+    """
+    refuse_units(frequency=frequency, velocity=velocity, length=length, t_end=t_end, h=h)
+    if not 0 < frequency < 1 or not -1 < velocity < 1:
+        raise ValueError(f"a breather needs 0 < frequency < 1 and |velocity| < 1, got {frequency!r} and {velocity!r}.")
+    return _sine_gordon("sine-gordon-breather", partial(_breather, frequency, velocity), points, length, t_end, h)
+
+
+def sine_gordon_kinks(
+    points: int = 512, velocity: float = 0.5, length: float = 80.0, t_end: float = 20.0, h: float | None = None
+) -> WaveProblem:
+    """Kink and antikink of the sine-Gordon equation that meet, pass through each other and part, with the closed form.
+
+    ``tan(q / 4) = sinh(v c s) / (v cosh(c x))``, c = 1 / sqrt(1 - v^2), s = t - t_end / 2: they meet in the middle of
+    the run, at the middle of the ring.
+
+    Parameters
+    ----------
+    points : int
+    velocity : float
+        v of the kink, that of the antikink is -v; between 0 and 1.
+    length : float
+        Of the ring; the error of the closed form there is exp(-c (length - v t_end) / 2).
+    t_end : float
+    h : float, optional
+        Default: half of `SineGordon.largest_step`.
+
+    Returns
+    -------
+    WaveProblem
+        With the closed form as `reference`.
+
+    Raises
+    ------
+    ValueError
+        For another velocity.
+    """
+    refuse_units(velocity=velocity, length=length, t_end=t_end, h=h)
+    if not 0 < velocity < 1:
+        raise ValueError(f"kinks need 0 < velocity < 1, got {velocity!r}.")
+    return _sine_gordon("sine-gordon-kinks", partial(_kinks, velocity, t_end / 2), points, length, t_end, h)
+
+
+def _sine_gordon(name: str, closed: Any, points: int, length: float, t_end: float, h: float | None) -> WaveProblem:
+    equation = SineGordon(Grid(points, -length / 2, length / 2))
+    exact = partial(closed, equation.grid.points(0), length)
+    start = exact(0.0)
+    step = 0.5 * equation.largest_step() if h is None else h
+    return equation.problem(start[:points], start[points:], t_end, step, name=name, reference=exact)
+
+
+def _breather(frequency: float, velocity: float, x: np.ndarray, length: float, t: float) -> np.ndarray:
+    b, c = sqrt(1 - frequency**2), 1 / sqrt(1 - velocity**2)
+    distance = _around(x - velocity * t, length)
+    z, s = c * distance, t / c - c * velocity * distance  # c (x - v t) and c (t - v x)
+    ratio, sech = b / frequency, 1 / np.cosh(b * z)
+    sine, cosine = np.sin(frequency * s), np.cos(frequency * s)
+    u = ratio * sine * sech
+    # The rates of s and z are c and -c v.
+    u_t = ratio * sech * c * (frequency * cosine + velocity * b * sine * np.tanh(b * z))
+    return np.concatenate([4 * np.arctan(u), 4 * u_t / (1 + u * u)])
+
+
+def _kinks(velocity: float, middle: float, x: np.ndarray, length: float, t: float) -> np.ndarray:
+    c = 1 / sqrt(1 - velocity**2)
+    s = velocity * c * (t - middle)
+    sech = 1 / (velocity * np.cosh(c * x))
+    u, u_t = np.sinh(s) * sech, velocity * c * np.cosh(s) * sech
+    return np.concatenate([4 * np.arctan(u), 4 * u_t / (1 + u * u)])
+
+
+def korteweg_de_vries_solitons(
+    speeds: Any = (2.0, 1.0),
+    places: Any = (-8.0, 4.0),
+    points: int = 256,
+    length: float = 64.0,
+    t_end: float = 20.0,
+    h: float | None = None,
+) -> WaveProblem:
+    """Solitons of the Korteweg-de Vries equation that overtake each other, with their closed form.
+
+    One soliton is ``u = c / 2 sech^2(sqrt(c) (x - c t - x0) / 2)``; of several the closed form is Hirota's.
+
+    Parameters
+    ----------
+    speeds : float or sequence of float
+        c > 0, each another.
+    places : float or sequence of float
+        x0 of each; a soliton that others are to the right of stands there, others are shifted.
+    points : int
+    length : float
+        Of the ring. The closed form is one of the line: all solitons must stay well within half the ring around the
+        point that starts at the mean of the places and moves with the mean of the speeds.
+    t_end : float
+    h : float, optional
+        Default: a third of `KortewegDeVries.largest_step`.
+
+    Returns
+    -------
+    WaveProblem
+        With the closed form as `reference`.
+
+    Raises
+    ------
+    ValueError
+        For speeds that are not positive or not different, and another number of places.
+    """
+    refuse_units(speeds=speeds, places=places, length=length, t_end=t_end, h=h)
+    c, x0 = np.atleast_1d(np.asarray(speeds, dtype=float)), np.atleast_1d(np.asarray(places, dtype=float))
+    if c.ndim != 1 or not np.all(c > 0) or np.unique(c).size != c.size or x0.shape != c.shape:
+        raise ValueError(
+            f"solitons need positive speeds, all different, and a place for each; got {speeds!r} and {places!r}."
+        )
+    equation = KortewegDeVries(Grid(points, -length / 2, length / 2))
+    exact = partial(_solitons, equation.grid.points(0), length, np.sqrt(c), x0)
+    start = exact(0.0)
+    step = equation.largest_step(0.5 * c.max()) / 3 if h is None else h
+    return equation.problem(start, t_end, step, name="korteweg-de-vries-solitons", reference=exact)
+
+
+def _solitons(x: np.ndarray, length: float, k: np.ndarray, x0: np.ndarray, t: float) -> np.ndarray:
+    """2 (log F)_xx, F the sum over all sets of solitons of exp(sum of k (x - x0 - k^2 t) and of their shifts).
+
+    With the terms of F as weights this is twice the variance of the sets' sums of k.
+    """
+    centre = np.mean(x0) + np.mean(k**2) * t
+    place = _around(x - centre, length) + centre
+    sets = np.array(list(product((0.0, 1.0), repeat=k.size)))
+    exponent = sets @ (k[:, None] * (place - x0[:, None] - (k * k * t)[:, None]))
+    for i, j in combinations(range(k.size), 2):
+        both = sets[:, i] * sets[:, j]
+        exponent += (2 * both * np.log(abs(k[i] - k[j]) / (k[i] + k[j])))[:, None]
+    weights = np.exp(exponent - exponent.max(axis=0))
+    weights /= weights.sum(axis=0)
+    slopes = sets @ k
+    away = slopes[:, None] - slopes @ weights
+    return 2 * np.sum(weights * away * away, axis=0)
+
+
+def _around(x: np.ndarray, length: float) -> np.ndarray:
+    """Distances on the ring, the short way round."""
+    return np.remainder(x + length / 2, length) - length / 2

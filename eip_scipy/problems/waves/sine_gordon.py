@@ -1,0 +1,226 @@
+"""The sine-Gordon equation on a periodic grid: right-hand side, invariants, and the problem they make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ...core.invariants import Invariant
+from ...core.names import nearest
+from ...methods.nystrom import RKN1210
+from ..gross_pitaevskii.grid import Grid
+from .modes import RealModes
+from .record import WaveProblem
+
+__all__ = ["SineGordon"]
+
+MOMENTA = ("momentum_x", "momentum_y", "momentum_z")
+INVARIANTS = ("energy", *MOMENTA)
+SOURCE = "Ablowitz & Segur, Solitons and the Inverse Scattering Transform (SIAM 1981), section 1.5"
+
+
+class SineGordon:
+    """The equation ``q_tt = Laplace q - sin q`` in one, two or three dimensions, Fourier pseudospectral in space.
+
+    The state is (q, p), both fields flat, with p = q_t: a system of the second order, for Nystrom methods.
+
+    Parameters
+    ----------
+    grid : Grid
+
+    Attributes
+    ----------
+    grid : Grid
+
+    Notes
+    -----
+    The energy ``w sum (p^2 + |grad q|^2) / 2 + 1 - cos q``, w the cell, is an invariant of the equations on the grid,
+    whatever the field. The momenta ``-w sum p dq`` are so to spectral accuracy only: sin q has modes that the grid
+    does not, and what it takes them for does not vanish where the field is not resolved.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import integrate
+    >>> from eip_scipy.problems import Grid, SineGordon
+    >>> equation = SineGordon(Grid(64, 0, 2 * np.pi))
+    >>> x = equation.grid.points(0)
+    >>> run = integrate(equation.problem(np.cos(x), np.sin(x), t_end=5.0, h=0.05))
+    >>> run.success, bool(run.max_defect[0] < 1e-13)
+    (True, True)
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        self.grid = grid
+        self._modes = RealModes(grid)
+        self._square = np.zeros(self._modes.shape)
+        for axis in range(grid.dim):
+            self._square += self._modes.wavenumbers(axis) ** 2
+
+    def __repr__(self) -> str:
+        return f"SineGordon({self.grid!r})"
+
+    def acceleration(self, q: np.ndarray) -> np.ndarray:
+        """Laplace q - sin q, flat."""
+        modes = self._modes.forward(q)
+        modes *= -self._square
+        out = self._modes.backward(modes)
+        out -= np.sin(q)
+        return out
+
+    def rhs(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with (p, Laplace q - sin q)."""
+        n = self.grid.size
+        out[:n] = y[n:]
+        out[n:] = self.acceleration(y[:n])
+
+    def fun(self, t: float, y: np.ndarray) -> np.ndarray:
+        """The same as a new array: what `solve_ivp` takes."""
+        out = np.empty_like(y)
+        self.rhs(t, y, out)
+        return out
+
+    def energy(self, y: np.ndarray) -> float:
+        """``w sum (p^2 + |grad q|^2) / 2 + 1 - cos q``."""
+        n = self.grid.size
+        q, p = y[:n], y[n:]
+        laplacian = self._modes.backward(-self._square * self._modes.forward(q))
+        # 1 - cos q without the cancellation where q is small.
+        density = 0.5 * (p @ p - q @ laplacian) + 2 * np.sum(np.sin(0.5 * q) ** 2)
+        return float(self.grid.cell * density)
+
+    def momentum(self, y: np.ndarray) -> np.ndarray:
+        """The momenta ``-w sum p dq`` along the axes that the grid has."""
+        return np.array([self._momentum_along(axis, y) for axis in range(self.grid.dim)])
+
+    def _momentum_along(self, axis: int, y: np.ndarray) -> float:
+        n = self.grid.size
+        return float(-self.grid.cell * (y[n:] @ self._slope(axis, y[:n])))
+
+    def _slope(self, axis: int, field: np.ndarray) -> np.ndarray:
+        return self._modes.backward(1j * self._modes.wavenumbers(axis, odd=True) * self._modes.forward(field))
+
+    def _energy_gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
+        """By f = (p, a): (-w a, w p)."""
+        n, cell = self.grid.size, self.grid.cell
+        np.multiply(f[n:], -cell, out=out[:n])
+        np.multiply(y[n:], cell, out=out[n:])
+
+    def _momentum_gradient(self, axis: int, t: float, y: np.ndarray, out: np.ndarray) -> None:
+        n, cell = self.grid.size, self.grid.cell
+        np.multiply(self._slope(axis, y[n:]), cell, out=out[:n])
+        np.multiply(self._slope(axis, y[:n]), -cell, out=out[n:])
+
+    def invariants(self, names: Sequence[str] = ("energy",)) -> tuple[Invariant, ...]:
+        """Make the invariants of the equation.
+
+        Parameters
+        ----------
+        names : sequence of {"energy", "momentum_x", "momentum_y", "momentum_z"}, optional
+            The momenta are conserved as far as the grid resolves the field; see the notes of `SineGordon`.
+
+        Returns
+        -------
+        tuple of Invariant
+            The energy's gradient takes the right-hand side, which the step has.
+
+        Raises
+        ------
+        ValueError
+            For other names.
+        """
+        names = (names,) if isinstance(names, str) else tuple(names)
+        return tuple(self._invariant(name) for name in names)
+
+    def _invariant(self, name: str) -> Invariant:
+        made: dict[str, tuple[Callable[..., float], Callable[..., None]]] = {
+            along: (partial(self._momentum_along, axis), partial(self._momentum_gradient, axis))
+            for axis, along in enumerate(MOMENTA[: self.grid.dim])
+        }
+        made["energy"] = self.energy, self._energy_gradient
+        if name not in made:
+            known = [name for name in INVARIANTS if name in made]
+            names = f"{', '.join(known)}{nearest(name, known)}"
+            raise ValueError(f"unknown invariant {name!r} on {self.grid!r}, expected {names}")
+        value, gradient = made[name]
+        return Invariant(partial(_at, value), gradient, name=name, in_place=True, uses_f=name == "energy")
+
+    def largest_step(self, limit: float = 8.0) -> float:
+        """The step above which an explicit method is unstable.
+
+        Parameters
+        ----------
+        limit : float, optional
+            The method's bound on h times the largest frequency; default: for `EIPRKN12`. That of `EIPRKN8` is 3.3.
+
+        Returns
+        -------
+        float
+        """
+        return float(limit / np.sqrt(1.0 + self._square.max()))
+
+    def problem(
+        self,
+        q0: Any,
+        p0: Any,
+        t_end: float,
+        h: float | None = None,
+        *,
+        name: str = "sine-gordon",
+        invariants: Sequence[str] = ("energy",),
+        reference: Callable[[float], np.ndarray | None] | None = None,
+        source: str = SOURCE,
+    ) -> WaveProblem:
+        """Make the initial value problem.
+
+        Parameters
+        ----------
+        q0, p0 : array_like
+            The field and its derivative in time at t = 0, of the grid's shape or flat.
+        t_end : float
+            End of the interval that starts at 0.
+        h : float, optional
+            A step; `largest_step` bounds it.
+        name : str, optional
+        invariants : sequence of str, optional
+            See `invariants`.
+        reference : callable, optional
+            ``reference(t) -> y``: a closed form.
+        source : str, optional
+
+        Returns
+        -------
+        WaveProblem
+            Its method is the Nystrom method of `EIPRKN12`.
+
+        Raises
+        ------
+        ValueError
+            When a field is not of the grid's shape.
+        """
+        grid, fields = self.grid, [np.asarray(a, dtype=float) for a in (q0, p0)]
+        for a in fields:
+            if a.shape not in (grid.shape, (grid.size,)):
+                raise ValueError(f"a field has shape {a.shape}, expected {grid.shape} or ({grid.size},).")
+        return WaveProblem(
+            name=name,
+            fun=self.fun,
+            rhs=self.rhs,
+            y0=np.concatenate([a.ravel() for a in fields]),
+            t_span=(0.0, t_end),
+            h=h,
+            invariants=self.invariants(invariants),
+            metric="euclidean",
+            method=RKN1210,
+            reference=reference,
+            units="dimensionless",
+            source=source,
+            equation=self,
+        )
+
+
+def _at(value: Callable[[np.ndarray], float], t: float, y: np.ndarray) -> float:
+    return value(y)
