@@ -398,6 +398,9 @@ class Loop:
     def _chunk(self, chunk: int) -> int:
         """Steps of the next call: none beyond the next look or, with a callback, the next saved one."""
         driver, schedule = self.driver, self.driver.schedule
+        history, left = driver.run.method.multistep, schedule.span.n_steps - driver.step
+        if history is not None and left - history.middle <= chunk:
+            chunk = left  # the last states cost a step of the method that starts, each of them that is asked for
         chunk = min([chunk, *(look - driver.step for look in setup.LOOKS if look > driver.step)])
         if self.callback is None:
             return chunk
