@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import numpy
-from setuptools import Extension, setup
+from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 
 FOLDER = Path("eip_scipy/engine/cpp")
@@ -95,4 +95,8 @@ if platform.machine().lower() in ("x86_64", "amd64"):
 if only := os.environ.get("EIP_SCIPY_BUILD"):
     name, *further = only.split()
     builds = {} if name == "none" else {name: [*builds[name], *further]}
-setup(ext_modules=[module(name, *flags) for name, flags in builds.items()], cmdclass={"build_ext": Build})
+setup(
+    packages=[*find_packages(include=["eip_scipy", "eip_scipy.*"]), "eip_scipy.integrations"],
+    ext_modules=[module(name, *flags) for name, flags in builds.items()],
+    cmdclass={"build_ext": Build},
+)
