@@ -367,7 +367,7 @@ def kept_for(k):
     return pytest.param(k, marks=marks)
 
 
-@pytest.mark.parametrize("seed", map(kept_for, range(200)))
+@pytest.mark.parametrize("seed", [*map(kept_for, range(200))])
 def test_none_in_random_systems(seed):
     f, y0 = random_system(seed)
     assert [names(f, y0, degree=degree) for degree in (2, 3, 4)] == [[], [], []]
