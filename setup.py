@@ -24,7 +24,7 @@ else:
     # out are about Python's own interface.
     FLAGS = ["-std=c++20", "-O3", "-g0", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
     FLAGS += ["-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-cast-function-type", "-Wno-missing-field-initializers"]
-    V3, QUICK, OLD = ["-march=x86-64-v3"], "-O1", ["-O2"]
+    V3, QUICK, OLD = ["-march=x86-64-v3"], "-O1", ["-O1"]
 MISSING = """\
 eip_scipy's engine is written in C++20, and no compiler built it. Install one: g++ 11 or newer (Debian, Ubuntu: apt
 install g++; Fedora: dnf install gcc-c++), clang 14 or newer, or on macOS Xcode's tools (xcode-select --install)."""
@@ -89,7 +89,8 @@ class Build(build_ext):
 
 builds: dict[str, list[str]] = {"_native": []}
 if platform.machine().lower() in ("x86_64", "amd64"):
-    # What is left to the first are processors of 2012 and before, which call a function for a fused operation.
+    # What is left to the first are processors of 2012 and before, which call a function for a fused operation: of the
+    # optimizer the least, which spares a third of its compilation.
     builds = {"_native": OLD, "_native_v3": V3}
 # For .ci: one of them, and further flags; or none, where the package is looked at and not run.
 if only := os.environ.get("EIP_SCIPY_BUILD"):
