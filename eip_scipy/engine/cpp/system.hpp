@@ -160,7 +160,7 @@ struct System {
     }
 
     template <class W>
-    void call_rhs_pointer(const W &w, double t, const double *y, double *out, int64_t floats) {
+    [[gnu::always_inline]] void call_rhs_pointer(const W &w, double t, const double *y, double *out, int64_t floats) {
         if (rhs_pointer.library) return rhs_pointer.library(t, y, nullptr, out, params, floats, n_params);
         fill(out, NOT_A_NUMBER, floats);
         const int status = rhs_pointer.pointer(t, y, out, params);
@@ -185,7 +185,7 @@ struct System {
     }
 
     template <class W>
-    void grad_by_differences(const W &w, int64_t k, double t, const double *y, double *G) {
+    [[gnu::cold, gnu::noinline]] void grad_by_differences(const W &w, int64_t k, double t, const double *y, double *G) {
         const Native<ValuePointer> &inv = inv_pointers[k];
         const auto values_at = [&](double *state, double *out) {
             fill(out, NOT_A_NUMBER, inv.floats);
