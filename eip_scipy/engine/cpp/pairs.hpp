@@ -22,7 +22,7 @@ inline void store_some(Vector v, double *a, int64_t left) {
 
 // With their parts exchanged.
 inline Vector swapped(Vector z) {
-    Vector w;
+    Vector w{};
     for (int k = 0; k < WIDTH; ++k) w[k] = z[k ^ 1];
     return w;
 }
@@ -35,7 +35,7 @@ inline Vector turning(double s) {
 }
 
 inline Vector times(Vector w, Vector z) {
-    Vector re, im;
+    Vector re{}, im{};
     for (int k = 0; k < WIDTH; ++k) {
         re[k] = w[k & ~1];
         im[k] = k % 2 ? w[k] : -w[k + 1];
