@@ -72,8 +72,10 @@ def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
     try:
         pointer = _compile(fun, kind, number)
     except NumbaError as error:
-        first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        raise NotCompilableError(f"{name} does not compile for this state: {first}") from error
+        if any(isinstance(known.return_type, types.List | types.BaseTuple) for known in fun.nopython_signatures):
+            raise NotCompilableError(f"{name} returns a list or a tuple: return np.array([...])") from error
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+        raise NotCompilableError(f"{name} does not compile for this state: {' '.join(lines[:2])}") from error
     if any(isinstance(known.return_type, types.Optional) for known in fun.nopython_signatures):
         raise NotCompilableError(f"{name} returns None in some places, and a number or an array in others")
     return Compiled(pointer, fun, name, kind)

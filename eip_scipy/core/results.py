@@ -134,8 +134,9 @@ class Diagnostics:
         width = max(len(name) for name in self.names)
         for name, largest, last in zip(self.names, self.max_defect, self.last_defect, strict=True):
             lines.append(f"  {name:<{width}}  max defect {largest:.2e}, last {last:.2e}")
-        if self._estimated:
-            lines.append(f"  largest correction: {self.max_correction:.3g} local errors")
+        if self.worst is not None:
+            name, t, size = self.worst
+            lines.append(f"  largest correction: {size:.3g} local errors, of {name} at t={t:.6g}")
         if self.message:
             lines.append(f"  {self.message}")
         return "\n".join(lines)

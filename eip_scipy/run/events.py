@@ -116,7 +116,8 @@ class Events:
         try:
             value = self.functions[k](t, y, *self._extra)
         except TypeError:
-            given, mend = ("t", "y", *names(self._extra)), "It takes the run's params or args, if there are any."
+            given = "t", "y", *names(self._extra)
+            mend = f"What the call or its Problem brings besides t and y comes last: def event({', '.join(given)})."
             require_arguments(self.functions[k], given, f"event {k}", mend)
             raise
         return self._number(k, t, value)

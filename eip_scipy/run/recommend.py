@@ -50,7 +50,7 @@ def recommend(
     invariants : Invariant or sequence of Invariant, optional
         What to keep; default: what the problem brings, of a function nothing.
     max_nfev : int, optional
-        Evaluations that one trial may take, about; default: 50 000, and 300 000 of compiled functions. A longer run
+        Evaluations that one trial may take, about; default: 100 000, and 500 000 of compiled functions. A longer run
         is tried on the first part of its interval, and its error extrapolated.
     params, in_place, jacobian, metric, blocks, frame, compiled
         As for `integrate`, for all runs. With `jacobian`, or a problem that brings it, `EIPGJ14` is tried.

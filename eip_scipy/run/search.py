@@ -167,20 +167,21 @@ class Search:
                 f"the smallest tolerances differ by {agreement:.1e} at the end. Rounding errors have grown to that, or "
                 f"the motion is chaotic. {hint}"
             )
-        self.bench.truth = reference.y
+        self.bench.truth, self.bench.doubt = reference.y, agreement
 
     def _reference(self, kind: Kind, rtol: float) -> tuple[float, Outcome]:
         """How well two runs agree at the end, going down in tolerance from `rtol`, and the tighter one."""
         rtol, wider, agreement = max(rtol, FINE_START), None, math.inf
         while True:
-            settings = kind.settings(kind.near(rtol))
+            value = kind.near(rtol)
+            settings = kind.settings(value)
             done, before = self.bench.run(settings), agreement
             self.longest = max(self.longest, done.nfev)
             if done.trouble:
                 return agreement, done if wider is None else wider
             if wider is not None:
                 agreement = self.bench.judged(settings, wider, done.y).error
-            if agreement <= AGREEMENT * self.wanted or rtol <= FINEST_RTOL or agreement > ROUNDED * before:
+            if agreement <= AGREEMENT * self.wanted or value <= FINEST_RTOL or agreement > ROUNDED * before:
                 return min(agreement, before), done
             wider, rtol = done, max(rtol * REFERENCE_STEP, FINEST_RTOL)
 

@@ -4,6 +4,7 @@ import math
 from fractions import Fraction
 
 import mpmath
+import numba
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -734,3 +735,10 @@ def test_scale_of_an_invariant():
     result = run(invariants=wide)
     assert result.diagnostics.n_skipped == 10
     np.testing.assert_array_equal(result.y, run().y)
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("listed", [lambda t, y: [y[1], -y[0]], lambda t, y: (y[1], -y[0])])
+def test_a_jitted_function_that_returns_a_list_is_told_what_to_return(listed):
+    run = integrate(numba.njit(listed), (0, 1), [1.0, 0.0], method=EIPRK4, h=0.1)
+    assert "returns a list or a tuple: return np.array([...])" in run.message

@@ -50,6 +50,16 @@ def test_kepler_by_its_closed_form(wanted):
     assert np.array_equal(same.y, run.y)
 
 
+@pytest.mark.parametrize("eccentricity", [0.0, 0.3])
+def test_where_small_tolerances_do_not_suffice(eccentricity):
+    """Plain runs with the smallest tolerance are further off than the wanted error: none of them is the truth."""
+    problem = kepler(eccentricity, relativistic=0)
+    choice = recommend(problem, (0, 500), error=1e-9)
+    assert error(choice.run().y[:, -1], problem.reference(500)) < 1e-9
+    assert choice.trusted
+    assert all(trial.error > 0 for trial in choice.trials)
+
+
 @pytest.mark.parametrize("name", ["euler_top", "three_wave", "kepler_e0999"])
 @pytest.mark.parametrize("wanted", [1e-5, 1e-8])
 def test_hard_cases(name, wanted):
