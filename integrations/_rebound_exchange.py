@@ -48,7 +48,7 @@ def problem_from_simulation(
     sim : rebound.Simulation
         Point masses under their mutual gravity. It is synchronised, as before any reading of a simulation.
     t_span : tuple of float, optional
-        Start and end; default: from sim.t over 1000 steps sim.dt.
+        Start, which is sim.t, and end; default: from sim.t over 1000 steps sim.dt.
     h : float, optional
         A sensible fixed step; default: the magnitude of sim.dt.
     forces : str or sequence of str, optional
@@ -72,7 +72,7 @@ def problem_from_simulation(
     TypeError
         For something else than a simulation, such as the path of an archive.
     ValueError
-        The simulation has what the N-body problem lacks (variational particles, softening, forces that are not known,
+        `t_span` starts at another time than the state; or the simulation has what the N-body problem lacks (variational particles, softening, forces that are not known,
         collisions, boundaries ...); the message says which and why it is not supported.
 
     Notes
@@ -93,6 +93,11 @@ def problem_from_simulation(
     chosen, known = (check_forces(forces), constants) if forces is not None else _attached(sim)
     if forces is None and constants is not None:
         raise ValueError("problem_from_simulation: constants belong to forces=...; REBOUNDx's forces bring their own.")
+    if t_span is not None and isinstance(t_span[0], int | float) and t_span[0] != sim.t:
+        raise ValueError(
+            f"problem_from_simulation: t_span starts at {t_span[0]:.10g}, but the state is that of t={sim.t:.10g}. "
+            f"Give t_span=({sim.t:.10g}, ...), or count time anew: sim.t = {t_span[0]:.10g}."
+        )
     sim.synchronize()
     q, v = state(sim).reshape(2, -1, 3)
     return nbody(
