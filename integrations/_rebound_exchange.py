@@ -72,8 +72,9 @@ def problem_from_simulation(
     TypeError
         For something else than a simulation, such as the path of an archive.
     ValueError
-        `t_span` starts at another time than the state; or the simulation has what the N-body problem lacks (variational particles, softening, forces that are not known,
-        collisions, boundaries ...); the message says which and why it is not supported.
+        `t_span` starts at another time than the state; or the simulation has what the N-body problem lacks
+        (variational particles, softening, forces that are not known, collisions, boundaries ...): the message says
+        which and why it is not supported.
 
     Notes
     -----

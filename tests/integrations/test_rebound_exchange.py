@@ -110,11 +110,10 @@ def test_names_may_be_given():
         exchange.problem_from_simulation(planets(), names=["A", "A", "C", "D"])
 
 
-
 def test_a_span_that_starts_elsewhere_than_the_state_is_refused():
     sim = planets()
     sim.t = 5.0
-    with pytest.raises(ValueError, match=r"t_span starts at 0, but the state is that of t=5\. Give t_span=\(5, \.\.\.\)"):
+    with pytest.raises(ValueError, match=r"t_span starts at 0, but the state is that of t=5\. Give t_span=\(5, "):
         exchange.problem_from_simulation(sim, t_span=(0, 10))
     assert exchange.problem_from_simulation(sim, t_span=(5, 10)).t_span[0] == 5
 
