@@ -28,7 +28,8 @@ from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
 from eip_scipy.problems import kepler, solar_system
 
 REPEATS = 7
-STEPS = 200_000
+# Steps of a run, and how many runs there are: short ones, since long ones hold what else a shared machine does.
+STEPS, RUNS = 20_000, 60
 H = 0.03
 MU = 0.005
 
@@ -146,9 +147,32 @@ def least(action) -> float:
     return best
 
 
-def least_run(**arguments) -> float:
-    """Least wall time of several runs, without what comes before the steps."""
-    return min(integrate(**arguments).wall_time for _ in range(REPEATS + 1))
+def per_step(seconds, steps: int = STEPS) -> float:
+    """Seconds of one step, without what a run begins with: from the least times of runs of two lengths.
+
+    ``seconds(n)`` is the time of a run of n steps.
+    """
+    few = steps // 5
+    short = long = np.inf
+    for _ in range(RUNS):
+        short, long = min(short, seconds(few)), min(long, seconds(steps))
+    return (long - short) / (steps - few)
+
+
+def of_integrate(h: float, **arguments):
+    """The time of a run of n steps, without what comes before them."""
+    return lambda n: integrate(t_span=(0.0, n * h), h=h, **arguments).wall_time
+
+
+def of_call(action):
+    """The time of a call that takes how many steps there are."""
+
+    def seconds(n: int) -> float:
+        begin = time.perf_counter()
+        action(n)
+        return time.perf_counter() - begin
+
+    return seconds
 
 
 def kepler_speed() -> dict[str, float]:
@@ -156,43 +180,21 @@ def kepler_speed() -> dict[str, float]:
     y0 = problem.y0
     targets = [energy(0.0, y0), momentum(0.0, y0)]
     arrays = [Invariant(energy, energy_gradient, name="H"), Invariant(momentum, momentum_gradient, name="L")]
-    span = (0.0, STEPS * H)
+    own = {"fun": kepler_array, "y0": y0, "method": EIPRK4, "invariants": arrays, "compiled": True}
     out = {}
     for metric in ("euclidean", "error"):
-        hand = least(lambda metric=metric: fused(*y0, H, STEPS, *targets, metric == "error")) / STEPS
-        in_place = least_run(fun=problem, t_span=span, method=EIPRK4, h=H, metric=metric) / STEPS
-        array = (
-            least_run(
-                fun=kepler_array,
-                t_span=span,
-                y0=y0,
-                method=EIPRK4,
-                h=H,
-                metric=metric,
-                invariants=arrays,
-                compiled=True,
-            )
-            / STEPS
-        )
+        hand = per_step(of_call(lambda n, metric=metric: fused(*y0, H, n, *targets, metric == "error")))
+        in_place = per_step(of_integrate(H, fun=problem, method=EIPRK4, metric=metric))
+        array = per_step(of_integrate(H, **own, metric=metric))
         out[f"{metric}: hand-fused loop [us/step]"] = 1e6 * hand
         out[f"{metric}: in place / hand-fused"] = in_place / hand
         out[f"{metric}: array-returning / hand-fused"] = array / hand
         out[f"{metric}: in place [us/step]"] = 1e6 * in_place
     solution = solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9)
     scipy_step = least(lambda: solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9)) / (solution.t.size - 1)
-    adaptive = integrate(
-        kepler_array, (0, 6000), y0, method=EIPRK45, rtol=1e-6, atol=1e-9, invariants=arrays, save_every=1
-    )
-    adaptive_step = least_run(
-        fun=kepler_array,
-        t_span=(0, 6000),
-        y0=y0,
-        method=EIPRK45,
-        rtol=1e-6,
-        atol=1e-9,
-        invariants=arrays,
-        compiled=True,
-    ) / (adaptive.t.size - 1)
+    adaptive = {**own, "t_span": (0, 600), "method": EIPRK45, "rtol": 1e-6, "atol": 1e-9}
+    steps = integrate(**adaptive, save_every=1).t.size - 1
+    adaptive_step = min(integrate(**adaptive).wall_time for _ in range(RUNS)) / steps
     fixed = least(lambda: solve_ivp(kepler_array, (0, 60), y0, method=EIPRK4, h=H, invariants=arrays)) / round(60 / H)
     out["solve_ivp RK45 [us/step]"] = 1e6 * scipy_step
     out["solve_ivp EIPRK4 with H and L [us/step]"] = 1e6 * fixed
@@ -203,9 +205,10 @@ def kepler_speed() -> dict[str, float]:
 
 
 def solar_speed() -> dict[str, float]:
-    problem = solar_system(years=40)
-    plain = least_run(fun=problem, method=EIPRK4, invariants=()) / 20_000
-    eip = least_run(fun=problem, method=EIPRK4) / 20_000
+    problem = solar_system()
+    run = {"fun": problem, "method": EIPRK4}
+    plain = per_step(of_integrate(problem.h, **run, invariants=()), 4000)
+    eip = per_step(of_integrate(problem.h, **run), 4000)
     return {
         "10 bodies, plain RK4 [us/step]": 1e6 * plain,
         "10 bodies, EIP-RK4 [us/step]": 1e6 * eip,
@@ -274,7 +277,9 @@ def main() -> None:
     arguments = parser.parse_args()
     results = {**kepler_speed(), **solar_speed(), **sampling_speed(), **process_times()}
     width = max(map(len, results))
-    print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, least of {REPEATS} runs")
+    print(
+        f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, least of {RUNS} short runs"
+    )
     for name, value in results.items():
         print(f"{name:<{width}}  {value:8.3f}")
     if arguments.json:
