@@ -11,6 +11,7 @@ import pytest
 
 # Before any import of matplotlib, and through the environment, so that subprocesses inherit it.
 os.environ["MPLBACKEND"] = "Agg"
+os.environ["MATPLOTLIBRC"] = str(Path(__file__).with_name("matplotlibrc"))
 
 # As in a terminal: what a shell starts in the background ignores Ctrl-C, with all its children, and tests press it.
 signal.signal(signal.SIGINT, signal.default_int_handler)

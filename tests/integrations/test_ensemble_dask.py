@@ -202,7 +202,7 @@ def test_by_name():
 
 @slow
 def test_ctrl_c(pair):
-    timer = threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
     timer.start()
     begin = time.perf_counter()
     with pytest.raises(KeyboardInterrupt) as info:

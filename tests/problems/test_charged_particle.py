@@ -13,11 +13,6 @@ from eip_scipy.problems import TOKAMAK, UNIFORM, ParticleField, charged_particle
 from eip_scipy.problems.particle_orbits import ParticleOrbit, radial_range
 
 POINTS = [(1.05, 0.0, 0.0), (0.3, -0.9, 0.07), (-0.8, 0.7, -0.2), (1.3, 0.2, 0.5)]
-PROBLEMS = {
-    f"{make.__name__}-{form}": make(form=form)
-    for make in (uniform_field, tokamak)
-    for form in ("canonical", "velocity")
-}
 
 
 # --- the paper's fields ---
@@ -88,17 +83,19 @@ def test_fields_along_many_points():
 
 # --- equations and invariants ---
 
-problems = pytest.mark.parametrize(
-    "problem",
-    [
-        pytest.param(p, marks=[pytest.mark.nightly, pytest.mark.slow]) if "velocity" in name else p
-        for name, p in PROBLEMS.items()
-    ],
-    ids=list(PROBLEMS),
+
+@pytest.fixture(
+    scope="module", params=["canonical", pytest.param("velocity", marks=[pytest.mark.nightly, pytest.mark.slow])]
 )
+def form(request):
+    return request.param
 
 
-@problems
+@pytest.fixture(scope="module", params=[uniform_field, tokamak])
+def problem(request, form):
+    return request.param(form=form)
+
+
 def test_invariants_have_their_gradients_and_do_not_change(problem):
     rng = np.random.default_rng(5)
     for point in POINTS:
@@ -135,7 +132,6 @@ def test_first_reference_state_is_met(make, form):
     assert problem.reference(1.5 * t) is None
 
 
-@problems
 def test_order_four_with_the_invariants_kept(problem):
     t = 300 * problem.h
     truth = integrate(problem, (0.0, t), method=EIPDOP853, h=problem.h / 4).y[:, -1]

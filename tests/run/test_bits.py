@@ -51,7 +51,9 @@ def both(t, y):
 @njit
 def both_gradients(t, y):
     out = np.empty((2, 4))
-    out[0], out[1] = energy_gradient(t, y), momentum_gradient(t, y)
+    one, two = energy_gradient(t, y), momentum_gradient(t, y)
+    for i in range(4):  # whole rows at once take Numba seconds to compile
+        out[0, i], out[1, i] = one[i], two[i]
     return out
 
 
