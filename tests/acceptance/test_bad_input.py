@@ -302,8 +302,10 @@ class TestCompiledExceptions:
         "where",
         [
             "fun",
-            "grad",
-            *(pytest.param(name, marks=[pytest.mark.nightly, pytest.mark.slow]) for name in ("in place", "value")),
+            *(
+                pytest.param(name, marks=[pytest.mark.nightly, pytest.mark.slow])
+                for name in ("grad", "in place", "value")
+            ),
         ],
     )
     def test_propagate(self, where):

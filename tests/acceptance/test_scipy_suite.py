@@ -157,7 +157,11 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853], ids=lambda m: m.__name__)
+@pytest.mark.parametrize(
+    "method",
+    [EIPRK45, *(pytest.param(m, marks=[pytest.mark.nightly, pytest.mark.slow]) for m in (EIPRK23, EIPDOP853))],
+    ids=lambda m: m.__name__,
+)
 def test_as_shipped(method):
     """All of them, for each class; the only allowances are the name, and two private functions of SciPy's."""
     name = method.SCIPY.__name__

@@ -177,7 +177,7 @@ def slope_phi(x, y, z):
     return -0.3 * y
 
 
-@pytest.mark.parametrize("charge", [3.0, pytest.param(-3.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("charge", [3.0, pytest.param(-3.0, marks=[pytest.mark.nightly, pytest.mark.slow])])
 def test_gyration_in_a_constant_field(charge):
     """B = 2 e_z, m = 1.5: frequency |q| B / m, radius m v / (|q| B), and the E x B drift (0.15, 0, 0)."""
     field = ParticleField(vector_potential=constant_a, magnetic=constant_b, electric=constant_e, potential=slope_phi)
