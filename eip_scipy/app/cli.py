@@ -100,11 +100,7 @@ def _commands() -> dict[str, tuple[str, Any, Any]]:
     """For each command a summary, what adds its options, and what runs it."""
     return {
         "list": ("list commands, methods, problems and data sets", lambda parser: None, _list),
-        "doctor": (
-            "what is installed, and a test of it in seconds",
-            doctor.add_arguments,
-            doctor.run,
-        ),
+        "doctor": ("what is installed, and a test of it in seconds", lambda parser: None, doctor.run),
         "solar-system": (
             "run the solar system and compare with other methods (the paper's Experiment II)",
             solar_system.add_arguments,

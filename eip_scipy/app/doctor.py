@@ -21,7 +21,7 @@ from ..problems import kepler, solar_system
 from ..run.integrate import integrate
 from .report import check_target, compact, describe_machine, document, say, table, warn, write_json
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["run"]
 
 # What a package that is not needed brings: module, its extra, and for what.
 EXTRAS = (
@@ -57,10 +57,6 @@ class Check(NamedTuple):
     def cells(self) -> tuple[str, ...]:
         verdict = "ok" if self.passed else "FAILED"
         return compact(self.found), compact(self.bound), f"{self.seconds:.2f}", verdict
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """None of its own."""
 
 
 def run(args: argparse.Namespace) -> int:

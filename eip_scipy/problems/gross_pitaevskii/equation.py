@@ -11,8 +11,8 @@ import numpy as np
 
 from ...core.inputs import refuse_units
 from ...core.invariants import Invariant, JointInvariants
-from ...core.names import nearest
 from ...core.problem import Problem
+from ..named_invariants import named_invariant
 from .conserved import Energy, Joint
 from .grid import Grid, Multiplier, SpectralSum
 from .moments import Moments, moments, total_mass
@@ -337,10 +337,7 @@ class GrossPitaevskii:
             made[along] = partial(self._momentum_along, axis), partial(self._momentum_gradient, axis)
         if name in MOMENTA and name not in made:
             raise ValueError(f"{name!r} is an invariant of more dimensions than {self.grid!r} has.")
-        if name not in made:
-            raise ValueError(f"unknown invariant {name!r}, expected {', '.join(INVARIANTS)}{nearest(name, INVARIANTS)}")
-        value, gradient = made[name]
-        return Invariant(partial(_at, value), gradient, name=name, in_place=True, uses_f=name == "energy")
+        return named_invariant(name, made, INVARIANTS, uses_f=name == "energy")
 
     def problem(
         self,
@@ -416,10 +413,6 @@ class GrossPitaevskii:
         # Twice the interaction: the linearised term is 2 beta |psi|^2 u + beta psi^2 conj(u).
         local = 2 * abs(self.beta) * self._largest(self.as_field(psi)) ** 2
         return float(limit / (self.largest_frequency() + local))
-
-
-def _at(value: Callable[[np.ndarray], float], t: float, y: np.ndarray) -> float:
-    return value(y)
 
 
 def _on_grid(potential: Any, grid: Grid) -> np.ndarray:

@@ -56,9 +56,7 @@ def soliton(
         When beta is not negative or the amplitude not positive.
     """
     refuse_units(amplitude=amplitude, velocity=velocity, beta=beta, length=length, t_end=t_end, h=h)
-    if not beta < 0 or not amplitude > 0:
-        raise ValueError(f"a bright soliton needs beta < 0 and amplitude > 0, got {beta!r} and {amplitude!r}.")
-    gpe = GrossPitaevskii(Grid(points, -length / 2, length / 2), beta=beta, **options)
+    gpe = _focusing("bright soliton", points, length, amplitude, beta, options)
     x = gpe.grid.points(0)
     exact = partial(_soliton, x, length, amplitude, velocity, beta)
     start = exact(0.0)
@@ -107,13 +105,19 @@ def breather(
         When beta is not negative or the amplitude not positive.
     """
     refuse_units(amplitude=amplitude, velocity=velocity, beta=beta, length=length, t_end=t_end, h=h)
-    if not beta < 0 or not amplitude > 0:
-        raise ValueError(f"a breather needs beta < 0 and amplitude > 0, got {beta!r} and {amplitude!r}.")
-    gpe = GrossPitaevskii(Grid(points, -length / 2, length / 2), beta=beta, **options)
+    gpe = _focusing("breather", points, length, amplitude, beta, options)
     exact = partial(_breather, gpe.grid.points(0), length, amplitude, velocity, beta)
     step = 0.005 / amplitude**2 if h is None else h
     source = "Satsuma & Yajima, Prog. Theor. Phys. Suppl. 55 (1974) 284"
     return gpe.problem(exact(0.0), t_end, step, name="breather", reference=exact, source=source)
+
+
+def _focusing(
+    kind: str, points: int, length: float, amplitude: float, beta: float, options: dict[str, Any]
+) -> GrossPitaevskii:
+    if not beta < 0 or not amplitude > 0:
+        raise ValueError(f"a {kind} needs beta < 0 and amplitude > 0, got {beta!r} and {amplitude!r}.")
+    return GrossPitaevskii(Grid(points, -length / 2, length / 2), beta=beta, **options)
 
 
 def plane_wave(

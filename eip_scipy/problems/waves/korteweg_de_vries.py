@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
 import scipy.fft
 
 from ...core.invariants import Invariant
-from ...core.names import nearest
 from ..gross_pitaevskii.grid import Grid
+from ..named_invariants import named_invariant
 from .lawson import Lawson
 from .record import WaveProblem
 
 __all__ = ["KortewegDeVries"]
 
-INVARIANTS = ("mass", "momentum", "energy")
 SOURCE = "Gardner, Greene, Kruskal & Miura, Phys. Rev. Lett. 19 (1967) 1095"
 
 
@@ -168,10 +166,7 @@ class KortewegDeVries:
             "momentum": (self.momentum, self._momentum_gradient),
             "energy": (self.energy, self._energy_gradient),
         }
-        if name not in made:
-            raise ValueError(f"unknown invariant {name!r}, expected {', '.join(made)}{nearest(name, tuple(made))}")
-        value, gradient = made[name]
-        return Invariant(partial(_at, value), gradient, name=name, in_place=True)
+        return named_invariant(name, made, tuple(made))
 
     def largest_step(self, u: Any, limit: float = 2.8) -> float:
         """The step above which `Lawson` is unstable: a bound by the nonlinear term alone, for the linear one is exact.
@@ -246,7 +241,3 @@ class KortewegDeVries:
             source=source,
             equation=self,
         )
-
-
-def _at(value: Callable[[np.ndarray], float], t: float, u: np.ndarray) -> float:
-    return value(u)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ...core.invariants import Invariant
-from ...core.names import nearest
 from ...methods.nystrom import RKN1210
 from ..gross_pitaevskii.grid import Grid
+from ..named_invariants import named_invariant
 from .modes import RealModes
 from .record import WaveProblem
 
@@ -141,12 +141,8 @@ class SineGordon:
             for axis, along in enumerate(MOMENTA[: self.grid.dim])
         }
         made["energy"] = self.energy, self._energy_gradient
-        if name not in made:
-            known = [name for name in INVARIANTS if name in made]
-            names = f"{', '.join(known)}{nearest(name, known)}"
-            raise ValueError(f"unknown invariant {name!r} on {self.grid!r}, expected {names}")
-        value, gradient = made[name]
-        return Invariant(partial(_at, value), gradient, name=name, in_place=True, uses_f=name == "energy")
+        known = [name for name in INVARIANTS if name in made]
+        return named_invariant(name, made, known, uses_f=name == "energy", where=f" on {self.grid!r}")
 
     def largest_step(self, limit: float = 8.0) -> float:
         """The step above which an explicit method is unstable.
@@ -220,7 +216,3 @@ class SineGordon:
             source=source,
             equation=self,
         )
-
-
-def _at(value: Callable[[np.ndarray], float], t: float, y: np.ndarray) -> float:
-    return value(y)
