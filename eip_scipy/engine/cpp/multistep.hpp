@@ -311,6 +311,12 @@ inline void values_in_the_middle(const Run &run, double *scratch) {
     }
 }
 
+// How far the values in w.values are from where they began, into w.target.
+template <class W>
+inline void defects_of_values(const Multistep &ms, const W &w) {
+    for (int64_t i = 0; i < w.l; ++i) w.target[i] = (w.values[i] - ms.levels[i]) - ms.levels[w.l + i];
+}
+
 // (w.y_hat, w.carry_hat): the newest state, with the gradients there in w.G.
 inline void newest_state(const Run &run, double t) {
     const Multistep &ms = *run.method.multistep;
@@ -329,7 +335,7 @@ inline void defects_in_the_middle(const Run &run, double t, double *scratch) {
     copy(w.G, w.Q, w.l * w.m);
     copy(w.carry_hat, w.carry, w.m);
     values_in_the_middle(run, scratch);
-    for (int64_t i = 0; i < w.l; ++i) w.target[i] = (w.values[i] - ms.levels[i]) - ms.levels[w.l + i];
+    defects_of_values(ms, w);
     copy(w.Q, w.G, w.l * w.m);
     copy(w.carry, w.carry_hat, w.m);
     evaluate_invariants(run, t, w.y_hat);
@@ -431,7 +437,7 @@ inline Code project_last(const Run &run, const Step &step, double from) {
     evaluate_invariants(run, step.t_new, w.y_hat);
     ++w.counters[NJEV];
     copy(w.target, ms.levels, w.l);
-    for (int64_t i = 0; i < w.l; ++i) w.target[i] = (w.values[i] - ms.levels[i]) - ms.levels[w.l + i];
+    defects_of_values(ms, w);
     const Code status = project_softly(run, step);
     if (status != OK || run.options.reuse_f) return status;
     run.system.rhs(w, step.t_new, step.y_new, w.last());

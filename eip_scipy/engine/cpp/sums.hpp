@@ -18,14 +18,6 @@ constexpr int WIDTH = 2;
 typedef double Vector __attribute__((vector_size(WIDTH * sizeof(double))));
 constexpr int VECTORS = LANES / WIDTH;
 
-inline Vector load(const double *a) {
-    Vector v;
-    std::memcpy(&v, a, sizeof v);
-    return v;
-}
-
-inline void store(Vector v, double *a) { std::memcpy(a, &v, sizeof v); }
-
 // One float, or a vector of them.
 template <class Value>
 inline Value load_as(const double *a) {
@@ -38,6 +30,10 @@ template <class Value>
 inline void store_as(Value v, double *a) {
     std::memcpy(a, &v, sizeof v);
 }
+
+inline Vector load(const double *a) { return load_as<Vector>(a); }
+
+inline void store(Vector v, double *a) { store_as(v, a); }
 
 // part.template operator()<Value, COUNT>(i): COUNT vectors, or floats, from i on, until n. No entry is met twice, and
 // vectors begin at multiples of their length: what has just been written in such vectors is read at once.
@@ -161,20 +157,12 @@ inline void combine_part(const double *y, double scale, const Rows &rows, double
         const double weight = rows.weights[j];
         if (weight == 0.0) continue;
         const double *row = rows.first + j * rows.stride + i;
-        for (int k = 0; k < COUNT; ++k) {
-            Float value;
-            std::memcpy(&value, row + k * LENGTH, sizeof value);
-            total[k] += weight * value;
-        }
+        for (int k = 0; k < COUNT; ++k) total[k] += weight * load_as<Float>(row + k * LENGTH);
     }
     for (int k = 0; k < COUNT; ++k) {
         Float value = scale * total[k];
-        if constexpr (ADD) {
-            Float start;
-            std::memcpy(&start, y + i + k * LENGTH, sizeof start);
-            value = start + value;
-        }
-        std::memcpy(out + i + k * LENGTH, &value, sizeof value);
+        if constexpr (ADD) value = load_as<Float>(y + i + k * LENGTH) + value;
+        store_as(value, out + i + k * LENGTH);
     }
 }
 
