@@ -16,7 +16,7 @@ from setuptools.command.build_ext import build_ext
 
 FOLDER = Path("eip_scipy/engine/cpp")
 # Called once a run, or by Python: these are compiled in half the time without the passes that make loops fast.
-COLD = ["library.cpp", "module.cpp", "python_functions.cpp", "records.cpp"]
+COLD = ["complex_step.cpp", "library.cpp", "module.cpp", "python_functions.cpp", "records.cpp"]
 if sys.platform == "win32":
     FLAGS, V3, QUICK, OLD = ["/std:c++20", "/O2", "/fp:precise"], ["/arch:AVX2"], "/O1", []
 else:

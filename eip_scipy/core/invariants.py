@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..engine.data import EPS
-from ..engine.native import Call, call
+from ..engine.native import BUILD, Call, call
 from .arguments import names, scalars
 from .inputs import count, filled, flag, is_number, reals, refuse_units, require_arguments, shown
 from .jitted import NotCompilableError, is_jitted, jit_is_off, numba_errors
@@ -282,12 +282,7 @@ class NumericalGradient:
         return np.asarray(self._invariant.fun(t, y.copy(), *self._invariant.args, *extra))
 
     def _by_complex_step(self, t: float, y: Array, extra: tuple) -> Array:
-        columns = []
-        for k in range(y.size):
-            shifted = y.astype(complex)
-            shifted[k] += 1j * COMPLEX_STEP
-            columns.append(np.imag(self._fun(t, shifted, extra)) / COMPLEX_STEP)
-        return np.stack(columns, axis=-1)
+        return BUILD.gradients.complex_step(self._invariant.fun, t, y, self._invariant.args + extra, COMPLEX_STEP)
 
     def _complex_step_is_valid(self, t: float, y: Array, extra: tuple) -> bool:
         """Whether `fun` takes complex states and is analytic there: the real part unmoved, differences agree."""

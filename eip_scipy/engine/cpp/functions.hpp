@@ -5,6 +5,6 @@
 
 namespace eip {
 
-extern PyMethodDef condensate_functions[], field_functions[], comparator_functions[];
+extern PyMethodDef condensate_functions[], field_functions[], comparator_functions[], gradient_functions[];
 
 }  // namespace eip

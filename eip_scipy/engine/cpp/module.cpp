@@ -573,6 +573,7 @@ PyMODINIT_FUNC EIP_INIT() {
         eip::add_functions(module, "condensates", eip::condensate_functions) < 0 ||
         eip::add_functions(module, "fields", eip::field_functions) < 0 ||
         eip::add_functions(module, "comparators", eip::comparator_functions) < 0 ||
+        eip::add_functions(module, "gradients", eip::gradient_functions) < 0 ||
         PyModule_AddStringConstant(module, "SOURCES", EIP_SOURCES) < 0 ||
         PyModule_AddIntConstant(module, "HAS_V3", eip::has_v3()) < 0) {
         Py_DECREF(module);

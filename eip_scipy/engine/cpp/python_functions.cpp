@@ -101,9 +101,22 @@ void PythonCall::operator()(double t, const double *y, const double *f, double *
     if (!in_place_) take(value.get(), time_object.get(), out);
 }
 
+// Whether a value is a list of as many floats as are expected, Python's or NumPy's: what most functions return.
+bool PythonCall::takes_list(PyObject *value) const {
+    if (n_dimensions_ != 1 || value_type_ != NPY_DOUBLE || !PyList_CheckExact(value)) return false;
+    if (PyList_GET_SIZE(value) != dimensions_[0]) return false;
+    for (Py_ssize_t k = 0; k < dimensions_[0]; ++k)
+        if (!PyFloat_Check(PyList_GET_ITEM(value, k))) return false;
+    return true;
+}
+
 void PythonCall::take(PyObject *value, PyObject *t, double *out) const {
     if (n_dimensions_ == 0 && PyFloat_Check(value)) {
         out[0] = PyFloat_AS_DOUBLE(value);
+        return;
+    }
+    if (takes_list(value)) {
+        for (Py_ssize_t k = 0; k < floats_; ++k) out[k] = PyFloat_AS_DOUBLE(PyList_GET_ITEM(value, k));
         return;
     }
     const auto plain = [this](PyObject *a) {

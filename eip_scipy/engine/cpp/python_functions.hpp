@@ -23,6 +23,7 @@ class PythonCall {
     int64_t floats() const { return floats_; }
 
   private:
+    bool takes_list(PyObject *value) const;
     void take(PyObject *value, PyObject *t, double *out) const;
 
     PyObject *fun_, *convert_;

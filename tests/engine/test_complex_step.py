@@ -1,0 +1,84 @@
+"""The engine's complex steps: gradients of functions in Python, and what such functions may return."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from eip_scipy.engine.native import BUILD
+
+complex_step = BUILD.gradients.complex_step
+Y = np.array([0.3, -0.4, 1.2])
+STEP = 1e-100
+
+
+def product(t, y, *args):
+    return t * y[0] ** 3 * y[1] * sum(args, start=1.0)
+
+
+GRADIENT = 2.0 * np.array([3 * Y[0] ** 2 * Y[1], Y[0] ** 3, 0.0])
+
+KINDS = {
+    "NumPy's complex": product,
+    "Python's complex": lambda t, y: complex(product(t, y)),
+    "no dimensions": lambda t, y: np.array(product(t, y)),
+    "single precision": lambda t, y: np.complex64(0) + product(t, y),
+    "extended precision": lambda t, y: np.clongdouble(product(t, y)),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_numbers(kind):
+    G = complex_step(KINDS[kind], 2.0, Y, (), STEP)
+    assert G.dtype == float
+    assert G.shape == (3,)
+    np.testing.assert_allclose(G, GRADIENT, rtol=4e-16)
+
+
+@pytest.mark.parametrize("as_kind", [np.array, list, tuple], ids=["array", "list", "tuple"])
+def test_several_values_and_further_arguments(as_kind):
+    G = complex_step(lambda t, y, a, b: as_kind([product(t, y, a), b * product(t, y)]), 2.0, Y, (4.0, 3), STEP)
+    np.testing.assert_allclose(G, [5 * GRADIENT, 3 * GRADIENT], rtol=4e-16)
+    assert G.flags.c_contiguous
+
+
+def test_constants_have_no_slope():
+    np.testing.assert_array_equal(complex_step(lambda t, y: 7, 0.0, Y, (), STEP), np.zeros(3))
+    one_real = complex_step(lambda t, y: y[0] if y[0].imag else 1.5, 0.0, Y, (), STEP)
+    np.testing.assert_array_equal(one_real, [1, 0, 0])
+
+
+def test_each_call_has_an_array_of_its_own():
+    kept = []
+    complex_step(lambda t, y: kept.append(y) or y[0], 0.0, Y, (), STEP)
+    np.testing.assert_array_equal(np.imag(kept), STEP * np.eye(3))
+    np.testing.assert_array_equal(np.real(kept), [Y, Y, Y])
+
+
+def test_what_cannot_be_taken():
+    shapes = iter([np.zeros(2), np.zeros(3), np.zeros(2)])
+    with pytest.raises(ValueError, match="differ in shape"):
+        complex_step(lambda t, y: next(shapes), 0.0, Y, (), STEP)
+    with pytest.raises(ValueError, match="differ in shape"):
+        complex_step(lambda t, y: np.zeros(2) if y[0].imag else 1j, 0.0, Y, (), STEP)
+    with pytest.raises(TypeError, match="returned None, expected numbers"):
+        complex_step(lambda t, y: None, 0.0, Y, (), STEP)
+    with pytest.raises(ZeroDivisionError):
+        complex_step(lambda t, y: 1 / 0, 0.0, Y, (), STEP)
+    for y in ([0.3], Y.astype(complex), Y.astype(np.float32), Y[::2], np.empty(0), np.zeros((2, 2)), None):
+        with pytest.raises(TypeError, match="expected fun, t, y"):
+            complex_step(product, 0.0, y, (), STEP)
+    for arguments in ((product, 0.0, Y, [], STEP), (product, 0.0, Y, ()), (product, 0.0, Y, (), STEP, 1)):
+        with pytest.raises(TypeError, match="expected fun, t, y"):
+            complex_step(*arguments)
+    with pytest.raises(TypeError):
+        complex_step(product, 0.0, Y, (), "step")
+
+
+def test_nothing_is_lost():
+    argument = object()
+    before = sys.getrefcount(argument), sys.getrefcount(product), sys.getrefcount(Y)
+    for _ in range(100):
+        complex_step(lambda t, y, a: y[0], 0.0, Y, (argument,), STEP)
+        complex_step(product, 0.0, Y, (), STEP)
+    assert (sys.getrefcount(argument), sys.getrefcount(product), sys.getrefcount(Y)) == before
