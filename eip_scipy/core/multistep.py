@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -46,7 +47,8 @@ def times(jacobian: Callable[..., None], *extra: Array) -> Callable[[float, Arra
     """A user's ``jacobian(t, q, dq, out, *extra)`` as a function that returns its product with dq."""
 
     def product(t: float, q: Array, dq: Array) -> Array:
-        out = np.full_like(q, np.nan)
+        out = np.empty_like(q)
+        out.fill(np.nan)
         jacobian(t, q.copy(), dq.copy(), out, *extra)
         return out
 
@@ -115,6 +117,11 @@ def _largest_frequency(system: SecondOrder) -> float:
     def along(d: Array) -> Array:
         return _difference(system, d, slice(0, half)) if system.jacobian is None else system.jacobian(t, y[:half], d)
 
+    if half <= ROUNDS and y.dtype.kind == "f":
+        columns = [along(unit) for unit in np.eye(half)]
+        return (
+            math.sqrt(max(0.0, -np.linalg.eigvals(np.array(columns)).real.min())) if np.isfinite(columns).all() else 0.0
+        )
     top = _largest(along, y)
     return float(np.sqrt(max(0.0, _largest(lambda d: top * d - along(d), y) - top))) if top else 0.0
 
@@ -175,7 +182,7 @@ def _record(
 
 def _aligned(shape: tuple[int, ...]) -> Array:
     """Zeros from the beginning of a cache line on: else each load of a vector may take two."""
-    size = int(np.prod(shape))
+    size = math.prod(shape)
     memory = np.zeros(size * 8 + ALIGNMENT, np.uint8)
     first = -memory.ctypes.data % ALIGNMENT
     return memory[first : first + size * 8].view(np.float64).reshape(shape)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
@@ -180,7 +181,7 @@ def _number(params: Packed | None, y0: np.ndarray) -> Kind:
 
 def _native(fun: Any, kind: Kind, name: str) -> Native:
     width = 2 if np.dtype(kind.dtype).kind == "c" and not kind.real else 1
-    floats = int(np.prod(kind.shape, dtype=int)) * width
+    floats = math.prod(kind.shape) * width
     if isinstance(fun, (PointerFunction, LibraryFunction)):
         return Native(fun, floats)
     if jit_is_off():

@@ -208,7 +208,8 @@ class ProjectionOptions:
     @classmethod
     def split(cls, keywords: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """The keywords that are options, and the others."""
-        own = {name: value for name, value in keywords.items() if name in cls.names()}
+        names = cls.names()
+        own = {name: value for name, value in keywords.items() if name in names}
         return own, {name: value for name, value in keywords.items() if name not in own}
 
     def settled(self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, known: InvariantSet) -> Settled:
