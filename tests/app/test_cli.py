@@ -21,6 +21,7 @@ import eip_scipy.integrations
 from eip_scipy import EIPRK1, EIPRK4, Invariant, integrate
 from eip_scipy.app import report
 from eip_scipy.app.cli import main
+from eip_scipy.app.listing import fixed_step_methods
 from eip_scipy.app.solar import cost as solar_cost
 from eip_scipy.app.solar import errors as solar_errors
 from eip_scipy.app.solar import runs as solar_run
@@ -407,8 +408,11 @@ def test_a_file_that_cannot_be_written_at_the_end_leaves_the_table(tmp_path, cap
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "required: COMMAND"),
-        (["solar"], "invalid choice: 'solar'"),
+        ([], "expected COMMAND first, one of list, doctor, solar-system"),
+        (["solar"], "unknown COMMAND 'solar', expected one of list, "),
+        (["solar-sytem"], "did you mean 'solar-system'?"),
+        (["--years", "1", "solar-system"], "expected COMMAND first"),
+        (["solar-system", "--yaers", "5"], "unrecognized arguments: --yaers 5; did you mean '--years'?"),
         (["solar-system", "--years", "many"], "--years: expected a positive number, got 'many'"),
         (["solar-system", "--years", "-5"], "--years: expected a positive number, got '-5'"),
         (["solar-system", "--years", "0"], "--years: expected a positive number"),
@@ -608,7 +612,7 @@ def test_osculating_orbits_pass_through_the_planets():
 
 
 def test_every_method_of_the_solvers_is_offered():
-    methods = solar_system.fixed_step_methods()
+    methods = fixed_step_methods()
     assert methods["EIPRK1"] is EIPRK1
     assert "EIPSolver" not in methods
 

@@ -11,6 +11,7 @@ import pytest
 from eip_scipy.app.cli import main
 from eip_scipy.app.solar import solar_system
 from eip_scipy.app.solar.epoch import parse_epoch
+from eip_scipy.app.study import Session
 from eip_scipy.integrations import jpl
 from eip_scipy.problems import solar_data
 from eip_scipy.problems import solar_system as problem_of
@@ -30,7 +31,7 @@ def nothing_to_time(monkeypatch):
     """Less to run than the command would: no timings, no REBOUND."""
     monkeypatch.setattr(solar_system, "_time_methods", lambda *args: None)
     monkeypatch.setattr(solar_system, "_write_figures", lambda *args: None)
-    monkeypatch.setattr("eip_scipy.app.cli._rebound", lambda args: None)
+    monkeypatch.setattr(Session, "peer", lambda *args: None)
 
 
 def the_line(capsys):

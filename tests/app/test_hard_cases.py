@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 from eip_scipy import Invariant, check_gradient
 from eip_scipy.app.cli import main
 from eip_scipy.app.hard import cases as command
-from eip_scipy.app.kepler import cost as kepler_cost
 from eip_scipy.app.kepler import figures as kepler_figures
+from eip_scipy.app.study import Session
 from eip_scipy.app.work_precision import cost_to_reach
 from eip_scipy.problems.hard_cases import EQUATIONS, hard_cases
 
@@ -177,14 +177,9 @@ def test_projection_on_a_wrong_invariant_shows():
 # --- the command ---
 
 
-@pytest.fixture
-def few(monkeypatch):
-    monkeypatch.setattr(command, "hard_cases", lambda: hard_cases(FEW))
-
-
-@pytest.mark.usefixtures("few")
 def test_command_prints_and_writes(tmp_path, capsys):
-    status = main(["hard-cases", "--method", "EIPDOP853", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")])
+    arguments = ["--method", "EIPDOP853", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")]
+    status = main(["hard-cases", *arguments], cases=hard_cases(FEW))
     out = capsys.readouterr().out
     assert max(map(len, out.replace(str(tmp_path), "").splitlines())) <= 79
     assert "kepler_e00" in out
@@ -211,10 +206,9 @@ def test_a_case_without_known_cause_is_judged_by_its_neighbours():
     assert "not known" in command.cause(replace(worse, nearby=(1.5, 1.2, 9.0)))
 
 
-@pytest.mark.usefixtures("few")
 def test_other_settings_have_no_bars_but_success(tmp_path, capsys):
     arguments = ["--method", "EIPRK23", "--rtol", "1e-4", "--metric", "euclidean", "--out", str(tmp_path)]
-    assert main(["hard-cases", *arguments]) == 0
+    assert main(["hard-cases", *arguments], cases=hard_cases(FEW)) == 0
     out = capsys.readouterr().out
     assert out.count("\nok     ") == 1
     assert "rtol = 0.0001, atol = 1e-07" in out
@@ -277,7 +271,7 @@ def test_solar_figures_come_from_the_command(tmp_path, monkeypatch):
     from eip_scipy.app.paper import reproduce
 
     monkeypatch.setattr(reproduce.solar_system, "run", run)
-    monkeypatch.setattr("eip_scipy.app.cli._rebound", lambda args: SimpleNamespace(run="REBOUND"))
+    monkeypatch.setattr(Session, "peer", lambda *args: SimpleNamespace(run="REBOUND"))
     target = tmp_path / "run.json"
     assert main(["reproduce", "fig-solar", "--out", str(tmp_path), "--json", str(target), "--quiet"]) == 1
     assert seen == [(None, "EIPRK4", tmp_path, "REBOUND")]  # None: the command's own default
@@ -306,9 +300,8 @@ def test_cost_to_reach():
 
 
 @pytest.mark.needs_jit
-def test_work_precision(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(kepler_cost, "REPEATS", 1)
-    assert main(["work-precision", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")]) == 0
+def test_work_precision(tmp_path, capsys):
+    assert main(["work-precision", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")], repeats=1) == 0
     points = json.loads((tmp_path / "run.json").read_text())["points"]
     assert {point["method"] for point in points} >= {"EIPRK2", "EIPRK5", "EIPRK23", "EIPDOP853"}
     best = {point["method"]: point["position_error"] for point in points}

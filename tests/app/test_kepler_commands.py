@@ -30,19 +30,18 @@ def read(file):
 # Work and precision.
 
 
-@pytest.fixture
-def few_runs(monkeypatch):
-    monkeypatch.setattr(kepler_cost, "T_END", T_END)
-    monkeypatch.setattr(kepler_cost, "REPEATS", 1)
-    monkeypatch.setattr(kepler_cost, "REFERENCE_STEPS", 300)
-    monkeypatch.setattr(kepler_cost, "FIXED", {EIPRK2: (100, 400), EIPRK4: (100, 200)})
-    monkeypatch.setattr(kepler_cost, "PAIRS", {EIPRK45: (1e-4, 1e-7)})
+FEW = {
+    "t_end": T_END,
+    "repeats": 1,
+    "reference_steps": 300,
+    "fixed": {EIPRK2: (100, 400), EIPRK4: (100, 200)},
+    "pairs": {EIPRK45: (1e-4, 1e-7)},
+}
 
 
-@pytest.mark.usefixtures("few_runs")
 def test_errors_fall_with_the_order_and_work_is_counted(tmp_path, capsys):
     file = tmp_path / "run.json"
-    assert main(["work-precision", "--out", str(tmp_path), "--json", str(file)]) == 0
+    assert main(["work-precision", "--out", str(tmp_path), "--json", str(file)], **FEW) == 0
     points = json.loads(file.read_text())["points"]
     error = {method: [p["position_error"] for p in points if p["method"] == method] for method in ("EIPRK2", "EIPRK4")}
     assert error["EIPRK2"][0] / error["EIPRK2"][1] == pytest.approx(4**2, rel=0.2)
@@ -57,18 +56,17 @@ def test_errors_fall_with_the_order_and_work_is_counted(tmp_path, capsys):
     assert [line.split()[0] for line in lines if line.startswith("wrote")] == ["wrote"] * 3
 
 
-@pytest.mark.usefixtures("few_runs")
 def test_csv_of_work_and_precision_has_a_line_for_each_run(tmp_path, capsys):
-    assert main(["work-precision", "--out", str(tmp_path), "--quiet"]) == 0
+    assert main(["work-precision", "--out", str(tmp_path), "--quiet"], **FEW) == 0
     assert [row["method"] for row in read(tmp_path / "work-precision.csv")] == [
         "EIPRK2", "EIPRK2", "EIPRK4", "EIPRK4", "EIPRK45", "EIPRK45",
     ]  # fmt: skip
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.usefixtures("few_runs", "no_plotting")
+@pytest.mark.usefixtures("no_plotting")
 def test_work_and_precision_without_matplotlib(tmp_path, capsys):
-    assert main(["work-precision", "--out", str(tmp_path), "--quiet"]) == 0
+    assert main(["work-precision", "--out", str(tmp_path), "--quiet"], **FEW) == 0
     assert "eip-scipy: no figures: " in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["work-precision.csv"]
 
@@ -77,8 +75,8 @@ def test_work_and_precision_interrupted(tmp_path, capsys, monkeypatch):
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(kepler_cost, "measure", stop)
-    assert main(["work-precision", "--out", str(tmp_path), "--quiet"]) == 130
+    monkeypatch.setattr(kepler_cost, "work_precision", stop)
+    assert main(["work-precision", "--out", str(tmp_path), "--quiet"], **FEW) == 130
     assert "nothing was written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -89,7 +87,8 @@ def test_cheapest_methods_of_the_text():
         return kepler_cost.CostCurve(n, 1000 * n, n / 1000, np.array(errors))
 
     names = {method.__name__: work(np.nan) for method in kepler_cost.FIXED}
-    text = kepler_cost.text({**names, "EIPRK2": work(0.1, 1e-2, 1e-4), "EIPRK45": work(1e-2, 1e-3)}, "a machine")
+    works = {**names, "EIPRK2": work(0.1, 1e-2, 1e-4), "EIPRK45": work(1e-2, 1e-3)}
+    text = kepler_cost.KeplerCost().text(kepler_cost.Found(works, "a machine"))
     nfev = text.split("for an error of")[1].splitlines()
     row = {line[:24].strip(): line[24:].split() for line in nfev}
     assert row["EIPRK2"] == ["2.0", "3.0", "-", "-"]

@@ -10,10 +10,10 @@ from functools import partial
 from pathlib import Path
 
 from ...checkpoint import CheckpointError
-from ...core import solvers
 from ...ensembles.chunks import cores
 from .. import long_runs
 from ..beside import Beside
+from ..listing import METRICS, fixed_step_methods
 from ..long_runs import positive
 from ..report import UsageError, check_outputs, say, warn, write_csv, write_file, write_json
 from . import epoch as solar_epoch
@@ -23,24 +23,13 @@ from .errors import SolarStudy
 from .report import cost_rows, csv_rows, json_content, text
 from .runs import MethodRun, Peer, make_scene, plan
 
-__all__ = ["add_arguments", "fixed_step_methods", "run"]
+__all__ = ["add_arguments", "run"]
 
 YEARS, STEP = 2000.0, 0.002
-METRICS = ("error", "euclidean")
 COST_YEARS = 100.0
 BESIDE_YEARS = 200.0  # in shorter runs a second process would cost what it saves
 BESIDE_FIGURES, OWN_FIGURES = slice(None, 4), slice(4, None)  # they take as long as the timings and the others
 DONE, CHECK_FAILED, INTERRUPTED = 0, 1, 130
-
-
-def fixed_step_methods() -> dict[str, type[solvers.EIPSolver]]:
-    """Find the solver classes that a user names: those with a tableau."""
-    found = {name: getattr(solvers, name) for name in solvers.__all__}
-    return {
-        name: value
-        for name, value in found.items()
-        if isinstance(value, type) and issubclass(value, solvers.EIPSolver) and hasattr(value, "TABLEAU")
-    }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

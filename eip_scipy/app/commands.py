@@ -1,0 +1,42 @@
+"""The commands: by its words where each stands, and what it does; exit statuses. Quick to import, for ``--help``."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+__all__ = ["CHECK_FAILED", "COMMANDS", "DONE", "INTERRUPTED", "MOVED", "WRONG_USAGE", "Entry"]
+
+DONE, CHECK_FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+
+
+class Entry(NamedTuple):
+    """A command: "module:class" below `eip_scipy.app`, and a line for ``--help``."""
+
+    where: str
+    summary: str
+
+
+COMMANDS = {
+    "list": Entry("listing:Listing", "list commands, methods, problems and data sets"),
+    "doctor": Entry("doctor:Doctor", "what is installed, and a test of it in seconds"),
+    "solar-system": Entry(
+        "legacy:SolarSystem", "run the solar system and compare with other methods (the paper's Experiment II)"
+    ),
+    "charged-particle": Entry(
+        "legacy:ChargedParticle", "charged particles in two fields by several methods (the paper's Experiment III)"
+    ),
+    "hard-cases": Entry("hard.cases:HardCases", "run 35 hard cases with and without projection"),
+    "hard-scenes": Entry(
+        "hard.scenes:HardScenes",
+        "error against cost on high eccentricities, chaos and close encounters, beside IAS15",
+    ),
+    "gpe": Entry(
+        "legacy:Gpe", "rotating Gross-Pitaevskii equation: ground states, the ring, and vortex lines (Experiment IV)"
+    ),
+    "work-precision": Entry(
+        "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
+    ),
+    "reproduce": Entry("legacy:Reproduce", "recompute the paper's tables and figures"),
+}
+# Options of before, by command, and the command that does it now.
+MOVED: dict[tuple[str, str], str] = {}
