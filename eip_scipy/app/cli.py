@@ -104,9 +104,9 @@ def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=_listed(below) if below else None,
     )
-    for word in words:
-        if (name, word.partition("=")[0]) in MOVED:
-            parser.exit(WRONG_USAGE, f"{parser.prog}: {word} is now: {PROGRAM} {MOVED[name, word.partition('=')[0]]}\n")
+    for flag in (word.partition("=")[0] for word in words):
+        if (name, flag) in MOVED:
+            parser.exit(WRONG_USAGE, f"{parser.prog}: {flag} is now: {PROGRAM} {MOVED[name, flag]}\n")
     command = getattr(import_module(f".{module}", __package__), kind)
     _add_options(parser, command)
     args, rest = parser.parse_known_args(words)

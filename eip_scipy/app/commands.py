@@ -23,8 +23,11 @@ COMMANDS = {
         "legacy:SolarSystem", "run the solar system and compare with other methods (the paper's Experiment II)"
     ),
     "charged-particle": Entry(
-        "legacy:ChargedParticle", "charged particles in two fields by several methods (the paper's Experiment III)"
+        "particles.charged_particle:ChargedParticle",
+        "charged particles in two fields by several methods (the paper's Experiment III)",
     ),
+    "charged-particle uniform": Entry("particles.charged_particle:Uniform", "the uniform field alone"),
+    "charged-particle tokamak": Entry("particles.charged_particle:Tokamak", "the tokamak alone, or one orbit of it"),
     "hard-cases": Entry("hard.cases:HardCases", "run 35 hard cases with and without projection"),
     "hard-scenes": Entry(
         "hard.scenes:HardScenes",
@@ -39,4 +42,7 @@ COMMANDS = {
     "reproduce": Entry("legacy:Reproduce", "recompute the paper's tables and figures"),
 }
 # Options of before, by command, and the command that does it now.
-MOVED: dict[tuple[str, str], str] = {}
+MOVED = {
+    ("charged-particle", "--field"): "charged-particle uniform, or charged-particle tokamak",
+    ("charged-particle", "--orbit"): "charged-particle tokamak --orbit",
+}

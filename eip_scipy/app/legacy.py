@@ -6,7 +6,6 @@ from typing import Any
 
 from .condensates import gpe
 from .paper import reproduce
-from .particles import charged_particle
 from .report import UsageError
 from .solar import frontier as solar_frontier
 from .solar import solar_system
@@ -30,14 +29,6 @@ class Gpe:
     @staticmethod
     def run(args: Any, session: Any) -> int:
         return gpe.run(args)
-
-
-class ChargedParticle:
-    add_arguments = staticmethod(charged_particle.add_arguments)
-
-    @staticmethod
-    def run(args: Any, session: Any) -> int:
-        return charged_particle.run(args)
 
 
 class Reproduce:

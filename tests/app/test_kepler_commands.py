@@ -12,6 +12,7 @@ from eip_scipy.app.cli import main
 from eip_scipy.app.kepler import cost as kepler_cost
 from eip_scipy.app.kepler import figures as kepler_figures
 from eip_scipy.app.report import compact
+from eip_scipy.app.study import Session
 
 PNG = b"\x89PNG\r\n\x1a\n"
 T_END = 1.5
@@ -101,9 +102,12 @@ def test_cheapest_methods_of_the_text():
 # The paper's figures 1 and 2.
 
 
+SHORT = kepler_figures.KeplerFigures(t_end=T_END)
+
+
 @pytest.fixture(scope="module")
 def lines():
-    return kepler_figures.study(t_end=T_END)
+    return SHORT.measure(Session("fig-kepler"))
 
 
 def test_each_line_keeps_what_it_is_named_after(lines):
@@ -124,24 +128,23 @@ def test_positions_are_measured_against_the_solution(lines):
     assert 1e-7 < end["EIP-HL, RK5"] < end["EIP-HL"] < 1e-3
 
 
-def test_known_values_are_compared_to_their_digits(lines, monkeypatch):
-    assert not any(check["matched"] for check in kepler_figures.checks(lines))  # they are those at t = 2000
-    monkeypatch.setattr(kepler_figures, "T_END", T_END)
+def test_known_values_are_compared_to_their_digits(lines):
+    assert not any(check.passed for check in kepler_figures.KeplerFigures().checks(lines))  # they are those at t = 2000
     at_end, largest = lines["EIP-H"].momentum_error[-1], lines["EIP-HL, RK2"].energy_error.max()
     known = [
         ("EIP-H", "momentum_error", "|L - L0|", "end", compact(at_end)),
         ("EIP-H", "momentum_error", "|L - L0|", "end", compact(1.2 * at_end)),
         ("EIP-HL, RK2", "energy_error", "max |H - H0|", "max", compact(largest)),
     ]
-    monkeypatch.setattr(kepler_figures, "KNOWN", known)
-    checks = kepler_figures.checks(lines)
-    assert [check["matched"] for check in checks] == [True, False, True]
-    assert [check["ours"] for check in checks] == [at_end, at_end, largest]
-    assert kepler_figures.text(lines).splitlines()[-2].startswith("FAILED EIP-H")
+    study = kepler_figures.KeplerFigures(t_end=T_END, known=known)
+    checks = study.checks(lines)
+    assert [check.passed for check in checks] == [True, False, True]
+    assert [check.ours for check in checks] == [at_end, at_end, largest]
+    assert study.text(lines).splitlines()[-2].startswith("FAILED EIP-H")
 
 
 def test_figures_have_a_row_for_each_method(lines):
-    figures = dict(kepler_figures.figures(lines))
+    figures = dict(SHORT.figures(lines))
     assert {name: len(figure.axes) for name, figure in figures.items()} == {
         "fig-kepler-1.png": 3 * 4, "fig-kepler-2.png": 2 * 4,
     }  # fmt: skip
@@ -156,7 +159,7 @@ def test_figures_have_a_row_for_each_method(lines):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_command_for_the_figures(lines, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(kepler_figures, "study", lambda: lines)
+    monkeypatch.setattr(kepler_figures.KeplerFigures, "measure", lambda self, session: lines)
     file = tmp_path / "run.json"
     assert main(["reproduce", "fig-kepler", "--out", str(tmp_path), "--json", str(file)]) == 1
     assert capsys.readouterr().out.count("\nFAILED ") == 4
@@ -173,7 +176,7 @@ def test_command_for_the_figures(lines, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.usefixtures("no_plotting")
 def test_command_for_the_figures_without_matplotlib(lines, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(kepler_figures, "study", lambda: lines)
+    monkeypatch.setattr(kepler_figures.KeplerFigures, "measure", lambda self, session: lines)
     assert main(["reproduce", "fig-kepler", "--out", str(tmp_path), "--quiet"]) == 1
     assert "eip-scipy: no figures: " in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["fig-kepler.csv"]

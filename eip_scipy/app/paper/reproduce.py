@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from decimal import Decimal
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -26,18 +26,17 @@ from ...core.solvers import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPSolver
 from ...problems import Problem, harmonic, kepler, rotating_packet
 from ...run.integrate import integrate
 from .. import report
-from ..condensates import efficiency as gpe_efficiency
-from ..kepler import figures as kepler_figures
-from ..particles import charged_particle
-from ..particles import report as particle_report
+from ..condensates.efficiency import Efficiency
+from ..kepler.figures import KeplerFigures
+from ..particles.charged_particle import ChargedParticle
 from ..solar import solar_system
+from ..study import Session, Study, perform
 
 __all__ = ["FIGURES", "TABLES", "Cell", "Value", "add_arguments", "reproduce", "run"]
 
 TABLES = ("table1", "table2", "table3", "table4", "table5")
 SLOW = ("table5",)
 FIGURES = ("fig-kepler", "fig-solar", "fig-particle", "fig-tokamak", "fig-efficiency")
-PARTICLE_SCENES = {"fig-particle": ("uniform",), "fig-tokamak": ("tokamak-banana", "tokamak-transit")}
 OMEGA = 10.0
 METHODS: dict[str, type[EIPSolver]] = {"RK1": EIPRK1, "RK2": EIPRK2, "RK3": EIPRK3, "RK4": EIPRK4}
 # check=False: the paper's longest steps are far too long, and nobody need be told.
@@ -340,47 +339,21 @@ def _say_written(args: argparse.Namespace, written: list[Path]) -> None:
         report.say("\n".join(["", *(f"wrote {path}" for path in written)]))
 
 
+FIGURE_STUDIES: dict[str, Callable[[], Study[Any]]] = {
+    "fig-kepler": KeplerFigures,
+    "fig-particle": partial(ChargedParticle, scenes=("uniform",), paper_only=True, stem="fig-particle"),
+    "fig-tokamak": partial(
+        ChargedParticle, scenes=("tokamak-banana", "tokamak-transit"), paper_only=True, stem="fig-tokamak"
+    ),
+    "fig-efficiency": Efficiency,
+}
+
+
 def _figure(name: str, args: argparse.Namespace, peer: Callable[[], Any]) -> tuple[int, dict[str, Any]]:
     """Make one of the paper's figures; exit status and content of the JSON."""
-    if name == "fig-kepler":
-        return _kepler(args)
-    if name == "fig-efficiency":
-        return _efficiency(args)
-    return _solar(args, peer) if name == "fig-solar" else _particle(name, args)
-
-
-def _kepler(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Make the paper's figures 1 and 2; exit status and content of the JSON."""
-    return _study("fig-kepler", kepler_figures, kepler_figures.study(), args)
-
-
-def _efficiency(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Make the paper's figure of efficiency; exit status and content of the JSON."""
-    return _study("fig-efficiency", gpe_efficiency, gpe_efficiency.study(quiet=args.quiet), args)
-
-
-def _study(name: str, command: Any, found: Any, args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Print and write what a module of a figure lays out of its study."""
-    if not args.quiet:
-        report.say(command.text(found))
-    checks = command.checks(found)
-    if args.out is not None:
-        folder = Path(args.out)
-        written = report.write_results(folder, {f"{name}.csv": command.rows(found)}, command.figures(found))
-        _say_written(args, written)
-    return 0 if all(check["matched"] for check in checks) else 1, {"checks": checks}
-
-
-def _particle(name: str, args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Make the figures of Experiment III in one of its fields; exit status and content of the JSON."""
-    studies = charged_particle.run_scenes(PARTICLE_SCENES[name], paper_only=True, quiet=args.quiet)
-    if not args.quiet:
-        report.say("\n\n".join(particle_report.text(found) for found in studies.values()))
-    if args.out is not None:
-        results = charged_particle.results(studies, name, paper_only=True)
-        _say_written(args, report.write_results(args.out, *results))
-    content = charged_particle.record(studies)
-    return 0 if content["passed"] else 1, content
+    if name == "fig-solar":
+        return _solar(args, peer)
+    return perform(FIGURE_STUDIES[name](), Session(name, args.out, None, args.quiet))
 
 
 def _solar(args: argparse.Namespace, peer: Callable[[], Any]) -> tuple[int, dict[str, Any]]:
