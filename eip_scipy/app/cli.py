@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None, **settings: Any) -> int:
     argv : sequence of str, optional
         Arguments; default: those of the process.
     **settings
-        Of the command, beside its options.
+        Of the command, in place of its own defaults.
 
     Returns
     -------
@@ -109,6 +109,7 @@ def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
             parser.exit(WRONG_USAGE, f"{parser.prog}: {flag} is now: {PROGRAM} {MOVED[name, flag]}\n")
     command = getattr(import_module(f".{module}", __package__), kind)
     _add_options(parser, command)
+    parser.set_defaults(**settings)
     args, rest = parser.parse_known_args(words)
     if rest:
         known = [
@@ -116,14 +117,12 @@ def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
             *(b.split()[1] for b in below),
         ]
         parser.error(f"unrecognized arguments: {' '.join(rest)}{_nearest(rest[0].partition('=')[0], known)}")
-    return _conduct(name, command, args, settings)
+    return _conduct(name, command, args)
 
 
 def _add_options(parser: argparse.ArgumentParser, command: Any) -> None:
     """Those of the command, which are fields of it, and those of all commands."""
-    if hasattr(command, "add_arguments"):  # not a Study yet
-        command.add_arguments(parser)
-    for item in () if hasattr(command, "add_arguments") else fields(command):
+    for item in fields(command):
         if "help" not in item.metadata:
             continue
         settings = {"default": item.default, **item.metadata}
@@ -140,7 +139,7 @@ def _add_options(parser: argparse.ArgumentParser, command: Any) -> None:
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
 
-def _conduct(name: str, command: Any, args: argparse.Namespace, settings: dict[str, Any]) -> int:
+def _conduct(name: str, command: Any, args: argparse.Namespace) -> int:
     from ..core.results import ProjectionWarning
     from .report import UsageError, listening, warn
     from .study import Session
@@ -149,10 +148,7 @@ def _conduct(name: str, command: Any, args: argparse.Namespace, settings: dict[s
     own = {key: value for key, value in vars(args).items() if key not in ("out", "json", "quiet")}
     with listening(ProjectionWarning) as untrusted:
         try:
-            if hasattr(command, "add_arguments"):
-                status = command.run(args, session)
-            else:
-                status = command(**own, **settings).run(session)
+            status = command(**own).run(session)
             for line in session.absent:  # at the end, where it is seen
                 warn(line)
         except UsageError as error:

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
+from ..checkpoint import CheckpointError
 from .commands import CHECK_FAILED, DONE, INTERRUPTED
-from .report import check_folder, check_target, document, say, warn, write_csv, write_file, write_json
+from .report import UsageError, check_folder, check_target, document, say, warn, write_csv, write_file, write_json
 
 __all__ = [
     "Check",
@@ -100,6 +102,10 @@ class Session:
         Print nothing but errors.
     absent : list of str
         What could not be compared with, said at the end.
+    written : set of Path
+        Files that were made.
+    open : ExitStack
+        What is to be closed when the command ends.
     """
 
     name: str
@@ -108,6 +114,7 @@ class Session:
     quiet: bool = False
     absent: list[str] = field(default_factory=list)
     written: set[Path] = field(default_factory=set)
+    open: ExitStack = field(default_factory=ExitStack)
 
     @property
     def shown(self) -> bool:
@@ -207,8 +214,12 @@ class Study(Command, Generic[Found]):
         """What the user is told besides: how to go on."""
         return ""
 
+    def check_settings(self) -> None:
+        """Raise UsageError for settings that do not go together."""
+
     def run(self, session: Session) -> int:
-        """See `perform`; the files are looked at first."""
+        """See `perform`; the settings and the files are looked at first."""
+        self.check_settings()
         if self.writes_files:
             check_folder(session.out)
         if session.json is not None:
@@ -229,30 +240,36 @@ def perform(study: Study[Any], session: Session) -> tuple[int, dict[str, Any]]:
     int, dict
         Exit status: 0 done, 1 a check failed, 130 interrupted; and what is in the JSON.
     """
-    interrupted = ""
-    try:
-        found = study.measure(session)
-    except PartlyDone as stop:
-        found, interrupted = stop.found, "interrupted; the runs that were done are in the table and the files"
-    except KeyboardInterrupt:
-        _tell(study.when_interrupted(), "interrupted; nothing was written")
-        return INTERRUPTED, {}
-    session.say(study.text(found))
-    numbers = _write_numbers(study, found, session)
-    try:
-        if not interrupted and study.refine(found, session):
-            numbers = _write_numbers(study, found, session)
-    except KeyboardInterrupt:
-        interrupted = "interrupted; the table is complete, what is measured after it and the figures are missing"
-    if interrupted:
-        _tell(study.when_interrupted(), interrupted)
-        return INTERRUPTED, numbers
-    try:
-        for name, figure in study.figures(found):
-            session.wrote(write_file(session.out / name, getattr(figure, "savefig", figure)))
-    except ImportError as error:
-        warn(f"no figures: {error}")
+    with session.open:
+        interrupted = ""
+        try:
+            found = study.measure(session)
+        except PartlyDone as stop:
+            found, interrupted = stop.found, "interrupted; the runs that were done are in the table and the files"
+        except KeyboardInterrupt:
+            _tell(study.when_interrupted(), "interrupted; nothing was written")
+            return INTERRUPTED, {}
+        except MemoryError as error:
+            raise UsageError(f"not enough memory: {error}") from error
+        except CheckpointError as error:
+            raise UsageError(f"{error} On the command line, resume=True is --resume.") from error
+        session.say(study.text(found))
+        numbers = _write_numbers(study, found, session)
+        try:
+            if not interrupted and study.refine(found, session):
+                numbers = _write_numbers(study, found, session)
+        except KeyboardInterrupt:
+            interrupted = "interrupted; the table is complete, what is measured after it and the figures are missing"
+        if interrupted:
+            _tell(study.when_interrupted(), interrupted)
+            return INTERRUPTED, numbers
+        _write_figures(study, found, session)
     return DONE if all(check.passed for check in study.checks(found)) else CHECK_FAILED, numbers
+
+
+def _writer(figure: Any) -> Callable[[Path], Any]:
+    write: Callable[[Path], Any] = figure.savefig if hasattr(figure, "savefig") else figure
+    return write
 
 
 def _tell(*lines: str) -> None:
@@ -267,3 +284,11 @@ def _write_numbers(study: Study[Any], found: Any, session: Session) -> dict[str,
     if session.json is not None:
         session.wrote(write_json(session.json, document(session.name, study.arguments(), **numbers)))
     return numbers
+
+
+def _write_figures(study: Study[Any], found: Any, session: Session) -> None:
+    try:
+        for name, figure in study.figures(found):
+            session.wrote(write_file(session.out / name, _writer(figure)))
+    except ImportError as error:
+        warn(f"no figures: {error}")

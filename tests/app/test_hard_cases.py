@@ -3,8 +3,7 @@
 import csv
 import json
 import math
-from dataclasses import replace
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,7 +13,9 @@ from eip_scipy import Invariant, check_gradient
 from eip_scipy.app.cli import main
 from eip_scipy.app.hard import cases as command
 from eip_scipy.app.kepler import figures as kepler_figures
-from eip_scipy.app.study import Session
+from eip_scipy.app.paper import reproduce
+from eip_scipy.app.solar.solar_system import SolarSystem
+from eip_scipy.app.study import Check, Session, Study
 from eip_scipy.app.work_precision import cost_to_reach
 from eip_scipy.problems.hard_cases import EQUATIONS, hard_cases
 
@@ -260,33 +261,42 @@ def test_a_known_value_can_differ():
     assert not any(check.passed for check in kepler_figures.KeplerFigures().checks(lines))  # too short for any
 
 
-def test_solar_figures_come_from_the_command(tmp_path, monkeypatch):
+@dataclass(frozen=True, kw_only=True)
+class Noted(Study):
+    """In place of what takes long; tells where it ran."""
+
+    seen: list
+    passed: bool = True
+
+    def measure(self, session):
+        self.seen.append((session.name, session.out, session.json))
+
+    def text(self, found):
+        return "a table"
+
+    def numbers(self, found):
+        return {"cells": [], "orders": [], "checks": ["one"]}
+
+    def checks(self, found):
+        return [Check("one", self.passed)]
+
+
+def test_solar_figures_come_from_the_command(tmp_path, capsys):
     seen = []
-
-    def run(args, judge):
-        seen.append((args.years, args.method, args.out, judge))
-        args.json.write_text('{"checks": []}')
-        return 1
-
-    from eip_scipy.app.paper import reproduce
-
-    monkeypatch.setattr(reproduce.solar_system, "run", run)
-    monkeypatch.setattr(Session, "peer", lambda *args: SimpleNamespace(run="REBOUND"))
-    target = tmp_path / "run.json"
-    assert main(["reproduce", "fig-solar", "--out", str(tmp_path), "--json", str(target), "--quiet"]) == 1
-    assert seen == [(None, "EIPRK4", tmp_path, "REBOUND")]  # None: the command's own default
+    target, studies = tmp_path / "run.json", {"fig-solar": lambda: Noted(seen=seen, passed=False)}
+    assert main(["reproduce", "fig-solar", "--out", str(tmp_path), "--json", str(target)], studies=studies) == 1
+    assert seen == [("solar-system", tmp_path, tmp_path / "solar-system.json")]
     run = json.loads(target.read_text())
-    assert (run["passed"], run["fig-solar"]) == (False, {"checks": []})
+    assert (run["command"], run["passed"], run["fig-solar"]["checks"]) == ("reproduce", False, ["one"])
+    assert json.loads((tmp_path / "solar-system.json").read_text())["command"] == "solar-system"
+    assert reproduce.STUDIES["fig-solar"] is SolarSystem
 
 
-def test_all_means_all(tmp_path, monkeypatch):
-    from eip_scipy.app.paper import reproduce
-
-    done = []
-    monkeypatch.setattr(reproduce, "_figure", lambda name, args, judge: (done.append(name), (0, {}))[1])
-    monkeypatch.setattr(reproduce, "reproduce", lambda name, progress: done.append(name) or [])
-    assert main(["reproduce", "all", "--out", str(tmp_path), "--quiet"]) == 0
-    assert done == [*reproduce.TABLES, *reproduce.FIGURES]
+def test_all_means_all(tmp_path):
+    seen = []
+    studies = dict.fromkeys(reproduce.STUDIES, lambda: Noted(seen=seen))
+    assert main(["reproduce", "all", "--out", str(tmp_path), "--quiet"], studies=studies) == 0
+    assert [name for name, *_ in seen if name != "solar-system"] == [n for n in reproduce.STUDIES if n != "fig-solar"]
 
 
 def test_cost_to_reach():

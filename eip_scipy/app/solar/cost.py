@@ -30,9 +30,8 @@ from .runs import (
     whole_number,
 )
 
-__all__ = ["ENOUGH_SECONDS", "MERCURY", "REPEATS", "TimedRun", "by_method", "cost", "cost_methods", "timed"]
+__all__ = ["ENOUGH_SECONDS", "MERCURY", "TimedRun", "by_method", "cost", "cost_methods", "timed"]
 
-REPEATS = 3
 ENOUGH_SECONDS = 0.2  # what disturbs so long a run is not seen on axes of many powers of ten
 MULTISTEP_COUNTS = (255, 300, 412, 600)  # steps a year; half of the first would not be stable
 MERCURY = 0  # of the planets, which start behind the Sun
@@ -121,6 +120,8 @@ def cost(
     scene: SolarScene,
     methods: Mapping[str, tuple[Runner, Sequence[float]]],
     peer: Peer | None,
+    *,
+    repeats: int,
     callback: Callable[[], Any] | None = None,
 ) -> list[TimedRun]:
     """Final position errors against the time of the run, for several methods and steps.
@@ -133,9 +134,10 @@ def cost(
         From `cost_methods`.
     peer : callable or None
         REBOUND, if it is there.
+    repeats : int
+        Of each method and step, unless one took more than `ENOUGH_SECONDS`.
     callback : callable, optional
-        ``callback()`` after each run; there are `REPEATS` of each method and step, those that are left out since one
-        took more than `ENOUGH_SECONDS` included.
+        ``callback()`` after each run, those that are left out included.
 
     Returns
     -------
@@ -146,7 +148,7 @@ def cost(
         truth = (tight_run(scene, False) if peer is None else rebound_run(scene, peer, "IAS15", "ias15", 1, False)).y[
             :, -1
         ]
-    return timed(methods, truth, repeats=REPEATS, enough_seconds=ENOUGH_SECONDS, callback=callback)
+    return timed(methods, truth, repeats=repeats, enough_seconds=ENOUGH_SECONDS, callback=callback)
 
 
 def cost_methods(
