@@ -83,13 +83,12 @@ def test_work_and_precision_interrupted(tmp_path, capsys, monkeypatch):
 
 
 def test_cheapest_methods_of_the_text():
-    def work(*errors):
-        n = np.arange(1.0, len(errors) + 1)
-        return kepler_cost.CostCurve(n, 1000 * n, n / 1000, np.array(errors))
+    def work(name, *errors):
+        return [kepler_cost.KeplerPoint(name, k, 1000 * k, k / 1000, error) for k, error in enumerate(errors, 1)]
 
-    names = {method.__name__: work(np.nan) for method in kepler_cost.FIXED}
-    works = {**names, "EIPRK2": work(0.1, 1e-2, 1e-4), "EIPRK45": work(1e-2, 1e-3)}
-    text = kepler_cost.KeplerCost().text(kepler_cost.Found(works, "a machine"))
+    points = [*work("EIPRK2", 0.1, 1e-2, 1e-4), *work("EIPRK45", 1e-2, 1e-3)]
+    points += [point for name in ("EIPRK3", "EIPRK4", "EIPRK5") for point in work(name, np.nan)]
+    text = kepler_cost.KeplerCost().text(kepler_cost.Found(points, "a machine"))
     nfev = text.split("for an error of")[1].splitlines()
     row = {line[:24].strip(): line[24:].split() for line in nfev}
     assert row["EIPRK2"] == ["2.0", "3.0", "-", "-"]

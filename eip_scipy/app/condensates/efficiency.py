@@ -45,7 +45,6 @@ ORDERS = {
     "splitting4-EIP": 4,
 }  # fmt: skip
 SLOPES, SLOPE_TOLERANCE, LEFT = ("CN", "EIP-ME"), 0.1, 1e-12
-DRAWN = {"h": "h", "cost": "seconds", "error": "error_max"}
 
 
 class Contender(NamedTuple):
@@ -295,19 +294,21 @@ class Efficiency(Study[Found]):
 
     def figures(self, found: Found) -> Figures:
         """Error against step and against time, a row for each wave."""
-        from ...plotting import efficiency_figure
+        from ...plotting import CostPanel, cost_figure
 
-        series = {
-            wave: {name: {key: trial.column(name, source) for key, source in DRAWN.items()} for name in METHODS}
-            for wave, trial in found.items()
-        }
+        rows = []
+        for wave, trial in found.items():
+            steps, times = (
+                {name: (trial.column(name, cost), trial.column(name, "error_max")) for name in METHODS}
+                for cost in ("h", "seconds")
+            )
+            slopes = {name: trial.slope(name) for name in SLOPES}
+            rows.append([CostPanel(wave, "step h", steps, slopes), CostPanel(wave, "processor time [s]", times)])
         yield (
             f"{self.stem}.png",
-            efficiency_figure(
-                series,
+            cost_figure(
+                rows,
                 error=r"max $|\delta\psi|$ at t = 1",
-                cost="processor time [s]",
-                slopes={wave: {name: trial.slope(name) for name in SLOPES} for wave, trial in found.items()},
                 title=f"NLS equation, {self.points} x {self.points} points: accuracy and cost",
             ),
         )

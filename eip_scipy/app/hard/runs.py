@@ -6,7 +6,7 @@ Nothing is printed or written here. REBOUND comes in as a module, or None, so th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
@@ -20,6 +20,7 @@ from ...problems import Problem, centre_time, comet, figure_eight, kepler, pair_
 from ...problems.time_transformed import time_transformed
 from ...run.integrate import integrate
 from ..long_runs import named
+from ..work_precision import work_precision
 
 __all__ = ["SCENES", "Contender", "HardScene", "Outcome", "Point", "Spread", "measure", "methods", "scene"]
 
@@ -267,7 +268,7 @@ def methods(of: HardScene, spread: Spread, rebound: Any = None) -> dict[str, Con
 
 def measure(
     of: HardScene, spread: Spread, rebound: Any = None, callback: Callable[[], Any] = lambda: None
-) -> Iterator[Point]:
+) -> list[Point]:
     """Run all methods on a scene.
 
     Parameters
@@ -276,33 +277,32 @@ def measure(
     spread : Spread
     rebound : module, optional
     callback : callable, optional
-        ``callback()`` after each point.
+        ``callback()`` after each of the repeats of each point, those left out included.
 
-    Yields
-    ------
-    Point
+    Returns
+    -------
+    list of Point
     """
-    for name, method in methods(of, spread, rebound).items():
-        for value in method.settings:
-            looked = method.run(value, True)
-            outcome, wall_time = _timed(partial(method.run, value, False), spread.repeats)
-            error = math.nan if outcome.failure else of.error(outcome.y[:, -1])
-            yield Point(
-                of.name, name, method.setting, value, looked.nfev, wall_time, error,
-                *of.invariant_errors(looked.y), outcome.failure,
-            )  # fmt: skip
-            callback()
+    contenders = methods(of, spread, rebound)
+    failures: dict[tuple[str, float], str] = {}
 
+    def timed(name: str, value: float) -> tuple[float, np.ndarray]:
+        outcome = contenders[name].run(value, False)
+        failures[name, value] = outcome.failure
+        end = outcome.y[:, -1]
+        return outcome.wall_time, np.full_like(end, math.nan) if outcome.failure else end
 
-def _timed(run: Callable[[], Outcome], repeats: int) -> tuple[Outcome, float]:
-    outcome = run()
-    least = spent = outcome.wall_time
-    for _ in range(1, repeats):
-        if spent > ENOUGH_SECONDS:
-            break
-        seconds = run().wall_time
-        least, spent = min(least, seconds), spent + seconds
-    return outcome, least
+    runners = {name: (partial(timed, name), method.settings) for name, method in contenders.items()}
+    done = work_precision(
+        runners, of.error, repeats=spread.repeats, enough_seconds=math.inf, in_all=ENOUGH_SECONDS, callback=callback
+    )
+    found = []
+    for name, value, wall_time, error in done.points:
+        looked = contenders[name].run(value, True)
+        errors = of.invariant_errors(looked.y)
+        setting, failure = contenders[name].setting, failures[name, value]
+        found.append(Point(of.name, name, setting, value, looked.nfev, wall_time, error, *errors, failure))
+    return found
 
 
 def _adaptive(problem: Problem, options: dict[str, Any], rtol: float, look: bool) -> Outcome:

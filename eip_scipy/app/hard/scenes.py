@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...core.names import nearest
-from ..kepler.cost import CostCurve
 from ..report import compact, describe_machine, table
 from ..study import Figures, Rows, Session, Study, option
-from ..work_precision import cost_to_reach
+from ..work_precision import cost_to_reach, curves
 from .runs import ATOL_PER_RTOL, SCENES, HardScene, Point, Spread, measure, methods, scene
 
-__all__ = ["Found", "HardScenes", "works"]
+__all__ = ["Found", "HardScenes"]
 
 Results = dict[str, tuple[HardScene, list[Point]]]
 
@@ -36,19 +35,6 @@ def _known(name: str) -> str:
     )
 
 
-def works(points: Sequence[Point]) -> dict[str, CostCurve]:
-    """Group a scene's points by their methods."""
-    found: dict[str, list[Point]] = {}
-    for point in points:
-        found.setdefault(point.method, []).append(point)
-    return {
-        name: CostCurve(
-            *(np.array([getattr(p, key) for p in group]) for key in ("value", "nfev", "wall_time", "error"))
-        )
-        for name, group in found.items()
-    }
-
-
 def _cells(point: Point) -> list[str]:
     errors = (point.error, point.energy_error, point.momentum_error)
     return [_setting(point), str(point.nfev), compact(1e3 * point.wall_time, 3), *map(compact, errors)]
@@ -62,20 +48,14 @@ def _failures(failures: list[str]) -> list[str]:
     return ["Did not reach the end:", *(f"  {line}" for line in failures), ""] if failures else []
 
 
-def _cost(work: CostCurve, level: float, key: str) -> float:
-    return cost_to_reach(getattr(work, key), work.error, level)
-
-
 def _costs(results: Results) -> list[str]:
     """What each method costs at each scene's error level, evaluations and time."""
     scenes = [of for of, _ in results.values()]
     names = list(dict.fromkeys(p.method for _, points in results.values() for p in points))
     lines = []
     for key, label, factor in (("nfev", "1000 evaluations", 1e-3), ("wall_time", "milliseconds", 1e3)):
-        costs = {
-            name: [factor * _cost(works(points)[name], of.level, key) for of, points in results.values()]
-            for name in names
-        }
+        levels = [(of.level, curves(points, key)) for of, points in results.values()]
+        costs = {name: [factor * cost_to_reach(*of[name], level) for level, of in levels] for name in names}
         body = [(name, [compact(cost) for cost in row]) for name, row in costs.items()]
         head = [[of.name, compact(of.level, 1)] for of in scenes]
         cheapest = []
@@ -108,9 +88,9 @@ class HardScenes(Study[Found]):
         """All methods on each scene."""
         rebound = session.peer("rebound", "WHFast and IAS15")
         scenes = [scene(name) for name in self.arguments()["scenes"]]
-        total = sum(len(method.settings) for of in scenes for method in methods(of, self.spread, rebound).values())
-        with session.bar(total, "hard scenes", "point") as bar:
-            results = {of.name: (of, list(measure(of, self.spread, rebound, bar.update))) for of in scenes}
+        points = sum(len(method.settings) for of in scenes for method in methods(of, self.spread, rebound).values())
+        with session.bar(self.spread.repeats * points, "hard scenes") as bar:
+            results = {of.name: (of, measure(of, self.spread, rebound, bar.update)) for of in scenes}
         return Found(results, describe_machine())
 
     def text(self, found: Found) -> str:
@@ -142,20 +122,24 @@ class HardScenes(Study[Found]):
 
     def figures(self, found: Found) -> Figures:
         """Error against evaluations and time, two panels for each scene."""
-        from ...plotting import scenes_figure
+        from ...plotting import CostPanel, cost_figure
 
-        panels: Mapping[str, Any] = {
-            of.title: {name: vars(work) for name, work in works(points).items()}
-            for of, points in found.results.values()
-        }
+        every = list(found.results.values())
+        rows = [
+            [CostPanel(of.title if key == "nfev" else "", label, curves(points, key)) for of, points in three]
+            for three in (every[k : k + 3] for k in range(0, len(every), 3))
+            for key, label in (("nfev", "evaluations of f"), ("wall_time", "wall time [s]"))
+        ]
         yield (
             "hard-scenes.png",
-            scenes_figure(
-                panels,
+            cost_figure(
+                rows,
                 error="error of position at the end",
                 title="Hard scenes: error against cost (errors above 1 left out)",
-                largest=1.0,
                 footnote=f"{found.machine}; one thread, least of at most {self.spread.repeats}",
+                largest=1.0,
+                size=(4.0, 2.8),
+                shared=False,
             ),
         )
 

@@ -16,9 +16,9 @@ from ...run.integrate import integrate
 from ..long_runs import named
 from ..report import compact, table
 from ..study import Figures, Rows, Session, Study
-from ..work_precision import Runner, cost_to_reach, work_precision
+from ..work_precision import Curve, Runner, cost_to_reach, costs_at, curves, work_precision
 
-__all__ = ["CostCurve", "KeplerCost"]
+__all__ = ["Found", "KeplerCost", "KeplerPoint"]
 
 FIXED: dict[type[EIPSolver], tuple[int, ...]] = {
     # Steps in the whole run.
@@ -36,28 +36,20 @@ PAIRS: dict[type[EIPSolver], tuple[float, ...]] = {
 LEVELS = (1e-2, 1e-4, 1e-6, 1e-8)
 
 
-@dataclass(frozen=True, eq=False)
-class CostCurve:
-    """One method's runs, from the cheapest to the dearest.
+class KeplerPoint(NamedTuple):
+    """One run: its step or relative tolerance, evaluations of f, seconds, and the final error of the position."""
 
-    Attributes
-    ----------
-    setting : ndarray
-        Step, or relative tolerance.
-    nfev, wall_time, error : ndarray
-        Evaluations of f, seconds, and final position error.
-    """
-
-    setting: np.ndarray
-    nfev: np.ndarray
-    wall_time: np.ndarray
-    error: np.ndarray
+    method: str
+    setting: float
+    nfev: int
+    wall_time: float
+    error: float
 
 
 class Found(NamedTuple):
-    """The curves by the methods' names, and the machine."""
+    """The runs, each method's from the cheapest to the dearest, and the machine."""
 
-    works: dict[str, CostCurve]
+    points: list[KeplerPoint]
     machine: str
 
 
@@ -87,37 +79,19 @@ class KeplerCost(Study[Found]):
             result = work_precision(
                 methods, lambda y: float(np.hypot(*(y[:2] - truth))), repeats=self.repeats, callback=bar.update
             )
-        works = {}
-        for name in methods:
-            points = [point for point in result.points if point.method == name]
-            works[name] = CostCurve(
-                np.array([p.step for p in points]),
-                np.array([nfev[name, p.step] for p in points]),
-                np.array([p.wall_time for p in points]),
-                np.array([p.error for p in points]),
-            )
-        return Found(works, result.machine)
+        points = [KeplerPoint(p.method, p.step, nfev[p.method, p.step], p.wall_time, p.error) for p in result.points]
+        return Found(points, result.machine)
 
     def text(self, found: Found) -> str:
         """Lay out the cost of each method at some errors."""
         title = f"Work and precision: perturbed Kepler problem, e = 0.6, H and L kept, t = {self.t_end:g}"
         parts = [title, found.machine]
         for cost, unit, factor in (("nfev", "1000 evaluations of f", 1e-3), ("wall_time", "milliseconds", 1e3)):
-            body = []
-            for name, work in found.works.items():
-                cells = [compact(factor * cost_to_reach(getattr(work, cost), work.error, level)) for level in LEVELS]
-                body.append(
-                    (name, [f"<{cell}" if work.error[0] <= x else cell for x, cell in zip(LEVELS, cells, strict=True)])
-                )
-            cheapest = []
-            for level in LEVELS:
-                known = {
-                    name: cost_to_reach(getattr(work, cost), work.error, level) for name, work in found.works.items()
-                }
-                fixed = {method.__name__: known[method.__name__] for method in self.fixed}
-                cheapest.append([_cheapest(fixed), _cheapest(known)])
-            body.append(("cheapest with fixed step", [pair[0] for pair in cheapest]))
-            body.append(("cheapest of all", [pair[1] for pair in cheapest]))
+            known = curves(found.points, cost)
+            fixed = {method.__name__: known[method.__name__] for method in self.fixed}
+            body = [(name, costs_at(curve, LEVELS, factor)) for name, curve in known.items()]
+            body.append(("cheapest with fixed step", [_cheapest(fixed, level) for level in LEVELS]))
+            body.append(("cheapest of all", [_cheapest(known, level) for level in LEVELS]))
             head = [["error", compact(level, 1)] for level in LEVELS]
             parts += ["", f"{unit.capitalize()} for an error of the final position:", table(head, body)]
         parts += ["", '"<": the cheapest run is more accurate; "-": no run is as accurate.']
@@ -135,25 +109,25 @@ class KeplerCost(Study[Found]):
         fixed = {method.__name__ for method in self.fixed}
         return [
             {
-                "method": name,
-                "h": float(work.setting[k]) if name in fixed else None,
-                "rtol": None if name in fixed else float(work.setting[k]),
-                "nfev": int(work.nfev[k]),
-                "wall_time_s": float(work.wall_time[k]),
-                "position_error": float(work.error[k]),
+                "method": p.method,
+                "h": p.setting if p.method in fixed else None,
+                "rtol": None if p.method in fixed else p.setting,
+                "nfev": p.nfev,
+                "wall_time_s": p.wall_time,
+                "position_error": p.error,
             }
-            for name, work in found.works.items()
-            for k in range(work.error.size)
+            for p in found.points
         ]
 
     def figures(self, found: Found) -> Figures:
         """Error against evaluations and against time."""
-        from ...plotting import work_figure
+        from ...plotting import CostPanel, cost_figure
 
+        costs = {"nfev": "evaluations of f", "wall_time": "wall time [s]"}
         yield (
             "work-precision.png",
-            work_figure(
-                {name: vars(work) for name, work in found.works.items()},
+            cost_figure(
+                [[CostPanel("", label, curves(found.points, cost)) for cost, label in costs.items()]],
                 error=f"error of position at t = {self.t_end:g}",
                 title="Perturbed Kepler problem, e = 0.6, H and L kept: error against cost",
                 footnote=f"{found.machine}; one thread, least of {self.repeats}",
@@ -176,6 +150,7 @@ def _noted(result: Any, method: type[EIPSolver], nfev: dict[Any, int], step: flo
     return result.wall_time, result.y[:, -1] if result.success else np.full(4, np.nan)
 
 
-def _cheapest(known: dict[str, float]) -> str:
-    finite = {name: cost for name, cost in known.items() if math.isfinite(cost)}
+def _cheapest(known: Mapping[str, Curve], level: float) -> str:
+    costs = {name: cost_to_reach(*curve, level) for name, curve in known.items()}
+    finite = {name: cost for name, cost in costs.items() if math.isfinite(cost)}
     return min(finite, key=finite.__getitem__) if finite else "-"

@@ -10,7 +10,7 @@ import numpy as np
 from ... import plotting
 from ...problems.gravity.solar_data import YEAR_D
 from ..report import describe_machine
-from .cost import ENOUGH_SECONDS, by_method
+from .cost import ENOUGH_SECONDS, panels
 from .errors import MERCURY, SolarRuns, ecliptic, longitude_errors
 from .runs import MethodRun, SolarScene
 
@@ -189,9 +189,9 @@ def _mercury_figure(study: SolarRuns, styles: Any) -> Any:
 
 def _cost_figure(study: SolarRuns, styles: Any) -> Any:
     assert study.cost_scene is not None
-    return plotting.frontier_figure(
-        by_method(study.cost),
-        unit="AU",
+    return plotting.cost_figure(
+        panels(study.cost),
+        error="error of position [AU]",
         styles=styles,
         title=f"Error against cost: runs of {study.cost_scene.years:g} yr, {study.scene.data.name}",
         footnote=f"{describe_machine()}; one thread, least of {study.repeats} timings, or one above {ENOUGH_SECONDS} s",

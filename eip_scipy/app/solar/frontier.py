@@ -18,8 +18,8 @@ from ...run.integrate import integrate
 from ..long_runs import named, positive
 from ..report import UsageError, compact, describe_machine, table
 from ..study import Figures, Rows, Session, Study, option
-from ..work_precision import Runner, cost_to_reach
-from .cost import MERCURY, TimedRun, by_method, timed
+from ..work_precision import Runner, costs_at, curves
+from .cost import MERCURY, TimedRun, panels, timed
 from .runs import KEPT, Peer, whole_number
 
 __all__ = ["Found", "Frontier", "methods"]
@@ -114,18 +114,6 @@ def _setting(item: TimedRun) -> str:
     return f"tol {item.step:.0e}" if item.method.startswith("heyoka") else f"{item.step * YEAR_D:.4g} d"
 
 
-def _costs(runs: Sequence[TimedRun]) -> list[tuple[str, list[str]]]:
-    lines = []
-    for name in dict.fromkeys(item.method for item in runs):
-        own = [item for item in runs if item.method == name]
-        seconds, errors = [item.wall_time for item in own], [item.mercury for item in own]
-        cells = [
-            ("<" if errors[0] <= level else "") + compact(cost_to_reach(seconds, errors, level)) for level in LEVELS
-        ]
-        lines.append((name, cells))
-    return lines
-
-
 def _rows(runs: Sequence[TimedRun]) -> Rows:
     """Make the lines of the CSV file."""
     planets = load("de440").bodies[1:]
@@ -184,6 +172,7 @@ class Frontier(Study[Found]):
             cells = [_setting(item), f"{item.wall_time:.3g}", compact(item.errors[MERCURY]), worst]
             body.append((item.method, cells))
         what = "errors of position [AU] and wall time"
+        costs = [(name, costs_at(curve, LEVELS)) for name, curve in curves(found.runs, error="mercury").items()]
         parts = [
             f"Ten bodies, Newton, {self.years:g} years: {what}, least of {self.repeats}, one core",
             found.machine,
@@ -191,7 +180,7 @@ class Frontier(Study[Found]):
             table([["step", ""], ["wall", "[s]"], ["Mercury", "[AU]"], ["worst of the", "others [AU]"]], body),
             "",
             "Seconds for an error of Mercury's position:",
-            table([["error [AU]", compact(level, 1)] for level in LEVELS], _costs(found.runs)),
+            table([["error [AU]", compact(level, 1)] for level in LEVELS], costs),
             '"<": the cheapest run is more accurate; "-": no run is as accurate.',
         ]
         return "\n".join(parts)
@@ -206,13 +195,13 @@ class Frontier(Study[Found]):
 
     def figures(self, found: Found) -> Figures:
         """Mercury's error and that of the others, against time."""
-        from ...plotting import frontier_figure
+        from ...plotting import cost_figure
 
         yield (
             "frontier.png",
-            frontier_figure(
-                by_method(found.runs),
-                unit="AU",
+            cost_figure(
+                panels(found.runs),
+                error="error of position [AU]",
                 title=f"Ten bodies, Newton, {self.years:g} years: error of position against cost",
                 footnote=f"{found.machine}; one thread, least of {self.repeats}",
             ),
