@@ -46,7 +46,6 @@ COMMANDS = {
     "work-precision": Entry(
         "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
     ),
-    "orders": Entry("kepler.orders:Orders", "whether the methods with fixed steps have their orders"),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
 }
 # Options of before, by command, and the command that does it now.
