@@ -78,7 +78,7 @@ def _no_command(words: list[str]) -> int:
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and leave")
     _, rest = parser.parse_known_args(words)
     what = "TASK" if group else "COMMAND"
-    last = [name.removeprefix(group).strip() for name in known]
+    last = list(dict.fromkeys(name.removeprefix(group).split()[0] for name in known))
     if not rest or rest[0].startswith("-"):
         parser.error(f"expected {what} first, one of {', '.join(last)}")
     parser.error(f"unknown {what} {rest[0]!r}, expected one of {', '.join(last)}{_nearest(rest[0], last)}")

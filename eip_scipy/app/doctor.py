@@ -159,16 +159,13 @@ class Doctor(Study[Examined]):
         return found
 
     def text(self, found: Examined) -> str:
-        """Versions, extras, and a table of the trials."""
         return _text(*found)
 
     def numbers(self, found: Examined) -> dict[str, Any]:
-        """The same."""
         trials = [{**trial._asdict(), "passed": trial.passed} for trial in found.trials]
         return {"installation": found.installed, "extras": found.extras, "checks": trials}
 
     def checks(self, found: Examined) -> Sequence[Trial]:
-        """All trials."""
         return found.trials
 
 

@@ -52,7 +52,6 @@ class Listing(Study[Found]):
         }
 
     def text(self, found: Found) -> str:
-        """A list for each kind."""
         lines = []
         for heading, entries in found.items():
             width = max(map(len, entries))
@@ -60,7 +59,6 @@ class Listing(Study[Found]):
         return "\n".join(lines)
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """The same."""
         return dict(found)
 
 

@@ -236,7 +236,6 @@ class Efficiency(Study[Found]):
     stem: str = "fig-efficiency"
 
     def measure(self, session: Session) -> Found:
-        """Run all."""
         plane = plane_wave((self.points, self.points), t_end=T_END, fft=make_transforms().name)
         assert plane.reference is not None
         exact = plane.reference(T_END)
@@ -260,7 +259,6 @@ class Efficiency(Study[Found]):
         return [*known, Slope(WAVES[1], "mass and energy of EIP-ME", 0.0, left, LEFT)]
 
     def text(self, found: Found) -> str:
-        """Lay out slopes and costs, and what is not as it should be."""
         parts = [describe_machine()]
         for wave, trial in found.items():
             body = []
@@ -277,7 +275,6 @@ class Efficiency(Study[Found]):
         return "\n\n".join(parts)
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """The checks."""
         names = ("wave", "quantity", "known", "ours")
         return {
             "checks": [
@@ -287,7 +284,6 @@ class Efficiency(Study[Found]):
         }
 
     def tables(self, found: Found) -> dict[str, Rows]:
-        """A row for each run."""
         return {
             f"{self.stem}.csv": [{"wave": wave, **row} for wave, trial in found.items() for row in trial.rows.values()]
         }

@@ -61,7 +61,6 @@ class VortexLines(QuenchStudy):
     turn_known: float = 0.02
 
     def arguments(self) -> dict[str, Any]:
-        """Of the runs."""
         return {"h": self.step, "t_end": self.t_end}
 
     def measure(self, session: Session) -> QuenchRuns:

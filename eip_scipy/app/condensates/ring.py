@@ -63,7 +63,6 @@ class Ring(QuenchStudy):
         super().check_settings()
 
     def arguments(self) -> dict[str, Any]:
-        """Of the runs."""
         return {"h": self.step, "t_end": self.t_end}
 
     def measure(self, session: Session) -> QuenchRuns:

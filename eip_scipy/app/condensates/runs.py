@@ -336,19 +336,15 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
         return made
 
     def text(self, found: QuenchRuns) -> str:
-        """Errors, vortices and checks."""
         return _text(found, self.checks(found))
 
     def checks(self, found: QuenchRuns) -> list[FieldCheck]:
-        """Of the runs that were done."""
         return [*_checks(found), *found.more]
 
     def tables(self, found: QuenchRuns) -> dict[str, Rows]:
-        """The errors in time."""
         return {f"{found.quench.name}.csv": _rows(found)}
 
     def numbers(self, found: QuenchRuns) -> dict[str, Any]:
-        """Errors, times, checks, and the vortices in time."""
         numbers: dict[str, Any] = {
             "errors": _rows(found),
             "wall_time_s": {name: line.wall_time for name, line in found.lines.items()},

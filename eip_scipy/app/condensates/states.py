@@ -220,11 +220,9 @@ class GroundStates(Study[Results]):
     trap_points: int = 128
 
     def arguments(self) -> dict[str, Any]:
-        """With the scenes that ran."""
         return {"scenes": list(dict.fromkeys(self.scene or self.scenes)), "starts": self.starts, "seed": self.seed}
 
     def measure(self, session: Session) -> Results:
-        """Search each scene's states."""
         with searching(session) as update:
             return {name: self.scenes[name](self, update) for name in self.arguments()["scenes"]}
 
@@ -251,7 +249,6 @@ class GroundStates(Study[Results]):
         return checks
 
     def text(self, found: Results) -> str:
-        """Lay out a table for each scene, and the checks."""
         head = [["E"], ["mu"], ["residual"], ["iterations"], ["vortices"]]
         machine = f"{describe_machine()}; residual: norm of H psi - mu psi."
         out = ["Ground states of the rotating Gross-Pitaevskii equation", machine]
@@ -264,11 +261,9 @@ class GroundStates(Study[Results]):
         return "\n".join([*out, "", *(check.line for check in self.checks(found))])
 
     def tables(self, found: Results) -> dict[str, Rows]:
-        """A row for each state."""
         return {"ground-states.csv": _rows(found)}
 
     def numbers(self, found: Results) -> dict[str, Any]:
-        """The same rows, and the checks."""
         return {"states": _rows(found), "checks": [check.record for check in self.checks(found)]}
 
     def figures(self, found: Results) -> Figures:

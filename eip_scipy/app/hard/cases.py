@@ -389,16 +389,13 @@ class HardCases(Study[list[Comparison]]):
         return {"method": self.method, "rtol": rtol, "atol": ATOL_PER_RTOL * rtol, "metric": self.metric}
 
     def measure(self, session: Session) -> list[Comparison]:
-        """All cases."""
         with session.bar(len(self.cases), "hard cases", "case") as bar:
             return compare(self.cases, adaptive_methods()[self.method], self.tolerance, self.metric, bar.update)
 
     def checks(self, found: list[Comparison]) -> list[Check]:
-        """The bars."""
         return bars(found, self.method, self.tolerance, self.metric)
 
     def text(self, found: list[Comparison]) -> str:
-        """Table, summary, cases that get worse, and checks."""
         return text(found, self.checks(found), self.arguments())
 
     @property
@@ -406,16 +403,13 @@ class HardCases(Study[list[Comparison]]):
         return f"hard-cases-{self.method}-{self.metric}"
 
     def tables(self, found: list[Comparison]) -> dict[str, Rows]:
-        """A row for each case."""
         return {f"{self._stem}.csv": rows(found)}
 
     def numbers(self, found: list[Comparison]) -> dict[str, Any]:
-        """Cases, summary and checks."""
         checks = [check._asdict() for check in self.checks(found)]
         return {"cases": rows(found), "summary": summary(found), "checks": checks}
 
     def figures(self, found: list[Comparison]) -> Figures:
-        """Errors with projection against those without."""
         from ...plotting import gains_figure
 
         rtol = self.tolerance

@@ -81,11 +81,9 @@ class HardScenes(Study[Found]):
     spread: Spread = field(default_factory=Spread)
 
     def arguments(self) -> dict[str, Any]:
-        """The scenes that ran."""
         return {"scenes": list(dict.fromkeys(self.scene or SCENES))}
 
     def measure(self, session: Session) -> Found:
-        """All methods on each scene."""
         rebound = session.peer("rebound", "WHFast and IAS15")
         scenes = [scene(name) for name in self.arguments()["scenes"]]
         points = sum(len(method.settings) for of in scenes for method in methods(of, self.spread, rebound).values())
@@ -94,7 +92,6 @@ class HardScenes(Study[Found]):
         return Found(results, describe_machine())
 
     def text(self, found: Found) -> str:
-        """Lay out a table for each scene, and what each method costs at one error."""
         lines = [
             "Hard scenes: error against cost",
             f"{found.machine}; one thread, least of at most {self.spread.repeats} runs.",
@@ -113,11 +110,9 @@ class HardScenes(Study[Found]):
         return "\n".join([*lines, "", *_failures(failures), *_costs(found.results)])
 
     def tables(self, found: Found) -> dict[str, Rows]:
-        """A row for each point."""
         return {"hard-scenes.csv": _rows(found.results)}
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """The same rows."""
         return {"points": _rows(found.results)}
 
     def figures(self, found: Found) -> Figures:

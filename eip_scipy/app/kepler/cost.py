@@ -64,7 +64,6 @@ class KeplerCost(Study[Found]):
     pairs: Mapping[type[EIPSolver], Sequence[float]] = field(default_factory=lambda: PAIRS)
 
     def measure(self, session: Session) -> Found:
-        """Run all methods."""
         problem = kepler(t_end=self.t_end)
         adaptive = replace(problem, h=None)
         truth = integrate(problem, method=EIPDOP853, h=self.t_end / self.reference_steps, compensated=True).y[:2, -1]
@@ -83,7 +82,6 @@ class KeplerCost(Study[Found]):
         return Found(points, result.machine)
 
     def text(self, found: Found) -> str:
-        """Lay out the cost of each method at some errors."""
         title = f"Work and precision: perturbed Kepler problem, e = 0.6, H and L kept, t = {self.t_end:g}"
         parts = [title, found.machine]
         for cost, unit, factor in (("nfev", "1000 evaluations of f", 1e-3), ("wall_time", "milliseconds", 1e3)):
@@ -98,11 +96,9 @@ class KeplerCost(Study[Found]):
         return "\n".join(parts)
 
     def tables(self, found: Found) -> dict[str, Rows]:
-        """A row for each run."""
         return {"work-precision.csv": self._rows(found)}
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """The same rows."""
         return {"points": self._rows(found)}
 
     def _rows(self, found: Found) -> Rows:
@@ -120,7 +116,6 @@ class KeplerCost(Study[Found]):
         ]
 
     def figures(self, found: Found) -> Figures:
-        """Error against evaluations and against time."""
         from ...plotting import CostPanel, cost_figure
 
         costs = {"nfev": "evaluations of f", "wall_time": "wall time [s]"}

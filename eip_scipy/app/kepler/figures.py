@@ -93,7 +93,6 @@ class KeplerFigures(Study[Found]):
     known: Sequence[tuple[str, str, str, str, str]] = KNOWN
 
     def measure(self, session: Session) -> Found:
-        """Run the methods and the reference."""
         problem = kepler()
         span = (0.0, round(self.t_end / STEP) * STEP)
         tight = integrate(
@@ -117,7 +116,6 @@ class KeplerFigures(Study[Found]):
         return checks
 
     def text(self, found: Found) -> str:
-        """Lay out the errors and the known values."""
         t_end = next(iter(found.values())).t[-1]
         head = [["error of", "H"], ["error of", "L"], ["error of", "position"]]
         body = [
@@ -130,12 +128,10 @@ class KeplerFigures(Study[Found]):
         return "\n".join([title, "", table(head, body), "", *(check.line for check in self.checks(found))])
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """The known values and ours."""
         checks = self.checks(found)
         return {"checks": [{**c._asdict(), "known": float(c.known), "matched": c.passed} for c in checks]}
 
     def tables(self, found: Found) -> dict[str, Rows]:
-        """Every 50th step."""
         lines = [
             {
                 "method": name,
@@ -152,7 +148,6 @@ class KeplerFigures(Study[Found]):
         return {"fig-kepler.csv": lines}
 
     def figures(self, found: Found) -> Figures:
-        """The paper's two."""
         from ...plotting import KeplerRun, paper_kepler_figure
 
         for file, (title, methods) in FIGURES.items():

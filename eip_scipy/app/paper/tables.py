@@ -163,7 +163,6 @@ class PaperTable(Study[list[Cell]]):
         return cells
 
     def text(self, found: list[Cell]) -> str:
-        """The table."""
         return table_text(found)
 
     def checks(self, found: list[Cell]) -> list[Check]:
@@ -171,7 +170,6 @@ class PaperTable(Study[list[Cell]]):
         return [Check(self.name, passed(found))]
 
     def tables(self, found: list[Cell]) -> dict[str, Rows]:
-        """Errors, then orders."""
         data = self.numbers(found)
         kinds = (("cells", "error"), ("orders", "order"))
         return {

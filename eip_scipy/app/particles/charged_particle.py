@@ -31,7 +31,6 @@ class ChargedParticle(Study[Found]):
         return self.scenes
 
     def measure(self, session: Session) -> Found:
-        """All methods in each scene."""
         if find_spec("numba") is None:
             warn('the fields are Python here, which takes hours; with pip install "eip_scipy[numba]" it is a minute')
         runs = len(self.chosen()) * (1 + (len(PAPER_METHODS) if self.paper_only else len(METHODS) + 1))
@@ -39,15 +38,12 @@ class ChargedParticle(Study[Found]):
             return {name: study(name, paper_only=self.paper_only, callback=bar.update) for name in self.chosen()}
 
     def text(self, found: Found) -> str:
-        """Numbers and checks, scene by scene."""
         return "\n\n".join(report.text(scene) for scene in found.values())
 
     def checks(self, found: Found) -> list[report.RangeCheck]:
-        """Of all scenes."""
         return [check for scene in found.values() for check in report.checks(scene)]
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """Numbers by scene and method, and the checks."""
         checks = self.checks(found)
         return {
             "scenes": {name: scene.numbers for name, scene in found.items()},
@@ -56,7 +52,6 @@ class ChargedParticle(Study[Found]):
         }
 
     def tables(self, found: Found) -> dict[str, Rows]:
-        """Orbits and errors of all scenes."""
         return {f"{self.stem}.csv": [row for scene in found.values() for row in report.rows(scene)]}
 
     def figures(self, found: Found) -> Figures:

@@ -149,7 +149,6 @@ class Frontier(Study[Found]):
             raise UsageError(f"there is no stored reference state: --years must be one of {known}, got {self.years:g}")
 
     def measure(self, session: Session) -> Found:
-        """Run and time all methods."""
         peers = session.peer("rebound", "WHFast and IAS15"), session.peer("heyoka", "heyoka")
         peer, heyoka = (None if found is None else found.run for found in peers)
         problem = solar_system(years=self.years)
@@ -163,7 +162,6 @@ class Frontier(Study[Found]):
         return Found(runs, describe_machine())
 
     def text(self, found: Found) -> str:
-        """Lay out all runs, and what it costs to reach a level of error."""
         others = np.delete(np.array(load("de440").bodies[1:]), MERCURY)
         body = []
         for item in found.runs:
@@ -186,11 +184,9 @@ class Frontier(Study[Found]):
         return "\n".join(parts)
 
     def tables(self, found: Found) -> dict[str, Rows]:
-        """A row for each run."""
         return {"frontier.csv": _rows(found.runs)}
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """The same rows."""
         return {"runs": _rows(found.runs)}
 
     def figures(self, found: Found) -> Figures:

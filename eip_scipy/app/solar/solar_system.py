@@ -55,7 +55,6 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
     timed_methods: Callable[..., Mapping[str, Any]] = cost_methods
 
     def check_settings(self) -> None:
-        """See that there is one start."""
         if self.data is not None and self.epoch is not None:
             raise UsageError("argument --epoch: not allowed with argument --data")
         if self.kernel is not None and self.epoch is None:
@@ -63,7 +62,6 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         super().check_settings()
 
     def arguments(self) -> dict[str, Any]:
-        """What the runs depend on."""
         known = {key: getattr(self, key) for key in ("years", "h", "method", "metric")}
         start = {"data": self.data or DATA} if self.epoch is None else {"epoch": self.epoch, "kernel": self.kernel}
         return known | start
@@ -123,7 +121,6 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return True
 
     def text(self, found: Found) -> str:
-        """Head, table, notes and checks."""
         return report.text(found.runs, self)
 
     def checks(self, found: Found) -> list[Check]:
@@ -131,12 +128,10 @@ class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
         return found.runs.checks()
 
     def tables(self, found: Found) -> dict[str, Rows]:
-        """The errors of all runs and, once they are there, the timings."""
         timed = {"error-against-cost.csv": report.cost_rows(found.runs)} if found.runs.cost else {}
         return {"solar-system.csv": report.csv_rows(found.runs), **timed}
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """All numbers."""
         return report.json_content(found.runs)
 
     def figures(self, found: Found) -> Figures:

@@ -231,7 +231,6 @@ class Truth(AnyEpoch, Study[Found]):
         ]
 
     def text(self, found: Found) -> str:
-        """The table: for each time the error of each planet in km and arcsec."""
         runs = found.runs
         bodies, years = list(runs[0].km), runs[0].years
         lines: list[tuple[str, Sequence[str]]] = []
@@ -250,16 +249,13 @@ class Truth(AnyEpoch, Study[Found]):
         return head + table([[body] for body in bodies], lines)
 
     def tables(self, found: Found) -> dict[str, Rows]:
-        """All saved times."""
         return {"solar-truth.csv": csv_rows(found.runs)}
 
     def numbers(self, found: Found) -> dict[str, Any]:
-        """The numbers of the table, and what failed."""
         failed = [check.text for check in self.checks(found) if not check.passed]
         return {"epoch": found.start, "step_yr": found.step, "errors": table_rows(found.runs), "failed": failed}
 
     def figures(self, found: Found) -> Figures:
-        """The errors in time."""
         from ...plotting import longitude_figure
 
         runs = found.runs
