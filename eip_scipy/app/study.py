@@ -5,9 +5,10 @@ A new command is a file with a subclass of `Study`, and a line in `eip_scipy.app
 
 from __future__ import annotations
 
+import argparse
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields
 from importlib import import_module
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from ..checkpoint import CheckpointError
+from ..core.names import nearest
 from .commands import CHECK_FAILED, DONE, INTERRUPTED
 from .report import UsageError, check_folder, check_target, document, say, warn, write_csv, write_file, write_json
 
@@ -27,6 +29,7 @@ __all__ = [
     "Session",
     "Study",
     "Verdict",
+    "one_of",
     "option",
     "perform",
 ]
@@ -55,6 +58,29 @@ def option(default: Any, text: str, **settings: Any) -> Any:
     dataclasses.Field
     """
     return field(default=default, metadata={"help": text, **settings})
+
+
+def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
+    """Make a ``type`` of an option that takes one of these names, and says which is nearest to another.
+
+    Parameters
+    ----------
+    what : str
+        What they name.
+    known : collection of str
+
+    Returns
+    -------
+    callable
+    """
+
+    def read(text: str) -> str:
+        if text in known:
+            return text
+        hint = nearest(text.lower(), known)
+        raise argparse.ArgumentTypeError(f"unknown {what} {text!r}, expected one of {', '.join(known)}{hint}")
+
+    return read
 
 
 class Verdict(Protocol):

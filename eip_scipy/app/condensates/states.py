@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.names import nearest
 from ...problems.gross_pitaevskii import (
     Grid,
     GrossPitaevskii,
@@ -31,7 +30,7 @@ from ...problems.gross_pitaevskii import (
 )
 from ..long_runs import Checkpoints
 from ..report import UsageError, compact, describe_machine, table, write_file
-from ..study import Figures, Rows, Session, Study, option
+from ..study import Figures, Rows, Session, Study, one_of, option
 
 __all__ = [
     "LINES",
@@ -184,14 +183,6 @@ class KnownState(NamedTuple):
         return f"{verdict:<6} {self.quantity} {self.known:.10g}, ours {self.ours:.10g}{note}"
 
 
-def _scene(name: str) -> str:
-    if name in SCENES:
-        return name
-    raise argparse.ArgumentTypeError(
-        f"unknown scene {name!r}, expected one of {', '.join(SCENES)}{nearest(name, SCENES)}"
-    )
-
-
 def _count(text: str) -> int:
     try:
         value = int(text)
@@ -210,7 +201,7 @@ class GroundStates(Study[Results]):
         None,
         f"one scene, may be repeated; default: all ({', '.join(SCENES)})",
         action="append",
-        type=_scene,
+        type=one_of("scene", SCENES),
         metavar="NAME",
     )
     starts: int = option(4, "starts for each rotation in the trap (%(default)s)", type=_count, metavar="N")

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.names import nearest
 from ..report import compact, describe_machine, table
-from ..study import Figures, Rows, Session, Study, option
+from ..study import Figures, Rows, Session, Study, one_of, option
 from ..work_precision import cost_to_reach, curves
 from .runs import ATOL_PER_RTOL, SCENES, HardScene, Point, Spread, measure, methods, scene
 
@@ -25,14 +23,6 @@ class Found(NamedTuple):
 
     results: Results
     machine: str
-
-
-def _known(name: str) -> str:
-    if name in SCENES:
-        return name
-    raise argparse.ArgumentTypeError(
-        f"unknown scene {name!r}, expected one of {', '.join(SCENES)}{nearest(name, SCENES)}"
-    )
 
 
 def _cells(point: Point) -> list[str]:
@@ -75,7 +65,7 @@ class HardScenes(Study[Found]):
         None,
         f"one scene, may be repeated; default: all ({', '.join(SCENES)})",
         action="append",
-        type=_known,
+        type=one_of("scene", SCENES),
         metavar="NAME",
     )
     spread: Spread = field(default_factory=Spread)

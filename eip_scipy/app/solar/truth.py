@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.names import nearest
 from ...core.solvers import EIPDOP853
 from ...problems import SolarSystemData, solar_system
 from ...problems.gravity.forces import FORCES, check_forces
@@ -18,7 +16,7 @@ from ...problems.gravity.solar_data import AU_KM, YEAR_D
 from ...run.integrate import integrate
 from ..long_runs import named, positive
 from ..report import UsageError, compact, table, warn
-from ..study import Check, Figures, PartlyDone, Rows, Session, Study, option
+from ..study import Check, Figures, PartlyDone, Rows, Session, Study, one_of, option
 from .epoch import AnyEpoch, kernels, one_line
 from .runs import whole_number
 
@@ -27,6 +25,7 @@ __all__ = ["Found", "Model", "ModelRun", "Truth", "errors", "models", "run_model
 PAPER_EPOCH = (2456690.5, 20.3 / 24)
 STEP = 0.001
 MOON = "moon"  # no force but a body, chosen beside the forces
+KNOWN = (*FORCES, MOON)
 STANDARD = ((), ("1pn",), ("1pn", "moon-quadrupole"), ("1pn", MOON), ("1pn", "j2", MOON))
 REPORTED = (1.0, 10.0, 100.0)
 PANELS = ("Mercury", "EMB", "Mars", "Jupiter")
@@ -56,14 +55,6 @@ class ModelRun(NamedTuple):
     arcsec: dict[str, np.ndarray]
     step_km: dict[str, float]
     """Change of the final position when the step is halved."""
-
-
-def _force(text: str) -> str:
-    known = [*FORCES, MOON]
-    if text in known:
-        return text
-    hint = nearest(text.lower(), known, cutoff=0.4)
-    raise argparse.ArgumentTypeError(f"unknown force {text!r}; known: {', '.join(known)}{hint}")
 
 
 def models(forces: Sequence[str] | None) -> list[Model]:
@@ -183,8 +174,8 @@ class Truth(AnyEpoch, Study[Found]):
     h: float | None = option(None, f"step in years, shortened to divide the run ({STEP:g})", type=positive)
     forces: Sequence[str] | None = option(
         None,
-        f"one model in place of the standard ones, of {', '.join([*FORCES, MOON])}",
-        type=_force,
+        f"one model in place of the standard ones, of {', '.join(KNOWN)}",
+        type=one_of("force", KNOWN),
         nargs="+",
         metavar="FORCE",
     )
