@@ -47,5 +47,5 @@ starts = np.array([[0.4, 0, 0, 2], [0.5, 0, 0, 1.7]])
 members = ensemble(kepler(), (0, 10), starts, method=EIPRK4)
 assert members.success, members.message
 
-subprocess.run([Path(sysconfig.get_path("scripts")) / "eip-scipy", "--help"], check=True, stdout=subprocess.DEVNULL)
+subprocess.run([Path(sysconfig.get_path("scripts")) / "eip-scipy", "list"], check=True, stdout=subprocess.DEVNULL)
 print(f"eip_scipy {eip_scipy.__version__} ({BUILD.__name__}) on {sys.version.split()[0]}: {size / 1e6:.2f} MB, works")

@@ -29,8 +29,9 @@ from scipy.integrate import solve_ivp
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, EIPSolver, integrate
 from eip_scipy.app.particles.runs import SCENES, scene
 from eip_scipy.app.report import compact, describe_machine, document, table, write_json
+from eip_scipy.app.work_precision import curves
 from eip_scipy.comparators import boris, implicit_midpoint
-from eip_scipy.plotting import frontier_figure
+from eip_scipy.plotting import CostPanel, cost_figure
 from eip_scipy.problems import ParticleProblem, tokamak
 from eip_scipy.problems.particle_orbits import ParticleOrbit
 
@@ -239,16 +240,13 @@ def errors(orbit: ParticleOrbit, truth: ParticleOrbit) -> tuple[float, float]:
 def draw(points: list[Point], folder: Path) -> None:
     """One figure for each scene."""
     for name in dict.fromkeys(point.scene for point in points):
-        series = {}
-        for method in dict.fromkeys(point.method for point in points):
-            mine = [point for point in points if (point.scene, point.method) == (name, method)]
-            keys = {"wall_time": "wall_time", "position": "position", "guiding centre": "guiding_centre"}
-            series[method] = {key: np.array([getattr(point, field) for point in mine]) for key, field in keys.items()}
-        figure = frontier_figure(
-            series,
-            unit="system size",
+        mine = [point for point in points if point.scene == name]
+        kinds = {"position": "position", "guiding_centre": "guiding centre"}
+        panels = [CostPanel(title, "processor time [s]", curves(mine, error=key)) for key, title in kinds.items()]
+        figure = cost_figure(
+            [panels],
+            error="error [system size]",
             title=f"Charged particle, {name.replace('-', ', ')}: error at the end of the paper's interval against cost",
-            time="processor time [s]",
             footnote=f"{describe_machine()}; one thread",
         )
         figure.savefig(folder / f"charged-particle-cost-{name}.png")

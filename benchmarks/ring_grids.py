@@ -18,7 +18,7 @@ import numpy as np
 from scipy.signal import resample
 
 from eip_scipy import EIPRK4, eip_method, integrate
-from eip_scipy.app.condensates.ring import KAPPA_AFTER, KAPPA_BEFORE, SAVED, SNAPSHOTS, STEP
+from eip_scipy.app.condensates.ring import Ring
 from eip_scipy.app.condensates.runs import motion
 from eip_scipy.app.condensates.states import load_state
 from eip_scipy.app.report import describe_machine, table, write_csv
@@ -33,10 +33,11 @@ from eip_scipy.problems.gross_pitaevskii import (
 
 START_POINTS = 256
 SPLITTING_STEP = 1.25e-3
+RING = Ring()
 
 
 def ground(file):
-    gpe = ring_condensate(KAPPA_BEFORE, points=START_POINTS)
+    gpe = ring_condensate(RING.kappas[0], points=START_POINTS)
     return ground_state(gpe, ring_start(gpe, 38, 123), tol=1e-8).psi if file is None else load_state(file, gpe)
 
 
@@ -56,16 +57,16 @@ class Run:
     """A run's fields at the snapshots in the frame at rest, and its vortices seen from the rotating one."""
 
     def __init__(self, psi, points, t_end, *, turning=False):
-        gpe = ring_condensate(KAPPA_AFTER, points=points)
-        problem = gpe.problem(on_grid(psi, points), t_end, STEP if turning else SPLITTING_STEP)
+        gpe = ring_condensate(RING.kappas[1], points=points)
+        problem = gpe.problem(on_grid(psi, points), t_end, RING.step if turning else SPLITTING_STEP)
         problem = problem if turning else at_rest(problem)
         method = EIPRK4 if turning else eip_method(Splitting(problem.equation))
-        result = integrate(problem, method=method, save_every=round(SAVED / problem.h), progress=True)
+        result = integrate(problem, method=method, save_every=round(RING.saved / problem.h), progress=True)
         self.label = f"{points} x {points}, {'turning, RK4' if turning else 'at rest, splitting'}"
         self.wall_time = result.wall_time
         # The phases of a field at rest are those of the turning one at turned points: vortices are found in either.
         moved = motion(gpe, result.t, result.y)
-        self.times = [at for at in SNAPSHOTS if at <= t_end + 1e-9]
+        self.times = [at for at in RING.snapshots if at <= t_end + 1e-9]
         at = [int(np.argmin(np.abs(result.t - t))) for t in self.times]
         self.counts = [len(moved.found[k].charges) for k in at]
         self.turned = [moved.angle[k] - (0.0 if turning else gpe.Omega * result.t[k]) for k in at]
@@ -76,7 +77,7 @@ class Run:
         ]
 
     def errors(self, fine):
-        cell = ring_condensate(KAPPA_AFTER, points=fine.fields[0].shape[0]).grid.cell
+        cell = ring_condensate(RING.kappas[1], points=fine.fields[0].shape[0]).grid.cell
         pairs = zip(self.fields, fine.fields, strict=True)
         return [float(np.sqrt(cell) * np.linalg.norm(on_grid(a, len(b)) - b)) for a, b in pairs]
 

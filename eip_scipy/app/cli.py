@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
-from .. import comparators, problems
-from ..core.results import ProjectionWarning
-from ..core.versions import versions
-from ..problems.gravity import solar_data
-from . import doctor
-from .condensates import gpe
-from .hard import cases as hard_cases
-from .hard import scenes as hard_scenes
-from .kepler import cost as kepler_cost
-from .paper import reproduce
-from .particles import charged_particle
-from .report import UsageError, check_target, document, listening, say, warn, write_json
-from .solar import frontier as solar_frontier
-from .solar import solar_system
-from .solar import truth as solar_truth
+from .commands import CHECK_FAILED, COMMANDS, DONE, INTERRUPTED, MOVED, WRONG_USAGE
 
 __all__ = ["main"]
 
-DONE, CHECK_FAILED, WRONG_USAGE = 0, 1, 2
+PROGRAM = "eip-scipy"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -35,13 +23,25 @@ class _Parser(argparse.ArgumentParser):
         self.exit(WRONG_USAGE, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+class _Version(argparse.Action):
+    """Asks for the version when it is wanted, which takes reading."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        from importlib.metadata import version
+
+        print(f"eip_scipy {version('eip_scipy')}")
+        parser.exit()
+
+
+def main(argv: Sequence[str] | None = None, **settings: Any) -> int:
     """Run one command.
 
     Parameters
     ----------
     argv : sequence of str, optional
         Arguments; default: those of the process.
+    **settings
+        Of the command, in place of its own defaults.
 
     Returns
     -------
@@ -49,46 +49,89 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 a check inside the command failed or a run is not to be trusted, 2 wrong usage, 130
         interrupted.
     """
-    with listening(ProjectionWarning) as untrusted:
-        try:
-            status = _run(argv)
-        finally:
-            for message in untrusted:
-                warn(message)
-    return CHECK_FAILED if status == DONE and untrusted else status
-
-
-def _run(argv: Sequence[str] | None) -> int:
+    words = list(sys.argv[1:] if argv is None else argv)
+    name = next((name for name in _longest_first() if words[: name.count(" ") + 1] == name.split()), None)
     try:
-        args = _parser().parse_args(argv)
-        args.absent = []
-        status = int(args.run(args))
-        for line in args.absent:  # at the end, where it is seen
-            warn(line)
-        return status
+        if name is None:
+            return _no_command(words)
+        return _run(name, words[name.count(" ") + 1 :], settings)
     except SystemExit as leave:  # argparse, for --help, --version and errors
         return int(leave.code or DONE)
-    except UsageError as error:
-        warn(str(error))
-        return WRONG_USAGE
-    except KeyboardInterrupt:
-        warn("interrupted")
-        return 130
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="eip-scipy", description="Explicit invariants-preserving integrators for SciPy.")
-    parser.add_argument("--version", action="version", version=f"eip_scipy {versions()['eip_scipy']}")
-    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
-    for name, (summary, add_arguments, run) in _commands().items():
-        command = commands.add_parser(name, help=summary, description=summary)
-        add_arguments(command)
-        _add_common(command)
-        command.set_defaults(run=run)
-    return parser
+def _longest_first() -> list[str]:
+    return sorted(COMMANDS, key=lambda name: -name.count(" "))
 
 
-def _add_common(parser: argparse.ArgumentParser) -> None:
+def _no_command(words: list[str]) -> int:
+    """The first word is an option, or the first of a command's two words, or mistyped."""
+    groups = {name.split()[0] for name in COMMANDS if " " in name} - set(COMMANDS)
+    group = words.pop(0) if words and words[0] in groups else ""
+    known = [name for name in COMMANDS if name.startswith(group)]
+    parser = _Parser(
+        prog=f"{PROGRAM} {group}".rstrip(),
+        usage=f"{PROGRAM} {group or 'COMMAND'} {'TASK ' if group else ''}[options]",
+        description="Explicit invariants-preserving integrators for SciPy." if not group else None,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_listed(known),
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and leave")
+    _, rest = parser.parse_known_args(words)
+    what = "TASK" if group else "COMMAND"
+    last = list(dict.fromkeys(name.removeprefix(group).split()[0] for name in known))
+    if not rest or rest[0].startswith("-"):
+        parser.error(f"expected {what} first, one of {', '.join(last)}")
+    parser.error(f"unknown {what} {rest[0]!r}, expected one of {', '.join(last)}{_nearest(rest[0], last)}")
+
+
+def _listed(names: Sequence[str]) -> str:
+    width = max(map(len, names))
+    return "\n".join(["commands:", *(f"  {name:<{width}}  {COMMANDS[name].summary}" for name in names)])
+
+
+def _nearest(word: str, known: Sequence[str]) -> str:
+    from ..core.names import nearest
+
+    return nearest(word, known)
+
+
+def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
+    module, _, kind = COMMANDS[name].where.partition(":")
+    below = [other for other in COMMANDS if other.startswith(f"{name} ")]
+    parser = _Parser(
+        prog=f"{PROGRAM} {name}",
+        description=COMMANDS[name].summary,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_listed(below) if below else None,
+    )
+    for flag in (word.partition("=")[0] for word in words):
+        if (name, flag) in MOVED:
+            parser.exit(WRONG_USAGE, f"{parser.prog}: {flag} is now: {PROGRAM} {MOVED[name, flag]}\n")
+    command = getattr(import_module(f".{module}", __package__), kind)
+    _add_options(parser, command)
+    parser.set_defaults(**settings)
+    args, rest = parser.parse_known_args(words)
+    if rest:
+        known = [
+            *(text for action in parser._actions for text in action.option_strings),
+            *(b.split()[1] for b in below),
+        ]
+        parser.error(f"unrecognized arguments: {' '.join(rest)}{_nearest(rest[0].partition('=')[0], known)}")
+    return _conduct(name, command, args)
+
+
+def _add_options(parser: argparse.ArgumentParser, command: Any) -> None:
+    """Those of the command, which are fields of it, and those of all commands."""
+    for item in fields(command):
+        if "help" not in item.metadata:
+            continue
+        settings = {"default": item.default, **item.metadata}
+        flag = f"--{item.name.replace('_', '-')}"
+        if settings.pop("positional", False):
+            flag = item.name
+        elif item.default is False:
+            settings["action"] = "store_true"
+        parser.add_argument(flag, **settings)
     parser.add_argument(
         "--out", type=Path, default=Path("eip_results"), metavar="DIR", help="folder of figures and CSV (./%(default)s)"
     )
@@ -96,113 +139,25 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
 
-def _commands() -> dict[str, tuple[str, Any, Any]]:
-    """For each command a summary, what adds its options, and what runs it."""
-    return {
-        "list": ("list commands, methods, problems and data sets", lambda parser: None, _list),
-        "doctor": ("what is installed, and a test of it in seconds", lambda parser: None, doctor.run),
-        "solar-system": (
-            "run the solar system and compare with other methods (the paper's Experiment II)",
-            solar_system.add_arguments,
-            _solar_system,
-        ),
-        "charged-particle": (
-            "charged particles in two fields by several methods (the paper's Experiment III)",
-            charged_particle.add_arguments,
-            charged_particle.run,
-        ),
-        "hard-cases": (
-            "run 35 hard cases with and without projection",
-            hard_cases.add_arguments,
-            hard_cases.run,
-        ),
-        "hard-scenes": (
-            "error against cost on high eccentricities, chaos and close encounters, beside IAS15",
-            hard_scenes.add_arguments,
-            lambda args: hard_scenes.run(args, _rebound(args)),
-        ),
-        "gpe": (
-            "rotating Gross-Pitaevskii equation: ground states, the ring, and vortex lines (Experiment IV)",
-            gpe.add_arguments,
-            gpe.run,
-        ),
-        "work-precision": (
-            "error against cost of all methods on the perturbed Kepler problem",
-            kepler_cost.add_arguments,
-            kepler_cost.run,
-        ),
-        "reproduce": (
-            "recompute the paper's tables and figures",
-            reproduce.add_arguments,
-            lambda args: reproduce.run(args, lambda: _runner(_rebound(args))),
-        ),
-    }
+def _conduct(name: str, command: Any, args: argparse.Namespace) -> int:
+    from ..core.results import ProjectionWarning
+    from .report import UsageError, listening, warn
+    from .study import Session
 
-
-def _rebound(args: argparse.Namespace) -> Any:
-    return _peer(args, "rebound", "WHFast and IAS15")
-
-
-def _peer(args: argparse.Namespace, name: str, methods: str) -> Any:
-    """An integration, or None and a line at the end that says how to get it."""
-    try:
-        return import_module(f"eip_scipy.integrations.{name}")
-    except ImportError as error:
-        args.absent.append(f"no comparison with {methods}: {error}")
-        return None
-
-
-def _runner(peer: Any) -> Any:
-    return None if peer is None else peer.run
-
-
-def _solar_system(args: argparse.Namespace) -> int:
-    if (args.truth or args.frontier) and (args.checkpoint is not None or args.resume):
-        raise UsageError("--checkpoint and --resume go with the comparison of methods, not with --truth or --frontier")
-    if args.truth:
-        return solar_truth.run(args, _ephemeris())
-    if args.frontier:
-        return solar_frontier.run(args, _runner(_rebound(args)), _runner(_peer(args, "heyoka", "heyoka")))
-    return solar_system.run(args, _runner(_rebound(args)), lambda *where: _ephemeris().initial_data(*where))
-
-
-def _ephemeris() -> solar_truth.Ephemeris:
-    """JPL's kernels; what they need is looked for when they are read."""
-    from eip_scipy.integrations import jpl
-
-    return solar_truth.Ephemeris(jpl.initial_data, jpl.heliocentric)
-
-
-def _list(args: argparse.Namespace) -> int:
-    content = _listing()
-    if not args.quiet:
-        for heading, entries in content.items():
-            say(f"{heading}:")
-            width = max(map(len, entries))
-            for name, summary in entries.items():
-                say(f"  {name:<{width}}  {summary}".rstrip())
-    if args.json is not None:
-        check_target(args.json)
-        write_json(args.json, document("list", {}, **content))
-    return DONE
-
-
-def _listing() -> dict[str, dict[str, str]]:
-    sets = {name: solar_data.load(name) for name in solar_data.available()}
-    others = {name: getattr(comparators, name) for name in comparators.__all__}
-    scenes = {name: getattr(problems, name) for name in problems.__all__}
-    return {
-        "commands": {name: summary for name, (summary, _, _) in _commands().items()},
-        "methods": {name: _first_line(method) for name, method in solar_system.fixed_step_methods().items()},
-        "comparators": {name: _first_line(make) for name, make in others.items() if not isinstance(make, type)},
-        "problems": {
-            name: _first_line(make)
-            for name, make in scenes.items()
-            if callable(make) and not isinstance(make, type)  # neither records nor fields
-        },
-        "data": {name: f"{len(data.bodies)} bodies at {data.epoch}, {data.axes}" for name, data in sets.items()},
-    }
-
-
-def _first_line(item: Any) -> str:
-    return (item.__doc__ or "").strip().split("\n")[0].split(". ")[0].rstrip(".")
+    session = Session(name, args.out, args.json, args.quiet)
+    own = {key: value for key, value in vars(args).items() if key not in ("out", "json", "quiet")}
+    with listening(ProjectionWarning) as untrusted:
+        try:
+            status = command(**own).run(session)
+            for line in session.absent:  # at the end, where it is seen
+                warn(line)
+        except UsageError as error:
+            warn(str(error))
+            status = WRONG_USAGE
+        except KeyboardInterrupt:
+            warn("interrupted")
+            status = INTERRUPTED
+        finally:
+            for message in untrusted:
+                warn(message)
+    return CHECK_FAILED if status == DONE and untrusted else status

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
@@ -19,9 +19,10 @@ from ..engine.native import BUILD
 from ..ensembles.ensemble import ensemble
 from ..problems import kepler, solar_system
 from ..run.integrate import integrate
-from .report import check_target, compact, describe_machine, document, say, table, warn, write_json
+from .report import compact, describe_machine, table, warn
+from .study import Session, Study
 
-__all__ = ["run"]
+__all__ = ["Doctor"]
 
 # What a package that is not needed brings: module, its extra, and for what.
 EXTRAS = (
@@ -42,7 +43,7 @@ EXTRAS = (
 DEFECT, DISTANCE, PLANETS = 1e-13, 1e-11, 1e-7
 
 
-class Check(NamedTuple):
+class Trial(NamedTuple):
     """What was looked at, the number found and the largest that will do."""
 
     name: str
@@ -59,34 +60,6 @@ class Check(NamedTuple):
         return compact(self.found), compact(self.bound), f"{self.seconds:.2f}", verdict
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        With ``json`` (Path or None) and ``quiet``.
-
-    Returns
-    -------
-    int
-        Exit status: 0 all is well, 1 a check failed.
-    """
-    if args.json is not None:
-        check_target(args.json)
-    installed, extras = _installed(), _extras()
-    checks = [_timed(name, bound, measure) for name, bound, measure in CHECKS]
-    failed = [check.name for check in checks if not check.passed]
-    if not args.quiet:
-        say(_text(installed, extras, checks))
-    if args.json is not None:
-        found = [{**check._asdict(), "passed": check.passed} for check in checks]
-        write_json(args.json, document("doctor", {}, installation=installed, extras=extras, checks=found))
-    if failed:
-        warn(f"failed: {', '.join(failed)}. This installation computes something else than it must; install it anew.")
-    return 1 if failed else 0
-
-
 def _installed() -> dict[str, str]:
     found = versions()
     names = ("eip_scipy", "python", "numpy", "scipy", "tqdm")
@@ -98,21 +71,14 @@ def _installed() -> dict[str, str]:
     }
 
 
-def _extras() -> dict[str, dict[str, Any]]:
-    return {
-        module: {"installed": find_spec(module) is not None, "extra": extra, "for": what}
-        for module, extra, what in EXTRAS
-    }
-
-
-def _timed(name: str, bound: float, measure: Callable[[], float]) -> Check:
+def _timed(name: str, bound: float, measure: Callable[[], float]) -> Trial:
     begin = perf_counter()
     try:
         found = measure()
     except Exception as error:  # a part that does not even run is what the command looks for
         warn(f"{name}: {type(error).__name__}: {error}")
         found = math.nan
-    return Check(name, found, bound, perf_counter() - begin)
+    return Trial(name, found, bound, perf_counter() - begin)
 
 
 def _defects() -> float:
@@ -164,7 +130,46 @@ CHECKS = (
 )
 
 
-def _text(installed: dict[str, str], extras: dict[str, dict[str, Any]], checks: list[Check]) -> str:
+class Examined(NamedTuple):
+    """What the command found."""
+
+    installed: dict[str, str]
+    extras: dict[str, dict[str, Any]]
+    trials: list[Trial]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor(Study[Examined]):
+    """The command."""
+
+    packages: tuple[tuple[str, str, str], ...] = EXTRAS
+    trials: tuple[tuple[str, float, Callable[[], float]], ...] = CHECKS
+    writes_files = False
+
+    def measure(self, session: Session) -> Examined:
+        """Look what is there, and run each trial."""
+        extras = {
+            module: {"installed": find_spec(module) is not None, "extra": extra, "for": what}
+            for module, extra, what in self.packages
+        }
+        found = Examined(_installed(), extras, [_timed(*trial) for trial in self.trials])
+        if failed := [trial.name for trial in found.trials if not trial.passed]:
+            names = ", ".join(failed)
+            warn(f"failed: {names}. This installation computes something else than it must; install it anew.")
+        return found
+
+    def text(self, found: Examined) -> str:
+        return _text(*found)
+
+    def numbers(self, found: Examined) -> dict[str, Any]:
+        trials = [{**trial._asdict(), "passed": trial.passed} for trial in found.trials]
+        return {"installation": found.installed, "extras": found.extras, "checks": trials}
+
+    def checks(self, found: Examined) -> Sequence[Trial]:
+        return found.trials
+
+
+def _text(installed: dict[str, str], extras: dict[str, dict[str, Any]], checks: Sequence[Trial]) -> str:
     width = max(map(len, (*installed, *extras)))
     lines = [f"{name:<{width}}  {value}" for name, value in installed.items()]
     lines += ["", "extras"]

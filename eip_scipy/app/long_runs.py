@@ -1,31 +1,49 @@
-"""Commands that take minutes: their options, and what `integrate` and the user are told of checkpoints."""
+"""Commands that take minutes: their checkpoints, and what `integrate` is told of them."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..checkpoint import CheckpointError
 from ..core.solvers import EIPSolver
-from .report import UsageError, check_folder, warn
+from .report import UsageError, check_folder
+from .study import option
 
-__all__ = ["add_arguments", "check", "checkpoint_options", "named", "positive", "tell_how_to_resume", "unusable"]
+__all__ = ["Checkpoints", "named", "positive"]
 
 
-def add_arguments(parser: Any, runs: str) -> None:
-    """Add ``--checkpoint DIR`` and ``--resume``.
+@dataclass(frozen=True, kw_only=True)
+class Checkpoints:
+    """Settings of a study whose runs keep checkpoints; stands before `Study` among the bases."""
 
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser or a group of it
-    runs : str
-        Whose checkpoints they are, for the help.
-    """
-    parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"keep checkpoints of {runs} in DIR")
-    parser.add_argument("--resume", action="store_true", help="with --checkpoint: go on from those that are in DIR")
+    checkpoint: Path | None = option(
+        None, "keep checkpoints of the runs that this package does in DIR", type=Path, metavar="DIR"
+    )
+    resume: bool = option(False, "with --checkpoint: go on from those that are in DIR")
+
+    def check_settings(self) -> None:
+        """See that the options go together and the folder can be written to."""
+        if self.resume and self.checkpoint is None:
+            raise UsageError("--resume needs the folder to resume from: --checkpoint DIR")
+        if self.checkpoint is not None:
+            check_folder(self.checkpoint)
+
+    def checkpoint_options(self, name: str) -> dict[str, Any]:
+        """Options of `integrate` for the checkpoints of the run of that name: one file each."""
+        if self.checkpoint is None:
+            return {}
+        file = re.sub("[^A-Za-z0-9]+", "-", name).strip("-")
+        return {"checkpoint": self.checkpoint / f"{file}.npz", "resume": self.resume}
+
+    def when_interrupted(self) -> str:
+        """Say which command goes on, if there are checkpoints."""
+        if self.checkpoint is None:
+            return ""
+        return f"the same command with --resume goes on from the checkpoints in {str(self.checkpoint)!r}"
 
 
 def positive(text: str) -> float:
@@ -44,40 +62,6 @@ def positive(text: str) -> float:
     return value
 
 
-def check(args: argparse.Namespace) -> None:
-    """See that the options go together and the folder can be written to.
-
-    Raises
-    ------
-    UsageError
-    """
-    if args.resume and args.checkpoint is None:
-        raise UsageError("--resume needs the folder to resume from: --checkpoint DIR")
-    if args.checkpoint is not None:
-        check_folder(args.checkpoint)
-
-
-def checkpoint_options(args: argparse.Namespace, name: str) -> dict[str, Any]:
-    """Options of `integrate` for the checkpoints of the run of that name: one file each."""
-    if args.checkpoint is None:
-        return {}
-    file = re.sub("[^A-Za-z0-9]+", "-", name).strip("-")
-    return {"checkpoint": args.checkpoint / f"{file}.npz", "resume": args.resume}
-
-
 def named(method: type[EIPSolver], name: str) -> type[EIPSolver]:
     """Put the method under another name, for its progress bar and for what is said of the run."""
     return type(name, (method,), {"__doc__": method.__doc__})
-
-
-def tell_how_to_resume(args: argparse.Namespace) -> None:
-    """After an interruption: say which command goes on, if there are checkpoints."""
-    if args.checkpoint is not None:
-        warn(f"the same command with --resume goes on from the checkpoints in {str(args.checkpoint)!r}")
-
-
-def unusable(error: MemoryError | CheckpointError) -> UsageError:
-    """What `integrate` refuses, as the command line says it."""
-    if isinstance(error, MemoryError):
-        return UsageError(f"not enough memory: {error}")
-    return UsageError(f"{error} On the command line, resume=True is --resume.")

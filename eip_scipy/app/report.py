@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import math
@@ -26,7 +25,6 @@ __all__ = [
     "check_outputs",
     "check_target",
     "compact",
-    "deliver",
     "describe_machine",
     "document",
     "listening",
@@ -37,7 +35,6 @@ __all__ = [
     "write_csv",
     "write_file",
     "write_json",
-    "write_results",
 ]
 
 _untrusted: list[str] = []  # what was said of runs that are not to be trusted, since `listening` began
@@ -316,69 +313,6 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
             writer.writerows(_plain(row) for row in rows)
 
     return write_file(path, write)
-
-
-def write_results(
-    folder: Path, tables: Mapping[str, Sequence[Mapping[str, Any]]], figures: Iterable[tuple[str, Any]]
-) -> list[Path]:
-    """Write tables and figures; where matplotlib is missing, which the first figure finds, a line says so.
-
-    Parameters
-    ----------
-    folder : Path
-    tables : mapping
-        By file name the rows of a CSV file.
-    figures : iterable of (str, Figure)
-        File names and figures, each made when it is asked for.
-
-    Returns
-    -------
-    list of Path
-    """
-    written = [write_csv(folder / name, rows) for name, rows in tables.items()]
-    try:
-        for name, figure in figures:
-            written.append(write_file(folder / name, figure.savefig))
-    except ImportError as error:
-        warn(f"no figures: {error}")
-    return written
-
-
-def deliver(
-    args: argparse.Namespace,
-    command: str,
-    text: str,
-    tables: Mapping[str, Sequence[Mapping[str, Any]]],
-    figures: Iterable[tuple[str, Any]],
-    arguments: Mapping[str, Any],
-    *,
-    also: Iterable[Path] = (),
-    **content: Any,
-) -> None:
-    """Print and write what a command found, and say which files there are: the last lines of most commands.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        With ``out``, ``json`` (Path or None) and ``quiet``.
-    command, text : str
-        Its name, and what it prints.
-    tables, figures
-        See `write_results`; they go to ``args.out``.
-    arguments : mapping
-        The options of the run, for ``args.json``.
-    also : iterable of Path
-        Files that the command writes itself.
-    **content
-        The numbers, for ``args.json``.
-    """
-    if not args.quiet:
-        say(f"{text}\n")
-    written = [*write_results(args.out, tables, figures), *also]
-    if args.json is not None:
-        written.append(write_json(args.json, document(command, arguments, **content)))
-    if not args.quiet:
-        say("\n".join(f"wrote {path}" for path in written))
 
 
 def _plain(value: Any) -> Any:

@@ -1,20 +1,22 @@
-"""Error against cost: methods at several steps, timed on one machine."""
+"""Error against cost: methods at several steps, timed on one machine; and what an error costs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .report import describe_machine
+from .report import compact, describe_machine
 
-__all__ = ["Runner", "WorkPoint", "WorkPrecision", "cost_to_reach", "work_precision"]
+__all__ = ["Curve", "Runner", "WorkPoint", "WorkPrecision", "cost_to_reach", "costs_at", "curves", "work_precision"]
 
 Runner = Callable[[float], tuple[float, np.ndarray]]
 """``run(step) -> (wall_time, y)``."""
+Curve = tuple[list[float], list[float]]
+"""A method's costs and errors, from the cheapest run to the dearest."""
 
 
 class WorkPoint(NamedTuple):
@@ -61,6 +63,7 @@ def work_precision(
     *,
     repeats: int = 3,
     enough_seconds: float = 1.0,
+    in_all: float = math.inf,
     callback: Callable[[], Any] | None = None,
 ) -> WorkPrecision:
     """Run methods at several steps and take error and time.
@@ -76,6 +79,8 @@ def work_precision(
         Runs of each point, the least time of which counts: what disturbs a timing makes it longer, never shorter.
     enough_seconds : float, optional
         No further run of a point that took longer.
+    in_all : float, optional
+        Nor of one whose runs took so many seconds together.
     callback : callable, optional
         ``callback()`` after each of the ``repeats`` runs of each point, those left out included.
 
@@ -92,11 +97,13 @@ def work_precision(
         raise ValueError(f"repeats must be at least 1, got {repeats!r}.")
     points = [WorkPoint(method, step, 0.0, math.nan) for method, (_, steps) in methods.items() for step in steps]
     states = [np.empty(0)] * len(points)
+    spent = [0.0] * len(points)
     for turn in range(repeats):
         # All points in turn, not each at once: another process that disturbs for a while disturbs one run of a point.
         for k, point in enumerate(points):
-            if point.wall_time <= enough_seconds:
+            if point.wall_time <= enough_seconds and spent[k] <= in_all:
                 seconds, states[k] = methods[point.method][0](point.step)
+                spent[k] += seconds
                 least = min(seconds, point.wall_time) if turn else seconds
                 points[k] = point._replace(wall_time=least, error=_error(states[k], error))
             if callback is not None:
@@ -125,6 +132,32 @@ def cost_to_reach(costs: Any, errors: Any, level: float) -> float:
             part = math.log(errors[k - 1] / level) / math.log(errors[k - 1] / errors[k])
             return float(costs[k - 1] * (costs[k] / costs[k - 1]) ** part)
     return math.nan
+
+
+def curves(runs: Iterable[Any], cost: str = "wall_time", error: str = "error") -> dict[str, Curve]:
+    """Gather runs by their methods.
+
+    Parameters
+    ----------
+    runs : iterable
+        With ``method`` and the two attributes named, such as `WorkPoint`.
+    cost, error : str, optional
+
+    Returns
+    -------
+    dict of str to Curve
+    """
+    found: dict[str, Curve] = {}
+    for run in runs:
+        costs, errors = found.setdefault(run.method, ([], []))
+        costs.append(getattr(run, cost))
+        errors.append(getattr(run, error))
+    return found
+
+
+def costs_at(curve: Curve, levels: Iterable[float], factor: float = 1.0) -> list[str]:
+    """Cells of a table: what each level of error costs, "<" before a bound and "-" where no run is as accurate."""
+    return [("<" if curve[1][0] <= level else "") + compact(factor * cost_to_reach(*curve, level)) for level in levels]
 
 
 def _error(state: np.ndarray, error: Callable[[np.ndarray], float]) -> float:

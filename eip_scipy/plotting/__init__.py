@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
+    "CostPanel",
     "Curves",
     "ErrorSeries",
     "FieldPanel",
@@ -35,11 +36,9 @@ __all__ = [
     "ParticleRow",
     "SurfacePanel",
     "cost_figure",
-    "efficiency_figure",
     "errors_figure",
     "fields_figure",
     "fields_movie",
-    "frontier_figure",
     "gains_figure",
     "longitude_figure",
     "method_styles",
@@ -47,9 +46,7 @@ __all__ = [
     "orbits_figure",
     "paper_kepler_figure",
     "particle_figure",
-    "scenes_figure",
     "surfaces_figure",
-    "work_figure",
 ]
 
 # Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white, and Tol's wine.
@@ -268,42 +265,6 @@ def orbit_in_time_figure(panels: Mapping[str, tuple[Any, Any]], *, unit: str, ti
     return figure
 
 
-def cost_figure(
-    points: Iterable[Any], *, error: str, title: str = "", footnote: str = "", styles: Styles | None = None
-) -> Figure:
-    """Draw error against wall time, a line for each method.
-
-    Parameters
-    ----------
-    points : iterable of WorkPoint
-        Those without an error (failed runs) are left out.
-    error : str
-        Label of the error, with its unit.
-    title, footnote : str, optional
-    styles : mapping, optional
-        From `method_styles`.
-
-    Returns
-    -------
-    Figure
-    """
-    methods: dict[str, list[Any]] = {}
-    for point in points:
-        methods.setdefault(point.method, []).append(point)
-    styles = method_styles(methods) if styles is None else styles
-    figure = _figure(7.6, 5.2, title)
-    axis = figure.subplots()
-    for name, all_points in methods.items():
-        good = [p for p in all_points if np.isfinite(p.error) and p.error > 0]
-        axis.plot([p.wall_time for p in good], [p.error for p in good], ms=6, **styles[name])
-    _log_x(axis)
-    _log_errors(axis, "wall time [s]", error)
-    axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, handlelength=3.5)
-    if footnote:
-        figure.supxlabel(footnote, fontsize="small", color="0.35")
-    return figure
-
-
 class KeplerRun(NamedTuple):
     """A run of the perturbed Kepler problem by one method.
 
@@ -489,166 +450,88 @@ def gains_figure(errors: Mapping[str, tuple[float, float]], *, what: str, title:
     return figure
 
 
-def work_figure(series: Mapping[str, Mapping[str, Any]], *, error: str, title: str = "", footnote: str = "") -> Figure:
-    """Draw error against evaluations of f and against wall time, a line for each method.
+class CostPanel(NamedTuple):
+    """Errors against one cost.
 
-    Parameters
+    Attributes
     ----------
-    series : mapping of str to mapping
-        For each method arrays "nfev", "wall_time" and "error".
-    error : str
-        Label of the error.
-    title, footnote : str, optional
-
-    Returns
-    -------
-    Figure
+    title : str
+    cost : str
+        Label of the cost, with its unit.
+    curves : mapping of str to (array_like, array_like)
+        By method costs and errors; what is not a number above 0 is left out.
+    slopes : mapping of str to float, optional
+        Of some methods, each drawn as a line a little below the method's.
     """
-    styles = method_styles(series)
-    figure = _figure(10.5, 5.2, title)
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, key, label in zip(axes, ("nfev", "wall_time"), ("evaluations of f", "wall time [s]"), strict=True):
-        for name, values in series.items():
-            good = np.isfinite(values["error"]) & (np.asarray(values["error"]) > 0)
-            axis.plot(np.asarray(values[key])[good], np.asarray(values["error"])[good], ms=5, **styles[name])
-        _log_x(axis)
-        _log_errors(axis, label, error if axis is axes[0] else "")
-    _legend_below(figure, axes[0])
-    if footnote:
-        axes[1].annotate(footnote, (1, 1.02), xycoords="axes fraction", ha="right", fontsize="x-small", color="0.35")
-    return figure
+
+    title: str
+    cost: str
+    curves: Mapping[str, tuple[Any, Any]]
+    slopes: Mapping[str, float] = {}
 
 
-def frontier_figure(
-    series: Mapping[str, Mapping[str, Any]],
+def cost_figure(
+    rows: Sequence[Sequence[CostPanel]],
     *,
-    unit: str,
-    time: str = "wall time [s]",
+    error: str,
     title: str = "",
     footnote: str = "",
     styles: Styles | None = None,
+    largest: float = np.inf,
+    size: tuple[float, float] = (5.3, 4.2),
+    shared: bool = True,
 ) -> Figure:
-    """Draw errors against wall time in one panel for each kind of error, a line for each method.
+    """Draw error against cost, a line for each method.
 
     Parameters
     ----------
-    series : mapping of str to mapping
-        For each method arrays "wall_time" and, by the panels' titles, errors.
-    unit : str
-        Of the errors.
-    time : str, optional
-        Label of the time.
+    rows : sequence of sequences of CostPanel
+        A method has the same style in all.
+    error : str
+        Label of the error, with its unit.
     title, footnote : str, optional
     styles : mapping, optional
         From `method_styles`.
-
-    Returns
-    -------
-    Figure
-    """
-    styles = method_styles(series) if styles is None else styles
-    panels = [key for key in next(iter(series.values())) if key != "wall_time"]
-    figure = _figure(5.4 * len(panels), 5.6, title)
-    axes = figure.subplots(1, len(panels), sharex=True, sharey=True)
-    for axis, panel in zip(axes, panels, strict=True):
-        for name, values in series.items():
-            axis.plot(values["wall_time"], values[panel], ms=5, **styles[name])
-        axis.set_title(panel, fontsize="medium")
-    for axis in axes:
-        _log_x(axis)
-        _log_errors(axis, time, f"error of position [{unit}]" if axis is axes[0] else "")
-    _legend_below(figure, axes[0])
-    if footnote:
-        axes[-1].annotate(footnote, (1, -0.17), xycoords="axes fraction", ha="right", fontsize="x-small", color="0.35")
-    return figure
-
-
-def scenes_figure(
-    scenes: Mapping[str, Mapping[str, Mapping[str, Any]]],
-    *,
-    error: str,
-    largest: float = np.inf,
-    title: str = "",
-    footnote: str = "",
-) -> Figure:
-    """Draw error against evaluations and, below, against wall time: two panels for each scene, three scenes abreast.
-
-    Parameters
-    ----------
-    scenes : mapping of str to mapping
-        For each scene its methods, with arrays as for `work_figure`; a method has the same style in all.
-    error : str
-        Label of the error.
     largest : float, optional
-        Larger errors, of runs that lost the orbit, are left out.
-    title, footnote : str, optional
+        Larger errors, of runs that are lost, are left out.
+    size : (float, float), optional
+        Of a panel, in inches.
+    shared : bool, optional
+        Panels of a row have the same axis of errors, and those with the same cost that of the cost.
 
     Returns
     -------
     Figure
     """
-    styles = method_styles(dict.fromkeys(name for series in scenes.values() for name in series))
-    columns = min(3, len(scenes))
-    blocks = -(-len(scenes) // columns)
-    figure = _figure(max(4.0 * columns, 6.5), 5.6 * blocks + 1.1, title)
-    axes = figure.subplots(2 * blocks, columns, squeeze=False)
-    for axis in axes.flat[len(scenes) :]:
-        axis.set_visible(False)
-    for k, (name, series) in enumerate(scenes.items()):
-        block, column = divmod(k, columns)
-        pair = axes[2 * block, column], axes[2 * block + 1, column]
-        pair[0].set_title(name, fontsize="medium")
-        for axis, key, label in zip(pair, ("nfev", "wall_time"), ("evaluations of f", "wall time [s]"), strict=True):
-            axis.set_visible(True)
-            for method, values in series.items():
-                errors = np.asarray(values["error"])
-                good = (errors > 0) & (errors <= largest)
-                axis.plot(np.asarray(values[key])[good], errors[good], ms=4.5, lw=1.2, **styles[method])
-            _log_x(axis)
-            _log_errors(axis, label, "")
-    figure.supylabel(error, fontsize="medium")
-    _legend_below(figure, axes[0, 0])
+    columns = max(map(len, rows))
+    names = dict.fromkeys(name for row in rows for panel in row for name in panel.curves)
+    styles = method_styles(names) if styles is None else styles
+    figure = _figure(max(size[0] * columns, 6.5), size[1] * len(rows) + 1.1, title)
     if footnote:  # above: the legend is below
-        figure.suptitle(f"{title}\n{footnote}", fontsize="medium")
-    return figure
-
-
-def efficiency_figure(
-    problems: Mapping[str, Mapping[str, Mapping[str, Any]]],
-    *,
-    error: str,
-    cost: str,
-    slopes: Mapping[str, Mapping[str, float]] | None = None,
-    title: str = "",
-) -> Figure:
-    """Draw error against step and against cost, a row for each problem, as the paper's test of efficiency does.
-
-    Parameters
-    ----------
-    problems : mapping of str to mapping
-        For each problem its methods, with arrays "h", "cost" and "error"; a method has the same style in all.
-    error, cost : str
-        Labels, with units.
-    slopes : mapping of str to mapping, optional
-        For each problem the slopes of some methods in h, each drawn as a line a little below the method.
-    title : str, optional
-
-    Returns
-    -------
-    Figure
-    """
-    styles = method_styles(dict.fromkeys(name for series in problems.values() for name in series))
-    figure = _figure(10.5, 4.1 * len(problems) + 0.9, title)
-    axes = figure.subplots(len(problems), 2, sharex="col", sharey="row", squeeze=False)
-    for row, (problem, series) in zip(axes, problems.items(), strict=True):
-        for axis, key, label in zip(row, ("h", "cost"), ("step h", cost), strict=True):
-            for method, values in series.items():
-                axis.plot(values[key], values["error"], ms=5, lw=1.2, **styles[method])
-            axis.set_title(problem, fontsize="medium")
-            _log_x(axis)
-            _log_errors(axis, label, error if axis is row[0] else "")
-        for method, slope in (slopes or {}).get(problem, {}).items():
-            _slope_line(row[0], np.asarray(series[method]["h"]), np.asarray(series[method]["error"]), slope)
+        figure.suptitle(f"{typeset(title)}\n{footnote}", fontsize="medium")
+    axes = figure.subplots(len(rows), columns, sharey="row" if shared else "none", squeeze=False)
+    first: dict[str, Axes] = {}
+    drawn = []
+    for row, places in zip(rows, axes, strict=True):
+        for axis in places[len(row) :]:
+            axis.set_visible(False)
+        for panel, axis in zip(row, places, strict=False):
+            drawn.append((panel, axis))
+            if shared and first.setdefault(panel.cost, axis) is not axis:
+                axis.sharex(first[panel.cost])
+            for name, values in panel.curves.items():
+                cost, errors = (np.asarray(value, dtype=float) for value in values)
+                good = (errors > 0) & (errors <= largest)
+                axis.plot(cost[good], errors[good], ms=5, lw=1.2, **styles[name])
+            axis.set_title(panel.title, fontsize="medium")
+    for panel, axis in drawn:
+        _log_x(axis)
+        _log_errors(axis, panel.cost, error if shared and axis in axes[:, 0] else "")
+        for name, slope in panel.slopes.items():
+            cost, errors = panel.curves[name]
+            _slope_line(axis, np.asarray(cost), np.asarray(errors), slope)
+    if not shared:
+        figure.supylabel(error, fontsize="medium")
     _legend_below(figure, axes[0, 0])
     return figure
 
@@ -884,8 +767,13 @@ def _log_x(axis: Axes) -> None:
     low, high = axis.get_xlim()
     if high / low < 100:
         axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.xaxis.set_major_formatter(FuncFormatter(_short))
     axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _short(value: float, _: Any) -> str:
+    """A number of a log axis, where long ones would run into each other."""
+    return f"{value:g}" if value < 1e4 else f"{value:.0e}".replace("e+0", "e")
 
 
 def _log_errors(axis: Axes, x: str, y: str) -> None:

@@ -21,7 +21,7 @@ import eip_scipy.integrations
 from eip_scipy import EIPRK1, EIPRK4, Invariant, integrate
 from eip_scipy.app import report
 from eip_scipy.app.cli import main
-from eip_scipy.app.solar import cost as solar_cost
+from eip_scipy.app.listing import fixed_step_methods
 from eip_scipy.app.solar import errors as solar_errors
 from eip_scipy.app.solar import runs as solar_run
 from eip_scipy.app.solar import solar_system
@@ -46,9 +46,7 @@ def leapfrog_only(scene, method, metric, judge):
     return {"SV": (lambda step: (1.0, scene.problem.y0), [scene.h, scene.h / 2])}
 
 
-@pytest.fixture
-def little_to_time(monkeypatch):
-    monkeypatch.setattr(solar_system, "cost_methods", leapfrog_only)
+LITTLE = {"timed_methods": leapfrog_only}
 
 
 @pytest.fixture
@@ -82,13 +80,8 @@ def short(tmp_path_factory):
     """A short run with everything on; REBOUND where it is installed."""
     pytest.importorskip("rebound")
     folder = tmp_path_factory.mktemp("short")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(solar_cost, "REPEATS", 1)
-        patch.setattr(solar_system, "REPEATS", 1)
-        patch.setattr(solar_system, "BESIDE_YEARS", 0.0)  # as in the 2000 years
-        status = main(
-            ["solar-system", *SPAN, "--out", str(folder / "out"), "--json", str(folder / "run.json"), "--quiet"]
-        )
+    command = ["solar-system", *SPAN, "--out", str(folder / "out"), "--json", str(folder / "run.json"), "--quiet"]
+    status = main(command, repeats=1, beside_years=0.0)  # with a second process, as in the 2000 years
     return SimpleNamespace(status=status, out=folder / "out", json=json.loads((folder / "run.json").read_text()))
 
 
@@ -151,11 +144,10 @@ def test_order_shows_in_the_errors(short):
 
 @pytest.mark.slow
 @pytest.mark.needs_jit
-@pytest.mark.usefixtures("little_to_time")
 def test_one_year_against_the_stored_states(tmp_path, capsys, monkeypatch):
     pytest.importorskip("rebound")
     monkeypatch.setattr(solar_system, "images", lambda study, part: {"figure.png": PNG})  # the short run draws them
-    assert main(["solar-system", "--years", "1", "--out", str(tmp_path)]) == 0
+    assert main(["solar-system", "--years", "1", "--out", str(tmp_path)], **LITTLE) == 0
     text = capsys.readouterr().out
     assert "Reference: stored states (Taylor, 80 bits) at 1 yr; turns counted along IAS15" in text
     assert "IAS15 agrees with the stored states at 1 yr" in text
@@ -174,9 +166,10 @@ def test_one_year_against_the_stored_states(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.usefixtures("little_to_time")
 def test_euclidean_metric_comes_first_when_asked_for(tmp_path, capsys, no_rebound):
-    assert main(["solar-system", *SPAN, "--metric", "euclidean", "--data", "paper", "--out", str(tmp_path)]) == 0
+    assert (
+        main(["solar-system", *SPAN, "--metric", "euclidean", "--data", "paper", "--out", str(tmp_path)], **LITTLE) == 0
+    )
     out = capsys.readouterr().out
     assert lines(out)[4].split() == ["euclid.", "error", "alone", "every", "10", "auto", "tight"]
     assert "initial data 'paper'" in out
@@ -186,9 +179,8 @@ def test_euclidean_metric_comes_first_when_asked_for(tmp_path, capsys, no_reboun
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.usefixtures("little_to_time")
 def test_a_method_without_estimate_has_one_metric(tmp_path, capsys, no_rebound):
-    assert main(["solar-system", *SPAN, "--method", "EIPRK1", "--out", str(tmp_path)]) == 0
+    assert main(["solar-system", *SPAN, "--method", "EIPRK1", "--out", str(tmp_path)], **LITTLE) == 0
     assert lines(capsys.readouterr().out)[3].split() == ["EIPRK1", "RK1", "SV", "EIPRKN12", "EIPGJ14", "EIPRKN12"]
 
 
@@ -197,9 +189,8 @@ def test_a_method_without_estimate_has_one_metric(tmp_path, capsys, no_rebound):
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.usefixtures("little_to_time")
 def test_without_rebound_the_command_runs_and_says_what_to_install(tmp_path, capsys, no_rebound):
-    assert main(["solar-system", *SPAN, "--out", str(tmp_path), "--quiet"]) == 0
+    assert main(["solar-system", *SPAN, "--out", str(tmp_path), "--quiet"], **LITTLE) == 0
     captured = capsys.readouterr()
     assert captured.out == ""
     (line,) = lines(captured.err)
@@ -207,9 +198,8 @@ def test_without_rebound_the_command_runs_and_says_what_to_install(tmp_path, cap
     assert {path.name for path in tmp_path.iterdir()} >= FIGURES
 
 
-@pytest.mark.usefixtures("little_to_time")
 def test_without_matplotlib_the_numbers_are_there(tmp_path, capsys, no_rebound, no_matplotlib):
-    assert main(["solar-system", *SPAN, "--out", str(tmp_path), "--json", str(tmp_path / "run.json")]) == 0
+    assert main(["solar-system", *SPAN, "--out", str(tmp_path), "--json", str(tmp_path / "run.json")], **LITTLE) == 0
     captured = capsys.readouterr()
     figures, rebound = lines(captured.err)[-2:]
     assert 'pip install "eip_scipy[plot]"' in figures
@@ -224,7 +214,6 @@ def test_without_matplotlib_the_numbers_are_there(tmp_path, capsys, no_rebound, 
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
-@pytest.mark.usefixtures("little_to_time")
 def test_a_run_that_fails_is_reported_and_changes_the_status(tmp_path, capsys, no_rebound, monkeypatch):
     broken = Invariant(lambda t, y, p: 1.0 if t < 1 else np.nan, lambda t, y, p: 0.0 * y, name="broken")
 
@@ -234,7 +223,9 @@ def test_a_run_that_fails_is_reported_and_changes_the_status(tmp_path, capsys, n
         return integrate(problem, **options)
 
     monkeypatch.setattr(solar_run, "integrate", integrate_with_it)
-    status = main(["solar-system", "--years", "2", "--h", "0.01", "--method", "EIPRK5", "--out", str(tmp_path)])
+    status = main(
+        ["solar-system", "--years", "2", "--h", "0.01", "--method", "EIPRK5", "--out", str(tmp_path)], **LITTLE
+    )
     out = capsys.readouterr().out
     assert status == 1
     assert "FAILED EIPRK5 (error) reached the end" in out
@@ -245,17 +236,15 @@ def test_a_run_that_fails_is_reported_and_changes_the_status(tmp_path, capsys, n
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.usefixtures("little_to_time")
 def test_a_failed_check_changes_the_status(tmp_path, capsys, no_rebound, monkeypatch):
     monkeypatch.setattr(solar_errors, "ROUND_OFF", 1e-30)
     monkeypatch.setattr(solar_errors, "FASTEST", 1e-9)
-    assert main(["solar-system", *SPAN, "--out", str(tmp_path)]) == 1
+    assert main(["solar-system", *SPAN, "--out", str(tmp_path)], **LITTLE) == 1
     assert "FAILED EIPRK4 (error) keeps H" in capsys.readouterr().out
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.usefixtures("little_to_time")
 def test_a_run_that_is_not_to_be_trusted_is_told(tmp_path, capsys, no_rebound, monkeypatch):
     """At the end, once, by its name; in the JSON and the exit status too. Other warnings are shown as usual."""
 
@@ -276,12 +265,12 @@ def test_a_run_that_is_not_to_be_trusted_is_told(tmp_path, capsys, no_rebound, m
     with monkeypatch.context() as patch:
         patch.setattr(solar_run, "integrate", doubtful)
         with pytest.warns(UserWarning, match="another") as shown:
-            assert main(command) == 1
+            assert main(command, **LITTLE) == 1
     assert [item.category for item in shown] == [UserWarning]
     _, line = lines(capsys.readouterr().err)  # the first is on REBOUND
     assert line.startswith("eip-scipy: EIPRK4 (error): not to be trusted: 'energy' ")
     assert json.loads(file.read_text())["trusted"] is False
-    assert main(command) == 0
+    assert main(command, **LITTLE) == 0
     assert len(lines(capsys.readouterr().err)) == 1
     assert json.loads(file.read_text())["trusted"] is True
 
@@ -300,7 +289,7 @@ def test_an_interruption_keeps_what_was_done(tmp_path, capsys, no_rebound, monke
 
 
 def test_an_interruption_while_timing_keeps_the_table(tmp_path, capsys, no_rebound, monkeypatch):
-    def interrupted(*args):
+    def interrupted(*args, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(solar_system, "cost", interrupted)
@@ -313,26 +302,25 @@ def test_an_interruption_while_timing_keeps_the_table(tmp_path, capsys, no_rebou
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.usefixtures("little_to_time")
 def test_an_interrupted_command_goes_on(tmp_path, capsys, no_rebound, monkeypatch):
     """With --checkpoint, runs that were done are not done again; the numbers are those of an uninterrupted command."""
     folder = tmp_path / "kept"
     command = ["solar-system", *SPAN, "--checkpoint", str(folder)]
-    assert main(["solar-system", *SPAN, "--out", str(tmp_path / "whole"), "--quiet"]) == 0
+    assert main(["solar-system", *SPAN, "--out", str(tmp_path / "whole"), "--quiet"], **LITTLE) == 0
 
     def interrupted(scene):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(solar_run, "_verlet", interrupted)
-        assert main([*command, "--out", str(tmp_path / "first")]) == 130
+        assert main([*command, "--out", str(tmp_path / "first")], **LITTLE) == 130
     assert f"the same command with --resume goes on from the checkpoints in '{folder}'" in capsys.readouterr().err
     done = {"EIPRK4-error.npz", "EIPRK4-euclidean.npz", "RK4.npz"}
     assert {path.name for path in folder.iterdir()} == done
     before = {name: (folder / name).read_bytes() for name in done}
-    assert main([*command, "--out", str(tmp_path / "again")]) == 2
+    assert main([*command, "--out", str(tmp_path / "again")], **LITTLE) == 2
     assert "exists. resume=True goes on with the run that it holds" in capsys.readouterr().err
-    assert main([*command, "--out", str(tmp_path / "second"), "--resume", "--quiet"]) == 0
+    assert main([*command, "--out", str(tmp_path / "second"), "--resume", "--quiet"], **LITTLE) == 0
     assert {path.name for path in folder.iterdir()} == {*done, "EIPRKN12.npz", "EIPGJ14.npz", "EIPRKN12-tight.npz"}
     assert {name: (folder / name).read_bytes() for name in done} == before
 
@@ -341,7 +329,7 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, no_rebound, monkeypatc
             return [{k: v for k, v in row.items() if k != "wall_time_s"} for row in csv.DictReader(stream)]
 
     assert numbers("second") == numbers("whole")
-    assert main([*command, "--out", str(tmp_path / "third"), "--resume", "--h", "0.001"]) == 2
+    assert main([*command, "--out", str(tmp_path / "third"), "--resume", "--h", "0.001"], **LITTLE) == 2
     assert "belongs to another run: h is" in capsys.readouterr().err
 
 
@@ -349,21 +337,23 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, no_rebound, monkeypatc
     ("options", "message"),
     [
         (["--resume"], "--resume needs the folder to resume from: --checkpoint DIR"),
-        (["--truth", "--checkpoint", "a"], "--checkpoint and --resume go with the comparison of methods"),
-        (["--frontier", "--resume"], "--checkpoint and --resume go with the comparison of methods"),
+        (["truth", "--checkpoint", "a"], "unrecognized arguments: --checkpoint a"),
+        (["frontier", "--resume"], "unrecognized arguments: --resume"),
+        (["--frontier", "--years", "10"], "--frontier is now: eip-scipy solar-system frontier\n"),
+        (["--truth"], "--truth is now: eip-scipy solar-system truth\n"),
     ],
 )
-def test_checkpoints_that_nothing_can_be_done_with(options, message, tmp_path, capsys, no_rebound):
+def test_options_that_nothing_can_be_done_with(options, message, tmp_path, capsys, no_rebound):
     assert main(["solar-system", *options, "--out", str(tmp_path)]) == 2
     assert message in capsys.readouterr().err
 
 
-def test_an_interruption_anywhere_is_one_line(capsys, monkeypatch):
+def test_an_interruption_anywhere_is_one_line(tmp_path, capsys, monkeypatch):
     def interrupted(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("eip_scipy.app.paper.reproduce.reproduce", interrupted)
-    assert main(["reproduce", "table1", "--quiet"]) == 130
+    monkeypatch.setattr("eip_scipy.app.paper.tables.table_text", interrupted)
+    assert main(["reproduce", "table1", "--out", str(tmp_path)]) == 130
     assert lines(capsys.readouterr().err) == ["eip-scipy: interrupted"]
 
 
@@ -384,17 +374,16 @@ def test_control_c(tmp_path):
     finally:
         process.kill()
     assert process.returncode == 130, err
-    assert lines(err)[-1] == "eip-scipy: interrupted; no run was done"
+    assert lines(err)[-1] == "eip-scipy: interrupted; nothing was written"
     assert "Traceback" not in err
 
 
-@pytest.mark.usefixtures("little_to_time")
 def test_a_file_that_cannot_be_written_at_the_end_leaves_the_table(tmp_path, capsys, no_rebound, monkeypatch):
     def full(*args):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(report.os, "replace", full)
-    assert main(["solar-system", *SPAN, "--out", str(tmp_path)]) == 2
+    assert main(["solar-system", *SPAN, "--out", str(tmp_path)], **LITTLE) == 2
     captured = capsys.readouterr()
     assert "max |dH/H|" in captured.out
     assert lines(captured.err)[-1].endswith("solar-system.csv': no space left on device")
@@ -407,8 +396,11 @@ def test_a_file_that_cannot_be_written_at_the_end_leaves_the_table(tmp_path, cap
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "required: COMMAND"),
-        (["solar"], "invalid choice: 'solar'"),
+        ([], "expected COMMAND first, one of list, doctor, solar-system"),
+        (["solar"], "unknown COMMAND 'solar', expected one of list, "),
+        (["solar-sytem"], "did you mean 'solar-system'?"),
+        (["--years", "1", "solar-system"], "expected COMMAND first"),
+        (["solar-system", "--yaers", "5"], "unrecognized arguments: --yaers 5; did you mean '--years'?"),
         (["solar-system", "--years", "many"], "--years: expected a positive number, got 'many'"),
         (["solar-system", "--years", "-5"], "--years: expected a positive number, got '-5'"),
         (["solar-system", "--years", "0"], "--years: expected a positive number"),
@@ -581,7 +573,7 @@ def test_the_tightest_run_is_checked_against_the_stored_states(name, offset, pas
     y[3:5, 1] += offset  # Mercury
     zero = np.zeros(2)
     run = solar_run.MethodRun(name, (name,), 0.1, 0.0, np.array([0.0, 1.0]), y, zero, zero)
-    *_, check = solar_errors.SolarStudy(scene, 4, [run], run).checks()
+    *_, check = solar_errors.SolarRuns(scene, 4, [run], run).checks()
     assert check.text.startswith(f"{name} agrees with the stored states at 1 yr")
     assert check.passed == passed
 
@@ -608,7 +600,7 @@ def test_osculating_orbits_pass_through_the_planets():
 
 
 def test_every_method_of_the_solvers_is_offered():
-    methods = solar_system.fixed_step_methods()
+    methods = fixed_step_methods()
     assert methods["EIPRK1"] is EIPRK1
     assert "EIPSolver" not in methods
 
@@ -624,7 +616,7 @@ def test_two_thousand_years():
     scene = solar_run.make_scene("de440", 2000.0, 0.002)
     tasks = {task.name: task for task in solar_run.plan(scene, EIPRK4, "error", rebound.run)}
     runs = {name: tasks[name].start(False) for name in ("EIPRK4 (error)", "RK4", "SV", "EIPRKN12", "EIPGJ14", "IAS15")}
-    study = solar_errors.SolarStudy(scene, 4, list(runs.values()), runs["IAS15"])
+    study = solar_errors.SolarRuns(scene, 4, list(runs.values()), runs["IAS15"])
     longitude = {name: errors.longitude for name, errors in study.errors(2000.0).items()}
     assert longitude["RK4"][0] == pytest.approx(70.5, abs=0.5)
     assert longitude["SV"][0] == pytest.approx(-96.7, abs=0.5)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from eip_scipy.app.cli import main
-from eip_scipy.app.solar import solar_system
 from eip_scipy.app.solar.epoch import parse_epoch
+from eip_scipy.app.solar.solar_system import SolarSystem
+from eip_scipy.app.study import Session
 from eip_scipy.integrations import jpl
 from eip_scipy.problems import solar_data
 from eip_scipy.problems import solar_system as problem_of
@@ -28,9 +29,9 @@ def kernel():
 @pytest.fixture
 def nothing_to_time(monkeypatch):
     """Less to run than the command would: no timings, no REBOUND."""
-    monkeypatch.setattr(solar_system, "_time_methods", lambda *args: None)
-    monkeypatch.setattr(solar_system, "_write_figures", lambda *args: None)
-    monkeypatch.setattr("eip_scipy.app.cli._rebound", lambda args: None)
+    monkeypatch.setattr(SolarSystem, "refine", lambda *args: False)
+    monkeypatch.setattr(SolarSystem, "figures", lambda *args: ())
+    monkeypatch.setattr(Session, "peer", lambda *args: None)
 
 
 def the_line(capsys):

@@ -39,19 +39,12 @@ def read(file):
 # Ground states.
 
 
-@pytest.fixture
-def small(monkeypatch):
-    monkeypatch.setattr(gpe_states, "TRAP_POINTS", 64)
-    monkeypatch.setattr(gpe_states, "PUBLISHED", {0.0: 3.9459469, 0.65: 3.6506129})
-
-
 @pytest.mark.slow
 @pytest.mark.needs_jit
-@pytest.mark.usefixtures("small")
 def test_trap(tmp_path, capsys):
     file = tmp_path / "run.json"
     command = ["gpe", "ground-state", "--scene", "trap", "--starts", "2", "--out", str(tmp_path), "--json", str(file)]
-    assert main(command) == 0
+    assert main(command, trap_points=64, published={0.0: 3.9459469, 0.65: 3.6506129}) == 0
     out = capsys.readouterr().out
     assert "V = r^2 / 2, beta = 100; lowest of 2 starts" in out
     assert out.count("ok     trap") == 2
@@ -73,8 +66,8 @@ def found(energy, Omega=0.8, converged=True, points=16):
 
 def test_checks_of_the_trap():
     def matched(*args, **kwargs):
-        (check,) = gpe_states.checks({"trap": [found(*args, **kwargs)]})
-        return check["matched"], check["note"]
+        (check,) = gpe_states.GroundStates().checks({"trap": [found(*args, **kwargs)]})
+        return check.passed, check.note
 
     assert matched(3.1904172 + 9e-6) == (True, "")
     assert matched(3.1904172 + 2e-5) == (False, "")
@@ -84,9 +77,9 @@ def test_checks_of_the_trap():
 
 def test_a_missed_energy_fails_the_command(tmp_path, monkeypatch, capsys):
     item = found(3.2, converged=False)
-    monkeypatch.setitem(gpe_states.SCENES, "trap", lambda args, update: [item])
     monkeypatch.setitem(sys.modules, "eip_scipy.plotting", None)
-    assert main(["gpe", "ground-state", "--scene", "trap", "--out", str(tmp_path)]) == 1
+    scenes = {"trap": lambda settings, update: [item]}
+    assert main(["gpe", "ground-state", "--out", str(tmp_path)], scenes=scenes) == 1
     captured = capsys.readouterr()
     assert "FAILED trap, Omega: E 3.1904172, ours 3.2" in captured.out
     assert "Omega: stopped" in captured.out
@@ -96,10 +89,10 @@ def test_a_missed_energy_fails_the_command(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("task", ["ground-state", "ring", "vortex-lines"])
 def test_interrupted(task, tmp_path, monkeypatch, capsys):
-    def stop(*args):
+    def stop(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(gpe_states.SCENES, "trap", stop)
+    monkeypatch.setattr(gpe_states, "ground_state", stop)
     monkeypatch.setattr(gpe_ring, "search_ring", stop)
     monkeypatch.setattr(gpe_lines, "search_saddle", stop)
     assert main(["gpe", task, "--out", str(tmp_path), "--quiet"]) == 130
@@ -126,16 +119,16 @@ def small_ring(kappa=0.3, points=32):
     return GrossPitaevskii(grid, quartic_trap(0.0, kappa, 1, 1), Omega=1.0, beta=50.0)
 
 
-@pytest.fixture
-def short(monkeypatch):
-    monkeypatch.setattr(gpe_ring, "ring_condensate", small_ring)
-    monkeypatch.setattr(gpe_ring, "POINTS", 32)
-    monkeypatch.setattr(gpe_ring, "T_END", 0.2)
-    monkeypatch.setattr(gpe_ring, "STEP", 5e-3)
-    monkeypatch.setattr(gpe_ring, "REFERENCE_STEP", 5e-3)
-    monkeypatch.setattr(gpe_ring, "SAVED", 0.05)
-    monkeypatch.setattr(gpe_ring, "SNAPSHOTS", (0.0, 0.1, 0.2, 7.0))
-    monkeypatch.setattr(gpe_ring, "SENSE", -1)  # two vortices near the centre are no ring
+SHORT = {
+    "condensate": small_ring,
+    "points": 32,
+    "t_end": 0.2,
+    "step": 5e-3,
+    "reference_step": 5e-3,
+    "saved": 0.05,
+    "snapshots": (0.0, 0.1, 0.2, 7.0),
+    "sense": -1,  # two vortices near the centre are no ring
+}
 
 
 @pytest.fixture
@@ -153,11 +146,10 @@ def start(tmp_path):
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.usefixtures("short")
 def test_ring(tmp_path, start, capsys):
     out, file = tmp_path / "out", tmp_path / "ring.json"
     command = ["gpe", "ring", "--start", str(start), "--movie", "--out", str(out), "--json", str(file)]
-    assert main(command) == 0
+    assert main(command, **SHORT) == 0
     text = capsys.readouterr().out
     assert "Ring, kappa = 0.3 -> 0.7, RK4, h = 0.005, to t = 0.2" in text
     assert "ok     vortices in the snapshots: [2, 2, 2]" in text
@@ -179,19 +171,18 @@ def test_ring(tmp_path, start, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("short", "no_plotting")
+@pytest.mark.usefixtures("no_plotting")
 def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch):
-    monkeypatch.setattr(gpe_ring, "SENSE", 1)
-    assert main(["gpe", "ring", "--start", str(start), "--out", str(tmp_path)]) == 1
+    command = ["gpe", "ring", "--start", str(start), "--out", str(tmp_path)]
+    assert main(command, **{**SHORT, "sense": 1}) == 1
     assert "FAILED vortices turn anticlockwise" in capsys.readouterr().out
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("short")
 def test_another_end(tmp_path, start, capsys):
     """Snapshots and movie are those of the times that the run has."""
     command = ["gpe", "ring", "--start", str(start), "--t-end", "0.12", "--movie", "--out", str(tmp_path / "out")]
-    assert main(command) == 0
+    assert main(command, **SHORT) == 0
     text = capsys.readouterr().out
     assert "to t = 0.12" in text
     assert "vortices in the snapshots: [2, 2]" in text
@@ -204,33 +195,34 @@ def test_another_end(tmp_path, start, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("short", "no_plotting")
+@pytest.mark.usefixtures("no_plotting")
 @pytest.mark.parametrize("end", ["0.05", "0.005"])
 def test_an_end_before_the_vortices_have_turned(end, tmp_path, start, capsys):
     """What cannot be checked is said, and fails nothing."""
-    assert main(["gpe", "ring", "--start", str(start), "--t-end", end, "--out", str(tmp_path / "out")]) == 0
+    assert main(["gpe", "ring", "--start", str(start), "--t-end", end, "--out", str(tmp_path / "out")], **SHORT) == 0
     text = capsys.readouterr().out
     assert "-      not checked: in which sense the vortices turn, for the run ends before t = 0.1\n" in text
     assert "FAILED" not in text
 
 
-@pytest.mark.usefixtures("short")
 def test_an_end_before_the_first_step(tmp_path, start, capsys):
-    assert main(["gpe", "ring", "--start", str(start), "--t-end", "0.004", "--out", str(tmp_path / "out")]) == 2
+    assert (
+        main(["gpe", "ring", "--start", str(start), "--t-end", "0.004", "--out", str(tmp_path / "out")], **SHORT) == 2
+    )
     assert "--t-end: expected at least 0.005, the reference's step, got 0.004" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("short", "no_plotting")
+@pytest.mark.usefixtures("no_plotting")
 def test_a_stationary_state(start, tmp_path, monkeypatch):
     """Without a quench the gradients are parallel: that is counted, and nothing is nan."""
-    monkeypatch.setattr(gpe_ring, "KAPPA_AFTER", 0.3)
     gpe = small_ring()
     state = ground_state(gpe, gpe_states.load_state(start, gpe), tol=1e-11)
     assert state.converged
     gpe_states.save_state(start, gpe_states.Found("", gpe, state))
     file = tmp_path / "ring.json"
-    main(["gpe", "ring", "--start", str(start), "--out", str(tmp_path), "--json", str(file), "--quiet"])
+    command = ["gpe", "ring", "--start", str(start), "--out", str(tmp_path), "--json", str(file), "--quiet"]
+    main(command, **SHORT, kappas=(0.3, 0.3))
     content = json.loads(file.read_text())
     assert max(map(abs, content["turned_rad"])) < 1e-8  # so that the sense, and with it the status, is chance
     assert content["rank_reduced"].pop("EIP-ME") > 0  # until the steps' own error has led away by 1e-8
@@ -240,13 +232,12 @@ def test_a_stationary_state(start, tmp_path, monkeypatch):
 
 @pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.usefixtures("short")
 @pytest.mark.parametrize(("run", "evaluation", "done"), [(0, 207, []), (2, 93, ["EIP-M"])])
 def test_an_interrupted_command_goes_on(run, evaluation, done, tmp_path, start, capsys, monkeypatch):
     """In the reference or a method's run; the numbers are then those of an uninterrupted command, bit for bit."""
     folder = tmp_path / "kept"
     command = ["gpe", "ring", "--start", str(start), "--checkpoint", str(folder)]
-    assert main(["gpe", "ring", "--start", str(start), "--out", str(tmp_path / "whole"), "--quiet"]) == 0
+    assert main(["gpe", "ring", "--start", str(start), "--out", str(tmp_path / "whole"), "--quiet"], **SHORT) == 0
     runs, calls = count(), count()
 
     def breaking(problem, **options):
@@ -262,39 +253,37 @@ def test_an_interrupted_command_goes_on(run, evaluation, done, tmp_path, start, 
     with monkeypatch.context() as patch:
         patch.setattr(gpe_runs, "integrate", breaking)
         patch.setattr(resume, "SNAPSHOT_SECONDS", 0.0)
-        assert main([*command, "--out", str(tmp_path / "first")]) == 130
+        assert main([*command, "--out", str(tmp_path / "first")], **SHORT) == 130
     captured = capsys.readouterr()
     assert f"the same command with --resume goes on from the checkpoints in '{folder}'" in captured.err
     assert [line.split()[0] for line in captured.out.splitlines() if line.startswith(("EIP", "RK4"))] == done
-    assert main([*command, "--out", str(tmp_path / "again")]) == 2
+    assert main([*command, "--out", str(tmp_path / "again")], **SHORT) == 2
     assert "exists. resume=True goes on with the run that it holds" in capsys.readouterr().err
-    assert main([*command, "--out", str(tmp_path / "second"), "--resume", "--quiet"]) == 0
+    assert main([*command, "--out", str(tmp_path / "second"), "--resume", "--quiet"], **SHORT) == 0
     assert {path.stem for path in folder.iterdir()} == {*gpe_runs.METHODS, gpe_runs.REFERENCE}
     assert read(tmp_path / "second" / "ring.csv") == read(tmp_path / "whole" / "ring.csv")
-    assert main([*command, "--out", str(tmp_path / "third"), "--resume", "--t-end", "0.1"]) == 2
+    assert main([*command, "--out", str(tmp_path / "third"), "--resume", "--t-end", "0.1"], **SHORT) == 2
     assert "belongs to another run: t_span is" in capsys.readouterr().err
 
 
-@pytest.fixture
-def coarse(monkeypatch):
-    """The paper's condensate on a grid that is good for three digits, and a few steps."""
-    for module in (gpe_states, gpe_lines):
-        monkeypatch.setattr(module, "LINE_POINTS", 40)
-    monkeypatch.setattr(gpe_lines, "ENERGIES_KNOWN", 1e-3)
-    monkeypatch.setattr(gpe_lines, "TURN_KNOWN", 0.03)
-    monkeypatch.setattr(gpe_lines, "T_END", 0.2)
-    monkeypatch.setattr(gpe_lines, "SAVED", 0.1)
-    monkeypatch.setattr(gpe_lines, "SNAPSHOTS", (0.0, 0.2))
+# The paper's condensate on a grid that is good for three digits, and a few steps.
+COARSE = {
+    "points": 40,
+    "energies_known": 1e-3,
+    "turn_known": 0.03,
+    "t_end": 0.2,
+    "saved": 0.1,
+    "snapshots": (0.0, 0.2),
+}
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
-@pytest.mark.usefixtures("coarse")
 def test_vortex_lines(tmp_path, capsys, monkeypatch):
     out, file, folder = tmp_path / "out", tmp_path / "lines.json", tmp_path / "kept"
     command = ["gpe", "vortex-lines", "--out", str(out), "--json", str(file), "--checkpoint", str(folder)]
-    assert main(command) == 0
+    assert main(command, **COARSE) == 0
     text = capsys.readouterr().out
     assert "Vortex lines, Omega = 0.7 -> 0.9, RK4, h = 0.005, to t = 0.2" in text
     assert "Start: 4 lines, E = 3.329" in text
@@ -310,7 +299,7 @@ def test_vortex_lines(tmp_path, capsys, monkeypatch):
     (out / "vortex-lines-surfaces.png").unlink()
     monkeypatch.setattr(gpe_lines, "search_saddle", None)
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
-    assert main([*command, "--resume"]) == 0
+    assert main([*command, "--resume"], **COARSE) == 0
     assert 'no surfaces: surfaces of equal density need scikit-image: pip install "eip_scipy[surfaces]"' in (
         capsys.readouterr().err
     )
@@ -365,15 +354,19 @@ def test_start_that_is_no_state(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["gpe", "states"], "invalid choice: 'states'"),
+        (
+            ["gpe", "ground-states"],
+            "unknown TASK 'ground-states', expected one of ground-state, ring, vortex-lines; did",
+        ),
+        (["gpe", "--seed", "1", "ring"], "expected TASK first, one of ground-state, ring, vortex-lines"),
         (["gpe", "ground-state", "--scene", "rings"], "did you mean 'ring'"),
         (["gpe", "ground-state", "--starts", "0"], "expected an integer >= 1, got '0'"),
-        (["gpe"], "required: TASK"),
+        (["gpe"], "expected TASK first, one of ground-state, ring, vortex-lines"),
         (["gpe", "ring", "--t-end", "0"], "expected a positive number, got '0'"),
         (["gpe", "ring", "--resume"], "--resume needs the folder to resume from"),
-        (["gpe", "ring", "--starts", "3"], "--starts goes with ground-state, not with ring"),
-        (["gpe", "vortex-lines", "--t-end", "3"], "--t-end goes with ring, not with vortex-lines"),
-        (["gpe", "ground-state", "--checkpoint", "a"], "--checkpoint goes with ring and vortex-lines, not with ground"),
+        (["gpe", "ring", "--starts", "3"], "unrecognized arguments: --starts 3; did you mean '--start'?"),
+        (["gpe", "vortex-lines", "--t-end", "3"], "unrecognized arguments: --t-end 3"),
+        (["gpe", "ground-state", "--checkpoint", "a"], "unrecognized arguments: --checkpoint a"),
     ],
 )
 def test_wrong_usage(arguments, message, capsys):

@@ -8,14 +8,18 @@ import pytest
 
 from eip_scipy.app.cli import main
 from eip_scipy.app.condensates import efficiency as gpe_efficiency
+from eip_scipy.app.study import Session
 
 pytestmark = [pytest.mark.nightly, pytest.mark.slow]
+
+
+SMALL = gpe_efficiency.Efficiency(points=16, repeats=1)
 
 
 @pytest.fixture(scope="module")
 def trials():
     """On 16 x 16 points, where the modulated wave is resolved to 1e-3: the errors are those of the steps alone."""
-    return gpe_efficiency.study(points=16, repeats=1)
+    return SMALL.measure(Session("fig-efficiency"))
 
 
 def test_orders_are_those_of_the_methods(trials):
@@ -48,7 +52,7 @@ def test_sav_takes_one_pair_of_transforms_a_step(trials):
 
 
 def test_command(trials, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(gpe_efficiency, "study", lambda quiet: trials)
+    monkeypatch.setattr(gpe_efficiency.Efficiency, "measure", lambda self, session: trials)
     status = main(["reproduce", "fig-efficiency", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")])
     content = json.loads((tmp_path / "run.json").read_text())
     checks = content["fig-efficiency"]["checks"]
@@ -64,15 +68,15 @@ def test_command(trials, tmp_path, capsys, monkeypatch):
     assert {line["wave"] for line in lines} == {"plane wave", "modulated wave"}
 
 
-def test_a_wrong_slope_is_a_failure(trials, monkeypatch):
-    monkeypatch.setitem(gpe_efficiency.ORDERS, "CN", 3)
-    failed = [check for check in gpe_efficiency.checks(trials) if check["quantity"] == "slope of CN"]
-    assert [check["matched"] for check in failed] == [False, False]
-    assert "FAILED modulated wave, slope of CN: 2, known 3" in gpe_efficiency.text(trials)
+def test_a_wrong_slope_is_a_failure(trials):
+    study = gpe_efficiency.Efficiency(orders={**gpe_efficiency.ORDERS, "CN": 3})
+    failed = [check for check in study.checks(trials) if check.quantity == "slope of CN"]
+    assert [check.passed for check in failed] == [False, False]
+    assert "FAILED modulated wave, slope of CN: 2, known 3" in study.text(trials)
 
 
 def test_figure_has_a_row_for_each_wave(trials):
-    ((name, figure),) = gpe_efficiency.figures(trials)
+    ((name, figure),) = SMALL.figures(trials)
     assert name == "fig-efficiency.png"
     assert len(figure.axes) == 4
     assert [axis.get_title() for axis in figure.axes[::2]] == list(trials)

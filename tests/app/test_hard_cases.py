@@ -3,8 +3,7 @@
 import csv
 import json
 import math
-from dataclasses import replace
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,8 +12,10 @@ from scipy.integrate import solve_ivp
 from eip_scipy import Invariant, check_gradient
 from eip_scipy.app.cli import main
 from eip_scipy.app.hard import cases as command
-from eip_scipy.app.kepler import cost as kepler_cost
 from eip_scipy.app.kepler import figures as kepler_figures
+from eip_scipy.app.paper import reproduce
+from eip_scipy.app.solar.solar_system import SolarSystem
+from eip_scipy.app.study import Check, Session, Study
 from eip_scipy.app.work_precision import cost_to_reach
 from eip_scipy.problems.hard_cases import EQUATIONS, hard_cases
 
@@ -177,14 +178,9 @@ def test_projection_on_a_wrong_invariant_shows():
 # --- the command ---
 
 
-@pytest.fixture
-def few(monkeypatch):
-    monkeypatch.setattr(command, "hard_cases", lambda: hard_cases(FEW))
-
-
-@pytest.mark.usefixtures("few")
 def test_command_prints_and_writes(tmp_path, capsys):
-    status = main(["hard-cases", "--method", "EIPDOP853", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")])
+    arguments = ["--method", "EIPDOP853", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")]
+    status = main(["hard-cases", *arguments], cases=hard_cases(FEW))
     out = capsys.readouterr().out
     assert max(map(len, out.replace(str(tmp_path), "").splitlines())) <= 79
     assert "kepler_e00" in out
@@ -211,10 +207,9 @@ def test_a_case_without_known_cause_is_judged_by_its_neighbours():
     assert "not known" in command.cause(replace(worse, nearby=(1.5, 1.2, 9.0)))
 
 
-@pytest.mark.usefixtures("few")
 def test_other_settings_have_no_bars_but_success(tmp_path, capsys):
     arguments = ["--method", "EIPRK23", "--rtol", "1e-4", "--metric", "euclidean", "--out", str(tmp_path)]
-    assert main(["hard-cases", *arguments]) == 0
+    assert main(["hard-cases", *arguments], cases=hard_cases(FEW)) == 0
     out = capsys.readouterr().out
     assert out.count("\nok     ") == 1
     assert "rtol = 0.0001, atol = 1e-07" in out
@@ -261,41 +256,47 @@ def test_figures_of_the_kepler_problem(tmp_path, capsys):
 
 
 @pytest.mark.needs_jit
-def test_a_known_value_can_differ(monkeypatch):
-    lines = kepler_figures.study(t_end=30.0)
-    assert [check["matched"] for check in kepler_figures.checks(lines)] == [False] * 4  # too short for any
+def test_a_known_value_can_differ():
+    lines = kepler_figures.KeplerFigures(t_end=30.0).measure(Session("fig-kepler"))
+    assert not any(check.passed for check in kepler_figures.KeplerFigures().checks(lines))  # too short for any
 
 
-def test_solar_figures_come_from_the_command(tmp_path, monkeypatch):
+@dataclass(frozen=True, kw_only=True)
+class Noted(Study):
+    """In place of what takes long; tells where it ran."""
+
+    seen: list
+    passed: bool = True
+
+    def measure(self, session):
+        self.seen.append((session.name, session.out, session.json))
+
+    def text(self, found):
+        return "a table"
+
+    def numbers(self, found):
+        return {"cells": [], "orders": [], "checks": ["one"]}
+
+    def checks(self, found):
+        return [Check("one", self.passed)]
+
+
+def test_solar_figures_come_from_the_command(tmp_path, capsys):
     seen = []
-
-    def run(args, judge):
-        seen.append((args.years, args.method, args.out, judge))
-        args.json.write_text('{"checks": []}')
-        return 1
-
-    from eip_scipy.app.paper import reproduce
-
-    monkeypatch.setattr(reproduce.solar_system, "run", run)
-    monkeypatch.setattr("eip_scipy.app.cli._rebound", lambda args: SimpleNamespace(run="REBOUND"))
-    target = tmp_path / "run.json"
-    assert main(["reproduce", "fig-solar", "--out", str(tmp_path), "--json", str(target), "--quiet"]) == 1
-    assert seen == [(None, "EIPRK4", tmp_path, "REBOUND")]  # None: the command's own default
+    target, studies = tmp_path / "run.json", {"fig-solar": lambda: Noted(seen=seen, passed=False)}
+    assert main(["reproduce", "fig-solar", "--out", str(tmp_path), "--json", str(target)], studies=studies) == 1
+    assert seen == [("solar-system", tmp_path, tmp_path / "solar-system.json")]
     run = json.loads(target.read_text())
-    assert (run["passed"], run["fig-solar"]) == (False, {"checks": []})
+    assert (run["command"], run["passed"], run["fig-solar"]["checks"]) == ("reproduce", False, ["one"])
+    assert json.loads((tmp_path / "solar-system.json").read_text())["command"] == "solar-system"
+    assert reproduce.STUDIES["fig-solar"] is SolarSystem
 
 
-def test_all_means_all(tmp_path, monkeypatch):
-    from eip_scipy.app.paper import reproduce
-
-    done = []
-    monkeypatch.setattr(reproduce, "_kepler", lambda args: (done.append("fig-kepler"), (0, {}))[1])
-    monkeypatch.setattr(reproduce, "_solar", lambda args, judge: (done.append("fig-solar"), (0, {}))[1])
-    monkeypatch.setattr(reproduce, "_particle", lambda name, args: (done.append(name), (0, {}))[1])
-    monkeypatch.setattr(reproduce, "_efficiency", lambda args: (done.append("fig-efficiency"), (0, {}))[1])
-    monkeypatch.setattr(reproduce, "reproduce", lambda name, progress: done.append(name) or [])
-    assert main(["reproduce", "all", "--out", str(tmp_path), "--quiet"]) == 0
-    assert done == [*reproduce.TABLES, *reproduce.FIGURES]
+def test_all_means_all(tmp_path):
+    seen = []
+    studies = dict.fromkeys(reproduce.STUDIES, lambda: Noted(seen=seen))
+    assert main(["reproduce", "all", "--out", str(tmp_path), "--quiet"], studies=studies) == 0
+    assert [name for name, *_ in seen if name != "solar-system"] == [n for n in reproduce.STUDIES if n != "fig-solar"]
 
 
 def test_cost_to_reach():
@@ -306,9 +307,8 @@ def test_cost_to_reach():
 
 
 @pytest.mark.needs_jit
-def test_work_precision(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(kepler_cost, "REPEATS", 1)
-    assert main(["work-precision", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")]) == 0
+def test_work_precision(tmp_path, capsys):
+    assert main(["work-precision", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")], repeats=1) == 0
     points = json.loads((tmp_path / "run.json").read_text())["points"]
     assert {point["method"] for point in points} >= {"EIPRK2", "EIPRK5", "EIPRK23", "EIPDOP853"}
     best = {point["method"]: point["position_error"] for point in points}

@@ -12,6 +12,7 @@ from eip_scipy.app.cli import main
 from eip_scipy.app.kepler import cost as kepler_cost
 from eip_scipy.app.kepler import figures as kepler_figures
 from eip_scipy.app.report import compact
+from eip_scipy.app.study import Session
 
 PNG = b"\x89PNG\r\n\x1a\n"
 T_END = 1.5
@@ -30,19 +31,18 @@ def read(file):
 # Work and precision.
 
 
-@pytest.fixture
-def few_runs(monkeypatch):
-    monkeypatch.setattr(kepler_cost, "T_END", T_END)
-    monkeypatch.setattr(kepler_cost, "REPEATS", 1)
-    monkeypatch.setattr(kepler_cost, "REFERENCE_STEPS", 300)
-    monkeypatch.setattr(kepler_cost, "FIXED", {EIPRK2: (100, 400), EIPRK4: (100, 200)})
-    monkeypatch.setattr(kepler_cost, "PAIRS", {EIPRK45: (1e-4, 1e-7)})
+FEW = {
+    "t_end": T_END,
+    "repeats": 1,
+    "reference_steps": 300,
+    "fixed": {EIPRK2: (100, 400), EIPRK4: (100, 200)},
+    "pairs": {EIPRK45: (1e-4, 1e-7)},
+}
 
 
-@pytest.mark.usefixtures("few_runs")
 def test_errors_fall_with_the_order_and_work_is_counted(tmp_path, capsys):
     file = tmp_path / "run.json"
-    assert main(["work-precision", "--out", str(tmp_path), "--json", str(file)]) == 0
+    assert main(["work-precision", "--out", str(tmp_path), "--json", str(file)], **FEW) == 0
     points = json.loads(file.read_text())["points"]
     error = {method: [p["position_error"] for p in points if p["method"] == method] for method in ("EIPRK2", "EIPRK4")}
     assert error["EIPRK2"][0] / error["EIPRK2"][1] == pytest.approx(4**2, rel=0.2)
@@ -57,18 +57,17 @@ def test_errors_fall_with_the_order_and_work_is_counted(tmp_path, capsys):
     assert [line.split()[0] for line in lines if line.startswith("wrote")] == ["wrote"] * 3
 
 
-@pytest.mark.usefixtures("few_runs")
 def test_csv_of_work_and_precision_has_a_line_for_each_run(tmp_path, capsys):
-    assert main(["work-precision", "--out", str(tmp_path), "--quiet"]) == 0
+    assert main(["work-precision", "--out", str(tmp_path), "--quiet"], **FEW) == 0
     assert [row["method"] for row in read(tmp_path / "work-precision.csv")] == [
         "EIPRK2", "EIPRK2", "EIPRK4", "EIPRK4", "EIPRK45", "EIPRK45",
     ]  # fmt: skip
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.usefixtures("few_runs", "no_plotting")
+@pytest.mark.usefixtures("no_plotting")
 def test_work_and_precision_without_matplotlib(tmp_path, capsys):
-    assert main(["work-precision", "--out", str(tmp_path), "--quiet"]) == 0
+    assert main(["work-precision", "--out", str(tmp_path), "--quiet"], **FEW) == 0
     assert "eip-scipy: no figures: " in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["work-precision.csv"]
 
@@ -77,19 +76,19 @@ def test_work_and_precision_interrupted(tmp_path, capsys, monkeypatch):
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(kepler_cost, "measure", stop)
-    assert main(["work-precision", "--out", str(tmp_path), "--quiet"]) == 130
+    monkeypatch.setattr(kepler_cost, "work_precision", stop)
+    assert main(["work-precision", "--out", str(tmp_path), "--quiet"], **FEW) == 130
     assert "nothing was written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
 def test_cheapest_methods_of_the_text():
-    def work(*errors):
-        n = np.arange(1.0, len(errors) + 1)
-        return kepler_cost.CostCurve(n, 1000 * n, n / 1000, np.array(errors))
+    def work(name, *errors):
+        return [kepler_cost.KeplerPoint(name, k, 1000 * k, k / 1000, error) for k, error in enumerate(errors, 1)]
 
-    names = {method.__name__: work(np.nan) for method in kepler_cost.FIXED}
-    text = kepler_cost.text({**names, "EIPRK2": work(0.1, 1e-2, 1e-4), "EIPRK45": work(1e-2, 1e-3)}, "a machine")
+    points = [*work("EIPRK2", 0.1, 1e-2, 1e-4), *work("EIPRK45", 1e-2, 1e-3)]
+    points += [point for name in ("EIPRK3", "EIPRK4", "EIPRK5") for point in work(name, np.nan)]
+    text = kepler_cost.KeplerCost().text(kepler_cost.Found(points, "a machine"))
     nfev = text.split("for an error of")[1].splitlines()
     row = {line[:24].strip(): line[24:].split() for line in nfev}
     assert row["EIPRK2"] == ["2.0", "3.0", "-", "-"]
@@ -102,9 +101,12 @@ def test_cheapest_methods_of_the_text():
 # The paper's figures 1 and 2.
 
 
+SHORT = kepler_figures.KeplerFigures(t_end=T_END)
+
+
 @pytest.fixture(scope="module")
 def lines():
-    return kepler_figures.study(t_end=T_END)
+    return SHORT.measure(Session("fig-kepler"))
 
 
 def test_each_line_keeps_what_it_is_named_after(lines):
@@ -125,24 +127,23 @@ def test_positions_are_measured_against_the_solution(lines):
     assert 1e-7 < end["EIP-HL, RK5"] < end["EIP-HL"] < 1e-3
 
 
-def test_known_values_are_compared_to_their_digits(lines, monkeypatch):
-    assert not any(check["matched"] for check in kepler_figures.checks(lines))  # they are those at t = 2000
-    monkeypatch.setattr(kepler_figures, "T_END", T_END)
+def test_known_values_are_compared_to_their_digits(lines):
+    assert not any(check.passed for check in kepler_figures.KeplerFigures().checks(lines))  # they are those at t = 2000
     at_end, largest = lines["EIP-H"].momentum_error[-1], lines["EIP-HL, RK2"].energy_error.max()
     known = [
         ("EIP-H", "momentum_error", "|L - L0|", "end", compact(at_end)),
         ("EIP-H", "momentum_error", "|L - L0|", "end", compact(1.2 * at_end)),
         ("EIP-HL, RK2", "energy_error", "max |H - H0|", "max", compact(largest)),
     ]
-    monkeypatch.setattr(kepler_figures, "KNOWN", known)
-    checks = kepler_figures.checks(lines)
-    assert [check["matched"] for check in checks] == [True, False, True]
-    assert [check["ours"] for check in checks] == [at_end, at_end, largest]
-    assert kepler_figures.text(lines).splitlines()[-2].startswith("FAILED EIP-H")
+    study = kepler_figures.KeplerFigures(t_end=T_END, known=known)
+    checks = study.checks(lines)
+    assert [check.passed for check in checks] == [True, False, True]
+    assert [check.ours for check in checks] == [at_end, at_end, largest]
+    assert study.text(lines).splitlines()[-2].startswith("FAILED EIP-H")
 
 
 def test_figures_have_a_row_for_each_method(lines):
-    figures = dict(kepler_figures.figures(lines))
+    figures = dict(SHORT.figures(lines))
     assert {name: len(figure.axes) for name, figure in figures.items()} == {
         "fig-kepler-1.png": 3 * 4, "fig-kepler-2.png": 2 * 4,
     }  # fmt: skip
@@ -157,7 +158,7 @@ def test_figures_have_a_row_for_each_method(lines):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_command_for_the_figures(lines, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(kepler_figures, "study", lambda: lines)
+    monkeypatch.setattr(kepler_figures.KeplerFigures, "measure", lambda self, session: lines)
     file = tmp_path / "run.json"
     assert main(["reproduce", "fig-kepler", "--out", str(tmp_path), "--json", str(file)]) == 1
     assert capsys.readouterr().out.count("\nFAILED ") == 4
@@ -174,7 +175,7 @@ def test_command_for_the_figures(lines, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.usefixtures("no_plotting")
 def test_command_for_the_figures_without_matplotlib(lines, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(kepler_figures, "study", lambda: lines)
+    monkeypatch.setattr(kepler_figures.KeplerFigures, "measure", lambda self, session: lines)
     assert main(["reproduce", "fig-kepler", "--out", str(tmp_path), "--quiet"]) == 1
     assert "eip-scipy: no figures: " in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["fig-kepler.csv"]

@@ -116,10 +116,9 @@ def test_command(tmp_path, capsys):
     ("options", "scenes"),
     [
         ([], particle_runs.SCENES),
-        (["--field", "uniform"], ("uniform",)),
-        (["--field", "tokamak"], particle_runs.SCENES[1:]),
-        (["--orbit", "transit"], ("tokamak-transit",)),
-        (["--field", "tokamak", "--orbit", "banana"], ("tokamak-banana",)),
+        (["uniform"], ("uniform",)),
+        (["tokamak"], particle_runs.SCENES[1:]),
+        (["tokamak", "--orbit", "banana"], ("tokamak-banana",)),
     ],
 )
 def test_scenes_of_the_command(options, scenes, tmp_path, capsys):
@@ -132,20 +131,22 @@ def test_scenes_of_the_command(options, scenes, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--field", "uniform", "--orbit", "banana"], "--orbit is for the tokamak"),
-        (["--field", "stellarator"], "invalid choice"),
-        (["--orbit", "potato"], "invalid choice"),
+        (["--field", "uniform"], "--field is now: eip-scipy charged-particle uniform, or charged-particle tokamak\n"),
+        (["--orbit=banana"], "--orbit is now: eip-scipy charged-particle tokamak --orbit\n"),
+        (["uniform", "--orbit", "banana"], "unrecognized arguments: --orbit"),
+        (["tokomak"], "unrecognized arguments: tokomak; did you mean 'tokamak'?"),
+        (["tokamak", "--orbit", "potato"], "invalid choice"),
     ],
 )
 def test_wrong_usage(options, words, tmp_path, capsys):
-    assert main(["charged-particle", "--out", str(tmp_path), *options]) == 2
+    assert main(["charged-particle", *options, "--out", str(tmp_path)]) == 2
     assert words in capsys.readouterr().err
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("short_runs", "no_plotting")
 def test_without_matplotlib(tmp_path, capsys):
-    assert main(["charged-particle", "--field", "uniform", "--out", str(tmp_path), "--quiet"]) == 1
+    assert main(["charged-particle", "uniform", "--out", str(tmp_path), "--quiet"]) == 1
     assert "eip-scipy: no figures: " in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["charged-particle.csv"]
 

@@ -1,6 +1,5 @@
 """The paper's tables: every cell's agreement as measured, tables 1-4 also beside the same computation in 50 digits."""
 
-import argparse
 import csv
 import json
 
@@ -8,8 +7,10 @@ import mpmath_tables
 import numpy as np
 import pytest
 
-from eip_scipy.app.paper import reproduce
-from eip_scipy.app.paper.reproduce import TABLES, Value
+from eip_scipy.app.cli import main
+from eip_scipy.app.paper import tables
+from eip_scipy.app.paper.tables import TABLES, PaperTable, Value
+from eip_scipy.app.study import Session
 
 EPS = np.finfo(float).eps
 DATA = json.loads(mpmath_tables.DATA.read_text(encoding="utf-8"))
@@ -43,9 +44,13 @@ ORDERS_APART = {
 }
 
 
+def cells_of(name):
+    return PaperTable(name=name).measure(Session("reproduce", quiet=True))
+
+
 @pytest.fixture(scope="module")
 def cells():
-    return [cell for table in TABLES if table not in reproduce.SLOW for cell in reproduce.reproduce(table)]
+    return [cell for name in TABLES[:4] for cell in cells_of(name)]
 
 
 def place(cell):
@@ -138,20 +143,20 @@ def table5(name):
 def test_table5_from_its_longest_steps():
     """The paper's digits; the other cells take minutes: `eip-scipy reproduce table5`."""
     stored = table5("Omega = 0.5, EIP-ME")
-    (error,) = reproduce._field_differences(reproduce.Series(**{**stored, "divisors": [2]}))
+    (error,) = tables._field_differences(tables.Series(**{**stored, "divisors": [2]}))
     assert Value(stored["errors"][0], error, float("nan"), roundoff=1e-15).status in ("matched", "round-off")
 
 
 def test_table5_has_no_50_digit_column(monkeypatch):
     """And a number is judged by the paper's alone: here one is off by more than round-off."""
     monkeypatch.setitem(
-        reproduce._ERRORS, 5, lambda series: [float(x) * (1 + 1e-3 * (series.Omega == 0.9)) for x in series.errors]
+        tables._ERRORS, 5, lambda series: [float(x) * (1 + 1e-3 * (series.Omega == 0.9)) for x in series.errors]
     )
-    cells = reproduce.reproduce("table5")
+    cells = cells_of("table5")
     assert (len(cells), sum(cell.order is not None for cell in cells)) == (27, 18)
     assert all(np.isnan(cell.error.mpmath) for cell in cells)
     assert {cell.column[:11] for cell in cells if cell.error.status == "differs"} == {"Omega = 0.9"}
-    text = reproduce.table_text(cells)
+    text = tables.table_text(cells)
     assert "mpmath" not in text
     assert "nan" not in text
     assert max(map(len, text.splitlines())) <= 130
@@ -192,55 +197,40 @@ def test_round_off_of_the_paper():
     assert Value("6.8501e-12", 6.8430e-12, 6.8425e-12, roundoff=EPS).status == "differs"
 
 
-def arguments(*argv):
-    parser = argparse.ArgumentParser()
-    reproduce.add_arguments(parser)
-    args = parser.parse_args(argv)
-    args.out = args.json = None
-    args.quiet = False
-    return args
-
-
 def test_command_prints_and_writes(tmp_path, capsys):
-    args = arguments("table2", "table1")
-    args.out, args.json = tmp_path / "new", tmp_path / "tables.json"
-    assert reproduce.run(args) == 0
+    out, file = tmp_path / "new", tmp_path / "tables.json"
+    assert main(["reproduce", "table2", "table1", "--out", str(out), "--json", str(file)]) == 0
     text = capsys.readouterr().out
     assert "15 of 16 errors and 10 of 12 orders agree" in text
     assert "24 of 24 errors and 18 of 18 orders agree" in text
     assert "misprinted as 3.1922" in text
     assert max(map(len, text.splitlines())) <= 130
-    written = json.loads(args.json.read_text())
+    written = json.loads(file.read_text())
     assert (written["command"], written["passed"]) == ("reproduce", True)
     assert (len(written["cells"]), len(written["orders"])) == (40, 30)
     assert {"table", "row", "column", "paper", "ours"} <= written["cells"][0].keys()
     (misprint,) = (cell for cell in written["cells"] if cell["misprinted_as"] is not None)
     assert (misprint["row"], misprint["column"], misprint["paper"]) == ("RK2 iter#1", "h0/1", 31.922)
-    with open(args.out / "table1.csv", newline="") as file:
-        lines = list(csv.DictReader(file))
+    with open(out / "table1.csv", newline="") as stream:
+        lines = list(csv.DictReader(stream))
     assert len(lines) == 28
     assert float(lines[0]["ours"]) == pytest.approx(6.3506e-3, rel=1e-4)
 
 
-def test_quiet_prints_nothing(capsys):
-    args = arguments("table1")
-    args.quiet = True
-    assert reproduce.run(args) == 0
+def test_quiet_prints_nothing(tmp_path, capsys):
+    assert main(["reproduce", "table1", "--quiet", "--out", str(tmp_path)]) == 0
     assert capsys.readouterr().out == ""
 
 
-def test_a_wrong_number_fails_the_command(monkeypatch, capsys):
+def test_a_wrong_number_fails_the_command(tmp_path, monkeypatch, capsys):
     """The status is 1 and the line is marked when the step is not the paper's."""
-    monkeypatch.setitem(reproduce.METHODS, "RK3", reproduce.EIPRK2)
-    assert reproduce.run(arguments("table1")) == 1
+    monkeypatch.setitem(tables.METHODS, "RK3", tables.EIPRK2)
+    assert main(["reproduce", "table1", "--out", str(tmp_path)]) == 1
     text = capsys.readouterr().out
     assert "7 marked ! DIFFER" in text
     assert "0/5!" in text
 
 
 def test_unknown_table_is_wrong_usage(capsys):
-    with pytest.raises(SystemExit) as error:
-        arguments("table6")
-    assert error.value.code == 2
-    with pytest.raises(ValueError, match=r"table must be one of table1, .*, got 'table6'\."):
-        reproduce.reproduce("table6")
+    assert main(["reproduce", "table6"]) == 2
+    assert "invalid choice: 'table6'" in capsys.readouterr().err

@@ -333,16 +333,20 @@ def test_bad_shift(shift, message):
         sav_crank_nicolson(problem.equation, (0, 1), problem.y0, 0.1, shift=shift)
 
 
-# The figure of the test of efficiency.
+# The figure of error against cost.
 
 
-def test_efficiency_figure():
+def test_error_against_cost():
     """Two panels for each problem, in which each method has one style, and lines of the slopes asked for."""
     plotting = pytest.importorskip("eip_scipy.plotting")
     h = np.array([0.1, 0.05, 0.025])
-    series = {name: {"h": h, "cost": 1 / h, "error": h**p} for name, p in (("second", 2), ("fourth", 4))}
-    problems = {"one": series, "two": series}
-    figure = plotting.efficiency_figure(problems, error="error", cost="time [s]", slopes={"two": {"fourth": 4.0}})
+    orders = {"second": 2, "fourth": 4}
+    steps, times = ({name: (x, h**p) for name, p in orders.items()} for x in (h, 1 / h))
+    rows = [
+        [plotting.CostPanel(name, "step h", steps, slopes), plotting.CostPanel(name, "time [s]", times)]
+        for name, slopes in (("one", {}), ("two", {"fourth": 4.0}))
+    ]
+    figure = plotting.cost_figure(rows, error="error")
     axes = np.reshape(figure.axes, (2, 2))
     assert [axis.get_title() for axis in axes.flat] == ["one", "one", "two", "two"]
     assert [axis.get_xlabel() for axis in axes[1]] == ["step h", "time [s]"]

@@ -201,12 +201,8 @@ def test_a_problem_without_compiled_equations_is_refused():
 # The command.
 
 
-@pytest.fixture
-def few_runs(monkeypatch):
-    monkeypatch.setattr(hard_scenes, "REPEATS", 1)
-    monkeypatch.setattr(scene_runs, "TOLERANCES", (1e-7, 1e-11))
-    monkeypatch.setattr(scene_runs, "STEPS_PER_TURN", (30, 60))
-    monkeypatch.setattr(scene_runs, "EPSILONS", {"prs23": (1e-5, 1e-7), "global": (1e-4,)})
+FEW = scene_runs.Spread((1e-7, 1e-11), (30, 60), {"prs23": (1e-5, 1e-7), "global": (1e-4,)}, repeats=1)
+COARSE = scene_runs.Spread((1e-3, 1e-5), (10, 20), repeats=1)
 
 
 @pytest.fixture
@@ -219,13 +215,12 @@ def no_rebound(monkeypatch):
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
-@pytest.mark.usefixtures("few_runs")
 def test_command_compares_methods(tmp_path, capsys):
     pytest.importorskip("rebound")
     file = tmp_path / "run.json"
     names = ["kepler-0.9", "comet"]
     options = [option for name in names for option in ("--scene", name)]
-    assert main(["hard-scenes", *options, "--out", str(tmp_path), "--json", str(file)]) == 0
+    assert main(["hard-scenes", *options, "--out", str(tmp_path), "--json", str(file)], spread=FEW) == 0
     points = json.loads(file.read_text())["points"]
     assert list(dict.fromkeys(p["scene"] for p in points)) == names
     error = {(p["scene"], p["method"], p["value"]): p["position_error"] for p in points}
@@ -251,14 +246,12 @@ def small_scene(monkeypatch):
     monkeypatch.setitem(
         SCENES, "small", lambda: scene_runs.HardScene("small", "small", problem, centre_time, (40,), 1e-4)
     )
-    monkeypatch.setattr(scene_runs, "TOLERANCES", (1e-3, 1e-5))
-    monkeypatch.setattr(scene_runs, "STEPS_PER_TURN", (10, 20))
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_runs", "no_rebound", "small_scene")
+@pytest.mark.usefixtures("no_rebound", "small_scene")
 def test_command_without_rebound_says_what_to_install(tmp_path, capsys):
-    assert main(["hard-scenes", "--scene", "small", "--out", str(tmp_path)]) == 0
+    assert main(["hard-scenes", "--scene", "small", "--out", str(tmp_path)], spread=COARSE) == 0
     out, err = capsys.readouterr()
     assert "no comparison with WHFast and IAS15" in err
     assert 'pip install "eip_scipy[rebound]"' in err
@@ -269,11 +262,11 @@ def test_command_without_rebound_says_what_to_install(tmp_path, capsys):
     assert max(float(p["position_error"]) for p in points) < 0.1
 
 
-@pytest.mark.usefixtures("few_runs", "small_scene")
+@pytest.mark.usefixtures("small_scene")
 def test_a_run_that_fails_is_listed(capsys):
     of = scene("small")
     failed = scene_runs.Point("small", "EIPRKN12", "h", 0.1, 7, 0.01, math.nan, 0.0, 0.0, "projection failed")
-    text = hard_scenes.text({"small": (of, [failed])}, "a machine")
+    text = hard_scenes.HardScenes().text(hard_scenes.Found({"small": (of, [failed])}, "a machine"))
     assert "Did not reach the end:\n  small, EIPRKN12, h 0.10: projection failed" in text
 
 

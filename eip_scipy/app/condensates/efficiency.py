@@ -11,13 +11,13 @@ All methods have the same library of transforms.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from math import ceil
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from tqdm import tqdm
 
 from ...comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
 from ...core.solvers import EIPRK4, eip_method
@@ -25,11 +25,12 @@ from ...problems import Splitting, plane_wave
 from ...problems.gross_pitaevskii import FieldProblem, make_transforms
 from ...run.integrate import integrate
 from ..report import describe_machine, table
+from ..study import Figures, Rows, Session, Study
 from ..work_precision import cost_to_reach, work_precision
 
-__all__ = ["METHODS", "QuenchStudy", "Trial", "checks", "figures", "rows", "runs_text", "study", "text"]
+__all__ = ["METHODS", "Efficiency", "Slope", "Trial", "runs_text"]
 
-POINTS, REPEATS, T_END = 64, 3, 1.0
+T_END = 1.0
 SHARES = (0.9, 0.64, 0.45, 0.32, 0.225)  # of the step above which RK4 is unstable
 LONG = tuple(T_END / n for n in (25, 50, 100, 200, 400, 800, 1600, 3200, 6400))
 FOURTH = tuple(T_END / n for n in (10, 20, 40, 80, 160, 320))
@@ -44,7 +45,6 @@ ORDERS = {
     "splitting4-EIP": 4,
 }  # fmt: skip
 SLOPES, SLOPE_TOLERANCE, LEFT = ("CN", "EIP-ME"), 0.1, 1e-12
-DRAWN = {"h": "h", "cost": "seconds", "error": "error_max"}
 
 
 class Contender(NamedTuple):
@@ -196,82 +196,125 @@ class Trial:
         return float(np.polyfit(np.log(h[clean]), np.log(error[clean]), 1)[0]) if clean.size > 1 else float("nan")
 
 
-QuenchStudy = dict[str, Trial]
+class Slope(NamedTuple):
+    """A slope or an invariant's error, as it should be and as it is."""
+
+    wave: str
+    quantity: str
+    known: float
+    ours: float
+    slack: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether they agree."""
+        return abs(self.ours - self.known) <= self.slack
 
 
-def study(points: int = POINTS, repeats: int = REPEATS, quiet: bool = True) -> QuenchStudy:
-    """Run all methods on both waves.
+Found = dict[str, Trial]
 
-    Parameters
+
+@dataclass(frozen=True, kw_only=True)
+class Efficiency(Study[Found]):
+    """``reproduce fig-efficiency``: all methods on both waves.
+
+    Attributes
     ----------
-    points : int, optional
+    points : int
         Along each axis.
-    repeats : int, optional
+    repeats : int
         Runs of each, the least time of which counts.
-    quiet : bool, optional
-        Without a progress bar.
-
-    Returns
-    -------
-    dict of str to Trial
+    orders : mapping of str to int
+        What the slopes should be.
+    stem : str
+        Of the files' names.
     """
-    plane = plane_wave((points, points), t_end=T_END, fft=make_transforms().name)
-    assert plane.reference is not None
-    exact = plane.reference(T_END)
-    assert exact is not None
-    trials = dict(zip(WAVES, (Trial(plane, exact), Trial(*modulated_wave(points))), strict=True))
-    total = repeats * sum(len(steps) for trial in trials.values() for _, steps in trial.methods().values())
-    with tqdm(total=total, desc="fig-efficiency", unit="run", leave=False, disable=quiet) as bar:
-        for trial in trials.values():
-            trial.measure(repeats, bar.update)
-    return trials
 
+    points: int = 64
+    repeats: int = 3
+    orders: Mapping[str, int] = field(default_factory=lambda: ORDERS)
+    stem: str = "fig-efficiency"
 
-def checks(trials: QuenchStudy) -> list[dict[str, Any]]:
-    """Compare the slopes with the methods' orders, and what EIP-ME leaves of its invariants with round-off.
+    def measure(self, session: Session) -> Found:
+        plane = plane_wave((self.points, self.points), t_end=T_END, fft=make_transforms().name)
+        assert plane.reference is not None
+        exact = plane.reference(T_END)
+        assert exact is not None
+        trials = dict(zip(WAVES, (Trial(plane, exact), Trial(*modulated_wave(self.points))), strict=True))
+        total = self.repeats * sum(len(steps) for trial in trials.values() for _, steps in trial.methods().values())
+        with session.bar(total, "fig-efficiency") as bar:
+            for trial in trials.values():
+                trial.measure(self.repeats, bar.update)
+        return trials
 
-    Returns
-    -------
-    list of dict
-        With `wave`, `quantity`, `known`, `ours` and `matched`.
-    """
-    found = []
-    for wave, trial in trials.items():
-        for name, order in ORDERS.items():
-            ours = trial.slope(name)
-            if not np.isnan(ours):
-                matched = abs(ours - order) <= SLOPE_TOLERANCE
-                found.append({"wave": wave, "quantity": f"slope of {name}", "known": order, "ours": ours})
-                found[-1]["matched"] = matched
-    ours = max(float(trials[WAVES[1]].column("EIP-ME", f"error_{name}").max()) for name in KEPT)
-    found.append({"wave": WAVES[1], "quantity": "mass and energy of EIP-ME", "known": 0.0, "ours": ours})
-    found[-1]["matched"] = ours <= LEFT
-    return found
+    def checks(self, found: Found) -> list[Slope]:
+        """Compare the slopes with the methods' orders, and what EIP-ME leaves of its invariants with round-off."""
+        slopes = [
+            Slope(wave, f"slope of {name}", order, trial.slope(name), SLOPE_TOLERANCE)
+            for wave, trial in found.items()
+            for name, order in self.orders.items()
+        ]
+        left = max(float(found[WAVES[1]].column("EIP-ME", f"error_{name}").max()) for name in KEPT)
+        known = [slope for slope in slopes if not np.isnan(slope.ours)]
+        return [*known, Slope(WAVES[1], "mass and energy of EIP-ME", 0.0, left, LEFT)]
 
+    def text(self, found: Found) -> str:
+        parts = [describe_machine()]
+        for wave, trial in found.items():
+            body = []
+            for name in METHODS:
+                cost, error = trial.column(name, "seconds"), trial.column(name, "error_max")
+                numbers = [_number(trial.slope(name), ".2f")]
+                body.append((name, numbers + [_number(cost_to_reach(cost, error, level), ".2g") for level in LEVELS]))
+            parts.append(f"{wave}: slope in h, and processor seconds to reach an error (max)")
+            parts.append(table([["slope"], *([f"{level:.0e}"] for level in LEVELS)], body))
+        checks = self.checks(found)
+        failed = [check for check in checks if not check.passed]
+        parts.append(f"{len(checks) - len(failed)} of {len(checks)} slopes and invariants are as they should be.")
+        parts += [f"FAILED {c.wave}, {c.quantity}: {c.ours:.3g}, known {c.known:.3g}" for c in failed]
+        return "\n\n".join(parts)
 
-def text(trials: QuenchStudy) -> str:
-    """Lay out slopes and costs, and what is not as it should be."""
-    parts = [describe_machine()]
-    for wave, trial in trials.items():
-        body = []
-        for name in METHODS:
-            cost, error = trial.column(name, "seconds"), trial.column(name, "error_max")
-            numbers = [_number(trial.slope(name), ".2f")]
-            body.append((name, numbers + [_number(cost_to_reach(cost, error, level), ".2g") for level in LEVELS]))
-        parts.append(f"{wave}: slope in h, and processor seconds to reach an error (max)")
-        parts.append(table([["slope"], *([f"{level:.0e}"] for level in LEVELS)], body))
-    judged = checks(trials)
-    failed = [c for c in judged if not c["matched"]]
-    parts.append(f"{len(judged) - len(failed)} of {len(judged)} slopes and invariants are as they should be.")
-    parts += [f"FAILED {c['wave']}, {c['quantity']}: {c['ours']:.3g}, known {c['known']:.3g}" for c in failed]
-    return "\n\n".join(parts)
+    def numbers(self, found: Found) -> dict[str, Any]:
+        names = ("wave", "quantity", "known", "ours")
+        return {
+            "checks": [
+                {**{name: getattr(check, name) for name in names}, "matched": check.passed}
+                for check in self.checks(found)
+            ]
+        }
+
+    def tables(self, found: Found) -> dict[str, Rows]:
+        return {
+            f"{self.stem}.csv": [{"wave": wave, **row} for wave, trial in found.items() for row in trial.rows.values()]
+        }
+
+    def figures(self, found: Found) -> Figures:
+        """Error against step and against time, a row for each wave."""
+        from ...plotting import CostPanel, cost_figure
+
+        rows = []
+        for wave, trial in found.items():
+            steps, times = (
+                {name: (trial.column(name, cost), trial.column(name, "error_max")) for name in METHODS}
+                for cost in ("h", "seconds")
+            )
+            slopes = {name: trial.slope(name) for name in SLOPES}
+            rows.append([CostPanel(wave, "step h", steps, slopes), CostPanel(wave, "processor time [s]", times)])
+        yield (
+            f"{self.stem}.png",
+            cost_figure(
+                rows,
+                error=r"max $|\delta\psi|$ at t = 1",
+                title=f"NLS equation, {self.points} x {self.points} points: accuracy and cost",
+            ),
+        )
 
 
 def _number(value: float, form: str) -> str:
     return "-" if np.isnan(value) else f"{value:{form}}"
 
 
-def runs_text(trials: QuenchStudy) -> str:
+def runs_text(trials: Found) -> str:
     """Lay out all runs."""
     parts = []
     for wave, trial in trials.items():
@@ -283,46 +326,3 @@ def runs_text(trials: QuenchStudy) -> str:
         heads = [["h"], ["error", "max"], ["error", "L2"], ["error of", "mass"], ["error of", "energy"]]
         parts += [wave, table([*heads, ["pairs", "a step"], ["CPU [s]"], [""]], body)]
     return "\n\n".join(parts)
-
-
-def rows(trials: QuenchStudy) -> list[dict[str, Any]]:
-    """Make the lines of the CSV file."""
-    return [{"wave": wave, **row} for wave, trial in trials.items() for row in trial.rows.values()]
-
-
-def figures(trials: QuenchStudy) -> Iterator[tuple[str, Any]]:
-    """Make the figure.
-
-    Yields
-    ------
-    (str, Figure)
-        File name and figure.
-
-    Raises
-    ------
-    ImportError
-        Without matplotlib.
-    """
-    from ...plotting import efficiency_figure
-
-    series = {
-        wave: {name: {key: trial.column(name, source) for key, source in DRAWN.items()} for name in METHODS}
-        for wave, trial in trials.items()
-    }
-    shape = " x ".join(map(str, _grid(trials)))
-    yield (
-        "fig-efficiency.png",
-        efficiency_figure(
-            series,
-            error=r"max $|\delta\psi|$ at t = 1",
-            cost="processor time [s]",
-            slopes={wave: {name: trial.slope(name) for name in SLOPES} for wave, trial in trials.items()},
-            title=f"NLS equation, {shape} points: accuracy and cost",
-        ),
-    )
-
-
-def _grid(trials: QuenchStudy) -> tuple[int, ...]:
-    equation = trials[WAVES[0]].problem.equation
-    assert equation is not None
-    return equation.grid.shape

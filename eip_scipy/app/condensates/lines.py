@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ...problems import GrossPitaevskii
 from ...problems.gross_pitaevskii import density_surface, line_condensate, rotated, vortices
-from .. import long_runs
-from ..report import check_outputs, compact, warn
-from .runs import REFERENCE, SHOWN, Figures, Motion, Quench, QuenchStudy, check, conclude, motion, study
+from ..report import compact, warn
+from ..study import Figures, Session
+from .runs import REFERENCE, SHOWN, FieldCheck, Motion, Quench, QuenchRuns, QuenchStudy
 from .states import (
     LINE_POINTS,
     LINES,
@@ -27,78 +26,99 @@ from .states import (
     searching,
 )
 
-__all__ = ["run"]
+__all__ = ["VortexLines"]
 
-INTERRUPTED = 130
-STEP, T_END = 5e-3, 20.0
-REFERENCE_STEP = 1e-2
-SAVED = 1.0  # time between two saved states
 OMEGA_BEFORE, OMEGA_AFTER = 0.7, 0.9
-SNAPSHOTS = (0.0, 4.0, 8.0, 12.0, 16.0, 20.0)
-# The trap is round: what stands still in the slower frame goes on with it, and stays behind the faster one.
-SENSE = -1
-ENERGY_KEPT = 1e-13
-TURN_KNOWN = 0.02  # rad: at the lines a tenth of the distance between two points of the grid
-ENERGIES_KNOWN = 1e-4
 LEVEL = 1e-3  # of the paper's surfaces
 SLICE = 5.0  # half the side of the paper's slices
 ROOM = ((-4.0, 4.0), (-4.0, 4.0), (-6.0, 6.0))
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run ``gpe vortex-lines``; see `eip_scipy.app.condensates.gpe.run`."""
-    check_outputs(args.out, args.json)
-    long_runs.check(args)
-    before, after = (line_condensate(Omega, LINE_POINTS) for Omega in (OMEGA_BEFORE, OMEGA_AFTER))
-    try:
-        start = kept_state(args, before, search_saddle)
-        with searching(args) as update:
-            lower = leave_saddle(before, start, args.seed, update)
-    except KeyboardInterrupt:
-        warn("interrupted in the search for the stationary state; nothing was written")
-        return INTERRUPTED
-    quench = Quench(
-        name="vortex-lines",
-        title=f"Vortex lines, Omega = {OMEGA_BEFORE:g} -> {OMEGA_AFTER:g}",
-        problem=after.problem(start, T_END, STEP, name="vortex-lines"),
-        reference_step=REFERENCE_STEP,
-        interval=SAVED,
-        snapshots=SNAPSHOTS,
-        sense=SENSE,
-        energy_kept=ENERGY_KEPT,
-    )
-    made = study(quench, progress=not args.quiet, checkpoint_of=partial(long_runs.checkpoint_options, args))
-    if made.fields is None:
-        return conclude(args, made, None)
-    moved = motion(after, made.lines[SHOWN].t, made.fields)
-    return conclude(
-        args,
-        made,
-        moved,
-        more=[*_state_checks(before, start, lower), _turn_check(moved)],
-        notes=[*_state_notes(before, start, lower), _grid_note(before, made, moved.t)],
-        figures=partial(_figures, made, moved),
-    )
+@dataclass(frozen=True, kw_only=True)
+class VortexLines(QuenchStudy):
+    """The command.
 
+    The trap is round: what stands still in the slower frame goes on with it, and stays behind the faster one.
 
-def _state_checks(gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[dict[str, Any]]:
-    saddle, count = gpe.energy(start), len(vortices(gpe, start).charges)
-    return [
-        check(f"E of the start {SADDLE_ENERGY}", saddle, abs(saddle - SADDLE_ENERGY) < ENERGIES_KNOWN),
-        check(f"lines of the start, {SADDLE_LINES}", count, count == SADDLE_LINES),
-        check(
-            f"E below that saddle {LINES_ENERGY}",
-            lower.state.energy,
-            lower.state.converged and abs(lower.state.energy - LINES_ENERGY) < ENERGIES_KNOWN,
-        ),
-        check(f"lines there, {LINES}", lower.count, lower.count == LINES),
-    ]
+    Attributes
+    ----------
+    points : int
+        Along each axis.
+    saved : float
+        Time between two saved states.
+    energies_known : float
+        How well the energies of the start and below it are.
+    turn_known : float
+        rad: at the lines a tenth of the distance between two points of the grid.
+    """
 
+    points: int = LINE_POINTS
+    t_end: float = 20.0
+    step: float = 5e-3
+    saved: float = 1.0
+    snapshots: tuple[float, ...] = (0.0, 4.0, 8.0, 12.0, 16.0, 20.0)
+    energies_known: float = 1e-4
+    turn_known: float = 0.02
 
-def _turn_check(moved: Motion) -> dict[str, Any]:
-    """The lines turn by the difference of the rotations times t."""
-    off = float(np.abs(moved.angle - (OMEGA_BEFORE - OMEGA_AFTER) * moved.t).max())
-    return check(f"angle off {OMEGA_BEFORE - OMEGA_AFTER:.1f} t by less than {TURN_KNOWN:g} rad", off, off < TURN_KNOWN)
+    def arguments(self) -> dict[str, Any]:
+        return {"h": self.step, "t_end": self.t_end}
+
+    def measure(self, session: Session) -> QuenchRuns:
+        """Search the state, show that it is a saddle, and do all runs."""
+        before, after = (line_condensate(Omega, self.points) for Omega in (OMEGA_BEFORE, OMEGA_AFTER))
+        start = kept_state(self, session, before, lambda update: search_saddle(self.points, update))
+        with searching(session) as update:
+            lower = leave_saddle(before, start, self.seed, update)
+        quench = Quench(
+            name="vortex-lines",
+            title=f"Vortex lines, Omega = {OMEGA_BEFORE:g} -> {OMEGA_AFTER:g}",
+            problem=after.problem(start, self.t_end, self.step, name="vortex-lines"),
+            reference_step=1e-2,
+            interval=self.saved,
+            snapshots=self.snapshots,
+            sense=-1,
+            energy_kept=1e-13,
+        )
+        made = self.do_runs(quench, session)
+        assert made.moved is not None
+        made.more = [*self._state_checks(before, start, lower), self._turn_check(made.moved)]
+        made.notes = [*_state_notes(before, start, lower), _grid_note(before, made, made.moved.t)]
+        return made
+
+    def _state_checks(self, gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[FieldCheck]:
+        saddle, count, state = gpe.energy(start), len(vortices(gpe, start).charges), lower.state
+        below = state.converged and abs(state.energy - LINES_ENERGY) < self.energies_known
+        return [
+            FieldCheck(f"E of the start {SADDLE_ENERGY}", saddle, abs(saddle - SADDLE_ENERGY) < self.energies_known),
+            FieldCheck(f"lines of the start, {SADDLE_LINES}", count, count == SADDLE_LINES),
+            FieldCheck(f"E below that saddle {LINES_ENERGY}", state.energy, below),
+            FieldCheck(f"lines there, {LINES}", lower.count, lower.count == LINES),
+        ]
+
+    def _turn_check(self, moved: Motion) -> FieldCheck:
+        """The lines turn by the difference of the rotations times t."""
+        slower = OMEGA_BEFORE - OMEGA_AFTER
+        off = float(np.abs(moved.angle - slower * moved.t).max())
+        return FieldCheck(f"angle off {slower:.1f} t by less than {self.turn_known:g} rad", off, off < self.turn_known)
+
+    def pictures(self, found: QuenchRuns) -> Figures:
+        """The plane z = 0, and surfaces of equal density."""
+        from ...plotting import fields_figure, surfaces_figure
+
+        moved = found.moved
+        assert moved is not None
+        title, times = f"{found.quench.title}, {SHOWN}", found.quench.shown(moved.t)
+        slices = {f"t = {moved.t[k]:g}": _slice(found, moved, k) for k in times}
+        yield (
+            "vortex-lines-slices.png",
+            fields_figure(slices, title=f"{title}: density in the plane z = 0", shared=True),
+        )
+        try:
+            surfaces = {f"t = {moved.t[k]:g}": _surface(found, moved, k) for k in times}
+        except ImportError as error:
+            warn(f"no surfaces: {error}")
+            return
+        yield "vortex-lines-surfaces.png", surfaces_figure(surfaces, ROOM, title=rf"{title}: $|\psi|^2$ = {LEVEL:g}")
 
 
 def _state_notes(gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[str]:
@@ -110,7 +130,7 @@ def _state_notes(gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[
     ]
 
 
-def _grid_note(before: GrossPitaevskii, made: QuenchStudy, t: np.ndarray) -> str:
+def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
     """How far the reference ends from the closed form, the start turned and with the phase of mu t."""
     assert made.reference is not None
     start = made.quench.problem.y0
@@ -122,23 +142,7 @@ def _grid_note(before: GrossPitaevskii, made: QuenchStudy, t: np.ndarray) -> str
     )
 
 
-def _figures(made: QuenchStudy, moved: Motion) -> Figures:
-    from ...plotting import fields_figure, surfaces_figure
-
-    title, times = f"{made.quench.title}, {SHOWN}", made.quench.shown(moved.t)
-    slices = {f"t = {moved.t[k]:g}": _slice(made, moved, k) for k in times}
-    figure = fields_figure(slices, title=f"{title}: density in the plane z = 0", shared=True)
-    yield "vortex-lines-slices.png", figure.savefig
-    try:
-        surfaces = {f"t = {moved.t[k]:g}": _surface(made, moved, k) for k in times}
-    except ImportError as error:
-        warn(f"no surfaces: {error}")
-        return
-    figure = surfaces_figure(surfaces, ROOM, title=rf"{title}: $|\psi|^2$ = {LEVEL:g}")
-    yield "vortex-lines-surfaces.png", figure.savefig
-
-
-def _slice(made: QuenchStudy, moved: Motion, k: int) -> Any:
+def _slice(made: QuenchRuns, moved: Motion, k: int) -> Any:
     from ...plotting import FieldPanel
 
     grid = made.quench.equation.grid
@@ -147,7 +151,7 @@ def _slice(made: QuenchStudy, moved: Motion, k: int) -> Any:
     return FieldPanel(*shown, ("x", "y"), moved.vortices[k].positions, moved.followed(k))
 
 
-def _surface(made: QuenchStudy, moved: Motion, k: int) -> Any:
+def _surface(made: QuenchRuns, moved: Motion, k: int) -> Any:
     """The surface, and the sector of it in which the line is that is followed."""
     from ...plotting import SurfacePanel
 
@@ -157,6 +161,6 @@ def _surface(made: QuenchStudy, moved: Motion, k: int) -> Any:
     return SurfacePanel(surface.corners, np.where(surface.inside, 1 + followed, 0))
 
 
-def _field(made: QuenchStudy, k: int) -> np.ndarray:
+def _field(made: QuenchRuns, k: int) -> np.ndarray:
     assert made.fields is not None
     return made.quench.equation.as_field(made.fields[:, k])

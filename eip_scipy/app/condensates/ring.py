@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,78 +12,98 @@ import numpy as np
 
 from ...problems import GrossPitaevskii
 from ...problems.gross_pitaevskii import ring_condensate
-from .. import long_runs
-from ..report import UsageError, check_outputs, warn
-from .runs import SHOWN, Figures, Motion, Quench, QuenchStudy, conclude, motion, study
+from ..long_runs import positive
+from ..report import UsageError
+from ..study import Figures, Session, option
+from .runs import SHOWN, Motion, Quench, QuenchRuns, QuenchStudy
 from .states import cropped, kept_state, load_state, search_ring
 
-__all__ = ["T_END", "run"]
+__all__ = ["Ring"]
 
-INTERRUPTED = 130
-POINTS, STEP, T_END = 256, 2e-4, 1.0
-REFERENCE_STEP = 5e-4
-SAVED = 0.02  # time between two saved states
-KAPPA_BEFORE, KAPPA_AFTER = 0.3, 0.7
-SNAPSHOTS = (0.0, 0.24, 0.44, 0.72, 0.8, 1.0)
-# The tightened ring contracts, keeps its angular momentum, and so turns faster than the frame.
-SENSE = 1
-ENERGY_KEPT = 1e-12
 FRAMES_PER_SECOND = 8
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run ``gpe ring``; see `eip_scipy.app.condensates.gpe.run`."""
-    if args.t_end < REFERENCE_STEP:
-        raise UsageError(f"--t-end: expected at least {REFERENCE_STEP:g}, the reference's step, got {args.t_end:g}")
-    check_outputs(args.out, args.json)
-    long_runs.check(args)
-    after = ring_condensate(KAPPA_AFTER, POINTS)
-    try:
-        start = _start(args)
-    except KeyboardInterrupt:
-        warn("interrupted in the search for the ground state; nothing was written")
-        return INTERRUPTED
-    quench = Quench(
-        name="ring",
-        title=f"Ring, kappa = {KAPPA_BEFORE:g} -> {KAPPA_AFTER:g}",
-        problem=after.problem(start, args.t_end, STEP, name="ring"),
-        reference_step=REFERENCE_STEP,
-        interval=SAVED,
-        snapshots=SNAPSHOTS,
-        sense=SENSE,
-        energy_kept=ENERGY_KEPT,
+@dataclass(frozen=True, kw_only=True)
+class Ring(QuenchStudy):
+    """The command.
+
+    The tightened ring contracts, keeps its angular momentum, and so turns faster than the frame: `sense` is 1.
+
+    Attributes
+    ----------
+    condensate : callable
+        ``condensate(kappa, points)``, the equation.
+    kappas : (float, float)
+        Before and after.
+    saved : float
+        Time between two saved states.
+    """
+
+    start: Path | None = option(
+        None, "ring.npz of ground-state; default: the state is searched first", type=Path, metavar="FILE"
     )
-    made = study(quench, progress=not args.quiet, checkpoint_of=partial(long_runs.checkpoint_options, args))
-    if made.fields is None:
-        return conclude(args, made, None)
-    moved = motion(after, made.lines[SHOWN].t, made.fields)
-    return conclude(args, made, moved, figures=partial(_figures, args, made, moved))
+    t_end: float = option(
+        1.0, "end of the run (%(default)s); 10 in the paper's figure of the errors", type=positive, metavar="T"
+    )
+    movie: bool = option(False, "write ring.gif, too")
+    condensate: Callable[[float, int], GrossPitaevskii] = ring_condensate
+    points: int = 256
+    kappas: tuple[float, float] = (0.3, 0.7)
+    step: float = 2e-4
+    reference_step: float = 5e-4
+    saved: float = 0.02
+    snapshots: tuple[float, ...] = (0.0, 0.24, 0.44, 0.72, 0.8, 1.0)
+    sense: int = 1
 
+    def check_settings(self) -> None:
+        """See that there is a step to take."""
+        if self.t_end < self.reference_step:
+            least = f"{self.reference_step:g}, the reference's step"
+            raise UsageError(f"--t-end: expected at least {least}, got {self.t_end:g}")
+        super().check_settings()
 
-def _start(args: argparse.Namespace) -> np.ndarray:
-    """The ground state: from a file, from beside the checkpoints, or searched."""
-    before = ring_condensate(KAPPA_BEFORE, POINTS)
-    if args.start is not None:
-        return load_state(args.start, before)
-    return kept_state(args, before, partial(search_ring, args.seed))
+    def arguments(self) -> dict[str, Any]:
+        return {"h": self.step, "t_end": self.t_end}
 
+    def measure(self, session: Session) -> QuenchRuns:
+        """All runs, from the ground state: from a file, from beside the checkpoints, or searched."""
+        before, after = (self.condensate(kappa, self.points) for kappa in self.kappas)
+        if self.start is not None:
+            start = load_state(self.start, before)
+        else:
+            start = kept_state(self, session, before, partial(search_ring, self.seed))
+        quench = Quench(
+            name="ring",
+            title=f"Ring, kappa = {self.kappas[0]:g} -> {self.kappas[1]:g}",
+            problem=after.problem(start, self.t_end, self.step, name="ring"),
+            reference_step=self.reference_step,
+            interval=self.saved,
+            snapshots=self.snapshots,
+            sense=self.sense,
+            energy_kept=1e-12,
+        )
+        return self.do_runs(quench, session)
 
-def _figures(args: argparse.Namespace, made: QuenchStudy, moved: Motion) -> Figures:
-    from ...plotting import fields_figure, fields_movie
+    def pictures(self, found: QuenchRuns) -> Figures:
+        """Density and vortices at some times, and as a film."""
+        from ...plotting import fields_figure, fields_movie
 
-    quench, fields = made.quench, made.fields
-    assert fields is not None
-    every = _panels(quench.equation, fields, moved)
-    shown = {f"t = {moved.t[k]:.2f}": every[k] for k in quench.shown(moved.t)}
-    figure = fields_figure(shown, title=f"{quench.title}: density and vortices, {SHOWN}", shared=True)
-    yield "ring-snapshots.png", figure.savefig
-    if args.movie:
-        titles = [f"t = {t:.2f}" for t in moved.t]
+        quench, fields, moved = found.quench, found.fields, found.moved
+        assert fields is not None
+        assert moved is not None
+        every = _panels(quench.equation, fields, moved)
+        shown = {f"t = {moved.t[k]:.2f}": every[k] for k in quench.shown(moved.t)}
+        yield (
+            "ring-snapshots.png",
+            fields_figure(shown, title=f"{quench.title}: density and vortices, {SHOWN}", shared=True),
+        )
+        if self.movie:
+            titles = [f"t = {t:.2f}" for t in moved.t]
 
-        def film(path: Path) -> None:
-            fields_movie(path, every, titles, per_second=FRAMES_PER_SECOND)
+            def film(path: Path) -> None:
+                fields_movie(path, every, titles, per_second=FRAMES_PER_SECOND)
 
-        yield "ring.gif", film
+            yield "ring.gif", film
 
 
 def _panels(gpe: GrossPitaevskii, y: np.ndarray, moved: Motion) -> list[Any]:

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Iterable, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checkpoint import CheckpointError
 from ...core.solvers import EIPDOP853, EIPRK4, EIPSolver
 from ...problems import FieldProblem, GrossPitaevskii
 from ...problems.gross_pitaevskii import Vortices, vortices
 from ...run.integrate import integrate
-from .. import long_runs
-from ..report import compact, describe_machine, document, say, table, warn, write_csv, write_file, write_json
+from ..long_runs import Checkpoints, named
+from ..report import compact, describe_machine, table
+from ..study import Figures, PartlyDone, Rows, Session, Study, option
 
-__all__ = ["METHODS", "SHOWN", "FieldRun", "Motion", "Quench", "QuenchStudy", "check", "conclude", "motion", "study"]
+__all__ = ["METHODS", "SHOWN", "FieldCheck", "FieldRun", "Motion", "Quench", "QuenchRuns", "QuenchStudy", "motion"]
 
-DONE, FAILED, INTERRUPTED = 0, 1, 130
 METHODS = {"EIP-M": ("mass",), "EIP-E": ("energy",), "EIP-ME": ("mass", "energy"), "RK4": ()}
 SHOWN = "EIP-ME"  # whose fields are kept, for the figures
 REFERENCE = "EIPDOP853"
@@ -30,7 +28,14 @@ MASS_KEPT = 1e-14
 SMALL = 1e-3
 AXES = "seen from above, with x to the right and y up"
 SENSES = {1: "anticlockwise", -1: "clockwise"}
-Figures = Iterable[tuple[str, Callable[[Path], Any]]]
+
+
+class FieldCheck(NamedTuple):
+    """What must hold, its value, and whether it does."""
+
+    what: str
+    value: Any
+    passed: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +116,7 @@ class FieldRun:
 
 
 @dataclass(eq=False)
-class QuenchStudy:
+class QuenchRuns:
     """The runs of a quench, those of `METHODS` that were done.
 
     Attributes
@@ -120,14 +125,21 @@ class QuenchStudy:
     lines : dict of str to FieldRun
     reference, fields : ndarray, shape (n, m), or None
         States of the reference and of `SHOWN`.
-    interrupted : bool
+    moved : Motion or None
+        The vortices of `SHOWN`.
+    more : list of FieldCheck
+        Checks beside those of all quenches.
+    notes : list of str
+        Lines for the head of the table.
     """
 
     quench: Quench
     lines: dict[str, FieldRun] = field(default_factory=dict)
     reference: np.ndarray | None = None
     fields: np.ndarray | None = None
-    interrupted: bool = False
+    moved: Motion | None = None
+    more: list[FieldCheck] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,60 +170,19 @@ class Motion:
         return int(np.abs(self.off(k, *self.vortices[k].positions.T)).argmin())
 
 
-def study(
-    quench: Quench, *, progress: bool = False, checkpoint_of: Callable[[str], dict[str, Any]] = lambda name: {}
-) -> QuenchStudy:
-    """Run the reference and each of `METHODS`; Ctrl-C ends it with what was done.
-
-    Parameters
-    ----------
-    quench : Quench
-    progress : bool, optional
-        Show a bar with the time that is left of each run.
-    checkpoint_of : callable, optional
-        ``checkpoint_of(name)``: the options of `integrate` that keep checkpoints of the run of that name.
-
-    Returns
-    -------
-    QuenchStudy
-
-    Raises
-    ------
-    UsageError
-        When the saved states do not fit the memory, or checkpoints are not of these runs.
-    RuntimeError
-        When a run fails.
-    """
-    made = QuenchStudy(quench)
-    try:
-        made.reference = _run(
-            quench, REFERENCE, EIPDOP853, quench.reference_step, METHODS[SHOWN], progress, checkpoint_of
-        ).y
-        for name, invariants in METHODS.items():
-            run = _run(quench, name, EIPRK4, quench.step, invariants, progress, checkpoint_of)
-            made.lines[name] = _line(quench, run, made.reference)
-            if name == SHOWN:
-                made.fields = run.y
-    except KeyboardInterrupt:
-        made.interrupted = True
-    except (MemoryError, CheckpointError) as error:
-        raise long_runs.unusable(error) from error
-    return made
-
-
 def _run(
     quench: Quench,
+    progress: bool,
+    checkpoint_of: Callable[[str], dict[str, Any]],
     name: str,
     method: type[EIPSolver],
     h: float,
     invariants: Sequence[str],
-    progress: bool,
-    checkpoint_of: Callable[[str], dict[str, Any]],
 ) -> Any:
     chosen = quench.equation.invariants(invariants)
     run = integrate(
         quench.problem,
-        method=long_runs.named(method, name),
+        method=named(method, name),
         h=h,
         invariants=chosen,
         save_every=round(quench.interval / h),
@@ -262,50 +233,37 @@ def _mean_turn(old: np.ndarray, new: np.ndarray, guess: float) -> float:
     return guess + float(np.median(difference[np.arange(old.size), nearest]))
 
 
-def check(what: str, value: Any, passed: bool) -> dict[str, Any]:
-    """What must hold, its value, and whether it does."""
-    return {"what": what, "value": value, "passed": bool(passed)}
-
-
-def checks(made: QuenchStudy, moved: Motion | None) -> list[dict[str, Any]]:
-    """Vortices keep their count and turn as they should, and each invariant that is kept is kept.
-
-    Returns
-    -------
-    list of dict
-        With `what`, `value` and `passed`; of the runs that were done.
-    """
-    found, quench = [], made.quench
+def _checks(made: QuenchRuns) -> list[FieldCheck]:
+    """Vortices keep their count and turn as they should, and each invariant that is kept is kept."""
+    found, quench, moved = [], made.quench, made.moved
     if moved is not None:
         at = quench.shown(moved.t)
         counts = [len(moved.vortices[k].charges) for k in at]
-        found.append(check("vortices in the snapshots", counts, counts[0] > 0 and len(set(counts)) == 1))
+        found.append(FieldCheck("vortices in the snapshots", counts, counts[0] > 0 and len(set(counts)) == 1))
         if len(at) > 1:
             turned = float(moved.angle[at[-1]])
             sense = f"vortices turn {SENSES[quench.sense]}, angle at t = {moved.t[at[-1]]:g} [rad]"
-            found.append(check(sense, turned, quench.sense * turned > 0))
+            found.append(FieldCheck(sense, turned, quench.sense * turned > 0))
     for name, line in made.lines.items():
         for item, bound in (("mass", MASS_KEPT), ("energy", quench.energy_kept)):
             if item in METHODS[name]:
                 error = float(getattr(line, f"{item}_error").max())
-                found.append(check(f"{name}: error of the {item} below {bound:.0e}", error, error < bound))
+                found.append(FieldCheck(f"{name}: error of the {item} below {bound:.0e}", error, error < bound))
     return found
 
 
-def text(
-    made: QuenchStudy, moved: Motion | None, found: list[dict[str, Any]], notes: Sequence[str], machine: str
-) -> str:
+def _text(made: QuenchRuns, found: Sequence[FieldCheck]) -> str:
     """Lay out the errors, the vortices and the checks."""
-    quench = made.quench
+    quench, moved = made.quench, made.moved
     head = [["wall time", "[s]"], ["evaluations", "of f"], ["error of", "mass"], ["error of", "energy"]]
     head += [["error of", "psi"], ["rank", "reduced"]]
     body = [(name, _cells(line)) for name, line in made.lines.items()]
     out = [
         f"{quench.title}, RK4, h = {quench.step:g}, to t = {quench.t_end:g}",
-        machine,
+        describe_machine(),
         f"Largest errors, absolute; that of psi is the norm of the difference from {REFERENCE}, "
         f"h = {quench.reference_step:g}",
-        *notes,
+        *made.notes,
         "",
         table(head, body),
         "",
@@ -323,7 +281,7 @@ def text(
             "",
         ]
     for item in found:
-        out.append(f"{'ok' if item['passed'] else 'FAILED':<6} {item['what']}: {_value(item['value'])}")
+        out.append(f"{'ok' if item.passed else 'FAILED':<6} {item.what}: {_value(item.value)}")
     if moved is not None and len(quench.shown(moved.t)) < 2:
         before = f"the run ends before t = {quench.snapshots[1]:g}"
         out.append(f"{'-':<6} not checked: in which sense the vortices turn, for {before}")
@@ -346,7 +304,84 @@ def _radius(found: Vortices) -> str:
     return f"{np.hypot(*found.positions.T).mean():.3f}" if found.charges.size else "-"
 
 
-def rows(made: QuenchStudy) -> list[dict[str, Any]]:
+@dataclass(frozen=True, kw_only=True)
+class QuenchStudy(Checkpoints, Study[QuenchRuns]):
+    """What the commands on quenches have in common."""
+
+    seed: int = option(0, "of the random starts (%(default)s)", type=int, metavar="N")
+
+    def do_runs(self, quench: Quench, session: Session) -> QuenchRuns:
+        """Run the reference and each of `METHODS`; what the user interrupts leaves those that were done.
+
+        Raises
+        ------
+        RuntimeError
+            When a run fails.
+        """
+        made = QuenchRuns(quench)
+        run = partial(_run, quench, session.shown, self.checkpoint_options)
+        try:
+            made.reference = run(REFERENCE, EIPDOP853, quench.reference_step, METHODS[SHOWN]).y
+            for name, invariants in METHODS.items():
+                done = run(name, EIPRK4, quench.step, invariants)
+                made.lines[name] = _line(quench, done, made.reference)
+                if name == SHOWN:
+                    made.fields = done.y
+        except KeyboardInterrupt:
+            if not made.lines:
+                raise
+            made.moved = _moved(made)
+            raise PartlyDone(made) from None
+        made.moved = _moved(made)
+        return made
+
+    def text(self, found: QuenchRuns) -> str:
+        return _text(found, self.checks(found))
+
+    def checks(self, found: QuenchRuns) -> list[FieldCheck]:
+        return [*_checks(found), *found.more]
+
+    def tables(self, found: QuenchRuns) -> dict[str, Rows]:
+        return {f"{found.quench.name}.csv": _rows(found)}
+
+    def numbers(self, found: QuenchRuns) -> dict[str, Any]:
+        numbers: dict[str, Any] = {
+            "errors": _rows(found),
+            "wall_time_s": {name: line.wall_time for name, line in found.lines.items()},
+            "rank_reduced": {name: line.n_rank_reduced for name, line in found.lines.items()},
+            "checks": [check._asdict() for check in self.checks(found)],
+        }
+        if found.moved is not None:
+            numbers |= {"vortices": [len(v.charges) for v in found.moved.vortices], "turned_rad": found.moved.angle}
+        return numbers
+
+    def figures(self, found: QuenchRuns) -> Figures:
+        """The errors in time, and what the fields look like."""
+        from ...plotting import ErrorSeries, errors_figure
+
+        quench = found.quench
+        mass, energy = (abs(value(quench.problem.y0)) for value in (quench.equation.mass, quench.equation.energy))
+        series = {
+            name: ErrorSeries(
+                line.t, {"mass": line.mass_error / mass, "energy": line.energy_error / energy}, line.field_error
+            )
+            for name, line in found.lines.items()
+        }
+        title = f"{quench.title}, RK4, h = {quench.step:g}"
+        figure = errors_figure(series, time="t", trajectory=r"error of $\psi$ (norm)", title=title)
+        yield f"{quench.name}-errors.png", figure
+        yield from self.pictures(found)
+
+    @abstractmethod
+    def pictures(self, found: QuenchRuns) -> Figures:
+        """Of the fields."""
+
+
+def _moved(made: QuenchRuns) -> Motion | None:
+    return None if made.fields is None else motion(made.quench.equation, made.lines[SHOWN].t, made.fields)
+
+
+def _rows(made: QuenchRuns) -> Rows:
     """Make the lines of the CSV file."""
     return [
         {
@@ -359,94 +394,3 @@ def rows(made: QuenchStudy) -> list[dict[str, Any]]:
         for name, line in made.lines.items()
         for k in range(line.t.size)
     ]
-
-
-def conclude(
-    args: argparse.Namespace,
-    made: QuenchStudy,
-    moved: Motion | None,
-    *,
-    more: Sequence[dict[str, Any]] = (),
-    notes: Sequence[str] = (),
-    figures: Callable[[], Figures] | None = None,
-) -> int:
-    """Print the tables and write the files.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        With ``task``, ``out``, ``json`` and ``quiet``.
-    made : QuenchStudy
-    moved : Motion or None
-        None where the run of `SHOWN` is missing.
-    more : sequence of dict, optional
-        Checks beside those of `checks`.
-    notes : sequence of str, optional
-        Lines for the head of the table.
-    figures : callable, optional
-        ``figures()`` yields file names, and functions that write them, beside that of the errors; ImportError where a
-        library is missing.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
-    if made.interrupted:
-        long_runs.tell_how_to_resume(args)
-    if not made.lines:
-        warn("interrupted; no run was done")
-        return INTERRUPTED
-    found = [*checks(made, moved), *more]
-    if not args.quiet:
-        say(text(made, moved, found, notes, describe_machine()))
-        say()
-    _write_numbers(args, made, moved, found)
-    if made.interrupted:
-        warn("interrupted; the runs that were done are in the table and the files")
-        return INTERRUPTED
-    try:
-        for name, save in (*_errors_figure(made), *(figures() if figures is not None else ())):
-            _say(args, write_file(args.out / name, save))
-    except ImportError as error:
-        warn(f"no figures: {error}")
-    return DONE if all(item["passed"] for item in found) else FAILED
-
-
-def _write_numbers(
-    args: argparse.Namespace, made: QuenchStudy, moved: Motion | None, found: list[dict[str, Any]]
-) -> None:
-    _say(args, write_csv(args.out / f"{made.quench.name}.csv", rows(made)))
-    if args.json is None:
-        return
-    numbers: dict[str, Any] = {
-        "errors": rows(made),
-        "wall_time_s": {name: line.wall_time for name, line in made.lines.items()},
-        "rank_reduced": {name: line.n_rank_reduced for name, line in made.lines.items()},
-        "checks": found,
-    }
-    if moved is not None:
-        numbers |= {"vortices": [len(v.charges) for v in moved.vortices], "turned_rad": moved.angle}
-    arguments = {"h": made.quench.step, "t_end": made.quench.t_end}
-    _say(args, write_json(args.json, document(f"gpe {args.task}", arguments, **numbers)))
-
-
-def _errors_figure(made: QuenchStudy) -> Figures:
-    from ...plotting import ErrorSeries, errors_figure
-
-    quench = made.quench
-    mass, energy = (abs(value(quench.problem.y0)) for value in (quench.equation.mass, quench.equation.energy))
-    series = {
-        name: ErrorSeries(
-            line.t, {"mass": line.mass_error / mass, "energy": line.energy_error / energy}, line.field_error
-        )
-        for name, line in made.lines.items()
-    }
-    title = f"{quench.title}, RK4, h = {quench.step:g}"
-    figure = errors_figure(series, time="t", trajectory=r"error of $\psi$ (norm)", title=title)
-    yield f"{quench.name}-errors.png", partial(figure.savefig)
-
-
-def _say(args: argparse.Namespace, path: Path) -> None:
-    if not args.quiet:
-        say(f"wrote {path}")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,16 +28,9 @@ from ...problems.gross_pitaevskii import (
     vortices,
     with_noise,
 )
-from ..report import (
-    UsageError,
-    check_outputs,
-    compact,
-    deliver,
-    describe_machine,
-    table,
-    warn,
-    write_file,
-)
+from ..long_runs import Checkpoints
+from ..report import UsageError, compact, describe_machine, table, write_file
+from ..study import Figures, Rows, Session, Study, one_of, option
 
 __all__ = [
     "LINES",
@@ -45,23 +39,23 @@ __all__ = [
     "SADDLE_LINES",
     "SCENES",
     "Found",
+    "GroundStates",
+    "KnownState",
     "kept_state",
     "leave_saddle",
     "load_state",
-    "run",
     "save_state",
     "search_ring",
     "search_saddle",
     "searching",
 ]
 
-DONE, FAILED, INTERRUPTED = 0, 1, 130
 # V = r^2 / 2, beta = 100: angular velocity and published energy.
 PUBLISHED = {0.0: 3.9459469, 0.65: 3.6506129, 0.71: 3.4997148, 0.76: 3.3475310, 0.80: 3.1904172}
 PUBLISHED_DIGITS = 1e-5
 RING_ENERGY, LINES_ENERGY, LINES = -115.270, 3.3029, 2
 SADDLE_ENERGY, SADDLE_LINES = 3.3293, 4  # of the state in the paper's figure
-TRAP_POINTS, RING_POINTS, LINE_POINTS = 128, 256, 64
+RING_POINTS, LINE_POINTS = 256, 64
 TRAP_TOLERANCE, RING_TOLERANCE, LINES_TOLERANCE, SADDLE_TOLERANCE = 1e-6, 1e-8, 1e-5, 1e-8
 MOST_LINES, LINES_RADIUS, LINES_ITERATIONS = 4, 1.5, 1000
 VISIBLE, MARGIN = 1e-3, 1.15  # part of the density that a figure shows, and the room around it
@@ -93,14 +87,14 @@ class Found:
         return len(vortices(self.equation, self.state.psi).charges)
 
 
-def trap(args: argparse.Namespace, update: Update) -> list[Found]:
+def trap(settings: GroundStates, update: Update) -> list[Found]:
     """The lowest of several starts for each rotation."""
-    grid = Grid((TRAP_POINTS, TRAP_POINTS), -10.0, 10.0)
+    grid = Grid((settings.trap_points, settings.trap_points), -10.0, 10.0)
     found = []
-    for Omega, published in PUBLISHED.items():
+    for Omega, published in settings.published.items():
         gpe = GrossPitaevskii(grid, harmonic_trap(1.0, 1.0), Omega=Omega, beta=100.0)
         states = []
-        for start in vortex_starts(gpe, args.starts if Omega else 1, args.seed):
+        for start in vortex_starts(gpe, settings.starts if Omega else 1, settings.seed):
             update(f"trap, Omega = {Omega:g}")
             states.append(ground_state(gpe, start, tol=TRAP_TOLERANCE))
         best = min(states, key=lambda state: state.energy)
@@ -108,9 +102,9 @@ def trap(args: argparse.Namespace, update: Update) -> list[Found]:
     return found
 
 
-def ring(args: argparse.Namespace, update: Update) -> list[Found]:
+def ring(settings: GroundStates, update: Update) -> list[Found]:
     """The paper's ring."""
-    return [search_ring(args.seed, update)]
+    return [search_ring(settings.seed, update)]
 
 
 def search_ring(seed: int, update: Update) -> Found:
@@ -127,23 +121,23 @@ def search_ring(seed: int, update: Update) -> Found:
     return Found(f"{count} around {winding}", gpe, state)
 
 
-def lines(args: argparse.Namespace, update: Update) -> list[Found]:
+def lines(settings: GroundStates, update: Update) -> list[Found]:
     """States of the paper's 3D condensate from starts with 0 ... 4 lines, and the saddle with four."""
     gpe = line_condensate(points=LINE_POINTS)
-    rng = np.random.default_rng(args.seed)
+    rng = np.random.default_rng(settings.seed)
     found = []
     for count in range(MOST_LINES + 1):
         update(f"lines, {count} imprinted")
         start = with_noise(imprint(gpe, polygon(count, LINES_RADIUS if count > 1 else 0.0)), rng)
         state = ground_state(gpe, start, tol=LINES_TOLERANCE, max_iterations=LINES_ITERATIONS)
         found.append(Found(f"{count} imprinted", gpe, state))
-    return [*found, search_saddle(update)]
+    return [*found, search_saddle(LINE_POINTS, update)]
 
 
-def search_saddle(update: Update) -> Found:
+def search_saddle(points: int, update: Update) -> Found:
     """The paper's state with four lines, a saddle: the start has a square's symmetry, and the descent keeps it."""
     update(f"lines, {SADDLE_LINES} imprinted without noise")
-    gpe = line_condensate(points=LINE_POINTS)
+    gpe = line_condensate(points=points)
     start = imprint(gpe, polygon(SADDLE_LINES, LINES_RADIUS))
     return Found(f"{SADDLE_LINES} without noise: a saddle", gpe, ground_state(gpe, start, tol=SADDLE_TOLERANCE))
 
@@ -156,7 +150,8 @@ def leave_saddle(gpe: GrossPitaevskii, saddle: np.ndarray, seed: int, update: Up
     return Found("down from the saddle", gpe, state)
 
 
-SCENES: dict[str, Callable[[argparse.Namespace, Update], list[Found]]] = {"trap": trap, "ring": ring, "lines": lines}
+Scene = Callable[["GroundStates", Update], list[Found]]
+SCENES: dict[str, Scene] = {"trap": trap, "ring": ring, "lines": lines}
 TITLES = {
     "trap": "trap: V = r^2 / 2, beta = 100; lowest of {starts} starts for each Omega",
     "ring": "ring: V = -0.1 r^2 + 0.075 r^4, beta = 1000, Omega = 3.5; a row of vortices around a winding",
@@ -165,56 +160,115 @@ TITLES = {
 Results = dict[str, list[Found]]
 
 
-def checks(results: Results) -> list[dict[str, Any]]:
-    """Compare with known energies.
+class KnownState(NamedTuple):
+    """A number of a state that is known, and ours."""
 
-    Returns
-    -------
-    list of dict
-        With `quantity`, `known`, `ours`, `matched` and `note`. A lower energy than a published one is no miss.
-    """
-    found = []
-    for item in results.get("trap", ()):
-        known, ours = PUBLISHED[item.equation.Omega], item.state.energy
-        below = ours < known - PUBLISHED_DIGITS
-        matched = item.state.converged and (below or abs(ours - known) <= PUBLISHED_DIGITS)
-        found.append(_check(f"trap, {item.label}: E", known, ours, matched, "lower" if below else ""))
-    for item in results.get("ring", ()):
-        good = item.state.converged and item.state.energy <= RING_ENERGY
-        found.append(_check("ring: E at most", RING_ENERGY, item.state.energy, good))
-    if "lines" in results:
-        best = min(results["lines"], key=lambda item: item.state.energy)
-        good = best.state.converged and abs(best.state.energy - LINES_ENERGY) < 1e-4
-        found.append(_check("lines: lowest E", LINES_ENERGY, best.state.energy, good))
-        found.append(_check("lines: of the lowest", LINES, best.count, best.count == LINES))
-        saddle = results["lines"][-1]
-        good = saddle.state.converged and abs(saddle.state.energy - SADDLE_ENERGY) < 1e-4
-        found.append(_check("lines: E of the saddle", SADDLE_ENERGY, saddle.state.energy, good))
-        found.append(_check("lines: of the saddle", SADDLE_LINES, saddle.count, saddle.count == SADDLE_LINES))
-    return found
+    quantity: str
+    known: float
+    ours: float
+    passed: bool
+    note: str = ""
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """For the JSON."""
+        known = {"quantity": self.quantity, "known": self.known, "ours": self.ours}
+        return {**known, "matched": self.passed, "note": self.note}
+
+    @property
+    def line(self) -> str:
+        """One line of the text."""
+        note = f" ({self.note})" if self.note else ""
+        verdict = "ok" if self.passed else "FAILED"
+        return f"{verdict:<6} {self.quantity} {self.known:.10g}, ours {self.ours:.10g}{note}"
 
 
-def _check(quantity: str, known: float, ours: float, matched: bool, note: str = "") -> dict[str, Any]:
-    return {"quantity": quantity, "known": known, "ours": ours, "matched": bool(matched), "note": note}
+def _count(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected an integer >= 1, got {text!r}")
+    return value
 
 
-def text(results: Results, starts: int, machine: str) -> str:
-    """Lay out a table for each scene, and the checks."""
-    head = [["E"], ["mu"], ["residual"], ["iterations"], ["vortices"]]
-    out = ["Ground states of the rotating Gross-Pitaevskii equation", f"{machine}; residual: norm of H psi - mu psi."]
-    for name, found in results.items():
-        gpe = found[0].equation
-        size = " x ".join(map(str, gpe.grid.shape))
-        out += ["", f"{TITLES[name].format(starts=starts)}", f"{size} points", ""]
-        known = [["published"], ["difference"]] if name == "trap" else []
-        out.append(table([*head, *known], [(item.label, _cells(item)) for item in found]))
-        out += [f"  {item.label}: {item.state.message}" for item in found if not item.state.converged]
-    out.append("")
-    for check in checks(results):
-        note = f" ({check['note']})" if check["note"] else ""
-        numbers = f"{check['known']:.10g}, ours {check['ours']:.10g}{note}"
-        out.append(f"{'ok' if check['matched'] else 'FAILED':<6} {check['quantity']} {numbers}")
-    return "\n".join(out)
+@dataclass(frozen=True, kw_only=True)
+class GroundStates(Study[Results]):
+    """The command."""
+
+    scene: Sequence[str] | None = option(
+        None,
+        f"one scene, may be repeated; default: all ({', '.join(SCENES)})",
+        action="append",
+        type=one_of("scene", SCENES),
+        metavar="NAME",
+    )
+    starts: int = option(4, "starts for each rotation in the trap (%(default)s)", type=_count, metavar="N")
+    seed: int = option(0, "of the random starts (%(default)s)", type=int, metavar="N")
+    scenes: Mapping[str, Scene] = field(default_factory=lambda: SCENES)
+    published: Mapping[float, float] = field(default_factory=lambda: PUBLISHED)
+    trap_points: int = 128
+
+    def arguments(self) -> dict[str, Any]:
+        return {"scenes": list(dict.fromkeys(self.scene or self.scenes)), "starts": self.starts, "seed": self.seed}
+
+    def measure(self, session: Session) -> Results:
+        with searching(session) as update:
+            return {name: self.scenes[name](self, update) for name in self.arguments()["scenes"]}
+
+    def checks(self, found: Results) -> list[KnownState]:
+        """Compare with known energies. A lower energy than a published one is no miss."""
+        checks = []
+        for item in found.get("trap", ()):
+            known, ours = self.published[item.equation.Omega], item.state.energy
+            below = ours < known - PUBLISHED_DIGITS
+            matched = item.state.converged and (below or abs(ours - known) <= PUBLISHED_DIGITS)
+            checks.append(KnownState(f"trap, {item.label}: E", known, ours, matched, "lower" if below else ""))
+        for item in found.get("ring", ()):
+            good = item.state.converged and item.state.energy <= RING_ENERGY
+            checks.append(KnownState("ring: E at most", RING_ENERGY, item.state.energy, good))
+        if "lines" in found:
+            best = min(found["lines"], key=lambda item: item.state.energy)
+            good = best.state.converged and abs(best.state.energy - LINES_ENERGY) < 1e-4
+            checks.append(KnownState("lines: lowest E", LINES_ENERGY, best.state.energy, good))
+            checks.append(KnownState("lines: of the lowest", LINES, best.count, best.count == LINES))
+            saddle = found["lines"][-1]
+            good = saddle.state.converged and abs(saddle.state.energy - SADDLE_ENERGY) < 1e-4
+            checks.append(KnownState("lines: E of the saddle", SADDLE_ENERGY, saddle.state.energy, good))
+            checks.append(KnownState("lines: of the saddle", SADDLE_LINES, saddle.count, saddle.count == SADDLE_LINES))
+        return checks
+
+    def text(self, found: Results) -> str:
+        head = [["E"], ["mu"], ["residual"], ["iterations"], ["vortices"]]
+        machine = f"{describe_machine()}; residual: norm of H psi - mu psi."
+        out = ["Ground states of the rotating Gross-Pitaevskii equation", machine]
+        for name, states in found.items():
+            size = " x ".join(map(str, states[0].equation.grid.shape))
+            out += ["", f"{TITLES[name].format(starts=self.starts)}", f"{size} points", ""]
+            known = [["published"], ["difference"]] if name == "trap" else []
+            out.append(table([*head, *known], [(item.label, _cells(item)) for item in states]))
+            out += [f"  {item.label}: {item.state.message}" for item in states if not item.state.converged]
+        return "\n".join([*out, "", *(check.line for check in self.checks(found))])
+
+    def tables(self, found: Results) -> dict[str, Rows]:
+        return {"ground-states.csv": _rows(found)}
+
+    def numbers(self, found: Results) -> dict[str, Any]:
+        return {"states": _rows(found), "checks": [check.record for check in self.checks(found)]}
+
+    def figures(self, found: Results) -> Figures:
+        """The fields that `gpe ring` starts from, as files; densities and vortices."""
+        for name, states in found.items():
+            if name != "trap":
+                yield f"{name}.npz", partial(_save, min(states, key=lambda item: item.state.energy))
+
+        from ...plotting import fields_figure
+
+        for name, states in found.items():
+            shown = panels(name, states)
+            figure = fields_figure(shown, title=TITLES[name].split(";")[0], columns=3 if len(shown) <= 6 else 4)
+            yield f"ground-state-{name}.png", figure
 
 
 def _cells(item: Found) -> list[str]:
@@ -224,7 +278,7 @@ def _cells(item: Found) -> list[str]:
     return [*numbers, str(item.count), *known]
 
 
-def rows(results: Results) -> list[dict[str, Any]]:
+def _rows(results: Results) -> Rows:
     """Make the lines of the CSV file."""
     return [
         {
@@ -243,48 +297,6 @@ def rows(results: Results) -> list[dict[str, Any]]:
         for name, found in results.items()
         for item in found
     ]
-
-
-def run(args: argparse.Namespace) -> int:
-    """Run ``gpe ground-state``; see `eip_scipy.app.condensates.gpe.run`."""
-    check_outputs(args.out, args.json)
-    names = list(dict.fromkeys(args.scene or SCENES))
-    try:
-        with searching(args) as update:
-            results = {name: SCENES[name](args, update) for name in names}
-    except KeyboardInterrupt:
-        warn("interrupted; nothing was written")
-        return INTERRUPTED
-    found, judged = rows(results), checks(results)
-    arguments = {"scenes": list(results), "starts": args.starts, "seed": args.seed}
-    tables = {"ground-states.csv": found}
-    deliver(
-        args,
-        "gpe ground-state",
-        text(results, args.starts, describe_machine()),
-        tables,
-        _figures(results),
-        arguments,
-        also=_states(args, results),
-        states=found,
-        checks=judged,
-    )
-    return DONE if all(check["matched"] for check in judged) else FAILED
-
-
-def _states(args: argparse.Namespace, results: Results) -> Iterator[Path]:
-    for name, found in results.items():
-        if name != "trap":
-            yield save_state(args.out / f"{name}.npz", min(found, key=lambda item: item.state.energy))
-
-
-def _figures(results: Results) -> Iterator[tuple[str, Any]]:
-    from ...plotting import fields_figure
-
-    for name, found in results.items():
-        shown = panels(name, found)
-        figure = fields_figure(shown, title=TITLES[name].split(";")[0], columns=3 if len(shown) <= 6 else 4)
-        yield f"ground-state-{name}.png", figure
 
 
 def panels(name: str, found: list[Found]) -> dict[str, Any]:
@@ -332,6 +344,10 @@ def cropped(
 
 def save_state(path: Path, item: Found) -> Path:
     """Write a state as an npz file without pickled objects."""
+    return write_file(path, partial(_save, item))
+
+
+def _save(item: Found, path: Path) -> None:
     gpe, state = item.equation, item.state
     content: dict[str, Any] = {
         "psi": state.psi,
@@ -344,25 +360,25 @@ def save_state(path: Path, item: Found) -> Path:
         "mu": state.mu,
         "residual": state.residual,
     }
-    return write_file(path, lambda temporary: np.savez_compressed(temporary, **content))
+    np.savez_compressed(path, **content)
 
 
 @contextmanager
-def searching(args: argparse.Namespace) -> Iterator[Update]:
-    """Show what is searched, and for how long, unless ``--quiet``; yields what takes the words for it."""
-    from tqdm import tqdm
-
-    with tqdm(bar_format="{desc} [{elapsed}]", disable=args.quiet, leave=False) as bar:
+def searching(session: Session) -> Iterator[Update]:
+    """Show what is searched, and for how long; yields what takes the words for it."""
+    with session.bar(None, "", bar_format="{desc} [{elapsed}]") as bar:
         yield bar.set_description_str
 
 
-def kept_state(args: argparse.Namespace, gpe: GrossPitaevskii, search: Callable[[Update], Found]) -> np.ndarray:
+def kept_state(
+    settings: Checkpoints, session: Session, gpe: GrossPitaevskii, search: Callable[[Update], Found]
+) -> np.ndarray:
     """The field to start from: with ``--resume`` the one beside the checkpoints, else the one that `search` finds.
 
     Parameters
     ----------
-    args : argparse.Namespace
-        With ``checkpoint``, ``resume`` and ``quiet``.
+    settings : Checkpoints
+    session : Session
     gpe : GrossPitaevskii
     search : callable
         ``search(update)``.
@@ -371,10 +387,10 @@ def kept_state(args: argparse.Namespace, gpe: GrossPitaevskii, search: Callable[
     -------
     ndarray, shape (J, K[, L])
     """
-    kept = None if args.checkpoint is None else args.checkpoint / "state.npz"
-    if kept is not None and args.resume and kept.exists():
+    kept = None if settings.checkpoint is None else settings.checkpoint / "state.npz"
+    if kept is not None and settings.resume and kept.exists():
         return load_state(kept, gpe)
-    with searching(args) as update:
+    with searching(session) as update:
         found = search(update)
     if kept is not None:
         save_state(kept, found)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from textwrap import fill
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -16,19 +16,13 @@ from ...core.results import Diagnostics
 from ...core.solvers import EIPSolver
 from ...methods.runge_kutta import Tableau
 from ...problems.hard_cases import HardCase, hard_cases
+from ..listing import METRICS, fixed_step_methods
 from ..long_runs import named
-from ..report import (
-    check_outputs,
-    compact,
-    deliver,
-    table,
-    warn,
-)
-from ..solar.solar_system import METRICS, fixed_step_methods
+from ..report import compact, table
+from ..study import Check, Figures, Rows, Session, Study, option
 
-__all__ = ["Bar", "CaseOutcome", "Comparison", "adaptive_methods", "add_arguments", "bars", "compare", "run"]
+__all__ = ["CaseOutcome", "Comparison", "HardCases", "adaptive_methods", "bars", "compare"]
 
-DONE, CHECK_FAILED, INTERRUPTED = 0, 1, 130
 TOLERANCES = {"EIPDOP853": 1e-9}
 USUAL_TOLERANCE = 1e-6
 ATOL_PER_RTOL = 1e-3
@@ -108,13 +102,6 @@ class Comparison:
         return _ratio(self.plain.error, self.projected.error)
 
 
-class Bar(NamedTuple):
-    """A check of the command."""
-
-    text: str
-    passed: bool
-
-
 def _ratio(a: float, b: float) -> float:
     return a / b if b > 0 else math.nan if math.isnan(b) else math.inf
 
@@ -126,17 +113,6 @@ def adaptive_methods() -> dict[str, type[EIPSolver]]:
         for name, method in fixed_step_methods().items()
         if method.TABLEAU.has_estimate and isinstance(method.TABLEAU, Tableau)
     }
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of ``hard-cases``."""
-    parser.add_argument(
-        "--method", choices=list(adaptive_methods()), default="EIPRK45", help="the method (%(default)s)"
-    )
-    parser.add_argument(
-        "--rtol", type=_tolerance, help="relative tolerance (1e-9 for EIPDOP853, else 1e-6); atol is a thousandth of it"
-    )
-    parser.add_argument("--metric", choices=METRICS, default="error", help="metric of the projection (%(default)s)")
 
 
 def _tolerance(text: str) -> float:
@@ -251,7 +227,7 @@ def summary(results: Sequence[Comparison]) -> dict[str, Any]:
     }
 
 
-def bars(results: Sequence[Comparison], method: str, rtol: float, metric: str) -> list[Bar]:
+def bars(results: Sequence[Comparison], method: str, rtol: float, metric: str) -> list[Check]:
     """Check the results; bars on drift and errors are set for EIPRK45 at 1e-6 and EIPDOP853 at 1e-9 only.
 
     Parameters
@@ -264,37 +240,37 @@ def bars(results: Sequence[Comparison], method: str, rtol: float, metric: str) -
 
     Returns
     -------
-    list of Bar
+    list of Check
     """
     known = summary(results)
-    found = [Bar(f"every run with projection reaches its end: {known['n_failed']} did not", known["n_failed"] == 0)]
+    found = [Check(f"every run with projection reaches its end: {known['n_failed']} did not", known["n_failed"] == 0)]
     if (method, rtol) not in SETTINGS:
         return found
     least = len(results) - MAY_EXCEED
     median, mean, worst = known["median_drift"], known["geometric_mean_gain"], known["worst_gain"]
     found += [
-        Bar(
+        Check(
             f"drift at most {compact(SMALL_DRIFT, 1)} in at least {least} cases: in {known['n_small_drift']}",
             known["n_small_drift"] >= least,
         ),
-        Bar(f"median of the drift at most {compact(MEDIAN_DRIFT, 1)}: {compact(median)}", median <= MEDIAN_DRIFT),
+        Check(f"median of the drift at most {compact(MEDIAN_DRIFT, 1)}: {compact(median)}", median <= MEDIAN_DRIFT),
     ]
     if metric != "error":
         return found
     at_least = LEAST_GAIN[method]
     found.append(
-        Bar(f"geometric mean of the errors' reduction at least {at_least:g}: {compact(mean, 3)}", mean >= at_least)
+        Check(f"geometric mean of the errors' reduction at least {at_least:g}: {compact(mean, 3)}", mean >= at_least)
     )
     if method in WORST_GAIN:
         at_most = 1 / WORST_GAIN[method]
         found.append(
-            Bar(f"no error more than {at_most:g} times the plain one: {_times(worst)}", worst >= WORST_GAIN[method])
+            Check(f"no error more than {at_most:g} times the plain one: {_times(worst)}", worst >= WORST_GAIN[method])
         )
     if method in LARGEST_ERROR:
         limit = LARGEST_ERROR[method]
         above = [r.case.name for r in results if r.plain.error < limit and not r.projected.error <= limit]
         found.append(
-            Bar(
+            Check(
                 f"no error above {compact(limit, 1)} where the plain one is below it: {', '.join(above) or 'none'}",
                 not above,
             )
@@ -310,7 +286,7 @@ def _times(gain: float) -> str:
     return f"{factor:.2f} times {word}" if factor < 1.095 else f"{compact(factor)} times {word}"
 
 
-def text(results: Sequence[Comparison], checks: Sequence[Bar], arguments: dict[str, Any]) -> str:
+def text(results: Sequence[Comparison], checks: Sequence[Check], arguments: dict[str, Any]) -> str:
     """Lay out table, summary, cases that get worse, and checks, at most 79 columns."""
     known, rtol = summary(results), arguments["rtol"]
     head = [
@@ -333,7 +309,7 @@ def text(results: Sequence[Comparison], checks: Sequence[Bar], arguments: dict[s
         "",
         *_failures(results),
         *_worse(results),
-        *(f"{'ok' if bar.passed else 'FAILED':<6} {bar.text}" for bar in checks),
+        *(check.line for check in checks),
     ]
     return "\n".join([*head, table(columns, body), *lines])
 
@@ -391,55 +367,57 @@ def rows(results: Sequence[Comparison]) -> list[dict[str, Any]]:
     return lines
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command.
+@dataclass(frozen=True, kw_only=True)
+class HardCases(Study[list[Comparison]]):
+    """The command."""
 
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Options of `add_arguments`, and ``out``, ``json`` (Path or None) and ``quiet``.
-
-    Returns
-    -------
-    int
-        Exit status: 0 done, 1 a bar was missed, 130 interrupted.
-    """
-    from tqdm import tqdm
-
-    check_outputs(args.out, args.json)
-    rtol = args.rtol or TOLERANCES.get(args.method, USUAL_TOLERANCE)
-    arguments = {"method": args.method, "rtol": rtol, "atol": ATOL_PER_RTOL * rtol, "metric": args.metric}
-    cases = hard_cases()
-    try:
-        with tqdm(total=len(cases), desc="hard cases", unit="case", disable=args.quiet, leave=False) as bar:
-            results = compare(cases, adaptive_methods()[args.method], rtol, args.metric, bar.update)
-    except KeyboardInterrupt:
-        warn("interrupted; nothing was written")
-        return INTERRUPTED
-    checks = bars(results, args.method, rtol, args.metric)
-    stem = f"hard-cases-{args.method}-{args.metric}"
-    deliver(
-        args,
-        "hard-cases",
-        text(results, checks, arguments),
-        {f"{stem}.csv": rows(results)},
-        _figures(args, results, rtol, stem),
-        arguments,
-        cases=rows(results),
-        summary=summary(results),
-        checks=[check._asdict() for check in checks],
+    method: str = option("EIPRK45", "the method (%(default)s)", choices=list(adaptive_methods()))
+    rtol: float | None = option(
+        None, "relative tolerance (1e-9 for EIPDOP853, else 1e-6); atol is a thousandth of it", type=_tolerance
     )
-    return DONE if all(check.passed for check in checks) else CHECK_FAILED
+    metric: str = option("error", "metric of the projection (%(default)s)", choices=METRICS)
+    cases: Sequence[HardCase] = field(default_factory=hard_cases)
 
+    @property
+    def tolerance(self) -> float:
+        """The relative one."""
+        return self.rtol or TOLERANCES.get(self.method, USUAL_TOLERANCE)
 
-def _figures(args: argparse.Namespace, results: Sequence[Comparison], rtol: float, stem: str) -> Iterator[Any]:
-    from ...plotting import gains_figure
+    def arguments(self) -> dict[str, Any]:
+        """The options, and what follows from them."""
+        rtol = self.tolerance
+        return {"method": self.method, "rtol": rtol, "atol": ATOL_PER_RTOL * rtol, "metric": self.metric}
 
-    yield (
-        f"{stem}.png",
-        gains_figure(
-            {r.case.name: (r.plain.error / rtol, r.projected.error / rtol) for r in results},
-            what="final error / rtol",
-            title=f"{args.method}, metric {args.metric!r}, rtol = {rtol:g}: {len(results)} hard cases",
-        ),
-    )
+    def measure(self, session: Session) -> list[Comparison]:
+        with session.bar(len(self.cases), "hard cases", "case") as bar:
+            return compare(self.cases, adaptive_methods()[self.method], self.tolerance, self.metric, bar.update)
+
+    def checks(self, found: list[Comparison]) -> list[Check]:
+        return bars(found, self.method, self.tolerance, self.metric)
+
+    def text(self, found: list[Comparison]) -> str:
+        return text(found, self.checks(found), self.arguments())
+
+    @property
+    def _stem(self) -> str:
+        return f"hard-cases-{self.method}-{self.metric}"
+
+    def tables(self, found: list[Comparison]) -> dict[str, Rows]:
+        return {f"{self._stem}.csv": rows(found)}
+
+    def numbers(self, found: list[Comparison]) -> dict[str, Any]:
+        checks = [check._asdict() for check in self.checks(found)]
+        return {"cases": rows(found), "summary": summary(found), "checks": checks}
+
+    def figures(self, found: list[Comparison]) -> Figures:
+        from ...plotting import gains_figure
+
+        rtol = self.tolerance
+        yield (
+            f"{self._stem}.png",
+            gains_figure(
+                {r.case.name: (r.plain.error / rtol, r.projected.error / rtol) for r in found},
+                what="final error / rtol",
+                title=f"{self.method}, metric {self.metric!r}, rtol = {rtol:g}: {len(found)} hard cases",
+            ),
+        )

@@ -6,8 +6,8 @@ Nothing is printed or written here. REBOUND comes in as a module, or None, so th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -20,19 +20,39 @@ from ...problems import Problem, centre_time, comet, figure_eight, kepler, pair_
 from ...problems.time_transformed import time_transformed
 from ...run.integrate import integrate
 from ..long_runs import named
+from ..work_precision import work_precision
 
-__all__ = ["SCENES", "Contender", "HardScene", "Outcome", "Point", "measure", "methods", "scene"]
+__all__ = ["SCENES", "Contender", "HardScene", "Outcome", "Point", "Spread", "measure", "methods", "scene"]
 
-TOLERANCES = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 # Of IAS15, by its step criterion; each starts where the steps are about as long as its corrector converges with.
 EPSILONS = {"prs23": (1e-4, 1e-5, 1e-6, 1e-7, 1e-9), "global": (1e-2, 1e-3, 1e-4, 1e-6, 1e-9)}
-STEPS_PER_TURN = (20, 40, 60, 80, 120)
 ATOL_PER_RTOL = 1e-3
-# A short run is timed often, so that one of them fits between two disturbances by other processes.
-REPEATS, ENOUGH_SECONDS = 40, 0.4
+ENOUGH_SECONDS = 0.4
 MOST_SAVES = 20_000
 # Longer than any scene takes in fictitious time, which ends at an event.
 FAR = 1e6
+
+
+@dataclass(frozen=True)
+class Spread:
+    """At which settings all methods run, from coarse to fine, and how often.
+
+    Attributes
+    ----------
+    tolerances : tuple of float
+    steps_per_turn : tuple of int
+        Of fictitious time.
+    epsilons : mapping of str to tuple of float
+        Of IAS15, by its step criterion.
+    repeats : int
+        Timed runs of each point at most, the least time of which counts; fewer of one that takes long. A short run is
+        timed often, so that one of them fits between two disturbances by other processes.
+    """
+
+    tolerances: tuple[float, ...] = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+    steps_per_turn: tuple[int, ...] = (20, 40, 60, 80, 120)
+    epsilons: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: EPSILONS)
+    repeats: int = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,12 +234,13 @@ class Point(NamedTuple):
     failure: str
 
 
-def methods(of: HardScene, rebound: Any = None) -> dict[str, Contender]:
+def methods(of: HardScene, spread: Spread, rebound: Any = None) -> dict[str, Contender]:
     """Set up the methods for a scene.
 
     Parameters
     ----------
     of : HardScene
+    spread : Spread
     rebound : module, optional
         `eip_scipy.integrations.rebound`; without it there is no IAS15.
 
@@ -229,61 +250,59 @@ def methods(of: HardScene, rebound: Any = None) -> dict[str, Contender]:
         "DOP853" is EIPDOP853 without invariants, which is SciPy's DOP853 compiled.
     """
     transformed, end = time_transformed(of.problem, FAR, of.g), reaches(of.problem.t_span[1])
-    in_s = tuple(2 * math.pi / n for n in STEPS_PER_TURN)
+    in_s = tuple(2 * math.pi / n for n in spread.steps_per_turn)
     t0, t_end = of.problem.t_span
     found = {
-        "EIPDOP853": Contender("rtol", TOLERANCES, partial(_adaptive, of.problem, {})),
-        "DOP853": Contender("rtol", TOLERANCES, partial(_adaptive, of.problem, {"invariants": ()})),
+        "EIPDOP853": Contender("rtol", spread.tolerances, partial(_adaptive, of.problem, {})),
+        "DOP853": Contender("rtol", spread.tolerances, partial(_adaptive, of.problem, {"invariants": ()})),
         "EIPDOP853, fixed ds": Contender("ds", in_s, partial(_fictitious, transformed, end, {})),
         "DOP853, fixed ds": Contender("ds", in_s, partial(_fictitious, transformed, end, {"invariants": ()})),
         "EIPRKN12": Contender("h", tuple((t_end - t0) / n for n in of.steps), partial(_fixed, of.problem)),
-        "SciPy's DOP853": Contender("rtol", TOLERANCES, partial(_scipy, of.problem)),
+        "SciPy's DOP853": Contender("rtol", spread.tolerances, partial(_scipy, of.problem)),
     }
     if rebound is not None:
-        for criterion, epsilons in EPSILONS.items():
+        for criterion, epsilons in spread.epsilons.items():
             found[f"IAS15, {criterion}"] = Contender("epsilon", epsilons, partial(_ias15, of, rebound, criterion))
     return found
 
 
 def measure(
-    of: HardScene, rebound: Any = None, repeats: int = REPEATS, callback: Callable[[], Any] = lambda: None
-) -> Iterator[Point]:
+    of: HardScene, spread: Spread, rebound: Any = None, callback: Callable[[], Any] = lambda: None
+) -> list[Point]:
     """Run all methods on a scene.
 
     Parameters
     ----------
     of : HardScene
+    spread : Spread
     rebound : module, optional
-    repeats : int, optional
-        Timed runs of each point at most, the least time of which counts; fewer of one that takes long.
     callback : callable, optional
-        ``callback()`` after each point.
+        ``callback()`` after each of the repeats of each point, those left out included.
 
-    Yields
-    ------
-    Point
+    Returns
+    -------
+    list of Point
     """
-    for name, method in methods(of, rebound).items():
-        for value in method.settings:
-            looked = method.run(value, True)
-            outcome, wall_time = _timed(partial(method.run, value, False), repeats)
-            error = math.nan if outcome.failure else of.error(outcome.y[:, -1])
-            yield Point(
-                of.name, name, method.setting, value, looked.nfev, wall_time, error,
-                *of.invariant_errors(looked.y), outcome.failure,
-            )  # fmt: skip
-            callback()
+    contenders = methods(of, spread, rebound)
+    failures: dict[tuple[str, float], str] = {}
 
+    def timed(name: str, value: float) -> tuple[float, np.ndarray]:
+        outcome = contenders[name].run(value, False)
+        failures[name, value] = outcome.failure
+        end = outcome.y[:, -1]
+        return outcome.wall_time, np.full_like(end, math.nan) if outcome.failure else end
 
-def _timed(run: Callable[[], Outcome], repeats: int) -> tuple[Outcome, float]:
-    outcome = run()
-    least = spent = outcome.wall_time
-    for _ in range(1, repeats):
-        if spent > ENOUGH_SECONDS:
-            break
-        seconds = run().wall_time
-        least, spent = min(least, seconds), spent + seconds
-    return outcome, least
+    runners = {name: (partial(timed, name), method.settings) for name, method in contenders.items()}
+    done = work_precision(
+        runners, of.error, repeats=spread.repeats, enough_seconds=math.inf, in_all=ENOUGH_SECONDS, callback=callback
+    )
+    found = []
+    for name, value, wall_time, error in done.points:
+        looked = contenders[name].run(value, True)
+        errors = of.invariant_errors(looked.y)
+        setting, failure = contenders[name].setting, failures[name, value]
+        found.append(Point(of.name, name, setting, value, looked.nfev, wall_time, error, *errors, failure))
+    return found
 
 
 def _adaptive(problem: Problem, options: dict[str, Any], rtol: float, look: bool) -> Outcome:

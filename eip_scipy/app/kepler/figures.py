@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,10 +12,11 @@ from ...core.solvers import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, EIPSolver
 from ...problems import kepler
 from ...run.integrate import integrate
 from ..report import compact, table
+from ..study import Figures, Rows, Session, Study
 
-__all__ = ["KeplerRun", "KeplerStudy", "checks", "figures", "rows", "study", "text"]
+__all__ = ["KeplerFigures", "KeplerRun", "KnownValue"]
 
-STEP, T_END = 0.03, 2000.0
+STEP = 0.03
 ORBIT_END = 100.0
 REFINEMENT = 6  # steps of the reference in one
 # check=False: the paper's RK2 keeps both invariants and loses the orbit, which is what the figure shows.
@@ -58,33 +59,106 @@ class KeplerRun:
     position_error: np.ndarray
 
 
-KeplerStudy = dict[str, KeplerRun]
+class KnownValue(NamedTuple):
+    """An error that is known to two digits, and ours."""
+
+    method: str
+    quantity: str
+    known: str
+    ours: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the digits agree."""
+        return compact(self.ours) == self.known
+
+    @property
+    def line(self) -> str:
+        """One line of the text."""
+        verdict = "ok" if self.passed else "FAILED"
+        return f"{verdict:<6} {self.method}, {self.quantity}: {compact(self.ours)}, known {compact(float(self.known))}"
 
 
-def study(t_end: float = T_END) -> KeplerStudy:
-    """Run the methods of both figures and the reference, in the paper's setting.
+Found = dict[str, KeplerRun]
 
-    Parameters
-    ----------
-    t_end : float, optional
 
-    Returns
-    -------
-    dict of str to KeplerRun
-        By the names in the figures.
+@dataclass(frozen=True, kw_only=True)
+class KeplerFigures(Study[Found]):
+    """``reproduce fig-kepler``: the methods of both figures in the paper's setting, by the names in the figures.
 
-    Notes
-    -----
     The reference is EIPDOP853 with a sixth of the step, compensated; with a third it differs by 1e-11 at t = 2000.
     """
-    problem = kepler()
-    span = (0.0, round(t_end / STEP) * STEP)
-    tight = integrate(problem, span, method=EIPDOP853, h=STEP / REFINEMENT, save_every=REFINEMENT, compensated=True).y
-    return {
-        name: _line(method, kept, problem, span, tight)
-        for _, methods in FIGURES.values()
-        for name, (method, kept) in methods.items()
-    }
+
+    t_end: float = 2000.0
+    known: Sequence[tuple[str, str, str, str, str]] = KNOWN
+
+    def measure(self, session: Session) -> Found:
+        problem = kepler()
+        span = (0.0, round(self.t_end / STEP) * STEP)
+        tight = integrate(
+            problem, span, method=EIPDOP853, h=STEP / REFINEMENT, save_every=REFINEMENT, compensated=True
+        ).y
+        return {
+            name: _line(method, kept, problem, span, tight)
+            for _, methods in FIGURES.values()
+            for name, (method, kept) in methods.items()
+        }
+
+    def checks(self, found: Found) -> list[KnownValue]:
+        """Compare with the known values, to their two digits."""
+        checks = []
+        for name, error, quantity, kind, known in self.known:
+            line = found[name]
+            values = getattr(line, error)
+            at = int(np.searchsorted(line.t, self.t_end)) if kind == "end" else slice(None)
+            ours = float(np.max(values[at])) if line.t[-1] >= self.t_end * (1 - 1e-12) else float("nan")
+            checks.append(KnownValue(name, quantity, known, ours))
+        return checks
+
+    def text(self, found: Found) -> str:
+        t_end = next(iter(found.values())).t[-1]
+        head = [["error of", "H"], ["error of", "L"], ["error of", "position"]]
+        body = [
+            (name, [compact(float(e.max())) for e in (line.energy_error, line.momentum_error, line.position_error)])
+            for name, line in found.items()
+        ]
+        title = (
+            f"Figures 1 and 2: perturbed Kepler problem, h = {STEP:g}, t = 0 ... {t_end:.5g}; largest absolute errors"
+        )
+        return "\n".join([title, "", table(head, body), "", *(check.line for check in self.checks(found))])
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        checks = self.checks(found)
+        return {"checks": [{**c._asdict(), "known": float(c.known), "matched": c.passed} for c in checks]}
+
+    def tables(self, found: Found) -> dict[str, Rows]:
+        lines = [
+            {
+                "method": name,
+                "t": line.t[k],
+                "q1": line.y[0, k],
+                "q2": line.y[1, k],
+                "energy_error": line.energy_error[k],
+                "momentum_error": line.momentum_error[k],
+                "position_error": line.position_error[k],
+            }
+            for name, line in found.items()
+            for k in range(0, line.t.size, 50)
+        ]
+        return {"fig-kepler.csv": lines}
+
+    def figures(self, found: Found) -> Figures:
+        from ...plotting import KeplerRun, paper_kepler_figure
+
+        for file, (title, methods) in FIGURES.items():
+            runs = {}
+            for name in methods:
+                line = found[name]
+                shown = line.t <= ORBIT_END
+                runs[name] = KeplerRun(
+                    line.t, line.energy_error, line.momentum_error, line.position_error, line.y[:2, shown]
+                )
+            yield file, paper_kepler_figure(runs, title=title)
 
 
 def _line(method: type[EIPSolver], kept: str, problem: Any, span: tuple[float, float], tight: np.ndarray) -> KeplerRun:
@@ -96,82 +170,3 @@ def _line(method: type[EIPSolver], kept: str, problem: Any, span: tuple[float, f
     momentum = q[0] * v[1] - q[1] * v[0]
     position_error = np.hypot(*(q - tight[:2]))
     return KeplerRun(run.t, run.y, np.abs(energy - energy[0]), np.abs(momentum - momentum[0]), position_error)
-
-
-def checks(lines: KeplerStudy) -> list[dict[str, Any]]:
-    """Compare with the known values, to their two digits.
-
-    Returns
-    -------
-    list of dict
-        With `method`, `quantity`, `known`, `ours` and `matched`.
-    """
-    found = []
-    for name, error, quantity, kind, known in KNOWN:
-        line = lines[name]
-        values = getattr(line, error)
-        at = int(np.searchsorted(line.t, T_END)) if kind == "end" else slice(None)
-        ours = float(np.max(values[at])) if line.t[-1] >= T_END * (1 - 1e-12) else float("nan")
-        record = {"method": name, "quantity": quantity, "known": float(known), "ours": ours}
-        found.append({**record, "matched": compact(ours) == known})
-    return found
-
-
-def text(lines: KeplerStudy) -> str:
-    """Lay out the errors and the known values."""
-    t_end = next(iter(lines.values())).t[-1]
-    head = [["error of", "H"], ["error of", "L"], ["error of", "position"]]
-    body = [
-        (name, [compact(float(e.max())) for e in (line.energy_error, line.momentum_error, line.position_error)])
-        for name, line in lines.items()
-    ]
-    known = [
-        f"{'ok' if c['matched'] else 'FAILED':<6} {c['method']}, {c['quantity']}: {compact(c['ours'])}, "
-        f"known {compact(c['known'])}"
-        for c in checks(lines)
-    ]
-    title = f"Figures 1 and 2: perturbed Kepler problem, h = {STEP:g}, t = 0 ... {t_end:.5g}; largest absolute errors"
-    return "\n".join([title, "", table(head, body), "", *known])
-
-
-def rows(lines: KeplerStudy) -> list[dict[str, Any]]:
-    """Make the lines of the CSV file, at every 50th step."""
-    return [
-        {
-            "method": name,
-            "t": line.t[k],
-            "q1": line.y[0, k],
-            "q2": line.y[1, k],
-            "energy_error": line.energy_error[k],
-            "momentum_error": line.momentum_error[k],
-            "position_error": line.position_error[k],
-        }
-        for name, line in lines.items()
-        for k in range(0, line.t.size, 50)
-    ]
-
-
-def figures(lines: KeplerStudy) -> Iterator[tuple[str, Any]]:
-    """Make the figures one by one.
-
-    Yields
-    ------
-    (str, Figure)
-        File name and figure.
-
-    Raises
-    ------
-    ImportError
-        Without matplotlib.
-    """
-    from ...plotting import KeplerRun, paper_kepler_figure
-
-    for file, (title, methods) in FIGURES.items():
-        runs = {}
-        for name in methods:
-            line = lines[name]
-            shown = line.t <= ORBIT_END
-            runs[name] = KeplerRun(
-                line.t, line.energy_error, line.momentum_error, line.position_error, line.y[:2, shown]
-            )
-        yield file, paper_kepler_figure(runs, title=title)

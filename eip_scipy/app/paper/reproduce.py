@@ -1,487 +1,71 @@
-"""``eip-scipy reproduce table1 ... table5 fig-kepler ... all``: the paper's numbers beside ours, and its figures.
-
-The paper's numbers, their misprints and the same computations in 50 digits are data: ``data/paper_tables.json``.
-"""
+"""``eip-scipy reproduce table1 ... table5 fig-kepler ... all``: the paper's tables and figures, one after the other."""
 
 from __future__ import annotations
 
-import argparse
-import json
-import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from decimal import Decimal
-from functools import cache
-from importlib.resources import files
-from itertools import groupby, pairwise
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
-import numpy as np
-from scipy.integrate import solve_ivp
-from tqdm import tqdm
+from ..commands import DONE, INTERRUPTED
+from ..condensates.efficiency import Efficiency
+from ..kepler.figures import KeplerFigures
+from ..particles.charged_particle import ChargedParticle
+from ..report import check_outputs, document, write_json
+from ..solar.solar_system import SolarSystem
+from ..study import Command, Session, Study, option, perform
+from .tables import TABLES, PaperTable
 
-from ...core.diagnostics import observed_order
-from ...core.solvers import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPSolver
-from ...problems import Problem, harmonic, kepler, rotating_packet
-from ...run.integrate import integrate
-from .. import report
-from ..condensates import efficiency as gpe_efficiency
-from ..kepler import figures as kepler_figures
-from ..particles import charged_particle
-from ..particles import report as particle_report
-from ..solar import solar_system
+__all__ = ["STUDIES", "Reproduce"]
 
-__all__ = ["FIGURES", "TABLES", "Cell", "Value", "add_arguments", "reproduce", "run"]
-
-TABLES = ("table1", "table2", "table3", "table4", "table5")
-SLOW = ("table5",)
-FIGURES = ("fig-kepler", "fig-solar", "fig-particle", "fig-tokamak", "fig-efficiency")
-PARTICLE_SCENES = {"fig-particle": ("uniform",), "fig-tokamak": ("tokamak-banana", "tokamak-transit")}
-OMEGA = 10.0
-METHODS: dict[str, type[EIPSolver]] = {"RK1": EIPRK1, "RK2": EIPRK2, "RK3": EIPRK3, "RK4": EIPRK4}
-# check=False: the paper's longest steps are far too long, and nobody need be told.
-PAPER_SETTING: dict[str, Any] = {"metric": "euclidean", "reuse_f": False, "check": False}
-WIDE, NARROW, DIGITS = 12, 9, 8  # columns of the printed tables
+Make = Callable[[], Study[Any]]
+STUDIES: dict[str, Make] = {
+    **{name: partial(PaperTable, name=name) for name in TABLES},
+    "fig-kepler": KeplerFigures,
+    "fig-solar": SolarSystem,
+    "fig-particle": partial(ChargedParticle, scenes=("uniform",), paper_only=True, stem="fig-particle"),
+    "fig-tokamak": partial(
+        ChargedParticle, scenes=("tokamak-banana", "tokamak-transit"), paper_only=True, stem="fig-tokamak"
+    ),
+    "fig-efficiency": Efficiency,
+}
 
 
-@dataclass(frozen=True)
-class Value:
-    """One number of the paper and ours.
+@dataclass(frozen=True, kw_only=True)
+class Reproduce(Command):
+    """The command."""
 
-    Attributes
-    ----------
-    paper : str
-        The number as printed, its misprints corrected.
-    ours, mpmath : float
-        The same from this package in double precision, and in 50 digits (nan where that is out of reach).
-    roundoff : float
-        What round-off may change in it.
-    printed : str or None
-        What the paper prints, where that is a misprint.
-    """
-
-    paper: str
-    ours: float
-    mpmath: float
-    roundoff: float
-    printed: str | None = None
-
-    @property
-    def paper_digits(self) -> int:
-        """Significant digits that the paper prints."""
-        return len(Decimal(self.paper).as_tuple().digits)
-
-    @property
-    def digits(self) -> int:
-        """Leading significant digits that agree once both numbers are rounded to them."""
-        paper, ours = Decimal(self.paper), Decimal(self.ours)
-        for count in range(self.paper_digits, 0, -1):
-            place = Decimal(1).scaleb(paper.adjusted() - count + 1)
-            if paper.quantize(place) == ours.quantize(place):
-                return count
-        return 0
-
-    @property
-    def matched(self) -> bool:
-        """Whether every printed digit agrees."""
-        return self.digits == self.paper_digits
-
-    @property
-    def within_roundoff(self) -> bool:
-        """Whether ours lies within round-off of what the paper would print so, or of the number in 50 digits.
-
-        In the second case the round-off is the paper's.
-        """
-        half_unit = 0.5 * 10.0 ** int(Decimal(self.paper).as_tuple().exponent)
-        from_paper, from_exact = abs(self.ours - float(self.paper)), abs(self.ours - self.mpmath)
-        return from_paper <= half_unit + self.roundoff or from_exact <= self.roundoff
-
-    @property
-    def status(self) -> str:
-        """Either "matched", "round-off" or "differs"."""
-        if self.matched:
-            return "matched"
-        return "round-off" if self.within_roundoff else "differs"
-
-    def like_paper(self, value: float) -> str:
-        """`value` in the notation and with the digits of the paper."""
-        decimals = len(self.paper.partition("e")[0].partition(".")[2])
-        return f"{value:.{decimals}{'e' if 'e' in self.paper else 'f'}}"
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A cell of one of the paper's tables: an error, and its order unless it is the first of its series."""
-
-    table: int
-    row: str
-    column: str
-    error: Value
-    order: Value | None
-
-
-@dataclass(frozen=True)
-class Series:
-    """One method at successively shorter steps, as stored."""
-
-    table: int
-    name: str
-    method: str
-    iterations: int
-    invariants: str
-    h: str
-    divisors: list[int]
-    errors: list[str]
-    orders: list[str]
-    mpmath: list[str] | None = None
-    errata: dict[str, dict[str, str]] | None = None
-    Omega: float = 0.0
-
-    @property
-    def steps(self) -> list[float]:
-        """Lengths of the steps."""
-        return [float(self.h) / d for d in self.divisors]
-
-    @property
-    def solver(self) -> type[EIPSolver]:
-        """The solver class."""
-        return METHODS[self.method]
-
-
-@cache
-def _data() -> dict[str, Any]:
-    return json.loads(files("eip_scipy.data").joinpath("paper_tables.json").read_text(encoding="utf-8"))
-
-
-def reproduce(table: str, progress: bool = False) -> list[Cell]:
-    """Compute one of the paper's tables in the paper's setting: fixed steps, euclidean metric.
-
-    Parameters
-    ----------
-    table : {"table1", "table2", "table3", "table4", "table5"}
-        The last takes minutes: 37500 steps on 128 x 128 points for each of nine columns.
-    progress : bool, optional
-        Show a progress bar in the one that takes long.
-
-    Returns
-    -------
-    list of Cell
-        Method by method, from the longest step to the shortest.
-
-    Raises
-    ------
-    ValueError
-        For another table.
-    """
-    if table not in TABLES:
-        raise ValueError(f"table must be one of {', '.join(TABLES)}, got {table!r}.")
-    number = TABLES.index(table) + 1
-    stored = [Series(**s) for s in _data()["series"] if s["table"] == number]
-    shown = tqdm(stored, table, unit="column", leave=False, disable=not (progress and table in SLOW))
-    return [cell for series in shown for cell in _cells(series)]
-
-
-def _cells(series: Series) -> list[Cell]:
-    """Compute one series."""
-    about = _data()["tables"][str(series.table)]
-    errors = _ERRORS[series.table](series)
-    exact = [math.nan] * len(errors) if series.mpmath is None else [float(x) for x in series.mpmath]
-    orders = _orders(series, errors, exact, about["roundoff"])
-    cells = []
-    for k, (printed, divisor) in enumerate(zip(series.errors, series.divisors, strict=True)):
-        labels = {"name": series.name, "method": series.method, "h": series.h, "d": divisor}
-        misprint = (series.errata or {}).get(str(k), {}).get("printed")
-        error = Value(printed, errors[k], exact[k], about["roundoff"], misprint)
-        cells.append(
-            Cell(series.table, about["row"].format(**labels), about["column"].format(**labels), error, orders[k])
-        )
-    return cells
-
-
-def _orders(series: Series, errors: list[float], exact: list[float], roundoff: float) -> list[Value | None]:
-    """Order at each step but the first; round-off in two errors moves it in proportion to their size."""
-    refinement = -np.diff(np.log(series.steps))
-    relative = roundoff / np.where(np.isnan(exact), errors, exact)
-    slack = (relative[:-1] + relative[1:]) / refinement
-    columns = zip(
-        series.orders, observed_order(errors, series.steps), observed_order(exact, series.steps), slack, strict=True
-    )
-    return [None, *(Value(paper, float(ours), float(mpmath), float(s)) for paper, ours, mpmath, s in columns)]
-
-
-def _multiplier_errors(series: Series) -> list[float]:
-    """Table 1: |lambda_hat - lambda_star| of the last step."""
-    return [_multiplier_error(series, h) for h in series.steps]
-
-
-def _multiplier_error(series: Series, h: float) -> float:
-    """lambda_hat is what the step's projection did, lambda_star the paper's closed form at the same raw result."""
-    problem = harmonic(OMEGA)
-    steps: list[tuple[np.ndarray, np.ndarray]] = []
-
-    class Recorder(series.solver):  # type: ignore[name-defined]
-        def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
-            y_new = super()._project_step(t, y, y_hat, err)
-            steps.append((y_hat.copy(), y_new))
-            return y_new
-
-    solve_ivp(
-        problem.fun, problem.t_span, problem.y0, method=Recorder, h=h, invariants=problem.invariants, **PAPER_SETTING
-    )
-    y_hat, y_new = steps[-1]
-    gradient = OMEGA * y_hat
-    # fsum, because BLAS rounds differently from machine to machine.
-    lambda_hat = math.fsum((y_new - y_hat) * gradient) / math.fsum(gradient * gradient)
-    lambda_star = -(1 - math.hypot(*problem.y0) / math.hypot(*y_hat)) / OMEGA
-    return abs(lambda_hat - lambda_star)
-
-
-def _last_defects(series: Series) -> list[float]:
-    """Tables 2 and 4: the last defect of the first invariant that is kept."""
-    problem = harmonic(OMEGA) if series.table == 2 else kepler(eccentricity=0.6, relativistic=0.005)
-    return [_last_defect(problem, series, h) for h in series.steps]
-
-
-def _last_defect(problem: Problem, series: Series, h: float) -> float:
-    values = _run(problem, series, h).invariants[0]
-    return abs(float(values[-1] - values[0]))
-
-
-def _differences(series: Series) -> list[float]:
-    """Table 3: largest difference, over the components, of the ends of two successive steps."""
-    problem = kepler(eccentricity=0.6, relativistic=0.005)
-    steps = [2 * series.steps[0], *series.steps]
-    ends = [_run(problem, series, h).y[:, -1] for h in steps]
-    return [float(np.abs(a - b).max()) for a, b in pairwise(ends)]
-
-
-def _field_differences(series: Series) -> list[float]:
-    """Table 5: largest modulus of the difference of the fields at the ends of two successive steps."""
-    steps = [2 * series.steps[0], *series.steps]
-    problem = rotating_packet(series.Omega, nyquist="zero")
-    ends = [_run(problem, series, h, problem.t_span[1]).y[:, -1] for h in steps]
-    return [float(np.abs(a - b).max()) for a, b in pairwise(ends)]
-
-
-def _run(problem: Problem, series: Series, h: float, t_end: float = 1.0) -> Any:
-    """round(t_end/h) steps of length h: the paper's last steps do not all end on t = 1."""
-    kept = [item for item in problem.invariants if item.name[0].upper() in series.invariants]
-    return integrate(
-        problem,
-        (0.0, round(t_end / h) * h),
-        method=series.solver,
-        h=h,
-        invariants=kept,
-        iterations=series.iterations,
-        compiled=False,  # the same bits; these runs are too short to be worth compiling
-        **PAPER_SETTING,
-    )
-
-
-_ERRORS = {1: _multiplier_errors, 2: _last_defects, 3: _differences, 4: _last_defects, 5: _field_differences}
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what the command takes besides the options of all commands."""
-    parser.add_argument(
-        "table",
+    table: Sequence[str] = option(
+        (),
+        f"{', '.join(STUDIES)} or all; several may be given",
+        positional=True,
         nargs="+",
-        choices=(*TABLES, *FIGURES, "all"),
+        choices=(*STUDIES, "all"),
         metavar="WHAT",
-        help=f"{', '.join((*TABLES, *FIGURES))} or all; several may be given",
     )
+    studies: Mapping[str, Make] = field(default_factory=lambda: STUDIES)
 
-
-def run(args: argparse.Namespace, peer: Callable[[], Any] = lambda: None) -> int:
-    """Print the tables and figures' numbers, write them where that is asked for, and return the exit status.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        With `table` (list of str), `out`, `json` and `quiet`.
-    peer : callable, optional
-        ``peer()`` finds REBOUND's integrators or returns None; called for the solar figures only.
-
-    Returns
-    -------
-    int
-        0 when every number agrees with the paper's to the printed digits or to round-off, else 1.
-    """
-    wanted = list(dict.fromkeys((*TABLES, *FIGURES) if "all" in args.table else args.table))
-    if args.out is not None:
-        report.check_folder(Path(args.out))
-    if args.json is not None:
-        report.check_target(Path(args.json))
-    tables = {name: reproduce(name, progress=not args.quiet) for name in wanted if name in TABLES}
-    everything = [cell for cells in tables.values() for cell in cells]
-    if tables and not args.quiet:
-        report.say("\n\n".join(table_text(cells) for cells in tables.values()))
-    written = []
-    if args.out is not None:
-        written += [report.write_csv(Path(args.out) / f"{table}.csv", _lines(cells)) for table, cells in tables.items()]
-    _say_written(args, written)
-    content, status = as_dict(everything), 0 if passed(everything) else 1
-    for name in wanted:
-        if name in FIGURES:
-            if not args.quiet and name != wanted[0]:
-                report.say()
-            worse, content[name] = _figure(name, args, peer)
-            status = max(status, worse)
-    content["passed"] = status == 0
-    if args.json is not None:
-        report.write_json(Path(args.json), report.document("reproduce", {"table": wanted}, **content))
-        _say_written(args, [Path(args.json)])
-    return status
-
-
-def _say_written(args: argparse.Namespace, written: list[Path]) -> None:
-    if written and not args.quiet:
-        report.say("\n".join(["", *(f"wrote {path}" for path in written)]))
-
-
-def _figure(name: str, args: argparse.Namespace, peer: Callable[[], Any]) -> tuple[int, dict[str, Any]]:
-    """Make one of the paper's figures; exit status and content of the JSON."""
-    if name == "fig-kepler":
-        return _kepler(args)
-    if name == "fig-efficiency":
-        return _efficiency(args)
-    return _solar(args, peer) if name == "fig-solar" else _particle(name, args)
-
-
-def _kepler(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Make the paper's figures 1 and 2; exit status and content of the JSON."""
-    return _study("fig-kepler", kepler_figures, kepler_figures.study(), args)
-
-
-def _efficiency(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Make the paper's figure of efficiency; exit status and content of the JSON."""
-    return _study("fig-efficiency", gpe_efficiency, gpe_efficiency.study(quiet=args.quiet), args)
-
-
-def _study(name: str, command: Any, found: Any, args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Print and write what a module of a figure lays out of its study."""
-    if not args.quiet:
-        report.say(command.text(found))
-    checks = command.checks(found)
-    if args.out is not None:
-        folder = Path(args.out)
-        written = report.write_results(folder, {f"{name}.csv": command.rows(found)}, command.figures(found))
-        _say_written(args, written)
-    return 0 if all(check["matched"] for check in checks) else 1, {"checks": checks}
-
-
-def _particle(name: str, args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Make the figures of Experiment III in one of its fields; exit status and content of the JSON."""
-    studies = charged_particle.run_scenes(PARTICLE_SCENES[name], paper_only=True, quiet=args.quiet)
-    if not args.quiet:
-        report.say("\n\n".join(particle_report.text(found) for found in studies.values()))
-    if args.out is not None:
-        results = charged_particle.results(studies, name, paper_only=True)
-        _say_written(args, report.write_results(args.out, *results))
-    content = charged_particle.record(studies)
-    return 0 if content["passed"] else 1, content
-
-
-def _solar(args: argparse.Namespace, peer: Callable[[], Any]) -> tuple[int, dict[str, Any]]:
-    """Make the figures of Experiment II by the command ``solar-system``; exit status and content of the JSON."""
-    parser = argparse.ArgumentParser()
-    solar_system.add_arguments(parser)
-    own = parser.parse_args([])
-    own.out, own.quiet = Path("." if args.out is None else args.out), args.quiet
-    own.json = own.out / "solar-system.json"
-    own.json.unlink(missing_ok=True)  # one that is there afterwards is of this run
-    status = solar_system.run(own, peer())
-    return status, json.loads(own.json.read_text(encoding="utf-8")) if own.json.exists() else {}
-
-
-def passed(cells: Iterable[Cell]) -> bool:
-    """Whether no number differs by more than round-off."""
-    return all(value.status != "differs" for cell in cells for value in (cell.error, cell.order) if value is not None)
-
-
-def as_dict(cells: list[Cell]) -> dict[str, Any]:
-    """All cells as plain data; the orders, which the paper prints in columns of their own, form a second list."""
-    orders = [_record(cell, cell.order) for cell in cells if cell.order is not None]
-    return {"cells": [_record(cell, cell.error) for cell in cells], "orders": orders, "passed": passed(cells)}
-
-
-def _record(cell: Cell, value: Value) -> dict[str, Any]:
-    cause = _data()["tables"][str(cell.table)]["cause"]
-    return {
-        "table": cell.table,
-        "row": cell.row,
-        "column": cell.column,
-        "paper": float(value.paper),
-        "ours": value.ours,
-        "mpmath": value.mpmath,
-        "digits": value.digits,
-        "paper_digits": value.paper_digits,
-        "status": value.status,
-        "cause": cause if value.status == "round-off" else None,
-        "misprinted_as": None if value.printed is None else float(value.printed),
-    }
-
-
-def _lines(cells: list[Cell]) -> list[dict[str, Any]]:
-    """Lines of a CSV file: errors, then orders."""
-    data = as_dict(cells)
-    return [
-        {"quantity": quantity, **record}
-        for name, quantity in (("cells", "error"), ("orders", "order"))
-        for record in data[name]
-    ]
-
-
-def table_text(cells: list[Cell]) -> str:
-    """One table as text."""
-    about = _data()["tables"][str(cells[0].table)]
-    labels = [(cell.row, cell.column) if cells[0].table == 2 else (cell.column, cell.row) for cell in cells]
-    width = max(len(label) for pair in labels for label in pair)
-    exact = any(not math.isnan(cell.error.mpmath) for cell in cells)
-    lines = [f"Table {cells[0].table}: {about['title']}", f"         {about['problem']}", "", *_head(width, exact)]
-    series = groupby(zip(labels, cells, strict=True), key=lambda item: item[0][0])
-    for name, members in series:
-        for k, ((_, step), cell) in enumerate(members):
-            lines.append(f"{name if k == 0 else '':<{width}}  {step:<{width}}{_values_text(cell)}".rstrip())
-    return "\n".join([*lines, "", *_summary(cells)])
-
-
-def _head(width: int, exact: bool) -> list[str]:
-    name = "mpmath" if exact else ""
-    errors = f"{'paper':>{WIDE}}{'ours':>{WIDE}}{'digits':>{DIGITS}}{name:>{WIDE}}"
-    orders = f"{'paper':>{NARROW}}{'ours':>{NARROW}}{'digits':>{DIGITS}}{name:>{NARROW}}"
-    rules = ["  " + f" {name} ".center(len(group) - 2, "-") for name, group in (("error", errors), ("order", orders))]
-    margin = " " * (2 * width + 2)
-    return [margin + "".join(rules), margin + errors + orders]
-
-
-def _values_text(cell: Cell) -> str:
-    """One line's numbers; those in 50 digits where a printed digit differs."""
-    text = _value_text(cell.error, WIDE)
-    if cell.order is not None:
-        text += _value_text(cell.order, NARROW)
-    if cell.error.printed is not None:
-        text += f"  misprinted as {cell.error.printed}"
-    return text
-
-
-def _value_text(value: Value, width: int) -> str:
-    exact = "" if value.matched or math.isnan(value.mpmath) else value.like_paper(value.mpmath)
-    agree = f"{value.digits}/{value.paper_digits}" + ("!" if value.status == "differs" else " ")
-    return f"{value.paper:>{width}}{value.like_paper(value.ours):>{width}}{agree:>{DIGITS}}{exact:>{width}}"
-
-
-def _summary(cells: list[Cell]) -> list[str]:
-    """How many numbers agree, and why the others do not."""
-    errors = [cell.error for cell in cells]
-    orders = [cell.order for cell in cells if cell.order is not None]
-    counts = [f"{sum(v.matched for v in values)} of {len(values)}" for values in (errors, orders)]
-    lines = [f"{counts[0]} errors and {counts[1]} orders agree to every printed digit."]
-    statuses = [value.status for value in (*errors, *orders)]
-    if "round-off" in statuses:
-        about = _data()["tables"][str(cells[0].table)]
-        lines.append(f"Round-off ({about['roundoff']:.1e}) explains {statuses.count('round-off')}: {about['cause']}.")
-    if "differs" in statuses:
-        lines.append(f"{statuses.count('differs')} marked ! DIFFER by more than round-off.")
-    return lines
+    def run(self, session: Session) -> int:
+        """Each as a command of its own would, and one JSON of all; the numbers of all tables are in two lists of it."""
+        check_outputs(session.out, session.json)
+        wanted = list(dict.fromkeys(self.studies if "all" in self.table else self.table))
+        content: dict[str, Any] = {"cells": [], "orders": []}
+        status = DONE
+        for k, name in enumerate(wanted):
+            if k > 0:
+                session.say()
+            own = Session(name, session.out, None, session.quiet, session.absent)
+            if name == "fig-solar":  # a command of its own, which leaves its numbers
+                own.name, own.json = "solar-system", session.out / "solar-system.json"
+            judged, numbers = perform(self.studies[name](), own)
+            if judged == INTERRUPTED:
+                return INTERRUPTED
+            status = max(status, judged)
+            if name in TABLES:
+                content = {**content, **{kind: content[kind] + numbers[kind] for kind in ("cells", "orders")}}
+            else:
+                content[name] = numbers
+        content["passed"] = status == DONE
+        if session.json is not None:
+            session.wrote(write_json(session.json, document(session.name, {"table": wanted}, **content)))
+        return status

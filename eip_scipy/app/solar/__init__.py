@@ -1,1 +1,1 @@
-"""``solar-system``, with ``--truth`` and ``--frontier``."""
+"""``solar-system``, ``solar-system frontier`` and ``solar-system truth``."""

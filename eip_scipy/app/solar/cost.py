@@ -14,7 +14,7 @@ from ...core.solvers import EIPGJ14, EIPRK4, EIPRK5, EIPRKN12, EIPSolver
 from ...problems.gravity.solar_data import YEAR_D
 from ...run.integrate import integrate
 from ..long_runs import named
-from ..work_precision import Runner, work_precision
+from ..work_precision import Runner, curves, work_precision
 from .runs import (
     HIGH_ORDER,
     KEPT,
@@ -30,9 +30,8 @@ from .runs import (
     whole_number,
 )
 
-__all__ = ["ENOUGH_SECONDS", "MERCURY", "REPEATS", "TimedRun", "by_method", "cost", "cost_methods", "timed"]
+__all__ = ["ENOUGH_SECONDS", "MERCURY", "TimedRun", "cost", "cost_methods", "panels", "timed"]
 
-REPEATS = 3
 ENOUGH_SECONDS = 0.2  # what disturbs so long a run is not seen on axes of many powers of ten
 MULTISTEP_COUNTS = (255, 300, 412, 600)  # steps a year; half of the first would not be stable
 MERCURY = 0  # of the planets, which start behind the Sun
@@ -105,22 +104,20 @@ def timed(
     ]
 
 
-def by_method(runs: Sequence[TimedRun]) -> dict[str, dict[str, list[float]]]:
-    """Series of times and errors, as `eip_scipy.plotting.frontier_figure` takes them."""
-    return {
-        name: {
-            "wall_time": [item.wall_time for item in runs if item.method == name],
-            "Mercury": [item.mercury for item in runs if item.method == name],
-            "the worst of the other planets": [item.others for item in runs if item.method == name],
-        }
-        for name in dict.fromkeys(item.method for item in runs)
-    }
+def panels(runs: Sequence[TimedRun], time: str = "wall time [s]") -> list[list[Any]]:
+    """Mercury's error and the largest of the others, for `eip_scipy.plotting.cost_figure`."""
+    from ...plotting import CostPanel
+
+    kinds = {"mercury": "Mercury", "others": "the worst of the other planets"}
+    return [[CostPanel(title, time, curves(runs, error=error)) for error, title in kinds.items()]]
 
 
 def cost(
     scene: SolarScene,
     methods: Mapping[str, tuple[Runner, Sequence[float]]],
     peer: Peer | None,
+    *,
+    repeats: int,
     callback: Callable[[], Any] | None = None,
 ) -> list[TimedRun]:
     """Final position errors against the time of the run, for several methods and steps.
@@ -133,9 +130,10 @@ def cost(
         From `cost_methods`.
     peer : callable or None
         REBOUND, if it is there.
+    repeats : int
+        Of each method and step, unless one took more than `ENOUGH_SECONDS`.
     callback : callable, optional
-        ``callback()`` after each run; there are `REPEATS` of each method and step, those that are left out since one
-        took more than `ENOUGH_SECONDS` included.
+        ``callback()`` after each run, those that are left out included.
 
     Returns
     -------
@@ -146,7 +144,7 @@ def cost(
         truth = (tight_run(scene, False) if peer is None else rebound_run(scene, peer, "IAS15", "ias15", 1, False)).y[
             :, -1
         ]
-    return timed(methods, truth, repeats=REPEATS, enough_seconds=ENOUGH_SECONDS, callback=callback)
+    return timed(methods, truth, repeats=repeats, enough_seconds=ENOUGH_SECONDS, callback=callback)
 
 
 def cost_methods(

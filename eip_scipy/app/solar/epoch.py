@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import date
 from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ...problems.gravity.solar_data import SolarSystemData, available, load
 from ..report import UsageError
+from ..study import option
 
-__all__ = ["Ephemeris", "Epoch", "add_arguments", "initial_data", "parse_epoch"]
+__all__ = ["AnyEpoch", "Epoch", "kernels", "one_line", "parse_epoch"]
 
-Ephemeris = Callable[[tuple[float, float], Path | None], SolarSystemData]
-"""`eip_scipy.integrations.jpl.initial_data`."""
-
-DEFAULT = "de440"
-TEN_BODIES = [name for name in available() if len(load(name).bodies) == 10]  # what the tables and figures are made for
 FORMS = '"2014-02-02T20:18", "2000-01-01" (both TDB, Gregorian calendar), "JD2451545.0" or "2451545.0"'
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d):(\d\d)(?::(\d\d(?:\.\d+)?))?)?")
 _JULIAN_DATE = re.compile(r"(?:JD ?)?(-?\d{1,8}(?:\.\d*)?)", re.IGNORECASE)
@@ -32,18 +30,6 @@ class Epoch(NamedTuple):
 
     midnight: float
     rest: float
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add ``--data``, or instead ``--epoch`` with ``--kernel``."""
-    start = parser.add_mutually_exclusive_group()
-    start.add_argument("--data", choices=TEN_BODIES, help=f"initial data that the package carries ({DEFAULT})")
-    start.add_argument(
-        "--epoch", type=_epoch, help=f'start at any epoch of a JPL kernel: {FORMS}; needs "eip_scipy[jpl]"'
-    )
-    parser.add_argument(
-        "--kernel", type=Path, metavar="FILE", help="with --epoch: a kernel of your own (.bsp) instead of DE440"
-    )
 
 
 def parse_epoch(text: str) -> Epoch:
@@ -99,31 +85,25 @@ def _epoch(text: str) -> Epoch:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def initial_data(args: argparse.Namespace, ephemeris: Ephemeris | None) -> SolarSystemData:
-    """Get the data that the options ask for.
+@dataclass(frozen=True, kw_only=True)
+class AnyEpoch:
+    """Settings of a study that can start at any epoch of a JPL kernel."""
 
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Options of `add_arguments`.
-    ephemeris : callable or None
-        Reads a kernel; needed for ``--epoch`` only.
+    epoch: Epoch | None = option(
+        None, f'start at any epoch of a JPL kernel: {FORMS}; needs "eip_scipy[jpl]"', type=_epoch
+    )
+    kernel: Path | None = option(None, "a kernel of your own (.bsp) instead of DE440", type=Path, metavar="FILE")
 
-    Returns
-    -------
-    SolarSystemData
 
-    Raises
-    ------
-    UsageError
-        When the epoch cannot be had; one line.
-    """
-    if args.epoch is None:
-        if args.kernel is not None:
-            raise UsageError("--kernel goes with --epoch, which says where in the kernel to start")
-        return load(args.data or DEFAULT)
-    assert ephemeris is not None  # whoever lets users choose an epoch brings a reader
+def kernels() -> Any:
+    """`eip_scipy.integrations.jpl`; what it needs is looked for when a kernel is read."""
+    return import_module("eip_scipy.integrations.jpl")
+
+
+@contextmanager
+def one_line() -> Iterator[None]:
+    """Say in one line what an epoch, a kernel or a model cannot do."""
     try:
-        return ephemeris(args.epoch, args.kernel)
+        yield
     except (ImportError, OSError, ValueError) as error:
         raise UsageError(" ".join(str(error).split())) from error

@@ -8,10 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..study import Check
 from .cost import MERCURY, TimedRun
 from .runs import TIGHT, MethodRun, SolarScene, report_times, stored_state
 
-__all__ = ["MERCURY", "Check", "PointErrors", "SolarStudy", "ecliptic", "errors_at", "longitude_errors"]
+__all__ = ["MERCURY", "PointErrors", "SolarRuns", "ecliptic", "errors_at", "longitude_errors"]
 
 OBLIQUITY = math.radians(84381.448 / 3600)  # IAU 1976, as the paper's data: from the axes of the ICRF to the ecliptic
 # A turn is counted right if the longitude error changes by less than half a turn between saved states. Two ellipses as
@@ -31,15 +32,8 @@ class PointErrors(NamedTuple):
     position: np.ndarray
 
 
-class Check(NamedTuple):
-    """A condition that a sound run meets."""
-
-    passed: bool
-    text: str
-
-
 @dataclass
-class SolarStudy:
+class SolarRuns:
     """The runs done so far and what follows from them; an interruption leaves it usable."""
 
     scene: SolarScene
@@ -48,6 +42,8 @@ class SolarStudy:
     tight: MethodRun | None = None
     cost: list[TimedRun] = field(default_factory=list)
     cost_scene: SolarScene | None = None
+    repeats: int = 3
+    """Timed runs of each, the least time of which counts."""
     beside: str = ""
     """Name of the run that was done beside the others, on another core; empty: one after the other."""
 
@@ -178,12 +174,12 @@ def checks(scene: SolarScene, order: int, main: MethodRun, tight: MethodRun | No
     -------
     list of Check
     """
-    done = [Check(not main.failure, f"{main.name} reached the end")]
+    done = [Check(f"{main.name} reached the end", not main.failure)]
     # Defects are O(h^(2p + 2)): round-off for small steps; for large ones the factor is measured, with room of 10.
     bound = max(ROUND_OFF, 1e-3 * (FASTEST * scene.h) ** (2 * order + 2))
     for name, series in (("H", main.energy_error), ("L", main.momentum_error)):
         value = float(series.max())
-        done.append(Check(value <= bound, f"{main.name} keeps {name}: relative error {value:.1e} (bound {bound:.1e})"))
+        done.append(Check(f"{main.name} keeps {name}: relative error {value:.1e} (bound {bound:.1e})", value <= bound))
     if tight is not None:
         done += _reference_checks(scene, tight)
     return done
@@ -194,7 +190,7 @@ def _reference_checks(scene: SolarScene, tight: MethodRun) -> list[Check]:
     stored = [year for year in report_times(scene) if stored_state(scene, year) is not None]
     at_end = errors_at(scene, tight, stored[-1], tight) if stored else None
     if at_end is None:
-        return [Check(not tight.failure, f"{tight.name} reached the end")]
+        return [Check(f"{tight.name} reached the end", not tight.failure)]
     worst, bound = float(at_end.position.max()), TIGHT_POSITION[tight.name]
     text = f"{tight.name} agrees with the stored states at {stored[-1]:g} yr to {worst:.1e} AU (bound {bound:g})"
-    return [Check(worst <= bound, text)]
+    return [Check(text, worst <= bound)]

@@ -1,4 +1,4 @@
-"""The figures of ``eip-scipy solar-system``: from a `SolarStudy` to the functions of `eip_scipy.plotting`."""
+"""The figures of ``eip-scipy solar-system``: from a `SolarRuns` to the functions of `eip_scipy.plotting`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from ... import plotting
 from ...problems.gravity.solar_data import YEAR_D
 from ..report import describe_machine
-from .cost import ENOUGH_SECONDS, REPEATS, by_method
-from .errors import MERCURY, SolarStudy, ecliptic, longitude_errors
+from .cost import ENOUGH_SECONDS, panels
+from .errors import MERCURY, SolarRuns, ecliptic, longitude_errors
 from .runs import MethodRun, SolarScene
 
 __all__ = ["figures", "jacobi", "osculating_orbits"]
@@ -20,12 +20,12 @@ OUTER, INNER = slice(4, 9), slice(0, 4)
 ELLIPSES = 40
 
 
-def figures(study: SolarStudy, part: slice = slice(None)) -> Iterator[tuple[str, Any]]:
+def figures(study: SolarRuns, part: slice = slice(None)) -> Iterator[tuple[str, Any]]:
     """Make figures one by one.
 
     Parameters
     ----------
-    study : SolarStudy
+    study : SolarRuns
         With its reference run, and for the last figure with the timings.
     part : slice, optional
         Which of `FIGURES`.
@@ -95,11 +95,11 @@ def _norm(vectors: np.ndarray) -> np.ndarray:
     return np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _span(study: SolarStudy) -> str:
+def _span(study: SolarRuns) -> str:
     return f"{study.scene.years:g} yr, {study.scene.data.name}"
 
 
-def _longitudes(study: SolarStudy) -> dict[str, np.ndarray]:
+def _longitudes(study: SolarRuns) -> dict[str, np.ndarray]:
     """Longitude errors along each run but the reference."""
     tight = study.tight
     if tight is None:
@@ -107,7 +107,7 @@ def _longitudes(study: SolarStudy) -> dict[str, np.ndarray]:
     return {run.name: longitude_errors(study.scene, run, tight) for run in study.runs if run is not tight}
 
 
-def _errors_figure(study: SolarStudy, styles: Any) -> Any:
+def _errors_figure(study: SolarRuns, styles: Any) -> Any:
     longitude = _longitudes(study)
     series = {}
     for run in study.runs:
@@ -122,11 +122,11 @@ def _errors_figure(study: SolarStudy, styles: Any) -> Any:
     )
 
 
-def _reference_name(study: SolarStudy) -> str:
+def _reference_name(study: SolarRuns) -> str:
     return study.tight.name if study.tight else "reference"
 
 
-def _longitude_figure(study: SolarStudy, styles: Any) -> Any:
+def _longitude_figure(study: SolarRuns, styles: Any) -> Any:
     return plotting.longitude_figure(
         study.tight.t if study.tight else (),
         _longitudes(study),
@@ -137,7 +137,7 @@ def _longitude_figure(study: SolarStudy, styles: Any) -> Any:
     )
 
 
-def _shown(study: SolarStudy) -> dict[str, MethodRun]:
+def _shown(study: SolarRuns) -> dict[str, MethodRun]:
     """Stoermer-Verlet and the method asked for, as in the paper, and the reference."""
     verlet = next(run for run in study.runs if run.name == "SV")
     shown = {"Störmer-Verlet": verlet, study.runs[0].name: study.runs[0]}
@@ -152,15 +152,15 @@ def _sample(run: MethodRun) -> np.ndarray:
     return np.unique(np.append((golden * run.t.size).astype(int), [0, run.t.size - 1]))
 
 
-def _outer_figure(study: SolarStudy, styles: Any) -> Any:
+def _outer_figure(study: SolarRuns, styles: Any) -> Any:
     return _orbits_figure(study, OUTER, "Outer planets and Pluto")
 
 
-def _inner_figure(study: SolarStudy, styles: Any) -> Any:
+def _inner_figure(study: SolarRuns, styles: Any) -> Any:
     return _orbits_figure(study, INNER, "Inner planets")
 
 
-def _orbits_figure(study: SolarStudy, which: slice, title: str) -> Any:
+def _orbits_figure(study: SolarRuns, which: slice, title: str) -> Any:
     scene = study.scene
     panels = {}
     for name, run in _shown(study).items():
@@ -174,7 +174,7 @@ def _orbits_figure(study: SolarStudy, which: slice, title: str) -> Any:
     )
 
 
-def _mercury_figure(study: SolarStudy, styles: Any) -> Any:
+def _mercury_figure(study: SolarRuns, styles: Any) -> Any:
     panels = {}
     for name, run in _shown(study).items():
         sample = _sample(run)
@@ -187,14 +187,14 @@ def _mercury_figure(study: SolarStudy, styles: Any) -> Any:
     )
 
 
-def _cost_figure(study: SolarStudy, styles: Any) -> Any:
+def _cost_figure(study: SolarRuns, styles: Any) -> Any:
     assert study.cost_scene is not None
-    return plotting.frontier_figure(
-        by_method(study.cost),
-        unit="AU",
+    return plotting.cost_figure(
+        panels(study.cost),
+        error="error of position [AU]",
         styles=styles,
         title=f"Error against cost: runs of {study.cost_scene.years:g} yr, {study.scene.data.name}",
-        footnote=f"{describe_machine()}; one thread, least of {REPEATS} timings, or one above {ENOUGH_SECONDS} s",
+        footnote=f"{describe_machine()}; one thread, least of {study.repeats} timings, or one above {ENOUGH_SECONDS} s",
     )
 
 

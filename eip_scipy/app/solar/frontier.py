@@ -1,12 +1,12 @@
-"""``eip-scipy solar-system --frontier``: error against cost of long runs at high accuracy, beside the peers at hand."""
+"""``eip-scipy solar-system frontier``: error against cost of long runs at high accuracy, beside the peers at hand."""
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,24 +15,15 @@ from ...core.solvers import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK4, EIPRKN8, EIPRKN
 from ...problems import Problem, solar_system
 from ...problems.gravity.solar_data import YEAR_D, load, reference_states
 from ...run.integrate import integrate
-from ..long_runs import named
-from ..report import (
-    UsageError,
-    check_outputs,
-    compact,
-    deliver,
-    describe_machine,
-    table,
-    warn,
-)
-from ..work_precision import Runner, cost_to_reach
-from .cost import MERCURY, TimedRun, by_method, timed
+from ..long_runs import named, positive
+from ..report import UsageError, compact, describe_machine, table
+from ..study import Figures, Rows, Session, Study, option
+from ..work_precision import Runner, costs_at, curves
+from .cost import MERCURY, TimedRun, panels, timed
 from .runs import KEPT, Peer, whole_number
 
-__all__ = ["measure", "methods", "run"]
+__all__ = ["Found", "Frontier", "methods"]
 
-DONE, INTERRUPTED = 0, 130
-YEARS, REPEATS = 1000.0, 3
 PATIENCE = 30.0  # a run of so many seconds is not repeated
 LEVELS = (1e-6, 1e-7, 1e-8, 1e-9)
 
@@ -83,27 +74,6 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
     return found
 
 
-def measure(
-    years: float, peer: Peer | None, heyoka: Peer | None, callback: Callable[[], Any] | None = None
-) -> list[TimedRun]:
-    """Run and time all methods.
-
-    Raises
-    ------
-    ValueError
-        When the package holds no reference state at `years`.
-    """
-    if years not in reference_states():
-        known = ", ".join(f"{t:g}" for t in reference_states())
-        raise ValueError(f"--frontier needs a stored reference state: --years must be one of {known}, got {years:g}")
-    problem = solar_system(years=years)
-    assert problem.reference is not None
-    truth = problem.reference(years)
-    assert truth is not None
-    found = methods(problem, years, peer, heyoka)
-    return timed(found, truth, repeats=REPEATS, enough_seconds=PATIENCE, callback=callback)
-
-
 def _dividing(years: float, wanted: Sequence[float]) -> list[float]:
     """Steps shortened to divide the span."""
     return [years / whole_number(years / h) for h in wanted]
@@ -144,41 +114,7 @@ def _setting(item: TimedRun) -> str:
     return f"tol {item.step:.0e}" if item.method.startswith("heyoka") else f"{item.step * YEAR_D:.4g} d"
 
 
-def text(runs: Sequence[TimedRun], years: float, machine: str) -> str:
-    """Lay out all runs, and what it costs to reach a level of error."""
-    others = np.delete(np.array(load("de440").bodies[1:]), MERCURY)
-    body = []
-    for item in runs:
-        rest = np.delete(item.errors, MERCURY)
-        worst = f"{compact(rest.max())} {others[rest.argmax()]}" if np.isfinite(rest).all() else compact(math.nan)
-        cells = [_setting(item), f"{item.wall_time:.3g}", compact(item.errors[MERCURY]), worst]
-        body.append((item.method, cells))
-    parts = [
-        f"Ten bodies, Newton, {years:g} years: errors of position [AU] and wall time, least of {REPEATS}, one core",
-        machine,
-        "",
-        table([["step", ""], ["wall", "[s]"], ["Mercury", "[AU]"], ["worst of the", "others [AU]"]], body),
-        "",
-        "Seconds for an error of Mercury's position:",
-        table([["error [AU]", compact(level, 1)] for level in LEVELS], _costs(runs)),
-        '"<": the cheapest run is more accurate; "-": no run is as accurate.',
-    ]
-    return "\n".join(parts)
-
-
-def _costs(runs: Sequence[TimedRun]) -> list[tuple[str, list[str]]]:
-    lines = []
-    for name in dict.fromkeys(item.method for item in runs):
-        own = [item for item in runs if item.method == name]
-        seconds, errors = [item.wall_time for item in own], [item.mercury for item in own]
-        cells = [
-            ("<" if errors[0] <= level else "") + compact(cost_to_reach(seconds, errors, level)) for level in LEVELS
-        ]
-        lines.append((name, cells))
-    return lines
-
-
-def rows(runs: Sequence[TimedRun]) -> list[dict[str, Any]]:
+def _rows(runs: Sequence[TimedRun]) -> Rows:
     """Make the lines of the CSV file."""
     planets = load("de440").bodies[1:]
     return [
@@ -192,64 +128,77 @@ def rows(runs: Sequence[TimedRun]) -> list[dict[str, Any]]:
     ]
 
 
-def run(args: argparse.Namespace, peer: Peer | None, heyoka: Peer | None) -> int:
-    """Run the command.
+class Found(NamedTuple):
+    """The runs, and the machine."""
 
-    Parameters
-    ----------
-    args : argparse.Namespace
-        With ``years``, ``out``, ``json`` (Path or None) and ``quiet``.
-    peer, heyoka : callable or None
-        ``run`` of `eip_scipy.integrations.rebound` and of `eip_scipy.integrations.heyoka`.
-
-    Returns
-    -------
-    int
-        Exit status: 0 done, 130 interrupted.
-
-    Raises
-    ------
-    UsageError
-        For a span or data without a reference state, or files that cannot be written.
-    """
-    from tqdm import tqdm
-
-    args.years = YEARS if args.years is None else args.years
-    if args.data not in (None, "de440") or args.epoch is not None:
-        raise UsageError(f"--frontier has reference states for --data de440 only, got {args.data or args.epoch!r}")
-    check_outputs(args.out, args.json)
-    points = sum(len(steps) for _, steps in methods(solar_system(years=1.0), 1.0, peer, heyoka).values())
-    try:
-        with tqdm(total=REPEATS * points, desc="frontier", unit="run", disable=args.quiet, leave=False) as bar:
-            runs = measure(args.years, peer, heyoka, bar.update)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
-    except KeyboardInterrupt:
-        warn("interrupted; nothing was written")
-        return INTERRUPTED
-    machine = describe_machine()
-    found = rows(runs)
-    deliver(
-        args,
-        "solar-system --frontier",
-        text(runs, args.years, machine),
-        {"frontier.csv": found},
-        _figures(runs, args.years, machine),
-        {"years": args.years},
-        runs=found,
-    )
-    return DONE
+    runs: list[TimedRun]
+    machine: str
 
 
-def _figures(runs: Sequence[TimedRun], years: float, machine: str) -> Iterator[Any]:
-    from ...plotting import frontier_figure
+@dataclass(frozen=True, kw_only=True)
+class Frontier(Study[Found]):
+    """The command."""
 
-    yield (
-        "frontier.png",
-        frontier_figure(
-            by_method(runs),
-            unit="AU",
-            title=f"Ten bodies, Newton, {years:g} years: error of position against cost",
-            footnote=f"{machine}; one thread, least of {REPEATS}",
-        ),
-    )
+    years: float = option(1000.0, "length in Julian years: 1, 10, 100, 1000 or 2000 (%(default)g)", type=positive)
+    repeats: int = 3
+
+    def check_settings(self) -> None:
+        """See that there is a state to compare with."""
+        if self.years not in reference_states():
+            known = ", ".join(f"{t:g}" for t in reference_states())
+            raise UsageError(f"there is no stored reference state: --years must be one of {known}, got {self.years:g}")
+
+    def measure(self, session: Session) -> Found:
+        peers = session.peer("rebound", "WHFast and IAS15"), session.peer("heyoka", "heyoka")
+        peer, heyoka = (None if found is None else found.run for found in peers)
+        problem = solar_system(years=self.years)
+        assert problem.reference is not None
+        truth = problem.reference(self.years)
+        assert truth is not None
+        chosen = methods(problem, self.years, peer, heyoka)
+        total = self.repeats * sum(len(steps) for _, steps in chosen.values())
+        with session.bar(total, "frontier") as bar:
+            runs = timed(chosen, truth, repeats=self.repeats, enough_seconds=PATIENCE, callback=bar.update)
+        return Found(runs, describe_machine())
+
+    def text(self, found: Found) -> str:
+        others = np.delete(np.array(load("de440").bodies[1:]), MERCURY)
+        body = []
+        for item in found.runs:
+            rest = np.delete(item.errors, MERCURY)
+            worst = f"{compact(rest.max())} {others[rest.argmax()]}" if np.isfinite(rest).all() else compact(math.nan)
+            cells = [_setting(item), f"{item.wall_time:.3g}", compact(item.errors[MERCURY]), worst]
+            body.append((item.method, cells))
+        what = "errors of position [AU] and wall time"
+        costs = [(name, costs_at(curve, LEVELS)) for name, curve in curves(found.runs, error="mercury").items()]
+        parts = [
+            f"Ten bodies, Newton, {self.years:g} years: {what}, least of {self.repeats}, one core",
+            found.machine,
+            "",
+            table([["step", ""], ["wall", "[s]"], ["Mercury", "[AU]"], ["worst of the", "others [AU]"]], body),
+            "",
+            "Seconds for an error of Mercury's position:",
+            table([["error [AU]", compact(level, 1)] for level in LEVELS], costs),
+            '"<": the cheapest run is more accurate; "-": no run is as accurate.',
+        ]
+        return "\n".join(parts)
+
+    def tables(self, found: Found) -> dict[str, Rows]:
+        return {"frontier.csv": _rows(found.runs)}
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        return {"runs": _rows(found.runs)}
+
+    def figures(self, found: Found) -> Figures:
+        """Mercury's error and that of the others, against time."""
+        from ...plotting import cost_figure
+
+        yield (
+            "frontier.png",
+            cost_figure(
+                panels(found.runs),
+                error="error of position [AU]",
+                title=f"Ten bodies, Newton, {self.years:g} years: error of position against cost",
+                footnote=f"{found.machine}; one thread, least of {self.repeats}",
+            ),
+        )

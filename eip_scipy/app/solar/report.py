@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Sequence
 from textwrap import fill
@@ -11,22 +10,24 @@ from typing import Any
 import numpy as np
 
 from ...problems.gravity.solar_data import YEAR_D
-from ..report import compact, document, table
-from .errors import PointErrors, SolarStudy
+from ..report import compact, table
+from .errors import PointErrors, SolarRuns
 from .runs import HIGH_ORDER, MULTISTEP, TIGHT, MethodRun, report_times
 
 __all__ = ["cost_rows", "csv_rows", "json_content", "text"]
 
 
-def text(study: SolarStudy, args: argparse.Namespace) -> str:
+def text(study: SolarRuns, settings: Any) -> str:
     """Lay out the head, the table, the notes and the checks, 90 columns for the usual names."""
-    parts = [_head(study, args), _table(study), _notes(study), *_check_lines(study)]
+    parts = [_head(study, settings), _table(study), _notes(study), *_check_lines(study)]
     return "\n".join(["", *parts])
 
 
-def _head(study: SolarStudy, args: argparse.Namespace) -> str:
+def _head(study: SolarRuns, settings: Any) -> str:
     scene = study.scene
-    asked = "" if math.isclose(scene.h, args.h, rel_tol=1e-12) else f", shortened from {args.h:g} to divide the run"
+    asked = (
+        "" if math.isclose(scene.h, settings.h, rel_tol=1e-12) else f", shortened from {settings.h:g} to divide the run"
+    )
     return "\n".join(
         [
             f"Solar system, {scene.years:g} yr from {scene.data.epoch}, initial data {scene.data.name!r}",
@@ -37,7 +38,7 @@ def _head(study: SolarStudy, args: argparse.Namespace) -> str:
     )
 
 
-def _reference_line(study: SolarStudy) -> str:
+def _reference_line(study: SolarRuns) -> str:
     sources = {errors.reference for errors in study.errors(study.scene.years).values()}
     if not sources:
         return "No reference: the runs did not get to the end."
@@ -47,7 +48,7 @@ def _reference_line(study: SolarStudy) -> str:
     return f"Reference: the tightest run at hand, {sources.pop()}"
 
 
-def _table(study: SolarStudy) -> str:
+def _table(study: SolarRuns) -> str:
     end = study.errors(study.scene.years)
     rows: list[tuple[str, Sequence[str]]] = [
         ("step [d]", [_step(run) for run in study.runs]),
@@ -66,7 +67,7 @@ def _step(run: MethodRun) -> str:
     return "adaptive" if run.step is None else f"{run.step * YEAR_D:.4g}"
 
 
-def _cell(study: SolarStudy, run: MethodRun, errors: PointErrors | None, quantity: str, k: int) -> str:
+def _cell(study: SolarRuns, run: MethodRun, errors: PointErrors | None, quantity: str, k: int) -> str:
     if errors is None:
         return "failed" if run.failure else "ref." if run is study.tight else "-"
     value = float(getattr(errors, quantity)[k])
@@ -78,7 +79,7 @@ def _counts(tight: MethodRun | None) -> bool:
     return tight is not None and not tight.failure
 
 
-def _notes(study: SolarStudy) -> str:
+def _notes(study: SolarRuns) -> str:
     shown = {run.name for run in study.runs}
     notes = [
         "dH, dL: largest along the saved states.",
@@ -100,11 +101,11 @@ def _notes(study: SolarStudy) -> str:
     return "\n".join(["", fill(" ".join(filter(None, notes)), 79, break_on_hyphens=False), *failures])
 
 
-def _check_lines(study: SolarStudy) -> list[str]:
-    return ["", *(f"{'ok    ' if check.passed else 'FAILED'} {check.text}" for check in study.checks())]
+def _check_lines(study: SolarRuns) -> list[str]:
+    return ["", *(check.line for check in study.checks())]
 
 
-def cost_rows(study: SolarStudy) -> list[dict[str, Any]]:
+def cost_rows(study: SolarRuns) -> list[dict[str, Any]]:
     """Make a row for each method and step that was timed."""
     if study.cost_scene is None:
         return []
@@ -121,7 +122,7 @@ def cost_rows(study: SolarStudy) -> list[dict[str, Any]]:
     ]
 
 
-def csv_rows(study: SolarStudy) -> list[dict[str, Any]]:
+def csv_rows(study: SolarRuns) -> list[dict[str, Any]]:
     """Make a row for each method and time with a reference, all planets in it."""
     rows = []
     planets = study.scene.planets
@@ -147,15 +148,8 @@ def csv_rows(study: SolarStudy) -> list[dict[str, Any]]:
     return rows
 
 
-def _arguments(study: SolarStudy, args: argparse.Namespace) -> dict[str, Any]:
-    known = {key: getattr(args, key) for key in ("years", "h", "method", "metric")}
-    if args.epoch is None:
-        return {**known, "data": study.scene.data.name}
-    return {**known, "epoch": args.epoch, "kernel": args.kernel}
-
-
-def json_content(study: SolarStudy, args: argparse.Namespace) -> dict[str, Any]:
-    """Collect all numbers, for `write_json`."""
+def json_content(study: SolarRuns) -> dict[str, Any]:
+    """Collect all numbers."""
     scene = study.scene
     times = {year: study.errors(year) for year in report_times(scene)}
     methods = [
@@ -179,17 +173,15 @@ def json_content(study: SolarStudy, args: argparse.Namespace) -> dict[str, Any]:
         }
         for run in study.runs
     ]
-    return document(
-        "solar-system",
-        _arguments(study, args),
-        step_yr=scene.h,
-        data={"epoch": scene.data.epoch, "axes": scene.data.axes, "source": scene.data.source},
-        methods=methods,
-        ran_beside_the_others=study.beside or None,
-        error_against_cost={
+    return {
+        "step_yr": scene.h,
+        "data": {"epoch": scene.data.epoch, "axes": scene.data.axes, "source": scene.data.source},
+        "methods": methods,
+        "ran_beside_the_others": study.beside or None,
+        "error_against_cost": {
             "error": "Mercury's position [AU]",
             "error_others": "largest error of another planet's position [AU]",
             "points": cost_rows(study),
         },
-        checks=[check._asdict() for check in study.checks()],
-    )
+        "checks": [check._asdict() for check in study.checks()],
+    }

@@ -1,227 +1,159 @@
-"""``eip-scipy solar-system``: the paper's Experiment II as a table, figures and files; options and order of events."""
+"""``eip-scipy solar-system``: the paper's Experiment II as a table, figures and files; settings and order of events."""
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from ...checkpoint import CheckpointError
-from ...core import solvers
 from ...ensembles.chunks import cores
-from .. import long_runs
+from ...problems.gravity.solar_data import SolarSystemData, available, load
 from ..beside import Beside
-from ..long_runs import positive
-from ..report import UsageError, check_outputs, say, warn, write_csv, write_file, write_json
-from . import epoch as solar_epoch
-from . import truth as solar_truth
-from .cost import REPEATS, cost, cost_methods
-from .errors import SolarStudy
-from .report import cost_rows, csv_rows, json_content, text
+from ..listing import METRICS, fixed_step_methods
+from ..long_runs import Checkpoints, positive
+from ..report import UsageError
+from ..study import Check, Figures, PartlyDone, Rows, Session, Study, option
+from . import report
+from .cost import cost, cost_methods
+from .epoch import AnyEpoch, kernels, one_line
+from .errors import SolarRuns
 from .runs import MethodRun, Peer, make_scene, plan
 
-__all__ = ["add_arguments", "fixed_step_methods", "run"]
+__all__ = ["Found", "SolarSystem"]
 
-YEARS, STEP = 2000.0, 0.002
-METRICS = ("error", "euclidean")
+DATA = "de440"
+TEN_BODIES = [name for name in available() if len(load(name).bodies) == 10]  # what the tables and figures are made for
 COST_YEARS = 100.0
-BESIDE_YEARS = 200.0  # in shorter runs a second process would cost what it saves
 BESIDE_FIGURES, OWN_FIGURES = slice(None, 4), slice(4, None)  # they take as long as the timings and the others
-DONE, CHECK_FAILED, INTERRUPTED = 0, 1, 130
 
 
-def fixed_step_methods() -> dict[str, type[solvers.EIPSolver]]:
-    """Find the solver classes that a user names: those with a tableau."""
-    found = {name: getattr(solvers, name) for name in solvers.__all__}
-    return {
-        name: value
-        for name, value in found.items()
-        if isinstance(value, type) and issubclass(value, solvers.EIPSolver) and hasattr(value, "TABLEAU")
-    }
+class Found(NamedTuple):
+    """The runs, REBOUND if it is there, and the process that did the longest run beside the others, and draws."""
+
+    runs: SolarRuns
+    peer: Peer | None
+    beside: Beside | None
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of ``solar-system``."""
-    parser.add_argument(
-        "--years",
-        type=_span,
-        help=f"length in Julian years ({YEARS:g}; with --truth {solar_truth.YEARS:g}, negative to go back)",
-    )
-    parser.add_argument(
-        "--h",
-        type=positive,
-        help=f"step in years, shortened to divide the run ({STEP:g}; with --truth {solar_truth.STEP:g})",
-    )
-    parser.add_argument(
-        "--method", choices=list(fixed_step_methods()), default="EIPRK4", help="the method to show (%(default)s)"
-    )
-    parser.add_argument("--metric", choices=METRICS, default="error", help="its metric (%(default)s)")
-    parser.add_argument(
-        "--frontier",
-        action="store_true",
-        help="error against cost of high-order methods and their peers instead; --years 1, 10, 100, 1000 or 2000",
-    )
-    long_runs.add_arguments(parser, "the runs that this package does")
-    solar_epoch.add_arguments(parser)
-    solar_truth.add_arguments(parser)
+@dataclass(frozen=True, kw_only=True)
+class SolarSystem(Checkpoints, AnyEpoch, Study[Found]):
+    """The command.
 
-
-def _span(text: str) -> float:
-    return -positive(text[1:]) if text.startswith("-") else positive(text)
-
-
-def run(args: argparse.Namespace, peer: Peer | None, ephemeris: solar_epoch.Ephemeris | None = None) -> int:
-    """Run the command.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Options of `add_arguments`, and ``out``, ``json`` (Path or None) and ``quiet``.
-    peer : callable or None
-        `eip_scipy.integrations.rebound.run`, None without REBOUND.
-    ephemeris : callable, optional
-        `eip_scipy.integrations.jpl.initial_data`, for ``--epoch``.
-
-    Returns
-    -------
-    int
-        Exit status: 0 done, 1 a check failed, 130 interrupted.
-
-    Raises
-    ------
-    UsageError
-        For arguments or files that cannot be used.
+    The longest run is done by a second process, from `beside_years` on: in shorter runs that costs what it saves.
     """
-    args.years = YEARS if args.years is None else args.years
-    args.h = STEP if args.h is None else args.h
-    if args.years < 0:
-        raise UsageError(f"--years: expected a positive number, got '{args.years:g}'; only --truth goes back in time")
-    if args.forces:
-        raise UsageError("--forces goes with --truth; without it, methods are compared under Newton's gravitation")
-    long_runs.check(args)
-    data = solar_epoch.initial_data(args, ephemeris)
-    try:
-        study = SolarStudy(make_scene(data, args.years, args.h), fixed_step_methods()[args.method].TABLEAU.order)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
-    check_outputs(args.out, args.json)
-    if peer is None or args.years < BESIDE_YEARS or cores() < 2:
-        return _compare(study, args, peer, None)
-    with Beside() as beside:
-        return _compare(study, args, peer, beside)
 
+    years: float = option(2000.0, "length in Julian years (%(default)g)", type=positive)
+    h: float = option(0.002, "step in years, shortened to divide the run (%(default)s)", type=positive)
+    method: str = option("EIPRK4", "the method to show (%(default)s)", choices=list(fixed_step_methods()))
+    metric: str = option("error", "its metric (%(default)s)", choices=METRICS)
+    data: str | None = option(None, f"initial data that the package carries ({DATA})", choices=TEN_BODIES)
+    repeats: int = 3
+    beside_years: float = 200.0
+    timed_methods: Callable[..., Mapping[str, Any]] = cost_methods
 
-def _compare(study: SolarStudy, args: argparse.Namespace, peer: Peer | None, beside: Beside | None) -> int:
-    """The command in its order: runs, table, timings, figures; `beside` takes the longest run, and then figures."""
-    interrupted = _integrate(study, args, peer, beside)
-    if interrupted:
-        long_runs.tell_how_to_resume(args)
-    if not study.runs:
-        warn("interrupted; no run was done")
-        return INTERRUPTED
-    if not args.quiet:
-        say(text(study, args))
-    status = DONE if all(check.passed for check in study.checks()) else CHECK_FAILED
-    _write_numbers(study, args)
-    if interrupted:
-        warn("interrupted; the runs that were done are in the table and the files")
-        return INTERRUPTED
-    try:
-        if beside is not None:
-            beside.start(partial(images, study, BESIDE_FIGURES))
-        _time_methods(study, args, peer)
-        _write_numbers(study, args)
-    except KeyboardInterrupt:
-        warn("interrupted; the table is complete, error against cost and the figures are missing")
-        return INTERRUPTED
-    _write_figures(study, args, beside)
-    return status
+    def check_settings(self) -> None:
+        if self.data is not None and self.epoch is not None:
+            raise UsageError("argument --epoch: not allowed with argument --data")
+        if self.kernel is not None and self.epoch is None:
+            raise UsageError("--kernel goes with --epoch, which says where in the kernel to start")
+        super().check_settings()
 
+    def arguments(self) -> dict[str, Any]:
+        known = {key: getattr(self, key) for key in ("years", "h", "method", "metric")}
+        start = {"data": self.data or DATA} if self.epoch is None else {"epoch": self.epoch, "kernel": self.kernel}
+        return known | start
 
-def _integrate(study: SolarStudy, args: argparse.Namespace, peer: Peer | None, beside: Beside | None) -> bool:
-    """Do the runs, the last of them beside the others if it may; True if the user interrupted them."""
-    tasks = plan(
-        study.scene, fixed_step_methods()[args.method], args.metric, peer, partial(long_runs.checkpoint_options, args)
-    )
-    starts: list[Callable[[], MethodRun]] = [partial(task.start, not args.quiet) for task in tasks]
-    try:
+    def measure(self, session: Session) -> Found:
+        """Do the runs; what the user interrupts leaves those that were done."""
+        method = fixed_step_methods()[self.method]
+        with one_line():
+            runs = SolarRuns(make_scene(self._start(), self.years, self.h), method.TABLEAU.order, repeats=self.repeats)
+        rebound = session.peer("rebound", "WHFast and IAS15")
+        peer = None if rebound is None else rebound.run
+        alone = peer is None or self.years < self.beside_years or cores() < 2
+        beside = None if alone else session.open.enter_context(Beside())
+        try:
+            self._integrate(runs, session, peer, beside)
+        except KeyboardInterrupt:
+            if not runs.runs:
+                raise
+            raise PartlyDone(Found(runs, peer, beside)) from None
+        return Found(runs, peer, beside)
+
+    def _start(self) -> SolarSystemData:
+        if self.epoch is None:
+            return load(self.data or DATA)
+        data: SolarSystemData = kernels().initial_data(self.epoch, self.kernel)
+        return data
+
+    def _integrate(self, runs: SolarRuns, session: Session, peer: Peer | None, beside: Beside | None) -> None:
+        """Do the runs, the last of them beside the others if it may."""
+        method = fixed_step_methods()[self.method]
+        tasks = plan(runs.scene, method, self.metric, peer, self.checkpoint_options)
+        starts: list[Callable[[], MethodRun]] = [partial(task.start, session.shown) for task in tasks]
         if beside is not None:
             beside.start(partial(tasks[-1].start, False))
-            starts[-1], study.beside = beside.result, tasks[-1].name
+            starts[-1], runs.beside = beside.result, tasks[-1].name
         for task, start in zip(tasks, starts, strict=True):
-            with _waiting(task.name, shown=not (args.quiet or task.has_bar)):
-                study.runs.append(start())
-        study.tight = study.runs[-1]
-    except KeyboardInterrupt:
+            if task.has_bar:
+                runs.runs.append(start())
+            else:  # what runs, and for how long
+                with session.bar(1, task.name, bar_format="{desc}: {elapsed}", leave=True) as bar:
+                    runs.runs.append(start())
+                    bar.update()
+        runs.tight = runs.runs[-1]
+
+    def refine(self, found: Found, session: Session) -> bool:
+        """Time several methods and steps, while the second process draws."""
+        runs = found.runs
+        if found.beside is not None:
+            found.beside.start(partial(images, runs, BESIDE_FIGURES))
+        years = min(self.years, COST_YEARS)
+        scene = runs.scene if years == self.years else make_scene(runs.scene.data, years, min(self.h, years))
+        methods = self.timed_methods(scene, fixed_step_methods()[self.method], self.metric, found.peer)
+        total = self.repeats * sum(len(steps) for _, steps in methods.values())
+        with session.bar(total, "error against cost", leave=True) as bar:
+            runs.cost = cost(scene, methods, found.peer, repeats=self.repeats, callback=bar.update)
+        runs.cost_scene = scene
         return True
-    except (MemoryError, CheckpointError) as error:
-        raise long_runs.unusable(error) from error
-    return False
+
+    def text(self, found: Found) -> str:
+        return report.text(found.runs, self)
+
+    def checks(self, found: Found) -> list[Check]:
+        """Of the method, and of the run that others are compared with."""
+        return found.runs.checks()
+
+    def tables(self, found: Found) -> dict[str, Rows]:
+        timed = {"error-against-cost.csv": report.cost_rows(found.runs)} if found.runs.cost else {}
+        return {"solar-system.csv": report.csv_rows(found.runs), **timed}
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        return report.json_content(found.runs)
+
+    def figures(self, found: Found) -> Figures:
+        """Those of the second process, and the others."""
+        drawn = images(found.runs, slice(None) if found.beside is None else OWN_FIGURES)
+        if found.beside is not None:
+            drawn = found.beside.result() | drawn
+        for name, image in drawn.items():
+            yield name, partial(_write, image)
 
 
-@contextlib.contextmanager
-def _waiting(label: str, *, shown: bool) -> Iterator[None]:
-    """Show what runs, and for how long, where there is no progress to be had."""
-    from tqdm import tqdm
-
-    with tqdm(total=1, desc=label, bar_format="{desc}: {elapsed}", disable=not shown) as bar:
-        yield
-        bar.update()
-
-
-def _time_methods(study: SolarStudy, args: argparse.Namespace, peer: Peer | None) -> None:
-    from tqdm import tqdm
-
-    years = min(study.scene.years, COST_YEARS)
-    scene = study.scene if years == study.scene.years else make_scene(study.scene.data, years, min(args.h, years))
-    methods = cost_methods(scene, fixed_step_methods()[args.method], args.metric, peer)
-    total = REPEATS * sum(len(steps) for _, steps in methods.values())
-    with tqdm(total=total, desc="error against cost", unit="run", disable=args.quiet) as bar:
-        study.cost = cost(scene, methods, peer, bar.update)
-    study.cost_scene = scene
-
-
-def _write_numbers(study: SolarStudy, args: argparse.Namespace) -> None:
-    """Write what is known; a second time when the timings are there, too."""
-    again = bool(study.cost)
-    _say(args, write_csv(args.out / "solar-system.csv", csv_rows(study)), again=again)
-    if study.cost:
-        _say(args, write_csv(args.out / "error-against-cost.csv", cost_rows(study)))
-    if args.json is not None:
-        _say(args, write_json(args.json, json_content(study, args)), again=again)
-
-
-def images(study: SolarStudy, part: slice) -> dict[str, bytes]:
+def images(runs: SolarRuns, part: slice) -> dict[str, bytes]:
     """Some of the figures as PNG files, by their names."""
     from .figures import figures
 
     found = {}
-    for name, figure in figures(study, part):
+    for name, figure in figures(runs, part):
         stream = io.BytesIO()
         figure.savefig(stream, format="png")
         found[name] = stream.getvalue()
     return found
 
 
-def _write_figures(study: SolarStudy, args: argparse.Namespace, beside: Beside | None) -> None:
-    try:
-        drawn = images(study, slice(None) if beside is None else OWN_FIGURES)
-        if beside is not None:
-            drawn = beside.result() | drawn
-    except ImportError as error:
-        warn(f"no figures: {error}")
-        return
-    for name, image in drawn.items():
-        _say(args, write_file(args.out / name, partial(_write, image)))
-
-
 def _write(image: bytes, path: Path) -> None:
     path.write_bytes(image)
-
-
-def _say(args: argparse.Namespace, path: Path, *, again: bool = False) -> None:
-    if not (args.quiet or again):
-        say(f"wrote {path}")

@@ -1,49 +1,37 @@
-"""``eip-scipy solar-system --truth``: what each force is worth, measured against the ephemeris DE440 itself."""
+"""``eip-scipy solar-system truth``: what each force is worth, measured against the ephemeris DE440 itself."""
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.names import nearest
 from ...core.solvers import EIPDOP853
 from ...problems import SolarSystemData, solar_system
 from ...problems.gravity.forces import FORCES, check_forces
 from ...problems.gravity.solar_data import AU_KM, YEAR_D
 from ...run.integrate import integrate
-from ..report import (
-    UsageError,
-    check_outputs,
-    compact,
-    deliver,
-    table,
-    warn,
-)
+from ..long_runs import named, positive
+from ..report import UsageError, compact, table, warn
+from ..study import Check, Figures, PartlyDone, Rows, Session, Study, one_of, option
+from .epoch import AnyEpoch, kernels, one_line
 from .runs import whole_number
 
-__all__ = ["Ephemeris", "Model", "ModelRun", "add_arguments", "errors", "models", "run", "run_model"]
+__all__ = ["Found", "Model", "ModelRun", "Truth", "errors", "models", "run_model"]
 
 PAPER_EPOCH = (2456690.5, 20.3 / 24)
-YEARS, STEP = 100.0, 0.001
+STEP = 0.001
 MOON = "moon"  # no force but a body, chosen beside the forces
+KNOWN = (*FORCES, MOON)
 STANDARD = ((), ("1pn",), ("1pn", "moon-quadrupole"), ("1pn", MOON), ("1pn", "j2", MOON))
 REPORTED = (1.0, 10.0, 100.0)
 PANELS = ("Mercury", "EMB", "Mars", "Jupiter")
 ARCSEC = math.degrees(1.0) * 3600
 # The step may add this share of an error, and this many km, which no model here reaches.
 STEP_SHARE, STEP_KM = 0.01, 1e-3
-DONE, CHECK_FAILED, INTERRUPTED = 0, 1, 130
-
-
-class Ephemeris(NamedTuple):
-    """What is asked of a kernel: functions of `eip_scipy.integrations.jpl`."""
-
-    initial_data: Callable[..., SolarSystemData]
-    heliocentric: Callable[..., dict[str, np.ndarray]]
 
 
 class Model(NamedTuple):
@@ -69,28 +57,6 @@ class ModelRun(NamedTuple):
     """Change of the final position when the step is halved."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add ``--truth`` and ``--forces``."""
-    parser.add_argument(
-        "--truth", action="store_true", help="compare force models with DE440 itself instead of methods with each other"
-    )
-    parser.add_argument(
-        "--forces",
-        type=_force,
-        nargs="+",
-        metavar="FORCE",
-        help=f"with --truth: one model in place of the standard ones, of {', '.join([*FORCES, MOON])}",
-    )
-
-
-def _force(text: str) -> str:
-    known = [*FORCES, MOON]
-    if text in known:
-        return text
-    hint = nearest(text.lower(), known, cutoff=0.4)
-    raise argparse.ArgumentTypeError(f"unknown force {text!r}; known: {', '.join(known)}{hint}")
-
-
 def models(forces: Sequence[str] | None) -> list[Model]:
     """The models to be compared: Newton and the one asked for, or the standard ones.
 
@@ -102,57 +68,6 @@ def models(forces: Sequence[str] | None) -> list[Model]:
     asked = STANDARD if forces is None else ((), tuple(forces))
     found = [Model(check_forces(name for name in names if name != MOON), MOON in names) for names in asked]
     return list(dict.fromkeys(found))
-
-
-def run(args: argparse.Namespace, ephemeris: Ephemeris) -> int:
-    """Run the command.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Options of ``solar-system``, of which it takes ``years``, ``h``, ``forces``, ``epoch``, ``kernel``, ``out``,
-        ``json`` and ``quiet``.
-    ephemeris : Ephemeris
-
-    Returns
-    -------
-    int
-        Exit status: 0 done, 1 a check failed, 130 interrupted.
-
-    Raises
-    ------
-    UsageError
-        For arguments, a kernel or files that cannot be used.
-    """
-    years = YEARS if args.years is None else args.years
-    h = min(STEP, abs(years)) if args.h is None else args.h
-    if args.data is not None:
-        raise UsageError("--truth starts from the ephemeris itself: leave --data out, or choose an --epoch")
-    epoch, kernel = args.epoch or PAPER_EPOCH, args.kernel
-    try:
-        chosen = models(args.forces)
-        times, every, step = save_times(years, h)
-        truth = ephemeris.heliocentric(epoch, times * YEAR_D, kernel)
-        data = {moon: ephemeris.initial_data(epoch, kernel, moon=moon) for moon in {m.moon for m in chosen}}
-        for model in chosen:  # what cannot be combined is said before anything runs
-            solar_system(data[model.moon], forces=model.forces)
-    except (ImportError, OSError, ValueError) as error:
-        raise UsageError(" ".join(str(error).split())) from error
-    check_outputs(args.out, args.json)
-    runs: list[ModelRun] = []
-    try:
-        for model in chosen:
-            runs.append(run_model(model, data[model.moon], times, every, step, truth, progress=not args.quiet))
-    except KeyboardInterrupt:
-        warn("interrupted; the models that were done are in the table and the files")
-    if not runs:
-        return INTERRUPTED
-    start = next(iter(data.values())).epoch
-    failed = _failures(runs)
-    _report(args, runs, start, step, failed)
-    if len(runs) < len(chosen):
-        return INTERRUPTED
-    return CHECK_FAILED if failed else DONE
 
 
 def save_times(years: float, h: float) -> tuple[np.ndarray, int, float]:
@@ -214,7 +129,7 @@ def _positions(
 ) -> dict[str, np.ndarray]:
     """Heliocentric positions in km, as the ephemeris gives them."""
     problem = solar_system(data, years=float(times[-1]), h=step, forces=model.forces)
-    method = type(model.name, (EIPDOP853,), {"__doc__": EIPDOP853.__doc__})  # names the progress bar
+    method = named(EIPDOP853, model.name)
     result = integrate(problem, method=method, save_every=every, every="auto", compensated=True, progress=progress)
     if not result.success:
         raise UsageError(f"{model.name} with h = {step:g} yr: {result.message}")
@@ -239,24 +154,112 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def _failures(runs: Sequence[ModelRun]) -> list[str]:
-    """What the step adds to an error where it is more than a small share of it."""
-    return [
-        f"{run.model.name}: halving the step moves {body} by {moved:.2g} km, its error is {run.km[body][-1]:.2g} km; "
-        "take a smaller --h"
-        for run in runs
-        for body, moved in run.step_km.items()
-        if not moved <= STEP_KM + STEP_SHARE * run.km[body][-1]
-    ]
+class Found(NamedTuple):
+    """The models' runs, the start in words, and the step in years."""
+
+    runs: list[ModelRun]
+    start: str
+    step: float
 
 
-def _report(args: argparse.Namespace, runs: Sequence[ModelRun], start: str, step: float, failed: list[str]) -> None:
-    for failure in failed:
-        warn(failure)
-    arguments = {"years": args.years, "h": args.h, "forces": args.forces}
-    content: dict[str, Any] = {"epoch": start, "step_yr": step, "errors": table_rows(runs), "failed": failed}
-    tables = {"solar-truth.csv": csv_rows(runs)}
-    deliver(args, "solar-system --truth", text(runs, start, step), tables, _figures(runs, start), arguments, **content)
+def _span(text: str) -> float:
+    return -positive(text[1:]) if text.startswith("-") else positive(text)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth(AnyEpoch, Study[Found]):
+    """The command."""
+
+    years: float = option(100.0, "length in Julian years, negative to go back (%(default)g)", type=_span)
+    h: float | None = option(None, f"step in years, shortened to divide the run ({STEP:g})", type=positive)
+    forces: Sequence[str] | None = option(
+        None,
+        f"one model in place of the standard ones, of {', '.join(KNOWN)}",
+        type=one_of("force", KNOWN),
+        nargs="+",
+        metavar="FORCE",
+    )
+
+    def arguments(self) -> dict[str, Any]:
+        """What the runs depend on, beside the epoch."""
+        return {"years": self.years, "h": self.h, "forces": self.forces}
+
+    def measure(self, session: Session) -> Found:
+        """Run the models; what the user interrupts leaves those that were done."""
+        h = min(STEP, abs(self.years)) if self.h is None else self.h
+        epoch, jpl = self.epoch or PAPER_EPOCH, kernels()
+        with one_line():
+            chosen = models(self.forces)
+            times, every, step = save_times(self.years, h)
+            truth = jpl.heliocentric(epoch, times * YEAR_D, self.kernel)
+            data = {moon: jpl.initial_data(epoch, self.kernel, moon=moon) for moon in {m.moon for m in chosen}}
+            for model in chosen:  # what cannot be combined is said before anything runs
+                solar_system(data[model.moon], forces=model.forces)
+        found = Found([], next(iter(data.values())).epoch, step)
+        try:
+            for model in chosen:
+                own = data[model.moon]
+                found.runs.append(run_model(model, own, times, every, step, truth, progress=session.shown))
+        except KeyboardInterrupt:
+            if not found.runs:
+                raise
+            raise PartlyDone(found) from None
+        for check in self.checks(found):
+            if not check.passed:
+                warn(check.text)
+        return found
+
+    def checks(self, found: Found) -> list[Check]:
+        """What the step adds to an error must be a small share of it."""
+        return [
+            Check(
+                f"{run.model.name}: halving the step moves {body} by {moved:.2g} km, "
+                f"its error is {run.km[body][-1]:.2g} km; take a smaller --h",
+                moved <= STEP_KM + STEP_SHARE * float(run.km[body][-1]),
+            )
+            for run in found.runs
+            for body, moved in run.step_km.items()
+        ]
+
+    def text(self, found: Found) -> str:
+        runs = found.runs
+        bodies, years = list(runs[0].km), runs[0].years
+        lines: list[tuple[str, Sequence[str]]] = []
+        for place in reported(years):
+            for unit in ("km", "arcsec"):
+                lines.append((f"{years[place]:g} yr: error in {unit}", ()))
+                for run in runs:
+                    errors = run.km if unit == "km" else run.arcsec
+                    lines.append((f"  {run.model.name}", [compact(float(errors[body][place])) for body in bodies]))
+        lines.append(("end: change in km when the step is halved", ()))
+        lines += [(f"  {run.model.name}", [compact(run.step_km[body]) for body in bodies]) for run in runs]
+        head = (
+            f"Force models against DE440, {years[-1]:g} yr from {found.start}, EIPDOP853 with h = {found.step:.6g} yr\n"
+            "heliocentric positions; EMB: the mass-weighted mean of Earth and Moon\n\n"
+        )
+        return head + table([[body] for body in bodies], lines)
+
+    def tables(self, found: Found) -> dict[str, Rows]:
+        return {"solar-truth.csv": csv_rows(found.runs)}
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        failed = [check.text for check in self.checks(found) if not check.passed]
+        return {"epoch": found.start, "step_yr": found.step, "errors": table_rows(found.runs), "failed": failed}
+
+    def figures(self, found: Found) -> Figures:
+        from ...plotting import longitude_figure
+
+        runs = found.runs
+        direction = "after" if runs[0].years[-1] > 0 else "before"
+        figure = longitude_figure(
+            np.abs(runs[0].years),
+            {run.model.name: np.array([run.km[body] for body in PANELS]) for run in runs},
+            PANELS,
+            time=f"years {direction} {found.start[:10]}",
+            error="error against DE440 [km]",
+            title="What each force is worth",
+        )
+        yield "solar-truth.png", figure
 
 
 def reported(years: np.ndarray) -> list[int]:
@@ -264,24 +267,6 @@ def reported(years: np.ndarray) -> list[int]:
     span = np.abs(years)
     inside = [int(np.argmin(np.abs(span - year))) for year in REPORTED if year < span[-1] * (1 - 1e-9)]
     return [*inside, years.size - 1]
-
-
-def text(runs: Sequence[ModelRun], start: str, step: float) -> str:
-    """The table: for each time the error of each planet in km and arcsec."""
-    bodies, years = list(runs[0].km), runs[0].years
-    lines: list[tuple[str, Sequence[str]]] = []
-    for place in reported(years):
-        for unit in ("km", "arcsec"):
-            lines.append((f"{years[place]:g} yr: error in {unit}", ()))
-            for run in runs:
-                found = run.km if unit == "km" else run.arcsec
-                lines.append((f"  {run.model.name}", [compact(float(found[body][place])) for body in bodies]))
-    lines.append(("end: change in km when the step is halved", ()))
-    lines += [(f"  {run.model.name}", [compact(run.step_km[body]) for body in bodies]) for run in runs]
-    head = f"Force models against DE440, {years[-1]:g} yr from {start}, EIPDOP853 with h = {step:.6g} yr"
-    return f"{head}\nheliocentric positions; EMB: the mass-weighted mean of Earth and Moon\n\n" + table(
-        [[body] for body in bodies], lines
-    )
 
 
 def table_rows(runs: Sequence[ModelRun]) -> list[dict[str, Any]]:
@@ -308,18 +293,3 @@ def _row(run: ModelRun, k: int, body: str) -> dict[str, Any]:
         "km": float(run.km[body][k]),
         "arcsec": float(run.arcsec[body][k]),
     }
-
-
-def _figures(runs: Sequence[ModelRun], start: str) -> Iterator[Any]:
-    from ... import plotting
-
-    direction = "after" if runs[0].years[-1] > 0 else "before"
-    figure = plotting.longitude_figure(
-        np.abs(runs[0].years),
-        {run.model.name: np.array([run.km[body] for body in PANELS]) for run in runs},
-        PANELS,
-        time=f"years {direction} {start[:10]}",
-        error="error against DE440 [km]",
-        title="What each force is worth",
-    )
-    yield "solar-truth.png", figure

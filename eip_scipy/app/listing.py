@@ -1,0 +1,66 @@
+"""``eip-scipy list``: commands, methods, problems and data sets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from .. import comparators, problems
+from ..core import solvers
+from ..problems.gravity import solar_data
+from .commands import COMMANDS
+from .study import Session, Study
+
+__all__ = ["METRICS", "Listing", "fixed_step_methods"]
+
+METRICS = ("error", "euclidean")
+
+Found = dict[str, dict[str, str]]
+
+
+def fixed_step_methods() -> dict[str, type[solvers.EIPSolver]]:
+    """Find the solver classes that a user names: those with a tableau."""
+    found = {name: getattr(solvers, name) for name in solvers.__all__}
+    return {
+        name: value
+        for name, value in found.items()
+        if isinstance(value, type) and issubclass(value, solvers.EIPSolver) and hasattr(value, "TABLEAU")
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listing(Study[Found]):
+    """The command."""
+
+    writes_files = False
+
+    def measure(self, session: Session) -> Found:
+        """Names with the first lines of their docstrings, by their kind."""
+        sets = {name: solar_data.load(name) for name in solar_data.available()}
+        others = {name: getattr(comparators, name) for name in comparators.__all__}
+        scenes = {name: getattr(problems, name) for name in problems.__all__}
+        return {
+            "commands": {name: entry.summary for name, entry in COMMANDS.items()},
+            "methods": {name: _first_line(method) for name, method in fixed_step_methods().items()},
+            "comparators": {name: _first_line(make) for name, make in others.items() if not isinstance(make, type)},
+            "problems": {
+                name: _first_line(make)
+                for name, make in scenes.items()
+                if callable(make) and not isinstance(make, type)  # neither records nor fields
+            },
+            "data": {name: f"{len(data.bodies)} bodies at {data.epoch}, {data.axes}" for name, data in sets.items()},
+        }
+
+    def text(self, found: Found) -> str:
+        lines = []
+        for heading, entries in found.items():
+            width = max(map(len, entries))
+            lines += [f"{heading}:", *(f"  {name:<{width}}  {text}".rstrip() for name, text in entries.items())]
+        return "\n".join(lines)
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        return dict(found)
+
+
+def _first_line(item: Any) -> str:
+    return (item.__doc__ or "").strip().split("\n")[0].split(". ")[0].rstrip(".")
