@@ -1,10 +1,15 @@
 """Sphinx configuration; build with ``python -m sphinx -W -b html docs docs/_build/html``.
 
-Neither the build nor the pages ask the network for anything: formulas become MathML, other projects' names are looked up
-in ``_inventories``, and the theme's fonts are the reader's.
+Neither the build nor the pages ask the network for anything: formulas become MathML, names of other projects are looked
+up in ``_inventories``, and the theme's fonts are the reader's.
+
+EIP_NOTEBOOKS names a folder with the notebooks as they were run; without it they are shown without their outputs.
 """
 
+import os
+import shutil
 from importlib.metadata import version as installed_version
+from pathlib import Path
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
@@ -17,7 +22,7 @@ release = installed_version("eip_scipy")
 version = release
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
@@ -26,10 +31,10 @@ extensions = [
 ]
 templates_path = ["_templates"]
 exclude_patterns = ["_build", "_inventories"]
-source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
 myst_heading_anchors = 3
+nb_execution_mode = "off"  # .ci/run runs them
 
 autosummary_generate = True
 autosummary_imported_members = False
@@ -50,11 +55,13 @@ html_math_renderer = "mathml"
 
 
 def inline_formula(writer, node):
+    """A formula within a line."""
     writer.body.append(tex2mathml(node.astext()))
     raise nodes.SkipNode
 
 
 def formula(writer, node):
+    """A formula of its own, which scrolls where the page is narrow."""
     writer.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
     raise nodes.SkipNode
 
@@ -66,6 +73,20 @@ def without_single_names(app, env):
             entry.parent.remove(entry)
 
 
+def show_notebooks():
+    """Lay the notebooks of examples/ beside their page, and take away what lay there."""
+    shown = Path(__file__).parent / "notebooks"
+    for page in shown.iterdir():
+        if page.name != "index.md":
+            page.unlink()
+    executed = os.environ.get("EIP_NOTEBOOKS")
+    sources = Path(executed).glob("*.ipynb") if executed else (shown.parents[1] / "examples").glob("*.md")
+    for source in sources:
+        shutil.copy(source, shown)
+
+
 def setup(app):
+    """Sphinx calls it."""
+    show_notebooks()
     app.connect("env-updated", without_single_names)
     app.add_html_math_renderer("mathml", (inline_formula, None), (formula, None))

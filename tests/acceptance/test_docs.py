@@ -28,7 +28,8 @@ def assert_output(found, printed):
 PAGES = (
     "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/rebound-and-astropy",
     "tutorials/pdes", "tutorials/own-pde", "tutorials/ensembles", "how-to/recommend", "how-to/find-invariants",
-    "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep", "how-to/own-methods",
+    "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
+    "how-to/own-methods",
 )  # fmt: skip
 NIGHTLY = ("results/hard-scenes", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h")
 
@@ -73,4 +74,5 @@ def test_notebooks_are_listed():
         text = notebook.read_text(encoding="utf-8")
         assert text.startswith("---\njupytext:\n")
         title = re.search(r"^# (.+)$", text, re.MULTILINE)[1]
-        assert f"| {title}: `{notebook.name}` |" in page
+        assert f"| [{title}]({notebook.stem}): `{notebook.name}` |" in page
+        assert f"\n{notebook.stem}\n" in page
