@@ -35,6 +35,8 @@ exclude_patterns = ["_build", "_inventories"]
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"  # .ci/run runs them
+nb_merge_streams = True
+nb_output_stderr = "remove"  # progress bars
 
 autosummary_generate = True
 autosummary_imported_members = False
@@ -46,6 +48,8 @@ intersphinx_mapping = {
     "scipy": ("https://docs.scipy.org/doc/scipy/", "_inventories/scipy.txt"),
 }
 
+smartquotes = False  # options have two hyphens
+html_domain_indices = False
 html_theme = "furo"
 html_title = f"eip_scipy {release}"
 html_theme_options = {"navigation_with_keys": True}
@@ -85,8 +89,16 @@ def show_notebooks():
         shutil.copy(source, shown)
 
 
+def keep_short_cells_whole(app, doctree):
+    """Numbers such as 1e-8 in tables are not broken at their hyphens: narrow pages scroll the table."""
+    for cell in doctree.findall(nodes.entry):
+        if len(cell.astext()) <= 14:
+            cell["classes"].append("short")
+
+
 def setup(app):
     """Sphinx calls it."""
     show_notebooks()
     app.connect("env-updated", without_single_names)
+    app.connect("doctree-read", keep_short_cells_whole)
     app.add_html_math_renderer("mathml", (inline_formula, None), (formula, None))

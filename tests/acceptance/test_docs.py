@@ -65,6 +65,14 @@ def test_a_wrong_output_is_seen():
             assert_output("error 2.4e-05, defect 3e-15 [1, 2]", wrong)
 
 
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])
+def test_links_lead_somewhere(page):
+    """Sphinx looks at the links between its own pages."""
+    text = re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    links = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text)
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
 def test_notebooks_are_listed():
     """Each notebook is on the documentation's page; `.ci/run` executes them."""
     notebooks = sorted((ROOT / "examples").glob("*.md"))
