@@ -80,7 +80,7 @@ def without_single_names(app, env):
 def show_notebooks():
     """Lay the notebooks of examples/ beside their page, and take away what lay there."""
     shown = Path(__file__).parent / "notebooks"
-    for page in shown.iterdir():
+    for page in (*shown.glob("*.md"), *shown.glob("*.ipynb")):
         if page.name != "index.md":
             page.unlink()
     executed = os.environ.get("EIP_NOTEBOOKS")
