@@ -137,7 +137,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", metavar="TEXT", default="", help="runs whose group, name or method contains this")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="the tables by group, as in docs/trust.md")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="the tables of docs/explanation/trust.md")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="a line for each run")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()

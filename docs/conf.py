@@ -1,6 +1,19 @@
-"""Sphinx configuration; build with ``python -m sphinx -W -b html docs docs/_build/html``."""
+"""Sphinx configuration; build with ``python -m sphinx -W -b html docs docs/_build/html``.
 
+Neither the build nor the pages ask the network for anything: formulas become MathML, names of other projects are looked
+up in ``_inventories``, and the theme's fonts are the reader's.
+
+EIP_NOTEBOOKS names a folder with the notebooks as they were run; without it they are shown without their outputs.
+"""
+
+import os
+import shutil
 from importlib.metadata import version as installed_version
+from pathlib import Path
+
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx import addnodes
 
 project = "eip_scipy"
 author = "The eip_scipy developers"
@@ -9,24 +22,83 @@ release = installed_version("eip_scipy")
 version = release
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
+    "sphinx.ext.intersphinx",
+    "sphinx_design",
 ]
 templates_path = ["_templates"]
-exclude_patterns = ["_build"]
-source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
+exclude_patterns = ["_build", "_inventories"]
 
-myst_enable_extensions = ["amsmath", "dollarmath"]
+myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
 myst_heading_anchors = 3
+nb_execution_mode = "off"  # .ci/run runs them
+nb_merge_streams = True
+nb_output_stderr = "remove"  # progress bars
 
 autosummary_generate = True
 autosummary_imported_members = False
 autodoc_typehints = "none"  # the docstrings give the types
 numpydoc_show_class_members = False  # the templates list them
+default_role = "py:obj"
+intersphinx_mapping = {
+    "numpy": ("https://numpy.org/doc/stable/", "_inventories/numpy.txt"),
+    "scipy": ("https://docs.scipy.org/doc/scipy/", "_inventories/scipy.txt"),
+}
 
+smartquotes = False  # options have two hyphens
+html_domain_indices = False
 html_theme = "furo"
 html_title = f"eip_scipy {release}"
 html_theme_options = {"navigation_with_keys": True}
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
+html_math_renderer = "mathml"
+
+
+def inline_formula(writer, node):
+    """A formula within a line."""
+    writer.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def formula(writer, node):
+    """A formula of its own, which scrolls where the page is narrow."""
+    writer.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
+def without_single_names(app, env):
+    """The sidebar ends at the page of reference: a hundred names more on each page took a third of the build."""
+    for entry in list(env.tocs["reference/index"].findall(addnodes.toctree)):
+        if any("generated" in page for page in entry["includefiles"]):
+            entry.parent.remove(entry)
+
+
+def show_notebooks():
+    """Lay the notebooks of examples/ beside their page, and take away what lay there."""
+    shown = Path(__file__).parent / "notebooks"
+    for page in (*shown.glob("*.md"), *shown.glob("*.ipynb")):
+        if page.name != "index.md":
+            page.unlink()
+    executed = os.environ.get("EIP_NOTEBOOKS")
+    sources = Path(executed).glob("*.ipynb") if executed else (shown.parents[1] / "examples").glob("*.md")
+    for source in sources:
+        shutil.copy(source, shown)
+
+
+def keep_short_cells_whole(app, doctree):
+    """Numbers such as 1e-8 in tables are not broken at their hyphens: narrow pages scroll the table."""
+    for cell in doctree.findall(nodes.entry):
+        if len(cell.astext()) <= 14:
+            cell["classes"].append("short")
+
+
+def setup(app):
+    """Sphinx calls it."""
+    show_notebooks()
+    app.connect("env-updated", without_single_names)
+    app.connect("doctree-read", keep_short_cells_whole)
+    app.add_html_math_renderer("mathml", (inline_formula, None), (formula, None))

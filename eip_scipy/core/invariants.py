@@ -74,7 +74,7 @@ class Invariant:
     C functions are given as `scipy.LowLevelCallable`, ctypes or cffi function pointers, of the signatures
     ``int I(double t, const double *y, double *values, const double *params)`` and
     ``int G(double t, const double *y, const double *f, double *out, const double *params)``; f is the derivative with
-    ``uses_f=True`` and holds nothing else. See :doc:`/c-functions`.
+    ``uses_f=True`` and holds nothing else. See :doc:`/tutorials/c-functions`.
 
     Examples
     --------

@@ -41,9 +41,9 @@ class CFunctions:
     Parameters
     ----------
     one, eight : LowLevelCallable, ctypes or cffi function pointer
-        Both of the same signature, that of :doc:`/c-functions`. For `eight`, each number of the arrays is eight, one of
-        each member: component i of member k is ``y[8 * i + k]``, and alike in `f`, `out` and `params`; t is that
-        of all. Each member has to get the bits that `one` gives it.
+        Both of the same signature, that of :doc:`/tutorials/c-functions`. For `eight`, each number of the arrays
+        is eight, one of each member: component i of member k is ``y[8 * i + k]``, and alike in `f`, `out` and
+        `params`; t is that of all. Each member has to get the bits that `one` gives it.
 
     Examples
     --------

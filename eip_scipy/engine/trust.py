@@ -24,14 +24,15 @@ N_FIGURES = 16
 
 # Noted are changes of so many local errors, and defects of such shares of their invariants' terms, before and after.
 LARGE, FAR, LARGE_SHARE = 50.0, 0.03, 1e-2
-# What no healthy run shows (docs/trust.md has the figures). One change of so many local errors (the estimates of pairs
-# of methods vanish by chance, which makes thousands), LARGE ones in such a share of the projections, changes that are
-# together so many times the errors; one defect of such a share of the terms, FAR ones in such a share of them.
+# What no healthy run shows (docs/explanation/trust.md has the figures). One change of so many local errors (the
+# estimates of pairs of methods vanish by chance, which makes thousands), LARGE ones in such a share of the projections,
+# changes that are together so many times the errors; one defect of such a share of the terms, FAR ones in such a share
+# of them.
 BEYOND_DOUBT, OFTEN, TOGETHER = 1e4, 0.1, 20.0
 TOO_FAR, FAR_OFTEN = 0.05, 0.01
 # So many changes make a share or a sum, where more than one is LARGE.
 ENOUGH = 5
-PAGE = '"When a run is not trusted" (docs/trust.md)'
+PAGE = '"When a run is not trusted" (docs/explanation/trust.md)'
 
 
 class ProjectionWarning(RuntimeWarning):

@@ -100,15 +100,15 @@ def integrate(
     fun : callable or Problem
         ``fun(t, y[, params]) -> (n,)``; with ``in_place=True``, ``fun(t, y, out[, params])``. For a compiled run a
         lazily jitted Numba function, or a C function as `scipy.LowLevelCallable`, ctypes or cffi pointer,
-        ``int fun(double t, const double *y, double *out, const double *params)``, see :doc:`/c-functions`. With a
-        Nystrom method (`EIPRKN8`, `EIPRKN12`) or a multistep one (`EIPGJ12`, `EIPGJ14`), whose state is (q, v), the
-        acceleration: ``acc(t, q[, params]) ->
-        (n/2,)``, in place ``acc(t, q, out[, params])``. A `Problem` brings everything else with it; options given here
+        ``int fun(double t, const double *y, double *out, const double *params)``, see
+        :doc:`/tutorials/c-functions`. With a Nystrom method (`EIPRKN8`, `EIPRKN12`) or a multistep one
+        (`EIPGJ12`, `EIPGJ14`), whose state is (q, v), the acceleration: ``acc(t, q[, params]) -> (n/2,)``, in place
+        ``acc(t, q, out[, params])``. A `Problem` brings everything else with it; options given here
         take precedence.
     t_span : (float, float)
         Start and end; backward if the end comes first. Of a `Problem` with units also durations of astropy, and with an
-        epoch its times, in any scale, see :doc:`/astronomy`; the same goes for `t_eval`, and durations for `h`,
-        `first_step` and `max_step`.
+        epoch its times, in any scale, see :doc:`/tutorials/rebound-and-astropy`; the same goes for `t_eval`, and
+        durations for `h`, `first_step` and `max_step`.
     y0 : array_like, shape (n,)
         Initial state, real or complex.
     method : type, optional

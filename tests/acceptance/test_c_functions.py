@@ -12,7 +12,7 @@ import pytest
 from c_compiler import compiler
 from test_docs import ROOT, assert_output
 
-PAGE = (ROOT / "docs" / "c-functions.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/tutorials/c-functions.md").read_text(encoding="utf-8")
 BUILD = re.compile(r"^```console\n\$ (.*)\n```$", re.MULTILINE)
 PRINTED = re.compile(r"^```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMANDS = {"cc": compiler(), "cythonize": [sys.executable, "-m", "Cython.Build.Cythonize"]}
@@ -34,6 +34,6 @@ def test_example(k, script, tmp_path):
 
 
 def test_the_page_shows_all_files():
-    shown = re.findall(r"^```\{literalinclude\} \.\./(\S+)$", PAGE, re.MULTILINE)
+    shown = re.findall(r"^```\{literalinclude\} \.\./\.\./(\S+)$", PAGE, re.MULTILINE)
     assert sorted(shown) == sorted(str(path.relative_to(ROOT)) for path in (ROOT / "examples/c-functions").iterdir())
     assert all(f"`{Path(path).name}`" in PAGE for path in shown)

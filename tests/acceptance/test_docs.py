@@ -26,10 +26,12 @@ def assert_output(found, printed):
 
 
 PAGES = (
-    "quickstart", "results", "adaptive", "own-methods", "multistep", "checkpoints", "ensembles", "finding-invariants",
-    "recommend", "astronomy", "waves",
+    "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/rebound-and-astropy",
+    "tutorials/pdes", "tutorials/own-pde", "tutorials/ensembles", "how-to/recommend", "how-to/find-invariants",
+    "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
+    "how-to/own-methods",
 )  # fmt: skip
-NIGHTLY = ("hard-scenes", "charged-particles", "gross-pitaevskii", "written")
+NIGHTLY = ("results/hard-scenes", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h")
 
 
 @pytest.mark.parametrize(
@@ -63,13 +65,22 @@ def test_a_wrong_output_is_seen():
             assert_output("error 2.4e-05, defect 3e-15 [1, 2]", wrong)
 
 
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])
+def test_links_lead_somewhere(page):
+    """Sphinx looks at the links between its own pages."""
+    text = re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    links = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text)
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
 def test_notebooks_are_listed():
     """Each notebook is on the documentation's page; `.ci/run` executes them."""
     notebooks = sorted((ROOT / "examples").glob("*.md"))
     assert notebooks
-    page = (ROOT / "docs" / "notebooks.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/notebooks/index.md").read_text(encoding="utf-8")
     for notebook in notebooks:
         text = notebook.read_text(encoding="utf-8")
         assert text.startswith("---\njupytext:\n")
         title = re.search(r"^# (.+)$", text, re.MULTILINE)[1]
-        assert f"| {title}: `{notebook.name}` |" in page
+        assert f"| [{title}]({notebook.stem}): `{notebook.name}` |" in page
+        assert f"\n{notebook.stem}\n" in page

@@ -79,7 +79,8 @@ def test_an_invariant_whose_rate_is_zero_at_the_start(driver, method):
                 return np.array([y[1], -np.sin(y[0]) + 0.3 * np.sin(t)])
     else:
         fun = pendulum(0.2)
-    with pytest.warns(ProjectionWarning, match=r"(?s)'energy'.*no invariant of this system.*docs/trust.md") as caught:
+    told = r"(?s)'energy'.*no invariant of this system.*docs/explanation/trust.md"
+    with pytest.warns(ProjectionWarning, match=told) as caught:
         run, record = driver(fun, (0, 20), [2.0, 0.0], method=method, rtol=1e-8, invariants=ENERGY)
     assert len(caught) == 1
     assert caught[0].filename == __file__

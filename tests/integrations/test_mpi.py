@@ -79,7 +79,9 @@ def test_results_are_the_serial_ones(ranks, serial, tmp_path):
 @needs_mpirun
 def test_the_page(tmp_path):
     """The script of the documentation's page, on two ranks."""
-    code, printed = (text for _, text in BLOCK.findall((TESTS.parent / "docs" / "mpi.md").read_text(encoding="utf-8")))
+    code, printed = (
+        text for _, text in BLOCK.findall((TESTS.parent / "docs/developers/mpi.md").read_text(encoding="utf-8"))
+    )
     (tmp_path / "condensate.py").write_text(code, encoding="utf-8")
     assert_output(on_ranks(2, "condensate.py", cwd=tmp_path), printed)
     assert np.load(tmp_path / "condensate.npy").shape == (32, 32, 24)
