@@ -36,6 +36,9 @@ class Origin(NamedTuple):
     invariants: Any
 
 
+UNSET = ("units", "epoch")  # fields that print where they hold something
+
+
 class IntegrationResult(OptimizeResult):
     """Result of `integrate`; fields by name or by key, as in SciPy's own results.
 
@@ -57,7 +60,8 @@ class IntegrationResult(OptimizeResult):
     sol : OdeSolution or None
         Likewise: the run as a function of time, with ``dense_output=True``.
     nfev, njev, nlu : int
-        Evaluations of the right-hand side and of the invariants' gradients, and factorisations.
+        Evaluations of the right-hand side and of the invariants' gradients, and factorisations. A one-step method of
+        another kind (`Lawson`, `Splitting`) adds what it evaluates in the place of the right-hand side.
     status : int
         0: the end was reached; 1: a callback or an event stopped the run; -1: a step failed.
     message : str
@@ -161,6 +165,10 @@ class IntegrationResult(OptimizeResult):
         from .continuation import continued
 
         return continued(self, t, options)
+
+    def __repr__(self) -> str:
+        """Without what this run has none of."""
+        return repr(OptimizeResult({key: value for key, value in self.items() if key not in UNSET or value}))
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray"]
