@@ -1,11 +1,11 @@
 """Sphinx configuration; build with ``python -m sphinx -W -b html docs docs/_build/html``."""
 
-from importlib.metadata import version as installed_version
+from eip_scipy import __version__
 
 project = "eip_scipy"
 author = "The eip_scipy developers"
 copyright = "2026, The eip_scipy developers"
-release = installed_version("eip_scipy")
+release = __version__
 version = release
 
 extensions = [

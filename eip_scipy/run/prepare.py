@@ -339,7 +339,7 @@ def _method(method: Any) -> Any:
     if method is None:
         raise TypeError(
             "integrate: method is missing. Take EIPDOP853 with rtol=1e-9 where the step may vary, EIPRK4 with h=... "
-            "where it is fixed, EIPRKN12 for q'' = a(t, q); eip_scipy.recommend(...) finds method and step for an error."
+            "where it is fixed, EIPRKN12 for q'' = a(t, q); eip_scipy.recommend(...) finds method and step."
         )
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
         raise TypeError(
