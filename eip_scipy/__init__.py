@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from .run.results import IntegrationResult
     from .run.saving import load, save
     from .run.tables import to_dataframe, to_xarray
+    from .run.view import view
 
     __version__: str
 
@@ -93,6 +94,7 @@ __all__ = [
     "show_config",
     "to_dataframe",
     "to_xarray",
+    "view",
 ]
 
 _HOMES = {  # the module of each of these names, and the modules that are public themselves
@@ -124,6 +126,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "show_config": "core.config",
     "to_dataframe": "run.tables",
     "to_xarray": "run.tables",
+    "view": "run.view",
     **dict.fromkeys((name for name in __all__ if name.startswith("EIP") or name == "eip_method"), "core.solvers"),
 }
 _MODULES = ("checkpoint", "problems")

@@ -118,6 +118,12 @@ class IntegrationResult(OptimizeResult):
 
         return plot(self, names, orbit=orbit)
 
+    def view(self, path: Any = None, *, names: Any = None, reference: Any = None) -> Any:
+        """Write a page that plays the run, see `eip_scipy.view`."""
+        from .view import view
+
+        return view(self, path, names=names, reference=reference)
+
     def continue_to(self, t: float, **options: Any) -> IntegrationResult:
         """Go on from the last state to a later time, with the functions and options of the run.
 
@@ -171,7 +177,7 @@ class IntegrationResult(OptimizeResult):
         return repr(OptimizeResult({key: value for key, value in self.items() if key not in UNSET or value}))
 
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray"]
+        return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray", "view"]
 
     def __getstate__(self) -> None:
         """Of attributes beside the fields there is the origin alone, whose functions stay here."""
