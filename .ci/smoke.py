@@ -17,6 +17,7 @@ import eip_scipy
 from eip_scipy import EIPRK4, ensemble, integrate
 from eip_scipy.engine.native import BUILD
 from eip_scipy.problems import kepler, solar_system, soliton
+from eip_scipy.run.view import page
 
 MEGABYTES = 5
 # Of the defects; without projection those of the first example are 9e-5.
@@ -48,6 +49,7 @@ for problem, t_span in (kepler(), (0, 100)), (solar_system(), (0, 100)), (solito
     assert run.success, run.message
     assert run.trusted, run.message
     assert max(run.diagnostics.max_defect) < BOUND, run.diagnostics
+assert "<canvas" in page(run)  # whose frame is a file
 starts = np.array([[0.4, 0, 0, 2], [0.5, 0, 0, 1.7]])
 members = ensemble(kepler(), (0, 10), starts, method=EIPRK4)
 assert members.success, members.message

@@ -30,7 +30,7 @@ INVARIANCE_TOLERANCE = 1e-8
 TARGET_TOLERANCE = 1e-8
 COMPLEX_STEP = 1e-100
 # Components from which on a gradient by as many evaluations is told of. Steps of EIPRK4 of a chain with it and without:
-# in Python 15 times longer for 64 components, 65 for 256, 770 for 4096; jitted 3 for 128, 12 for 256, 110 for 4096.
+# in Python 5 times longer for 64 components, 66 for 256, 640 for 4096; jitted 3 for 128, 12 for 256, 110 for 4096.
 LARGE = 200
 # Central differences of order 6: weights of +-1, +-2, +-3 steps (Fornberg 1988, table 1); those of order 4, to compare.
 DIFFERENCE_WEIGHTS = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
