@@ -17,6 +17,7 @@ import eip_scipy
 from eip_scipy import EIPRK4, ensemble, integrate
 from eip_scipy.engine.native import BUILD
 from eip_scipy.problems import kepler, solar_system, soliton
+from eip_scipy.run.view import page
 
 MEGABYTES = 5
 # Of the defects; without projection those of the first example are 9e-5.
@@ -28,7 +29,12 @@ files = metadata.files("eip_scipy")
 assert files is not None
 size = sum(Path(file.locate()).stat().st_size for file in files if file.suffix != ".pyc")
 assert size < MEGABYTES * 1e6, f"our own files take {size / 1e6:.1f} MB"
-assert not any(file.suffix in (".cpp", ".hpp") for file in files)
+assert {file.suffix for file in files} <= {".py", ".pyc", ".so", ".pyd", ".json", ".html", ".typed", ".txt", ""}, (
+    "more than the package"
+)
+assert {"py.typed", "LICENSE"} <= {file.name for file in files}
+folders = {file.parts[0] for file in files} - {".."}  # above it the command
+assert folders == {"eip_scipy", f"eip_scipy-{eip_scipy.__version__}.dist-info"}, folders
 assert find_spec("numba") is None, "Numba came along, which is an extra"
 
 # The README's first example; the README is the wheel's description.
@@ -43,9 +49,12 @@ for problem, t_span in (kepler(), (0, 100)), (solar_system(), (0, 100)), (solito
     assert run.success, run.message
     assert run.trusted, run.message
     assert max(run.diagnostics.max_defect) < BOUND, run.diagnostics
+assert "<canvas" in page(run)  # whose frame is a file
 starts = np.array([[0.4, 0, 0, 2], [0.5, 0, 0, 1.7]])
 members = ensemble(kepler(), (0, 10), starts, method=EIPRK4)
 assert members.success, members.message
 
-subprocess.run([Path(sysconfig.get_path("scripts")) / "eip-scipy", "list"], check=True, stdout=subprocess.DEVNULL)
+assert metadata.version("eip_scipy") == eip_scipy.__version__
+# Tests of its own, which pass without any extra.
+subprocess.run([Path(sysconfig.get_path("scripts")) / "eip-scipy", "doctor"], check=True)
 print(f"eip_scipy {eip_scipy.__version__} ({BUILD.__name__}) on {sys.version.split()[0]}: {size / 1e6:.2f} MB, works")

@@ -8,17 +8,18 @@ EIP_NOTEBOOKS names a folder with the notebooks as they were run; without it the
 
 import os
 import shutil
-from importlib.metadata import version as installed_version
 from pathlib import Path
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx import addnodes
 
+from eip_scipy import __version__
+
 project = "eip_scipy"
 author = "The eip_scipy developers"
 copyright = "2026, The eip_scipy developers"
-release = installed_version("eip_scipy")
+release = __version__
 version = release
 
 extensions = [

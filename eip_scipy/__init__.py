@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from . import checkpoint as checkpoint
     from . import problems as problems
     from .checkpoint import CheckpointError
+    from .core.config import show_config
     from .core.invariants import Invariant, JointInvariants, check_gradient
     from .core.one_step import OneStepMethod
     from .core.pointers import CFunctions
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from .run.results import IntegrationResult
     from .run.saving import load, save
     from .run.tables import to_dataframe, to_xarray
+    from .run.view import view
 
     __version__: str
 
@@ -89,8 +91,10 @@ __all__ = [
     "project",
     "recommend",
     "save",
+    "show_config",
     "to_dataframe",
     "to_xarray",
+    "view",
 ]
 
 _HOMES = {  # the module of each of these names, and the modules that are public themselves
@@ -119,8 +123,10 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "project": "core.project",
     "recommend": "run.recommend",
     "save": "run.saving",
+    "show_config": "core.config",
     "to_dataframe": "run.tables",
     "to_xarray": "run.tables",
+    "view": "run.view",
     **dict.fromkeys((name for name in __all__ if name.startswith("EIP") or name == "eip_method"), "core.solvers"),
 }
 _MODULES = ("checkpoint", "problems")
@@ -132,9 +138,7 @@ def __getattr__(name: str) -> Any:
     elif name in _MODULES:
         value = _import_module(f".{name}", __name__)
     elif name == "__version__":
-        from importlib.metadata import version
-
-        value = version("eip_scipy")
+        value = _import_module(".core.versions", __name__).VERSION
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value

@@ -27,9 +27,9 @@ class _Version(argparse.Action):
     """Asks for the version when it is wanted, which takes reading."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        from importlib.metadata import version
+        from ..core.versions import VERSION
 
-        print(f"eip_scipy {version('eip_scipy')}")
+        print(f"eip_scipy {VERSION}")
         parser.exit()
 
 

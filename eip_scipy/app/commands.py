@@ -46,6 +46,7 @@ COMMANDS = {
     "work-precision": Entry(
         "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
     ),
+    "view": Entry("view:View", "a page that plays a saved run"),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
 }
 # Options of before, by command, and the command that does it now.

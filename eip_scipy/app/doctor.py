@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
-from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from ..core.config import configuration, described
 from ..core.solvers import EIPRK4, EIPRKN12
-from ..core.versions import versions
-from ..engine.native import BUILD
 from ..ensembles.ensemble import ensemble
 from ..problems import kepler, solar_system
 from ..run.integrate import integrate
@@ -24,22 +21,6 @@ from .study import Session, Study
 
 __all__ = ["Doctor"]
 
-# What a package that is not needed brings: module, its extra, and for what.
-EXTRAS = (
-    ("numba", "numba", "jitted functions of your own"),
-    ("matplotlib", "plot", "figures"),
-    ("sympy", "sympy", "hamiltonian, equations"),
-    ("rebound", "rebound", "simulations of REBOUND; WHFast and IAS15 to compare with"),
-    ("heyoka", "heyoka", "Taylor series to compare with"),
-    ("astropy", "astro", "quantities and times"),
-    ("jplephem", "jpl", "JPL's ephemerides"),
-    ("xarray", "xarray", "results as datasets"),
-    ("pandas", "pandas", "results as data frames"),
-    ("zarr", "zarr", "ensembles on disk"),
-    ("dask", "distributed", "ensembles on a cluster"),
-    ("mpi4py", "mpi", "states over many processes"),
-    ("ducc0", "fft", "faster Fourier transforms"),
-)
 DEFECT, DISTANCE, PLANETS = 1e-13, 1e-11, 1e-7
 
 
@@ -58,17 +39,6 @@ class Trial(NamedTuple):
     def cells(self) -> tuple[str, ...]:
         verdict = "ok" if self.passed else "FAILED"
         return compact(self.found), compact(self.bound), f"{self.seconds:.2f}", verdict
-
-
-def _installed() -> dict[str, str]:
-    found = versions()
-    names = ("eip_scipy", "python", "numpy", "scipy", "tqdm")
-    return {
-        **{name: str(found[name]) for name in names},
-        "engine": f"{BUILD.__name__.rsplit('.', 1)[-1]} ({'AVX2 and FMA' if BUILD.HAS_V3 else 'any processor'} here)",
-        "folder": str(Path(__file__).parents[1]),
-        "machine": describe_machine(),
-    }
 
 
 def _timed(name: str, bound: float, measure: Callable[[], float]) -> Trial:
@@ -133,8 +103,7 @@ CHECKS = (
 class Examined(NamedTuple):
     """What the command found."""
 
-    installed: dict[str, str]
-    extras: dict[str, dict[str, Any]]
+    installed: dict[str, Any]
     trials: list[Trial]
 
 
@@ -142,17 +111,12 @@ class Examined(NamedTuple):
 class Doctor(Study[Examined]):
     """The command."""
 
-    packages: tuple[tuple[str, str, str], ...] = EXTRAS
     trials: tuple[tuple[str, float, Callable[[], float]], ...] = CHECKS
     writes_files = False
 
     def measure(self, session: Session) -> Examined:
         """Look what is there, and run each trial."""
-        extras = {
-            module: {"installed": find_spec(module) is not None, "extra": extra, "for": what}
-            for module, extra, what in self.packages
-        }
-        found = Examined(_installed(), extras, [_timed(*trial) for trial in self.trials])
+        found = Examined(configuration(), [_timed(*trial) for trial in self.trials])
         if failed := [trial.name for trial in found.trials if not trial.passed]:
             names = ", ".join(failed)
             warn(f"failed: {names}. This installation computes something else than it must; install it anew.")
@@ -163,18 +127,12 @@ class Doctor(Study[Examined]):
 
     def numbers(self, found: Examined) -> dict[str, Any]:
         trials = [{**trial._asdict(), "passed": trial.passed} for trial in found.trials]
-        return {"installation": found.installed, "extras": found.extras, "checks": trials}
+        return {"installation": found.installed, "checks": trials}
 
     def checks(self, found: Examined) -> Sequence[Trial]:
         return found.trials
 
 
-def _text(installed: dict[str, str], extras: dict[str, dict[str, Any]], checks: Sequence[Trial]) -> str:
-    width = max(map(len, (*installed, *extras)))
-    lines = [f"{name:<{width}}  {value}" for name, value in installed.items()]
-    lines += ["", "extras"]
-    for module, entry in extras.items():
-        state = "installed" if entry["installed"] else f"absent: pip install 'eip_scipy[{entry['extra']}]'"
-        lines.append(f"{module:<{width}}  {state:<45}  {entry['for']}")
-    head = (("found",), ("at most",), ("s",), ("",))
-    return "\n".join((*lines, "", table(head, [(check.name, check.cells()) for check in checks])))
+def _text(installed: dict[str, Any], trials: Sequence[Trial]) -> str:
+    rows = table((("found",), ("at most",), ("s",), ("",)), [(trial.name, trial.cells()) for trial in trials])
+    return "\n\n".join((described(installed), f"machine: {describe_machine()}", rows))

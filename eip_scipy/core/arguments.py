@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .inputs import is_number, real_array, refuse_units, shown
 
-__all__ = ["Packed", "extra_arguments", "floats", "names", "scalars"]
+__all__ = ["Packed", "extra_arguments", "floats", "names", "parameter_values", "scalars"]
 
 EXACT = 2**53  # an integer up to here is a float as well
 
@@ -32,7 +33,7 @@ def extra_arguments(args: Any, params: Any) -> tuple[Any, ...]:
         For both, for `args` that cannot be unpacked, and for `params` that are no floats.
     """
     if args is None:
-        return () if params is None else (real_array("params", params, TypeError).reshape(-1),)
+        return () if params is None else (parameter_values(params).reshape(-1),)
     if params is not None:
         raise TypeError("give args or params, not both: either is what the functions take as their last arguments.")
     try:
@@ -41,6 +42,23 @@ def extra_arguments(args: Any, params: Any) -> tuple[Any, ...]:
         raise TypeError(f"args must be a tuple, got {shown(args)}; write args=(x,) for a single argument.") from None
     refuse_units(args=found)
     return tuple(item.copy() for item in found) if _is_array(found) else found
+
+
+def parameter_values(params: Any) -> np.ndarray:
+    """`params` as an array of floats.
+
+    Raises
+    ------
+    TypeError
+        For what holds no numbers, names among it.
+    """
+    if isinstance(params, Mapping):
+        raise TypeError(
+            f"params must be an array of numbers, got {shown(params)}: give the values in the order in which fun reads "
+            "them, params=[1.0, 2.0], or the mapping itself by args=(mapping,), with which Python calls fun. Problems "
+            "made by hamiltonian or equations take names."
+        )
+    return real_array("params", params, TypeError)
 
 
 def scalars(extra: tuple[Any, ...]) -> str | None:

@@ -151,7 +151,20 @@ def require_arguments(fun: Callable[..., Any], given: Sequence[str], what: str, 
     try:
         signature.bind(*given)
     except TypeError as error:
+        if _leaves_out_time(signature, given):
+            names = ", ".join(given)
+            mend = f"The time comes first, needed or not: write lambda {names}: ..., or def name({names})."
         raise TypeError(f"{what} is called with ({', '.join(given)}): {error}. {mend}") from None
+
+
+def _leaves_out_time(signature: inspect.Signature, given: Sequence[str]) -> bool:
+    """Whether a function takes what it is given but for the time."""
+    try:
+        signature.bind(*given[1:])
+    except TypeError:
+        return False
+    first = next(iter(signature.parameters), "t")
+    return given[0] == "t" and not first.strip("_").startswith("t")
 
 
 def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any, what: str, t: float) -> np.ndarray:

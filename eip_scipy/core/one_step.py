@@ -7,6 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from ..engine.counters import NFEV
 from ..engine.data import Work
 from ..methods.orders import Ordered
 from .inputs import refuse_units, shown
@@ -29,6 +30,9 @@ class OneStepMethod(Protocol):
     error_estimator_order : int, optional
         Order of the second result whose difference from the first is the error estimate. Only where `one_step`
         returns an estimate; without one the step is fixed and the default metric euclidean.
+    evaluations : int, optional
+        Evaluations of the right-hand side, or of a part of it, in one step: what a step adds to ``nfev``. Default: 0,
+        as a method that is not ours does not show what it evaluates.
     name : str, optional
         Default: the name of the object's class.
     """
@@ -64,8 +68,8 @@ class OneStep(Ordered):
 
     Attributes
     ----------
-    name, order, error_estimator_order
-        Of the method; the last is None without an estimate.
+    name, order, error_estimator_order, evaluations
+        Of the method; the estimate's order is None without one.
     b, c, exponent
         Those of a method of one stage, the derivative at the start, and the exponent of the step control.
 
@@ -78,7 +82,8 @@ class OneStep(Ordered):
 
     Notes
     -----
-    f is evaluated only where a gradient takes it: the steps themselves do not.
+    f is evaluated only where a gradient takes it: the steps themselves do not. ``nfev`` counts these evaluations and
+    the method's `evaluations`, in each step that is tried.
     """
 
     def __init__(self, method: OneStepMethod) -> None:
@@ -87,9 +92,12 @@ class OneStep(Ordered):
                 f"expected a Tableau, a NystromTableau or an object with one_step(t, y, h) and order, got {method!r}."
             )
         self.name = str(getattr(method, "name", type(method).__name__))
-        self.order = _order(self.name, "order", method.order)
+        self.order = _integer(self.name, "order", method.order)
+        self.evaluations = _integer(self.name, "evaluations", getattr(method, "evaluations", 0), least=0)
         estimate = getattr(method, "error_estimator_order", None)
-        self.error_estimator_order = None if estimate is None else _order(self.name, "error_estimator_order", estimate)
+        self.error_estimator_order = (
+            None if estimate is None else _integer(self.name, "error_estimator_order", estimate)
+        )
         self._one_step: Callable[[float, np.ndarray, float], Any] = method.one_step
         self.b, self.c = np.ones(1), np.zeros(1)
         self.exponent = -1.0 / ((self.error_estimator_order or 0) + 1)
@@ -101,6 +109,7 @@ class OneStep(Ordered):
     def fill(self, w: Work, t: float, y: np.ndarray, h: float) -> None:
         """One step into the buffers `w`: the state, and the estimate where there is one."""
         result = self._one_step(float(t), y.copy(), float(h))
+        w.counters[NFEV] += self.evaluations
         if self.has_estimate:
             result, estimate = self._pair(result)
             w.err[:] = self._vector(estimate, "an estimate", t, y).view(float)
@@ -119,9 +128,9 @@ class OneStep(Ordered):
         return np.ascontiguousarray(vector, dtype=y.dtype)
 
 
-def _order(name: str, what: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"{name}: {what} must be an integer >= 1, got {value!r}.")
+def _integer(name: str, what: str, value: Any, least: int = 1) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ValueError(f"{name}: {what} must be an integer >= {least}, got {value!r}.")
     return int(value)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from ..engine.native import library
-from .inputs import has_unit, refuse_units, shown
+from .inputs import has_unit, real_array, refuse_units, shown
 from .invariants import Invariant
+from .names import nearest
 from .pointers import by_pointer
 from .units import DAY_S, Epoch, Unit, apart, as_epoch, in_unit, is_time, moment, shown_epoch
 from .units import units as known_units
@@ -164,6 +165,16 @@ class Problem:
         """The units of length and time, where `units` names two."""
         return known_units(self.units)
 
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values of the parameters by name, of a problem that names them: those of `hamiltonian` and `equations` do."""
+        return {}
+
+    @property
+    def has_second_order(self) -> bool:
+        """Whether the problem has a method ``second_order()`` that gives it in (q, v)."""
+        return False
+
     def plain(self, **given: Any) -> dict[str, Any]:
         """Arguments of a run as plain numbers in the units of the problem, by the names that `integrate` has for them.
 
@@ -171,8 +182,9 @@ class Problem:
         ----------
         **given
             Of ``t_span``, ``t_eval``, ``t`` (times: numbers, durations, or moments where the problem has an `epoch`),
-            ``h``, ``first_step``, ``max_step`` (durations) and ``y0``, which is a pair (positions, velocities) where it
-            has units. What is plain stays as it is, and None.
+            ``h``, ``first_step``, ``max_step`` (durations), ``y0``, which is a pair (positions, velocities) where it
+            has units, and ``params``, which may be a mapping of names to values. What is plain stays as it is, and so
+            does None.
 
         Returns
         -------
@@ -181,9 +193,11 @@ class Problem:
         Raises
         ------
         TypeError
-            For units or dates that the problem cannot convert, for its own `units` name none, or it has no `epoch`.
+            For units or dates that the problem cannot convert, for its own `units` name none, or it has no `epoch`;
+            for names of parameters where it has none.
         ValueError
-            When a moment is given as the start and the problem's own state is that of another, and no `y0` is given.
+            When a moment is given as the start and the problem's own state is that of another, and no `y0` is given;
+            for a parameter that is none of the problem's.
         """
         known, out = self.unit_system, dict(given)
         for name in MOMENTS:
@@ -192,12 +206,29 @@ class Problem:
         for name in DURATIONS:
             if name in given:
                 out[name] = in_unit(name, given[name], (0, 1), known)
+        if isinstance(given.get("params"), Mapping):
+            out["params"] = self._named_parameters(given["params"])
         span, start = apart(given.get("t_span")), given.get("y0")
         if start is not None:
             out["y0"] = self._plain_state(start)
         elif isinstance(span, tuple | list) and span and is_time(span[0]):
             out["t_span"] = (self._own_start(span[0], out["t_span"][0]), *out["t_span"][1:])
         return out
+
+    def _named_parameters(self, given: Mapping[str, Any]) -> np.ndarray:
+        """Values in the problem's order, its own where none is given: (p,), of columns (members, p)."""
+        known = self.parameters
+        if not known:
+            raise TypeError(
+                f"params: the problem {self.name!r} has no names for its parameters; give an array of numbers in the "
+                f"order of problem.params, got {shown(given)}."
+            )
+        for name in given:
+            if name not in known:
+                hint = nearest(str(name), known)
+                raise ValueError(f"params: {self.name} has no parameter {name!r}{hint}. It has {', '.join(known)}.")
+        columns = [real_array(f"params[{name!r}]", value) for name, value in {**known, **given}.items()]
+        return np.stack(np.broadcast_arrays(*columns), axis=-1)
 
     def _plain_state(self, y0: Any) -> Any:
         """Positions and velocities with units as the state; anything else as it is."""

@@ -176,9 +176,16 @@ def check_halves(n: int) -> None:
 
 
 def depends_on_velocity(
-    rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, y0: np.ndarray, f0: np.ndarray, method: str
+    rhs: Callable[[float, np.ndarray], np.ndarray],
+    t0: float,
+    y0: np.ndarray,
+    f0: np.ndarray,
+    method: str,
+    hint: Callable[[], str] = str,
 ) -> bool:
     """Whether the accelerations of q'' = a(t, q, v), y = (q, v), change with v, by one more evaluation.
+
+    Where the equations are of another kind `hint` says what else the caller knows to do.
 
     Raises
     ------
@@ -193,13 +200,19 @@ def depends_on_velocity(
     if not (np.array_equal(f0[:half], y0[half:]) and np.array_equal(f[:half], other[half:])):
         raise ValueError(
             f"{method} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be v, "
-            f"the second half of the state. Reorder the state, or take a Runge-Kutta method such as EIPDOP853."
+            f"the second half of the state, and are not. Take a Runge-Kutta method such as EIPDOP853, or where the "
+            f"system is one of second order, write it with the velocities as that half{hint()}."
         )
     return not np.array_equal(f[half:], f0[half:], equal_nan=True)
 
 
 def check_second_order(
-    rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, y0: np.ndarray, f0: np.ndarray, method: str
+    rhs: Callable[[float, np.ndarray], np.ndarray],
+    t0: float,
+    y0: np.ndarray,
+    f0: np.ndarray,
+    method: str,
+    hint: Callable[[], str] = str,
 ) -> None:
     """Whether the right-hand side is that of q'' = a(t, q) for y = (q, v), by one more evaluation.
 
@@ -208,7 +221,7 @@ def check_second_order(
     ValueError
         When the first half of the derivative is not v, or the second changes with v.
     """
-    if depends_on_velocity(rhs, t0, y0, f0, method):
+    if depends_on_velocity(rhs, t0, y0, f0, method, hint):
         raise ValueError(
             f"{method} integrates q'' = a(t, q), but fun's accelerations change with the velocity; take a Runge-Kutta "
             f"method such as EIPDOP853."

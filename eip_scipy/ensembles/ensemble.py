@@ -20,8 +20,8 @@ from scipy.optimize import OptimizeResult
 
 from ..checkpoint.own_file import absolute
 from ..core import setup
-from ..core.arguments import extra_arguments, floats
-from ..core.inputs import count, flag, is_number, real_array, refuse_units, shown
+from ..core.arguments import extra_arguments, floats, parameter_values
+from ..core.inputs import count, flag, is_number, refuse_units, shown
 from ..core.invariants import as_invariants
 from ..core.jitted import is_compiled
 from ..core.names import nearest
@@ -216,7 +216,8 @@ def ensemble(
     y0s : array_like, shape (members, n)
         Starts; one (n,) for all where `params` differ. Default: the start of a `Problem`.
     params : array_like of float, shape (p,) or (members, p), optional
-        Parameters of all members, or of each.
+        Parameters of all members, or of each. Of a problem that names them also a mapping, of a name to one value or
+        to one for each member, as in ``params={"k": [1.0, 2.0]}``.
     method : type, optional
         As for `integrate`.
     h : float, optional
@@ -514,7 +515,9 @@ def _inputs(fun: Any, y0s: Any, params: Any, invariants: Any) -> tuple[np.ndarra
         if y0s is None:
             raise TypeError("ensemble: y0s is missing; only a Problem brings a start of its own, and not each does.")
     starts = setup.states("y0s", y0s)
-    own = None if params is None else np.atleast_1d(real_array("params", params, TypeError))
+    if problem is not None:
+        params = problem.plain(params=params)["params"]
+    own = None if params is None else np.atleast_1d(parameter_values(params))
     if starts.ndim == 1 and own is not None and own.ndim == 2:
         starts = np.tile(starts, (len(own), 1))
     if starts.ndim != 2 or starts.size == 0:

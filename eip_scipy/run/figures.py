@@ -8,7 +8,7 @@ import numpy as np
 
 from .tables import component_names, invariant_rows
 
-__all__ = ["plot"]
+__all__ = ["described", "planes", "plot"]
 
 
 def plot(result: Any, names: Any = None, *, orbit: bool | None = None) -> Any:
@@ -49,7 +49,7 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None) -> Any:
     from ..plotting.runs import run_figure
 
     labels = component_names(result, names)
-    pairs = _planes(labels)
+    pairs = planes(labels)
     if orbit and not pairs:
         raise ValueError("plot: an orbit needs components named x and y, or x_0 and y_0 and so on; give names=...")
     y, diagnostics = np.asarray(result.y), result.get("diagnostics")
@@ -62,11 +62,11 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None) -> Any:
         paths=paths,
         errors={name: errors for name, (_, errors) in invariants.items()},
         corrections={name: size for name, size in corrections.items() if np.isfinite(size)},
-        title=_title(result),
+        title=described(result),
     )
 
 
-def _planes(names: tuple[str, ...]) -> dict[str, tuple[int, int]]:
+def planes(names: tuple[str, ...]) -> dict[str, tuple[int, int]]:
     """Of each body the places of x and y."""
     place = {name: k for k, name in enumerate(names)}
     bodies = [name[1:] for name in names if name[:1] == "x" and name[1:2] in ("", "_")]
@@ -77,7 +77,8 @@ def _planes(names: tuple[str, ...]) -> dict[str, tuple[int, int]]:
     }
 
 
-def _title(result: Any) -> str:
+def described(result: Any) -> str:
+    """The method and the step of a run, and whether it is to be trusted."""
     if "method" not in result:
         return ""
     step = "adaptive steps" if result.h is None else f"h = {result.h:g}"

@@ -125,7 +125,8 @@ def integrate(
         functions as `params`; a single array of floats is the same as ``params``. With anything else Python calls the
         functions.
     params : array_like of float, optional
-        In place of `args`: passed on as the last argument, one array of floats.
+        In place of `args`: passed on as the last argument, one array of floats. A problem that names its parameters
+        (`hamiltonian`, `equations`) also takes a mapping of those that are to have other values.
     in_place : bool, optional
         Whether `fun` fills its third argument.
     jacobian : callable, optional

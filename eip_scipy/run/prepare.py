@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ..core import setup
+from ..core import setup, solvers
 from ..core.arguments import Packed, extra_arguments, floats, names, scalars
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import Invariant, as_invariants
@@ -290,10 +291,11 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     system.bind(y0)
     calls = Counted(system.derivative)
     f0 = system.first(calls, t0, y0)
+    hint = partial(_second_order_hint, asked.fun)
     if isinstance(method, NystromTableau):
-        setup.check_second_order(calls, t0, y0, f0, name)
+        setup.check_second_order(calls, t0, y0, f0, name, hint)
     elif isinstance(method, GaussJackson):
-        method = replace(method, velocities=setup.depends_on_velocity(calls, t0, y0, f0, name))
+        method = replace(method, velocities=setup.depends_on_velocity(calls, t0, y0, f0, name, hint))
     start = Start(t0, y0, f0, stepping.first(calls, y0, f0, method))
     schedule = _schedule(stepping.span, start.tau, request, system.events)
     run = setup.prepare(method, calls, start, projection, stepping, extra=system.extra, check_start=check_start)
@@ -319,22 +321,40 @@ def started_at(request: Request) -> tuple[float, np.ndarray]:
 
 
 def _plain(request: Request) -> Request:
-    """The request with times and lengths that have units as numbers; only a problem knows the units of a state."""
+    """The request in numbers; only a problem knows the units of a state, and the names of its parameters."""
     problem = request.fun
     if not isinstance(problem, Problem):
         return request
-    names = ("t_span", "y0", "t_eval", "h", "first_step", "max_step")
+    names = ("t_span", "y0", "t_eval", "h", "first_step", "max_step", "params")
     return replace(request, **problem.plain(**{name: getattr(request, name) for name in names}))
 
 
+def _second_order_hint(fun: Any) -> str:
+    """Of a problem that can be written so, how."""
+    can = isinstance(fun, Problem) and fun.has_second_order
+    return "; this problem does it: problem.second_order(), with a start (q, v)" if can else ""
+
+
 def _method(method: Any) -> Any:
+    if method is None:
+        raise TypeError(
+            "integrate: method is missing. Take EIPDOP853 with rtol=1e-9 where the step may vary, EIPRK4 with h=... "
+            "where it is fixed, EIPRKN12 for q'' = a(t, q); eip_scipy.recommend(...) finds method and step."
+        )
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
         raise TypeError(
-            f"integrate: method must be an EIP class such as EIPRK4, or one that eip_method made; got {method!r}."
+            f"integrate: method must be an EIP class such as EIPRK4, or one that eip_method made; got {method!r}"
+            f"{_class_of(method)}."
         )
     if method._project_step is not EIPSolver._project_step:
         raise TypeError(f"integrate does not call {method.__name__}._project_step; use it through solve_ivp.")
     return method.TABLEAU
+
+
+def _class_of(method: Any) -> str:
+    """A hint of the class, where its name came, or SciPy's for the same."""
+    name = f"EIP{str(getattr(method, '__name__', method)).upper().removeprefix('EIP')}"
+    return f". Give the class: from eip_scipy import {name}" if name in solvers.__all__ else ""
 
 
 def _check_choices(request: Request) -> None:

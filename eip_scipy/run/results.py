@@ -36,6 +36,9 @@ class Origin(NamedTuple):
     invariants: Any
 
 
+UNSET = ("units", "epoch")  # fields that print where they hold something
+
+
 class IntegrationResult(OptimizeResult):
     """Result of `integrate`; fields by name or by key, as in SciPy's own results.
 
@@ -57,7 +60,8 @@ class IntegrationResult(OptimizeResult):
     sol : OdeSolution or None
         Likewise: the run as a function of time, with ``dense_output=True``.
     nfev, njev, nlu : int
-        Evaluations of the right-hand side and of the invariants' gradients, and factorisations.
+        Evaluations of the right-hand side and of the invariants' gradients, and factorisations. A one-step method of
+        another kind (`Lawson`, `Splitting`) adds what it evaluates in the place of the right-hand side.
     status : int
         0: the end was reached; 1: a callback or an event stopped the run; -1: a step failed.
     message : str
@@ -114,6 +118,12 @@ class IntegrationResult(OptimizeResult):
 
         return plot(self, names, orbit=orbit)
 
+    def view(self, path: Any = None, *, names: Any = None, reference: Any = None) -> Any:
+        """Write a page that plays the run, see `eip_scipy.view`."""
+        from .view import view
+
+        return view(self, path, names=names, reference=reference)
+
     def continue_to(self, t: float, **options: Any) -> IntegrationResult:
         """Go on from the last state to a later time, with the functions and options of the run.
 
@@ -162,8 +172,12 @@ class IntegrationResult(OptimizeResult):
 
         return continued(self, t, options)
 
+    def __repr__(self) -> str:
+        """Without what this run has none of."""
+        return repr(OptimizeResult({key: value for key, value in self.items() if key not in UNSET or value}))
+
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray"]
+        return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray", "view"]
 
     def __getstate__(self) -> None:
         """Of attributes beside the fields there is the origin alone, whose functions stay here."""

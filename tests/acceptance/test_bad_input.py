@@ -683,7 +683,7 @@ def test_options_of_other_solvers_warn_as_scipy_s(names):
         by_scipy(**options, invarients=3)
 
 
-@pytest.mark.parametrize("method", ["RK45", "EIPRK4", RK45, None, EIPSolver, 4])
+@pytest.mark.parametrize("method", ["RK45", "EIPRK4", RK45, EIPSolver, 4])
 def test_wrong_method(method):
     with pytest.raises(TypeError, match="method must be an EIP class such as EIPRK4"):
         by_integrate(method=method)
@@ -828,6 +828,40 @@ FORGOTTEN = [
 def test_forgotten_args_of_an_invariant(driver, invariants, match):
     with pytest.raises(TypeError, match=match + r"Invariant\(\.\.\., args=\(\.\.\.,\)\)"):
         driver(invariants=invariants)
+
+
+TIME_LEFT_OUT = [
+    Invariant(lambda y: y @ y, name="M"),
+    Invariant(lambda y: y @ y, square_gradient, name="M"),
+    Invariant(square, lambda y: 2 * y, name="M"),
+    Invariant(lambda y, m: m * (y @ y), name="M", args=(2.0,)),
+]
+
+
+@all_of_them
+@pytest.mark.parametrize("invariants", TIME_LEFT_OUT)
+def test_invariants_without_the_time(driver, invariants):
+    names = "t, y, args\\[0\\]" if invariants.args else "t, y"
+    with pytest.raises(
+        TypeError, match=rf"'M' is called with \({names}\): .* The time comes first, .* lambda {names}: "
+    ):
+        driver(invariants=invariants)
+
+
+def test_a_method_by_its_name():
+    for method in ("EIPRK4", "rk45", RK45):
+        with pytest.raises(TypeError, match=r"Give the class: from eip_scipy import EIPRK45?\.$"):
+            by_integrate(method=method)
+    with pytest.raises(TypeError, match=r"got 'Radau'\.$"):
+        by_integrate(method="Radau")
+
+
+@pytest.mark.parametrize("driver", [by_integrate, by_ensemble], ids=["integrate", "ensemble"])
+def test_names_of_parameters_that_nobody_knows(driver):
+    with pytest.raises(
+        TypeError, match=r"got {'k': 1.0}: give the values .* params=\[1.0, 2.0\], .* args=\(mapping,\)"
+    ):
+        driver(params={"k": 1.0})
 
 
 def test_type_errors_within_an_invariant_pass_unchanged():

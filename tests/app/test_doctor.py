@@ -4,8 +4,10 @@ import json
 
 import pytest
 
+import eip_scipy
 from eip_scipy.app import doctor
 from eip_scipy.app.cli import main
+from eip_scipy.core import config
 from eip_scipy.engine.native import BUILD
 
 
@@ -17,7 +19,7 @@ def test_says_what_is_there_and_that_it_works(capsys, tmp_path):
     assert text.count(" ok") == len(doctor.CHECKS)
     found = json.loads(file.read_text())
     assert all(check["passed"] for check in found["checks"])
-    assert found["extras"]["numba"]["extra"] == "numba"
+    assert found["installation"] == eip_scipy.show_config("dicts")
     assert main(["doctor", "--quiet"]) == 0
     assert capsys.readouterr().out == ""
 
@@ -31,6 +33,7 @@ def test_a_wrong_result_is_told(measure, capsys):
     assert "failed: sums." in shown.err
 
 
-def test_an_extra_that_is_absent_is_named(capsys):
-    assert main(["doctor"], trials=doctor.CHECKS[:1], packages=[("no_such_module", "plot", "figures")]) == 0
+def test_an_extra_that_is_absent_is_named(capsys, monkeypatch):
+    monkeypatch.setattr(config, "EXTRAS", {"no_such_module": ("plot", "figures")})
+    assert main(["doctor"], trials=doctor.CHECKS[:1]) == 0
     assert "no_such_module  absent: pip install 'eip_scipy[plot]'" in capsys.readouterr().out

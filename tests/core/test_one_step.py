@@ -143,6 +143,22 @@ def test_fun_is_called_only_where_someone_asks():
         assert counts[1] - counts[0] == 10 * each
 
 
+def test_a_method_says_what_it_evaluates():
+    """In fixed steps and adaptive ones, those rejected too."""
+
+    class Counted(RK43):
+        evaluations = 5
+
+    calls = []
+    method = eip_method(Counted(lambda t, y: calls.append(t) or oscillator(t, y)))
+    for options in ({"h": 0.1}, {"rtol": 1e-6, "first_step": 3.0}):
+        calls.clear()
+        sol = runs(method, **options)
+        assert 2 * (sol.nfev - 1) == len(calls)  # of both drivers; the derivative at the start is theirs
+    with pytest.raises(ValueError, match=r"evaluations must be an integer >= 0, got -1"):
+        eip_method(type("Wrong", (Verlet,), {"evaluations": -1})())
+
+
 def test_complex_states_keep_their_type():
     class Exact:
         order = 8

@@ -231,10 +231,48 @@ def test_pairs(H, names):
     assert all(f"{q} with {p}" in repr(problem) for q, p in problem.pairs)
 
 
-@pytest.mark.parametrize("H", ["px**2 + k*x**2", "px**2 + y", "p**2 + a*b", "3", "k"])
-def test_names_without_a_partner(H):
-    with pytest.raises(ValueError, match=r"no partner among coordinates and momenta .*params={'k': 1.0}"):
+@pytest.mark.parametrize(
+    ("H", "match"),
+    [
+        (
+            "px**2 + k*x**2",
+            r"not clear what k is: .* goes with it \(pairs found: x with px\).*params={'k': 1.0}",
+        ),
+        ("px**2 + y", r"not clear what y is: .*params={'y': 1.0}"),
+        ("p**2 + a*b", r"not clear what a and b and p are: .* goes with them \(pairs found: none\).*'p': 1.0}"),
+        ("3", r"H contains neither coordinates nor momenta\. Names are paired as x with px"),
+        ("k", r"not clear what k is"),
+    ],
+)
+def test_names_without_a_partner(H, match):
+    with pytest.raises(ValueError, match=match):
         hamiltonian(H)
+
+
+def test_parameters_by_name_in_runs():
+    """Those that are not named keep their values; an ensemble takes one for each member."""
+    problem, start = hamiltonian("p**2/(2*m) + k*q**2/2", params={"m": 2.0, "k": 1.0}), [1.0, 0.0]
+    options = {"method": EIPDOP853, "rtol": 1e-9, "atol": 1e-9}
+    run = integrate(problem, (0, 3), start, params={"k": 4.0}, **options)
+    np.testing.assert_array_equal(run.y, integrate(problem, (0, 3), start, params=[2.0, 4.0], **options).y)
+    members = ensemble(problem, (0, 3), start, params={"k": [1.0, 4.0]}, **options)
+    np.testing.assert_array_equal(members.y[1], run.y[:, -1])
+    for call in (integrate, ensemble):
+        with pytest.raises(ValueError, match=r"hamiltonian has no parameter 'K'\. It has m, k\."):
+            call(problem, (0, 3), start, params={"K": 4.0}, **options)
+        with pytest.raises(TypeError, match=r"the problem 'kepler' has no names for its parameters"):
+            call(kepler(), (0, 3), params={"eps": 0.0}, **options)
+
+
+def test_nystrom_methods_say_what_works():
+    """The problem in (q, v) where there is one, and not where there is none."""
+    options = {"method": EIPRKN12, "h": 0.1}
+    with pytest.raises(ValueError, match=r"Take a Runge-Kutta .*this problem does it: problem\.second_order\(\)"):
+        integrate(hamiltonian("px**2/4 + x**2/2"), (0, 1), [1.0, 2.0], **options)
+    prey = equations({"x": "x*(1 - y)", "y": "y*(x - 1)"})
+    for problem in (prey, hamiltonian("px**2*x + x**2")):
+        with pytest.raises(ValueError, match=r"Take a Runge-Kutta method such as EIPDOP853, .* as that half\.$"):
+            integrate(problem, (0, 1), [1.0, 2.0], **options)
 
 
 # --- equations, energies, gradients ---

@@ -242,7 +242,7 @@ def test_methods_that_problems_bring():
 
 
 def test_a_problem_without_a_method_needs_one():
-    with pytest.raises(TypeError, match=r"^integrate: method must be an EIP class such as EIPRK4.*; got None\.$"):
+    with pytest.raises(TypeError, match=r"^integrate: method is missing\. Take EIPDOP853 .*eip_scipy\.recommend"):
         integrate(kepler())
 
 
@@ -308,6 +308,24 @@ def test_adaptive_steps_of_lawson(tableau):
         errors.append(np.abs(run.y[:, -1] - scene.reference(2.0)).max())
     assert errors[0] < 1e-2
     assert errors[1] < 1e-2 * errors[0]
+
+
+@pytest.mark.parametrize("tableau", [RK3, RK4, DOP853], ids=lambda tableau: tableau.name)
+def test_lawson_counts_what_it_evaluates(tableau, monkeypatch):
+    """And the derivative at the start; the energy's gradient takes none."""
+    scene = korteweg_de_vries_solitons(points=64, t_end=1.0)
+    equation, calls = scene.equation, []
+    plain = equation.nonlinear
+    monkeypatch.setattr(equation, "nonlinear", lambda modes: calls.append(1) or plain(modes))
+    run = integrate(scene, (0, 0.1), method=eip_method(Lawson(equation, tableau)), h=0.01, check=False)
+    assert run.nfev == len(calls) > 10 * tableau.n_stages
+
+
+@pytest.mark.parametrize(("scheme", "flows"), [("strang", 1), ("s6", 6), ("rkn6", 6)])
+def test_splittings_count_their_pairs_of_transforms(scheme, flows):
+    scene = soliton(points=64, t_end=0.1)
+    run = integrate(scene, method=eip_method(Splitting(scene.equation, scheme)), h=0.01, invariants=())
+    assert run.nfev == 1 + 10 * flows
 
 
 def test_lawson_is_exact_for_linear_waves():

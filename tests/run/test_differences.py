@@ -9,7 +9,7 @@ from numba import njit
 from systems import jit_orbit, orbit, pericentre
 
 from eip_scipy import EIPRK4, EIPRK45, EIPRKN12, Invariant, ensemble, integrate, project
-from eip_scipy.core.invariants import InvariantSet
+from eip_scipy.core.invariants import LARGE, InvariantSet
 
 NUMBERS = ctypes.POINTER(ctypes.c_double)
 VALUE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, NUMBERS, NUMBERS, NUMBERS)
@@ -176,3 +176,41 @@ def test_nystrom(c):
     run = integrate(acceleration, (0, 60), pericentre(0.5), method=EIPRKN12, h=0.05, invariants=kept)
     assert run.compiled
     assert (run.max_defect < 1e-14).all()
+
+
+# What differences cost.
+
+
+def chain(t, y):
+    """A field on a ring: q'' = q_xx - sin(q)."""
+    q, v = y[: y.size // 2], y[y.size // 2 :]
+    out = np.empty(y.size)
+    out[: q.size] = v
+    out[q.size :] = np.roll(q, 1) - 2 * q + np.roll(q, -1) - np.sin(q)
+    return out
+
+
+def chain_energy(t, y):
+    q, v = y[: y.size // 2], y[y.size // 2 :]
+    return (v * v).sum() / 2 + ((np.roll(q, -1) - q) ** 2).sum() / 2 + (1 - np.cos(q)).sum()
+
+
+def pulse(m):
+    return np.concatenate([np.exp(-(np.linspace(-4, 4, m) ** 2)), np.zeros(m)])
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_gradients_of_a_large_grid_by_its_values_are_told(compiled):
+    """Once, with the line that mends it, which is right; a small state is not told."""
+    m = LARGE // 2
+    fun, energy = (njit(chain), njit(chain_energy)) if compiled else (chain, chain_energy)
+    told = pytest.warns(UserWarning, match=rf"no grad is given for 'H': .* {2 * m} evaluations .* w \* np.concatenate")
+    with told as found:
+        run = integrate(fun, (0, 0.1), pulse(m), method=EIPRK4, h=0.05, invariants=Invariant(energy, name="H"))
+    assert len(found) == 1
+    assert run.compiled == compiled
+    mended = Invariant(chain_energy, lambda t, y, f: np.concatenate([-f[m:], f[:m]]), uses_f=True, name="H")
+    other = integrate(chain, (0, 0.1), pulse(m), method=EIPRK4, h=0.05, invariants=mended)
+    np.testing.assert_allclose(run.y, other.y, rtol=0, atol=1e-13)
+    few = pulse(m - 1)
+    integrate(fun, (0, 0.1), few, method=EIPRK4, h=0.05, invariants=Invariant(energy, name="H"))

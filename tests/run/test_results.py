@@ -466,6 +466,11 @@ def test_plot_is_saved(tmp_path):
     assert (tmp_path / "run.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_a_run_prints_what_it_has():
+    assert "units" not in repr(integrate(oscillator, (0, 1), Y0, method=EIPRK4, h=0.1))
+    assert "units: G M = 1" in repr(kepler_run())
+
+
 def test_methods_are_listed():
     assert {"continue_to", "plot", "save", "to_xarray", "t", "y"} <= set(dir(kepler_run()))
     assert set(kepler_run()) >= FIELDS

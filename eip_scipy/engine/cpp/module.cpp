@@ -6,6 +6,14 @@
 #include "python_functions.hpp"
 #include "records.hpp"
 
+#if defined(__clang__)
+#define EIP_COMPILER __VERSION__  // begins with its name
+#elif defined(__GNUC__)
+#define EIP_COMPILER "GCC " __VERSION__
+#else
+#define EIP_COMPILER "an unnamed compiler"
+#endif
+
 namespace eip {
 
 // FailedCallError(which functions, which of them, t, bytes of y, of f, status): whoever made them says what it means.
@@ -575,6 +583,7 @@ PyMODINIT_FUNC EIP_INIT() {
         eip::add_functions(module, "comparators", eip::comparator_functions) < 0 ||
         eip::add_functions(module, "gradients", eip::gradient_functions) < 0 ||
         PyModule_AddStringConstant(module, "SOURCES", EIP_SOURCES) < 0 ||
+        PyModule_AddStringConstant(module, "COMPILER", EIP_COMPILER) < 0 ||
         PyModule_AddIntConstant(module, "HAS_V3", eip::has_v3()) < 0) {
         Py_DECREF(module);
         return nullptr;

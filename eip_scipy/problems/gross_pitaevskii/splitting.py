@@ -76,6 +76,8 @@ class Splitting:
     ----------
     gpe, scheme
     order : int
+    evaluations : int
+        Linear flows in a step, each of a pair of transforms, as an evaluation of the right-hand side.
     name : str
 
     Raises
@@ -106,6 +108,7 @@ class Splitting:
             scheme = SCHEMES[scheme]
         self.gpe, self.scheme = gpe, scheme
         self.order, self.name = scheme.order, f"splitting-{scheme.name}"
+        self.evaluations = len(scheme.linear)
         self._h: float | None = None
         self._flows: list[LinearFlow] = []
 

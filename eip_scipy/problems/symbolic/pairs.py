@@ -32,14 +32,24 @@ def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
             pairs.append((others[0], "p"))
             left = []
     if left or not pairs:
-        known = "; ".join(f"{q} with {p}" for q, p in pairs) or "no pairs"
-        raise ValueError(
-            f"hamiltonian: {', '.join(left) or 'H'} has no partner among coordinates and momenta (found: {known}). "
-            "Names are paired as x with px, q1 with p1, theta with p_theta. Give q and p, as in hamiltonian(H, 'a b', "
-            "'pa pb'), and the values of what is constant, as in params={'k': 1.0}."
-        )
+        raise ValueError(_unpaired(left, pairs))
     pairs.sort(key=lambda pair: _natural(pair[0]))
     return tuple(q for q, _ in pairs), tuple(p for _, p in pairs)
+
+
+def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
+    """What is wrong with names that are left without a partner, or with no names."""
+    rule = "Names are paired as x with px, q1 with p1, theta with p_theta; others by hamiltonian(H, 'a b', 'pa pb')."
+    if not left:
+        return f"hamiltonian: H contains neither coordinates nor momenta. {rule}"
+    are = "is" if len(left) == 1 else "are"
+    known = "; ".join(f"{q} with {p}" for q, p in pairs) or "none"
+    values = ", ".join(f"{name!r}: 1.0" for name in left)
+    return (
+        f"hamiltonian: it is not clear what {' and '.join(left)} {are}: no coordinate or momentum among the names of H "
+        f"goes with {'it' if len(left) == 1 else 'them'} (pairs found: {known}). A constant needs a value: "
+        f"params={{{values}}}. {rule}"
+    )
 
 
 def _coordinate(momentum: str, free: set[str]) -> str | None:

@@ -103,17 +103,13 @@ class SymbolicProblem(Problem):
             Where q' is no constant matrix W times p, or p' depends on p.
         """
         names, rates = self.system.components, self.system.rates
-        half = len(self.pairs)
-        q, p = names[:half], [symbol(item) for item in names[half:]]
-        canonical = half > 0 and len(names) == 2 * half
-        W = sympy.Matrix(rates[:half]).jacobian(p) if canonical else sympy.zeros(1)
-        constant = canonical and not W.has(*(symbol(item) for item in (*names, "t")))
-        linear = constant and sympy.simplify(sympy.Matrix(rates[:half]) - W * sympy.Matrix(p)).is_zero_matrix
-        if not linear or any(rate.has(*p) for rate in rates[half:]) or W.det() == 0:
+        half, W = len(self.pairs), self._kinetic()
+        if W is None:
             raise ValueError(
                 f"{self.name}: {_cut(rates)} is not q' = W p, p' = a(t, q) with a constant matrix W, as second order "
                 "needs."
             )
+        q, p = names[:half], [symbol(item) for item in names[half:]]
         new = as_names("the state", (*q, *(f"v_{item}" for item in q)))
         v = sympy.Matrix([symbol(item) for item in new[half:]])
         momenta = dict(zip(p, W.inv() * v, strict=True))
@@ -126,6 +122,23 @@ class SymbolicProblem(Problem):
             checks=self.checks,
             invariants=_invariants(system, self.params),
         )
+
+    @property
+    def has_second_order(self) -> bool:
+        """Whether `second_order` gives one."""
+        return self._kinetic() is not None
+
+    def _kinetic(self) -> Any:
+        """The matrix W of q' = W p, where it is constant and regular and p' does not depend on p; else None."""
+        names, rates, half = self.system.components, self.system.rates, len(self.pairs)
+        p = [symbol(item) for item in names[half:]]
+        if half == 0 or len(names) != 2 * half or any(rate.has(*p) for rate in rates[half:]):
+            return None
+        W = sympy.Matrix(rates[:half]).jacobian(p)
+        if W.has(*(symbol(item) for item in (*names, "t"))) or W.det() == 0:
+            return None
+        rest = sympy.simplify(sympy.Matrix(rates[:half]) - W * sympy.Matrix(p))
+        return W if rest.is_zero_matrix else None
 
     def __repr__(self) -> str:
         pairs = ", ".join(f"{q} with {p}" for q, p in self.pairs)

@@ -29,6 +29,8 @@ class Lawson:
     equation, tableau
     order : int
     error_estimator_order : int or None
+    evaluations : int
+        Of the nonlinear term in a step.
     name : str
 
     Raises
@@ -62,6 +64,7 @@ class Lawson:
             raise TypeError(f"Lawson: expected a Tableau, such as that of EIPDOP853, got {tableau!r}.")
         self.equation, self.tableau = equation, tableau
         self.order, self.error_estimator_order = tableau.order, tableau.error_estimator_order
+        self.evaluations = tableau.n_stages + tableau.fsal
         self.name = f"Lawson-{tableau.name}"
         self._h: float | None = None
         self._turns: list[np.ndarray] = []

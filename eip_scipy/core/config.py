@@ -1,0 +1,108 @@
+"""What is installed: versions, the engine's build, extras."""
+
+from __future__ import annotations
+
+import platform
+from pathlib import Path
+from typing import Any
+
+from ..engine.native import BUILD
+from .inputs import shown
+from .versions import VERSION, installed
+
+__all__ = ["configuration", "described", "show_config"]
+
+REQUIRED = "numpy", "scipy", "tqdm"
+# What a package that is not needed brings: its extra, and for what.
+EXTRAS = {
+    "numba": ("numba", "jitted functions of your own"),
+    "matplotlib": ("plot", "figures"),
+    "sympy": ("sympy", "hamiltonian, equations"),
+    "rebound": ("rebound", "simulations of REBOUND; WHFast and IAS15 to compare with"),
+    "heyoka": ("heyoka", "Taylor series to compare with"),
+    "astropy": ("astro", "quantities and times"),
+    "jplephem": ("jpl", "JPL's ephemerides"),
+    "xarray": ("xarray", "results as datasets"),
+    "pandas": ("pandas", "results as data frames"),
+    "zarr": ("zarr", "ensembles on disk"),
+    "dask": ("distributed", "ensembles on a cluster"),
+    "mpi4py": ("mpi", "states over many processes"),
+    "ducc0": ("fft", "faster Fourier transforms"),
+}
+
+
+def show_config(mode: str = "stdout") -> dict[str, Any] | None:
+    """Show versions, the engine's build and the extras, as `numpy.show_config` does: for a report of a defect.
+
+    Parameters
+    ----------
+    mode : {"stdout", "dicts"}
+        Print it, or return it.
+
+    Returns
+    -------
+    dict or None
+        With "dicts": ``versions``, of the package, Python and what it needs; ``engine``, its ``build``, whether that is
+        for ``AVX2 and FMA``, and its ``compiler``; ``extras``, by module the ``version`` (None: not installed), the
+        ``extra`` that brings it and what it is ``for``; ``folder`` and ``system``.
+
+    Raises
+    ------
+    ValueError
+        For another mode.
+
+    Notes
+    -----
+    ``eip-scipy doctor`` shows the same and runs a test of seconds.
+
+    Examples
+    --------
+    >>> import eip_scipy
+    >>> eip_scipy.show_config("dicts")["extras"]["matplotlib"]["extra"]
+    'plot'
+    """
+    if mode not in ("stdout", "dicts"):
+        raise ValueError(f"mode must be 'stdout' or 'dicts', got {shown(mode)}.")
+    found = configuration()
+    if mode == "dicts":
+        return found
+    print(described(found))
+    return None
+
+
+def configuration() -> dict[str, Any]:
+    """See `show_config`."""
+    fast = BUILD.__name__.endswith("_v3")
+    return {
+        "versions": {
+            "eip_scipy": VERSION,
+            "python": platform.python_version(),
+            **{package: installed(package) for package in REQUIRED},
+        },
+        "engine": {"build": BUILD.__name__.rpartition(".")[2], "AVX2 and FMA": fast, "compiler": BUILD.COMPILER},
+        "extras": {
+            module: {"version": installed(module), "extra": extra, "for": what}
+            for module, (extra, what) in EXTRAS.items()
+        },
+        "folder": str(Path(__file__).parents[1]),
+        "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
+    }
+
+
+def described(found: dict[str, Any]) -> str:
+    """A configuration as lines of text."""
+    engine, extras = found["engine"], found["extras"]
+    kind = "for AVX2 and FMA" if engine["AVX2 and FMA"] else "for any processor"
+    rows = {
+        **found["versions"],
+        "engine": f"{engine['build']}, {kind}, by {engine['compiler']}",
+        "folder": found["folder"],
+        "system": found["system"],
+    }
+    width = max(map(len, (*rows, *extras)))
+    lines = [f"{name:<{width}}  {value}" for name, value in rows.items()]
+    lines += ["", "extras"]
+    for module, entry in extras.items():
+        state = entry["version"] or f"absent: pip install 'eip_scipy[{entry['extra']}]'"
+        lines.append(f"{module:<{width}}  {state:<45}  {entry['for']}")
+    return "\n".join(lines)

@@ -1,0 +1,68 @@
+"""What a release says of itself: one version everywhere, what is promised about data, the page on what changed."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from test_docs import test_page as run_page
+
+import eip_scipy
+from eip_scipy.core.versions import versions
+
+ROOT = Path(__file__).parents[2]
+SOURCES = sorted([*(ROOT / "eip_scipy").rglob("*.py"), *(ROOT / "integrations").rglob("*.py")])
+UNPICKLES = {"pickle", "cPickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "runpy"}
+
+
+def test_one_version():
+    version = eip_scipy.__version__
+    assert versions()["eip_scipy"] == version
+    assert re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)[1] == version
+    assert re.search(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1] == version
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert project["project"]["dynamic"] == ["version"]
+    assert project["tool"]["setuptools"]["dynamic"]["version"]["attr"] == "eip_scipy.core.versions.VERSION"
+
+
+def forbidden(tree):
+    """What reads data as code, in a module: imports, calls, NumPy's pickles."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from {alias.name.partition(".")[0] for alias in node.names} & UNPICKLES
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield from {node.module.partition(".")[0]} & UNPICKLES
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("eval", "exec"):
+            yield node.func.id
+        elif isinstance(node, ast.keyword) and node.arg == "allow_pickle" and ast.unparse(node.value) != "False":
+            yield "allow_pickle"
+
+
+def test_no_data_is_run():
+    """As SECURITY.md promises."""
+    found = {str(path): [*forbidden(ast.parse(path.read_text(encoding="utf-8")))] for path in SOURCES}
+    assert {path: names for path, names in found.items() if names} == {}
+
+
+@pytest.mark.parametrize(
+    "text", ["import pickle", "from marshal import loads", "eval('1')", "np.load(path, allow_pickle=True)"]
+)
+def test_what_is_forbidden_is_seen(text):
+    assert [*forbidden(ast.parse(text))]
+
+
+def test_configuration(capsys):
+    found = eip_scipy.show_config("dicts")
+    assert found["versions"]["eip_scipy"] == eip_scipy.__version__
+    assert found["engine"]["compiler"]
+    assert capsys.readouterr().out == ""
+    eip_scipy.show_config()
+    text = capsys.readouterr().out
+    assert all(name in text for name in (found["engine"]["build"], found["engine"]["compiler"], *found["extras"]))
+    with pytest.raises(ValueError, match=r"mode must be 'stdout' or 'dicts', got 'json'\."):
+        eip_scipy.show_config("json")
+
+
+def test_the_page_on_what_changed(capsys, tmp_path, monkeypatch):
+    run_page("docs/changes-0.2.md", capsys, tmp_path, monkeypatch)
