@@ -98,6 +98,7 @@ class OctetFunctions(NamedTuple):
     inv: tuple[tuple[Any, int], ...]
     grad: tuple[tuple[Any, int], ...]
     owner: Any
+    jacobian: Any = None
 
 
 class Hooks(NamedTuple):

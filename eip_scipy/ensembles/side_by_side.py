@@ -11,23 +11,25 @@ from ..core.native_functions import Native
 from ..core.options import Options
 from ..core.pointers import PointerFunction
 from ..core.stepping import UNBOUNDED
-from ..engine.data import AUTO, NEW, Schedule
+from ..engine.data import AUTO, NEW, Multistep, Schedule
 from ..engine.native import LibraryFunction, NativeFunctions, OctetFunctions
 
 __all__ = ["LANES", "need_compiling", "octet_functions", "why_one_by_one"]
 
 LANES = 8
+NAMES = ("rhs", "inv", "grad", "jacobian")  # of a run's functions
 
 
-def why_one_by_one(options: Options, schedule: Schedule, dtype: np.dtype) -> str:
+def why_one_by_one(history: Multistep | None, options: Options, schedule: Schedule, dtype: np.dtype) -> str:
     """Why members with these options have to run one by one; "" where they take the same fixed steps."""
     reasons = {
         "steps are adaptive": options.adaptive,
         "the interval is endless": schedule.span.n_steps >= UNBOUNDED,
         "the state is complex": np.dtype(dtype).kind == "c",
         "events may end members at different times": schedule.g.size > 0,
-        "compensated=True": options.compensated,
-        "every='auto'": options.every == AUTO,
+        "there are fewer steps than the method's history has": history is not None and history.brief,
+        "compensated=True": history is None and options.compensated,
+        "every='auto'": history is None and options.every == AUTO,
         "iterations > 1": options.iterations > 1,
         "direction is not 'new'": options.direction != NEW,
     }
@@ -43,16 +45,22 @@ def octet_functions(functions: NativeFunctions) -> OctetFunctions:
         Where there are none, with the name of the function and the reason.
     """
     owner = functions.owner
-    found = {name: [_of_eight(native) for native in owner[name]] for name in ("rhs", "inv", "grad")}
-    return OctetFunctions(rhs=found["rhs"][0][0], inv=tuple(found["inv"]), grad=tuple(found["grad"]), owner=functions)
+    found = {name: [_of_eight(native) for native in owner.get(name, [])] for name in NAMES}
+    return OctetFunctions(
+        rhs=found["rhs"][0][0],
+        inv=tuple(found["inv"]),
+        grad=tuple(found["grad"]),
+        owner=functions,
+        jacobian=found["jacobian"][0][0] if found["jacobian"] else None,
+    )
 
 
 def need_compiling(functions: NativeFunctions) -> bool:
     """Whether some of them are Numba functions, which are compiled once more for eight members."""
     return any(
         not isinstance(native.function, (PointerFunction, LibraryFunction))
-        for name in ("rhs", "inv", "grad")
-        for native in functions.owner[name]
+        for name in NAMES
+        for native in functions.owner.get(name, [])
     )
 
 

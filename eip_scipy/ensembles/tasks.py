@@ -390,7 +390,7 @@ class Sweeper:
     def _go_side_by_side(self, members: int) -> str:
         driver = self.loop.driver
         run, schedule = driver.run, driver.schedule
-        reason = why_one_by_one(run.options, schedule, run.y0.dtype)
+        reason = why_one_by_one(run.method.multistep, run.options, schedule, run.y0.dtype)
         little = members * schedule.span.n_steps * run.y0.size < LEAST_WORK
         if not reason and little and need_compiling(driver.functions):
             reason = "there is less to do than functions for eight members take to compile"

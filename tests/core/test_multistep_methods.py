@@ -293,7 +293,7 @@ def test_evaluations_do_not_depend_on_how_fast_the_machine_is(monkeypatch):
 
 
 def test_members_have_the_bits_of_single_runs():
-    """In an ensemble, one after the other."""
+    """In an ensemble; more of them in tests/ensembles/test_side_by_side.py."""
     problem = solar_system(years=3)
     starts = problem.y0 * (1 + 1e-6 * np.arange(3)[:, None])
     result = ensemble(problem, None, starts, method=EIPGJ14, h=1 / 500)

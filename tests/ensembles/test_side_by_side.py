@@ -6,9 +6,21 @@ import numpy as np
 import pytest
 from numba import njit
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ12,
+    EIPGJ14,
+    EIPRK4,
+    EIPRK5,
+    EIPRK45,
+    EIPRKN8,
+    EIPRKN12,
+    Invariant,
+    ensemble,
+    integrate,
+)  # fmt: skip
 from eip_scipy.ensembles import tasks
-from eip_scipy.problems import harmonic, kepler, solar_system
+from eip_scipy.problems import Problem, harmonic, kepler, solar_system
 from eip_scipy.problems.gravity.nbody import nbody
 
 FIELDS = ("y", "max_defect", "nfev", "njev", "nlu")
@@ -279,3 +291,123 @@ def test_adaptive_members_run_one_by_one():
     run = check_bits(harmonic(), (0, 1), starts, method=EIPRK45, first_step=0.1)
     assert not run.side_by_side.any()
     assert run.one_by_one == "steps are adaptive"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"save_every": 7},
+        {"t_eval": np.array([0.0, 0.001, 0.5, 0.5001, 2.9, 2.9999, 3.0])},
+        {"every": 1, "save_every": 50},
+        {"every": 7},
+        {"invariants": ()},
+        {"metric": "euclidean"},
+    ],
+    ids=lambda options: "-".join(options) or "defaults",
+)
+@pytest.mark.parametrize("method", [EIPGJ12, EIPGJ14])
+def test_members_of_multistep_methods(method, options):
+    problem = solar_system(years=100.0)
+    starts = spread_starts(problem.y0, 11, size=1e-7)
+    run = check_bits(problem, (0, 3), starts, method=method, h=1 / 620, members=[0, 4, 7, 8, 10], **options)
+    assert run.side_by_side.all()
+    assert run.one_by_one == ""
+
+
+def test_multistep_members_backward_and_on_two_dimensions():
+    run = check_bits(kepler(), (1.0, -40.3), spread_starts(kepler().y0, 9), method=EIPGJ14, h=0.02, save_every=100)
+    assert run.side_by_side.all()
+    assert np.all(run.nlu > 0)
+
+
+@pytest.mark.parametrize("kept", [(0,), (1,), (0, 1)], ids=["H", "L", "both"])
+def test_multistep_members_keep_any_number_of_invariants(kept):
+    problem = solar_system(years=100.0)
+    starts = spread_starts(problem.y0, 8, size=1e-7)
+    invariants = [problem.invariants[k] for k in kept]
+    run = check_bits(problem, (0, 2), starts, method=EIPGJ14, h=1 / 412, invariants=invariants, members=[0, 7])
+    assert run.side_by_side.all()
+
+
+def test_multistep_members_with_bodies_of_their_own():
+    """Masses of each member, in some of which another body is the heaviest: that is what the Jacobian is of."""
+    problem = solar_system(years=100.0)
+    masses = problem.params * (1 + 1e-3 * np.random.default_rng(3).normal(size=(9, 10)))
+    starts = spread_starts(problem.y0, 9, size=1e-7)
+    check_bits(problem, (0, 2), starts, params=masses, method=EIPGJ14, h=1 / 412, members=[0, 4, 8])
+    places, speeds = [[-0.5, 0, 0], [0.5, 0, 0], [9, 0, 0]], [[0, -0.7, 0], [0, 0.7, 0], [0, 0.46, 0]]
+    pair = nbody([1.0, 0.9, 1e-3], places, speeds, t_span=(0, 40))
+    weights = np.tile(pair.params, (8, 1))
+    weights[1::2, :2] = weights[1::2, 1::-1]
+    run = check_bits(pair, (0, 40), np.tile(pair.y0, (8, 1)), params=weights, method=EIPGJ14, h=0.02)
+    assert run.side_by_side.all()
+
+
+def test_a_multistep_member_that_fails_disturbs_no_other():
+    """One starts with NaN, one has its orbit's pericentre where the step is not stable any more."""
+    starts = spread_starts(kepler().y0, 10)
+    starts[3, 0] = np.nan
+    starts[6] = [1.6, 0.0, 0.0, 0.3]
+    run = check_bits(
+        kepler(), (0, 30), starts, method=EIPGJ14, h=0.02, save_every=100, members=[0, 1, 2, 4, 5, 6, 7, 9]
+    )
+    assert list(run.failed) == [3, 6]
+    assert "not small" in run.message[6] or "projection failed" in run.message[6]
+    assert list(np.flatnonzero(~run.side_by_side)) == [3, 6]
+
+
+@pytest.mark.parametrize("together", [True, False], ids=["side by side", "one by one"])
+def test_evaluations_of_multistep_members_do_not_depend_on_how_fast_the_machine_is(monkeypatch, together):
+    """Calls of the engine that end anywhere, within the last states too."""
+    monkeypatch.setattr(tasks, "FIRST_STEPS", 3)
+    monkeypatch.setattr(tasks, "SWEEP_SECONDS", 0.0)
+    if not together:
+        monkeypatch.setattr(tasks, "why_one_by_one", lambda *_: "a test")
+    run = check_bits(kepler(), (0, 3.01), spread_starts(kepler().y0, 9), method=EIPGJ14, h=0.02)
+    assert run.side_by_side.all() == together
+
+
+def test_multistep_members_without_a_history_run_one_by_one():
+    run = check_bits(kepler(), (0, 0.2), spread_starts(kepler().y0, 9), method=EIPGJ14, h=0.02)
+    assert not run.side_by_side.any()
+    assert run.one_by_one == "there are fewer steps than the method's history has"
+
+
+@njit
+def springs(t, q, out, params):
+    for i in range(q.size):
+        out[i] = -params[0] * (i + 1.0) * q[i] - 0.1 * q[i] ** 3
+
+
+@njit
+def springs_jacobian(t, q, dq, out, params):
+    for i in range(q.size):
+        out[i] = -(params[0] * (i + 1.0) + 0.3 * q[i] ** 2) * dq[i]
+
+
+@pytest.mark.slow
+@pytest.mark.needs_jit
+def test_multistep_members_by_functions_of_the_users_own():
+    starts = np.random.default_rng(5).normal(size=(10, 6))
+    params = np.linspace(0.5, 2, 10)[:, None]
+    options = {"h": 0.05, "in_place": True, "invariants": (), "method": EIPGJ14, "jacobian": springs_jacobian}
+    run = check_bits(springs, (0, 20), starts, params=params, **options)
+    assert run.side_by_side.all()
+
+
+@njit
+def drifting(t, y, out, params):
+    half = y.size // 2
+    for i in range(half):
+        out[i] = y[half + i]
+        out[half + i] = -params[0] * (i + 1.0) * y[i] - 1e-5 * y[half + i]
+
+
+@pytest.mark.slow
+@pytest.mark.needs_jit
+def test_multistep_members_whose_accelerations_take_velocities():
+    params = np.array([1.0])
+    problem = Problem("drifting", lambda t, y: None, np.ones(6), (0.0, 20.0), rhs=drifting, params=params)
+    run = check_bits(problem, (0, 20), spread_starts(problem.y0, 9), method=EIPGJ12, h=0.02, save_every=90)
+    assert run.side_by_side.all()

@@ -111,7 +111,7 @@ inline double least_step(double t, double sign) { return 10.0 * std::abs(std::ne
 // TOO_SMALL; of a multistep method UNSTABLE too.
 template <class AnyRun>
 inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_t k, const double *y, double *y_new) {
-    if (run.method.multistep) return next_states(of_any_length(run), span, clock, k, k + 1, y, y_new);
+    if (run.method.multistep) return next_states(OneState{of_any_length(run), y_new}, span, clock, k, k + 1, y, y_new);
     const Options &o = run.options;
     const auto &w = run.work;
     const bool adaptive = span.h == 0.0;

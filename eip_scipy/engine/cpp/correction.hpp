@@ -24,8 +24,8 @@ template <class Value, class W>
 inline MatrixOf<Value> small(Value *a, int64_t size, const W &w) { return {a, size, size, w.l}; }
 
 // w.values = I(y); compensated runs add what the carry is worth, by the gradients at hand.
-template <class AnyRun>
-inline void evaluate_invariants(const AnyRun &run, double t, const double *y) {
+template <class AnyRun, class Value>
+inline void evaluate_invariants(const AnyRun &run, double t, const Value *y) {
     const auto &w = run.work;
     run.system.inv(w, t, y, w.values);
     if (run.options.compensated)

@@ -24,6 +24,9 @@ enum Counter : int {
 };
 enum Clock : int { TIME, TIME_NEW, LENGTH, NEXT_LENGTH };
 enum Place : int { STEP, ROW, PENDING };
+// And of a multistep method's history: whether there is one, the newest node and its row, nodes since the last projection,
+// and estimates collected.
+enum Node : int { HAVE_NODES, NEWEST, NEWEST_ROW, SINCE, SEEN, N_NODE_PLACES };
 
 // Columns of the figures of a run's projections (trust.py says what they mean).
 enum Figure : int {

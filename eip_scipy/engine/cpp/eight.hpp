@@ -9,21 +9,23 @@ namespace eip {
 struct Eight {
     using Run = RunOf<Work, OctetSystem>;
 
-    const Method &method;
+    Method method;
     Options options;  // those of the run, tolerances for 8 n floats
     OctetSystem system;
     std::vector<Octet> memory;
     std::vector<double> tolerances, no_norm;
+    Multistep multistep{};  // of a multistep method: that of one state of 8 n floats
     int64_t counters[N_COUNTERS] = {};
     Work flat{};
     WorkOf<Octet> work{};
     SizedWith<4, 2, Octet> short_work{work};  // the same where it is of that length
-    Octet *y, *y_new, *projections, *skips, *reduced;
+    Octet *y, *y_new, *projections, *skips, *reduced, *levels, *nodes, *sums, *predicted, *change;
     // Members that are still here; their counters beyond those of all; rank of the last projection.
     bool alive[LANES] = {};
     int64_t first = -1, count = 0;  // the first of them, of how many in all
     int64_t step = 0, row = 0;      // the next step, and the next row to be saved
     int64_t own[LANES][N_COUNTERS] = {}, rank[LANES] = {};
+    int64_t place[N_NODE_PLACES] = {}, projected[LANES] = {};  // of the history; the node of each one's last projection
 
     Eight(const Method &method, const Options &o, const Work &w, OctetSystem functions)
         : method(method), options(o), system(std::move(functions)), no_norm(1) {
@@ -31,13 +33,17 @@ struct Eight {
         work.n = work.m = n;
         work.l = l;
         work.stages = w.stages;
+        const Multistep *ms = method.multistep;
+        const int64_t half = ms ? ms->half : 0, nodes_kept = ms ? ms->rows : 0;
         const std::pair<Octet **, int64_t> places[] = {
             {&work.K, (w.stages + 1) * n}, {&work.G, l * n}, {&work.Q, l * n}, {&work.R, l * l}, {&work.stage, n},
             {&work.y_hat, n}, {&work.err, n}, {&work.err_low, n}, {&work.err_sum, n},
             {&work.sigma, n}, {&work.move, n}, {&work.scale, blocks}, {&work.ratio, blocks}, {&work.mu, l},
             {&work.values, l}, {&work.g, l}, {&work.band, l}, {&work.before, l}, {&work.worth, l}, {&work.defect, l},
             {&work.max_defect, l}, {&work.target, l}, {&work.trust, l * N_FIGURES}, {&work.products, products},
-            {&work.max_correction, 1}, {&y, n}, {&y_new, n}, {&projections, 1}, {&skips, 1}, {&reduced, 1}};
+            {&work.max_correction, 1}, {&y, n}, {&y_new, n}, {&projections, 1}, {&skips, 1}, {&reduced, 1},
+            {&work.carry, n}, {&work.carry_hat, n}, {&work.f_point, n}, {&levels, 3 * l}, {&nodes, nodes_kept * half},
+            {&sums, 4 * half}, {&predicted, 3 * half}, {&change, half}};
         int64_t total = 0;
         for (const auto &[place, count] : places) total += count;
         memory.resize(total, Octet(0.0));
@@ -54,6 +60,7 @@ struct Eight {
             tolerances[LANES * n + i] = o.atol[i / LANES];
         }
         flatten(w);
+        if (ms) lengthen(*ms, nodes_kept);
     }
 
     Run run() { return {method, flat_options_, flat, system, nullptr}; }
@@ -77,13 +84,30 @@ struct Eight {
         flat.stages = w.stages;
         for (const auto &[place, octets] : std::initializer_list<std::pair<double **, Octet *>>{
                  {&flat.K, work.K}, {&flat.stage, work.stage}, {&flat.y_hat, work.y_hat}, {&flat.err, work.err},
-                 {&flat.err_low, work.err_low}, {&flat.err_sum, work.err_sum}})
+                 {&flat.err_low, work.err_low}, {&flat.err_sum, work.err_sum}, {&flat.carry, work.carry},
+                 {&flat.carry_hat, work.carry_hat}, {&flat.f_point, work.f_point}, {&flat.move, work.move}})
             *place = OctetSystem::floats_of(octets);
         flat.norm = no_norm.data();
         flat.counters = counters;
         flat_options_ = options;
         flat_options_.rtol = tolerances.data();
         flat_options_.atol = tolerances.data() + LANES * w.n;
+    }
+
+    // The history of one state of 8 n floats.
+    void lengthen(const Multistep &one, int64_t rows) {
+        multistep = one;
+        multistep.half = multistep.pitch = LANES * one.half;
+        multistep.rows = rows;
+        multistep.first *= LANES;
+        multistep.count *= LANES;
+        multistep.nodes = OctetSystem::floats_of(nodes);
+        multistep.sums = OctetSystem::floats_of(sums);
+        multistep.predicted = OctetSystem::floats_of(predicted);
+        multistep.change = OctetSystem::floats_of(change);
+        multistep.levels = OctetSystem::floats_of(levels);
+        multistep.place = place;
+        method.multistep = &multistep;
     }
 };
 

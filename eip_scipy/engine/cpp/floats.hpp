@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <vector>
 
 #include "values.hpp"
 
@@ -37,6 +38,22 @@ inline double norm(const double *a, int64_t n) {
     double total = 0.0;
     for (int64_t i = 0; i < n; ++i) total += (a[i] / top) * (a[i] / top);
     return top * std::sqrt(total);
+}
+
+// Of each of eight members.
+inline Octet norm(const Octet *a, int64_t n) {
+    const Octet square = dot(a, a, n);
+    const Mask extreme = !((1e-200 < square) & (square < 1e200));
+    if (!any(extreme)) return sqrt(square);
+    double norms[LANES];
+    sqrt(square).store(norms);
+    std::vector<double> own(n);
+    for (int lane = 0; lane < LANES; ++lane) {
+        if (!extreme.lane(lane)) continue;
+        for (int64_t i = 0; i < n; ++i) own[i] = a[i].lane(lane);
+        norms[lane] = norm(own.data(), n);
+    }
+    return Octet::load(norms);
 }
 
 // Whether no entry is NaN or infinite: the sum of squares is finite too unless it overflows; x - x is 0 then.

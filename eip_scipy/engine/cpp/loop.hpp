@@ -150,6 +150,13 @@ inline int64_t next_stop(const Method &method, const Samples *samples, const Sch
     return std::max(stop, k + 1);
 }
 
+// The step up to which a member goes that is at step k, in so many steps: to its end where a multistep method is near it,
+// whose last states cost a step of the method that starts, each of them that is asked for.
+inline int64_t last_of(const Method &method, const Span &span, int64_t k, int64_t steps) {
+    const bool near = method.multistep && span.n_steps - method.multistep->middle <= k + steps;
+    return near ? span.n_steps : k + steps;
+}
+
 // Steps up to `k_end`; returns OK or why it stopped. Without `samples` it pauses where there is something to sample.
 template <class AnyRun>
 [[gnu::noinline]] inline Code advance(const AnyRun &run, Samples *samples, const Schedule &s, int64_t k_end, double *y,
@@ -171,8 +178,9 @@ template <class AnyRun>
             *samples->interpolants.count == samples->interpolants.capacity)
             return FULL;
         const int64_t stop = next_stop(run.method, samples, s, k, k_end);
-        const Code status = stop == k + 1 ? next_step(run, s.span, s.clock, k, y, y_new)
-                                          : next_states(of_any_length(run), s.span, s.clock, k, stop, y, y_new);
+        const Code status =
+            stop == k + 1 ? next_step(run, s.span, s.clock, k, y, y_new)
+                          : next_states(OneState{of_any_length(run), y_new}, s.span, s.clock, k, stop, y, y_new);
         if (status != OK) return status;
         place[STEP] = stop;
         place[PENDING] = 1;

@@ -35,7 +35,7 @@ inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, co
     std::fill_n(w.counters, static_cast<int64_t>(N_COUNTERS), 0);
     w.counters[NFEV] = members.evaluations;
     std::fill_n(s.place, 3, 0);
-    if (run.method.multistep) std::fill_n(run.method.multistep->place, static_cast<int64_t>(N_NODE_PLACES), 0);
+    if (run.method.multistep) forget_history(*run.method.multistep, w.l);
     s.clock[TIME] = s.clock[TIME_NEW] = t0;
     s.clock[NEXT_LENGTH] = members.first_steps[k];
     if (std::isnan(members.first_steps[k])) return false;
@@ -104,8 +104,9 @@ inline Code sweep(const AnyRun &run, Samples *samples, const Schedule &s, const 
         if (!begun && !begin_member(of_any_length(run), samples, s, members, y)) return DOUBTFUL;
         begun = 1;
         const int64_t before = s.place[STEP];
-        const Code code = advance(run, samples, s, before + steps, y, y_new, members.saved(k, run.work));
-        steps -= s.place[STEP] - before;
+        const int64_t k_end = last_of(run.method, s.span, before, steps);
+        const Code code = advance(run, samples, s, k_end, y, y_new, members.saved(k, run.work));
+        steps = std::max<int64_t>(0, steps - (s.place[STEP] - before));
         if (code == OK && s.clock[TIME] != s.span.t_bound) return OK;
         if (code != OK && code != ENDED) return code;
         end_member(of_any_length(run), samples, s, members, y, code);

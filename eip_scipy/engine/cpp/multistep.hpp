@@ -8,9 +8,6 @@
 
 namespace eip {
 
-// Places in Multistep::place: whether there is a history, the newest node and its row, nodes since the last projection,
-// and estimates collected.
-enum Node : int { HAVE_NODES, NEWEST, NEWEST_ROW, SINCE, SEEN, N_NODE_PLACES };
 // Estimates that are collected before one is used, and what is left of each a turn later.
 constexpr int64_t COLLECTED = 20;
 constexpr double MEMORY = 0.9;
@@ -61,10 +58,15 @@ inline void row_sums(const Rows &rows, int64_t i, Value *out) {
 
 // The vectors that hold the entries `first` to `end` - 1.
 inline void row_sums(const Rows &rows, double *out, int64_t first, int64_t end) {
-    for (int64_t i = first - first % WIDTH; i < end; i += WIDTH) {
-        Vector sum;
-        row_sums<Vector, 1>(rows, i, &sum);
-        store(sum, out + i);
+    Vector sums[4];
+    int64_t i = first - first % WIDTH;
+    for (; end - i > 3 * WIDTH; i += 4 * WIDTH) {
+        row_sums<Vector, 4>(rows, i, sums);
+        for (int k = 0; k < 4; ++k) store(sums[k], out + i + k * WIDTH);
+    }
+    for (; i < end; i += WIDTH) {
+        row_sums<Vector, 1>(rows, i, sums);
+        store(sums[0], out + i);
     }
 }
 
@@ -163,8 +165,15 @@ inline void begin_sums(const Multistep &ms, int64_t back, double *scratch) {
     }
 }
 
+// As before the first step.
+inline void forget_history(const Multistep &ms, int64_t l) {
+    std::fill_n(ms.place, static_cast<int64_t>(N_NODE_PLACES), 0);
+    fill(ms.levels, 0.0, 3 * l);
+}
+
 // A step of the method that starts, from (y, w.carry) at t, with the derivative in w.row(0); into w.y_hat, w.carry_hat.
-inline void start_step(const Run &run, double t, double h, const double *y) {
+template <class AnyRun>
+inline void start_step(const AnyRun &run, double t, double h, const double *y) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     const double part = h / static_cast<double>(ms.substeps);
@@ -185,8 +194,10 @@ inline void start_step(const Run &run, double t, double h, const double *y) {
     }
 }
 
-// The first `order` nodes, from y at the start with the derivative in w.row(0); `y` is overwritten.
-inline Code begin_history(const Run &run, double *y) {
+// The first `order` nodes, from y at the start with the derivative in w.row(0); `y` is overwritten. Of eight members what is
+// not finite stays in one, and shows when that is looked at.
+template <class AnyRun>
+inline Code begin_history(const AnyRun &run, double *y) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     double *S = ms.sums;
@@ -201,7 +212,7 @@ inline Code begin_history(const Run &run, double *y) {
             run.system.rhs(w, ms.t0 + static_cast<double>(k) * ms.h, y, w.row(0));
             ++w.counters[NFEV];
         }
-        if (!all_finite(w.row(0), w.m)) return NOT_FINITE;
+        if (run.system.MEMBERS == 1 && !all_finite(w.row(0), w.m)) return NOT_FINITE;
         copy(w.row(0) + ms.half, next_row(ms), ms.half);
         ++ms.place[NEWEST_ROW];
         if (k != ms.order - 1 - ms.middle) continue;
@@ -217,7 +228,8 @@ inline Code begin_history(const Run &run, double *y) {
 
 // What the corrector would change of the newest position, times the Jacobian, is added to the newest acceleration; `older`
 // is the older nodes' part of it.
-inline void correct_node(const Run &run, double t, double *q, const double *older, double *a) {
+template <class AnyRun>
+inline void correct_node(const AnyRun &run, double t, double *q, const double *older, double *a) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     const int64_t end = ms.first + ms.count;
@@ -229,7 +241,8 @@ inline void correct_node(const Run &run, double t, double *q, const double *olde
 }
 
 // One more node.
-inline Code add_node(const Run &run) {
+template <class AnyRun>
+inline Code add_node(const AnyRun &run) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] + 1) * ms.h;
@@ -241,7 +254,7 @@ inline Code add_node(const Run &run) {
     double *a = next_row(ms);
     run.system.acceleration(w, t, y, w.row(1), a);
     ++w.counters[NFEV];
-    if (!is_finite_row(ms, a)) return NOT_FINITE;
+    if (run.system.MEMBERS == 1 && !is_finite_row(ms, a)) return NOT_FINITE;
     if (ms.count > 0) correct_node(run, t, y, older, a);
     add_to_sums(ms, a);
     ++ms.place[NEWEST_ROW];
@@ -252,45 +265,50 @@ inline Code add_node(const Run &run) {
 
 // Whether the highest difference of the newest nodes is small beside the accelerations, in each body or in all together: it
 // is that of a smooth motion in steps that resolve it.
-inline bool is_smooth(const Multistep &ms, const Options &o, const double *highest) {
-    const int64_t size = o.blocks.size == 3 && ms.half % 3 == 0 ? 3 : ms.half;
-    for (int64_t i = 0; i < ms.half; i += size) {
-        double top = 0.0;
+template <class Value>
+inline Truth<Value> is_smooth(const Multistep &ms, const Options &o, const Value *highest, int64_t half) {
+    const int64_t size = o.blocks.size == 3 && half % 3 == 0 ? 3 : half;
+    Truth<Value> rough{};
+    for (int64_t i = 0; i < half; i += size) {
+        Value top = 0.0;
         for (const int64_t back : {int64_t{0}, ms.middle, ms.order - 1})
-            top = std::max(top, norm(newest(ms) - back * ms.pitch + i, size));
-        if (!(norm(highest + i, size) <= ms.growth * top)) return false;
+            top = max(top, norm(as_values<Value>(newest(ms) - back * ms.pitch) + i, size));
+        rough = rough | !(norm(highest + i, size) <= ms.growth * top);
     }
-    return true;
+    return !rough;
 }
 
-// The shape of the steps' errors into w.err_sum, collected over the last turns, and their size now; UNSTABLE where the
-// history is not smooth.
-template <class W>
-inline Code estimate_nodes(const Multistep &ms, const Options &o, double &size, const W &w) {
-    const int64_t half = ms.half, n = ms.order + 1;
-    double *shape = w.move, *highest = w.stage;
-    weighted_sum(1.0, latest(ms, ms.size, n), highest, half);
-    if (!is_smooth(ms, o, highest)) return UNSTABLE;
-    weighted_sum(ms.h * ms.h, latest(ms, ms.shape_q, n), shape, half);
-    weighted_sum(ms.h, latest(ms, ms.shape_v, n), shape + half, half);
-    const double *last = newest(ms), *before = last - ms.pitch;
+// The shape of the steps' errors into w.err_sum, collected over the last turns, and their size now, which counts where the
+// history is smooth; whether it is.
+template <class W, class Value = typename W::Value>
+inline Truth<Value> estimate_nodes(const Multistep &ms, const Options &o, Value &size, const W &w) {
+    const int64_t half = w.m / 2, n = ms.order + 1;
+    Value *shape = w.move, *highest = w.stage;
+    weighted_sum(1.0, latest(ms, ms.size, n), as_floats(highest), ms.half);
+    const Truth<Value> smooth = is_smooth(ms, o, highest, half);
+    weighted_sum(ms.h * ms.h, latest(ms, ms.shape_q, n), as_floats(shape), ms.half);
+    weighted_sum(ms.h, latest(ms, ms.shape_v, n), as_floats(shape + half), ms.half);
+    const Value *last = as_values<Value>(newest(ms)), *before = as_values<Value>(newest(ms) - ms.pitch);
     for (int64_t i = 0; i < half; ++i) w.f_point[i] = last[i] - before[i];
-    const double faster = norm(shape + half, half) * norm(last, half) * ms.h, slower = norm(shape, half) * norm(w.f_point, half);
-    if (faster > 0.0) scale_by(shape + half, std::min(1.0, slower / faster), half);
-    const double lower = norm(shape, half), upper = ms.h * ms.h * norm(highest, half);
-    size = lower > 0.0 ? ms.error_constant * upper / lower : 0.0;
-    for (int64_t i = 0; i < w.m; ++i) w.err_sum[i] = MEMORY * w.err_sum[i] + std::abs(shape[i]);
+    const Value faster = norm(shape + half, half) * norm(last, half) * ms.h;
+    const Value slower = norm(shape, half) * norm(w.f_point, half);
+    const Value part = where(faster > 0.0, min(Value(1.0), slower / faster), 1.0);
+    for (int64_t i = half; i < w.m; ++i) shape[i] *= part;
+    const Value lower = norm(shape, half), upper = ms.h * ms.h * norm(highest, half);
+    size = where(lower > 0.0, ms.error_constant * upper / lower, 0.0);
+    for (int64_t i = 0; i < w.m; ++i) w.err_sum[i] = MEMORY * w.err_sum[i] + abs(shape[i]);
     ++ms.place[SEEN];
-    return OK;
+    return smooth;
 }
 
 // (scratch, w.carry_hat): the state in the middle of the history; the invariants there in w.values, their gradients in w.G.
-inline void values_in_the_middle(const Run &run, double *scratch) {
+template <class AnyRun, class Value>
+inline void values_in_the_middle(const AnyRun &run, Value *scratch) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] - ms.middle) * ms.h;
-    state_of(ms, ms.middle, scratch, w.carry_hat);
-    slope_of(ms, ms.middle, scratch, w.f_point);
+    state_of(ms, ms.middle, as_floats(scratch), as_floats(w.carry_hat));
+    slope_of(ms, ms.middle, as_floats(scratch), as_floats(w.f_point));
     run.system.grad(w, t, scratch, w.f_point, w.G);
     evaluate_invariants(run, t, scratch);
     ++w.counters[NJEV];
@@ -314,22 +332,25 @@ inline void values_in_the_middle(const Run &run, double *scratch) {
 // How far the values in w.values are from where they began, into w.target.
 template <class W>
 inline void defects_of_values(const Multistep &ms, const W &w) {
-    for (int64_t i = 0; i < w.l; ++i) w.target[i] = (w.values[i] - ms.levels[i]) - ms.levels[w.l + i];
+    const auto *levels = as_values<typename W::Value>(ms.levels);
+    for (int64_t i = 0; i < w.l; ++i) w.target[i] = (w.values[i] - levels[i]) - levels[w.l + i];
 }
 
 // (w.y_hat, w.carry_hat): the newest state, with the gradients there in w.G.
-inline void newest_state(const Run &run, double t) {
+template <class AnyRun>
+inline void newest_state(const AnyRun &run, double t) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
-    state_of(ms, 0, w.y_hat, w.carry_hat);
-    slope_of(ms, 0, w.y_hat, w.last());
+    state_of(ms, 0, as_floats(w.y_hat), as_floats(w.carry_hat));
+    slope_of(ms, 0, as_floats(w.y_hat), as_floats(w.last()));
     run.system.grad(w, t, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
 }
 
 // What is to be corrected at the newest state, into w.target: the defects in the middle of the history, where the formula for
 // the state is the most accurate. Values and gradients at the newest state are left in w.values and w.G.
-inline void defects_in_the_middle(const Run &run, double t, double *scratch) {
+template <class AnyRun, class Value>
+inline void defects_in_the_middle(const AnyRun &run, double t, Value *scratch) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     copy(w.G, w.Q, w.l * w.m);
@@ -341,36 +362,67 @@ inline void defects_in_the_middle(const Run &run, double t, double *scratch) {
     evaluate_invariants(run, t, w.y_hat);
 }
 
-// The projection of w.y_hat by the defects in w.target, with the targets in the first row of ms.levels. Of a defect as small
-// as its rounding only a part is taken, the less the smaller it is: each correction turns the orbit a little, in a direction
-// that no invariant holds.
-inline Code project_softly(const Run &run, const Step &step) {
-    const Multistep &ms = *run.method.multistep;
-    const auto &w = run.work;
-    double *left = ms.levels + 2 * w.l;
+// Before a projection of w.y_hat by the defects in w.target, with the targets in the first row of ms.levels: of a defect as
+// small as its rounding only a part is to be taken, the less the smaller it is, because each correction turns the orbit a
+// little, in a direction that no invariant holds. What is left goes into the third row.
+template <class W>
+inline void soften_defects(const Multistep &ms, const W &w) {
+    using Value = typename W::Value;
+    Value *levels = as_values<Value>(ms.levels), *left = levels + 2 * w.l;
     for (int64_t i = 0; i < w.l; ++i) {
-        const double defect = w.target[i], square = defect * defect;
-        const double noise = EPS * abs_dot(w.gradient(i), w.y_hat, w.m);
-        const double part = square > 0.0 ? square / (square + noise * noise) : 0.0;
+        const Value defect = w.target[i], square = defect * defect;
+        const Value noise = EPS * abs_dot(w.gradient(i), w.y_hat, w.m);
+        const Value part = where(square > 0.0, square / (square + noise * noise), 0.0);
         w.target[i] = w.values[i] - part * defect;
-        left[i] = (defect - part * defect) + ms.levels[w.l + i];
+        left[i] = (defect - part * defect) + levels[w.l + i];
     }
-    const Code status = project_evaluated(run, step);
-    copy(ms.levels, w.target, w.l);
+}
+
+// And after it: the targets as they were, and what was left. `those`: whose projection it was.
+template <class W>
+inline void note_what_is_left(const Multistep &ms, const Truth<typename W::Value> &those, const W &w) {
+    using Value = typename W::Value;
+    const Value *levels = as_values<Value>(ms.levels), *left = levels + 2 * w.l;
+    copy(levels, w.target, w.l);
     for (int64_t i = 0; i < w.l; ++i) {
         w.defect[i] += left[i];
-        w.max_defect[i] = std::max(w.max_defect[i], std::abs(w.defect[i]));
+        w.max_defect[i] = where(those, max(w.max_defect[i], abs(w.defect[i])), w.max_defect[i]);
     }
+}
+
+// The projection between both.
+inline Code project_softly(const Run &run, const Step &step) {
+    const Multistep &ms = *run.method.multistep;
+    soften_defects(ms, run.work);
+    const Code status = project_evaluated(run, step);
+    note_what_is_left(ms, true, run.work);
     return status;
 }
 
-// The estimates of errors since the last projection into w.err.
-template <class W>
-inline void gather_errors(const Multistep &ms, double size, const W &w) {
-    const double factor = size * std::sqrt(1.0 + static_cast<double>(ms.place[SINCE]));
+// The estimates of errors into w.err, `since` nodes after the last projection.
+template <class Value, class W>
+inline void gather_errors(const Value &size, const Value &since, const W &w) {
+    const Value factor = size * sqrt(1.0 + since);
     for (int64_t i = 0; i < w.m; ++i) w.err[i] = factor * w.err_sum[i];
     w.counters[HAVE_ERROR] = 1;
     w.counters[WAITED] = 0;
+}
+
+// The correction w.move of `those` into the sums.
+template <class W>
+inline void move_sums(const Multistep &ms, const Truth<typename W::Value> &those, const W &w) {
+    using Value = typename W::Value;
+    const int64_t half = w.m / 2;
+    const auto row = [&](int64_t k) { return as_values<Value>(ms.sums + k * ms.pitch); };
+    Value *S = row(0), *S_rest = row(1), *s = row(2), *s_rest = row(3);
+    for (int64_t i = 0; i < half; ++i) {
+        const Value kick = w.move[half + i] / ms.h, shift = w.move[i] / (ms.h * ms.h) + kick;
+        const PairOf<Value> first = two_sum(s[i], kick), second = two_sum(S[i], shift);
+        s[i] = where(those, first.value, s[i]);
+        s_rest[i] = where(those, s_rest[i] + first.rest, s_rest[i]);
+        S[i] = where(those, second.value, S[i]);
+        S_rest[i] = where(those, S_rest[i] + second.rest, S_rest[i]);
+    }
 }
 
 // The projection, whose correction goes into the sums; the history stays as it is.
@@ -379,10 +431,10 @@ inline void gather_errors(const Multistep &ms, double size, const W &w) {
     const Options &o = run.options;
     const auto &w = run.work;
     double size;
-    const Code smooth = estimate_nodes(ms, o, size, w);
-    if (smooth != OK || w.l == 0 || ms.place[SEEN] <= COLLECTED) return smooth;
+    if (!estimate_nodes(ms, o, size, w)) return UNSTABLE;
+    if (w.l == 0 || ms.place[SEEN] <= COLLECTED) return OK;
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST]) * ms.h;
-    gather_errors(ms, size, w);
+    gather_errors(size, static_cast<double>(ms.place[SINCE]), w);
     newest_state(run, t);
     if (o.every == AUTO && !tells_more(w)) return OK;
     copy(w.target, ms.levels, w.l);
@@ -391,30 +443,7 @@ inline void gather_errors(const Multistep &ms, double size, const W &w) {
     const Code status = project_softly(run, Step{t, t, ms.h, w.y_hat, scratch, true, true});
     if (status != OK) return status;
     ms.place[SINCE] = 0;
-    if (w.counters[PROJECTIONS] == before) return OK;
-    double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
-    for (int64_t i = 0; i < ms.half; ++i) {
-        const double kick = w.move[ms.half + i] / ms.h, shift = w.move[i] / (ms.h * ms.h) + kick;
-        const Pair first = two_sum(s[i], kick), second = two_sum(S[i], shift);
-        s[i] = first.value;
-        s_rest[i] += first.rest;
-        S[i] = second.value;
-        S_rest[i] += second.rest;
-    }
-    return OK;
-}
-
-// The history up to node `last`.
-inline Code advance_history(const Run &run, int64_t last, double *scratch) {
-    const Multistep &ms = *run.method.multistep;
-    while (ms.place[NEWEST] < last) {
-        Code status = add_node(run);
-        const int64_t after = ms.place[NEWEST] - ms.order;
-        if (status == OK && run.work.l > 0 && after > 0 && after <= LEVELS * LEVEL_SPACING && after % LEVEL_SPACING == 0)
-            collect_levels(run, scratch);
-        if (status == OK && ms.place[NEWEST] % ms.spacing == 0) status = project_nodes(run, scratch);
-        if (status != OK) return status;
-    }
+    if (w.counters[PROJECTIONS] > before) move_sums(ms, true, w);
     return OK;
 }
 
@@ -427,9 +456,8 @@ inline Code project_last(const Run &run, const Step &step, double from) {
         w.counters[HAVE_ERROR] = 1;
     } else {
         double size;
-        const Code smooth = estimate_nodes(ms, run.options, size, w);
-        if (smooth != OK) return smooth;
-        gather_errors(ms, size, w);
+        if (!estimate_nodes(ms, run.options, size, w)) return UNSTABLE;
+        gather_errors(size, static_cast<double>(ms.place[SINCE]), w);
     }
     if (w.l == 0) return OK;
     if (ms.brief || ms.place[NEWEST] < ms.order + LEVELS * LEVEL_SPACING) fill(ms.levels + w.l, 0.0, w.l);
@@ -469,10 +497,38 @@ inline Code project_last(const Run &run, const Step &step, double from) {
     return status;
 }
 
+// What a run of one state does with it besides adding nodes.
+struct OneState {
+    const Run &run;
+    double *scratch;
+
+    void collect() const { collect_levels(run, scratch); }
+    Code project() const { return project_nodes(run, scratch); }
+    Code finish(const Step &step) const { return finish_nodes(run, step); }
+};
+
+// The history up to node `last`; `states` as OneState.
+template <class States>
+inline Code advance_history(const States &states, int64_t last) {
+    const auto &run = states.run;
+    const Multistep &ms = *run.method.multistep;
+    while (ms.place[NEWEST] < last) {
+        Code status = add_node(run);
+        const int64_t after = ms.place[NEWEST] - ms.order;
+        if (status == OK && run.work.l > 0 && after > 0 && after <= LEVELS * LEVEL_SPACING && after % LEVEL_SPACING == 0)
+            states.collect();
+        if (status == OK && ms.place[NEWEST] % ms.spacing == 0) status = states.project();
+        if (status != OK) return status;
+    }
+    return OK;
+}
+
 // From the state y at step k to that at step `stop`, whose derivative is left in w.last(). The last step of a run is never a
 // node: it may be shorter.
-inline Code next_states(const Run &run, const Span &span, double *clock, int64_t k, int64_t stop, const double *y,
+template <class States>
+inline Code next_states(const States &states, const Span &span, double *clock, int64_t k, int64_t stop, const double *y,
                         double *y_new) {
+    const auto &run = states.run;
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     int64_t *place = ms.place;
@@ -484,7 +540,7 @@ inline Code next_states(const Run &run, const Span &span, double *clock, int64_t
     const Step step{clock[TIME], clock[TIME_NEW], clock[LENGTH], y, y_new, last, last};
     if (ms.brief) {
         w.counters[WAITED] = k;
-        return finish_nodes(run, step);
+        return states.finish(step);
     }
     if (!place[HAVE_NODES]) {
         copy(y, y_new, w.m);
@@ -493,12 +549,12 @@ inline Code next_states(const Run &run, const Span &span, double *clock, int64_t
         place[HAVE_NODES] = 1;
     }
     const int64_t ahead = ms.level ? 0 : ms.middle;
-    const Code status = advance_history(run, std::min(stop + ahead, last_node), y_new);
+    const Code status = advance_history(states, std::min(stop + ahead, last_node));
     if (status != OK) return status;
     const int64_t back = place[NEWEST] - stop;
-    if (last || back < ahead) return finish_nodes(run, step);
+    if (last || back < ahead) return states.finish(step);
     state_of(ms, back, y_new, w.carry_hat);
-    if (!all_finite(y_new, w.m)) return NOT_FINITE;
+    if (run.system.MEMBERS == 1 && !all_finite(y_new, w.m)) return NOT_FINITE;
     slope_of(ms, back, y_new, w.last());
     return OK;
 }

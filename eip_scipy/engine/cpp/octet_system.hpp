@@ -10,9 +10,11 @@ struct GaveUp {};
 
 // The functions of eight members: those of a single run on arrays of octets.
 struct OctetSystem {
+    static constexpr int MEMBERS = LANES;
     Native<ValuePointer, Octet> rhs_pointer{};
     std::vector<Native<ValuePointer, Octet>> inv_pointers;
     std::vector<Native<GradientPointer, Octet>> grad_pointers;
+    Native<GradientPointer, Octet> jacobian_pointer{};
     bool second_order = false;
     std::vector<Octet> params, scratch, scratch_f;
 
@@ -34,7 +36,27 @@ struct OctetSystem {
         require(rhs_pointer.pointer(t, y, out, floats_of(params.data())));
     }
 
-    void inv(double t, const Octet *y, Octet *values) {
+    // As System's.
+    template <class W>
+    void acceleration(const W &w, double t, const double *y, double *f, double *a) {
+        const int64_t half = w.m / 2;
+        if (second_order && rhs_pointer.library)
+            return rhs_pointer.library(t, octets_of(y), nullptr, octets_of(a), params.data(), half / LANES, p());
+        rhs_of_scratch(w, t, y, f);
+        copy(f + half, a, half);
+    }
+
+    template <class W>
+    void jacobian(const W &w, double t, const double *q, const double *dq, double *out, int64_t count) {
+        const auto &[pointer, library, octets] = jacobian_pointer;
+        if (library)
+            return library(t, octets_of(q), octets_of(dq), octets_of(out), params.data(), count / LANES, p());
+        fill(out, NOT_A_NUMBER, w.m / 2);
+        require(pointer(t, q, dq, out, floats_of(params.data())));
+    }
+
+    template <class W>
+    void inv(const W &, double t, const Octet *y, Octet *values) {
         for (const auto &[pointer, library, octets] : inv_pointers) {
             if (library) {
                 library(t, y, nullptr, values, params.data(), n(), p());
@@ -46,7 +68,8 @@ struct OctetSystem {
         }
     }
 
-    void grad(double t, const Octet *y, const Octet *f, Octet *G) {
+    template <class W>
+    void grad(const W &, double t, const Octet *y, const Octet *f, Octet *G) {
         for (const auto &[pointer, library, octets] : grad_pointers) {
             if (library) {
                 library(t, y, f, G, params.data(), n(), p());

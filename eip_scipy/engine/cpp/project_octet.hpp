@@ -21,7 +21,7 @@ namespace eip {
         least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
         move_along(o, w, w.Q, w.stage);
     } else {
-        fill(w.stage, NOT_A_NUMBER, w.m);
+        for (double *out : {w.move, w.stage}) fill(out, NOT_A_NUMBER, w.m);
     }
     eight.give(w.move, lane, eights.move, w.m);
     eight.give(w.stage, lane, eight.y_new, w.m);
@@ -70,21 +70,20 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w)
     return more;
 }
 
-// Projects eight members; returns those of `alive` who have to make this step by themselves. As `project_step`. W is
-// the work of all eight, or the same of a length that the compiler knows.
+// The rest of a projection of eight members, where the gradients at w.y_hat and the invariants' values are known, from y
+// at the step's beginning into eight.y_new; returns those of `alive` who have to do it by themselves.
 template <class W>
-inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask &alive, const Work &single) {
+inline Mask project_octet_evaluated(Eight &eight, const W &w, double t, const Octet *y, const Mask &alive,
+                                    const Work &single) {
     const Options &o = eight.options;
-    eight.system.grad(step.t_new, w.y_hat, w.last(), w.G);
-    ++w.counters[NJEV];
-    if (o.every != 1 && o.metric == ERROR) quadrature(eight.flat.err, eight.flat.err_sum, eight.flat.err, eight.flat.m);
-    eight.system.inv(step.t_new, w.y_hat, w.values);
     const Mask outside = defects<Octet>(nullptr, w.y_hat, o, w, w.before);
     Mask leave{};
     Octet largest_error = 0.0;
     if (o.metric == ERROR) {
-        leave = outside & block_sizes<Octet>(eight.y, EPS, o, w);
+        copy(w.sigma, w.stage, w.m);
+        leave = outside & block_sizes<Octet>(y, o.compensated ? 0.0 : EPS, o, w);
         largest_error = weights_from_sizes(o, w);
+        for (int64_t j = 0; j < w.m; ++j) w.sigma[j] = where(outside & alive, w.sigma[j], w.stage[j]);
     }
     Octet *rows = weighed_gradients(o, w);
     const Mask dependent = outside & alive & !solve_gram(rows_of(rows, w), w.g, small(w.R, w.l, w), w.mu);
@@ -96,12 +95,18 @@ inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask
         for (int64_t lane = 0; lane < LANES; ++lane)
             if (dependent.lane(lane)) solve_alone(eight, lane, o, single);
     const Octet correction = correction_in_local_errors(largest_error, o, w);
-    if (o.blocks.count * o.blocks.width == w.m) leave = leave | (outside & (correction > HEALTHY));
+    if (o.compensated) {
+        for (int64_t j = 0; j < w.m; ++j) w.move[j] = where(outside, w.move[j], 0.0);
+        copy(w.y_hat, eight.y_new, w.m);
+        compensated_add(as_floats(eight.y_new), as_floats(w.carry_hat), as_floats(w.move), LANES * w.m);
+    } else if (o.blocks.count * o.blocks.width == w.m) {
+        leave = leave | (outside & (correction > HEALTHY));
+    }
     for (int64_t j = 0; j < w.m; ++j) eight.y_new[j] = where(outside, eight.y_new[j], w.y_hat[j]);
-    eight.system.inv(step.t_new, eight.y_new, w.values);
+    evaluate_invariants(RunOf<W, OctetSystem>{eight.method, o, w, eight.system, nullptr}, t, eight.y_new);
     const Mask held = defects_held<Octet>(w.before, w) & small_shares(o, w) & all_finite(eight.y_new, w.m);
     Mask done = alive & held & !leave;
-    if (o.watched) done = done & !note_octet(step.t_new, done, o, w);
+    if (o.watched) done = done & !note_octet(t, done, o, w);
     for (int64_t i = 0; i < w.l; ++i)
         w.max_defect[i] = where(done, max(w.max_defect[i], abs(w.defect[i])), w.max_defect[i]);
     const Mask corrected = done & outside;
@@ -111,6 +116,52 @@ inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask
     for (int64_t lane = 0; lane < LANES; ++lane)
         if (corrected.lane(lane) && eight.rank[lane] < w.l) eight.at(eight.reduced, lane) += 1.0;
     return alive & !done;
+}
+
+// As `project_step`. W is the work of all eight, or the same of a length that the compiler knows.
+template <class W>
+inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask &alive, const Work &single) {
+    const Options &o = eight.options;
+    eight.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
+    ++w.counters[NJEV];
+    if (o.every != 1 && o.metric == ERROR) quadrature(eight.flat.err, eight.flat.err_sum, eight.flat.err, eight.flat.m);
+    eight.system.inv(w, step.t_new, w.y_hat, w.values);
+    return project_octet_evaluated(eight, w, step.t_new, eight.y, alive, single);
+}
+
+// As `project_nodes`, of a multistep method. Members whose steps are not stable leave those of `alive`; those who have to do
+// it by themselves come back, with their gathered errors as they were in w.err_low.
+inline Mask project_octet_nodes(Eight &eight, Mask &alive, const Work &single) {
+    const Options &o = eight.options;
+    const WorkOf<Octet> &w = eight.work;
+    const Multistep &ms = eight.multistep;
+    const RunOf<WorkOf<Octet>, OctetSystem> run{eight.method, o, w, eight.system, nullptr};
+    Octet size;
+    copy(w.err_sum, w.err_low, w.m);
+    alive = alive & estimate_nodes(ms, o, size, w);
+    if (w.l == 0 || ms.place[SEEN] <= COLLECTED) return Mask{};
+    const double t = ms.t0 + static_cast<double>(ms.place[NEWEST]) * ms.h;
+    double since[LANES];
+    for (int lane = 0; lane < LANES; ++lane) since[lane] = static_cast<double>(ms.place[SINCE] - eight.projected[lane]);
+    gather_errors(size, Octet::load(since), w);
+    newest_state(run, t);
+    const Mask those = o.every == AUTO ? alive & tells_more(w) : alive;
+    if (!any(those)) return Mask{};
+    copy(w.target, as_values<Octet>(ms.levels), w.l);
+    const int64_t counted = w.counters[NJEV];
+    defects_in_the_middle(run, t, eight.y_new);
+    w.counters[NJEV] = counted;
+    soften_defects(ms, w);
+    const Octet before = *eight.projections;
+    const Mask leave = project_octet_evaluated(eight, w, t, w.y_hat, those, single), done = those & !leave;
+    note_what_is_left(ms, done, w);
+    move_sums(ms, *eight.projections > before, w);
+    for (int lane = 0; lane < LANES; ++lane) {
+        if (!done.lane(lane)) continue;
+        eight.projected[lane] = ms.place[SINCE];
+        ++eight.own[lane][NJEV];
+    }
+    return leave;
 }
 
 }  // namespace eip

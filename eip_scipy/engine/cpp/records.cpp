@@ -419,8 +419,14 @@ OctetSystem octet_system_of(PyObject *functions, const Data &run) {
     system.scratch.resize(w.n);
     system.scratch_f.resize(w.n);
     const Options &o = run.options;
-    const bool plain = w.n == w.m && !o.compensated && !o.adaptive && o.every >= 1 && o.direction == NEW;
-    if (run.system.python || !plain || o.iterations != 1) {
+    const Ref jacobian = attribute(functions, "jacobian");
+    if (jacobian.get() != Py_None)
+        system.jacobian_pointer =
+            pointer_of<Native<GradientPointer, Octet>>(jacobian.get(), "jacobian", w.n / 2, w.n / 2, p);
+    const Multistep *ms = run.method.multistep;
+    const bool steps = ms ? !ms->brief && !ms->level && (ms->count == 0 || jacobian.get() != Py_None)
+                          : !o.compensated && o.every >= 1;
+    if (run.system.python || w.n != w.m || o.adaptive || o.iterations != 1 || o.direction != NEW || !steps) {
         PyErr_SetString(PyExc_ValueError, "engine: a run of this kind does not go side by side with others");
         throw PythonError{};
     }

@@ -23,6 +23,12 @@ inline void count_of(const Eight &eight, int64_t lane, const int64_t *shared, in
     out[LAST_RANK] = eight.rank[lane];
 }
 
+inline Mask alive_of(const Eight &eight) {
+    double lanes[LANES];
+    for (int64_t lane = 0; lane < LANES; ++lane) lanes[lane] = eight.alive[lane];
+    return Octet::load(lanes) > 0.0;
+}
+
 // The parameters of one member, for the functions of the single run.
 inline void take_params(const Eight &eight, int64_t lane, System &system) {
     eight.take(eight.system.params.data(), lane, system.params, system.n_params);
@@ -37,6 +43,7 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
     eight.take(eight.y, lane, y, w.m);
     eight.take(eights.K, lane, w.K, w.m);
     eight.take(eights.err_sum, lane, w.err_sum, w.m);
+    eight.take(eights.sigma, lane, w.sigma, w.m);
     eight.take(eights.target, lane, w.target, w.l);
     eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
     eight.take(eights.max_defect, lane, w.max_defect, w.l);
@@ -50,6 +57,7 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
         return false;
     }
     eight.give(y_new, lane, eight.y_new, w.m);
+    eight.give(w.sigma, lane, eights.sigma, w.m);
     eight.give(w.trust, lane, eights.trust, w.l * N_FIGURES);
     eight.give(w.max_defect, lane, eights.max_defect, w.l);
     eight.at(eights.max_correction, lane) = w.max_correction[0];
@@ -59,11 +67,100 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
     return true;
 }
 
-inline Mask alive_of(const Eight &eight) {
-    double lanes[LANES];
-    for (int64_t lane = 0; lane < LANES; ++lane) lanes[lane] = eight.alive[lane];
-    return Octet::load(lanes) > 0.0;
+// Of a multistep method: what one member's projections need, on the buffers of the single run.
+inline void take_history(const Run &run, Eight &eight, int64_t lane) {
+    const auto &w = run.work;
+    const WorkOf<Octet> &eights = eight.work;
+    const Multistep &one = *run.method.multistep, &all = eight.multistep;
+    const int64_t rows = std::min(all.order, all.place[NEWEST_ROW]) + 1;
+    std::copy_n(all.place, static_cast<int64_t>(N_NODE_PLACES), one.place);
+    one.place[NEWEST_ROW] = rows - 1;
+    one.place[SINCE] -= eight.projected[lane];
+    const Octet *oldest = OctetSystem::octets_of(newest(all)) - (rows - 1) * one.half;
+    for (int64_t j = 0; j < rows; ++j) eight.take(oldest + j * one.half, lane, one.nodes + j * one.pitch, one.half);
+    for (int64_t j = 0; j < 4; ++j) eight.take(eight.sums + j * one.half, lane, one.sums + j * one.pitch, one.half);
+    eight.take(eight.levels, lane, one.levels, 3 * w.l);
+    eight.take(eights.err_sum, lane, w.err_sum, w.m);
+    eight.take(eights.target, lane, w.target, w.l);
+    eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
+    eight.take(eights.max_defect, lane, w.max_defect, w.l);
+    w.max_correction[0] = eight.at(eights.max_correction, lane);
+    eight.take(eights.sigma, lane, w.sigma, w.m);
+    std::copy_n(eight.own[lane], static_cast<int64_t>(N_COUNTERS), w.counters);
+    w.counters[LAST_RANK] = eight.rank[lane];
+    take_params(eight, lane, run.system);
 }
+
+// And what they may have changed of it.
+inline void give_history(const Run &run, Eight &eight, int64_t lane) {
+    const auto &w = run.work;
+    const WorkOf<Octet> &eights = eight.work;
+    const Multistep &one = *run.method.multistep;
+    eight.give(one.levels, lane, eight.levels, 3 * w.l);
+    eight.give(w.err_sum, lane, eights.err_sum, w.m);
+    std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), eight.own[lane]);
+    eight.rank[lane] = w.counters[LAST_RANK];
+    if (one.place[SINCE] > 0) return;
+    eight.projected[lane] = eight.multistep.place[SINCE];
+    for (int64_t j = 0; j < 4; ++j) eight.give(one.sums + j * one.pitch, lane, eight.sums + j * one.half, one.half);
+    eight.give(w.sigma, lane, eights.sigma, w.m);
+    eight.give(w.trust, lane, eights.trust, w.l * N_FIGURES);
+    eight.give(w.max_defect, lane, eights.max_defect, w.l);
+    eight.at(eights.max_correction, lane) = w.max_correction[0];
+}
+
+// As OneState: nodes are added to eight histories at once, and projected; what is rare is done for one member after the
+// other.
+struct EightStates {
+    const Eight::Run &run;
+    const Run &single;
+    Eight &eight;
+    double *y_new;
+
+    void collect() const {
+        each(alive_of(eight), [&](int64_t) { return collect_levels(single, y_new), OK; });
+    }
+    Code project() const {
+        Mask alive = alive_of(eight);
+        const Mask alone = project_octet_nodes(eight, alive, single.work);
+        for (int64_t lane = 0; lane < LANES; ++lane) eight.alive[lane] = alive.lane(lane);
+        if (!any(alone)) return OK;
+        each(alone, [&](int64_t lane) {  // from the beginning: what has been counted and gathered is taken back
+            eight.take(eight.work.err_low, lane, single.work.err_sum, single.work.m);
+            --single.work.counters[NJEV];
+            return project_nodes(single, y_new);
+        });
+        return OK;
+    }
+    Code finish(const Step &step) const {
+        const auto &w = single.work;
+        each(alive_of(eight), [&](int64_t lane) {
+            const Step own{step.t, step.t_new, step.h, nullptr, y_new, step.project, step.last};
+            const Code code = finish_nodes(single, own);
+            if (step.last) single.method.multistep->place[SINCE] = 0;  // the last state is projected
+            eight.give(y_new, lane, eight.y_new, w.m);
+            eight.give(w.last(), lane, eight.work.last(), w.m);
+            return code;
+        });
+        return OK;
+    }
+
+  private:
+    // A member for which it fails has to run by itself.
+    template <typename Action>
+    void each(const Mask &those, Action action) const {
+        for (int64_t lane = 0; lane < LANES; ++lane) {
+            if (!those.lane(lane)) continue;
+            take_history(single, eight, lane);
+            try {
+                eight.alive[lane] = action(lane) == OK;
+            } catch (const Broken &) {
+                eight.alive[lane] = false;
+            }
+            if (eight.alive[lane]) give_history(single, eight, lane);
+        }
+    }
+};
 
 // Whether a time of t_eval lies in the step that ends at t_new.
 inline bool is_due(const Schedule &s, int64_t row, double t_new) {
@@ -80,6 +177,7 @@ inline bool is_due(const Schedule &s, int64_t row, double t_new) {
     s.clock[TIME_NEW] = step.t_new;
     for (int64_t lane = 0; lane < LANES; ++lane) {
         if (!eight.alive[lane]) continue;
+        if (run.method.multistep) take_history(run, eight, lane);
         eight.take(eights.K, lane, w.K, (w.stages + 1) * w.m);
         eight.take(eights.sigma, lane, w.sigma, w.m);
         eight.take(eight.y, lane, y, w.m);
@@ -98,9 +196,9 @@ inline bool is_due(const Schedule &s, int64_t row, double t_new) {
     while (is_due(s, eight.row, step.t_new)) ++eight.row;
 }
 
-// The next step of all eight.
-inline void step_octet(const Run &run, Samples *samples, Eight &eight, const Schedule &s, const Members &members,
-                       double *y, double *y_new) {
+// The next step of all eight, which is the one that comes back.
+inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const Schedule &s, const Members &members,
+                          double *y, double *y_new) {
     const Span &span = s.span;
     const Options &o = eight.options;
     WorkOf<Octet> &w = eight.work;
@@ -136,6 +234,23 @@ inline void step_octet(const Run &run, Samples *samples, Eight &eight, const Sch
     if (is_due(s, eight.row, t_new)) sample_octet(run, *samples, eight, s, members, step, y, y_new);
     copy(w.last(), w.row(0), w.m);
     std::swap(eight.y, eight.y_new);
+    return k + 1;
+}
+
+// The next states of all eight by a multistep method, at most `steps` further; the step that they belong to.
+[[gnu::noinline]] inline int64_t next_octet_states(const Run &run, const Octets &octets, const Schedule &s,
+                                                   const Members &members, int64_t steps, double *y, double *y_new) {
+    const auto &[eight, samples] = octets;
+    s.place[ROW] = eight.row;
+    const int64_t k = eight.step, stop = next_stop(run.method, samples, s, k, last_of(run.method, s.span, k, steps));
+    double *from = OctetSystem::floats_of(eight.y), *to = OctetSystem::floats_of(eight.y_new);
+    const Eight::Run all = eight.run();
+    next_states(EightStates{all, run, eight, y_new}, s.span, s.clock, k, stop, from, to);
+    const Step step{s.clock[TIME], s.clock[TIME_NEW], s.clock[LENGTH], from, to, false, false};
+    if (is_due(s, eight.row, step.t_new)) sample_octet(run, *samples, eight, s, members, step, y, y_new);
+    copy(eight.work.last(), eight.work.row(0), eight.work.m);
+    std::swap(eight.y, eight.y_new);
+    return stop;
 }
 
 // Eight members, the last one repeated where there are fewer, as at the start of a run.
@@ -160,12 +275,14 @@ inline void begin_octet(const Run &run, Eight &eight, const Schedule &s, const M
     w.counters[NFEV] = members.evaluations;
     std::fill_n(&eight.own[0][0], LANES * N_COUNTERS, 0);
     std::fill_n(eight.rank, LANES, 0);
+    std::fill_n(eight.projected, LANES, 0);
+    if (eight.method.multistep) forget_history(eight.multistep, LANES * w.l);
     fill(w.trust, 0.0, w.l * N_FIGURES);
     for (int64_t i = 0; i < w.l; ++i) w.figures(i)[TERMS] = INFINITE;
     eight.system.rhs(eight.flat, t0, OctetSystem::floats_of(eight.y), OctetSystem::floats_of(w.row(0)));
-    eight.system.inv(t0, eight.y, w.target);
+    eight.system.inv(w, t0, eight.y, w.target);
     copy(w.target, w.values, w.l);
-    eight.system.grad(t0, eight.y, w.row(0), w.G);
+    eight.system.grad(w, t0, eight.y, w.row(0), w.G);
     const Mask sound = all_finite(eight.y, n) & all_finite(w.row(0), n) & all_finite(w.target, w.l) &
                        all_finite(w.G, w.l * n);
     if (eight.options.watched) start_figures<Octet>(eight.y, w.row(0), members.first_steps[first], eight.options, w);
@@ -208,10 +325,13 @@ inline Code sweep_octets(const Run &run, const Octets &octets, const Schedule &s
                 if (s.n_eval == 0 || s.t_eval[0] == s.span.t0) save_octet(eight, members);
                 begun = 1;
             }
-            for (; eight.step < s.span.n_steps && any(alive_of(eight)); ++eight.step) {
-                if (steps-- == 0) return OK;
-                const int64_t made = eight.step + 1;
-                step_octet(run, samples, eight, s, members, y, y_new);
+            while (eight.step < s.span.n_steps && any(alive_of(eight))) {
+                if (steps <= 0) return OK;
+                const int64_t made = eight.method.multistep
+                                         ? next_octet_states(run, octets, s, members, steps, y, y_new)
+                                         : step_octet(run, samples, eight, s, members, y, y_new);
+                steps -= made - eight.step;
+                eight.step = made;
                 const bool due = made == s.span.n_steps || (s.save_every > 0 && made % s.save_every == 0);
                 if (s.n_eval == 0 && due) save_octet(eight, members);
             }

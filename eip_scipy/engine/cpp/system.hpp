@@ -65,6 +65,7 @@ struct FailedCall {
 
 // The functions of a run, by pointer or in Python: all of them, or of a run by pointer the events.
 struct System {
+    static constexpr int MEMBERS = 1;
     Native<ValuePointer> rhs_pointer{};
     std::vector<Native<ValuePointer>> inv_pointers, event_pointers;
     std::vector<Native<GradientPointer>> grad_pointers;

@@ -161,18 +161,20 @@ inline void take_note(double t, const Options &o, const W &w) {
 
 // Whether the errors gathered make some invariant more uncertain than NOISE_BANDS roundings of its terms.
 template <class W>
-inline bool tells_more(const W &w) {
+inline auto tells_more(const W &w) {
+    using Value = typename W::Value;
+    Truth<Value> more{};
     for (int64_t i = 0; i < w.l; ++i) {
-        const double *G = w.gradient(i);
-        double error = 0.0, noise = 0.0;
+        const Value *G = w.gradient(i);
+        Value error = 0.0, noise = 0.0;
         for (int64_t j = 0; j < w.m; ++j) {
-            const double x = w.err[j] * G[j];
+            const Value x = w.err[j] * G[j];
             error += x * x;
-            noise += std::abs(G[j] * w.y_hat[j]);
+            noise += abs(G[j] * w.y_hat[j]);
         }
-        if (std::sqrt(error) > NOISE_BANDS * EPS * noise) return true;
+        more = more | (sqrt(error) > NOISE_BANDS * EPS * noise);
     }
-    return false;
+    return more;
 }
 
 // Per row, twice the defects of all rows in its own unit: what a projection of lower rank may move between them. Twice,

@@ -73,6 +73,14 @@ inline Mask all_finite(const Octet *a, int64_t n) {
     return square - square == 0.0;
 }
 
+// Floats as values and back: those of eight members stand beside each other.
+template <class Value>
+inline Value *as_values(double *a) {
+    return reinterpret_cast<Value *>(a);
+}
+inline double *as_floats(double *a) { return a; }
+inline double *as_floats(Octet *a) { return reinterpret_cast<double *>(a); }
+
 // x, or 1 in place of 0: a divisor where the quotient does not count.
 template <class Value>
 inline Value positive(const Value &x) {

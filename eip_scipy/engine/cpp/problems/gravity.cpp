@@ -34,7 +34,8 @@ void gradient_of_momentum(const Given<T> &g) {
     angular_momentum_gradient(g.y, g.params, g.p, g.out);
 }
 
-void central(const Given<double> &g) {
+template <class T>
+void central(const Given<T> &g) {
     central_jacobian(g.y, g.f, g.params, g.n / 3, g.out);
 }
 
@@ -48,7 +49,7 @@ constexpr const char *POSITIONS = "positions, 3 numbers a body, and every G m";
 const LibraryFunction functions[] = {
     {"gravity.rhs", Value::DERIVATIVE, 0, EIP_BOTH(rhs), of_bodies, BODIES},
     {"gravity.acc", Value::ACCELERATION, 0, EIP_BOTH(acc), at_positions, POSITIONS},
-    {"gravity.central", Value::GRADIENT_BY_F, 1, plain<double, central>, nullptr, at_positions_first, POSITIONS},
+    {"gravity.central", Value::GRADIENT_BY_F, 1, EIP_BOTH(central), at_positions_first, POSITIONS},
     {"gravity.energy", Value::NUMBERS, 1, EIP_BOTH(energy), of_bodies, BODIES},
     {"gravity.energy_gradient", Value::GRADIENT_BY_F, 1, EIP_BOTH(gradient_of_energy), of_bodies, BODIES},
     {"gravity.momentum", Value::NUMBERS, 3, EIP_BOTH(momentum), of_bodies, BODIES},

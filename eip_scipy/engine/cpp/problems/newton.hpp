@@ -2,6 +2,7 @@
 #pragma once
 
 #include "../library.hpp"
+#include "../values.hpp"
 #include "pair_sums.hpp"
 
 namespace eip {
@@ -13,31 +14,51 @@ inline void newton_rhs(const T *y, const T *gm, int64_t bodies, T *out) {
 }
 
 // The accelerations' derivative along dq, as far as the heaviest body makes it, for the bodies that dq moves; with their
-// reactions on that body.
-inline void central_jacobian(const double *q, const double *dq, const double *gm, int64_t bodies, double *out) {
-    const int64_t centre = std::max_element(gm, gm + bodies) - gm;
-    double *reaction = out + 3 * centre;
-    for (int c = 0; c < 3; ++c) reaction[c] = 0.0;
+// reactions on that body. Of eight members each may have another heaviest one.
+template <class T>
+inline void central_jacobian(const T *q, const T *dq, const T *gm, int64_t bodies, T *out) {
+    T mass = gm[0], centre = 0.0, place[3], kick[3], reaction[3];
+    for (int c = 0; c < 3; ++c) {
+        place[c] = q[c];
+        kick[c] = dq[c];
+        reaction[c] = 0.0;
+    }
+    for (int64_t k = 1; k < bodies; ++k) {
+        const Truth<T> heavier = gm[k] > mass;
+        if (!any(heavier)) continue;
+        mass = where(heavier, gm[k], mass);
+        centre = where(heavier, static_cast<double>(k), centre);
+        for (int c = 0; c < 3; ++c) {
+            place[c] = where(heavier, q[3 * k + c], place[c]);
+            kick[c] = where(heavier, dq[3 * k + c], kick[c]);
+        }
+    }
     for (int64_t k = 0; k < bodies; ++k) {
-        const double *d = dq + 3 * k;
-        double *change = out + 3 * k;
-        if (k == centre) continue;
-        if (d[0] == 0.0 && d[1] == 0.0 && d[2] == 0.0) {
+        const T *d = dq + 3 * k;
+        T *change = out + 3 * k;
+        const Truth<T> rests = (d[0] == 0.0) & (d[1] == 0.0) & (d[2] == 0.0);
+        const Truth<T> moves = !(rests | (centre == static_cast<double>(k)));
+        if (!any(moves)) {
             for (int c = 0; c < 3; ++c) change[c] = 0.0;
             continue;
         }
-        double r[3], moved[3], square = 0.0, along = 0.0;
+        T r[3], moved[3], square = 0.0, along = 0.0;
         for (int c = 0; c < 3; ++c) {
-            r[c] = q[3 * k + c] - q[3 * centre + c];
-            moved[c] = d[c] - dq[3 * centre + c];
+            r[c] = q[3 * k + c] - place[c];
+            moved[c] = d[c] - kick[c];
             square += r[c] * r[c];
             along += r[c] * moved[c];
         }
-        const double tidal = gm[centre] / (square * std::sqrt(square)), radial = 3.0 * along / square;
+        const T tidal = mass / (square * sqrt(square)), radial = 3.0 * along / square;
         for (int c = 0; c < 3; ++c) {
-            change[c] = tidal * (radial * r[c] - moved[c]);
-            reaction[c] -= gm[k] / gm[centre] * change[c];
+            change[c] = where(moves, tidal * (radial * r[c] - moved[c]), 0.0);
+            reaction[c] = where(moves, reaction[c] - gm[k] / mass * change[c], reaction[c]);
         }
+    }
+    for (int64_t k = 0; k < bodies; ++k) {
+        const Truth<T> is_centre = centre == static_cast<double>(k);
+        if (!any(is_centre)) continue;
+        for (int c = 0; c < 3; ++c) out[3 * k + c] = where(is_centre, reaction[c], out[3 * k + c]);
     }
 }
 
