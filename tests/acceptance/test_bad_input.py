@@ -1228,7 +1228,15 @@ class TestNotCompilable:
         }
 
     @pytest.mark.filterwarnings("ignore:invariant 'V' has no grad")
-    @pytest.mark.parametrize("case", ["plain fun", "plain value", "plain grad", "no grad", "args"])
+    @pytest.mark.parametrize(
+        "case",
+        [
+            "plain fun",
+            "plain grad",
+            "args",
+            *(pytest.param(k, marks=[pytest.mark.nightly, pytest.mark.slow]) for k in ("plain value", "no grad")),
+        ],
+    )
     def test_says_which_and_why(self, case):
         fun, invariants, reason = self.cases()[case]
         with pytest.raises(TypeError, match=reason):

@@ -178,6 +178,7 @@ def test_the_other_sense_fails_the_command(tmp_path, start, capsys, monkeypatch)
     assert "FAILED vortices turn anticlockwise" in capsys.readouterr().out
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_another_end(tmp_path, start, capsys):
     """Snapshots and movie are those of the times that the run has."""

@@ -306,6 +306,8 @@ def test_cost_to_reach():
     assert math.isnan(cost_to_reach([1e3, 1e4, 1e5], errors, 1e-5))
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.needs_jit
 def test_work_precision(tmp_path, capsys):
     assert main(["work-precision", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")], repeats=1) == 0

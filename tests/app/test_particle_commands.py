@@ -161,6 +161,7 @@ def test_interrupted(tmp_path, capsys, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.usefixtures("short_runs")
 def test_paper_figures(tmp_path, capsys):

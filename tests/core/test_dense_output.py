@@ -32,7 +32,8 @@ PAIRS = [EIPRK23, EIPRK45, EIPDOP853]
 OWN = {cls: eip_method(cls.TABLEAU) for cls in PAIRS}
 pairs = pytest.mark.parametrize("method", PAIRS, ids=lambda m: m.__name__)
 second_order = pytest.param(EIPRK2, marks=[pytest.mark.nightly, pytest.mark.slow])  # in thousands of steps
-every_class = pytest.mark.parametrize("method", [*PAIRS, second_order, EIPRK4, EIPRK5], ids=lambda m: m.__name__)
+fifth_order = pytest.param(EIPRK5, marks=[pytest.mark.nightly, pytest.mark.slow])
+every_class = pytest.mark.parametrize("method", [*PAIRS, second_order, EIPRK4, fifth_order], ids=lambda m: m.__name__)
 
 Y0 = pericentre(0.6)
 I0 = np.array([energy(0, Y0), momentum(0, Y0)])

@@ -548,6 +548,8 @@ def test_rhs_not_finite_after_some_time(driver):
     assert run.t[-1] == 0.49
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.needs_jit
 def test_failures_of_compiled_runs_are_the_same():
     from numba import njit

@@ -110,7 +110,9 @@ def test_order_of_scipy_s_pairs(tableau):
         Tableau(tableau.name, tableau.A.tolist(), tableau.b.tolist(), tableau.order + 1)
 
 
-@pytest.mark.parametrize("tableau", METHODS, ids=name)
+@pytest.mark.parametrize(
+    "tableau", [*METHODS[:-1], pytest.param(BUTCHER6, marks=[pytest.mark.nightly, pytest.mark.slow])], ids=name
+)
 def test_order_of_the_step_in_fractions(tableau):
     A, b = exact(tableau.A), exact(tableau.b)
     assert all(residual(tree, A, b) == 0 for k in range(1, tableau.order + 1) for tree in grafted(k))

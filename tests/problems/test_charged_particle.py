@@ -123,7 +123,7 @@ def test_both_forms_are_the_same_motion(make):
 
 
 @pytest.mark.parametrize("make", [uniform_field, tokamak])
-@pytest.mark.parametrize("form", ["canonical", pytest.param("velocity", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("form", ["canonical", pytest.param("velocity", marks=[pytest.mark.nightly, pytest.mark.slow])])
 def test_first_reference_state_is_met(make, form):
     problem = make(form=form)
     t = problem.t_span[1] / 100
@@ -365,6 +365,7 @@ def test_a_wrong_claim_of_symmetry_is_seen():
         integrate(problem, method=EIPRK4)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("form", ["velocity", pytest.param("canonical", marks=[pytest.mark.nightly, pytest.mark.slow])])

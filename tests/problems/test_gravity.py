@@ -69,7 +69,7 @@ def check_against_exact(gm, y):
     assert abs(error) <= (3 if gm.size >= 8 else 4 + np.sqrt(gm.size)) * ROUNDING * energy_size
 
 
-@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("n", [*SIZES[:-1], pytest.param(100, marks=[pytest.mark.nightly, pytest.mark.slow])])
 def test_accuracy(n):
     check_against_exact(*bodies(n))
 

@@ -204,6 +204,8 @@ def test_lotka_volterra():
     assert names(lotka_volterra, [1.0, 0.5], degree=4) == []
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 def test_terms_of_time_and_state_jitted():
     if config.DISABLE_JIT:
         pytest.skip("of compiled functions")

@@ -278,6 +278,8 @@ def test_nystrom_methods_say_what_works():
 # --- equations, energies, gradients ---
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 def test_kepler_as_the_packages_own():
     own, problem = kepler(), hamiltonian(KEPLER, params={"eps": 0.005}, invariants=L)
     rng = np.random.default_rng(1)
@@ -329,6 +331,8 @@ def test_multistep_methods_take_their_jacobian():
     assert hamiltonian("p**2/2 + abs(q)").jacobian is None  # it has no derivative at 0
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 def test_second_order_of_masses():
     problem = hamiltonian("p1**2/(2*m) + p2**2/4 + p1*p2/10 + q1**2/2 + q2**2*cos(q1)**2", params={"m": 3.0})
     other = problem.second_order()
@@ -375,6 +379,8 @@ def test_henon_heiles_as_written_by_hand():
     assert run.max_defect[0] < 1e-14
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 def test_double_pendulum_against_scipy():
     problem = hamiltonian(DOUBLE_PENDULUM, "th1 th2", "p1 p2", params=PENDULUM_PARAMS)
     y0 = np.array([1.0, 0.5, 0.2, -0.1])
@@ -574,6 +580,8 @@ def test_problems_pickle_and_copy():
             assert len(other.invariants) == len(item.invariants)
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.parametrize("H", [KEPLER, KEPLER.replace("1/sqrt(x**2 + y**2)", "cos(x**2 + y**2)")])
 def test_members_of_an_ensemble(H):
     problem = hamiltonian(H, params={"eps": 0.005}, invariants=L)
@@ -620,6 +628,8 @@ def test_code_is_the_same_in_every_process():
     assert len(found) == 1
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 def test_a_lattice_of_many_names():
     n = 12
     H = " + ".join(f"p{k}**2/2 + (q{(k + 1) % n} - q{k})**2/2 + (q{(k + 1) % n} - q{k})**4/4" for k in range(n))

@@ -164,6 +164,7 @@ COMPILED = {
     ),
     "complex": (precession, np.array([0.6, 0.8j]), COMPLEX | {"compiled": True}),
 }
+AT_ONCE = ("compensated, every auto", "events", "Nystrom")
 
 
 def same(one, other):
@@ -241,7 +242,7 @@ def test_resumed_runs_are_the_same(name, tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.usefixtures("fine")
-@pytest.mark.parametrize("name", COMPILED)
+@pytest.mark.parametrize("name", [k if k in AT_ONCE else pytest.param(k, marks=pytest.mark.nightly) for k in COMPILED])
 def test_resumed_compiled_runs_are_the_same(name, tmp_path, monkeypatch):
     fun, y0, options = COMPILED[name]
     whole = integrate(fun, SPAN, y0, **options)
@@ -260,7 +261,11 @@ def test_resumed_compiled_runs_are_the_same(name, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("fine")
-@pytest.mark.parametrize("name", ["fixed", "compensated", "every auto", "adaptive", "adaptive, events", "Nystrom, all"])
+@pytest.mark.parametrize(
+    "name",
+    ["fixed", "adaptive, events", "Nystrom, all"]
+    + [pytest.param(name, marks=pytest.mark.nightly) for name in ("compensated", "every auto", "adaptive")],
+)
 @pytest.mark.parametrize(
     "error", [BrokenOffError, pytest.param(KeyboardInterrupt, marks=[pytest.mark.nightly, pytest.mark.slow])]
 )

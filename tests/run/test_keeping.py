@@ -386,7 +386,14 @@ FOREIGN = [replaced, overwritten, another_run, a_folder, edited]
 
 
 @pytest.mark.usefixtures("often")
-@pytest.mark.parametrize("change", FOREIGN)
+@pytest.mark.parametrize(
+    "change",
+    [
+        replaced,
+        a_folder,
+        *(pytest.param(k, marks=[pytest.mark.nightly, pytest.mark.slow]) for k in FOREIGN[1:] if k is not a_folder),
+    ],
+)
 def test_another_file_has_come_to_be_there(change, tmp_path):
     """It stays, and the run is kept beside it from then on."""
     place, states = tmp_path / "kept.npz", []
