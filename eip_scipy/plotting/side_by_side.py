@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from . import FLOOR, _figure, _legend_below, _log_errors, _log_x, method_styles
+from . import FLOOR, _figure, _log_errors, _log_x, method_styles
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,7 +64,10 @@ def side_by_side_figure(
     for axis, label in zip(axes, panels, strict=True):
         _log_x(axis)
         _log_errors(axis, time if axis is axes[-1] else "", label)
-    _legend_below(figure, axes[0])
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=2, fontsize="small", frameon=False, handlelength=3.5
+    )
     if footnote:
         axes[0].annotate(footnote, (1, 1.02), xycoords="axes fraction", ha="right", fontsize="xx-small", color="0.35")
     return figure

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from ..work_precision import cost_to_reach
-from .peers import COMPILED, PEERS
+from .peers import COMPILED, OWN, PEERS, PYTHON
 
 __all__ = ["LEVELS", "REASONS", "Row", "Standing", "groups", "reason", "standings"]
 
@@ -110,7 +110,23 @@ def _cost(runs: Sequence[Row], level: float) -> float:
 
 # Why a peer wins where it does, by the beginnings of suite, scene and peer, and the kind of function; the first that
 # fits is printed, and only beside a measured loss.
-REASONS: tuple[tuple[str, str, str, str, str], ...] = ()
+CHECKS = "Each call of ours looks at invariants and gradients, some milliseconds: most of so short a run."
+CHEAP = (
+    "Its loop is compiled and calls nothing but the function; ours calls the invariants and their gradients too, and "
+    "where errors grow as slowly without projection that is not earned back."
+)
+TAYLOR = (
+    "A Taylor series of high order, whose coefficients are compiled for these very equations and this tolerance; the "
+    "equations must be written as its expressions, while ours takes any function."
+)
+REASONS: tuple[tuple[str, str, str, str, str], ...] = (
+    ("solar", "", OWN, "REBOUND WHFast", "It solves each planet's Kepler orbit exactly and steps over the small rest."),
+    ("", "", OWN, "heyoka", TAYLOR),
+    ("solar", "outer", COMPILED, "", CHECKS),
+    ("kepler", "rigid", "", "", CHEAP),
+    ("", "", PYTHON, "CyRK", CHEAP),
+    ("", "", COMPILED, "", CHEAP),
+)
 
 
 def reason(standing: Standing) -> str:

@@ -74,11 +74,12 @@ def _equal_error(found: Found, suite: str) -> list[Table]:
         group = [each for each in known if (each.suite, each.scene, each.takes) == where]
         levels = [level for level in LEVELS if any(each.level == level for each in group)]
         head = [where[2]]
-        ours = ["**ours**"]
+        ours, names = ["**ours**"], []
         for level in levels:
             best = next(each for each in group if each.level == level)
             head += [f"error {compact(level, 1)}", "by ours"]
-            ours += [f"{_seconds(best.ours)} ({best.best})", "1"]
+            ours += [_seconds(best.ours), "1"]
+            names.append(f"{best.best} at {compact(level, 1)}")
         rows = [ours]
         for peer in dict.fromkeys(each.peer for each in group):
             row = [peer]
@@ -86,7 +87,7 @@ def _equal_error(found: Found, suite: str) -> list[Table]:
                 (each,) = [each for each in group if each.peer == peer and each.level == level]
                 row += [_seconds(each.seconds), _ratio(each)]
             rows.append(row)
-        notes = [_loss(each) for each in group if each.lost]
+        notes = [f"Ours: {', '.join(names)}.", *(_loss(each) for each in group if each.lost)]
         tables.append(Table(where[1], head, rows, notes, where))
     return tables
 
@@ -128,15 +129,14 @@ def _tables(found: Found, suite: str) -> list[Table]:
 
 
 def _failures(found: Found, suite: str) -> list[str]:
-    """What peers said instead of a result, each once."""
+    """What peers said instead of a result, first, in each scene."""
     if SUITES[suite].task == "asked":
         return []
-    lines = [
-        f"{row.peer}, {row.scene}: {row.said}"
-        for row in found.rows
-        if row.suite == suite and row.said and row.seconds is None
-    ]
-    return list(dict.fromkeys(lines))
+    said: dict[str, str] = {}
+    for row in found.rows:
+        if row.suite == suite and row.said and row.seconds is None:
+            said.setdefault(f"{row.peer}, {row.scene}", row.said)
+    return [f"{who}: {what}" for who, what in said.items()]
 
 
 def _field(found: Found) -> Table:
@@ -208,7 +208,7 @@ h1 { font-size: 1.7rem; margin: .5rem 0; } h2 { border-top: 2px solid #0072b2; p
 h3 { margin-bottom: .3rem; } .kind, .meta { color: #555; font-weight: normal; }
 nav a { margin-right: 1rem; white-space: nowrap; } a { color: #0060a0; }
 .scene { display: grid; grid-template-columns: minmax(0, 26rem) minmax(0, 1fr); gap: 0 1.5rem; align-items: start; }
-.scene.plain { grid-template-columns: minmax(0, 1fr); }
+.scene.plain { grid-template-columns: minmax(0, 1fr); } .plain td, .plain th { text-align: left; }
 img { width: 100%; height: auto; } .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .86rem; } td, th { padding: .22rem .6rem; text-align: right;
   border-bottom: 1px solid #ddd; white-space: nowrap; } td:first-child, th:first-child { text-align: left; }
@@ -252,7 +252,7 @@ def _scene(each: Table, figures: Mapping[Where, Any]) -> str:
         )
     kind = f" <span class=kind>{escape(each.where[2])}</span>" if each.where else ""
     title = f"<h3>{escape(each.title)}{kind}</h3>" if each.title else ""
-    rows = "".join(_line(row) for row in each.rows)
+    rows = "".join(_line(row, each.head) for row in each.rows)
     notes = "".join(f"<li>{escape(note)}" for note in each.notes)
     head = "".join(f"<th>{escape(name)}" for name in each.head)
     return (
@@ -261,14 +261,13 @@ def _scene(each: Table, figures: Mapping[Where, Any]) -> str:
     )
 
 
-def _line(row: list[str]) -> str:
+def _line(row: list[str], head: list[str]) -> str:
     kind = " class=ours" if row[0] == "**ours**" else ""
-    return f"<tr{kind}>" + "".join(_cell(value) for value in row) + "</tr>"
+    return f"<tr{kind}>" + "".join(_cell(value, name) for value, name in zip(row, head, strict=True)) + "</tr>"
 
 
-def _cell(value: str) -> str:
-    try:
-        lost = " class=lost" if float(value) < 1 else ""
-    except ValueError:
-        lost = " class=words" if len(value) > 40 else ""
-    return f"<td{lost}>{escape(value.strip('*'))}"
+def _cell(value: str, head: str) -> str:
+    kind = " class=words" if len(value) > 40 else ""
+    if head == "by ours" and value[0].isdigit() and float(value) < 1:
+        kind = " class=lost"
+    return f"<td{kind}>{escape(value.strip('*'))}"

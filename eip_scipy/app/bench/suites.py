@@ -141,6 +141,7 @@ def solar() -> list[dict[str, Any]]:
         full_steps = {
             "EIPRKN12": [round(years * n) for n in (20, 25, 32, 40, 50, 64)],
             "EIPGJ12": [round(years * n) for n in (560, 650, 750, 900)],
+            "EIPGJ14": [round(years * n) for n in (260, 300, 350, 412, 500, 600)],
             "WHFast": [round(years * n) for n in (15, 30, 60, 120, 240, 480)],
             "heyoka": few,
         }

@@ -96,7 +96,7 @@ def asked(peer: Peer, request: Mapping[str, Any]) -> Answers:
     for record in request["scenes"]:
         scene, extra = scene_from(record), dict(record["extra"])
         functions = scene.plain()
-        if "invariants" in extra:
+        if extra.pop("invariants", False) and not peer.keeps:
             extra["invariants"] = [functions.values]
         if "events" in extra:
             extra["events"] = [_crossing]
@@ -104,8 +104,9 @@ def asked(peer: Peer, request: Mapping[str, Any]) -> Answers:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
                 solve = peer.prepare(scene, **extra)
-                error = scene.error(solve(record["settings"][0]))
-            yield {"scene": record["title"], "said": f"done, error {error:.0e}"}
+                y = solve(record["settings"][0])
+            said = f"done, error {scene.error(y):.0e}, change of the invariants {scene.drift(y):.0e}"
+            yield {"scene": record["title"], "said": said}
         except ImportError:
             raise
         except Exception as error:

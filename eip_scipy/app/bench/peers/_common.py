@@ -40,6 +40,8 @@ class Peer:
         Equations that it is asked for; empty: all.
     warm : bool
         Whether each setting compiles code of its own, so that a run goes before those that count.
+    projects : bool
+        Whether it, too, gets the scene's invariants.
     """
 
     name: str
@@ -49,6 +51,12 @@ class Peer:
     steps: bool = False
     scenes: tuple[str, ...] = ()
     warm: bool = False
+    projects: bool = False
+
+    @property
+    def keeps(self) -> bool:
+        """Whether it always gets the scene's invariants."""
+        return self.ours or self.projects
 
     @property
     def ours(self) -> bool:

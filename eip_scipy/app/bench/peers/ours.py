@@ -114,4 +114,5 @@ PEERS = (
     Peer("EIPDOP853 in solve_ivp", "eip_scipy", PYTHON, _in_solve_ivp),
     *_each(COMPILED, _compiled, ()),
     *_each(OWN, _native, ("bodies",)),
+    Peer("EIPGJ14 (problem)", "eip_scipy", OWN, partial(_native, "EIPGJ14", every=10), True, ("bodies",)),
 )

@@ -105,7 +105,7 @@ PEERS = (
     *(Peer(f"extensisq {name}", "extensisq", PYTHON, partial(_extensisq, name)) for name in ("Pr9", "SWAG")),
     *(Peer(f"CyRK {name}", "CyRK", PYTHON, partial(_cyrk, name)) for name in ("DOP853", "Vern8", "LSODA")),
     Peer("scikit-SUNDAE CVODE", "scikit-sundae", PYTHON, _sundae),
-    Peer("homproj DOP853", "homproj", PYTHON, _homproj),
+    Peer("homproj DOP853", "homproj", PYTHON, _homproj, projects=True),
     Peer("desolver RK87", "desolver", PYTHON, partial(_desolver, "RK87")),
     Peer("SciPy DOP853 (jitted)", "scipy", COMPILED, partial(_scipy_jitted, "DOP853")),
 )
