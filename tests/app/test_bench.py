@@ -18,6 +18,7 @@ from eip_scipy.app.bench.command import Bench
 from eip_scipy.app.bench.compare import Row, standings
 from eip_scipy.app.bench.equations import EQUATIONS, scene_from
 from eip_scipy.app.bench.peers import COMPILED, PEERS, PYTHON
+from eip_scipy.app.cli import main
 from eip_scipy.app.report import UsageError
 from eip_scipy.app.study import Session
 
@@ -173,9 +174,9 @@ def test_the_field_keeps_its_invariants():
     assert functions.values(0.0, scene.end) == pytest.approx(functions.values(0.0, y), rel=1e-9)
 
 
-def test_unknown_names_are_refused():
-    with pytest.raises(UsageError, match="no suite 'moon'; expected all, or some of kepler"):
-        Bench(suite=["moon"]).check_settings()
+def test_unknown_names_are_refused(capsys):
+    assert main(["bench", "--suite", "sollar"]) == 2
+    assert "unknown suite 'sollar', expected one of all, kepler, solar, " in capsys.readouterr().err
     with pytest.raises(UsageError, match="no peer 'nobody'; expected some of CyRK"):
         Bench(peers=["nobody"]).check_settings()
 

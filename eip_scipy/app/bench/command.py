@@ -10,7 +10,7 @@ from typing import Any
 
 from ...core.versions import versions
 from ..report import UsageError, describe_machine
-from ..study import Figures, PartlyDone, Rows, Session, Study, option
+from ..study import Figures, PartlyDone, Rows, Session, Study, one_of, option
 from .compare import Row, standings
 from .figures import drawn
 from .page import Found, html, markdown, text
@@ -26,7 +26,11 @@ class Bench(Study[Found]):
     """The command. A run counts by the least of `repeats`; a sweep ends after a run of more than `patience` seconds."""
 
     suite: Sequence[str] = option(
-        ("all",), f"what to run: all, or some of {', '.join(SUITES)}", nargs="+", metavar="SUITE"
+        ("all",),
+        f"what to run: all, or some of {', '.join(SUITES)}",
+        nargs="+",
+        metavar="SUITE",
+        type=one_of("suite", ("all", *SUITES)),
     )
     peers: Sequence[str] | None = option(
         None, "packages to compare with, as pip calls them, or beginnings of peers' names", nargs="+", metavar="PEER"
@@ -39,10 +43,7 @@ class Bench(Study[Found]):
     field_of_peers: Mapping[str, Peer] = field(default_factory=lambda: PEERS)
 
     def check_settings(self) -> None:
-        """Suites and peers must be known."""
-        for name in self.suite:
-            if name not in ("all", *SUITES):
-                raise UsageError(f"there is no suite {name!r}; expected all, or some of {', '.join(SUITES)}")
+        """Peers must be known."""
         for name in self.peers or ():
             if not any(_is(peer, name) for peer in PEERS.values()):
                 known = sorted({peer.distribution for peer in PEERS.values() if not peer.ours})
