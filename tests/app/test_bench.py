@@ -119,6 +119,8 @@ def test_cost_at_equal_error_is_interpolated_and_divided_by_our_best():
         *rows_of("SciPy DOP853", (10.0, 1e-5), (1000.0, 1e-7)),
     ]
     near, far = standings(rows)
+    assert not near.bound
+    assert far.tried == 1000.0
     assert (near.best, near.ours) == ("EIPRKN12", pytest.approx(math.sqrt(3)))
     assert near.seconds == pytest.approx(100.0)
     assert far.best == "EIPDOP853"
@@ -145,7 +147,7 @@ def test_a_reason_is_printed_only_where_the_peer_won(monkeypatch):
     ahead = [*rows_of("EIPDOP853", (2.0, 1e-10)), *rows_of("SciPy DOP853", (1.0, 1e-10))]
     behind = [*rows_of("EIPDOP853", (1.0, 1e-10)), *rows_of("SciPy DOP853", (2.0, 1e-10))]
     texts = [page.text(page.Found("here", "today", rows)) for rows in (ahead, behind)]
-    assert "SciPy DOP853 is ahead by 2 at 1e-6. It is clever." in texts[0]
+    assert "SciPy DOP853 is ahead by 2 at 1e-6; SciPy DOP853 is ahead by 2 at 1e-9. It is clever." in texts[0]
     assert "clever" not in texts[1]
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from time import perf_counter
 from typing import Any
 
 from ...core.versions import versions
@@ -38,7 +39,7 @@ class Bench(Study[Found]):
     repeats: int = 4
     enough: float = 0.12
     patience: float = 0.4
-    limit: float = 60.0
+    limit: float = 90.0
     suites: Mapping[str, Suite] = field(default_factory=lambda: SUITES)
     field_of_peers: Mapping[str, Peer] = field(default_factory=lambda: PEERS)
 
@@ -65,7 +66,9 @@ class Bench(Study[Found]):
                 for suite, peer, scenes in asked:
                     bar.set_postfix_str(f"{suite.name}: {peer.name}")
                     if peer.distribution not in found.absent:
+                        begin = perf_counter()
                         self._ask(found, suite.name, suite.task, peer, scenes)
+                        found.took[suite.name, peer.name] = perf_counter() - begin
                     bar.update()
         except KeyboardInterrupt:
             raise PartlyDone(found) from None

@@ -31,6 +31,8 @@ class Found:
         Of the peers' packages, by their names with pip; ours among them.
     absent : dict
         By the same names why a package did not run.
+    took : dict
+        By suite and peer the seconds that asking took.
     """
 
     machine: str
@@ -38,6 +40,7 @@ class Found:
     rows: list[Row] = field(default_factory=list)
     versions: dict[str, str] = field(default_factory=dict)
     absent: dict[str, str] = field(default_factory=dict)
+    took: dict[tuple[str, str], float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -62,8 +65,10 @@ def _seconds(value: float | None) -> str:
 
 def _ratio(standing: Standing) -> str:
     if not math.isfinite(standing.seconds):
-        return "not reached"
-    return f"{standing.ratio:.2g}" if standing.ratio < 100 else f"{standing.ratio:.0f}"
+        least = standing.tried / standing.ours
+        return f"> {least:.2g}" if least > 1 else "not reached"
+    mark = "< " if standing.bound else ""
+    return mark + f"{standing.ratio:.2g}" if standing.ratio < 100 else f"{standing.ratio:.0f}"
 
 
 def _equal_error(found: Found, suite: str) -> list[Table]:
@@ -85,16 +90,22 @@ def _equal_error(found: Found, suite: str) -> list[Table]:
             row = [peer]
             for level in levels:
                 (each,) = [each for each in group if each.peer == peer and each.level == level]
-                row += [_seconds(each.seconds), _ratio(each)]
+                row += [("< " if each.bound else "") + _seconds(each.seconds), _ratio(each)]
             rows.append(row)
-        notes = [f"Ours: {', '.join(names)}.", *(_loss(each) for each in group if each.lost)]
+        notes = [f"Ours: {', '.join(names)}.", *_losses(group)]
         tables.append(Table(where[1], head, rows, notes, where))
     return tables
 
 
-def _loss(each: Standing) -> str:
-    ahead = f"ahead by {1 / each.ratio:.2g}" if each.ratio else "the only one that arrives"
-    return f"{each.peer} is {ahead} at {compact(each.level, 1)}. {reason(each)}".strip()
+def _losses(group: list[Standing]) -> list[str]:
+    """A line for each reason: which peers won for it, where and by how much."""
+    by_reason: dict[str, list[str]] = {}
+    for each in group:
+        if each.lost:
+            ahead = f"ahead by {1 / each.ratio:.2g}" if each.ratio else "the only one that arrives"
+            told = by_reason.setdefault(reason(each), [])
+            told.append(f"{each.peer} is {ahead} at {compact(each.level, 1)}")
+    return [f"{'; '.join(told)}. {why}".strip() for why, told in by_reason.items()]
 
 
 def _first(found: Found) -> list[Table]:
@@ -158,8 +169,9 @@ HOW = (
     "largest component of the difference to the exact final state, relative to its largest component; exact states are "
     "closed forms, or come from arithmetic of more digits. The time is that of a whole call, the least of several, "
     'without imports and compilation, interpolated to the error; "by ours" is the peer\'s time by that of our cheapest '
-    'method. Absolute tolerances are a thousandth of the relative ones, for all. "Not reached": none of its runs '
-    "was as accurate, or a longer one was not tried."
+    'method. Absolute tolerances are a thousandth of the relative ones, for all. "<": the cheapest run is more '
+    'accurate than that. ">": no run was as accurate, the longest of which took so many times our time, and longer ones '
+    "were not tried."
 )
 
 
@@ -172,6 +184,12 @@ def text(found: Found) -> str:
             body = [(row[0].strip("*"), row[1:]) for row in each.rows]
             parts += ["", each.title, table([[name] for name in each.head[1:]], body), *each.notes]
         parts += _failures(found, suite)
+    if found.took:
+        longest = max(found.took, key=found.took.__getitem__)
+        all_of_it = (
+            f"{sum(found.took.values()):.0f} s, the longest {found.took[longest]:.0f} s for {': '.join(longest)}"
+        )
+        parts += ["", f"{len(found.took)} times a package was asked, in {all_of_it}."]
     parts += ["", *(f"{name} did not run: {why}" for name, why in found.absent.items())]
     return "\n".join(parts).rstrip()
 
@@ -268,6 +286,6 @@ def _line(row: list[str], head: list[str]) -> str:
 
 def _cell(value: str, head: str) -> str:
     kind = " class=words" if len(value) > 40 else ""
-    if head == "by ours" and value[0].isdigit() and float(value) < 1:
+    if head == "by ours" and value.lstrip("< ")[0].isdigit() and float(value.lstrip("< ")) < 1:
         kind = " class=lost"
     return f"<td{kind}>{escape(value.strip('*'))}"

@@ -58,7 +58,7 @@ def _numbalsoda(scene: Scene) -> Solve:
     def each(starts, rtol, atol):  # type: ignore[no-untyped-def]
         ends = np.empty_like(starts)
         for k in range(len(starts)):
-            states, _ = dop853(address, starts[k], times, params, rtol=rtol, atol=atol)
+            states, _ = dop853(address, starts[k], times, params, rtol=rtol, atol=atol, mxstep=10**7)
             ends[k] = states[-1]
         return ends
 

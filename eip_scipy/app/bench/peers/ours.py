@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..equations import Functions, Scene
+from ..equations import EQUATIONS, Functions, Scene
 from ._common import ATOL, COMPILED, OWN, PYTHON, Peer, Solve, package
 
 __all__ = ["PEERS"]
@@ -103,7 +103,6 @@ def _each(takes: str, make: Any, scenes: tuple[str, ...]) -> list[Peer]:
     second = scenes or SECOND_ORDER
     return [
         Peer(f"EIPDOP853{label}", "eip_scipy", takes, partial(make, "EIPDOP853"), scenes=scenes),
-        Peer(f"EIPDOP853, every=10{label}", "eip_scipy", takes, partial(make, "EIPDOP853", every=10), scenes=scenes),
         Peer(f"EIPRKN12{label}", "eip_scipy", takes, partial(make, "EIPRKN12", every=10), True, second),
         Peer(f"EIPGJ12{label}", "eip_scipy", takes, partial(make, "EIPGJ12", every=10), True, second),
     ]
@@ -111,8 +110,16 @@ def _each(takes: str, make: Any, scenes: tuple[str, ...]) -> list[Peer]:
 
 PEERS = (
     *_each(PYTHON, _python, ()),
+    Peer("EIPDOP853, every=10", "eip_scipy", PYTHON, partial(_python, "EIPDOP853", every=10)),
     Peer("EIPDOP853 in solve_ivp", "eip_scipy", PYTHON, _in_solve_ivp),
     *_each(COMPILED, _compiled, ()),
+    Peer(
+        "EIPDOP853, every=10 (jitted)",
+        "eip_scipy",
+        COMPILED,
+        partial(_compiled, "EIPDOP853", every=10),
+        scenes=tuple(EQUATIONS),
+    ),
     *_each(OWN, _native, ("bodies",)),
     Peer("EIPGJ14 (problem)", "eip_scipy", OWN, partial(_native, "EIPGJ14", every=10), True, ("bodies",)),
 )
