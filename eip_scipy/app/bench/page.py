@@ -64,11 +64,14 @@ def _seconds(value: float | None) -> str:
 
 
 def _ratio(standing: Standing) -> str:
-    if not math.isfinite(standing.seconds):
-        least = standing.tried / standing.ours
-        return f"> {least:.2g}" if least > 1 else "not reached"
-    mark = "< " if standing.bound else ""
-    return mark + f"{standing.ratio:.2g}" if standing.ratio < 100 else f"{standing.ratio:.0f}"
+    if math.isfinite(standing.seconds):
+        return ("< " if standing.bound else "") + _times(standing.ratio)
+    least = standing.tried / standing.ours
+    return f"> {_times(least)}" if least > 1 else "not reached"
+
+
+def _times(value: float) -> str:
+    return f"{value:.2g}" if value < 100 else f"{value:.0f}"
 
 
 def _equal_error(found: Found, suite: str) -> list[Table]:
@@ -170,7 +173,7 @@ HOW = (
     "closed forms, or come from arithmetic of more digits. The time is that of a whole call, the least of several, "
     'without imports and compilation, interpolated to the error; "by ours" is the peer\'s time by that of our cheapest '
     'method. Absolute tolerances are a thousandth of the relative ones, for all. "<": the cheapest run is more '
-    'accurate than that. ">": no run was as accurate, the longest of which took so many times our time, and longer ones '
+    'accurate than that. ">": no run was as accurate, the longest of which took so many times our time; longer ones '
     "were not tried."
 )
 
@@ -246,7 +249,7 @@ def html(found: Found, figures: Mapping[Where, Any]) -> str:
         f"<title>eip_scipy beside the field</title><style>{STYLE}</style>",
         "<h1>Side by side with the field</h1>",
         f"<p class=meta>{escape(found.date)}, {escape(found.machine)}</p><p>{escape(HOW)}</p>",
-        "<nav>" + "".join(f'<a href="#{name}">{escape(SUITES[name].title)}</a>' for name in suites) + "</nav>",
+        "<nav>" + " ".join(f'<a href="#{name}">{escape(SUITES[name].title)}</a>' for name in suites) + "</nav>",
         f"<section>{_scene(_field(found), figures)}</section>",
     ]
     for name in suites:
