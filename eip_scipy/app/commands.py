@@ -47,6 +47,7 @@ COMMANDS = {
         "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
     ),
     "view": Entry("view:View", "a page that plays a saved run"),
+    "bench": Entry("bench.command:Bench", "this package beside SciPy, REBOUND, heyoka and others, on this machine"),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
 }
 # Options of before, by command, and the command that does it now.

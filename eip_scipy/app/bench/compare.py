@@ -1,0 +1,155 @@
+"""Costs at equal error: our best method beside each peer, and why a peer wins where it does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from ..work_precision import cost_to_reach
+from .peers import COMPILED, OWN, PEERS, PYTHON
+
+__all__ = ["LEVELS", "REASONS", "Row", "Standing", "groups", "reason", "standings"]
+
+LEVELS = (1e-6, 1e-9)
+
+
+class Row(NamedTuple):
+    """One run, or what came instead; a line of the CSV file.
+
+    Attributes
+    ----------
+    suite, scene, takes, peer : str
+        `takes`: what kind of function.
+    setting, seconds, error, drift : float or None
+    said : str
+        An error's first line, or what else there is to say.
+    """
+
+    suite: str
+    scene: str
+    takes: str
+    peer: str
+    setting: float | None = None
+    seconds: float | None = None
+    error: float | None = None
+    drift: float | None = None
+    said: str = ""
+
+
+class Standing(NamedTuple):
+    """A peer beside our best method at one error.
+
+    Attributes
+    ----------
+    suite, scene, takes, peer : str
+    level : float
+        The error of the trajectory.
+    seconds : float
+        nan where it did not come so far.
+    best : str
+        Our method.
+    ours : float
+        Its seconds; inf where none of ours came so far.
+    tried : float
+        Seconds of the peer's longest run.
+    bound : bool
+        Whether `seconds` is a bound: the peer's cheapest run is more accurate than that.
+    """
+
+    suite: str
+    scene: str
+    takes: str
+    peer: str
+    level: float
+    seconds: float
+    best: str
+    ours: float
+    tried: float = 0.0
+    bound: bool = False
+
+    @property
+    def ratio(self) -> float:
+        """The peer's time by ours: above 1 where we are ahead."""
+        return self.seconds / self.ours
+
+    @property
+    def lost(self) -> bool:
+        """Whether the peer won."""
+        return self.ratio < 1
+
+
+def groups(rows: Iterable[Row]) -> dict[tuple[str, str, str], dict[str, list[Row]]]:
+    """By suite, scene and kind of function the runs of each peer that have a time and an error."""
+    found: dict[tuple[str, str, str], dict[str, list[Row]]] = {}
+    for row in rows:
+        if row.seconds is not None and row.error is not None and math.isfinite(row.error):
+            found.setdefault((row.suite, row.scene, row.takes), {}).setdefault(row.peer, []).append(row)
+    return found
+
+
+def standings(rows: Iterable[Row], levels: Sequence[float] = LEVELS) -> list[Standing]:
+    """Each peer of each group beside our best; where we have no method of the kind, beside our compiled ones."""
+    known = groups(rows)
+    found = []
+    for (suite, scene, takes), peers in known.items():
+        others = [name for name in peers if not PEERS[name].ours]
+        our_runs = _ours(peers) or _ours(known.get((suite, scene, COMPILED), {}))
+        for level in levels:
+            costs = {name: _cost(runs, level) for name, runs in our_runs.items()}
+            reached = {name: cost for name, cost in costs.items() if math.isfinite(cost)}
+            best = min(reached, key=reached.__getitem__, default="none of ours")
+            ours = reached.get(best, math.inf)
+            for name in others:
+                runs = peers[name]
+                tried, bound = max(row.seconds or 0.0 for row in runs), (runs[0].error or 0.0) <= level
+                found.append(Standing(suite, scene, takes, name, level, _cost(runs, level), best, ours, tried, bound))
+    return found
+
+
+def _ours(peers: dict[str, list[Row]]) -> dict[str, list[Row]]:
+    return {name: runs for name, runs in peers.items() if PEERS[name].ours}
+
+
+def _cost(runs: Sequence[Row], level: float) -> float:
+    return cost_to_reach([row.seconds for row in runs], [row.error for row in runs], level)
+
+
+# Why a peer wins where it does, by the beginnings of suite, scene and peer, and the kind of function; the first that
+# fits is printed, and only beside a measured loss.
+CHECKS = "Each call of ours looks at invariants and gradients, some milliseconds: most of so short a run."
+CHEAP = (
+    "Its loop is compiled and calls nothing but the function; ours calls the invariants and their gradients too, and "
+    "where errors grow as slowly without projection that is not earned back."
+)
+PLANETS = (
+    "It is made for planets: each orbit around the Sun is followed exactly, and only what the planets do to each other "
+    "is stepped over; ours takes any force."
+)
+TAYLOR = (
+    "A Taylor series of high order, whose coefficients are compiled for these very equations and this tolerance; the "
+    "equations must be written as its expressions, while ours takes any function."
+)
+REASONS: tuple[tuple[str, str, str, str, str], ...] = (
+    ("solar", "", OWN, "REBOUND WHFast", PLANETS),
+    ("", "", OWN, "heyoka", TAYLOR),
+    ("solar", "outer", COMPILED, "", CHECKS),
+    ("particle", "", COMPILED, "", CHECKS),
+    ("", "", PYTHON, "CyRK", CHEAP),
+    ("", "", COMPILED, "", CHEAP),
+)
+
+
+def reason(standing: Standing) -> str:
+    """Why the peer won; empty where it did not, or where nothing is known."""
+    if not standing.lost:
+        return ""
+    for suite, scene, takes, peer, why in REASONS:
+        if (
+            standing.suite.startswith(suite)
+            and standing.scene.startswith(scene)
+            and takes in ("", standing.takes)
+            and standing.peer.startswith(peer)
+        ):
+            return why
+    return ""

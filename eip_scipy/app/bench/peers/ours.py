@@ -1,0 +1,125 @@
+"""Our own methods as some of the field."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ..equations import EQUATIONS, Functions, Scene
+from ._common import ATOL, COMPILED, OWN, PYTHON, Peer, Solve, package
+
+__all__ = ["PEERS"]
+
+SECOND_ORDER = ("kepler", "henon_heiles", "bodies")
+
+
+def _end(result: Any) -> np.ndarray:
+    if not result.success:
+        raise RuntimeError(result.message)
+    return result.y[:, -1]
+
+
+def _kept(functions: Functions) -> Any:
+    return package("eip_scipy").Invariant(functions.values, functions.gradients)
+
+
+def _problem(scene: Scene) -> Any:
+    q, v = scene.y0.reshape(2, -1, 3)
+    return package("eip_scipy.problems").nbody(scene.params["gm"], q, v, t_span=(0.0, scene.t_end))
+
+
+def _run(method: str, arguments: dict[str, Any], t_end: float, options: dict[str, Any], setting: float) -> np.ndarray:
+    eip = package("eip_scipy")
+    if method in ("EIPRKN12", "EIPGJ14", "EIPGJ12", "EIPRK4"):
+        control: dict[str, Any] = {"h": t_end / setting}
+    else:
+        control = {"rtol": setting, "atol": ATOL * setting, "h": None}
+    result = eip.integrate(**arguments, t_span=(0.0, t_end), method=getattr(eip, method), **control, **options)
+    return _end(result)
+
+
+def _first_order(method: str) -> bool:
+    return method not in ("EIPRKN12", "EIPGJ12", "EIPGJ14")
+
+
+def _python(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
+    functions = scene.plain()
+    fun = functions.fun if _first_order(method) else functions.acc
+    options = {"invariants": _kept(functions), "every": every, **extra}
+    return partial(_run, method, {"fun": fun, "y0": scene.y0}, scene.t_end, options)
+
+
+def _in_solve_ivp(scene: Scene, **extra: Any) -> Solve:
+    solve_ivp, method = package("scipy.integrate").solve_ivp, package("eip_scipy").EIPDOP853
+    functions = scene.plain()
+    options = {"method": method, "invariants": _kept(functions), **extra}
+
+    def solve(setting: float) -> np.ndarray:
+        return _end(
+            solve_ivp(functions.fun, (0.0, scene.t_end), scene.y0, rtol=setting, atol=ATOL * setting, **options)
+        )
+
+    return solve
+
+
+def _compiled(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
+    functions = scene.compiled()
+    fun = functions.fun if _first_order(method) else functions.acc
+    options = {"compiled": True, "every": every, **extra}
+    if scene.equations == "bodies":
+        return partial(_run, method, {"fun": _with_own_function(scene, functions)}, scene.t_end, options)
+    arguments = {"fun": fun, "y0": scene.y0, "in_place": True, "invariants": _kept(functions)}
+    return partial(_run, method, arguments, scene.t_end, options)
+
+
+def _with_own_function(scene: Scene, functions: Functions) -> Any:
+    """The package's problem, whose invariants are compiled, with the user's jitted function."""
+    njit, right = package("numba").njit, functions.fun
+    filling: Any = functions.acc
+
+    @njit
+    def acc(t, q, params):  # type: ignore[no-untyped-def]
+        out = np.empty_like(q)
+        filling(t, q, out)
+        return out
+
+    @njit
+    def rhs(t, y, out, params):  # type: ignore[no-untyped-def]
+        right(t, y, out)
+
+    return replace(_problem(scene), rhs=rhs, acc=acc)
+
+
+def _native(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
+    return partial(_run, method, {"fun": _problem(scene)}, scene.t_end, {"every": every, **extra})
+
+
+def _each(takes: str, make: Any, scenes: tuple[str, ...]) -> list[Peer]:
+    """One method for each kind: adaptive of the first order, Nystrom and multistep for q'' = a(q)."""
+    label = {PYTHON: "", COMPILED: " (jitted)", OWN: " (problem)"}[takes]
+    second = scenes or SECOND_ORDER
+    return [
+        Peer(f"EIPDOP853{label}", "eip_scipy", takes, partial(make, "EIPDOP853"), scenes=scenes),
+        Peer(f"EIPRKN12{label}", "eip_scipy", takes, partial(make, "EIPRKN12", every=10), True, second),
+        Peer(f"EIPGJ12{label}", "eip_scipy", takes, partial(make, "EIPGJ12", every=10), True, second),
+    ]
+
+
+PEERS = (
+    *_each(PYTHON, _python, ()),
+    Peer("EIPDOP853, every=10", "eip_scipy", PYTHON, partial(_python, "EIPDOP853", every=10)),
+    Peer("EIPDOP853 in solve_ivp", "eip_scipy", PYTHON, _in_solve_ivp),
+    *_each(COMPILED, _compiled, ()),
+    Peer(
+        "EIPDOP853, every=10 (jitted)",
+        "eip_scipy",
+        COMPILED,
+        partial(_compiled, "EIPDOP853", every=10),
+        scenes=tuple(EQUATIONS),
+    ),
+    *_each(OWN, _native, ("bodies",)),
+    Peer("EIPGJ14 (problem)", "eip_scipy", OWN, partial(_native, "EIPGJ14", every=10), True, ("bodies",)),
+)
