@@ -104,7 +104,7 @@ inline Mask project_octet_evaluated(Eight &eight, const W &w, double t, const Oc
     }
     for (int64_t j = 0; j < w.m; ++j) eight.y_new[j] = where(outside, eight.y_new[j], w.y_hat[j]);
     evaluate_invariants(RunOf<W, OctetSystem>{eight.method, o, w, eight.system, nullptr}, t, eight.y_new);
-    const Mask held = defects_held<Octet>(w.before, w) & small_shares(o, w) & all_finite(eight.y_new, w.m);
+    const Mask held = defects_held<Octet>(w.before, o, w) & small_shares(o, w) & all_finite(eight.y_new, w.m);
     Mask done = alive & held & !leave;
     if (o.watched) done = done & !note_octet(t, done, o, w);
     for (int64_t i = 0; i < w.l; ++i)

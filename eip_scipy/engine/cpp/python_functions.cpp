@@ -328,7 +328,7 @@ bool PythonHooks::project_jointly(const Step &step) {
     } else {
         copy(w.y_hat, step.y_new, w.m);
     }
-    if (!defects_held<double>(w.before, w) || !small_shares(o, w)) return false;
+    if (!defects_held<double>(w.before, o, w) || !small_shares(o, w)) return false;
     ++w.counters[NJEV];
     if (outside) {
         ++w.counters[NLU];

@@ -61,14 +61,16 @@ inline auto own_terms(int64_t i, const Options &o, const W &w) {
     return min(now, figures[TERMS]) + TINY;
 }
 
-// Note the defects; whether all are finite and none has grown beyond what round-off explains.
+// Note the defects; whether all are finite and none has grown beyond what round-off explains: FAILURE_BANDS dead bands, or
+// as many roundings where bands are smaller.
 template <class Value, class W>
-inline Truth<Value> defects_held(const Value *before, const W &w) {
+inline Truth<Value> defects_held(const Value *before, const Options &o, const W &w) {
+    const double bands = FAILURE_BANDS * std::max(1.0, EPS * o.per_band);
     Truth<Value> bad{};
     for (int64_t i = 0; i < w.l; ++i) {
         w.defect[i] = w.values[i] - w.target[i];
         const Value size = abs(w.defect[i]);
-        bad = bad | !(size < INFINITE) | ((size > abs(before[i])) & (size > FAILURE_BANDS * w.band[i]));
+        bad = bad | !(size < INFINITE) | ((size > abs(before[i])) & (size > bands * w.band[i]));
     }
     return !bad;
 }
@@ -82,10 +84,10 @@ inline auto small_shares(const Options &o, const W &w) {
 }
 
 // Note the defects after a projection. It has failed where something is not finite, or a defect has grown and stands
-// above FAILURE_BANDS dead bands, or is more than the limit.
+// above FAILURE_BANDS dead bands and roundings, or is more than the limit.
 template <class W>
 inline Code judge(const double *before, const double *y, const Options &o, const W &w) {
-    const bool held = defects_held(before, w);
+    const bool held = defects_held(before, o, w);
     return all_finite(y, w.m) && held && small_shares(o, w) ? OK : FAILED_PROJECTION;
 }
 
