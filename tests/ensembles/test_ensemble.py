@@ -396,6 +396,7 @@ def test_statistics_are_those_of_the_trajectories():
     np.testing.assert_allclose(found.std, np.nanstd(kept, axis=0), rtol=1e-12)
     np.testing.assert_array_equal(found.min, np.nanmin(kept, axis=0))
     np.testing.assert_array_equal(found.max, np.nanmax(kept, axis=0))
+    assert repr(found).startswith(f"Statistics of 29 members at {len(run.times)} times, {y0s.shape[1]} quantities")
 
 
 def test_statistics_of_a_function_of_the_last_states():
