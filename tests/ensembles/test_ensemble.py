@@ -406,6 +406,16 @@ def test_statistics_of_a_function_of_the_last_states():
     assert run.statistics.count.tolist() == [2]
 
 
+def test_members_in_columns_are_told():
+    def unpacked(t, y):
+        position, velocity = y
+        return [velocity, -position]
+
+    with pytest.raises(ValueError, match="too many values to unpack") as info:
+        ensemble(unpacked, (0, 1), np.ones((2, 5)), method=EIPRK4, h=0.1)
+    assert info.value.__notes__ == ["ensemble: the rows of y0s are the members, here 2 of 5 components."]
+
+
 def test_wrong_statistics():
     with pytest.raises(ValueError, match="reduce must be 'state' or a function"):
         ensemble(oscillator, (0, 1), np.eye(2), h=0.1, reduce="mean")
