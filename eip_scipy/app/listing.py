@@ -38,16 +38,13 @@ class Listing(Study[Found]):
         """Names with the first lines of their docstrings, by their kind."""
         sets = {name: solar_data.load(name) for name in solar_data.available()}
         others = {name: getattr(comparators, name) for name in comparators.__all__}
-        scenes = {name: getattr(problems, name) for name in problems.__all__}
+        functions = {name: make for name in problems.__all__ if _is_function(make := getattr(problems, name))}
         return {
             "commands": {name: entry.summary for name, entry in COMMANDS.items()},
             "methods": {name: _first_line(method) for name, method in fixed_step_methods().items()},
             "comparators": {name: _first_line(make) for name, make in others.items() if not isinstance(make, type)},
-            "problems": {
-                name: _first_line(make)
-                for name, make in scenes.items()
-                if callable(make) and not isinstance(make, type)  # neither records nor fields
-            },
+            "problems": {name: _first_line(make) for name, make in functions.items() if _makes_problems(make)},
+            "for problems": {name: _first_line(make) for name, make in functions.items() if not _makes_problems(make)},
             "data": {name: f"{len(data.bodies)} bodies at {data.epoch}, {data.axes}" for name, data in sets.items()},
         }
 
@@ -60,6 +57,15 @@ class Listing(Study[Found]):
 
     def numbers(self, found: Found) -> dict[str, Any]:
         return dict(found)
+
+
+def _is_function(item: Any) -> bool:
+    return callable(item) and not isinstance(item, type)  # neither records nor fields
+
+
+def _makes_problems(function: Any) -> bool:
+    made = str(function.__annotations__.get("return"))  # as a time scale, which has none
+    return "Problem" in made or "HardCase" in made
 
 
 def _first_line(item: Any) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from ..engine.data import EPS
 from ..engine.native import BUILD, Call, call
 from .arguments import names, scalars
+from .callers import users_level
 from .inputs import count, filled, flag, is_number, reals, refuse_units, require_arguments, shown
 from .jitted import NotCompilableError, is_jitted, jit_is_off, numba_errors
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
@@ -270,13 +271,6 @@ class NumericalGradient:
         self.floors = floors
         by_pointer = isinstance(invariant.fun, PointerFunction)
         self.complex_step = y.dtype.kind == "f" and not by_pointer and self._complex_step_is_valid(t, y, extra)
-        if not self.complex_step and not by_pointer:
-            warnings.warn(
-                f"invariant {label!r} has no grad and allows no complex step: its gradient comes from central "
-                "differences of order 6 (about 1e-12 relative). Give grad for full accuracy and speed.",
-                UserWarning,
-                stacklevel=2,
-            )
 
     def __call__(self, t: float, y: Array, *extra: Any) -> Array:
         if self.complex_step:
@@ -378,10 +372,13 @@ def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
 class InvariantSet:
     """All invariants of a run as one: sizes, names, targets, scales, and the functions that the step calls.
 
-    Made at the start state, where values and shapes are checked. `extra` holds the run's `params`, if any.
+    Made at the start state, where values and shapes are checked. `extra` holds the run's `params`, if any. `tell`: warn
+    of what gradients that are not given cost.
     """
 
-    def __init__(self, invariants: Any, t0: float, y0: Array, f0: Array, tau: float, extra: tuple = ()) -> None:
+    def __init__(
+        self, invariants: Any, t0: float, y0: Array, f0: Array, tau: float, extra: tuple = (), *, tell: bool = True
+    ) -> None:
         self.items = given = as_invariants(invariants)
         self.extra = extra
         # Why a jitted invariant has no compiled gradient, by its label.
@@ -413,7 +410,9 @@ class InvariantSet:
             item.grad if item.grad is not None else NumericalGradient(item, label, t0, y0, self.floors, extra)
             for item, label in zip(self.items, self.labels, strict=True)
         ]
-        self._tell_of_cost(given, y0.size)
+        if tell:
+            self._tell_of_differences()
+            self._tell_of_cost(given, y0.size)
         self.target = self._targets()
         self.shape, self.dtype = (self.size, y0.size), y0.dtype
         places = [
@@ -431,6 +430,16 @@ class InvariantSet:
         self._gradients_at_start(t0, y0, f0)
         self.calls = self._calls(y0)
 
+    def _tell_of_differences(self) -> None:
+        for grad, label in zip(self.grads, self.labels, strict=True):
+            if isinstance(grad, NumericalGradient) and not grad.complex_step and label not in self.by_differences:
+                warnings.warn(
+                    f"invariant {label!r} has no grad and allows no complex step: its gradient comes from central "
+                    "differences of order 6 (about 1e-12 relative). Give grad for full accuracy and speed.",
+                    UserWarning,
+                    stacklevel=users_level(),
+                )
+
     def _tell_of_cost(self, given: Sequence[Invariant], n: int) -> None:
         """Once for all invariants of a large state whose gradients are computed from their values.
 
@@ -445,7 +454,7 @@ class InvariantSet:
                 "of m coordinates and m momenta, of cells w, Invariant(fun, grad=lambda t, y, f: "
                 "w * np.concatenate([-f[m:], f[:m]]), uses_f=True).",
                 UserWarning,
-                stacklevel=2,
+                stacklevel=users_level(),
             )
 
     @property
@@ -635,7 +644,7 @@ class InvariantSet:
             warnings.warn(
                 f"{complaint.text}. Projecting on it gives a wrong solution. (check=False skips this check.)",
                 UserWarning,
-                stacklevel=6,
+                stacklevel=users_level(),
             )
         return [complaint.text for complaint in found]
 

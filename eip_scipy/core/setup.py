@@ -303,10 +303,10 @@ def prepare(
     extra : tuple
         Further arguments of the invariants' functions (``(params,)`` or nothing).
     check_start : bool
-        False: the invariants have been checked at the start of another run like this.
+        False: the invariants have been checked, and their cost told, at the start of another run like this.
     """
     t0, y0, f0, tau = start
-    invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra)
+    invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra, tell=check_start)
     options, sigma, identity = projection.settled(method, stepping, y0, invariants)
     options = options._replace(scales=_scales(options, invariants, start))
     arrays = method_arrays(method)

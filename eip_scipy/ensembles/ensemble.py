@@ -570,6 +570,8 @@ def _first_that_starts(task: Task, starts: np.ndarray, params: np.ndarray) -> tu
             alike: list[int] = np.flatnonzero((params == params[k]).all(axis=1)).tolist() if found else []
             return Plan(tried, ready), dict.fromkeys(alike, found)
     assert first is not None
+    # A transposed array meets the user's own function first, which may say little: jitted code says nothing at all.
+    first.add_note(f"ensemble: the rows of y0s are the members, here {len(starts)} of {starts.shape[1]} components.")
     raise first
 
 

@@ -11,7 +11,7 @@ import numpy as np
 __all__ = ["Statistics", "merge", "statistics_of"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Statistics:
     """Mean, variance and extremes over members, at each of m times, of k quantities.
 
@@ -43,6 +43,11 @@ class Statistics:
     def std(self) -> np.ndarray:
         """Square root of the variance."""
         return np.sqrt(self.var)
+
+    def __repr__(self) -> str:
+        members = " to ".join(map(str, sorted({int(self.count.min()), int(self.count.max())})))
+        quantities, times = self.mean.shape
+        return f"Statistics of {members} members at {times} times, {quantities} quantities: mean, var, std, min, max"
 
 
 def statistics_of(reduce: Any, t: np.ndarray, states: np.ndarray) -> Statistics | None:

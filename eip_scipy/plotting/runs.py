@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["run_figure"]
 
 MOST = 9  # components, or bodies, that can be told apart
+TICKS = 5  # of times with five digits: more would touch each other
 HEALTHY = 5.0  # corrections in local errors, see `Diagnostics`
 
 
@@ -59,6 +60,7 @@ def run_figure(
         axes[1].plot(t, _above_zero(np.abs(values)), lw=1.1, **styles[name] | {"marker": None})
     if errors:
         _log_errors(axes[1], "t", "|I - target|")
+        axes[1].locator_params(axis="x", nbins=TICKS)
         axes[1].legend(fontsize="small", loc="upper left")
     if corrections:
         _draw_corrections(axes[-1], corrections, styles)
@@ -84,6 +86,7 @@ def _draw_components(axis: Axes, t: np.ndarray, components: Mapping[str, Any]) -
         style |= {"label": f"|{name}|" if is_complex else name, "marker": None}
         axis.plot(t, np.abs(values) if is_complex else values, lw=1.1, **style)
     axis.set_xlabel("t")
+    axis.locator_params(axis="x", nbins=TICKS)
     axis.grid(alpha=0.2)
     _named(axis, len(components))
 

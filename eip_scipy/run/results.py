@@ -131,8 +131,7 @@ class IntegrationResult(OptimizeResult):
         ----------
         t : float
             The new end, beyond the present one in the direction of the run; as in `t_span` of `integrate` also a
-            duration
-            from t = 0, or a time.
+            duration from t = 0, or a time.
         **options
             Options of `integrate` that are to be others than before. Times in `t_eval` are not asked for again: give
             new ones, or the states at both ends are saved. An event that ended the run may end it again at once;

@@ -28,6 +28,7 @@ from eip_scipy import (
     ensemble,
     integrate,
     project,
+    recommend,
 )
 
 EPS = np.finfo(float).eps
@@ -1126,6 +1127,30 @@ def test_no_invariant_warns(driver):
     for item in record:
         assert "'first' is no invariant of this system: at t=0 it changes at the rate 2" in str(item.message)
         assert item.filename == __file__
+
+
+@pytest.mark.parametrize("size", [2, 200])  # a large state tells of the missing gradient too
+@pytest.mark.parametrize(
+    "call",
+    [
+        "solve_ivp(fun, (0, 0.1), y0, method=EIPRK4, h=0.1, invariants=first)",
+        "integrate(fun, (0, 0.1), y0, method=EIPRK4, h=0.1, invariants=first)",
+        "ensemble(fun, (0, 0.1), [y0, y0, y0], method=EIPRK4, h=0.1, invariants=first)",
+        "recommend(fun, (0, 0.1), y0, invariants=first)",
+    ],
+)
+def test_warnings_come_once_and_name_the_line_that_a_user_wrote(call, size):
+    """That of a script: nothing of this file is between it and the package."""
+    names = {"__name__": "__main__", "fun": lambda t, y: 1.0 + 0.1 * np.abs(y), "y0": np.ones(size)}
+    names |= {"first": Invariant(lambda t, y: abs(y[0])), "EIPRK4": EIPRK4, "solve_ivp": solve_ivp}
+    names |= {"integrate": integrate, "ensemble": ensemble, "recommend": recommend}
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        exec(compile(call, "script.py", "exec"), names)
+    said = [(str(item.message), item.filename) for item in record if item.category is UserWarning]
+    of_cost = ["no grad is given"] if size > 2 else []
+    for words in ("allows no complex step", "is no invariant of this system", *of_cost):
+        assert [place for text, place in said if words in text] == ["script.py"]
 
 
 @both

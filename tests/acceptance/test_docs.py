@@ -73,6 +73,13 @@ def test_links_lead_somewhere(page):
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
+def test_links_have_a_text():
+    """Without one Sphinx fills in the title, and who reads the file itself sees no link."""
+    pages = [page for page in (ROOT / "docs").rglob("*.md") if "_build" not in page.parts]
+    assert pages
+    assert [page.name for page in pages if "[](" in page.read_text(encoding="utf-8")] == []
+
+
 def test_notebooks_are_listed():
     """Each notebook is on the documentation's page; `.ci/run` executes them."""
     notebooks = sorted((ROOT / "examples").glob("*.md"))

@@ -463,7 +463,10 @@ def test_list(capsys, tmp_path):
     text = capsys.readouterr().out
     for name in ("solar-system", "EIPRK5", "stormer_verlet", "kepler", "de440-j2000"):
         assert name in text
-    assert set(json.loads(file.read_text())["methods"]) >= {"EIPRK1", "EIPRK2", "EIPRK3", "EIPRK4", "EIPRK5"}
+    found = json.loads(file.read_text())
+    assert set(found["methods"]) >= {"EIPRK1", "EIPRK2", "EIPRK3", "EIPRK4", "EIPRK5"}
+    assert set(found["problems"]) >= {"kepler", "nbody", "hamiltonian", "hard_cases", "soliton", "tokamak"}
+    assert set(found["for problems"]) >= {"find_invariants", "harmonic_trap", "orbital_elements", "pair_time"}
     assert main(["list", "--quiet"]) == 0
     assert capsys.readouterr().out == ""
 

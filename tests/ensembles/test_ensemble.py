@@ -396,6 +396,7 @@ def test_statistics_are_those_of_the_trajectories():
     np.testing.assert_allclose(found.std, np.nanstd(kept, axis=0), rtol=1e-12)
     np.testing.assert_array_equal(found.min, np.nanmin(kept, axis=0))
     np.testing.assert_array_equal(found.max, np.nanmax(kept, axis=0))
+    assert repr(found).startswith(f"Statistics of 29 members at {len(run.times)} times, {y0s.shape[1]} quantities")
 
 
 def test_statistics_of_a_function_of_the_last_states():
@@ -403,6 +404,16 @@ def test_statistics_of_a_function_of_the_last_states():
     assert run.statistics.mean.shape == (1, 1)
     np.testing.assert_allclose(run.statistics.mean, [[1.0]], rtol=1e-5)
     assert run.statistics.count.tolist() == [2]
+
+
+def test_members_in_columns_are_told():
+    def unpacked(t, y):
+        position, velocity = y
+        return [velocity, -position]
+
+    with pytest.raises(ValueError, match="too many values to unpack") as info:
+        ensemble(unpacked, (0, 1), np.ones((2, 5)), method=EIPRK4, h=0.1)
+    assert info.value.__notes__ == ["ensemble: the rows of y0s are the members, here 2 of 5 components."]
 
 
 def test_wrong_statistics():

@@ -3,6 +3,7 @@
 import pickle
 import sys
 import zipfile
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -459,6 +460,16 @@ def test_plot_of_components():
     first, *_ = axes_of(field.plot())
     assert first.get_title() == "the first 9 of 16"
     np.testing.assert_array_equal(first.lines[3].get_ydata(), np.abs(field.y[3]))
+
+
+def test_long_times_do_not_touch_each_other():
+    figure = integrate(kepler(), (0, 20_000), method=EIPRK4, save_every=2000).plot(orbit=False)
+    figure.draw_without_rendering()
+    for axis in axes_of(figure)[:2]:
+        boxes = [label.get_window_extent() for label in axis.get_xticklabels()]
+        inside = [box for box in boxes if axis.bbox.x0 <= (box.x0 + box.x1) / 2 <= axis.bbox.x1]
+        assert len(inside) > 2
+        assert all(left.x1 < right.x0 for left, right in pairwise(inside))
 
 
 def test_plot_is_saved(tmp_path):

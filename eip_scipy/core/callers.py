@@ -1,0 +1,20 @@
+"""Where a warning belongs: the line of the user's program that led to it."""
+
+from __future__ import annotations
+
+import sys
+
+__all__ = ["users_level"]
+
+INSIDE = (__name__.partition(".")[0], "scipy")
+
+
+def users_level() -> int:
+    """The `stacklevel`, for a warning of the caller, of the first function outside of this package and SciPy.
+
+    How many functions lie between differs: `solve_ivp`, `integrate`, `ensemble` and `recommend` prepare runs alike.
+    """
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in INSIDE:
+        frame, level = frame.f_back, level + 1
+    return level
