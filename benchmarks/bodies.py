@@ -13,11 +13,13 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
+from installed import peer
 
 from eip_scipy import EIPRKN12, integrate
 from eip_scipy.app.report import describe_machine
-from eip_scipy.integrations import rebound
 from eip_scipy.problems import Problem, nbody
+
+rebound = peer("eip_scipy.integrations.rebound")
 
 REPEATS = 3
 PERIOD = 2 * np.pi

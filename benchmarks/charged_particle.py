@@ -1,6 +1,6 @@
 """Charged particles: speed of the compiled step, and error against cost beside other methods.
 
-    python benchmarks/charged_particle.py [--out DIR] [--json FILE] [--repeats 3]
+    python benchmarks/charged_particle.py [--out DIR] [--json FILE] [--repeats 3] [--quick]
 
 1. Time of a step in the tokamak: plain RK4, EIP-HL with both metrics and with wider spacings, Boris, implicit midpoint;
    and the same EIP-HL through solve_ivp, from the first 200 000 of the paper's steps (solve_ivp: 5000). Runs in turn,
@@ -51,8 +51,8 @@ def cpu_seconds(call: Callable[..., Any], *args: Any, **options: Any) -> float:
     return thread_time() - start
 
 
-def speed(repeats: int) -> dict[str, float]:
-    """Microseconds for a step of the banana orbit."""
+def speed(turns: int, share: float) -> dict[str, float]:
+    """Microseconds for a step of the banana orbit; `share`: of the steps."""
     problem, other = tokamak(), tokamak(form="velocity")
     assert problem.h is not None
     rk4 = partial(integrate, method=EIPRK4)
@@ -75,15 +75,12 @@ def speed(repeats: int) -> dict[str, float]:
         "EIP-HL, through solve_ivp": lambda span: through_solve_ivp(problem, span, blocks=3),
     }
     times = {name: [np.inf, np.inf] for name in runs}
-    for _ in range(ROUNDS * repeats):
+    steps_of = {name: round(share * (SOLVE_IVP_STEPS if "solve_ivp" in name else SPEED_STEPS)) for name in runs}
+    for _ in range(turns):
         for name, run in runs.items():
-            for k, steps in enumerate((1, steps_of(name))):
+            for k, steps in enumerate((1, steps_of[name])):
                 times[name][k] = min(times[name][k], cpu_seconds(run, (0.0, steps * problem.h)))
-    return {name: 1e6 * (many - one) / (steps_of(name) - 1) for name, (one, many) in times.items()}
-
-
-def steps_of(name: str) -> int:
-    return SOLVE_IVP_STEPS if "solve_ivp" in name else SPEED_STEPS
+    return {name: 1e6 * (many - one) / (steps_of[name] - 1) for name, (one, many) in times.items()}
 
 
 def through_solve_ivp(problem: ParticleProblem, span: tuple[float, float], **options: Any) -> Any:
@@ -205,9 +202,9 @@ def tail_times(problem: ParticleProblem) -> np.ndarray:
     return np.append(np.arange(steps - TAIL, steps) * problem.h, problem.t_span[1])
 
 
-def measure(name: str, repeats: int) -> list[Point]:
-    """All methods on one scene, in turn; of each the least time of several turns."""
-    problem, other = scene(name), scene(name, form="velocity")
+def measure(name: str, repeats: int, share: float) -> list[Point]:
+    """All methods on one scene, in turn; of each the least time of several turns. `share`: of the interval."""
+    problem, other = (shortened(scene(name, form=form), share) for form in ("canonical", "velocity"))
     assert problem.h is not None
     # A quarter of the paper's step, compensated: 1e-9 from the states stored with the problem.
     run = integrate(problem, method=EIPDOP853, h=problem.h / 4, save_every=4, compensated=True, invariants=())
@@ -223,6 +220,15 @@ def measure(name: str, repeats: int) -> list[Point]:
         print(f"{name:16} {case.method:18} {case.setting:8g} {least:8.3f} s  position {error[0]:.1e}  "
               f"guiding centre {error[1]:.1e}", flush=True)  # fmt: skip
     return points
+
+
+def shortened(problem: ParticleProblem, share: float) -> ParticleProblem:
+    """A share of the interval, whole in the longest steps."""
+    assert problem.h is not None
+    if share == 1:
+        return problem
+    longest = 4 * problem.h
+    return replace(problem, t_span=(0.0, round(share * problem.t_span[1] / longest) * longest))
 
 
 def errors(orbit: ParticleOrbit, truth: ParticleOrbit) -> tuple[float, float]:
@@ -257,11 +263,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=STATIC)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--quick", action="store_true", help="a hundredth of the steps, each run once")
     args = parser.parse_args()
     print(describe_machine(), flush=True)
-    best = speed(args.repeats)
+    share, repeats, rounds = (0.01, 1, 1) if args.quick else (1.0, args.repeats, ROUNDS)
+    best = speed(rounds * repeats, share)
     print(speed_text(best), "\n", flush=True)
-    points = [point for name in SCENES for point in measure(name, args.repeats)]
+    points = [point for name in SCENES for point in measure(name, repeats, share)]
     draw(points, args.out)
     if args.json:
         content = {"microseconds_per_step": best, "points": [point._asdict() for point in points]}

@@ -122,7 +122,7 @@ def memory(members: int) -> None:
 
 def curve(largest: int, steps: int, repeats: int) -> list[dict[str, Any]]:
     rows = []
-    for members in (10**k for k in range(2, 10) if 10**k <= largest):
+    for members in [10**k for k in range(2, 10) if 10**k <= largest] or [largest]:
         best = min(seconds(members, steps, None) for _ in range(repeats if members < 10**5 else 1))
         rows.append({"members": members, "steps": steps, "seconds": best, "us per member": 1e6 * best / members})
         print(

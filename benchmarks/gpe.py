@@ -1,6 +1,6 @@
 """Cost of the rotating Gross-Pitaevskii equation: its right-hand side beside transforms alone, steps beside plain RK4.
 
-    python benchmarks/gpe.py [--json FILE] [--figure FILE] [--seconds S]
+    python benchmarks/gpe.py [--json FILE] [--figure FILE] [--seconds S] [--quick]
 
 Processor time, the least of several; those that are compared are taken in turn, so that other load on the machine
 disturbs all alike. One thread. "transforms" are a library's alone, a pair along each axis: x, and then the other axes
@@ -125,9 +125,10 @@ def save_figure(found, path):
               ("scipy", "f"): "f by SciPy"}  # fmt: skip
     labels = {key: label for key, label in labels.items() if key in found[FLAT[0]]}
     styles = method_styles(labels.values())
+    sides = [[shape for shape in found if len(shape) == dimensions] for dimensions in (2, 3)]
     figure = Figure(figsize=(9.5, 4.6), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
-    for axis, shapes, title in zip(axes, (FLAT, FULL), ("two dimensions", "three dimensions"), strict=True):
+    for axis, shapes, title in zip(axes, sides, ("two dimensions", "three dimensions"), strict=True):
         points = np.array([np.prod(shape) for shape in shapes])
         for key, label in labels.items():
             axis.plot(points, [found[shape][key] for shape in shapes], ms=5, lw=1.2, **styles[label])
@@ -135,8 +136,7 @@ def save_figure(found, path):
         line = line * found[shapes[0]][next(iter(labels))] / line[0]
         axis.plot(points, line, color="0.4", ls=":", label="N log N, through the first f")
         axis.set(xscale="log", yscale="log", xlabel="grid points N", title=title)
-        sides = [f"${shape[0]}^{len(shape)}$" for shape in shapes]
-        axis.set_xticks(points, sides)
+        axis.set_xticks(points, [f"${shape[0]}^{len(shape)}$" for shape in shapes])
         axis.minorticks_off()
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("one evaluation of f [ms]")
@@ -154,10 +154,14 @@ def main() -> None:
     parser.add_argument("--json", metavar="FILE")
     parser.add_argument("--figure", metavar="FILE")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="for each row")
+    parser.add_argument("--quick", action="store_true", help="the smallest grids only, a few turns")
     arguments = parser.parse_args()
     print(describe_machine())
-    found = {shape: right_hand_side(shape, arguments.seconds) for shape in (*FLAT, *FULL)}
-    keys = list(found[FLAT[0]])
+    shapes, stepped_shapes, seconds = (*FLAT, *FULL), STEPPED, arguments.seconds
+    if arguments.quick:
+        shapes, stepped_shapes, seconds = (FLAT[0], FULL[0]), (FLAT[0],), 0.0
+    found = {shape: right_hand_side(shape, seconds) for shape in shapes}
+    keys = list(found[shapes[0]])
     lines = [(named(shape), [f"{row[key]:.3f}" for key in keys]) for shape, row in found.items()]
     print("\nRight-hand side and its parts [ms]\n")
     print(table([list(key) for key in keys], lines))
@@ -165,7 +169,7 @@ def main() -> None:
     names = [fft for fft, what in keys if what == "f"]
     ratios = {s: [f"{row[fft, 'f'] / row[fft, 'transforms']:.2f}" for fft in names] for s, row in found.items()}
     print(table([[fft] for fft in names], [(named(shape), row) for shape, row in ratios.items()]))
-    stepped = {shape: steps(shape, 5 * arguments.seconds) for shape in STEPPED}
+    stepped = {shape: steps(shape, 5 * seconds) for shape in stepped_shapes}
     for shape, row in stepped.items():
         body = []
         for name in VARIANTS:

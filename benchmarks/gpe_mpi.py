@@ -1,6 +1,6 @@
 """Cost of the Gross-Pitaevskii equation on ranks of MPI, beside the equation on one processor.
 
-    mpirun -n 2 python -m mpi4py benchmarks/gpe_mpi.py [--json FILE]
+    mpirun -n 2 python -m mpi4py benchmarks/gpe_mpi.py [--quick] [--json FILE]
 
 Least wall-clock times, taken in turn; ranks that have no part in a measurement sleep. One thread on each rank.
 """
@@ -12,16 +12,17 @@ import json
 import time
 
 import numpy as np
-from mpi4py import MPI
+from installed import peer
 
 from eip_scipy import EIPRK4
 from eip_scipy.app.report import describe_machine, table
-from eip_scipy.integrations.mpi import over_ranks
-from eip_scipy.integrations.mpi_fields import SlabGrossPitaevskii
 from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
 
-WORLD = MPI.COMM_WORLD
+mpi, slabs = peer("eip_scipy.integrations.mpi"), peer("eip_scipy.integrations.mpi_fields")
+
+MPI, WORLD = mpi.MPI, mpi.MPI.COMM_WORLD
 SHAPES = ((256, 256), (64, 64, 64), (128, 128, 128))
+QUICK_SHAPES = ((32, 32), (16, 16, 16))
 SECONDS = 30.0  # for each shape
 IN_A_ROW = 8
 STEPS = 20  # whose results are compared
@@ -58,14 +59,14 @@ class Case:
             return
         grid, trap = Grid(shape, -10, 10), harmonic_trap(*[1.0] * len(shape))
         options = {"Omega": 0.7, "beta": 400}
-        self.gpe = SlabGrossPitaevskii(grid, trap, comm=self.comm, **options) if ranks else None
+        self.gpe = slabs.SlabGrossPitaevskii(grid, trap, comm=self.comm, **options) if ranks else None
         self.gpe = self.gpe or GrossPitaevskii(grid, trap, **options)
         self.psi = start(self.gpe)
         self.out = np.empty_like(self.psi)
         self.solvers = [self.solver(ranks, names) for names in ((), ("mass", "energy"))]
 
     def solver(self, ranks, names):
-        method = over_ranks(EIPRK4, self.comm) if ranks else EIPRK4
+        method = mpi.over_ranks(EIPRK4, self.comm) if ranks else EIPRK4
         h = 0.2 * self.gpe.largest_step(self.psi)
         invariants = self.gpe.invariants(names)
         return method(self.gpe.fun, 0.0, self.psi, 1e3, h=h, invariants=invariants, metric="euclidean")
@@ -90,7 +91,7 @@ def counts():
     return sorted({0, *(2**k for k in range(WORLD.size.bit_length()) if 2**k <= WORLD.size), WORLD.size})
 
 
-def compare(shape):
+def compare(shape, seconds):
     """Rows {ranks: (f, step of RK4, step of EIP-ME in ms, relative errors of f and of the state)}, on rank 0."""
     cases = {ranks: Case(shape, ranks) for ranks in counts()}
     results = {}
@@ -99,7 +100,7 @@ def compare(shape):
             results[ranks] = case.results()
         wait()
     best = dict.fromkeys(cases, np.inf)
-    end = time.perf_counter() + SECONDS
+    end = time.perf_counter() + seconds
     while WORLD.bcast(time.perf_counter() < end):
         for ranks, case in cases.items():
             if case.here:
@@ -116,14 +117,15 @@ def compare(shape):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small grids, a second each")
     parser.add_argument("--json", metavar="FILE")
     arguments = parser.parse_args()
     results = {}
     if WORLD.rank == 0:
         print(describe_machine())
         print(MPI.Get_library_version().splitlines()[0])
-    for shape in SHAPES:
-        rows = compare(shape)
+    for shape in QUICK_SHAPES if arguments.quick else SHAPES:
+        rows = compare(shape, 1.0 if arguments.quick else SECONDS)
         if WORLD.rank == 0:
             name = " x ".join(map(str, shape))
             results[name] = rows

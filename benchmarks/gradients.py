@@ -1,6 +1,6 @@
 """What a compiled gradient that nobody wrote costs beside one written by hand, in runs of `integrate`.
 
-    python benchmarks/gradients.py [--json FILE]
+    python benchmarks/gradients.py [--repeats 7] [--json FILE]
 
 Each system runs with hand-written jitted gradients and without any, in turn; the ratio is that of the least times. The
 hand-written ones share what they can within a function, as their author would write them.
@@ -13,11 +13,11 @@ import json
 import math
 
 import numpy as np
-from numba import njit
+from installed import peer
 
 from eip_scipy import EIPRK4, Invariant, integrate
 
-REPEATS = 7
+njit = peer("numba", '"eip_scipy[numba]"').njit
 
 
 @njit
@@ -154,7 +154,7 @@ SYSTEMS = {
 }
 
 
-def measure(name: str) -> dict[str, float]:
+def measure(name: str, repeats: int) -> dict[str, float]:
     """Seconds per step with gradients written by hand and with compiled ones, and their ratio."""
     fun, y0, pairs = SYSTEMS[name]
     kept = {
@@ -162,7 +162,7 @@ def measure(name: str) -> dict[str, float]:
         "compiled": [Invariant(value) for value, _ in pairs],
     }
     best = dict.fromkeys(kept, math.inf)
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         for kind, invariants in kept.items():
             run = integrate(
                 fun, (0.0, 500.0), y0, method=EIPRK4, h=0.01, in_place=True, invariants=invariants, compiled=True
@@ -173,11 +173,12 @@ def measure(name: str) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=7, metavar="N", help="of each run (%(default)s)")
     parser.add_argument("--json", metavar="FILE", help="write the numbers there")
     args = parser.parse_args()
     rows = {}
     for name in SYSTEMS:
-        rows[name] = measure(name)
+        rows[name] = measure(name, args.repeats)
         print(
             f"{name:30s} {1e6 * rows[name]['by hand']:6.3f} us a step, compiled: {rows[name]['ratio']:.2f} times that"
         )

@@ -15,12 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from installed import peer
 
 from eip_scipy import EIPGJ14, EIPRKN12, integrate
 from eip_scipy.app.report import describe_machine, write_csv
-from eip_scipy.integrations import rebound
 from eip_scipy.problems import solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D
+
+rebound = peer("eip_scipy.integrations.rebound")
 
 BODIES = {"Mercury": 1, "Earth-Moon": 3, "Jupiter": 5}
 COLOURS = {
@@ -39,6 +41,11 @@ def reference(years: float) -> dict[float, np.ndarray]:
 def distances(y: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Of each body [AU]."""
     return np.linalg.norm((y - truth)[:30].reshape(10, 3), axis=1)
+
+
+def slope(times: np.ndarray, errors: np.ndarray) -> float:
+    """The exponent of the growth; nan of a single time."""
+    return float(np.polyfit(np.log(times), np.log(errors), 1)[0]) if times.size > 1 else float("nan")
 
 
 def runs(times: np.ndarray) -> dict[str, np.ndarray]:
@@ -103,10 +110,10 @@ def main() -> None:
     }
     late = times >= 10
     for name, own in errors.items():
-        slopes = [np.polyfit(np.log(times[late]), np.log(own[late, k]), 1)[0] for k in BODIES.values()]
+        slopes = [slope(times[late], own[late, k]) for k in BODIES.values()]
         last = ", ".join(
-            f"{body} {own[-1, k]:.1e} AU (slope {slope:.1f})"
-            for (body, k), slope in zip(BODIES.items(), slopes, strict=True)
+            f"{body} {own[-1, k]:.1e} AU (slope {exponent:.1f})"
+            for (body, k), exponent in zip(BODIES.items(), slopes, strict=True)
         )
         print(f"{name}: after {times[-1]:g} yr {last}")
     args.out.mkdir(parents=True, exist_ok=True)

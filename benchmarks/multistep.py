@@ -27,6 +27,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from installed import peer
 from runners import Methods, by_rebound, by_us, one_each, rows, show
 from scipy.spatial.transform import Rotation
 
@@ -49,6 +50,9 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--json", metavar="FILE")
     args = parser.parse_args()
+    if not {2, 4, 5}.isdisjoint(args.parts):  # before the minutes that others take
+        peer("heyoka", '"eip_scipy[heyoka]"')
+        peer("reboundx", "reboundx")
     print(describe_machine())
     found = {str(part): PARTS[part](args.quick) for part in args.parts}
     if args.json:

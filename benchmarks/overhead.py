@@ -1,6 +1,6 @@
 """What an EIP class costs in solve_ivp beside SciPy's own, per step on the same right-hand side.
 
-    python benchmarks/overhead.py [--json FILE]
+    python benchmarks/overhead.py [--pairs 15] [--json FILE]
 
 Kepler's problem in plain NumPy, e = .6, two invariants (H, L) with analytic gradients; medians of paired runs, each
 class in turn with SciPy's, so that a machine whose speed drifts does not decide. Beside the median of the ratios stands
@@ -19,7 +19,6 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, Invariant
 
-PAIRS = 15
 SPAN = (0.0, 60.0)
 Y0 = np.array([0.4, 0.0, 0.0, 2.0])
 
@@ -76,6 +75,7 @@ def per_step(options) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=15, metavar="N", help="of runs (%(default)s)")
     parser.add_argument("--json", metavar="FILE")
     arguments = parser.parse_args()
     results = {}
@@ -84,7 +84,7 @@ def main() -> None:
         if "t_eval" in options:
             peer["t_eval"] = options["t_eval"]
         per_step(options), per_step(peer)
-        pairs = np.array([(per_step(options), per_step(peer)) for _ in range(PAIRS)])
+        pairs = np.array([(per_step(options), per_step(peer)) for _ in range(arguments.pairs)])
         ours, theirs = np.median(pairs, axis=0)
         ratio, least = float(np.median(pairs[:, 0] / pairs[:, 1])), float(np.divide(*pairs.min(axis=0)))
         results[name] = {

@@ -1,6 +1,6 @@
 """Reference states of the charged particles, by Taylor's method in extended precision (heyoka, ``pip install heyoka``).
 
-    python benchmarks/particle_references.py [--bits 113] [--out FILE]
+    python benchmarks/particle_references.py [--bits 113] [--points 100] [--out FILE]
 
 writes ``particle_references.json`` anew: position, velocity and canonical momentum at each hundredth of the paper's
 intervals, with the largest difference of a position from the same run in double precision. heyoka integrates the form
@@ -15,11 +15,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import heyoka
 import numpy as np
+from installed import peer
 
 from eip_scipy.problems import ParticleProblem, tokamak, uniform_field
 from eip_scipy.problems.particles.charged_particle import ORBITS
+
+heyoka = peer("heyoka", '"eip_scipy[heyoka]"')
 
 TARGET = Path(__file__).parents[1] / "eip_scipy" / "data" / "particle_references.json"
 BITS, POINTS = 113, 100
@@ -87,13 +89,14 @@ def states(problem: ParticleProblem, times: np.ndarray, bits: int | None) -> np.
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bits", type=int, default=BITS)
+    parser.add_argument("--points", type=int, default=POINTS, help="how many of the hundred, from the first on")
     parser.add_argument("--out", type=Path, default=TARGET)
     args = parser.parse_args()
     stored = {}
     for problem in (uniform_field(), *map(tokamak, ORBITS)):
         assert problem.h is not None
         steps = round(problem.t_span[1] / problem.h)
-        times = np.arange(1, POINTS + 1) * (steps // POINTS) * problem.h
+        times = np.arange(1, args.points + 1) * (steps // POINTS) * problem.h
         rows, double = states(problem, times, args.bits), states(problem, times, None)
         apart = np.linalg.norm(rows[:, :3] - double[:, :3], axis=1).max()
         print(f"{problem.name:16} to t = {times[-1]:g}: from double precision {apart:.1e}", flush=True)

@@ -14,10 +14,8 @@ import json
 import math
 from typing import Any
 
-import heyoka
 import numpy as np
-import rebound
-import reboundx
+from installed import peer
 from runners import Methods, by_rebound, by_us, one_each, rows, show
 
 from eip_scipy import EIPGJ14, EIPRKN12
@@ -25,6 +23,10 @@ from eip_scipy.app.report import describe_machine
 from eip_scipy.app.solar.cost import timed
 from eip_scipy.problems import Problem, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D
+
+heyoka = peer("heyoka", '"eip_scipy[heyoka]"')
+rebound = peer("rebound", "rebound")
+reboundx = peer("reboundx", "reboundx")
 
 REPEATS = 3
 FLOAT = np.longdouble

@@ -7,13 +7,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from installed import peer
 
 from eip_scipy import integrate
 from eip_scipy.app.solar.cost import TimedRun
 from eip_scipy.app.work_precision import Runner
 from eip_scipy.core.solvers import EIPSolver
-from eip_scipy.integrations import rebound as peers
 from eip_scipy.problems import Problem
+
+rebound = peer("eip_scipy.integrations.rebound")
 
 __all__ = ["by_rebound", "by_us", "one_each", "rows", "show"]
 
@@ -36,7 +38,7 @@ def by_rebound(problem: Problem, integrator: str, prepare: Callable[..., Any] | 
 
     def run(h: float) -> tuple[float, np.ndarray]:
         n = 1 if math.isnan(h) else round(years / h)
-        result = peers.run(gm, problem.y0, integrator, h=years / n, n_steps=n, prepare=prepare)
+        result = rebound.run(gm, problem.y0, integrator, h=years / n, n_steps=n, prepare=prepare)
         return result.wall_time, result.y[:, -1]
 
     return run

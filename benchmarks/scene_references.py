@@ -15,10 +15,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import heyoka
 import numpy as np
+from installed import peer
 
 from eip_scipy.problems import Problem, comet, figure_eight, pythagorean
+
+heyoka = peer("heyoka", '"eip_scipy[heyoka]"')
 
 TARGET = Path(__file__).parents[1] / "eip_scipy" / "data" / "scene_references.json"
 BITS, CHECK_BITS = 160, 113

@@ -16,12 +16,14 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from installed import peer
 
 from eip_scipy import EIPGJ14, EIPRKN12, ensemble, integrate
 from eip_scipy.app.report import describe_machine
-from eip_scipy.integrations import rebound as peers
 from eip_scipy.problems import Problem, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D
+
+rebound = peer("eip_scipy.integrations.rebound")
 
 REPEATS = 5
 # Of each method the steps a year, and its options.
@@ -71,7 +73,7 @@ def runs(problem: Problem, years: float, starts: np.ndarray, sample: int) -> dic
 
 
 def by_rebound(problem: Problem, starts: np.ndarray, integrator: str, h: float, n: int) -> np.ndarray:
-    return np.array([peers.run(problem.params, y, integrator, h=h, n_steps=n).y[:, -1] for y in starts])
+    return np.array([rebound.run(problem.params, y, integrator, h=h, n_steps=n).y[:, -1] for y in starts])
 
 
 def mercury(states: np.ndarray, truth: np.ndarray) -> float:

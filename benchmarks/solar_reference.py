@@ -18,10 +18,12 @@ import json
 import time
 from collections.abc import Sequence
 
-import heyoka
 import numpy as np
+from installed import peer
 
 from eip_scipy.problems.gravity.solar_data import YEAR_D, SolarSystemData, load, reference_states
+
+heyoka = peer("heyoka", '"eip_scipy[heyoka]"')
 
 FLOAT = np.longdouble
 

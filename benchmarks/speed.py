@@ -1,6 +1,6 @@
 """Speed of the step, as ratios measured in one run on one core.
 
-    python benchmarks/speed.py [--json FILE]
+    python benchmarks/speed.py [--quick] [--json FILE]
 
 1. Compiled Kepler EIP-RK4 with H and L against a loop in which the same step (stages, metric, projection) is fused by
    hand for this one problem; per step also against solve_ivp with SciPy's RK45, and so EIP-RK45 with adaptive steps.
@@ -19,17 +19,28 @@ import subprocess
 import sys
 import time
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from installed import peer
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
 from eip_scipy.problems import kepler, solar_system
 
-REPEATS = 7
-# Steps of a run, and how many runs there are: short ones, since long ones hold what else a shared machine does.
-STEPS, RUNS = 20_000, 60
+njit = peer("numba", '"eip_scipy[numba]"').njit
+
+
+class Turns(NamedTuple):
+    """How many runs, whole calls and processes; short runs, since long ones hold what else a shared machine does."""
+
+    runs: int = 60
+    calls: int = 7
+    processes: int = 4
+
+
+QUICK = Turns(1, 1, 2)
+STEPS = 20_000  # of a run
 H = 0.03
 MU = 0.005
 
@@ -136,25 +147,25 @@ def fused(a, b, c, d, h, steps, energy0, momentum0, error_metric):
     return a, b, c, d, worst
 
 
-def least(action) -> float:
+def least(action, calls: int) -> float:
     """Least wall time in seconds of several calls, after one that is not counted."""
     action()
     best = np.inf
-    for _ in range(REPEATS):
+    for _ in range(calls):
         begin = time.perf_counter()
         action()
         best = min(best, time.perf_counter() - begin)
     return best
 
 
-def per_step(seconds, steps: int = STEPS) -> float:
+def per_step(seconds, runs: int, steps: int = STEPS) -> float:
     """Seconds of one step, without what a run begins with: from the least times of runs of two lengths.
 
     ``seconds(n)`` is the time of a run of n steps.
     """
     few = steps // 5
     short = long = np.inf
-    for _ in range(RUNS):
+    for _ in range(runs):
         short, long = min(short, seconds(few)), min(long, seconds(steps))
     return (long - short) / (steps - few)
 
@@ -175,7 +186,7 @@ def of_call(action):
     return seconds
 
 
-def kepler_speed() -> dict[str, float]:
+def kepler_speed(turns: Turns) -> dict[str, float]:
     problem = kepler(relativistic=MU)
     y0 = problem.y0
     targets = [energy(0.0, y0), momentum(0.0, y0)]
@@ -183,19 +194,21 @@ def kepler_speed() -> dict[str, float]:
     own = {"fun": kepler_array, "y0": y0, "method": EIPRK4, "invariants": arrays, "compiled": True}
     out = {}
     for metric in ("euclidean", "error"):
-        hand = per_step(of_call(lambda n, metric=metric: fused(*y0, H, n, *targets, metric == "error")))
-        in_place = per_step(of_integrate(H, fun=problem, method=EIPRK4, metric=metric))
-        array = per_step(of_integrate(H, **own, metric=metric))
+        hand = per_step(of_call(lambda n, metric=metric: fused(*y0, H, n, *targets, metric == "error")), turns.runs)
+        in_place = per_step(of_integrate(H, fun=problem, method=EIPRK4, metric=metric), turns.runs)
+        array = per_step(of_integrate(H, **own, metric=metric), turns.runs)
         out[f"{metric}: hand-fused loop [us/step]"] = 1e6 * hand
         out[f"{metric}: in place / hand-fused"] = in_place / hand
         out[f"{metric}: array-returning / hand-fused"] = array / hand
         out[f"{metric}: in place [us/step]"] = 1e6 * in_place
     solution = solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9)
-    scipy_step = least(lambda: solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9)) / (solution.t.size - 1)
+    scipy_call = least(lambda: solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9), turns.calls)
+    scipy_step = scipy_call / (solution.t.size - 1)
     adaptive = {**own, "t_span": (0, 600), "method": EIPRK45, "rtol": 1e-6, "atol": 1e-9}
     steps = integrate(**adaptive, save_every=1).t.size - 1
-    adaptive_step = min(integrate(**adaptive).wall_time for _ in range(RUNS)) / steps
-    fixed = least(lambda: solve_ivp(kepler_array, (0, 60), y0, method=EIPRK4, h=H, invariants=arrays)) / round(60 / H)
+    adaptive_step = min(integrate(**adaptive).wall_time for _ in range(turns.runs)) / steps
+    options = {"method": EIPRK4, "h": H, "invariants": arrays}
+    fixed = least(lambda: solve_ivp(kepler_array, (0, 60), y0, **options), turns.calls) / round(60 / H)
     out["solve_ivp RK45 [us/step]"] = 1e6 * scipy_step
     out["solve_ivp EIPRK4 with H and L [us/step]"] = 1e6 * fixed
     out["solve_ivp RK45 / compiled EIPRK4 (array-returning), per step"] = scipy_step / array
@@ -204,11 +217,11 @@ def kepler_speed() -> dict[str, float]:
     return out
 
 
-def solar_speed() -> dict[str, float]:
+def solar_speed(turns: Turns) -> dict[str, float]:
     problem = solar_system()
     run = {"fun": problem, "method": EIPRK4}
-    plain = per_step(of_integrate(problem.h, **run, invariants=()), 4000)
-    eip = per_step(of_integrate(problem.h, **run), 4000)
+    plain = per_step(of_integrate(problem.h, **run, invariants=()), turns.runs, 4000)
+    eip = per_step(of_integrate(problem.h, **run), turns.runs, 4000)
     return {
         "10 bodies, plain RK4 [us/step]": 1e6 * plain,
         "10 bodies, EIP-RK4 [us/step]": 1e6 * eip,
@@ -221,15 +234,15 @@ def crossing(t, y, params):
     return y[1]
 
 
-def sampling_speed() -> dict[str, float]:
+def sampling_speed(turns: Turns) -> dict[str, float]:
     problem = kepler(relativistic=MU)
     short, long = (0.0, 300.0), (0.0, 5100.0)
     times = np.linspace(*short, 3001)
     found = integrate(problem, long, method=EIPRK4, h=H, events=crossing).t_events[0].size
-    every = least(lambda: integrate(problem, short, method=EIPRK4, h=H, save_every=1))
-    sampled = least(lambda: integrate(problem, short, method=EIPRK4, h=H, t_eval=times))
-    plain = least(lambda: integrate(problem, long, method=EIPRK4, h=H))
-    section = least(lambda: integrate(problem, long, method=EIPRK4, h=H, events=crossing))
+    every = least(lambda: integrate(problem, short, method=EIPRK4, h=H, save_every=1), turns.calls)
+    sampled = least(lambda: integrate(problem, short, method=EIPRK4, h=H, t_eval=times), turns.calls)
+    plain = least(lambda: integrate(problem, long, method=EIPRK4, h=H), turns.calls)
+    section = least(lambda: integrate(problem, long, method=EIPRK4, h=H, events=crossing), turns.calls)
     return {
         "3001 times in t_eval / save_every=1": sampled / every,
         f"section of {found} crossings / run without": section / plain,
@@ -258,9 +271,9 @@ print(imported - begin, time.perf_counter() - begin)
 """
 
 
-def process_times() -> dict[str, float]:
+def process_times(turns: Turns) -> dict[str, float]:
     firsts = []
-    for k in range(4):
+    for k in range(turns.processes):
         code = USER % ((1.0 + 0.001 * k,) * 3)
         printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
         firsts.append([float(x) for x in printed.split()])
@@ -273,12 +286,17 @@ def process_times() -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="each once")
     parser.add_argument("--json", metavar="FILE")
     arguments = parser.parse_args()
-    results = {**kepler_speed(), **solar_speed(), **sampling_speed(), **process_times()}
+    turns = QUICK if arguments.quick else Turns()
+    results: dict[str, float] = {}
+    for measure in (kepler_speed, solar_speed, sampling_speed, process_times):
+        results |= measure(turns)
     width = max(map(len, results))
     print(
-        f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, least of {RUNS} short runs"
+        f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, "
+        f"least of {turns.runs} short runs"
     )
     for name, value in results.items():
         print(f"{name:<{width}}  {value:8.3f}")

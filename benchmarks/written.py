@@ -1,6 +1,6 @@
 """What a problem written as an expression costs: a fresh process, and the run beside functions written by hand.
 
-    python benchmarks/written.py [--json FILE]
+    python benchmarks/written.py [--quick] [--json FILE]
 
 Henon and Heiles' Hamiltonian to t = 10 000. The fresh process counts all from the start of Python: imports, the use of
 SymPy, Numba's compilation, the run. The compiled runs are measured in turn, and the least times compared.
@@ -15,9 +15,11 @@ import sys
 import time
 
 import numpy as np
-from numba import njit
+from installed import peer
 
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, hamiltonian, integrate
+
+njit = peer("numba", '"eip_scipy[numba]"').njit
 
 H = "(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3"
 SPAN, Y0 = (0.0, 1e4), [0.0, 0.1, 0.5, 0.0]
@@ -26,7 +28,7 @@ FRESH = (
     f"run = integrate(hamiltonian({H!r}), {SPAN}, {Y0}, method=EIPDOP853, rtol=1e-10)\n"
     "assert run.compiled and run.success"
 )
-TURNS = 10
+PROCESSES, TURNS = 3, 10
 
 
 @njit
@@ -48,10 +50,12 @@ def gradient(t, y):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="each once")
     parser.add_argument("--json", help="write the numbers to this file")
     arguments = parser.parse_args()
+    processes, turns = (1, 1) if arguments.quick else (PROCESSES, TURNS)
     fresh = []
-    for _ in range(3):
+    for _ in range(processes):
         start = time.perf_counter()
         subprocess.run([sys.executable, "-c", FRESH], check=True)
         fresh.append(time.perf_counter() - start)
@@ -65,7 +69,7 @@ def main() -> None:
     }
     for name, options in cases.items():
         times: dict[str, list[float]] = {"written": [], "by hand": []}
-        for _ in range(TURNS):
+        for _ in range(turns):
             times["written"].append(integrate(problem, SPAN, Y0, **options).wall_time)
             times["by hand"].append(integrate(rhs, SPAN, Y0, **by_hand, **options).wall_time)
         least = {key: min(values) for key, values in times.items()}

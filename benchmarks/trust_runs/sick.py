@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numba import njit
+from installed import peer
 
 from eip_scipy import Invariant
 from eip_scipy.problems import (
@@ -36,6 +36,8 @@ from eip_scipy.problems.hard_cases import (
 
 from . import systems as s
 from .record import Run, runs
+
+njit = peer("numba", '"eip_scipy[numba]"').njit
 
 REST, MOVING, LEAK, GRADIENT, LONG, BLOWN, MEMBER = (
     "no invariant, its rate 0 at the start",

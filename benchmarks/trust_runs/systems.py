@@ -7,11 +7,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numba import njit
+from installed import peer
 
 from eip_scipy import Invariant
 from eip_scipy.problems import Problem
 from eip_scipy.problems.hard_cases import CaseEquations
+
+njit = peer("numba", '"eip_scipy[numba]"').njit
 
 Array = np.ndarray
 
