@@ -122,6 +122,10 @@ CHEAP = (
     "Its loop is compiled and calls nothing but the function; ours calls the invariants and their gradients too, and "
     "where errors grow as slowly without projection that is not earned back."
 )
+UNPROJECTED = (
+    "The same steps without the projection, whose invariants and gradients are further calls: where errors grow as "
+    "slowly without it that is not earned back."
+)
 PLANETS = (
     "It is made for planets: each orbit around the Sun is followed exactly, and only what the planets do to each other "
     "is stepped over; ours takes any force."
@@ -135,6 +139,7 @@ REASONS: tuple[tuple[str, str, str, str, str], ...] = (
     ("", "", OWN, "heyoka", TAYLOR),
     ("solar", "outer", COMPILED, "", CHECKS),
     ("particle", "", COMPILED, "", CHECKS),
+    ("", "", PYTHON, "SciPy", UNPROJECTED),
     ("", "", PYTHON, "CyRK", CHEAP),
     ("", "", COMPILED, "", CHEAP),
 )
