@@ -32,6 +32,7 @@ __all__ = [
     "one_of",
     "option",
     "perform",
+    "some_of",
 ]
 
 Found = TypeVar("Found")
@@ -81,6 +82,24 @@ def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
         raise argparse.ArgumentTypeError(f"unknown {what} {text!r}, expected one of {', '.join(known)}{hint}")
 
     return read
+
+
+def some_of(what: str, known: Collection[str]) -> Any:
+    """Make a field of a command that takes some of these names, one an option.
+
+    Parameters
+    ----------
+    what : str
+        What they name.
+    known : collection of str
+
+    Returns
+    -------
+    dataclasses.Field
+        None: all.
+    """
+    text = f"one {what}, may be repeated; default: all ({', '.join(known)})"
+    return option(None, text, action="append", type=one_of(what, known), metavar="NAME")
 
 
 class Verdict(Protocol):

@@ -30,7 +30,7 @@ from ...problems.gross_pitaevskii import (
 )
 from ..long_runs import Checkpoints
 from ..report import UsageError, compact, describe_machine, table, write_file
-from ..study import Figures, Rows, Session, Study, one_of, option
+from ..study import Figures, Rows, Session, Study, option, some_of
 
 __all__ = [
     "LINES",
@@ -197,13 +197,7 @@ def _count(text: str) -> int:
 class GroundStates(Study[Results]):
     """The command."""
 
-    scene: Sequence[str] | None = option(
-        None,
-        f"one scene, may be repeated; default: all ({', '.join(SCENES)})",
-        action="append",
-        type=one_of("scene", SCENES),
-        metavar="NAME",
-    )
+    scene: Sequence[str] | None = some_of("scene", SCENES)
     starts: int = option(4, "starts for each rotation in the trap (%(default)s)", type=_count, metavar="N")
     seed: int = option(0, "of the random starts (%(default)s)", type=int, metavar="N")
     scenes: Mapping[str, Scene] = field(default_factory=lambda: SCENES)

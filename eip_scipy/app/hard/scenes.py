@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..report import compact, describe_machine, table
-from ..study import Figures, Rows, Session, Study, one_of, option
+from ..study import Figures, Rows, Session, Study, some_of
 from ..work_precision import cost_to_reach, curves
 from .runs import ATOL_PER_RTOL, SCENES, HardScene, Point, Spread, measure, methods, scene
 
@@ -61,13 +61,7 @@ def _costs(results: Results) -> list[str]:
 class HardScenes(Study[Found]):
     """The command."""
 
-    scene: Sequence[str] | None = option(
-        None,
-        f"one scene, may be repeated; default: all ({', '.join(SCENES)})",
-        action="append",
-        type=one_of("scene", SCENES),
-        metavar="NAME",
-    )
+    scene: Sequence[str] | None = some_of("scene", SCENES)
     spread: Spread = field(default_factory=Spread)
 
     def arguments(self) -> dict[str, Any]:
