@@ -16,7 +16,7 @@ from .stepping import Stepping
 __all__ = ["SecondOrder", "attach_history", "times"]
 
 Array = np.ndarray
-AUTO_SPACING = 50
+AUTO_SPACING = 64
 # Steps of DOP853, which starts where accelerations depend on velocities, in one step.
 SUBSTEPS = 4
 ROWS = 4  # of the history's window, in orders of the method

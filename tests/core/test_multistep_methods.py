@@ -406,6 +406,16 @@ def test_what_becomes_unstable_is_told():
     assert np.isfinite(run.y).all()
 
 
+def test_a_passage_is_told_at_whichever_step_it_comes():
+    """Not only where it falls near a projection: here none is made, and it comes later by two steps each time."""
+    for later in range(0, 70, 2):
+        start = np.array([(1 + later * 0.005 / 1.11) ** (2 / 3), 0.0, 0.0, 0.02])
+        run = integrate(acceleration, (0, 3), start, method=EIPGJ12, h=0.005, save_every=10)
+        passage = np.pi * np.sqrt((start[0] / 2) ** 3)
+        assert run.status == -1
+        assert passage - 0.1 < run.t[-1] < passage + 0.1
+
+
 def test_a_force_that_jumps_is_told():
     """Differences of its history do not fall."""
     run = integrate(lambda t, q: -q * (1.0 if t < 3 else 1.5), (0, 20), [1.0, 0.0], method=EIPGJ12, h=0.03)

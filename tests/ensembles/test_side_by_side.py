@@ -357,6 +357,17 @@ def test_a_multistep_member_that_fails_disturbs_no_other():
     assert list(np.flatnonzero(~run.side_by_side)) == [3, 6]
 
 
+def test_multistep_members_tell_a_passage_at_whichever_step_it_comes():
+    """No projection is made here: what looks at them in between ends those that it has to."""
+    starts = spread_starts(kepler().y0, 16)
+    for k in range(0, 16, 2):
+        starts[k] = [(1 + k * 0.02) ** (2 / 3), 0.0, 0.0, 0.02]
+    run = check_bits(kepler(), (0, 2), starts, method=EIPGJ12, h=0.005, invariants=(), save_every=10)
+    assert list(run.failed) == list(range(0, 16, 2))
+    assert list(np.flatnonzero(run.side_by_side)) == list(range(1, 16, 2))
+    assert "not small" in run.message[0]
+
+
 @pytest.mark.parametrize("together", [True, False], ids=["side by side", "one by one"])
 def test_evaluations_of_multistep_members_do_not_depend_on_how_fast_the_machine_is(monkeypatch, together):
     """Calls of the engine that end anywhere, within the last states too."""

@@ -49,7 +49,9 @@ inline void row_sums(const Rows &rows, int64_t i, Value *out) {
     Value even[COUNT] = {}, odd[COUNT] = {};
     const double *row = rows.first + i;
     const auto add = [&](int64_t j, Value *sums) {
-        for (int k = 0; k < COUNT; ++k) sums[k] += rows.weights[j] * load_as<Value>(row + j * rows.stride + k * LENGTH);
+        const Value weight = spread<Value>(rows.weights[j]);
+        for (int k = 0; k < COUNT; ++k)
+            sums[k] = fused(weight, load_as<Value>(row + j * rows.stride + k * LENGTH), sums[k]);
     };
     for (int64_t j = 0; j + 1 < rows.count; j += 2) add(j, even), add(j + 1, odd);
     if (rows.count % 2) add(rows.count - 1, even);
@@ -264,18 +266,33 @@ inline Code add_node(const AnyRun &run) {
 }
 
 // Whether the highest difference of the newest nodes is small beside the accelerations, in each body or in all together: it
-// is that of a smooth motion in steps that resolve it.
+// is that of a smooth motion in steps that resolve it. Squares beside the newest accelerations, which are almost always
+// enough, cost less than norms beside the largest ones.
 template <class Value>
 inline Truth<Value> is_smooth(const Multistep &ms, const Options &o, const Value *highest, int64_t half) {
     const int64_t size = o.blocks.size == 3 && half % 3 == 0 ? 3 : half;
+    const auto node = [&](int64_t back) { return as_values<Value>(newest(ms) - back * ms.pitch); };
+    const Value *last = node(0);
     Truth<Value> rough{};
     for (int64_t i = 0; i < half; i += size) {
+        const Value square = dot(highest + i, highest + i, size), bound = dot(last + i, last + i, size);
+        rough = rough | !(square < (ms.growth * ms.growth) * bound);
+    }
+    if (!any(rough)) return !rough;
+    rough = {};
+    for (int64_t i = 0; i < half; i += size) {
         Value top = 0.0;
-        for (const int64_t back : {int64_t{0}, ms.middle, ms.order - 1})
-            top = max(top, norm(as_values<Value>(newest(ms) - back * ms.pitch) + i, size));
+        for (const int64_t back : {int64_t{0}, ms.middle, ms.order - 1}) top = max(top, norm(node(back) + i, size));
         rough = rough | !(norm(highest + i, size) <= ms.growth * top);
     }
     return !rough;
+}
+
+// The highest difference of the newest nodes into w.stage; whether they are smooth.
+template <class W, class Value = typename W::Value>
+inline Truth<Value> look_at_nodes(const Multistep &ms, const Options &o, const W &w) {
+    weighted_sum(1.0, latest(ms, ms.size, ms.order + 1), as_floats(w.stage), ms.half);
+    return is_smooth(ms, o, w.stage, w.m / 2);
 }
 
 // The shape of the steps' errors into w.err_sum, collected over the last turns, and their size now, which counts where the
@@ -283,9 +300,8 @@ inline Truth<Value> is_smooth(const Multistep &ms, const Options &o, const Value
 template <class W, class Value = typename W::Value>
 inline Truth<Value> estimate_nodes(const Multistep &ms, const Options &o, Value &size, const W &w) {
     const int64_t half = w.m / 2, n = ms.order + 1;
-    Value *shape = w.move, *highest = w.stage;
-    weighted_sum(1.0, latest(ms, ms.size, n), as_floats(highest), ms.half);
-    const Truth<Value> smooth = is_smooth(ms, o, highest, half);
+    Value *shape = w.move;
+    const Truth<Value> smooth = look_at_nodes(ms, o, w);
     weighted_sum(ms.h * ms.h, latest(ms, ms.shape_q, n), as_floats(shape), ms.half);
     weighted_sum(ms.h, latest(ms, ms.shape_v, n), as_floats(shape + half), ms.half);
     const Value *last = as_values<Value>(newest(ms)), *before = as_values<Value>(newest(ms) - ms.pitch);
@@ -294,7 +310,7 @@ inline Truth<Value> estimate_nodes(const Multistep &ms, const Options &o, Value 
     const Value slower = norm(shape, half) * norm(w.f_point, half);
     const Value part = where(faster > 0.0, min(Value(1.0), slower / faster), 1.0);
     for (int64_t i = half; i < w.m; ++i) shape[i] *= part;
-    const Value lower = norm(shape, half), upper = ms.h * ms.h * norm(highest, half);
+    const Value lower = norm(shape, half), upper = ms.h * ms.h * norm(w.stage, half);
     size = where(lower > 0.0, ms.error_constant * upper / lower, 0.0);
     for (int64_t i = 0; i < w.m; ++i) w.err_sum[i] = MEMORY * w.err_sum[i] + abs(shape[i]);
     ++ms.place[SEEN];
@@ -503,11 +519,12 @@ struct OneState {
     double *scratch;
 
     void collect() const { collect_levels(run, scratch); }
+    Code look() const { return look_at_nodes(*run.method.multistep, run.options, run.work) ? OK : UNSTABLE; }
     Code project() const { return project_nodes(run, scratch); }
     Code finish(const Step &step) const { return finish_nodes(run, step); }
 };
 
-// The history up to node `last`; `states` as OneState.
+// The history up to node `last`; `states` as OneState. Each node is among those of a look or of a projection.
 template <class States>
 inline Code advance_history(const States &states, int64_t last) {
     const auto &run = states.run;
@@ -517,7 +534,11 @@ inline Code advance_history(const States &states, int64_t last) {
         const int64_t after = ms.place[NEWEST] - ms.order;
         if (status == OK && run.work.l > 0 && after > 0 && after <= LEVELS * LEVEL_SPACING && after % LEVEL_SPACING == 0)
             states.collect();
-        if (status == OK && ms.place[NEWEST] % ms.spacing == 0) status = states.project();
+        if (status != OK) return status;
+        if (ms.place[NEWEST] % ms.spacing == 0)
+            status = states.project();
+        else if (ms.place[NEWEST] % ms.order == 0)
+            status = states.look();
         if (status != OK) return status;
     }
     return OK;

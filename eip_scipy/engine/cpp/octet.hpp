@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cmath>
+#include <type_traits>
 
 #include "sums.hpp"
 
@@ -16,6 +17,14 @@ inline Vector spread_vector(double x) {
 #else
     return Vector{x, x};
 #endif
+}
+
+template <class Value>
+inline Value spread(double x) {
+    if constexpr (std::is_same_v<Value, double>)
+        return x;
+    else
+        return spread_vector(x);
 }
 
 // One instruction, and below by the compiler's own name for it: the header with the processor's takes longer to compile
@@ -37,6 +46,8 @@ inline Vector fused(Vector a, Vector b, Vector c) {
     return c;
 }
 #endif
+
+inline double fused(double a, double b, double c) { return std::fma(a, b, c); }
 
 // A truth value for each of eight.
 struct Mask {
@@ -105,6 +116,6 @@ inline Octet multiply_add(const Octet &a, const Octet &b, const Octet &c) {
 
 inline Octet max(const Octet &a, const Octet &b) { return where(b > a, b, a); }
 inline Octet min(const Octet &a, const Octet &b) { return where(b < a, b, a); }
-inline double multiply_add(double a, double b, double c) { return std::fma(a, b, c); }
+inline double multiply_add(double a, double b, double c) { return fused(a, b, c); }
 
 }  // namespace eip

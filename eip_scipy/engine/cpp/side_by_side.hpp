@@ -120,10 +120,14 @@ struct EightStates {
     void collect() const {
         each(alive_of(eight), [&](int64_t) { return collect_levels(single, y_new), OK; });
     }
+    Code look() const {
+        keep(alive_of(eight) & look_at_nodes(eight.multistep, eight.options, eight.work));
+        return OK;
+    }
     Code project() const {
         Mask alive = alive_of(eight);
         const Mask alone = project_octet_nodes(eight, alive, single.work);
-        for (int64_t lane = 0; lane < LANES; ++lane) eight.alive[lane] = alive.lane(lane);
+        keep(alive);
         if (!any(alone)) return OK;
         each(alone, [&](int64_t lane) {  // from the beginning: what has been counted and gathered is taken back
             eight.take(eight.work.err_low, lane, single.work.err_sum, single.work.m);
@@ -146,6 +150,10 @@ struct EightStates {
     }
 
   private:
+    void keep(const Mask &those) const {
+        for (int64_t lane = 0; lane < LANES; ++lane) eight.alive[lane] = those.lane(lane);
+    }
+
     // A member for which it fails has to run by itself.
     template <typename Action>
     void each(const Mask &those, Action action) const {
