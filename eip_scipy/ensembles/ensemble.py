@@ -33,7 +33,7 @@ from ..engine.counters import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
 from ..run.events import Events
 from ..run.interrupts import ended_by_sigterm, kept_ctrl_c
-from ..run.memory import check_bytes, free_memory
+from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request
 from ..run.tables import dataset, default_names
 from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
@@ -589,8 +589,8 @@ def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
 
 def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) -> None:
     """Refuse to gather more than fits."""
-    bound = 0.5 * free_memory() if max_bytes is None else max_bytes
     each = plan.size * plan.dtype.itemsize * (1 + rows) + 8 * (len(plan.names) + N_COUNTERS + 4)
+    bound = most_bytes(members * each, max_bytes)
     if members * each > bound:
         what = f"{rows} states each; raise save_every, take statistics (reduce=), write to a Zarr group (out=)"
         mend = what if rows else "the last state of each; run them in parts"

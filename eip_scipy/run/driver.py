@@ -18,6 +18,7 @@ from ..core.stepping import UNBOUNDED, AnyMethod
 from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
 from .events import Events
+from .memory import most_bytes
 
 __all__ = ["Driver", "check_memory", "saved_rows"]
 
@@ -37,7 +38,7 @@ class Driver:
         tableau: AnyMethod,
         events: Events,
         keeps_steps: bool,
-        max_bytes: float,
+        max_bytes: float | None,
     ) -> None:
         self.run, self.schedule, self.params, self._events = run, schedule, params, events
         self.functions: Any = functions
@@ -252,13 +253,13 @@ def expected_steps(schedule: Schedule) -> int:
     return 0 if schedule.span.h == 0.0 or schedule.span.n_steps == UNBOUNDED else schedule.span.n_steps
 
 
-def check_memory(rows: int, run: Run, max_bytes: float) -> None:
+def check_memory(rows: int, run: Run, max_bytes: float | None) -> None:
     """Refuse to save more than fits."""
     needed = rows * (run.y0.nbytes + 8.0 * (1 + run.invariants.size))
     require_memory(needed, f"saving {rows:.3g} states of {run.y0.size} components", max_bytes, "raise save_every")
 
 
-def require_memory(needed: float, what: str, max_bytes: float, mend: str) -> None:
+def require_memory(needed: float, what: str, max_bytes: float | None, mend: str) -> None:
     """Refuse to keep more than fits.
 
     Raises
@@ -266,7 +267,8 @@ def require_memory(needed: float, what: str, max_bytes: float, mend: str) -> Non
     MemoryError
         With the number of bytes and what to do.
     """
-    if needed > max_bytes:
+    bound = most_bytes(needed, max_bytes)
+    if needed > bound:
         raise MemoryError(
-            f"{what} needs {needed / 1e9:.3g} GB, the bound is {max_bytes / 1e9:.3g} GB; {mend} (or max_bytes)."
+            f"{what} needs {needed / 1e9:.3g} GB, the bound is {bound / 1e9:.3g} GB; {mend} (or max_bytes)."
         )

@@ -265,7 +265,7 @@ class Loop:
                 tableau=prepared.method,
                 events=system.events,
                 keeps_steps=request.dense_output,
-                max_bytes=prepared.max_bytes,
+                max_bytes=request.max_bytes,
             )
         keeper.begin(self.driver, self.events)
         self._slowed = wanted is None and _slowed_by_invariants(system.fun, functions, run)
@@ -355,7 +355,7 @@ class Loop:
                 return 0, ARRIVED
             if code == OK:
                 # At most a doubling, so that one fast chunk cannot make a slow one long; none of one that was cut.
-                longer = max(self.chunk, 2 * steps)
+                longer = max(self.chunk, 8 * steps)
                 self.chunk = max(1, min(longer, int(steps * CHUNK_SECONDS / max(seconds, 1e-9))))
 
     def _tell_why_slow(self, seconds: float) -> None:

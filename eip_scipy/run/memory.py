@@ -7,7 +7,9 @@ from typing import Any
 
 from ..core.inputs import is_number, refuse_units, shown
 
-__all__ = ["check_bytes", "free_memory"]
+__all__ = ["check_bytes", "most_bytes"]
+
+SMALL = 2**22  # bytes: the system is not asked whether there are so many, which would take longer than to use them
 
 
 def check_bytes(max_bytes: Any) -> None:
@@ -15,6 +17,13 @@ def check_bytes(max_bytes: Any) -> None:
     refuse_units(max_bytes=max_bytes)
     if max_bytes is not None and not (is_number(max_bytes) and max_bytes >= 0):
         raise ValueError(f"max_bytes must be a number of bytes >= 0, got {shown(max_bytes)}.")
+
+
+def most_bytes(needed: float, max_bytes: float | None) -> float:
+    """Bytes that may be taken by who needs so many: `max_bytes`, or half of what is free."""
+    if max_bytes is not None:
+        return max_bytes
+    return SMALL if needed <= SMALL else 0.5 * free_memory()
 
 
 def free_memory() -> float:

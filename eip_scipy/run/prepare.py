@@ -33,7 +33,7 @@ from ..methods.nystrom import NystromTableau
 from .driver import check_memory, saved_rows
 from .events import Events, as_events
 from .interpreted_functions import FORMS, INTERPRETED
-from .memory import check_bytes, free_memory
+from .memory import check_bytes
 from .resume import settings
 
 __all__ = ["DEFAULT", "Prepared", "Request", "prepared", "started_at"]
@@ -219,7 +219,7 @@ class System:
 
 @dataclass
 class Prepared:
-    """A run that is ready but for its functions, which are compiled last; `max_bytes` bounds what it saves.
+    """A run that is ready but for its functions, which are compiled last.
 
     `asked` is the request as it came, `request` with what a problem brings.
     """
@@ -233,7 +233,6 @@ class Prepared:
     schedule: Schedule
     run: Run
     diagnostics: Diagnostics
-    max_bytes: float
 
     @property
     def label(self) -> str:
@@ -304,14 +303,13 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
         moved = None if system.jacobian is None else times(system.jacobian, *system.extra)
         seen = SecondOrder(calls, start, moved, None if frequencies is None else frequencies(y0))
         attach_history(run, method, name, seen, stepping, level=False)
-    bound = 0.5 * free_memory() if request.max_bytes is None else request.max_bytes
-    check_memory(saved_rows(schedule), run, bound)
+    check_memory(saved_rows(schedule), run, request.max_bytes)
     record = Diagnostics() if request.diagnostics is None else request.diagnostics
     setup.attach(record, run)
     system.events.fill(t0, run.y0, schedule.g)
     run.work.K[0] = f0 if run.y0 is y0 else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
-    return Prepared(asked, request, method, system, stepping, start, schedule, run, record, bound)
+    return Prepared(asked, request, method, system, stepping, start, schedule, run, record)
 
 
 def started_at(request: Request) -> tuple[float, np.ndarray]:

@@ -439,7 +439,8 @@ def test_a_folder_without_permission(tmp_path, capsys, monkeypatch):
 
 
 def test_too_much_memory_is_one_line(tmp_path, capsys, no_rebound, monkeypatch):
-    monkeypatch.setattr("eip_scipy.run.prepare.free_memory", lambda: 1000.0)
+    monkeypatch.setattr("eip_scipy.run.memory.free_memory", lambda: 1000.0)
+    monkeypatch.setattr("eip_scipy.run.memory.SMALL", 0)
     assert main(["solar-system", *SPAN, "--out", str(tmp_path), "--quiet"]) == 2
     assert "not enough memory" in lines(capsys.readouterr().err)[-1]
 
