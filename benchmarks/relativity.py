@@ -31,7 +31,7 @@ reboundx = peer("reboundx", "reboundx")
 REPEATS = 3
 FLOAT = np.longdouble
 C = 299792.458 * 86400 * YEAR_D / 149597870.7  # AU/yr
-MULTISTEP, NYSTROM = (360, 412, 500, 600), (32, 40, 48, 64, 80)  # steps a year
+MULTISTEP, NYSTROM = (260, 300, 360, 412, 500, 600), (32, 40, 48, 64, 80)  # steps a year
 DAYS = {"whfast-c17": (5, 3, 2, 1, 0.5), "saba(10,6,4)": (10, 5, 3)}
 
 
