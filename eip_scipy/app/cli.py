@@ -141,12 +141,13 @@ def _add_options(parser: argparse.ArgumentParser, command: Any) -> None:
 
 def _conduct(name: str, command: Any, args: argparse.Namespace) -> int:
     from ..core.results import ProjectionWarning
+    from ..run.interrupts import ended_by_sigterm
     from .report import UsageError, listening, warn
     from .study import Session
 
     session = Session(name, args.out, args.json, args.quiet)
     own = {key: value for key, value in vars(args).items() if key not in ("out", "json", "quiet")}
-    with listening(ProjectionWarning) as untrusted:
+    with ended_by_sigterm(True), listening(ProjectionWarning) as untrusted:
         try:
             status = command(**own).run(session)
             for line in session.absent:  # at the end, where it is seen

@@ -14,8 +14,8 @@ from types import FrameType
 __all__ = ["TerminatedError", "ended_by_sigterm", "kept_ctrl_c", "look_for_signals"]
 
 
-class TerminatedError(BaseException):
-    """SIGTERM has come, in a run that has something to keep first."""
+class TerminatedError(KeyboardInterrupt):
+    """SIGTERM has come where there is something to keep first; what Ctrl-C leaves in order, it does."""
 
 
 # Seconds after which a Ctrl-C is tried again that came where Python would drop it.
@@ -74,6 +74,7 @@ def ended_by_sigterm(wanted: bool) -> Iterator[None]:
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         if _Came.sigterm:
+            sys.stdout.flush()  # the signal does not
             signal.raise_signal(signal.SIGTERM)
 
 

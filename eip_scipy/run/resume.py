@@ -22,7 +22,6 @@ from ..core.stepping import Stepping
 from ..engine.data import NEXT_LENGTH, TIME, Method
 from ..methods.multistep import Weights
 from .events import Events
-from .interrupts import TerminatedError
 
 __all__ = ["Keeper", "keeping", "settings"]
 
@@ -308,7 +307,7 @@ class _FileKeeper(Keeper):
             self._write(None, f"interrupted by {type(error).__name__}")
         except CheckpointError as failure:
             error.add_note(str(failure))
-        except (KeyboardInterrupt, TerminatedError):
+        except KeyboardInterrupt:
             error.add_note("interrupted again while the checkpoint was written")
         again = "resume=True"
         if self._file.moved:

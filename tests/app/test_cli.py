@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import matplotlib
 import numpy as np
 import pytest
+from forked import Forker
 
 import eip_scipy
 import eip_scipy.integrations
@@ -286,6 +287,30 @@ def test_an_interruption_keeps_what_was_done(tmp_path, capsys, no_rebound, monke
     assert "interrupted; the runs that were done are in the table" in captured.err
     with open(tmp_path / "solar-system.csv", newline="") as stream:
         assert [row["method"] for row in csv.DictReader(stream)] == ["EIPRK4 (error)", "EIPRK4 (euclidean)", "RK4"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_sigterm_keeps_what_was_done(tmp_path):
+    """As Ctrl-C does; the process ends by it then, as whoever sent it expects."""
+    code = f"""
+        import os, signal, sys
+        sys.modules["rebound"] = None
+        from eip_scipy.app import cli
+        from eip_scipy.app.solar import runs
+
+        runs._verlet = lambda scene: os.kill(os.getpid(), signal.SIGTERM)
+        cli.main(["solar-system", *{SPAN}, "--out", out])
+        print("went on")
+    """
+    forker = Forker(tmp_path)
+    out = tmp_path / "out"
+    code, printed, errors = forker.start(code, out=str(out)).wait()
+    forker.close()
+    assert code == -signal.SIGTERM, errors
+    assert lines(printed)[3].split() == ["EIPRK4", "EIPRK4", "RK4"]
+    assert "went on" not in printed
+    assert "interrupted; the runs that were done are in the table" in errors
+    assert [path.name for path in out.iterdir()] == ["solar-system.csv"]
 
 
 def test_an_interruption_while_timing_keeps_the_table(tmp_path, capsys, no_rebound, monkeypatch):
