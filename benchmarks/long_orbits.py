@@ -84,9 +84,9 @@ def main() -> None:
     rows |= {f"EIPGJ14, h = {h:.5g} yr": timed(problem, args.years, EIPGJ14, h, {}) for h in MULTISTEP}
     rows |= peers(problem, args.years)
     print(f"{platform.machine()}, Python {platform.python_version()}; {args.years:g} years, errors of position [AU]\n")
-    print(f"{'':40}{'wall [s]':>9}" + "".join(f"{name:>9}" for name in PLANETS))
+    print(f"{'':45}{'wall [s]':>9}" + "".join(f"{name:>9}" for name in PLANETS))
     for name, row in rows.items():
-        print(f"{name:40}{row['wall']:9.3f}" + "".join(f"{x:9.1e}" for x in row["errors"]))
+        print(f"{name:45}{row['wall']:9.3f}" + "".join(f"{x:9.1e}" for x in row["errors"]))
     if args.json:
         with open(args.json, "w") as file:
             json.dump({"years": args.years, "machine": platform.machine(), "rows": rows}, file, indent=1)
