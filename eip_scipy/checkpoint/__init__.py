@@ -312,7 +312,7 @@ def _require_undamaged(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[
     start = stream.read(4)
     size = stream.seek(0, os.SEEK_END)
     if start != ZIP:
-        raise CheckpointError(f"{_name(path)} is no checkpoint of eip_scipy; name another file.")
+        raise CheckpointError(f"{_name(path)} is no file of eip_scipy; name another one.")
     tail = len(MARK) + DIGITS
     stream.seek(max(0, size - tail))
     end = stream.read(tail)

@@ -97,7 +97,7 @@ class EIPSolver(OdeSolver):
 
     TABLEAU: ClassVar[Tableau | NystromTableau | GaussJackson | OneStep]
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
-    SCIPY: ClassVar[type[OdeSolver] | None] = None
+    _SCIPY: ClassVar[type[OdeSolver] | None] = None
     t: float
     t_old: float
 
@@ -211,11 +211,11 @@ class EIPSolver(OdeSolver):
         stepping: Stepping,
         own_steps: bool,
     ) -> OdeSolver | None:
-        if self.SCIPY is None or stepping.h is not None or own_steps or self._finishes:
+        if self._SCIPY is None or stepping.h is not None or own_steps or self._finishes:
             return None
 
         control = {"first_step": stepping.first_step, "max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
-        solver = self.SCIPY(partial(_copied, derivative), self.t, start, self.t_bound, **control)
+        solver = self._SCIPY(partial(_copied, derivative), self.t, start, self.t_bound, **control)
         if np.isnan(solver.h_abs):
             return None  # SciPy's loop would never end
         solver.fun = derivative  # in place of SciPy's two wrappers, whose work it does
@@ -425,7 +425,7 @@ class EIPRK23(EIPSolver):
     """EIP method on SciPy's RK23, the pair of Bogacki and Shampine. Options: see `EIPSolver`."""
 
     TABLEAU = RK23
-    SCIPY = scipy.integrate.RK23
+    _SCIPY = scipy.integrate.RK23
 
 
 class EIPRK45(EIPSolver):
@@ -435,14 +435,14 @@ class EIPRK45(EIPSolver):
     """
 
     TABLEAU = RK45
-    SCIPY = scipy.integrate.RK45
+    _SCIPY = scipy.integrate.RK45
 
 
 class EIPDOP853(EIPSolver):
     """EIP method on SciPy's DOP853, of order 8. Options: see `EIPSolver`."""
 
     TABLEAU = DOP853
-    SCIPY = scipy.integrate.DOP853
+    _SCIPY = scipy.integrate.DOP853
 
 
 class EIPRKN8(EIPSolver):

@@ -98,7 +98,7 @@ class Recommendation:
         part = "" if self.share == 1 else f", extrapolated from {self.share:.2g} of the interval"
         lines = [
             f"{self.problem.name}: error {self.wanted:g} at the end of t from {t0:g} to {t_end:g}",
-            f"  integrate(problem, {called(self.options)})",
+            f"  run(): integrate(problem, {called(self.options)})",
             f"  expected: error {self.error:.1e}, {self.nfev} evaluations{part}",
             *([f"  WARNING: {self.message}"] if self.message else []),
             *_table(self.trials, self.trial),

@@ -18,6 +18,7 @@ from .results import IntegrationResult
 __all__ = ["load", "save"]
 
 KIND = "result"
+RESUMED = ("integrate", "ensemble")  # with the same arguments
 # Buffers of Diagnostics, in the order in which it takes them.
 BUFFERS = ("_max_defect", "_last_defect", "_max_correction", "_counters", "_figures")
 
@@ -99,11 +100,15 @@ def load(path: str | os.PathLike[str]) -> Any:
     >>> run = load("kepler.npz")  # doctest: +SKIP
     """
     try:
-        header, arrays = checkpoint.read(path, KIND)
+        header, arrays = checkpoint.read(path)
     except CheckpointError as error:
         if isinstance(error.__cause__, OSError):
             raise error.__cause__ from None
         raise ValueError(f"load: {os.fspath(path)!r} is no result that save has written: {error}") from error
+    if (kind := header.get("kind")) != KIND:
+        name = repr(os.fspath(path))
+        again = f"; {kind}(..., checkpoint={name}, resume=True) goes on with it" if kind in RESUMED else ""
+        raise ValueError(f"load: {name} is no result that save has written, but a checkpoint of {kind!r}{again}.")
     made = IntegrationResult if header["class"] == IntegrationResult.__name__ else OptimizeResult
     result = made(header["values"])
     for name, length in header["lists"].items():

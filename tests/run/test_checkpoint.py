@@ -537,7 +537,7 @@ def test_a_file_that_is_there_is_not_replaced(tmp_path):
         path.write_bytes(content)
         with pytest.raises(CheckpointError, match=r"exists\. resume=True goes on .* delete this one"):
             integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED)
-        with pytest.raises(CheckpointError, match="is no checkpoint of eip_scipy"):
+        with pytest.raises(CheckpointError, match="is no file of eip_scipy"):
             integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
         assert path.read_bytes() == content
 
@@ -844,7 +844,7 @@ def test_each_changed_byte_is_seen(tmp_path):
         damaged = bytearray(raw)
         damaged[k] ^= 1 << k % 8
         path.write_bytes(damaged)
-        with pytest.raises(CheckpointError, match=r"is damaged|is truncated|is no checkpoint"):
+        with pytest.raises(CheckpointError, match=r"is damaged|is truncated|is no file"):
             checkpoint.read(path)
 
 
@@ -863,7 +863,7 @@ def test_each_truncation_is_seen(tmp_path):
     raw = small_file(path)
     for k in range(len(raw)):
         path.write_bytes(raw[:k])
-        with pytest.raises(CheckpointError, match=r"is truncated|is no checkpoint|is damaged"):
+        with pytest.raises(CheckpointError, match=r"is truncated|is no file|is damaged"):
             checkpoint.read(path)
     path.write_bytes(raw + b"\n")
     with pytest.raises(CheckpointError, match="is truncated"):

@@ -170,7 +170,7 @@ def test_what_is_printed():
     choice = recommend(pendulum, (0, 20), [1.0, 0.5], invariants=ENERGY, error=1e-6)
     lines = repr(choice).splitlines()
     assert lines[0] == "pendulum: error 1e-06 at the end of t from 0 to 20"
-    assert lines[1].startswith(f"  integrate(problem, method={choice.method.__name__}, ")
+    assert lines[1].startswith(f"  run(): integrate(problem, method={choice.method.__name__}, ")
     assert f"{choice.nfev} evaluations" in lines[2]
     assert sum(line.startswith("  -> ") for line in lines) == 1
     assert any("invariants=()" in line for line in lines)  # what the projection does is shown

@@ -248,7 +248,7 @@ def test_interpolants_are_scipy_s(method):
     """The pair's own interpolant, where nothing is projected, over the same steps."""
     own = eip_method(method.TABLEAU)
     options = {"rtol": 1e-2, "first_step": 0.05, "max_step": 0.05, "dense_output": True}
-    theirs = solve_ivp(PROBLEM.fun, (0, 3), PROBLEM.y0, method=method.SCIPY, **options)
+    theirs = solve_ivp(PROBLEM.fun, (0, 3), PROBLEM.y0, method=method._SCIPY, **options)
     ours = integrate(PROBLEM.fun, (0, 3), PROBLEM.y0, method=own, **options)
     np.testing.assert_array_equal(ours.sol.ts, theirs.sol.ts)
     times = np.linspace(0, 3, 501)
