@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +13,13 @@ from . import FLOOR, PALETTE, _figure, _log_errors, method_styles
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.gridspec import SubplotSpec
 
 __all__ = ["run_figure"]
 
 MOST = 9  # components, or bodies, that can be told apart
 TICKS = 5  # of times with five digits: more would touch each other
+WIDE = 10.0  # of two components' sizes: in one frame the smaller one would be a line
 HEALTHY = 5.0  # corrections in local errors, see `Diagnostics`
 
 
@@ -50,18 +53,19 @@ def run_figure(
     """
     widths = [1.0, *([1.0] if errors else []), *([0.6] if corrections else [])]
     figure = _figure(4.4 * sum(widths) + 0.6, 4.2, title)
-    axes = figure.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
+    grid = figure.add_gridspec(1, len(widths), width_ratios=widths)
     if paths:
-        _draw_paths(axes[0], paths)
+        _draw_paths(figure.add_subplot(grid[0]), paths)
     else:
-        _draw_components(axes[0], np.asarray(t), components)
+        _draw_components(figure, grid[0], np.asarray(t), components)
+    axes = [figure.add_subplot(grid[k]) for k in range(1, len(widths))]
     styles = method_styles(errors)
     for name, values in errors.items():
-        axes[1].plot(t, _above_zero(np.abs(values)), lw=1.1, **styles[name] | {"marker": None})
+        axes[0].plot(t, _above_zero(np.abs(values)), lw=1.1, **styles[name] | {"marker": None})
     if errors:
-        _log_errors(axes[1], "t", "|I - target|")
-        axes[1].locator_params(axis="x", nbins=TICKS)
-        axes[1].legend(fontsize="small", loc="upper left")
+        _log_errors(axes[0], "t", "|I - target|")
+        axes[0].locator_params(axis="x", nbins=TICKS)
+        axes[0].legend(fontsize="small", loc="upper left")
     if corrections:
         _draw_corrections(axes[-1], corrections, styles)
     return figure
@@ -75,25 +79,48 @@ def _draw_paths(axis: Axes, paths: Mapping[str, tuple[Any, Any]]) -> None:
     axis.set_xlabel("x")
     axis.set_ylabel("y")
     axis.grid(alpha=0.2)
-    _named(axis, len(paths))
-
-
-def _draw_components(axis: Axes, t: np.ndarray, components: Mapping[str, Any]) -> None:
-    shown = dict(list(components.items())[:MOST])
-    for name, style in method_styles(shown).items():
-        values = np.asarray(shown[name])
-        is_complex = values.dtype.kind == "c"
-        style |= {"label": f"|{name}|" if is_complex else name, "marker": None}
-        axis.plot(t, np.abs(values) if is_complex else values, lw=1.1, **style)
-    axis.set_xlabel("t")
-    axis.locator_params(axis="x", nbins=TICKS)
-    axis.grid(alpha=0.2)
-    _named(axis, len(components))
-
-
-def _named(axis: Axes, there: int) -> None:
-    if there > 1:
+    if len(paths) > 1:
         axis.legend(fontsize="small", loc="upper right")
+    _counted(axis, len(paths))
+
+
+def _draw_components(figure: Figure, place: SubplotSpec, t: np.ndarray, components: Mapping[str, Any]) -> None:
+    """On one axis, or on two where some would lie flat beside others, such as a velocity beside an angle that grows."""
+    shown = dict(list(components.items())[:MOST])
+    groups = _by_size(shown) if len(components) <= MOST else [list(shown)]
+    parts = place.subgridspec(len(groups), 1)
+    axes = [figure.add_subplot(parts[0])]
+    axes += [figure.add_subplot(parts[k], sharex=axes[0]) for k in range(1, len(groups))]
+    styles = method_styles(shown)
+    for axis, group in zip(axes, groups, strict=True):
+        for name in group:
+            values = np.asarray(shown[name])
+            is_complex = values.dtype.kind == "c"
+            style = styles[name] | {"label": f"|{name}|" if is_complex else name, "marker": None}
+            axis.plot(t, np.abs(values) if is_complex else values, lw=1.1, **style)
+        axis.grid(alpha=0.2)
+        if len(shown) > 1:
+            axis.legend(fontsize="small", loc="upper right")
+    axes[-1].set_xlabel("t")
+    axes[-1].locator_params(axis="x", nbins=TICKS)
+    _counted(axes[0], len(components))
+
+
+def _by_size(components: Mapping[str, Any]) -> list[list[str]]:
+    """The names in one group, or in two where the largest gap between their sizes is a wide one."""
+    sizes = {name: np.max(np.abs(values), initial=0.0) for name, values in components.items()}
+    ordered = sorted((size, name) for name, size in sizes.items() if 0 < size < np.inf)
+    gaps = [above / below for (below, _), (above, _) in itertools.pairwise(ordered)]
+    if not gaps or max(gaps) < WIDE:
+        return [list(components)]
+    bar = ordered[gaps.index(max(gaps)) + 1][0]
+    return [
+        [name for name in components if sizes[name] >= bar],
+        [name for name in components if not sizes[name] >= bar],
+    ]
+
+
+def _counted(axis: Axes, there: int) -> None:
     if there > MOST:
         axis.set_title(f"the first {MOST} of {there}", fontsize="medium")
 

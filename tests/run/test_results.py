@@ -464,6 +464,16 @@ def test_plot_of_components():
     np.testing.assert_array_equal(first.lines[3].get_ydata(), np.abs(field.y[3]))
 
 
+def test_a_component_that_grows_hides_no_other():
+    run = integrate(lambda t, y: [y[1], -np.sin(y[0])], (0, 100), [0.0, 2.5], method=EIPRK4, h=0.05, save_every=5)
+    above, below = axes_of(run.plot(names="theta omega"))
+    for axis, row, name in zip((above, below), run.y, ("theta", "omega"), strict=True):
+        assert [line.get_label() for line in axis.lines] == [name]
+        np.testing.assert_array_equal(axis.lines[0].get_ydata(), row)
+    low, high = below.get_ylim()
+    assert high - low < 2 * np.ptp(run.y[1])
+
+
 def test_long_times_do_not_touch_each_other():
     figure = integrate(kepler(), (0, 20_000), method=EIPRK4, save_every=2000).plot(orbit=False)
     figure.draw_without_rendering()
