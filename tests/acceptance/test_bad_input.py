@@ -1117,6 +1117,27 @@ def test_gradients_vanish_at_an_extremum(angle):
         integrate(orbit, (0.0, 0.01), circle, method=EIPRK4, h=0.01, invariants=wrong)
 
 
+@pytest.mark.parametrize("angle", [0.0, np.pi, 0.3, 1.0, 2.5, 4.0])
+def test_gradients_by_differences_vanish_at_an_extremum(angle):
+    """Without grad, and with functions that take no complex step, gradients there are rounding too."""
+    c, s = np.cos(angle), np.sin(angle)
+
+    def squares(t, y):
+        q, v = y[:2], y[2:]
+        return ((v @ v) * q - (q @ v) * v - q / math.sqrt(q @ q)) ** 2
+
+    def told(fun):
+        with warnings.catch_warnings(record=True) as record:
+            warnings.simplefilter("always")
+            result = integrate(orbit, (0, 0.01), [c, s, -s, c], method=EIPRK4, h=0.01, invariants=Invariant(fun))
+        return result.trusted, [str(item.message) for item in record if "has no grad" not in str(item.message)]
+
+    assert told(squares) == (True, [])
+    trusted, texts = told(lambda t, y: squares(t, y) + 1e-6 * y[:2])
+    assert not trusted
+    assert "is no invariant of this system" in texts[0]
+
+
 @both
 def test_no_invariant_warns(driver):
     first = Invariant(lambda t, y: y[0], lambda t, y: np.array([1.0, 0.0]), name="first")

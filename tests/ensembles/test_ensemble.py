@@ -700,7 +700,7 @@ def test_another_machine_is_a_warning(where, tmp_path, monkeypatch):
 def test_what_is_no_store(where, tmp_path):
     place = tmp_path / "other"
     place.write_text("something") if where == "checkpoint" else place.mkdir()
-    with pytest.raises(CheckpointError, match=r"is no (ensemble|checkpoint) of eip_scipy"):
+    with pytest.raises(CheckpointError, match=r"is no (ensemble|file) of eip_scipy"):
         stored(resume=True, **{where: place})
 
 

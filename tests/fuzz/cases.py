@@ -183,7 +183,7 @@ def random_case(seed: int) -> Case:
         in_place = True
     else:
         system = random_system(rng)
-        kept = _chosen(rng, system.kept)
+        kept = _chosen(rng, system)
         if kept and rng.random() < 0.08:
             kept, sick = (*kept[:-1], _leaking(rng, system, kept[-1])), True
         if rng.random() < 0.15:
@@ -224,17 +224,25 @@ def random_case(seed: int) -> Case:
 # What is kept.
 
 
-def _chosen(rng: np.random.Generator, kept: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
-    """Some of them in any order, maybe with one that depends on them, maybe two of them as one vector."""
+def _chosen(rng: np.random.Generator, system: System) -> tuple[Quantity, ...]:
+    """Some that it keeps, in any order, maybe with one that depends on them, maybe two of them as one vector."""
+    kept = system.kept
     if rng.random() < 0.05:
         return ()
     chosen = [kept[k] for k in rng.permutation(len(kept))[: rng.integers(1, len(kept) + 1)]]
     if rng.random() < 0.25:
-        made = (_multiple, _square)[rng.integers(2)]
-        chosen.append(made(rng, chosen[rng.integers(len(chosen))]))
+        made, of = (_multiple, _square)[rng.integers(2)], chosen[rng.integers(len(chosen))]
+        if made is _multiple or not _vanishes(of, system):
+            chosen.append(made(rng, of))
     if len(chosen) > 1 and rng.random() < 0.2:
         chosen = [_stacked(chosen[0], chosen[1]), *chosen[2:]]
     return tuple(chosen)
+
+
+def _vanishes(a: Quantity, system: System) -> bool:
+    """Whether a part of it is rounding at the start: a square of that has no gradient to project along."""
+    t, y = system.t0, system.y0
+    return bool(np.any(np.abs(a.fun(t, y)) <= 1e-8 * (np.abs(a.grad(t, y)) @ np.abs(y))))
 
 
 def _multiple(rng: np.random.Generator, a: Quantity) -> Quantity:
