@@ -11,10 +11,10 @@ namespace eip {
 // Estimates that are collected before one is used, and what is left of each a turn later.
 constexpr int64_t COLLECTED = 20;
 constexpr double MEMORY = 0.9;
-// Values of the invariants at the start that are averaged, nodes from one to the next, and how many roundings of an
-// invariant's terms their mean may be off.
-constexpr int64_t LEVELS = 32, LEVEL_SPACING = 4;
-constexpr double LEVEL_BANDS = 4.0;
+// Values of the invariants around the start that are averaged, how far from it in parts of the state, and how many roundings
+// of an invariant's terms their mean may be off.
+constexpr int64_t LEVELS = 64;
+constexpr double LEVEL_DISTANCE = 0x1p-44, LEVEL_BANDS = 4.0;
 
 inline Pair quotient(const Pair &a, const Pair &b) {
     const double first = a.value / b.value;
@@ -196,6 +196,31 @@ inline void start_step(const AnyRun &run, double t, double h, const double *y) {
     }
 }
 
+// How far the invariants at the start are from the targets, into the second row of ms.levels: the mean over states as near
+// as some hundred roundings, less what the gradients make of the distance. The one value at the start is off by its own
+// rounding, which is more than the motion's errors come to in a long time; values on the way are off by errors of the steps,
+// which differ from place to place of an orbit. What is more than rounding is a target of the user's.
+template <class System, class W, class Value = typename W::Value>
+inline void find_levels(System &system, const Multistep &ms, const W &w, const Value *y) {
+    Value *levels = as_values<Value>(ms.levels) + w.l, *near = w.y_hat, *distance = w.move;
+    system.grad(w, ms.t0, y, w.row(0), w.G);
+    ++w.counters[NJEV];
+    for (int64_t k = 0; k < LEVELS; ++k) {
+        for (int64_t i = 0; i < w.m; ++i) {
+            const double turn = 0.6180339887498949 * static_cast<double>(k * w.m + i + 1);
+            near[i] = y[i] + (LEVEL_DISTANCE * (turn - std::floor(turn) - 0.5)) * y[i];
+            distance[i] = near[i] - y[i];
+        }
+        system.inv(w, ms.t0, near, w.values);
+        for (int64_t i = 0; i < w.l; ++i)
+            levels[i] += ((w.values[i] - w.target[i]) - dot(w.gradient(i), distance, w.m)) / static_cast<double>(LEVELS);
+    }
+    for (int64_t i = 0; i < w.l; ++i) {
+        const Value terms = max(abs(w.values[i]), abs_dot(w.gradient(i), y, w.m));
+        levels[i] = where(abs(levels[i]) < LEVEL_BANDS * EPS * terms, levels[i], 0.0);
+    }
+}
+
 // The first `order` nodes, from y at the start with the derivative in w.row(0); `y` is overwritten. Of eight members what is
 // not finite stays in one, and shows when that is looked at.
 template <class AnyRun>
@@ -330,21 +355,6 @@ inline void values_in_the_middle(const AnyRun &run, Value *scratch) {
     ++w.counters[NJEV];
 }
 
-// How far the first values are from the targets in the mean, into the second row of ms.levels. One value, at the start, is
-// off by its rounding, which is more than the motion's own errors come to in a long time. What is more than rounding is not.
-[[gnu::noinline]] inline void collect_levels(const Run &run, double *scratch) {
-    const Multistep &ms = *run.method.multistep;
-    const auto &w = run.work;
-    const int64_t count = (ms.place[NEWEST] - ms.order) / LEVEL_SPACING;
-    values_in_the_middle(run, scratch);
-    for (int64_t i = 0; i < w.l; ++i) {
-        double &mean = ms.levels[w.l + i];
-        mean += ((w.values[i] - w.target[i]) - mean) / static_cast<double>(count);
-        const double terms = std::max(std::abs(w.values[i]), abs_dot(w.gradient(i), scratch, w.m));
-        if (count == LEVELS && !(std::abs(mean) <= LEVEL_BANDS * EPS * terms)) mean = 0.0;
-    }
-}
-
 // How far the values in w.values are from where they began, into w.target.
 template <class W>
 inline void defects_of_values(const Multistep &ms, const W &w) {
@@ -476,7 +486,6 @@ inline Code project_last(const Run &run, const Step &step, double from) {
         gather_errors(size, static_cast<double>(ms.place[SINCE]), w);
     }
     if (w.l == 0) return OK;
-    if (ms.brief || ms.place[NEWEST] < ms.order + LEVELS * LEVEL_SPACING) fill(ms.levels + w.l, 0.0, w.l);
     run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
     evaluate_invariants(run, step.t_new, w.y_hat);
     ++w.counters[NJEV];
@@ -518,7 +527,7 @@ struct OneState {
     const Run &run;
     double *scratch;
 
-    void collect() const { collect_levels(run, scratch); }
+    void begin(const double *y) const { find_levels(run.system, *run.method.multistep, run.work, y); }
     Code look() const { return look_at_nodes(*run.method.multistep, run.options, run.work) ? OK : UNSTABLE; }
     Code project() const { return project_nodes(run, scratch); }
     Code finish(const Step &step) const { return finish_nodes(run, step); }
@@ -531,9 +540,6 @@ inline Code advance_history(const States &states, int64_t last) {
     const Multistep &ms = *run.method.multistep;
     while (ms.place[NEWEST] < last) {
         Code status = add_node(run);
-        const int64_t after = ms.place[NEWEST] - ms.order;
-        if (status == OK && run.work.l > 0 && after > 0 && after <= LEVELS * LEVEL_SPACING && after % LEVEL_SPACING == 0)
-            states.collect();
         if (status != OK) return status;
         if (ms.place[NEWEST] % ms.spacing == 0)
             status = states.project();
@@ -564,6 +570,7 @@ inline Code next_states(const States &states, const Span &span, double *clock, i
         return states.finish(step);
     }
     if (!place[HAVE_NODES]) {
+        if (w.l > 0) states.begin(y);
         copy(y, y_new, w.m);
         const Code status = begin_history(run, y_new);
         if (status != OK) return status;

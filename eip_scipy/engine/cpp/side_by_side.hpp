@@ -117,9 +117,7 @@ struct EightStates {
     Eight &eight;
     double *y_new;
 
-    void collect() const {
-        each(alive_of(eight), [&](int64_t) { return collect_levels(single, y_new), OK; });
-    }
+    void begin(const double *) const { find_levels(eight.system, eight.multistep, eight.work, eight.y); }
     Code look() const {
         keep(alive_of(eight) & look_at_nodes(eight.multistep, eight.options, eight.work));
         return OK;
