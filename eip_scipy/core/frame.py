@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from ..engine.data import FrameRows
 from .blocks import INDEX
@@ -65,10 +65,10 @@ def _frame_matrices(frame: Any, n: int, width: int) -> tuple[np.ndarray, np.ndar
     # Rows of C and columns of S in units of their own: only then does the condition number tell singular from scaled.
     C = C / np.maximum(np.abs(C).max(axis=1, keepdims=True), np.finfo(float).tiny)
     S = S / np.maximum(np.abs(S).max(axis=0, keepdims=True), np.finfo(float).tiny)
-    product = C @ S
-    if not np.all(np.isfinite(product)) or not np.linalg.cond(product) < 1e12:
+    shifts = C @ S
+    if not np.all(np.isfinite(shifts)) or not np.linalg.cond(shifts) < 1e12:
         raise ValueError("frame: C S is singular; S must span shifts that change every row of C y.")
-    return C, np.ascontiguousarray(np.linalg.solve(product.T, S.T))
+    return C, np.ascontiguousarray(np.linalg.solve(shifts.T, S.T))
 
 
 def _real_form(a: np.ndarray) -> np.ndarray:
@@ -84,8 +84,12 @@ def _by_bodies(a: np.ndarray) -> np.ndarray:
     groups = a.shape[0] // 3
     if groups == 0 or a.shape[1] % (3 * groups):
         return np.zeros((0, 0))
-    weights = np.array([a[3 * k, part] for k, part in enumerate(np.arange(a.shape[1]).reshape(groups, -1)[:, ::3])])
-    return weights if np.array_equal(a, np.kron(block_diag(*weights), np.eye(3))) else np.zeros((0, 0))
+    entries = a.reshape(groups, 3, groups, -1, 3)
+    weights = np.array([entries[k, 0, k, :, 0] for k in range(groups)])
+    expected = np.zeros_like(entries)
+    for k, axis in product(range(groups), range(3)):
+        expected[k, axis, k, :, axis] = weights[k]
+    return weights if np.array_equal(entries, expected) else np.zeros((0, 0))
 
 
 def _sparse_rows(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -110,16 +110,19 @@ class Request:
 
 
 class System:
-    """The user's functions of a run: `fun` as it was given, and `rhs`, interpreted, as the loop calls it."""
+    """The user's functions of a run: `fun` as it was given, and `rhs`, interpreted, as the loop calls it.
 
-    def __init__(self, request: Request, form: str) -> None:
+    `acc`: the accelerations alone, where the method wants nothing else and a problem brings them.
+    """
+
+    def __init__(self, request: Request, form: str, acc: Any) -> None:
         self.fun, self.form = request.fun, form
         if not callable(self.fun):
             raise TypeError(f"integrate: fun must be callable or a Problem, got {self.fun!r}{address_hint(self.fun)}.")
         self.extra = extra_arguments(request.args, request.params)
         self.parameters = floats(self.extra)
         self.events = Events(request.events, self.extra)
-        self.jacobian = request.jacobian
+        self.acc, self.jacobian = acc, request.jacobian
         if self.jacobian is not None and not callable(self.jacobian):
             raise TypeError(
                 f"jacobian must be a function jacobian(t, q, dq, out[, params]), got {shown(self.jacobian)}."
@@ -163,7 +166,7 @@ class System:
             if numbers is None:
                 raise NotCompilableError("args are neither numbers nor one array of floats")
             params = Packed(self.parameters, numbers) if self.extra else None
-            functions = native_functions(self.fun, self.form, params, run.invariants, run.y0)
+            functions = native_functions(*self._native_form, params, run.invariants, run.y0)
             if self._corrects(run):
                 functions = with_jacobian(functions, self.jacobian, params, run.y0)
         except NotCompilableError as reason:
@@ -176,6 +179,14 @@ class System:
             if wanted:
                 raise
             return functions._replace(python=in_python), f"events are called from Python: {reason}"
+
+    @property
+    def _native_form(self) -> tuple[Any, str]:
+        """`fun` and its form, or the accelerations alone where they are of the same library: nothing else is used."""
+        own = isinstance(self.fun, LibraryFunction) and isinstance(self.acc, LibraryFunction)
+        if own and self.fun.__name__.partition(".")[0] == self.acc.__name__.partition(".")[0]:
+            return self.acc, "acceleration"
+        return self.fun, self.form
 
     def calls(self, run: Run, functions: PythonFunctions | NativeFunctions) -> dict[str, str]:
         """Which kind of call is made of each function; see `IntegrationResult`."""
@@ -280,8 +291,10 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     asked, request = request, request.with_pointers()
     in_place = in_place or isinstance(request.fun, PointerFunction)
     frequencies = request.fun.frequencies if isinstance(request.fun, Problem) else None
-    request, form = _with_problem(request, FORMS[isinstance(method, (NystromTableau, GaussJackson)), in_place])
-    system = System(request, form)
+    of_second_order = isinstance(method, (NystromTableau, GaussJackson))
+    acc = request.fun.acc if of_second_order and isinstance(request.fun, Problem) else None
+    request, form = _with_problem(request, FORMS[of_second_order, in_place])
+    system = System(request, form, acc)
     t0, t_bound = _span(request, system.events)
     y0 = _state(request.y0)
     name = request.method.__name__

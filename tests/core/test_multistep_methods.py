@@ -2,6 +2,7 @@
 
 import ctypes
 import math
+from dataclasses import replace
 
 import mpmath
 import numba
@@ -24,6 +25,7 @@ from eip_scipy import (
     ensemble,
     integrate,
 )
+from eip_scipy.engine.native import library
 from eip_scipy.problems import Problem, nbody, solar_system
 from eip_scipy.problems.gravity import solar_data
 from eip_scipy.run import integrate as longrun
@@ -220,6 +222,16 @@ def test_python_jitted_and_native_functions_give_the_same_bits():
     assert compiled.compiled
     assert not python.compiled
     assert np.array_equal(compiled.y, python.y)
+
+
+def test_a_problems_accelerations_are_taken_where_they_are_of_its_library():
+    """They have the bits of the whole right-hand side; what belongs to another one is left alone."""
+    problem = nbody([1.0, 1e-3], [[0, 0, 0], [0.8, 0, 0.1]], [[0, -1e-3, 0], [0, 1.2, 0.1]], t_span=(0, 20), h=0.05)
+    for method in (EIPGJ14, EIPRKN12):
+        runs = [
+            integrate(replace(problem, acc=acc), method=method) for acc in (problem.acc, None, library["kepler.acc"])
+        ]
+        assert all(np.array_equal(run.y, runs[0].y) and run.nfev == runs[0].nfev for run in runs)
 
 
 C_FUNCTIONS = """

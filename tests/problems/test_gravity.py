@@ -14,6 +14,7 @@ from numba import njit
 from eip_scipy import EIPRK4, integrate
 from eip_scipy.engine.native import library
 from eip_scipy.problems import solar_system
+from eip_scipy.problems.gravity import frequencies
 
 rhs, acc = library["gravity.rhs"], library["gravity.acc"]
 energy, energy_gradient = library["gravity.energy"], library["gravity.energy_gradient"]
@@ -263,3 +264,20 @@ def test_arguments_are_converted_or_refused():
 
 def test_pickled_by_name():
     assert pickle.loads(pickle.dumps(rhs)) is rhs
+
+
+@pytest.mark.parametrize("pairs", [1, 40, 2**15])
+def test_frequencies_of_orbits_and_of_a_moon(monkeypatch, pairs):
+    """Two planets and a moon on known orbits, whichever pairs are looked at together."""
+    monkeypatch.setattr(frequencies, "PAIRS", pairs)
+    gm = np.array([1e-3, 1.0, 1e-9, 0.0])  # the first planet, the star, its moon, a test particle
+    q, v = np.zeros((2, 4, 3))
+    q[0], v[0] = (1, 0, 0), (0, np.sqrt(gm[0] + gm[1]), 0)
+    q[2], v[2] = q[0] + (0, 0, 0.01), v[0] + (np.sqrt((gm[0] + gm[2]) / 0.01), 0, 0)
+    e = 0.5
+    q[3], v[3] = (0, 4 * (1 - e), 0), (np.sqrt((1 + e) / (4 * (1 - e))), 0, 0)
+    about, others = frequencies.orbital_frequencies(gm, np.concatenate([q.ravel(), v.ravel()]))
+    assert about[1] == 0.0
+    assert about[0] == pytest.approx(np.sqrt(1.001), rel=1e-12)
+    assert about[3] == pytest.approx(np.sqrt(4**-3 * (1 - e) ** -1.5), rel=1e-12)
+    assert others == pytest.approx(np.sqrt((gm[0] + gm[2]) / 0.01**3), rel=1e-9)

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "data.hpp"
+#include "octet.hpp"
 
 namespace eip {
 
@@ -19,15 +20,20 @@ inline PairOf<Value> two_sum(const Value &a, const Value &b) {
     return {s, (a - (s - v)) + (b - v)};
 }
 
+// The rounding error is exact either way; below, by Dekker's splitting, as a call for each fused operation takes longer.
 template <class Value>
 inline PairOf<Value> two_product(const Value &a, const Value &b) {
-    constexpr double SPLITTER = 134217729.0;  // 2^27 + 1 (Dekker)
     const Value p = a * b;
+#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+    return {p, fused(a, b, -p)};
+#else
+    constexpr double SPLITTER = 134217729.0;  // 2^27 + 1
     Value x = SPLITTER * a;
     const Value a_high = x - (x - a), a_low = a - a_high;
     x = SPLITTER * b;
     const Value b_high = x - (x - b), b_low = b - b_high;
     return {p, ((a_high * b_high - p) + a_high * b_low + a_low * b_high) + a_low * b_low};
+#endif
 }
 
 // (y_hat, carry_hat) = y + carry + h sum_j (b + b_low)[j] K[j], rounded once to two floats.

@@ -58,18 +58,14 @@ inline void row_sums(const Rows &rows, int64_t i, Value *out) {
     for (int k = 0; k < COUNT; ++k) out[k] = even[k] + odd[k];
 }
 
-// The vectors that hold the entries `first` to `end` - 1.
+// The vectors that hold the entries `first` to `end` - 1; `out` goes to the rows' ends.
 inline void row_sums(const Rows &rows, double *out, int64_t first, int64_t end) {
-    Vector sums[4];
-    int64_t i = first - first % WIDTH;
-    for (; end - i > 3 * WIDTH; i += 4 * WIDTH) {
-        row_sums<Vector, 4>(rows, i, sums);
-        for (int k = 0; k < 4; ++k) store(sums[k], out + i + k * WIDTH);
-    }
-    for (; i < end; i += WIDTH) {
-        row_sums<Vector, 1>(rows, i, sums);
-        store(sums[0], out + i);
-    }
+    const int64_t start = first - first % WIDTH;
+    in_blocks((end - start + WIDTH - 1) / WIDTH * WIDTH, [&]<class Value, int COUNT>(int64_t i) {
+        Value sums[COUNT];
+        row_sums<Value, COUNT>(rows, start + i, sums);
+        for (int k = 0; k < COUNT; ++k) store_as<Value>(sums[k], out + start + i + k * sizeof(Value) / sizeof(double));
+    });
 }
 
 // out = scale (total + (rest + what the rows add)), to the rows' ends.

@@ -73,7 +73,7 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w)
 // The rest of a projection of eight members, where the gradients at w.y_hat and the invariants' values are known, from y
 // at the step's beginning into eight.y_new; returns those of `alive` who have to do it by themselves.
 template <class W>
-inline Mask project_octet_evaluated(Eight &eight, const W &w, double t, const Octet *y, const Mask &alive,
+[[gnu::flatten]] inline Mask project_octet_evaluated(Eight &eight, const W &w, double t, const Octet *y, const Mask &alive,
                                     const Work &single) {
     const Options &o = eight.options;
     const Mask outside = defects<Octet>(nullptr, w.y_hat, o, w, w.before);

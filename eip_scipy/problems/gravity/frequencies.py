@@ -6,6 +6,8 @@ import numpy as np
 
 __all__ = ["orbital_frequencies"]
 
+PAIRS = 2**15  # that are looked at at once: all of them would take the memory of N^2 distances
+
 
 def orbital_frequencies(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
     """The largest angular frequency of each body on its orbit about the heaviest one, and that of all other pairs.
@@ -30,31 +32,36 @@ def orbital_frequencies(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, floa
     """
     q, v = y.reshape(2, -1, 3)
     centre = int(np.argmax(gm))
-    about = _frequencies(gm, q, v, centre)
+    about = _frequencies(gm, q, v, np.array([centre]))[0]
     others = 0.0
-    for i in range(gm.size):  # row by row: all pairs at once would take the memory of N^2 distances
-        if i == centre:
-            continue
-        pair = _frequencies(gm, q, v, i)
-        pair[[i, centre]] = 0.0
-        distance = np.linalg.norm(q - q[i], axis=1)
-        distance[i] = np.inf
-        nearer = (gm + gm[i]) / distance**3 > (gm[centre] + gm[i]) / distance[centre] ** 3
-        others = max(others, float(pair[nearer].max(initial=0.0)))
+    rows = max(1, PAIRS // gm.size)
+    for first in range(0, gm.size, rows):
+        bodies = np.arange(first, min(first + rows, gm.size))
+        here = np.arange(bodies.size)
+        pairs = _frequencies(gm, q, v, bodies)
+        pairs[:, centre] = pairs[bodies == centre] = 0.0
+        distance = np.linalg.norm(q - q[bodies, None], axis=2)
+        to_centre = distance[:, centre].copy()
+        distance[here, bodies] = to_centre[bodies == centre] = np.inf
+        mass = gm[bodies]
+        with np.errstate(divide="ignore"):  # two bodies at one place are told where the accelerations are
+            nearer = (gm + mass[:, None]) / distance**3 > ((gm[centre] + mass) / to_centre**3)[:, None]
+        others = max(others, float(pairs[nearer].max(initial=0.0)))
     return about, others
 
 
-def _frequencies(gm: np.ndarray, q: np.ndarray, v: np.ndarray, i: int) -> np.ndarray:
-    """Of the orbits of all bodies about body i."""
-    r, u, mass = q - q[i], v - v[i], gm + gm[i]
+def _frequencies(gm: np.ndarray, q: np.ndarray, v: np.ndarray, bodies: np.ndarray) -> np.ndarray:
+    """Of the orbits of all bodies about each of `bodies`, a row for each of these."""
+    r, u, mass = q - q[bodies, None], v - v[bodies, None], gm + gm[bodies, None]
+    (x, y, z), (vx, vy, vz) = r.T, u.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.linalg.norm(r, axis=1)
-        inverse_axis = 2 / distance - (u**2).sum(axis=1) / mass
-        momentum = (np.cross(r, u) ** 2).sum(axis=1) / mass
+        distance = np.sqrt(x * x + y * y + z * z).T
+        inverse_axis = 2 / distance - (vx * vx + vy * vy + vz * vz).T / mass
+        momentum = ((y * vz - z * vy) ** 2 + (z * vx - x * vz) ** 2 + (x * vy - y * vx) ** 2).T / mass
         eccentricity = np.sqrt(np.maximum(0.0, 1 - momentum * inverse_axis))
         pericentre = momentum / (1 + eccentricity)
         fastest = np.sqrt(mass / pericentre**3)
         mean = np.sqrt(mass * np.maximum(inverse_axis, 0.0) ** 3)
         found = np.where(inverse_axis > 0, np.sqrt(mean * fastest), fastest)
-    found[i] = 0.0
+    found[np.arange(bodies.size), bodies] = 0.0
     return np.where((mass > 0) & ~np.isnan(found), found, 0.0)
