@@ -674,19 +674,19 @@ class InvariantSet:
         self, t: float, y: Array, directions: Array, G: Array, here: Array, rounding: Callable[[Array], Array]
     ) -> Iterator[Complaint]:
         """Those that do not agree with the differences along the first direction in which any does not."""
-        products = G.conj() * directions[:, None, :]
-        along, terms = products.sum(axis=2).real, np.abs(products).sum(axis=2)
-        wrong = np.ones(along.shape, bool)
+        along, terms = (directions @ G.conj().T).real, np.abs(directions) @ np.abs(G).T
+        wrong = np.array(True)
         for step in CHECK_STEPS:
-            plus = np.array([self.values(t, y + step * d) for d in directions])
-            minus = np.array([self.values(t, y - step * d) for d in directions])
-            difference = (plus - minus) / (2 * step)
-            noise = CHECK_NOISE / step * (EPS * np.maximum(np.abs(plus), np.abs(minus)) + 5e-324)
+            both = np.array([[self.values(t, state) for state in y + side * directions] for side in (step, -step)])
+            difference = (both[0] - both[1]) * (0.5 / step)
+            sizes, moves = np.abs(both), np.abs(both - here)
+            noise = (CHECK_NOISE / step) * (EPS * np.maximum(sizes[0], sizes[1]) + 5e-324)
             # At an extremum both ends move alike; their difference is then the rounding inside the invariant.
-            moved = (np.abs(plus - here) + np.abs(minus - here)) / (2 * step)
-            allowed = CHECK_TOLERANCE * (terms + moved)
+            allowed = CHECK_TOLERANCE * (terms + (moves[0] + moves[1]) * (0.5 / step))
             agrees = ~(np.abs(difference - along) > allowed + noise)
-            wrong &= ~(agrees & ((step == CHECK_STEPS[0]) | (noise <= allowed)))
+            if step != CHECK_STEPS[0]:
+                agrees &= noise <= allowed
+            wrong = wrong & ~agrees
             if not wrong.any():
                 return
         wrong &= ~(rounding(directions) > np.abs(difference - along))

@@ -26,6 +26,10 @@ inline Value block_square(const Value *a, int64_t b, const Value &unit, const Bl
         const Value x = a[3 * b] * unit, y = a[3 * b + 1] * unit, z = a[3 * b + 2] * unit;
         return x * x + y * y + z * z;
     }
+    if (blocks.size == 2) {
+        const Value x = a[2 * b] * unit, y = a[2 * b + 1] * unit;
+        return x * x + y * y;
+    }
     Value total = 0.0;
     for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) {
         const Value x = a[blocks.member[p]] * unit;
@@ -34,11 +38,13 @@ inline Value block_square(const Value *a, int64_t b, const Value &unit, const Bl
     return total;
 }
 
-// Per block the sum of a; consecutive blocks of three without looking places up.
+// Per block the sum of a; consecutive blocks of two or three without looking places up.
 template <class Value>
 inline void block_sums(const Value *a, const Blocks &blocks, Value *out) {
     if (blocks.size == 3) {
         for (int64_t b = 0; b < blocks.count; ++b) out[b] = a[3 * b] + a[3 * b + 1] + a[3 * b + 2];
+    } else if (blocks.size == 2) {
+        for (int64_t b = 0; b < blocks.count; ++b) out[b] = a[2 * b] + a[2 * b + 1];
     } else {
         for (int64_t b = 0; b < blocks.count; ++b) {
             Value total = 0.0;
@@ -164,6 +170,8 @@ inline auto weights_from_sizes(const Options &o, const W &w) {
     for (int64_t b = 0; b < blocks.count; ++b) {
         if (blocks.size == 3)
             w.sigma[3 * b] = w.sigma[3 * b + 1] = w.sigma[3 * b + 2] = w.ratio[b];
+        else if (blocks.size == 2)
+            w.sigma[2 * b] = w.sigma[2 * b + 1] = w.ratio[b];
         else
             for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) w.sigma[blocks.member[p]] = w.ratio[b];
     }
@@ -178,9 +186,11 @@ inline double error_metric(const double *y, double rounding, const Options &o, c
     return weights_from_sizes(o, w);
 }
 
-// Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none.
+// Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none, or where it is
+// not above `least`.
 template <class Value, class W>
-inline Value correction_in_local_errors(const Value &largest_error, const Options &o, const W &w) {
+inline Value correction_in_local_errors(const Value &largest_error, const Options &o, const W &w,
+                                        const Value &least = 0.0) {
     if (!any(largest_error > 0.0)) return 0.0 * largest_error;
     Value top = 0.0;
     for (int64_t b = 0; b < (o.blocks.size == 1 ? w.m : o.blocks.count); ++b) {
@@ -194,6 +204,8 @@ inline Value correction_in_local_errors(const Value &largest_error, const Option
         }
         top = where(w.scale[b] > 0.0, max(top, square), top);
     }
+    const Value bound = (1.0 - 8.0 * EPS) * (least * largest_error);
+    if (!any(top > bound * bound)) return 0.0 * largest_error;
     return where(largest_error > 0.0, sqrt(top) / largest_error, 0.0 * largest_error);
 }
 

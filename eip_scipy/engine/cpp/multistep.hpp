@@ -255,12 +255,14 @@ template <class AnyRun>
 inline void correct_node(const AnyRun &run, double t, double *q, const double *older, double *a) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
-    const int64_t end = ms.first + ms.count;
-    for (int64_t i = ms.first; i < end; ++i) ms.change[i] = ms.h * ms.h * (older[i] + ms.correction[ms.order] * a[i]);
-    run.system.jacobian(w, t, q, ms.change, w.f_point, end);
+    const int64_t first = ms.first, end = first + ms.count;
+    const double square = ms.h * ms.h, weight = ms.correction[ms.order];
+    double *change = ms.change;
+    for (int64_t i = first; i < end; ++i) change[i] = square * (older[i] + weight * a[i]);
+    run.system.jacobian(w, t, q, change, w.f_point, end);
     // Float by float: they have just been written so, and a load of several would wait until all those stores are done.
     const volatile double *product = w.f_point;
-    for (int64_t i = ms.first; i < end; ++i) a[i] += product[i];
+    for (int64_t i = first; i < end; ++i) a[i] += product[i];
 }
 
 // One more node.

@@ -53,14 +53,21 @@ inline double fused(double a, double b, double c) { return std::fma(a, b, c); }
 struct Mask {
     Bits part[VECTORS];
 
-    bool lane(int k) const { return part[k / WIDTH][k % WIDTH] != 0; }
-    bool any() const {
-        Bits all = part[0];
-        for (int v = 1; v < VECTORS; ++v) all |= part[v];
-        bool found = false;
-        for (int k = 0; k < WIDTH; ++k) found |= all[k] != 0;
+    // Lane k as bit k.
+    unsigned bits() const {
+        unsigned found = 0;
+        for (int v = 0; v < VECTORS; ++v) {
+#if defined(__AVX__) && !defined(__clang__)
+            found |= static_cast<unsigned>(__builtin_ia32_movmskpd256((Vector)part[v])) << (v * WIDTH);
+#else
+            for (int k = 0; k < WIDTH; ++k) found |= (part[v][k] != 0 ? 1U : 0U) << (v * WIDTH + k);
+#endif
+        }
         return found;
     }
+    bool lane(int64_t k) const { return (bits() >> k & 1U) != 0; }
+    bool any() const { return bits() != 0; }
+    bool all() const { return bits() == (1U << LANES) - 1U; }
 };
 
 struct Octet {

@@ -77,24 +77,26 @@ template <class W>
                                     const Work &single) {
     const Options &o = eight.options;
     const Mask outside = defects<Octet>(nullptr, w.y_hat, o, w, w.before);
+    const Mask moved = outside & alive;
+    const bool all_move = moved.all();
     Mask leave{};
     Octet largest_error = 0.0;
     if (o.metric == ERROR) {
-        copy(w.sigma, w.stage, w.m);
+        if (!all_move) copy(w.sigma, w.stage, w.m);
         leave = outside & block_sizes<Octet>(y, o.compensated ? 0.0 : EPS, o, w);
         largest_error = weights_from_sizes(o, w);
-        for (int64_t j = 0; j < w.m; ++j) w.sigma[j] = where(outside & alive, w.sigma[j], w.stage[j]);
+        for (int64_t j = 0; !all_move && j < w.m; ++j) w.sigma[j] = where(moved, w.sigma[j], w.stage[j]);
     }
     Octet *rows = weighed_gradients(o, w);
-    const Mask dependent = outside & alive & !solve_gram(rows_of(rows, w), w.g, small(w.R, w.l, w), w.mu);
+    const Mask dependent = moved & !solve_gram(rows_of(rows, w), w.g, small(w.R, w.l, w), w.mu);
     move_along(o, w, rows, eight.y_new);
-    const Mask moved = outside & alive;
     for (int64_t lane = 0; lane < LANES; ++lane)
-        if (moved.lane(lane)) eight.rank[lane] = w.l;
+        if (all_move || moved.lane(lane)) eight.rank[lane] = w.l;
     if (any(dependent))
         for (int64_t lane = 0; lane < LANES; ++lane)
             if (dependent.lane(lane)) solve_alone(eight, lane, o, single);
-    const Octet correction = correction_in_local_errors(largest_error, o, w);
+    // What is neither a record nor too large need not be known.
+    const Octet correction = correction_in_local_errors(largest_error, o, w, min(*w.max_correction, HEALTHY));
     if (o.compensated) {
         for (int64_t j = 0; j < w.m; ++j) w.move[j] = where(outside, w.move[j], 0.0);
         copy(w.y_hat, eight.y_new, w.m);
@@ -102,7 +104,7 @@ template <class W>
     } else if (o.blocks.count * o.blocks.width == w.m) {
         leave = leave | (outside & (correction > HEALTHY));
     }
-    for (int64_t j = 0; j < w.m; ++j) eight.y_new[j] = where(outside, eight.y_new[j], w.y_hat[j]);
+    for (int64_t j = 0; !all_move && j < w.m; ++j) eight.y_new[j] = where(outside, eight.y_new[j], w.y_hat[j]);
     evaluate_invariants(RunOf<W, OctetSystem>{eight.method, o, w, eight.system, nullptr}, t, eight.y_new);
     const Mask held = defects_held<Octet>(w.before, o, w) & small_shares(o, w) & all_finite(eight.y_new, w.m);
     Mask done = alive & held & !leave;
@@ -113,7 +115,7 @@ template <class W>
     *w.max_correction = where(corrected, max(*w.max_correction, correction), *w.max_correction);
     *eight.projections += where(corrected, 1.0, 0.0);
     *eight.skips += where(done & !outside, 1.0, 0.0);
-    for (int64_t lane = 0; lane < LANES; ++lane)
+    for (int64_t lane = 0; any(dependent) && lane < LANES; ++lane)
         if (corrected.lane(lane) && eight.rank[lane] < w.l) eight.at(eight.reduced, lane) += 1.0;
     return alive & !done;
 }

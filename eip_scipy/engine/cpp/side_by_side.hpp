@@ -235,7 +235,7 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
             if (leave.lane(lane))
                 eight.alive[lane] = returned[lane] = step_alone(run, eight, lane, s, before, y, y_new);
     close_step(all, step, OK);
-    for (int64_t lane = 0; lane < LANES; ++lane)
+    for (int64_t lane = 0; any(leave) && lane < LANES; ++lane)
         for (int c = 0; returned[lane] && c < N_COUNTERS; ++c) eight.own[lane][c] -= w.counters[c];
     if (is_due(s, eight.row, t_new)) sample_octet(run, *samples, eight, s, members, step, y, y_new);
     copy(w.last(), w.row(0), w.m);

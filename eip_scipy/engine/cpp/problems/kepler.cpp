@@ -8,7 +8,7 @@ using std::sqrt;
 
 // The pull over r: r^-3 + 3/2 eps r^-5, by divisions that do not wait for each other.
 template <class T>
-T pull(const T *q, const T &eps) {
+[[gnu::always_inline]] inline T pull(const T *q, const T &eps) {
     const T r2 = q[0] * q[0] + q[1] * q[1], w = 1.0 / (r2 * sqrt(r2));
     return w + 1.5 * eps * w * (1.0 / r2);
 }
