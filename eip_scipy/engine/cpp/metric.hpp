@@ -186,11 +186,9 @@ inline double error_metric(const double *y, double rounding, const Options &o, c
     return weights_from_sizes(o, w);
 }
 
-// Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none, or where it is
-// not above `least`.
+// Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none.
 template <class Value, class W>
-inline Value correction_in_local_errors(const Value &largest_error, const Options &o, const W &w,
-                                        const Value &least = 0.0) {
+inline Value correction_in_local_errors(const Value &largest_error, const Options &o, const W &w) {
     if (!any(largest_error > 0.0)) return 0.0 * largest_error;
     Value top = 0.0;
     for (int64_t b = 0; b < (o.blocks.size == 1 ? w.m : o.blocks.count); ++b) {
@@ -204,8 +202,6 @@ inline Value correction_in_local_errors(const Value &largest_error, const Option
         }
         top = where(w.scale[b] > 0.0, max(top, square), top);
     }
-    const Value bound = (1.0 - 8.0 * EPS) * (least * largest_error);
-    if (!any(top > bound * bound)) return 0.0 * largest_error;
     return where(largest_error > 0.0, sqrt(top) / largest_error, 0.0 * largest_error);
 }
 

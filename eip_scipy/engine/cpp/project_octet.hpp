@@ -73,8 +73,8 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w)
 // The rest of a projection of eight members, where the gradients at w.y_hat and the invariants' values are known, from y
 // at the step's beginning into eight.y_new; returns those of `alive` who have to do it by themselves.
 template <class W>
-[[gnu::flatten]] inline Mask project_octet_evaluated(Eight &eight, const W &w, double t, const Octet *y, const Mask &alive,
-                                    const Work &single) {
+[[gnu::flatten]] inline Mask project_octet_evaluated(Eight &eight, const W &w, double t, const Octet *y,
+                                                     const Mask &alive, const Work &single) {
     const Options &o = eight.options;
     const Mask outside = defects<Octet>(nullptr, w.y_hat, o, w, w.before);
     const Mask moved = outside & alive;
@@ -95,8 +95,7 @@ template <class W>
     if (any(dependent))
         for (int64_t lane = 0; lane < LANES; ++lane)
             if (dependent.lane(lane)) solve_alone(eight, lane, o, single);
-    // What is neither a record nor too large need not be known.
-    const Octet correction = correction_in_local_errors(largest_error, o, w, min(*w.max_correction, HEALTHY));
+    const Octet correction = correction_in_local_errors(largest_error, o, w);
     if (o.compensated) {
         for (int64_t j = 0; j < w.m; ++j) w.move[j] = where(outside, w.move[j], 0.0);
         copy(w.y_hat, eight.y_new, w.m);
