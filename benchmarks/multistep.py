@@ -69,7 +69,7 @@ def thousand_years(quick: bool) -> Table:
 
     def methods(turned: Problem, turn: int) -> Methods:
         return {
-            **yearly("EIPGJ14", by_us(turned, EIPGJ14), 260, 300, 350, 380, 412, 440, 500, 600, 768),
+            **yearly("EIPGJ14", by_us(turned, EIPGJ14), 260, 300, 350, 405, 440, 500, 600, 768),
             **yearly("EIPGJ12", by_us(turned, EIPGJ12), 592),
             **yearly("EIPRKN12", by_us(turned, EIPRKN12, every=10, compensated=True), 44, 64),
             **daily("WHFast c17", by_rebound(turned, "whfast-c17"), 5, 4, 3, 2, 1.4, 1),

@@ -85,6 +85,21 @@ inline double abs_dot(const double *a, const double *b, int64_t n) {
     return lanes.sum() + rest;
 }
 
+// Sum of (a_i b_i)^2.
+inline double square_dot(const double *a, const double *b, int64_t n) {
+    const int64_t whole = n - n % LANES;
+    double rest = 0.0;
+    for (int64_t i = whole; i < n; ++i) rest += (a[i] * b[i]) * (a[i] * b[i]);
+    if (whole == 0) return 0.0 + rest;
+    Lanes lanes;
+    for (int64_t i = 0; i < whole; i += LANES)
+        for (int k = 0; k < VECTORS; ++k) {
+            const Vector x = load(a + i + k * WIDTH) * load(b + i + k * WIDTH);
+            lanes.part[k] += x * x;
+        }
+    return lanes.sum() + rest;
+}
+
 // Sums of |a_i b_i| and of |a_i c_i|, each as by `abs_dot`.
 struct AbsDots {
     double b, c;

@@ -168,13 +168,8 @@ inline auto tells_more(const W &w) {
     Truth<Value> more{};
     for (int64_t i = 0; i < w.l; ++i) {
         const Value *G = w.gradient(i);
-        Value error = 0.0, noise = 0.0;
-        for (int64_t j = 0; j < w.m; ++j) {
-            const Value x = w.err[j] * G[j];
-            error += x * x;
-            noise += abs(G[j] * w.y_hat[j]);
-        }
-        more = more | (sqrt(error) > NOISE_BANDS * EPS * noise);
+        const Value error = sqrt(square_dot(w.err, G, w.m)), noise = abs_dot(G, w.y_hat, w.m);
+        more = more | (error > NOISE_BANDS * EPS * noise);
     }
     return more;
 }

@@ -53,6 +53,10 @@ inline Octet abs_dot(const Octet *a, const Octet *b, int64_t n) {
     return sum_of(n, [=](int64_t i) { return abs(a[i] * b[i]); });
 }
 
+inline Octet square_dot(const Octet *a, const Octet *b, int64_t n) {
+    return sum_of(n, [=](int64_t i) { return (a[i] * b[i]) * (a[i] * b[i]); });
+}
+
 struct AbsDotsOfOctets {
     Octet b, c;
 };
