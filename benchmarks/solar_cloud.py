@@ -29,7 +29,7 @@ REPEATS = 5
 # Of each method the steps a year, and its options.
 METHODS = {
     "EIPRKN12": ((36, 38, 44), {"method": EIPRKN12, "every": 10}),
-    "EIPGJ14": ((236, 255, 300, 412), {"method": EIPGJ14}),
+    "EIPGJ14": ((236, 255, 300, 405, 460), {"method": EIPGJ14}),
 }
 DAYS = (2, 3, 4, 5)
 SPREAD = 1e-6  # of each coordinate, relative
