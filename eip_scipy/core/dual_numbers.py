@@ -195,8 +195,9 @@ def _define(emit: Callable[..., Any], *functions: Any, compares: bool = False) -
     kinds = [(Dual,), (Dual, Dual), (Dual, types.Float), (types.Float, Dual)]
     for function in functions:
 
-        @infer_global(function)
         class _Template(AbstractTemplate):
+            key = function
+
             def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
                 if not _is_dual(*args):
                     return None
@@ -204,6 +205,8 @@ def _define(emit: Callable[..., Any], *functions: Any, compares: bool = False) -
                 found = [k if k == dual else types.float64 for k in args]
                 return signature(types.boolean if compares else dual, *found)
 
+        # Not as a decorator, which asks for the module of each function: those of NumPy 2.0 name none.
+        infer_global(function, types.Function(_Template))
         for choice in kinds:
             lower_builtin(function, *choice)(lower)
 
@@ -406,8 +409,9 @@ for _function in (operator.pow, operator.ipow, math.pow, np.power):
 def _define_for_arrays(function: Any) -> None:
     """Type an expression of arrays; Numba turns it into a loop over its scalars, which are typed above."""
 
-    @infer_global(function)
     class _Template(AbstractTemplate):
+        key = function
+
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
             found = [a for a in args if isinstance(a, types.Array)]
             kinds = [a.dtype if isinstance(a, types.Array) else a for a in args]
@@ -415,6 +419,8 @@ def _define_for_arrays(function: Any) -> None:
                 return None
             dual = next(k for k in kinds if isinstance(k, Dual))
             return signature(types.Array(dual, max(a.ndim for a in found), "C"), *args)
+
+    infer_global(function, types.Function(_Template))
 
 
 ARRAY_FUNCTIONS: tuple[Any, ...] = (
