@@ -74,6 +74,14 @@ struct Octet {
     Vector part[VECTORS];
 
     Octet() = default;
+    // Vector by vector: GCC copies the whole in pieces of 8 and 16 bytes, by way of memory.
+    Octet(const Octet &x) {
+        for (int v = 0; v < VECTORS; ++v) part[v] = x.part[v];
+    }
+    Octet &operator=(const Octet &x) {
+        for (int v = 0; v < VECTORS; ++v) part[v] = x.part[v];
+        return *this;
+    }
     Octet(double x) {  // NOLINT: a number stands for itself in every lane
         for (Vector &v : part) v = spread_vector(x);
     }
