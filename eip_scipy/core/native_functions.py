@@ -82,7 +82,7 @@ def native_functions(
     number = _number(params, y0)
     kind = number._replace(shape=(size,), size=size, real=False, in_place=form.endswith("place"))
     values = None if params is None else params.values
-    rhs = function_alone(fun, kind, "fun", values, second_order=second_order)
+    rhs = function_alone(fun, kind, "acceleration" if second_order else "fun", values, second_order=second_order)
     inv, grad = list[Native](), list[Native]()
     for k, (item, label) in enumerate(zip(invariants.items, invariants.labels, strict=True)):
         name = f"invariant {label!r}"

@@ -62,7 +62,10 @@ class Start(NamedTuple):
 
 @dataclass
 class Run:
-    """All that a driver needs besides the user's functions; `left_out`: what NaN in the derivative may come from."""
+    """All that a driver needs, apart from the user's functions.
+
+    `called` is the name of the argument that gave the right-hand side. `left_out`: what NaN in its value may come from.
+    """
 
     y0: np.ndarray
     method: Method | OneStep
@@ -72,6 +75,7 @@ class Run:
     identity: dict[str, Any]  # see `Settled`
     trust: Trust
     tau: float
+    called: str = "fun"
     left_out: str = ""
     looked: int = -1
 
@@ -129,9 +133,9 @@ def _if_any(hooks: Hooks) -> Hooks | None:
     return hooks if hooks != Hooks() else None
 
 
-def as_derivative(value: Any, n: int, dtype: np.dtype, t: float) -> np.ndarray:
+def as_derivative(value: Any, n: int, dtype: np.dtype, t: float, name: str = "fun") -> np.ndarray:
     """The value of a user's right-hand side at t as an array (n,), or an error; see `as_vector`."""
-    return as_vector(value, n, dtype, "fun returned", t)
+    return as_vector(value, n, dtype, f"{name} returned", t)
 
 
 def initial_state(y0: Any, name: str = "y0") -> np.ndarray:
@@ -438,7 +442,7 @@ def _bad_value(run: Run, f: np.ndarray, t: float) -> str:
     hint = ""
     if run.left_out and unset.size:
         hint = f" (component {unset[0]} is NaN; {run.left_out})"
-    return f"fun returned a non-finite value at t={t:.10g}{hint}"
+    return f"{run.called} returned a non-finite value at t={t:.10g}{hint}"
 
 
 def attach(diagnostics: Any, run: Run) -> None:

@@ -448,8 +448,8 @@ class EIPDOP853(EIPSolver):
 class EIPRKN8(EIPSolver):
     """EIP method on the Runge-Kutta-Nystrom pair 8(6) of Dormand, El-Mikkawy and Prince, nine stages.
 
-    For q'' = a(t, q) as a first-order system: the state is (q, v), and the first half of `fun` must be v. With
-    `integrate`, `fun` is the acceleration. Options: see `EIPSolver`.
+    For q'' = a(t, q) as a first-order system: the state is (q, v), and the first half of `fun` must be v. `integrate`
+    also takes the acceleration alone, as ``acceleration=``. Options: see `EIPSolver`.
     """
 
     TABLEAU = RKN86
@@ -458,8 +458,8 @@ class EIPRKN8(EIPSolver):
 class EIPRKN12(EIPSolver):
     """EIP method on the Runge-Kutta-Nystrom pair 12(10) of Dormand, El-Mikkawy and Prince, 17 stages.
 
-    For q'' = a(t, q) as a first-order system: the state is (q, v), and the first half of `fun` must be v. With
-    `integrate`, `fun` is the acceleration. Options: see `EIPSolver`; at small steps ``every="auto"``.
+    For q'' = a(t, q) as a first-order system: the state is (q, v), and the first half of `fun` must be v. `integrate`
+    also takes the acceleration alone, as ``acceleration=``. Options: see `EIPSolver`; at small steps ``every="auto"``.
     """
 
     TABLEAU = RKN1210
@@ -469,8 +469,9 @@ class EIPGJ12(EIPSolver):
     """EIP method on the summed multistep method of Gauss and Jackson, of order 12: one evaluation a step.
 
     For smooth motions q'' = a(t, q), with a fixed step `h`, as a first-order system: the state is (q, v), and the
-    first half of `fun` must be v. With `integrate`, `fun` is the acceleration; accelerations that depend on velocities
-    come as the `fun` of a `Problem`. Options: see `EIPSolver`; `every` is "auto" and `compensated` True unless given.
+    first half of `fun` must be v. `integrate` also takes the acceleration alone, as ``acceleration=``; accelerations
+    that depend on velocities come as the second half of `fun`. Options: see `EIPSolver`; `every` is "auto" and
+    `compensated` True unless given.
 
     Raises
     ------

@@ -34,7 +34,7 @@ from ..engine.trust import ProjectionWarning
 from ..run.events import Events
 from ..run.interrupts import ended_by_sigterm, kept_ctrl_c
 from ..run.memory import check_bytes, most_bytes
-from ..run.prepare import DEFAULT, Request
+from ..run.prepare import DEFAULT, Request, default_method
 from ..run.tables import dataset, default_names
 from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
 from .side_by_side import LANES
@@ -54,7 +54,8 @@ LEAST_OCTETS = 4  # of members in a chunk
 TRIED = 8
 SHOWN = 5
 # Of a request: what an ensemble has of its own, or not at all.
-ALONE = {"fun", "t_span", "y0", "params", "projection", "callback", "diagnostics", "max_bytes", "progress"}
+ALONE = {"fun", "acceleration", "t_span", "y0", "params", "projection"}
+ALONE |= {"callback", "diagnostics", "max_bytes", "progress"}
 OWN = ("executor", "reduce", "callback", "out", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(ALONE))
 
 
@@ -180,12 +181,13 @@ class EnsembleResult(OptimizeResult):
 
 
 def ensemble(
-    fun: Callable[..., Any] | Problem,
+    fun: Callable[..., Any] | Problem | None = None,
     t_span: Any = None,
     y0s: Any = None,
     *,
+    acceleration: Any = None,
     params: Any = None,
-    method: type[EIPSolver] = EIPRK4,
+    method: type[EIPSolver] | None = None,
     h: float | None = DEFAULT,
     invariants: Any = DEFAULT,
     executor: Any = None,
@@ -215,11 +217,13 @@ def ensemble(
         Start and end, the same for all.
     y0s : array_like, shape (members, n)
         Starts; one (n,) for all where `params` differ. Default: the start of a `Problem`.
+    acceleration : callable, optional
+        In place of `fun`, as for `integrate`.
     params : array_like of float, shape (p,) or (members, p), optional
         Parameters of all members, or of each. Of a problem that names them also a mapping, of a name to one value or
         to one for each member, as in ``params={"k": [1.0, 2.0]}``.
     method : type, optional
-        As for `integrate`.
+        As for `integrate`. Default: the problem's own, if it has one, else `EIPRK4`.
     h : float, optional
         As for `integrate`: the step; None: adaptive steps; without it, adaptive steps where rtol, atol, first_step or
         max_step ask for them, else a problem's own step.
@@ -311,13 +315,15 @@ def ensemble(
         shared = floats(extra_arguments(options["args"], params))
         parameters = np.broadcast_to(shared, (len(starts), shared.size))
     keep = reduce is None or out is not None
+    method = default_method(fun) or EIPRK4 if method is None else method
     common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
+    common["acceleration"] = acceleration
     request = Request.of(fun=_bare(fun), t_span=t_span, y0=starts[0], params=parameters[0], **common).with_pointers()
     if request.args is not None or not parameters.shape[1]:
         request = dataclasses.replace(request, params=None)
     plan, doubts = _first_that_starts(Task(request, reduce, keep, len(starts)), starts, parameters)
     starts = np.ascontiguousarray(starts, plan.dtype)
-    size = _chunk_size(plan, len(starts), request.fun) if chunk is None else count("chunk", chunk)
+    size = _chunk_size(plan, len(starts), request.function) if chunk is None else count("chunk", chunk)
     held = plan.times.size if reduce is None and out is None else 0
     _check_memory(plan, len(starts), held, max_bytes)
     store: Store | None = None

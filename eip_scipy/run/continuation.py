@@ -19,7 +19,7 @@ __all__ = ["continued"]
 
 # What comes from the run's end, or holds for the first run only.
 OWN = {"t_span", "y0", "t_eval", "diagnostics", "projection"}
-FIXED = ("fun", "t_span", "y0", "invariants")
+FIXED = ("fun", "acceleration", "t_span", "y0", "invariants")
 
 
 def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> IntegrationResult:

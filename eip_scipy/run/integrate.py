@@ -43,6 +43,7 @@ ENDED_BY_EVENT = "A termination event occurred."
 # Names that the projection's options stand beside, for hints.
 OWN = (
     *(
+        "acceleration",
         "method",
         "h",
         "args",
@@ -63,10 +64,11 @@ OWN = (
 
 @takes_projection_options
 def integrate(
-    fun: Callable[..., Any] | Problem,
+    fun: Callable[..., Any] | Problem | None = None,
     t_span: Any = None,
     y0: Any = None,
     *,
+    acceleration: Any = None,
     method: type[EIPSolver] | None = None,
     h: float | None = DEFAULT,
     args: Any = None,
@@ -102,15 +104,18 @@ def integrate(
         lazily jitted Numba function, or a C function as `scipy.LowLevelCallable`, ctypes or cffi pointer,
         ``int fun(double t, const double *y, double *out, const double *params)``, see
         :doc:`/tutorials/c-functions`. With a Nystrom method (`EIPRKN8`, `EIPRKN12`) or a multistep one
-        (`EIPGJ12`, `EIPGJ14`), whose state is (q, v), the acceleration: ``acc(t, q[, params]) -> (n/2,)``, in place
-        ``acc(t, q, out[, params])``. A `Problem` brings everything else with it; options given here
-        take precedence.
+        (`EIPGJ12`, `EIPGJ14`), whose state is (q, v), ``fun`` must return (v, a); give `acceleration` instead to
+        write a alone. A `Problem` brings everything else with it; options given here take precedence.
     t_span : (float, float)
         Start and end; backward if the end comes first. Of a `Problem` with units also durations of astropy, and with an
         epoch its times, in any scale, see :doc:`/tutorials/rebound-and-astropy`; the same goes for `t_eval`, and
         durations for `h`, `first_step` and `max_step`.
     y0 : array_like, shape (n,)
         Initial state, real or complex.
+    acceleration : callable, optional
+        In place of `fun`, for q'' = a(t, q) with the state (q, v) and any method: ``acceleration(t, q[, params]) ->
+        (n/2,)``, in place ``acceleration(t, q, out[, params])``; a Python, Numba or C function as for `fun`.
+        Accelerations that depend on velocities belong in `fun`.
     method : type, optional
         `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, `EIPGJ12`, `EIPGJ14`, or a
         class made by `eip_method`; one on a one-step method runs interpreted. Default: the problem's
@@ -128,7 +133,7 @@ def integrate(
         In place of `args`: passed on as the last argument, one array of floats. A problem that names its parameters
         (`hamiltonian`, `equations`) also takes a mapping of those that are to have other values.
     in_place : bool, optional
-        Whether `fun` fills its third argument.
+        Whether `fun`, or `acceleration`, fills its third argument.
     jacobian : callable, optional
         For a multistep method that takes it (`EIPGJ14`): ``jacobian(t, q, dq, out[, params])`` fills `out` with the
         derivative of the accelerations along dq, a Numba or C function for a compiled run. A problem may bring its own.
@@ -211,6 +216,7 @@ def integrate(
     refuse_units(checkpoint_every=checkpoint_every)
     request = Request(
         fun=fun,
+        acceleration=acceleration,
         t_span=t_span,
         y0=y0,
         method=method,

@@ -13,7 +13,7 @@ from ..core.inputs import filled
 
 __all__ = ["FORMS", "INTERPRETED"]
 
-FORMS = {  # (of a Nystrom method, in place) -> what a user's function is
+FORMS = {  # (given as an acceleration, in place) -> what a user's function is
     (False, False): "value",
     (False, True): "in place",
     (True, False): "acceleration",
@@ -21,19 +21,21 @@ FORMS = {  # (of a Nystrom method, in place) -> what a user's function is
 }
 
 
-def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
+def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str = "fun") -> Callable[..., None]:
     """The user's right-hand side as Python calls it, its values checked."""
     n, dtype, shape = y0.size, y0.dtype, y0.shape
 
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
         f = fun(t, y.copy(), *extra)
         known = type(f) is np.ndarray and f.shape == shape and f.dtype == dtype
-        out[:] = f if known else setup.as_derivative(f, n, dtype, t)
+        out[:] = f if known else setup.as_derivative(f, n, dtype, t, name)
 
     return rhs
 
 
-def _interpreted_in_place(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
+def _interpreted_in_place(
+    fun: Callable[..., Any], extra: tuple, y0: np.ndarray, name: str = "fun"
+) -> Callable[..., None]:
     """The user's right-hand side in place, looked at in its first call; NaN in `out` then shows what it leaves out."""
     first = True
 
@@ -41,7 +43,7 @@ def _interpreted_in_place(fun: Callable[..., Any], extra: tuple, y0: np.ndarray)
         nonlocal first
         if first:
             first = False
-            out[:] = filled(lambda part: fun(t, y.copy(), part, *extra), out.shape, out.dtype, "fun", t)
+            out[:] = filled(lambda part: fun(t, y.copy(), part, *extra), out.shape, out.dtype, name, t)
         else:
             out.fill(math.nan)
             fun(t, y.copy(), out, *extra)
@@ -50,11 +52,11 @@ def _interpreted_in_place(fun: Callable[..., Any], extra: tuple, y0: np.ndarray)
 
 
 def _interpreted_acceleration(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
-    return _second_order(_interpreted_value(fun, extra, _positions(y0)))
+    return _second_order(_interpreted_value(fun, extra, _positions(y0), "acceleration"))
 
 
 def _interpreted_acceleration_in_place(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
-    return _second_order(_interpreted_in_place(fun, extra, _positions(y0)))
+    return _second_order(_interpreted_in_place(fun, extra, _positions(y0), "acceleration"))
 
 
 def _positions(y0: np.ndarray) -> np.ndarray:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..core import setup, solvers
+from ..core.acceleration import BY_NAME, AccelerationField, is_acceleration
 from ..core.arguments import Packed, extra_arguments, floats, names, scalars
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import Invariant, as_invariants
@@ -36,9 +38,14 @@ from .interpreted_functions import FORMS, INTERPRETED
 from .memory import check_bytes
 from .resume import settings
 
-__all__ = ["DEFAULT", "Prepared", "Request", "prepared", "started_at"]
+__all__ = ["DEFAULT", "Prepared", "Request", "default_method", "prepared", "started_at"]
 
 CALLED = "fun", "It takes (t, y), out with in_place=True, and what the run has of params=... or args=(...)."
+CALLED_ACCELERATION = (
+    "acceleration",
+    "It takes (t, q), out with in_place=True, and what the run has of params=... or args=(...). If accelerations "
+    "change with the velocity, pass the right-hand side fun(t, y) of y = (q, v) instead.",
+)
 
 
 class _Default:
@@ -56,7 +63,8 @@ DEFAULT: Any = _Default()
 class Request:
     """What `integrate` is asked for, as it was given; of the projection's options those that were."""
 
-    fun: Any
+    fun: Any = None
+    acceleration: Any = None
     t_span: Any = None
     y0: Any = None
     method: Any
@@ -89,7 +97,13 @@ class Request:
     def with_pointers(self) -> Request:
         """The request with its C functions by pointer as Python calls them."""
         jacobian = by_pointer(self.jacobian, "jacobian", GRADIENT, takes_f=True)
-        return replace(self, fun=by_pointer(self.fun, "fun"), events=as_events(self.events), jacobian=jacobian)
+        fun, acceleration = by_pointer(self.fun, "fun"), by_pointer(self.acceleration, "acceleration")
+        return replace(self, fun=fun, acceleration=acceleration, events=as_events(self.events), jacobian=jacobian)
+
+    @property
+    def function(self) -> Any:
+        """Return what was given as the right-hand side, or in its place."""
+        return self.fun if self.acceleration is None else self.acceleration
 
     @property
     def adaptive(self) -> bool:
@@ -117,8 +131,6 @@ class System:
 
     def __init__(self, request: Request, form: str, acc: Any) -> None:
         self.fun, self.form = request.fun, form
-        if not callable(self.fun):
-            raise TypeError(f"integrate: fun must be callable or a Problem, got {self.fun!r}{address_hint(self.fun)}.")
         self.extra = extra_arguments(request.args, request.params)
         self.parameters = floats(self.extra)
         self.events = Events(request.events, self.extra)
@@ -132,6 +144,11 @@ class System:
     def bind(self, y0: np.ndarray) -> None:
         """Make `rhs` for states like y0."""
         self.rhs = INTERPRETED[self.form](self.fun, self.extra, y0)
+
+    @property
+    def name(self) -> str:
+        """Name of the argument of `integrate` that the function came as."""
+        return "acceleration" if self.form.startswith("acceleration") else "fun"
 
     def derivative(self, t: float, y: np.ndarray) -> np.ndarray:
         """The derivative as a new array."""
@@ -152,7 +169,8 @@ class System:
             return calls(t0, y0)
         except TypeError:
             out = ("out",) if "in place" in self.form else ()
-            require_arguments(self.fun, ("t", "y", *out, *names(self.extra)), *CALLED)
+            state, called = ("y", CALLED) if self.name == "fun" else ("q", CALLED_ACCELERATION)
+            require_arguments(self.fun, ("t", state, *out, *names(self.extra)), *called)
             raise
 
     def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
@@ -199,7 +217,7 @@ class System:
             return "pointer" if isinstance(fun, PointerFunction) else "jitted"
 
         in_python = isinstance(functions, PythonFunctions)
-        found = {"fun": kind(self.fun, in_python)}
+        found = {self.name: kind(self.fun, in_python)}
         for item, label in zip(run.invariants.items, run.invariants.labels, strict=True):
             found[label] = kind(item.fun, in_python)
             differences = item.grad is None and not in_python
@@ -219,7 +237,7 @@ class System:
         size = n // 2 if second_order else n
 
         def convert(f: Any, t: float) -> np.ndarray:
-            return np.array(setup.as_derivative(f, size, dtype, t), dtype, order="C")
+            return np.array(setup.as_derivative(f, size, dtype, t, self.name), dtype, order="C")
 
         rhs = call(self.fun, self.extra, (size,), convert, in_place=in_place)
         jacobian = None
@@ -283,17 +301,15 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     """A run as it is asked for, all that was given checked; `check_start`: see `setup.prepare`."""
     request = _plain(request)
     refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
-    if request.method is None and isinstance(request.fun, Problem) and request.fun.method is not None:
-        request = replace(request, method=eip_method(request.fun.method))
+    if request.method is None:
+        request = replace(request, method=default_method(request.fun))
     method = _method(request.method)
-    in_place = flag("in_place", request.in_place)
     _check_choices(request)
     asked, request = request, request.with_pointers()
-    in_place = in_place or isinstance(request.fun, PointerFunction)
     frequencies = request.fun.frequencies if isinstance(request.fun, Problem) else None
     of_second_order = isinstance(method, (NystromTableau, GaussJackson))
     acc = request.fun.acc if of_second_order and isinstance(request.fun, Problem) else None
-    request, form = _with_problem(request, FORMS[of_second_order, in_place])
+    request, form = _with_problem(request)
     system = System(request, form, acc)
     t0, t_bound = _span(request, system.events)
     y0 = _state(request.y0)
@@ -302,16 +318,17 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     projection = ProjectionOptions(**request.projection)
     system.bind(y0)
     calls = Counted(system.derivative)
-    f0 = system.first(calls, t0, y0)
-    hint = partial(_second_order_hint, asked.fun)
-    if isinstance(method, NystromTableau):
-        setup.check_second_order(calls, t0, y0, f0, name, hint)
-    elif isinstance(method, GaussJackson):
-        method = replace(method, velocities=setup.depends_on_velocity(calls, t0, y0, f0, name, hint))
+    with _accelerations_named(asked, system, of_second_order, t0, y0):
+        f0 = system.first(calls, t0, y0)
+        hint = partial(_second_order_hint, asked.fun)
+        if isinstance(method, NystromTableau):
+            setup.check_second_order(calls, t0, y0, f0, name, hint)
+        elif isinstance(method, GaussJackson):
+            method = replace(method, velocities=setup.depends_on_velocity(calls, t0, y0, f0, name, hint))
     start = Start(t0, y0, f0, stepping.first(calls, y0, f0, method))
     schedule = _schedule(stepping.span, start.tau, request, system.events)
     run = setup.prepare(method, calls, start, projection, stepping, extra=system.extra, check_start=check_start)
-    run.left_out = system.left_out
+    run.left_out, run.called = system.left_out, system.name
     if isinstance(method, GaussJackson):
         moved = None if system.jacobian is None else times(system.jacobian, *system.extra)
         seen = SecondOrder(calls, start, moved, None if frequencies is None else frequencies(y0))
@@ -323,6 +340,11 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     run.work.K[0] = f0 if run.y0 is y0 else calls(t0, run.y0)
     run.work.counters[NFEV] = calls.count
     return Prepared(asked, request, method, system, stepping, start, schedule, run, record)
+
+
+def default_method(fun: Any) -> type[EIPSolver] | None:
+    """Return the class on a problem's own method; None for other functions and problems without one."""
+    return eip_method(fun.method) if isinstance(fun, Problem) and fun.method is not None else None
 
 
 def started_at(request: Request) -> tuple[float, np.ndarray]:
@@ -341,9 +363,34 @@ def _plain(request: Request) -> Request:
 
 
 def _second_order_hint(fun: Any) -> str:
-    """Of a problem that can be written so, how."""
-    can = isinstance(fun, Problem) and fun.has_second_order
-    return "; this problem does it: problem.second_order(), with a start (q, v)" if can else ""
+    """Return how a problem is written in (q, v), or how an acceleration is passed."""
+    if not isinstance(fun, Problem):
+        return f". If fun is the acceleration a(t, q), {BY_NAME}"
+    return "; this problem does it: problem.second_order(), with a start (q, v)" if fun.has_second_order else ""
+
+
+@contextmanager
+def _accelerations_named(
+    asked: Request, system: System, of_second_order: bool, t0: float, y0: np.ndarray
+) -> Iterator[None]:
+    """Refuse an acceleration in the place of `fun`, whatever its first call as a right-hand side of (q, v) raised.
+
+    Raises
+    ------
+    ValueError
+        Naming the argument that takes accelerations.
+    """
+    try:
+        yield
+    except Exception as error:
+        given_as_fun = of_second_order and not isinstance(asked.fun, Problem) and system.name == "fun"
+        if given_as_fun and is_acceleration(system.fun, "in place" in system.form, system.extra, t0, y0):
+            raise ValueError(
+                f"fun gives {y0.size // 2} of the {y0.size} components that the state y = (q, v) has. For "
+                f"{asked.method.__name__}, as for every method, fun(t, y) must return the derivative (v, a) of the "
+                f"state. If fun is the acceleration a(t, q), {BY_NAME}."
+            ) from error
+        raise
 
 
 def _method(method: Any) -> Any:
@@ -387,15 +434,36 @@ def _given_or_brought(request: Request) -> tuple[Any, Any]:
     return t_span, y0
 
 
-def _with_problem(request: Request, form: str) -> tuple[Request, str]:
+def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
+    """Return the function that the engine calls and what it is: a right-hand side or an acceleration."""
+    acceleration = isinstance(fun, AccelerationField)
+    if acceleration:
+        fun, in_place = fun.acceleration, fun.in_place
+    if not callable(fun):
+        name, what = ("acceleration", "callable") if acceleration else ("fun", "callable or a Problem")
+        raise TypeError(f"integrate: {name} must be {what}, got {fun!r}{address_hint(fun)}.")
+    return fun, FORMS[acceleration, in_place or isinstance(fun, PointerFunction)]
+
+
+def _with_problem(request: Request) -> tuple[Request, str]:
     """The request with what a `Problem` brings where nothing else is given, and the form of its function."""
     t_span, y0 = _given_or_brought(request)
     projection, params = dict(request.projection), request.params
     extra_arguments(request.args, params)  # which raises for what is wrong with them
-    problem = request.fun
+    problem, in_place = request.fun, flag("in_place", request.in_place)
+    if request.acceleration is not None:
+        if problem is not None:
+            raise TypeError(
+                "give fun or acceleration, not both: acceleration=a stands for the fun(t, y) = (v, a(t, q)) of "
+                "y = (q, v), and a Problem has its own function."
+            )
+        problem = AccelerationField(request.acceleration, in_place)
+    elif problem is None:
+        raise TypeError("integrate: fun is missing; give a function fun(t, y), a Problem, or acceleration=a(t, q).")
     if not isinstance(problem, Problem):
         projection |= _with_run_params(projection, params, request.args)
-        return replace(request, t_span=t_span, y0=y0, projection=projection), form
+        fun, form = _function_and_form(problem, in_place)
+        return replace(request, fun=fun, t_span=t_span, y0=y0, projection=projection), form
     if request.args is not None:
         raise TypeError("args: a Problem has params; give params=..., or its functions in place of the Problem.")
     brought = {option.name for option in fields(problem)} & set(ProjectionOptions.names())
@@ -404,7 +472,8 @@ def _with_problem(request: Request, form: str) -> tuple[Request, str]:
     if params is None and problem.rhs is not None:
         params = problem.params
     projection |= _with_run_params(projection, params)
-    form, fun = ("value", problem.fun) if problem.rhs is None else ("in place", problem.rhs)
+    own = problem.fun if problem.rhs is None else problem.rhs
+    fun, form = _function_and_form(own, problem.rhs is not None)
     jacobian = problem.jacobian if request.jacobian is None else request.jacobian
     h = problem.h if request.h is DEFAULT and not request.adaptive else request.h
     found = replace(request, fun=fun, t_span=t_span, y0=y0, params=params, h=h, projection=projection)

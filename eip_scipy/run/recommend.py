@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from ..core import setup
+from ..core.acceleration import AccelerationField
 from ..core.inputs import flag, is_number, refuse_units, shown
 from ..core.invariants import as_invariants
 from ..core.names import nearest
@@ -24,10 +25,11 @@ COMMON = ("params", "in_place", "jacobian", "metric", "blocks", "frame", "compil
 
 
 def recommend(
-    fun: Callable[..., Any] | Problem,
+    fun: Callable[..., Any] | Problem | None = None,
     t_span: Any = None,
     y0: Any = None,
     *,
+    acceleration: Any = None,
     error: float = 1e-6,
     invariants: Any = None,
     max_nfev: int | None = None,
@@ -44,6 +46,8 @@ def recommend(
         Start and end, which must be finite; default: those of the problem.
     y0 : array_like, shape (n,)
         Likewise.
+    acceleration : callable, optional
+        In place of `fun`, as for `integrate`: the a of q'' = a(t, q), with y = (q, v).
     error : float, optional
         Wanted error of the state at the end: largest component of the difference to the exact one, relative to the
         largest component.
@@ -92,8 +96,21 @@ def recommend(
     (True, True, True)
     """
     _check(error, max_nfev, options)
-    problem, common = _problem(fun, t_span, y0, invariants, options)
+    problem, common = _problem(_right_hand_side(fun, acceleration, options), t_span, y0, invariants, options)
     return Search(problem, common, float(error), max_nfev).recommendation()
+
+
+def _right_hand_side(fun: Any, acceleration: Any, options: dict[str, Any]) -> Any:
+    """Return what was given as the right-hand side; an acceleration holds `in_place` from now on."""
+    if acceleration is None:
+        return fun
+    if fun is not None:
+        raise TypeError("recommend: give fun or acceleration, not both.")
+    acceleration = by_pointer(acceleration, "acceleration")
+    if not callable(acceleration):
+        raise TypeError(f"recommend: acceleration must be callable, got {shown(acceleration)}.")
+    in_place = flag("in_place", options.pop("in_place", False)) or isinstance(acceleration, PointerFunction)
+    return AccelerationField(acceleration, in_place)
 
 
 def _check(error: Any, max_nfev: Any, options: Mapping[str, Any]) -> None:
@@ -137,7 +154,7 @@ def _made(fun: Any, t_span: Any, y0: Any, common: dict[str, Any]) -> Problem:
     """A problem of a function, which takes `in_place` and `params` out of the options where it holds them itself."""
     if not callable(by_pointer(fun, "fun")):
         raise TypeError(f"recommend: fun must be callable or a Problem, got {shown(fun)}.")
-    name = getattr(fun, "__name__", "problem")
+    name = getattr(getattr(fun, "acceleration", fun), "__name__", "problem")
     pointer = by_pointer(fun, "fun")
     if not (flag("in_place", common.pop("in_place", False)) or isinstance(pointer, PointerFunction)):
         return Problem(name=name, fun=fun, y0=y0, t_span=t_span)

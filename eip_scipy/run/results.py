@@ -75,8 +75,9 @@ class IntegrationResult(OptimizeResult):
         Whether all functions were called natively; if not, `message` says which were not, and why.
     calls : dict of str
         How each was called: "python", "jitted" (a Numba function, as a C pointer), "pointer" (a C function) or, of a
-        C function's gradient that is not given, "differences". The keys are "fun", the name of each invariant
-        ("invariant 0" for the first one, if it has none), "gradient of " and that name, "event 0", "event 1" and so on.
+        C function's gradient that is not given, "differences". The keys are "fun" or "acceleration", the name of each
+        invariant ("invariant 0" for the first one, if it has none), "gradient of " and that name, "event 0", "event 1"
+        and so on.
     method : str
     h : float or None
     component_names : tuple of str

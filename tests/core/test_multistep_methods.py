@@ -90,9 +90,15 @@ def test_order(order):
     end = 20 * np.pi
     errors = [
         np.abs(
-            integrate(acceleration, (0, end), Y0, method=method, h=2 * np.pi / n, jacobian=jacobian, compiled=False).y[
-                :, -1
-            ]
+            integrate(
+                acceleration=acceleration,
+                t_span=(0, end),
+                y0=Y0,
+                method=method,
+                h=2 * np.pi / n,
+                jacobian=jacobian,
+                compiled=False,
+            ).y[:, -1]
             - exact(end)[:, 0]
         ).max()
         for n in counts[order]
@@ -108,9 +114,9 @@ def test_a_long_run_keeps_its_invariants_and_its_orbit(method):
     """A hundred revolutions, both errors near round-off; the result says so."""
     record = Diagnostics()
     run = integrate(
-        acceleration,
-        (0, 200 * np.pi),
-        Y0,
+        acceleration=acceleration,
+        t_span=(0, 200 * np.pi),
+        y0=Y0,
         method=method,
         h=STEP,
         jacobian=jacobian,
@@ -134,7 +140,10 @@ def test_projection_is_what_keeps_the_orbit(method):
     h = 2 * np.pi / (190 if method is EIPGJ12 else 90)
     given = {"method": method, "h": h, "jacobian": jacobian}
     end = 400 * np.pi
-    kept, left = (integrate(acceleration, (0, end), Y0, **given, **options).y[:, -1] for options in (KEPT, {}))
+    kept, left = (
+        integrate(acceleration=acceleration, t_span=(0, end), y0=Y0, **given, **options).y[:, -1]
+        for options in (KEPT, {})
+    )
     assert np.abs(kept - exact(end)[:, 0]).max() < 0.3 * np.abs(left - exact(end)[:, 0]).max()
 
 
@@ -159,7 +168,9 @@ def test_roundings_in_a_long_run_are_no_failure():
         return np.array([y[0] + 2 * y[0] * y[1], y[1] + y[0] ** 2 - y[1] ** 2, y[2], y[3]])
 
     kept, y0 = Invariant(energy, gradient), [0.0, 0.55, 0.2416954005906332, 0.0]
-    result = integrate(acceleration, (0, 300), y0, method=EIPGJ12, h=1 / 60, every=10, invariants=kept)
+    result = integrate(
+        acceleration=acceleration, t_span=(0, 300), y0=y0, method=EIPGJ12, h=1 / 60, every=10, invariants=kept
+    )
     assert result.success, result.message
     assert result.max_defect[0] < 2e-16
 
@@ -172,11 +183,11 @@ def test_between_steps(method, sign):
     y0 = Y0 if sign > 0 else Y0 * [1, 1, -1, -1]
     times = np.linspace(0, end, 111)
     given = {"method": method, "h": STEP, "jacobian": jacobian, **KEPT}
-    run = integrate(acceleration, (0, sign * end), y0, dense_output=True, save_every=1, **given)
+    run = integrate(acceleration=acceleration, t_span=(0, sign * end), y0=y0, dense_output=True, save_every=1, **given)
     flip = np.array([1, 1, sign, sign])[:, None]
     assert np.abs(run.y * flip - exact(np.abs(run.t))).max() < 2e-13
     assert np.abs(run.sol(sign * times) * flip - exact(times)).max() < 1e-12
-    sampled = integrate(acceleration, (0, sign * end), y0, t_eval=sign * times, **given)
+    sampled = integrate(acceleration=acceleration, t_span=(0, sign * end), y0=y0, t_eval=sign * times, **given)
     assert np.array_equal(sampled.y, run.sol(sign * times))
     assert np.array_equal(run.sol(run.t), run.y)
 
@@ -187,7 +198,16 @@ def test_few_steps(method):
     for count in (1, 2, 5, 11, 12, 13, 14, 15, 16, 17, 20, 27):
         for extra in (0.0, 0.3):
             end = (count + extra) * STEP
-            run = integrate(acceleration, (0, end), Y0, method=method, h=STEP, save_every=1, jacobian=jacobian, **KEPT)
+            run = integrate(
+                acceleration=acceleration,
+                t_span=(0, end),
+                y0=Y0,
+                method=method,
+                h=STEP,
+                save_every=1,
+                jacobian=jacobian,
+                **KEPT,
+            )
             assert run.t.size == count + 1 + (extra > 0)
             assert np.abs(run.y - exact(run.t)).max() < 3e-15
 
@@ -196,7 +216,7 @@ def test_bits_do_not_depend_on_what_is_saved():
     """Nor on chunks: rows, times and events are looked at, and change nothing."""
     given = {"method": EIPGJ14, "h": STEP, "jacobian": jacobian, **KEPT}
     last = [
-        integrate(acceleration, (0, 60), Y0, **given, **options).y[:, -1]
+        integrate(acceleration=acceleration, t_span=(0, 60), y0=Y0, **given, **options).y[:, -1]
         for options in (
             {},
             {"save_every": 1},
@@ -217,8 +237,8 @@ def test_python_jitted_and_native_functions_give_the_same_bits():
     interpreted = integrate(problem, method=EIPGJ14, compiled=False)
     assert np.array_equal(native.y, interpreted.y)
     given = {"method": EIPGJ14, "h": STEP, **KEPT}
-    compiled = integrate(acceleration, (0, 20), Y0, jacobian=jacobian, **given)
-    python = integrate(acceleration, (0, 20), Y0, jacobian=jacobian, compiled=False, **given)
+    compiled = integrate(acceleration=acceleration, t_span=(0, 20), y0=Y0, jacobian=jacobian, **given)
+    python = integrate(acceleration=acceleration, t_span=(0, 20), y0=Y0, jacobian=jacobian, compiled=False, **given)
     assert compiled.compiled
     assert not python.compiled
     assert np.array_equal(compiled.y, python.y)
@@ -274,12 +294,12 @@ def test_c_functions(tmp_path):
         out[:] = [w * (along * q[k] - dq[k]) for k in range(2)]
 
     given = {"method": EIPGJ14, "h": STEP, "params": [1.0], "in_place": True}
-    native = integrate(library.acceleration, (0, 20), Y0, jacobian=library.jacobian, **given)
-    python = integrate(in_python, (0, 20), Y0, jacobian=times, **given)
-    assert native.calls == {"fun": "pointer", "jacobian": "pointer"}
+    native = integrate(acceleration=library.acceleration, t_span=(0, 20), y0=Y0, jacobian=library.jacobian, **given)
+    python = integrate(acceleration=in_python, t_span=(0, 20), y0=Y0, jacobian=times, **given)
+    assert native.calls == {"acceleration": "pointer", "jacobian": "pointer"}
     assert np.array_equal(native.y, python.y)
     with pytest.raises(TypeError, match="jacobian is a C function of the signature"):
-        integrate(library.acceleration, (0, 20), Y0, jacobian=library.acceleration, **given)
+        integrate(acceleration=library.acceleration, t_span=(0, 20), y0=Y0, jacobian=library.acceleration, **given)
 
 
 def test_events():
@@ -289,12 +309,30 @@ def test_events():
         return y[0] * y[2] + y[1] * y[3]
 
     pericentre.direction = 1
-    run = integrate(acceleration, (0, 40), Y0, method=EIPGJ14, h=STEP, jacobian=jacobian, events=pericentre, **KEPT)
+    run = integrate(
+        acceleration=acceleration,
+        t_span=(0, 40),
+        y0=Y0,
+        method=EIPGJ14,
+        h=STEP,
+        jacobian=jacobian,
+        events=pericentre,
+        **KEPT,
+    )
     period = 2 * np.pi
     later = run.t_events[0][run.t_events[0] > 1]
     assert np.allclose(later, period * np.arange(1, 7), rtol=0, atol=1e-11)
     pericentre.terminal = run.t_events[0].size - 3
-    run = integrate(acceleration, (0, 40), Y0, method=EIPGJ14, h=STEP, jacobian=jacobian, events=pericentre, **KEPT)
+    run = integrate(
+        acceleration=acceleration,
+        t_span=(0, 40),
+        y0=Y0,
+        method=EIPGJ14,
+        h=STEP,
+        jacobian=jacobian,
+        events=pericentre,
+        **KEPT,
+    )
     assert run.status == 1
     assert abs(run.t[-1] - 3 * period) < 1e-11
 
@@ -401,7 +439,13 @@ def test_a_step_that_is_not_stable_is_refused_with_one_that_is():
     longest = float(str(error.value).split("Take h <= ")[1].split(",")[0])
     assert integrate(problem, method=EIPGJ12, h=0.99 * longest).trusted
     with pytest.raises(ValueError, match=r"of frequency 3 \(period 2\.094\)\. Take h <= 0\.0217"):
-        integrate(lambda t, q: -np.array([1.0, 9.0]) * q, (0, 10), [1.0, 1.0, 0.0, 0.0], method=EIPGJ12, h=0.05)
+        integrate(
+            acceleration=lambda t, q: -np.array([1.0, 9.0]) * q,
+            t_span=(0, 10),
+            y0=[1.0, 1.0, 0.0, 0.0],
+            method=EIPGJ12,
+            h=0.05,
+        )
     with pytest.raises(ValueError, match="is not stable"):
         solve_ivp(orbit, (0, 20), Y0, method=EIPGJ14, h=STEP)  # which has no Jacobian here
 
@@ -417,7 +461,7 @@ def test_a_moon_is_named_by_its_own_frequency():
 def test_what_becomes_unstable_is_told():
     """A close passage that the start does not show ends the run, with what it had."""
     start = np.array([1.0, 0.0, 0.0, 0.02])
-    run = integrate(acceleration, (0, 5), start, method=EIPGJ12, h=0.005, save_every=10)
+    run = integrate(acceleration=acceleration, t_span=(0, 5), y0=start, method=EIPGJ12, h=0.005, save_every=10)
     assert run.status == -1
     assert not run.trusted
     assert "the step is too long, or the motion not smooth" in run.message
@@ -430,7 +474,7 @@ def test_a_passage_is_told_at_whichever_step_it_comes():
     """Not only where it falls near a projection: here none is made, and it comes later by two steps each time."""
     for later in range(0, 70, 2):
         start = np.array([(1 + later * 0.005 / 1.11) ** (2 / 3), 0.0, 0.0, 0.02])
-        run = integrate(acceleration, (0, 3), start, method=EIPGJ12, h=0.005, save_every=10)
+        run = integrate(acceleration=acceleration, t_span=(0, 3), y0=start, method=EIPGJ12, h=0.005, save_every=10)
         passage = np.pi * np.sqrt((start[0] / 2) ** 3)
         assert run.status == -1
         assert passage - 0.1 < run.t[-1] < passage + 0.1
@@ -438,7 +482,9 @@ def test_a_passage_is_told_at_whichever_step_it_comes():
 
 def test_a_force_that_jumps_is_told():
     """Differences of its history do not fall."""
-    run = integrate(lambda t, q: -q * (1.0 if t < 3 else 1.5), (0, 20), [1.0, 0.0], method=EIPGJ12, h=0.03)
+    run = integrate(
+        acceleration=lambda t, q: -q * (1.0 if t < 3 else 1.5), t_span=(0, 20), y0=[1.0, 0.0], method=EIPGJ12, h=0.03
+    )
     assert run.status == -1
     assert "or forces jump" in run.message
     assert 3 <= float(run.message.split("at t=")[1].split(":")[0]) < 6
@@ -448,7 +494,7 @@ def test_a_false_invariant_is_told():
     """As of other methods."""
     false = Invariant(lambda t, y: y[0] ** 2 + y[3], lambda t, y: np.array([2 * y[0], 0, 0, 1.0]))
     with pytest.warns(ProjectionWarning, match="is no invariant of this system"):
-        run = integrate(acceleration, (0, 30), Y0, method=EIPGJ12, h=STEP, invariants=false)
+        run = integrate(acceleration=acceleration, t_span=(0, 30), y0=Y0, method=EIPGJ12, h=STEP, invariants=false)
     assert not run.trusted
 
 
@@ -465,7 +511,7 @@ def test_a_false_invariant_is_told():
 def test_bad_options(options, error, message):
     """What came, and what to do."""
     with pytest.raises(error, match=message):
-        integrate(acceleration, (0, 1), Y0, **{"method": EIPGJ12, "h": 0.01, **KEPT, **options})
+        integrate(acceleration=acceleration, t_span=(0, 1), y0=Y0, **{"method": EIPGJ12, "h": 0.01, **KEPT, **options})
 
 
 def test_states_that_are_none():
@@ -489,9 +535,11 @@ def test_no_step_to_override():
 
 def test_what_is_not_finite():
     """Where it was, as of other methods."""
-    run = integrate(lambda t, q: -q if t < 1 else q * np.nan, (0, 3), [1.0, 0.0], method=EIPGJ12, h=0.03)
+    run = integrate(
+        acceleration=lambda t, q: -q if t < 1 else q * np.nan, t_span=(0, 3), y0=[1.0, 0.0], method=EIPGJ12, h=0.03
+    )
     assert run.status == -1
-    assert "fun returned a non-finite value at t=1.02" in run.message
+    assert "acceleration returned a non-finite value at t=1.02" in run.message
 
 
 @both

@@ -58,7 +58,12 @@ def exact():
 def test_order(method, n, options, exact):
     """Of one interval in steps so large that truncation is all there is."""
     errors = [
-        np.abs(integrate(acceleration, (0, 2), Y0, method=method, h=2 / k, compiled=False, **options).y[:, -1] - exact)
+        np.abs(
+            integrate(
+                acceleration=acceleration, t_span=(0, 2), y0=Y0, method=method, h=2 / k, compiled=False, **options
+            ).y[:, -1]
+            - exact
+        )
         for k in n
     ]
     (order,) = observed_order([e.max() for e in errors], [1 / k for k in n])
@@ -81,7 +86,7 @@ def test_one_step_is_the_tableau(method):
     q, v, k = Y0[:2], Y0[2:], accelerations(tableau, h)
     expected = np.concatenate([q + h * v + h * h * tableau.b @ k, v + h * tableau.b_prime @ k])
     for compensated in (False, True):
-        run = integrate(acceleration, (0, h), Y0, method=method, h=h, compensated=compensated)
+        run = integrate(acceleration=acceleration, t_span=(0, h), y0=Y0, method=method, h=h, compensated=compensated)
         np.testing.assert_allclose(run.y[:, -1], expected, rtol=4e-16, atol=4e-16)
 
 
@@ -122,8 +127,8 @@ def test_time_reaches_every_stage(method):
     start, end = (np.array([np.sin(3 * t), 3 * np.cos(3 * t)]) for t in (0.4, 2.4))
     for compensated in (False, True):
         run = integrate(
-            lambda t, q: np.array([-9 * np.sin(3 * t)]), (0.4, 2.4), start, method=method, h=0.05,
-            compensated=compensated,
+            acceleration=lambda t, q: np.array([-9 * np.sin(3 * t)]), t_span=(0.4, 2.4), y0=start, method=method,
+            h=0.05, compensated=compensated,
         )  # fmt: skip
         np.testing.assert_allclose(run.y[:, -1], end, rtol=0, atol=1e-10)
 
@@ -137,7 +142,9 @@ def test_all_ways_give_the_same_bits(method, options):
     end = solve_ivp(orbit, span, Y0, method=method, h=h, **options).y[:, -1]
     for fun, in_place in ((acceleration, False), (fill_acceleration, True)):
         given = {"method": method, "h": h, "in_place": in_place, **options}
-        runs = [integrate(fun, span, Y0, compiled=compiled, **given) for compiled in (False, True)]
+        runs = [
+            integrate(acceleration=fun, t_span=span, y0=Y0, compiled=compiled, **given) for compiled in (False, True)
+        ]
         np.testing.assert_array_equal(runs[0].y, runs[1].y)
         assert runs[0].nfev == runs[1].nfev
     np.testing.assert_allclose(runs[0].y[:, -1], end, rtol=0, atol=1e-13)
@@ -154,7 +161,7 @@ def string(t, u, params):
 @both
 def test_complex_states_and_params(method):
     q, v = np.array([1.0 + 0.5j, -0.3j]), np.array([0.2j, 1.0 + 0j])
-    run = integrate(string, (0, 2), np.concatenate([q, v]), method=method, h=0.02, params=[1.5])
+    run = integrate(acceleration=string, t_span=(0, 2), y0=np.concatenate([q, v]), method=method, h=0.02, params=[1.5])
     expected = q * np.cos(3.0) + v / 1.5 * np.sin(3.0)
     assert run.compiled != numba.config.DISABLE_JIT
     np.testing.assert_allclose(run.y[:2, -1], expected, rtol=0, atol=1e-13)
@@ -170,7 +177,7 @@ def test_adaptive(method, backward, exact):
     assert sol.status == 0
     np.testing.assert_allclose(sol.y[:, -1], end, rtol=0, atol=2e-8)
     assert diagnostics.max_defect.max() < 1e-14
-    run = integrate(acceleration, span, start, method=method, rtol=1e-9, atol=1e-11, **KEPT)
+    run = integrate(acceleration=acceleration, t_span=span, y0=start, method=method, rtol=1e-9, atol=1e-11, **KEPT)
     assert run.compiled != numba.config.DISABLE_JIT
     np.testing.assert_allclose(run.y[:, -1], sol.y[:, -1], rtol=0, atol=1e-12)
 
@@ -181,7 +188,9 @@ def test_dense_output(method, options):
     """Quintic in q: of order 6, of order 5 in v; exact at the nodes and on the manifold between them."""
     errors = []
     times = np.linspace(0, 2, 101)
-    fine = integrate(acceleration, (0, 2), Y0, method=EIPRKN12, h=0.02, save_every=1, compiled=False).y
+    fine = integrate(
+        acceleration=acceleration, t_span=(0, 2), y0=Y0, method=EIPRKN12, h=0.02, save_every=1, compiled=False
+    ).y
     for h in (0.2, 0.1):
         sol = solve_ivp(orbit, (0, 2), Y0, method=method, h=h, dense_output=True, **options)
         np.testing.assert_array_equal(sol.sol(sol.t), sol.y)
@@ -205,12 +214,12 @@ def test_what_is_no_second_order_system(method):
         solve_ivp(lambda t, y: [y[2], y[3], -y[2], -y[3]], (0, 1), Y0, method=method, h=0.1)
     for call in (
         lambda: solve_ivp(lambda t, y: -y, (0, 1), Y0[:3], method=method, h=0.1),
-        lambda: integrate(acceleration, (0, 1), Y0[:3], method=method, h=0.1),
+        lambda: integrate(acceleration=acceleration, t_span=(0, 1), y0=Y0[:3], method=method, h=0.1),
     ):
         with pytest.raises(ValueError, match="even number of components; y0 has 3"):
             call()
-    with pytest.raises(ValueError, match=r"fun returned shape \(4,\), expected \(2,\)"):
-        integrate(lambda t, q: np.zeros(4), (0, 1), Y0, method=method, h=0.1)
+    with pytest.raises(ValueError, match=r"acceleration returned shape \(4,\), expected \(2,\)"):
+        integrate(acceleration=lambda t, q: np.zeros(4), t_span=(0, 1), y0=Y0, method=method, h=0.1)
 
 
 def test_events_and_samples():
@@ -221,7 +230,7 @@ def test_events_and_samples():
 
     options = {"method": EIPRKN12, "h": 0.05, "events": radial, "t_eval": np.linspace(0, 20, 41), **KEPT}
     sol = solve_ivp(orbit, (0, 20), Y0, **options)
-    run = integrate(acceleration, (0, 20), Y0, **options)
+    run = integrate(acceleration=acceleration, t_span=(0, 20), y0=Y0, **options)
     a = -0.5 / energy(0, Y0)
     period = 2 * np.pi * a**1.5
     for found in (sol, run):
@@ -288,7 +297,9 @@ def test_compensated_sum_of_a_constant_acceleration():
 
     def error(compensated):
         options = {"h": h, "method": eip_method(TAYLOR), "compensated": compensated, "compiled": False}
-        y = integrate(lambda t, q: a, (0, steps * h), np.concatenate([0 * v0, v0]), **options).y[:2, -1]
+        y = integrate(acceleration=lambda t, q: a, t_span=(0, steps * h), y0=np.concatenate([0 * v0, v0]), **options).y[
+            :2, -1
+        ]
         return max(abs(float(Fraction(x) - wanted)) for x, wanted in zip(y, exact_end, strict=True))
 
     assert error(True) < 1e-14
@@ -297,7 +308,7 @@ def test_compensated_sum_of_a_constant_acceleration():
 
 def test_a_tableau_of_ones_own():
     method = eip_method(TAYLOR)
-    run = integrate(acceleration, (0, 1), Y0, method=method, h=0.001, **KEPT)
+    run = integrate(acceleration=acceleration, t_span=(0, 1), y0=Y0, method=method, h=0.001, **KEPT)
     assert run.success
     assert method.__doc__ == "EIP method on <NystromTableau Taylor 2: 1 stages, order 1>."
     assert run.max_defect.max() < 1e-10
@@ -306,20 +317,20 @@ def test_a_tableau_of_ones_own():
 @pytest.mark.parametrize("value", [0, -1, 2.5, True, "sometimes"])
 def test_every_is_a_number_or_auto(value):
     with pytest.raises(ValueError, match="every must be an integer >= 1"):
-        integrate(acceleration, (0, 1), Y0, method=EIPRKN12, h=0.1, **{**KEPT, "every": value})
+        integrate(acceleration=acceleration, t_span=(0, 1), y0=Y0, method=EIPRKN12, h=0.1, **{**KEPT, "every": value})
 
 
 def test_auto_needs_an_estimate():
     method = eip_method(TAYLOR)
     with pytest.raises(ValueError, match="every='auto' needs an error estimate, and Taylor 2 has none"):
-        integrate(acceleration, (0, 1), Y0, method=method, h=0.1, every="auto", **KEPT)
+        integrate(acceleration=acceleration, t_span=(0, 1), y0=Y0, method=method, h=0.1, every="auto", **KEPT)
 
 
 def test_auto_projects_where_it_pays():
     """Large steps are projected one and all; small ones, whose error is below round-off, at the end only."""
     counts = []
     for h in (0.5, 0.005):
-        run = integrate(acceleration, (0, 10), Y0, method=EIPRKN12, h=h, every="auto", **KEPT)
+        run = integrate(acceleration=acceleration, t_span=(0, 10), y0=Y0, method=EIPRKN12, h=h, every="auto", **KEPT)
         counts.append((run.diagnostics.n_projections + run.diagnostics.n_skipped, round(10 / h)))
     assert counts[0][0] == counts[0][1]
     assert counts[1][0] <= 3

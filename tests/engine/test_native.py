@@ -35,8 +35,6 @@ H = Invariant(
 def parts(method=EIPRK4, **options):
     """Arguments of an engine that is ready to step."""
     fun, y0 = pull, Y0
-    if method is EIPRKN12:
-        fun = lambda t, q: -q / np.hypot(*q) ** 3  # noqa: E731
     if options.pop("dtype", None):
         fun, y0 = lambda t, y: -1j * y, np.ones(3, complex)
     ready = prepared(Request.of(fun=fun, t_span=(0, 1), y0=y0, method=method, compiled=False, **options))
@@ -374,9 +372,11 @@ RUNS = """
         {"h": 0.05, "metric": weights, "direction": "old", "iterations": 2}, {"h": 0.05, "method": EIPRKN12},
     ):
         given = {"method": EIPRK4, "compiled": False} | options
-        fun = problem.fun if given["method"] is not EIPRKN12 else lambda t, q: -q / np.hypot(*q) ** 3
+        fun = {"fun": problem.fun}
+    if given["method"] is EIPRKN12:
+        fun = {"acceleration": lambda t, q: -q / np.hypot(*q) ** 3}
         more = {"invariants": problem.invariants} if given["method"] is not EIPRKN12 else {}
-        run = integrate(fun, (0, 20), problem.y0, **given, **more)
+        run = integrate(**fun, t_span=(0, 20), y0=problem.y0, **given, **more)
         seen.update(run.y.tobytes() + run.max_defect.tobytes())
     run = integrate(bodies, (0, 2.0), method=EIPRK4, compiled=False, h=0.01)
     seen.update(run.y.tobytes() + run.max_defect.tobytes())

@@ -8,6 +8,7 @@ import sys
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -42,6 +43,8 @@ from eip_scipy import (
     integrate,
 )
 from eip_scipy.ensembles.tasks import Plan, Task, run_members
+from eip_scipy.methods.nystrom import RKN1210
+from eip_scipy.methods.runge_kutta import RK5
 from eip_scipy.problems import kepler
 from eip_scipy.run.prepare import Request
 
@@ -145,8 +148,19 @@ def _acceleration(t, q):
 @needs_jit
 def test_nystrom():
     y0s, options = starts(4), {"method": EIPRKN8, "h": 0.05, "invariants": HL}
-    run = ensemble(_acceleration, SPAN, y0s, **options)
-    same_members(run, lambda k: integrate(_acceleration, SPAN, y0s[k], **options))
+    run = ensemble(acceleration=_acceleration, t_span=SPAN, y0s=y0s, **options)
+    same_members(run, lambda k: integrate(acceleration=_acceleration, t_span=SPAN, y0=y0s[k], **options))
+
+
+@pytest.mark.parametrize("own", [RK5, RKN1210], ids=str)
+def test_the_method_of_a_problem(own):
+    """Without `method` the problem's own steps the members, as in `integrate`; a problem without one has EIPRK4."""
+    problem, y0s = replace(kepler(), method=own), starts(3)
+    run = ensemble(problem, (0, 1), y0s)
+    assert run.method == f"EIP_{own.name}"
+    same_members(run, lambda k: integrate(problem, (0, 1), y0s[k]))
+    given = ensemble(problem, (0, 1), y0s, method=EIPRK4)
+    np.testing.assert_array_equal(given.y, ensemble(kepler(), (0, 1), y0s).y)
 
 
 @njit

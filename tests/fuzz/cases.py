@@ -95,7 +95,7 @@ class Case:
 
     @property
     def fun(self) -> Callable[..., Any]:
-        """The right-hand side as `integrate` and `ensemble` take it."""
+        """The right-hand side, or the acceleration, as `integrate` and `ensemble` take it."""
         if self.native:
             return jitted.acceleration if self.method in NYSTROM else jitted.motion
         fun = self.system.acc if self.method in NYSTROM else self.system.fun
@@ -104,6 +104,11 @@ class Case:
         if self.params is not None:
             fun = with_params(fun)
         return filling(fun) if self.in_place else fun
+
+    @property
+    def takes(self) -> str:
+        """The argument that `fun` is given as."""
+        return "acceleration" if self.method in NYSTROM else "fun"
 
     @property
     def options(self) -> dict[str, Any]:
@@ -125,8 +130,8 @@ class Case:
 
     def integrate(self, **options: Any) -> Any:
         """The run by `integrate`."""
-        fun = options.pop("fun", None) or self.fun
-        return eip_scipy.integrate(fun, self.t_span, self.system.y0.copy(), **self.options | options)
+        given = {self.takes: options.pop("fun", None) or self.fun, "t_span": self.t_span}
+        return eip_scipy.integrate(**given, y0=self.system.y0.copy(), **self.options | options)
 
     def __str__(self) -> str:
         kept = ", ".join(str(item.name) for item in self.invariants) or "nothing"

@@ -49,7 +49,7 @@ def adaptive(**options: Any) -> Any:
 def nystrom(**options: Any) -> Any:
     """Compensated steps that are projected now and then."""
     given = {"method": EIPRKN12, "h": 0.05, "every": 7, "compensated": True, "invariants": KEPT, "save_every": 10}
-    return integrate(ORBIT.acc, (0, 200), ORBIT.y0, **given | options)
+    return integrate(acceleration=ORBIT.acc, t_span=(0, 200), y0=ORBIT.y0, **given | options)
 
 
 def members(**options: Any) -> Any:

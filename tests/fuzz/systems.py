@@ -332,7 +332,7 @@ def members(runs: Runs, **options: Any) -> Iterator[str]:
     if all(item.target is None for item in case.invariants):
         starts[0] += 1e-3 * case.size * runs.rng.standard_normal(case.size.size)
     given = {**case.options, "t_eval": case.times, **options}
-    run, _ = observed(lambda: ensemble(case.fun, case.t_span, starts, **given))
+    run, _ = observed(lambda: ensemble(**{case.takes: case.fun}, t_span=case.t_span, y0s=starts, **given))
     if any(TooManyCallsError.__name__ in message for message in run.message):  # calls are counted for both together
         return
     alone = runs.whole

@@ -127,7 +127,7 @@ def test_second_order_in_place_and_jacobian():
 
     exact = np.cos(np.sqrt(K / M) * SPAN[1]) + 0.5 * np.sqrt(M / K) * np.sin(np.sqrt(K / M) * SPAN[1])
     options = {"h": 0.05, "args": (K, M), "in_place": True, "jacobian": jacobian}
-    result = integrate(acc, SPAN, Y0, method=EIPGJ14, **options)
+    result = integrate(acceleration=acc, t_span=SPAN, y0=Y0, method=EIPGJ14, **options)
     assert set(result.calls.values()) == {"jitted"}
     np.testing.assert_allclose(result.y[0, -1], exact, rtol=1e-12)
 

@@ -173,7 +173,9 @@ def test_a_status_where_a_shift_leaves_the_domain(c):
 def test_nystrom(c):
     acceleration = njit(lambda t, q: -q / (q[0] * q[0] + q[1] * q[1]) ** 1.5)
     kept = Invariant(c("both"), size=2)
-    run = integrate(acceleration, (0, 60), pericentre(0.5), method=EIPRKN12, h=0.05, invariants=kept)
+    run = integrate(
+        acceleration=acceleration, t_span=(0, 60), y0=pericentre(0.5), method=EIPRKN12, h=0.05, invariants=kept
+    )
     assert run.compiled
     assert (run.max_defect < 1e-14).all()
 

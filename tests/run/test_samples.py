@@ -88,7 +88,7 @@ def run(method, events=None, span=(0.0, 30.0), **options):
     """Kepler by Numba functions; a Nystrom method gets its acceleration."""
     if method in NYSTROM:
         given = {"y0": PROBLEM.y0, "params": PROBLEM.params, "invariants": PROBLEM.invariants, "blocks": 2}
-        return integrate(acceleration, span, method=method, events=events, **given, **options)
+        return integrate(acceleration=acceleration, t_span=span, method=method, events=events, **given, **options)
     return integrate(PROBLEM, span, method=method, events=events, **options)
 
 
@@ -229,9 +229,8 @@ def test_solution_over_the_run(method, steps):
 def test_interpolants_are_hermite_s(method):
     """SciPy's, through values and slopes at both ends; positions of a Nystrom method through accelerations too."""
     y0, params = PROBLEM.y0, PROBLEM.params
-    fun = acceleration if method is EIPRKN8 else PROBLEM.fun
-    given = {"params": params} if method is EIPRKN8 else {}
-    found = integrate(fun, (0, 1), y0, method=method, h=0.1, save_every=1, dense_output=True, **given)
+    given = {"acceleration": acceleration, "params": params} if method is EIPRKN8 else {"fun": PROBLEM.fun}
+    found = integrate(**given, t_span=(0, 1), y0=y0, method=method, h=0.1, save_every=1, dense_output=True)
     slopes = np.array([PROBLEM.fun(t, y) for t, y in zip(found.t, found.y.T, strict=True)])
     times = np.linspace(0, 1, 97)
     if method is EIPRK4:

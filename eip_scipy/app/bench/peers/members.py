@@ -21,13 +21,13 @@ def _ours(method: str, scene: Scene) -> Solve:
     eip, functions = package("eip_scipy"), scene.compiled()
     second = method != "EIPDOP853"
     kept = eip.Invariant(functions.values, functions.gradients)
-    fun = functions.acc if second else functions.fun
+    right_hand_side = {"acceleration": functions.acc} if second else {"fun": functions.fun}
 
     def solve(setting: float) -> np.ndarray:
         control = {"h": scene.t_end / setting, "every": 10} if second else {"rtol": setting, "atol": ATOL * setting}
         run = eip.ensemble(
-            fun, (0.0, scene.t_end), scene.y0, method=getattr(eip, method), invariants=kept, executor=1, in_place=True,
-            compiled=True, **control,
+            **right_hand_side, t_span=(0.0, scene.t_end), y0s=scene.y0, method=getattr(eip, method), invariants=kept,
+            executor=1, in_place=True, compiled=True, **control,
         )  # fmt: skip
         return run.y
 

@@ -41,15 +41,17 @@ def _run(method: str, arguments: dict[str, Any], t_end: float, options: dict[str
     return _end(result)
 
 
-def _first_order(method: str) -> bool:
-    return method not in ("EIPRKN12", "EIPGJ12", "EIPGJ14")
+def _right_hand_side(method: str, functions: Functions) -> dict[str, Any]:
+    """Return the argument of `integrate` that a user writes: the accelerations where the method takes no more."""
+    if method in ("EIPRKN12", "EIPGJ12", "EIPGJ14"):
+        return {"acceleration": functions.acc}
+    return {"fun": functions.fun}
 
 
 def _python(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
     functions = scene.plain()
-    fun = functions.fun if _first_order(method) else functions.acc
     options = {"invariants": _kept(functions), "every": every, **extra}
-    return partial(_run, method, {"fun": fun, "y0": scene.y0}, scene.t_end, options)
+    return partial(_run, method, {**_right_hand_side(method, functions), "y0": scene.y0}, scene.t_end, options)
 
 
 def _in_solve_ivp(scene: Scene, **extra: Any) -> Solve:
@@ -67,11 +69,11 @@ def _in_solve_ivp(scene: Scene, **extra: Any) -> Solve:
 
 def _compiled(method: str, scene: Scene, every: int = 1, **extra: Any) -> Solve:
     functions = scene.compiled()
-    fun = functions.fun if _first_order(method) else functions.acc
     options = {"compiled": True, "every": every, **extra}
     if scene.equations == "bodies":
         return partial(_run, method, {"fun": _with_own_function(scene, functions)}, scene.t_end, options)
-    arguments = {"fun": fun, "y0": scene.y0, "in_place": True, "invariants": _kept(functions)}
+    arguments = {"y0": scene.y0, "in_place": True, "invariants": _kept(functions)}
+    arguments |= _right_hand_side(method, functions)
     return partial(_run, method, arguments, scene.t_end, options)
 
 

@@ -1,0 +1,84 @@
+"""Accelerations a(t, q) as right-hand sides of y = (q, v), and functions given as such that are accelerations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .inputs import filled
+from .one_step import as_vector
+from .pointers import PointerFunction
+
+__all__ = ["BY_NAME", "AccelerationField", "is_acceleration"]
+
+BY_NAME = "pass it by name: integrate(acceleration=fun, t_span=..., y0=..., ...)"
+
+
+class AccelerationField:
+    """First-order right-hand side ``f(t, y[, *args]) = (v, a)`` of y = (q, v), made of an acceleration.
+
+    `integrate` and the functions built on it call the acceleration itself. The object pickles where the acceleration
+    does.
+
+    Parameters
+    ----------
+    acceleration : callable
+        ``acceleration(t, q, *args) -> (n/2,)``, or ``acceleration(t, q, out, *args)`` with `in_place`.
+    in_place : bool, optional
+    """
+
+    def __init__(self, acceleration: Callable[..., Any], in_place: bool = False) -> None:
+        self.acceleration, self.in_place = acceleration, in_place
+
+    def __call__(self, t: float, y: np.ndarray, *args: Any) -> np.ndarray:
+        """Return the derivative at (t, y) as a new array."""
+        half, state = y.size // 2, np.asarray(y)
+        q, v = state[:half].copy(), state[half:]
+        if self.in_place:
+            a = filled(lambda out: self.acceleration(t, q, out, *args), q.shape, q.dtype, "acceleration", t)
+        else:
+            a = as_vector(self.acceleration(t, q, *args), half, q.dtype, "acceleration returned", t)
+        return np.concatenate([v, a])
+
+
+def is_acceleration(fun: Callable[..., Any], in_place: bool, extra: tuple[Any, ...], t: float, y: np.ndarray) -> bool:
+    """Return whether a function that is not a right-hand side of y = (q, v) gives n/2 accelerations instead.
+
+    It is called with y and with q. Numba functions are called as Python code and C functions with y alone, because
+    compiled code could read or write beyond the end of a shorter array.
+
+    Parameters
+    ----------
+    fun : callable
+    in_place : bool
+    extra : tuple
+        Further arguments of `fun`.
+    t : float
+    y : ndarray, shape (n,)
+    """
+    code = getattr(fun, "py_func", fun)
+    states = (y,) if isinstance(fun, PointerFunction) else (y, y[: y.size // 2])
+    gives = _fills if in_place else _returns
+    return y.size % 2 == 0 and any(gives(code, extra, t, state.copy(), y.size // 2) for state in states)
+
+
+def _returns(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: np.ndarray, count: int) -> bool:
+    """Return whether the value of `fun` at a state has `count` components."""
+    try:
+        with np.errstate(all="ignore"):
+            return np.shape(fun(t, state, *extra)) == (count,)
+    except Exception:  # the function does not take these arguments
+        return False
+
+
+def _fills(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: np.ndarray, count: int) -> bool:
+    """Return whether `fun` fills the first `count` components of its argument out, and no others."""
+    out = np.full_like(state, np.nan)
+    try:
+        with np.errstate(all="ignore"):
+            fun(t, state, out, *extra)
+    except Exception:  # the function does not take these arguments
+        return False
+    return bool(np.isfinite(out[:count]).all() and np.isnan(out[count:]).all())

@@ -1,0 +1,177 @@
+"""One meaning of `fun` for all methods: the derivative of y = (q, v); accelerations have an argument of their own."""
+
+import ctypes
+import math
+import pickle
+
+import numpy as np
+import pytest
+from c_compiler import shared_library
+from numba import njit
+from scipy.integrate import solve_ivp
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ12,
+    EIPGJ14,
+    EIPRK4,
+    EIPRKN8,
+    EIPRKN12,
+    Invariant,
+    ensemble,
+    integrate,
+    recommend,
+)
+from eip_scipy.core.acceleration import AccelerationField
+from eip_scipy.core.problem import Problem
+
+Y0 = np.array([1.0, 0.5, 0.2, -0.3])
+SECOND_ORDER = {EIPRKN8: {"rtol": 1e-11, "atol": 1e-13}, EIPRKN12: {"rtol": 1e-11, "atol": 1e-13}}
+SECOND_ORDER |= {EIPGJ12: {"h": 0.02}}
+ENERGY = Invariant(
+    lambda t, y, p: 0.5 * (p[0] * y[:2] @ y[:2] + y[2:] @ y[2:]), lambda t, y, p: np.append(p[0] * y[:2], y[2:])
+)
+C_SOURCE = """
+int acceleration(double t, const double *q, double *out, const double *p) {
+    for (int k = 0; k < 2; ++k) out[k] = -p[0] * q[k];
+    return 0;
+}
+"""
+
+
+def spring(t, q):
+    return -4 * q
+
+
+def spring_in_place(t, q, out):
+    out[:] = -4 * q
+
+
+def spring_of_two(t, q):
+    x, y = q
+    return [-4 * x, -4 * y]
+
+
+def spring_with_rate(t, q, params):
+    return -params[0] * q
+
+
+def field(t, y):
+    return np.append(y[2:], -4 * y[:2])
+
+
+JITTED = {fun: njit(fun) for fun in (spring, spring_in_place, field)}
+
+
+def exact(t):
+    """q'' = -4 q in closed form."""
+    q, v = Y0[:2], Y0[2:]
+    return np.append(q * np.cos(2 * t) + v / 2 * np.sin(2 * t), v * np.cos(2 * t) - 2 * q * np.sin(2 * t))
+
+
+def pointer(folder):
+    source = folder / "spring.c"
+    source.write_text(C_SOURCE)
+    library = ctypes.CDLL(str(shared_library(folder / "spring.so", source)))
+    array = ctypes.POINTER(ctypes.c_double)
+    library.acceleration.argtypes = [ctypes.c_double, array, array, array]
+    return library.acceleration
+
+
+@pytest.mark.parametrize("method", SECOND_ORDER)
+@pytest.mark.parametrize("how", ["python", "jitted", "in place", "jitted in place", "field", "jitted field", "params"])
+def test_accelerations_and_fields_of_second_order_methods(method, how):
+    def made(fun):
+        return JITTED[fun] if "jitted" in how else fun
+
+    given = {"t_span": (0, 3), "y0": Y0, "method": method, "in_place": "in place" in how, **SECOND_ORDER[method]}
+    if how == "params":
+        run = integrate(acceleration=spring_with_rate, params=[4.0], invariants=ENERGY, **given)
+    elif "field" in how:
+        run = integrate(made(field), **given)
+    else:
+        run = integrate(acceleration=made(spring_in_place if given["in_place"] else spring), **given)
+    np.testing.assert_allclose(run.y[:, -1], exact(3), rtol=0, atol=2e-10)
+    assert next(iter(run.calls)) == ("fun" if "field" in how else "acceleration")
+    longer = run.continue_to(4)
+    np.testing.assert_allclose(longer.y[:, -1], exact(4), rtol=0, atol=4e-10)
+
+
+def test_every_method_takes_accelerations(tmp_path):
+    """Runge-Kutta methods have the bits of the field made of them; C functions work by their address."""
+    run = integrate(acceleration=spring, t_span=(0, 3), y0=Y0, method=EIPRK4, h=0.01)
+    np.testing.assert_array_equal(run.y, integrate(field, (0, 3), Y0, method=EIPRK4, h=0.01).y)
+    given = {"t_span": (0, 3), "y0": Y0, "method": EIPRKN12, "rtol": 1e-10}
+    in_c = integrate(acceleration=pointer(tmp_path), params=[4.0], **given)
+    assert in_c.calls == {"acceleration": "pointer"}
+    np.testing.assert_array_equal(in_c.y, integrate(acceleration=spring, **given).y)
+
+
+def test_ensembles_recommendations_and_checkpoints(tmp_path):
+    starts = Y0 * np.linspace(1, 2, 9)[:, None]
+    members = ensemble(acceleration=JITTED[spring], t_span=(0, 3), y0s=starts, method=EIPRKN12, h=0.1)
+    np.testing.assert_allclose(members.y, np.linspace(1, 2, 9)[:, None] * exact(3), rtol=0, atol=1e-12)
+    choice = recommend(acceleration=spring_in_place, t_span=(0, 20), y0=Y0, in_place=True, error=1e-9)
+    assert choice.method in (EIPRKN8, EIPRKN12, EIPGJ12)
+    run = choice.run()
+    assert np.abs(run.y[:, -1] - exact(20)).max() < 1e-8
+    given = {"acceleration": spring, "t_span": (0, 3), "y0": Y0, "method": EIPRKN12, "h": 0.1}
+    path = tmp_path / "run.npz"
+    with pytest.raises(ZeroDivisionError):
+        integrate(**given, checkpoint=path, save_every=1, callback=lambda t, y, d: 1 / 0 if t > 1.5 else None)
+    resumed = integrate(**given, checkpoint=path, save_every=1, resume=True)
+    np.testing.assert_array_equal(resumed.y, integrate(**given, save_every=1).y)
+
+
+@pytest.mark.parametrize("method", [EIPRKN8, EIPRKN12, EIPGJ12, EIPGJ14])
+@pytest.mark.parametrize("fun", [spring, spring_of_two, JITTED[spring], lambda t, q: -4 * q[:2]], ids=range(4))
+def test_the_old_call_names_the_new_one(method, fun):
+    """Whether the acceleration of q, called with y, gives n/2 values, n of them, or raises."""
+    steps = {"h": 0.01} if method in (EIPGJ12, EIPGJ14) else {"rtol": 1e-8}
+    for run in (integrate, ensemble):
+        with pytest.raises(ValueError, match=r"integrate\(acceleration=fun, t_span=\.\.\., y0=\.\.\., \.\.\.\)"):
+            run(fun, (0, 1), Y0 if run is integrate else [Y0, Y0], method=method, **steps)
+
+
+def test_the_old_call_in_place_and_by_pointer(tmp_path):
+    def one_by_one(t, q, out):
+        out[0], out[1] = -4 * q[0], -4 * q[1]
+
+    for fun in (spring_in_place, one_by_one, njit(one_by_one), pointer(tmp_path)):
+        with pytest.raises(ValueError, match="acceleration=fun"):
+            integrate(fun, (0, 1), Y0, method=EIPRKN12, rtol=1e-8, in_place=True, params=None)
+
+
+def test_what_is_neither():
+    """No first-order field of (q, v); what the user's own function raises is passed on."""
+    with pytest.raises(ValueError, match="acceleration=fun"):
+        integrate(lambda t, y: -y, (0, 1), [1.0, 0.0], method=EIPRKN12, rtol=1e-8)
+    with pytest.raises(KeyError, match="mass"):
+        integrate(lambda t, y: {}["mass"], (0, 1), Y0, method=EIPRKN12, rtol=1e-8)
+    with pytest.raises(TypeError, match=r"give fun or acceleration, not both"):
+        integrate(field, (0, 1), Y0, acceleration=spring, method=EIPRKN12, rtol=1e-8)
+    with pytest.raises(TypeError, match="fun is missing"):
+        integrate(t_span=(0, 1), y0=Y0, method=EIPRK4, h=0.1)
+    with pytest.raises(TypeError, match="acceleration must be callable"):
+        integrate(acceleration=3, t_span=(0, 1), y0=Y0, method=EIPRK4, h=0.1)
+    with pytest.raises(TypeError, match=r"'v'.*the right-hand side fun\(t, y\)"):
+        integrate(acceleration=lambda t, q, v: -v, t_span=(0, 1), y0=Y0, method=EIPGJ12, h=0.1)
+
+
+def test_accelerations_that_depend_on_velocities():
+    """They are the second half of fun: q'' = -q - v/50, whose solution decays as exp(-t/100)."""
+    rate = math.sqrt(1 - 1e-4)
+    run = integrate(lambda t, y: np.array([y[1], -y[0] - y[1] / 50]), (0, 10), [1.0, -0.01], method=EIPGJ12, h=0.01)
+    np.testing.assert_allclose(run.y[0, -1], math.exp(-0.1) * math.cos(10 * rate), rtol=0, atol=1e-12)
+
+
+def test_a_field_made_of_accelerations():
+    """As the function of a Problem and in solve_ivp; it pickles where the acceleration does."""
+    made = AccelerationField(spring)
+    np.testing.assert_array_equal(made(0.0, Y0), field(0.0, Y0))
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(made))(0.0, Y0), field(0.0, Y0))
+    problem = Problem("spring", made, Y0, (0.0, 3.0))
+    run = integrate(problem, method=EIPRKN12, rtol=1e-10)
+    assert list(run.calls) == ["acceleration"]
+    sol = solve_ivp(made, (0, 3), Y0, method=EIPDOP853, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(sol.y[:, -1], exact(3), rtol=0, atol=1e-8)
