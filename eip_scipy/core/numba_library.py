@@ -18,7 +18,9 @@ from ..engine.native import LibraryFunction
 
 __all__ = ["register"]
 
-FUNCTION = ctypes.CFUNCTYPE(None, ctypes.c_double, *[ctypes.c_void_p] * 4, *[ctypes.c_int64] * 2)
+FUNCTION = ctypes.CFUNCTYPE(
+    ctypes.c_int, ctypes.c_void_p, ctypes.c_double, *[ctypes.c_void_p] * 4, *[ctypes.c_int64] * 2
+)
 FITS = ctypes.CFUNCTYPE(ctypes.c_bool, *[ctypes.c_int64] * 2)
 
 
@@ -41,8 +43,9 @@ def _jitted(function: Any) -> Any:
 
 
 def _value_of(function: Any) -> Callable[..., Any]:
-    call, fits = FUNCTION(function.address), FITS(function.fits_address)
+    call, fits, handle = FUNCTION(function.call_address), FITS(function.fits_address), function.handle
     numbers, of_state = function.numbers, function.fills_states
+    no_memory = f"{function.__name__} could not get the memory that it needs"
     wrong = f"{function.__name__} takes another number of states or parameters"
 
     def value(t, y, f, params):
@@ -51,7 +54,9 @@ def _value_of(function: Any) -> Callable[..., Any]:
             raise ValueError(wrong)
         out = np.empty(numbers * (n if of_state else 1))
         state, slope, parameters = _floats(y), _floats(f), _floats(params)
-        call(t, state.ctypes.data, slope.ctypes.data, out.ctypes.data, parameters.ctypes.data, n, p)
+        pointers = state.ctypes.data, slope.ctypes.data, out.ctypes.data, parameters.ctypes.data
+        if call(handle, t, *pointers, n, p) != 0:
+            raise MemoryError(no_memory)
         return out
 
     return value

@@ -95,6 +95,18 @@ PyObject *function_call(PyObject *self, PyObject *const *arguments, size_t flags
     });
 }
 
+// Call a function for one state from compiled code that no exception may pass through. Returns 0, or 1 if the function
+// did not get the memory that it needs.
+int call_by_handle(const void *handle, double t, const double *y, const double *f, double *out, const double *params,
+                   int64_t n, int64_t p) {
+    try {
+        static_cast<const LibraryFunction *>(handle)->one(t, y, f, out, params, n, p);
+        return 0;
+    } catch (const std::exception &) {
+        return 1;
+    }
+}
+
 PyObject *function_repr(PyObject *self) { return PyUnicode_FromFormat("<%s of eip_scipy>", of(self).name); }
 
 // By its name, so that it travels to other processes.
@@ -109,9 +121,10 @@ PyObject *function_reduce(PyObject *self, PyObject *) {
 PyObject *get_name(PyObject *self, void *) { return PyUnicode_FromString(of(self).name); }
 PyObject *get_takes_f(PyObject *self, void *) { return PyBool_FromLong(of(self).value == Value::GRADIENT_BY_F); }
 PyObject *get_in_place(PyObject *self, void *) { return PyBool_FromLong(!of(self).returns()); }
-PyObject *get_address(PyObject *self, void *) {
-    return PyLong_FromVoidPtr(reinterpret_cast<void *>(of(self).one));
+PyObject *get_handle(PyObject *self, void *) {
+    return PyLong_FromVoidPtr(const_cast<LibraryFunction *>(&of(self)));
 }
+PyObject *get_call_address(PyObject *, void *) { return PyLong_FromVoidPtr(reinterpret_cast<void *>(call_by_handle)); }
 PyObject *get_fits_address(PyObject *self, void *) {
     return PyLong_FromVoidPtr(reinterpret_cast<void *>(of(self).fits));
 }
@@ -125,7 +138,8 @@ PyGetSetDef function_attributes[] = {
     {"__name__", get_name, nullptr, "Its name in `library`.", nullptr},
     {"takes_f", get_takes_f, nullptr, "Whether it takes the derivative of the state.", nullptr},
     {"in_place", get_in_place, nullptr, "Whether it fills an array.", nullptr},
-    {"address", get_address, nullptr, "For one state, with the signature in library.hpp.", nullptr},
+    {"handle", get_handle, nullptr, "The first argument of the function at `call_address`.", nullptr},
+    {"call_address", get_call_address, nullptr, "Address of `call_by_handle`, whose signature is in library.cpp.", nullptr},
     {"fits_address", get_fits_address, nullptr, "Of ``bool fits(int64_t n, int64_t p)``.", nullptr},
     {"numbers", get_numbers, nullptr, "How many numbers, or states, it fills.", nullptr},
     {"fills_states", get_fills_states, nullptr, "Whether these are of the state's size.", nullptr},

@@ -18,7 +18,7 @@ struct Given {
     int64_t n, p;
 };
 
-// It fills all of `out`, cannot fail, and leaves y, f and params as they are.
+// Such a function fills all of `out` and leaves y, f and params as they are. It throws nothing but std::bad_alloc.
 template <class T>
 using LibraryPointer = void (*)(double t, const T *y, const T *f, T *out, const T *params, int64_t n, int64_t p);
 

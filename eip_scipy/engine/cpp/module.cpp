@@ -133,7 +133,8 @@ void expect(Engine *self, Py_ssize_t count, Py_ssize_t expected, const char *nam
     if (PyErr_Occurred()) throw PythonError{};
 }
 
-// A step or more by `call`, which takes a Run; without the GIL where no function is Python's.
+// Make a step or more by `call`, which takes a Run, without the GIL if no function is Python's. An exception of the engine
+// leaves only after the GIL is taken again, since `guarded` turns it into Python's.
 template <typename Call>
 Code stepped(Engine *self, Call call) {
     const FloatingPoint mode;
@@ -141,14 +142,18 @@ Code stepped(Engine *self, Call call) {
     PyThreadState *released = d.system.python || self->hooks ? nullptr : PyEval_SaveThread();
     Code code = OK;
     bool broken = false;
+    std::exception_ptr thrown;
     try {
         code = call(Run{d.method, d.options, d.work, d.system, self->hooks});
     } catch (const Broken &) {
         broken = true;
     } catch (const PythonError &) {
         broken = true;
+    } catch (const std::exception &) {
+        thrown = std::current_exception();
     }
     if (released) PyEval_RestoreThread(released);
+    if (thrown) std::rethrow_exception(thrown);
     if (broken) {
         raise_broken(d.system);
         throw PythonError{};

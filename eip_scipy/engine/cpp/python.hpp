@@ -11,7 +11,9 @@
 #include <Python.h>
 #include <numpy/arrayobject.h>
 
+#include <exception>
 #include <initializer_list>
+#include <new>
 #include <utility>
 
 namespace eip {
@@ -142,7 +144,8 @@ class Arrays {
     PyObject *kept_;
 };
 
-// Runs what may throw where Python calls; NULL with the error set.
+// Run `call` where Python calls the engine, and return NULL with a Python error set if it throws. No exception may pass
+// into Python's own frames: that ends the process.
 template <typename Call>
 PyObject *guarded(Call call) {
     try {
@@ -151,6 +154,8 @@ PyObject *guarded(Call call) {
         return nullptr;
     } catch (const std::bad_alloc &) {
         return PyErr_NoMemory();
+    } catch (const std::exception &error) {
+        return PyErr_Format(PyExc_RuntimeError, "engine: %s", error.what());
     }
 }
 
