@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -17,12 +17,39 @@ from .pointers import by_pointer
 from .units import DAY_S, Epoch, Unit, apart, as_epoch, in_unit, is_time, moment, shown_epoch
 from .units import units as known_units
 
-__all__ = ["Problem", "bind", "component_names", "native_invariant"]
+__all__ = ["Deferred", "Problem", "bind", "component_names", "made", "native_invariant"]
 
 MOST = 12  # components that are printed
 MOMENTS, DURATIONS = ("t_span", "t_eval", "t"), ("h", "first_step", "max_step")
 # A start this near that of the problem is the same: a Julian date in one float is up to 20 microseconds off.
 SAME_S = 1e-4
+
+
+class Deferred:
+    """A function that is made when it is first called or asked for.
+
+    Parameters
+    ----------
+    make : callable
+        ``make()`` returns the function.
+    """
+
+    def __init__(self, make: Callable[[], Callable[..., Any]]) -> None:
+        self._make = make
+
+    def __call__(self, *args: Any) -> Any:
+        """Call the function."""
+        return self.function(*args)
+
+    @cached_property
+    def function(self) -> Callable[..., Any]:
+        """The function itself."""
+        return self._make()
+
+
+def made(function: Any) -> Any:
+    """Return the function that a `Deferred` stands for, and any other function as it is."""
+    return function.function if isinstance(function, Deferred) else function
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -22,7 +22,7 @@ from ..core.native_functions import native_functions, with_events, with_jacobian
 from ..core.one_step import OneStep
 from ..core.options import ProjectionOptions
 from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
-from ..core.problem import Problem
+from ..core.problem import Problem, made
 from ..core.results import Diagnostics
 from ..core.setup import Counted, Run, Start
 from ..core.solvers import EIPSolver, eip_method
@@ -324,6 +324,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
         if isinstance(method, NystromTableau):
             setup.check_second_order(calls, t0, y0, f0, name, hint)
         elif isinstance(method, GaussJackson):
+            system.jacobian = made(system.jacobian)
             method = replace(method, velocities=setup.depends_on_velocity(calls, t0, y0, f0, name, hint))
     start = Start(t0, y0, f0, stepping.first(calls, y0, f0, method))
     schedule = _schedule(stepping.span, start.tau, request, system.events)

@@ -32,7 +32,7 @@ def functions_of(path):
 def cases(c):
     """Names, functions that return arrays, and whether the engine runs them without the GIL."""
     kept = [Invariant(c["energy"], c["energy_gradient"], uses_f=True), Invariant(c["momentum"])]
-    scene = kepler(0.6)
+    problem = kepler(0.6)
     square = Invariant(lambda t, y: y[0] ** 2 + y[1] ** 2)
     places, speeds = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     bodies = nbody([1.0, 1e-3], places, speeds, t_span=(0, 1), forces="eih", h=0.1, constants=ForceConstants(c=100.0))
@@ -61,10 +61,10 @@ def cases(c):
         ),
         "Python": (lambda: integrate(turning, (0, 1), [1.0, 0.0], method=EIPRK45, invariants=square).y, False),
         "Python, samples": (lambda: sampled(turning, square), False),
-        "multistep": (lambda: integrate(scene, (0, 2), method=EIPGJ12, h=0.005, t_eval=[0.301, 0.7017]).y, True),
-        "Nystrom": (lambda: integrate(scene, (0, 2), method=EIPRKN12, h=0.05, t_eval=[0.301, 0.7017]).y, True),
+        "multistep": (lambda: integrate(problem, (0, 2), method=EIPGJ12, h=0.005, t_eval=[0.301, 0.7017]).y, True),
+        "Nystrom": (lambda: integrate(problem, (0, 2), method=EIPRKN12, h=0.05, t_eval=[0.301, 0.7017]).y, True),
         "eih": (lambda: integrate(bodies, method=EIPRK4).y, True),
-        "octets": (lambda: ensemble(scene, (0, 1), np.tile(scene.y0, (16, 1)), method=EIPRK4, h=0.05).y, True),
+        "batches": (lambda: ensemble(problem, (0, 1), np.tile(problem.y0, (16, 1)), method=EIPRK4, h=0.05).y, True),
         "midpoint": (lambda: implicit_midpoint(fill, (0, 1), [1.0, 0.0], 0.1).y, False),
         "library": (lambda: np.atleast_1d(library["eih.momentum"](0.0, bodies.y0, bodies.params)), False),
         "compiled": (lambda: compiled(bodies.y0, bodies.params), True),

@@ -21,7 +21,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def failures(tmp_path_factory):
-    """By case: whether the engine runs it without the GIL, and what each allocation that failed has raised."""
+    """Return for each case whether the GIL is released, and what each allocation that failed has raised."""
     folder = tmp_path_factory.mktemp("memory")
     functions = shared_library(folder / "functions.so", HERE.parent / "run" / "pointers.c", KEPLER)
     preloaded = folder / "failing.so"

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import json
 import math
 import os
 import pickle
@@ -17,9 +18,11 @@ from hypothesis import strategies as st
 from numba import config, njit
 from scipy.integrate import solve_ivp
 
+import eip_scipy.problems.symbolic.system as symbolic_system
 from eip_scipy import (
     EIPDOP853,
     EIPGJ12,
+    EIPGJ14,
     EIPRK4,
     EIPRK45,
     EIPRKN12,
@@ -37,6 +40,7 @@ from eip_scipy.problems.symbolic.parser import as_expression, as_names
 HENON_HEILES = "(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3"
 KEPLER = "(px**2 + py**2)/2 - 1/sqrt(x**2 + y**2) - eps/(2*(x**2 + y**2)**1.5)"
 L = {"L": "x*py - y*px"}
+Q = sympy.Symbol("q", real=True)
 SO3 = [[0, "-m3", "m2"], ["m3", 0, "-m1"], ["-m2", "m1", 0]]
 TOP = "(m1**2/I1 + m2**2/I2 + m3**2/I3)/2"
 INERTIA = {"I1": 1.0, "I2": 2.0, "I3": 3.0}
@@ -129,6 +133,82 @@ def test_any_text_is_read_or_refused(text):
     except ValueError:
         return
     assert isinstance(found, sympy.Expr)
+
+
+def nested(text, times, inner="q"):
+    for _ in range(times):
+        inner = text.format(inner)
+    return inner
+
+
+# SymPy would compute these for hours, some of it in one operation that no signal interrupts.
+BOMBS = [
+    "((1+10**-290)**1000)**1000*q + p", "(1+10**-290)**1000*q + p", "9**9**9*q + p", "(1.0000001*q)**1000 + p",
+    "*".join(["(1+10**-290)"] * 2000) + "*q + p", "+".join(f"q/{k * k + k + 41}" for k in range(2000)),
+    "*".join(f"q**(1/{k * k + k + 41})" for k in range(2000)), "*".join(f"{2 * k + 3}**(1/2)" for k in range(2000)),
+    "*".join(f"2**(1/{k * k + k + 41})" for k in range(2000)), "*".join(f"(q+{k}*p)" for k in range(2000)),
+    "abs((sqrt(q)+p+a+b+c+d)**40+1)", "".join(f"max(x{k}," for k in range(90)) + "p" + ")" * 90,
+    nested("sqrt({0}+sqrt({0}))", 12, "2") + "*q + p", nested("({0}*{0}+1)", 15) + "+p",
+    nested("exp({})", 6, "5") + "*q", nested("p/(q+{})", 48),
+]  # fmt: skip
+TRIED = """
+import json, sys, time
+from eip_scipy import equations, hamiltonian
+told = []
+for text in json.load(sys.stdin):
+    begin = time.process_time()
+    try:
+        hamiltonian(text, "q", "p", params={name: 1.0 for name in ["a", "b", "c", "d", *(f"x{k}" for k in range(90))]})
+    except ValueError as error:
+        told.append([str(error), time.process_time() - begin])
+try:  # its value is a tower, and so are those of its parts
+    equations(["p", "-q"], "q p", invariants={"I": "exp(exp(exp(exp(exp(exp(q))))))"})
+except ValueError as error:
+    told.append([str(error), 0.0])
+print(json.dumps(told))
+"""
+
+
+@pytest.mark.slow
+def test_what_would_take_hours_is_refused_in_seconds():
+    """In a process of its own, which is ended after a minute; seconds are those of the processor."""
+    done = subprocess.run(
+        [sys.executable, "-c", TRIED],
+        input=json.dumps(BOMBS),
+        env=os.environ | {"NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    told = json.loads(done.stdout)
+    assert len(told) == len(BOMBS) + 1
+    assert all(len(text) < 700 for text, _ in told)
+    assert max(seconds for _, seconds in told) < 5
+
+
+def test_exact_constants_of_moderate_size_are_computed():
+    assert read("1.0001**365").evalf(20) == pytest.approx(1.0001**365, rel=1e-14)
+    assert read("(1 + 1e-290)**4").is_Rational
+
+
+def test_a_declared_name_is_neither_a_constant_nor_a_function():
+    """pi' = -phi and phi' = pi for H = pi^2/2 + phi^2/2, where pi is the momentum."""
+    for problem in (
+        hamiltonian("pi**2/2 + phi**2/2", "phi", "pi"),
+        equations({"phi": "pi", "pi": "-phi"}, invariants={"H": "pi**2/2 + phi**2/2"}),
+        equations(["pi", "-phi"], "phi pi"),
+    ):
+        np.testing.assert_array_equal(problem.fun(0.0, np.array([1.0, 2.0])), [2.0, -1.0])
+    problem = hamiltonian("p**2/2 + pi*q**2/2", params={"pi": 2.0}, invariants={"twice": "p**2 + pi*q**2"})
+    np.testing.assert_array_equal(problem.fun(0.0, np.array([1.0, 3.0])), [3.0, -2.0])
+    problem = hamiltonian(
+        "m1*m2*m3*pi", "m1 m2 m3", poisson=[[0, "-pi", 0], ["pi", 0, 0], [0, 0, 0]], params={"pi": 3.0}
+    )
+    np.testing.assert_array_equal(problem.fun(0.0, np.array([1.0, 2.0, 5.0])), [-9 * 5.0, 9 * 2.0 * 5.0, 0.0])
+    assert hamiltonian("p**2/2 + pi*q**2/2").fun(0.0, np.array([1.0, 3.0]))[1] == -math.pi
+    with pytest.raises(ValueError, match="calls log, a component or parameter here; rename that"):
+        hamiltonian("log**2/2 + log(q)", "q", "log")
 
 
 LEAVES = st.sampled_from(["x", "y", "k", "2", "0.25", "pi", "(-3)"])
@@ -238,6 +318,8 @@ def test_pairs(H, names):
             "px**2 + k*x**2",
             r"not clear what k is: .* goes with it \(pairs found: x with px\).*params={'k': 1.0}",
         ),
+        ("p**2/(2*m) + k*q**2/2", r"not clear what k and m are: .*pairs found: q with p\).*{'k': 1.0, 'm': 1.0}\. "),
+        ("p**2/(2*m*l**2) - m*g*l*cos(theta)", r"not clear what g and l and m are: .*pairs found: theta with p\)"),
         ("px**2 + y", r"not clear what y is: .*params={'y': 1.0}"),
         ("p**2 + a*b", r"not clear what a and b and p are: .* goes with them \(pairs found: none\).*'p': 1.0}"),
         ("3", r"H contains neither coordinates nor momenta\. Names are paired as x with px"),
@@ -329,6 +411,24 @@ def test_multistep_methods_take_their_jacobian():
     run = integrate(problem, (0, 20), own.y0, method=EIPGJ12, h=0.01)
     assert run.y[:, -1] == pytest.approx(integrate(own, (0, 20), method=EIPRKN12, h=0.01).y[:, -1], abs=1e-10)
     assert hamiltonian("p**2/2 + abs(q)").jacobian is None  # it has no derivative at 0
+
+
+def test_the_jacobian_is_written_when_it_is_asked_for(monkeypatch):
+    """The derivatives of a product of 40 factors alone would take a minute."""
+    written = []
+    known = symbolic_system._jacobian
+    monkeypatch.setattr(symbolic_system, "_jacobian", lambda system: written.append(system) or known(system))
+    problem = hamiltonian("p**2/2 - cos(3*q)*cos(5*q)")
+    copied = pickle.loads(pickle.dumps(dataclasses.replace(problem, y0=np.array([0.3, 0.0]), t_span=(0.0, 0.1))))
+    integrate(copied, method=EIPRKN12, h=0.05)
+    assert not written
+    run = integrate(copied, method=EIPGJ14, h=1e-3)
+    assert len(written) == 1
+    assert run.max_defect[0] < 1e-12
+    out = np.empty(1)
+    problem.jacobian(0.0, np.array([0.3]), np.array([2.0]), out)
+    d = sympy.diff(-sympy.diff(-sympy.cos(3 * Q) * sympy.cos(5 * Q), Q), Q).subs(Q, 0.3)  # of -dV/dq
+    assert out[0] == pytest.approx(2 * float(d), rel=1e-14)
 
 
 @pytest.mark.nightly
@@ -461,6 +561,13 @@ def test_invariants_of_time():
         ("(px**2 + py**2)/2 + (x**2 + k*y**2)/2", L, {"k": 1.0}, "numerically, at 8 points with the parameters given"),
         # A function of the energy, whose bracket would take minutes to expand.
         (HENON_HEILES, {"H^20": f"({HENON_HEILES} + 1)**20"}, None, "numerically, at 8 points"),
+        # Next to q = 2 and q = -2 too.
+        (
+            "p**2/2 + max(abs(q) - k, 0)**2/2",
+            {"H^30": "(p**2/2 + max(abs(q) - 2, 0)**2/2 + sin(p)**2 + cos(p)**2)**30"},
+            {"k": 2.0},
+            "numerically, at 48 points with the parameters given",
+        ),
     ],
 )
 def test_how_invariants_are_known(H, invariants, params, how):
@@ -479,6 +586,13 @@ def test_how_invariants_are_known(H, invariants, params, how):
         (HENON_HEILES, {"I": "3"}, "does not depend on x, y, px, py"),
         (HENON_HEILES, {"H": "x"}, "H is there already"),
         (HENON_HEILES, {"I": "sqrt(-2 - x**2)"}, "finite and real at no point tried"),
+        # Constant in one branch, which all points of moderate size are in.
+        ("(p**2 + q**2)/2", {"I": "max(q, 3)"}, r"its rate is p\*Heaviside\(q - 3\), at q="),
+        ("(p**2 + q**2)/2", {"I": "max(q**2, 1e8)"}, "'I' is no invariant"),
+        ("(p**2 + q**2)/2", {"I": "max(q, 3) - max(q, 3.001)"}, "'I' is no invariant"),
+        ("(p**2 + q**2)/2", {"I": "min(-7, q)*abs(p)"}, "'I' is no invariant"),
+        ("(p**2 + q**2)/2", {"I": "abs(q + 9) - q"}, "'I' is no invariant"),
+        ("(p**2 + q**2)/2", {"I": "max(sin(q), 2)"}, r"changes its branch, so that it cannot be checked"),
     ],
 )
 def test_what_is_no_invariant_is_refused(H, invariants, says):

@@ -5,7 +5,8 @@ SymPy is loaded when one of them is called, and nowhere else in the package.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,7 @@ def hamiltonian(
     H : str or sympy.Expr
         The Hamiltonian. Text is read as Python's arithmetic of numbers, names, pi and functions such as sqrt and cos,
         by a reader that runs nothing of it; every name is yours, E, I, S, N, beta and gamma too, but for t, the time.
+        A name that you declare, as a coordinate, momentum or parameter, is yours before all else: then pi is no number.
     q, p : str or sequence, optional
         Names of coordinates and momenta, ``"q1 q2"``, a list of them, or SymPy symbols. The state is (q, p). Default:
         the names in `H` that are no parameters, x with px, q1 with p1, theta with p_theta and so on; the result's repr
@@ -79,7 +81,8 @@ def hamiltonian(
     _require_sympy("hamiltonian")
     from .system import hamiltonian_problem
 
-    return hamiltonian_problem(H, q, p, params, invariants, name, poisson, extended)
+    with _nested("hamiltonian"):
+        return hamiltonian_problem(H, q, p, params, invariants, name, poisson, extended)
 
 
 def equations(
@@ -122,7 +125,19 @@ def equations(
     _require_sympy("equations")
     from .system import equations_problem
 
-    return equations_problem(f, y, params, invariants, name)
+    with _nested("equations"):
+        return equations_problem(f, y, params, invariants, name)
+
+
+@contextmanager
+def _nested(what: str) -> Iterator[None]:
+    """Name the reason where SymPy reaches the limit of Python's stack."""
+    try:
+        yield
+    except RecursionError:
+        raise ValueError(
+            f"{what}: the expressions, or their derivatives, nest too deep for SymPy; write the functions by hand."
+        ) from None
 
 
 def _require_sympy(what: str) -> None:

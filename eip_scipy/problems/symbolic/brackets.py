@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import sympy
 
-__all__ = ["how_kept"]
+from .branches import Switches
+from .sizes import EXPANDED_TERMS, expanded_terms
+
+__all__ = ["how_kept", "vanishes"]
 
 POINTS, TRIES = 8, 200
-DIGITS = 30
+DIGITS = 50
+LARGEST = sympy.Integer(10) ** 300
 ROUND_OFF = 1e-20  # of a rate that is 0, to its terms, when computed with DIGITS
-# Beyond these the algebra may take minutes where numbers take milliseconds.
-EXPANDED_TERMS, SIMPLIFIED_OPERATIONS = 2000, 120
+# Operations beyond which `simplify` may take minutes where numbers take milliseconds.
+SIMPLIFIED_OPERATIONS = 120
 
 
 class Rate(NamedTuple):
@@ -30,8 +33,9 @@ class Rate(NamedTuple):
 
     def at(self, point: Mapping[Any, Any]) -> tuple[Any, Any] | None:
         """The sum, and that of the absolute values, at a point; None where they are not all finite and real."""
-        values = [term.evalf(DIGITS, subs=point) for term in self.terms]
-        if not all(value.is_Float or value.is_Integer or value.is_zero for value in values):
+        known = {item: value.evalf(DIGITS) for item, value in point.items()}
+        values = [_value(term, known) for term in self.terms]
+        if any(value is None for value in values):
             return None
         return sum(values), sum(map(abs, values))
 
@@ -61,6 +65,13 @@ def how_kept(
     if not rate.terms or _is_zero(rate.total):
         return "symbolically"
     points = list(_points([*variables, time], rate, parameters))
+    try:
+        points += _beside_switches([quantity, *rates, *rate.terms], [*variables, time], rate, parameters)
+    except ValueError as error:
+        raise ValueError(
+            f"invariant {name!r}: {error}, so that it cannot be checked in all branches. Give the invariant of each "
+            "branch, or a run without it."
+        ) from None
     if not points:
         raise ValueError(f"invariant {name!r}: its rate {_cut(rate.total)} is finite and real at no point tried.")
     for point, (total, size) in points:
@@ -73,9 +84,35 @@ def how_kept(
     return f"numerically, at {len(points)} points" + (" with the parameters given" if parameters else "")
 
 
+def _value(expression: Any, known: dict[Any, Any]) -> Any:
+    """The value of an expression, from the parts up; None where a part is not finite and real.
+
+    `known` has the symbols' values and receives those of the parts. SymPy's own evaluation takes a part as large as it
+    is: a tower of exponentials then asks for more digits than there is memory.
+    """
+    if expression not in known:
+        known[expression] = None
+        parts = [_value(part, known) for part in expression.args]
+        if all(part is not None for part in parts):
+            value = expression if expression.is_Rational else (expression.func(*parts) if parts else expression)
+            value = value if value.is_Rational else value.evalf(DIGITS)
+            if (value.is_Float or value.is_Rational) and abs(value) < LARGEST:
+                known[expression] = value
+    return known[expression]
+
+
+def vanishes(expression: Any) -> bool:
+    """Return whether an expression is 0, by algebra if that is quick, else at random points."""
+    if _is_zero(expression):
+        return True
+    rate = Rate([expression])
+    points = list(_points(sorted(expression.free_symbols, key=str), rate, {}))
+    return bool(points) and all(abs(total) <= ROUND_OFF for _, (total, _) in points)
+
+
 def _is_zero(expression: Any) -> bool:
     """Whether algebra shows it, where that is quick."""
-    if _terms(expression) > EXPANDED_TERMS:
+    if expanded_terms(expression) > EXPANDED_TERMS:
         return False
     expanded = sympy.expand(expression)
     if expanded == 0:
@@ -83,32 +120,40 @@ def _is_zero(expression: Any) -> bool:
     return expression.count_ops() <= SIMPLIFIED_OPERATIONS and bool(sympy.simplify(expanded) == 0)
 
 
-def _terms(expression: Any) -> int:
-    """How many terms there are at most once it is expanded."""
-    match expression:
-        case sympy.Add():
-            return sum(map(_terms, expression.args))
-        case sympy.Mul():
-            return math.prod(map(_terms, expression.args))
-        case sympy.Pow(args=(base, sympy.Integer() as exponent)):
-            terms, power = _terms(base), min(abs(int(exponent)), EXPANDED_TERMS)
-            return math.comb(terms + power - 1, power)
-    return 1
-
-
 def _points(variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]) -> Iterator[tuple[Any, Any]]:
     """Random points where the rate is finite and real; of both signs, or positive where roots and logarithms ask."""
     draw = random.Random(20220)
+    given = {item: sympy.Rational(value) for item, value in parameters.items()}
     found = 0
     for k in range(TRIES):
-        signs = (-1, 1) if k < TRIES // 2 else (1,)
-        point = {item: draw.choice(signs) * sympy.Rational(draw.randint(300, 1700), 1000) for item in variables}
-        values = rate.at(point | {item: sympy.Rational(value) for item, value in parameters.items()})
+        point = _drawn(draw, variables, (-1, 1) if k < TRIES // 2 else (1,))
+        values = rate.at(point | given)
         if values is not None:
             yield point, values
             found += 1
         if found == POINTS:
             return
+
+
+def _beside_switches(
+    expressions: Sequence[Any], variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]
+) -> Iterator[tuple[Any, Any]]:
+    """Yield points next to the places at which max, min, abs and the like change their branches."""
+    switches = Switches(expressions, variables)
+    draw = random.Random(20221)
+    given = {item: sympy.Rational(value) for item, value in parameters.items()}
+
+    def value(expression: Any, point: Mapping[Any, Any]) -> Any:
+        return _value(expression, {item: number.evalf(DIGITS) for item, number in ({**point, **given}).items()})
+
+    for point in switches.points(lambda: _drawn(draw, variables, (-1, 1)), value):
+        values = rate.at(point | given)
+        if values is not None:
+            yield point, values
+
+
+def _drawn(draw: random.Random, variables: Sequence[Any], signs: Sequence[int]) -> dict[Any, Any]:
+    return {item: draw.choice(signs) * sympy.Rational(draw.randint(300, 1700), 1000) for item in variables}
 
 
 def _cut(expression: Any) -> str:

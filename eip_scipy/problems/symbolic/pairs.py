@@ -26,11 +26,9 @@ def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
         if coordinate is not None:
             pairs.append((coordinate, momentum))
     left = sorted(free - {name for pair in pairs for name in pair}, key=_natural)
-    if "p" in left:
-        others = [name for name in left if name != "p"] or ["q"]
-        if len(others) == 1:
-            pairs.append((others[0], "p"))
-            left = []
+    if "p" in left and (coordinate := _partner_of_p([name for name in left if name != "p"])) is not None:
+        pairs.append((coordinate, "p"))
+        left = [name for name in left if name not in ("p", coordinate)]
     if left or not pairs:
         raise ValueError(_unpaired(left, pairs))
     pairs.sort(key=lambda pair: _natural(pair[0]))
@@ -61,6 +59,14 @@ def _coordinate(momentum: str, free: set[str]) -> str | None:
         likely = (f"q{momentum[1:]}", f"q{rest}", f"x{momentum[1:]}", f"x{rest}")
         return next((name for name in likely if name in free), likely[0])
     return rest if rest in free or rest in KNOWN or (momentum.startswith("p_") and rest.isidentifier()) else None
+
+
+def _partner_of_p(others: list[str]) -> str | None:
+    """The coordinate that p goes with, of the names left: q, the only name of a coordinate, or the only name."""
+    if "q" in others or not others:
+        return "q"
+    likely = [name for name in others if name in KNOWN] or others
+    return likely[0] if len(likely) == 1 else None
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

@@ -1,7 +1,7 @@
 """Expressions from text: Python's grammar, of which a short list of nodes, operators and functions is let through.
 
 Nothing of the text is ever run. SymPy's own reader (`sympify`, `parse_expr`) calls `eval` and takes E, I, S, N, Q, beta
-and gamma for objects of its own; here every name that is not called is the user's.
+and gamma for objects of its own; here every name that is not called is the user's, and pi too if the user declares it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import sympy
+
+from .sizes import TooLargeError, require_constant, require_function, require_power, require_product, require_sum
 
 __all__ = ["as_expression", "as_names", "symbol"]
 
@@ -36,6 +38,7 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
 ALLOWED = f"numbers, names, pi, + - * / **, parentheses, and the functions {', '.join(sorted(FUNCTIONS))}"
 LONGEST = 200_000
 DEEPEST = 100
+LARGEST_SIZE = 20_000  # operations
 LARGEST_EXPONENT = 1000
 LARGEST = sympy.Integer(10) ** 300
 
@@ -63,8 +66,10 @@ def as_names(what: str, names: Any) -> tuple[str, ...]:
     return found
 
 
-def as_expression(what: str, given: Any) -> sympy.Expr:
+def as_expression(what: str, given: Any, declared: Iterable[str] = ()) -> sympy.Expr:
     """A SymPy expression in real symbols from text, a number or an expression of SymPy's.
+
+    A name that is `declared`, as a component of the state or a parameter, is neither a constant nor a function.
 
     Raises
     ------
@@ -72,7 +77,7 @@ def as_expression(what: str, given: Any) -> sympy.Expr:
         Naming what came, `what` it is, and what is allowed.
     """
     if isinstance(given, str):
-        found = Reader(what, given).read()
+        found = Reader(what, given, declared).read()
     elif isinstance(given, (bool, complex)) or not isinstance(given, (int, float, sympy.Expr)):
         raise TypeError(f"{what}: expected an expression, as text or of SymPy's, got {_cut(given)}.")
     else:
@@ -125,8 +130,10 @@ def _with_real_symbols(what: str, given: sympy.Expr) -> sympy.Expr:
 class Reader:
     """One text, read once."""
 
-    def __init__(self, what: str, text: str) -> None:
+    def __init__(self, what: str, text: str, declared: Iterable[str] = ()) -> None:
         self.what, self.text = what, " ".join(text.split())  # it may go over several lines
+        self.declared = frozenset(declared)
+        self.compared = 0  # values in max and min
 
     def read(self) -> sympy.Expr:
         """The expression."""
@@ -145,6 +152,12 @@ class Reader:
                 f"{self.what}: {_cut(self.text)} is too long or nests too deep for Python's parser; put parts of long "
                 "sums in parentheses, or give it as a SymPy expression."
             ) from None
+        size = sum(isinstance(node, ast.operator | ast.unaryop | ast.Call) for node in ast.walk(tree))
+        if size > LARGEST_SIZE:
+            raise ValueError(
+                f"{self.what}: {_cut(self.text)} has {size} operations, more than {LARGEST_SIZE}. Write the "
+                "functions of a system of this size by hand."
+            )
         return self._expression(tree.body, 0)
 
     def _mistake(self, error: SyntaxError) -> str:
@@ -160,7 +173,12 @@ class Reader:
     def _expression(self, node: ast.expr, depth: int) -> sympy.Expr:
         if depth > DEEPEST:
             raise ValueError(f"{self.what}: {_cut(self.text)} nests more than {DEEPEST} deep.")
-        found = self._converted(node, depth)
+        try:
+            found = self._converted(node, depth)
+            if found.is_number:
+                require_constant(found)
+        except TooLargeError as error:
+            raise self._refuse(node, str(error)) from None
         # At every level: what is built from numbers that floats hold stays small enough to be computed at once.
         if found.is_number and not _is_float(found):
             raise self._refuse(node, "is no number that a float holds")
@@ -171,15 +189,19 @@ class Reader:
             case ast.Constant():
                 return self._number(node)
             case ast.Name():
-                return sympy.pi if node.id == "pi" else symbol(node.id)
+                return sympy.pi if node.id == "pi" and "pi" not in self.declared else symbol(node.id)
             case ast.UnaryOp(op=ast.UAdd()):
                 return self._expression(node.operand, depth + 1)
             case ast.UnaryOp(op=ast.USub()):
                 return -self._expression(node.operand, depth + 1)
             case ast.BinOp(op=ast.Add() | ast.Sub()):
-                return sympy.Add(*self._chain(node, (ast.Add, ast.Sub), lambda x: -x, depth))
+                terms = self._chain(node, (ast.Add, ast.Sub), lambda x: -x, depth)
+                require_sum(terms)
+                return sympy.Add(*terms)
             case ast.BinOp(op=ast.Mult() | ast.Div()):
-                return sympy.Mul(*self._chain(node, (ast.Mult, ast.Div), lambda x: x**-1, depth))
+                factors = self._chain(node, (ast.Mult, ast.Div), lambda x: x**-1, depth)
+                require_product(factors)
+                return sympy.Mul(*factors)
             case ast.BinOp(op=ast.Pow()):
                 return self._power(node, depth)
             case ast.Call():
@@ -215,13 +237,18 @@ class Reader:
                 raise self._refuse(node.right, f"is an exponent beyond {LARGEST_EXPONENT}")
             if base.is_number and base != 0 and size * abs(math.log(abs(float(base)))) > math.log(LARGEST):
                 raise self._refuse(node, "is too large, or too small")
+        require_power(base, exponent)
         return base**exponent
 
     def _call(self, node: ast.Call, depth: int) -> sympy.Expr:
         name = node.func.id if isinstance(node.func, ast.Name) else None
+        if name in self.declared:
+            raise self._refuse(node, f"calls {name}, a component or parameter here; rename that to call {name}")
         if name not in FUNCTIONS:
             raise self._refuse(node.func, "is no function known here")
         function, count = FUNCTIONS[name]
         if node.keywords or len(node.args) != count:
             raise self._refuse(node, f"is not as {name} is called, with {count} argument{'s' * (count > 1)}")
-        return function(*(self._expression(item, depth + 1) for item in node.args))
+        arguments = [self._expression(item, depth + 1) for item in node.args]
+        self.compared = require_function(function.__name__.lower(), arguments, self.compared)
+        return function(*arguments)

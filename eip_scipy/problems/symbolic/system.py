@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -16,8 +16,8 @@ import sympy
 from ...core.inputs import is_number, refuse_units, shown
 from ...core.invariants import Invariant
 from ...core.jitted import compiled_like, is_jitted
-from ...core.problem import Problem, bind
-from .brackets import how_kept
+from ...core.problem import Deferred, Problem, bind
+from .brackets import how_kept, vanishes
 from .pairs import paired
 from .parser import as_expression, as_names, symbol
 from .program import Arguments, function
@@ -57,7 +57,7 @@ class Functions(NamedTuple):
 
     rhs: Callable[..., None]
     acc: Callable[..., np.ndarray] | None
-    jacobian: Callable[..., None] | None
+    jacobian: Deferred | None
     invariants: tuple[tuple[Callable[..., float], Callable[..., None]], ...]
 
 
@@ -137,8 +137,8 @@ class SymbolicProblem(Problem):
         W = sympy.Matrix(rates[:half]).jacobian(p)
         if W.has(*(symbol(item) for item in (*names, "t"))) or W.det() == 0:
             return None
-        rest = sympy.simplify(sympy.Matrix(rates[:half]) - W * sympy.Matrix(p))
-        return W if rest.is_zero_matrix else None
+        rest = sympy.Matrix(rates[:half]) - W * sympy.Matrix(p)
+        return W if all(map(vanishes, rest)) else None
 
     def __repr__(self) -> str:
         pairs = ", ".join(f"{q} with {p}" for q, p in self.pairs)
@@ -170,10 +170,12 @@ def hamiltonian_problem(
     H: Any, q: Any, p: Any, params: Any, invariants: Any, name: str | None, poisson: Any, extended: bool
 ) -> SymbolicProblem:
     """See `hamiltonian`."""
-    energy, values = as_expression("H", H), _parameters(params)
-    names, rates, pairs = _canonical(energy, q, p, values) if poisson is None else _lie(energy, q, p, poisson)
+    values = _parameters(params)
+    declared = {*values, *(name for given in (q, p) if given is not None for name in as_names("q and p", given))}
+    energy = as_expression("H", H, declared)
+    names, rates, pairs = _canonical(energy, q, p, values) if poisson is None else _lie(energy, q, p, poisson, declared)
     if not energy.has(*map(symbol, names)):
-        raise ValueError(f"hamiltonian: H = {energy} does not depend on {', '.join(names)}.")
+        raise ValueError(f"hamiltonian: H = {_cut(energy)} does not depend on {', '.join(names)}.")
     checks = {"H": "by construction"}
     kept = {"H": energy}
     time = symbol("t")
@@ -208,8 +210,10 @@ def equations_problem(f: Any, y: Any, params: Any, invariants: Any, name: str | 
         given = [f] if isinstance(f, (str, sympy.Expr)) else list(f)
     if len(given) != len(names):
         raise ValueError(f"equations: {len(given)} derivatives for the {len(names)} components {', '.join(names)}.")
-    rates = tuple(as_expression(f"the derivative of {k}", item) for k, item in zip(names, given, strict=True))
-    return _checked("f", name or "equations", names, rates, _parameters(params), {}, {}, invariants, ())
+    values = _parameters(params)
+    declared = {*names, *values}
+    rates = tuple(as_expression(f"the derivative of {k}", item, declared) for k, item in zip(names, given, strict=True))
+    return _checked("f", name or "equations", names, rates, values, {}, {}, invariants, ())
 
 
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
@@ -227,7 +231,7 @@ def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tupl
     return names, (*forward, *back), tuple(zip(q, p, strict=True))
 
 
-def _lie(energy: Any, y: Any, p: Any, poisson: Any) -> tuple[Any, Any, Any]:
+def _lie(energy: Any, y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, Any]:
     """The same of y' = B(y) grad H."""
     if y is None or p is not None:
         raise TypeError("hamiltonian: with poisson= the names of the state are given as q, and p is left out.")
@@ -236,10 +240,10 @@ def _lie(energy: Any, y: Any, p: Any, poisson: Any) -> tuple[Any, Any, Any]:
     n = len(names)
     if len(rows) != n or any(len(row) != n for row in rows):
         raise ValueError(f"hamiltonian: poisson must have the shape ({n}, {n}), for {', '.join(names)}.")
-    B = sympy.Matrix(n, n, lambda i, j: as_expression(f"poisson[{i}][{j}]", rows[i][j]))
+    B = sympy.Matrix(n, n, lambda i, j: as_expression(f"poisson[{i}][{j}]", rows[i][j], declared))
     for i, j in product(range(n), repeat=2):
-        total = sympy.simplify(B[i, j] + B[j, i])
-        if total != 0:
+        total = B[i, j] + B[j, i]
+        if not vanishes(total):
             raise ValueError(f"hamiltonian: poisson must be antisymmetric, but [{i}][{j}] + [{j}][{i}] = {total}.")
     gradient = sympy.Matrix([sympy.diff(energy, symbol(item)) for item in names])
     return names, tuple(B * gradient), ()
@@ -266,10 +270,10 @@ def _checked(
             raise TypeError(f"invariants: names must be strings, got {shown(label)}.")
         if label in kept:
             raise ValueError(f"invariants: {label} is there already.")
-        quantity = as_expression(f"invariant {label!r}", given)
+        quantity = as_expression(f"invariant {label!r}", given, known)
         _require_known(f"invariant {label!r}", quantity, known)
         if not quantity.has(*variables):
-            raise ValueError(f"invariant {label!r} is {quantity}, which does not depend on {', '.join(names)}.")
+            raise ValueError(f"invariant {label!r} is {_cut(quantity)}, which does not depend on {', '.join(names)}.")
         checks[label] = how_kept(label, quantity, variables, rates, parameters)
         kept[label] = quantity
     system = System(tuple(names), tuple(values), tuple(rates), tuple(kept.items()))
@@ -313,7 +317,7 @@ def _functions(system: System) -> Functions:
         gradient = [sympy.diff(quantity, variable) for variable in system.variables]
         value = function(f"invariant {name}", [quantity], arguments, in_place=False)
         invariants.append((value, function(f"gradient of {name}", gradient, arguments, in_place=True)))
-    return Functions(rhs, _acceleration(system), _jacobian(system), tuple(invariants))
+    return Functions(rhs, _acceleration(system), _deferred_jacobian(system), tuple(invariants))
 
 
 def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
@@ -336,17 +340,24 @@ def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
     return compiled_like(with_params if system.parameters else without, fill)
 
 
-def _jacobian(system: System) -> Callable[..., None] | None:
-    """Of the accelerations, times a vector; where it has one that is soon made."""
+def _deferred_jacobian(system: System) -> Deferred | None:
+    """The Jacobian of the accelerations times a vector, which is written when it is asked for; None without one."""
     found = system.accelerations
     if found is None or len(found) > LARGEST_JACOBIAN:
         return None
+    if any(a.has(sympy.sign, sympy.Heaviside) for a in found):  # of absolute values, and the larger of two
+        return None
+    return Deferred(partial(_jacobian, system))
+
+
+@lru_cache(maxsize=64)
+def _jacobian(system: System) -> Callable[..., None]:
+    found = system.accelerations
+    assert found is not None
     names = system.components[: len(found)]
     along = [f"d {name}" for name in names]  # which is nobody's name
     pairs = [(symbol(q), symbol(d)) for q, d in zip(names, along, strict=True)]
     rows = [sympy.Add(*(sympy.diff(a, q) * d for q, d in pairs)) for a in found]
-    if any(row.has(sympy.DiracDelta) for row in rows):  # of absolute values, and the larger of two
-        return None
     return function("Jacobian", rows, Arguments(names, system.parameters, along), in_place=True)
 
 

@@ -1,0 +1,91 @@
+"""Points on both sides of each place at which max, min, abs, sign or a step changes its branch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+import sympy
+
+__all__ = ["Switches"]
+
+KINDS = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside)
+MOST = 60  # differences whose sign chooses a branch
+LINES = 4  # along which a change of sign is looked for, for each of them
+POWERS = range(-40, 101, 4)  # of 2: the places on a line
+BISECTIONS = 40  # which leave a relative distance of 1e-11
+
+
+class Switches:
+    """The differences whose signs choose the branches of some expressions.
+
+    Parameters
+    ----------
+    expressions : sequence of sympy.Expr
+    variables : sequence of sympy.Symbol
+    """
+
+    def __init__(self, expressions: Iterable[Any], variables: Sequence[Any]) -> None:
+        atoms = sorted({atom for item in expressions for atom in item.atoms(*KINDS)}, key=str)
+        self._variables = variables
+        self._differences: dict[Any, Any] = {}
+        for atom in atoms:
+            several = isinstance(atom, (sympy.Max, sympy.Min))
+            found = [a - b for a, b in combinations(atom.args, 2)] if several else [atom.args[0]]
+            self._differences |= {item: atom for item in found if item.free_symbols & set(variables)}
+
+    def points(self, draw: Callable[[], dict[Any, Any]], at: Callable[[Any, Mapping[Any, Any]], Any]) -> list[Any]:
+        """Return points next to all changes of a branch, on both sides of them.
+
+        Parameters
+        ----------
+        draw : callable
+            A random point.
+        at : callable
+            ``at(expression, point)``: the value there, None where it is not finite and real.
+
+        Raises
+        ------
+        ValueError
+            Naming a function, a branch of which is not found.
+        """
+        if len(self._differences) > MOST:
+            raise ValueError(f"it has {len(self._differences)} changes of a branch, more than {MOST}")
+        found = []
+        for difference, atom in self._differences.items():
+            sides = [side for _ in range(LINES) for side in self._sides(difference, draw(), at)]
+            one_sided = difference.is_nonnegative or difference.is_nonpositive
+            if not sides and not one_sided:
+                raise ValueError(f"no point was found where {_cut(atom)} changes its branch")
+            found += sides
+        return found
+
+    def _sides(self, difference: Any, point: dict[Any, Any], at: Callable[[Any, Mapping[Any, Any]], Any]) -> list[Any]:
+        """Two points on a line along a variable, at which the difference has opposite signs; [] if there are none."""
+        for variable in sorted(difference.free_symbols & set(self._variables), key=str):
+            places = [sign * sympy.Integer(2) ** power for sign in (-1, 1) for power in POWERS]
+            places = [sympy.Integer(0), point[variable], *places]
+            signs: dict[int, Any] = {}
+            for place in sorted(places, key=abs):
+                value = at(difference, point | {variable: place})
+                if value is not None and value != 0:
+                    signs.setdefault(1 if value > 0 else -1, place)
+                if len(signs) == 2:
+                    return self._closer(difference, point, variable, signs, at)
+        return []
+
+    def _closer(self, difference: Any, point: Any, variable: Any, signs: Any, at: Any) -> list[Any]:
+        below, above = signs[-1], signs[1]
+        for _ in range(BISECTIONS):
+            middle = (below + above) / 2
+            value = at(difference, point | {variable: middle})
+            if value is None or value == 0:
+                break
+            below, above = (middle, above) if value < 0 else (below, middle)
+        return [point | {variable: place} for place in (below, above)]
+
+
+def _cut(expression: Any) -> str:
+    text = str(expression)
+    return text if len(text) <= 120 else f"{text[:120]}..."
