@@ -11,7 +11,7 @@ import numpy as np
 
 from ..engine.native import library
 from .inputs import has_unit, real_array, refuse_units, shown
-from .invariants import Invariant
+from .invariants import Invariant, as_invariants
 from .names import nearest
 from .pointers import by_pointer
 from .units import DAY_S, Epoch, Unit, apart, as_epoch, in_unit, is_time, moment, shown_epoch
@@ -71,7 +71,8 @@ class Problem:
     t_span : tuple of float
         Start and end in the problem's unit of time.
     invariants : tuple of Invariant
-        The invariants that the equations have (linear ones in `frame`), with ``args=(params,)``.
+        The invariants that the equations have (linear ones in `frame`), with ``args=(params,)``. Given as an Invariant,
+        a function, or a sequence of them.
     rhs : callable, optional
         Compiled right-hand side in place: ``rhs(t, y, out, params)``, or a C function by pointer.
     acc : callable, optional
@@ -136,6 +137,7 @@ class Problem:
         if self.epoch is not None:
             object.__setattr__(self, "epoch", as_epoch("epoch", self.epoch))
         object.__setattr__(self, "rhs", by_pointer(self.rhs, "rhs"))
+        object.__setattr__(self, "invariants", as_invariants(self.invariants))
         if self.component_names is not None:
             n = None if self.y0 is None else np.size(self.y0)
             object.__setattr__(self, "component_names", component_names(self.component_names, n))

@@ -35,6 +35,7 @@ from ..engine.trust import Trust
 from ..methods.multistep import GaussJackson
 from ..methods.nystrom import RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853
+from .blocks import like_components
 from .frame import spanned
 from .inputs import reals, refuse_units, shown
 from .invariants import InvariantSet
@@ -310,8 +311,11 @@ def prepare(
         False: the invariants have been checked, and their cost told, at the start of another run like this.
     """
     t0, y0, f0, tau = start
-    invariants = InvariantSet(projection.invariants, t0, y0, f0, tau, extra, tell=check_start)
+    invariants = InvariantSet(
+        projection.invariants, t0, y0, f0, tau, extra, tell=check_start, t_bound=stepping.span.t_bound, rhs=rhs
+    )
     options, sigma, identity = projection.settled(method, stepping, y0, invariants)
+    invariants.kinds = like_components(options.groups, y0, f0)
     options = options._replace(scales=_scales(options, invariants, start))
     arrays = method_arrays(method)
     work = make_work(y0.size, y0.dtype, arrays.b.size, invariants.size, options.groups.start.size - 1)
@@ -352,8 +356,7 @@ def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0
     projection.work.K[-1] = f0
     y, status = projection(t0, run.y0)
     work = projection.work
-    missed = np.abs(work.defect) > 1e-8 * run.invariants.term_sizes(t0, y, f0) if status == 0 else [True]
-    if np.any(missed):
+    if status != 0 or run.invariants.misses(t0, y, f0).any():
         raise ValueError(projection_failure(run.invariants, work, t0))
     return y
 

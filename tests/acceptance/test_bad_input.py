@@ -972,12 +972,19 @@ def test_memory_of_the_invariants_counts_too():
 
 @both
 def test_invariants_of_wrong_kind(driver):
-    with pytest.raises(TypeError, match=r"got the function .*square.*; wrap it: Invariant\("):
-        driver(invariants=square)
-    with pytest.raises(TypeError, match=r"expected Invariant objects, got .*wrap functions"):
-        driver(invariants=[SQUARE, square])
-    with pytest.raises(TypeError, match="expected an Invariant or a sequence of them, got None"):
-        driver(invariants=None)
+    for wrong in (Invariant, 5.0, None):  # the class itself is not an invariant either
+        with pytest.raises(TypeError, match=r"invariants: got .*; expected an Invariant, a function f\(t, y\)"):
+            driver(invariants=wrong)
+        with pytest.raises(TypeError, match=r"got .* among them; expected Invariant objects or functions f\(t, y\)"):
+            driver(invariants=[SQUARE, wrong])
+
+
+@both
+def test_a_function_stands_for_its_invariant(driver):
+    wanted = driver(invariants=Invariant(square, name="square"))
+    for given in (square, [square]):
+        found = driver(invariants=given)
+        np.testing.assert_array_equal(found.y, wanted.y)
 
 
 @pytest.mark.parametrize(

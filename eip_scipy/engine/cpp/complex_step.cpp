@@ -1,4 +1,5 @@
 // Gradients of functions in Python by complex steps: Im I(y + i h e_k) / h, which loses no digit to a difference.
+#include <cmath>
 #include <vector>
 
 #include "functions.hpp"
@@ -7,7 +8,14 @@ namespace eip {
 
 namespace {
 
+// Steps of the differences that a gradient is compared with, one to one side, then one to both, and how far they may
+// differ: in units of the sum of the derivative's terms, and in roundings of the values.
+constexpr double ONE_SIDED = 1e-8, TWO_SIDED = 1e-5, AGREEMENT = 1e-6, ROUNDINGS = 8.0, EPS = 2.220446049250313e-16;
+
 PyArrayObject *array_of(const Ref &object) { return reinterpret_cast<PyArrayObject *>(object.get()); }
+const double *floats_of(PyObject *array) {
+    return static_cast<const double *>(PyArray_DATA(reinterpret_cast<PyArrayObject *>(array)));
+}
 
 // y with a small imaginary part in component k: a new array each time, since the function may keep what it was given.
 Ref shifted(const double *y, npy_intp n, npy_intp k, double step) {
@@ -27,6 +35,7 @@ class Columns {
     Columns(npy_intp n, double step) : n_(n), step_(step) {}
 
     void take(PyObject *value, npy_intp k) {
+        // The real part is taken from the first column.
         if (k > 0 && PyComplex_Check(value) && PyArray_NDIM(array_of(gradient_)) == 1) {
             out_[k] = PyComplex_ImagAsDouble(value) / step_;
             return;
@@ -37,7 +46,13 @@ class Columns {
         require_shape(found);
         const auto *pairs = static_cast<const double *>(PyArray_DATA(found));
         for (npy_intp i = 0; i < PyArray_SIZE(found); ++i) out_[i * n_ + k] = pairs[2 * i + 1] / step_;
+        if (k > 0) return;
+        values_.resize(PyArray_SIZE(found));
+        for (size_t i = 0; i < values_.size(); ++i) values_[i] = pairs[2 * i];
     }
+
+    const double *row(size_t i) const { return out_ + i * n_; }
+    const std::vector<double> &values() const { return values_; }
 
     PyObject *release() { return gradient_.release(); }
 
@@ -72,36 +87,109 @@ class Columns {
     npy_intp n_;
     double step_;
     Ref gradient_;
+    std::vector<double> values_;
     double *out_ = nullptr;
 };
 
-PyObject *gradient(PyObject *fun, PyObject *t, PyObject *y, PyObject *args, double step) {
-    auto *state = reinterpret_cast<PyArrayObject *>(y);
-    const npy_intp n = PyArray_DIM(state, 0);
-    const Py_ssize_t further = PyTuple_GET_SIZE(args);
-    std::vector<PyObject *> arguments(3 + further);  // the callee's place, t and y before the others
-    arguments[1] = t;
-    for (Py_ssize_t k = 0; k < further; ++k) arguments[3 + k] = PyTuple_GET_ITEM(args, k);
-    Columns columns(n, step);
-    for (npy_intp k = 0; k < n; ++k) {
-        const Ref z = shifted(static_cast<const double *>(PyArray_DATA(state)), n, k, step);
-        arguments[2] = z.get();
-        const size_t count = static_cast<size_t>(2 + further) | PY_VECTORCALL_ARGUMENTS_OFFSET;
-        columns.take(Ref(PyObject_Vectorcall(fun, arguments.data() + 1, count, nullptr)).get(), k);
+// A function in Python of t, the state and further arguments.
+class Function {
+  public:
+    Function(PyObject *fun, PyObject *t, PyObject *args) : fun_(fun), arguments_(3 + PyTuple_GET_SIZE(args)) {
+        arguments_[1] = t;  // after the place that a vectorcall may write to
+        for (Py_ssize_t k = 0; k < PyTuple_GET_SIZE(args); ++k) arguments_[3 + k] = PyTuple_GET_ITEM(args, k);
     }
-    return columns.release();
+
+    Ref operator()(const Ref &state) {
+        arguments_[2] = state.get();
+        const size_t count = (arguments_.size() - 1) | PY_VECTORCALL_ARGUMENTS_OFFSET;
+        return Ref(PyObject_Vectorcall(fun_, arguments_.data() + 1, count, nullptr));
+    }
+
+  private:
+    PyObject *fun_;
+    std::vector<PyObject *> arguments_;
+};
+
+// The function's values at y + step * way, (l,).
+std::vector<double> values_at(Function &function, const double *y, const std::vector<double> &way, double step) {
+    npy_intp n = static_cast<npy_intp>(way.size());
+    const Ref state(PyArray_SimpleNew(1, &n, NPY_DOUBLE));
+    auto *moved = static_cast<double *>(PyArray_DATA(array_of(state)));
+    for (npy_intp k = 0; k < n; ++k) moved[k] = y[k] + step * way[k];
+    const Ref found(PyArray_FROM_OTF(function(state).get(), NPY_DOUBLE, NPY_ARRAY_IN_ARRAY));
+    const double *first = floats_of(found.get());
+    return {first, first + PyArray_SIZE(array_of(found))};
+}
+
+// Whether the gradient's product with `way` is (above - below) / distance.
+bool is_slope(const Columns &columns, const std::vector<double> &way, const std::vector<double> &above,
+              const std::vector<double> &below, double distance) {
+    if (above.size() != below.size()) return false;
+    for (size_t i = 0; i < above.size(); ++i) {
+        double along = 0.0, terms = 0.0;
+        for (size_t k = 0; k < way.size(); ++k) {
+            along += columns.row(i)[k] * way[k];
+            terms += std::abs(columns.row(i)[k] * way[k]);
+        }
+        const double rounding = ROUNDINGS * EPS * (std::abs(above[i]) + std::abs(below[i])) / distance;
+        if (!(std::abs((above[i] - below[i]) / distance - along) <= AGREEMENT * terms + rounding)) return false;
+    }
+    return true;
+}
+
+// Whether a gradient agrees with the function's differences along one direction, in units of |y_k| + floors_k.
+bool agrees(Function &function, const Columns &columns, const double *y, npy_intp n, const double *direction,
+            const double *floors) {
+    std::vector<double> way(n);
+    for (npy_intp k = 0; k < n; ++k) way[k] = direction[k] * (std::abs(y[k]) + floors[k]);
+    if (is_slope(columns, way, values_at(function, y, way, ONE_SIDED), columns.values(), ONE_SIDED)) return true;
+    const std::vector<double> above = values_at(function, y, way, TWO_SIDED);
+    return is_slope(columns, way, above, values_at(function, y, way, -TWO_SIDED), 2.0 * TWO_SIDED);
+}
+
+Columns columns_of(Function &function, PyObject *y, double step) {
+    const npy_intp n = PyArray_SIZE(reinterpret_cast<PyArrayObject *>(y));
+    Columns columns(n, step);
+    for (npy_intp k = 0; k < n; ++k) columns.take(function(shifted(floats_of(y), n, k, step)).get(), k);
+    return columns;
+}
+
+bool is_state(PyObject *y) {
+    return is_plain(y, NPY_DOUBLE, {ANY}) && PyArray_SIZE(reinterpret_cast<PyArrayObject *>(y)) > 0;
+}
+
+double number(PyObject *value) {
+    const double found = PyFloat_AsDouble(value);
+    if (found == -1.0 && PyErr_Occurred()) throw PythonError{};
+    return found;
 }
 
 PyObject *complex_step(PyObject *, PyObject *const *arguments, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
-        if (count != 5 || !is_plain(arguments[2], NPY_DOUBLE, {ANY}) ||
-            PyArray_SIZE(reinterpret_cast<PyArrayObject *>(arguments[2])) == 0 || !PyTuple_Check(arguments[3])) {
+        if (count != 5 || !is_state(arguments[2]) || !PyTuple_Check(arguments[3])) {
             PyErr_SetString(PyExc_TypeError, "complex_step: expected fun, t, y (n,) of float64 with n > 0, args, step");
             throw PythonError{};
         }
-        const double step = PyFloat_AsDouble(arguments[4]);
-        if (step == -1.0 && PyErr_Occurred()) throw PythonError{};
-        return gradient(arguments[0], arguments[1], arguments[2], arguments[3], step);
+        Function function(arguments[0], arguments[1], arguments[3]);
+        return columns_of(function, arguments[2], number(arguments[4])).release();
+    });
+}
+
+PyObject *checked_complex_step(PyObject *, PyObject *const *arguments, Py_ssize_t count) {
+    return guarded([&]() -> PyObject * {
+        const bool right = count == 7 && is_state(arguments[2]) && PyTuple_Check(arguments[3]);
+        const npy_intp n = right ? PyArray_SIZE(reinterpret_cast<PyArrayObject *>(arguments[2])) : 0;
+        if (!right || !is_plain(arguments[5], NPY_DOUBLE, {n}) || !is_plain(arguments[6], NPY_DOUBLE, {n})) {
+            PyErr_SetString(PyExc_TypeError,
+                            "checked_complex_step: expected fun, t, y (n,) of float64 with n > 0, args, step, direction "
+                            "(n,), floors (n,)");
+            throw PythonError{};
+        }
+        Function function(arguments[0], arguments[1], arguments[3]);
+        Columns columns = columns_of(function, arguments[2], number(arguments[4]));
+        if (!agrees(function, columns, floats_of(arguments[2]), n, floats_of(arguments[5]), floats_of(arguments[6])))
+            Py_RETURN_NONE;
+        return columns.release();
     });
 }
 
@@ -111,6 +199,9 @@ PyMethodDef gradient_functions[] = {
     {"complex_step", reinterpret_cast<PyCFunction>(complex_step), METH_FASTCALL,
      "complex_step(fun, t, y, args, step)\n\nThe gradient of ``fun(t, y, *args)`` along the components of y (n,): "
      "(..., n), the imaginary parts over the step."},
+    {"checked_complex_step", reinterpret_cast<PyCFunction>(checked_complex_step), METH_FASTCALL,
+     "checked_complex_step(fun, t, y, args, step, direction, floors)\n\nThe same, or None where it disagrees with a "
+     "difference of ``fun`` along ``direction * (abs(y) + floors)``, as that of a function does which is not analytic."},
     {nullptr, nullptr, 0, nullptr},
 };
 

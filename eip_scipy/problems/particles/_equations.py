@@ -12,7 +12,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
-from ...core.invariants import DIFFERENCE_WEIGHTS
+from ...core.gradients import DIFFERENCE_WEIGHTS
 from ...core.jitted import compiled_like, is_compiled
 
 __all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like"]

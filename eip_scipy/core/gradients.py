@@ -1,0 +1,167 @@
+"""Gradients of invariants that come without one: complex steps where they are right, differences elsewhere."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from ..engine.data import EPS
+from ..engine.native import BUILD
+
+__all__ = ["NumericalGradient", "difference_gradient", "random_directions", "typical_sizes"]
+
+Array = np.ndarray
+
+COMPLEX_STEP = 1e-100
+# How far from the start, in units of its components' sizes, a complex step is tried, and how far it may then be from
+# differences, in units of the largest component. The shorter distances stay clear of a singularity close to the start.
+TRIALS = ((1e-2, 1e-7), (1e-4, 1e-9), (1e-6, 1e-10))
+# Central differences of order 6: weights of +-1, +-2, +-3 steps (Fornberg 1988, table 1); those of order 4, to compare.
+DIFFERENCE_WEIGHTS = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
+LOWER_WEIGHTS = (2 / 3, -1 / 12, 0.0)
+# As in engine/cpp/differences.hpp.
+FIRST_SHIFT, SHORTER, MOST_SHIFTS = 5e-3, 1 / 16, 5
+DIFFER, ROUNDINGS, LEAST = 1e-8, 1e3, np.finfo(float).tiny
+
+
+class NumericalGradient:
+    """Gradient of a function without one: by complex steps where they are right, else by differences of order 6.
+
+    A complex step is wrong where the function takes an absolute value, a norm or a real part, which may be in a part of
+    its domain only. Each gradient by complex steps is therefore compared with a difference along one direction. The
+    choice depends on the state alone, so that a run that is resumed takes the same steps.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(t, y, *args)``, the invariant's function.
+    args : tuple
+        The invariant's own arguments. Those of the run follow them in each call.
+    takes_complex : bool
+        False for functions that complex steps must not be tried with.
+    t, y
+        The start.
+    floors : ndarray, shape (n,)
+        See `typical_sizes`.
+    extra : tuple
+        The run's arguments.
+    """
+
+    def __init__(
+        self, fun: Callable[..., Any], args: tuple, takes_complex: bool, t: float, y: Array, floors: Array, extra: tuple
+    ) -> None:
+        self._function, self._args = fun, args
+        self.floors = floors
+        self._direction = random_directions(y.size, False)[-1]
+        self.complex_step = takes_complex and y.dtype.kind == "f" and self._takes_complex_steps(t, y, extra)
+
+    def __call__(self, t: float, y: Array, *extra: Any) -> Array:
+        """Return the gradient (..., n)."""
+        if self.complex_step:
+            try:
+                found = self._by_complex_step(t, y, extra)
+            except Exception:  # an error of the function itself comes again from the differences
+                found = None
+            if found is not None:
+                return found
+        return difference_gradient(lambda x: self._fun(t, x, extra), y, self.floors)
+
+    def _fun(self, t: float, y: Array, extra: tuple) -> Array:
+        return np.asarray(self._function(t, y.copy(), *self._args, *extra))
+
+    def _by_complex_step(self, t: float, y: Array, extra: tuple) -> Array | None:
+        """The gradient by complex steps; None where it disagrees with a difference."""
+        return BUILD.gradients.checked_complex_step(
+            self._function, t, y, self._args + extra, COMPLEX_STEP, self._direction, self.floors
+        )
+
+    def _takes_complex_steps(self, t: float, y: Array, extra: tuple) -> bool:
+        """Return whether the function takes complex states and is analytic near the start.
+
+        It is evaluated next to y, because derivatives of abs(y_k) and the like may happen to vanish at y itself.
+        """
+        real = self._fun(t, y, extra)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)
+                plain = self._fun(t, y.astype(complex), extra)
+                if np.any(np.imag(plain) != 0) or not np.allclose(np.real(plain), real, rtol=1e-12):
+                    return False
+                return any(self._agrees_beside(t, y, extra, *trial) for trial in TRIALS)
+        except Exception:  # whatever a library raises for numbers that it does not know
+            return False
+
+    def _agrees_beside(self, t: float, y: Array, extra: tuple, length: float, tolerance: float) -> bool:
+        size = np.abs(y) + self.floors
+        y = y + length * size * random_directions(y.size, False)[0]
+        G = BUILD.gradients.complex_step(self._function, t, y, self._args + extra, COMPLEX_STEP)
+        D = difference_gradient(lambda x: self._fun(t, x, extra), y, self.floors)
+        return bool(np.all(np.abs((G - D) * size) <= tolerance * np.max(np.abs(D * size), axis=-1, keepdims=True)))
+
+
+def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -> Array:
+    """Gradient of value(y) by central differences of order 6, shifts in units of |y_k| + floor_k.
+
+    Where those of order 4 do not agree, as beside a singularity that is nearer than the state's size, the shifts are
+    shortened while that helps. The engine computes the same bits (engine/cpp/differences.hpp).
+    """
+
+    def along(k: int, unit: complex) -> Any:
+        # A power of two: y + shift and y - shift then differ by the shift exactly, except for their own rounding.
+        shift = 2.0 ** np.round(np.log2(FIRST_SHIFT * (abs(y[k]) + floor[k])))
+        found, least = None, np.inf
+        for _ in range(MOST_SHIFTS):
+            sums, excess = _shifted_sums(value, y, k, shift * unit)
+            found = np.full_like(sums, np.nan) if found is None else found
+            if excess < least:
+                found, least = sums / shift, excess
+            elif least < np.inf:
+                break
+            if least <= 1:
+                break
+            shift *= SHORTER
+        return found
+
+    columns = [along(k, 1.0) for k in range(y.size)]
+    if y.dtype.kind == "c":
+        columns = [column + 1j * along(k, 1j) for k, column in enumerate(columns)]
+    return np.stack(columns, axis=-1)
+
+
+def _shifted_sums(value: Callable[[Array], Any], y: Array, k: int, shift: complex) -> tuple[Array, float]:
+    """The sums of order 6 over shifts of y_k, and by how much more than they may those of order 4 differ."""
+    sums, lower, largest = np.zeros(()), np.zeros(()), np.zeros(())
+    for (multiple, weight), lower_weight in zip(DIFFERENCE_WEIGHTS, LOWER_WEIGHTS, strict=True):
+        ends = [y.copy(), y.copy()]
+        ends[0][k] += multiple * shift
+        ends[1][k] -= multiple * shift
+        above, below = (np.asarray(value(end)) for end in ends)
+        with np.errstate(invalid="ignore"):
+            sums, lower = sums + weight * (above - below), lower + lower_weight * (above - below)
+            largest = np.max([np.broadcast_to(largest, above.shape), np.abs(above), np.abs(below)], axis=0)
+    with np.errstate(invalid="ignore"):
+        excess = np.abs(sums - lower) / (DIFFER * np.abs(sums) + ROUNDINGS * EPS * largest + LEAST)
+    return sums, float(np.max(excess, initial=0.0))
+
+
+def typical_sizes(y: Array, f: Array, tau: float) -> Array:
+    """Return for each component how far it moves in a step, which stands for its size where it is smaller than that.
+
+    Components about which nothing is known take the largest size of the others, or 1.
+    """
+    floors = np.where(np.isfinite(f), np.abs(tau * f), 0.0)
+    floors = np.maximum(floors, 1e-3 * np.abs(y))
+    floors[floors == 0] = floors.max(initial=0.0) or 1.0
+    return floors
+
+
+@lru_cache
+def random_directions(n: int, is_complex: bool) -> Array:
+    """Return two directions, the same in each run: a generator takes as long to make as all else in a check."""
+    rng = np.random.default_rng(20220)
+    parts = rng.standard_normal((2, 2 if is_complex else 1, n))
+    return parts[:, 0] + 1j * parts[:, 1] if is_complex else parts[:, 0]

@@ -1,0 +1,338 @@
+"""Checks of invariants at a state: their gradients, their precision, and whether the system keeps them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ..engine.data import EPS
+from .conditional import is_kept_on_a_surface, on_targets
+from .gradients import DIFFERENCE_WEIGHTS, random_directions
+
+if TYPE_CHECKING:
+    from .invariants import InvariantSet
+
+__all__ = ["Complaint", "complaints", "listed"]
+
+Array = np.ndarray
+Derivative = Callable[[float, Array], Array]
+
+# Shorter ones have the last word where the first reaches too far.
+CHECK_STEPS = (6e-6, 6e-8, 6e-10)
+CHECK_TOLERANCE, CHECK_NOISE = 1e-4, 6.0
+INVARIANCE_TOLERANCE = 1e-8
+# What single precision leaves of a rate, in units of its terms.
+SINGLE_TOLERANCE = 1e-5
+# A gradient may be rounding and nothing else, as differences find that of a square which is 0: so many roundings of the
+# state, or as many times what those make of it.
+BLUR = 4.0
+# The rounding of a rate, in roundings of the largest derivatives of the same kind. Accelerations that come from a
+# system of linear equations, such as those of constrained bodies, have tens of them.
+RATE_ROUNDINGS = 100.0
+# Differences to one side of order 6: weights of 0, 1, ... 6 steps.
+ONE_SIDED_WEIGHTS = (-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6)
+MOST_NAMES = 3
+DOUBLE = (
+    "Compute it in double precision: with JAX jax.config.update('jax_enable_x64', True), with PyTorch by tensors and "
+    "parameters of torch.float64"
+)
+WRONG = "Projecting on it gives a wrong solution"
+MISSING = "Add that constraint to the invariants, and start on it"
+
+
+class Complaint(NamedTuple):
+    """What a check found.
+
+    Attributes
+    ----------
+    is_error : bool
+        Whether a run must not start with it.
+    text : str
+    advice : str
+        What follows from it, or what to do about it.
+    """
+
+    is_error: bool
+    text: str
+    advice: str = ""
+
+
+class _Samples(NamedTuple):
+    """A state, its derivative there, and what is known of the invariants around it.
+
+    `directions` are the test directions (2, n), in units of the components' motion; `ends` holds the values (2, 2, l)
+    at the first of `CHECK_STEPS` to both sides.
+    """
+
+    t: float
+    y: Array
+    f: Array
+    tau: float
+    span: Array
+    directions: Array
+    G: Array
+    here: Array
+    ends: Array
+
+
+def complaints(
+    known: InvariantSet, t: float, y: Array, f: Array, tau: float, rhs: Derivative | None
+) -> Iterator[Complaint]:
+    """Yield what is wrong with the precision of invariants, with gradients, or else with rates of change.
+
+    Parameters
+    ----------
+    known : InvariantSet
+    t : float
+    y, f : ndarray, shape (n,)
+        A state and its derivative there.
+    tau : float
+        The length of a step.
+    rhs : callable or None
+        ``rhs(t, y) -> (n,)``. With it, invariants that hold only together with others are looked at where all hold.
+    """
+    if known.size == 0 or y.size == 0:
+        return
+    # No further than the state moves while it changes by its own size: close to a singularity that is far less
+    # than a step.
+    moving, size = np.abs(f).max(), np.abs(y).max()
+    span = np.abs(y) + (min(tau, size / moving) if size > 0 and moving > 0 else tau) * np.abs(f)
+    directions = random_directions(y.size, y.dtype.kind == "c") * span
+    G, here = known.gradients(t, y, f), known.values(t, y)
+    ends = _values_at_ends(known, t, y, directions, CHECK_STEPS[0])
+    at = _Samples(t, y, f, tau, span, directions, G, here, ends)
+    for check in (_single_precision, _wrong_gradients):
+        found = list(check(known, at))
+        if found:
+            yield from found
+            return
+    yield from _wrong_rates(known, at, rhs)
+
+
+def listed(names: list[str]) -> str:
+    """Return at most three names in quotes, and the number of the others."""
+    quoted = [repr(name) for name in names[:MOST_NAMES]]
+    more = len(names) - len(quoted)
+    return ", ".join(quoted) + (f" and {more} more" if more else "")
+
+
+def _values_at_ends(known: InvariantSet, t: float, y: Array, directions: Array, step: float) -> Array:
+    return np.array([[known.values(t, state) for state in y + side * directions] for side in (step, -step)])
+
+
+def _rounding(known: InvariantSet, at: _Samples, ways: Array) -> Array:
+    """Return how far derivatives along `ways`, (k, l), change where the state does by roundings."""
+    states = [at.y + BLUR * EPS * d for d in (*at.directions, -at.directions[0])]
+    blurred = [known.gradients(at.t, state, at.f) - at.G for state in states]
+    return BLUR * np.abs(np.array(blurred)[:, None] * ways[:, None]).sum(axis=3).max(axis=0)
+
+
+# Precision.
+
+
+def _are_single(values: Array) -> Array:
+    """Return which columns of values (m, k) hold numbers of single precision that use more than half of its bits."""
+    values = np.ascontiguousarray(values, float)
+    with np.errstate(over="ignore", invalid="ignore"):
+        exact = values.astype(np.float32).astype(float) == values
+    long = (values.view(np.int64) & (2**40 - 1)) != 0
+    return exact.all(axis=0) & long.any(axis=0)
+
+
+def _single_precision(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
+    single = _are_single(np.concatenate([at.ends.reshape(-1, known.size), at.here[None]]))
+    names = [name for name, found in zip(known.names, single, strict=True) if found]
+    if names:
+        yield Complaint(
+            True,
+            f"the values of invariant {listed(names)} have single precision (float32): their rounding, about 1e-7 of "
+            "them, is larger than what a projection corrects",
+            DOUBLE,
+        )
+
+
+def _in_single_precision(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> str:
+    """Return what has single precision, of the right-hand side and the gradients; "" for neither."""
+    states = at.y + CHECK_STEPS[0] * at.directions
+    if rhs is not None and _are_single(np.array([rhs(at.t, state).view(float) for state in states])).any():
+        return "fun returns numbers of single precision (float32)"
+    rows = np.array([known.gradients(at.t, state, at.f).view(float) for state in states])
+    for k, name in enumerate(known.names):
+        if _are_single(rows[:, k]).any():
+            return f"the gradient of invariant {name!r} has single precision (float32)"
+    return ""
+
+
+# Gradients.
+
+
+def _wrong_gradients(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
+    """Yield those that do not agree with the differences along the first direction in which any does not."""
+    along, terms = (at.directions @ at.G.conj().T).real, np.abs(at.directions) @ np.abs(at.G).T
+    # An invariant's own terms may be larger than its value and than what its gradient shows.
+    inner = known.norm_products(at.G, at.span)
+    wrong, ends = np.array(True), at.ends
+    for step in CHECK_STEPS:
+        if step != CHECK_STEPS[0]:
+            ends = _values_at_ends(known, at.t, at.y, at.directions, step)
+        difference = (ends[0] - ends[1]) * (0.5 / step)
+        sizes, moves = np.abs(ends), np.abs(ends - at.here)
+        noise = (CHECK_NOISE / step) * (EPS * np.maximum(np.maximum(sizes[0], sizes[1]), inner) + 5e-324)
+        # At an extremum both ends move alike; their difference is then the rounding inside the invariant.
+        allowed = CHECK_TOLERANCE * (terms + (moves[0] + moves[1]) * (0.5 / step))
+        agrees = ~(np.abs(difference - along) > allowed + noise)
+        if step != CHECK_STEPS[0]:
+            agrees &= noise <= allowed
+        wrong = wrong & ~agrees
+        if not wrong.any():
+            return
+    wrong &= ~(_rounding(known, at, at.directions) > np.abs(difference - along))
+    # Where the slopes to both sides differ there is a kink, and no gradient of a function could be right.
+    kink = np.abs(ends[0] + ends[1] - 2 * at.here) / step > np.abs(along) * 0.01 + noise
+    wrong &= ~(np.array(known.computed) & kink)
+    way = int(wrong.any(axis=1).argmax())
+    for k in np.flatnonzero(wrong[way]):
+        yield _wrong_gradient(known, int(k), at.t, difference[way, k], along[way, k])
+
+
+def _wrong_gradient(known: InvariantSet, k: int, t: float, difference: float, along: float) -> Complaint:
+    name, where = known.names[k], f"along a test direction at t={t:.6g} its derivative is {difference:.6g}"
+    if known.computed[k]:
+        return Complaint(
+            False,
+            f"the gradient of invariant {name!r}, which is computed from its values, is not accurate: {where} by short "
+            f"differences and {along:.6g} by the gradient. The function is not smooth there, or its values have few "
+            "digits",
+            "Give Invariant its gradient, grad=",
+        )
+    return Complaint(
+        True,
+        f"gradient of invariant {name!r} is wrong: {where} by differences and {along:.6g} by grad",
+        "Correct grad, or omit it to have it computed",
+    )
+
+
+# Rates of change.
+
+
+class _Rates(NamedTuple):
+    """Rates of change (l,), the sums of their terms, the part of them that is explicit in time, and which are wrong."""
+
+    rate: Array
+    terms: Array
+    in_time: Array
+    wrong: Array
+
+
+def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> Iterator[Complaint]:
+    found = _rates(known, at)
+    if found is None or not found.wrong.any():
+        return
+    wrong = found.wrong
+    # Of small rates only: single precision does not explain large ones.
+    small = wrong & (np.abs(found.rate) <= SINGLE_TOLERANCE * found.terms)
+    if small.any() and (what := _in_single_precision(known, at, rhs)):
+        names = [known.names[k] for k in np.flatnonzero(small)]
+        yield Complaint(
+            False,
+            f"{what}, which hides whether this system keeps {listed(names)}: at t={at.t:.6g} the rate of change is "
+            f"{found.rate[small][0]:.3g}, where its terms sum to {found.terms[small][0]:.3g}",
+            DOUBLE,
+        )
+        wrong = wrong & ~small
+    if wrong.any() and rhs is not None and (moved := on_targets(known, at.t, at.y, at.span, rhs)) is not None:
+        f = rhs(at.t, moved)
+        there = _rates(known, at._replace(y=moved, f=f, G=known.gradients(at.t, moved, f)))
+        if there is not None:
+            found, wrong = there, wrong & there.wrong
+    yield from _complaints_of_rates(known, at, found, wrong, rhs)
+
+
+def _complaints_of_rates(
+    known: InvariantSet, at: _Samples, found: _Rates, wrong: Array, rhs: Derivative | None
+) -> Iterator[Complaint]:
+    """Yield one text for all that depend on others, and one for all that are no invariants, the worst first."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        order = np.argsort(-np.nan_to_num(np.abs(found.rate) / found.terms), kind="stable")
+    conditional: list[int] = []
+    plain: list[int] = []
+    for k in (int(k) for k in order if wrong[k]):
+        free = rhs is not None and found.in_time[k] == 0
+        kept = free and rhs is not None and is_kept_on_a_surface(known, k, at.t, at.y, at.span, rhs)
+        (conditional if kept else plain).append(k)
+    for those, words, advice in ((plain, _no_invariant, WRONG), (conditional, _depends_on_others, MISSING)):
+        if those:
+            others = [known.names[k] for k in those[1:]]
+            text = words(known.names[those[0]], at.t, found.rate[those[0]], found.terms[those[0]])
+            yield Complaint(False, text + (f"; the same holds for {listed(others)}" if others else ""), advice)
+
+
+def _no_invariant(name: str, t: float, rate: float, terms: float) -> str:
+    return (
+        f"{name!r} is no invariant of this system: at t={t:.6g} it changes at the rate {rate:.3g}, where the terms of "
+        f"that rate sum to {terms:.3g}"
+    )
+
+
+def _depends_on_others(name: str, t: float, rate: float, terms: float) -> str:
+    return (
+        f"{name!r} is kept only where its rate of change is 0, as a length is while the velocity along it is 0, and at "
+        f"t={t:.6g} that rate is {rate:.3g}, where its terms sum to {terms:.3g}: a constraint on which it depends is "
+        "missing or not met, such as the velocity constraint that belongs to a length"
+    )
+
+
+def _rates(known: InvariantSet, at: _Samples) -> _Rates | None:
+    """Return the rates of change at a state, or None where the derivative is too small for a rate."""
+    # In units of the largest component of f: large states would overflow otherwise.
+    unit = np.abs(at.f).max()
+    if 0 < unit < np.finfo(float).tiny / EPS:
+        return None
+    unit = unit or 1.0
+    in_time, noise = _time_derivative(known, at)
+    in_time, noise = in_time / unit, noise / unit
+    products = at.G.conj() * (at.f / unit)
+    rate, terms = in_time + products.sum(axis=1).real, np.abs(in_time) + np.abs(products).sum(axis=1)
+    noise = noise + RATE_ROUNDINGS * EPS * known.norm_products(at.G, at.f / unit)
+    wrong = np.abs(rate) > INVARIANCE_TOLERANCE * terms + noise
+    if wrong.any():
+        wrong &= ~(_rounding(known, at, at.f[None] / unit)[0] > np.abs(rate))
+    with np.errstate(over="ignore"):
+        return _Rates(rate * unit, terms * unit, in_time, wrong)
+
+
+def _time_derivative(known: InvariantSet, at: _Samples) -> tuple[Array, Array]:
+    """Return the partial derivative in time, from times inside the run's interval, and the rounding in it.
+
+    The rounding is infinite where the interval has no other time, because nothing is known of the derivative then.
+    """
+    none = np.zeros(known.size)
+    low, high = min(known.t_span), max(known.t_span)
+    before, after = at.t - low, high - at.t
+    side, room = (1, after) if after >= before else (-1, before)
+    far = at.t + side * min(room, at.tau)
+    if far == at.t or not 0 < at.tau < math.inf:
+        return none, np.full(known.size, np.inf)
+    with np.errstate(over="ignore"):
+        rounding = EPS * known.sizes_of_terms(at.y, at.G, at.here)
+        hidden = 4 * rounding / abs(far - at.t)
+    fixed = known.values(far, at.y) == at.here  # as almost always
+    step, centred = 0.01 * at.tau, min(before, after) >= 0.05 * at.tau
+    step = 2.0 ** (round(math.log2(step)) if centred else math.floor(math.log2(min(step, room / 6))))
+    if fixed.all() and (known.values(at.t + side * step, at.y) == at.here).all():
+        return none, hidden
+    if not step > 100 * np.spacing(abs(at.t)):
+        return none, np.where(fixed, hidden, np.inf)
+    if centred:
+        weights = {sign * multiple: sign * weight for multiple, weight in DIFFERENCE_WEIGHTS for sign in (1, -1)}
+    else:
+        weights = {side * k: side * weight for k, weight in enumerate(ONE_SIDED_WEIGHTS)}
+    values = {multiple: known.values(at.t + multiple * step, at.y) for multiple in weights}
+    changed = np.any([value != at.here for value in values.values()], axis=0)
+    total = np.where(changed, sum(weight * values[multiple] for multiple, weight in weights.items()), 0.0)
+    total[~np.isfinite(total)] = 0.0
+    with np.errstate(over="ignore"):
+        return total / step, np.where(fixed & ~changed, hidden, 50 * rounding / step)

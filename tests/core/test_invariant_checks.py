@@ -1,0 +1,280 @@
+"""Gradients that are not given, and the checks of invariants: what they find, and whom they leave alone."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPRK4,
+    EIPRK45,
+    EIPRKN12,
+    Invariant,
+    ensemble,
+    integrate,
+    project,
+    recommend,
+)
+from eip_scipy.core.invariants import InvariantSet, as_invariants
+from eip_scipy.core.problem import Problem
+
+NO_COMPLEX_STEP = "has no grad and allows no complex step"
+
+
+def oscillator(t, y):
+    return np.array([y[1], -y[0]])
+
+
+def square(t, y):
+    return y @ y
+
+
+def pendulum(t, y):
+    return np.array([y[1], -np.sin(y[0])])
+
+
+def energy(t, y):
+    return 0.5 * y[1] ** 2 - np.cos(y[0])
+
+
+def energy_gradient(t, y):
+    return np.array([np.sin(y[0]), y[1]])
+
+
+def said(call):
+    """The result of a call, or its error, and the texts of its warnings."""
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        result = call()
+    return result, [str(item.message) for item in record]
+
+
+# A function stands for its invariant.
+
+
+def test_a_function_stands_for_its_invariant_everywhere():
+    fixed = {"method": EIPRK4, "h": 0.1}
+    wanted = integrate(oscillator, (0, 1), [1.0, 0.0], invariants=Invariant(square), **fixed)
+    assert wanted.max_defect.size == 1
+    for given in (square, [square]):
+        assert as_invariants(given)[0].name == "square"
+        for run in (
+            integrate(oscillator, (0, 1), [1.0, 0.0], invariants=given, **fixed),
+            solve_ivp(oscillator, (0, 1), [1.0, 0.0], invariants=given, **fixed),
+            integrate(Problem("two", oscillator, np.array([1.0, 0.0]), (0, 1), invariants=given), **fixed),
+        ):
+            np.testing.assert_array_equal(run.y[:, -1], wanted.y[:, -1])
+        np.testing.assert_array_equal(
+            ensemble(oscillator, (0, 1), [[1.0, 0.0]], invariants=given, **fixed).y[0], wanted.y[:, -1]
+        )
+        assert recommend(oscillator, (0, 1), [1.0, 0.0], invariants=given).options["invariants"]
+        assert project([0.6, 0.81], given, target=[1.0], iterations=5).defect == pytest.approx(0, abs=1e-15)
+    assert as_invariants([lambda t, y: y[0], Invariant(square, name="S")])[0].name is None
+
+
+def test_functions_with_parameters():
+    """``fun(t, y, *args)``: the run's own arguments come last."""
+
+    def scaled(t, y, k):
+        return k * (y @ y)
+
+    run = integrate(
+        lambda t, y, k: k * oscillator(t, y), (0, 1), [1.0, 0.0], args=(2.0,), method=EIPRK4, h=0.05, invariants=scaled
+    )
+    assert run.success
+    np.testing.assert_allclose(run.invariants, 2.0, rtol=1e-12)
+
+
+# Gradients that are not given.
+
+
+def wall(t, y):
+    beyond = np.maximum(abs(y[0]) - 1, 0)
+    return np.array([y[1], -y[0] - 150 * beyond**2 * np.sign(y[0])])
+
+
+WALLS = {
+    "abs": lambda x: np.maximum(np.abs(x) - 1, 0),
+    "norm": lambda x: np.maximum(np.linalg.norm(np.array([x])) - 1, 0),
+    "real": lambda x: max(x.real - 1, 0) + max(-x.real - 1, 0),
+}
+
+
+@pytest.mark.parametrize("kind", WALLS)
+def test_a_complex_step_that_is_wrong_later_is_replaced_there(kind):
+    """A soft wall that is not felt at the start: beyond it, a complex step sees no slope of abs, norm or real part."""
+
+    def wall_energy(t, y):
+        return 0.5 * y[1] ** 2 + 0.5 * y[0] ** 2 + 50 * WALLS[kind](y[0]) ** 3
+
+    def gradient(t, y):
+        return np.array([-wall(t, y)[1], y[1]])
+
+    kept = InvariantSet(wall_energy, 0.0, np.array([0.5, 2.0]), wall(0, np.array([0.5, 2.0])), 0.02)
+    assert kept.grads[0].complex_step
+    for x in (0.5, -0.7, 0.9999, 1.0001, 1.2, -1.3):
+        y = np.array([x, 0.3])
+        np.testing.assert_allclose(kept.gradients(0.0, y, y)[0], gradient(0, y), rtol=1e-9, atol=1e-12)
+    options = {"method": EIPRK45, "rtol": 1e-6, "invariants": Invariant(wall_energy, name="E")}
+    run, texts = said(lambda: integrate(wall, (0, 20), [0.5, 2.0], save_every=1, **options))
+    assert (texts, run.trusted) == ([], True)
+    assert np.abs(run.y[0]).max() > 1.2
+    by_hand = integrate(wall, (0, 20), [0.5, 2.0], **(options | {"invariants": Invariant(wall_energy, gradient)}))
+    np.testing.assert_allclose(run.y[:, -1], by_hand.y[:, -1], rtol=0, atol=1e-9)
+
+
+def test_a_complex_step_next_to_a_singularity():
+    """Start of Arenstorf's orbit: the Moon is 0.006 away, where 1 % of the state is 0.01."""
+    mu = 0.012277471
+
+    def moved(t, y):
+        r1 = np.array([y[0] + mu, y[1]])
+        r2 = np.array([y[0] + mu - 1, y[1]])
+        pull = (1 - mu) * r1 / (r1 @ r1) ** 1.5 + mu * r2 / (r2 @ r2) ** 1.5
+        return np.array([y[2], y[3], y[0] + 2 * y[3] - pull[0], y[1] - 2 * y[2] - pull[1]])
+
+    def jacobi(t, y):
+        r1, r2 = (y[0] + mu) ** 2 + y[1] ** 2, (y[0] + mu - 1) ** 2 + y[1] ** 2
+        return 0.5 * (y[2] ** 2 + y[3] ** 2 - y[0] ** 2 - y[1] ** 2) - (1 - mu) / r1**0.5 - mu / r2**0.5
+
+    period = 17.0652165601579625588917206249
+    y0 = [0.994, 0.0, 0.0, -2.00158510637908252240537862224]
+    options = {"method": EIPDOP853, "rtol": 1e-9, "atol": 1e-12, "invariants": jacobi}
+    run, texts = said(lambda: integrate(moved, (0, period), y0, **options))
+    assert (texts, run.trusted) == ([], True)
+    np.testing.assert_allclose(run.y[:, -1], y0, rtol=0, atol=1e-3)  # the orbit is closed
+
+
+class RefusedError(Exception):
+    """What a library may raise that does not know complex numbers."""
+
+
+@pytest.mark.parametrize("error", [RuntimeError, NotImplementedError, AssertionError, KeyError, RefusedError])
+def test_functions_that_refuse_complex_numbers(error):
+    def refuses(t, y):
+        if np.iscomplexobj(y):
+            raise error("no complex numbers")
+        return energy(t, y)
+
+    options = {"method": EIPRK4, "h": 0.05, "save_every": 20}
+    run, texts = said(lambda: integrate(pendulum, (0, 5), [1.0, 0.3], invariants=refuses, **options))
+    assert len(texts) == 1
+    assert NO_COMPLEX_STEP in texts[0]
+    assert run.trusted
+    wanted = integrate(pendulum, (0, 5), [1.0, 0.3], invariants=Invariant(energy, energy_gradient), **options)
+    np.testing.assert_allclose(run.y, wanted.y, rtol=0, atol=1e-11)
+
+
+def test_functions_that_refuse_complex_numbers_later():
+    def refuses(t, y):
+        if np.iscomplexobj(y) and y[0].real < 0:
+            raise RuntimeError("no complex numbers here")
+        return energy(t, y)
+
+    run, texts = said(lambda: integrate(pendulum, (0, 5), [1.0, 0.3], method=EIPRK4, h=0.05, invariants=refuses))
+    assert (texts, run.trusted) == ([], True)
+
+
+def test_an_error_of_the_function_itself_is_not_hidden():
+    def breaks(t, y):
+        if np.real(y[0]) < 0:
+            raise RuntimeError("beyond the table")
+        return energy(t, y)
+
+    with pytest.raises(RuntimeError, match="beyond the table"):
+        integrate(pendulum, (0, 5), [1.0, 0.3], method=EIPRK4, h=0.05, invariants=breaks)
+
+
+def test_a_gradient_that_was_not_given_is_not_blamed():
+    """A function of few digits: its differences are noise, and no gradient was given that could be wrong."""
+    rounded = Invariant(lambda t, y: round(float(square(t, y)), 7), name="S")
+    run, texts = said(lambda: integrate(oscillator, (0, 1), [1.0, 0.3], method=EIPRK4, h=0.1, invariants=rounded))
+    assert not any("is wrong" in text or "by grad" in text for text in (*texts, run.message))
+    assert any("computed from its values, is not accurate" in text for text in texts)
+
+
+# Single precision.
+
+
+def in_single(fun):
+    return lambda t, y: np.asarray(fun(t, np.asarray(y, np.float32)), np.float32)
+
+
+SINGLE = {
+    "value": (pendulum, Invariant(in_single(energy), energy_gradient, name="E")),
+    "value as a float": (pendulum, Invariant(lambda t, y: float(in_single(energy)(t, y)), energy_gradient, name="E")),
+    "gradient": (pendulum, Invariant(energy, lambda t, y: np.float32(energy_gradient(t, y)), name="E")),
+    "field": (in_single(pendulum), Invariant(energy, energy_gradient, name="E")),
+    "half of the field": (
+        lambda t, y: np.array([y[1], float(in_single(pendulum)(t, y)[1])]),
+        Invariant(energy, energy_gradient, name="E"),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", SINGLE)
+def test_single_precision_is_named(kind):
+    fun, kept = SINGLE[kind]
+    options = {"method": EIPRK4, "h": 0.05, "invariants": kept}
+    if kind.startswith("value"):
+        with pytest.raises(ValueError, match=r"'E' have single precision \(float32\).*jax_enable_x64.*torch.float64"):
+            integrate(fun, (0, 5), [1.0, 0.3], **options)
+        return
+    run, texts = said(lambda: integrate(fun, (0, 5), [1.0, 0.3], **options))
+    assert all("single precision (float32)" in text and "no invariant" not in text for text in texts)
+    assert "single precision (float32)" in run.message
+
+
+def test_single_precision_explains_no_friction():
+    friction = in_single(lambda t, y: pendulum(t, y) - np.array([0.0, 0.1 * y[1]], np.float32))
+    kept = Invariant(energy, energy_gradient, name="E")
+    _, texts = said(lambda: integrate(friction, (0, 5), [1.0, 0.3], method=EIPRK4, h=0.05, invariants=kept))
+    assert "'E' is no invariant of this system" in texts[0]
+
+
+# Times.
+
+
+SPANS = [(0.0, 1.0), (1.0, 0.0), (2.0, 2.0), (5.0, 5.001), (0.0, 1e-9)]
+
+
+@pytest.mark.parametrize("span", SPANS)
+@pytest.mark.parametrize("method", [EIPRK4, EIPDOP853, EIPRKN12])
+def test_no_function_is_called_outside_the_interval(span, method):
+    """Tables end where the run does."""
+    low, high = min(span), max(span)
+
+    def table(t):
+        assert low <= t <= high
+        return np.cos(t)
+
+    def work(t, y):
+        return 0.5 * y[1] ** 2 + 0.5 * y[0] ** 2 - y[0] * table(t)
+
+    def kept(t, y):  # the last component is the work of the force
+        return work(t, y) + y[2]
+
+    def with_work(t, y):
+        return np.array([y[1], table(t) - y[0], -y[0] * np.sin(t)])
+
+    if method is EIPRKN12:  # without work: an autonomous energy that looks at the table
+        options = {"method": method, "rtol": 1e-9, "invariants": lambda t, y: square(t, y) + 0 * table(t)}
+        fun, y0 = (lambda t, y: oscillator(t, y) + 0 * table(t)), [1.0, 0.0]
+    else:
+        options = {"method": method, "invariants": Invariant(kept, name="E")}
+        options |= {"h": max(abs(high - low) / 10, 1e-12)} if method is EIPRK4 else {"rtol": 1e-8, "atol": 1e-10}
+        fun, y0 = with_work, [1.0, 0.0, 0.0]
+    run, texts = said(lambda: integrate(fun, span, y0, **options))
+    assert (texts, run.status) == ([], 0)
+
+
+def test_an_explicit_rate_in_time_is_found_at_either_end():
+    """An energy whose force depends on time is not kept, forward and backward."""
+    driven = Invariant(lambda t, y: square(t, y) + 0.1 * t, lambda t, y: 2 * y, name="S")
+    y, f = np.array([1.0, 0.3]), np.array([0.3, -1.0])
+    for start, end in ((0.0, 1.0), (1.0, 0.0)):
+        known = InvariantSet(driven, start, y, f, 0.1, t_bound=end)
+        with pytest.warns(UserWarning, match=r"'S' is no invariant.* changes at the rate 0\.1"):
+            known.check(start, y, f, 0.1)
