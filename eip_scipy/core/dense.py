@@ -7,16 +7,30 @@ import threading
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from scipy.integrate import DOP853 as SCIPY_DOP853
 from scipy.integrate import DenseOutput, OdeSolution
 
-from ..engine.data import CUBIC, ERROR, GIVEN, HISTORY, NEW, POLYNOMIAL, QUINTIC, SEVENTH, Dense, make_work
+from ..engine.data import (
+    CUBIC,
+    ERROR,
+    GIVEN,
+    HISTORY,
+    NEW,
+    NYSTROM,
+    POLYNOMIAL,
+    QUINTIC,
+    SEVENTH,
+    Dense,
+    Method,
+    make_work,
+)
 from ..engine.native import Engine
 from ..methods.multistep import GaussJackson, interpolation_weights
-from ..methods.nystrom import NystromTableau
+from ..methods.nystrom import RKN1210, NystromTableau
+from ..methods.nystrom_interpolants import LEAST_ORDER, interpolant
 from ..methods.runge_kutta import DOP853
 from .inputs import refuse_units, shown
 from .one_step import OneStep
@@ -112,22 +126,42 @@ class Interpolants:
             )
 
 
+class _Form(NamedTuple):
+    """Kind of a run's interpolants, what they are made with, and how many states one consists of without its ends."""
+
+    kind: int
+    rows: int
+    weights: Array = np.zeros((0, 0))
+    A: Array = np.zeros((0, 0))
+    c: Array = np.zeros(0)
+
+
+def _form(run: Run, tableau: AnyMethod) -> _Form:
+    if isinstance(tableau, GaussJackson):
+        assert isinstance(run.method, Method)
+        assert run.method.multistep is not None
+        if not run.method.multistep.brief:
+            weights = interpolation_weights(tableau.order).reshape(-1, tableau.order)
+            return _Form(HISTORY, (tableau.order + 1) // 2 + 1, weights)
+        if tableau.velocities:
+            return _Form(QUINTIC, 3)
+        tableau = RKN1210  # The method that starts makes all steps.
+    if isinstance(tableau, NystromTableau):
+        if tableau.order < LEAST_ORDER:
+            return _Form(QUINTIC, 3)
+        A, c, weights = interpolant(tableau)
+        return _Form(NYSTROM, (weights.shape[0] + 1) // 2 + 1, weights, A, c)
+    if tableau is DOP853:
+        return _Form(SEVENTH, 3 + len(SCIPY_DOP853.D), SCIPY_DOP853.D, SCIPY_DOP853.A_EXTRA, SCIPY_DOP853.C_EXTRA)
+    if isinstance(tableau, OneStep) or tableau.P is None:
+        return _Form(CUBIC, 3)
+    return _Form(POLYNOMIAL, 1 + tableau.P.shape[1], tableau.P.T)
+
+
 def _record(run: Run, tableau: AnyMethod, events: int) -> Dense:
     roots = min(MOST_ROOTS, ROOT_NUMBERS // run.y0.size) if events else 0
-    none = np.zeros((0, 0))
-    kind, weights, A, c = CUBIC, none, none, np.zeros(0)
-    stages, rows = run.method.b.size, 3
-    if isinstance(tableau, NystromTableau):
-        kind = QUINTIC
-    elif isinstance(tableau, GaussJackson):
-        kind, weights = HISTORY, interpolation_weights(tableau.order).reshape(-1, tableau.order)
-        rows = max(3, (tableau.order + 1) // 2) + 1
-    elif tableau is DOP853:
-        kind, weights, A, c = SEVENTH, SCIPY_DOP853.D, SCIPY_DOP853.A_EXTRA, SCIPY_DOP853.C_EXTRA
-        rows = 3 + weights.shape[0]
-    elif not isinstance(tableau, OneStep) and tableau.P is not None:
-        kind, weights = POLYNOMIAL, tableau.P.T
-        rows = 1 + weights.shape[0]
+    kind, rows, weights, A, c = _form(run, tableau)
+    stages = run.method.b.size
     n, dtype, invariants = run.y0.size, run.y0.dtype, run.invariants.size
     options = run.options._replace(
         metric=GIVEN, direction=NEW, every=1, compensated=False, iterations=ITERATIONS, watched=False, limit=math.inf

@@ -13,7 +13,7 @@ from .trust import N_FIGURES, TERMS
 OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED, UNSTABLE = range(6)
 PAUSE, FULL, ENDED, DOUBTFUL = 10, 11, 12, 13
 # Interpolants of dense output.
-CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY = range(5)
+CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY, NYSTROM = range(6)
 
 EPS = 2.220446049250313e-16
 # Dead band in roundings of an invariant's terms; where the state's own roundings are carried, the values' remain.
@@ -300,11 +300,11 @@ class Members(NamedTuple):
 class Dense(NamedTuple):
     """What dense output is made with, and what the loop samples by it.
 
-    `weights` are rows over the stages, of a tableau's own polynomial or of DOP853's, which has further stages, A and c.
-    `own_slopes`: the steps leave no f at their ends. `by_travel`: corrections are weighed by what each block travels
-    within the step, else by the run's weights. `missed`: how many states were left unprojected, and the time of the
-    first. `event`, `t`, `y`: roots of events that the loop has found, ``counts[0]`` of them; ``counts[1]`` interpolants
-    are kept. `left`: how often each event may still happen before it ends the run.
+    `weights` are rows over the stages, of a tableau's own polynomial or of that of DOP853 or a Nystrom method, which
+    have further stages, A and c. `own_slopes`: the steps leave no f at their ends. `by_travel`: corrections are weighed
+    by what each block travels within the step, else by the run's weights. `missed`: how many states were left
+    unprojected, and the time of the first. `event`, `t`, `y`: roots of events that the loop has found, ``counts[0]`` of
+    them; ``counts[1]`` interpolants are kept. `left`: how often each event may still happen before it ends the run.
     """
 
     kind: int

@@ -185,24 +185,20 @@ def test_adaptive(method, backward, exact):
 @both
 @pytest.mark.parametrize("options", [{"invariants": ()}, KEPT])
 def test_dense_output(method, options):
-    """Quintic in q: of order 6, of order 5 in v; exact at the nodes and on the manifold between them."""
-    errors = []
+    """As accurate as the steps, exact at the nodes and on the manifold between them."""
     times = np.linspace(0, 2, 101)
     fine = integrate(
-        acceleration=acceleration, t_span=(0, 2), y0=Y0, method=EIPRKN12, h=0.02, save_every=1, compiled=False
+        acceleration=acceleration, t_span=(0, 2), y0=Y0, method=EIPRKN12, h=0.02, t_eval=times, compiled=False
     ).y
     for h in (0.2, 0.1):
         sol = solve_ivp(orbit, (0, 2), Y0, method=method, h=h, dense_output=True, **options)
         np.testing.assert_array_equal(sol.sol(sol.t), sol.y)
-        between = sol.sol(times)
-        errors.append(np.abs(between - fine))
+        between, at = sol.sol(times), sol.sol(np.linspace(0, 2, 11))
+        error = max(np.abs(at - fine[:, ::10]).max(), 1e-14)
+        assert np.abs(between - fine).max() < 3 * error
         if options is KEPT:
             drift = [[item.fun(0, y) - item.fun(0, Y0) for y in between.T] for item in INVARIANTS]
             assert np.abs(drift).max() < 1e-11
-    place, speed = (observed_order([e[part].max() for e in errors], [2, 1])[0] for part in (slice(2), slice(2, 4)))
-    # A projection mends v's error, of order 5, in q too.
-    assert place > (4.6 if options is KEPT else 5.6)
-    assert speed > 4.6
 
 
 @both

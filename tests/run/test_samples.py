@@ -17,6 +17,7 @@ from eip_scipy import (
     EIPRKN8,
     EIPRKN12,
     Invariant,
+    NystromTableau,
     eip_method,
     integrate,
 )
@@ -225,11 +226,16 @@ def test_solution_over_the_run(method, steps):
     assert [piece.t for piece in kept.sol.interpolants[1:3]] == kept.t[2:4].tolist()
 
 
-@pytest.mark.parametrize("method", [EIPRK4, EIPRKN8])
+NYSTROM4 = NystromTableau(
+    "Nystrom 4", [[], ["1/8"], [0, "1/2"]], ["1/6", "1/3", 0], ["1/6", "2/3", "1/6"], [0, "1/2", 1], 4
+)
+
+
+@pytest.mark.parametrize("method", [EIPRK4, eip_method(NYSTROM4)])
 def test_interpolants_are_hermite_s(method):
     """SciPy's, through values and slopes at both ends; positions of a Nystrom method through accelerations too."""
     y0, params = PROBLEM.y0, PROBLEM.params
-    given = {"acceleration": acceleration, "params": params} if method is EIPRKN8 else {"fun": PROBLEM.fun}
+    given = {"fun": PROBLEM.fun} if method is EIPRK4 else {"acceleration": acceleration, "params": params}
     found = integrate(**given, t_span=(0, 1), y0=y0, method=method, h=0.1, save_every=1, dense_output=True)
     slopes = np.array([PROBLEM.fun(t, y) for t, y in zip(found.t, found.y.T, strict=True)])
     times = np.linspace(0, 1, 97)

@@ -8,11 +8,16 @@
 
 namespace eip {
 
-enum Interpolant : int { CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY };
+enum Interpolant : int { CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY, NYSTROM };
+
+// The most nodes of a polynomial through accelerations.
+constexpr int64_t MOST_NODES = 32;
+// A share of an invariant's terms: the square of a smaller defect is below rounding.
+constexpr double SMALL_SHARE = 1e-9;
 
 // What the interpolants of a run are made with, and the buffers of their projections. `weights` are rows over the stages:
-// those of a tableau's own polynomial, or of DOP853's, which has `further` stages besides, or Lagrange's for the nodes of a
-// multistep method, [interval, node, power].
+// those of a tableau's own polynomial, or of that of DOP853 or a Nystrom method, which have `further` stages, or Lagrange's
+// for the nodes of a multistep method, [interval, node, power].
 struct Dense {
     int64_t kind, polynomials, columns, further;
     const double *weights, *A, *c;
@@ -25,7 +30,8 @@ struct Dense {
 
     // States that make up an interpolant, besides those of the two ends and the weights.
     int64_t rows() const {
-        if (kind == HISTORY) return std::max<int64_t>(3, (columns + 1) / 2) + 1;
+        if (kind == HISTORY) return (columns + 1) / 2 + 1;
+        if (kind == NYSTROM) return (polynomials + 1) / 2 + 1;
         return kind == POLYNOMIAL ? polynomials + 1 : kind == SEVENTH ? 3 + polynomials : 3;
     }
     int64_t floats() const { return 3 + (3 + rows()) * work.m + 2 * work.l; }
@@ -143,14 +149,84 @@ inline void seventh(const DenseRun &dense, const Piece &piece, double h, const W
         weighted_sum(h, {d.weights + j * d.columns, w.K, d.columns, m}, bend + (1 + j) * m, m);
 }
 
+// Constants of the recurrences below, which take divisions.
+struct LegendreFactors {
+    double ahead[MOST_NODES + 1], behind[MOST_NODES + 1], integral[MOST_NODES + 1];
+
+    constexpr LegendreFactors() : ahead{}, behind{}, integral{} {
+        for (int j = 0; j <= MOST_NODES; ++j) {
+            ahead[j] = (2.0 * j + 1.0) / (j + 1.0);
+            behind[j] = j / (j + 1.0);
+            integral[j] = 0.5 / (2.0 * j + 1.0);
+        }
+    }
+};
+
+constexpr LegendreFactors LEGENDRE;
+
+// Integrals of the Legendre polynomials P_0 to P_(count - 1) of 2 theta - 1 over theta, from the start of a step on: once
+// for velocities, twice for positions. The integral of P_j is a difference of P_(j + 1) and P_(j - 1), and its integral the
+// same difference of their integrals.
+struct LegendreIntegrals {
+    double once[MOST_NODES + 1], twice[MOST_NODES];
+
+    LegendreIntegrals(double theta, int64_t count) {
+        const double x = 2.0 * theta - 1.0;
+        double before = 1.0, here = x;
+        once[0] = theta;
+        for (int64_t j = 1; j <= count; ++j) {
+            const double next = LEGENDRE.ahead[j] * x * here - LEGENDRE.behind[j] * before;
+            once[j] = LEGENDRE.integral[j] * (next - before);
+            before = here;
+            here = next;
+        }
+        twice[0] = 0.5 * theta * theta;
+        for (int64_t j = 1; j < count; ++j) twice[j] = LEGENDRE.integral[j] * (once[j + 1] - once[j - 1]);
+    }
+};
+
+// The state at t_old + theta h by the accelerations' polynomial, whose Legendre coefficients are the first rows.
+inline void from_accelerations(const Dense &d, const Piece &piece, double theta, double *out, const Work &w) {
+    const int64_t half = w.m / 2;
+    const double h = *piece.t - *piece.t_old;
+    const LegendreIntegrals integrals(theta, d.polynomials);
+    weighted_sum(h * h, {integrals.twice, piece.rows, d.polynomials, half}, out, half);
+    weighted_sum(h, {integrals.once, piece.rows, d.polynomials, half}, out + half, half);
+    for (int64_t i = 0; i < half; ++i) {
+        const double v = piece.y_old[half + i];
+        out[i] = piece.y_old[i] + (theta * h * v + out[i]);
+        out[half + i] = v + out[half + i];
+    }
+}
+
+// For y = (q, v) of a Nystrom method: the accelerations at further stages, which the method's own ones give accurately, and
+// the polynomial through some of them, integrated. Its rows are Legendre coefficients, and last what the integrals miss at
+// the end of the step: the method's error and the projection's move.
+inline void nystrom(const DenseRun &dense, const Piece &piece, double h, const Work &step) {
+    const Dense &d = dense.dense;
+    const Work &w = dense.work;
+    const int64_t known = step.stages + 1, m = w.m, half = m / 2;
+    const double *accelerations = w.K + half;
+    copy(step.K, w.K, known * m);
+    copy(piece.y_old + half, w.stage + half, half);
+    for (int64_t k = 0; k < d.further; ++k) {
+        nystrom_position(piece.y_old, h, d.c[k], {d.A + k * d.columns, accelerations, known + k, m}, w.stage, half);
+        dense.run.system.rhs_of_scratch(w, *piece.t_old + d.c[k] * h, w.stage, w.row(known + k));
+        ++w.counters[NFEV];
+    }
+    for (int64_t j = 0; j < d.polynomials; ++j)
+        weighted_sum(1.0, {d.weights + j * d.columns, accelerations, d.columns, m}, piece.rows + j * half, half);
+    double *missing = piece.rows + (d.rows() - 1) * m;
+    from_accelerations(d, piece, 1.0, missing, w);
+    for (int64_t i = 0; i < m; ++i) missing[i] = piece.y[i] - missing[i];
+}
+
 // For the nodes of a multistep method: the accelerations of the whole history, and behind them how many nodes before the
-// newest the step begins, and its length in nodes' distances. A run too short for a history has the quintic, and -1 there.
+// newest the step begins, and its length in nodes' distances.
 inline void history(const Dense &d, const Piece &piece, double *f_old, double *f, const Work &w) {
     const Multistep &ms = *d.multistep;
     double *about = piece.rows + (d.rows() - 1) * w.m;
     const double h = *piece.t - *piece.t_old;
-    about[0] = -1.0;
-    if (ms.brief) return quintic(piece, h, f_old, f, w);
     const int64_t back = ms.place[NEWEST] - std::llround((*piece.t_old - ms.t0) / ms.h);
     about[0] = static_cast<double>(back);
     about[1] = h / ms.h;
@@ -208,6 +284,7 @@ inline void describe(const DenseRun &dense, const Work &step, double t_old, cons
     if (d.kind == QUINTIC) quintic(piece, h, f_old, f, w);
     if (d.kind == POLYNOMIAL) polynomial(d, piece, h, step, w);
     if (d.kind == SEVENTH) seventh(dense, piece, h, step);
+    if (d.kind == NYSTROM) nystrom(dense, piece, h, step);
     if (d.kind == HISTORY) {
         copy(step.row(0), w.row(0), w.m);
         copy(step.last(), w.last(), w.m);
@@ -226,13 +303,16 @@ inline void evaluate(const Dense &d, const Piece &piece, double theta, double *o
     const int64_t m = w.m, half = m / 2;
     const double rest = 1.0 - theta;
     const double *rows = piece.rows;
-    const bool nodes = d.kind == HISTORY && rows[(d.rows() - 1) * m] >= 0.0;
-    if (nodes) {
+    if (d.kind == HISTORY) {
         from_history(d, piece, theta, out, w);
+    } else if (d.kind == NYSTROM) {
+        const double *missing = rows + (d.rows() - 1) * m, share = theta * theta * (3.0 - 2.0 * theta);
+        from_accelerations(d, piece, theta, out, w);
+        for (int64_t i = 0; i < m; ++i) out[i] += share * missing[i];
     } else if (d.kind == CUBIC) {
         for (int64_t i = 0; i < m; ++i)
             out[i] = piece.y_old[i] + theta * rows[i] + theta * rest * (rest * rows[m + i] - theta * rows[2 * m + i]);
-    } else if (d.kind == QUINTIC || d.kind == HISTORY) {
+    } else if (d.kind == QUINTIC) {
         const double h = *piece.t - *piece.t_old;
         for (int64_t i = 0; i < half; ++i) {
             double place = rows[5 * half + i], slope = 5.0 * place;
@@ -258,6 +338,36 @@ inline void evaluate(const Dense &d, const Piece &piece, double theta, double *o
     }
 }
 
+// Project w.y_hat onto w.target by Newton steps, into `out`; return false if no state nearby meets the target. One step
+// removes a defect whose square is far below the rounding of the invariant's terms; no evaluation confirms that.
+inline bool project_sample(const Run &run, double t, double *out) {
+    const Options &o = run.options;
+    const Work &w = run.work;
+    for (int64_t k = 0; k < o.iterations; ++k) {
+        if (o.uses_f) {
+            run.system.rhs(w, t, w.y_hat, w.last());
+            ++w.counters[NFEV];
+        }
+        run.system.grad(w, t, w.y_hat, w.last(), w.G);
+        evaluate_invariants(run, t, w.y_hat);
+        if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) {
+            copy(w.y_hat, out, w.m);
+            return all_finite(out, w.m);
+        }
+        const int64_t rank = first_move(o, w, out, false);
+        if (rank < 0) return false;
+        bool small = rank == w.l, met = true;
+        for (int64_t i = 0; i < w.l; ++i) small &= std::abs(w.before[i]) <= SMALL_SHARE * o.per_band * w.band[i];
+        if (small) return all_finite(out, w.m);
+        evaluate_invariants(run, t, out);
+        if (judge(w.before, out, o, w) != OK) return false;
+        for (int64_t i = 0; i < w.l; ++i) met &= std::abs(w.defect[i]) <= w.band[i];
+        if (met) return true;
+        copy(out, w.y_hat, w.m);
+    }
+    return true;
+}
+
 // The state at t: an end of the step, or the interpolant's projected. Where no state near it meets the levels it is given
 // as it is, and counted; beyond the step, where an extrapolation may lead anywhere, without a count.
 inline void interpolate(const DenseRun &dense, double *floats, double t, double *out) {
@@ -279,12 +389,8 @@ inline void interpolate(const DenseRun &dense, double *floats, double t, double 
     for (int64_t i = 0; i < w.l; ++i) w.target[i] = (1.0 - share) * piece.levels_old[i] + share * piece.levels[i];
     copy(piece.sigma, w.sigma, w.m);
     copy(out, w.y_hat, w.m);
-    if (d.options.uses_f) {
-        system.rhs(w, t, w.y_hat, w.last());
-        ++w.counters[NFEV];
-    }
-    if (project_step(dense.run, Step{t, t, 0.0, w.y_hat, out, true, true}) == OK) return;
-    copy(w.y_hat, out, w.m);
+    if (project_sample(dense.run, t, out)) return;
+    evaluate(d, piece, theta, out, w);
     if (theta != share) return;
     if (d.missed[0] == 0.0) d.missed[1] = t;
     d.missed[0] += 1.0;

@@ -228,16 +228,17 @@ static void read_interpolant(PyObject *dense, int64_t stages, Arrays &arrays, De
     d.kind = integer(dense, "kind");
     d.polynomials = Arrays::length(dense, "weights");
     d.columns = Arrays::length(dense, "weights", 1);
-    if (d.multistep && (d.kind != HISTORY || d.columns != d.multistep->order || d.polynomials != d.columns * d.columns))
-        d.kind = -1;
+    const bool history = d.multistep && !d.multistep->brief;
+    if (history && (d.columns != d.multistep->order || d.polynomials != d.columns * d.columns)) d.kind = -1;
     d.further = Arrays::length(dense, "c");
     d.weights = arrays.floats(dense, "weights", {d.polynomials, d.columns});
     d.A = arrays.floats(dense, "A", {d.further, ANY});
     d.c = arrays.floats(dense, "c", {d.further});
-    const bool known = d.kind >= CUBIC && (d.multistep ? d.kind == HISTORY : d.kind < HISTORY);
-    const bool fits = d.kind == POLYNOMIAL ? d.columns == stages + 1
-                    : d.kind == SEVENTH    ? d.columns == stages + 1 + d.further && d.columns <= d.work.stages + 1
-                                           : true;
+    const bool known = history ? d.kind == HISTORY : d.kind >= CUBIC && d.kind <= NYSTROM && d.kind != HISTORY;
+    const bool staged = d.kind == SEVENTH || d.kind == NYSTROM;
+    bool fits = !staged || (d.columns == stages + 1 + d.further && d.columns <= d.work.stages + 1);
+    if (d.kind == POLYNOMIAL) fits = d.columns == stages + 1;
+    if (d.kind == NYSTROM) fits &= d.polynomials >= 1 && d.polynomials <= MOST_NODES;
     if (!known || !fits || (d.further > 0 && Arrays::length(dense, "A", 1) != d.columns)) {
         PyErr_SetString(PyExc_ValueError, "engine: the interpolant does not fit the method");
         throw PythonError{};
@@ -258,7 +259,8 @@ static Dense dense_of(PyObject *dense, const Data &run, Arrays &arrays, int type
     d.missed = arrays.floats(dense, "missed", {2});
     d.multistep = run.method.multistep;
     read_interpolant(dense, run.work.stages, arrays, d);
-    if ((d.kind == QUINTIC || d.kind == HISTORY) && (d.work.m % 2 || d.work.stages < 1)) {
+    const bool halves = d.kind == QUINTIC || d.kind == HISTORY || d.kind == NYSTROM;
+    if (halves && (d.work.m % 2 || d.work.stages < 1)) {
         PyErr_SetString(PyExc_ValueError, "engine: a state of positions and velocities has an even length");
         throw PythonError{};
     }

@@ -1,0 +1,153 @@
+"""Interpolants of Nystrom methods: further stages within a step, and the polynomial through their accelerations."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .nystrom import NystromTableau, NystromTree, _density, nystrom_trees
+
+__all__ = ["LEAST_ORDER", "Interpolant", "interpolant"]
+
+# Methods of lower order have the quintic through positions, velocities and accelerations at both ends.
+LEAST_ORDER = 6
+# Stages of a group that comes before the others, and how often the group is enlarged.
+GROUP, MOST_GROUPS = 6, 3
+# Newton iterations for a node, and the bits that they keep.
+ITERATIONS, BITS = 12, 120
+# A condition counts as dependent on others below the first number, beside its own size, and as met below the second.
+DEPENDENT, MET = 1e-10, 1e-11
+
+Array = np.ndarray
+
+
+class Interpolant(NamedTuple):
+    """Further stages of a step and what the accelerations at some of them give.
+
+    The rows of accelerations are those of the method's stages, that at the end of the step, and those of the further
+    stages, in this order.
+
+    Attributes
+    ----------
+    A : ndarray, shape (further, rows)
+        Weights of a further stage's position over the rows before its own.
+    c : ndarray, shape (further,)
+        Nodes of the further stages.
+    legendre : ndarray, shape (k, rows)
+        Weights over all rows of the coefficients of the polynomial of degree k - 1 through the accelerations at both
+        ends and at the last k - 2 further stages, in Legendre polynomials of 2 theta - 1.
+    """
+
+    A: Array
+    c: Array
+    legendre: Array
+
+
+@cache
+def interpolant(tableau: NystromTableau) -> Interpolant:
+    """Return the interpolant of a tableau of order p, of at least `LEAST_ORDER`.
+
+    The velocity of a step is interpolated by the integral of the polynomial through accelerations at Gauss-Lobatto
+    nodes, the position by the integral of that. Where the error of the position at such a node is O(h^s), the
+    velocity in between has an error of O(h^(s + 1)); so a group of stages comes before, at equidistant nodes, until s
+    is at least p - 1 or no further group helps.
+    """
+    s = tableau.n_stages - tableau.fsal
+    A, c = np.zeros((s + 1, s + 1)), np.ones(s + 1)
+    A[:s, :s], A[s, :s], c[:s] = tableau.A[:s, :s], tableau.b[:s], tableau.c[:s]
+    nodes = _lobatto_nodes(tableau.order - 3)
+    reached, weights = _stages(A, c, nodes, tableau.order - 1)
+    for k in range(1, MOST_GROUPS + 1):
+        if reached >= tableau.order - 1:
+            break
+        group = np.arange(1, GROUP * k + 1) / (GROUP * k + 1)
+        longer = _extended(A, c, group, _stages(A, c, group, tableau.order - 1)[1])
+        better, further = _stages(*longer, nodes, tableau.order - 1)
+        if better <= reached:
+            break
+        (A, c), reached, weights = longer, better, further
+    A, c = _extended(A, c, nodes, weights)
+    used = np.array([0, *range(c.size - nodes.size, c.size), s])
+    legendre = np.zeros((used.size, c.size))
+    legendre[:, used] = _legendre_weights(c[used])
+    return Interpolant(A[s + 1 :], c[s + 1 :], legendre)
+
+
+def _extended(A: Array, c: Array, nodes: Array, weights: Array) -> tuple[Array, Array]:
+    """Stages followed by others at `nodes`, with the weights (nodes, stages)."""
+    known = c.size
+    longer = np.zeros((known + nodes.size, known + nodes.size))
+    longer[:known, :known], longer[known:, :known] = A, weights
+    return longer, np.concatenate([c, nodes])
+
+
+def _stages(A: Array, c: Array, nodes: Array, order: int) -> tuple[int, Array]:
+    """Weights (nodes, stages) of positions within the step, and the power of h that the worst of them errs by.
+
+    Each row has the smallest norm among those that meet the order conditions of as many vertices as can be met, up to
+    an error of O(h^order). The conditions are made orthonormal one after the other, by sums of columns: a library's
+    solver would give other bits on another processor.
+    """
+    rows, met = np.zeros((c.size, 0)), np.zeros((0, nodes.size))
+    active, reached = np.ones(nodes.size, bool), np.full(nodes.size, 2)
+    for vertices in range(1, order - 1):
+        before = met.shape[0]
+        for tree in nystrom_trees(vertices):
+            factors = _stage_factors(A, c, tree)
+            size = float(np.sqrt((factors * factors).sum())) or 1.0
+            row, right = factors / size, nodes ** (vertices + 1) / ((vertices + 1) * _density(tree) * size)
+            for _ in range(2):
+                products = (rows * row[:, None]).sum(axis=0)
+                row, right = row - (rows * products).sum(axis=1), right - (products[:, None] * met).sum(axis=0)
+            length = float(np.sqrt((row * row).sum()))
+            if length < DEPENDENT:
+                active &= np.abs(right) < MET
+            else:
+                rows, met = np.column_stack([rows, row / length]), np.vstack([met, right / length])
+        met[before:, ~active] = 0.0
+        reached[active] = vertices + 2
+    return int(reached.min()), np.array([(rows * column).sum(axis=1) for column in met.T])
+
+
+def _stage_factors(A: Array, c: Array, tree: NystromTree) -> Array:
+    """Return the elementary weights of a tree at all stages."""
+    factors = c**tree.leaves
+    for sub in tree.subtrees:
+        factors = factors * (A.T * _stage_factors(A, c, sub)[:, None]).sum(axis=0)
+    return factors
+
+
+def _lobatto_nodes(interior: int) -> Array:
+    """Return the Gauss-Lobatto nodes between 0 and 1, correctly rounded: the zeros of the derivative of P_(k + 1)."""
+    n = interior + 1
+    nodes = []
+    for i in range(n - 1, 0, -1):
+        x = Fraction(math.cos(math.pi * i / n))
+        for _ in range(ITERATIONS):
+            values = _legendre(n, x)
+            slope = n * (values[n - 1] - x * values[n]) / (1 - x * x)
+            x -= slope * (1 - x * x) / (2 * x * slope - n * (n + 1) * values[n])
+            x = Fraction(round(x * 2**BITS), 2**BITS)
+        nodes.append(float((x + 1) / 2))
+    return np.array(nodes)
+
+
+def _legendre(degree: int, x: Any) -> list[Any]:
+    """Return the Legendre polynomials of degrees 0 to `degree` at x."""
+    values = [x * 0 + 1, x]
+    for j in range(1, degree):
+        values.append(((2 * j + 1) * x * values[j] - j * values[j - 1]) / (j + 1))
+    return values
+
+
+def _legendre_weights(nodes: Array) -> Array:
+    """Return the weights (k, k) of Legendre coefficients over values at k Gauss-Lobatto nodes of [0, 1]."""
+    k = nodes.size
+    values = np.array(_legendre(k - 1, 2.0 * nodes - 1.0))
+    factors = np.arange(k) + 0.5
+    factors[-1] = 0.5 * (k - 1)
+    return factors[:, None] * values * (2.0 / (k * (k - 1) * values[-1] ** 2))

@@ -1,0 +1,220 @@
+"""Between the steps of the Nystrom methods: samples, dense output and events as accurate as the steps."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPGJ12, EIPRKN8, EIPRKN12, Invariant, NystromTableau, eip_method, integrate
+from eip_scipy.methods.nystrom import RKN86, RKN1210
+from eip_scipy.methods.nystrom_interpolants import interpolant
+from eip_scipy.problems import kepler
+
+both = pytest.mark.parametrize("method", [EIPRKN8, EIPRKN12])
+STEPS = [{"rtol": 1e-10, "atol": 1e-13}, {"rtol": 1e-12, "atol": 1e-15}, {"h": 0.1}]
+steps = pytest.mark.parametrize("options", STEPS, ids=["1e-10", "1e-12", "fixed"])
+ECCENTRICITY, END = 0.6, 50.0
+TIMES = np.linspace(0.0, END, 501)
+
+
+def pull(t, q):
+    return -q / (q[0] ** 2 + q[1] ** 2) ** 1.5
+
+
+def logarithmic(t, q):
+    return -np.array([q[0], q[1] / 0.64]) / (0.1 + q[0] ** 2 + q[1] ** 2 / 0.64)
+
+
+def galactic_energy(t, y):
+    return 0.5 * (y[2] ** 2 + y[3] ** 2) + 0.5 * np.log(0.1 + y[0] ** 2 + y[1] ** 2 / 0.64)
+
+
+def apsis(t, y):
+    return y[0] * y[2] + y[1] * y[3]
+
+
+def exact_kepler(t):
+    """Return the orbit from its pericentre at t = 0, by Kepler's equation, as (4, m)."""
+    t, e = np.asarray(t, float), ECCENTRICITY
+    u = t + e * np.sin(t)
+    for _ in range(60):
+        u = u - (u - e * np.sin(u) - t) / (1 - e * np.cos(u))
+    b, r = np.sqrt(1 - e * e), 1 - e * np.cos(u)
+    return np.array([np.cos(u) - e, b * np.sin(u), -np.sin(u) / r, b * np.cos(u) / r])
+
+
+PROBLEM = kepler(ECCENTRICITY, relativistic=0.0)
+KEPLER = {"y0": PROBLEM.y0, "invariants": PROBLEM.invariants}
+GALACTIC = {"y0": np.array([1.0, 0.0, 0.1, 0.8]), "invariants": [Invariant(galactic_energy)]}
+
+
+@pytest.fixture(scope="module")
+def exact_galactic():
+    """The galactic orbit by steps so short that both methods and their interpolants agree to 1e-13."""
+    fine = {"h": 0.025, "compensated": True, "dense_output": True, **GALACTIC}
+    return integrate(acceleration=logarithmic, t_span=(0, END), method=EIPRKN12, **fine).sol
+
+
+def field(acceleration):
+    return lambda t, y: np.concatenate([y[2:], acceleration(t, y[:2])])
+
+
+def largest(difference):
+    return np.abs(difference).max()
+
+
+@both
+@steps
+@pytest.mark.parametrize("kept", [True, False], ids=["projected", "plain"])
+@pytest.mark.parametrize("orbit", ["kepler", "galactic"])
+def test_samples_are_as_accurate_as_the_steps(method, options, kept, orbit, exact_galactic):
+    """The closed form of Kepler's problem, and a galactic orbit; 501 samples by all ways to them."""
+    fun, acceleration, given, exact = {
+        "kepler": (PROBLEM, pull, KEPLER, exact_kepler),
+        "galactic": (field(logarithmic), logarithmic, GALACTIC, exact_galactic),
+    }[orbit]
+    given = {**given, **options, "method": method} | ({} if kept else {"invariants": ()})
+    run = integrate(fun, (0, END), save_every=1, dense_output=True, **given)
+    assert run.compiled == (orbit == "kepler")
+    error = max(largest(run.y - exact(run.t)), 1e-14)
+    sampled = integrate(fun, (0, END), t_eval=TIMES, **given)
+    assert largest(sampled.y - exact(TIMES)) < 3 * error
+    np.testing.assert_array_equal(run.sol(TIMES), sampled.y)
+    np.testing.assert_array_equal(run.sol(run.t), run.y)
+    y0 = given.pop("y0")
+    run = solve_ivp(field(acceleration), (0, END), y0, dense_output=True, **given)
+    error = max(largest(run.y - exact(run.t)), 1e-14)
+    assert largest(run.sol(TIMES) - exact(TIMES)) < 3 * error
+
+
+@both
+@steps
+def test_events_are_as_accurate_as_the_steps(method, options):
+    """Passages of the apsides are at multiples of pi, where the radius is 1 - e or 1 + e."""
+    given = {"method": method, "events": apsis, "compiled": False, **KEPLER, **options}
+    run = integrate(acceleration=pull, t_span=(0.1, END), save_every=1, **{**given, "y0": exact_kepler([0.1])[:, 0]})
+    error = max(largest(run.y - exact_kepler(run.t)), 1e-14)
+    turns = np.pi * np.arange(1, 16)
+    assert largest(run.t_events[0] - turns) < 3 * error
+    assert largest(np.array(run.y_events[0]).T - exact_kepler(turns)) < 10 * error
+
+
+@both
+def test_samples_have_the_order_of_the_steps(method):
+    """Halved steps divide the error of samples as they do that of the steps, of order p."""
+    errors = []
+    for h in (0.2, 0.1) if method is EIPRKN8 else (0.25, 0.125):
+        run = integrate(
+            acceleration=pull,
+            t_span=(0, 2),
+            method=method,
+            h=h,
+            t_eval=np.linspace(0, 2, 101),
+            compiled=False,
+            **KEPLER,
+        )
+        errors.append(largest(run.y - exact_kepler(run.t)))
+    assert np.log2(errors[0] / errors[1]) > method.TABLEAU.order - 2.0
+
+
+@both
+def test_backward_and_complex(method):
+    """The same orbit backward, and in the complex plane as one component."""
+    run = integrate(
+        acceleration=pull, t_span=(0, -9), method=method, h=0.05, t_eval=-TIMES[:90], compiled=False, **KEPLER
+    )
+    assert largest(run.y - exact_kepler(run.t)) < (1e-9 if method is EIPRKN8 else 1e-13)
+    y0 = KEPLER["y0"][::2] + 1j * KEPLER["y0"][1::2]
+    plane = integrate(
+        acceleration=lambda t, z: -z / abs(z) ** 3,
+        t_span=(0, -9),
+        y0=y0,
+        method=method,
+        h=0.05,
+        t_eval=-TIMES[:90],
+        compiled=False,
+    )
+    real = integrate(
+        acceleration=pull,
+        t_span=(0, -9),
+        method=method,
+        h=0.05,
+        t_eval=-TIMES[:90],
+        compiled=False,
+        **KEPLER | {"invariants": ()},
+    )
+    np.testing.assert_allclose([plane.y[0].real, plane.y[0].imag], real.y[:2], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(("method", "further"), [(EIPRKN8, 5), (EIPRKN12, 15)])
+def test_evaluations_are_counted(method, further):
+    """Each step with samples in it takes the interpolant's further stages, and no other step does."""
+    given = {"method": method, "h": 0.1, "compiled": False, "y0": PROBLEM.y0}
+    plain = integrate(acceleration=pull, t_span=(0, 5), **given)
+    for count in (1, 20):
+        times = 0.1 * np.arange(10, 20)[:, None] + 0.1 * (np.arange(count) + 0.5) / count
+        assert (
+            integrate(acceleration=pull, t_span=(0, 5), t_eval=times.ravel(), **given).nfev == plain.nfev + 10 * further
+        )
+    assert integrate(acceleration=pull, t_span=(0, 5), dense_output=True, **given).nfev == plain.nfev + 50 * further
+    assert integrate(acceleration=pull, t_span=(0, 5), t_eval=plain.t, **given).nfev == plain.nfev
+
+
+def test_a_multistep_run_too_short_for_a_history():
+    """Its steps are those of the Nystrom method that starts it, and so are its samples."""
+    times = np.linspace(0, 1, 41)
+    run = integrate(acceleration=pull, t_span=(0, 1), method=EIPGJ12, h=0.125, t_eval=times, compiled=False, **KEPLER)
+    assert largest(run.y - exact_kepler(times)) < 1e-9
+
+
+def test_methods_of_low_order_keep_the_quintic():
+    """Nystrom's own method of order 4: the quintic through both ends errs about as much as the steps, for nothing."""
+    tableau = NystromTableau(
+        "Nystrom 4",
+        [[], ["1/8"], [0, "1/2"]],
+        ["1/6", "1/3", 0],
+        ["1/6", "2/3", "1/6"],
+        [0, "1/2", 1],
+        4,
+    )
+    given = {"method": eip_method(tableau), "h": 0.02, "compiled": False, **KEPLER}
+    run = integrate(acceleration=pull, t_span=(0, 5), save_every=1, dense_output=True, **given)
+    times = np.linspace(0, 5, 333)
+    assert run.nfev == integrate(acceleration=pull, t_span=(0, 5), **given).nfev
+    assert largest(run.sol(times) - exact_kepler(times)) < 3 * largest(run.y - exact_kepler(run.t))
+
+
+@pytest.mark.parametrize(("tableau", "stages", "error"), [(RKN86, 5, 7), (RKN1210, 15, 12)], ids=["8", "12"])
+def test_further_stages(tableau, stages, error):
+    """On q'' = q the position at each node, by its definition, misses cosh by a term of the order that it claims."""
+    A, c, legendre = interpolant(tableau)
+    s = tableau.n_stages - tableau.fsal
+    assert A.shape == (stages, s + 1 + stages)
+    misses = []
+    for h in (1.0, 0.5):
+        a = []
+        for i in range(s):
+            a.append(1.0 + h * h * sum(tableau.A[i, j] * a[j] for j in range(i)))
+        a.append(1.0 + h * h * sum(tableau.b[j] * a[j] for j in range(s)))
+        for row in A:
+            a.append(1.0 + h * h * float(np.dot(row[: len(a)], a)))
+        misses.append(np.array(a[s + 1 :]) - np.cosh(c * h))
+    used = np.flatnonzero(legendre.any(axis=0))[1:-1]
+    used = used[used > s] - s - 1
+    assert largest(misses[0][used]) < 5e-7
+    seen = np.log2(np.abs(misses[0][used]).max() / np.abs(misses[1][used]).max())
+    assert seen > error - 0.5 or largest(misses[1]) < 1e-15
+
+
+@pytest.mark.parametrize("tableau", [RKN86, RKN1210], ids=["8", "12"])
+def test_polynomial_through_the_accelerations(tableau):
+    """Legendre coefficients of powers sampled at its nodes are those that NumPy finds."""
+    _, c, legendre = interpolant(tableau)
+    s = tableau.n_stages - tableau.fsal
+    nodes = np.concatenate([np.full(s, np.nan), [1.0], c])
+    nodes[0] = 0.0
+    used = np.flatnonzero(legendre.any(axis=0))
+    x = 2 * nodes[used] - 1
+    for power in range(legendre.shape[0]):
+        expected = np.polynomial.legendre.poly2leg([0.0] * power + [1.0])
+        found = legendre[:, used] @ x**power
+        np.testing.assert_allclose(found, np.pad(expected, (0, len(found) - len(expected))), rtol=0, atol=5e-15)
