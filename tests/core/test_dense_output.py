@@ -1,8 +1,6 @@
 """Dense output: exactly y_k at t_k, on the manifold in between, of SciPy's orders, and safe brackets for events."""
 
-import copy
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -435,13 +433,6 @@ def jit_with_params():
     momentum_value = njit(lambda t, y, p: jit_momentum(t, y))
     second = Invariant(momentum_value, njit(lambda t, y, p: jit_momentum_gradient(t, y)), name="L")
     return fun, event, [Invariant(value, gradient, name="H"), second]
-
-
-def test_copies_and_pickles():
-    sol = solve(EIPRK45, invariants=[H, L], dense_output=True).sol
-    np.testing.assert_array_equal(copy.deepcopy(sol)(1.5), sol(1.5))
-    with pytest.raises(TypeError, match="send its values"):
-        pickle.dumps(sol)
 
 
 # Samples on the manifold.
