@@ -43,6 +43,7 @@ Array = np.ndarray
 ITERATIONS = 5
 # Roots of events that the loop finds before someone looks at them, and the numbers that their states may be.
 MOST_ROOTS, ROOT_NUMBERS = 1024, 2**17
+MOST_CROSSINGS = 3  # of an event in a step, see engine/cpp/crossings.hpp
 
 
 class Interpolants:
@@ -106,6 +107,13 @@ class Interpolants:
         count = int(record.counts[0])
         record.counts[0] = 0
         return record.event[:count], record.t[:count], record.y[:count]
+
+    def pending(self) -> tuple[Array, Array]:
+        """Which events happen in the step that is pending, and when, where the loop left their states to the caller."""
+        record = self.record
+        count = int(record.counts[2])
+        record.counts[2] = 0
+        return record.pending_event[:count], record.pending_t[:count]
 
     def warn(self) -> None:
         """Say where states were left unprojected since the last call."""
@@ -176,8 +184,10 @@ def _record(run: Run, tableau: AnyMethod, events: int) -> Dense:
         event=np.zeros(roots, np.int64),
         t=np.zeros(roots),
         y=np.zeros((roots, n), dtype),
-        counts=np.zeros(2, np.int64),
+        counts=np.zeros(3, np.int64),
         left=np.zeros(events),
+        pending_event=np.zeros(MOST_CROSSINGS * events, np.int64),
+        pending_t=np.zeros(MOST_CROSSINGS * events),
     )
 
 

@@ -48,7 +48,9 @@ class Schedule(NamedTuple):
     """Where a run steps and what it saves.
 
     `place` holds [step, row, pending]: pending is 1 between a step and its becoming the current state, so that whoever
-    is called in between sees both of its ends. `clock` is that of the step.
+    is called in between sees both of its ends. `clock` is that of the step. `g` and `rate` are the events' values and
+    their rates of change at the start of a step, `g_new` and `rate_new` those at its end; a rate that is not known yet
+    is NaN. An event looks in `g_direction`.
     """
 
     span: Span
@@ -58,13 +60,16 @@ class Schedule(NamedTuple):
     clock: np.ndarray
     g: np.ndarray
     g_new: np.ndarray
+    rate: np.ndarray
+    rate_new: np.ndarray
     g_direction: np.ndarray
 
 
 def bare_schedule(span: Span, first: float) -> Schedule:
     """One that saves nothing; `first` is the length of the first step."""
     none = np.zeros(0)
-    return Schedule(span, 0, none, np.zeros(3, np.int64), np.array([span.t0, span.t0, 0.0, first]), none, none, none)
+    clock = np.array([span.t0, span.t0, 0.0, first])
+    return Schedule(span, 0, none, np.zeros(3, np.int64), clock, none, none, none, none, none)
 
 
 class Multistep(NamedTuple):
@@ -305,6 +310,7 @@ class Dense(NamedTuple):
     by what each block travels within the step, else by the run's weights. `missed`: how many states were left
     unprojected, and the time of the first. `event`, `t`, `y`: roots of events that the loop has found, ``counts[0]`` of
     them; ``counts[1]`` interpolants are kept. `left`: how often each event may still happen before it ends the run.
+    `pending_event`, `pending_t`: the ``counts[2]`` roots of a step for whose states there is no room.
     """
 
     kind: int
@@ -322,3 +328,5 @@ class Dense(NamedTuple):
     y: np.ndarray
     counts: np.ndarray
     left: np.ndarray
+    pending_event: np.ndarray
+    pending_t: np.ndarray

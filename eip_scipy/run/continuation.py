@@ -11,6 +11,7 @@ from scipy.integrate import OdeSolution
 from ..core.inputs import is_number, shown
 from ..core.problem import Problem
 from ..core.results import Diagnostics
+from .events import ContinuedEvents, as_events
 from .integrate import integrate
 from .prepare import Request
 from .results import IntegrationResult, Origin
@@ -40,6 +41,8 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
     request = origin.request
     asked = {item.name: getattr(request, item.name) for item in fields(Request) if item.name not in OWN}
     asked |= {**request.projection, "invariants": origin.invariants}
+    if result.t_events is not None:
+        asked["events"] = ContinuedEvents(as_events(asked["events"]), map(len, result.t_events))
     if options.get("t_eval") is not None:
         asked["save_every"] = None
     try:

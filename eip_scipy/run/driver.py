@@ -137,7 +137,7 @@ class Driver:
             "clock": schedule.clock,
             "y": self.state,
             "slope": w.K[0],
-            "g": schedule.g,
+            **({"g": schedule.g, "rate": schedule.rate} if schedule.g.size else {"g": schedule.g}),
             "target": self.run.options.target,
             **nodes,
             **{name: getattr(w, name) for name in kept},
@@ -151,6 +151,8 @@ class Driver:
             copies["clock"][TIME] = self.schedule.clock[TIME_NEW]
             copies["y"], copies["slope"] = self.new.copy(), self.run.work.K[-1].copy()
             copies["g"] = self.schedule.g_new.copy()
+            if self.schedule.g.size:
+                copies["rate"] = self.schedule.rate_new.copy()
         return copies
 
     def load(self, t: np.ndarray, y: np.ndarray) -> None:
@@ -210,14 +212,17 @@ class Driver:
         """Interpolants kept so far."""
         return 0 if self._interpolants is None else int(self._interpolants.record.counts[1])
 
+    def pending_events(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which events happen in the step that is pending, and when; only where the loop left them to the caller."""
+        assert self._interpolants is not None  # the loop pauses for nothing else
+        return self._interpolants.pending()
+
     def dense(self) -> DenseOutput:
         """Dense output over the step that is pending."""
         interpolants = self._interpolants
         assert interpolants is not None  # the loop pauses for nothing else
-        if self._kept:
-            return ManifoldDenseOutput(interpolants, self._pieces[self._kept - 1])
-        t_old, t = (float(self.schedule.clock[place]) for place in (TIME, TIME_NEW))
-        return interpolants.over(t_old, self.state, t, self.new)
+        piece = self._pieces[self._kept - 1] if self._kept else interpolants.record.piece.copy()
+        return ManifoldDenseOutput(interpolants, piece)
 
     def warn(self) -> None:
         """Of states between steps that the loop could not project."""

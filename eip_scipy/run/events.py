@@ -8,15 +8,25 @@ from typing import Any
 
 import numpy as np
 from scipy.integrate import DenseOutput
-from scipy.optimize import brentq
 
 from ..core.arguments import names
 from ..core.inputs import is_number, reals, refuse_units, require_arguments, shown
 from ..core.pointers import address_hint, by_pointer, is_pointer
-from ..engine.data import EPS
 from ..engine.native import Call, call
 
-__all__ = ["Events", "as_events"]
+__all__ = ["ContinuedEvents", "Events", "as_events"]
+
+
+class ContinuedEvents(tuple):
+    """Events of a run that is continued, with the number of times that each has happened before."""
+
+    happened: tuple[int, ...]
+
+    def __new__(cls, events: Any, happened: Any) -> ContinuedEvents:
+        """Take the events, and how often each has happened."""
+        found = super().__new__(cls, events)
+        found.happened = tuple(happened)
+        return found
 
 
 class Events:
@@ -44,7 +54,8 @@ class Events:
         self._extra = extra
         self.directions = np.array([_direction(getattr(item, "direction", 0)) for item in items])
         self._allowed = [_allowed(getattr(item, "terminal", None)) for item in items]
-        self._counts = [0] * len(items)
+        self._before = items.happened if isinstance(items, ContinuedEvents) else (0,) * len(items)
+        self._counts = list(self._before)
         self.t: list[list[float]] = [[] for _ in items]
         self.y: list[list[np.ndarray]] = [[] for _ in items]
         self.last: tuple[float, np.ndarray] = math.nan, np.zeros(0)
@@ -71,8 +82,8 @@ class Events:
         return list(zip(self.directions.tolist(), self._allowed, strict=True))
 
     def restore(self, k: int, t: np.ndarray, y: np.ndarray) -> None:
-        """Let event `k` have happened at the times `t` (m,) in the states `y` (m, n)."""
-        self.t[k], self.y[k], self._counts[k] = t.tolist(), list(y), t.size
+        """Let event `k` have happened in this run at the times `t` (m,) in the states `y` (m, n)."""
+        self.t[k], self.y[k], self._counts[k] = t.tolist(), list(y), self._before[k] + t.size
 
     @property
     def left(self) -> list[float]:
@@ -95,21 +106,26 @@ class Events:
         for k in range(len(self.functions)):
             values[k] = self._value(k, t, y.copy())
 
-    def handle(self, old: np.ndarray, new: np.ndarray, sol: DenseOutput) -> float | None:
-        """Locate the events between the ends of a step; returns the time at which the run ends, if it does."""
-        up, down = (old <= 0) & (new >= 0), (old >= 0) & (new <= 0)
-        rising, falling = up & (self.directions >= 0), down & (self.directions <= 0)
-        active = np.flatnonzero(rising | falling)
-        roots = [(self._root(int(k), sol), int(k)) for k in active]
-        roots.sort(key=lambda found: found[0], reverse=bool(sol.t < sol.t_old))
-        for root, k in roots:
-            self._note(k, root, sol(root))
-            if self._counts[k] >= self._allowed[k]:
-                return root
-        return None
+    def handle(self, which: np.ndarray, times: np.ndarray, sol: DenseOutput) -> float | None:
+        """Note events that happen in a step, in the order of their times; returns the time at which the run ends.
 
-    def _root(self, k: int, sol: DenseOutput) -> float:
-        return float(brentq(lambda t: self._value(k, t, sol(t)), sol.t_old, sol.t, xtol=4 * EPS, rtol=4 * EPS))
+        Returns None where no event ends it.
+
+        Raises
+        ------
+        ValueError
+            When an event has no root where it changes its sign, because it is NaN there.
+        """
+        for k, t in zip(which.tolist(), times.tolist(), strict=True):
+            if math.isnan(t):
+                raise ValueError(
+                    f"event {k} changes its sign between t={sol.t_old:.10g} and t={sol.t:.10g}, but is NaN between, "
+                    "so that its time cannot be found. Let the event return a finite number for every state."
+                )
+            self._note(k, t, sol(t))
+            if self._counts[k] >= self._allowed[k]:
+                return t
+        return None
 
     def _value(self, k: int, t: float, y: np.ndarray) -> float:
         """Event k at (t, y), which it may keep or overwrite."""
@@ -153,7 +169,7 @@ def as_events(events: Any) -> tuple[Callable[..., Any], ...]:
     for item in items:
         if not callable(item):
             raise TypeError(f"events must be callable, got {shown(item)}{address_hint(item)}.")
-    return items
+    return ContinuedEvents(items, events.happened) if isinstance(events, ContinuedEvents) else items
 
 
 def _adapted(event: Any, k: int) -> Any:

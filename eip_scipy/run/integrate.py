@@ -395,7 +395,7 @@ class Loop:
         """Samples and events in the step that is pending; True where an event ends the run."""
         driver, schedule = self.driver, self.driver.schedule
         sol = driver.dense()
-        end = self.events.handle(schedule.g, schedule.g_new, sol)
+        end = self.events.handle(*driver.pending_events(), sol)
         limit = sol.t if end is None else end
         while driver.rows < schedule.t_eval.size and schedule.span.sign * (schedule.t_eval[driver.rows] - limit) <= 0:
             t = float(schedule.t_eval[driver.rows])

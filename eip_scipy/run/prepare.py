@@ -543,6 +543,8 @@ def _schedule(span: Span, tau: float, request: Request, events: Events) -> Sched
         clock=np.array([span.t0, span.t0, 0.0, tau]),
         g=np.zeros(n_events),
         g_new=np.zeros(n_events),
+        rate=np.full(n_events, np.nan),
+        rate_new=np.zeros(n_events),
         g_direction=events.directions,
     )
 

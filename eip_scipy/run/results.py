@@ -136,8 +136,9 @@ class IntegrationResult(OptimizeResult):
             duration from t = 0, or a time.
         **options
             Options of `integrate` that are to be others than before. Times in `t_eval` are not asked for again: give
-            new ones, or the states at both ends are saved. An event that ended the run may end it again at once;
-            ``events=None`` leaves it out.
+            new ones, or the states at both ends are saved. Events keep their counts: one with ``terminal = 3`` that
+            happened twice before ends the run when it happens once more. An event that ended the run may end it again
+            at once; ``events=None`` leaves it out. Events that are given anew begin to count at 0.
 
         Returns
         -------

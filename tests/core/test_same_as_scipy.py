@@ -57,6 +57,10 @@ def level(name, method):
     return 1e-12 if method is OURS[name] else OWN_LEVEL[name]
 
 
+# Roots are right to 4 eps (1 + |t|) in SciPy, and to 4 eps (h + |t|) in `integrate`. States move by this times a slope.
+ROOTS = 256 * EPS
+
+
 def assert_close(ours, theirs, rtol):
     """To rtol of the largest size that a component takes."""
     ours, theirs = np.asarray(ours), np.asarray(theirs)
@@ -401,11 +405,13 @@ def test_events_of_integrate(case, method, projected, compiled, terminal):
         jit_event.terminal = False
     assert run.compiled is compiled
     assert sol.status == (1 if terminal else 0)
-    compare(run, sol, counts=False)
+    if not terminal:
+        compare(run, sol, counts=False)
+    for name in ("t", "y"):
+        assert_close(run[name], sol[name], ROOTS)
     for kind in ("t_events", "y_events"):
         for mine, other in zip(run[kind], sol[kind], strict=True):
-            assert mine.shape == other.shape
-            np.testing.assert_array_equal(mine, other)
+            assert_close(mine.T, other.T, ROOTS)
 
 
 @drivers
@@ -424,8 +430,8 @@ def test_terminal_event_and_t_eval(method, compiled):
     assert 10 < len(sol.t) < 301
     np.testing.assert_array_equal(run.t, sol.t)
     assert_close(run.y, sol.y, 8 * EPS)
-    np.testing.assert_array_equal(run.t_events[0], sol.t_events[0])
-    np.testing.assert_array_equal(run.y_events[0], sol.y_events[0])
+    for kind in ("t_events", "y_events"):
+        assert_close(run[kind][0].T, sol[kind][0].T, ROOTS)
 
 
 OPTIONS_OF_BOTH = {

@@ -1,4 +1,4 @@
-"""States between steps and roots of events in the compiled loop: those of solve_ivp, and of SciPy's root finder."""
+"""States between steps and roots of events in the loop: those of solve_ivp, and of functions in Python."""
 
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -105,8 +105,8 @@ def assert_same(one, other):
 
 @methods
 @pytest.mark.parametrize("span", [(0.0, 30.0), (30.0, 0.0)], ids=["forward", "backward"])
-def test_roots_in_the_loop_are_scipy_s(method, steps, span):
-    """Interpreted, SciPy's own root finder is at work."""
+def test_roots_and_samples_of_compiled_and_interpreted_runs(method, steps, span):
+    """Return the same bits."""
     times = np.linspace(*span, 500)
     options = {"t_eval": times, "events": EVENTS, "span": span, "dense_output": True, **steps}
     compiled, interpreted = run(method, **options), run(method, compiled=False, **options)
@@ -185,7 +185,7 @@ def test_more_roots_than_the_loop_has_room_for():
 
 
 def test_an_event_that_is_nan_in_between():
-    """SciPy's own error, as interpreted."""
+    """Raise an error that names the event and the step."""
 
     @njit
     def broken(t, y, params):

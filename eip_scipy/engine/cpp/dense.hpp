@@ -221,18 +221,51 @@ inline void nystrom(const DenseRun &dense, const Piece &piece, double h, const W
     for (int64_t i = 0; i < m; ++i) missing[i] = piece.y[i] - missing[i];
 }
 
+// How many nodes before the newest a step begins at t_old.
+inline int64_t nodes_back(const Multistep &ms, double t_old) {
+    return ms.place[NEWEST] - std::llround((t_old - ms.t0) / ms.h);
+}
+
 // For the nodes of a multistep method: the accelerations of the whole history, and behind them how many nodes before the
 // newest the step begins, and its length in nodes' distances.
 inline void history(const Dense &d, const Piece &piece, double *f_old, double *f, const Work &w) {
     const Multistep &ms = *d.multistep;
     double *about = piece.rows + (d.rows() - 1) * w.m;
     const double h = *piece.t - *piece.t_old;
-    const int64_t back = ms.place[NEWEST] - std::llround((*piece.t_old - ms.t0) / ms.h);
+    const int64_t back = nodes_back(ms, *piece.t_old);
     about[0] = static_cast<double>(back);
     about[1] = h / ms.h;
     for (int64_t j = 0; j < ms.order; ++j) copy(newest(ms) - j * ms.pitch, piece.rows + j * ms.half, ms.half);
     slope_of(ms, back, piece.y_old, f_old);
     if (back > 0) slope_of(ms, back - 1, piece.y, f);
+}
+
+// The derivative at the start of the step just made, and at its end: where the step left it, from the history of a multistep
+// method, or by an evaluation where the method leaves none.
+inline const double *slope_at_start(const Run &run, const Dense &d, double t_old, const double *y_old) {
+    double *f = d.work.row(0);
+    if (d.own_slopes) {
+        run.system.rhs(d.work, t_old, y_old, f);
+        ++run.work.counters[NFEV];
+        return f;
+    }
+    if (!d.multistep || d.multistep->brief) return run.work.row(0);
+    slope_of(*d.multistep, nodes_back(*d.multistep, t_old), y_old, f);
+    return f;
+}
+
+inline const double *slope_at_end(const Run &run, const Dense &d, double t_old, double t, const double *y) {
+    double *f = d.work.last();
+    if (d.own_slopes) {
+        run.system.rhs(d.work, t, y, f);
+        ++run.work.counters[NFEV];
+        return f;
+    }
+    if (!d.multistep || d.multistep->brief) return run.work.last();
+    const int64_t back = nodes_back(*d.multistep, t_old);
+    if (back == 0) return run.work.last();
+    slope_of(*d.multistep, back - 1, y, f);
+    return f;
 }
 
 // Its value: the state at the step's start, and the polynomial through the accelerations integrated twice.

@@ -5,20 +5,21 @@
 #include <type_traits>
 
 #include "control.hpp"
+#include "crossings.hpp"
 #include "dense.hpp"
-#include "roots.hpp"
 
 namespace eip {
 
 // Where a run steps and what it saves. `place` holds [step, row, pending]: pending is 1 between a step and its becoming
-// the current state, so that whoever is called in between sees both of its ends.
+// the current state, so that whoever is called in between sees both of its ends. Of the events there are the values and
+// the rates of change at both ends; a rate that is not known yet is NaN.
 struct Schedule {
     Span span;
     int64_t save_every;
     const double *t_eval;
     int64_t n_eval;
     int64_t *place;
-    double *clock, *g, *g_new;
+    double *clock, *g, *g_new, *rate, *rate_new;
     const double *g_direction;
     int64_t n_events;
 };
@@ -29,11 +30,12 @@ struct Saved {
 };
 
 // Roots that the loop has found since someone looked: of which event, when, in which state. `left`: how often an event may
-// still happen before it ends the run.
+// still happen before it ends the run. The roots of a step for whose states there is too little room
+// are `pending_*`.
 struct Roots {
-    int64_t *event;
-    double *t, *y;
-    int64_t *count;
+    int64_t *event, *pending_event;
+    double *t, *y, *pending_t;
+    int64_t *count, *pending_count;
     int64_t capacity;
     double *left;
 };
@@ -53,41 +55,102 @@ struct Samples {
     double *piece;  // scratch for the interpolant of a step
 };
 
-// Whether event i changes its sign in the direction that it looks at.
-inline bool crossed(const Schedule &s, int64_t i) {
-    return (s.g[i] <= 0.0 && 0.0 <= s.g_new[i] && s.g_direction[i] >= 0.0) ||
-           (s.g[i] >= 0.0 && 0.0 >= s.g_new[i] && s.g_direction[i] <= 0.0);
+// Says whether event i goes from the value `before` to the value `after` in the direction that it looks at.
+inline bool crosses(const Schedule &s, int64_t i, double before, double after) {
+    return (before <= 0.0 && 0.0 <= after && s.g_direction[i] >= 0.0) ||
+           (before >= 0.0 && 0.0 >= after && s.g_direction[i] <= 0.0);
 }
 
-inline bool any_crossed(const Schedule &s) {
+inline EventEnds ends_of(const Schedule &s, int64_t i) {
+    const double h = s.clock[TIME_NEW] - s.clock[TIME];
+    return {s.g[i], s.g_new[i], h * s.rate[i], h * s.rate_new[i]};
+}
+
+// Says whether an event happens in the step, or may happen there twice.
+inline bool any_crossing(const Schedule &s) {
     for (int64_t i = 0; i < s.n_events; ++i)
-        if (crossed(s, i)) return true;
+        if (crosses(s, i, s.g[i], s.g_new[i]) || may_cross_inside(ends_of(s, i))) return true;
     return false;
 }
 
-// Notes the events that happen in a step, in the order of their times. ENDED where one of them ends the run, at `end`: what
-// comes after it does not count. PAUSE, and nothing noted, where one has no root to be found.
-inline Code locate(const Run &run, const DenseRun &dense, const Schedule &s, Roots &roots, double *piece, double &end) {
+// Values of the events at the end of the step, and their rates of change: a difference over a small part of the step, inside
+// of it, along the slope of the state.
+[[gnu::noinline]] inline void evaluate_events(const Run &run, const Dense &d, const Schedule &s, const double *y,
+                                              const double *y_new) {
+    const Work &w = run.work;
+    const double t = s.clock[TIME], t_new = s.clock[TIME_NEW], part = SLOPE_PART * (t_new - t);
+    double *state = d.work.y_hat;
+    const auto values_near = [&](double time, double distance, const double *at, const double *f, double *values) {
+        for (int64_t i = 0; i < w.m; ++i) state[i] = at[i] + distance * f[i];
+        run.system.event(w, time + distance, state, values);
+    };
+    run.system.event(w, t_new, y_new, s.g_new);
+    if (std::isnan(s.rate[0])) {
+        values_near(t, part, y, slope_at_start(run, d, t, y), s.rate);
+        for (int64_t i = 0; i < s.n_events; ++i) s.rate[i] = (s.rate[i] - s.g[i]) / part;
+    }
+    values_near(t_new, -part, y_new, slope_at_end(run, d, t, t_new, y_new), s.rate_new);
+    for (int64_t i = 0; i < s.n_events; ++i) s.rate_new[i] = (s.g_new[i] - s.rate_new[i]) / part;
+}
+
+struct Root {
+    double t;
+    int64_t event;
+};
+
+// The roots of all events in a step, in the order of their times; NaN for one that is not found.
+inline std::vector<Root> roots_in_step(const Run &run, const DenseRun &dense, const Schedule &s, double *piece) {
     const auto &w = run.work;
+    const double t = s.clock[TIME], t_new = s.clock[TIME_NEW], length = std::abs(t_new - t);
     std::vector<double> values(s.n_events), state(w.m);
-    std::vector<std::pair<double, int64_t>> found;
+    std::vector<Root> found;
     for (int64_t i = 0; i < s.n_events; ++i) {
-        if (!crossed(s, i)) continue;
-        const double root = root_between(s.clock[TIME], s.g[i], s.clock[TIME_NEW], s.g_new[i], [&](double t) {
-            interpolate(dense, piece, t, state.data());
-            run.system.event(w, t, state.data(), values.data());
+        const auto value_at = [&](double time) {
+            interpolate(dense, piece, time, state.data());
+            run.system.event(w, time, state.data(), values.data());
             return values[i];
-        });
-        if (std::isnan(root)) return PAUSE;
-        const auto place = std::find_if(found.begin(), found.end(),
-                                        [&](const auto &other) { return s.span.sign * (root - other.first) < 0.0; });
-        found.emplace(place, root, i);
+        };
+        const auto time_of = [&](double theta) { return t + theta * (t_new - t); };
+        const EventEnds ends = ends_of(s, i);
+        EventPoints inside;
+        if (may_cross_inside(ends)) inside = points_inside(ends, [&](double theta) { return value_at(time_of(theta)); });
+        double before = t, g_before = s.g[i];
+        for (int k = 0; k <= inside.count; ++k) {
+            const bool last = k == inside.count;
+            const double after = last ? t_new : time_of(inside.point[k].theta);
+            const double g_after = last ? s.g_new[i] : inside.point[k].value;
+            if (crosses(s, i, g_before, g_after)) {
+                const double root = root_between(length, before, g_before, after, g_after, value_at);
+                const auto place = std::find_if(found.begin(), found.end(), [&](const Root &other) {
+                    return s.span.sign * (root - other.t) < 0.0;
+                });
+                found.insert(place, {root, i});
+            }
+            before = after;
+            g_before = g_after;
+        }
+    }
+    return found;
+}
+
+// Notes the events that happen in a step, in the order of their times. ENDED where one of them ends the run, at `end`: what
+// comes after it does not count. PAUSE, with all of them pending, if their states have no room or one cannot be found.
+inline Code locate(const Run &run, const DenseRun &dense, const Schedule &s, Roots &roots, double *piece, double &end) {
+    const std::vector<Root> found = roots_in_step(run, dense, s, piece);
+    const auto number = std::ssize(found);
+    const bool lost = std::any_of(found.begin(), found.end(), [](const Root &root) { return std::isnan(root.t); });
+    if (lost || roots.capacity - *roots.count < number) {
+        for (const auto &[t, event] : found) {
+            roots.pending_event[*roots.pending_count] = event;
+            roots.pending_t[(*roots.pending_count)++] = t;
+        }
+        return PAUSE;
     }
     for (const auto &[t, event] : found) {
         int64_t &count = *roots.count;
         roots.event[count] = event;
         roots.t[count] = t;
-        interpolate(dense, piece, t, roots.y + count * w.m);
+        interpolate(dense, piece, t, roots.y + count * run.work.m);
         ++count;
         roots.left[event] -= 1.0;
         if (roots.left[event] <= 0.0) {
@@ -99,21 +162,17 @@ inline Code locate(const Run &run, const DenseRun &dense, const Schedule &s, Roo
 }
 
 // What is asked for within the step that is pending: its interpolant, roots of events, states at given times. OK, ENDED by
-// an event, or PAUSE where the caller has to do it: events in Python, one without a root, no room for more.
+// an event, or PAUSE where the caller has to do the rest, see `locate`.
 inline Code sample(const Run &run, Samples &samples, const Schedule &s, const double *y, const double *y_new,
                    const Saved &saved) {
     const auto &w = run.work;
     const DenseRun dense(samples.dense, run.system);
     Pieces &kept = samples.interpolants;
-    Roots &roots = samples.roots;
     double end = s.clock[TIME_NEW];
-    const bool crossing = any_crossed(s), able = !run.system.python && roots.capacity - *roots.count >= s.n_events;
-    if (crossing && !able && kept.capacity == 0) return PAUSE;
     double *piece = kept.capacity > 0 ? kept.first + *kept.count * samples.dense.floats() : samples.piece;
     describe(dense, w, s.clock[TIME], y, end, y_new, piece);
     *kept.count += kept.capacity > 0;
-    Code code = OK;
-    if (crossing) code = able ? locate(run, dense, s, roots, piece, end) : PAUSE;
+    const Code code = any_crossing(s) ? locate(run, dense, s, samples.roots, piece, end) : OK;
     for (int64_t &row = s.place[ROW]; code != PAUSE && row < s.n_eval; ++row) {
         if (s.span.sign * (s.t_eval[row] - end) > 0.0) break;
         saved.t[row] = s.t_eval[row];
@@ -127,7 +186,7 @@ inline Code sample(const Run &run, Samples &samples, const Schedule &s, const do
 inline bool wants_samples(const Work &w, const Samples *samples, const Schedule &s, const double *y_new,
                           const Saved &saved) {
     int64_t &row = s.place[ROW];
-    if (any_crossed(s) || (samples && samples->interpolants.capacity > 0)) return true;
+    if (any_crossing(s) || (samples && samples->interpolants.capacity > 0)) return true;
     const double t_new = s.clock[TIME_NEW];
     if (row >= s.n_eval || s.span.sign * (s.t_eval[row] - t_new) > 0.0) return false;
     if (s.t_eval[row] != t_new) return true;
@@ -169,6 +228,7 @@ template <class AnyRun>
             copy(w.last(), w.row(0), w.m);
             copy(y_new, y, w.m);
             copy(s.g_new, s.g, s.n_events);
+            copy(s.rate_new, s.rate, s.n_events);
             place[PENDING] = 0;
         }
         const int64_t k = place[STEP];
@@ -191,7 +251,7 @@ template <class AnyRun>
             copy(y_new, saved.y + place[ROW] * w.m, w.m);
             ++place[ROW];
         }
-        if (s.n_events > 0) run.system.event(w, t_new, y_new, s.g_new);
+        if (s.n_events > 0) evaluate_events(of_any_length(run), samples->dense, s, y, y_new);
         if (!wants_samples(w, samples, s, y_new, saved)) continue;
         const Code code = samples ? sample(of_any_length(run), *samples, s, y, y_new, saved) : PAUSE;
         if (code != OK) return code;

@@ -49,6 +49,7 @@ inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, co
     for (int64_t i = 0; i < w.l; ++i) w.figures(i)[TERMS] = INFINITE;
     if (o.watched) start_figures(y, w.row(0), members.first_steps[k], o, w);
     if (s.n_events > 0) system.event(w, t0, y, s.g);
+    fill(s.rate, NOT_A_NUMBER, s.n_events);
     if (samples) {
         *samples->roots.count = 0;
         copy(members.left, samples->roots.left, s.n_events);

@@ -219,6 +219,8 @@ Schedule schedule_of(PyObject *schedule, Arrays &arrays) {
     s.clock = arrays.floats(schedule, "clock", {4});
     s.g = arrays.floats(schedule, "g", {s.n_events});
     s.g_new = arrays.floats(schedule, "g_new", {s.n_events});
+    s.rate = arrays.floats(schedule, "rate", {s.n_events});
+    s.rate_new = arrays.floats(schedule, "rate_new", {s.n_events});
     s.g_direction = arrays.floats(schedule, "g_direction", {s.n_events});
     return s;
 }
@@ -277,9 +279,12 @@ Samples samples_of(PyObject *dense, const Data &run, int64_t events, Arrays &arr
     roots.t = arrays.floats(dense, "t", {roots.capacity});
     roots.y = static_cast<double *>(arrays.memory_of(dense, "y", type, {roots.capacity, d.work.n}));
     roots.left = arrays.floats(dense, "left", {events});
+    roots.pending_event = arrays.integers<int64_t>(dense, "pending_event", {MOST_CROSSINGS * events});
+    roots.pending_t = arrays.floats(dense, "pending_t", {MOST_CROSSINGS * events});
     samples.piece = arrays.floats(dense, "piece", {d.floats()});
-    auto *counts = arrays.integers<int64_t>(dense, "counts", {2});
+    auto *counts = arrays.integers<int64_t>(dense, "counts", {3});
     roots.count = counts;
+    roots.pending_count = counts + 2;
     samples.interpolants.count = counts + 1;
     return samples;
 }

@@ -7,13 +7,14 @@
 
 namespace eip {
 
-constexpr double ROOT_TOLERANCE = 4.0 * EPS;  // absolute and relative, as solve_ivp asks for
+constexpr double ROOT_TOLERANCE = 4.0 * EPS;  // of the step's length, and relative to the time
 constexpr int MAX_ROOT_STEPS = 100;
 
 // A root of f between a and b, where its values fa and fb differ in sign; NaN where f is, or without convergence. Brent's
-// method, each operation as in scipy.optimize.brentq, so that solve_ivp and this loop find the same root.
+// method, each operation as in scipy.optimize.brentq. `length` is that of the step, whatever the unit of time: SciPy's
+// absolute tolerance of 9e-16 would be all of a step of 1e-15.
 template <class Function>
-inline double root_between(double a, double fa, double b, double fb, Function f) {
+inline double root_between(double length, double a, double fa, double b, double fb, Function f) {
     if (fa == 0.0) return a;
     double before = a, f_before = fa, best = b, f_best = fb, other = 0.0, f_other = 0.0;
     double last = 0.0, move = 0.0;  // the two moves made last
@@ -31,7 +32,7 @@ inline double root_between(double a, double fa, double b, double fb, Function f)
             f_best = f_other;
             f_other = f_before;
         }
-        const double tolerance = (ROOT_TOLERANCE + ROOT_TOLERANCE * std::abs(best)) / 2.0, half = (other - best) / 2.0;
+        const double tolerance = ROOT_TOLERANCE * (length + std::abs(best)) / 2.0, half = (other - best) / 2.0;
         if (f_best == 0.0 || std::abs(half) < tolerance) return best;
         double next = half;
         if (std::abs(last) > tolerance && std::abs(f_best) < std::abs(f_before)) {

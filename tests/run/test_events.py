@@ -1,0 +1,267 @@
+"""Events of `integrate`: their times, two crossings within one step, and their counts in a run that is continued."""
+
+import math
+
+import numpy as np
+import pytest
+from numba import njit
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPRK4,
+    EIPRK45,
+    Invariant,
+    eip_method,
+    ensemble,
+    integrate,
+)
+from eip_scipy.problems import kepler
+
+PHASE = 0.3
+SPAN = 50.0
+
+
+def oscillator(t, y):
+    return np.array([y[1], -y[0]])
+
+
+def energy(t, y):
+    return 0.5 * (y[0] * y[0] + y[1] * y[1])
+
+
+def energy_gradient(t, y):
+    return y.copy()
+
+
+START = [math.cos(PHASE), -math.sin(PHASE)]
+ENERGY = Invariant(energy, grad=energy_gradient)
+
+
+def passages(level, end=SPAN):
+    """Return the times at which cos(t + PHASE) has this level."""
+    angle = math.acos(level)
+    found = [sign * angle + 2 * math.pi * k - PHASE for k in range(20) for sign in (-1, 1)]
+    return np.array(sorted(t for t in found if 0 < t < end))
+
+
+def reaching(level, direction=0, terminal=None):
+    def event(t, y):
+        return y[0] - level
+
+    event.direction, event.terminal = direction, terminal
+    return event
+
+
+def compiled(event):
+    found = njit(event)
+    found.direction, found.terminal = event.direction, event.terminal
+    return found
+
+
+@pytest.mark.parametrize("scale", [1e-15, 1.0, 1e12])
+@pytest.mark.parametrize("start", [0.0, -1.0])
+def test_times_are_relative_to_the_step(scale, start):
+    """The event is at 0.3 of the interval, exactly: y grows by 1 over it."""
+    begin = start * scale
+    run = integrate(
+        lambda t, y: [1 / scale],
+        (begin, begin + scale),
+        [0.0],
+        method=EIPRK45,
+        events=lambda t, y: y[0] - 0.3,
+        rtol=1e-3,
+        atol=1e-6,
+    )
+    np.testing.assert_allclose(run.t_events[0], [begin + 0.3 * scale], rtol=0, atol=1e-15 * scale)
+
+
+ACCURATE = {
+    "DOP853, adaptive": (EIPDOP853, {"rtol": 1e-12, "atol": 1e-12}, 1e-6),
+    "DOP853": (EIPDOP853, {"h": 1.0}, 1e-5),
+    "RK4": (EIPRK4, {"h": 0.05}, 1e-3),
+    "RK45, few steps": (EIPRK45, {"h": 0.5}, 2e-2),
+}
+
+
+LEVELS = [0.0, 0.9, 0.9999, 1 - 1e-7, -0.7]
+# The errors of the methods of low order are larger than the height of the shortest passages.
+CASES = [(name, level) for name in ACCURATE for level in LEVELS if "DOP853" in name or level <= 0.9]
+
+
+@pytest.mark.parametrize(("name", "level"), CASES)
+def test_both_crossings_of_a_grazing_passage(name, level):
+    """The closed form is cos(t + PHASE) = level; a passage above 1 - 1e-7 takes 9e-4, a thousandth of a step."""
+    method, options, error = ACCURATE[name]
+    run = integrate(oscillator, (0, SPAN), START, method=method, events=reaching(level), invariants=ENERGY, **options)
+    expected = passages(level)
+    assert run.t_events[0].size == expected.size
+    # An error of the state moves the time by itself over the slope at the passage.
+    np.testing.assert_allclose(run.t_events[0], expected, rtol=0, atol=error)
+    np.testing.assert_allclose(run.y_events[0][:, 0], level, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("rtol", [1e-3, 1e-6, 1e-12])
+def test_grazing_passages_of_an_orbit(rtol):
+    """Kepler's equation gives the times at which x = cos E - e reaches a level just below its largest value, 1 - e."""
+    e, end = 0.6, 60.0
+    problem = kepler(e, relativistic=0)
+    for level in (1 - e - 1e-4, -1 - e + 1e-3, 0.0):
+        anomaly = math.acos(level + e)
+        times = [s * (anomaly - e * math.sin(anomaly)) + 2 * math.pi * k for k in range(12) for s in (-1, 1)]
+        expected = sorted(t for t in times if 0 < t < end)
+        run = integrate(problem, (0, end), method=EIPDOP853, rtol=rtol, atol=1e-3 * rtol, events=directed(level, 0))
+        if rtol < 1e-3:
+            assert run.t_events[0].size == len(expected)
+        if rtol < 1e-6:
+            np.testing.assert_allclose(run.t_events[0], expected, rtol=0, atol=1e-6)
+        # The levels are crossed up and down in turn, whatever the error of the orbit: both ways as often.
+        ways = [
+            integrate(problem, (0, end), method=EIPDOP853, rtol=rtol, atol=1e-3 * rtol, events=one).t_events[0].size
+            for one in (directed(level, 1), directed(level, -1))
+        ]
+        assert sum(ways) == run.t_events[0].size
+        assert abs(ways[0] - ways[1]) <= 1
+
+
+def directed(level, direction):
+    def event(t, y, *_):
+        return y[0] - level
+
+    event.direction = direction
+    return event
+
+
+def test_three_crossings_in_one_step():
+    """The event is a cubic of the time with zeros at 0.2, 0.5 and 0.8; the step is from 0 to 1."""
+    zeros = np.array([0.2, 0.5, 0.8])
+    for direction, expected in ((0, zeros), (1, zeros[::2]), (-1, zeros[1:2])):
+
+        def event(t, y):
+            return float(np.prod(y[0] - zeros))
+
+        event.direction = direction
+        run = integrate(lambda t, y: [1.0], (0, 1), [0.0], method=EIPRK4, h=1.0, events=event)
+        np.testing.assert_allclose(run.t_events[0], expected, rtol=0, atol=1e-15)
+
+
+def test_a_passage_that_does_not_reach_zero_is_none():
+    for height in (1e-3, 1e-9, 1e-14):
+        run = integrate(
+            oscillator, (0, SPAN), START, method=EIPDOP853, h=0.5, events=reaching(1 + height), invariants=ENERGY
+        )
+        assert run.t_events[0].size == 0
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853])
+def test_compiled_and_interpreted_events_have_the_same_bits(method):
+    level = reaching(0.99)
+    options = {"method": method, "h": 0.7}
+    run = integrate(oscillator, (0, SPAN), START, events=level, invariants=ENERGY, **options)
+    kept = Invariant(njit(energy), grad=njit(energy_gradient))
+    for event in (level, compiled(level)):
+        other = integrate(njit(oscillator), (0, SPAN), START, events=event, invariants=kept, **options)
+        np.testing.assert_array_equal(other.t_events[0], run.t_events[0])
+        np.testing.assert_array_equal(other.y_events[0], run.y_events[0])
+    assert run.t_events[0].size == passages(0.99).size
+
+
+def test_directions_and_the_order_in_time_within_one_step():
+    """Count of two crossings in a step the one in the direction of the event, and end the run by the second."""
+    for direction, first in ((1, 0), (-1, 1)):  # the run begins below the level: the first passage is up
+        event = reaching(0.99, direction)
+        run = integrate(oscillator, (0, SPAN), START, method=EIPDOP853, h=1.0, events=event, invariants=ENERGY)
+        np.testing.assert_allclose(run.t_events[0], passages(0.99)[first::2], rtol=0, atol=1e-5)
+    ended = integrate(
+        oscillator,
+        (0, SPAN),
+        START,
+        method=EIPDOP853,
+        h=1.0,
+        events=[reaching(0.995), reaching(0.99, terminal=3)],
+        invariants=ENERGY,
+        save_every=1,
+    )
+    assert ended.status == 1
+    assert ended.t[-1] == ended.t_events[1][-1]
+    assert ended.t_events[1].size == 3
+    np.testing.assert_allclose(ended.t_events[1], passages(0.99)[:3], rtol=0, atol=1e-5)
+    # What comes later in the step that ends the run does not count.
+    assert (ended.t_events[0] < ended.t[-1]).all()
+
+
+def test_backward_in_time():
+    forward = integrate(oscillator, (0, SPAN), START, method=EIPDOP853, h=1.0, events=reaching(0.9), invariants=ENERGY)
+    end = [math.cos(SPAN + PHASE), -math.sin(SPAN + PHASE)]
+    back = integrate(oscillator, (SPAN, 0), end, method=EIPDOP853, h=1.0, events=reaching(0.9), invariants=ENERGY)
+    np.testing.assert_allclose(back.t_events[0][::-1], forward.t_events[0], rtol=0, atol=1e-5)
+
+
+class Verlet:
+    """Position Verlet for the unit oscillator."""
+
+    order = 2
+
+    def one_step(self, t, y, h):
+        y[0] += h / 2 * y[1]
+        y[1] -= h * y[0]
+        y[0] += h / 2 * y[1]
+        return y
+
+
+def test_one_step_methods_look_inside_too():
+    """Their steps leave no derivative; the event's rate takes one evaluation more."""
+    method = eip_method(Verlet())
+    run = integrate(oscillator, (0, SPAN), START, method=method, h=0.3, events=reaching(0.97))
+    assert run.t_events[0].size == passages(0.97).size
+
+
+@pytest.mark.needs_jit
+def test_members_of_an_ensemble_end_at_grazing_passages():
+    starts = np.array([[math.cos(p), -math.sin(p)] for p in (0.3, 0.4, 2.0)])
+    level = compiled(reaching(0.99, terminal=2))
+    kept = Invariant(njit(energy), grad=njit(energy_gradient))
+    options = {"method": EIPDOP853, "h": 1.0, "events": level, "invariants": kept}
+    run = ensemble(njit(oscillator), (0, SPAN), starts, **options)
+    for k, start in enumerate(starts):
+        alone = integrate(njit(oscillator), (0, SPAN), start, **options)
+        assert run.t[k] == alone.t[-1]
+        np.testing.assert_array_equal(run.y[k], alone.y[:, -1])
+
+
+@pytest.mark.parametrize("as_compiled", [False, pytest.param(True, marks=pytest.mark.needs_jit)])
+def test_counts_go_on_in_a_continued_run(as_compiled):
+    event = reaching(0.9, terminal=5)
+    fun = oscillator
+    if as_compiled:
+        event, fun = compiled(event), njit(oscillator)
+    times = passages(0.9)
+    run = integrate(fun, (0, times[2] + 0.1), START, method=EIPDOP853, h=0.1, events=event)
+    assert run.t_events[0].size == 3
+    run = run.continue_to(times[3] + 0.1)
+    assert (run.status, run.t_events[0].size) == (0, 4)
+    run = run.continue_to(SPAN)
+    assert (run.status, run.t_events[0].size) == (1, 5)
+    np.testing.assert_allclose(run.t_events[0], times[:5], rtol=0, atol=1e-7)
+    # Events that are given anew begin to count at 0.
+    other = integrate(fun, (0, times[2] + 0.1), START, method=EIPDOP853, h=0.1, events=event)
+    other = other.continue_to(SPAN, events=event)
+    assert (other.status, other.t_events[0].size) == (1, 3 + 5)
+
+
+def test_counts_go_on_from_a_checkpoint_of_a_continued_run(tmp_path):
+    event, times = reaching(0.9, terminal=5), passages(0.9)
+    first = integrate(oscillator, (0, times[1] + 0.1), START, method=EIPDOP853, h=0.1, events=event)
+    path, stopped = tmp_path / "run", []
+
+    def stop(t, y, defects):
+        if t > times[3] + 0.1 and not stopped:
+            stopped.append(t)
+            raise RuntimeError("broken off")
+
+    options = {"checkpoint": path, "resume": True, "save_every": 1, "callback": stop}
+    with pytest.raises(RuntimeError, match="broken off"):
+        first.continue_to(SPAN, **options)
+    run = first.continue_to(SPAN, **options)
+    assert (run.status, run.t_events[0].size) == (1, 5)
+    np.testing.assert_allclose(run.t_events[0], times[:5], rtol=0, atol=1e-7)
