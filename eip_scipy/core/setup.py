@@ -80,8 +80,13 @@ class Run:
     left_out: str = ""
     looked: int = -1
 
-    def engine(self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, **others: Any) -> Engine:
-        """The engine of the run, which begins where work.K[0] is the derivative; `others` are further `Hooks`."""
+    def engine(
+        self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, *, begins: bool = True, **others: Any
+    ) -> Engine:
+        """Return the engine of the run, which `begins` where work.K[0] is the derivative, or is to go on.
+
+        `others` are further `Hooks`.
+        """
         one_step = self.method if isinstance(self.method, OneStep) else None
         hooks = Hooks(
             one_step=None if one_step is None else partial(one_step.fill, self.work),
@@ -90,7 +95,7 @@ class Run:
             **others,
         )
         engine, w = Engine(self.method, self.options, self.work, functions, schedule, _if_any(hooks)), self.work
-        if self.options.watched:
+        if self.options.watched and begins:
             t, f = schedule.span.t0, w.K[0]
             w.values[:], w.G[:] = self.invariants.values(t, self.y0), self.invariants.gradients(t, self.y0, f)
             engine.start(self.y0, f, self.tau)

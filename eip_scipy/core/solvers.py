@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import copyreg
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -12,23 +14,28 @@ import numpy as np
 import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
-from ..engine.counters import FOUND, NFEV, NJEV, NLU, REJECTED
-from ..engine.data import FAILED_PROJECTION, OK, bare_schedule
+from ..engine.counters import FOUND, NFEV, NJEV, NLU, REJECTED, WAITED
+from ..engine.data import FAILED_PROJECTION, NEXT_LENGTH, OK, Work, bare_schedule
 from ..engine.native import Call, PythonFunctions
 from ..engine.trust import ProjectionWarning
 from ..methods.multistep import GaussJackson
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
 from . import setup
+from .between_steps import N_LEFT, Settings, checked_stepping, checked_vector, is_state, kept_state
+from .callers import users_level
+from .coefficients import attributes_of, is_same, tableau_of
+from .copies import parts_of, run_of, scipy_values, set_scipy_values
 from .dense import ExactEnds, Interpolants
 from .inputs import refuse_units, shown
-from .invariants import as_invariants
+from .invariants import InvariantSet, as_invariants
 from .multistep import SecondOrder, attach_history, times
 from .names import nearest
 from .one_step import OneStep, OneStepMethod
 from .options import ProjectionOptions, takes_projection_options
+from .results import Diagnostics
 from .setup import Start
-from .stepping import StepOptions, Stepping, interval
+from .stepping import AnyMethod, StepOptions, Stepping, interval
 
 __all__ = [
     "EIPDOP853",
@@ -47,11 +54,21 @@ __all__ = [
     "eip_method",
 ]
 
+# What a step of SciPy's solver reads.
+HANDED = ("t", "y", "f", "t_bound", "direction", "max_step", "rtol", "atol", "h_abs")
+# Of a solver's attributes: those that its copies share, and those that are made again for a copy.
+SHARED = {"_user_fun", "_projection", "_jacobian"}
+MADE = {"fun", "fun_single", "fun_vectorized", "_fun", "_bound_fun", "_derivative", "_call", "_method", "_scipy"}
+MADE |= {"_run", "_work", "_schedule", "_engine", "_interpolants", "_left", "_taken", "diagnostics"}
 OPTIONS = ("h", "first_step", "max_step", "rtol", "atol", "vectorized", "diagnostics", *ProjectionOptions.names())
 
 
+class SolverClass(type):
+    """Type of the solver classes: those that `eip_method` makes pickle too."""
+
+
 @takes_projection_options
-class EIPSolver(OdeSolver):
+class EIPSolver(OdeSolver, metaclass=SolverClass):
     """Explicit invariants-preserving solver: a Runge-Kutta step, then one Newton step of projection.
 
     Use one of the methods `EIPRK1` ... `EIPRK5`, or `eip_method` for a tableau of your own, with
@@ -83,9 +100,22 @@ class EIPSolver(OdeSolver):
     n, status, t_bound, direction, t, y, t_old, step_size, nfev, njev, nlu
         As in `scipy.integrate.OdeSolver`; `njev` counts evaluations of the invariants' gradients and `nlu`
         factorisations of the projection.
+    order, error_estimator_order, n_stages, A, B, C, E, P
+        Attributes of the classes, as of SciPy's Runge-Kutta classes; NotImplemented where a method has none.
+    diagnostics : Diagnostics
+        The record of the projections, the given one or a new one.
 
     Notes
     -----
+    Between two steps, ``fun``, ``t``, ``y``, ``f``, ``t_bound`` (with ``status = "running"`` after the end),
+    ``direction``, ``max_step``, ``h_abs``, ``rtol``, ``atol`` and, with fixed steps, ``h`` may be set, and the next
+    step takes what was set. A state or a time that was set is a new start: each invariant without a given target takes
+    its value there, given targets must be met, and the figures by which the projection is judged begin anew, while
+    counts and the largest residuals go on. If ``y``, ``t`` or ``fun`` was set and ``f`` was not, the derivative is
+    evaluated again; only `EIPRK23`, `EIPRK45` and `EIPDOP853` without invariants keep the old one for the first stage,
+    as SciPy's own do. A multistep method starts again after any change. Wrong values raise in the next step. Copies by
+    `copy.deepcopy` and `pickle`, for which the functions must pickle, go on to the same bits.
+
     The error estimate sees the step before its projection. Defects of the invariants after it are O(h^(2p + 2)) for a
     method of order p (theorem 2.1 of [1]_), and the method keeps its order.
 
@@ -98,8 +128,25 @@ class EIPSolver(OdeSolver):
     TABLEAU: ClassVar[Tableau | NystromTableau | GaussJackson | OneStep]
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     _SCIPY: ClassVar[type[OdeSolver] | None] = None
+    order: Any = NotImplemented
+    error_estimator_order: Any = NotImplemented
+    n_stages: Any = NotImplemented
+    A: Any = NotImplemented
+    B: Any = NotImplemented
+    C: Any = NotImplemented
+    E: Any = NotImplemented
+    P: Any = NotImplemented
     t: float
     t_old: float
+    y: np.ndarray
+    f: np.ndarray
+    h_abs: Any
+    nfev: int
+    _interpolants: Interpolants | None
+    _left: tuple[Any, ...]
+    _taken: tuple[Any, ...]
+    _run: setup.Run
+    _work: Work
 
     def __init__(
         self,
@@ -125,71 +172,241 @@ class EIPSolver(OdeSolver):
             warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=3)
         t0, t_bound = interval((t0, t_bound))
         start = setup.initial_state(y0)
-        self._calls = [0]
-        derivative, self._call = _checked(fun, start.size, start.dtype, vectorized, self._calls)
-        self._derivative = derivative
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
+        self._bind(fun, [0])
         steps = StepOptions(h=h, first_step=first_step, max_step=max_step, rtol=rtol, atol=atol)
         stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, self.n, stacklevel=4)
-        self.h, self.max_step = stepping.h, stepping.span.max_step
-        self.rtol, self.atol = stepping.rtol, stepping.atol
-        self._k, self._span = 0, stepping.span
+        self._take_stepping(stepping)
         kept = as_invariants(projection.invariants)
         if self.h is None and stepping.first_step is None:
             stepping.require_scale(start)
-        self._scipy = self._scipy_solver(derivative, start, stepping, bool(kept) or bool(projection.compensated))
-        f0 = derivative(t0, start).copy() if self._scipy is None else np.zeros_like(start)
-        fresh = partial(_copied, derivative)
-        if isinstance(self.TABLEAU, NystromTableau):
-            setup.check_second_order(fresh, t0, start, f0, type(self).__name__)
-        self._method = self.TABLEAU
-        if isinstance(self.TABLEAU, GaussJackson):
-            if self._finishes:
-                raise TypeError(f"{type(self).__name__}: a multistep method has no step that _project_step could end.")
-            velocities = setup.depends_on_velocity(fresh, t0, start, f0, type(self).__name__)
-            self._method = replace(self.TABLEAU, velocities=velocities)
-        self.h_abs = stepping.first_step
+        self._projection, self._jacobian = replace(projection, invariants=kept), _checked_jacobian(jacobian)
+        self._scipy = self._scipy_solver(start, bool(kept) or bool(projection.compensated))
+        f0 = self._derivative(t0, start).copy() if self._scipy is None else self._scipy.f
+        self._method = self._checked_method(Start(t0, start, f0, 0.0))
+        self.h_abs = stepping.first_step if self._scipy is None else self._scipy.h_abs
         if self._scipy is None:
-            self.h_abs = stepping.first(derivative, start, f0, self.TABLEAU)
-        projection = replace(projection, invariants=kept)
-        begin = Start(t0, start, f0, self.h_abs or 0.0)
-        run = setup.prepare(self._method, derivative, begin, projection, stepping)
-        jacobian_call = None
-        if isinstance(self._method, GaussJackson):
-            jacobian_call = self._attach(run, jacobian, begin, stepping)
-        setup.attach(diagnostics, run)
-        self._run, self._work = run, run.work
-        self._project_now, self._projection_status, self._last = False, OK, False
-        self._accepted = run.y0
-        if run.y0 is not start:
-            f0 = derivative(t0, run.y0).copy()
-        self.y, self.f = run.y0, f0
+            self.h_abs = stepping.first(self._derivative, start, f0, self.TABLEAU)
+        self.h_previous: float | None = None
+        self.diagnostics = Diagnostics() if diagnostics is None else diagnostics
+        self._start(Start(t0, start, f0, self.h_abs or 0.0), check=True)
         self._work.counters[NFEV] = self._calls[0]
-        self._count()
+        self._drive(begins=True)
         self.y_old = self.y
         self._noted, self._told = 0, False
-        self._interpolants: Interpolants | None = None
-        if self._scipy is None:
-            self._work.K[0] = f0
-            self._schedule = bare_schedule(stepping.span, float(self.h_abs or 0.0))
-            functions = PythonFunctions(
-                self._call, *run.invariants.calls, (), second_order=False, jacobian=jacobian_call
-            )
-            self._engine = run.engine(functions, self._schedule, **self._hooks())
+        self._count()
+        self._settle()
 
-    def _attach(self, run: setup.Run, jacobian: Any, begin: Start, stepping: Stepping) -> Call | None:
-        """The history of a multistep method; the Jacobian as the engine calls it."""
-        method, half = self._method, self.n // 2
-        assert isinstance(method, GaussJackson)
-        if jacobian is not None and not callable(jacobian):
-            raise TypeError(f"jacobian must be a function jacobian(t, q, dq, out), got {shown(jacobian)}.")
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        """Give a class of a method the attributes of SciPy's RungeKutta classes: order, n_stages, A, B, C, E, P ..."""
+        super().__init_subclass__(**keywords)
+        if "TABLEAU" in vars(cls):
+            for name, value in attributes_of(cls.TABLEAU, cls._SCIPY).items():
+                if name not in vars(cls):
+                    setattr(cls, name, value)
 
-        moved = None if jacobian is None else times(jacobian)
+    def _bind(self, fun: Callable[..., Any], calls: list[int]) -> None:
+        """Take a user's function, which is vectorized if that of the start is; `calls` counts."""
+        self._user_fun, self._bound_fun, self._calls = fun, self.fun, calls
+        vectorized = self.vectorized and fun is not self.fun
+        self._derivative, self._call = _checked(fun, self.n, self.y.dtype, vectorized, calls)
+
+    def _take_stepping(self, stepping: Stepping) -> None:
+        """Take options of the steps that have been checked."""
+        self._stepping = stepping
+        self.h, self.max_step = stepping.h, stepping.span.max_step
+        self._taken = self.fun, self.t_bound, self.direction, self.max_step, self.h
+        self.rtol, self.atol = _frozen(stepping.rtol), _frozen(stepping.atol)
+
+    def _checked_method(self, start: Start) -> AnyMethod:
+        """Return the method for the present function, which is called where it has to be one of second order."""
+        fresh, name = partial(_copied, self._derivative), type(self).__name__
+        if isinstance(self.TABLEAU, NystromTableau):
+            setup.check_second_order(fresh, start.t, start.y, start.f, name)
+        if not isinstance(self.TABLEAU, GaussJackson):
+            return self.TABLEAU
+        if self._finishes:
+            raise TypeError(f"{name}: a multistep method has no step that _project_step could end.")
+        velocities = setup.depends_on_velocity(fresh, start.t, start.y, start.f, name)
+        return replace(self.TABLEAU, velocities=velocities)
+
+    def _start(self, begin: Start, *, check: bool) -> None:
+        """Begin at a state: `check` its invariants there or not, and make the buffers of the run."""
+        run = setup.prepare(self._method, self._derivative, begin, self._projection, self._stepping, check_start=check)
+        self._run, self._work, self._begin = run, run.work, begin
+        self._attach_history(begin)
+        setup.attach(self.diagnostics, run)
+        self._project_now, self._projection_status, self._last = False, OK, False
+        self._accepted = run.y0
+        self.y, self.f = run.y0, begin.f
+        if run.y0 is not begin.y:
+            self.f = self._derivative(begin.t, run.y0).copy()
+        self._steps = 0
+
+    def _drive(self, *, begins: bool) -> None:
+        """Make the engine for the present interval, options and functions; `begins`: the run starts with it."""
+        self._k, self._interpolants = 0, None
+        if self._scipy is not None:
+            return
+        self._work.K[0] = self.f
+        self._schedule = bare_schedule(self._stepping.span, float(self.h_abs or 0.0))
+        calls, jacobian = self._run.invariants.calls, None
+        if self._jacobian is not None:
+            jacobian = Call(self._jacobian, (), (self.n // 2,), _never, takes_f=True, in_place=True)
+        functions = PythonFunctions(self._call, *calls, (), second_order=False, jacobian=jacobian)
+        self._engine = self._run.engine(functions, self._schedule, begins=begins, **self._hooks())
+
+    def _attach_history(self, begin: Start) -> None:
+        """Give a multistep method the history that it makes from a state on."""
+        if not isinstance(self._method, GaussJackson):
+            return
+        moved = None if self._jacobian is None else times(self._jacobian)
         seen = SecondOrder(partial(_copied, self._derivative), begin, moved, None)
-        attach_history(run, method, type(self).__name__, seen, stepping, level=True)
-        if jacobian is None:
-            return None
-        return Call(jacobian, (), (half,), _never, takes_f=True, in_place=True)
+        attach_history(self._run, self._method, type(self).__name__, seen, self._stepping, level=True)
+
+    def _settle(self) -> None:
+        """Note what the attributes are between two steps, so that a change of them shows."""
+        self._left = self.t, self.y, self.f, self.h_abs, self.rtol, self.atol, self.nfev
+        self._kept = kept_state(self.y) if self._scipy is None else None
+
+    @property
+    def _untouched(self) -> bool:
+        """Return whether all attributes are as the last step left them."""
+        t, y, f, h_abs, rtol, atol, nfev = self._left
+        return (
+            self.y is y
+            and self.t is t
+            and self.f is f
+            and self.h_abs is h_abs
+            and self.rtol is rtol
+            and self.atol is atol
+            and self.nfev == nfev
+            and (self.fun, self.t_bound, self.direction, self.max_step, self.h) == self._taken
+            and (self._kept is None or is_state(y, self._kept))
+        )
+
+    @property
+    def _was(self) -> Settings:
+        """Return the attributes as the last step left them."""
+        return Settings(*self._left, *self._taken)
+
+    def _hand_on(self) -> None:
+        """Take what was set between two steps, as the notes of the class say."""
+        was, like = self._was, self._run.y0
+        stepping = checked_stepping(self, self.TABLEAU, was, stacklevel=5)
+        y = self.y if self.y is was.y else checked_vector("y", self.y, like)
+        f = self.f if self.f is was.f else checked_vector("f", self.f, like)
+        self.y, self.f = y, f
+        called = self.nfev - was.nfev
+        self._calls[0] += called
+        self._work.counters[NFEV] += called
+        refunctioned, moved = self.fun is not was.fun, self._moved
+        if refunctioned:
+            self._bind(self.fun, self._calls)
+        self._take_stepping(stepping)
+        if self._scipy is not None:
+            self._hand_to_scipy(self._scipy, refunctioned)
+            return
+        before = self._calls[0]
+        if (refunctioned or moved) and self.f is was.f:
+            self.f = self._derivative(self.t, self.y).copy()
+        here = Start(float(self.t), self.y, self.f, float(self.h_abs or 0.0))
+        if refunctioned:
+            self._method = self._checked_method(here)
+        if moved:
+            self._restart(here)
+        else:
+            self._go_on(here)
+        self._work.counters[NFEV] += self._calls[0] - before
+        self._drive(begins=moved)
+
+    def _hand_to_scipy(self, solver: OdeSolver, refunctioned: bool) -> None:
+        """Set on SciPy's solver what was set on this one."""
+        if refunctioned:
+            solver.fun = self._derivative
+        for name in HANDED:
+            setattr(solver, name, getattr(self, name))
+
+    def _restart(self, here: Start) -> None:
+        """Begin anew at a state that was set; the counts and the largest residuals of the run go on."""
+        old = self._run
+        self._start(here, check=False)
+        new, counters = self._run, self._work.counters
+        counters[:] = old.work.counters
+        counters[WAITED] = 0
+        new.work.max_defect[:] = old.work.max_defect
+        new.work.max_correction[:] = old.work.max_correction
+        new.trust.doubts += [*old.trust.reasons, *old.trust.doubts]
+        new.trust.failed = old.trust.failed
+
+    def _go_on(self, here: Start) -> None:
+        """Go on from the last state with other tolerances, another interval or another function."""
+        run = self._run
+        fresh = self._projection.settled(self._method, self._stepping, run.y0, run.invariants).options
+        run.options = run.options._replace(rtol=fresh.rtol, atol=fresh.atol, block_atol=fresh.block_atol)
+        self._attach_history(here)
+
+    def _state(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return what a copy shares with this solver, the user's functions, and what it copies."""
+        shared = {name: getattr(self, name) for name in SHARED}
+        was = self._was._asdict()
+        if self.fun is not self._bound_fun:  # it was set since the last step
+            shared["fun"] = self.fun
+        del was["fun"]
+        copied = {
+            "attributes": {name: value for name, value in vars(self).items() if name not in MADE | SHARED},
+            "set": {name: value for name, value in was.items() if getattr(self, name) is not value},
+            "replaced": self._user_fun is self._bound_fun,
+            "velocities": getattr(self._method, "velocities", None),
+            "run": parts_of(self._run),
+            "joint": self._run.options.joint is not None,
+            "clock": None if self._scipy is not None else self._schedule.clock,
+            "scipy": None if self._scipy is None else scipy_values(self._scipy),
+        }
+        return shared, copied
+
+    def _revive(self, shared: dict[str, Any], copied: dict[str, Any]) -> None:
+        """Become the solver whose `_state` this is."""
+        begin, user = copied["attributes"]["_begin"], shared["_user_fun"]
+        vectorized = copied["attributes"]["vectorized"]
+        super().__init__(user, begin.t, begin.y, begin.t + 1.0, vectorized, support_complex=True)
+        if copied["replaced"]:
+            self.fun = user
+        self._bind(user, [0])
+        self._scipy, self._method = None, self.TABLEAU
+        if isinstance(self.TABLEAU, GaussJackson):
+            self._method = replace(self.TABLEAU, velocities=copied["velocities"])
+        if copied["scipy"] is not None and self._SCIPY is not None:
+            fresh = partial(_copied, self._derivative)
+            self._scipy = self._SCIPY(fresh, begin.t, begin.y, begin.t + 1.0, first_step=1.0)
+            self._scipy.fun = self._derivative
+            set_scipy_values(self._scipy, copied["scipy"])
+        invariants = InvariantSet(shared["_projection"].invariants, *begin, tell=False)
+        self._run = run_of(copied["run"], invariants, self._method, joint=copied["joint"])
+        self._work, self._begin, self._jacobian = self._run.work, begin, shared["_jacobian"]
+        self.f, self.h_abs, self._stepping = begin.f, 0.0, copied["attributes"]["_stepping"]
+        self._drive(begins=False)
+        self._work.K[0] = copied["run"].work.K[0]
+        if copied["clock"] is not None:
+            self._schedule.clock[:] = copied["clock"]
+        calls = self._calls
+        self.__dict__.update(copied["attributes"] | {name: shared[name] for name in SHARED})
+        calls[:], self._calls = self._calls, calls
+        self.diagnostics = Diagnostics()
+        setup.attach(self.diagnostics, self._run)
+        now = {name: getattr(self, name) for name in Settings._fields}
+        was = Settings(**now | copied["set"])
+        self._left, self._taken = tuple(was[:N_LEFT]), tuple(was[N_LEFT:])
+        self.fun = shared.get("fun", self.fun)
+
+    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
+        return _revived, (type(self), *self._state())
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        new = memo[id(self)] = type(self).__new__(type(self))
+        shared, copied = self._state()
+        new._revive(shared, copy.deepcopy(copied, memo))
+        return new
 
     def _hooks(self) -> dict[str, Any]:
         """Parts of the steps that a subclass takes itself, see `Hooks`."""
@@ -200,25 +417,22 @@ class EIPSolver(OdeSolver):
         """Whether a subclass ends the steps, by the hook."""
         return type(self)._project_step is not EIPSolver._project_step
 
-    def _count(self) -> None:
+    def _count(self) -> int:
+        """Show the counts of the run; returns how often something stood out in its projections."""
         counters = self._work.counters.tolist()
         self.nfev, self.njev, self.nlu = counters[NFEV], counters[NJEV], counters[NLU]
+        return int(counters[FOUND])
 
-    def _scipy_solver(
-        self,
-        derivative: Callable[[float, np.ndarray], np.ndarray],
-        start: np.ndarray,
-        stepping: Stepping,
-        own_steps: bool,
-    ) -> OdeSolver | None:
-        if self._SCIPY is None or stepping.h is not None or own_steps or self._finishes:
+    def _scipy_solver(self, start: np.ndarray, own_steps: bool) -> OdeSolver | None:
+        if self._SCIPY is None or self.h is not None or own_steps or self._finishes:
             return None
 
-        control = {"first_step": stepping.first_step, "max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
-        solver = self._SCIPY(partial(_copied, derivative), self.t, start, self.t_bound, **control)
+        control = {"max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
+        control["first_step"] = self._stepping.first_step
+        solver = self._SCIPY(partial(_copied, self._derivative), self.t, start, self.t_bound, **control)
         if np.isnan(solver.h_abs):
             return None  # SciPy's loop would never end
-        solver.fun = derivative  # in place of SciPy's two wrappers, whose work it does
+        solver.fun = self._derivative  # in place of SciPy's two wrappers, whose work it does
         return solver
 
     def _scipy_step(self, solver: OdeSolver) -> tuple[bool, str | None]:
@@ -237,23 +451,43 @@ class EIPSolver(OdeSolver):
         solver.f = solver.f.copy()
         solver.t_old = self.t
         self.y_old, self.y, self.t = self.y, solver.y, solver.t
+        self.f, self.h_abs, self.h_previous = solver.f, solver.h_abs, solver.h_previous
         return True, None
 
     def _step_impl(self) -> tuple[bool, str | None]:
-        if self._scipy is not None:
-            return self._scipy_step(self._scipy)
-        run, w = self._run, self._work
+        if not self._untouched:
+            self._hand_on()
+        done, message = self._own_step() if self._scipy is None else self._scipy_step(self._scipy)
+        self._settle()
+        return done, message
+
+    @property
+    def _moved(self) -> bool:
+        """Return whether the state or the time is not the one that the last step left."""
+        t, y = self._left[:2]
+        if self.t != t or (self._kept is not None and not is_state(self.y, self._kept)):
+            return True
+        return self.y is not y and not np.array_equal(self.y, y)
+
+    def _own_step(self) -> tuple[bool, str | None]:
+        run = self._run
         status, t, y_new, f_new = self._engine.step(self._k, self.t, self.y, self.f)
-        self._count()
+        found = self._count()
         if status != OK:
             run.trust.failed = True
             return False, setup.failure(status, run, self._schedule.clock)
+        if t == self.t:
+            return False, self.TOO_SMALL_STEP
         self._k += 1
+        self._steps += 1
+        self.h_previous = t - self.t
         self.y_old = self.y
         self.y, self.t, self.f = y_new, t, f_new
         if self._finishes:
             self.y = self._accepted
-        if w.counters[FOUND] != self._noted or self._k in setup.LOOKS or self.t == self.t_bound:
+        if self.h is None:
+            self.h_abs = self._schedule.clock.item(NEXT_LENGTH)
+        if found != self._noted or self._steps in setup.LOOKS or self.t == self.t_bound:
             self._watch()
         return True, None
 
@@ -261,9 +495,9 @@ class EIPSolver(OdeSolver):
         """Look at the run where something stands out, early and at its end; warn once, and at once: it may end here."""
         run, arrived = self._run, self.t == self.t_bound
         self._noted = self._work.counters[FOUND]
-        if not self._told and run.look(self._k, arrived, self.t, self.y, lambda: self._derivative(self.t, self.y)):
+        if not self._told and run.look(self._steps, arrived, self.t, self.y, lambda: self._derivative(self.t, self.y)):
             self._told = True
-            warnings.warn(f"{type(self).__name__}: {run.trust.message}", ProjectionWarning, stacklevel=5)
+            warnings.warn(f"{type(self).__name__}: {run.trust.message}", ProjectionWarning, stacklevel=users_level())
 
     def _finish(self, t_new: float, project: bool, last: bool) -> int:
         """What the engine's `finish_step` does, with the hook in its place."""
@@ -307,20 +541,53 @@ class EIPSolver(OdeSolver):
         return y_new
 
     def _dense_output_impl(self) -> DenseOutput:
+        t, y = self._left[:2]
+        if self._kept is not None and not is_state(y, self._kept):  # changed after the step whose output this is
+            y = np.frombuffer(self._kept, y.dtype) if isinstance(self._kept, bytes) else self._kept
         if self._scipy is not None:
-            out = ExactEnds(self._scipy.dense_output(), self.y_old, self.y)
+            out = ExactEnds(self._scipy.dense_output(), self.y_old, y)
             self.nfev = self._calls[0]
-            return out
-        if self._interpolants is None:
-            self._interpolants = Interpolants(self._run, self._method, self._engine)
-        out = self._interpolants.over(self.t_old, self.y_old, self.t, self.y)
-        self._count()
+        else:
+            if self._interpolants is None:
+                self._interpolants = Interpolants(self._run, self._method, self._engine)
+            out = self._interpolants.over(self.t_old, self.y_old, t, y)
+            self._count()
+        self._left = *self._left[:-1], self.nfev
         return out
+
+
+def _revived(solver: type[EIPSolver], shared: dict[str, Any], copied: dict[str, Any]) -> EIPSolver:
+    """Return the solver whose `_state` this is, as it comes back from a pickle."""
+    new = solver.__new__(solver)
+    new._revive(shared, copied)
+    return new
+
+
+def _reduced_class(made: type) -> Any:
+    """Return what a pickle holds of a class: its name, or what `eip_method` made it of."""
+    origin = vars(made).get("_ORIGIN")
+    return made.__qualname__ if origin is None else (eip_method, (origin,))
+
+
+copyreg.pickle(SolverClass, _reduced_class)
 
 
 def _copied(derivative: Callable[[float, np.ndarray], np.ndarray], t: float, y: np.ndarray) -> np.ndarray:
     """The derivative as an array of its own."""
     return derivative(t, y).copy()
+
+
+def _frozen(a: np.ndarray) -> np.ndarray:
+    """A copy that cannot be changed in place, which no step would notice."""
+    a = a.copy()
+    a.setflags(write=False)
+    return a
+
+
+def _checked_jacobian(jacobian: Any) -> Any:
+    if jacobian is not None and not callable(jacobian):
+        raise TypeError(f"jacobian must be a function jacobian(t, q, dq, out), got {shown(jacobian)}.")
+    return jacobian
 
 
 def _never(value: Any, t: float) -> np.ndarray:
@@ -503,15 +770,19 @@ class EIPGJ14(EIPSolver):
     TABLEAU = GaussJackson(order=14, corrected=True)
 
 
-def eip_method(method: Tableau | NystromTableau | GaussJackson | OneStepMethod) -> type[EIPSolver]:
-    """A solver class on any explicit Runge-Kutta or Runge-Kutta-Nystrom tableau, or on a one-step method of your own.
+def eip_method(
+    method: Tableau | NystromTableau | GaussJackson | OneStepMethod | type[OdeSolver],
+) -> type[EIPSolver]:
+    """Return a solver class on a Runge-Kutta or Runge-Kutta-Nystrom method, or on a user-defined one-step method.
 
     Parameters
     ----------
-    method : Tableau, NystromTableau, GaussJackson or OneStepMethod
-        The last is any object with ``one_step(t, y, h) -> y_hat`` and ``order``; see `OneStepMethod`. Its steps are
-        projected like all others; `fun` serves gradients that take f and dense output (a cubic through both ends)
-        only, so that `nfev` does not count what `one_step` evaluates.
+    method : Tableau, NystromTableau, GaussJackson, OneStepMethod or a class like SciPy's RK45
+        Of a subclass of SciPy's RungeKutta, or a class of another package with the same attributes, the coefficients A,
+        B, C, E and P are read and checked against the order conditions; the step control is the one of this package.
+        A one-step method is any object with ``one_step(t, y, h) -> y_hat`` and ``order``; see `OneStepMethod`. Its
+        steps are projected like all others; `fun` serves gradients that take f and dense output (a cubic through both
+        ends) only, so that `nfev` does not count what `one_step` evaluates.
 
     Returns
     -------
@@ -521,9 +792,9 @@ def eip_method(method: Tableau | NystromTableau | GaussJackson | OneStepMethod) 
     Raises
     ------
     TypeError
-        When it is none of them.
+        If it is none of them, or a class whose coefficients do not make its steps.
     ValueError
-        When a one-step method's order is no integer >= 1.
+        If the order of a one-step method is not an integer >= 1, or coefficients of a class miss an order condition.
 
     Examples
     --------
@@ -541,5 +812,20 @@ def eip_method(method: Tableau | NystromTableau | GaussJackson | OneStepMethod) 
     >>> bool(abs(sol.y[:, -1] @ sol.y[:, -1] - 1) < 1e-8)
     True
     """
-    tableau = method if isinstance(method, (Tableau, NystromTableau, GaussJackson)) else OneStep(method)
-    return type(f"EIP_{tableau.name}", (EIPSolver,), {"TABLEAU": tableau, "__doc__": f"EIP method on {tableau!r}."})
+    if isinstance(method, type) and issubclass(method, OdeSolver):
+        return _on_class(method)
+    given: Any = method
+    tableau = given if isinstance(given, (Tableau, NystromTableau, GaussJackson)) else OneStep(given)
+    members = {"TABLEAU": tableau, "_ORIGIN": method, "__doc__": f"EIP method on {tableau!r}."}
+    made: Any = SolverClass(f"EIP_{tableau.name}", (EIPSolver,), members)
+    return made
+
+
+def _on_class(solver: type[OdeSolver]) -> type[EIPSolver]:
+    """Return the class of this package on the method of a solver class."""
+    if issubclass(solver, EIPSolver):
+        return solver
+    for own in (EIPRK23, EIPRK45, EIPDOP853):
+        if own._SCIPY is not None and is_same(solver, own._SCIPY):
+            return own
+    return eip_method(tableau_of(solver))

@@ -274,6 +274,16 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
     )
 
 
+def copied_work(work: Work) -> Work:
+    """Return buffers of their own with the same numbers, views of each other as those of `make_work` are."""
+    n = work.stage.size
+    new = make_work(n, work.stage.dtype, len(work.K) - 1, len(work.G), work.scale.size)
+    for name, array in new._asdict().items():
+        if isinstance(array, np.ndarray):
+            array[...] = getattr(work, name)
+    return new
+
+
 class Members(NamedTuple):
     """Members of an ensemble as the engine runs them, on the buffers of one run; by member, what each brings and gets.
 

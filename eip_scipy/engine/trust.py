@@ -108,9 +108,14 @@ class Trust:
         return trust
 
     @property
+    def reasons(self) -> list[str]:
+        """Return what is wrong with the corrections, in a sentence for each invariant."""
+        return [_reason(self.names[k], self.figures[k]) for k in np.flatnonzero(self.sick)]
+
+    @property
     def message(self) -> str:
         """Why the run is not to be trusted; "" where nothing speaks against it."""
-        reasons = [_reason(self.names[k], self.figures[k]) for k in np.flatnonzero(self.sick)] + self.doubts
+        reasons = self.reasons + self.doubts
         if not reasons:
             return ""
         cause = "" if self.doubts else (

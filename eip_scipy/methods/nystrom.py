@@ -11,11 +11,11 @@ from fractions import Fraction
 from functools import cache
 from itertools import combinations_with_replacement
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from .orders import Ordered
+from .orders import Ordered, named_constant
 from .runge_kutta import FLOAT_TOLERANCE, Number, _low_parts, _stage_matrix, _vector
 
 __all__ = ["RKN86", "RKN1210", "NystromTableau"]
@@ -236,6 +236,9 @@ class NystromTableau(Ordered):
                     f"{name}: {row.label} is not of order {row.order}: a condition of order {vertices + row.position} "
                     f"misses by {residual:.3g}."
                 )
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return named_constant(self, globals()) or super().__reduce_ex__(protocol)
 
     def __repr__(self) -> str:
         estimate = f", estimate of order {self.error_estimator_order}" if self.has_estimate else ""

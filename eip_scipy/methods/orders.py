@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-__all__ = ["Ordered"]
+from collections.abc import Mapping
+from typing import Any
+
+__all__ = ["Ordered", "named_constant"]
+
+
+def named_constant(value: Any, names: Mapping[str, Any]) -> str | None:
+    """Return the name under which a module has an object, for pickles: it comes back as the same object."""
+    return next((name for name, own in names.items() if own is value), None)
 
 
 class Ordered:

@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
-from .orders import Ordered
+from .orders import Ordered, named_constant
 
 __all__ = ["DOP853", "RK1", "RK2", "RK3", "RK4", "RK5", "RK23", "RK45", "Tableau"]
 
@@ -226,6 +227,9 @@ class Tableau(Ordered):
                     f"{name}: {label} is not of order {order}: the condition of tree {tree} of order {_size(tree)} "
                     f"misses by {float(residual):.3g}."
                 )
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return named_constant(self, globals()) or super().__reduce_ex__(protocol)
 
     @property
     def paired(self) -> bool:

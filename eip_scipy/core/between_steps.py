@@ -1,0 +1,115 @@
+"""What may be set on a solver between its steps, as on SciPy's: whether something was, and what it then has to be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from . import setup
+from .inputs import is_number, shown
+from .stepping import AnyMethod, StepOptions, Stepping, fixed_steps
+
+__all__ = ["N_LEFT", "Settings", "checked_stepping", "checked_vector", "is_state", "kept_state"]
+
+# Up to this number of components a copy of the state is compared as bytes, which is faster for short arrays.
+SHORT = 2048
+# The first settings, which each step leaves anew; the others it takes.
+N_LEFT = 7
+
+
+class Settings(NamedTuple):
+    """The attributes of a solver that may be set between its steps, by the objects that the last step left there."""
+
+    t: float
+    y: np.ndarray
+    f: np.ndarray
+    h_abs: float
+    rtol: np.ndarray
+    atol: np.ndarray
+    nfev: int
+    fun: Any
+    t_bound: float
+    direction: float
+    max_step: float
+    h: float | None
+
+
+def kept_state(y: np.ndarray) -> bytes | np.ndarray:
+    """Return a copy of a state, for `is_state`."""
+    return y.tobytes() if y.size <= SHORT else y.copy()
+
+
+def is_state(y: np.ndarray, kept: bytes | np.ndarray) -> bool:
+    """Return whether `y` is still the state of which `kept` is a copy."""
+    return y.tobytes() == kept if type(kept) is bytes else np.array_equal(y, kept)
+
+
+def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
+    """Return a state or a derivative that was set as a new array of the size and type of `like`.
+
+    Raises
+    ------
+    TypeError
+        If `value` does not hold numbers.
+    ValueError
+        If it has another shape, is not finite, or is complex where the state was real.
+    """
+    found = setup.initial_state(value, name)
+    if found.shape != like.shape:
+        raise ValueError(f"`{name}` was set to an array of {found.size} components; this solver has {like.size}.")
+    if found.dtype.kind == "c" and like.dtype.kind != "c":
+        raise ValueError(f"`{name}` was set to complex numbers, but the solver was started with a real y0.")
+    return found.astype(like.dtype)
+
+
+def checked_stepping(solver: Any, method: AnyMethod, was: Settings, stacklevel: int) -> Stepping:
+    """Return how a solver goes on from its present time with the attributes that it has now.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an attribute has a wrong value, or belongs to the other kind of steps.
+    """
+    _check_kind_of_steps(solver, was)
+    t, t_bound, sign = (
+        _number("t", solver.t),
+        _number("t_bound", solver.t_bound),
+        _number("direction", solver.direction),
+    )
+    if not np.isfinite(t) or np.isnan(t_bound):
+        raise ValueError(f"`t` must be finite and `t_bound` a number, got t={shown(t)} and t_bound={shown(t_bound)}.")
+    if abs(sign) != 1:
+        raise ValueError(f"`direction` must be 1 or -1, got {shown(solver.direction)}.")
+    if sign * (t_bound - t) < 0:
+        raise ValueError(
+            f"`t_bound` was set to {t_bound:g}, which is behind t = {t:g} in the direction {sign:+g} of the steps. Set "
+            f"`direction` to {-sign:+g} too, or start a new solver."
+        )
+    steps = StepOptions(h=solver.h, max_step=solver.max_step, rtol=solver.rtol, atol=solver.atol)
+    found = steps.checked(type(solver).__name__, method, t, sign * np.inf, solver.n, stacklevel=stacklevel + 1)
+    h = found.h
+    n_steps = found.span.n_steps if h is None else fixed_steps(h, t, t_bound)
+    span = found.span._replace(h=sign * (h or 0.0), t_bound=t_bound, sign=sign, n_steps=n_steps)
+    return replace(found, span=span, first_step=None if h is not None else float(solver.h_abs))
+
+
+def _check_kind_of_steps(solver: Any, was: Settings) -> None:
+    """Refuse options of adaptive steps for a solver with a fixed step, and a fixed step for one with adaptive steps."""
+    if (solver.h is None) != (was.h is None):
+        kind = "adaptive steps" if was.h is None else f"the fixed step h = {was.h:g}"
+        raise ValueError(f"`h` was set to {shown(solver.h)} on a solver with {kind}; start a new solver.")
+    if was.h is None:
+        if solver.h_abs is not was.h_abs and not (is_number(solver.h_abs) and solver.h_abs > 0):
+            raise ValueError(f"`h_abs` must be a positive number, got {shown(solver.h_abs)}.")
+    elif solver.h_abs != was.h_abs:
+        raise ValueError(
+            f"`h_abs` was set to {shown(solver.h_abs)} on a solver with the fixed step h = {was.h:g}; set `h` instead."
+        )
+
+
+def _number(name: str, value: Any) -> float:
+    if not is_number(value):
+        raise ValueError(f"`{name}` must be a real number, got {shown(value)}.")
+    return float(value)

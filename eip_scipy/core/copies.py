@@ -1,0 +1,77 @@
+"""Copies of solvers in the middle of a run, in memory or by pickle: they go on to the same bits.
+
+The engine and what is bound to the user's functions are made again; everything that a step left is copied.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+from scipy.integrate import OdeSolver
+
+from ..engine.data import Work, copied_work
+from ..engine.trust import Trust
+from .invariants import InvariantSet
+from .one_step import OneStep
+from .setup import Run
+
+__all__ = ["RunParts", "parts_of", "run_of", "scipy_values", "set_scipy_values"]
+
+BOUND = ("work", "invariants", "trust")
+
+
+class RunParts(NamedTuple):
+    """What makes a `Run` again, apart from its invariants: plain values and arrays."""
+
+    values: dict[str, Any]
+    work: Work
+    doubts: list[str]
+    failed: bool
+
+
+def parts_of(run: Run) -> RunParts:
+    """Return what makes a run again; the user's one-step method stays out."""
+    values = {item.name: getattr(run, item.name) for item in fields(run) if item.name not in BOUND}
+    values["options"] = run.options._replace(joint=None)
+    if isinstance(run.method, OneStep):
+        values["method"] = None
+    return RunParts(values, copied_work(run.work), list(run.trust.doubts), run.trust.failed)
+
+
+def run_of(parts: RunParts, invariants: InvariantSet, method: Any, *, joint: bool) -> Run:
+    """Return the run of these parts, on copies of their buffers.
+
+    Parameters
+    ----------
+    parts : RunParts
+    invariants : InvariantSet
+        The same invariants, made at the same start.
+    method : OneStep
+        Taken where the run has a one-step method.
+    joint : bool
+        Whether the run's options hold the invariants that are projected jointly.
+    """
+    values, work = copy.deepcopy(parts.values), copied_work(parts.work)
+    if values["method"] is None:
+        values["method"] = method
+    if joint:
+        values["options"] = values["options"]._replace(joint=invariants.items)
+    trust = Trust(invariants.names, work.trust)
+    trust.doubts, trust.failed = list(parts.doubts), parts.failed
+    return Run(**values, work=work, invariants=invariants, trust=trust)
+
+
+def scipy_values(solver: OdeSolver) -> dict[str, Any]:
+    """Return the attributes of a solver of SciPy, apart from its functions."""
+    return {name: value for name, value in vars(solver).items() if not callable(value)}
+
+
+def set_scipy_values(solver: OdeSolver, values: dict[str, Any]) -> None:
+    """Give a solver of SciPy these attributes; its stages, K, may be a part of an array, and are filled in place."""
+    for name, value in values.items():
+        if name.startswith("K"):
+            getattr(solver, name)[...] = value
+        else:
+            setattr(solver, name, value)

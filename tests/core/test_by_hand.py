@@ -1,0 +1,409 @@
+"""Solvers stepped by hand, as public code steps SciPy's: what is set between two steps has its effect, or raises."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from scipy.integrate import DOP853, RK23, RK45
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ12,
+    EIPGJ14,
+    EIPRK4,
+    EIPRK23,
+    EIPRK45,
+    EIPRKN8,
+    EIPRKN12,
+    Diagnostics,
+    Invariant,
+    eip_method,
+)
+from eip_scipy.methods.nystrom import RKN86
+from eip_scipy.methods.runge_kutta import DOP853 as DOP853_TABLEAU
+from eip_scipy.methods.runge_kutta import RK5
+
+Y0 = [1.0, 0.3]
+PAIRS = ((EIPRK45, RK45), (EIPRK23, RK23), (EIPDOP853, DOP853))
+
+
+def driven(t, y):
+    return np.array([y[1], -np.sin(y[0]) + 0.1 * np.cos(t)])
+
+
+def pendulum(t, y):
+    return np.array([y[1], -np.sin(y[0])])
+
+
+def heavier(t, y):
+    return np.array([y[1], -2 * np.sin(y[0])])
+
+
+def energy(t, y):
+    return y[1] ** 2 / 2 - np.cos(y[0])
+
+
+def energy_gradient(t, y):
+    return np.array([np.sin(y[0]), y[1]])
+
+
+def jacobian(t, q, dq, out):
+    out[:] = -np.cos(q) * dq
+
+
+KEPT = Invariant(energy, energy_gradient, name="energy")
+
+
+def stepped(solver, most=3000):
+    """Times and states of the next steps."""
+    rows = []
+    while solver.status == "running" and most > 0:
+        solver.step()
+        rows.append((solver.t, *solver.y))
+        assert len(rows) < 3000
+        most -= 1
+    return rows
+
+
+# What public code does with SciPy's solvers, each as a function of a solver that returns rows.
+
+
+def moved_bound(s):
+    rows = stepped(s)
+    s.t_bound, s.status = 9.0, "running"
+    return rows + stepped(s)
+
+
+def nearer_bound(s):
+    rows = stepped(s, 3)
+    s.t_bound = s.t + 0.01
+    rows += stepped(s)
+    s.t_bound, s.status = 5.0, "running"
+    return rows + stepped(s)
+
+
+def kicked(s):
+    rows = stepped(s, 3)
+    s.y = s.y + [0, 0.5]
+    s.f = s.fun(s.t, s.y)
+    return rows + stepped(s)
+
+
+def kicked_in_place(s):
+    rows = stepped(s, 3)
+    s.y[1] += 0.5
+    s.f = s.fun(s.t, s.y)
+    return rows + stepped(s)
+
+
+def other_function(s):
+    rows = stepped(s, 3)
+    s.fun, s.f = heavier, heavier(s.t, s.y)
+    return rows + stepped(s)
+
+
+def other_tolerances(s):
+    rows = stepped(s, 3)
+    s.rtol, s.atol = 1e-9, 1e-11
+    return rows + stepped(s)
+
+
+def shorter_steps(s):
+    rows = stepped(s, 3)
+    s.max_step = 0.05
+    return rows + stepped(s)
+
+
+def short_step(s):
+    rows = stepped(s, 3)
+    s.h_abs = 1e-3
+    return rows + stepped(s)
+
+
+def backward(s):
+    rows = stepped(s)
+    s.direction, s.t_bound, s.status = -1.0, 0.0, "running"
+    return rows + stepped(s)
+
+
+def other_time(s):
+    rows = stepped(s, 3)
+    s.t, s.f = 0.0, s.fun(0.0, s.y)
+    return rows + stepped(s)
+
+
+IDIOMS = [
+    *(moved_bound, nearer_bound, kicked, kicked_in_place, other_function, other_tolerances, shorter_steps),
+    *(short_step, backward, other_time),
+]
+
+
+@pytest.mark.parametrize("idiom", IDIOMS)
+@pytest.mark.parametrize(("ours", "scipy_s"), PAIRS)
+def test_the_same_as_scipy(idiom, ours, scipy_s):
+    given = {"rtol": 1e-6, "atol": 1e-8}
+    theirs = scipy_s(driven, 0, Y0, 5.0, **given)
+    expected = np.array(idiom(theirs))
+    solver = ours(driven, 0, Y0, 5.0, **given)
+    np.testing.assert_allclose(np.array(idiom(solver)), expected, rtol=0, atol=1e-14)
+    assert solver.h_abs == theirs.h_abs
+    if idiom is not other_function:  # SciPy counts calls of the first function only
+        assert solver.nfev == theirs.nfev
+    if ours is EIPDOP853:  # its estimate, a quotient, tells the roundings of two engines apart
+        return
+    own = type("Own", (ours,), {"_SCIPY": None})(driven, 0, Y0, 5.0, **given)
+    np.testing.assert_allclose(idiom(own)[-1], expected[-1], rtol=0, atol=1e-11)
+
+
+def test_what_is_not_set_is_scipy_s_too():
+    """A state without its derivative: SciPy's next step takes the old one."""
+    solvers = [solver(driven, 0, Y0, 5.0) for solver in (EIPRK45, RK45)]
+    for s in solvers:
+        s.step()
+        s.y = s.y + 0.1
+    np.testing.assert_array_equal(stepped(solvers[0]), stepped(solvers[1]))
+
+
+CASES = {
+    "RK45": (EIPRK45, {"rtol": 1e-9, "atol": 1e-11}),
+    "DOP853": (EIPDOP853, {"rtol": 1e-10, "atol": 1e-12}),
+    "RK4": (EIPRK4, {"h": 0.01}),
+    "RK4, every=3": (EIPRK4, {"h": 0.01, "every": 3}),
+    "RK4, free": (EIPRK4, {"h": 0.01, "invariants": ()}),
+    "RKN12": (EIPRKN12, {"rtol": 1e-11, "atol": 1e-13, "max_step": 0.5}),
+    "RKN8": (EIPRKN8, {"h": 0.1, "every": "auto", "compensated": True}),
+    "GJ12": (EIPGJ12, {"h": 0.02}),
+}
+
+
+def reference(t0, y0, t):
+    end = DOP853(pendulum, t0, y0, t, rtol=1e-13, atol=1e-14)
+    stepped(end)
+    return end.y
+
+
+@pytest.mark.parametrize("idiom", [moved_bound, nearer_bound, backward])
+@pytest.mark.parametrize("case", CASES)
+def test_other_intervals_with_invariants(case, idiom):
+    """One run to the last bound, by SciPy's DOP853 at 1e-13."""
+    method, options = CASES[case]
+    solver = method(pendulum, 0, Y0, 5.0, **{"invariants": KEPT} | options)
+    assert stepped(solver) if idiom is None else idiom(solver)
+    expected = Y0 if idiom is backward else reference(0, Y0, solver.t)
+    np.testing.assert_allclose(solver.y, expected, rtol=0, atol=2e-8)
+    assert solver.diagnostics.trusted
+
+
+@pytest.mark.parametrize("derivative", [True, False])
+@pytest.mark.parametrize("in_place", [True, False])
+@pytest.mark.parametrize("case", CASES)
+def test_impulses_with_invariants(case, in_place, derivative):
+    """The energy after a kick is kept from then on, and the orbit is that of the kicked state."""
+    method, options = CASES[case]
+    record = Diagnostics()
+    solver = method(pendulum, 0, Y0, 5.0, diagnostics=record, **{"invariants": KEPT} | options)
+    stepped(solver, 3)
+    t, y = solver.t, solver.y + [0, 0.5]
+    if in_place:
+        solver.y[1] += 0.5
+    else:
+        solver.y = y.tolist()
+    if derivative:
+        solver.f = solver.fun(t, y)
+    stepped(solver)
+    np.testing.assert_allclose(solver.y, reference(t, reference(0, Y0, t) + [0, 0.5], 5.0), rtol=0, atol=2e-8)
+    if solver.diagnostics.names:
+        assert abs(energy(5.0, solver.y) - energy(t, y)) < 1e-11
+    assert record.trusted
+    assert record is solver.diagnostics
+
+
+def test_given_targets_hold_after_an_impulse():
+    """A target that was given is a condition on the kicked state, as on a start."""
+    given = Invariant(energy, energy_gradient, target=energy(0, np.array(Y0)), name="energy")
+    solver = EIPRK4(pendulum, 0, Y0, 5.0, h=0.1, invariants=given)
+    stepped(solver, 3)
+    solver.y = solver.y + 0.1
+    with pytest.raises(ValueError, match="violates invariant 'energy'"):
+        solver.step()
+    projected = EIPRK4(pendulum, 0, Y0, 5.0, h=0.1, invariants=given, project_initial=True)
+    stepped(projected, 3)
+    projected.y = projected.y + 0.1
+    stepped(projected)
+    np.testing.assert_allclose(energy(0, projected.y), energy(0, np.array(Y0)), rtol=0, atol=1e-13)
+
+
+def test_what_was_found_before_an_impulse_stays():
+    """Friction before the kick, told once; the run is not trusted afterwards either."""
+    solver = EIPRK45(
+        lambda t, y: np.array([y[1], -np.sin(y[0]) - 0.2 * y[1]]), 0, [2.0, 0.0], 20.0, rtol=1e-8, invariants=KEPT
+    )
+    with pytest.warns(RuntimeWarning, match="energy"):
+        stepped(solver, 100)
+    counts = solver.diagnostics.n_projections
+    solver.y = np.array([0.5, 0.0])
+    stepped(solver, 2)
+    assert not solver.diagnostics.trusted
+    assert solver.diagnostics.n_projections > counts
+
+
+def test_a_changed_function_with_invariants():
+    """From a pendulum to one with twice the weight, whose own energy is then no invariant of the first."""
+    solver = EIPRK45(pendulum, 0, Y0, 5.0, rtol=1e-10, atol=1e-12, compensated=True)
+    stepped(solver, 5)
+    t, y = solver.t, solver.y.copy()
+    solver.fun = heavier
+    stepped(solver)
+    end = DOP853(heavier, t, y, 5.0, rtol=1e-13, atol=1e-14)
+    stepped(end)
+    np.testing.assert_allclose(solver.y, end.y, rtol=0, atol=2e-9)
+
+
+@pytest.mark.parametrize(
+    ("method", "name", "value", "match"),
+    [
+        (EIPRK45, "t_bound", -1.0, "behind t"),
+        (EIPRK45, "t_bound", "x", "`t_bound` must be a real number"),
+        (EIPRK45, "direction", 0.5, "`direction` must be 1 or -1"),
+        (EIPRK45, "rtol", -1.0, "`rtol` must be positive"),
+        (EIPRK45, "atol", [1, 2, 3], "`atol` has wrong shape"),
+        (EIPRK45, "max_step", 0.0, "`max_step` must be positive"),
+        (EIPRK45, "h_abs", -1.0, "`h_abs` must be a positive number"),
+        (EIPRK45, "h", 0.1, "`h` was set to 0.1 on a solver with adaptive steps"),
+        (EIPRK45, "y", [1.0, 2.0, 3.0], "an array of 3 components; this solver has 2"),
+        (EIPRK45, "y", [np.nan, 0.0], "must be finite"),
+        (EIPRK45, "y", [1j, 0.0], "complex"),
+        (EIPRK4, "h_abs", 0.01, "set `h` instead"),
+        (EIPRK4, "max_step", 0.01, "h sets a fixed step"),
+        (EIPRK4, "h", None, "`h` was set to None"),
+        (EIPRKN8, "fun", lambda t, y: -y, "the first 1 components of fun must be v"),
+    ],
+)
+@pytest.mark.parametrize("kept", [(), KEPT], ids=["free", "kept"])
+def test_wrong_values_raise(method, name, value, match, kept):
+    h = {} if method is EIPRK45 else {"h": 0.1}
+    solver = method(pendulum, 0, Y0, 5.0, invariants=kept, **h)
+    stepped(solver, 2)
+    setattr(solver, name, value)
+    with pytest.raises(ValueError, match=match):
+        solver.step()
+
+
+def test_tolerances_cannot_change_in_place():
+    solver = EIPRK45(pendulum, 0, Y0, 5.0)
+    with pytest.raises(ValueError, match="read-only"):
+        solver.rtol[:] = 1e-9
+
+
+def test_another_fixed_step():
+    """Half the step from t = 1 on: sixteen times less error from there, and no end before the bound."""
+    solver = EIPRK4(pendulum, 0, Y0, 5.0, h=0.1)
+    stepped(solver, 10)
+    solver.h = 0.05
+    rows = stepped(solver)
+    np.testing.assert_allclose(np.diff([row[0] for row in rows]), 0.05, rtol=1e-12)
+    assert solver.t == 5.0
+
+
+# Copies.
+
+
+class Verlet:
+    """A one-step method of a user's own."""
+
+    order = 2
+
+    def one_step(self, t, y, h):
+        q, p = y
+        p = p - h / 2 * np.sin(q)
+        q = q + h * p
+        return [q, p - h / 2 * np.sin(q)]
+
+
+class Counting(EIPRK45):
+    """A subclass with a hook and an attribute of its own."""
+
+    seen = 0
+
+    def _project_step(self, t, y, y_hat, err):
+        self.seen += 1
+        return super()._project_step(t, y, y_hat, err)
+
+
+COPIED = [
+    (EIPRK45, {}),
+    (EIPDOP853, {}),
+    (EIPRK23, {"rtol": 1e-5}),
+    (EIPRK4, {"h": 0.05}),
+    (EIPRK45, {"invariants": KEPT}),
+    (EIPRK45, {"invariants": Invariant(energy), "compensated": True, "every": 3}),
+    (EIPDOP853, {"invariants": KEPT, "rtol": 1e-7}),
+    (EIPRKN12, {"invariants": KEPT, "rtol": 1e-8}),
+    (EIPRKN8, {"invariants": KEPT, "h": 0.2, "every": "auto", "compensated": True}),
+    (EIPGJ12, {"invariants": KEPT, "h": 0.02}),
+    (EIPGJ14, {"invariants": KEPT, "h": 0.1, "jacobian": jacobian}),
+    (eip_method(RK5), {"invariants": KEPT, "h": 0.05}),
+    (eip_method(DOP853_TABLEAU), {"invariants": KEPT, "rtol": 1e-6}),
+    (eip_method(RKN86), {"h": 0.1}),
+    (eip_method(Verlet()), {"invariants": KEPT, "h": 0.05}),
+    (Counting, {"invariants": KEPT, "rtol": 1e-5}),
+]
+
+
+def rest(solver):
+    """What dense output gives in the last step, and all that is to come."""
+    middle = solver.dense_output()(0.5 * (solver.t_old + solver.t))
+    rows = stepped(solver)
+    counts = solver.nfev, solver.njev, solver.nlu, solver.diagnostics.n_projections, getattr(solver, "seen", 0)
+    return np.concatenate([middle, *rows, [solver.h_abs, *solver.diagnostics.max_defect, *counts]])
+
+
+@pytest.mark.parametrize("case", range(len(COPIED)))
+def test_copies_go_on_to_the_same_bits(case):
+    method, options = COPIED[case]
+    solver = method(pendulum, 0, Y0, 6.0, **options)
+    stepped(solver, 4)
+    copies = [copy.deepcopy(solver), pickle.loads(pickle.dumps(solver)), copy.copy(solver)]
+    kicked = copy.deepcopy(solver)
+    expected = rest(solver)
+    for other in copies:
+        np.testing.assert_array_equal(rest(other), expected)
+    assert type(copies[0]) is method
+    if kicked.status == "running":
+        kicked.y, kicked.t_bound = kicked.y + 0.1, 7.0  # set, and not yet taken
+        other = pickle.loads(pickle.dumps(kicked))
+        np.testing.assert_array_equal(rest(other), rest(kicked))
+        assert other.t == 7.0
+
+
+def test_copies_share_functions_and_nothing_else():
+    def fun(t, y):
+        return pendulum(t, y)
+
+    record = Diagnostics()
+    solver = EIPRK45(fun, 0, Y0, 6.0, invariants=KEPT, diagnostics=record)
+    solver.note = [1]
+    stepped(solver, 3)
+    other, count = copy.deepcopy(solver), record.n_projections
+    other.note.append(2)
+    other.y[0] += 1.0
+    assert solver.note == [1]
+    stepped(other)
+    assert record.n_projections == count
+    assert solver.status == "running"
+    with pytest.raises((AttributeError, pickle.PicklingError), match="fun"):
+        pickle.dumps(solver)
+
+
+@pytest.mark.parametrize("method", [EIPRK4, Counting, *(eip_method(m) for m in (RK5, RKN86, DOP853_TABLEAU, RK45))])
+def test_classes_pickle(method):
+    found = pickle.loads(pickle.dumps(method))
+    assert found.TABLEAU is method.TABLEAU
+    assert found.__name__ == method.__name__
+
+
+def test_classes_on_methods_of_a_user_pickle():
+    found = pickle.loads(pickle.dumps(eip_method(Verlet())))
+    assert found.order == 2
+    assert found.__name__ == "EIP_Verlet"
