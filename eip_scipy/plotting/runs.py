@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import FLOOR, PALETTE, _figure, _log_errors, method_styles
+from . import FLOOR, PALETTE, _log_errors, method_styles, typeset
+from .shown import shown_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
 
-__all__ = ["run_figure"]
+__all__ = ["draw_run", "run_figure"]
 
 MOST = 9  # components, or bodies, that can be told apart
 TICKS = 5  # of times with five digits: more would touch each other
@@ -52,7 +53,9 @@ def run_figure(
     Figure
     """
     widths = [1.0, *([1.0] if errors else []), *([0.6] if corrections else [])]
-    figure = _figure(4.4 * sum(widths) + 0.6, 4.2, title)
+    figure = shown_figure(4.4 * sum(widths) + 0.6, 4.2)
+    if title:
+        figure.suptitle(typeset(title), fontsize="large")
     grid = figure.add_gridspec(1, len(widths), width_ratios=widths)
     if paths:
         _draw_paths(figure.add_subplot(grid[0]), paths)
@@ -65,10 +68,34 @@ def run_figure(
     if errors:
         _log_errors(axes[0], "t", "|I - target|")
         axes[0].locator_params(axis="x", nbins=TICKS)
-        axes[0].legend(fontsize="small", loc="upper left")
+        axes[0].legend(fontsize="small", loc="best")
     if corrections:
         _draw_corrections(axes[-1], corrections, styles)
     return figure
+
+
+def draw_run(
+    axis: Axes, t: Any, components: Mapping[str, Any], paths: Mapping[str, tuple[Any, Any]], title: str = ""
+) -> None:
+    """Draw the paths of a run, or its components if there are none, into given axes.
+
+    Parameters
+    ----------
+    axis : matplotlib.axes.Axes
+    t, components, paths
+        As for `run_figure`.
+    title : str, optional
+        Set where the axes have none.
+    """
+    if paths:
+        _draw_paths(axis, paths)
+    else:
+        shown = dict(list(components.items())[:MOST])
+        _draw_lines(axis, t, shown, method_styles(shown))
+        axis.set_xlabel("t")
+        _counted(axis, len(components))
+    if title and not axis.get_title():
+        axis.set_title(typeset(title), fontsize="medium")
 
 
 def _draw_paths(axis: Axes, paths: Mapping[str, tuple[Any, Any]]) -> None:
@@ -93,17 +120,23 @@ def _draw_components(figure: Figure, place: SubplotSpec, t: np.ndarray, componen
     axes += [figure.add_subplot(parts[k], sharex=axes[0]) for k in range(1, len(groups))]
     styles = method_styles(shown)
     for axis, group in zip(axes, groups, strict=True):
-        for name in group:
-            values = np.asarray(shown[name])
-            is_complex = values.dtype.kind == "c"
-            style = styles[name] | {"label": f"|{name}|" if is_complex else name, "marker": None}
-            axis.plot(t, np.abs(values) if is_complex else values, lw=1.1, **style)
-        axis.grid(alpha=0.2)
-        if len(shown) > 1:
-            axis.legend(fontsize="small", loc="upper right")
+        _draw_lines(axis, t, {name: shown[name] for name in group}, styles, legend=len(shown) > 1)
     axes[-1].set_xlabel("t")
     axes[-1].locator_params(axis="x", nbins=TICKS)
     _counted(axes[0], len(components))
+
+
+def _draw_lines(
+    axis: Axes, t: Any, components: Mapping[str, Any], styles: Mapping[str, dict[str, Any]], *, legend: bool = True
+) -> None:
+    for name, given in components.items():
+        values = np.asarray(given)
+        is_complex = values.dtype.kind == "c"
+        style = styles[name] | {"label": f"|{name}|" if is_complex else name, "marker": None}
+        axis.plot(t, np.abs(values) if is_complex else values, lw=1.1, **style)
+    axis.grid(alpha=0.2)
+    if legend and len(components) > 0:
+        axis.legend(fontsize="small", loc="upper right")
 
 
 def _by_size(components: Mapping[str, Any]) -> list[list[str]]:
@@ -136,6 +169,6 @@ def _draw_corrections(axis: Axes, corrections: Mapping[str, float], styles: Mapp
         axis.bar(k, max(size, FLOOR), width=0.6, color=styles[name]["color"])
     axis.set_xticks(range(len(corrections)), list(corrections))
     axis.axhline(HEALTHY, color="0.4", lw=1.0, ls=":")
-    text = axis.annotate("most healthy runs stay below", (0.02, HEALTHY), xycoords=("axes fraction", "data"))
+    text = axis.annotate("most correct runs stay below", (0.02, HEALTHY), xycoords=("axes fraction", "data"))
     text.set(va="bottom", fontsize="x-small")
     _log_errors(axis, "", "largest correction [local errors]")

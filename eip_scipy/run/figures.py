@@ -11,7 +11,7 @@ from .tables import component_names, invariant_rows
 __all__ = ["described", "planes", "plot"]
 
 
-def plot(result: Any, names: Any = None, *, orbit: bool | None = None) -> Any:
+def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any = None) -> Any:
     """Draw a run: the components or the orbit, the invariants' errors, and the largest corrections.
 
     A flat line of errors says that the projection works, and nothing about the orbit: that is what the panel of
@@ -26,11 +26,14 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None) -> Any:
     orbit : bool, optional
         Whether to draw paths in the plane in place of components in time. Default: where components are named x and y,
         or x_0 and y_0, x_1 and y_1 and so on.
+    ax : matplotlib.axes.Axes, optional
+        Draw only the orbit or the components, into these axes.
 
     Returns
     -------
-    matplotlib.figure.Figure
-        ``figure.savefig("run.png")``; a notebook shows it.
+    matplotlib.figure.Figure or matplotlib.axes.Axes
+        The figure, or `ax` where it is given. A notebook shows the figure, without a magic; in a script with windows
+        ``matplotlib.pyplot.show()`` shows it; ``figure.savefig("run.png")`` writes it to a file.
 
     Raises
     ------
@@ -46,7 +49,7 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None) -> Any:
     >>> run = integrate(kepler(), (0, 20), method=EIPRK4, save_every=2)
     >>> run.plot().savefig("kepler.png")  # doctest: +SKIP
     """
-    from ..plotting.runs import run_figure
+    from ..plotting.runs import draw_run, run_figure
 
     labels = component_names(result, names)
     pairs = planes(labels)
@@ -54,11 +57,15 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None) -> Any:
         raise ValueError("plot: an orbit needs components named x and y, or x_0 and y_0 and so on; give names=...")
     y, diagnostics = np.asarray(result.y), result.get("diagnostics")
     paths = {name: (y[i], y[j]) for name, (i, j) in pairs.items()} if orbit is not False else {}
+    components = dict(zip(labels, y, strict=True))
+    if ax is not None:
+        draw_run(ax, result.t, components, paths, described(result))
+        return ax
     invariants = invariant_rows(result)
     corrections = {} if diagnostics is None else dict(zip(invariants, diagnostics.corrections, strict=True))
     return run_figure(
         result.t,
-        dict(zip(labels, y, strict=True)),
+        components,
         paths=paths,
         errors={name: errors for name, (_, errors) in invariants.items()},
         corrections={name: size for name, size in corrections.items() if np.isfinite(size)},

@@ -114,11 +114,11 @@ class IntegrationResult(OptimizeResult):
 
         save(self, path)
 
-    def plot(self, names: Any = None, *, orbit: bool | None = None) -> Any:
+    def plot(self, names: Any = None, *, orbit: bool | None = None, ax: Any = None) -> Any:
         """Draw the run, see `eip_scipy.plot`."""
         from .figures import plot
 
-        return plot(self, names, orbit=orbit)
+        return plot(self, names, orbit=orbit, ax=ax)
 
     def view(self, path: Any = None, *, names: Any = None, reference: Any = None) -> Any:
         """Write a page that plays the run, see `eip_scipy.view`."""

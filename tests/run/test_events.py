@@ -186,7 +186,7 @@ def test_directions_and_the_order_in_time_within_one_step():
     assert ended.t[-1] == ended.t_events[1][-1]
     assert ended.t_events[1].size == 3
     np.testing.assert_allclose(ended.t_events[1], passages(0.99)[:3], rtol=0, atol=1e-5)
-    # What comes later in the step that ends the run does not count.
+    # Later events of the step that ends the run do not count.
     assert (ended.t_events[0] < ended.t[-1]).all()
 
 

@@ -1,4 +1,4 @@
-// Where one event changes its sign within a step: between the ends of the step, and twice where it turns back inside.
+// Search for the points within a step between which an event changes its sign more often than the ends of the step show.
 #pragma once
 
 #include <algorithm>
@@ -12,7 +12,7 @@ namespace eip {
 
 constexpr int MOST_CROSSINGS = 3;           // that are looked for in a step, of each event
 constexpr double SLOPE_PART = 1.0 / 4096;   // of the step, over which the slope of an event is taken
-constexpr double REACH = 4.0;               // a value beyond so many slopes times the step comes to no zero and back
+constexpr double REACH = 4.0;               // slopes times the step: a larger value does not reach zero
 constexpr int MAX_SEARCHES = 40;            // values in one search for an extremum
 constexpr double SEARCH_TOLERANCE = 1e-9;   // of the step
 constexpr double VERTEX_ERROR = 0.1;        // of a parabola's vertex, relative to the distance of its points
@@ -33,7 +33,7 @@ struct EventPoints {
     void add(const EventPoint &p) { point[count++] = p; }
 };
 
-// Where the cubic through these values and slopes turns inside the step, in order, and whether it has a minimum there.
+// The extrema inside the step of the cubic through these values and slopes, in order, and which of them are minima.
 struct Turns {
     double theta[2] = {0.0, 0.0};
     bool minimum[2] = {false, false};

@@ -1,0 +1,116 @@
+"""The figure of a run is shown in notebooks, in windows, and in axes of the user."""
+
+import sys
+import types
+import warnings
+
+import numpy as np
+import pytest
+
+from eip_scipy import EIPRK4, integrate, plot
+from eip_scipy.problems import kepler
+
+pyplot = pytest.importorskip("matplotlib.pyplot")
+PNG = b"\x89PNG"
+CODE = """
+from eip_scipy import EIPRK4, integrate
+from eip_scipy.problems import kepler
+
+run = integrate(kepler(), (0, 10), method=EIPRK4, save_every=5)
+"""
+
+
+@pytest.fixture(scope="module")
+def run():
+    return integrate(kepler(), (0, 10), method=EIPRK4, save_every=5)
+
+
+@pytest.fixture
+def windows():
+    """A backend whose figures have windows, of which nothing is seen."""
+    from matplotlib.backend_bases import FigureManagerBase
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    class Canvas(FigureCanvasAgg):
+        manager_class = FigureManagerBase
+
+    name, before = "windows_that_nobody_sees", pyplot.get_backend()
+    backend = types.ModuleType(name)
+    backend.FigureCanvas, backend.FigureManager = Canvas, FigureManagerBase
+    sys.modules[name] = backend
+    pyplot.switch_backend(f"module://{name}")
+    yield pyplot
+    pyplot.close("all")
+    pyplot.switch_backend(before)
+    del sys.modules[name]
+
+
+def test_without_windows_nobody_keeps_the_figure(run):
+    before = pyplot.get_fignums()
+    figures = [run.plot() for _ in range(25)]
+    assert pyplot.get_fignums() == before
+    assert figures[0]._repr_png_()[:4] == PNG
+
+
+def test_pyplot_shows_the_figure_in_a_window(run, windows):
+    figure = run.plot()
+    assert windows.gcf() is figure
+    # The window shows it, so that a notebook needs no other picture.
+    assert figure._repr_png_() is None
+    windows.close(figure)
+    assert figure._repr_png_()[:4] == PNG
+
+
+def test_windows_do_not_add_up(run, windows, tmp_path):
+    """Twenty are open at most, from where on matplotlib warns, which is an error in these tests."""
+    own = windows.figure()
+    figures = [run.plot() for _ in range(25)]
+    assert len(windows.get_fignums()) == windows.rcParams["figure.max_open_warning"]
+    assert windows.fignum_exists(own.number)
+    assert windows.gcf() is figures[-1]
+    figures[0].savefig(tmp_path / "first.png")
+    assert (tmp_path / "first.png").read_bytes()[:4] == PNG
+
+
+def test_axes_of_the_user(run):
+    figure, (left, right) = pyplot.subplots(1, 2)
+    assert run.plot(ax=left) is left
+    np.testing.assert_array_equal(left.lines[0].get_xydata(), run.y[:2].T)
+    assert left.get_title() == "EIPRK4, h = 0.03"
+    right.set_title("my own")
+    assert plot(run, "q1 q2 p1 p2", ax=right) is right
+    assert [line.get_label() for line in right.lines] == ["q1", "q2", "p1", "p2"]
+    assert right.get_title() == "my own"
+    assert figure.axes == [left, right]
+    pyplot.close(figure)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("cells", "pictures"),
+    [
+        (
+            [
+                CODE + "run.plot()",
+                "run.plot();",
+                "figure = run.plot()\nimport matplotlib.pyplot as plt\nplt.show()",
+                "figure",
+                "figure, ax = plt.subplots()\nrun.plot(ax=ax)",
+                "for _ in range(25):\n    run.plot()",
+            ],
+            [1, 1, 1, 1, 1, 25],
+        ),
+        (["%matplotlib inline", CODE + "run.plot()"], [0, 1]),
+    ],
+    ids=["no magic", "magic"],
+)
+def test_a_notebook_shows_the_figure_once(cells, pictures, monkeypatch):
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    monkeypatch.delenv("MPLBACKEND")  # that of these tests
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of Jupyter's own
+        nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
+    found = [sum("image/png" in output.get("data", {}) for output in cell.outputs) for cell in notebook.cells]
+    assert found == pictures
