@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
-from .commands import CHECK_FAILED, COMMANDS, DONE, INTERRUPTED, MOVED, WRONG_USAGE
+from .commands import CHECK_FAILED, COMMANDS, DONE, INTERRUPTED, MOVED, NOT_PRINTED, WRONG_USAGE
 
 __all__ = ["main"]
 
@@ -46,8 +46,8 @@ def main(argv: Sequence[str] | None = None, **settings: Any) -> int:
     Returns
     -------
     int
-        Exit status: 0 done, 1 a check inside the command failed or a run is not to be trusted, 2 wrong usage, 130
-        interrupted.
+        Exit status: 0 done, 1 a check inside the command failed or a run is not to be trusted, 2 wrong usage, 3 the
+        text could not be printed, though the files are written, 130 interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     name = next((name for name in _longest_first() if words[: name.count(" ") + 1] == name.split()), None)
@@ -142,12 +142,12 @@ def _add_options(parser: argparse.ArgumentParser, command: Any) -> None:
 def _conduct(name: str, command: Any, args: argparse.Namespace) -> int:
     from ..core.results import ProjectionWarning
     from ..run.interrupts import ended_by_sigterm
-    from .report import UsageError, listening, warn
+    from .report import UsageError, listening, printing, warn
     from .study import Session
 
     session = Session(name, args.out, args.json, args.quiet)
     own = {key: value for key, value in vars(args).items() if key not in ("out", "json", "quiet")}
-    with ended_by_sigterm(True), listening(ProjectionWarning) as untrusted:
+    with ended_by_sigterm(True), listening(ProjectionWarning) as untrusted, printing() as unsaid:
         try:
             status = command(**own).run(session)
             for line in session.absent:  # at the end, where it is seen
@@ -161,4 +161,8 @@ def _conduct(name: str, command: Any, args: argparse.Namespace) -> int:
         finally:
             for message in untrusted:
                 warn(message)
-    return CHECK_FAILED if status == DONE and untrusted else status
+            if unsaid:
+                warn(f"cannot print to standard output: {unsaid[0]}. The files of the command are not concerned.")
+    if status == DONE and untrusted:
+        return CHECK_FAILED
+    return NOT_PRINTED if status == DONE and unsaid else status

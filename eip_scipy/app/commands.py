@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["CHECK_FAILED", "COMMANDS", "DONE", "INTERRUPTED", "MOVED", "WRONG_USAGE", "Entry"]
+__all__ = ["CHECK_FAILED", "COMMANDS", "DONE", "INTERRUPTED", "MOVED", "NOT_PRINTED", "WRONG_USAGE", "Entry"]
 
-DONE, CHECK_FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+DONE, CHECK_FAILED, WRONG_USAGE, NOT_PRINTED, INTERRUPTED = 0, 1, 2, 3, 130
 
 
 class Entry(NamedTuple):

@@ -10,7 +10,7 @@ import platform
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TextIO
@@ -29,6 +29,7 @@ __all__ = [
     "document",
     "listening",
     "machine",
+    "printing",
     "say",
     "table",
     "warn",
@@ -38,6 +39,7 @@ __all__ = [
 ]
 
 _untrusted: list[str] = []  # what was said of runs that are not to be trusted, since `listening` began
+_unsaid: list[str] = []  # why stdout took no text, since `printing` began
 
 
 class UsageError(Exception):
@@ -156,18 +158,41 @@ def _line(label: str, cells: Sequence[str], first: int, widths: Sequence[int]) -
 
 
 def say(text: str = "") -> None:
-    """Print on stdout; neither a reader that has left, say `head`, nor a terminal without Unicode ends the command."""
+    """Print on stdout; neither a terminal without Unicode nor a stdout that takes nothing ends the command.
+
+    A reader that has left, say `head`, wants no more. Any other failure is noted for `printing`.
+    """
+    if sys.stdout is None or sys.stdout.closed:
+        _unsaid.append("it is closed")
+        return
     encoding = sys.stdout.encoding or "utf-8"
     try:
         print(text.encode(encoding, "replace").decode(encoding), flush=True)
-    except BrokenPipeError:
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):
+            _unsaid.append(_reason(error))
         # Python writes what is left when it closes stdout; let that go nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def warn(message: str) -> None:
-    """Print one line for the user on the error stream."""
-    print(f"eip-scipy: {message}", file=sys.stderr)
+    """Print one line for the user on the error stream, if there is one that takes it."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(f"eip-scipy: {message}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def printing() -> Iterator[list[str]]:
+    """Collect the reasons why `say` could not print, instead of ending the command.
+
+    Yields
+    ------
+    list of str
+        Filled as text is printed.
+    """
+    _unsaid.clear()
+    yield _unsaid
 
 
 @contextmanager

@@ -149,6 +149,8 @@ class Session:
         What could not be compared with, said at the end.
     written : set of Path
         Files that were made.
+    unnamed : list of Path
+        Those of them that no line has named yet.
     open : ExitStack
         What is to be closed when the command ends.
     """
@@ -159,12 +161,13 @@ class Session:
     quiet: bool = False
     absent: list[str] = field(default_factory=list)
     written: set[Path] = field(default_factory=set)
+    unnamed: list[Path] = field(default_factory=list)
     open: ExitStack = field(default_factory=ExitStack)
 
     @property
     def shown(self) -> bool:
         """Whether progress is shown: to a terminal only, as a file would fill with it."""
-        return not self.quiet and sys.stderr.isatty()
+        return not self.quiet and sys.stderr is not None and sys.stderr.isatty()
 
     def bar(self, total: int | None, what: str, unit: str = "run", **settings: Any) -> Any:
         """Make a progress bar of tqdm, to be used in a ``with``."""
@@ -199,10 +202,17 @@ class Session:
             say(text)
 
     def wrote(self, path: Path) -> None:
-        """Say that a file is there, once, with an empty line before the first."""
+        """Note that a file is there; `name_files` prints it, once."""
         if path not in self.written:
-            self.say(f"wrote {path}" if self.written else f"\nwrote {path}")
+            self.unnamed.append(path)
         self.written.add(path)
+
+    def name_files(self) -> None:
+        """Print which files were made since the last time, with an empty line before the first of all."""
+        first = len(self.unnamed) == len(self.written)
+        for k, path in enumerate(self.unnamed):
+            self.say(f"\nwrote {path}" if first and k == 0 else f"wrote {path}")
+        self.unnamed.clear()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,11 +308,14 @@ def perform(study: Study[Any], session: Session) -> tuple[int, dict[str, Any]]:
             raise UsageError(f"not enough memory: {error}") from error
         except CheckpointError as error:
             raise UsageError(f"{error} On the command line, resume=True is --resume.") from error
-        session.say(study.text(found))
+        # Before any line is printed: a stdout that takes nothing loses no file.
         numbers = _write_numbers(study, found, session)
+        session.say(study.text(found))
+        session.name_files()
         try:
             if not interrupted and study.refine(found, session):
                 numbers = _write_numbers(study, found, session)
+                session.name_files()
         except KeyboardInterrupt:
             interrupted = "interrupted; the table is complete, what is measured after it and the figures are missing"
         if interrupted:
@@ -335,5 +348,6 @@ def _write_figures(study: Study[Any], found: Any, session: Session) -> None:
     try:
         for name, figure in study.figures(found):
             session.wrote(write_file(session.out / name, _writer(figure)))
+            session.name_files()
     except ImportError as error:
         warn(f"no figures: {error}")

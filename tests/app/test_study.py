@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, fields
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 
@@ -158,3 +159,42 @@ def test_help_is_quick():
     loaded = {name.split(".")[0] for name in done.stdout.split()}
     assert "argparse" in loaded
     assert not loaded & {"numpy", "scipy", "numba", "matplotlib", "tqdm"}
+
+
+WRITING = """
+import sys
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+from eip_scipy.app.cli import main
+from eip_scipy.app.commands import COMMANDS, Entry
+import test_study
+sys.modules["eip_scipy.app.test_study"] = test_study
+COMMANDS["sums"] = Entry("test_study:Sums", "")
+sys.exit(main(["sums", "--out", {out!r}, "--json", {json!r}], ends={{}}))
+"""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no file that is always full")
+@pytest.mark.parametrize(("redirected", "status"), [(">/dev/full", 3), (">&-", 3), (">&- 2>&-", 3), ("| true", 0)])
+def test_a_stdout_that_takes_nothing_loses_no_file(redirected, status, tmp_path):
+    names = {"tests": str(Path(__file__).parent), "out": str(tmp_path / "out"), "json": str(tmp_path / "sums.json")}
+    (tmp_path / "run.py").write_text(WRITING.format(**names))
+    command = f"set -o pipefail; sleep 0.1 | {sys.executable} {tmp_path / 'run.py'} {redirected}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
+    assert done.returncode == status
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["first.png", "second.txt", "sums.csv"]
+    assert json.loads((tmp_path / "sums.json").read_text())["sum"] == 16
+    if status and "2>" not in redirected:
+        assert done.stderr.startswith("eip-scipy: cannot print to standard output: ")
+        assert done.stderr.count("\n") == 1
+
+
+def test_files_are_written_before_the_text_is_made(tmp_path):
+    class Wordless(Sums):
+        def text(self, found):
+            raise UnicodeError
+
+    with pytest.raises(UnicodeError):
+        Wordless(ends={}).run(Session("sums", tmp_path, tmp_path / "sums.json"))
+    assert (tmp_path / "sums.csv").exists()
+    assert (tmp_path / "sums.json").exists()

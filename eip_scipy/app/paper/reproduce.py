@@ -68,4 +68,5 @@ class Reproduce(Command):
         content["passed"] = status == DONE
         if session.json is not None:
             session.wrote(write_json(session.json, document(session.name, {"table": wanted}, **content)))
+            session.name_files()
         return status
