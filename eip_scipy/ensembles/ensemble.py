@@ -35,7 +35,7 @@ from ..run.events import Events
 from ..run.interrupts import ended_by_sigterm, kept_ctrl_c
 from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
-from ..run.tables import dataset, default_names
+from ..run.tables import dataset, default_names, to_dataframe
 from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
 from .side_by_side import LANES
 from .statistics import Statistics, merge
@@ -154,8 +154,12 @@ class EnsembleResult(OptimizeResult):
         attributes = {name: self[name] for name in ("method", "h", "success", "stopped", "wall_time")}
         return dataset(variables, coordinates, attributes)
 
+    def to_dataframe(self, names: Any = None) -> Any:
+        """Return the members as a `pandas.DataFrame`, see `eip_scipy.to_dataframe`."""
+        return to_dataframe(self, names)
+
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), "to_xarray"]
+        return [*super().__dir__(), "to_dataframe", "to_xarray"]
 
     def __repr__(self) -> str:
         ran = int(np.count_nonzero(self.status != NOT_RUN))

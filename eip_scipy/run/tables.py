@@ -26,8 +26,8 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
 
     Parameters
     ----------
-    result : IntegrationResult or OdeResult
-        From `integrate` or from `scipy.integrate.solve_ivp`.
+    result : IntegrationResult, OdeResult or EnsembleResult
+        From `integrate`, `scipy.integrate.solve_ivp` or `ensemble`, whose table is that of ``result.to_xarray()``.
     names : sequence of str or str, optional
         Names of the components, as a list or as ``"x y vx vy"``. Default: those of the run's `Problem`, else "y0", "y1"
         and so on.
@@ -37,7 +37,7 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
     xarray.Dataset
         ``y`` (component, t) with the coordinates ``component`` and ``t``: ``data.y.sel(component="x")``. With
         invariants ``invariants`` and ``invariant_errors``, I - target, both (invariant, t), and ``max_defect``. Its
-        attributes are method, h (nan: adaptive steps), message, trusted and the like, as far as there are any.
+        attributes are method, h (nan: adaptive steps), message, trusted (1 or 0) and the like, as far as there are any.
 
     Raises
     ------
@@ -54,6 +54,8 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
     >>> data.y.dims, data.component.values.tolist(), data.attrs["method"]
     (('component', 't'), ['x', 'y', 'vx', 'vy'], 'EIPRK4')
     """
+    if _of_members(result):
+        return result.to_xarray(names)
     variables: dict[str, Any] = {"y": (("component", "t"), np.asarray(result.y))}
     coordinates: dict[str, Any] = {"t": np.asarray(result.t), "component": list(component_names(result, names))}
     rows = invariant_rows(result)
@@ -79,7 +81,9 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
     -------
     pandas.DataFrame
         Indexed by ``t``: a column for each component, then for each invariant its value, "H", and "H error", the value
-        less the target. Where a component has the name of an invariant, the latter is "invariant H".
+        less the target. Where a component has the name of an invariant, the latter is "invariant H". Of an ensemble
+        indexed by ``member``: a column for each component of the last state, then "t_end", "status", "message",
+        "trusted", and "H max_defect" for each invariant.
 
     Raises
     ------
@@ -100,11 +104,26 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
         import pandas
     except ModuleNotFoundError as error:
         raise _missing("pandas", error) from error
+    if _of_members(result):
+        members = pandas.Index(result.first + np.arange(len(result.y)), name="member")
+        return pandas.DataFrame(_member_columns(result, names), index=members)
     columns = dict(zip(component_names(result, names), np.asarray(result.y), strict=True))
     for name, (values, errors) in invariant_rows(result).items():
         label = f"invariant {name}" if name in columns else name
         columns |= {label: values, f"{label} error": errors}
     return pandas.DataFrame(columns, index=pandas.Index(result.t, name="t"))
+
+
+def _of_members(result: Any) -> bool:
+    """Whether a result is that of an ensemble, whose states are (members, components)."""
+    return "trajectories" in result
+
+
+def _member_columns(result: Any, names: Any) -> dict[str, np.ndarray]:
+    labels = component_names(result, names, result.y.shape[1])
+    columns = dict(zip(labels, result.y.T, strict=True))
+    columns |= {"t_end": result.t, "status": result.status, "message": result.message, "trusted": result.trusted}
+    return columns | {f"{name} max_defect": result.max_defect[:, k] for k, name in enumerate(result.names)}
 
 
 def invariant_rows(result: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -117,9 +136,9 @@ def invariant_rows(result: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return rows
 
 
-def component_names(result: Any, names: Any = None) -> tuple[str, ...]:
-    """The names given, else a result's own, else "y0", "y1" and so on."""
-    n = len(result.y)
+def component_names(result: Any, names: Any = None, n: int | None = None) -> tuple[str, ...]:
+    """The names given, else a result's own, else "y0", "y1" and so on; `n` of them, default: a row of y for each."""
+    n = len(result.y) if n is None else n
     if names is None:
         names = getattr(result, "component_names", None)
     return default_names(n) if names is None else checked(names, n)
@@ -142,9 +161,14 @@ def dataset(variables: dict[str, Any], coordinates: dict[str, Any], attributes: 
         import xarray
     except ModuleNotFoundError as error:
         raise _missing("xarray", error) from error
-    # NetCDF and Zarr know no None.
-    told = {name: np.nan if value is None else value for name, value in attributes.items()}
-    return xarray.Dataset(variables, coordinates, told)
+    return xarray.Dataset(variables, coordinates, {name: _attribute(value) for name, value in attributes.items()})
+
+
+def _attribute(value: Any) -> Any:
+    """The value as NetCDF and Zarr store it, which have neither None nor booleans among attributes."""
+    if value is None:
+        return np.nan
+    return int(value) if isinstance(value, (bool, np.bool_)) else value
 
 
 def _missing(library: str, error: ModuleNotFoundError) -> ImportError:

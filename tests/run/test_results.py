@@ -122,6 +122,24 @@ def test_xarray_goes_to_netcdf(tmp_path):
     data.to_netcdf(tmp_path / "run.nc", engine="scipy")
     with xarray.open_dataset(tmp_path / "run.nc", engine="scipy") as again:
         np.testing.assert_array_equal(again.y, data.y)
+        assert again.attrs["trusted"] == 1
+
+
+@pytest.mark.parametrize("engine", ["h5netcdf", "netCDF4"])
+def test_xarray_goes_to_netcdf_4(engine, tmp_path):
+    """Runs with fixed and adaptive steps, and an ensemble, through each library for files of version 4."""
+    xarray = pytest.importorskip("xarray", reason="needs xarray")
+    pytest.importorskip(engine, reason=f"needs {engine}")
+    many = ensemble(oscillator, (0, 1), np.ones((3, 2)), h=0.1, save_every=2)
+    runs = kepler_run(), integrate(oscillator, (0, 1), Y0, method=EIPRK45), many
+    for k, run in enumerate(runs):
+        data = run.to_xarray()
+        path = tmp_path / f"{k}.nc"
+        data.to_netcdf(path, engine=engine.lower())
+        with xarray.open_dataset(path, engine=engine.lower()) as again:
+            assert again.attrs["success"] == 1
+            np.testing.assert_array_equal(again.y, data.y)
+            assert set(again.variables) == set(data.variables)
 
 
 def test_to_dataframe():
@@ -163,6 +181,20 @@ def test_ensemble_to_xarray():
     last = ensemble(oscillator, (0, 1), np.ones((3, 2)), h=0.1).to_xarray("q p")
     assert "states" not in last
     assert last.component.values.tolist() == ["q", "p"]
+
+
+def test_tables_of_as_many_members_as_components():
+    """A row for each member: its components are not taken for those of another member."""
+    starts = np.array([[1.0, 2.0], [3.0, 4.0]])
+    result = ensemble(oscillator, (0, 1), starts, h=0.1, method=EIPRK4, invariants=SQUARE)
+    frame, data = to_dataframe(result, "q p"), to_xarray(result, "q p")
+    np.testing.assert_array_equal(frame["p"], result.y[:, 1])
+    np.testing.assert_array_equal(data.y.sel(component="p"), result.y[:, 1])
+    assert list(frame.columns) == ["q", "p", "t_end", "status", "message", "trusted", "S max_defect"]
+    assert frame.index.name == "member"
+    np.testing.assert_array_equal(frame["S max_defect"], result.max_defect[:, 0])
+    assert result.to_dataframe().columns[0] == "y0"
+    assert data.identical(result.to_xarray("q p"))
 
 
 @pytest.mark.parametrize(("table", "library"), [("to_xarray", "xarray"), ("to_dataframe", "pandas")])
