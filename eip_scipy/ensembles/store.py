@@ -24,6 +24,13 @@ __all__ = ["CheckpointStore", "Store", "ZarrStore", "location", "require_identit
 
 KIND = "ensemble"
 LABEL = "eip_scipy_ensemble"
+# Of format 2 the metadata may name the codec that unpickles. A group's own file may hold metadata of any format.
+FORMAT: dict[str, Any] = {"zarr_format": 3, "use_consolidated": False}
+OPTIONAL = ("states", "time", "known_by")
+ARRAYS = (
+    *OPTIONAL, "y", "t_end", "max_defect", "max_correction", "counters", "side_by_side", "trusted", "message", "status",
+)  # fmt: skip
+CODECS = {"blosc", "bytes", "crc32c", "gzip", "transpose", "vlen-bytes", "vlen-utf8", "zstd"}
 SAME = 1e-9
 # Writing a checkpoint takes at most a twentieth of the time.
 LEAST_RATIO = 19.0
@@ -168,7 +175,7 @@ class ZarrStore:
                 return
             mode = "w"  # left by us before it was whole
         try:
-            self._group = zarr.open_group(self._place, mode=mode, zarr_format=3, attributes={LABEL: None})
+            self._group = zarr.open_group(self._place, mode=mode, attributes={LABEL: None}, **FORMAT)
         except FileExistsError as error:
             raise CheckpointError(f"{self.path!r} is no ensemble of eip_scipy: {error}") from error
         except OSError:
@@ -182,7 +189,7 @@ class ZarrStore:
         if self._local is not None:
             return os.path.lexists(self._local)
         try:
-            zarr.open_group(self._place, mode="r")
+            zarr.open_group(self._place, mode="r", **FORMAT)
         except FileNotFoundError:
             return False
         return True
@@ -190,11 +197,30 @@ class ZarrStore:
     def _existing(self, zarr: Any) -> dict[str, Any] | None:
         """What the group that is there says of itself; None where it was left before it was whole."""
         try:
-            self._group = zarr.open_group(self._place, mode="r+")
+            self._group = zarr.open_group(self._place, mode="r+", **FORMAT)
             found: dict[str, Any] | None = self._group.attrs[LABEL]
+            if found is not None:
+                self._require_plain_arrays()
         except (KeyError, ValueError, OSError) as error:
-            raise CheckpointError(f"{self.path!r} is no ensemble of eip_scipy: {error}") from error
+            old = self._local is not None and (self._local / ".zgroup").exists()
+            why = "it is a Zarr group of format 2, whose metadata may name code to run" if old else error
+            raise CheckpointError(f"{self.path!r} is no ensemble of eip_scipy: {why}") from error
         return found
+
+    def _require_plain_arrays(self) -> None:
+        """Look at all arrays before one is read: a codec from elsewhere may run what is in the data."""
+        for name in ARRAYS:
+            if name not in self._group:
+                if name in OPTIONAL:
+                    continue
+                raise ValueError(f"it has no array {name!r} of format 3")
+            metadata = self._group[name].metadata.to_dict()
+            codecs = {codec["name"] for codec in metadata.get("codecs", ())}
+            if metadata["zarr_format"] != 3 or not codecs <= CODECS:
+                raise ValueError(
+                    f"its array {name!r} is stored by {', '.join(sorted(codecs - CODECS)) or 'another format'}; "
+                    f"expected {', '.join(sorted(CODECS))}"
+                )
 
     def _status(self) -> tuple[int, int] | None:
         """What the group is known by: it writes its own file at its making only."""
@@ -220,7 +246,7 @@ class ZarrStore:
         try:
             mark = self._status()
             if mark != self._mark:
-                own = _zarr().open_group(self._place, mode="r").attrs[LABEL] == self._label
+                own = _zarr().open_group(self._place, mode="r", **FORMAT).attrs[LABEL] == self._label
                 self._mark = mark if own else None
         except (KeyError, ValueError, OSError):
             self._mark = None

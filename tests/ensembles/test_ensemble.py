@@ -1,7 +1,10 @@
 """`ensemble`: members equal single runs bit for bit, on any number of workers; failures, statistics, stores."""
 
+import contextlib
+import json
 import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -736,6 +739,78 @@ def test_a_store_that_was_not_begun_yet(tmp_path):
     zarr = pytest.importorskip("zarr", reason="needs zarr")
     zarr.open_group(tmp_path / "run.zarr", mode="w", attributes={"eip_scipy_ensemble": None})
     same(stored(), stored(out=tmp_path / "run.zarr", resume=True))
+
+
+class Trap:
+    """Makes a folder where it is unpickled."""
+
+    def __init__(self, path):
+        self._path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self._path),)
+
+
+def trapped(path, trap, zarr_format):
+    """Put a status whose codec unpickles, in a format that can name it, in the place of the store's own."""
+    zarr, numcodecs = pytest.importorskip("zarr"), pytest.importorskip("numcodecs")
+    attributes = dict(zarr.open_group(path, mode="r").attrs)
+    group = zarr.open_group(path, mode="w", zarr_format=zarr_format, attributes=attributes)
+    where = path
+    if zarr_format == 3:  # a group of format 3 with an array of format 2 in it
+        where = path / "status"
+        (path / "y").mkdir()
+    else:
+        group.create_array("y", shape=(11, 2), chunks=(3, 2), dtype=float)
+        where = path / "status"
+    where.mkdir(exist_ok=True)
+    described = {
+        "zarr_format": 2, "shape": [11], "chunks": [3], "dtype": "|O", "compressor": None, "fill_value": None,
+        "order": "C",
+        "filters": [{"id": "vlen-utf8"}, {"id": "pickle", "protocol": 4}],
+    }  # fmt: skip
+    (where / ".zarray").write_text(json.dumps(described))
+    (where / ".zattrs").write_text("{}")
+    for chunk in range(4):
+        (where / str(chunk)).write_bytes(pickle.dumps(Trap(trap)))
+    if zarr_format == 3:
+        found = json.loads((path / "zarr.json").read_text())
+        found["consolidated_metadata"] = {
+            "kind": "inline", "must_understand": False, "metadata": {"status": described | {"attributes": {}}},
+        }  # fmt: skip
+        (path / "zarr.json").write_text(json.dumps(found))
+    return numcodecs
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_a_strangers_store_runs_no_code(zarr_format, tmp_path, monkeypatch):
+    """The codec that unpickles is let loose, as in numcodecs before it refused to."""
+    path, trap = tmp_path / "run.zarr", tmp_path / "sprung"
+    stored(out=path)
+    numcodecs = trapped(path, trap, zarr_format)
+    monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
+    with pytest.raises(CheckpointError, match="is no ensemble of eip_scipy") as refused:
+        stored(out=path, resume=True)
+    assert not trap.exists()
+    if zarr_format == 2:
+        assert "it is a Zarr group of format 2, whose metadata may name code to run" in str(refused.value)
+        import zarr
+
+        with contextlib.suppress(Exception):
+            zarr.open_group(path, mode="r")["status"][:]
+        assert trap.exists()  # so the trap works
+
+
+@pytest.mark.filterwarnings("ignore:Numcodecs codecs are not in the Zarr version 3 specification")
+def test_a_codec_from_elsewhere_is_refused(tmp_path):
+    pytest.importorskip("zarr")
+    path = tmp_path / "run.zarr"
+    stored(out=path)
+    described = json.loads((path / "y" / "zarr.json").read_text())
+    described["codecs"].append({"name": "numcodecs.zlib", "configuration": {"level": 1}})
+    (path / "y" / "zarr.json").write_text(json.dumps(described))
+    with pytest.raises(CheckpointError, match=r"its array 'y' is stored by numcodecs\.zlib; expected blosc, bytes"):
+        stored(out=path, resume=True)
 
 
 def test_checkpoints_in_time(tmp_path):
