@@ -308,10 +308,11 @@ def perform(study: Study[Any], session: Session) -> tuple[int, dict[str, Any]]:
             raise UsageError(f"not enough memory: {error}") from error
         except CheckpointError as error:
             raise UsageError(f"{error} On the command line, resume=True is --resume.") from error
-        # Before any line is printed: a stdout that takes nothing loses no file.
-        numbers = _write_numbers(study, found, session)
-        session.say(study.text(found))
-        session.name_files()
+        try:  # files before text: a stdout that takes nothing loses no file, and a full disk no text
+            numbers = _write_numbers(study, found, session)
+        finally:
+            session.say(study.text(found))
+            session.name_files()
         try:
             if not interrupted and study.refine(found, session):
                 numbers = _write_numbers(study, found, session)
