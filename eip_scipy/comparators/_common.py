@@ -108,7 +108,7 @@ class FixedSteps(NamedTuple):
             raise ValueError(f"save_every must be a positive integer or None, got {save_every!r}")
         n_steps = fixed_steps(h, t0, t_bound)
         step = math.copysign(h, t_bound - t0)
-        return cls(t0, t_bound, step, t_bound - (t0 + (n_steps - 1) * step), saved_steps(n_steps, int(save_every)))
+        return cls(t0, t_bound, step, (t_bound - t0) - (n_steps - 1) * step, saved_steps(n_steps, int(save_every)))
 
     @property
     def t(self) -> np.ndarray:

@@ -258,11 +258,24 @@ class _Pieces(Sequence[ManifoldDenseOutput]):
         return ManifoldDenseOutput(self._interpolants, self._pieces[k])
 
 
-def solution(interpolants: Interpolants, pieces: Array, t_end: float) -> OdeSolution:
-    """Dense output over a run, from its interpolants (m, floats), up to its end.
+class _AtRest(_AtRealTimes):
+    """The dense output of a run without a step: one state."""
+
+    def __init__(self, t: float, y: Array) -> None:
+        super().__init__(t, t)
+        self._y = y.copy()
+
+    def _call_impl(self, t: Array) -> Array:
+        return self._y.copy() if t.ndim == 0 else np.repeat(self._y[:, None], t.size, axis=1)
+
+
+def solution(interpolants: Interpolants, pieces: Array, t_end: float, y_end: Array) -> OdeSolution:
+    """Dense output over a run, from its interpolants (m, floats), up to its end; `y_end` is the state there.
 
     Where an event has ended the run at the very beginning of a step, it goes on to that step's end.
     """
+    if not len(pieces):
+        return OdeSolution([t_end, t_end], [_AtRest(t_end, y_end)])
     if len(pieces) and pieces[-1, 0] == t_end:
         t_end = pieces[-1, 1]
     ts = np.append(pieces[:, 0], t_end)

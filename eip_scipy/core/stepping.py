@@ -58,7 +58,8 @@ class Stepping:
             When it is to be estimated and the error of a component has no scale.
         """
         if self.h is not None:
-            return self.h
+            length = abs(self.span.t_bound - self.span.t0)
+            return min(self.h, length) if length else self.h
         if self.first_step is not None:
             return self.first_step
         self.require_scale(y0)
@@ -134,7 +135,7 @@ class StepOptions:
         first_step, max_step = step_bounds(self.first_step, self.max_step, t0, t_bound)
         rtol, atol = tolerances(self.rtol, self.atol, n)
         if h is not None:
-            h = check_fixed_step(h, t0, t_bound)
+            h = check_fixed_step(h, t0, t_bound, may_be_longer=True)
         elif np.any(rtol < LEAST_RTOL):
             message = f"At least one element of `rtol` is too small. Setting `rtol = np.maximum(rtol, {LEAST_RTOL})`."
             warnings.warn(message, stacklevel=stacklevel)
@@ -193,15 +194,17 @@ def tolerances(rtol: Any, atol: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
     return out[0], out[1]
 
 
-def check_fixed_step(h: Any, t0: float, t_bound: float) -> float:
-    """The step h as a positive float.
+def check_fixed_step(h: Any, t0: float, t_bound: float, *, may_be_longer: bool = False) -> float:
+    """Return the step h as a positive float.
+
+    A step that may be longer than the interval is shortened to it, as the last step of any run.
 
     Raises
     ------
     TypeError
         When it has a unit.
     ValueError
-        When it is no positive number, longer than the interval, or below ten spacings of t.
+        When it is not a positive number, or longer than the interval, or below ten spacings of t.
     """
     refuse_units(h=h)
     if not is_number(h) or not 0 < h < math.inf:
@@ -210,7 +213,7 @@ def check_fixed_step(h: Any, t0: float, t_bound: float) -> float:
     span = abs(t_bound - t0)
     if span == 0:
         return h
-    if h > span * (1 + _slack(h, t0, t_bound)):
+    if not may_be_longer and h > span * (1 + _slack(h, t0, t_bound)):
         raise ValueError(f"`h` exceeds bounds. Got h = {h:g} for an interval of length {span:g}.")
     largest = max(abs(t0), abs(t_bound)) if math.isfinite(t_bound) else abs(t0)
     spacing = float(np.spacing(largest))

@@ -22,7 +22,8 @@ from .memory import most_bytes
 
 __all__ = ["Driver", "check_memory", "saved_rows"]
 
-FIRST_ROWS = 1024
+# Room that a run begins with if the number of its steps is not known; it grows.
+FIRST_ROWS, FIRST_BYTES = 1024, 2**24
 
 
 class Driver:
@@ -43,8 +44,8 @@ class Driver:
         self.run, self.schedule, self.params, self._events = run, schedule, params, events
         self.functions: Any = functions
         self._max_bytes = max_bytes
-        rows = saved_rows(schedule) or FIRST_ROWS
         n, dtype = run.y0.size, run.y0.dtype
+        rows = saved_rows(schedule) or _first(run.y0.nbytes)
         # One row to spare for the last state of a run that ends early.
         self.t = np.empty(rows + 1)
         self.y = np.empty((rows + 1, n), dtype)
@@ -55,7 +56,8 @@ class Driver:
         self._pieces = np.empty((0, 0))
         if schedule.t_eval.size or schedule.g.size or keeps_steps:
             self._interpolants = Interpolants(run, tableau, self.engine, schedule.g.size, self.own_errors)
-            self._pieces = self._more_pieces(expected_steps(schedule) or FIRST_ROWS if keeps_steps else 0)
+            steps = expected_steps(schedule) or _first(8 * self._interpolants.floats)
+            self._pieces = self._more_pieces(steps if keeps_steps else 0)
 
     def advance(self, k_end: int) -> int:
         """Step on to step `k_end`, or to what stops the loop before it; returns the loop's code."""
@@ -233,7 +235,7 @@ class Driver:
         """Dense output over the whole run, where its steps are kept."""
         if self._interpolants is None or not self._pieces.size:
             return None
-        return solution(self._interpolants, self._pieces[: self._kept], t_end)
+        return solution(self._interpolants, self._pieces[: self._kept], t_end, self.now[1])
 
     def values(self) -> np.ndarray:
         """Invariants of the saved states, (l, m)."""
@@ -242,6 +244,11 @@ class Driver:
         with self.own_errors():
             self.engine.values(t, y, out)
         return out.T
+
+
+def _first(size: int) -> int:
+    """How many items of so many bytes there is room for at first."""
+    return min(FIRST_ROWS, max(2, FIRST_BYTES // max(size, 1)))
 
 
 def saved_rows(schedule: Schedule) -> int:

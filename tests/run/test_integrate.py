@@ -11,17 +11,21 @@ from scipy.integrate import solve_ivp
 from systems import SQUARE, oscillator
 
 from eip_scipy import (
+    EIPGJ12,
     EIPRK1,
     EIPRK2,
     EIPRK3,
     EIPRK4,
     EIPRK5,
+    EIPRK45,
+    EIPRKN12,
     Diagnostics,
     IntegrationResult,
     Invariant,
     ProjectionWarning,
     check_gradient,
     eip_method,
+    ensemble,
     integrate,
     project,
 )
@@ -56,6 +60,44 @@ def test_save_every(save_every, steps, t_span):
     np.testing.assert_array_equal(some.y, every.y[:, list(steps)])
     np.testing.assert_array_equal(some.invariants, every.invariants[:, list(steps)])
     assert some.t[-1] == t_span[1]
+
+
+FAR = 2.2e11  # where times are 3e-5 apart
+WAYS = [(EIPRK5, {}), (EIPRK4, {}), (EIPRKN12, {"second": True}), (EIPGJ12, {"second": True})]
+
+
+@pytest.mark.parametrize(("method", "how"), WAYS, ids=[method.__name__ for method, _ in WAYS])
+@pytest.mark.parametrize("length", [20.0, 19.875, 0.125])
+def test_an_autonomous_system_does_not_see_the_time(method, how, length):
+    """The lengths of steps, of the last one too, are not differences of times, which have lost their last digits."""
+    second = {"acceleration": lambda t, q: -q} if how else {}
+    fun = None if how else oscillator
+    options = {"method": method, "h": 0.02, "check": False, "save_every": 100, **second}
+    for t0 in (FAR, -FAR / 8):
+        end = float(t0 + length)
+        far = integrate(fun, (t0, end), Y0, **options)
+        np.testing.assert_allclose(far.y[:, -1], exact(end - t0), rtol=0, atol=2e-7 if method is EIPRK4 else 1e-9)
+        near = integrate(fun, (0.0, end - t0), Y0, **options)
+        np.testing.assert_allclose(far.y[:, -1], near.y[:, -1], rtol=0, atol=1e-14)
+        assert far.t[-1] == end
+        members = ensemble(fun, (t0, end), np.tile(Y0, (8, 1)), **options)
+        np.testing.assert_array_equal(members.y[3], far.y[:, -1])
+
+
+def test_a_span_of_zero_has_a_solution():
+    result = run((3.0, 3.0), dense_output=True)
+    np.testing.assert_array_equal(result.sol(3.0), Y0)
+    np.testing.assert_array_equal(result.sol([3.0, 3.0]), np.column_stack([Y0, Y0]))
+    assert (result.sol.t_min, result.sol.t_max) == (3.0, 3.0)
+
+
+@pytest.mark.parametrize("options", [{"dense_output": True}, {"save_every": 1}])
+def test_no_more_room_than_a_few_steps_take(options):
+    """The number of adaptive steps is not known; 1024 of them would take 8 GB and more."""
+    result = integrate(
+        lambda t, y: -y, (0, 0.1), np.ones(10**6), method=EIPRK45, rtol=1e-2, max_bytes=4e8, check=False, **options
+    )
+    np.testing.assert_allclose(result.y[0, -1], math.exp(-0.1), rtol=1e-3)
 
 
 def test_fields():

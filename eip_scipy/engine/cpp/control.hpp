@@ -130,7 +130,7 @@ inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_
         const double t_new = adaptive ? t + h_abs * span.sign : span.t0 + (k + 1) * span.h;
         const bool last = adaptive ? span.sign * (t_new - span.t_bound) >= 0 : k + 1 >= span.n_steps;
         clock[TIME_NEW] = last ? span.t_bound : t_new;
-        clock[LENGTH] = adaptive || last ? clock[TIME_NEW] - t : span.h;
+        clock[LENGTH] = adaptive ? clock[TIME_NEW] - t : span.between(k, k + 1);
         h_abs = std::abs(clock[LENGTH]);
         const bool again = o.every == AUTO && !run.method.multistep && w.counters[WAITED] == 0;
         const bool project = w.l > 0 && (last || again || spacing == 1 || (k + 1) % spacing == 0);

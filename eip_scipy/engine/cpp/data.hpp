@@ -43,6 +43,13 @@ struct Span {
     double t0, h, t_bound, sign;
     int64_t n_steps;
     double max_step;
+
+    // The length that is left after k fixed steps. The difference of two times far from 0 has lost its last digits.
+    double left(int64_t k) const { return (t_bound - t0) - static_cast<double>(k) * h; }
+    // The length from step k to step `stop`, the last of which may be of another length than h.
+    double between(int64_t k, int64_t stop) const {
+        return stop >= n_steps ? left(k) : static_cast<double>(stop - k) * h;
+    }
 };
 
 // What a multistep method knows of a run besides the state (multistep.hpp); weights go from the oldest node to the newest.

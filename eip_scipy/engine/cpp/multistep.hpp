@@ -476,7 +476,7 @@ inline Code project_last(const Run &run, const Step &step, double from) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     if (ms.brief) {
-        estimate_error(run, Step{from, step.t_new, step.t_new - from, step.y_new, step.y_new, true, true});
+        estimate_error(run, Step{from, step.t_new, step.h, step.y_new, step.y_new, true, true});
         w.counters[HAVE_ERROR] = 1;
     } else {
         double size;
@@ -497,7 +497,7 @@ inline Code project_last(const Run &run, const Step &step, double from) {
 }
 
 // The state at t, beyond what the history can be centred on, by the method that starts: from the middle of the history, or
-// in a run without one from y at t_old. The last one is projected.
+// in a run without one from y at t_old; step.h is the length from there. The last one is projected.
 [[gnu::noinline]] inline Code finish_nodes(const Run &run, const Step &step) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
@@ -509,7 +509,7 @@ inline Code project_last(const Run &run, const Step &step, double from) {
     } else {
         copy(step.y, step.y_new, w.m);
     }
-    start_step(run, from, step.t_new - from, step.y_new);
+    start_step(run, from, step.h, step.y_new);
     if (!all_finite(w.y_hat, w.m)) return NOT_FINITE;
     run.system.rhs(w, step.t_new, w.y_hat, w.last());
     ++w.counters[NFEV];
@@ -561,7 +561,7 @@ inline Code next_states(const States &states, const Span &span, double *clock, i
     const bool last = stop >= span.n_steps;
     clock[TIME] = span.t0 + static_cast<double>(k) * span.h;
     clock[TIME_NEW] = last ? span.t_bound : span.t0 + static_cast<double>(stop) * span.h;
-    clock[LENGTH] = clock[TIME_NEW] - clock[TIME];
+    clock[LENGTH] = span.between(k, stop);
     const Step step{clock[TIME], clock[TIME_NEW], clock[LENGTH], y, y_new, last, last};
     if (ms.brief) {
         w.counters[WAITED] = k;
@@ -578,7 +578,10 @@ inline Code next_states(const States &states, const Span &span, double *clock, i
     const Code status = advance_history(states, std::min(stop + ahead, last_node));
     if (status != OK) return status;
     const int64_t back = place[NEWEST] - stop;
-    if (last || back < ahead) return states.finish(step);
+    if (last || back < ahead) {
+        const double length = span.between(place[NEWEST] - ms.middle, stop);
+        return states.finish(Step{step.t, step.t_new, length, y, y_new, last, last});
+    }
     state_of(ms, back, y_new, w.carry_hat);
     if (run.system.MEMBERS == 1 && !all_finite(y_new, w.m)) return NOT_FINITE;
     slope_of(ms, back, y_new, w.last());

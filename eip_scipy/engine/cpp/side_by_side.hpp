@@ -214,7 +214,7 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
     const double t_new = last ? span.t_bound : span.t0 + (k + 1) * span.h;
     const bool project = w.l > 0 && (last || (k + 1) % o.every == 0);
     double *from = OctetSystem::floats_of(eight.y), *to = OctetSystem::floats_of(eight.y_new);
-    const Step step{t, t_new, last ? t_new - t : span.h, from, to, project, last};
+    const Step step{t, t_new, span.between(k, k + 1), from, to, project, last};
     int64_t before[N_COUNTERS];
     std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), before);
     Eight::Run all = eight.run();
