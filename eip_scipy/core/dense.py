@@ -258,7 +258,7 @@ class _Pieces(Sequence[ManifoldDenseOutput]):
         return ManifoldDenseOutput(self._interpolants, self._pieces[k])
 
 
-class _AtRest(_AtRealTimes):
+class _AtRest(AtRealTimes):
     """The dense output of a run without a step: one state."""
 
     def __init__(self, t: float, y: Array) -> None:
