@@ -76,6 +76,12 @@ def problem_from_simulation(
         (variational particles, softening, forces that are not known, collisions, boundaries ...): the message says
         which and why it is not supported.
 
+    Warns
+    -----
+    UserWarning
+        When the simulation has what ends it or watches it, which a problem cannot hold: exit_max_distance,
+        exit_min_distance (`exit_events` has events for them) and a heartbeat.
+
     Notes
     -----
     Particles from ``sim.N_active`` on attract nothing, with ``sim.testparticle_type`` 0: masses that they have are
@@ -91,6 +97,7 @@ def problem_from_simulation(
             "one in an archive is rebound.Simulation(path)"
         )
     _refuse_unsupported(sim)
+    _warn_of_what_is_left_out(sim)
     chosen, known = (check_forces(forces), constants) if forces is not None else _attached(sim)
     if forces is None and constants is not None:
         raise ValueError("problem_from_simulation: constants belong to forces=...; REBOUNDx's forces bring their own.")
@@ -102,7 +109,7 @@ def problem_from_simulation(
     sim.synchronize()
     q, v = state(sim).reshape(2, -1, 3)
     return nbody(
-        sim.G * _attracting_masses(sim),
+        _attracting_masses(sim),
         q,
         v,
         t_span=(sim.t, sim.t + 1000 * sim.dt) if t_span is None else t_span,
@@ -115,6 +122,58 @@ def problem_from_simulation(
         bodies=_names(sim) if names is None else names,
         G=sim.G,
     )
+
+
+class _Exit:
+    """A terminal event: 0 where the largest or smallest distance has the value at which a simulation ends."""
+
+    terminal, direction = True, 0.0
+
+    def __init__(self, name: str, limit: float) -> None:
+        self.__name__, self._limit = name, limit
+
+    def __call__(self, t: float, y: np.ndarray, *args: Any) -> float:
+        q = np.asarray(y)[: len(y) // 2].reshape(-1, 3)
+        if self.__name__ == "exit_max_distance":
+            return self._limit - float(np.linalg.norm(q, axis=1).max())
+        pairs = (np.linalg.norm(q[k + 1 :] - q[k], axis=1).min() for k in range(len(q) - 1))
+        return float(min(pairs)) - self._limit
+
+
+def exit_events(sim: rebound.Simulation) -> list[_Exit]:
+    """Return terminal events for the distances at which a simulation ends.
+
+    Parameters
+    ----------
+    sim : rebound.Simulation
+
+    Returns
+    -------
+    list of callable
+        For ``integrate(problem, ..., events=exit_events(sim))``: where the largest distance of a particle from the
+        origin reaches ``sim.exit_max_distance``, and where two particles come as near as ``sim.exit_min_distance``;
+        one for each of the two that is set. REBOUND looks after each step, an event is located within it.
+    """
+    given = {name: float(getattr(sim, name)) for name in ("exit_max_distance", "exit_min_distance")}
+    return [_Exit(name, limit) for name, limit in given.items() if limit > 0]
+
+
+def _warn_of_what_is_left_out(sim: rebound.Simulation) -> None:
+    exits = [event.__name__ for event in exit_events(sim)]
+    if exits:
+        warnings.warn(
+            f"problem_from_simulation: the simulation ends by {' and '.join(exits)}, and a problem has no such end. "
+            "Give integrate(..., events=exit_events(sim)), from eip_scipy.integrations.rebound.",
+            UserWarning,
+            stacklevel=3,
+        )
+    if sim._heartbeat:
+        warnings.warn(
+            "problem_from_simulation: the simulation's heartbeat is not called by runs of the problem. If it ends the "
+            "simulation or changes particles, give integrate events=... or callback=... in its place.",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def to_simulation(

@@ -29,12 +29,12 @@ except ModuleNotFoundError as error:
         'eip_scipy.integrations.rebound needs REBOUND: pip install "eip_scipy[rebound]"', name="rebound"
     ) from error
 
-from ._rebound_exchange import problem_from_simulation, read_archive, to_archive, to_simulation
+from ._rebound_exchange import exit_events, problem_from_simulation, read_archive, to_archive, to_simulation
 from ._rebound_exchange import state as _state
 
 __all__ = [
-    "INTEGRATORS", "ReboundRun", "ReboundSteps", "ias15_steps", "problem_from_simulation", "read_archive", "run",
-    "simulation", "to_archive", "to_simulation",
+    "INTEGRATORS", "ReboundRun", "ReboundSteps", "exit_events", "ias15_steps", "problem_from_simulation",
+    "read_archive", "run", "simulation", "to_archive", "to_simulation",
 ]  # fmt: skip
 
 INTEGRATORS = ("whfast", "whfast-c17", "ias15", "leapfrog", "saba(10,6,4)")

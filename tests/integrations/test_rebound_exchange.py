@@ -50,6 +50,35 @@ def short_run(**options):
     return integrate(problem, (0, 3), method=EIPRKN12, **{"save_every": 20, **options})
 
 
+def test_distances_that_end_a_simulation_are_events():
+    """A planet on a radial way out crosses 3; two bodies that fall together meet at .5: both to rounding."""
+    sim = rebound.Simulation()
+    sim.add(m=1.0)
+    sim.add(m=0.0, x=1.0, vx=2.0)
+    sim.N_active, sim.exit_max_distance, sim.dt = 1, 3.0, 0.01
+    with pytest.warns(UserWarning, match=r"ends by exit_max_distance, .* events=exit_events\(sim\)"):
+        problem = exchange.problem_from_simulation(sim, t_span=(0, 10))
+    run = integrate(problem, method=EIPDOP853, rtol=1e-10, events=exchange.exit_events(sim))
+    assert run.status == 1
+    assert run.y[3, -1] == pytest.approx(3.0, rel=1e-12)
+    sim = rebound.Simulation()
+    for side in (-1, 1):
+        sim.add(m=0.5, x=side, vy=0.1 * side)
+    sim.exit_min_distance, sim.dt = 0.5, 0.01
+    with pytest.warns(UserWarning, match="ends by exit_min_distance,"):
+        problem = exchange.problem_from_simulation(sim, t_span=(0, 10))
+    run = integrate(problem, method=EIPDOP853, rtol=1e-10, events=exchange.exit_events(sim))
+    assert np.linalg.norm(run.y[3:6, -1] - run.y[:3, -1]) == pytest.approx(0.5, rel=1e-12)
+
+
+def test_a_heartbeat_is_named():
+    sim = planets()
+    assert exchange.exit_events(sim) == []
+    sim.heartbeat = lambda simulation: None
+    with pytest.warns(UserWarning, match="heartbeat is not called by runs of the problem"):
+        exchange.problem_from_simulation(sim)
+
+
 @pytest.mark.parametrize("units", UNITS)
 def test_there_and_back(units):
     sim = planets(units)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from eip_scipy import EIPRK4, integrate
+from eip_scipy import EIPRK4, EIPRKN12, integrate
 from eip_scipy.engine.native import library
-from eip_scipy.problems import solar_system
+from eip_scipy.problems import nbody, solar_system
 from eip_scipy.problems.gravity import frequencies
 
 rhs, acc = library["gravity.rhs"], library["gravity.acc"]
@@ -281,3 +281,27 @@ def test_frequencies_of_orbits_and_of_a_moon(monkeypatch, pairs):
     assert about[0] == pytest.approx(np.sqrt(1.001), rel=1e-12)
     assert about[3] == pytest.approx(np.sqrt(4**-3 * (1 - e) ** -1.5), rel=1e-12)
     assert others == pytest.approx(np.sqrt((gm[0] + gm[2]) / 0.01**3), rel=1e-9)
+
+
+# Masses and G.
+
+
+def test_masses_are_multiplied_by_G():
+    """A circular orbit of 1 AU takes a year; params are G m."""
+    G = 4 * np.pi**2
+    places, speeds = [[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 2 * np.pi, 0]]
+    problem = nbody([1.0, 0.0], places, speeds, t_span=(0, 1), G=G)
+    np.testing.assert_array_equal(problem.params, [G, 0.0])
+    assert problem.G == G
+    run = integrate(problem, method=EIPRKN12, h=1 / 64)
+    np.testing.assert_allclose(run.y[:, -1], problem.y0, atol=1e-12)
+    same = nbody([G, 0.0], places, speeds, t_span=(0, 1))
+    np.testing.assert_array_equal(same.params, problem.params)
+    one = nbody([1.0, 1e-3], places, [[0, 0, 0], [0, 1, 0]], t_span=(0, 1), G=1.0)
+    np.testing.assert_array_equal(one.params, [1.0, 1e-3])
+
+
+@pytest.mark.parametrize("G", [0.0, -1.0, np.nan, np.inf, "1", True])
+def test_a_wrong_G(G):
+    with pytest.raises(ValueError, match="nbody: G must be a positive finite number, got"):
+        nbody([1.0, 0.0], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 1, 0]], t_span=(0, 1), G=G)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.inputs import has_unit, is_number, refuse_units, shown
 from ...core.invariants import Invariant
 from ...core.problem import Problem, bind, native_invariant
 from ...core.units import Epoch, apart, as_epoch, in_unit, is_time, moment
@@ -48,9 +49,9 @@ def nbody(
     Parameters
     ----------
     gm : array_like, shape (N,)
-        G times the masses, in the units of length and time of the state; 0 for test particles, which are attracted and
-        do not attract. With units of astropy: G m, or the masses, which are then multiplied by the constant of
-        gravitation.
+        G times the masses, in the units of length and time of the state, or with `G` the masses; 0 for test particles,
+        which are attracted and do not attract. With units of astropy: G m, or the masses, which are then multiplied by
+        the constant of gravitation.
     position, velocity : array_like, shape (N, 3)
         Plain numbers, or with units of astropy, then all three of `gm`, `position` and `velocity`.
     t_span : (float, float)
@@ -87,7 +88,9 @@ def nbody(
         When t is 0: a Time of astropy in any scale, or a Julian date in TDB, in one or two numbers. Default: the start
         of a `t_span` of moments.
     G : float, optional
-        The constant of gravitation in `gm`, where masses of their own are to be told from it, as for REBOUND.
+        The constant of gravitation. If it is given, the first argument holds the masses, which are multiplied by it:
+        ``nbody([1, 1e-6], ..., G=4 * np.pi**2)`` in AU, years and solar masses. `Problem.G` keeps it, so that a
+        simulation of REBOUND gets the same masses.
 
     Returns
     -------
@@ -99,7 +102,8 @@ def nbody(
     Raises
     ------
     ValueError
-        When shapes disagree, a mass is negative, all are 0, two bodies are in one place, or for unknown forces.
+        When shapes disagree, a mass is negative, all are 0, two bodies are in one place, `G` is not positive, or for
+        unknown forces.
 
     Warns
     -----
@@ -132,7 +136,7 @@ def nbody(
     t_span = apart(t_span)
     units = units or default_units(gm, position, velocity, t_span)
     known = known_units(units)
-    gm, position, velocity = in_units(gm, position, velocity, known)
+    gm, position, velocity = in_units(_gravitational(gm, G), position, velocity, known)
     epoch = _epoch(t_span) if epoch is None else as_epoch("epoch", epoch)
     t_span = moment("t_span", t_span, known, epoch, "nbody")
     h = in_unit("h", h, (0, 1), known)
@@ -173,6 +177,21 @@ def component_names(n: int, bodies: Sequence[str] | None) -> tuple[str, ...]:
 def _epoch(t_span: Any) -> Epoch | None:
     start = t_span[0] if isinstance(t_span, tuple | list) and t_span else None
     return as_epoch("t_span", start) if is_time(start) else None
+
+
+def _gravitational(masses: Any, G: Any) -> Any:
+    """Return G times the masses if G is given, else the first argument as it is."""
+    if G is None:
+        return masses
+    refuse_units(G=G)
+    if not (is_number(G) and 0 < G < np.inf):
+        raise ValueError(f"nbody: G must be a positive finite number, got {shown(G)}.")
+    if any(has_unit(item) for item in (masses, *np.atleast_1d(np.asarray(masses, dtype=object)))):
+        raise TypeError(
+            "nbody: G multiplies masses that are plain numbers, but the first argument has a unit. Leave out G: masses "
+            "with a unit are multiplied by the constant of gravitation, and G m is taken as it is."
+        )
+    return G * np.asarray(masses, dtype=float)
 
 
 def _newtonian(params: np.ndarray) -> tuple[Invariant, Invariant]:
