@@ -63,17 +63,18 @@ def attach_history(
     Raises
     ------
     ValueError
-        When the step is longer than what is stable at the start, with one that would do.
+        When the step is longer than what is stable at the start, with one that would do; not with ``check=False``.
     """
     assert stepping.h is not None
     brief = stepping.span.n_steps - 1 < method.order
-    corrected = slice(0, 0) if brief else _stable(method, name, system, stepping.h)
+    check = run.options.limit < math.inf  # the option of this name bounds the shares of corrections
+    corrected = slice(0, 0) if brief else _stable(method, name, system, stepping.h, check)
     assert isinstance(run.method, Method)  # of the method that starts
     run.method = run.method._replace(multistep=_record(run, method, corrected, stepping, brief=brief, level=level))
 
 
-def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float) -> slice:
-    """Which floats of the accelerations the Jacobian is to correct, where the step is stable."""
+def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float, check: bool) -> slice:
+    """Return which floats of the accelerations the Jacobian corrects; with `check` refuse a step that is not stable."""
     y0 = system.start.y
     half = y0.size // 2
     plain = stability_limit(method.order, False)
@@ -90,13 +91,13 @@ def _stable(method: GaussJackson, name: str, system: SecondOrder, h: float) -> s
         planets = float(bodies.max(initial=0.0))
         # Nothing corrects moons.
         fastest, limit = (planets, limit) if planets * plain >= moons * limit else (moons, plain)
-    if not h * fastest <= limit:
+    if check and not h * fastest <= limit:
         raise ValueError(
             f"{name}: h = {h:g} is not stable for a motion as fast as the fastest one at the start, of frequency "
             f"{fastest:.4g} (period {2 * np.pi / fastest:.4g}). Take h <= {limit / fastest:.3g}, or a method whose "
             "steps are less bound, such as EIPRKN12."
         )
-    if method.velocities:
+    if check and method.velocities:
         strongest, limit = _largest_damping(system), damping_limit(method.order)
         if not h * strongest <= limit:
             raise ValueError(

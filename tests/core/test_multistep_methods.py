@@ -26,7 +26,7 @@ from eip_scipy import (
     integrate,
 )
 from eip_scipy.engine.native import library
-from eip_scipy.problems import Problem, nbody, solar_system
+from eip_scipy.problems import Problem, figure_eight, nbody, solar_system
 from eip_scipy.problems.gravity import solar_data
 from eip_scipy.run import integrate as longrun
 
@@ -448,6 +448,34 @@ def test_a_step_that_is_not_stable_is_refused_with_one_that_is():
         )
     with pytest.raises(ValueError, match="is not stable"):
         solve_ivp(orbit, (0, 20), Y0, method=EIPGJ14, h=STEP)  # which has no Jacobian here
+
+
+@pytest.mark.parametrize("method", [EIPGJ12, EIPGJ14])
+def test_bodies_without_relative_angular_momentum(method):
+    """Two of the figure eight's bodies start at the same velocity; their attraction is less than that of the third.
+
+    After one period of 6.32591398 the start comes back, to the digits that it is given in.
+    """
+    problem = figure_eight()
+    run = integrate(problem, (0, 6.32591398), method=method, h=0.01)
+    assert run.trusted
+    np.testing.assert_allclose(run.y[:, -1], problem.y0, rtol=0, atol=1e-7)
+    brief = integrate(problem, (0, 1e-4), method=method, h=1e-6)
+    exact = integrate(problem, (0, 1e-4), method=EIPDOP853, rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(brief.y[:, -1], exact.y[:, -1], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("apart", [0.0, 3.0])
+def test_a_radial_motion_has_a_finite_frequency(apart):
+    """From rest the bodies fall together, and a step that is too long is refused, by check; flying apart it is not."""
+    places, speeds = [[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [apart, 0, 0]]
+    problem = nbody([1.0, 1.0], places, speeds, t_span=(0, 0.3), h=0.01)
+    expected = integrate(problem, method=EIPDOP853, rtol=1e-13, atol=1e-15, h=None).y[:, -1]
+    if apart == 0.0:
+        with pytest.raises(ValueError, match=r"Take h <= 0\.000\d+"):
+            integrate(problem, method=EIPGJ14)
+    run = integrate(problem, method=EIPGJ14, check=apart > 0.0)
+    np.testing.assert_allclose(run.y[:, -1], expected, rtol=0, atol=1e-11)
 
 
 def test_a_moon_is_named_by_its_own_frequency():

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...engine.native import library
+
 __all__ = ["orbital_frequencies"]
 
+# Least pericentre, in units of a pair's present distance: nearer, a radial orbit ends in a collision or is perturbed.
+LEAST_PERICENTRE = 1e-3
 PAIRS = 2**15  # that are looked at at once: all of them would take the memory of N^2 distances
 
 
@@ -28,17 +32,21 @@ def orbital_frequencies(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, floa
     Notes
     -----
     From the osculating orbit. Between the mean motion n and the frequency in the pericentre, n (1 - e)^(-3/2), a
-    multistep method's stability is that of their geometric mean: measured with Mercury, e = .2.
+    multistep method's stability is that of their geometric mean: measured with Mercury, e = .2. A pair has no such
+    orbit if the others change its motion more than its own attraction does, and no pericentre to come if it flies apart
+    for good: then the frequency is that at the present distance. So the frequency of a pair without angular momentum is
+    finite.
     """
     q, v = y.reshape(2, -1, 3)
+    pulls = library["gravity.acc"](0.0, q.ravel(), gm).reshape(-1, 3)
     centre = int(np.argmax(gm))
-    about = _frequencies(gm, q, v, np.array([centre]))[0]
+    about = _frequencies(gm, q, v, pulls, np.array([centre]))[0]
     others = 0.0
     rows = max(1, PAIRS // gm.size)
     for first in range(0, gm.size, rows):
         bodies = np.arange(first, min(first + rows, gm.size))
         here = np.arange(bodies.size)
-        pairs = _frequencies(gm, q, v, bodies)
+        pairs = _frequencies(gm, q, v, pulls, bodies)
         pairs[:, centre] = pairs[bodies == centre] = 0.0
         distance = np.linalg.norm(q - q[bodies, None], axis=2)
         to_centre = distance[:, centre].copy()
@@ -50,8 +58,8 @@ def orbital_frequencies(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, floa
     return about, others
 
 
-def _frequencies(gm: np.ndarray, q: np.ndarray, v: np.ndarray, bodies: np.ndarray) -> np.ndarray:
-    """Of the orbits of all bodies about each of `bodies`, a row for each of these."""
+def _frequencies(gm: np.ndarray, q: np.ndarray, v: np.ndarray, pulls: np.ndarray, bodies: np.ndarray) -> np.ndarray:
+    """Return the frequencies of the orbits of all bodies about each of `bodies`, a row for each of these."""
     r, u, mass = q - q[bodies, None], v - v[bodies, None], gm + gm[bodies, None]
     (x, y, z), (vx, vy, vz) = r.T, u.T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -59,9 +67,16 @@ def _frequencies(gm: np.ndarray, q: np.ndarray, v: np.ndarray, bodies: np.ndarra
         inverse_axis = 2 / distance - (vx * vx + vy * vy + vz * vz).T / mass
         momentum = ((y * vz - z * vy) ** 2 + (z * vx - x * vz) ** 2 + (x * vy - y * vx) ** 2).T / mass
         eccentricity = np.sqrt(np.maximum(0.0, 1 - momentum * inverse_axis))
-        pericentre = momentum / (1 + eccentricity)
+        pericentre = np.maximum(momentum / (1 + eccentricity), LEAST_PERICENTRE * distance)
         fastest = np.sqrt(mass / pericentre**3)
         mean = np.sqrt(mass * np.maximum(inverse_axis, 0.0) ** 3)
-        found = np.where(inverse_axis > 0, np.sqrt(mean * fastest), fastest)
+        here = np.sqrt(mass / distance**3)
+        attraction = mass / distance**2
+        others = pulls - pulls[bodies, None] + (mass / distance**3)[:, :, None] * r
+        alone = np.sqrt((others**2).sum(axis=2)) < attraction
+        bound = inverse_axis > 0
+        apart = ~bound & ((x * vx + y * vy + z * vz).T > 0)
+        found = np.where(bound, np.sqrt(mean * fastest), fastest)
+        found = np.where(alone & ~apart, found, here)
     found[np.arange(bodies.size), bodies] = 0.0
     return np.where((mass > 0) & ~np.isnan(found), found, 0.0)
