@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK4, EIPRK45, EIPSolver, Invariant, ensemble, integrate
+from eip_scipy import EIPRK4, EIPRK45, EIPRKN8, EIPRKN12, EIPSolver, Invariant, ensemble, integrate
 from eip_scipy.core.options import ProjectionKeywords, ProjectionOptions
 from eip_scipy.problems import kepler
 
@@ -32,10 +32,11 @@ def test_documentation_names_the_options():
     assert "{" + "ProjectionOptions" not in EIPSolver.__doc__ + integrate.__doc__
 
 
-def test_none_is_the_own_of_the_method():
+@pytest.mark.parametrize("method", [EIPRK4, EIPRKN8, EIPRKN12])
+def test_none_is_the_own_of_the_method(method):
     p = kepler()
     plain, none = (
-        integrate(p, (0, 3), method=EIPRK4, h=0.1, compiled=False, **options)
+        integrate(p, (0, 3), method=method, h=0.1, compiled=False, **options)
         for options in ({"every": 1, "compensated": False}, {"every": None, "compensated": None})
     )
     np.testing.assert_array_equal(plain.y, none.y)
