@@ -63,14 +63,22 @@ class Surroundings:
             self.failure = self.failure or error
             return np.full((len(self.terms), y.size), np.nan)
 
+    def term_values(self, y: Array) -> Array:
+        """Of each term; NaN where it cannot be computed."""
+        try:
+            return np.array([item.fun(y.copy()) for item in self.terms], dtype=float)
+        except (ArithmeticError, ValueError):
+            return np.full(len(self.terms), np.nan)
+
     def _look_around(self) -> None:
         """Sizes of the components, and a time in which the state moves by its own size."""
         here, self.scale, self.tau = self.y0, np.abs(self.y0), 0.0
         for _ in range(3):  # a component may start to move only where others have moved
             f = np.abs(self._slope(self.t, here))
             f[~np.isfinite(f)] = 0.0
-            if self.tau == 0.0 and f.any():
-                self.tau = float(np.max(self.scale, initial=0.0) or 1.0) / float(np.max(f))
+            if f.any():  # a start near a fixed point is slow, and its surroundings are not
+                tau = float(np.max(self.scale, initial=0.0) or 1.0) / float(np.max(f))
+                self.tau = min(self.tau or tau, tau)
             self.scale = np.maximum(self.scale, self.tau * f)
             here = self.y0 + 0.1 * self.scale * self.rng.standard_normal(self.y0.size)
         self.scale[self.scale == 0.0] = np.max(self.scale) or 1.0
@@ -103,7 +111,7 @@ class Surroundings:
 
     def _follow(self) -> Array:
         """States along a trajectory from y0."""
-        solver = DOP853(self._slope, self.t, self.y0, self.t + 3 * self.tau, rtol=1e-12, atol=1e-12 * self.scale)
+        solver = DOP853(self._slope, self.t, self.y0, self.t + 3 * self.tau, rtol=1e-12, atol=1e-16 * self.scale)
         states = [self.y0]
         while solver.status == "running" and len(states) <= STEPS:
             solver.step()

@@ -24,6 +24,8 @@ FAIR_PIVOT, INDEPENDENT = 1e-2, 1e-6
 NEGLIGIBLE = (1e-6, 1e-8, 1e-10, 0.0)  # coefficients that are left out, if the rest is still kept
 LARGEST_INTEGER, RATIONAL = 1000, 1e-8
 DRIFT = 1e-8
+RELATIVE, ABSOLUTE = 1e-10, 1e-14  # how far a trajectory's states may be off, relative and in units of the scale
+APART = 1e3  # the least singular value that is not 0, in units of rounding
 
 
 class Search:
@@ -60,7 +62,13 @@ class Search:
 
     def _search(self, columns: list[int]) -> None:
         """Take in what is kept among some columns, and does not depend on what is there already."""
-        null = self._null_space(columns)
+        null, numerical = self._null_space(columns), self._numerical_null_space(columns)
+        self._take(null, columns)
+        if len(numerical) > len(null):
+            self._take(numerical, columns)
+
+    def _take(self, null: Array, columns: list[int]) -> None:
+        """Take in of the rows of a null space those that are kept."""
         known = np.array([self._row(item) for item in self._products(columns)]).reshape(-1, self._width)
         rows = self._reduced(known, null)
         for row in sorted(rows, key=self._simplicity):
@@ -74,18 +82,40 @@ class Search:
 
     def _null_space(self, columns: Any) -> Array:
         """Rows that span it: singular vectors from the smallest on, as long as they are kept at the fresh points."""
-        A, columns = self.sample.rates[:, columns], np.asarray(columns)
-        weights = np.sqrt(np.mean(self.sample.sizes[:, columns] ** 2, axis=0))
         # What does not move at all is kept; beside columns of that size no rounding is small.
-        still = weights == 0
-        found = [self._spread(np.ones(1), [k]) for k in columns[still]]
-        vectors = np.linalg.svd(np.linalg.qr(A[:, ~still] / weights[~still], mode="r"))[2]
-        for vector in vectors[::-1]:
-            row = self._spread(vector / weights[~still], columns[~still])
+        still, _, rows = self._singular(columns)
+        found = [self._spread(np.ones(1), [k]) for k in still]
+        for row in rows[::-1]:
             if not self._is_kept(row):
                 break
             found.append(row / np.linalg.norm(row))
         return np.array(found).reshape(-1, self._width)
+
+    def _numerical_null_space(self, columns: Any) -> Array:
+        """Return the rows whose singular values are 0 except for rounding, if these stand apart; none is tried yet.
+
+        Rounding leaves such a row with a little of all columns. Near the points at which all terms of the invariant
+        vanish, of y1**2 + y0**4/2 where y0 does, that little is more than the terms, and the row is not kept there.
+        """
+        still, values, rows = self._singular(columns)
+        if not values.size:
+            return np.empty((0, self._width))
+        rounding = np.finfo(float).eps * values[0] * len(self.sample.points)
+        zero = values <= rounding
+        if zero.all() or values[~zero].min() < APART * rounding:
+            return np.empty((0, self._width))
+        found = [self._spread(np.ones(1), [k]) for k in still] + [row / np.linalg.norm(row) for row in rows[zero]]
+        return np.array(found).reshape(-1, self._width)
+
+    def _singular(self, columns: Any) -> tuple[Array, Array, Array]:
+        """Return columns that do not move, and the singular values of the others, the largest first, with the rows."""
+        A, columns = self.sample.rates[:, columns], np.asarray(columns)
+        weights = np.sqrt(np.mean(self.sample.sizes[:, columns] ** 2, axis=0))
+        still, moving = columns[weights == 0], columns[weights > 0]
+        scaled = A[:, weights > 0] / weights[weights > 0]
+        values, vectors = np.linalg.svd(np.linalg.qr(scaled, mode="r"))[1:]
+        rows = np.array([self._spread(vector / weights[weights > 0], moving) for vector in vectors])
+        return still, values, rows.reshape(-1, self._width)
 
     def _is_kept(self, row: Array) -> bool:
         """Whether the rate is 0 at the fresh points: relative to the products in it, and to the terms of dI/dy . f."""
@@ -214,14 +244,19 @@ class Search:
         return False
 
     def _stays(self, row: Array) -> bool:
-        """Whether it is constant along the trajectory."""
-        points = self.around.trajectory / self.around.scale
+        """Return whether it is constant along the trajectory, as far as the errors of the states allow to tell."""
+        states, coefficients = self.around.trajectory, row[len(self.basis) :]
+        points = states / self.around.scale
         parts = [row[k] * points[:, item].prod(axis=1) for k, item in enumerate(self.basis) if row[k]]
-        for term, coefficient in zip(self.terms, row[len(self.basis) :], strict=True):
-            if coefficient:
-                parts.append(coefficient * np.array([float(term.fun(y.copy())) for y in self.around.trajectory]))
-        values, size = sum(parts), np.max(sum(map(np.abs, parts)))
-        return bool(np.all(np.abs(values - values[0]) <= DRIFT * size))
+        if coefficients.any():
+            parts += list((coefficients * np.array([self.around.term_values(y) for y in states])).T)
+        values, sizes = sum(parts), sum(map(np.abs, parts))
+        bound = DRIFT * np.fmax.accumulate(sizes)
+        # Where a logarithm's argument is nearly 0 the trajectory's own errors decide, and from there on.
+        errors = RELATIVE * np.abs(points) + ABSOLUTE
+        sure = ((np.abs(self._gradients(row, points)) * errors).sum(axis=1) <= bound) & np.isfinite(values)
+        end = sure.size if sure.all() else int(np.argmin(sure))
+        return bool(np.all(np.abs(values - values[0])[:end] <= bound[:end]))
 
 
 def _unit(vector: Array) -> Array:
