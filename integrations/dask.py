@@ -19,8 +19,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from eip_scipy.ensembles.chunks import Chunk, Part, cores, finished, run_elsewhere
 from eip_scipy.ensembles.tasks import FAILED, Members, Plan, Task
 
@@ -191,7 +189,7 @@ class DaskPool:
         except distributed.KilledWorker as error:
             task = replace(self._task, reduce=None, keep=True)
             plan = Plan(self._task)
-            members = _joined(self._one_by_one(task, plan, chunk, error))
+            members = Members.joined(list(self._one_by_one(task, plan, chunk, error)))
             return finished(self._task, plan, members)
 
     def close(self) -> None:
@@ -288,17 +286,9 @@ class DaskPool:
         for first, last in ((0, m // 2), (m // 2, m)):
             with self._connected():
                 self._wait_for_workers()
-            half = Chunk(chunk.first + first, chunk.y0s[first:last], chunk.params[first:last])
+            half = chunk.part(first, last)
             try:
                 found.append(self._result(self._submit(task, half)).members)
             except distributed.KilledWorker as again:
                 found.extend(self._one_by_one(task, plan, half, again))
         return found
-
-
-def _joined(parts: Iterable[Members]) -> Members:
-    parts = list(parts)
-    fields = {
-        name: np.concatenate([getattr(part, name) for part in parts]) for name in Members._fields if name != "message"
-    }
-    return Members(**fields, message=[text for part in parts for text in part.message])

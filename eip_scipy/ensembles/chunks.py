@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..run.interrupts import look_for_signals
+from .own_times import OwnTimes
 from .statistics import Statistics, statistics_of
 from .tasks import Members, Plan, Task, run_members
 
@@ -26,11 +27,16 @@ AHEAD = 3
 
 
 class Chunk(NamedTuple):
-    """Members that run together: their starts (m, n) and parameters (m, p), from number `first` on."""
+    """Members that run together, from number `first` on: their starts (m, n), parameters (m, p) and own times."""
 
     first: int
     y0s: np.ndarray
     params: np.ndarray
+    own: OwnTimes = OwnTimes()
+
+    def part(self, first: int, last: int) -> Chunk:
+        """Return some of the members, counted from the first one of the chunk."""
+        return Chunk(self.first + first, self.y0s[first:last], self.params[first:last], self.own.part(first, last))
 
 
 class Part(NamedTuple):
@@ -59,7 +65,7 @@ class Pool(Protocol):
 
 def run_chunk(plan: Plan, chunk: Chunk, stop: threading.Event | None = None) -> Part:
     """Run the members of a chunk, and their statistics where they are wanted."""
-    return finished(plan.task, plan, run_members(plan, chunk.y0s, chunk.params, stop))
+    return finished(plan.task, plan, run_members(plan, chunk.y0s, chunk.params, stop, chunk.own))
 
 
 def finished(task: Task, plan: Plan, members: Members) -> Part:
@@ -68,7 +74,7 @@ def finished(task: Task, plan: Plan, members: Members) -> Part:
     if task.reduce is not None:
         statistics = statistics_of(task.reduce, *plan.states(members))
     if not task.keep:
-        members = members._replace(saved=members.saved[:, :0].copy())
+        members = members._replace(saved=members.saved[:, :0].copy(), saved_values=members.saved_values[:, :0].copy())
     return Part(members, statistics, plan.one_by_one)
 
 

@@ -37,6 +37,8 @@ from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
 from ..run.tables import dataset, default_names, to_dataframe
 from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
+from .happened import Happened
+from .own_times import OwnTimes, own_times
 from .side_by_side import LANES
 from .statistics import Statistics, merge
 from .store import CheckpointStore, Store, ZarrStore, location, require_same_functions
@@ -90,10 +92,18 @@ class EnsembleResult(OptimizeResult):
     names : tuple of str
         Of the l invariants.
     nfev, njev, nlu, n_rejected_projections : ndarray, shape (members,)
-    times : ndarray, shape (m,)
-        Times of saved states; empty where none were asked for.
+    times : ndarray, shape (m,) or (members, m)
+        Times of saved states; empty if none were asked for. If members have times of their own, there is one row for
+        each, which ends with nan where it is shorter than the others.
     trajectories : ndarray or zarr.Array or None, shape (members, n, m)
-        Saved states; nan after the end of a member that did not get there. None where they were reduced.
+        Saved states; nan after the end of a member that did not get there. None if they were reduced.
+    invariants : ndarray or zarr.Array, shape (members, l) or (members, l, m)
+        Values of the invariants: in the last states, or in the saved states if `trajectories` has them.
+    target : ndarray, shape (members, l)
+        The values that were kept, each member's own.
+    t_events, y_events : list of list of ndarray, or None
+        With events, ``t_events[k]`` and ``y_events[k]`` are those of member k, as in `scipy.integrate.solve_ivp`: one
+        array for each event.
     statistics : Statistics or None
         Over all members, by ``reduce=``.
     first : int
@@ -128,8 +138,10 @@ class EnsembleResult(OptimizeResult):
         -------
         xarray.Dataset
             The names of a Zarr group that `out` asks for, and more: ``y`` (member, component), ``t_end``, ``status``,
-            ``message``, ``trusted``, ``max_correction`` (member), ``max_defect`` (member, invariant), the counts; and
-            ``states`` (member, component, time) where trajectories are in memory. What `out` holds is opened by
+            ``message``, ``trusted``, ``max_correction`` (member), ``max_defect``, ``target`` (member, invariant), the
+            counts; ``states`` (member, component, time) and ``invariants`` (member, invariant, time) if trajectories
+            are in memory, with ``row`` and ``times`` (member, row) in place of ``time`` if members have times of their
+            own; else ``end_invariants`` (member, invariant). What `out` holds is opened by
             ``xarray.open_zarr(out, consolidated=False)``.
 
         Raises
@@ -143,14 +155,22 @@ class EnsembleResult(OptimizeResult):
         variables["t_end"] = ("member",), self.t
         variables["message"] = ("member",), self.message.astype(str)
         variables["max_defect"] = ("member", "invariant"), self.max_defect
+        variables["target"] = ("member", "invariant"), self.target
+        if isinstance(self.invariants, np.ndarray) and self.invariants.ndim == 2:
+            variables["end_invariants"] = ("member", "invariant"), self.invariants
         coordinates: dict[str, Any] = {
             "member": self.first + np.arange(self.t.size),
             "component": list(component_names(self.component_names if names is None else names, self.y.shape[1])),
             "invariant": list(self.names),
         }
         if isinstance(self.trajectories, np.ndarray):
-            variables["states"] = ("member", "component", "time"), self.trajectories
-            coordinates["time"] = self.times
+            axis = "time" if self.times.ndim == 1 else "row"
+            variables["states"] = ("member", "component", axis), self.trajectories
+            variables["invariants"] = ("member", "invariant", axis), self.invariants
+            if self.times.ndim == 1:
+                coordinates["time"] = self.times
+            else:
+                variables["times"] = ("member", "row"), self.times
         attributes = {name: self[name] for name in ("method", "h", "success", "stopped", "wall_time")}
         return dataset(variables, coordinates, attributes)
 
@@ -158,8 +178,56 @@ class EnsembleResult(OptimizeResult):
         """Return the members as a `pandas.DataFrame`, see `eip_scipy.to_dataframe`."""
         return to_dataframe(self, names)
 
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.save`.
+
+        Trajectories that `out` holds stay there: after `load` they are None, and `invariants` those of the last states.
+        """
+        from ..run.saving import save
+
+        save(self, path)
+
+    def plot(self, names: Any = None) -> Any:
+        """Draw the ensemble: its states, the errors of the invariants, and how its members ended.
+
+        Parameters
+        ----------
+        names : sequence of str or str, optional
+            As for `eip_scipy.to_xarray`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            For each component the median of all members in time, with bands that hold 50 % and 90 % of them; or, if no
+            states are saved at common times, the same of the last states. Then the largest error of each invariant in
+            each member, and the numbers of members that came to the end, were ended by an event, are not to be trusted,
+            failed or did not run. A notebook shows the figure, as that of `IntegrationResult.plot`.
+
+        Raises
+        ------
+        ImportError
+            Without matplotlib: ``pip install "eip_scipy[plot]"``.
+        """
+        from .figures import plot
+
+        return plot(self, names)
+
+    def _packed(self) -> dict[str, Any]:
+        """Return the fields as `eip_scipy.save` takes them."""
+        from .saving import packed
+
+        ends = vars(self).get("_ends")
+        return packed(self if ends is None else {**self, "end_invariants": ends})
+
+    @classmethod
+    def _unpacked(cls, fields: dict[str, Any]) -> EnsembleResult:
+        """Return a result from what `_packed` gave."""
+        from .saving import unpacked
+
+        return cls(unpacked(fields))
+
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), "to_dataframe", "to_xarray"]
+        return [*super().__dir__(), "plot", "save", "to_dataframe", "to_xarray"]
 
     def __repr__(self) -> str:
         ran = int(np.count_nonzero(self.status != NOT_RUN))
@@ -217,8 +285,8 @@ def ensemble(
     ----------
     fun : callable or Problem
         As for `integrate`.
-    t_span : (float, float)
-        Start and end, the same for all.
+    t_span : (float, float) or array_like, shape (members, 2)
+        Start and end: the same for all, or a row for each member.
     y0s : array_like, shape (members, n)
         Starts; one (n,) for all where `params` differ. Default: the start of a `Problem`.
     acceleration : callable, optional
@@ -240,8 +308,10 @@ def ensemble(
         for each core; see `eip_scipy.integrations.dask`.
     save_every : int, optional
         Save each so many-th step of every member in ``.trajectories``; fixed steps only.
-    t_eval : array_like, optional
-        Times to save at instead.
+    t_eval : array_like or sequence of array_like, optional
+        Times to save at instead: the same for all, or a row (members, m) or an array for each member. Members that have
+        intervals or times of their own are prepared and run one by one, which takes some milliseconds for each; they
+        take neither `save_every` nor `reduce`.
     reduce : "state" or callable, optional
         Statistics over members (mean, variance, extremes) of the saved states, or of the last ones where none are
         saved; a function ``reduce(t, y) -> float or (k,)``: of that. Trajectories are then kept in `out` only.
@@ -267,8 +337,8 @@ def ensemble(
         Bound on the memory for results; default: half of what is free.
     **options
         Those of `integrate`: args (the same for all), in_place, events, compensated, compiled, metric, blocks, frame,
-        direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step. Of events only
-        terminal ones make sense: they end a member, and their times are in ``.t``. `check` looks at one member.
+        direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step. Events are kept
+        for each member in ``.t_events`` and ``.y_events``; a terminal one ends its member. `check` looks at one member.
 
     Returns
     -------
@@ -314,7 +384,8 @@ def ensemble(
     _check_places(out, checkpoint, checkpoint_every, resume)
     out = None if out is None else location(out)
     checkpoint = None if checkpoint is None else absolute(checkpoint)
-    starts, parameters = _inputs(fun, y0s, params, options.get("invariants", ()))
+    own = own_times(fun, t_span, t_eval, save_every, reduce)
+    starts, parameters = _inputs(fun, y0s, params, options.get("invariants", ()), own)
     if options.get("args") is not None:
         shared = floats(extra_arguments(options["args"], params))
         parameters = np.broadcast_to(shared, (len(starts), shared.size))
@@ -325,20 +396,25 @@ def ensemble(
     request = Request.of(fun=_bare(fun), t_span=t_span, y0=starts[0], params=parameters[0], **common).with_pointers()
     if request.args is not None or not parameters.shape[1]:
         request = dataclasses.replace(request, params=None)
-    plan, doubts = _first_that_starts(Task(request, reduce, keep, len(starts)), starts, parameters)
+    if own:
+        request = dataclasses.replace(request, **own.of(0))
+    task = Task(request, reduce, keep, len(starts), own.padded.shape[1] if own else None)
+    plan, doubts = _first_that_starts(task, starts, parameters, own)
     starts = np.ascontiguousarray(starts, plan.dtype)
     size = _chunk_size(plan, len(starts), request.function) if chunk is None else count("chunk", chunk)
     held = plan.times.size if reduce is None and out is None else 0
     _check_memory(plan, len(starts), held, max_bytes)
     store: Store | None = None
     if out is not None:
-        identity = plan.identity(starts, parameters, size)
-        store = ZarrStore(out, identity, plan.empty(size), plan.times, len(starts), resume)
+        identity = plan.identity(starts, parameters, size, own)
+        times = plan.times if own.times is None else own.padded
+        store = ZarrStore(out, identity, plan.empty(size), times, len(starts), resume, plan.events)
     elif checkpoint is not None:
-        store = CheckpointStore(checkpoint, plan.identity(starts, parameters, size), checkpoint_every, resume)
+        store = CheckpointStore(checkpoint, plan.identity(starts, parameters, size, own), checkpoint_every, resume)
     with ended_by_sigterm(store is not None), nullcontext() if store is None else closing(store):
-        gathered = _Gathered(plan, len(starts), held, size, store, callback, doubts)
-        result = gathered.run(partial(_pool, executor, plan, progress), _chunks(starts, parameters, size), progress)
+        gathered = _Gathered(plan, len(starts), held, size, store, callback, doubts, own)
+        chunks = _chunks(starts, parameters, size, own)
+        result = gathered.run(partial(_pool, executor, plan, progress), chunks, progress)
     doubtful = np.flatnonzero((result.status >= 0) & ~result.trusted)
     if doubtful.size:
         _warn(result, doubtful)
@@ -378,7 +454,9 @@ class _Gathered:
         store: Store | None,
         callback: Callable[[EnsembleResult], Any] | None,
         doubts: dict[int, str],
+        own: OwnTimes,
     ) -> None:
+        self.own = own
         self.plan, self.chunk, self.store, self.callback, self.doubts = plan, chunk, store, callback, doubts
         self.method = plan.task.request.method.__name__
         self.whole = Members.empty(members, plan.size, plan.dtype, len(plan.names), held)
@@ -445,7 +523,7 @@ class _Gathered:
     def _take(self, first: int, part: Part) -> None:
         members, last = part.members, first + len(part.members.t)
         for name, whole in self.whole._asdict().items():
-            if name != "saved" or whole.shape[1]:
+            if not name.startswith("saved") or whole.shape[1]:
                 whole[first:last] = getattr(members, name)
         self.statistics = merge(self.statistics, part.statistics)
         self.one_by_one = part.one_by_one or self.one_by_one
@@ -457,13 +535,15 @@ class _Gathered:
     def _of(self, members: Members, statistics: Statistics | None, first: int) -> EnsembleResult:
         plan, counters = self.plan, members.counters
         trajectories = members.saved.swapaxes(1, 2) if members.saved.shape[1] else None
-        if members is self.whole and self.store is not None:
-            trajectories = self.store.states
+        ends = members.values
+        invariants = ends if trajectories is None else members.saved_values.swapaxes(1, 2)
+        if members is self.whole and self.store is not None and self.store.states is not None:
+            trajectories, invariants = self.store.states, self.store.saved_values
         trusted, message = members.trusted.copy(), np.array(members.message, dtype=object)
         for k in range(len(trusted)) if self.doubts else ():
             if trusted[k] and first + k in self.doubts:
                 trusted[k], message[k] = False, f"{message[k]}; {self.doubts[first + k]}"
-        return EnsembleResult(
+        result = EnsembleResult(
             y=members.y,
             t=members.t,
             status=members.status,
@@ -480,8 +560,12 @@ class _Gathered:
             njev=counters[:, NJEV],
             nlu=counters[:, NLU],
             n_rejected_projections=counters[:, REJECTED],
-            times=plan.times,
+            times=self._times(first, len(members.t)),
             trajectories=trajectories,
+            invariants=invariants,
+            target=members.target,
+            t_events=[[t for t, _ in member] for member in self._events(members)] if plan.events else None,
+            y_events=[[y for _, y in member] for member in self._events(members)] if plan.events else None,
             statistics=statistics,
             first=first,
             stopped=self.stopped,
@@ -491,6 +575,20 @@ class _Gathered:
             chunk=self.chunk,
             component_names=plan.component_names,
         )
+        object.__setattr__(result, "_ends", ends)  # an attribute, not a field
+        return result
+
+    def _times(self, first: int, count: int) -> np.ndarray:
+        """Return the times of saved states, those of `count` members from number `first` on if each has its own."""
+        if not self.own or not self.plan.times.size:
+            return self.plan.times
+        return self.own.padded[first : first + count]
+
+    def _events(self, members: Members) -> list[Happened]:
+        """Return the events of members; none of those that did not run."""
+        n, dtype = self.plan.size, self.plan.dtype
+        none = [(np.zeros(0), np.zeros((0, n), dtype))] * self.plan.events
+        return [found or none for found in members.happened]
 
 
 def _check_options(options: dict[str, Any]) -> None:
@@ -499,8 +597,7 @@ def _check_options(options: dict[str, Any]) -> None:
     for name in options:
         if name not in known:
             raise TypeError(f"ensemble() has no option {name!r}{nearest(name, (*OWN, *known))}")
-    if not all(math.isfinite(times) for _, times in Events(options.get("events")).ends):
-        raise ValueError("ensemble: an event must be terminal: it ends a member; the times of others are not kept.")
+    Events(options.get("events"))  # which raises for what is wrong with them
 
 
 def _check_places(out: Any, checkpoint: Any, every: Any, resume: Any) -> None:
@@ -517,7 +614,7 @@ def _check_places(out: Any, checkpoint: Any, every: Any, resume: Any) -> None:
         raise ValueError("resume=True needs the place to go on from: out= or checkpoint=.")
 
 
-def _inputs(fun: Any, y0s: Any, params: Any, invariants: Any) -> tuple[np.ndarray, np.ndarray]:
+def _inputs(fun: Any, y0s: Any, params: Any, invariants: Any, times: OwnTimes) -> tuple[np.ndarray, np.ndarray]:
     """Starts (members, n) and parameters (members, p), p = 0 where there are none."""
     problem = fun if isinstance(fun, Problem) else None
     if y0s is None:
@@ -530,8 +627,14 @@ def _inputs(fun: Any, y0s: Any, params: Any, invariants: Any) -> tuple[np.ndarra
     own = None if params is None else np.atleast_1d(parameter_values(params))
     if starts.ndim == 1 and own is not None and own.ndim == 2:
         starts = np.tile(starts, (len(own), 1))
+    elif starts.ndim == 1 and times:
+        starts = np.tile(starts, (times.members, 1))
     if starts.ndim != 2 or starts.size == 0:
         raise ValueError(f"y0s must have the shape (members, n), got {starts.shape}.")
+    if times and times.members != len(starts):
+        raise ValueError(
+            f"{times.name} has {times.members} rows for {len(starts)} members; give one row for each, or one for all."
+        )
     if own is None:
         brought = None if problem is None or problem.rhs is None else problem.params
         own = np.zeros(0) if brought is None else np.asarray(brought, float).reshape(-1)
@@ -561,7 +664,9 @@ def _not_called(t: float, y: np.ndarray) -> np.ndarray:
     raise NotImplementedError("the problem's compiled right-hand side is in use")
 
 
-def _first_that_starts(task: Task, starts: np.ndarray, params: np.ndarray) -> tuple[Plan, dict[int, str]]:
+def _first_that_starts(
+    task: Task, starts: np.ndarray, params: np.ndarray, times: OwnTimes
+) -> tuple[Plan, dict[int, str]]:
     """The plan by a member whose start `integrate` takes; its error where it takes none of some members.
 
     Also what the checks of the start found, by member: it holds for all that have the same parameters.
@@ -569,7 +674,8 @@ def _first_that_starts(task: Task, starts: np.ndarray, params: np.ndarray) -> tu
     first: Exception | None = None
     for k in np.unique(np.linspace(0, len(starts) - 1, TRIED).astype(int)):
         own = None if task.request.params is None else params[k].copy()
-        tried = dataclasses.replace(task, request=dataclasses.replace(task.request, y0=starts[k].copy(), params=own))
+        request = dataclasses.replace(task.request, y0=starts[k].copy(), params=own, **times.of(k))
+        tried = dataclasses.replace(task, request=request)
         try:
             ready = tried.prepared(tried.request.y0, own, check_start=True)
         except Exception as error:
@@ -599,7 +705,7 @@ def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
 
 def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) -> None:
     """Refuse to gather more than fits."""
-    each = plan.size * plan.dtype.itemsize * (1 + rows) + 8 * (len(plan.names) + N_COUNTERS + 4)
+    each = plan.size * plan.dtype.itemsize * (1 + rows) + 8 * (len(plan.names) * (3 + rows) + N_COUNTERS + 4)
     bound = most_bytes(members * each, max_bytes)
     if members * each > bound:
         what = f"{rows} states each; raise save_every, take statistics (reduce=), write to a Zarr group (out=)"
@@ -610,10 +716,11 @@ def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) 
         )
 
 
-def _chunks(starts: np.ndarray, params: np.ndarray, size: int) -> Callable[[int], Iterator[Chunk]]:
+def _chunks(starts: np.ndarray, params: np.ndarray, size: int, own: OwnTimes) -> Callable[[int], Iterator[Chunk]]:
     def chunks(done: int) -> Iterator[Chunk]:
         for first in range(done, len(starts), size):
-            yield Chunk(first, starts[first : first + size], np.ascontiguousarray(params[first : first + size]))
+            last = first + size
+            yield Chunk(first, starts[first:last], np.ascontiguousarray(params[first:last]), own.part(first, last))
 
     return chunks
 

@@ -17,8 +17,9 @@ from .. import checkpoint
 from ..checkpoint import CheckpointError
 from ..checkpoint.locks import Lock
 from ..checkpoint.own_file import OwnFile, absolute, unlocked
+from .happened import Flat, flattened, unflattened
 from .statistics import Statistics
-from .tasks import COMPARED, NOT_RUN, Members
+from .tasks import COMPARED, LISTS, NOT_RUN, Members
 
 __all__ = ["CheckpointStore", "Store", "ZarrStore", "location", "require_identity", "require_same_functions"]
 
@@ -32,6 +33,7 @@ ARRAYS = (
 )  # fmt: skip
 CODECS = {"blosc", "bytes", "crc32c", "gzip", "transpose", "vlen-bytes", "vlen-utf8", "zstd"}
 SAME = 1e-9
+EVENTS_IN_A_FILE = 4096
 # Writing a checkpoint takes at most a twentieth of the time.
 LEAST_RATIO = 19.0
 
@@ -54,6 +56,10 @@ class Store(Protocol):
     @property
     def states(self) -> Any:
         """The saved states (members, n, times), where the store keeps them and nobody else."""
+
+    @property
+    def saved_values(self) -> Any:
+        """The invariants of the saved states (members, l, times), likewise."""
 
     def read(self, first: int, last: int) -> Members:
         """Results of members `first` to `last`."""
@@ -93,6 +99,21 @@ def require_identity(path: Any, there: dict[str, Any], here: dict[str, Any]) -> 
         )
 
 
+def require_all(path: Any, missing: list[str]) -> None:
+    """Refuse a store that lacks something that an ensemble keeps.
+
+    Raises
+    ------
+    CheckpointError
+        Naming the first that is missing.
+    """
+    if missing:
+        raise CheckpointError(
+            f"{os.fspath(path)!r} was written by an earlier version of eip_scipy: {missing[0]!r} is missing. Resume it "
+            "with that version, or name another place to start anew."
+        )
+
+
 def require_same_functions(path: Any, there: np.ndarray, here: np.ndarray, sizes: np.ndarray, first: int) -> None:
     """Compare what functions give where a member of the last finished chunk ended.
 
@@ -122,9 +143,11 @@ class ZarrStore:
         What makes two ensembles the same.
     empty : Members
         One chunk's room, for shapes and types.
-    times : ndarray, shape (m,)
+    times : ndarray, shape (m,) or (members, m)
     members : int
     resume : bool
+    events : int, optional
+        How many there are, of which times and states are kept.
 
     Raises
     ------
@@ -138,9 +161,18 @@ class ZarrStore:
     statistics = None
 
     def __init__(
-        self, path: Any, identity: dict[str, Any], empty: Members, times: np.ndarray, members: int, resume: bool
+        self,
+        path: Any,
+        identity: dict[str, Any],
+        empty: Members,
+        times: np.ndarray,
+        members: int,
+        resume: bool,
+        events: int = 0,
     ) -> None:
         zarr = _zarr()
+        self._events = events
+        self._group: Any = None
         self.path, self._members, self._chunk = location(path), members, len(empty.t)
         self._local = None if is_url(self.path) else Path(os.path.realpath(self.path))
         self._place = self.path if self._local is None else str(self._local)
@@ -170,6 +202,7 @@ class ZarrStore:
             found = self._existing(zarr)
             if found is not None:
                 require_identity(self.path, found, identity)
+                require_all(self.path, [name for name in ("target", "end_invariants") if name not in self._group])
                 checkpoint.warn_of_other_versions(self.path, found, stacklevel=4)
                 self._label, self._mark = found, self._status()
                 return
@@ -259,9 +292,22 @@ class ZarrStore:
     def _create(self, identity: dict[str, Any], empty: Members, times: np.ndarray) -> None:
         n = empty.y.shape[1]
         self._make("y", empty.y.dtype, ("member", "component"), (n,))
+        kept, rows = empty.max_defect.shape[1], empty.saved.shape[1]
         if times.size:
-            self._make("states", empty.y.dtype, ("member", "component", "time"), (n, times.size))
-            self._group.create_array("time", data=times, dimension_names=("time",))
+            axis = "time" if times.ndim == 1 else "row"  # xarray takes no two-dimensional array by its axis' name
+            self._make("states", empty.y.dtype, ("member", "component", axis), (n, rows))
+            self._make("invariants", np.dtype(float), ("member", "invariant", axis), (kept, rows))
+            axes = ("time",) if times.ndim == 1 else ("member", "row")
+            self._group.create_array("time" if times.ndim == 1 else "times", data=times, dimension_names=axes)
+        self._make("end_invariants", np.dtype(float), ("member", "invariant"), (kept,))
+        self._make("target", np.dtype(float), ("member", "invariant"), (kept,))
+        if self._events:
+            self._make("event_count", np.dtype(np.int64), ("member", "event"), (self._events,), fill=0)
+            for name, axes, shape in (("event_t", ("happened",), ()), ("event_y", ("happened", "component"), (n,))):
+                dtype = empty.y.dtype if shape else np.dtype(float)
+                self._group.create_array(
+                    name, shape=(0, *shape), chunks=(EVENTS_IN_A_FILE, *shape), dtype=dtype, dimension_names=axes
+                )
         self._make("t_end", np.dtype(float), ("member",))
         self._make("max_defect", np.dtype(float), ("member", "invariant"), empty.max_defect.shape[1:])
         self._make("max_correction", np.dtype(float), ("member",))
@@ -300,6 +346,10 @@ class ZarrStore:
     def states(self) -> Any:
         return self._group.get("states", None)
 
+    @property
+    def saved_values(self) -> Any:
+        return self._group.get("invariants", None)
+
     def read(self, first: int, last: int) -> Members:
         group, place = self._group, slice(first, last)
         y = group["y"][place]
@@ -315,7 +365,33 @@ class ZarrStore:
             side_by_side=group["side_by_side"][place],
             trusted=group["trusted"][place],
             saved=group["states"][place].swapaxes(1, 2) if "states" in group else none,
+            saved_values=group["invariants"][place].swapaxes(1, 2)
+            if "invariants" in group
+            else np.empty((last - first, 0, group["target"].shape[1])),
+            values=group["end_invariants"][place],
+            target=group["target"][place],
+            happened=unflattened(self._flat(first, last)),
         )
+
+    def _flat(self, first: int, last: int) -> Flat:
+        """Return the events of members `first` to `last`, behind those of the members before."""
+        if not self._events:
+            return Flat(np.zeros((last - first, 0), np.int64), np.zeros(0), np.zeros((0, 1)))
+        counts = self._group["event_count"][:last]
+        begin, end = int(counts[:first].sum()), int(counts.sum())
+        return Flat(counts[first:], self._group["event_t"][begin:end], self._group["event_y"][begin:end])
+
+    def _write_events(self, first: int, members: Members) -> None:
+        """Write the events of a chunk, in place of those of one that was broken off before it was whole."""
+        group, y = self._group, members.y
+        flat = flattened(members.happened, self._events, y.shape[1], y.dtype)
+        group["event_count"][first : first + len(members.t)] = flat.counts
+        begin = int(group["event_count"][:first].sum())
+        end = begin + flat.t.size
+        for name, values in (("event_t", flat.t), ("event_y", flat.y)):
+            group[name].resize((end, *values.shape[1:]))
+            if values.size:
+                group[name][begin:end] = values
 
     def known_by(self, first: int) -> np.ndarray:
         if "known_by" not in self._group:
@@ -336,8 +412,13 @@ class ZarrStore:
             group["max_correction"][place] = members.max_correction
             group["side_by_side"][place] = members.side_by_side
             group["trusted"][place] = members.trusted
+            group["end_invariants"][place] = members.values
+            group["target"][place] = members.target
             if "states" in group:
                 group["states"][place] = members.saved.swapaxes(1, 2)
+                group["invariants"][place] = members.saved_values.swapaxes(1, 2)
+            if self._events:
+                self._write_events(first, members)
             group["known_by"][first // self._chunk, : known_by.size] = known_by
             group["message"][place] = np.array(members.message, dtype=object)
             group["status"][place] = members.status
@@ -369,7 +450,7 @@ class CheckpointStore:
         When there is a file and `resume` is false, or it is damaged, or that of another ensemble, or cannot be written.
     """
 
-    states = None
+    states = saved_values = None
 
     def __init__(self, path: Any, identity: dict[str, Any], every: float, resume: bool) -> None:
         self._identity, self._every = identity, every
@@ -395,6 +476,10 @@ class CheckpointStore:
             raise self._file.existing("ensemble")
         self._header, self._arrays = self._file.read(KIND)
         require_identity(self._file.name, self._header, self._identity)
+        if self.finished:
+            needed = [f"members_{name}" for name in Members._fields if name not in LISTS]
+            needed += [f"events_{name}" for name in Flat._fields]
+            require_all(self._file.name, [name for name in needed if name not in self._arrays])
         checkpoint.warn_of_other_versions(self._file.name, self._header, stacklevel=4)
 
     @property
@@ -413,8 +498,13 @@ class CheckpointStore:
 
     def read(self, first: int, last: int) -> Members:
         usual, others = self._header["usual"], self._header["messages"]
-        arrays = {name: self._arrays[f"members_{name}"][first:last] for name in Members._fields if name != "message"}
-        return Members(**arrays, message=[others.get(str(k), usual) for k in range(first, last)])
+        arrays = {name: self._arrays[f"members_{name}"][first:last] for name in Members._fields if name not in LISTS}
+        flat = Flat(*(self._arrays[f"events_{name}"] for name in Flat._fields))
+        return Members(
+            **arrays,
+            message=[others.get(str(k), usual) for k in range(first, last)],
+            happened=unflattened(flat)[first:last],
+        )
 
     def known_by(self, first: int) -> np.ndarray:
         return self._arrays.get("known_by", np.zeros(0))
@@ -446,7 +536,10 @@ class CheckpointStore:
             "usual": usual,
             "messages": {str(k): text for k, text in enumerate(messages) if text != usual},
         }
-        arrays = {f"members_{name}": getattr(whole, name)[:done] for name in Members._fields if name != "message"}
+        arrays = {f"members_{name}": getattr(whole, name)[:done] for name in Members._fields if name not in LISTS}
+        happened = whole.happened[:done]
+        flat = flattened(happened, max(map(len, happened), default=0), whole.y.shape[1], whole.y.dtype)
+        arrays |= {f"events_{name}": value for name, value in flat._asdict().items()}
         arrays["known_by"] = known_by
         if statistics is not None:
             arrays |= {f"statistics_{name}": value for name, value in vars(statistics).items()}

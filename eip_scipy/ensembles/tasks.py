@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,13 +24,15 @@ from ..engine import data
 from ..engine.counters import N_COUNTERS, NFEV
 from ..engine.data import DOUBTFUL, OK, PAUSE, Schedule
 from ..engine.trust import Trust, sick
-from ..run.driver import saved_rows
+from ..run.driver import Driver, saved_rows
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop
 from ..run.prepare import Prepared, Request, prepared
-from ..run.resume import Keeper
+from ..run.resume import Keeper, plain
+from .happened import Happened, happened
+from .own_times import OwnTimes
 from .side_by_side import need_compiling, octet_functions, why_one_by_one
 
-__all__ = ["COMPARED", "FAILED", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
+__all__ = ["COMPARED", "FAILED", "LISTS", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
 
 FAILED, NOT_RUN = -1, -2
 # Steps of the first call of the engine; how long one may take.
@@ -40,6 +43,9 @@ BY_MEMBER = (
 )
 LEAST_WORK = 3e7  # floats times steps, a second or two: compiling functions for eight members takes as long
 COMPARED = 16
+LISTS = "message", "happened"  # of the fields of Members; the others are arrays
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+SHARED = OwnTimes()
 
 
 class StoppedError(Exception):
@@ -60,16 +66,21 @@ class Task:
         Whether the saved states themselves are wanted.
     members : int
         How many there are in all.
+    rows : int or None
+        States that are saved at most, where members have intervals or times of their own.
     """
 
     request: Request
     reduce: Any = None
     keep: bool = True
     members: int = 1
+    rows: int | None = None
 
-    def prepared(self, y0: np.ndarray, params: np.ndarray | None, *, check_start: bool = False) -> Prepared:
-        """The run of one member, as `integrate` prepares it."""
-        return prepared(replace(self.request, y0=y0, params=params), check_start=check_start)
+    def prepared(
+        self, y0: np.ndarray, params: np.ndarray | None, own: Mapping[str, Any] = NOTHING, *, check_start: bool = False
+    ) -> Prepared:
+        """Prepare the run of one member as `integrate` does; `own` are its interval and times."""
+        return prepared(replace(self.request, y0=y0, params=params, **own), check_start=check_start)
 
 
 class Members(NamedTuple):
@@ -95,6 +106,12 @@ class Members(NamedTuple):
         Whether it did not fail and nothing speaks against it.
     saved : ndarray, shape (m, times, n)
         States at the plan's `times`; nan after the end of a member that did not reach them. No times: shape (m, 0, n).
+    saved_values : ndarray, shape (m, times, l)
+        Values of the invariants there.
+    values, target : ndarray, shape (m, l)
+        Values of the invariants in the last states, and those that were kept.
+    happened : list of Happened
+        Of each member the times and states of its events.
     """
 
     y: np.ndarray
@@ -107,6 +124,19 @@ class Members(NamedTuple):
     side_by_side: np.ndarray
     trusted: np.ndarray
     saved: np.ndarray
+    saved_values: np.ndarray
+    values: np.ndarray
+    target: np.ndarray
+    happened: list[Happened]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Members]) -> Members:
+        """Return the members of several parts in their order."""
+        fields: dict[str, Any] = {}
+        for name in cls._fields:
+            given = [getattr(part, name) for part in parts]
+            fields[name] = [item for part in given for item in part] if name in LISTS else np.concatenate(given)
+        return cls(**fields)
 
     @classmethod
     def empty(cls, m: int, n: int, dtype: Any, invariants: int, times: int) -> Members:
@@ -122,6 +152,10 @@ class Members(NamedTuple):
             side_by_side=np.zeros(m, bool),
             trusted=np.zeros(m, bool),
             saved=np.full((m, times, n), np.nan, dtype),
+            saved_values=np.full((m, times, invariants), np.nan),
+            values=np.full((m, invariants), np.nan),
+            target=np.full((m, invariants), np.nan),
+            happened=[[] for _ in range(m)],
         )
 
 
@@ -158,7 +192,8 @@ class Plan:
         self.pointers = self._ready.pointers
         self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, schedule.span.t0
         self.t_bound, self.h = schedule.span.t_bound, self._ready.stepping.h
-        self.times = saved_times(schedule)
+        self.times = saved_times(schedule) if task.rows is None else np.full(task.rows, np.nan)
+        self.events = len(self._ready.system.events.functions)
         self.n_steps = None if schedule.span.n_steps >= UNBOUNDED else schedule.span.n_steps
         first = np.concatenate([run.work.K[0], run.invariants.start_values])
         self._start_values = [repr(value) for value in first[:COMPARED].tolist()]
@@ -170,10 +205,12 @@ class Plan:
         loop = Loop(replace(ready, request=replace(ready.request, progress=progress)), Keeper())
         self.why_not = loop.why_not
         own_targets = any(item.target is not None for item in ready.run.invariants.items)
-        own_start = ready.run.identity["project_initial"] or own_targets
+        own_start = ready.run.identity["project_initial"] or own_targets or self.task.rows is not None
         by_differences = bool(ready.run.invariants.by_differences)  # whose shifts depend on the start
         self._together = self.why_not is None and not own_start and not by_differences
-        if by_differences:
+        if self.task.rows is not None:
+            own = "members have intervals or times of their own"
+        elif by_differences:
             own = "the gradient of an invariant comes from differences"
         else:
             own = "the start of each member is projected, or an invariant has a target"
@@ -194,16 +231,18 @@ class Plan:
         last = np.where((members.status >= 0)[:, None], members.y, np.nan)
         return np.array([self.t_bound]), last[:, None]
 
-    def loop(self, y0: np.ndarray, params: np.ndarray) -> Loop:
-        """The run of one member by itself."""
-        return Loop(self._prepared(y0, params), Keeper())
+    def loop(self, y0: np.ndarray, params: np.ndarray, own: Mapping[str, Any] = NOTHING) -> Loop:
+        """Return the run of one member by itself; `own` are its interval and times."""
+        return Loop(self._prepared(y0, params, own), Keeper())
 
-    def _prepared(self, y0: np.ndarray, params: np.ndarray) -> Prepared:
-        return self.task.prepared(y0, None if self.task.request.params is None else params)
+    def _prepared(self, y0: np.ndarray, params: np.ndarray, own: Mapping[str, Any] = NOTHING) -> Prepared:
+        return self.task.prepared(y0, None if self.task.request.params is None else params, own)
 
-    def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int) -> dict[str, Any]:
+    def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int, own: OwnTimes) -> dict[str, Any]:
         """What makes two ensembles the same, as JSON holds it: settings, and what their functions give at one start."""
-        return {"settings": self._ready.identity(starts, params) | {"chunk": chunk}, "start": self._start_values}
+        settings = self._ready.identity(starts, params) | {"chunk": chunk}
+        settings |= {name: plain(value) for name, value in own.identity.items()}
+        return {"settings": settings, "start": self._start_values}
 
     def known_by(self, y0s: np.ndarray, params: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
         """What the functions give at the end of the first of these members that came to one, and how large they are.
@@ -264,7 +303,13 @@ def saved_times(schedule: Schedule) -> np.ndarray:
     return times
 
 
-def run_members(plan: Plan, y0s: np.ndarray, params: np.ndarray, stop: threading.Event | None = None) -> Members:
+def run_members(
+    plan: Plan,
+    y0s: np.ndarray,
+    params: np.ndarray,
+    stop: threading.Event | None = None,
+    own: OwnTimes = SHARED,
+) -> Members:
     """Run members one after the other.
 
     Parameters
@@ -276,6 +321,8 @@ def run_members(plan: Plan, y0s: np.ndarray, params: np.ndarray, stop: threading
         Parameters of each; p = 0 where the functions take none.
     stop : threading.Event, optional
         Set it to stop within some tenths of a second.
+    own : OwnTimes, optional
+        Intervals and times of these members.
 
     Returns
     -------
@@ -295,7 +342,7 @@ def run_members(plan: Plan, y0s: np.ndarray, params: np.ndarray, stop: threading
             driver.run(plan, y0s, params, out, watch)
         else:
             for k in range(len(y0s)):
-                _alone(plan, k, y0s[k], params[k], out, watch)
+                _alone(plan, k, y0s[k], params[k], out, watch, own.of(k))
     return out
 
 
@@ -312,12 +359,20 @@ class _Watch:
             raise StoppedError
 
 
-def _alone(plan: Plan, k: int, y0: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
-    """One member as `integrate` runs it."""
+def _alone(
+    plan: Plan,
+    k: int,
+    y0: np.ndarray,
+    params: np.ndarray,
+    out: Members,
+    watch: _Watch,
+    own: Mapping[str, Any] = NOTHING,
+) -> None:
+    """Run one member as `integrate` does."""
     try:
-        loop = plan.loop(y0, params)
+        loop = plan.loop(y0, params, own)
     except Exception as error:
-        out.y[k], out.t[k] = y0, plan.t0
+        out.y[k], out.t[k] = y0, own.get("t_span", (plan.t0,))[0]
         _describe(out, k, FAILED, _reason(error))
         return
     try:
@@ -327,10 +382,29 @@ def _alone(plan: Plan, k: int, y0: np.ndarray, params: np.ndarray, out: Members,
     except Exception as error:
         status, message = FAILED, _reason(error)
     _store(loop, k, status, loop.explained(message), out)
-    rows = min(loop.driver.rows, plan.times.size)
-    same = np.flatnonzero(loop.driver.t[:rows] != plan.times[:rows])
+    wanted = own.get("t_eval", plan.times)
+    rows = min(loop.driver.rows, wanted.size) if plan.times.size else 0
+    same = np.flatnonzero(loop.driver.t[:rows] != wanted[:rows])
     rows = int(same[0]) if same.size else rows
     out.saved[k, :rows] = loop.driver.y[:rows]
+    out.saved_values[k, :rows] = _values(loop.driver, loop.driver.t[:rows], loop.driver.y[:rows])
+    out.values[k] = _values(loop.driver, out.t[k : k + 1], out.y[k : k + 1])[0]
+    out.target[k] = loop.driver.run.invariants.target
+    out.happened[k] = [
+        (np.array(t), np.array(y, plan.dtype).reshape(len(t), plan.size))
+        for t, y in zip(loop.events.t, loop.events.y, strict=True)
+    ]
+
+
+def _values(driver: Driver, t: np.ndarray, y: np.ndarray, *params: np.ndarray) -> np.ndarray:
+    """Return the invariants (m, l) of states (m, n), nan where an invariant cannot be evaluated."""
+    try:
+        return driver.values_at(t, y, *params)
+    except Exception:
+        if len(t) == 1:
+            return np.full((1, driver.run.invariants.size), np.nan)
+        each = [_values(driver, t[k : k + 1], y[k : k + 1], *(p[k : k + 1] for p in params)) for k in range(len(t))]
+        return np.concatenate(each)
 
 
 def _store(loop: Loop, k: int, status: int, message: str, out: Members) -> None:
@@ -384,8 +458,23 @@ class Sweeper:
         self._look_at_ends(each, out)
         if each.kept:
             out.saved[:] = each.rows[:, : plan.times.size]
+        self._evaluate(plan, y0s, params, out)
         if np.isnan(self.loop.diagnostics.max_correction):  # no error estimate to measure by
             out.max_correction[:] = np.nan
+
+    def _evaluate(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members) -> None:
+        """Evaluate the invariants of all members at their starts, ends and saved states, as a single run does."""
+        driver, m = self.loop.driver, len(y0s)
+        if not driver.run.invariants.size:
+            return
+        params = np.ascontiguousarray(params)
+        out.target[:] = _values(driver, np.full(m, plan.t0), np.ascontiguousarray(y0s), params)
+        ran = np.flatnonzero(~np.isnan(out.t))
+        out.values[ran] = _values(driver, out.t[ran], out.y[ran], params[ran])
+        if plan.times.size and plan.task.keep:
+            members, rows = np.nonzero(~np.isnan(out.saved).any(axis=2))
+            times = plan.times[rows]
+            out.saved_values[members, rows] = _values(driver, times, out.saved[members, rows], params[members])
 
     def _go_side_by_side(self, members: int) -> str:
         driver = self.loop.driver
@@ -439,7 +528,10 @@ class Sweeper:
                 reason = _reason(error)
             done = int(where[0])
             self._arrived(np.arange(those.start + first, those.start + done), each, out)
-            if reason is not None or code != OK:
+            failed = reason is not None or code != OK
+            if plan.events and (failed or done > first):
+                out.happened[those.start + first] = happened(plan.events, *self.loop.driver.events_found())
+            if failed:
                 self._look_at(plan, those.start + done, code, reason, each, out, watch)
                 where[:] = done + 1, 0
             elif done < m:

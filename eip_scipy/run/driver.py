@@ -239,11 +239,19 @@ class Driver:
 
     def values(self) -> np.ndarray:
         """Invariants of the saved states, (l, m)."""
-        t, y = self.t[: self.rows], self.y[: self.rows]
-        out = np.empty((self.rows, self.run.invariants.size))
+        return self.values_at(self.t[: self.rows], self.y[: self.rows]).T
+
+    def values_at(self, t: np.ndarray, y: np.ndarray, *params: np.ndarray) -> np.ndarray:
+        """Return the invariants (m, l) of states (m, n), each with its own `params` (m, p) where they are given."""
+        out = np.empty((len(t), self.run.invariants.size))
         with self.own_errors():
-            self.engine.values(t, y, out)
-        return out.T
+            self.engine.values(t, y, out, *params)
+        return out
+
+    def events_found(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return which events the loop has found since the last call, when, and in which states."""
+        assert self._interpolants is not None  # a run with events has them
+        return self._interpolants.roots()
 
 
 def _first(size: int) -> int:

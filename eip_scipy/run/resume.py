@@ -23,7 +23,7 @@ from ..engine.data import NEXT_LENGTH, TIME, Method
 from ..methods.multistep import Weights
 from .events import Events
 
-__all__ = ["Keeper", "keeping", "settings"]
+__all__ = ["Keeper", "keeping", "plain", "settings"]
 
 KIND = "integrate"
 # A run goes on from its last snapshot: what came after it is done again.
@@ -132,17 +132,17 @@ def settings(
         "t_eval": schedule.t_eval if schedule.t_eval.size else None,
         "events": events.ends,
     }
-    return {name: _plain(value) for name, value in found.items()}
+    return {name: plain(value) for name, value in found.items()}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """A value as JSON holds it, long arrays by their digest."""
     if isinstance(value, np.ndarray):
         if value.size <= SHORT:
-            return _plain(value.tolist())
+            return plain(value.tolist())
         return f"{value.dtype} {value.shape} {_digest((value,))}"
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, complex) or (isinstance(value, float) and not math.isfinite(value)):
         return repr(value)
     return value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from .results import IntegrationResult
 __all__ = ["load", "save"]
 
 KIND = "result"
+ENSEMBLE = "EnsembleResult"
+RESULTS: dict[str, Any] = {IntegrationResult.__name__: IntegrationResult}
 RESUMED = ("integrate", "ensemble")  # with the same arguments
 # Buffers of Diagnostics, in the order in which it takes them.
 BUFFERS = ("_max_defect", "_last_defect", "_max_correction", "_counters", "_figures")
@@ -28,9 +31,9 @@ def save(result: Any, path: str | os.PathLike[str]) -> None:
 
     Parameters
     ----------
-    result : IntegrationResult or OdeResult
-        From `integrate` or from `scipy.integrate.solve_ivp`. All its fields are kept, those that you have added too,
-        but for functions: ``sol``, and the run's own.
+    result : IntegrationResult, EnsembleResult or OdeResult
+        From `integrate`, `ensemble` or `scipy.integrate.solve_ivp`. All its fields are kept, those that you have added
+        too, except functions: ``sol``, and the run's own. Trajectories in the Zarr group of an ensemble stay there.
     path : path-like
         Taken as it is; a file that is there is replaced in one step, once the new one is whole. The file is an npz
         archive, which `numpy.load` opens too, with ``header.json`` for all that is no array, and a SHA-256.
@@ -55,12 +58,13 @@ def save(result: Any, path: str | os.PathLike[str]) -> None:
     (True, 'reached the end of the interval')
     """
     if not isinstance(result, OptimizeResult):
-        raise TypeError(f"save: expected a result of integrate or solve_ivp, got {shown(result)}.")
+        raise TypeError(f"save: expected a result of integrate, ensemble or solve_ivp, got {shown(result)}.")
     arrays: dict[str, np.ndarray] = {}
     values: dict[str, Any] = {}
     lists: dict[str, int] = {}
     told: dict[str, Any] | None = None
-    for name, value in result.items():
+    packed = getattr(result, "_packed", None)  # of a result that holds more than arrays and numbers
+    for name, value in (result if packed is None else packed()).items():
         if isinstance(value, Diagnostics):
             told = _described(value, arrays)
         elif isinstance(value, np.ndarray):
@@ -83,7 +87,7 @@ def load(path: str | os.PathLike[str]) -> Any:
 
     Returns
     -------
-    IntegrationResult
+    IntegrationResult or EnsembleResult
         As it was saved, but without functions: ``sol`` is None, and `IntegrationResult.continue_to` says how to go on.
         A result of `solve_ivp` comes back as an `scipy.optimize.OptimizeResult`, of which its own class is one.
 
@@ -109,13 +113,17 @@ def load(path: str | os.PathLike[str]) -> Any:
         name = repr(os.fspath(path))
         again = f"; {kind}(..., checkpoint={name}, resume=True) goes on with it" if kind in RESUMED else ""
         raise ValueError(f"load: {name} is no result that save has written, but a checkpoint of {kind!r}{again}.")
-    made = IntegrationResult if header["class"] == IntegrationResult.__name__ else OptimizeResult
+    made = RESULTS.get(header["class"], OptimizeResult)
+    if header["class"] == ENSEMBLE:  # by name: ensembles are built on runs
+        made = getattr(import_module(f"{__package__.rpartition('.')[0]}.ensembles.ensemble"), ENSEMBLE)
     result = made(header["values"])
     for name, length in header["lists"].items():
         result[name] = [arrays.pop(f"{name}.{k}") for k in range(length)]
     if header["diagnostics"] is not None:
         result["diagnostics"] = _diagnostics(header["diagnostics"], arrays)
     result.update(arrays)
+    if header["class"] == ENSEMBLE:
+        return made._unpacked(result)
     for name in ("component_names", "epoch"):
         if result.get(name) is not None:
             result[name] = tuple(result[name])

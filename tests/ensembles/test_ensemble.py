@@ -522,7 +522,6 @@ def test_progress(capsys):
         ({"executor": 0}, ValueError, "executor must be an integer >= 1"),
         ({"executor": "slurm"}, TypeError, "executor must be None, a number of threads"),
         ({"chunk": 0}, ValueError, "chunk must be an integer >= 1"),
-        ({"events": oscillator}, ValueError, "an event must be terminal"),
         ({"save_every": 0}, ValueError, "save_every must be an integer >= 1"),
         ({"save_every": 1, "h": None}, ValueError, "needs fixed steps"),
         ({"resume": True}, ValueError, "resume=True needs the place to go on from"),

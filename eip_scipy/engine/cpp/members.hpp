@@ -111,6 +111,11 @@ inline Code sweep(const AnyRun &run, Samples *samples, const Schedule &s, const 
         if (code == OK && s.clock[TIME] != s.span.t_bound) return OK;
         if (code != OK && code != ENDED) return code;
         end_member(of_any_length(run), samples, s, members, y, code);
+        if (s.n_events > 0) {  // whose roots the caller takes before those of the next member
+            ++k;
+            begun = 0;
+            return OK;
+        }
     }
     return OK;
 }

@@ -446,21 +446,31 @@ PyObject *engine_close(Engine *self, PyObject *const *args, Py_ssize_t count) {
     });
 }
 
-PyDoc_STRVAR(values_doc, "values(t, y, out) -> None\n\nFill out (m, l) with the invariants at states y (m, n).");
+PyDoc_STRVAR(values_doc,
+             "values(t, y, out, params=None) -> None\n\nFill out (m, l) with the invariants at states y (m, n), each with "
+             "its own params (m, p) where they are given.");
 
 PyObject *engine_values(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
-        expect(self, count, 3, "t, y, out");
+        expect(self, count == 4 ? 3 : count, 3, "t, y, out, and params or not");
         const Busy busy(self->busy);
         const Ref kept(PyList_New(0));
         Arrays arrays(kept.get());
         const Work &w = self->data->work;
+        const System &system = self->data->system;
         const auto *t = static_cast<const double *>(arrays.memory(args[0], "t", NPY_DOUBLE, {ANY}, true));
         const npy_intp rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[0]), 0);
         const auto *y = static_cast<const double *>(arrays.memory(args[1], "y", self->type, {rows, w.n}, true));
         auto *out = static_cast<double *>(arrays.memory(args[2], "out", NPY_DOUBLE, {rows, w.l}));
+        const double *params = nullptr;
+        if (count == 4 && system.n_params > 0)
+            params = static_cast<const double *>(
+                arrays.memory(args[3], "params", NPY_DOUBLE, {rows, system.n_params}, true));
         stepped(self, [&](const Run &run) {
-            for (npy_intp k = 0; k < rows; ++k) run.system.inv(run.work, t[k], y + k * w.m, out + k * w.l);
+            for (npy_intp k = 0; k < rows; ++k) {
+                if (params) copy(params + k * system.n_params, system.params, system.n_params);
+                run.system.inv(run.work, t[k], y + k * w.m, out + k * w.l);
+            }
             return OK;
         });
         Py_RETURN_NONE;

@@ -1,0 +1,120 @@
+"""Intervals and times of saved states that each member has for itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..core.inputs import shown
+from ..core.problem import Problem
+from ..core.stepping import interval
+
+__all__ = ["OwnTimes", "own_times"]
+
+
+class OwnTimes(NamedTuple):
+    """Intervals and times of members.
+
+    Attributes
+    ----------
+    spans : list of (float, float) or None
+        None where all members have the same interval.
+    times : list of ndarray or None
+        None where all members have the same interval and times, or no times.
+    """
+
+    spans: list[tuple[float, float]] | None = None
+    times: list[np.ndarray] | None = None
+
+    def __bool__(self) -> bool:
+        return self.spans is not None or self.times is not None
+
+    @property
+    def members(self) -> int:
+        """How many members have rows."""
+        return len(self.spans or self.times or ())
+
+    @property
+    def name(self) -> str:
+        """The argument that has a row for each member."""
+        return "t_eval" if self.spans is None else "t_span"
+
+    def part(self, first: int, last: int) -> OwnTimes:
+        """Return those of some members."""
+        spans = None if self.spans is None else self.spans[first:last]
+        return OwnTimes(spans, None if self.times is None else self.times[first:last])
+
+    def of(self, k: int) -> dict[str, Any]:
+        """Return what member `k` asks `integrate` for."""
+        found: dict[str, Any] = {}
+        if self.spans is not None:
+            found["t_span"] = self.spans[k]
+        if self.times is not None:
+            found["t_eval"] = self.times[k]
+        return found
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The settings that are compared when an ensemble is resumed."""
+        found: dict[str, Any] = {}
+        if self.spans is not None:
+            found["t_span"] = np.array(self.spans)
+        if self.times is not None:
+            found["t_eval"] = self.padded
+        return found
+
+    @property
+    def padded(self) -> np.ndarray:
+        """The times as rows (members, m) that end with nan."""
+        times = self.times or []
+        out = np.full((len(times), max((t.size for t in times), default=0)), np.nan)
+        for row, t in zip(out, times, strict=True):
+            row[: t.size] = t
+        return out
+
+
+def own_times(fun: Any, t_span: Any, t_eval: Any, save_every: Any, reduce: Any) -> OwnTimes:
+    """Find out which of `t_span` and `t_eval` have a row for each member.
+
+    Raises
+    ------
+    ValueError
+        For rows of another shape, or together with `save_every` or `reduce`, which need the same times of all members.
+    """
+    spans, times = None, None
+    if _has_rows(t_span):
+        spans = [interval(_plain(fun, "t_span", _pair(row))) for row in t_span]
+    if _has_rows(t_eval):
+        times = [np.array(_plain(fun, "t_eval", row), float) for row in t_eval]
+        for k, row in enumerate(times):
+            if row.ndim != 1 or row.size == 0:
+                raise ValueError(f"t_eval[{k}] must be the times of one member, 1-dimensional and not empty.")
+    if spans is not None and times is None and t_eval is not None:
+        times = [np.array(_plain(fun, "t_eval", t_eval), float)] * len(spans)
+    if spans is not None and times is not None and len(spans) != len(times):
+        raise ValueError(f"t_span has {len(spans)} rows and t_eval has {len(times)}; give one of each for each member.")
+    found = OwnTimes(spans, times)
+    if found and save_every is not None:
+        raise ValueError("save_every needs the same t_span for all members; give t_eval, one row for each member.")
+    if found and reduce is not None:
+        raise ValueError("reduce compares members at the same times; give one t_span and one t_eval for all members.")
+    return found
+
+
+def _has_rows(given: Any) -> bool:
+    """Return whether an argument has a row for each member."""
+    if isinstance(given, np.ndarray) or not isinstance(given, Sequence):
+        return np.ndim(given) == 2
+    return len(given) > 0 and all(np.ndim(item) == 1 for item in given)
+
+
+def _pair(row: Any) -> Any:
+    if np.shape(row) != (2,):
+        raise ValueError(f"t_span must be (start, end), or have the shape (members, 2); got the row {shown(row)}.")
+    return row
+
+
+def _plain(fun: Any, name: str, row: Any) -> Any:
+    return fun.plain(**{name: row})[name] if isinstance(fun, Problem) else row

@@ -1,0 +1,59 @@
+"""An `EnsembleResult` as the plain fields that a file takes, and back."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from .happened import Flat, flattened, unflattened
+from .statistics import Statistics
+
+__all__ = ["packed", "unpacked"]
+
+TUPLES = "names", "component_names"
+
+
+def packed(result: Any) -> dict[str, Any]:
+    """Return the fields of a result as arrays and what JSON holds."""
+    fields = dict(result)
+    ends = fields.pop("end_invariants", None)
+    messages = [str(text) for text in fields.pop("message")]
+    usual = Counter(messages).most_common(1)[0][0]
+    others = {str(k): text for k, text in enumerate(messages) if text != usual}
+    fields["messages"] = {"usual": usual, "others": others}
+    if not isinstance(fields["trajectories"], np.ndarray):
+        fields["trajectories"] = None
+    if not isinstance(fields["invariants"], np.ndarray):  # which are in the store, as the trajectories are
+        fields["invariants"] = ends
+    statistics = fields.pop("statistics")
+    if statistics is not None:
+        fields |= {f"statistics.{name}": value for name, value in vars(statistics).items()}
+    times, states = fields.pop("t_events"), fields.pop("y_events")
+    if times is not None:
+        pairs = [list(zip(t, y, strict=True)) for t, y in zip(times, states, strict=True)]
+        n, dtype = fields["y"].shape[1], fields["y"].dtype
+        flat = flattened(pairs, len(times[0]), n, dtype)
+        fields |= {f"events.{name}": value for name, value in flat._asdict().items()}
+    return fields
+
+
+def unpacked(fields: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a result from what `packed` gave."""
+    fields = dict(fields)
+    messages = fields.pop("messages")
+    m = len(fields["t"])
+    fields["message"] = np.array([messages["others"].get(str(k), messages["usual"]) for k in range(m)], dtype=object)
+    found = {name: fields.pop(f"statistics.{name}", None) for name in Statistics.__dataclass_fields__}
+    fields["statistics"] = None if found["t"] is None else Statistics(**found)
+    events = [fields.pop(f"events.{name}", None) for name in Flat._fields]
+    fields["t_events"] = fields["y_events"] = None
+    if events[0] is not None:
+        members = unflattened(Flat(*events))
+        fields["t_events"] = [[t for t, _ in member] for member in members]
+        fields["y_events"] = [[y for _, y in member] for member in members]
+    for name in TUPLES:
+        if fields.get(name) is not None:
+            fields[name] = tuple(fields[name])
+    return fields
