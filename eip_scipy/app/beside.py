@@ -1,4 +1,4 @@
-"""A second process for what may go on beside a command's own work: one call at a time."""
+"""Other processes for what may go on next to a command's own work: one that is asked, or as many as there are cores."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import multiprocessing
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from typing import Any
 
 from .report import UsageError
 
-__all__ = ["Beside"]
+__all__ = ["Beside", "workers"]
 
 
 class Beside:
@@ -56,6 +58,43 @@ class Beside:
         if error is not None:
             raise error
         return value
+
+
+@contextlib.contextmanager
+def workers(processes: int) -> Iterator[Callable[..., Callable[[], Any]]]:
+    """Start processes that share calls; leaving the context ends them, whatever they do.
+
+    Parameters
+    ----------
+    processes : int
+
+    Yields
+    ------
+    callable
+        ``start(function, *args)`` puts a call in line and returns a function that waits for its value, or raises
+        UsageError if a process is no more. Function, arguments and value must pickle.
+    """
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn"))
+
+    def start(function: Callable[..., Any], *args: Any) -> Callable[[], Any]:
+        with _deaf():
+            future = pool.submit(function, *args)
+
+        def value() -> Any:
+            try:
+                return future.result()
+            except BrokenProcessPool:
+                raise UsageError("a process of this command has died: killed, or out of memory") from None
+
+        return value
+
+    try:
+        yield start
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - others:
+            process.kill()
 
 
 @contextlib.contextmanager

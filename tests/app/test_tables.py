@@ -45,7 +45,7 @@ ORDERS_APART = {
 
 
 def cells_of(name):
-    return PaperTable(name=name).measure(Session("reproduce", quiet=True))
+    return PaperTable(name=name, processes=1).measure(Session("reproduce", quiet=True))
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +160,22 @@ def test_table5_has_no_50_digit_column(monkeypatch):
     assert "mpmath" not in text
     assert "nan" not in text
     assert max(map(len, text.splitlines())) <= 130
+
+
+def test_runs_of_table5_are_shared(monkeypatch):
+    """All of them are put in line, those with most steps first, and give the numbers of one after the other."""
+    line = []
+
+    def start(function, series, h):
+        line.append(h)
+        return lambda: function(series, h)
+
+    monkeypatch.setattr(tables, "_field_end", lambda series, h: np.array([h**4 * (1 + series.Omega), 0.0]))
+    stored = [tables.Series(**s) for s in DATA["series"] if s["table"] == 5]
+    shared = tables._shared(stored, start)
+    assert len(line) == 9 * 4
+    assert line == sorted(line)
+    assert [shared(series) for series in stored] == [tables._field_differences(series) for series in stored]
 
 
 def test_nine_columns_of_table5_are_stored():
