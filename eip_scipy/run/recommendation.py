@@ -48,6 +48,8 @@ class Recommendation:
     reason : str
     trials : tuple of Trial
         All trials: ``options``, ``error``, ``nfev``, ``seconds``, and ``trouble`` of those that failed.
+    stiff : bool
+        Whether an implicit method takes a third of the evaluations or less; `reason` says which.
     """
 
     problem: Problem
@@ -58,6 +60,7 @@ class Recommendation:
     message: str
     reason: str
     trials: tuple[Trial, ...]
+    stiff: bool = False
 
     @property
     def method(self) -> Any:

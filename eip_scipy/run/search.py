@@ -18,6 +18,7 @@ from ..core.solvers import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN
 from .integrate import integrate
 from .prepare import Request, prepared
 from .recommendation import Recommendation, called
+from .stiffness import implicit_run
 from .trials import Bench, Outcome, Trial, difference
 from .tuning import AIM, COARSEST_RTOL, FINEST_RTOL, WINDOW, Kind, best, tune
 
@@ -57,6 +58,8 @@ BETTER = 3.0
 CHEAPER = 0.9
 # A run is bound by stability where so many times the tolerance takes no fewer evaluations.
 LOOSER, FEWER = 10.0, 0.9
+# Equations are stiff if an implicit method takes so many times fewer evaluations.
+STIFF = 3.0
 # What takes fewer evaluations than this is not worth the remark.
 LEAST_BOUND = 1000
 
@@ -100,7 +103,9 @@ class Search:
         if self.keeps:
             chosen = self._other_metric(chosen)
             self._say_what_projection_does(chosen)
-        self._say_what_binds(chosen)
+        stiff = self._say_that_it_is_stiff(chosen)
+        if not stiff:
+            self._say_what_binds(chosen)
         if self.message:
             warnings.warn(f"recommend: {self.message}", ProjectionWarning, stacklevel=3)
         return Recommendation(
@@ -112,6 +117,7 @@ class Search:
             message=self.message,
             reason=" ".join([self._why(chosen), *self.notes]),
             trials=tuple(self.trials),
+            stiff=stiff,
         )
 
     # --- what is known before: size, steps, a truth to compare with ---
@@ -269,6 +275,23 @@ class Search:
         plain = self._trial({**chosen.options, **PLAIN})
         if math.isfinite(plain.error):
             self.notes.append(f"Without the projection the error is {plain.error:.1e}.")
+
+    def _say_that_it_is_stiff(self, chosen: Trial) -> bool:
+        """Try SciPy's implicit method if the run is long, and say by how much it is cheaper if it is."""
+        bench, share = self.bench, self.bench.share
+        if chosen.nfev * share < LEAST_BOUND or np.iscomplexobj(bench.truth):
+            return False
+        implicit = implicit_run(bench, self.wanted, int(chosen.nfev * share / STIFF))
+        if implicit is None:
+            return False
+        nfev = round(implicit.nfev / share)
+        self.notes.append(
+            f"The equations are stiff: stability bounds the steps of explicit methods. SciPy's implicit method Radau "
+            f"has an error of {implicit.error:.1e} with {nfev} evaluations, {chosen.nfev / nfev:.2g} times fewer. Take "
+            f'scipy.integrate.solve_ivp(fun, t_span, y0, method="Radau", rtol={implicit.rtol:.2g}, '
+            f'atol={implicit.atol:.2g}), or "BDF".'
+        )
+        return True
 
     def _say_what_binds(self, chosen: Trial) -> None:
         """Whether stability bounds the steps, where the run is more accurate than wanted."""

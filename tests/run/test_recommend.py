@@ -2,10 +2,12 @@
 
 import math
 import pickle
+import re
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 from systems import H, L, orbit, pericentre
 
 from eip_scipy import EIPGJ14, Invariant, ProjectionWarning, integrate, recommend
@@ -148,9 +150,36 @@ def test_errors_that_cannot_be_reached():
         recommend(lorenz, (0, 60), [1.0, 1.0, 1.0])
 
 
-def test_stability_is_named():
-    choice = recommend(lambda t, y: np.array([-2000 * (y[0] - math.cos(t))]), (0, 2), [1.0], error=1e-4)
-    assert "Stability bounds the steps" in choice.reason
+A = np.array([[-1000.0, 999.0], [1.0, -2.0]])  # eigenvalues -1001 and -1
+STIFF = {
+    "linear": (lambda t, y: A @ y, (0, 10), [1.0, 0.0]),
+    "relaxation": (lambda t, y: np.array([-2000 * (y[0] - math.cos(t))]), (0, 2), [1.0]),
+    "van der Pol": (lambda t, y: np.array([y[1], 1000 * (1 - y[0] ** 2) * y[1] - y[0]]), (0, 500), [2.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("name", STIFF)
+def test_stiffness_is_named(name):
+    """With the method of SciPy that takes a third of the evaluations or less: as it does when it is run."""
+    fun, t_span, y0 = STIFF[name]
+    choice = recommend(fun, t_span, y0, error=1e-4)
+    assert choice.stiff
+    said = re.search(r"error of (\S+) with (\d+) evaluations.*rtol=(\S+), atol=(\S+)\), or \"BDF\"", choice.reason)
+    error, nfev, rtol, atol = map(float, said.groups())
+    assert "The equations are stiff: stability bounds the steps" in choice.reason
+    assert error <= 1e-4
+    assert 3 * nfev <= choice.nfev
+    if choice.share == 1:
+        sol = solve_ivp(fun, t_span, y0, method="Radau", rtol=rtol, atol=atol)
+        assert sol.nfev <= 1.05 * nfev
+        if name == "linear":
+            exact = expm(A * 10) @ y0
+            assert np.abs(sol.y[:, -1] - exact).max() <= 1.1e-4 * np.abs(exact).max()
+
+
+def test_fast_oscillations_are_not_stiff():
+    assert not recommend(lambda t, y: np.array([y[1], -1e4 * y[0]]), (0, 10), [1.0, 0.0], error=1e-4).stiff
+    assert not recommend(kepler(0.6, relativistic=0), (0, 500), error=1e-6).stiff
 
 
 def test_a_run_that_fails_at_once():

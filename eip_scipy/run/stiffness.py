@@ -1,0 +1,80 @@
+"""Whether equations are stiff: what SciPy's implicit method takes for the same error."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from ..core.solvers import EIPDOP853
+from .prepare import Request, prepared
+from .trials import Bench, difference
+
+__all__ = ["ImplicitRun", "implicit_run"]
+
+# Tolerances to be tried, in units of the wanted error, and what atol is of rtol times the size of the start.
+TOLERANCES, ATOL_PER_RTOL = (0.1, 1e-2, 1e-3, 1e-4), 1e-3
+# An implicit step solves a system of as many equations: beyond, that costs more than the evaluations that it saves.
+LARGEST = 500
+
+
+class ImplicitRun(NamedTuple):
+    """What a run by Radau took: its tolerances, its error, and evaluations, those for Jacobians among them."""
+
+    rtol: float
+    atol: float
+    error: float
+    nfev: int
+
+
+class _TooManyError(Exception):
+    """The evaluations are used up."""
+
+
+def implicit_run(bench: Bench, wanted: float, most: int) -> ImplicitRun | None:
+    """Run a problem by SciPy's Radau to the end of the bench's trials.
+
+    Parameters
+    ----------
+    bench : Bench
+        With the truth to compare with.
+    wanted : float
+        Error at the last time of the bench.
+    most : int
+        Evaluations that a run may take.
+
+    Returns
+    -------
+    ImplicitRun or None
+        None if it does not get there.
+    """
+    y0, times = bench.problem.y0, bench.times
+    if y0.size > LARGEST:
+        return None
+    options = {**bench.common, "method": EIPDOP853, "rtol": 1e-3, "atol": 1e-6, "invariants": ()}
+    derivative = prepared(Request.of(fun=bench.problem, **options)).system.derivative
+    calls = 0
+
+    def fun(t: float, y: np.ndarray) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls > most:
+            raise _TooManyError
+        return derivative(t, y)
+
+    size = min(1.0, float(np.abs(y0).max())) or 1.0
+    for part in TOLERANCES:
+        rtol, calls = max(part * wanted, 1e-12), 0
+        atol = ATOL_PER_RTOL * rtol * size
+        try:
+            with np.errstate(all="ignore"):
+                run = solve_ivp(fun, (bench.t0, times[-1]), y0, method="Radau", rtol=rtol, atol=atol)
+        except (_TooManyError, ValueError, ArithmeticError, np.linalg.LinAlgError):
+            return None  # what explicit methods do is recommended all the same
+        if not run.success:
+            return None
+        error = float(difference(run.y[:, -1:], bench.truth[:, -1:])[0])
+        if error <= wanted:
+            return ImplicitRun(rtol, atol, max(error, bench.doubt), calls)
+    return None
