@@ -42,7 +42,7 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
     asked = {item.name: getattr(request, item.name) for item in fields(Request) if item.name not in OWN}
     asked |= {**request.projection, "invariants": origin.invariants}
     if result.t_events is not None:
-        asked["events"] = ContinuedEvents(as_events(asked["events"]), map(len, result.t_events))
+        asked["events"] = ContinuedEvents(as_events(asked["events"]), result.t_events)
     if options.get("t_eval") is not None:
         asked["save_every"] = None
     try:

@@ -18,12 +18,12 @@ __all__ = ["ContinuedEvents", "Events", "as_events"]
 
 
 class ContinuedEvents(tuple):
-    """Events of a run that is continued, with the number of times that each has happened before."""
+    """Events of a run that is continued, and the times at which each has happened before."""
 
-    happened: tuple[int, ...]
+    happened: tuple[np.ndarray, ...]
 
     def __new__(cls, events: Any, happened: Any) -> ContinuedEvents:
-        """Take the events, and how often each has happened."""
+        """Take the events and the times of each."""
         found = super().__new__(cls, events)
         found.happened = tuple(happened)
         return found
@@ -54,7 +54,8 @@ class Events:
         self._extra = extra
         self.directions = np.array([_direction(getattr(item, "direction", 0)) for item in items])
         self._allowed = [_allowed(getattr(item, "terminal", None)) for item in items]
-        self._before = items.happened if isinstance(items, ContinuedEvents) else (0,) * len(items)
+        self._happened = items.happened if isinstance(items, ContinuedEvents) else (np.zeros(0),) * len(items)
+        self._before = [len(times) for times in self._happened]
         self._counts = list(self._before)
         self.t: list[list[float]] = [[] for _ in items]
         self.y: list[list[np.ndarray]] = [[] for _ in items]
@@ -105,6 +106,16 @@ class Events:
         """Values of all events."""
         for k in range(len(self.functions)):
             values[k] = self._value(k, t, y.copy())
+
+    def leave(self, t: float, y: np.ndarray, f: np.ndarray, step: float, values: np.ndarray) -> None:
+        """Take the values a little later of those events that happened where the run is continued.
+
+        The value there is a rounding error, by whose sign the event would happen again.
+        """
+        part = step / 4096
+        for k, times in enumerate(self._happened):
+            if len(times) and times[-1] == t:
+                values[k] = self._value(k, t + part, y + part * f)
 
     def handle(self, which: np.ndarray, times: np.ndarray, sol: DenseOutput) -> float | None:
         """Note events that happen in a step, in the order of their times; returns the time at which the run ends.

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .tables import component_names, invariant_rows
+from .tables import component_names, invariant_rows, of_members
 
 __all__ = ["described", "planes", "plot"]
 
@@ -19,8 +19,9 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
 
     Parameters
     ----------
-    result : IntegrationResult or OdeResult
-        From `integrate` or from `scipy.integrate.solve_ivp`. What was saved is drawn: give `save_every` or `t_eval`.
+    result : IntegrationResult, OdeResult or EnsembleResult
+        From `integrate`, from `scipy.integrate.solve_ivp`, or from `ensemble`, whose figure is that of
+        `EnsembleResult.plot`. What was saved is drawn: give `save_every` or `t_eval`.
     names : sequence of str or str, optional
         As for `to_xarray`.
     orbit : bool, optional
@@ -51,6 +52,8 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
     """
     from ..plotting.runs import draw_run, run_figure
 
+    if of_members(result):
+        return result.plot(names)
     labels = component_names(result, names)
     pairs = planes(labels)
     if orbit and not pairs:

@@ -339,6 +339,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     setup.attach(record, run)
     system.events.fill(t0, run.y0, schedule.g)
     run.work.K[0] = f0 if run.y0 is y0 else calls(t0, run.y0)
+    system.events.leave(t0, run.y0, run.work.K[0], start.tau * schedule.span.sign, schedule.g)
     run.work.counters[NFEV] = calls.count
     return Prepared(asked, request, method, system, stepping, start, schedule, run, record)
 

@@ -137,8 +137,9 @@ class IntegrationResult(OptimizeResult):
         **options
             Options of `integrate` that are to be others than before. Times in `t_eval` are not asked for again: give
             new ones, or the states at both ends are saved. Events keep their counts: one with ``terminal = 3`` that
-            happened twice before ends the run when it happens once more. An event that ended the run may end it again
-            at once; ``events=None`` leaves it out. Events that are given anew begin to count at 0.
+            happened twice before ends the run when it happens once more, and one that ended the run ends it again when
+            it happens next; ``events=None`` leaves it out. Events that are given anew begin to count at 0, and may
+            happen at once.
 
         Returns
         -------

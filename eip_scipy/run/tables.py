@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
     from xarray import Dataset
 
-__all__ = ["component_names", "dataset", "default_names", "invariant_rows", "to_dataframe", "to_xarray"]
+__all__ = ["component_names", "dataset", "default_names", "invariant_rows", "of_members", "to_dataframe", "to_xarray"]
 
 TABLES = {"xarray": "xarray", "pandas": "dataframe"}
 # Of a result what describes the whole run, in the order of an attribute list.
@@ -54,7 +54,7 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
     >>> data.y.dims, data.component.values.tolist(), data.attrs["method"]
     (('component', 't'), ['x', 'y', 'vx', 'vy'], 'EIPRK4')
     """
-    if _of_members(result):
+    if of_members(result):
         return result.to_xarray(names)
     variables: dict[str, Any] = {"y": (("component", "t"), np.asarray(result.y))}
     coordinates: dict[str, Any] = {"t": np.asarray(result.t), "component": list(component_names(result, names))}
@@ -104,7 +104,7 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
         import pandas
     except ModuleNotFoundError as error:
         raise _missing("pandas", error) from error
-    if _of_members(result):
+    if of_members(result):
         members = pandas.Index(result.first + np.arange(len(result.y)), name="member")
         return pandas.DataFrame(_member_columns(result, names), index=members)
     columns = dict(zip(component_names(result, names), np.asarray(result.y), strict=True))
@@ -114,7 +114,7 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
     return pandas.DataFrame(columns, index=pandas.Index(result.t, name="t"))
 
 
-def _of_members(result: Any) -> bool:
+def of_members(result: Any) -> bool:
     """Whether a result is that of an ensemble, whose states are (members, components)."""
     return "trajectories" in result
 

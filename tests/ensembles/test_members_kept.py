@@ -15,6 +15,7 @@ from eip_scipy import (
     ensemble,
     integrate,
     load,
+    plot,
     save,
 )
 from eip_scipy.problems import kepler
@@ -344,7 +345,7 @@ def test_a_figure_of_members_in_time(tmp_path):
     np.testing.assert_array_equal(errors.lines[-1].get_xdata(), [FAILING])
     ends = dict(zip([label.get_text() for label in counts.get_yticklabels()], counts.patches, strict=True))
     assert {name: bar.get_width() for name, bar in ends.items()} == {"reached the end": 20, "failed": 1}
-    run.plot().savefig(tmp_path / "run.png")
+    plot(run).savefig(tmp_path / "run.png")
     assert (tmp_path / "run.png").read_bytes()[:4] == b"\x89PNG"
 
 

@@ -249,6 +249,20 @@ def test_counts_go_on_in_a_continued_run(as_compiled):
     assert (other.status, other.t_events[0].size) == (1, 3 + 5)
 
 
+@pytest.mark.parametrize("phase", np.linspace(0.1, 0.7, 7))
+def test_an_event_that_ended_a_run_does_not_happen_again_at_once(phase):
+    """Whatever the sign of the rounding error there: it next happens at the next passage, and ends the run again."""
+    event, times = reaching(0.9 * math.cos(phase), terminal=True), passages(0.9 * math.cos(phase))
+    run = integrate(oscillator, (0, SPAN), START, method=EIPDOP853, h=0.1, events=event)
+    for count in range(1, 6):
+        np.testing.assert_allclose(run.t_events[0], times[:count], rtol=0, atol=1e-7)
+        assert run.t[-1] == run.t_events[0][-1]
+        run = run.continue_to(SPAN)
+    backward = integrate(oscillator, (0, -SPAN), START, method=EIPDOP853, h=0.1, events=event)
+    before = backward.t[-1]
+    assert backward.continue_to(-SPAN).t[-1] < before - 0.1
+
+
 def test_counts_go_on_from_a_checkpoint_of_a_continued_run(tmp_path):
     event, times = reaching(0.9, terminal=5), passages(0.9)
     first = integrate(oscillator, (0, times[1] + 0.1), START, method=EIPDOP853, h=0.1, events=event)
