@@ -144,6 +144,25 @@ def test_three_crossings_in_one_step():
         np.testing.assert_allclose(run.t_events[0], expected, rtol=0, atol=1e-15)
 
 
+@pytest.mark.parametrize("depth", [0.3, 0.03, 0.003])
+def test_an_event_with_a_kink(depth):
+    """|t - 0.37 - k| - depth is zero at 0.37 + k -+ depth, within each step of length 1."""
+    run = integrate(
+        lambda t, y: [1.0], (0, 9), [0.0], method=EIPRK4, h=1.0, events=lambda t, y: abs(y[0] % 1.0 - 0.37) - depth
+    )
+    expected = [0.37 + k + side * depth for k in range(9) for side in (-1, 1)]
+    inside = [t for t in run.t_events[0] if abs(t - round(t)) > 1e-9]  # the event jumps between the steps
+    np.testing.assert_allclose(inside, expected, rtol=0, atol=1e-14)
+
+
+def test_a_search_that_finds_nothing_does_not_warn():
+    """Halfway through these steps no state has the energy of both ends; nothing there is asked for."""
+    run = integrate(
+        oscillator, (0, SPAN), START, method=EIPRK4, h=1.5, events=reaching(1.2), invariants=ENERGY, check=False
+    )
+    assert run.t_events[0].size == 0
+
+
 def test_a_passage_that_does_not_reach_zero_is_none():
     for height in (1e-3, 1e-9, 1e-14):
         run = integrate(

@@ -113,7 +113,11 @@ inline std::vector<Root> roots_in_step(const Run &run, const DenseRun &dense, co
         const auto time_of = [&](double theta) { return t + theta * (t_new - t); };
         const EventEnds ends = ends_of(s, i);
         EventPoints inside;
-        if (may_cross_inside(ends)) inside = points_inside(ends, [&](double theta) { return value_at(time_of(theta)); });
+        if (may_cross_inside(ends)) {
+            const double missed = dense.dense.missed[0];
+            inside = points_inside(ends, [&](double theta) { return value_at(time_of(theta)); });
+            if (inside.count == 0) dense.dense.missed[0] = missed;  // no result has a state that was left unprojected
+        }
         double before = t, g_before = s.g[i];
         for (int k = 0; k <= inside.count; ++k) {
             const bool last = k == inside.count;
