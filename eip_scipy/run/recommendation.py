@@ -49,7 +49,7 @@ class Recommendation:
     trials : tuple of Trial
         All trials: ``options``, ``error``, ``nfev``, ``seconds``, and ``trouble`` of those that failed.
     stiff : bool
-        Whether an implicit method takes a third of the evaluations or less; `reason` says which.
+        Whether an implicit method takes at most 0.33 of the evaluations; `reason` names it.
     """
 
     problem: Problem

@@ -58,7 +58,7 @@ BETTER = 3.0
 CHEAPER = 0.9
 # A run is bound by stability where so many times the tolerance takes no fewer evaluations.
 LOOSER, FEWER = 10.0, 0.9
-# Equations are stiff if an implicit method takes so many times fewer evaluations.
+# Equations are stiff if an implicit method takes fewer evaluations by at least this factor.
 STIFF = 3.0
 # What takes fewer evaluations than this is not worth the remark.
 LEAST_BOUND = 1000

@@ -1,4 +1,4 @@
-"""Whether equations are stiff: what SciPy's implicit method takes for the same error."""
+"""The comparison with SciPy's implicit method that shows whether equations are stiff."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LARGEST = 500
 
 
 class ImplicitRun(NamedTuple):
-    """What a run by Radau took: its tolerances, its error, and evaluations, those for Jacobians among them."""
+    """Tolerances, error and evaluations of a run by Radau; those for Jacobians are counted."""
 
     rtol: float
     atol: float

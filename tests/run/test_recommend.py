@@ -160,7 +160,7 @@ STIFF = {
 
 @pytest.mark.parametrize("name", STIFF)
 def test_stiffness_is_named(name):
-    """With the method of SciPy that takes a third of the evaluations or less: as it does when it is run."""
+    """The reason names the method of SciPy that takes at most 0.33 of the evaluations, as it does when it is run."""
     fun, t_span, y0 = STIFF[name]
     choice = recommend(fun, t_span, y0, error=1e-4)
     assert choice.stiff

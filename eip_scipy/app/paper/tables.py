@@ -270,7 +270,7 @@ def _field_differences(series: Series) -> list[float]:
 
 
 def _shared(stored: list[Series], start: Callable[..., Callable[[], Any]]) -> Callable[[Series], list[float]]:
-    """The same with the runs of all series put in line at once, those with most steps first."""
+    """Return the same function after putting the runs of all series in line, those with most steps first."""
     runs = [(series, h) for series in stored for h in _field_steps(series)]
     waiting = {(series.name, h): start(_field_end, series, h) for series, h in sorted(runs, key=lambda run: run[1])}
     return lambda series: _field_changes([waiting[series.name, h]() for h in _field_steps(series)])
