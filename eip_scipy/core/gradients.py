@@ -64,6 +64,8 @@ class NumericalGradient:
         if self.complex_step:
             try:
                 found = self._by_complex_step(t, y, extra)
+            except MemoryError:
+                raise
             except Exception:  # an error of the function itself comes again from the differences
                 found = None
             if found is not None:
@@ -92,6 +94,8 @@ class NumericalGradient:
                 if np.any(np.imag(plain) != 0) or not np.allclose(np.real(plain), real, rtol=1e-12):
                     return False
                 return any(self._agrees_beside(t, y, extra, *trial) for trial in TRIALS)
+        except MemoryError:
+            raise
         except Exception:  # whatever a library raises for numbers that it does not know
             return False
 

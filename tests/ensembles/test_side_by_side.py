@@ -403,7 +403,7 @@ def test_multistep_members_by_functions_of_the_users_own():
     starts = np.random.default_rng(5).normal(size=(10, 6))
     params = np.linspace(0.5, 2, 10)[:, None]
     options = {"h": 0.05, "in_place": True, "invariants": (), "method": EIPGJ14, "jacobian": springs_jacobian}
-    run = check_bits(springs, (0, 20), starts, params=params, **options)
+    run = check_bits(None, (0, 20), starts, params=params, acceleration=springs, **options)
     assert run.side_by_side.all()
 
 
