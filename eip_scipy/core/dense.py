@@ -61,6 +61,8 @@ class Interpolants:
         That of the run, which has dense output from now on.
     events : int
         How many events the loop looks at.
+    shows : bool
+        Whether states between two projections are handed out as copies on the manifold; else as they are.
     errors : callable
         A context that says what a failed call by pointer means, as `Driver.own_errors`.
     """
@@ -71,9 +73,10 @@ class Interpolants:
         tableau: AnyMethod,
         engine: Engine,
         events: int = 0,
+        shows: bool = False,
         errors: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
-        self.record = _record(run, tableau, events)
+        self.record = _record(run, tableau, events, shows=shows)
         self._engine, self._dtype, self._n, self._errors = engine, run.y0.dtype, run.y0.size, errors
         self._lock = threading.RLock()  # one buffer for all threads that ask
         engine.sample(self.record)
@@ -92,6 +95,13 @@ class Interpolants:
         with self._lock, self._errors():
             self._engine.describe(t_old, y_old, t, y, piece)
         return ManifoldDenseOutput(self, piece)
+
+    def shown(self, t: float, y: Array) -> Array:
+        """Return the last state, y at t, as the run hands it out."""
+        out = np.empty_like(y)
+        with self._lock, self._errors():
+            self._engine.show(t, y, out)
+        return out
 
     def states(self, piece: Array, times: Array) -> Array:
         """The states (n, m) at times (m,) by an interpolant."""
@@ -145,7 +155,7 @@ def _form(run: Run, tableau: AnyMethod) -> _Form:
         assert run.method.multistep is not None
         if not run.method.multistep.brief:
             weights = interpolation_weights(tableau.order).reshape(-1, tableau.order)
-            return _Form(HISTORY, (tableau.order + 1) // 2 + 1, weights)
+            return _Form(HISTORY, (tableau.order + 1) // 2 + 2, weights)
         if tableau.velocities:
             return _Form(QUINTIC, 3)
         tableau = RKN1210  # The method that starts makes all steps.
@@ -161,7 +171,7 @@ def _form(run: Run, tableau: AnyMethod) -> _Form:
     return _Form(POLYNOMIAL, 1 + tableau.P.shape[1], tableau.P.T)
 
 
-def _record(run: Run, tableau: AnyMethod, events: int) -> Dense:
+def _record(run: Run, tableau: AnyMethod, events: int, *, shows: bool) -> Dense:
     roots = min(MOST_ROOTS, ROOT_NUMBERS // run.y0.size) if events else 0
     kind, rows, weights, A, c = _form(run, tableau)
     stages = run.method.b.size
@@ -176,10 +186,12 @@ def _record(run: Run, tableau: AnyMethod, events: int) -> Dense:
         A=A.copy("C"),
         c=c.copy(),
         own_slopes=isinstance(tableau, OneStep),
+        shows=shows,
         by_travel=invariants > 0 and run.options.metric == ERROR,
         options=options._replace(target=np.zeros(invariants)),
         work=make_work(n, dtype, stages + c.size if c.size else 1, invariants, options.groups.start.size - 1),
         missed=np.zeros(2),
+        waiting=np.zeros(2, np.int64),
         piece=np.zeros(3 + (3 + rows) * n * width + 2 * invariants),
         event=np.zeros(roots, np.int64),
         t=np.zeros(roots),

@@ -317,10 +317,12 @@ class Dense(NamedTuple):
 
     `weights` are rows over the stages, of a tableau's own polynomial or of that of DOP853 or a Nystrom method, which
     have further stages, A and c. `own_slopes`: the steps leave no f at their ends. `by_travel`: corrections are weighed
-    by what each block travels within the step, else by the run's weights. `missed`: how many states were left
-    unprojected, and the time of the first. `event`, `t`, `y`: roots of events that the loop has found, ``counts[0]`` of
-    them; ``counts[1]`` interpolants are kept. `left`: how often each event may still happen before it ends the run.
-    `pending_event`, `pending_t`: the ``counts[2]`` roots of a step for whose states there is no room.
+    by what each block travels within the step, else by the run's weights. `shows`: states that a step leaves
+    unprojected are handed out as projected copies. `missed`: how many states were left unprojected, and the time of the
+    first. `waiting`: whether the states at both ends of the step at hand are not projected. `event`, `t`, `y`: roots of
+    events that the loop has found, ``counts[0]`` of them; ``counts[1]`` interpolants are kept. `left`: how often each
+    event may still happen before it ends the run. `pending_event`, `pending_t`: the ``counts[2]`` roots of a step for
+    whose states there is no room.
     """
 
     kind: int
@@ -329,9 +331,11 @@ class Dense(NamedTuple):
     c: np.ndarray
     own_slopes: bool
     by_travel: bool
+    shows: bool
     options: Any
     work: Work
     missed: np.ndarray
+    waiting: np.ndarray
     piece: np.ndarray
     event: np.ndarray
     t: np.ndarray

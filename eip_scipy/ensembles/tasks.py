@@ -375,13 +375,14 @@ def _alone(
         out.y[k], out.t[k] = y0, own.get("t_span", (plan.t0,))[0]
         _describe(out, k, FAILED, _reason(error))
         return
+    broken = False
     try:
         status, message = loop.steps(watch)
     except StoppedError:
         raise
     except Exception as error:
-        status, message = FAILED, _reason(error)
-    _store(loop, k, status, loop.explained(message), out)
+        status, message, broken = FAILED, _reason(error), True
+    _store(loop, k, status, loop.explained(message), out, loop.driver.y[: loop.driver.rows], broken=broken)
     wanted = own.get("t_eval", plan.times)
     rows = min(loop.driver.rows, wanted.size) if plan.times.size else 0
     same = np.flatnonzero(loop.driver.t[:rows] != wanted[:rows])
@@ -390,10 +391,25 @@ def _alone(
     out.saved_values[k, :rows] = _values(loop.driver, loop.driver.t[:rows], loop.driver.y[:rows])
     out.values[k] = _values(loop.driver, out.t[k : k + 1], out.y[k : k + 1])[0]
     out.target[k] = loop.driver.run.invariants.target
+    schedule = loop.driver.schedule
+    after = loop.driver.t[:rows] != schedule.span.t0
+    _cover(out, slice(k, k + 1), out.saved_values[k, :rows][None, after], schedule)
     out.happened[k] = [
         (np.array(t), np.array(y, plan.dtype).reshape(len(t), plan.size))
         for t, y in zip(loop.events.t, loop.events.y, strict=True)
     ]
+
+
+def _cover(out: Members, those: slice, rows: np.ndarray, schedule: Schedule) -> None:
+    """Let the largest defects cover the invariants' values at rows (m, rows, l), and those in the last states.
+
+    As in the result of a single run, which holds no state of an event beside the times that it is asked for.
+    """
+    target, before = out.target[those], out.max_defect[those]
+    beside = (out.status[those] == 1) & (schedule.t_eval.size > 0)
+    last = np.where(beside[:, None], 0.0, np.abs(out.values[those] - target))
+    largest = np.fmax(last, np.fmax.reduce(np.abs(rows - target[:, None]), axis=1, initial=0.0))
+    out.max_defect[those] = np.where(np.isnan(before), before, np.fmax(before, largest))
 
 
 def _values(driver: Driver, t: np.ndarray, y: np.ndarray, *params: np.ndarray) -> np.ndarray:
@@ -407,11 +423,16 @@ def _values(driver: Driver, t: np.ndarray, y: np.ndarray, *params: np.ndarray) -
         return np.concatenate(each)
 
 
-def _store(loop: Loop, k: int, status: int, message: str, out: Members) -> None:
+def _store(
+    loop: Loop, k: int, status: int, message: str, out: Members, rows: np.ndarray, *, broken: bool = False
+) -> None:
+    """Store the results of member k, whose saved states are `rows`; `broken`: a function has raised an exception."""
     driver, work = loop.driver, loop.driver.run.work
     t, y = driver.now
     if status == 1:
         t, y = loop.events.last
+    elif status == FAILED and not broken:
+        y = rows[-1] if len(rows) and driver.t[len(rows) - 1] == t else driver.shown(t, y)
     out.y[k], out.t[k] = y, t
     out.max_defect[k] = work.max_defect
     out.counters[k] = work.counters
@@ -475,6 +496,7 @@ class Sweeper:
             members, rows = np.nonzero(~np.isnan(out.saved).any(axis=2))
             times = plan.times[rows]
             out.saved_values[members, rows] = _values(driver, times, out.saved[members, rows], params[members])
+        _cover(out, slice(None), out.saved_values[:, plan.times != plan.t0], driver.schedule)
 
     def _go_side_by_side(self, members: int) -> str:
         driver = self.loop.driver
@@ -591,7 +613,16 @@ class Sweeper:
             if each.kept:
                 each.rows[k, :-1] = out.saved[k]
             return
-        _store(loop, k, FAILED, reason or setup.failure(code, driver.run, driver.schedule.clock), out)
+        rows = each.rows[k if each.kept else 0, : driver.rows]
+        _store(
+            loop,
+            k,
+            FAILED,
+            reason or setup.failure(code, driver.run, driver.schedule.clock),
+            out,
+            rows,
+            broken=reason is not None,
+        )
         if each.kept:
             each.rows[k, driver.rows :] = np.nan
 

@@ -17,6 +17,7 @@ from ..core.setup import Run
 from ..core.stepping import UNBOUNDED, AnyMethod
 from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
+from ..methods.multistep import GaussJackson
 from .events import Events
 from .memory import most_bytes
 
@@ -54,8 +55,11 @@ class Driver:
         self.engine = run.engine(functions, schedule)
         self._interpolants = None
         self._pieces = np.empty((0, 0))
-        if schedule.t_eval.size or schedule.g.size or keeps_steps:
-            self._interpolants = Interpolants(run, tableau, self.engine, schedule.g.size, self.own_errors)
+        shows = run.invariants.size > 0 and (run.options.every != 1 or isinstance(tableau, GaussJackson))
+        if schedule.t_eval.size or schedule.g.size or keeps_steps or shows:
+            self._interpolants = Interpolants(
+                run, tableau, self.engine, schedule.g.size, shows=shows, errors=self.own_errors
+            )
             steps = expected_steps(schedule) or _first(8 * self._interpolants.floats)
             self._pieces = self._more_pieces(steps if keeps_steps else 0)
 
@@ -177,7 +181,12 @@ class Driver:
         """After an early end: the last accepted state too."""
         t, y = self.now
         if self.rows == 0 or self.t[self.rows - 1] != t:
-            self.save(t, y)
+            self.save(t, self.shown(t, y))
+
+    def shown(self, t: float, y: np.ndarray) -> np.ndarray:
+        """Return the last state, y at t, as the rows have it."""
+        interpolants = self._interpolants
+        return interpolants.shown(t, y) if interpolants is not None and interpolants.record.shows else y
 
     def cut(self, t: float, y: np.ndarray) -> None:
         """End the rows with the state at which an event ended the run inside the last step."""
@@ -236,6 +245,12 @@ class Driver:
         if self._interpolants is None or not self._pieces.size:
             return None
         return solution(self._interpolants, self._pieces[: self._kept], t_end, self.now[1])
+
+    def note(self, values: np.ndarray) -> None:
+        """Let the largest defects of the run cover the invariants' values (l, m) at saved states after the start."""
+        largest, target = self.run.work.max_defect, self.run.invariants.target
+        defects = np.abs(values - target[:, None])[:, self.t[: self.rows] != self.schedule.span.t0]
+        np.fmax(largest, np.fmax.reduce(defects, axis=1, initial=0.0), out=largest)
 
     def values(self) -> np.ndarray:
         """Invariants of the saved states, (l, m)."""

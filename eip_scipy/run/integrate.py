@@ -438,10 +438,12 @@ class Loop:
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
         driver = self.driver
         rows, counters, events = driver.rows, driver.run.work.counters, self.events
+        values = self._values(broken)
+        driver.note(values)
         result = IntegrationResult(
             t=driver.t[:rows],
             y=driver.y[:rows].T,
-            invariants=self._values(broken),
+            invariants=values,
             target=driver.run.invariants.target,
             max_defect=driver.run.work.max_defect,
             diagnostics=self.diagnostics,

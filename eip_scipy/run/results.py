@@ -53,7 +53,7 @@ class IntegrationResult(OptimizeResult):
     target : ndarray, shape (l,)
         The values that were kept.
     max_defect : ndarray, shape (l,)
-        Largest ``|I - target|`` after a projection or at a saved step.
+        Largest ``|I - target|`` after a projection or at a saved state.
     diagnostics : Diagnostics
     t_events, y_events : list of ndarray or None
         As in `scipy.integrate.solve_ivp`.

@@ -329,7 +329,8 @@ def test_solve_ivp_is_the_same_step(case, span):
     run = integrate(fun, span, Y0, save_every=1, compiled=False, **options)
     sol = solve_ivp(fun, span, Y0, **options)
     np.testing.assert_array_equal(sol.t, run.t)
-    np.testing.assert_array_equal(sol.y, run.y)
+    projected = [*range(0, len(run.t), options.get("every", 1)), -1]  # in between integrate saves projected copies
+    np.testing.assert_array_equal(sol.y[:, projected], run.y[:, projected])
     assert (sol.nfev, sol.njev, sol.nlu) == (run.nfev, run.njev, run.nlu)
 
 

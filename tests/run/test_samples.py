@@ -11,6 +11,7 @@ from scipy.interpolate import BPoly
 
 from eip_scipy import (
     EIPDOP853,
+    EIPGJ12,
     EIPRK4,
     EIPRK23,
     EIPRK45,
@@ -19,6 +20,7 @@ from eip_scipy import (
     Invariant,
     NystromTableau,
     eip_method,
+    ensemble,
     integrate,
 )
 from eip_scipy.problems import kepler
@@ -258,6 +260,72 @@ def test_interpolants_are_scipy_s(method):
     np.testing.assert_array_equal(ours.sol.ts, theirs.sol.ts)
     times = np.linspace(0, 3, 501)
     np.testing.assert_allclose(ours.sol(times), theirs.sol(times), rtol=0, atol=2e-13)
+
+
+# Output lies on the manifold, however seldom the steps are projected.
+
+SELDOM = {
+    "RK4": (EIPRK4, {"h": 0.05, "every": 3}),
+    "RK45": (EIPRK45, {"rtol": 1e-5, "every": 10}),
+    "RK23, euclidean": (EIPRK23, {"rtol": 1e-4, "every": 7, "metric": "euclidean"}),
+    "DOP853": (EIPDOP853, {"rtol": 1e-5, "every": 4}),
+    "RKN8": (EIPRKN8, {"h": 0.1, "every": 50}),
+    "RKN12, auto": (EIPRKN12, {"rtol": 1e-5, "every": "auto", "compensated": True}),
+    "GJ12": (EIPGJ12, {"h": 0.01}),
+}
+seldom = pytest.mark.parametrize(("method", "steps"), list(SELDOM.values()), ids=list(SELDOM))
+
+
+@seldom
+@pytest.mark.parametrize("compiled", [None, False])
+def test_output_between_projections_lies_on_the_manifold(method, steps, compiled):
+    """Rows, samples, dense output and states of events miss the targets by no more than projected steps do."""
+    problem = kepler(0.6, relativistic=0.0, t_end=30.0)
+    given = {"method": method, "compiled": compiled, "check": False, **steps}
+    plain = integrate(problem, (0, 30), **given)
+    saved = integrate(problem, (0, 30), save_every=1, dense_output=True, events=apsis, **given)
+    times = np.linspace(0, 30, 401)
+    sampled = integrate(problem, (0, 30), t_eval=times, **given)
+    level = max(plain.max_defect.max(), 1e-14)
+    for run in (saved, sampled):
+        assert np.abs(run.invariants - run.target[:, None]).max() < 1.01 * level
+        assert np.all(run.max_defect >= np.abs(run.invariants - run.target[:, None]).max(axis=1))
+    for t, y in zip(saved.t_events[0], saved.y_events[0], strict=True):
+        values = [item.fun(t, y, *item.args) for item in problem.invariants]
+        assert np.abs(values - saved.target).max() < 1.01 * level
+    np.testing.assert_array_equal(saved.sol(saved.t), saved.y)
+    np.testing.assert_array_equal(saved.sol(times), sampled.y)
+    # The steps are the same, whatever is handed out.
+    np.testing.assert_array_equal(saved.y[:, -1], plain.y[:, -1])
+    np.testing.assert_array_equal(sampled.y[:, -1], plain.y[:, -1])
+
+
+def test_unprojected_states_are_off_the_manifold():
+    """The test above can see it: solve_ivp hands out the states as they are, and a copy is near to each."""
+    problem = kepler(0.6, relativistic=0.0)
+    options = {"method": EIPRK4, "h": 0.05, "every": 3, "invariants": problem.invariants, "blocks": 2}
+    states = solve_ivp(problem.fun, (0, 30), problem.y0, **options)
+    run = integrate(problem.fun, (0, 30), problem.y0, save_every=1, **options)
+    off = np.abs(
+        [[item.fun(0, y, *item.args) for y in states.y.T] for item in problem.invariants] - run.target[:, None]
+    )
+    assert off.max() > 1e-6
+    np.testing.assert_array_equal(run.y[:, ::3], states.y[:, ::3])
+    assert np.abs(run.y - states.y).max() < 10 * off.max()
+
+
+@seldom
+def test_rows_of_members_lie_on_the_manifold(method, steps):
+    """The rows of an ensemble, and the largest defects, are those of single runs, also eight members at a time."""
+    problem = kepler(0.6, relativistic=0.0, t_end=3.0)
+    starts = problem.y0 * (1 + 0.01 * np.arange(9))[:, None]
+    for rows in ({"save_every": 1}, {"t_eval": np.linspace(0, 3, 40)}):
+        if "h" in steps or "t_eval" in rows:
+            run = ensemble(problem, (0, 3), starts, method=method, executor=1, **rows, **steps)
+            single = integrate(problem, (0, 3), starts[8], method=method, check=False, **rows, **steps)
+            np.testing.assert_array_equal(run.trajectories[8], single.y)
+            np.testing.assert_array_equal(run.max_defect[8], single.max_defect)
+            assert np.abs(single.invariants - single.target[:, None]).max() <= run.max_defect[8].max()
 
 
 def test_an_event_at_the_very_start_ends_the_run():

@@ -12,6 +12,8 @@ enum Interpolant : int { CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY, NYSTROM }
 
 // The most nodes of a polynomial through accelerations.
 constexpr int64_t MOST_NODES = 32;
+// The number of roundings by which a state that is handed out as it is may miss its targets.
+constexpr double SHOWN_ROUNDINGS = 4.0;
 // A share of an invariant's terms: the square of a smaller defect is below rounding.
 constexpr double SMALL_SHARE = 1e-9;
 
@@ -23,14 +25,16 @@ struct Dense {
     const double *weights, *A, *c;
     bool own_slopes;  // the steps leave no f at their ends
     bool by_travel;   // weights of the projection by what each block travels within the step, else those of the run
+    bool shows;       // states that a step leaves unprojected are handed out as projected copies
     Options options;
     Work work;
     const Multistep *multistep;
-    double *missed;  // how many states were left unprojected, and the time of the first
+    double *missed;   // how many states were left unprojected, and the time of the first
+    int64_t *waiting;  // whether the states at the start and at the end of the step at hand are not projected
 
     // States that make up an interpolant, besides those of the two ends and the weights.
     int64_t rows() const {
-        if (kind == HISTORY) return (columns + 1) / 2 + 1;
+        if (kind == HISTORY) return (columns + 1) / 2 + 2;
         if (kind == NYSTROM) return (polynomials + 1) / 2 + 1;
         return kind == POLYNOMIAL ? polynomials + 1 : kind == SEVENTH ? 3 + polynomials : 3;
     }
@@ -69,26 +73,34 @@ inline double block_norm(const double *a, const double *minus, int64_t b, const 
     return norm(w.move, count);
 }
 
+// Weights sigma, at most 1, from a weight of each block; 1 if all of them are 0.
+template <typename WeightOf>
+inline void weigh_blocks(double *sigma, const Blocks &blocks, const Work &w, WeightOf weight_of) {
+    double largest_weight = 0.0;
+    for (int64_t b = 0; b < blocks.count; ++b) {
+        const double weight = weight_of(b);
+        for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) sigma[blocks.member[p]] = weight;
+        largest_weight = std::max(largest_weight, weight);
+    }
+    if (largest_weight > 0.0)
+        for (int64_t i = 0; i < w.m; ++i) sigma[i] /= largest_weight;
+    else
+        fill(sigma, 1.0, w.m);
+}
+
 // How far each block goes within the step, as weights of the interpolant's correction.
 //
 // Those of the step do not fit: an interpolant errs in other components than the end of a step does. A slope that passes
 // through zero within the step does not make a block immobile, hence the second term.
 inline void travelled(const Piece &piece, double h, const double *f_old, const double *f, const Blocks &blocks,
                       const Work &w) {
-    double largest_weight = 0.0;
-    for (int64_t b = 0; b < blocks.count; ++b) {
+    weigh_blocks(piece.sigma, blocks, w, [&](int64_t b) {
         const auto size_of = [&](const double *a, const double *minus) { return block_norm(a, minus, b, blocks, w); };
         const double size = std::max(size_of(piece.y_old, nullptr), size_of(piece.y, nullptr));
         const double slope = std::abs(h) * std::max(size_of(f_old, nullptr), size_of(f, nullptr));
         const double turn = std::abs(h) * size_of(f_old, f);
-        const double weight = std::hypot(slope, std::sqrt(size) * std::sqrt(turn));
-        for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) piece.sigma[blocks.member[p]] = weight;
-        largest_weight = std::max(largest_weight, weight);
-    }
-    if (largest_weight > 0.0)
-        for (int64_t i = 0; i < w.m; ++i) piece.sigma[i] /= largest_weight;
-    else
-        fill(piece.sigma, 1.0, w.m);
+        return std::hypot(slope, std::sqrt(size) * std::sqrt(turn));
+    });
 }
 
 // The cubic through both ends with their slopes: rows change, h f_old - change, h f - change.
@@ -129,13 +141,13 @@ inline void polynomial(const Dense &d, const Piece &piece, double h, const Work 
 }
 
 // DOP853's of order 7, from three more evaluations: rows change, h f_old - change, 2 change - h (f + f_old), h D K.
-inline void seventh(const DenseRun &dense, const Piece &piece, double h, const Work &step) {
+inline void seventh(const DenseRun &dense, const Piece &piece, double h, const double *y_old, const Work &step) {
     const Dense &d = dense.dense;
     const Work &w = dense.work;
     const int64_t known = step.stages + 1, m = w.m;
     copy(step.K, w.K, known * m);
     for (int64_t k = 0; k < d.further; ++k) {
-        combine(piece.y_old, h, {d.A + k * d.columns, w.K, known + k, m}, w.stage, m);
+        combine(y_old, h, {d.A + k * d.columns, w.K, known + k, m}, w.stage, m);
         dense.run.system.rhs_of_scratch(w, *piece.t_old + d.c[k] * h, w.stage, w.row(known + k));
         ++w.counters[NFEV];
     }
@@ -202,15 +214,15 @@ inline void from_accelerations(const Dense &d, const Piece &piece, double theta,
 // For y = (q, v) of a Nystrom method: the accelerations at further stages, which the method's own ones give accurately, and
 // the polynomial through some of them, integrated. Its rows are Legendre coefficients, and last what the integrals miss at
 // the end of the step: the method's error and the projection's move.
-inline void nystrom(const DenseRun &dense, const Piece &piece, double h, const Work &step) {
+inline void nystrom(const DenseRun &dense, const Piece &piece, double h, const double *y_old, const Work &step) {
     const Dense &d = dense.dense;
     const Work &w = dense.work;
     const int64_t known = step.stages + 1, m = w.m, half = m / 2;
     const double *accelerations = w.K + half;
     copy(step.K, w.K, known * m);
-    copy(piece.y_old + half, w.stage + half, half);
+    copy(y_old + half, w.stage + half, half);
     for (int64_t k = 0; k < d.further; ++k) {
-        nystrom_position(piece.y_old, h, d.c[k], {d.A + k * d.columns, accelerations, known + k, m}, w.stage, half);
+        nystrom_position(y_old, h, d.c[k], {d.A + k * d.columns, accelerations, known + k, m}, w.stage, half);
         dense.run.system.rhs_of_scratch(w, *piece.t_old + d.c[k] * h, w.stage, w.row(known + k));
         ++w.counters[NFEV];
     }
@@ -227,17 +239,20 @@ inline int64_t nodes_back(const Multistep &ms, double t_old) {
 }
 
 // For the nodes of a multistep method: the accelerations of the whole history, and behind them how many nodes before the
-// newest the step begins, and its length in nodes' distances.
-inline void history(const Dense &d, const Piece &piece, double *f_old, double *f, const Work &w) {
+// newest the step begins, and its length in nodes' distances; before these, what the projections of the states that are
+// handed out change between the ends.
+inline void history(const Dense &d, const Piece &piece, const double *y_old, const double *y, double *f_old, double *f,
+                    const Work &w) {
     const Multistep &ms = *d.multistep;
-    double *about = piece.rows + (d.rows() - 1) * w.m;
+    double *missing = piece.rows + (d.rows() - 2) * w.m, *about = missing + w.m;
+    for (int64_t i = 0; i < w.m; ++i) missing[i] = (piece.y[i] - y[i]) - (piece.y_old[i] - y_old[i]);
     const double h = *piece.t - *piece.t_old;
     const int64_t back = nodes_back(ms, *piece.t_old);
     about[0] = static_cast<double>(back);
     about[1] = h / ms.h;
     for (int64_t j = 0; j < ms.order; ++j) copy(newest(ms) - j * ms.pitch, piece.rows + j * ms.half, ms.half);
-    slope_of(ms, back, piece.y_old, f_old);
-    if (back > 0) slope_of(ms, back - 1, piece.y, f);
+    slope_of(ms, back, y_old, f_old);
+    if (back > 0) slope_of(ms, back - 1, y, f);
 }
 
 // The derivative at the start of the step just made, and at its end: where the step left it, from the history of a multistep
@@ -268,9 +283,11 @@ inline const double *slope_at_end(const Run &run, const Dense &d, double t_old, 
     return f;
 }
 
-// Its value: the state at the step's start, and the polynomial through the accelerations integrated twice.
+// Returns the state by a history: that at the start of the step, the accelerations' polynomial integrated twice, and a share
+// of what is missing at the end.
 inline void from_history(const Dense &d, const Piece &piece, double theta, double *out, const Work &w) {
-    const double *about = piece.rows + (d.rows() - 1) * w.m;
+    const double *missing = piece.rows + (d.rows() - 2) * w.m, *about = missing + w.m;
+    const double share = theta * theta * (3.0 - 2.0 * theta);
     const int64_t order = d.columns, half = w.m / 2;
     const double x = theta * about[1], h = (*piece.t - *piece.t_old) / about[1];
     std::vector<double> weights(2 * order);
@@ -291,20 +308,89 @@ inline void from_history(const Dense &d, const Piece &piece, double theta, doubl
         out[i] = piece.y_old[i] + (h * x * v + out[i]);
         out[half + i] = v + out[half + i];
     }
+    for (int64_t i = 0; i < w.m; ++i) out[i] += share * missing[i];
 }
 
-// The interpolant over a step from y_old at t_old to y at t, from the buffers that it left.
-inline void describe(const DenseRun &dense, const Work &step, double t_old, const double *y_old, double t,
-                     const double *y, double *out) {
+// Project w.y_hat onto w.target by Newton steps, into `out`; return false if no state nearby meets the target. One step
+// removes a defect whose square is far below the rounding of the invariant's terms; no evaluation confirms that.
+inline bool project_sample(const Run &run, double t, double *out) {
+    const Options &o = run.options;
+    const Work &w = run.work;
+    for (int64_t k = 0; k < o.iterations; ++k) {
+        if (o.uses_f) {
+            run.system.rhs(w, t, w.y_hat, w.last());
+            ++w.counters[NFEV];
+        }
+        run.system.grad(w, t, w.y_hat, w.last(), w.G);
+        evaluate_invariants(run, t, w.y_hat);
+        if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) {
+            copy(w.y_hat, out, w.m);
+            return all_finite(out, w.m);
+        }
+        const int64_t rank = first_move(o, w, out, false);
+        if (rank < 0) return false;
+        bool small = rank == w.l, met = true;
+        for (int64_t i = 0; i < w.l; ++i) small &= std::abs(w.before[i]) <= SMALL_SHARE * o.per_band * w.band[i];
+        if (small) return all_finite(out, w.m);
+        evaluate_invariants(run, t, out);
+        if (judge(w.before, out, o, w) != OK) return false;
+        for (int64_t i = 0; i < w.l; ++i) met &= std::abs(w.defect[i]) <= w.band[i];
+        if (met) return true;
+        copy(out, w.y_hat, w.m);
+    }
+    return true;
+}
+
+// The state y at t, which no projection has made, as it is handed out: a copy projected onto the targets, or y itself if it
+// misses them by rounding only, or if no state nearby meets them. With the error metric each block moves in proportion to
+// its size. The copy depends on nothing but the state, so that it is the same as the end of one step and as the start of the
+// next.
+inline void hand_out(const Run &run, const DenseRun &dense, double t, const double *y, double *out) {
     const Dense &d = dense.dense;
     const Work &w = dense.work;
+    System &system = dense.run.system;
+    const auto try_to_project = [&] {
+        copy(y, w.y_hat, w.m);
+        return project_sample(dense.run, t, out);
+    };
+    copy(y, out, w.m);
+    copy(run.work.target, w.target, w.l);
+    system.inv(w, t, y, w.values);
+    bool near = true;
+    for (int64_t i = 0; i < w.l; ++i) {
+        const double size = std::max(std::max(std::abs(w.values[i]), std::abs(w.target[i])), d.options.scales[i]);
+        near &= std::abs(w.values[i] - w.target[i]) <= SHOWN_ROUNDINGS * EPS * size;
+    }
+    if (near) return;
+    if (d.by_travel)
+        weigh_blocks(w.sigma, d.options.blocks, w, [&](int64_t b) { return block_norm(y, nullptr, b, d.options.blocks, w); });
+    else
+        copy(run.work.sigma, w.sigma, w.m);
+    bool met = try_to_project();
+    if (!met) {
+        fill(w.sigma, 1.0, w.m);
+        met = try_to_project();
+    }
+    if (!met) copy(y, out, w.m);
+}
+
+// The interpolant over a step from y_old at t_old to y at t, from the buffers that it left. It meets the states at both ends
+// as they are handed out.
+inline void describe(const Run &run, const DenseRun &dense, double t_old, const double *y_old, double t, const double *y,
+                     double *out) {
+    const Dense &d = dense.dense;
+    const Work &w = dense.work, &step = run.work;
     const Piece piece(out, d);
     const double h = t - t_old;
     *piece.t_old = t_old;
     *piece.t = t;
     *piece.known = 0.0;
-    copy(y_old, piece.y_old, w.m);
-    copy(y, piece.y, w.m);
+    const auto end_of_piece = [&](bool waiting, double time, const double *state, double *end) {
+        if (d.shows && waiting) return hand_out(run, dense, time, state, end);
+        copy(state, end, w.m);
+    };
+    end_of_piece(d.waiting[0], t_old, y_old, piece.y_old);
+    end_of_piece(d.waiting[1], t, y, piece.y);
     const double *f_old = step.row(0), *f = step.last();
     if (d.own_slopes) {
         f_old = w.row(0);
@@ -316,12 +402,12 @@ inline void describe(const DenseRun &dense, const Work &step, double t_old, cons
     if (d.kind == CUBIC) cubic(piece, h, f_old, f, w);
     if (d.kind == QUINTIC) quintic(piece, h, f_old, f, w);
     if (d.kind == POLYNOMIAL) polynomial(d, piece, h, step, w);
-    if (d.kind == SEVENTH) seventh(dense, piece, h, step);
-    if (d.kind == NYSTROM) nystrom(dense, piece, h, step);
+    if (d.kind == SEVENTH) seventh(dense, piece, h, y_old, step);
+    if (d.kind == NYSTROM) nystrom(dense, piece, h, y_old, step);
     if (d.kind == HISTORY) {
         copy(step.row(0), w.row(0), w.m);
         copy(step.last(), w.last(), w.m);
-        history(d, piece, w.row(0), w.last(), w);
+        history(d, piece, y_old, y, w.row(0), w.last(), w);
         f_old = w.row(0);
         f = w.last();
     }
@@ -369,36 +455,6 @@ inline void evaluate(const Dense &d, const Piece &piece, double theta, double *o
             out[i] = total + piece.y_old[i];
         }
     }
-}
-
-// Project w.y_hat onto w.target by Newton steps, into `out`; return false if no state nearby meets the target. One step
-// removes a defect whose square is far below the rounding of the invariant's terms; no evaluation confirms that.
-inline bool project_sample(const Run &run, double t, double *out) {
-    const Options &o = run.options;
-    const Work &w = run.work;
-    for (int64_t k = 0; k < o.iterations; ++k) {
-        if (o.uses_f) {
-            run.system.rhs(w, t, w.y_hat, w.last());
-            ++w.counters[NFEV];
-        }
-        run.system.grad(w, t, w.y_hat, w.last(), w.G);
-        evaluate_invariants(run, t, w.y_hat);
-        if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) {
-            copy(w.y_hat, out, w.m);
-            return all_finite(out, w.m);
-        }
-        const int64_t rank = first_move(o, w, out, false);
-        if (rank < 0) return false;
-        bool small = rank == w.l, met = true;
-        for (int64_t i = 0; i < w.l; ++i) small &= std::abs(w.before[i]) <= SMALL_SHARE * o.per_band * w.band[i];
-        if (small) return all_finite(out, w.m);
-        evaluate_invariants(run, t, out);
-        if (judge(w.before, out, o, w) != OK) return false;
-        for (int64_t i = 0; i < w.l; ++i) met &= std::abs(w.defect[i]) <= w.band[i];
-        if (met) return true;
-        copy(out, w.y_hat, w.m);
-    }
-    return true;
 }
 
 // The state at t: an end of the step, or the interpolant's projected. Where no state near it meets the levels it is given

@@ -49,8 +49,12 @@ void close_once(const Run &run, const Step &step, Code status) { close_step(run,
 void describe_step(const Run &run, const Dense &d, double t_old, const double *y_old, double t, const double *y,
                    double *piece) {
     const DenseRun dense(d, run.system);
-    describe(dense, run.work, t_old, y_old, t, y, piece);
+    describe(run, dense, t_old, y_old, t, y, piece);
     count_calls(dense, run.work);
+}
+
+void show_state(const Run &run, const Samples &samples, int64_t end, double t, const double *y, double *out) {
+    give(run, &samples, end, t, y, out);
 }
 
 void interpolate_step(const Run &run, const Dense &d, double *piece, const double *t, int64_t rows, double *out) {

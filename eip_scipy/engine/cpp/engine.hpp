@@ -28,6 +28,8 @@ void close_once(const Run &run, const Step &step, Code status);
 // The interpolant over a step of a run from y_old at t_old to y at t, and states at some times by it.
 void describe_step(const Run &run, const Dense &dense, double t_old, const double *y_old, double t, const double *y,
                    double *piece);
+// The state y at t, an end (0 or 1) of the step at hand, as a run hands it out.
+void show_state(const Run &run, const Samples &samples, int64_t end, double t, const double *y, double *out);
 void interpolate_step(const Run &run, const Dense &dense, double *piece, const double *t, int64_t rows, double *out);
 
 }  // namespace eip

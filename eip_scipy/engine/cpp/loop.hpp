@@ -165,6 +165,21 @@ inline Code locate(const Run &run, const DenseRun &dense, const Schedule &s, Roo
     return OK;
 }
 
+// Notes whether the state at the start of a step, or at its end, is one that no projection has made.
+inline void note_waiting(const Samples *samples, int64_t end, bool waiting) {
+    if (samples) samples->dense.waiting[end] = waiting;
+}
+
+// Saves the state y at t, an end of the step at hand, as a row: as it is handed out.
+template <class AnyRun>
+inline void give(const AnyRun &run, const Samples *samples, int64_t end, double t, const double *y, double *out) {
+    const auto &w = run.work;
+    if (!samples || !samples->dense.shows || !samples->dense.waiting[end]) return copy(y, out, w.m);
+    const DenseRun dense(samples->dense, run.system);
+    hand_out(of_any_length(run), dense, t, y, out);
+    count_calls(dense, of_any_length(run).work);
+}
+
 // What is asked for within the step that is pending: its interpolant, roots of events, states at given times. OK, ENDED by
 // an event, or PAUSE where the caller has to do the rest, see `locate`.
 inline Code sample(const Run &run, Samples &samples, const Schedule &s, const double *y, const double *y_new,
@@ -174,7 +189,7 @@ inline Code sample(const Run &run, Samples &samples, const Schedule &s, const do
     Pieces &kept = samples.interpolants;
     double end = s.clock[TIME_NEW];
     double *piece = kept.capacity > 0 ? kept.first + *kept.count * samples.dense.floats() : samples.piece;
-    describe(dense, w, s.clock[TIME], y, end, y_new, piece);
+    describe(run, dense, s.clock[TIME], y, end, y_new, piece);
     *kept.count += kept.capacity > 0;
     const Code code = any_crossing(s) ? locate(run, dense, s, samples.roots, piece, end) : OK;
     for (int64_t &row = s.place[ROW]; code != PAUSE && row < s.n_eval; ++row) {
@@ -187,7 +202,8 @@ inline Code sample(const Run &run, Samples &samples, const Schedule &s, const do
 }
 
 // Whether something within the step is asked for: more than a time that is its end, whose state is saved here.
-inline bool wants_samples(const Work &w, const Samples *samples, const Schedule &s, const double *y_new,
+template <class AnyRun>
+inline bool wants_samples(const AnyRun &run, const Samples *samples, const Schedule &s, const double *y_new,
                           const Saved &saved) {
     int64_t &row = s.place[ROW];
     if (any_crossing(s) || (samples && samples->interpolants.capacity > 0)) return true;
@@ -195,7 +211,7 @@ inline bool wants_samples(const Work &w, const Samples *samples, const Schedule 
     if (row >= s.n_eval || s.span.sign * (s.t_eval[row] - t_new) > 0.0) return false;
     if (s.t_eval[row] != t_new) return true;
     saved.t[row] = t_new;
-    copy(y_new, saved.y + row * w.m, w.m);
+    give(run, samples, 1, t_new, y_new, saved.y + row * run.work.m);
     ++row;
     return false;
 }
@@ -241,6 +257,7 @@ template <class AnyRun>
         if (samples && samples->interpolants.capacity > 0 &&
             *samples->interpolants.count == samples->interpolants.capacity)
             return FULL;
+        note_waiting(samples, 0, run.method.multistep ? k > 0 : w.counters[WAITED] > 0);
         const int64_t stop = next_stop(run.method, samples, s, k, k_end);
         const Code status =
             stop == k + 1 ? next_step(run, s.span, s.clock, k, y, y_new)
@@ -249,14 +266,15 @@ template <class AnyRun>
         place[STEP] = stop;
         place[PENDING] = 1;
         const double t_new = s.clock[TIME_NEW];
+        note_waiting(samples, 1, run.method.multistep ? t_new != s.span.t_bound : w.counters[WAITED] > 0);
         const bool due = t_new == s.span.t_bound || (s.save_every > 0 && stop % s.save_every == 0);
         if (s.n_eval == 0 && due) {
             saved.t[place[ROW]] = t_new;
-            copy(y_new, saved.y + place[ROW] * w.m, w.m);
+            give(run, samples, 1, t_new, y_new, saved.y + place[ROW] * w.m);
             ++place[ROW];
         }
         if (s.n_events > 0) evaluate_events(of_any_length(run), samples->dense, s, y, y_new);
-        if (!wants_samples(w, samples, s, y_new, saved)) continue;
+        if (!wants_samples(run, samples, s, y_new, saved)) continue;
         const Code code = samples ? sample(of_any_length(run), *samples, s, y, y_new, saved) : PAUSE;
         if (code != OK) return code;
     }

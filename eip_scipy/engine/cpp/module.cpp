@@ -356,6 +356,27 @@ PyObject *engine_describe(Engine *self, PyObject *const *args, Py_ssize_t count)
     });
 }
 
+PyDoc_STRVAR(show_doc, "show(t, y, out) -> None\n\nFill out (n,) with the last state, y at t, as the run hands it out.");
+
+PyObject *engine_show(Engine *self, PyObject *const *args, Py_ssize_t count) {
+    return guarded([&]() -> PyObject * {
+        expect(self, count, 3, "t, y, out");
+        const Busy busy(self->busy), interpolating(self->interpolating);
+        dense_output(self);
+        const Ref kept(PyList_New(0));
+        const double t = PyFloat_AsDouble(args[0]);
+        if (PyErr_Occurred()) return nullptr;
+        const double *y = state_of(args[1], "y", self, kept.get(), true);
+        double *out = state_of(args[2], "out", self, kept.get());
+        const int64_t end = scheduled(self).place[PENDING] == 1;
+        stepped(self, [&](const Run &run) {
+            show_state(run, *self->samples, end, t, y, out);
+            return OK;
+        });
+        Py_RETURN_NONE;
+    });
+}
+
 PyDoc_STRVAR(interpolate_doc,
              "interpolate(piece, t, out) -> None\n\nFill out (m, n) with the states at times t (m,) by an interpolant.");
 
@@ -548,6 +569,7 @@ PyMethodDef engine_methods[] = {
     {"sample", reinterpret_cast<PyCFunction>(engine_sample), METH_FASTCALL, sample_doc},
     {"describe", reinterpret_cast<PyCFunction>(engine_describe), METH_FASTCALL, describe_doc},
     {"interpolate", reinterpret_cast<PyCFunction>(engine_interpolate), METH_FASTCALL, interpolate_doc},
+    {"show", reinterpret_cast<PyCFunction>(engine_show), METH_FASTCALL, show_doc},
     {nullptr, nullptr, 0, nullptr},
 };
 

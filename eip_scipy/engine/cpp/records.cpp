@@ -258,7 +258,9 @@ static Dense dense_of(PyObject *dense, const Data &run, Arrays &arrays, int type
     }
     d.options = options_of(options.get(), d.work, arrays);
     d.by_travel = truth(dense, "by_travel");
+    d.shows = truth(dense, "shows");
     d.missed = arrays.floats(dense, "missed", {2});
+    d.waiting = arrays.integers<int64_t>(dense, "waiting", {2});
     d.multistep = run.method.multistep;
     read_interpolant(dense, run.work.stages, arrays, d);
     const bool halves = d.kind == QUINTIC || d.kind == HISTORY || d.kind == NYSTROM;

@@ -173,6 +173,15 @@ inline bool is_due(const Schedule &s, int64_t row, double t_new) {
     return row < s.n_eval && s.span.sign * (s.t_eval[row] - t_new) <= 0.0;
 }
 
+// Copies what handing out states of one member takes onto the buffers of the single run.
+inline void take_shown(const Run &run, Eight &eight, int64_t lane) {
+    const auto &w = run.work;
+    eight.take(eight.work.sigma, lane, w.sigma, w.m);
+    eight.take(eight.work.target, lane, w.target, w.l);
+    take_params(eight, lane, run.system);
+    w.counters[NFEV] = 0;
+}
+
 // States at the times of t_eval within the step just made, member by member as in a single run.
 [[gnu::noinline]] inline void sample_octet(const Run &run, Samples &samples, Eight &eight, const Schedule &s,
                                            const Members &members, const Step &step, double *y, double *y_new) {
@@ -185,15 +194,13 @@ inline bool is_due(const Schedule &s, int64_t row, double t_new) {
         if (!eight.alive[lane]) continue;
         if (run.method.multistep) take_history(run, eight, lane);
         eight.take(eights.K, lane, w.K, (w.stages + 1) * w.m);
-        eight.take(eights.sigma, lane, w.sigma, w.m);
+        take_shown(run, eight, lane);
         eight.take(eight.y, lane, y, w.m);
         eight.take(eight.y_new, lane, y_new, w.m);
-        take_params(eight, lane, run.system);
-        w.counters[NFEV] = 0;
         s.place[ROW] = row;
         const Saved saved = members.saved(members.where[0] + lane, w);
         try {
-            if (wants_samples(w, &samples, s, y_new, saved)) sample(run, samples, s, y, y_new, saved);
+            if (wants_samples(run, &samples, s, y_new, saved)) sample(run, samples, s, y, y_new, saved);
         } catch (const Broken &) {
             eight.alive[lane] = false;
         }
@@ -235,6 +242,8 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
             if (leave.lane(lane))
                 eight.alive[lane] = returned[lane] = step_alone(run, eight, lane, s, before, y, y_new);
     close_step(all, step, OK);
+    note_waiting(samples, 0, before[WAITED] > 0);
+    note_waiting(samples, 1, w.counters[WAITED] > 0);
     for (int64_t lane = 0; any(leave) && lane < LANES; ++lane)
         for (int c = 0; returned[lane] && c < N_COUNTERS; ++c) eight.own[lane][c] -= w.counters[c];
     if (is_due(s, eight.row, t_new)) sample_octet(run, *samples, eight, s, members, step, y, y_new);
@@ -253,6 +262,8 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
     const Eight::Run all = eight.run();
     next_states(EightStates{all, run, eight, y_new}, s.span, s.clock, k, stop, from, to);
     const Step step{s.clock[TIME], s.clock[TIME_NEW], s.clock[LENGTH], from, to, false, false};
+    note_waiting(samples, 0, k > 0);
+    note_waiting(samples, 1, step.t_new != s.span.t_bound);
     if (is_due(s, eight.row, step.t_new)) sample_octet(run, *samples, eight, s, members, step, y, y_new);
     copy(eight.work.last(), eight.work.row(0), eight.work.m);
     std::swap(eight.y, eight.y_new);
@@ -295,11 +306,22 @@ inline void begin_octet(const Run &run, Eight &eight, const Schedule &s, const M
     for (int64_t lane = 0; lane < LANES; ++lane) eight.alive[lane] = first + lane < members.count && sound.lane(lane);
 }
 
-// States of all members as their next row.
-inline void save_octet(Eight &eight, const Members &members) {
+// States of all members at t as their next row.
+inline void save_octet(const Run &run, const Samples *samples, Eight &eight, double t, const Members &members, double *y) {
     const int64_t n = eight.work.n, row = eight.row++;
-    for (int64_t lane = 0; members.kept && lane < LANES && members.where[0] + lane < members.count; ++lane)
-        eight.take(eight.y, lane, members.rows + ((members.where[0] + lane) * members.n_rows + row) * n, n);
+    for (int64_t lane = 0; members.kept && lane < LANES && members.where[0] + lane < members.count; ++lane) {
+        double *out = members.rows + ((members.where[0] + lane) * members.n_rows + row) * n;
+        eight.take(eight.y, lane, out, n);
+        if (!samples || !samples->dense.shows || !samples->dense.waiting[1] || !eight.alive[lane]) continue;
+        take_shown(run, eight, lane);
+        copy(out, y, n);
+        try {
+            give(run, samples, 1, t, y, out);
+        } catch (const Broken &) {
+            eight.alive[lane] = false;
+        }
+        eight.own[lane][NFEV] += run.work.counters[NFEV];
+    }
 }
 
 // Results of those members that came to their ends.
@@ -328,7 +350,7 @@ inline Code sweep_octets(const Run &run, const Octets &octets, const Schedule &s
         try {
             if (!begun || eight.first != first || eight.count != members.count) {
                 begin_octet(run, eight, s, members);
-                if (s.n_eval == 0 || s.t_eval[0] == s.span.t0) save_octet(eight, members);
+                if (s.n_eval == 0 || s.t_eval[0] == s.span.t0) save_octet(run, nullptr, eight, s.span.t0, members, y);
                 begun = 1;
             }
             while (eight.step < s.span.n_steps && any(alive_of(eight))) {
@@ -339,7 +361,8 @@ inline Code sweep_octets(const Run &run, const Octets &octets, const Schedule &s
                 steps -= made - eight.step;
                 eight.step = made;
                 const bool due = made == s.span.n_steps || (s.save_every > 0 && made % s.save_every == 0);
-                if (s.n_eval == 0 && due) save_octet(eight, members);
+                const double t = made == s.span.n_steps ? s.span.t_bound : s.span.t0 + static_cast<double>(made) * s.span.h;
+                if (s.n_eval == 0 && due) save_octet(run, samples, eight, t, members, y);
             }
             end_octet(eight, s, members);
         } catch (const GaveUp &) {
