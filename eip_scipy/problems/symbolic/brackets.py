@@ -62,9 +62,12 @@ def how_kept(
     time = sympy.Symbol("t", real=True)
     terms = [sympy.diff(quantity, variable) * f for variable, f in zip(variables, rates, strict=True)]
     rate = Rate([term for term in [*terms, sympy.diff(quantity, time)] if term != 0])
-    if not rate.terms or _is_zero(rate.total):
+    if not rate.terms or _expands_to_zero(rate.total):
         return "symbolically"
     points = list(_points([*variables, time], rate, parameters))
+    _require_kept(name, rate, points)  # numbers take milliseconds, and `simplify` may take minutes
+    if _simplifies_to_zero(rate.total):
+        return "symbolically"
     try:
         points += _beside_switches([quantity, *rates, *rate.terms], [*variables, time], rate, parameters)
     except ValueError as error:
@@ -74,6 +77,11 @@ def how_kept(
         ) from None
     if not points:
         raise ValueError(f"invariant {name!r}: its rate {_cut(rate.total)} is finite and real at no point tried.")
+    _require_kept(name, rate, points)
+    return f"numerically, at {len(points)} points" + (" with the parameters given" if parameters else "")
+
+
+def _require_kept(name: str, rate: Rate, points: Sequence[Any]) -> None:
     for point, (total, size) in points:
         if abs(total) > ROUND_OFF * size:
             place = ", ".join(f"{key}={float(value):.3g}" for key, value in point.items())
@@ -81,7 +89,6 @@ def how_kept(
                 f"{name!r} is no invariant of these equations: its rate is {_cut(rate.total)}, at {place} "
                 f"{float(total):.3g} where its terms sum to {float(size):.3g}."
             )
-    return f"numerically, at {len(points)} points" + (" with the parameters given" if parameters else "")
 
 
 def _value(expression: Any, known: dict[Any, Any]) -> Any:
@@ -103,21 +110,22 @@ def _value(expression: Any, known: dict[Any, Any]) -> Any:
 
 def vanishes(expression: Any) -> bool:
     """Return whether an expression is 0, by algebra if that is quick, else at random points."""
-    if _is_zero(expression):
+    if _expands_to_zero(expression):
         return True
     rate = Rate([expression])
     points = list(_points(sorted(expression.free_symbols, key=str), rate, {}))
     return bool(points) and all(abs(total) <= ROUND_OFF for _, (total, _) in points)
 
 
-def _is_zero(expression: Any) -> bool:
-    """Whether algebra shows it, where that is quick."""
-    if expanded_terms(expression) > EXPANDED_TERMS:
+def _expands_to_zero(expression: Any) -> bool:
+    return expanded_terms(expression) <= EXPANDED_TERMS and sympy.expand(expression) == 0
+
+
+def _simplifies_to_zero(expression: Any) -> bool:
+    """Whether algebra shows that it is 0, where that is quick."""
+    if expanded_terms(expression) > EXPANDED_TERMS or expression.count_ops() > SIMPLIFIED_OPERATIONS:
         return False
-    expanded = sympy.expand(expression)
-    if expanded == 0:
-        return True
-    return expression.count_ops() <= SIMPLIFIED_OPERATIONS and bool(sympy.simplify(expanded) == 0)
+    return bool(sympy.simplify(sympy.expand(expression)) == 0)
 
 
 def _points(variables: Sequence[Any], rate: Rate, parameters: Mapping[Any, float]) -> Iterator[tuple[Any, Any]]:
