@@ -339,7 +339,9 @@ def test_solve_ivp_is_the_same_step(case, span):
 def test_solve_ivp_is_the_same_complex_step(case):
     options = {"method": EIPRK4, "h": 0.03, "check": False} | COMPLEX_CASES[case]
     run = integrate(lattice, (0, 2), Z0, save_every=1, compiled=True, **options)
-    np.testing.assert_array_equal(solve_ivp(lattice, (0, 2), Z0, **options).y, run.y)
+    projected = [*range(0, len(run.t), options.get("every", 1)), -1]  # in between integrate saves projected copies
+    sol = solve_ivp(lattice, (0, 2), Z0, **options)
+    np.testing.assert_array_equal(sol.y[:, projected], run.y[:, projected])
 
 
 def test_results_do_not_depend_on_what_is_saved():
