@@ -407,8 +407,9 @@ def _cover(out: Members, those: slice, rows: np.ndarray, schedule: Schedule) -> 
     """
     target, before = out.target[those], out.max_defect[those]
     beside = (out.status[those] == 1) & (schedule.t_eval.size > 0)
-    last = np.where(beside[:, None], 0.0, np.abs(out.values[those] - target))
-    largest = np.fmax(last, np.fmax.reduce(np.abs(rows - target[:, None]), axis=1, initial=0.0))
+    with np.errstate(invalid="ignore"):  # of members that have failed
+        last = np.where(beside[:, None], 0.0, np.abs(out.values[those] - target))
+        largest = np.fmax(last, np.fmax.reduce(np.abs(rows - target[:, None]), axis=1, initial=0.0))
     out.max_defect[those] = np.where(np.isnan(before), before, np.fmax(before, largest))
 
 

@@ -194,7 +194,7 @@ def test_counts_are_looked_at():
     engine, record = dense_parts(h=0.1, invariants=H)
     y, pieces = np.zeros(4), np.zeros((2, record.piece.size))
     for counts in ([-1, 0], [0, -1], [0, 3]):
-        record.counts[:] = counts
+        record.counts[:2] = counts
         with pytest.raises(ValueError, match="counts"):
             engine.advance(1, y, y, np.zeros(9), np.zeros((9, 4)), pieces)
     record.counts[:] = 0
