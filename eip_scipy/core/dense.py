@@ -147,6 +147,7 @@ class _Form(NamedTuple):
     weights: Array = np.zeros((0, 0))
     A: Array = np.zeros((0, 0))
     c: Array = np.zeros(0)
+    own_slopes: bool = False
 
 
 def _form(run: Run, tableau: AnyMethod) -> _Form:
@@ -157,7 +158,7 @@ def _form(run: Run, tableau: AnyMethod) -> _Form:
             weights = interpolation_weights(tableau.order).reshape(-1, tableau.order)
             return _Form(HISTORY, (tableau.order + 1) // 2 + 2, weights)
         if tableau.velocities:
-            return _Form(QUINTIC, 3)
+            return _Form(QUINTIC, 3, own_slopes=True)  # The method that starts takes several steps in one.
         tableau = RKN1210  # The method that starts makes all steps.
     if isinstance(tableau, NystromTableau):
         if tableau.order < LEAST_ORDER:
@@ -167,13 +168,13 @@ def _form(run: Run, tableau: AnyMethod) -> _Form:
     if tableau is DOP853:
         return _Form(SEVENTH, 3 + len(SCIPY_DOP853.D), SCIPY_DOP853.D, SCIPY_DOP853.A_EXTRA, SCIPY_DOP853.C_EXTRA)
     if isinstance(tableau, OneStep) or tableau.P is None:
-        return _Form(CUBIC, 3)
+        return _Form(CUBIC, 3, own_slopes=isinstance(tableau, OneStep))
     return _Form(POLYNOMIAL, 1 + tableau.P.shape[1], tableau.P.T)
 
 
 def _record(run: Run, tableau: AnyMethod, events: int, *, shows: bool) -> Dense:
     roots = min(MOST_ROOTS, ROOT_NUMBERS // run.y0.size) if events else 0
-    kind, rows, weights, A, c = _form(run, tableau)
+    kind, rows, weights, A, c, own_slopes = _form(run, tableau)
     stages = run.method.b.size
     n, dtype, invariants = run.y0.size, run.y0.dtype, run.invariants.size
     options = run.options._replace(
@@ -185,7 +186,7 @@ def _record(run: Run, tableau: AnyMethod, events: int, *, shows: bool) -> Dense:
         weights=weights.copy("C"),
         A=A.copy("C"),
         c=c.copy(),
-        own_slopes=isinstance(tableau, OneStep),
+        own_slopes=own_slopes,
         shows=shows,
         by_travel=invariants > 0 and run.options.metric == ERROR,
         options=options._replace(target=np.zeros(invariants)),

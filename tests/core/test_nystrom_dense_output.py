@@ -166,6 +166,18 @@ def test_a_multistep_run_too_short_for_a_history():
     assert largest(run.y - exact_kepler(times)) < 1e-9
 
 
+def test_a_short_multistep_run_whose_accelerations_depend_on_velocities():
+    """The quintic with the slopes at both ends of each step, which DOP853 makes in four of its own."""
+
+    def damped(t, y):
+        return np.concatenate([y[2:], pull(t, y[:2]) - 0.05 * y[2:]])
+
+    times = np.linspace(0, 2, 41)
+    run = integrate(damped, (0, 2), [0.8, 0.0, 0.0, 1.2], method=EIPGJ12, h=0.25, t_eval=times, compiled=False)
+    exact = solve_ivp(damped, (0, 2), run.y[:, 0], method="DOP853", rtol=1e-12, atol=1e-14, t_eval=times).y
+    assert largest(run.y - exact) < 5e-6
+
+
 def test_methods_of_low_order_keep_the_quintic():
     """Nystrom's own method of order 4: the quintic through both ends errs about as much as the steps, for nothing."""
     tableau = NystromTableau(
