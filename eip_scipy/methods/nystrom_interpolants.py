@@ -60,13 +60,13 @@ def interpolant(tableau: NystromTableau) -> Interpolant:
     A, c = np.zeros((s + 1, s + 1)), np.ones(s + 1)
     A[:s, :s], A[s, :s], c[:s] = tableau.A[:s, :s], tableau.b[:s], tableau.c[:s]
     nodes = _lobatto_nodes(tableau.order - 3)
-    reached, weights = _stages(A, c, nodes, tableau.order - 1)
+    reached, weights = _stages(A, c, nodes, tableau.order)
     for k in range(1, MOST_GROUPS + 1):
         if reached >= tableau.order - 1:
             break
         group = np.arange(1, GROUP * k + 1) / (GROUP * k + 1)
-        longer = _extended(A, c, group, _stages(A, c, group, tableau.order - 1)[1])
-        better, further = _stages(*longer, nodes, tableau.order - 1)
+        longer = _extended(A, c, group, _stages(A, c, group, tableau.order)[1])
+        better, further = _stages(*longer, nodes, tableau.order)
         if better <= reached:
             break
         (A, c), reached, weights = longer, better, further
@@ -86,16 +86,16 @@ def _extended(A: Array, c: Array, nodes: Array, weights: Array) -> tuple[Array, 
 
 
 def _stages(A: Array, c: Array, nodes: Array, order: int) -> tuple[int, Array]:
-    """Weights (nodes, stages) of positions within the step, and the power of h that the worst of them errs by.
+    """Return the power of h that positions within the step err by, at most `order`, and their weights (nodes, stages).
 
-    Each row has the smallest norm among those that meet the order conditions of as many vertices as can be met, up to
-    an error of O(h^order). The conditions are made orthonormal one after the other, by sums of columns: a library's
-    solver would give other bits on another processor.
+    Each row of weights has the smallest norm among those that meet the order conditions of as many vertices as can be
+    met at all nodes. The conditions are made orthonormal one after the other, by sums of columns: a library's solver
+    would give other bits on another processor.
     """
     rows, met = np.zeros((c.size, 0)), np.zeros((0, nodes.size))
-    active, reached = np.ones(nodes.size, bool), np.full(nodes.size, 2)
+    power = 2
     for vertices in range(1, order - 1):
-        before = met.shape[0]
+        before = rows.shape[1]
         for tree in nystrom_trees(vertices):
             factors = _stage_factors(A, c, tree)
             size = float(np.sqrt((factors * factors).sum())) or 1.0
@@ -104,13 +104,17 @@ def _stages(A: Array, c: Array, nodes: Array, order: int) -> tuple[int, Array]:
                 products = (rows * row[:, None]).sum(axis=0)
                 row, right = row - (rows * products).sum(axis=1), right - (products[:, None] * met).sum(axis=0)
             length = float(np.sqrt((row * row).sum()))
-            if length < DEPENDENT:
-                active &= np.abs(right) < MET
-            else:
+            if length >= DEPENDENT:
                 rows, met = np.column_stack([rows, row / length]), np.vstack([met, right / length])
-        met[before:, ~active] = 0.0
-        reached[active] = vertices + 2
-    return int(reached.min()), np.array([(rows * column).sum(axis=1) for column in met.T])
+            elif np.abs(right).max() >= MET:
+                return power, _smallest(rows[:, :before], met[:before])
+        power = vertices + 2
+    return power, _smallest(rows, met)
+
+
+def _smallest(rows: Array, met: Array) -> Array:
+    """Return the solutions (nodes, stages) of smallest norm, for orthonormal `rows` and right sides `met`."""
+    return np.array([(rows * column).sum(axis=1) for column in met.T])
 
 
 def _stage_factors(A: Array, c: Array, tree: NystromTree) -> Array:
