@@ -373,8 +373,8 @@ RUNS = """
     ):
         given = {"method": EIPRK4, "compiled": False} | options
         fun = {"fun": problem.fun}
-    if given["method"] is EIPRKN12:
-        fun = {"acceleration": lambda t, q: -q / np.hypot(*q) ** 3}
+        if given["method"] is EIPRKN12:
+            fun = {"acceleration": lambda t, q: -q / np.hypot(*q) ** 3}
         more = {"invariants": problem.invariants} if given["method"] is not EIPRKN12 else {}
         run = integrate(**fun, t_span=(0, 20), y0=problem.y0, **given, **more)
         seen.update(run.y.tobytes() + run.max_defect.tobytes())
