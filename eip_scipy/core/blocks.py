@@ -9,7 +9,7 @@ import numpy as np
 from ..engine.data import Grouping
 from .inputs import refuse_units, shown
 
-__all__ = ["INDEX", "blocks_of", "like_components"]
+__all__ = ["INDEX", "blocks_of", "kinds_of"]
 
 # Unsigned: Numba then leaves out the test for negative indices, which costs more than the access itself.
 INDEX = np.uint64
@@ -41,25 +41,20 @@ def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
     return Grouping(member, start, width, len(groups[0]) if regular else 0)
 
 
-def like_components(groups: Grouping, y: np.ndarray, f: np.ndarray) -> np.ndarray:
-    """Return a number for each component, the same for those that have the same unit as far as that is known.
+def kinds_of(groups: Grouping, y: np.ndarray, f: np.ndarray) -> Grouping:
+    """Return the groups of floats that have the same unit, as far as that is known.
 
     Those of a block have it. Without blocks, the coordinates have one and the velocities or momenta another, where the
     state looks like (q, p): the derivative of its first half vanishes with the second half, and its product with that,
     which is twice a kinetic energy, is not negative.
     """
     n = y.size
-    if len(groups.start) - 1 < n:
-        kinds = np.empty(n, int)
-        block = np.repeat(np.arange(len(groups.start) - 1), np.diff(groups.start).astype(int))
-        kinds[groups.member.astype(int) // groups.width] = block
-        return kinds
-    if n % 2 or y.dtype.kind == "c":
-        return np.arange(n)
+    if len(groups.start) - 1 < n or n % 2 or n == 0 or y.dtype.kind == "c":
+        return groups
     q_dot, p = f[: n // 2], y[n // 2 :]
     with np.errstate(over="ignore", invalid="ignore"):
         like = (q_dot != 0).any() == (p != 0).any() and (q_dot * np.sign(p)).sum() >= 0
-    return np.arange(n) // (n // 2) if like else np.arange(n)
+    return _consecutive(n // 2, n, 1) if like else groups
 
 
 def _consecutive(size: int, n: int, width: int) -> Grouping:

@@ -18,12 +18,12 @@ Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
 
 NEWTON_STEPS, ROUNDINGS, RANK_TOLERANCE = 10, 8.0, 1e-8
-# Gradients of rates take 2 n evaluations of all gradients: components up to which that is worth it.
+# Slopes of a rate take 2 n evaluations of all gradients: components up to which that is worth it.
 MOST_COMPONENTS = 64
 SHIFT = 1e-6
 # A surface counts as near within such a part of the components' sizes; Newton's method must find it at once; a rate
 # counts as 0 below such a part of its terms.
-NEAR, CONVERGED, VANISHES = 0.05, 1e-2, 1e-2
+NEAR, CONVERGED, VANISHES = 0.1, 1e-2, 0.1
 
 
 def on_targets(known: InvariantSet, t: float, y: Array, span: Array, rhs: Derivative) -> Array | None:
@@ -51,43 +51,94 @@ def on_targets(known: InvariantSet, t: float, y: Array, span: Array, rhs: Deriva
     return None if nearest is y else nearest
 
 
-def is_kept_on_a_surface(known: InvariantSet, k: int, t: float, y: Array, span: Array, rhs: Derivative) -> bool:
+def is_kept_on_a_surface(
+    known: InvariantSet, k: int, held: Array, t: float, y: Array, f: Array, rhs: Derivative
+) -> bool:
     """Return whether the rate of invariant k vanishes on a surface near y that the flow does not leave.
 
     The rate of a length is the velocity along it, and a system with that constraint keeps both together: the rate is 0
     near y, and there its own rate is 0. Friction, a driving force or a wrong term do neither.
+
+    Parameters
+    ----------
+    known : InvariantSet
+    k : int
+    held : ndarray of bool, shape (l,)
+        The invariants that the system keeps. The surface is looked for where they have their values at y, because a
+        constraint that is violated a little does the work that makes up for friction; or where some of them are 0,
+        which they are not at y if it violates a constraint.
+    t : float
+    y, f : ndarray, shape (n,)
+        A state and its derivative there.
+    rhs : callable
     """
-    weights = np.repeat(span, y.view(float).size // span.size)
-    moving = np.flatnonzero(weights > 0)
-    if moving.size > MOST_COMPONENTS or not moving.size:
+    size, moved_by = np.abs(y).max(), np.abs(f).max()
+    # How far the components move while the state moves by its own size: more than in a step.
+    span = np.abs(y) + (size / moved_by if moved_by > 0 else 0.0) * np.abs(f)
+    rate = _Rate(known, k, t, y, span, rhs)
+    if not 0 < np.count_nonzero(rate.weights) <= MOST_COMPONENTS:
         return False
+    slope, first = rate.slopes(rate.floats), rate(rate.floats)
+    if rate.is_kept_at(rate.root(slope, first, known.gradients(t, y, f)[held])):
+        return True
+    if not held.any():
+        return False
+    found = rate.root(slope, first, known.gradients(t, y, f)[:0])
+    if found is None:
+        return False
+    before, after = np.abs(known.values(t, y))[held], np.abs(known.values(t, found.view(y.dtype)))[held]
+    return bool((after <= CONVERGED * before)[before > 0].any()) and rate.is_kept_at(found)
 
-    def rate(floats: Array) -> float:
-        state = floats.view(y.dtype)
-        f = rhs(t, state)
-        return float(known.gradients(t, state, f)[k].view(float) @ f.view(float))
 
-    def slopes(floats: Array) -> Array:
+class _Rate:
+    """The rate of change of an invariant as a function of the state's floats, and its slopes in units of `weights`."""
+
+    def __init__(self, known: InvariantSet, k: int, t: float, y: Array, span: Array, rhs: Derivative) -> None:
+        self._known, self._k, self._t, self._rhs, self._dtype = known, k, t, rhs, y.dtype
+        self.floats = np.ascontiguousarray(y).view(float).copy()
+        self.weights = np.repeat(span, self.floats.size // span.size)
+
+    def __call__(self, floats: Array) -> float:
+        state = floats.view(self._dtype)
+        f = self._rhs(self._t, state)
+        return float(self._known.gradients(self._t, state, f)[self._k].view(float) @ f.view(float))
+
+    def slopes(self, floats: Array) -> Array:
+        """Return the slopes by central differences, (m,)."""
         found = np.zeros(floats.size)
-        for j in moving:
+        for j in np.flatnonzero(self.weights):
             ends = []
             for shift in (SHIFT, -SHIFT):
                 moved = floats.copy()
-                moved[j] += shift * weights[j]
-                ends.append(rate(moved))
+                moved[j] += shift * self.weights[j]
+                ends.append(self(moved))
             found[j] = (ends[0] - ends[1]) / (2 * SHIFT)
         return found
 
-    floats = np.ascontiguousarray(y).view(float).copy()
-    first = rate(floats)
-    slope = slopes(floats)
-    square = float(slope @ slope)
-    if not 0 < square < np.inf or abs(first) > NEAR * np.sqrt(square):
-        return False
-    floats -= weights * slope * (first / square)
-    if not abs(rate(floats)) <= CONVERGED * abs(first):
-        return False
-    slope = slopes(floats)
-    f = rhs(t, floats.view(y.dtype)).view(float)
-    changes = slope[moving] / weights[moving] * f[moving]
-    return bool(abs(changes.sum()) <= VANISHES * np.abs(changes).sum())
+    def root(self, slope: Array, first: float, G: Array) -> Array | None:
+        """Return the nearest state at which the rate vanishes and the invariants of gradients G do not change, or None.
+
+        One step of Newton's method must find it.
+        """
+        rows = np.vstack([slope, G.view(float) * self.weights])
+        lengths = np.linalg.norm(rows, axis=1)
+        if not (0 < lengths[0] < np.inf and np.isfinite(lengths).all()):
+            return None
+        lengths[lengths == 0] = 1.0
+        wanted = np.zeros(len(rows))
+        wanted[0] = -first / lengths[0]
+        rows /= lengths[:, None]
+        move = np.linalg.lstsq(rows, wanted, rcond=RANK_TOLERANCE)[0]
+        if np.abs(move).max() > NEAR or np.abs(rows @ move - wanted).max() > CONVERGED * abs(wanted[0]):
+            return None
+        floats = self.floats + self.weights * move
+        return floats if abs(self(floats)) <= CONVERGED * abs(first) else None
+
+    def is_kept_at(self, floats: Array | None) -> bool:
+        """Return whether the flow leaves the rate as it is at a state."""
+        if floats is None:
+            return False
+        moving = self.weights > 0
+        f = self._rhs(self._t, floats.view(self._dtype)).view(float)
+        changes = self.slopes(floats)[moving] / self.weights[moving] * f[moving]
+        return bool(abs(changes.sum()) <= VANISHES * np.abs(changes).sum())

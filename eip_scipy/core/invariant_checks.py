@@ -28,7 +28,7 @@ INVARIANCE_TOLERANCE = 1e-8
 SINGLE_TOLERANCE = 1e-5
 # A gradient may be rounding and nothing else, as differences find that of a square which is 0: so many roundings of the
 # state, or as many times what those make of it.
-BLUR = 4.0
+BLUR, BLURRED = 4.0, 3
 # The rounding of a rate, in roundings of the largest derivatives of the same kind. Accelerations that come from a
 # system of linear equations, such as those of constrained bodies, have tens of them.
 RATE_ROUNDINGS = 100.0
@@ -123,11 +123,26 @@ def _values_at_ends(known: InvariantSet, t: float, y: Array, directions: Array, 
     return np.array([[known.values(t, state) for state in y + side * directions] for side in (step, -step)])
 
 
+def _blurred(at: _Samples) -> list[Array]:
+    """Return states that differ from this one by roundings."""
+    return [at.y + BLUR * EPS * d for d in (*at.directions, -at.directions[0])]
+
+
 def _rounding(known: InvariantSet, at: _Samples, ways: Array) -> Array:
     """Return how far derivatives along `ways`, (k, l), change where the state does by roundings."""
-    states = [at.y + BLUR * EPS * d for d in (*at.directions, -at.directions[0])]
-    blurred = [known.gradients(at.t, state, at.f) - at.G for state in states]
+    blurred = [known.gradients(at.t, state, at.f) - at.G for state in _blurred(at)]
     return BLUR * np.abs(np.array(blurred)[:, None] * ways[:, None]).sum(axis=3).max(axis=0)
+
+
+def _rounding_of_rates(known: InvariantSet, at: _Samples, unit: float, rhs: Derivative | None) -> Array:
+    """Return how far rates (l,), in this unit, change by the rounding inside gradients and right-hand side."""
+    found = _rounding(known, at, at.f[None] / unit)[0]
+    if rhs is None:
+        return found
+    # More of them: forces that cancel leave the same rounding at many states, and none at others.
+    states = [*_blurred(at), *(at.y * (1.0 + BLUR * EPS * k) for k in range(-BLURRED, BLURRED + 1))]
+    changes = [np.abs(at.G) @ np.abs(rhs(at.t, state) / unit - at.f / unit) for state in states]
+    return found + BLUR * np.max(changes, axis=0)
 
 
 # Precision.
@@ -228,7 +243,7 @@ class _Rates(NamedTuple):
 
 
 def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> Iterator[Complaint]:
-    found = _rates(known, at)
+    found = _rates(known, at, rhs)
     if found is None or not found.wrong.any():
         return
     wrong = found.wrong
@@ -245,9 +260,10 @@ def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> I
         wrong = wrong & ~small
     if wrong.any() and rhs is not None and (moved := on_targets(known, at.t, at.y, at.span, rhs)) is not None:
         f = rhs(at.t, moved)
-        there = _rates(known, at._replace(y=moved, f=f, G=known.gradients(at.t, moved, f)))
-        if there is not None:
-            found, wrong = there, wrong & there.wrong
+        G, here = known.gradients(at.t, moved, f), known.values(at.t, moved)
+        nearest = at._replace(y=moved, f=f, G=G, here=here)
+        if (there := _rates(known, nearest, rhs)) is not None:
+            at, found, wrong = nearest, there, wrong & there.wrong
     yield from _complaints_of_rates(known, at, found, wrong, rhs)
 
 
@@ -261,7 +277,7 @@ def _complaints_of_rates(
     plain: list[int] = []
     for k in (int(k) for k in order if wrong[k]):
         free = rhs is not None and found.in_time[k] == 0
-        kept = free and rhs is not None and is_kept_on_a_surface(known, k, at.t, at.y, at.span, rhs)
+        kept = free and rhs is not None and is_kept_on_a_surface(known, k, ~found.wrong, at.t, at.y, at.f, rhs)
         (conditional if kept else plain).append(k)
     for those, words, advice in ((plain, _no_invariant, WRONG), (conditional, _depends_on_others, MISSING)):
         if those:
@@ -285,7 +301,7 @@ def _depends_on_others(name: str, t: float, rate: float, terms: float) -> str:
     )
 
 
-def _rates(known: InvariantSet, at: _Samples) -> _Rates | None:
+def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates | None:
     """Return the rates of change at a state, or None where the derivative is too small for a rate."""
     # In units of the largest component of f: large states would overflow otherwise.
     unit = np.abs(at.f).max()
@@ -299,7 +315,7 @@ def _rates(known: InvariantSet, at: _Samples) -> _Rates | None:
     noise = noise + RATE_ROUNDINGS * EPS * known.norm_products(at.G, at.f / unit)
     wrong = np.abs(rate) > INVARIANCE_TOLERANCE * terms + noise
     if wrong.any():
-        wrong &= ~(_rounding(known, at, at.f[None] / unit)[0] > np.abs(rate))
+        wrong &= ~(_rounding_of_rates(known, at, unit, rhs) > np.abs(rate))
     with np.errstate(over="ignore"):
         return _Rates(rate * unit, terms * unit, in_time, wrong)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.data import EPS
+from ..engine.data import EPS, Grouping
 from ..engine.native import Call, call
 from .arguments import names, scalars
 from .callers import users_level
@@ -307,8 +307,8 @@ class InvariantSet:
 
     Attributes
     ----------
-    kinds : ndarray of int, shape (n,), or None
-        The components of one number have the same unit, see `like_components`. None: nothing is known of them.
+    kinds : Grouping or None
+        Components that have the same unit, see `kinds_of`. None: nothing is known of them.
     computed : list of bool
         Which of the l gradients are computed because none was given.
     """
@@ -327,7 +327,7 @@ class InvariantSet:
         rhs: Callable[[float, Array], Array] | None = None,
     ) -> None:
         self.t_span, self.rhs = (t0, t0 if t_bound is None else t_bound), rhs
-        self.kinds: Array | None = None
+        self.kinds: Grouping | None = None
         self.items = given = as_invariants(invariants)
         self.extra = extra
         # Why a jitted invariant has no compiled gradient, by its label.
@@ -583,9 +583,10 @@ class InvariantSet:
         if not (0 < largest < np.inf and 0 < size < np.inf):
             return np.zeros(len(G))
         rows, vector = np.abs(G) / largest, np.abs(x) / size
-        if self.kinds is not None:
-            order = np.argsort(self.kinds, kind="stable")
-            first = np.flatnonzero(np.diff(self.kinds[order], prepend=-1))
+        if self.kinds is not None and len(self.kinds.start) - 1 < x.size:
+            first = self.kinds.start[:-1].astype(np.intp)
+            order = self.kinds.member.astype(np.intp)[:: self.kinds.width] // self.kinds.width
+            first //= self.kinds.width
             rows = np.sqrt(np.add.reduceat(rows[:, order] ** 2, first, axis=1))
             vector = np.sqrt(np.add.reduceat(vector[order] ** 2, first))
         return (rows @ vector) * size * largest

@@ -73,7 +73,7 @@ def _text(kind: str, text: str) -> dict[str, str]:
 class Options(NamedTuple):
     """The options as the engine reads them (cpp/data.hpp).
 
-    `rtol` by float of the state, `atol` by component, `block_atol` by block.
+    `rtol` by float of the state, `atol` by component, `block_atol` by block. `kinds`: floats of the same unit.
     `watched`: whether corrections are compared with the errors of the steps. `limit`: the share of an invariant's terms
     that a projection may leave as its defect; the terms are `per_band` dead bands.
     `joint`: in interpreted runs the `JointInvariants` whose functions serve, else None.
@@ -86,6 +86,7 @@ class Options(NamedTuple):
     frame: FrameRows
     target: np.ndarray
     scales: np.ndarray
+    kinds: Grouping
     kappa: float
     metric: int
     direction: int
@@ -242,6 +243,7 @@ class ProjectionOptions:
             frame=frame_rows(self.frame, n, width),
             target=known.target,
             scales=known.scales,
+            kinds=groups,
             kappa=method.kappa,
             metric=kind,
             direction=DIRECTIONS[self.direction],

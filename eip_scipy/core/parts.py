@@ -79,9 +79,10 @@ class _Coordinates:
         rank, ranks = solver.place
         self._gathered, self._derivative, self._run = solver.gathered, solver._derivative, run
         self._own, n = slice(rank * size, (rank + 1) * size), ranks * size
+        each = blocks_of(None, n, 1)
         # Sizes of the invariants' terms stand in for those that the step would find at the state itself.
         self._options = run.options._replace(
-            rtol=np.zeros(n), atol=np.zeros(n), block_atol=np.zeros(n), groups=blocks_of(None, n, 1), joint=None,
+            rtol=np.zeros(n), atol=np.zeros(n), block_atol=np.zeros(n), groups=each, kinds=each, joint=None,
             scales=np.empty(size),
         )  # fmt: skip
         self._work = make_work(n, np.dtype(float), 0, size, n)._replace(**{k: getattr(run.work, k) for k in SCALARS})

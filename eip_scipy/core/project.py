@@ -14,6 +14,7 @@ from ..engine.data import BAND, EPS, Span
 from ..engine.trust import LARGE_SHARE, ProjectionWarning
 from ..methods.runge_kutta import RK1
 from . import setup
+from .blocks import kinds_of
 from .inputs import count, is_number, reals, refuse_units, shown
 from .invariants import InvariantSet
 from .one_step import as_vector
@@ -109,7 +110,7 @@ def project(
     )
     nowhere = Stepping(Span(t, 0.0, t, 1.0, 0, np.inf), 0.0, None, np.zeros(n), np.zeros(n))
     options, weight, _ = given.settled(RK1, nowhere, y, known)
-    options = options._replace(target=_targets(known, target))
+    options = options._replace(target=_targets(known, target), kinds=kinds_of(options.groups, y, f_hat))
     projection = setup.Projection(known, options, derivative)
     work = projection.work
     if weight is not None:

@@ -35,7 +35,7 @@ from ..engine.trust import Trust
 from ..methods.multistep import GaussJackson
 from ..methods.nystrom import RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853
-from .blocks import like_components
+from .blocks import kinds_of
 from .frame import spanned
 from .inputs import reals, refuse_units, shown
 from .invariants import InvariantSet
@@ -320,7 +320,8 @@ def prepare(
         projection.invariants, t0, y0, f0, tau, extra, tell=check_start, t_bound=stepping.span.t_bound, rhs=rhs
     )
     options, sigma, identity = projection.settled(method, stepping, y0, invariants)
-    invariants.kinds = like_components(options.groups, y0, f0)
+    options = options._replace(kinds=kinds_of(options.groups, y0, f0))
+    invariants.kinds = options.kinds
     options = options._replace(scales=_scales(options, invariants, start))
     arrays = method_arrays(method)
     work = make_work(y0.size, y0.dtype, arrays.b.size, invariants.size, options.groups.start.size - 1)

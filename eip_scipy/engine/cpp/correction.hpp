@@ -154,6 +154,12 @@ inline Moved move(const AnyRun &run, const Step &step, double largest_error = -1
     return true;
 }
 
+// The state that a step comes from; null for a projection by itself.
+template <class W>
+inline const double *origin(const Step &step, const W &w) {
+    return step.h != 0.0 && step.y != w.y_hat ? step.y : nullptr;
+}
+
 // What follows the first Newton step: further ones, and whether the projection holds.
 template <class AnyRun>
 inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
@@ -170,7 +176,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
         compensated_add(step.y_new, w.carry_hat, w.move, w.m);
     }
     evaluate_invariants(run, step.t_new, step.y_new);
-    return judge(w.before, step.y_new, o, w);
+    return judge(w.before, origin(step, w), step.y_new, o, w);
 }
 
 // Further tries with weights ever nearer to equal relative errors; at most MAX_SOFTENED.
@@ -205,7 +211,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     move_along(o, w, w.Q, step.y_new);
     evaluate_invariants(run, step.t_new, step.y_new);
     shared_defects(w, w.g);
-    return judge(w.g, step.y_new, o, w);
+    return judge(w.g, origin(step, w), step.y_new, o, w);
 }
 
 // y_hat lies in all dead bands: nothing is moved.
@@ -213,8 +219,8 @@ template <class W>
 inline Code stay(const Step &step, const Options &o, const W &w) {
     ++w.counters[SKIPPED];
     copy(w.y_hat, step.y_new, w.m);
-    const Code status = judge(w.before, step.y_new, o, w);
-    if (status == OK) take_note(step.t_new, o, w);
+    const Code status = judge(w.before, origin(step, w), step.y_new, o, w);
+    if (status == OK) take_note(step.t_new, origin(step, w), o, w);
     return status;
 }
 
@@ -265,7 +271,7 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
         w.counters[RANK_REDUCED] += moved.rank < w.l;
     }
     if (status == OK) {
-        take_note(step.t_new, o, w);
+        take_note(step.t_new, origin(step, w), o, w);
         w.max_correction[0] = std::max(w.max_correction[0], moved.correction);
     }
     return status;

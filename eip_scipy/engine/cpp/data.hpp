@@ -101,6 +101,7 @@ struct Options {
     Blocks blocks;
     Frame frame;
     const double *scales;
+    Blocks kinds;  // floats of the same unit, as far as that is known
     double kappa;
     int64_t metric, direction, iterations, every;
     bool reuse_f, uses_f, compensated, adaptive, watched;

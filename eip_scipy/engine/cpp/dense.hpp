@@ -333,7 +333,7 @@ inline bool project_sample(const Run &run, double t, double *out) {
         for (int64_t i = 0; i < w.l; ++i) small &= std::abs(w.before[i]) <= SMALL_SHARE * o.per_band * w.band[i];
         if (small) return all_finite(out, w.m);
         evaluate_invariants(run, t, out);
-        if (judge(w.before, out, o, w) != OK) return false;
+        if (judge(w.before, nullptr, out, o, w) != OK) return false;
         for (int64_t i = 0; i < w.l; ++i) met &= std::abs(w.defect[i]) <= w.band[i];
         if (met) return true;
         copy(out, w.y_hat, w.m);

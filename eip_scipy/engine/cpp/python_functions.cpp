@@ -341,7 +341,7 @@ bool PythonHooks::project_jointly(const Step &step) {
         raise_to(w.defect, w.max_defect, w.l);
     } else {
         const double steps = 1.0 + static_cast<double>(w.counters[WAITED]);
-        note(step.t_new, measured ? steps : 0.0, EPS * std::sqrt(steps), o, w);
+        note(step.t_new, measured ? steps : 0.0, EPS * std::sqrt(steps), nullptr, o, w);
     }
     return true;
 }

@@ -182,6 +182,7 @@ Options options_of(PyObject *options, Work &w, Arrays &arrays) {
     o.rtol = arrays.floats(options, "rtol", {w.m});
     o.atol = arrays.floats(options, "atol", {w.n});
     o.blocks = blocks_of(attribute(options, "groups").get(), w.m, arrays);
+    o.kinds = blocks_of(attribute(options, "kinds").get(), w.m, arrays);
     o.block_atol = arrays.floats(options, "block_atol", {o.blocks.count});
     o.frame = frame_of(attribute(options, "frame").get(), w.m, arrays);
     w.target = arrays.floats(options, "target", {w.l});

@@ -8,6 +8,8 @@ namespace eip {
 constexpr double FAILURE_BANDS = 100.0, NOISE_BANDS = 3.0;
 // Terms that vanish for a moment, where an invariant's own pass through zero, count as this share of those at the start.
 constexpr double LEAST_SHARE = 1e-3;
+// Coordinates that move by less than this share of their size stand still.
+constexpr double STILL = 1e4 * EPS;
 constexpr double LARGE = 50.0, FAR = 0.03, LARGE_SHARE = 1e-2;
 
 // Defects w.g = values - target and their dead bands; inside its band a defect is set to 0, `raw` keeps all. Returns
@@ -27,7 +29,8 @@ inline Truth<Value> defects(const double *terms, const Value *y, const Options &
         } else {
             own = terms ? Value(terms[i]) : abs_dot(w.gradient(i), y, w.m);
         }
-        size = max(max(size, Value(o.scales[i])), own);
+        // A gradient that is not finite makes its band so: the projection then fails, also of a state on the manifold.
+        size = max(own, max(size, Value(o.scales[i])));
         w.band[i] = band * size;
         raw[i] = w.values[i] - w.target[i];
         const Truth<Value> inside = (w.band[i] < INFINITE) & (abs(raw[i]) <= w.band[i]);
@@ -61,6 +64,43 @@ inline auto own_terms(int64_t i, const Options &o, const W &w) {
     return min(now, figures[TERMS]) + TINY;
 }
 
+// The sum of |G_b| |x_b| over groups of floats with the same unit. Terms G_k x_k may vanish together by the orientation
+// of the axes; these products do not.
+[[gnu::cold, gnu::noinline]] inline double norm_products(const double *G, const double *x, const Blocks &kinds) {
+    double total = 0.0;
+    for (int64_t b = 0; b < kinds.count; ++b) {
+        double gradient = 0.0, size = 0.0;
+        for (uint64_t place = kinds.start[b]; place < kinds.start[b + 1]; ++place) {
+            gradient = std::hypot(gradient, G[kinds.member[place]]);
+            size = std::hypot(size, x[kinds.member[place]]);
+        }
+        total += gradient * size;
+    }
+    return total;
+}
+
+// Return whether a state (q, v) stands still: its coordinates move by roundings in a step from y, and what its
+// velocities do is the rounding of forces that cancel.
+[[gnu::cold, gnu::noinline]] inline bool at_rest(const double *y, const Options &o, const Work &w) {
+    if (o.kinds.count != 2 || 2 * o.kinds.size != w.m || o.blocks.count != w.m) return false;
+    double moved = 0.0, size = 0.0;
+    for (int64_t j = 0; j < w.m / 2; ++j) {
+        moved = std::max(moved, std::abs(w.y_hat[j] - y[j]));
+        size = std::max(size, std::abs(y[j]));
+    }
+    return moved <= STILL * size;
+}
+
+// The terms by which a defect is measured that is large in units of `own`. `y`, the state at the step's start, must be
+// on the manifold: a state that blows up has large terms too. It is null where no such state is available. Components
+// whose units are unknown have no orientation that could hide anything.
+inline double generous_terms(int64_t i, double own, const double *y, const Options &o, const Work &w) {
+    if (!y || o.kinds.count == w.m) return own;
+    if (at_rest(y, o, w)) return INFINITE;
+    const double found = norm_products(w.gradient(i), y, o.kinds);
+    return std::abs(w.figures(i)[LEFT]) <= LARGE_SHARE * found ? std::max(own, found) : own;
+}
+
 // Note the defects; whether all are finite and none has grown beyond what round-off explains: FAILURE_BANDS dead bands, or
 // as many roundings where bands are smaller.
 template <class Value, class W>
@@ -83,12 +123,27 @@ inline auto small_shares(const Options &o, const W &w) {
     return !bad;
 }
 
+// Return whether the defects hold in units of the terms that the orientation of the axes does not hide, and of their
+// rounding.
+[[gnu::cold, gnu::noinline]] inline bool held_generously(const double *before, const double *y_old, const Options &o,
+                                                         const Work &w) {
+    const double bands = FAILURE_BANDS * std::max(1.0, EPS * o.per_band);
+    bool bad = false;
+    for (int64_t i = 0; i < w.l; ++i) {
+        const double size = std::abs(w.defect[i]), own = generous_terms(i, own_terms(i, o, w), y_old, o, w);
+        const double rounding = bands * std::max(w.band[i], norm_products(w.gradient(i), w.y_hat, o.kinds) / o.per_band);
+        bad = bad || !(size < INFINITE) || (size > std::abs(before[i]) && size > rounding) || !(size <= o.limit * own);
+    }
+    return !bad;
+}
+
 // Note the defects after a projection. It has failed where something is not finite, or a defect has grown and stands
-// above FAILURE_BANDS dead bands and roundings, or is more than the limit.
+// above FAILURE_BANDS dead bands and roundings, or is more than the limit. y_old: the state at the step's start, or null.
 template <class W>
-inline Code judge(const double *before, const double *y, const Options &o, const W &w) {
+inline Code judge(const double *before, const double *y_old, const double *y, const Options &o, const W &w) {
     const bool held = defects_held(before, o, w);
-    return all_finite(y, w.m) && held && small_shares(o, w) ? OK : FAILED_PROJECTION;
+    if (!all_finite(y, w.m)) return FAILED_PROJECTION;
+    return (held && small_shares(o, w)) || held_generously(before, y_old, o, w) ? OK : FAILED_PROJECTION;
 }
 
 // A defect that is large beside its invariant's terms.
@@ -117,14 +172,16 @@ inline int64_t weigh_change(double size, double expected, double t, double *figu
 // What an accepted projection leaves: its defects, and whether the errors of the steps explain its corrections.
 //
 // An invariant's local errors since the last projection are worth `errors` times w.worth, their rounding `rounding` times
-// its terms; with errors = 0 nothing is known of them.
+// its terms; with errors = 0 nothing is known of them. y_old: the state at the step's start, or null.
 template <class W>
-inline void note(double t, double errors, double rounding, const Options &o, const W &w) {
+inline void note(double t, double errors, double rounding, const double *y_old, const Options &o, const W &w) {
     for (int64_t i = 0; i < w.l; ++i) {
         double *figures = w.figures(i);
         const double size = std::abs(w.defect[i]), raw = std::abs(w.before[i]);
         w.max_defect[i] = std::max(w.max_defect[i], size);
-        const double terms = o.per_band * w.band[i], own = own_terms(i, o, w);
+        const double terms = o.per_band * w.band[i];
+        double own = own_terms(i, o, w);
+        if (raw > FAR * own || size > LARGE_SHARE * own) own = generous_terms(i, own, y_old, o, w);
         figures[NOTED] += 1.0;
         if (raw > FAR * own) {
             note_share(raw / own, t, figures, RAW, RAW_AT);
@@ -140,8 +197,10 @@ inline void note(double t, double errors, double rounding, const Options &o, con
         }
         // An estimate that vanishes tells nothing: that of RK4 does where f depends on t alone.
         if (errors > 0.0 && w.worth[i] > 0.0) {
-            const double expected = errors * w.worth[i] + rounding * terms + TINY;
-            w.counters[FOUND] += weigh_change(std::abs(w.before[i] - figures[LEFT]), expected, t, figures);
+            const double change = std::abs(w.before[i] - figures[LEFT]);
+            double expected = errors * w.worth[i] + rounding * terms + TINY;
+            if (change > LARGE * expected) expected += rounding * generous_terms(i, 0.0, y_old, o, w);
+            if (expected < INFINITE) w.counters[FOUND] += weigh_change(change, expected, t, figures);
         }
         figures[LEFT] = w.defect[i];
     }
@@ -149,7 +208,7 @@ inline void note(double t, double errors, double rounding, const Options &o, con
 
 // The same for a step, whose estimates, where they are gathered in quadrature, are of errors that add.
 template <class W>
-inline void take_note(double t, const Options &o, const W &w) {
+inline void take_note(double t, const double *y_old, const Options &o, const W &w) {
     if (!o.watched) return raise_to(w.defect, w.max_defect, w.l);
     const double waited = w.counters[WAITED];
     double rounding = EPS, errors = w.counters[HAVE_ERROR] ? 1.0 : 0.0;
@@ -158,7 +217,7 @@ inline void take_note(double t, const Options &o, const W &w) {
         const bool gathered = o.metric == ERROR || o.every == AUTO || o.adaptive;
         errors *= gathered ? std::sqrt(1.0 + waited) : 1.0 + waited;
     }
-    note(t, errors, rounding, o, w);
+    note(t, errors, rounding, y_old, o, w);
 }
 
 // Whether the errors gathered make some invariant more uncertain than NOISE_BANDS roundings of its terms.
