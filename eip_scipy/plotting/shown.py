@@ -6,7 +6,7 @@ import io
 import weakref
 from typing import Any
 
-from matplotlib import pyplot, rc_context, rcParams
+from matplotlib import pyplot, rcParams
 from matplotlib.backends.registry import BackendFilter, backend_registry
 from matplotlib.figure import Figure
 
@@ -81,8 +81,13 @@ def shown_figure(width: float, height: float) -> ShownFigure:
     if not inline:  # in a notebook the end of the cell closes what it has shown
         _close_oldest()
     dpi = DPI if inline else rcParams["figure.dpi"]  # a window of 160 dots per inch would leave the screen
-    with rc_context({"figure.max_open_warning": 0} if inline else {}):
+    most = rcParams["figure.max_open_warning"]
+    # Not by rc_context: pyplot may load its backend now, and what that sets (interactive for the inline one) must stay.
+    rcParams["figure.max_open_warning"] = 0 if inline else most
+    try:
         figure = pyplot.figure(FigureClass=ShownFigure, figsize=(width, height), dpi=dpi, layout="constrained")
+    finally:
+        rcParams["figure.max_open_warning"] = most
     assert isinstance(figure, ShownFigure)
     _windows.append(weakref.ref(figure))
     return figure
