@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from .run.recommendation import Recommendation
     from .run.results import IntegrationResult
     from .run.saving import load, save
+    from .run.solve_ivp import OdeResult, solve_ivp
     from .run.tables import to_dataframe, to_xarray
     from .run.view import view
 
@@ -75,6 +76,7 @@ __all__ = [
     "Invariant",
     "JointInvariants",
     "NystromTableau",
+    "OdeResult",
     "OneStepMethod",
     "ProjectionResult",
     "ProjectionWarning",
@@ -93,6 +95,7 @@ __all__ = [
     "recommend",
     "save",
     "show_config",
+    "solve_ivp",
     "to_dataframe",
     "to_xarray",
     "view",
@@ -108,6 +111,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "Invariant": "core.invariants",
     "JointInvariants": "core.invariants",
     "NystromTableau": "methods.nystrom",
+    "OdeResult": "run.solve_ivp",
     "OneStepMethod": "core.one_step",
     "ProjectionResult": "core.results",
     "ProjectionWarning": "core.results",
@@ -125,6 +129,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "recommend": "run.recommend",
     "save": "run.saving",
     "show_config": "core.config",
+    "solve_ivp": "run.solve_ivp",
     "to_dataframe": "run.tables",
     "to_xarray": "run.tables",
     "view": "run.view",

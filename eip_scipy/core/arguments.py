@@ -9,7 +9,7 @@ import numpy as np
 
 from .inputs import is_number, real_array, refuse_units, shown
 
-__all__ = ["Packed", "extra_arguments", "floats", "names", "parameter_values", "scalars"]
+__all__ = ["Packed", "are_same", "extra_arguments", "floats", "names", "parameter_values", "scalars"]
 
 EXACT = 2**53  # an integer up to here is a float as well
 
@@ -42,6 +42,12 @@ def extra_arguments(args: Any, params: Any) -> tuple[Any, ...]:
         raise TypeError(f"args must be a tuple, got {shown(args)}; write args=(x,) for a single argument.") from None
     refuse_units(args=found)
     return tuple(item.copy() for item in found) if _is_array(found) else found
+
+
+def are_same(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+    """Return whether two tuples hold the same arguments, or equal numbers."""
+    pairs = zip(one, other, strict=False)
+    return len(one) == len(other) and all(a is b or np.array_equal(a, b) for a, b in pairs)
 
 
 def parameter_values(params: Any) -> np.ndarray:

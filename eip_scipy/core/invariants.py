@@ -50,7 +50,8 @@ class Invariant:
     target : float or array_like, shape (l_i,), optional
         The value to keep. Default: the value at the start. A given target is a condition that the start must meet.
     args : tuple, optional
-        Further arguments of `fun` and `grad`. (``solve_ivp(args=...)`` reaches only its own functions.)
+        Further arguments of `fun` and `grad`. The ``args`` of `eip_scipy.solve_ivp` and
+        of `integrate` follow these; those of SciPy's own function do not reach invariants.
     size : int, optional
         Number l_i of the values of `fun`, which a C function does not show; without it, a C function gives one number.
     name : str, optional
@@ -276,8 +277,8 @@ def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype
 
 def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple, extra: tuple) -> None:
     given = (*first, *(f"args[{k}]" for k in range(len(args))), *names(extra))
-    mend = "Give what it takes besides by Invariant(..., args=(...,))"
-    mend += f", or take the run's {names(extra)[0].partition('[')[0]} as its last arguments." if extra else "."
+    last = f"take the run's {names(extra)[0].partition('[')[0]} as its last arguments" if extra else "those of the call"
+    mend = f"It must take t, y, its own arguments, Invariant(..., args=(...,)), and {last}."
     require_arguments(fun, given, what, mend)
 
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import inspect
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple, TypedDict, TypeVar
+from typing import Any, Literal, NamedTuple, TypedDict, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..engine.data import (
     AUTO,
@@ -34,7 +35,7 @@ from ..methods.multistep import GaussJackson
 from .blocks import blocks_of
 from .frame import frame_rows
 from .inputs import count, flag, real_array
-from .invariants import InvariantSet, JointInvariants
+from .invariants import Invariant, InvariantSet, JointInvariants
 from .one_step import OneStep
 from .stepping import AnyMethod, Stepping
 
@@ -52,13 +53,13 @@ Documented = TypeVar("Documented", bound=Any)
 class ProjectionKeywords(TypedDict, total=False):
     """The names of `ProjectionOptions` as keywords, for type checkers."""
 
-    invariants: Any
-    metric: Any
-    blocks: Any
-    frame: Any
-    direction: str
+    invariants: Invariant | Callable[..., Any] | Iterable[Invariant | Callable[..., Any]]
+    metric: Literal["error", "euclidean"] | Sequence[float] | np.ndarray | None
+    blocks: int | Sequence[ArrayLike] | None
+    frame: tuple[ArrayLike, ArrayLike] | None
+    direction: Literal["new", "old", "midpoint"]
     iterations: int
-    every: int | str | None
+    every: int | Literal["auto"] | None
     reuse_f: bool
     compensated: bool | None
     check: bool

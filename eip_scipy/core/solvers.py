@@ -169,13 +169,13 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         jacobian = options.pop("jacobian", None) if isinstance(self.TABLEAU, GaussJackson) else None
         projection, extraneous = ProjectionOptions.of(options)
         if extraneous:
-            warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=3)
+            warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=users_level())
         t0, t_bound = interval((t0, t_bound))
         start = setup.initial_state(y0)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
         self._bind(fun, [0])
         steps = StepOptions(h=h, first_step=first_step, max_step=max_step, rtol=rtol, atol=atol)
-        stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, self.n, stacklevel=4)
+        stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, self.n, stacklevel=users_level() + 1)
         self._take_stepping(stepping)
         kept = as_invariants(projection.invariants)
         if self.h is None and stepping.first_step is None:
@@ -491,9 +491,9 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             self._watch()
         return True, None
 
-    def _watch(self) -> None:
+    def _watch(self, *, ended: bool = False) -> None:
         """Look at the run where something stands out, early and at its end; warn once, and at once: it may end here."""
-        run, arrived = self._run, self.t == self.t_bound
+        run, arrived = self._run, ended or self.t == self.t_bound
         self._noted = self._work.counters[FOUND]
         if not self._told and run.look(self._steps, arrived, self.t, self.y, lambda: self._derivative(self.t, self.y)):
             self._told = True

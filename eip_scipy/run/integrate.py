@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from ..core import setup
 from ..core.inputs import refuse_units
 from ..core.jitted import is_compiled, is_jitted
 from ..core.names import nearest
-from ..core.options import ProjectionOptions, takes_projection_options
+from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.pointers import PointerFunction
 from ..core.problem import Problem
 from ..core.results import Diagnostics
@@ -91,7 +91,7 @@ def integrate(
     atol: Any = DEFAULT,
     first_step: float | None = None,
     max_step: float = np.inf,
-    **projection: Any,
+    **projection: Unpack[ProjectionKeywords],
 ) -> IntegrationResult:
     """Integrate with fixed or adaptive steps, compiled where the functions are Numba functions.
 

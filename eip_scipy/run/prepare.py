@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core import setup, solvers
 from ..core.acceleration import BY_NAME, AccelerationField, is_acceleration
-from ..core.arguments import Packed, extra_arguments, floats, names, scalars
+from ..core.arguments import Packed, are_same, extra_arguments, floats, names, scalars
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import Invariant, as_invariants
 from ..core.jitted import NotCompilableError
@@ -489,13 +489,8 @@ def _with_run_params(projection: Mapping[str, Any], params: Any, args: Any = Non
     items = as_invariants(projection["invariants"])
     extra = (() if params is None else (params,)) if args is None else tuple(args)
     if extra:
-        items = tuple(_bare(item) if _takes(item, extra) else item for item in items)
+        items = tuple(_bare(item) if are_same(item.args, extra) else item for item in items)
     return {"invariants": items}
-
-
-def _takes(item: Invariant, extra: tuple[Any, ...]) -> bool:
-    same = (a is b or np.array_equal(a, b) for a, b in zip(item.args, extra, strict=False))
-    return len(item.args) == len(extra) and all(same)
 
 
 def _bare(item: Invariant) -> Invariant:

@@ -5,18 +5,20 @@ left out. Those of the 25 tests that take the default method, RK45, or Radau, go
 place of RK45. ``python -m pytest tests/acceptance/test_scipy_suite.py -k shipped -rP`` prints the count for each class.
 
 And more strictly: each of its tests once per class, which it gets too where it takes the default method, or an implicit
-one on the way to something else.
+one on the way to something else. The same holds for `eip_scipy.solve_ivp` with the class EIPRK45, and with SciPy's own
+methods by name, where all tests run as they are shipped.
 """
 
 import ast
 import importlib.util
+import itertools
 import types
 from pathlib import Path
 
 import pytest
 from scipy import integrate
 
-from eip_scipy import EIPDOP853, EIPRK23, EIPRK45, eip_method
+from eip_scipy import EIPDOP853, EIPRK23, EIPRK45, eip_method, solve_ivp
 from eip_scipy.core.stepping import Stepping
 from eip_scipy.engine.data import Span
 
@@ -29,6 +31,7 @@ METHODS = {
     "own RK23": ("RK23", eip_method(EIPRK23.TABLEAU)),
     "own RK45": ("RK45", eip_method(EIPRK45.TABLEAU)),
     "own DOP853": ("DOP853", eip_method(EIPDOP853.TABLEAU)),
+    "typed RK45": ("RK45", EIPRK45),
 }
 ALL = {*SCIPY, "Radau", "BDF", "LSODA"}
 
@@ -91,15 +94,22 @@ class OneMethod(ast.NodeTransformer):
         return self.generic_visit(node)
 
 
-def suite(name, method, as_shipped=False):
-    """SciPy's module with the class `method` in the place of `name`, and what counts its uses.
-
-    The class takes the place of all other methods too, unless the suite is left `as_shipped`.
-    """
+def module_of(name):
+    """SciPy's module with its lists of methods cut down to one, or with all of them where the name is empty."""
     text, path = SOURCE
     tree = ast.fix_missing_locations(OneMethod(name).visit(ast.parse(text)))
     module = types.ModuleType("scipy_suite_" + name)
     exec(compile(tree, path, "exec"), module.__dict__)
+    return module
+
+
+def suite(name, method, as_shipped=False, solver=integrate.solve_ivp):
+    """SciPy's module with the class `method` in the place of `name`, and what counts its uses.
+
+    The class takes the place of all other methods too, unless the suite is left `as_shipped`. `solver` is the function
+    in the place of `solve_ivp`.
+    """
+    module = module_of(name)
     used = []
     order = method.TABLEAU.error_estimator_order if hasattr(method, "TABLEAU") else method.error_estimator_order
 
@@ -114,13 +124,13 @@ def suite(name, method, as_shipped=False):
 
     def solve_ivp(*args, method=name, **options):
         assert method in (name, Counting, "Radau"), f"{method} is not the method under test"
-        if "jac" not in options:
-            return integrate.solve_ivp(*args, method=Counting, **options)
+        if "jac" not in options or (options["jac"] is None and solver is not integrate.solve_ivp):
+            return solver(*args, method=Counting, **options)
         with pytest.warns(UserWarning, match="have no effect for a chosen solver: `jac`"):
-            return integrate.solve_ivp(*args, method=Counting, **options)
+            return solver(*args, method=Counting, **options)
 
     def as_called(*args, method="RK45", **options):
-        return integrate.solve_ivp(*args, method=Counting if method == name else method, **options)
+        return solver(*args, method=Counting if method == name else method, **options)
 
     def select_initial_step(fun, t0, y0, t_bound, max_step, f0, direction, order, rtol, atol):
         used.append("initial_step")
@@ -147,7 +157,10 @@ def cases_of(function):
 
 
 SOURCE = source()
-SUITES = {label: (name, *suite(name, method)) for label, (name, method) in METHODS.items()}
+SUITES = {
+    label: (name, *suite(name, method, solver=solve_ivp if label.startswith("typed") else integrate.solve_ivp))
+    for label, (name, method) in METHODS.items()
+}
 CASES = [
     pytest.param(label, key, case, id="-".join([key, label, *map(str, case.values())]))
     for label, (name, module, _) in SUITES.items()
@@ -174,6 +187,26 @@ def test_as_shipped(method):
     print(f"{method.__name__}: {len(passed)} of {len(EXPECTED)} of SciPy's own tests pass")
     assert len(passed) == len(EXPECTED) == 25
     assert used.count(name) > 40
+
+
+def test_all_methods_through_the_typed_function():
+    """All tests of the wheel, with each method of SciPy by its name or class; a result has what SciPy's has."""
+    module, count, used = module_of(""), 0, []
+
+    def typed(*args, method="RK45", **options):
+        used.append(method)
+        return solve_ivp(*args, method=method, **options)
+
+    module.solve_ivp = typed
+    for key in sorted(EXPECTED):
+        function = getattr(module, key)
+        marks = [m.args for m in getattr(function, "pytestmark", []) if m.name == "parametrize"]
+        for values in itertools.product(*(values for _, values in marks)):
+            arguments = dict(zip((name for name, _ in marks), values, strict=True))
+            call(module, key, None, arguments)
+            count += 1
+    assert count >= len(EXPECTED)
+    assert len(used) > 100
 
 
 @pytest.mark.parametrize(("label", "key", "case"), CASES)

@@ -233,7 +233,7 @@ def eip_name(method: type[EIPSolver], metric: str) -> str:
     return f"{method.__name__} ({metric})"
 
 
-def _eip(scene: SolarScene, method: type[EIPSolver], metric: str, progress: bool, **checkpoint: Any) -> MethodRun:
+def _eip(scene: SolarScene, method: type[EIPSolver], metric: Any, progress: bool, **checkpoint: Any) -> MethodRun:
     name = eip_name(method, metric)
     head = (method.__name__, "euclid." if metric == "euclidean" else metric)
     result = integrate(

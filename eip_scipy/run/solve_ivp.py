@@ -1,0 +1,267 @@
+"""`solve_ivp` with types: SciPy's function, whose result also says whether the run is reliable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
+from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
+import scipy.integrate
+from numpy.typing import ArrayLike
+from scipy.integrate import OdeSolution, OdeSolver
+
+from ..core.acceleration import AccelerationField
+from ..core.arguments import are_same
+from ..core.inputs import shown
+from ..core.invariants import Invariant, as_invariants
+from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
+from ..core.results import Diagnostics
+from ..core.setup import initial_state
+from ..core.solvers import EIPDOP853, EIPRK23, EIPRK45, EIPSolver, SolverClass, eip_method
+
+if TYPE_CHECKING:
+    Result = dict[str, Any]
+else:  # SciPy's class of results has no public name
+    Result = type(scipy.integrate.solve_ivp(lambda t, y: y, (0.0, 0.0), [0.0]))
+
+__all__ = ["OdeResult", "solve_ivp"]
+
+EXPLICIT = {"RK23": EIPRK23, "RK45": EIPRK45, "DOP853": EIPDOP853}
+IMPLICIT = ("Radau", "BDF", "LSODA")
+# Options of the EIP methods alone.
+OWN = {"h", "jacobian", "diagnostics", *ProjectionOptions.names()}
+
+
+class OdeResult(Result):
+    """Result of `solve_ivp`: SciPy's OdeResult, with what says whether the run is reliable.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+        Times.
+    y : ndarray, shape (n, m)
+        States. With ``project_initial=True`` the state at the start is the projected one.
+    sol : OdeSolution or None
+        The solution as a function of time, with ``dense_output=True``.
+    t_events, y_events : list of ndarray or None
+        Times and states of each event.
+    nfev, njev, nlu : int
+        Numbers of evaluations of `fun` and of the invariants' gradients, and of factorisations in projections.
+    status : int
+        0: the end was reached; 1: an event ended the run; -1: a step failed.
+    message : str
+        Why the run ended, and why it is not reliable if it is not.
+    success : bool
+        ``status >= 0``.
+    trusted : bool
+        Whether no step failed and nothing contradicts the run, see `Diagnostics`.
+    diagnostics : Diagnostics
+        The record of the projections.
+    """
+
+    t: np.ndarray
+    y: np.ndarray
+    sol: OdeSolution | None
+    t_events: list[np.ndarray] | None
+    y_events: list[np.ndarray] | None
+    nfev: int
+    njev: int
+    nlu: int
+    status: int
+    message: str
+    success: bool
+    trusted: bool
+    diagnostics: Diagnostics
+
+
+@takes_projection_options
+def solve_ivp(
+    fun: Callable[..., Any] | None = None,
+    t_span: ArrayLike | None = None,
+    y0: ArrayLike | None = None,
+    method: type[OdeSolver] | str = EIPRK45,
+    t_eval: ArrayLike | None = None,
+    dense_output: bool = False,
+    events: Callable[..., Any] | Sequence[Callable[..., Any]] | None = None,
+    vectorized: bool = False,
+    args: Iterable[Any] | None = None,
+    *,
+    acceleration: Callable[..., Any] | None = None,
+    h: float | None = None,
+    first_step: float | None = None,
+    max_step: float | None = None,
+    rtol: ArrayLike | None = None,
+    atol: ArrayLike | None = None,
+    jacobian: Callable[..., Any] | None = None,
+    diagnostics: Diagnostics | None = None,
+    jac: Any = None,
+    jac_sparsity: Any = None,
+    lband: int | None = None,
+    uband: int | None = None,
+    min_step: float | None = None,
+    **projection: Unpack[ProjectionKeywords],
+) -> OdeResult:
+    """Solve an initial value problem by `scipy.integrate.solve_ivp`, with typed options and a result that is judged.
+
+    The states are those of `scipy.integrate.solve_ivp` with the same method. In addition this function passes `args` to
+    the invariants, takes accelerations, and returns whether the run is reliable. Editors and type checkers know its
+    options.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(t, y, *args) -> (n,)``, the right-hand side.
+    t_span : (float, float)
+        Start and end.
+    y0 : array_like, shape (n,)
+        Initial state, real or complex.
+    method : type or str, optional
+        An EIP method (default: `EIPRK45`), or a method of SciPy by its name or class. With invariants or any other
+        option of the EIP methods, "RK23", "RK45", "DOP853" and other explicit Runge-Kutta classes stand for the EIP
+        methods on them; without, SciPy's own take the steps.
+    t_eval, dense_output, events, vectorized
+        As for `scipy.integrate.solve_ivp`.
+    args : tuple, optional
+        Further arguments of `fun`, of the events, of `jacobian` and `jac`, and of the invariants, where they follow
+        the invariant's own ``args`` unless both are the same.
+    acceleration : callable, optional
+        In place of `fun`, ``acceleration(t, q, *args) -> (n/2,)`` for q'' = a(t, q) with the state (q, v).
+    h : float, optional
+        Length of fixed steps.
+    first_step, max_step, rtol, atol : optional
+        As for the methods; by default their own.
+    jacobian : callable, optional
+        For `EIPGJ14`: ``jacobian(t, q, dq, out, *args)``.
+    {names of ProjectionOptions}
+        As for the methods, see `EIPSolver`.
+    diagnostics : Diagnostics, optional
+        An empty record to be filled; without it, the result has a new one.
+    jac, jac_sparsity, lband, uband, min_step : optional
+        Options of SciPy's implicit methods.
+
+    Returns
+    -------
+    OdeResult
+        SciPy's result, with ``trusted`` and ``diagnostics``; ``message`` includes why a run is not reliable.
+
+    Raises
+    ------
+    TypeError
+        If options of the EIP methods are given to an implicit method; and as raised by SciPy and the methods.
+
+    Warns
+    -----
+    ProjectionWarning
+        If the projection hides a failure.
+    UserWarning
+        If an option has no effect for the method.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import EIPDOP853, solve_ivp
+    >>> def pendulum(t, y, g):
+    ...     return [y[1], -g * np.sin(y[0])]
+    >>> def energy(t, y, g):
+    ...     return 0.5 * y[1] ** 2 - g * np.cos(y[0])
+    >>> sol = solve_ivp(pendulum, (0, 20), [1.0, 0.0], EIPDOP853, args=(9.81,), invariants=energy, rtol=1e-8)
+    >>> sol.success, sol.trusted, bool(sol.diagnostics.max_defect < 1e-11)
+    (True, True, True)
+    """
+    options: dict[str, Any] = {
+        "h": h, "first_step": first_step, "max_step": max_step, "rtol": rtol, "atol": atol, "jacobian": jacobian,
+        "diagnostics": diagnostics, "jac": jac, "jac_sparsity": jac_sparsity, "lband": lband, "uband": uband,
+        "min_step": min_step,
+    }  # fmt: skip
+    options = {name: value for name, value in options.items() if value is not None} | dict(projection)
+    kept = as_invariants(options.pop("invariants", ()))
+    if kept:
+        options["invariants"] = kept
+    function = _right_hand_side(fun, acceleration)
+    if t_span is None or y0 is None:
+        raise TypeError(f"solve_ivp: {'t_span' if t_span is None else 'y0'} is missing.")
+    common = {"t_eval": t_eval, "dense_output": dense_output, "events": events, "vectorized": vectorized, "args": args}
+    method = _with_projection(method, [name for name in options if name in OWN])
+    if not (isinstance(method, type) and issubclass(method, EIPSolver)):
+        sol = scipy.integrate.solve_ivp(function, t_span, y0, method=method, **common, **options)
+        return OdeResult(sol, trusted=bool(sol.success), diagnostics=Diagnostics())
+    common["args"], extra = _unpacked(args)
+    if kept and extra:
+        options["invariants"] = tuple(_with_arguments(item, extra) for item in kept)
+    if jacobian is not None and extra:
+        options["jacobian"] = lambda *first: jacobian(*first, *extra)
+    record = options.setdefault("diagnostics", Diagnostics())
+    start = initial_state(y0) if options.get("project_initial") else None
+    noting, solvers = _noting(method, start)
+    sol = scipy.integrate.solve_ivp(
+        function, t_span, y0 if start is None else start, method=noting, **common, **options
+    )
+    if sol.status == 1:  # SciPy does not tell the solver that its run has ended
+        solvers[0]._watch(ended=True)
+    message = f"{sol.message}; {record.message}" if record.message else sol.message
+    return OdeResult(sol, message=message, trusted=bool(sol.success) and record.trusted, diagnostics=record)
+
+
+def _right_hand_side(fun: Any, acceleration: Any) -> Any:
+    """Return the function that is given, or the right-hand side of an acceleration."""
+    name, given = ("fun", fun) if acceleration is None else ("acceleration", acceleration)
+    if acceleration is not None and fun is not None:
+        raise TypeError("solve_ivp: give fun or acceleration, not both.")
+    if given is None:
+        raise TypeError("solve_ivp: fun is missing; give a function fun(t, y), or acceleration=a(t, q).")
+    if not callable(given):
+        hint = "; a Problem is solved by problem.solve_ivp(method=...)" if hasattr(given, "solve_ivp") else ""
+        raise TypeError(f"solve_ivp: {name} must be callable, got {shown(given)}{hint}.")
+    return fun if acceleration is None else AccelerationField(acceleration)
+
+
+def _with_projection(method: Any, given: list[str]) -> Any:
+    """Return the EIP method on a method of SciPy if options of EIP methods are given; otherwise the method itself."""
+    is_class = isinstance(method, type) and issubclass(method, OdeSolver)
+    if not given or not (is_class or method in EXPLICIT or method in IMPLICIT):
+        return method
+    if not is_class and method in EXPLICIT:
+        return EXPLICIT[method]
+    if is_class and hasattr(method, "A"):
+        return eip_method(method)
+    if refused := [name for name in given if name in ProjectionOptions.names()]:
+        raise TypeError(
+            f"solve_ivp: the method {getattr(method, '__name__', method)} takes no {', '.join(refused)}; give an EIP "
+            "method such as EIPDOP853, or omit these options."
+        )
+    return method
+
+
+def _unpacked(args: Any) -> tuple[Any, tuple[Any, ...]]:
+    """Return `args` for SciPy, which says what is wrong with them, and the arguments in them."""
+    try:
+        extra = () if args is None else tuple(args)
+    except TypeError:
+        return args, ()
+    return None if args is None else extra, extra
+
+
+def _with_arguments(item: Invariant, extra: tuple[Any, ...]) -> Invariant:
+    """Return an invariant with the arguments of the call after its own, unless both are the same."""
+    new = copy(item)
+    new.args = item.args if are_same(item.args, extra) else (*item.args, *extra)
+    return new
+
+
+def _noting(method: type[EIPSolver], start: np.ndarray | None) -> tuple[type[EIPSolver], list[EIPSolver]]:
+    """Return the class, and a list to which it adds its solver.
+
+    The state from which the solver starts is written to `start`, the initial state of SciPy's loop: it is the first of
+    the states that are returned, and the one at which the events are evaluated first.
+    """
+    solvers: list[EIPSolver] = []
+
+    def __init__(self: Any, *arguments: Any, **options: Any) -> None:  # noqa: N807
+        super(noting, self).__init__(*arguments, **options)
+        solvers.append(self)
+        if start is not None:
+            start[:] = self.y
+
+    noting: Any = SolverClass(method.__name__, (method,), {"__init__": __init__, "__doc__": method.__doc__})
+    return noting, solvers

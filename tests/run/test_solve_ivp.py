@@ -1,0 +1,406 @@
+"""`eip_scipy.solve_ivp`: SciPy's function to the last bit, with arguments for invariants and a judged result."""
+
+import copy
+import inspect
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.integrate
+
+import eip_scipy
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ14,
+    EIPRK1,
+    EIPRK4,
+    EIPRK45,
+    EIPRKN12,
+    Diagnostics,
+    Invariant,
+    OdeResult,
+    ProjectionWarning,
+    eip_method,
+    solve_ivp,
+)
+from eip_scipy.core.options import ProjectionOptions
+from eip_scipy.problems import kepler
+
+K = 2.0
+SciPyResult = type(scipy.integrate.solve_ivp(lambda t, y: y, (0, 0), [1.0]))
+
+
+def spring(t, y, k):
+    return np.array([y[1], -k * y[0]])
+
+
+def energy(t, y, k):
+    return 0.5 * (y[1] ** 2 + k * y[0] ** 2)
+
+
+def gradient(t, y, k):
+    return np.array([k * y[0], y[1]])
+
+
+def crossing(t, y, k):
+    return y[0]
+
+
+def second_fall(t, y, k):
+    return y[0] + 0.1
+
+
+def rotation(t, y, k):
+    return 1j * k * y
+
+
+def norm(t, y, k):
+    return np.sum(np.abs(y) ** 2)
+
+
+def twice(t, y, k):
+    return 2 * y
+
+
+second_fall.terminal, second_fall.direction = 2, -1
+ENERGY = Invariant(energy, gradient, name="energy")
+BOUND = Invariant(energy, gradient, args=(K,), name="energy")
+CASES = {
+    "plain": {},
+    "method": {"method": EIPDOP853, "rtol": 1e-9, "atol": [1e-12, 1e-10]},
+    "t_eval": {"t_eval": [0.0, 0.1, 3.0, 7.0]},
+    "dense": {"dense_output": True, "t_eval": np.linspace(0, 7, 5)},
+    "events": {"events": [crossing, second_fall], "dense_output": True},
+    "one event": {"events": crossing},
+    "bounds": {"first_step": 1e-3, "max_step": 0.2},
+    "fixed": {"method": EIPRK4, "h": 0.05, "every": 3},
+    "options": {"metric": "euclidean", "iterations": 2, "direction": "old", "blocks": 1, "compensated": True},
+    "backward": {"t_span": (7, -1), "t_eval": [6, 0, -1]},
+    "zero": {"t_span": (2, 2)},
+    "zero sampled": {"t_span": (2, 2), "t_eval": [2], "dense_output": True},
+    "vectorized": {"vectorized": True},
+    "multistep": {"method": EIPGJ14, "h": 0.05},
+    "complex": {"fun": rotation, "y0": [1.0, 1j], "invariants": Invariant(norm, twice, name="norm")},
+    "lists": {"t_span": [0, 7], "y0": (1, 0), "args": [K]},
+}
+
+
+def jacobian(t, q, dq, out, k):
+    out[:] = -k * dq
+
+
+def assert_same(one, other):
+    """Assert that two results agree to the last bit, messages and counts included."""
+    for name in ("t", "y", "nfev", "njev", "nlu", "status", "success", "message"):
+        np.testing.assert_array_equal(one[name], other[name], name)
+    for name in ("t_events", "y_events"):
+        assert (one[name] is None) == (other[name] is None)
+        for a, b in zip(one[name] or [], other[name] or [], strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert (one["sol"] is None) == (other["sol"] is None)
+    if one["sol"] is not None:
+        times = np.linspace(one["sol"].t_min, one["sol"].t_max, 7)
+        np.testing.assert_array_equal(one["sol"](times), other["sol"](times))
+
+
+@pytest.mark.parametrize("kept", [True, False])
+@pytest.mark.parametrize("name", CASES)
+def test_the_same_bits_as_through_scipy(name, kept):
+    """The invariants take their arguments from the call in one run, and as their own in the other."""
+    given = {"fun": spring, "t_span": (0, 7), "y0": [1.0, 0.0], "method": EIPRK45, "args": (K,), "invariants": ENERGY}
+    given |= CASES[name]
+    own = {**given, "invariants": Invariant(norm, twice, args=(K,), name="norm") if name == "complex" else BOUND}
+    if name == "multistep":
+        given["jacobian"], own["jacobian"] = jacobian, lambda t, q, dq, out: jacobian(t, q, dq, out, K)
+    if not kept:
+        del given["invariants"], own["invariants"]
+    typed, plain = solve_ivp(**given), scipy.integrate.solve_ivp(**own)
+    assert_same(typed, plain)
+    assert isinstance(typed, OdeResult)
+    assert isinstance(typed, SciPyResult)
+    assert typed.trusted
+    assert set(typed) == {*plain, "trusted", "diagnostics"}
+    assert typed.diagnostics.names == ((("norm",) if name == "complex" else ("energy",)) if kept else ())
+
+
+@pytest.mark.parametrize("method", ["RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA", scipy.integrate.Radau])
+def test_scipys_methods_are_scipys(method):
+    options = {"method": method, "events": crossing, "args": (K,), "dense_output": True, "rtol": 1e-6}
+    if method in ("Radau", "BDF"):
+        options["jac"] = lambda t, y, k: np.array([[0.0, 1.0], [-k, 0.0]])
+    typed, plain = (solve(spring, (0, 3), [1.0, 0.0], **options) for solve in (solve_ivp, scipy.integrate.solve_ivp))
+    assert_same(typed, plain)
+    assert typed.trusted
+    assert typed.diagnostics.names == ()
+
+
+@pytest.mark.parametrize(
+    ("method", "stands_for"),
+    [
+        ("RK45", EIPRK45),
+        ("DOP853", EIPDOP853),
+        (scipy.integrate.RK45, EIPRK45),
+        (scipy.integrate.RK23, eip_scipy.EIPRK23),
+        (eip_method(EIPRK4.TABLEAU), EIPRK4),
+    ],
+)
+def test_methods_of_scipy_with_invariants(method, stands_for):
+    step = {"h": 0.05} if stands_for is EIPRK4 else {}
+    one, other = (
+        solve_ivp(spring, (0, 3), [1.0, 0.0], m, args=(K,), invariants=energy, **step) for m in (method, stands_for)
+    )
+    assert_same(one, other)
+    assert one.diagnostics.names == ("energy",)
+    fixed = solve_ivp(spring, (0, 3), [1.0, 0.0], "RK45", args=(K,), h=0.5)
+    np.testing.assert_allclose(np.diff(fixed.t), 0.5)
+
+
+@pytest.mark.parametrize("method", ["Radau", "LSODA", scipy.integrate.BDF])
+def test_implicit_methods_refuse_invariants(method):
+    name = getattr(method, "__name__", method)
+    with pytest.raises(TypeError, match=rf"solve_ivp: the method {name} takes no invariants; give an EIP method"):
+        solve_ivp(spring, (0, 3), [1.0, 0.0], method, args=(K,), invariants=energy)
+    assert solve_ivp(spring, (0, 3), [1.0, 0.0], method, args=(K,), invariants=()).success
+
+
+BAD = [
+    {"method": "RK4"},
+    {"method": int},
+    {"args": 2.0},
+    {"t_eval": [0, 9]},
+    {"t_eval": [1, 0.5]},
+    {"t_eval": [[0, 1]]},
+    {"t_span": (0, 1, 2)},
+    {"y0": [[1.0, 0.0]]},
+    {"y0": [np.nan, 0.0]},
+    {"y0": ["a", 0.0]},
+    {"rtol": [1e-3, 1e-3, 1e-3]},
+    {"atol": -1e-3},
+    {"first_step": -1},
+    {"first_step": 100},
+    {"max_step": 0},
+    {"events": [second_fall, 3]},
+    {"every": 0},
+    {"metric": "taxicab"},
+    {"h": -1, "method": EIPRK4},
+    {"method": EIPRK1},
+    {"diagnostics": 1},
+]
+
+
+@pytest.mark.parametrize("wrong", BAD, ids=lambda wrong: "-".join(wrong))
+def test_the_same_errors_as_through_scipy(wrong):
+    given = {"fun": spring, "t_span": (0, 7), "y0": [1.0, 0.0], "method": EIPRK45, "args": (K,)} | wrong
+    with pytest.raises((TypeError, ValueError)) as through_scipy:
+        scipy.integrate.solve_ivp(**given)
+    with pytest.raises(through_scipy.type) as typed:
+        solve_ivp(**given)
+    assert str(typed.value) == str(through_scipy.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "fun is missing"),
+        ({"fun": spring}, "t_span is missing"),
+        ({"fun": spring, "t_span": (0, 1)}, "y0 is missing"),
+        ({"fun": spring, "acceleration": spring}, "fun or acceleration, not both"),
+        ({"acceleration": 3}, "acceleration must be callable, got 3"),
+        ({"fun": kepler()}, r"fun must be callable, got .*problem\.solve_ivp"),
+    ],
+)
+def test_what_is_missing(given, message):
+    with pytest.raises(TypeError, match=message):
+        solve_ivp(**given)
+
+
+def test_warnings_name_the_line_of_the_call():
+    with pytest.warns(UserWarning, match="no effect for a chosen solver: `hh`. `hh`: did you mean 'h'") as found:
+        solve_ivp(spring, (0, 1), [1.0, 0.0], args=(K,), hh=0.1)
+    with pytest.warns(UserWarning, match="`rtol` is too small") as low:
+        solve_ivp(spring, (0, 1), [1.0, 0.0], args=(K,), rtol=1e-20, invariants=energy)
+    assert {item.filename for item in [*found, *low]} == {__file__}
+
+
+def test_arguments_of_invariants():
+    """They come after the invariant's own; equal ones are not given twice; a function that takes none is an error."""
+
+    def scaled(t, y, factor, k):
+        return factor * energy(t, y, k)
+
+    sol = solve_ivp(spring, (0, 5), [1.0, 0.0], args=(K,), invariants=[Invariant(scaled, args=(3.0,)), BOUND])
+    assert sol.trusted
+    assert BOUND.args == (K,)
+    with pytest.raises(TypeError, match=r"'invariant 0' is called with \(t, y, args\[0\]\).*those of the call"):
+        solve_ivp(spring, (0, 5), [1.0, 0.0], args=(K,), invariants=lambda t, y: y @ y)
+
+
+def test_accelerations():
+    """q'' = -k q by an acceleration, against its closed form."""
+    options = {"method": EIPRKN12, "args": (K,), "rtol": 1e-11, "atol": 1e-12, "invariants": energy}
+    sol = solve_ivp(acceleration=lambda t, q, k: -k * q, t_span=(0, 5), y0=[1.0, 0.0], **options)
+    np.testing.assert_allclose(sol.y[0], np.cos(np.sqrt(K) * sol.t), atol=1e-10)
+    assert_same(sol, solve_ivp(spring, (0, 5), [1.0, 0.0], **options))
+
+
+TARGET = Invariant(energy, gradient, target=K / 2 * 1.1**2, name="energy")
+
+
+@pytest.mark.parametrize("sampled", [{}, {"t_eval": [0, 1]}, {"dense_output": True}, {"t_span": (0, 0)}], ids=str)
+@pytest.mark.parametrize("y0", [[1, 0], np.array([1.0, 0.0])], ids=["integers", "array"])
+def test_the_projected_start_is_the_first_state(sampled, y0):
+    """From (1, 0) the energy of (1.1, 0) is reached along its gradient, (k, 0); y0 itself stays what it was."""
+    given = {"t_span": (0, 3), "args": (K,), "invariants": TARGET, "project_initial": True} | sampled
+    sol = solve_ivp(spring, y0=y0, **given)
+    np.testing.assert_allclose(sol.y[:, 0], [1.1, 0.0], rtol=1e-15)
+    assert sol.y.dtype == float
+    np.testing.assert_array_equal(y0, [1, 0])
+    if sol.sol is not None:
+        np.testing.assert_array_equal(sol.sol(0.0), sol.y[:, 0])
+
+
+def test_events_are_evaluated_at_the_projected_start():
+    """An event between the given start and the projected one does not happen."""
+    sol = solve_ivp(
+        spring, (0, 0.2), [1, 0], args=(K,), invariants=TARGET, project_initial=True, events=lambda t, y, k: y[0] - 1.05
+    )
+    # y = 1.1 cos(sqrt(2) t) passes 1.05 at t = 0.2144.
+    assert sol.t_events[0].size == 0
+    moved = solve_ivp(
+        spring, (0, 0.3), [1, 0], args=(K,), invariants=TARGET, project_initial=True, events=lambda t, y, k: y[0] - 1.05
+    )
+    np.testing.assert_allclose(moved.t_events[0], [np.arccos(1.05 / 1.1) / np.sqrt(K)], rtol=1e-4)
+
+
+def damped(t, y, k):
+    return spring(t, y, k) - [0.0, 0.5 * y[1]]
+
+
+@pytest.mark.parametrize("stopped", [False, True], ids=["to the end", "by an event"])
+def test_runs_that_are_not_reliable(stopped):
+    """The message says so, a warning comes once, and a given record is the result's.
+
+    SciPy ends a run at an event without the solver's knowledge: after three steps nothing has been checked before.
+    """
+    record = Diagnostics()
+
+    def event(t, y, k):
+        return t - 0.12
+
+    event.terminal = True
+    options = {"args": (K,), "diagnostics": record, "h": 0.05, "method": EIPRK4}
+    with pytest.warns(ProjectionWarning, match="'energy' is no invariant of this system") as found:
+        sol = solve_ivp(damped, (0, 20), [1.0, 0.0], invariants=ENERGY, events=event if stopped else None, **options)
+    assert len(found) == 1
+    assert (sol.status, sol.success, sol.trusted) == (int(stopped), True, False)
+    assert sol.diagnostics is record
+    assert sol.message.endswith(f"; {record.message}")
+    assert "'energy'" in record.message
+
+
+def test_failed_runs():
+    def singular(t, y):
+        return y**2
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        sol = solve_ivp(singular, (0, 2), [1.0])
+    assert (sol.status, sol.success, sol.trusted) == (-1, False, False)
+
+
+def test_results_pickle_copy_and_print():
+    sol = solve_ivp(
+        spring, (0, 3), [1.0, 0.0], args=(K,), invariants=ENERGY, dense_output=True, events=crossing, rtol=1e-6
+    )
+    pickled = pickle.loads(pickle.dumps(sol))
+    times = np.linspace(0, 3, 7)
+    np.testing.assert_allclose(pickled.sol(times), sol.sol(times), rtol=1e-12, atol=1e-13)
+    for other in (pickled, copy.deepcopy(sol), copy.copy(sol)):
+        assert type(other) is OdeResult
+        assert_same(other | {"sol": None}, sol | {"sol": None})
+        assert other.trusted is True
+        np.testing.assert_array_equal(other.diagnostics.max_defect, sol.diagnostics.max_defect)
+    assert "trusted: True" in repr(sol)
+    assert "energy" in repr(sol)
+
+
+def test_the_signature_is_scipys_with_the_options():
+    shown, scipys = (list(inspect.signature(f).parameters) for f in (solve_ivp, scipy.integrate.solve_ivp))
+    assert shown[: len(scipys) - 1] == scipys[:-1]
+    assert set(ProjectionOptions.names()) < set(shown)
+
+
+USER_CODE = """
+import numpy as np
+from numpy.typing import NDArray
+
+from eip_scipy import EIPDOP853, Diagnostics, Invariant, OdeResult, integrate, solve_ivp
+
+Array = NDArray[np.float64]
+
+
+def fun(t: float, y: Array, k: float) -> list[float]:
+    return [y[1], -k * y[0]]
+
+
+def energy(t: float, y: Array, k: float) -> float:
+    return float(0.5 * (y[1] ** 2 + k * y[0] ** 2))
+
+
+def run(tight: float) -> OdeResult:
+    sol = solve_ivp(
+        fun, (0, 1), [1.0, 0.0], EIPDOP853, np.linspace(0, 1, 3), events=[energy], args=(2.0,), rtol=tight,
+        atol=[1e-9, 1e-12], invariants=[energy, Invariant(energy, name="H")], metric="euclidean", every="auto",
+        direction="old", blocks=[[0, 1]], project_initial=False, diagnostics=Diagnostics(),
+    )
+    defect: float = sol.diagnostics.max_defect.max()
+    text: str = sol.message
+    print(sol.y[:, -1], sol["t"], defect, text, sol.t_events[0] if sol.t_events else None)
+    plain: OdeResult = solve_ivp(fun, [0, 1], np.ones(2), "Radau", args=[2.0], jac=lambda t, y, k: np.eye(2))
+    return sol if sol.trusted and plain.success else plain
+
+
+integrate(fun, (0, 1), [1.0, 0.0], method=EIPDOP853, invariants=energy, blocks=2)
+# Below this line each statement has an error.
+solve_ivp(fun, (0, 1), [1.0, 0.0], hh=0.01)
+solve_ivp(fun, (0, 1), [1.0, 0.0], invariants=3)
+solve_ivp(fun, (0, 1), [1.0, 0.0], iterations="two")
+solve_ivp(fun, (0, 1), [1.0, 0.0], metric="taxicab")
+solve_ivp(fun, (0, 1), [1.0, 0.0], direction="up")
+print(solve_ivp(fun, (0, 1), [1.0, 0.0]).succes)
+integrate(fun, (0, 1), [1.0, 0.0], hh=0.01)
+"""
+
+
+@pytest.mark.slow
+def test_user_code_under_mypy(tmp_path):
+    """Correct code passes --strict, and each wrong option is found at its line."""
+    pytest.importorskip("mypy")
+    root = Path(eip_scipy.__file__).parents[1]
+    paths = {} if root.name == "site-packages" else {"MYPYPATH": str(root)}
+    path = tmp_path / "user.py"
+    path.write_text(USER_CODE, encoding="utf-8")
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--strict",
+        "--follow-imports=silent",
+        "--config-file=",
+        "--no-error-summary",
+    ]
+    found = subprocess.run(
+        [*command, f"--cache-dir={tmp_path / 'cache'}", str(path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        env=os.environ | paths,
+    )
+    lines = USER_CODE.splitlines()
+    first = next(k for k, line in enumerate(lines, 1) if "each statement" in line) + 1
+    errors = [int(line.split(":")[1]) for line in found.stdout.splitlines() if ": error: " in line]
+    assert errors == list(range(first, len(lines) + 1)), found.stdout + found.stderr
