@@ -26,8 +26,8 @@ else:
     FLAGS += ["-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-cast-function-type", "-Wno-missing-field-initializers"]
     V3, QUICK, OLD = ["-march=x86-64-v3"], "-O1", ["-O1"]
 MISSING = """\
-eip_scipy's engine is written in C++20, and no compiler built it. Install one: g++ 11 or newer (Debian, Ubuntu: apt
-install g++; Fedora: dnf install gcc-c++), clang 14 or newer, or on macOS Xcode's tools (xcode-select --install)."""
+eip_scipy's engine is written in C++20, and no compiler built it. Install one: g++ 12 or newer (Debian, Ubuntu: apt
+install g++; Fedora: dnf install gcc-c++), clang 15 or newer, or on macOS Xcode's tools (xcode-select --install)."""
 
 # For .ci: a folder with modules built before. Those of other sources are refused when they are imported.
 BUILT = os.environ.get("EIP_SCIPY_BUILT")

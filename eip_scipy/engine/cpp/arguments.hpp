@@ -1,14 +1,14 @@
 // Functions of whole arrays for Python: each argument is looked at here, by the type that the function asks for.
 #pragma once
 
+#include "python.hpp"
+
 #include <algorithm>
 #include <array>
 #include <cstddef>
 #include <tuple>
 #include <type_traits>
 #include <utility>
-
-#include "python.hpp"
 
 namespace eip {
 

@@ -6,7 +6,7 @@
 namespace eip {
 
 // Subnormal numbers are numbers here, whatever another library left in the processor's mode.
-class FloatingPoint {
+class [[maybe_unused]] FloatingPoint {
   public:
 #if defined(__SSE2__)
     FloatingPoint() : mode_(__builtin_ia32_stmxcsr()) { __builtin_ia32_ldmxcsr(mode_ & ~0x8040u); }

@@ -1,8 +1,8 @@
 // Gradients of functions in Python by complex steps: Im I(y + i h e_k) / h, which loses no digit to a difference.
+#include "functions.hpp"
+
 #include <cmath>
 #include <vector>
-
-#include "functions.hpp"
 
 namespace eip {
 

@@ -1,8 +1,9 @@
 // The library's functions among Python's objects.
 #pragma once
 
-#include "library.hpp"
 #include "python.hpp"
+
+#include "library.hpp"
 
 namespace eip {
 

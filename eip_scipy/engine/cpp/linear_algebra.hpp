@@ -95,7 +95,10 @@ inline Truth<Value> gram_solution(const MatrixOf<Value> &R, const Value *g, Valu
     const int64_t rows = R.rows;
     constexpr double LEAST = REORTHOGONALISE * REORTHOGONALISE;
     Truth<Value> bad{};
-    for (int64_t i = 0; i < rows; ++i) bad = bad | !((R(i, i) > 1e-140) & (R(i, i) < 1e140));
+    for (int64_t i = 0; i < rows; ++i) {
+        const Value diagonal = R(i, i);
+        bad = bad | !((diagonal > 1e-140) & (diagonal < 1e140));
+    }
     if (!any(!bad)) return !bad;
     if (rows == 2) {
         const Value determinant = R(0, 0) * R(1, 1) - R(1, 0) * R(1, 0);

@@ -1,7 +1,8 @@
 // The binding: an Engine holds a run's arrays and functions, and steps.
 #define EIP_IMPORTS_NUMPY
-#include "calls.hpp"
 #include "functions.hpp"
+
+#include "calls.hpp"
 #include "library_functions.hpp"
 #include "python_functions.hpp"
 #include "records.hpp"

@@ -1,4 +1,5 @@
 // Python objects and NumPy arrays, each looked at in one place before their memory is used.
+// Included before all headers of the standard library, as Python asks.
 #pragma once
 
 #define PY_SSIZE_T_CLEAN

@@ -1,10 +1,11 @@
 // A user's functions in Python, called with arrays of their own, as SciPy calls them.
 #pragma once
 
+#include "python.hpp"
+
 #include <optional>
 #include <vector>
 
-#include "python.hpp"
 #include "system.hpp"
 
 namespace eip {

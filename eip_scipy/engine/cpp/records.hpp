@@ -2,8 +2,9 @@
 // keep their memory, so that Python reads what the engine writes.
 #pragma once
 
-#include "engine.hpp"
 #include "python.hpp"
+
+#include "engine.hpp"
 
 namespace eip {
 

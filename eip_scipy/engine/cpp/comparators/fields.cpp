@@ -1,8 +1,9 @@
 // What the implicit schemes for the Gross-Pitaevskii equation do point by point.
+#include "../functions.hpp"
+
 #include <cmath>
 
 #include "../arguments.hpp"
-#include "../functions.hpp"
 #include "../pairs.hpp"
 
 namespace eip {

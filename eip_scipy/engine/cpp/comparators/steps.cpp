@@ -1,10 +1,11 @@
 // The loop over steps of one length that the comparators share.
+#include "../functions.hpp"
+
 #include <chrono>
 #include <optional>
 #include <string_view>
 
 #include "../calls.hpp"
-#include "../functions.hpp"
 #include "../python_functions.hpp"
 #include "../records.hpp"
 #include "schemes.hpp"

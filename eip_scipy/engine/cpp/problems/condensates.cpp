@@ -2,10 +2,11 @@
 //
 // Sums are those of blocks of a few hundred points, each in lanes of its own: the same bits on every machine, and the
 // error of a sum over a few hundred numbers, not of one over all.
+#include "../functions.hpp"
+
 #include <cmath>
 
 #include "../arguments.hpp"
-#include "../functions.hpp"
 #include "../pairs.hpp"
 
 namespace eip {
@@ -94,7 +95,7 @@ inline void put_phase(double angle, double *phase) {
     const double turn = k - 4 * whole(0.25 * k - 0.375);  // 0, 1, 2 or 3 quarters
     const bool odd = (turn == 1.0) | (turn == 3.0);
     const double cosine = odd ? s : c, sine = odd ? c : s;
-    phase[0] = (turn == 1.0) | (turn == 2.0) ? -cosine : cosine;
+    phase[0] = turn == 1.0 || turn == 2.0 ? -cosine : cosine;
     phase[1] = turn >= 2.0 ? sine : -sine;
 }
 

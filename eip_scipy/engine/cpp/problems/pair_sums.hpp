@@ -19,27 +19,27 @@ namespace eip {
 #if defined(__AVX__)
 inline void load_bodies(const double *a, Vector *xyz) {
     const Vector u = load(a), v = load(a + 4), w = load(a + 8);
-    xyz[0] = __builtin_shuffle(__builtin_shuffle(u, v, Bits{0, 3, 6, 6}), w, Bits{0, 1, 2, 5});
-    xyz[1] = __builtin_shuffle(__builtin_shuffle(u, v, Bits{1, 4, 7, 7}), w, Bits{0, 1, 2, 6});
-    xyz[2] = __builtin_shuffle(__builtin_shuffle(u, v, Bits{2, 5, 5, 5}), w, Bits{0, 1, 4, 7});
+    xyz[0] = __builtin_shufflevector(__builtin_shufflevector(u, v, 0, 3, 6, 6), w, 0, 1, 2, 5);
+    xyz[1] = __builtin_shufflevector(__builtin_shufflevector(u, v, 1, 4, 7, 7), w, 0, 1, 2, 6);
+    xyz[2] = __builtin_shufflevector(__builtin_shufflevector(u, v, 2, 5, 5, 5), w, 0, 1, 4, 7);
 }
 
 // The first `count` of them, 2 or 4. In vectors, as they are read: what is read must not wait for two stores.
 template <int COUNT>
 inline void store_bodies(const Vector *xyz, double *a) {
-    const Vector first = __builtin_shuffle(xyz[0], xyz[1], Bits{0, 4, 1, 5});
-    const Vector rest = __builtin_shuffle(first, xyz[2], Bits{3, 5, 3, 5});
-    store(__builtin_shuffle(first, xyz[2], Bits{0, 1, 4, 2}), a);
+    const Vector first = __builtin_shufflevector(xyz[0], xyz[1], 0, 4, 1, 5);
+    const Vector rest = __builtin_shufflevector(first, xyz[2], 3, 5, 3, 5);
+    store(__builtin_shufflevector(first, xyz[2], 0, 1, 4, 2), a);
     if constexpr (COUNT == 2) {
         std::memcpy(a + 4, &rest, 2 * sizeof(double));
     } else {
-        const Vector last = __builtin_shuffle(xyz[0], xyz[1], Bits{2, 6, 3, 7});
-        store(__builtin_shuffle(rest, last, Bits{0, 1, 4, 5}), a + 4);
-        store(__builtin_shuffle(last, xyz[2], Bits{6, 2, 3, 7}), a + 8);
+        const Vector last = __builtin_shufflevector(xyz[0], xyz[1], 2, 6, 3, 7);
+        store(__builtin_shufflevector(rest, last, 0, 1, 4, 5), a + 4);
+        store(__builtin_shufflevector(last, xyz[2], 6, 2, 3, 7), a + 8);
     }
 }
 
-inline Vector swapped_halves(Vector v) { return __builtin_shuffle(v, Bits{2, 3, 0, 1}); }
+inline Vector swapped_halves(Vector v) { return __builtin_shufflevector(v, v, 2, 3, 0, 1); }
 #else
 inline void load_bodies(const double *a, Vector *xyz) {
     const Vector u = load(a), v = load(a + 2), w = load(a + 4);
@@ -83,8 +83,8 @@ inline void load_sources(const double *q, const double *gm, int64_t j, Octet *xy
         of[3] = load(gm + j);
         Octet *out[4] = {xyz, xyz + 1, xyz + 2, &m};
         for (int c = 0; c < 4; ++c) {
-            out[c]->part[0] = __builtin_shuffle(of[c], Bits{0, 0, 1, 1});
-            out[c]->part[1] = __builtin_shuffle(of[c], Bits{2, 2, 3, 3});
+            out[c]->part[0] = __builtin_shufflevector(of[c], of[c], 0, 0, 1, 1);
+            out[c]->part[1] = __builtin_shufflevector(of[c], of[c], 2, 2, 3, 3);
         }
         return;
     }
@@ -190,10 +190,10 @@ struct LastTwo {
     // Adds the reactions of eight sources to target t.
     void take(int t, bool begin, const Octet &reaction, const Octet *distance) {
         const auto across = [=](Vector before, Vector v) {
-            return begin ? __builtin_shuffle(v, Vector{}, Bits{0, 1, 4, 5})
-                         : __builtin_shuffle(before, v, Bits{2, 3, 4, 5});
+            return begin ? __builtin_shufflevector(v, Vector{}, 0, 1, 4, 5)
+                         : __builtin_shufflevector(before, v, 2, 3, 4, 5);
         };
-        const auto within = [](const Octet &v) { return __builtin_shuffle(v.part[0], v.part[1], Bits{2, 3, 4, 5}); };
+        const auto within = [](const Octet &v) { return __builtin_shufflevector(v.part[0], v.part[1], 2, 3, 4, 5); };
         for (int c = 0; c < 3; ++c) {
             const Vector pull = -across(w[t], reaction.part[0]);
             const Vector first = fused(pull, across(d[t][c], distance[c].part[0]), sums[t][c]);
@@ -212,8 +212,9 @@ struct LastTwo {
         for (int t = 0; t < 2; ++t) {
             // A body's own pull is 0: in the third stream that of the first, in the fourth that of the second.
             const auto behind = [=](Vector before, Vector v) {
-                const Vector all = __builtin_shuffle(before, v, Bits{2, 3, 4, 5});
-                return __builtin_shuffle(all, Vector{}, t == 0 ? Bits{0, 1, 4, 3} : Bits{0, 1, 2, 4});
+                const Vector all = __builtin_shufflevector(before, v, 2, 3, 4, 5);
+                return t == 0 ? __builtin_shufflevector(all, Vector{}, 0, 1, 4, 3)
+                              : __builtin_shufflevector(all, Vector{}, 0, 1, 2, 4);
             };
             const Vector pull = behind(w[t], cube.times(gm[first + 1 - t]).part[0]);
             for (int c = 0; c < 3; ++c) {
@@ -224,11 +225,11 @@ struct LastTwo {
         // (s[0] + s[2]) + (s[1] + s[3]) of each; stored in vectors, as they are read.
         const auto halves = [&](int k) {
             const Vector u = streams[k], v = streams[k + 1];
-            return __builtin_shuffle(u, v, Bits{0, 1, 4, 5}) + __builtin_shuffle(u, v, Bits{2, 3, 6, 7});
+            return __builtin_shufflevector(u, v, 0, 1, 4, 5) + __builtin_shufflevector(u, v, 2, 3, 6, 7);
         };
         const Vector a = halves(0), b = halves(2), c = halves(4);
-        eip::store(__builtin_shuffle(a, b, Bits{0, 2, 4, 6}) + __builtin_shuffle(a, b, Bits{1, 3, 5, 7}), out + 3 * first);
-        const Vector rest = c + __builtin_shuffle(c, Bits{1, 0, 3, 2});
+        eip::store(__builtin_shufflevector(a, b, 0, 2, 4, 6) + __builtin_shufflevector(a, b, 1, 3, 5, 7), out + 3 * first);
+        const Vector rest = c + __builtin_shufflevector(c, c, 1, 0, 3, 2);
         out[3 * first + 4] = rest[0];
         out[3 * first + 5] = rest[2];
     }
