@@ -24,7 +24,7 @@ TRIALS = ((1e-2, 1e-7), (1e-4, 1e-9), (1e-6, 1e-10))
 DIFFERENCE_WEIGHTS = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
 LOWER_WEIGHTS = (2 / 3, -1 / 12, 0.0)
 # As in engine/cpp/differences.hpp.
-FIRST_SHIFT, SHORTER, MOST_SHIFTS = 5e-3, 1 / 16, 5
+FIRST_SHIFT, SHORTER, MOST_SHIFTS = 5e-3, 1 / 16, 7
 DIFFER, ROUNDINGS, LEAST = 1e-8, 1e3, np.finfo(float).tiny
 
 
@@ -110,8 +110,9 @@ class NumericalGradient:
 def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -> Array:
     """Gradient of value(y) by central differences of order 6, shifts in units of |y_k| + floor_k.
 
-    Where those of order 4 do not agree, as beside a singularity that is nearer than the state's size, the shifts are
-    shortened while that helps. The engine computes the same bits (engine/cpp/differences.hpp).
+    Where those of order 4 do not agree, as next to a singularity that is nearer than the state's size, the shifts are
+    shortened until they do; if they never do, the shift at which the orders agree best is taken. The engine computes
+    the same bits (engine/cpp/differences.hpp).
     """
 
     def along(k: int, unit: complex) -> Any:
@@ -123,8 +124,6 @@ def difference_gradient(value: Callable[[Array], Any], y: Array, floor: Array) -
             found = np.full_like(sums, np.nan) if found is None else found
             if excess < least:
                 found, least = sums / shift, excess
-            elif least < np.inf:
-                break
             if least <= 1:
                 break
             shift *= SHORTER

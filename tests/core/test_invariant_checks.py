@@ -147,6 +147,36 @@ def test_a_complex_step_next_to_a_singularity():
     np.testing.assert_allclose(run.y[:, -1], y0, rtol=0, atol=1e-3)  # the orbit is closed
 
 
+@pytest.mark.parametrize("takes_complex", [True, False])
+@pytest.mark.parametrize("distance", [3e-4, 3e-5, 3e-6])
+def test_a_computed_gradient_close_to_a_singularity(distance, takes_complex):
+    """A body on a circle about a mass at (1, 1): shifts of 5e-3 of a component's size reach far beyond that mass."""
+
+    def pull(t, y):
+        r = y[:2] - 1.0
+        return np.concatenate([y[2:], -r / (r @ r) ** 1.5])
+
+    def kept(t, y):
+        if not takes_complex:
+            y = np.array(y, float)
+        r2 = (y[0] - 1) ** 2 + (y[1] - 1) ** 2
+        return 0.5 * (y[2] ** 2 + y[3] ** 2) - r2**-0.5
+
+    def slope(t, y):
+        r = y[:2] - 1.0
+        return np.concatenate([r / (r @ r) ** 1.5, y[2:]])
+
+    turn, y0 = 2 * np.pi * distance**1.5, np.array([1.0 + distance, 1.0, 0.0, distance**-0.5])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", f".*{NO_COMPLEX_STEP}")
+        found = InvariantSet(kept, 0.0, y0, pull(0, y0), turn / 100)
+        run = integrate(pull, (0, turn / 4), y0, method=EIPDOP853, rtol=1e-9, atol=1e-14, invariants=kept)
+    assert found.grads[0].complex_step == takes_complex
+    np.testing.assert_allclose(found.gradients(0.0, y0, y0)[0], slope(0, y0), rtol=0, atol=1e-7 * distance**-2)
+    assert run.trusted
+    np.testing.assert_allclose(run.y[:2, -1], [1.0, 1.0 + distance], rtol=0, atol=1e-6 * distance)
+
+
 class RefusedError(Exception):
     """What a library may raise that does not know complex numbers."""
 

@@ -8,9 +8,11 @@ namespace eip {
 
 namespace {
 
-// Steps of the differences that a gradient is compared with, one to one side, then one to both, and how far they may
-// differ: in units of the sum of the derivative's terms, and in roundings of the values.
-constexpr double ONE_SIDED = 1e-8, TWO_SIDED = 1e-5, AGREEMENT = 1e-6, ROUNDINGS = 8.0, EPS = 2.220446049250313e-16;
+// Steps of the differences that a gradient is compared with, one to one side, then some to both, the shorter one next to
+// a singularity; and how far they may differ: in units of the sum of the derivative's terms, and in roundings of the
+// values.
+constexpr double ONE_SIDED = 1e-8, TWO_SIDED[] = {1e-5, 1e-7};
+constexpr double AGREEMENT = 1e-6, ROUNDINGS = 8.0, EPS = 2.220446049250313e-16;
 
 PyArrayObject *array_of(const Ref &object) { return reinterpret_cast<PyArrayObject *>(object.get()); }
 const double *floats_of(PyObject *array) {
@@ -143,8 +145,11 @@ bool agrees(Function &function, const Columns &columns, const double *y, npy_int
     std::vector<double> way(n);
     for (npy_intp k = 0; k < n; ++k) way[k] = direction[k] * (std::abs(y[k]) + floors[k]);
     if (is_slope(columns, way, values_at(function, y, way, ONE_SIDED), columns.values(), ONE_SIDED)) return true;
-    const std::vector<double> above = values_at(function, y, way, TWO_SIDED);
-    return is_slope(columns, way, above, values_at(function, y, way, -TWO_SIDED), 2.0 * TWO_SIDED);
+    for (const double step : TWO_SIDED) {
+        const std::vector<double> above = values_at(function, y, way, step);
+        if (is_slope(columns, way, above, values_at(function, y, way, -step), 2.0 * step)) return true;
+    }
+    return false;
 }
 
 Columns columns_of(Function &function, PyObject *y, double step) {

@@ -11,7 +11,7 @@ namespace eip {
 
 // The longest shift, in units of a component's size, and how much shorter each further one is.
 constexpr double FIRST_SHIFT = 5e-3, SHORTER = 1.0 / 16.0;
-constexpr int MOST_SHIFTS = 5;
+constexpr int MOST_SHIFTS = 7;
 constexpr int64_t PAIRS = 3;
 // Weights of the differences over one, two and three shifts to either side, of order 6 and of order 4.
 constexpr double ORDER_6[] = {3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0}, ORDER_4[] = {2.0 / 3.0, -1.0 / 12.0, 0.0};
@@ -61,8 +61,9 @@ inline double shifted_sums(const Values &values_at, const double *y, int64_t j, 
 
 // Rows G (l, m) of the gradients at y of the invariants that ``values_at(state, out)`` puts into out (l,).
 //
-// Where both orders do not agree, as beside a singularity that is nearer than the state's size, the shifts are shortened
-// while that helps.
+// Where both orders do not agree, as next to a singularity that is nearer than the state's size, the shifts are
+// shortened until they do; if they never do, the shift at which the orders agree best is taken. A shift that reaches
+// about as far as the singularity agrees worse than a longer one, so that the search must not end there.
 template <class Values>
 inline void difference_gradient(const Values &values_at, const double *y, int64_t l, Shifts &s, double *G) {
     s.values.resize(2 * PAIRS * l);
@@ -75,8 +76,6 @@ inline void difference_gradient(const Values &values_at, const double *y, int64_
             if (excess < least) {
                 least = excess;
                 for (int64_t k = 0; k < l; ++k) G[k * s.m + j] = s.sums[k] / shift;
-            } else if (least < INFINITE) {
-                break;
             }
             if (least <= 1.0) break;
         }
