@@ -594,13 +594,21 @@ class InvariantSet:
 
     def misses(self, t: float, y: Array, f: Array) -> Array:
         """Return which invariants miss their targets by more than 1e-8 of their terms and rounding, (l,)."""
+        return ~(self._excess(t, y, f) <= 1.0)
+
+    def _excess(self, t: float, y: Array, f: Array) -> Array:
+        """Return the distances from the targets as multiples of those that are allowed, (l,)."""
         G, values = self.gradients(t, y, f), self.values(t, y)
         allowed = TARGET_TOLERANCE * self.sizes_of_terms(y, G, values)
-        return ~(np.abs(values - self.target) <= allowed + TARGET_ROUNDINGS * EPS * self.norm_products(G, y))
+        allowed += TARGET_ROUNDINGS * EPS * self.norm_products(G, y)
+        residual = np.abs(values - self.target)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            return np.where(residual == 0, 0.0, residual / allowed)
 
     def start_violation(self, t: float, y: Array, f: Array) -> str | None:
-        """Return what is wrong with the start, where it misses given targets."""
-        missed = np.flatnonzero(self.misses(t, y, f)).tolist()
+        """Return what is wrong with the start, where it misses given targets; the worst invariant comes first."""
+        excess = np.nan_to_num(self._excess(t, y, f), nan=np.inf, posinf=np.inf)
+        missed = [int(k) for k in np.argsort(-excess, kind="stable") if excess[k] > 1.0]
         if not missed:
             return None
         residual = (self.values(t, y) - self.target)[missed[0]]

@@ -194,7 +194,13 @@ class ProjectionOptions:
         ),
     )
     project_initial: bool = field(
-        default=False, metadata=_text("bool", "Project y0 onto given targets before the first step.")
+        default=False,
+        metadata=_text(
+            "bool",
+            """Project y0 onto given targets before the first step, by the least correction in the plain 2-norm: all
+            components move alike, whatever `metric` and `blocks` are, and C y of a frame stays. `Diagnostics.moved`
+            says how far. `project` with ``sigma=`` holds components that may not move.""",
+        ),
     )
 
     @classmethod

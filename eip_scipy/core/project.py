@@ -35,6 +35,7 @@ def project(
     iterations: int = 1,
     target: Any = None,
     f: Any = None,
+    start: Any = None,
 ) -> ProjectionResult:
     """Project a state onto the targets of invariants.
 
@@ -52,10 +53,12 @@ def project(
     iterations : int, optional
         Newton steps. 1 leaves defects of second order in the defects of y_hat.
     target : array_like, shape (l,), optional
-        Values to meet. Default: each invariant's own `target`.
+        Values to meet. Default: each invariant's own `target`, or its value at `start`.
     f : array_like, shape (n,), or callable, optional
         The system's derivative at y_hat, or ``f(t, y)``, for invariants with ``uses_f=True``; a callable where
         `iterations` is above 1.
+    start : array_like, shape (n,), optional
+        State at which invariants without a `target` have the values to meet, at the time `t`.
 
     Returns
     -------
@@ -110,7 +113,7 @@ def project(
     )
     nowhere = Stepping(Span(t, 0.0, t, 1.0, 0, np.inf), 0.0, None, np.zeros(n), np.zeros(n))
     options, weight, _ = given.settled(RK1, nowhere, y, known)
-    options = options._replace(target=_targets(known, target), kinds=kinds_of(options.groups, y, f_hat))
+    options = options._replace(target=_targets(known, target, start, t), kinds=kinds_of(options.groups, y, f_hat))
     projection = setup.Projection(known, options, derivative)
     work = projection.work
     if weight is not None:
@@ -137,14 +140,31 @@ def _derivative(f: Any, t: float, y: np.ndarray) -> Callable[[float, np.ndarray]
     return lambda t, state: fixed
 
 
-def _targets(known: InvariantSet, target: Any) -> np.ndarray:
+def _targets(known: InvariantSet, target: Any, start: Any, t: float) -> np.ndarray:
     if target is not None:
+        if start is not None:
+            raise ValueError("project: give target or start, not both; invariants have targets of their own, too.")
         refuse_units(target=target)
         values = reals(target)
         if values is None or values.size != known.size or values.ndim > 1 or not np.isfinite(values).all():
             raise ValueError(f"project: target must be {known.size} finite numbers, got {shown(target)}.")
         return values.reshape(-1)
-    for item, label in zip(known.items, known.labels, strict=True):
-        if item.target is None:
-            raise ValueError(f"project: invariant {label!r} has no target; give it one, or pass target=.")
-    return known.target
+    lacking = [item.target is None for item in known.items]
+    if start is None:
+        if any(lacking):
+            label = known.labels[lacking.index(True)]
+            raise ValueError(
+                f"project: invariant {label!r} has no target; give it one, or pass target=, or start=, a state at "
+                "which it has the wanted value."
+            )
+        return known.target
+    state = setup.initial_state(start, "start")
+    if state.shape != known.shape[1:] or (state.dtype.kind == "c" and known.dtype.kind != "c"):
+        raise ValueError(
+            f"project: start must be a state like y_hat, of {known.shape[1]} components, got {shown(start)}."
+        )
+    sizes = np.diff(known.starts)
+    values = np.where(np.repeat(lacking, sizes), known.values(t, state.astype(known.dtype)), known.target)
+    if not np.isfinite(values).all():
+        raise ValueError(f"project: {known.names[int(np.argmin(np.isfinite(values)))]!r} is not finite at start.")
+    return values

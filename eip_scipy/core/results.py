@@ -39,6 +39,8 @@ class Diagnostics:
         corrections. It says nothing about accuracy.
     message : str
         Why the run is not to be trusted; "" where nothing speaks against it.
+    moved : str
+        How far ``project_initial=True`` moved y0; "" where it did not.
     worst : (str, float, float) or None
         Invariant, time and size of the largest correction, in local errors (rounding counts as one): below 5 in most
         healthy runs. None where none was measured.
@@ -59,6 +61,7 @@ class Diagnostics:
         trust: Trust,
         *,
         estimated: bool,
+        moved: str = "",
     ) -> None:
         """Take the buffers of a run, so that reading costs the run nothing."""
         self.names = trust.names
@@ -68,6 +71,7 @@ class Diagnostics:
         self._max_correction = max_correction
         self._counters = counters
         self._estimated = estimated
+        self.moved = moved
 
     @property
     def last_defect(self) -> np.ndarray:
@@ -137,6 +141,8 @@ class Diagnostics:
         if self.worst is not None:
             name, t, size = self.worst
             lines.append(f"  largest correction: {size:.3g} local errors, of {name} at t={t:.6g}")
+        if self.moved:
+            lines.append(f"  {self.moved}")
         if self.message:
             lines.append(f"  {self.message}")
         return "\n".join(lines)

@@ -38,7 +38,7 @@ from ..methods.runge_kutta import DOP853
 from .blocks import kinds_of
 from .frame import spanned
 from .inputs import reals, refuse_units, shown
-from .invariants import InvariantSet
+from .invariants import TARGET_TOLERANCE, InvariantSet
 from .one_step import OneStep, as_vector
 from .options import Options, ProjectionOptions
 from .results import Diagnostics
@@ -66,6 +66,7 @@ class Run:
     """All that a driver needs, apart from the user's functions.
 
     `called` is the name of the argument that gave the right-hand side. `left_out`: what NaN in its value may come from.
+    `moved` says how far `project_initial` has moved y0, or is empty.
     """
 
     y0: np.ndarray
@@ -79,6 +80,7 @@ class Run:
     called: str = "fun"
     left_out: str = ""
     looked: int = -1
+    moved: str = ""
 
     def engine(
         self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, *, begins: bool = True, **others: Any
@@ -330,6 +332,7 @@ def prepare(
     run = Run(y0, arrays, options, work, invariants, identity, Trust(invariants.names, work.trust), tau)
     if projection.project_initial:
         run.y0 = projected_start(run, rhs, t0, f0)
+        run.moved = _moved(y0, run.y0, invariants.floors)
         f0 = rhs(t0, run.y0)
     violation = invariants.start_violation(t0, run.y0, f0)
     if violation:
@@ -365,6 +368,18 @@ def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0
     if status != 0 or run.invariants.misses(t0, y, f0).any():
         raise ValueError(projection_failure(run.invariants, work, t0))
     return y
+
+
+def _moved(before: np.ndarray, after: np.ndarray, floors: np.ndarray) -> str:
+    """Return how far a start was moved, or nothing where that is no more than a target may be missed by."""
+    share = np.abs(after - before) / np.maximum(np.abs(before), floors)
+    count, k = int(np.count_nonzero(share > TARGET_TOLERANCE)), int(np.argmax(share)) if share.size else 0
+    if not count:
+        return ""
+    return (
+        f"project_initial moved {count} of {share.size} components of y0, most of all y0[{k}], from {before[k]:.6g} to "
+        f"{after[k]:.6g}"
+    )
 
 
 class Projection:
@@ -468,4 +483,5 @@ def attach(diagnostics: Any, run: Run) -> None:
         w.counters,
         run.trust,
         estimated=run.options.metric == ERROR,
+        moved=run.moved,
     )

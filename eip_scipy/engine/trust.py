@@ -32,6 +32,7 @@ BEYOND_DOUBT, OFTEN, TOGETHER = 1e4, 0.1, 20.0
 TOO_FAR, FAR_OFTEN = 0.05, 0.01
 # So many changes make a share or a sum, where more than one is LARGE.
 ENOUGH = 5
+MOST_REASONS = 3  # in a message
 PAGE = '"When a run is not trusted" (docs/explanation/trust.md)'
 
 
@@ -109,8 +110,15 @@ class Trust:
 
     @property
     def reasons(self) -> list[str]:
-        """Return what is wrong with the corrections, in a sentence for each invariant."""
-        return [_reason(self.names[k], self.figures[k]) for k in np.flatnonzero(self.sick)]
+        """Return what is wrong with the corrections: a sentence for each of the worst three invariants, and a count."""
+        found = np.flatnonzero(self.sick)
+        worst = found[np.argsort(-_severity(self.figures[found]), kind="stable")]
+        more = (
+            [f"{found.size - MOST_REASONS} more invariants were corrected too much"]
+            if found.size > MOST_REASONS
+            else []
+        )
+        return [_reason(self.names[k], self.figures[k]) for k in worst[:MOST_REASONS]] + more
 
     @property
     def message(self) -> str:
@@ -137,6 +145,12 @@ def sick(figures: np.ndarray) -> np.ndarray:
 def _extreme(figures: np.ndarray) -> np.ndarray:
     """Which rows have a single projection that no healthy run has."""
     return (figures[..., NU] > BEYOND_DOUBT) | (figures[..., RAW] > TOO_FAR) | (figures[..., SHARE] > 0)
+
+
+def _severity(figures: np.ndarray) -> np.ndarray:
+    """Return how far rows of figures (..., N_FIGURES) are beyond what a correct run has."""
+    corrections = np.maximum(figures[..., NU] / BEYOND_DOUBT, figures[..., RAW] / TOO_FAR)
+    return np.maximum(corrections, figures[..., SHARE] / LARGE_SHARE)
 
 
 def _reason(name: str, row: np.ndarray) -> str:

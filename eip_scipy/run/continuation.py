@@ -88,6 +88,7 @@ def _diagnostics(one: Diagnostics, two: Diagnostics) -> Diagnostics:
         one._counters + two._counters,
         one._trust.followed_by(two._trust),
         estimated=one._estimated and two._estimated,
+        moved=one.moved or two.moved,
     )
     return both
 

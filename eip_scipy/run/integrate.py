@@ -478,8 +478,8 @@ class Loop:
         if labels := self.driver.run.invariants.by_differences:
             names = ", ".join(map(repr, labels))
             notes.append(f"the gradient of {names} comes from differences: one of its own would be faster and exact")
-        doubt = self.driver.run.trust.message
-        message = f"{message}; {doubt}" if doubt else message
+        run = self.driver.run
+        message = "; ".join(filter(None, (message, run.moved, run.trust.message)))
         return f"{message} ({'; '.join(notes)})" if notes else message
 
     def _values(self, broken: bool) -> np.ndarray:

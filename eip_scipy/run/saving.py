@@ -140,6 +140,7 @@ def _described(diagnostics: Diagnostics, arrays: dict[str, np.ndarray]) -> dict[
         "doubts": trust.doubts,
         "failed": bool(trust.failed),
         "estimated": bool(diagnostics._estimated),
+        "moved": diagnostics.moved,
     }
 
 
@@ -148,7 +149,9 @@ def _diagnostics(told: dict[str, Any], arrays: dict[str, np.ndarray]) -> Diagnos
     trust = Trust(told["names"], figures)
     trust.doubts, trust.failed = told["doubts"], told["failed"]
     diagnostics = Diagnostics()
-    diagnostics._attach(largest, last, correction, counters, trust, estimated=told["estimated"])
+    diagnostics._attach(
+        largest, last, correction, counters, trust, estimated=told["estimated"], moved=told.get("moved", "")
+    )
     return diagnostics
 
 

@@ -51,7 +51,7 @@ class OdeResult(Result):
     status : int
         0: the end was reached; 1: an event ended the run; -1: a step failed.
     message : str
-        Why the run ended, and why it is not reliable if it is not.
+        Why the run ended, how far `project_initial` moved the start, and why the run is not reliable if it is not.
     success : bool
         ``status >= 0``.
     trusted : bool
@@ -199,7 +199,7 @@ def solve_ivp(
     )
     if sol.status == 1:  # SciPy does not tell the solver that its run has ended
         solvers[0]._watch(ended=True)
-    message = f"{sol.message}; {record.message}" if record.message else sol.message
+    message = "; ".join(filter(None, (sol.message, record.moved, record.message)))
     return OdeResult(sol, message=message, trusted=bool(sol.success) and record.trusted, diagnostics=record)
 
 

@@ -416,3 +416,24 @@ def test_what_a_resumed_run_says_is_what_a_whole_one_says(tmp_path):
     np.testing.assert_array_equal(resumed.y, whole.y)
     assert resumed.diagnostics.worst == whole.diagnostics.worst
     assert resumed.diagnostics.message == whole.diagnostics.message
+
+
+def test_the_worst_invariants_come_first():
+    """Of five damped oscillators the three with the largest corrections are described, and two are counted."""
+    friction = np.array([0.01, 0.02, 0.05, 0.1, 0.2])
+
+    def damped(t, y):
+        return np.concatenate([y[5:], -y[:5] - friction * y[5:]])
+
+    def energy(k):
+        return Invariant(lambda t, y: 0.5 * (y[k] ** 2 + y[k + 5] ** 2), name=f"E{k}")
+
+    with pytest.warns(ProjectionWarning):
+        run = integrate(
+            damped, (0, 10), np.repeat([1.0, 0.0], 5), method=EIPRK4, h=0.05, invariants=[energy(k) for k in range(5)]
+        )
+    reasons = run.message.partition("not to be trusted: ")[2].split("; ")
+    worst = np.argsort(-run.diagnostics.corrections)[:3]
+    assert [reason[:4] for reason in reasons[:3]] == [f"'E{k}'" for k in worst]
+    assert worst.tolist() != sorted(worst)
+    assert reasons[3] == "2 more invariants were corrected too much"

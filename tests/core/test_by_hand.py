@@ -364,11 +364,15 @@ def test_copies_go_on_to_the_same_bits(case):
     method, options = COPIED[case]
     solver = method(pendulum, 0, Y0, 6.0, **options)
     stepped(solver, 4)
+    last, middle = solver.dense_output(), 0.5 * (solver.t_old + solver.t)  # which may leave something for the next call
+    asked = last(middle)
     copies = [copy.deepcopy(solver), pickle.loads(pickle.dumps(solver)), copy.copy(solver)]
     kicked = copy.deepcopy(solver)
     expected = rest(solver)
     for other in copies:
         np.testing.assert_array_equal(rest(other), expected)
+    np.testing.assert_array_equal(expected[: asked.size], asked)
+    np.testing.assert_array_equal(last(middle), asked)
     assert type(copies[0]) is method
     if kicked.status == "running":
         kicked.y, kicked.t_bound = kicked.y + 0.1, 7.0  # set, and not yet taken

@@ -25,6 +25,7 @@ from eip_scipy import (
     OdeResult,
     ProjectionWarning,
     eip_method,
+    integrate,
     solve_ivp,
 )
 from eip_scipy.core.options import ProjectionOptions
@@ -261,6 +262,21 @@ def test_the_projected_start_is_the_first_state(sampled, y0):
     np.testing.assert_array_equal(y0, [1, 0])
     if sol.sol is not None:
         np.testing.assert_array_equal(sol.sol(0.0), sol.y[:, 0])
+
+
+@pytest.mark.parametrize("solve", [solve_ivp, integrate], ids=lambda solve: solve.__name__)
+def test_a_start_that_was_moved_is_reported(solve):
+    """A start off by 0.1 is, one that is off by less than a target may be missed by is not."""
+    given = {"t_span": (0, 1), "args": (K,), "invariants": TARGET, "project_initial": True, "method": EIPRK45}
+    sol = solve(spring, y0=[1.0, 0.0], **given)
+    moved = "project_initial moved 1 of 2 components of y0, most of all y0[0], from 1 to 1.1"
+    assert moved in sol.message
+    assert sol.diagnostics.moved == moved
+    assert moved in repr(sol.diagnostics)
+    assert sol.trusted
+    near = solve(spring, y0=[1.1 * (1 + 1e-10), 0.0], **given)
+    assert "moved" not in near.message
+    assert near.diagnostics.moved == ""
 
 
 def test_events_are_evaluated_at_the_projected_start():
