@@ -39,7 +39,15 @@ from .invariants import Invariant, InvariantSet, JointInvariants
 from .one_step import OneStep
 from .stepping import AnyMethod, Stepping
 
-__all__ = ["Options", "ProjectionKeywords", "ProjectionOptions", "Settled", "takes_projection_options", "weights"]
+__all__ = [
+    "Options",
+    "ProjectionDetails",
+    "ProjectionKeywords",
+    "ProjectionOptions",
+    "Settled",
+    "takes_projection_options",
+    "weights",
+]
 
 DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
 MOST_ITERATIONS = 1000
@@ -50,13 +58,17 @@ WHOLE, NAMES = "{ProjectionOptions}", "{names of ProjectionOptions}"
 Documented = TypeVar("Documented", bound=Any)
 
 
-class ProjectionKeywords(TypedDict, total=False):
-    """The names of `ProjectionOptions` as keywords, for type checkers."""
+Metric = Literal["error", "euclidean"] | Sequence[float] | np.ndarray | None
+Blocks = int | Sequence[ArrayLike] | None
+Frame = tuple[ArrayLike, ArrayLike] | None
 
-    invariants: Invariant | Callable[..., Any] | Iterable[Invariant | Callable[..., Any]]
-    metric: Literal["error", "euclidean"] | Sequence[float] | np.ndarray | None
-    blocks: int | Sequence[ArrayLike] | None
-    frame: tuple[ArrayLike, ArrayLike] | None
+
+class ProjectionDetails(TypedDict, total=False):
+    """The options of the projection as keywords, without the invariants, for type checkers."""
+
+    metric: Metric
+    blocks: Blocks
+    frame: Frame
     direction: Literal["new", "old", "midpoint"]
     iterations: int
     every: int | Literal["auto"] | None
@@ -64,6 +76,12 @@ class ProjectionKeywords(TypedDict, total=False):
     compensated: bool | None
     check: bool
     project_initial: bool
+
+
+class ProjectionKeywords(ProjectionDetails, total=False):
+    """The names of `ProjectionOptions` as keywords, for type checkers."""
+
+    invariants: Invariant | Callable[..., Any] | Iterable[Invariant | Callable[..., Any]]
 
 
 def _text(kind: str, text: str) -> dict[str, str]:

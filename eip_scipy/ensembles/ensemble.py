@@ -8,14 +8,15 @@ import os
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing, nullcontext
 from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import OptimizeResult
 
 from ..checkpoint.own_file import absolute
@@ -25,7 +26,7 @@ from ..core.inputs import count, flag, is_number, refuse_units, shown
 from ..core.invariants import as_invariants
 from ..core.jitted import is_compiled
 from ..core.names import nearest
-from ..core.options import ProjectionOptions
+from ..core.options import ProjectionDetails, ProjectionOptions
 from ..core.pointers import PointerFunction
 from ..core.problem import Problem, component_names
 from ..core.solvers import EIPRK4, EIPSolver
@@ -61,7 +62,28 @@ ALONE |= {"callback", "diagnostics", "max_bytes", "progress"}
 OWN = ("executor", "reduce", "callback", "out", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(ALONE))
 
 
-class EnsembleResult(OptimizeResult):
+if TYPE_CHECKING:
+    Fields = dict[str, Any]  # of which type checkers know those that are annotated
+else:
+    Fields = OptimizeResult
+
+
+class EnsembleKeywords(ProjectionDetails, total=False):
+    """The options of `integrate` that `ensemble` passes on, for type checkers."""
+
+    args: Iterable[Any] | None
+    in_place: bool
+    jacobian: Callable[..., Any] | None
+    events: Any
+    dense_output: bool
+    compiled: bool | None
+    rtol: ArrayLike
+    atol: ArrayLike
+    first_step: float | None
+    max_step: float
+
+
+class EnsembleResult(Fields):
     """Result of `ensemble`; fields by name or by key, as in SciPy's own results.
 
     Attributes
@@ -119,6 +141,36 @@ class EnsembleResult(OptimizeResult):
     component_names : tuple of str
         Those of the `Problem`, or "y0", "y1" and so on.
     """
+
+    y: np.ndarray
+    t: np.ndarray
+    status: np.ndarray
+    message: np.ndarray
+    failed: np.ndarray
+    success: bool
+    max_defect: np.ndarray
+    max_correction: np.ndarray
+    side_by_side: np.ndarray
+    one_by_one: str
+    trusted: np.ndarray
+    names: tuple[str, ...]
+    nfev: np.ndarray
+    njev: np.ndarray
+    nlu: np.ndarray
+    n_rejected_projections: np.ndarray
+    times: np.ndarray
+    trajectories: Any
+    invariants: Any
+    target: np.ndarray
+    t_events: list[list[np.ndarray]] | None
+    y_events: list[list[np.ndarray]] | None
+    statistics: Statistics | None
+    first: int
+    stopped: bool
+    wall_time: float
+    method: str
+    h: float | None
+    chunk: int
 
     @property
     def component_names(self) -> tuple[str, ...]:
@@ -274,7 +326,7 @@ def ensemble(
     chunk: int | None = None,
     progress: bool = False,
     max_bytes: float | None = None,
-    **options: Any,
+    **keywords: Unpack[EnsembleKeywords],
 ) -> EnsembleResult:
     """Integrate many members of one system: compiled, on all cores, or on a cluster.
 
@@ -335,8 +387,8 @@ def ensemble(
         Show a progress bar with the time that is left.
     max_bytes : float, optional
         Bound on the memory for results; default: half of what is free.
-    **options
-        Those of `integrate`: args (the same for all), in_place, events, compensated, compiled, metric, blocks, frame,
+    **keywords
+        Options of `integrate`: args (the same for all), in_place, events, compensated, compiled, metric, blocks, frame,
         direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step. Events are kept
         for each member in ``.t_events`` and ``.y_events``; a terminal one ends its member. `check` looks at one member.
 
@@ -372,6 +424,7 @@ def ensemble(
     >>> run.y.shape, run.success, bool((run.max_defect < 1e-11).all())
     ((5, 4), True, True)
     """
+    options: dict[str, Any] = dict(keywords)
     _check_options(options)
     if invariants is not DEFAULT:
         options["invariants"] = invariants

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 from ..core import setup
 from ..core.acceleration import AccelerationField
 from ..core.inputs import flag, is_number, refuse_units, shown
 from ..core.invariants import as_invariants
 from ..core.names import nearest
+from ..core.options import Blocks, Frame, Metric
 from ..core.pointers import PointerFunction, by_pointer
 from ..core.problem import Problem, bind
 from ..core.stepping import interval
@@ -20,8 +21,20 @@ from .search import Search
 
 __all__ = ["recommend"]
 
-# What else a call may say of the problem; all runs have it.
-COMMON = ("params", "in_place", "jacobian", "metric", "blocks", "frame", "compiled")
+
+class RecommendKeywords(TypedDict, total=False):
+    """The options of `integrate` that `recommend` passes on, for type checkers."""
+
+    params: Any
+    in_place: bool
+    jacobian: Callable[..., Any] | None
+    metric: Metric
+    blocks: Blocks
+    frame: Frame
+    compiled: bool | None
+
+
+COMMON = tuple(RecommendKeywords.__annotations__)
 
 
 def recommend(
@@ -33,7 +46,7 @@ def recommend(
     error: float = 1e-6,
     invariants: Any = None,
     max_nfev: int | None = None,
-    **options: Any,
+    **keywords: Unpack[RecommendKeywords],
 ) -> Recommendation:
     """Find method, step or tolerance, metric and blocks for a wanted error, by trial runs.
 
@@ -95,6 +108,7 @@ def recommend(
     >>> choice.trusted, choice.error <= 1e-8, run.nfev <= 1.1 * choice.nfev
     (True, True, True)
     """
+    options: dict[str, Any] = dict(keywords)
     _check(error, max_nfev, options)
     problem, common = _problem(_right_hand_side(fun, acceleration, options), t_span, y0, invariants, options)
     return Search(problem, common, float(error), max_nfev).recommendation()

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from scipy.integrate import OdeSolution
 from scipy.optimize import OptimizeResult
 
+from ..core.results import Diagnostics
 from .tables import default_names, to_dataframe, to_xarray
 
 __all__ = ["IntegrationResult", "Origin"]
@@ -36,10 +38,14 @@ class Origin(NamedTuple):
     invariants: Any
 
 
+if TYPE_CHECKING:
+    Fields = dict[str, Any]  # of which type checkers know those that are annotated
+else:
+    Fields = OptimizeResult
 UNSET = ("units", "epoch")  # fields that print where they hold something
 
 
-class IntegrationResult(OptimizeResult):
+class IntegrationResult(Fields):
     """Result of `integrate`; fields by name or by key, as in SciPy's own results.
 
     Attributes
@@ -93,6 +99,30 @@ class IntegrationResult(OptimizeResult):
     `continue_to`, and its ``sol`` holds a polynomial for each step, which meets the states at the steps exactly and
     those in between to 1e-12.
     """
+
+    t: np.ndarray
+    y: np.ndarray
+    invariants: np.ndarray
+    target: np.ndarray
+    max_defect: np.ndarray
+    diagnostics: Diagnostics
+    t_events: list[np.ndarray] | None
+    y_events: list[np.ndarray] | None
+    sol: OdeSolution | None
+    nfev: int
+    njev: int
+    nlu: int
+    status: int
+    message: str
+    success: bool
+    trusted: bool
+    wall_time: float
+    compiled: bool
+    calls: dict[str, str]
+    method: str
+    h: float | None
+    units: str
+    epoch: tuple[float, float] | None
 
     @property
     def component_names(self) -> tuple[str, ...]:

@@ -8,13 +8,19 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK4, EIPRK45, EIPRKN8, EIPRKN12, EIPSolver, Invariant, ensemble, integrate
 from eip_scipy.core.options import ProjectionKeywords, ProjectionOptions
+from eip_scipy.ensembles.ensemble import EnsembleKeywords
 from eip_scipy.problems import kepler
+from eip_scipy.run.recommend import COMMON, RecommendKeywords
 
 NAMES = ProjectionOptions.names()
 
 
 def test_keywords_for_type_checkers_are_the_options():
-    assert tuple(ProjectionKeywords.__annotations__) == NAMES
+    assert sorted(ProjectionKeywords.__annotations__) == sorted(NAMES)
+    given = set(inspect.signature(ensemble).parameters) | set(EnsembleKeywords.__annotations__)
+    assert set(EnsembleKeywords.__annotations__) >= {*NAMES} - {"invariants"}
+    assert given >= set(inspect.signature(integrate).parameters) - {"y0", "diagnostics"}
+    assert tuple(RecommendKeywords.__annotations__) == COMMON
 
 
 @pytest.mark.parametrize("function", [EIPSolver, EIPRK4, integrate])

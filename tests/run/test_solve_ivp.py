@@ -353,7 +353,7 @@ USER_CODE = """
 import numpy as np
 from numpy.typing import NDArray
 
-from eip_scipy import EIPDOP853, Diagnostics, Invariant, OdeResult, integrate, solve_ivp
+from eip_scipy import EIPDOP853, EIPRK4, Diagnostics, Invariant, OdeResult, ensemble, integrate, recommend, solve_ivp
 
 Array = NDArray[np.float64]
 
@@ -379,7 +379,11 @@ def run(tight: float) -> OdeResult:
     return sol if sol.trusted and plain.success else plain
 
 
-integrate(fun, (0, 1), [1.0, 0.0], method=EIPDOP853, invariants=energy, blocks=2)
+longer = integrate(fun, (0, 1), [1.0, 0.0], method=EIPDOP853, invariants=energy, blocks=2).continue_to(3)
+members = ensemble(fun, (0, 1), np.ones((3, 2)), h=0.1, method=EIPRK4, invariants=energy, args=(2.0,), every=2)
+largest: float = max(longer.max_defect.max(), members.max_defect.max())
+choice = recommend(fun, (0, 1), [1.0, 0.0], invariants=energy, params=[2.0], metric="euclidean")
+print(longer.diagnostics.moved + longer.message, members.statistics, choice.reason, largest)
 # Below this line each statement has an error.
 solve_ivp(fun, (0, 1), [1.0, 0.0], hh=0.01)
 solve_ivp(fun, (0, 1), [1.0, 0.0], invariants=3)
@@ -388,6 +392,10 @@ solve_ivp(fun, (0, 1), [1.0, 0.0], metric="taxicab")
 solve_ivp(fun, (0, 1), [1.0, 0.0], direction="up")
 print(solve_ivp(fun, (0, 1), [1.0, 0.0]).succes)
 integrate(fun, (0, 1), [1.0, 0.0], hh=0.01)
+ensemble(fun, (0, 1), np.ones((3, 2)), hh=0.1)
+recommend(fun, (0, 1), [1.0, 0.0], every=2)
+print(longer.trustd)
+print(members.trustd)
 """
 
 
