@@ -17,6 +17,7 @@ from .. import checkpoint
 from ..checkpoint import CheckpointError
 from ..checkpoint.locks import Lock
 from ..checkpoint.own_file import OwnFile, absolute, unlocked
+from ..core.inputs import shown
 from .happened import Flat, flattened, unflattened
 from .statistics import Statistics
 from .tasks import COMPARED, LISTS, NOT_RUN, Members
@@ -27,7 +28,10 @@ KIND = "ensemble"
 LABEL = "eip_scipy_ensemble"
 # Of format 2 the metadata may name the codec that unpickles. A group's own file may hold metadata of any format.
 FORMAT: dict[str, Any] = {"zarr_format": 3, "use_consolidated": False}
-OPTIONAL = ("states", "time", "known_by")
+OPTIONAL = (
+    "states", "time", "times", "invariants", "end_invariants", "target", "event_count", "event_t", "event_y",
+    "known_by",
+)  # fmt: skip
 ARRAYS = (
     *OPTIONAL, "y", "t_end", "max_defect", "max_correction", "counters", "side_by_side", "trusted", "message", "status",
 )  # fmt: skip
@@ -233,8 +237,10 @@ class ZarrStore:
             self._group = zarr.open_group(self._place, mode="r+", **FORMAT)
             found: dict[str, Any] | None = self._group.attrs[LABEL]
             if found is not None:
+                if not isinstance(found, dict):
+                    raise ValueError(f"its attribute {LABEL!r} is {shown(found)}, not a mapping")
                 self._require_plain_arrays()
-        except (KeyError, ValueError, OSError) as error:
+        except (KeyError, TypeError, ValueError, OSError) as error:  # TypeError: Zarr's, for codecs in a wrong order
             old = self._local is not None and (self._local / ".zgroup").exists()
             why = "it is a Zarr group of format 2, whose metadata may name code to run" if old else error
             raise CheckpointError(f"{self.path!r} is no ensemble of eip_scipy: {why}") from error
@@ -248,6 +254,8 @@ class ZarrStore:
                     continue
                 raise ValueError(f"it has no array {name!r} of format 3")
             metadata = self._group[name].metadata.to_dict()
+            if metadata.get("node_type") != "array":
+                raise ValueError(f"its {name!r} is not an array")
             codecs = {codec["name"] for codec in metadata.get("codecs", ())}
             if metadata["zarr_format"] != 3 or not codecs <= CODECS:
                 raise ValueError(

@@ -801,14 +801,44 @@ def test_a_strangers_store_runs_no_code(zarr_format, tmp_path, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore:Numcodecs codecs are not in the Zarr version 3 specification")
-def test_a_codec_from_elsewhere_is_refused(tmp_path):
+def test_a_codec_from_elsewhere_is_refused_in_each_array(tmp_path):
+    pytest.importorskip("zarr")
+    path = tmp_path / "run.zarr"
+    options = {"save_every": 2, "events": lambda t, y: y[0]}
+    stored(out=path, **options)
+    described = sorted(path.glob("*/zarr.json"))
+    assert {"y", "target", "end_invariants", "invariants", "event_t"} <= {item.parent.name for item in described}
+    for item in described:
+        text, name = item.read_text(), item.parent.name
+        changed = json.loads(text)
+        changed["codecs"].append({"name": "numcodecs.zlib", "configuration": {"level": 1}})
+        item.write_text(json.dumps(changed))
+        with pytest.raises(CheckpointError, match=rf"its array '{name}' is stored by numcodecs\.zlib; expected "):
+            stored(out=path, resume=True, **options)
+        item.write_text(text)
+    stored(out=path, resume=True, **options)
+
+
+def test_what_is_no_store_is_named(tmp_path):
+    """A group in place of an array, codecs in a wrong order, and a label that is no mapping."""
     pytest.importorskip("zarr")
     path = tmp_path / "run.zarr"
     stored(out=path)
-    described = json.loads((path / "y" / "zarr.json").read_text())
-    described["codecs"].append({"name": "numcodecs.zlib", "configuration": {"level": 1}})
-    (path / "y" / "zarr.json").write_text(json.dumps(described))
-    with pytest.raises(CheckpointError, match=r"its array 'y' is stored by numcodecs\.zlib; expected blosc, bytes"):
+    where = path / "status" / "zarr.json"
+    text = where.read_text()
+    where.write_text(json.dumps({"zarr_format": 3, "node_type": "group", "attributes": {}}))
+    with pytest.raises(CheckpointError, match="is no ensemble of eip_scipy: its 'status' is not an array"):
+        stored(out=path, resume=True)
+    changed = json.loads(text)
+    changed["codecs"].append(changed["codecs"][0])
+    where.write_text(json.dumps(changed))
+    with pytest.raises(CheckpointError, match="is no ensemble of eip_scipy"):
+        stored(out=path, resume=True)
+    where.write_text(text)
+    own = json.loads((path / "zarr.json").read_text())
+    own["attributes"]["eip_scipy_ensemble"] = [1, 2]
+    (path / "zarr.json").write_text(json.dumps(own))
+    with pytest.raises(CheckpointError, match=r"its attribute 'eip_scipy_ensemble' is \[1, 2\], not a mapping"):
         stored(out=path, resume=True)
 
 
