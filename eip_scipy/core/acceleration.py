@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,9 @@ from .inputs import filled
 from .one_step import as_vector
 from .pointers import PointerFunction
 
-__all__ = ["BY_NAME", "AccelerationField", "is_acceleration"]
+__all__ = ["BY_NAME", "AccelerationField", "is_acceleration", "named_accelerations"]
 
-BY_NAME = "pass it by name: integrate(acceleration=fun, t_span=..., y0=..., ...)"
+BY_NAME = "pass it by name: integrate(acceleration=fun, t_span=..., y0=..., ...), or eip_scipy.solve_ivp"
 
 
 class AccelerationField:
@@ -43,11 +44,35 @@ class AccelerationField:
         return np.concatenate([v, a])
 
 
+@contextmanager
+def named_accelerations(
+    method: str, fun: Callable[..., Any], in_place: bool, extra: tuple[Any, ...], t: float, y: np.ndarray
+) -> Iterator[None]:
+    """Refuse an acceleration in the place of `fun`, whatever its first call as a right-hand side of (q, v) raised.
+
+    Raises
+    ------
+    ValueError
+        Naming the argument that takes accelerations.
+    """
+    try:
+        yield
+    except Exception as error:
+        if is_acceleration(fun, in_place, extra, t, y):
+            raise ValueError(
+                f"fun gives {y.size // 2} of the {y.size} components that the state y = (q, v) has. For {method}, as "
+                "for every method, fun(t, y) must return the derivative (v, a) of the state. If fun is the "
+                f"acceleration a(t, q), {BY_NAME}."
+            ) from error
+        raise
+
+
 def is_acceleration(fun: Callable[..., Any], in_place: bool, extra: tuple[Any, ...], t: float, y: np.ndarray) -> bool:
     """Return whether a function that is not a right-hand side of y = (q, v) gives n/2 accelerations instead.
 
     It is called with y and with q. Numba functions are called as Python code and C functions with y alone, because
-    compiled code could read or write beyond the end of a shorter array.
+    compiled code could read or write beyond the end of a shorter array; for those behind a Python function, q is the
+    first half of an array like y.
 
     Parameters
     ----------
@@ -59,9 +84,9 @@ def is_acceleration(fun: Callable[..., Any], in_place: bool, extra: tuple[Any, .
     y : ndarray, shape (n,)
     """
     code = getattr(fun, "py_func", fun)
-    states = (y,) if isinstance(fun, PointerFunction) else (y, y[: y.size // 2])
+    sizes = (y.size,) if isinstance(fun, PointerFunction) else (y.size, y.size // 2)
     gives = _fills if in_place else _returns
-    return y.size % 2 == 0 and any(gives(code, extra, t, state.copy(), y.size // 2) for state in states)
+    return y.size % 2 == 0 and any(gives(code, extra, t, y.copy()[:size], y.size // 2) for size in sizes)
 
 
 def _returns(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: np.ndarray, count: int) -> bool:

@@ -6,6 +6,7 @@ import copy
 import copyreg
 import warnings
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
@@ -22,6 +23,7 @@ from ..methods.multistep import GaussJackson
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
 from . import setup
+from .acceleration import BY_NAME, named_accelerations
 from .between_steps import N_LEFT, Settings, checked_stepping, checked_vector, is_state, kept_state
 from .callers import users_level
 from .coefficients import attributes_of, is_same, tableau_of
@@ -182,7 +184,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             stepping.require_scale(start)
         self._projection, self._jacobian = replace(projection, invariants=kept), _checked_jacobian(jacobian)
         self._scipy = self._scipy_solver(start, bool(kept) or bool(projection.compensated))
-        f0 = self._derivative(t0, start).copy() if self._scipy is None else self._scipy.f
+        with self._named_accelerations(t0, start):
+            f0 = self._derivative(t0, start).copy() if self._scipy is None else self._scipy.f
         self._method = self._checked_method(Start(t0, start, f0, 0.0))
         self.h_abs = stepping.first_step if self._scipy is None else self._scipy.h_abs
         if self._scipy is None:
@@ -218,16 +221,22 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._taken = self.fun, self.t_bound, self.direction, self.max_step, self.h
         self.rtol, self.atol = _frozen(stepping.rtol), _frozen(stepping.atol)
 
+    def _named_accelerations(self, t: float, y: np.ndarray) -> AbstractContextManager[None]:
+        """Return a context that refuses an acceleration in the place of `fun`, where the method takes (q, v)."""
+        if self.vectorized or not isinstance(self.TABLEAU, NystromTableau | GaussJackson):
+            return nullcontext()
+        return named_accelerations(type(self).__name__, self._user_fun, False, (), t, y)
+
     def _checked_method(self, start: Start) -> AnyMethod:
         """Return the method for the present function, which is called where it has to be one of second order."""
         fresh, name = partial(_copied, self._derivative), type(self).__name__
         if isinstance(self.TABLEAU, NystromTableau):
-            setup.check_second_order(fresh, start.t, start.y, start.f, name)
+            setup.check_second_order(fresh, start.t, start.y, start.f, name, _by_name)
         if not isinstance(self.TABLEAU, GaussJackson):
             return self.TABLEAU
         if self._finishes:
             raise TypeError(f"{name}: a multistep method has no step that _project_step could end.")
-        velocities = setup.depends_on_velocity(fresh, start.t, start.y, start.f, name)
+        velocities = setup.depends_on_velocity(fresh, start.t, start.y, start.f, name, _by_name)
         return replace(self.TABLEAU, velocities=velocities)
 
     def _start(self, begin: Start, *, check: bool) -> None:
@@ -575,6 +584,11 @@ copyreg.pickle(SolverClass, _reduced_class)
 def _copied(derivative: Callable[[float, np.ndarray], np.ndarray], t: float, y: np.ndarray) -> np.ndarray:
     """The derivative as an array of its own."""
     return derivative(t, y).copy()
+
+
+def _by_name() -> str:
+    """Return how an acceleration is passed."""
+    return f". If fun is the acceleration a(t, q), {BY_NAME}"
 
 
 def _frozen(a: np.ndarray) -> np.ndarray:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..core import setup, solvers
-from ..core.acceleration import BY_NAME, AccelerationField, is_acceleration
+from ..core.acceleration import BY_NAME, AccelerationField, named_accelerations
 from ..core.arguments import Packed, are_same, extra_arguments, floats, names, scalars
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import Invariant, as_invariants
@@ -318,7 +318,9 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     projection = ProjectionOptions(**request.projection)
     system.bind(y0)
     calls = Counted(system.derivative)
-    with _accelerations_named(asked, system, of_second_order, t0, y0):
+    given_as_fun = of_second_order and not isinstance(asked.fun, Problem) and system.name == "fun"
+    in_place = "in place" in form
+    with named_accelerations(name, system.fun, in_place, system.extra, t0, y0) if given_as_fun else nullcontext():
         f0 = system.first(calls, t0, y0)
         hint = partial(_second_order_hint, asked.fun)
         if isinstance(method, NystromTableau):
@@ -369,30 +371,6 @@ def _second_order_hint(fun: Any) -> str:
     if not isinstance(fun, Problem):
         return f". If fun is the acceleration a(t, q), {BY_NAME}"
     return "; this problem does it: problem.second_order(), with a start (q, v)" if fun.has_second_order else ""
-
-
-@contextmanager
-def _accelerations_named(
-    asked: Request, system: System, of_second_order: bool, t0: float, y0: np.ndarray
-) -> Iterator[None]:
-    """Refuse an acceleration in the place of `fun`, whatever its first call as a right-hand side of (q, v) raised.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument that takes accelerations.
-    """
-    try:
-        yield
-    except Exception as error:
-        given_as_fun = of_second_order and not isinstance(asked.fun, Problem) and system.name == "fun"
-        if given_as_fun and is_acceleration(system.fun, "in place" in system.form, system.extra, t0, y0):
-            raise ValueError(
-                f"fun gives {y0.size // 2} of the {y0.size} components that the state y = (q, v) has. For "
-                f"{asked.method.__name__}, as for every method, fun(t, y) must return the derivative (v, a) of the "
-                f"state. If fun is the acceleration a(t, q), {BY_NAME}."
-            ) from error
-        raise
 
 
 def _method(method: Any) -> Any:

@@ -10,6 +10,7 @@ from c_compiler import shared_library
 from numba import njit
 from scipy.integrate import solve_ivp
 
+import eip_scipy
 from eip_scipy import (
     EIPDOP853,
     EIPGJ12,
@@ -131,6 +132,9 @@ def test_the_old_call_names_the_new_one(method, fun):
     for run in (integrate, ensemble):
         with pytest.raises(ValueError, match=r"integrate\(acceleration=fun, t_span=\.\.\., y0=\.\.\., \.\.\.\)"):
             run(fun, (0, 1), Y0 if run is integrate else [Y0, Y0], method=method, **steps)
+    for solve in (solve_ivp, eip_scipy.solve_ivp):
+        with pytest.raises(ValueError, match=r"integrate\(acceleration=fun, .*or eip_scipy\.solve_ivp"):
+            solve(fun, (0, 1), Y0, method=method, **steps)
 
 
 def test_the_old_call_in_place_and_by_pointer(tmp_path):
@@ -146,8 +150,11 @@ def test_what_is_neither():
     """No first-order field of (q, v); what the user's own function raises is passed on."""
     with pytest.raises(ValueError, match="acceleration=fun"):
         integrate(lambda t, y: -y, (0, 1), [1.0, 0.0], method=EIPRKN12, rtol=1e-8)
-    with pytest.raises(KeyError, match="mass"):
-        integrate(lambda t, y: {}["mass"], (0, 1), Y0, method=EIPRKN12, rtol=1e-8)
+    with pytest.raises(ValueError, match=r"first 1 components of fun must be v.*or eip_scipy\.solve_ivp"):
+        solve_ivp(lambda t, y: -y, (0, 1), [1.0, 0.0], EIPRKN12, rtol=1e-8)
+    for solve in (integrate, solve_ivp):
+        with pytest.raises(KeyError, match="mass"):
+            solve(lambda t, y: {}["mass"], (0, 1), Y0, method=EIPRKN12, rtol=1e-8)
     with pytest.raises(TypeError, match=r"give fun or acceleration, not both"):
         integrate(field, (0, 1), Y0, acceleration=spring, method=EIPRKN12, rtol=1e-8)
     with pytest.raises(TypeError, match="fun is missing"):
