@@ -33,6 +33,26 @@ TARGET_ROUNDINGS = 64.0
 LARGE = 200
 
 
+class OwnArguments:
+    """A function of an invariant, which takes the invariant's own `args` if a call leaves them out.
+
+    Parameters
+    ----------
+    function : callable
+    args : tuple
+    first : int
+        Number of the arguments before `args`, such as time and state.
+    """
+
+    def __init__(self, function: Callable[..., Any], args: tuple[Any, ...], first: int) -> None:
+        self.function, self.args, self.first = function, args, first
+        self.__name__ = getattr(function, "__name__", type(function).__name__)
+
+    def __call__(self, *given: Any) -> Any:
+        """Call the function."""
+        return self.function(*given, *(self.args if len(given) == self.first else ()))
+
+
 class Invariant:
     """A conserved quantity of a system, or several at once.
 
@@ -96,6 +116,8 @@ class Invariant:
         in_place, uses_f = flag("Invariant: in_place", in_place), flag("Invariant: uses_f", uses_f)
         size = None if size is None else count("Invariant: size", size)
         what = "an invariant" if name is None else f"invariant {name!r}"
+        if isinstance(fun, OwnArguments) or isinstance(grad, OwnArguments):
+            fun, grad, args = _apart(fun, grad, args)
         fun = by_pointer(fun, what, shape=(size,) if size and size > 1 else ())
         grad = by_pointer(grad, f"gradient of {what}", GRADIENT, takes_f=uses_f)
         if not callable(fun):
@@ -111,8 +133,7 @@ class Invariant:
             )
         if name is not None and not isinstance(name, str):
             raise TypeError(f"Invariant: name must be a string, got {shown(name)}.")
-        self.fun = fun
-        self.grad = grad
+        self.function, self.gradient = fun, grad
         self.target = None if target is None else _target(target)
         self.args = args
         self.size = size
@@ -121,8 +142,20 @@ class Invariant:
         self.in_place = in_place or isinstance(grad, PointerFunction)
         self.uses_f = uses_f
 
+    @property
+    def fun(self) -> Callable[..., Any]:
+        """Return the function, which takes `args` where they are left out."""
+        return OwnArguments(self.function, self.args, 2) if self.args else self.function
+
+    @property
+    def grad(self) -> Callable[..., Any] | None:
+        """Return the gradient, which takes `args` where they are left out; None if it is computed from the values."""
+        if self.gradient is None or not self.args:
+            return self.gradient
+        return OwnArguments(self.gradient, self.args, 2 + self.uses_f + self.in_place)
+
     def __repr__(self) -> str:
-        name = self.name or getattr(self.fun, "__name__", "?")
+        name = self.name or getattr(self.function, "__name__", "?")
         return f"Invariant({name})"
 
 
@@ -201,9 +234,16 @@ def _of_function(fun: Callable[..., Any]) -> Invariant:
     return Invariant(fun, name=None if name.startswith("<") else name)
 
 
+def _apart(fun: Any, grad: Any, args: Sequence[Any]) -> tuple[Any, Any, Sequence[Any]]:
+    """Return functions of another invariant without its arguments, which stand where none are given."""
+    functions = [found.function if isinstance(found, OwnArguments) else found for found in (fun, grad)]
+    own = next(found.args for found in (fun, grad) if isinstance(found, OwnArguments))
+    return functions[0], functions[1], args or own
+
+
 def _lacks_gradient(item: Invariant) -> bool:
     """Whether an invariant is jitted, as a compiled run takes it, but for its gradient."""
-    return item.grad is None and not item.args and is_jitted(item.fun) and not jit_is_off()
+    return item.gradient is None and not item.args and is_jitted(item.function) and not jit_is_off()
 
 
 def _target(target: Any) -> Array:
@@ -228,7 +268,7 @@ def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array,
     try:
         value = fun(t, y.copy())
     except TypeError:
-        _require_arguments(invariant.fun, f"invariant {label!r}", ("t", "y"), invariant.args, extra)
+        _require_arguments(invariant.function, f"invariant {label!r}", ("t", "y"), invariant.args, extra)
         raise
     value = _value(value, label, t)
     if value.ndim > 1:
@@ -335,7 +375,7 @@ class InvariantSet:
         self.why_not: dict[str, str] = {}
         self.floors = typical_sizes(y0, f0, tau)
         self.labels = [item.name or f"invariant {k}" for k, item in enumerate(self.items)]
-        functions = [bound(item.fun, item.args + extra) for item in self.items]
+        functions = [bound(item.function, item.args + extra) for item in self.items]
         values = [
             _first_value(item, fun, label, t0, y0, extra)
             for item, fun, label in zip(self.items, functions, self.labels, strict=True)
@@ -355,10 +395,10 @@ class InvariantSet:
         ]
         self._require_finite(self.start_values, "not finite at y0")
         self.scales = self._scales(sizes)
-        self.computed = np.repeat([item.grad is None for item in given], sizes).tolist()
+        self.computed = np.repeat([item.gradient is None for item in given], sizes).tolist()
         self.uses_f = any(item.uses_f for item in self.items)
         self.grads = [
-            item.grad if item.grad is not None else self._numerical_gradient(item, t0, y0) for item in self.items
+            self._numerical_gradient(item, t0, y0) if item.gradient is None else item.gradient for item in self.items
         ]
         if tell:
             self._tell_of_differences()
@@ -393,8 +433,8 @@ class InvariantSet:
         return scales
 
     def _numerical_gradient(self, item: Invariant, t: float, y: Array) -> NumericalGradient:
-        takes_complex = not isinstance(item.fun, PointerFunction)
-        return NumericalGradient(item.fun, item.args, takes_complex, t, y, self.floors, self.extra)
+        takes_complex = not isinstance(item.function, PointerFunction)
+        return NumericalGradient(item.function, item.args, takes_complex, t, y, self.floors, self.extra)
 
     def _tell_of_differences(self) -> None:
         for grad, label in zip(self.grads, self.labels, strict=True):
@@ -411,7 +451,7 @@ class InvariantSet:
 
         Of those that were `given`, for a jitted one has a compiled gradient by now.
         """
-        slow = ", ".join(repr(label) for item, label in zip(given, self.labels, strict=True) if item.grad is None)
+        slow = ", ".join(repr(label) for item, label in zip(given, self.labels, strict=True) if item.gradient is None)
         if slow and n >= LARGE:
             warnings.warn(
                 f"no grad is given for {slow}: each gradient of these {n} components takes {n} evaluations and more, "
@@ -427,7 +467,7 @@ class InvariantSet:
     def by_differences(self) -> list[str]:
         """The C functions by pointer without a gradient, by their labels."""
         known = zip(self.items, self.labels, strict=True)
-        return [label for item, label in known if item.grad is None and isinstance(item.fun, PointerFunction)]
+        return [label for item, label in known if item.gradient is None and isinstance(item.function, PointerFunction)]
 
     def with_targets(self) -> tuple[Invariant, ...]:
         """The invariants with the values that are kept as their targets."""
@@ -449,7 +489,7 @@ class InvariantSet:
 
         item = copy(item)
         try:
-            item.grad, item.in_place = gradient_by_duals(item.fun, n, shape, bool(self.extra), numbers), True
+            item.gradient, item.in_place = gradient_by_duals(item.function, n, shape, bool(self.extra), numbers), True
         except NotCompilableError as error:
             self.why_not[label] = str(error)
         return item
@@ -463,7 +503,7 @@ class InvariantSet:
             def convert(found: Any, t: float) -> Array:
                 return np.array(_value(found, label, t, shape), float, order="C")
 
-            return call(self.items[k].fun, self.items[k].args + self.extra, shape, convert, real=True)
+            return call(self.items[k].function, self.items[k].args + self.extra, shape, convert, real=True)
 
         def gradient(k: int) -> Call:
             _, takes_f, in_place, label, _, shape = self._gradients[k]
@@ -515,7 +555,7 @@ class InvariantSet:
                     G = _gradient(call(), label, t, expected, y.dtype)
             except TypeError:
                 first = ("t", "y", *(("f",) if takes_f else ()), *(("out",) if in_place else ()))
-                _require_arguments(item.grad or item.fun, what, first, item.args, self.extra)
+                _require_arguments(item.gradient or item.function, what, first, item.args, self.extra)
                 raise
             if not np.all(np.isfinite(G)):
                 raise ValueError(f"{what} is not finite at y0.")
@@ -523,11 +563,12 @@ class InvariantSet:
     def _bound_gradient(self, k: int) -> tuple[Callable[..., Any], bool, bool]:
         """Gradient k as gradient(t, y), with f behind y if the second is true and `out` at the end if the third is."""
         item = self.items[k]
-        return bound(self.grads[k], self._gradient_arguments(k)), item.uses_f and item.grad is not None, item.in_place
+        takes_f = item.uses_f and item.gradient is not None
+        return bound(self.grads[k], self._gradient_arguments(k)), takes_f, item.in_place
 
     def _gradient_arguments(self, k: int) -> tuple[Any, ...]:
         item = self.items[k]
-        return self.extra if item.grad is None else item.args + self.extra
+        return self.extra if item.gradient is None else item.args + self.extra
 
     def inv(self, t: float, y: Array, values: Array, params: Any = None) -> None:
         """Fill `values` (l,)."""
@@ -682,7 +723,7 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     size = np.where(y == 0, np.max(np.abs(y), initial=0.0) or 1.0, np.abs(y))
     G = InvariantSet(invariant, t, y, f, 0.0).gradients(t, y, f)
     floor = np.where(y == 0, size, 0.0)
-    D = np.atleast_2d(difference_gradient(lambda x: invariant.fun(t, x, *invariant.args), y, floor))
+    D = np.atleast_2d(difference_gradient(lambda x: invariant.function(t, x, *invariant.args), y, floor))
     largest = np.max(np.abs(G) * size, axis=1, keepdims=True)
     largest[largest == 0] = 1.0
     return float(np.max(np.abs(G - D) * size / largest))

@@ -89,15 +89,15 @@ def native_functions(
         if item.args:
             raise NotCompilableError(f"{name} has args; pass its parameters through params")
         shape = () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
-        inv.append(_native(item.fun, number._replace(shape=shape), name))
-        if item.grad is None and isinstance(item.fun, PointerFunction):
+        inv.append(_native(item.function, number._replace(shape=shape), name))
+        if item.gradient is None and isinstance(item.function, PointerFunction):
             grad.append(Native(None, inv[-1].floats * n * (2 if y0.dtype.kind == "c" else 1)))
             continue
-        if item.grad is None:
+        if item.gradient is None:
             raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
         rows = number._replace(shape=(*shape, n), real=False, takes_f=item.uses_f)
         rows = rows._replace(in_place=item.in_place, gradient=True)
-        grad.append(_native(item.grad, rows, f"gradient of {name}"))
+        grad.append(_native(item.gradient, rows, f"gradient of {name}"))
     return rhs._replace(
         inv=_addresses(inv),
         grad=_addresses(grad),

@@ -132,7 +132,7 @@ def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callabl
 
 
 def _transformed_invariant(item: Invariant) -> Invariant:
-    fun, grad = _transformed_functions(item.fun, item.grad, item.uses_f)
+    fun, grad = _transformed_functions(item.function, item.gradient, item.uses_f)
     return Invariant(fun, grad, args=item.args, in_place=True, uses_f=item.uses_f, name=item.name, scale=item.scale)
 
 

@@ -494,7 +494,7 @@ class Loop:
 
 def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:
     """Whether a jitted right-hand side is called from Python for the sake of invariants that are not jitted."""
-    kept = [found for item in run.invariants.items for found in (item.fun, item.grad)]
+    kept = [found for item in run.invariants.items for found in (item.function, item.gradient)]
     native = all(is_compiled(found) or isinstance(found, PointerFunction) for found in kept)
     return isinstance(functions, PythonFunctions) and is_jitted(fun) and not native
 

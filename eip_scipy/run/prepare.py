@@ -219,9 +219,9 @@ class System:
         in_python = isinstance(functions, PythonFunctions)
         found = {self.name: kind(self.fun, in_python)}
         for item, label in zip(run.invariants.items, run.invariants.labels, strict=True):
-            found[label] = kind(item.fun, in_python)
-            differences = item.grad is None and not in_python
-            found[f"gradient of {label}"] = "differences" if differences else kind(item.grad, in_python)
+            found[label] = kind(item.function, in_python)
+            differences = item.gradient is None and not in_python
+            found[f"gradient of {label}"] = "differences" if differences else kind(item.gradient, in_python)
         if self._corrects(run):
             found["jacobian"] = kind(self.jacobian, in_python)
         in_python = isinstance(functions, PythonFunctions) or functions.python is not None
@@ -289,7 +289,7 @@ class Prepared:
         """The C functions by pointer."""
         items = self.run.invariants.items
         functions = [self.system.fun, *self.system.events.functions]
-        functions += [function for item in items for function in (item.fun, item.grad)]
+        functions += [function for item in items for function in (item.function, item.gradient)]
         return [function for function in functions if isinstance(function, PointerFunction)]
 
     def identity(self, y0: Any, params: Any) -> dict[str, Any]:

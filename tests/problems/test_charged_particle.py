@@ -397,7 +397,7 @@ def test_compiled_functions_may_return_integers_and_arrays(form):
 def test_functions_of_one_field_are_composed_once():
     a, b = tokamak("banana"), tokamak("transit")
     assert a.rhs is b.rhs
-    assert a.invariants[0].fun is b.invariants[0].fun
+    assert a.invariants[0].function is b.invariants[0].function
     assert replace(a, h=0.1).field is TOKAMAK
 
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import eip_scipy.integrations
-from eip_scipy import EIPDOP853, EIPRK4, check_gradient, integrate
+from eip_scipy import EIPDOP853, EIPRK4, Invariant, check_gradient, hamiltonian, integrate
 from eip_scipy.app.cli import main
 from eip_scipy.app.hard import runs as scene_runs
 from eip_scipy.app.hard import scenes as hard_scenes
@@ -55,6 +56,30 @@ def test_pythagorean_energy_and_momentum():
     assert energy[0] == pytest.approx(-769 / 60, rel=1e-15)
     assert np.all(momentum == 0)
     assert problem.reference(69.0) is None
+
+
+def test_functions_of_invariants_take_their_own_parameters():
+    """Kepler's energy v^2 / 2 - 1 / r and angular momentum, and their gradients, with parameters and without."""
+    problem, y = kepler(relativistic=0), np.array([2.0, 0.0, 0.5, 0.25])
+    H, L = problem.invariants
+    assert (H.fun(0.0, y), L.fun(0.0, y)) == (0.5**2 / 2 + 0.25**2 / 2 - 0.5, 0.5)
+    assert H.fun(0.0, y, problem.params + 0.1) != H.fun(0.0, y) == H.fun(0.0, y, problem.params)
+    out, again = np.empty(4), np.empty(4)
+    for given in ((), (problem.params,)):
+        L.grad(0.0, y, out, *given)
+        np.testing.assert_array_equal(out, [0.25, -0.5, 0.0, 2.0])
+    f = problem.fun(0.0, y)
+    same = Invariant(H.fun, H.grad, in_place=H.in_place, uses_f=H.uses_f)
+    for item in (H, same):
+        item.grad(0.0, y, *((f,) if H.uses_f else ()), again)
+        np.testing.assert_allclose(again, [0.25, 0.0, 0.5, 0.25], rtol=1e-15)
+    assert (same.args, same.function) == (H.args, H.function)
+    runs = [integrate(problem, (0, 1), method=EIPRK4, h=0.1, invariants=items) for items in ((H, L), (same, L))]
+    np.testing.assert_array_equal(runs[0].y, runs[1].y)
+    assert pickle.loads(pickle.dumps(H.fun))(0.0, y) == H.fun(0.0, y)
+    spring = hamiltonian("p**2/(2*m) + k*q**2/2", params={"m": 2.0, "k": 3.0})
+    assert spring.invariants[0].fun(0.0, np.array([1.0, 2.0])) == 2.5
+    assert spring.invariants[0].fun(0.0, np.array([1.0, 2.0]), np.array([1.0, 1.0])) == 2.5
 
 
 @pytest.mark.needs_jit

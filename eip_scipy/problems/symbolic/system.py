@@ -156,7 +156,7 @@ class SymbolicProblem(Problem):
     def __reduce__(self) -> tuple[Any, ...]:
         """Functions are made again from the expressions where it is read."""
         own = [fun for fun, _ in _functions(self.system).invariants]
-        kept = [own.index(item.fun) if item.fun in own else item for item in self.invariants]
+        kept = [own.index(item.function) if item.function in own else item for item in self.invariants]
         left = {"fun", "rhs", "acc", "jacobian", "invariants"}
         return _again, (kept, {item.name: getattr(self, item.name) for item in fields(self) if item.name not in left})
 
