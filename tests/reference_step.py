@@ -14,6 +14,7 @@ import numpy as np
 
 EPS = np.finfo(float).eps
 FLOOR = 1e-7
+MEMORY = 0.9
 
 Array = np.ndarray
 
@@ -23,7 +24,8 @@ class Step:
     """What a step is made with.
 
     `fun` is f(t, y), `values` I(t, y) and `gradients` G(t, y) (l, n) of all invariants. `blocks` are lists of
-    components; `frame` is (C, S); the metric is "error", "euclidean" or n weights.
+    components; `frame` is (C, S); the metric is "error", "euclidean" or n weights. `remembered` holds the blocks'
+    relative errors, in units of the largest one, that the error metric remembers of the steps made so far.
     """
 
     tableau: Any
@@ -38,6 +40,7 @@ class Step:
     frame: tuple[Array, Array] | None = None
     direction: str = "new"
     iterations: int = 1
+    remembered: Any = 0.0
 
     def __call__(self, t: float, y: Array, h: float) -> Array:
         """The state at t + h."""
@@ -49,9 +52,9 @@ class Step:
     def projected(self, t_old: float, y: Array, t: float, y_hat: Array, err: Array | None) -> Array:
         """y_hat on the invariants' targets."""
         g = self.defects(t, y_hat)
+        sigma = self.weights(y, y_hat, err)
         if not g.any():
             return y_hat
-        sigma = self.weights(y, y_hat, err)
         # Newton's matrix has the gradients where the defects are taken; corrections go along those of the direction.
         along = {"new": (t, y_hat), "old": (t_old, y), "midpoint": ((t_old + t) / 2, (y + y_hat) / 2)}[self.direction]
         Q = sigma * self.neutral(floats(self.gradients(*along)))
@@ -71,7 +74,11 @@ class Step:
         return np.where(np.abs(g) <= 4 * EPS * size, 0.0, g)
 
     def weights(self, y: Array, y_hat: Array, err: Array | None) -> Array:
-        """Sigma: how far each float may move, the largest 1. By blocks, scale_b ((r_b / max r)^kappa + floor)."""
+        """Sigma: how far each float may move, the largest 1. By blocks, scale_b (e_b^kappa + floor).
+
+        e_b is the block's relative error in units of the largest one, or what is remembered of it. For a block that the
+        step leaves as it was, without an error, what is remembered does not count.
+        """
         width = floats(y).size // y.size
         if not isinstance(self.metric, str):
             return np.repeat(self.metric / np.max(self.metric), width)
@@ -81,14 +88,18 @@ class Step:
         places = [np.concatenate([np.arange(width) + width * k for k in block]) for block in blocks]
 
         def norms(a: Array) -> Array:
-            return np.array([np.linalg.norm(a[place]) for place in places])
+            return np.array([np.linalg.norm(floats(a)[place]) for place in places])
 
-        old, new, error = (norms(floats(a)) for a in (y, y_hat, err))
+        old, new, error = norms(y), norms(y_hat), norms(err)
         scale = self.atol * np.sqrt([len(block) for block in blocks]) + self.rtol * np.maximum(old, new)
-        ratio = np.hypot(error, EPS * new) / scale
-        if not ratio.any():
+        ratio = np.divide(np.hypot(error, EPS * new), scale, where=scale > 0, out=np.zeros(len(scale)))
+        now = ratio / (ratio.max() or 1.0)
+        self.remembered = np.maximum(now, MEMORY * self.remembered)
+        constant = (error == 0.0) & (norms(y_hat - y) == 0.0)
+        errors = np.where(constant, now, self.remembered)
+        if not errors.any():
             return np.ones(floats(y).size)
-        by_block = scale * ((ratio / ratio.max()) ** self.tableau.kappa + FLOOR)
+        by_block = scale * (errors**self.tableau.kappa + FLOOR)
         sigma = np.empty(floats(y).size)
         for place, weight in zip(places, by_block / by_block.max(), strict=True):
             sigma[place] = weight

@@ -32,7 +32,7 @@ from ..core.versions import versions
 
 __all__ = ["CheckpointError", "origin", "read", "require_same", "warn_of_other_versions", "write"]
 
-FORMAT, SCHEMA = "eip_scipy checkpoint", 2
+FORMAT, SCHEMA = "eip_scipy checkpoint", 3
 HEADER = "header.json"
 MARK = b"eip_scipy checkpoint, SHA-256 "
 DIGITS = 64

@@ -37,7 +37,7 @@ from .one_step import OneStep, OneStepMethod
 from .options import ProjectionOptions, takes_projection_options
 from .results import Diagnostics
 from .setup import Start
-from .stepping import AnyMethod, StepOptions, Stepping, interval
+from .stepping import ATOL, AnyMethod, StepOptions, Stepping, interval
 
 __all__ = [
     "EIPDOP853",
@@ -88,7 +88,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         End; before t0 to integrate backward.
     max_step, rtol, atol, first_step
         Step control, as in SciPy's own methods; the error estimate sees the step before its projection. `rtol` and
-        `atol` are also the scale of the error metric: ``|atol| + rtol |y|``, norms over a block.
+        `atol` are also the scale of the error metric: ``|atol| + rtol |y|``, norms over a block. The default of `atol`
+        is 1e-6 for adaptive steps and 0 for a fixed step `h`, where the metric then does not depend on units.
     vectorized : bool, optional
         Whether `fun` takes (n, k) arrays, as in SciPy.
     h : float, optional
@@ -158,7 +159,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         t_bound: float,
         max_step: float = np.inf,
         rtol: Any = 1e-3,
-        atol: Any = 1e-6,
+        atol: Any = ATOL,
         vectorized: bool = False,
         first_step: float | None = None,
         *,

@@ -18,6 +18,7 @@ from .inputs import is_number, reals, refuse_units, shown
 from .one_step import OneStep
 
 __all__ = [
+    "ATOL",
     "UNBOUNDED",
     "AnyMethod",
     "StepOptions",
@@ -31,6 +32,13 @@ __all__ = [
 AnyMethod = Tableau | NystromTableau | GaussJackson | OneStep
 UNBOUNDED = 2**62
 LEAST_RTOL = 100 * EPS  # SciPy's
+
+
+class DefaultTolerance(float):
+    """A tolerance that the user has not given."""
+
+
+ATOL = DefaultTolerance(1e-6)  # SciPy's
 
 
 @dataclass(frozen=True)
@@ -104,13 +112,17 @@ class Stepping:
 
 @dataclass(frozen=True, kw_only=True)
 class StepOptions:
-    """The options of the step size as a user gives them."""
+    """The options of the step size as a user gives them.
+
+    The default of `atol` counts for adaptive steps only. Fixed steps use it as a scale of the error metric and nothing
+    else, which a number that ignores the units of the state would spoil; unless it is given, it is 0 for them.
+    """
 
     h: Any = None
     first_step: Any = None
     max_step: Any = np.inf
     rtol: Any = 1e-3
-    atol: Any = 1e-6
+    atol: Any = ATOL
 
     def checked(self, name: str, method: AnyMethod, t0: float, t_bound: float, n: int, *, stacklevel: int) -> Stepping:
         """How a run of n components steps; `stacklevel` is that of the user, for a warning.
@@ -133,7 +145,8 @@ class StepOptions:
                 "h sets a fixed step; first_step and max_step belong to adaptive steps: give one or the other."
             )
         first_step, max_step = step_bounds(self.first_step, self.max_step, t0, t_bound)
-        rtol, atol = tolerances(self.rtol, self.atol, n)
+        unset = h is not None and isinstance(self.atol, DefaultTolerance)
+        rtol, atol = tolerances(self.rtol, 0.0 if unset else self.atol, n)
         if h is not None:
             h = check_fixed_step(h, t0, t_bound, may_be_longer=True)
         elif np.any(rtol < LEAST_RTOL):

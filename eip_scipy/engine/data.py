@@ -205,6 +205,8 @@ class Work(NamedTuple):
     sigma: np.ndarray
     scale: np.ndarray
     ratio: np.ndarray
+    memory: np.ndarray
+    memory_new: np.ndarray
     move: np.ndarray
     carry: np.ndarray
     carry_hat: np.ndarray
@@ -261,6 +263,8 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
         **small,
         scale=np.zeros(n_blocks),
         ratio=np.zeros(n_blocks),
+        memory=np.zeros(n_blocks),
+        memory_new=np.zeros(n_blocks),
         B=np.zeros((n_invariants, m)),
         Q=np.zeros((n_invariants, m)),
         R=np.zeros((n_invariants, n_invariants)),

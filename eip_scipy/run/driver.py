@@ -137,7 +137,7 @@ class Driver:
             if history is None
             else {"nodes": history.nodes, "sums": history.sums, "node": history.place, "levels": history.levels}
         )
-        kept = ("carry", "err_sum", "sigma", "defect", "max_defect", "max_correction", "trust", "counters")
+        kept = ("carry", "err_sum", "sigma", "memory", "defect", "max_defect", "max_correction", "trust", "counters")
         return {
             "place": schedule.place,
             "clock": schedule.clock,

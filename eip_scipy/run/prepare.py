@@ -26,7 +26,7 @@ from ..core.problem import Problem, made
 from ..core.results import Diagnostics
 from ..core.setup import Counted, Run, Start
 from ..core.solvers import EIPSolver, eip_method
-from ..core.stepping import AnyMethod, StepOptions, Stepping, interval
+from ..core.stepping import ATOL, AnyMethod, StepOptions, Stepping, interval
 from ..engine.counters import NFEV
 from ..engine.data import Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
@@ -119,7 +119,7 @@ class Request:
             first_step=self.first_step,
             max_step=self.max_step,
             rtol=1e-3 if self.rtol is DEFAULT else self.rtol,
-            atol=1e-6 if self.atol is DEFAULT else self.atol,
+            atol=ATOL if self.atol is DEFAULT else self.atol,
         )
 
 

@@ -429,22 +429,21 @@ def test_shorter_and_shorter_at_most_ten_times(driver):
 
 @both
 def test_impossible_manifold(driver):
-    """Two invariants that part at t = 0.45 whatever the state: a clean end before t = 1, and no silence about it."""
-    square = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="square")
-    drifting = Invariant(lambda t, y: y @ y + 10 * max(t - 0.45, 0.0), lambda t, y: 2 * y, name="drifting")
-    run = driver(turn, (0, 1), [1.0, 2.0], max_step=0.1, invariants=[square, drifting], check=False)
+    """A circle that shrinks from t = 0.45 on and is gone at t = 0.7: a clean end, and no silence about it."""
+    shrinking = Invariant(lambda t, y: y @ y + 20 * max(t - 0.45, 0.0), lambda t, y: 2 * y, name="shrinking")
+    run = driver(turn, (0, 1), [1.0, 2.0], max_step=0.1, invariants=shrinking, check=False)
     assert run.status == -1
     assert run.message.startswith("projection failed at t=")
-    assert "invariant 'drifting'" in run.message or "invariant 'square'" in run.message
-    assert "rank 1 of 2" in run.message
-    assert 0.4 < run.t[-1] < 1.0
+    assert "invariant 'shrinking'" in run.message
+    assert "rank 1 of 1" in run.message
+    assert 0.45 < run.t[-1] < 1.0
     assert np.isfinite(run.y).all()
     before = run.t < 0.45
     assert before.sum() > 4
     np.testing.assert_allclose((run.y[:, before] ** 2).sum(axis=0), 5.0, rtol=1e-9)
     assert run.diagnostics.n_rejected_projections >= 11
-    # What it did accept of the contradiction stands in the diagnostics.
-    assert run.max_defect.sum() >= 0.9 * 10 * max(run.t[-1] - 0.45, 0.0)
+    # The diagnostics hold the residual of the states that were accepted although no state meets the level.
+    assert run.max_defect[0] >= 0.9 * 20 * max(run.t[-1] - 0.7, 0.0)
 
 
 @both
@@ -763,7 +762,8 @@ def test_hook_may_project_another_raw_state():
     assert np.abs(energy(0, sol.y) - energy(0, Y0)).max() < 1e-10
     moves = np.array(moves)
     assert moves[:, 3].min() > 1e-6
-    assert moves[:, :3].max() < 1e-11  # by the metric's floor
+    # The corrections exceed five of these errors, so that the weights are softened; without that 1e-11, by their floor.
+    assert moves[:, :3].max() < 0.02 * moves[:, 3].min()
 
 
 @pytest.mark.nightly

@@ -66,8 +66,8 @@ def length(cls):
     return 0.5 if cls in (EIPDOP853, EIPRKN8, EIPRKN12) else 0.05
 
 
-def both(cls, problem, y0, **options):
-    """One step from y0 by the engine and by the reference; the targets are a little beside the start's values."""
+def both(cls, problem, y0, steps=1, **options):
+    """Make steps from y0 by the engine and by the reference; the targets are a little beside the start's values."""
     (fun, pairs, _), h = problem, length(cls)
     invariants, first = [], []
     for value, gradient in pairs:
@@ -76,7 +76,8 @@ def both(cls, problem, y0, **options):
         invariants.append(Invariant(value, gradient, target=target))
     given = {"rtol": 1e-3, "atol": 1e-6} | options
     solver = cls(fun, 0.0, y0.copy(), 10.0, h=h, invariants=invariants, check=False, **given)
-    assert solver.step() is None
+    for _ in range(steps):
+        assert solver.step() is None
 
     def values(t, y):
         return np.concatenate([np.atleast_1d(value(t, y)) for value, _ in pairs])
@@ -84,9 +85,12 @@ def both(cls, problem, y0, **options):
     def gradients(t, y):
         return np.concatenate([np.atleast_2d(gradient(t, y)) for _, gradient in pairs])
 
-    given = {name: value for name, value in given.items() if name not in ("every", "compensated")}
+    given = {name: value for name, value in given.items() if name not in ("every", "compensated", "reuse_f")}
     step = Step(cls.TABLEAU, fun, values, gradients, np.concatenate(first), **given)
-    return solver.y, step(0.0, y0, h), step
+    y = y0
+    for k in range(steps):
+        y = step(k * h, y, h)
+    return solver.y, y, step
 
 
 OPTIONS = [
@@ -112,6 +116,16 @@ def test_a_step_is_that_of_the_method(cls, options):
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14 * moved + 3e-16)
     if options.get("iterations", 1) > 2:
         assert np.abs(step.defects(length(cls), found)).max() <= 1e-15
+
+
+@pytest.mark.parametrize("options", [{}, {"blocks": [[0, 3], [1, 4], [2, 5]]}, {"blocks": 3}, {"atol": 0.0}])
+@pytest.mark.parametrize("cls", [EIPRK4, EIPRK45, EIPDOP853])
+def test_errors_of_earlier_steps_are_remembered(cls, options):
+    given = {"blocks": [[0, 1, 2], [3, 4, 5]]} if options.get("blocks") == 3 else options
+    found, expected, step = both(cls, REAL, Y0, steps=6, **given, reuse_f=False)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+    forgetful = both(cls, REAL, Y0, **given)[2]
+    assert not np.array_equal(step.remembered, forgetful.remembered)
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=lambda o: "-".join(o) or "plain")

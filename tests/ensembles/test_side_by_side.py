@@ -112,8 +112,8 @@ def test_parallel_gradients():
 
 def test_members_leave_and_come_back():
     """Components that stand alone make projections with softened weights: more than a vector does."""
-    starts = spread_starts(np.array([1.0, 0.0, 0.0, 1.0]), 16, size=0.1)
-    options = {"method": EIPRK5, "h": 0.1, "blocks": None, "save_every": 50}
+    starts = spread_starts(np.array([1.0, 0.0, 0.0, 0.85]), 16, size=0.03)
+    options = {"method": EIPRK5, "h": 0.3, "blocks": None, "save_every": 50, "every": 5}
     run = check_bits(kepler(), (0, 60), starts, **options)
     assert run.side_by_side.all()
     softened = [integrate(kepler(), (0, 60), start, **options).diagnostics.n_softened for start in starts]

@@ -769,7 +769,7 @@ def test_header_and_arrays(tmp_path):
     checkpoint.write(path, {"kind": "test", "a": [1, 2.5, None], "b": "ü"}, arrays)
     header, found = checkpoint.read(path, "test")
     assert (header["kind"], header["a"], header["b"]) == ("test", [1, 2.5, None], "ü")
-    assert header["schema"] == 2
+    assert header["schema"] == 3
     assert header["versions"]["numpy"] == np.__version__
     assert list(found) == list(arrays)
     with np.load(path, allow_pickle=False) as plain:
@@ -923,7 +923,7 @@ def forged(path, name, member, header=None):
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         archive.comment = checkpoint.MARK + b"0" * 64
-        archive.writestr("header.json", json.dumps({"format": "eip_scipy checkpoint", "schema": 2, **(header or {})}))
+        archive.writestr("header.json", json.dumps({"format": "eip_scipy checkpoint", "schema": 3, **(header or {})}))
         archive.writestr(name, member)
     path.write_bytes(sealed(stream.getvalue()))
 
@@ -968,8 +968,8 @@ def test_foreign_archives(tmp_path):
     np.savez(path, x=np.arange(3))
     with pytest.raises(CheckpointError, match="is truncated or no checkpoint of eip_scipy"):
         checkpoint.read(path)
-    forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"schema": 3})
-    with pytest.raises(CheckpointError, match="has schema 3, expected 2; resume with the version of eip_scipy"):
+    forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"schema": 4})
+    with pytest.raises(CheckpointError, match="has schema 4, expected 3; resume with the version of eip_scipy"):
         checkpoint.read(path)
     forged(path, "x.npy", npy_bytes("<f8", (1, 1), bytes(8), fortran=True))
     with pytest.raises(CheckpointError, match="no checkpoint"):
@@ -986,7 +986,7 @@ def test_foreign_archives(tmp_path):
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         archive.comment = checkpoint.MARK + b"0" * 64
-        archive.writestr("header.json", json.dumps({"format": "eip_scipy checkpoint", "schema": 2}))
+        archive.writestr("header.json", json.dumps({"format": "eip_scipy checkpoint", "schema": 3}))
         archive.writestr("x0.npy", npy_bytes("<f8", (128,), bytes(1024)))
         first = archive.filelist[-1]
         for k in range(1, 40):

@@ -128,9 +128,10 @@ inline Moved move(const AnyRun &run, const Step &step, double largest_error = -1
     const Options &o = run.options;
     const auto &w = run.work;
     ++w.counters[NLU];
-    // The state's own rounding is an error of the step, and at small steps the largest, unless it is carried along.
-    if (largest_error < 0.0)
-        largest_error = o.metric == ERROR ? error_metric(step.y, o.compensated ? 0.0 : EPS, o, w) : 0.0;
+    if (largest_error < 0.0) {
+        largest_error = o.metric == ERROR ? relative_errors(step.y, run) : 0.0;
+        if (o.metric == ERROR) weights_from_errors(step.y, o, w);
+    }
     const int64_t rank = o.direction == NEW ? first_move(o, w, step.y_new, o.iterations > 1)
                                             : other_directions(of_any_length(run), step);
     return {rank, largest_error, correction_in_local_errors(largest_error, o, w)};
@@ -187,7 +188,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     ++run.work.counters[SOFTENED];
     Code status = FAILED_PROJECTION;
     for (int k = 0; k < MAX_SOFTENED; ++k) {
-        soften(run.options, run.work);
+        soften(step.y, run.options, run.work);
         moved = move(run, step, moved.largest_error);
         status = correct(run, step, moved.rank);
         if (status == OK && !(alone && moved.correction > HEALTHY)) break;
@@ -214,14 +215,22 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     return judge(w.g, origin(step, w), step.y_new, o, w);
 }
 
-// y_hat lies in all dead bands: nothing is moved.
-template <class W>
-inline Code stay(const Step &step, const Options &o, const W &w) {
+// Accept y_hat, which lies in all dead bands, as it is. The errors are remembered all the same: in free flight, where
+// the estimates vanish, all relative errors are rounding and equal.
+template <class AnyRun>
+inline Code stay(const AnyRun &run, const Step &step) {
+    const Options &o = run.options;
+    const auto &w = run.work;
     ++w.counters[SKIPPED];
     copy(w.y_hat, step.y_new, w.m);
     const Code status = judge(w.before, origin(step, w), step.y_new, o, w);
-    if (status == OK) take_note(step.t_new, origin(step, w), o, w);
-    return status;
+    if (status != OK) return status;
+    take_note(step.t_new, origin(step, w), o, w);
+    if (o.metric == ERROR) {
+        relative_errors(step.y, run);
+        remember_errors(o, w);
+    }
+    return OK;
 }
 
 template <class AnyRun>
@@ -253,7 +262,7 @@ template <class AnyRun>
 inline Code project_evaluated(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
-    if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) return stay(step, o, w);
+    if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) return stay(run, step);
     Moved moved = move(run, step);
     Code status = correct(run, step, moved.rank);
     if (o.direction == NEW && o.iterations == 1 && !o.compensated) {
@@ -272,6 +281,7 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
     }
     if (status == OK) {
         take_note(step.t_new, origin(step, w), o, w);
+        remember_errors(o, w);
         w.max_correction[0] = std::max(w.max_correction[0], moved.correction);
     }
     return status;

@@ -136,9 +136,9 @@ template <class V>
 struct WorkOf {
     using Value = V;
     int64_t n, m, l, stages;
-    Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *move, *carry, *carry_hat,
-        *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *worth, *defect, *max_defect, *max_correction, *trust,
-        *target, *products;  // the invariants' levels; scratch of the frame
+    Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *memory, *memory_new, *move,
+        *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *worth, *defect, *max_defect,
+        *max_correction, *trust, *target, *products;  // the invariants' levels; scratch of the frame
     double *norm;
     int64_t *pivots, *counters;
     Inner inner;

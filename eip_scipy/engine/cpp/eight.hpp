@@ -38,7 +38,8 @@ struct Eight {
         const std::pair<Octet **, int64_t> places[] = {
             {&work.K, (w.stages + 1) * n}, {&work.G, l * n}, {&work.Q, l * n}, {&work.R, l * l}, {&work.stage, n},
             {&work.y_hat, n}, {&work.err, n}, {&work.err_low, n}, {&work.err_sum, n},
-            {&work.sigma, n}, {&work.move, n}, {&work.scale, blocks}, {&work.ratio, blocks}, {&work.mu, l},
+            {&work.sigma, n}, {&work.move, n}, {&work.scale, blocks}, {&work.ratio, blocks},
+            {&work.memory, blocks}, {&work.memory_new, blocks}, {&work.mu, l},
             {&work.values, l}, {&work.g, l}, {&work.band, l}, {&work.before, l}, {&work.worth, l}, {&work.defect, l},
             {&work.max_defect, l}, {&work.target, l}, {&work.trust, l * N_FIGURES}, {&work.products, products},
             {&work.max_correction, 1}, {&y, n}, {&y_new, n}, {&projections, 1}, {&skips, 1}, {&reduced, 1},

@@ -29,6 +29,7 @@ inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, co
     copy(members.params + k * system.n_params, system.params, system.n_params);
     copy(members.starts + k * w.m, y, w.m);
     copy(members.sigma, w.sigma, w.m);
+    fill(w.memory, 0.0, o.blocks.count);
     for (double *buffer : {w.carry, w.err_sum}) fill(buffer, 0.0, w.m);
     for (double *buffer : {w.defect, w.max_defect}) fill(buffer, 0.0, w.l);
     w.max_correction[0] = 0.0;

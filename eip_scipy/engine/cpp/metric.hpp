@@ -6,6 +6,8 @@
 namespace eip {
 
 constexpr double METRIC_FLOOR = 1e-7, TINY = 1e-290;
+// The share of a relative error that the metric still remembers one step later.
+constexpr double ERROR_MEMORY = 0.9;
 
 // x <- x^exponent, x in [0, 1]; for RK4 and DOP853 by square roots, several times faster than pow.
 template <class Value>
@@ -89,7 +91,7 @@ inline Truth<Value> component_sizes(const Value *__restrict y, double rounding, 
 template <class Value, class W>
 inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &o, const W &w) {
     if (o.blocks.size == 1) return component_sizes(y, rounding, o, w);
-    Value *scratch = w.sigma, *sizes = w.scale, *errors = w.ratio;
+    Value *scratch = w.move, *sizes = w.scale, *errors = w.ratio;
     weighted_squares(o.rtol, y, scratch, w.m);
     block_sums(scratch, o.blocks, errors);
     weighted_squares(o.rtol, w.y_hat, scratch, w.m);
@@ -139,34 +141,63 @@ inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &
     }
 }
 
-// From the sizes of n blocks and of their errors the weights, in `ratio`; returns the largest relative error.
+// Compute, from the sizes of n blocks and of their errors, the relative errors in units of the largest one: `ratio` of
+// this step, `memory_new` with what is remembered of earlier steps, of which the share `kept` is left. Returns the
+// largest relative error of this step.
 template <class Value>
-inline Value block_weights(Value *__restrict scale, Value *__restrict ratio, const Options &o, int64_t n) {
+inline Value remembered_errors(Value *__restrict scale, Value *__restrict ratio, const Value *__restrict memory,
+                               Value *__restrict memory_new, double kept, const Options &o, int64_t n) {
     const double *__restrict atol = o.block_atol;
     for (int64_t b = 0; b < n; ++b) {
         scale[b] += atol[b];
         // Over a scale of 0 there is no error to speak of.
         ratio[b] = where(scale[b] > 0.0, ratio[b], 0.0) / max(scale[b], Value(TINY));
     }
-    const Value largest_ratio = largest(ratio, n);
-    Value inverse = 1.0 / positive(largest_ratio);
-    for (int64_t b = 0; b < n; ++b) ratio[b] = min(Value(1.0), ratio[b] * inverse);
-    powers(ratio, o.kappa, n);
-    for (int64_t b = 0; b < n; ++b) ratio[b] = scale[b] * (ratio[b] + METRIC_FLOOR);
-    inverse = 1.0 / positive(largest(ratio, n));
-    for (int64_t b = 0; b < n; ++b) ratio[b] = where(largest_ratio > 0.0, ratio[b] * inverse, 1.0);
+    const Value largest_ratio = largest(ratio, n), inverse = 1.0 / positive(largest_ratio);
+    for (int64_t b = 0; b < n; ++b) {
+        ratio[b] = min(Value(1.0), ratio[b] * inverse);
+        memory_new[b] = max(ratio[b], kept * memory[b]);
+    }
     return largest_ratio;
 }
 
-// The weights w.sigma from what `block_sizes` has found, and the blocks' scales; returns the largest relative error.
-template <class W>
-inline auto weights_from_sizes(const Options &o, const W &w) {
+// Compute the weights of n blocks from their scales and their relative errors, which the weights replace.
+template <class Value>
+inline void block_weights(const Value *__restrict scale, Value *__restrict weights, const Options &o, int64_t n) {
+    const auto known = largest(weights, n) > 0.0;
+    powers(weights, o.kappa, n);
+    for (int64_t b = 0; b < n; ++b) weights[b] = scale[b] * (weights[b] + METRIC_FLOOR);
+    const Value inverse = 1.0 / positive(largest(weights, n));
+    for (int64_t b = 0; b < n; ++b) weights[b] = where(known, weights[b] * inverse, 1.0);
+}
+
+// Return whether a step from y has neither changed component i nor seen an error there. A component that is constant for
+// good, such as a parameter carried along as a component of the state, is not to be moved because of earlier steps.
+template <class Value, class W>
+inline Truth<Value> is_constant(const Value *y, int64_t i, const W &w) {
+    return (w.y_hat[i] == y[i]) & (w.err[i] == 0.0);
+}
+
+// Return whether all components of block b are constant in this sense.
+template <class Value, class W>
+inline Truth<Value> is_constant_block(const Value *y, int64_t b, const Blocks &blocks, const W &w) {
+    auto constant = is_constant(y, blocks.member[blocks.start[b]], w);
+    for (uint64_t p = blocks.start[b] + 1; any(constant) && p < blocks.start[b + 1]; ++p)
+        constant = constant & is_constant(y, blocks.member[p], w);
+    return constant;
+}
+
+// Compute the weights w.sigma from the blocks' scales and relative errors after a step from y.
+template <class Value, class W>
+inline void weights_from_errors(const Value *y, const Options &o, const W &w) {
     const Blocks &blocks = o.blocks;
-    const auto largest_ratio = block_weights(w.scale, w.ratio, o, blocks.size == 1 ? w.m : blocks.count);
     if (blocks.size == 1) {
-        copy(w.ratio, w.sigma, w.m);
-        return largest_ratio;
+        for (int64_t i = 0; i < w.m; ++i) w.sigma[i] = where(is_constant(y, i, w), w.ratio[i], w.memory_new[i]);
+        return block_weights(w.scale, w.sigma, o, w.m);
     }
+    for (int64_t b = 0; b < blocks.count; ++b)
+        w.ratio[b] = where(is_constant_block(y, b, blocks, w), w.ratio[b], w.memory_new[b]);
+    block_weights(w.scale, w.ratio, o, blocks.count);
     for (int64_t b = 0; b < blocks.count; ++b) {
         if (blocks.size == 3)
             w.sigma[3 * b] = w.sigma[3 * b + 1] = w.sigma[3 * b + 2] = w.ratio[b];
@@ -175,15 +206,33 @@ inline auto weights_from_sizes(const Options &o, const W &w) {
         else
             for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) w.sigma[blocks.member[p]] = w.ratio[b];
     }
-    return largest_ratio;
 }
 
-// Weights w.sigma of the error metric and the blocks' scales; returns the largest relative error r. The error is the
-// estimate and `rounding` times the state, in quadrature. r = 0 (no error at all) leaves the euclidean metric.
-template <class W>
-inline double error_metric(const double *y, double rounding, const Options &o, const W &w) {
+// Return the share of a remembered error that is left after the steps since the last projection. The estimates of a
+// multistep method have a memory of their own.
+template <class AnyRun>
+inline double memory_kept(const AnyRun &run) {
+    if (run.method.multistep) return 0.0;
+    const int64_t waited = run.work.counters[WAITED];
+    return waited == 0 ? ERROR_MEMORY : std::pow(ERROR_MEMORY, static_cast<double>(1 + waited));
+}
+
+// Compute the blocks' relative errors and scales, and return the largest relative error of the step. An error is the
+// estimate and, unless it is carried along, the rounding of the state, in quadrature.
+template <class AnyRun>
+inline double relative_errors(const double *y, const AnyRun &run) {
+    const Options &o = run.options;
+    const auto &w = run.work;
+    const double rounding = o.compensated ? 0.0 : EPS;
     if (block_sizes(y, rounding, o, w)) extreme_block_sizes(y, rounding, o, w);
-    return weights_from_sizes(o, w);
+    return remembered_errors(w.scale, w.ratio, w.memory, w.memory_new, memory_kept(run), o,
+                             o.blocks.size == 1 ? w.m : o.blocks.count);
+}
+
+// Remember the errors of a step that is accepted.
+template <class W>
+inline void remember_errors(const Options &o, const W &w) {
+    if (o.metric == ERROR) copy(w.memory_new, w.memory, o.blocks.size == 1 ? w.m : o.blocks.count);
 }
 
 // Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none.
@@ -205,11 +254,11 @@ inline Value correction_in_local_errors(const Value &largest_error, const Option
     return where(largest_error > 0.0, sqrt(top) / largest_error, 0.0 * largest_error);
 }
 
-// Half way, on a log scale, from the error metric to equal relative errors; blocks without error stay put.
-inline void soften(const Options &o, const Work &w) {
+// Half way, on a log scale, from the error metric to equal relative errors; constants are left out.
+inline void soften(const double *y, const Options &o, const Work &w) {
     const double inverse = 1.0 / largest(w.scale, o.blocks.count);
     for (int64_t b = 0; b < o.blocks.count; ++b) {
-        if (w.scale[b] == 0.0 || block_square(w.err, b, 1.0 / w.scale[b], o.blocks) == 0.0) continue;
+        if (is_constant_block(y, b, o.blocks, w)) continue;
         for (uint64_t p = o.blocks.start[b]; p < o.blocks.start[b + 1]; ++p) {
             const uint64_t i = o.blocks.member[p];
             w.sigma[i] = std::sqrt(w.sigma[i] * (w.scale[b] * inverse));

@@ -79,12 +79,15 @@ template <class W>
     const Mask outside = defects<Octet>(nullptr, w.y_hat, o, w, w.before);
     const Mask moved = outside & alive;
     const bool all_move = moved.all();
+    const RunOf<W, OctetSystem> run{eight.method, o, w, eight.system, nullptr};
+    const int64_t blocks = o.blocks.count;
     Mask leave{};
     Octet largest_error = 0.0;
     if (o.metric == ERROR) {
         if (!all_move) copy(w.sigma, w.stage, w.m);
-        leave = outside & block_sizes<Octet>(y, o.compensated ? 0.0 : EPS, o, w);
-        largest_error = weights_from_sizes(o, w);
+        leave = block_sizes<Octet>(y, o.compensated ? 0.0 : EPS, o, w);
+        largest_error = remembered_errors(w.scale, w.ratio, w.memory, w.memory_new, memory_kept(run), o, blocks);
+        weights_from_errors(y, o, w);
         for (int64_t j = 0; !all_move && j < w.m; ++j) w.sigma[j] = where(moved, w.sigma[j], w.stage[j]);
     }
     Octet *rows = weighed_gradients(o, w);
@@ -104,12 +107,14 @@ template <class W>
         leave = leave | (outside & (correction > HEALTHY));
     }
     for (int64_t j = 0; !all_move && j < w.m; ++j) eight.y_new[j] = where(outside, eight.y_new[j], w.y_hat[j]);
-    evaluate_invariants(RunOf<W, OctetSystem>{eight.method, o, w, eight.system, nullptr}, t, eight.y_new);
+    evaluate_invariants(run, t, eight.y_new);
     const Mask held = defects_held<Octet>(w.before, o, w) & small_shares(o, w) & all_finite(eight.y_new, w.m);
     Mask done = alive & held & !leave;
     if (o.watched) done = done & !note_octet(t, done, o, w);
     for (int64_t i = 0; i < w.l; ++i)
         w.max_defect[i] = where(done, max(w.max_defect[i], abs(w.defect[i])), w.max_defect[i]);
+    for (int64_t b = 0; o.metric == ERROR && b < blocks; ++b)
+        w.memory[b] = where(done, w.memory_new[b], w.memory[b]);
     const Mask corrected = done & outside;
     *w.max_correction = where(corrected, max(*w.max_correction, correction), *w.max_correction);
     *eight.projections += where(corrected, 1.0, 0.0);

@@ -64,6 +64,8 @@ Work work_of(PyObject *work, int64_t stages, int64_t blocks, Arrays &arrays, int
         *place = arrays.floats(work, name, {l});
     w.scale = arrays.floats(work, "scale", {blocks});
     w.ratio = arrays.floats(work, "ratio", {blocks});
+    w.memory = arrays.floats(work, "memory", {blocks});
+    w.memory_new = arrays.floats(work, "memory_new", {blocks});
     w.B = arrays.floats(work, "B", {l, m});
     w.Q = arrays.floats(work, "Q", {l, m});
     w.R = arrays.floats(work, "R", {l, l});

@@ -44,6 +44,7 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
     eight.take(eights.K, lane, w.K, w.m);
     eight.take(eights.err_sum, lane, w.err_sum, w.m);
     eight.take(eights.sigma, lane, w.sigma, w.m);
+    eight.take(eights.memory, lane, w.memory, run.options.blocks.count);
     eight.take(eights.target, lane, w.target, w.l);
     eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
     eight.take(eights.max_defect, lane, w.max_defect, w.l);
@@ -58,6 +59,7 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
     }
     eight.give(y_new, lane, eight.y_new, w.m);
     eight.give(w.sigma, lane, eights.sigma, w.m);
+    eight.give(w.memory, lane, eights.memory, run.options.blocks.count);
     eight.give(w.trust, lane, eights.trust, w.l * N_FIGURES);
     eight.give(w.max_defect, lane, eights.max_defect, w.l);
     eight.at(eights.max_correction, lane) = w.max_correction[0];
@@ -286,6 +288,7 @@ inline void begin_octet(const Run &run, Eight &eight, const Schedule &s, const M
     }
     copy(members.sigma, run.work.sigma, n);
     fill(w.err_sum, 0.0, n);
+    fill(w.memory, 0.0, eight.options.blocks.count);
     fill(w.max_defect, 0.0, w.l);
     for (Octet *one : {w.max_correction, eight.projections, eight.skips, eight.reduced}) *one = 0.0;
     std::fill_n(w.counters, static_cast<int64_t>(N_COUNTERS), 0);
