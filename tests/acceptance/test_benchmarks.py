@@ -28,6 +28,7 @@ RUNS = [
     ("growth", "--years 1 --out .", REBOUND),
     ("import_time", "--rounds 1 --json run.json", ()),
     ("long_orbits", "--years 1 --json run.json", ()),
+    ("metric_memory", "--only gear --json run.json", ()),
     ("metric_table", "--years 100 --rotations 1 --json run.json", ()),
     ("multistep", "--quick --parts 1 3 --json run.json", REBOUND),
     ("multistep", "--quick --parts 2 4 5 --json run.json", REBOUNDX),
