@@ -2,10 +2,11 @@
 
     python benchmarks/trust.py [--only TEXT] [--workers 2] [--markdown FILE] [--csv FILE] [--json FILE]
 
-Sick runs: quantities that are no invariants (their rate 0 at the start, or not), leaks, wrong gradients, steps too
-long, passages that blow up, members of ensembles; by all methods, fixed and adaptive, solve_ivp and integrate, compiled
-and interpreted, real and complex. Told means: ValueError or UserWarning at the start, ProjectionWarning, status -1, or
-`trusted` false. Their error is that of the last state, relative to its largest component.
+Sick runs: quantities that are no invariants (their rate 0 at the start, or not), leaks, leaks that start late or act in
+places, wrong gradients, steps too long, light bodies, passages that blow up, members of ensembles; by all methods,
+fixed and adaptive, solve_ivp and integrate, compiled and interpreted, real and complex. Told means: ValueError or
+UserWarning at the start, ProjectionWarning, status -1, or `trusted` false. Their error is that of the last
+state, relative to its largest component.
 
 Healthy runs: each is compared with the same run without invariants; one whose error is over ten times the other's, and
 above the tolerance, would be no healthy one. Anything told is a false alarm there.
@@ -30,6 +31,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 from trust_runs.healthy import healthy_runs
+from trust_runs.late import LATE
 from trust_runs.record import CHANNELS, SILENT, Outcome, Run, carry_out, carry_out_plain
 from trust_runs.sick import sick_runs
 
@@ -55,7 +57,7 @@ def record(run: Run) -> dict[str, Any]:
     """One run carried out."""
     begin = time.perf_counter()
     outcome = carry_out(run)
-    if run.sick is False and outcome.y is not None:
+    if (run.sick is False or run.group == LATE) and outcome.y is not None:
         outcome.plain_error = carry_out_plain(run, outcome.t).error
     data = {key: value for key, value in asdict(outcome).items() if key != "y"}
     told = outcome.told[0] if outcome.told else SILENT
@@ -82,6 +84,11 @@ def listing(rows: Iterable[dict[str, Any]]) -> str:
         channels = ", ".join(row["told"]) or (SILENT if row["sick"] else "")
         lines.append(f"  {row['name'][:52]:52} {row['how'][:62]:62} {error:>9}  {channels}")
     return "\n".join(lines)
+
+
+def harmful(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the late leaks that make a run much less accurate than the same run without projection."""
+    return [row for row in rows if row["group"] == LATE and row["error"] > SPOILT * row["plain_error"]]
 
 
 def groups(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
@@ -156,6 +163,9 @@ def main() -> int:
     print("\n" + "\n\n".join(map(markdown, tables)))
     print(f"\ntold: {told} of {len(sick)} sick runs ({told / max(1, len(sick)):.1%}); false alarms: {len(alarms)} of "
           f"{len(healthy)} ({len(alarms) / max(1, len(healthy)):.1%})")  # fmt: skip
+    late = harmful(sick)
+    print(f"late leaks that make the error more than {SPOILT:g} times larger: {sum(bool(row['told']) for row in late)} "
+          f"of {len(late)} reported")  # fmt: skip
     if args.markdown is not None:
         args.markdown.write_text("\n\n".join(map(markdown, tables)) + "\n")
     if args.csv is not None:

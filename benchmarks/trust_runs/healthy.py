@@ -25,18 +25,20 @@ from eip_scipy.problems import (
     tokamak,
     uniform_field,
 )
-from eip_scipy.problems.hard_cases import double_pendulum, rigid_body
+from eip_scipy.problems.hard_cases import double_pendulum, rigid_body, sir
 
 from . import systems as s
 from .record import Run, runs
 
-HARD, OWN, SOLAR, PAPER, SYSTEMS, EVERY, MEMBERS = (
+HARD, OWN, SOLAR, PAPER, SYSTEMS, EVERY, KINKS, LOOSE, MEMBERS = (
     "the hard cases",
     "the problems at their own steps",
     "the solar system over 100 years",
     "the paper's runs",
     "further systems",
     "every, compensated, metric, direction",
+    "kinked forces and cut-offs",
+    "loose tolerances",
     "ensembles",
 )
 SPACINGS = ("", "compensated", "every=10", "every=10 compensated", "every=auto", "every=auto compensated")
@@ -45,7 +47,7 @@ THREE = ", ".join(f"{method} {rtol}" for method in ("RK45", "DOP853", "RK5") for
 
 def healthy_runs() -> list[Run]:
     """All of them."""
-    parts = (hard(), own_steps(), solar(), paper(), systems(), spacing(), ensembles())
+    parts = (hard(), own_steps(), solar(), paper(), systems(), spacing(), kinks(), loose(), ensembles())
     return [replace(run, sick=False) for part in parts for run in part]
 
 
@@ -183,6 +185,96 @@ def spacing() -> Iterator[Run]:
     yield from some("Kepler", kepler, each("RKN12 h=0.03", (*SPACINGS[1:], *points), "integrate"))
     yield from some("Kepler", kepler, each("RK45 1e-6", ("every=10", "every=auto", *points)))
     yield from some("pendulum", s.pendulum, each("RK4 h=0.02", ("every=10", "every=auto", *points)))
+
+
+def one_coordinate(
+    name: str, slope: Callable[[float], float], potential: Callable[[float], float], q0: float, v0: float
+) -> Problem:
+    return s.mechanics(
+        name, lambda t, q, v: -slope(q[0]), lambda q: potential(q[0]), lambda q: np.array([slope(q[0])]), q0, v0, 20.0
+    )
+
+
+def huber(width: float) -> Problem:
+    """A spring whose force does not grow beyond a distance."""
+    return one_coordinate(
+        "Huber's spring",
+        lambda q: min(max(q, -width), width),
+        lambda q: 0.5 * q * q if abs(q) < width else width * (abs(q) - width / 2),
+        1.0,
+        0.1,
+    )
+
+
+def contact(stiffness: float) -> Problem:
+    """A ball that falls onto a spring."""
+    return one_coordinate(
+        "contact",
+        lambda q: 1 + stiffness * min(q, 0.0),
+        lambda q: q + 0.5 * stiffness * min(q, 0.0) ** 2,
+        1.0,
+        0.2,
+    )
+
+
+def hertz(stiffness: float) -> Problem:
+    """A ball that falls onto another."""
+    return one_coordinate(
+        "Hertz's contact",
+        lambda q: 1 - stiffness * max(-q, 0.0) ** 1.5,
+        lambda q: q + 0.4 * stiffness * max(-q, 0.0) ** 2.5,
+        1.0,
+        0.0,
+    )
+
+
+def dead_zone(width: float) -> Problem:
+    """A spring with backlash."""
+    return one_coordinate(
+        "backlash",
+        lambda q: np.sign(q) * max(abs(q) - width, 0.0),
+        lambda q: 0.5 * max(abs(q) - width, 0.0) ** 2,
+        1.0,
+        0.3,
+    )
+
+
+def cubic_walls(stiffness: float) -> Problem:
+    """Free flight between soft walls."""
+    return one_coordinate(
+        "cubic walls",
+        lambda q: stiffness * np.sign(q) * max(abs(q) - 1, 0.0) ** 3,
+        lambda q: stiffness / 4 * max(abs(q) - 1, 0.0) ** 4,
+        0.0,
+        1.0,
+    )
+
+
+def kinks() -> Iterator[Run]:
+    some = partial(runs, KINKS)
+    steps = "RK5 h=0.02, RK5 h=0.01 integrate, RK2 h=0.01, RK45 1e-6, RK45 1e-9 integrate, DOP853 1e-6, DOP853 1e-9"
+    for make, size in (
+        *((huber, width) for width in (0.1, 0.3, 0.7)),
+        *((contact, stiffness) for stiffness in (30.0, 100.0)),
+        *((hertz, stiffness) for stiffness in (100.0, 1000.0)),
+        *((dead_zone, width) for width in (0.1, 0.5)),
+        (cubic_walls, 100.0),
+    ):
+        yield from some(f"{make.__name__.replace('_', ' ')}, {size:g}", partial(make, size), steps)
+
+
+def epidemic(infection: float, recovery: float, infected: float) -> Problem:
+    return s.equations("SIR", sir(infection, recovery), [1 - infected, infected, 0.0], 60.0)
+
+
+def loose() -> Iterator[Run]:
+    some, tolerances = partial(runs, LOOSE), "RK45 1e-2, RK23 1e-2, DOP853 1e-2, RK45 1e-3"
+    for start in ((0.1, 1.0, 0.1), (0.0, 1.0, 1.0), (0.5, 0.7, 0.3)):
+        default = "RK45 rtol=1e-3, DOP853 rtol=1e-3, RK23 rtol=1e-3"
+        yield from some(f"rigid body from {start}", partial(top, *start), default)
+    for rates in ((0.5, 0.2), (0.4, 0.1), (1.0, 0.3), (2.0, 1.0)):
+        for infected in (0.1, 1e-2, 1e-3):
+            yield from some(f"SIR {rates}, {infected:g}", partial(epidemic, *rates, infected), tolerances)
 
 
 def ensembles() -> Iterator[Run]:

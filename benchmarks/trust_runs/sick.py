@@ -35,6 +35,7 @@ from eip_scipy.problems.hard_cases import (
 )
 
 from . import systems as s
+from .late import late_leaks, light_bodies
 from .record import Run, runs
 
 njit = peer("numba", '"eip_scipy[numba]"').njit
@@ -52,7 +53,8 @@ REST, MOVING, LEAK, GRADIENT, LONG, BLOWN, MEMBER = (
 
 def sick_runs() -> list[Run]:
     """All of them."""
-    return [*false_invariants(), *visible(), *leaks(), *gradients(), *long_steps(), *blown(), *members()]
+    every = (false_invariants, visible, leaks, late_leaks, gradients, long_steps, light_bodies, blown, members)
+    return [run for part in every for run in part()]
 
 
 # --- quantities that are no invariants ---
@@ -700,6 +702,22 @@ def members() -> Iterator[Run]:
         "RK4 h=0.05 ensemble",
         sick=(5, 1500),
         y0s=crowd,
+    )
+    rising = np.zeros((8, 1))
+    rising[1:, 0] = np.geomspace(1e-4, 0.1, 7)
+    yield from one(
+        "all but the first, with friction from 1e-4 to 0.1",
+        s.bare_pendulum,
+        "RK2 h=0.02 ensemble, RK4 h=0.02 ensemble, RK5 h=0.02 ensemble, RK45 1e-6 ensemble",
+        sick=tuple(range(1, 8)),
+        params=rising,
+    )
+    yield from one(
+        "the same among 20000, in vectors",
+        s.bare_pendulum,
+        "RK2 h=0.02 ensemble, RK4 h=0.02 ensemble",
+        sick=tuple(range(1, 8)),
+        params=np.concatenate([rising, np.zeros((19992, 1))]),
     )
     yield from one(
         "all of 10 with friction .001",

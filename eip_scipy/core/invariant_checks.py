@@ -53,11 +53,14 @@ class Complaint(NamedTuple):
     text : str
     advice : str
         What follows from it, or what to do about it.
+    dependent : bool
+        Whether it is about an invariant that is kept where others hold.
     """
 
     is_error: bool
     text: str
     advice: str = ""
+    dependent: bool = False
 
 
 class _Samples(NamedTuple):
@@ -283,7 +286,8 @@ def _complaints_of_rates(
         if those:
             others = [known.names[k] for k in those[1:]]
             text = words(known.names[those[0]], at.t, found.rate[those[0]], found.terms[those[0]])
-            yield Complaint(False, text + (f"; the same holds for {listed(others)}" if others else ""), advice)
+            text += f"; the same holds for {listed(others)}" if others else ""
+            yield Complaint(False, text, advice, those is conditional)
 
 
 def _no_invariant(name: str, t: float, rate: float, terms: float) -> str:

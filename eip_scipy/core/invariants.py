@@ -646,6 +646,12 @@ class InvariantSet:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.where(residual == 0, 0.0, residual / allowed)
 
+    def rate_shares(self, t: float, y: Array, f: Array) -> Array:
+        """Return the rates at which the invariants change along f, relative to the terms of these rates; (l,)."""
+        products = self.gradients(t, y, f).conj() * f
+        terms = np.abs(products).sum(axis=1)
+        return np.abs(products.sum(axis=1).real) / np.where(terms > 0, terms, 1.0)
+
     def start_violation(self, t: float, y: Array, f: Array) -> str | None:
         """Return what is wrong with the start, where it misses given targets; the worst invariant comes first."""
         excess = np.nan_to_num(self._excess(t, y, f), nan=np.inf, posinf=np.inf)

@@ -30,7 +30,7 @@ from ..engine.data import (
     FrameRows,
     Grouping,
 )
-from ..engine.trust import LARGE_SHARE
+from ..engine.trust import FAR, FAR_IN_TOLERANCES, LARGE_SHARE, MOST_FAR
 from ..methods.multistep import GaussJackson
 from .blocks import blocks_of
 from .frame import frame_rows
@@ -94,7 +94,8 @@ class Options(NamedTuple):
 
     `rtol` by float of the state, `atol` by component, `block_atol` by block. `kinds`: floats of the same unit.
     `watched`: whether corrections are compared with the errors of the steps. `limit`: the share of an invariant's terms
-    that a projection may leave as its defect; the terms are `per_band` dead bands.
+    that a projection may leave as its defect; the terms are `per_band` dead bands. `far`: the share of them from which
+    on a defect before a projection is noted.
     `joint`: in interpreted runs the `JointInvariants` whose functions serve, else None.
     """
 
@@ -118,6 +119,7 @@ class Options(NamedTuple):
     per_band: float
     watched: bool = False
     limit: float = np.inf
+    far: float = FAR
     joint: Any = None
 
 
@@ -282,6 +284,7 @@ class ProjectionOptions:
             per_band=1.0 / (_band(method, compensated) * EPS),
             watched=check and known.size > 0,
             limit=(LARGE_SHARE if stepping.h is None else 1.0) if check else np.inf,
+            far=FAR if stepping.h is not None else min(max(FAR, FAR_IN_TOLERANCES * np.max(rtol)), MOST_FAR),
         )
         if _can_project_jointly(options, known):
             options = options._replace(joint=known.items)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,16 +31,18 @@ from ..engine.data import (
     make_work,
 )
 from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
-from ..engine.trust import Trust
+from ..engine.trust import NOTHING, REASON, Trust
 from ..methods.multistep import GaussJackson
 from ..methods.nystrom import RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853
 from .blocks import kinds_of
+from .examination import Derivative, Examiner, is_check_due
 from .frame import spanned
 from .inputs import reals, refuse_units, shown
 from .invariants import TARGET_TOLERANCE, InvariantSet
 from .one_step import OneStep, as_vector
 from .options import Options, ProjectionOptions
+from .resolution import unresolved
 from .results import Diagnostics
 from .stepping import AnyMethod, Stepping
 
@@ -48,8 +50,6 @@ __all__ = ["Projection", "Run", "Start", "as_derivative", "prepare"]
 
 START_ITERATIONS = 50
 FRAME_DISTANCE = 1e-4
-# Steps after which the invariants are checked once more.
-LOOKS = (10, 100)
 
 
 class Start(NamedTuple):
@@ -103,24 +103,33 @@ class Run:
             engine.start(self.y0, f, self.tau)
         return engine
 
-    def look(self, steps: int, ended: bool, t: float, y: np.ndarray, derivative: Callable[[], np.ndarray]) -> bool:
-        """Look at a run after so many steps, or where it ends: whether something speaks against it, to be said now.
+    def look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
+        """Examine a run after `steps` steps, or where it has `ended`. Return whether it is to be reported now.
 
-        The invariants are checked at LOOKS (a run that ends before them: there), as their rates and gradients may
-        vanish at the start, and where the corrections are too large, to tell why.
+        Steps that the engine suspects are examined. The invariants are checked after some numbers of steps and at the
+        end, and where the corrections are too large, to find the reason. `rhs` returns a new array.
         """
         if not self.options.watched:
             return False
-        early = steps != self.looked and (steps in LOOKS or (ended and steps < LOOKS[0]))
-        doubtful = self.trust.beyond_doubt or (ended and bool(self.trust.sick.any()))
-        found: list[str] = []
-        if (early or doubtful) and not self.trust.doubts:
-            self.looked = steps
-            f = derivative()
-            if np.isfinite(f).all():
-                found = [complaint.text for complaint in self.invariants.complaints(t, y, f, self.tau)][:1]
-            self.trust.doubts += found
-        return doubtful or bool(found)
+        found = None
+        if not self.trust.doubts:
+            found = self.examiner.examine(self.work.suspect, rhs) if self.work.suspect[REASON] != NOTHING else None
+            due = (ended and not self.trust.failed) or is_check_due(steps)
+            if found is None and ((due and steps != self.looked) or self._is_doubtful(ended)):
+                self.looked = steps
+                found = self.examiner.complaint(rhs, t, y)
+            self.trust.doubts += [found] if found else []
+        return self._is_doubtful(ended) or found is not None
+
+    def _is_doubtful(self, ended: bool) -> bool:
+        """Return whether the corrections contradict the run, or will do so at its end."""
+        return self.trust.beyond_doubt or (ended and bool(self.trust.sick.any()))
+
+    @cached_property
+    def examiner(self) -> Examiner:
+        """Return the examiner of the run's states."""
+        resolution = partial(unresolved, self.method, self.options.groups)
+        return Examiner(self.invariants, self.tau, self.work.trust, resolution)
 
 
 class Counted:

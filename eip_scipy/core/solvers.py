@@ -29,6 +29,7 @@ from .callers import users_level
 from .coefficients import attributes_of, is_same, tableau_of
 from .copies import parts_of, run_of, scipy_values, set_scipy_values
 from .dense import ExactEnds, Interpolants
+from .examination import is_check_due
 from .inputs import refuse_units, shown
 from .invariants import InvariantSet, as_invariants
 from .multistep import SecondOrder, attach_history, times
@@ -352,6 +353,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     def _go_on(self, here: Start) -> None:
         """Go on from the last state with other tolerances, another interval or another function."""
         run = self._run
+        run.invariants.t_span = (run.invariants.t_span[0], float(self.t_bound))
         fresh = self._projection.settled(self._method, self._stepping, run.y0, run.invariants).options
         run.options = run.options._replace(rtol=fresh.rtol, atol=fresh.atol, block_atol=fresh.block_atol)
         self._attach_history(here)
@@ -497,7 +499,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             self.y = self._accepted
         if self.h is None:
             self.h_abs = self._schedule.clock.item(NEXT_LENGTH)
-        if found != self._noted or self._steps in setup.LOOKS or self.t == self.t_bound:
+        if found != self._noted or is_check_due(self._steps) or self.t == self.t_bound:
             self._watch()
         return True, None
 
@@ -505,7 +507,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         """Look at the run where something stands out, early and at its end; warn once, and at once: it may end here."""
         run, arrived = self._run, ended or self.t == self.t_bound
         self._noted = self._work.counters[FOUND]
-        if not self._told and run.look(self._steps, arrived, self.t, self.y, lambda: self._derivative(self.t, self.y)):
+        rhs = partial(_copied, self._derivative)
+        if not self._told and run.look(self._steps, arrived, self.t, self.y, rhs):
             self._told = True
             warnings.warn(f"{type(self).__name__}: {run.trust.message}", ProjectionWarning, stacklevel=users_level())
 

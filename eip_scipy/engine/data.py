@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .counters import N_COUNTERS
-from .trust import N_FIGURES, TERMS
+from .trust import N_FIGURES, N_SUSPECT, TERMS
 
 # Codes of a step; those of the loop.
 OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED, UNSTABLE = range(6)
@@ -225,6 +225,7 @@ class Work(NamedTuple):
     max_defect: np.ndarray
     max_correction: np.ndarray
     trust: np.ndarray
+    suspect: np.ndarray
     norm: np.ndarray
     counters: np.ndarray
     inner: Inner
@@ -272,6 +273,7 @@ def make_work(n: int, dtype: np.dtype, stages: int, n_invariants: int, n_blocks:
         max_defect=np.zeros(n_invariants),
         max_correction=np.zeros(1),
         trust=trust,
+        suspect=np.zeros(N_SUSPECT + 2 * m),
         norm=np.zeros(1),
         counters=np.zeros(N_COUNTERS, np.int64),
         inner=make_inner(n_invariants),
@@ -294,8 +296,8 @@ class Members(NamedTuple):
     They bring `starts` (m, n), `params` (m, p) and `first_steps` (m,), and share the number of `evaluations` before the
     first step, the weights `sigma` at the start and, of each event, how often it may happen before it ends a member,
     `left`. They get last states `y` (m, n) and times `t`, `status` (0 or 1), saved `rows` (m, rows, n), or if they are
-    not `kept` scratch (1, rows, n), and what a run's `Work` has: `figures` are its `trust`. `where` holds the member at
-    hand, and 1 where it has begun.
+    not `kept` scratch (1, rows, n), and what a run's `Work` has: `figures` are its `trust`, `suspects` its
+    `suspect`. `where` holds the member at hand, and 1 where it has begun.
     """
 
     starts: np.ndarray
@@ -313,6 +315,7 @@ class Members(NamedTuple):
     counters: np.ndarray
     max_correction: np.ndarray
     figures: np.ndarray
+    suspects: np.ndarray
     where: np.ndarray
 
 

@@ -20,16 +20,28 @@ __all__ = ["ProjectionWarning", "Trust"]
 # errors, and their number.
 START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MANY = range(9)
 NU, AT, MANY, FIRST, SUM, EXPECTED, JUDGED = range(9, 16)
-N_FIGURES = 16
+# The largest rate of change along the flow, in its own terms; the largest of these terms; the largest rate when a step
+# was kept for an examination last. In the first row only: the largest local error of a block, in what the step changes
+# there, when a step was kept for that reason last. The share of its terms from which on a defect before a projection is
+# FAR.
+RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM = range(16, 21)
+N_FIGURES = 21
+# A step that is to be examined: the reason, its two times, and behind these its two states.
+REASON, SUSPECT_FROM, SUSPECT_TO, N_SUSPECT = range(4)
+NOTHING, LARGE_CORRECTION, LARGE_ERROR, CHANGES_ALONG_FLOW = range(4)
 
-# Noted are changes of so many local errors, and defects of such shares of their invariants' terms, before and after.
+# Changes of LARGE local errors are noted, and defects of FAR and LARGE_SHARE of the terms before and after projections.
+# At loose tolerances steps may miss more: FAR is FAR_IN_TOLERANCES relative tolerances then, up to MOST_FAR.
 LARGE, FAR, LARGE_SHARE = 50.0, 0.03, 1e-2
+FAR_IN_TOLERANCES, MOST_FAR = 7.5, 0.075
 # What no healthy run shows (docs/explanation/trust.md has the figures). One change of so many local errors (the
 # estimates of pairs of methods vanish by chance, which makes thousands), LARGE ones in such a share of the projections,
-# changes that are together so many times the errors; one defect of such a share of the terms, FAR ones in such a share
-# of them.
+# changes that are together so many times the errors; one defect that is TOO_FAR times what FAR means, FAR ones in such
+# a share of them.
 BEYOND_DOUBT, OFTEN, TOGETHER = 1e4, 0.1, 20.0
-TOO_FAR, FAR_OFTEN = 0.05, 0.01
+TOO_FAR, FAR_OFTEN = 5 / 3, 0.01
+# Rates of change along the flow are rounding up to this share of their terms.
+ROUNDING_OF_RATES = 1e-11
 # So many changes make a share or a sum, where more than one is LARGE.
 ENOUGH = 5
 MOST_REASONS = 3  # in a message
@@ -93,10 +105,11 @@ class Trust:
         return np.where(self.figures[:, JUDGED] > 0, self.figures[:, NU], np.nan)
 
     def followed_by(self, other: Trust) -> Trust:
-        """That of a run and of the one that went on from its end, together."""
+        """Return the figures of a run together with those of the run that continued it."""
         one, two = self.figures, other.figures
         both = two.copy()  # START, TERMS, LEFT: of the last
-        both[:, TERMS] = np.maximum(one[:, TERMS], two[:, TERMS])
+        largest = [TERMS, RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM]
+        both[:, largest] = np.maximum(one[:, largest], two[:, largest])
         counts = [NOTED, RAW_MANY, MANY, SUM, EXPECTED, JUDGED]
         both[:, counts] = one[:, counts] + two[:, counts]
         for size, at in ((SHARE, SHARE_AT), (RAW, RAW_AT), (NU, AT)):
@@ -134,17 +147,41 @@ class Trust:
 
 
 def sick(figures: np.ndarray) -> np.ndarray:
-    """Which rows of figures (..., N_FIGURES) no healthy run has."""
-    judged = figures[..., JUDGED]
-    often = (judged >= ENOUGH) & (figures[..., MANY] > np.maximum(1, OFTEN * judged))
-    together = (judged >= ENOUGH) & (figures[..., SUM] > TOGETHER * figures[..., EXPECTED])
+    """Return which rows of figures (..., N_FIGURES) no correct run has."""
     far = figures[..., RAW_MANY] > FAR_OFTEN * figures[..., NOTED]
-    return _extreme(figures) | often | together | far
+    return _extreme(figures) | (_may_leak(figures) & _large_corrections(figures)) | far
+
+
+def suspects(figures: np.ndarray, suspect: np.ndarray) -> np.ndarray:
+    """Return which runs have a step that is worth an examination, from their figures (m, l, N_FIGURES).
+
+    `suspect`, (m, ...), holds what the engine has kept of these steps.
+    """
+    reason = suspect[:, REASON]
+    return (reason >= LARGE_ERROR) | ((reason == LARGE_CORRECTION) & _large_corrections(figures).any(axis=1))
+
+
+def _large_corrections(figures: np.ndarray) -> np.ndarray:
+    """Return which rows have corrections that the errors of the steps do not explain."""
+    judged = figures[..., JUDGED]
+    often = figures[..., MANY] > np.maximum(1, OFTEN * judged)
+    together = figures[..., SUM] > TOGETHER * figures[..., EXPECTED]
+    return (figures[..., NU] > BEYOND_DOUBT) | ((judged >= ENOUGH) & (often | together))
 
 
 def _extreme(figures: np.ndarray) -> np.ndarray:
-    """Which rows have a single projection that no healthy run has."""
-    return (figures[..., NU] > BEYOND_DOUBT) | (figures[..., RAW] > TOO_FAR) | (figures[..., SHARE] > 0)
+    """Return which rows have a single projection that no correct run has."""
+    large = _may_leak(figures) & (figures[..., NU] > BEYOND_DOUBT)
+    return large | (figures[..., RAW] > TOO_FAR * figures[..., FAR_FROM]) | (figures[..., SHARE] > 0)
+
+
+def _may_leak(figures: np.ndarray) -> np.ndarray:
+    """Return which rows are of quantities that may change along the flow.
+
+    Where the rate of change is nothing but rounding, large corrections come from estimates that are too small: those of
+    a step over a kink, or where the derivative depends on time alone.
+    """
+    return figures[..., RATE] > ROUNDING_OF_RATES
 
 
 def _severity(figures: np.ndarray) -> np.ndarray:
@@ -156,17 +193,17 @@ def _severity(figures: np.ndarray) -> np.ndarray:
 def _reason(name: str, row: np.ndarray) -> str:
     """What is wrong with one invariant's corrections."""
     parts = []
-    if row[NU] > LARGE:
+    if _may_leak(row) and row[NU] > LARGE:
         parts.append(
             f"{name!r} was corrected by up to {row[NU]:.2g} local errors, at t={row[AT]:.6g} (by more than {LARGE:g} "
             f"in {row[MANY]:.0f} of {row[JUDGED]:.0f} projections, first at t={row[FIRST]:.6g})"
         )
-    elif row[SUM] > TOGETHER * row[EXPECTED]:
+    elif _may_leak(row) and row[SUM] > TOGETHER * row[EXPECTED]:
         parts.append(f"{name!r} was corrected by {row[SUM] / row[EXPECTED]:.2g} local errors a projection")
     if row[RAW] > 0:
         parts.append(
             f"steps missed {name!r} by up to {row[RAW]:.2g} of its own terms, at t={row[RAW_AT]:.6g} (by more than "
-            f"{FAR:g} in {row[RAW_MANY]:.0f} of {row[NOTED]:.0f})"
+            f"{row[FAR_FROM]:g} in {row[RAW_MANY]:.0f} of {row[NOTED]:.0f})"
         )
     if row[SHARE] > 0:
         parts.append(f"the projection left {name!r} off by {row[SHARE]:.2g} of its own terms, at t={row[SHARE_AT]:.6g}")

@@ -23,7 +23,7 @@ from ..core.stepping import UNBOUNDED, saved_steps
 from ..engine import data
 from ..engine.counters import N_COUNTERS, NFEV
 from ..engine.data import DOUBTFUL, OK, PAUSE, Schedule
-from ..engine.trust import Trust, sick
+from ..engine.trust import Trust, sick, suspects
 from ..run.driver import Driver, saved_rows
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop
 from ..run.prepare import Prepared, Request, prepared
@@ -40,6 +40,7 @@ FIRST_STEPS, SWEEP_SECONDS = 1024, 0.1
 ENDS = (ARRIVED, ENDED_BY_EVENT)
 BY_MEMBER = (
     *("starts", "params", "first_steps", "y", "t", "status", "max_defect", "counters", "max_correction", "figures"),
+    "suspects",
 )
 LEAST_WORK = 3e7  # floats times steps, a second or two: compiling functions for eight members takes as long
 COMPARED = 16
@@ -477,7 +478,7 @@ class Sweeper:
             self._side_by_side(each, out, watch)
             for k in np.flatnonzero(out.status == NOT_RUN).tolist():
                 self._one_by_one(plan, slice(k, k + 1), each, out, watch)
-        self._look_at_ends(each, out)
+        self._examine(each, out)
         if each.kept:
             out.saved[:] = each.rows[:, : plan.times.size]
         self._evaluate(plan, y0s, params, out)
@@ -535,6 +536,7 @@ class Sweeper:
             counters=out.counters,
             max_correction=out.max_correction,
             figures=np.zeros((m, *driver.run.work.trust.shape)),
+            suspects=np.zeros((m, driver.run.work.suspect.size)),
             where=np.zeros(2, np.int64),
         )
 
@@ -560,31 +562,42 @@ class Sweeper:
             elif done < m:
                 self._adapt(time.perf_counter() - begin)
 
-    def _look_at_ends(self, each: data.Members, out: Members) -> None:
-        """Check the invariants at the end of the first member that got there and, where they are none, of all."""
+    def _examine(self, each: data.Members, out: Members) -> None:
+        """Examine the steps that the engine suspects, and check the invariants at ends.
+
+        They are checked at the end of the first member that got there and, if one is not conserved there, of all.
+        """
         run = self.loop.driver.run
         arrived = np.flatnonzero(out.status >= 0)
-        if not run.options.watched:
+        if not run.options.watched or not arrived.size:
             return
-        for k in arrived:
-            t = float(out.t[k])
-            f = self._derivative(each.params[k])(t, out.y[k])
-            found = next(run.invariants.complaints(t, out.y[k], f, each.first_steps[k]), None)
-            if found is not None:
-                trust = Trust(run.invariants.names, each.figures[k])
-                trust.doubts.append(found.text)
-                out.trusted[k] = False
-                out.message[k] = f"{ENDS[out.status[k]]}; {trust.message}"
-            elif k == arrived[0]:
-                return
+        suspected, at_ends = suspects(each.figures, each.suspects), True
+        for k in arrived.tolist():
+            if not (at_ends or suspected[k]):
+                continue
+            derivative = self._derivative(each.params[k])
+            run.invariants.target[:] = run.invariants.values(self.loop.driver.schedule.span.t0, each.starts[k])
+            examiner = replace(run.examiner, tau=float(each.first_steps[k]), figures=each.figures[k], largest=0.0)
+            found = examiner.examine(each.suspects[k], derivative) if suspected[k] else None
+            if at_ends:
+                at_end = examiner.complaint(derivative, float(out.t[k]), out.y[k])
+                found, at_ends = found or at_end, at_end is not None
+            self._judge(k, each, out, [found] if found else [])
+
+    def _judge(self, k: int, each: data.Members, out: Members, doubts: list[str]) -> None:
+        """Store whether a member that arrived is reliable, by its corrections and by what examinations found."""
+        trust = Trust(self.loop.driver.run.invariants.names, each.figures[k])
+        trust.doubts += doubts
+        end = ENDS[out.status[k]]
+        out.trusted[k] = trust.trusted
+        out.message[k] = end if trust.trusted else f"{end}; {trust.message}"
 
     def _arrived(self, those: np.ndarray, each: data.Members, out: Members) -> None:
-        """Members that the engine took to their ends, and what their corrections say."""
-        names, figures = self.loop.driver.run.invariants.names, each.figures[those]
-        out.trusted[those] = ~sick(figures).any(axis=1)
-        for k, rows in zip(those.tolist(), figures, strict=True):
-            end = ENDS[out.status[k]]
-            out.message[k] = end if out.trusted[k] else f"{end}; {Trust(names, rows).message}"
+        """Judge members that the engine took to their ends."""
+        for k in those.tolist():
+            out.trusted[k], out.message[k] = True, ENDS[out.status[k]]
+        for k in those[sick(each.figures[those]).any(axis=1)].tolist():
+            self._judge(k, each, out, [])
 
     def _side_by_side(self, each: data.Members, out: Members, watch: _Watch) -> None:
         """All members in octets, but for those that have to run by themselves."""

@@ -17,6 +17,7 @@ from ..core.setup import Run
 from ..core.stepping import UNBOUNDED, AnyMethod
 from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
+from ..engine.trust import NOTHING, REASON
 from ..methods.multistep import GaussJackson
 from .events import Events
 from .memory import most_bytes
@@ -116,6 +117,11 @@ class Driver:
     def step(self) -> int:
         """Steps made so far."""
         return int(self.schedule.place[STEP])
+
+    @property
+    def suspects(self) -> bool:
+        """Return whether the engine suspects a step, which is to be examined."""
+        return bool(self.run.work.suspect[REASON] != NOTHING)
 
     @property
     def rows(self) -> int:

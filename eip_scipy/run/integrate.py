@@ -13,6 +13,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from ..core import setup
+from ..core.examination import is_check_due, steps_to_check
 from ..core.inputs import refuse_units
 from ..core.jitted import is_compiled, is_jitted
 from ..core.names import nearest
@@ -323,7 +324,7 @@ class Loop:
         driver = self.driver
         t, y = driver.now
 
-        def derivative() -> np.ndarray:
+        def derivative(t: float, y: np.ndarray) -> np.ndarray:
             f = np.empty_like(y)
             self.rhs(t, y, f, driver.params)
             return f
@@ -351,7 +352,7 @@ class Loop:
                 return 1, STOPPED
             if ended:
                 return 1, ENDED_BY_EVENT
-            if driver.step in setup.LOOKS:
+            if is_check_due(driver.step) or driver.suspects:
                 self._look()
             if code == FULL:
                 driver.grow()
@@ -408,7 +409,7 @@ class Loop:
         history, left = driver.run.method.multistep, schedule.span.n_steps - driver.step
         if history is not None and left - history.middle <= chunk:
             chunk = left  # the last states cost a step of the method that starts, each of them that is asked for
-        chunk = min([chunk, *(look - driver.step for look in setup.LOOKS if look > driver.step)])
+        chunk = min(chunk, steps_to_check(driver.step))
         if self.callback is None:
             return chunk
         if schedule.t_eval.size:

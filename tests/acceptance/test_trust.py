@@ -1,5 +1,6 @@
 """Runs that are not to be trusted, and runs that are: what users are told, through the public interface."""
 
+import itertools
 import math
 import warnings
 
@@ -28,7 +29,8 @@ from eip_scipy import (
     integrate,
     project,
 )
-from eip_scipy.problems import kepler, pythagorean
+from eip_scipy.problems import kepler, nbody, pythagorean
+from eip_scipy.problems.hard_cases import lotka_volterra, rigid_body, sir
 
 EVERY_CLASS = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853, EIPRKN8, EIPRKN12]
 ADAPTIVE = [EIPRK23, EIPRK45, EIPDOP853, EIPRKN8, EIPRKN12]
@@ -377,6 +379,22 @@ def test_members_are_flagged_as_single_runs_are(compiled):
     assert "member 7" in repr(run)
 
 
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("method", [EIPRK2, EIPRK4, EIPRK5])
+@pytest.mark.parametrize("members", [8, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_each_member_is_judged_by_its_own_checks(method, members):
+    """Members 1 to 7 have friction of 1e-4 to 0.1, member 0 none; of many, eight run in one vector."""
+    energy = Invariant(pendulum_energy, pendulum_gradient, name="energy")
+    friction = np.zeros((members, 1))
+    friction[1:8, 0] = np.geomspace(1e-4, 0.1, 7)
+    starts = np.tile([2.0, 0.0], (members, 1))
+    with pytest.warns(ProjectionWarning, match=f"7 of {members} members .* the first of them member 1"):
+        run = ensemble(damped, (0, 10), starts, method=method, h=0.02, invariants=energy, params=friction)
+    assert run.success
+    assert np.flatnonzero(~run.trusted).tolist() == list(range(1, 8))
+    assert all("'energy' is no invariant" in run.message[k] for k in range(1, 8))
+
+
 @pytest.mark.parametrize("differing", [False, True])
 def test_members_that_the_start_speaks_against(differing):
     """The start of one member is checked: what it shows holds for those with the same parameters."""
@@ -393,6 +411,217 @@ def test_members_that_the_start_speaks_against(differing):
     assert run.success
     assert run.trusted.tolist() == [False, False, differing, differing]
     assert ["'energy' is no invariant" in text for text in run.message] == (~run.trusted).tolist()
+
+
+def late_friction(t, y):
+    return np.array([y[1], -np.sin(y[0]) - 1e-3 * y[1] * (t > 5)])
+
+
+def kicked(t, y):
+    return np.array([y[1], -np.sin(y[0]) + 0.05 * np.exp(-(((t - 7.3) / 0.1) ** 2))])
+
+
+LATE = [(late_friction, method) for method in (EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853)]
+LATE += [(kicked, method) for method in (EIPRK3, EIPRK4, EIPRK5, EIPRK45, EIPDOP853, EIPRKN8, EIPRKN12)]
+
+
+@both
+@pytest.mark.parametrize(("fun", "method"), LATE)
+def test_leaks_that_start_late(driver, fun, method):
+    """The energy is conserved until t = 5 or 7, and the end is off by more than 10 times the error without it."""
+    steps = {"h": 0.02} if method in (EIPRK2, EIPRK3, EIPRK4, EIPRK5) else {"rtol": 1e-8, "atol": 1e-10}
+    with pytest.warns(ProjectionWarning, match="'energy' is no invariant of this system: at t="):
+        run, record = driver(fun, (0, 20), [2.0, 0.0], method=method, invariants=ENERGY, **steps)
+    assert run.status == 0
+    assert not record.trusted
+
+
+def test_drag_near_the_pericentre_only():
+    """The drag acts at r < 0.42, for 10 % of each turn: not at the start, nor at the end."""
+
+    def fun(t, y):
+        r = np.hypot(y[0], y[1])
+        drag = 1e-2 if r < 0.42 else 0.0
+        return np.concatenate([y[2:], -y[:2] / r**3 - drag * y[2:]])
+
+    energy = Invariant(
+        lambda t, y: 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.hypot(y[0], y[1]),
+        lambda t, y: np.concatenate([y[:2] / np.hypot(y[0], y[1]) ** 3, y[2:]]),
+        name="energy",
+    )
+    for options in ({"method": EIPRK4, "h": 0.01}, {"method": EIPRK5, "h": 0.01}, {"method": EIPRK45, "rtol": 1e-8}):
+        with pytest.warns(ProjectionWarning, match="'energy' is no invariant"):
+            run = integrate(fun, (0, 19), [1.6, 0.0, 0.0, 0.5], invariants=energy, **options)
+        assert run.status == 0
+
+
+def kinked(kind):
+    """Return a force, its energy and a gradient with kinks, along which the energy is conserved."""
+    slopes = {
+        "Huber": lambda q: min(max(q, -0.3), 0.3),
+        "contact": lambda q: 1 + 100 * min(q, 0.0),
+        "dead zone": lambda q: min(q + 0.5, 0.0) + max(q - 0.5, 0.0),
+    }
+    potentials = {
+        "Huber": lambda q: 0.5 * q * q if abs(q) < 0.3 else 0.3 * (abs(q) - 0.15),
+        "contact": lambda q: q + 50 * min(q, 0.0) ** 2,
+        "dead zone": lambda q: 0.5 * max(abs(q) - 0.5, 0.0) ** 2,
+    }
+    slope, potential = slopes[kind], potentials[kind]
+    energy = Invariant(
+        lambda t, y: 0.5 * y[1] ** 2 + potential(y[0]), lambda t, y: np.array([slope(y[0]), y[1]]), name="energy"
+    )
+    return lambda t, y: np.array([y[1], -slope(y[0])]), energy
+
+
+@both
+@pytest.mark.parametrize("kind", ["Huber", "contact", "dead zone"])
+@pytest.mark.parametrize("method", [EIPRK5, EIPRK45, EIPDOP853])
+def test_kinks_are_no_leaks(driver, kind, method):
+    """Estimates of steps over a kink are too small, so that corrections are many times larger; the energy holds."""
+    fun, energy = kinked(kind)
+    for steps in [{"h": 0.02}, {"h": 0.01}] if method is EIPRK5 else [{"rtol": 1e-6}, {"rtol": 1e-9}]:
+        run, record = driver(fun, (0, 20), [1.0, 0.1], method=method, invariants=energy, **steps)
+        assert run.status == 0
+        assert record.trusted, record.message
+
+
+def light_planet(mass):
+    """Return a star, a giant planet at 5.2, and a planet at 0.2, whose period is 0.56."""
+    distances = np.array([5.2, 0.2])
+    q = [[0.0, 0.0, 0.0], *([r, 0.0, 0.0] for r in distances)]
+    v = [[0.0, 0.0, 0.0], *([0.0, r**-0.5, 0.0] for r in distances)]
+    return nbody([1.0, 1e-3, mass], q, v, t_span=(0.0, 60.0))
+
+
+@pytest.mark.parametrize("mass", [1e-9, 0.0])
+@pytest.mark.parametrize("method", [EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK45, EIPDOP853, EIPRKN8])
+def test_a_step_beyond_the_period_of_a_light_planet(method, mass):
+    """The energy of the system does not show that the planet leaves its orbit. Short steps resolve its motion."""
+    with pytest.warns(ProjectionWarning, match=r"h=0.3 do not resolve the motion of components (6, 7, 8|15, 16, 17) "):
+        run = integrate(light_planet(mass), method=method, h=0.3)
+    assert run.status == 0
+    short = {EIPRK2: 0.005, EIPRK3: 0.01}.get(method, 0.02)
+    run = integrate(light_planet(mass), (0, 10), method=method, h=short)
+    assert run.trusted, run.message
+    assert np.linalg.norm(run.y[6:9, -1] - run.y[:3, -1]) == pytest.approx(0.2, rel=0.02)
+
+
+def test_a_body_that_a_plain_function_integrates_is_looked_at():
+    """Two oscillators in one state, of which the energy knows one; the step is 5 radians of the other."""
+    fast = 25.0
+
+    def fun(t, y):
+        return np.array([y[1], -y[0], y[3], -(fast**2) * y[2]])
+
+    slow = Invariant(lambda t, y: 0.5 * (y[0] ** 2 + y[1] ** 2), lambda t, y: np.array([y[0], y[1], 0, 0]), name="slow")
+    with pytest.warns(ProjectionWarning, match="do not resolve the motion of component [23] "):
+        integrate(fun, (0, 2), [1.0, 0.0, 1.0, 0.0], method=EIPRK4, h=0.2, invariants=slow)
+    assert integrate(fun, (0, 2), [1.0, 0.0, 1.0, 0.0], method=EIPRK4, h=0.01, invariants=slow).trusted
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"every": 10}, {"every": "auto"}, {"compensated": True}, {"metric": "euclidean"}, {"direction": "midpoint"}],
+)
+@pytest.mark.parametrize("method", [EIPRK5, EIPRK45])
+def test_late_leaks_are_found_with_other_options(options, method):
+    steps = {"h": 0.02} if method is EIPRK5 else {"rtol": 1e-8}
+    with pytest.warns(ProjectionWarning, match="'energy' is no invariant of this system: at t="):
+        integrate(late_friction, (0, 20), [2.0, 0.0], method=method, invariants=ENERGY, **steps, **options)
+
+
+def test_late_leaks_are_found_backwards_in_time():
+    def fun(t, y):
+        return late_friction(-t, y)
+
+    with pytest.warns(ProjectionWarning, match="'energy' is no invariant of this system: at t=-"):
+        integrate(fun, (0, -20), [2.0, 0.0], method=EIPRK4, h=0.02, invariants=ENERGY)
+
+
+def test_a_leak_found_before_a_checkpoint_is_known_after_it(tmp_path):
+    """The friction acts from t = 5 to 7 only. The first call ends at t = 10, and the second one sees nothing of it."""
+
+    def fun(t, y):
+        return np.array([y[1], -np.sin(y[0]) - 1e-3 * y[1] * (5 < t < 7)])
+
+    steps = {"method": EIPRK4, "h": 0.02, "invariants": ENERGY}
+    with pytest.warns(ProjectionWarning):
+        first = integrate(fun, (0, 10), [2.0, 0.0], **steps)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ProjectionWarning)
+        assert not first.continue_to(20).trusted
+
+    calls = itertools.count()
+
+    def breaks_off(t, y):
+        if next(calls) > 2000:
+            raise KeyboardInterrupt
+        return fun(t, y)
+
+    path = tmp_path / "run.npz"
+    steps |= {"checkpoint": path, "checkpoint_every": 1e-9, "save_every": 10, "callback": lambda t, y, residuals: False}
+    with pytest.raises(KeyboardInterrupt):
+        integrate(breaks_off, (0, 20), [2.0, 0.0], **steps)
+    with pytest.warns(ProjectionWarning):
+        assert not integrate(fun, (0, 20), [2.0, 0.0], **steps, resume=True).trusted
+
+
+def test_examinations_stay_in_the_interval_and_refuse_nothing():
+    """The step over the kink is suspect, and functions raise outside the interval and where the run does not go."""
+    fun, energy = kinked("contact")
+    lowest = integrate(fun, (0, 3), [1.0, 0.0], method=EIPRK5, h=0.005, invariants=energy, save_every=1).y[0].min()
+
+    def careful(t, y):
+        if not (0 <= t <= 3 and y[0] > 1.5 * lowest):
+            raise RuntimeError(f"called at {t}, {y}")
+        return fun(t, y)
+
+    for method in (EIPRK4, EIPRK5):
+        run = integrate(careful, (0, 3), [1.0, 0.0], method=method, h=0.02, invariants=energy, check=True)
+        assert (run.status, run.trusted) == (0, True), run.message
+    with pytest.warns(ProjectionWarning, match="do not resolve"):
+        integrate(light_planet(0.0), (0, -60), method=EIPRK4, h=0.3)
+
+
+def loose_runs():
+    """Return systems whose invariants change by per cents in single steps at loose tolerances."""
+    top, epidemic = rigid_body(1.0, 2.0, 3.0), sir(1.0, 0.3)
+    yield top, [0.0, 1.0, 1.0], 25.0
+    yield top, [0.5, 0.7, 0.3], 25.0
+    yield epidemic, [0.9, 0.1, 0.0], 60.0
+    yield epidemic, [0.999, 0.001, 0.0], 60.0
+
+
+@pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853])
+@pytest.mark.parametrize("rtol", [1e-2, 1e-3])
+@pytest.mark.parametrize("number", range(4))
+def test_loose_tolerances_are_no_failure(number, rtol, method):
+    """A step may miss an invariant by a few tolerances; the reference is DOP853 at 1e-11."""
+    system, y0, end = list(loose_runs())[number]
+    invariant = Invariant(system.values, system.gradients, name="I")
+    record = Diagnostics()
+    span, options = (0, end), {"rtol": rtol, "atol": 1e-4}
+    run = solve_ivp(system.fun, span, y0, method=method, invariants=invariant, diagnostics=record, **options)
+    plain = solve_ivp(system.fun, span, y0, method=method, **options)
+    truth = solve_ivp(system.fun, span, y0, method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
+    assert (run.status, record.trusted) == (0, True), record.message
+    assert np.abs(run.y[:, -1] - truth).max() <= 3 * np.abs(plain.y[:, -1] - truth).max() + 10 * rtol
+
+
+@pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853])
+@pytest.mark.parametrize("y0", [(400.0, 1.0), (1.0, 400.0)])
+def test_populations_that_nearly_die_out_stay_positive(y0, method):
+    """Logarithms keep a population positive that becomes as small as 1e-80; residuals stay below 1 % of the terms."""
+    system = lotka_volterra()
+    invariant = Invariant(system.values, system.gradients, name="V")
+    record = Diagnostics()
+    with np.errstate(invalid="ignore"):  # steps that make a population negative are tried again with a shorter one
+        run = solve_ivp(system.fun, (0, 20), y0, method=method, invariants=invariant, diagnostics=record)
+    assert (run.status, record.trusted) == (0, True), record.message
+    assert run.y.min() > 0
+    kept = np.array([system.values(t, y)[0] for t, y in zip(run.t, run.y.T, strict=True)])
+    assert np.abs(kept - kept[0]).max() <= 1e-2 * abs(kept[0])
 
 
 def test_project_tells_of_what_it_leaves():

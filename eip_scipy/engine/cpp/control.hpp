@@ -24,8 +24,9 @@ inline void make_stages(const AnyRun &run, const Step &step) {
 }
 
 // What follows the stages: f at y_hat in w.last(), the local error in w.err and its norm in w.norm where they are wanted.
+// Return whether the step's local errors are to be compared with what it changes in each block.
 template <class AnyRun>
-inline void look_back(const AnyRun &run, const Step &step) {
+inline bool look_back(const AnyRun &run, const Step &step) {
     const Method &m = run.method;
     const Options &o = run.options;
     const auto &w = run.work;
@@ -36,10 +37,12 @@ inline void look_back(const AnyRun &run, const Step &step) {
         run.system.rhs(w, step.t_new, w.y_hat, w.last());
         ++w.counters[NFEV];
     }
-    if (estimate)
-        estimate_error(run, step);
-    else if (step.project && is_sampled(run))
-        sample_error(of_any_length(run), step);
+    if (estimate) estimate_error(run, step);
+    if (!step.project) return false;
+    const bool sampled = is_sampled(run);
+    if (sampled) [[unlikely]] sample(of_any_length(run), step);
+    w.counters[F_AT_RAW] = sampled || (o.adaptive && w.counters[HAVE_F] && w.counters[BEGUN] % ADAPTIVE_EACH == 0);
+    return sampled && is_sampled_for_resolution(w);
 }
 
 template <class AnyRun>
@@ -47,7 +50,8 @@ inline Code raw_step(const AnyRun &run, const Step &step) {
     make_stages(run, step);
     const bool finite = all_finite(run.work.y_hat, run.work.m);
     if (!(run.hooks && run.hooks->agree ? run.hooks->all_agree(finite) : finite)) return NOT_FINITE;
-    look_back(run, step);
+    if (look_back(run, step) && !run.options.adaptive) [[unlikely]]
+        note_roughness(step, run.options, run.work);
     return OK;
 }
 

@@ -225,7 +225,7 @@ inline Code stay(const AnyRun &run, const Step &step) {
     copy(w.y_hat, step.y_new, w.m);
     const Code status = judge(w.before, origin(step, w), step.y_new, o, w);
     if (status != OK) return status;
-    take_note(step.t_new, origin(step, w), o, w);
+    take_note(step, origin(step, w), o, w);
     if (o.metric == ERROR) {
         relative_errors(step.y, run);
         remember_errors(o, w);
@@ -246,6 +246,7 @@ inline Code project_step(const AnyRun &run, const Step &step) {
     const auto &w = run.work;
     run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
+    note_rates(step, o, w);
     if (o.every != 1 && (o.metric == ERROR || o.every == AUTO || o.adaptive)) {
         quadrature(w.err, w.err_sum, w.err, w.m);
         if (o.every == AUTO && !step.last && !tells_more(w)) {
@@ -280,7 +281,7 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
         w.counters[RANK_REDUCED] += moved.rank < w.l;
     }
     if (status == OK) {
-        take_note(step.t_new, origin(step, w), o, w);
+        take_note(step, origin(step, w), o, w);
         remember_errors(o, w);
         w.max_correction[0] = std::max(w.max_correction[0], moved.correction);
     }

@@ -20,7 +20,7 @@ constexpr int64_t AUTO = 0;  // the option `every`
 // Places in the counters (counters.py), in the clock and in the place of a run.
 enum Counter : int {
     NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED, HAVE_ERROR, BEGUN,
-    WAITED, FOUND, N_COUNTERS
+    WAITED, FOUND, F_AT_RAW, N_COUNTERS
 };
 enum Clock : int { TIME, TIME_NEW, LENGTH, NEXT_LENGTH };
 enum Place : int { STEP, ROW, PENDING };
@@ -31,8 +31,12 @@ enum Node : int { HAVE_NODES, NEWEST, NEWEST_ROW, SINCE, SEEN, N_NODE_PLACES };
 // Columns of the figures of a run's projections (trust.py says what they mean).
 enum Figure : int {
     START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MANY, NU, AT, MANY, FIRST, SUM, EXPECTED, JUDGED,
-    N_FIGURES
+    RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM, N_FIGURES
 };
+
+// The step that is to be examined: why, its two times, and behind these its two states (`suspect` in trust.hpp).
+enum SuspectPlace : int { REASON, SUSPECT_FROM, SUSPECT_TO, N_SUSPECT };
+enum Reason : int { NOTHING, LARGE_CORRECTION, LARGE_ERROR, CHANGES_ALONG_FLOW };
 
 constexpr double EPS = 2.220446049250313e-16;
 constexpr double INFINITE = std::numeric_limits<double>::infinity();
@@ -106,6 +110,7 @@ struct Options {
     int64_t metric, direction, iterations, every;
     bool reuse_f, uses_f, compensated, adaptive, watched;
     double per_band, limit;  // an invariant's terms are per_band dead bands; `limit`: the share of them that may be left
+    double far;              // defects before a projection are noted from this share of the terms on
 };
 
 // Its numbers and flags, for whoever reads them by their names.
@@ -123,6 +128,7 @@ inline void read_each(Options &o, Read read) {
     read("watched", o.watched);
     read("per_band", o.per_band);
     read("limit", o.limit);
+    read("far", o.far);
 }
 
 // Scratch of the small Newton systems.
@@ -139,7 +145,7 @@ struct WorkOf {
     Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *memory, *memory_new, *move,
         *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *worth, *defect, *max_defect,
         *max_correction, *trust, *target, *products;  // the invariants' levels; scratch of the frame
-    double *norm;
+    double *norm, *suspect;
     int64_t *pivots, *counters;
     Inner inner;
 

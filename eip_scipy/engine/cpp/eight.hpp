@@ -13,7 +13,7 @@ struct Eight {
     Options options;  // those of the run, tolerances for 8 n floats
     OctetSystem system;
     std::vector<Octet> memory;
-    std::vector<double> tolerances, no_norm;
+    std::vector<double> tolerances, no_norm, suspects;  // the last of all members, one after the other
     Multistep multistep{};  // of a multistep method: that of one state of 8 n floats
     int64_t counters[N_COUNTERS] = {};
     Work flat{};
@@ -55,6 +55,7 @@ struct Eight {
         }
         work.counters = counters;
         short_work = SizedWith<4, 2, Octet>(work);
+        suspects.resize(LANES * (N_SUSPECT + 2 * n));
         tolerances.resize(2 * LANES * n);
         for (int64_t i = 0; i < LANES * n; ++i) {
             tolerances[i] = o.rtol[i / LANES];
@@ -66,6 +67,10 @@ struct Eight {
 
     Run run() { return {method, flat_options_, flat, system, nullptr}; }
     double &at(Octet *a, int64_t lane) const { return OctetSystem::floats_of(a)[lane]; }
+
+    // The suspect step of one member.
+    double *suspect(int64_t lane) { return suspects.data() + lane * (N_SUSPECT + 2 * work.n); }
+    const double *suspect(int64_t lane) const { return suspects.data() + lane * (N_SUSPECT + 2 * work.n); }
 
     // One member's part of n octets, to floats and back.
     void take(const Octet *a, int64_t lane, double *out, int64_t n) const {

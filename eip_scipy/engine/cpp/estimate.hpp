@@ -7,6 +7,10 @@ namespace eip {
 
 // Without an estimate of their own, the first so many projections are compared with one, then one in as many.
 constexpr int64_t SAMPLED_FIRST = 8, SAMPLED_EACH = 16;
+// With an estimate of their own, every OWN_EACH-th projection looks at rates of change along the flow, and every
+// ADAPTIVE_EACH-th one of adaptive steps, which are longer, if f at the raw result is known anyway. Every RESOLUTION_EACH-th
+// projection compares local errors with what the step changes in each block.
+constexpr int64_t OWN_EACH = 32, ADAPTIVE_EACH = 4, RESOLUTION_EACH = 64;
 
 // Square of component i of a in units of atol + rtol max(|y|, |y_hat|); a complex one is a pair of floats.
 inline double relative_square(const double *a, int64_t i, const double *y, const double *y_hat, const Options &o) {
@@ -77,19 +81,26 @@ inline void trapezoid_error(const double *y, const double *y_hat, double h, cons
     for (int64_t i = 0; i < n; ++i) err[i] = y_hat[i] - y[i] - 0.5 * h * (f[i] + f_hat[i]);
 }
 
-// Whether this projection, which needs no estimate, is compared with one all the same.
+// Return whether this projection is one of those that are examined by an evaluation of f, which is not counted.
 template <class AnyRun>
 inline bool is_sampled(const AnyRun &run) {
     const int64_t begun = ++run.work.counters[BEGUN];
-    return run.options.watched && (begun <= SAMPLED_FIRST || begun % SAMPLED_EACH == 0);
+    const int64_t each = run.work.counters[HAVE_ERROR] ? OWN_EACH : SAMPLED_EACH;
+    return run.options.watched && (begun % each == 0 || begun <= SAMPLED_FIRST);
 }
 
-// The local error in w.err, by an evaluation of f that is not counted and serves nothing else.
+template <class W>
+inline bool is_sampled_for_resolution(const W &w) {
+    return w.counters[BEGUN] <= SAMPLED_FIRST || w.counters[BEGUN] % RESOLUTION_EACH == 0;
+}
+
+// f at the raw result in w.last(), and the local error in w.err where the step makes no estimate of it.
 template <class AnyRun>
-[[gnu::cold, gnu::noinline]] inline void sample_error(const AnyRun &run, const Step &step) {
+[[gnu::cold, gnu::noinline]] inline void sample(const AnyRun &run, const Step &step) {
     const Method &m = run.method;
     const auto &w = run.work;
     if (!w.counters[HAVE_F]) run.system.rhs(w, step.t_new, w.y_hat, w.last());
+    if (w.counters[HAVE_ERROR]) return;
     if (largest_abs(m.e, m.n_e) > 0.0 || largest_abs(m.e_v, m.n_e_v) > 0.0)
         estimate_error(run, step);
     else

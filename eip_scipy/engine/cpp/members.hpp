@@ -11,7 +11,7 @@ struct Members {
     int64_t count, n_rows, evaluations;
     bool kept;
     double *starts, *params, *first_steps, *sigma, *left, *t_saved;
-    double *y, *t, *rows, *max_defect, *max_correction, *figures;
+    double *y, *t, *rows, *max_defect, *max_correction, *figures, *suspects;
     int64_t *status, *counters, *where;
 
     Saved saved(int64_t k, const Work &w) const {
@@ -32,6 +32,7 @@ inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, co
     fill(w.memory, 0.0, o.blocks.count);
     for (double *buffer : {w.carry, w.err_sum}) fill(buffer, 0.0, w.m);
     for (double *buffer : {w.defect, w.max_defect}) fill(buffer, 0.0, w.l);
+    w.suspect[REASON] = NOTHING;
     w.max_correction[0] = 0.0;
     std::fill_n(w.counters, static_cast<int64_t>(N_COUNTERS), 0);
     w.counters[NFEV] = members.evaluations;
@@ -48,7 +49,7 @@ inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, co
         return false;
     fill(w.trust, 0.0, w.l * N_FIGURES);
     for (int64_t i = 0; i < w.l; ++i) w.figures(i)[TERMS] = INFINITE;
-    if (o.watched) start_figures(y, w.row(0), members.first_steps[k], o, w);
+    if (o.watched) start_figures(y, w.row(0), members.first_steps[k], run.method, run.hooks, o, w);
     if (s.n_events > 0) system.event(w, t0, y, s.g);
     fill(s.rate, NOT_A_NUMBER, s.n_events);
     if (samples) {
@@ -92,6 +93,7 @@ inline void end_member(const Run &run, Samples *samples, const Schedule &s, cons
     }
     copy(w.max_defect, members.max_defect + k * w.l, w.l);
     copy(w.trust, members.figures + k * w.l * N_FIGURES, w.l * N_FIGURES);
+    copy(w.suspect, members.suspects + k * (N_SUSPECT + 2 * w.m), N_SUSPECT + 2 * w.m);
     std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), members.counters + k * N_COUNTERS);
     members.max_correction[k] = w.max_correction[0];
 }

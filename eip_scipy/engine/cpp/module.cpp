@@ -509,7 +509,8 @@ PyObject *engine_start(Engine *self, PyObject *const *args, Py_ssize_t count) {
         const double *y = state_of(args[0], "y", self, kept.get(), true), *f = state_of(args[1], "f", self, kept.get(), true);
         const double tau = PyFloat_AsDouble(args[2]);
         if (PyErr_Occurred()) return nullptr;
-        start_figures(y, f, tau, self->data->options, self->data->work);
+        const Data &run = *self->data;
+        start_figures(y, f, tau, run.method, self->hooks, run.options, run.work);
         Py_RETURN_NONE;
     });
 }

@@ -460,6 +460,8 @@ inline void move_sums(const Multistep &ms, const Truth<typename W::Value> &those
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST]) * ms.h;
     gather_errors(size, static_cast<double>(ms.place[SINCE]), w);
     newest_state(run, t);
+    w.counters[F_AT_RAW] = 1;
+    note_rates(Step{t, t, ms.h, w.y_hat, scratch, true, true}, o, w);
     if (o.every == AUTO && !tells_more(w)) return OK;
     copy(w.target, ms.levels, w.l);
     defects_in_the_middle(run, t, scratch);
@@ -485,6 +487,8 @@ inline Code project_last(const Run &run, const Step &step, double from) {
     }
     if (w.l == 0) return OK;
     run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
+    w.counters[F_AT_RAW] = 1;
+    note_rates(step, run.options, w);
     evaluate_invariants(run, step.t_new, w.y_hat);
     ++w.counters[NJEV];
     copy(w.target, ms.levels, w.l);

@@ -40,7 +40,7 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w)
     for (int64_t i = 0; i < w.l; ++i) {
         const Octet *figures = w.figures(i);
         const Octet own = own_terms(i, o, w);
-        more = more | (abs(w.before[i]) > FAR * own) | (abs(w.defect[i]) > LARGE_SHARE * own);
+        more = more | (abs(w.before[i]) > o.far * own) | (abs(w.defect[i]) > LARGE_SHARE * own);
         if (errors > 0.0)
             more = more | ((w.worth[i] > 0.0) & (abs(w.before[i] - figures[LEFT]) > LARGE * expected_of(i)));
     }
@@ -131,8 +131,9 @@ inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask
     eight.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
     if (o.every != 1 && o.metric == ERROR) quadrature(eight.flat.err, eight.flat.err_sum, eight.flat.err, eight.flat.m);
+    const Mask noticed = o.watched && w.counters[F_AT_RAW] ? alive & rates_stand_out(w) : Mask{};
     eight.system.inv(w, step.t_new, w.y_hat, w.values);
-    return project_octet_evaluated(eight, w, step.t_new, eight.y, alive, single);
+    return noticed | project_octet_evaluated(eight, w, step.t_new, eight.y, alive & !noticed, single);
 }
 
 // As `project_nodes`, of a multistep method. Members whose steps are not stable leave those of `alive`; those who have to do
@@ -151,8 +152,9 @@ inline Mask project_octet_nodes(Eight &eight, Mask &alive, const Work &single) {
     for (int lane = 0; lane < LANES; ++lane) since[lane] = static_cast<double>(ms.place[SINCE] - eight.projected[lane]);
     gather_errors(size, Octet::load(since), w);
     newest_state(run, t);
-    const Mask those = o.every == AUTO ? alive & tells_more(w) : alive;
-    if (!any(those)) return Mask{};
+    const Mask noticed = o.watched ? alive & rates_stand_out(w) : Mask{};
+    const Mask those = (o.every == AUTO ? alive & tells_more(w) : alive) & !noticed;
+    if (!any(those)) return noticed;
     copy(w.target, as_values<Octet>(ms.levels), w.l);
     const int64_t counted = w.counters[NJEV];
     defects_in_the_middle(run, t, eight.y_new);
@@ -167,7 +169,7 @@ inline Mask project_octet_nodes(Eight &eight, Mask &alive, const Work &single) {
         eight.projected[lane] = ms.place[SINCE];
         ++eight.own[lane][NJEV];
     }
-    return leave;
+    return leave | noticed;
 }
 
 }  // namespace eip

@@ -275,10 +275,12 @@ int PythonHooks::raw_step(const Step &step) {
     }
     w.counters[HAVE_F] = 1;  // as far as anyone asks for it: the next step does not
     w.counters[HAVE_ERROR] = estimates_;
-    if (step.project && !estimates_ && is_sampled(run_)) {
+    const bool sampled = step.project && is_sampled(run_);
+    w.counters[F_AT_RAW] = sampled || (step.project && o.uses_f);
+    if (sampled) run_.system.rhs(w, step.t_new, w.y_hat, w.last());
+    if (sampled && !estimates_) {
         run_.system.rhs(w, step.t, step.y, w.f_point);
-        run_.system.rhs(w, step.t_new, w.y_hat, w.stage);
-        trapezoid_error(step.y, w.y_hat, step.h, w.f_point, w.stage, w.err, w.m);
+        trapezoid_error(step.y, w.y_hat, step.h, w.f_point, w.last(), w.err, w.m);
         w.counters[HAVE_ERROR] = 1;
     }
     if (o.adaptive) w.norm[0] = error_norm(w.err, step.y, w.y_hat, o, w.n);
@@ -341,7 +343,7 @@ bool PythonHooks::project_jointly(const Step &step) {
         raise_to(w.defect, w.max_defect, w.l);
     } else {
         const double steps = 1.0 + static_cast<double>(w.counters[WAITED]);
-        note(step.t_new, measured ? steps : 0.0, EPS * std::sqrt(steps), nullptr, o, w);
+        note(step, measured ? steps : 0.0, EPS * std::sqrt(steps), nullptr, o, w);
     }
     return true;
 }

@@ -48,6 +48,7 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
     eight.take(eights.target, lane, w.target, w.l);
     eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
     eight.take(eights.max_defect, lane, w.max_defect, w.l);
+    copy(eight.suspect(lane), w.suspect, N_SUSPECT + 2 * w.m);
     w.max_correction[0] = eight.at(eights.max_correction, lane);
     take_params(eight, lane, run.system);
     count_of(eight, lane, shared, w.counters);
@@ -62,6 +63,7 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
     eight.give(w.memory, lane, eights.memory, run.options.blocks.count);
     eight.give(w.trust, lane, eights.trust, w.l * N_FIGURES);
     eight.give(w.max_defect, lane, eights.max_defect, w.l);
+    copy(w.suspect, eight.suspect(lane), N_SUSPECT + 2 * w.m);
     eight.at(eights.max_correction, lane) = w.max_correction[0];
     for (Octet *counts : {eight.projections, eight.skips, eight.reduced}) eight.at(counts, lane) = 0.0;
     std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), eight.own[lane]);
@@ -86,6 +88,7 @@ inline void take_history(const Run &run, Eight &eight, int64_t lane) {
     eight.take(eights.target, lane, w.target, w.l);
     eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
     eight.take(eights.max_defect, lane, w.max_defect, w.l);
+    copy(eight.suspect(lane), w.suspect, N_SUSPECT + 2 * w.m);
     w.max_correction[0] = eight.at(eights.max_correction, lane);
     eight.take(eights.sigma, lane, w.sigma, w.m);
     std::copy_n(eight.own[lane], static_cast<int64_t>(N_COUNTERS), w.counters);
@@ -102,11 +105,12 @@ inline void give_history(const Run &run, Eight &eight, int64_t lane) {
     eight.give(w.err_sum, lane, eights.err_sum, w.m);
     std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), eight.own[lane]);
     eight.rank[lane] = w.counters[LAST_RANK];
+    eight.give(w.trust, lane, eights.trust, w.l * N_FIGURES);
+    copy(w.suspect, eight.suspect(lane), N_SUSPECT + 2 * w.m);
     if (one.place[SINCE] > 0) return;
     eight.projected[lane] = eight.multistep.place[SINCE];
     for (int64_t j = 0; j < 4; ++j) eight.give(one.sums + j * one.pitch, lane, eight.sums + j * one.half, one.half);
     eight.give(w.sigma, lane, eights.sigma, w.m);
-    eight.give(w.trust, lane, eights.trust, w.l * N_FIGURES);
     eight.give(w.max_defect, lane, eights.max_defect, w.l);
     eight.at(eights.max_correction, lane) = w.max_correction[0];
 }
@@ -228,9 +232,10 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
     std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), before);
     Eight::Run all = eight.run();
     make_stages(all, step);
-    look_back(all, step);
-    const Mask alive = alive_of(eight);
-    Mask leave;
+    const bool sampled = look_back(all, step);
+    Mask alive = alive_of(eight), leave, rough{};
+    if (sampled) [[unlikely]] rough = alive & is_rough(largest_error_share(step.h, eight.y, o, w), w.figures(0));
+    alive = alive & !rough;
     if (project) {
         leave = w.m == 4 && w.l == 2 ? project_octet(eight, eight.short_work, step, alive, run.work)
                                      : project_octet(eight, w, step, alive, run.work);
@@ -239,6 +244,7 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
         leave = alive & !all_finite(w.y_hat, w.m);
     }
     bool returned[LANES] = {};
+    leave = leave | rough;
     if (any(leave))
         for (int64_t lane = 0; lane < LANES; ++lane)
             if (leave.lane(lane))
@@ -294,6 +300,7 @@ inline void begin_octet(const Run &run, Eight &eight, const Schedule &s, const M
     std::fill_n(w.counters, static_cast<int64_t>(N_COUNTERS), 0);
     w.counters[NFEV] = members.evaluations;
     std::fill_n(&eight.own[0][0], LANES * N_COUNTERS, 0);
+    std::fill(eight.suspects.begin(), eight.suspects.end(), 0.0);
     std::fill_n(eight.rank, LANES, 0);
     std::fill_n(eight.projected, LANES, 0);
     if (eight.method.multistep) forget_history(eight.multistep, LANES * w.l);
@@ -305,7 +312,8 @@ inline void begin_octet(const Run &run, Eight &eight, const Schedule &s, const M
     eight.system.grad(w, t0, eight.y, w.row(0), w.G);
     const Mask sound = all_finite(eight.y, n) & all_finite(w.row(0), n) & all_finite(w.target, w.l) &
                        all_finite(w.G, w.l * n);
-    if (eight.options.watched) start_figures<Octet>(eight.y, w.row(0), members.first_steps[first], eight.options, w);
+    if (eight.options.watched)
+        start_figures<Octet>(eight.y, w.row(0), members.first_steps[first], eight.method, nullptr, eight.options, w);
     for (int64_t lane = 0; lane < LANES; ++lane) eight.alive[lane] = first + lane < members.count && sound.lane(lane);
 }
 
@@ -339,6 +347,7 @@ inline void end_octet(const Eight &eight, const Schedule &s, const Members &memb
         eight.take(eight.y, lane, members.y + k * w.n, w.n);
         eight.take(w.max_defect, lane, members.max_defect + k * w.l, w.l);
         eight.take(w.trust, lane, members.figures + k * w.l * N_FIGURES, w.l * N_FIGURES);
+        copy(eight.suspect(lane), members.suspects + k * (N_SUSPECT + 2 * w.n), N_SUSPECT + 2 * w.n);
         count_of(eight, lane, w.counters, members.counters + k * N_COUNTERS);
     }
 }

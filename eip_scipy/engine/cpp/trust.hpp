@@ -10,7 +10,15 @@ constexpr double FAILURE_BANDS = 100.0, NOISE_BANDS = 3.0;
 constexpr double LEAST_SHARE = 1e-3;
 // Coordinates that move by less than this share of their size stand still.
 constexpr double STILL = 1e4 * EPS;
-constexpr double LARGE = 50.0, FAR = 0.03, LARGE_SHARE = 1e-2;
+constexpr double LARGE = 50.0, LARGE_SHARE = 1e-2;
+// A rate of change along the flow is suspicious from LEAST_RATE of its terms on, and again when it has grown by RATE_GROWTH.
+// Terms that vanish for a moment, as those of velocity constraints do at singular positions, count as LEAST_TERMS of the
+// largest so far.
+constexpr double LARGEST = std::numeric_limits<double>::max();
+constexpr double LEAST_RATE = 1e-8, RATE_GROWTH = 2.0, LEAST_TERMS = 0.1;
+// A local error is suspicious from this share of what the step changes in its block, or of the block's size, on, and again
+// when it has grown by ERROR_GROWTH. Blocks count as if they changed by LEAST_CHANGE of the largest change at least.
+constexpr double LEAST_ERROR = 3e-3, ERROR_GROWTH = 2.0, LEAST_CHANGE = 1e-2;
 
 // Defects w.g = values - target and their dead bands; inside its band a defect is set to 0, `raw` keeps all. Returns
 // whether anything is left to project. `terms`: sums of |G_k y_k|, else they are taken at `y`; then, where the step's
@@ -40,9 +48,14 @@ inline Truth<Value> defects(const double *terms, const Value *y, const Options &
     return outside;
 }
 
-// The first figures of a run: its invariants' terms; those that vanish at the start, as they are a step later.
+// The first figures of a run: its invariants' terms; those that vanish at the start, as they are a step later. Where steps
+// are not all projected, or projected by other code, RATE begins as that of a quantity which is not known to be an
+// invariant.
 template <class Value, class W>
-inline void start_figures(const Value *y, const Value *f, double tau, const Options &o, const W &w) {
+inline void start_figures(const Value *y, const Value *f, double tau, const Method &method, const Hooks *hooks,
+                          const Options &o, const W &w) {
+    const bool own = !hooks || !(hooks->raw || hooks->finish || hooks->joint || hooks->project);
+    const bool known = !method.multistep && o.every == 1 && own;
     for (int64_t i = 0; i < w.l; ++i) {
         const Value *G = w.gradient(i);
         Value terms = max(max(abs(w.values[i]), abs(w.target[i])), max(Value(o.scales[i]), abs_dot(G, y, w.m)));
@@ -50,6 +63,8 @@ inline void start_figures(const Value *y, const Value *f, double tau, const Opti
         Value *figures = w.figures(i);
         fill(figures, 0.0, N_FIGURES);
         figures[LEFT] = w.values[i] - w.target[i];
+        figures[RATE] = known ? 0.0 : 1.0;
+        figures[FAR_FROM] = o.far;
         figures[START] = where(terms < INFINITE, terms, 0.0);
         figures[TERMS] = where(terms > 0.0, terms, INFINITE);
     }
@@ -146,6 +161,93 @@ inline Code judge(const double *before, const double *y_old, const double *y, co
     return (held && small_shares(o, w)) || held_generously(before, y_old, o, w) ? OK : FAILED_PROJECTION;
 }
 
+// Keep a step for an examination, which takes place in Python. A change along the flow has precedence.
+[[gnu::cold, gnu::noinline]] inline void suspect(Reason reason, const Step &step, const Work &w) {
+    if (w.suspect[REASON] > reason) return;
+    w.suspect[REASON] = reason;
+    w.suspect[SUSPECT_FROM] = step.t;
+    w.suspect[SUSPECT_TO] = step.t_new;
+    copy(step.y, w.suspect + N_SUSPECT, w.m);
+    copy(w.y_hat, w.suspect + N_SUSPECT + w.m, w.m);
+    ++w.counters[FOUND];
+}
+
+// A suspect step is examined at the state that is accepted, and not at one that was rejected or moved since.
+[[gnu::cold, gnu::noinline]] inline void keep_accepted(const Step &step, const Work &w) {
+    if (w.suspect[SUSPECT_FROM] != step.t) return;
+    w.suspect[SUSPECT_TO] = step.t_new;
+    copy(step.y_new, w.suspect + N_SUSPECT + w.m, w.m);
+}
+
+// Return whether some invariant changes along the flow at y_hat by more than was known before, relative to the terms of that
+// rate; f at y_hat is in w.last(). An explicit dependence on time shows here, too.
+template <class W>
+[[gnu::noinline]] inline auto rates_stand_out(const W &w) {
+    using Value = typename W::Value;
+    Truth<Value> found{};
+    for (int64_t i = 0; i < w.l; ++i) {
+        Value *figures = w.figures(i);
+        const Value *G = w.gradient(i), *f = w.last();
+        Value sum = 0.0, terms = 0.0;
+        for (int64_t k = 0; k < w.m; ++k) {
+            const Value product = G[k] * f[k];
+            sum += product;
+            terms += abs(product);
+        }
+        const Value rate = abs(sum);
+        figures[RATE_TERMS] = max(figures[RATE_TERMS], min(terms, Value(LARGEST)));
+        const Value unit = max(terms, LEAST_TERMS * figures[RATE_TERMS]) + TINY;
+        const Truth<Value> record = (rate > figures[RATE] * unit) & (rate < INFINITE);
+        if (any(record)) [[unlikely]] figures[RATE] = where(record, rate / unit, figures[RATE]);
+        found = found | (figures[RATE] > max(Value(LEAST_RATE), RATE_GROWTH * figures[RATE_NOTED]));
+    }
+    return found;
+}
+
+// Note the rates where f at y_hat is known.
+template <class W>
+[[gnu::noinline]] inline void note_known_rates(const Step &step, const W &w) {
+    if (!rates_stand_out(w)) return;
+    for (int64_t i = 0; i < w.l; ++i) w.figures(i)[RATE_NOTED] = w.figures(i)[RATE];
+    suspect(CHANGES_ALONG_FLOW, step, w);
+}
+
+template <class W>
+inline void note_rates(const Step &step, const Options &o, const W &w) {
+    if (o.watched && w.counters[F_AT_RAW]) [[unlikely]] note_known_rates(step, w);
+}
+
+// The largest local error of a block, relative to what a fixed step of length h from y changes in it and to its size.
+template <class Value, class W>
+[[gnu::noinline]] inline Value largest_error_share(double h, const Value *y, const Options &o, const W &w) {
+    Value *change = w.stage, largest_size = 0.0, top = 0.0;
+    const auto size = [&](int64_t b) {
+        const Value moved = max(block_square(change, b, Value(1.0), o.blocks), block_square(w.row(0), b, Value(h), o.blocks));
+        return max(moved, block_square(y, b, Value(1.0), o.blocks));
+    };
+    for (int64_t i = 0; i < w.m; ++i) change[i] = w.y_hat[i] - y[i];
+    for (int64_t b = 0; b < o.blocks.count; ++b) largest_size = max(largest_size, size(b));
+    const Value least = LEAST_CHANGE * LEAST_CHANGE * largest_size + TINY;
+    for (int64_t b = 0; b < o.blocks.count; ++b)
+        top = max(top, block_square(w.err, b, Value(1.0), o.blocks) / (size(b) + least));
+    return sqrt(top);
+}
+
+template <class Value>
+inline auto is_rough(const Value &share, const Value *figures) {
+    return share > max(Value(LEAST_ERROR), ERROR_GROWTH * figures[ROUGH_NOTED]);
+}
+
+// Note a fixed step whose local error is large compared with what it changes in some block. The step may not resolve that
+// block, which the invariants need not show.
+[[gnu::cold, gnu::noinline]] inline void note_roughness(const Step &step, const Options &o, const Work &w) {
+    if (w.suspect[REASON] >= LARGE_ERROR) return;  // the first one is examined: later ones may come of it
+    const double share = largest_error_share(step.h, step.y, o, w);
+    if (!is_rough(share, w.figures(0))) return;
+    w.figures(0)[ROUGH_NOTED] = share;
+    suspect(LARGE_ERROR, step, w);
+}
+
 // A defect that is large beside its invariant's terms.
 inline void note_share(double share, double t, double *figures, Figure largest_so_far, Figure at) {
     if (share > figures[largest_so_far]) {
@@ -154,8 +256,9 @@ inline void note_share(double share, double t, double *figures, Figure largest_s
     }
 }
 
-// What an invariant changed by since its last projection beside what the steps' errors explain; 1 if LARGE.
-inline int64_t weigh_change(double size, double expected, double t, double *figures) {
+// Compare what an invariant changed by since its last projection with what the steps' errors explain; return whether it is
+// LARGE.
+inline bool weigh_change(double size, double expected, double t, double *figures) {
     figures[JUDGED] += 1.0;
     figures[SUM] += size;
     figures[EXPECTED] += expected;
@@ -163,10 +266,10 @@ inline int64_t weigh_change(double size, double expected, double t, double *figu
         figures[NU] = size / expected;
         figures[AT] = t;
     }
-    if (!(size > LARGE * expected)) return 0;
+    if (!(size > LARGE * expected)) return false;
     if (figures[MANY] == 0.0) figures[FIRST] = t;
     figures[MANY] += 1.0;
-    return 1;
+    return true;
 }
 
 // What an accepted projection leaves: its defects, and whether the errors of the steps explain its corrections.
@@ -174,16 +277,17 @@ inline int64_t weigh_change(double size, double expected, double t, double *figu
 // An invariant's local errors since the last projection are worth `errors` times w.worth, their rounding `rounding` times
 // its terms; with errors = 0 nothing is known of them. y_old: the state at the step's start, or null.
 template <class W>
-inline void note(double t, double errors, double rounding, const double *y_old, const Options &o, const W &w) {
+inline void note(const Step &step, double errors, double rounding, const double *y_old, const Options &o, const W &w) {
+    const double t = step.t_new;
     for (int64_t i = 0; i < w.l; ++i) {
         double *figures = w.figures(i);
         const double size = std::abs(w.defect[i]), raw = std::abs(w.before[i]);
         w.max_defect[i] = std::max(w.max_defect[i], size);
         const double terms = o.per_band * w.band[i];
         double own = own_terms(i, o, w);
-        if (raw > FAR * own || size > LARGE_SHARE * own) own = generous_terms(i, own, y_old, o, w);
+        if (raw > o.far * own || size > LARGE_SHARE * own) own = generous_terms(i, own, y_old, o, w);
         figures[NOTED] += 1.0;
-        if (raw > FAR * own) {
+        if (raw > o.far * own) {
             note_share(raw / own, t, figures, RAW, RAW_AT);
             figures[RAW_MANY] += 1.0;
             ++w.counters[FOUND];
@@ -200,15 +304,19 @@ inline void note(double t, double errors, double rounding, const double *y_old, 
             const double change = std::abs(w.before[i] - figures[LEFT]);
             double expected = errors * w.worth[i] + rounding * terms + TINY;
             if (change > LARGE * expected) expected += rounding * generous_terms(i, 0.0, y_old, o, w);
-            if (expected < INFINITE) w.counters[FOUND] += weigh_change(change, expected, t, figures);
+            if (expected < INFINITE && weigh_change(change, expected, t, figures)) [[unlikely]] {
+                ++w.counters[FOUND];
+                if (figures[AT] == t) suspect(LARGE_CORRECTION, step, w);
+            }
         }
         figures[LEFT] = w.defect[i];
     }
+    if (w.suspect[REASON] != NOTHING) [[unlikely]] keep_accepted(step, w);
 }
 
 // The same for a step, whose estimates, where they are gathered in quadrature, are of errors that add.
 template <class W>
-inline void take_note(double t, const double *y_old, const Options &o, const W &w) {
+inline void take_note(const Step &step, const double *y_old, const Options &o, const W &w) {
     if (!o.watched) return raise_to(w.defect, w.max_defect, w.l);
     const double waited = w.counters[WAITED];
     double rounding = EPS, errors = w.counters[HAVE_ERROR] ? 1.0 : 0.0;
@@ -217,7 +325,7 @@ inline void take_note(double t, const double *y_old, const Options &o, const W &
         const bool gathered = o.metric == ERROR || o.every == AUTO || o.adaptive;
         errors *= gathered ? std::sqrt(1.0 + waited) : 1.0 + waited;
     }
-    note(t, errors, rounding, y_old, o, w);
+    note(step, errors, rounding, y_old, o, w);
 }
 
 // Whether the errors gathered make some invariant more uncertain than NOISE_BANDS roundings of its terms.

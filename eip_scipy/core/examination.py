@@ -1,0 +1,128 @@
+"""Examinations of a run on its way: whether its quantities are invariants there, and their gradients correct.
+
+At the start a rate or a gradient may vanish, or a function may take another branch than later. So the invariants are
+checked again after 10, 100, 1000, ... steps and at the end. Steps that the engine suspects are examined, too (`suspect`
+in engine/cpp/trust.hpp): an invariant changes along the flow there, a correction is large, or the local error of some
+part of the state is large, which the invariants need not show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..engine.trust import (
+    CHANGES_ALONG_FLOW,
+    LARGE_ERROR,
+    N_SUSPECT,
+    NOTHING,
+    NU,
+    RATE,
+    REASON,
+    SUSPECT_FROM,
+    SUSPECT_TO,
+)
+from .invariants import InvariantSet
+
+__all__ = ["Examiner", "is_check_due", "steps_to_check"]
+
+# Number of steps before the first check of the invariants, and the factor from one check to the next.
+FIRST_CHECK = SPACING = 10
+# Number of points of a step at which rates are examined, because a push may be shorter than the step.
+POINTS = 8
+# Factor by which the largest correction has to grow before a large correction is examined again.
+GROWTH = 2.0
+
+Array = np.ndarray
+Derivative = Callable[[float, Array], Array]
+
+
+def steps_to_check(steps: int) -> int:
+    """Return the number of steps from step `steps` to the next check of the invariants."""
+    due = FIRST_CHECK
+    while due <= steps:
+        due *= SPACING
+    return due - steps
+
+
+def is_check_due(steps: int) -> bool:
+    """Return whether a check of the invariants is due after `steps` steps."""
+    return steps > 0 and steps_to_check(steps - 1) == 1
+
+
+@dataclass
+class Examiner:
+    """Examiner of the states of a run.
+
+    Attributes
+    ----------
+    invariants : InvariantSet
+    tau : float
+        The length of a step.
+    figures : ndarray, shape (l, N_FIGURES)
+        The figures of the run's corrections. The rates of change that are found here are added to them.
+    resolution : callable
+        ``resolution(rhs, t, h, y, end_of_run)``: see `unresolved`.
+    largest : float
+        The largest correction when a large correction was examined last.
+    """
+
+    invariants: InvariantSet
+    tau: float
+    figures: Array
+    resolution: Callable[[Derivative, float, float, Array, float], str | None]
+    largest: float = 0.0
+
+    def complaint(self, rhs: Derivative, t: float, y: Array) -> str | None:
+        """Return what is wrong with an invariant or a gradient at a state of the run, or None."""
+        return _unless_refused(self._complaint, rhs, t, y, True)
+
+    def examine(self, suspect: Array, rhs: Derivative) -> str | None:
+        """Return what is wrong in the step that the engine suspects, or None. The engine may then suspect another."""
+        reason, t_old, t_new = suspect[REASON], float(suspect[SUSPECT_FROM]), float(suspect[SUSPECT_TO])
+        suspect[REASON] = NOTHING
+        old, new = np.split(suspect[N_SUSPECT:].copy().view(self.invariants.dtype), 2)
+        if reason == CHANGES_ALONG_FLOW:
+            return self.complaint(rhs, t_new, new)
+        if reason == LARGE_ERROR:
+            return _unless_refused(self.resolution, rhs, t_old, t_new - t_old, old, self.invariants.t_span[1])
+        return _unless_refused(self._along_chord, rhs, (t_old, t_new), (old, new))
+
+    def _complaint(self, rhs: Derivative, t: float, y: Array, on_manifold: bool) -> str | None:
+        """Return what is wrong at a state. Off the manifold, invariants that are kept where others hold may change."""
+        f = rhs(t, y)
+        if not np.isfinite(f).all():
+            return None
+        found = self.invariants.complaints(t, y, f, self.tau, rhs)
+        return next((one.text for one in found if on_manifold or not one.dependent), None)
+
+    def _along_chord(self, rhs: Derivative, times: tuple[float, float], ends: tuple[Array, Array]) -> str | None:
+        """Return what is wrong between the two ends of a step with a large correction, or None."""
+        largest = float(self.figures[:, NU].max(initial=0.0))
+        if largest < GROWTH * self.largest:
+            return None
+        self.largest = largest
+        (t_old, t_new), (old, new) = times, ends
+        for share in np.arange(1, POINTS + 1) / POINTS:
+            t, y = t_old + float(share) * (t_new - t_old), old + share * (new - old)
+            found = self._complaint(rhs, t, y, False)
+            if found is not None:
+                return found
+            np.fmax(self.figures[:, RATE], self.invariants.rate_shares(t, y, rhs(t, y)), out=self.figures[:, RATE])
+        return None
+
+
+def _unless_refused(look: Callable[..., str | None], *args: Any) -> str | None:
+    """Return what an examination finds.
+
+    The states that it looks at are near those of the run, but the run does not visit them. A function that refuses one
+    of them by an exception says nothing about the run.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            return look(*args)
+    except Exception:
+        return None

@@ -1,0 +1,96 @@
+"""Comparison of a few steps with shorter ones, which shows whether the steps resolve each part of the state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..engine.data import Grouping, Method
+from ..methods.runge_kutta import DOP853
+from .one_step import OneStep
+
+__all__ = ["unresolved"]
+
+# Consecutive steps that are compared, each with SUBSTEPS of DOP853. At most one of them passes a kink, so the step with
+# the largest error does not count.
+STEPS, SUBSTEPS = 3, 4
+# A block is not resolved if a step errs by this share of the block's size, or of what the step changes in it, by the
+# least number of stages. Correct runs have up to 0.034 by RK2 (table 2 of the paper) and 0.0074 by RK4 (the pericentre
+# of Kepler's orbit with e = 0.6 and h = 0.1).
+UNRESOLVED = {2: 0.1, 3: 0.03, 4: 1e-2, 8: 2e-3}
+# Blocks count as if they changed by this share of the largest change: rounding in the tails of a field is not resolved.
+LEAST_CHANGE = 1e-2
+# Share of its length by which a whole number of steps may miss an interval.
+ROUNDING = 1e-12
+
+Array = np.ndarray
+
+
+def unresolved(
+    method: Method | OneStep,
+    groups: Grouping,
+    rhs: Callable[[float, Array], Array],
+    t: float,
+    h: float,
+    y: Array,
+    end_of_run: float,
+) -> str | None:
+    """Return which part of the state steps of length h from (t, y) do not resolve, in a sentence; None for no part.
+
+    User-defined methods are not judged. Methods of order 1 are not judged either: all that a first step from rest
+    changes is an error of theirs. Functions are not called at times behind the end of the run.
+    """
+    steps = int(min(STEPS, (end_of_run - t) / h * (1 + ROUNDING)))
+    if isinstance(method, OneStep) or method.b.size == 1 or steps < 2:
+        return None
+    shares, end = [], y
+    for k in range(steps):
+        begin, at = end, t + k * h
+        end = begin
+        for part in range(SUBSTEPS):
+            end = _step(DOP853.A, DOP853.b, DOP853.c, rhs, at + part * h / SUBSTEPS, h / SUBSTEPS, end)
+        own = _nystrom_step(method, rhs, at, h, begin) if method.nystrom else _step(
+            method.A, method.b, method.c, rhs, at, h, begin
+        )  # fmt: skip
+        size = np.max([_norms(part, groups) for part in (end - begin, h * rhs(at, begin), begin)], axis=0)
+        if not (np.isfinite(end).all() and np.isfinite(own).all() and size.max() > 0):
+            return None
+        shares.append(_norms(own - end, groups) / (size + LEAST_CHANGE * size.max()))
+    second = np.sort(shares, axis=0)[-2]
+    block = int(second.argmax())
+    if second[block] < next(share for stages, share in reversed(UNRESOLVED.items()) if method.b.size >= stages):
+        return None
+    return (
+        f"steps of h={abs(h):g} do not resolve the motion of component{_components(groups, block)} of the state: at "
+        f"t={t:.6g} one step errs by {second[block]:.2g} of what it changes there; take a shorter step"
+    )
+
+
+def _step(A: Array, b: Array, c: Array, rhs: Callable[[float, Array], Array], t: float, h: float, y: Array) -> Array:
+    K = np.empty((b.size, y.size), y.dtype)
+    for i in range(b.size):
+        K[i] = rhs(t + c[i] * h, y + h * (A[i, :i] @ K[:i]))
+    return y + h * (b @ K)
+
+
+def _nystrom_step(method: Method, rhs: Callable[[float, Array], Array], t: float, h: float, y: Array) -> Array:
+    q, v = np.split(y, 2)
+    a = np.empty((method.b.size, q.size), y.dtype)
+    for i in range(method.b.size):
+        stage = q + h * (method.c[i] * v + h * (method.A[i, :i] @ a[:i]))
+        a[i] = rhs(t + method.c[i] * h, np.concatenate([stage, v]))[q.size :]
+    return np.concatenate([q + h * (v + h * (method.b @ a)), v + h * (method.b_v @ a)])
+
+
+def _norms(state: Array, groups: Grouping) -> Array:
+    """Return the length of each block of a state."""
+    squares = np.ascontiguousarray(state).view(float)[groups.member] ** 2
+    return np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp)))
+
+
+def _components(groups: Grouping, block: int) -> str:
+    """Return the components of a block as words behind "component"."""
+    floats = groups.member[groups.start[block] : groups.start[block + 1]].astype(int)
+    places = np.unique(floats // groups.width).tolist()
+    return f" {places[0]}" if len(places) == 1 else "s " + ", ".join(map(str, places[:6])) + ", ..." * (len(places) > 6)
