@@ -16,6 +16,7 @@ import numpy as np
 
 from ..engine.trust import (
     CHANGES_ALONG_FLOW,
+    EXAMINED,
     LARGE_ERROR,
     N_SUSPECT,
     NOTHING,
@@ -96,6 +97,8 @@ class Examiner:
         f = rhs(t, y)
         if not np.isfinite(f).all():
             return None
+        for column, shares in zip((RATE, EXAMINED), self.invariants.rate_shares(t, y, f), strict=True):
+            np.fmax(self.figures[:, column], shares, out=self.figures[:, column])
         found = self.invariants.complaints(t, y, f, self.tau, rhs)
         return next((one.text for one in found if on_manifold or not one.dependent), None)
 
@@ -111,7 +114,6 @@ class Examiner:
             found = self._complaint(rhs, t, y, False)
             if found is not None:
                 return found
-            np.fmax(self.figures[:, RATE], self.invariants.rate_shares(t, y, rhs(t, y)), out=self.figures[:, RATE])
         return None
 
 

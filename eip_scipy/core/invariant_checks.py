@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..engine.data import EPS
+from ..engine.trust import ROUNDING_OF_DIFFERENCES
 from .conditional import is_kept_on_a_surface, on_targets
 from .gradients import DIFFERENCE_WEIGHTS, random_directions
 
 if TYPE_CHECKING:
     from .invariants import InvariantSet
 
-__all__ = ["Complaint", "complaints", "listed"]
+__all__ = ["Complaint", "complaints", "listed", "rates_by_values"]
 
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
@@ -35,6 +36,9 @@ RATE_ROUNDINGS = 100.0
 # Differences to one side of order 6: weights of 0, 1, ... 6 steps.
 ONE_SIDED_WEIGHTS = (-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6)
 MOST_NAMES = 3
+# Short differences along the flow: their step, in the time in which the state moves by its size, and the share of the
+# rate's terms from which on those to both sides differ.
+SHORT, KINK = 1e-6, 1e-4
 DOUBLE = (
     "Compute it in double precision: with JAX jax.config.update('jax_enable_x64', True), with PyTorch by tensors and "
     "parameters of torch.float64"
@@ -318,10 +322,26 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
     rate, terms = in_time + products.sum(axis=1).real, np.abs(in_time) + np.abs(products).sum(axis=1)
     noise = noise + RATE_ROUNDINGS * EPS * known.norm_products(at.G, at.f / unit)
     wrong = np.abs(rate) > INVARIANCE_TOLERANCE * terms + noise
+    if (wrong & known.computed).any():
+        # Gradients that are computed over a kink are wrong, and the rate with them.
+        near = np.abs(in_time + rates_by_values(known, at.t, at.y, at.f) / unit) > ROUNDING_OF_DIFFERENCES * terms
+        wrong &= near | ~np.array(known.computed)
     if wrong.any():
         wrong &= ~(_rounding_of_rates(known, at, unit, rhs) > np.abs(rate))
     with np.errstate(over="ignore"):
         return _Rates(rate * unit, terms * unit, in_time, wrong)
+
+
+def rates_by_values(known: InvariantSet, t: float, y: Array, f: Array) -> Array:
+    """Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a kink."""
+    moving, size = np.abs(f).max(initial=0.0), np.abs(y).max(initial=0.0)
+    if not (0 < moving < np.inf and 0 < size < np.inf):
+        return np.zeros(known.size)
+    step = SHORT * size / moving
+    before, here, after = (known.values(t, y + side * step * f) for side in (-1.0, 0.0, 1.0))
+    back, forth = (here - before) / step, (after - here) / step
+    kink = np.abs(forth - back) > KINK * (np.abs(known.gradients(t, y, f)) @ np.abs(f))
+    return np.where(kink, np.nan, 0.5 * (back + forth))
 
 
 def _time_derivative(known: InvariantSet, at: _Samples) -> tuple[Array, Array]:

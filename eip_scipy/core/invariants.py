@@ -15,7 +15,7 @@ from .arguments import names, scalars
 from .callers import users_level
 from .gradients import NumericalGradient, difference_gradient, typical_sizes
 from .inputs import count, filled, flag, reals, refuse_units, require_arguments, shown
-from .invariant_checks import Complaint, complaints, listed
+from .invariant_checks import Complaint, complaints, listed, rates_by_values
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 
@@ -646,11 +646,13 @@ class InvariantSet:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.where(residual == 0, 0.0, residual / allowed)
 
-    def rate_shares(self, t: float, y: Array, f: Array) -> Array:
-        """Return the rates at which the invariants change along f, relative to the terms of these rates; (l,)."""
+    def rate_shares(self, t: float, y: Array, f: Array) -> tuple[Array, Array]:
+        """Return the rates of change along f by gradients and by values, relative to the terms of these rates; (l,)."""
         products = self.gradients(t, y, f).conj() * f
         terms = np.abs(products).sum(axis=1)
-        return np.abs(products.sum(axis=1).real) / np.where(terms > 0, terms, 1.0)
+        rates = np.abs(np.array([products.sum(axis=1).real, rates_by_values(self, t, y, f)]))
+        by_gradient, by_values = rates / np.where(terms > 0, terms, 1.0)
+        return by_gradient, by_values
 
     def start_violation(self, t: float, y: Array, f: Array) -> str | None:
         """Return what is wrong with the start, where it misses given targets; the worst invariant comes first."""

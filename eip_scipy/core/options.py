@@ -106,6 +106,7 @@ class Options(NamedTuple):
     frame: FrameRows
     target: np.ndarray
     scales: np.ndarray
+    computed: np.ndarray
     kinds: Grouping
     kappa: float
     metric: int
@@ -270,6 +271,7 @@ class ProjectionOptions:
             frame=frame_rows(self.frame, n, width),
             target=known.target,
             scales=known.scales,
+            computed=np.array(known.computed, float),
             kinds=groups,
             kappa=method.kappa,
             metric=kind,

@@ -83,7 +83,7 @@ class _Coordinates:
         # Sizes of the invariants' terms stand in for those that the step would find at the state itself.
         self._options = run.options._replace(
             rtol=np.zeros(n), atol=np.zeros(n), block_atol=np.zeros(n), groups=each, kinds=each, joint=None,
-            scales=np.empty(size),
+            scales=np.empty(size), computed=np.zeros(size),
         )  # fmt: skip
         self._work = make_work(n, np.dtype(float), 0, size, n)._replace(**{k: getattr(run.work, k) for k in SCALARS})
         functions = PythonFunctions(

@@ -25,7 +25,10 @@ NU, AT, MANY, FIRST, SUM, EXPECTED, JUDGED = range(9, 16)
 # there, when a step was kept for that reason last. The share of its terms from which on a defect before a projection is
 # FAR.
 RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM = range(16, 21)
-N_FIGURES = 21
+# Whether the gradient is computed from values, which is not accurate near kinks; the largest rate of change along the
+# flow that examinations found by short differences, in its own terms.
+BY_VALUES, EXAMINED = range(21, 23)
+N_FIGURES = 23
 # A step that is to be examined: the reason, its two times, and behind these its two states.
 REASON, SUSPECT_FROM, SUSPECT_TO, N_SUSPECT = range(4)
 NOTHING, LARGE_CORRECTION, LARGE_ERROR, CHANGES_ALONG_FLOW = range(4)
@@ -41,7 +44,7 @@ FAR_IN_TOLERANCES, MOST_FAR = 7.5, 0.075
 BEYOND_DOUBT, OFTEN, TOGETHER = 1e4, 0.1, 20.0
 TOO_FAR, FAR_OFTEN = 5 / 3, 0.01
 # Rates of change along the flow are rounding up to this share of their terms.
-ROUNDING_OF_RATES = 1e-11
+ROUNDING_OF_RATES, ROUNDING_OF_DIFFERENCES = 1e-11, 1e-7
 # So many changes make a share or a sum, where more than one is LARGE.
 ENOUGH = 5
 MOST_REASONS = 3  # in a message
@@ -108,7 +111,7 @@ class Trust:
         """Return the figures of a run together with those of the run that continued it."""
         one, two = self.figures, other.figures
         both = two.copy()  # START, TERMS, LEFT: of the last
-        largest = [TERMS, RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM]
+        largest = [TERMS, RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM, BY_VALUES, EXAMINED]
         both[:, largest] = np.maximum(one[:, largest], two[:, largest])
         counts = [NOTED, RAW_MANY, MANY, SUM, EXPECTED, JUDGED]
         both[:, counts] = one[:, counts] + two[:, counts]
@@ -181,7 +184,8 @@ def _may_leak(figures: np.ndarray) -> np.ndarray:
     Where the rate of change is nothing but rounding, large corrections come from estimates that are too small: those of
     a step over a kink, or where the derivative depends on time alone.
     """
-    return figures[..., RATE] > ROUNDING_OF_RATES
+    by_values, by_gradient = figures[..., EXAMINED] > ROUNDING_OF_DIFFERENCES, figures[..., RATE] > ROUNDING_OF_RATES
+    return np.where(figures[..., BY_VALUES] > 0, by_values, by_gradient)
 
 
 def _severity(figures: np.ndarray) -> np.ndarray:

@@ -476,11 +476,16 @@ def kinked(kind):
 
 @both
 @pytest.mark.parametrize("kind", ["Huber", "contact", "dead zone"])
-@pytest.mark.parametrize("method", [EIPRK5, EIPRK45, EIPDOP853])
-def test_kinks_are_no_leaks(driver, kind, method):
+@pytest.mark.parametrize("method", [EIPRK4, EIPRK5, EIPRK45, EIPDOP853])
+@pytest.mark.parametrize("given", [True, False], ids=["given", "computed"])
+@pytest.mark.filterwarnings("ignore:invariant 'energy' has no grad and allows no complex step")
+def test_kinks_are_no_leaks(driver, kind, method, given):
     """Estimates of steps over a kink are too small, so that corrections are many times larger; the energy holds."""
     fun, energy = kinked(kind)
-    for steps in [{"h": 0.02}, {"h": 0.01}] if method is EIPRK5 else [{"rtol": 1e-6}, {"rtol": 1e-9}]:
+    if not given:
+        energy = Invariant(energy.fun, name="energy")
+    every = [{"h": 0.02}, {"h": 0.01}] if method in (EIPRK4, EIPRK5) else [{"rtol": 1e-6}, {"rtol": 1e-9}]
+    for steps in every if given else every[:1]:
         run, record = driver(fun, (0, 20), [1.0, 0.1], method=method, invariants=energy, **steps)
         assert run.status == 0
         assert record.trusted, record.message
@@ -529,6 +534,14 @@ def test_late_leaks_are_found_with_other_options(options, method):
     steps = {"h": 0.02} if method is EIPRK5 else {"rtol": 1e-8}
     with pytest.warns(ProjectionWarning, match="'energy' is no invariant of this system: at t="):
         integrate(late_friction, (0, 20), [2.0, 0.0], method=method, invariants=ENERGY, **steps, **options)
+
+
+@pytest.mark.parametrize("method", [EIPRK4, EIPRK5, EIPRK45, EIPDOP853])
+def test_late_leaks_are_found_where_gradients_are_computed(method):
+    steps = {"h": 0.02} if method in (EIPRK4, EIPRK5) else {"rtol": 1e-8}
+    energy = Invariant(ENERGY.fun, name="energy")
+    with pytest.warns(ProjectionWarning, match="'energy' is no invariant of this system: at t="):
+        integrate(late_friction, (0, 20), [2.0, 0.0], method=method, invariants=energy, **steps)
 
 
 def test_late_leaks_are_found_backwards_in_time():

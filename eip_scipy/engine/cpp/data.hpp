@@ -31,7 +31,8 @@ enum Node : int { HAVE_NODES, NEWEST, NEWEST_ROW, SINCE, SEEN, N_NODE_PLACES };
 // Columns of the figures of a run's projections (trust.py says what they mean).
 enum Figure : int {
     START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MANY, NU, AT, MANY, FIRST, SUM, EXPECTED, JUDGED,
-    RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM, N_FIGURES
+    RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM, BY_VALUES, EXAMINED,
+    N_FIGURES
 };
 
 // The step that is to be examined: why, its two times, and behind these its two states (`suspect` in trust.hpp).
@@ -104,7 +105,7 @@ struct Options {
     const double *rtol, *atol, *block_atol;  // by float, by component, by block
     Blocks blocks;
     Frame frame;
-    const double *scales;
+    const double *scales, *computed;  // computed: 1 for invariants without a gradient of the user's
     Blocks kinds;  // floats of the same unit, as far as that is known
     double kappa;
     int64_t metric, direction, iterations, every;

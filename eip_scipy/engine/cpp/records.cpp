@@ -191,6 +191,7 @@ Options options_of(PyObject *options, Work &w, Arrays &arrays) {
     w.target = arrays.floats(options, "target", {w.l});
     w.products = arrays.floats(attribute(options, "frame").get(), "products", {o.frame.rows});
     o.scales = arrays.floats(options, "scales", {w.l});
+    o.computed = arrays.floats(options, "computed", {w.l});
     read_each(o, [options](const char *name, auto &value) {
         using Value = std::decay_t<decltype(value)>;
         if constexpr (std::is_same_v<Value, bool>)

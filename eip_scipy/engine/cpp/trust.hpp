@@ -64,6 +64,8 @@ inline void start_figures(const Value *y, const Value *f, double tau, const Meth
         fill(figures, 0.0, N_FIGURES);
         figures[LEFT] = w.values[i] - w.target[i];
         figures[RATE] = known ? 0.0 : 1.0;
+        figures[EXAMINED] = known ? 0.0 : 1.0;
+        figures[BY_VALUES] = o.computed[i];
         figures[FAR_FROM] = o.far;
         figures[START] = where(terms < INFINITE, terms, 0.0);
         figures[TERMS] = where(terms > 0.0, terms, INFINITE);
