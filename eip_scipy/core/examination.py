@@ -126,5 +126,7 @@ def _unless_refused(look: Callable[..., str | None], *args: Any) -> str | None:
     try:
         with np.errstate(all="ignore"):
             return look(*args)
+    except MemoryError:
+        raise
     except Exception:
         return None

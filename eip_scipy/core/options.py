@@ -286,7 +286,7 @@ class ProjectionOptions:
             per_band=1.0 / (_band(method, compensated) * EPS),
             watched=check and known.size > 0,
             limit=(LARGE_SHARE if stepping.h is None else 1.0) if check else np.inf,
-            far=FAR if stepping.h is not None else min(max(FAR, FAR_IN_TOLERANCES * np.max(rtol)), MOST_FAR),
+            far=FAR if stepping.h is not None else _far_by_tolerances(rtol),
         )
         if _can_project_jointly(options, known):
             options = options._replace(joint=known.items)
@@ -346,6 +346,10 @@ class ProjectionOptions:
                 return (ERROR if method.has_estimate else EUCLIDEAN), None
             raise ValueError(f"metric must be 'error', 'euclidean' or an array of n weights, got {metric!r}.")
         return GIVEN, np.repeat(weights("metric", metric, n), width)
+
+
+def _far_by_tolerances(rtol: np.ndarray) -> float:
+    return float(min(max(FAR, FAR_IN_TOLERANCES * np.max(rtol, initial=0.0)), MOST_FAR))
 
 
 def _band(method: AnyMethod, compensated: bool) -> float:
