@@ -46,9 +46,10 @@ struct Place {
     const char *kept = written ? "writable, " : "";
     if (PyArray_Check(object)) {
         const Ref dtype = attribute(object, "dtype"), shape = attribute(object, "shape");
-        PyErr_Format(PyExc_ValueError,
-                     "%s: argument %d is %S of shape %S; expected a %saligned, C-contiguous array of %s with an axis or more",
-                     place.function, place.argument, dtype.get(), shape.get(), kept, what);
+        PyErr_Format(
+            PyExc_ValueError,
+            "%s: argument %d is %S of shape %S; expected a %saligned, C-contiguous array of %s with an axis or more",
+            place.function, place.argument, dtype.get(), shape.get(), kept, what);
     } else {
         PyErr_Format(PyExc_TypeError, "%s: argument %d is %.80R; expected a %saligned, C-contiguous array of %s",
                      place.function, place.argument, object, kept, what);

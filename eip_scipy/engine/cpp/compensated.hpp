@@ -69,8 +69,7 @@ inline void compensated_nystrom(const double *y, double h, const Method &m, cons
         }
         const Pair drift = two_product(h, y[k]), half_kick = two_product(h, place);
         const Pair kick = two_product(h, half_kick.value);
-        const double rest =
-            drift.rest + kick.rest + h * (w.carry[k] + half_kick.rest + h * place_low) + w.carry[i];
+        const double rest = drift.rest + kick.rest + h * (w.carry[k] + half_kick.rest + h * place_low) + w.carry[i];
         const Pair first = two_sum(y[i], drift.value), second = two_sum(first.value, kick.value);
         const Pair q = two_sum(second.value, first.rest + second.rest + rest);
         w.y_hat[i] = q.value;

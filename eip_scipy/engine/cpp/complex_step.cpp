@@ -185,9 +185,10 @@ PyObject *checked_complex_step(PyObject *, PyObject *const *arguments, Py_ssize_
         const bool right = count == 7 && is_state(arguments[2]) && PyTuple_Check(arguments[3]);
         const npy_intp n = right ? PyArray_SIZE(reinterpret_cast<PyArrayObject *>(arguments[2])) : 0;
         if (!right || !is_plain(arguments[5], NPY_DOUBLE, {n}) || !is_plain(arguments[6], NPY_DOUBLE, {n})) {
-            PyErr_SetString(PyExc_TypeError,
-                            "checked_complex_step: expected fun, t, y (n,) of float64 with n > 0, args, step, direction "
-                            "(n,), floors (n,)");
+            PyErr_SetString(
+                PyExc_TypeError,
+                "checked_complex_step: expected fun, t, y (n,) of float64 with n > 0, args, step, direction "
+                "(n,), floors (n,)");
             throw PythonError{};
         }
         Function function(arguments[0], arguments[1], arguments[3]);
@@ -206,7 +207,8 @@ PyMethodDef gradient_functions[] = {
      "(..., n), the imaginary parts over the step."},
     {"checked_complex_step", reinterpret_cast<PyCFunction>(checked_complex_step), METH_FASTCALL,
      "checked_complex_step(fun, t, y, args, step, direction, floors)\n\nThe same, or None where it disagrees with a "
-     "difference of ``fun`` along ``direction * (abs(y) + floors)``, as that of a function does which is not analytic."},
+     "difference of ``fun`` along ``direction * (abs(y) + floors)``, as that of a function does which is not "
+     "analytic."},
     {nullptr, nullptr, 0, nullptr},
 };
 

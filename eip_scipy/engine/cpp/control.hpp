@@ -40,7 +40,8 @@ inline bool look_back(const AnyRun &run, const Step &step) {
     if (estimate) estimate_error(run, step);
     if (!step.project) return false;
     const bool sampled = is_sampled(run);
-    if (sampled) [[unlikely]] sample(of_any_length(run), step);
+    if (sampled) [[unlikely]]
+        sample(of_any_length(run), step);
     w.counters[F_AT_RAW] = sampled || (o.adaptive && w.counters[HAVE_F] && w.counters[BEGUN] % ADAPTIVE_EACH == 0);
     return sampled && is_sampled_for_resolution(w);
 }

@@ -19,9 +19,13 @@ struct Moved {
 };
 
 template <class Value, class W>
-inline MatrixOf<Value> rows_of(Value *a, const W &w) { return {a, w.l, w.m, w.m}; }
+inline MatrixOf<Value> rows_of(Value *a, const W &w) {
+    return {a, w.l, w.m, w.m};
+}
 template <class Value, class W>
-inline MatrixOf<Value> small(Value *a, int64_t size, const W &w) { return {a, size, size, w.l}; }
+inline MatrixOf<Value> small(Value *a, int64_t size, const W &w) {
+    return {a, size, size, w.l};
+}
 
 // w.values = I(y); compensated runs add what the carry is worth, by the gradients at hand.
 template <class AnyRun, class Value>
@@ -83,8 +87,7 @@ inline void newton_matrix_solve(int64_t rank, const Work &w) {
     const Inner &inner = w.inner;
     const Matrix matrix = small(inner.matrix, rank, w), R = small(inner.R, w.l, w);
     for (int64_t k = 0; k < rank; ++k) {
-        for (int64_t q = 0; q < rank; ++q)
-            matrix(k, q) = dot(w.B + w.pivots[k] * w.m, w.Q + w.pivots[q] * w.m, w.m);
+        for (int64_t q = 0; q < rank; ++q) matrix(k, q) = dot(w.B + w.pivots[k] * w.m, w.Q + w.pivots[q] * w.m, w.m);
         inner.g[k] = w.g[w.pivots[k]];
     }
     const int64_t inner_rank = factor(matrix, inner.inverse_norms, R, inner.pivots);

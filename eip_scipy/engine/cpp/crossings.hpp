@@ -10,12 +10,12 @@
 
 namespace eip {
 
-constexpr int MOST_CROSSINGS = 3;           // that are looked for in a step, of each event
-constexpr double SLOPE_PART = 1.0 / 4096;   // of the step, over which the slope of an event is taken
-constexpr double REACH = 4.0;               // slopes times the step: a larger value does not reach zero
-constexpr int MAX_SEARCHES = 40;            // values in one search for an extremum
-constexpr double SEARCH_TOLERANCE = 1e-9;   // of the step
-constexpr double VERTEX_ERROR = 0.25;       // of a parabola's vertex, relative to the distance of its points
+constexpr int MOST_CROSSINGS = 3;          // that are looked for in a step, of each event
+constexpr double SLOPE_PART = 1.0 / 4096;  // of the step, over which the slope of an event is taken
+constexpr double REACH = 4.0;              // slopes times the step: a larger value does not reach zero
+constexpr int MAX_SEARCHES = 40;           // values in one search for an extremum
+constexpr double SEARCH_TOLERANCE = 1e-9;  // of the step
+constexpr double VERTEX_ERROR = 0.25;      // of a parabola's vertex, relative to the distance of its points
 
 // The values of an event at both ends of a step, and its slopes there times the step's length.
 struct EventEnds {

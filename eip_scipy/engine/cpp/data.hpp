@@ -9,8 +9,16 @@ namespace eip {
 
 // Codes of a step; the last four are the loops'.
 enum Code : int {
-    OK = 0, NOT_FINITE = 1, FAILED_PROJECTION = 2, TOO_SMALL = 3, POSTPONED = 4, UNSTABLE = 5, PAUSE = 10, FULL = 11,
-    ENDED = 12, DOUBTFUL = 13
+    OK = 0,
+    NOT_FINITE = 1,
+    FAILED_PROJECTION = 2,
+    TOO_SMALL = 3,
+    POSTPONED = 4,
+    UNSTABLE = 5,
+    PAUSE = 10,
+    FULL = 11,
+    ENDED = 12,
+    DOUBTFUL = 13
 };
 
 enum Direction : int { NEW, OLD, MIDPOINT };
@@ -19,8 +27,22 @@ constexpr int64_t AUTO = 0;  // the option `every`
 
 // Places in the counters (counters.py), in the clock and in the place of a run.
 enum Counter : int {
-    NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED, HAVE_ERROR, BEGUN,
-    WAITED, FOUND, F_AT_RAW, N_COUNTERS
+    NFEV,
+    NJEV,
+    NLU,
+    PROJECTIONS,
+    SKIPPED,
+    RANK_REDUCED,
+    REJECTED,
+    LAST_RANK,
+    HAVE_F,
+    SOFTENED,
+    HAVE_ERROR,
+    BEGUN,
+    WAITED,
+    FOUND,
+    F_AT_RAW,
+    N_COUNTERS
 };
 enum Clock : int { TIME, TIME_NEW, LENGTH, NEXT_LENGTH };
 enum Place : int { STEP, ROW, PENDING };
@@ -30,8 +52,29 @@ enum Node : int { HAVE_NODES, NEWEST, NEWEST_ROW, SINCE, SEEN, N_NODE_PLACES };
 
 // Columns of the figures of a run's projections (trust.py says what they mean).
 enum Figure : int {
-    START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MANY, NU, AT, MANY, FIRST, SUM, EXPECTED, JUDGED,
-    RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM, BY_VALUES, EXAMINED,
+    START,
+    TERMS,
+    NOTED,
+    LEFT,
+    SHARE,
+    SHARE_AT,
+    RAW,
+    RAW_AT,
+    RAW_MANY,
+    NU,
+    AT,
+    MANY,
+    FIRST,
+    SUM,
+    EXPECTED,
+    JUDGED,
+    RATE,
+    RATE_TERMS,
+    RATE_NOTED,
+    ROUGH_NOTED,
+    FAR_FROM,
+    BY_VALUES,
+    EXAMINED,
     N_FIGURES
 };
 
@@ -67,10 +110,10 @@ struct Multistep {
     double error_constant, growth;
     bool brief, level, uses_v;  // no history at all; states not `middle` nodes behind it; accelerations take velocities
     double t0, h;
-    int64_t substeps, spacing;                 // of the method that starts; nodes from one projection to the next
-    int64_t first, count;                      // components that the Jacobian corrects
-    double *nodes, *sums;                      // (rows, pitch), (4, pitch)
-    double *predicted, *change, *levels;       // (3, pitch), (half), (3, l)
+    int64_t substeps, spacing;            // of the method that starts; nodes from one projection to the next
+    int64_t first, count;                 // components that the Jacobian corrects
+    double *nodes, *sums;                 // (rows, pitch), (4, pitch)
+    double *predicted, *change, *levels;  // (3, pitch), (half), (3, l)
     int64_t *place;
 };
 
@@ -106,12 +149,13 @@ struct Options {
     Blocks blocks;
     Frame frame;
     const double *scales, *computed;  // computed: 1 for invariants without a gradient of the user's
-    Blocks kinds;  // floats of the same unit, as far as that is known
+    Blocks kinds;                     // floats of the same unit, as far as that is known
     double kappa;
     int64_t metric, direction, iterations, every;
     bool reuse_f, uses_f, compensated, adaptive, watched;
-    double per_band, limit;  // an invariant's terms are per_band dead bands; `limit`: the share of them that may be left
-    double far;              // defects before a projection are noted from this share of the terms on
+    double per_band,
+        limit;   // an invariant's terms are per_band dead bands; `limit`: the share of them that may be left
+    double far;  // defects before a projection are noted from this share of the terms on
 };
 
 // Its numbers and flags, for whoever reads them by their names.
@@ -143,15 +187,15 @@ template <class V>
 struct WorkOf {
     using Value = V;
     int64_t n, m, l, stages;
-    Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *memory, *memory_new, *move,
-        *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *worth, *defect, *max_defect,
-        *max_correction, *trust, *target, *products;  // the invariants' levels; scratch of the frame
+    Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *memory, *memory_new,
+        *move, *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *worth, *defect,
+        *max_defect, *max_correction, *trust, *target, *products;  // the invariants' levels; scratch of the frame
     double *norm, *suspect;
     int64_t *pivots, *counters;
     Inner inner;
 
-    Value *row(int64_t i) const { return K + i * m; }        // f of stage i
-    Value *last() const { return K + stages * m; }           // f at the raw result, or at the end of the step
+    Value *row(int64_t i) const { return K + i * m; }  // f of stage i
+    Value *last() const { return K + stages * m; }     // f at the raw result, or at the end of the step
     Value *gradient(int64_t i) const { return G + i * m; }
     Value *figures(int64_t i) const { return trust + i * N_FIGURES; }
 };

@@ -29,7 +29,7 @@ struct Dense {
     Options options;
     Work work;
     const Multistep *multistep;
-    double *missed;   // how many states were left unprojected, and the time of the first
+    double *missed;    // how many states were left unprojected, and the time of the first
     int64_t *waiting;  // whether the states at the start and at the end of the step at hand are not projected
 
     // States that make up an interpolant, besides those of the two ends and the weights.
@@ -46,8 +46,15 @@ struct Piece {
     double *t_old, *t, *known, *y_old, *y, *rows, *sigma, *levels_old, *levels;
 
     Piece(double *first, const Dense &d)
-        : t_old(first), t(first + 1), known(first + 2), y_old(first + 3), y(y_old + d.work.m), rows(y + d.work.m),
-          sigma(rows + d.rows() * d.work.m), levels_old(sigma + d.work.m), levels(levels_old + d.work.l) {}
+        : t_old(first),
+          t(first + 1),
+          known(first + 2),
+          y_old(first + 3),
+          y(y_old + d.work.m),
+          rows(y + d.work.m),
+          sigma(rows + d.rows() * d.work.m),
+          levels_old(sigma + d.work.m),
+          levels(levels_old + d.work.l) {}
 };
 
 // Dense output as a run of its own.
@@ -123,8 +130,12 @@ inline void quintic(const Piece &piece, double h, const double *f_old, const dou
         const double place = piece.y[i] - q - h * v - 0.5 * h * h * a;
         const double slope = h * (piece.y[half + i] - v - h * a);
         const double curvature = h * h * (f[half + i] - a);
-        const double coefficients[] = {q, h * v, 0.5 * h * h * a, 10 * place - 4 * slope + 0.5 * curvature,
-                                       -15 * place + 7 * slope - curvature, 6 * place - 3 * slope + 0.5 * curvature};
+        const double coefficients[] = {q,
+                                       h * v,
+                                       0.5 * h * h * a,
+                                       10 * place - 4 * slope + 0.5 * curvature,
+                                       -15 * place + 7 * slope - curvature,
+                                       6 * place - 3 * slope + 0.5 * curvature};
         for (int k = 0; k < 6; ++k) rows[k * half + i] = coefficients[k];
     }
 }
@@ -363,7 +374,8 @@ inline void hand_out(const Run &run, const DenseRun &dense, double t, const doub
     }
     if (near) return;
     if (d.by_travel)
-        weigh_blocks(w.sigma, d.options.blocks, w, [&](int64_t b) { return block_norm(y, nullptr, b, d.options.blocks, w); });
+        weigh_blocks(w.sigma, d.options.blocks, w,
+                     [&](int64_t b) { return block_norm(y, nullptr, b, d.options.blocks, w); });
     else
         copy(run.work.sigma, w.sigma, w.m);
     bool met = try_to_project();
@@ -376,8 +388,8 @@ inline void hand_out(const Run &run, const DenseRun &dense, double t, const doub
 
 // The interpolant over a step from y_old at t_old to y at t, from the buffers that it left. It meets the states at both ends
 // as they are handed out.
-inline void describe(const Run &run, const DenseRun &dense, double t_old, const double *y_old, double t, const double *y,
-                     double *out) {
+inline void describe(const Run &run, const DenseRun &dense, double t_old, const double *y_old, double t,
+                     const double *y, double *out) {
     const Dense &d = dense.dense;
     const Work &w = dense.work, &step = run.work;
     const Piece piece(out, d);

@@ -14,7 +14,7 @@ struct Eight {
     OctetSystem system;
     std::vector<Octet> memory;
     std::vector<double> tolerances, no_norm, suspects;  // the last of all members, one after the other
-    Multistep multistep{};  // of a multistep method: that of one state of 8 n floats
+    Multistep multistep{};                              // of a multistep method: that of one state of 8 n floats
     int64_t counters[N_COUNTERS] = {};
     Work flat{};
     WorkOf<Octet> work{};
@@ -28,23 +28,56 @@ struct Eight {
     int64_t place[N_NODE_PLACES] = {}, projected[LANES] = {};  // of the history; the node of each one's last projection
 
     Eight(const Method &method, const Options &o, const Work &w, OctetSystem functions)
-        : method(method), options(o), system(std::move(functions)), no_norm(1) {
+        : method(method),
+          options(o),
+          system(std::move(functions)),
+          no_norm(1) {
         const int64_t n = w.n, l = w.l, blocks = o.blocks.count, products = o.frame.rows;
         work.n = work.m = n;
         work.l = l;
         work.stages = w.stages;
         const Multistep *ms = method.multistep;
         const int64_t half = ms ? ms->half : 0, nodes_kept = ms ? ms->rows : 0;
-        const std::pair<Octet **, int64_t> places[] = {
-            {&work.K, (w.stages + 1) * n}, {&work.G, l * n}, {&work.Q, l * n}, {&work.R, l * l}, {&work.stage, n},
-            {&work.y_hat, n}, {&work.err, n}, {&work.err_low, n}, {&work.err_sum, n},
-            {&work.sigma, n}, {&work.move, n}, {&work.scale, blocks}, {&work.ratio, blocks},
-            {&work.memory, blocks}, {&work.memory_new, blocks}, {&work.mu, l},
-            {&work.values, l}, {&work.g, l}, {&work.band, l}, {&work.before, l}, {&work.worth, l}, {&work.defect, l},
-            {&work.max_defect, l}, {&work.target, l}, {&work.trust, l * N_FIGURES}, {&work.products, products},
-            {&work.max_correction, 1}, {&y, n}, {&y_new, n}, {&projections, 1}, {&skips, 1}, {&reduced, 1},
-            {&work.carry, n}, {&work.carry_hat, n}, {&work.f_point, n}, {&levels, 3 * l}, {&nodes, nodes_kept * half},
-            {&sums, 4 * half}, {&predicted, 3 * half}, {&change, half}};
+        const std::pair<Octet **, int64_t> places[] = {{&work.K, (w.stages + 1) * n},
+                                                       {&work.G, l * n},
+                                                       {&work.Q, l * n},
+                                                       {&work.R, l * l},
+                                                       {&work.stage, n},
+                                                       {&work.y_hat, n},
+                                                       {&work.err, n},
+                                                       {&work.err_low, n},
+                                                       {&work.err_sum, n},
+                                                       {&work.sigma, n},
+                                                       {&work.move, n},
+                                                       {&work.scale, blocks},
+                                                       {&work.ratio, blocks},
+                                                       {&work.memory, blocks},
+                                                       {&work.memory_new, blocks},
+                                                       {&work.mu, l},
+                                                       {&work.values, l},
+                                                       {&work.g, l},
+                                                       {&work.band, l},
+                                                       {&work.before, l},
+                                                       {&work.worth, l},
+                                                       {&work.defect, l},
+                                                       {&work.max_defect, l},
+                                                       {&work.target, l},
+                                                       {&work.trust, l * N_FIGURES},
+                                                       {&work.products, products},
+                                                       {&work.max_correction, 1},
+                                                       {&y, n},
+                                                       {&y_new, n},
+                                                       {&projections, 1},
+                                                       {&skips, 1},
+                                                       {&reduced, 1},
+                                                       {&work.carry, n},
+                                                       {&work.carry_hat, n},
+                                                       {&work.f_point, n},
+                                                       {&levels, 3 * l},
+                                                       {&nodes, nodes_kept * half},
+                                                       {&sums, 4 * half},
+                                                       {&predicted, 3 * half},
+                                                       {&change, half}};
         int64_t total = 0;
         for (const auto &[place, count] : places) total += count;
         memory.resize(total, Octet(0.0));
@@ -88,10 +121,17 @@ struct Eight {
         flat.n = flat.m = LANES * w.n;
         flat.l = w.l;
         flat.stages = w.stages;
-        for (const auto &[place, octets] : std::initializer_list<std::pair<double **, Octet *>>{
-                 {&flat.K, work.K}, {&flat.stage, work.stage}, {&flat.y_hat, work.y_hat}, {&flat.err, work.err},
-                 {&flat.err_low, work.err_low}, {&flat.err_sum, work.err_sum}, {&flat.carry, work.carry},
-                 {&flat.carry_hat, work.carry_hat}, {&flat.f_point, work.f_point}, {&flat.move, work.move}})
+        for (const auto &[place, octets] :
+             std::initializer_list<std::pair<double **, Octet *>>{{&flat.K, work.K},
+                                                                  {&flat.stage, work.stage},
+                                                                  {&flat.y_hat, work.y_hat},
+                                                                  {&flat.err, work.err},
+                                                                  {&flat.err_low, work.err_low},
+                                                                  {&flat.err_sum, work.err_sum},
+                                                                  {&flat.carry, work.carry},
+                                                                  {&flat.carry_hat, work.carry_hat},
+                                                                  {&flat.f_point, work.f_point},
+                                                                  {&flat.move, work.move}})
             *place = OctetSystem::floats_of(octets);
         flat.norm = no_norm.data();
         flat.counters = counters;

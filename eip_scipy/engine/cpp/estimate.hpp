@@ -36,8 +36,8 @@ inline double error_norm(const double *err, const double *y, const double *y_hat
 }
 
 // The same for DOP853's pair of estimates; then err <- err |err| / hypot(err, low / 10), by component.
-inline double paired_error_norm(double *err, const double *low, const double *y, const double *y_hat,
-                                const Options &o, int64_t n) {
+inline double paired_error_norm(double *err, const double *low, const double *y, const double *y_hat, const Options &o,
+                                int64_t n) {
     const int64_t width = o.blocks.width;
     double fine = 0.0, coarse = 0.0;
     for (int64_t i = 0; i < n; ++i) {

@@ -8,8 +8,7 @@ namespace eip {
 namespace {
 
 struct Function {
-    PyObject_HEAD
-    vectorcallfunc vectorcall;
+    PyObject_HEAD vectorcallfunc vectorcall;
     const LibraryFunction *function;
 };
 
@@ -57,8 +56,8 @@ void require_length(const LibraryFunction &function, const Ref &f, int64_t n) {
 void require_count(const LibraryFunction &function, Py_ssize_t count, bool by_f) {
     const Py_ssize_t expected = 3 + by_f + !function.returns();
     if (count == expected) return;
-    PyErr_Format(PyExc_TypeError, "%s takes (t, y%s%s, params), %zd arguments; got %zd", function.name, by_f ? ", f" : "",
-                 function.returns() ? "" : ", out", expected, count);
+    PyErr_Format(PyExc_TypeError, "%s takes (t, y%s%s, params), %zd arguments; got %zd", function.name,
+                 by_f ? ", f" : "", function.returns() ? "" : ", out", expected, count);
     throw PythonError{};
 }
 
@@ -121,9 +120,7 @@ PyObject *function_reduce(PyObject *self, PyObject *) {
 PyObject *get_name(PyObject *self, void *) { return PyUnicode_FromString(of(self).name); }
 PyObject *get_takes_f(PyObject *self, void *) { return PyBool_FromLong(of(self).value == Value::GRADIENT_BY_F); }
 PyObject *get_in_place(PyObject *self, void *) { return PyBool_FromLong(!of(self).returns()); }
-PyObject *get_handle(PyObject *self, void *) {
-    return PyLong_FromVoidPtr(const_cast<LibraryFunction *>(&of(self)));
-}
+PyObject *get_handle(PyObject *self, void *) { return PyLong_FromVoidPtr(const_cast<LibraryFunction *>(&of(self))); }
 PyObject *get_call_address(PyObject *, void *) { return PyLong_FromVoidPtr(reinterpret_cast<void *>(call_by_handle)); }
 PyObject *get_fits_address(PyObject *self, void *) {
     return PyLong_FromVoidPtr(reinterpret_cast<void *>(of(self).fits));
@@ -139,7 +136,8 @@ PyGetSetDef function_attributes[] = {
     {"takes_f", get_takes_f, nullptr, "Whether it takes the derivative of the state.", nullptr},
     {"in_place", get_in_place, nullptr, "Whether it fills an array.", nullptr},
     {"handle", get_handle, nullptr, "The first argument of the function at `call_address`.", nullptr},
-    {"call_address", get_call_address, nullptr, "Address of `call_by_handle`, whose signature is in library.cpp.", nullptr},
+    {"call_address", get_call_address, nullptr, "Address of `call_by_handle`, whose signature is in library.cpp.",
+     nullptr},
     {"fits_address", get_fits_address, nullptr, "Of ``bool fits(int64_t n, int64_t p)``.", nullptr},
     {"numbers", get_numbers, nullptr, "How many numbers, or states, it fills.", nullptr},
     {"fills_states", get_fills_states, nullptr, "Whether these are of the state's size.", nullptr},

@@ -259,9 +259,9 @@ template <class AnyRun>
             return FULL;
         note_waiting(samples, 0, run.method.multistep ? k > 0 : w.counters[WAITED] > 0);
         const int64_t stop = next_stop(run.method, samples, s, k, k_end);
-        const Code status =
-            stop == k + 1 ? next_step(run, s.span, s.clock, k, y, y_new)
-                          : next_states(OneState{of_any_length(run), y_new}, s.span, s.clock, k, stop, y, y_new);
+        const Code status = stop == k + 1
+                                ? next_step(run, s.span, s.clock, k, y, y_new)
+                                : next_states(OneState{of_any_length(run), y_new}, s.span, s.clock, k, stop, y, y_new);
         if (status != OK) return status;
         place[STEP] = stop;
         place[PENDING] = 1;

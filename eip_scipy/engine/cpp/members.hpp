@@ -14,9 +14,7 @@ struct Members {
     double *y, *t, *rows, *max_defect, *max_correction, *figures, *suspects;
     int64_t *status, *counters, *where;
 
-    Saved saved(int64_t k, const Work &w) const {
-        return {t_saved, rows + (kept ? k * n_rows * w.m : 0), n_rows};
-    }
+    Saved saved(int64_t k, const Work &w) const { return {t_saved, rows + (kept ? k * n_rows * w.m : 0), n_rows}; }
 };
 
 // Everything as at the start of a run; false where it has none that is finite, which is then to be explained.

@@ -42,8 +42,7 @@ bool has_v3() {
 }
 
 struct Engine {
-    PyObject_HEAD
-    PyObject *kept;  // every object that the run uses
+    PyObject_HEAD PyObject *kept;  // every object that the run uses
     Data *data;
     Schedule *schedule;
     Samples *samples;
@@ -58,8 +57,8 @@ void engine_setup(Engine *self, PyObject *method, PyObject *options, PyObject *w
                   PyObject *schedule, PyObject *hooks) {
     Arrays arrays(self->kept);
     const Ref y_hat = attribute(work, "y_hat");
-    const bool is_complex = PyArray_Check(y_hat.get()) &&
-                            PyArray_TYPE(reinterpret_cast<PyArrayObject *>(y_hat.get())) == NPY_CDOUBLE;
+    const bool is_complex =
+        PyArray_Check(y_hat.get()) && PyArray_TYPE(reinterpret_cast<PyArrayObject *>(y_hat.get())) == NPY_CDOUBLE;
     self->type = is_complex ? NPY_CDOUBLE : NPY_DOUBLE;
     self->data = new Data();
     Data &run = *self->data;
@@ -129,8 +128,10 @@ class Busy {
 
 // A method's arguments: as many as `names` says, of an engine that is set up.
 void expect(Engine *self, Py_ssize_t count, Py_ssize_t expected, const char *names) {
-    if (!self->data) PyErr_SetString(PyExc_RuntimeError, "engine: not set up");
-    else if (count != expected) PyErr_Format(PyExc_TypeError, "engine: expected the arguments %s", names);
+    if (!self->data)
+        PyErr_SetString(PyExc_RuntimeError, "engine: not set up");
+    else if (count != expected)
+        PyErr_Format(PyExc_TypeError, "engine: expected the arguments %s", names);
     if (PyErr_Occurred()) throw PythonError{};
 }
 
@@ -206,19 +207,19 @@ PyObject *engine_advance(Engine *self, PyObject *const *args, Py_ssize_t count) 
         Saved saved{};
         saved.t = static_cast<double *>(arrays.memory(args[3], "t_saved", NPY_DOUBLE, {ANY}));
         saved.rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[3]), 0);
-        saved.y = static_cast<double *>(
-            arrays.memory(args[4], "y_saved", self->type, {saved.rows, self->data->work.n}));
+        saved.y =
+            static_cast<double *>(arrays.memory(args[4], "y_saved", self->type, {saved.rows, self->data->work.n}));
         Samples *samples = self->samples;
         if (samples) {
             Pieces &pieces = samples->interpolants;
-            pieces.first = static_cast<double *>(
-                arrays.memory(args[5], "pieces", NPY_DOUBLE, {ANY, samples->dense.floats()}));
+            pieces.first =
+                static_cast<double *>(arrays.memory(args[5], "pieces", NPY_DOUBLE, {ANY, samples->dense.floats()}));
             pieces.capacity = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[5]), 0);
         }
         check_room(schedule, saved, samples, self->data->method.multistep);
         if (self->hooks) self->hooks->set_state(args[2]);
-        return PyLong_FromLong(stepped(
-            self, [&](const Run &run) { return advance_run(run, samples, schedule, k_end, y, y_new, saved); }));
+        return PyLong_FromLong(
+            stepped(self, [&](const Run &run) { return advance_run(run, samples, schedule, k_end, y, y_new, saved); }));
     });
 }
 
@@ -247,9 +248,10 @@ SweepArguments sweep_arguments(Engine *self, PyObject *const *args, PyObject *ke
     return given;
 }
 
-PyDoc_STRVAR(sweep_doc,
-             "sweep(members, steps, y, y_new, t_saved) -> int\n\nRun members of an ensemble one after the other, so many "
-             "steps in all; `members` is a record of data.py, whose `where` says how far they are.");
+PyDoc_STRVAR(
+    sweep_doc,
+    "sweep(members, steps, y, y_new, t_saved) -> int\n\nRun members of an ensemble one after the other, so many "
+    "steps in all; `members` is a record of data.py, whose `where` says how far they are.");
 
 PyObject *engine_sweep(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
@@ -270,9 +272,10 @@ PyObject *engine_sweep(Engine *self, PyObject *const *args, Py_ssize_t count) {
     });
 }
 
-PyDoc_STRVAR(eight_doc,
-             "side_by_side(functions) -> None\n\nFunctions of eight members, by which `sweep_octets` runs them from now "
-             "on; `functions` holds addresses, as those of the run.");
+PyDoc_STRVAR(
+    eight_doc,
+    "side_by_side(functions) -> None\n\nFunctions of eight members, by which `sweep_octets` runs them from now "
+    "on; `functions` holds addresses, as those of the run.");
 
 PyObject *engine_side_by_side(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
@@ -285,9 +288,10 @@ PyObject *engine_side_by_side(Engine *self, PyObject *const *args, Py_ssize_t co
     });
 }
 
-PyDoc_STRVAR(sweep_octets_doc,
-             "sweep_octets(members, steps, y, y_new, t_saved) -> int\n\nThe same, eight members side by side, by steps of "
-             "all eight. Whose status is not set has to run by itself.");
+PyDoc_STRVAR(
+    sweep_octets_doc,
+    "sweep_octets(members, steps, y, y_new, t_saved) -> int\n\nThe same, eight members side by side, by steps of "
+    "all eight. Whose status is not set has to run by itself.");
 
 PyObject *engine_sweep_octets(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
@@ -299,14 +303,15 @@ PyObject *engine_sweep_octets(Engine *self, PyObject *const *args, Py_ssize_t co
         const bool fixed = s.span.h != 0.0 && s.n_events == 0 && (s.n_eval == 0 || (self->samples && members.kept));
         const int64_t saved = s.n_eval > 0 ? s.n_eval : s.save_every > 0 ? s.span.n_steps / s.save_every + 2 : 2;
         if (!self->eight || !fixed || (members.kept && members.n_rows < saved)) {
-            PyErr_SetString(PyExc_ValueError, "engine: members side by side take fixed steps, and need room for all rows");
+            PyErr_SetString(PyExc_ValueError,
+                            "engine: members side by side take fixed steps, and need room for all rows");
             return nullptr;
         }
         Samples *samples = self->samples;
         if (samples) samples->interpolants.capacity = 0;
         const Octets octets{*self->eight, samples};
-        return PyLong_FromLong(stepped(
-            self, [&](const Run &run) { return sweep_eights(run, octets, s, members, steps, y, y_new); }));
+        return PyLong_FromLong(
+            stepped(self, [&](const Run &run) { return sweep_eights(run, octets, s, members, steps, y, y_new); }));
     });
 }
 
@@ -357,7 +362,8 @@ PyObject *engine_describe(Engine *self, PyObject *const *args, Py_ssize_t count)
     });
 }
 
-PyDoc_STRVAR(show_doc, "show(t, y, out) -> None\n\nFill out (n,) with the last state, y at t, as the run hands it out.");
+PyDoc_STRVAR(show_doc,
+             "show(t, y, out) -> None\n\nFill out (n,) with the last state, y at t, as the run hands it out.");
 
 PyObject *engine_show(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
@@ -378,8 +384,9 @@ PyObject *engine_show(Engine *self, PyObject *const *args, Py_ssize_t count) {
     });
 }
 
-PyDoc_STRVAR(interpolate_doc,
-             "interpolate(piece, t, out) -> None\n\nFill out (m, n) with the states at times t (m,) by an interpolant.");
+PyDoc_STRVAR(
+    interpolate_doc,
+    "interpolate(piece, t, out) -> None\n\nFill out (m, n) with the states at times t (m,) by an interpolant.");
 
 PyObject *engine_interpolate(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
@@ -400,8 +407,9 @@ PyObject *engine_interpolate(Engine *self, PyObject *const *args, Py_ssize_t cou
     });
 }
 
-PyDoc_STRVAR(step_doc,
-             "step(k, t, y, f) -> (status, t_new, y_new, f_new)\n\nStep k from the state y at t with the derivative f.");
+PyDoc_STRVAR(
+    step_doc,
+    "step(k, t, y, f) -> (status, t_new, y_new, f_new)\n\nStep k from the state y at t with the derivative f.");
 
 PyObject *engine_step(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
@@ -468,9 +476,10 @@ PyObject *engine_close(Engine *self, PyObject *const *args, Py_ssize_t count) {
     });
 }
 
-PyDoc_STRVAR(values_doc,
-             "values(t, y, out, params=None) -> None\n\nFill out (m, l) with the invariants at states y (m, n), each with "
-             "its own params (m, p) where they are given.");
+PyDoc_STRVAR(
+    values_doc,
+    "values(t, y, out, params=None) -> None\n\nFill out (m, l) with the invariants at states y (m, n), each with "
+    "its own params (m, p) where they are given.");
 
 PyObject *engine_values(Engine *self, PyObject *const *args, Py_ssize_t count) {
     return guarded([&]() -> PyObject * {
@@ -506,7 +515,8 @@ PyObject *engine_start(Engine *self, PyObject *const *args, Py_ssize_t count) {
         expect(self, count, 3, "y, f, tau");
         const Busy busy(self->busy);
         const Ref kept(PyList_New(0));
-        const double *y = state_of(args[0], "y", self, kept.get(), true), *f = state_of(args[1], "f", self, kept.get(), true);
+        const double *y = state_of(args[0], "y", self, kept.get(), true),
+                     *f = state_of(args[1], "f", self, kept.get(), true);
         const double tau = PyFloat_AsDouble(args[2]);
         if (PyErr_Occurred()) return nullptr;
         const Data &run = *self->data;
@@ -582,7 +592,10 @@ PyDoc_STRVAR(engine_doc,
 PyTypeObject engine_type = {.ob_base = PyVarObject_HEAD_INIT(nullptr, 0)};
 
 PyModuleDef module = {
-    .m_base = PyModuleDef_HEAD_INIT, .m_name = EIP_NAME, .m_doc = "The step in C++.", .m_size = -1,
+    .m_base = PyModuleDef_HEAD_INIT,
+    .m_name = EIP_NAME,
+    .m_doc = "The step in C++.",
+    .m_size = -1,
 };
 
 // Functions by subject, as a module in this one.
@@ -612,8 +625,8 @@ PyMODINIT_FUNC EIP_INIT() {
     if (PyType_Ready(&type) < 0) return nullptr;
     PyObject *module = PyModule_Create(&eip::module);
     if (!module) return nullptr;
-    eip::failed_call_error =
-        PyErr_NewExceptionWithDoc("eip_scipy.engine.FailedCallError", "A function by pointer failed.", nullptr, nullptr);
+    eip::failed_call_error = PyErr_NewExceptionWithDoc("eip_scipy.engine.FailedCallError",
+                                                       "A function by pointer failed.", nullptr, nullptr);
     if (!eip::failed_call_error || !eip::add_library(module) ||
         PyModule_AddObjectRef(module, "FailedCallError", eip::failed_call_error) < 0 ||
         PyModule_AddObjectRef(module, "Engine", reinterpret_cast<PyObject *>(&type)) < 0 ||

@@ -209,7 +209,8 @@ inline void find_levels(System &system, const Multistep &ms, const W &w, const V
         }
         system.inv(w, ms.t0, near, w.values);
         for (int64_t i = 0; i < w.l; ++i)
-            levels[i] += ((w.values[i] - w.target[i]) - dot(w.gradient(i), distance, w.m)) / static_cast<double>(LEVELS);
+            levels[i] +=
+                ((w.values[i] - w.target[i]) - dot(w.gradient(i), distance, w.m)) / static_cast<double>(LEVELS);
     }
     for (int64_t i = 0; i < w.l; ++i) {
         const Value terms = max(abs(w.values[i]), abs_dot(w.gradient(i), y, w.m));

@@ -49,8 +49,7 @@ struct OctetSystem {
     template <class W>
     void jacobian(const W &w, double t, const double *q, const double *dq, double *out, int64_t count) {
         const auto &[pointer, library, octets] = jacobian_pointer;
-        if (library)
-            return library(t, octets_of(q), octets_of(dq), octets_of(out), params.data(), count / LANES, p());
+        if (library) return library(t, octets_of(q), octets_of(dq), octets_of(out), params.data(), count / LANES, p());
         fill(out, NOT_A_NUMBER, w.m / 2);
         require(pointer(t, q, dq, out, floats_of(params.data())));
     }

@@ -113,8 +113,7 @@ template <class W>
     if (o.watched) done = done & !note_octet(t, done, o, w);
     for (int64_t i = 0; i < w.l; ++i)
         w.max_defect[i] = where(done, max(w.max_defect[i], abs(w.defect[i])), w.max_defect[i]);
-    for (int64_t b = 0; o.metric == ERROR && b < blocks; ++b)
-        w.memory[b] = where(done, w.memory_new[b], w.memory[b]);
+    for (int64_t b = 0; o.metric == ERROR && b < blocks; ++b) w.memory[b] = where(done, w.memory_new[b], w.memory[b]);
     const Mask corrected = done & outside;
     *w.max_correction = where(corrected, max(*w.max_correction, correction), *w.max_correction);
     *eight.projections += where(corrected, 1.0, 0.0);

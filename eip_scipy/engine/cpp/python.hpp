@@ -132,9 +132,10 @@ class Arrays {
         const Ref dtype(reinterpret_cast<PyObject *>(PyArray_DescrFromType(type)));
         if (PyArray_Check(object)) {
             const Ref has = attribute(object, "dtype"), came = attribute(object, "shape");
-            PyErr_Format(PyExc_ValueError,
-                         "engine: %s is %S of shape %S; expected writable, aligned, C-contiguous %S of shape %S (-1: any)",
-                         name, has.get(), came.get(), dtype.get(), wanted.get());
+            PyErr_Format(
+                PyExc_ValueError,
+                "engine: %s is %S of shape %S; expected writable, aligned, C-contiguous %S of shape %S (-1: any)", name,
+                has.get(), came.get(), dtype.get(), wanted.get());
         } else {
             PyErr_Format(PyExc_TypeError, "engine: %s is %.80R; expected an array, %S of shape %S (-1: any)", name,
                          object, dtype.get(), wanted.get());

@@ -136,7 +136,8 @@ void PythonCall::take(PyObject *value, PyObject *t, double *out) const {
 }
 
 PythonFunctions::PythonFunctions(PyObject *functions, PyObject *work, const Work &sizes, int type, PyObject *kept)
-    : m_(sizes.m), second_order_(truth(functions, "second_order")) {
+    : m_(sizes.m),
+      second_order_(truth(functions, "second_order")) {
     const int64_t components = second_order_ ? sizes.n / 2 : sizes.n;
     rhs_.emplace(attribute(functions, "rhs").get(), type, components, kept);
     const auto calls = [&](const char *name, std::vector<PythonCall> &out, int64_t expected) {
@@ -217,7 +218,8 @@ void PythonFunctions::jacobian(double t, const double *q, const double *dq, doub
 }
 
 PythonHooks::PythonHooks(PyObject *hooks, PyObject *work, const Run &run, int type, PyObject *kept)
-    : run_(run), type_(type) {
+    : run_(run),
+      type_(type) {
     const auto given = [&](const char *name) -> PyObject * {
         PyObject *found = kept_attribute(hooks, name, kept);
         return found == Py_None ? nullptr : found;
@@ -291,8 +293,8 @@ int PythonHooks::project_elsewhere(const Step &step) {
     const Ref t_old = time(step.t), t = time(step.t_new);
     const npy_intp n = run_.work.n;
     const Ref y_new = view(step.y_new, 1, &n, type_, to_);
-    return code_of(Ref(PyObject_CallFunctionObjArgs(project_, t_old.get(), t.get(), truth_of(step.last), y_new.get(),
-                                                    nullptr)));
+    return code_of(
+        Ref(PyObject_CallFunctionObjArgs(project_, t_old.get(), t.get(), truth_of(step.last), y_new.get(), nullptr)));
 }
 
 bool PythonHooks::all_agree(bool here) {
@@ -304,8 +306,8 @@ bool PythonHooks::all_agree(bool here) {
 
 int PythonHooks::finish_step(const Step &step) {
     const Ref t_new = time(step.t_new);
-    return code_of(Ref(PyObject_CallFunctionObjArgs(finish_, t_new.get(), truth_of(step.project), truth_of(step.last),
-                                                    nullptr)));
+    return code_of(
+        Ref(PyObject_CallFunctionObjArgs(finish_, t_new.get(), truth_of(step.project), truth_of(step.last), nullptr)));
 }
 
 // One Newton step by the functions of `JointInvariants`: the one that `project_step` takes in the euclidean metric, its

@@ -84,7 +84,8 @@ class PythonHooks final : public Hooks {
     Run run_;
     int type_;
     PyObject *to_ = nullptr;
-    PyObject *one_step_ = nullptr, *finish_ = nullptr, *project_ = nullptr, *agree_ = nullptr, *moments_ = nullptr, *shift_ = nullptr;
+    PyObject *one_step_ = nullptr, *finish_ = nullptr, *project_ = nullptr, *agree_ = nullptr, *moments_ = nullptr,
+             *shift_ = nullptr;
     PyObject *y_hat_ = nullptr, *f_hat_ = nullptr, *values_ = nullptr, *R_ = nullptr, *terms_ = nullptr, *mu_ = nullptr;
     bool estimates_ = false;
 };

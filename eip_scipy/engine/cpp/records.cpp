@@ -54,13 +54,25 @@ Work work_of(PyObject *work, int64_t stages, int64_t blocks, Arrays &arrays, int
     w.y_hat = state("y_hat", {n});
     w.f_point = state("f_point", {n});
     w.G = state("G", {l, n});
-    for (const auto &[name, place] : std::initializer_list<std::pair<const char *, double **>>{
-             {"err", &w.err}, {"err_low", &w.err_low}, {"err_sum", &w.err_sum}, {"sigma", &w.sigma},
-             {"move", &w.move}, {"carry", &w.carry}, {"carry_hat", &w.carry_hat}})
+    for (const auto &[name, place] :
+         std::initializer_list<std::pair<const char *, double **>>{{"err", &w.err},
+                                                                   {"err_low", &w.err_low},
+                                                                   {"err_sum", &w.err_sum},
+                                                                   {"sigma", &w.sigma},
+                                                                   {"move", &w.move},
+                                                                   {"carry", &w.carry},
+                                                                   {"carry_hat", &w.carry_hat}})
         *place = arrays.floats(work, name, {m});
-    for (const auto &[name, place] : std::initializer_list<std::pair<const char *, double **>>{
-             {"inverse_norms", &w.inverse_norms}, {"mu", &w.mu}, {"values", &w.values}, {"g", &w.g}, {"band", &w.band},
-             {"before", &w.before}, {"worth", &w.worth}, {"defect", &w.defect}, {"max_defect", &w.max_defect}})
+    for (const auto &[name, place] :
+         std::initializer_list<std::pair<const char *, double **>>{{"inverse_norms", &w.inverse_norms},
+                                                                   {"mu", &w.mu},
+                                                                   {"values", &w.values},
+                                                                   {"g", &w.g},
+                                                                   {"band", &w.band},
+                                                                   {"before", &w.before},
+                                                                   {"worth", &w.worth},
+                                                                   {"defect", &w.defect},
+                                                                   {"max_defect", &w.max_defect}})
         *place = arrays.floats(work, name, {l});
     w.scale = arrays.floats(work, "scale", {blocks});
     w.ratio = arrays.floats(work, "ratio", {blocks});
@@ -130,7 +142,8 @@ Multistep multistep_of(PyObject *record, const Work &w, Arrays &arrays) {
     ms.place = arrays.integers<int64_t>(record, "place", {N_NODE_PLACES});
     check_history(ms);
     const bool fits = ms.first >= 0 && ms.count >= 0 && ms.first <= ms.half && ms.count <= ms.half - ms.first;
-    const bool sizes = fits && ms.order >= 4 && ms.pitch % 4 == 0 && ms.rows > 2 * ms.order && ms.pitch >= ms.half && ms.middle >= 0;
+    const bool sizes =
+        fits && ms.order >= 4 && ms.pitch % 4 == 0 && ms.rows > 2 * ms.order && ms.pitch >= ms.half && ms.middle >= 0;
     if (w.m % 2 || !sizes || ms.middle >= ms.order || ms.substeps < 1 || ms.spacing < 1 || ms.h == 0.0) {
         PyErr_SetString(PyExc_ValueError, "engine: the record of the multistep method does not fit the run");
         throw PythonError{};
@@ -209,8 +222,8 @@ Options options_of(PyObject *options, Work &w, Arrays &arrays) {
 }
 
 static Span span_of(PyObject *span) {
-    return {number(span, "t0"), number(span, "h"), number(span, "t_bound"), number(span, "sign"),
-            integer(span, "n_steps"), number(span, "max_step")};
+    return {number(span, "t0"),   number(span, "h"),        number(span, "t_bound"),
+            number(span, "sign"), integer(span, "n_steps"), number(span, "max_step")};
 }
 
 Schedule schedule_of(PyObject *schedule, Arrays &arrays) {
@@ -296,7 +309,8 @@ Samples samples_of(PyObject *dense, const Data &run, int64_t events, Arrays &arr
     return samples;
 }
 
-Members members_of(PyObject *members, const Data &run, const Schedule &schedule, int64_t rows, Arrays &arrays, int type) {
+Members members_of(PyObject *members, const Data &run, const Schedule &schedule, int64_t rows, Arrays &arrays,
+                   int type) {
     Members m{};
     const Work &w = run.work;
     m.count = Arrays::length(members, "starts");
@@ -439,8 +453,8 @@ OctetSystem octet_system_of(PyObject *functions, const Data &run) {
         system.jacobian_pointer =
             pointer_of<Native<GradientPointer, Octet>>(jacobian.get(), "jacobian", w.n / 2, w.n / 2, p);
     const Multistep *ms = run.method.multistep;
-    const bool steps = ms ? !ms->brief && !ms->level && (ms->count == 0 || jacobian.get() != Py_None)
-                          : !o.compensated && o.every >= 1;
+    const bool steps =
+        ms ? !ms->brief && !ms->level && (ms->count == 0 || jacobian.get() != Py_None) : !o.compensated && o.every >= 1;
     if (run.system.python || w.n != w.m || o.adaptive || o.iterations != 1 || o.direction != NEW || !steps) {
         PyErr_SetString(PyExc_ValueError, "engine: a run of this kind does not go side by side with others");
         throw PythonError{};

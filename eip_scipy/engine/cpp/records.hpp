@@ -29,7 +29,8 @@ Options options_of(PyObject *options, Work &w, Arrays &arrays);
 Schedule schedule_of(PyObject *schedule, Arrays &arrays);
 Samples samples_of(PyObject *dense, const Data &run, int64_t events, Arrays &arrays, int type);
 // `rows` are saved of each member.
-Members members_of(PyObject *members, const Data &run, const Schedule &schedule, int64_t rows, Arrays &arrays, int type);
+Members members_of(PyObject *members, const Data &run, const Schedule &schedule, int64_t rows, Arrays &arrays,
+                   int type);
 // Functions of eight members of the run.
 OctetSystem octet_system_of(PyObject *functions, const Data &run);
 // Functions by pointer.

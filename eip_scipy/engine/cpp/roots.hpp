@@ -44,8 +44,7 @@ inline double root_between(double length, double a, double fa, double b, double 
                 next = -f_best * (f_other * slope_other - f_before * slope_before) /
                        (slope_other * slope_before * (f_other - f_before));
             }
-            const bool short_enough =
-                2.0 * std::abs(next) < std::min(std::abs(last), 3.0 * std::abs(half) - tolerance);
+            const bool short_enough = 2.0 * std::abs(next) < std::min(std::abs(last), 3.0 * std::abs(half) - tolerance);
             last = short_enough ? move : half;
             move = short_enough ? next : half;
         } else {

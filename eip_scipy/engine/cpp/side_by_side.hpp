@@ -37,7 +37,7 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
 // The step of one member on the buffers of the single run, up to its new state; false where it fails. `shared`: what all
 // had counted before the step.
 [[gnu::noinline]] inline bool step_alone(const Run &run, Eight &eight, int64_t lane, const Schedule &s,
-                                                    const int64_t *shared, double *y, double *y_new) {
+                                         const int64_t *shared, double *y, double *y_new) {
     const auto &w = run.work;
     const WorkOf<Octet> &eights = eight.work;
     eight.take(eight.y, lane, y, w.m);
@@ -234,7 +234,8 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
     make_stages(all, step);
     const bool sampled = look_back(all, step);
     Mask alive = alive_of(eight), leave, rough{};
-    if (sampled) [[unlikely]] rough = alive & is_rough(largest_error_share(step.h, eight.y, o, w), w.figures(0));
+    if (sampled) [[unlikely]]
+        rough = alive & is_rough(largest_error_share(step.h, eight.y, o, w), w.figures(0));
     alive = alive & !rough;
     if (project) {
         leave = w.m == 4 && w.l == 2 ? project_octet(eight, eight.short_work, step, alive, run.work)
@@ -310,15 +311,16 @@ inline void begin_octet(const Run &run, Eight &eight, const Schedule &s, const M
     eight.system.inv(w, t0, eight.y, w.target);
     copy(w.target, w.values, w.l);
     eight.system.grad(w, t0, eight.y, w.row(0), w.G);
-    const Mask sound = all_finite(eight.y, n) & all_finite(w.row(0), n) & all_finite(w.target, w.l) &
-                       all_finite(w.G, w.l * n);
+    const Mask sound =
+        all_finite(eight.y, n) & all_finite(w.row(0), n) & all_finite(w.target, w.l) & all_finite(w.G, w.l * n);
     if (eight.options.watched)
         start_figures<Octet>(eight.y, w.row(0), members.first_steps[first], eight.method, nullptr, eight.options, w);
     for (int64_t lane = 0; lane < LANES; ++lane) eight.alive[lane] = first + lane < members.count && sound.lane(lane);
 }
 
 // States of all members at t as their next row.
-inline void save_octet(const Run &run, const Samples *samples, Eight &eight, double t, const Members &members, double *y) {
+inline void save_octet(const Run &run, const Samples *samples, Eight &eight, double t, const Members &members,
+                       double *y) {
     const int64_t n = eight.work.n, row = eight.row++;
     for (int64_t lane = 0; members.kept && lane < LANES && members.where[0] + lane < members.count; ++lane) {
         double *out = members.rows + ((members.where[0] + lane) * members.n_rows + row) * n;
@@ -373,7 +375,8 @@ inline Code sweep_octets(const Run &run, const Octets &octets, const Schedule &s
                 steps -= made - eight.step;
                 eight.step = made;
                 const bool due = made == s.span.n_steps || (s.save_every > 0 && made % s.save_every == 0);
-                const double t = made == s.span.n_steps ? s.span.t_bound : s.span.t0 + static_cast<double>(made) * s.span.h;
+                const double t =
+                    made == s.span.n_steps ? s.span.t_bound : s.span.t0 + static_cast<double>(made) * s.span.h;
                 if (s.n_eval == 0 && due) save_octet(run, samples, eight, t, members, y);
             }
             end_octet(eight, s, members);

@@ -80,8 +80,7 @@ inline double abs_dot(const double *a, const double *b, int64_t n) {
     if (whole == 0) return 0.0 + rest;
     Lanes lanes;
     for (int64_t i = 0; i < whole; i += LANES)
-        for (int k = 0; k < VECTORS; ++k)
-            lanes.part[k] += absolute(load(a + i + k * WIDTH) * load(b + i + k * WIDTH));
+        for (int k = 0; k < VECTORS; ++k) lanes.part[k] += absolute(load(a + i + k * WIDTH) * load(b + i + k * WIDTH));
     return lanes.sum() + rest;
 }
 

@@ -130,7 +130,8 @@ struct System {
             }
             fill(G, NOT_A_NUMBER, floats);  // shows where a gradient leaves a part of it as it was
             const int status = pointer(t, copied(y, scratch, w.m), copied(f, scratch_f, w.m), G, params);
-            if (status) [[unlikely]] gave_up(status, {"grad", k, t, {y, y + w.m}, {f, f + w.m}}, G, floats);
+            if (status) [[unlikely]]
+                gave_up(status, {"grad", k, t, {y, y + w.m}, {f, f + w.m}}, G, floats);
             G += floats;
         }
     }
@@ -144,7 +145,8 @@ struct System {
         if (library) return library(t, q, dq, out, params, count, n_params);
         fill(out, NOT_A_NUMBER, floats);
         const int status = pointer(t, q, dq, out, params);
-        if (status) [[unlikely]] gave_up(status, {"jacobian", 0, t, {q, q + w.m / 2}, {dq, dq + w.m / 2}}, out, floats);
+        if (status) [[unlikely]]
+            gave_up(status, {"jacobian", 0, t, {q, q + w.m / 2}, {dq, dq + w.m / 2}}, out, floats);
     }
 
   private:
@@ -165,7 +167,8 @@ struct System {
         if (rhs_pointer.library) return rhs_pointer.library(t, y, nullptr, out, params, floats, n_params);
         fill(out, NOT_A_NUMBER, floats);
         const int status = rhs_pointer.pointer(t, y, out, params);
-        if (status) [[unlikely]] gave_up(status, {"rhs", 0, t, {y, y + w.m}, {}}, out, floats);
+        if (status) [[unlikely]]
+            gave_up(status, {"rhs", 0, t, {y, y + w.m}, {}}, out, floats);
     }
 
     template <class W>
@@ -180,7 +183,8 @@ struct System {
             }
             fill(values, NOT_A_NUMBER, floats);  // shows where a function leaves a value as it was
             const int status = pointer(t, copied(y, scratch, w.m), values, params);
-            if (status) [[unlikely]] gave_up(status, {name, k, t, {y, y + w.m}, {}}, values, floats);
+            if (status) [[unlikely]]
+                gave_up(status, {name, k, t, {y, y + w.m}, {}}, values, floats);
             values += floats;
         }
     }
@@ -191,7 +195,8 @@ struct System {
         const auto values_at = [&](double *state, double *out) {
             fill(out, NOT_A_NUMBER, inv.floats);
             const int status = inv.pointer(t, state, out, params);
-            if (status) [[unlikely]] gave_up(status, {"inv", k, t, {state, state + w.m}, {}}, out, inv.floats);
+            if (status) [[unlikely]]
+                gave_up(status, {"inv", k, t, {state, state + w.m}, {}}, out, inv.floats);
         };
         difference_gradient(values_at, y, inv.floats, shifts, G);
     }

@@ -148,7 +148,8 @@ inline auto small_shares(const Options &o, const W &w) {
     bool bad = false;
     for (int64_t i = 0; i < w.l; ++i) {
         const double size = std::abs(w.defect[i]), own = generous_terms(i, own_terms(i, o, w), y_old, o, w);
-        const double rounding = bands * std::max(w.band[i], norm_products(w.gradient(i), w.y_hat, o.kinds) / o.per_band);
+        const double rounding =
+            bands * std::max(w.band[i], norm_products(w.gradient(i), w.y_hat, o.kinds) / o.per_band);
         bad = bad || !(size < INFINITE) || (size > std::abs(before[i]) && size > rounding) || !(size <= o.limit * own);
     }
     return !bad;
@@ -200,7 +201,8 @@ template <class W>
         figures[RATE_TERMS] = max(figures[RATE_TERMS], min(terms, Value(LARGEST)));
         const Value unit = max(terms, LEAST_TERMS * figures[RATE_TERMS]) + TINY;
         const Truth<Value> record = (rate > figures[RATE] * unit) & (rate < INFINITE);
-        if (any(record)) [[unlikely]] figures[RATE] = where(record, rate / unit, figures[RATE]);
+        if (any(record)) [[unlikely]]
+            figures[RATE] = where(record, rate / unit, figures[RATE]);
         found = found | (figures[RATE] > max(Value(LEAST_RATE), RATE_GROWTH * figures[RATE_NOTED]));
     }
     return found;
@@ -216,7 +218,8 @@ template <class W>
 
 template <class W>
 inline void note_rates(const Step &step, const Options &o, const W &w) {
-    if (o.watched && w.counters[F_AT_RAW]) [[unlikely]] note_known_rates(step, w);
+    if (o.watched && w.counters[F_AT_RAW]) [[unlikely]]
+        note_known_rates(step, w);
 }
 
 // The largest local error of a block, relative to what a fixed step of length h from y changes in it and to its size.
@@ -224,7 +227,8 @@ template <class Value, class W>
 [[gnu::noinline]] inline Value largest_error_share(double h, const Value *y, const Options &o, const W &w) {
     Value *change = w.stage, largest_size = 0.0, top = 0.0;
     const auto size = [&](int64_t b) {
-        const Value moved = max(block_square(change, b, Value(1.0), o.blocks), block_square(w.row(0), b, Value(h), o.blocks));
+        const Value moved =
+            max(block_square(change, b, Value(1.0), o.blocks), block_square(w.row(0), b, Value(h), o.blocks));
         return max(moved, block_square(y, b, Value(1.0), o.blocks));
     };
     for (int64_t i = 0; i < w.m; ++i) change[i] = w.y_hat[i] - y[i];
@@ -313,7 +317,8 @@ inline void note(const Step &step, double errors, double rounding, const double 
         }
         figures[LEFT] = w.defect[i];
     }
-    if (w.suspect[REASON] != NOTHING) [[unlikely]] keep_accepted(step, w);
+    if (w.suspect[REASON] != NOTHING) [[unlikely]]
+        keep_accepted(step, w);
 }
 
 // The same for a step, whose estimates, where they are gathered in quadrature, are of errors that add.

@@ -168,7 +168,7 @@ inline double odd_less_even(const Lanes &lanes) {
 struct Tail {
     double of[3][LANES] = {};
     Tail(npy_intp count, std::initializer_list<const double *> from) {
-        double(*copy)[LANES] = of;
+        double (*copy)[LANES] = of;
         for (const double *first : from) std::copy_n(first, count, *copy++);
     }
 };
@@ -327,9 +327,8 @@ double weighted_square(ConstField field, ConstReals weight) {
         for (npy_intp r = 0; r < weight.points; ++r, z += 2 * columns) total += w[r] * dot(z, z, 2 * columns);
         return total;
     }
-    return sum_of_points(field.points, [=](npy_intp i) {
-        return w[i] * (z[2 * i] * z[2 * i] + z[2 * i + 1] * z[2 * i + 1]);
-    });
+    return sum_of_points(field.points,
+                         [=](npy_intp i) { return w[i] * (z[2 * i] * z[2 * i] + z[2 * i + 1] * z[2 * i + 1]); });
 }
 
 // Sum of V |psi|^2 + beta / 2 |psi|^4.

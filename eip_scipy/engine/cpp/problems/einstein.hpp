@@ -67,7 +67,11 @@ struct Einstein {
     double over_c2;
 
     Einstein(const double *y, const double *gm, int64_t bodies, double over_c2)
-        : q(y), v(y + 3 * bodies), gm(gm), n(bodies), over_c2(over_c2) {}
+        : q(y),
+          v(y + 3 * bodies),
+          gm(gm),
+          n(bodies),
+          over_c2(over_c2) {}
 
     // The sum of G m / r over the other bodies, at each.
     std::vector<double> potentials() const {

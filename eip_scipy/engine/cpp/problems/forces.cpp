@@ -157,8 +157,11 @@ struct Pair {
 
     // r and v of the second body from the first, u = 1/r and x = mu / (c^2 r).
     explicit Pair(const Given<double> &g)
-        : gm_sun(g.params[0]), mu(g.params[0] + g.params[1]), over_c2(g.params[2 + OVER_C2]),
-          r(body(g.y, 1) - body(g.y, 0)), v(body(g.y, 3) - body(g.y, 2)) {
+        : gm_sun(g.params[0]),
+          mu(g.params[0] + g.params[1]),
+          over_c2(g.params[2 + OVER_C2]),
+          r(body(g.y, 1) - body(g.y, 0)),
+          v(body(g.y, 3) - body(g.y, 2)) {
         u = 1.0 / std::sqrt(dot(r, r));
         x = over_c2 * mu * u;
     }
@@ -227,15 +230,15 @@ const LibraryFunction functions[] = {
     {"forces.momentum", Value::NUMBERS, 3, plain<double, momentum>, nullptr, of_bodies, BODIES},
     {"forces.momentum_gradient", Value::GRADIENT, 3, plain<double, momentum_gradient>, nullptr, of_bodies, BODIES},
     {"forces.axial_momentum", Value::NUMBERS, 1, plain<double, axial_momentum>, nullptr, of_bodies, BODIES},
-    {"forces.axial_momentum_gradient", Value::GRADIENT, 1,
-     plain<double, axial_momentum_gradient>, nullptr, of_bodies, BODIES},
+    {"forces.axial_momentum_gradient", Value::GRADIENT, 1, plain<double, axial_momentum_gradient>, nullptr, of_bodies,
+     BODIES},
     {"eih.energy", Value::NUMBERS, 1, plain<double, eih_energy>, nullptr, of_bodies, BODIES},
     {"eih.energy_gradient", Value::GRADIENT, 1, plain<double, eih_energy_gradient>, nullptr, of_bodies, BODIES},
     {"eih.momentum", Value::NUMBERS, 3, plain<double, eih_momentum>, nullptr, of_bodies, BODIES},
     {"eih.momentum_gradient", Value::GRADIENT, 3, plain<double, eih_momentum_gradient>, nullptr, of_bodies, BODIES},
     {"eih.axial_momentum", Value::NUMBERS, 1, plain<double, eih_axial_momentum>, nullptr, of_bodies, BODIES},
-    {"eih.axial_momentum_gradient", Value::GRADIENT, 1,
-     plain<double, eih_axial_momentum_gradient>, nullptr, of_bodies, BODIES},
+    {"eih.axial_momentum_gradient", Value::GRADIENT, 1, plain<double, eih_axial_momentum_gradient>, nullptr, of_bodies,
+     BODIES},
     {"pair.energy", Value::NUMBERS, 1, plain<double, pair_energy>, nullptr, of_two, TWO},
     {"pair.energy_gradient", Value::GRADIENT, 1, plain<double, pair_energy_gradient>, nullptr, of_two, TWO},
     {"pair.momentum", Value::NUMBERS, 3, plain<double, pair_momentum>, nullptr, of_two, TWO},

@@ -228,7 +228,8 @@ struct LastTwo {
             return __builtin_shufflevector(u, v, 0, 1, 4, 5) + __builtin_shufflevector(u, v, 2, 3, 6, 7);
         };
         const Vector a = halves(0), b = halves(2), c = halves(4);
-        eip::store(__builtin_shufflevector(a, b, 0, 2, 4, 6) + __builtin_shufflevector(a, b, 1, 3, 5, 7), out + 3 * first);
+        eip::store(__builtin_shufflevector(a, b, 0, 2, 4, 6) + __builtin_shufflevector(a, b, 1, 3, 5, 7),
+                   out + 3 * first);
         const Vector rest = c + __builtin_shufflevector(c, c, 1, 0, 3, 2);
         out[3 * first + 4] = rest[0];
         out[3 * first + 5] = rest[2];
@@ -454,7 +455,8 @@ inline Carried energy_of_body(const Octet *y, const Octet *gm, int64_t n, int64_
 }
 
 // Bodies k, k + stride, ... of a block of eight, added by halves.
-inline Carried energy_of_some(const Octet *y, const Octet *gm, int64_t n, int64_t first, int64_t skip, int k, int stride) {
+inline Carried energy_of_some(const Octet *y, const Octet *gm, int64_t n, int64_t first, int64_t skip, int k,
+                              int stride) {
     if (stride == LANES) return k >= skip ? energy_of_body(y, gm, n, first + k) : Carried{};
     const Carried a = energy_of_some(y, gm, n, first, skip, k, 2 * stride);
     const Carried b = energy_of_some(y, gm, n, first, skip, k + stride, 2 * stride);
