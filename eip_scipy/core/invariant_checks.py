@@ -37,8 +37,9 @@ RATE_ROUNDINGS = 100.0
 ONE_SIDED_WEIGHTS = (-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6)
 MOST_NAMES = 3
 # Short differences along the flow: their step, in the time in which the state moves by its size, and the share of the
-# rate's terms from which on those to both sides differ.
-SHORT, KINK = 1e-6, 1e-4
+# rate's terms from which on those to both sides differ. What curvature makes them differ by is half as large at half
+# the step; what a kink does is not.
+SHORT, KINK, KEPT_AT_HALF = 1e-6, 1e-4, 0.6
 DOUBLE = (
     "Compute it in double precision: with JAX jax.config.update('jax_enable_x64', True), with PyTorch by tensors and "
     "parameters of torch.float64"
@@ -337,10 +338,16 @@ def rates_by_values(known: InvariantSet, t: float, y: Array, f: Array) -> Array:
     moving, size = np.abs(f).max(initial=0.0), np.abs(y).max(initial=0.0)
     if not (0 < moving < np.inf and 0 < size < np.inf):
         return np.zeros(known.size)
-    step = SHORT * size / moving
-    before, here, after = (known.values(t, y + side * step * f) for side in (-1.0, 0.0, 1.0))
-    back, forth = (here - before) / step, (after - here) / step
-    kink = np.abs(forth - back) > KINK * (np.abs(known.gradients(t, y, f)) @ np.abs(f))
+    step, here = SHORT * size / moving, known.values(t, y)
+
+    def slopes(step: float) -> tuple[Array, Array]:
+        before, after = (known.values(t, y + side * f) for side in (-step, step))
+        return (here - before) / step, (after - here) / step
+
+    (back, forth), (half_back, half_forth) = slopes(step), slopes(0.5 * step)
+    jump, half_jump = np.abs(forth - back), np.abs(half_forth - half_back)
+    terms = np.abs(known.gradients(t, y, f)) @ np.abs(f)
+    kink = (jump > KINK * terms) & (half_jump > KEPT_AT_HALF * jump)
     return np.where(kink, np.nan, 0.5 * (back + forth))
 
 

@@ -31,7 +31,7 @@ from ..engine.data import (
     make_work,
 )
 from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
-from ..engine.trust import NOTHING, REASON, Trust
+from ..engine.trust import EXAMINED, NOTHING, REASON, Trust
 from ..methods.multistep import GaussJackson
 from ..methods.nystrom import RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853
@@ -111,14 +111,18 @@ class Run:
         """
         if not self.options.watched:
             return False
-        found = None
-        if not self.trust.doubts:
-            found = self.examiner.examine(self.work.suspect, rhs) if self.work.suspect[REASON] != NOTHING else None
-            due = (ended and not self.trust.failed) or is_check_due(steps)
-            if found is None and ((due and steps != self.looked) or self._is_doubtful(ended)):
-                self.looked = steps
-                found = self.examiner.complaint(rhs, t, y)
-            self.trust.doubts += [found] if found else []
+        suspect = self.work.suspect
+        if self.trust.doubts:
+            # One examination still has to tell how fast the invariants change, by which corrections are judged.
+            if suspect[REASON] != NOTHING and not self.work.trust[:, EXAMINED].any():
+                self.examiner.examine(suspect, rhs)
+            return self._is_doubtful(ended)
+        found = self.examiner.examine(suspect, rhs) if suspect[REASON] != NOTHING else None
+        due = (ended and not self.trust.failed) or is_check_due(steps)
+        if found is None and ((due and steps != self.looked) or self._is_doubtful(ended)):
+            self.looked = steps
+            found = self.examiner.complaint(rhs, t, y)
+        self.trust.doubts += [found] if found else []
         return self._is_doubtful(ended) or found is not None
 
     def _is_doubtful(self, ended: bool) -> bool:

@@ -680,3 +680,16 @@ def test_the_worst_invariants_come_first():
     assert [reason[:4] for reason in reasons[:3]] == [f"'E{k}'" for k in worst]
     assert worst.tolist() != sorted(worst)
     assert reasons[3] == "2 more invariants were corrected too much"
+
+
+@both
+def test_friction_is_told_where_the_gradient_is_computed(driver):
+    """At the pericentre, where the energy's terms along the flow vanish: the rate there is -c v^2 = -0.01 * 2^2."""
+    energy = Invariant(lambda t, y: 0.5 * (y[2] ** 2 + y[3] ** 2) - (y[0] ** 2 + y[1] ** 2) ** -0.5)
+
+    def damped(t, y):
+        r3 = np.hypot(y[0], y[1]) ** 3
+        return np.array([y[2], y[3], -y[0] / r3 - 0.01 * y[2], -y[1] / r3 - 0.01 * y[3]])
+
+    with pytest.warns(UserWarning, match="at t=0 it changes at the rate -0.04,"), pytest.warns(ProjectionWarning):
+        driver(damped, (0, 20), [0.4, 0.0, 0.0, 2.0], method=EIPRK45, rtol=1e-6, atol=1e-8, invariants=energy)
