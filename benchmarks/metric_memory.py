@@ -68,7 +68,7 @@ class Scene:
 
 @dataclass
 class Outcome:
-    """One run beside the same run without invariants."""
+    """One run and the same run without invariants."""
 
     scene: str
     group: str
@@ -82,7 +82,7 @@ class Outcome:
 
     @property
     def worse(self) -> bool:
-        """Whether the error exceeds three times the unprojected run's and the tolerance."""
+        """Return whether the error exceeds three times the unprojected run's and the tolerance."""
         return not self.failed and not self.error <= FACTOR * self.plain + TOLERANCE
 
     @property
@@ -92,7 +92,7 @@ class Outcome:
 
 
 def outcomes(scene: Scene, plain: dict[Any, float], **options: Any) -> Iterator[Outcome]:
-    """All runs of a scene; `plain` keeps the unprojected errors."""
+    """Yield all runs of a problem; `plain` keeps the unprojected errors."""
     for method in scene.methods:
         for step in scene.steps:
             control = {"h": step} if step >= 1e-3 or scene.group == "SI units" else {"rtol": step, "atol": step}
@@ -145,7 +145,7 @@ def second_order(force: Any, energy: Any, slope: Any) -> tuple[Any, tuple[Invari
 
 
 def of_potential(energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
-    """The same from U and grad U."""
+    """Return the same from U and grad U."""
 
     @njit
     def force(q, out):
@@ -197,7 +197,7 @@ def discs(seed: int, cut: float = 2.5) -> Scene:
 
 
 def backlash(stiffness: float, start: float, speed: float) -> Scene:
-    """One body on a spring with a dead zone of half width .5."""
+    """One body on a spring with a dead zone of half width 0.5."""
 
     @njit
     def energy(q):

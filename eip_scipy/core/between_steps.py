@@ -1,4 +1,4 @@
-"""What may be set on a solver between its steps, as on SciPy's: whether something was, and what it then has to be."""
+"""Attributes of a solver that may be set between its steps, as on SciPy's: checks of what was set."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ NEWTON_STEPS, ROUNDINGS, RANK_TOLERANCE = 10, 8.0, 1e-8
 MOST_COMPONENTS = 64
 SHIFT = 1e-6
 # A surface counts as near within this part of the components' sizes. Newton's method must leave at most the second
-# number of a rate in so many steps, and ends below the third.
+# number of a rate after RATE_STEPS steps, and ends below the third.
 NEAR, CONVERGED, FOUND, RATE_STEPS = 0.1, 1e-2, 1e-6, 5
 # The flow keeps a rate at 0 if the rate of the rate is below this share of its terms, in units of the distance to the
 # surface, or rounding of differences. Friction in place of a violated constraint makes the share as large as that
