@@ -15,7 +15,7 @@ __all__ = ["NAMES", "attributes_of", "is_same", "tableau_of"]
 NAMES = ("order", "error_estimator_order", "n_stages", "A", "B", "C", "E", "P", "E3", "E5")
 # Names of the order of the embedded method, in SciPy and in other packages.
 EMBEDDED = ("error_estimator_order", "order_secondary")
-# What makes a step of SciPy's classes besides their coefficients.
+# The methods that make a step of SciPy's classes from their coefficients.
 STEP = ("_step_impl", "_estimate_error", "_estimate_error_norm")
 WANTED = "a subclass of SciPy's RungeKutta such as RK45, or a class with the same attributes"
 LEAST_ORDER = 2  # of dense output

@@ -23,7 +23,7 @@ BOUND = ("work", "invariants", "trust")
 
 
 class RunParts(NamedTuple):
-    """What makes a `Run` again, apart from its invariants: plain values and arrays."""
+    """The plain values and arrays from which a `Run` is made again, apart from its invariants."""
 
     values: dict[str, Any]
     work: Work

@@ -25,10 +25,10 @@ Derivative = Callable[[float, Array], Array]
 CHECK_STEPS = (6e-6, 6e-8, 6e-10)
 CHECK_TOLERANCE, CHECK_NOISE = 1e-4, 6.0
 INVARIANCE_TOLERANCE = 1e-8
-# What single precision leaves of a rate, in units of its terms.
+# Single precision leaves this share of the terms of a rate.
 SINGLE_TOLERANCE = 1e-5
-# A gradient may be rounding and nothing else, as differences find that of a square which is 0: so many roundings of the
-# state, or as many times what those make of it.
+# A gradient may be rounding and nothing else, as differences find that of a square which is 0: this many roundings of
+# the state, or as many times what those make of it.
 BLUR, BLURRED = 4.0, 3
 # The rounding of a rate, in roundings of the largest derivatives of the same kind. Accelerations that come from a
 # system of linear equations, such as those of constrained bodies, have tens of them.

@@ -25,7 +25,7 @@ Array = np.ndarray
 FLOAT = np.dtype(float)
 
 TARGET_TOLERANCE = 1e-8
-# A value that misses its target by so many roundings of the state meets it.
+# A value that misses its target by at most this many roundings of the state meets it.
 TARGET_ROUNDINGS = 64.0
 # Components from which on the cost of gradients that take as many evaluations is pointed out. Steps of EIPRK4 of a
 # chain with such a gradient and without: in Python 5 times longer for 64 components, 66 for 256, 640 for 4096; jitted 3

@@ -57,9 +57,9 @@ __all__ = [
     "eip_method",
 ]
 
-# What a step of SciPy's solver reads.
+# The attributes that a step of SciPy's solver reads.
 HANDED = ("t", "y", "f", "t_bound", "direction", "max_step", "rtol", "atol", "h_abs")
-# Of a solver's attributes: those that its copies share, and those that are made again for a copy.
+# Attributes of a solver that its copies share, and those that are made again for a copy.
 SHARED = {"_user_fun", "_projection", "_jacobian"}
 MADE = {"fun", "fun_single", "fun_vectorized", "_fun", "_bound_fun", "_derivative", "_call", "_method", "_scipy"}
 MADE |= {"_run", "_work", "_schedule", "_engine", "_interpolants", "_left", "_taken", "diagnostics"}

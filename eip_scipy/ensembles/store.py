@@ -26,7 +26,7 @@ __all__ = ["CheckpointStore", "Store", "ZarrStore", "location", "require_identit
 
 KIND = "ensemble"
 LABEL = "eip_scipy_ensemble"
-# Of format 2 the metadata may name the codec that unpickles. A group's own file may hold metadata of any format.
+# Metadata of format 2 may name the codec that unpickles. A group's own file may hold metadata of any format.
 FORMAT: dict[str, Any] = {"zarr_format": 3, "use_consolidated": False}
 OPTIONAL = (
     "states", "time", "times", "invariants", "end_invariants", "target", "event_count", "event_t", "event_y",

@@ -276,7 +276,7 @@ class Driver:
 
 
 def _first(size: int) -> int:
-    """How many items of so many bytes there is room for at first."""
+    """Return the number of items of `size` bytes for which room is made at first."""
     return min(FIRST_ROWS, max(2, FIRST_BYTES // max(size, 1)))
 
 

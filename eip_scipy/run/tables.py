@@ -115,7 +115,7 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
 
 
 def of_members(result: Any) -> bool:
-    """Whether a result is that of an ensemble, whose states are (members, components)."""
+    """Return whether a result is that of an ensemble, whose states are (members, components)."""
     return "trajectories" in result
 
 

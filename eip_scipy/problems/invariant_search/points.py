@@ -64,7 +64,7 @@ class Surroundings:
             return np.full((len(self.terms), y.size), np.nan)
 
     def term_values(self, y: Array) -> Array:
-        """Of each term; NaN where it cannot be computed."""
+        """Return the value of each term, NaN where it cannot be computed."""
         try:
             return np.array([item.fun(y.copy()) for item in self.terms], dtype=float)
         except (ArithmeticError, ValueError):

@@ -122,7 +122,7 @@ def _expands_to_zero(expression: Any) -> bool:
 
 
 def _simplifies_to_zero(expression: Any) -> bool:
-    """Whether algebra shows that it is 0, where that is quick."""
+    """Return whether algebra shows that an expression is 0, where that is quick."""
     if expanded_terms(expression) > EXPANDED_TERMS or expression.count_ops() > SIMPLIFIED_OPERATIONS:
         return False
     return bool(sympy.simplify(sympy.expand(expression)) == 0)

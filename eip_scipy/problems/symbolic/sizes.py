@@ -38,7 +38,7 @@ ZERO, ONE = sympy.Integer(0), sympy.Integer(1)
 
 
 class TooLargeError(ValueError):
-    """What an expression would need of SymPy."""
+    """The work that an expression would be for SymPy."""
 
 
 def require_sum(items: Iterable[Any]) -> None:
