@@ -33,7 +33,7 @@ ADAPTIVE = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 
 
 @dataclass
-class Scene:
+class Case:
     """A problem with its invariants, and the steps or tolerances that it is run with."""
 
     group: str
@@ -70,7 +70,7 @@ class Scene:
 class Outcome:
     """One run and the same run without invariants."""
 
-    scene: str
+    case: str
     group: str
     method: str
     step: float
@@ -91,30 +91,30 @@ class Outcome:
         return (self.error + 1e-15) / (self.plain + 1e-15)
 
 
-def outcomes(scene: Scene, plain: dict[Any, float], **options: Any) -> Iterator[Outcome]:
+def outcomes(case: Case, plain: dict[Any, float], **options: Any) -> Iterator[Outcome]:
     """Yield all runs of a problem; `plain` keeps the unprojected errors."""
-    for method in scene.methods:
-        for step in scene.steps:
-            control = {"h": step} if step >= 1e-3 or scene.group == "SI units" else {"rtol": step, "atol": step}
-            given = {"method": method, "in_place": scene.in_place, **control}
-            key = scene.name, method.__name__, step
+    for method in case.methods:
+        for step in case.steps:
+            control = {"h": step} if step >= 1e-3 or case.group == "SI units" else {"rtol": step, "atol": step}
+            given = {"method": method, "in_place": case.in_place, **control}
+            key = case.name, method.__name__, step
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
                 if key not in plain:
-                    plain[key] = scene.error(integrate(scene.fun, (0, scene.end), scene.y0, **given).y[:, -1])
+                    plain[key] = case.error(integrate(case.fun, (0, case.end), case.y0, **given).y[:, -1])
                 run = integrate(
-                    scene.fun,
-                    (0, scene.end),
-                    scene.y0,
-                    invariants=scene.invariants,
+                    case.fun,
+                    (0, case.end),
+                    case.y0,
+                    invariants=case.invariants,
                     **given,
-                    **scene.options,
+                    **case.options,
                     **options,
                 )
             failed = run.status < 0
             yield Outcome(
-                scene.name, scene.group, method.__name__, step, failed, not failed and not run.trusted,
-                np.nan if failed else scene.error(run.y[:, -1]), plain[key], run.message,
+                case.name, case.group, method.__name__, step, failed, not failed and not run.trusted,
+                np.nan if failed else case.error(run.y[:, -1]), plain[key], run.message,
             )  # fmt: skip
 
 
@@ -156,7 +156,7 @@ def of_potential(energy: Any, slope: Any) -> tuple[Any, tuple[Invariant, ...]]:
     return second_order(force, energy, slope)
 
 
-def discs(seed: int, cut: float = 2.5) -> Scene:
+def discs(seed: int, cut: float = 2.5) -> Case:
     """Nine discs with a truncated Lennard-Jones force, in free space with walls of a soft box."""
     shift = 4 * (cut**-12 - cut**-6)
 
@@ -193,10 +193,10 @@ def discs(seed: int, cut: float = 2.5) -> Scene:
     v = rng.standard_normal((9, 2))
     v -= v.mean(axis=0)
     name = f"discs, cut-off {cut:.3g}, start {seed}"
-    return Scene("discs", name, fun, kept, np.concatenate([q.ravel(), v.ravel()]), 3.0, (0.002, 0.005, 0.01))
+    return Case("discs", name, fun, kept, np.concatenate([q.ravel(), v.ravel()]), 3.0, (0.002, 0.005, 0.01))
 
 
-def backlash(stiffness: float, start: float, speed: float) -> Scene:
+def backlash(stiffness: float, start: float, speed: float) -> Case:
     """One body on a spring with a dead zone of half width 0.5."""
 
     @njit
@@ -211,10 +211,10 @@ def backlash(stiffness: float, start: float, speed: float) -> Scene:
 
     fun, kept = of_potential(energy, slope)
     name = f"backlash, k = {stiffness:g}, start {start:g}, {speed:g}"
-    return Scene("backlash", name, fun, kept, np.array([start, speed]), 40.0, (0.01, 0.02, 0.05))
+    return Case("backlash", name, fun, kept, np.array([start, speed]), 40.0, (0.01, 0.02, 0.05))
 
 
-def gear(stiffness: float) -> Scene:
+def gear(stiffness: float) -> Case:
     """Two bodies that turn against each other with play, one of them on a soft spring."""
 
     @njit
@@ -230,12 +230,12 @@ def gear(stiffness: float) -> Scene:
         out[1] = -pull
 
     fun, kept = of_potential(energy, slope)
-    return Scene(
+    return Case(
         "backlash", f"gear, k = {stiffness:g}", fun, kept, np.array([1.0, 0.3, 0.0, 0.5]), 30.0, (0.01, 0.02, 0.05)
     )
 
 
-def wall(stiffness: float, power: int, speed: float) -> Scene:
+def wall(stiffness: float, power: int, speed: float) -> Case:
     """Free flight between soft walls at -1 and 1."""
 
     @njit
@@ -250,10 +250,10 @@ def wall(stiffness: float, power: int, speed: float) -> Scene:
 
     fun, kept = of_potential(energy, slope)
     name = f"wall, power {power}, k = {stiffness:g}, speed {speed:g}"
-    return Scene("wall", name, fun, kept, np.array([0.1, speed]), 20.0, (0.01, 0.02, 0.05))
+    return Case("wall", name, fun, kept, np.array([0.1, speed]), 20.0, (0.01, 0.02, 0.05))
 
 
-def round_wall(power: int) -> Scene:
+def round_wall(power: int) -> Case:
     """Free flight inside a round soft wall in the plane; energy and angular momentum."""
 
     @njit
@@ -278,12 +278,12 @@ def round_wall(power: int) -> Scene:
 
     fun, kept = of_potential(energy, slope)
     kept += (Invariant(turn, grad=turn_slope, in_place=True, name="L"),)
-    return Scene(
+    return Case(
         "wall", f"round wall, power {power}", fun, kept, np.array([0.2, 0.1, 0.9, 0.5]), 20.0, (0.01, 0.02, 0.05)
     )
 
 
-def ball(stiffness: float) -> Scene:
+def ball(stiffness: float) -> Case:
     """A ball that bounces on a Hertz contact under gravity."""
 
     @njit
@@ -295,10 +295,10 @@ def ball(stiffness: float) -> Scene:
         out[0] = 1.0 - (stiffness * (-q[0]) ** 1.5 if q[0] < 0 else 0.0)
 
     fun, kept = of_potential(energy, slope)
-    return Scene("Hertz", f"ball, k = {stiffness:g}", fun, kept, np.array([1.0, 0.0]), 20.0, (0.005, 0.01, 0.02))
+    return Case("Hertz", f"ball, k = {stiffness:g}", fun, kept, np.array([1.0, 0.0]), 20.0, (0.005, 0.01, 0.02))
 
 
-def beads(count: int) -> Scene:
+def beads(count: int) -> Case:
     """A chain of beads in Hertz contact, the first one struck; it ends in soft walls."""
 
     @njit
@@ -325,10 +325,10 @@ def beads(count: int) -> Scene:
     fun, kept = of_potential(energy, slope)
     y0 = np.zeros(2 * count)
     y0[count] = 1.0
-    return Scene("Hertz", f"{count} beads", fun, kept, y0, 3.0, (0.005, 0.01, 0.02))
+    return Case("Hertz", f"{count} beads", fun, kept, y0, 3.0, (0.005, 0.01, 0.02))
 
 
-def huber(width: float, bodies: int) -> Scene:
+def huber(width: float, bodies: int) -> Case:
     """Springs whose force is constant beyond `width`: one body, or a chain between walls."""
 
     @njit
@@ -360,13 +360,13 @@ def huber(width: float, bodies: int) -> Scene:
     fun, kept = of_potential(energy, slope)
     y0 = np.zeros(2 * bodies)
     y0[0], y0[bodies] = 1.0, 0.3
-    return Scene("Huber", f"Huber, width {width:g}, {bodies} bodies", fun, kept, y0, 20.0, (0.01, 0.02, 0.05))
+    return Case("Huber", f"Huber, width {width:g}, {bodies} bodies", fun, kept, y0, 20.0, (0.01, 0.02, 0.05))
 
 
 CHARGE, MASSES = 1.602176634e-19, {"electron": 9.1093837e-31, "proton": 1.67262192e-27, "ion": 6.64e-26}
 
 
-def magnetic(name: str, momenta: bool) -> Scene:
+def magnetic(name: str, momenta: bool) -> Case:
     """A particle in SI units in a uniform field of 1 T and a Penning trap's potential, in (x, p) or (x, v)."""
     mass = MASSES[name]
     charge, field_, size = CHARGE, 1.0, 1e-3
@@ -400,13 +400,13 @@ def magnetic(name: str, momenta: bool) -> Scene:
     kept = (Invariant(energy, grad=energy_slope, in_place=True, name="energy"),)
     period = 2 * np.pi / cyclotron
     kind = "momenta" if momenta else "velocities"
-    return Scene(
+    return Case(
         "SI units", f"{name}, {kind}", fun, kept, y0, 20 * period, tuple(period / n for n in (20, 40, 80)),
         reference_options={"h": period / 400}, seen=[0, 1, 2],
     )  # fmt: skip
 
 
-def trap(name: str, exponent: int) -> Scene:
+def trap(name: str, exponent: int) -> Case:
     """A particle in SI units on a line, (x, p), in a trap whose potential grows as x^2 or x^4."""
     mass, size = MASSES[name], 1e-3
     frequency = 0.1 * CHARGE / mass
@@ -426,7 +426,7 @@ def trap(name: str, exponent: int) -> Scene:
 
     period = 2 * np.pi / frequency
     kept = (Invariant(energy, grad=slope, in_place=True, name="energy"),)
-    return Scene(
+    return Case(
         "SI units", f"{name}, trap x^{exponent}", fun, kept, np.array([size, 0.0]), 20 * period,
         tuple(period / n for n in (20, 40, 80)), reference_options={"h": period / 400}, seen=[0],
     )  # fmt: skip
@@ -476,7 +476,7 @@ def levels(
     )
 
 
-def pendulum(links: int) -> tuple[Scene, Scene]:
+def pendulum(links: int) -> tuple[Case, Case]:
     """A chain of rods without mass in Cartesian coordinates, lengths kept; with and without the energy."""
     n = 2 * links
 
@@ -516,15 +516,15 @@ def pendulum(links: int) -> tuple[Scene, Scene]:
 
 def _with_energy(
     name: str, fun: Any, kept: tuple[Invariant, ...], energy: Invariant, y0: np.ndarray, end: float, **more: Any
-) -> tuple[Scene, Scene]:
+) -> tuple[Case, Case]:
     common = {"methods": (EIPDOP853,), "in_place": False, "steps": ADAPTIVE}
     return (
-        Scene("mechanisms", f"{name}, c", fun, kept, y0, end, **common, **more),
-        Scene("mechanisms", f"{name}, c + E", fun, (*kept, energy), y0, end, **common, **more),
+        Case("mechanisms", f"{name}, c", fun, kept, y0, end, **common, **more),
+        Case("mechanisms", f"{name}, c + E", fun, (*kept, energy), y0, end, **common, **more),
     )
 
 
-def knife_edge() -> tuple[Scene, Scene]:
+def knife_edge() -> tuple[Case, Case]:
     """A knife edge on an inclined plane (Chaplygin's sleigh at its centre): x, y, angle; non-holonomic."""
 
     def jacobian(q: np.ndarray) -> np.ndarray:
@@ -679,7 +679,7 @@ class Andrews:
         return out
 
     @classmethod
-    def scenes(cls) -> tuple[Scene, Scene]:
+    def cases(cls) -> tuple[Case, Case]:
         one = cls()
         fun = constrained(one.mass, one.forces, one.jacobian, one.bias)
         kept = levels(one.constraints, one.jacobian, one.rates, 6)
@@ -689,7 +689,7 @@ class Andrews:
         return _with_energy("Andrews", fun, kept, energy, y0, 0.03, known=known, seen=[0, 1, 2, 3, 4, 5, 6])
 
 
-def disc() -> tuple[Scene, Scene]:
+def disc() -> tuple[Case, Case]:
     """A thin disc that rolls without slipping, wobbling: x, y, heading, lean, spin; two non-holonomic constraints."""
     mass, radius, gravity = 1.0, 1.0, 9.81
     flat, axial = 0.25 * mass * radius**2, 0.5 * mass * radius**2
@@ -768,7 +768,7 @@ def disc() -> tuple[Scene, Scene]:
     )
 
 
-def cut_off() -> Iterator[Scene]:
+def cut_off() -> Iterator[Case]:
     """Problems whose forces have kinks or jumps."""
     for seed in range(3):
         yield discs(seed)
@@ -792,7 +792,7 @@ def cut_off() -> Iterator[Scene]:
         yield huber(width, 5)
 
 
-def scenes() -> Iterator[Scene]:
+def cases() -> Iterator[Case]:
     """All of them."""
     yield from cut_off()
     for name in MASSES:
@@ -800,7 +800,7 @@ def scenes() -> Iterator[Scene]:
             yield magnetic(name, momenta)
         yield trap(name, 2)
         yield trap(name, 4)
-    yield from Andrews.scenes()
+    yield from Andrews.cases()
     yield from disc()
     yield from knife_edge()
     yield from pendulum(2)
@@ -820,19 +820,19 @@ def line(name: str, found: list[Outcome]) -> str:
     return f"{name:36} {len(found):5} {failed:7} {accused:8} {worse:6} {mean_ratio(found):10.3g} {worst:10.3g}"
 
 
-def scatter(chosen: Iterable[Scene]) -> str:
+def scatter(chosen: Iterable[Case]) -> str:
     """Count how often errors of chaotic problems differ by more than three times for no reason but chance."""
     chance, projected = [], []
-    for scene in chosen:
-        for method in scene.methods:
-            for step in scene.steps:
+    for case in chosen:
+        for method in case.methods:
+            for step in case.steps:
                 options = [{"method": method, "in_place": True, "h": share * step} for share in (1.0, 0.98, 0.96, 0.94)]
-                ends = (integrate(scene.fun, (0, scene.end), scene.y0, **one).y[:, -1] for one in options)
-                plain = [scene.error(y) for y in ends]
+                ends = (integrate(case.fun, (0, case.end), case.y0, **one).y[:, -1] for one in options)
+                plain = [case.error(y) for y in ends]
                 chance += [error / plain[0] for error in plain[1:]]
                 for one, error in zip(options, plain, strict=True):
-                    run = integrate(scene.fun, (0, scene.end), scene.y0, invariants=scene.invariants, **one)
-                    projected.append(scene.error(run.y[:, -1]) / error)
+                    run = integrate(case.fun, (0, case.end), case.y0, invariants=case.invariants, **one)
+                    projected.append(case.error(run.y[:, -1]) / error)
     counts = [f"{sum(ratio > FACTOR for ratio in ratios)} of {len(ratios)}" for ratios in (chance, projected)]
     return f"three times worse: {counts[0]} at a step 2 to 6 % shorter, {counts[1]} with projection"
 
@@ -843,18 +843,18 @@ def main() -> None:
     parser.add_argument("--metric", default="error", choices=("error", "euclidean"))
     parser.add_argument("--json", metavar="FILE")
     args = parser.parse_args()
-    chosen = [scene for scene in scenes() if args.only in f"{scene.group} {scene.name}"]
+    chosen = [case for case in cases() if args.only in f"{case.group} {case.name}"]
     plain: dict[Any, float] = {}
     found: list[Outcome] = []
     print(f"{'':36} {'runs':>5} {'failed':>7} {'accused':>8} {'worse':>6} {'mean ratio':>10} {'worst':>10}")
-    for scene in chosen:
-        own = list(outcomes(scene, plain, metric=args.metric))
+    for case in chosen:
+        own = list(outcomes(case, plain, metric=args.metric))
         found += own
-        print(line(scene.name, own), flush=True)
+        print(line(case.name, own), flush=True)
     print()
     for group in dict.fromkeys(one.group for one in found):
         print(line(group, [one for one in found if one.group == group]))
-    if discs_chosen := [scene for scene in chosen if scene.group == "discs"]:
+    if discs_chosen := [case for case in chosen if case.group == "discs"]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             print(f"\ndiscs, {scatter(discs_chosen)}")

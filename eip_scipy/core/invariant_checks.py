@@ -325,7 +325,8 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
     wrong = np.abs(rate) > INVARIANCE_TOLERANCE * terms + noise
     if (wrong & known.computed).any():
         # Gradients that are computed over a kink are wrong, and the rate with them.
-        near = np.abs(in_time + rates_by_values(known, at.t, at.y, at.f) / unit) > ROUNDING_OF_DIFFERENCES * terms
+        by_values = rates_by_values(known, at.t, at.y, at.f, np.abs(at.G) @ np.abs(at.f)) / unit
+        near = np.abs(in_time + by_values) > ROUNDING_OF_DIFFERENCES * terms
         wrong &= near | ~np.array(known.computed)
     if wrong.any():
         wrong &= ~(_rounding_of_rates(known, at, unit, rhs) > np.abs(rate))
@@ -333,8 +334,11 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
         return _Rates(rate * unit, terms * unit, in_time, wrong)
 
 
-def rates_by_values(known: InvariantSet, t: float, y: Array, f: Array) -> Array:
-    """Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a kink."""
+def rates_by_values(known: InvariantSet, t: float, y: Array, f: Array, terms: Array) -> Array:
+    """Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a kink.
+
+    `terms`, (l,), are the sums of the rates' terms, ``|G| |f|``.
+    """
     moving, size = np.abs(f).max(initial=0.0), np.abs(y).max(initial=0.0)
     if not (0 < moving < np.inf and 0 < size < np.inf):
         return np.zeros(known.size)
@@ -346,7 +350,6 @@ def rates_by_values(known: InvariantSet, t: float, y: Array, f: Array) -> Array:
 
     (back, forth), (half_back, half_forth) = slopes(step), slopes(0.5 * step)
     jump, half_jump = np.abs(forth - back), np.abs(half_forth - half_back)
-    terms = np.abs(known.gradients(t, y, f)) @ np.abs(f)
     kink = (jump > KINK * terms) & (half_jump > KEPT_AT_HALF * jump)
     return np.where(kink, np.nan, 0.5 * (back + forth))
 

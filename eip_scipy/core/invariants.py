@@ -19,7 +19,7 @@ from .invariant_checks import Complaint, complaints, listed, rates_by_values
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 
-__all__ = ["Invariant", "InvariantSet", "JointInvariants", "as_invariants", "check_gradient"]
+__all__ = ["Invariant", "InvariantSet", "JointInvariants", "as_invariants", "check_gradient", "with_args"]
 
 Array = np.ndarray
 FLOAT = np.dtype(float)
@@ -229,6 +229,13 @@ def _is_function(item: Any) -> bool:
     return callable(item) and not isinstance(item, type)
 
 
+def with_args(item: Invariant, args: tuple[Any, ...]) -> Invariant:
+    """Return an invariant with other arguments of its own."""
+    new = copy(item)
+    new.args = args
+    return new
+
+
 def _of_function(fun: Callable[..., Any]) -> Invariant:
     name = getattr(fun, "__name__", "<")
     return Invariant(fun, name=None if name.startswith("<") else name)
@@ -318,8 +325,8 @@ def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype
 def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple, extra: tuple) -> None:
     given = (*first, *(f"args[{k}]" for k in range(len(args))), *names(extra))
     last = f"take the run's {names(extra)[0].partition('[')[0]} as its last arguments" if extra else "those of the call"
-    mend = f"It must take t, y, its own arguments, Invariant(..., args=(...,)), and {last}."
-    require_arguments(fun, given, what, mend)
+    advice = f"It must take t, y, its own arguments, Invariant(..., args=(...,)), and {last}."
+    require_arguments(fun, given, what, advice)
 
 
 def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
@@ -650,7 +657,7 @@ class InvariantSet:
         """Return the rates of change along f by gradients and by values, relative to the terms of these rates; (l,)."""
         products = self.gradients(t, y, f).conj() * f
         terms = np.abs(products).sum(axis=1)
-        rates = np.abs(np.array([products.sum(axis=1).real, rates_by_values(self, t, y, f)]))
+        rates = np.abs(np.array([products.sum(axis=1).real, rates_by_values(self, t, y, f, terms)]))
         by_gradient, by_values = rates / np.where(terms > 0, terms, 1.0)
         return by_gradient, by_values
 

@@ -25,8 +25,8 @@ NU, AT, MANY, FIRST, SUM, EXPECTED, JUDGED = range(9, 16)
 # there, when a step was kept for that reason last. The share of its terms from which on a defect before a projection is
 # FAR.
 RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM = range(16, 21)
-# Whether the gradient is computed from values, which is not accurate near kinks; the largest rate of change along the
-# flow that examinations found by short differences, in its own terms.
+# A flag for a gradient that is computed from values, which is not accurate near kinks; the largest rate of change along
+# the flow that examinations found by short differences, in its own terms.
 BY_VALUES, EXAMINED = range(21, 23)
 N_FIGURES = 23
 # A step that is to be examined: the reason, its two times, and behind these its two states.

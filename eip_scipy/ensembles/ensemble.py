@@ -13,11 +13,10 @@ from concurrent.futures import Executor
 from contextlib import ExitStack, closing, nullcontext
 from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import OptimizeResult
 
 from ..checkpoint.own_file import absolute
 from ..core import setup
@@ -36,6 +35,7 @@ from ..run.events import Events
 from ..run.interrupts import ended_by_sigterm, kept_ctrl_c
 from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
+from ..run.results import Fields
 from ..run.tables import dataset, default_names, to_dataframe
 from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
 from .happened import Happened
@@ -60,12 +60,6 @@ SHOWN = 5
 ALONE = {"fun", "acceleration", "t_span", "y0", "params", "projection"}
 ALONE |= {"callback", "diagnostics", "max_bytes", "progress"}
 OWN = ("executor", "reduce", "callback", "out", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(ALONE))
-
-
-if TYPE_CHECKING:
-    Fields = dict[str, Any]  # of which type checkers know those that are annotated
-else:
-    Fields = OptimizeResult
 
 
 class EnsembleKeywords(ProjectionDetails, total=False):

@@ -15,7 +15,7 @@ from ..core import setup, solvers
 from ..core.acceleration import BY_NAME, AccelerationField, named_accelerations
 from ..core.arguments import Packed, are_same, extra_arguments, floats, names, scalars
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
-from ..core.invariants import Invariant, as_invariants
+from ..core.invariants import as_invariants, with_args
 from ..core.jitted import NotCompilableError
 from ..core.multistep import SecondOrder, attach_history, times
 from ..core.native_functions import native_functions, with_events, with_jacobian
@@ -467,14 +467,8 @@ def _with_run_params(projection: Mapping[str, Any], params: Any, args: Any = Non
     items = as_invariants(projection["invariants"])
     extra = (() if params is None else (params,)) if args is None else tuple(args)
     if extra:
-        items = tuple(_bare(item) if are_same(item.args, extra) else item for item in items)
+        items = tuple(with_args(item, ()) if are_same(item.args, extra) else item for item in items)
     return {"invariants": items}
-
-
-def _bare(item: Invariant) -> Invariant:
-    bare = Invariant.__new__(Invariant)
-    bare.__dict__.update(item.__dict__, args=())
-    return bare
 
 
 def _required(name: str, value: Any) -> Any:

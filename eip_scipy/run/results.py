@@ -12,7 +12,7 @@ from scipy.optimize import OptimizeResult
 from ..core.results import Diagnostics
 from .tables import default_names, to_dataframe, to_xarray
 
-__all__ = ["IntegrationResult", "Origin"]
+__all__ = ["Fields", "IntegrationResult", "Origin"]
 
 
 class Origin(NamedTuple):

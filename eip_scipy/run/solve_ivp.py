@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from copy import copy
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
@@ -14,7 +13,7 @@ from scipy.integrate import OdeSolution, OdeSolver
 from ..core.acceleration import AccelerationField
 from ..core.arguments import are_same
 from ..core.inputs import shown
-from ..core.invariants import Invariant, as_invariants
+from ..core.invariants import as_invariants, with_args
 from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.results import Diagnostics
 from ..core.setup import initial_state
@@ -188,7 +187,10 @@ def solve_ivp(
         return OdeResult(sol, trusted=bool(sol.success), diagnostics=Diagnostics())
     common["args"], extra = _unpacked(args)
     if kept and extra:
-        options["invariants"] = tuple(_with_arguments(item, extra) for item in kept)
+        # The arguments of the call follow those of an invariant, unless both are the same.
+        options["invariants"] = tuple(
+            item if are_same(item.args, extra) else with_args(item, (*item.args, *extra)) for item in kept
+        )
     if jacobian is not None and extra:
         options["jacobian"] = lambda *first: jacobian(*first, *extra)
     record = options.setdefault("diagnostics", Diagnostics())
@@ -240,13 +242,6 @@ def _unpacked(args: Any) -> tuple[Any, tuple[Any, ...]]:
     except TypeError:
         return args, ()
     return None if args is None else extra, extra
-
-
-def _with_arguments(item: Invariant, extra: tuple[Any, ...]) -> Invariant:
-    """Return an invariant with the arguments of the call after its own, unless both are the same."""
-    new = copy(item)
-    new.args = item.args if are_same(item.args, extra) else (*item.args, *extra)
-    return new
 
 
 def _noting(method: type[EIPSolver], start: np.ndarray | None) -> tuple[type[EIPSolver], list[EIPSolver]]:

@@ -662,7 +662,7 @@ def test_what_a_resumed_run_says_is_what_a_whole_one_says(tmp_path):
 
 
 def test_the_worst_invariants_come_first():
-    """Of five damped oscillators the three with the largest corrections are described, and two are counted."""
+    """The three of five damped oscillators with the largest corrections are described, and two are counted."""
     friction = np.array([0.01, 0.02, 0.05, 0.1, 0.2])
 
     def damped(t, y):

@@ -237,7 +237,7 @@ def test_events_and_samples():
 @pytest.mark.slow
 @pytest.mark.needs_jit
 def test_projection_pays_and_costs_little():
-    """Ten bodies over 100 years, h = .02: Mercury 150 times better, no other planet worse by 2x or 1e-11 AU.
+    """Ten bodies over 100 years, h = 0.02: Mercury 150 times better, no other planet worse by 2x or 1e-11 AU.
 
     The gain scatters: with `every` of 1, 5, 10, 20 and "auto" it is 163, 542, 783, 267 and 183.
     """

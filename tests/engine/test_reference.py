@@ -67,7 +67,7 @@ def length(cls):
 
 
 def both(cls, problem, y0, steps=1, **options):
-    """Make steps from y0 by the engine and by the reference; the targets are a little beside the start's values."""
+    """Make steps from y0 by the engine and by the reference; the targets differ a little from the start's values."""
     (fun, pairs, _), h = problem, length(cls)
     invariants, first = [], []
     for value, gradient in pairs:

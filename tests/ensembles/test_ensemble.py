@@ -820,7 +820,7 @@ def test_a_codec_from_elsewhere_is_refused_in_each_array(tmp_path):
 
 
 def test_what_is_no_store_is_named(tmp_path):
-    """A group in place of an array, codecs in a wrong order, and a label that is no mapping."""
+    """A group in place of an array, codecs in a wrong order, and a label that is not a mapping."""
     pytest.importorskip("zarr")
     path = tmp_path / "run.zarr"
     stored(out=path)

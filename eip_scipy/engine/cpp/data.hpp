@@ -153,9 +153,9 @@ struct Options {
     double kappa;
     int64_t metric, direction, iterations, every;
     bool reuse_f, uses_f, compensated, adaptive, watched;
-    double per_band,
-        limit;   // an invariant's terms are per_band dead bands; `limit`: the share of them that may be left
-    double far;  // defects before a projection are noted from this share of the terms on
+    double per_band;  // an invariant's terms are this many dead bands
+    double limit;     // the share of the terms that may be left
+    double far;       // defects before a projection are noted from this share of the terms on
 };
 
 // Its numbers and flags, for whoever reads them by their names.
@@ -194,6 +194,8 @@ struct WorkOf {
     int64_t *pivots, *counters;
     Inner inner;
 
+    int64_t suspect_size() const { return N_SUSPECT + 2 * m; }
+    Reason suspected() const { return static_cast<Reason>(suspect[REASON]); }
     Value *row(int64_t i) const { return K + i * m; }  // f of stage i
     Value *last() const { return K + stages * m; }     // f at the raw result, or at the end of the step
     Value *gradient(int64_t i) const { return G + i * m; }

@@ -61,8 +61,8 @@ inline double shifted_sums(const Values &values_at, const double *y, int64_t j, 
 
 // Rows G (l, m) of the gradients at y of the invariants that ``values_at(state, out)`` puts into out (l,).
 //
-// Where both orders do not agree, as next to a singularity that is nearer than the state's size, the shifts are
-// shortened until they do; if they never do, the shift at which the orders agree best is taken. A shift that reaches
+// The shifts are shortened until both orders agree, which they do not at first next to a singularity that is nearer than
+// the state's size; if they never do, the shift at which the orders agree best is taken. A shift that reaches
 // about as far as the singularity agrees worse than a longer one, so that the search must not end there.
 template <class Values>
 inline void difference_gradient(const Values &values_at, const double *y, int64_t l, Shifts &s, double *G) {

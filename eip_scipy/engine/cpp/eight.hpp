@@ -88,7 +88,7 @@ struct Eight {
         }
         work.counters = counters;
         short_work = SizedWith<4, 2, Octet>(work);
-        suspects.resize(LANES * (N_SUSPECT + 2 * n));
+        suspects.resize(LANES * work.suspect_size());
         tolerances.resize(2 * LANES * n);
         for (int64_t i = 0; i < LANES * n; ++i) {
             tolerances[i] = o.rtol[i / LANES];
@@ -102,8 +102,8 @@ struct Eight {
     double &at(Octet *a, int64_t lane) const { return OctetSystem::floats_of(a)[lane]; }
 
     // The suspect step of one member.
-    double *suspect(int64_t lane) { return suspects.data() + lane * (N_SUSPECT + 2 * work.n); }
-    const double *suspect(int64_t lane) const { return suspects.data() + lane * (N_SUSPECT + 2 * work.n); }
+    double *suspect(int64_t lane) { return suspects.data() + lane * work.suspect_size(); }
+    const double *suspect(int64_t lane) const { return suspects.data() + lane * work.suspect_size(); }
 
     // One member's part of n octets, to floats and back.
     void take(const Octet *a, int64_t lane, double *out, int64_t n) const {

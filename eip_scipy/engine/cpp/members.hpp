@@ -91,7 +91,7 @@ inline void end_member(const Run &run, Samples *samples, const Schedule &s, cons
     }
     copy(w.max_defect, members.max_defect + k * w.l, w.l);
     copy(w.trust, members.figures + k * w.l * N_FIGURES, w.l * N_FIGURES);
-    copy(w.suspect, members.suspects + k * (N_SUSPECT + 2 * w.m), N_SUSPECT + 2 * w.m);
+    copy(w.suspect, members.suspects + k * w.suspect_size(), w.suspect_size());
     std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), members.counters + k * N_COUNTERS);
     members.max_correction[k] = w.max_correction[0];
 }

@@ -42,7 +42,8 @@ bool has_v3() {
 }
 
 struct Engine {
-    PyObject_HEAD PyObject *kept;  // every object that the run uses
+    PyObject_HEAD
+    PyObject *kept;  // every object that the run uses
     Data *data;
     Schedule *schedule;
     Samples *samples;

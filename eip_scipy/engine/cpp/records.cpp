@@ -84,7 +84,7 @@ Work work_of(PyObject *work, int64_t stages, int64_t blocks, Arrays &arrays, int
     w.max_correction = arrays.floats(work, "max_correction", {1});
     w.norm = arrays.floats(work, "norm", {1});
     w.trust = arrays.floats(work, "trust", {l, N_FIGURES});
-    w.suspect = arrays.floats(work, "suspect", {N_SUSPECT + 2 * m});
+    w.suspect = arrays.floats(work, "suspect", {w.suspect_size()});
     w.pivots = arrays.integers<int64_t>(work, "pivots", {l});
     w.counters = arrays.integers<int64_t>(work, "counters", {N_COUNTERS});
     const Ref inner = attribute(work, "inner");
@@ -331,7 +331,7 @@ Members members_of(PyObject *members, const Data &run, const Schedule &schedule,
     m.max_defect = arrays.floats(members, "max_defect", {m.count, w.l});
     m.max_correction = arrays.floats(members, "max_correction", {m.count});
     m.figures = arrays.floats(members, "figures", {m.count, w.l, N_FIGURES});
-    m.suspects = arrays.floats(members, "suspects", {m.count, N_SUSPECT + 2 * w.m});
+    m.suspects = arrays.floats(members, "suspects", {m.count, w.suspect_size()});
     m.status = arrays.integers<int64_t>(members, "status", {m.count});
     m.counters = arrays.integers<int64_t>(members, "counters", {m.count, N_COUNTERS});
     m.where = arrays.integers<int64_t>(members, "where", {2});

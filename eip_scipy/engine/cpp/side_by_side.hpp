@@ -48,7 +48,7 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
     eight.take(eights.target, lane, w.target, w.l);
     eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
     eight.take(eights.max_defect, lane, w.max_defect, w.l);
-    copy(eight.suspect(lane), w.suspect, N_SUSPECT + 2 * w.m);
+    copy(eight.suspect(lane), w.suspect, w.suspect_size());
     w.max_correction[0] = eight.at(eights.max_correction, lane);
     take_params(eight, lane, run.system);
     count_of(eight, lane, shared, w.counters);
@@ -63,7 +63,7 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
     eight.give(w.memory, lane, eights.memory, run.options.blocks.count);
     eight.give(w.trust, lane, eights.trust, w.l * N_FIGURES);
     eight.give(w.max_defect, lane, eights.max_defect, w.l);
-    copy(w.suspect, eight.suspect(lane), N_SUSPECT + 2 * w.m);
+    copy(w.suspect, eight.suspect(lane), w.suspect_size());
     eight.at(eights.max_correction, lane) = w.max_correction[0];
     for (Octet *counts : {eight.projections, eight.skips, eight.reduced}) eight.at(counts, lane) = 0.0;
     std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), eight.own[lane]);
@@ -88,7 +88,7 @@ inline void take_history(const Run &run, Eight &eight, int64_t lane) {
     eight.take(eights.target, lane, w.target, w.l);
     eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
     eight.take(eights.max_defect, lane, w.max_defect, w.l);
-    copy(eight.suspect(lane), w.suspect, N_SUSPECT + 2 * w.m);
+    copy(eight.suspect(lane), w.suspect, w.suspect_size());
     w.max_correction[0] = eight.at(eights.max_correction, lane);
     eight.take(eights.sigma, lane, w.sigma, w.m);
     std::copy_n(eight.own[lane], static_cast<int64_t>(N_COUNTERS), w.counters);
@@ -106,7 +106,7 @@ inline void give_history(const Run &run, Eight &eight, int64_t lane) {
     std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), eight.own[lane]);
     eight.rank[lane] = w.counters[LAST_RANK];
     eight.give(w.trust, lane, eights.trust, w.l * N_FIGURES);
-    copy(w.suspect, eight.suspect(lane), N_SUSPECT + 2 * w.m);
+    copy(w.suspect, eight.suspect(lane), w.suspect_size());
     if (one.place[SINCE] > 0) return;
     eight.projected[lane] = eight.multistep.place[SINCE];
     for (int64_t j = 0; j < 4; ++j) eight.give(one.sums + j * one.pitch, lane, eight.sums + j * one.half, one.half);
@@ -349,7 +349,7 @@ inline void end_octet(const Eight &eight, const Schedule &s, const Members &memb
         eight.take(eight.y, lane, members.y + k * w.n, w.n);
         eight.take(w.max_defect, lane, members.max_defect + k * w.l, w.l);
         eight.take(w.trust, lane, members.figures + k * w.l * N_FIGURES, w.l * N_FIGURES);
-        copy(eight.suspect(lane), members.suspects + k * (N_SUSPECT + 2 * w.n), N_SUSPECT + 2 * w.n);
+        copy(eight.suspect(lane), members.suspects + k * w.suspect_size(), w.suspect_size());
         count_of(eight, lane, w.counters, members.counters + k * N_COUNTERS);
     }
 }

@@ -166,7 +166,7 @@ inline Code judge(const double *before, const double *y_old, const double *y, co
 
 // Keep a step for an examination, which takes place in Python. A change along the flow has precedence.
 [[gnu::cold, gnu::noinline]] inline void suspect(Reason reason, const Step &step, const Work &w) {
-    if (w.suspect[REASON] > reason) return;
+    if (w.suspected() > reason) return;
     w.suspect[REASON] = reason;
     w.suspect[SUSPECT_FROM] = step.t;
     w.suspect[SUSPECT_TO] = step.t_new;
@@ -247,7 +247,7 @@ inline auto is_rough(const Value &share, const Value *figures) {
 // Note a fixed step whose local error is large compared with what it changes in some block. The step may not resolve that
 // block, which the invariants need not show.
 [[gnu::cold, gnu::noinline]] inline void note_roughness(const Step &step, const Options &o, const Work &w) {
-    if (w.suspect[REASON] >= LARGE_ERROR) return;  // the first one is examined: later ones may come of it
+    if (w.suspected() >= LARGE_ERROR) return;  // the first one is examined: later ones may come of it
     const double share = largest_error_share(step.h, step.y, o, w);
     if (!is_rough(share, w.figures(0))) return;
     w.figures(0)[ROUGH_NOTED] = share;
@@ -317,7 +317,7 @@ inline void note(const Step &step, double errors, double rounding, const double 
         }
         figures[LEFT] = w.defect[i];
     }
-    if (w.suspect[REASON] != NOTHING) [[unlikely]]
+    if (w.suspected() != NOTHING) [[unlikely]]
         keep_accepted(step, w);
 }
 
