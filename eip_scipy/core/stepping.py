@@ -248,11 +248,12 @@ def fixed_steps(h: float, t0: float, t_bound: float) -> int:
     """Number of steps of length h from t0 to t_bound, UNBOUNDED for an endless interval.
 
     T/h rounded where it is a whole number but for round-off, else the next larger one; the last step is then shorter.
+    An interval that is not empty takes one step at least, however much longer h is.
     """
     ratio = abs(t_bound - t0) / h
     if not ratio < UNBOUNDED:
         return UNBOUNDED
-    whole = round(ratio)
+    whole = max(round(ratio), 1) if ratio > 0 else 0
     return whole if abs(ratio - whole) <= _slack(h, t0, t_bound) else math.ceil(ratio)
 
 

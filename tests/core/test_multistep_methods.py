@@ -193,6 +193,21 @@ def test_between_steps(method, sign):
 
 
 @both
+@pytest.mark.parametrize("end", [1e-9, 1e-12, 1e-300])
+def test_intervals_far_below_the_step(method, end):
+    """An interval that is not empty takes a step; y(t) = y0 + t y'(t0) to rounding, because end^2 is below that."""
+    rates = np.concatenate([Y0[Y0.size // 2 :], acceleration(0.0, Y0[: Y0.size // 2])])
+    given = {"acceleration": acceleration, "t_span": (0, end), "method": method, "h": STEP, "jacobian": jacobian}
+    run = integrate(y0=Y0, **given, **KEPT)
+    assert run.status == 0
+    assert run.t[-1] == end
+    assert np.abs(run.y[:, -1] - (Y0 + end * rates)).max() < 1e-15
+    members = ensemble(y0s=np.array([Y0, Y0]), **given, **KEPT)
+    assert (members.status == 0).all()
+    assert (members.t == end).all()
+
+
+@both
 def test_few_steps(method):
     """Runs shorter than a history are those of the method that starts."""
     for count in (1, 2, 5, 11, 12, 13, 14, 15, 16, 17, 20, 27):
