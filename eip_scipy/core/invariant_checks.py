@@ -38,8 +38,11 @@ ONE_SIDED_WEIGHTS = (-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6)
 MOST_NAMES = 3
 # Short differences along the flow: their step, in the time in which the state moves by its size, and the share of the
 # rate's terms from which on those to both sides differ. What curvature makes them differ by is half as large at half
-# the step; what a kink does is not.
+# the step; what a kink does is not. Beside a kink of the slope, where terms may vanish, the differences to both sides
+# differ by more than the rate that is found.
 SHORT, KINK, KEPT_AT_HALF = 1e-6, 1e-4, 0.6
+# The rounding of a value, in units of its terms.
+ROUNDINGS = 4.0
 DOUBLE = (
     "Compute it in double precision: with JAX jax.config.update('jax_enable_x64', True), with PyTorch by tensors and "
     "parameters of torch.float64"
@@ -325,7 +328,7 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
     wrong = np.abs(rate) > INVARIANCE_TOLERANCE * terms + noise
     if (wrong & known.computed).any():
         # Gradients that are computed over a kink are wrong, and the rate with them.
-        by_values = rates_by_values(known, at.t, at.y, at.f, np.abs(at.G) @ np.abs(at.f)) / unit
+        by_values = rates_by_values(known, at.t, at.y, at.f, at.G) / unit
         near = np.abs(in_time + by_values) > ROUNDING_OF_DIFFERENCES * terms
         wrong &= near | ~np.array(known.computed)
     if wrong.any():
@@ -334,15 +337,15 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
         return _Rates(rate * unit, terms * unit, in_time, wrong)
 
 
-def rates_by_values(known: InvariantSet, t: float, y: Array, f: Array, terms: Array) -> Array:
+def rates_by_values(known: InvariantSet, t: float, y: Array, f: Array, G: Array) -> Array:
     """Return rates of change along f by short differences to both sides, (l,); NaN where these differ at a kink.
 
-    `terms`, (l,), are the sums of the rates' terms, ``|G| |f|``.
+    Rates that are within the rounding of the values, which is larger than terms that nearly vanish, are 0.
     """
     moving, size = np.abs(f).max(initial=0.0), np.abs(y).max(initial=0.0)
     if not (0 < moving < np.inf and 0 < size < np.inf):
         return np.zeros(known.size)
-    step, here = SHORT * size / moving, known.values(t, y)
+    step, here, terms = SHORT * size / moving, known.values(t, y), np.abs(G) @ np.abs(f)
 
     def slopes(step: float) -> tuple[Array, Array]:
         before, after = (known.values(t, y + side * f) for side in (-step, step))
@@ -350,8 +353,11 @@ def rates_by_values(known: InvariantSet, t: float, y: Array, f: Array, terms: Ar
 
     (back, forth), (half_back, half_forth) = slopes(step), slopes(0.5 * step)
     jump, half_jump = np.abs(forth - back), np.abs(half_forth - half_back)
-    kink = (jump > KINK * terms) & (half_jump > KEPT_AT_HALF * jump)
-    return np.where(kink, np.nan, 0.5 * (back + forth))
+    rates = 0.5 * (back + forth)
+    kink = (jump > KINK * terms) & ((half_jump > KEPT_AT_HALF * jump) | (np.abs(rates) <= jump))
+    rates[kink] = np.nan
+    rounding = ROUNDINGS * EPS * known.sizes_of_terms(y, G, here) / step
+    return np.where(np.abs(rates) <= rounding, 0.0, rates)
 
 
 def _time_derivative(known: InvariantSet, at: _Samples) -> tuple[Array, Array]:

@@ -655,9 +655,10 @@ class InvariantSet:
 
     def rate_shares(self, t: float, y: Array, f: Array) -> tuple[Array, Array]:
         """Return the rates of change along f by gradients and by values, relative to the terms of these rates; (l,)."""
-        products = self.gradients(t, y, f).conj() * f
+        G = self.gradients(t, y, f)
+        products = G.conj() * f
         terms = np.abs(products).sum(axis=1)
-        rates = np.abs(np.array([products.sum(axis=1).real, rates_by_values(self, t, y, f, terms)]))
+        rates = np.abs(np.array([products.sum(axis=1).real, rates_by_values(self, t, y, f, G)]))
         by_gradient, by_values = rates / np.where(terms > 0, terms, 1.0)
         return by_gradient, by_values
 

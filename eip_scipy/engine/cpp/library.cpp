@@ -8,7 +8,8 @@ namespace eip {
 namespace {
 
 struct Function {
-    PyObject_HEAD vectorcallfunc vectorcall;
+    PyObject_HEAD
+    vectorcallfunc vectorcall;
     const LibraryFunction *function;
 };
 
