@@ -97,7 +97,11 @@ if only := os.environ.get("EIP_SCIPY_BUILD"):
     name, *further = only.split()
     builds = {} if name == "none" else {name: [*builds[name], *further]}
 setup(
-    packages=[*find_packages(include=["eip_scipy", "eip_scipy.*"]), "eip_scipy.integrations"],
+    packages=[
+        *find_packages(include=["eip_scipy", "eip_scipy.*"]),
+        "eip_scipy.integrations",
+        *find_packages("studies"),
+    ],
     ext_modules=[module(name, *flags) for name, flags in builds.items()],
     cmdclass={"build_ext": Build},
 )

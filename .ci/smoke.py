@@ -34,7 +34,7 @@ assert {file.suffix for file in files} <= {".py", ".pyc", ".so", ".pyd", ".json"
 )
 assert {"py.typed", "LICENSE"} <= {file.name for file in files}
 folders = {file.parts[0] for file in files} - {".."}  # above it the command
-assert folders == {"eip_scipy", f"eip_scipy-{eip_scipy.__version__}.dist-info"}, folders
+assert folders == {"eip_scipy", "eip_scipy_studies", f"eip_scipy-{eip_scipy.__version__}.dist-info"}, folders
 assert find_spec("numba") is None, "Numba came along, which is an extra"
 
 # The README's first example; the README is the wheel's description.

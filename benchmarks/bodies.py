@@ -16,8 +16,8 @@ import numpy as np
 from installed import peer
 
 from eip_scipy import EIPRKN12, integrate
-from eip_scipy.app.report import describe_machine
 from eip_scipy.problems import Problem, nbody
+from eip_scipy_studies.report import describe_machine
 
 rebound = peer("eip_scipy.integrations.rebound")
 

@@ -27,13 +27,13 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, EIPSolver, integrate
-from eip_scipy.app.particles.runs import SCENES, scene
-from eip_scipy.app.report import compact, describe_machine, document, table, write_json
-from eip_scipy.app.work_precision import curves
 from eip_scipy.comparators import boris, implicit_midpoint
 from eip_scipy.plotting import CostPanel, cost_figure
 from eip_scipy.problems import ParticleProblem, tokamak
 from eip_scipy.problems.particle_orbits import ParticleOrbit
+from eip_scipy_studies.particles.runs import SCENES, scene
+from eip_scipy_studies.report import compact, describe_machine, document, table, write_json
+from eip_scipy_studies.work_precision import curves
 
 STATIC = Path(__file__).parents[1] / "docs" / "_static"
 TAIL = 60  # states of the reference, three gyrations, at the end of the interval

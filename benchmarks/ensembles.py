@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 
 from eip_scipy import EIPRK4, ensemble, integrate
-from eip_scipy.app.report import describe_machine, write_csv
 from eip_scipy.problems import kepler
+from eip_scipy_studies.report import describe_machine, write_csv
 
 H = 0.03
 MEMORY = """

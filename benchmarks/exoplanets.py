@@ -21,11 +21,11 @@ from relativity import C, potential, reference
 from runners import Methods, by_rebound, by_us, one_each, rows, show
 
 from eip_scipy import EIPGJ14, EIPRKN12
-from eip_scipy.app.report import describe_machine
-from eip_scipy.app.solar.cost import timed
 from eip_scipy.problems import Problem, nbody
 from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.problems.gravity.solar_data import YEAR_D
+from eip_scipy_studies.report import describe_machine
+from eip_scipy_studies.solar.cost import timed
 
 REPEATS = 3
 GM_SUN = 4 * math.pi**2  # AU^3/yr^2, to four digits

@@ -18,9 +18,9 @@ import numpy as np
 from scipy.integrate import RK45
 
 from eip_scipy import EIPRK4, integrate
-from eip_scipy.app.report import describe_machine, table
 from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
 from eip_scipy.problems.gross_pitaevskii.transforms import LIBRARIES
+from eip_scipy_studies.report import describe_machine, table
 
 FLAT = tuple((n, n) for n in (64, 128, 256, 512, 1024))
 FULL = tuple((n, n, n) for n in (32, 64, 128))

@@ -9,8 +9,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from eip_scipy.app.condensates.efficiency import Efficiency, Trial, runs_text
-from eip_scipy.app.study import Session
+from eip_scipy_studies.condensates.efficiency import Efficiency, Trial, runs_text
+from eip_scipy_studies.study import Session
 
 
 class RunsToo(Efficiency):

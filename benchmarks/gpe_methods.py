@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from eip_scipy import EIPDOP853, EIPRK4, eip_method, integrate
-from eip_scipy.app.report import table, write_csv
-from eip_scipy.app.work_precision import cost_to_reach, work_precision
 from eip_scipy.problems import Splitting
 from eip_scipy.problems.gross_pitaevskii import at_rest, ground_state, ring_condensate, ring_start, rotated
+from eip_scipy_studies.report import table, write_csv
+from eip_scipy_studies.work_precision import cost_to_reach, work_precision
 
 KEPT = ("mass", "energy")
 LEVELS = (1e-5, 1e-6, 1e-7)

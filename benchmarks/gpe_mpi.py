@@ -15,8 +15,8 @@ import numpy as np
 from installed import peer
 
 from eip_scipy import EIPRK4
-from eip_scipy.app.report import describe_machine, table
 from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
+from eip_scipy_studies.report import describe_machine, table
 
 mpi, slabs = peer("eip_scipy.integrations.mpi"), peer("eip_scipy.integrations.mpi_fields")
 

@@ -18,9 +18,9 @@ import numpy as np
 from installed import peer
 
 from eip_scipy import EIPGJ14, EIPRKN12, integrate
-from eip_scipy.app.report import describe_machine, write_csv
 from eip_scipy.problems import solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D
+from eip_scipy_studies.report import describe_machine, write_csv
 
 rebound = peer("eip_scipy.integrations.rebound")
 

@@ -16,8 +16,8 @@ import subprocess
 import sys
 from statistics import median
 
-from eip_scipy.app.report import describe_machine
 from eip_scipy.core.versions import versions
+from eip_scipy_studies.report import describe_machine
 
 ROUNDS = 7
 REFERENCE = "import scipy.integrate"

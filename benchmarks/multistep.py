@@ -32,11 +32,11 @@ from runners import Methods, by_rebound, by_us, one_each, rows, show
 from scipy.spatial.transform import Rotation
 
 from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRKN12, integrate
-from eip_scipy.app.report import describe_machine
-from eip_scipy.app.solar.cost import timed
-from eip_scipy.app.work_precision import cost_to_reach
 from eip_scipy.problems import Problem, kepler, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D
+from eip_scipy_studies.report import describe_machine
+from eip_scipy_studies.solar.cost import timed
+from eip_scipy_studies.work_precision import cost_to_reach
 
 ROTATIONS = 6
 REPEATS = 200  # of runs of milliseconds

@@ -30,12 +30,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eip_scipy import EIPRKN8, EIPRKN12, integrate
-from eip_scipy.app.hard.runs import SCENES, scene
-from eip_scipy.app.report import describe_machine
 from eip_scipy.core.setup import depends_on_velocity
 from eip_scipy.core.solvers import EIPSolver
 from eip_scipy.engine.trust import ProjectionWarning
 from eip_scipy.problems import Problem, hard_cases, solar_system
+from eip_scipy_studies.hard.runs import SCENES, scene
+from eip_scipy_studies.report import describe_machine
 
 WAYS: dict[str, dict[str, Any]] = {
     "each": {"every": 1, "compensated": False},

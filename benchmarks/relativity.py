@@ -19,10 +19,10 @@ from installed import peer
 from runners import Methods, by_rebound, by_us, one_each, rows, show
 
 from eip_scipy import EIPGJ14, EIPRKN12
-from eip_scipy.app.report import describe_machine
-from eip_scipy.app.solar.cost import timed
 from eip_scipy.problems import Problem, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D
+from eip_scipy_studies.report import describe_machine
+from eip_scipy_studies.solar.cost import timed
 
 heyoka = peer("heyoka", '"eip_scipy[heyoka]"')
 rebound = peer("rebound", "rebound")

@@ -18,10 +18,6 @@ import numpy as np
 from scipy.signal import resample
 
 from eip_scipy import EIPRK4, eip_method, integrate
-from eip_scipy.app.condensates.ring import Ring
-from eip_scipy.app.condensates.runs import motion
-from eip_scipy.app.condensates.states import load_state
-from eip_scipy.app.report import describe_machine, table, write_csv
 from eip_scipy.problems import Splitting
 from eip_scipy.problems.gross_pitaevskii import (
     at_rest,
@@ -30,6 +26,10 @@ from eip_scipy.problems.gross_pitaevskii import (
     ring_start,
     rotated,
 )
+from eip_scipy_studies.condensates.ring import Ring
+from eip_scipy_studies.condensates.runs import motion
+from eip_scipy_studies.condensates.states import load_state
+from eip_scipy_studies.report import describe_machine, table, write_csv
 
 START_POINTS, TOLERANCE = 256, 1e-8  # of the ground state
 SPLITTING_STEP = 1.25e-3

@@ -23,8 +23,8 @@ from installed import peer
 from scipy.spatial.transform import Rotation
 
 from eip_scipy import EIPRKN12, integrate
-from eip_scipy.app.report import describe_machine
 from eip_scipy.problems import Problem, solar_system
+from eip_scipy_studies.report import describe_machine
 
 rebound = peer("eip_scipy.integrations.rebound")
 

@@ -10,10 +10,10 @@ import numpy as np
 from installed import peer
 
 from eip_scipy import integrate
-from eip_scipy.app.solar.cost import TimedRun
-from eip_scipy.app.work_precision import Runner
 from eip_scipy.core.solvers import EIPSolver
 from eip_scipy.problems import Problem
+from eip_scipy_studies.solar.cost import TimedRun
+from eip_scipy_studies.work_precision import Runner
 
 rebound = peer("eip_scipy.integrations.rebound")
 

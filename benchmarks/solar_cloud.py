@@ -19,9 +19,9 @@ import numpy as np
 from installed import peer
 
 from eip_scipy import EIPGJ14, EIPRKN12, ensemble, integrate
-from eip_scipy.app.report import describe_machine
 from eip_scipy.problems import Problem, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D
+from eip_scipy_studies.report import describe_machine
 
 rebound = peer("eip_scipy.integrations.rebound")
 

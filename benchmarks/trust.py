@@ -35,7 +35,7 @@ from trust_runs.late import LATE
 from trust_runs.record import CHANNELS, SILENT, Outcome, Run, carry_out, carry_out_plain
 from trust_runs.sick import sick_runs
 
-from eip_scipy.app.report import describe_machine, write_csv
+from eip_scipy_studies.report import describe_machine, write_csv
 
 LEAST_TOLD, MOST_ALARMS = 0.95, 0.01
 SPOILT, TOLERANCE = 10.0, 1e3  # times the error without projection; times rtol

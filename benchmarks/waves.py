@@ -27,8 +27,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPDOP853, integrate
-from eip_scipy.app.report import describe_machine, table
 from eip_scipy.problems import breather, korteweg_de_vries_solitons, sine_gordon_breather, sine_gordon_kinks
+from eip_scipy_studies.report import describe_machine, table
 
 OWN, RAW, EIP, SCIPY = "own method, projected", "own method alone", "EIPDOP853", "SciPy's DOP853"
 METHODS = (OWN, RAW, EIP, SCIPY)

@@ -1,8 +1,8 @@
-"""``python -m eip_scipy``: the command line."""
+"""``python -m eip_scipy``: the command line, which is in `eip_scipy_studies`."""
 
 import sys
 
-from .app.cli import main
+from eip_scipy_studies.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

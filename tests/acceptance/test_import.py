@@ -8,7 +8,7 @@ import pytest
 
 import eip_scipy
 
-HEAVY = ["matplotlib", "numba", "scipy", "tqdm"]
+HEAVY = ["eip_scipy_studies", "matplotlib", "numba", "scipy", "tqdm"]
 HEAVY_FOR_STEPS = ["dask", "matplotlib", "scipy.ndimage", "scipy.signal", "scipy.stats", "skimage", "tqdm", "zarr"]
 
 
@@ -37,6 +37,13 @@ def test_names_bring_no_more_than_they_need():
 def test_steps_bring_no_ensembles_and_no_problems():
     names = ["eip_scipy.ensembles", "eip_scipy.problems"]
     assert loaded("from eip_scipy import EIPRK4, Invariant, integrate", names) == []
+
+
+def test_no_name_brings_the_studies():
+    """Neither the public names nor the public modules load them; `python -m eip_scipy` does."""
+    modules = "checkpoint, comparators, integrations, methods, plotting, problems"
+    assert loaded(f"from eip_scipy import *\nfrom eip_scipy import {modules}", ["eip_scipy_studies"]) == []
+    assert loaded("import eip_scipy.__main__", ["eip_scipy_studies", "numpy"]) == ["eip_scipy_studies"]
 
 
 def test_all_public_names_are_there():

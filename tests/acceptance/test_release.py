@@ -12,7 +12,7 @@ import eip_scipy
 from eip_scipy.core.versions import versions
 
 ROOT = Path(__file__).parents[2]
-SOURCES = sorted([*(ROOT / "eip_scipy").rglob("*.py"), *(ROOT / "integrations").rglob("*.py")])
+SOURCES = sorted(path for folder in ("eip_scipy", "integrations", "studies") for path in (ROOT / folder).rglob("*.py"))
 UNPICKLES = {"pickle", "cPickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "runpy"}
 
 

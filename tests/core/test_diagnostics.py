@@ -5,9 +5,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK4, Invariant, integrate
-from eip_scipy.app.work_precision import WorkPoint, work_precision
 from eip_scipy.core.diagnostics import drift_slope, invariants_along, observed_order
 from eip_scipy.problems import harmonic, kepler
+from eip_scipy_studies.work_precision import WorkPoint, work_precision
 
 
 def test_slope_of_a_line_is_exact():

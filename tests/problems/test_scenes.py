@@ -14,10 +14,6 @@ import pytest
 
 import eip_scipy.integrations
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, check_gradient, hamiltonian, integrate
-from eip_scipy.app.cli import main
-from eip_scipy.app.hard import runs as scene_runs
-from eip_scipy.app.hard import scenes as hard_scenes
-from eip_scipy.app.hard.runs import SCENES, scene
 from eip_scipy.problems import (
     centre_time,
     comet,
@@ -31,6 +27,10 @@ from eip_scipy.problems import (
     time_transformed,
 )
 from eip_scipy.problems.gravity.scenes import FIGURE_EIGHT_PERIOD
+from eip_scipy_studies.cli import main
+from eip_scipy_studies.hard import runs as scene_runs
+from eip_scipy_studies.hard import scenes as hard_scenes
+from eip_scipy_studies.hard.runs import SCENES, scene
 
 PNG = b"\x89PNG\r\n\x1a\n"
 ROOT = Path(__file__).parents[2]

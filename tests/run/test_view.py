@@ -13,9 +13,9 @@ from scipy.integrate import solve_ivp
 from systems import oscillator
 
 from eip_scipy import EIPDOP853, EIPRK4, IntegrationResult, equations, integrate, load, view
-from eip_scipy.app.cli import main
 from eip_scipy.problems import harmonic, kepler, soliton
 from eip_scipy.run import view as module
+from eip_scipy_studies.cli import main
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 Y0 = np.array([1.0, 2.0])

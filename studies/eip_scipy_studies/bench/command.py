@@ -1,0 +1,138 @@
+"""``eip-scipy bench``: this package beside the field, each peer in a process of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from time import perf_counter
+from typing import Any
+
+from eip_scipy import __version__
+
+from ..report import UsageError, describe_machine
+from ..study import Figures, PartlyDone, Rows, Session, Study, one_of, option
+from .compare import Row, standings
+from .figures import drawn
+from .page import Found, html, markdown, text
+from .peers import PEERS, Peer
+from .process import ask
+from .suites import SUITES, Suite
+
+__all__ = ["Bench", "Found"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench(Study[Found]):
+    """The command. A run counts by the least of `repeats`; a sweep ends after a run of more than `patience` seconds."""
+
+    suite: Sequence[str] = option(
+        ("all",),
+        f"what to run: all, or some of {', '.join(SUITES)}",
+        nargs="+",
+        metavar="SUITE",
+        type=one_of("suite", ("all", *SUITES)),
+    )
+    peers: Sequence[str] | None = option(
+        None, "packages to compare with, as pip calls them, or beginnings of peers' names", nargs="+", metavar="PEER"
+    )
+    repeats: int = 4
+    enough: float = 0.12
+    patience: float = 0.4
+    limit: float = 90.0
+    suites: Mapping[str, Suite] = field(default_factory=lambda: SUITES)
+    field_of_peers: Mapping[str, Peer] = field(default_factory=lambda: PEERS)
+
+    def check_settings(self) -> None:
+        """Peers must be known."""
+        for name in self.peers or ():
+            if not any(_is(peer, name) for peer in PEERS.values()):
+                known = sorted({peer.distribution for peer in PEERS.values() if not peer.ours})
+                raise UsageError(f"there is no peer {name!r}; expected some of {', '.join(known)}")
+
+    def measure(self, session: Session) -> Found:
+        """Ask one peer after the other."""
+        found = Found(describe_machine(), datetime.now(UTC).strftime("%Y-%m-%d"))
+        found.versions["eip_scipy"] = __version__
+        asked = [
+            (self.suites[name], peer, scenes)
+            for name in (self.suites if "all" in self.suite else self.suite)
+            for make in [self.suites[name].make()]
+            for peer in self.field_of_peers.values()
+            if self._chosen(peer) and (scenes := make(peer))
+        ]
+        try:
+            with session.bar(len(asked), "bench", "peer") as bar:
+                for suite, peer, scenes in asked:
+                    bar.set_postfix_str(f"{suite.name}: {peer.name}")
+                    if peer.distribution not in found.absent:
+                        begin = perf_counter()
+                        self._ask(found, suite.name, suite.task, peer, scenes)
+                        found.took[suite.name, peer.name] = perf_counter() - begin
+                    bar.update()
+        except KeyboardInterrupt:
+            raise PartlyDone(found) from None
+        return found
+
+    def _chosen(self, peer: Peer) -> bool:
+        return peer.ours or self.peers is None or any(_is(peer, name) for name in self.peers)
+
+    def _ask(self, found: Found, suite: str, task: str, peer: Peer, scenes: list[dict[str, Any]]) -> None:
+        request = {
+            "peer": peer.name, "task": task, "scenes": scenes, "repeats": self.repeats, "enough": self.enough,
+            "patience": self.patience,
+        }  # fmt: skip
+        reply = ask(request, self.limit)
+        if task == "first" and not reply.failed:  # the first process may have written bytecode
+            reply = min(reply, ask(request, self.limit), key=lambda each: each.first or math.inf)
+        if reply.version is not None:
+            found.versions[peer.distribution] = reply.version
+        missing = [answer["absent"] for answer in reply.answers if "absent" in answer]
+        if missing:
+            found.absent[peer.distribution] = missing[0]
+            return
+        rows = [_row(suite, peer, answer) for answer in reply.answers]
+        if task == "first":
+            rows = [row._replace(seconds=reply.first) if row.error is not None else row for row in rows]
+        found.rows += rows
+        if reply.failed:
+            found.rows.append(Row(suite, scenes[-1]["title"], peer.takes, peer.name, said=reply.failed))
+
+    def text(self, found: Found) -> str:
+        """Tables at equal error, and what did not run."""
+        return text(found)
+
+    def tables(self, found: Found) -> dict[str, Rows]:
+        """All points, and the comparison at equal error."""
+        compared = [
+            {**each._asdict(), "ratio": each.ratio if math.isfinite(each.ratio) else None}
+            for each in standings(found.rows)
+        ]
+        return {"bench.csv": [row._asdict() for row in found.rows], "bench-equal-error.csv": compared}
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        """The same, with the versions."""
+        return {
+            "rows": [row._asdict() for row in found.rows],
+            "versions_of_peers": found.versions,
+            "absent": found.absent,
+        }
+
+    def figures(self, found: Found) -> Figures:
+        """A figure for each scene and kind of function, and the report with all of them inside."""
+        pictures, names = {}, {}
+        for where, name, figure in drawn(found.rows, found.machine):
+            yield name, figure
+            pictures[where], names[where] = figure, name
+        yield "bench.html", lambda path: path.write_text(html(found, pictures), encoding="utf-8")
+        yield "bench.md", lambda path: path.write_text(markdown(found, names), encoding="utf-8")
+
+
+def _is(peer: Peer, name: str) -> bool:
+    return name.lower() == peer.distribution.lower() or peer.name.lower().startswith(name.lower())
+
+
+def _row(suite: str, peer: Peer, answer: dict[str, Any]) -> Row:
+    known = {name: value for name, value in answer.items() if name in Row._fields}
+    return Row(suite, known.pop("scene", ""), peer.takes, peer.name, **known)

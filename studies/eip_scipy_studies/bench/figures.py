@@ -1,0 +1,51 @@
+"""The figures of the report, one for each scene and kind of function."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from .compare import LEVELS, Row, groups
+from .peers import COMPILED, OWN, PEERS, PYTHON
+from .suites import SUITES
+
+__all__ = ["Where", "drawn"]
+
+Where = tuple[str, str, str]
+"""Suite, scene and kind of function."""
+SHORT = {PYTHON: "python", COMPILED: "compiled", OWN: "own"}
+
+
+def drawn(rows: list[Row], machine: str) -> Iterator[tuple[Where, str, Any]]:
+    """Where each figure belongs, the name of its file, and the figure."""
+    from eip_scipy.plotting.side_by_side import side_by_side_figure
+
+    known = groups(rows)
+    for where, peers in known.items():
+        suite, scene, takes = where
+        if SUITES[suite].task != "precision":
+            continue
+        shown = dict(peers)
+        if not any(PEERS[name].ours for name in shown):  # beside the same of ours as in the tables
+            compiled = known.get((suite, scene, COMPILED), {})
+            shown |= {name: runs for name, runs in compiled.items() if PEERS[name].ours}
+        series = {name: _arrays(runs) for name, runs in shown.items()}
+        figure = side_by_side_figure(
+            series,
+            ours=[name for name in series if PEERS[name].ours],
+            levels=LEVELS,
+            title=f"{scene}: {takes}",
+            footnote=machine,
+        )
+        slug = re.sub(r"[^a-z0-9]+", "-", f"{suite} {scene} {SHORT[takes]}".lower()).strip("-")
+        yield where, f"bench-{slug}.png", figure
+
+
+def _arrays(runs: list[Row]) -> dict[str, list[float]]:
+    return {
+        "seconds": [math.nan if row.seconds is None else row.seconds for row in runs],
+        "error": [math.nan if row.error is None else row.error for row in runs],
+        "drift": [math.nan if row.drift is None else row.drift for row in runs],
+    }

@@ -1,0 +1,110 @@
+"""One peer in a process of its own: a request goes in as JSON, answers come out line by line as they are known."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from threading import Timer
+from time import perf_counter
+from typing import Any
+
+__all__ = ["Reply", "ask"]
+
+WORKER = "eip_scipy_studies.bench.worker"
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What a worker answered.
+
+    Attributes
+    ----------
+    answers : list of dict
+        Until its end, or until it was ended.
+    version : str or None
+        That of the peer's package.
+    first : float or None
+        Seconds from the start of the process to its first answer.
+    failed : str
+        Why it did not come to its end; empty where it did.
+    """
+
+    answers: list[dict[str, Any]]
+    version: str | None
+    first: float | None
+    failed: str
+
+
+def ask(request: Mapping[str, Any], limit: float, worker: str = WORKER) -> Reply:
+    """Start a worker, hand it the request, and read until it ends or `limit` seconds have passed.
+
+    Parameters
+    ----------
+    request : mapping
+        See `worker`.
+    limit : float
+    worker : str, optional
+        The module that is run.
+
+    Returns
+    -------
+    Reply
+    """
+    begin = perf_counter()
+    # One thread for all; what hides a problem of threads is the same for all then.
+    quiet = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", worker],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            env={**os.environ, **quiet},
+        )
+        late = Timer(limit, process.kill)
+        late.start()
+        try:
+            answers, first = _read(process, request, begin)
+            status = process.wait()
+        finally:  # Ctrl-C among other things
+            late.cancel()
+            process.kill()
+            process.wait()
+        errors.seek(0)
+        said = [line.strip() for line in errors.read().splitlines() if line.strip()]
+    version = None
+    if answers and "version" in answers[-1]:
+        version = answers.pop()["version"]
+    if status == 0:
+        failed = ""
+    elif perf_counter() - begin >= limit:
+        failed = f"not done after {limit:g} s, and ended"
+    else:
+        failed = f"the process ended with status {status}{': ' + said[-1] if said else ''}"
+    return Reply(answers, version, first, failed)
+
+
+def _read(
+    process: subprocess.Popen[str], request: Mapping[str, Any], begin: float
+) -> tuple[list[dict[str, Any]], float | None]:
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with contextlib.suppress(BrokenPipeError):  # it has died: its status tells
+        process.stdin.write(json.dumps(request))
+        process.stdin.close()
+    answers: list[dict[str, Any]] = []
+    first = None
+    for line in process.stdout:
+        if not line.endswith("\n"):  # ended within a line
+            break
+        first = perf_counter() - begin if first is None else first
+        answers.append(json.loads(line))
+    process.stdout.close()
+    return answers, first

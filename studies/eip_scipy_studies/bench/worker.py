@@ -1,0 +1,206 @@
+"""The process that runs one peer: reads a request in JSON on stdin, answers in lines of JSON on stdout.
+
+    python -m eip_scipy_studies.bench.worker < request.json
+
+A request names the peer, a task and scenes; each answer is written as soon as it is known, so that a worker that is
+ended keeps what it had. What a peer prints goes to stderr.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from .equations import Functions, Scene, scene_from
+from .peers import PEERS, Peer
+
+__all__ = ["TASKS", "first_line", "main"]
+
+Answers = Iterator[dict[str, Any]]
+
+
+def precision(peer: Peer, request: Mapping[str, Any]) -> Answers:
+    """Time and errors of each scene at its settings, from the loosest on."""
+    for record in request["scenes"]:
+        try:
+            scene = scene_from(record)
+            solve = peer.prepare(scene)
+            yield from _points(solve, scene, record, request, peer.warm)
+        except ImportError:
+            raise
+        except Exception as error:  # whatever a package raises is the answer, and the next scene goes on
+            yield {"scene": record["title"], "said": first_line(error)}
+
+
+def _points(
+    solve: Callable[[float], np.ndarray],
+    scene: Scene,
+    record: Mapping[str, Any],
+    request: Mapping[str, Any],
+    warm: bool,
+) -> Answers:
+    for k, setting in enumerate(record["settings"]):
+        try:
+            if warm or k == 0:  # what is compiled and looked up on the way
+                solve(setting)
+            seconds, y = _least(partial(solve, setting), request["enough"], request["repeats"])
+        except ImportError:
+            raise
+        except Exception as error:
+            yield {"scene": scene.title, "setting": setting, "said": first_line(error)}
+            continue
+        finite = np.isfinite(y).all()
+        yield {
+            "scene": scene.title,
+            "setting": setting,
+            "seconds": seconds,
+            "error": scene.error(y) if finite else None,
+            "drift": scene.drift(y) if finite else None,
+        }
+        if seconds > request["patience"]:
+            return
+
+
+def _least(action: Callable[[], np.ndarray], enough: float, repeats: int) -> tuple[float, np.ndarray]:
+    """Least time of at most so many calls, of at least one; no further one after `enough` seconds in all."""
+    least, spent, y = np.inf, 0.0, np.empty(0)
+    for _ in range(repeats):
+        begin = perf_counter()
+        y = action()
+        taken = perf_counter() - begin
+        least, spent = min(least, taken), spent + taken
+        if spent > enough:
+            break
+    return least, y
+
+
+def first(peer: Peer, request: Mapping[str, Any]) -> Answers:
+    """One solution, which the other side times together with the start of this process."""
+    (record,) = request["scenes"]
+    scene = scene_from(record)
+    yield {"scene": record["title"], "error": scene.error(peer.prepare(scene)(record["settings"][0]))}
+
+
+def asked(peer: Peer, request: Mapping[str, Any]) -> Answers:
+    """What happens when a peer is asked for something: the first line of its error or warning, or how well it did."""
+    for record in request["scenes"]:
+        scene, extra = scene_from(record), dict(record["extra"])
+        functions = scene.plain()
+        if extra.pop("invariants", False) and not peer.keeps:
+            extra["invariants"] = [functions.values]
+        if "events" in extra:
+            extra["events"] = [_crossing]
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                solve = peer.prepare(scene, **extra)
+                y = solve(record["settings"][0])
+            said = f"done, error {scene.error(y):.0e}, change of the invariants {scene.drift(y):.0e}"
+            yield {"scene": record["title"], "said": said}
+        except ImportError:
+            raise
+        except Exception as error:
+            yield {"scene": record["title"], "said": first_line(error)}
+
+
+def _crossing(t: float, y: np.ndarray) -> float:
+    return float(np.real(y[0]))
+
+
+def overhead(peer: Peer, request: Mapping[str, Any]) -> Answers:
+    """Time of one evaluation of the user's function in a run, and of the function alone."""
+    (record,) = request["scenes"]
+    scene = scene_from(record)
+    setting = record["settings"][0]
+    counting = _Counting(**{field.name: getattr(scene, field.name) for field in fields(scene)})
+    _Counting.calls = 0
+    peer.prepare(counting)(setting)
+    solve, fun = peer.prepare(scene), scene.plain().fun
+    seconds, y = _least(lambda: solve(setting), request["enough"], request["repeats"])
+    alone, _ = _least(lambda: _call(fun, scene.y0), request["enough"], request["repeats"])
+    each = seconds / _Counting.calls - alone / CALLS
+    told = f"{_Counting.calls} evaluations of {alone / CALLS * 1e6:.1f} us"
+    yield {"scene": record["title"], "seconds": each, "error": scene.error(y), "said": told}
+
+
+CALLS = 2000
+
+
+def _call(fun: Callable[..., Any], y: np.ndarray) -> Any:
+    for _ in range(CALLS):
+        fun(0.0, y)
+    return y
+
+
+class _Counting(Scene):
+    """A scene whose function counts its calls."""
+
+    calls = 0
+
+    def plain(self) -> Functions:
+        """The functions of the scene, counted."""
+        functions = super().plain()
+
+        def counted(fun: Callable[..., Any]) -> Callable[..., Any]:
+            def call(t: float, y: np.ndarray) -> Any:
+                _Counting.calls += 1
+                return fun(t, y)
+
+            return call
+
+        acc = None if functions.acc is None else counted(functions.acc)
+        return functions._replace(fun=counted(functions.fun), acc=acc)
+
+
+TASKS: dict[str, Callable[[Peer, Mapping[str, Any]], Answers]] = {
+    "precision": precision, "first": first, "asked": asked, "overhead": overhead,
+}  # fmt: skip
+
+
+def first_line(error: BaseException) -> str:
+    """The kind of an error and the first line of what it says."""
+    said = str(error).strip().split("\n")[0]
+    return f"{type(error).__name__}: {said}" if said else type(error).__name__
+
+
+def main() -> None:
+    """Answer one request."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what a package prints is no answer
+
+    def say(answer: Mapping[str, Any]) -> None:
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
+
+    request = json.loads(sys.stdin.read())
+    peer = PEERS[request["peer"]]
+    warnings.simplefilter("ignore")
+    try:
+        for answer in TASKS[request["task"]](peer, request):
+            say(answer)
+    except ImportError as error:
+        say({"absent": first_line(error)})
+    except Exception as error:
+        say({"said": first_line(error)})
+    say({"version": _version(peer.distribution)})
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None
+
+
+if __name__ == "__main__":
+    main()

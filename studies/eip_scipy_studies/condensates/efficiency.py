@@ -1,0 +1,327 @@
+"""The paper's test of efficiency: error against processor time for the NLS equation, EIP beside schemes that rival it.
+
+Two problems on 64 x 64 points of [0, 2 pi)^2, beta = 1, to t = 1. The paper's plane wave is a stationary state: the
+gradients of mass and energy are parallel, so that a projection onto both has rank 1 (counted in the table), |psi|^2 is
+constant, so that the linear systems of LIC need no iteration, and splittings are exact. The modulated wave has none of
+that. Explicit steps are limited by the grid, those of the others are not. Times are processor seconds, the least of
+several runs taken in turn, less the least of a run of a single step: what the set-up takes, up to 20 ms, is left out.
+All methods have the same library of transforms.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import ceil
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPRK4, eip_method, integrate
+from eip_scipy.comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
+from eip_scipy.problems import FieldProblem, Splitting, plane_wave
+from eip_scipy.problems.gross_pitaevskii import make_transforms
+
+from ..report import describe_machine, table
+from ..study import Figures, Rows, Session, Study
+from ..work_precision import cost_to_reach, work_precision
+
+__all__ = ["METHODS", "Efficiency", "Slope", "Trial", "runs_text"]
+
+T_END = 1.0
+SHARES = (0.9, 0.64, 0.45, 0.32, 0.225)  # of the step above which RK4 is unstable
+LONG = tuple(T_END / n for n in (25, 50, 100, 200, 400, 800, 1600, 3200, 6400))
+FOURTH = tuple(T_END / n for n in (10, 20, 40, 80, 160, 320))
+FIT_BETWEEN = 1e-11, 1e-2  # smaller errors are round-off, larger ones not yet of any order
+FITTED = 3  # of those the finest: longer steps of splittings are not of their order yet
+LEVELS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
+WAVES = ("plane wave", "modulated wave")
+KEPT = ("mass", "energy")
+# Slopes in h that are known, to a tenth, those of CN and EIP-ME also drawn; and what EIP-ME may leave of both errors.
+ORDERS = {
+    "RK4": 4, "EIP-M": 4, "EIP-E": 4, "EIP-ME": 4, "CN": 2, "LIC": 2, "SAV/CN": 2, "Strang": 2,
+    "splitting4-EIP": 4,
+}  # fmt: skip
+SLOPES, SLOPE_TOLERANCE, LEFT = ("CN", "EIP-ME"), 0.1, 1e-12
+
+
+class Contender(NamedTuple):
+    """A method of the test.
+
+    ``run(problem, h, t_end)`` returns the two ends, the pairs of transforms and a remark; ``steps(problem)`` the steps.
+    """
+
+    run: Callable[[FieldProblem, float, float], tuple[np.ndarray, int, str]]
+    steps: Callable[[FieldProblem], Sequence[float]]
+
+
+def stable_steps(problem: FieldProblem) -> list[float]:
+    """Steps below RK4's limit that divide the interval."""
+    assert problem.equation is not None
+    limit = problem.equation.largest_step(problem.y0)
+    return [T_END / ceil(T_END / (share * limit)) for share in SHARES]
+
+
+def _own(problem: FieldProblem, h: float, t_end: float, base: Any, names: Sequence[str]) -> Any:
+    assert problem.equation is not None
+    invariants = problem.equation.invariants(names)
+    result = integrate(problem, (0.0, t_end), method=base(problem.equation), h=h, invariants=invariants)
+    made, reduced = result.diagnostics.n_projections, result.diagnostics.n_rank_reduced
+    remark = f"rank 1 in {reduced} of {made} projections" if reduced else ""
+    return result.y, result.nfev, remark
+
+
+def runge_kutta(*names: str) -> Contender:
+    """EIP on RK4."""
+    return Contender(lambda problem, h, t_end: _own(problem, h, t_end, lambda gpe: EIPRK4, names), stable_steps)
+
+
+def other(base: Callable[..., Any], steps: Sequence[float], *names: str) -> Contender:
+    """EIP on another one-step method, or without `names` that alone."""
+
+    def run(problem: FieldProblem, h: float, t_end: float) -> Any:
+        return _own(problem, h, t_end, lambda gpe: eip_method(base(gpe)), names)
+
+    return Contender(run, lambda problem: steps)
+
+
+def implicit(scheme: Callable[..., Any]) -> Contender:
+    """One of the paper's schemes."""
+
+    def run(problem: FieldProblem, h: float, t_end: float) -> tuple[np.ndarray, int, str]:
+        result = scheme(problem.equation, (0.0, t_end), problem.y0, h)
+        return result.y, result.nfev, "" if result.message == "completed" else result.message
+
+    return Contender(run, lambda problem: LONG)
+
+
+METHODS = {
+    "RK4": runge_kutta(),
+    "EIP-M": runge_kutta("mass"),
+    "EIP-E": runge_kutta("energy"),
+    "EIP-ME": runge_kutta(*KEPT),
+    "CN": implicit(crank_nicolson),
+    "LIC": implicit(linearly_implicit),
+    "SAV/CN": implicit(sav_crank_nicolson),
+    "Strang": other(lambda gpe: Splitting(gpe, "strang"), LONG),
+    "splitting4-EIP": other(Splitting, FOURTH, *KEPT),
+}
+
+
+def modulated_wave(points: int) -> tuple[FieldProblem, np.ndarray]:
+    """A plane wave with bumps, and its state at the end by SciPy's DOP853 at its tightest."""
+    gpe = plane_wave((points, points), fft=make_transforms().name).equation
+    assert gpe is not None
+    x, y = gpe.grid.mesh()
+    psi0 = np.exp(1j * (x + y)) * (1 + 0.5 * np.cos(x) + 0.5 * np.sin(y))
+    problem = gpe.problem(psi0, T_END, name="modulated-wave")
+    fun = gpe.changed(fft="auto").fun  # with the least round-off
+    fine = solve_ivp(fun, (0.0, T_END), problem.y0, method="DOP853", rtol=3e-14, atol=1e-15)
+    return problem, fine.y[:, -1]
+
+
+class Trial:
+    """One problem: its runs, and what besides error and time they tell.
+
+    Parameters
+    ----------
+    problem : FieldProblem
+    exact : ndarray
+        Its end.
+
+    Attributes
+    ----------
+    rows : dict
+        By (method, h) the numbers of a run.
+    """
+
+    def __init__(self, problem: FieldProblem, exact: np.ndarray) -> None:
+        self.problem, self.exact = problem, exact
+        self.rows: dict[tuple[str, float], dict[str, Any]] = {}
+        self._single: dict[str, float] = {}  # seconds of a single step, set-up included
+
+    def runner(self, name: str) -> Callable[[float], tuple[float, np.ndarray]]:
+        """``run(h)`` of a method, for `work_precision`."""
+        method = METHODS[name]
+
+        def run(h: float) -> tuple[float, np.ndarray]:
+            begin = time.process_time()
+            method.run(self.problem, h, h)
+            between = time.process_time()
+            y, pairs, remark = method.run(self.problem, h, T_END)
+            seconds = time.process_time() - between
+            self._single[name] = min(self._single.get(name, np.inf), between - begin)
+            self.rows[name, h] = {"method": name, "h": h, "pairs": pairs, "remark": remark, **self.errors(y)}
+            return seconds, y[:, -1]
+
+        return run
+
+    def errors(self, y: np.ndarray) -> dict[str, float]:
+        """Errors at the end, those of mass and energy relative."""
+        gpe, (start, end) = self.problem.equation, y.T
+        assert gpe is not None
+        difference = end - self.exact
+        return {
+            "error_max": float(np.abs(difference).max()),
+            "error_L2": float(np.sqrt(gpe.mass(difference))),
+            "error_mass": abs(gpe.mass(end) / gpe.mass(start) - 1),
+            "error_energy": abs(gpe.energy(end) / gpe.energy(start) - 1),
+        }
+
+    def methods(self) -> dict[str, tuple[Callable[[float], tuple[float, np.ndarray]], Sequence[float]]]:
+        """All runners with their steps."""
+        return {name: (self.runner(name), method.steps(self.problem)) for name, method in METHODS.items()}
+
+    def measure(self, repeats: int, callback: Callable[[], Any]) -> None:
+        """Fill `rows`; `callback()` after each run."""
+
+        def error(end: np.ndarray) -> float:
+            return float(np.abs(end - self.exact).max())
+
+        found = work_precision(self.methods(), error, repeats=repeats, enough_seconds=np.inf, callback=callback)
+        for point in found.points:
+            self.rows[point.method, point.step]["seconds"] = point.wall_time - self._single[point.method]
+
+    def column(self, name: str, key: str) -> np.ndarray:
+        """A quantity of a method, by its steps."""
+        return np.array([row[key] for (method, _), row in self.rows.items() if method == name])
+
+    def slope(self, name: str) -> float:
+        """Fitted order; nan where two clean errors are not to be had, as of a splitting on the plane wave."""
+        h, error = self.column(name, "h"), self.column(name, "error_max")
+        clean = np.flatnonzero((error > FIT_BETWEEN[0]) & (error < FIT_BETWEEN[1]))[-FITTED:]
+        return float(np.polyfit(np.log(h[clean]), np.log(error[clean]), 1)[0]) if clean.size > 1 else float("nan")
+
+
+class Slope(NamedTuple):
+    """A slope or an invariant's error, as it should be and as it is."""
+
+    wave: str
+    quantity: str
+    known: float
+    ours: float
+    slack: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether they agree."""
+        return abs(self.ours - self.known) <= self.slack
+
+
+Found = dict[str, Trial]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Efficiency(Study[Found]):
+    """``reproduce fig-efficiency``: all methods on both waves.
+
+    Attributes
+    ----------
+    points : int
+        Along each axis.
+    repeats : int
+        Runs of each, the least time of which counts.
+    orders : mapping of str to int
+        What the slopes should be.
+    stem : str
+        Of the files' names.
+    """
+
+    points: int = 64
+    repeats: int = 3
+    orders: Mapping[str, int] = field(default_factory=lambda: ORDERS)
+    stem: str = "fig-efficiency"
+
+    def measure(self, session: Session) -> Found:
+        plane = plane_wave((self.points, self.points), t_end=T_END, fft=make_transforms().name)
+        assert plane.reference is not None
+        exact = plane.reference(T_END)
+        assert exact is not None
+        trials = dict(zip(WAVES, (Trial(plane, exact), Trial(*modulated_wave(self.points))), strict=True))
+        total = self.repeats * sum(len(steps) for trial in trials.values() for _, steps in trial.methods().values())
+        with session.bar(total, "fig-efficiency") as bar:
+            for trial in trials.values():
+                trial.measure(self.repeats, bar.update)
+        return trials
+
+    def checks(self, found: Found) -> list[Slope]:
+        """Compare the slopes with the methods' orders, and what EIP-ME leaves of its invariants with round-off."""
+        slopes = [
+            Slope(wave, f"slope of {name}", order, trial.slope(name), SLOPE_TOLERANCE)
+            for wave, trial in found.items()
+            for name, order in self.orders.items()
+        ]
+        left = max(float(found[WAVES[1]].column("EIP-ME", f"error_{name}").max()) for name in KEPT)
+        known = [slope for slope in slopes if not np.isnan(slope.ours)]
+        return [*known, Slope(WAVES[1], "mass and energy of EIP-ME", 0.0, left, LEFT)]
+
+    def text(self, found: Found) -> str:
+        parts = [describe_machine()]
+        for wave, trial in found.items():
+            body = []
+            for name in METHODS:
+                cost, error = trial.column(name, "seconds"), trial.column(name, "error_max")
+                numbers = [_number(trial.slope(name), ".2f")]
+                body.append((name, numbers + [_number(cost_to_reach(cost, error, level), ".2g") for level in LEVELS]))
+            parts.append(f"{wave}: slope in h, and processor seconds to reach an error (max)")
+            parts.append(table([["slope"], *([f"{level:.0e}"] for level in LEVELS)], body))
+        checks = self.checks(found)
+        failed = [check for check in checks if not check.passed]
+        parts.append(f"{len(checks) - len(failed)} of {len(checks)} slopes and invariants are as they should be.")
+        parts += [f"FAILED {c.wave}, {c.quantity}: {c.ours:.3g}, known {c.known:.3g}" for c in failed]
+        return "\n\n".join(parts)
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        names = ("wave", "quantity", "known", "ours")
+        return {
+            "checks": [
+                {**{name: getattr(check, name) for name in names}, "matched": check.passed}
+                for check in self.checks(found)
+            ]
+        }
+
+    def tables(self, found: Found) -> dict[str, Rows]:
+        return {
+            f"{self.stem}.csv": [{"wave": wave, **row} for wave, trial in found.items() for row in trial.rows.values()]
+        }
+
+    def figures(self, found: Found) -> Figures:
+        """Error against step and against time, a row for each wave."""
+        from eip_scipy.plotting import CostPanel, cost_figure
+
+        rows = []
+        for wave, trial in found.items():
+            steps, times = (
+                {name: (trial.column(name, cost), trial.column(name, "error_max")) for name in METHODS}
+                for cost in ("h", "seconds")
+            )
+            slopes = {name: trial.slope(name) for name in SLOPES}
+            rows.append([CostPanel(wave, "step h", steps, slopes), CostPanel(wave, "processor time [s]", times)])
+        yield (
+            f"{self.stem}.png",
+            cost_figure(
+                rows,
+                error=r"max $|\delta\psi|$ at t = 1",
+                title=f"NLS equation, {self.points} x {self.points} points: accuracy and cost",
+            ),
+        )
+
+
+def _number(value: float, form: str) -> str:
+    return "-" if np.isnan(value) else f"{value:{form}}"
+
+
+def runs_text(trials: Found) -> str:
+    """Lay out all runs."""
+    parts = []
+    for wave, trial in trials.items():
+        body = []
+        for row in trial.rows.values():
+            errors = [f"{row[key]:.1e}" for key in ("error_max", "error_L2", "error_mass", "error_energy")]
+            pairs = f"{row['pairs'] * row['h'] / T_END:.1f}"
+            body.append((row["method"], [f"{row['h']:.2e}", *errors, pairs, f"{row['seconds']:.4f}", row["remark"]]))
+        heads = [["h"], ["error", "max"], ["error", "L2"], ["error of", "mass"], ["error of", "energy"]]
+        parts += [wave, table([*heads, ["pairs", "a step"], ["CPU [s]"], [""]], body)]
+    return "\n\n".join(parts)

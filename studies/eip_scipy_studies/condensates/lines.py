@@ -1,0 +1,167 @@
+"""``eip-scipy gpe vortex-lines``: the paper's condensate in three dimensions, turned faster; its lines in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from eip_scipy.problems import GrossPitaevskii
+from eip_scipy.problems.gross_pitaevskii import density_surface, line_condensate, rotated, vortices
+
+from ..report import compact, warn
+from ..study import Figures, Session
+from .runs import REFERENCE, SHOWN, FieldCheck, Motion, Quench, QuenchRuns, QuenchStudy
+from .states import (
+    LINE_POINTS,
+    LINES,
+    LINES_ENERGY,
+    SADDLE_ENERGY,
+    SADDLE_LINES,
+    Found,
+    cropped,
+    kept_state,
+    leave_saddle,
+    search_saddle,
+    searching,
+)
+
+__all__ = ["VortexLines"]
+
+OMEGA_BEFORE, OMEGA_AFTER = 0.7, 0.9
+LEVEL = 1e-3  # of the paper's surfaces
+SLICE = 5.0  # half the side of the paper's slices
+ROOM = ((-4.0, 4.0), (-4.0, 4.0), (-6.0, 6.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class VortexLines(QuenchStudy):
+    """The command.
+
+    The trap is round: what stands still in the slower frame goes on with it, and stays behind the faster one.
+
+    Attributes
+    ----------
+    points : int
+        Along each axis.
+    saved : float
+        Time between two saved states.
+    energies_known : float
+        How well the energies of the start and below it are.
+    turn_known : float
+        rad: at the lines a tenth of the distance between two points of the grid.
+    """
+
+    points: int = LINE_POINTS
+    t_end: float = 20.0
+    step: float = 5e-3
+    saved: float = 1.0
+    snapshots: tuple[float, ...] = (0.0, 4.0, 8.0, 12.0, 16.0, 20.0)
+    energies_known: float = 1e-4
+    turn_known: float = 0.02
+
+    def arguments(self) -> dict[str, Any]:
+        return {"h": self.step, "t_end": self.t_end}
+
+    def measure(self, session: Session) -> QuenchRuns:
+        """Search the state, show that it is a saddle, and do all runs."""
+        before, after = (line_condensate(Omega, self.points) for Omega in (OMEGA_BEFORE, OMEGA_AFTER))
+        start = kept_state(self, session, before, lambda update: search_saddle(self.points, update))
+        with searching(session) as update:
+            lower = leave_saddle(before, start, self.seed, update)
+        quench = Quench(
+            name="vortex-lines",
+            title=f"Vortex lines, Omega = {OMEGA_BEFORE:g} -> {OMEGA_AFTER:g}",
+            problem=after.problem(start, self.t_end, self.step, name="vortex-lines"),
+            reference_step=1e-2,
+            interval=self.saved,
+            snapshots=self.snapshots,
+            sense=-1,
+            energy_kept=1e-13,
+        )
+        made = self.do_runs(quench, session)
+        assert made.moved is not None
+        made.more = [*self._state_checks(before, start, lower), self._turn_check(made.moved)]
+        made.notes = [*_state_notes(before, start, lower), _grid_note(before, made, made.moved.t)]
+        return made
+
+    def _state_checks(self, gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[FieldCheck]:
+        saddle, count, state = gpe.energy(start), len(vortices(gpe, start).charges), lower.state
+        below = state.converged and abs(state.energy - LINES_ENERGY) < self.energies_known
+        return [
+            FieldCheck(f"E of the start {SADDLE_ENERGY}", saddle, abs(saddle - SADDLE_ENERGY) < self.energies_known),
+            FieldCheck(f"lines of the start, {SADDLE_LINES}", count, count == SADDLE_LINES),
+            FieldCheck(f"E below that saddle {LINES_ENERGY}", state.energy, below),
+            FieldCheck(f"lines there, {LINES}", lower.count, lower.count == LINES),
+        ]
+
+    def _turn_check(self, moved: Motion) -> FieldCheck:
+        """The lines turn by the difference of the rotations times t."""
+        slower = OMEGA_BEFORE - OMEGA_AFTER
+        off = float(np.abs(moved.angle - slower * moved.t).max())
+        return FieldCheck(f"angle off {slower:.1f} t by less than {self.turn_known:g} rad", off, off < self.turn_known)
+
+    def pictures(self, found: QuenchRuns) -> Figures:
+        """The plane z = 0, and surfaces of equal density."""
+        from eip_scipy.plotting import fields_figure, surfaces_figure
+
+        moved = found.moved
+        assert moved is not None
+        title, times = f"{found.quench.title}, {SHOWN}", found.quench.shown(moved.t)
+        slices = {f"t = {moved.t[k]:g}": _slice(found, moved, k) for k in times}
+        yield (
+            "vortex-lines-slices.png",
+            fields_figure(slices, title=f"{title}: density in the plane z = 0", shared=True),
+        )
+        try:
+            surfaces = {f"t = {moved.t[k]:g}": _surface(found, moved, k) for k in times}
+        except ImportError as error:
+            warn(f"no surfaces: {error}")
+            return
+        yield "vortex-lines-surfaces.png", surfaces_figure(surfaces, ROOM, title=rf"{title}: $|\psi|^2$ = {LEVEL:g}")
+
+
+def _state_notes(gpe: GrossPitaevskii, start: np.ndarray, lower: Found) -> list[str]:
+    residual = gpe.hamiltonian(start) - gpe.chemical_potential(start) * start
+    return [
+        f"Start: {len(vortices(gpe, start).charges)} lines, E = {gpe.energy(start):.8f}, residual "
+        f"{compact(float(np.sqrt(gpe.mass(residual))))}: a saddle. A little noise, and the descent",
+        f"goes on to {lower.count} lines, E = {lower.state.energy:.8f}, residual {compact(lower.state.residual)}",
+    ]
+
+
+def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
+    """How far the reference ends from the closed form, the start turned and with the phase of mu t."""
+    assert made.reference is not None
+    start = made.quench.problem.y0
+    mu, turn = before.chemical_potential(start), OMEGA_AFTER - OMEGA_BEFORE
+    exact = rotated(before, start, turn * t[-1]).reshape(-1) * np.exp(-1j * mu * t[-1])
+    off = np.sqrt(before.mass(made.reference[:, -1] - exact))
+    return (
+        f"{REFERENCE} ends {compact(float(off))} from the start turned by {-turn * t[-1]:g} rad: the error of the grid"
+    )
+
+
+def _slice(made: QuenchRuns, moved: Motion, k: int) -> Any:
+    from eip_scipy.plotting import FieldPanel
+
+    grid = made.quench.equation.grid
+    density = np.abs(_field(made, k)[:, :, grid.shape[2] // 2]) ** 2
+    shown = cropped(density, grid, (0, 1), SLICE)
+    return FieldPanel(*shown, ("x", "y"), moved.vortices[k].positions, moved.followed(k))
+
+
+def _surface(made: QuenchRuns, moved: Motion, k: int) -> Any:
+    """The surface, and the sector of it in which the line is that is followed."""
+    from eip_scipy.plotting import SurfacePanel
+
+    surface = density_surface(made.quench.equation, _field(made, k), LEVEL)
+    x, y, _ = surface.corners.mean(axis=1).T
+    followed = np.abs(moved.off(k, x, y)) < np.pi / len(moved.vortices[k].charges)
+    return SurfacePanel(surface.corners, np.where(surface.inside, 1 + followed, 0))
+
+
+def _field(made: QuenchRuns, k: int) -> np.ndarray:
+    assert made.fields is not None
+    return made.quench.equation.as_field(made.fields[:, k])

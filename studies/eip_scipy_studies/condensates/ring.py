@@ -1,0 +1,124 @@
+"""``eip-scipy gpe ring``: the paper's ring after its trap is tightened; vortices and invariants in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eip_scipy.problems import GrossPitaevskii
+from eip_scipy.problems.gross_pitaevskii import ring_condensate
+
+from ..long_runs import positive
+from ..report import UsageError
+from ..study import Figures, Session, option
+from .runs import SHOWN, Motion, Quench, QuenchRuns, QuenchStudy
+from .states import cropped, kept_state, load_state, search_ring
+
+__all__ = ["Ring"]
+
+FRAMES_PER_SECOND = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ring(QuenchStudy):
+    """The command.
+
+    The tightened ring contracts, keeps its angular momentum, and so turns faster than the frame: `sense` is 1.
+
+    Attributes
+    ----------
+    condensate : callable
+        ``condensate(kappa, points)``, the equation.
+    kappas : (float, float)
+        Before and after.
+    saved : float
+        Time between two saved states.
+    """
+
+    start: Path | None = option(
+        None, "ring.npz of ground-state; default: the state is searched first", type=Path, metavar="FILE"
+    )
+    t_end: float = option(
+        1.0, "end of the run (%(default)s); 10 in the paper's figure of the errors", type=positive, metavar="T"
+    )
+    movie: bool = option(False, "write ring.gif, too")
+    condensate: Callable[[float, int], GrossPitaevskii] = ring_condensate
+    points: int = 256
+    kappas: tuple[float, float] = (0.3, 0.7)
+    step: float = 2e-4
+    reference_step: float = 5e-4
+    saved: float = 0.02
+    snapshots: tuple[float, ...] = (0.0, 0.24, 0.44, 0.72, 0.8, 1.0)
+    sense: int = 1
+
+    def check_settings(self) -> None:
+        """See that there is a step to take."""
+        if self.t_end < self.reference_step:
+            least = f"{self.reference_step:g}, the reference's step"
+            raise UsageError(f"--t-end: expected at least {least}, got {self.t_end:g}")
+        super().check_settings()
+
+    def arguments(self) -> dict[str, Any]:
+        return {"h": self.step, "t_end": self.t_end}
+
+    def measure(self, session: Session) -> QuenchRuns:
+        """All runs, from the ground state: from a file, from beside the checkpoints, or searched."""
+        before, after = (self.condensate(kappa, self.points) for kappa in self.kappas)
+        if self.start is not None:
+            start = load_state(self.start, before)
+        else:
+            start = kept_state(self, session, before, partial(search_ring, self.seed))
+        quench = Quench(
+            name="ring",
+            title=f"Ring, kappa = {self.kappas[0]:g} -> {self.kappas[1]:g}",
+            problem=after.problem(start, self.t_end, self.step, name="ring"),
+            reference_step=self.reference_step,
+            interval=self.saved,
+            snapshots=self.snapshots,
+            sense=self.sense,
+            energy_kept=1e-12,
+        )
+        return self.do_runs(quench, session)
+
+    def pictures(self, found: QuenchRuns) -> Figures:
+        """Density and vortices at some times, and as a film."""
+        from eip_scipy.plotting import fields_figure, fields_movie
+
+        quench, fields, moved = found.quench, found.fields, found.moved
+        assert fields is not None
+        assert moved is not None
+        every = _panels(quench.equation, fields, moved)
+        shown = {f"t = {moved.t[k]:.2f}": every[k] for k in quench.shown(moved.t)}
+        yield (
+            "ring-snapshots.png",
+            fields_figure(shown, title=f"{quench.title}: density and vortices, {SHOWN}", shared=True),
+        )
+        if self.movie:
+            titles = [f"t = {t:.2f}" for t in moved.t]
+
+            def film(path: Path) -> None:
+                fields_movie(path, every, titles, per_second=FRAMES_PER_SECOND)
+
+            yield "ring.gif", film
+
+
+def _panels(gpe: GrossPitaevskii, y: np.ndarray, moved: Motion) -> list[Any]:
+    """One panel for each saved state, all of the first one's size, which is the largest."""
+    from eip_scipy.plotting import FieldPanel
+
+    fields = np.abs(gpe.grid.field(y)) ** 2
+    largest = fields.max(axis=0)
+    _, ends = cropped(largest, gpe.grid, (0, 1))
+    keep = [
+        np.flatnonzero((gpe.grid.points(axis) > ends[2 * axis]) & (gpe.grid.points(axis) < ends[2 * axis + 1]))
+        for axis in (0, 1)
+    ]
+    return [
+        FieldPanel(field[np.ix_(*keep)], ends, ("x", "y"), moved.vortices[k].positions, moved.followed(k))
+        for k, field in enumerate(fields)
+    ]

@@ -1,0 +1,396 @@
+"""Condensates after a quench, for `gpe ring` and `gpe vortex-lines`: runs, errors, vortices in time, checks, files."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eip_scipy import EIPDOP853, EIPRK4, EIPSolver, integrate
+from eip_scipy.problems import FieldProblem, GrossPitaevskii
+from eip_scipy.problems.gross_pitaevskii import Vortices, vortices
+
+from ..long_runs import Checkpoints, named
+from ..report import compact, describe_machine, table
+from ..study import Figures, PartlyDone, Rows, Session, Study, option
+
+__all__ = ["METHODS", "SHOWN", "FieldCheck", "FieldRun", "Motion", "Quench", "QuenchRuns", "QuenchStudy", "motion"]
+
+METHODS = {"EIP-M": ("mass",), "EIP-E": ("energy",), "EIP-ME": ("mass", "energy"), "RK4": ()}
+SHOWN = "EIP-ME"  # whose fields are kept, for the figures
+REFERENCE = "EIPDOP853"
+MASS_KEPT = 1e-14
+SMALL = 1e-3
+AXES = "seen from above, with x to the right and y up"
+SENSES = {1: "anticlockwise", -1: "clockwise"}
+
+
+class FieldCheck(NamedTuple):
+    """What must hold, its value, and whether it does."""
+
+    what: str
+    value: Any
+    passed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Quench:
+    """A condensate whose trap or rotation changes at t = 0, and what is to be seen of it.
+
+    Attributes
+    ----------
+    name : str
+        Of its files.
+    title : str
+    problem : FieldProblem
+        With the step of RK4, from the stationary state of the equation before.
+    reference_step : float
+        Of EIPDOP853, which the others are compared with.
+    interval : float
+        Time between two saved states, short enough to follow the vortices.
+    snapshots : tuple of float
+    sense : int
+        In which the vortices turn in the rotating frame: 1 anticlockwise, -1 clockwise.
+    energy_kept : float
+        Bound on the absolute error of the energy where it is kept.
+    """
+
+    name: str
+    title: str
+    problem: FieldProblem
+    reference_step: float
+    interval: float
+    snapshots: tuple[float, ...]
+    sense: int
+    energy_kept: float
+
+    @property
+    def equation(self) -> GrossPitaevskii:
+        """The equation after the quench."""
+        assert self.problem.equation is not None
+        return self.problem.equation
+
+    @property
+    def step(self) -> float:
+        """The step of RK4."""
+        assert self.problem.h is not None
+        return self.problem.h
+
+    @property
+    def t_end(self) -> float:
+        """End of the run."""
+        return self.problem.t_span[1]
+
+    def shown(self, t: np.ndarray) -> list[int]:
+        """Which of the saved times are those of the snapshots, as far as the run goes."""
+        return [int(np.argmin(np.abs(t - at))) for at in self.snapshots if at <= t[-1] + 1e-9]
+
+
+@dataclass(frozen=True, eq=False)
+class FieldRun:
+    """One method's run.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+    mass_error, energy_error, field_error : ndarray, shape (m,)
+        Absolute; the last is the norm of the difference from the reference.
+    wall_time : float
+    nfev : int
+    n_rank_reduced : int
+        Projections in which the gradients were parallel, as at a stationary state.
+    """
+
+    t: np.ndarray
+    mass_error: np.ndarray
+    energy_error: np.ndarray
+    field_error: np.ndarray
+    wall_time: float
+    nfev: int
+    n_rank_reduced: int
+
+
+@dataclass(eq=False)
+class QuenchRuns:
+    """The runs of a quench, those of `METHODS` that were done.
+
+    Attributes
+    ----------
+    quench : Quench
+    lines : dict of str to FieldRun
+    reference, fields : ndarray, shape (n, m), or None
+        States of the reference and of `SHOWN`.
+    moved : Motion or None
+        The vortices of `SHOWN`.
+    more : list of FieldCheck
+        Checks beside those of all quenches.
+    notes : list of str
+        Lines for the head of the table.
+    """
+
+    quench: Quench
+    lines: dict[str, FieldRun] = field(default_factory=dict)
+    reference: np.ndarray | None = None
+    fields: np.ndarray | None = None
+    moved: Motion | None = None
+    more: list[FieldCheck] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The vortices in time, in three dimensions those of the middle plane.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+    vortices : list of Vortices
+    angle : ndarray, shape (m,)
+        By how much they have turned about the centre, on average, positive anticlockwise [rad].
+    """
+
+    t: np.ndarray
+    vortices: list[Vortices]
+    angle: np.ndarray
+
+    def off(self, k: int, x: Any, y: Any) -> Any:
+        """Angles of points from where one vortex, the rightmost at the start, is in the state k, in (-pi, pi]."""
+        a, b = self.vortices[0].positions[np.argmax(self.vortices[0].positions[:, 0])]
+        return np.angle(np.exp(1j * (np.arctan2(y, x) - np.arctan2(b, a) - self.angle[k])))
+
+    def followed(self, k: int) -> int | None:
+        """Which of the vortices in the state k that one is; None where there is none."""
+        if not (self.vortices[0].charges.size and self.vortices[k].charges.size):
+            return None
+        return int(np.abs(self.off(k, *self.vortices[k].positions.T)).argmin())
+
+
+def _run(
+    quench: Quench,
+    progress: bool,
+    checkpoint_of: Callable[[str], dict[str, Any]],
+    name: str,
+    method: type[EIPSolver],
+    h: float,
+    invariants: Sequence[str],
+) -> Any:
+    chosen = quench.equation.invariants(invariants)
+    run = integrate(
+        quench.problem,
+        method=named(method, name),
+        h=h,
+        invariants=chosen,
+        save_every=round(quench.interval / h),
+        progress=progress,
+        **checkpoint_of(name),
+    )
+    if not run.success:
+        raise RuntimeError(f"{name} failed: {run.message}")
+    return run
+
+
+def _line(quench: Quench, run: Any, reference: np.ndarray) -> FieldRun:
+    gpe = quench.equation
+    mass, energy = (np.array([value(y) for y in run.y.T]) for value in (gpe.mass, gpe.energy))
+    difference = np.sqrt([gpe.mass(y - tight) for y, tight in zip(run.y.T, reference.T, strict=True)])
+    errors = np.abs(mass - mass[0]), np.abs(energy - energy[0])
+    return FieldRun(run.t, *errors, difference, run.wall_time, run.nfev, run.diagnostics.n_rank_reduced)
+
+
+def motion(gpe: GrossPitaevskii, t: np.ndarray, fields: np.ndarray) -> Motion:
+    """Follow the vortices: each goes on as before, then to the nearest one in the next state; the median counts.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+    t : ndarray, shape (m,)
+    fields : ndarray, shape (n, m)
+
+    Returns
+    -------
+    Motion
+    """
+    found = [vortices(gpe, y) for y in fields.T]
+    angles = [np.arctan2(*v.positions.T[::-1]) for v in found]
+    turned, step = [0.0], 0.0
+    for old, new in pairwise(angles):
+        step = _mean_turn(old, new, step)
+        turned.append(turned[-1] + step)
+    return Motion(t, found, np.array(turned))
+
+
+def _mean_turn(old: np.ndarray, new: np.ndarray, guess: float) -> float:
+    """Median of the turns from each old angle, `guess` added, to the nearest new one."""
+    if not (old.size and new.size):
+        return guess
+    difference = np.angle(np.exp(1j * (new[None, :] - old[:, None] - guess)))
+    nearest = np.abs(difference).argmin(axis=1)
+    return guess + float(np.median(difference[np.arange(old.size), nearest]))
+
+
+def _checks(made: QuenchRuns) -> list[FieldCheck]:
+    """Vortices keep their count and turn as they should, and each invariant that is kept is kept."""
+    found, quench, moved = [], made.quench, made.moved
+    if moved is not None:
+        at = quench.shown(moved.t)
+        counts = [len(moved.vortices[k].charges) for k in at]
+        found.append(FieldCheck("vortices in the snapshots", counts, counts[0] > 0 and len(set(counts)) == 1))
+        if len(at) > 1:
+            turned = float(moved.angle[at[-1]])
+            sense = f"vortices turn {SENSES[quench.sense]}, angle at t = {moved.t[at[-1]]:g} [rad]"
+            found.append(FieldCheck(sense, turned, quench.sense * turned > 0))
+    for name, line in made.lines.items():
+        for item, bound in (("mass", MASS_KEPT), ("energy", quench.energy_kept)):
+            if item in METHODS[name]:
+                error = float(getattr(line, f"{item}_error").max())
+                found.append(FieldCheck(f"{name}: error of the {item} below {bound:.0e}", error, error < bound))
+    return found
+
+
+def _text(made: QuenchRuns, found: Sequence[FieldCheck]) -> str:
+    """Lay out the errors, the vortices and the checks."""
+    quench, moved = made.quench, made.moved
+    head = [["wall time", "[s]"], ["evaluations", "of f"], ["error of", "mass"], ["error of", "energy"]]
+    head += [["error of", "psi"], ["rank", "reduced"]]
+    body = [(name, _cells(line)) for name, line in made.lines.items()]
+    out = [
+        f"{quench.title}, RK4, h = {quench.step:g}, to t = {quench.t_end:g}",
+        describe_machine(),
+        f"Largest errors, absolute; that of psi is the norm of the difference from {REFERENCE}, "
+        f"h = {quench.reference_step:g}",
+        *made.notes,
+        "",
+        table(head, body),
+        "",
+    ]
+    if moved is not None:
+        where = [
+            (f"t = {moved.t[k]:.2f}", [str(len(v.charges)), _radius(v), f"{moved.angle[k]:+.3f}"])
+            for k in quench.shown(moved.t)
+            for v in (moved.vortices[k],)
+        ]
+        out += [
+            f"Vortices, in the rotating frame; turned: positive anticlockwise, {AXES}",
+            "",
+            table([["number"], ["mean radius"], ["turned [rad]"]], where),
+            "",
+        ]
+    for item in found:
+        out.append(f"{'ok' if item.passed else 'FAILED':<6} {item.what}: {_value(item.value)}")
+    if moved is not None and len(quench.shown(moved.t)) < 2:
+        before = f"the run ends before t = {quench.snapshots[1]:g}"
+        out.append(f"{'-':<6} not checked: in which sense the vortices turn, for {before}")
+    return "\n".join(out)
+
+
+def _value(value: Any) -> str:
+    """A check's number, an error short and what is not small with the digits that it is compared in."""
+    if isinstance(value, float):
+        return compact(value, 3) if abs(value) < SMALL else f"{value:.6g}"
+    return str(value)
+
+
+def _cells(line: FieldRun) -> list[str]:
+    errors = (compact(float(e.max())) for e in (line.mass_error, line.energy_error, line.field_error))
+    return [compact(line.wall_time, 3), str(line.nfev), *errors, str(line.n_rank_reduced)]
+
+
+def _radius(found: Vortices) -> str:
+    return f"{np.hypot(*found.positions.T).mean():.3f}" if found.charges.size else "-"
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuenchStudy(Checkpoints, Study[QuenchRuns]):
+    """What the commands on quenches have in common."""
+
+    seed: int = option(0, "of the random starts (%(default)s)", type=int, metavar="N")
+
+    def do_runs(self, quench: Quench, session: Session) -> QuenchRuns:
+        """Run the reference and each of `METHODS`; what the user interrupts leaves those that were done.
+
+        Raises
+        ------
+        RuntimeError
+            When a run fails.
+        """
+        made = QuenchRuns(quench)
+        run = partial(_run, quench, session.shown, self.checkpoint_options)
+        try:
+            made.reference = run(REFERENCE, EIPDOP853, quench.reference_step, METHODS[SHOWN]).y
+            for name, invariants in METHODS.items():
+                done = run(name, EIPRK4, quench.step, invariants)
+                made.lines[name] = _line(quench, done, made.reference)
+                if name == SHOWN:
+                    made.fields = done.y
+        except KeyboardInterrupt:
+            if not made.lines:
+                raise
+            made.moved = _moved(made)
+            raise PartlyDone(made) from None
+        made.moved = _moved(made)
+        return made
+
+    def text(self, found: QuenchRuns) -> str:
+        return _text(found, self.checks(found))
+
+    def checks(self, found: QuenchRuns) -> list[FieldCheck]:
+        return [*_checks(found), *found.more]
+
+    def tables(self, found: QuenchRuns) -> dict[str, Rows]:
+        return {f"{found.quench.name}.csv": _rows(found)}
+
+    def numbers(self, found: QuenchRuns) -> dict[str, Any]:
+        numbers: dict[str, Any] = {
+            "errors": _rows(found),
+            "wall_time_s": {name: line.wall_time for name, line in found.lines.items()},
+            "rank_reduced": {name: line.n_rank_reduced for name, line in found.lines.items()},
+            "checks": [check._asdict() for check in self.checks(found)],
+        }
+        if found.moved is not None:
+            numbers |= {"vortices": [len(v.charges) for v in found.moved.vortices], "turned_rad": found.moved.angle}
+        return numbers
+
+    def figures(self, found: QuenchRuns) -> Figures:
+        """The errors in time, and what the fields look like."""
+        from eip_scipy.plotting import ErrorSeries, errors_figure
+
+        quench = found.quench
+        mass, energy = (abs(value(quench.problem.y0)) for value in (quench.equation.mass, quench.equation.energy))
+        series = {
+            name: ErrorSeries(
+                line.t, {"mass": line.mass_error / mass, "energy": line.energy_error / energy}, line.field_error
+            )
+            for name, line in found.lines.items()
+        }
+        title = f"{quench.title}, RK4, h = {quench.step:g}"
+        figure = errors_figure(series, time="t", trajectory=r"error of $\psi$ (norm)", title=title)
+        yield f"{quench.name}-errors.png", figure
+        yield from self.pictures(found)
+
+    @abstractmethod
+    def pictures(self, found: QuenchRuns) -> Figures:
+        """Of the fields."""
+
+
+def _moved(made: QuenchRuns) -> Motion | None:
+    return None if made.fields is None else motion(made.quench.equation, made.lines[SHOWN].t, made.fields)
+
+
+def _rows(made: QuenchRuns) -> Rows:
+    """Make the lines of the CSV file."""
+    return [
+        {
+            "method": name,
+            "t": line.t[k],
+            "mass_error": line.mass_error[k],
+            "energy_error": line.energy_error[k],
+            "field_error": line.field_error[k],
+        }
+        for name, line in made.lines.items()
+        for k in range(line.t.size)
+    ]

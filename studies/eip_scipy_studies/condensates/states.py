@@ -1,0 +1,419 @@
+"""``eip-scipy gpe ground-state``: ground states in a harmonic trap, the paper's ring, and its vortex lines."""
+
+from __future__ import annotations
+
+import argparse
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
+from eip_scipy.problems.gross_pitaevskii import (
+    GroundState,
+    ground_state,
+    imprint,
+    line_condensate,
+    lowest_ring,
+    polygon,
+    ring_condensate,
+    vortex_starts,
+    vortices,
+    with_noise,
+)
+
+from ..long_runs import Checkpoints
+from ..report import UsageError, compact, describe_machine, table, write_file
+from ..study import Figures, Rows, Session, Study, option, some_of
+
+__all__ = [
+    "LINES",
+    "LINES_ENERGY",
+    "SADDLE_ENERGY",
+    "SADDLE_LINES",
+    "SCENES",
+    "Found",
+    "GroundStates",
+    "KnownState",
+    "kept_state",
+    "leave_saddle",
+    "load_state",
+    "save_state",
+    "search_ring",
+    "search_saddle",
+    "searching",
+]
+
+# V = r^2 / 2, beta = 100: angular velocity and published energy.
+PUBLISHED = {0.0: 3.9459469, 0.65: 3.6506129, 0.71: 3.4997148, 0.76: 3.3475310, 0.80: 3.1904172}
+PUBLISHED_DIGITS = 1e-5
+RING_ENERGY, LINES_ENERGY, LINES = -115.270, 3.3029, 2
+SADDLE_ENERGY, SADDLE_LINES = 3.3293, 4  # of the state in the paper's figure
+RING_POINTS, LINE_POINTS = 256, 64
+TRAP_TOLERANCE, RING_TOLERANCE, LINES_TOLERANCE, SADDLE_TOLERANCE = 1e-6, 1e-8, 1e-5, 1e-8
+MOST_LINES, LINES_RADIUS, LINES_ITERATIONS = 4, 1.5, 1000
+VISIBLE, MARGIN = 1e-3, 1.15  # part of the density that a figure shows, and the room around it
+Update = Callable[[str], Any]
+Ends = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A stationary state and where it came from.
+
+    Attributes
+    ----------
+    label : str
+        What told its start from the others.
+    equation : GrossPitaevskii
+    state : GroundState
+    published : float or None
+    """
+
+    label: str
+    equation: GrossPitaevskii
+    state: GroundState
+    published: float | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of vortices, in three dimensions in the middle plane."""
+        return len(vortices(self.equation, self.state.psi).charges)
+
+
+def trap(settings: GroundStates, update: Update) -> list[Found]:
+    """The lowest of several starts for each rotation."""
+    grid = Grid((settings.trap_points, settings.trap_points), -10.0, 10.0)
+    found = []
+    for Omega, published in settings.published.items():
+        gpe = GrossPitaevskii(grid, harmonic_trap(1.0, 1.0), Omega=Omega, beta=100.0)
+        states = []
+        for start in vortex_starts(gpe, settings.starts if Omega else 1, settings.seed):
+            update(f"trap, Omega = {Omega:g}")
+            states.append(ground_state(gpe, start, tol=TRAP_TOLERANCE))
+        best = min(states, key=lambda state: state.energy)
+        found.append(Found(f"Omega = {Omega:.2f}", gpe, best, published))
+    return found
+
+
+def ring(settings: GroundStates, update: Update) -> list[Found]:
+    """The paper's ring."""
+    return [search_ring(settings.seed, update)]
+
+
+def search_ring(seed: int, update: Update) -> Found:
+    """Walk over numbers of vortices and windings to the ground state of the paper's ring."""
+    gpe = ring_condensate(points=RING_POINTS)
+    tried: list[tuple[float, int, int]] = []
+
+    def report(count: int, winding: int, energy: float) -> None:
+        tried.append((energy, count, winding))
+        update(f"ring, {count} vortices around a winding of {winding}")
+
+    state = lowest_ring(gpe, tol=RING_TOLERANCE, seed=seed, report=report)
+    _, count, winding = min(tried)
+    return Found(f"{count} around {winding}", gpe, state)
+
+
+def lines(settings: GroundStates, update: Update) -> list[Found]:
+    """States of the paper's 3D condensate from starts with 0 ... 4 lines, and the saddle with four."""
+    gpe = line_condensate(points=LINE_POINTS)
+    rng = np.random.default_rng(settings.seed)
+    found = []
+    for count in range(MOST_LINES + 1):
+        update(f"lines, {count} imprinted")
+        start = with_noise(imprint(gpe, polygon(count, LINES_RADIUS if count > 1 else 0.0)), rng)
+        state = ground_state(gpe, start, tol=LINES_TOLERANCE, max_iterations=LINES_ITERATIONS)
+        found.append(Found(f"{count} imprinted", gpe, state))
+    return [*found, search_saddle(LINE_POINTS, update)]
+
+
+def search_saddle(points: int, update: Update) -> Found:
+    """The paper's state with four lines, a saddle: the start has a square's symmetry, and the descent keeps it."""
+    update(f"lines, {SADDLE_LINES} imprinted without noise")
+    gpe = line_condensate(points=points)
+    start = imprint(gpe, polygon(SADDLE_LINES, LINES_RADIUS))
+    return Found(f"{SADDLE_LINES} without noise: a saddle", gpe, ground_state(gpe, start, tol=SADDLE_TOLERANCE))
+
+
+def leave_saddle(gpe: GrossPitaevskii, saddle: np.ndarray, seed: int, update: Update) -> Found:
+    """Where the descent goes from a state with a little noise: from a saddle to a lower state."""
+    update("lines, down from the saddle")
+    start = with_noise(saddle, np.random.default_rng(seed))
+    state = ground_state(gpe, start, tol=LINES_TOLERANCE, max_iterations=LINES_ITERATIONS)
+    return Found("down from the saddle", gpe, state)
+
+
+Scene = Callable[["GroundStates", Update], list[Found]]
+SCENES: dict[str, Scene] = {"trap": trap, "ring": ring, "lines": lines}
+TITLES = {
+    "trap": "trap: V = r^2 / 2, beta = 100; lowest of {starts} starts for each Omega",
+    "ring": "ring: V = -0.1 r^2 + 0.075 r^4, beta = 1000, Omega = 3.5; a row of vortices around a winding",
+    "lines": "lines: V = (x^2 + y^2 + z^2 / 4) / 2, beta = 400, Omega = 0.7; by lines imprinted on the start",
+}
+Results = dict[str, list[Found]]
+
+
+class KnownState(NamedTuple):
+    """A number of a state that is known, and ours."""
+
+    quantity: str
+    known: float
+    ours: float
+    passed: bool
+    note: str = ""
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """For the JSON."""
+        known = {"quantity": self.quantity, "known": self.known, "ours": self.ours}
+        return {**known, "matched": self.passed, "note": self.note}
+
+    @property
+    def line(self) -> str:
+        """One line of the text."""
+        note = f" ({self.note})" if self.note else ""
+        verdict = "ok" if self.passed else "FAILED"
+        return f"{verdict:<6} {self.quantity} {self.known:.10g}, ours {self.ours:.10g}{note}"
+
+
+def _count(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected an integer >= 1, got {text!r}")
+    return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundStates(Study[Results]):
+    """The command."""
+
+    scene: Sequence[str] | None = some_of("scene", SCENES)
+    starts: int = option(4, "starts for each rotation in the trap (%(default)s)", type=_count, metavar="N")
+    seed: int = option(0, "of the random starts (%(default)s)", type=int, metavar="N")
+    scenes: Mapping[str, Scene] = field(default_factory=lambda: SCENES)
+    published: Mapping[float, float] = field(default_factory=lambda: PUBLISHED)
+    trap_points: int = 128
+
+    def arguments(self) -> dict[str, Any]:
+        return {"scenes": list(dict.fromkeys(self.scene or self.scenes)), "starts": self.starts, "seed": self.seed}
+
+    def measure(self, session: Session) -> Results:
+        with searching(session) as update:
+            return {name: self.scenes[name](self, update) for name in self.arguments()["scenes"]}
+
+    def checks(self, found: Results) -> list[KnownState]:
+        """Compare with known energies. A lower energy than a published one is no miss."""
+        checks = []
+        for item in found.get("trap", ()):
+            known, ours = self.published[item.equation.Omega], item.state.energy
+            below = ours < known - PUBLISHED_DIGITS
+            matched = item.state.converged and (below or abs(ours - known) <= PUBLISHED_DIGITS)
+            checks.append(KnownState(f"trap, {item.label}: E", known, ours, matched, "lower" if below else ""))
+        for item in found.get("ring", ()):
+            good = item.state.converged and item.state.energy <= RING_ENERGY
+            checks.append(KnownState("ring: E at most", RING_ENERGY, item.state.energy, good))
+        if "lines" in found:
+            best = min(found["lines"], key=lambda item: item.state.energy)
+            good = best.state.converged and abs(best.state.energy - LINES_ENERGY) < 1e-4
+            checks.append(KnownState("lines: lowest E", LINES_ENERGY, best.state.energy, good))
+            checks.append(KnownState("lines: of the lowest", LINES, best.count, best.count == LINES))
+            saddle = found["lines"][-1]
+            good = saddle.state.converged and abs(saddle.state.energy - SADDLE_ENERGY) < 1e-4
+            checks.append(KnownState("lines: E of the saddle", SADDLE_ENERGY, saddle.state.energy, good))
+            checks.append(KnownState("lines: of the saddle", SADDLE_LINES, saddle.count, saddle.count == SADDLE_LINES))
+        return checks
+
+    def text(self, found: Results) -> str:
+        head = [["E"], ["mu"], ["residual"], ["iterations"], ["vortices"]]
+        machine = f"{describe_machine()}; residual: norm of H psi - mu psi."
+        out = ["Ground states of the rotating Gross-Pitaevskii equation", machine]
+        for name, states in found.items():
+            size = " x ".join(map(str, states[0].equation.grid.shape))
+            out += ["", f"{TITLES[name].format(starts=self.starts)}", f"{size} points", ""]
+            known = [["published"], ["difference"]] if name == "trap" else []
+            out.append(table([*head, *known], [(item.label, _cells(item)) for item in states]))
+            out += [f"  {item.label}: {item.state.message}" for item in states if not item.state.converged]
+        return "\n".join([*out, "", *(check.line for check in self.checks(found))])
+
+    def tables(self, found: Results) -> dict[str, Rows]:
+        return {"ground-states.csv": _rows(found)}
+
+    def numbers(self, found: Results) -> dict[str, Any]:
+        return {"states": _rows(found), "checks": [check.record for check in self.checks(found)]}
+
+    def figures(self, found: Results) -> Figures:
+        """The fields that `gpe ring` starts from, as files; densities and vortices."""
+        for name, states in found.items():
+            if name != "trap":
+                yield f"{name}.npz", partial(_save, min(states, key=lambda item: item.state.energy))
+
+        from eip_scipy.plotting import fields_figure
+
+        for name, states in found.items():
+            shown = panels(name, states)
+            figure = fields_figure(shown, title=TITLES[name].split(";")[0], columns=3 if len(shown) <= 6 else 4)
+            yield f"ground-state-{name}.png", figure
+
+
+def _cells(item: Found) -> list[str]:
+    state = item.state
+    numbers = [f"{state.energy:.8f}", f"{state.mu:.8f}", compact(state.residual), str(state.iterations)]
+    known = [] if item.published is None else [f"{item.published:.7f}", f"{state.energy - item.published:+.1e}"]
+    return [*numbers, str(item.count), *known]
+
+
+def _rows(results: Results) -> Rows:
+    """Make the lines of the CSV file."""
+    return [
+        {
+            "scene": name,
+            "start": item.label,
+            "Omega": item.equation.Omega,
+            "beta": item.equation.beta,
+            "energy": item.state.energy,
+            "published": item.published,
+            "mu": item.state.mu,
+            "residual": item.state.residual,
+            "iterations": item.state.iterations,
+            "converged": item.state.converged,
+            "vortices": item.count,
+        }
+        for name, found in results.items()
+        for item in found
+    ]
+
+
+def panels(name: str, found: list[Found]) -> dict[str, Any]:
+    """Densities to draw: one panel for each state, of lines in the plane z = 0 and of the lowest in x = 0 too."""
+    from eip_scipy.plotting import FieldPanel
+
+    out = {}
+    for item in found:
+        grid = item.equation.grid
+        density = np.abs(item.state.psi) ** 2
+        if grid.dim == 3:
+            density = density[:, :, grid.shape[2] // 2]
+        where = vortices(item.equation, item.state.psi).positions
+        kind = "line" if name == "lines" else "vortex"
+        title = f"{item.label}\nE = {item.state.energy:.6f}, {_counted(item.count, kind)}"
+        out[title] = FieldPanel(*cropped(density, grid, (0, 1)), ("x", "y"), where)
+    if name == "lines":
+        item = min(found, key=lambda item: item.state.energy)
+        grid = item.equation.grid
+        side = np.abs(item.state.psi[grid.shape[0] // 2]) ** 2
+        out["the lowest, x = 0"] = FieldPanel(*cropped(side, grid, (1, 2)), ("y", "z"), np.zeros((0, 2)))
+    return out
+
+
+def _counted(count: int, kind: str) -> str:
+    plural = {"vortex": "vortices", "line": "lines"}[kind]
+    return f"{count or 'no'} {kind if count == 1 else plural}"
+
+
+def cropped(
+    density: np.ndarray, grid: Grid, axes: tuple[int, int], half: float | None = None
+) -> tuple[np.ndarray, Ends]:
+    """The middle of a plane, by default with little of the empty space around the condensate, and its ends."""
+    if half is None:
+        seen = (np.any(density > VISIBLE * density.max(), axis=1 - k) for k in (0, 1))
+        half = MARGIN * max(float(np.abs(grid.points(a)[there]).max()) for a, there in zip(axes, seen, strict=True))
+    keep = [np.flatnonzero(np.abs(grid.points(axis)) <= half) for axis in axes]
+    a, b, c, d = (
+        float(grid.points(axis)[k[edge]] + shift * grid.spacing[axis])
+        for axis, k in zip(axes, keep, strict=True)
+        for edge, shift in ((0, -0.5), (-1, 0.5))
+    )
+    return density[np.ix_(*keep)], (a, b, c, d)
+
+
+def save_state(path: Path, item: Found) -> Path:
+    """Write a state as an npz file without pickled objects."""
+    return write_file(path, partial(_save, item))
+
+
+def _save(item: Found, path: Path) -> None:
+    gpe, state = item.equation, item.state
+    content: dict[str, Any] = {
+        "psi": state.psi,
+        "V": gpe.V,
+        "lower": gpe.grid.lower,
+        "upper": gpe.grid.upper,
+        "Omega": gpe.Omega,
+        "beta": gpe.beta,
+        "energy": state.energy,
+        "mu": state.mu,
+        "residual": state.residual,
+    }
+    np.savez_compressed(path, **content)
+
+
+@contextmanager
+def searching(session: Session) -> Iterator[Update]:
+    """Show what is searched, and for how long; yields what takes the words for it."""
+    with session.bar(None, "", bar_format="{desc} [{elapsed}]") as bar:
+        yield bar.set_description_str
+
+
+def kept_state(
+    settings: Checkpoints, session: Session, gpe: GrossPitaevskii, search: Callable[[Update], Found]
+) -> np.ndarray:
+    """The field to start from: with ``--resume`` the one beside the checkpoints, else the one that `search` finds.
+
+    Parameters
+    ----------
+    settings : Checkpoints
+    session : Session
+    gpe : GrossPitaevskii
+    search : callable
+        ``search(update)``.
+
+    Returns
+    -------
+    ndarray, shape (J, K[, L])
+    """
+    kept = None if settings.checkpoint is None else settings.checkpoint / "state.npz"
+    if kept is not None and settings.resume and kept.exists():
+        return load_state(kept, gpe)
+    with searching(session) as update:
+        found = search(update)
+    if kept is not None:
+        save_state(kept, found)
+    return found.state.psi
+
+
+def load_state(path: Path, gpe: GrossPitaevskii) -> np.ndarray:
+    """Read the field of a state of `save_state`, which must be one of `gpe`.
+
+    Raises
+    ------
+    UsageError
+        When the file cannot be read, or holds a state of another grid or equation.
+    """
+    try:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+            content = {name: file[name] for name in ("psi", "V", "lower", "upper", "Omega", "beta")}
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise UsageError(f"cannot read a state from {str(path)!r}: {error}") from error
+    expected: dict[str, Any] = {
+        "lower": gpe.grid.lower,
+        "upper": gpe.grid.upper,
+        "Omega": gpe.Omega,
+        "beta": gpe.beta,
+        "V": gpe.V,
+    }
+    for name, value in expected.items():
+        if np.shape(value) != content[name].shape or not np.allclose(value, content[name], rtol=1e-12):
+            raise UsageError(f"{str(path)!r} holds a state of another equation: its {name} differs from {gpe!r}")
+    psi = content["psi"]
+    if psi.shape != gpe.grid.shape or psi.dtype.kind != "c" or not np.isfinite(psi).all():
+        raise UsageError(f"{str(path)!r}: psi must be a finite complex field of shape {gpe.grid.shape}")
+    return psi

@@ -1,0 +1,137 @@
+"""``eip-scipy doctor``: what is installed, and whether it computes what it must, in seconds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPRK4, EIPRKN12, ensemble, integrate
+from eip_scipy.core.config import configuration, described
+from eip_scipy.problems import kepler, solar_system
+
+from .report import compact, describe_machine, table, warn
+from .study import Session, Study
+
+__all__ = ["Doctor"]
+
+DEFECT, DISTANCE, PLANETS = 1e-13, 1e-11, 1e-7
+
+
+class Trial(NamedTuple):
+    """What was looked at, the number found and the largest that will do."""
+
+    name: str
+    found: float
+    bound: float
+    seconds: float
+
+    @property
+    def passed(self) -> bool:
+        return bool(self.found <= self.bound)
+
+    def cells(self) -> tuple[str, ...]:
+        verdict = "ok" if self.passed else "FAILED"
+        return compact(self.found), compact(self.bound), f"{self.seconds:.2f}", verdict
+
+
+def _timed(name: str, bound: float, measure: Callable[[], float]) -> Trial:
+    begin = perf_counter()
+    try:
+        found = measure()
+    except Exception as error:  # a part that does not even run is what the command looks for
+        warn(f"{name}: {type(error).__name__}: {error}")
+        found = math.nan
+    return Trial(name, found, bound, perf_counter() - begin)
+
+
+def _defects() -> float:
+    """How far energy and angular momentum, by their formulas, go from their values at the start."""
+    problem = kepler(relativistic=0.0)
+    run = solve_ivp(problem.fun, (0, 20), problem.y0, method=EIPRK4, h=0.02, invariants=problem.invariants)
+    x, y, vx, vy = run.y
+    values = (vx**2 + vy**2) / 2 - 1 / np.hypot(x, y), x * vy - y * vx
+    return max(float(np.abs(value - value[0]).max()) for value in values)
+
+
+def _bits() -> float:
+    """Functions in Python and native ones: the largest difference of states, which must be none."""
+    problem = kepler()
+    runs = problem.solve_ivp((0, 20), method=EIPRK4, h=0.02), integrate(problem, (0, 20), method=EIPRK4, h=0.02)
+    return float(np.abs(runs[0].y[:, -1] - runs[1].y[:, -1]).max())
+
+
+def _orbit() -> float:
+    problem = kepler(relativistic=0.0)
+    assert problem.reference is not None
+    run = integrate(problem, (0, 20), method=EIPRKN12, h=0.1)
+    return float(np.abs(run.y[:, -1] - problem.reference(run.t[-1])).max())
+
+
+def _planets() -> float:
+    """A year of the solar system by two methods: the largest difference of places, in AU."""
+    problem = solar_system()
+    runs = [integrate(problem, (0, 1), method=method, h=1 / n) for method, n in ((EIPRKN12, 64), (EIPRK4, 2000))]
+    half = problem.y0.size // 2
+    return float(np.abs(runs[0].y[:half, -1] - runs[1].y[:half, -1]).max())
+
+
+def _members() -> float:
+    """Members of an ensemble and their single runs: the largest difference, which must be none."""
+    problem = kepler()
+    starts = problem.y0 * np.linspace(0.9, 1.1, 16)[:, None]
+    together = ensemble(problem, (0, 5), starts, method=EIPRK4, h=0.05, progress=False)
+    alone = [integrate(problem, (0, 5), start, method=EIPRK4, h=0.05).y[:, -1] for start in starts]
+    return float(np.abs(together.y - alone).max())
+
+
+CHECKS = (
+    ("solve_ivp keeps H and L", DEFECT, _defects),
+    ("Python and native functions: the same bits", 0.0, _bits),
+    ("Kepler's orbit: the closed form", DISTANCE, _orbit),
+    ("a year of the planets by two methods, AU", PLANETS, _planets),
+    ("members of an ensemble: the bits of single runs", 0.0, _members),
+)
+
+
+class Examined(NamedTuple):
+    """What the command found."""
+
+    installed: dict[str, Any]
+    trials: list[Trial]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor(Study[Examined]):
+    """The command."""
+
+    trials: tuple[tuple[str, float, Callable[[], float]], ...] = CHECKS
+    writes_files = False
+
+    def measure(self, session: Session) -> Examined:
+        """Look what is there, and run each trial."""
+        found = Examined(configuration(), [_timed(*trial) for trial in self.trials])
+        if failed := [trial.name for trial in found.trials if not trial.passed]:
+            names = ", ".join(failed)
+            warn(f"failed: {names}. This installation computes something else than it must; install it anew.")
+        return found
+
+    def text(self, found: Examined) -> str:
+        return _text(*found)
+
+    def numbers(self, found: Examined) -> dict[str, Any]:
+        trials = [{**trial._asdict(), "passed": trial.passed} for trial in found.trials]
+        return {"installation": found.installed, "checks": trials}
+
+    def checks(self, found: Examined) -> Sequence[Trial]:
+        return found.trials
+
+
+def _text(installed: dict[str, Any], trials: Sequence[Trial]) -> str:
+    rows = table((("found",), ("at most",), ("s",), ("",)), [(trial.name, trial.cells()) for trial in trials])
+    return "\n\n".join((described(installed), f"machine: {describe_machine()}", rows))

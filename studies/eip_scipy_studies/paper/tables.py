@@ -1,0 +1,384 @@
+"""``eip-scipy reproduce table1 ... table5``: the paper's numbers beside ours.
+
+The paper's numbers, their misprints and the same computations in 50 digits are data: ``data/paper_tables.json``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from decimal import Decimal
+from functools import cache
+from importlib.resources import files
+from itertools import groupby, pairwise
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPSolver, integrate
+from eip_scipy.core.diagnostics import observed_order
+from eip_scipy.ensembles.chunks import cores
+from eip_scipy.problems import Problem, harmonic, kepler, rotating_packet
+
+from ..beside import workers
+from ..study import Check, Rows, Session, Study
+
+__all__ = ["TABLES", "Cell", "PaperTable", "Value"]
+
+TABLES = ("table1", "table2", "table3", "table4", "table5")
+LONGEST = 5  # the table that takes minutes
+OMEGA = 10.0
+METHODS: dict[str, type[EIPSolver]] = {"RK1": EIPRK1, "RK2": EIPRK2, "RK3": EIPRK3, "RK4": EIPRK4}
+# check=False: the paper's longest steps are far too long, and nobody need be told.
+PAPER_SETTING: dict[str, Any] = {"metric": "euclidean", "reuse_f": False, "check": False}
+WIDE, NARROW, DIGITS = 12, 9, 8  # columns of the printed tables
+
+
+@dataclass(frozen=True)
+class Value:
+    """One number of the paper and ours.
+
+    Attributes
+    ----------
+    paper : str
+        The number as printed, its misprints corrected.
+    ours, mpmath : float
+        The same from this package in double precision, and in 50 digits (nan where that is out of reach).
+    roundoff : float
+        What round-off may change in it.
+    printed : str or None
+        What the paper prints, where that is a misprint.
+    """
+
+    paper: str
+    ours: float
+    mpmath: float
+    roundoff: float
+    printed: str | None = None
+
+    @property
+    def paper_digits(self) -> int:
+        """Significant digits that the paper prints."""
+        return len(Decimal(self.paper).as_tuple().digits)
+
+    @property
+    def digits(self) -> int:
+        """Leading significant digits that agree once both numbers are rounded to them."""
+        paper, ours = Decimal(self.paper), Decimal(self.ours)
+        for count in range(self.paper_digits, 0, -1):
+            place = Decimal(1).scaleb(paper.adjusted() - count + 1)
+            if paper.quantize(place) == ours.quantize(place):
+                return count
+        return 0
+
+    @property
+    def matched(self) -> bool:
+        """Whether every printed digit agrees."""
+        return self.digits == self.paper_digits
+
+    @property
+    def within_roundoff(self) -> bool:
+        """Whether ours lies within round-off of what the paper would print so, or of the number in 50 digits.
+
+        In the second case the round-off is the paper's.
+        """
+        half_unit = 0.5 * 10.0 ** int(Decimal(self.paper).as_tuple().exponent)
+        from_paper, from_exact = abs(self.ours - float(self.paper)), abs(self.ours - self.mpmath)
+        return from_paper <= half_unit + self.roundoff or from_exact <= self.roundoff
+
+    @property
+    def status(self) -> str:
+        """Either "matched", "round-off" or "differs"."""
+        if self.matched:
+            return "matched"
+        return "round-off" if self.within_roundoff else "differs"
+
+    def like_paper(self, value: float) -> str:
+        """`value` in the notation and with the digits of the paper."""
+        decimals = len(self.paper.partition("e")[0].partition(".")[2])
+        return f"{value:.{decimals}{'e' if 'e' in self.paper else 'f'}}"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of one of the paper's tables: an error, and its order unless it is the first of its series."""
+
+    table: int
+    row: str
+    column: str
+    error: Value
+    order: Value | None
+
+
+@dataclass(frozen=True)
+class Series:
+    """One method at successively shorter steps, as stored."""
+
+    table: int
+    name: str
+    method: str
+    iterations: int
+    invariants: str
+    h: str
+    divisors: list[int]
+    errors: list[str]
+    orders: list[str]
+    mpmath: list[str] | None = None
+    errata: dict[str, dict[str, str]] | None = None
+    Omega: float = 0.0
+
+    @property
+    def steps(self) -> list[float]:
+        """Lengths of the steps."""
+        return [float(self.h) / d for d in self.divisors]
+
+    @property
+    def solver(self) -> type[EIPSolver]:
+        """The solver class."""
+        return METHODS[self.method]
+
+
+@cache
+def _data() -> dict[str, Any]:
+    return json.loads(files("eip_scipy.data").joinpath("paper_tables.json").read_text(encoding="utf-8"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperTable(Study[list[Cell]]):
+    """One of the paper's tables in the paper's setting: fixed steps, euclidean metric.
+
+    Table 5 takes minutes: 37500 steps on 128 x 128 points for each of nine columns. Its runs share the cores.
+    """
+
+    name: str
+    processes: int = field(default_factory=cores)
+
+    def measure(self, session: Session) -> list[Cell]:
+        """Method by method, from the longest step to the shortest."""
+        number = TABLES.index(self.name) + 1
+        stored = [Series(**s) for s in _data()["series"] if s["table"] == number]
+        cells = []
+        with session.bar(len(stored), self.name, "column") as bar, ExitStack() as stack:
+            errors: Callable[[Series], list[float]] = _ERRORS[number]
+            if number == LONGEST and self.processes > 1:
+                errors = _shared(stored, stack.enter_context(workers(self.processes)))
+            for series in stored:
+                cells += _cells(series, errors(series))
+                bar.update()
+        return cells
+
+    def text(self, found: list[Cell]) -> str:
+        return table_text(found)
+
+    def checks(self, found: list[Cell]) -> list[Check]:
+        """No number differs by more than round-off."""
+        return [Check(self.name, passed(found))]
+
+    def tables(self, found: list[Cell]) -> dict[str, Rows]:
+        data = self.numbers(found)
+        kinds = (("cells", "error"), ("orders", "order"))
+        return {
+            f"{self.name}.csv": [{"quantity": quantity, **record} for kind, quantity in kinds for record in data[kind]]
+        }
+
+    def numbers(self, found: list[Cell]) -> dict[str, Any]:
+        """All cells; the orders, which the paper prints in columns of their own, form a second list."""
+        orders = [_record(cell, cell.order) for cell in found if cell.order is not None]
+        return {"cells": [_record(cell, cell.error) for cell in found], "orders": orders}
+
+
+def _cells(series: Series, errors: list[float]) -> list[Cell]:
+    """The cells of one series."""
+    about = _data()["tables"][str(series.table)]
+    exact = [math.nan] * len(errors) if series.mpmath is None else [float(x) for x in series.mpmath]
+    orders = _orders(series, errors, exact, about["roundoff"])
+    cells = []
+    for k, (printed, divisor) in enumerate(zip(series.errors, series.divisors, strict=True)):
+        labels = {"name": series.name, "method": series.method, "h": series.h, "d": divisor}
+        misprint = (series.errata or {}).get(str(k), {}).get("printed")
+        error = Value(printed, errors[k], exact[k], about["roundoff"], misprint)
+        cells.append(
+            Cell(series.table, about["row"].format(**labels), about["column"].format(**labels), error, orders[k])
+        )
+    return cells
+
+
+def _orders(series: Series, errors: list[float], exact: list[float], roundoff: float) -> list[Value | None]:
+    """Order at each step but the first; round-off in two errors moves it in proportion to their size."""
+    refinement = -np.diff(np.log(series.steps))
+    relative = roundoff / np.where(np.isnan(exact), errors, exact)
+    slack = (relative[:-1] + relative[1:]) / refinement
+    columns = zip(
+        series.orders, observed_order(errors, series.steps), observed_order(exact, series.steps), slack, strict=True
+    )
+    return [None, *(Value(paper, float(ours), float(mpmath), float(s)) for paper, ours, mpmath, s in columns)]
+
+
+def _multiplier_errors(series: Series) -> list[float]:
+    """Table 1: |lambda_hat - lambda_star| of the last step."""
+    return [_multiplier_error(series, h) for h in series.steps]
+
+
+def _multiplier_error(series: Series, h: float) -> float:
+    """lambda_hat is what the step's projection did, lambda_star the paper's closed form at the same raw result."""
+    problem = harmonic(OMEGA)
+    steps: list[tuple[np.ndarray, np.ndarray]] = []
+
+    class Recorder(series.solver):  # type: ignore[name-defined]
+        def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
+            y_new = super()._project_step(t, y, y_hat, err)
+            steps.append((y_hat.copy(), y_new))
+            return y_new
+
+    solve_ivp(
+        problem.fun, problem.t_span, problem.y0, method=Recorder, h=h, invariants=problem.invariants, **PAPER_SETTING
+    )
+    y_hat, y_new = steps[-1]
+    gradient = OMEGA * y_hat
+    # fsum, because BLAS rounds differently from machine to machine.
+    lambda_hat = math.fsum((y_new - y_hat) * gradient) / math.fsum(gradient * gradient)
+    lambda_star = -(1 - math.hypot(*problem.y0) / math.hypot(*y_hat)) / OMEGA
+    return abs(lambda_hat - lambda_star)
+
+
+def _last_defects(series: Series) -> list[float]:
+    """Tables 2 and 4: the last defect of the first invariant that is kept."""
+    problem = harmonic(OMEGA) if series.table == 2 else kepler(eccentricity=0.6, relativistic=0.005)
+    return [_last_defect(problem, series, h) for h in series.steps]
+
+
+def _last_defect(problem: Problem, series: Series, h: float) -> float:
+    values = _run(problem, series, h).invariants[0]
+    return abs(float(values[-1] - values[0]))
+
+
+def _differences(series: Series) -> list[float]:
+    """Table 3: largest difference, over the components, of the ends of two successive steps."""
+    problem = kepler(eccentricity=0.6, relativistic=0.005)
+    steps = [2 * series.steps[0], *series.steps]
+    ends = [_run(problem, series, h).y[:, -1] for h in steps]
+    return [float(np.abs(a - b).max()) for a, b in pairwise(ends)]
+
+
+def _field_differences(series: Series) -> list[float]:
+    """Table 5: largest modulus of the difference of the fields at the ends of two successive steps."""
+    return _field_changes([_field_end(series, h) for h in _field_steps(series)])
+
+
+def _shared(stored: list[Series], start: Callable[..., Callable[[], Any]]) -> Callable[[Series], list[float]]:
+    """Return the same function after putting the runs of all series in line, those with most steps first."""
+    runs = [(series, h) for series in stored for h in _field_steps(series)]
+    waiting = {(series.name, h): start(_field_end, series, h) for series, h in sorted(runs, key=lambda run: run[1])}
+    return lambda series: _field_changes([waiting[series.name, h]() for h in _field_steps(series)])
+
+
+def _field_steps(series: Series) -> list[float]:
+    return [2 * series.steps[0], *series.steps]
+
+
+def _field_end(series: Series, h: float) -> np.ndarray:
+    problem = rotating_packet(series.Omega, nyquist="zero")
+    end: np.ndarray = _run(problem, series, h, problem.t_span[1]).y[:, -1]
+    return end
+
+
+def _field_changes(ends: list[np.ndarray]) -> list[float]:
+    return [float(np.abs(a - b).max()) for a, b in pairwise(ends)]
+
+
+def _run(problem: Problem, series: Series, h: float, t_end: float = 1.0) -> Any:
+    """round(t_end/h) steps of length h: the paper's last steps do not all end on t = 1."""
+    kept = [item for item in problem.invariants if item.name[0].upper() in series.invariants]
+    return integrate(
+        problem,
+        (0.0, round(t_end / h) * h),
+        method=series.solver,
+        h=h,
+        invariants=kept,
+        iterations=series.iterations,
+        compiled=False,  # the same bits; these runs are too short to be worth compiling
+        **PAPER_SETTING,
+    )
+
+
+_ERRORS = {1: _multiplier_errors, 2: _last_defects, 3: _differences, 4: _last_defects, 5: _field_differences}
+
+
+def passed(cells: Iterable[Cell]) -> bool:
+    """Whether no number differs by more than round-off."""
+    return all(value.status != "differs" for cell in cells for value in (cell.error, cell.order) if value is not None)
+
+
+def _record(cell: Cell, value: Value) -> dict[str, Any]:
+    cause = _data()["tables"][str(cell.table)]["cause"]
+    return {
+        "table": cell.table,
+        "row": cell.row,
+        "column": cell.column,
+        "paper": float(value.paper),
+        "ours": value.ours,
+        "mpmath": value.mpmath,
+        "digits": value.digits,
+        "paper_digits": value.paper_digits,
+        "status": value.status,
+        "cause": cause if value.status == "round-off" else None,
+        "misprinted_as": None if value.printed is None else float(value.printed),
+    }
+
+
+def table_text(cells: list[Cell]) -> str:
+    """One table as text."""
+    about = _data()["tables"][str(cells[0].table)]
+    labels = [(cell.row, cell.column) if cells[0].table == 2 else (cell.column, cell.row) for cell in cells]
+    width = max(len(label) for pair in labels for label in pair)
+    exact = any(not math.isnan(cell.error.mpmath) for cell in cells)
+    lines = [f"Table {cells[0].table}: {about['title']}", f"         {about['problem']}", "", *_head(width, exact)]
+    series = groupby(zip(labels, cells, strict=True), key=lambda item: item[0][0])
+    for name, members in series:
+        for k, ((_, step), cell) in enumerate(members):
+            lines.append(f"{name if k == 0 else '':<{width}}  {step:<{width}}{_values_text(cell)}".rstrip())
+    return "\n".join([*lines, "", *_summary(cells)])
+
+
+def _head(width: int, exact: bool) -> list[str]:
+    name = "mpmath" if exact else ""
+    errors = f"{'paper':>{WIDE}}{'ours':>{WIDE}}{'digits':>{DIGITS}}{name:>{WIDE}}"
+    orders = f"{'paper':>{NARROW}}{'ours':>{NARROW}}{'digits':>{DIGITS}}{name:>{NARROW}}"
+    rules = ["  " + f" {name} ".center(len(group) - 2, "-") for name, group in (("error", errors), ("order", orders))]
+    margin = " " * (2 * width + 2)
+    return [margin + "".join(rules), margin + errors + orders]
+
+
+def _values_text(cell: Cell) -> str:
+    """One line's numbers; those in 50 digits where a printed digit differs."""
+    text = _value_text(cell.error, WIDE)
+    if cell.order is not None:
+        text += _value_text(cell.order, NARROW)
+    if cell.error.printed is not None:
+        text += f"  misprinted as {cell.error.printed}"
+    return text
+
+
+def _value_text(value: Value, width: int) -> str:
+    exact = "" if value.matched or math.isnan(value.mpmath) else value.like_paper(value.mpmath)
+    agree = f"{value.digits}/{value.paper_digits}" + ("!" if value.status == "differs" else " ")
+    return f"{value.paper:>{width}}{value.like_paper(value.ours):>{width}}{agree:>{DIGITS}}{exact:>{width}}"
+
+
+def _summary(cells: list[Cell]) -> list[str]:
+    """How many numbers agree, and why the others do not."""
+    errors = [cell.error for cell in cells]
+    orders = [cell.order for cell in cells if cell.order is not None]
+    counts = [f"{sum(v.matched for v in values)} of {len(values)}" for values in (errors, orders)]
+    lines = [f"{counts[0]} errors and {counts[1]} orders agree to every printed digit."]
+    statuses = [value.status for value in (*errors, *orders)]
+    if "round-off" in statuses:
+        about = _data()["tables"][str(cells[0].table)]
+        lines.append(f"Round-off ({about['roundoff']:.1e}) explains {statuses.count('round-off')}: {about['cause']}.")
+    if "differs" in statuses:
+        lines.append(f"{statuses.count('differs')} marked ! DIFFER by more than round-off.")
+    return lines

@@ -1,0 +1,80 @@
+"""``eip-scipy charged-particle``: the paper's Experiment III by several methods, numbers, checks and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+from eip_scipy.problems.particles.charged_particle import ORBITS
+
+from ..report import warn
+from ..study import Figures, Rows, Session, Study, option
+from . import report
+from .runs import METHODS, PAPER_METHODS, SCENES, ParticleStudy, study
+
+__all__ = ["ChargedParticle", "Tokamak", "Uniform"]
+
+Found = dict[str, ParticleStudy]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChargedParticle(Study[Found]):
+    """The command, in both fields; `paper_only` is what the paper's figures need, under their names."""
+
+    scenes: Sequence[str] = SCENES
+    paper_only: bool = False
+    stem: str = "charged-particle"
+
+    def chosen(self) -> Sequence[str]:
+        """The scenes that run."""
+        return self.scenes
+
+    def measure(self, session: Session) -> Found:
+        if find_spec("numba") is None:
+            warn('the fields are Python here, which takes hours; with pip install "eip_scipy[numba]" it is a minute')
+        runs = len(self.chosen()) * (1 + (len(PAPER_METHODS) if self.paper_only else len(METHODS) + 1))
+        with session.bar(runs, "charged particle") as bar:
+            return {name: study(name, paper_only=self.paper_only, callback=bar.update) for name in self.chosen()}
+
+    def text(self, found: Found) -> str:
+        return "\n\n".join(report.text(scene) for scene in found.values())
+
+    def checks(self, found: Found) -> list[report.RangeCheck]:
+        return [check for scene in found.values() for check in report.checks(scene)]
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        checks = self.checks(found)
+        return {
+            "scenes": {name: scene.numbers for name, scene in found.items()},
+            "checks": [{**check._asdict(), "passed": check.passed} for check in checks],
+            "passed": all(check.passed for check in checks),
+        }
+
+    def tables(self, found: Found) -> dict[str, Rows]:
+        return {f"{self.stem}.csv": [row for scene in found.values() for row in report.rows(scene)]}
+
+    def figures(self, found: Found) -> Figures:
+        """One for each field; a figure of the paper is one field."""
+        for name, figure in report.figures(found, paper_only=self.paper_only):
+            yield f"{self.stem}.png" if self.paper_only else f"{self.stem}-{name}.png", figure
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uniform(ChargedParticle):
+    """The uniform field alone."""
+
+    scenes: Sequence[str] = SCENES[:1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tokamak(ChargedParticle):
+    """The tokamak alone."""
+
+    scenes: Sequence[str] = SCENES[1:]
+    orbit: str | None = option(None, "one orbit; default: both", choices=tuple(ORBITS))
+
+    def chosen(self) -> Sequence[str]:
+        """The scenes of the orbit."""
+        return [name for name in self.scenes if self.orbit in (None, name.removeprefix("tokamak-"))]

@@ -1,0 +1,281 @@
+"""Tables, checks, files and figures of the charged particles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eip_scipy.problems.particle_orbits import ParticleOrbit
+
+from ..report import compact, table
+from .runs import PAPER_METHODS, ParticleRun, ParticleStudy
+
+__all__ = ["RangeCheck", "checks", "figures", "rows", "text"]
+
+CURVE_POINTS = 40_000  # at most about so many of an orbit's curve in a figure
+ROWS = 1000  # of each run in the CSV file
+ROUND_OFF = 1e-9  # relative: what "kept" means for H and L
+TIP = 1.0095
+TITLES = {
+    "uniform": "Charged particle, uniform magnetic field and radial electric field",
+    "tokamak-banana": "Charged particle, axisymmetric tokamak, banana orbit",
+    "tokamak-transit": "Charged particle, axisymmetric tokamak, transit orbit",
+}
+
+
+class RangeCheck(NamedTuple):
+    """A number that must lie between two bounds."""
+
+    scene: str
+    what: str
+    value: float
+    low: float
+    high: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether it does; nan does not."""
+        return self.low <= self.value <= self.high
+
+    @property
+    def text(self) -> str:
+        """One line."""
+        whole = float(self.value).is_integer() and self.low == self.high
+        number = f"{self.value:.0f}" if whole else compact(self.value, 5 if "tip" in self.what else 4)
+        if self.low == self.high:
+            expected = f"expected {self.low:g}"
+        elif self.low == 0:
+            expected = f"at most {compact(self.high)}"
+        elif self.high == np.inf:
+            expected = f"at least {compact(self.low)}"
+        else:
+            expected = f"between {compact(self.low, 5)} and {compact(self.high, 5)}"
+        return f"{'ok' if self.passed else 'FAILED':<6} {self.what}: {number}, {expected}"
+
+
+def checks(found: ParticleStudy) -> list[RangeCheck]:
+    """Compare with the reference and with what the methods are known to do over the paper's interval."""
+    got = found.numbers
+    kept = [
+        RangeCheck(found.scene, f"{name}, largest relative error of {symbol}", got[name][key], 0.0, ROUND_OFF)
+        for name in _keepers(found)
+        for symbol, key in (("H", "energy_error"), ("L", "momentum_error"))
+    ]
+    reference = RangeCheck(found.scene, "reference, distance from the stored states", found.reference_error, 0.0, 2e-9)
+    special = {"uniform": _uniform_checks, "tokamak-banana": _banana_checks, "tokamak-transit": _transit_checks}
+    return [reference, *kept, *special[found.scene](found.scene, got, _keepers(found))]
+
+
+def _keepers(found: ParticleStudy) -> list[str]:
+    """The methods that keep both invariants."""
+    return [name for name in found.lines if name.startswith("EIP-HL")]
+
+
+def _uniform_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[RangeCheck]:
+    true = got["reference"]["gyroradius_first"]
+    found = [RangeCheck(scene, "RK4, gyroradius in the last turn", got["RK4"]["gyroradius_last"], 0.0, 0.02)]
+    for name in keepers:
+        for turn in ("first", "last"):
+            value = got[name][f"gyroradius_{turn}"]
+            found.append(RangeCheck(scene, f"{name}, gyroradius in the {turn} turn", value, true - 1e-4, true + 1e-4))
+        found.append(
+            RangeCheck(scene, f"{name}, error of the guiding centre's angle [rad]", got[name]["angle_error"], 0.0, 2e-3)
+        )
+    lost = "EIP-H, error of the guiding centre's angle [rad]: one invariant of two is not enough"
+    return [*found, RangeCheck(scene, lost, got["EIP-H"]["angle_error"], 5.0, np.inf)]
+
+
+def _banana_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[RangeCheck]:
+    found = [
+        RangeCheck(scene, "RK4, banana tips: then it circulates", got["RK4"]["tips"], 2, 2),
+        RangeCheck(scene, "EIP-H, banana tips", got["EIP-H"]["tips"], 3, 3),
+    ]
+    for name in keepers:
+        found.append(RangeCheck(scene, f"{name}, banana tips", got[name]["tips"], 8, 8))
+        for end in ("nearest", "farthest"):
+            value = got[name][f"tip_{end}"]
+            found.append(RangeCheck(scene, f"{name}, R of the {end} tip", value, TIP - 2e-4, TIP + 2e-4))
+        found.append(_moment(scene, name, got))
+    return found
+
+
+def _transit_checks(scene: str, got: Mapping[str, Mapping[str, float]], keepers: list[str]) -> list[RangeCheck]:
+    what = "error of the extrema of R and z in a turn"
+    found = [RangeCheck(scene, f"RK4, {what}", got["RK4"]["extrema_error"], 5e-3, np.inf)]
+    for name in keepers:
+        found.append(RangeCheck(scene, f"{name}, {what}", got[name]["extrema_error"], 0.0, 5e-4))
+        found.append(_moment(scene, name, got))
+    return found
+
+
+def _moment(scene: str, name: str, got: Mapping[str, Mapping[str, float]]) -> RangeCheck:
+    value = abs(got[name]["moment_change"])
+    return RangeCheck(scene, f"{name}, change of the magnetic moment", value, 0.0, 5e-4)
+
+
+COMMON = {
+    "energy_error": ["error", "of H"],
+    "momentum_error": ["error", "of L"],
+    "phase_error": ["gyro-", "phase"],
+    "position_error": ["position", ""],
+    "nfev": ["evalu-", "ations"],
+    "wall_time": ["time", "[s]"],
+}
+UNIFORM = {
+    "gyroradius_first": ["gyroradius", "first turn"],
+    "gyroradius_last": ["gyroradius", "last turn"],
+    "angle_error": ["guiding", "angle"],
+}
+TRANSIT = {
+    "extrema_error": ["extrema", "of R, z"],
+    "moment_change": ["magnetic", "moment"],
+}
+BANANA = {
+    "tips": ["banana", "tips"],
+    "tip_nearest": ["least R", "of tips"],
+    "tip_farthest": ["largest R", "of tips"],
+    **TRANSIT,
+}
+SPECIAL = {"uniform": UNIFORM, "tokamak-banana": BANANA, "tokamak-transit": TRANSIT}
+PRECISE = {"gyroradius_first": 4, "gyroradius_last": 4, "tip_nearest": 5, "tip_farthest": 5}
+LEGEND = {
+    "uniform": [
+        "gyroradius: half the range of R in one turn around the origin; last turn: the 100th, or the last there is.",
+        "guiding angle: largest error of the guiding centre's angle [rad], averaged over a gyration.",
+    ],
+    "tokamak": [
+        "extrema: largest error of the extrema of R and z in a poloidal turn of the reference.",
+        "magnetic moment: last over first such turn, less 1.",
+    ],
+}
+
+
+def text(found: ParticleStudy) -> str:
+    """Lay out the numbers and the checks of one scene."""
+    got, problem = found.numbers, found.problem
+    columns = {**SPECIAL[found.scene], **COMMON}
+    body = [(name, [_cell(key, values[key]) for key in columns]) for name, values in got.items()]
+    steps = found.reference.orbit.t.size - 1
+    lines = [
+        f"{TITLES[found.scene]}: {steps} steps, h = {problem.h:.5g}",
+        "",
+        table(list(columns.values()), body),
+        "",
+        *LEGEND["uniform" if found.scene == "uniform" else "tokamak"],
+        "gyrophase [rad] and position: errors at the end. H, L: largest relative errors.",
+        "",
+        *(check.text for check in checks(found)),
+    ]
+    return "\n".join(lines)
+
+
+def _cell(key: str, value: float) -> str:
+    return str(int(value)) if key in ("nfev", "tips") else compact(value, PRECISE.get(key, 2))
+
+
+def rows(found: ParticleStudy) -> Iterator[dict[str, Any]]:
+    """Make the lines of the CSV file, about a thousand of each method."""
+    for name, line in {"reference": found.reference, **found.lines}.items():
+        every = max((line.orbit.t.size - 1) // ROWS, 1)
+        for k in range(0, line.orbit.t.size, every):
+            yield {
+                "scene": found.scene,
+                "method": name,
+                "t": line.orbit.t[k],
+                **dict(zip("xyz", line.orbit.x[:, k], strict=True)),
+                **dict(zip(("v_x", "v_y", "v_z"), line.orbit.v[:, k], strict=True)),
+                "energy_error": line.energy_error[k],
+                "momentum_error": line.momentum_error[k],
+            }
+
+
+def figures(studies: Mapping[str, ParticleStudy], *, paper_only: bool = False) -> Iterator[tuple[str, Any]]:
+    """Make the figures one by one: that of the uniform field, and one of both of the tokamak's orbits.
+
+    Parameters
+    ----------
+    studies : mapping of str to ParticleStudy
+        By their scenes.
+    paper_only : bool, optional
+        Only the rows of the paper's figures, RK4 and EIP-HL, besides EIP-H in the uniform field.
+
+    Yields
+    ------
+    (str, Figure)
+        File name without its ending, and figure.
+
+    Raises
+    ------
+    ImportError
+        Without matplotlib.
+    """
+    from eip_scipy.plotting import particle_figure
+
+    if "uniform" in studies:
+        found = studies["uniform"]
+        names = list(PAPER_METHODS) if paper_only else list(found.lines)
+        lines = {name: found.lines[name] for name in names}
+        yield (
+            "uniform",
+            particle_figure({name: _uniform_row(found, line) for name, line in lines.items()}, title=TITLES["uniform"]),
+        )
+    orbits = {scene: found for scene, found in studies.items() if scene != "uniform"}
+    if orbits:
+        first = next(iter(orbits.values()))
+        names = ["RK4", "EIP-HL"] if paper_only else list(first.lines)
+        yield (
+            "tokamak",
+            particle_figure(
+                {name: _tokamak_row(orbits, name) for name in names}, title="Charged particle, axisymmetric tokamak"
+            ),
+        )
+
+
+def _uniform_row(found: ParticleStudy, line: ParticleRun) -> Any:
+    from eip_scipy.plotting import Curves, ParticleRow
+
+    turns, reference = line.orbit.turns(), found.reference.orbit
+    last = min(100.0, float(turns[-1]))
+    first = min(1.0, last)
+    parts = {
+        "first turn": turns <= first,
+        "100th turn" if last == 100 else "last turn": (turns >= last - 1) & (turns <= last),
+    }
+    orbits = {name: Curves("x", "y", {"": line.orbit.x[:2, part]}) for name, part in parts.items()}
+    phase = line.orbit.gyrophase - reference.gyrophase
+    angle = line.orbit.averaged(line.orbit.guiding_angle - reference.guiding_angle)
+    trajectory = {
+        "gyrophase": (line.orbit.t, phase),
+        "guiding centre": (line.orbit.averaged(line.orbit.t), angle),
+    }
+    return ParticleRow(orbits, _invariant_errors({"": line}), "error of angle [rad]", trajectory)
+
+
+def _tokamak_row(orbits: Mapping[str, ParticleStudy], name: str) -> Any:
+    from eip_scipy.plotting import Curves, ParticleRow
+
+    lines = {scene.removeprefix("tokamak-"): found.lines[name] for scene, found in orbits.items()}
+    panels = {f"{kind} orbit": Curves("R", "z", {"": _thin(line.orbit)}) for kind, line in lines.items()}
+    trajectory = {}
+    for scene, found in orbits.items():
+        truth, line = found.reference.orbit, found.lines[name]
+        apart = np.linalg.norm(line.orbit.averaged(line.orbit.guiding_centre - truth.guiding_centre), axis=0)
+        trajectory[scene.removeprefix("tokamak-")] = (line.orbit.averaged(line.orbit.t), apart)
+    return ParticleRow(panels, _invariant_errors(lines), "error of guiding centre", trajectory)
+
+
+def _thin(orbit: ParticleOrbit) -> np.ndarray:
+    """Points of a long orbit in (R, z): a few of each gyration are enough for the eye."""
+    every = max(orbit.t.size // CURVE_POINTS, 1)
+    return np.stack([orbit.R[::every], orbit.z[::every]])
+
+
+def _invariant_errors(lines: Mapping[str, ParticleRun]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    found = {}
+    for kind, line in lines.items():
+        end = f", {kind}" if kind else ""
+        found[f"H{end}"] = (line.orbit.t, line.energy_error)
+        found[f"L{end}"] = (line.orbit.t, line.momentum_error)
+    return found

@@ -1,0 +1,353 @@
+"""What the commands share: machine and versions, numbers and tables as text, files that are whole or not there."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import platform
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from eip_scipy.core.versions import versions
+
+__all__ = [
+    "UsageError",
+    "check_folder",
+    "check_outputs",
+    "check_target",
+    "compact",
+    "describe_machine",
+    "document",
+    "listening",
+    "machine",
+    "printing",
+    "say",
+    "table",
+    "warn",
+    "write_csv",
+    "write_file",
+    "write_json",
+]
+
+_untrusted: list[str] = []  # what was said of runs that are not to be trusted, since `listening` began
+_unsaid: list[str] = []  # why stdout took no text, since `printing` began
+
+
+class UsageError(Exception):
+    """Something the user gave cannot be used; the message is one line that says what to do. Exit status 2."""
+
+
+def machine() -> dict[str, Any]:
+    """Describe the machine: processor, architecture, number of processors and system."""
+    return {
+        "processor": _processor(),
+        "architecture": platform.machine(),
+        "cpus": os.cpu_count(),
+        "system": f"{platform.system()} {platform.release()}",
+    }
+
+
+def describe_machine() -> str:
+    """Describe the machine in one line, as the titles of timings need it."""
+    known = machine()
+    plural = "" if known["cpus"] == 1 else "s"
+    return f"{known['processor']}, {known['cpus']} CPU{plural}, {platform.system()}, Python {platform.python_version()}"
+
+
+def _processor() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:
+            for line in lines:
+                if line.startswith("model name"):
+                    return " ".join(line.split(":", 1)[1].split())
+    except OSError:
+        pass
+    return platform.processor() or platform.machine() or "unknown processor"
+
+
+def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict[str, Any]:
+    """Wrap a command's numbers for `write_json`: what was asked for, when, with which versions, on which machine.
+
+    It says too whether all runs since `listening` began are to be trusted.
+
+    Parameters
+    ----------
+    command : str
+    arguments : mapping
+        The options of the run.
+    **content
+        The numbers.
+
+    Returns
+    -------
+    dict
+    """
+    return {
+        "command": command,
+        "arguments": dict(arguments),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "trusted": not _untrusted,
+        "versions": versions(),
+        "machine": machine(),
+        **content,
+    }
+
+
+def compact(value: float | None, digits: int = 2) -> str:
+    """Write a number in at most ``digits + 6`` characters; "-" stands for None and for what is not finite.
+
+    Examples
+    --------
+    >>> [compact(x) for x in (0.0, 71.2, -0.8939, 0.0011, -3.6e-9, 123456.0, None)]
+    ['0', '71', '-0.89', '1.1e-3', '-3.6e-9', '1.2e5', '-']
+    """
+    if value is None or not math.isfinite(value):
+        return "-"
+    if value == 0:
+        return "0"
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    power = int(exponent)
+    if -2 <= power <= 2:
+        return f"{float(f'{mantissa}e{power}'):.{max(digits - 1 - power, 0)}f}"
+    return f"{mantissa}e{power}"
+
+
+def table(head: Sequence[Sequence[str]], rows: Iterable[tuple[str, Sequence[str]]]) -> str:
+    """Lay out a table with one column of labels and right-aligned cells.
+
+    Parameters
+    ----------
+    head : sequence of sequences of str
+        The lines of each column's head, one sequence for each column.
+    rows : iterable of (str, sequence of str)
+        Label and cells; a row without cells is a heading of its own.
+
+    Returns
+    -------
+    str
+        Without a newline at the end.
+    """
+    body = list(rows)
+    first = max(len(label) for label, cells in body if cells)
+    widths = [max(map(len, lines)) for lines in head]
+    for _, cells in body:
+        widths = [max(width, len(cell)) for width, cell in zip(widths, cells, strict=True)] if cells else widths
+    height = max(map(len, head))
+    columns = [[*lines, *[""] * (height - len(lines))] for lines in head]
+    lines = [("", [column[k] for column in columns]) for k in range(height)]
+    rule = "-" * (first + sum(width + 1 for width in widths))
+    text = [_line(label, cells, first, widths) for label, cells in lines]
+    text += [rule, *(_line(label, cells, first, widths) for label, cells in body)]
+    return "\n".join(text)
+
+
+def _line(label: str, cells: Sequence[str], first: int, widths: Sequence[int]) -> str:
+    if not cells:
+        return label
+    text = f"{label:<{first}}" + "".join(f" {cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
+    return text.rstrip()
+
+
+def say(text: str = "") -> None:
+    """Print on stdout; neither a terminal without Unicode nor a stdout that takes nothing ends the command.
+
+    A reader that has left, say `head`, wants no more. Any other failure is noted for `printing`.
+    """
+    if sys.stdout is None or sys.stdout.closed:
+        _unsaid.append("it is closed")
+        return
+    encoding = sys.stdout.encoding or "utf-8"
+    try:
+        print(text.encode(encoding, "replace").decode(encoding), flush=True)
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):
+            _unsaid.append(_reason(error))
+        # Python writes what is left when it closes stdout; let that go nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def warn(message: str) -> None:
+    """Print one line for the user on the error stream, if there is one that takes it."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(f"eip-scipy: {message}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def printing() -> Iterator[list[str]]:
+    """Collect the reasons why `say` could not print, instead of ending the command.
+
+    Yields
+    ------
+    list of str
+        Filled as text is printed.
+    """
+    _unsaid.clear()
+    yield _unsaid
+
+
+@contextmanager
+def listening(kind: type[Warning]) -> Iterator[list[str]]:
+    """Collect warnings that a run is not to be trusted, each text once, instead of showing them.
+
+    Parameters
+    ----------
+    kind : type
+        Theirs; others go where they went.
+
+    Yields
+    ------
+    list of str
+        Filled as runs end; `document` looks at it, too.
+    """
+    _untrusted.clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", kind)
+        show = warnings.showwarning
+
+        def listen(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if not issubclass(category, kind):
+                show(message, category, filename, lineno, file, line)
+            elif str(message) not in _untrusted:
+                _untrusted.append(str(message))
+
+        warnings.showwarning = listen
+        yield _untrusted
+
+
+def check_folder(folder: Path) -> None:
+    """Make `folder` if need be and see that files can be written there.
+
+    Raises
+    ------
+    UsageError
+        When it cannot be made or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _try_to_write(folder)
+    except OSError as error:
+        raise UsageError(f"cannot write to the folder {str(folder)!r}: {_reason(error)}") from error
+
+
+def check_target(path: Path) -> None:
+    """See that a file can be written at `path`, in a folder that exists.
+
+    Raises
+    ------
+    UsageError
+        When it cannot.
+    """
+    if path.is_dir():
+        raise UsageError(f"cannot write {str(path)!r}: it is a folder")
+    try:
+        _try_to_write(path.parent)
+    except OSError as error:
+        raise UsageError(f"cannot write {str(path)!r}: {_reason(error)}") from error
+
+
+def check_outputs(folder: Path, target: Path | None) -> None:
+    """Check the folder of a command's files and the file of its JSON, if one is wanted, before it computes.
+
+    Raises
+    ------
+    UsageError
+        When one of them cannot be written.
+    """
+    check_folder(folder)
+    if target is not None:
+        check_target(target)
+
+
+def _try_to_write(folder: Path) -> None:
+    probe = folder / f".eip-scipy-{os.getpid()}.probe"
+    probe.touch()
+    probe.unlink()
+
+
+def _reason(error: OSError) -> str:
+    return (error.strerror or str(error)).lower()
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path` that takes its place when all went well; an old file stays until then."""
+    temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise UsageError(f"cannot write {str(path)!r}: {_reason(error)}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_file(path: Path, write: Callable[[Path], Any]) -> Path:
+    """Let `write` fill a temporary file that then takes the place of `path`; an interruption leaves no torn file.
+
+    Parameters
+    ----------
+    path : Path
+    write : callable
+        ``write(temporary_path)``; the temporary path ends as `path` does.
+
+    Returns
+    -------
+    Path
+        `path`.
+
+    Raises
+    ------
+    UsageError
+        When the file cannot be written.
+    """
+    with _whole(path) as temporary:
+        write(temporary)
+    return path
+
+
+def write_json(path: Path, content: Any) -> Path:
+    """Write JSON; arrays become lists, and what is not finite null (JSON has no NaN)."""
+    text = json.dumps(_plain(content), indent=1, allow_nan=False) + "\n"
+    return write_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
+    """Write one line for each row under the names of the first row's entries; an empty cell is a missing number."""
+
+    def write(temporary: Path) -> None:
+        with open(temporary, "w", newline="", encoding="utf-8") as stream:
+            writer = csv.DictWriter(stream, list(rows[0]) if rows else [])
+            writer.writeheader()
+            writer.writerows(_plain(row) for row in rows)
+
+    return write_file(path, write)
+
+
+def _plain(value: Any) -> Any:
+    """`value` made of Python's own types, None for numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, str | int | float | None) else str(value)

@@ -1,0 +1,211 @@
+"""Error against cost for the solar system: what is timed, at which steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from eip_scipy import EIPGJ14, EIPRK4, EIPRK5, EIPRKN12, EIPSolver, integrate
+from eip_scipy.problems.gravity.solar_data import YEAR_D
+
+from ..long_runs import named
+from ..work_precision import Runner, curves, work_precision
+from .runs import (
+    HIGH_ORDER,
+    KEPT,
+    MULTISTEP,
+    Peer,
+    SolarScene,
+    eip_name,
+    leapfrog,
+    metric_of,
+    rebound_run,
+    stored_state,
+    tight_run,
+    whole_number,
+)
+
+__all__ = ["ENOUGH_SECONDS", "MERCURY", "TimedRun", "cost", "cost_methods", "panels", "timed"]
+
+ENOUGH_SECONDS = 0.2  # what disturbs so long a run is not seen on axes of many powers of ten
+MULTISTEP_COUNTS = (255, 300, 412, 600)  # steps a year; half of the first would not be stable
+MERCURY = 0  # of the planets, which start behind the Sun
+
+
+@dataclass(frozen=True, eq=False)
+class TimedRun:
+    """One method at one step or tolerance.
+
+    Attributes
+    ----------
+    method : str
+    step : float
+        Years; for heyoka its tolerance; nan for IAS15, which has its own.
+    wall_time : float
+        Seconds.
+    errors : ndarray, shape (9,)
+        Distance of each planet from the reference [AU]; nan where the run failed.
+    """
+
+    method: str
+    step: float
+    wall_time: float
+    errors: np.ndarray
+
+    @property
+    def mercury(self) -> float:
+        """Mercury's error."""
+        return float(self.errors[MERCURY])
+
+    @property
+    def others(self) -> float:
+        """The largest error of another planet."""
+        return float(np.delete(self.errors, MERCURY).max())
+
+
+def timed(
+    methods: Mapping[str, tuple[Runner, Sequence[float]]],
+    truth: np.ndarray,
+    *,
+    repeats: int,
+    enough_seconds: float = 1.0,
+    callback: Callable[[], Any] | None = None,
+) -> list[TimedRun]:
+    """Run and time methods; see `work_precision`.
+
+    Parameters
+    ----------
+    methods : mapping
+        As `work_precision` takes it.
+    truth : ndarray, shape (60,)
+        The state at the end of all runs.
+    repeats, enough_seconds, callback
+        As for `work_precision`.
+
+    Returns
+    -------
+    list of TimedRun
+    """
+    done = work_precision(
+        methods, lambda y: math.nan, repeats=repeats, enough_seconds=enough_seconds, callback=callback
+    )
+
+    def errors(y: np.ndarray) -> np.ndarray:
+        return np.linalg.norm((y - truth)[: y.size // 2].reshape(-1, 3), axis=1)[1:]
+
+    return [
+        TimedRun(point.method, point.step, point.wall_time, errors(state))
+        for point, state in zip(done.points, done.states, strict=True)
+    ]
+
+
+def panels(runs: Sequence[TimedRun], time: str = "wall time [s]") -> list[list[Any]]:
+    """Mercury's error and the largest of the others, for `eip_scipy.plotting.cost_figure`."""
+    from eip_scipy.plotting import CostPanel
+
+    kinds = {"mercury": "Mercury", "others": "the worst of the other planets"}
+    return [[CostPanel(title, time, curves(runs, error=error)) for error, title in kinds.items()]]
+
+
+def cost(
+    scene: SolarScene,
+    methods: Mapping[str, tuple[Runner, Sequence[float]]],
+    peer: Peer | None,
+    *,
+    repeats: int,
+    callback: Callable[[], Any] | None = None,
+) -> list[TimedRun]:
+    """Final position errors against the time of the run, for several methods and steps.
+
+    Parameters
+    ----------
+    scene : SolarScene
+        Of the span to be timed.
+    methods : mapping
+        From `cost_methods`.
+    peer : callable or None
+        REBOUND, if it is there.
+    repeats : int
+        Of each method and step, unless one took more than `ENOUGH_SECONDS`.
+    callback : callable, optional
+        ``callback()`` after each run, those that are left out included.
+
+    Returns
+    -------
+    list of TimedRun
+    """
+    truth = stored_state(scene, scene.years)
+    if truth is None:
+        truth = (tight_run(scene, False) if peer is None else rebound_run(scene, peer, "IAS15", "ias15", 1, False)).y[
+            :, -1
+        ]
+    return timed(methods, truth, repeats=repeats, enough_seconds=ENOUGH_SECONDS, callback=callback)
+
+
+def cost_methods(
+    scene: SolarScene, method: type[EIPSolver], metric: str, peer: Peer | None
+) -> dict[str, tuple[Runner, Sequence[float]]]:
+    """List what `cost` times, with the steps.
+
+    Parameters
+    ----------
+    scene : SolarScene
+    method : type
+        With its projection, and without; and beside it EIPRK5 (EIPRK4 beside EIPRK5), EIPRKN12 and
+        EIPGJ14.
+    metric : {"error", "euclidean"}
+    peer : callable or None
+
+    Returns
+    -------
+    dict
+        As `work_precision` takes it.
+    """
+    other = EIPRK4 if method is EIPRK5 else EIPRK5
+    own = metric_of(method, metric)
+    steps = _steps(scene, [scene.h * factor for factor in (4, 2, 1, 0.5)])
+    methods: dict[str, tuple[Runner, Sequence[float]]] = {
+        eip_name(method, own): (partial(_time_eip, scene, method, {"metric": own}), steps),
+        method.TABLEAU.name: (partial(_time_eip, scene, method, {"invariants": ()}), steps),
+        eip_name(other, metric): (partial(_time_eip, scene, other, {"metric": metric}), steps),
+        "SV": (partial(_time_verlet, scene), _steps(scene, [scene.h * f for f in (2, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)])),
+        HIGH_ORDER: (partial(_time_eip, scene, EIPRKN12, KEPT), _steps(scene, [1 / n for n in (24, 32, 40, 48, 64)])),
+        MULTISTEP: (partial(_time_eip, scene, EIPGJ14, {}), _steps(scene, [1 / n for n in MULTISTEP_COUNTS])),
+    }
+    if peer is None:
+        return methods
+    days = _steps(scene, [d / YEAR_D for d in (10.0, 5.0, 2.5, 1.25)])
+    methods["WHFast"] = (partial(_time_rebound, scene, peer, "whfast"), days)
+    methods["WHFast (c17)"] = (partial(_time_rebound, scene, peer, "whfast-c17"), days)
+    if stored_state(scene, scene.years) is not None:  # otherwise it is the reference
+        methods["IAS15"] = (partial(_time_rebound, scene, peer, "ias15"), [scene.years])
+    return methods
+
+
+def _steps(scene: SolarScene, wanted: Sequence[float]) -> list[float]:
+    """Shorten steps to divide the span: a shortened last one would spoil a symplectic method."""
+    return sorted({scene.years / whole_number(scene.years / h) for h in wanted}, reverse=True)
+
+
+def _time_eip(
+    scene: SolarScene, method: type[EIPSolver], options: dict[str, Any], step: float
+) -> tuple[float, np.ndarray]:
+    name = f"{method.__name__}, h = {step:.4g} yr"
+    result = integrate(scene.problem, method=named(method, name), h=step, **options)
+    return result.wall_time, result.y[:, -1] if result.success else np.full_like(scene.problem.y0, np.nan)
+
+
+def _time_verlet(scene: SolarScene, step: float) -> tuple[float, np.ndarray]:
+    result = leapfrog(scene, step, None)
+    return result.wall_time, result.y[:, -1]
+
+
+def _time_rebound(scene: SolarScene, peer: Peer, integrator: str, step: float) -> tuple[float, np.ndarray]:
+    n_steps = whole_number(scene.years / step)
+    result = peer(scene.problem.params, scene.problem.y0, integrator, h=scene.years / n_steps, n_steps=n_steps)
+    return result.wall_time, result.y[:, -1]

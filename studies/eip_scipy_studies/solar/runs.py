@@ -1,0 +1,350 @@
+"""The solar system run by several methods: the scene that they share, the runs, and their states.
+
+Nothing is printed or written here. REBOUND comes in as a function (`Peer`), so that this module needs no extra.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eip_scipy import EIPGJ14, EIPRKN12, EIPSolver, integrate
+from eip_scipy.comparators import StormerVerletResult, stormer_verlet
+from eip_scipy.core.diagnostics import invariants_along
+from eip_scipy.core.stepping import check_fixed_step
+from eip_scipy.problems import Problem, SolarSystemData, solar_system
+from eip_scipy.problems.gravity.solar_data import YEAR_D, load
+
+from ..long_runs import named
+
+__all__ = [
+    "HIGH_ORDER",
+    "KEPT",
+    "MULTISTEP",
+    "TIGHT",
+    "MethodRun",
+    "Peer",
+    "PendingRun",
+    "SolarScene",
+    "eip_name",
+    "leapfrog",
+    "make_scene",
+    "metric_of",
+    "plan",
+    "rebound_run",
+    "report_times",
+    "stored_state",
+    "tight_run",
+    "whole_number",
+]
+
+Peer = Callable[..., Any]
+"""`eip_scipy.integrations.rebound.run`."""
+
+WHFAST_DAYS = 5.0
+MOST_SAVES = 20_000
+HIGH_ORDER, TIGHT = "EIPRKN12", "EIPRKN12 (tight)"
+HIGH_ORDER_STEP = 1 / 64  # years: rounding, not the step, makes what errors are left
+KEPT: dict[str, Any] = {"every": 10, "compensated": True}
+"""How long runs of high order keep their invariants."""
+MULTISTEP = "EIPGJ14"
+MULTISTEP_STEP = 1 / 600  # years
+
+
+@dataclass(frozen=True, eq=False)
+class SolarScene:
+    """What all methods share: the problem, its data, and the times at which states are saved.
+
+    Attributes
+    ----------
+    problem : Problem
+        In AU and Julian years; its `h` divides the time between saves.
+    data : SolarSystemData
+    years, h : float
+    n_saves : int
+        States saved after the start, equally spaced.
+    every : int
+        Steps between them.
+    """
+
+    problem: Problem
+    data: SolarSystemData
+    years: float
+    h: float
+    n_saves: int
+    every: int
+
+    @property
+    def interval(self) -> float:
+        """Years between saved states."""
+        return self.years / self.n_saves
+
+    @property
+    def planets(self) -> tuple[str, ...]:
+        """Names of the bodies without the Sun."""
+        return self.data.bodies[1:]
+
+
+@dataclass(frozen=True, eq=False)
+class MethodRun:
+    """One method's run; states that are not finite are left out.
+
+    Attributes
+    ----------
+    name : str
+    head : tuple of str
+        The name on the lines of a table's head.
+    step : float or None
+        Years; None where the method chooses its steps.
+    wall_time : float
+        Seconds, compilation and the reading of states left out.
+    t : ndarray, shape (m,)
+    y : ndarray, shape (60, m)
+    energy_error, momentum_error : ndarray, shape (m,)
+        |H - H(0)| / |H(0)| and |L - L(0)| / |L(0)|.
+    failure : str
+        Why the run did not reach its end, or empty.
+    """
+
+    name: str
+    head: tuple[str, ...]
+    step: float | None
+    wall_time: float
+    t: np.ndarray
+    y: np.ndarray
+    energy_error: np.ndarray
+    momentum_error: np.ndarray
+    failure: str = ""
+
+
+class PendingRun(NamedTuple):
+    """A run still to be done: ``start(progress)``; `has_bar`: whether it shows a progress bar by itself."""
+
+    name: str
+    start: Callable[[bool], MethodRun]
+    has_bar: bool
+
+
+def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScene:
+    """Set the scene for a run of so many years.
+
+    Parameters
+    ----------
+    data : str or SolarSystemData
+        One of `eip_scipy.problems.gravity.solar_data.available()`, or data for another epoch.
+    years : float
+        Length of the run in Julian years, > 0.
+    h : float
+        Upper bound of the step in years; the step divides the time between saved states and is shortened where need be.
+
+    Returns
+    -------
+    SolarScene
+
+    Raises
+    ------
+    ValueError
+        For a step that does not fit into the span or is below the spacing of numbers there, or for unknown data.
+    """
+    check_fixed_step(h, 0.0, years)
+    n_saves = whole_number(years / max(_save_interval(years), h))
+    every = whole_number(years / (n_saves * h))
+    step = years / (n_saves * every)
+    known = load(data) if isinstance(data, str) else data
+    return SolarScene(solar_system(known, years=years, h=step), known, years, step, n_saves, every)
+
+
+def _save_interval(years: float) -> float:
+    """Dense enough to count turns, some hundred points for a curve, and 1, 10, 100 ... years among them."""
+    for least_years, interval in ((200.0, 1.0), (100.0, 0.5), (40.0, 0.2), (1.0, 0.1)):
+        if years >= least_years:
+            return max(interval, years / MOST_SAVES)
+    return years / 10
+
+
+def whole_number(ratio: float) -> int:
+    """Round the ratio up, unless it is a whole number to rounding."""
+    nearest = round(ratio)
+    return max(1, nearest if abs(ratio - nearest) <= 1e-9 * ratio else math.ceil(ratio))
+
+
+def plan(
+    scene: SolarScene,
+    method: type[EIPSolver],
+    metric: str,
+    peer: Peer | None,
+    checkpoint_of: Callable[[str], dict[str, Any]] = lambda name: {},
+) -> list[PendingRun]:
+    """List the runs of the comparison: first the method asked for, last the tightest, which serves as reference.
+
+    Parameters
+    ----------
+    scene : SolarScene
+    method : type
+        `EIPRK1` ... `EIPRK5` or another fixed-step class.
+    metric : {"error", "euclidean"}
+    peer : callable or None
+        REBOUND, if it is there.
+    checkpoint_of : callable, optional
+        ``checkpoint_of(name)``: the options of `integrate` that keep checkpoints of the run of that name.
+
+    Returns
+    -------
+    list of PendingRun
+    """
+    metrics = {metric_of(method, metric), metric_of(method, "error"), "euclidean"}
+    ordered = sorted(metrics, key=lambda m: m != metric_of(method, metric))
+    names = [eip_name(method, m) for m in ordered]
+    tasks = [
+        PendingRun(name, partial(_eip, scene, method, m, **checkpoint_of(name)), True)
+        for name, m in zip(names, ordered, strict=True)
+    ]
+    name = method.TABLEAU.name
+    tasks.append(PendingRun(name, partial(_plain, scene, method, **checkpoint_of(name)), True))
+    tasks.append(PendingRun("SV", lambda progress: _verlet(scene), False))
+    tasks.append(
+        PendingRun(
+            HIGH_ORDER, partial(_high_order, scene, HIGH_ORDER, "every 10", 1, **checkpoint_of(HIGH_ORDER)), True
+        )
+    )
+    tasks.append(PendingRun(MULTISTEP, partial(_multistep, scene, **checkpoint_of(MULTISTEP)), True))
+    if peer is None:
+        tasks.append(PendingRun(TIGHT, partial(tight_run, scene, **checkpoint_of(TIGHT)), True))
+        return tasks
+    per_save = max(1, round(scene.interval * YEAR_D / WHFAST_DAYS))
+    for name, integrator, steps in (("WHFast", "whfast", per_save), ("WHFast (c17)", "whfast-c17", per_save)):
+        tasks.append(PendingRun(name, partial(rebound_run, scene, peer, name, integrator, steps), False))
+    tasks.append(PendingRun("IAS15", partial(rebound_run, scene, peer, "IAS15", "ias15", 1), False))
+    return tasks
+
+
+def metric_of(method: type[EIPSolver], metric: str) -> str:
+    """Return the metric that a method really has: euclidean without an error estimate."""
+    return metric if method.TABLEAU.has_estimate else "euclidean"
+
+
+def eip_name(method: type[EIPSolver], metric: str) -> str:
+    """Name a method with its metric."""
+    return f"{method.__name__} ({metric})"
+
+
+def _eip(scene: SolarScene, method: type[EIPSolver], metric: Any, progress: bool, **checkpoint: Any) -> MethodRun:
+    name = eip_name(method, metric)
+    head = (method.__name__, "euclid." if metric == "euclidean" else metric)
+    result = integrate(
+        scene.problem,
+        method=named(method, name),
+        metric=metric,
+        save_every=scene.every,
+        progress=progress,
+        **checkpoint,
+    )
+    return _finished(scene, name, head, scene.h, result, "" if result.success else result.message)
+
+
+def _plain(scene: SolarScene, method: type[EIPSolver], progress: bool, **checkpoint: Any) -> MethodRun:
+    name = method.TABLEAU.name
+    result = integrate(
+        scene.problem,
+        method=named(method, name),
+        invariants=(),
+        save_every=scene.every,
+        progress=progress,
+        **checkpoint,
+    )
+    return _finished(scene, name, (name, "alone"), scene.h, result, "" if result.success else result.message)
+
+
+def tight_run(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
+    """Run the tightest at hand without REBOUND: the method of order 12 with half of its step."""
+    return _high_order(scene, TIGHT, "tight", 2, progress, **checkpoint)
+
+
+def _high_order(scene: SolarScene, name: str, word: str, shorter: int, progress: bool, **checkpoint: Any) -> MethodRun:
+    """Run the method for small errors over long times, its step divided by `shorter`."""
+    per_save = shorter * whole_number(scene.interval / HIGH_ORDER_STEP)
+    return _long(scene, EIPRKN12, name, word, per_save, progress, **KEPT, **checkpoint)
+
+
+def _multistep(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
+    per_save = whole_number(scene.interval / MULTISTEP_STEP)
+    return _long(scene, EIPGJ14, MULTISTEP, "auto", per_save, progress, **checkpoint)
+
+
+def _long(
+    scene: SolarScene, method: type[EIPSolver], name: str, word: str, per_save: int, progress: bool, **options: Any
+) -> MethodRun:
+    step = scene.interval / per_save
+    result = integrate(
+        scene.problem, method=named(method, name), h=step, save_every=per_save, progress=progress, **options
+    )
+    head = (method.__name__, word)
+    return _finished(scene, name, head, step, result, "" if result.success else result.message)
+
+
+def _verlet(scene: SolarScene) -> MethodRun:
+    result = leapfrog(scene, scene.h, scene.every)
+    failure = "" if np.isfinite(result.y).all() else result.message
+    return _finished(scene, "SV", ("SV",), scene.h, result, failure)
+
+
+def leapfrog(scene: SolarScene, step: float, save_every: int | None) -> StormerVerletResult:
+    """Run Stoermer-Verlet in its kick-drift-kick form."""
+    problem = scene.problem
+    assert problem.acc is not None  # N bodies have accelerations
+    return stormer_verlet(problem.acc, problem.t_span, problem.y0, step, params=problem.params, save_every=save_every)
+
+
+def rebound_run(scene: SolarScene, peer: Peer, name: str, integrator: str, per_save: int, progress: bool) -> MethodRun:
+    """Run REBOUND; with fixed steps timed in a run without saves, each of which costs a synchronisation."""
+    step = scene.interval / per_save
+    run = partial(peer, scene.problem.params, scene.problem.y0, integrator, h=step, n_steps=scene.n_saves * per_save)
+    result = run(save_every=per_save)
+    fixed = integrator != "ias15"
+    wall_time = run().wall_time if fixed else result.wall_time
+    head = tuple(name.replace("(", "").replace(")", "").split())
+    return _finished(scene, name, head, step if fixed else None, result, "", wall_time)
+
+
+def _finished(
+    scene: SolarScene,
+    name: str,
+    head: tuple[str, ...],
+    step: float | None,
+    result: Any,
+    failure: str,
+    wall_time: float | None = None,
+) -> MethodRun:
+    finite = np.isfinite(result.y).all(axis=0)
+    t, y = result.t[finite], result.y[:, finite]
+    values = invariants_along(scene.problem.invariants, t, y)
+    start = values[:, :1]
+    return MethodRun(
+        name=name,
+        head=head,
+        step=step,
+        wall_time=result.wall_time if wall_time is None else wall_time,
+        t=t,
+        y=y,
+        energy_error=np.abs(values[0] / start[0] - 1),
+        momentum_error=np.linalg.norm((values - start)[1:], axis=0) / np.linalg.norm(start[1:]),
+        failure=failure,
+    )
+
+
+def stored_state(scene: SolarScene, year: float) -> np.ndarray | None:
+    """Return the reference state that the package carries for a time, if there is one."""
+    known = scene.problem.reference
+    return None if known is None else known(round(float(year), 9))
+
+
+def report_times(scene: SolarScene) -> list[float]:
+    """Years at which errors are reported: those with a stored reference state that were saved, and the end."""
+    times = np.linspace(0.0, scene.years, scene.n_saves + 1)[1:]
+    stored = [round(float(t), 9) for t in times if stored_state(scene, t) is not None]
+    return sorted({*stored, float(scene.years)})

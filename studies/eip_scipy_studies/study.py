@@ -1,0 +1,355 @@
+"""What a command is: settings, a measurement, and what is shown of it; and the one runner of all commands.
+
+A new command is a file with a subclass of `Study`, and a line in `eip_scipy_studies.commands`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, fields
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+
+from eip_scipy import CheckpointError
+from eip_scipy.core.names import nearest
+
+from .commands import CHECK_FAILED, DONE, INTERRUPTED
+from .report import UsageError, check_folder, check_target, document, say, warn, write_csv, write_file, write_json
+
+__all__ = [
+    "Check",
+    "Command",
+    "Figures",
+    "PartlyDone",
+    "Rows",
+    "Session",
+    "Study",
+    "Verdict",
+    "one_of",
+    "option",
+    "perform",
+    "some_of",
+]
+
+Found = TypeVar("Found")
+Rows = Sequence[Mapping[str, Any]]
+"""The lines of a CSV file, each with its columns' names."""
+Figures = Iterable[tuple[str, Any]]
+"""File names, and figures of matplotlib or functions that write to a path."""
+
+
+def option(default: Any, text: str, **settings: Any) -> Any:
+    """Make a field of a command that is an option of the command line, ``--its-name``.
+
+    Parameters
+    ----------
+    default : object
+        False makes a flag.
+    text : str
+        What ``--help`` says.
+    **settings
+        As for `argparse.ArgumentParser.add_argument`; ``positional=True`` makes it an argument without dashes.
+
+    Returns
+    -------
+    dataclasses.Field
+    """
+    return field(default=default, metadata={"help": text, **settings})
+
+
+def one_of(what: str, known: Collection[str]) -> Callable[[str], str]:
+    """Make a ``type`` of an option that takes one of these names, and says which is nearest to another.
+
+    Parameters
+    ----------
+    what : str
+        What they name.
+    known : collection of str
+
+    Returns
+    -------
+    callable
+    """
+
+    def read(text: str) -> str:
+        if text in known:
+            return text
+        hint = nearest(text.lower(), known)
+        raise argparse.ArgumentTypeError(f"unknown {what} {text!r}, expected one of {', '.join(known)}{hint}")
+
+    return read
+
+
+def some_of(what: str, known: Collection[str]) -> Any:
+    """Make a field of a command that takes some of these names, one an option.
+
+    Parameters
+    ----------
+    what : str
+        What they name.
+    known : collection of str
+
+    Returns
+    -------
+    dataclasses.Field
+        None: all.
+    """
+    text = f"one {what}, may be repeated; default: all ({', '.join(known)})"
+    return option(None, text, action="append", type=one_of(what, known), metavar="NAME")
+
+
+class Verdict(Protocol):
+    """What the runner asks of a check."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether it holds."""
+        ...
+
+
+class Check(NamedTuple):
+    """A check of a command, in words."""
+
+    text: str
+    passed: bool
+
+    @property
+    def line(self) -> str:
+        """One line of the text."""
+        return f"{'ok' if self.passed else 'FAILED':<6} {self.text}"
+
+
+class PartlyDone(KeyboardInterrupt):
+    """The user interrupted a measurement that leaves something to show."""
+
+    def __init__(self, found: Any) -> None:
+        super().__init__()
+        self.found = found
+
+
+@dataclass
+class Session:
+    """What a command runs in: where its files go, what it shows, whom it is compared with.
+
+    Attributes
+    ----------
+    name : str
+        The words of the command.
+    out : Path
+        Folder of figures and CSV files.
+    json : Path or None
+        File of the numbers.
+    quiet : bool
+        Print nothing but errors.
+    absent : list of str
+        What could not be compared with, said at the end.
+    written : set of Path
+        Files that were made.
+    unnamed : list of Path
+        Those of them that no line has named yet.
+    open : ExitStack
+        What is to be closed when the command ends.
+    """
+
+    name: str
+    out: Path = Path("eip_results")
+    json: Path | None = None
+    quiet: bool = False
+    absent: list[str] = field(default_factory=list)
+    written: set[Path] = field(default_factory=set)
+    unnamed: list[Path] = field(default_factory=list)
+    open: ExitStack = field(default_factory=ExitStack)
+
+    @property
+    def shown(self) -> bool:
+        """Whether progress is shown: to a terminal only, as a file would fill with it."""
+        return not self.quiet and sys.stderr is not None and sys.stderr.isatty()
+
+    def bar(self, total: int | None, what: str, unit: str = "run", **settings: Any) -> Any:
+        """Make a progress bar of tqdm, to be used in a ``with``."""
+        from tqdm import tqdm
+
+        return tqdm(total=total, desc=what, unit=unit, disable=not self.shown, **{"leave": False, **settings})
+
+    def peer(self, name: str, methods: str) -> Any:
+        """Find one of `eip_scipy.integrations`; None, and a line at the end, where what it needs is not installed.
+
+        Parameters
+        ----------
+        name : str
+        methods : str
+            What there is no comparison with then.
+
+        Returns
+        -------
+        module or None
+        """
+        try:
+            return import_module(f"eip_scipy.integrations.{name}")
+        except ImportError as error:
+            line = f"no comparison with {methods}: {error}"
+            if line not in self.absent:
+                self.absent.append(line)
+            return None
+
+    def say(self, text: str = "") -> None:
+        """Print, unless quiet."""
+        if not self.quiet:
+            say(text)
+
+    def wrote(self, path: Path) -> None:
+        """Note that a file is there; `name_files` prints it, once."""
+        if path not in self.written:
+            self.unnamed.append(path)
+        self.written.add(path)
+
+    def name_files(self) -> None:
+        """Print which files were made since the last time, with an empty line before the first of all."""
+        first = len(self.unnamed) == len(self.written)
+        for k, path in enumerate(self.unnamed):
+            self.say(f"\nwrote {path}" if first and k == 0 else f"wrote {path}")
+        self.unnamed.clear()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command(ABC):
+    """Settings as fields: those made by `option` are the user's, the others change in tests and in other commands."""
+
+    @abstractmethod
+    def run(self, session: Session) -> int:
+        """Do it, and return the exit status."""
+
+    def arguments(self) -> dict[str, Any]:
+        """The user's settings, for the JSON."""
+        return {item.name: getattr(self, item.name) for item in fields(self) if "help" in item.metadata}
+
+
+class Study(Command, Generic[Found]):
+    """A command that measures something. The methods take what `measure` returned.
+
+    A measurement must be there and a text; all else is optional. `writes_files` is False for one without CSV files and
+    figures.
+    """
+
+    writes_files = True
+
+    @abstractmethod
+    def measure(self, session: Session) -> Found:
+        """Compute. What the user interrupts may raise `PartlyDone` with what there is."""
+
+    @abstractmethod
+    def text(self, found: Found) -> str:
+        """What is printed."""
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        """The content of the JSON."""
+        return {}
+
+    def tables(self, found: Found) -> Mapping[str, Rows]:
+        """CSV files, by their names."""
+        return {}
+
+    def checks(self, found: Found) -> Sequence[Verdict]:
+        """What decides on the exit status."""
+        return ()
+
+    def figures(self, found: Found) -> Figures:
+        """Make figures one by one. ImportError where what draws them is not installed, which a line then says."""
+        return ()
+
+    def refine(self, found: Found, session: Session) -> bool:
+        """Measure what takes long, with the text and the tables out; True where these are to be written anew."""
+        return False
+
+    def when_interrupted(self) -> str:
+        """What the user is told besides: how to go on."""
+        return ""
+
+    def check_settings(self) -> None:
+        """Raise UsageError for settings that do not go together."""
+
+    def run(self, session: Session) -> int:
+        """See `perform`; the settings and the files are looked at first."""
+        self.check_settings()
+        if self.writes_files:
+            check_folder(session.out)
+        if session.json is not None:
+            check_target(session.json)
+        return perform(self, session)[0]
+
+
+def perform(study: Study[Any], session: Session) -> tuple[int, dict[str, Any]]:
+    """Measure, print, write, judge: what all commands have in common.
+
+    Parameters
+    ----------
+    study : Study
+    session : Session
+
+    Returns
+    -------
+    int, dict
+        Exit status: 0 done, 1 a check failed, 130 interrupted; and what is in the JSON.
+    """
+    with session.open:
+        interrupted = ""
+        try:
+            found = study.measure(session)
+        except PartlyDone as stop:
+            found, interrupted = stop.found, "interrupted; the runs that were done are in the table and the files"
+        except KeyboardInterrupt:
+            _tell(study.when_interrupted(), "interrupted; nothing was written")
+            return INTERRUPTED, {}
+        except MemoryError as error:
+            raise UsageError(f"not enough memory: {error}") from error
+        except CheckpointError as error:
+            raise UsageError(f"{error} On the command line, resume=True is --resume.") from error
+        try:  # files before text: a stdout that takes nothing loses no file, and a full disk no text
+            numbers = _write_numbers(study, found, session)
+        finally:
+            session.say(study.text(found))
+            session.name_files()
+        try:
+            if not interrupted and study.refine(found, session):
+                numbers = _write_numbers(study, found, session)
+                session.name_files()
+        except KeyboardInterrupt:
+            interrupted = "interrupted; the table is complete, what is measured after it and the figures are missing"
+        if interrupted:
+            _tell(study.when_interrupted(), interrupted)
+            return INTERRUPTED, numbers
+        _write_figures(study, found, session)
+    return DONE if all(check.passed for check in study.checks(found)) else CHECK_FAILED, numbers
+
+
+def _writer(figure: Any) -> Callable[[Path], Any]:
+    write: Callable[[Path], Any] = figure.savefig if hasattr(figure, "savefig") else figure
+    return write
+
+
+def _tell(*lines: str) -> None:
+    for line in filter(None, lines):
+        warn(line)
+
+
+def _write_numbers(study: Study[Any], found: Any, session: Session) -> dict[str, Any]:
+    for name, rows in study.tables(found).items():
+        session.wrote(write_csv(session.out / name, rows))
+    numbers = study.numbers(found)
+    if session.json is not None:
+        session.wrote(write_json(session.json, document(session.name, study.arguments(), **numbers)))
+    return numbers
+
+
+def _write_figures(study: Study[Any], found: Any, session: Session) -> None:
+    try:
+        for name, figure in study.figures(found):
+            session.wrote(write_file(session.out / name, _writer(figure)))
+            session.name_files()
+    except ImportError as error:
+        warn(f"no figures: {error}")

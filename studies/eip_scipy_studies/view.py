@@ -1,0 +1,66 @@
+"""``eip-scipy view``: a page that plays a saved run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from eip_scipy import load
+from eip_scipy.run.figures import described
+from eip_scipy.run.view import page
+
+from .report import UsageError
+from .study import Check, Figures, Session, Study, option
+
+__all__ = ["View"]
+
+
+class Movie(NamedTuple):
+    """A run, and the page that plays it."""
+
+    run: Any
+    page: str
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the run is; a result of `solve_ivp` does not say."""
+        return bool(self.run.get("trusted", True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class View(Study[Movie]):
+    """The command."""
+
+    result: Path = option(None, "a file that run.save() has written", positional=True, type=Path, metavar="RESULT")
+    reference: Path | None = option(None, "another one, of the same times, that is right", type=Path, metavar="FILE")
+    names: str | None = option(None, 'names of the components, as "x y vx vy"', metavar="NAMES")
+
+    def measure(self, session: Session) -> Movie:
+        """Read the run, and write its page."""
+        run = _loaded(self.result)
+        reference = None if self.reference is None else _loaded(self.reference)
+        try:
+            return Movie(run, page(run, names=self.names, reference=reference))
+        except ValueError as error:
+            raise UsageError(str(error)) from error
+
+    def text(self, found: Movie) -> str:
+        t = found.run.t
+        return f"{described(found.run)}; {len(t)} saved states from t = {t[0]:g} to {t[-1]:g}".lstrip("; ")
+
+    def numbers(self, found: Movie) -> dict[str, Any]:
+        return {"of_a_trusted_run": found.trusted}
+
+    def checks(self, found: Movie) -> list[Check]:
+        return [Check("the run is to be trusted", found.trusted)]
+
+    def figures(self, found: Movie) -> Figures:
+        yield f"{self.result.stem}.html", lambda path: path.write_text(found.page, encoding="utf-8")
+
+
+def _loaded(path: Path) -> Any:
+    try:
+        return load(path)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot read {str(path)!r}: {error}") from error
