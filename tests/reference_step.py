@@ -15,6 +15,8 @@ import numpy as np
 EPS = np.finfo(float).eps
 FLOOR = 1e-7
 MEMORY = 0.9
+# The share of its terms that a given target may be missed by without a further Newton step, and their largest number.
+MOST_LEFT, FURTHER = 1e-9, 3
 
 Array = np.ndarray
 
@@ -59,7 +61,9 @@ class Step:
         along = {"new": (t, y_hat), "old": (t_old, y), "midpoint": ((t_old + t) / 2, (y + y_hat) / 2)}[self.direction]
         Q = sigma * self.neutral(floats(self.gradients(*along)))
         mu, now = np.zeros(len(g)), y_hat
-        for _ in range(self.iterations):
+        for k in range(self.iterations + FURTHER):
+            if k >= self.iterations and self.shares(t, now).max() <= MOST_LEFT:
+                break
             B = sigma * self.neutral(floats(self.gradients(t, now)))
             mu += np.linalg.lstsq(B @ Q.T, -self.defects(t, now), rcond=None)[0]
             now = states(floats(y_hat) + self.kept(sigma * (Q.T @ mu)), y)
@@ -67,11 +71,13 @@ class Step:
 
     def defects(self, t: float, y: Array) -> Array:
         """I - target; 0 where that is the rounding of four of an invariant's terms."""
+        return np.where(self.shares(t, y) <= 4 * EPS, 0.0, self.values(t, y) - self.target)
+
+    def shares(self, t: float, y: Array) -> Array:
+        """Return the distances from the targets in units of the invariants' terms."""
         values = self.values(t, y)
         terms = np.abs(floats(self.gradients(t, y)) * floats(y)).sum(axis=1)
-        size = np.max([np.abs(values), np.abs(self.target), terms], axis=0)
-        g = values - self.target
-        return np.where(np.abs(g) <= 4 * EPS * size, 0.0, g)
+        return np.abs(values - self.target) / np.max([np.abs(values), np.abs(self.target), terms], axis=0)
 
     def weights(self, y: Array, y_hat: Array, err: Array | None) -> Array:
         """Sigma: how far each float may move, the largest 1. By blocks, scale_b (e_b^kappa + floor).

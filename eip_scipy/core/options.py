@@ -35,7 +35,7 @@ from ..methods.multistep import GaussJackson
 from .blocks import blocks_of
 from .frame import frame_rows
 from .inputs import count, flag, real_array
-from .invariants import Invariant, InvariantSet, JointInvariants
+from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet, JointInvariants
 from .one_step import OneStep
 from .stepping import AnyMethod, Stepping
 
@@ -51,6 +51,8 @@ __all__ = [
 
 DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
 MOST_ITERATIONS = 1000
+# A tenth of what a start may miss a given target by.
+MOST_LEFT = 0.1 * TARGET_TOLERANCE
 WIDTH = 120
 # In docstrings: these lines become the options with their texts, or their names.
 WHOLE, NAMES = "{ProjectionOptions}", "{names of ProjectionOptions}"
@@ -96,6 +98,8 @@ class Options(NamedTuple):
     `watched`: whether corrections are compared with the errors of the steps. `limit`: the share of an invariant's terms
     that a projection may leave as its defect; the terms are `per_band` dead bands. `far`: the share of them from which
     on a defect before a projection is noted.
+    `most_left`: the share of each one's terms that a Newton step may leave without a further one; finite where the user
+    gave a target, which a run that goes on from here must meet.
     `joint`: in interpreted runs the `JointInvariants` whose functions serve, else None.
     """
 
@@ -107,6 +111,7 @@ class Options(NamedTuple):
     target: np.ndarray
     scales: np.ndarray
     computed: np.ndarray
+    most_left: np.ndarray
     kinds: Grouping
     kappa: float
     metric: int
@@ -272,6 +277,8 @@ class ProjectionOptions:
             target=known.target,
             scales=known.scales,
             computed=np.array(known.computed, float),
+            # Multistep methods put the defects in place of the targets; their errors leave nothing to speak of.
+            most_left=np.where(known.given & (not isinstance(method, GaussJackson)), MOST_LEFT, np.inf),
             kinds=groups,
             kappa=method.kappa,
             metric=kind,

@@ -113,7 +113,11 @@ def project(
     )
     nowhere = Stepping(Span(t, 0.0, t, 1.0, 0, np.inf), 0.0, None, np.zeros(n), np.zeros(n))
     options, weight, _ = given.settled(RK1, nowhere, y, known)
-    options = options._replace(target=_targets(known, target, start, t), kinds=kinds_of(options.groups, y, f_hat))
+    options = options._replace(
+        target=_targets(known, target, start, t),
+        kinds=kinds_of(options.groups, y, f_hat),
+        most_left=np.full(known.size, np.inf),  # as many Newton steps as asked for
+    )
     projection = setup.Projection(known, options, derivative)
     work = projection.work
     if weight is not None:

@@ -15,6 +15,7 @@ from eip_scipy import (
     EIPDOP853,
     EIPGJ12,
     EIPRK4,
+    EIPRK23,
     EIPRK45,
     EIPRKN12,
     IntegrationResult,
@@ -345,6 +346,39 @@ def test_results_pickle():
 
 
 # Runs that go on.
+
+
+@pytest.mark.parametrize(
+    ("method", "options"), [(EIPRK45, {}), (EIPDOP853, {"rtol": 1e-2}), (EIPRK23, {}), (EIPRK4, {"h": 0.2})]
+)
+def test_own_end_states_are_starts(method, options):
+    """One Newton step at a loose tolerance leaves more of a given target than a start may miss."""
+
+    def pendulum(t, y):
+        pull = (y[2:] @ y[2:] - 9.81 * y[1]) / (y[:2] @ y[:2])
+        return np.concatenate([y[2:], [0.0, -9.81] - pull * y[:2]])
+
+    rod = Invariant(lambda t, y: y[:2] @ y[:2] - 1, target=0, name="rod")
+    along = Invariant(lambda t, y: y[:2] @ y[2:], target=0, name="along")
+    y, defects = np.array([1.0, 0.0, 0.0, 0.0]), []
+    for k in range(20):
+        run = integrate(pendulum, (0.37 * k, 0.37 * (k + 1)), y, method=method, invariants=[rod, along], **options)
+        assert run.status == 0
+        y = run.y[:, -1]
+        defects += [abs(y[:2] @ y[:2] - 1), abs(y[:2] @ y[2:])]
+    # Terms of `along` reach 2 g = 20 in the square of the speed.
+    assert max(defects) < 1e-7
+    if method is EIPRK4:
+        members = ensemble(pendulum, (0, 3.7), [[1.0, 0, 0, 0], y], method=method, invariants=[rod, along], **options)
+        assert (members.status == 0).all()
+        assert np.abs((members.y[:, :2] ** 2).sum(axis=1) - 1).max() < 1e-7
+
+
+def test_loose_runs_continue():
+    """What one Newton step leaves of a value measured at the start is not held against the continued run."""
+    first = integrate(lambda t, y: np.array([y[1], -np.sin(y[0])]), (0, 9), [3.0, 0.0], method=EIPRK23, rtol=1e-2,
+                      invariants=Invariant(lambda t, y: 0.5 * y[1] ** 2 - np.cos(y[0])))  # fmt: skip
+    assert first.continue_to(20).status == 0
 
 
 @pytest.mark.parametrize(

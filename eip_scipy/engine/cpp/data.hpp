@@ -149,6 +149,8 @@ struct Options {
     Blocks blocks;
     Frame frame;
     const double *scales, *computed;  // computed: 1 for invariants without a gradient of the user's
+    const double *most_left;          // the share of its terms that a Newton step may leave without a further one
+    bool has_limits;                  // whether any of these is finite
     Blocks kinds;                     // floats of the same unit, as far as that is known
     double kappa;
     int64_t metric, direction, iterations, every;

@@ -205,6 +205,8 @@ Options options_of(PyObject *options, Work &w, Arrays &arrays) {
     w.products = arrays.floats(attribute(options, "frame").get(), "products", {o.frame.rows});
     o.scales = arrays.floats(options, "scales", {w.l});
     o.computed = arrays.floats(options, "computed", {w.l});
+    o.most_left = arrays.floats(options, "most_left", {w.l});
+    o.has_limits = std::any_of(o.most_left, o.most_left + w.l, [](double share) { return share < INFINITE; });
     read_each(o, [options](const char *name, auto &value) {
         using Value = std::decay_t<decltype(value)>;
         if constexpr (std::is_same_v<Value, bool>)
