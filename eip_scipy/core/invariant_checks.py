@@ -38,8 +38,8 @@ ONE_SIDED_WEIGHTS = (-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6)
 MOST_NAMES = 3
 # Short differences along the flow: their step, in the time in which the state moves by its size, and the share of the
 # rate's terms from which on those to both sides differ. What curvature makes them differ by is half as large at half
-# the step; what a kink does is not. Beside a kink of the slope, where terms may vanish, the differences to both sides
-# differ by more than the rate that is found.
+# the step; what a kink does is not. Next to a kink of the slope, where terms may vanish, the differences to both
+# sides differ by more than the rate that is found.
 SHORT, KINK, KEPT_AT_HALF = 1e-6, 1e-4, 0.6
 # The rounding of a value, in units of its terms.
 ROUNDINGS = 4.0

@@ -375,7 +375,7 @@ def test_own_end_states_are_starts(method, options):
 
 
 def test_loose_runs_continue():
-    """What one Newton step leaves of a value measured at the start is not held against the continued run."""
+    """A continued run starts although one Newton step has left a part of the value measured at the first start."""
     first = integrate(lambda t, y: np.array([y[1], -np.sin(y[0])]), (0, 9), [3.0, 0.0], method=EIPRK23, rtol=1e-2,
                       invariants=Invariant(lambda t, y: 0.5 * y[1] ** 2 - np.cos(y[0])))  # fmt: skip
     assert first.continue_to(20).status == 0

@@ -164,35 +164,35 @@ inline const double *origin(const Step &step, const W &w) {
     return step.h != 0.0 && step.y != w.y_hat ? step.y : nullptr;
 }
 
-// The largest distance of y_new from a given target, in units of what may be left of it.
-template <class AnyRun>
-[[gnu::noinline]] inline double missed_targets(const AnyRun &run, const Step &step) {
-    const Options &o = run.options;
-    const auto &w = run.work;
-    double worst = 0.0;
-    run.system.inv(w, step.t_new, step.y_new, w.values);
+// The largest distance of w.values from a given target, in units of what may be left of it.
+template <class W>
+inline auto missed_targets(const Options &o, const W &w) {
+    typename W::Value worst = 0.0;
     for (int64_t i = 0; i < w.l; ++i)
-        worst = std::max(worst, std::abs(w.values[i] - w.target[i]) / (o.most_left[i] * o.per_band * w.band[i] + TINY));
+        worst = max(worst, abs(w.values[i] - w.target[i]) / (o.most_left[i] * o.per_band * w.band[i] + TINY));
     return worst;
 }
 
 // Further Newton steps towards given targets, while they come nearer; returns the rank. Gradients that are nearly parallel
-// may not reach them at all: the state is then the nearest so far.
-[[gnu::cold, gnu::noinline]] inline int64_t reach_targets(const Run &run, const Step &step, int64_t rank) {
+// may not reach them at all: the state is then the nearest so far. w.values are its invariants, before and after.
+[[gnu::cold, gnu::noinline]] inline int64_t come_nearer(const Run &run, const Step &step, int64_t rank) {
     const Options &o = run.options;
     const Work &w = run.work;
+    const auto evaluate = [&] { run.system.inv(w, step.t_new, step.y_new, w.values); };
+    double missed = missed_targets(o, w);
     if (o.direction == NEW && o.iterations == 1) rank = first_move(o, w, step.y_new, true);
-    double missed = missed_targets(run, step);
     for (int k = 0; rank >= 0 && k < MAX_FURTHER && missed > 1.0; ++k) {
         copy(step.y_new, w.stage, w.m);
         if (!newton_iteration(run, step, rank)) break;
         const double before = missed;
-        missed = missed_targets(run, step);
+        evaluate();
+        missed = missed_targets(o, w);
         if (missed < before) continue;
         copy(w.stage, step.y_new, w.m);
         for (int64_t j = 0; j < w.m; ++j) w.move[j] = step.y_new[j] - w.y_hat[j];
         break;
     }
+    evaluate();
     return rank;
 }
 
@@ -207,13 +207,16 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     }
     for (int64_t k = 1; k < o.iterations; ++k)
         if (!newton_iteration(of_any_length(run), step, rank)) break;
-    if (o.has_limits && missed_targets(run, step) > 1.0) [[unlikely]]
-        rank = reach_targets(of_any_length(run), step, rank);
+    if (o.has_limits) {
+        run.system.inv(w, step.t_new, step.y_new, w.values);
+        if (missed_targets(o, w) > 1.0) [[unlikely]]
+            rank = come_nearer(of_any_length(run), step, rank);
+    }
     if (o.compensated) {
         copy(w.y_hat, step.y_new, w.m);
         compensated_add(step.y_new, w.carry_hat, w.move, w.m);
     }
-    evaluate_invariants(run, step.t_new, step.y_new);
+    if (o.compensated || !o.has_limits) evaluate_invariants(run, step.t_new, step.y_new);
     return judge(w.before, origin(step, w), step.y_new, o, w);
 }
 

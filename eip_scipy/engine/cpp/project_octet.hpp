@@ -109,8 +109,7 @@ template <class W>
     for (int64_t j = 0; !all_move && j < w.m; ++j) eight.y_new[j] = where(outside, eight.y_new[j], w.y_hat[j]);
     evaluate_invariants(run, t, eight.y_new);
     const Mask held = defects_held<Octet>(w.before, o, w) & small_shares(o, w) & all_finite(eight.y_new, w.m);
-    for (int64_t i = 0; o.has_limits && i < w.l; ++i)
-        leave = leave | (abs(w.defect[i]) > o.most_left[i] * o.per_band * w.band[i]);
+    if (o.has_limits) leave = leave | (missed_targets(o, w) > 1.0);
     Mask done = alive & held & !leave;
     if (o.watched) done = done & !note_octet(t, done, o, w);
     for (int64_t i = 0; i < w.l; ++i)
