@@ -7,6 +7,7 @@ a function is to be compiled.
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING, Any
 
+from .core import moved as moved
 from .core import source_tree as source_tree
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """The paper's tables 1-4 in 50 digits, independent of the package: ``python tests/mpmath_tables.py`` stores them.
 
-The results go as the lists "mpmath" into eip_scipy/data/paper_tables.json, where they tell what the paper and we
-would both have without round-off. Steps, tableaux and start are the decimals of the paper, not their doubles.
+The results go as the lists "mpmath" into paper_tables.json of eip_scipy_studies/data, where they say what the paper and
+we would both have without round-off. Steps, tableaux and start are the decimals of the paper, not their doubles.
 """
 
 import json
@@ -12,7 +12,7 @@ from pathlib import Path
 import mpmath
 from mpmath import mpf
 
-DATA = Path(__file__).parents[1] / "eip_scipy" / "data" / "paper_tables.json"
+DATA = Path(__file__).parents[1] / "studies" / "eip_scipy_studies" / "data" / "paper_tables.json"
 DIGITS = 50
 STORED_DIGITS = 12
 

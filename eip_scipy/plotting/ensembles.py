@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from . import FLOOR, PALETTE, _log_errors, method_styles, typeset
+from . import FLOOR, PALETTE, log_errors, method_styles, typeset
 from .shown import shown_figure
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def _draw_errors(axis: Axes, members: np.ndarray, errors: Mapping[str, Any], fai
         bottom = np.full(np.count_nonzero(failed), 0.03)
         style = {"ls": "", "marker": "x", "ms": 6, "mew": 1.4, "color": FAILURES, "label": "failed"}
         axis.plot(members[failed], bottom, transform=axis.get_xaxis_transform(), **style)
-    _log_errors(axis, "member", "largest |I - target|")
+    log_errors(axis, "member", "largest |I - target|")
     axis.locator_params(axis="x", nbins=5, integer=True)
     axis.legend(fontsize="small", loc="best", markerscale=1.6 if size < 4 else 1.0)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import FLOOR, PALETTE, _log_errors, method_styles, typeset
+from . import FLOOR, PALETTE, log_errors, method_styles, typeset
 from .shown import shown_figure
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def run_figure(
     for name, values in errors.items():
         axes[0].plot(t, _above_zero(np.abs(values)), lw=1.1, **styles[name] | {"marker": None})
     if errors:
-        _log_errors(axes[0], "t", "|I - target|")
+        log_errors(axes[0], "t", "|I - target|")
         axes[0].locator_params(axis="x", nbins=TICKS)
         axes[0].legend(fontsize="small", loc="best")
     if corrections:
@@ -171,4 +171,4 @@ def _draw_corrections(axis: Axes, corrections: Mapping[str, float], styles: Mapp
     axis.axhline(HEALTHY, color="0.4", lw=1.0, ls=":")
     text = axis.annotate("most correct runs stay below", (0.02, HEALTHY), xycoords=("axes fraction", "data"))
     text.set(va="bottom", fontsize="x-small")
-    _log_errors(axis, "", "largest correction [local errors]")
+    log_errors(axis, "", "largest correction [local errors]")

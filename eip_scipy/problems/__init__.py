@@ -1,5 +1,6 @@
-"""Problems with invariants: functions that return a `Problem`, and `hard_cases`, which returns many with solutions."""
+"""Problems with invariants: functions that return a `Problem`."""
 
+from ..core.moved import moved_names
 from ..core.problem import Problem
 from .gravity import solar_data as solar_data
 from .gravity.forces import ForceConstants
@@ -20,7 +21,6 @@ from .gross_pitaevskii import (
     rotating_packet,
     soliton,
 )
-from .hard_cases import HardCase, hard_cases
 from .harmonic import harmonic
 from .invariant_search import find_invariants
 from .kepler import kepler
@@ -45,7 +45,6 @@ __all__ = [
     "ForceConstants",
     "Grid",
     "GrossPitaevskii",
-    "HardCase",
     "KortewegDeVries",
     "Lawson",
     "OrbitalElements",
@@ -64,7 +63,6 @@ __all__ = [
     "figure_eight",
     "find_invariants",
     "hamiltonian",
-    "hard_cases",
     "harmonic",
     "harmonic_trap",
     "kepler",
@@ -85,3 +83,5 @@ __all__ = [
     "tokamak",
     "uniform_field",
 ]
+
+__getattr__ = moved_names(__name__)

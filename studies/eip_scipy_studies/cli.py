@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
-from .commands import CHECK_FAILED, COMMANDS, DONE, INTERRUPTED, MOVED, NOT_PRINTED, WRONG_USAGE
+from .commands import CHECK_FAILED, COMMANDS, DONE, INTERRUPTED, MOVED, NOT_PRINTED, WRONG_USAGE, nearest
 
 __all__ = ["main"]
 
@@ -81,18 +81,12 @@ def _no_command(words: list[str]) -> int:
     last = list(dict.fromkeys(name.removeprefix(group).split()[0] for name in known))
     if not rest or rest[0].startswith("-"):
         parser.error(f"expected {what} first, one of {', '.join(last)}")
-    parser.error(f"unknown {what} {rest[0]!r}, expected one of {', '.join(last)}{_nearest(rest[0], last)}")
+    parser.error(f"unknown {what} {rest[0]!r}, expected one of {', '.join(last)}{nearest(rest[0], last)}")
 
 
 def _listed(names: Sequence[str]) -> str:
     width = max(map(len, names))
     return "\n".join(["commands:", *(f"  {name:<{width}}  {COMMANDS[name].summary}" for name in names)])
-
-
-def _nearest(word: str, known: Sequence[str]) -> str:
-    from eip_scipy.core.names import nearest
-
-    return nearest(word, known)
 
 
 def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
@@ -116,7 +110,7 @@ def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
             *(text for action in parser._actions for text in action.option_strings),
             *(b.split()[1] for b in below),
         ]
-        parser.error(f"unrecognized arguments: {' '.join(rest)}{_nearest(rest[0].partition('=')[0], known)}")
+        parser.error(f"unrecognized arguments: {' '.join(rest)}{nearest(rest[0].partition('=')[0], known)}")
     return _conduct(name, command, args)
 
 
@@ -141,14 +135,13 @@ def _add_options(parser: argparse.ArgumentParser, command: Any) -> None:
 
 def _conduct(name: str, command: Any, args: argparse.Namespace) -> int:
     from eip_scipy import ProjectionWarning
-    from eip_scipy.run.interrupts import ended_by_sigterm
 
-    from .report import UsageError, listening, printing, warn
+    from .report import UsageError, ended_by_sigterm, listening, printing, warn
     from .study import Session
 
     session = Session(name, args.out, args.json, args.quiet)
     own = {key: value for key, value in vars(args).items() if key not in ("out", "json", "quiet")}
-    with ended_by_sigterm(True), listening(ProjectionWarning) as untrusted, printing() as unsaid:
+    with ended_by_sigterm(), listening(ProjectionWarning) as untrusted, printing() as unsaid:
         try:
             status = command(**own).run(session)
             for line in session.absent:  # at the end, where it is seen

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
-__all__ = ["CHECK_FAILED", "COMMANDS", "DONE", "INTERRUPTED", "MOVED", "NOT_PRINTED", "WRONG_USAGE", "Entry"]
+__all__ = ["CHECK_FAILED", "COMMANDS", "DONE", "INTERRUPTED", "MOVED", "NOT_PRINTED", "WRONG_USAGE", "Entry", "nearest"]
 
 DONE, CHECK_FAILED, WRONG_USAGE, NOT_PRINTED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -58,3 +59,11 @@ MOVED = {
     ("charged-particle", "--field"): "charged-particle uniform, or charged-particle tokamak",
     ("charged-particle", "--orbit"): "charged-particle tokamak --orbit",
 }
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return ``; did you mean ...?`` for the known name that is most like `name`, or nothing."""
+    import difflib
+
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -11,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK4, EIPRKN12, ensemble, integrate
-from eip_scipy.core.config import configuration, described
+from eip_scipy import EIPRK4, EIPRKN12, ensemble, integrate, show_config
 from eip_scipy.problems import kepler, solar_system
 
 from .report import compact, describe_machine, table, warn
@@ -115,14 +116,14 @@ class Doctor(Study[Examined]):
 
     def measure(self, session: Session) -> Examined:
         """Look what is there, and run each trial."""
-        found = Examined(configuration(), [_timed(*trial) for trial in self.trials])
+        found = Examined(show_config("dicts") or {}, [_timed(*trial) for trial in self.trials])
         if failed := [trial.name for trial in found.trials if not trial.passed]:
             names = ", ".join(failed)
             warn(f"failed: {names}. This installation computes something else than it must; install it anew.")
         return found
 
     def text(self, found: Examined) -> str:
-        return _text(*found)
+        return _text(found.trials)
 
     def numbers(self, found: Examined) -> dict[str, Any]:
         trials = [{**trial._asdict(), "passed": trial.passed} for trial in found.trials]
@@ -132,6 +133,9 @@ class Doctor(Study[Examined]):
         return found.trials
 
 
-def _text(installed: dict[str, Any], trials: Sequence[Trial]) -> str:
+def _text(trials: Sequence[Trial]) -> str:
+    installation = io.StringIO()
+    with redirect_stdout(installation):
+        show_config()
     rows = table((("found",), ("at most",), ("s",), ("",)), [(trial.name, trial.cells()) for trial in trials])
-    return "\n\n".join((described(installed), f"machine: {describe_machine()}", rows))
+    return "\n\n".join((installation.getvalue().rstrip(), f"machine: {describe_machine()}", rows))

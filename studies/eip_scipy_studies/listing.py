@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import eip_scipy
-from eip_scipy import EIPSolver, comparators, problems
+from eip_scipy import EIPSolver, problems
 from eip_scipy.problems import solar_data
 
+from . import comparators, hard_cases
 from .commands import COMMANDS
 from .study import Session, Study
 
@@ -36,6 +37,7 @@ class Listing(Study[Found]):
         sets = {name: solar_data.load(name) for name in solar_data.available()}
         others = {name: getattr(comparators, name) for name in comparators.__all__}
         functions = {name: make for name in problems.__all__ if _is_function(make := getattr(problems, name))}
+        functions["hard_cases"] = hard_cases.hard_cases
         return {
             "commands": {name: entry.summary for name, entry in COMMANDS.items()},
             "methods": {name: _first_line(method) for name, method in fixed_step_methods().items()},

@@ -7,17 +7,20 @@ import json
 import math
 import os
 import platform
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from types import FrameType
 from typing import Any, TextIO
 
 import numpy as np
 
-from eip_scipy.core.versions import versions
+from eip_scipy import show_config
 
 __all__ = [
     "UsageError",
@@ -25,13 +28,16 @@ __all__ = [
     "check_outputs",
     "check_target",
     "compact",
+    "cores",
     "describe_machine",
     "document",
+    "ended_by_sigterm",
     "listening",
     "machine",
     "printing",
     "say",
     "table",
+    "versions",
     "warn",
     "write_csv",
     "write_file",
@@ -72,6 +78,19 @@ def _processor() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine() or "unknown processor"
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions of Python, of eip_scipy, of what it needs and of its extras; None for what is absent."""
+    found = show_config("dicts") or {}
+    return {**found["versions"], **{name: extra["version"] for name, extra in found["extras"].items()}}
 
 
 def document(command: str, arguments: Mapping[str, Any], **content: Any) -> dict[str, Any]:
@@ -229,6 +248,35 @@ def listening(kind: type[Warning]) -> Iterator[list[str]]:
 
         warnings.showwarning = listen
         yield _untrusted
+
+
+@contextmanager
+def ended_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM end the block as Ctrl-C does, and afterwards the process, as the sender of the signal expects.
+
+    A handler of the user's own stays in place. A second SIGTERM does not disturb what the first one started.
+    """
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    came = False
+
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal came
+        if not came:
+            came = True
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        if came:
+            if sys.stdout is not None:
+                sys.stdout.flush()
+            signal.raise_signal(signal.SIGTERM)
 
 
 def check_folder(folder: Path) -> None:

@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from eip_scipy import CheckpointError
-from eip_scipy.core.names import nearest
 
-from .commands import CHECK_FAILED, DONE, INTERRUPTED
+from .commands import CHECK_FAILED, DONE, INTERRUPTED, nearest
 from .report import UsageError, check_folder, check_target, document, say, warn, write_csv, write_file, write_json
 
 __all__ = [

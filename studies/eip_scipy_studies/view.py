@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from eip_scipy import load
-from eip_scipy.run.figures import described
-from eip_scipy.run.view import page
+from eip_scipy import load, view
 
 from .report import UsageError
 from .study import Check, Figures, Session, Study, option
@@ -41,13 +40,19 @@ class View(Study[Movie]):
         run = _loaded(self.result)
         reference = None if self.reference is None else _loaded(self.reference)
         try:
-            return Movie(run, page(run, names=self.names, reference=reference))
+            with TemporaryDirectory() as folder:
+                page = view(run, Path(folder) / "page.html", names=self.names, reference=reference)
+                return Movie(run, page.read_text(encoding="utf-8"))
         except ValueError as error:
             raise UsageError(str(error)) from error
 
     def text(self, found: Movie) -> str:
-        t = found.run.t
-        return f"{described(found.run)}; {len(t)} saved states from t = {t[0]:g} to {t[-1]:g}".lstrip("; ")
+        run, t = found.run, found.run.t
+        how = ""
+        if "method" in run:  # a result of `solve_ivp` does not say
+            steps = "adaptive steps" if run.h is None else f"h = {run.h:g}"
+            how = f"{run.method}, {steps}{'' if run.trusted else ': not to be trusted'}; "
+        return f"{how}{len(t)} saved states from t = {t[0]:g} to {t[-1]:g}"
 
     def numbers(self, found: Movie) -> dict[str, Any]:
         return {"of_a_trusted_run": found.trusted}

@@ -25,7 +25,7 @@ def test_the_package_alone_is_light():
     found = python("import eip_scipy, sys\nprint(*sys.modules)")
     assert set(found).isdisjoint(HEAVY)
     own = {name for name in found if name.startswith("eip_scipy.")}
-    assert own <= {"eip_scipy.core", "eip_scipy.core.source_tree", "eip_scipy.integrations"}
+    assert own <= {"eip_scipy.core", "eip_scipy.core.moved", "eip_scipy.core.source_tree", "eip_scipy.integrations"}
 
 
 def test_names_bring_no_more_than_they_need():
@@ -41,7 +41,7 @@ def test_steps_bring_no_ensembles_and_no_problems():
 
 def test_no_name_brings_the_studies():
     """Neither the public names nor the public modules load them; `python -m eip_scipy` does."""
-    modules = "checkpoint, comparators, integrations, methods, plotting, problems"
+    modules = "checkpoint, integrations, methods, native_kernels, plotting, problems"
     assert loaded(f"from eip_scipy import *\nfrom eip_scipy import {modules}", ["eip_scipy_studies"]) == []
     assert loaded("import eip_scipy.__main__", ["eip_scipy_studies", "numpy"]) == ["eip_scipy_studies"]
 
@@ -67,3 +67,30 @@ def test_no_folder_or_module_has_a_public_name():
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'EIPRK7'"):
         eip_scipy.EIPRK7  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("code", "new"),
+    [
+        ("from eip_scipy.comparators import boris as it", "eip_scipy_studies.comparators"),
+        ("from eip_scipy.problems import hard_cases as it", "eip_scipy_studies.hard_cases.hard_cases"),
+        ("from eip_scipy.problems.hard_cases import HardCase as it", "eip_scipy_studies.hard_cases"),
+        ("import eip_scipy.problems.hard_cases\nit = eip_scipy.problems.hard_cases", "eip_scipy_studies.hard_cases"),
+        ("from eip_scipy.plotting import cost_figure as it", "eip_scipy_studies.plotting.cost_figure"),
+    ],
+)
+def test_a_moved_name_is_found_and_says_where_it_is_now(code, new):
+    warned = "import warnings\nwith warnings.catch_warnings(record=True) as all:\n warnings.simplefilter('always')\n "
+    code = code.replace("\n", "\n ")
+    told = "\nprint(callable(it), *{f'{w.category.__name__} {w.filename} {w.message}' for w in all}, sep='|')"
+    callable_, *warnings = " ".join(python(f"{warned}{code}{told}")).split("|")
+    assert callable_ == "True"
+    (warning,) = warnings
+    assert warning.startswith("DeprecationWarning <string> eip_scipy.")
+    assert f"is now {new};" in warning
+
+
+def test_no_other_name_is_looked_for_in_the_studies():
+    for code in ("import eip_scipy.problems.soft_cases", "from eip_scipy.plotting import no_figure"):
+        with pytest.raises(ImportError):
+            exec(code)

@@ -7,9 +7,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from systems import SQUARE, oscillator
 
-from eip_scipy import EIPRK4, EIPRK45, Invariant, check_gradient, comparators, ensemble, integrate, problems, project
+from eip_scipy import EIPRK4, EIPRK45, Invariant, check_gradient, ensemble, integrate, problems, project
 from eip_scipy.core.diagnostics import drift_slope, invariants_along, observed_order
 from eip_scipy.problems import ForceConstants, Grid, GrossPitaevskii, Problem, nbody
+from eip_scipy_studies.comparators import stormer_verlet
 
 units = pytest.importorskip("astropy.units")
 Time = pytest.importorskip("astropy.time").Time
@@ -107,7 +108,7 @@ def along(**options):
 
 def verlet(**options):
     arguments = {"t_span": (0, 1), "y0": Y0, "h": 0.1, **options}
-    return comparators.stormer_verlet(lambda t, q, *p: -q, **arguments)
+    return stormer_verlet(lambda t, q, *p: -q, **arguments)
 
 
 ARGUMENTS = [

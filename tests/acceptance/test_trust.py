@@ -30,7 +30,7 @@ from eip_scipy import (
     project,
 )
 from eip_scipy.problems import kepler, nbody, pythagorean
-from eip_scipy.problems.hard_cases import lotka_volterra, rigid_body, sir
+from eip_scipy_studies.hard_cases import lotka_volterra, rigid_body, sir
 
 EVERY_CLASS = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853, EIPRKN8, EIPRKN12]
 ADAPTIVE = [EIPRK23, EIPRK45, EIPDOP853, EIPRKN8, EIPRKN12]

@@ -12,9 +12,9 @@ import numpy as np
 from numba import njit
 
 from eip_scipy import EIPGJ12, EIPRK4, EIPRK45, EIPRKN12, Invariant, ensemble, integrate
-from eip_scipy.comparators import implicit_midpoint
 from eip_scipy.engine.native import BUILD, library
 from eip_scipy.problems import ForceConstants, kepler, nbody
+from eip_scipy_studies.comparators import implicit_midpoint
 
 Y0 = [1.6, 0.0, 0.0, 0.5]
 DOUBLES = ctypes.POINTER(ctypes.c_double)

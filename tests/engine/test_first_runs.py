@@ -16,7 +16,7 @@ RUNS = """
     import sys
     import numpy as np
     from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, ensemble, integrate
-    from eip_scipy.comparators import stormer_verlet
+    from eip_scipy_studies.comparators import stormer_verlet
     from eip_scipy.problems import harmonic, kepler, nbody, solar_system, soliton
 
     for problem in harmonic(), kepler(), solar_system(years=1), solar_system(years=1, forces="eih"):

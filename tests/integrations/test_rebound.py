@@ -9,9 +9,9 @@ from numba import njit
 
 rebound = pytest.importorskip("rebound")
 
-from eip_scipy.comparators import stormer_verlet  # noqa: E402
 from eip_scipy.integrations import rebound as judge  # noqa: E402
 from eip_scipy.problems import comet, solar_data  # noqa: E402
+from eip_scipy_studies.comparators import stormer_verlet  # noqa: E402
 
 DATA = solar_data.load("de440")
 REFERENCE = solar_data.reference_states("de440")

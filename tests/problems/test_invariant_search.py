@@ -5,8 +5,8 @@ import pytest
 from numba import config, njit
 
 from eip_scipy import EIPRK4, check_gradient, find_invariants, hamiltonian, integrate
-from eip_scipy.problems import hard_cases
 from eip_scipy.problems import kepler as kepler_problem
+from eip_scipy_studies.hard_cases import hard_cases
 
 
 def kepler(t, y):

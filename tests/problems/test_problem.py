@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
-from eip_scipy.problems import Problem, comet, hard_cases, harmonic, kepler, plane_wave, rotating_packet, soliton
+from eip_scipy.problems import Problem, comet, harmonic, kepler, plane_wave, rotating_packet, soliton
 from eip_scipy.problems.gravity.nbody import nbody
 from eip_scipy.problems.gravity.scenes import pythagorean
 from eip_scipy.problems.time_transformed import centre_time, time_transformed
+from eip_scipy_studies.hard_cases import hard_cases
 
 MAKERS = [kepler, lambda: kepler(relativistic=0), harmonic, pythagorean, comet, soliton]
 MAKERS += [lambda: plane_wave((8, 8)), lambda: rotating_packet(points=8)]

@@ -33,9 +33,9 @@ from eip_scipy import (
     hamiltonian,
     integrate,
 )
-from eip_scipy.comparators import stormer_verlet
 from eip_scipy.problems import kepler
 from eip_scipy.problems.symbolic.parser import as_expression, as_names
+from eip_scipy_studies.comparators import stormer_verlet
 
 HENON_HEILES = "(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3"
 KEPLER = "(px**2 + py**2)/2 - 1/sqrt(x**2 + y**2) - eps/(2*(x**2 + y**2)**1.5)"

@@ -12,7 +12,7 @@ from systems import H, L, orbit, pericentre
 
 from eip_scipy import EIPGJ14, Invariant, ProjectionWarning, integrate, recommend
 from eip_scipy.problems import kepler, solar_system
-from eip_scipy.problems.hard_cases import hard_cases
+from eip_scipy_studies.hard_cases import hard_cases
 
 FACTOR = 10.0
 

@@ -20,7 +20,6 @@ from forked import Forker
 import eip_scipy
 import eip_scipy.integrations
 from eip_scipy import EIPRK1, EIPRK4, Invariant, integrate
-from eip_scipy.ensembles.chunks import cores
 from eip_scipy.problems import solar_data
 from eip_scipy_studies import report
 from eip_scipy_studies.cli import main
@@ -63,7 +62,7 @@ def no_matplotlib(monkeypatch):
         if name.split(".")[0] == "matplotlib":
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    for module in ("eip_scipy.plotting", "eip_scipy_studies.solar.figures"):
+    for module in ("eip_scipy.plotting", "eip_scipy_studies.plotting", "eip_scipy_studies.solar.figures"):
         monkeypatch.delitem(sys.modules, module, raising=False)
     monkeypatch.delattr(eip_scipy, "plotting", raising=False)
     monkeypatch.delattr("eip_scipy_studies.solar.figures", raising=False)
@@ -116,7 +115,7 @@ def test_json_holds_numbers_versions_and_machine(short):
         assert set(errors["longitude_rad"]) == set(solar_data.load().bodies[1:])
         assert 0 < errors["position_AU"]["Mercury"] < 1
     assert run["methods"][-1]["errors"] == []  # it is the reference
-    assert run["ran_beside_the_others"] == ("IAS15" if cores() > 1 else None)
+    assert run["ran_beside_the_others"] == ("IAS15" if report.cores() > 1 else None)
     points = run["error_against_cost"]["points"]
     assert {point["method"] for point in points} >= {"EIPRK5 (error)", "EIPRKN12", "EIPGJ14", "WHFast (c17)"}
     assert all(point["error"] > 0 and point["error_others"] > 0 for point in points)

@@ -77,7 +77,7 @@ def test_checks_of_the_trap():
 
 def test_a_missed_energy_fails_the_command(tmp_path, monkeypatch, capsys):
     item = found(3.2, converged=False)
-    monkeypatch.setitem(sys.modules, "eip_scipy.plotting", None)
+    monkeypatch.setitem(sys.modules, "eip_scipy_studies.plotting", None)
     scenes = {"trap": lambda settings, update: [item]}
     assert main(["gpe", "ground-state", "--out", str(tmp_path)], scenes=scenes) == 1
     captured = capsys.readouterr()
@@ -133,7 +133,7 @@ SHORT = {
 
 @pytest.fixture
 def no_plotting(monkeypatch):
-    monkeypatch.setitem(sys.modules, "eip_scipy.plotting", None)
+    monkeypatch.setitem(sys.modules, "eip_scipy_studies.plotting", None)
 
 
 @pytest.fixture

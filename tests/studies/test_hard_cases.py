@@ -10,9 +10,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from eip_scipy import Invariant, check_gradient
-from eip_scipy.problems.hard_cases import EQUATIONS, hard_cases
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.hard import cases as command
+from eip_scipy_studies.hard_cases import EQUATIONS, hard_cases
 from eip_scipy_studies.kepler import figures as kepler_figures
 from eip_scipy_studies.paper import reproduce
 from eip_scipy_studies.solar.solar_system import SolarSystem

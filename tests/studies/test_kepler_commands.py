@@ -20,7 +20,7 @@ T_END = 1.5
 
 @pytest.fixture
 def no_plotting(monkeypatch):
-    monkeypatch.setitem(sys.modules, "eip_scipy.plotting", None)
+    monkeypatch.setitem(sys.modules, "eip_scipy_studies.plotting", None)
 
 
 def read(file):

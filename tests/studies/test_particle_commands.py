@@ -31,7 +31,7 @@ def short_runs(short, monkeypatch):
 
 @pytest.fixture
 def no_plotting(monkeypatch):
-    monkeypatch.setitem(sys.modules, "eip_scipy.plotting", None)
+    monkeypatch.setitem(sys.modules, "eip_scipy_studies.plotting", None)
 
 
 def read(file):

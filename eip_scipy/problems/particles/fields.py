@@ -121,7 +121,7 @@ class ParticleField:
 
     @cached_property
     def fill(self) -> Callable[..., None]:
-        """``fill(t, x, out)``: E in out[:3], B in out[3:]; what `eip_scipy.comparators.boris` takes."""
+        """``fill(t, x, out)``: E in out[:3], B in out[3:]; what `eip_scipy_studies.comparators.boris` takes."""
         E, B = self.functions.E, self.functions.B
 
         def fields(t: float, x: np.ndarray, out: np.ndarray) -> None:

@@ -143,7 +143,7 @@ class Scene:
         if self.equations == "nls":
             return _nls(self.y0.size, self.params["length"])
         if self.equations == "case":
-            (case,) = import_module("eip_scipy.problems.hard_cases").hard_cases([self.params["name"]])
+            (case,) = import_module("eip_scipy_studies.hard_cases").hard_cases([self.params["name"]])
             invariant = case.problem.invariants[0]
             return Functions(case.problem.fun, invariant.fun, invariant.grad)
         return Functions(*(_returning_array(function) for function in EQUATIONS[self.equations](math.sqrt)))
@@ -207,7 +207,7 @@ def _jitted_array(function: Any, njit: Any) -> Any:
 
 def _bodies(gm: list[float]) -> Functions:
     """N bodies by sums over arrays, G = 1; energy, momentum, angular momentum."""
-    case = import_module("eip_scipy.problems.hard_cases").n_body(gm, 1.0, 3)
+    case = import_module("eip_scipy_studies.hard_cases").n_body(gm, 1.0, 3)
     m, n = np.array(gm), len(gm)
 
     def acc(t: float, q: np.ndarray) -> np.ndarray:

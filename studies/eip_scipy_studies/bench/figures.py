@@ -20,7 +20,7 @@ SHORT = {PYTHON: "python", COMPILED: "compiled", OWN: "own"}
 
 def drawn(rows: list[Row], machine: str) -> Iterator[tuple[Where, str, Any]]:
     """Where each figure belongs, the name of its file, and the figure."""
-    from eip_scipy.plotting.side_by_side import side_by_side_figure
+    from ..plotting import side_by_side_figure
 
     known = groups(rows)
     for where, peers in known.items():

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
-from eip_scipy.problems import hard_cases, solar_system, soliton
+from eip_scipy.problems import solar_system, soliton
 
+from ..hard_cases import hard_cases, stored_cases
 from .peers import COMPILED, OWN, PEERS, PYTHON, Peer
 
 __all__ = ["SUITES", "Suite"]
@@ -126,8 +125,7 @@ def kepler() -> list[dict[str, Any]]:
 def solar() -> list[dict[str, Any]]:
     """Outer and full solar system."""
     (outer,) = hard_cases(["outer_solar_system"])
-    cases = json.loads(files("eip_scipy.data").joinpath("hard_cases.json").read_text(encoding="utf-8"))["cases"]
-    stored = next(case["params"] for case in cases if case["name"] == outer.name)
+    stored = stored_cases()[outer.name]["params"]
     gm = [stored["G"] * m for m in stored["masses"]]
     both = (PYTHON, COMPILED, OWN)
     few = (1e-9, 1e-13)  # heyoka compiles for ten seconds at each

@@ -20,10 +20,10 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK4, eip_method, integrate
-from eip_scipy.comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
 from eip_scipy.problems import FieldProblem, Splitting, plane_wave
 from eip_scipy.problems.gross_pitaevskii import make_transforms
 
+from ..comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
 from ..report import describe_machine, table
 from ..study import Figures, Rows, Session, Study
 from ..work_precision import cost_to_reach, work_precision
@@ -289,7 +289,7 @@ class Efficiency(Study[Found]):
 
     def figures(self, found: Found) -> Figures:
         """Error against step and against time, a row for each wave."""
-        from eip_scipy.plotting import CostPanel, cost_figure
+        from ..plotting import CostPanel, cost_figure
 
         rows = []
         for wave, trial in found.items():

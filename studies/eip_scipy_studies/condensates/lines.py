@@ -104,7 +104,7 @@ class VortexLines(QuenchStudy):
 
     def pictures(self, found: QuenchRuns) -> Figures:
         """The plane z = 0, and surfaces of equal density."""
-        from eip_scipy.plotting import fields_figure, surfaces_figure
+        from ..plotting import fields_figure, surfaces_figure
 
         moved = found.moved
         assert moved is not None
@@ -144,7 +144,7 @@ def _grid_note(before: GrossPitaevskii, made: QuenchRuns, t: np.ndarray) -> str:
 
 
 def _slice(made: QuenchRuns, moved: Motion, k: int) -> Any:
-    from eip_scipy.plotting import FieldPanel
+    from ..plotting import FieldPanel
 
     grid = made.quench.equation.grid
     density = np.abs(_field(made, k)[:, :, grid.shape[2] // 2]) ** 2
@@ -154,7 +154,7 @@ def _slice(made: QuenchRuns, moved: Motion, k: int) -> Any:
 
 def _surface(made: QuenchRuns, moved: Motion, k: int) -> Any:
     """The surface, and the sector of it in which the line is that is followed."""
-    from eip_scipy.plotting import SurfacePanel
+    from ..plotting import SurfacePanel
 
     surface = density_surface(made.quench.equation, _field(made, k), LEVEL)
     x, y, _ = surface.corners.mean(axis=1).T

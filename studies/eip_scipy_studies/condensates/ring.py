@@ -87,7 +87,7 @@ class Ring(QuenchStudy):
 
     def pictures(self, found: QuenchRuns) -> Figures:
         """Density and vortices at some times, and as a film."""
-        from eip_scipy.plotting import fields_figure, fields_movie
+        from ..plotting import fields_figure, fields_movie
 
         quench, fields, moved = found.quench, found.fields, found.moved
         assert fields is not None
@@ -109,7 +109,7 @@ class Ring(QuenchStudy):
 
 def _panels(gpe: GrossPitaevskii, y: np.ndarray, moved: Motion) -> list[Any]:
     """One panel for each saved state, all of the first one's size, which is the largest."""
-    from eip_scipy.plotting import FieldPanel
+    from ..plotting import FieldPanel
 
     fields = np.abs(gpe.grid.field(y)) ** 2
     largest = fields.max(axis=0)

@@ -357,7 +357,7 @@ class QuenchStudy(Checkpoints, Study[QuenchRuns]):
 
     def figures(self, found: QuenchRuns) -> Figures:
         """The errors in time, and what the fields look like."""
-        from eip_scipy.plotting import ErrorSeries, errors_figure
+        from ..plotting import ErrorSeries, errors_figure
 
         quench = found.quench
         mass, energy = (abs(value(quench.problem.y0)) for value in (quench.equation.mass, quench.equation.energy))

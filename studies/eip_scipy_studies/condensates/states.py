@@ -256,7 +256,7 @@ class GroundStates(Study[Results]):
             if name != "trap":
                 yield f"{name}.npz", partial(_save, min(states, key=lambda item: item.state.energy))
 
-        from eip_scipy.plotting import fields_figure
+        from ..plotting import fields_figure
 
         for name, states in found.items():
             shown = panels(name, states)
@@ -294,7 +294,7 @@ def _rows(results: Results) -> Rows:
 
 def panels(name: str, found: list[Found]) -> dict[str, Any]:
     """Densities to draw: one panel for each state, of lines in the plane z = 0 and of the lowest in x = 0 too."""
-    from eip_scipy.plotting import FieldPanel
+    from ..plotting import FieldPanel
 
     out = {}
     for item in found:

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import Diagnostics, EIPSolver, Tableau
-from eip_scipy.problems import HardCase, hard_cases
 
+from ..hard_cases import HardCase, hard_cases
 from ..listing import METRICS, fixed_step_methods
 from ..long_runs import named
 from ..report import compact, table
@@ -409,7 +409,7 @@ class HardCases(Study[list[Comparison]]):
         return {"cases": rows(found), "summary": summary(found), "checks": checks}
 
     def figures(self, found: list[Comparison]) -> Figures:
-        from eip_scipy.plotting import gains_figure
+        from ..plotting import gains_figure
 
         rtol = self.tolerance
         yield (

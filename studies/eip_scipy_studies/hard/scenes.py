@@ -101,7 +101,7 @@ class HardScenes(Study[Found]):
 
     def figures(self, found: Found) -> Figures:
         """Error against evaluations and time, two panels for each scene."""
-        from eip_scipy.plotting import CostPanel, cost_figure
+        from ..plotting import CostPanel, cost_figure
 
         every = list(found.results.values())
         rows = [

@@ -116,7 +116,7 @@ class KeplerCost(Study[Found]):
         ]
 
     def figures(self, found: Found) -> Figures:
-        from eip_scipy.plotting import CostPanel, cost_figure
+        from ..plotting import CostPanel, cost_figure
 
         costs = {"nfev": "evaluations of f", "wall_time": "wall time [s]"}
         yield (

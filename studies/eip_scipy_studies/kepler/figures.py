@@ -148,7 +148,7 @@ class KeplerFigures(Study[Found]):
         return {"fig-kepler.csv": lines}
 
     def figures(self, found: Found) -> Figures:
-        from eip_scipy.plotting import KeplerRun, paper_kepler_figure
+        from ..plotting import KeplerRun, paper_kepler_figure
 
         for file, (title, methods) in FIGURES.items():
             runs = {}

@@ -20,11 +20,10 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPSolver, integrate
-from eip_scipy.core.diagnostics import observed_order
-from eip_scipy.ensembles.chunks import cores
 from eip_scipy.problems import Problem, harmonic, kepler, rotating_packet
 
 from ..beside import workers
+from ..report import cores
 from ..study import Check, Rows, Session, Study
 
 __all__ = ["TABLES", "Cell", "PaperTable", "Value"]
@@ -144,7 +143,7 @@ class Series:
 
 @cache
 def _data() -> dict[str, Any]:
-    return json.loads(files("eip_scipy.data").joinpath("paper_tables.json").read_text(encoding="utf-8"))
+    return json.loads(files("eip_scipy_studies.data").joinpath("paper_tables.json").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,11 +209,10 @@ def _cells(series: Series, errors: list[float]) -> list[Cell]:
 def _orders(series: Series, errors: list[float], exact: list[float], roundoff: float) -> list[Value | None]:
     """Order at each step but the first; round-off in two errors moves it in proportion to their size."""
     refinement = -np.diff(np.log(series.steps))
+    observed, expected = (-np.diff(np.log(np.abs(values))) / refinement for values in (errors, exact))
     relative = roundoff / np.where(np.isnan(exact), errors, exact)
     slack = (relative[:-1] + relative[1:]) / refinement
-    columns = zip(
-        series.orders, observed_order(errors, series.steps), observed_order(exact, series.steps), slack, strict=True
-    )
+    columns = zip(series.orders, observed, expected, slack, strict=True)
     return [None, *(Value(paper, float(ours), float(mpmath), float(s)) for paper, ours, mpmath, s in columns)]
 
 

@@ -211,7 +211,7 @@ def figures(studies: Mapping[str, ParticleStudy], *, paper_only: bool = False) -
     ImportError
         Without matplotlib.
     """
-    from eip_scipy.plotting import particle_figure
+    from ..plotting import particle_figure
 
     if "uniform" in studies:
         found = studies["uniform"]
@@ -234,7 +234,7 @@ def figures(studies: Mapping[str, ParticleStudy], *, paper_only: bool = False) -
 
 
 def _uniform_row(found: ParticleStudy, line: ParticleRun) -> Any:
-    from eip_scipy.plotting import Curves, ParticleRow
+    from ..plotting import Curves, ParticleRow
 
     turns, reference = line.orbit.turns(), found.reference.orbit
     last = min(100.0, float(turns[-1]))
@@ -254,7 +254,7 @@ def _uniform_row(found: ParticleStudy, line: ParticleRun) -> Any:
 
 
 def _tokamak_row(orbits: Mapping[str, ParticleStudy], name: str) -> Any:
-    from eip_scipy.plotting import Curves, ParticleRow
+    from ..plotting import Curves, ParticleRow
 
     lines = {scene.removeprefix("tokamak-"): found.lines[name] for scene, found in orbits.items()}
     panels = {f"{kind} orbit": Curves("R", "z", {"": _thin(line.orbit)}) for kind, line in lines.items()}

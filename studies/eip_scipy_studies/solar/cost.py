@@ -105,8 +105,8 @@ def timed(
 
 
 def panels(runs: Sequence[TimedRun], time: str = "wall time [s]") -> list[list[Any]]:
-    """Mercury's error and the largest of the others, for `eip_scipy.plotting.cost_figure`."""
-    from eip_scipy.plotting import CostPanel
+    """Mercury's error and the largest of the others, for `eip_scipy_studies.plotting.cost_figure`."""
+    from ..plotting import CostPanel
 
     kinds = {"mercury": "Mercury", "others": "the worst of the other planets"}
     return [[CostPanel(title, time, curves(runs, error=error)) for error, title in kinds.items()]]

@@ -1,4 +1,4 @@
-"""The figures of ``eip-scipy solar-system``: from a `SolarRuns` to the functions of `eip_scipy.plotting`."""
+"""The figures of ``eip-scipy solar-system``: from a `SolarRuns` to the functions of `eip_scipy_studies.plotting`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy import plotting
+from eip_scipy.plotting import method_styles
 from eip_scipy.problems.gravity.solar_data import YEAR_D
 
+from .. import plotting
 from ..report import describe_machine
 from .cost import ENOUGH_SECONDS, panels
 from .errors import MERCURY, SolarRuns, ecliptic, longitude_errors
@@ -37,9 +38,7 @@ def figures(study: SolarRuns, part: slice = slice(None)) -> Iterator[tuple[str, 
         File name and figure.
     """
     # One style for a method in all figures; what was timed comes last, so that the runs look the same without it.
-    styles = plotting.method_styles(
-        dict.fromkeys([*(run.name for run in study.runs), *(item.method for item in study.cost)])
-    )
+    styles = method_styles(dict.fromkeys([*(run.name for run in study.runs), *(item.method for item in study.cost)]))
     for name, figure in list(FIGURES.items())[part]:
         yield name, figure(study, styles)
 

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK4, EIPRKN8, EIPRKN12, integrate
-from eip_scipy.comparators import stormer_verlet
 from eip_scipy.problems import Problem, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D, load, reference_states
 
+from ..comparators import stormer_verlet
 from ..long_runs import named, positive
 from ..report import UsageError, compact, describe_machine, table
 from ..study import Figures, Rows, Session, Study, option
@@ -191,7 +191,7 @@ class Frontier(Study[Found]):
 
     def figures(self, found: Found) -> Figures:
         """Mercury's error and that of the others, against time."""
-        from eip_scipy.plotting import cost_figure
+        from ..plotting import cost_figure
 
         yield (
             "frontier.png",

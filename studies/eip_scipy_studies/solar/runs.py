@@ -14,12 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eip_scipy import EIPGJ14, EIPRKN12, EIPSolver, integrate
-from eip_scipy.comparators import StormerVerletResult, stormer_verlet
-from eip_scipy.core.diagnostics import invariants_along
-from eip_scipy.core.stepping import check_fixed_step
+from eip_scipy.native_kernels import FixedSteps
 from eip_scipy.problems import Problem, SolarSystemData, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D, load
 
+from ..comparators import StormerVerletResult, stormer_verlet
 from ..long_runs import named
 
 __all__ = [
@@ -151,7 +150,7 @@ def make_scene(data: str | SolarSystemData, years: float, h: float) -> SolarScen
     ValueError
         For a step that does not fit into the span or is below the spacing of numbers there, or for unknown data.
     """
-    check_fixed_step(h, 0.0, years)
+    FixedSteps.of((0.0, years), h, None)
     n_saves = whole_number(years / max(_save_interval(years), h))
     every = whole_number(years / (n_saves * h))
     step = years / (n_saves * every)
@@ -322,7 +321,9 @@ def _finished(
 ) -> MethodRun:
     finite = np.isfinite(result.y).all(axis=0)
     t, y = result.t[finite], result.y[:, finite]
-    values = invariants_along(scene.problem.invariants, t, y)
+    states = list(zip(t.tolist(), y.T.copy(), strict=True))
+    kept = [np.array([item.fun(*state) for state in states]) for item in scene.problem.invariants]
+    values = np.concatenate([item.reshape(t.size, -1).T for item in kept])
     start = values[:, :1]
     return MethodRun(
         name=name,

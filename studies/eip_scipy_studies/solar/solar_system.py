@@ -9,14 +9,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from eip_scipy.ensembles.chunks import cores
 from eip_scipy.problems import SolarSystemData
 from eip_scipy.problems.gravity.solar_data import available, load
 
 from ..beside import Beside
 from ..listing import METRICS, fixed_step_methods
 from ..long_runs import Checkpoints, positive
-from ..report import UsageError
+from ..report import UsageError, cores
 from ..study import Check, Figures, PartlyDone, Rows, Session, Study, option
 from . import report
 from .cost import cost, cost_methods

@@ -247,7 +247,7 @@ class Truth(AnyEpoch, Study[Found]):
         return {"epoch": found.start, "step_yr": found.step, "errors": table_rows(found.runs), "failed": failed}
 
     def figures(self, found: Found) -> Figures:
-        from eip_scipy.plotting import longitude_figure
+        from ..plotting import longitude_figure
 
         runs = found.runs
         direction = "after" if runs[0].years[-1] > 0 else "before"

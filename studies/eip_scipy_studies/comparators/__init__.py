@@ -1,0 +1,30 @@
+"""Methods that the projection is measured against; each stands alone and knows no solver of this package.
+
+`stormer_verlet` is the symplectic leapfrog of order 2 for q'' = a(t, q), in both of its forms; `boris` the pusher for
+charged particles; `implicit_midpoint` the symplectic method of order 2 for any Hamiltonian. `crank_nicolson`,
+`linearly_implicit` and `sav_crank_nicolson` are the implicit schemes of the paper's test of efficiency, for the
+Gross-Pitaevskii equation (the last one without rotation).
+"""
+
+from eip_scipy.native_kernels import FixedStepResult
+
+from ._fields import FieldResult
+from .boris import boris
+from .crank_nicolson import crank_nicolson
+from .implicit_midpoint import implicit_midpoint
+from .linearly_implicit import linearly_implicit
+from .scalar_auxiliary import SAVResult, sav_crank_nicolson
+from .stormer_verlet import StormerVerletResult, stormer_verlet
+
+__all__ = [
+    "FieldResult",
+    "FixedStepResult",
+    "SAVResult",
+    "StormerVerletResult",
+    "boris",
+    "crank_nicolson",
+    "implicit_midpoint",
+    "linearly_implicit",
+    "sav_crank_nicolson",
+    "stormer_verlet",
+]

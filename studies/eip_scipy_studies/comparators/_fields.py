@@ -1,0 +1,277 @@
+"""What the implicit schemes for the Gross-Pitaevskii equation share: their loop, their record and their solver.
+
+With the linear part ``K = -Laplace / 2`` diagonal in the modes, ``1 + i c K`` is inverted by one pair of transforms.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from eip_scipy.native_kernels import FixedSteps, fields
+from eip_scipy.problems import GrossPitaevskii
+
+__all__ = ["FieldResult", "FieldScheme", "FixedPoint", "Implicit", "march"]
+
+MOST_ITERATIONS = 100
+WARM_STEPS = 3  # after which each branch of a scheme has been taken
+
+
+@dataclass(frozen=True)
+class FieldResult:
+    """What `crank_nicolson` and `linearly_implicit` return.
+
+    Attributes
+    ----------
+    t : ndarray, shape (m,)
+        Saved times, the first and the last of the interval among them.
+    y : ndarray, shape (n, m)
+        States at `t`, flat and complex; ``gpe.grid.field(y)`` for fields. nan from where a scheme failed.
+    nfev : int
+        Evaluations of the nonlinear term, each with a pair of transforms: linear solves, in other words.
+    wall_time : float
+        Seconds spent in the integration, plans of transforms excluded.
+    message : str
+        "completed", or why and where the scheme failed.
+    """
+
+    t: np.ndarray
+    y: np.ndarray
+    nfev: int
+    wall_time: float
+    message: str
+
+
+class FieldScheme:
+    """A scheme on its way; its subclasses implement `restart` and `step`.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+
+    Attributes
+    ----------
+    psi : ndarray
+        The state, flat.
+    nfev : int
+        Pairs of transforms so far.
+    """
+
+    def __init__(self, gpe: GrossPitaevskii) -> None:
+        self.gpe = gpe
+        self.V = gpe.V.reshape(-1)
+        self.kinetic = np.broadcast_to(sum(gpe.kinetic_factor(axis) for axis in range(gpe.grid.dim)), gpe.grid.shape)
+        self.axes = tuple(range(gpe.grid.dim))
+        self.psi = np.empty(gpe.grid.size, complex)
+        self.nfev = 0
+        self._rotation = np.empty(gpe.grid.size if gpe.Omega else 0, complex)
+
+    def start(self, psi: np.ndarray) -> None:
+        """Go back to t0, with a copy of `psi`."""
+        self.psi = psi.copy()
+        self.nfev = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was computed from former states."""
+        raise NotImplementedError
+
+    def step(self, h: float) -> str:
+        """Advance `psi` by h, signed; returns why that failed, or nothing."""
+        raise NotImplementedError
+
+    def rotation(self, field: np.ndarray) -> np.ndarray:
+        """-Omega Lz field, flat and in a buffer; (0,) without rotation."""
+        if self.gpe.Omega:
+            shape = self.gpe.grid.shape
+            self.gpe.angular(field.reshape(shape), self._rotation.reshape(shape))
+            self._rotation *= -self.gpe.Omega
+        return self._rotation
+
+    def forward(self, field: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with the modes of `field`; both flat."""
+        shape = self.gpe.grid.shape
+        self.gpe.transforms.forward(field.reshape(shape), self.axes, out.reshape(shape))
+
+    def backward(self, field: np.ndarray) -> None:
+        """Replace modes by their field times the number of points."""
+        self.gpe.transforms.backward(field.reshape(self.gpe.grid.shape), self.axes)
+
+
+class FixedPoint:
+    """Solves ``m = psi - i c (K + W(m)) m``: K and a constant w implicit, W - w from the iterate before.
+
+    The iteration ``m <- (1 + i c (K + w))^-1 rhs(m)``, ``rhs(m) = psi - i c (W(m) - w) m``, contracts by about
+    c max|W - w| where W is pointwise. The change of `rhs` from one iterate to the next is the residual of the equation
+    itself, not of the preconditioned one, and costs no transform.
+
+    Parameters
+    ----------
+    scheme : FieldScheme
+    tol : float
+        Bound of the residual's norm relative to that of the state.
+    c, w : float
+        w is best the middle of the range of W.
+    """
+
+    def __init__(self, scheme: FieldScheme, tol: float, c: float, w: float) -> None:
+        self.scheme, self.tol, self.c, self.w = scheme, tol, c, w
+        self._inverse = (1 / (1 + 1j * c * (scheme.kinetic + w)) / scheme.psi.size).reshape(-1)
+        self._rhs = np.empty_like(scheme.psi)
+        self._means: list[np.ndarray] = []
+
+    def solve(self, rhs: Callable[[np.ndarray, np.ndarray], float], guess: np.ndarray) -> tuple[np.ndarray, str]:
+        """Find m, in an array that stays as it is for the next three solutions only.
+
+        Parameters
+        ----------
+        rhs : callable
+            ``rhs(m, values)`` replaces `values` and returns the norm of their change.
+        guess : ndarray, shape (n,)
+            Used until three solutions are known, from which then a parabola is extrapolated.
+
+        Returns
+        -------
+        m : ndarray, shape (n,)
+        failure : str
+        """
+        scheme, values = self.scheme, self._rhs
+        if len(self._means) < 3:
+            mean = guess.copy()
+        else:
+            mean = self._means.pop(0)
+            fields.extrapolate(self._means[1], self._means[0], mean)
+        bound = self.tol * float(np.linalg.norm(scheme.psi))
+        rhs(mean, values)
+        residual = math.inf
+        for _ in range(MOST_ITERATIONS):
+            scheme.forward(values, mean)
+            fields.multiply_modes(mean, self._inverse)
+            scheme.backward(mean)
+            scheme.nfev += 1
+            residual = rhs(mean, values)
+            if not residual > bound:
+                break
+        self._means.append(mean)
+        if residual <= bound:
+            return mean, ""
+        return mean, f"the iteration left a residual of {residual:.1e}, expected {bound:.1e}; take a smaller h"
+
+
+class Implicit(FieldScheme):
+    """A scheme whose step goes from a state to another, 2 c later, through their mean, which `FixedPoint` finds.
+
+    The mean fulfils ``mean = start - i c (K + W - Omega Lz) mean``, W pointwise.
+
+    Parameters
+    ----------
+    gpe : GrossPitaevskii
+    psi : ndarray, shape (n,)
+        A typical state.
+    tol : float
+        See `FixedPoint`.
+    """
+
+    def __init__(self, gpe: GrossPitaevskii, psi: np.ndarray, tol: float) -> None:
+        super().__init__(gpe)
+        W = self.V + gpe.beta * (psi.real**2 + psi.imag**2)
+        self._w, self._tol = 0.5 * float(W.min() + W.max()), tol
+        self._W = np.empty_like(self.V)
+        self._solver: FixedPoint | None = None
+
+    def restart(self) -> None:
+        """See `FieldScheme`."""
+        self._solver = None
+
+    def solver(self, c: float) -> tuple[FixedPoint, bool]:
+        """The solver for c, and whether it is a new one, without solutions before."""
+        new = self._solver is None or self._solver.c != c
+        if self._solver is None or new:
+            self._solver = FixedPoint(self, self._tol, c, self._w)
+        return self._solver, new
+
+    def potential(self, start: np.ndarray, mean: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with W."""
+        raise NotImplementedError
+
+    def cross(self, solver: FixedPoint, start: np.ndarray) -> str:
+        """Replace `start` by the state at the other end; returns why that failed, or nothing."""
+
+        def rhs(mean: np.ndarray, values: np.ndarray) -> float:
+            self.potential(start, mean, self._W)
+            return float(fields.right_side(start, mean, self.rotation(mean), self._W, solver.w, solver.c, values))
+
+        mean, failure = solver.solve(rhs, self.psi)
+        fields.other_end(mean, start)
+        return failure
+
+
+def check_tol(tol: Any) -> float:
+    """`tol` as a float.
+
+    Raises
+    ------
+    ValueError
+        When it does not lie between round-off and 1.
+    """
+    if isinstance(tol, bool) or not isinstance(tol, (int, float, np.integer, np.floating)) or not 1e-15 <= tol < 1:
+        raise ValueError(f"tol must be a number from 1e-15 to 1, got {tol!r}")
+    return float(tol)
+
+
+def check_equation(gpe: Any) -> GrossPitaevskii:
+    """`gpe`, when it is an equation.
+
+    Raises
+    ------
+    TypeError
+        When it is no `GrossPitaevskii`.
+    """
+    if not isinstance(gpe, GrossPitaevskii):
+        raise TypeError(f"gpe must be a GrossPitaevskii, got {type(gpe).__name__}; of a problem pass problem.equation")
+    return gpe
+
+
+def march(
+    make: Callable[[GrossPitaevskii, np.ndarray], FieldScheme],
+    gpe: GrossPitaevskii,
+    t_span: Any,
+    y0: Any,
+    h: Any,
+    save_every: int | None,
+    observe: Callable[[Any], float] = lambda scheme: math.nan,
+) -> tuple[FieldResult, np.ndarray]:
+    """Take all steps; also returns what `observe` says of the scheme at each saved state."""
+    steps = FixedSteps.of(t_span, h, save_every)
+    psi = check_equation(gpe).as_field(y0).reshape(-1)
+    if not np.isfinite(psi).all():
+        raise ValueError("All components of the initial state `y0` must be finite.")
+    if math.isclose(steps.h, steps.last, rel_tol=1e-9):
+        steps = steps._replace(last=steps.h)  # what differs by round-off only is no step of another length
+    ys = np.full((steps.saved.size, psi.size), np.nan, complex)
+    observed = np.full(steps.saved.size, np.nan)
+
+    scheme = make(gpe, psi)
+    scheme.start(psi)
+    for _ in range(WARM_STEPS):  # measures plans of transforms
+        scheme.step(steps.h)
+    scheme.start(psi)
+    ys[0], observed[0] = scheme.psi, observe(scheme)
+    message, row = "completed", 1
+    begin = perf_counter()
+    n_steps = int(steps.saved[-1])
+    for k in range(n_steps):
+        failure = scheme.step(steps.last if k == n_steps - 1 else steps.h)
+        if failure:
+            message = f"failed in the step from t={steps.t0 + k * steps.h!r}: {failure}"
+            break
+        if k + 1 == steps.saved[row]:
+            ys[row], observed[row] = scheme.psi, observe(scheme)
+            row += 1
+    wall_time = perf_counter() - begin
+    return FieldResult(steps.t, ys.T, scheme.nfev, wall_time, message), observed

@@ -1,0 +1,282 @@
+"""Charged particles: speed of the compiled step, and error against cost beside other methods.
+
+    python -m eip_scipy_studies.measurements.charged_particle [--out DIR] [--json FILE] [--repeats 3] [--quick]
+
+1. Time of a step in the tokamak: plain RK4, EIP-HL with both metrics and with wider spacings, Boris, implicit midpoint;
+   and the same EIP-HL through solve_ivp, from the first 200 000 of the paper's steps (solve_ivp: 5000). Runs in turn,
+   the least time of each, without what comes before the first step; the ratios are of one and the same process.
+2. Error against cost in the uniform field and on both orbits of the tokamak: error of position and of the guiding
+   centre (averaged over a gyration) at the end of the paper's interval, EIP methods and the same without projection in
+   the canonical form, Boris and heyoka (where installed) in the form (x, v). Figures in DIR, default docs/_static.
+
+Times are processor times of the thread, which on an idle machine are wall times and on a busy one still mean something.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from time import thread_time
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, EIPSolver, integrate
+from eip_scipy.problems import ParticleProblem, tokamak
+from eip_scipy.problems.particle_orbits import ParticleOrbit
+
+from ..comparators import boris, implicit_midpoint
+from ..particles.runs import SCENES, scene
+from ..plotting import CostPanel, cost_figure
+from ..report import compact, describe_machine, document, table, write_json
+from ..work_precision import curves
+
+STATIC = Path(__file__).parents[1] / "docs" / "_static"
+TAIL = 60  # states of the reference, three gyrations, at the end of the interval
+SPEED_STEPS, SOLVE_IVP_STEPS = 200_000, 5000
+ROUNDS = 5
+
+
+# 1. Speed.
+
+
+def cpu_seconds(call: Callable[..., Any], *args: Any, **options: Any) -> float:
+    """Processor time of the thread in a call."""
+    start = thread_time()
+    call(*args, **options)
+    return thread_time() - start
+
+
+def speed(turns: int, share: float) -> dict[str, float]:
+    """Microseconds for a step of the banana orbit; `share`: of the steps."""
+    problem, other = tokamak(), tokamak(form="velocity")
+    assert problem.h is not None
+    rk4 = partial(integrate, method=EIPRK4)
+    plain: dict[str, Any] = {"invariants": ()}
+    euclidean: dict[str, Any] = {"metric": "euclidean"}
+    runs: dict[str, Callable[[tuple[float, float]], Any]] = {
+        "RK4": lambda span: rk4(problem, span, **plain),
+        "EIP-HL, euclidean": lambda span: rk4(problem, span, **euclidean),
+        "EIP-HL": lambda span: rk4(problem, span),
+        "EIP-HL, euclidean, every=5": lambda span: rk4(problem, span, every=5, **euclidean),
+        "EIP-HL, every=5": lambda span: rk4(problem, span, every=5),
+        "(x, v): RK4": lambda span: rk4(other, span, **plain),
+        "(x, v): EIP-HL, euclidean": lambda span: rk4(other, span, **euclidean),
+        "(x, v): EIP-HL": lambda span: rk4(other, span),
+        "(x, v): Boris": lambda span: boris(other.field.fill, span, other.y0, problem.h),
+        "implicit midpoint": lambda span: implicit_midpoint(
+            problem.rhs, span, problem.y0, problem.h, params=problem.params
+        ),
+        "EIP-HL, euclidean, through solve_ivp": lambda span: through_solve_ivp(problem, span, **euclidean),
+        "EIP-HL, through solve_ivp": lambda span: through_solve_ivp(problem, span, blocks=3),
+    }
+    times = {name: [np.inf, np.inf] for name in runs}
+    steps_of = {name: round(share * (SOLVE_IVP_STEPS if "solve_ivp" in name else SPEED_STEPS)) for name in runs}
+    for _ in range(turns):
+        for name, run in runs.items():
+            for k, steps in enumerate((1, steps_of[name])):
+                times[name][k] = min(times[name][k], cpu_seconds(run, (0.0, steps * problem.h)))
+    return {name: 1e6 * (many - one) / (steps_of[name] - 1) for name, (one, many) in times.items()}
+
+
+def through_solve_ivp(problem: ParticleProblem, span: tuple[float, float], **options: Any) -> Any:
+    kept = problem.invariants
+    return solve_ivp(problem.fun, span, problem.y0, EIPRK4, t_eval=[0], h=problem.h, invariants=kept, **options)
+
+
+def speed_text(best: dict[str, float]) -> str:
+    plain = {True: best["(x, v): RK4"], False: best["RK4"]}
+    head = [["us per", "step"], ["times", "plain RK4"]]
+    body = [(name, [compact(us, 3), compact(us / plain[name.startswith("(x")], 3)]) for name, us in best.items()]
+    ratios = [
+        f"through solve_ivp / compiled: {best[f'{name}, through solve_ivp'] / best[name]:.0f} ({name})"
+        for name in ("EIP-HL, euclidean", "EIP-HL")
+    ]
+    title = "Steps of the banana orbit, canonical form where nothing else is said"
+    return "\n".join([title, "", table(head, body), "", *ratios])
+
+
+# 2. Error against cost.
+
+
+class Point(NamedTuple):
+    """One method at one setting: seconds, and errors of position and guiding centre at the end."""
+
+    scene: str
+    method: str
+    setting: float
+    wall_time: float
+    position: float
+    guiding_centre: float
+
+
+class Case(NamedTuple):
+    """One method at one setting: its seconds without saving, and its states (t, y), with the last gyrations."""
+
+    method: str
+    setting: float
+    seconds: Callable[[], float]
+    states: Callable[[], tuple[np.ndarray, np.ndarray]]
+    problem: ParticleProblem
+
+
+def cases(problem: ParticleProblem, other: ParticleProblem) -> Iterator[Case]:
+    """All methods and settings: steps in units of the paper's, or tolerances. `other` has the states (x, v)."""
+    fine, wide, wider = (1.0, 0.5, 0.25, 0.125), (2.0, 1.0, 0.5, 0.25), (4.0, 2.0, 1.0, 0.5)
+    for name, method, factors in (("RK4", EIPRK4, fine), ("RK45", EIPRK45, wide), ("DOP853", EIPDOP853, wider)):
+        for factor in factors:
+            yield fixed(f"EIP-HL, {name}", problem, method, problem.invariants, factor)
+        if name != "RK45":
+            for factor in factors:
+                yield fixed(name, problem, method, (), factor)
+    for rtol in (1e-6, 1e-8, 1e-10, 1e-12):
+        yield adaptive(problem, rtol)
+    for factor in (1.0, 0.5, 0.25):
+        run = partial(implicit_midpoint, problem.rhs, problem.t_span, problem.y0, params=problem.params)
+        yield compared("implicit midpoint", problem, run, factor)
+    for factor in (1.0, 0.5, 0.25, 0.125, 0.0625):
+        yield compared("Boris", other, partial(boris, other.field.fill, other.t_span, other.y0), factor)
+    try:
+        import heyoka  # noqa: F401
+    except ImportError:
+        print('no comparison with heyoka: pip install "eip_scipy[heyoka]"', file=sys.stderr)
+        return
+    for tolerance in (1e-6, 1e-9, 1e-12, 1e-15):
+        yield taylor(other, tolerance)
+
+
+def spacing(factor: float) -> int:
+    """Steps between two saved states: those are at multiples of the paper's step."""
+    return max(round(1 / factor), 1)
+
+
+def fixed(name: str, problem: ParticleProblem, method: type[EIPSolver], kept: Any, factor: float) -> Case:
+    assert problem.h is not None
+    run = partial(integrate, problem, method=method, invariants=kept, h=factor * problem.h)
+    return Case(name, factor, lambda: cpu_seconds(run), lambda: states_of(run(save_every=spacing(factor))), problem)
+
+
+def states_of(run: Any) -> tuple[np.ndarray, np.ndarray]:
+    return run.t, run.y
+
+
+def compared(name: str, problem: ParticleProblem, method: Callable[..., Any], factor: float) -> Case:
+    assert problem.h is not None
+    run = partial(method, h=factor * problem.h)
+    return Case(name, factor, lambda: cpu_seconds(run), lambda: states_of(run(save_every=spacing(factor))), problem)
+
+
+def adaptive(problem: ParticleProblem, rtol: float) -> Case:
+    free = replace(problem, h=None)
+    run = partial(integrate, free, method=EIPDOP853, invariants=(), rtol=rtol, atol=1e-3 * rtol)
+    states = lambda: states_of(run(t_eval=tail_times(problem)))  # noqa: E731
+    return Case("DOP853, adaptive", rtol, lambda: cpu_seconds(run), states, problem)
+
+
+def taylor(problem: ParticleProblem, tolerance: float) -> Case:
+    import heyoka
+
+    from .particle_references import system
+
+    def integrator() -> Any:
+        return heyoka.taylor_adaptive(system(problem.field.name, 1e-2), problem.y0, tol=tolerance)
+
+    def seconds() -> float:
+        made = integrator()  # its compilation is not counted
+        return cpu_seconds(made.propagate_until, problem.t_span[1])
+
+    def states() -> tuple[np.ndarray, np.ndarray]:
+        made, times = integrator(), tail_times(problem)
+        made.propagate_until(times[0])
+        return times, np.asarray(made.propagate_grid(times)[-1]).T
+
+    return Case("heyoka", tolerance, seconds, states, problem)
+
+
+def tail_times(problem: ParticleProblem) -> np.ndarray:
+    assert problem.h is not None
+    steps = round(problem.t_span[1] / problem.h)
+    return np.append(np.arange(steps - TAIL, steps) * problem.h, problem.t_span[1])
+
+
+def measure(name: str, repeats: int, share: float) -> list[Point]:
+    """All methods on one scene, in turn; of each the least time of several turns. `share`: of the interval."""
+    problem, other = (shortened(scene(name, form=form), share) for form in ("canonical", "velocity"))
+    assert problem.h is not None
+    # A quarter of the paper's step, compensated: 1e-9 from the states stored with the problem.
+    run = integrate(problem, method=EIPDOP853, h=problem.h / 4, save_every=4, compensated=True, invariants=())
+    truth = ParticleOrbit(problem, run.t[-TAIL - 1 :], run.y[:, -TAIL - 1 :])
+    chosen = list(cases(problem, other))
+    off = [errors(ParticleOrbit(case.problem, *case.states()), truth) for case in chosen]
+    best = [np.inf] * len(chosen)
+    for _ in range(repeats):
+        best = [min(least, case.seconds()) for least, case in zip(best, chosen, strict=True)]
+    points = []
+    for case, least, error in zip(chosen, best, off, strict=True):
+        points.append(Point(name, case.method, case.setting, least, *error))
+        print(f"{name:16} {case.method:18} {case.setting:8g} {least:8.3f} s  position {error[0]:.1e}  "
+              f"guiding centre {error[1]:.1e}", flush=True)  # fmt: skip
+    return points
+
+
+def shortened(problem: ParticleProblem, share: float) -> ParticleProblem:
+    """A share of the interval, whole in the longest steps."""
+    assert problem.h is not None
+    if share == 1:
+        return problem
+    longest = 4 * problem.h
+    return replace(problem, t_span=(0.0, round(share * problem.t_span[1] / longest) * longest))
+
+
+def errors(orbit: ParticleOrbit, truth: ParticleOrbit) -> tuple[float, float]:
+    """Errors of position and of the averaged guiding centre at the end."""
+    step = round(float(np.median(np.diff(orbit.t))) / float(np.median(np.diff(truth.t))))
+    count = TAIL // step + 1
+    tail = ParticleOrbit(orbit.problem, orbit.t[-count:], np.ascontiguousarray(orbit.y[:, -count:]))
+    same = slice(None, None, step)
+    if not np.isfinite(tail.y).all():
+        return float("nan"), float("nan")
+    apart = tail.averaged(tail.guiding_centre - truth.guiding_centre[:, same])[:, -1]
+    return float(np.linalg.norm(tail.x[:, -1] - truth.x[:, -1])), float(np.linalg.norm(apart))
+
+
+def draw(points: list[Point], folder: Path) -> None:
+    """One figure for each scene."""
+    for name in dict.fromkeys(point.scene for point in points):
+        mine = [point for point in points if point.scene == name]
+        kinds = {"position": "position", "guiding_centre": "guiding centre"}
+        panels = [CostPanel(title, "processor time [s]", curves(mine, error=key)) for key, title in kinds.items()]
+        figure = cost_figure(
+            [panels],
+            error="error [system size]",
+            title=f"Charged particle, {name.replace('-', ', ')}: error at the end of the paper's interval against cost",
+            footnote=f"{describe_machine()}; one thread",
+        )
+        figure.savefig(folder / f"charged-particle-cost-{name}.png")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=STATIC)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--quick", action="store_true", help="a hundredth of the steps, each run once")
+    args = parser.parse_args()
+    print(describe_machine(), flush=True)
+    share, repeats, rounds = (0.01, 1, 1) if args.quick else (1.0, args.repeats, ROUNDS)
+    best = speed(rounds * repeats, share)
+    print(speed_text(best), "\n", flush=True)
+    points = [point for name in SCENES for point in measure(name, repeats, share)]
+    draw(points, args.out)
+    if args.json:
+        content = {"microseconds_per_step": best, "points": [point._asdict() for point in points]}
+        write_json(args.json, document("benchmarks/charged_particle.py", vars(args), **content))
+
+
+if __name__ == "__main__":
+    main()

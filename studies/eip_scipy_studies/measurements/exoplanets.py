@@ -1,0 +1,149 @@
+"""Three systems of exoplanets: EIPGJ14 and EIPRKN12 beside WHFast and IAS15, errors of position beside times.
+
+    python -m eip_scipy_studies.measurements.exoplanets [--share 1.0] [--json FILE]
+
+A resonant chain (seven planets with the periods, masses and transits of TRAPPIST-1's, on circles at the start), a
+planet of eccentricity .6 with one further out, and a hot Jupiter with two companions under the relativistic potential
+in 1/r^2, which is REBOUNDx's `gr_potential` on the other side. Errors of position [AU], of the innermost planet and the
+largest of another one's, against heyoka in 80-bit arithmetic, run anew each time; wall times are the least of three in
+turns, one core. ``pip install reboundx heyoka``. `--share`: of the spans.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eip_scipy import EIPGJ14, EIPRKN12
+from eip_scipy.problems import Problem, nbody
+from eip_scipy.problems.gravity.forces import ForceConstants
+from eip_scipy.problems.gravity.solar_data import YEAR_D
+
+from ..report import describe_machine
+from ..solar.cost import timed
+from .relativity import C, potential, reference
+from .runners import Methods, by_rebound, by_us, one_each, rows, show
+
+REPEATS = 3
+GM_SUN = 4 * math.pi**2  # AU^3/yr^2, to four digits
+EARTH = 3.003e-6  # solar masses
+
+
+class System(NamedTuple):
+    """A problem, the period of its innermost planet, and how many steps in it are to be taken."""
+
+    problem: Problem
+    period: float
+    relativity: bool
+    multistep: tuple[int, ...]
+    nystrom: tuple[int, ...]
+    whfast: tuple[int, ...]
+
+
+def planets(
+    star: float, elements: list[tuple[float, float, float, float, float, float]], years: float, relativity: bool = False
+) -> Problem:
+    """Bodies on ellipses about a star of so many solar masses, in the frame of their barycentre.
+
+    `elements`: mass [solar masses], semi-major axis [AU], eccentricity, inclination, argument of the pericentre, mean
+    anomaly [rad].
+    """
+    gm, q, v = [GM_SUN * star], [np.zeros(3)], [np.zeros(3)]
+    for mass, axis, e, tilt, turn, mean in elements:
+        angle = mean
+        for _ in range(50):
+            angle -= (angle - e * math.sin(angle) - mean) / (1 - e * math.cos(angle))
+        side, speed = math.sqrt(1 - e * e), math.sqrt(GM_SUN * (star + mass) / axis) / (1 - e * math.cos(angle))
+        c, s = math.cos(turn), math.sin(turn)
+        along = np.array([c, s * math.cos(tilt), s * math.sin(tilt)])
+        across = np.array([-s, c * math.cos(tilt), c * math.sin(tilt)])
+        gm.append(GM_SUN * mass)
+        q.append(axis * ((math.cos(angle) - e) * along + side * math.sin(angle) * across))
+        v.append(speed * (-math.sin(angle) * along + side * math.cos(angle) * across))
+    masses, place, speeds = np.array(gm), np.array(q), np.array(v)
+    share = masses / masses.sum()
+    options: dict[str, Any] = {"forces": "gr-potential", "constants": ForceConstants(c=C)} if relativity else {}
+    return nbody(masses, place - share @ place, speeds - share @ speeds, t_span=(0.0, years), **options)
+
+
+def chain(share: float) -> System:
+    """Seven planets near 8:5, 5:3, 3:2, 3:2, 4:3 and 3:2."""
+    star = 0.0898
+    days = np.array([1.510826, 2.421937, 4.049219, 6.101013, 9.207540, 12.352446, 18.772866])
+    transits = np.array([7.55044, 8.58728, 7.06768, 7.82771, 7.07426, 7.71462, -0.39324])
+    masses = np.array([1.374, 1.308, 0.388, 0.692, 1.039, 1.321, 0.326]) * EARTH
+    axes = (star * (days / YEAR_D) ** 2) ** (1 / 3)
+    phases = 2 * np.pi * (7.93 - transits) / days
+    elements = [(mass, axis, 0.0, 0.0, 0.0, phase) for mass, axis, phase in zip(masses, axes, phases, strict=True)]
+    problem = planets(star, elements, 6.0 * share)
+    return System(problem, days[0] / YEAR_D, False, (60, 70, 80, 100), (8, 10, 12, 16), (18, 30, 60, 120, 240))
+
+
+def eccentric(share: float) -> System:
+    """A planet of eccentricity .6 within .5 AU, and a heavier one outside."""
+    elements = [(1e-3, 0.5, 0.6, 0.1, 0.3, 1.0), (2e-3, 5.0, 0.1, 0.0, 2.0, 4.0)]
+    problem = planets(1.0, elements, 300.0 * share)
+    return System(problem, 0.5**1.5, False, (240, 280, 320, 400), (32, 40, 50, 64), (30, 60, 120, 240, 480))
+
+
+def hot_jupiter(share: float) -> System:
+    """A planet of 1e-3 in 2.9 days, with relativity; a light one beyond it, and a far one."""
+    elements = [
+        (1e-3, 0.04, 0.02, 0.0, 1.0, 0.0), (3e-5, 0.09, 0.01, 0.02, 2.0, 2.0), (3e-3, 1.4, 0.1, 0.05, 0.0, 4.0),
+    ]  # fmt: skip
+    problem = planets(1.0, elements, 10.0 * share, relativity=True)
+    return System(problem, 0.04**1.5, True, (60, 70, 80, 100), (8, 10, 12, 16), (18, 30, 60, 120, 240))
+
+
+SYSTEMS = {"resonant chain": chain, "e = .6": eccentric, "hot Jupiter": hot_jupiter}
+
+
+def methods(system: System) -> Methods:
+    """A row for each method and number of steps in the innermost period."""
+    problem, period, force = system.problem, system.period, potential if system.relativity else None
+
+    def some(name: str, run: Any, counts: tuple[int, ...]) -> Methods:
+        return one_each(lambda h: f"{name}, {round(period / h)}", run, [period / n for n in counts])
+
+    return {
+        **some("EIPGJ14", by_us(problem, EIPGJ14), system.multistep),
+        **some("EIPRKN12", by_us(problem, EIPRKN12, every=10, compensated=True), system.nystrom),
+        **some("WHFast c17", by_rebound(problem, "whfast-c17", force), system.whfast),
+        "IAS15": (by_rebound(problem, "ias15", force), [math.nan]),
+    }
+
+
+def tables(share: float) -> dict[str, dict[str, Any]]:
+    """Print and return them all."""
+    found = {}
+    for name, make in SYSTEMS.items():
+        system = make(share)
+        problem = system.problem
+        years = problem.t_span[1]
+        gm = problem.params[: problem.y0.size // 6]
+        truth = np.zeros_like(problem.y0)
+        truth[: truth.size // 2] = reference(gm, problem.y0, years, C if system.relativity else None)
+        found[name] = rows([timed(methods(system), truth, repeats=REPEATS)])
+        print(f"\n{name}: {years:g} years, {years / system.period:.0f} revolutions; steps in the innermost period")
+        show(found[name], "innermost")
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--share", type=float, default=1.0)
+    parser.add_argument("--json", metavar="FILE")
+    args = parser.parse_args()
+    print(describe_machine())
+    found = tables(args.share)
+    if args.json:
+        with open(args.json, "w") as file:
+            json.dump({"machine": describe_machine(), "systems": found}, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,151 @@
+"""Cost of the Gross-Pitaevskii equation on ranks of MPI, beside the equation on one processor.
+
+    mpirun -n 2 python -m mpi4py benchmarks/gpe_mpi.py [--quick] [--json FILE]
+
+Least wall-clock times, taken in turn; ranks that have no part in a measurement sleep. One thread on each rank.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+
+import numpy as np
+
+from eip_scipy import EIPRK4
+from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
+
+from ..report import describe_machine, table
+from .installed import peer
+
+mpi, slabs = peer("eip_scipy.integrations.mpi"), peer("eip_scipy.integrations.mpi_fields")
+
+MPI, WORLD = mpi.MPI, mpi.MPI.COMM_WORLD
+SHAPES = ((256, 256), (64, 64, 64), (128, 128, 128))
+QUICK_SHAPES = ((32, 32), (16, 16, 16))
+SECONDS = 30.0  # for each shape
+IN_A_ROW = 8
+STEPS = 20  # whose results are compared
+
+
+def wait():
+    """A barrier in which ranks sleep."""
+    request = WORLD.Ibarrier()
+    while not request.Test():
+        time.sleep(1e-4)
+
+
+def timed(function, comm):
+    """Seconds of the slowest rank."""
+    comm.Barrier()
+    begin = time.perf_counter()
+    function()
+    return comm.allreduce(time.perf_counter() - begin, MPI.MAX)
+
+
+def start(gpe):
+    x, y, *z = gpe.grid.mesh()
+    # Not divided by the mass, whose last digits depend on the order of its sum: the results are compared.
+    return (0.5 * (x - 0.5 + 1j * (y + 0.2)) * np.exp(-(x**2 + y**2 + sum(a * a for a in z)) / 2)).ravel()
+
+
+class Case:
+    """The equation on the first ranks, on a single one without MPI where their number is 0."""
+
+    def __init__(self, shape, ranks):
+        self.here = WORLD.rank < max(ranks, 1)
+        self.comm = WORLD.Split(0 if self.here else MPI.UNDEFINED)
+        if not self.here:
+            return
+        grid, trap = Grid(shape, -10, 10), harmonic_trap(*[1.0] * len(shape))
+        options = {"Omega": 0.7, "beta": 400}
+        self.gpe = slabs.SlabGrossPitaevskii(grid, trap, comm=self.comm, **options) if ranks else None
+        self.gpe = self.gpe or GrossPitaevskii(grid, trap, **options)
+        self.psi = start(self.gpe)
+        self.out = np.empty_like(self.psi)
+        self.solvers = [self.solver(ranks, names) for names in ((), ("mass", "energy"))]
+
+    def solver(self, ranks, names):
+        method = mpi.over_ranks(EIPRK4, self.comm) if ranks else EIPRK4
+        h = 0.2 * self.gpe.largest_step(self.psi)
+        invariants = self.gpe.invariants(names)
+        return method(self.gpe.fun, 0.0, self.psi, 1e3, h=h, invariants=invariants, metric="euclidean")
+
+    def measure(self):
+        """Seconds of f, of a step without invariants and of one that keeps both."""
+        functions = [lambda: self.gpe.rhs(0.0, self.psi, self.out), *(solver.step for solver in self.solvers)]
+        return np.array([min(timed(function, self.comm) for _ in range(IN_A_ROW)) for function in functions])
+
+    def results(self):
+        """Whole fields on rank 0: f at the start, and the state after some steps with projection."""
+        solver = self.solvers[1]
+        for _ in range(STEPS):
+            solver.step()
+        self.gpe.rhs(0.0, self.psi, self.out)
+        whole = getattr(self.gpe, "gather", np.array)
+        return [np.ravel(whole(a)) for a in (self.out, solver.y)]
+
+
+def counts():
+    """0 (no MPI), 1, 2, 4, ... and all ranks."""
+    return sorted({0, *(2**k for k in range(WORLD.size.bit_length()) if 2**k <= WORLD.size), WORLD.size})
+
+
+def compare(shape, seconds):
+    """Rows {ranks: (f, step of RK4, step of EIP-ME in ms, relative errors of f and of the state)}, on rank 0."""
+    cases = {ranks: Case(shape, ranks) for ranks in counts()}
+    results = {}
+    for ranks, case in cases.items():
+        if case.here:
+            results[ranks] = case.results()
+        wait()
+    best = dict.fromkeys(cases, np.inf)
+    end = time.perf_counter() + seconds
+    while WORLD.bcast(time.perf_counter() < end):
+        for ranks, case in cases.items():
+            if case.here:
+                best[ranks] = np.minimum(best[ranks], case.measure())
+            wait()
+    if WORLD.rank:
+        return {}
+    errors = {
+        ranks: [float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(result, results[0], strict=True)]
+        for ranks, result in results.items()
+    }
+    return {ranks: [*(1e3 * best[ranks]).tolist(), *errors[ranks]] for ranks in cases}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small grids, a second each")
+    parser.add_argument("--json", metavar="FILE")
+    arguments = parser.parse_args()
+    results = {}
+    if WORLD.rank == 0:
+        print(describe_machine())
+        print(MPI.Get_library_version().splitlines()[0])
+    for shape in QUICK_SHAPES if arguments.quick else SHAPES:
+        rows = compare(shape, 1.0 if arguments.quick else SECONDS)
+        if WORLD.rank == 0:
+            name = " x ".join(map(str, shape))
+            results[name] = rows
+            body = [
+                (
+                    f"{ranks} rank{'s' * (ranks > 1)}" if ranks else "without MPI",
+                    [f"{row[0]:.2f}", f"{rows[0][0] / row[0]:.2f}", f"{row[1]:.2f}", f"{row[2]:.2f}",
+                     f"{rows[0][2] / row[2]:.2f}", f"{row[3]:.0e}", f"{row[4]:.0e}"],
+                )
+                for ranks, row in rows.items()
+            ]  # fmt: skip
+            print(f"\n{name} [ms]\n")
+            heads = [["f"], ["speed-up"], ["RK4", "step"], ["EIP-ME", "step"], ["speed-up"], ["error", "of f"],
+                     ["error after", f"{STEPS} steps"]]  # fmt: skip
+            print(table(heads, body), flush=True)
+    if arguments.json and WORLD.rank == 0:
+        with open(arguments.json, "w") as file:
+            json.dump(results, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,136 @@
+"""What the metric of the projection does to the solar system: errors of longitude after 100 and 2000 years.
+
+    python -m eip_scipy_studies.measurements.metric_table [--years 100|2000] [--rotations 5] [--json FILE]
+
+RK4, h = .002 yr, DE440 system barycentres, invariants H and L: every EIP row keeps both to 1e-15; they differ in which
+planet pays for it. Errors are unwrapped heliocentric ecliptic longitudes [rad] against the packaged reference states.
+Then the gain of Mercury's position over plain RK4 in random rotations of the axes, with blocks of 3 and without.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from eip_scipy import EIPRK4, integrate
+from eip_scipy.problems import nbody, solar_system
+from eip_scipy.problems.gravity.solar_data import load
+
+from ..comparators import stormer_verlet
+
+STEP = 0.002
+SAVE_EVERY = 20
+GRAVITATION = 6.6743e-11  # turns G m [m^3/s^2] into masses [kg] for the row in SI momenta
+OBLIQUITY = np.deg2rad(84381.448 / 3600)
+PLANETS = ("Mercury", "Venus", "EMB", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune", "Pluto")
+
+
+def longitudes(y: np.ndarray) -> np.ndarray:
+    """Unwrapped heliocentric ecliptic longitudes (9, m) of states (60, m)."""
+    q = y[:30].reshape(10, 3, -1)
+    q = q[1:] - q[:1]
+    north = np.cos(OBLIQUITY) * q[:, 1] + np.sin(OBLIQUITY) * q[:, 2]
+    return np.unwrap(np.arctan2(north, q[:, 0]), axis=1)
+
+
+def turn(angle: np.ndarray) -> np.ndarray:
+    """The angle in (-pi, pi]."""
+    return np.pi - np.mod(np.pi - angle, 2 * np.pi)
+
+
+def reference_longitudes(near: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Longitudes of the reference state, their turns counted by a run `near` it (all errors below pi)."""
+    last = longitudes(near)[:, -1]
+    return last + turn(longitudes(reference[:, None])[:, 0] - last)
+
+
+def position_errors(y: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Distances [AU] of the planets from the reference."""
+    return np.linalg.norm((y - reference)[:30].reshape(10, 3), axis=1)[1:]
+
+
+def momentum_weights(masses: np.ndarray) -> np.ndarray:
+    """Weights in (q, v) of the euclidean metric in (q, p)."""
+    return np.concatenate([np.ones(30), np.repeat(1 / masses, 3)])
+
+
+def metric_rows(years: float) -> dict[str, np.ndarray]:
+    """Errors of longitude (9,) of each row of the table."""
+    problem, si = solar_system(years=years), solar_system(years=years, units="SI")
+    suns = problem.params / problem.params[0]
+    half = np.repeat(1 / np.sqrt(suns), 3)
+    common = {"method": EIPRK4, "save_every": SAVE_EVERY}
+    runs = {
+        "RK4 alone": integrate(problem, invariants=(), **common).y,
+        "EIP, euclidean, SI (q, p)": integrate(si, metric=momentum_weights(si.params / GRAVITATION), **common).y,
+        "EIP, euclidean, AU/yr (q, p)": integrate(problem, metric=momentum_weights(suns), **common).y,
+        "EIP, euclidean, AU/yr (q, v)": integrate(problem, metric="euclidean", **common).y,
+        "EIP, mass-weighted": integrate(problem, metric=np.concatenate([half, half]), **common).y,
+        "EIP, error-weighted, blocks, frame": integrate(problem, **common).y,
+    }
+    runs["EIP, euclidean, SI (q, p)"] = runs["EIP, euclidean, SI (q, p)"] / 1.495978707e11
+    verlet = stormer_verlet(problem.acc, problem.t_span, problem.y0, STEP, params=problem.params, save_every=SAVE_EVERY)
+    reference = problem.reference(years)
+    truth = reference_longitudes(runs["EIP, error-weighted, blocks, frame"], reference)
+    rows = {"Stoermer-Verlet (kick-drift-kick)": longitudes(verlet.y)[:, -1] - truth}
+    return rows | {name: longitudes(y)[:, -1] - truth for name, y in runs.items()}
+
+
+def rotation_gains(rotations: int, seed: int = 1) -> list[dict[str, float]]:
+    """Mercury's position error after 100 years, plain RK4's over EIP's, in random orientations of the axes."""
+    data = load("de440")
+    scale = 365.25
+    out = []
+    for turned in Rotation.random(rotations, rng=seed).as_matrix():
+        problem = nbody(
+            data.gm * scale**2,
+            data.position @ turned.T,
+            data.velocity @ turned.T * scale,
+            t_span=(0.0, 100.0),
+            h=STEP,
+        )
+        reference = solar_system().reference(100.0)
+        reference = (reference.reshape(20, 3) @ turned.T).ravel()
+        errors = {
+            name: position_errors(integrate(problem, method=EIPRK4, **options).y[:, -1], reference)[0]
+            for name, options in {
+                "plain": {"invariants": ()},
+                "blocks of 3": {},
+                "no blocks": {"blocks": None},
+            }.items()
+        }
+        out.append({name: errors["plain"] / errors[name] for name in errors if name != "plain"})
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--years", type=float, choices=(100.0, 1000.0, 2000.0), nargs="*", default=[100.0, 2000.0])
+    parser.add_argument("--rotations", type=int, default=5)
+    parser.add_argument("--json", metavar="FILE")
+    arguments = parser.parse_args()
+    results: dict[str, object] = {}
+    for years in arguments.years:
+        rows = metric_rows(years)
+        results[f"{years:g} years"] = {
+            name: dict(zip(PLANETS, row.tolist(), strict=True)) for name, row in rows.items()
+        }
+        print(f"\nError of longitude after {years:g} years, h = {STEP} yr [rad]")
+        print(f"{'':36}" + "".join(f"{planet:>10}" for planet in PLANETS))
+        for name, row in rows.items():
+            print(f"{name:36}" + "".join(f"{value:10.1e}" for value in row))
+    gains = rotation_gains(arguments.rotations)
+    results["rotations"] = gains
+    print("\nMercury after 100 years, random axes: plain RK4's position error over EIP's")
+    for gain in gains:
+        print("   ".join(f"{name}: {value:.4g}" for name, value in gain.items()))
+    if arguments.json:
+        with open(arguments.json, "w") as file:
+            json.dump(results, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,310 @@
+"""Speed of the step, as ratios measured in one run on one core.
+
+    python -m eip_scipy_studies.measurements.speed [--quick] [--json FILE]
+
+1. Compiled Kepler EIP-RK4 with H and L against a loop in which the same step (stages, metric, projection) is fused by
+   hand for this one problem; per step also against solve_ivp with SciPy's RK45, and so EIP-RK45 with adaptive steps.
+2. Compiled solar system, EIP-RK4 (H, L, blocks, frame) against plain compiled RK4.
+3. Compiled Kepler to t = 300 with 3001 times in t_eval against saving each step; a section of 1600 crossings against
+   the run without it. Whole calls.
+4. A process: from its start to its first compiled step, with a user's functions that no cache knows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import time
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
+from eip_scipy.problems import kepler, solar_system
+
+from .installed import peer
+
+njit = peer("numba", '"eip_scipy[numba]"').njit
+
+
+class Turns(NamedTuple):
+    """How many runs, whole calls and processes; short runs, since long ones hold what else a shared machine does."""
+
+    runs: int = 60
+    calls: int = 7
+    processes: int = 4
+
+
+QUICK = Turns(1, 1, 2)
+STEPS = 20_000  # of a run
+H = 0.03
+MU = 0.005
+
+
+@njit
+def kepler_array(t, y):
+    r2 = y[0] * y[0] + y[1] * y[1]
+    w = 1.0 / (r2 * sqrt(r2))
+    w += 1.5 * MU * w / r2
+    return np.array([y[2], y[3], -w * y[0], -w * y[1]])
+
+
+@njit
+def energy(t, y):
+    r2 = y[0] * y[0] + y[1] * y[1]
+    r = sqrt(r2)
+    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1.0 / r - 0.5 * MU / (r * r2)
+
+
+@njit
+def energy_gradient(t, y):
+    r2 = y[0] * y[0] + y[1] * y[1]
+    w = 1.0 / (r2 * sqrt(r2))
+    w += 1.5 * MU * w / r2
+    return np.array([w * y[0], w * y[1], y[2], y[3]])
+
+
+@njit
+def momentum(t, y):
+    return y[0] * y[3] - y[1] * y[2]
+
+
+@njit
+def momentum_gradient(t, y):
+    return np.array([y[3], -y[2], -y[1], y[0]])
+
+
+@njit
+def _pull(a, b):
+    r2 = a * a + b * b
+    w = 1.0 / (r2 * sqrt(r2))
+    return w + 1.5 * MU * w / r2
+
+
+@njit
+def _weight(err, old, new, rtol, atol):
+    return abs(err) / (atol + rtol * max(abs(old), abs(new)))
+
+
+@njit
+def fused(a, b, c, d, h, steps, energy0, momentum0, error_metric):
+    """Kepler EIP-RK4 with everything written out: stages, error metric, 2 x 2 normal equations, check of the result."""
+    rtol, atol = 1e-3, 1e-6
+    worst = 0.0
+    w = _pull(a, b)
+    for _ in range(steps):
+        a1, b1, c1, d1 = c, d, -w * a, -w * b
+        x, y, u, v = a + 0.5 * h * a1, b + 0.5 * h * b1, c + 0.5 * h * c1, d + 0.5 * h * d1
+        w = _pull(x, y)
+        a2, b2, c2, d2 = u, v, -w * x, -w * y
+        x, y, u, v = a + 0.5 * h * a2, b + 0.5 * h * b2, c + 0.5 * h * c2, d + 0.5 * h * d2
+        w = _pull(x, y)
+        a3, b3, c3, d3 = u, v, -w * x, -w * y
+        x, y, u, v = a + h * a3, b + h * b3, c + h * c3, d + h * d3
+        w = _pull(x, y)
+        a4, b4, c4, d4 = u, v, -w * x, -w * y
+        x = a + h / 6 * (a1 + 2 * (a2 + a3) + a4)
+        y = b + h / 6 * (b1 + 2 * (b2 + b3) + b4)
+        u = c + h / 6 * (c1 + 2 * (c2 + c3) + c4)
+        v = d + h / 6 * (d1 + 2 * (d2 + d3) + d4)
+        w = _pull(x, y)
+        s0 = s1 = s2 = s3 = 1.0
+        if error_metric:
+            s0 = _weight(h / 6 * (a4 - u), a, x, rtol, atol)
+            s1 = _weight(h / 6 * (b4 - v), b, y, rtol, atol)
+            s2 = _weight(h / 6 * (c4 + w * x), c, u, rtol, atol)
+            s3 = _weight(h / 6 * (d4 + w * y), d, v, rtol, atol)
+            top = max(max(s0, s1), max(s2, s3))
+            s0, s1, s2, s3 = s0 / top, s1 / top, s2 / top, s3 / top
+            s0 = (atol + rtol * max(abs(a), abs(x))) * (s0 * sqrt(sqrt(s0)) + 1e-7)
+            s1 = (atol + rtol * max(abs(b), abs(y))) * (s1 * sqrt(sqrt(s1)) + 1e-7)
+            s2 = (atol + rtol * max(abs(c), abs(u))) * (s2 * sqrt(sqrt(s2)) + 1e-7)
+            s3 = (atol + rtol * max(abs(d), abs(v))) * (s3 * sqrt(sqrt(s3)) + 1e-7)
+            top = max(max(s0, s1), max(s2, s3))
+            s0, s1, s2, s3 = (s0 / top) ** 2, (s1 / top) ** 2, (s2 / top) ** 2, (s3 / top) ** 2
+        r2 = x * x + y * y
+        r = sqrt(r2)
+        g0 = 0.5 * (u * u + v * v) - 1.0 / r - 0.5 * MU / (r * r2) - energy0
+        g1 = x * v - y * u - momentum0
+        G0, G1 = w * x, w * y
+        m00 = s0 * G0 * G0 + s1 * G1 * G1 + s2 * u * u + s3 * v * v
+        m01 = s0 * G0 * v - s1 * G1 * u - s2 * u * y + s3 * v * x
+        m11 = s0 * v * v + s1 * u * u + s2 * y * y + s3 * x * x
+        det = m00 * m11 - m01 * m01
+        p, q = -(m11 * g0 - m01 * g1) / det, -(m00 * g1 - m01 * g0) / det
+        a, b = x + s0 * (p * G0 + q * v), y + s1 * (p * G1 - q * u)
+        c, d = u + s2 * (p * u - q * y), v + s3 * (p * v + q * x)
+        r2 = a * a + b * b
+        r = sqrt(r2)
+        worst = max(worst, abs(0.5 * (c * c + d * d) - 1.0 / r - 0.5 * MU / (r * r2) - energy0))
+        worst = max(worst, abs(a * d - b * c - momentum0))
+        if not error_metric:
+            w = _pull(a, b)
+    return a, b, c, d, worst
+
+
+def least(action, calls: int) -> float:
+    """Least wall time in seconds of several calls, after one that is not counted."""
+    action()
+    best = np.inf
+    for _ in range(calls):
+        begin = time.perf_counter()
+        action()
+        best = min(best, time.perf_counter() - begin)
+    return best
+
+
+def per_step(seconds, runs: int, steps: int = STEPS) -> float:
+    """Seconds of one step, without what a run begins with: from the least times of runs of two lengths.
+
+    ``seconds(n)`` is the time of a run of n steps.
+    """
+    few = steps // 5
+    short = long = np.inf
+    for _ in range(runs):
+        short, long = min(short, seconds(few)), min(long, seconds(steps))
+    return (long - short) / (steps - few)
+
+
+def of_integrate(h: float, **arguments):
+    """The time of a run of n steps, without what comes before them."""
+    return lambda n: integrate(t_span=(0.0, n * h), h=h, **arguments).wall_time
+
+
+def of_call(action):
+    """The time of a call that takes how many steps there are."""
+
+    def seconds(n: int) -> float:
+        begin = time.perf_counter()
+        action(n)
+        return time.perf_counter() - begin
+
+    return seconds
+
+
+def kepler_speed(turns: Turns) -> dict[str, float]:
+    problem = kepler(relativistic=MU)
+    y0 = problem.y0
+    targets = [energy(0.0, y0), momentum(0.0, y0)]
+    arrays = [Invariant(energy, energy_gradient, name="H"), Invariant(momentum, momentum_gradient, name="L")]
+    own = {"fun": kepler_array, "y0": y0, "method": EIPRK4, "invariants": arrays, "compiled": True}
+    out = {}
+    for metric in ("euclidean", "error"):
+        hand = per_step(of_call(lambda n, metric=metric: fused(*y0, H, n, *targets, metric == "error")), turns.runs)
+        in_place = per_step(of_integrate(H, fun=problem, method=EIPRK4, metric=metric), turns.runs)
+        array = per_step(of_integrate(H, **own, metric=metric), turns.runs)
+        out[f"{metric}: hand-fused loop [us/step]"] = 1e6 * hand
+        out[f"{metric}: in place / hand-fused"] = in_place / hand
+        out[f"{metric}: array-returning / hand-fused"] = array / hand
+        out[f"{metric}: in place [us/step]"] = 1e6 * in_place
+    solution = solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9)
+    scipy_call = least(lambda: solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9), turns.calls)
+    scipy_step = scipy_call / (solution.t.size - 1)
+    adaptive = {**own, "t_span": (0, 600), "method": EIPRK45, "rtol": 1e-6, "atol": 1e-9}
+    steps = integrate(**adaptive, save_every=1).t.size - 1
+    adaptive_step = min(integrate(**adaptive).wall_time for _ in range(turns.runs)) / steps
+    options = {"method": EIPRK4, "h": H, "invariants": arrays}
+    fixed = least(lambda: solve_ivp(kepler_array, (0, 60), y0, **options), turns.calls) / round(60 / H)
+    out["solve_ivp RK45 [us/step]"] = 1e6 * scipy_step
+    out["solve_ivp EIPRK4 with H and L [us/step]"] = 1e6 * fixed
+    out["solve_ivp RK45 / compiled EIPRK4 (array-returning), per step"] = scipy_step / array
+    out["compiled EIPRK45, adaptive, with H and L [us/step]"] = 1e6 * adaptive_step
+    out["solve_ivp RK45 / compiled EIPRK45 (array-returning), per step"] = scipy_step / adaptive_step
+    return out
+
+
+def solar_speed(turns: Turns) -> dict[str, float]:
+    problem = solar_system()
+    run = {"fun": problem, "method": EIPRK4}
+    plain = per_step(of_integrate(problem.h, **run, invariants=()), turns.runs, 4000)
+    eip = per_step(of_integrate(problem.h, **run), turns.runs, 4000)
+    return {
+        "10 bodies, plain RK4 [us/step]": 1e6 * plain,
+        "10 bodies, EIP-RK4 [us/step]": 1e6 * eip,
+        "10 bodies, EIP-RK4 / plain RK4": eip / plain,
+    }
+
+
+@njit
+def crossing(t, y, params):
+    return y[1]
+
+
+def sampling_speed(turns: Turns) -> dict[str, float]:
+    problem = kepler(relativistic=MU)
+    short, long = (0.0, 300.0), (0.0, 5100.0)
+    times = np.linspace(*short, 3001)
+    found = integrate(problem, long, method=EIPRK4, h=H, events=crossing).t_events[0].size
+    every = least(lambda: integrate(problem, short, method=EIPRK4, h=H, save_every=1), turns.calls)
+    sampled = least(lambda: integrate(problem, short, method=EIPRK4, h=H, t_eval=times), turns.calls)
+    plain = least(lambda: integrate(problem, long, method=EIPRK4, h=H), turns.calls)
+    section = least(lambda: integrate(problem, long, method=EIPRK4, h=H, events=crossing), turns.calls)
+    return {
+        "3001 times in t_eval / save_every=1": sampled / every,
+        f"section of {found} crossings / run without": section / plain,
+    }
+
+
+USER = """
+import time
+begin = time.perf_counter()
+import numpy as np
+from numba import njit
+from eip_scipy import EIPRK4, Invariant, integrate
+imported = time.perf_counter()
+@njit
+def fun(t, y):
+    return np.array([y[1], -np.sin(y[0]) * %r])
+@njit
+def energy(t, y):
+    return 0.5 * y[1] ** 2 - np.cos(y[0]) * %r
+@njit
+def gradient(t, y):
+    return np.array([np.sin(y[0]) * %r, y[1]])
+run = integrate(fun, (0.0, 1.0), [1.0, 0.0], method=EIPRK4, h=0.1, invariants=Invariant(energy, gradient))
+assert run.compiled
+print(imported - begin, time.perf_counter() - begin)
+"""
+
+
+def process_times(turns: Turns) -> dict[str, float]:
+    firsts = []
+    for k in range(turns.processes):
+        code = USER % ((1.0 + 0.001 * k,) * 3)
+        printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        firsts.append([float(x) for x in printed.split()])
+    rest = np.median(np.array(firsts[1:]), axis=0)  # the first one may write bytecode
+    return {
+        "a process: import [s]": float(rest[0]),
+        "a process: start to the end of its first compiled run [s]": float(rest[1]),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="each once")
+    parser.add_argument("--json", metavar="FILE")
+    arguments = parser.parse_args()
+    turns = QUICK if arguments.quick else Turns()
+    results: dict[str, float] = {}
+    for measure in (kepler_speed, solar_speed, sampling_speed, process_times):
+        results |= measure(turns)
+    width = max(map(len, results))
+    print(
+        f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, "
+        f"least of {turns.runs} short runs"
+    )
+    for name, value in results.items():
+        print(f"{name:<{width}}  {value:8.3f}")
+    if arguments.json:
+        with open(arguments.json, "w") as file:
+            json.dump(results, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()

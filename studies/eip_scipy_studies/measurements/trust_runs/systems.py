@@ -1,0 +1,485 @@
+"""Small systems with the quantities claimed of them, which need not be invariants; each function makes a `Problem`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from eip_scipy import Invariant
+from eip_scipy.problems import Problem
+
+from ...hard_cases import CaseEquations
+from ..installed import peer
+
+njit = peer("numba", '"eip_scipy[numba]"').njit
+
+Array = np.ndarray
+
+
+def claimed(name: str, fun: Callable[..., Any], y0: Any, end: float, *kept: Invariant, start: float = 0.0) -> Problem:
+    """A system, and what is claimed of it."""
+    y0 = np.array(y0)
+    return Problem(
+        name=name, fun=fun, y0=y0 + (0j if y0.dtype.kind == "c" else 0.0), t_span=(start, end), invariants=kept
+    )
+
+
+def equations(name: str, system: CaseEquations, y0: Any, end: float, of: CaseEquations | None = None) -> Problem:
+    """One of the hard cases' systems; `of`: the system whose invariants are claimed, when it is another one."""
+    of = of or system
+    return claimed(name, system.fun, y0, end, Invariant(of.values, of.gradients, name="I"))
+
+
+def mechanics(
+    name: str,
+    acceleration: Callable[[float, Array, Array], Any],
+    potential: Callable[[Array], float],
+    slope: Callable[[Array], Any],
+    q0: Any,
+    v0: Any,
+    end: float,
+    masses: Any = 1.0,
+) -> Problem:
+    """q'' = acceleration(t, q, v), and the claim that m v^2 / 2 + potential(q) is kept; slope is its derivative."""
+    n = np.size(q0)
+
+    def fun(t, y):
+        return np.concatenate([y[n:], np.atleast_1d(acceleration(t, y[:n], y[n:]))])
+
+    def energy(t, y):
+        return float(np.sum(masses * y[n:] ** 2) / 2 + potential(y[:n]))
+
+    def gradient(t, y):
+        return np.concatenate([np.atleast_1d(slope(y[:n])), masses * y[n:]])
+
+    return claimed(
+        name,
+        fun,
+        np.concatenate([np.atleast_1d(q0), np.atleast_1d(v0)]),
+        end,
+        Invariant(energy, gradient, name="energy"),
+    )
+
+
+def turning() -> Invariant:
+    """Angular momentum of motion in the plane, y = (x, z, u, v)."""
+    return Invariant(
+        lambda t, y: y[0] * y[3] - y[1] * y[2], lambda t, y: np.array([y[3], -y[2], -y[1], y[0]]), name="L"
+    )
+
+
+def norm() -> Invariant:
+    """Sum of squares."""
+    return Invariant(lambda t, y: float(np.vdot(y, y).real), lambda t, y: 2 * y, name="norm")
+
+
+def component(k: int, name: str) -> Invariant:
+    """The component y_k."""
+    return Invariant(lambda t, y: float(y[k]), lambda t, y: np.arange(y.size) == k + 0.0, name=name)
+
+
+class Verlet:
+    """A user's one-step method for q'' = force(t, q, v)."""
+
+    order = 2
+
+    def __init__(self, force: Callable[[float, np.ndarray, np.ndarray], np.ndarray]) -> None:
+        self.force = force
+
+    def one_step(self, t, y, h):
+        q, v = np.split(y, 2)
+        v = v + h / 2 * self.force(t, q, v)
+        q = q + h * v
+        return np.concatenate([q, v + h / 2 * self.force(t + h, q, v)])
+
+
+# --- one and two degrees of freedom ---
+
+
+def pendulum(friction: float = 0.0, sign: float = 1.0, end: float = 20.0, q0: float = 2.0, v0: float = 0.0) -> Problem:
+    """Pendulum with friction; `sign` of the potential claimed."""
+    return mechanics(
+        f"pendulum, friction {friction:g}",
+        lambda t, q, v: -np.sin(q) - friction * v,
+        lambda q: -sign * np.cos(q[0]),
+        lambda q: sign * np.sin(q),
+        q0,
+        v0,
+        end,
+    )
+
+
+def spring(force: Callable[[float, Array, Array], Any], q0: float = 1.0, v0: float = 0.0, end: float = 20.0) -> Problem:
+    """q'' = force(t, q, v), and the claim that q'^2 / 2 + q^2 / 2 is kept."""
+    return mechanics("spring", force, lambda q: q[0] ** 2 / 2, lambda q: q, q0, v0, end)
+
+
+def duffing(cubic: float = 1.0, q0: float = 0.5, end: float = 20.0) -> Problem:
+    """q'' = q - q^3, claimed with another factor of the quartic term."""
+    return mechanics(
+        "Duffing's oscillator",
+        lambda t, q, v: q - q**3,
+        lambda q: -(q[0] ** 2) / 2 + cubic * q[0] ** 4 / 4,
+        lambda q: -q + cubic * q**3,
+        q0,
+        0.0,
+        end,
+    )
+
+
+def falling(drag: float, v0: float = 0.0, end: float = 10.0) -> Problem:
+    """A stone that falls from rest, with the air's resistance."""
+    return mechanics(
+        f"fall with drag {drag:g}",
+        lambda t, q, v: -1 - drag * v * np.abs(v),
+        lambda q: q[0],
+        lambda q: np.ones(1),
+        10.0,
+        v0,
+        end,
+    )
+
+
+def henon_heiles(cubic: float = 1.0, q0: Any = (0.3, 0.2), v0: Any = (0.0, 0.0), end: float = 50.0) -> Problem:
+    """Henon and Heiles; `cubic`: factor of the cubic terms claimed."""
+    return mechanics(
+        "Henon-Heiles",
+        lambda t, q, v: np.array([-q[0] - 2 * q[0] * q[1], -q[1] - q[0] ** 2 + q[1] ** 2]),
+        lambda q: (q @ q) / 2 + cubic * (q[0] ** 2 * q[1] - q[1] ** 3 / 3),
+        lambda q: np.array([q[0] + cubic * 2 * q[0] * q[1], q[1] + cubic * (q[0] ** 2 - q[1] ** 2)]),
+        q0,
+        v0,
+        end,
+    )
+
+
+def central(
+    name: str, extra: Callable[[float, Array], Any], y0: Any, end: float, *kept: Invariant, strength: float = 1.0
+) -> Problem:
+    """Kepler's attraction and another acceleration extra(t, y)."""
+
+    def fun(t, y):
+        return np.concatenate([y[2:], -strength * y[:2] / np.hypot(y[0], y[1]) ** 3 + extra(t, y)])
+
+    return claimed(name, fun, y0, end, *kept)
+
+
+def kepler_energy() -> Invariant:
+    """Of G M = 1."""
+    return Invariant(
+        lambda t, y: (y[2] ** 2 + y[3] ** 2) / 2 - 1 / np.hypot(y[0], y[1]),
+        lambda t, y: np.concatenate([y[:2] / np.hypot(y[0], y[1]) ** 3, y[2:]]),
+        name="energy",
+    )
+
+
+def laplace_x() -> Invariant:
+    """The component of Laplace's vector towards the pericentre."""
+
+    def value(t, y):
+        x, z, u, v = y
+        return v * (x * v - z * u) - x / np.hypot(x, z)
+
+    def gradient(t, y):
+        x, z, u, v = y
+        r = np.hypot(x, z)
+        return np.array([v * v - 1 / r + x * x / r**3, -u * v + x * z / r**3, -z * v, 2 * x * v - z * u])
+
+    return Invariant(value, gradient, name="A_x")
+
+
+def planar_field(
+    name: str, acceleration: Callable[[float, Array], Any], y0: Any, end: float, *kept: Invariant
+) -> Problem:
+    """q'' = acceleration(t, y) in the plane."""
+    return claimed(name, lambda t, y: np.concatenate([y[2:], acceleration(t, y)]), y0, end, *kept)
+
+
+# --- lattices ---
+
+
+def chain(
+    name: str,
+    force: Callable[[Array], Array],
+    spring_energy: Callable[[Array], Array],
+    claimed_force: Callable[[Array], Array],
+    q0: Any,
+    end: float,
+    v0: Any = None,
+    friction: Any = 0.0,
+    masses: Any = 1.0,
+    claimed_masses: Any = 1.0,
+) -> Problem:
+    """Springs in a row between walls: `force` as a function of the elongations, `spring_energy` as claimed."""
+    q0 = np.array(q0, dtype=float)
+
+    def stretched(q):
+        return np.diff(q, prepend=0.0, append=0.0)
+
+    def acceleration(t, q, v):
+        return (np.diff(force(stretched(q))) - friction * v) / masses
+
+    def potential(q):
+        return float(spring_energy(stretched(q)).sum())
+
+    return mechanics(
+        name,
+        acceleration,
+        potential,
+        lambda q: -np.diff(claimed_force(stretched(q))),
+        q0,
+        np.zeros(q0.size) if v0 is None else v0,
+        end,
+        claimed_masses,
+    )
+
+
+def toda(claim_harmonic: bool = False, n: int = 8, end: float = 20.0, moving: bool = False) -> Problem:
+    """Toda's lattice, one mass displaced."""
+    q0 = np.where(np.arange(n) == n // 2, 0.8, 0.0)
+    v0 = np.where(np.arange(n) == n // 2, 0.5, 0.0) if moving else None
+    if claim_harmonic:
+        return chain("Toda lattice", np.expm1, lambda d: d * d / 2, lambda d: d, q0, end, v0)
+    return chain("Toda lattice", np.expm1, lambda d: np.expm1(d) - d, np.expm1, q0, end, v0)
+
+
+def fput(
+    alpha: float = 0.25, claimed_alpha: float | None = None, n: int = 16, end: float = 50.0, **more: Any
+) -> Problem:
+    """Fermi, Pasta, Ulam and Tsingou's chain, first mode."""
+    own = alpha if claimed_alpha is None else claimed_alpha
+    q0 = np.sin(np.pi * np.arange(1, n + 1) / (n + 1))
+    return chain(
+        "FPUT chain",
+        lambda d: d + alpha * d * d,
+        lambda d: d * d / 2 + own * d**3 / 3,
+        lambda d: d + own * d * d,
+        q0,
+        end,
+        **more,
+    )
+
+
+def sine_gordon(
+    claimed_coupling: float | None = None, n: int = 64, end: float = 20.0, friction: float = 0.0
+) -> Problem:
+    """Sine-Gordon by lines: a kink and an antikink at rest."""
+    x = np.linspace(-10, 10, n, endpoint=False)
+    h = x[1] - x[0]
+    c = 1 / h**2
+    own = c if claimed_coupling is None else claimed_coupling * c
+    u0 = 4 * np.arctan(np.exp(x + 5)) - 4 * np.arctan(np.exp(x - 5))
+
+    def curvature(u):
+        return np.roll(u, -1) - 2 * u + np.roll(u, 1)
+
+    return mechanics(
+        "sine-Gordon by lines",
+        lambda t, u, v: c * curvature(u) - np.sin(u) - friction * v,
+        lambda u: own * (np.diff(u, append=u[:1]) ** 2).sum() / 2 + (1 - np.cos(u)).sum(),
+        lambda u: -own * curvature(u) + np.sin(u),
+        u0,
+        np.zeros(n),
+        end,
+    )
+
+
+# --- complex states ---
+
+
+def waves(
+    end: float,
+    *,
+    n: int = 64,
+    potential: Callable[[float, Array], Any] = lambda t, x: x**2 / 2,
+    beta: float = 0.0,
+    claimed_beta: float | None = None,
+    claimed_potential: Callable[[Array], Array] | None = None,
+    start: Callable[[Array], Array] = lambda x: np.exp(-((x - 1) ** 2) / 2),
+    keep: Sequence[str] = ("mass", "energy"),
+) -> Problem:
+    """Schroedinger's equation on a line, i psi' = -psi''/2 + V psi + beta |psi|^2 psi; mass and energy as claimed."""
+    x = np.linspace(-8, 8, n, endpoint=False)
+    dx = x[1] - x[0]
+    k2 = (2 * np.pi * np.fft.fftfreq(n, dx)) ** 2
+    b = beta if claimed_beta is None else claimed_beta
+    V = np.real(potential(0.0, x)) if claimed_potential is None else claimed_potential(x)
+
+    def kinetic(psi):
+        return np.fft.ifft(k2 / 2 * np.fft.fft(psi))
+
+    def fun(t, psi):
+        return -1j * (kinetic(psi) + (potential(t, x) + beta * np.abs(psi) ** 2) * psi)
+
+    def energy(t, psi):
+        density = np.abs(psi) ** 2
+        return float((np.vdot(psi, kinetic(psi)).real + (V * density + b / 2 * density**2).sum()) * dx)
+
+    def slope(t, psi):
+        return 2 * dx * (kinetic(psi) + (V + b * np.abs(psi) ** 2) * psi)
+
+    mass = Invariant(lambda t, psi: float(np.vdot(psi, psi).real * dx), lambda t, psi: 2 * dx * psi, name="mass")
+    known = {"mass": mass, "energy": Invariant(energy, slope, name="energy")}
+    return claimed("waves", fun, start(x) + 0j, end, *(known[item] for item in keep))
+
+
+# --- compiled: jitted equations and energies ---
+# params: (square of the frequency, friction, strength of the driving force, its frequency)
+
+
+@njit(cache=True)
+def _spring_rhs(t, y, out, params):
+    out[0] = y[1]
+    out[1] = -params[0] * y[0] - params[1] * y[1] + params[2] * np.sin(params[3] * t)
+
+
+@njit(cache=True)
+def _spring_acc(t, q, params):
+    return -params[0] * q + params[2] * np.sin(params[3] * t)
+
+
+@njit(cache=True)
+def _spring_energy(t, y, params):
+    return 0.5 * (y[1] * y[1] + params[0] * y[0] * y[0])
+
+
+@njit(cache=True)
+def _spring_gradient(t, y, out, params):
+    out[0] = params[0] * y[0]
+    out[1] = y[1]
+
+
+def compiled_spring(
+    square: float = 1.0,
+    friction: float = 0.0,
+    force: float = 0.0,
+    frequency: float = 1.0,
+    end: float = 20.0,
+    y0: Any = (1.0, 0.0),
+    h: float | None = None,
+) -> Problem:
+    """Spring with friction and a driving force, jitted; its energy claimed."""
+    params = np.array([square, friction, force, frequency])
+    return Problem(
+        name="spring",
+        fun=lambda t, y: np.array([y[1], -square * y[0] - friction * y[1] + force * np.sin(frequency * t)]),
+        rhs=_spring_rhs,
+        acc=None if friction else _spring_acc,
+        y0=np.array(y0, dtype=float),
+        t_span=(0.0, end),
+        h=h,
+        params=params,
+        invariants=(Invariant(_spring_energy, _spring_gradient, args=(params,), in_place=True, name="energy"),),
+    )
+
+
+@njit(cache=True)
+def _pendulum_rhs(t, y, out, params):
+    out[0] = y[1]
+    out[1] = -np.sin(y[0]) - params[0] * y[1]
+
+
+@njit(cache=True)
+def _pendulum_energy(t, y, params):
+    return 0.5 * y[1] * y[1] - np.cos(y[0])
+
+
+@njit(cache=True)
+def _pendulum_gradient(t, y, out, params):
+    out[0] = np.sin(y[0])
+    out[1] = y[1]
+
+
+def compiled_pendulum(
+    friction: float = 0.0, end: float = 20.0, y0: Any = (2.0, 0.0), h: float | None = None
+) -> Problem:
+    """Pendulum with friction, jitted; its energy claimed."""
+    params = np.array([friction])
+    return Problem(
+        name="pendulum",
+        fun=lambda t, y: np.array([y[1], -np.sin(y[0]) - friction * y[1]]),
+        rhs=_pendulum_rhs,
+        y0=np.array(y0, dtype=float),
+        t_span=(0.0, end),
+        h=h,
+        params=params,
+        invariants=(Invariant(_pendulum_energy, _pendulum_gradient, args=(params,), in_place=True, name="energy"),),
+    )
+
+
+@njit(cache=True)
+def _trap_rhs(t, y, out, params):
+    out[0] = y[2]
+    out[1] = y[3]
+    out[2] = -y[0]
+    out[3] = -params[0] * y[1]
+
+
+@njit(cache=True)
+def _trap_acc(t, q, params):
+    out = np.empty(2)
+    out[0] = -q[0]
+    out[1] = -params[0] * q[1]
+    return out
+
+
+@njit(cache=True)
+def _trap_turning(t, y, params):
+    return y[0] * y[3] - y[1] * y[2]
+
+
+@njit(cache=True)
+def _trap_gradient(t, y, out, params):
+    out[0] = y[3]
+    out[1] = -y[2]
+    out[2] = -y[1]
+    out[3] = y[0]
+
+
+def compiled_trap(square: float, end: float = 20.0, h: float | None = None) -> Problem:
+    """Anisotropic trap, jitted, started on an axis; angular momentum claimed."""
+    params = np.array([square])
+    return Problem(
+        name="trap",
+        fun=lambda t, y: np.array([y[2], y[3], -y[0], -square * y[1]]),
+        rhs=_trap_rhs,
+        acc=_trap_acc,
+        y0=np.array([1.0, 0.0, 0.0, 0.5]),
+        t_span=(0.0, end),
+        h=h,
+        params=params,
+        invariants=(Invariant(_trap_turning, _trap_gradient, args=(params,), in_place=True, name="L"),),
+    )
+
+
+@njit(cache=True)
+def _doubled_gradient(t, y, out, params):
+    out[0] = 2 * params[0] * y[0]
+    out[1] = 2 * y[1]
+
+
+def spring_of_doubled_gradient() -> Problem:
+    """The spring with its energy's gradient doubled, jitted."""
+    spring = compiled_spring()
+    wrong = Invariant(_spring_energy, _doubled_gradient, args=(spring.params,), in_place=True, name="energy")
+    return replace(spring, invariants=(wrong,))
+
+
+# --- members: their invariants take the parameters ---
+
+
+def bare(problem: Problem) -> Problem:
+    return replace(
+        problem, invariants=tuple(Invariant(i.fun, i.grad, in_place=True, name=i.name) for i in problem.invariants)
+    )
+
+
+def bare_pendulum(end: float = 20.0) -> Problem:
+    return bare(compiled_pendulum(end=end))
+
+
+def bare_spring() -> Problem:
+    return bare(compiled_spring())

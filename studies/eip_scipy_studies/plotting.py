@@ -1,0 +1,829 @@
+"""Figures of the studies: functions that take data and return a matplotlib Figure.
+
+Needs ``pip install "eip_scipy[plot]"``. The figures belong to no window: save them with ``figure.savefig(path)``, or
+show them in a notebook.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+# First of all: its error says how matplotlib is installed.
+from eip_scipy.plotting import FLOOR, MARKERS, PALETTE, log_errors, method_styles, typeset  # isort: skip
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize, to_rgba
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = [
+    "CostPanel",
+    "Curves",
+    "ErrorSeries",
+    "FieldPanel",
+    "Orbits",
+    "ParticleRow",
+    "SurfacePanel",
+    "blank_figure",
+    "cost_figure",
+    "errors_figure",
+    "fields_figure",
+    "fields_movie",
+    "gains_figure",
+    "longitude_figure",
+    "orbit_in_time_figure",
+    "orbits_figure",
+    "paper_kepler_figure",
+    "particle_figure",
+    "side_by_side_figure",
+    "surfaces_figure",
+]
+
+WIDTH, HEIGHT = 6.4, 7.4
+LINE_HEIGHT = 0.19  # of the legend, inches
+FAINT = {"lw": 1.0, "ms": 4, "alpha": 0.85}
+OURS = {"lw": 2.4, "ms": 6, "zorder": 5}
+DPI = 160
+POINTS = 250
+LONG_LABEL = 24
+DENSITY = r"density $|\psi|^2$"
+VEIL = 0.13  # opacity of what the inside is seen through
+
+
+class ErrorSeries(NamedTuple):
+    """Errors of one method in time.
+
+    Attributes
+    ----------
+    t : array_like, shape (m,)
+    invariants : mapping of str to array_like, shape (m,)
+        Relative error of each invariant.
+    trajectory : array_like, shape (m,)
+        Error of the trajectory; nan where unknown.
+    """
+
+    t: Any
+    invariants: Mapping[str, Any]
+    trajectory: Any
+
+
+class Orbits(NamedTuple):
+    """Orbits of k bodies by one method.
+
+    Attributes
+    ----------
+    paths : array_like, shape (k, m, 2, points)
+        For each body m curves in the plane.
+    last : array_like, shape (k, 2)
+        The final positions.
+    """
+
+    paths: Any
+    last: Any
+
+
+Styles = Mapping[str, Mapping[str, Any]]
+
+
+def errors_figure(
+    series: Mapping[str, ErrorSeries], *, time: str, trajectory: str, title: str = "", styles: Styles | None = None
+) -> Figure:
+    """Draw invariant errors in time, and beside them the trajectory error, without which they prove nothing.
+
+    Parameters
+    ----------
+    series : mapping of str to ErrorSeries
+        For each method; all with the same invariants.
+    time, trajectory : str
+        Labels of the time axis and of the trajectory's error, with units.
+    title : str, optional
+    styles : mapping, optional
+        From `method_styles`.
+
+    Returns
+    -------
+    Figure
+    """
+    names = list(next(iter(series.values())).invariants)
+    styles = method_styles(series) if styles is None else styles
+    figure = blank_figure(3.9 * (len(names) + 1), 4.4, title)
+    axes = figure.subplots(1, len(names) + 1, sharex=True)
+    for axis, name in zip(axes, names, strict=False):
+        for method, data in series.items():
+            _envelope(axis, data.t, data.invariants[name], styles[method])
+        log_errors(axis, time, f"relative error of {name}")
+    for method, data in series.items():
+        _envelope(axes[-1], data.t, data.trajectory, styles[method])
+    log_errors(axes[-1], time, trajectory)
+    _legend_below(figure, axes[0])
+    return figure
+
+
+def longitude_figure(
+    t: Any,
+    errors: Mapping[str, Any],
+    planets: Sequence[str],
+    *,
+    time: str,
+    error: str = "|error of longitude| [rad]",
+    title: str = "",
+    styles: Styles | None = None,
+) -> Figure:
+    """Draw an error in time, one panel for each planet; on log axes a power of time is a straight line.
+
+    Parameters
+    ----------
+    t : array_like, shape (m,)
+    errors : mapping of str to array_like, shape (k, m)
+        For each method the errors of the k planets; nan where unknown.
+    planets : sequence of str, length k
+    time, error : str
+        Labels of the axes, with units.
+    title : str, optional
+    styles : mapping, optional
+        From `method_styles`.
+
+    Returns
+    -------
+    Figure
+    """
+    styles = method_styles(errors) if styles is None else styles
+    columns = min(3, len(planets)) if len(planets) != 4 else 2
+    rows = -(-len(planets) // columns)
+    figure = blank_figure(3.7 * columns, 2.5 * rows + 1.2, title)
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for k, axis in enumerate(axes.flat):
+        if k >= len(planets):
+            axis.set_visible(False)
+            continue
+        for method, values in errors.items():
+            _envelope(axis, t, np.asarray(values)[k], styles[method], log=True)
+        _log_x(axis)
+        log_errors(axis, time if k + columns >= len(planets) else "", "")
+        axis.set_title(planets[k], fontsize="medium")
+    figure.supylabel(error, fontsize="medium")
+    _legend_below(figure, axes[0, 0])
+    return figure
+
+
+def orbits_figure(panels: Mapping[str, Orbits], bodies: Sequence[str], *, unit: str, title: str = "") -> Figure:
+    """Draw orbits in a plane, one panel for each method, with the final positions.
+
+    Parameters
+    ----------
+    panels : mapping of str to Orbits
+        For each method the orbits of k bodies.
+    bodies : sequence of str, length k
+    unit : str
+        Unit of length.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    figure = blank_figure(4.1 * len(panels), 5.4, title)
+    axes = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+    for axis, (name, orbits) in zip(axes, panels.items(), strict=True):
+        for k, body in enumerate(bodies):
+            colour = PALETTE[k % len(PALETTE)]
+            axis.add_collection(
+                LineCollection(list(np.swapaxes(np.asarray(orbits.paths)[k], 1, 2)), colors=colour, lw=0.5)
+            )
+            mark = {"marker": MARKERS[k % len(MARKERS)], "mec": "white", "ms": 7, "zorder": 3}
+            axis.plot(*np.asarray(orbits.last)[k], ls="", color=colour, label=body, **mark)
+        _plane(axis, name, unit)
+    axes[0].set_ylabel(f"y [{unit}]")
+    _legend_below(figure, axes[0], heading="final position")
+    return figure
+
+
+def orbit_in_time_figure(panels: Mapping[str, tuple[Any, Any]], *, unit: str, time: str, title: str = "") -> Figure:
+    """Draw one body's changing orbit in a plane, coloured by time, one panel for each method.
+
+    Parameters
+    ----------
+    panels : mapping of str to (array_like, array_like)
+        For each method times, (m,), and curves, (m, 2, points).
+    unit, time : str
+        Unit of length, and label of the time.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    figure = blank_figure(4.1 * len(panels) + 0.8, 4.9, title)
+    axes = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+    norm = Normalize(0.0, max(float(np.max(t)) for t, _ in panels.values()))
+    for axis, (name, (t, paths)) in zip(axes, panels.items(), strict=True):
+        curves = LineCollection(list(np.swapaxes(paths, 1, 2)), cmap="viridis", norm=norm, lw=0.7)
+        curves.set_array(np.asarray(t, dtype=float))
+        axis.add_collection(curves)
+        axis.autoscale()
+        _plane(axis, name, unit)
+    axes[0].set_ylabel(f"y [{unit}]")
+    figure.colorbar(curves, ax=list(axes), label=time, shrink=0.8, pad=0.01)
+    return figure
+
+
+class KeplerRun(NamedTuple):
+    """A run of the perturbed Kepler problem by one method.
+
+    Attributes
+    ----------
+    t : array_like, shape (m,)
+    energy_error, momentum_error, position_error : array_like, shape (m,)
+    orbit : array_like, shape (2, k)
+        Positions to draw.
+    """
+
+    t: Any
+    energy_error: Any
+    momentum_error: Any
+    position_error: Any
+    orbit: Any
+
+
+def paper_kepler_figure(runs: Mapping[str, KeplerRun], *, title: str = "") -> Figure:
+    """Draw orbits, energy, momentum and position errors, a row for each method, as the paper's figures 1 and 2 do.
+
+    Parameters
+    ----------
+    runs : mapping of str to KeplerRun
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    figure = blank_figure(14.0, 3.1 * len(runs) + 0.6, title)
+    axes = figure.subplots(len(runs), 4, squeeze=False, width_ratios=[0.85, 1, 1, 1])
+    for row, (name, run) in zip(axes, runs.items(), strict=True):
+        row[0].plot(*np.asarray(run.orbit), color=PALETTE[0], lw=0.35)
+        _plane(row[0], name, "")
+        row[0].set_xlabel("$q_1$")
+        row[0].set_ylabel("$q_2$")
+        errors = (("$|H - H_0|$", run.energy_error), ("$|L - L_0|$", run.momentum_error))
+        for k, (label, values) in enumerate((*errors, ("error of position", run.position_error))):
+            _envelope(row[1 + k], run.t, values, {"color": PALETTE[k], "ls": "-", "marker": ""})
+            log_errors(row[1 + k], "t", label)
+            low, high = np.log10(row[1 + k].get_ylim())
+            row[1 + k].set_ylim(10 ** np.floor(low), 10 ** np.ceil(high))  # two labelled ticks at least
+    return figure
+
+
+class Curves(NamedTuple):
+    """Curves in one plane.
+
+    Attributes
+    ----------
+    x, y : str
+        Labels of the axes.
+    paths : mapping of str to array_like, shape (2, k)
+    """
+
+    x: str
+    y: str
+    paths: Mapping[str, Any]
+
+
+class ParticleRow(NamedTuple):
+    """What one method got of a charged particle.
+
+    Attributes
+    ----------
+    orbits : mapping of str to Curves
+        By the panels' titles.
+    invariants : mapping of str to (array_like, array_like)
+        Times and relative errors.
+    trajectory : str
+        Label of the trajectory's errors, with unit.
+    errors : mapping of str to (array_like, array_like)
+        Times and errors of the trajectory.
+    """
+
+    orbits: Mapping[str, Curves]
+    invariants: Mapping[str, tuple[Any, Any]]
+    trajectory: str
+    errors: Mapping[str, tuple[Any, Any]]
+
+
+def particle_figure(rows: Mapping[str, ParticleRow], *, title: str = "") -> Figure:
+    """Draw orbits, errors of the invariants and of the trajectory, a row for each method.
+
+    Parameters
+    ----------
+    rows : mapping of str to ParticleRow
+        By the methods' names; all with as many orbits.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    orbits = len(next(iter(rows.values())).orbits)
+    figure = blank_figure(3.4 * (orbits + 2), 2.9 * len(rows) + 0.6, title)
+    axes = figure.subplots(len(rows), orbits + 2, squeeze=False)
+    for line, (name, row) in zip(axes, rows.items(), strict=True):
+        for axis, (panel, curves) in zip(line, row.orbits.items(), strict=False):
+            for path in curves.paths.values():
+                axis.plot(*np.asarray(path), color=PALETTE[0], lw=0.35, rasterized=True)
+            axis.set_title(f"{name}: {panel}", fontsize="medium")
+            axis.set_xlabel(curves.x)
+            axis.set_ylabel(curves.y)
+            axis.set_aspect("equal", adjustable="box")
+            axis.grid(alpha=0.2)
+        for axis, label, values in (
+            (line[-2], "relative error", row.invariants),
+            (line[-1], row.trajectory, row.errors),
+        ):
+            for style, (key, (t, error)) in zip(method_styles(values).values(), values.items(), strict=True):
+                _envelope(axis, t, error, {**style, "label": key})
+            log_errors(axis, "t", label)
+            axis.legend(fontsize="x-small", loc="best", handlelength=3, framealpha=0.8)
+    for column in range(orbits + 2):
+        _share_limits(axes[:, column], both=column < orbits)
+    return figure
+
+
+def _share_limits(axes: Iterable[Axes], *, both: bool) -> None:
+    """Give axes the limits that hold all of them, in y or in x and y."""
+    for get, put in (("get_ylim", "set_ylim"), ("get_xlim", "set_xlim"))[: 1 + both]:
+        limits = np.array([getattr(axis, get)() for axis in axes])
+        for axis in axes:
+            getattr(axis, put)(limits[:, 0].min(), limits[:, 1].max())
+
+
+def gains_figure(errors: Mapping[str, tuple[float, float]], *, what: str, title: str = "", labels: int = 6) -> Figure:
+    """Draw errors with projection against errors without; below the diagonal projection helps.
+
+    Parameters
+    ----------
+    errors : mapping of str to (float, float)
+        For each case the error without and with; those not finite or zero are left out.
+    what : str
+        Name of the error, with its unit.
+    title : str, optional
+    labels : int, optional
+        How many of the largest gains get their names; those above the diagonal all do.
+
+    Returns
+    -------
+    Figure
+    """
+    figure = blank_figure(7.4, 6.4, title)
+    axis = figure.subplots()
+    good = {name: pair for name, pair in errors.items() if all(np.isfinite(x) and x > 0 for x in pair)}
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    x, y = np.array(list(good.values())).reshape(-1, 2).T
+    low, high = (float(f(10.0, g(np.log10([x, y])) + d)) for f, g, d in ((pow, np.min, -0.5), (pow, np.max, 0.5)))
+    span = np.array([low, high])
+    axis.plot(span, span, color="0.4", lw=1.0)
+    for factor in (1e-1, 1e-2, 1e-3):
+        axis.plot(span, factor * span, color="0.75", lw=0.7, ls=":")
+        axis.annotate(
+            f"{1 / factor:.0f} times less", (low / factor, low), (10, 3), textcoords="offset points",
+            fontsize="x-small", color="0.5", rotation=45, rotation_mode="anchor",
+        )  # fmt: skip
+    worse = y > x
+    axis.plot(
+        x[~worse], y[~worse], ls="", marker="o", color=PALETTE[0], mec="white", ms=7, label="less with projection"
+    )
+    if worse.any():
+        axis.plot(
+            x[worse], y[worse], ls="", marker="s", color=PALETTE[2], mec="white", ms=7, label="more with projection"
+        )
+    gains = set(np.argsort(y / x)[:labels])
+    for k, name in enumerate(good):
+        if worse[k]:  # to the left, where no other points are
+            axis.annotate(name, (x[k], y[k]), (-6, 3), textcoords="offset points", fontsize="x-small", ha="right")
+        elif k in gains:
+            axis.annotate(name, (x[k], y[k]), (6, -3), textcoords="offset points", fontsize="x-small")
+    high_x = high * 40  # room for names
+    axis.set_xlim(low, high_x)
+    axis.set_ylim(low, high)
+    axis.set_aspect("equal")
+    axis.set_xlabel(f"{what}, without projection")
+    axis.set_ylabel(f"{what}, with projection")
+    axis.grid(which="major", alpha=0.25)
+    axis.legend(loc="upper left", fontsize="small", framealpha=0.9)
+    return figure
+
+
+class CostPanel(NamedTuple):
+    """Errors against one cost.
+
+    Attributes
+    ----------
+    title : str
+    cost : str
+        Label of the cost, with its unit.
+    curves : mapping of str to (array_like, array_like)
+        By method costs and errors; what is not a number above 0 is left out.
+    slopes : mapping of str to float, optional
+        Of some methods, each drawn as a line a little below the method's.
+    """
+
+    title: str
+    cost: str
+    curves: Mapping[str, tuple[Any, Any]]
+    slopes: Mapping[str, float] = {}
+
+
+def cost_figure(
+    rows: Sequence[Sequence[CostPanel]],
+    *,
+    error: str,
+    title: str = "",
+    footnote: str = "",
+    styles: Styles | None = None,
+    largest: float = np.inf,
+    size: tuple[float, float] = (5.3, 4.2),
+    shared: bool = True,
+) -> Figure:
+    """Draw error against cost, a line for each method.
+
+    Parameters
+    ----------
+    rows : sequence of sequences of CostPanel
+        A method has the same style in all.
+    error : str
+        Label of the error, with its unit.
+    title, footnote : str, optional
+    styles : mapping, optional
+        From `method_styles`.
+    largest : float, optional
+        Larger errors, of runs that are lost, are left out.
+    size : (float, float), optional
+        Of a panel, in inches.
+    shared : bool, optional
+        Panels of a row have the same axis of errors, and those with the same cost that of the cost.
+
+    Returns
+    -------
+    Figure
+    """
+    columns = max(map(len, rows))
+    names = dict.fromkeys(name for row in rows for panel in row for name in panel.curves)
+    styles = method_styles(names) if styles is None else styles
+    figure = blank_figure(max(size[0] * columns, 6.5), size[1] * len(rows) + 1.1, title)
+    if footnote:  # above: the legend is below
+        figure.suptitle(f"{typeset(title)}\n{footnote}", fontsize="medium")
+    axes = figure.subplots(len(rows), columns, sharey="row" if shared else "none", squeeze=False)
+    first: dict[str, Axes] = {}
+    drawn = []
+    for row, places in zip(rows, axes, strict=True):
+        for axis in places[len(row) :]:
+            axis.set_visible(False)
+        for panel, axis in zip(row, places, strict=False):
+            drawn.append((panel, axis))
+            if shared and first.setdefault(panel.cost, axis) is not axis:
+                axis.sharex(first[panel.cost])
+            for name, values in panel.curves.items():
+                cost, errors = (np.asarray(value, dtype=float) for value in values)
+                good = (errors > 0) & (errors <= largest)
+                axis.plot(cost[good], errors[good], ms=5, lw=1.2, **styles[name])
+            axis.set_title(panel.title, fontsize="medium")
+    for panel, axis in drawn:
+        _log_x(axis)
+        log_errors(axis, panel.cost, error if shared and axis in axes[:, 0] else "")
+        for name, slope in panel.slopes.items():
+            cost, errors = panel.curves[name]
+            _slope_line(axis, np.asarray(cost), np.asarray(errors), slope)
+    if not shared:
+        figure.supylabel(error, fontsize="medium")
+    _legend_below(figure, axes[0, 0])
+    return figure
+
+
+def _slope_line(axis: Axes, h: np.ndarray, error: np.ndarray, slope: float) -> None:
+    """A dotted line below a method, with its slope below the shortest step."""
+    ends = np.array([h.min(), h.max()])
+    line = 0.25 * error[np.argmax(h)] * (ends / ends[1]) ** slope
+    axis.plot(ends, line, color="0.4", lw=1.0, ls=":")
+    start = float(ends[0]), float(line[0])
+    text = axis.annotate(f"slope {slope:.2f}", start, (4, -2), textcoords="offset points", va="top", fontsize="small")
+    text.set_bbox({"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5})
+
+
+class FieldPanel(NamedTuple):
+    """A density in a plane.
+
+    Attributes
+    ----------
+    density : array_like, shape (m, n)
+        By the first coordinate, then by the second.
+    ends : tuple of float
+        Lower and upper end of the first coordinate, then of the second.
+    axes : tuple of str
+        Names of the coordinates.
+    vortices : array_like, shape (k, 2)
+        Positions to mark.
+    followed : int, optional
+        Number of the one that is told from the others, to be followed from panel to panel.
+    """
+
+    density: Any
+    ends: tuple[float, float, float, float]
+    axes: tuple[str, str]
+    vortices: Any
+    followed: int | None = None
+
+
+def fields_figure(
+    panels: Mapping[str, FieldPanel], *, title: str = "", columns: int = 3, shared: bool = False
+) -> Figure:
+    """Draw densities in planes, with their vortices, a panel for each.
+
+    Parameters
+    ----------
+    panels : mapping of str to FieldPanel
+        By the panels' titles.
+    title : str, optional
+    columns : int, optional
+        Panels abreast.
+    shared : bool, optional
+        One scale of colours for all.
+
+    Returns
+    -------
+    Figure
+    """
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = blank_figure(4.1 * columns if columns > 1 else 5.6, 3.9 * rows + 0.4, title)
+    if columns == 1:
+        figure.suptitle(typeset(title), fontsize="medium")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    top = max(float(np.max(panel[0])) for panel in panels.values()) if shared else None
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    for axis, (name, panel) in zip(axes.flat, panels.items(), strict=False):
+        image = field_panel(axis, name, panel, top)
+        if not shared:
+            figure.colorbar(image, cax=axis.inset_axes((1.03, 0.0, 0.05, 1.0)), label=DENSITY)
+    if shared:
+        figure.colorbar(image, ax=list(axes.flat), shrink=0.8, pad=0.02, label=DENSITY)
+    return figure
+
+
+def fields_movie(path: Any, panels: Sequence[FieldPanel], titles: Sequence[str], *, per_second: int) -> None:
+    """Write an animated GIF, a frame for each panel, on one scale of colours.
+
+    Parameters
+    ----------
+    path : str or Path
+        Ends in ".gif".
+    panels : sequence of FieldPanel
+        All of one shape.
+    titles : sequence of str
+    per_second : int
+        Frames.
+    """
+    top = max(float(np.max(panel.density)) for panel in panels)
+    figure = Figure(figsize=(5.2, 4.6), dpi=90, layout="constrained")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    image = field_panel(axis, titles[0], panels[0], top)
+    figure.colorbar(image, ax=axis, shrink=0.84, pad=0.02, label=DENSITY)
+
+    def frame(k: int) -> None:
+        axis.clear()
+        field_panel(axis, titles[k], panels[k], top)
+
+    movie = FuncAnimation(figure, frame, frames=len(panels))
+    movie.save(path, writer=PillowWriter(fps=per_second))
+
+
+class SurfacePanel(NamedTuple):
+    """A surface in space.
+
+    Attributes
+    ----------
+    corners : array_like, shape (m, 3, 3)
+        x, y and z of the three corners of each triangle.
+    part : array_like of int, shape (m,)
+        What each triangle belongs to: 0 the outside, 1 the inside, 2 a part of it to be told from the rest.
+    """
+
+    corners: Any
+    part: Any
+
+
+def surfaces_figure(
+    panels: Mapping[str, Any],
+    ends: Sequence[tuple[float, float]],
+    *,
+    title: str = "",
+    columns: int = 3,
+    view: tuple[float, float] = (28.0, -62.0),
+) -> Figure:
+    """Draw surfaces in space, a panel for each: the outside as a veil, and solid what lies inside.
+
+    Parameters
+    ----------
+    panels : mapping of str to SurfacePanel
+        By the panels' titles.
+    ends : sequence of (float, float)
+        Lower and upper end of x, y and z.
+    title : str, optional
+    columns : int, optional
+        Panels abreast.
+    view : (float, float), optional
+        From where: degrees above the plane of x and y, and degrees from the x axis.
+
+    Returns
+    -------
+    Figure
+    """
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = blank_figure(3.4 * columns, 4.1 * rows + 0.4, title)
+    for k, (name, surface) in enumerate(panels.items()):
+        axis: Any = figure.add_subplot(rows, columns, k + 1, projection="3d", proj_type="ortho")
+        corners = np.asarray(surface.corners)
+        colours = _shaded(corners, np.asarray(surface.part), view)
+        axis.add_collection3d(Poly3DCollection(corners, facecolors=colours, lw=0))
+        axis.view_init(*view)
+        axis.set(xlim=ends[0], ylim=ends[1], zlim=ends[2], xlabel="x", ylabel="y", zlabel="z")
+        axis.set_box_aspect([high - low for low, high in ends], zoom=0.98)
+        axis.set_title(name, fontsize="medium")
+        for side in (axis.xaxis, axis.yaxis, axis.zaxis):
+            side.set_major_locator(MaxNLocator(4, steps=(2, 5, 10)))
+    return figure
+
+
+def _shaded(corners: np.ndarray, part: np.ndarray, view: tuple[float, float]) -> np.ndarray:
+    """Colours (m, 4) of triangles in a light that comes from beside the viewer."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal /= np.where(length > 0, length, 1.0)
+    high, around = np.radians([view[0] + 15, view[1] - 30])
+    light = np.array([np.cos(high) * np.cos(around), np.cos(high) * np.sin(around), np.sin(high)])
+    # Both sides are lit: through the veil the far side of the surface is seen from behind.
+    shade = 0.45 + 0.55 * np.abs(normal @ light)
+    colour = np.array([to_rgba(PALETTE[5], VEIL), to_rgba(PALETTE[0]), to_rgba(PALETTE[2])])[part]
+    colour[:, :3] *= shade[:, None]
+    return colour
+
+
+def field_panel(axis: Axes, title: str, panel: FieldPanel, top: float | None) -> Any:
+    """Draw one density; the image, for a scale of colours or to be changed in a movie."""
+    density, ends, names, where, followed = panel
+    image = axis.imshow(
+        np.asarray(density).T, origin="lower", extent=ends, cmap="viridis", vmin=0.0, vmax=top, interpolation="bilinear"
+    )
+    where = np.asarray(where)
+    if where.size:
+        axis.plot(*where.T, ls="", marker="o", mfc="none", mec=PALETTE[1], mew=0.9, ms=5)
+    if followed is not None:
+        axis.plot(*where[followed], ls="", marker="o", mfc=PALETTE[2], mec="white", mew=0.9, ms=7)
+    axis.set_title(typeset(title), fontsize="medium")
+    axis.set_xlabel(names[0])
+    axis.set_ylabel(names[1])
+    axis.xaxis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
+    axis.yaxis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
+    return image
+
+
+def blank_figure(width: float, height: float, title: str = "") -> Figure:
+    """Return an empty figure of this size in inches, in the layout that all figures have."""
+    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+    if title:
+        figure.suptitle(typeset(title), fontsize="large")
+    return figure
+
+
+def _envelope(axis: Axes, t: Any, values: Any, style: Mapping[str, Any], *, log: bool = False) -> None:
+    """Draw the largest magnitude in each of some hundred spans of time; noise drawn in full would be a block."""
+    t, magnitude = np.asarray(t, dtype=float), np.abs(np.asarray(values, dtype=float))
+    n = min(t.size, magnitude.size)
+    known = np.flatnonzero(np.isfinite(magnitude[:n]) & (t[:n] > 0))
+    if not known.size:
+        axis.plot([], [], **style)
+        return
+    scale = np.log(t[known]) if log else t[known]
+    edges = np.linspace(scale[0], scale[-1], POINTS + 1)[1:-1]
+    groups = [group for group in np.split(known, np.searchsorted(scale, edges, side="right")) if group.size]
+    at = np.array([t[group[-1]] for group in groups])
+    top = np.array([max(magnitude[group].max(), FLOOR) for group in groups])
+    axis.plot(at, top, lw=1.3, ms=4.5, markevery=_marked(np.log(at) if log else at), **style)
+
+
+def _marked(scale: np.ndarray, count: int = 6) -> list[int]:
+    """Numbers of `count` points about equally spaced, for markers."""
+    wanted = np.linspace(scale[0], scale[-1], 2 * count + 1)[1::2]
+    return sorted({int(np.argmin(np.abs(scale - at))) for at in wanted})
+
+
+def _log_x(axis: Axes) -> None:
+    """Make x a log axis with labels at powers of ten; in a short span at 2 and 5 times those as well."""
+    axis.set_xscale("log")
+    low, high = axis.get_xlim()
+    if high / low < 100:
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter(FuncFormatter(_short))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _short(value: float, _: Any) -> str:
+    """A number of a log axis, where long ones would run into each other."""
+    return f"{value:g}" if value < 1e4 else f"{value:.0e}".replace("e+0", "e")
+
+
+def _plane(axis: Axes, title: str, unit: str) -> None:
+    """Equal scales, and a cross for the central body."""
+    axis.plot(0, 0, ls="", marker="+", color="black", ms=8)
+    axis.set_title(title, fontsize="medium")
+    axis.set_aspect("equal", adjustable="box")
+    axis.set_xlabel(f"x [{unit}]")
+    axis.xaxis.set_major_locator(MaxNLocator(5))
+    axis.yaxis.set_major_locator(MaxNLocator(5))
+    axis.grid(alpha=0.2)
+
+
+def _legend_below(figure: Figure, axis: Axes, heading: str | None = None) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    most = 4 if len(labels) > 5 else 5
+    if max(map(len, labels), default=0) > LONG_LABEL:
+        most = 2
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=min(len(labels), most),
+        fontsize="small",
+        frameon=False,
+        handlelength=3.5 if heading is None else 1.5,
+        title=heading,
+        title_fontsize="small",
+    )
+
+
+def side_by_side_figure(
+    series: Mapping[str, Mapping[str, Any]],
+    *,
+    ours: Collection[str],
+    levels: Collection[float],
+    time: str = "wall time [s]",
+    title: str = "",
+    footnote: str = "",
+) -> Figure:
+    """Draw the trajectory's error against time and, below, the invariants', a line for each peer.
+
+    Parameters
+    ----------
+    series : mapping of str to mapping
+        For each peer arrays "seconds", "error" and "drift", the last with nan where it is not known.
+    ours : collection of str
+        Those that are drawn heavier.
+    levels : collection of float
+        Errors of the trajectory at which the text compares: dotted lines.
+    time : str, optional
+        Label of the time.
+    title, footnote : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    drifts = np.concatenate([np.asarray(values["drift"], dtype=float) for values in series.values()])
+    panels = ["error of the trajectory"] + ["change of the invariants"] * bool(np.isfinite(drifts).any())
+    height = HEIGHT if len(panels) == 2 else 0.6 * HEIGHT
+    figure = blank_figure(WIDTH, height + LINE_HEIGHT * -(-len(series) // 2), title)
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    styles = method_styles([*(name for name in series if name in ours), *(name for name in series if name not in ours)])
+    for axis, key in zip(axes, ("error", "drift"), strict=False):
+        for name in styles:
+            _curve(
+                axis, series[name]["seconds"], series[name][key], {**styles[name], **(OURS if name in ours else FAINT)}
+            )
+    for level in levels:
+        axes[0].axhline(level, color="0.6", lw=0.8, ls=":")
+    for axis, label in zip(axes, panels, strict=True):
+        _log_x(axis)
+        log_errors(axis, time if axis is axes[-1] else "", label)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=2, fontsize="small", frameon=False, handlelength=3.5
+    )
+    if footnote:
+        axes[0].annotate(footnote, (1, 1.02), xycoords="axes fraction", ha="right", fontsize="xx-small", color="0.35")
+    return figure
+
+
+def _curve(axis: Axes, seconds: Any, errors: Any, style: Mapping[str, Any]) -> None:
+    """What is below the spacing of numbers is drawn there: a log axis has no zero."""
+    x, y = np.asarray(seconds, dtype=float), np.asarray(errors, dtype=float)
+    good = np.isfinite(x) & np.isfinite(y)
+    axis.plot(x[good], np.maximum(y[good], FLOOR), **style)
