@@ -88,4 +88,4 @@ def _warn(old: str, new: str) -> None:
     warnings.warn(f"{old} is now {new}; the old name will be removed.", DeprecationWarning, stacklevel=3)
 
 
-sys.meta_path.append(MovedModules)  # type: ignore[arg-type]
+sys.meta_path.append(MovedModules)

@@ -101,7 +101,12 @@ def _run(name: str, words: Sequence[str], settings: dict[str, Any]) -> int:
     for flag in (word.partition("=")[0] for word in words):
         if (name, flag) in MOVED:
             parser.exit(WRONG_USAGE, f"{parser.prog}: {flag} is now: {PROGRAM} {MOVED[name, flag]}\n")
-    command = getattr(import_module(f".{module}", __package__), kind)
+    from .report import UsageError
+
+    try:
+        command = getattr(import_module(f".{module}", __package__), kind)
+    except UsageError as error:  # a package is not installed that the study needs
+        parser.exit(WRONG_USAGE, f"{parser.prog}: {error}\n")
     _add_options(parser, command)
     parser.set_defaults(**settings)
     args, rest = parser.parse_known_args(words)

@@ -50,6 +50,53 @@ COMMANDS = {
     "view": Entry("view:View", "a page that plays a saved run"),
     "bench": Entry("bench.command:Bench", "this package beside SciPy, REBOUND, heyoka and others, on this machine"),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
+    "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, beside IAS15"),
+    "study charged-particle": Entry(
+        "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
+    ),
+    "study ensembles": Entry(
+        "measurements.ensembles:Ensembles", "cost of a member, threads, workers, memory, growth with the size"
+    ),
+    "study exoplanets": Entry(
+        "measurements.exoplanets:Exoplanets", "three systems of exoplanets beside WHFast and IAS15"
+    ),
+    "study gpe": Entry(
+        "measurements.gpe:EquationCost", "cost of the Gross-Pitaevskii equation beside its transforms and RK4"
+    ),
+    "study gpe-efficiency": Entry("condensates.efficiency:AllRuns", "the paper's test of efficiency with all its runs"),
+    "study gpe-methods": Entry("measurements.gpe_methods:BaseMethods", "RK4 and splittings on the paper's ring"),
+    "study gpe-mpi": Entry("measurements.gpe_mpi:RanksCost", "the Gross-Pitaevskii equation on ranks of MPI"),
+    "study gradients": Entry("measurements.gradients:Gradients", "compiled gradients beside gradients written by hand"),
+    "study growth": Entry("measurements.growth:Growth", "growth of the error of position over 10 000 years"),
+    "study import-time": Entry("measurements.import_time:ImportTime", "how long imports take"),
+    "study long-orbits": Entry(
+        "measurements.long_orbits:LongOrbits", "what projection and compensation bring over 1000 years"
+    ),
+    "study metric-memory": Entry(
+        "measurements.metric_memory:MetricMemory", "the metric on problems whose error estimates mislead it"
+    ),
+    "study metric-table": Entry("measurements.metric_table:MetricTable", "what the metric does to the solar system"),
+    "study multistep": Entry("measurements.multistep:Multistep", "EIPGJ14 and EIPGJ12 beside WHFast, IAS15 and heyoka"),
+    "study nystrom-defaults": Entry(
+        "measurements.nystrom_defaults:NystromDefaults", "two options of the Nyström methods that could be defaults"
+    ),
+    "study overhead": Entry("measurements.overhead:Overhead", "cost of a step in solve_ivp beside SciPy's classes"),
+    "study particle-reference": Entry(
+        "measurements.references:ParticleReference", "reference states of the charged particles"
+    ),
+    "study recommend": Entry("measurements.recommend:Recommended", "true errors of recommended runs on the hard cases"),
+    "study relativity": Entry(
+        "measurements.relativity:Relativity", "ten bodies with relativity beside WHFast and IAS15"
+    ),
+    "study ring-grids": Entry("measurements.ring_grids:RingGrids", "the paper's ring on several grids"),
+    "study scene-reference": Entry("measurements.references:SceneReference", "reference states of the hard scenes"),
+    "study solar-cloud": Entry("measurements.solar_cloud:SolarCloud", "an ensemble of solar systems beside REBOUND"),
+    "study solar-reference": Entry("measurements.references:SolarReference", "reference states of the solar system"),
+    "study speed": Entry("measurements.speed:Speed", "speed of the compiled step"),
+    "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
+    "study waves": Entry("measurements.waves:Waves", "errors against cost of waves beside SciPy's DOP853"),
+    "study with-and-without": Entry("measurements.with_and_without:WithAndWithout", "the README's figure"),
+    "study written": Entry("measurements.written:Written", "cost of a problem written as an expression"),
 }
 # Options of before, by command, and the command that does it now.
 MOVED = {

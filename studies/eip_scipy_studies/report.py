@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Any, TextIO
@@ -34,6 +35,7 @@ __all__ = [
     "ended_by_sigterm",
     "listening",
     "machine",
+    "needed",
     "printing",
     "say",
     "table",
@@ -78,6 +80,32 @@ def _processor() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine() or "unknown processor"
+
+
+def needed(module: str, install: str = "") -> Any:
+    """Import what a study cannot do without.
+
+    Parameters
+    ----------
+    module : str
+    install : str, optional
+        What ``pip install`` takes. The integrations of the package say that themselves.
+
+    Returns
+    -------
+    module
+
+    Raises
+    ------
+    UsageError
+        When the module is not installed; the message says how to install it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        if not install and (error.name or "eip_scipy").startswith("eip_scipy"):
+            raise  # the package itself is broken
+        raise UsageError(f"{error}: pip install {install}" if install else str(error)) from error
 
 
 def cores() -> int:

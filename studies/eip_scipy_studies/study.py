@@ -18,12 +18,24 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 from eip_scipy import CheckpointError
 
 from .commands import CHECK_FAILED, DONE, INTERRUPTED, nearest
-from .report import UsageError, check_folder, check_target, document, say, warn, write_csv, write_file, write_json
+from .report import (
+    UsageError,
+    check_folder,
+    check_target,
+    describe_machine,
+    document,
+    say,
+    warn,
+    write_csv,
+    write_file,
+    write_json,
+)
 
 __all__ = [
     "Check",
     "Command",
     "Figures",
+    "Measurement",
     "PartlyDone",
     "Rows",
     "Session",
@@ -280,6 +292,22 @@ class Study(Command, Generic[Found]):
         if session.json is not None:
             check_target(session.json)
         return perform(self, session)[0]
+
+
+class Measurement(Study[Found]):
+    """A study of times: what `measure` returns is in the JSON as it is, and the text begins with the machine."""
+
+    writes_files = False
+
+    @abstractmethod
+    def table(self, found: Found) -> str:
+        """Lay out what was measured."""
+
+    def text(self, found: Found) -> str:
+        return f"{describe_machine()}\n\n{self.table(found)}"
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        return {"found": found}
 
 
 def perform(study: Study[Any], session: Session) -> tuple[int, dict[str, Any]]:

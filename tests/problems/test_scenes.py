@@ -4,7 +4,6 @@ import csv
 import json
 import math
 import pickle
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -159,11 +158,12 @@ def test_pythagorean_to_its_end():
 @pytest.mark.slow
 def test_reference_file_can_be_made_anew(tmp_path):
     pytest.importorskip("heyoka")
-    target = tmp_path / "new.json"
-    command = [sys.executable, str(ROOT / "benchmarks" / "scene_references.py"), "--bits", "128", "--out", str(target)]
-    subprocess.run(command, check=True, capture_output=True)
+    assert main(["study", "scene-reference", "--bits", "128", "--out", str(tmp_path)]) == 0
     stored = ROOT / "eip_scipy" / "data" / "scene_references.json"
-    assert json.loads(target.read_text())["states"] == json.loads(stored.read_text())["states"]
+    assert (
+        json.loads((tmp_path / "scene_references.json").read_text())["states"]
+        == json.loads(stored.read_text())["states"]
+    )
 
 
 # Fictitious time.

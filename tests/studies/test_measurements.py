@@ -1,91 +1,110 @@
-"""Every benchmark tells what it takes, and runs through with small settings."""
+"""Every measurement, ``eip-scipy study NAME``, tells what it takes, and runs through with small settings."""
 
 import os
-import runpy
 import shlex
 import subprocess
 import sys
 from importlib import import_module
-from pathlib import Path
 
 import pytest
 
+from eip_scipy_studies.cli import main
+from eip_scipy_studies.commands import COMMANDS
+from eip_scipy_studies.report import UsageError, needed
+from eip_scipy_studies.timing import clocked, least, many_calls
+
 pytestmark = pytest.mark.needs_jit
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
-# By script: what each run of it is given, and the modules without which it only says how they are installed.
+# By name: what each run of it is given, and the modules without which it only says how they are installed.
 HEYOKA, REBOUND, REBOUNDX = ("heyoka",), ("rebound",), ("heyoka", "rebound", "reboundx")
 RUNS = [
-    ("bodies", "--periods 2 --bodies 10", REBOUND),
-    ("charged_particle", "--quick --out . --json run.json", ()),
-    ("ensembles", "--members 10 --steps 100 --repeats 1 --largest 10 --out .", ()),
+    ("bodies", "--periods 2 --bodies 10 --json run.json", REBOUND),
+    ("charged-particle", "--quick --json run.json", ()),
+    ("ensembles", "--members 10 --steps 100 --repeats 1 --largest 10 --json run.json", ()),
     ("exoplanets", "--share .002 --json run.json", REBOUNDX),
-    ("gpe", "--quick --json run.json --figure run.png", ()),
-    ("gpe_efficiency", "--points 16 --repeats 1 --out .", ()),
-    ("gpe_methods", "--points 64 --t-end .01 --repeats 1 --only RK4-EIP s6-EIP --csv run.csv", ()),
-    ("gpe_mpi", "--quick --json run.json", ("eip_scipy.integrations.mpi",)),
+    ("gpe", "--quick --json run.json", ()),
+    ("gpe-efficiency", "--points 16 --repeats 1 --json run.json", ()),
+    ("gpe-methods", "--points 64 --t-end .01 --repeats 1 --only RK4-EIP s6-EIP --json run.json", ()),
+    ("gpe-mpi", "--quick --json run.json", ("eip_scipy.integrations.mpi",)),
     ("gradients", "--repeats 1 --json run.json", ()),
-    ("growth", "--years 1 --out .", REBOUND),
-    ("import_time", "--rounds 1 --json run.json", ()),
-    ("long_orbits", "--years 1 --json run.json", ()),
-    ("metric_memory", "--only gear --json run.json", ()),
-    ("metric_table", "--years 100 --rotations 1 --json run.json", ()),
-    ("multistep", "--quick --parts 1 3 --json run.json", REBOUND),
-    ("multistep", "--quick --parts 2 4 5 --json run.json", REBOUNDX),
-    ("nystrom_defaults", "--system figure-eight --json run.json", ()),
+    ("growth", "--years 1 --json run.json", REBOUND),
+    ("import-time", "--rounds 1 --json run.json", ()),
+    ("long-orbits", "--years 1 --json run.json", ()),
+    ("metric-memory", "--only gear --json run.json", ()),
+    ("metric-table", "--years 100 --rotations 1 --json run.json", ()),
+    ("multistep", "--quick --parts 1 2 4 --json run.json", REBOUND),
+    ("multistep", "--quick --parts 3 --json run.json", HEYOKA),
+    ("nystrom-defaults", "--system figure-eight --json run.json", ()),
     ("overhead", "--pairs 1 --json run.json", ()),
-    ("particle_references", "--bits 64 --points 2 --out run.json", HEYOKA),
+    ("particle-reference", "--bits 64 --points 2 --json run.json", HEYOKA),
     ("recommend", "--cases pendulum --json run.json", ()),
     ("relativity", "--years 1 --json run.json", REBOUNDX),
-    ("ring_grids", "--quick --csv run.csv", ()),
-    ("rotations", "--rotations 1 --years 10 1 --json run.json", REBOUND),
-    ("scene_references", "--bits 64 --out run.json", HEYOKA),
-    ("solar_cloud", "--members 16 --years 1 --sample 2 --json run.json", REBOUND),
-    ("solar_reference", "--years 1 --json run.json", HEYOKA),
+    ("ring-grids", "--quick --json run.json", ()),
+    ("scene-reference", "--bits 64 --json run.json", HEYOKA),
+    ("solar-cloud", "--members 16 --years 1 --sample 2 --json run.json", REBOUND),
+    ("solar-reference", "--years 1 --json run.json", HEYOKA),
     ("speed", "--quick --json run.json", ()),
-    ("trust", "--only pendulum --workers 1 --markdown run.md --csv run.csv --json run.json", ()),
-    ("waves", "--quick --json run.json --figure run.png", ()),
-    ("with_and_without", "--figure run.png", ()),
+    ("trust", "--only pendulum --json run.json", ()),
+    ("waves", "--quick --json run.json", ()),
+    ("with-and-without", "--json run.json", ()),
     ("written", "--quick --json run.json", ()),
 ]
 NAMES = sorted({name for name, *_ in RUNS})
 
 
-def test_every_script_is_listed():
-    scripts = {path.stem for path in FOLDER.glob("*.py") if "__main__" in path.read_text(encoding="utf-8")}
-    assert set(NAMES) == scripts
+def test_every_study_is_listed():
+    assert sorted(name.removeprefix("study ") for name in COMMANDS if name.startswith("study ")) == NAMES
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_help(name, monkeypatch, capsys):
-    """Or which command brings what it cannot do without."""
-    monkeypatch.syspath_prepend(FOLDER)
-    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--help"])
-    with pytest.raises(SystemExit) as end:
-        runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
-    if end.value.code == 0:
-        assert capsys.readouterr().out.startswith(f"usage: {name}.py")
+def test_help(name, capsys):
+    """Or how to install what it cannot do without."""
+    status = main(["study", name, "--help"])
+    shown = capsys.readouterr()
+    if status == 0:
+        assert shown.out.startswith(f"usage: eip-scipy study {name}")
     else:
-        assert "pip install" in end.value.code
-        assert not installed(needed(name))
+        assert "pip install" in shown.err
+        assert not installed(needs(name))
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "arguments", "modules"), RUNS, ids=[f"{name} {words}" for name, words, _ in RUNS])
 def test_small_run(name, arguments, modules, tmp_path):
-    command = [sys.executable, str(FOLDER / f"{name}.py"), *shlex.split(arguments)]
+    command = [sys.executable, "-m", "eip_scipy", "study", name, *shlex.split(arguments)]
     run = subprocess.run(command, cwd=tmp_path, env={**os.environ, "MPLBACKEND": "Agg"}, capture_output=True, text=True)
     if installed(modules):
         assert run.returncode == 0, run.stderr
         assert run.stdout
+        assert (tmp_path / "run.json").exists()
     else:
-        assert run.returncode == 1
+        assert run.returncode == 2
         assert "Traceback" not in run.stderr
         assert "pip install" in run.stderr
 
 
-def needed(name):
+def test_what_is_needed_says_how_it_is_installed():
+    with pytest.raises(UsageError, match="pip install no-such-package"):
+        needed("no_such_package", "no-such-package")
+    with pytest.raises(ImportError, match="no_such_module"):
+        needed("eip_scipy.no_such_module")
+
+
+def test_least_times_are_taken_in_turn():
+    order = []
+    actions = {name: lambda name=name: order.append(name) or float(len(order)) for name in "ab"}
+    assert least(actions, turns=3) == {"a": 1.0, "b": 2.0}
+    assert order == list("ababab")
+    assert least(actions, seconds=1e-9) == {"a": 7.0, "b": 8.0}
+    calls = []
+    assert 0 <= clocked(lambda: calls.append(1))() < 1
+    assert len(calls) == 1
+    assert 0 <= many_calls(lambda: calls.append(1))() < 1
+    assert len(calls) > 4
+
+
+def needs(name):
     return {module for script, _, modules in RUNS if script == name for module in modules}
 
 

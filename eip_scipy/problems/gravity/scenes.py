@@ -1,7 +1,7 @@
 """Hard scenes of celestial mechanics: close encounters, chaos, choreography; each with a reference state at its end.
 
 The starts are here; the reference states are data (``data/scene_references.json``), made in 160-bit arithmetic by
-``benchmarks/scene_references.py``.
+``eip-scipy study scene-reference``.
 """
 
 from __future__ import annotations

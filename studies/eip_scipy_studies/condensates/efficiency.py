@@ -25,10 +25,10 @@ from eip_scipy.problems.gross_pitaevskii import make_transforms
 
 from ..comparators import crank_nicolson, linearly_implicit, sav_crank_nicolson
 from ..report import describe_machine, table
-from ..study import Figures, Rows, Session, Study
+from ..study import Figures, Rows, Session, Study, option
 from ..work_precision import cost_to_reach, work_precision
 
-__all__ = ["METHODS", "Efficiency", "Slope", "Trial", "runs_text"]
+__all__ = ["METHODS", "AllRuns", "Efficiency", "Slope", "Trial"]
 
 T_END = 1.0
 SHARES = (0.9, 0.64, 0.45, 0.32, 0.225)  # of the step above which RK4 is unstable
@@ -307,6 +307,18 @@ class Efficiency(Study[Found]):
                 title=f"NLS equation, {self.points} x {self.points} points: accuracy and cost",
             ),
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AllRuns(Efficiency):
+    """``eip-scipy study gpe-efficiency``: the test on a grid of any size, with a table of all runs."""
+
+    points: int = option(64, "points of the grid along each axis (%(default)s)", type=int)
+    repeats: int = option(5, "runs of each (%(default)s)", type=int)
+    stem: str = "gpe-efficiency"
+
+    def text(self, found: Found) -> str:
+        return f"{runs_text(found)}\n\n{super().text(found)}"
 
 
 def _number(value: float, form: str) -> str:

@@ -1,30 +1,31 @@
-"""Growth of the cost with the number of bodies: EIPRKN12 and REBOUND's IAS15 on N = 10, 30, 100, 300.
-
-    python -m eip_scipy_studies.measurements.bodies [--periods 20] [--bodies 10 30 100 300]
+"""``eip-scipy study bodies``: cost against the number of bodies, EIPRKN12 and REBOUND's IAS15.
 
 A star with N - 1 light planets (G m = 1e-9 of the star's) on nearly circular, nearly coplanar orbits of semi-major axes
-from 1 to 30, random phases. EIPRKN12 with 25 steps in the innermost period, every = 10, compensated; IAS15 with its
-own steps. Wall times per innermost period, least of three, one core; the energy's relative error, and the largest
+from 1 to 30, random phases. EIPRKN12 takes 25 steps in the innermost period, every=10, compensated; IAS15 its own
+steps. Wall times per innermost period, the least of three, one core; the relative error of the energy, and the largest
 distance between the two final states as a measure of agreement.
 """
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from eip_scipy import EIPRKN12, integrate
 from eip_scipy.problems import Problem, nbody
 
-from ..report import describe_machine
-from .installed import peer
+from ..report import needed, table
+from ..study import Measurement, Session, option
 
-rebound = peer("eip_scipy.integrations.rebound")
+__all__ = ["Bodies"]
 
 REPEATS = 3
 PERIOD = 2 * np.pi
 STEPS = 25
+Found = dict[int, dict[str, float]]
 
 
 def system(bodies: int, periods: float) -> Problem:
@@ -40,28 +41,38 @@ def system(bodies: int, periods: float) -> Problem:
     return nbody(gm, q - share @ q, v - share @ v, t_span=(0.0, periods * PERIOD), h=PERIOD / STEPS)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--periods", type=int, default=20)
-    parser.add_argument("--bodies", type=int, nargs="+", default=[10, 30, 100, 300])
-    args = parser.parse_args()
-    print(f"{describe_machine()}; milliseconds per innermost period")
-    print(f"{'N':>5}{'EIPRKN12':>12}{'IAS15':>12}{'ratio':>8}{'dH/H':>10}{'IAS15 dE/E':>12}{'distance':>10}")
-    for bodies in args.bodies:
-        problem = system(bodies, args.periods)
+@dataclass(frozen=True, kw_only=True)
+class Bodies(Measurement[Found]):
+    """The command."""
+
+    periods: int = option(20, "length of the runs in innermost periods (%(default)s)", type=int, metavar="N")
+    bodies: Sequence[int] = option((10, 30, 100, 300), "numbers of bodies", type=int, nargs="+", metavar="N")
+
+    def measure(self, session: Session) -> Found:
+        rebound = needed("eip_scipy.integrations.rebound")
+        with session.bar(len(self.bodies), "bodies") as bar:
+            return {n: self._compare(system(n, self.periods), rebound, bar) for n in self.bodies}
+
+    def _compare(self, problem: Problem, rebound: Any, bar: Any) -> dict[str, float]:
+        start = problem.y0
         own = [integrate(problem, method=EIPRKN12, every=10, compensated=True) for _ in range(REPEATS)]
-        peers = [
-            rebound.run(problem.params, problem.y0, "ias15", h=problem.t_span[1], n_steps=1) for _ in range(REPEATS)
-        ]
-        seconds, theirs = (min(run.wall_time for run in runs) for runs in (own, peers))
-        energy = [problem.invariants[0].fun(0.0, y, problem.params) for y in (problem.y0, own[0].y[:, -1])]
-        distance = np.linalg.norm((own[0].y[:, -1] - peers[0].y[:, -1])[: 3 * bodies].reshape(-1, 3), axis=1).max()
-        print(
-            f"{bodies:5}{1e3 * seconds / args.periods:12.3f}{1e3 * theirs / args.periods:12.3f}{theirs / seconds:8.1f}"
-            f"{abs(energy[1] / energy[0] - 1):10.1e}{peers[0].energy_error[-1]:12.1e}{distance:10.1e}",
-            flush=True,
-        )
+        peers = [rebound.run(problem.params, start, "ias15", h=problem.t_span[1], n_steps=1) for _ in range(REPEATS)]
+        seconds, theirs = (min(run.wall_time for run in runs) / self.periods for runs in (own, peers))
+        end = own[0].y[:, -1]
+        energy = [problem.invariants[0].fun(0.0, y, problem.params) for y in (start, end)]
+        apart = (end - peers[0].y[:, -1])[: start.size // 2].reshape(-1, 3)
+        bar.update()
+        return {
+            "EIPRKN12 [ms]": 1e3 * seconds,
+            "IAS15 [ms]": 1e3 * theirs,
+            "ratio": theirs / seconds,
+            "dH/H": abs(energy[1] / energy[0] - 1),
+            "IAS15 dE/E": peers[0].energy_error[-1],
+            "distance": float(np.linalg.norm(apart, axis=1).max()),
+        }
 
-
-if __name__ == "__main__":
-    main()
+    def table(self, found: Found) -> str:
+        forms = (".3f", ".3f", ".1f", ".1e", ".1e", ".1e")
+        names = list(next(iter(found.values())))
+        body = [(f"N = {n}", [f"{row[k]:{f}}" for k, f in zip(names, forms, strict=True)]) for n, row in found.items()]
+        return "Milliseconds per innermost period\n\n" + table([[name] for name in names], body)

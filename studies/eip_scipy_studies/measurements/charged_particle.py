@@ -1,25 +1,20 @@
-"""Charged particles: speed of the compiled step, and error against cost beside other methods.
-
-    python -m eip_scipy_studies.measurements.charged_particle [--out DIR] [--json FILE] [--repeats 3] [--quick]
+"""``eip-scipy study charged-particle``: speed of the compiled step, and error against cost, for charged particles.
 
 1. Time of a step in the tokamak: plain RK4, EIP-HL with both metrics and with wider spacings, Boris, implicit midpoint;
    and the same EIP-HL through solve_ivp, from the first 200 000 of the paper's steps (solve_ivp: 5000). Runs in turn,
    the least time of each, without what comes before the first step; the ratios are of one and the same process.
 2. Error against cost in the uniform field and on both orbits of the tokamak: error of position and of the guiding
    centre (averaged over a gyration) at the end of the paper's interval, EIP methods and the same without projection in
-   the canonical form, Boris and heyoka (where installed) in the form (x, v). Figures in DIR, default docs/_static.
+   the canonical form, Boris and heyoka (where installed) in the form (x, v).
 
 Times are processor times of the thread, which on an idle machine are wall times and on a busy one still mean something.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from time import thread_time
 from typing import Any, NamedTuple
 
@@ -32,30 +27,25 @@ from eip_scipy.problems.particle_orbits import ParticleOrbit
 
 from ..comparators import boris, implicit_midpoint
 from ..particles.runs import SCENES, scene
-from ..plotting import CostPanel, cost_figure
-from ..report import compact, describe_machine, document, table, write_json
+from ..report import compact, describe_machine, needed, table
+from ..study import Figures, Measurement, Rows, Session, option
+from ..timing import clocked, least
 from ..work_precision import curves
+from .references import particle_equations
 
-STATIC = Path(__file__).parents[1] / "docs" / "_static"
+__all__ = ["ParticleCost"]
+
 TAIL = 60  # states of the reference, three gyrations, at the end of the interval
 SPEED_STEPS, SOLVE_IVP_STEPS = 200_000, 5000
 ROUNDS = 5
 
 
-# 1. Speed.
-
-
-def cpu_seconds(call: Callable[..., Any], *args: Any, **options: Any) -> float:
-    """Processor time of the thread in a call."""
-    start = thread_time()
-    call(*args, **options)
-    return thread_time() - start
-
-
 def speed(turns: int, share: float) -> dict[str, float]:
     """Microseconds for a step of the banana orbit; `share`: of the steps."""
     problem, other = tokamak(), tokamak(form="velocity")
-    assert problem.h is not None
+    h, rhs = problem.h, problem.rhs
+    assert h is not None
+    assert rhs is not None
     rk4 = partial(integrate, method=EIPRK4)
     plain: dict[str, Any] = {"invariants": ()}
     euclidean: dict[str, Any] = {"metric": "euclidean"}
@@ -68,20 +58,19 @@ def speed(turns: int, share: float) -> dict[str, float]:
         "(x, v): RK4": lambda span: rk4(other, span, **plain),
         "(x, v): EIP-HL, euclidean": lambda span: rk4(other, span, **euclidean),
         "(x, v): EIP-HL": lambda span: rk4(other, span),
-        "(x, v): Boris": lambda span: boris(other.field.fill, span, other.y0, problem.h),
-        "implicit midpoint": lambda span: implicit_midpoint(
-            problem.rhs, span, problem.y0, problem.h, params=problem.params
-        ),
+        "(x, v): Boris": lambda span: boris(other.field.fill, span, other.y0, h),
+        "implicit midpoint": lambda span: implicit_midpoint(rhs, span, problem.y0, h, params=problem.params),
         "EIP-HL, euclidean, through solve_ivp": lambda span: through_solve_ivp(problem, span, **euclidean),
         "EIP-HL, through solve_ivp": lambda span: through_solve_ivp(problem, span, blocks=3),
     }
-    times = {name: [np.inf, np.inf] for name in runs}
-    steps_of = {name: round(share * (SOLVE_IVP_STEPS if "solve_ivp" in name else SPEED_STEPS)) for name in runs}
-    for _ in range(turns):
-        for name, run in runs.items():
-            for k, steps in enumerate((1, steps_of[name])):
-                times[name][k] = min(times[name][k], cpu_seconds(run, (0.0, steps * problem.h)))
-    return {name: 1e6 * (many - one) / (steps_of[name] - 1) for name, (one, many) in times.items()}
+    counts = {name: round(share * (SOLVE_IVP_STEPS if "solve_ivp" in name else SPEED_STEPS)) for name in runs}
+    actions = {
+        (name, n): clocked(partial(run, (0.0, n * h)), thread_time)
+        for name, run in runs.items()
+        for n in (1, counts[name])
+    }
+    best = least(actions, turns=turns)
+    return {name: 1e6 * (best[name, n] - best[name, 1]) / (n - 1) for name, n in counts.items()}
 
 
 def through_solve_ivp(problem: ParticleProblem, span: tuple[float, float], **options: Any) -> Any:
@@ -99,9 +88,6 @@ def speed_text(best: dict[str, float]) -> str:
     ]
     title = "Steps of the banana orbit, canonical form where nothing else is said"
     return "\n".join([title, "", table(head, body), "", *ratios])
-
-
-# 2. Error against cost.
 
 
 class Point(NamedTuple):
@@ -125,7 +111,7 @@ class Case(NamedTuple):
     problem: ParticleProblem
 
 
-def cases(problem: ParticleProblem, other: ParticleProblem) -> Iterator[Case]:
+def cases(problem: ParticleProblem, other: ParticleProblem, with_heyoka: bool) -> Iterator[Case]:
     """All methods and settings: steps in units of the paper's, or tolerances. `other` has the states (x, v)."""
     fine, wide, wider = (1.0, 0.5, 0.25, 0.125), (2.0, 1.0, 0.5, 0.25), (4.0, 2.0, 1.0, 0.5)
     for name, method, factors in (("RK4", EIPRK4, fine), ("RK45", EIPRK45, wide), ("DOP853", EIPDOP853, wider)):
@@ -136,17 +122,13 @@ def cases(problem: ParticleProblem, other: ParticleProblem) -> Iterator[Case]:
                 yield fixed(name, problem, method, (), factor)
     for rtol in (1e-6, 1e-8, 1e-10, 1e-12):
         yield adaptive(problem, rtol)
+    assert problem.rhs is not None
     for factor in (1.0, 0.5, 0.25):
         run = partial(implicit_midpoint, problem.rhs, problem.t_span, problem.y0, params=problem.params)
         yield compared("implicit midpoint", problem, run, factor)
     for factor in (1.0, 0.5, 0.25, 0.125, 0.0625):
         yield compared("Boris", other, partial(boris, other.field.fill, other.t_span, other.y0), factor)
-    try:
-        import heyoka  # noqa: F401
-    except ImportError:
-        print('no comparison with heyoka: pip install "eip_scipy[heyoka]"', file=sys.stderr)
-        return
-    for tolerance in (1e-6, 1e-9, 1e-12, 1e-15):
+    for tolerance in (1e-6, 1e-9, 1e-12, 1e-15) if with_heyoka else ():
         yield taylor(other, tolerance)
 
 
@@ -158,7 +140,9 @@ def spacing(factor: float) -> int:
 def fixed(name: str, problem: ParticleProblem, method: type[EIPSolver], kept: Any, factor: float) -> Case:
     assert problem.h is not None
     run = partial(integrate, problem, method=method, invariants=kept, h=factor * problem.h)
-    return Case(name, factor, lambda: cpu_seconds(run), lambda: states_of(run(save_every=spacing(factor))), problem)
+    return Case(
+        name, factor, lambda: clocked(run, thread_time)(), lambda: states_of(run(save_every=spacing(factor))), problem
+    )
 
 
 def states_of(run: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -168,27 +152,27 @@ def states_of(run: Any) -> tuple[np.ndarray, np.ndarray]:
 def compared(name: str, problem: ParticleProblem, method: Callable[..., Any], factor: float) -> Case:
     assert problem.h is not None
     run = partial(method, h=factor * problem.h)
-    return Case(name, factor, lambda: cpu_seconds(run), lambda: states_of(run(save_every=spacing(factor))), problem)
+    return Case(
+        name, factor, lambda: clocked(run, thread_time)(), lambda: states_of(run(save_every=spacing(factor))), problem
+    )
 
 
 def adaptive(problem: ParticleProblem, rtol: float) -> Case:
     free = replace(problem, h=None)
     run = partial(integrate, free, method=EIPDOP853, invariants=(), rtol=rtol, atol=1e-3 * rtol)
     states = lambda: states_of(run(t_eval=tail_times(problem)))  # noqa: E731
-    return Case("DOP853, adaptive", rtol, lambda: cpu_seconds(run), states, problem)
+    return Case("DOP853, adaptive", rtol, lambda: clocked(run, thread_time)(), states, problem)
 
 
 def taylor(problem: ParticleProblem, tolerance: float) -> Case:
-    import heyoka
-
-    from .particle_references import system
+    heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
 
     def integrator() -> Any:
-        return heyoka.taylor_adaptive(system(problem.field.name, 1e-2), problem.y0, tol=tolerance)
+        return heyoka.taylor_adaptive(particle_equations(problem.field.name, 1e-2), problem.y0, tol=tolerance)
 
     def seconds() -> float:
         made = integrator()  # its compilation is not counted
-        return cpu_seconds(made.propagate_until, problem.t_span[1])
+        return clocked(lambda: made.propagate_until(problem.t_span[1]), thread_time)()
 
     def states() -> tuple[np.ndarray, np.ndarray]:
         made, times = integrator(), tail_times(problem)
@@ -204,24 +188,20 @@ def tail_times(problem: ParticleProblem) -> np.ndarray:
     return np.append(np.arange(steps - TAIL, steps) * problem.h, problem.t_span[1])
 
 
-def measure(name: str, repeats: int, share: float) -> list[Point]:
-    """All methods on one scene, in turn; of each the least time of several turns. `share`: of the interval."""
+def costs(name: str, repeats: int, share: float, with_heyoka: bool) -> list[Point]:
+    """Run all methods on a share of one scene's interval, in turn; the least time of several turns counts."""
     problem, other = (shortened(scene(name, form=form), share) for form in ("canonical", "velocity"))
     assert problem.h is not None
     # A quarter of the paper's step, compensated: 1e-9 from the states stored with the problem.
     run = integrate(problem, method=EIPDOP853, h=problem.h / 4, save_every=4, compensated=True, invariants=())
     truth = ParticleOrbit(problem, run.t[-TAIL - 1 :], run.y[:, -TAIL - 1 :])
-    chosen = list(cases(problem, other))
+    chosen = list(cases(problem, other, with_heyoka))
     off = [errors(ParticleOrbit(case.problem, *case.states()), truth) for case in chosen]
-    best = [np.inf] * len(chosen)
-    for _ in range(repeats):
-        best = [min(least, case.seconds()) for least, case in zip(best, chosen, strict=True)]
-    points = []
-    for case, least, error in zip(chosen, best, off, strict=True):
-        points.append(Point(name, case.method, case.setting, least, *error))
-        print(f"{name:16} {case.method:18} {case.setting:8g} {least:8.3f} s  position {error[0]:.1e}  "
-              f"guiding centre {error[1]:.1e}", flush=True)  # fmt: skip
-    return points
+    best = least({k: case.seconds for k, case in enumerate(chosen)}, turns=repeats)
+    return [
+        Point(name, case.method, case.setting, best[k], *error)
+        for k, (case, error) in enumerate(zip(chosen, off, strict=True))
+    ]
 
 
 def shortened(problem: ParticleProblem, share: float) -> ParticleProblem:
@@ -245,38 +225,61 @@ def errors(orbit: ParticleOrbit, truth: ParticleOrbit) -> tuple[float, float]:
     return float(np.linalg.norm(tail.x[:, -1] - truth.x[:, -1])), float(np.linalg.norm(apart))
 
 
-def draw(points: list[Point], folder: Path) -> None:
-    """One figure for each scene."""
-    for name in dict.fromkeys(point.scene for point in points):
-        mine = [point for point in points if point.scene == name]
+class Found(NamedTuple):
+    """Microseconds for a step, and the points of error against cost."""
+
+    speed: dict[str, float]
+    points: list[Point]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParticleCost(Measurement[Found]):
+    """The command."""
+
+    writes_files = True
+    repeats: int = option(3, "runs of each (%(default)s)", type=int)
+    quick: bool = option(False, "a hundredth of the steps, each run once")
+
+    def measure(self, session: Session) -> Found:
+        share, repeats, rounds = (0.01, 1, 1) if self.quick else (1.0, self.repeats, ROUNDS)
+        with_heyoka = session.peer("heyoka", "heyoka") is not None
+        with session.bar(1 + len(SCENES), "charged-particle", "part") as bar:
+            best = speed(rounds * repeats, share)
+            bar.update()
+            points: list[Point] = []
+            for name in SCENES:
+                points += costs(name, repeats, share, with_heyoka)
+                bar.update()
+        return Found(best, points)
+
+    def table(self, found: Found) -> str:
+        body = [
+            (
+                f"{point.scene}, {point.method}",
+                [f"{point.setting:g}", *(compact(x) for x in (point.wall_time, point.position, point.guiding_centre))],
+            )
+            for point in found.points
+        ]
+        heads = [["step or", "tolerance"], ["time [s]"], ["position"], ["guiding", "centre"]]
+        return f"{speed_text(found.speed)}\n\n{table(heads, body)}"
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        return {"microseconds_per_step": found.speed, "points": self.tables(found)["charged-particle-cost.csv"]}
+
+    def tables(self, found: Found) -> dict[str, Rows]:
+        return {"charged-particle-cost.csv": [point._asdict() for point in found.points]}
+
+    def figures(self, found: Found) -> Figures:
+        """Draw one figure for each scene."""
+        from ..plotting import CostPanel, cost_figure
+
         kinds = {"position": "position", "guiding_centre": "guiding centre"}
-        panels = [CostPanel(title, "processor time [s]", curves(mine, error=key)) for key, title in kinds.items()]
-        figure = cost_figure(
-            [panels],
-            error="error [system size]",
-            title=f"Charged particle, {name.replace('-', ', ')}: error at the end of the paper's interval against cost",
-            footnote=f"{describe_machine()}; one thread",
-        )
-        figure.savefig(folder / f"charged-particle-cost-{name}.png")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=STATIC)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--quick", action="store_true", help="a hundredth of the steps, each run once")
-    args = parser.parse_args()
-    print(describe_machine(), flush=True)
-    share, repeats, rounds = (0.01, 1, 1) if args.quick else (1.0, args.repeats, ROUNDS)
-    best = speed(rounds * repeats, share)
-    print(speed_text(best), "\n", flush=True)
-    points = [point for name in SCENES for point in measure(name, repeats, share)]
-    draw(points, args.out)
-    if args.json:
-        content = {"microseconds_per_step": best, "points": [point._asdict() for point in points]}
-        write_json(args.json, document("benchmarks/charged_particle.py", vars(args), **content))
-
-
-if __name__ == "__main__":
-    main()
+        for name in dict.fromkeys(point.scene for point in found.points):
+            mine = [point for point in found.points if point.scene == name]
+            panels = [CostPanel(title, "processor time [s]", curves(mine, error=key)) for key, title in kinds.items()]
+            title = (
+                f"Charged particle, {name.replace('-', ', ')}: error at the end of the paper's interval against cost"
+            )
+            footnote = f"{describe_machine()}; one thread"
+            figure = cost_figure([panels], error="error [system size]", title=title, footnote=footnote)
+            yield f"charged-particle-cost-{name}.png", figure

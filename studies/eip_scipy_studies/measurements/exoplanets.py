@@ -1,19 +1,16 @@
-"""Three systems of exoplanets: EIPGJ14 and EIPRKN12 beside WHFast and IAS15, errors of position beside times.
-
-    python -m eip_scipy_studies.measurements.exoplanets [--share 1.0] [--json FILE]
+"""``eip-scipy study exoplanets``: EIPGJ14 and EIPRKN12 beside WHFast and IAS15 on three systems of exoplanets.
 
 A resonant chain (seven planets with the periods, masses and transits of TRAPPIST-1's, on circles at the start), a
-planet of eccentricity .6 with one further out, and a hot Jupiter with two companions under the relativistic potential
+planet of eccentricity 0.6 with one further out, and a hot Jupiter with two companions under the relativistic potential
 in 1/r^2, which is REBOUNDx's `gr_potential` on the other side. Errors of position [AU], of the innermost planet and the
 largest of another one's, against heyoka in 80-bit arithmetic, run anew each time; wall times are the least of three in
-turns, one core. ``pip install reboundx heyoka``. `--share`: of the spans.
+turns, one core. ``pip install reboundx heyoka``.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,10 +20,13 @@ from eip_scipy.problems import Problem, nbody
 from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.problems.gravity.solar_data import YEAR_D
 
-from ..report import describe_machine
+from ..report import needed
 from ..solar.cost import timed
-from .relativity import C, potential, reference
-from .runners import Methods, by_rebound, by_us, one_each, rows, show
+from ..study import Measurement, Session, option
+from .orbits import Methods, Row, by_rebound, by_us, one_each, orbit_table, rows
+from .relativity import potential, reference, speed_of_light
+
+__all__ = ["SYSTEMS", "Exoplanets"]
 
 REPEATS = 3
 GM_SUN = 4 * math.pi**2  # AU^3/yr^2, to four digits
@@ -66,7 +66,9 @@ def planets(
         v.append(speed * (-math.sin(angle) * along + side * math.cos(angle) * across))
     masses, place, speeds = np.array(gm), np.array(q), np.array(v)
     share = masses / masses.sum()
-    options: dict[str, Any] = {"forces": "gr-potential", "constants": ForceConstants(c=C)} if relativity else {}
+    options: dict[str, Any] = (
+        {"forces": "gr-potential", "constants": ForceConstants(c=speed_of_light)} if relativity else {}
+    )
     return nbody(masses, place - share @ place, speeds - share @ speeds, t_span=(0.0, years), **options)
 
 
@@ -117,33 +119,31 @@ def methods(system: System) -> Methods:
     }
 
 
-def tables(share: float) -> dict[str, dict[str, Any]]:
-    """Print and return them all."""
-    found = {}
-    for name, make in SYSTEMS.items():
-        system = make(share)
-        problem = system.problem
-        years = problem.t_span[1]
-        gm = problem.params[: problem.y0.size // 6]
-        truth = np.zeros_like(problem.y0)
-        truth[: truth.size // 2] = reference(gm, problem.y0, years, C if system.relativity else None)
-        found[name] = rows([timed(methods(system), truth, repeats=REPEATS)])
-        print(f"\n{name}: {years:g} years, {years / system.period:.0f} revolutions; steps in the innermost period")
-        show(found[name], "innermost")
-    return found
+@dataclass(frozen=True, kw_only=True)
+class Exoplanets(Measurement[dict[str, dict[str, Row]]]):
+    """The command."""
 
+    share: float = option(1.0, "share of the spans (%(default)s)", type=float)
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--share", type=float, default=1.0)
-    parser.add_argument("--json", metavar="FILE")
-    args = parser.parse_args()
-    print(describe_machine())
-    found = tables(args.share)
-    if args.json:
-        with open(args.json, "w") as file:
-            json.dump({"machine": describe_machine(), "systems": found}, file, indent=1)
+    def measure(self, session: Session) -> dict[str, dict[str, Row]]:
+        needed("reboundx", "reboundx")
+        found = {}
+        for name, make in SYSTEMS.items():
+            system = make(self.share)
+            problem = system.problem
+            assert problem.params is not None
+            gm = problem.params[: problem.y0.size // 6]
+            truth = np.zeros_like(problem.y0)
+            c = speed_of_light if system.relativity else None
+            truth[: truth.size // 2] = reference(gm, problem.y0, problem.t_span[1], c)
+            found[name] = rows([timed(methods(system), truth, repeats=REPEATS)])
+        return found
 
-
-if __name__ == "__main__":
-    main()
+    def table(self, found: dict[str, dict[str, Row]]) -> str:
+        parts = []
+        for name, own in found.items():
+            system = SYSTEMS[name](self.share)
+            years = system.problem.t_span[1]
+            title = f"{name}: {years:g} years, {years / system.period:.0f} revolutions; steps in the innermost period"
+            parts.append(f"{title}\n\n{orbit_table(own, 'innermost')}")
+        return "\n\n".join(parts)

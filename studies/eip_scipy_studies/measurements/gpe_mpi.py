@@ -1,27 +1,26 @@
-"""Cost of the Gross-Pitaevskii equation on ranks of MPI, beside the equation on one processor.
+"""``eip-scipy study gpe-mpi``: cost of the Gross-Pitaevskii equation on ranks of MPI, beside one processor.
 
-    mpirun -n 2 python -m mpi4py benchmarks/gpe_mpi.py [--quick] [--json FILE]
+    mpirun -n 2 python -m mpi4py -m eip_scipy study gpe-mpi
 
 Least wall-clock times, taken in turn; ranks that have no part in a measurement sleep. One thread on each rank.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from eip_scipy import EIPRK4
 from eip_scipy.problems import Grid, GrossPitaevskii, harmonic_trap
 
-from ..report import describe_machine, table
-from .installed import peer
+from ..report import needed, table
+from ..study import Measurement, Session, option
 
-mpi, slabs = peer("eip_scipy.integrations.mpi"), peer("eip_scipy.integrations.mpi_fields")
+__all__ = ["RanksCost"]
 
-MPI, WORLD = mpi.MPI, mpi.MPI.COMM_WORLD
 SHAPES = ((256, 256), (64, 64, 64), (128, 128, 128))
 QUICK_SHAPES = ((32, 32), (16, 16, 16))
 SECONDS = 30.0  # for each shape
@@ -29,9 +28,21 @@ IN_A_ROW = 8
 STEPS = 20  # whose results are compared
 
 
+def mpi() -> Any:
+    return needed("eip_scipy.integrations.mpi")
+
+
+def slabs() -> Any:
+    return needed("eip_scipy.integrations.mpi_fields")
+
+
+def world() -> Any:
+    return mpi().MPI.COMM_WORLD
+
+
 def wait():
     """A barrier in which ranks sleep."""
-    request = WORLD.Ibarrier()
+    request = world().Ibarrier()
     while not request.Test():
         time.sleep(1e-4)
 
@@ -41,7 +52,7 @@ def timed(function, comm):
     comm.Barrier()
     begin = time.perf_counter()
     function()
-    return comm.allreduce(time.perf_counter() - begin, MPI.MAX)
+    return comm.allreduce(time.perf_counter() - begin, mpi().MPI.MAX)
 
 
 def start(gpe):
@@ -54,20 +65,22 @@ class Case:
     """The equation on the first ranks, on a single one without MPI where their number is 0."""
 
     def __init__(self, shape, ranks):
-        self.here = WORLD.rank < max(ranks, 1)
-        self.comm = WORLD.Split(0 if self.here else MPI.UNDEFINED)
+        self.here = world().rank < max(ranks, 1)
+        self.comm = world().Split(0 if self.here else mpi().MPI.UNDEFINED)
         if not self.here:
             return
         grid, trap = Grid(shape, -10, 10), harmonic_trap(*[1.0] * len(shape))
-        options = {"Omega": 0.7, "beta": 400}
-        self.gpe = slabs.SlabGrossPitaevskii(grid, trap, comm=self.comm, **options) if ranks else None
-        self.gpe = self.gpe or GrossPitaevskii(grid, trap, **options)
+        options: dict[str, Any] = {"Omega": 0.7, "beta": 400}
+        if ranks:
+            self.gpe: Any = slabs().SlabGrossPitaevskii(grid, trap, comm=self.comm, **options)
+        else:
+            self.gpe = GrossPitaevskii(grid, trap, **options)
         self.psi = start(self.gpe)
         self.out = np.empty_like(self.psi)
         self.solvers = [self.solver(ranks, names) for names in ((), ("mass", "energy"))]
 
     def solver(self, ranks, names):
-        method = mpi.over_ranks(EIPRK4, self.comm) if ranks else EIPRK4
+        method = mpi().over_ranks(EIPRK4, self.comm) if ranks else EIPRK4
         h = 0.2 * self.gpe.largest_step(self.psi)
         invariants = self.gpe.invariants(names)
         return method(self.gpe.fun, 0.0, self.psi, 1e3, h=h, invariants=invariants, metric="euclidean")
@@ -89,7 +102,7 @@ class Case:
 
 def counts():
     """0 (no MPI), 1, 2, 4, ... and all ranks."""
-    return sorted({0, *(2**k for k in range(WORLD.size.bit_length()) if 2**k <= WORLD.size), WORLD.size})
+    return sorted({0, *(2**k for k in range(world().size.bit_length()) if 2**k <= world().size), world().size})
 
 
 def compare(shape, seconds):
@@ -100,14 +113,14 @@ def compare(shape, seconds):
         if case.here:
             results[ranks] = case.results()
         wait()
-    best = dict.fromkeys(cases, np.inf)
+    best: dict[int, Any] = dict.fromkeys(cases, np.inf)
     end = time.perf_counter() + seconds
-    while WORLD.bcast(time.perf_counter() < end):
+    while world().bcast(time.perf_counter() < end):
         for ranks, case in cases.items():
             if case.here:
                 best[ranks] = np.minimum(best[ranks], case.measure())
             wait()
-    if WORLD.rank:
+    if world().rank:
         return {}
     errors = {
         ranks: [float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(result, results[0], strict=True)]
@@ -116,20 +129,24 @@ def compare(shape, seconds):
     return {ranks: [*(1e3 * best[ranks]).tolist(), *errors[ranks]] for ranks in cases}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small grids, a second each")
-    parser.add_argument("--json", metavar="FILE")
-    arguments = parser.parse_args()
-    results = {}
-    if WORLD.rank == 0:
-        print(describe_machine())
-        print(MPI.Get_library_version().splitlines()[0])
-    for shape in QUICK_SHAPES if arguments.quick else SHAPES:
-        rows = compare(shape, 1.0 if arguments.quick else SECONDS)
-        if WORLD.rank == 0:
-            name = " x ".join(map(str, shape))
-            results[name] = rows
+@dataclass(frozen=True, kw_only=True)
+class RanksCost(Measurement[dict[str, dict[int, list[float]]]]):
+    """The command."""
+
+    quick: bool = option(False, "small grids, a second each")
+
+    def measure(self, session: Session) -> dict[str, dict[int, list[float]]]:
+        shapes, seconds = (QUICK_SHAPES, 1.0) if self.quick else (SHAPES, SECONDS)
+        found = {" x ".join(map(str, shape)): compare(shape, seconds) for shape in shapes}
+        if world().rank:  # the first one shows the results of all
+            session.json, session.quiet = None, True
+        return found
+
+    def table(self, found: dict[str, dict[int, list[float]]]) -> str:
+        parts = [mpi().MPI.Get_library_version().splitlines()[0]]
+        heads = [["f"], ["speed-up"], ["RK4", "step"], ["EIP-ME", "step"], ["speed-up"], ["error", "of f"],
+                 ["error after", f"{STEPS} steps"]]  # fmt: skip
+        for name, rows in found.items():
             body = [
                 (
                     f"{ranks} rank{'s' * (ranks > 1)}" if ranks else "without MPI",
@@ -138,14 +155,6 @@ def main() -> None:
                 )
                 for ranks, row in rows.items()
             ]  # fmt: skip
-            print(f"\n{name} [ms]\n")
-            heads = [["f"], ["speed-up"], ["RK4", "step"], ["EIP-ME", "step"], ["speed-up"], ["error", "of f"],
-                     ["error after", f"{STEPS} steps"]]  # fmt: skip
-            print(table(heads, body), flush=True)
-    if arguments.json and WORLD.rank == 0:
-        with open(arguments.json, "w") as file:
-            json.dump(results, file, indent=1)
-
-
-if __name__ == "__main__":
-    main()
+            if body:
+                parts.append(f"{name} [ms]\n\n{table(heads, body)}")
+        return "\n\n".join(parts)

@@ -1,24 +1,28 @@
-"""What a compiled gradient that nobody wrote costs beside one written by hand, in runs of `integrate`.
+"""``eip-scipy study gradients``: cost of a compiled gradient beside one written by hand.
 
-    python -m eip_scipy_studies.measurements.gradients [--repeats 7] [--json FILE]
-
-Each system runs with hand-written jitted gradients and without any, in turn; the ratio is that of the least times. The
-hand-written ones share what they can within a function, as their author would write them.
+Each system runs by `integrate` with hand-written jitted gradients and without any, in turn; the ratio is that of the
+least times. The hand-written ones share what they can within a function, as their author would write them.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from eip_scipy import EIPRK4, Invariant, integrate
 
-from .installed import peer
+from ..report import needed, table
+from ..study import Measurement, Session, option
+from ..timing import least
 
-njit = peer("numba", '"eip_scipy[numba]"').njit
+__all__ = ["Gradients"]
+
+njit = needed("numba", '"eip_scipy[numba]"').njit
+STEPS, H = 50_000, 0.01
 
 
 @njit
@@ -155,38 +159,34 @@ SYSTEMS = {
 }
 
 
-def measure(name: str, repeats: int) -> dict[str, float]:
-    """Seconds per step with gradients written by hand and with compiled ones, and their ratio."""
+def seconds(name: str, written: bool) -> float:
+    """Return the seconds per step of one run, with gradients written by hand or compiled."""
     fun, y0, pairs = SYSTEMS[name]
-    kept = {
-        "by hand": [Invariant(value, gradient, in_place=True) for value, gradient in pairs],
-        "compiled": [Invariant(value) for value, _ in pairs],
-    }
-    best = dict.fromkeys(kept, math.inf)
-    for _ in range(repeats):
-        for kind, invariants in kept.items():
-            run = integrate(
-                fun, (0.0, 500.0), y0, method=EIPRK4, h=0.01, in_place=True, invariants=invariants, compiled=True
-            )
-            best[kind] = min(best[kind], run.wall_time / 50_000)
-    return best | {"ratio": best["compiled"] / best["by hand"]}
+    kept = [Invariant(value, gradient if written else None, in_place=written) for value, gradient in pairs]
+    options: dict[str, Any] = {"method": EIPRK4, "h": H, "in_place": True, "invariants": kept, "compiled": True}
+    return integrate(fun, (0.0, STEPS * H), y0, **options).wall_time / STEPS
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repeats", type=int, default=7, metavar="N", help="of each run (%(default)s)")
-    parser.add_argument("--json", metavar="FILE", help="write the numbers there")
-    args = parser.parse_args()
-    rows = {}
-    for name in SYSTEMS:
-        rows[name] = measure(name, args.repeats)
-        print(
-            f"{name:30s} {1e6 * rows[name]['by hand']:6.3f} us a step, compiled: {rows[name]['ratio']:.2f} times that"
-        )
-    if args.json:
-        with open(args.json, "w") as file:
-            json.dump(rows, file, indent=1)
+@dataclass(frozen=True, kw_only=True)
+class Gradients(Measurement[dict[str, dict[str, float]]]):
+    """The command."""
 
+    repeats: int = option(7, "runs of each (%(default)s)", type=int, metavar="N")
 
-if __name__ == "__main__":
-    main()
+    def measure(self, session: Session) -> dict[str, dict[str, float]]:
+        kinds = {"by hand": True, "compiled": False}
+        found = {}
+        with session.bar(len(SYSTEMS), "gradients", "system") as bar:
+            for name in SYSTEMS:
+                actions = {kind: partial(seconds, name, written) for kind, written in kinds.items()}
+                best = least(actions, turns=self.repeats)
+                found[name] = best | {"ratio": best["compiled"] / best["by hand"]}
+                bar.update()
+        return found
+
+    def table(self, found: dict[str, dict[str, float]]) -> str:
+        body = [
+            (name, [f"{1e6 * row['by hand']:.3f}", f"{1e6 * row['compiled']:.3f}", f"{row['ratio']:.2f}"])
+            for name, row in found.items()
+        ]
+        return table([["by hand", "[us a step]"], ["compiled", "[us a step]"], ["ratio"]], body)

@@ -1,18 +1,16 @@
-"""Growth of the error of position over 10 000 years: EIPGJ14, EIPRKN12, IAS15, WHFast, beside Brouwer's law.
+"""``eip-scipy study growth``: growth of the error of position over 10 000 years, beside Brouwer's law.
 
-    python -m eip_scipy_studies.measurements.growth [--years 10000] [--out DIR]
-
-Ten bodies from DE440, Newtonian, against growth_reference.json (see solar_reference.py). An error of longitude that
-comes from round-off alone grows as t^(3/2) (Brouwer 1937), one from a drift of the energy as t^2, one of a method that
-keeps the energy's error bounded as t. Writes DIR/growth.png and DIR/growth.csv.
+Ten bodies from DE440, Newtonian, by EIPGJ14, EIPRKN12, IAS15 and WHFast, against growth_reference.json (see
+`solar_reference`). An error of longitude that comes from round-off alone grows as t^(3/2) (Brouwer 1937), one from a
+drift of the energy as t^2, one of a method that keeps the energy's error bounded as t.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,113 +18,113 @@ from eip_scipy import EIPGJ14, EIPRKN12, integrate
 from eip_scipy.problems import solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D
 
-from ..report import describe_machine, write_csv
-from .installed import peer
+from ..report import needed, table
+from ..study import Figures, Measurement, Rows, Session, option
 
-rebound = peer("eip_scipy.integrations.rebound")
+__all__ = ["Growth", "reference"]
 
 BODIES = {"Mercury": 1, "Earth-Moon": 3, "Jupiter": 5}
-COLOURS = {
-    "EIPRKN12, every 10, compensated": "#0072B2", "EIPRKN12, every 10": "#56B4E9",
-    "RKN12, compensated": "#E69F00", "EIPGJ14": "#009E73", "WHFast (c17), 1 d": "#000000", "IAS15": "#D55E00",
-}  # fmt: skip
-MARKERS = ("o", "v", "s", "P", "X", "D")
+NYSTROM = {"method": EIPRKN12, "h": 1 / 64}
+WAYS: dict[str, dict[str, Any]] = {
+    "EIPRKN12, every 10, compensated": {**NYSTROM, "every": 10, "compensated": True},
+    "EIPRKN12, every 10": {**NYSTROM, "every": 10},
+    "RKN12, compensated": {**NYSTROM, "invariants": (), "compensated": True},
+    "EIPGJ14": {"method": EIPGJ14, "h": 1 / 600},
+}
 
 
 def reference(years: float) -> dict[float, np.ndarray]:
-    """States (60,) in AU and AU/day by time, up to `years`."""
-    content = json.loads((Path(__file__).parent / "growth_reference.json").read_text())
-    return {float(t): np.array(y, dtype=float) for t, y in content["states"].items() if float(t) <= years}
-
-
-def distances(y: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Of each body [AU]."""
-    return np.linalg.norm((y - truth)[:30].reshape(10, 3), axis=1)
+    """Return states (60,) in AU and AU/day by time, up to `years`."""
+    text = files("eip_scipy_studies.data").joinpath("growth_reference.json").read_text(encoding="utf-8")
+    states = json.loads(text)["states"].items()
+    return {float(t): np.array(y, dtype=float) for t, y in states if float(t) <= years}
 
 
 def slope(times: np.ndarray, errors: np.ndarray) -> float:
-    """The exponent of the growth; nan of a single time."""
+    """Return the exponent of the growth; nan for a single time."""
     return float(np.polyfit(np.log(times), np.log(errors), 1)[0]) if times.size > 1 else float("nan")
 
 
-def runs(times: np.ndarray) -> dict[str, np.ndarray]:
-    """For each method the states (60, m) at the times."""
-    problem = solar_system(years=times[-1])
-    nystrom = {"method": EIPRKN12, "h": 1 / 64}
-    ways: dict[str, dict[str, Any]] = {
-        "EIPRKN12, every 10, compensated": {**nystrom, "every": 10, "compensated": True},
-        "EIPRKN12, every 10": {**nystrom, "every": 10},
-        "RKN12, compensated": {**nystrom, "invariants": (), "compensated": True},
-        "EIPGJ14": {"method": EIPGJ14, "h": 1 / 600},
-    }
-    found = {}
-    for name, options in ways.items():
-        result = integrate(problem, (0.0, times[-1]), t_eval=times, **options)
-        print(f"{name}: {result.wall_time:.1f} s", flush=True)
-        found[name] = result.y
-    for name, integrator in (("WHFast (c17), 1 d", "whfast-c17"), ("IAS15", "ias15")):
-        columns, wall = [], 0.0
-        # From the start to each time: a saved time would cut a step of IAS15.
-        for t in times:
-            n = 1 if integrator == "ias15" else round(t * YEAR_D)
-            result = rebound.run(problem.params, problem.y0, integrator, h=t / n, n_steps=n)
-            columns.append(result.y[:, -1])
-            wall = result.wall_time
-        print(f"{name}: {wall:.1f} s", flush=True)
-        found[name] = np.array(columns).T
-    return found
+class Found(NamedTuple):
+    """Times, and of each method the seconds of the run and the errors (m, 10) of the bodies [AU]."""
+
+    times: np.ndarray
+    seconds: dict[str, float]
+    errors: dict[str, np.ndarray]
 
 
-def figure(times: np.ndarray, errors: dict[str, np.ndarray]) -> Any:
-    """One panel for each body."""
-    from matplotlib.figure import Figure
+@dataclass(frozen=True, kw_only=True)
+class Growth(Measurement[Found]):
+    """The command."""
 
-    page = Figure(figsize=(12, 5), layout="constrained", dpi=160)
-    page.suptitle("Ten bodies, Newton: growth of the error of position")
-    axes = page.subplots(1, len(BODIES), sharex=True, sharey=True)
-    for axis, (body, k) in zip(axes, BODIES.items(), strict=True):
-        for (name, own), marker in zip(errors.items(), MARKERS, strict=True):
-            shown = np.where(own[:, k] > 0, own[:, k], np.nan)
-            axis.loglog(times, shown, color=COLOURS[name], marker=marker, ms=4, label=name)
-        start = np.median([own[0, k] for own in errors.values()])
-        axis.loglog(times, 0.1 * start * (times / times[0]) ** 1.5, color="0.5", ls=":", label="slope 3/2 (Brouwer)")
-        axis.set_title(body)
-        axis.set_xlabel("time [yr]")
-        axis.grid(alpha=0.3)
-    axes[0].set_ylabel("error of position [AU]")
-    page.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
-    return page
+    writes_files = True
+    years: float = option(10_000.0, "length of the runs (%(default)s)", type=float)
 
+    def measure(self, session: Session) -> Found:
+        rebound = needed("eip_scipy.integrations.rebound")
+        known = reference(self.years)
+        times = np.array(list(known))
+        problem = solar_system(years=times[-1])
+        seconds, states = {}, {}
+        with session.bar(len(WAYS) + 2, "growth") as bar:
+            for name, options in WAYS.items():
+                result = integrate(problem, (0.0, times[-1]), t_eval=times, **options)
+                seconds[name], states[name] = result.wall_time, result.y
+                bar.update()
+            for name, integrator in (("WHFast (c17), 1 d", "whfast-c17"), ("IAS15", "ias15")):
+                # From the start to each time: a saved time would cut a step of IAS15.
+                counts = [1 if integrator == "ias15" else round(t * YEAR_D) for t in times]
+                runs = [
+                    rebound.run(problem.params, problem.y0, integrator, h=t / n, n_steps=n)
+                    for t, n in zip(times, counts, strict=True)
+                ]
+                seconds[name], states[name] = runs[-1].wall_time, np.array([run.y[:, -1] for run in runs]).T
+                bar.update()
+        truth = np.array(list(known.values())).T
+        errors = {name: np.linalg.norm((y - truth)[:30].reshape(10, 3, -1), axis=1).T for name, y in states.items()}
+        return Found(times, seconds, errors)
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--years", type=float, default=10_000.0)
-    parser.add_argument("--out", type=Path, default=Path("eip_results"))
-    args = parser.parse_args()
-    known = reference(args.years)
-    times = np.array(list(known))
-    print(describe_machine())
-    errors = {
-        name: np.array([distances(y[:, k], known[t]) for k, t in enumerate(times)]) for name, y in runs(times).items()
-    }
-    late = times >= 10
-    for name, own in errors.items():
-        slopes = [slope(times[late], own[late, k]) for k in BODIES.values()]
-        last = ", ".join(
-            f"{body} {own[-1, k]:.1e} AU (slope {exponent:.1f})"
-            for (body, k), exponent in zip(BODIES.items(), slopes, strict=True)
+    def table(self, found: Found) -> str:
+        late = found.times >= 10
+        body = []
+        for name, own in found.errors.items():
+            cells = [f"{found.seconds[name]:.1f}"]
+            for k in BODIES.values():
+                cells += [f"{own[-1, k]:.1e}", f"{slope(found.times[late], own[late, k]):.1f}"]
+            body.append((name, cells))
+        heads = [["time [s]"], *(head for body in BODIES for head in ([body, "[AU]"], ["slope"]))]
+        return (
+            f"After {found.times[-1]:g} years, and the exponents of the growth from 10 years on\n\n{table(heads, body)}"
         )
-        print(f"{name}: after {times[-1]:g} yr {last}")
-    args.out.mkdir(parents=True, exist_ok=True)
-    rows = [
-        {"method": name, "years": t, **{body: own[j, k] for body, k in BODIES.items()}}
-        for name, own in errors.items()
-        for j, t in enumerate(times)
-    ]
-    print(f"wrote {write_csv(args.out / 'growth.csv', rows)}")
-    figure(times, errors).savefig(args.out / "growth.png")
-    print(f"wrote {args.out / 'growth.png'}")
 
+    def numbers(self, found: Found) -> dict[str, Any]:
+        return {"seconds": found.seconds}
 
-if __name__ == "__main__":
-    main()
+    def tables(self, found: Found) -> dict[str, Rows]:
+        rows = [
+            {"method": name, "years": t, **{body: own[j, k] for body, k in BODIES.items()}}
+            for name, own in found.errors.items()
+            for j, t in enumerate(found.times)
+        ]
+        return {"growth.csv": rows}
+
+    def figures(self, found: Found) -> Figures:
+        from eip_scipy.plotting import method_styles
+
+        from ..plotting import blank_figure
+
+        styles = method_styles(found.errors)
+        figure = blank_figure(12, 5, "Ten bodies, Newton: growth of the error of position")
+        axes = figure.subplots(1, len(BODIES), sharex=True, sharey=True)
+        for axis, (body, k) in zip(axes, BODIES.items(), strict=True):
+            for name, own in found.errors.items():
+                axis.loglog(found.times, np.where(own[:, k] > 0, own[:, k], np.nan), ms=4, **styles[name])
+            start = np.median([own[0, k] for own in found.errors.values()])
+            law = 0.1 * start * (found.times / found.times[0]) ** 1.5
+            axis.loglog(found.times, law, color="0.5", ls=":", label="slope 3/2 (Brouwer)")
+            axis.set_title(body)
+            axis.set_xlabel("time [yr]")
+            axis.grid(alpha=0.3)
+        axes[0].set_ylabel("error of position [AU]")
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+        yield "growth.png", figure

@@ -1,26 +1,23 @@
-"""How long imports take: the package, and the names most runs begin with, beside `scipy.integrate` and Numba.
+"""``eip-scipy study import-time``: how long imports take, beside `scipy.integrate` and Numba.
 
-    python -m eip_scipy_studies.measurements.import_time [--rounds N] [--json FILE]
-
-Each import in a fresh process, all in turn, so that a machine whose speed drifts does not decide; processor time less
-that of an empty process in the same round. The first round is not counted: it writes the bytecode. The median over
+Each import runs in a fresh process, all in turn, so that a machine whose speed drifts does not decide; processor time
+less that of an empty process in the same round. The first round is not counted: it writes the bytecode. The median over
 the rounds, and that of the ratio to `import scipy.integrate` in the same round.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from statistics import median
 
-from eip_scipy.core.versions import versions
+from ..report import table
+from ..study import Measurement, Session, option
 
-from ..report import describe_machine
+__all__ = ["ImportTime"]
 
-ROUNDS = 7
 REFERENCE = "import scipy.integrate"
 IMPORTS = (
     REFERENCE,
@@ -32,8 +29,8 @@ IMPORTS = (
 )
 
 
-def seconds(code):
-    """Processor time of a fresh process."""
+def seconds(code: str) -> float:
+    """Return the processor time of a fresh process."""
     writing = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     before = os.times()
     subprocess.run([sys.executable, "-c", code], check=True, env=writing)
@@ -41,33 +38,25 @@ def seconds(code):
     return after.children_user + after.children_system - before.children_user - before.children_system
 
 
-def measure(rounds):
-    found = {code: [] for code in IMPORTS}
-    for turn in range(rounds + 1):
-        empty = seconds("")
-        for code, times in found.items():
-            taken = seconds(code) - empty
-            if turn:
-                times.append(taken)
-    return found
+@dataclass(frozen=True, kw_only=True)
+class ImportTime(Measurement[dict[str, dict[str, float]]]):
+    """The command."""
 
+    rounds: int = option(7, "rounds of fresh processes (%(default)s)", type=int, metavar="N")
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--rounds", type=int, default=ROUNDS, metavar="N", help="of fresh processes (%(default)s)")
-    parser.add_argument("--json", metavar="FILE", help="the numbers as JSON")
-    args = parser.parse_args()
-    found = measure(args.rounds)
-    print(describe_machine())
-    rows = []
-    for code, times in found.items():
-        ratio = median(t / s for t, s in zip(times, found[REFERENCE], strict=True))
-        rows.append({"import": code, "seconds": median(times), "ratio": ratio})
-        print(f"{code:<42} {median(times):5.2f} s {ratio:5.2f}")
-    if args.json:
-        with open(args.json, "w", encoding="utf-8") as out:
-            json.dump({"machine": describe_machine(), "versions": versions(), "imports": rows}, out, indent=1)
+    def measure(self, session: Session) -> dict[str, dict[str, float]]:
+        times: dict[str, list[float]] = {code: [] for code in IMPORTS}
+        with session.bar(self.rounds + 1, "import-time", "round") as bar:
+            for turn in range(self.rounds + 1):
+                empty = seconds("")
+                for code, own in times.items():
+                    taken = seconds(code) - empty
+                    if turn:
+                        own.append(taken)
+                bar.update()
+        ratios = {code: [t / s for t, s in zip(own, times[REFERENCE], strict=True)] for code, own in times.items()}
+        return {code: {"seconds": median(own), "ratio": median(ratios[code])} for code, own in times.items()}
 
-
-if __name__ == "__main__":
-    main()
+    def table(self, found: dict[str, dict[str, float]]) -> str:
+        body = [(code, [f"{row['seconds']:.2f}", f"{row['ratio']:.2f}"]) for code, row in found.items()]
+        return table([["seconds"], ["ratio"]], body)

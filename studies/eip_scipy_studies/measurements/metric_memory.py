@@ -1,32 +1,34 @@
-"""Compare the projection's metric with no projection on problems whose error estimates mislead it.
-
-    python -m eip_scipy_studies.measurements.metric_memory [--only TEXT] [--metric error|euclidean] [--json FILE]
+"""``eip-scipy study metric-memory``: the projection's metric on problems whose error estimates mislead it.
 
 Cut-off problems, at fixed steps: forces with kinks or jumps (discs with a truncated Lennard-Jones force, backlash,
 soft walls, Hertz contacts, Huber springs), three steps by four methods each, the energy kept. SI units: charged
 particles whose momenta are near 1e-24. Mechanisms: constraints on positions and velocities, adaptive steps, with and
 without the energy.
 
-A run has failed when its status is -1, is accused when it is not trusted, and is worse when its final error exceeds
-three times that of the unprojected run and a tolerance of 1e-9. Errors are relative to the reference's largest
-component. For the discs, which are chaotic, it also counts how often this happens by chance.
+Each run is compared with the same run without projection. A run has failed when its status is -1, is accused when it is
+not trusted, and is worse when its final error exceeds three times that of the unprojected run and a tolerance of 1e-9.
+Errors are relative to the reference's largest component. For the discs, which are chaotic, the command also counts how
+often this happens by chance.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, Invariant, integrate
 
+from ..report import needed, table
+from ..study import Session, Study, option
+
+__all__ = ["MetricMemory"]
+
+njit = needed("numba", '"eip_scipy[numba]"').njit
 METHODS = (EIPRK4, EIPRK5, EIPRK45, EIPDOP853)
 FACTOR, TOLERANCE = 3.0, 1e-9
 ADAPTIVE = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
@@ -517,7 +519,7 @@ def pendulum(links: int) -> tuple[Case, Case]:
 def _with_energy(
     name: str, fun: Any, kept: tuple[Invariant, ...], energy: Invariant, y0: np.ndarray, end: float, **more: Any
 ) -> tuple[Case, Case]:
-    common = {"methods": (EIPDOP853,), "in_place": False, "steps": ADAPTIVE}
+    common: dict[str, Any] = {"methods": (EIPDOP853,), "in_place": False, "steps": ADAPTIVE}
     return (
         Case("mechanisms", f"{name}, c", fun, kept, y0, end, **common, **more),
         Case("mechanisms", f"{name}, c + E", fun, (*kept, energy), y0, end, **common, **more),
@@ -813,11 +815,12 @@ def mean_ratio(found: Iterable[Outcome]) -> float:
     return float(np.exp(np.mean(np.log(ratios)))) if ratios else np.nan
 
 
-def line(name: str, found: list[Outcome]) -> str:
-    """A row of the table."""
+def row(name: str, found: list[Outcome]) -> tuple[str, list[str]]:
+    """Return a row of the table."""
     failed, accused, worse = (sum(getattr(one, what) for one in found) for what in ("failed", "accused", "worse"))
     worst = max((one.ratio for one in found if not one.failed and one.error > TOLERANCE), default=np.nan)
-    return f"{name:36} {len(found):5} {failed:7} {accused:8} {worse:6} {mean_ratio(found):10.3g} {worst:10.3g}"
+    counts = [str(len(found)), str(failed), str(accused), str(worse)]
+    return name, [*counts, f"{mean_ratio(found):.3g}", f"{worst:.3g}"]
 
 
 def scatter(chosen: Iterable[Case]) -> str:
@@ -837,31 +840,41 @@ def scatter(chosen: Iterable[Case]) -> str:
     return f"three times worse: {counts[0]} at a step 2 to 6 % shorter, {counts[1]} with projection"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="", metavar="TEXT", help="problems whose group or name contains this")
-    parser.add_argument("--metric", default="error", choices=("error", "euclidean"))
-    parser.add_argument("--json", metavar="FILE")
-    args = parser.parse_args()
-    chosen = [case for case in cases() if args.only in f"{case.group} {case.name}"]
-    plain: dict[Any, float] = {}
-    found: list[Outcome] = []
-    print(f"{'':36} {'runs':>5} {'failed':>7} {'accused':>8} {'worse':>6} {'mean ratio':>10} {'worst':>10}")
-    for case in chosen:
-        own = list(outcomes(case, plain, metric=args.metric))
-        found += own
-        print(line(case.name, own), flush=True)
-    print()
-    for group in dict.fromkeys(one.group for one in found):
-        print(line(group, [one for one in found if one.group == group]))
-    if discs_chosen := [case for case in chosen if case.group == "discs"]:
-        with warnings.catch_warnings():
+class Found(NamedTuple):
+    """All runs, and how often those of the discs differ by chance."""
+
+    runs: list[Outcome]
+    chance: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricMemory(Study[Found]):
+    """The command."""
+
+    writes_files = False
+    only: str = option("", "problems whose group or name contains this", metavar="TEXT")
+    metric: str = option("error", "metric of the projection (%(default)s)", choices=("error", "euclidean"))
+
+    def measure(self, session: Session) -> Found:
+        chosen = [case for case in cases() if self.only in f"{case.group} {case.name}"]
+        plain: dict[Any, float] = {}
+        found: list[Outcome] = []
+        with session.bar(len(chosen), "metric-memory", "problem") as bar, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            print(f"\ndiscs, {scatter(discs_chosen)}")
-    if args.json:
-        with open(args.json, "w") as file:
-            json.dump([vars(one) for one in found], file, indent=1)
+            for case in chosen:
+                found += outcomes(case, plain, metric=self.metric)
+                bar.update()
+            discs_chosen = [case for case in chosen if case.group == "discs"]
+            return Found(found, f"discs, {scatter(discs_chosen)}" if discs_chosen else "")
 
+    def text(self, found: Found) -> str:
+        heads = [["runs"], ["failed"], ["accused"], ["worse"], ["mean ratio"], ["worst"]]
+        parts = []
+        for key in ("case", "group"):
+            names = dict.fromkeys(getattr(one, key) for one in found.runs)
+            body = [row(name, [one for one in found.runs if getattr(one, key) == name]) for name in names]
+            parts.append(table(heads, body))
+        return "\n\n".join(filter(None, [*parts, found.chance]))
 
-if __name__ == "__main__":
-    main()
+    def numbers(self, found: Found) -> dict[str, Any]:
+        return {"runs": [vars(one) for one in found.runs]}

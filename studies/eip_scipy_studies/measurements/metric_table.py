@@ -1,16 +1,16 @@
-"""What the metric of the projection does to the solar system: errors of longitude after 100 and 2000 years.
+"""``eip-scipy study metric-table``: what the metric of the projection does to the solar system.
 
-    python -m eip_scipy_studies.measurements.metric_table [--years 100|2000] [--rotations 5] [--json FILE]
-
-RK4, h = .002 yr, DE440 system barycentres, invariants H and L: every EIP row keeps both to 1e-15; they differ in which
-planet pays for it. Errors are unwrapped heliocentric ecliptic longitudes [rad] against the packaged reference states.
-Then the gain of Mercury's position over plain RK4 in random rotations of the axes, with blocks of 3 and without.
+RK4, h = 0.002 yr, DE440 system barycentres, invariants H and L: every EIP row keeps both to 1e-15; they differ in which
+planet pays for it. Errors are unwrapped heliocentric ecliptic longitudes [rad] against the packaged reference states
+after 100 and 2000 years. Then the gain of Mercury's position over plain RK4 in random rotations of the axes, with
+blocks of 3 and without.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,6 +20,11 @@ from eip_scipy.problems import nbody, solar_system
 from eip_scipy.problems.gravity.solar_data import load
 
 from ..comparators import stormer_verlet
+from ..report import table
+from ..study import Session, Study, option
+from .multistep import known_end
+
+__all__ = ["MetricTable"]
 
 STEP = 0.002
 SAVE_EVERY = 20
@@ -60,9 +65,11 @@ def momentum_weights(masses: np.ndarray) -> np.ndarray:
 def metric_rows(years: float) -> dict[str, np.ndarray]:
     """Errors of longitude (9,) of each row of the table."""
     problem, si = solar_system(years=years), solar_system(years=years, units="SI")
+    assert problem.params is not None
+    assert si.params is not None
     suns = problem.params / problem.params[0]
     half = np.repeat(1 / np.sqrt(suns), 3)
-    common = {"method": EIPRK4, "save_every": SAVE_EVERY}
+    common: dict[str, Any] = {"method": EIPRK4, "save_every": SAVE_EVERY}
     runs = {
         "RK4 alone": integrate(problem, invariants=(), **common).y,
         "EIP, euclidean, SI (q, p)": integrate(si, metric=momentum_weights(si.params / GRAVITATION), **common).y,
@@ -72,8 +79,9 @@ def metric_rows(years: float) -> dict[str, np.ndarray]:
         "EIP, error-weighted, blocks, frame": integrate(problem, **common).y,
     }
     runs["EIP, euclidean, SI (q, p)"] = runs["EIP, euclidean, SI (q, p)"] / 1.495978707e11
+    assert problem.acc is not None
     verlet = stormer_verlet(problem.acc, problem.t_span, problem.y0, STEP, params=problem.params, save_every=SAVE_EVERY)
-    reference = problem.reference(years)
+    reference = known_end(problem)
     truth = reference_longitudes(runs["EIP, error-weighted, blocks, frame"], reference)
     rows = {"Stoermer-Verlet (kick-drift-kick)": longitudes(verlet.y)[:, -1] - truth}
     return rows | {name: longitudes(y)[:, -1] - truth for name, y in runs.items()}
@@ -92,45 +100,45 @@ def rotation_gains(rotations: int, seed: int = 1) -> list[dict[str, float]]:
             t_span=(0.0, 100.0),
             h=STEP,
         )
-        reference = solar_system().reference(100.0)
-        reference = (reference.reshape(20, 3) @ turned.T).ravel()
+        reference = (known_end(solar_system(years=100.0)).reshape(20, 3) @ turned.T).ravel()
+        ways: dict[str, dict[str, Any]] = {
+            "plain": {"invariants": ()},
+            "blocks of 3": {},
+            "no blocks": {"blocks": None},
+        }
         errors = {
             name: position_errors(integrate(problem, method=EIPRK4, **options).y[:, -1], reference)[0]
-            for name, options in {
-                "plain": {"invariants": ()},
-                "blocks of 3": {},
-                "no blocks": {"blocks": None},
-            }.items()
+            for name, options in ways.items()
         }
         out.append({name: errors["plain"] / errors[name] for name in errors if name != "plain"})
     return out
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--years", type=float, choices=(100.0, 1000.0, 2000.0), nargs="*", default=[100.0, 2000.0])
-    parser.add_argument("--rotations", type=int, default=5)
-    parser.add_argument("--json", metavar="FILE")
-    arguments = parser.parse_args()
-    results: dict[str, object] = {}
-    for years in arguments.years:
-        rows = metric_rows(years)
-        results[f"{years:g} years"] = {
-            name: dict(zip(PLANETS, row.tolist(), strict=True)) for name, row in rows.items()
-        }
-        print(f"\nError of longitude after {years:g} years, h = {STEP} yr [rad]")
-        print(f"{'':36}" + "".join(f"{planet:>10}" for planet in PLANETS))
-        for name, row in rows.items():
-            print(f"{name:36}" + "".join(f"{value:10.1e}" for value in row))
-    gains = rotation_gains(arguments.rotations)
-    results["rotations"] = gains
-    print("\nMercury after 100 years, random axes: plain RK4's position error over EIP's")
-    for gain in gains:
-        print("   ".join(f"{name}: {value:.4g}" for name, value in gain.items()))
-    if arguments.json:
-        with open(arguments.json, "w") as file:
-            json.dump(results, file, indent=1)
+@dataclass(frozen=True, kw_only=True)
+class MetricTable(Study[dict[str, Any]]):
+    """The command."""
 
+    writes_files = False
+    years: Sequence[float] = option(
+        (100.0, 2000.0), "lengths of the runs", type=float, nargs="+", choices=(100.0, 1000.0, 2000.0)
+    )
+    rotations: int = option(5, "random rotations of the axes (%(default)s)", type=int)
 
-if __name__ == "__main__":
-    main()
+    def measure(self, session: Session) -> dict[str, Any]:
+        found: dict[str, Any] = {f"{years:g} years": metric_rows(years) for years in self.years}
+        return found | {"rotations": rotation_gains(self.rotations)}
+
+    def text(self, found: dict[str, Any]) -> str:
+        parts = []
+        for span, rows in found.items():
+            if span == "rotations":
+                continue
+            body = [(name, [f"{value:.1e}" for value in row]) for name, row in rows.items()]
+            title = f"Error of longitude after {span}, h = {STEP} yr [rad]"
+            parts.append(f"{title}\n\n{table([[planet] for planet in PLANETS], body)}")
+        gains = ["   ".join(f"{name}: {value:.4g}" for name, value in gain.items()) for gain in found["rotations"]]
+        title = "Mercury after 100 years, random axes: plain RK4's position error over EIP's"
+        return "\n\n".join([*parts, "\n".join([title, *gains])])
+
+    def numbers(self, found: dict[str, Any]) -> dict[str, Any]:
+        return found

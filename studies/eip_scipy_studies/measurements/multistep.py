@@ -1,28 +1,20 @@
-"""One evaluation a step: EIPGJ14 and EIPGJ12 beside EIPRKN12, WHFast, IAS15 and heyoka, in five tables.
-
-    python -m eip_scipy_studies.measurements.multistep [--parts 1 2 3 4 5] [--quick] [--json FILE]
+"""``eip-scipy study multistep``: EIPGJ14 and EIPGJ12, one evaluation a step, beside EIPRKN12 and other packages.
 
 1. Ten bodies, Newton, 1000 years: each run once in each of six rotations of the axes, in turns. Errors of position [AU]
    against the packaged reference state: Mercury's, the least and the largest over the rotations, and the largest of
-   another planet. The ratios below it are of least times.
-2. The same over 10 000 years (IAS15 once), against growth_reference.json; and 1000 years with the relativistic
-   potential, WHFast by REBOUNDx (relativity.py).
-3. Ensembles over 100 years: systems per second and core (solar_cloud.py).
-4. Three systems of exoplanets (exoplanets.py).
-5. Kepler's problem with e = .6 and the relativistic term to t = 600, beside heyoka, which is compiled before.
+   another planet. The ratios below the table are of least times.
+2. The same over 10 000 years (IAS15 once), against growth_reference.json.
+3. Kepler's problem with e = 0.6 and the relativistic term to t = 600, beside heyoka, which is compiled before.
+4. EIPRKN12 over 100 years with steps of 0.02 yr, with and without projection, in the same rotations.
 
-One core, and nothing beside it: ratios of times are what counts. REBOUND for all of it; for the second half of 2, for 4
-and for 5 ``pip install reboundx heyoka``, which are no dependencies. `--quick`: a tenth of it or less, to see that it
-runs.
+One core, and nothing beside it: ratios of times are what counts. Parts 1, 2 and 4 need REBOUND, part 3 heyoka.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
 
@@ -31,42 +23,61 @@ from scipy.spatial.transform import Rotation
 
 from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRKN12, integrate
 from eip_scipy.problems import Problem, kepler, solar_system
-from eip_scipy.problems.gravity.solar_data import YEAR_D
 
-from ..report import describe_machine
+from ..report import needed, table
 from ..solar.cost import timed
+from ..study import Measurement, Session, option
 from ..work_precision import cost_to_reach
-from .installed import peer
-from .runners import Methods, by_rebound, by_us, one_each, rows, show
+from .growth import reference
+from .orbits import Methods, Row, by_rebound, by_us, daily, orbit_table, rows, yearly
+
+__all__ = ["Multistep"]
 
 ROTATIONS = 6
 REPEATS = 200  # of runs of milliseconds
 END, WANTED = 600.0, 1e-9
-Table = dict[str, dict[str, float]]
+OURS = ("EIPGJ14", "EIPGJ12", "EIPRKN12")
+Table = dict[str, Row]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", type=int, nargs="+", choices=sorted(PARTS), default=sorted(PARTS))
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json", metavar="FILE")
-    args = parser.parse_args()
-    if not {2, 4, 5}.isdisjoint(args.parts):  # before the minutes that others take
-        peer("heyoka", '"eip_scipy[heyoka]"')
-        peer("reboundx", "reboundx")
-    print(describe_machine())
-    found = {str(part): PARTS[part](args.quick) for part in args.parts}
-    if args.json:
-        with open(args.json, "w") as file:
-            json.dump({"machine": describe_machine(), "quick": args.quick, "parts": found}, file, indent=1)
+@dataclass(frozen=True, kw_only=True)
+class Multistep(Measurement[dict[str, Table]]):
+    """The command."""
+
+    parts: Sequence[int] = option((1, 2, 3, 4), "parts of the study", type=int, nargs="+", choices=(1, 2, 3, 4))
+    quick: bool = option(False, "a tenth of the spans and fewer rotations, to see that it runs")
+
+    def measure(self, session: Session) -> dict[str, Table]:
+        if 3 in self.parts:  # before the minutes that others take
+            needed("heyoka", '"eip_scipy[heyoka]"')
+        ways = {1: thousand_years, 2: ten_thousand_years, 3: against_heyoka, 4: with_projection}
+        with session.bar(len(self.parts), "multistep", "part") as bar:
+            found = {}
+            for part in self.parts:
+                found[str(part)] = ways[part](self.quick)
+                bar.update()
+        return found
+
+    def table(self, found: dict[str, Table]) -> str:
+        share = 10 if self.quick else 1
+        titles = {
+            "1": f"Ten bodies, {1000 / share:g} years",
+            "2": f"Ten bodies, {10_000 / share:g} years",
+            "3": f"Kepler, e = 0.6, relativistic term, t = {END:g}: steps in 2 pi, or tolerances",
+            "4": f"Ten bodies, {100 / share:g} years, h = 0.02 yr",
+        }
+        parts = []
+        for part, own in found.items():
+            text = kepler_table(own) if part == "3" else orbit_table(own, "Mercury")
+            if part == "1":
+                text += "\n\n" + "\n".join(compared(own, 2e-9, 1e-10) + compared(own, 1e-7, math.inf))
+            parts.append(f"{part}. {titles[part]}\n\n{text}")
+        return "\n\n".join(parts)
 
 
 def thousand_years(quick: bool) -> Table:
     years = 100.0 if quick else 1000.0
     problem = solar_system(years=years)
-    assert problem.reference is not None
-    truth = problem.reference(years)
-    assert truth is not None
 
     def methods(turned: Problem, turn: int) -> Methods:
         return {
@@ -77,19 +88,11 @@ def thousand_years(quick: bool) -> Table:
             "IAS15": (by_rebound(turned, "ias15"), [math.nan]),
         }
 
-    found = in_rotations(problem, truth, methods, 2 if quick else ROTATIONS)
-    print(f"\n1. Ten bodies, {years:g} years")
-    show(found, "Mercury")
-    compare(found, 2e-9, 1e-10)
-    compare(found, 1e-7, math.inf)
-    return found
+    return in_rotations(problem, known_end(problem), methods, 2 if quick else ROTATIONS)
 
 
-def ten_thousand_years(quick: bool) -> dict[str, Table]:
-    from . import growth, relativity
-
+def ten_thousand_years(quick: bool) -> Table:
     years = 1000.0 if quick else 10_000.0
-    truth = growth.reference(years)[years]
 
     def methods(turned: Problem, turn: int) -> Methods:
         found = {
@@ -99,28 +102,30 @@ def ten_thousand_years(quick: bool) -> dict[str, Table]:
         }
         return found if turn else found | {"IAS15": (by_rebound(turned, "ias15"), [math.nan])}
 
-    found = in_rotations(solar_system(years=years), truth, methods, 1 if quick else ROTATIONS)
-    print(f"\n2. Ten bodies, {years:g} years")
-    show(found, "Mercury")
-    return {"Newton": found, "gr-potential": relativity.table(10.0 if quick else 1000.0)}
+    return in_rotations(solar_system(years=years), reference(years)[years], methods, 1 if quick else ROTATIONS)
 
 
-def ensembles(quick: bool) -> Table:
-    from . import solar_cloud
+def with_projection(quick: bool) -> Table:
+    problem = solar_system(years=10.0 if quick else 100.0)
 
-    print("\n3. Ensembles")
-    return solar_cloud.table(*((32, 10.0, 2) if quick else (1000, 100.0, 16)))
+    def methods(turned: Problem, turn: int) -> Methods:
+        ways: dict[str, dict[str, Any]] = {"no projection": {"invariants": ()}, "every=10": {"every": 10}}
+        runs = {name: (by_us(turned, EIPRKN12, **options), [0.02]) for name, options in ways.items()}
+        return {f"{name}, rotation {turn}": run for name, run in runs.items()}
+
+    return in_rotations(problem, known_end(problem), methods, 2 if quick else ROTATIONS)
 
 
-def three_systems(quick: bool) -> dict[str, Table]:
-    from . import exoplanets
-
-    print("\n4. Exoplanets")
-    return exoplanets.tables(0.02 if quick else 1.0)
+def known_end(problem: Problem) -> np.ndarray:
+    """Return the reference state at the end of the problem's interval."""
+    assert problem.reference is not None
+    truth = problem.reference(problem.t_span[1])
+    assert truth is not None
+    return truth
 
 
 def against_heyoka(quick: bool) -> Table:
-    """Least times of a whole call in milliseconds, and of the steps alone; largest errors of a component."""
+    """Measure least times of whole calls in milliseconds and of the steps alone, and largest errors of a component."""
     problem = kepler(0.6, 0.005, END)
     truth = taylor(problem, 1e-18)[0]()
     calls: dict[str, tuple[Callable[[], np.ndarray], Callable[[], float]]] = {
@@ -140,15 +145,18 @@ def against_heyoka(quick: bool) -> Table:
             row["call"] = min(row["call"], 1e3 * (perf_counter() - begin))
             row["steps"] = min(row["steps"], 1e3 * steps())
             row["error"] = float(np.abs(state - truth).max())
-    print(f"\n5. Kepler, e = .6, relativistic term, t = {END:g}: steps in 2 pi, or tolerances")
-    print(f"{'':26}{'call [ms]':>11}{'steps [ms]':>11}{'error':>10}")
-    for name, row in found.items():
-        print(f"{name:26}{row['call']:11.3f}{row['steps']:11.3f}{row['error']:10.1e}")
-    enough = {name: row for name, row in found.items() if row["error"] <= WANTED}
-    for kind in ("EIPGJ14", "EIPGJ12", "EIPRKN12"):
-        times = [least(enough, kind, part) / least(enough, "heyoka", "call") for part in ("call", "steps")]
-        print(f"error {WANTED:g}: {kind} takes {times[0]:.2f} of heyoka's time, its steps alone {times[1]:.2f}")
     return found
+
+
+def kepler_table(found: Table) -> str:
+    """Lay out what `against_heyoka` found, and what the wanted error costs beside heyoka."""
+    body = [(name, [f"{row['call']:.3f}", f"{row['steps']:.3f}", f"{row['error']:.1e}"]) for name, row in found.items()]
+    lines = [table([["call [ms]"], ["steps [ms]"], ["error"]], body), ""]
+    enough = {name: row for name, row in found.items() if row["error"] <= WANTED}
+    for kind in OURS:
+        times = [least(enough, kind, part) / least(enough, "heyoka", "call") for part in ("call", "steps")]
+        lines.append(f"error {WANTED:g}: {kind} takes {times[0]:.2f} of heyoka's time, its steps alone {times[1]:.2f}")
+    return "\n".join(lines)
 
 
 def own(problem: Problem, **options: Any) -> tuple[Callable[[], np.ndarray], Callable[[], float]]:
@@ -165,8 +173,7 @@ def own(problem: Problem, **options: Any) -> tuple[Callable[[], np.ndarray], Cal
 
 def taylor(problem: Problem, tolerance: float) -> tuple[Callable[[], np.ndarray], Callable[[], float]]:
     """The same by heyoka, made and compiled before."""
-    import heyoka
-
+    heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
     assert problem.params is not None
     x, y, u, v = heyoka.make_vars("x", "y", "u", "v")
     square = x * x + y * y
@@ -186,16 +193,6 @@ def taylor(problem: Problem, tolerance: float) -> tuple[Callable[[], np.ndarray]
     return run, lambda: last[0]
 
 
-def yearly(name: str, run: Any, *counts: int) -> Methods:
-    """Steps by how many there are in a year."""
-    return one_each(lambda h: f"{name}, 1/{round(1 / h)} yr", run, [1 / n for n in counts])
-
-
-def daily(name: str, run: Any, *days: float) -> Methods:
-    """Steps in days."""
-    return one_each(lambda h: f"{name}, {h * YEAR_D:.3g} d", run, [d / YEAR_D for d in days])
-
-
 def in_rotations(problem: Problem, truth: np.ndarray, methods: Callable[[Problem, int], Methods], turns: int) -> Table:
     """All methods in turn, in axes turned anew each time."""
     found = []
@@ -206,26 +203,19 @@ def in_rotations(problem: Problem, truth: np.ndarray, methods: Callable[[Problem
     return rows(found)
 
 
-def compare(found: Table, mercury: float, others: float) -> None:
-    """What the cheapest run that is as good takes, beside WHFast's time for Mercury and IAS15's."""
+def compared(found: Table, mercury: float, others: float) -> list[str]:
+    """Say what the cheapest run of these errors takes, beside WHFast's time for Mercury and IAS15's."""
     whfast = [row for name, row in found.items() if name.startswith("WHFast")]
     there = cost_to_reach([row["least"] for row in whfast], [row["worst"] for row in whfast], mercury)
     good = {name: row for name, row in found.items() if row["worst"] <= mercury and row["others"] <= others}
-    for kind in ("EIPGJ14", "EIPGJ12", "EIPRKN12"):
-        own = least(good, kind, "least")
-        print(
-            f"Mercury {mercury:g}, others {others:g}: {kind} takes {own:.4g} s, {own / there:.2f} of WHFast's time for "
-            f"Mercury, {found['IAS15']['least'] / own:.1f} times less than IAS15"
-        )
+    times = {kind: least(good, kind, "least") for kind in OURS}
+    return [
+        f"Mercury {mercury:g}, others {others:g}: {kind} takes {own:.4g} s, {own / there:.2f} of WHFast's time for "
+        f"Mercury, {found['IAS15']['least'] / own:.1f} times less than IAS15"
+        for kind, own in times.items()
+    ]
 
 
 def least(found: Table, kind: str, part: str) -> float:
     """The least time of a method; nan without a run of it."""
     return min((row[part] for name, row in found.items() if name.startswith(kind)), default=math.nan)
-
-
-PARTS = {1: thousand_years, 2: ten_thousand_years, 3: ensembles, 4: three_systems, 5: against_heyoka}
-
-
-if __name__ == "__main__":
-    main()

@@ -1,13 +1,11 @@
-"""EIPRKN8 and EIPRKN12: a projection where it tells more than round-off, and compensated sums, beside neither.
+"""``eip-scipy study nystrom-defaults``: two options of EIPRKN8 and EIPRKN12 that could be defaults.
 
-    python -m eip_scipy_studies.measurements.nystrom_defaults [--system NAME ...] [--json FILE]
-
-Ten bodies over 100 and 1000 years, orbits of exoplanets, the hard scenes and all hard cases whose forces do not change
-with the velocity; fixed steps that bring EIPRKN12 to about 1e-3, 1e-6, 1e-9 and 1e-12, and three tolerances. Each
-figure is over three neighbouring steps or tolerances, for a single run's last digits are luck: the geometric mean of
-the errors at the end and of the largest changes of an invariant along the run (up to 4000 of its rows), the sum of the
-times, and how many runs were not trusted. Exoplanets need
-heyoka and REBOUNDx.
+A projection where it tells more than round-off (`every="auto"`) and compensated sums, beside neither. Ten bodies over
+100 and 1000 years, orbits of exoplanets, the hard scenes and all hard cases whose forces do not change with the
+velocity; fixed steps that bring EIPRKN12 to about 1e-3, 1e-6, 1e-9 and 1e-12, and three tolerances. Each number is over
+three neighbouring steps or tolerances, for a single run's last digits are luck: the geometric mean of the errors at the
+end and of the largest changes of an invariant along the run (up to 4000 of its rows), the sum of the times, and how
+many runs were not trusted. Exoplanets need heyoka and REBOUNDx.
 
 What came of it: the error is that of projecting each step, compensated or not, but where rounding is most of it, and
 there both together divide it by up to 1000 (1000 years). But compensation takes 10 to 40 % more time in most runs,
@@ -17,26 +15,26 @@ do not go side by side. Neither is never worse, so neither is a default.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from eip_scipy import EIPRKN8, EIPRKN12, EIPSolver, integrate
-from eip_scipy.core.setup import depends_on_velocity
-from eip_scipy.engine.trust import ProjectionWarning
+from eip_scipy import EIPRKN8, EIPRKN12, EIPSolver, ProjectionWarning, integrate
 from eip_scipy.problems import Problem, solar_system
 
 from ..hard.runs import SCENES, scene
 from ..hard_cases import hard_cases
-from ..report import describe_machine
+from ..report import table
+from ..study import Measurement, Session, option
+from ..timing import clocked, least
+
+__all__ = ["NystromDefaults"]
 
 WAYS: dict[str, dict[str, Any]] = {
     "each": {"every": 1, "compensated": False},
@@ -75,37 +73,49 @@ def by_reference(problem: Problem, size: float = 1.0) -> System:
 def systems() -> Iterator[tuple[str, Callable[[], System]]]:
     """All of them by name, made when they are wanted."""
     for years in (100.0, 1000.0):
-        yield f"ten bodies, {years:g} yr", lambda years=years: by_reference(solar_system(years=years))
+        yield f"ten bodies, {years:g} yr", partial(_solar, years)
     for name in ("resonant chain", "e = .6", "hot Jupiter"):
         yield name, partial(exoplanets, name)
     for name in SCENES:
         if name != "kepler-0.999":  # a million steps
-            yield name, lambda name=name: by_reference(replace(scene(name).problem, h=None))
+            yield name, partial(_scene, name)
     for case in hard_cases():
         if is_second_order(case.problem):
-            yield case.name, lambda case=case: System(case.problem, case.error, natively=False)
+            yield case.name, partial(System, case.problem, case.error, natively=False)
+
+
+def _solar(years: float) -> System:
+    return by_reference(solar_system(years=years))
+
+
+def _scene(name: str) -> System:
+    return by_reference(replace(scene(name).problem, h=None))
 
 
 def exoplanets(name: str) -> System:
-    """One of the benchmark's systems."""
+    """Return a system of `exoplanets`."""
     from .exoplanets import SYSTEMS
-    from .relativity import C, reference
+    from .relativity import reference, speed_of_light
 
     problem, _, relativity, *_ = SYSTEMS[name](0.2)
+    assert problem.params is not None
     gm, half = problem.params[: problem.y0.size // 6], problem.y0.size // 2
-    end = reference(gm, problem.y0, problem.t_span[1], C if relativity else None)
+    end = reference(gm, problem.y0, problem.t_span[1], speed_of_light if relativity else None)
     return System(problem, lambda y: float(np.max(np.abs(y[:half] - end))))
 
 
 def is_second_order(problem: Problem) -> bool:
-    """Whether a hard case is q'' = a(t, q)."""
+    """Return whether a hard case is q'' = a(t, q)."""
     t, y = problem.t_span[0], np.asarray(problem.y0)
+    n = y.size // 2
     if y.dtype.kind == "c" or y.size % 2:
         return False
-    try:
-        return not depends_on_velocity(problem.fun, t, y, problem.fun(t, y), "")
-    except ValueError:  # the first half of its derivative is not the second half of the state
-        return False
+    rng = np.random.default_rng(1)
+    turned = np.concatenate([y[:n], y[n:] * (1 + 0.1 * rng.standard_normal(n)) + 0.1 * rng.standard_normal(n)])
+    f, other = problem.fun(t, y), problem.fun(t, turned)
+    return bool(
+        np.array_equal(f[:n], y[n:]) and np.array_equal(other[:n], turned[n:]) and np.array_equal(f[n:], other[n:])
+    )
 
 
 class Run(NamedTuple):
@@ -118,17 +128,15 @@ class Run(NamedTuple):
     trusted: bool
 
 
-def one(system: System, method: type[EIPSolver], options: dict[str, Any], rows: bool = True) -> Run:
+def run_one(system: System, method: type[EIPSolver], options: dict[str, Any], rows: bool = True) -> Run:
     """One run; its time is the processor's for a run without the rows that show the drift."""
     steps = options.get("save_every", 1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ProjectionWarning)
         run = integrate(system.problem, method=method, **options | ({"save_every": steps} if rows else {}))
-        wall = math.inf
-        for _ in range(REPEATS if system.natively and rows else 0):
-            begin = time.process_time()
-            integrate(system.problem, method=method, **options | {"save_every": None})
-            wall = min(wall, time.process_time() - begin)
+        again = partial(integrate, system.problem, method=method, **options | {"save_every": None})
+        turns = REPEATS if system.natively and rows else 0
+        wall = least({"": clocked(again, time.process_time)}, turns=turns)[""]
     error = system.error(run.y[:, -1]) if run.success else math.nan
     values = run.invariants
     sizes = np.maximum(np.abs(values[:, 0]), 1e-3 * np.abs(values[:, 0]).max(initial=0.0))[:, None]
@@ -141,7 +149,7 @@ def steps(system: System) -> list[int]:
     found, n, left = list[int](), 8, list(LEVELS)
     span = abs(system.problem.t_span[1] - system.problem.t_span[0])
     while left and n < (MOST_STEPS if system.natively else MOST_STEPS // 8):
-        error = one(system, EIPRKN12, {"h": span / n, "every": 1, "compensated": False}, rows=False).error
+        error = run_one(system, EIPRKN12, {"h": span / n, "every": 1, "compensated": False}, rows=False).error
         if error < left[0]:
             found.append(n)
             while left and error < left[0]:
@@ -171,7 +179,7 @@ def rows(name: str, make: Callable[[], System]) -> Iterator[dict[str, Any]]:
     for setting, options in settings(system):
         for method in (EIPRKN8, EIPRKN12):
             # In turns, for the machine may have other work to do.
-            runs = [{way: one(system, method, o | more) for way, more in WAYS.items()} for o in options]
+            runs = [{way: run_one(system, method, o | more) for way, more in WAYS.items()} for o in options]
             for way in WAYS:
                 own = [turn[way] for turn in runs]
                 yield {
@@ -189,35 +197,32 @@ def rows(name: str, make: Callable[[], System]) -> Iterator[dict[str, Any]]:
                 }
 
 
-def show(found: list[dict[str, Any]]) -> None:
-    """A line for each setting: errors and changes of each way, times over the first way's."""
-    print(f"{'':48}" + "".join(f"{way:>31}" for way in WAYS))
-    print(f"{'':48}" + f"{'error':>11}{'drift':>9}{'time':>6}{'bad':>5}" * len(WAYS))
-    for k in range(0, len(found), len(WAYS)):
-        group = found[k : k + len(WAYS)]
-        line = f"{group[0]['system']:22}{group[0]['method']:10}{group[0]['setting']:16}"
-        for row in group:
-            ratio = row["time"] / group[0]["time"] if row["natively"] else row["nfev"] / group[0]["nfev"]
-            line += f"{row['error']:11.1e}{row['drift']:9.1e}{ratio:6.2f}{row['untrusted']:5d}"
-        print(line, flush=True)
+@dataclass(frozen=True, kw_only=True)
+class NystromDefaults(Measurement[list[dict[str, Any]]]):
+    """The command."""
 
+    system: list[str] | None = option(
+        None, "one system, may be repeated; default: all", action="append", metavar="NAME"
+    )
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--system", action="append", metavar="NAME")
-    parser.add_argument("--json", metavar="FILE")
-    args = parser.parse_args()
-    print(describe_machine())
-    found: list[dict[str, Any]] = []
-    for name, make in systems():
-        if not args.system or name in args.system:
-            own = list(rows(name, make))
-            show(own)
-            found += own
-    if args.json:
-        with open(args.json, "w") as file:
-            json.dump({"machine": describe_machine(), "rows": found}, file, indent=1)
+    def measure(self, session: Session) -> list[dict[str, Any]]:
+        chosen = {name: make for name, make in systems() if not self.system or name in self.system}
+        found: list[dict[str, Any]] = []
+        with session.bar(len(chosen), "nystrom-defaults", "system") as bar:
+            for name, make in chosen.items():
+                found += rows(name, make)
+                bar.update()
+        return found
 
-
-if __name__ == "__main__":
-    main()
+    def table(self, found: list[dict[str, Any]]) -> str:
+        """Lay out errors and changes of each way, times over the first way's, and how many runs are not trusted."""
+        heads = [[way if what == "error" else "", what] for way in WAYS for what in ("error", "drift", "time", "bad")]
+        body = []
+        for k in range(0, len(found), len(WAYS)):
+            group, cells = found[k : k + len(WAYS)], []
+            for row in group:
+                cost = "time" if row["natively"] else "nfev"
+                ratio = row[cost] / group[0][cost]
+                cells += [f"{row['error']:.1e}", f"{row['drift']:.1e}", f"{ratio:.2f}", str(row["untrusted"])]
+            body.append((", ".join(group[0][key] for key in ("system", "method", "setting")), cells))
+        return table(heads, body)

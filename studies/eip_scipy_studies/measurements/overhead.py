@@ -1,23 +1,26 @@
-"""What an EIP class costs in solve_ivp beside SciPy's own, per step on the same right-hand side.
+"""``eip-scipy study overhead``: cost of an EIP class in solve_ivp beside SciPy's own class, per step.
 
-    python -m eip_scipy_studies.measurements.overhead [--pairs 15] [--json FILE]
-
-Kepler's problem in plain NumPy, e = .6, two invariants (H, L) with analytic gradients; medians of paired runs, each
-class in turn with SciPy's, so that a machine whose speed drifts does not decide. Beside the median of the ratios stands
-the ratio of the least times, which other load on the machine hardly touches.
+Kepler's problem in plain NumPy, e = 0.6, two invariants (H, L) with analytic gradients; medians of paired runs, each
+class in turn with SciPy's on the same right-hand side, so that a machine whose speed drifts does not decide. Beside the
+median of the ratios stands the ratio of the least times, which other load on the machine hardly touches.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import time
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, Invariant
+
+from ..report import table
+from ..study import Measurement, Session, option
+
+__all__ = ["Overhead"]
 
 SPAN = (0.0, 60.0)
 Y0 = np.array([0.4, 0.0, 0.0, 2.0])
@@ -48,10 +51,10 @@ def momentum_gradient(t, y):
 
 
 BOTH = [Invariant(energy, energy_gradient, name="H"), Invariant(momentum, momentum_gradient, name="L")]
-TOLERANCES = {"rtol": 1e-6, "atol": 1e-9}
+TOLERANCES: dict[str, float] = {"rtol": 1e-6, "atol": 1e-9}
 STEPS = solve_ivp(fun, SPAN, Y0, **TOLERANCES).t.size - 1  # with RK45; the projection does not change their number
 SAMPLES = np.linspace(*SPAN, 10 * STEPS)
-CASES = {
+CASES: dict[str, dict[str, Any]] = {
     "EIPRK4, h = .03, H and L": {"method": EIPRK4, "h": 0.03, "invariants": BOTH},
     "EIPRK23, H and L": {"method": EIPRK23, "invariants": BOTH, **TOLERANCES},
     "EIPRK45, H and L": {"method": EIPRK45, "invariants": BOTH, **TOLERANCES},
@@ -66,41 +69,46 @@ CASES = {
 PEERS = {EIPRK4: "RK45", EIPRK45: "RK45", EIPRK23: "RK23", EIPDOP853: "DOP853"}
 
 
-def per_step(options) -> float:
+def per_step(options: dict[str, Any]) -> float:
+    """Return the seconds of one step."""
     begin = time.perf_counter()
     solution = solve_ivp(fun, SPAN, Y0, **options)
     steps = STEPS if "t_eval" in options else solution.t.size - 1
     return (time.perf_counter() - begin) / steps
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pairs", type=int, default=15, metavar="N", help="of runs (%(default)s)")
-    parser.add_argument("--json", metavar="FILE")
-    arguments = parser.parse_args()
-    results = {}
-    for name, options in CASES.items():
-        peer = {"method": PEERS[options["method"]], **TOLERANCES}
-        if "t_eval" in options:
-            peer["t_eval"] = options["t_eval"]
-        per_step(options), per_step(peer)
-        pairs = np.array([(per_step(options), per_step(peer)) for _ in range(arguments.pairs)])
-        ours, theirs = np.median(pairs, axis=0)
-        ratio, least = float(np.median(pairs[:, 0] / pairs[:, 1])), float(np.divide(*pairs.min(axis=0)))
-        results[name] = {
-            "us per step": 1e6 * ours,
-            f"{peer['method']} us per step": 1e6 * theirs,
-            "ratio": ratio,
-            "ratio of the least": least,
-        }
-        print(
-            f"{name:36} {1e6 * ours:7.1f} us   SciPy's {peer['method']:7}{1e6 * theirs:7.1f} us   ratio {ratio:5.2f}"
-            f", of the least {least:5.2f}"
+@dataclass(frozen=True, kw_only=True)
+class Overhead(Measurement[dict[str, dict[str, Any]]]):
+    """The command."""
+
+    pairs: int = option(15, "pairs of runs (%(default)s)", type=int, metavar="N")
+
+    def measure(self, session: Session) -> dict[str, dict[str, Any]]:
+        found = {}
+        with session.bar(len(CASES), "overhead", "class") as bar:
+            for name, options in CASES.items():
+                peer: dict[str, Any] = {"method": PEERS[options["method"]], **TOLERANCES}
+                if "t_eval" in options:
+                    peer["t_eval"] = options["t_eval"]
+                per_step(options), per_step(peer)
+                pairs = np.array([(per_step(options), per_step(peer)) for _ in range(self.pairs)])
+                ours, theirs = 1e6 * np.median(pairs, axis=0)
+                found[name] = {
+                    "us per step": ours,
+                    "peer": peer["method"],
+                    "peer's us per step": theirs,
+                    "ratio": float(np.median(pairs[:, 0] / pairs[:, 1])),
+                    "ratio of the least": float(np.divide(*pairs.min(axis=0))),
+                }
+                bar.update()
+        return found
+
+    def table(self, found: dict[str, dict[str, Any]]) -> str:
+        forms = (".1f", "", ".1f", ".2f", ".2f")
+        body = [
+            (name, [f"{value:{form}}" for value, form in zip(row.values(), forms, strict=True)])
+            for name, row in found.items()
+        ]
+        return table(
+            [["us per", "step"], ["SciPy's", ""], ["us per", "step"], ["ratio", ""], ["of the", "least"]], body
         )
-    if arguments.json:
-        with open(arguments.json, "w") as file:
-            json.dump(results, file, indent=1)
-
-
-if __name__ == "__main__":
-    main()

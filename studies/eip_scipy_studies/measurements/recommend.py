@@ -1,28 +1,29 @@
-"""How well `recommend` does on the 35 hard cases: wanted, expected and true error of the recommended run.
+"""``eip-scipy study recommend``: how well `recommend` does on the 35 hard cases.
 
-    python -m eip_scipy_studies.measurements.recommend [--errors 1e-6 ...] [--json FILE]
-
-The true error is that of `recommendation.run()` against the exact final state. Two counts: true errors between a tenth
-of the wanted one and ten times it, and those that are at most ten times it. Times: of the search, and of the run.
+Wanted, expected and true error of the recommended run; the true one is that of `recommendation.run()` against the exact
+final state. Two counts: true errors between a tenth of the wanted one and ten times it, and those that are at most ten
+times it. Times: of the search, and of the run.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 from eip_scipy import recommend
 
-from ..hard_cases import hard_cases
+from ..hard_cases import HardCase, hard_cases
+from ..report import table
+from ..study import Measurement, Session, option
+
+__all__ = ["Recommended"]
 
 FACTOR = 10.0
-HEAD = (
-    f"{'case':<21} {'wanted':>7} {'expected':>9} {'true':>9} {'true/wanted':>11} {'nfev':>7} {'search':>8} {'run':>7}"
-)
 
 
-def measure(case, wanted: float) -> dict:
+def recommended(case: HardCase, wanted: float) -> dict[str, Any]:
     start = time.perf_counter()
     choice = recommend(case.problem, error=wanted)
     searched = time.perf_counter()
@@ -43,53 +44,61 @@ def measure(case, wanted: float) -> dict:
     }
 
 
-def line(row: dict) -> str:
-    told = ", ".join(
-        f"{k}={v:g}" if isinstance(v, float) else f"{k}={v}"
-        for k, v in row["options"].items()
-        if k not in ("atol", "compensated")
-    )
-    return (
-        f"{row['case']:<21} {row['wanted']:7.0e} {row['expected']:9.1e} {row['true']:9.1e} "
-        f"{row['true'] / row['wanted']:11.2f} {row['nfev']:7d} {row['search_seconds']:6.2f} s "
-        f"{row['run_seconds']:5.2f} s  {row['method']} {told}{'' if row['trusted'] else '  NOT TRUSTED'}"
-    )
+@dataclass(frozen=True, kw_only=True)
+class Recommended(Measurement[list[dict[str, Any]]]):
+    """The command."""
+
+    errors: Sequence[float] = option((1e-6,), "wanted errors", type=float, nargs="+")
+    cases: Sequence[str] | None = option(None, "names of some cases", nargs="+", metavar="NAME")
+
+    def measure(self, session: Session) -> list[dict[str, Any]]:
+        found, cases = [], hard_cases(self.cases)
+        with session.bar(len(self.errors) * len(cases), "recommend", "case") as bar:
+            for wanted in self.errors:
+                for case in cases:
+                    try:
+                        found.append(recommended(case, wanted))
+                    except ValueError as error:
+                        found.append({"case": case.name, "wanted": wanted, "failed": str(error)})
+                    bar.update()
+        return found
+
+    def table(self, found: list[dict[str, Any]]) -> str:
+        return "\n\n".join(self._table([row for row in found if row["wanted"] == wanted]) for wanted in self.errors)
+
+    @staticmethod
+    def _table(found: list[dict[str, Any]]) -> str:
+        done, wanted = [row for row in found if "failed" not in row], found[0]["wanted"]
+        heads = [
+            ["wanted"],
+            ["expected"],
+            ["true"],
+            ["true /", "wanted"],
+            ["nfev"],
+            ["search", "[s]"],
+            ["run [s]"],
+            [""],
+        ]
+        lines = [table(heads, [(row["case"], cells(row)) for row in done])] if done else []
+        lines += [f"{row['case']}: {row['failed']}" for row in found if "failed" in row]
+        both = sum(1 / FACTOR <= row["true"] / wanted <= FACTOR for row in done)
+        above = sum(row["true"] <= FACTOR * wanted for row in done)
+        expected = sum(1 / FACTOR <= row["true"] / row["expected"] <= FACTOR for row in done)
+        searches, runs = (sum(row[key] for row in done) for key in ("search_seconds", "run_seconds"))
+        lines += [
+            f"wanted {wanted:g}, {len(found)} cases: true error within a factor of {FACTOR:g} of the wanted one in "
+            f"{both}, at most {FACTOR:g} times it in {above}; within that factor of the expected one in {expected}",
+            f"{searches:.0f} s for the searches, {runs:.1f} s for the runs",
+        ]
+        return "\n".join(lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--errors", type=float, nargs="+", default=[1e-6])
-    parser.add_argument("--cases", nargs="+", help="names of some")
-    parser.add_argument("--json", help="write the numbers to this file")
-    arguments = parser.parse_args()
-    rows = []
-    for wanted in arguments.errors:
-        print(HEAD)
-        found = []
-        cases = hard_cases(arguments.cases)
-        for case in cases:
-            try:
-                found.append(measure(case, wanted))
-            except ValueError as error:
-                print(f"{case.name:<21} {wanted:7.0e} {error}")
-                continue
-            print(line(found[-1]), flush=True)
-        both = sum(1 / FACTOR <= row["true"] / wanted <= FACTOR for row in found)
-        above = sum(row["true"] <= FACTOR * wanted for row in found)
-        expected = sum(1 / FACTOR <= row["true"] / row["expected"] <= FACTOR for row in found)
-        print(
-            f"wanted {wanted:g}, {len(cases)} cases: true error within a factor of {FACTOR:g} of the wanted one in "
-            f"{both}, at most {FACTOR:g} times it in {above}; within that factor of the expected one in {expected}"
-        )
-        print(
-            f"in all {sum(row['search_seconds'] for row in found):.0f} s for the searches, "
-            f"{sum(row['run_seconds'] for row in found):.1f} s for the runs\n"
-        )
-        rows += found
-    if arguments.json:
-        with open(arguments.json, "w", encoding="utf-8") as file:
-            json.dump(rows, file, indent=1)
-
-
-if __name__ == "__main__":
-    main()
+def cells(row: dict[str, Any]) -> list[str]:
+    """Lay out one case."""
+    shown = {key: value for key, value in row["options"].items() if key not in ("atol", "compensated")}
+    options = ", ".join(f"{k}={v:g}" if isinstance(v, float) else f"{k}={v}" for k, v in shown.items())
+    return [
+        f"{row['wanted']:.0e}", f"{row['expected']:.1e}", f"{row['true']:.1e}", f"{row['true'] / row['wanted']:.2f}",
+        str(row["nfev"]), f"{row['search_seconds']:.2f}", f"{row['run_seconds']:.2f}",
+        f"{row['method']} {options}{'' if row['trusted'] else '  NOT TRUSTED'}",
+    ]  # fmt: skip

@@ -1,36 +1,33 @@
-"""The paper's ring on several grids: what the grid's own error is, beside that of the steps.
-
-    python -m eip_scipy_studies.measurements.ring_grids [--points N ...] [--t-end T] [--start FILE] [--csv FILE] [--quick]
+"""``eip-scipy study ring-grids``: the paper's ring on several grids, the grid's own error beside that of the steps.
 
 All runs start from the ground state for kappa = 0.3 on the paper's 256 x 256 points, by its Fourier modes, in the trap
 of kappa = 0.7. They are splittings of order 4 with both invariants kept, in the frame at rest; the last one is what
-`eip-scipy gpe ring` does, RK4 in the rotating frame on 256 x 256 points. Error: the norm of the
-difference from the finest grid's field, modes that a grid lacks included. Edge: the largest amplitude among the modes
-with one of the three highest wavenumbers, as a part of the largest of all.
+`eip-scipy gpe ring` does, RK4 in the rotating frame on 256 x 256 points. Error: the norm of the difference from the
+finest grid's field, modes that a grid lacks included. Edge: the largest amplitude among the modes with one of the three
+highest wavenumbers, as a part of the largest of all.
 """
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.signal import resample
 
 from eip_scipy import EIPRK4, eip_method, integrate
 from eip_scipy.problems import Splitting
-from eip_scipy.problems.gross_pitaevskii import (
-    at_rest,
-    ground_state,
-    ring_condensate,
-    ring_start,
-    rotated,
-)
+from eip_scipy.problems.gross_pitaevskii import at_rest, ground_state, ring_condensate, ring_start, rotated
 
 from ..condensates.ring import Ring
 from ..condensates.runs import motion
 from ..condensates.states import load_state
-from ..report import describe_machine, table, write_csv
+from ..report import table
+from ..study import Measurement, Rows, Session, option
+
+__all__ = ["RingGrids"]
 
 START_POINTS, TOLERANCE = 256, 1e-8  # of the ground state
 SPLITTING_STEP = 1.25e-3
@@ -54,15 +51,17 @@ def edge(field):
     return float(max(highest) / amplitude.max())
 
 
-class Run:
+class GridRun:
     """A run's fields at the snapshots in the frame at rest, and its vortices seen from the rotating one."""
 
-    def __init__(self, psi, points, t_end, *, turning=False):
+    def __init__(self, psi, points, t_end, *, shown, turning=False):
         gpe = ring_condensate(RING.kappas[1], points=points)
         problem = gpe.problem(on_grid(psi, points), t_end, RING.step if turning else SPLITTING_STEP)
         problem = problem if turning else at_rest(problem)
+        assert problem.equation is not None
+        assert problem.h is not None
         method = EIPRK4 if turning else eip_method(Splitting(problem.equation))
-        result = integrate(problem, method=method, save_every=round(RING.saved / problem.h), progress=True)
+        result = integrate(problem, method=method, save_every=round(RING.saved / problem.h), progress=shown)
         self.label = f"{points} x {points}, {'turning, RK4' if turning else 'at rest, splitting'}"
         self.wall_time = result.wall_time
         # The phases of a field at rest are those of the turning one at turned points: vortices are found in either.
@@ -83,40 +82,47 @@ class Run:
         return [float(np.sqrt(cell) * np.linalg.norm(on_grid(a, len(b)) - b)) for a, b in pairs]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--points", type=int, nargs="+", default=[192, 256, 384, 512], help="the last is the finest")
-    parser.add_argument("--t-end", type=float, default=1.0)
-    parser.add_argument("--start", type=Path, help="ring.npz of `eip-scipy gpe ground-state`")
-    parser.add_argument("--csv", type=Path)
-    parser.add_argument("--quick", action="store_true", help="a rough start on few points, two grids, a short interval")
-    arguments = parser.parse_args()
-    start, tolerance = START_POINTS, TOLERANCE
-    if arguments.quick:
-        start, tolerance, arguments.points, arguments.t_end = 64, 1e-2, [64, 96], RING.saved
-    psi = ground(arguments.start, start, tolerance)
-    runs = [Run(psi, points, arguments.t_end) for points in sorted(arguments.points)]
-    fine = runs[-1]
-    runs.append(Run(psi, start, arguments.t_end, turning=True))
-    print(describe_machine())
-    rows = [
-        {"run": run.label, "t": t, "error": error, "edge": edge(field), "vortices": count, "turned": turned}
-        for run in runs
-        for t, error, field, count, turned in zip(
-            run.times, run.errors(fine), run.fields, run.counts, run.turned, strict=True
-        )
-    ]
-    for run in runs:
-        body = [
-            (f"t = {r['t']:.2f}", [f"{r['error']:.1e}", f"{r['edge']:.1e}", str(r["vortices"]), f"{r['turned']:+.3f}"])
-            for r in rows
-            if r["run"] == run.label
-        ]
-        head = [["error of psi"], ["edge"], ["vortices"], ["turned [rad]"]]
-        print(f"\n{run.label}, {run.wall_time:.0f} s\n{table(head, body)}")
-    if arguments.csv:
-        print(f"\nwrote {write_csv(arguments.csv, rows)}")
+@dataclass(frozen=True, kw_only=True)
+class RingGrids(Measurement[list[dict[str, Any]]]):
+    """The command."""
 
+    writes_files = True
+    points: Sequence[int] = option((192, 256, 384, 512), "points along each axis of the grids", type=int, nargs="+")
+    t_end: float = option(1.0, "end of the runs (%(default)s)", type=float)
+    start: Path | None = option(None, "ring.npz of `eip-scipy gpe ground-state`", type=Path, metavar="FILE")
+    quick: bool = option(False, "a rough start on few points, two grids, a short interval")
 
-if __name__ == "__main__":
-    main()
+    def measure(self, session: Session) -> list[dict[str, Any]]:
+        start, tolerance, points, t_end = START_POINTS, TOLERANCE, self.points, self.t_end
+        if self.quick:
+            start, tolerance, points, t_end = 64, 1e-2, (64, 96), RING.saved
+        psi = ground(self.start, start, tolerance)
+        runs = [GridRun(psi, count, t_end, shown=session.shown) for count in sorted(points)]
+        fine = runs[-1]
+        runs.append(GridRun(psi, start, t_end, shown=session.shown, turning=True))
+        return [
+            {"run": run.label, "seconds": run.wall_time, "t": t, "error": error, "edge": edge(field),
+             "vortices": count, "turned": turned}
+            for run in runs
+            for t, error, field, count, turned in zip(
+                run.times, run.errors(fine), run.fields, run.counts, run.turned, strict=True
+            )
+        ]  # fmt: skip
+
+    def table(self, found: list[dict[str, Any]]) -> str:
+        parts = []
+        for label in dict.fromkeys(row["run"] for row in found):
+            own = [row for row in found if row["run"] == label]
+            body = [
+                (
+                    f"t = {r['t']:.2f}",
+                    [f"{r['error']:.1e}", f"{r['edge']:.1e}", str(r["vortices"]), f"{r['turned']:+.3f}"],
+                )
+                for r in own
+            ]
+            head = [["error of psi"], ["edge"], ["vortices"], ["turned [rad]"]]
+            parts.append(f"{label}, {own[0]['seconds']:.0f} s\n{table(head, body)}")
+        return "\n\n".join(parts)
+
+    def tables(self, found: list[dict[str, Any]]) -> dict[str, Rows]:
+        return {"ring-grids.csv": found}

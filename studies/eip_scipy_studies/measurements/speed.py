@@ -1,6 +1,4 @@
-"""Speed of the step, as ratios measured in one run on one core.
-
-    python -m eip_scipy_studies.measurements.speed [--quick] [--json FILE]
+"""``eip-scipy study speed``: speed of the step, as ratios measured in one run on one core.
 
 1. Compiled Kepler EIP-RK4 with H and L against a loop in which the same step (stages, metric, projection) is fused by
    hand for this one problem; per step also against solve_ivp with SciPy's RK45, and so EIP-RK45 with adaptive steps.
@@ -12,14 +10,13 @@
 
 from __future__ import annotations
 
-import argparse
-import json
-import platform
 import subprocess
 import sys
-import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from math import sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -27,9 +24,13 @@ from scipy.integrate import solve_ivp
 from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
 from eip_scipy.problems import kepler, solar_system
 
-from .installed import peer
+from ..report import needed, table
+from ..study import Measurement, Session, option
+from ..timing import clocked, least
 
-njit = peer("numba", '"eip_scipy[numba]"').njit
+__all__ = ["Speed"]
+
+njit = needed("numba", '"eip_scipy[numba]"').njit
 
 
 class Turns(NamedTuple):
@@ -148,43 +149,25 @@ def fused(a, b, c, d, h, steps, energy0, momentum0, error_metric):
     return a, b, c, d, worst
 
 
-def least(action, calls: int) -> float:
-    """Least wall time in seconds of several calls, after one that is not counted."""
-    action()
-    best = np.inf
-    for _ in range(calls):
-        begin = time.perf_counter()
-        action()
-        best = min(best, time.perf_counter() - begin)
-    return best
-
-
-def per_step(seconds, runs: int, steps: int = STEPS) -> float:
+def per_step(seconds: Callable[[int], float], runs: int, steps: int = STEPS) -> float:
     """Seconds of one step, without what a run begins with: from the least times of runs of two lengths.
 
     ``seconds(n)`` is the time of a run of n steps.
     """
     few = steps // 5
-    short = long = np.inf
-    for _ in range(runs):
-        short, long = min(short, seconds(few)), min(long, seconds(steps))
-    return (long - short) / (steps - few)
+    best = least({n: partial(seconds, n) for n in (few, steps)}, turns=runs)
+    return (best[steps] - best[few]) / (steps - few)
 
 
-def of_integrate(h: float, **arguments):
+def call_time(action: Callable[[], Any], calls: int) -> float:
+    """Return the least wall time of several calls, after one that is not counted."""
+    action()
+    return least({"": clocked(action)}, turns=calls)[""]
+
+
+def of_integrate(h: float, **arguments: Any) -> Callable[[int], float]:
     """The time of a run of n steps, without what comes before them."""
     return lambda n: integrate(t_span=(0.0, n * h), h=h, **arguments).wall_time
-
-
-def of_call(action):
-    """The time of a call that takes how many steps there are."""
-
-    def seconds(n: int) -> float:
-        begin = time.perf_counter()
-        action(n)
-        return time.perf_counter() - begin
-
-    return seconds
 
 
 def kepler_speed(turns: Turns) -> dict[str, float]:
@@ -192,10 +175,14 @@ def kepler_speed(turns: Turns) -> dict[str, float]:
     y0 = problem.y0
     targets = [energy(0.0, y0), momentum(0.0, y0)]
     arrays = [Invariant(energy, energy_gradient, name="H"), Invariant(momentum, momentum_gradient, name="L")]
-    own = {"fun": kepler_array, "y0": y0, "method": EIPRK4, "invariants": arrays, "compiled": True}
+    own: dict[str, Any] = {"fun": kepler_array, "y0": y0, "method": EIPRK4, "invariants": arrays, "compiled": True}
     out = {}
+
+    def hand_fused(error_metric: bool, n: int) -> float:
+        return clocked(lambda: fused(*y0, H, n, *targets, error_metric))()
+
     for metric in ("euclidean", "error"):
-        hand = per_step(of_call(lambda n, metric=metric: fused(*y0, H, n, *targets, metric == "error")), turns.runs)
+        hand = per_step(partial(hand_fused, metric == "error"), turns.runs)
         in_place = per_step(of_integrate(H, fun=problem, method=EIPRK4, metric=metric), turns.runs)
         array = per_step(of_integrate(H, **own, metric=metric), turns.runs)
         out[f"{metric}: hand-fused loop [us/step]"] = 1e6 * hand
@@ -203,13 +190,13 @@ def kepler_speed(turns: Turns) -> dict[str, float]:
         out[f"{metric}: array-returning / hand-fused"] = array / hand
         out[f"{metric}: in place [us/step]"] = 1e6 * in_place
     solution = solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9)
-    scipy_call = least(lambda: solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9), turns.calls)
+    scipy_call = call_time(lambda: solve_ivp(kepler_array, (0, 60), y0, rtol=1e-6, atol=1e-9), turns.calls)
     scipy_step = scipy_call / (solution.t.size - 1)
-    adaptive = {**own, "t_span": (0, 600), "method": EIPRK45, "rtol": 1e-6, "atol": 1e-9}
+    adaptive: dict[str, Any] = {**own, "t_span": (0, 600), "method": EIPRK45, "rtol": 1e-6, "atol": 1e-9}
     steps = integrate(**adaptive, save_every=1).t.size - 1
     adaptive_step = min(integrate(**adaptive).wall_time for _ in range(turns.runs)) / steps
-    options = {"method": EIPRK4, "h": H, "invariants": arrays}
-    fixed = least(lambda: solve_ivp(kepler_array, (0, 60), y0, **options), turns.calls) / round(60 / H)
+    options: dict[str, Any] = {"method": EIPRK4, "h": H, "invariants": arrays}
+    fixed = call_time(lambda: solve_ivp(kepler_array, (0, 60), y0, **options), turns.calls) / round(60 / H)
     out["solve_ivp RK45 [us/step]"] = 1e6 * scipy_step
     out["solve_ivp EIPRK4 with H and L [us/step]"] = 1e6 * fixed
     out["solve_ivp RK45 / compiled EIPRK4 (array-returning), per step"] = scipy_step / array
@@ -220,7 +207,8 @@ def kepler_speed(turns: Turns) -> dict[str, float]:
 
 def solar_speed(turns: Turns) -> dict[str, float]:
     problem = solar_system()
-    run = {"fun": problem, "method": EIPRK4}
+    assert problem.h is not None
+    run: dict[str, Any] = {"fun": problem, "method": EIPRK4}
     plain = per_step(of_integrate(problem.h, **run, invariants=()), turns.runs, 4000)
     eip = per_step(of_integrate(problem.h, **run), turns.runs, 4000)
     return {
@@ -239,11 +227,13 @@ def sampling_speed(turns: Turns) -> dict[str, float]:
     problem = kepler(relativistic=MU)
     short, long = (0.0, 300.0), (0.0, 5100.0)
     times = np.linspace(*short, 3001)
-    found = integrate(problem, long, method=EIPRK4, h=H, events=crossing).t_events[0].size
-    every = least(lambda: integrate(problem, short, method=EIPRK4, h=H, save_every=1), turns.calls)
-    sampled = least(lambda: integrate(problem, short, method=EIPRK4, h=H, t_eval=times), turns.calls)
-    plain = least(lambda: integrate(problem, long, method=EIPRK4, h=H), turns.calls)
-    section = least(lambda: integrate(problem, long, method=EIPRK4, h=H, events=crossing), turns.calls)
+    crossings = integrate(problem, long, method=EIPRK4, h=H, events=crossing).t_events
+    assert crossings is not None
+    found = crossings[0].size
+    every = call_time(lambda: integrate(problem, short, method=EIPRK4, h=H, save_every=1), turns.calls)
+    sampled = call_time(lambda: integrate(problem, short, method=EIPRK4, h=H, t_eval=times), turns.calls)
+    plain = call_time(lambda: integrate(problem, long, method=EIPRK4, h=H), turns.calls)
+    section = call_time(lambda: integrate(problem, long, method=EIPRK4, h=H, events=crossing), turns.calls)
     return {
         "3001 times in t_eval / save_every=1": sampled / every,
         f"section of {found} crossings / run without": section / plain,
@@ -285,26 +275,20 @@ def process_times(turns: Turns) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="each once")
-    parser.add_argument("--json", metavar="FILE")
-    arguments = parser.parse_args()
-    turns = QUICK if arguments.quick else Turns()
-    results: dict[str, float] = {}
-    for measure in (kepler_speed, solar_speed, sampling_speed, process_times):
-        results |= measure(turns)
-    width = max(map(len, results))
-    print(
-        f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, "
-        f"least of {turns.runs} short runs"
-    )
-    for name, value in results.items():
-        print(f"{name:<{width}}  {value:8.3f}")
-    if arguments.json:
-        with open(arguments.json, "w") as file:
-            json.dump(results, file, indent=1)
+@dataclass(frozen=True, kw_only=True)
+class Speed(Measurement[dict[str, float]]):
+    """The command."""
 
+    quick: bool = option(False, "each once")
 
-if __name__ == "__main__":
-    main()
+    def measure(self, session: Session) -> dict[str, float]:
+        turns = QUICK if self.quick else Turns()
+        found: dict[str, float] = {}
+        with session.bar(4, "speed", "part") as bar:
+            for part in (kepler_speed, solar_speed, sampling_speed, process_times):
+                found |= part(turns)
+                bar.update()
+        return found
+
+    def table(self, found: dict[str, float]) -> str:
+        return table([[""]], [(name, [f"{value:.3f}"]) for name, value in found.items()])

@@ -1,48 +1,42 @@
-"""Are sick runs told, and healthy ones left in peace? The runs are in trust_runs/.
+"""``eip-scipy study trust``: whether faulty runs are reported, and correct ones are not. The runs are in trust_runs/.
 
-    python -m eip_scipy_studies.measurements.trust [--only TEXT] [--workers 2] [--markdown FILE] [--csv FILE] [--json FILE]
+Faulty runs: quantities that are no invariants (their rate 0 at the start, or not), leaks, leaks that start late or act
+in places, wrong gradients, steps too long, light bodies, passages that blow up, members of ensembles; by all methods,
+fixed and adaptive, solve_ivp and integrate, compiled and interpreted, real and complex. A run is reported by ValueError
+or UserWarning at the start, by ProjectionWarning, status -1, or `trusted` false. Its error is that of the last state,
+relative to its largest component.
 
-Sick runs: quantities that are no invariants (their rate 0 at the start, or not), leaks, leaks that start late or act in
-places, wrong gradients, steps too long, light bodies, passages that blow up, members of ensembles; by all methods,
-fixed and adaptive, solve_ivp and integrate, compiled and interpreted, real and complex. Told means: ValueError or
-UserWarning at the start, ProjectionWarning, status -1, or `trusted` false. Their error is that of the last
-state, relative to its largest component.
+Correct runs: each is compared with the same run without invariants; one whose error is over ten times the other's, and
+above the tolerance, would not be a correct one. Any report is a false alarm there.
 
-Healthy runs: each is compared with the same run without invariants; one whose error is over ten times the other's, and
-above the tolerance, would be no healthy one. Anything told is a false alarm there.
-
-Exit status 1 when less than 95 % of the sick runs are told, or more than 1 % of the healthy ones.
+Exit status 1 if less than 95 % of the faulty runs are reported, or more than 1 % of the correct ones.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import sys
 import time
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
-from multiprocessing import get_context
-from pathlib import Path
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from ..report import describe_machine, write_csv
+from ..beside import workers
+from ..report import cores
+from ..study import Check, Figures, Measurement, Rows, Session, option
 from .trust_runs.healthy import healthy_runs
 from .trust_runs.late import LATE
 from .trust_runs.record import CHANNELS, SILENT, Outcome, Run, carry_out, carry_out_plain
 from .trust_runs.sick import sick_runs
+
+__all__ = ["Trust"]
 
 LEAST_TOLD, MOST_ALARMS = 0.95, 0.01
 SPOILT, TOLERANCE = 10.0, 1e3  # times the error without projection; times rtol
 CHUNK = 8
 
 
-def measure(numbers: list[int]) -> list[dict[str, Any]]:
+def carried_out(numbers: list[int]) -> list[dict[str, Any]]:
     """The runs of these numbers, as plain data."""
     every = all_runs()
     return [record(every[number]) for number in numbers]
@@ -126,54 +120,65 @@ def markdown(table: list[list[str]]) -> str:
     return "\n".join([lines[0], rule, *lines[1:]])
 
 
-def run_all(numbers: list[int], workers: int) -> list[dict[str, Any]]:
-    """In processes of their own; neighbours together, for they share what their errors are measured against."""
-    parts = [numbers[k : k + CHUNK] for k in range(0, len(numbers), CHUNK)]
-    rows = []
-    with (
-        ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool,
-        tqdm(total=len(numbers), leave=False) as bar,
-    ):
-        for part in pool.map(measure, parts):
-            rows += part
-            bar.update(len(part))
-    return rows
+@dataclass(frozen=True, kw_only=True)
+class Trust(Measurement[list[dict[str, Any]]]):
+    """The command."""
+
+    writes_files = True
+    only: str = option("", "runs whose group, name or method contains this", metavar="TEXT")
+    processes: int = field(default_factory=cores)
+
+    def measure(self, session: Session) -> list[dict[str, Any]]:
+        numbers = [k for k, run in enumerate(all_runs()) if self.only in f"{run.group} {run.name} {run.label}"]
+        # Neighbours go together, for they share what their errors are measured against.
+        parts = [numbers[k : k + CHUNK] for k in range(0, len(numbers), CHUNK)]
+        found = []
+        with workers(min(self.processes, len(parts))) as start, session.bar(len(numbers), "trust") as bar:
+            for part, value in zip(parts, [start(carried_out, part) for part in parts], strict=True):
+                found += value()
+                bar.update(len(part))
+        return found
+
+    def table(self, found: list[dict[str, Any]]) -> str:
+        sick, healthy = split(found)
+        reported, alarms = [row for row in sick if row["told"]], [row for row in healthy if row["told"]]
+        parts = [
+            f"FAULTY RUNS: error of the last state, and how each was reported\n{listing(sick)}",
+            f"CORRECT RUNS that were reported\n{listing(alarms)}",
+        ]
+        if harmed := [row for row in healthy if row["spoilt"]]:
+            parts.append(f"NOT CORRECT: much more accurate without projection\n{listing(harmed)}")
+        parts += tables(found)
+        late = harmful(sick)
+        parts.append(
+            f"reported: {len(reported)} of {len(sick)} faulty runs ({len(reported) / max(1, len(sick)):.1%}); false "
+            f"alarms: {len(alarms)} of {len(healthy)} ({len(alarms) / max(1, len(healthy)):.1%})\n"
+            f"late leaks that make the error more than {SPOILT:g} times larger: "
+            f"{sum(bool(row['told']) for row in late)} of {len(late)} reported"
+        )
+        return "\n\n".join(parts)
+
+    def checks(self, found: list[dict[str, Any]]) -> list[Check]:
+        sick, healthy = split(found)
+        reported, alarms = (sum(bool(row["told"]) for row in rows) for rows in (sick, healthy))
+        return [
+            Check("faulty runs are reported", reported >= LEAST_TOLD * len(sick)),
+            Check("correct runs are not", alarms <= MOST_ALARMS * len(healthy)),
+        ]
+
+    def tables(self, found: list[dict[str, Any]]) -> dict[str, Rows]:
+        return {"trust.csv": [{**row, "told": ", ".join(row["told"])} for row in found]}
+
+    def figures(self, found: list[dict[str, Any]]) -> Figures:
+        """Give the tables of the page on trust, as Markdown."""
+        yield "trust.md", lambda path: path.write_text("\n\n".join(tables(found)) + "\n", encoding="utf-8")
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", metavar="TEXT", default="", help="runs whose group, name or method contains this")
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="the tables of docs/explanation/trust.md")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="a line for each run")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    args = parser.parse_args()
-    wanted = [k for k, run in enumerate(all_runs()) if args.only in f"{run.group} {run.name} {run.label}"]
-    begin = time.perf_counter()
-    rows = run_all(wanted, args.workers)
-    sick, healthy = ([row for row in rows if row["sick"] is state] for state in (True, False))
-    tables = [table(own) for table, own in ((sick_table, sick), (healthy_table, healthy)) if own]
-    told, alarms = sum(bool(row["told"]) for row in sick), [row for row in healthy if row["told"]]
-    print(f"{describe_machine()}; {len(rows)} runs, {time.perf_counter() - begin:.0f} s")
-    print("\nSICK RUNS: error of the last state, and how each was told", listing(sick), sep="\n")
-    print("\nHEALTHY RUNS that were told", listing(alarms), sep="\n")
-    harmed = [row for row in healthy if row["spoilt"]]
-    if harmed:
-        print("\nNOT HEALTHY: much more accurate without projection", listing(harmed), sep="\n")
-    print("\n" + "\n\n".join(map(markdown, tables)))
-    print(f"\ntold: {told} of {len(sick)} sick runs ({told / max(1, len(sick)):.1%}); false alarms: {len(alarms)} of "
-          f"{len(healthy)} ({len(alarms) / max(1, len(healthy)):.1%})")  # fmt: skip
-    late = harmful(sick)
-    print(f"late leaks that make the error more than {SPOILT:g} times larger: {sum(bool(row['told']) for row in late)} "
-          f"of {len(late)} reported")  # fmt: skip
-    if args.markdown is not None:
-        args.markdown.write_text("\n\n".join(map(markdown, tables)) + "\n")
-    if args.csv is not None:
-        write_csv(args.csv, [{**row, "told": ", ".join(row["told"])} for row in rows])
-    if args.json is not None:
-        args.json.write_text(json.dumps({"machine": describe_machine(), "runs": rows}, indent=1, default=float))
-    return int(told < LEAST_TOLD * len(sick) or len(alarms) > MOST_ALARMS * len(healthy))
+def split(found: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return the faulty runs and the correct ones."""
+    return [row for row in found if row["sick"]], [row for row in found if not row["sick"]]
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def tables(found: list[dict[str, Any]]) -> list[str]:
+    """Return the tables of both kinds that there are."""
+    return [markdown(make(own)) for make, own in zip((sick_table, healthy_table), split(found), strict=True) if own]

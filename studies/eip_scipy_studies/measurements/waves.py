@@ -1,6 +1,4 @@
-"""Waves by lines: the methods that the problems bring beside SciPy's DOP853, errors against processor time.
-
-    python -m eip_scipy_studies.measurements.waves [--quick] [--json FILE] [--figure FILE]
+"""``eip-scipy study waves``: waves by lines, errors against processor time beside SciPy's DOP853.
 
 Three waves with closed forms: the breather of the nonlinear Schroedinger equation, a kink and an antikink of the
 sine-Gordon equation that meet, two solitons of the Korteweg-de Vries equation that overtake each other. Each by
@@ -17,10 +15,8 @@ runs of more than a second are made once. One thread.
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +25,10 @@ from scipy.integrate import solve_ivp
 from eip_scipy import EIPDOP853, integrate
 from eip_scipy.problems import breather, korteweg_de_vries_solitons, sine_gordon_breather, sine_gordon_kinks
 
-from ..report import describe_machine, table
+from ..report import table
+from ..study import Figures, Measurement, Session, option
+
+__all__ = ["Waves"]
 
 OWN, RAW, EIP, SCIPY = "own method, projected", "own method alone", "EIPDOP853", "SciPy's DOP853"
 METHODS = (OWN, RAW, EIP, SCIPY)
@@ -48,7 +47,7 @@ LONG: dict[str, tuple[Any, float, float]] = {  # problem, end, step, which the t
 TIMES = (0.1, 0.3, 1.0)  # of the longer runs, in parts of their length
 
 
-def own(problem: Any, t: Any, h: float, **options: Any) -> tuple[np.ndarray, int | None]:
+def by_own(problem: Any, t: Any, h: float, **options: Any) -> tuple[np.ndarray, int | None]:
     return integrate(problem, (0.0, t[-1]), h=h, t_eval=t, **options).y, None
 
 
@@ -67,8 +66,8 @@ def methods(problem: Any, steps: Any, tolerances: Any) -> dict[tuple[str, float]
     """Runs by method and step or tolerance, each a function of the times at which states are wanted."""
     runs: dict[tuple[str, float], Any] = {}
     for h in steps:
-        runs[OWN, h] = lambda t, h=h: own(problem, t, h)
-        runs[RAW, h] = lambda t, h=h: own(problem, t, h, invariants=())
+        runs[OWN, h] = lambda t, h=h: by_own(problem, t, h)
+        runs[RAW, h] = lambda t, h=h: by_own(problem, t, h, invariants=())
     for tolerance in tolerances:
         runs[EIP, tolerance] = lambda t, x=tolerance: by_eip(problem, t, x)
         runs[SCIPY, tolerance] = lambda t, x=tolerance: by_scipy(problem, t, x)
@@ -81,73 +80,86 @@ def errors(problem: Any, t: float, y: np.ndarray) -> tuple[float, float]:
     return float(np.abs(y - problem.reference(t)).max()), float(np.abs(end / start - 1).max())
 
 
-def costs(problem: Any, steps: Any, tolerances: Any, repeats: int) -> dict[tuple[str, float], dict[str, Any]]:
-    runs, t_end = methods(problem, steps, tolerances), problem.t_span[1]
-    found: dict[tuple[str, float], dict[str, Any]] = {}
+def costs(problem: Any, steps: Any, tolerances: Any, times: Any, repeats: int) -> list[dict[str, Any]]:
+    """Return a row for each run: its processor time, calls of f, and errors at the times."""
+    runs = methods(problem, steps, tolerances)
+    rows: dict[tuple[str, float], dict[str, Any]] = {}
     for _ in range(repeats):
         for key, run in runs.items():
-            if key in found and found[key]["seconds"] > SHORT:
+            if key in rows and rows[key]["seconds"] > SHORT:
                 continue
             begin = time.process_time()
-            y, calls = run([t_end])
+            y, calls = run(times)
             seconds = time.process_time() - begin
-            if key not in found:
-                field, invariants = errors(problem, t_end, y[:, -1])
-                found[key] = {"field": field, "invariants": invariants, "calls": calls, "seconds": seconds}
-            found[key]["seconds"] = min(found[key]["seconds"], seconds)
-    return found
+            if key not in rows:
+                pairs = [errors(problem, at, state) for at, state in zip(times, y.T, strict=True)]
+                (method, at), (field, kept) = key, pairs[-1]
+                rows[key] = {"method": method, "at": at, "field": field, "invariants": kept, "calls": calls}
+                rows[key] |= {"fields": [pair[0] for pair in pairs], "seconds": seconds}
+            rows[key]["seconds"] = min(rows[key]["seconds"], seconds)
+    return sorted(rows.values(), key=lambda row: (METHODS.index(row["method"]), -row["at"]))
 
 
-def growth(problem: Any, t_end: float, h: float) -> dict[tuple[str, float], dict[str, Any]]:
-    """Errors at some times of a longer run, one step and one tolerance for each method."""
-    t = t_end * np.array(TIMES)
-    found = {}
-    for key, run in methods(problem, (h,), (1e-8,)).items():
-        begin = time.process_time()
-        y, calls = run(t)
-        seconds = time.process_time() - begin
-        pairs = [errors(problem, at, state) for at, state in zip(t, y.T, strict=True)]
-        found[key] = {"t": t.tolist(), "field": [a for a, _ in pairs], "invariants": [b for _, b in pairs]}
-        found[key] |= {"calls": calls, "seconds": seconds}
-    return found
+def rows_table(rows: list[dict[str, Any]], times: Any) -> str:
+    """Lay out rows with the errors of the field at the times."""
+    body = []
+    for row in rows:
+        fields = [f"{error:.1e}" for error in row["fields"]]
+        numbers = [f"{row['invariants']:.0e}", f"{row['seconds']:.2f}", str(row["calls"] or "")]
+        body.append((row["method"], [f"{row['at']:g}", *fields, *numbers]))
+    heads = [["field", f"t = {t:g}"] for t in times]
+    return table([["h or", "rtol"], *heads, ["invariants", "at the end"], ["time [s]"], ["f"]], body)
 
 
-def show_costs(name: str, found: dict[tuple[str, float], dict[str, Any]]) -> None:
-    print(f"\n{name}\n")
-    rows = [
-        (
-            method,
-            [f"{x:g}", f"{r['field']:.1e}", f"{r['invariants']:.0e}", f"{r['seconds']:.2f}", str(r["calls"] or "")],
-        )
-        for (method, x), r in sorted(found.items(), key=lambda item: (METHODS.index(item[0][0]), -item[0][1]))
-    ]
-    print(table([["h or", "rtol"], ["field"], ["invariants"], ["time [s]"], ["f"]], rows))
+@dataclass(frozen=True, kw_only=True)
+class Waves(Measurement[dict[str, dict[str, list[dict[str, Any]]]]]):
+    """The command."""
+
+    writes_files = True
+    quick: bool = option(False, "a twentieth of each wave, each method once, no longer runs")
+
+    def measure(self, session: Session) -> dict[str, dict[str, list[dict[str, Any]]]]:
+        found: dict[str, dict[str, list[dict[str, Any]]]] = {"costs": {}, "growth": {}}
+        longer = {} if self.quick else LONG
+        with session.bar(len(SCENES) + len(longer), "waves", "wave") as bar:
+            for name, (problem, steps, tolerances) in SCENES.items():
+                if self.quick:
+                    steps, tolerances = steps[:1], tolerances[:1]
+                    problem = replace(problem, t_span=(0.0, problem.t_span[1] / 20))
+                repeats = 1 if self.quick else REPEATS
+                found["costs"][name] = costs(problem, steps, tolerances, [problem.t_span[1]], repeats)
+                bar.update()
+            for name, (problem, t_end, h) in longer.items():
+                found["growth"][name] = costs(problem, (h,), (1e-8,), t_end * np.array(TIMES), 1)
+                bar.update()
+        return found
+
+    def table(self, found: dict[str, dict[str, list[dict[str, Any]]]]) -> str:
+        share = 20 if self.quick else 1
+        ends = {name: [problem.t_span[1] / share] for name, (problem, *_) in SCENES.items()}
+        parts = [f"{name}\n\n{rows_table(rows, ends[name])}" for name, rows in found["costs"].items()]
+        for name, rows in found["growth"].items():
+            parts.append(f"{name}, in time\n\n{rows_table(rows, LONG[name][1] * np.array(TIMES))}")
+        return "\n\n".join(parts)
+
+    def figures(self, found: dict[str, dict[str, list[dict[str, Any]]]]) -> Figures:
+        yield "waves.png", figure(found["costs"])
 
 
-def show_growth(name: str, found: dict[tuple[str, float], dict[str, Any]]) -> None:
-    t = next(iter(found.values()))["t"]
-    print(f"\n{name}: errors of the field at t = {', '.join(f'{x:g}' for x in t)}, and of the invariants at the end\n")
-    rows = [
-        (method, [f"{x:g}", *(f"{e:.1e}" for e in r["field"]), f"{r['invariants'][-1]:.0e}", f"{r['seconds']:.1f}"])
-        for (method, x), r in found.items()
-    ]
-    print(table([["h or", "rtol"], *([f"{x:g}"] for x in t), ["invariants"], ["time [s]"]], rows))
-
-
-def save_figure(found: dict[str, Any], path: str) -> None:
+def figure(found: dict[str, list[dict[str, Any]]]) -> Any:
     """Draw the waves in space and time, and below each the errors against the processor's time."""
-    from matplotlib.figure import Figure
-
     from eip_scipy.plotting import method_styles
 
+    from ..plotting import blank_figure
+
     styles = method_styles(METHODS)
-    figure = Figure(figsize=(12, 10.5), layout="constrained")
+    figure = blank_figure(12, 10.5)
     panels = figure.subplots(3, len(SCENES), height_ratios=(1.1, 1, 1))
     widths = {"NLS breather": 5, "sine-Gordon kinks": 20, "KdV solitons": 32}
     labels = {"NLS breather": "|ψ|", "sine-Gordon kinks": "q", "KdV solitons": "u"}
     for (name, (problem, *_)), column in zip(SCENES.items(), panels.T, strict=True):
         grid = problem.equation.grid
-        x, t = grid.points(0), np.linspace(*problem.t_span, 240)
+        x, t = grid.points(0), np.linspace(0.0, problem.t_span[1], 240)
         field = np.array([problem.reference(at)[: grid.size] for at in t])
         middle = np.abs(x) < widths[name]
         shown = np.abs(field) if np.iscomplexobj(field) else field
@@ -156,44 +168,11 @@ def save_figure(found: dict[str, Any], path: str) -> None:
         column[0].set(title=name, xlabel="x", ylabel="t")
         for axis, what in zip(column[1:], ("field", "invariants"), strict=True):
             for method in METHODS:
-                rows = [(r["seconds"], r[what]) for (m, _), r in found[name].items() if m == method]
+                rows = [(r["seconds"], r[what]) for r in found[name] if r["method"] == method]
                 axis.plot(*np.maximum(np.array(rows), 1e-16).T, ms=5, lw=1.3, **styles[method])
             axis.set(xscale="log", yscale="log", xlabel="processor time [s]")
             axis.grid(alpha=0.3)
     panels[1, 0].set_ylabel("largest error of the field at the end")
     panels[2, 0].set_ylabel("largest relative error of an invariant")
     figure.legend(*panels[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    figure.savefig(path, dpi=130)
-    print(f"wrote {path}")
-
-
-def plain(found: dict[str, Any]) -> dict[str, Any]:
-    return {name: [{"method": m, "at": x, **r} for (m, x), r in part.items()] for name, part in found.items()}
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a twentieth of each wave, each method once")
-    parser.add_argument("--json", metavar="FILE")
-    parser.add_argument("--figure", metavar="FILE")
-    arguments = parser.parse_args()
-    print(describe_machine())
-    found, longer = {}, {}
-    for name, (problem, steps, tolerances) in SCENES.items():
-        if arguments.quick:
-            steps, tolerances = steps[:1], tolerances[:1]
-            problem = replace(problem, t_span=(0.0, problem.t_span[1] / 20))
-        found[name] = costs(problem, steps, tolerances, 1 if arguments.quick else REPEATS)
-        show_costs(f"{name}, to t = {problem.t_span[1]:g}", found[name])
-    if arguments.figure:
-        save_figure(found, arguments.figure)
-    for name, (problem, t_end, h) in () if arguments.quick else LONG.items():
-        longer[name] = growth(problem, t_end, h)
-        show_growth(name, longer[name])
-    if arguments.json:
-        with open(arguments.json, "w") as file:
-            json.dump({"costs": plain(found), "growth": plain(longer)}, file, indent=1)
-
-
-if __name__ == "__main__":
-    main()
+    return figure

@@ -1,18 +1,24 @@
-"""The README's figure: a comet by SciPy's `solve_ivp` with RK45, and with its two invariants kept by EIPRK45.
+"""``eip-scipy study with-and-without``: the README's figure, a comet by RK45 and by EIPRK45.
 
-    python -m eip_scipy_studies.measurements.with_and_without [--figure docs/_static/with-and-without.png]
-
-It prints the calls of `fun` and the largest errors of energy and of place in the first and the last period; the places
-are compared with Kepler's equation.
+SciPy's `solve_ivp` runs both; EIPRK45 keeps the two invariants. The calls of `fun` and the largest errors of energy and
+of place in the first and the last period; the places are compared with Kepler's equation.
 """
 
-import argparse
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK45, Invariant
 from eip_scipy.problems import kepler
+
+from ..report import table
+from ..study import Figures, Session, Study
+
+__all__ = ["WithAndWithout"]
 
 PERIOD = 2 * np.pi
 T_END = 32 * PERIOD
@@ -33,53 +39,65 @@ def momentum(t, y):
     return y[0] * y[3] - y[1] * y[2]
 
 
-def runs():
-    """By name: SciPy's results."""
-    invariants = [Invariant(energy), Invariant(momentum)]
-    return {
-        "RK45": solve_ivp(fun, (0, T_END), START, method="RK45", **TOLERANCES),
-        "EIPRK45": solve_ivp(fun, (0, T_END), START, method=EIPRK45, invariants=invariants, **TOLERANCES),
-    }
+class Errors(NamedTuple):
+    """Times of a run, its errors of the energy and of the place, and its calls of `fun`."""
+
+    t: np.ndarray
+    energy: np.ndarray
+    place: np.ndarray
+    nfev: int
+
+    def largest(self) -> dict[str, float]:
+        """Return the largest errors of the first and of the last period."""
+        ends = {"first": self.t <= PERIOD, "last": self.t >= T_END - PERIOD}
+        return {
+            f"{what}, {when} period": float(getattr(self, what)[where].max())
+            for what in ("energy", "place")
+            for when, where in ends.items()
+        }
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--figure", metavar="FILE", help="draw it")
-    args = parser.parse_args()
-    reference = kepler(relativistic=0.0).reference
-    errors = {}
-    for name, sol in runs().items():
-        defect = np.abs(energy(sol.t, sol.y) - energy(0, np.asarray(START))) * 2  # |H| is 1/2
-        exact = np.array([reference(time) for time in sol.t]).T
-        errors[name] = sol.t, defect, np.hypot(*(sol.y[:2] - exact[:2]))
-        first, last = sol.t <= PERIOD, sol.t >= T_END - PERIOD
-        figures = (f"{part[where].max():.1e}" for part in errors[name][1:] for where in (first, last))
-        row = "{:8} {} calls, |dH/H| {} in the first period, {} in the last; place {}, {}"
-        print(row.format(name, sol.nfev, *figures))
-    if args.figure:
-        draw(args.figure, errors)
+@dataclass(frozen=True, kw_only=True)
+class WithAndWithout(Study[dict[str, Errors]]):
+    """The command."""
 
+    def measure(self, session: Session) -> dict[str, Errors]:
+        kept = {"invariants": [Invariant(energy), Invariant(momentum)]}
+        ways: dict[str, dict[str, Any]] = {"RK45": {"method": "RK45"}, "EIPRK45": {"method": EIPRK45, **kept}}
+        reference = kepler(relativistic=0.0).reference
+        assert reference is not None
+        found = {}
+        for name, options in ways.items():
+            run = solve_ivp(fun, (0, T_END), START, **options, **TOLERANCES)
+            defect = np.abs(energy(run.t, run.y) - energy(0, np.asarray(START))) * 2  # |H| is 1/2
+            exact = np.array([reference(time) for time in run.t]).T
+            found[name] = Errors(run.t, defect, np.hypot(*(run.y[:2] - exact[:2])), run.nfev)
+        return found
 
-def draw(file, errors):
-    from matplotlib.figure import Figure
+    def text(self, found: dict[str, Errors]) -> str:
+        body = [(name, [str(run.nfev), *(f"{x:.1e}" for x in run.largest().values())]) for name, run in found.items()]
+        heads = [["calls"], ["|dH/H|", "first period"], ["", "last"], ["place", "first period"], ["", "last"]]
+        return table(heads, body)
 
-    colours = {"RK45": "#D55E00", "EIPRK45": "#0072B2"}  # Okabe and Ito
-    labels = {"RK45": "RK45", "EIPRK45": "EIPRK45, energy and angular momentum kept"}
-    figure = Figure(figsize=(9, 3.6), dpi=150, layout="constrained")
-    energies, places = figure.subplots(1, 2)
-    for name, (t, defect, place) in errors.items():
-        line = {"color": colours[name], "lw": 1.2}
-        energies.semilogy(t[1:] / PERIOD, np.maximum(defect[1:], 1e-16), label=labels[name], **line)
-        places.semilogy(t[1:] / PERIOD, place[1:], **line)
-    energies.set(xlabel="periods of the comet", ylabel="error of the energy, |ΔH/H|")
-    places.set(xlabel="periods of the comet", ylabel="error of the place [semi-major axes]")
-    places.set_ylim(1e-7, 1e-1)
-    for axes in (energies, places):
-        axes.grid(alpha=0.3)
-        axes.set_xlim(0, T_END / PERIOD)
-    figure.legend(loc="outside upper center", ncols=2, frameon=False)
-    figure.savefig(file)
+    def numbers(self, found: dict[str, Errors]) -> dict[str, Any]:
+        return {"errors": {name: {"nfev": run.nfev, **run.largest()} for name, run in found.items()}}
 
+    def figures(self, found: dict[str, Errors]) -> Figures:
+        from eip_scipy.plotting import PALETTE
 
-if __name__ == "__main__":
-    main()
+        from ..plotting import blank_figure
+
+        looks = {"RK45": (PALETTE[2], "RK45"), "EIPRK45": (PALETTE[0], "EIPRK45, energy and angular momentum kept")}
+        figure = blank_figure(9, 3.6)
+        energies, places = figure.subplots(1, 2)
+        for name, run in found.items():
+            colour, label = looks[name]
+            energies.semilogy(run.t[1:] / PERIOD, np.maximum(run.energy[1:], 1e-16), color=colour, lw=1.2, label=label)
+            places.semilogy(run.t[1:] / PERIOD, run.place[1:], color=colour, lw=1.2)
+        energies.set(xlabel="periods of the comet", ylabel="error of the energy, |ΔH/H|")
+        places.set(xlabel="periods of the comet", ylabel="error of the place [semi-major axes]", ylim=(1e-7, 1e-1))
+        for axes in (energies, places):
+            axes.grid(alpha=0.3)
+            axes.set_xlim(0, T_END / PERIOD)
+        figure.legend(loc="outside upper center", ncols=2, frameon=False)
+        yield "with-and-without.png", figure

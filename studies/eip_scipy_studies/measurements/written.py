@@ -1,6 +1,4 @@
-"""What a problem written as an expression costs: a fresh process, and the run beside functions written by hand.
-
-    python -m eip_scipy_studies.measurements.written [--quick] [--json FILE]
+"""``eip-scipy study written``: cost of a problem written as an expression, beside functions written by hand.
 
 Henon and Heiles' Hamiltonian to t = 10 000. The fresh process counts all from the start of Python: imports, the use of
 SymPy, Numba's compilation, the run. The compiled runs are measured in turn, and the least times compared.
@@ -8,19 +6,22 @@ SymPy, Numba's compilation, the run. The compiled runs are measured in turn, and
 
 from __future__ import annotations
 
-import argparse
-import json
 import subprocess
 import sys
-import time
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, hamiltonian, integrate
 
-from .installed import peer
+from ..report import needed, table
+from ..study import Measurement, Session, option
+from ..timing import clocked, least
 
-njit = peer("numba", '"eip_scipy[numba]"').njit
+__all__ = ["Written"]
+
+njit = needed("numba", '"eip_scipy[numba]"').njit
 
 H = "(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3"
 SPAN, Y0 = (0.0, 1e4), [0.0, 0.1, 0.5, 0.0]
@@ -49,38 +50,37 @@ def gradient(t, y):
     return np.array([y[0] + 2 * y[0] * y[1], y[1] + y[0] * y[0] - y[1] * y[1], y[2], y[3]])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="each once")
-    parser.add_argument("--json", help="write the numbers to this file")
-    arguments = parser.parse_args()
-    processes, turns = (1, 1) if arguments.quick else (PROCESSES, TURNS)
-    fresh = []
-    for _ in range(processes):
-        start = time.perf_counter()
-        subprocess.run([sys.executable, "-c", FRESH], check=True)
-        fresh.append(time.perf_counter() - start)
-    rows = {"fresh process [s]": min(fresh)}
-    print(f"fresh process, from Python's start to the end of the run: {min(fresh):.2f} s (least of {len(fresh)})")
-    problem = hamiltonian(H)
-    by_hand = {"in_place": True, "invariants": Invariant(energy, gradient, name="H")}
-    cases = {
-        "EIPDOP853, rtol = 1e-10": {"method": EIPDOP853, "rtol": 1e-10, "atol": 1e-10},
-        "EIPRK4, h = .02": {"method": EIPRK4, "h": 0.02},
-    }
-    for name, options in cases.items():
-        times: dict[str, list[float]] = {"written": [], "by hand": []}
-        for _ in range(turns):
-            times["written"].append(integrate(problem, SPAN, Y0, **options).wall_time)
-            times["by hand"].append(integrate(rhs, SPAN, Y0, **by_hand, **options).wall_time)
-        least = {key: min(values) for key, values in times.items()}
-        rows[name] = least | {"ratio": least["written"] / least["by hand"]}
-        print(f"{name}: written {least['written'] * 1e3:.1f} ms, by hand {least['by hand'] * 1e3:.1f} ms: "
-              f"ratio {rows[name]['ratio']:.2f}")  # fmt: skip
-    if arguments.json:
-        with open(arguments.json, "w", encoding="utf-8") as file:
-            json.dump(rows, file, indent=1)
+CASES: dict[str, dict[str, Any]] = {
+    "EIPDOP853, rtol = 1e-10": {"method": EIPDOP853, "rtol": 1e-10, "atol": 1e-10},
+    "EIPRK4, h = 0.02": {"method": EIPRK4, "h": 0.02},
+}
 
 
-if __name__ == "__main__":
-    main()
+@dataclass(frozen=True, kw_only=True)
+class Written(Measurement[dict[str, Any]]):
+    """The command."""
+
+    quick: bool = option(False, "each once")
+
+    def measure(self, session: Session) -> dict[str, Any]:
+        processes, turns = (1, 1) if self.quick else (PROCESSES, TURNS)
+        fresh = clocked(lambda: subprocess.run([sys.executable, "-c", FRESH], check=True))
+        found: dict[str, Any] = {"fresh process [s]": least({"": fresh}, turns=processes)[""]}
+        problem, kept = hamiltonian(H), Invariant(energy, gradient, name="H")
+        for name, options in CASES.items():
+            runs = {
+                "written": lambda o=options: integrate(problem, SPAN, Y0, **o).wall_time,
+                "by hand": lambda o=options: integrate(rhs, SPAN, Y0, in_place=True, invariants=kept, **o).wall_time,
+            }
+            best = least(runs, turns=turns)
+            found[name] = best | {"ratio": best["written"] / best["by hand"]}
+        return found
+
+    def table(self, found: dict[str, Any]) -> str:
+        body = [
+            (name, [f"{1e3 * row['written']:.1f}", f"{1e3 * row['by hand']:.1f}", f"{row['ratio']:.2f}"])
+            for name, row in found.items()
+            if name in CASES
+        ]
+        fresh = f"A fresh process, from Python's start to the end of the run: {found['fresh process [s]']:.2f} s"
+        return f"{table([['written', '[ms]'], ['by hand', '[ms]'], ['ratio', '']], body)}\n\n{fresh}"

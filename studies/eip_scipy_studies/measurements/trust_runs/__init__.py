@@ -1,1 +1,1 @@
-"""What benchmarks/trust.py runs: systems, sick runs, healthy runs."""
+"""Runs of `trust`: systems, faulty runs, correct runs."""

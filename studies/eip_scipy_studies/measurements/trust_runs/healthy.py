@@ -13,7 +13,6 @@ from eip_scipy.problems import (
     centre_time,
     comet,
     figure_eight,
-    hard_cases,
     harmonic,
     kepler,
     plane_wave,
@@ -26,7 +25,7 @@ from eip_scipy.problems import (
     uniform_field,
 )
 
-from ...hard_cases import double_pendulum, rigid_body, sir
+from ...hard_cases import double_pendulum, hard_cases, rigid_body, sir
 from . import systems as s
 from .record import Run, runs
 
@@ -103,7 +102,11 @@ def own_steps() -> Iterator[Run]:
     yield from own("Pythagorean bodies to t = 10", near, "DOP853 1e-10, RK45 1e-8, RKN12 1e-10")
     yield from own("Pythagorean bodies", pythagorean, "DOP853 1e-13 integrate, RKN12 1e-13 integrate")
     yield from own("comet", comet, "DOP853 1e-9, DOP853 1e-12 integrate, RKN12 1e-11 integrate, RK45 1e-7")
-    fields = {"uniform field": uniform_field, "tokamak": tokamak, "tokamak, transit": partial(tokamak, "transit")}
+    fields: dict[str, Callable[[], Problem]] = {
+        "uniform field": uniform_field,
+        "tokamak": tokamak,
+        "tokamak, transit": partial(tokamak, "transit"),
+    }
     for name, field in fields.items():
         orbit = partial(short, field, 2000.0)
         yield from own(f"particle, {name}", orbit, "RK4 integrate, RK5 integrate, DOP853 integrate, RK45 1e-6")

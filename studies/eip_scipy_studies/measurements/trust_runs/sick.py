@@ -33,12 +33,12 @@ from ...hard_cases import (
     sir,
     three_wave,
 )
-from ..installed import peer
+from ...report import needed
 from . import systems as s
 from .late import late_leaks, light_bodies
 from .record import Run, runs
 
-njit = peer("numba", '"eip_scipy[numba]"').njit
+njit = needed("numba", '"eip_scipy[numba]"').njit
 
 REST, MOVING, LEAK, GRADIENT, LONG, BLOWN, MEMBER = (
     "no invariant, its rate 0 at the start",
@@ -237,7 +237,9 @@ def late() -> Problem:
 def relativistic_planets() -> Problem:
     """Post-Newtonian terms, and Newton's energy and angular momentum."""
     planets = solar_system(years=1.0, forces="1pn")
-    newton = n_body(solar_system().params.tolist(), 1.0, 3)
+    masses = solar_system().params
+    assert masses is not None
+    newton = n_body(masses.tolist(), 1.0, 3)
     energy = Invariant(
         lambda t, y, *_: newton.values(t, y)[0], lambda t, y, *_: newton.gradients(t, y)[0], name="energy"
     )
@@ -434,13 +436,13 @@ def leaves(t, y, params):
     return y[0] + 0.99
 
 
-def turns_back(t, y):
+def turns_back(t: float, y: np.ndarray) -> Any:
     return y[1] - 1e-3
 
 
-leaves.terminal = turns_back.terminal = True
-leaves.direction = -1.0
-turns_back.direction = 1.0
+DIRECTIONS: tuple[tuple[Any, float], ...] = ((leaves, -1.0), (turns_back, 1.0))
+for event, direction in DIRECTIONS:
+    event.terminal, event.direction = True, direction
 
 
 def false_invariants() -> Iterator[Run]:

@@ -12,9 +12,9 @@ from eip_scipy import Invariant
 from eip_scipy.problems import Problem
 
 from ...hard_cases import CaseEquations
-from ..installed import peer
+from ...report import needed
 
-njit = peer("numba", '"eip_scipy[numba]"').njit
+njit = needed("numba", '"eip_scipy[numba]"').njit
 
 Array = np.ndarray
 

@@ -1,0 +1,94 @@
+"""Runs of planets by this package and by REBOUND, and the table of their times and errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from eip_scipy import EIPSolver, integrate
+from eip_scipy.problems import Problem
+from eip_scipy.problems.gravity.solar_data import YEAR_D
+
+from ..report import needed, table
+from ..solar.cost import TimedRun
+from ..work_precision import Runner
+
+__all__ = ["Methods", "Row", "by_rebound", "by_us", "daily", "one_each", "orbit_table", "rows", "yearly"]
+
+Methods = dict[str, tuple[Runner, Sequence[float]]]
+Row = dict[str, float]
+
+
+def by_us(problem: Problem, method: type[EIPSolver], **options: Any) -> Runner:
+    """Make a run from the start to the end of the problem's interval, by steps of the runner's argument."""
+
+    def run(h: float) -> tuple[float, np.ndarray]:
+        result = integrate(problem, method=method, h=h, **options)
+        return result.wall_time, result.y[:, -1]
+
+    return run
+
+
+def by_rebound(problem: Problem, integrator: str, prepare: Callable[..., Any] | None = None) -> Runner:
+    """Make the same run by an integrator of REBOUND.
+
+    Its steps are shortened to divide the interval; IAS15 chooses its own, for which the argument is nan.
+    """
+    rebound = needed("eip_scipy.integrations.rebound")
+    assert problem.params is not None
+    gm, years = problem.params[: problem.y0.size // 6], problem.t_span[1]
+
+    def run(h: float) -> tuple[float, np.ndarray]:
+        n = 1 if math.isnan(h) else round(years / h)
+        result = rebound.run(gm, problem.y0, integrator, h=years / n, n_steps=n, prepare=prepare)
+        return result.wall_time, result.y[:, -1]
+
+    return run
+
+
+def one_each(label: Callable[[float], str], run: Runner, steps: Iterable[float]) -> Methods:
+    """Make a row of the table for each step."""
+    return {label(h): (run, [h]) for h in steps}
+
+
+def yearly(name: str, run: Runner, *counts: int) -> Methods:
+    """Make a row for each number of steps in a year."""
+    return one_each(lambda h: f"{name}, 1/{round(1 / h)} yr", run, [1 / n for n in counts])
+
+
+def daily(name: str, run: Runner, *days: float) -> Methods:
+    """Make a row for each step in days."""
+    return one_each(lambda h: f"{name}, {h * YEAR_D:.3g} d", run, [d / YEAR_D for d in days])
+
+
+def rows(turns: Sequence[Sequence[TimedRun]]) -> dict[str, Row]:
+    """Return the least and the median time of each method, and the extremes of its errors, over all turns."""
+    found = {}
+    for name in dict.fromkeys(item.method for turn in turns for item in turn):
+        own = [item for turn in turns for item in turn if item.method == name]
+        found[name] = {
+            "least": min(item.wall_time for item in own),
+            "median": float(np.median([item.wall_time for item in own])),
+            "step": own[0].step,
+            "best": min(item.mercury for item in own),
+            "worst": max(item.mercury for item in own),
+            "others": max(item.others for item in own),
+        }
+    return found
+
+
+def orbit_table(found: Mapping[str, Row], first: str) -> str:
+    """Lay out `rows`; `first` is the name of the innermost planet."""
+    head = [["median", "[s]"], ["least", "[s]"], [f"{first} [AU]", "least"], ["", "largest"], ["others", "[AU]"]]
+    cells = {
+        name: [
+            f"{row['median']:.4g}",
+            f"{row['least']:.4g}",
+            *(f"{row[key]:.1e}" for key in ("best", "worst", "others")),
+        ]
+        for name, row in found.items()
+    }
+    return table(head, cells.items())

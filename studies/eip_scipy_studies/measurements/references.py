@@ -1,0 +1,272 @@
+"""``eip-scipy study particle-reference``, ``scene-reference`` and ``solar-reference``: states in extended precision.
+
+heyoka's Taylor series in 80 to 160 bits make the reference states that the library and the studies carry as data:
+``particle_references.json``, ``scene_references.json``, ``solar_reference.json`` and ``growth_reference.json``. Each
+command writes its states as a file in the folder of ``--out`` and prints how far they are from what is known otherwise.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eip_scipy.problems import ParticleProblem, Problem, comet, figure_eight, pythagorean, tokamak, uniform_field
+from eip_scipy.problems.gravity.solar_data import YEAR_D, SolarSystemData, load, reference_states
+from eip_scipy.problems.particles.charged_particle import ORBITS
+
+from ..report import UsageError, needed
+from ..study import Figures, Session, Study, option
+
+__all__ = ["ParticleReference", "SceneReference", "SolarReference", "particle_equations"]
+
+FLOAT = np.longdouble
+CHECK_BITS, POINTS = 113, 100
+
+
+def _heyoka() -> Any:
+    return needed("heyoka", '"eip_scipy[heyoka]"')
+
+
+class Found(NamedTuple):
+    """What is printed, where the states come from, and the states."""
+
+    lines: list[str]
+    about: str
+    states: dict[str, Any]
+
+
+class Reference(Study[Found]):
+    """A study that makes reference states."""
+
+    file = ""
+
+    @abstractmethod
+    def measure(self, session: Session) -> Found:
+        """Compute the states."""
+
+    def text(self, found: Found) -> str:
+        return "\n".join(found.lines)
+
+    def figures(self, found: Found) -> Figures:
+        """Give the file of the states: what is not a CSV file is written as figures are."""
+        text = json.dumps({"about": found.about, "states": found.states}, indent=1) + "\n"
+        yield self.file, lambda path: path.write_text(text, encoding="utf-8")
+
+
+# Charged particles. heyoka integrates the form (x, v) with B written out; so the canonical equations and A are tested
+# by the states, not used for them. The first momentum is that of the problem, rounded to double precision as there.
+
+
+def particle_equations(name: str, potential: Any) -> list[tuple[Any, Any]]:
+    """Return the equations of motion in (x, v), as symbols of heyoka."""
+    heyoka = _heyoka()
+    x, y, z, u, v, w = state = heyoka.make_vars("x", "y", "z", "u", "v", "w")
+    r2 = x * x + y * y
+    if name == "uniform":
+        field = potential * r2 ** (-1.5)
+        acceleration = (field * x + v, field * y - u, 0.0 * z)
+    else:
+        half = 0.5 / r2
+        b = (-half * (2.0 * y + x * z), half * (2.0 * x - y * z), half * (r2 - heyoka.sqrt(r2)))
+        acceleration = (v * b[2] - w * b[1], w * b[0] - u * b[2], u * b[1] - v * b[0])
+    return list(zip(state, (u, v, w, *acceleration), strict=True))
+
+
+def vector_potential(name: str, x: Any, number: Any) -> list[Any]:
+    """Return A in the arithmetic of `number`, for the canonical momenta."""
+    half, one = number(0.5), number(1.0)
+    if name == "uniform":
+        return [-half * x[1], half * x[0], number(0.0)]
+    r2 = x[0] * x[0] + x[1] * x[1]
+    r = r2**half
+    a = half * x[2] / r2
+    b = half * half * ((one - r) * (one - r) + x[2] * x[2]) / r2
+    return [a * x[0] - b * x[1], a * x[1] + b * x[0], -half * _log(r, number)]
+
+
+def _log(r: Any, number: Any) -> Any:
+    """Logarithm of numbers near 1: Newton's method on exp, whose series is short there."""
+    result = number(float(np.log(float(r))))
+    for _ in range(3):
+        term = total = number(1.0)
+        for k in range(1, 60):
+            term = term * result / number(float(k))
+            total = total + term
+        result = result + (r - total) / total
+    return result
+
+
+def particle_states(problem: ParticleProblem, times: np.ndarray, bits: int | None) -> np.ndarray:
+    """Return rows (x, v, p) at `times`; with bits=None from double precision."""
+    heyoka = _heyoka()
+
+    def number(value: float) -> Any:
+        return float(value) if bits is None else heyoka.real(float(value), bits)
+
+    name = problem.field.name
+    x = [number(c) for c in problem.y0[:3]]
+    v = [number(p) - a for p, a in zip(problem.y0[3:], vector_potential(name, x, number), strict=True)]
+    options = {} if bits is None else {"fp_type": heyoka.real}
+    # 1 / 100 would not be the double 1e-2 in more bits.
+    integrator = heyoka.taylor_adaptive(particle_equations(name, number(1e-2)), [*x, *v], **options)
+    rows = []
+    for t in times:
+        integrator.propagate_until(number(t))
+        now = list(integrator.state)
+        momentum = [v + a for v, a in zip(now[3:], vector_potential(name, now[:3], number), strict=True)]
+        rows.append([float(c) for c in (*now, *momentum)])
+    return np.array(rows)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParticleReference(Reference):
+    """Position, velocity and canonical momentum at each hundredth of the paper's intervals."""
+
+    file = "particle_references.json"
+    bits: int = option(113, "precision in bits (%(default)s)", type=int)
+    points: int = option(POINTS, "how many of the hundred states, from the first on (%(default)s)", type=int)
+
+    def measure(self, session: Session) -> Found:
+        heyoka, lines, stored = _heyoka(), [], {}
+        for problem in (uniform_field(), *map(tokamak, ORBITS)):
+            assert problem.h is not None
+            steps = round(problem.t_span[1] / problem.h)
+            times = np.arange(1, self.points + 1) * (steps // POINTS) * problem.h
+            rows, double = (particle_states(problem, times, bits) for bits in (self.bits, None))
+            apart = np.linalg.norm(rows[:, :3] - double[:, :3], axis=1).max()
+            lines.append(f"{problem.name:16} to t = {times[-1]:g}: from double precision {apart:.1e}")
+            stored[problem.name] = [
+                {
+                    "t": float(t),
+                    **dict(zip(("position", "velocity", "momentum"), row.reshape(3, 3).tolist(), strict=True)),
+                }
+                for t, row in zip(times, rows, strict=True)
+            ]
+        about = (
+            "Charged particles of problems/charged_particle.py at each hundredth of the paper's intervals: heyoka "
+            f"{heyoka.__version__}, Taylor, {self.bits}-bit arithmetic; made by `eip-scipy study particle-reference`."
+        )
+        return Found(lines, about, stored)
+
+
+# Hard scenes. The order of the Taylor series and the tolerance follow the precision. The differences say how far a
+# scene can be known: 64 bits are not enough for the three bodies of Burrau at t = 70.
+
+
+def scenes() -> list[tuple[Problem, list[float]]]:
+    """Return the scenes without a closed form, with the times of the states to store."""
+    return [
+        (pythagorean(), [10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0]),
+        (figure_eight(), [figure_eight(n).t_span[1] for n in (1, 10, 100)]),
+        (comet(), [20.0]),
+    ]
+
+
+def scene_states(problem: Problem, times: Sequence[float], bits: int) -> np.ndarray:
+    """Return states (q, v) at `times` in rows, rounded from numbers of `bits` bits."""
+    heyoka = _heyoka()
+
+    def real(x: float) -> Any:
+        return heyoka.real(float(x), bits)
+
+    assert problem.params is not None
+    n = problem.params.size
+    system = heyoka.model.nbody(n, masses=[real(m) for m in problem.params])
+    # heyoka's state is body by body.
+    start = [real(x) for x in problem.y0.reshape(2, n, 3).swapaxes(0, 1).ravel()]
+    integrator = heyoka.taylor_adaptive(system, start, fp_type=heyoka.real)
+    rows = []
+    for t in times:
+        integrator.propagate_until(real(t))
+        rows.append(np.array([float(x) for x in integrator.state]).reshape(n, 2, 3).swapaxes(0, 1).ravel())
+    return np.array(rows)
+
+
+def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the largest distance between a body's two positions, for rows of states."""
+    positions = (a - b)[:, : a.shape[1] // 2].astype(float).reshape(len(a), -1, 3)
+    return np.linalg.norm(positions, axis=2).max(axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneReference(Reference):
+    """Final states of the scenes; the difference from 113 bits and, if REBOUND is installed, from IAS15."""
+
+    file = "scene_references.json"
+    bits: int = option(160, "precision in bits (%(default)s)", type=int)
+
+    def measure(self, session: Session) -> Found:
+        heyoka, lines, stored = _heyoka(), [], {}
+        rebound = session.peer("rebound", "IAS15")
+        for problem, times in scenes():
+            rows, fewer = (scene_states(problem, times, bits) for bits in (self.bits, CHECK_BITS))
+            stored[problem.name] = [{"t": t, "state": row.tolist()} for t, row in zip(times, rows, strict=True)]
+            double = np.full_like(rows, np.nan)
+            if rebound is not None:
+                runs = [rebound.run(problem.params, problem.y0, "ias15", h=t, n_steps=1) for t in times]
+                double = np.array([run.y[:, -1] for run in runs])
+            for t, a, b in zip(times, difference(rows, fewer), difference(rows, double), strict=True):
+                lines.append(f"{problem.name:14} t = {t:<12.6g} from {CHECK_BITS} bits: {a:.1e}   from IAS15: {b:.1e}")
+        about = (
+            "Final states (q of all bodies, v of all bodies) of the scenes in problems/scenes.py: heyoka "
+            f"{heyoka.__version__}, Taylor, {self.bits}-bit arithmetic; made by `eip-scipy study scene-reference`."
+        )
+        return Found(lines, about, stored)
+
+
+# The solar system in 80 bits, Newtonian, from the packaged "de440" data.
+
+
+def solar_states(data: SolarSystemData, years: Sequence[float], tolerance: float) -> list[np.ndarray]:
+    """Return states (6 N,) in AU and AU/day, all positions first, at times in ascending order."""
+    heyoka = _heyoka()
+    equations = heyoka.model.nbody(len(data.bodies), masses=list(data.gm.astype(FLOAT)), Gconst=FLOAT(1))
+    by_body = np.concatenate([data.position, data.velocity], axis=1).ravel().astype(FLOAT)
+    integrator = heyoka.taylor_adaptive(
+        equations, by_body, fp_type=FLOAT, tol=FLOAT(tolerance), high_accuracy=True, compact_mode=True
+    )
+    found = []
+    for t in years:
+        outcome = integrator.propagate_until(FLOAT(t) * FLOAT(YEAR_D))[0]
+        if outcome != heyoka.taylor_outcome.time_limit:
+            raise UsageError(f"heyoka stopped before {t:g} yr: {outcome}")
+        found.append(integrator.state.copy().reshape(-1, 2, 3).swapaxes(0, 1).ravel())
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolarReference(Reference):
+    """States of the ten bodies, and their difference from the packaged ones.
+
+    ``growth_reference.json`` comes from ``--years 1 2 5 10 20 50 100 200 500 1000 2000 5000 10000``.
+    """
+
+    file = "solar-reference.json"
+    years: Sequence[float] = option((1, 10, 100, 1000, 2000), "times in Julian years", type=float, nargs="+")
+    tolerance: float = option(1e-24, "tolerance of the Taylor series (%(default)s)", type=float)
+
+    def measure(self, session: Session) -> Found:
+        heyoka, years, known = _heyoka(), sorted(self.years), reference_states()
+        begin = perf_counter()
+        found = solar_states(load("de440"), years, self.tolerance)
+        lines = [f"heyoka {heyoka.__version__}, tolerance {self.tolerance:g}: {perf_counter() - begin:.1f} s"]
+        for t, state in zip(years, found, strict=True):
+            if t in known:
+                apart = difference(state[None], known[t].astype(FLOAT)[None])[0]
+                lines.append(f"{t:8g} yr: {apart:.1e} AU from the packaged state")
+        about = (
+            "Newtonian ten-body solar system from the data set de440: all positions [AU], then all velocities "
+            f"[AU/day], by time in Julian years; heyoka {heyoka.__version__}, 80 bits, tolerance {self.tolerance:g}; "
+            "made by `eip-scipy study solar-reference`."
+        )
+        stored = {
+            f"{t:g}": [np.format_float_scientific(x, precision=19) for x in y]
+            for t, y in zip(years, found, strict=True)
+        }
+        return Found(lines, about, stored)

@@ -1,0 +1,69 @@
+"""Times of functions that are compared: all of them in turn, and of each the least."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, TypeVar
+
+__all__ = ["clocked", "least", "many_calls"]
+
+Name = TypeVar("Name", bound=Hashable)
+Action = Callable[[], float]
+FEWEST = 3
+
+
+def clocked(call: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> Action:
+    """Make a function that calls `call` once and returns the seconds that this took."""
+
+    def run() -> float:
+        begin = clock()
+        call()
+        return clock() - begin
+
+    return run
+
+
+def many_calls(call: Callable[[], Any]) -> Action:
+    """Make a function that returns the processor time of one of several calls, of which reading the clock is no part.
+
+    `call` is called before, to compile and plan what it needs.
+    """
+    call()
+    calls = max(1, int(2e-3 / max(clocked(call)(), 1e-6)))
+
+    def several() -> None:
+        for _ in range(calls):
+            call()
+
+    def run() -> float:
+        call()  # the state in which other functions left memory and caches is not measured
+        return clocked(several, time.process_time)() / calls
+
+    return run
+
+
+def least(actions: Mapping[Name, Action], *, turns: int = 1, seconds: float = 0.0) -> dict[Name, float]:
+    """Return the least time of each action.
+
+    Parameters
+    ----------
+    actions : mapping of hashable to callable
+        Functions that return their own times.
+    turns : int, optional
+        How many times each of them is called. All are called in turn, so that other load disturbs all alike.
+    seconds : float, optional
+        If it is not 0: take turns until so many seconds have passed, at least 3 turns.
+
+    Returns
+    -------
+    dict of hashable to float
+    """
+    best = dict.fromkeys(actions, math.inf)
+    end, done = time.perf_counter() + seconds, 0
+    while done < (FEWEST if seconds else turns) or (seconds and time.perf_counter() < end):
+        for name, action in actions.items():
+            best[name] = min(best[name], action())
+        done += 1
+    return best
