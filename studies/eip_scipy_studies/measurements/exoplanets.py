@@ -21,9 +21,9 @@ from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 from ..report import needed
-from ..solar.cost import timed
+from ..solar.cost import by_us, timed
 from ..study import Measurement, Session, option
-from .orbits import Methods, Row, by_rebound, by_us, one_each, orbit_table, rows
+from .orbits import Methods, Row, by_rebound, one_each, orbit_table, rows
 from .relativity import potential, reference, speed_of_light
 
 __all__ = ["SYSTEMS", "Exoplanets"]
@@ -106,7 +106,7 @@ SYSTEMS = {"resonant chain": chain, "e = .6": eccentric, "hot Jupiter": hot_jupi
 
 def methods(system: System) -> Methods:
     """A row for each method and number of steps in the innermost period."""
-    problem, period, force = system.problem, system.period, potential if system.relativity else None
+    problem, period, force = system.problem, system.period, {"prepare": potential} if system.relativity else {}
 
     def some(name: str, run: Any, counts: tuple[int, ...]) -> Methods:
         return one_each(lambda h: f"{name}, {round(period / h)}", run, [period / n for n in counts])
@@ -114,8 +114,8 @@ def methods(system: System) -> Methods:
     return {
         **some("EIPGJ14", by_us(problem, EIPGJ14), system.multistep),
         **some("EIPRKN12", by_us(problem, EIPRKN12, every=10, compensated=True), system.nystrom),
-        **some("WHFast c17", by_rebound(problem, "whfast-c17", force), system.whfast),
-        "IAS15": (by_rebound(problem, "ias15", force), [math.nan]),
+        **some("WHFast c17", by_rebound(problem, "whfast-c17", **force), system.whfast),
+        "IAS15": (by_rebound(problem, "ias15", **force), [math.nan]),
     }
 
 

@@ -17,9 +17,9 @@ from eip_scipy.problems import solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 from ..report import UsageError, table
-from ..solar.cost import TimedRun, timed
+from ..solar.cost import TimedRun, by_us, timed
 from ..study import Measurement, Session, option
-from .orbits import Methods, by_rebound, by_us
+from .orbits import Methods, by_rebound
 
 __all__ = ["LongOrbits"]
 

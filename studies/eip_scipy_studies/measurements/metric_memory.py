@@ -691,10 +691,12 @@ class Andrews:
         return _with_energy("Andrews", fun, kept, energy, y0, 0.03, known=known, seen=[0, 1, 2, 3, 4, 5, 6])
 
 
-def disc() -> tuple[Case, Case]:
-    """A thin disc that rolls without slipping, wobbling: x, y, heading, lean, spin; two non-holonomic constraints."""
-    mass, radius, gravity = 1.0, 1.0, 9.81
-    flat, axial = 0.25 * mass * radius**2, 0.5 * mass * radius**2
+DISC = 1.0, 1.0, 9.81, 0.25, 0.5  # mass, radius, gravity, moments of inertia about a diameter and about the axis
+
+
+def disc_mechanics() -> tuple[Callable[..., Any], ...]:
+    """Return mass matrix, forces, constraints' matrix and its change for `disc`, as functions of (q[, u])."""
+    mass, radius, gravity, flat, axial = DISC
 
     # q = (x, y, a, b, c) of the point of contact's track; velocity of the centre: that of (x, y, radius sin b).
     def matrix(q: np.ndarray) -> np.ndarray:
@@ -738,6 +740,14 @@ def disc() -> tuple[Case, Case]:
         out[:, 2] = -radius * side * (np.cos(b) * u[2] + u[4]) - radius * np.sin(b) * forward * u[3]
         out[:, 3] = -radius * np.sin(b) * forward * u[2] - radius * np.cos(b) * side * u[3]
         return out
+
+    return matrix, forces, jacobian, rates
+
+
+def disc() -> tuple[Case, Case]:
+    """A thin disc that rolls without slipping, wobbling: x, y, heading, lean, spin; two non-holonomic constraints."""
+    mass, radius, gravity, flat, axial = DISC
+    matrix, forces, jacobian, rates = disc_mechanics()
 
     def bias(q: np.ndarray, u: np.ndarray) -> np.ndarray:
         return rates(q, u) @ u

@@ -25,11 +25,11 @@ from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRKN12, integrate
 from eip_scipy.problems import Problem, kepler, solar_system
 
 from ..report import needed, table
-from ..solar.cost import timed
+from ..solar.cost import by_us, timed
 from ..study import Measurement, Session, option
 from ..work_precision import cost_to_reach
 from .growth import reference
-from .orbits import Methods, Row, by_rebound, by_us, daily, orbit_table, rows, yearly
+from .orbits import Methods, Row, by_rebound, daily, orbit_table, rows, yearly
 
 __all__ = ["Multistep"]
 

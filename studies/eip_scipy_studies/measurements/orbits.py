@@ -2,51 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from eip_scipy import EIPSolver, integrate
 from eip_scipy.problems import Problem
 from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 from ..report import needed, table
-from ..solar.cost import TimedRun
+from ..solar.cost import TimedRun, by_peer
 from ..work_precision import Runner
 
-__all__ = ["Methods", "Row", "by_rebound", "by_us", "daily", "one_each", "orbit_table", "rows", "yearly"]
+__all__ = ["Methods", "Row", "by_rebound", "daily", "one_each", "orbit_table", "rows", "yearly"]
 
 Methods = dict[str, tuple[Runner, Sequence[float]]]
 Row = dict[str, float]
 
 
-def by_us(problem: Problem, method: type[EIPSolver], **options: Any) -> Runner:
-    """Make a run from the start to the end of the problem's interval, by steps of the runner's argument."""
-
-    def run(h: float) -> tuple[float, np.ndarray]:
-        result = integrate(problem, method=method, h=h, **options)
-        return result.wall_time, result.y[:, -1]
-
-    return run
-
-
-def by_rebound(problem: Problem, integrator: str, prepare: Callable[..., Any] | None = None) -> Runner:
-    """Make the same run by an integrator of REBOUND.
-
-    Its steps are shortened to divide the interval; IAS15 chooses its own, for which the argument is nan.
-    """
-    rebound = needed("eip_scipy.integrations.rebound")
-    assert problem.params is not None
-    gm, years = problem.params[: problem.y0.size // 6], problem.t_span[1]
-
-    def run(h: float) -> tuple[float, np.ndarray]:
-        n = 1 if math.isnan(h) else round(years / h)
-        result = rebound.run(gm, problem.y0, integrator, h=years / n, n_steps=n, prepare=prepare)
-        return result.wall_time, result.y[:, -1]
-
-    return run
+def by_rebound(problem: Problem, integrator: str, **options: Any) -> Runner:
+    """Make a run by an integrator of REBOUND, which must be installed; see `by_peer`."""
+    return by_peer(problem, needed("eip_scipy.integrations.rebound").run, integrator, **options)
 
 
 def one_each(label: Callable[[float], str], run: Runner, steps: Iterable[float]) -> Methods:

@@ -18,9 +18,9 @@ from eip_scipy.problems import Problem, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 from ..report import needed
-from ..solar.cost import timed
+from ..solar.cost import by_us, timed
 from ..study import Measurement, Session, option
-from .orbits import Methods, Row, by_rebound, by_us, daily, orbit_table, rows, yearly
+from .orbits import Methods, Row, by_rebound, daily, orbit_table, rows, yearly
 
 __all__ = ["Relativity", "potential", "reference", "speed_of_light"]
 
@@ -68,8 +68,8 @@ def methods(problem: Problem) -> Methods:
     found = yearly("EIPGJ14", by_us(problem, EIPGJ14), *MULTISTEP)
     found |= yearly("EIPRKN12", by_us(problem, EIPRKN12, every=10, compensated=True), *NYSTROM)
     for name, days in DAYS.items():
-        found |= daily(name, by_rebound(problem, name, potential), *days)
-    return found | {"ias15": (by_rebound(problem, "ias15", potential), [math.nan])}
+        found |= daily(name, by_rebound(problem, name, prepare=potential), *days)
+    return found | {"ias15": (by_rebound(problem, "ias15", prepare=potential), [math.nan])}
 
 
 @dataclass(frozen=True, kw_only=True)

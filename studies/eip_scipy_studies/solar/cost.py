@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from eip_scipy import EIPGJ14, EIPRK4, EIPRK5, EIPRKN12, EIPSolver, integrate
+from eip_scipy.problems import Problem
 from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 from ..long_runs import named
@@ -30,7 +30,18 @@ from .runs import (
     whole_number,
 )
 
-__all__ = ["ENOUGH_SECONDS", "MERCURY", "TimedRun", "cost", "cost_methods", "panels", "timed"]
+__all__ = [
+    "ENOUGH_SECONDS",
+    "MERCURY",
+    "TimedRun",
+    "by_peer",
+    "by_us",
+    "by_verlet",
+    "cost",
+    "cost_methods",
+    "panels",
+    "timed",
+]
 
 ENOUGH_SECONDS = 0.2  # what disturbs so long a run is not seen on axes of many powers of ten
 MULTISTEP_COUNTS = (255, 300, 412, 600)  # steps a year; half of the first would not be stable
@@ -66,6 +77,43 @@ class TimedRun:
     def others(self) -> float:
         """The largest error of another planet."""
         return float(np.delete(self.errors, MERCURY).max())
+
+
+def by_us(problem: Problem, method: type[EIPSolver], **options: Any) -> Runner:
+    """Make a run over the problem's interval by steps of the runner's argument, in years; nan for one that failed."""
+
+    def run(step: float) -> tuple[float, np.ndarray]:
+        name = f"{method.__name__}, h = {step:.4g} yr"
+        result = integrate(problem, method=named(method, name), h=step, **options)
+        return result.wall_time, result.y[:, -1] if result.success else np.full_like(problem.y0, np.nan)
+
+    return run
+
+
+def by_verlet(problem: Problem) -> Runner:
+    """Make the same run by Stoermer-Verlet."""
+
+    def run(step: float) -> tuple[float, np.ndarray]:
+        result = leapfrog(problem, step, None)
+        return result.wall_time, result.y[:, -1]
+
+    return run
+
+
+def by_peer(problem: Problem, peer: Peer, integrator: str, **options: Any) -> Runner:
+    """Make the same run by an integrator of REBOUND, whose steps are shortened to divide the interval.
+
+    IAS15 chooses its own steps, for which the argument is nan.
+    """
+    assert problem.params is not None
+    gm, years = problem.params[: problem.y0.size // 6], problem.t_span[1]
+
+    def run(step: float) -> tuple[float, np.ndarray]:
+        n_steps = 1 if math.isnan(step) else whole_number(years / step)
+        result = peer(gm, problem.y0, integrator, h=years / n_steps, n_steps=n_steps, **options)
+        return result.wall_time, result.y[:, -1]
+
+    return run
 
 
 def timed(
@@ -167,45 +215,26 @@ def cost_methods(
         As `work_precision` takes it.
     """
     other = EIPRK4 if method is EIPRK5 else EIPRK5
-    own = metric_of(method, metric)
+    own, problem = metric_of(method, metric), scene.problem
     steps = _steps(scene, [scene.h * factor for factor in (4, 2, 1, 0.5)])
     methods: dict[str, tuple[Runner, Sequence[float]]] = {
-        eip_name(method, own): (partial(_time_eip, scene, method, {"metric": own}), steps),
-        method.TABLEAU.name: (partial(_time_eip, scene, method, {"invariants": ()}), steps),
-        eip_name(other, metric): (partial(_time_eip, scene, other, {"metric": metric}), steps),
-        "SV": (partial(_time_verlet, scene), _steps(scene, [scene.h * f for f in (2, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)])),
-        HIGH_ORDER: (partial(_time_eip, scene, EIPRKN12, KEPT), _steps(scene, [1 / n for n in (24, 32, 40, 48, 64)])),
-        MULTISTEP: (partial(_time_eip, scene, EIPGJ14, {}), _steps(scene, [1 / n for n in MULTISTEP_COUNTS])),
+        eip_name(method, own): (by_us(problem, method, metric=own), steps),
+        method.TABLEAU.name: (by_us(problem, method, invariants=()), steps),
+        eip_name(other, metric): (by_us(problem, other, metric=metric), steps),
+        "SV": (by_verlet(problem), _steps(scene, [scene.h * f for f in (2, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)])),
+        HIGH_ORDER: (by_us(problem, EIPRKN12, **KEPT), _steps(scene, [1 / n for n in (24, 32, 40, 48, 64)])),
+        MULTISTEP: (by_us(problem, EIPGJ14), _steps(scene, [1 / n for n in MULTISTEP_COUNTS])),
     }
     if peer is None:
         return methods
     days = _steps(scene, [d / YEAR_D for d in (10.0, 5.0, 2.5, 1.25)])
-    methods["WHFast"] = (partial(_time_rebound, scene, peer, "whfast"), days)
-    methods["WHFast (c17)"] = (partial(_time_rebound, scene, peer, "whfast-c17"), days)
+    methods["WHFast"] = (by_peer(problem, peer, "whfast"), days)
+    methods["WHFast (c17)"] = (by_peer(problem, peer, "whfast-c17"), days)
     if stored_state(scene, scene.years) is not None:  # otherwise it is the reference
-        methods["IAS15"] = (partial(_time_rebound, scene, peer, "ias15"), [scene.years])
+        methods["IAS15"] = (by_peer(problem, peer, "ias15"), [scene.years])
     return methods
 
 
 def _steps(scene: SolarScene, wanted: Sequence[float]) -> list[float]:
     """Shorten steps to divide the span: a shortened last one would spoil a symplectic method."""
     return sorted({scene.years / whole_number(scene.years / h) for h in wanted}, reverse=True)
-
-
-def _time_eip(
-    scene: SolarScene, method: type[EIPSolver], options: dict[str, Any], step: float
-) -> tuple[float, np.ndarray]:
-    name = f"{method.__name__}, h = {step:.4g} yr"
-    result = integrate(scene.problem, method=named(method, name), h=step, **options)
-    return result.wall_time, result.y[:, -1] if result.success else np.full_like(scene.problem.y0, np.nan)
-
-
-def _time_verlet(scene: SolarScene, step: float) -> tuple[float, np.ndarray]:
-    result = leapfrog(scene, step, None)
-    return result.wall_time, result.y[:, -1]
-
-
-def _time_rebound(scene: SolarScene, peer: Peer, integrator: str, step: float) -> tuple[float, np.ndarray]:
-    n_steps = whole_number(scene.years / step)
-    result = peer(scene.problem.params, scene.problem.y0, integrator, h=scene.years / n_steps, n_steps=n_steps)
-    return result.wall_time, result.y[:, -1]

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK4, EIPRKN8, EIPRKN12, integrate
+from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK4, EIPRKN8, EIPRKN12
 from eip_scipy.problems import Problem, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D, load, reference_states
 
-from ..comparators import stormer_verlet
-from ..long_runs import named, positive
+from ..long_runs import positive
 from ..report import UsageError, compact, describe_machine, table
 from ..study import Figures, Rows, Session, Study, option
 from ..work_precision import Runner, costs_at, curves
-from .cost import MERCURY, TimedRun, panels, timed
+from .cost import MERCURY, TimedRun, by_peer, by_us, by_verlet, panels, timed
 from .runs import KEPT, Peer, whole_number
 
 __all__ = ["Found", "Frontier", "methods"]
@@ -46,7 +45,7 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
     """
 
     def own(method: Any, *steps: float, **options: Any) -> tuple[Runner, Sequence[float]]:
-        return partial(_integrate, problem, years, method, options), _dividing(years, steps)
+        return by_us(problem, method, **options), _dividing(years, steps)
 
     steps = (1 / 24, 1 / 32, 1 / 40, 1 / 48, 1 / 64, 1 / 80, 1 / 100)
     found = {
@@ -57,17 +56,17 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
         "EIPRKN8": own(EIPRKN8, 1 / 80, 1 / 100, 1 / 160, 1 / 240, **KEPT),
         "EIPDOP853": own(EIPDOP853, 1 / 80, 1 / 120, 1 / 180, 1 / 240, **KEPT),
         "EIPRK4": own(EIPRK4, 1 / 500, 1 / 1000),
-        "SV": (partial(_verlet, problem, years), _dividing(years, [1 / 500, 1 / 1000, 1 / 2000])),
+        "SV": (by_verlet(problem), _dividing(years, [1 / 500, 1 / 1000, 1 / 2000])),
     }
     if peer is not None:
 
         def by_rebound(name: str, *days: float) -> tuple[Runner, Sequence[float]]:
-            return partial(_rebound, peer, problem, years, name), _dividing(years, [d / YEAR_D for d in days])
+            return by_peer(problem, peer, name), _dividing(years, [d / YEAR_D for d in days])
 
         found |= {
             "WHFast (c17)": by_rebound("whfast-c17", 10, 5, 3, 2, 1.4, 1, 0.7305),
             "SABA(10,6,4)": by_rebound("saba(10,6,4)", 20, 15, 10, 7.5, 5, 3),
-            "IAS15": (partial(_ias15, peer, problem, years), [math.nan]),
+            "IAS15": (by_peer(problem, peer, "ias15"), [math.nan]),
         }
     if heyoka is not None:
         found["heyoka (double)"] = partial(_heyoka, heyoka, problem, years), [1e-9, 1e-11, 1e-13, 2.2e-16]
@@ -77,30 +76,6 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
 def _dividing(years: float, wanted: Sequence[float]) -> list[float]:
     """Steps shortened to divide the span."""
     return [years / whole_number(years / h) for h in wanted]
-
-
-def _integrate(
-    problem: Problem, years: float, method: Any, options: Mapping[str, Any], step: float
-) -> tuple[float, np.ndarray]:
-    name = f"{method.__name__}, h = {step:.4g} yr"
-    result = integrate(problem, (0.0, years), method=named(method, name), h=step, **options)
-    return result.wall_time, result.y[:, -1] if result.success else np.full(problem.y0.size, np.nan)
-
-
-def _verlet(problem: Problem, years: float, step: float) -> tuple[float, np.ndarray]:
-    assert problem.acc is not None
-    result = stormer_verlet(problem.acc, (0.0, years), problem.y0, step, params=problem.params)
-    return result.wall_time, result.y[:, -1]
-
-
-def _rebound(peer: Peer, problem: Problem, years: float, name: str, step: float) -> tuple[float, np.ndarray]:
-    n_steps = whole_number(years / step)
-    result = peer(problem.params, problem.y0, name, h=years / n_steps, n_steps=n_steps)
-    return result.wall_time, result.y[:, -1]
-
-
-def _ias15(peer: Peer, problem: Problem, years: float, step: float) -> tuple[float, np.ndarray]:
-    return _rebound(peer, problem, years, "ias15", years)
 
 
 def _heyoka(peer: Peer, problem: Problem, years: float, tolerance: float) -> tuple[float, np.ndarray]:

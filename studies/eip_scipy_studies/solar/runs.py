@@ -287,14 +287,13 @@ def _long(
 
 
 def _verlet(scene: SolarScene) -> MethodRun:
-    result = leapfrog(scene, scene.h, scene.every)
+    result = leapfrog(scene.problem, scene.h, scene.every)
     failure = "" if np.isfinite(result.y).all() else result.message
     return _finished(scene, "SV", ("SV",), scene.h, result, failure)
 
 
-def leapfrog(scene: SolarScene, step: float, save_every: int | None) -> StormerVerletResult:
+def leapfrog(problem: Problem, step: float, save_every: int | None) -> StormerVerletResult:
     """Run Stoermer-Verlet in its kick-drift-kick form."""
-    problem = scene.problem
     assert problem.acc is not None  # N bodies have accelerations
     return stormer_verlet(problem.acc, problem.t_span, problem.y0, step, params=problem.params, save_every=save_every)
 

@@ -53,7 +53,8 @@ REST, MOVING, LEAK, GRADIENT, LONG, BLOWN, MEMBER = (
 
 def sick_runs() -> list[Run]:
     """All of them."""
-    every = (false_invariants, visible, leaks, late_leaks, gradients, long_steps, light_bodies, blown, members)
+    every = [with_friction, false_invariants, visible, leaks, late_leaks, gradients, long_steps, light_bodies, blown]
+    every += [members, rising_friction]
     return [run for part in every for run in part()]
 
 
@@ -445,7 +446,7 @@ for event, direction in DIRECTIONS:
     event.terminal, event.direction = True, direction
 
 
-def false_invariants() -> Iterator[Run]:
+def with_friction() -> Iterator[Run]:
     at_rest = partial(runs, REST)
     friction = partial(s.pendulum, 0.2), partial(s.compiled_pendulum, 0.2)
     yield from at_rest(
@@ -477,6 +478,10 @@ def false_invariants() -> Iterator[Run]:
     yield from at_rest(
         "pendulum with friction .2, an event ends it", friction[1], "RK4 h=0.05 integrate", events=leaves
     )
+
+
+def false_invariants() -> Iterator[Run]:
+    at_rest = partial(runs, REST)
     wrong_sign = partial(s.pendulum, 0.0, -1.0)
     yield from at_rest("pendulum, sign of the potential", wrong_sign, "RK45 1e-6, RK4 h=0.05")
     yield from at_rest("Duffing without its quartic term", partial(s.duffing, 0.0), "RK45 1e-6")
@@ -705,6 +710,10 @@ def members() -> Iterator[Run]:
         sick=(5, 1500),
         y0s=crowd,
     )
+
+
+def rising_friction() -> Iterator[Run]:
+    one = partial(runs, MEMBER)
     rising = np.zeros((8, 1))
     rising[1:, 0] = np.geomspace(1e-4, 0.1, 7)
     yield from one(
