@@ -1,9 +1,9 @@
 """Compiled loops of the engine for methods with fixed steps that the projection is compared with.
 
 This module is the door through which other packages, `eip_scipy_studies.comparators` among them, reach these loops.
-`take_steps` runs a scheme over functions of the user, compiled where they have an address; `fields` holds loops over
-the points of a complex field, one call for each part of a step of the Gross-Pitaevskii equation. Names and signatures
-of the schemes follow the engine and may change with it.
+`run_in_place` and `run_second_order` run a scheme over a function of the user, compiled if it has an address; `fields`
+holds loops over the points of a complex field, one call for each part of a step of the Gross-Pitaevskii equation. The
+schemes follow the engine and may change with it.
 """
 
 from __future__ import annotations
@@ -27,16 +27,11 @@ from .engine.native import BUILD, Call, FailedCallError, NativeFunctions, Python
 __all__ = [
     "FixedStepResult",
     "FixedSteps",
-    "Kind",
-    "by_pointer",
-    "call",
     "check_state",
     "fields",
-    "fill_in_place",
-    "functions_of",
-    "real_vector",
     "refuse_units",
-    "take_steps",
+    "run_in_place",
+    "run_second_order",
 ]
 
 fields = BUILD.fields
@@ -68,8 +63,8 @@ class FixedStepResult:
     message: str
 
 
-def check_span(t_span: Any) -> tuple[float, float]:
-    """Start and end as floats; ValueError for anything but two finite numbers."""
+def _check_span(t_span: Any) -> tuple[float, float]:
+    """Return start and end as floats; ValueError for anything but two finite numbers."""
     refuse_units(t_span=t_span)
     span = reals(t_span)
     if span is None or span.shape != (2,) or not np.isfinite(span).all():
@@ -77,7 +72,7 @@ def check_span(t_span: Any) -> tuple[float, float]:
     return float(span[0]), float(span[1])
 
 
-def real_vector(values: Any, name: str) -> np.ndarray:
+def _real_vector(values: Any, name: str) -> np.ndarray:
     """Copy a 1-D array of real numbers to contiguous float64."""
     refuse_units(**{name: values})
     if np.iscomplexobj(values):
@@ -92,7 +87,7 @@ def real_vector(values: Any, name: str) -> np.ndarray:
 
 def check_state(y0: Any) -> np.ndarray:
     """Copy the initial state; ValueError unless all of its components are finite."""
-    y = real_vector(y0, "y0")
+    y = _real_vector(y0, "y0")
     if not np.isfinite(y).all():
         raise ValueError("All components of the initial state `y0` must be finite.")
     return y
@@ -113,8 +108,8 @@ class FixedSteps(NamedTuple):
 
     @classmethod
     def of(cls, t_span: Any, h: Any, save_every: Any) -> FixedSteps:
-        """From what the user gave, checked."""
-        t0, t_bound = check_span(t_span)
+        """Make the steps from the user's arguments, which are checked."""
+        t0, t_bound = _check_span(t_span)
         h = check_fixed_step(h, t0, t_bound)
         if save_every is None:
             save_every = 0
@@ -132,8 +127,8 @@ class FixedSteps(NamedTuple):
         return t
 
 
-def message(reason: str, t: np.ndarray, ys: np.ndarray) -> str:
-    """How the run went; `reason` says why it was interpreted, and is empty where it was not."""
+def _message(reason: str, t: np.ndarray, ys: np.ndarray) -> str:
+    """Say how the run went; `reason` says why it was interpreted, and is empty if it was compiled."""
     text = f"interpreted: {reason}" if reason else "compiled"
     finite = np.isfinite(ys).all(axis=1)
     if finite.all():
@@ -141,56 +136,106 @@ def message(reason: str, t: np.ndarray, ys: np.ndarray) -> str:
     return f"{text}; the saved states from t={t[np.argmin(finite)].item()!r} on are not finite"
 
 
-def functions_of(
+def run_in_place(
+    scheme: str,
+    fun: Callable[..., Any],
+    steps: FixedSteps,
+    y: np.ndarray,
+    params: Any,
+    *,
+    name: str,
+    takes: int,
+    fills: int,
+    constant: float = 0.0,
+) -> FixedStepResult:
+    """Run a scheme over a function that fills an array.
+
+    Parameters
+    ----------
+    scheme : str
+        Name of a scheme in engine/cpp/comparators.
+    fun : callable
+        ``fun(t, x, out[, params])`` with the first `takes` components of the state, which fills `fills` numbers. A
+        function jitted by Numba and a C function by pointer run compiled, any other callable interpreted.
+    steps : FixedSteps
+    y : ndarray, shape (n,)
+        The start, which is overwritten.
+    params : array_like or None
+    name : str
+        Name of `fun` in messages.
+    takes, fills : int
+    constant : float, optional
+        Number that the scheme takes, such as the charge per mass.
+
+    Returns
+    -------
+    FixedStepResult
+    """
+    if not callable(fun) and not is_pointer(fun):
+        raise TypeError(f"{name} must be callable, got {fun!r}")
+    given = None if params is None else _real_vector(params, "params")
+    fun = by_pointer(fun, name)
+
+    def called(t: float, y: np.ndarray, out: np.ndarray, *extra: np.ndarray) -> None:
+        fun(t, y[:takes], out, *extra)
+
+    in_python = call(called, () if given is None else (given,), (fills,), None, in_place=True)
+    kind = Kind((fills,), takes, -1 if given is None else given.size, "d", in_place=True)
+    return _run(scheme, fun, in_python, kind, name, given, steps, y, constant=constant)
+
+
+def run_second_order(
+    scheme: str, acc: Callable[..., Any], steps: FixedSteps, y: np.ndarray, params: Any
+) -> FixedStepResult:
+    """Run a scheme over an acceleration, ``acc(t, q[, params]) -> (n/2,)``; see `run_in_place`.
+
+    It is called once before the run, which checks the shape of its value.
+    """
+    given = None if params is None else _real_vector(params, "params")
+    half = y.size // 2
+    extra = () if given is None else (given,)
+    convert = _converter(half)
+    acc = by_pointer(acc, "acc", shape=(half,))
+    convert(acc(steps.t0, y[:half].copy(), *extra), steps.t0)
+    in_python = call(acc, extra, (half,), convert)
+    kind = Kind((half,), half, -1 if given is None else given.size, "d")
+    return _run(scheme, acc, in_python, kind, "acc", given, steps, y, second_order=True)
+
+
+def _converter(size: int) -> Callable[[Any, float], np.ndarray]:
+    """Make a function that converts values of `acc`: NumPy would silently broadcast scalars or drop imaginary parts."""
+
+    def convert(value: Any, t: float) -> np.ndarray:
+        if value is None:
+            raise TypeError(f"acc returned None, expected {size} numbers")
+        if np.iscomplexobj(value):
+            raise TypeError("acc returned complex numbers, expected real ones")
+        if np.shape(value) != (size,):
+            raise ValueError(f"acc returned shape {np.shape(value)}, expected ({size},)")
+        return np.array(value, dtype=float)
+
+    return convert
+
+
+def _run(
+    scheme: str,
     fun: Callable[..., Any],
     in_python: Call,
     kind: Kind,
     name: str,
     params: np.ndarray | None,
+    steps: FixedSteps,
+    y: np.ndarray,
     *,
+    constant: float = 0.0,
     second_order: bool = False,
-) -> tuple[NativeFunctions | PythonFunctions, str]:
-    """A user's function as the engine takes it, by its address or `in_python`; and why not by its address, if not."""
+) -> FixedStepResult:
+    """Take all steps from y, which moves, with the function's address or, if it has none, with `in_python`."""
+    functions: NativeFunctions | PythonFunctions
     try:
-        return function_alone(fun, kind, name, params, second_order=second_order), ""
+        functions, reason = function_alone(fun, kind, name, params, second_order=second_order), ""
     except NotCompilableError as error:
-        return PythonFunctions(in_python, (), (), (), second_order), str(error)
-
-
-def fill_in_place(
-    scheme: str,
-    fun: Callable[..., Any],
-    name: str,
-    kind: Kind,
-    steps: FixedSteps,
-    y: np.ndarray,
-    params: Any,
-    constant: float = 0.0,
-) -> FixedStepResult:
-    """Run a comparator whose function is ``fun(t, x, out[, params])``, x the state's first ``kind.size`` numbers."""
-    if not callable(fun) and not is_pointer(fun):
-        raise TypeError(f"{name} must be callable, got {fun!r}")
-    given = None if params is None else real_vector(params, "params")
-    fun, size = by_pointer(fun, name), kind.size
-
-    def called(t: float, y: np.ndarray, out: np.ndarray, *extra: np.ndarray) -> None:
-        fun(t, y[:size], out, *extra)
-
-    in_python = call(called, () if given is None else (given,), kind.shape, None, in_place=True)
-    kind = kind._replace(p=-1 if given is None else given.size)
-    functions, reason = functions_of(fun, in_python, kind, name, given)
-    return take_steps(scheme, functions, steps, y, reason, constant)
-
-
-def take_steps(
-    scheme: str,
-    functions: NativeFunctions | PythonFunctions,
-    steps: FixedSteps,
-    y: np.ndarray,
-    reason: str,
-    constant: float = 0.0,
-) -> FixedStepResult:
-    """All steps from y, which moves, by a scheme of engine/cpp/comparators; `reason` says why they are interpreted."""
+        functions, reason = PythonFunctions(in_python, (), (), (), second_order), str(error)
     ys = np.full((steps.saved.size, y.size), np.nan)
     ys[0] = y
     work = make_work(y.size, np.dtype(float), 1, 0, 0)
@@ -201,6 +246,6 @@ def take_steps(
         failed = error.args
     else:
         wall_time = perf_counter() - start
-        return FixedStepResult(steps.t, ys.T, evaluations, wall_time, message(reason, steps.t, ys))
+        return FixedStepResult(steps.t, ys.T, evaluations, wall_time, _message(reason, steps.t, ys))
     assert isinstance(functions, NativeFunctions)  # those in Python raise their own errors
     raise_again(functions, *failed)

@@ -297,7 +297,7 @@ class Curves(NamedTuple):
 
 
 class ParticleRow(NamedTuple):
-    """What one method got of a charged particle.
+    """Orbits and errors of one method for a charged particle.
 
     Attributes
     ----------
@@ -823,7 +823,7 @@ def side_by_side_figure(
 
 
 def _curve(axis: Axes, seconds: Any, errors: Any, style: Mapping[str, Any]) -> None:
-    """What is below the spacing of numbers is drawn there: a log axis has no zero."""
+    """Draw a curve; errors below the spacing of numbers are drawn there, since a log axis has no zero."""
     x, y = np.asarray(seconds, dtype=float), np.asarray(errors, dtype=float)
     good = np.isfinite(x) & np.isfinite(y)
     axis.plot(x[good], np.maximum(y[good], FLOOR), **style)

@@ -1,4 +1,4 @@
-"""What the implicit schemes for the Gross-Pitaevskii equation share: their loop, their record and their solver.
+"""Common part of the implicit schemes for the Gross-Pitaevskii equation: their loop, their record and their solver.
 
 With the linear part ``K = -Laplace / 2`` diagonal in the modes, ``1 + i c K`` is inverted by one pair of transforms.
 """
@@ -24,7 +24,7 @@ WARM_STEPS = 3  # after which each branch of a scheme has been taken
 
 @dataclass(frozen=True)
 class FieldResult:
-    """What `crank_nicolson` and `linearly_implicit` return.
+    """Result of `crank_nicolson` and `linearly_implicit`.
 
     Attributes
     ----------

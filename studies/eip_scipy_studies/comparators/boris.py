@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.native_kernels import FixedStepResult, FixedSteps, Kind, check_state, fill_in_place, refuse_units
+from eip_scipy.native_kernels import FixedStepResult, FixedSteps, check_state, refuse_units, run_in_place
 
 __all__ = ["boris"]
 
@@ -80,5 +80,5 @@ def boris(
     if not (mass > 0 and np.isfinite(mass) and np.isfinite(charge)):
         raise ValueError(f"mass must be positive and charge finite, got {mass!r} and {charge!r}")
     steps = FixedSteps.of(t_span, h, save_every)
-    kind = Kind((6,), 3, -1, "d", in_place=True)
-    return fill_in_place("boris", fields, "fields", kind, steps, y, params, charge / mass)
+    ratio = charge / mass
+    return run_in_place("boris", fields, steps, y, params, name="fields", takes=3, fills=6, constant=ratio)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from eip_scipy.native_kernels import FixedStepResult, FixedSteps, Kind, check_state, fill_in_place
+from eip_scipy.native_kernels import FixedStepResult, FixedSteps, check_state, run_in_place
 
 __all__ = ["implicit_midpoint"]
 
@@ -69,5 +69,5 @@ def implicit_midpoint(
     True
     """
     y = check_state(y0)
-    kind = Kind((y.size,), y.size, -1, "d", in_place=True)
-    return fill_in_place("implicit-midpoint", rhs, "rhs", kind, FixedSteps.of(t_span, h, save_every), y, params)
+    steps = FixedSteps.of(t_span, h, save_every)
+    return run_in_place("implicit-midpoint", rhs, steps, y, params, name="rhs", takes=y.size, fills=y.size)

@@ -19,7 +19,7 @@ __all__ = ["SAVResult", "sav_crank_nicolson"]
 
 @dataclass(frozen=True)
 class SAVResult(FieldResult):
-    """What `sav_crank_nicolson` returns: a `FieldResult` with one array more.
+    """Result of `sav_crank_nicolson`: a `FieldResult` with one more array.
 
     Attributes
     ----------

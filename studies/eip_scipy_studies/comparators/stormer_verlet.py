@@ -7,17 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy.native_kernels import (
-    FixedStepResult,
-    FixedSteps,
-    Kind,
-    by_pointer,
-    call,
-    check_state,
-    functions_of,
-    real_vector,
-    take_steps,
-)
+from eip_scipy.native_kernels import FixedStepResult, FixedSteps, check_state, run_second_order
 
 __all__ = ["FORMS", "StormerVerletResult", "stormer_verlet"]
 
@@ -25,7 +15,7 @@ FORMS = ("kick-drift-kick", "drift-kick-drift")
 
 
 class StormerVerletResult(FixedStepResult):
-    """What `stormer_verlet` returns: a `FixedStepResult` with states (q, v) and evaluations of the acceleration."""
+    """Result of `stormer_verlet`: a `FixedStepResult` with states (q, v) and evaluations of the acceleration."""
 
 
 def stormer_verlet(
@@ -96,17 +86,7 @@ def stormer_verlet(
     y = _check_halves(y0)
     if form not in FORMS:
         raise ValueError(f"unknown form {form!r}: expected one of {', '.join(map(repr, FORMS))}")
-    given = None if params is None else real_vector(params, "params")
-
-    half = y.size // 2
-    extra = () if given is None else (given,)
-    convert = _converter(half)
-    acc = by_pointer(acc, "acc", shape=(half,))
-    convert(acc(steps.t0, y[:half].copy(), *extra), steps.t0)
-    kind = Kind((half,), half, -1 if given is None else given.size, "d")
-    in_python = call(acc, extra, (half,), convert)
-    functions, reason = functions_of(acc, in_python, kind, "acc", given, second_order=True)
-    run = take_steps(form, functions, steps, y, reason)
+    run = run_second_order(form, acc, steps, y, params)
     return StormerVerletResult(run.t, run.y, int(steps.saved[-1]) + 1, run.wall_time, run.message)
 
 
@@ -115,18 +95,3 @@ def _check_halves(y0: Any) -> np.ndarray:
     if y.size == 0 or y.size % 2:
         raise ValueError(f"y0 must hold q and v, an even number of components, got {y.size}")
     return y
-
-
-def _converter(size: int) -> Callable[[Any, float], np.ndarray]:
-    """What makes of a value of `acc` an array: NumPy would broadcast a scalar and drop an imaginary part silently."""
-
-    def convert(value: Any, t: float) -> np.ndarray:
-        if value is None:
-            raise TypeError(f"acc returned None, expected {size} numbers")
-        if np.iscomplexobj(value):
-            raise TypeError("acc returned complex numbers, expected real ones")
-        if np.shape(value) != (size,):
-            raise ValueError(f"acc returned shape {np.shape(value)}, expected ({size},)")
-        return np.array(value, dtype=float)
-
-    return convert

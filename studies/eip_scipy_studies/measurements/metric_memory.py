@@ -54,7 +54,7 @@ class Case:
 
     @cached_property
     def reference(self) -> np.ndarray:
-        """The state at the end, by DOP853 at tight tolerances unless it is known."""
+        """Return the state at the end, by DOP853 at tight tolerances unless it is known."""
         if self.known is not None:
             return self.known
         run = integrate(
@@ -63,7 +63,7 @@ class Case:
         return run.y[:, -1]
 
     def error(self, y: np.ndarray) -> float:
-        """The error of a final state, relative to the largest component."""
+        """Return the error of a final state, relative to the largest component."""
         reference = self.reference[self.seen]
         return float(np.abs(y[self.seen] - reference).max() / np.abs(reference).max())
 
@@ -805,7 +805,7 @@ def cut_off() -> Iterator[Case]:
 
 
 def cases() -> Iterator[Case]:
-    """All of them."""
+    """Yield all problems."""
     yield from cut_off()
     for name in MASSES:
         for momenta in (True, False):
@@ -820,7 +820,7 @@ def cases() -> Iterator[Case]:
 
 
 def mean_ratio(found: Iterable[Outcome]) -> float:
-    """The geometric mean of the errors relative to the unprojected runs'."""
+    """Return the geometric mean of the errors relative to the unprojected runs'."""
     ratios = [one.ratio for one in found if not one.failed]
     return float(np.exp(np.mean(np.log(ratios)))) if ratios else np.nan
 

@@ -160,7 +160,7 @@ def kepler_table(found: Table) -> str:
 
 
 def own(problem: Problem, **options: Any) -> tuple[Callable[[], np.ndarray], Callable[[], float]]:
-    """A run, and the seconds that its steps took."""
+    """Make a run, and the seconds that its steps took."""
     last = [0.0]
 
     def run() -> np.ndarray:
@@ -172,7 +172,7 @@ def own(problem: Problem, **options: Any) -> tuple[Callable[[], np.ndarray], Cal
 
 
 def taylor(problem: Problem, tolerance: float) -> tuple[Callable[[], np.ndarray], Callable[[], float]]:
-    """The same by heyoka, made and compiled before."""
+    """Make the same run by heyoka, compiled before, and the seconds that it took."""
     heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
     assert problem.params is not None
     x, y, u, v = heyoka.make_vars("x", "y", "u", "v")
@@ -194,7 +194,7 @@ def taylor(problem: Problem, tolerance: float) -> tuple[Callable[[], np.ndarray]
 
 
 def in_rotations(problem: Problem, truth: np.ndarray, methods: Callable[[Problem, int], Methods], turns: int) -> Table:
-    """All methods in turn, in axes turned anew each time."""
+    """Run all methods in turn, in axes turned anew each time."""
     found = []
     for turn, rotation in enumerate([Rotation.identity(), *Rotation.random(turns - 1, np.random.default_rng(1))]):
         own = replace(problem, y0=rotation.apply(problem.y0.reshape(-1, 3)).ravel()) if turn else problem
@@ -217,5 +217,5 @@ def compared(found: Table, mercury: float, others: float) -> list[str]:
 
 
 def least(found: Table, kind: str, part: str) -> float:
-    """The least time of a method; nan without a run of it."""
+    """Return the least time of a method; nan without a run of it."""
     return min((row[part] for name, row in found.items() if name.startswith(kind)), default=math.nan)

@@ -59,7 +59,7 @@ class System(NamedTuple):
 
 
 def by_reference(problem: Problem, size: float = 1.0) -> System:
-    """A problem that knows its last state; errors of the positions in units of `size`."""
+    """Make a system of a problem that knows its last state; errors of the positions in units of `size`."""
 
     def error(y: np.ndarray) -> float:
         assert problem.reference is not None
@@ -71,7 +71,7 @@ def by_reference(problem: Problem, size: float = 1.0) -> System:
 
 
 def systems() -> Iterator[tuple[str, Callable[[], System]]]:
-    """All of them by name, made when they are wanted."""
+    """Yield the systems by name, made when they are wanted."""
     for years in (100.0, 1000.0):
         yield f"ten bodies, {years:g} yr", partial(_solar, years)
     for name in ("resonant chain", "e = .6", "hot Jupiter"):
@@ -119,7 +119,7 @@ def is_second_order(problem: Problem) -> bool:
 
 
 class Run(NamedTuple):
-    """What one came to."""
+    """Errors and costs of a run."""
 
     error: float
     drift: float
@@ -129,7 +129,7 @@ class Run(NamedTuple):
 
 
 def run_one(system: System, method: type[EIPSolver], options: dict[str, Any], rows: bool = True) -> Run:
-    """One run; its time is the processor's for a run without the rows that show the drift."""
+    """Run a system; the time is the processor's for a run without the rows that show the drift."""
     steps = options.get("save_every", 1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ProjectionWarning)
@@ -145,7 +145,7 @@ def run_one(system: System, method: type[EIPSolver], options: dict[str, Any], ro
 
 
 def steps(system: System) -> list[int]:
-    """Numbers of steps that bring EIPRKN12, each step projected, below the levels, as far as it gets there."""
+    """Return numbers of steps that bring EIPRKN12, each step projected, below the levels, as far as it gets there."""
     found, n, left = list[int](), 8, list(LEVELS)
     span = abs(system.problem.t_span[1] - system.problem.t_span[0])
     while left and n < (MOST_STEPS if system.natively else MOST_STEPS // 8):
@@ -159,7 +159,7 @@ def steps(system: System) -> list[int]:
 
 
 def settings(system: System) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """Names of settings, and the neighbours that each stands for."""
+    """Yield names of settings, and the neighbours that each stands for."""
     span = abs(system.problem.t_span[1] - system.problem.t_span[0])
     for n in steps(system):
         save = {"save_every": max(1, n // MOST_ROWS)}
@@ -169,12 +169,12 @@ def settings(system: System) -> Iterator[tuple[str, list[dict[str, Any]]]]:
 
 
 def mean(values: list[float]) -> float:
-    """The geometric one; nan where a run has failed."""
+    """Return the geometric mean; nan if a run has failed."""
     return float(np.exp(np.mean(np.log(np.maximum(values, 1e-18)))))
 
 
 def rows(name: str, make: Callable[[], System]) -> Iterator[dict[str, Any]]:
-    """A row for each method, setting and way."""
+    """Yield a row for each method, setting and way."""
     system = make()
     for setting, options in settings(system):
         for method in (EIPRKN8, EIPRKN12):

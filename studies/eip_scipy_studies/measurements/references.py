@@ -34,7 +34,7 @@ def _heyoka() -> Any:
 
 
 class Found(NamedTuple):
-    """What is printed, where the states come from, and the states."""
+    """Lines to print, the origin of the states, and the states."""
 
     lines: list[str]
     about: str

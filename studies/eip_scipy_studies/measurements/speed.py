@@ -34,7 +34,7 @@ njit = needed("numba", '"eip_scipy[numba]"').njit
 
 
 class Turns(NamedTuple):
-    """How many runs, whole calls and processes; short runs, since long ones hold what else a shared machine does."""
+    """Numbers of runs, whole calls and processes. Runs are short: other load on a shared machine disturbs long ones."""
 
     runs: int = 60
     calls: int = 7

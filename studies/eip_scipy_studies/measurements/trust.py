@@ -37,18 +37,18 @@ CHUNK = 8
 
 
 def carried_out(numbers: list[int]) -> list[dict[str, Any]]:
-    """The runs of these numbers, as plain data."""
+    """Carry out the runs of these numbers, and return them as plain data."""
     every = all_runs()
     return [record(every[number]) for number in numbers]
 
 
 def all_runs() -> list[Run]:
-    """Sick ones first."""
+    """Return all runs, the faulty ones first."""
     return sick_runs() + healthy_runs()
 
 
 def record(run: Run) -> dict[str, Any]:
-    """One run carried out."""
+    """Carry out one run."""
     begin = time.perf_counter()
     outcome = carry_out(run)
     if (run.sick is False or run.group == LATE) and outcome.y is not None:
@@ -62,13 +62,13 @@ def record(run: Run) -> dict[str, Any]:
 
 
 def spoilt(run: Run, outcome: Outcome) -> bool:
-    """Whether the projection did harm to a run that was to be healthy."""
+    """Return whether the projection spoilt a run that should be correct."""
     allowed = SPOILT * outcome.plain_error + TOLERANCE * run.options.get("rtol", 1e-12)
     return bool(outcome.error > allowed)
 
 
 def listing(rows: Iterable[dict[str, Any]]) -> str:
-    """A line for each run."""
+    """Lay out a line for each run."""
     lines, group = [], None
     for row in rows:
         if row["group"] != group:
@@ -86,7 +86,7 @@ def harmful(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def groups(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Rows by group, in their order."""
+    """Return rows by group, in their order."""
     found: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         found.setdefault(row["group"], []).append(row)
@@ -94,7 +94,7 @@ def groups(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
 
 
 def sick_table(rows: list[dict[str, Any]]) -> list[list[str]]:
-    """Group by group how they were told, by the plainest of the ways of each run."""
+    """Count, group by group, how runs were reported, by the plainest of the ways of each run."""
     table = [["what is wrong", "runs", *CHANNELS, "not told"]]
     for group, own in {**groups(rows), "all": rows}.items():
         counts = [sum(row["first"] == channel for row in own) for channel in (*CHANNELS, SILENT)]
@@ -103,7 +103,7 @@ def sick_table(rows: list[dict[str, Any]]) -> list[list[str]]:
 
 
 def healthy_table(rows: list[dict[str, Any]]) -> list[list[str]]:
-    """Group by group the false alarms."""
+    """Count the false alarms, group by group."""
     table = [["healthy runs", "runs", "false alarms"]]
     for group, own in {**groups(rows), "all": rows}.items():
         table.append([group, str(len(own)), str(sum(bool(row["told"]) for row in own))])
@@ -111,7 +111,7 @@ def healthy_table(rows: list[dict[str, Any]]) -> list[list[str]]:
 
 
 def markdown(table: list[list[str]]) -> str:
-    """A table as text that is also Markdown."""
+    """Lay out a table as text that is also Markdown."""
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in table

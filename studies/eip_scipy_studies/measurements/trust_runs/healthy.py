@@ -1,4 +1,4 @@
-"""Runs that must pass in silence: true invariants, steps that suit."""
+"""Correct runs, which must not be reported: true invariants, steps that suit."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ THREE = ", ".join(f"{method} {rtol}" for method in ("RK45", "DOP853", "RK5") for
 
 
 def healthy_runs() -> list[Run]:
-    """All of them."""
+    """Return all correct runs."""
     parts = (hard(), own_steps(), solar(), paper(), systems(), spacing(), kinks(), loose(), ensembles())
     return [replace(run, sick=False) for part in parts for run in part]
 

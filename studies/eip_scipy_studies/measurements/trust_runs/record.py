@@ -91,7 +91,7 @@ def _option(item: str) -> dict[str, Any]:
 
 @dataclass
 class Outcome:
-    """What came of a run: how it told, its end, and for a healthy run whether the projection spoilt it."""
+    """Outcome of a run: how it was reported, its end, and for a correct run whether the projection spoilt it."""
 
     told: list[str]
     status: int | None = None
@@ -123,7 +123,7 @@ def carry_out(run: Run) -> Outcome:
 
 
 def carry_out_plain(run: Run, t: float) -> Outcome:
-    """The same without invariants, to the time that the run reached."""
+    """Carry out the run without invariants, to the time that it reached."""
     problem = run.problem()
     options = {key: value for key, value in run.options.items() if key not in ("metric", "every")}
     options |= {"invariants": ()}

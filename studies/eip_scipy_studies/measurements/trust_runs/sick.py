@@ -1,4 +1,4 @@
-"""Runs that must not pass in silence."""
+"""Faulty runs, which must be reported."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ REST, MOVING, LEAK, GRADIENT, LONG, BLOWN, MEMBER = (
 
 
 def sick_runs() -> list[Run]:
-    """All of them."""
+    """Return all faulty runs."""
     every = [with_friction, false_invariants, visible, leaks, late_leaks, gradients, long_steps, light_bodies, blown]
     every += [members, rising_friction]
     return [run for part in every for run in part()]

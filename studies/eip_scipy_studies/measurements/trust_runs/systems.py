@@ -168,7 +168,7 @@ def central(
 
 
 def kepler_energy() -> Invariant:
-    """Of G M = 1."""
+    """Return the energy of motion around a centre with G M = 1."""
     return Invariant(
         lambda t, y: (y[2] ** 2 + y[3] ** 2) / 2 - 1 / np.hypot(y[0], y[1]),
         lambda t, y: np.concatenate([y[:2] / np.hypot(y[0], y[1]) ** 3, y[2:]]),
