@@ -94,8 +94,9 @@ class Problem:
         For q'' = a(t, q): ``jacobian(t, q, dq, out, params)`` fills `out` with the derivative of the accelerations
         along dq, or with its largest part; for multistep methods such as `EIPGJ14`.
     frequencies : callable, optional
-        ``frequencies(y) -> (bodies, others)``: the largest angular frequency of each body on its orbit about the body
-        that the Jacobian takes as the centre, which has 0 itself, and the largest of all other motions.
+        ``frequencies(y, duration) -> (bodies, others)``: the largest angular frequency, within a run of this signed
+        length, of each body on its orbit about the body that the Jacobian takes as the centre, which has 0 itself, and
+        the largest of all other motions.
     reference : callable, optional
         ``reference(t) -> y``: a closed form, or stored reference states; None at times without one.
     source : str
@@ -125,7 +126,7 @@ class Problem:
     reference: Callable[[float], np.ndarray | None] | None = None
     source: str = ""
     jacobian: Callable[..., None] | None = None
-    frequencies: Callable[[np.ndarray], tuple[np.ndarray, float]] | None = None
+    frequencies: Callable[[np.ndarray, float], tuple[np.ndarray, float]] | None = None
     component_names: tuple[str, ...] | None = None
     epoch: Epoch | None = None
     G: float | None = None

@@ -334,7 +334,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     run.left_out, run.called = system.left_out, system.name
     if isinstance(method, GaussJackson):
         moved = None if system.jacobian is None else times(system.jacobian, *system.extra)
-        seen = SecondOrder(calls, start, moved, None if frequencies is None else frequencies(y0))
+        seen = SecondOrder(calls, start, moved, None if frequencies is None else frequencies(y0, t_bound - t0))
         attach_history(run, method, name, seen, stepping, level=False)
     check_memory(saved_rows(schedule), run, request.max_bytes)
     record = Diagnostics() if request.diagnostics is None else request.diagnostics

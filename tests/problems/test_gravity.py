@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from eip_scipy import EIPRK4, EIPRKN12, integrate
+from eip_scipy import EIPGJ12, EIPGJ14, EIPRK4, EIPRKN12, integrate
 from eip_scipy.engine.native import library
 from eip_scipy.problems import nbody, solar_system
 from eip_scipy.problems.gravity import frequencies
@@ -281,6 +281,48 @@ def test_frequencies_of_orbits_and_of_a_moon(monkeypatch, pairs):
     assert about[0] == pytest.approx(np.sqrt(1.001), rel=1e-12)
     assert about[3] == pytest.approx(np.sqrt(4**-3 * (1 - e) ** -1.5), rel=1e-12)
     assert others == pytest.approx(np.sqrt((gm[0] + gm[2]) / 0.01**3), rel=1e-9)
+
+
+def falling(t_span):
+    """Two bodies that fall from rest; they collide at pi / sqrt(8 G m) = 0.907."""
+    return nbody([1.0, 0.5], [[0, 0, 0], [1, 0, 0]], np.zeros((2, 3)), t_span=t_span, G=1.0)
+
+
+@pytest.mark.parametrize("method", [EIPGJ12, EIPGJ14])
+@pytest.mark.parametrize("end", [0.3, -0.3])
+def test_a_pericentre_behind_the_end_of_a_run_does_not_bound_its_steps(method, end):
+    """The distance of bodies that fall from rest, by its closed form."""
+    run = integrate(falling((0, end)), method=method, h=0.003)
+    r = run.y[3, -1] - run.y[0, -1]
+    time = (np.sqrt(r * (1 - r)) + np.arccos(np.sqrt(r))) / np.sqrt(2 * 1.5)
+    assert run.trusted
+    assert time == pytest.approx(0.3, abs=1e-11)
+
+
+def test_a_pericentre_within_a_run_bounds_its_steps():
+    with pytest.raises(ValueError, match="h = 0.003 is not stable"):
+        integrate(falling((0, 1.0)), method=EIPGJ14, h=0.003)
+
+
+@pytest.mark.parametrize("approaches", [True, False])
+def test_frequencies_within_a_run(approaches):
+    """At the end of the run, or in the pericentre if that comes before: e = 0.9, from a known place on the orbit."""
+    e, anomaly = 0.9, 2.0
+    r = 1 - e * np.cos(anomaly)
+    place = np.array([np.cos(anomaly) - e, np.sqrt(1 - e**2) * np.sin(anomaly), 0])
+    speed = np.array([-np.sin(anomaly), np.sqrt(1 - e**2) * np.cos(anomaly), 0]) / r
+    y = np.concatenate([np.zeros(3), place, np.zeros(3), -speed if approaches else speed])
+    mean = anomaly - e * np.sin(anomaly)
+    to_pericentre = mean if approaches else 2 * np.pi - mean
+    later = 1.2 if approaches else 2 * np.pi - 1.2  # an eccentric anomaly on the way there
+    duration = abs(mean - (later - e * np.sin(later)))
+
+    def found(duration):
+        return frequencies.orbital_frequencies(np.array([1.0, 0.0]), y, duration)[0][1]
+
+    assert found(duration) == pytest.approx((1 - e * np.cos(later)) ** -0.75, rel=1e-6)
+    assert found(1.01 * to_pericentre) == found(np.inf) == pytest.approx((1 - e) ** -0.75, rel=1e-6)
+    assert found(-1e-9) == pytest.approx(r**-0.75, rel=1e-6)
 
 
 # Masses and G.
