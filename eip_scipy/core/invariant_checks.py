@@ -183,13 +183,19 @@ def _single_precision(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
 def _in_single_precision(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> str:
     """Return what has single precision, of the right-hand side and the gradients; "" for neither."""
     states = at.y + CHECK_STEPS[0] * at.directions
-    if rhs is not None and _are_single(np.array([rhs(at.t, state).view(float) for state in states])).any():
+    if rhs is not None and _vary_in_single([rhs(at.t, state) for state in states]):
         return "fun returns numbers of single precision (float32)"
-    rows = np.array([known.gradients(at.t, state, at.f).view(float) for state in states])
+    rows = [known.gradients(at.t, state, at.f) for state in states]
     for k, name in enumerate(known.names):
-        if _are_single(rows[:, k]).any():
+        if _vary_in_single([row[k] for row in rows]):
             return f"the gradient of invariant {name!r} has single precision (float32)"
     return ""
+
+
+def _vary_in_single(found: list[Array]) -> bool:
+    """Return whether some component varies by numbers of single precision; constants of such numbers may be meant."""
+    values = np.array(found).view(float)
+    return bool((_are_single(values) & (np.ptp(values, axis=0) != 0)).any())
 
 
 # Gradients.
@@ -255,21 +261,24 @@ class _Rates(NamedTuple):
 
 def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> Iterator[Complaint]:
     found = _rates(known, at, rhs)
-    if found is None or not found.wrong.any():
+    if found is None:
         return
     wrong = found.wrong
-    # Of small rates only: single precision does not explain large ones.
+    # Of small rates only: single precision does not explain large ones. Differences of values do not see small rates.
     small = wrong & (np.abs(found.rate) <= SINGLE_TOLERANCE * found.terms)
-    if small.any() and (what := _in_single_precision(known, at, rhs)):
-        names = [known.names[k] for k in np.flatnonzero(small)]
-        yield Complaint(
-            False,
-            f"{what}, which hides whether this system keeps {listed(names)}: at t={at.t:.6g} the rate of change is "
-            f"{found.rate[small][0]:.3g}, where its terms sum to {found.terms[small][0]:.3g}",
-            DOUBLE,
-        )
+    if (small.any() or _are_single(at.f[None].view(float)).any()) and (what := _in_single_precision(known, at, rhs)):
+        names = [name for name, hidden in zip(known.names, small | ~wrong, strict=True) if hidden]
+        if names:
+            yield Complaint(
+                False,
+                f"{what}, which hides whether this system keeps {listed(names)}: rates of change below about 1e-7 of "
+                "their terms are rounding",
+                DOUBLE,
+            )
         wrong = wrong & ~small
-    if wrong.any() and rhs is not None and (moved := on_targets(known, at.t, at.y, at.span, rhs)) is not None:
+    if not wrong.any():
+        return
+    if rhs is not None and (moved := on_targets(known, at.t, at.y, at.span, rhs)) is not None:
         f = rhs(at.t, moved)
         G, here = known.gradients(at.t, moved, f), known.values(at.t, moved)
         nearest = at._replace(y=moved, f=f, G=G, here=here)

@@ -207,6 +207,7 @@ class ZarrStore:
             if found is not None:
                 require_identity(self.path, found, identity)
                 require_all(self.path, [name for name in ("target", "end_invariants") if name not in self._group])
+                self._require_layout(empty, times)
                 checkpoint.warn_of_other_versions(self.path, found, stacklevel=4)
                 self._label, self._mark = found, self._status()
                 return
@@ -298,52 +299,71 @@ class ZarrStore:
             )
 
     def _create(self, identity: dict[str, Any], empty: Members, times: np.ndarray) -> None:
-        n = empty.y.shape[1]
-        self._make("y", empty.y.dtype, ("member", "component"), (n,))
-        kept, rows = empty.max_defect.shape[1], empty.saved.shape[1]
+        for name, array in self._layout(empty, times).items():
+            self._group.create_array(name, **array)
         if times.size:
-            axis = "time" if times.ndim == 1 else "row"  # xarray takes no two-dimensional array by its axis' name
-            self._make("states", empty.y.dtype, ("member", "component", axis), (n, rows))
-            self._make("invariants", np.dtype(float), ("member", "invariant", axis), (kept, rows))
-            axes = ("time",) if times.ndim == 1 else ("member", "row")
-            self._group.create_array("time" if times.ndim == 1 else "times", data=times, dimension_names=axes)
-        self._make("end_invariants", np.dtype(float), ("member", "invariant"), (kept,))
-        self._make("target", np.dtype(float), ("member", "invariant"), (kept,))
-        if self._events:
-            self._make("event_count", np.dtype(np.int64), ("member", "event"), (self._events,), fill=0)
-            for name, axes, shape in (("event_t", ("happened",), ()), ("event_y", ("happened", "component"), (n,))):
-                dtype = empty.y.dtype if shape else np.dtype(float)
-                self._group.create_array(
-                    name, shape=(0, *shape), chunks=(EVENTS_IN_A_FILE, *shape), dtype=dtype, dimension_names=axes
-                )
-        self._make("t_end", np.dtype(float), ("member",))
-        self._make("max_defect", np.dtype(float), ("member", "invariant"), empty.max_defect.shape[1:])
-        self._make("max_correction", np.dtype(float), ("member",))
-        self._make("counters", np.dtype(np.int64), ("member", "counter"), empty.counters.shape[1:], fill=0)
-        self._make("side_by_side", np.dtype(bool), ("member",), fill=False)
-        self._make("trusted", np.dtype(bool), ("member",), fill=False)
-        # Room for what a chunk's functions are recognised by.
-        width = COMPARED + empty.max_defect.shape[1]
-        self._group.create_array(
-            "known_by",
-            shape=(-(-self._members // self._chunk), width),
-            chunks=(1, width),
-            dtype=float,
-            fill_value=np.nan,
-            dimension_names=("chunk", "value"),
-        )
-        self._make("message", str, ("member",), fill="")
-        self._make("status", np.dtype(np.int64), ("member",), fill=NOT_RUN)
+            self._group[_name_of(times)][...] = times
         # Last: a group without it was left before it was whole.
         self._group.attrs[LABEL] = {**checkpoint.origin(), **identity}
 
-    def _make(
-        self, name: str, dtype: Any, axes: tuple[str, ...], shape: tuple[int, ...] = (), fill: Any = np.nan
-    ) -> None:
-        chunks = (self._chunk, *(max(1, size) for size in shape))
-        self._group.create_array(
-            name, shape=(self._members, *shape), chunks=chunks, dtype=dtype, fill_value=fill, dimension_names=axes
-        )
+    def _layout(self, empty: Members, times: np.ndarray) -> dict[str, dict[str, Any]]:
+        """Return what the arrays of this ensemble are created by."""
+        n, (kept, rows) = empty.y.shape[1], (empty.max_defect.shape[1], empty.saved.shape[1])
+        number, count, state = np.dtype(float), np.dtype(np.int64), empty.y.dtype
+        layout: dict[str, dict[str, Any]] = {}
+
+        def array(name: str, dtype: Any, axes: tuple[str, ...], *shape: int, fill: Any = np.nan) -> None:
+            chunks = (self._chunk, *(max(1, size) for size in shape))
+            layout[name] = {"shape": (self._members, *shape), "chunks": chunks, "dtype": dtype, "fill_value": fill}
+            layout[name]["dimension_names"] = ("member", *axes)
+
+        array("y", state, ("component",), n)
+        if times.size:
+            axis = "time" if times.ndim == 1 else "row"  # xarray takes no two-dimensional array by its axis' name
+            array("states", state, ("component", axis), n, rows)
+            array("invariants", number, ("invariant", axis), kept, rows)
+            axes = ("time",) if times.ndim == 1 else ("member", "row")
+            layout[_name_of(times)] = {"shape": times.shape, "dtype": times.dtype, "dimension_names": axes}
+        array("end_invariants", number, ("invariant",), kept)
+        array("target", number, ("invariant",), kept)
+        if self._events:
+            array("event_count", count, ("event",), self._events, fill=0)
+            for name, dtype, axes, shape in (("event_t", number, (), ()), ("event_y", state, ("component",), (n,))):
+                chunks = (EVENTS_IN_A_FILE, *shape)
+                layout[name] = {"shape": (0, *shape), "chunks": chunks, "dtype": dtype}
+                layout[name]["dimension_names"] = ("happened", *axes)
+        array("t_end", number, ())
+        array("max_defect", number, ("invariant",), kept)
+        array("max_correction", number, ())
+        array("counters", count, ("counter",), empty.counters.shape[1], fill=0)
+        array("side_by_side", np.dtype(bool), (), fill=False)
+        array("trusted", np.dtype(bool), (), fill=False)
+        # Room for what a chunk's functions are recognised by.
+        width = COMPARED + kept
+        layout["known_by"] = {"shape": (-(-self._members // self._chunk), width), "chunks": (1, width), "dtype": number}
+        layout["known_by"] |= {"fill_value": np.nan, "dimension_names": ("chunk", "value")}
+        array("message", str, (), fill="")
+        array("status", count, (), fill=NOT_RUN)
+        return layout
+
+    def _require_layout(self, empty: Members, times: np.ndarray) -> None:
+        """Refuse arrays of other sizes, whose reading may take any amount of memory.
+
+        Raises
+        ------
+        CheckpointError
+        """
+        for name, array in self._layout(empty, times).items():
+            there = self._group.get(name)
+            if there is None:  # one of OPTIONAL
+                continue
+            shape, chunks = array["shape"], array.get("chunks", there.chunks)
+            grows = name in ("event_t", "event_y")
+            if there.shape[grows:] != shape[grows:] or there.chunks != chunks:
+                raise CheckpointError(
+                    f"{self.path!r} is damaged: its array {name!r} has the shape {there.shape} in chunks of "
+                    f"{there.chunks}; expected {shape} in chunks of {chunks}. Name another place to start anew."
+                )
 
     @property
     def finished(self) -> int:
@@ -561,6 +581,11 @@ class CheckpointStore:
         self._waiting = None
         self._written = time.perf_counter()
         self._cost = self._written - begin
+
+
+def _name_of(times: np.ndarray) -> str:
+    """Return the name of the array of times, which are common to all members or of each."""
+    return "time" if times.ndim == 1 else "times"
 
 
 def is_url(path: str) -> bool:

@@ -40,6 +40,8 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
     ------
     ImportError
         Without matplotlib: ``pip install "eip_scipy[plot]"``.
+    TypeError
+        When `ax` is not one Axes, or the figure of an ensemble is asked for with `ax` or `orbit`.
     ValueError
         When an orbit is asked for and no components are named so.
 
@@ -52,7 +54,12 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
     """
     from ..plotting.runs import draw_run, run_figure
 
+    if ax is not None and not hasattr(ax, "plot"):
+        kind = f"{type(ax).__name__} of shape {ax.shape}" if isinstance(ax, np.ndarray) else type(ax).__name__
+        raise TypeError(f"plot: ax must be one matplotlib Axes, got {kind}; choose one of several, such as axes[0].")
     if of_members(result):
+        if ax is not None or orbit is not None:
+            raise TypeError("plot: the figure of an ensemble takes neither ax nor orbit; leave them out.")
         return result.plot(names)
     labels = component_names(result, names)
     pairs = planes(labels)

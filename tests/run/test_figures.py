@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from eip_scipy import EIPRK4, integrate, plot
+from eip_scipy import EIPRK4, ensemble, integrate, plot
 from eip_scipy.problems import kepler
 
 pyplot = pytest.importorskip("matplotlib.pyplot")
@@ -82,6 +82,17 @@ def test_axes_of_the_user(run):
     assert [line.get_label() for line in right.lines] == ["q1", "q2", "p1", "p2"]
     assert right.get_title() == "my own"
     assert figure.axes == [left, right]
+    pyplot.close(figure)
+
+
+def test_axes_that_are_several_are_refused(run):
+    figure, axes = pyplot.subplots(1, 2)
+    with pytest.raises(TypeError, match=r"ax must be one matplotlib Axes, got ndarray of shape \(2,\); choose one"):
+        run.plot(ax=axes)
+    with pytest.raises(TypeError, match="ax must be one matplotlib Axes, got str"):
+        run.plot(ax="left")
+    with pytest.raises(TypeError, match="the figure of an ensemble takes neither ax nor orbit"):
+        plot(ensemble(kepler(), (0, 1), [kepler().y0], method=EIPRK4), ax=axes[0])
     pyplot.close(figure)
 
 
