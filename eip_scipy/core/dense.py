@@ -49,9 +49,10 @@ MOST_CROSSINGS = 3  # of an event in a step, see engine/cpp/crossings.hpp
 class Interpolants:
     """Makes a run's interpolants, by its engine, and evaluates them.
 
-    An interpolant is projected onto the invariants' levels between those of the step's two ends. The levels are linear
-    between the defects of the two ends, which are 1e-15 to 1e-12 after a projection, and what the step left where it
-    was not projected: the ends themselves are met exactly.
+    States between two projections are handed out as copies on the manifold. An interpolant is projected onto the
+    invariants' levels between those of the step's two ends. The levels are linear between the defects of the two ends,
+    which are 1e-15 to 1e-12 after a projection, and what the step left where it was not projected: the ends themselves
+    are met exactly.
 
     Parameters
     ----------
@@ -61,8 +62,6 @@ class Interpolants:
         That of the run, which has dense output from now on.
     events : int
         How many events the loop looks at.
-    shows : bool
-        Whether states between two projections are handed out as copies on the manifold; else as they are.
     errors : callable
         A context that says what a failed call by pointer means, as `Driver.own_errors`.
     """
@@ -73,10 +72,9 @@ class Interpolants:
         tableau: AnyMethod,
         engine: Engine,
         events: int = 0,
-        shows: bool = False,
         errors: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
-        self.record = _record(run, tableau, events, shows=shows)
+        self.record = _record(run, tableau, events, shows=run.shows)
         self._engine, self._dtype, self._n, self._errors = engine, run.y0.dtype, run.y0.size, errors
         self._lock = threading.RLock()  # one buffer for all threads that ask
         engine.sample(self.record)

@@ -190,8 +190,7 @@ class ProjectionOptions:
             'int or "auto"',
             """Project each `every`-th step and the last one; "auto": when the error estimates, added in quadrature
             since the last projection, make an invariant more uncertain than round-off (asked at each fifth step
-            and after a projection). In between `integrate` and `ensemble` hand out copies of the states that are
-            projected; solve_ivp hands out the states themselves, which lie off the manifold.
+            and after a projection). In between, states are handed out as projected copies.
             Default: the method's own, "auto" for a multistep method and 1 for others.""",
         ),
     )

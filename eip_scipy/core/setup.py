@@ -103,6 +103,12 @@ class Run:
             engine.start(self.y0, f, self.tau)
         return engine
 
+    @property
+    def shows(self) -> bool:
+        """Return whether states that are not projected are handed out as projected copies."""
+        multistep = isinstance(self.method, Method) and self.method.multistep is not None
+        return self.invariants.size > 0 and (self.options.every != 1 or multistep)
+
     def look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
         """Examine a run after `steps` steps, or where it has `ended`. Return whether it is to be reported now.
 

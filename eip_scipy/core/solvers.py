@@ -16,7 +16,7 @@ import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
 from ..engine.counters import FOUND, NFEV, NJEV, NLU, REJECTED, WAITED
-from ..engine.data import FAILED_PROJECTION, NEXT_LENGTH, OK, Work, bare_schedule
+from ..engine.data import FAILED_PROJECTION, NEXT_LENGTH, OK, PENDING, Work, bare_schedule
 from ..engine.native import Call, PythonFunctions
 from ..engine.trust import ProjectionWarning
 from ..methods.multistep import GaussJackson
@@ -119,6 +119,9 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     evaluated again; only `EIPRK23`, `EIPRK45` and `EIPDOP853` without invariants keep the old one for the first stage,
     as SciPy's own do. A multistep method starts again after any change. Wrong values raise in the next step. Copies by
     `copy.deepcopy` and `pickle`, for which the functions must pickle, go on to the same bits.
+
+    With ``every=k`` the states between two projections are handed out as projected copies, also by dense output; the
+    steps go on from the states themselves.
 
     The error estimate sees the step before its projection. Defects of the invariants after it are O(h^(2p + 2)) for a
     method of order p (theorem 2.1 of [1]_), and the method keeps its order.
@@ -250,6 +253,10 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._project_now, self._projection_status, self._last = False, OK, False
         self._accepted = run.y0
         self.y, self.f = run.y0, begin.f
+        # The state that the steps are made from, where `y` is its copy on the manifold.
+        self._raw = self._raw_old = run.y0
+        self._waits = False, False  # whether the states at both ends of the last step wait for a projection
+        self._shows = run.shows and not self._hooks()  # a hook's projection is its own
         if run.y0 is not begin.y:
             self.f = self._derivative(begin.t, run.y0).copy()
         self._steps = 0
@@ -261,6 +268,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             return
         self._work.K[0] = self.f
         self._schedule = bare_schedule(self._stepping.span, float(self.h_abs or 0.0))
+        self._schedule.place[PENDING] = 1  # what is handed out between two steps is the end of the last one
         calls, jacobian = self._run.invariants.calls, None
         if self._jacobian is not None:
             jacobian = Call(self._jacobian, (), (self.n // 2,), _never, takes_f=True, in_place=True)
@@ -483,7 +491,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _own_step(self) -> tuple[bool, str | None]:
         run = self._run
-        status, t, y_new, f_new = self._engine.step(self._k, self.t, self.y, self.f)
+        status, t, y_new, f_new = self._engine.step(self._k, self.t, self._raw, self.f)
         found = self._count()
         if status != OK:
             run.trust.failed = True
@@ -493,10 +501,12 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._k += 1
         self._steps += 1
         self.h_previous = t - self.t
-        self.y_old = self.y
-        self.y, self.t, self.f = y_new, t, f_new
         if self._finishes:
-            self.y = self._accepted
+            y_new = self._accepted
+        self._raw_old, self._raw = self._raw, y_new
+        self.y_old = self.y
+        self.y = self._on_manifold(t, y_new) if self._shows else y_new
+        self.t, self.f = t, f_new
         if self.h is None:
             self.h_abs = self._schedule.clock.item(NEXT_LENGTH)
         if found != self._noted or is_check_due(self._steps) or self.t == self.t_bound:
@@ -553,6 +563,20 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._projection_status = self._engine.project(self.t, y, t, self._last, y_new)
         return y_new
 
+    def _sampled(self) -> Interpolants:
+        """Return the interpolants of the run, which hand out states on the manifold."""
+        if self._interpolants is None:
+            self._interpolants = Interpolants(self._run, self._method, self._engine)
+        self._interpolants.record.waiting[:] = self._waits
+        return self._interpolants
+
+    def _on_manifold(self, t: float, y: np.ndarray) -> np.ndarray:
+        """Return the state of a step as it is handed out."""
+        multistep = isinstance(self.TABLEAU, GaussJackson)
+        waits = bool(t != self.t_bound if multistep else self._work.counters[WAITED] > 0)
+        self._waits = self._waits[1], waits
+        return self._sampled().shown(t, y) if waits else y
+
     def _dense_output_impl(self) -> DenseOutput:
         t, y = self._left[:2]
         if self._kept is not None and not is_state(y, self._kept):  # changed after the step whose output this is
@@ -561,9 +585,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             out = ExactEnds(self._scipy.dense_output(), self.y_old, y)
             self.nfev = self._calls[0]
         else:
-            if self._interpolants is None:
-                self._interpolants = Interpolants(self._run, self._method, self._engine)
-            out = self._interpolants.over(self.t_old, self.y_old, t, y)
+            ends = (self._raw_old, self._raw) if self._shows else (self.y_old, y)
+            out = self._sampled().over(self.t_old, ends[0], t, ends[1])
             self._count()
         self._left = *self._left[:-1], self.nfev
         return out

@@ -18,7 +18,6 @@ from ..core.stepping import UNBOUNDED, AnyMethod
 from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
 from ..engine.trust import NOTHING, REASON
-from ..methods.multistep import GaussJackson
 from .events import Events
 from .memory import most_bytes
 
@@ -56,11 +55,8 @@ class Driver:
         self.engine = run.engine(functions, schedule)
         self._interpolants = None
         self._pieces = np.empty((0, 0))
-        shows = run.invariants.size > 0 and (run.options.every != 1 or isinstance(tableau, GaussJackson))
-        if schedule.t_eval.size or schedule.g.size or keeps_steps or shows:
-            self._interpolants = Interpolants(
-                run, tableau, self.engine, schedule.g.size, shows=shows, errors=self.own_errors
-            )
+        if schedule.t_eval.size or schedule.g.size or keeps_steps or run.shows:
+            self._interpolants = Interpolants(run, tableau, self.engine, schedule.g.size, errors=self.own_errors)
             steps = expected_steps(schedule) or _first(8 * self._interpolants.floats)
             self._pieces = self._more_pieces(steps if keeps_steps else 0)
 

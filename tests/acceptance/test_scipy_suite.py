@@ -36,6 +36,7 @@ METHODS = {
 ALL = {*SCIPY, "Radau", "BDF", "LSODA"}
 
 DOES_NOT_APPLY = {
+    "test_integration_complex_sparse": "implicit methods: a sparse Jacobian of complex numbers",
     "test_integration_sparse_difference": "implicit methods: differences of a sparse Jacobian",
     "test_integration_const_jac": "implicit methods: a constant Jacobian",
     "test_integration_stiff": "implicit methods: stiffness",

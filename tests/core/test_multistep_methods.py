@@ -482,7 +482,7 @@ def test_bodies_without_relative_angular_momentum(method):
 
 @pytest.mark.parametrize("apart", [0.0, 3.0])
 def test_a_radial_motion_has_a_finite_frequency(apart):
-    """From rest the bodies fall together, and a step that is too long for their meeting is refused; flying apart it is not."""
+    """From rest the bodies fall together, and a step too long for their meeting is refused; flying apart it is not."""
     places, speeds = [[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [apart, 0, 0]]
     problem = nbody([1.0, 1.0], places, speeds, t_span=(0, 0.3), h=0.01)
     expected = integrate(problem, method=EIPDOP853, rtol=1e-13, atol=1e-15, h=None).y[:, -1]

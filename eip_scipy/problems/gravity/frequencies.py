@@ -37,10 +37,10 @@ def orbital_frequencies(gm: np.ndarray, y: np.ndarray, duration: float = np.inf)
     -----
     From the osculating orbit. Between the mean motion n and the frequency in the pericentre, n (1 - e)^(-3/2), a
     multistep method's stability is that of their geometric mean: measured with Mercury, e = 0.2. If a bound pair does
-    not reach its pericentre within the run, its distance at the end takes the place of the pericentre. A pair has no such
-    orbit if the others change its motion more than its own attraction does, and no pericentre to come if it flies apart
-    for good: then the frequency is that at the present distance. So the frequency of a pair without angular momentum is
-    finite.
+    not reach its pericentre within the run, its distance at the end takes the place of the pericentre. A pair has no
+    such orbit if the others change its motion more than its own attraction does, and no pericentre to come if it flies
+    apart for good: then the frequency is that at the present distance. So the frequency of a pair without angular
+    momentum is finite.
     """
     q, v = y.reshape(2, -1, 3)
     pulls = library["gravity.acc"](0.0, q.ravel(), gm).reshape(-1, 3)
