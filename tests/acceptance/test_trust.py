@@ -495,6 +495,16 @@ def test_kinks_are_no_leaks(driver, kind, method, given):
             assert record.trusted, record.message
 
 
+@pytest.mark.parametrize("every", [4, "auto"])
+@pytest.mark.parametrize("kind", ["Huber", "contact", "dead zone", "cubic wall"])
+@pytest.mark.parametrize("method", [EIPRK4, EIPDOP853])
+def test_kinks_are_no_leaks_between_projections(every, kind, method):
+    fun, energy = kinked(kind)
+    for start in ([1.0, 0.1], [0.029, -2.3], [0.453, 0.663]):
+        run = integrate(fun, (0, 20), start, method=method, h=0.01, invariants=energy, every=every)
+        assert run.trusted, run.message
+
+
 def light_planet(mass):
     """Return a star, a giant planet at 5.2, and a planet at 0.2, whose period is 0.56."""
     distances = np.array([5.2, 0.2])
@@ -514,6 +524,18 @@ def test_a_step_beyond_the_period_of_a_light_planet(method, mass):
     run = integrate(light_planet(mass), (0, 10), method=method, h=short)
     assert run.trusted, run.message
     assert np.linalg.norm(run.y[6:9, -1] - run.y[:3, -1]) == pytest.approx(0.2, rel=0.02)
+
+
+@pytest.mark.parametrize("method", [EIPRK3, EIPRK4, EIPRK5, EIPDOP853, EIPRKN8, EIPRKN12])
+def test_a_body_that_one_step_throws_out_is_lost(method):
+    """A test particle with e = 0.2 whose period is 0.22: after its first step it moves freely, which steps resolve."""
+    a, e = 0.108, 0.2
+    q = [[0.0, 0.0, 0.0], [5.2, 0.0, 0.0], [a * (1 + e), 0.0, 0.0]]
+    v = [[0.0, 0.0, 0.0], [0.0, 5.2**-0.5, 0.0], [0.0, np.sqrt((1 - e) / (1 + e) / a), 0.0]]
+    problem = nbody([1.0, 1e-3, 0.0], q, v, t_span=(0.0, 60.0))
+    with pytest.warns(ProjectionWarning, match="h=0.344 do not resolve the motion of components "):
+        run = integrate(problem, method=method, h=0.344)
+    assert np.linalg.norm(run.y[6:9, -1] - run.y[:3, -1]) > 100 * a
 
 
 def test_a_body_that_a_plain_function_integrates_is_looked_at():
@@ -624,6 +646,24 @@ def test_loose_tolerances_are_no_failure(number, rtol, method):
     truth = solve_ivp(system.fun, span, y0, method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
     assert (run.status, record.trusted) == (0, True), record.message
     assert np.abs(run.y[:, -1] - truth).max() <= 3 * np.abs(plain.y[:, -1] - truth).max() + 10 * rtol
+
+
+@pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853])
+def test_constraints_at_loose_tolerances_in_pieces(method):
+    """The estimate of a component may vanish in a step in which only this component matters."""
+    length = Invariant(lambda t, y: y[0] ** 2 + y[1] ** 2, lambda t, y: [2 * y[0], 2 * y[1], 0, 0], target=1.0)
+    speed = Invariant(lambda t, y: y[0] * y[2] + y[1] * y[3], lambda t, y: [y[2], y[3], y[0], y[1]], target=0.0)
+
+    def fun(t, y):
+        tension = (y[2] ** 2 + y[3] ** 2 - 9.81 * y[1]) / (y[0] ** 2 + y[1] ** 2)
+        return np.array([y[2], y[3], -tension * y[0], -9.81 - tension * y[1]])
+
+    y = np.array([1.0, 0.0, 0.0, 0.0])
+    for k in range(40):
+        run = integrate(fun, (2.3 * k, 2.3 * (k + 1)), y, method=method, invariants=[length, speed])
+        y = run.y[:, -1]
+        assert run.trusted, run.message
+        np.testing.assert_allclose([y[:2] @ y[:2], y[:2] @ y[2:]], [1.0, 0.0], rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853])

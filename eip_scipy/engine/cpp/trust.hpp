@@ -17,8 +17,9 @@ constexpr double LARGE = 50.0, LARGE_SHARE = 1e-2;
 constexpr double LARGEST = std::numeric_limits<double>::max();
 constexpr double LEAST_RATE = 1e-8, RATE_GROWTH = 2.0, LEAST_TERMS = 0.1;
 // A local error is suspicious from this share of what the step changes in its block, or of the block's size, on, and again
-// when it has grown by ERROR_GROWTH. Blocks count as if they changed by LEAST_CHANGE of the largest change at least.
-constexpr double LEAST_ERROR = 3e-3, ERROR_GROWTH = 2.0, LEAST_CHANGE = 1e-2;
+// when it has grown by ERROR_GROWTH; from CLEAR_ERROR on it is clearly too large. Blocks count as if they changed by
+// LEAST_CHANGE of the largest change at least.
+constexpr double LEAST_ERROR = 3e-3, CLEAR_ERROR = 0.1, ERROR_GROWTH = 2.0, LEAST_CHANGE = 1e-2;
 
 // Defects w.g = values - target and their dead bands; inside its band a defect is set to 0, `raw` keeps all. Returns
 // whether anything is left to project. `terms`: sums of |G_k y_k|, else they are taken at `y`; then, where the step's
@@ -48,14 +49,13 @@ inline Truth<Value> defects(const double *terms, const Value *y, const Options &
     return outside;
 }
 
-// The first figures of a run: its invariants' terms; those that vanish at the start, as they are a step later. Where steps
-// are not all projected, or projected by other code, RATE begins as that of a quantity which is not known to be an
-// invariant.
+// The first figures of a run: its invariants' terms; those that vanish at the start, as they are a step later. Where other
+// code projects, or a multistep method does, RATE begins as that of a quantity which is not known to be an invariant.
 template <class Value, class W>
 inline void start_figures(const Value *y, const Value *f, double tau, const Method &method, const Hooks *hooks,
                           const Options &o, const W &w) {
     const bool own = !hooks || !(hooks->raw || hooks->finish || hooks->joint || hooks->project);
-    const bool known = !method.multistep && o.every == 1 && own;
+    const bool known = !method.multistep && own;
     for (int64_t i = 0; i < w.l; ++i) {
         const Value *G = w.gradient(i);
         Value terms = max(max(abs(w.values[i]), abs(w.target[i])), max(Value(o.scales[i]), abs_dot(G, y, w.m)));
@@ -247,7 +247,8 @@ inline auto is_rough(const Value &share, const Value *figures) {
 // Note a fixed step whose local error is large compared with what it changes in some block. The step may not resolve that
 // block, which the invariants need not show.
 [[gnu::cold, gnu::noinline]] inline void note_roughness(const Step &step, const Options &o, const Work &w) {
-    if (w.suspected() >= LARGE_ERROR) return;  // the first one is examined: later ones may come of it
+    // The first one that is clearly too large is examined: later ones may come of it.
+    if (w.suspected() > LARGE_ERROR || (w.suspected() == LARGE_ERROR && w.figures(0)[ROUGH_NOTED] > CLEAR_ERROR)) return;
     const double share = largest_error_share(step.h, step.y, o, w);
     if (!is_rough(share, w.figures(0))) return;
     w.figures(0)[ROUGH_NOTED] = share;
@@ -260,6 +261,20 @@ inline void note_share(double share, double t, double *figures, Figure largest_s
         figures[largest_so_far] = share;
         figures[at] = t;
     }
+}
+
+// Return what the step's errors are worth for invariant i if those that the metric remembers are counted: the estimates of
+// the components that its gradient touches may vanish by chance in one step.
+[[gnu::cold, gnu::noinline]] inline double remembered_worth(int64_t i, const Options &o, const Work &w) {
+    if (o.metric != ERROR) return 0.0;
+    double largest_error = 0.0, worth = 0.0;
+    for (int64_t b = 0; b < o.blocks.count; ++b)
+        if (w.scale[b] > 0.0)
+            largest_error = std::max(largest_error, std::sqrt(block_square(w.err, b, 1.0, o.blocks)) / w.scale[b]);
+    for (int64_t b = 0; b < o.blocks.count; ++b)
+        for (uint64_t place = o.blocks.start[b]; place < o.blocks.start[b + 1]; ++place)
+            worth += std::abs(w.gradient(i)[o.blocks.member[place]]) * w.memory_new[b] * w.scale[b];
+    return worth * largest_error;
 }
 
 // Compare what an invariant changed by since its last projection with what the steps' errors explain; return whether it is
@@ -309,7 +324,8 @@ inline void note(const Step &step, double errors, double rounding, const double 
         if (errors > 0.0 && w.worth[i] > 0.0) {
             const double change = std::abs(w.before[i] - figures[LEFT]);
             double expected = errors * w.worth[i] + rounding * terms + TINY;
-            if (change > LARGE * expected) expected += rounding * generous_terms(i, 0.0, y_old, o, w);
+            if (change > LARGE * expected)
+                expected += rounding * generous_terms(i, 0.0, y_old, o, w) + errors * remembered_worth(i, o, w);
             if (expected < INFINITE && weigh_change(change, expected, t, figures)) [[unlikely]] {
                 ++w.counters[FOUND];
                 if (figures[AT] == t) suspect(LARGE_CORRECTION, step, w);
