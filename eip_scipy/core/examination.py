@@ -8,6 +8,7 @@ part of the state is large, which the invariants need not show.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -79,7 +80,7 @@ class Examiner:
 
     def complaint(self, rhs: Derivative, t: float, y: Array) -> str | None:
         """Return what is wrong with an invariant or a gradient at a state of the run, or None."""
-        return _unless_refused(self._complaint, rhs, t, y, True)
+        return self._unless_refused(_complaint, rhs, t, y, True)
 
     def examine(self, suspect: Array, rhs: Derivative) -> str | None:
         """Return what is wrong in the step that the engine suspects, or None. The engine may then suspect another."""
@@ -89,44 +90,73 @@ class Examiner:
         if reason == CHANGES_ALONG_FLOW:
             return self.complaint(rhs, t_new, new)
         if reason == LARGE_ERROR:
-            return _unless_refused(self.resolution, rhs, t_old, t_new - t_old, old, self.invariants.t_span[1])
-        return _unless_refused(self._along_chord, rhs, (t_old, t_new), (old, new))
+            return self._unless_refused(_unresolved, rhs, t_old, t_new - t_old, old)
+        return self._unless_refused(_along_chord, rhs, (t_old, t_new), (old, new))
 
-    def _complaint(self, rhs: Derivative, t: float, y: Array, on_manifold: bool) -> str | None:
-        """Return what is wrong at a state. Off the manifold, invariants that are kept where others hold may change."""
-        f = rhs(t, y)
-        if not np.isfinite(f).all():
+    def _unless_refused(self, look: Callable[..., str | None], rhs: Derivative, *args: Any) -> str | None:
+        """Return what an examination finds, which calls the user's functions through guards.
+
+        The states that it looks at are near those of the run, but the run does not visit them. A function that refuses
+        one of them by an exception says nothing about the run.
+        """
+        known = copy.copy(self.invariants)
+        vars(known).update(inv=_guarded(known.inv), grad=_guarded(known.grad))
+        try:
+            with np.errstate(all="ignore"):
+                return look(self, known, _guarded(rhs), *args)
+        except _RefusedError:
             return None
-        for column, shares in zip((RATE, EXAMINED), self.invariants.rate_shares(t, y, f), strict=True):
-            np.fmax(self.figures[:, column], shares, out=self.figures[:, column])
-        found = self.invariants.complaints(t, y, f, self.tau, rhs)
-        return next((one.text for one in found if on_manifold or not one.dependent), None)
 
-    def _along_chord(self, rhs: Derivative, times: tuple[float, float], ends: tuple[Array, Array]) -> str | None:
-        """Return what is wrong between the two ends of a step with a large correction, or None."""
-        largest = float(self.figures[:, NU].max(initial=0.0))
-        if largest < GROWTH * self.largest:
-            return None
-        self.largest = largest
-        (t_old, t_new), (old, new) = times, ends
-        for share in np.arange(1, POINTS + 1) / POINTS:
-            t, y = t_old + float(share) * (t_new - t_old), old + share * (new - old)
-            found = self._complaint(rhs, t, y, False)
-            if found is not None:
-                return found
+
+class _RefusedError(Exception):
+    """A user's function has refused a state that the run does not visit."""
+
+
+def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function whose exceptions are those of a refused state; a lack of memory remains one."""
+
+    def call(*args: Any) -> Any:
+        try:
+            return function(*args)
+        except MemoryError:
+            raise
+        except Exception as error:
+            raise _RefusedError from error
+
+    return call
+
+
+def _complaint(
+    examiner: Examiner, known: InvariantSet, rhs: Derivative, t: float, y: Array, on_manifold: bool
+) -> str | None:
+    """Return what is wrong at a state. Off the manifold, invariants that are kept where others hold may change."""
+    f = rhs(t, y)
+    if not np.isfinite(f).all():
         return None
+    figures = examiner.figures
+    for column, shares in zip((RATE, EXAMINED), known.rate_shares(t, y, f), strict=True):
+        np.fmax(figures[:, column], shares, out=figures[:, column])
+    found = known.complaints(t, y, f, examiner.tau, rhs)
+    return next((one.text for one in found if on_manifold or not one.dependent), None)
 
 
-def _unless_refused(look: Callable[..., str | None], *args: Any) -> str | None:
-    """Return what an examination finds.
+def _unresolved(examiner: Examiner, known: InvariantSet, rhs: Derivative, t: float, h: float, y: Array) -> str | None:
+    """Return which part of the state the steps from here do not resolve, or None."""
+    return examiner.resolution(rhs, t, h, y, known.t_span[1])
 
-    The states that it looks at are near those of the run, but the run does not visit them. A function that refuses one
-    of them by an exception says nothing about the run.
-    """
-    try:
-        with np.errstate(all="ignore"):
-            return look(*args)
-    except MemoryError:
-        raise
-    except Exception:
+
+def _along_chord(
+    examiner: Examiner, known: InvariantSet, rhs: Derivative, times: tuple[float, float], ends: tuple[Array, Array]
+) -> str | None:
+    """Return what is wrong between the two ends of a step with a large correction, or None."""
+    largest = float(examiner.figures[:, NU].max(initial=0.0))
+    if largest < GROWTH * examiner.largest:
         return None
+    examiner.largest = largest
+    (t_old, t_new), (old, new) = times, ends
+    for share in np.arange(1, POINTS + 1) / POINTS:
+        t, y = t_old + float(share) * (t_new - t_old), old + share * (new - old)
+        found = _complaint(examiner, known, rhs, t, y, False)
+        if found is not None:
+            return found
+    return None

@@ -328,10 +328,10 @@ class ZarrStore:
         array("target", number, ("invariant",), kept)
         if self._events:
             array("event_count", count, ("event",), self._events, fill=0)
-            for name, dtype, axes, shape in (("event_t", number, (), ()), ("event_y", state, ("component",), (n,))):
-                chunks = (EVENTS_IN_A_FILE, *shape)
-                layout[name] = {"shape": (0, *shape), "chunks": chunks, "dtype": dtype}
-                layout[name]["dimension_names"] = ("happened", *axes)
+            layout["event_t"] = {"shape": (0,), "chunks": (EVENTS_IN_A_FILE,), "dtype": number}
+            layout["event_t"]["dimension_names"] = ("happened",)
+            layout["event_y"] = {"shape": (0, n), "chunks": (EVENTS_IN_A_FILE, n), "dtype": state}
+            layout["event_y"]["dimension_names"] = ("happened", "component")
         array("t_end", number, ())
         array("max_defect", number, ("invariant",), kept)
         array("max_correction", number, ())

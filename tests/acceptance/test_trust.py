@@ -623,6 +623,18 @@ def test_examinations_stay_in_the_interval_and_refuse_nothing():
         integrate(light_planet(0.0), (0, -60), method=EIPRK4, h=0.3)
 
 
+def test_errors_of_an_examination_itself_are_not_hidden(monkeypatch):
+    """Only the user's functions may refuse a state."""
+    from eip_scipy.core.invariants import InvariantSet
+
+    def broken(self, t, y, f):
+        raise ArithmeticError("of the examination")
+
+    monkeypatch.setattr(InvariantSet, "rate_shares", broken)
+    with pytest.raises(ArithmeticError, match="of the examination"):
+        integrate(pendulum(), (0, 3), [1.0, 0.0], method=EIPRK4, h=0.02, invariants=ENERGY)
+
+
 def loose_runs():
     """Return systems whose invariants change by per cents in single steps at loose tolerances."""
     top, epidemic = rigid_body(1.0, 2.0, 3.0), sir(1.0, 0.3)

@@ -90,12 +90,12 @@ def _made(code: CodeType, functions: Mapping[str, Any]) -> FunctionType:
 
 def _compiled(what: str, body: list[ast.stmt], arguments: Arguments, in_place: bool) -> CodeType:
     given = {"t": True, "y": True, "dy": arguments.arrays["dy"], "out": in_place, "params": arguments.arrays["params"]}
-    names = [name for name, there in given.items() if there]
-    parameters = ast.arguments(
-        posonlyargs=[], args=[ast.arg(arg=name) for name in names], kwonlyargs=[], kw_defaults=[], defaults=[]
-    )
-    definition = ast.FunctionDef(name="written", args=parameters, body=body, decorator_list=[])
-    module = ast.fix_missing_locations(ast.Module(body=[definition], type_ignores=[]))
+    names = ", ".join(name for name, there in given.items() if there)
+    module = ast.parse(f"def written({names}): pass")
+    (definition,) = module.body
+    assert isinstance(definition, ast.FunctionDef)
+    definition.body = body
+    ast.fix_missing_locations(module)
     (code,) = (item for item in compile(module, f"<{what}>", "exec").co_consts if isinstance(item, CodeType))
     return code
 
