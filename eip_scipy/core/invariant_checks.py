@@ -27,6 +27,8 @@ CHECK_TOLERANCE, CHECK_NOISE = 1e-4, 6.0
 INVARIANCE_TOLERANCE = 1e-8
 # Single precision leaves this share of the terms of a rate.
 SINGLE_TOLERANCE = 1e-5
+# Components smaller than this share of the largest one are not looked at for single precision.
+LEAST_SINGLE = 1e-3
 # A gradient may be rounding and nothing else, as differences find that of a square which is 0: this many roundings of
 # the state, or as many times what those make of it.
 BLUR, BLURRED = 4.0, 3
@@ -192,10 +194,20 @@ def _in_single_precision(known: InvariantSet, at: _Samples, rhs: Derivative | No
     return ""
 
 
+def _large_and_single(found: list[Array]) -> Array:
+    """Return which components hold numbers of single precision and are not much smaller than the largest one.
+
+    What is left of terms that cancel, as next to an equilibrium, has few digits too.
+    """
+    values = np.array(found).view(float)
+    sizes = np.abs(values).max(axis=0)
+    return _are_single(values) & (sizes >= LEAST_SINGLE * sizes.max(initial=0.0))
+
+
 def _vary_in_single(found: list[Array]) -> bool:
     """Return whether some component varies by numbers of single precision; constants of such numbers may be meant."""
-    values = np.array(found).view(float)
-    return bool((_are_single(values) & (np.ptp(values, axis=0) != 0)).any())
+    varies = np.ptp(np.array(found).view(float), axis=0) != 0
+    return bool((_large_and_single(found) & varies).any())
 
 
 # Gradients.
@@ -266,7 +278,7 @@ def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> I
     wrong = found.wrong
     # Of small rates only: single precision does not explain large ones. Differences of values do not see small rates.
     small = wrong & (np.abs(found.rate) <= SINGLE_TOLERANCE * found.terms)
-    if (small.any() or _are_single(at.f[None].view(float)).any()) and (what := _in_single_precision(known, at, rhs)):
+    if (small.any() or _large_and_single([at.f]).any()) and (what := _in_single_precision(known, at, rhs)):
         names = [name for name, hidden in zip(known.names, small | ~wrong, strict=True) if hidden]
         if names:
             yield Complaint(

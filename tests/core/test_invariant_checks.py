@@ -280,6 +280,36 @@ def test_a_constant_in_single_precision_is_no_field_in_single_precision():
     assert not texts
 
 
+@pytest.mark.parametrize("method", [EIPRK45, EIPDOP853])
+def test_next_to_an_equilibrium_few_digits_are_no_single_precision(method):
+    """Brockett's flow sorts the eigenvalues of a matrix; what is left of its derivative at the end is rounding."""
+    L0, N = np.random.default_rng(0).normal(size=(5, 5)), np.diag(np.arange(5.0))
+    L0 = L0 + L0.T
+    rows, columns = np.triu_indices(5)
+
+    def matrix(y):
+        L = np.zeros((5, 5))
+        L[rows, columns] = L[columns, rows] = y
+        return L
+
+    def fun(t, y):
+        L = matrix(y)
+        bracket = L @ N - N @ L
+        return (L @ bracket - bracket @ L)[rows, columns]
+
+    once = np.where(rows == columns, 1.0, 2.0)  # how often an entry stands in the matrix
+    traces = Invariant(
+        lambda t, y: np.array([np.trace(matrix(y)), np.trace(matrix(y) @ matrix(y))]),
+        lambda t, y: np.array([rows == columns, 2 * once * y], float),
+    )
+    for end in (5.0, 20.0, 40.0):
+        run, texts = said(
+            lambda end=end: integrate(fun, (0, end), L0[rows, columns], method=method, invariants=traces, rtol=1e-9)
+        )
+        assert run.trusted, run.message
+        assert not texts
+
+
 def test_single_precision_explains_no_friction():
     friction = in_single(lambda t, y: pendulum(t, y) - np.array([0.0, 0.1 * y[1]], np.float32))
     kept = Invariant(energy, energy_gradient, name="E")
