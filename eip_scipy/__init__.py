@@ -5,21 +5,21 @@ a function is to be compiled.
 """
 
 from importlib import import_module as _import_module
+from pathlib import Path as _Path
 from typing import TYPE_CHECKING, Any
 
-from .core import moved as moved
-from .core import source_tree as source_tree
+from .core.moved import moved_names as _moved_names
 
 if TYPE_CHECKING:
     from . import checkpoint as checkpoint
+    from . import methods as methods
     from . import problems as problems
-    from .checkpoint import CheckpointError
+    from . import results as results
+    from . import solvers as solvers
     from .core.config import show_config
-    from .core.invariants import Invariant, JointInvariants, check_gradient
-    from .core.one_step import OneStepMethod
-    from .core.pointers import CFunctions
+    from .core.invariants import Invariant, check_gradient
     from .core.project import project
-    from .core.results import Diagnostics, ProjectionResult, ProjectionWarning
+    from .core.results import Diagnostics, ProjectionWarning
     from .core.solvers import (
         EIPDOP853,
         EIPGJ12,
@@ -33,24 +33,15 @@ if TYPE_CHECKING:
         EIPRK45,
         EIPRKN8,
         EIPRKN12,
-        EIPSolver,
         eip_method,
     )
-    from .ensembles.ensemble import EnsembleResult, ensemble
-    from .methods.multistep import GaussJackson
-    from .methods.nystrom import NystromTableau
-    from .methods.runge_kutta import Tableau
+    from .ensembles.ensemble import ensemble
     from .problems.invariant_search import find_invariants
     from .problems.symbolic import equations, hamiltonian
-    from .run.figures import plot
     from .run.integrate import integrate
     from .run.recommend import recommend
-    from .run.recommendation import Recommendation
-    from .run.results import IntegrationResult
-    from .run.saving import load, save
-    from .run.solve_ivp import OdeResult, solve_ivp
-    from .run.tables import to_dataframe, to_xarray
-    from .run.view import view
+    from .run.saving import load
+    from .run.solve_ivp import solve_ivp
 
     __version__: str
 
@@ -67,22 +58,9 @@ __all__ = [
     "EIPRK45",
     "EIPRKN8",
     "EIPRKN12",
-    "CFunctions",
-    "CheckpointError",
     "Diagnostics",
-    "EIPSolver",
-    "EnsembleResult",
-    "GaussJackson",
-    "IntegrationResult",
     "Invariant",
-    "JointInvariants",
-    "NystromTableau",
-    "OdeResult",
-    "OneStepMethod",
-    "ProjectionResult",
     "ProjectionWarning",
-    "Recommendation",
-    "Tableau",
     "check_gradient",
     "eip_method",
     "ensemble",
@@ -91,33 +69,16 @@ __all__ = [
     "hamiltonian",
     "integrate",
     "load",
-    "plot",
     "project",
     "recommend",
-    "save",
     "show_config",
     "solve_ivp",
-    "to_dataframe",
-    "to_xarray",
-    "view",
 ]
 
 _HOMES = {  # the module of each of these names, and the modules that are public themselves
-    "CFunctions": "core.pointers",
-    "CheckpointError": "checkpoint",
     "Diagnostics": "core.results",
-    "EnsembleResult": "ensembles.ensemble",
-    "GaussJackson": "methods.multistep",
-    "IntegrationResult": "run.results",
     "Invariant": "core.invariants",
-    "JointInvariants": "core.invariants",
-    "NystromTableau": "methods.nystrom",
-    "OdeResult": "run.solve_ivp",
-    "OneStepMethod": "core.one_step",
-    "ProjectionResult": "core.results",
     "ProjectionWarning": "core.results",
-    "Recommendation": "run.recommendation",
-    "Tableau": "methods.runge_kutta",
     "check_gradient": "core.invariants",
     "ensemble": "ensembles.ensemble",
     "equations": "problems.symbolic",
@@ -125,18 +86,18 @@ _HOMES = {  # the module of each of these names, and the modules that are public
     "hamiltonian": "problems.symbolic",
     "integrate": "run.integrate",
     "load": "run.saving",
-    "plot": "run.figures",
     "project": "core.project",
     "recommend": "run.recommend",
-    "save": "run.saving",
     "show_config": "core.config",
     "solve_ivp": "run.solve_ivp",
-    "to_dataframe": "run.tables",
-    "to_xarray": "run.tables",
-    "view": "run.view",
     **dict.fromkeys((name for name in __all__ if name.startswith("EIP") or name == "eip_method"), "core.solvers"),
 }
-_MODULES = ("checkpoint", "problems")
+# In a clone the integrations lie beside the package; an installed package has them inside.
+if not _Path(__file__).with_name("integrations").exists():
+    __path__.append(str(_Path(__file__).parents[1]))
+
+_MODULES = ("checkpoint", "methods", "problems", "results", "solvers")
+_moved = _moved_names(__name__, stacklevel=3)
 
 
 def __getattr__(name: str) -> Any:
@@ -147,7 +108,7 @@ def __getattr__(name: str) -> Any:
     elif name == "__version__":
         value = _import_module(".core.versions", __name__).VERSION
     else:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return _moved(name)
     globals()[name] = value
     return value
 

@@ -288,8 +288,8 @@ def read_archive(path: str | os.PathLike[str], *, every: int = 1, names: Sequenc
     -------
     OptimizeResult
         Times ``t`` (m,), states (q, v) ``y`` (6 N, m), ``gm`` (N,), ``component_names``, ``units`` and ``message``;
-        `eip_scipy.to_xarray`, `eip_scipy.plot`, `orbital_elements` and the like take it. One snapshot with all of its
-        settings is ``rebound.Simulation(path, snapshot=k)``, which `problem_from_simulation` takes.
+        `eip_scipy.results.to_xarray`, `eip_scipy.results.plot`, `orbital_elements` and the like take it. One snapshot
+        with all of its settings is ``rebound.Simulation(path, snapshot=k)``, which `problem_from_simulation` takes.
 
     Raises
     ------

@@ -47,7 +47,8 @@ class CFunctions:
 
     Examples
     --------
-    >>> from eip_scipy import CFunctions, ensemble
+    >>> from eip_scipy import ensemble
+    >>> from eip_scipy.problems import CFunctions
     >>> ensemble(CFunctions(library.rhs, library.rhs_of_eight), (0, 1), starts, h=0.1)  # doctest: +SKIP
     """
 

@@ -178,7 +178,7 @@ class EnsembleResult(Fields):
         Parameters
         ----------
         names : sequence of str or str, optional
-            As for `eip_scipy.to_xarray`.
+            As for `eip_scipy.results.to_xarray`.
 
         Returns
         -------
@@ -221,11 +221,11 @@ class EnsembleResult(Fields):
         return dataset(variables, coordinates, attributes)
 
     def to_dataframe(self, names: Any = None) -> Any:
-        """Return the members as a `pandas.DataFrame`, see `eip_scipy.to_dataframe`."""
+        """Return the members as a `pandas.DataFrame`, see `eip_scipy.results.to_dataframe`."""
         return to_dataframe(self, names)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.save`.
+        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.results.save`.
 
         Trajectories that `out` holds stay there: after `load` they are None, and `invariants` those of the last states.
         """
@@ -239,7 +239,7 @@ class EnsembleResult(Fields):
         Parameters
         ----------
         names : sequence of str or str, optional
-            As for `eip_scipy.to_xarray`.
+            As for `eip_scipy.results.to_xarray`.
 
         Returns
         -------
@@ -259,7 +259,7 @@ class EnsembleResult(Fields):
         return plot(self, names)
 
     def _packed(self) -> dict[str, Any]:
-        """Return the fields as `eip_scipy.save` takes them."""
+        """Return the fields as `eip_scipy.results.save` takes them."""
         from .saving import packed
 
         ends = vars(self).get("_ends")

@@ -1,1 +1,7 @@
-"""Tables of coefficients."""
+"""Coefficients of methods."""
+
+from .multistep import GaussJackson
+from .nystrom import NystromTableau
+from .runge_kutta import Tableau
+
+__all__ = ["GaussJackson", "NystromTableau", "Tableau"]

@@ -1,6 +1,8 @@
 """Problems with invariants: functions that return a `Problem`."""
 
+from ..core.invariants import JointInvariants
 from ..core.moved import moved_names
+from ..core.pointers import CFunctions
 from ..core.problem import Problem
 from .gravity import solar_data as solar_data
 from .gravity.forces import ForceConstants
@@ -41,10 +43,12 @@ from .waves import (
 __all__ = [
     "TOKAMAK",
     "UNIFORM",
+    "CFunctions",
     "FieldProblem",
     "ForceConstants",
     "Grid",
     "GrossPitaevskii",
+    "JointInvariants",
     "KortewegDeVries",
     "Lawson",
     "OrbitalElements",

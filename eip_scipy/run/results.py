@@ -131,27 +131,27 @@ class IntegrationResult(Fields):
         return default_names(len(self.y)) if given is None else tuple(given)
 
     def to_xarray(self, names: Any = None) -> Any:
-        """The run as an `xarray.Dataset`, see `eip_scipy.to_xarray`."""
+        """The run as an `xarray.Dataset`, see `eip_scipy.results.to_xarray`."""
         return to_xarray(self, names)
 
     def to_dataframe(self, names: Any = None) -> Any:
-        """The run as a `pandas.DataFrame`, see `eip_scipy.to_dataframe`."""
+        """The run as a `pandas.DataFrame`, see `eip_scipy.results.to_dataframe`."""
         return to_dataframe(self, names)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.save`."""
+        """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.results.save`."""
         from .saving import save
 
         save(self, path)
 
     def plot(self, names: Any = None, *, orbit: bool | None = None, ax: Any = None) -> Any:
-        """Draw the run, see `eip_scipy.plot`."""
+        """Draw the run, see `eip_scipy.results.plot`."""
         from .figures import plot
 
         return plot(self, names, orbit=orbit, ax=ax)
 
     def view(self, path: Any = None, *, names: Any = None, reference: Any = None) -> Any:
-        """Write a page that plays the run, see `eip_scipy.view`."""
+        """Write a page that plays the run, see `eip_scipy.results.view`."""
         from .view import view
 
         return view(self, path, names=names, reference=reference)

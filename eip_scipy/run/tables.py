@@ -48,7 +48,8 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
 
     Examples
     --------
-    >>> from eip_scipy import EIPRK4, integrate, to_xarray
+    >>> from eip_scipy import EIPRK4, integrate
+    >>> from eip_scipy.results import to_xarray
     >>> from eip_scipy.problems import kepler
     >>> data = to_xarray(integrate(kepler(), (0, 10), method=EIPRK4, save_every=10))
     >>> data.y.dims, data.component.values.tolist(), data.attrs["method"]

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import eip_scipy
-from eip_scipy import EIPSolver, problems
+from eip_scipy import problems
 from eip_scipy.problems import solar_data
+from eip_scipy.solvers import EIPSolver
 
 from . import comparators, hard_cases
 from .commands import COMMANDS

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from eip_scipy import EIPSolver
+from eip_scipy.solvers import EIPSolver
 
 from .report import UsageError, check_folder
 from .study import option

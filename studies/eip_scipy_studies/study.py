@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
-from eip_scipy import CheckpointError
+from eip_scipy.checkpoint import CheckpointError
 
 from .commands import CHECK_FAILED, DONE, INTERRUPTED, nearest
 from .report import (

@@ -7,7 +7,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from eip_scipy import load, view
+from eip_scipy import load
+from eip_scipy.results import view
 
 from .report import UsageError
 from .study import Check, Figures, Session, Study, option

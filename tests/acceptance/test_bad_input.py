@@ -21,7 +21,6 @@ from eip_scipy import (
     EIPRK4,
     EIPRK45,
     Diagnostics,
-    EIPSolver,
     Invariant,
     ProjectionWarning,
     check_gradient,
@@ -30,6 +29,7 @@ from eip_scipy import (
     project,
     recommend,
 )
+from eip_scipy.solvers import EIPSolver
 
 EPS = np.finfo(float).eps
 Y0 = [1.0, 2.0]

@@ -22,14 +22,13 @@ from eip_scipy import (
     EIPRKN12,
     Diagnostics,
     Invariant,
-    JointInvariants,
     ProjectionWarning,
     eip_method,
     ensemble,
     integrate,
     project,
 )
-from eip_scipy.problems import kepler, nbody, pythagorean
+from eip_scipy.problems import JointInvariants, kepler, nbody, pythagorean
 from eip_scipy_studies.hard_cases import lotka_volterra, rigid_body, sir
 
 EVERY_CLASS = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853, EIPRKN8, EIPRKN12]

@@ -20,12 +20,12 @@ from eip_scipy import (
     EIPRK45,
     EIPRKN12,
     Diagnostics,
-    EIPSolver,
     Invariant,
     eip_method,
     integrate,
 )
 from eip_scipy.problems import kepler, solar_system
+from eip_scipy.solvers import EIPSolver
 
 EPS = np.finfo(float).eps
 METHODS = [EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]

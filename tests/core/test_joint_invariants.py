@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK4, Diagnostics, Invariant, JointInvariants, integrate
+from eip_scipy import EIPRK4, Diagnostics, Invariant, integrate
+from eip_scipy.problems import JointInvariants
 
 RNG = np.random.default_rng(7)
 N = 24

@@ -18,7 +18,6 @@ from eip_scipy import (
     EIPGJ14,
     EIPRKN12,
     Diagnostics,
-    GaussJackson,
     Invariant,
     ProjectionWarning,
     eip_method,
@@ -26,6 +25,7 @@ from eip_scipy import (
     integrate,
 )
 from eip_scipy.engine.native import library
+from eip_scipy.methods import GaussJackson
 from eip_scipy.problems import Problem, figure_eight, nbody, solar_system
 from eip_scipy.problems.gravity import solar_data
 from eip_scipy.run import integrate as longrun

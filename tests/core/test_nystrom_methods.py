@@ -9,8 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from systems import energy, jit_energy, jit_energy_gradient, jit_momentum, jit_momentum_gradient
 
-from eip_scipy import EIPRKN8, EIPRKN12, Diagnostics, Invariant, NystromTableau, eip_method, integrate
+from eip_scipy import EIPRKN8, EIPRKN12, Diagnostics, Invariant, eip_method, integrate
 from eip_scipy.core.diagnostics import observed_order
+from eip_scipy.methods import NystromTableau
 from eip_scipy.problems import solar_system
 
 Y0 = np.array([0.8, 0.1, -0.2, 1.1])

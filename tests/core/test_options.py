@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK4, EIPRK45, EIPRKN8, EIPRKN12, EIPSolver, Invariant, ensemble, integrate
+from eip_scipy import EIPRK4, EIPRK45, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate
 from eip_scipy.core.options import ProjectionKeywords, ProjectionOptions
 from eip_scipy.ensembles.ensemble import EnsembleKeywords
 from eip_scipy.problems import kepler
 from eip_scipy.run.recommend import COMMON, RecommendKeywords
+from eip_scipy.solvers import EIPSolver
 
 NAMES = ProjectionOptions.names()
 

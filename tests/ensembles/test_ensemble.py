@@ -32,23 +32,13 @@ from systems import (
     pericentre,
 )
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPRK4,
-    EIPRK5,
-    EIPRK45,
-    EIPRKN8,
-    CheckpointError,
-    EnsembleResult,
-    Invariant,
-    checkpoint,
-    ensemble,
-    integrate,
-)
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, EIPRKN8, Invariant, checkpoint, ensemble, integrate
+from eip_scipy.checkpoint import CheckpointError
 from eip_scipy.ensembles.tasks import Plan, Task, run_members
 from eip_scipy.methods.nystrom import RKN1210
 from eip_scipy.methods.runge_kutta import RK5
 from eip_scipy.problems import kepler
+from eip_scipy.results import EnsembleResult
 from eip_scipy.run.prepare import Request
 
 needs_jit = pytest.mark.needs_jit

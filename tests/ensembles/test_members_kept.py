@@ -5,20 +5,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPRK4,
-    CheckpointError,
-    EnsembleResult,
-    Invariant,
-    checkpoint,
-    ensemble,
-    integrate,
-    load,
-    plot,
-    save,
-)
+from eip_scipy import EIPDOP853, EIPRK4, Invariant, checkpoint, ensemble, integrate, load
+from eip_scipy.checkpoint import CheckpointError
 from eip_scipy.problems import kepler
+from eip_scipy.results import EnsembleResult, plot, save
 
 PROBLEM = kepler()
 FAILING = 5

@@ -11,10 +11,11 @@ units = pytest.importorskip("astropy.units")
 Time = pytest.importorskip("astropy.time").Time
 TimeDelta = pytest.importorskip("astropy.time").TimeDelta
 
-from eip_scipy import EIPRK4, EIPRK45, EIPRKN12, ensemble, integrate, load, to_xarray  # noqa: E402
+from eip_scipy import EIPRK4, EIPRK45, EIPRKN12, ensemble, integrate, load  # noqa: E402
 from eip_scipy.core.units import units as known_units  # noqa: E402
 from eip_scipy.integrations import astropy as out  # noqa: E402
 from eip_scipy.problems import Problem, kepler, nbody, solar_system  # noqa: E402
+from eip_scipy.results import to_xarray  # noqa: E402
 
 AU, YR, DAY, KM_S = units.AU, units.yr, units.day, units.km / units.s
 EPOCH = Time(2456690.5, 20.3 / 24, format="jd", scale="tdb")  # of the data set "de440"

@@ -16,10 +16,11 @@ from test_docs import BLOCK, assert_output
 
 pytest.importorskip("eip_scipy.integrations.mpi", exc_type=ImportError)
 
-from eip_scipy import EIPRK4, EIPRK45, Diagnostics, EIPSolver, Invariant, eip_method
+from eip_scipy import EIPRK4, EIPRK45, Diagnostics, Invariant, eip_method
 from eip_scipy.integrations.mpi import MPI, gathered, over_ranks, total
 from eip_scipy.integrations.mpi_fields import Slab, SlabGrossPitaevskii, Transposition
 from eip_scipy.problems import Grid, GrossPitaevskii, Splitting, harmonic_trap
+from eip_scipy.solvers import EIPSolver
 
 TESTS = Path(__file__).parents[1]
 # What belongs to this Python first: an MPI that pip installed.

@@ -7,9 +7,10 @@ import pytest
 
 rebound = pytest.importorskip("rebound")
 
-from eip_scipy import EIPDOP853, EIPRKN12, integrate, load, plot, to_xarray  # noqa: E402
+from eip_scipy import EIPDOP853, EIPRKN12, integrate, load  # noqa: E402
 from eip_scipy.integrations import rebound as exchange  # noqa: E402
 from eip_scipy.problems import ForceConstants, kepler, nbody, orbital_elements, solar_system  # noqa: E402
+from eip_scipy.results import plot, to_xarray  # noqa: E402
 
 VERSION_5 = hasattr(rebound.Particle, "name")
 UNITS = {

@@ -6,7 +6,8 @@ from math import comb
 import numpy as np
 import pytest
 
-from eip_scipy import GaussJackson, eip_method
+from eip_scipy import eip_method
+from eip_scipy.methods import GaussJackson
 from eip_scipy.methods.multistep import (
     correction_weights,
     interpolation_weights,

@@ -6,7 +6,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from eip_scipy import Invariant, Tableau, eip_method, integrate
+from eip_scipy import Invariant, eip_method, integrate
+from eip_scipy.methods import Tableau
 from eip_scipy.methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, order_residuals, rooted_trees
 
 EPS = np.finfo(float).eps

@@ -9,7 +9,8 @@ from c_compiler import shared_library
 from numba import njit
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPGJ14, EIPRK4, CheckpointError, Invariant, ensemble, integrate
+from eip_scipy import EIPGJ14, EIPRK4, Invariant, ensemble, integrate
+from eip_scipy.checkpoint import CheckpointError
 from eip_scipy.ensembles import tasks
 from eip_scipy.problems import kepler
 

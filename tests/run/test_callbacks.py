@@ -8,7 +8,8 @@ import pytest
 from numba import njit
 from systems import SQUARE, oscillator
 
-from eip_scipy import EIPRK4, EIPRK45, CheckpointError, Invariant, ensemble, integrate
+from eip_scipy import EIPRK4, EIPRK45, Invariant, ensemble, integrate
+from eip_scipy.checkpoint import CheckpointError
 
 Y0 = [1.0, 2.0]
 # Beyond a thousand doublings of a number of steps, where no float holds it any more.

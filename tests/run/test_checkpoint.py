@@ -44,12 +44,12 @@ from eip_scipy import (
     EIPRK45,
     EIPRKN8,
     EIPRKN12,
-    CheckpointError,
     Diagnostics,
     Invariant,
     checkpoint,
     integrate,
 )
+from eip_scipy.checkpoint import CheckpointError
 from eip_scipy.problems import kepler
 from eip_scipy.run import driver as _driver
 from eip_scipy.run import integrate as longrun

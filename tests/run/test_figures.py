@@ -7,8 +7,9 @@ import warnings
 import numpy as np
 import pytest
 
-from eip_scipy import EIPRK4, ensemble, integrate, plot
+from eip_scipy import EIPRK4, ensemble, integrate
 from eip_scipy.problems import kepler
+from eip_scipy.results import plot
 
 pyplot = pytest.importorskip("matplotlib.pyplot")
 PNG = b"\x89PNG"

@@ -20,7 +20,6 @@ from eip_scipy import (
     EIPRK45,
     EIPRKN12,
     Diagnostics,
-    IntegrationResult,
     Invariant,
     ProjectionWarning,
     check_gradient,
@@ -31,6 +30,7 @@ from eip_scipy import (
 )
 from eip_scipy.methods.runge_kutta import RK4
 from eip_scipy.problems import Problem, harmonic, kepler
+from eip_scipy.results import IntegrationResult
 
 EPS = np.finfo(float).eps
 Y0 = np.array([1.0, 2.0])

@@ -17,8 +17,8 @@ import pytest
 from forked import Forker
 from systems import SQUARE, H, L, orbit, oscillator, pericentre
 
-from eip_scipy import EIPRK4, CheckpointError, Invariant, checkpoint, ensemble, integrate
-from eip_scipy.checkpoint import locks
+from eip_scipy import EIPRK4, Invariant, checkpoint, ensemble, integrate
+from eip_scipy.checkpoint import CheckpointError, locks
 from eip_scipy.run import resume as _resume
 
 TESTS = Path(__file__).parents[1]

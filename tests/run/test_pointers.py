@@ -15,19 +15,9 @@ from numba import njit
 from scipy import LowLevelCallable
 from scipy.integrate import solve_ivp
 
-from eip_scipy import (
-    EIPRK4,
-    EIPRK45,
-    EIPRKN12,
-    CFunctions,
-    CheckpointError,
-    Invariant,
-    check_gradient,
-    ensemble,
-    integrate,
-    project,
-)
-from eip_scipy.problems import Problem
+from eip_scipy import EIPRK4, EIPRK45, EIPRKN12, Invariant, check_gradient, ensemble, integrate, project
+from eip_scipy.checkpoint import CheckpointError
+from eip_scipy.problems import CFunctions, Problem
 
 HERE = Path(__file__).parent
 KEPLER = HERE.parents[1] / "examples" / "c-functions" / "kepler.c"

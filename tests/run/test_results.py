@@ -18,18 +18,14 @@ from eip_scipy import (
     EIPRK23,
     EIPRK45,
     EIPRKN12,
-    IntegrationResult,
     Invariant,
     ProjectionWarning,
     ensemble,
     integrate,
     load,
-    plot,
-    save,
-    to_dataframe,
-    to_xarray,
 )
 from eip_scipy.problems import harmonic, kepler, soliton
+from eip_scipy.results import IntegrationResult, plot, save, to_dataframe, to_xarray
 
 Y0 = np.array([1.0, 2.0])
 NAMES = ("x", "y", "vx", "vy")
@@ -328,7 +324,7 @@ def test_a_failed_save_leaves_the_file_that_was_there(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(zipfile.ZipFile, "writestr", full)
-    with pytest.raises(eip_scipy.CheckpointError, match="no space left"):
+    with pytest.raises(eip_scipy.checkpoint.CheckpointError, match="no space left"):
         kepler_run(6.0).save(path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

@@ -18,11 +18,11 @@ from eip_scipy import (
     EIPRKN8,
     EIPRKN12,
     Invariant,
-    NystromTableau,
     eip_method,
     ensemble,
     integrate,
 )
+from eip_scipy.methods import NystromTableau
 from eip_scipy.problems import kepler
 
 pytestmark = pytest.mark.needs_jit

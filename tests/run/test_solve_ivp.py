@@ -22,7 +22,6 @@ from eip_scipy import (
     EIPRKN12,
     Diagnostics,
     Invariant,
-    OdeResult,
     ProjectionWarning,
     eip_method,
     integrate,
@@ -30,6 +29,7 @@ from eip_scipy import (
 )
 from eip_scipy.core.options import ProjectionOptions
 from eip_scipy.problems import kepler
+from eip_scipy.results import OdeResult
 
 K = 2.0
 SciPyResult = type(scipy.integrate.solve_ivp(lambda t, y: y, (0, 0), [1.0]))
@@ -353,7 +353,8 @@ USER_CODE = """
 import numpy as np
 from numpy.typing import NDArray
 
-from eip_scipy import EIPDOP853, EIPRK4, Diagnostics, Invariant, OdeResult, ensemble, integrate, recommend, solve_ivp
+from eip_scipy import EIPDOP853, EIPRK4, Diagnostics, Invariant, ensemble, integrate, recommend, solve_ivp
+from eip_scipy.results import OdeResult
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,9 @@ from matplotlib import image
 from scipy.integrate import solve_ivp
 from systems import oscillator
 
-from eip_scipy import EIPDOP853, EIPRK4, IntegrationResult, equations, integrate, load, view
+from eip_scipy import EIPDOP853, EIPRK4, equations, integrate, load
 from eip_scipy.problems import harmonic, kepler, soliton
+from eip_scipy.results import IntegrationResult, view
 from eip_scipy.run import view as module
 from eip_scipy_studies.cli import main
 

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPSolver, integrate
+from eip_scipy import EIPDOP853, EIPRK4, integrate
 from eip_scipy.problems import FieldProblem, GrossPitaevskii
 from eip_scipy.problems.gross_pitaevskii import Vortices, vortices
+from eip_scipy.solvers import EIPSolver
 
 from ..long_runs import Checkpoints, named
 from ..report import compact, describe_machine, table

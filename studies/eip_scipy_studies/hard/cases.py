@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from eip_scipy import Diagnostics, EIPSolver, Tableau
+from eip_scipy import Diagnostics
+from eip_scipy.methods import Tableau
+from eip_scipy.solvers import EIPSolver
 
 from ..hard_cases import HardCase, hard_cases
 from ..listing import METRICS, fixed_step_methods

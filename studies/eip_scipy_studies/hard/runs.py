@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPDOP853, EIPRKN12, EIPSolver, integrate
+from eip_scipy import EIPDOP853, EIPRKN12, integrate
 from eip_scipy.problems import (
     Problem,
     centre_time,
@@ -27,6 +27,7 @@ from eip_scipy.problems import (
     reaches,
     time_transformed,
 )
+from eip_scipy.solvers import EIPSolver
 
 from ..long_runs import named
 from ..work_precision import work_precision

@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eip_scipy import EIPDOP853, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPSolver, integrate
+from eip_scipy import EIPDOP853, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, integrate
 from eip_scipy.problems import Problem, kepler
+from eip_scipy.solvers import EIPSolver
 
 from ..long_runs import named
 from ..report import compact, table

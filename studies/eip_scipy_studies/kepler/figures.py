@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eip_scipy import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, EIPSolver, integrate
+from eip_scipy import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, integrate
 from eip_scipy.problems import kepler
+from eip_scipy.solvers import EIPSolver
 
 from ..report import compact, table
 from ..study import Figures, Rows, Session, Study

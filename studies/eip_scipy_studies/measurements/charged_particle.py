@@ -21,9 +21,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, EIPSolver, integrate
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, integrate
 from eip_scipy.problems import ParticleProblem, tokamak
 from eip_scipy.problems.particle_orbits import ParticleOrbit
+from eip_scipy.solvers import EIPSolver
 
 from ..comparators import boris, implicit_midpoint
 from ..particles.runs import SCENES, scene

@@ -25,8 +25,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eip_scipy import EIPRKN8, EIPRKN12, EIPSolver, ProjectionWarning, integrate
+from eip_scipy import EIPRKN8, EIPRKN12, ProjectionWarning, integrate
 from eip_scipy.problems import Problem, solar_system
+from eip_scipy.solvers import EIPSolver
 
 from ..hard.runs import SCENES, scene
 from ..hard_cases import hard_cases

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPSolver, integrate
+from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, integrate
 from eip_scipy.problems import Problem, harmonic, kepler, rotating_packet
+from eip_scipy.solvers import EIPSolver
 
 from ..beside import workers
 from ..report import cores

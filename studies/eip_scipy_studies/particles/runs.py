@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPSolver, integrate
+from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, integrate
 from eip_scipy.problems import ParticleProblem, tokamak, uniform_field
 from eip_scipy.problems.particle_orbits import ParticleOrbit, radial_range
 from eip_scipy.problems.particles.charged_particle import ORBITS
+from eip_scipy.solvers import EIPSolver
 
 from ..comparators import boris, implicit_midpoint
 from ..long_runs import named

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from eip_scipy import EIPGJ14, EIPRK4, EIPRK5, EIPRKN12, EIPSolver, integrate
+from eip_scipy import EIPGJ14, EIPRK4, EIPRK5, EIPRKN12, integrate
 from eip_scipy.problems import Problem
 from eip_scipy.problems.gravity.solar_data import YEAR_D
+from eip_scipy.solvers import EIPSolver
 
 from ..long_runs import named
 from ..work_precision import Runner, curves, work_precision

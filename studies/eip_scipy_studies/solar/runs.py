@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eip_scipy import EIPGJ14, EIPRKN12, EIPSolver, integrate
+from eip_scipy import EIPGJ14, EIPRKN12, integrate
 from eip_scipy.native_kernels import FixedSteps
 from eip_scipy.problems import Problem, SolarSystemData, solar_system
 from eip_scipy.problems.gravity.solar_data import YEAR_D, load
+from eip_scipy.solvers import EIPSolver
 
 from ..comparators import StormerVerletResult, stormer_verlet
 from ..long_runs import named

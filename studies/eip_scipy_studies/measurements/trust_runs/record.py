@@ -13,8 +13,9 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import eip_scipy
-from eip_scipy import EIPDOP853, Diagnostics, EIPSolver, eip_method, ensemble, integrate
+from eip_scipy import EIPDOP853, Diagnostics, eip_method, ensemble, integrate
 from eip_scipy.problems import Problem
+from eip_scipy.solvers import EIPSolver
 
 # What a run that tells may do, the plainest first.
 ERROR, START, WARNING, FAILED, UNTRUSTED, SILENT = (

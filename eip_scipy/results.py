@@ -1,0 +1,26 @@
+"""Results of runs, of ensembles and of projections, and what is done with them: tables, files, figures, pages."""
+
+from .core.results import Diagnostics, ProjectionResult
+from .ensembles.ensemble import EnsembleResult
+from .run.figures import plot
+from .run.recommendation import Recommendation
+from .run.results import IntegrationResult
+from .run.saving import load, save
+from .run.solve_ivp import OdeResult
+from .run.tables import to_dataframe, to_xarray
+from .run.view import view
+
+__all__ = [
+    "Diagnostics",
+    "EnsembleResult",
+    "IntegrationResult",
+    "OdeResult",
+    "ProjectionResult",
+    "Recommendation",
+    "load",
+    "plot",
+    "save",
+    "to_dataframe",
+    "to_xarray",
+    "view",
+]
