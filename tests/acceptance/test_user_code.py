@@ -30,6 +30,6 @@ def test_it_runs(program, tmp_path):
     assert defect < 1e-14
     assert states.shape == (2, 11)
     assert (message, trusted) == ("The solver successfully reached the end of the integration interval.", True)
-    assert program.long_run(tmp_path / "run.npz") > 4 * 667
+    assert program.long_run(tmp_path / "run.npz") > 4 * 334
     np.testing.assert_allclose(program.members()[:, 0], [0.600086, 0.277699], atol=1e-4)
     assert program.others() == []  # no polynomial
