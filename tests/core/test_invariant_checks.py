@@ -262,7 +262,7 @@ def test_single_precision_is_named(kind):
 @pytest.mark.parametrize("grad", [None, lambda t, y: y])
 @pytest.mark.parametrize("method", [EIPRK4, EIPDOP853])
 def test_a_field_in_single_precision_is_named_from_every_start(method, grad, y0):
-    """Where a rate of change is 0 by chance, too."""
+    """Also if a rate of change is 0 by chance."""
     kept = Invariant(lambda t, y: 0.5 * (y[0] ** 2 + y[1] ** 2), grad, name="E")
     step = {"h": 0.05} if method is EIPRK4 else {"rtol": 1e-9}
     oscillator = in_single(lambda t, y: np.array([y[1], -y[0]]))
