@@ -8,8 +8,11 @@ import hashlib
 import os
 import platform
 import sys
+import threading
 from pathlib import Path
+from typing import Any, ClassVar
 
+import nanobind
 import numpy
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
@@ -17,14 +20,22 @@ from setuptools.command.build_ext import build_ext
 FOLDER = Path("eip_scipy/engine/cpp")
 # Called once a run, or by Python: these are compiled in half the time without the passes that make loops fast.
 COLD = ["complex_step.cpp", "library.cpp", "module.cpp", "python_functions.cpp", "records.cpp"]
+# The library of nanobind is compiled once and linked into both modules: what differs between these, the NB_DOMAIN that
+# keeps their types apart, stands in its headers only.
+NANOBIND = Path(nanobind.include_dir()).parent
+INCLUDED = [str(NANOBIND / "include"), str(NANOBIND / "ext" / "robin_map" / "include")]
 if sys.platform == "win32":
     FLAGS, V3, QUICK, OLD = ["/std:c++20", "/O2", "/fp:precise"], ["/arch:AVX2"], "/O1", []
+    OTHERS, OTHERS_OWN = [f"/I{path}" for path in INCLUDED], ["/std:c++20"]
 else:
     # No fused operation but those that are written, no reordering: the same bits from every build. The warnings left
     # out are about Python's own interface.
     FLAGS = ["-std=c++20", "-O3", "-g0", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
     FLAGS += ["-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-cast-function-type", "-Wno-missing-field-initializers"]
     V3, QUICK, OLD = ["-march=x86-64-v3"], "-O1", ["-O1"]
+    # Not our headers: without warnings. The library handles Python's objects under several types.
+    OTHERS = [f"-isystem{path}" for path in INCLUDED]
+    OTHERS_OWN = ["-std=c++20", "-g0", "-w", "-fvisibility=hidden", "-fno-strict-aliasing", "-ffunction-sections"]
 MISSING = """\
 eip_scipy's engine is written in C++20, and no compiler built it. Install one: g++ 12 or newer (Debian, Ubuntu: apt
 install g++; Fedora: dnf install gcc-c++), clang 15 or newer, or on macOS Xcode's tools (xcode-select --install)."""
@@ -46,14 +57,17 @@ def module(name: str, *flags: str) -> Extension:
         sources=[str(path) for path in sorted(FOLDER.rglob("*.cpp"))],
         depends=[str(path) for path in sorted(FOLDER.rglob("*.hpp"))],
         include_dirs=[numpy.get_include()],
-        define_macros=[("EIP_INIT", f"PyInit_{name}"), ("EIP_NAME", f'"{name}"'), ("EIP_SOURCES", f'"{stamp()}"')],
-        extra_compile_args=[*FLAGS, *flags],
+        define_macros=[("EIP_MODULE", name), ("NB_DOMAIN", name), ("EIP_SOURCES", f'"{stamp()}"')],
+        extra_compile_args=[*FLAGS, *OTHERS, *flags],
         language="c++",
     )
 
 
 class Build(build_ext):
     """Builds the modules side by side, and says what is missing where no compiler can be had."""
+
+    binding: ClassVar[list[str]] = []  # the object file of nanobind's library
+    binding_lock = threading.Lock()
 
     def finalize_options(self) -> None:
         """A process for each core, unless another number is asked for."""
@@ -82,9 +96,23 @@ class Build(build_ext):
                 depends=ext.depends,
             )
             ext.sources = [source for source in ext.sources if source not in cold]
+            ext.extra_objects += self.compiled_binding(own.compiler)
             build_ext.build_extension(own, ext)
         except Exception as error:
             raise SystemExit(f"{MISSING}\nWhat the build said: {error}") from error
+
+    def compiled_binding(self, compiler: Any) -> list[str]:
+        """Return the binding's library, compiled by whichever module comes to it first."""
+        with self.binding_lock:
+            if not self.binding:
+                self.binding += compiler.compile(
+                    [str(NANOBIND / "src" / "nb_combined.cpp")],
+                    output_dir=str(Path(self.build_temp) / "nanobind"),
+                    macros=[("NB_COMPACT_ASSERTIONS", None)],
+                    include_dirs=[*self.include_dirs, *INCLUDED],
+                    extra_postargs=[*OTHERS_OWN, QUICK],
+                )
+            return self.binding
 
 
 builds: dict[str, list[str]] = {"_native": []}

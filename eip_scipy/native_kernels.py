@@ -21,7 +21,7 @@ from .core.jitted import NotCompilableError
 from .core.native_functions import Kind, function_alone, raise_again
 from .core.pointers import by_pointer, is_pointer
 from .core.stepping import check_fixed_step, fixed_steps, saved_steps
-from .engine.data import make_work
+from .engine.data import Work
 from .engine.native import BUILD, Call, FailedCallError, NativeFunctions, PythonFunctions, call
 
 __all__ = [
@@ -238,7 +238,7 @@ def _run(
         functions, reason = PythonFunctions(in_python, (), (), (), second_order), str(error)
     ys = np.full((steps.saved.size, y.size), np.nan)
     ys[0] = y
-    work = make_work(y.size, np.dtype(float), 1, 0, 0)
+    work = Work(y.size, np.dtype(float), 1, 0, 0)
     start = perf_counter()
     try:
         evaluations = BUILD.comparators.take_steps(scheme, constant, functions, work, steps, y, ys)

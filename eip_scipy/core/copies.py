@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from scipy.integrate import OdeSolver
 
-from ..engine.data import Work, copied_work
+from ..engine.data import Work
 from ..engine.trust import Trust
 from .invariants import InvariantSet
 from .one_step import OneStep
@@ -37,7 +37,7 @@ def parts_of(run: Run) -> RunParts:
     values["options"] = run.options._replace(joint=None)
     if isinstance(run.method, OneStep):
         values["method"] = None
-    return RunParts(values, copied_work(run.work), list(run.trust.doubts), run.trust.failed)
+    return RunParts(values, copy.deepcopy(run.work), list(run.trust.doubts), run.trust.failed)
 
 
 def run_of(parts: RunParts, invariants: InvariantSet, method: Any, *, joint: bool) -> Run:
@@ -53,7 +53,7 @@ def run_of(parts: RunParts, invariants: InvariantSet, method: Any, *, joint: boo
     joint : bool
         Whether the run's options hold the invariants that are projected jointly.
     """
-    values, work = copy.deepcopy(parts.values), copied_work(parts.work)
+    values, work = copy.deepcopy(parts.values), copy.deepcopy(parts.work)
     if values["method"] is None:
         values["method"] = method
     if joint:

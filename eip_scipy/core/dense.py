@@ -18,6 +18,7 @@ from ..engine.data import (
     ERROR,
     GIVEN,
     HISTORY,
+    MOST_CROSSINGS,
     NEW,
     NYSTROM,
     POLYNOMIAL,
@@ -25,7 +26,7 @@ from ..engine.data import (
     SEVENTH,
     Dense,
     Method,
-    make_work,
+    Work,
 )
 from ..engine.native import Engine
 from ..methods.multistep import GaussJackson, interpolation_weights
@@ -43,7 +44,6 @@ Array = np.ndarray
 ITERATIONS = 5
 # Roots of events that the loop finds before someone looks at them, and the numbers that their states may be.
 MOST_ROOTS, ROOT_NUMBERS = 1024, 2**17
-MOST_CROSSINGS = 3  # of an event in a step, see engine/cpp/crossings.hpp
 
 
 class Interpolants:
@@ -188,7 +188,7 @@ def _record(run: Run, tableau: AnyMethod, events: int, *, shows: bool) -> Dense:
         shows=shows,
         by_travel=invariants > 0 and run.options.metric == ERROR,
         options=options._replace(target=np.zeros(invariants)),
-        work=make_work(n, dtype, stages + c.size if c.size else 1, invariants, options.groups.start.size - 1),
+        work=Work(n, dtype, stages + c.size if c.size else 1, invariants, options.groups.start.size - 1),
         missed=np.zeros(2),
         waiting=np.zeros(2, np.int64),
         piece=np.zeros(3 + (3 + rows) * n * width + 2 * invariants),

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.trust import (
+from ..engine.data import (
     CHANGES_ALONG_FLOW,
     EXAMINED,
     LARGE_ERROR,

@@ -7,8 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..engine.counters import NFEV
-from ..engine.data import Work
+from ..engine.data import NFEV, Work
 from ..methods.orders import Ordered
 from .inputs import refuse_units, shown
 

@@ -1,7 +1,7 @@
 """The options of the projection, in one place: names, defaults, documentation, checks, and what identifies a run.
 
 Whatever projects takes them as `ProjectionOptions` or as its keywords. A new option is a field here, a keyword, and,
-where the step is to know it, a field of `Options`, and the same in engine/cpp/data.hpp.
+where the step is to know it, a field of `Options` in engine/cpp/data.hpp.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ from ..engine.data import (
     EPS,
     ERROR,
     EUCLIDEAN,
+    FAR,
     GIVEN,
+    LARGE_SHARE,
     MIDPOINT,
     NEW,
     OLD,
-    FrameRows,
-    Grouping,
+    Options,
 )
-from ..engine.trust import FAR, FAR_IN_TOLERANCES, LARGE_SHARE, MOST_FAR
+from ..engine.trust import FAR_IN_TOLERANCES, MOST_FAR
 from ..methods.multistep import GaussJackson
 from .blocks import blocks_of
 from .frame import frame_rows
@@ -89,44 +90,6 @@ class ProjectionKeywords(ProjectionDetails, total=False):
 def _text(kind: str, text: str) -> dict[str, str]:
     """An option's kind of value, and what it is, for docstrings."""
     return {"kind": kind, "text": " ".join(text.split())}
-
-
-class Options(NamedTuple):
-    """The options as the engine reads them (cpp/data.hpp).
-
-    `rtol` by float of the state, `atol` by component, `block_atol` by block. `kinds`: floats of the same unit.
-    `watched`: whether corrections are compared with the errors of the steps. `limit`: the share of an invariant's terms
-    that a projection may leave as its defect; the terms are `per_band` dead bands. `far`: the share of them from which
-    on a defect before a projection is noted.
-    `most_left`: the share of each one's terms that a Newton step may leave without a further one; finite where the user
-    gave a target, which a run that goes on from here must meet.
-    `joint`: in interpreted runs the `JointInvariants` whose functions serve, else None.
-    """
-
-    rtol: np.ndarray
-    atol: np.ndarray
-    block_atol: np.ndarray
-    groups: Grouping
-    frame: FrameRows
-    target: np.ndarray
-    scales: np.ndarray
-    computed: np.ndarray
-    most_left: np.ndarray
-    kinds: Grouping
-    kappa: float
-    metric: int
-    direction: int
-    iterations: int
-    every: int
-    reuse_f: bool
-    uses_f: bool
-    compensated: bool
-    adaptive: bool
-    per_band: float
-    watched: bool = False
-    limit: float = np.inf
-    far: float = FAR
-    joint: Any = None
 
 
 class Settled(NamedTuple):

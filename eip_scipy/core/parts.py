@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.data import NO_METHOD, make_work
+from ..engine.data import NO_METHOD, Work
 from ..engine.native import Call, Engine, PythonFunctions
 from .blocks import blocks_of
 from .invariants import InvariantSet
@@ -18,7 +18,7 @@ from .solvers import EIPSolver
 __all__ = ["SolverOfParts"]
 
 DEPENDENT = 2.0**-26  # what is left of a normalised gradient that is a combination of others, to round-off
-SCALARS = ("values", "g", "band", "before", "defect", "max_defect", "max_correction", "norm", "counters")
+SCALARS = {"values", "g", "band", "before", "defect", "max_defect", "max_correction", "norm", "counters"}
 
 
 class SolverOfParts(EIPSolver):
@@ -85,7 +85,8 @@ class _Coordinates:
             rtol=np.zeros(n), atol=np.zeros(n), block_atol=np.zeros(n), groups=each, kinds=each, joint=None,
             scales=np.empty(size), computed=np.zeros(size),
         )  # fmt: skip
-        self._work = make_work(n, np.dtype(float), 0, size, n)._replace(**{k: getattr(run.work, k) for k in SCALARS})
+        self._work = Work(n, float, 0, size, n)
+        self._work.share(run.work, SCALARS)
         functions = PythonFunctions(
             Call(self.rhs, (), (n,), _given),
             (Call(self.inv, (), (size,), _given),),
@@ -120,11 +121,11 @@ class _Coordinates:
         begins, self._begins = self._begins, False
         self._run.invariants.grad(t, self._at(c), w.K[-1] if begins else w.f_point, w.G)
         if begins:
-            _orthonormal_rows(w.G_r, self._basis)
+            _orthonormal_rows(w.G.view(float), self._basis)
         part = np.empty((size, size + 1))
         # By loops of NumPy's own: threads of BLAS on each of the ranks would compete.
-        np.einsum("ij,kj->ik", w.G_r, self._basis, out=part[:, :-1])
-        np.einsum("ij,j->i", np.abs(w.G_r), np.abs(w.y_hat_r), out=part[:, -1])
+        np.einsum("ij,kj->ik", w.G.view(float), self._basis, out=part[:, :-1])
+        np.einsum("ij,j->i", np.abs(w.G.view(float)), np.abs(w.y_hat.view(float)), out=part[:, -1])
         parts = self._gathered(part)
         if begins:
             np.maximum(self._run.options.scales, parts[:, :, -1].sum(axis=0), out=self._options.scales)
@@ -135,8 +136,8 @@ class _Coordinates:
         w = self._run.work
         if not c.any():
             return w.y_hat
-        np.einsum("i,ij->j", c[self._own], self._basis, out=w.stage_r)
-        np.add(w.y_hat_r, w.stage_r, out=w.stage_r)
+        np.einsum("i,ij->j", c[self._own], self._basis, out=w.stage.view(float))
+        np.add(w.y_hat.view(float), w.stage.view(float), out=w.stage.view(float))
         return w.stage
 
 

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.counters import LAST_RANK
-from ..engine.data import BAND, EPS, Span
-from ..engine.trust import LARGE_SHARE, ProjectionWarning
+from ..engine.data import BAND, EPS, LARGE_SHARE, LAST_RANK, Span
+from ..engine.trust import ProjectionWarning
 from ..methods.runge_kutta import RK1
 from . import setup
 from .blocks import kinds_of

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..engine.counters import N_COUNTERS, PROJECTIONS, RANK_REDUCED, REJECTED, SKIPPED, SOFTENED
-from ..engine.trust import N_FIGURES, ProjectionWarning, Trust
+from ..engine.data import N_COUNTERS, N_FIGURES, PROJECTIONS, RANK_REDUCED, REJECTED, SKIPPED, SOFTENED
+from ..engine.trust import ProjectionWarning, Trust
 
 __all__ = ["Diagnostics", "ProjectionResult", "ProjectionWarning"]
 

@@ -10,17 +10,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import OdeSolver
 
-from ..engine.counters import LAST_RANK
 from ..engine.data import (
     EPS,
     ERROR,
     EUCLIDEAN,
+    EXAMINED,
     HAVE_NODES,
+    LAST_RANK,
     LENGTH,
     NEW,
     NEWEST,
     NO_METHOD,
     NOT_FINITE,
+    NOTHING,
+    REASON,
     TIME,
     TIME_NEW,
     TOO_SMALL,
@@ -28,10 +31,9 @@ from ..engine.data import (
     Method,
     Schedule,
     Work,
-    make_work,
 )
 from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
-from ..engine.trust import EXAMINED, NOTHING, REASON, Trust
+from ..engine.trust import Trust
 from ..methods.multistep import GaussJackson
 from ..methods.nystrom import RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853
@@ -345,7 +347,7 @@ def prepare(
     invariants.kinds = options.kinds
     options = options._replace(scales=_scales(options, invariants, start))
     arrays = method_arrays(method)
-    work = make_work(y0.size, y0.dtype, arrays.b.size, invariants.size, options.groups.start.size - 1)
+    work = Work(y0.size, y0.dtype, arrays.b.size, invariants.size, options.groups.start.size - 1)
     if sigma is not None:
         work.sigma[:] = sigma
     run = Run(y0, arrays, options, work, invariants, identity, Trust(invariants.names, work.trust), tau)
@@ -416,7 +418,7 @@ class Projection:
         self, invariants: InvariantSet, options: Options, rhs: Callable[[float, np.ndarray], np.ndarray]
     ) -> None:
         n, dtype = invariants.shape[1], invariants.dtype
-        self.work = make_work(n, dtype, 0, invariants.size, options.groups.start.size - 1)
+        self.work = Work(n, dtype, 0, invariants.size, options.groups.start.size - 1)
         derivative = Call(rhs, (), (n,), lambda value, t: np.array(value, dtype))
         functions = PythonFunctions(derivative, *invariants.calls, (), second_order=False)
         self._engine = Engine(NO_METHOD, options._replace(joint=None), self.work, functions)

@@ -15,8 +15,20 @@ import numpy as np
 import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
-from ..engine.counters import FOUND, NFEV, NJEV, NLU, REJECTED, WAITED
-from ..engine.data import FAILED_PROJECTION, NEXT_LENGTH, OK, PENDING, Work, bare_schedule
+from ..engine.data import (
+    FAILED_PROJECTION,
+    FOUND,
+    NEXT_LENGTH,
+    NFEV,
+    NJEV,
+    NLU,
+    OK,
+    PENDING,
+    REJECTED,
+    WAITED,
+    Work,
+    bare_schedule,
+)
 from ..engine.native import Call, PythonFunctions
 from ..engine.trust import ProjectionWarning
 from ..methods.multistep import GaussJackson

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,6 @@ __all__ = [
 # Names one of the builds, _native or _native_v3, in place of the best one that the processor takes.
 VARIABLE = "EIP_SCIPY_ENGINE"
 AGAIN = "python -m pip install --no-build-isolation --no-deps --editable ."
-# Further arguments that the engine hands on itself.
-MOST_ARGUMENTS = 8
 
 
 class Call(NamedTuple):
@@ -52,7 +50,7 @@ class Call(NamedTuple):
 
 def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...], convert: Any, **kind: bool) -> Call:
     """A `Call` with as many further arguments as there are."""
-    if len(args) > MOST_ARGUMENTS:
+    if len(args) > BUILD.MOST_ARGUMENTS:
         return Call(lambda *first: fun(*first, *args), (), shape, convert, **kind)
     return Call(fun, args, shape, convert, **kind)
 
@@ -145,11 +143,15 @@ def _require_current(build: Any) -> None:
         raise ImportError(f"the sources in {folder} have changed since the engine was built. Build it: {AGAIN}")
 
 
-BUILD = _best()
-_require_current(BUILD)
-Engine, FailedCallError = BUILD.Engine, BUILD.FailedCallError
+if TYPE_CHECKING:
+    from . import _native as BUILD  # noqa: N812
+else:
+    BUILD = _best()
+    _require_current(BUILD)
+Engine = BUILD.Engine
+FailedCallError = BUILD.FailedCallError
 LibraryFunction = BUILD.LibraryFunction
-library: dict[str, Any] = BUILD.LIBRARY
+library: dict[str, LibraryFunction] = BUILD.LIBRARY
 """The functions of the library's own problems that are in C++, by name."""
 
 

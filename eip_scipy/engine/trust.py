@@ -11,31 +11,38 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .data import (
+    AT,
+    BY_VALUES,
+    EXAMINED,
+    EXPECTED,
+    FAR_FROM,
+    FIRST,
+    JUDGED,
+    LARGE,
+    LARGE_CORRECTION,
+    LARGE_ERROR,
+    LARGE_SHARE,
+    MANY,
+    NOTED,
+    NU,
+    RATE,
+    RATE_NOTED,
+    RATE_TERMS,
+    RAW,
+    RAW_AT,
+    RAW_MANY,
+    REASON,
+    ROUGH_NOTED,
+    SHARE,
+    SHARE_AT,
+    SUM,
+    TERMS,
+)
+
 __all__ = ["ProjectionWarning", "Trust"]
 
-# Columns of the figures. An invariant's terms at the start, and the largest on the manifold. The number of projections;
-# the defect that the last one left; the largest that one left, in these terms, and when. The largest defect before a
-# projection, in these terms, when, and how many were FAR. Between two projections an invariant changes: the largest
-# change in local errors, when, how many were LARGE, and when the first was; the sum of the changes, that of the local
-# errors, and their number.
-START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MANY = range(9)
-NU, AT, MANY, FIRST, SUM, EXPECTED, JUDGED = range(9, 16)
-# The largest rate of change along the flow, in its own terms; the largest of these terms; the largest rate when a step
-# was kept for an examination last. In the first row only: the largest local error of a block, in what the step changes
-# there, when a step was kept for that reason last. The share of its terms from which on a defect before a projection is
-# FAR.
-RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM = range(16, 21)
-# A flag for a gradient that is computed from values, which is not accurate near kinks; the largest rate of change along
-# the flow that examinations found by short differences, in its own terms.
-BY_VALUES, EXAMINED = range(21, 23)
-N_FIGURES = 23
-# A step that is to be examined: the reason, its two times, and behind these its two states.
-REASON, SUSPECT_FROM, SUSPECT_TO, N_SUSPECT = range(4)
-NOTHING, LARGE_CORRECTION, LARGE_ERROR, CHANGES_ALONG_FLOW = range(4)
-
-# Changes of LARGE local errors are noted, and defects of FAR and LARGE_SHARE of the terms before and after projections.
 # At loose tolerances steps may miss more: FAR is FAR_IN_TOLERANCES relative tolerances then, up to MOST_FAR.
-LARGE, FAR, LARGE_SHARE = 50.0, 0.03, 1e-2
 FAR_IN_TOLERANCES, MOST_FAR = 7.5, 0.075
 # What no healthy run shows (docs/explanation/trust.md has the figures). One change of so many local errors (the
 # estimates of pairs of methods vanish by chance, which makes thousands), LARGE ones in such a share of the projections,

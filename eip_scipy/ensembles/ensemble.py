@@ -29,7 +29,7 @@ from ..core.options import ProjectionDetails, ProjectionOptions
 from ..core.pointers import PointerFunction
 from ..core.problem import Problem, component_names
 from ..core.solvers import EIPRK4, EIPSolver
-from ..engine.counters import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
+from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
 from ..run.events import Events
 from ..run.interrupts import ended_by_sigterm, kept_ctrl_c
@@ -725,6 +725,8 @@ def _first_that_starts(
         tried = dataclasses.replace(task, request=request)
         try:
             ready = tried.prepared(tried.request.y0, own, check_start=True)
+        except MemoryError:
+            raise
         except Exception as error:
             first = first or error
         else:

@@ -21,8 +21,7 @@ from ..core import setup
 from ..core.jitted import NotCompilableError
 from ..core.stepping import UNBOUNDED, saved_steps
 from ..engine import data
-from ..engine.counters import N_COUNTERS, NFEV
-from ..engine.data import DOUBTFUL, OK, PAUSE, Schedule
+from ..engine.data import DOUBTFUL, N_COUNTERS, NFEV, OK, PAUSE, Schedule
 from ..engine.trust import Trust, sick, suspects
 from ..run.driver import Driver, saved_rows
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop

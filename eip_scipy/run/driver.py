@@ -15,7 +15,7 @@ from ..core.jitted import ChangedShapeError
 from ..core.native_functions import raise_again
 from ..core.setup import Run
 from ..core.stepping import UNBOUNDED, AnyMethod
-from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Members, Schedule
+from ..engine.data import NOTHING, PENDING, REASON, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
 from ..engine.trust import NOTHING, REASON
 from .events import Events

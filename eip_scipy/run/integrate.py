@@ -23,8 +23,7 @@ from ..core.problem import Problem
 from ..core.results import Diagnostics
 from ..core.solvers import EIPSolver
 from ..core.stepping import UNBOUNDED
-from ..engine.counters import NFEV, NJEV, NLU
-from ..engine.data import ENDED, FULL, OK, PAUSE, ROW, STEP, TIME, Schedule
+from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, OK, PAUSE, ROW, STEP, TIME, Schedule
 from ..engine.native import PythonFunctions
 from ..engine.trust import ProjectionWarning
 from . import resume as _resume

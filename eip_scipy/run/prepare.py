@@ -27,8 +27,7 @@ from ..core.results import Diagnostics
 from ..core.setup import Counted, Run, Start
 from ..core.solvers import EIPSolver, eip_method
 from ..core.stepping import ATOL, AnyMethod, StepOptions, Stepping, interval
-from ..engine.counters import NFEV
-from ..engine.data import Schedule, Span
+from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
 from ..methods.multistep import GaussJackson
 from ..methods.nystrom import NystromTableau

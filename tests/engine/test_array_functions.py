@@ -79,7 +79,7 @@ def test_what_is_no_such_array_is_refused(name):
         wrong += [np.zeros(3)] if kind in "zw" else [good[k].astype(complex)]
         wrong += [frozen] if kind in "zn" else []
         for array in wrong:
-            with pytest.raises((TypeError, ValueError), match=f"{name.partition('.')[2]}: argument {k + 1} is"):
+            with pytest.raises(TypeError, match=rf"{name.partition('.')[2]}\(\): incompatible function arguments"):
                 function(*good[:k], array, *good[k + 1 :])
 
 
@@ -95,9 +95,9 @@ def test_arrays_of_different_lengths_are_refused(name):
 
 def test_arguments_are_counted_and_numbers_are_numbers():
     multiply, turn = BUILD.condensates.multiply, BUILD.condensates.turn
-    with pytest.raises(TypeError, match="multiply takes 2 arguments, got 1"):
+    with pytest.raises(TypeError, match=r"multiply\(field.*, factor.*\) -> None"):
         multiply(np.zeros(3, complex))
-    with pytest.raises(TypeError, match="real number"):
+    with pytest.raises(TypeError, match="factor: float"):
         turn(np.zeros(3, complex), "1", np.zeros(3, complex))
 
 

@@ -262,7 +262,7 @@ def test_no_member_leaves_a_trace(options):
     before = run_members(plan, y0s, none)
     with plan.driver() as driver:
         run, work = driver.loop.driver, driver.loop.driver.run.work
-        for buffer in [*(a for a in work if isinstance(a, np.ndarray)), *work.inner, run.state, run.new]:
+        for buffer in [*work.arrays().values(), run.state, run.new]:
             buffer.reshape(-1).view(np.int64)[:] = np.array(np.nan).view(np.int64)
     after = run_members(plan, y0s[::-1].copy(), none)
     for name in ("y", "t", "status", "max_defect", "counters", "max_correction"):

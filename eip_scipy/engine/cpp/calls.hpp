@@ -18,6 +18,6 @@ class [[maybe_unused]] FloatingPoint {
 };
 
 // The Python error of a call that was `Broken`, but where one is set already.
-void raise_broken(const System &system);
+[[noreturn]] void raise_broken(const System &system);
 
 }  // namespace eip

@@ -1,5 +1,7 @@
 // Gradients of functions in Python by complex steps: Im I(y + i h e_k) / h, which loses no digit to a difference.
-#include "functions.hpp"
+#include "module.hpp"
+
+#include <nanobind/stl/optional.h>
 
 #include <cmath>
 #include <vector>
@@ -14,15 +16,10 @@ namespace {
 constexpr double ONE_SIDED = 1e-8, TWO_SIDED[] = {1e-5, 1e-7};
 constexpr double AGREEMENT = 1e-6, ROUNDINGS = 8.0, EPS = 2.220446049250313e-16;
 
-PyArrayObject *array_of(const Ref &object) { return reinterpret_cast<PyArrayObject *>(object.get()); }
-const double *floats_of(PyObject *array) {
-    return static_cast<const double *>(PyArray_DATA(reinterpret_cast<PyArrayObject *>(array)));
-}
-
 // y with a small imaginary part in component k: a new array each time, since the function may keep what it was given.
-Ref shifted(const double *y, npy_intp n, npy_intp k, double step) {
-    Ref array(PyArray_SimpleNew(1, &n, NPY_CDOUBLE));
-    auto *z = static_cast<double *>(PyArray_DATA(array_of(array)));
+Array shifted(const double *y, npy_intp n, npy_intp k, double step) {
+    Array array = new_array({n}, NPY_CDOUBLE);
+    double *z = array.floats();
     for (npy_intp j = 0; j < n; ++j) {
         z[2 * j] = y[j];
         z[2 * j + 1] = 0.0;
@@ -38,15 +35,15 @@ class Columns {
 
     void take(PyObject *value, npy_intp k) {
         // The real part is taken from the first column.
-        if (k > 0 && PyComplex_Check(value) && PyArray_NDIM(array_of(gradient_)) == 1) {
+        if (k > 0 && PyComplex_Check(value) && PyArray_NDIM(gradient_.get()) == 1) {
             out_[k] = PyComplex_ImagAsDouble(value) / step_;
             return;
         }
-        const Ref numbers = as_complex(value);
-        PyArrayObject *found = array_of(numbers);
+        const Array numbers = as_complex(value);
+        PyArrayObject *found = numbers.get();
         if (k == 0) make(found);
         require_shape(found);
-        const auto *pairs = static_cast<const double *>(PyArray_DATA(found));
+        const double *pairs = numbers.floats();
         for (npy_intp i = 0; i < PyArray_SIZE(found); ++i) out_[i * n_ + k] = pairs[2 * i + 1] / step_;
         if (k > 0) return;
         values_.resize(PyArray_SIZE(found));
@@ -56,39 +53,35 @@ class Columns {
     const double *row(size_t i) const { return out_ + i * n_; }
     const std::vector<double> &values() const { return values_; }
 
-    PyObject *release() { return gradient_.release(); }
+    const Array &gradient() const { return gradient_; }
 
   private:
-    static Ref as_complex(PyObject *value) {
-        const Ref array(PyArray_FROM_O(value));
-        const int type = PyArray_TYPE(array_of(array));
-        if (!PyTypeNum_ISNUMBER(type) && !PyTypeNum_ISBOOL(type)) {
-            PyErr_Format(PyExc_TypeError, "the function returned %.80R, expected numbers", value);
-            throw PythonError{};
-        }
-        return Ref(PyArray_FROM_OTF(array.get(), NPY_CDOUBLE, NPY_ARRAY_IN_ARRAY | NPY_ARRAY_FORCECAST));
+    static Array as_complex(PyObject *value) {
+        const Array array = owned<Array>(PyArray_FROM_O(value));
+        const int type = PyArray_TYPE(array.get());
+        if (!PyTypeNum_ISNUMBER(type) && !PyTypeNum_ISBOOL(type))
+            refuse(PyExc_TypeError, "the function returned %.80R, expected numbers", value);
+        return owned<Array>(PyArray_FROM_OTF(array.ptr(), NPY_CDOUBLE, NPY_ARRAY_IN_ARRAY | NPY_ARRAY_FORCECAST));
     }
 
     void make(PyArrayObject *value) {
         std::vector<npy_intp> shape(PyArray_DIMS(value), PyArray_DIMS(value) + PyArray_NDIM(value));
         shape.push_back(n_);
-        gradient_ = Ref(PyArray_SimpleNew(static_cast<int>(shape.size()), shape.data(), NPY_DOUBLE));
-        out_ = static_cast<double *>(PyArray_DATA(array_of(gradient_)));
+        gradient_ = owned<Array>(PyArray_SimpleNew(static_cast<int>(shape.size()), shape.data(), NPY_DOUBLE));
+        out_ = gradient_.floats();
     }
 
     void require_shape(PyArrayObject *value) const {
         const int axes = PyArray_NDIM(value);
-        PyArrayObject *gradient = array_of(gradient_);
-        if (axes + 1 == PyArray_NDIM(gradient) &&
-            PyArray_CompareLists(PyArray_DIMS(value), PyArray_DIMS(gradient), axes))
-            return;
-        PyErr_SetString(PyExc_ValueError, "the function's values differ in shape");
-        throw PythonError{};
+        PyArrayObject *gradient = gradient_.get();
+        require(axes + 1 == PyArray_NDIM(gradient) &&
+                    PyArray_CompareLists(PyArray_DIMS(value), PyArray_DIMS(gradient), axes),
+                "the function's values differ in shape");
     }
 
     npy_intp n_;
     double step_;
-    Ref gradient_;
+    Array gradient_;
     std::vector<double> values_;
     double *out_ = nullptr;
 };
@@ -96,31 +89,28 @@ class Columns {
 // A function in Python of t, the state and further arguments.
 class Function {
   public:
-    Function(PyObject *fun, PyObject *t, PyObject *args) : fun_(fun), arguments_(3 + PyTuple_GET_SIZE(args)) {
-        arguments_[1] = t;  // after the place that a vectorcall may write to
-        for (Py_ssize_t k = 0; k < PyTuple_GET_SIZE(args); ++k) arguments_[3 + k] = PyTuple_GET_ITEM(args, k);
+    Function(nb::handle fun, nb::handle t, const nb::tuple &args) : fun_(fun), arguments_(3 + nb::len(args)) {
+        arguments_[1] = t.ptr();  // after the place that a vectorcall may write to
+        for (size_t k = 0; k < nb::len(args); ++k) arguments_[3 + k] = args[k].ptr();
     }
 
-    Ref operator()(const Ref &state) {
-        arguments_[2] = state.get();
+    nb::object operator()(const Array &state) {
+        arguments_[2] = state.ptr();
         const size_t count = (arguments_.size() - 1) | PY_VECTORCALL_ARGUMENTS_OFFSET;
-        return Ref(PyObject_Vectorcall(fun_, arguments_.data() + 1, count, nullptr));
+        return owned(PyObject_Vectorcall(fun_.ptr(), arguments_.data() + 1, count, nullptr));
     }
 
   private:
-    PyObject *fun_;
+    nb::handle fun_;
     std::vector<PyObject *> arguments_;
 };
 
 // The function's values at y + step * way, (l,).
 std::vector<double> values_at(Function &function, const double *y, const std::vector<double> &way, double step) {
-    npy_intp n = static_cast<npy_intp>(way.size());
-    const Ref state(PyArray_SimpleNew(1, &n, NPY_DOUBLE));
-    auto *moved = static_cast<double *>(PyArray_DATA(array_of(state)));
-    for (npy_intp k = 0; k < n; ++k) moved[k] = y[k] + step * way[k];
-    const Ref found(PyArray_FROM_OTF(function(state).get(), NPY_DOUBLE, NPY_ARRAY_IN_ARRAY));
-    const double *first = floats_of(found.get());
-    return {first, first + PyArray_SIZE(array_of(found))};
+    const Array state = new_array({static_cast<npy_intp>(way.size())});
+    for (size_t k = 0; k < way.size(); ++k) state.floats()[k] = y[k] + step * way[k];
+    const Array found = owned<Array>(PyArray_FROM_OTF(function(state).ptr(), NPY_DOUBLE, NPY_ARRAY_IN_ARRAY));
+    return {found.floats(), found.floats() + found.size()};
 }
 
 // Whether the gradient's product with `way` is (above - below) / distance.
@@ -152,64 +142,43 @@ bool agrees(Function &function, const Columns &columns, const double *y, npy_int
     return false;
 }
 
-Columns columns_of(Function &function, PyObject *y, double step) {
-    const npy_intp n = PyArray_SIZE(reinterpret_cast<PyArrayObject *>(y));
+using State = ArrayOf<const double, 1>;
+
+Columns columns_of(Function &function, const State &y, double step) {
+    const npy_intp n = y.shape[0];
+    require(n > 0, "complex_step: expected a state of one number or more");
     Columns columns(n, step);
-    for (npy_intp k = 0; k < n; ++k) columns.take(function(shifted(floats_of(y), n, k, step)).get(), k);
+    for (npy_intp k = 0; k < n; ++k) columns.take(function(shifted(y.data, n, k, step)).ptr(), k);
     return columns;
 }
 
-bool is_state(PyObject *y) {
-    return is_plain(y, NPY_DOUBLE, {ANY}) && PyArray_SIZE(reinterpret_cast<PyArrayObject *>(y)) > 0;
+Array complex_step(nb::handle fun, nb::handle t, State y, const nb::tuple &args, double step) {
+    Function function(fun, t, args);
+    return columns_of(function, y, step).gradient();
 }
 
-double number(PyObject *value) {
-    const double found = PyFloat_AsDouble(value);
-    if (found == -1.0 && PyErr_Occurred()) throw PythonError{};
-    return found;
-}
-
-PyObject *complex_step(PyObject *, PyObject *const *arguments, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        if (count != 5 || !is_state(arguments[2]) || !PyTuple_Check(arguments[3])) {
-            PyErr_SetString(PyExc_TypeError, "complex_step: expected fun, t, y (n,) of float64 with n > 0, args, step");
-            throw PythonError{};
-        }
-        Function function(arguments[0], arguments[1], arguments[3]);
-        return columns_of(function, arguments[2], number(arguments[4])).release();
-    });
-}
-
-PyObject *checked_complex_step(PyObject *, PyObject *const *arguments, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        const bool right = count == 7 && is_state(arguments[2]) && PyTuple_Check(arguments[3]);
-        const npy_intp n = right ? PyArray_SIZE(reinterpret_cast<PyArrayObject *>(arguments[2])) : 0;
-        if (!right || !is_plain(arguments[5], NPY_DOUBLE, {n}) || !is_plain(arguments[6], NPY_DOUBLE, {n})) {
-            PyErr_SetString(
-                PyExc_TypeError,
-                "checked_complex_step: expected fun, t, y (n,) of float64 with n > 0, args, step, direction "
-                "(n,), floors (n,)");
-            throw PythonError{};
-        }
-        Function function(arguments[0], arguments[1], arguments[3]);
-        Columns columns = columns_of(function, arguments[2], number(arguments[4]));
-        if (!agrees(function, columns, floats_of(arguments[2]), n, floats_of(arguments[5]), floats_of(arguments[6])))
-            Py_RETURN_NONE;
-        return columns.release();
-    });
+std::optional<Array> checked_complex_step(nb::handle fun, nb::handle t, State y, const nb::tuple &args, double step,
+                                          State direction, State floors) {
+    const npy_intp n = y.shape[0];
+    require(direction.shape[0] == n && floors.shape[0] == n,
+            "checked_complex_step: expected y, direction and floors of one length");
+    Function function(fun, t, args);
+    const Columns columns = columns_of(function, y, step);
+    if (!agrees(function, columns, y.data, n, direction.data, floors.data)) return {};
+    return columns.gradient();
 }
 
 }  // namespace
 
-PyMethodDef gradient_functions[] = {
-    {"complex_step", reinterpret_cast<PyCFunction>(complex_step), METH_FASTCALL,
-     "complex_step(fun, t, y, args, step)\n\nThe gradient of ``fun(t, y, *args)`` along the components of y (n,): "
-     "(..., n), the imaginary parts over the step."},
-    {"checked_complex_step", reinterpret_cast<PyCFunction>(checked_complex_step), METH_FASTCALL,
-     "checked_complex_step(fun, t, y, args, step, direction, floors)\n\nThe same, or None where it disagrees with a "
-     "difference of ``fun`` along ``direction * (abs(y) + floors)``, as that of a function does which is not "
-     "analytic."},
-    {nullptr, nullptr, 0, nullptr},
-};
+void add_gradients(nb::module_ module) {
+    module.def(
+        "complex_step", complex_step, "fun"_a, "t"_a, "y"_a, "args"_a, "step"_a,
+        "Return the gradient (..., n) of ``fun(t, y, *args)`` along the components of y (n,): the imaginary parts "
+        "over the step.");
+    module.def("checked_complex_step", checked_complex_step, "fun"_a, "t"_a, "y"_a, "args"_a, "step"_a, "direction"_a,
+               "floors"_a,
+               "Return the same, or None where it disagrees with a difference of ``fun`` along ``direction * (abs(y) + "
+               "floors)``, as that of a function does which is not analytic.");
+}
 
 }  // namespace eip

@@ -3,88 +3,70 @@
 #pragma once
 
 #include <cstdint>
+#include <initializer_list>
 #include <limits>
 
 namespace eip {
 
-// Codes of a step; the last four are the loops'.
-enum Code : int {
-    OK = 0,
-    NOT_FINITE = 1,
-    FAILED_PROJECTION = 2,
-    TOO_SMALL = 3,
-    POSTPONED = 4,
-    UNSTABLE = 5,
-    PAUSE = 10,
-    FULL = 11,
-    ENDED = 12,
-    DOUBTFUL = 13
-};
+// An enumeration, with the text of its names, by which Python gets them (module.cpp).
+#define EIP_ENUM(NAME, ...)          \
+    enum NAME : int { __VA_ARGS__ }; \
+    constexpr const char *NAME##_NAMES = #__VA_ARGS__
 
-enum Direction : int { NEW, OLD, MIDPOINT };
-enum Metric : int { EUCLIDEAN, ERROR, GIVEN };
+// Codes of a step; from PAUSE on those of the loops.
+EIP_ENUM(Code, OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED, UNSTABLE, PAUSE = 10, FULL, ENDED, DOUBTFUL);
+
+EIP_ENUM(Direction, NEW, OLD, MIDPOINT);
+EIP_ENUM(Metric, EUCLIDEAN, ERROR, GIVEN);
 constexpr int64_t AUTO = 0;  // the option `every`
 
-// Places in the counters (counters.py), in the clock and in the place of a run.
-enum Counter : int {
-    NFEV,
-    NJEV,
-    NLU,
-    PROJECTIONS,
-    SKIPPED,
-    RANK_REDUCED,
-    REJECTED,
-    LAST_RANK,
-    HAVE_F,
-    SOFTENED,
-    HAVE_ERROR,
-    BEGUN,
-    WAITED,
-    FOUND,
-    F_AT_RAW,
-    N_COUNTERS
-};
-enum Clock : int { TIME, TIME_NEW, LENGTH, NEXT_LENGTH };
-enum Place : int { STEP, ROW, PENDING };
-// And of a multistep method's history: whether there is one, the newest node and its row, nodes since the last projection,
-// and estimates collected.
-enum Node : int { HAVE_NODES, NEWEST, NEWEST_ROW, SINCE, SEEN, N_NODE_PLACES };
+// Places of the numbers that the step counts and leaves for the next one. From HAVE_ERROR on: whether an estimate of the
+// step's error is available, projections begun without one, steps since the last projection, what stood out in them, and
+// whether the last row of K holds f at the raw result.
+EIP_ENUM(Counter, NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, SOFTENED,
+         HAVE_ERROR, BEGUN, WAITED, FOUND, F_AT_RAW, N_COUNTERS);
+// Places in the clock of a run: the current time, the time and length of the step tried last, the length to try next.
+EIP_ENUM(Clock, TIME, TIME_NEW, LENGTH, NEXT_LENGTH);
+EIP_ENUM(Place, STEP, ROW, PENDING);
+// Places in that of a multistep method's history: whether there is one, the newest node and its row, nodes since the last
+// projection, and estimates collected.
+EIP_ENUM(Node, HAVE_NODES, NEWEST, NEWEST_ROW, SINCE, SEEN, N_NODE_PLACES);
+EIP_ENUM(Interpolant, CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY, NYSTROM);
 
-// Columns of the figures of a run's projections (trust.py says what they mean).
-enum Figure : int {
-    START,
-    TERMS,
-    NOTED,
-    LEFT,
-    SHARE,
-    SHARE_AT,
-    RAW,
-    RAW_AT,
-    RAW_MANY,
-    NU,
-    AT,
-    MANY,
-    FIRST,
-    SUM,
-    EXPECTED,
-    JUDGED,
-    RATE,
-    RATE_TERMS,
-    RATE_NOTED,
-    ROUGH_NOTED,
-    FAR_FROM,
-    BY_VALUES,
-    EXAMINED,
-    N_FIGURES
-};
+// Columns of the figures of a run's projections. An invariant's terms at the start, and the largest on the manifold. The
+// number of projections; the defect that the last one left; the largest that one left, in these terms, and when. The
+// largest defect before a projection, in these terms, when, and how many were FAR. Between two projections an invariant
+// changes: the largest change in local errors, when, how many were LARGE, and when the first was; the sum of the changes,
+// that of the local errors, and their number. The largest rate of change along the flow, in its own terms; the largest of
+// these terms; the largest rate when a step was kept for an examination last. In the first row only: the largest local
+// error of a block, in what the step changes there, when a step was kept for that reason last. The share of its terms from
+// which on a defect before a projection is FAR. A flag for a gradient that is computed from values, which is not accurate
+// near kinks; the largest rate of change along the flow that examinations found by short differences, in its own terms.
+EIP_ENUM(Figure, START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MANY, NU, AT, MANY, FIRST, SUM, EXPECTED,
+         JUDGED, RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM, BY_VALUES, EXAMINED, N_FIGURES);
 
 // The step that is to be examined: why, its two times, and behind these its two states (`suspect` in trust.hpp).
-enum SuspectPlace : int { REASON, SUSPECT_FROM, SUSPECT_TO, N_SUSPECT };
-enum Reason : int { NOTHING, LARGE_CORRECTION, LARGE_ERROR, CHANGES_ALONG_FLOW };
+EIP_ENUM(SuspectPlace, REASON, SUSPECT_FROM, SUSPECT_TO, N_SUSPECT);
+EIP_ENUM(Reason, NOTHING, LARGE_CORRECTION, LARGE_ERROR, CHANGES_ALONG_FLOW);
 
+// Changes of LARGE local errors are noted, and defects of FAR and LARGE_SHARE of the terms before and after projections.
+constexpr double LARGE = 50.0, FAR = 0.03, LARGE_SHARE = 1e-2;
 constexpr double EPS = 2.220446049250313e-16;
 constexpr double INFINITE = std::numeric_limits<double>::infinity();
 constexpr double NOT_A_NUMBER = std::numeric_limits<double>::quiet_NaN();
+
+// The records below come from Python, where they are named tuples. `fields` lists a record's fields once, in their order:
+// `visit` gets each one's name, its place here and, of an array, the lengths of its axes. A length that is `Bound` is that of
+// the array; all others must fit. `visit.sizes` are those of the run; what is derived from the fields is set at the end.
+// records.cpp makes the named tuples by these functions, and reads them.
+struct Bound {
+    int64_t &length;
+};
+
+struct Sizes {
+    int64_t n = 0, m = 0, l = 0, blocks = 0, events = 0, params = 0, rows = 0;
+    bool tableau = true;  // whether a method has one
+};
 
 // Where a run steps: t_k = t0 + k h (h = 0: adaptive steps), the last one on t_bound.
 struct Span {
@@ -99,6 +81,16 @@ struct Span {
         return stop >= n_steps ? left(k) : static_cast<double>(stop - k) * h;
     }
 };
+
+template <class Visit>
+void fields(Span &s, Visit &visit) {
+    visit("t0", s.t0);
+    visit("h", s.h);
+    visit("t_bound", s.t_bound);
+    visit("sign", s.sign);
+    visit("n_steps", s.n_steps);
+    visit("max_step", s.max_step);
+}
 
 // What a multistep method knows of a run besides the state (multistep.hpp); weights go from the oldest node to the newest.
 struct Multistep {
@@ -117,37 +109,109 @@ struct Multistep {
     int64_t *place;
 };
 
+template <class Visit>
+void fields(Multistep &ms, Visit &visit) {
+    visit("predict_q", ms.predict_q, Bound{ms.order});
+    visit("predict_v", ms.predict_v, ms.order);
+    visit("states_q", ms.states_q, ms.order, ms.order);
+    visit("states_v", ms.states_v, ms.order, ms.order);
+    visit("correction", ms.correction, ms.order + 1);
+    visit("shape_q", ms.shape_q, ms.order + 1);
+    visit("shape_v", ms.shape_v, ms.order + 1);
+    visit("size", ms.size, ms.order + 1);
+    visit("error_constant", ms.error_constant);
+    visit("growth", ms.growth);
+    visit("middle", ms.middle);
+    visit("brief", ms.brief);
+    visit("level", ms.level);
+    visit("uses_v", ms.uses_v);
+    visit("t0", ms.t0);
+    visit("h", ms.h);
+    visit("substeps", ms.substeps);
+    visit("spacing", ms.spacing);
+    visit("corrected_first", ms.first);
+    visit("corrected_count", ms.count);
+    visit("nodes", ms.nodes, Bound{ms.rows}, Bound{ms.pitch});
+    visit("sums", ms.sums, 4, ms.pitch);
+    visit("predicted", ms.predicted, 3, ms.pitch);
+    visit("change", ms.change, visit.sizes.m / 2);
+    visit("levels", ms.levels, 3, visit.sizes.l);
+    visit("place", ms.place, N_NODE_PLACES);
+    ms.half = visit.sizes.m / 2;
+}
+
 // A tableau; rows of A are `columns` long. e weighs the rows of K in the error estimate, e_low in DOP853's second one;
 // names ending in _v are a Nystrom method's weights of the velocity.
 struct Method {
     int64_t stages, columns;
     const double *A, *b, *b_low, *b_v, *b_v_low, *c, *e, *e_v, *e_low;
-    int64_t n_e, n_e_v;
+    int64_t n_e, n_e_v, n_e_low;
     bool nystrom, fsal, paired;
     double exponent;
     const Multistep *multistep;  // whose first states the tableau makes, else null
 };
 
+// A one-step method of a user's own has no tableau.
+template <class Visit>
+void fields(Method &m, Visit &visit) {
+    visit("b", m.b, Bound{m.stages});
+    visit("c", m.c, m.stages);
+    visit("exponent", m.exponent);
+    if (!visit.sizes.tableau) return;
+    visit("A", m.A, m.stages, Bound{m.columns});
+    visit("b_low", m.b_low, m.stages);
+    visit("b_v", m.b_v, m.stages);
+    visit("b_v_low", m.b_v_low, m.stages);
+    visit("e", m.e, Bound{m.n_e});
+    visit("e_v", m.e_v, Bound{m.n_e_v});
+    visit("e_low", m.e_low, Bound{m.n_e_low});
+    visit("nystrom", m.nystrom);
+    visit("fsal", m.fsal);
+    visit("paired", m.paired);
+    visit.in_python("multistep", "Multistep | None", true);
+}
+
 // Blocks of floats: member[start[b]] to member[start[b + 1]]. `size` is that of consecutive blocks alike, else 0.
 struct Blocks {
     const uint64_t *member, *start;
-    int64_t count, width, size;
+    int64_t members, starts, count, width, size;
 };
+
+template <class Visit>
+void fields(Blocks &b, Visit &visit) {
+    visit("member", b.member, Bound{b.members});
+    visit("start", b.start, Bound{b.starts});
+    visit("width", b.width);
+    visit("size", b.size);
+    b.count = b.starts - 1;
+}
 
 // Linear invariants that corrections must not touch: non-zeros of C and, after them, of M^T, M = S (C S)^-1. Where x, y
 // and z of bodies have rows alike, `bodies` (2, groups, count) holds their weights instead.
 struct Frame {
     const uint64_t *start, *place;
     const double *value;
-    int64_t rows;
+    int64_t starts, rows, values;
+    double *products;  // scratch
     const double *bodies;
     int64_t groups, count;
 };
+
+template <class Visit>
+void fields(Frame &f, Visit &visit) {
+    visit("start", f.start, 2, Bound{f.starts});
+    visit("place", f.place, Bound{f.values});
+    visit("value", f.value, f.values);
+    f.rows = f.starts - 1;
+    visit("products", f.products, f.rows);
+    visit("bodies", f.bodies, 2, Bound{f.groups}, Bound{f.count});
+}
 
 struct Options {
     const double *rtol, *atol, *block_atol;  // by float, by component, by block
     Blocks blocks;
     Frame frame;
+    double *target;
     const double *scales, *computed;  // computed: 1 for invariants without a gradient of the user's
     const double *most_left;          // the share of its terms that a Newton step may leave without a further one
     bool has_limits;                  // whether any of these is finite
@@ -160,22 +224,33 @@ struct Options {
     double far;       // defects before a projection are noted from this share of the terms on
 };
 
-// Its numbers and flags, for whoever reads them by their names.
-template <class Read>
-inline void read_each(Options &o, Read read) {
-    read("kappa", o.kappa);
-    read("metric", o.metric);
-    read("direction", o.direction);
-    read("iterations", o.iterations);
-    read("every", o.every);
-    read("reuse_f", o.reuse_f);
-    read("uses_f", o.uses_f);
-    read("compensated", o.compensated);
-    read("adaptive", o.adaptive);
-    read("watched", o.watched);
-    read("per_band", o.per_band);
-    read("limit", o.limit);
-    read("far", o.far);
+template <class Visit>
+void fields(Options &o, Visit &visit) {
+    const Sizes &is = visit.sizes;
+    visit("rtol", o.rtol, is.m);
+    visit("atol", o.atol, is.n);
+    visit("block_atol", o.block_atol, is.blocks);
+    visit.record("groups", "Grouping", o.blocks);
+    visit.record("frame", "FrameRows", o.frame);
+    visit("target", o.target, is.l);
+    visit("scales", o.scales, is.l);
+    visit("computed", o.computed, is.l);
+    visit("most_left", o.most_left, is.l);
+    visit.record("kinds", "Grouping", o.kinds);
+    visit("kappa", o.kappa);
+    visit("metric", o.metric);
+    visit("direction", o.direction);
+    visit("iterations", o.iterations);
+    visit("every", o.every);
+    visit("reuse_f", o.reuse_f);
+    visit("uses_f", o.uses_f);
+    visit("compensated", o.compensated);
+    visit("adaptive", o.adaptive);
+    visit("per_band", o.per_band);
+    visit.by_default("watched", o.watched, false);
+    visit.by_default("limit", o.limit, INFINITE);
+    visit.by_default("far", o.far, FAR);
+    visit.in_python("joint", "typing.Any", true);
 }
 
 // Scratch of the small Newton systems.
@@ -203,6 +278,53 @@ struct WorkOf {
     Value *gradient(int64_t i) const { return G + i * m; }
     Value *figures(int64_t i) const { return trust + i * N_FIGURES; }
 };
+
+// All buffers of a run, by name and shape, for whoever makes them or hands them out. Those of a state's type hold w.n of its
+// numbers to a row.
+template <class V, class Visit>
+void each_buffer(WorkOf<V> &w, int64_t blocks, Visit &visit) {
+    const int64_t n = w.n, l = w.l, m = w.m;
+    visit.states("K", w.K, {w.stages + 1, n});
+    visit.states("stage", w.stage, {n});
+    visit.states("y_hat", w.y_hat, {n});
+    visit.states("f_point", w.f_point, {n});
+    visit.states("G", w.G, {l, n});
+    visit("err", w.err, {m});
+    visit("err_low", w.err_low, {m});
+    visit("err_sum", w.err_sum, {m});
+    visit("sigma", w.sigma, {m});
+    visit("move", w.move, {m});
+    visit("carry", w.carry, {m});
+    visit("carry_hat", w.carry_hat, {m});
+    visit("scale", w.scale, {blocks});
+    visit("ratio", w.ratio, {blocks});
+    visit("memory", w.memory, {blocks});
+    visit("memory_new", w.memory_new, {blocks});
+    visit("B", w.B, {l, m});
+    visit("Q", w.Q, {l, m});
+    visit("R", w.R, {l, l});
+    visit("inverse_norms", w.inverse_norms, {l});
+    visit("mu", w.mu, {l});
+    visit("values", w.values, {l});
+    visit("g", w.g, {l});
+    visit("band", w.band, {l});
+    visit("before", w.before, {l});
+    visit("worth", w.worth, {l});
+    visit("defect", w.defect, {l});
+    visit("max_defect", w.max_defect, {l});
+    visit("max_correction", w.max_correction, {1});
+    visit("norm", w.norm, {1});
+    visit("trust", w.trust, {l, N_FIGURES});
+    visit("suspect", w.suspect, {w.suspect_size()});
+    visit("pivots", w.pivots, {l});
+    visit("counters", w.counters, {N_COUNTERS});
+    visit("inner_matrix", w.inner.matrix, {l, l});
+    visit("inner_R", w.inner.R, {l, l});
+    visit("inner_g", w.inner.g, {l});
+    visit("inner_inverse_norms", w.inner.inverse_norms, {l});
+    visit("inner_mu", w.inner.mu, {l});
+    visit("inner_pivots", w.inner.pivots, {l});
+}
 
 using Work = WorkOf<double>;
 

@@ -8,8 +8,6 @@
 
 namespace eip {
 
-enum Interpolant : int { CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY, NYSTROM };
-
 // The most nodes of a polynomial through accelerations.
 constexpr int64_t MOST_NODES = 32;
 // The number of roundings by which a state that is handed out as it is may miss its targets.
@@ -21,7 +19,7 @@ constexpr double SMALL_SHARE = 1e-9;
 // those of a tableau's own polynomial, or of that of DOP853 or a Nystrom method, which have `further` stages, or Lagrange's
 // for the nodes of a multistep method, [interval, node, power].
 struct Dense {
-    int64_t kind, polynomials, columns, further;
+    int64_t kind, polynomials, columns, further, A_columns;
     const double *weights, *A, *c;
     bool own_slopes;  // the steps leave no f at their ends
     bool by_travel;   // weights of the projection by what each block travels within the step, else those of the run

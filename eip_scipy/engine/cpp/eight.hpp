@@ -1,6 +1,9 @@
 // Eight members of an ensemble: their buffers and counters.
 #pragma once
 
+#include <functional>
+#include <numeric>
+
 #include "octet_system.hpp"
 
 namespace eip {
@@ -38,51 +41,25 @@ struct Eight {
         work.stages = w.stages;
         const Multistep *ms = method.multistep;
         const int64_t half = ms ? ms->half : 0, nodes_kept = ms ? ms->rows : 0;
-        const std::pair<Octet **, int64_t> places[] = {{&work.K, (w.stages + 1) * n},
-                                                       {&work.G, l * n},
-                                                       {&work.Q, l * n},
-                                                       {&work.R, l * l},
-                                                       {&work.stage, n},
-                                                       {&work.y_hat, n},
-                                                       {&work.err, n},
-                                                       {&work.err_low, n},
-                                                       {&work.err_sum, n},
-                                                       {&work.sigma, n},
-                                                       {&work.move, n},
-                                                       {&work.scale, blocks},
-                                                       {&work.ratio, blocks},
-                                                       {&work.memory, blocks},
-                                                       {&work.memory_new, blocks},
-                                                       {&work.mu, l},
-                                                       {&work.values, l},
-                                                       {&work.g, l},
-                                                       {&work.band, l},
-                                                       {&work.before, l},
-                                                       {&work.worth, l},
-                                                       {&work.defect, l},
-                                                       {&work.max_defect, l},
-                                                       {&work.target, l},
-                                                       {&work.trust, l * N_FIGURES},
-                                                       {&work.products, products},
-                                                       {&work.max_correction, 1},
-                                                       {&y, n},
-                                                       {&y_new, n},
-                                                       {&projections, 1},
-                                                       {&skips, 1},
-                                                       {&reduced, 1},
-                                                       {&work.carry, n},
-                                                       {&work.carry_hat, n},
-                                                       {&work.f_point, n},
-                                                       {&levels, 3 * l},
-                                                       {&nodes, nodes_kept * half},
-                                                       {&sums, 4 * half},
-                                                       {&predicted, 3 * half},
-                                                       {&change, half}};
-        int64_t total = 0;
-        for (const auto &[place, count] : places) total += count;
-        memory.resize(total, Octet(0.0));
+        Places places;
+        each_buffer(work, blocks, places);
+        for (const auto &[place, count] :
+             std::initializer_list<std::pair<Octet **, int64_t>>{{&work.target, l},
+                                                                 {&work.products, products},
+                                                                 {&y, n},
+                                                                 {&y_new, n},
+                                                                 {&projections, 1},
+                                                                 {&skips, 1},
+                                                                 {&reduced, 1},
+                                                                 {&levels, 3 * l},
+                                                                 {&nodes, nodes_kept * half},
+                                                                 {&sums, 4 * half},
+                                                                 {&predicted, 3 * half},
+                                                                 {&change, half}})
+            places.add(*place, count);
+        memory.resize(places.total, Octet(0.0));
         Octet *next = memory.data();
-        for (const auto &[place, count] : places) {
+        for (const auto &[place, count] : places.of) {
             *place = next;
             next += count;
         }
@@ -114,6 +91,25 @@ struct Eight {
     }
 
   private:
+    // Where buffers of octets begin, and how many each holds; those of a run that are no octets are not its members'.
+    struct Places {
+        std::vector<std::pair<Octet **, int64_t>> of;
+        int64_t total = 0;
+
+        void add(Octet *&place, int64_t count) {
+            of.emplace_back(&place, count);
+            total += count;
+        }
+        void operator()(const char *, Octet *&place, std::initializer_list<int64_t> shape) {
+            add(place, std::accumulate(shape.begin(), shape.end(), int64_t{1}, std::multiplies()));
+        }
+        void states(const char *name, Octet *&place, std::initializer_list<int64_t> shape) {
+            (*this)(name, place, shape);
+        }
+        template <class Other>
+        void operator()(const char *, Other *&, std::initializer_list<int64_t>) {}
+    };
+
     Options flat_options_{};
 
     // The same buffers as those of one state of 8 n floats, as far as the raw step needs them.

@@ -50,6 +50,9 @@ struct LibraryFunction {
     }
 };
 
+// Refuses sizes that a function of the library's does not take.
+void require_sizes(const LibraryFunction &function, int64_t n, int64_t p);
+
 std::span<const LibraryFunction> kepler_functions();
 std::span<const LibraryFunction> gravity_functions();
 std::span<const LibraryFunction> force_functions();

@@ -24,6 +24,20 @@ struct Schedule {
     int64_t n_events;
 };
 
+template <class Visit>
+void fields(Schedule &s, Visit &visit) {
+    visit.record("span", "Span", s.span);
+    visit("save_every", s.save_every);
+    visit("t_eval", s.t_eval, Bound{s.n_eval});
+    visit("place", s.place, 3);
+    visit("clock", s.clock, 4);
+    visit("g", s.g, Bound{s.n_events});
+    visit("g_new", s.g_new, s.n_events);
+    visit("rate", s.rate, s.n_events);
+    visit("rate_new", s.rate_new, s.n_events);
+    visit("g_direction", s.g_direction, s.n_events);
+}
+
 struct Saved {
     double *t, *y;
     int64_t rows;
@@ -52,8 +66,35 @@ struct Samples {
     Dense dense;
     Roots roots;
     Pieces interpolants;
-    double *piece;  // scratch for the interpolant of a step
+    double *piece;    // scratch for the interpolant of a step
+    int64_t *counts;  // of the roots, the interpolants and the pending roots
 };
+
+// The dense output's buffers and the run's method are known before.
+template <class Visit>
+void fields(Samples &s, Visit &visit) {
+    Dense &d = s.dense;
+    Roots &roots = s.roots;
+    visit("kind", d.kind);
+    visit("weights", d.weights, Bound{d.polynomials}, Bound{d.columns});
+    visit("c", d.c, Bound{d.further});
+    visit("A", d.A, d.further, Bound{d.A_columns});
+    visit("own_slopes", d.own_slopes);
+    visit("by_travel", d.by_travel);
+    visit("shows", d.shows);
+    visit.in_python("options", "Options", false);
+    visit.in_python("work", "Work", false);
+    visit("missed", d.missed, 2);
+    visit("waiting", d.waiting, 2);
+    visit("piece", s.piece, d.floats());
+    visit("event", roots.event, Bound{roots.capacity});
+    visit("t", roots.t, roots.capacity);
+    visit.states("y", roots.y, roots.capacity, visit.sizes.n);
+    visit("counts", s.counts, 3);
+    visit("left", roots.left, visit.sizes.events);
+    visit("pending_event", roots.pending_event, MOST_CROSSINGS * visit.sizes.events);
+    visit("pending_t", roots.pending_t, MOST_CROSSINGS * visit.sizes.events);
+}
 
 // Says whether event i goes from the value `before` to the value `after` in the direction that it looks at.
 inline bool crosses(const Schedule &s, int64_t i, double before, double after) {

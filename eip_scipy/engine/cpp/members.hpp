@@ -17,6 +17,29 @@ struct Members {
     Saved saved(int64_t k, const Work &w) const { return {t_saved, rows + (kept ? k * n_rows * w.m : 0), n_rows}; }
 };
 
+template <class Visit>
+void fields(Members &m, Visit &visit) {
+    const Sizes &is = visit.sizes;
+    visit.states("starts", m.starts, Bound{m.count}, is.n);
+    visit("params", m.params, m.count, is.params);
+    visit("first_steps", m.first_steps, m.count);
+    visit("evaluations", m.evaluations);
+    visit("sigma", m.sigma, is.m);
+    visit("left", m.left, is.events);
+    visit("kept", m.kept);
+    visit.states("rows", m.rows, m.kept ? m.count : 1, is.rows, is.n);
+    visit.states("y", m.y, m.count, is.n);
+    visit("t", m.t, m.count);
+    visit("status", m.status, m.count);
+    visit("max_defect", m.max_defect, m.count, is.l);
+    visit("counters", m.counters, m.count, N_COUNTERS);
+    visit("max_correction", m.max_correction, m.count);
+    visit("figures", m.figures, m.count, is.l, N_FIGURES);
+    visit("suspects", m.suspects, m.count, N_SUSPECT + 2 * is.m);
+    visit("where", m.where, 2);
+    m.n_rows = is.rows;
+}
+
 // Everything as at the start of a run; false where it has none that is finite, which is then to be explained.
 inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, const Members &members, double *y) {
     const auto &w = run.work;

@@ -1,11 +1,15 @@
 // The binding: an Engine holds a run's arrays and functions, and steps.
 #define EIP_IMPORTS_NUMPY
-#include "functions.hpp"
+#include "module.hpp"
+
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <string>
+#include <string_view>
 
 #include "calls.hpp"
-#include "library_functions.hpp"
 #include "python_functions.hpp"
-#include "records.hpp"
 
 #if defined(__clang__)
 #define EIP_COMPILER __VERSION__  // begins with its name
@@ -21,15 +25,20 @@ namespace eip {
 static PyObject *failed_call_error = nullptr;
 
 void raise_broken(const System &system) {
-    if (PyErr_Occurred()) return;
+    if (PyErr_Occurred()) throw nb::python_error();
     const FailedCall &call = system.failed;
-    const auto bytes = [](const std::vector<double> &a) { return static_cast<Py_ssize_t>(a.size() * sizeof(double)); };
-    const Ref arguments(Py_BuildValue("(sLdy#y#i)", call.functions, static_cast<long long>(call.index), call.t,
-                                      call.y.data(), bytes(call.y), call.f.data(), bytes(call.f), call.status));
-    PyErr_SetObject(failed_call_error, arguments.get());
+    const auto bytes = [](const std::vector<double> &a) { return nb::bytes(a.data(), a.size() * sizeof(double)); };
+    const nb::tuple arguments =
+        nb::make_tuple(call.functions, call.index, call.t, bytes(call.y), bytes(call.f), call.status);
+    PyErr_SetObject(failed_call_error, arguments.ptr());
+    throw nb::python_error();
 }
 
 namespace {
+
+using State = StatesOf<double, 1>;
+using ConstState = StatesOf<const double, 1>;
+using Times = ArrayOf<const double, 1>;
 
 // Whether the processor takes the other build, for x86-64-v3.
 bool has_v3() {
@@ -41,605 +50,399 @@ bool has_v3() {
 #endif
 }
 
-struct Engine {
-    PyObject_HEAD
-    PyObject *kept;  // every object that the run uses
-    Data *data;
-    Schedule *schedule;
-    Samples *samples;
-    Eight *eight;
-    PythonFunctions *functions;
-    PythonHooks *hooks;
-    int type;
-    bool busy, interpolating;
-};
-
-void engine_setup(Engine *self, PyObject *method, PyObject *options, PyObject *work, PyObject *functions,
-                  PyObject *schedule, PyObject *hooks) {
-    Arrays arrays(self->kept);
-    const Ref y_hat = attribute(work, "y_hat");
-    const bool is_complex =
-        PyArray_Check(y_hat.get()) && PyArray_TYPE(reinterpret_cast<PyArrayObject *>(y_hat.get())) == NPY_CDOUBLE;
-    self->type = is_complex ? NPY_CDOUBLE : NPY_DOUBLE;
-    self->data = new Data();
-    Data &run = *self->data;
-    run.method = method_of(method, arrays);
-    run.work = work_of(work, run.method.stages, Arrays::length(work, "scale"), arrays, self->type);
-    run.options = options_of(options, run.work, arrays);
-    if (run.options.blocks.count != Arrays::length(work, "scale")) {
-        PyErr_SetString(PyExc_ValueError, "engine: work has room for another number of blocks");
-        throw PythonError{};
-    }
-    if (schedule != Py_None) self->schedule = new Schedule(schedule_of(schedule, arrays));
-    System &system = run.system;
-    const int64_t events = self->schedule ? self->schedule->n_events : 0;
-    for (PyObject *object : {method, options, work, functions, schedule, hooks})
-        if (PyList_Append(self->kept, object) < 0) throw PythonError{};
-    const bool native = truth(functions, "native");
-    const Ref python = native ? attribute(functions, "python") : Ref::borrowed(functions);
-    const bool by_python = python.get() != Py_None;
-    if (native) read_pointers(functions, run.work, by_python ? 0 : events, arrays, system);
-    if (by_python) {
-        self->functions = new PythonFunctions(python.get(), work, run.work, self->type, self->kept);
-        system.python = self->functions;
-        if (self->functions->events() != events) {
-            PyErr_SetString(PyExc_ValueError, "engine: another number of events than their values have room for");
-            throw PythonError{};
-        }
-    }
-    if (hooks != Py_None) {
-        const Run steps{run.method, run.options, run.work, run.system, nullptr};
-        self->hooks = new PythonHooks(hooks, work, steps, self->type, self->kept);
-    }
-    if (!self->hooks || !self->hooks->raw) read_tableau(method, arrays, run.method);
-    const Ref multistep = attribute(method, "multistep");
-    if (multistep.get() != Py_None) {
-        run.multistep = multistep_of(multistep.get(), run.work, arrays);
-        run.method.multistep = &run.multistep;
-        const bool jacobian = native ? system.jacobian_pointer.pointer || system.jacobian_pointer.library
-                                     : self->functions->has_jacobian();
-        if (self->hooks || !run.options.compensated || (run.multistep.count > 0 && !jacobian)) {
-            PyErr_SetString(PyExc_ValueError, "engine: the options do not fit a multistep method");
-            throw PythonError{};
-        }
-    }
-    if ((run.method.nystrom || system.second_order) && run.work.m % 2) {
-        PyErr_SetString(PyExc_ValueError, "engine: a state of positions and velocities has an even length");
-        throw PythonError{};
-    }
-}
-
 // The engine steps for one caller at a time, and interpolates for one: a function that does so with the run it belongs to
 // is refused. Hooks come back to it while it works, to project and to close the step at hand.
 class Busy {
   public:
     explicit Busy(bool &flag) : flag_(flag) {
-        if (flag) {
-            PyErr_SetString(PyExc_RuntimeError,
-                            "engine: a run cannot be stepped, nor its dense output evaluated, from its own functions");
-            throw PythonError{};
-        }
+        if (flag)
+            refuse(PyExc_RuntimeError,
+                   "engine: a run cannot be stepped, nor its dense output evaluated, from its own functions");
         flag = true;
     }
     ~Busy() { flag_ = false; }
+    Busy(const Busy &) = delete;
+    Busy &operator=(const Busy &) = delete;
 
   private:
     bool &flag_;
 };
 
-// A method's arguments: as many as `names` says, of an engine that is set up.
-void expect(Engine *self, Py_ssize_t count, Py_ssize_t expected, const char *names) {
-    if (!self->data)
-        PyErr_SetString(PyExc_RuntimeError, "engine: not set up");
-    else if (count != expected)
-        PyErr_Format(PyExc_TypeError, "engine: expected the arguments %s", names);
-    if (PyErr_Occurred()) throw PythonError{};
+template <class Array>
+void require_shape(const Array &array, const char *name, Lengths shape) {
+    if (std::equal(shape.begin(), shape.end(), array.shape)) return;
+    refuse(PyExc_ValueError, "engine: %s is an array of another shape than the run's", name);
 }
 
-// Make a step or more by `call`, which takes a Run, without the GIL if no function is Python's. An exception of the engine
-// leaves only after the GIL is taken again, since `guarded` turns it into Python's.
-template <typename Call>
-Code stepped(Engine *self, Call call) {
-    const FloatingPoint mode;
-    Data &d = *self->data;
-    PyThreadState *released = d.system.python || self->hooks ? nullptr : PyEval_SaveThread();
-    Code code = OK;
-    bool broken = false;
-    std::exception_ptr thrown;
-    try {
-        code = call(Run{d.method, d.options, d.work, d.system, self->hooks});
-    } catch (const Broken &) {
-        broken = true;
-    } catch (const PythonError &) {
-        broken = true;
-    } catch (const std::exception &) {
-        thrown = std::current_exception();
+class Engine {
+  public:
+    Engine(nb::object method, nb::object options, nb::object work, nb::object functions, nb::object schedule,
+           nb::object hooks);
+
+    int advance(int64_t k_end, State y, State y_new, ArrayOf<double, 1> t_saved, StatesOf<double, 2> y_saved,
+                std::optional<ArrayOf<double, 2>> pieces);
+    int sweep(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved);
+    int sweep_octets(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved);
+    void side_by_side(nb::object functions);
+    std::tuple<int, double, Array, Array> step(int64_t k, double t, ConstState y, ConstState f);
+    int project(double t_old, ConstState y, double t, bool last, State y_new);
+    void close(double t_new, State y_new, bool project, int status);
+    void values(Times t, StatesOf<const double, 2> y, ArrayOf<double, 2> out,
+                std::optional<ArrayOf<const double, 2>> params);
+    void start(ConstState y, ConstState f, double tau);
+    void sample(nb::object dense);
+    void describe(double t_old, ConstState y_old, double t, ConstState y, ArrayOf<double, 1> piece);
+    void interpolate(ArrayOf<double, 1> piece, Times t, StatesOf<double, 2> out);
+    void show(double t, ConstState y, State out);
+
+    // What the garbage collector asks for.
+    nb::handle kept() const { return kept_; }
+    void clear();
+
+  private:
+    // Members of an ensemble as a sweep takes them.
+    Members swept(nb::handle members, int64_t steps, const ArrayOf<double, 1> &t_saved, nb::list &kept);
+
+    template <class Array>
+    auto *checked(const Array &array, const char *name) const {
+        require(array.type == type_, "engine: a state is of another type than the run's");
+        require_shape(array, name, {data_.work.n});
+        return array.data;
     }
-    if (released) PyEval_RestoreThread(released);
-    if (thrown) std::rethrow_exception(thrown);
-    if (broken) {
-        raise_broken(d.system);
-        throw PythonError{};
+    const Schedule &schedule() const {
+        if (!schedule_) refuse(PyExc_RuntimeError, "engine: this one has no schedule");
+        return *schedule_;
     }
-    return code;
+    const Dense &dense() const {
+        if (!samples_) refuse(PyExc_RuntimeError, "engine: no dense output");
+        return samples_->dense;
+    }
+    Samples *samples() { return samples_ ? &*samples_ : nullptr; }
+    void check_room(const Saved &saved);
+
+    // Make a step or more by `call`, which takes a Run, without the GIL if no function is Python's.
+    template <class Call>
+    Code stepped(Call call) {
+        if (!kept_.is_valid()) refuse(PyExc_RuntimeError, "engine: not set up");
+        const FloatingPoint mode;
+        try {
+            std::optional<nb::gil_scoped_release> released;
+            if (!data_.system.python && !hooks_) released.emplace();
+            return call(Run{data_.method, data_.options, data_.work, data_.system, hooks_.get()});
+        } catch (const Broken &) {  // the GIL is taken again
+            raise_broken(data_.system);
+        }
+    }
+
+    nb::list kept_;  // every object that the run uses
+    Data data_{};
+    std::optional<Schedule> schedule_;
+    std::optional<Samples> samples_;
+    std::unique_ptr<Eight> eight_;
+    std::unique_ptr<PythonFunctions> functions_;
+    std::unique_ptr<PythonHooks> hooks_;
+    int type_ = NPY_DOUBLE;
+    bool busy_ = false, interpolating_ = false;
+};
+
+Engine::Engine(nb::object method, nb::object options, nb::object work, nb::object functions, nb::object schedule,
+               nb::object hooks) {
+    for (const nb::object &object : {method, options, work, functions, schedule, hooks}) kept_.append(object);
+    const Buffers &buffers = buffers_of(work);
+    type_ = buffers.type;
+    data_.work = buffers.work;
+    const bool has_tableau = hooks.is_none() || nb::object(hooks.attr("one_step")).is_none();
+    data_.method = method_of(method, has_tableau, kept_);
+    require(data_.method.stages == data_.work.stages, "engine: work has room for another number of stages");
+    data_.options = options_of(options, data_.work, buffers.blocks, kept_);
+    if (!schedule.is_none()) schedule_ = schedule_of(schedule, kept_);
+    System &system = data_.system;
+    const int64_t events = schedule_ ? schedule_->n_events : 0;
+    const bool native = truth(functions, "native");
+    const nb::object python = native ? nb::object(functions.attr("python")) : functions;
+    if (native) read_pointers(functions, data_.work, python.is_none() ? events : 0, kept_, system);
+    if (!python.is_none()) {
+        functions_ = std::make_unique<PythonFunctions>(python, buffers.owner(), data_.work, type_, kept_);
+        system.python = functions_.get();
+        require(functions_->events() == events, "engine: another number of events than their values have room for");
+    }
+    if (!hooks.is_none()) {
+        const Run steps{data_.method, data_.options, data_.work, data_.system, nullptr};
+        hooks_ = std::make_unique<PythonHooks>(hooks, buffers, steps, kept_);
+    }
+    const nb::object multistep = method.attr("multistep");
+    if (!multistep.is_none()) {
+        data_.multistep = multistep_of(multistep, data_.work, kept_);
+        data_.method.multistep = &data_.multistep;
+        const bool jacobian =
+            native ? system.jacobian_pointer.pointer || system.jacobian_pointer.library : functions_->has_jacobian();
+        require(!hooks_ && data_.options.compensated && (data_.multistep.count == 0 || jacobian),
+                "engine: the options do not fit a multistep method");
+    }
+    require(!(data_.method.nystrom || system.second_order) || data_.work.m % 2 == 0,
+            "engine: a state of positions and velocities has an even length");
 }
 
-Schedule &scheduled(Engine *self) {
-    if (!self->schedule) {
-        PyErr_SetString(PyExc_RuntimeError, "engine: this one has no schedule");
-        throw PythonError{};
-    }
-    return *self->schedule;
-}
-
-double *state_of(PyObject *object, const char *name, Engine *self, PyObject *kept, bool read_only = false) {
-    Arrays arrays(kept);
-    return static_cast<double *>(arrays.memory(object, name, self->type, {self->data->work.n}, read_only));
+void Engine::clear() {
+    eight_.reset();
+    functions_.reset();
+    hooks_.reset();
+    kept_.reset();
 }
 
 // Counts that Python may have written, before the loop goes by them.
-void check_room(const Schedule &schedule, const Saved &saved, const Samples *samples, const Multistep *multistep) {
-    const int64_t row = schedule.place[ROW];
-    bool good = row >= 0 && row <= saved.rows && schedule.n_eval < std::max<int64_t>(saved.rows, 1);
-    if (multistep) check_history(*multistep);
-    if (samples) {
-        const int64_t roots = *samples->roots.count, pieces = *samples->interpolants.count;
-        good &= roots >= 0 && pieces >= 0 && pieces <= samples->interpolants.capacity;
+void Engine::check_room(const Saved &saved) {
+    const int64_t row = schedule().place[ROW];
+    bool good = row >= 0 && row <= saved.rows && schedule().n_eval < std::max<int64_t>(saved.rows, 1);
+    if (data_.method.multistep) check_history(*data_.method.multistep);
+    if (samples_) {
+        const int64_t roots = *samples_->roots.count, pieces = *samples_->interpolants.count;
+        good &= roots >= 0 && pieces >= 0 && pieces <= samples_->interpolants.capacity;
     }
-    if (good) return;
-    PyErr_SetString(PyExc_ValueError, "engine: place or counts are outside the rows, or there are too few");
-    throw PythonError{};
+    require(good, "engine: place or counts are outside the rows, or there are too few");
 }
 
-PyDoc_STRVAR(advance_doc,
-             "advance(k_end, y, y_new, t_saved, y_saved, pieces) -> int\n\nStep on to step k_end, or to what stops the "
-             "loop. pieces (rows, floats) receives the interpolants of all steps if it has rows.");
-
-PyObject *engine_advance(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 6, "k_end, y, y_new, t_saved, y_saved, pieces");
-        const Busy busy(self->busy);
-        const Ref kept(PyList_New(0));
-        const Schedule &schedule = scheduled(self);
-        const long long k_end = PyLong_AsLongLong(args[0]);
-        if (k_end == -1 && PyErr_Occurred()) return nullptr;
-        double *y = state_of(args[1], "y", self, kept.get()), *y_new = state_of(args[2], "y_new", self, kept.get());
-        Arrays arrays(kept.get());
-        Saved saved{};
-        saved.t = static_cast<double *>(arrays.memory(args[3], "t_saved", NPY_DOUBLE, {ANY}));
-        saved.rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[3]), 0);
-        saved.y =
-            static_cast<double *>(arrays.memory(args[4], "y_saved", self->type, {saved.rows, self->data->work.n}));
-        Samples *samples = self->samples;
-        if (samples) {
-            Pieces &pieces = samples->interpolants;
-            pieces.first =
-                static_cast<double *>(arrays.memory(args[5], "pieces", NPY_DOUBLE, {ANY, samples->dense.floats()}));
-            pieces.capacity = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[5]), 0);
-        }
-        check_room(schedule, saved, samples, self->data->method.multistep);
-        if (self->hooks) self->hooks->set_state(args[2]);
-        return PyLong_FromLong(
-            stepped(self, [&](const Run &run) { return advance_run(run, samples, schedule, k_end, y, y_new, saved); }));
-    });
-}
-
-// What both sweeps take: the members, how many steps, and the states of the run.
-struct SweepArguments {
-    Members members;
-    int64_t steps;
-    double *y, *y_new;
-};
-
-SweepArguments sweep_arguments(Engine *self, PyObject *const *args, PyObject *kept) {
-    SweepArguments given{};
-    given.steps = PyLong_AsLongLong(args[1]);
-    if (given.steps == -1 && PyErr_Occurred()) throw PythonError{};
-    given.y = state_of(args[2], "y", self, kept);
-    given.y_new = state_of(args[3], "y_new", self, kept);
-    Arrays arrays(kept);
-    auto *t_saved = static_cast<double *>(arrays.memory(args[4], "t_saved", NPY_DOUBLE, {ANY}));
-    const npy_intp rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[4]), 0);
-    given.members = members_of(args[0], *self->data, scheduled(self), rows, arrays, self->type);
-    given.members.t_saved = t_saved;
-    if (given.steps < 1 || rows < 2) {
-        PyErr_SetString(PyExc_ValueError, "engine: members need a step or more, and two rows or more");
-        throw PythonError{};
+int Engine::advance(int64_t k_end, State y, State y_new, ArrayOf<double, 1> t_saved, StatesOf<double, 2> y_saved,
+                    std::optional<ArrayOf<double, 2>> pieces) {
+    const Busy busy(busy_);
+    double *from = checked(y, "y"), *to = checked(y_new, "y_new");
+    const Saved saved{t_saved.data, y_saved.data, t_saved.shape[0]};
+    require(y_saved.type == type_, "engine: y_saved is of another type than the run's states");
+    require_shape(y_saved, "y_saved", {saved.rows, data_.work.n});
+    if (samples_) {
+        require(pieces.has_value(), "engine: pieces are missing");
+        require_shape(*pieces, "pieces", {pieces->shape[0], dense().floats()});
+        samples_->interpolants.first = pieces->data;
+        samples_->interpolants.capacity = pieces->shape[0];
     }
-    return given;
+    check_room(saved);
+    if (hooks_) hooks_->set_state(y_new.object);
+    return stepped([&](const Run &run) { return advance_run(run, samples(), *schedule_, k_end, from, to, saved); });
 }
 
-PyDoc_STRVAR(
-    sweep_doc,
-    "sweep(members, steps, y, y_new, t_saved) -> int\n\nRun members of an ensemble one after the other, so many "
-    "steps in all; `members` is a record of data.py, whose `where` says how far they are.");
+Members Engine::swept(nb::handle members, int64_t steps, const ArrayOf<double, 1> &t_saved, nb::list &kept) {
+    const int64_t rows = t_saved.shape[0];
+    Members found = members_of(members, data_, schedule(), rows, type_, kept);
+    found.t_saved = t_saved.data;
+    require(steps >= 1 && rows >= 2, "engine: members need a step or more, and two rows or more");
+    return found;
+}
 
-PyObject *engine_sweep(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 5, "members, steps, y, y_new, t_saved");
-        const Busy busy(self->busy);
-        const Ref kept(PyList_New(0));
-        const Schedule &schedule = scheduled(self);
-        const auto [members, steps, y, y_new] = sweep_arguments(self, args, kept.get());
-        if (self->functions || self->hooks || (schedule.n_events > 0 && !self->samples)) {
-            PyErr_SetString(PyExc_ValueError, "engine: members are swept by native functions");
-            return nullptr;
+int Engine::sweep(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved) {
+    const Busy busy(busy_);
+    nb::list kept;
+    double *from = checked(y, "y"), *to = checked(y_new, "y_new");
+    const Members all = swept(members, steps, t_saved, kept);
+    require(!functions_ && !hooks_ && (schedule().n_events == 0 || samples_),
+            "engine: members are swept by native functions");
+    check_room(all.saved(0, data_.work));
+    if (samples_) samples_->interpolants.capacity = 0;
+    return stepped([&](const Run &run) { return sweep_members(run, samples(), *schedule_, all, steps, from, to); });
+}
+
+void Engine::side_by_side(nb::object functions) {
+    const Busy busy(busy_);
+    kept_.append(functions);
+    eight_ = std::make_unique<Eight>(data_.method, data_.options, data_.work, octet_system_of(functions, data_));
+}
+
+int Engine::sweep_octets(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved) {
+    const Busy busy(busy_);
+    nb::list kept;
+    const Schedule &s = schedule();
+    double *from = checked(y, "y"), *to = checked(y_new, "y_new");
+    const Members all = swept(members, steps, t_saved, kept);
+    const bool fixed = s.span.h != 0.0 && s.n_events == 0 && (s.n_eval == 0 || (samples_ && all.kept));
+    const int64_t saved = s.n_eval > 0 ? s.n_eval : s.save_every > 0 ? s.span.n_steps / s.save_every + 2 : 2;
+    require(eight_ && fixed && (!all.kept || all.n_rows >= saved),
+            "engine: members side by side take fixed steps, and need room for all rows");
+    if (samples_) samples_->interpolants.capacity = 0;
+    const Octets octets{*eight_, samples()};
+    return stepped([&](const Run &run) { return sweep_eights(run, octets, s, all, steps, from, to); });
+}
+
+void Engine::sample(nb::object dense) {
+    const Busy busy(busy_), interpolating(interpolating_);
+    kept_.append(dense);
+    samples_ = samples_of(dense, data_, schedule_ ? schedule_->n_events : 0, type_, kept_);
+    if (functions_) functions_->add_owner(buffers_of(dense.attr("work")).owner(), kept_);
+}
+
+void Engine::describe(double t_old, ConstState y_old, double t, ConstState y, ArrayOf<double, 1> piece) {
+    const Busy busy(busy_), interpolating(interpolating_);
+    const Dense &d = dense();
+    const double *from = checked(y_old, "y_old"), *to = checked(y, "y");
+    require_shape(piece, "piece", {d.floats()});
+    stepped([&](const Run &run) { return describe_step(run, d, t_old, from, t, to, piece.data), OK; });
+}
+
+void Engine::show(double t, ConstState y, State out) {
+    const Busy busy(busy_), interpolating(interpolating_);
+    dense();
+    const double *from = checked(y, "y");
+    double *to = checked(out, "out");
+    const int64_t end = schedule().place[PENDING] == 1;
+    stepped([&](const Run &run) { return show_state(run, *samples_, end, t, from, to), OK; });
+}
+
+void Engine::interpolate(ArrayOf<double, 1> piece, Times t, StatesOf<double, 2> out) {
+    const Busy interpolating(interpolating_);
+    const Dense &d = dense();
+    require_shape(piece, "piece", {d.floats()});
+    require(out.type == type_, "engine: out is of another type than the run's states");
+    require_shape(out, "out", {t.shape[0], d.work.n});
+    stepped([&](const Run &run) { return interpolate_step(run, d, piece.data, t.data, t.shape[0], out.data), OK; });
+}
+
+std::tuple<int, double, Array, Array> Engine::step(int64_t k, double t, ConstState y, ConstState f) {
+    const Busy busy(busy_);
+    const Work &w = data_.work;
+    const Schedule &s = schedule();
+    const double *from = checked(y, "y");
+    copy(checked(f, "f"), w.row(0), w.m);
+    s.clock[TIME] = t;
+    Array y_new = new_array({w.n}, type_), f_new = new_array({w.n}, type_);
+    if (hooks_) hooks_->set_state(y_new);
+    const Code code = stepped([&](const Run &run) { return step_once(run, s, k, from, y_new.floats()); });
+    copy(w.last(), f_new.floats(), w.m);
+    return {code, s.clock[TIME_NEW], std::move(y_new), std::move(f_new)};
+}
+
+int Engine::project(double t_old, ConstState y, double t, bool last, State y_new) {
+    const Step step{t_old, t, t - t_old, checked(y, "y"), checked(y_new, "y_new"), true, last};
+    if (hooks_) hooks_->set_state(y_new.object);
+    return stepped([&](const Run &run) { return project_once(run, step); });
+}
+
+void Engine::close(double t_new, State y_new, bool project, int status) {
+    const Step step{0.0, t_new, 0.0, nullptr, checked(y_new, "y_new"), project, false};
+    stepped([&](const Run &run) { return close_once(run, step, static_cast<Code>(status)), OK; });
+}
+
+void Engine::values(Times t, StatesOf<const double, 2> y, ArrayOf<double, 2> out,
+                    std::optional<ArrayOf<const double, 2>> params) {
+    const Busy busy(busy_);
+    const Work &w = data_.work;
+    const System &system = data_.system;
+    const npy_intp rows = t.shape[0];
+    require(y.type == type_, "engine: y is of another type than the run's states");
+    require_shape(y, "y", {rows, w.n});
+    require_shape(out, "out", {rows, w.l});
+    const double *given = params && system.n_params > 0 ? params->data : nullptr;
+    if (given) require_shape(*params, "params", {rows, system.n_params});
+    stepped([&](const Run &run) {
+        for (npy_intp k = 0; k < rows; ++k) {
+            if (given) copy(given + k * system.n_params, system.params, system.n_params);
+            run.system.inv(run.work, t.data[k], y.data + k * w.m, out.data + k * w.l);
         }
-        check_room(schedule, members.saved(0, self->data->work), self->samples, self->data->method.multistep);
-        if (self->samples) self->samples->interpolants.capacity = 0;
-        return PyLong_FromLong(stepped(self, [&](const Run &run) {
-            return sweep_members(run, self->samples, schedule, members, steps, y, y_new);
-        }));
+        return OK;
     });
 }
 
-PyDoc_STRVAR(
-    eight_doc,
-    "side_by_side(functions) -> None\n\nFunctions of eight members, by which `sweep_octets` runs them from now "
-    "on; `functions` holds addresses, as those of the run.");
-
-PyObject *engine_side_by_side(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 1, "functions");
-        const Busy busy(self->busy);
-        if (PyList_Append(self->kept, args[0]) < 0) return nullptr;
-        const Data &d = *self->data;
-        delete std::exchange(self->eight, new Eight(d.method, d.options, d.work, octet_system_of(args[0], d)));
-        Py_RETURN_NONE;
-    });
+void Engine::start(ConstState y, ConstState f, double tau) {
+    const Busy busy(busy_);
+    start_figures(checked(y, "y"), checked(f, "f"), tau, data_.method, hooks_.get(), data_.options, data_.work);
 }
 
-PyDoc_STRVAR(
-    sweep_octets_doc,
-    "sweep_octets(members, steps, y, y_new, t_saved) -> int\n\nThe same, eight members side by side, by steps of "
-    "all eight. Whose status is not set has to run by itself.");
-
-PyObject *engine_sweep_octets(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 5, "members, steps, y, y_new, t_saved");
-        const Busy busy(self->busy);
-        const Ref kept(PyList_New(0));
-        const Schedule &s = scheduled(self);
-        const auto [members, steps, y, y_new] = sweep_arguments(self, args, kept.get());
-        const bool fixed = s.span.h != 0.0 && s.n_events == 0 && (s.n_eval == 0 || (self->samples && members.kept));
-        const int64_t saved = s.n_eval > 0 ? s.n_eval : s.save_every > 0 ? s.span.n_steps / s.save_every + 2 : 2;
-        if (!self->eight || !fixed || (members.kept && members.n_rows < saved)) {
-            PyErr_SetString(PyExc_ValueError,
-                            "engine: members side by side take fixed steps, and need room for all rows");
-            return nullptr;
-        }
-        Samples *samples = self->samples;
-        if (samples) samples->interpolants.capacity = 0;
-        const Octets octets{*self->eight, samples};
-        return PyLong_FromLong(
-            stepped(self, [&](const Run &run) { return sweep_eights(run, octets, s, members, steps, y, y_new); }));
-    });
-}
-
-PyDoc_STRVAR(sample_doc, "sample(dense) -> None\n\nDense output from now on; `dense` is a record of data.py.");
-
-PyObject *engine_sample(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 1, "dense");
-        const Busy busy(self->busy), interpolating(self->interpolating);
-        Arrays arrays(self->kept);
-        if (PyList_Append(self->kept, args[0]) < 0) return nullptr;
-        const int64_t events = self->schedule ? self->schedule->n_events : 0;
-        const Samples samples = samples_of(args[0], *self->data, events, arrays, self->type);
-        if (self->functions) self->functions->add_buffers(attribute(args[0], "work").get(), self->kept);
-        delete std::exchange(self->samples, new Samples(samples));
-        Py_RETURN_NONE;
-    });
-}
-
-const Dense &dense_output(Engine *self) {
-    if (!self->samples) {
-        PyErr_SetString(PyExc_RuntimeError, "engine: no dense output");
-        throw PythonError{};
-    }
-    return self->samples->dense;
-}
-
-PyDoc_STRVAR(describe_doc,
-             "describe(t_old, y_old, t, y, piece) -> None\n\nThe interpolant over the step made last, as numbers.");
-
-PyObject *engine_describe(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 5, "t_old, y_old, t, y, piece");
-        const Busy busy(self->busy), interpolating(self->interpolating);
-        const Dense &d = dense_output(self);
-        const Ref kept(PyList_New(0));
-        const double t_old = PyFloat_AsDouble(args[0]), t = PyFloat_AsDouble(args[2]);
-        if (PyErr_Occurred()) return nullptr;
-        const double *y_old = state_of(args[1], "y_old", self, kept.get(), true);
-        const double *y = state_of(args[3], "y", self, kept.get(), true);
-        Arrays arrays(kept.get());
-        auto *piece = static_cast<double *>(arrays.memory(args[4], "piece", NPY_DOUBLE, {d.floats()}));
-        stepped(self, [&](const Run &run) {
-            describe_step(run, d, t_old, y_old, t, y, piece);
-            return OK;
-        });
-        Py_RETURN_NONE;
-    });
-}
-
-PyDoc_STRVAR(show_doc,
-             "show(t, y, out) -> None\n\nFill out (n,) with the last state, y at t, as the run hands it out.");
-
-PyObject *engine_show(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 3, "t, y, out");
-        const Busy busy(self->busy), interpolating(self->interpolating);
-        dense_output(self);
-        const Ref kept(PyList_New(0));
-        const double t = PyFloat_AsDouble(args[0]);
-        if (PyErr_Occurred()) return nullptr;
-        const double *y = state_of(args[1], "y", self, kept.get(), true);
-        double *out = state_of(args[2], "out", self, kept.get());
-        const int64_t end = scheduled(self).place[PENDING] == 1;
-        stepped(self, [&](const Run &run) {
-            show_state(run, *self->samples, end, t, y, out);
-            return OK;
-        });
-        Py_RETURN_NONE;
-    });
-}
-
-PyDoc_STRVAR(
-    interpolate_doc,
-    "interpolate(piece, t, out) -> None\n\nFill out (m, n) with the states at times t (m,) by an interpolant.");
-
-PyObject *engine_interpolate(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 3, "piece, t, out");
-        const Busy interpolating(self->interpolating);
-        const Dense &d = dense_output(self);
-        const Ref kept(PyList_New(0));
-        Arrays arrays(kept.get());
-        auto *piece = static_cast<double *>(arrays.memory(args[0], "piece", NPY_DOUBLE, {d.floats()}));
-        const auto *t = static_cast<const double *>(arrays.memory(args[1], "t", NPY_DOUBLE, {ANY}, true));
-        const npy_intp rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[1]), 0);
-        auto *out = static_cast<double *>(arrays.memory(args[2], "out", self->type, {rows, d.work.n}));
-        stepped(self, [&](const Run &run) {
-            interpolate_step(run, d, piece, t, rows, out);
-            return OK;
-        });
-        Py_RETURN_NONE;
-    });
-}
-
-PyDoc_STRVAR(
-    step_doc,
-    "step(k, t, y, f) -> (status, t_new, y_new, f_new)\n\nStep k from the state y at t with the derivative f.");
-
-PyObject *engine_step(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 4, "k, t, y, f");
-        const Busy busy(self->busy);
-        const Work &w = self->data->work;
-        const Ref kept(PyList_New(0));
-        const Schedule &s = scheduled(self);
-        const long long k = PyLong_AsLongLong(args[0]);
-        s.clock[TIME] = PyFloat_AsDouble(args[1]);
-        if (PyErr_Occurred()) return nullptr;
-        const double *y = state_of(args[2], "y", self, kept.get(), true);
-        copy(state_of(args[3], "f", self, kept.get(), true), w.row(0), w.m);
-        npy_intp n = w.n;
-        Ref y_new(PyArray_SimpleNew(1, &n, self->type));
-        double *end = static_cast<double *>(PyArray_DATA(reinterpret_cast<PyArrayObject *>(y_new.get())));
-        if (self->hooks) self->hooks->set_state(y_new.get());
-        const Code code = stepped(self, [&](const Run &run) { return step_once(run, s, k, y, end); });
-        Ref f_new(PyArray_SimpleNew(1, &n, self->type));
-        copy(w.last(), static_cast<double *>(PyArray_DATA(reinterpret_cast<PyArrayObject *>(f_new.get()))), w.m);
-        return Py_BuildValue("(idNN)", static_cast<int>(code), s.clock[TIME_NEW], y_new.release(), f_new.release());
-    });
-}
-
-// A projection by itself, or within a step whose hook calls for it.
-PyDoc_STRVAR(project_doc, "project(t_old, y, t, last, y_new) -> int\n\nProject work.y_hat into y_new.");
-
-PyObject *engine_project(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 5, "t_old, y, t, last, y_new");
-        const Ref kept(PyList_New(0));
-        Step step{};
-        step.t = PyFloat_AsDouble(args[0]);
-        step.t_new = PyFloat_AsDouble(args[2]);
-        step.h = step.t_new - step.t;
-        step.y = state_of(args[1], "y", self, kept.get(), true);
-        step.y_new = state_of(args[4], "y_new", self, kept.get());
-        step.last = PyObject_IsTrue(args[3]);
-        step.project = true;
-        if (PyErr_Occurred()) return nullptr;
-        if (self->hooks) self->hooks->set_state(args[4]);
-        return PyLong_FromLong(stepped(self, [&](const Run &run) { return project_once(run, step); }));
-    });
-}
-
-PyDoc_STRVAR(close_doc,
-             "close(t_new, y_new, project, status) -> None\n\nEnd a step whose state is y_new, after its projection.");
-
-PyObject *engine_close(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 4, "t_new, y_new, project, status");
-        const Ref kept(PyList_New(0));
-        Step step{};
-        step.t_new = PyFloat_AsDouble(args[0]);
-        step.y_new = state_of(args[1], "y_new", self, kept.get());
-        step.project = PyObject_IsTrue(args[2]);
-        const auto status = static_cast<Code>(PyLong_AsLong(args[3]));
-        if (PyErr_Occurred()) return nullptr;
-        stepped(self, [&](const Run &run) {
-            close_once(run, step, status);
-            return OK;
-        });
-        Py_RETURN_NONE;
-    });
-}
-
-PyDoc_STRVAR(
-    values_doc,
-    "values(t, y, out, params=None) -> None\n\nFill out (m, l) with the invariants at states y (m, n), each with "
-    "its own params (m, p) where they are given.");
-
-PyObject *engine_values(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count == 4 ? 3 : count, 3, "t, y, out, and params or not");
-        const Busy busy(self->busy);
-        const Ref kept(PyList_New(0));
-        Arrays arrays(kept.get());
-        const Work &w = self->data->work;
-        const System &system = self->data->system;
-        const auto *t = static_cast<const double *>(arrays.memory(args[0], "t", NPY_DOUBLE, {ANY}, true));
-        const npy_intp rows = PyArray_DIM(reinterpret_cast<PyArrayObject *>(args[0]), 0);
-        const auto *y = static_cast<const double *>(arrays.memory(args[1], "y", self->type, {rows, w.n}, true));
-        auto *out = static_cast<double *>(arrays.memory(args[2], "out", NPY_DOUBLE, {rows, w.l}));
-        const double *params = nullptr;
-        if (count == 4 && system.n_params > 0)
-            params = static_cast<const double *>(
-                arrays.memory(args[3], "params", NPY_DOUBLE, {rows, system.n_params}, true));
-        stepped(self, [&](const Run &run) {
-            for (npy_intp k = 0; k < rows; ++k) {
-                if (params) copy(params + k * system.n_params, system.params, system.n_params);
-                run.system.inv(run.work, t[k], y + k * w.m, out + k * w.l);
-            }
-            return OK;
-        });
-        Py_RETURN_NONE;
-    });
-}
-
-PyDoc_STRVAR(start_doc, "start(y, f, tau) -> None\n\nThe invariants' terms at the start, from work.values and work.G.");
-
-PyObject *engine_start(Engine *self, PyObject *const *args, Py_ssize_t count) {
-    return guarded([&]() -> PyObject * {
-        expect(self, count, 3, "y, f, tau");
-        const Busy busy(self->busy);
-        const Ref kept(PyList_New(0));
-        const double *y = state_of(args[0], "y", self, kept.get(), true),
-                     *f = state_of(args[1], "f", self, kept.get(), true);
-        const double tau = PyFloat_AsDouble(args[2]);
-        if (PyErr_Occurred()) return nullptr;
-        const Data &run = *self->data;
-        start_figures(y, f, tau, run.method, self->hooks, run.options, run.work);
-        Py_RETURN_NONE;
-    });
-}
-
-int engine_traverse(Engine *self, visitproc visit, void *arg) {
-    Py_VISIT(self->kept);
+int traverse(PyObject *self, visitproc visit, void *arg) {
+    Py_VISIT(Py_TYPE(self));
+    if (nb::inst_ready(self)) Py_VISIT(nb::inst_ptr<Engine>(self)->kept().ptr());
     return 0;
 }
 
-void engine_release(Engine *self) {
-    delete std::exchange(self->data, nullptr);
-    delete std::exchange(self->schedule, nullptr);
-    delete std::exchange(self->samples, nullptr);
-    delete std::exchange(self->eight, nullptr);
-    delete std::exchange(self->functions, nullptr);
-    delete std::exchange(self->hooks, nullptr);
-}
-
-int engine_clear(Engine *self) {
-    engine_release(self);
-    Py_CLEAR(self->kept);
+int clear(PyObject *self) {
+    nb::inst_ptr<Engine>(self)->clear();
     return 0;
 }
 
-void engine_dealloc(Engine *self) {
-    PyObject_GC_UnTrack(self);
-    engine_clear(self);
-    Py_TYPE(self)->tp_free(reinterpret_cast<PyObject *>(self));
+PyType_Slot engine_slots[] = {
+    {Py_tp_traverse, reinterpret_cast<void *>(traverse)}, {Py_tp_clear, reinterpret_cast<void *>(clear)}, {0, nullptr}};
+
+void add_engine(nb::module_ &m) {
+    nb::class_<Engine>(m, "Engine", nb::type_slots(engine_slots),
+                       "The step of one run, on its arrays. `functions` says in `native` whether it holds addresses.")
+        .def(nb::init<nb::object, nb::object, nb::object, nb::object, nb::object, nb::object>(), "method"_a,
+             "options"_a, "work"_a, "functions"_a, "schedule"_a = nb::none(), "hooks"_a = nb::none(),
+             nb::sig("def __init__(self, method: typing.Any, options: Options, work: Work, functions: typing.Any, "
+                     "schedule: Schedule | None = None, hooks: typing.Any = None) -> None"))
+        .def("advance", &Engine::advance, "k_end"_a, "y"_a, "y_new"_a, "t_saved"_a, "y_saved"_a, "pieces"_a.none(),
+             "Step on to step k_end, or to what stops the loop. pieces (rows, floats) receives the interpolants of all "
+             "steps if it has rows.")
+        .def(
+            "sweep", &Engine::sweep, "members"_a, "steps"_a, "y"_a, "y_new"_a, "t_saved"_a,
+            "Run members of an ensemble one after the other, so many steps in all; the `where` of the record `members` "
+            "says how far they are.")
+        .def("side_by_side", &Engine::side_by_side, "functions"_a,
+             "Functions of eight members, by which `sweep_octets` runs them from now on; `functions` holds addresses, "
+             "as "
+             "those of the run.")
+        .def("sweep_octets", &Engine::sweep_octets, "members"_a, "steps"_a, "y"_a, "y_new"_a, "t_saved"_a,
+             "Do what `sweep` does with eight members side by side, by steps of all eight. Whose status is not set has "
+             "to run by itself.")
+        .def("step", &Engine::step, "k"_a, "t"_a, "y"_a, "f"_a,
+             "Step k from the state y at t with the derivative f. Returns (status, t_new, y_new, f_new).")
+        .def("project", &Engine::project, "t_old"_a, "y"_a, "t"_a, "last"_a, "y_new"_a,
+             "Project work.y_hat into y_new: by itself, or within a step whose hook calls for it.")
+        .def("close", &Engine::close, "t_new"_a, "y_new"_a, "project"_a, "status"_a,
+             "End a step whose state is y_new, after its projection.")
+        .def("values", &Engine::values, "t"_a, "y"_a, "out"_a, "params"_a = nb::none(),
+             "Fill out (m, l) with the invariants at states y (m, n), each with its own params (m, p) where they are "
+             "given.")
+        .def("start", &Engine::start, "y"_a, "f"_a, "tau"_a,
+             "Set the invariants' terms at the start, from work.values and work.G.")
+        .def("sample", &Engine::sample, "dense"_a, "Make dense output from now on by this record.")
+        .def("describe", &Engine::describe, "t_old"_a, "y_old"_a, "t"_a, "y"_a, "piece"_a,
+             "Fill piece with the interpolant over the step made last.")
+        .def("interpolate", &Engine::interpolate, "piece"_a, "t"_a, "out"_a,
+             "Fill out (m, n) with the states at times t (m,) by an interpolant.")
+        .def("show", &Engine::show, "t"_a, "y"_a, "out"_a,
+             "Fill out (n,) with the last state, y at t, as the run hands it out.");
 }
 
-PyObject *engine_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
-    static const char *names[] = {"method", "options", "work", "functions", "schedule", "hooks", nullptr};
-    PyObject *method, *options, *work, *functions, *schedule = Py_None, *hooks = Py_None;
-    if (!PyArg_ParseTupleAndKeywords(args, keywords, "OOOO|OO", const_cast<char **>(names), &method, &options, &work,
-                                     &functions, &schedule, &hooks))
-        return nullptr;
-    auto *self = reinterpret_cast<Engine *>(type->tp_alloc(type, 0));
-    if (!self) return nullptr;
-    PyObject *made = guarded([&]() -> PyObject * {
-        self->kept = Ref(PyList_New(0)).release();
-        engine_setup(self, method, options, work, functions, schedule, hooks);
-        return reinterpret_cast<PyObject *>(self);
-    });
-    if (!made) Py_DECREF(self);
-    return made;
+// The integers of an enumeration, by the text of its names.
+void add_integers(nb::module_ &m, std::string_view names) {
+    for (long value = 0; !names.empty(); ++value) {
+        const size_t end = std::min(names.find(','), names.size());
+        const std::string entry(names.substr(0, end));
+        const size_t equals = entry.find('=');
+        if (equals != std::string::npos) value = std::stol(entry.substr(equals + 1));
+        m.attr(entry.substr(0, entry.find_first_of(" =")).c_str()) = value;
+        names.remove_prefix(std::min(names.find_first_not_of(", ", end), names.size()));
+    }
 }
 
-PyMethodDef engine_methods[] = {
-    {"advance", reinterpret_cast<PyCFunction>(engine_advance), METH_FASTCALL, advance_doc},
-    {"sweep", reinterpret_cast<PyCFunction>(engine_sweep), METH_FASTCALL, sweep_doc},
-    {"side_by_side", reinterpret_cast<PyCFunction>(engine_side_by_side), METH_FASTCALL, eight_doc},
-    {"sweep_octets", reinterpret_cast<PyCFunction>(engine_sweep_octets), METH_FASTCALL, sweep_octets_doc},
-    {"step", reinterpret_cast<PyCFunction>(engine_step), METH_FASTCALL, step_doc},
-    {"project", reinterpret_cast<PyCFunction>(engine_project), METH_FASTCALL, project_doc},
-    {"close", reinterpret_cast<PyCFunction>(engine_close), METH_FASTCALL, close_doc},
-    {"values", reinterpret_cast<PyCFunction>(engine_values), METH_FASTCALL, values_doc},
-    {"start", reinterpret_cast<PyCFunction>(engine_start), METH_FASTCALL, start_doc},
-    {"sample", reinterpret_cast<PyCFunction>(engine_sample), METH_FASTCALL, sample_doc},
-    {"describe", reinterpret_cast<PyCFunction>(engine_describe), METH_FASTCALL, describe_doc},
-    {"interpolate", reinterpret_cast<PyCFunction>(engine_interpolate), METH_FASTCALL, interpolate_doc},
-    {"show", reinterpret_cast<PyCFunction>(engine_show), METH_FASTCALL, show_doc},
-    {nullptr, nullptr, 0, nullptr},
-};
-
-PyDoc_STRVAR(engine_doc,
-             "Engine(method, options, work, functions, schedule=None, hooks=None)\n\n"
-             "The step of one run, on its arrays. `functions` says in `native` whether it holds addresses.");
-
-PyTypeObject engine_type = {.ob_base = PyVarObject_HEAD_INIT(nullptr, 0)};
-
-PyModuleDef module = {
-    .m_base = PyModuleDef_HEAD_INIT,
-    .m_name = EIP_NAME,
-    .m_doc = "The step in C++.",
-    .m_size = -1,
-};
-
-// Functions by subject, as a module in this one.
-int add_functions(PyObject *module, const char *subject, PyMethodDef *functions) {
-    PyObject *found = PyModule_New(subject);
-    const int status = found ? PyModule_AddFunctions(found, functions) : -1;
-    const int added = status < 0 ? -1 : PyModule_AddObjectRef(module, subject, found);
-    Py_XDECREF(found);
-    return added;
+void add_constants(nb::module_ &m) {
+    for (const char *names : {Code_NAMES, Direction_NAMES, Metric_NAMES, Counter_NAMES, Clock_NAMES, Place_NAMES,
+                              Node_NAMES, Interpolant_NAMES, Figure_NAMES, SuspectPlace_NAMES, Reason_NAMES})
+        add_integers(m, names);
+    m.attr("AUTO") = AUTO;
+    m.attr("MOST_ARGUMENTS") = MOST_ARGUMENTS;
+    m.attr("MOST_CROSSINGS") = MOST_CROSSINGS;
+    m.attr("EPS") = EPS;
+    m.attr("LARGE") = LARGE;
+    m.attr("FAR") = FAR;
+    m.attr("LARGE_SHARE") = LARGE_SHARE;
+    m.attr("SOURCES") = EIP_SOURCES;
+    m.attr("COMPILER") = EIP_COMPILER;
+    m.attr("HAS_V3") = has_v3();
 }
 
 }  // namespace
 }  // namespace eip
 
-PyMODINIT_FUNC EIP_INIT() {
-    import_array();
-    PyTypeObject &type = eip::engine_type;
-    type.tp_name = "eip_scipy.engine.Engine";
-    type.tp_basicsize = sizeof(eip::Engine);
-    type.tp_dealloc = reinterpret_cast<destructor>(eip::engine_dealloc);
-    type.tp_flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC;
-    type.tp_doc = eip::engine_doc;
-    type.tp_traverse = reinterpret_cast<traverseproc>(eip::engine_traverse);
-    type.tp_clear = reinterpret_cast<inquiry>(eip::engine_clear);
-    type.tp_methods = eip::engine_methods;
-    type.tp_new = eip::engine_new;
-    if (PyType_Ready(&type) < 0) return nullptr;
-    PyObject *module = PyModule_Create(&eip::module);
-    if (!module) return nullptr;
+NB_MODULE(EIP_MODULE, m) {
+    if (_import_array() < 0) throw nanobind::python_error();
+    nanobind::set_leak_warnings(false);  // what lives to the end of the process is no leak
+    m.doc() = "The step in C++.";
     eip::failed_call_error = PyErr_NewExceptionWithDoc("eip_scipy.engine.FailedCallError",
                                                        "A function by pointer failed.", nullptr, nullptr);
-    if (!eip::failed_call_error || !eip::add_library(module) ||
-        PyModule_AddObjectRef(module, "FailedCallError", eip::failed_call_error) < 0 ||
-        PyModule_AddObjectRef(module, "Engine", reinterpret_cast<PyObject *>(&type)) < 0 ||
-        eip::add_functions(module, "condensates", eip::condensate_functions) < 0 ||
-        eip::add_functions(module, "fields", eip::field_functions) < 0 ||
-        eip::add_functions(module, "comparators", eip::comparator_functions) < 0 ||
-        eip::add_functions(module, "gradients", eip::gradient_functions) < 0 ||
-        PyModule_AddStringConstant(module, "SOURCES", EIP_SOURCES) < 0 ||
-        PyModule_AddStringConstant(module, "COMPILER", EIP_COMPILER) < 0 ||
-        PyModule_AddIntConstant(module, "HAS_V3", eip::has_v3()) < 0) {
-        Py_DECREF(module);
-        return nullptr;
-    }
-    return module;
+    m.attr("FailedCallError") = eip::owned(eip::failed_call_error);
+    eip::add_constants(m);
+    eip::add_records(m);
+    eip::add_engine(m);
+    eip::add_library(m);
+    eip::add_condensates(m.def_submodule("condensates"));
+    eip::add_fields(m.def_submodule("fields"));
+    eip::add_comparators(m.def_submodule("comparators"));
+    eip::add_gradients(m.def_submodule("gradients"));
 }

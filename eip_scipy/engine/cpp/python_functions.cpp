@@ -8,97 +8,81 @@ namespace eip {
 
 namespace {
 
-PyObject *kept_attribute(PyObject *object, const char *name, PyObject *kept) {
-    const Ref found = attribute(object, name);
-    if (PyList_Append(kept, found.get()) < 0) throw PythonError{};
-    return found.get();
+nb::handle kept_attribute(nb::handle object, const char *name, nb::list &kept) {
+    const nb::object found = object.attr(name);
+    kept.append(found);
+    return found;
 }
 
 // An np.float64: where a function divides by t = 0 it gets inf, as from SciPy.
-Ref time(double t) {
-    Ref object(PyArrayScalar_New(Double));
-    PyArrayScalar_ASSIGN(object.get(), Double, t);
+nb::object time(double t) {
+    nb::object object = owned(PyArrayScalar_New(Double));
+    PyArrayScalar_ASSIGN(object.ptr(), Double, t);
     return object;
 }
 
 // A new array with a copy of a state, or of its first `components`.
-Ref copied(const double *y, int64_t components, int type) {
-    npy_intp length = components;
-    Ref array(PyArray_SimpleNew(1, &length, type));
-    std::memcpy(PyArray_DATA(reinterpret_cast<PyArrayObject *>(array.get())), y,
-                PyArray_NBYTES(reinterpret_cast<PyArrayObject *>(array.get())));
+Array copied(const double *y, int64_t components, int type) {
+    Array array = new_array({components}, type);
+    std::memcpy(array.floats(), y, PyArray_NBYTES(array.get()));
     return array;
 }
 
-// An array over memory that belongs to `owner`.
-Ref view(double *memory, int n_dimensions, const npy_intp *dimensions, int type, PyObject *owner) {
-    Ref array(PyArray_SimpleNewFromData(n_dimensions, dimensions, type, memory));
-    Py_INCREF(owner);
-    if (PyArray_SetBaseObject(reinterpret_cast<PyArrayObject *>(array.get()), owner) < 0) throw PythonError{};
-    return array;
+// Call a function with such objects.
+template <class... Arguments>
+nb::object call(nb::handle function, const Arguments &...arguments) {
+    PyObject *given[] = {nullptr, arguments.ptr()...};
+    return owned(
+        PyObject_Vectorcall(function.ptr(), given + 1, sizeof...(Arguments) | PY_VECTORCALL_ARGUMENTS_OFFSET, nullptr));
 }
-
-constexpr int MOST_ARGUMENTS = 8;
 
 int width_of(int type) { return type == NPY_CDOUBLE ? 2 : 1; }
 
 }  // namespace
 
-PythonCall::PythonCall(PyObject *description, int type, int64_t components, PyObject *kept)
+PythonCall::PythonCall(nb::handle description, int type, int64_t components, nb::list &kept)
     : fun_(kept_attribute(description, "fun", kept)),
       convert_(kept_attribute(description, "convert", kept)),
       type_(type),
       components_(components),
       takes_f_(truth(description, "takes_f")),
       in_place_(truth(description, "in_place")) {
-    PyObject *args = kept_attribute(description, "args", kept);
-    if (!PyTuple_Check(args)) {
-        PyErr_SetString(PyExc_TypeError, "engine: args must be a tuple");
-        throw PythonError{};
-    }
-    if (PyTuple_GET_SIZE(args) > MOST_ARGUMENTS) {
-        PyErr_Format(PyExc_ValueError, "engine: at most %d further arguments", MOST_ARGUMENTS);
-        throw PythonError{};
-    }
-    for (Py_ssize_t k = 0; k < PyTuple_GET_SIZE(args); ++k) args_.push_back(PyTuple_GET_ITEM(args, k));
-    const bool real = truth(description, "real");
-    value_type_ = real ? static_cast<int>(NPY_DOUBLE) : type;
-    const Ref shape = attribute(description, "shape");
-    n_dimensions_ = PyTuple_Check(shape.get()) ? static_cast<int>(PyTuple_GET_SIZE(shape.get())) : 3;
-    if (n_dimensions_ > 2) {
-        PyErr_SetString(PyExc_TypeError, "engine: shape must be a tuple of at most two lengths");
-        throw PythonError{};
-    }
+    const nb::handle args = kept_attribute(description, "args", kept);
+    if (!nb::isinstance<nb::tuple>(args)) throw nb::type_error("engine: args must be a tuple");
+    require(nb::len(args) <= MOST_ARGUMENTS, "engine: too many further arguments");
+    for (const nb::handle argument : nb::borrow<nb::tuple>(args)) args_.push_back(argument);
+    value_type_ = truth(description, "real") ? static_cast<int>(NPY_DOUBLE) : type;
+    const nb::object shape = description.attr("shape");
+    n_dimensions_ = nb::isinstance<nb::tuple>(shape) ? static_cast<int>(nb::len(shape)) : 3;
+    if (n_dimensions_ > 2) throw nb::type_error("engine: shape must be a tuple of at most two lengths");
     floats_ = width_of(value_type_);
     for (int k = 0; k < n_dimensions_; ++k) {
-        dimensions_[k] = PyLong_AsSsize_t(PyTuple_GET_ITEM(shape.get(), k));
-        if (dimensions_[k] < 0) {
-            if (!PyErr_Occurred()) PyErr_SetString(PyExc_ValueError, "engine: negative length");
-            throw PythonError{};
-        }
+        dimensions_[k] = nb::cast<npy_intp>(shape[k]);
+        require(dimensions_[k] >= 0, "engine: negative length");
         floats_ *= dimensions_[k];
     }
 }
 
-void PythonCall::operator()(double t, const double *y, const double *f, double *out, PyObject *owner) const {
+void PythonCall::operator()(double t, const double *y, const double *f, double *out, nb::handle owner) const {
     PyObject *arguments[5 + MOST_ARGUMENTS];  // t, y, f and out before them, and the place of the callee
-    const Ref time_object = time(t), y_object = copied(y, components_, type_);
-    Ref f_object, out_object;
+    const nb::object time_object = time(t), y_object = copied(y, components_, type_);
+    nb::object f_object, out_object;
     size_t count = 1;  // the first place is the callee's
-    arguments[count++] = time_object.get();
-    arguments[count++] = y_object.get();
+    arguments[count++] = time_object.ptr();
+    arguments[count++] = y_object.ptr();
     if (takes_f_) {
         f_object = copied(f, components_, type_);
-        arguments[count++] = f_object.get();
+        arguments[count++] = f_object.ptr();
     }
     if (in_place_) {
         fill(out, NOT_A_NUMBER, floats_);  // shows where the function leaves a part of it as it was
         out_object = view(out, n_dimensions_, dimensions_, value_type_, owner);
-        arguments[count++] = out_object.get();
+        arguments[count++] = out_object.ptr();
     }
-    for (PyObject *argument : args_) arguments[count++] = argument;
-    const Ref value(PyObject_Vectorcall(fun_, arguments + 1, (count - 1) | PY_VECTORCALL_ARGUMENTS_OFFSET, nullptr));
-    if (!in_place_) take(value.get(), time_object.get(), out);
+    for (const nb::handle argument : args_) arguments[count++] = argument.ptr();
+    const nb::object value =
+        owned(PyObject_Vectorcall(fun_.ptr(), arguments + 1, (count - 1) | PY_VECTORCALL_ARGUMENTS_OFFSET, nullptr));
+    if (!in_place_) take(value.ptr(), time_object.ptr(), out);
 }
 
 // Whether a value is a list of as many floats as are expected, Python's or NumPy's: what most functions return.
@@ -120,143 +104,119 @@ void PythonCall::take(PyObject *value, PyObject *t, double *out) const {
         return;
     }
     const auto plain = [this](PyObject *a) {
-        if (n_dimensions_ == 1) return is_plain(a, value_type_, {dimensions_[0]});
-        return n_dimensions_ == 2 ? is_plain(a, value_type_, {dimensions_[0], dimensions_[1]})
-                                  : is_plain(a, value_type_, {});
+        return is_plain(a, value_type_, n_dimensions_) &&
+               std::equal(dimensions_, dimensions_ + n_dimensions_, PyArray_DIMS(reinterpret_cast<PyArrayObject *>(a)));
     };
-    Ref found = Ref::borrowed(value);
+    nb::object found = nb::borrow(value);
     if (!PyArray_CheckExact(value) || !plain(value)) {
-        found = Ref(PyObject_CallFunctionObjArgs(convert_, value, t, nullptr));
-        if (!plain(found.get())) {
-            PyErr_Format(PyExc_TypeError, "engine: convert returned %.80R", found.get());
-            throw PythonError{};
-        }
+        found = owned(PyObject_CallFunctionObjArgs(convert_.ptr(), value, t, nullptr));
+        if (!plain(found.ptr())) refuse(PyExc_TypeError, "engine: convert returned %.80R", found.ptr());
     }
-    std::memcpy(out, PyArray_DATA(reinterpret_cast<PyArrayObject *>(found.get())), floats_ * sizeof(double));
+    std::memcpy(out, PyArray_DATA(reinterpret_cast<PyArrayObject *>(found.ptr())), floats_ * sizeof(double));
 }
 
-PythonFunctions::PythonFunctions(PyObject *functions, PyObject *work, const Work &sizes, int type, PyObject *kept)
-    : m_(sizes.m),
+PythonFunctions::PythonFunctions(nb::handle functions, nb::handle owner, const Work &sizes, int type, nb::list &kept)
+    : owner_(owner),
+      m_(sizes.m),
       second_order_(truth(functions, "second_order")) {
     const int64_t components = second_order_ ? sizes.n / 2 : sizes.n;
-    rhs_.emplace(attribute(functions, "rhs").get(), type, components, kept);
+    rhs_.emplace(functions.attr("rhs"), type, components, kept);
     const auto calls = [&](const char *name, std::vector<PythonCall> &out, int64_t expected) {
-        const Ref items(PySequence_Fast(attribute(functions, name).get(), "engine: expected a sequence of functions"));
         int64_t total = 0;
-        for (Py_ssize_t k = 0; k < PySequence_Fast_GET_SIZE(items.get()); ++k) {
-            out.emplace_back(PySequence_Fast_GET_ITEM(items.get(), k), type, sizes.n, kept);
+        for (const nb::handle item : nb::object(functions.attr(name))) {
+            out.emplace_back(item, type, sizes.n, kept);
             total += out.back().floats();
         }
-        if (expected >= 0 && total != expected) {
-            PyErr_Format(PyExc_ValueError, "engine: the values of %s are %lld floats, expected %lld", name,
-                         static_cast<long long>(total), static_cast<long long>(expected));
-            throw PythonError{};
-        }
+        if (expected >= 0 && total != expected)
+            refuse(PyExc_ValueError, "engine: the values of %s are %lld floats, expected %lld", name,
+                   static_cast<long long>(total), static_cast<long long>(expected));
     };
     calls("inv", inv_, sizes.l);
     calls("grad", grad_, sizes.l * sizes.m);
     calls("event", event_, -1);
-    if (rhs_->floats() != (second_order_ ? m_ / 2 : m_)) {
-        PyErr_SetString(PyExc_ValueError, "engine: rhs must give as many numbers as the state has");
-        throw PythonError{};
-    }
-    const Ref jacobian = attribute(functions, "jacobian");
-    if (jacobian.get() != Py_None) {
-        jacobian_.emplace(jacobian.get(), type, sizes.n / 2, kept);
-        if (jacobian_->floats() != m_ / 2) {
-            PyErr_SetString(PyExc_ValueError, "engine: jacobian must fill half as many numbers as the state has");
-            throw PythonError{};
-        }
-    }
-    add_buffers(work, kept);
+    require(rhs_->floats() == (second_order_ ? m_ / 2 : m_), "engine: rhs must give as many numbers as the state has");
+    const nb::object jacobian = functions.attr("jacobian");
+    if (jacobian.is_none()) return;
+    jacobian_.emplace(jacobian, type, sizes.n / 2, kept);
+    require(jacobian_->floats() == m_ / 2, "engine: jacobian must fill half as many numbers as the state has");
 }
 
-void PythonFunctions::add_buffers(PyObject *work, PyObject *kept) {
-    for (const char *name : {"K", "stage", "f_point", "G"}) {
-        PyObject *array = kept_attribute(work, name, kept);
-        auto *first = static_cast<const double *>(PyArray_DATA(reinterpret_cast<PyArrayObject *>(array)));
-        const npy_intp bytes = PyArray_NBYTES(reinterpret_cast<PyArrayObject *>(array));
-        owners_.push_back({first, first + bytes / static_cast<npy_intp>(sizeof(double)), array});
-    }
-}
-
-PyObject *PythonFunctions::owner_of(const double *out) const {
-    for (const Owner &owner : owners_)
-        if (owner.first <= out && out < owner.last) return owner.array;
-    return owners_.front().array;
+void PythonFunctions::add_owner(nb::handle owner, nb::list &kept) {
+    const nb::object both = nb::make_tuple(owner_, owner);
+    kept.append(both);
+    owner_ = both;
 }
 
 void PythonFunctions::rhs(double t, const double *y, double *out) {
-    if (!second_order_) return (*rhs_)(t, y, nullptr, out, owner_of(out));
+    if (!second_order_) return (*rhs_)(t, y, nullptr, out, owner_);
     copy(y + m_ / 2, out, m_ / 2);
-    (*rhs_)(t, y, nullptr, out + m_ / 2, owner_of(out));
+    (*rhs_)(t, y, nullptr, out + m_ / 2, owner_);
 }
 
 void PythonFunctions::inv(double t, const double *y, double *values) {
     for (const PythonCall &call : inv_) {
-        call(t, y, nullptr, values, nullptr);
+        call(t, y, nullptr, values, {});
         values += call.floats();
     }
 }
 
 void PythonFunctions::grad(double t, const double *y, const double *f, double *G) {
     for (const PythonCall &call : grad_) {
-        call(t, y, f, G, owner_of(G));
+        call(t, y, f, G, owner_);
         G += call.floats();
     }
 }
 
 void PythonFunctions::event(double t, const double *y, double *values) {
     for (const PythonCall &call : event_) {
-        call(t, y, nullptr, values, nullptr);
+        call(t, y, nullptr, values, {});
         values += call.floats();
     }
 }
 
 void PythonFunctions::jacobian(double t, const double *q, const double *dq, double *out) {
-    (*jacobian_)(t, q, dq, out, owner_of(out));
+    (*jacobian_)(t, q, dq, out, owner_);
 }
 
-PythonHooks::PythonHooks(PyObject *hooks, PyObject *work, const Run &run, int type, PyObject *kept)
+PythonHooks::PythonHooks(nb::handle hooks, const Buffers &buffers, const Run &run, nb::list &kept)
     : run_(run),
-      type_(type) {
-    const auto given = [&](const char *name) -> PyObject * {
-        PyObject *found = kept_attribute(hooks, name, kept);
-        return found == Py_None ? nullptr : found;
+      type_(buffers.type) {
+    const auto given = [&](const char *name) {
+        const nb::handle found = kept_attribute(hooks, name, kept);
+        return found.is_none() ? nb::handle() : found;
     };
     one_step_ = given("one_step");
     finish_ = given("finish");
     project_ = given("project");
     agree_ = given("agree");
     estimates_ = truth(hooks, "estimates");
-    raw = one_step_ != nullptr;
-    finish = finish_ != nullptr;
-    project = project_ != nullptr;
-    agree = agree_ != nullptr;
-    if (PyObject *joint_invariants = given("joint")) {
-        joint = true;
-        moments_ = kept_attribute(joint_invariants, "moments", kept);
-        shift_ = kept_attribute(joint_invariants, "shift", kept);
-        y_hat_ = kept_attribute(work, "y_hat", kept);
-        values_ = kept_attribute(work, "values", kept);
-        R_ = kept_attribute(work, "R", kept);
-        terms_ = kept_attribute(work, "inverse_norms", kept);
-        mu_ = kept_attribute(work, "mu", kept);
-        const Ref K = attribute(work, "K"), last(PyLong_FromLong(-1)), row(PyObject_GetItem(K.get(), last.get()));
-        if (PyList_Append(kept, row.get()) < 0) throw PythonError{};
-        f_hat_ = row.get();
-    }
+    raw = one_step_.is_valid();
+    finish = finish_.is_valid();
+    project = project_.is_valid();
+    agree = agree_.is_valid();
+    const nb::handle joint_invariants = given("joint");
+    joint = joint_invariants.is_valid();
+    if (!joint) return;
+    moments_ = kept_attribute(joint_invariants, "moments", kept);
+    shift_ = kept_attribute(joint_invariants, "shift", kept);
+    const auto array = [&](const char *name) {
+        const Array found = buffers.array(name);
+        kept.append(found);
+        return nb::handle(found);
+    };
+    y_hat_ = array("y_hat");
+    values_ = array("values");
+    R_ = array("R");
+    terms_ = array("inverse_norms");
+    mu_ = array("mu");
+    const nb::object last = buffers.array("K")[-1];
+    kept.append(last);
+    f_hat_ = last;
 }
 
 namespace {
 
-int code_of(const Ref &returned) {
-    const long value = PyLong_AsLong(returned.get());
-    if (value == -1 && PyErr_Occurred()) throw PythonError{};
-    return static_cast<int>(value);
-}
-
-PyObject *truth_of(bool value) { return value ? Py_True : Py_False; }
+int code_of(const nb::object &returned) { return nb::cast<int>(returned); }
 
 }  // namespace
 
@@ -264,8 +224,7 @@ PyObject *truth_of(bool value) { return value ? Py_True : Py_False; }
 int PythonHooks::raw_step(const Step &step) {
     const Options &o = run_.options;
     const Work &w = run_.work;
-    const Ref t = time(step.t), y = copied(step.y, w.n, type_), h = time(step.h);
-    const Ref none(PyObject_CallFunctionObjArgs(one_step_, t.get(), y.get(), h.get(), nullptr));
+    call(one_step_, time(step.t), copied(step.y, w.n, type_), time(step.h));
     if (!all_finite(w.y_hat, w.m)) return NOT_FINITE;
     if (step.project && o.uses_f) {
         if (o.direction == OLD) {
@@ -290,24 +249,15 @@ int PythonHooks::raw_step(const Step &step) {
 }
 
 int PythonHooks::project_elsewhere(const Step &step) {
-    const Ref t_old = time(step.t), t = time(step.t_new);
     const npy_intp n = run_.work.n;
-    const Ref y_new = view(step.y_new, 1, &n, type_, to_);
     return code_of(
-        Ref(PyObject_CallFunctionObjArgs(project_, t_old.get(), t.get(), truth_of(step.last), y_new.get(), nullptr)));
+        call(project_, time(step.t), time(step.t_new), nb::bool_(step.last), view(step.y_new, 1, &n, type_, to_)));
 }
 
-bool PythonHooks::all_agree(bool here) {
-    const Ref found(PyObject_CallFunctionObjArgs(agree_, truth_of(here), nullptr));
-    const int value = PyObject_IsTrue(found.get());
-    if (value < 0) throw PythonError{};
-    return value;
-}
+bool PythonHooks::all_agree(bool here) { return nb::bool_(call(agree_, nb::bool_(here))).is(nb::bool_(true)); }
 
 int PythonHooks::finish_step(const Step &step) {
-    const Ref t_new = time(step.t_new);
-    return code_of(
-        Ref(PyObject_CallFunctionObjArgs(finish_, t_new.get(), truth_of(step.project), truth_of(step.last), nullptr)));
+    return code_of(call(finish_, time(step.t_new), nb::bool_(step.project), nb::bool_(step.last)));
 }
 
 // One Newton step by the functions of `JointInvariants`: the one that `project_step` takes in the euclidean metric, its
@@ -316,8 +266,8 @@ int PythonHooks::finish_step(const Step &step) {
 bool PythonHooks::project_jointly(const Step &step) {
     const Options &o = run_.options;
     const Work &w = run_.work;
-    const Ref t = time(step.t_new);
-    Ref(PyObject_CallFunctionObjArgs(moments_, t.get(), y_hat_, f_hat_, values_, R_, terms_, nullptr));
+    const nb::object t = time(step.t_new);
+    call(moments_, t, y_hat_, f_hat_, values_, R_, terms_);
     const bool measured = o.watched && w.counters[HAVE_ERROR];
     if (measured) {
         const double err = norm(w.err, w.m);
@@ -327,8 +277,7 @@ bool PythonHooks::project_jointly(const Step &step) {
     if (outside) {
         if (!gram_solution(Matrix{w.R, w.l, w.l, w.l}, w.g, w.mu)) return false;
         const npy_intp n = w.n;
-        const Ref y_new = view(step.y_new, 1, &n, type_, to_);
-        Ref(PyObject_CallFunctionObjArgs(shift_, t.get(), y_hat_, f_hat_, mu_, y_new.get(), values_, nullptr));
+        call(shift_, t, y_hat_, f_hat_, mu_, view(step.y_new, 1, &n, type_, to_), values_);
     } else {
         copy(w.y_hat, step.y_new, w.m);
     }

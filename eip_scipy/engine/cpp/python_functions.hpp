@@ -1,14 +1,17 @@
 // A user's functions in Python, called with arrays of their own, as SciPy calls them.
 #pragma once
 
-#include "python.hpp"
+#include "arrays.hpp"
 
 #include <optional>
 #include <vector>
 
-#include "system.hpp"
+#include "records.hpp"
 
 namespace eip {
+
+// Further arguments of a function at most.
+constexpr int MOST_ARGUMENTS = 8;
 
 // One function: fun(t, y[, f][, out], *args). What it returns is taken as it is where it is an array of the right kind,
 // or a float; else `convert(value, t)` makes that of it,
@@ -16,10 +19,10 @@ namespace eip {
 class PythonCall {
   public:
     // `description` has the attributes fun, args, convert, shape (of the value: () for a number), takes_f, in_place.
-    PythonCall(PyObject *description, int type, int64_t components, PyObject *kept);
+    PythonCall(nb::handle description, int type, int64_t components, nb::list &kept);
 
-    // y has `components` of the state's type; f too, where the function takes it. `owner`: the array that `out` lies in.
-    void operator()(double t, const double *y, const double *f, double *out, PyObject *owner) const;
+    // y has `components` of the state's type; f too, where the function takes it. `owner`: what `out` belongs to.
+    void operator()(double t, const double *y, const double *f, double *out, nb::handle owner) const;
 
     int64_t floats() const { return floats_; }
 
@@ -27,8 +30,8 @@ class PythonCall {
     bool takes_list(PyObject *value) const;
     void take(PyObject *value, PyObject *t, double *out) const;
 
-    PyObject *fun_, *convert_;
-    std::vector<PyObject *> args_;
+    nb::handle fun_, convert_;
+    std::vector<nb::handle> args_;
     npy_intp dimensions_[2];
     int n_dimensions_, type_, value_type_;
     int64_t components_, floats_;
@@ -38,8 +41,9 @@ class PythonCall {
 // The functions of a run.
 class PythonFunctions final : public Functions {
   public:
-    // `functions` has rhs, and sequences inv, grad and event; `work` the arrays that functions in place fill.
-    PythonFunctions(PyObject *functions, PyObject *work, const Work &sizes, int type, PyObject *kept);
+    // `functions` has rhs, and sequences inv, grad and event; `owner` is what all memory that functions in place fill
+    // belongs to.
+    PythonFunctions(nb::handle functions, nb::handle owner, const Work &sizes, int type, nb::list &kept);
 
     void rhs(double t, const double *y, double *out) override;
     void inv(double t, const double *y, double *values) override;
@@ -49,19 +53,13 @@ class PythonFunctions final : public Functions {
     bool has_jacobian() const { return jacobian_.has_value(); }
     int64_t events() const { return static_cast<int64_t>(event_.size()); }
 
-    // More arrays that functions in place fill.
-    void add_buffers(PyObject *work, PyObject *kept);
+    // Memory of another owner's is filled too.
+    void add_owner(nb::handle owner, nb::list &kept);
 
   private:
-    struct Owner {
-        const double *first, *last;
-        PyObject *array;
-    };
-    PyObject *owner_of(const double *out) const;
-
     std::optional<PythonCall> rhs_, jacobian_;
     std::vector<PythonCall> inv_, grad_, event_;
-    std::vector<Owner> owners_;
+    nb::handle owner_;
     int64_t m_;
     bool second_order_;
 };
@@ -69,7 +67,7 @@ class PythonFunctions final : public Functions {
 // Parts of a step in Python, see `Hooks` in native.py.
 class PythonHooks final : public Hooks {
   public:
-    PythonHooks(PyObject *hooks, PyObject *work, const Run &run, int type, PyObject *kept);
+    PythonHooks(nb::handle hooks, const Buffers &buffers, const Run &run, nb::list &kept);
 
     int raw_step(const Step &step) override;
     int finish_step(const Step &step) override;
@@ -78,15 +76,12 @@ class PythonHooks final : public Hooks {
     bool all_agree(bool here) override;
 
     // The array that the steps to come lead to.
-    void set_state(PyObject *to) { to_ = to; }
+    void set_state(nb::handle to) { to_ = to; }
 
   private:
     Run run_;
     int type_;
-    PyObject *to_ = nullptr;
-    PyObject *one_step_ = nullptr, *finish_ = nullptr, *project_ = nullptr, *agree_ = nullptr, *moments_ = nullptr,
-             *shift_ = nullptr;
-    PyObject *y_hat_ = nullptr, *f_hat_ = nullptr, *values_ = nullptr, *R_ = nullptr, *terms_ = nullptr, *mu_ = nullptr;
+    nb::handle to_, one_step_, finish_, project_, agree_, moments_, shift_, y_hat_, f_hat_, values_, R_, terms_, mu_;
     bool estimates_ = false;
 };
 

@@ -1,12 +1,45 @@
-// From the records of data.py to what the steps take. What comes from Python is looked at here, once; all arrays of a run
-// keep their memory, so that Python reads what the engine writes.
+// From the records that Python makes (`fields` in data.hpp, loop.hpp and members.hpp) and the functions' addresses to what
+// the steps take. What comes from Python is looked at here, once; the arrays of a run keep their memory, so that Python reads
+// what the engine writes.
 #pragma once
 
-#include "python.hpp"
+#include "arrays.hpp"
+
+#include <memory>
 
 #include "engine.hpp"
 
 namespace eip {
+
+// Buffers of a run in memory of the engine's own, which arrays over it keep. A complex state has two floats to a number.
+class Buffers {
+  public:
+    Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants, int64_t blocks);
+
+    // Buffers with the numbers of others, which have this state.
+    explicit Buffers(const nb::tuple &state);
+    nb::tuple state() const;
+
+    // The arrays over the buffers, by name, or one of them.
+    const nb::dict &arrays() const;
+    Array array(const char *name) const { return nb::borrow<Array>(arrays()[name]); }
+    // Use another run's buffers of these names from now on.
+    void share(const Buffers &other, const nb::set &names);
+
+    Work work{};
+    int64_t blocks;
+    int type;
+
+    // What the memory belongs to.
+    nb::handle owner() const { return owner_; }
+
+  private:
+    nb::object owner_;
+    mutable nb::dict arrays_;  // empty as long as none is asked for
+};
+
+// Those that an object of Python's is.
+const Buffers &buffers_of(nb::handle work);
 
 // What the steps of a run refer to.
 struct Data {
@@ -17,23 +50,31 @@ struct Data {
     System system;
 };
 
-Method method_of(PyObject *method, Arrays &arrays);
-// Coefficients, which a one-step method of a user's own has none of.
-void read_tableau(PyObject *method, Arrays &arrays, Method &m);
+// Reading adds to `kept` what has to live as long as the engine.
+Method method_of(nb::handle method, bool has_tableau, nb::list &kept);
 // What a multistep method holds besides the run's buffers; its history, which Python may fill.
-Multistep multistep_of(PyObject *record, const Work &w, Arrays &arrays);
+Multistep multistep_of(nb::handle record, const Work &w, nb::list &kept);
 void check_history(const Multistep &multistep);
-Work work_of(PyObject *work, int64_t stages, int64_t blocks, Arrays &arrays, int type);
 // Sets what the buffers hold of them too: targets, scratch of the frame.
-Options options_of(PyObject *options, Work &w, Arrays &arrays);
-Schedule schedule_of(PyObject *schedule, Arrays &arrays);
-Samples samples_of(PyObject *dense, const Data &run, int64_t events, Arrays &arrays, int type);
+Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept);
+Schedule schedule_of(nb::handle schedule, nb::list &kept);
+Samples samples_of(nb::handle dense, const Data &run, int64_t events, int type, nb::list &kept);
 // `rows` are saved of each member.
-Members members_of(PyObject *members, const Data &run, const Schedule &schedule, int64_t rows, Arrays &arrays,
-                   int type);
+Members members_of(nb::handle members, const Data &run, const Schedule &schedule, int64_t rows, int type,
+                   nb::list &kept);
 // Functions of eight members of the run.
-OctetSystem octet_system_of(PyObject *functions, const Data &run);
+OctetSystem octet_system_of(nb::handle functions, const Data &run);
 // Functions by pointer.
-void read_pointers(PyObject *functions, const Work &w, int64_t events, Arrays &arrays, System &system);
+void read_pointers(nb::handle functions, const Work &w, int64_t events, nb::list &kept, System &system);
+
+// Attributes of a record.
+double number(nb::handle record, const char *name);
+int64_t integer(nb::handle record, const char *name);
+bool truth(nb::handle record, const char *name);
+// The memory of an array of this type and shape that may be written to.
+void *memory(nb::handle array, const char *name, int type, Lengths shape, nb::list &kept);
+
+// The records' types and that of the buffers, in the module.
+void add_records(nb::module_ &module);
 
 }  // namespace eip

@@ -10,7 +10,6 @@ constexpr double FAILURE_BANDS = 100.0, NOISE_BANDS = 3.0;
 constexpr double LEAST_SHARE = 1e-3;
 // Coordinates that move by less than this share of their size stand still.
 constexpr double STILL = 1e4 * EPS;
-constexpr double LARGE = 50.0, LARGE_SHARE = 1e-2;
 // A rate of change along the flow is suspicious from LEAST_RATE of its terms on, and again when it has grown by RATE_GROWTH.
 // Terms that vanish for a moment, as those of velocity constraints do at singular positions, count as LEAST_TERMS of the
 // largest so far.

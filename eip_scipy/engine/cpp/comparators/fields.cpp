@@ -1,9 +1,10 @@
 // What the implicit schemes for the Gross-Pitaevskii equation do point by point.
-#include "../functions.hpp"
+#include "../module.hpp"
+
+#include <nanobind/stl/array.h>
 
 #include <cmath>
 
-#include "../arguments.hpp"
 #include "../pairs.hpp"
 
 namespace eip {
@@ -122,17 +123,16 @@ void advance(ConstField modes, ConstField inverse, double factor, Field new_mode
 
 }  // namespace
 
-PyMethodDef field_functions[] = {
-    bound<"extrapolate", extrapolate>("extrapolate(last, before, first)"),
-    bound<"multiply_modes", multiply_modes>("multiply_modes(modes, factor)"),
-    bound<"right_side", right_side>("right_side(start, mean, rotation, W, w, c, out) -> float"),
-    bound<"other_end", other_end>("other_end(mean, start)"),
-    bound<"mean_density", mean_density>("mean_density(start, mean, V, beta, out)"),
-    bound<"density", density>("density(psi, V, beta, out)"),
-    bound<"nonlinear_force", nonlinear_force>("nonlinear_force(psi, other, a, V, beta, out) -> float"),
-    bound<"projections", projections>("projections(force, modes, inverse, c) -> tuple"),
-    bound<"advance", advance>("advance(modes, inverse, factor, new_modes, force)"),
-    {nullptr, nullptr, 0, nullptr},
-};
+void add_fields(nb::module_ module) {
+    module.def("extrapolate", extrapolate, "last"_a, "before"_a, "first"_a);
+    module.def("multiply_modes", multiply_modes, "modes"_a, "factor"_a);
+    module.def("right_side", right_side, "start"_a, "mean"_a, "rotation"_a, "W"_a, "w"_a, "c"_a, "out"_a);
+    module.def("other_end", other_end, "mean"_a, "start"_a);
+    module.def("mean_density", mean_density, "start"_a, "mean"_a, "V"_a, "beta"_a, "out"_a);
+    module.def("density", density, "psi"_a, "V"_a, "beta"_a, "out"_a);
+    module.def("nonlinear_force", nonlinear_force, "psi"_a, "other"_a, "a"_a, "V"_a, "beta"_a, "out"_a);
+    module.def("projections", projections, "force"_a, "modes"_a, "inverse"_a, "c"_a);
+    module.def("advance", advance, "modes"_a, "inverse"_a, "factor"_a, "new_modes"_a, "force"_a);
+}
 
 }  // namespace eip

@@ -1,5 +1,5 @@
 // The loop over steps of one length that the comparators share.
-#include "../functions.hpp"
+#include "../module.hpp"
 
 #include <chrono>
 #include <optional>
@@ -25,25 +25,24 @@ struct FixedSteps {
 // Lets other threads run, and looks at signals now and then.
 class Unlocked {
   public:
-    explicit Unlocked(bool unlocks) : state_(unlocks ? PyEval_SaveThread() : nullptr) {}
-    ~Unlocked() {
-        if (state_) PyEval_RestoreThread(state_);
+    explicit Unlocked(bool unlocks) {
+        if (unlocks) release();
     }
-    Unlocked(const Unlocked &) = delete;
-    Unlocked &operator=(const Unlocked &) = delete;
 
     void look() {
-        if (!state_ || Clock::now() < next_) return;
-        PyEval_RestoreThread(std::exchange(state_, nullptr));
-        if (PyErr_CheckSignals() < 0) throw PythonError{};
-        state_ = PyEval_SaveThread();
+        if (!released_ || Clock::now() < next_) return;
+        released_.reset();
+        if (PyErr_CheckSignals() < 0) throw nb::python_error();
+        release();
         next_ = Clock::now() + PAUSE;
     }
 
   private:
     using Clock = std::chrono::steady_clock;
     static constexpr std::chrono::milliseconds PAUSE{20};
-    PyThreadState *state_;
+    void release() { released_ = std::make_unique<nb::gil_scoped_release>(); }
+
+    std::unique_ptr<nb::gil_scoped_release> released_;
     Clock::time_point next_ = Clock::now() + PAUSE;
 };
 
@@ -74,71 +73,56 @@ void drive_by_name(std::string_view name, Callee &callee, double constant, const
     }
 }
 
-FixedSteps steps_of(PyObject *record, PyObject *rows, int64_t n, Arrays &arrays) {
-    FixedSteps s{};
-    s.t0 = number(record, "t0");
-    s.h = number(record, "h");
-    s.last = number(record, "last");
-    s.rows = Arrays::length(record, "saved");
-    s.saved = arrays.integers<int64_t>(record, "saved", {s.rows});
-    s.y = static_cast<double *>(arrays.memory(rows, "rows", NPY_DOUBLE, {s.rows, n}));
-    bool good = s.rows > 0 && s.saved[0] == 0;
-    for (int64_t r = 1; r < s.rows; ++r) good &= s.saved[r] > s.saved[r - 1];
-    if (good) return s;
-    PyErr_SetString(PyExc_ValueError, "take_steps: the steps to save must rise from 0");
-    throw PythonError{};
+FixedSteps steps_of(nb::handle record, const StatesOf<double, 2> &rows, int64_t n) {
+    const nb::object numbers = record.attr("saved");
+    const auto saved = nb::cast<ArrayOf<const int64_t, 1>>(numbers);
+    const FixedSteps s{number(record, "t0"), number(record, "h"), number(record, "last"),
+                       saved.data,           saved.shape[0],      rows.data};
+    bool good = s.rows > 0 && s.saved[0] == 0 && rows.shape[0] == s.rows && rows.shape[1] == n;
+    for (int64_t r = 1; good && r < s.rows; ++r) good = s.saved[r] > s.saved[r - 1];
+    require(good, "take_steps: the steps to save must rise from 0, with a row for each");
+    return s;
 }
 
 void require_scheme(std::string_view name, int64_t n) {
     const bool halves = name == "kick-drift-kick" || name == "drift-kick-drift";
-    if ((halves && n % 2 == 0) || (name == "boris" && n == 6) || name == "implicit-midpoint") return;
-    PyErr_SetString(PyExc_ValueError, "take_steps: no such scheme, or a state of another size than it has");
-    throw PythonError{};
+    require((halves && n % 2 == 0) || (name == "boris" && n == 6) || name == "implicit-midpoint",
+            "take_steps: no such scheme, or a state of another size than it has");
 }
 
-PyDoc_STRVAR(take_steps_doc,
-             "take_steps(scheme, constant, functions, work, steps, y, rows) -> int\n\nTake all steps from y, which "
-             "moves; rows (saved, n) receives the states to save. Returns the number of evaluations.");
-
-PyObject *take_steps(PyObject *, PyObject *args) {
-    return guarded([&]() -> PyObject * {
-        const char *name;
-        double constant;
-        PyObject *functions, *work_object, *record, *y_object, *rows;
-        if (!PyArg_ParseTuple(args, "sdOOOOO", &name, &constant, &functions, &work_object, &record, &y_object, &rows))
-            return nullptr;
-        const Ref kept(PyList_New(0));
-        Arrays arrays(kept.get());
-        const Work work = work_of(work_object, 1, 0, arrays, NPY_DOUBLE);
-        auto *y = static_cast<double *>(arrays.memory(y_object, "y", NPY_DOUBLE, {work.n}));
-        require_scheme(name, work.n);
-        const FixedSteps steps = steps_of(record, rows, work.n, arrays);
-        System system;
-        std::optional<PythonFunctions> in_python;
-        if (truth(functions, "native")) {
-            read_pointers(functions, work, 0, arrays, system);
-        } else {
-            in_python.emplace(functions, work_object, work, NPY_DOUBLE, kept.get());
-            system.python = &*in_python;
-        }
-        const FloatingPoint mode;
-        Callee callee{system, work};
-        try {
-            Unlocked others(!in_python);
-            drive_by_name(name, callee, constant, steps, y, others);
-        } catch (const Broken &) {
-            raise_broken(system);
-            return nullptr;
-        }
-        return PyLong_FromLongLong(callee.evaluations);
-    });
+int64_t take_steps(const char *name, double constant, nb::object functions, const Buffers &buffers, nb::object record,
+                   ArrayOf<double, 1> y, StatesOf<double, 2> rows) {
+    nb::list kept;
+    const Work &work = buffers.work;
+    require(work.m == y.shape[0] && work.n == work.m && rows.type == NPY_DOUBLE && work.stages >= 1,
+            "take_steps: y or rows do not fit the buffers");
+    require_scheme(name, work.n);
+    const FixedSteps steps = steps_of(record, rows, work.n);
+    System system;
+    std::optional<PythonFunctions> in_python;
+    if (truth(functions, "native")) {
+        read_pointers(functions, work, 0, kept, system);
+    } else {
+        in_python.emplace(functions, buffers.owner(), work, NPY_DOUBLE, kept);
+        system.python = &*in_python;
+    }
+    const FloatingPoint mode;
+    Callee callee{system, work};
+    try {
+        Unlocked others(!in_python);
+        drive_by_name(name, callee, constant, steps, y.data, others);
+    } catch (const Broken &) {
+        raise_broken(system);
+    }
+    return callee.evaluations;
 }
 
 }  // namespace
 
-PyMethodDef comparator_functions[] = {
-    {"take_steps", take_steps, METH_VARARGS, take_steps_doc},
-    {nullptr, nullptr, 0, nullptr},
-};
+void add_comparators(nb::module_ module) {
+    module.def("take_steps", take_steps, "scheme"_a, "constant"_a, "functions"_a, "work"_a, "steps"_a, "y"_a, "rows"_a,
+               "Take all steps from y, which moves; rows (saved, n) receives the states to save. Returns the number of "
+               "evaluations.");
+}
 
 }  // namespace eip

@@ -2,11 +2,12 @@
 //
 // Sums are those of blocks of a few hundred points, each in lanes of its own: the same bits on every machine, and the
 // error of a sum over a few hundred numbers, not of one over all.
-#include "../functions.hpp"
+#include "../module.hpp"
+
+#include <nanobind/stl/array.h>
 
 #include <cmath>
 
-#include "../arguments.hpp"
 #include "../pairs.hpp"
 
 namespace eip {
@@ -365,24 +366,23 @@ std::array<double, 5> quartic_sums(ConstField psi, ConstField p) {
 
 }  // namespace
 
-PyMethodDef condensate_functions[] = {
-    bound<"multiply", multiply>("multiply(field, factor)"),
-    bound<"derivative", derivative>("derivative(rest, psi, V, beta, out)"),
-    bound<"derivative_at_once", derivative_at_once>("derivative_at_once(psi, V, beta, out)"),
-    bound<"add_potential", add_potential>("add_potential(psi, V, beta, out)"),
-    bound<"local_flow", local_flow>("local_flow(psi, V, beta, h)"),
-    bound<"turn", turn>("turn(f, factor, out)"),
-    bound<"divide_by_root", divide_by_root>("divide_by_root(a, psi, V, beta, shift, out)"),
-    bound<"rotate", rotate>("rotate(a, b, c, s)"),
-    bound<"moments", moments>("moments(psi, f) -> tuple"),
-    bound<"total_mass", total_mass>("total_mass(psi) -> float"),
-    bound<"expansion", expansion>("expansion(psi, near, f) -> tuple"),
-    bound<"shifted", shifted>("shifted(psi, f, a, b, out) -> tuple"),
-    bound<"inner", inner>("inner(a, b) -> float"),
-    bound<"weighted_square", weighted_square>("weighted_square(field, weight) -> float"),
-    bound<"interaction_energy", interaction_energy>("interaction_energy(psi, V, beta) -> float"),
-    bound<"quartic_sums", quartic_sums>("quartic_sums(psi, p) -> tuple"),
-    {nullptr, nullptr, 0, nullptr},
-};
+void add_condensates(nb::module_ module) {
+    module.def("multiply", multiply, "field"_a, "factor"_a);
+    module.def("derivative", derivative, "rest"_a, "psi"_a, "V"_a, "beta"_a, "out"_a);
+    module.def("derivative_at_once", derivative_at_once, "psi"_a, "V"_a, "beta"_a, "out"_a);
+    module.def("add_potential", add_potential, "psi"_a, "V"_a, "beta"_a, "out"_a);
+    module.def("local_flow", local_flow, "psi"_a, "V"_a, "beta"_a, "h"_a);
+    module.def("turn", turn, "f"_a, "factor"_a, "out"_a);
+    module.def("divide_by_root", divide_by_root, "a"_a, "psi"_a, "V"_a, "beta"_a, "shift"_a, "out"_a);
+    module.def("rotate", rotate, "a"_a, "b"_a, "c"_a, "s"_a);
+    module.def("moments", moments, "psi"_a, "f"_a);
+    module.def("total_mass", total_mass, "psi"_a);
+    module.def("expansion", expansion, "psi"_a, "near"_a, "f"_a);
+    module.def("shifted", shifted, "psi"_a, "f"_a, "a"_a, "b"_a, "out"_a);
+    module.def("inner", inner, "a"_a, "b"_a);
+    module.def("weighted_square", weighted_square, "field"_a, "weight"_a);
+    module.def("interaction_energy", interaction_energy, "psi"_a, "V"_a, "beta"_a);
+    module.def("quartic_sums", quartic_sums, "psi"_a, "p"_a);
+}
 
 }  // namespace eip
