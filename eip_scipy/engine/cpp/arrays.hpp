@@ -84,13 +84,15 @@ constexpr int TYPE = std::is_same_v<std::remove_const_t<T>, double>    ? NPY_DOU
 constexpr auto NUMBERS = nb::detail::const_name("numpy.typing.NDArray[numpy.inexact]");
 constexpr auto FLOATS = nb::detail::const_name("numpy.typing.NDArray[numpy.float64]");
 constexpr auto INTEGERS = nb::detail::const_name("numpy.typing.NDArray[numpy.int64]");
+constexpr auto UNSIGNED = nb::detail::const_name("numpy.typing.NDArray[numpy.uint64]");
 
 // An argument of a function in Python: an array of T and so many axes, which is written to unless T is const. Where T is
 // double and `STATES`, one of a state's type, float64 or complex128; complex numbers are pairs of floats here.
 template <class T, int AXES, bool STATES = false>
 struct ArrayOf {
-    static constexpr auto ARGUMENT =
-        nb::detail::const_name<STATES>(NUMBERS, nb::detail::const_name<TYPE<T> == NPY_DOUBLE>(FLOATS, INTEGERS));
+    static constexpr auto ARGUMENT = nb::detail::const_name<STATES>(
+        NUMBERS, nb::detail::const_name<TYPE<T> == NPY_DOUBLE>(
+                     FLOATS, nb::detail::const_name<TYPE<T> == NPY_INT64>(INTEGERS, UNSIGNED)));
     T *data;
     const npy_intp *shape;
     int type;

@@ -77,36 +77,194 @@ void require_shape(const Array &array, const char *name, Lengths shape) {
 class Engine {
   public:
     Engine(nb::object method, nb::object options, nb::object work, nb::object functions, nb::object schedule,
-           nb::object hooks);
+           nb::object hooks) {
+        for (const nb::object &object : {method, options, work, functions, schedule, hooks}) kept_.append(object);
+        const Buffers &buffers = buffers_of(work);
+        type_ = buffers.type;
+        data_.work = buffers.work;
+        const bool has_tableau = hooks.is_none() || nb::object(hooks.attr("one_step")).is_none();
+        data_.method = method_of(method, has_tableau, kept_);
+        require(data_.method.stages == data_.work.stages, "engine: work has room for another number of stages");
+        data_.options = options_of(options, data_.work, buffers.blocks, kept_);
+        if (!schedule.is_none()) schedule_ = schedule_of(schedule, kept_);
+        System &system = data_.system;
+        const int64_t events = schedule_ ? schedule_->n_events : 0;
+        const bool native = truth(functions, "native");
+        const nb::object python = native ? nb::object(functions.attr("python")) : functions;
+        if (native) read_pointers(functions, data_.work, python.is_none() ? events : 0, kept_, system);
+        if (!python.is_none()) {
+            functions_ = std::make_unique<PythonFunctions>(python, buffers.owner(), data_.work, type_, kept_);
+            system.python = functions_.get();
+            require(functions_->events() == events, "engine: another number of events than their values have room for");
+        }
+        if (!hooks.is_none()) {
+            const Run steps{data_.method, data_.options, data_.work, data_.system, nullptr};
+            hooks_ = std::make_unique<PythonHooks>(hooks, buffers, steps, kept_);
+        }
+        const nb::object multistep = method.attr("multistep");
+        if (!multistep.is_none()) {
+            data_.multistep = multistep_of(multistep, data_.work, kept_);
+            data_.method.multistep = &data_.multistep;
+            const bool jacobian = native ? system.jacobian_pointer.pointer || system.jacobian_pointer.library
+                                         : functions_->has_jacobian();
+            require(!hooks_ && data_.options.compensated && (data_.multistep.count == 0 || jacobian),
+                    "engine: the options do not fit a multistep method");
+        }
+        require(!(data_.method.nystrom || system.second_order) || data_.work.m % 2 == 0,
+                "engine: a state of positions and velocities has an even length");
+    }
+
+    // Nothing is called from now on.
+    void clear() {
+        busy_ = interpolating_ = true;
+        eight_.reset();
+        functions_.reset();
+        hooks_.reset();
+        kept_.reset();
+    }
 
     int advance(int64_t k_end, State y, State y_new, ArrayOf<double, 1> t_saved, StatesOf<double, 2> y_saved,
-                std::optional<ArrayOf<double, 2>> pieces);
-    int sweep(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved);
-    int sweep_octets(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved);
-    void side_by_side(nb::object functions);
-    std::tuple<int, double, Array, Array> step(int64_t k, double t, ConstState y, ConstState f);
-    int project(double t_old, ConstState y, double t, bool last, State y_new);
-    void close(double t_new, State y_new, bool project, int status);
+                std::optional<ArrayOf<double, 2>> pieces) {
+        const Busy busy(busy_);
+        double *from = checked(y, "y"), *to = checked(y_new, "y_new");
+        const Saved saved{t_saved.data, checked(y_saved, "y_saved", t_saved.shape[0]), t_saved.shape[0]};
+        if (samples_) {
+            require(pieces.has_value(), "engine: pieces are missing");
+            require_shape(*pieces, "pieces", {pieces->shape[0], dense().floats()});
+            samples_->interpolants.first = pieces->data;
+            samples_->interpolants.capacity = pieces->shape[0];
+        }
+        check_room(saved);
+        if (hooks_) hooks_->set_state(y_new.object);
+        return stepped([&](const Run &run) { return advance_run(run, samples(), *schedule_, k_end, from, to, saved); });
+    }
+
+    int sweep(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved) {
+        const Busy busy(busy_);
+        nb::list kept;
+        double *from = checked(y, "y"), *to = checked(y_new, "y_new");
+        const Members all = swept(members, steps, t_saved, kept);
+        require(!functions_ && !hooks_ && (schedule().n_events == 0 || samples_),
+                "engine: members are swept by native functions");
+        check_room(all.saved(0, data_.work));
+        if (samples_) samples_->interpolants.capacity = 0;
+        return stepped([&](const Run &run) { return sweep_members(run, samples(), *schedule_, all, steps, from, to); });
+    }
+
+    void side_by_side(nb::object functions) {
+        const Busy busy(busy_);
+        kept_.append(functions);
+        eight_ = std::make_unique<Eight>(data_.method, data_.options, data_.work, octet_system_of(functions, data_));
+    }
+
+    int sweep_octets(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved) {
+        const Busy busy(busy_);
+        nb::list kept;
+        const Schedule &s = schedule();
+        double *from = checked(y, "y"), *to = checked(y_new, "y_new");
+        const Members all = swept(members, steps, t_saved, kept);
+        const bool fixed = s.span.h != 0.0 && s.n_events == 0 && (s.n_eval == 0 || (samples_ && all.kept));
+        const int64_t saved = s.n_eval > 0 ? s.n_eval : s.save_every > 0 ? s.span.n_steps / s.save_every + 2 : 2;
+        require(eight_ && fixed && (!all.kept || all.n_rows >= saved),
+                "engine: members side by side take fixed steps, and need room for all rows");
+        if (samples_) samples_->interpolants.capacity = 0;
+        const Octets octets{*eight_, samples()};
+        return stepped([&](const Run &run) { return sweep_eights(run, octets, s, all, steps, from, to); });
+    }
+
+    void sample(nb::object dense) {
+        const Busy busy(busy_), interpolating(interpolating_);
+        kept_.append(dense);
+        samples_ = samples_of(dense, data_, schedule_ ? schedule_->n_events : 0, type_, kept_);
+        if (functions_) functions_->add_owner(buffers_of(dense.attr("work")).owner(), kept_);
+    }
+
+    void describe(double t_old, ConstState y_old, double t, ConstState y, ArrayOf<double, 1> piece) {
+        const Busy busy(busy_), interpolating(interpolating_);
+        const Dense &d = dense();
+        const double *from = checked(y_old, "y_old"), *to = checked(y, "y");
+        require_shape(piece, "piece", {d.floats()});
+        stepped([&](const Run &run) { return describe_step(run, d, t_old, from, t, to, piece.data), OK; });
+    }
+
+    void show(double t, ConstState y, State out) {
+        const Busy busy(busy_), interpolating(interpolating_);
+        dense();
+        const double *from = checked(y, "y");
+        double *to = checked(out, "out");
+        const int64_t end = schedule().place[PENDING] == 1;
+        stepped([&](const Run &run) { return show_state(run, *samples_, end, t, from, to), OK; });
+    }
+
+    void interpolate(ArrayOf<double, 1> piece, Times t, StatesOf<double, 2> out) {
+        const Busy interpolating(interpolating_);
+        const Dense &d = dense();
+        require_shape(piece, "piece", {d.floats()});
+        double *states = checked(out, "out", t.shape[0]);
+        stepped([&](const Run &run) { return interpolate_step(run, d, piece.data, t.data, t.shape[0], states), OK; });
+    }
+
+    std::tuple<int, double, Array, Array> step(int64_t k, double t, ConstState y, ConstState f) {
+        const Busy busy(busy_);
+        const Work &w = data_.work;
+        const Schedule &s = schedule();
+        const double *from = checked(y, "y");
+        copy(checked(f, "f"), w.row(0), w.m);
+        s.clock[TIME] = t;
+        Array y_new = new_array({w.n}, type_), f_new = new_array({w.n}, type_);
+        if (hooks_) hooks_->set_state(y_new);
+        const Code code = stepped([&](const Run &run) { return step_once(run, s, k, from, y_new.floats()); });
+        copy(w.last(), f_new.floats(), w.m);
+        return {code, s.clock[TIME_NEW], std::move(y_new), std::move(f_new)};
+    }
+
+    int project(double t_old, ConstState y, double t, bool last, State y_new) {
+        const Step step{t_old, t, t - t_old, checked(y, "y"), checked(y_new, "y_new"), true, last};
+        if (hooks_) hooks_->set_state(y_new.object);
+        return stepped([&](const Run &run) { return project_once(run, step); });
+    }
+
+    void close(double t_new, State y_new, bool project, int status) {
+        const Step step{0.0, t_new, 0.0, nullptr, checked(y_new, "y_new"), project, false};
+        stepped([&](const Run &run) { return close_once(run, step, static_cast<Code>(status)), OK; });
+    }
+
     void values(Times t, StatesOf<const double, 2> y, ArrayOf<double, 2> out,
-                std::optional<ArrayOf<const double, 2>> params);
-    void start(ConstState y, ConstState f, double tau);
-    void sample(nb::object dense);
-    void describe(double t_old, ConstState y_old, double t, ConstState y, ArrayOf<double, 1> piece);
-    void interpolate(ArrayOf<double, 1> piece, Times t, StatesOf<double, 2> out);
-    void show(double t, ConstState y, State out);
+                std::optional<ArrayOf<const double, 2>> params) {
+        const Busy busy(busy_);
+        const Work &w = data_.work;
+        const System &system = data_.system;
+        const npy_intp rows = t.shape[0];
+        const double *states = checked(y, "y", rows);
+        require_shape(out, "out", {rows, w.l});
+        const double *given = params && system.n_params > 0 ? params->data : nullptr;
+        if (given) require_shape(*params, "params", {rows, system.n_params});
+        stepped([&](const Run &run) {
+            for (npy_intp k = 0; k < rows; ++k) {
+                if (given) copy(given + k * system.n_params, system.params, system.n_params);
+                run.system.inv(run.work, t.data[k], states + k * w.m, out.data + k * w.l);
+            }
+            return OK;
+        });
+    }
+
+    void start(ConstState y, ConstState f, double tau) {
+        const Busy busy(busy_);
+        start_figures(checked(y, "y"), checked(f, "f"), tau, data_.method, hooks_.get(), data_.options, data_.work);
+    }
 
     // What the garbage collector asks for.
     nb::handle kept() const { return kept_; }
-    void clear();
 
   private:
-    // Members of an ensemble as a sweep takes them.
-    Members swept(nb::handle members, int64_t steps, const ArrayOf<double, 1> &t_saved, nb::list &kept);
-
-    template <class Array>
-    auto *checked(const Array &array, const char *name) const {
-        require(array.type == type_, "engine: a state is of another type than the run's");
-        require_shape(array, name, {data_.work.n});
+    // The memory of a state, or of `rows` of them.
+    template <class T, int AXES>
+    T *checked(const StatesOf<T, AXES> &array, const char *name, npy_intp rows = 1) const {
+        if (array.type != type_) refuse(PyExc_ValueError, "engine: %s is of another type than the run's states", name);
+        if constexpr (AXES == 1)
+            require_shape(array, name, {data_.work.n});
+        else
+            require_shape(array, name, {rows, data_.work.n});
         return array.data;
     }
     const Schedule &schedule() const {
@@ -118,7 +276,27 @@ class Engine {
         return samples_->dense;
     }
     Samples *samples() { return samples_ ? &*samples_ : nullptr; }
-    void check_room(const Saved &saved);
+
+    // Counts that Python may have written, before the loop goes by them.
+    void check_room(const Saved &saved) {
+        const int64_t row = schedule().place[ROW];
+        bool good = row >= 0 && row <= saved.rows && schedule().n_eval < std::max<int64_t>(saved.rows, 1);
+        if (data_.method.multistep) check_history(*data_.method.multistep);
+        if (samples_) {
+            const int64_t roots = *samples_->roots.count, pieces = *samples_->interpolants.count;
+            good &= roots >= 0 && pieces >= 0 && pieces <= samples_->interpolants.capacity;
+        }
+        require(good, "engine: place or counts are outside the rows, or there are too few");
+    }
+
+    // Members of an ensemble as a sweep takes them.
+    Members swept(nb::handle members, int64_t steps, const ArrayOf<double, 1> &t_saved, nb::list &kept) {
+        const int64_t rows = t_saved.shape[0];
+        Members found = members_of(members, data_, schedule(), rows, type_, kept);
+        found.t_saved = t_saved.data;
+        require(steps >= 1 && rows >= 2, "engine: members need a step or more, and two rows or more");
+        return found;
+    }
 
     // Make a step or more by `call`, which takes a Run, without the GIL if no function is Python's.
     template <class Call>
@@ -144,205 +322,6 @@ class Engine {
     int type_ = NPY_DOUBLE;
     bool busy_ = false, interpolating_ = false;
 };
-
-Engine::Engine(nb::object method, nb::object options, nb::object work, nb::object functions, nb::object schedule,
-               nb::object hooks) {
-    for (const nb::object &object : {method, options, work, functions, schedule, hooks}) kept_.append(object);
-    const Buffers &buffers = buffers_of(work);
-    type_ = buffers.type;
-    data_.work = buffers.work;
-    const bool has_tableau = hooks.is_none() || nb::object(hooks.attr("one_step")).is_none();
-    data_.method = method_of(method, has_tableau, kept_);
-    require(data_.method.stages == data_.work.stages, "engine: work has room for another number of stages");
-    data_.options = options_of(options, data_.work, buffers.blocks, kept_);
-    if (!schedule.is_none()) schedule_ = schedule_of(schedule, kept_);
-    System &system = data_.system;
-    const int64_t events = schedule_ ? schedule_->n_events : 0;
-    const bool native = truth(functions, "native");
-    const nb::object python = native ? nb::object(functions.attr("python")) : functions;
-    if (native) read_pointers(functions, data_.work, python.is_none() ? events : 0, kept_, system);
-    if (!python.is_none()) {
-        functions_ = std::make_unique<PythonFunctions>(python, buffers.owner(), data_.work, type_, kept_);
-        system.python = functions_.get();
-        require(functions_->events() == events, "engine: another number of events than their values have room for");
-    }
-    if (!hooks.is_none()) {
-        const Run steps{data_.method, data_.options, data_.work, data_.system, nullptr};
-        hooks_ = std::make_unique<PythonHooks>(hooks, buffers, steps, kept_);
-    }
-    const nb::object multistep = method.attr("multistep");
-    if (!multistep.is_none()) {
-        data_.multistep = multistep_of(multistep, data_.work, kept_);
-        data_.method.multistep = &data_.multistep;
-        const bool jacobian =
-            native ? system.jacobian_pointer.pointer || system.jacobian_pointer.library : functions_->has_jacobian();
-        require(!hooks_ && data_.options.compensated && (data_.multistep.count == 0 || jacobian),
-                "engine: the options do not fit a multistep method");
-    }
-    require(!(data_.method.nystrom || system.second_order) || data_.work.m % 2 == 0,
-            "engine: a state of positions and velocities has an even length");
-}
-
-void Engine::clear() {
-    eight_.reset();
-    functions_.reset();
-    hooks_.reset();
-    kept_.reset();
-}
-
-// Counts that Python may have written, before the loop goes by them.
-void Engine::check_room(const Saved &saved) {
-    const int64_t row = schedule().place[ROW];
-    bool good = row >= 0 && row <= saved.rows && schedule().n_eval < std::max<int64_t>(saved.rows, 1);
-    if (data_.method.multistep) check_history(*data_.method.multistep);
-    if (samples_) {
-        const int64_t roots = *samples_->roots.count, pieces = *samples_->interpolants.count;
-        good &= roots >= 0 && pieces >= 0 && pieces <= samples_->interpolants.capacity;
-    }
-    require(good, "engine: place or counts are outside the rows, or there are too few");
-}
-
-int Engine::advance(int64_t k_end, State y, State y_new, ArrayOf<double, 1> t_saved, StatesOf<double, 2> y_saved,
-                    std::optional<ArrayOf<double, 2>> pieces) {
-    const Busy busy(busy_);
-    double *from = checked(y, "y"), *to = checked(y_new, "y_new");
-    const Saved saved{t_saved.data, y_saved.data, t_saved.shape[0]};
-    require(y_saved.type == type_, "engine: y_saved is of another type than the run's states");
-    require_shape(y_saved, "y_saved", {saved.rows, data_.work.n});
-    if (samples_) {
-        require(pieces.has_value(), "engine: pieces are missing");
-        require_shape(*pieces, "pieces", {pieces->shape[0], dense().floats()});
-        samples_->interpolants.first = pieces->data;
-        samples_->interpolants.capacity = pieces->shape[0];
-    }
-    check_room(saved);
-    if (hooks_) hooks_->set_state(y_new.object);
-    return stepped([&](const Run &run) { return advance_run(run, samples(), *schedule_, k_end, from, to, saved); });
-}
-
-Members Engine::swept(nb::handle members, int64_t steps, const ArrayOf<double, 1> &t_saved, nb::list &kept) {
-    const int64_t rows = t_saved.shape[0];
-    Members found = members_of(members, data_, schedule(), rows, type_, kept);
-    found.t_saved = t_saved.data;
-    require(steps >= 1 && rows >= 2, "engine: members need a step or more, and two rows or more");
-    return found;
-}
-
-int Engine::sweep(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved) {
-    const Busy busy(busy_);
-    nb::list kept;
-    double *from = checked(y, "y"), *to = checked(y_new, "y_new");
-    const Members all = swept(members, steps, t_saved, kept);
-    require(!functions_ && !hooks_ && (schedule().n_events == 0 || samples_),
-            "engine: members are swept by native functions");
-    check_room(all.saved(0, data_.work));
-    if (samples_) samples_->interpolants.capacity = 0;
-    return stepped([&](const Run &run) { return sweep_members(run, samples(), *schedule_, all, steps, from, to); });
-}
-
-void Engine::side_by_side(nb::object functions) {
-    const Busy busy(busy_);
-    kept_.append(functions);
-    eight_ = std::make_unique<Eight>(data_.method, data_.options, data_.work, octet_system_of(functions, data_));
-}
-
-int Engine::sweep_octets(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved) {
-    const Busy busy(busy_);
-    nb::list kept;
-    const Schedule &s = schedule();
-    double *from = checked(y, "y"), *to = checked(y_new, "y_new");
-    const Members all = swept(members, steps, t_saved, kept);
-    const bool fixed = s.span.h != 0.0 && s.n_events == 0 && (s.n_eval == 0 || (samples_ && all.kept));
-    const int64_t saved = s.n_eval > 0 ? s.n_eval : s.save_every > 0 ? s.span.n_steps / s.save_every + 2 : 2;
-    require(eight_ && fixed && (!all.kept || all.n_rows >= saved),
-            "engine: members side by side take fixed steps, and need room for all rows");
-    if (samples_) samples_->interpolants.capacity = 0;
-    const Octets octets{*eight_, samples()};
-    return stepped([&](const Run &run) { return sweep_eights(run, octets, s, all, steps, from, to); });
-}
-
-void Engine::sample(nb::object dense) {
-    const Busy busy(busy_), interpolating(interpolating_);
-    kept_.append(dense);
-    samples_ = samples_of(dense, data_, schedule_ ? schedule_->n_events : 0, type_, kept_);
-    if (functions_) functions_->add_owner(buffers_of(dense.attr("work")).owner(), kept_);
-}
-
-void Engine::describe(double t_old, ConstState y_old, double t, ConstState y, ArrayOf<double, 1> piece) {
-    const Busy busy(busy_), interpolating(interpolating_);
-    const Dense &d = dense();
-    const double *from = checked(y_old, "y_old"), *to = checked(y, "y");
-    require_shape(piece, "piece", {d.floats()});
-    stepped([&](const Run &run) { return describe_step(run, d, t_old, from, t, to, piece.data), OK; });
-}
-
-void Engine::show(double t, ConstState y, State out) {
-    const Busy busy(busy_), interpolating(interpolating_);
-    dense();
-    const double *from = checked(y, "y");
-    double *to = checked(out, "out");
-    const int64_t end = schedule().place[PENDING] == 1;
-    stepped([&](const Run &run) { return show_state(run, *samples_, end, t, from, to), OK; });
-}
-
-void Engine::interpolate(ArrayOf<double, 1> piece, Times t, StatesOf<double, 2> out) {
-    const Busy interpolating(interpolating_);
-    const Dense &d = dense();
-    require_shape(piece, "piece", {d.floats()});
-    require(out.type == type_, "engine: out is of another type than the run's states");
-    require_shape(out, "out", {t.shape[0], d.work.n});
-    stepped([&](const Run &run) { return interpolate_step(run, d, piece.data, t.data, t.shape[0], out.data), OK; });
-}
-
-std::tuple<int, double, Array, Array> Engine::step(int64_t k, double t, ConstState y, ConstState f) {
-    const Busy busy(busy_);
-    const Work &w = data_.work;
-    const Schedule &s = schedule();
-    const double *from = checked(y, "y");
-    copy(checked(f, "f"), w.row(0), w.m);
-    s.clock[TIME] = t;
-    Array y_new = new_array({w.n}, type_), f_new = new_array({w.n}, type_);
-    if (hooks_) hooks_->set_state(y_new);
-    const Code code = stepped([&](const Run &run) { return step_once(run, s, k, from, y_new.floats()); });
-    copy(w.last(), f_new.floats(), w.m);
-    return {code, s.clock[TIME_NEW], std::move(y_new), std::move(f_new)};
-}
-
-int Engine::project(double t_old, ConstState y, double t, bool last, State y_new) {
-    const Step step{t_old, t, t - t_old, checked(y, "y"), checked(y_new, "y_new"), true, last};
-    if (hooks_) hooks_->set_state(y_new.object);
-    return stepped([&](const Run &run) { return project_once(run, step); });
-}
-
-void Engine::close(double t_new, State y_new, bool project, int status) {
-    const Step step{0.0, t_new, 0.0, nullptr, checked(y_new, "y_new"), project, false};
-    stepped([&](const Run &run) { return close_once(run, step, static_cast<Code>(status)), OK; });
-}
-
-void Engine::values(Times t, StatesOf<const double, 2> y, ArrayOf<double, 2> out,
-                    std::optional<ArrayOf<const double, 2>> params) {
-    const Busy busy(busy_);
-    const Work &w = data_.work;
-    const System &system = data_.system;
-    const npy_intp rows = t.shape[0];
-    require(y.type == type_, "engine: y is of another type than the run's states");
-    require_shape(y, "y", {rows, w.n});
-    require_shape(out, "out", {rows, w.l});
-    const double *given = params && system.n_params > 0 ? params->data : nullptr;
-    if (given) require_shape(*params, "params", {rows, system.n_params});
-    stepped([&](const Run &run) {
-        for (npy_intp k = 0; k < rows; ++k) {
-            if (given) copy(given + k * system.n_params, system.params, system.n_params);
-            run.system.inv(run.work, t.data[k], y.data + k * w.m, out.data + k * w.l);
-        }
-        return OK;
-    });
-}
-
-void Engine::start(ConstState y, ConstState f, double tau) {
-    const Busy busy(busy_);
-    start_figures(checked(y, "y"), checked(f, "f"), tau, data_.method, hooks_.get(), data_.options, data_.work);
-}
 
 int traverse(PyObject *self, visitproc visit, void *arg) {
     Py_VISIT(Py_TYPE(self));

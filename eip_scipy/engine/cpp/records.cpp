@@ -18,8 +18,7 @@ namespace {
         refuse(PyExc_TypeError, "engine: %s is %.80R; expected an array, %S of shape %S", name, object.ptr(),
                dtype.ptr(), wanted.ptr());
     const nb::object has = object.attr("dtype"), came = object.attr("shape");
-    refuse(PyExc_ValueError,
-           "engine: %s is %S of shape %S; expected writable, aligned, C-contiguous %S of shape %S (0: perhaps any)",
+    refuse(PyExc_ValueError, "engine: %s is %S of shape %S; expected writable, aligned, C-contiguous %S of shape %S",
            name, has.ptr(), came.ptr(), dtype.ptr(), wanted.ptr());
 }
 
@@ -128,15 +127,11 @@ class Names {
     template <class T, class... Axes>
         requires(sizeof...(Axes) > 0)
     void operator()(const char *name, T *&, Axes...) {
-        constexpr int type = TYPE<T>;
-        add(name, type == NPY_DOUBLE  ? "numpy.typing.NDArray[numpy.float64]"
-                  : type == NPY_INT64 ? "numpy.typing.NDArray[numpy.int64]"
-                                      : "numpy.typing.NDArray[numpy.uint64]");
+        add(name, ArrayOf<T, 1>::ARGUMENT.text);
     }
-
     template <class... Axes>
     void states(const char *name, double *&, Axes...) {
-        add(name, "numpy.typing.NDArray[numpy.inexact]");
+        add(name, NUMBERS.text);
     }
     template <class Record>
     void record(const char *name, const char *type, Record &) {
@@ -407,22 +402,7 @@ namespace {
 // One for each buffer, so that a sanitizer sees where each one ends.
 using Memory = std::vector<std::vector<double>>;
 
-struct Maker {
-    Memory &memory;
-    int64_t width;
-
-    template <class T>
-    void operator()(const char *, T *&place, std::initializer_list<int64_t> shape, int64_t each = 1) {
-        int64_t count = each;
-        for (const int64_t length : shape) count *= length;
-        place = reinterpret_cast<T *>(memory.emplace_back(std::max<int64_t>(count, 1)).data());
-    }
-    void states(const char *name, double *&place, std::initializer_list<int64_t> shape) {
-        (*this)(name, place, shape, width);
-    }
-};
-
-// Calls `found(name, place, type, lengths)` for each buffer.
+// Calls `found(name, place, type, shape)` for each buffer.
 template <class Found>
 struct Finder {
     Found found;
@@ -430,24 +410,17 @@ struct Finder {
 
     template <class T>
     void operator()(const char *name, T *&place, std::initializer_list<int64_t> shape) {
-        found(name, place, TYPE<T>, shape);
+        found(name, place, TYPE<T>, std::span(shape));
     }
     void states(const char *name, double *&place, std::initializer_list<int64_t> shape) {
-        found(name, place, type, shape);
+        found(name, place, type, std::span(shape));
     }
 };
 
-template <class SomeBuffers, class Found>
-void for_each_buffer(SomeBuffers &buffers, Found found) {
-    Work work = buffers.work;
-    Finder<Found> finder{found, buffers.type};
-    each_buffer(work, buffers.blocks, finder);
-    if constexpr (!std::is_const_v<SomeBuffers>) buffers.work = work;
-}
-
-Array array_of(const Buffers &buffers, void *place, int type, std::initializer_list<int64_t> shape) {
-    const std::vector<npy_intp> lengths(shape.begin(), shape.end());
-    return view(place, static_cast<int>(shape.size()), lengths.data(), type, buffers.owner());
+template <class Found>
+void for_each_buffer(Work &work, int64_t blocks, int type, Found found) {
+    Finder<Found> finder{found, type};
+    each_buffer(work, blocks, finder);
 }
 
 }  // namespace
@@ -456,16 +429,19 @@ Buffers::Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants
     require(n >= 0 && stages >= 0 && invariants >= 0 && blocks >= 0, "engine: a negative number of buffers");
     PyArray_Descr *found = nullptr;
     if (!PyArray_DescrConverter(dtype.ptr(), &found)) throw nb::python_error();
-    type = nb::steal(reinterpret_cast<PyObject *>(found)).is_valid() ? found->type_num : 0;
+    const auto kept = owned(reinterpret_cast<PyObject *>(found));
+    type = found->type_num;
     require(type == NPY_DOUBLE || type == NPY_CDOUBLE, "engine: a state is of float64 or complex128");
-    const int64_t width = type == NPY_CDOUBLE ? 2 : 1;
     work.n = n;
-    work.m = n * width;
+    work.m = type == NPY_CDOUBLE ? 2 * n : n;
     work.l = invariants;
     work.stages = stages;
     auto own = std::make_unique<Memory>();
-    Maker maker{*own, width};
-    each_buffer(work, blocks, maker);
+    for_each_buffer(work, blocks, type, [&own]<class T>(const char *, T *&place, int type, auto shape) {
+        int64_t count = type == NPY_CDOUBLE ? 2 : 1;
+        for (const int64_t length : shape) count *= length;
+        place = reinterpret_cast<T *>(own->emplace_back(std::max<int64_t>(count, 1)).data());
+    });
     owner_ = nb::capsule(own.get(), [](void *memory) noexcept { delete static_cast<Memory *>(memory); });
     own.release();
     fill(work.sigma, 1.0, work.m);
@@ -486,27 +462,28 @@ nb::tuple Buffers::state() const {
 }
 
 const nb::dict &Buffers::arrays() const {
-    if (arrays_.size() == 0)
-        for_each_buffer(*this, [&](const char *name, auto *place, int type, std::initializer_list<int64_t> shape) {
-            arrays_[name] = array_of(*this, place, type, shape);
-        });
+    if (arrays_.size() > 0) return arrays_;
+    Work own = work;
+    for_each_buffer(own, blocks, type, [this](const char *name, auto *place, int type, auto shape) {
+        const std::vector<npy_intp> lengths(shape.begin(), shape.end());
+        arrays_[name] = view(place, static_cast<int>(lengths.size()), lengths.data(), type, owner_);
+    });
     return arrays_;
+}
+
+void Buffers::share(const Buffers &other, const nb::set &names) {
+    require(other.work.l == work.l, "engine: buffers of other lengths are not shared");
+    for_each_buffer(work, blocks, type, [&]<class T>(const char *name, T *&place, int, auto) {
+        if (names.contains(name)) place = static_cast<T *>(PyArray_DATA(other.array(name).get()));
+    });
+    owner_ = nb::make_tuple(owner_, other.owner_);
+    arrays_.clear();
 }
 
 const Buffers &buffers_of(nb::handle work) {
     const Buffers *found = nullptr;
     if (!nb::try_cast(work, found) || !found) throw nb::type_error("engine: work is no Work");
     return *found;
-}
-
-void Buffers::share(const Buffers &other, const nb::set &names) {
-    require(other.work.l == work.l, "engine: buffers of other lengths are not shared");
-    for_each_buffer(*this, [&](const char *name, auto *&place, int, std::initializer_list<int64_t>) {
-        if (names.contains(name))
-            place = static_cast<std::remove_reference_t<decltype(place)>>(PyArray_DATA(other.array(name).get()));
-    });
-    owner_ = nb::make_tuple(owner_, other.owner_);
-    arrays_.clear();
 }
 
 void add_records(nb::module_ &module) {
@@ -528,17 +505,12 @@ void add_records(nb::module_ &module) {
         .def("share", &Buffers::share, "other"_a, "names"_a, "Use the buffers of these names of others from now on.")
         .def("__getstate__", &Buffers::state)
         .def("__setstate__", [](Buffers &own, const nb::tuple &state) { new (&own) Buffers(state); });
-    const auto add = [&type](const char *name, auto *, int number, std::initializer_list<int64_t>) {
-        const std::string of = number == NPY_INT64    ? "numpy.int64"
-                               : number == NPY_DOUBLE ? "numpy.float64"
-                                                      : "typing.Any";
-        type.def_prop_ro(
-            name, [name](const Buffers &own) { return own.array(name); },
-            nb::sig(("def " + std::string(name) + "(self, /) -> numpy.typing.NDArray[" + of + "]").c_str()));
-    };
-    const nb::object dtype = nb::module_::import_("numpy").attr("dtype")("complex128");
-    const Buffers any(0, dtype, 0, 0, 0);
-    for_each_buffer(any, add);
+    Work any{};
+    for_each_buffer(any, 0, NPY_CDOUBLE, [&type](const char *name, auto *, int number, auto) {
+        const char *array = number == NPY_INT64 ? INTEGERS.text : number == NPY_DOUBLE ? FLOATS.text : "numpy.ndarray";
+        const std::string signature = "def " + std::string(name) + "(self, /) -> " + array;
+        type.def_prop_ro(name, [name](const Buffers &own) { return own.array(name); }, nb::sig(signature.c_str()));
+    });
 }
 
 }  // namespace eip

@@ -16,6 +16,8 @@ class Buffers {
   public:
     Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants, int64_t blocks);
 
+    Buffers(const Buffers &) = delete;
+    Buffers &operator=(const Buffers &) = delete;
     // Buffers with the numbers of others, which have this state.
     explicit Buffers(const nb::tuple &state);
     nb::tuple state() const;
