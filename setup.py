@@ -26,7 +26,7 @@ NANOBIND = Path(nanobind.include_dir()).parent
 INCLUDED = [str(NANOBIND / "include"), str(NANOBIND / "ext" / "robin_map" / "include")]
 if sys.platform == "win32":
     FLAGS, V3, QUICK, OLD = ["/std:c++20", "/O2", "/fp:precise"], ["/arch:AVX2"], "/O1", []
-    OTHERS, OTHERS_OWN = [f"/I{path}" for path in INCLUDED], ["/std:c++20"]
+    OTHERS, OTHERS_OWN, UNUSED = [f"/I{path}" for path in INCLUDED], ["/std:c++20"], []
 else:
     # No fused operation but those that are written, no reordering: the same bits from every build. The warnings left
     # out are about Python's own interface.
@@ -36,6 +36,7 @@ else:
     # Not our headers: without warnings. The library handles Python's objects under several types.
     OTHERS = [f"-isystem{path}" for path in INCLUDED]
     OTHERS_OWN = ["-std=c++20", "-g0", "-w", "-fvisibility=hidden", "-fno-strict-aliasing", "-ffunction-sections"]
+    UNUSED = ["-Wl,-dead_strip" if sys.platform == "darwin" else "-Wl,--gc-sections"]  # most of it is
 MISSING = """\
 eip_scipy's engine is written in C++20, and no compiler built it. Install one: g++ 12 or newer (Debian, Ubuntu: apt
 install g++; Fedora: dnf install gcc-c++), clang 15 or newer, or on macOS Xcode's tools (xcode-select --install)."""
@@ -59,6 +60,7 @@ def module(name: str, *flags: str) -> Extension:
         include_dirs=[numpy.get_include()],
         define_macros=[("EIP_MODULE", name), ("NB_DOMAIN", name), ("EIP_SOURCES", f'"{stamp()}"')],
         extra_compile_args=[*FLAGS, *OTHERS, *flags],
+        extra_link_args=UNUSED,
         language="c++",
     )
 

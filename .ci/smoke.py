@@ -29,9 +29,8 @@ files = metadata.files("eip_scipy")
 assert files is not None
 size = sum(Path(file.locate()).stat().st_size for file in files if file.suffix != ".pyc")
 assert size < MEGABYTES * 1e6, f"our own files take {size / 1e6:.1f} MB"
-assert {file.suffix for file in files} <= {".py", ".pyc", ".so", ".pyd", ".json", ".html", ".typed", ".txt", ""}, (
-    "more than the package"
-)
+SUFFIXES = {"", ".html", ".json", ".py", ".pyc", ".pyd", ".pyi", ".so", ".txt", ".typed"}
+assert {file.suffix for file in files} <= SUFFIXES, "more than the package"
 assert {"py.typed", "LICENSE"} <= {file.name for file in files}
 folders = {file.parts[0] for file in files} - {".."}  # above it the command
 assert folders == {"eip_scipy", "eip_scipy_studies", f"eip_scipy-{eip_scipy.__version__}.dist-info"}, folders

@@ -68,6 +68,18 @@ struct Sizes {
     bool tableau = true;  // whether a method has one
 };
 
+// Several places of one kind, each after its name; those of arrays after the lengths of their axes.
+template <class Visit, class Place, class... Others>
+void each(Visit &visit, const char *name, Place &place, Others &&...others) {
+    visit(name, place);
+    if constexpr (sizeof...(others) > 0) each(visit, others...);
+}
+template <class Visit, class Place, class... Others>
+void each(Visit &visit, std::initializer_list<int64_t> shape, const char *name, Place &place, Others &&...others) {
+    visit(name, place, shape);
+    if constexpr (sizeof...(others) > 0) each(visit, shape, others...);
+}
+
 // Where a run steps: t_k = t0 + k h (h = 0: adaptive steps), the last one on t_bound.
 struct Span {
     double t0, h, t_bound, sign;
@@ -84,12 +96,8 @@ struct Span {
 
 template <class Visit>
 void fields(Span &s, Visit &visit) {
-    visit("t0", s.t0);
-    visit("h", s.h);
-    visit("t_bound", s.t_bound);
-    visit("sign", s.sign);
-    visit("n_steps", s.n_steps);
-    visit("max_step", s.max_step);
+    each(visit, "t0", s.t0, "h", s.h, "t_bound", s.t_bound, "sign", s.sign, "n_steps", s.n_steps, "max_step",
+         s.max_step);
 }
 
 // What a multistep method knows of a run besides the state (multistep.hpp); weights go from the oldest node to the newest.
@@ -119,18 +127,9 @@ void fields(Multistep &ms, Visit &visit) {
     visit("shape_q", ms.shape_q, ms.order + 1);
     visit("shape_v", ms.shape_v, ms.order + 1);
     visit("size", ms.size, ms.order + 1);
-    visit("error_constant", ms.error_constant);
-    visit("growth", ms.growth);
-    visit("middle", ms.middle);
-    visit("brief", ms.brief);
-    visit("level", ms.level);
-    visit("uses_v", ms.uses_v);
-    visit("t0", ms.t0);
-    visit("h", ms.h);
-    visit("substeps", ms.substeps);
-    visit("spacing", ms.spacing);
-    visit("corrected_first", ms.first);
-    visit("corrected_count", ms.count);
+    each(visit, "error_constant", ms.error_constant, "growth", ms.growth, "middle", ms.middle, "brief", ms.brief,
+         "level", ms.level, "uses_v", ms.uses_v, "t0", ms.t0, "h", ms.h, "substeps", ms.substeps, "spacing", ms.spacing,
+         "corrected_first", ms.first, "corrected_count", ms.count);
     visit("nodes", ms.nodes, Bound{ms.rows}, Bound{ms.pitch});
     visit("sums", ms.sums, 4, ms.pitch);
     visit("predicted", ms.predicted, 3, ms.pitch);
@@ -165,9 +164,7 @@ void fields(Method &m, Visit &visit) {
     visit("e", m.e, Bound{m.n_e});
     visit("e_v", m.e_v, Bound{m.n_e_v});
     visit("e_low", m.e_low, Bound{m.n_e_low});
-    visit("nystrom", m.nystrom);
-    visit("fsal", m.fsal);
-    visit("paired", m.paired);
+    each(visit, "nystrom", m.nystrom, "fsal", m.fsal, "paired", m.paired);
     visit.in_python("multistep", "Multistep | None", true);
 }
 
@@ -181,8 +178,7 @@ template <class Visit>
 void fields(Blocks &b, Visit &visit) {
     visit("member", b.member, Bound{b.members});
     visit("start", b.start, Bound{b.starts});
-    visit("width", b.width);
-    visit("size", b.size);
+    each(visit, "width", b.width, "size", b.size);
     b.count = b.starts - 1;
 }
 
@@ -237,16 +233,9 @@ void fields(Options &o, Visit &visit) {
     visit("computed", o.computed, is.l);
     visit("most_left", o.most_left, is.l);
     visit.record("kinds", "Grouping", o.kinds);
-    visit("kappa", o.kappa);
-    visit("metric", o.metric);
-    visit("direction", o.direction);
-    visit("iterations", o.iterations);
-    visit("every", o.every);
-    visit("reuse_f", o.reuse_f);
-    visit("uses_f", o.uses_f);
-    visit("compensated", o.compensated);
-    visit("adaptive", o.adaptive);
-    visit("per_band", o.per_band);
+    each(visit, "kappa", o.kappa, "metric", o.metric, "direction", o.direction, "iterations", o.iterations, "every",
+         o.every, "reuse_f", o.reuse_f, "uses_f", o.uses_f, "compensated", o.compensated, "adaptive", o.adaptive,
+         "per_band", o.per_band);
     visit.by_default("watched", o.watched, false);
     visit.by_default("limit", o.limit, INFINITE);
     visit.by_default("far", o.far, FAR);
@@ -289,41 +278,21 @@ void each_buffer(WorkOf<V> &w, int64_t blocks, Visit &visit) {
     visit.states("y_hat", w.y_hat, {n});
     visit.states("f_point", w.f_point, {n});
     visit.states("G", w.G, {l, n});
-    visit("err", w.err, {m});
-    visit("err_low", w.err_low, {m});
-    visit("err_sum", w.err_sum, {m});
-    visit("sigma", w.sigma, {m});
-    visit("move", w.move, {m});
-    visit("carry", w.carry, {m});
-    visit("carry_hat", w.carry_hat, {m});
-    visit("scale", w.scale, {blocks});
-    visit("ratio", w.ratio, {blocks});
-    visit("memory", w.memory, {blocks});
-    visit("memory_new", w.memory_new, {blocks});
-    visit("B", w.B, {l, m});
-    visit("Q", w.Q, {l, m});
+    each(visit, {m}, "err", w.err, "err_low", w.err_low, "err_sum", w.err_sum, "sigma", w.sigma, "move", w.move,
+         "carry", w.carry, "carry_hat", w.carry_hat);
+    each(visit, {blocks}, "scale", w.scale, "ratio", w.ratio, "memory", w.memory, "memory_new", w.memory_new);
+    each(visit, {l, m}, "B", w.B, "Q", w.Q);
     visit("R", w.R, {l, l});
-    visit("inverse_norms", w.inverse_norms, {l});
-    visit("mu", w.mu, {l});
-    visit("values", w.values, {l});
-    visit("g", w.g, {l});
-    visit("band", w.band, {l});
-    visit("before", w.before, {l});
-    visit("worth", w.worth, {l});
-    visit("defect", w.defect, {l});
-    visit("max_defect", w.max_defect, {l});
-    visit("max_correction", w.max_correction, {1});
-    visit("norm", w.norm, {1});
+    each(visit, {l}, "inverse_norms", w.inverse_norms, "mu", w.mu, "values", w.values, "g", w.g, "band", w.band,
+         "before", w.before, "worth", w.worth, "defect", w.defect, "max_defect", w.max_defect);
+    each(visit, {1}, "max_correction", w.max_correction, "norm", w.norm);
     visit("trust", w.trust, {l, N_FIGURES});
     visit("suspect", w.suspect, {w.suspect_size()});
     visit("pivots", w.pivots, {l});
     visit("counters", w.counters, {N_COUNTERS});
-    visit("inner_matrix", w.inner.matrix, {l, l});
-    visit("inner_R", w.inner.R, {l, l});
-    visit("inner_g", w.inner.g, {l});
-    visit("inner_inverse_norms", w.inner.inverse_norms, {l});
-    visit("inner_mu", w.inner.mu, {l});
-    visit("inner_pivots", w.inner.pivots, {l});
+    each(visit, {l, l}, "inner_matrix", w.inner.matrix, "inner_R", w.inner.R);
+    each(visit, {l}, "inner_g", w.inner.g, "inner_inverse_norms", w.inner.inverse_norms, "inner_mu", w.inner.mu,
+         "inner_pivots", w.inner.pivots);
 }
 
 using Work = WorkOf<double>;

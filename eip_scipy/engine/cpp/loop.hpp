@@ -79,9 +79,7 @@ void fields(Samples &s, Visit &visit) {
     visit("weights", d.weights, Bound{d.polynomials}, Bound{d.columns});
     visit("c", d.c, Bound{d.further});
     visit("A", d.A, d.further, Bound{d.A_columns});
-    visit("own_slopes", d.own_slopes);
-    visit("by_travel", d.by_travel);
-    visit("shows", d.shows);
+    each(visit, "own_slopes", d.own_slopes, "by_travel", d.by_travel, "shows", d.shows);
     visit.in_python("options", "Options", false);
     visit.in_python("work", "Work", false);
     visit("missed", d.missed, 2);

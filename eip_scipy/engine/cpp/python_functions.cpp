@@ -28,14 +28,6 @@ Array copied(const double *y, int64_t components, int type) {
     return array;
 }
 
-// Call a function with such objects.
-template <class... Arguments>
-nb::object call(nb::handle function, const Arguments &...arguments) {
-    PyObject *given[] = {nullptr, arguments.ptr()...};
-    return owned(
-        PyObject_Vectorcall(function.ptr(), given + 1, sizeof...(Arguments) | PY_VECTORCALL_ARGUMENTS_OFFSET, nullptr));
-}
-
 int width_of(int type) { return type == NPY_CDOUBLE ? 2 : 1; }
 
 }  // namespace
@@ -109,7 +101,7 @@ void PythonCall::take(PyObject *value, PyObject *t, double *out) const {
     };
     nb::object found = nb::borrow(value);
     if (!PyArray_CheckExact(value) || !plain(value)) {
-        found = owned(PyObject_CallFunctionObjArgs(convert_.ptr(), value, t, nullptr));
+        found = convert_(nb::handle(value), nb::handle(t));
         if (!plain(found.ptr())) refuse(PyExc_TypeError, "engine: convert returned %.80R", found.ptr());
     }
     std::memcpy(out, PyArray_DATA(reinterpret_cast<PyArrayObject *>(found.ptr())), floats_ * sizeof(double));
@@ -224,7 +216,7 @@ int code_of(const nb::object &returned) { return nb::cast<int>(returned); }
 int PythonHooks::raw_step(const Step &step) {
     const Options &o = run_.options;
     const Work &w = run_.work;
-    call(one_step_, time(step.t), copied(step.y, w.n, type_), time(step.h));
+    one_step_(time(step.t), copied(step.y, w.n, type_), time(step.h));
     if (!all_finite(w.y_hat, w.m)) return NOT_FINITE;
     if (step.project && o.uses_f) {
         if (o.direction == OLD) {
@@ -250,14 +242,13 @@ int PythonHooks::raw_step(const Step &step) {
 
 int PythonHooks::project_elsewhere(const Step &step) {
     const npy_intp n = run_.work.n;
-    return code_of(
-        call(project_, time(step.t), time(step.t_new), nb::bool_(step.last), view(step.y_new, 1, &n, type_, to_)));
+    return code_of(project_(time(step.t), time(step.t_new), nb::bool_(step.last), view(step.y_new, 1, &n, type_, to_)));
 }
 
-bool PythonHooks::all_agree(bool here) { return nb::bool_(call(agree_, nb::bool_(here))).is(nb::bool_(true)); }
+bool PythonHooks::all_agree(bool here) { return nb::bool_(agree_(nb::bool_(here))).is(nb::bool_(true)); }
 
 int PythonHooks::finish_step(const Step &step) {
-    return code_of(call(finish_, time(step.t_new), nb::bool_(step.project), nb::bool_(step.last)));
+    return code_of(finish_(time(step.t_new), nb::bool_(step.project), nb::bool_(step.last)));
 }
 
 // One Newton step by the functions of `JointInvariants`: the one that `project_step` takes in the euclidean metric, its
@@ -267,7 +258,7 @@ bool PythonHooks::project_jointly(const Step &step) {
     const Options &o = run_.options;
     const Work &w = run_.work;
     const nb::object t = time(step.t_new);
-    call(moments_, t, y_hat_, f_hat_, values_, R_, terms_);
+    moments_(t, y_hat_, f_hat_, values_, R_, terms_);
     const bool measured = o.watched && w.counters[HAVE_ERROR];
     if (measured) {
         const double err = norm(w.err, w.m);
@@ -277,7 +268,7 @@ bool PythonHooks::project_jointly(const Step &step) {
     if (outside) {
         if (!gram_solution(Matrix{w.R, w.l, w.l, w.l}, w.g, w.mu)) return false;
         const npy_intp n = w.n;
-        call(shift_, t, y_hat_, f_hat_, mu_, view(step.y_new, 1, &n, type_, to_), values_);
+        shift_(t, y_hat_, f_hat_, mu_, view(step.y_new, 1, &n, type_, to_), values_);
     } else {
         copy(w.y_hat, step.y_new, w.m);
     }
