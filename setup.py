@@ -3,12 +3,11 @@
 One module for every processor, and on x86-64 another for those with AVX2 and FMA; eip_scipy/engine/native.py chooses.
 """
 
-import copy
 import hashlib
 import os
 import platform
 import sys
-import threading
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -68,14 +67,31 @@ def module(name: str, *flags: str) -> Extension:
 class Build(build_ext):
     """Builds the modules side by side, and says what is missing where no compiler can be had."""
 
-    binding: ClassVar[list[str]] = []  # the object file of nanobind's library
-    binding_lock = threading.Lock()
+    # A compiler for each core, whatever file of whichever module it is.
+    pool = ThreadPoolExecutor(os.cpu_count())
+    binding: ClassVar[list[Future[list[str]]]] = []  # nanobind's library
 
     def finalize_options(self) -> None:
-        """A process for each core, unless another number is asked for."""
+        """A thread for each module, unless another number is asked for."""
         super().finalize_options()
         if self.parallel is None:
             self.parallel = True
+
+    def build_extensions(self) -> None:
+        """Build all, the library of nanobind before them."""
+        if not BUILT and self.extensions:
+            source, macros = NANOBIND / "src" / "nb_combined.cpp", [("NB_COMPACT_ASSERTIONS", None)]
+            folders = [*self.include_dirs, *INCLUDED]
+            self.binding.append(self.compiled("nanobind", [str(source)], macros, folders, [*OTHERS_OWN, QUICK])[0])
+        super().build_extensions()
+
+    def compiled(
+        self, name: str, sources: list[str], macros: list[Any], folders: list[str], flags: list[str]
+    ) -> list[Future[list[str]]]:
+        """Start to compile files into a folder of that name."""
+        where = str(Path(self.build_temp) / name)
+        options = {"output_dir": where, "macros": macros, "include_dirs": folders, "extra_postargs": flags}
+        return [self.pool.submit(self.compiler.compile, [source], **options) for source in sources]
 
     def build_extension(self, ext: Extension) -> None:
         """One module, with objects of its own."""
@@ -84,37 +100,23 @@ class Build(build_ext):
             self.mkpath(str(Path(path).parent))
             self.copy_file(str(Path(BUILT, Path(path).name)), path)
             return
-        own = copy.copy(self)
-        own.build_temp = str(Path(self.build_temp) / ext.name)
-        cold = [source for source in ext.sources if Path(source).name in COLD]
+        hot = sorted((source for source in ext.sources if Path(source).name not in COLD), key=_longest_first)
+        cold = [source for source in ext.sources if source not in hot]
+        given = ext.define_macros, ext.include_dirs
         try:
-            # Linked after the others: of a function that both have, the fast one is taken.
-            ext.extra_objects = own.compiler.compile(
-                cold,
-                output_dir=own.build_temp,
-                macros=ext.define_macros,
-                include_dirs=ext.include_dirs,
-                extra_postargs=[*ext.extra_compile_args, QUICK],
-                depends=ext.depends,
-            )
-            ext.sources = [source for source in ext.sources if source not in cold]
-            ext.extra_objects += self.compiled_binding(own.compiler)
-            build_ext.build_extension(own, ext)
+            # The cold ones are linked after the others: of a function that both have, the fast one is taken.
+            jobs = self.compiled(ext.name, hot, *given, ext.extra_compile_args)
+            jobs += self.compiled(ext.name, cold, *given, [*ext.extra_compile_args, QUICK])
+            ext.extra_objects = [path for job in [*jobs, *self.binding] for path in job.result()]
+            ext.sources = []
+            super().build_extension(ext)
         except Exception as error:
             raise SystemExit(f"{MISSING}\nWhat the build said: {error}") from error
 
-    def compiled_binding(self, compiler: Any) -> list[str]:
-        """Return the binding's library, compiled by whichever module comes to it first."""
-        with self.binding_lock:
-            if not self.binding:
-                self.binding += compiler.compile(
-                    [str(NANOBIND / "src" / "nb_combined.cpp")],
-                    output_dir=str(Path(self.build_temp) / "nanobind"),
-                    macros=[("NB_COMPACT_ASSERTIONS", None)],
-                    include_dirs=[*self.include_dirs, *INCLUDED],
-                    extra_postargs=[*OTHERS_OWN, QUICK],
-                )
-            return self.binding
+
+def _longest_first(source: str) -> int:
+    """Put the file that takes longest first."""
+    return Path(source).name != "engine.cpp"
 
 
 builds: dict[str, list[str]] = {"_native": []}
