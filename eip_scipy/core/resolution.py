@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..engine.data import Grouping, Method
+from ..engine.data import LEAST_CHANGE, Grouping, Method
 from ..methods.runge_kutta import DOP853
 from .one_step import OneStep
 
@@ -21,8 +21,6 @@ STEPS, SUBSTEPS = 3, 4
 # of Kepler's orbit with e = 0.6 and h = 0.1).
 UNRESOLVED = {2: 0.1, 3: 0.03, 4: 1e-2, 8: 2e-3}
 LOST = 0.3
-# Blocks count as if they changed by this share of the largest change: rounding in the tails of a field is not resolved.
-LEAST_CHANGE = 1e-2
 # Share of its length by which a whole number of steps may miss an interval.
 ROUNDING = 1e-12
 
@@ -58,6 +56,7 @@ def unresolved(
         size = np.max([_norms(part, groups) for part in (end - begin, h * rhs(at, begin), begin)], axis=0)
         if not (np.isfinite(end).all() and np.isfinite(own).all() and size.max() > 0):
             return None
+        # Rounding in the tails of a field is not resolved.
         shares.append(_norms(own - end, groups) / (size + LEAST_CHANGE * size.max()))
     second, largest = np.sort(shares, axis=0)[-2:]
     errors = np.where(largest > LOST, largest, second)

@@ -95,8 +95,9 @@ EPS: float = 2.220446049250313e-16
 LARGE: float = 50.0
 FAR: float = 0.03
 LARGE_SHARE: float = 0.01
+LEAST_CHANGE: float = 0.01
 SOURCES: str = ...
-COMPILER: str = 'GCC 12.2.0'
+COMPILER: str
 HAS_V3: bool
 
 class Work:

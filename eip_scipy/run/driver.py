@@ -17,7 +17,6 @@ from ..core.setup import Run
 from ..core.stepping import UNBOUNDED, AnyMethod
 from ..engine.data import NOTHING, PENDING, REASON, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
-from ..engine.trust import NOTHING, REASON
 from .events import Events
 from .memory import most_bytes
 

@@ -401,6 +401,7 @@ void add_constants(nb::module_ &m) {
     m.attr("LARGE") = LARGE;
     m.attr("FAR") = FAR;
     m.attr("LARGE_SHARE") = LARGE_SHARE;
+    m.attr("LEAST_CHANGE") = LEAST_CHANGE;
     m.attr("SOURCES") = EIP_SOURCES;
     m.attr("COMPILER") = EIP_COMPILER;
     m.attr("HAS_V3") = has_v3();
