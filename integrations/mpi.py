@@ -17,7 +17,6 @@ import numpy as np
 
 from eip_scipy.core.invariants import Invariant, InvariantSet, as_invariants
 from eip_scipy.core.names import nearest
-from eip_scipy.core.one_step import OneStep
 from eip_scipy.core.parts import SolverOfParts
 from eip_scipy.core.solvers import EIPSolver
 
@@ -184,7 +183,7 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
     """
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
         raise TypeError(f"over_ranks: method must be an EIP class such as EIPRK4, got {method!r}.")
-    if isinstance(method.TABLEAU, OneStep):
+    if method.TABLEAU.in_python:
         raise TypeError(f"over_ranks: {method.__name__} is no Runge-Kutta method; its step would see one rank's part.")
     if method._project_step is not EIPSolver._project_step or issubclass(method, SolverOfParts):
         raise TypeError(f"over_ranks: {method.__name__} has a _project_step of its own, or is on ranks already.")

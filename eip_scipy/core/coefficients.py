@@ -37,7 +37,7 @@ def attributes_of(method: Any, scipy_class: type[OdeSolver] | None) -> dict[str,
         value = getattr(method, name, None)
         if value is not None:
             found[name] = value
-    if not isinstance(method, Tableau):
+    if method.of_second_order or method.in_python:
         return found
     found |= {"A": method.A, "B": method.b, "C": method.c}
     if method.paired:

@@ -14,12 +14,11 @@ from scipy.integrate import OdeSolver
 from ..engine.data import Work
 from ..engine.trust import Trust
 from .invariants import InvariantSet
-from .one_step import OneStep
 from .setup import Run
 
 __all__ = ["RunParts", "parts_of", "run_of", "scipy_values", "set_scipy_values"]
 
-BOUND = ("work", "invariants", "trust")
+BOUND = ("tableau", "work", "invariants", "trust")
 
 
 class RunParts(NamedTuple):
@@ -35,7 +34,7 @@ def parts_of(run: Run) -> RunParts:
     """Return what makes a run again; the user's one-step method stays out."""
     values = {item.name: getattr(run, item.name) for item in fields(run) if item.name not in BOUND}
     values["options"] = run.options._replace(joint=None)
-    if isinstance(run.method, OneStep):
+    if run.tableau.in_python:
         values["method"] = None
     return RunParts(values, copy.deepcopy(run.work), list(run.trust.doubts), run.trust.failed)
 
@@ -48,8 +47,7 @@ def run_of(parts: RunParts, invariants: InvariantSet, method: Any, *, joint: boo
     parts : RunParts
     invariants : InvariantSet
         The same invariants, made at the same start.
-    method : OneStep
-        Taken where the run has a one-step method.
+    method : Tableau, NystromTableau, GaussJackson or OneStep
     joint : bool
         Whether the run's options hold the invariants that are projected jointly.
     """
@@ -60,7 +58,7 @@ def run_of(parts: RunParts, invariants: InvariantSet, method: Any, *, joint: boo
         values["options"] = values["options"]._replace(joint=invariants.items)
     trust = Trust(invariants.names, work.trust)
     trust.doubts, trust.failed = list(parts.doubts), parts.failed
-    return Run(**values, work=work, invariants=invariants, trust=trust)
+    return Run(**values, tableau=method, work=work, invariants=invariants, trust=trust)
 
 
 def scipy_values(solver: OdeSolver) -> dict[str, Any]:

@@ -7,36 +7,23 @@ import threading
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy.integrate import DOP853 as SCIPY_DOP853
 from scipy.integrate import DenseOutput, OdeSolution
 
 from ..engine.data import (
-    CUBIC,
     ERROR,
     GIVEN,
-    HISTORY,
     MOST_CROSSINGS,
     NEW,
-    NYSTROM,
-    POLYNOMIAL,
-    QUINTIC,
-    SEVENTH,
     Dense,
-    Method,
     Work,
 )
 from ..engine.native import Engine
-from ..methods.multistep import GaussJackson, interpolation_weights
-from ..methods.nystrom import RKN1210, NystromTableau
-from ..methods.nystrom_interpolants import LEAST_ORDER, interpolant
-from ..methods.runge_kutta import DOP853
 from .kept_dense import AtRealTimes, KeptDenseOutput, kept
-from .one_step import OneStep
 from .setup import Run
-from .stepping import AnyMethod
+from .steppers import form
 
 __all__ = ["ExactEnds", "Interpolants", "ManifoldDenseOutput", "solution"]
 
@@ -57,7 +44,6 @@ class Interpolants:
     Parameters
     ----------
     run : Run
-    tableau : Tableau, NystromTableau or OneStep
     engine : Engine
         That of the run, which has dense output from now on.
     events : int
@@ -69,12 +55,11 @@ class Interpolants:
     def __init__(
         self,
         run: Run,
-        tableau: AnyMethod,
         engine: Engine,
         events: int = 0,
         errors: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
-        self.record = _record(run, tableau, events, shows=run.shows)
+        self.record = _record(run, events)
         self._engine, self._dtype, self._n, self._errors = engine, run.y0.dtype, run.y0.size, errors
         self._lock = threading.RLock()  # one buffer for all threads that ask
         engine.sample(self.record)
@@ -137,42 +122,10 @@ class Interpolants:
             )
 
 
-class _Form(NamedTuple):
-    """Kind of a run's interpolants, what they are made with, and how many states one consists of without its ends."""
-
-    kind: int
-    rows: int
-    weights: Array = np.zeros((0, 0))
-    A: Array = np.zeros((0, 0))
-    c: Array = np.zeros(0)
-    own_slopes: bool = False
-
-
-def _form(run: Run, tableau: AnyMethod) -> _Form:
-    if isinstance(tableau, GaussJackson):
-        assert isinstance(run.method, Method)
-        assert run.method.multistep is not None
-        if not run.method.multistep.brief:
-            weights = interpolation_weights(tableau.order).reshape(-1, tableau.order)
-            return _Form(HISTORY, (tableau.order + 1) // 2 + 2, weights)
-        if tableau.velocities:
-            return _Form(QUINTIC, 3, own_slopes=True)  # The method that starts takes several steps in one.
-        tableau = RKN1210  # The method that starts makes all steps.
-    if isinstance(tableau, NystromTableau):
-        if tableau.order < LEAST_ORDER:
-            return _Form(QUINTIC, 3)
-        A, c, weights = interpolant(tableau)
-        return _Form(NYSTROM, (weights.shape[0] + 1) // 2 + 1, weights, A, c)
-    if tableau is DOP853:
-        return _Form(SEVENTH, 3 + len(SCIPY_DOP853.D), SCIPY_DOP853.D, SCIPY_DOP853.A_EXTRA, SCIPY_DOP853.C_EXTRA)
-    if isinstance(tableau, OneStep) or tableau.P is None:
-        return _Form(CUBIC, 3, own_slopes=isinstance(tableau, OneStep))
-    return _Form(POLYNOMIAL, 1 + tableau.P.shape[1], tableau.P.T)
-
-
-def _record(run: Run, tableau: AnyMethod, events: int, *, shows: bool) -> Dense:
+def _record(run: Run, events: int) -> Dense:
     roots = min(MOST_ROOTS, ROOT_NUMBERS // run.y0.size) if events else 0
-    kind, rows, weights, A, c, own_slopes = _form(run, tableau)
+    brief = run.tableau.has_history and run.method.multistep.brief
+    kind, rows, weights, A, c, own_slopes = form(run.tableau, brief)
     stages = run.method.b.size
     n, dtype, invariants = run.y0.size, run.y0.dtype, run.invariants.size
     options = run.options._replace(
@@ -185,7 +138,7 @@ def _record(run: Run, tableau: AnyMethod, events: int, *, shows: bool) -> Dense:
         A=A.copy("C"),
         c=c.copy(),
         own_slopes=own_slopes,
-        shows=shows,
+        shows=run.shows,
         by_travel=invariants > 0 and run.options.metric == ERROR,
         options=options._replace(target=np.zeros(invariants)),
         work=Work(n, dtype, stages + c.size if c.size else 1, invariants, options.groups.start.size - 1),

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..engine.data import AUTO, N_NODE_PLACES, Method, Multistep
+from ..engine.data import AUTO, N_NODE_PLACES, Multistep
 from ..methods.multistep import GaussJackson, damping_limit, stability_limit, weights
 from .setup import Run, Start
 from .stepping import Stepping
@@ -55,9 +55,7 @@ def times(jacobian: Callable[..., None], *extra: Array) -> Callable[[float, Arra
     return product
 
 
-def attach_history(
-    run: Run, method: GaussJackson, name: str, system: SecondOrder, stepping: Stepping, *, level: bool
-) -> None:
+def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping, *, level: bool) -> None:
     """Give a run of a multistep method its history, after a look at its step.
 
     Raises
@@ -65,11 +63,11 @@ def attach_history(
     ValueError
         When the step is longer than what is stable at the start, with one that would do; not with ``check=False``.
     """
+    method: Any = run.tableau
     assert stepping.h is not None
     brief = stepping.span.n_steps - 1 < method.order
     check = run.options.limit < math.inf  # the option of this name bounds the shares of corrections
     corrected = slice(0, 0) if brief else _stable(method, name, system, stepping.h, check)
-    assert isinstance(run.method, Method)  # of the method that starts
     run.method = run.method._replace(multistep=_record(run, method, corrected, stepping, brief=brief, level=level))
 
 

@@ -85,6 +85,8 @@ class OneStep(Ordered):
     the method's `evaluations`, in each step that is tried.
     """
 
+    in_python = True
+
     def __init__(self, method: OneStepMethod) -> None:
         if not isinstance(method, OneStepMethod) or isinstance(method, type) or not callable(method.one_step):
             raise TypeError(

@@ -32,12 +32,10 @@ from ..engine.data import (
     Options,
 )
 from ..engine.trust import FAR_IN_TOLERANCES, MOST_FAR
-from ..methods.multistep import GaussJackson
 from .blocks import blocks_of
 from .frame import frame_rows
 from .inputs import count, flag, real_array
 from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet, JointInvariants
-from .one_step import OneStep
 from .stepping import AnyMethod, Stepping
 
 __all__ = [
@@ -221,7 +219,7 @@ class ProjectionOptions:
         kind, sigma = self._metric(method, n, width)
         if not isinstance(self.direction, str) or self.direction not in DIRECTIONS:
             raise ValueError(f"direction must be 'new', 'old' or 'midpoint', got {self.direction!r}.")
-        if isinstance(method, GaussJackson) and self.direction != "new":
+        if method.has_history and self.direction != "new":
             raise ValueError(
                 f"direction={self.direction!r}: {method.name} has no step that starts at a state; leave it out."
             )
@@ -240,7 +238,7 @@ class ProjectionOptions:
             scales=known.scales,
             computed=np.array(known.computed, float),
             # Multistep methods put the defects in place of the targets; their errors leave nothing to speak of.
-            most_left=np.where(known.given & (not isinstance(method, GaussJackson)), MOST_LEFT, np.inf),
+            most_left=np.where(known.given & (not method.has_history), MOST_LEFT, np.inf),
             kinds=groups,
             kappa=method.kappa,
             metric=kind,
@@ -248,7 +246,7 @@ class ProjectionOptions:
             iterations=count("iterations", self.iterations, MOST_ITERATIONS),
             every=self._every(method),
             # The steps of a one-step method do not take f: there is nothing to evaluate in place of f(y_hat).
-            reuse_f=flag("reuse_f", self.reuse_f) or isinstance(method, OneStep),
+            reuse_f=flag("reuse_f", self.reuse_f) or method.in_python,
             uses_f=known.uses_f,
             compensated=compensated,
             adaptive=stepping.h is None,
@@ -283,19 +281,18 @@ class ProjectionOptions:
         }
 
     def _compensated(self, method: AnyMethod) -> bool:
-        multistep = isinstance(method, GaussJackson)
         if self.compensated is None:
-            return multistep
+            return method.has_history
         compensated = flag("compensated", self.compensated)
-        if multistep and not compensated:
+        if method.has_history and not compensated:
             raise ValueError(f"compensated=False: the sums of {method.name} always carry their rounding; leave it out.")
-        if compensated and isinstance(method, OneStep):
+        if compensated and method.in_python:
             raise ValueError(f"compensated=True carries the rounding of a tableau's sums; {method.name} is no tableau.")
         return compensated
 
     def _every(self, method: AnyMethod) -> int:
         if self.every is None:
-            return AUTO if isinstance(method, GaussJackson) else 1
+            return AUTO if method.has_history else 1
         if not isinstance(self.every, str):
             return count("every", self.every)
         if self.every != "auto":
@@ -323,7 +320,7 @@ def _far_by_tolerances(rtol: np.ndarray) -> float:
 
 def _band(method: AnyMethod, compensated: bool) -> float:
     """The dead band of an invariant, in roundings of its terms."""
-    if isinstance(method, GaussJackson):  # takes a part only of what is within rounding
+    if method.has_history:  # takes a part only of what is within rounding
         return BAND_MULTISTEP
     return BAND_COMPENSATED if compensated else BAND
 

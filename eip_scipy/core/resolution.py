@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from ..engine.data import LEAST_CHANGE, Grouping, Method
 from ..methods.runge_kutta import DOP853
-from .one_step import OneStep
 
 __all__ = ["unresolved"]
 
@@ -28,7 +28,7 @@ Array = np.ndarray
 
 
 def unresolved(
-    method: Method | OneStep,
+    method: Any,
     groups: Grouping,
     rhs: Callable[[float, Array], Array],
     t: float,
@@ -38,11 +38,12 @@ def unresolved(
 ) -> str | None:
     """Return which part of the state steps of length h from (t, y) do not resolve, in a sentence; None for no part.
 
-    User-defined methods are not judged. Methods of order 1 are not judged either: all that a first step from rest
-    changes is an error of theirs. Functions are not called at times behind the end of the run.
+    `method` is that of a run. Methods of one stage are not judged, because all that a first step of order 1 from rest
+    changes is an error of it; a user-defined method counts as one of them. Functions are not called at times behind the
+    end of the run.
     """
     steps = int(min(STEPS, (end_of_run - t) / h * (1 + ROUNDING)))
-    if isinstance(method, OneStep) or method.b.size == 1 or steps < 2:
+    if method.b.size == 1 or steps < 2:
         return None
     shares, end = [], y
     for k in range(steps):

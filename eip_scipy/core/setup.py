@@ -28,21 +28,18 @@ from ..engine.data import (
     TIME_NEW,
     TOO_SMALL,
     UNSTABLE,
-    Method,
     Schedule,
     Work,
 )
 from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
-from ..methods.multistep import GaussJackson
-from ..methods.nystrom import RKN1210, NystromTableau
-from ..methods.runge_kutta import DOP853
+from . import steppers
 from .blocks import kinds_of
 from .examination import Derivative, Examiner, is_check_due
 from .frame import spanned
 from .inputs import reals, refuse_units, shown
 from .invariants import TARGET_TOLERANCE, InvariantSet
-from .one_step import OneStep, as_vector
+from .one_step import as_vector
 from .options import Options, ProjectionOptions
 from .resolution import unresolved
 from .results import Diagnostics
@@ -67,12 +64,14 @@ class Start(NamedTuple):
 class Run:
     """All that a driver needs, apart from the user's functions.
 
-    `called` is the name of the argument that gave the right-hand side. `left_out`: what NaN in its value may come from.
-    `moved` says how far `project_initial` has moved y0, or is empty.
+    `tableau` is the method as it was given, `method` what the engine takes its steps by. `called` is the name of the
+    argument that gave the right-hand side. `left_out`: what NaN in its value may come from. `moved` says how far
+    `project_initial` has moved y0, or is empty.
     """
 
     y0: np.ndarray
-    method: Method | OneStep
+    tableau: AnyMethod
+    method: Any  # Method, or OneStep
     options: Options
     work: Work
     invariants: InvariantSet
@@ -91,10 +90,10 @@ class Run:
 
         `others` are further `Hooks`.
         """
-        one_step = self.method if isinstance(self.method, OneStep) else None
+        in_python = self.tableau.in_python
         hooks = Hooks(
-            one_step=None if one_step is None else partial(one_step.fill, self.work),
-            estimates=one_step is not None and one_step.has_estimate,
+            one_step=partial(self.method.fill, self.work) if in_python else None,
+            estimates=in_python and self.tableau.has_estimate,
             joint=None if functions.native else self.options.joint,
             **others,
         )
@@ -108,8 +107,7 @@ class Run:
     @property
     def shows(self) -> bool:
         """Return whether states that are not projected are handed out as projected copies."""
-        multistep = isinstance(self.method, Method) and self.method.multistep is not None
-        return self.invariants.size > 0 and (self.options.every != 1 or multistep)
+        return self.invariants.size > 0 and (self.options.every != 1 or self.tableau.has_history)
 
     def look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
         """Examine a run after `steps` steps, or where it has `ended`. Return whether it is to be reported now.
@@ -202,117 +200,6 @@ def states(name: str, value: Any) -> np.ndarray:
     return np.array(y, dtype=complex, order="C")
 
 
-def check_halves(n: int) -> None:
-    """A state (q, v) has an even number of components."""
-    if n % 2:
-        raise ValueError(f"a Nystrom method needs the state (q, v), an even number of components; y0 has {n}.")
-
-
-def depends_on_velocity(
-    rhs: Callable[[float, np.ndarray], np.ndarray],
-    t0: float,
-    y0: np.ndarray,
-    f0: np.ndarray,
-    method: str,
-    hint: Callable[[], str] = str,
-) -> bool:
-    """Whether the accelerations of q'' = a(t, q, v), y = (q, v), change with v, by one more evaluation.
-
-    Where the equations are of another kind `hint` says what else the caller knows to do.
-
-    Raises
-    ------
-    ValueError
-        When the first half of the derivative is not v.
-    """
-    check_halves(y0.size)
-    half = y0.size // 2
-    other = y0.copy()
-    other[half:] = 1.5 * y0[half:] + 1.0
-    f = rhs(t0, other)
-    if not (np.array_equal(f0[:half], y0[half:]) and np.array_equal(f[:half], other[half:])):
-        raise ValueError(
-            f"{method} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be v, "
-            f"the second half of the state, and are not. Take a Runge-Kutta method such as EIPDOP853, or where the "
-            f"system is one of second order, write it with the velocities as that half{hint()}."
-        )
-    return not np.array_equal(f[half:], f0[half:], equal_nan=True)
-
-
-def check_second_order(
-    rhs: Callable[[float, np.ndarray], np.ndarray],
-    t0: float,
-    y0: np.ndarray,
-    f0: np.ndarray,
-    method: str,
-    hint: Callable[[], str] = str,
-) -> None:
-    """Whether the right-hand side is that of q'' = a(t, q) for y = (q, v), by one more evaluation.
-
-    Raises
-    ------
-    ValueError
-        When the first half of the derivative is not v, or the second changes with v.
-    """
-    if depends_on_velocity(rhs, t0, y0, f0, method, hint):
-        raise ValueError(
-            f"{method} integrates q'' = a(t, q), but fun's accelerations change with the velocity; take a Runge-Kutta "
-            f"method such as EIPDOP853."
-        )
-
-
-def method_arrays(tableau: AnyMethod) -> Method | OneStep:
-    """A tableau as the arrays that the step takes (writable copies: compiled code has one array type for all)."""
-    if isinstance(tableau, OneStep):
-        return tableau
-    if isinstance(tableau, GaussJackson):  # what makes its first states
-        return method_arrays(DOP853 if tableau.velocities else RKN1210)
-    exponent = -1.0 / ((tableau.error_estimator_order or 0) + 1)
-    if isinstance(tableau, NystromTableau):
-        return _nystrom_arrays(tableau, exponent)
-    none = np.zeros(tableau.b.size)
-    return Method(
-        A=tableau.A.copy(),
-        b=tableau.b.copy(),
-        b_low=tableau.b_low.copy(),
-        b_v=none,
-        b_v_low=none,
-        c=tableau.c.copy(),
-        e=tableau.e.copy(),
-        e_v=none,
-        e_low=tableau.e_low.copy(),
-        nystrom=False,
-        fsal=tableau.fsal,
-        paired=tableau.paired,
-        exponent=exponent,
-    )
-
-
-def _nystrom_arrays(tableau: NystromTableau, exponent: float) -> Method:
-    """A last stage that is the next step's first one is f at the new point, after the step."""
-    s = tableau.n_stages - tableau.fsal
-
-    def weights(e: np.ndarray) -> np.ndarray:
-        return np.concatenate([e, np.zeros(s + 1 - e.size)])
-
-    e, e_v = weights(tableau.e), weights(tableau.e_prime)
-    return Method(
-        A=tableau.A[:s, :s].copy(),
-        b=tableau.b[:s].copy(),
-        b_low=tableau.b_low[:s].copy(),
-        b_v=tableau.b_prime[:s].copy(),
-        b_v_low=tableau.b_prime_low[:s].copy(),
-        c=tableau.c[:s].copy(),
-        e=e,
-        e_v=e_v,
-        e_low=np.zeros(s + 1),
-        nystrom=True,
-        fsal=bool(e[-1] != 0.0 or e_v[-1] != 0.0),
-        paired=False,
-        exponent=exponent,
-    )
-
-
 def prepare(
     method: AnyMethod,
     rhs: Callable[[float, np.ndarray], np.ndarray],
@@ -346,11 +233,11 @@ def prepare(
     options = options._replace(kinds=kinds_of(options.groups, y0, f0))
     invariants.kinds = options.kinds
     options = options._replace(scales=_scales(options, invariants, start))
-    arrays = method_arrays(method)
+    arrays = steppers.arrays(method)
     work = Work(y0.size, y0.dtype, arrays.b.size, invariants.size, options.groups.start.size - 1)
     if sigma is not None:
         work.sigma[:] = sigma
-    run = Run(y0, arrays, options, work, invariants, identity, Trust(invariants.names, work.trust), tau)
+    run = Run(y0, method, arrays, options, work, invariants, identity, Trust(invariants.names, work.trust), tau)
     if projection.project_initial:
         run.y0 = projected_start(run, rhs, t0, f0)
         run.moved = _moved(y0, run.y0, invariants.floors)

@@ -34,7 +34,7 @@ from ..engine.trust import ProjectionWarning
 from ..methods.multistep import GaussJackson
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
-from . import setup
+from . import setup, steppers
 from .acceleration import BY_NAME, named_accelerations
 from .between_steps import N_LEFT, Settings, checked_stepping, checked_vector, is_state, kept_state
 from .callers import users_level
@@ -185,7 +185,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     ) -> None:
         if not hasattr(self, "TABLEAU"):
             raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
-        jacobian = options.pop("jacobian", None) if isinstance(self.TABLEAU, GaussJackson) else None
+        jacobian = options.pop("jacobian", None) if self.TABLEAU.has_history else None
         projection, extraneous = ProjectionOptions.of(options)
         if extraneous:
             warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=users_level())
@@ -240,21 +240,16 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _named_accelerations(self, t: float, y: np.ndarray) -> AbstractContextManager[None]:
         """Return a context that refuses an acceleration in the place of `fun`, where the method takes (q, v)."""
-        if self.vectorized or not isinstance(self.TABLEAU, NystromTableau | GaussJackson):
+        if self.vectorized or not self.TABLEAU.of_second_order:
             return nullcontext()
         return named_accelerations(type(self).__name__, self._user_fun, False, (), t, y)
 
     def _checked_method(self, start: Start) -> AnyMethod:
         """Return the method for the present function, which is called where it has to be one of second order."""
-        fresh, name = partial(_copied, self._derivative), type(self).__name__
-        if isinstance(self.TABLEAU, NystromTableau):
-            setup.check_second_order(fresh, start.t, start.y, start.f, name, _by_name)
-        if not isinstance(self.TABLEAU, GaussJackson):
-            return self.TABLEAU
-        if self._finishes:
+        name = type(self).__name__
+        if self.TABLEAU.has_history and self._finishes:
             raise TypeError(f"{name}: a multistep method has no step that _project_step could end.")
-        velocities = setup.depends_on_velocity(fresh, start.t, start.y, start.f, name, _by_name)
-        return replace(self.TABLEAU, velocities=velocities)
+        return steppers.checked(self.TABLEAU, partial(_copied, self._derivative), start, name, _by_name)
 
     def _start(self, begin: Start, *, check: bool) -> None:
         """Begin at a state: `check` its invariants there or not, and make the buffers of the run."""
@@ -289,11 +284,11 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _attach_history(self, begin: Start) -> None:
         """Give a multistep method the history that it makes from a state on."""
-        if not isinstance(self._method, GaussJackson):
+        if not self._method.has_history:
             return
         moved = None if self._jacobian is None else times(self._jacobian)
         seen = SecondOrder(partial(_copied, self._derivative), begin, moved, None)
-        attach_history(self._run, self._method, type(self).__name__, seen, self._stepping, level=True)
+        attach_history(self._run, type(self).__name__, seen, self._stepping, level=True)
 
     def _settle(self) -> None:
         """Note what the attributes are between two steps, so that a change of them shows."""
@@ -406,8 +401,9 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             self.fun = user
         self._bind(user, [0])
         self._scipy, self._method = None, self.TABLEAU
-        if isinstance(self.TABLEAU, GaussJackson):
-            self._method = replace(self.TABLEAU, velocities=copied["velocities"])
+        if self.TABLEAU.has_history:
+            tableau: Any = self.TABLEAU
+            self._method = replace(tableau, velocities=copied["velocities"])
         if copied["scipy"] is not None and self._SCIPY is not None:
             fresh = partial(_copied, self._derivative)
             self._scipy = self._SCIPY(fresh, begin.t, begin.y, begin.t + 1.0, first_step=1.0)
@@ -578,14 +574,13 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     def _sampled(self) -> Interpolants:
         """Return the interpolants of the run, which hand out states on the manifold."""
         if self._interpolants is None:
-            self._interpolants = Interpolants(self._run, self._method, self._engine)
+            self._interpolants = Interpolants(self._run, self._engine)
         self._interpolants.record.waiting[:] = self._waits
         return self._interpolants
 
     def _on_manifold(self, t: float, y: np.ndarray) -> np.ndarray:
         """Return the state of a step as it is handed out."""
-        multistep = isinstance(self.TABLEAU, GaussJackson)
-        waits = bool(t != self.t_bound if multistep else self._work.counters[WAITED] > 0)
+        waits = bool(t != self.t_bound if self.TABLEAU.has_history else self._work.counters[WAITED] > 0)
         self._waits = self._waits[1], waits
         return self._sampled().shown(t, y) if waits else y
 

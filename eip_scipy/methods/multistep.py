@@ -67,6 +67,8 @@ class GaussJackson(Ordered):
        Sci. 52 (2004) 331.
     """
 
+    of_second_order = has_history = True
+
     order: int
     corrected: bool = False
     name: str = ""

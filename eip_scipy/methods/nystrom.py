@@ -165,6 +165,8 @@ class NystromTableau(Ordered):
         When the tableau is not explicit, shapes disagree, or an order condition fails.
     """
 
+    of_second_order = True
+
     name: str
     A: np.ndarray
     b: np.ndarray

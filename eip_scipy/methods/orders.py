@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 __all__ = ["Ordered", "named_constant"]
 
@@ -18,6 +18,13 @@ class Ordered:
 
     order: int
     error_estimator_order: int | None
+    # Whether the equations are q'' = a(t, q), and the state is (q, v).
+    of_second_order: ClassVar[bool] = False
+    # Whether steps use what earlier ones left. Such a method starts once and carries its rounding, and its history is
+    # what is projected.
+    has_history: ClassVar[bool] = False
+    # Whether the steps are made by a user's Python function, without calls of the right-hand side.
+    in_python: ClassVar[bool] = False
 
     @property
     def has_estimate(self) -> bool:

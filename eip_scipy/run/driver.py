@@ -14,7 +14,7 @@ from ..core.dense import Interpolants, ManifoldDenseOutput, solution
 from ..core.jitted import ChangedShapeError
 from ..core.native_functions import raise_again
 from ..core.setup import Run
-from ..core.stepping import UNBOUNDED, AnyMethod
+from ..core.stepping import UNBOUNDED
 from ..engine.data import NOTHING, PENDING, REASON, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
 from .events import Events
@@ -36,7 +36,6 @@ class Driver:
         functions: PythonFunctions | NativeFunctions,
         params: np.ndarray,
         *,
-        tableau: AnyMethod,
         events: Events,
         keeps_steps: bool,
         max_bytes: float | None,
@@ -55,7 +54,7 @@ class Driver:
         self._interpolants = None
         self._pieces = np.empty((0, 0))
         if schedule.t_eval.size or schedule.g.size or keeps_steps or run.shows:
-            self._interpolants = Interpolants(run, tableau, self.engine, schedule.g.size, errors=self.own_errors)
+            self._interpolants = Interpolants(run, self.engine, schedule.g.size, errors=self.own_errors)
             steps = expected_steps(schedule) or _first(8 * self._interpolants.floats)
             self._pieces = self._more_pieces(steps if keeps_steps else 0)
 

@@ -268,7 +268,6 @@ class Loop:
                 prepared.schedule,
                 functions,
                 system.parameters,
-                tableau=prepared.method,
                 events=system.events,
                 keeps_steps=request.dense_output,
                 max_bytes=request.max_bytes,

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..core import setup
 from ..core.inputs import filled
+from ..core.steppers import check_halves
 
 __all__ = ["FORMS", "INTERPRETED"]
 
@@ -60,7 +61,7 @@ def _interpreted_acceleration_in_place(fun: Callable[..., Any], extra: tuple, y0
 
 
 def _positions(y0: np.ndarray) -> np.ndarray:
-    setup.check_halves(y0.size)
+    check_halves(y0.size)
     return y0[: y0.size // 2]
 
 

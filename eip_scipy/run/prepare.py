@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import setup, solvers
+from ..core import setup, solvers, steppers
 from ..core.acceleration import BY_NAME, AccelerationField, named_accelerations
 from ..core.arguments import Packed, are_same, extra_arguments, floats, names, scalars
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
@@ -19,7 +19,6 @@ from ..core.invariants import as_invariants, with_args
 from ..core.jitted import NotCompilableError
 from ..core.multistep import SecondOrder, attach_history, times
 from ..core.native_functions import native_functions, with_events, with_jacobian
-from ..core.one_step import OneStep
 from ..core.options import ProjectionOptions
 from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 from ..core.problem import Problem, made
@@ -29,8 +28,6 @@ from ..core.solvers import EIPSolver, eip_method
 from ..core.stepping import ATOL, AnyMethod, StepOptions, Stepping, interval
 from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
-from ..methods.multistep import GaussJackson
-from ..methods.nystrom import NystromTableau
 from .driver import check_memory, saved_rows
 from .events import Events, as_events
 from .interpreted_functions import FORMS, INTERPRETED
@@ -178,8 +175,8 @@ class System:
         if wanted is False:
             return in_python, "interpreted: compiled=False"
         try:
-            if isinstance(run.method, OneStep):
-                raise NotCompilableError(f"{run.method.name} is a one-step method in Python")
+            if run.tableau.in_python:
+                raise NotCompilableError(f"{run.tableau.name} is a one-step method in Python")
             if numbers is None:
                 raise NotCompilableError("args are neither numbers nor one array of floats")
             params = Packed(self.parameters, numbers) if self.extra else None
@@ -306,8 +303,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     _check_choices(request)
     asked, request = request, request.with_pointers()
     frequencies = request.fun.frequencies if isinstance(request.fun, Problem) else None
-    of_second_order = isinstance(method, (NystromTableau, GaussJackson))
-    acc = request.fun.acc if of_second_order and isinstance(request.fun, Problem) else None
+    acc = request.fun.acc if method.of_second_order and isinstance(request.fun, Problem) else None
     request, form = _with_problem(request)
     system = System(request, form, acc)
     t0, t_bound = _span(request, system.events)
@@ -317,24 +313,20 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     projection = ProjectionOptions(**request.projection)
     system.bind(y0)
     calls = Counted(system.derivative)
-    given_as_fun = of_second_order and not isinstance(asked.fun, Problem) and system.name == "fun"
+    given_as_fun = method.of_second_order and not isinstance(asked.fun, Problem) and system.name == "fun"
     in_place = "in place" in form
     with named_accelerations(name, system.fun, in_place, system.extra, t0, y0) if given_as_fun else nullcontext():
         f0 = system.first(calls, t0, y0)
-        hint = partial(_second_order_hint, asked.fun)
-        if isinstance(method, NystromTableau):
-            setup.check_second_order(calls, t0, y0, f0, name, hint)
-        elif isinstance(method, GaussJackson):
-            system.jacobian = made(system.jacobian)
-            method = replace(method, velocities=setup.depends_on_velocity(calls, t0, y0, f0, name, hint))
+        method = steppers.checked(method, calls, Start(t0, y0, f0, 0.0), name, partial(_second_order_hint, asked.fun))
     start = Start(t0, y0, f0, stepping.first(calls, y0, f0, method))
     schedule = _schedule(stepping.span, start.tau, request, system.events)
     run = setup.prepare(method, calls, start, projection, stepping, extra=system.extra, check_start=check_start)
     run.left_out, run.called = system.left_out, system.name
-    if isinstance(method, GaussJackson):
+    if method.has_history:
+        system.jacobian = made(system.jacobian)
         moved = None if system.jacobian is None else times(system.jacobian, *system.extra)
         seen = SecondOrder(calls, start, moved, None if frequencies is None else frequencies(y0, t_bound - t0))
-        attach_history(run, method, name, seen, stepping, level=False)
+        attach_history(run, name, seen, stepping, level=False)
     check_memory(saved_rows(schedule), run, request.max_bytes)
     record = Diagnostics() if request.diagnostics is None else request.diagnostics
     setup.attach(record, run)

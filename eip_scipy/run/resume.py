@@ -19,7 +19,7 @@ from ..checkpoint.own_file import OwnFile, unlocked
 from ..core.inputs import is_number, shown
 from ..core.setup import Run
 from ..core.stepping import Stepping
-from ..engine.data import NEXT_LENGTH, TIME, Method
+from ..engine.data import NEXT_LENGTH, TIME
 from ..methods.multistep import Weights
 from .events import Events
 
@@ -114,11 +114,11 @@ def settings(
     """All that decides the bits of a run, but for the functions, under the names that users give."""
     span = stepping.span
     # A one-step method of the user's own is known by its name and orders, as functions are by what they give.
-    if isinstance(run.method, Method):
+    if run.tableau.in_python:
+        parts = [run.tableau.order, run.tableau.error_estimator_order]
+    else:
         *parts, history = run.method
         parts += [] if history is None else [getattr(history, part) for part in Weights._fields]
-    else:
-        parts = [run.method.order, run.method.error_estimator_order]
     found = {
         "method": f"{method} {_digest(parts)[:8]}",
         "t_span": (span.t0, span.t_bound),

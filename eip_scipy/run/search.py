@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ..core import setup
 from ..core.problem import Problem
 from ..core.results import ProjectionWarning
 from ..core.setup import Counted
 from ..core.solvers import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12
+from ..core.steppers import depends_on_velocity
 from .integrate import integrate
 from .prepare import Request, prepared
 from .recommendation import Recommendation, called
@@ -341,7 +341,7 @@ def _asked_of_the_field(request: Request) -> tuple[bool | None, bool]:
     calls, start = Counted(ready.system.derivative), ready.start
     with np.errstate(all="ignore"):
         try:
-            velocities = setup.depends_on_velocity(calls, start.t, start.y, start.f, "")
+            velocities = depends_on_velocity(calls, start, "")
         except ValueError:
             velocities = None
     return velocities, why_not is None

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import Diagnostics
-from eip_scipy.methods import Tableau
 from eip_scipy.solvers import EIPSolver
 
 from ..hard_cases import HardCase, hard_cases
@@ -112,7 +111,7 @@ def adaptive_methods() -> dict[str, type[EIPSolver]]:
     return {
         name: method
         for name, method in fixed_step_methods().items()
-        if method.TABLEAU.has_estimate and isinstance(method.TABLEAU, Tableau)
+        if method.TABLEAU.has_estimate and not method.TABLEAU.of_second_order
     }
 
 

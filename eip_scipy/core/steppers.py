@@ -1,0 +1,217 @@
+"""What the families of methods do differently in a run; nothing else asks which family a method belongs to.
+
+Each function is written once for a family: Runge-Kutta tableaux, Nyström tableaux, Gauss-Jackson methods, and one-step
+methods of a user. Facts that need no more than a flag are attributes of `eip_scipy.methods.orders.Ordered`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import singledispatch
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.integrate import DOP853 as SCIPY_DOP853
+
+from ..engine.data import CUBIC, HISTORY, NYSTROM, POLYNOMIAL, QUINTIC, SEVENTH, Method
+from ..methods.multistep import GaussJackson, interpolation_weights
+from ..methods.nystrom import RKN1210, NystromTableau
+from ..methods.nystrom_interpolants import LEAST_ORDER
+from ..methods.nystrom_interpolants import interpolant as nystrom_interpolant
+from ..methods.runge_kutta import DOP853, Tableau
+from .one_step import OneStep
+
+__all__ = ["Form", "arrays", "check_halves", "checked", "depends_on_velocity", "form"]
+
+Array = np.ndarray
+Derivative = Callable[[float, Array], Array]
+
+
+# The coefficients as the engine reads them. They are copies that compiled code may write to.
+
+
+@singledispatch
+def arrays(method: Any) -> Method | OneStep:
+    """Return a method as the engine takes its steps."""
+    raise TypeError(f"{type(method).__name__} is not a family of methods.")
+
+
+@arrays.register
+def _(method: OneStep) -> OneStep:
+    return method
+
+
+@arrays.register
+def _(method: GaussJackson) -> Method | OneStep:
+    # The method that makes the first states.
+    return arrays(DOP853 if method.velocities else RKN1210)
+
+
+@arrays.register
+def _(method: Tableau) -> Method:
+    none = np.zeros(method.b.size)
+    return Method(
+        A=method.A.copy(),
+        b=method.b.copy(),
+        b_low=method.b_low.copy(),
+        b_v=none,
+        b_v_low=none,
+        c=method.c.copy(),
+        e=method.e.copy(),
+        e_v=none,
+        e_low=method.e_low.copy(),
+        nystrom=False,
+        fsal=method.fsal,
+        paired=method.paired,
+        exponent=_exponent(method),
+    )
+
+
+@arrays.register
+def _(method: NystromTableau) -> Method:
+    # A last stage that is the next step's first one is f at the new point, after the step.
+    s = method.n_stages - method.fsal
+
+    def weights(e: Array) -> Array:
+        return np.concatenate([e, np.zeros(s + 1 - e.size)])
+
+    e, e_v = weights(method.e), weights(method.e_prime)
+    return Method(
+        A=method.A[:s, :s].copy(),
+        b=method.b[:s].copy(),
+        b_low=method.b_low[:s].copy(),
+        b_v=method.b_prime[:s].copy(),
+        b_v_low=method.b_prime_low[:s].copy(),
+        c=method.c[:s].copy(),
+        e=e,
+        e_v=e_v,
+        e_low=np.zeros(s + 1),
+        nystrom=True,
+        fsal=bool(e[-1] != 0.0 or e_v[-1] != 0.0),
+        paired=False,
+        exponent=_exponent(method),
+    )
+
+
+def _exponent(method: Tableau | NystromTableau) -> float:
+    return -1.0 / ((method.error_estimator_order or 0) + 1)
+
+
+# Interpolants.
+
+
+class Form(NamedTuple):
+    """Kind of a run's interpolants, how many states one consists of without its ends, and what they are made with."""
+
+    kind: int
+    rows: int
+    weights: Array = np.zeros((0, 0))
+    A: Array = np.zeros((0, 0))
+    c: Array = np.zeros(0)
+    own_slopes: bool = False
+
+
+@singledispatch
+def form(method: Any, brief: bool) -> Form:
+    """Return the form of the interpolants of a method. `brief`: a run with too few steps for a history."""
+    raise TypeError(f"{type(method).__name__} is not a family of methods.")
+
+
+@form.register
+def _(method: OneStep, brief: bool) -> Form:
+    return Form(CUBIC, 3, own_slopes=True)
+
+
+@form.register
+def _(method: Tableau, brief: bool) -> Form:
+    if method is DOP853:
+        return Form(SEVENTH, 3 + len(SCIPY_DOP853.D), SCIPY_DOP853.D, SCIPY_DOP853.A_EXTRA, SCIPY_DOP853.C_EXTRA)
+    return Form(CUBIC, 3) if method.P is None else Form(POLYNOMIAL, 1 + method.P.shape[1], method.P.T)
+
+
+@form.register
+def _(method: NystromTableau, brief: bool) -> Form:
+    if method.order < LEAST_ORDER:
+        return Form(QUINTIC, 3)
+    A, c, weights = nystrom_interpolant(method)
+    return Form(NYSTROM, (weights.shape[0] + 1) // 2 + 1, weights, A, c)
+
+
+@form.register
+def _(method: GaussJackson, brief: bool) -> Form:
+    if not brief:
+        weights = interpolation_weights(method.order).reshape(-1, method.order)
+        return Form(HISTORY, (method.order + 1) // 2 + 2, weights)
+    # The method that starts takes all steps; several in one where accelerations depend on velocities.
+    return Form(QUINTIC, 3, own_slopes=True) if method.velocities else form(RKN1210, brief)
+
+
+# The equations that a method integrates.
+
+
+@singledispatch
+def checked(method: Any, rhs: Derivative, start: Any, name: str, hint: Callable[[], str]) -> Any:
+    """Return the method for equations, which are evaluated once more if they have to be of second order.
+
+    Parameters
+    ----------
+    method : Tableau, NystromTableau, GaussJackson or OneStep
+    rhs : callable
+        ``rhs(t, y) -> (n,)``.
+    start : Start
+    name : str
+        Name of the solver class, for messages.
+    hint : callable
+        Returns what else the caller can do if the equations are of another kind.
+
+    Raises
+    ------
+    ValueError
+        If the equations are not those of the method.
+    """
+    return method
+
+
+@checked.register
+def _(method: NystromTableau, rhs: Derivative, start: Any, name: str, hint: Callable[[], str]) -> NystromTableau:
+    if depends_on_velocity(rhs, start, name, hint):
+        raise ValueError(
+            f"{name} integrates q'' = a(t, q), but fun's accelerations change with the velocity; take a Runge-Kutta "
+            f"method such as EIPDOP853."
+        )
+    return method
+
+
+@checked.register
+def _(method: GaussJackson, rhs: Derivative, start: Any, name: str, hint: Callable[[], str]) -> GaussJackson:
+    return replace(method, velocities=depends_on_velocity(rhs, start, name, hint))
+
+
+def check_halves(n: int) -> None:
+    """Raise a ValueError if n components cannot be (q, v)."""
+    if n % 2:
+        raise ValueError(f"a Nystrom method needs the state (q, v), an even number of components; y0 has {n}.")
+
+
+def depends_on_velocity(rhs: Derivative, start: Any, name: str, hint: Callable[[], str] = str) -> bool:
+    """Return whether the accelerations of q'' = a(t, q, v), y = (q, v), change with v.
+
+    Raises
+    ------
+    ValueError
+        If the first half of the derivative is not v.
+    """
+    t0, y0, f0, _ = start
+    check_halves(y0.size)
+    half = y0.size // 2
+    other = y0.copy()
+    other[half:] = 1.5 * y0[half:] + 1.0
+    f = rhs(t0, other)
+    if not (np.array_equal(f0[:half], y0[half:]) and np.array_equal(f[:half], other[half:])):
+        raise ValueError(
+            f"{name} integrates q'' = a(t, q) with the state (q, v): the first {half} components of fun must be v, "
+            f"the second half of the state, and are not. Take a Runge-Kutta method such as EIPDOP853, or where the "
+            f"system is one of second order, write it with the velocities as that half{hint()}."
+        )
+    return not np.array_equal(f[half:], f0[half:], equal_nan=True)
