@@ -185,7 +185,7 @@ def dense_parts(**case):
     """An engine, and what its dense output is made with."""
     engine, method = Engine(**parts(**case)), case.pop("method", EIPRK4)
     ready = prepared(Request.of(fun=pull, t_span=(0, 1), y0=Y0, method=method, **case))
-    return engine, Interpolants(ready.run, ready.method, engine).record
+    return engine, Interpolants(ready.run, engine).record
 
 
 @pytest.mark.parametrize(
