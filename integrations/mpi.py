@@ -185,8 +185,8 @@ def over_ranks(method: type[EIPSolver], comm: MPI.Comm | None = None) -> type[EI
         raise TypeError(f"over_ranks: method must be an EIP class such as EIPRK4, got {method!r}.")
     if method.TABLEAU.in_python:
         raise TypeError(f"over_ranks: {method.__name__} is no Runge-Kutta method; its step would see one rank's part.")
-    if method._project_step is not EIPSolver._project_step or issubclass(method, SolverOfParts):
-        raise TypeError(f"over_ranks: {method.__name__} has a _project_step of its own, or is on ranks already.")
+    if issubclass(method, SolverOfParts):
+        raise TypeError(f"over_ranks: {method.__name__} is on ranks already.")
     members = {"COMM": MPI.COMM_WORLD if comm is None else comm, "__doc__": f"`{method.__name__}` over ranks."}
     return type(f"{method.__name__}OverRanks", (_OverRanks, method), members)
 

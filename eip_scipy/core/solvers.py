@@ -16,7 +16,6 @@ import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
 from ..engine.data import (
-    FAILED_PROJECTION,
     FOUND,
     NEXT_LENGTH,
     NFEV,
@@ -24,7 +23,6 @@ from ..engine.data import (
     NLU,
     OK,
     PENDING,
-    REJECTED,
     WAITED,
     Work,
     bare_schedule,
@@ -247,8 +245,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     def _checked_method(self, start: Start) -> AnyMethod:
         """Return the method for the present function, which is called where it has to be one of second order."""
         name = type(self).__name__
-        if self.TABLEAU.has_history and self._finishes:
-            raise TypeError(f"{name}: a multistep method has no step that _project_step could end.")
         return steppers.checked(self.TABLEAU, partial(_copied, self._derivative), start, name, _by_name)
 
     def _start(self, begin: Start, *, check: bool) -> None:
@@ -257,8 +253,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._run, self._work, self._begin = run, run.work, begin
         self._attach_history(begin)
         setup.attach(self.diagnostics, run)
-        self._project_now, self._projection_status, self._last = False, OK, False
-        self._accepted = run.y0
         self.y, self.f = run.y0, begin.f
         # The state that the steps are made from, where `y` is its copy on the manifold.
         self._raw = self._raw_old = run.y0
@@ -438,12 +432,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _hooks(self) -> dict[str, Any]:
         """Parts of the steps that a subclass takes itself, see `Hooks`."""
-        return {"finish": self._finish} if self._finishes else {}
-
-    @property
-    def _finishes(self) -> bool:
-        """Whether a subclass ends the steps, by the hook."""
-        return type(self)._project_step is not EIPSolver._project_step
+        return {}
 
     def _count(self) -> int:
         """Show the counts of the run; returns how often something stood out in its projections."""
@@ -452,7 +441,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         return int(counters[FOUND])
 
     def _scipy_solver(self, start: np.ndarray, own_steps: bool) -> OdeSolver | None:
-        if self._SCIPY is None or self.h is not None or own_steps or self._finishes:
+        if self._SCIPY is None or self.h is not None or own_steps:
             return None
 
         control = {"max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
@@ -509,8 +498,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._k += 1
         self._steps += 1
         self.h_previous = t - self.t
-        if self._finishes:
-            y_new = self._accepted
         self._raw_old, self._raw = self._raw, y_new
         self.y_old = self.y
         self.y = self._on_manifold(t, y_new) if self._shows else y_new
@@ -529,47 +516,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         if not self._told and run.look(self._steps, arrived, self.t, self.y, rhs):
             self._told = True
             warnings.warn(f"{type(self).__name__}: {run.trust.message}", ProjectionWarning, stacklevel=users_level())
-
-    def _finish(self, t_new: float, project: bool, last: bool) -> int:
-        """What the engine's `finish_step` does, with the hook in its place."""
-        w = self._work
-        self._project_now, self._projection_status, self._last = project, OK, last
-        self._accepted = self._project_step(t_new, self.y, w.y_hat, w.err)
-        if self._projection_status == FAILED_PROJECTION:
-            w.counters[REJECTED] += 1
-            return FAILED_PROJECTION
-        self._engine.close(t_new, self._accepted, project, self._projection_status)
-        return OK
-
-    def _project_step(self, t: float, y: np.ndarray, y_hat: np.ndarray, err: np.ndarray) -> np.ndarray:
-        """The accepted state from a raw step; override to act after each step.
-
-        Parameters
-        ----------
-        t : float
-            Time of the new state.
-        y : ndarray, shape (n,)
-            The state that the step started from.
-        y_hat : ndarray, shape (n,)
-            The raw result; a buffer, valid during the call.
-        err : ndarray
-            Its local error estimate (float view: 2 n entries for a complex state), zero where there is none.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            A new array.
-        """
-        w, y_new = self._work, np.empty_like(y)
-        if not self._project_now:
-            y_new[:] = y_hat
-            return y_new
-        if y_hat is not w.y_hat:
-            w.y_hat[:] = y_hat
-        if err is not w.err:
-            w.err[:] = err
-        self._projection_status = self._engine.project(self.t, y, t, self._last, y_new)
-        return y_new
 
     def _sampled(self) -> Interpolants:
         """Return the interpolants of the run, which hand out states on the manifold."""

@@ -270,12 +270,7 @@ class Engine:
         """
 
     def project(self, t_old: float, y: numpy.typing.NDArray[numpy.inexact], t: float, last: bool, y_new: numpy.typing.NDArray[numpy.inexact]) -> int:
-        """
-        Project work.y_hat into y_new: by itself, or within a step whose hook calls for it.
-        """
-
-    def close(self, t_new: float, y_new: numpy.typing.NDArray[numpy.inexact], project: bool, status: int) -> None:
-        """End a step whose state is y_new, after its projection."""
+        """Project work.y_hat into y_new."""
 
     def values(self, t: numpy.typing.NDArray[numpy.float64], y: numpy.typing.NDArray[numpy.inexact], out: numpy.typing.NDArray[numpy.float64], params: numpy.typing.NDArray[numpy.float64] | None = None) -> None:
         """

@@ -102,15 +102,13 @@ class OctetFunctions(NamedTuple):
 class Hooks(NamedTuple):
     """Parts of a step in Python, in place of the engine's own.
 
-    ``one_step(t, y, h)`` fills work.y_hat, and work.err if it `estimates`. ``finish(t_new, project, last)`` does all
-    that follows on the raw step, and returns the engine's code; so does ``project(t_old, t, last, y_new)`` for the
-    projection alone. `joint` are `JointInvariants`, which come before that. ``agree(here)``: whether the raw result is
-    finite on all processes that have a part of the state, as it is `here`.
+    ``one_step(t, y, h)`` fills work.y_hat, and work.err if it `estimates`. ``project(t_old, t, last, y_new)`` projects
+    work.y_hat and returns the engine's code. `joint` are `JointInvariants`, which come before that. ``agree(here)``:
+    whether the raw result is finite on all processes that have a part of the state, as it is `here`.
     """
 
     one_step: Callable[..., Any] | None = None
     estimates: bool = False
-    finish: Callable[..., Any] | None = None
     project: Callable[..., Any] | None = None
     agree: Callable[..., Any] | None = None
     joint: Any = None

@@ -375,8 +375,6 @@ def _method(method: Any) -> Any:
             f"integrate: method must be an EIP class such as EIPRK4, or one that eip_method made; got {method!r}"
             f"{_class_of(method)}."
         )
-    if method._project_step is not EIPSolver._project_step:
-        raise TypeError(f"integrate does not call {method.__name__}._project_step; use it through solve_ivp.")
     return method.TABLEAU
 
 

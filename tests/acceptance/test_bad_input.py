@@ -696,16 +696,6 @@ def test_method_without_a_tableau_through_solve_ivp():
         by_scipy(method=EIPSolver)
 
 
-def test_method_with_a_hook_of_its_own():
-    class Hooked(EIPRK4):
-        def _project_step(self, t, y, y_hat, err):
-            return super()._project_step(t, y, y_hat, err)
-
-    with pytest.raises(TypeError, match="_project_step; use it through solve_ivp"):
-        by_integrate(method=Hooked)
-    np.testing.assert_array_equal(by_scipy(method=Hooked, invariants=SQUARE).y, by_scipy(invariants=SQUARE).y)
-
-
 def test_missing_arguments():
     with pytest.raises(TypeError, match="method"):
         integrate(oscillator, (0, 1), Y0, h=0.1)

@@ -21,11 +21,9 @@ from eip_scipy import (
     EIPRKN12,
     Diagnostics,
     Invariant,
-    eip_method,
     integrate,
 )
 from eip_scipy.problems import kepler, solar_system
-from eip_scipy.solvers import EIPSolver
 
 EPS = np.finfo(float).eps
 METHODS = [EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]
@@ -737,46 +735,6 @@ def test_progress_says_that_a_run_is_compiled(capsys):
     assert capsys.readouterr().err.strip().startswith("compiling")
     integrate(jit_orbit, (0, 6), Y0, method=EIPRK45, progress=True, compiled=False)
     assert "compiling" not in capsys.readouterr().err
-
-
-def test_hook_after_each_accepted_step():
-    """`_project_step` is called once per accepted step, never for rejected ones, and its state goes on."""
-    seen = []
-
-    class Mine(EIPRK45):
-        def _project_step(self, t, y, y_hat, err):
-            seen.append(t)
-            out = super()._project_step(t, y, y_hat, err)
-            return out * 0.0 + np.where(out > 10, 10.0, out)
-
-    assert issubclass(Mine, EIPSolver)
-    for invariants in ((), H):
-        seen.clear()
-        sol = solve_ivp(orbit, (0, 6), Y0, method=Mine, invariants=invariants, first_step=3.0)
-        assert seen == sol.t[1:].tolist()
-        assert sol.nfev > 6 * len(sol.t)
-        same = solve_ivp(orbit, (0, 6), Y0, method=eip_method(EIPRK45.TABLEAU), invariants=invariants, first_step=3.0)
-        np.testing.assert_array_equal(sol.y, same.y)
-
-
-@pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")
-def test_hook_may_project_another_raw_state():
-    """What a class hands on as raw state and error is what is projected, by the weights of that error."""
-    moves = []
-
-    class Mine(EIPRK45):
-        def _project_step(self, t, y, y_hat, err):
-            raw = y_hat + 1e-6
-            y_new = super()._project_step(t, y, raw, err * [0.0, 0.0, 0.0, 1.0])
-            moves.append(np.abs(y_new - raw))
-            return y_new
-
-    sol = solve_ivp(orbit, (0, 0.1), Y0, method=Mine, h=0.02, invariants=H)
-    assert np.abs(energy(0, sol.y) - energy(0, Y0)).max() < 1e-10
-    moves = np.array(moves)
-    assert moves[:, 3].min() > 1e-6
-    # The corrections exceed five of these errors, so that the weights are softened; without that 1e-11, by their floor.
-    assert moves[:, :3].max() < 0.02 * moves[:, 3].min()
 
 
 @pytest.mark.nightly

@@ -565,17 +565,6 @@ def test_states_that_are_none():
         solve_ivp(lambda t, y: -y, (0, 1), np.ones(3), method=EIPGJ12, h=0.01)
 
 
-def test_no_step_to_override():
-    """A subclass cannot end what is no step."""
-
-    class Mine(EIPGJ12):
-        def _project_step(self, t, y, y_hat, err):
-            return y_hat
-
-    with pytest.raises(TypeError, match="has no step that _project_step could end"):
-        solve_ivp(orbit, (0, 1), Y0, method=Mine, h=0.01)
-
-
 def test_what_is_not_finite():
     """Where it was, as of other methods."""
     run = integrate(

@@ -121,10 +121,10 @@ def one_step(y, method, h, options):
     seen = []
 
     class Recorder(method):
-        def _project_step(self, t, y, y_hat, err):
-            y_new = super()._project_step(t, y, y_hat, err)
-            seen.append((y_hat.copy(), y_new))
-            return y_new
+        def _step_impl(self):
+            done = super()._step_impl()
+            seen.append((self._work.y_hat.copy(), self.y.copy()))
+            return done
 
     t = h * np.hypot(y[0], y[1]) ** 1.5
     solve_ivp(ORBIT.fun, (0, t), y, method=Recorder, h=abs(t), invariants=ORBIT.invariants, check=False, **options)

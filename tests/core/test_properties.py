@@ -566,17 +566,23 @@ def test_spacing_by_itself_is_its_rule(h, metric):
     seen, evaluated = [], set()
 
     class Recorder(EIPRK4):
-        def _project_step(self, t, y, y_hat, err):
-            seen.append((t, y_hat.copy(), err.copy()))
-            return super()._project_step(t, y, y_hat, err)
+        """What is known of each step before the errors are added to those of earlier steps."""
+
+        def _step_impl(self):
+            self._shows = False  # copies on the manifold evaluate the invariant in each step
+            alone = EIPRK4(swing, self.t, self._raw, self.t + 1.0, h=h, invariants=quiet, check=False)
+            alone.step()
+            done = super()._step_impl()
+            seen.append((self.t, alone._work.y_hat.copy(), alone._work.err.copy()))
+            return done
 
     def value(t, y):
         evaluated.add(t)
         return swing_energy(t, y)
 
     y0, n = [0.1, -0.2, 0.35, 0.05], 103
-    keep = Invariant(value, swing_gradient)
-    options = {"method": Recorder, "h": h, "invariants": keep, "metric": metric, "check": False}
+    keep, quiet = Invariant(value, swing_gradient), Invariant(swing_energy, swing_gradient)
+    options = {"method": Recorder, "reuse_f": False, "h": h, "invariants": keep, "metric": metric, "check": False}
     solve_ivp(swing, (0, n * h), y0, every="auto", **options)
     squares, expected = 0.0, {0.0, n * h}
     for k, (t, y_hat, err) in enumerate(seen, start=1):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK4, Diagnostics, Invariant, project
+from eip_scipy import EIPRK4, Diagnostics, Invariant, eip_method, project
 
 EPS = np.finfo(float).eps
 RTOL, STEP = 1e-3, 0.5
@@ -34,19 +34,20 @@ class Case:
         return out
 
     def run(self):
-        err = self.err.astype(self.y.dtype).view(float)
+        err = self.err.astype(self.y.dtype)
 
-        class Given(EIPRK4):
-            def _project_step(self, t, y, y_hat, _):
-                return super()._project_step(t, y, y_hat, err)
+        class Given:
+            order, error_estimator_order = 4, 3
+
+            def one_step(self, t, y, h):
+                return y, err
 
         self.evaluated.clear()
         diagnostics = Diagnostics()
         options = {"h": STEP, "rtol": RTOL, "atol": 0.0, "blocks": self.blocks, "check": False}
         keep = Invariant(self.value, self.gradient)
-        sol = solve_ivp(
-            lambda t, y: 0 * y, (0, STEP), self.y, method=Given, invariants=keep, diagnostics=diagnostics, **options
-        )
+        options |= {"method": eip_method(Given()), "invariants": keep, "diagnostics": diagnostics}
+        sol = solve_ivp(lambda t, y: 0 * y, (0, STEP), self.y, **options)
         return sol, diagnostics
 
     def lists(self):

@@ -305,18 +305,12 @@ def test_grids_that_cannot_be_cut(grid, ranks):
         SlabGrossPitaevskii(grid, comm=SimpleNamespace(rank=0, size=ranks))
 
 
-class Own(EIPRK4):
-    def _project_step(self, t, y, y_hat, err):
-        return y_hat.copy()
-
-
 @pytest.mark.parametrize(
     ("method", "match"),
     [
         ("EIPRK4", "must be an EIP class"),
         (EIPSolver, "must be an EIP class"),
         (eip_method(Splitting(small()[0])), "no Runge-Kutta method"),
-        (Own, "_project_step of its own"),
         (ALONE, "is on ranks already"),
     ],
 )

@@ -102,11 +102,6 @@ inline Code finish_step(const AnyRun &run, const Step &step) {
     return OK;
 }
 
-template <class AnyRun>
-inline Code any_finish_step(const AnyRun &run, const Step &step) {
-    return run.hooks && run.hooks->finish ? static_cast<Code>(run.hooks->finish_step(step)) : finish_step(run, step);
-}
-
 // SciPy's: ten spacings of the numbers at t.
 inline double least_step(double t, double sign) { return 10.0 * std::abs(std::nextafter(t, sign * INFINITE) - t); }
 
@@ -144,7 +139,7 @@ inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_
         const double norm = adaptive ? w.norm[0] : 0.0;
         if (status == OK && !std::isfinite(norm)) status = NOT_FINITE;
         if (status == OK && norm < 1.0) {
-            status = any_finish_step(run, step);
+            status = finish_step(run, step);
             if (status == OK) {
                 const double factor =
                     norm == 0.0 ? MAX_FACTOR : std::min(MAX_FACTOR, SAFETY * std::pow(norm, run.method.exponent));

@@ -44,8 +44,6 @@ Code step_once(const Run &run, const Schedule &s, int64_t k, const double *y, do
 
 Code project_once(const Run &run, const Step &step) { return project_any(run, step); }
 
-void close_once(const Run &run, const Step &step, Code status) { close_step(run, step, status); }
-
 void describe_step(const Run &run, const Dense &d, double t_old, const double *y_old, double t, const double *y,
                    double *piece) {
     const DenseRun dense(d, run.system);

@@ -23,7 +23,6 @@ Code sweep_eights(const Run &run, const Octets &octets, const Schedule &s, const
 // Step k of a run, and parts of a step: its projection, and what follows it.
 Code step_once(const Run &run, const Schedule &s, int64_t k, const double *y, double *y_new);
 Code project_once(const Run &run, const Step &step);
-void close_once(const Run &run, const Step &step, Code status);
 
 // The interpolant over a step of a run from y_old at t_old to y at t, and states at some times by it.
 void describe_step(const Run &run, const Dense &dense, double t_old, const double *y_old, double t, const double *y,

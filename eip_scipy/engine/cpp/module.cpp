@@ -51,7 +51,7 @@ bool has_v3() {
 }
 
 // The engine steps for one caller at a time, and interpolates for one: a function that does so with the run it belongs to
-// is refused. Hooks come back to it while it works, to project and to close the step at hand.
+// is refused.
 class Busy {
   public:
     explicit Busy(bool &flag) : flag_(flag) {
@@ -224,11 +224,6 @@ class Engine {
         return stepped([&](const Run &run) { return project_once(run, step); });
     }
 
-    void close(double t_new, State y_new, bool project, int status) {
-        const Step step{0.0, t_new, 0.0, nullptr, checked(y_new, "y_new"), project, false};
-        stepped([&](const Run &run) { return close_once(run, step, static_cast<Code>(status)), OK; });
-    }
-
     void values(Times t, StatesOf<const double, 2> y, ArrayOf<double, 2> out,
                 std::optional<ArrayOf<const double, 2>> params) {
         const Busy busy(busy_);
@@ -361,9 +356,7 @@ void add_engine(nb::module_ &m) {
         .def("step", &Engine::step, "k"_a, "t"_a, "y"_a, "f"_a,
              "Step k from the state y at t with the derivative f. Returns (status, t_new, y_new, f_new).")
         .def("project", &Engine::project, "t_old"_a, "y"_a, "t"_a, "last"_a, "y_new"_a,
-             "Project work.y_hat into y_new: by itself, or within a step whose hook calls for it.")
-        .def("close", &Engine::close, "t_new"_a, "y_new"_a, "project"_a, "status"_a,
-             "End a step whose state is y_new, after its projection.")
+             "Project work.y_hat into y_new.")
         .def("values", &Engine::values, "t"_a, "y"_a, "out"_a, "params"_a = nb::none(),
              "Fill out (m, l) with the invariants at states y (m, n), each with its own params (m, p) where they are "
              "given.")

@@ -178,12 +178,10 @@ PythonHooks::PythonHooks(nb::handle hooks, const Buffers &buffers, const Run &ru
         return found.is_none() ? nb::handle() : found;
     };
     one_step_ = given("one_step");
-    finish_ = given("finish");
     project_ = given("project");
     agree_ = given("agree");
     estimates_ = truth(hooks, "estimates");
     raw = one_step_.is_valid();
-    finish = finish_.is_valid();
     project = project_.is_valid();
     agree = agree_.is_valid();
     const nb::handle joint_invariants = given("joint");
@@ -246,10 +244,6 @@ int PythonHooks::project_elsewhere(const Step &step) {
 }
 
 bool PythonHooks::all_agree(bool here) { return nb::bool_(agree_(nb::bool_(here))).is(nb::bool_(true)); }
-
-int PythonHooks::finish_step(const Step &step) {
-    return code_of(finish_(time(step.t_new), nb::bool_(step.project), nb::bool_(step.last)));
-}
 
 // One Newton step by the functions of `JointInvariants`: the one that `project_step` takes in the euclidean metric, its
 // dead bands, bounds and verdict included. False where that needs more: gradients nearly parallel, or a projection that

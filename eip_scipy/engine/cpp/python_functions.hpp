@@ -70,7 +70,6 @@ class PythonHooks final : public Hooks {
     PythonHooks(nb::handle hooks, const Buffers &buffers, const Run &run, nb::list &kept);
 
     int raw_step(const Step &step) override;
-    int finish_step(const Step &step) override;
     bool project_jointly(const Step &step) override;
     int project_elsewhere(const Step &step) override;
     bool all_agree(bool here) override;
@@ -81,7 +80,7 @@ class PythonHooks final : public Hooks {
   private:
     Run run_;
     int type_;
-    nb::handle to_, one_step_, finish_, project_, agree_, moments_, shift_, y_hat_, f_hat_, values_, R_, terms_, mu_;
+    nb::handle to_, one_step_, project_, agree_, moments_, shift_, y_hat_, f_hat_, values_, R_, terms_, mu_;
     bool estimates_ = false;
 };
 

@@ -38,9 +38,8 @@ struct Step;
 class Hooks {
   public:
     virtual ~Hooks() = default;
-    bool raw = false, finish = false, joint = false, project = false, agree = false;
+    bool raw = false, joint = false, project = false, agree = false;
     virtual int raw_step(const Step &step) = 0;
-    virtual int finish_step(const Step &step) = 0;
     virtual bool project_jointly(const Step &step) = 0;
     virtual int project_elsewhere(const Step &step) = 0;
     virtual bool all_agree(bool here) = 0;

@@ -53,7 +53,7 @@ inline Truth<Value> defects(const double *terms, const Value *y, const Options &
 template <class Value, class W>
 inline void start_figures(const Value *y, const Value *f, double tau, const Method &method, const Hooks *hooks,
                           const Options &o, const W &w) {
-    const bool own = !hooks || !(hooks->raw || hooks->finish || hooks->joint || hooks->project);
+    const bool own = !hooks || !(hooks->raw || hooks->joint || hooks->project);
     const bool known = !method.multistep && own;
     for (int64_t i = 0; i < w.l; ++i) {
         const Value *G = w.gradient(i);
@@ -247,7 +247,8 @@ inline auto is_rough(const Value &share, const Value *figures) {
 // block, which the invariants need not show.
 [[gnu::cold, gnu::noinline]] inline void note_roughness(const Step &step, const Options &o, const Work &w) {
     // The first one that is clearly too large is examined: later ones may come of it.
-    if (w.suspected() > LARGE_ERROR || (w.suspected() == LARGE_ERROR && w.figures(0)[ROUGH_NOTED] > CLEAR_ERROR)) return;
+    if (w.suspected() > LARGE_ERROR || (w.suspected() == LARGE_ERROR && w.figures(0)[ROUGH_NOTED] > CLEAR_ERROR))
+        return;
     const double share = largest_error_share(step.h, step.y, o, w);
     if (!is_rough(share, w.figures(0))) return;
     w.figures(0)[ROUGH_NOTED] = share;
