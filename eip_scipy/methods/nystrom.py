@@ -157,12 +157,13 @@ class NystromTableau(Ordered):
         A, b, b_prime, c and, if given, b_hat and b_prime_hat, as fractions (floats where floats were given).
     n_stages : int
     fsal : bool
-        Whether the last stage is the first of the next step.
+        Whether the last stage serves the error estimate only, and is the first one of the next step.
 
     Raises
     ------
     ValueError
-        When the tableau is not explicit, shapes disagree, or an order condition fails.
+        When the tableau is not explicit, its first stage is not at the start of the step, shapes disagree, or an order
+        condition fails.
     """
 
     of_second_order = True
@@ -212,6 +213,10 @@ class NystromTableau(Ordered):
         if error_estimator_order is not None:
             rows.append(Weights("b_hat", exact["b_hat"], error_estimator_order, True))
             rows.append(Weights("b_prime_hat", exact["b_prime_hat"], error_estimator_order, False))
+        if exact["c"][0] != 0:
+            raise ValueError(
+                f"{name}: the first node is {exact['c'][0]}, expected 0: the first stage is at the start of the step."
+            )
         self._check_order(name, exact["A"], exact["c"], rows)
         self._set(name=name, order=order, error_estimator_order=error_estimator_order, reference=reference)
         self._set(b_hat=None, b_prime_hat=None, exact=MappingProxyType(exact), n_stages=s, fsal=_is_fsal(exact))
@@ -259,9 +264,9 @@ def _row(name: str, label: str, values: Sequence[Number], s: int) -> np.ndarray:
 
 
 def _is_fsal(exact: Mapping[str, np.ndarray]) -> bool:
-    """Whether the last stage is the new position at the new time, and the first stage the old at the old."""
-    ends_meet = exact["c"][0] == 0 and exact["c"][-1] == 1
-    return bool(ends_meet and np.array_equal(exact["A"][-1], exact["b"]))
+    """Return whether the last stage is at the new position and time, and the step does not use it."""
+    unused = exact["c"][-1] == 1 and exact["b"][-1] == 0 and exact["b_prime"][-1] == 0
+    return bool(unused and np.array_equal(exact["A"][-1], exact["b"]))
 
 
 def _difference(exact: Mapping[str, np.ndarray], key: str) -> np.ndarray:

@@ -8,7 +8,9 @@ import mpmath
 import numpy as np
 import pytest
 from mpmath import mpf
+from scipy.integrate import solve_ivp
 
+from eip_scipy import eip_method, integrate
 from eip_scipy.methods.nystrom import RKN86, RKN1210, NystromTableau, Weights, nystrom_residuals, nystrom_trees
 
 DIGITS = 60
@@ -283,12 +285,51 @@ def test_e_is_the_difference_of_the_weights(tableau, key):
     assert list(getattr(tableau, "e" if key == "b" else "e_prime")) == [float(x - y) for x, y in pairs]
 
 
+@pytest.mark.parametrize("tableau", METHODS[:2], ids=name)
+@pytest.mark.parametrize("driver", ["integrate", "solve_ivp"])
+def test_a_step_uses_all_weights(tableau, driver):
+    """Also those of a last stage at the new position; the step is written out in NumPy."""
+    h, y0 = 0.1, np.array([0.4, -0.2])
+
+    def acceleration(q):
+        return -np.sin(q) + 0.1 * q**2
+
+    k = np.zeros(tableau.n_stages)
+    for i in range(tableau.n_stages):
+        k[i] = acceleration(y0[0] + tableau.c[i] * h * y0[1] + h**2 * tableau.A[i, :i] @ k[:i])
+    expected = [y0[0] + h * y0[1] + h**2 * tableau.b @ k, y0[1] + h * tableau.b_prime @ k]
+    options = {"method": eip_method(tableau), "h": h}
+    if driver == "integrate":
+        run = integrate(acceleration=lambda t, q: acceleration(q), t_span=(0, h), y0=y0, **options)
+    else:
+        run = solve_ivp(lambda t, y: [y[1], acceleration(y[0])], (0, h), y0, **options)
+    np.testing.assert_allclose(run.y[:, -1], expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize("tableau", METHODS[:2], ids=name)
+def test_small_methods_have_their_order(tableau):
+    """Of the pendulum, against twice as many steps."""
+
+    def end(n):
+        options = {"method": eip_method(tableau), "h": 2.0 / n}
+        return integrate(acceleration=lambda t, q: -np.sin(q), t_span=(0, 2), y0=[1.0, 0.3], **options).y[:, -1]
+
+    one, two, four = (end(n) for n in (40, 80, 160))
+    order = np.log2(np.abs(one - two).max() / np.abs(two - four).max())
+    assert order == pytest.approx(tableau.order, abs=0.1)
+
+
+def test_the_first_stage_is_at_the_start():
+    with pytest.raises(ValueError, match="drift: the first node is 1/2, expected 0"):
+        NystromTableau("drift", A=[[]], b=["1/2"], b_prime=[1], c=["1/2"], order=2)
+
+
 def test_attributes():
     assert [t.n_stages for t in METHODS] == [2, 3, 2, 9, 17]
     assert [t.order for t in METHODS] == [2, 4, 2, 8, 12]
     assert [t.error_estimator_order for t in METHODS] == [1, None, None, 6, 10]
     assert [t.has_estimate for t in METHODS] == [True, False, False, True, True]
-    assert [t.fsal for t in METHODS] == [True, False, False, True, False]
+    assert [t.fsal for t in METHODS] == [False, False, False, True, False]
     assert all("Dormand, El-Mikkawy & Prince" in t.reference for t in HIGH)
     assert repr(RKN86) == "<NystromTableau RKN86: 9 stages, order 8, estimate of order 6>"
     assert repr(METHODS[1]) == "<NystromTableau nystrom4: 3 stages, order 4>"
