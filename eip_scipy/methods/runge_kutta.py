@@ -327,13 +327,6 @@ RK2 = _Published(
     error_estimator_order=1,
     reference=f"{_PAPER} (explicit midpoint); estimate: explicit Euler",
 )
-RALSTON3 = _Published(
-    "Ralston3",
-    [[], ["1/2"], [0, "3/4"]],
-    ["2/9", "1/3", "4/9"],
-    order=3,
-    reference="A. Ralston, Runge-Kutta methods with minimum error bounds, Math. Comp. 16 (1962), p. 433, eq. 3.9",
-)
 RK3 = _Published(
     "RK3",
     [[], ["1/3"], [0, "2/3"]],
