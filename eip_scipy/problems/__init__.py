@@ -4,7 +4,6 @@ from ..core.invariants import JointInvariants
 from ..core.moved import moved_names
 from ..core.pointers import CFunctions
 from ..core.problem import Problem
-from .duffing import duffing
 from .gravity import solar_data as solar_data
 from .gravity.forces import ForceConstants
 from .gravity.nbody import nbody
@@ -64,7 +63,6 @@ __all__ = [
     "centre_time",
     "charged_particle",
     "comet",
-    "duffing",
     "equations",
     "figure_eight",
     "find_invariants",
