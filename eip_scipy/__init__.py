@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         EIPRK45,
         EIPRKN8,
         EIPRKN12,
+        EIPVerlet,
         eip_method,
     )
     from .ensembles.ensemble import ensemble
@@ -58,6 +59,7 @@ __all__ = [
     "EIPRK45",
     "EIPRKN8",
     "EIPRKN12",
+    "EIPVerlet",
     "Diagnostics",
     "Invariant",
     "ProjectionWarning",
