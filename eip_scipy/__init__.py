@@ -33,7 +33,6 @@ if TYPE_CHECKING:
         EIPRK45,
         EIPRKN8,
         EIPRKN12,
-        EIPVerlet,
         eip_method,
     )
     from .ensembles.ensemble import ensemble
@@ -59,7 +58,6 @@ __all__ = [
     "EIPRK45",
     "EIPRKN8",
     "EIPRKN12",
-    "EIPVerlet",
     "Diagnostics",
     "Invariant",
     "ProjectionWarning",

@@ -30,7 +30,7 @@ from ..engine.data import (
 from ..engine.native import Call, PythonFunctions
 from ..engine.trust import ProjectionWarning
 from ..methods.multistep import GaussJackson
-from ..methods.nystrom import RKN86, RKN1210, VERLET, NystromTableau
+from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
 from . import setup, steppers
 from .acceleration import BY_NAME, named_accelerations
@@ -64,7 +64,6 @@ __all__ = [
     "EIPRKN8",
     "EIPRKN12",
     "EIPSolver",
-    "EIPVerlet",
     "eip_method",
 ]
 
@@ -716,15 +715,6 @@ class EIPRKN8(EIPSolver):
     """
 
     TABLEAU = RKN86
-
-
-class EIPVerlet(EIPSolver):
-    """EIP method on Stoermer and Verlet's step (order 2), for q'' = a(t, q) with the state (q, v).
-
-    Options: see `EIPSolver`.
-    """
-
-    TABLEAU = VERLET
 
 
 class EIPRKN12(EIPSolver):

@@ -306,15 +306,6 @@ class _Published(NystromTableau):
         return self.name  # of the variable too: exact fractions need not travel, and problems that have one pickle
 
 
-VERLET = NystromTableau(
-    "Verlet",
-    [[], ["1/2"]],
-    ["1/2", 0],
-    ["1/2", "1/2"],
-    [0, 1],
-    order=2,
-    reference="L. Verlet, Computer experiments on classical fluids I, Phys. Rev. 159 (1967), p. 98; kick, drift, kick",
-)
 RKN86 = _Published(
     "RKN86",
     [
