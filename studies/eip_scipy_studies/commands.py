@@ -85,7 +85,6 @@ COMMANDS = {
         "measurements.references:ParticleReference", "reference states of the charged particles"
     ),
     "study recommend": Entry("measurements.recommend:Recommended", "true errors of recommended runs on the hard cases"),
-    "study pendulum-period": Entry("measurements.pendulum_period:PendulumPeriod", "the period of a pendulum"),
     "study relativity": Entry(
         "measurements.relativity:Relativity", "ten bodies with relativity beside WHFast and IAS15"
     ),
