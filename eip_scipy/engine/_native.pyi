@@ -427,6 +427,7 @@ class Options(NamedTuple):
     most_left: numpy.typing.NDArray[numpy.float64]
     kinds: Grouping
     kappa: float
+    damping: float
     metric: int
     direction: int
     iterations: int
