@@ -129,14 +129,7 @@ def _record(run: Run, events: int) -> Dense:
     stages = run.method.b.size
     n, dtype, invariants = run.y0.size, run.y0.dtype, run.invariants.size
     options = run.options._replace(
-        metric=GIVEN,
-        direction=NEW,
-        every=1,
-        compensated=False,
-        iterations=ITERATIONS,
-        damping=1.0,
-        watched=False,
-        limit=math.inf,
+        metric=GIVEN, direction=NEW, every=1, compensated=False, iterations=ITERATIONS, watched=False, limit=math.inf
     )
     width = 2 if dtype.kind == "c" else 1
     return Dense(

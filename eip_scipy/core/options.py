@@ -34,7 +34,7 @@ from ..engine.data import (
 from ..engine.trust import FAR_IN_TOLERANCES, MOST_FAR
 from .blocks import blocks_of
 from .frame import frame_rows
-from .inputs import count, flag, is_number, real_array, shown
+from .inputs import count, flag, real_array
 from .invariants import TARGET_TOLERANCE, Invariant, InvariantSet, JointInvariants
 from .stepping import AnyMethod, Stepping
 
@@ -72,7 +72,6 @@ class ProjectionDetails(TypedDict, total=False):
     frame: Frame
     direction: Literal["new", "old", "midpoint"]
     iterations: int
-    damping: float
     every: int | Literal["auto"] | None
     reuse_f: bool
     compensated: bool | None
@@ -145,10 +144,6 @@ class ProjectionOptions:
         metadata=_text(
             "int", "Newton steps of the projection. 1 (default) is the EIP method; more is the standard projection."
         ),
-    )
-    damping: float = field(
-        default=1.0,
-        metadata=_text("float", "Share of each Newton step that is taken, in (0, 1]. Default 1."),
     )
     every: int | str | None = field(
         default=None,
@@ -249,7 +244,6 @@ class ProjectionOptions:
             metric=kind,
             direction=DIRECTIONS[self.direction],
             iterations=count("iterations", self.iterations, MOST_ITERATIONS),
-            damping=_share("damping", self.damping),
             every=self._every(method),
             # The steps of a one-step method do not take f: there is nothing to evaluate in place of f(y_hat).
             reuse_f=flag("reuse_f", self.reuse_f) or method.in_python,
@@ -279,7 +273,6 @@ class ProjectionOptions:
             "frame": None if self.frame is None else [np.asarray(a, y0.dtype) for a in self.frame],
             "direction": self.direction,
             "iterations": o.iterations,
-            "damping": o.damping,
             "every": "auto" if o.every == AUTO else o.every,
             "reuse_f": o.reuse_f,
             "uses_f": o.uses_f,
@@ -319,12 +312,6 @@ class ProjectionOptions:
                 return (ERROR if method.has_estimate else EUCLIDEAN), None
             raise ValueError(f"metric must be 'error', 'euclidean' or an array of n weights, got {metric!r}.")
         return GIVEN, np.repeat(weights("metric", metric, n), width)
-
-
-def _share(name: str, value: Any) -> float:
-    if not (is_number(value) and 0 < value <= 1):
-        raise ValueError(f"{name} must be a number in (0, 1], got {shown(value)}.")
-    return float(value)
 
 
 def _far_by_tolerances(rtol: np.ndarray) -> float:

@@ -267,13 +267,7 @@ def _scales(options: Options, invariants: InvariantSet, start: Start) -> np.ndar
 def projected_start(run: Run, rhs: Callable[[float, np.ndarray], np.ndarray], t0: float, f0: np.ndarray) -> np.ndarray:
     """y0 on the targets, by full Newton steps in the euclidean metric."""
     options = run.options._replace(
-        metric=EUCLIDEAN,
-        direction=NEW,
-        iterations=START_ITERATIONS,
-        damping=1.0,
-        compensated=False,
-        watched=False,
-        limit=np.inf,
+        metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False, watched=False, limit=np.inf
     )
     projection = Projection(run.invariants, options, rhs)
     projection.work.K[-1] = f0

@@ -427,7 +427,6 @@ class Options(NamedTuple):
     most_left: numpy.typing.NDArray[numpy.float64]
     kinds: Grouping
     kappa: float
-    damping: float
     metric: int
     direction: int
     iterations: int

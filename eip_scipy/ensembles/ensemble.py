@@ -383,9 +383,8 @@ def ensemble(
         Bound on the memory for results; default: half of what is free.
     **keywords
         Options of `integrate`: args (the same for all), in_place, events, compensated, compiled, metric, blocks, frame,
-        direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step, damping. Events
-        are kept for each member in ``.t_events`` and ``.y_events``; a terminal one ends its member. `check` looks at
-        one member.
+        direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step. Events are kept
+        for each member in ``.t_events`` and ``.y_events``; a terminal one ends its member. `check` looks at one member.
 
     Returns
     -------

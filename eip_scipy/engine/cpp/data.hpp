@@ -212,7 +212,7 @@ struct Options {
     const double *most_left;          // the share of its terms that a Newton step may leave without a further one
     bool has_limits;                  // whether any of these is finite
     Blocks kinds;                     // floats of the same unit, as far as that is known
-    double kappa, damping;            // damping: the share of a Newton step that is taken
+    double kappa;
     int64_t metric, direction, iterations, every;
     bool reuse_f, uses_f, compensated, adaptive, watched;
     double per_band;  // an invariant's terms are this many dead bands
@@ -233,9 +233,9 @@ void fields(Options &o, Visit &visit) {
     visit("computed", o.computed, is.l);
     visit("most_left", o.most_left, is.l);
     visit.record("kinds", "Grouping", o.kinds);
-    each(visit, "kappa", o.kappa, "damping", o.damping, "metric", o.metric, "direction", o.direction, "iterations",
-         o.iterations, "every", o.every, "reuse_f", o.reuse_f, "uses_f", o.uses_f, "compensated", o.compensated,
-         "adaptive", o.adaptive, "per_band", o.per_band);
+    each(visit, "kappa", o.kappa, "metric", o.metric, "direction", o.direction, "iterations", o.iterations, "every",
+         o.every, "reuse_f", o.reuse_f, "uses_f", o.uses_f, "compensated", o.compensated, "adaptive", o.adaptive,
+         "per_band", o.per_band);
     visit.by_default("watched", o.watched, false);
     visit.by_default("limit", o.limit, INFINITE);
     visit.by_default("far", o.far, FAR);

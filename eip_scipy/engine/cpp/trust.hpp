@@ -42,7 +42,7 @@ inline Truth<Value> defects(const double *terms, const Value *y, const Options &
         w.band[i] = band * size;
         raw[i] = w.values[i] - w.target[i];
         const Truth<Value> inside = (w.band[i] < INFINITE) & (abs(raw[i]) <= w.band[i]);
-        w.g[i] = where(inside, 0.0, o.damping * raw[i]);
+        w.g[i] = where(inside, 0.0, raw[i]);
         outside = outside | !inside;
     }
     return outside;
