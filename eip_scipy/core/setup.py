@@ -115,8 +115,8 @@ class Run:
         Steps that the engine suspects are examined. The invariants are checked after some numbers of steps and at the
         end, and where the corrections are too large, to find the reason. `rhs` returns a new array.
         """
-        if not self.options.watched:
-            return False
+        if not self.options.watched or self.trust.failed:
+            return False  # a failure has its own message
         suspect = self.work.suspect
         if self.trust.doubts:
             # One examination still has to tell how fast the invariants change, by which corrections are judged.
@@ -124,7 +124,7 @@ class Run:
                 self.examiner.examine(suspect, rhs)
             return self._is_doubtful(ended)
         found = self.examiner.examine(suspect, rhs) if suspect[REASON] != NOTHING else None
-        due = (ended and not self.trust.failed) or is_check_due(steps)
+        due = ended or is_check_due(steps)
         if found is None and ((due and steps != self.looked) or self._is_doubtful(ended)):
             self.looked = steps
             found = self.examiner.complaint(rhs, t, y)

@@ -110,12 +110,12 @@ class Work:
     def arrays(self) -> dict[str, numpy.typing.NDArray[Any]]:
         """Return all arrays by name."""
 
-    def share(self, other: Work, names: set) -> None:
+    def share(self, other: Work, names: set[Any]) -> None:
         """Use the buffers of these names of others from now on."""
 
-    def __getstate__(self) -> tuple: ...
+    def __getstate__(self) -> tuple[Any, ...]: ...
 
-    def __setstate__(self, arg: tuple, /) -> None: ...
+    def __setstate__(self, arg: tuple[Any, ...], /) -> None: ...
 
     @property
     def K(self, /) -> numpy.ndarray: ...
@@ -333,8 +333,8 @@ class LibraryFunction:
 
     def __repr__(self) -> str: ...
 
-    def __reduce__(self) -> tuple: ...
-LIBRARY: dict = ...
+    def __reduce__(self) -> tuple[Any, ...]: ...
+LIBRARY: dict[Any, Any] = ...
 
 class FailedCallError(Exception): ...
 
@@ -544,12 +544,12 @@ class comparators:
 
 class gradients:
     @staticmethod
-    def complex_step(fun: object, t: object, y: numpy.typing.NDArray[numpy.float64], args: tuple, step: float) -> numpy.ndarray:
+    def complex_step(fun: object, t: object, y: numpy.typing.NDArray[numpy.float64], args: tuple[Any, ...], step: float) -> numpy.ndarray:
         """
         Return the gradient (..., n) of ``fun(t, y, *args)`` along the components of y (n,): the imaginary parts over the step.
         """
     @staticmethod
-    def checked_complex_step(fun: object, t: object, y: numpy.typing.NDArray[numpy.float64], args: tuple, step: float, direction: numpy.typing.NDArray[numpy.float64], floors: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray | None:
+    def checked_complex_step(fun: object, t: object, y: numpy.typing.NDArray[numpy.float64], args: tuple[Any, ...], step: float, direction: numpy.typing.NDArray[numpy.float64], floors: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray | None:
         """
         Return the same, or None where it disagrees with a difference of ``fun`` along ``direction * (abs(y) + floors)``, as that of a function does which is not analytic.
         """

@@ -350,12 +350,12 @@ class Loop:
                 return 1, STOPPED
             if ended:
                 return 1, ENDED_BY_EVENT
+            if code not in (OK, PAUSE, ENDED, FULL):
+                return -1, setup.failure(code, driver.run, driver.schedule.clock)
             if is_check_due(driver.step) or driver.suspects:
                 self._look()
             if code == FULL:
                 driver.grow()
-            elif code not in (OK, PAUSE, ENDED):
-                return -1, setup.failure(code, driver.run, driver.schedule.clock)
             elif code == OK and driver.schedule.clock[TIME] == driver.schedule.span.t_bound:
                 return 0, ARRIVED
             if code == OK:
