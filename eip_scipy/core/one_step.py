@@ -81,8 +81,8 @@ class OneStep(Ordered):
 
     Notes
     -----
-    f is evaluated only where a gradient takes it: the steps themselves do not. ``nfev`` counts these evaluations and
-    the method's `evaluations`, in each step that is tried.
+    f is evaluated only if a gradient takes it, because the steps themselves do not, and in a few steps by which the
+    projections are judged. ``nfev`` counts the former and the method's `evaluations`, in each step that is tried.
     """
 
     in_python = True

@@ -214,9 +214,9 @@ def prepare(
 
     Parameters
     ----------
-    method : Tableau, NystromTableau or OneStep
+    method : Tableau, NystromTableau, GaussJackson or OneStep
     rhs : callable
-        ``rhs(t, y) -> (n,)``, checked; called only where an invariant's start must be projected.
+        ``rhs(t, y) -> (n,)``, checked; called if the start is projected, and by checks of the invariants.
     start : Start
     projection : ProjectionOptions
     stepping : Stepping
