@@ -420,14 +420,9 @@ def ensemble(
     """
     options: dict[str, Any] = dict(keywords)
     _check_options(options)
+    _check_choices(reduce, callback, progress, max_bytes)
     if invariants is not DEFAULT:
         options["invariants"] = invariants
-    if not (reduce is None or reduce == "state" or callable(reduce)):
-        raise ValueError(f"reduce must be 'state' or a function reduce(t, y), got {shown(reduce)}.")
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback must be a function callback(part), got {shown(callback)}.")
-    flag("progress", progress)
-    check_bytes(max_bytes)
     _check_places(out, checkpoint, checkpoint_every, resume)
     out = None if out is None else location(out)
     checkpoint = None if checkpoint is None else absolute(checkpoint)
@@ -452,30 +447,41 @@ def ensemble(
     held = plan.times.size if reduce is None and out is None else 0
     _check_memory(plan, len(starts), held, max_bytes)
     store: Store | None = None
-    if out is not None:
+    if out is not None or checkpoint is not None:
         identity = plan.identity(starts, parameters, size, own)
         times = plan.times if own.times is None else own.padded
-        store = ZarrStore(out, identity, plan.empty(size), times, len(starts), resume, plan.events)
-    elif checkpoint is not None:
-        store = CheckpointStore(checkpoint, plan.identity(starts, parameters, size, own), checkpoint_every, resume)
+        store = (
+            CheckpointStore(checkpoint, identity, checkpoint_every, resume)
+            if out is None
+            else ZarrStore(out, identity, plan.empty(size), times, len(starts), resume, plan.events)
+        )
     with ended_by_sigterm(store is not None), nullcontext() if store is None else closing(store):
         gathered = _Gathered(plan, len(starts), held, size, store, callback, doubts, own)
         chunks = _chunks(starts, parameters, size, own)
         result = gathered.run(partial(_pool, executor, plan, progress), chunks, progress)
-    doubtful = np.flatnonzero((result.status >= 0) & ~result.trusted)
-    if doubtful.size:
-        _warn(result, doubtful)
+    _warn(result, np.flatnonzero((result.status >= 0) & ~result.trusted))
     return result
 
 
+def _check_choices(reduce: Any, callback: Any, progress: Any, max_bytes: Any) -> None:
+    if not (reduce is None or reduce == "state" or callable(reduce)):
+        raise ValueError(f"reduce must be 'state' or a function reduce(t, y), got {shown(reduce)}.")
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback must be a function callback(part), got {shown(callback)}.")
+    flag("progress", progress)
+    check_bytes(max_bytes)
+
+
 def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
-    """Say that members are not to be trusted.
+    """Warn of members that are not to be trusted, if there are any.
 
     Raises
     ------
     ProjectionWarning
         Where warnings are errors, with the result as ``partial``.
     """
+    if not doubtful.size:
+        return
     k = int(doubtful[0])
     try:
         warnings.warn(
