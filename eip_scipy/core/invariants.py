@@ -418,6 +418,12 @@ class InvariantSet:
         given_targets = [item.target is not None and not item.is_measured for item in self.items]
         self.given = np.repeat(np.array(given_targets, bool), sizes)
         self.shape, self.dtype = (self.size, y0.size), y0.dtype
+        self._bind(functions, values, y0)
+        self._gradients_at_start(t0, y0, f0)
+        self.calls = self._calls(y0)
+
+    def _bind(self, functions: list[Callable[..., Any]], values: list[Array], y0: Array) -> None:
+        """Note functions and gradients with their places among all values, which `values` at the start show."""
         places = [
             start if scalar else slice(start, stop)
             for start, stop, scalar in zip(self.starts[:-1], self.starts[1:], self.scalar, strict=True)
@@ -430,8 +436,6 @@ class InvariantSet:
             (*self._bound_gradient(k), label, place, value.shape + y0.shape)
             for k, (label, place, value) in enumerate(zip(self.labels, places, values, strict=True))
         ]
-        self._gradients_at_start(t0, y0, f0)
-        self.calls = self._calls(y0)
 
     def _scales(self, sizes: list[int]) -> Array:
         scales = np.zeros(self.size)
