@@ -18,6 +18,7 @@ import numpy as np
 from ..engine.data import (
     CHANGES_ALONG_FLOW,
     EXAMINED,
+    LARGE_CORRECTION,
     LARGE_ERROR,
     N_SUSPECT,
     NOTHING,
@@ -26,6 +27,7 @@ from ..engine.data import (
     REASON,
     SUSPECT_FROM,
     SUSPECT_TO,
+    SUSPECT_WAITED,
 )
 from .invariants import InvariantSet
 
@@ -35,6 +37,8 @@ __all__ = ["Examiner", "is_check_due", "steps_to_check"]
 FIRST_CHECK = SPACING = 10
 # Number of points of a step at which rates are examined, because a push may be shorter than the step.
 POINTS = 8
+# Points of each step on the way back over steps that were not projected.
+BACK = 4
 # Factor by which the largest correction has to grow before a large correction is examined again.
 GROWTH = 2.0
 
@@ -91,7 +95,9 @@ class Examiner:
             return self.complaint(rhs, t_new, new)
         if reason == LARGE_ERROR:
             return self._unless_refused(_unresolved, rhs, t_old, t_new - t_old, old)
-        return self._unless_refused(_along_chord, rhs, (t_old, t_new), (old, new))
+        if reason != LARGE_CORRECTION:
+            return None
+        return self._unless_refused(_along_chord, rhs, (t_old, t_new), (old, new), int(suspect[SUSPECT_WAITED]))
 
     def _unless_refused(self, look: Callable[..., str | None], rhs: Derivative, *args: Any) -> str | None:
         """Return what an examination finds, which calls the user's functions through guards.
@@ -146,9 +152,17 @@ def _unresolved(examiner: Examiner, known: InvariantSet, rhs: Derivative, t: flo
 
 
 def _along_chord(
-    examiner: Examiner, known: InvariantSet, rhs: Derivative, times: tuple[float, float], ends: tuple[Array, Array]
+    examiner: Examiner,
+    known: InvariantSet,
+    rhs: Derivative,
+    times: tuple[float, float],
+    ends: tuple[Array, Array],
+    waited: int,
 ) -> str | None:
-    """Return what is wrong between the two ends of a step with a large correction, or None."""
+    """Return what is wrong between the two ends of a step with a large correction, or in the steps before it, or None.
+
+    `waited` steps before it were not projected, and any of them may be what the correction comes from.
+    """
     largest = float(examiner.figures[:, NU].max(initial=0.0))
     if largest < GROWTH * examiner.largest:
         return None
@@ -156,6 +170,29 @@ def _along_chord(
     (t_old, t_new), (old, new) = times, ends
     for share in np.arange(1, POINTS + 1) / POINTS:
         t, y = t_old + float(share) * (t_new - t_old), old + share * (new - old)
+        found = _complaint(examiner, known, rhs, t, y, False)
+        if found is not None:
+            return found
+    return _on_the_way(examiner, known, rhs, (t_old, old), t_new - t_old, waited)
+
+
+def _on_the_way(
+    examiner: Examiner, known: InvariantSet, rhs: Derivative, start: tuple[float, Array], h: float, steps: int
+) -> str | None:
+    """Return what is wrong on the way that led to a state, or None; it is followed back for about `steps` steps."""
+    (t, y), part = start, h / BACK
+    begin = known.t_span[0]
+    # Steps that vary may have been longer before.
+    for _ in range(BACK * (steps + (steps + 1) // 2)):
+        if (t - part - begin) * part < 0:
+            return None
+        k1 = rhs(t, y)
+        k2 = rhs(t - 0.5 * part, y - 0.5 * part * k1)
+        k3 = rhs(t - 0.5 * part, y - 0.5 * part * k2)
+        k4 = rhs(t - part, y - part * k3)
+        t, y = t - part, y - part / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        if not np.isfinite(y).all():
+            return None
         found = _complaint(examiner, known, rhs, t, y, False)
         if found is not None:
             return found

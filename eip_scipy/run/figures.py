@@ -72,13 +72,13 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
         draw_run(ax, result.t, components, paths, described(result))
         return ax
     invariants = invariant_rows(result)
-    corrections = {} if diagnostics is None else dict(zip(invariants, diagnostics.corrections, strict=True))
+    corrections = {} if diagnostics is None else dict(zip(diagnostics.names, diagnostics.corrections, strict=True))
     return run_figure(
         result.t,
         components,
         paths=paths,
         errors={name: errors for name, (_, errors) in invariants.items()},
-        corrections={name: size for name, size in corrections.items() if np.isfinite(size)},
+        corrections={name: size for name, size in corrections.items() if name in invariants and np.isfinite(size)},
         title=described(result),
     )
 

@@ -220,6 +220,8 @@ def _right_hand_side(fun: Any, acceleration: Any) -> Any:
 
 def _with_projection(method: Any, given: list[str]) -> Any:
     """Return the EIP method on a method of SciPy if options of EIP methods are given; otherwise the method itself."""
+    if isinstance(method, str) and method.upper().removeprefix("EIP") != method.upper():
+        raise ValueError(f"solve_ivp: {method!r} is a name; give the class, as in `from eip_scipy import {method}`.")
     is_class = isinstance(method, type) and issubclass(method, OdeSolver)
     if not given or not (is_class or method in EXPLICIT or method in IMPLICIT):
         return method

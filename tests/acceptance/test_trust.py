@@ -504,6 +504,21 @@ def test_kinks_are_no_leaks_between_projections(every, kind, method):
         assert run.trusted, run.message
 
 
+@pytest.mark.parametrize("every", [5, 10, 20])
+@pytest.mark.parametrize("driver", ["integrate", "ensemble"])
+def test_a_leak_shorter_than_the_spacing_is_found(every, driver):
+    """Drag in two steps of a hundred, which the steps that are projected seldom see."""
+
+    def fun(t, y):
+        return np.concatenate([y[2:], -y[:2] / np.hypot(*y[:2]) ** 3 - 0.1 * (0.03 < t % 1 < 0.05) * y[2:]])
+
+    energy = Invariant(lambda t, y: 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2), name="energy")
+    options = {"method": EIPRK4, "h": 0.01, "invariants": energy, "every": every}
+    run, y0 = (integrate, [0.4, 0.0, 0.0, 2.0]) if driver == "integrate" else (ensemble, [[0.4, 0.0, 0.0, 2.0]])
+    with pytest.warns(ProjectionWarning, match="'energy' (is no invariant|was corrected)"):
+        run(fun, (0, 20), y0, **options)
+
+
 def light_planet(mass):
     """Return a star, a giant planet at 5.2, and a planet at 0.2, whose period is 0.56."""
     distances = np.array([5.2, 0.2])

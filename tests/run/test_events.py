@@ -10,6 +10,7 @@ from eip_scipy import (
     EIPDOP853,
     EIPRK4,
     EIPRK45,
+    EIPRKN12,
     Invariant,
     eip_method,
     ensemble,
@@ -298,3 +299,40 @@ def test_counts_go_on_from_a_checkpoint_of_a_continued_run(tmp_path):
     run = first.continue_to(SPAN, **options)
     assert (run.status, run.t_events[0].size) == (1, 5)
     np.testing.assert_allclose(run.t_events[0], times[:5], rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("omega", [0.5, 1.0, 2.5, 3.0])
+@pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853, EIPRKN12])
+def test_a_run_goes_on_from_event_to_event(method, omega):
+    """The state at an event is off zero by rounding, on either side; each zero is found once."""
+
+    def zero(t, y):
+        return y[0]
+
+    zero.terminal = True
+    step = {"h": 0.05} if method is EIPRK4 else {"rtol": 1e-9, "atol": 1e-9}
+    run = integrate(lambda t, y: [y[1], -(omega**2) * y[0]], (0, 60), [1.0, 0.3], method=method, events=zero, **step)
+    for _ in range(8):
+        run = run.continue_to(60.0)
+    first = (np.pi - np.arctan(omega / 0.3)) / omega
+    expected = first + np.arange(9) * np.pi / omega
+    np.testing.assert_allclose(run.t_events[0], expected, rtol=2e-4 if method is EIPRK4 else 1e-7)
+
+
+@pytest.mark.parametrize("h", [0.125, 0.12])
+def test_a_zero_at_the_end_of_a_step_counts_once(h):
+    def event(t, y):
+        return (t - 0.25) * (t - 0.5) * (t - 0.75)
+
+    event.terminal = 3
+    run = integrate(lambda t, y: [y[1], -y[0]], (0, 2), [1.0, 0.0], method=EIPRK4, h=h, events=event)
+    np.testing.assert_allclose(run.t_events[0], [0.25, 0.5, 0.75], rtol=1e-14)
+
+
+@pytest.mark.parametrize("end", [8.0, -8.0])
+def test_zeros_at_steps_and_at_the_start_count_once(end):
+    for time in (0.0, np.sign(end) * 5.0):
+        run = integrate(
+            lambda t, y: [y[1], -y[0]], (0, end), [1.0, 0.0], method=EIPRK4, h=0.01, events=lambda t, y, s=time: t - s
+        )
+        np.testing.assert_allclose(run.t_events[0], [time], atol=1e-14)

@@ -400,6 +400,11 @@ print(members.trustd)
 """
 
 
+def test_a_name_in_the_place_of_a_class_is_answered_with_the_class():
+    with pytest.raises(ValueError, match="'EIPDOP853' is a name; give the class, as in `from eip_scipy"):
+        solve_ivp(lambda t, y: -y, (0, 1), [1.0], method="EIPDOP853")
+
+
 @pytest.mark.slow
 def test_user_code_under_mypy(tmp_path):
     """Correct code passes --strict, and each wrong option is found at its line."""

@@ -46,7 +46,7 @@ EIP_ENUM(Figure, START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MA
          JUDGED, RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM, BY_VALUES, EXAMINED, N_FIGURES);
 
 // The step that is to be examined: why, its two times, and behind these its two states (`suspect` in trust.hpp).
-EIP_ENUM(SuspectPlace, REASON, SUSPECT_FROM, SUSPECT_TO, N_SUSPECT);
+EIP_ENUM(SuspectPlace, REASON, SUSPECT_FROM, SUSPECT_TO, SUSPECT_WAITED, N_SUSPECT);
 EIP_ENUM(Reason, NOTHING, LARGE_CORRECTION, LARGE_ERROR, CHANGES_ALONG_FLOW);
 
 // Changes of LARGE local errors are noted, and defects of FAR and LARGE_SHARE of the terms before and after projections.

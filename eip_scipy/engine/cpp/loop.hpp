@@ -96,6 +96,8 @@ void fields(Samples &s, Visit &visit) {
 
 // Says whether event i goes from the value `before` to the value `after` in the direction that it looks at.
 inline bool crosses(const Schedule &s, int64_t i, double before, double after) {
+    // A zero at the end of the step before has been counted there.
+    if (before == 0.0 && s.clock[TIME] != s.span.t0) return false;
     return (before <= 0.0 && 0.0 <= after && s.g_direction[i] >= 0.0) ||
            (before >= 0.0 && 0.0 >= after && s.g_direction[i] <= 0.0);
 }
@@ -125,8 +127,10 @@ inline bool any_crossing(const Schedule &s) {
     };
     run.system.event(w, t_new, y_new, s.g_new);
     if (std::isnan(s.rate[0])) {
+        // Where a run is continued at an event, s.g is not its value there.
         values_near(t, part, y, slope_at_start(run, d, t, y), s.rate);
-        for (int64_t i = 0; i < s.n_events; ++i) s.rate[i] = (s.rate[i] - s.g[i]) / part;
+        run.system.event(w, t, y, s.rate_new);
+        for (int64_t i = 0; i < s.n_events; ++i) s.rate[i] = (s.rate[i] - s.rate_new[i]) / part;
     }
     values_near(t_new, -part, y_new, slope_at_end(run, d, t, t_new, y_new), s.rate_new);
     for (int64_t i = 0; i < s.n_events; ++i) s.rate_new[i] = (s.g_new[i] - s.rate_new[i]) / part;

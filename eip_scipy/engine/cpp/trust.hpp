@@ -169,6 +169,7 @@ inline Code judge(const double *before, const double *y_old, const double *y, co
     w.suspect[REASON] = reason;
     w.suspect[SUSPECT_FROM] = step.t;
     w.suspect[SUSPECT_TO] = step.t_new;
+    w.suspect[SUSPECT_WAITED] = static_cast<double>(w.counters[WAITED]);
     copy(step.y, w.suspect + N_SUSPECT, w.m);
     copy(w.y_hat, w.suspect + N_SUSPECT + w.m, w.m);
     ++w.counters[FOUND];
@@ -266,7 +267,8 @@ inline void note_share(double share, double t, double *figures, Figure largest_s
 // Return what the step's errors are worth for invariant i if those that the metric remembers are counted: the estimates of
 // the components that its gradient touches may vanish by chance in one step.
 [[gnu::cold, gnu::noinline]] inline double remembered_worth(int64_t i, const Options &o, const Work &w) {
-    if (o.metric != ERROR) return 0.0;
+    // The errors of several steps hardly vanish together.
+    if (o.metric != ERROR || w.counters[WAITED] > 0) return 0.0;
     double largest_error = 0.0, worth = 0.0;
     for (int64_t b = 0; b < o.blocks.count; ++b)
         if (w.scale[b] > 0.0)
