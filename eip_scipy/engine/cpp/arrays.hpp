@@ -23,6 +23,8 @@ namespace nb = nanobind;
 using namespace nb::literals;
 using Lengths = std::initializer_list<npy_intp>;
 
+static_assert(sizeof(npy_intp) == sizeof(int64_t), "the engine needs a 64-bit platform");
+
 // An error in Python's format, which knows %R and %S.
 template <class... Values>
 [[noreturn]] void refuse(PyObject *error, const char *format, Values... values) {

@@ -338,9 +338,9 @@ inline bool project_sample(const Run &run, double t, double *out) {
         }
         const int64_t rank = first_move(o, w, out, false);
         if (rank < 0) return false;
-        bool small = rank == w.l, met = true;
-        for (int64_t i = 0; i < w.l; ++i) small &= std::abs(w.before[i]) <= SMALL_SHARE * o.per_band * w.band[i];
-        if (small) return all_finite(out, w.m);
+        bool sure = rank == w.l, met = true;
+        for (int64_t i = 0; i < w.l; ++i) sure &= std::abs(w.before[i]) <= SMALL_SHARE * o.per_band * w.band[i];
+        if (sure) return all_finite(out, w.m);
         evaluate_invariants(run, t, out);
         if (judge(w.before, nullptr, out, o, w) != OK) return false;
         for (int64_t i = 0; i < w.l; ++i) met &= std::abs(w.defect[i]) <= w.band[i];
@@ -365,12 +365,12 @@ inline void hand_out(const Run &run, const DenseRun &dense, double t, const doub
     copy(y, out, w.m);
     copy(run.work.target, w.target, w.l);
     system.inv(w, t, y, w.values);
-    bool near = true;
+    bool meets = true;
     for (int64_t i = 0; i < w.l; ++i) {
         const double size = std::max(std::max(std::abs(w.values[i]), std::abs(w.target[i])), d.options.scales[i]);
-        near &= std::abs(w.values[i] - w.target[i]) <= SHOWN_ROUNDINGS * EPS * size;
+        meets &= std::abs(w.values[i] - w.target[i]) <= SHOWN_ROUNDINGS * EPS * size;
     }
-    if (near) return;
+    if (meets) return;
     if (d.by_travel)
         weigh_blocks(w.sigma, d.options.blocks, w,
                      [&](int64_t b) { return block_norm(y, nullptr, b, d.options.blocks, w); });

@@ -275,8 +275,8 @@ inline int64_t next_stop(const Method &method, const Samples *samples, const Sch
 // The step up to which a member goes that is at step k, in so many steps: to its end where a multistep method is near it,
 // whose last states cost a step of the method that starts, each of them that is asked for.
 inline int64_t last_of(const Method &method, const Span &span, int64_t k, int64_t steps) {
-    const bool near = method.multistep && span.n_steps - method.multistep->middle <= k + steps;
-    return near ? span.n_steps : k + steps;
+    const bool at_end = method.multistep && span.n_steps - method.multistep->middle <= k + steps;
+    return at_end ? span.n_steps : k + steps;
 }
 
 // Steps up to `k_end`; returns OK or why it stopped. Without `samples` it pauses where there is something to sample.

@@ -198,16 +198,16 @@ inline void start_step(const AnyRun &run, double t, double h, const double *y) {
 // which differ from place to place of an orbit. What is more than rounding is a target of the user's.
 template <class System, class W, class Value = typename W::Value>
 inline void find_levels(System &system, const Multistep &ms, const W &w, const Value *y) {
-    Value *levels = as_values<Value>(ms.levels) + w.l, *near = w.y_hat, *distance = w.move;
+    Value *levels = as_values<Value>(ms.levels) + w.l, *close_by = w.y_hat, *distance = w.move;
     system.grad(w, ms.t0, y, w.row(0), w.G);
     ++w.counters[NJEV];
     for (int64_t k = 0; k < LEVELS; ++k) {
         for (int64_t i = 0; i < w.m; ++i) {
             const double turn = 0.6180339887498949 * static_cast<double>(k * w.m + i + 1);
-            near[i] = y[i] + (LEVEL_DISTANCE * (turn - std::floor(turn) - 0.5)) * y[i];
-            distance[i] = near[i] - y[i];
+            close_by[i] = y[i] + (LEVEL_DISTANCE * (turn - std::floor(turn) - 0.5)) * y[i];
+            distance[i] = close_by[i] - y[i];
         }
-        system.inv(w, ms.t0, near, w.values);
+        system.inv(w, ms.t0, close_by, w.values);
         for (int64_t i = 0; i < w.l; ++i)
             levels[i] +=
                 ((w.values[i] - w.target[i]) - dot(w.gradient(i), distance, w.m)) / static_cast<double>(LEVELS);

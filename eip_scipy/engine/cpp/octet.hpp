@@ -97,6 +97,10 @@ struct Octet {
     double lane(int k) const { return part[k / WIDTH][k % WIDTH]; }
 };
 
+// Arrays of octets are also arrays of 8 n floats, and masks choose lane by lane.
+static_assert(sizeof(Octet) == LANES * sizeof(double) && sizeof(Mask) == sizeof(Octet) &&
+              sizeof(Bits) == sizeof(Vector));
+
 #define EIP_FOR_PARTS(Result, expression)                       \
     Result out;                                                 \
     for (int v = 0; v < VECTORS; ++v) out.part[v] = expression; \

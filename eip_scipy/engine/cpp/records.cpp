@@ -438,6 +438,7 @@ Buffers::Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants
     work.stages = stages;
     auto own = std::make_unique<Memory>();
     for_each_buffer(work, blocks, type, [&own]<class T>(const char *, T *&place, int type, auto shape) {
+        static_assert(sizeof(T) == sizeof(double));
         int64_t count = type == NPY_CDOUBLE ? 2 : 1;
         for (const int64_t length : shape) count *= length;
         place = reinterpret_cast<T *>(own->emplace_back(std::max<int64_t>(count, 1)).data());

@@ -17,6 +17,7 @@ constexpr int WIDTH = 2;
 #endif
 typedef double Vector __attribute__((vector_size(WIDTH * sizeof(double))));
 constexpr int VECTORS = LANES / WIDTH;
+static_assert(sizeof(Vector) == WIDTH * sizeof(double) && VECTORS * WIDTH == LANES);
 
 // One float, or a vector of them.
 template <class Value>

@@ -227,26 +227,26 @@ double total_mass(ConstField psi) {
 struct ExpansionSums {
     Lanes square, slope;
 
-    void add(const double *psi, const double *near, const double *f) {
+    void add(const double *psi, const double *from, const double *f) {
         for (int k = 0; k < VECTORS; ++k) {
-            const Vector d = load(psi + k * WIDTH) - load(near + k * WIDTH);
+            const Vector d = load(psi + k * WIDTH) - load(from + k * WIDTH);
             square.part[k] += d * d;
             slope.part[k] += d * swapped(load(f + k * WIDTH));
         }
     }
 };
 
-// Sums of |d|^2 and Re(conj(i f) d) for d = psi - near.
-std::array<double, 2> expansion(ConstField psi, ConstField near, ConstField f) {
-    require_one_length(psi, near, f);
+// Sums of |d|^2 and Re(conj(i f) d) for d = psi - from.
+std::array<double, 2> expansion(ConstField psi, ConstField from, ConstField f) {
+    require_one_length(psi, from, f);
     const Released released(psi.points);
     std::array<double, 2> total{};
     sum_blocks(2 * psi.points, total, [&](npy_intp begin, npy_intp end) {
         ExpansionSums block;
         npy_intp i = begin;
-        for (; i + LANES <= end; i += LANES) block.add(psi.data + i, near.data + i, f.data + i);
+        for (; i + LANES <= end; i += LANES) block.add(psi.data + i, from.data + i, f.data + i);
         if (i < end) {
-            const Tail tail(end - i, {psi.data + i, near.data + i, f.data + i});
+            const Tail tail(end - i, {psi.data + i, from.data + i, f.data + i});
             block.add(tail.of[0], tail.of[1], tail.of[2]);
         }
         return std::array{block.square.sum(), odd_less_even(block.slope)};

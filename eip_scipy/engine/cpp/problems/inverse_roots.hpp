@@ -4,6 +4,8 @@
 // between 1e-100 and 1e150 will do in any unit; bodies at one place give NaN.
 #pragma once
 
+#include <limits>
+
 #include "../octet.hpp"
 
 namespace eip {
@@ -14,6 +16,7 @@ constexpr uint64_t ESTIMATE = 0x5FE6996542967F58;
 constexpr double CUBIC[] = {2.216453840039739, -2.274298221857139, 1.3991927078645605, -0.3413483382980669};
 
 inline Vector root_estimate(Vector x) {
+    static_assert(std::numeric_limits<double>::is_iec559 && sizeof(double) == sizeof(uint64_t));
     typedef uint64_t Words __attribute__((vector_size(sizeof(Vector))));
     const Vector y = (Vector)(ESTIMATE - ((Words)x >> 1));
     const Vector c = x * y * y;
