@@ -62,55 +62,54 @@ inline Vector absolute(Vector v) {
     return v;
 }
 
-inline double dot(const double *a, const double *b, int64_t n) {
+inline double absolute(double x) { return __builtin_fabs(x); }
+
+// The sum of the terms of all i < n; term<Value>(i) is that of one float, or a vector of those from i on. The pointer says
+// what is added: floats, or octets (values.hpp).
+template <class Term>
+inline double sum_of(const double *, int64_t n, const Term &term) {
     const int64_t whole = n - n % LANES;
     double rest = 0.0;
-    for (int64_t i = whole; i < n; ++i) rest += a[i] * b[i];
+    for (int64_t i = whole; i < n; ++i) rest += term.template operator()<double>(i);
     if (whole == 0) return 0.0 + rest;
     Lanes lanes;
     for (int64_t i = 0; i < whole; i += LANES)
-        for (int k = 0; k < VECTORS; ++k) lanes.part[k] += load(a + i + k * WIDTH) * load(b + i + k * WIDTH);
+        for (int k = 0; k < VECTORS; ++k) lanes.part[k] += term.template operator()<Vector>(i + k * WIDTH);
     return lanes.sum() + rest;
+}
+
+template <class Value>
+inline Value dot(const Value *a, const Value *b, int64_t n) {
+    return sum_of(a, n, [=]<class Part>(int64_t i) { return load_as<Part>(a + i) * load_as<Part>(b + i); });
 }
 
 // Sum of |a_i b_i|.
-inline double abs_dot(const double *a, const double *b, int64_t n) {
-    const int64_t whole = n - n % LANES;
-    double rest = 0.0;
-    for (int64_t i = whole; i < n; ++i) rest += __builtin_fabs(a[i] * b[i]);
-    if (whole == 0) return 0.0 + rest;
-    Lanes lanes;
-    for (int64_t i = 0; i < whole; i += LANES)
-        for (int k = 0; k < VECTORS; ++k) lanes.part[k] += absolute(load(a + i + k * WIDTH) * load(b + i + k * WIDTH));
-    return lanes.sum() + rest;
+template <class Value>
+inline Value abs_dot(const Value *a, const Value *b, int64_t n) {
+    return sum_of(a, n, [=]<class Part>(int64_t i) { return absolute(load_as<Part>(a + i) * load_as<Part>(b + i)); });
 }
 
 // Sum of (a_i b_i)^2.
-inline double square_dot(const double *a, const double *b, int64_t n) {
-    const int64_t whole = n - n % LANES;
-    double rest = 0.0;
-    for (int64_t i = whole; i < n; ++i) rest += (a[i] * b[i]) * (a[i] * b[i]);
-    if (whole == 0) return 0.0 + rest;
-    Lanes lanes;
-    for (int64_t i = 0; i < whole; i += LANES)
-        for (int k = 0; k < VECTORS; ++k) {
-            const Vector x = load(a + i + k * WIDTH) * load(b + i + k * WIDTH);
-            lanes.part[k] += x * x;
-        }
-    return lanes.sum() + rest;
+template <class Value>
+inline Value square_dot(const Value *a, const Value *b, int64_t n) {
+    return sum_of(a, n, [=]<class Part>(int64_t i) {
+        const Part x = load_as<Part>(a + i) * load_as<Part>(b + i);
+        return x * x;
+    });
 }
 
-// Sums of |a_i b_i| and of |a_i c_i|, each as by `abs_dot`.
+// Sums of |a_i b_i| and of |a_i c_i|, each as by `abs_dot`, in one pass over floats.
+template <class Value>
 struct AbsDots {
-    double b, c;
+    Value b, c;
 };
 
-inline AbsDots abs_dots(const double *a, const double *b, const double *c, int64_t n) {
+inline AbsDots<double> abs_dots(const double *a, const double *b, const double *c, int64_t n) {
     const int64_t whole = n - n % LANES;
     double rest_b = 0.0, rest_c = 0.0;
     for (int64_t i = whole; i < n; ++i) {
-        rest_b += __builtin_fabs(a[i] * b[i]);
-        rest_c += __builtin_fabs(a[i] * c[i]);
+        rest_b += absolute(a[i] * b[i]);
+        rest_c += absolute(a[i] * c[i]);
     }
     if (whole == 0) return {0.0 + rest_b, 0.0 + rest_c};
     Lanes lanes_b, lanes_c;
@@ -124,37 +123,19 @@ inline AbsDots abs_dots(const double *a, const double *b, const double *c, int64
     return {lanes_b.sum() + rest_b, lanes_c.sum() + rest_c};
 }
 
-// Largest entry of non-negative ones, 0 for none; NaN is passed over.
-inline double largest(const double *a, int64_t n) {
-    double top = 0.0;
-    for (int64_t i = 0; i < n; ++i) top = a[i] > top ? a[i] : top;
-    return top;
-}
-
 // row -= (unit . row) unit; that product, and the square of what is left.
 struct Removed {
     double product, square;
 };
 
 inline Removed remove_component(double *row, const double *unit, int64_t n) {
-    const double r = dot(unit, row, n);
-    const int64_t whole = n - n % LANES;
-    double rest = 0.0;
-    for (int64_t i = whole; i < n; ++i) {
-        const double left = row[i] - r * unit[i];
-        row[i] = left;
-        rest += left * left;
-    }
-    if (whole == 0) return {r, 0.0 + rest};
-    Lanes lanes;
-    for (int64_t i = 0; i < whole; i += LANES)
-        for (int k = 0; k < VECTORS; ++k) {
-            const int64_t at = i + k * WIDTH;
-            const Vector left = load(row + at) - r * load(unit + at);
-            store(left, row + at);
-            lanes.part[k] += left * left;
-        }
-    return {r, lanes.sum() + rest};
+    const double r = dot<double>(unit, row, n);
+    const double square = sum_of(row, n, [=]<class Part>(int64_t i) {
+        const Part left = load_as<Part>(row + i) - r * load_as<Part>(unit + i);
+        store_as(left, row + i);
+        return left * left;
+    });
+    return {r, square};
 }
 
 // Rows of stages and their weights: sum_j weights[j] rows[j], in this order, weights of 0 skipped.

@@ -31,42 +31,34 @@ inline Octet power(const Octet &x, double exponent) {
     return Octet::load(lanes);
 }
 
-// Sum of so many terms, each lane in the order of sums.hpp.
+// What the sums of sums.hpp take in place of a float or vector: an octet, whose lanes are added in the same order.
+template <class Value>
+inline const Value &load_as(const Octet *a) {
+    return *a;
+}
+inline Octet absolute(const Octet &x) { return abs(x); }
+
 template <class Term>
-inline Octet sum_of(int64_t n, Term term) {
+inline Octet sum_of(const Octet *, int64_t n, const Term &term) {
     const int64_t whole = n - n % LANES;
     Octet rest(0.0);
-    for (int64_t i = whole; i < n; ++i) rest += term(i);
+    for (int64_t i = whole; i < n; ++i) rest += term.template operator()<Octet>(i);
     if (whole == 0) return rest;
     Octet sums[LANES];
     for (Octet &sum : sums) sum = 0.0;
     for (int64_t i = 0; i < whole; i += LANES)
-        for (int k = 0; k < LANES; ++k) sums[k] += term(i + k);
+        for (int k = 0; k < LANES; ++k) sums[k] += term.template operator()<Octet>(i + k);
     return ((sums[0] + sums[4]) + (sums[2] + sums[6])) + ((sums[1] + sums[5]) + (sums[3] + sums[7])) + rest;
 }
 
-inline Octet dot(const Octet *a, const Octet *b, int64_t n) {
-    return sum_of(n, [=](int64_t i) { return a[i] * b[i]; });
-}
-
-inline Octet abs_dot(const Octet *a, const Octet *b, int64_t n) {
-    return sum_of(n, [=](int64_t i) { return abs(a[i] * b[i]); });
-}
-
-inline Octet square_dot(const Octet *a, const Octet *b, int64_t n) {
-    return sum_of(n, [=](int64_t i) { return (a[i] * b[i]) * (a[i] * b[i]); });
-}
-
-struct AbsDotsOfOctets {
-    Octet b, c;
-};
-
-inline AbsDotsOfOctets abs_dots(const Octet *a, const Octet *b, const Octet *c, int64_t n) {
+inline AbsDots<Octet> abs_dots(const Octet *a, const Octet *b, const Octet *c, int64_t n) {
     return {abs_dot(a, b, n), abs_dot(a, c, n)};
 }
 
-inline Octet largest(const Octet *a, int64_t n) {
-    Octet top = 0.0;
+// The largest entry of non-negative ones, 0 for none; NaN is passed over.
+template <class Value>
+inline Value largest(const Value *a, int64_t n) {
+    Value top = 0.0;
     for (int64_t i = 0; i < n; ++i) top = max(top, a[i]);
     return top;
 }
