@@ -35,31 +35,29 @@ void multiply(Field field, ConstReals factor) {
         for (npy_intp i = 0; i < 2 * columns; ++i) z[i] *= factor.data[r];
 }
 
-// out = -i (out + rest + (V + beta |psi|^2) psi).
-void derivative(ConstField rest, ConstField psi, ConstReals V, double beta, Field out) {
-    require_one_length(rest, psi, V, out);
+// out = -i (out + (V + beta |psi|^2) psi), where `whole` adds to a float of out what else belongs to it.
+template <class Whole>
+void turned_derivative(ConstField psi, ConstReals V, double beta, Field out, Whole whole) {
     const Released released(psi.points);
     for (npy_intp i = 0; i < psi.points; ++i) {
         const double a = psi.data[2 * i], b = psi.data[2 * i + 1];
         const double v = V.data[i] + beta * (a * a + b * b);
-        const double re = out.data[2 * i] + rest.data[2 * i] + v * a;
-        const double im = out.data[2 * i + 1] + rest.data[2 * i + 1] + v * b;
+        const double re = whole(2 * i) + v * a, im = whole(2 * i + 1) + v * b;
         out.data[2 * i] = im;
         out.data[2 * i + 1] = -re;
     }
 }
 
+// out = -i (out + rest + (V + beta |psi|^2) psi).
+void derivative(ConstField rest, ConstField psi, ConstReals V, double beta, Field out) {
+    require_one_length(rest, psi, V, out);
+    turned_derivative(psi, V, beta, out, [&](npy_intp i) { return out.data[i] + rest.data[i]; });
+}
+
 // out = -i (out + (V + beta |psi|^2) psi).
 void derivative_at_once(ConstField psi, ConstReals V, double beta, Field out) {
     require_one_length(psi, V, out);
-    const Released released(psi.points);
-    for (npy_intp i = 0; i < psi.points; ++i) {
-        const double a = psi.data[2 * i], b = psi.data[2 * i + 1];
-        const double v = V.data[i] + beta * (a * a + b * b);
-        const double re = out.data[2 * i] + v * a, im = out.data[2 * i + 1] + v * b;
-        out.data[2 * i] = im;
-        out.data[2 * i + 1] = -re;
-    }
+    turned_derivative(psi, V, beta, out, [&](npy_intp i) { return out.data[i]; });
 }
 
 // out += (V + beta |psi|^2) psi.
@@ -165,19 +163,34 @@ inline double odd_less_even(const Lanes &lanes) {
     return ((lane[1] + lane[5]) + (lane[3] + lane[7])) - ((lane[0] + lane[4]) + (lane[2] + lane[6]));
 }
 
-// The last floats of up to three fields, filled up with zeros, whose terms are 0.
+// The last floats of a field, filled up with zeros, whose terms are 0.
 struct Tail {
-    double of[3][LANES] = {};
-    Tail(npy_intp count, std::initializer_list<const double *> from) {
-        double (*copy)[LANES] = of;
-        for (const double *first : from) std::copy_n(first, count, *copy++);
-    }
+    double of[LANES] = {};
+    Tail(npy_intp count, const double *from) { std::copy_n(from, count, of); }
 };
+
+// The sums over blocks of `Sums`, whose `add` takes eight floats of each field, and `sums` what a block comes to. `add`
+// is told where these floats stand, and how many of them count: fewer than eight at the end.
+template <class Sums, class... Fields>
+auto lane_sums(npy_intp floats, Sums begin, Fields... fields) {
+    decltype(begin.sums()) total{};
+    sum_blocks(floats, total, [&](npy_intp first, npy_intp end) {
+        Sums block = begin;
+        npy_intp i = first;
+        for (; i + LANES <= end; i += LANES) block.add(i, LANES, fields + i...);
+        if (i < end) {
+            const auto filled_up = [&](const double *from) { return Tail(end - i, from + i); };
+            block.add(i, end - i, filled_up(fields).of...);
+        }
+        return block.sums();
+    });
+    return total;
+}
 
 struct MomentSums {
     Lanes mass, along, square, quartic, sizes;
 
-    void add(const double *psi, const double *f) {
+    void add(npy_intp, npy_intp, const double *psi, const double *f) {
         for (int k = 0; k < VECTORS; ++k) {
             const Vector z = load(psi + k * WIDTH), g = load(f + k * WIDTH);
             const Vector squares = z * z, density = squares + swapped(squares), crossed = z * swapped(g);
@@ -200,18 +213,7 @@ struct MomentSums {
 std::array<double, 5> moments(ConstField psi, ConstField f) {
     require_one_length(psi, f);
     const Released released(psi.points);
-    std::array<double, 5> total{};
-    sum_blocks(2 * psi.points, total, [&](npy_intp begin, npy_intp end) {
-        MomentSums block;
-        npy_intp i = begin;
-        for (; i + LANES <= end; i += LANES) block.add(psi.data + i, f.data + i);
-        if (i < end) {
-            const Tail tail(end - i, {psi.data + i, f.data + i});
-            block.add(tail.of[0], tail.of[1]);
-        }
-        return block.sums();
-    });
-    return total;
+    return lane_sums(2 * psi.points, MomentSums{}, psi.data, f.data);
 }
 
 // The sum of |psi|^2.
@@ -227,67 +229,49 @@ double total_mass(ConstField psi) {
 struct ExpansionSums {
     Lanes square, slope;
 
-    void add(const double *psi, const double *from, const double *f) {
+    void add(npy_intp, npy_intp, const double *psi, const double *from, const double *f) {
         for (int k = 0; k < VECTORS; ++k) {
             const Vector d = load(psi + k * WIDTH) - load(from + k * WIDTH);
             square.part[k] += d * d;
             slope.part[k] += d * swapped(load(f + k * WIDTH));
         }
     }
+    std::array<double, 2> sums() const { return {square.sum(), odd_less_even(slope)}; }
 };
 
 // Sums of |d|^2 and Re(conj(i f) d) for d = psi - from.
 std::array<double, 2> expansion(ConstField psi, ConstField from, ConstField f) {
     require_one_length(psi, from, f);
     const Released released(psi.points);
-    std::array<double, 2> total{};
-    sum_blocks(2 * psi.points, total, [&](npy_intp begin, npy_intp end) {
-        ExpansionSums block;
-        npy_intp i = begin;
-        for (; i + LANES <= end; i += LANES) block.add(psi.data + i, from.data + i, f.data + i);
-        if (i < end) {
-            const Tail tail(end - i, {psi.data + i, from.data + i, f.data + i});
-            block.add(tail.of[0], tail.of[1], tail.of[2]);
-        }
-        return std::array{block.square.sum(), odd_less_even(block.slope)};
-    });
-    return total;
+    return lane_sums(2 * psi.points, ExpansionSums{}, psi.data, from.data, f.data);
 }
 
 struct ShiftSums {
+    double a;
+    Vector b;
+    double *out;
     Lanes mass, square, slope;
 
-    void add(const double *psi, const double *f, double a, Vector b, double *out) {
+    void add(npy_intp i, npy_intp count, const double *psi, const double *f) {
+        double last[LANES], *to = count == LANES ? out + i : last;
         for (int k = 0; k < VECTORS; ++k) {
             const Vector z = load(psi + k * WIDTH), turned = swapped(load(f + k * WIDTH));
-            const Vector d = a * z + b * turned, shifted = z + d;
-            store(shifted, out + k * WIDTH);
-            mass.part[k] += shifted * shifted;
+            const Vector d = a * z + b * turned, there = z + d;
+            store(there, to + k * WIDTH);
+            mass.part[k] += there * there;
             square.part[k] += d * d;
             slope.part[k] += d * turned;
         }
+        if (count < LANES) std::copy_n(last, count, out + i);
     }
+    std::array<double, 3> sums() const { return {mass.sum(), square.sum(), odd_less_even(slope)}; }
 };
 
 // out = psi + a psi + b i f; the sums of |out|^2, and of |d|^2 and Re(conj(i f) d) for the difference d from psi.
 std::array<double, 3> shifted(ConstField psi, ConstField f, double a, double b, Field out) {
     require_one_length(psi, f, out);
     const Released released(psi.points);
-    const Vector factor = turning(b);
-    std::array<double, 3> total{};
-    sum_blocks(2 * psi.points, total, [&](npy_intp begin, npy_intp end) {
-        ShiftSums block;
-        npy_intp i = begin;
-        for (; i + LANES <= end; i += LANES) block.add(psi.data + i, f.data + i, a, factor, out.data + i);
-        if (i < end) {
-            const Tail tail(end - i, {psi.data + i, f.data + i});
-            double last[LANES];
-            block.add(tail.of[0], tail.of[1], a, factor, last);
-            std::copy_n(last, end - i, out.data + i);
-        }
-        return std::array{block.mass.sum(), block.square.sum(), odd_less_even(block.slope)};
-    });
-    return total;
+    return lane_sums(2 * psi.points, ShiftSums{a, turning(b), out.data, {}, {}, {}}, psi.data, f.data);
 }
 
 // Re <a, b>.
