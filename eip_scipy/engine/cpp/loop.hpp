@@ -208,9 +208,10 @@ inline Code locate(const Run &run, const DenseRun &dense, const Schedule &s, Roo
     return OK;
 }
 
-// Notes whether the state at the start of a step, or at its end, is one that no projection has made.
-inline void note_waiting(const Samples *samples, int64_t end, bool waiting) {
-    if (samples) samples->dense.waiting[end] = waiting;
+// Notes whether the state at an end of a step (0 or 1) is one that no projection has made: `waited` steps after the last
+// one, or of a multistep method, whose projections are those of its history, `inside` the run.
+inline void note_waiting(const Samples *samples, int64_t end, const Method &method, int64_t waited, bool inside) {
+    if (samples) samples->dense.waiting[end] = method.multistep ? inside : waited > 0;
 }
 
 // Saves the state y at t, an end of the step at hand, as a row: as it is handed out.
@@ -300,7 +301,7 @@ template <class AnyRun>
         if (samples && samples->interpolants.capacity > 0 &&
             *samples->interpolants.count == samples->interpolants.capacity)
             return FULL;
-        note_waiting(samples, 0, run.method.multistep ? k > 0 : w.counters[WAITED] > 0);
+        note_waiting(samples, 0, run.method, w.counters[WAITED], k > 0);
         const int64_t stop = next_stop(run.method, samples, s, k, k_end);
         const Code status = stop == k + 1
                                 ? next_step(run, s.span, s.clock, k, y, y_new)
@@ -309,7 +310,7 @@ template <class AnyRun>
         place[STEP] = stop;
         place[PENDING] = 1;
         const double t_new = s.clock[TIME_NEW];
-        note_waiting(samples, 1, run.method.multistep ? t_new != s.span.t_bound : w.counters[WAITED] > 0);
+        note_waiting(samples, 1, run.method, w.counters[WAITED], t_new != s.span.t_bound);
         const bool due = t_new == s.span.t_bound || (s.save_every > 0 && stop % s.save_every == 0);
         if (s.n_eval == 0 && due) {
             saved.t[place[ROW]] = t_new;

@@ -40,6 +40,31 @@ void fields(Members &m, Visit &visit) {
     m.n_rows = is.rows;
 }
 
+// Of one member or of eight: nothing noted or counted but the evaluations at the start.
+template <class W>
+inline void clear_notes(const Members &members, const Options &o, const W &w) {
+    fill(w.memory, 0.0, o.blocks.count);
+    fill(w.err_sum, 0.0, w.m);
+    fill(w.max_defect, 0.0, w.l);
+    w.max_correction[0] = 0.0;
+    std::fill_n(w.counters, static_cast<int64_t>(N_COUNTERS), 0);
+    w.counters[NFEV] = members.evaluations;
+    fill(w.trust, 0.0, w.l * N_FIGURES);
+    for (int64_t i = 0; i < w.l; ++i) w.figures(i)[TERMS] = INFINITE;
+}
+
+// Targets and gradients at the start y, with f there in the first row of K; whether all of it is finite.
+template <class System, class W, class Value>
+inline Truth<Value> evaluate_start(System &system, const W &w, double t0, const Value *y) {
+    system.inv(w, t0, y, w.target);
+    copy(w.target, w.values, w.l);
+    system.grad(w, t0, y, w.row(0), w.G);
+    Truth<Value> finite = all_finite(y, w.m);
+    for (const auto &[values, count] : {std::pair(w.row(0), w.m), {w.target, w.l}, {w.G, w.l * w.m}})
+        finite = finite & all_finite(values, count);
+    return finite;
+}
+
 // Everything as at the start of a run; false where it has none that is finite, which is then to be explained.
 inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, const Members &members, double *y) {
     const auto &w = run.work;
@@ -50,26 +75,17 @@ inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, co
     copy(members.params + k * system.n_params, system.params, system.n_params);
     copy(members.starts + k * w.m, y, w.m);
     copy(members.sigma, w.sigma, w.m);
-    fill(w.memory, 0.0, o.blocks.count);
-    for (double *buffer : {w.carry, w.err_sum}) fill(buffer, 0.0, w.m);
-    for (double *buffer : {w.defect, w.max_defect}) fill(buffer, 0.0, w.l);
+    clear_notes(members, o, w);
+    fill(w.carry, 0.0, w.m);
+    fill(w.defect, 0.0, w.l);
     w.suspect[REASON] = NOTHING;
-    w.max_correction[0] = 0.0;
-    std::fill_n(w.counters, static_cast<int64_t>(N_COUNTERS), 0);
-    w.counters[NFEV] = members.evaluations;
     std::fill_n(s.place, 3, 0);
     if (run.method.multistep) forget_history(*run.method.multistep, w.l);
     s.clock[TIME] = s.clock[TIME_NEW] = t0;
     s.clock[NEXT_LENGTH] = members.first_steps[k];
     if (std::isnan(members.first_steps[k])) return false;
     system.rhs(w, t0, y, w.row(0));
-    system.inv(w, t0, y, w.target);
-    copy(w.target, w.values, w.l);
-    system.grad(w, t0, y, w.row(0), w.G);
-    if (!(all_finite(y, w.m) && all_finite(w.row(0), w.m) && all_finite(w.target, w.l) && all_finite(w.G, w.l * w.m)))
-        return false;
-    fill(w.trust, 0.0, w.l * N_FIGURES);
-    for (int64_t i = 0; i < w.l; ++i) w.figures(i)[TERMS] = INFINITE;
+    if (!evaluate_start(system, w, t0, y)) return false;
     if (o.watched) start_figures(y, w.row(0), members.first_steps[k], run.method, run.hooks, o, w);
     if (s.n_events > 0) system.event(w, t0, y, s.g);
     fill(s.rate, NOT_A_NUMBER, s.n_events);

@@ -34,23 +34,30 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
     eight.take(eight.system.params.data(), lane, system.params, system.n_params);
 }
 
-// The step of one member on the buffers of the single run, up to its new state; false where it fails. `shared`: what all
-// had counted before the step.
-[[gnu::noinline]] inline bool step_alone(const Run &run, Eight &eight, int64_t lane, const Schedule &s,
-                                         const int64_t *shared, double *y, double *y_new) {
+// What the projections of one member take and change, onto the buffers of the single run.
+inline void take_member(const Run &run, Eight &eight, int64_t lane) {
     const auto &w = run.work;
     const WorkOf<Octet> &eights = eight.work;
-    eight.take(eight.y, lane, y, w.m);
-    eight.take(eights.K, lane, w.K, w.m);
     eight.take(eights.err_sum, lane, w.err_sum, w.m);
     eight.take(eights.sigma, lane, w.sigma, w.m);
-    eight.take(eights.memory, lane, w.memory, run.options.blocks.count);
     eight.take(eights.target, lane, w.target, w.l);
     eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
     eight.take(eights.max_defect, lane, w.max_defect, w.l);
     copy(eight.suspect(lane), w.suspect, w.suspect_size());
     w.max_correction[0] = eight.at(eights.max_correction, lane);
     take_params(eight, lane, run.system);
+}
+
+// The step of one member on the buffers of the single run, up to its new state; false where it fails. `shared`: what all
+// had counted before the step.
+[[gnu::noinline]] inline bool step_alone(const Run &run, Eight &eight, int64_t lane, const Schedule &s,
+                                         const int64_t *shared, double *y, double *y_new) {
+    const auto &w = run.work;
+    const WorkOf<Octet> &eights = eight.work;
+    take_member(run, eight, lane);
+    eight.take(eight.y, lane, y, w.m);
+    eight.take(eights.K, lane, w.K, w.m);
+    eight.take(eights.memory, lane, w.memory, run.options.blocks.count);
     count_of(eight, lane, shared, w.counters);
     s.clock[NEXT_LENGTH] = std::abs(s.span.h);
     try {
@@ -74,8 +81,8 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
 // Of a multistep method: what one member's projections need, on the buffers of the single run.
 inline void take_history(const Run &run, Eight &eight, int64_t lane) {
     const auto &w = run.work;
-    const WorkOf<Octet> &eights = eight.work;
     const Multistep &one = *run.method.multistep, &all = eight.multistep;
+    take_member(run, eight, lane);
     const int64_t rows = std::min(all.order, all.place[NEWEST_ROW]) + 1;
     std::copy_n(all.place, static_cast<int64_t>(N_NODE_PLACES), one.place);
     one.place[NEWEST_ROW] = rows - 1;
@@ -84,16 +91,8 @@ inline void take_history(const Run &run, Eight &eight, int64_t lane) {
     for (int64_t j = 0; j < rows; ++j) eight.take(oldest + j * one.half, lane, one.nodes + j * one.pitch, one.half);
     for (int64_t j = 0; j < 4; ++j) eight.take(eight.sums + j * one.half, lane, one.sums + j * one.pitch, one.half);
     eight.take(eight.levels, lane, one.levels, 3 * w.l);
-    eight.take(eights.err_sum, lane, w.err_sum, w.m);
-    eight.take(eights.target, lane, w.target, w.l);
-    eight.take(eights.trust, lane, w.trust, w.l * N_FIGURES);
-    eight.take(eights.max_defect, lane, w.max_defect, w.l);
-    copy(eight.suspect(lane), w.suspect, w.suspect_size());
-    w.max_correction[0] = eight.at(eights.max_correction, lane);
-    eight.take(eights.sigma, lane, w.sigma, w.m);
     std::copy_n(eight.own[lane], static_cast<int64_t>(N_COUNTERS), w.counters);
     w.counters[LAST_RANK] = eight.rank[lane];
-    take_params(eight, lane, run.system);
 }
 
 // And what they may have changed of it.
@@ -251,8 +250,8 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
             if (leave.lane(lane))
                 eight.alive[lane] = returned[lane] = step_alone(run, eight, lane, s, before, y, y_new);
     close_step(all, step, OK);
-    note_waiting(samples, 0, before[WAITED] > 0);
-    note_waiting(samples, 1, w.counters[WAITED] > 0);
+    note_waiting(samples, 0, run.method, before[WAITED], k > 0);
+    note_waiting(samples, 1, run.method, w.counters[WAITED], !last);
     for (int64_t lane = 0; any(leave) && lane < LANES; ++lane)
         for (int c = 0; returned[lane] && c < N_COUNTERS; ++c) eight.own[lane][c] -= w.counters[c];
     if (is_due(s, eight.row, t_new)) sample_octet(run, *samples, eight, s, members, step, y, y_new);
@@ -271,8 +270,8 @@ inline int64_t step_octet(const Run &run, Samples *samples, Eight &eight, const 
     const Eight::Run all = eight.run();
     next_states(EightStates{all, run, eight, y_new}, s.span, s.clock, k, stop, from, to);
     const Step step{s.clock[TIME], s.clock[TIME_NEW], s.clock[LENGTH], from, to, false, false};
-    note_waiting(samples, 0, k > 0);
-    note_waiting(samples, 1, step.t_new != s.span.t_bound);
+    note_waiting(samples, 0, run.method, 0, k > 0);
+    note_waiting(samples, 1, run.method, 0, step.t_new != s.span.t_bound);
     if (is_due(s, eight.row, step.t_new)) sample_octet(run, *samples, eight, s, members, step, y, y_new);
     copy(eight.work.last(), eight.work.row(0), eight.work.m);
     std::swap(eight.y, eight.y_new);
@@ -294,25 +293,15 @@ inline void begin_octet(const Run &run, Eight &eight, const Schedule &s, const M
         eight.give(members.sigma, lane, w.sigma, n);
     }
     copy(members.sigma, run.work.sigma, n);
-    fill(w.err_sum, 0.0, n);
-    fill(w.memory, 0.0, eight.options.blocks.count);
-    fill(w.max_defect, 0.0, w.l);
-    for (Octet *one : {w.max_correction, eight.projections, eight.skips, eight.reduced}) *one = 0.0;
-    std::fill_n(w.counters, static_cast<int64_t>(N_COUNTERS), 0);
-    w.counters[NFEV] = members.evaluations;
+    clear_notes(members, eight.options, w);
+    for (Octet *one : {eight.projections, eight.skips, eight.reduced}) *one = 0.0;
     std::fill_n(&eight.own[0][0], LANES * N_COUNTERS, 0);
     std::fill(eight.suspects.begin(), eight.suspects.end(), 0.0);
     std::fill_n(eight.rank, LANES, 0);
     std::fill_n(eight.projected, LANES, 0);
     if (eight.method.multistep) forget_history(eight.multistep, LANES * w.l);
-    fill(w.trust, 0.0, w.l * N_FIGURES);
-    for (int64_t i = 0; i < w.l; ++i) w.figures(i)[TERMS] = INFINITE;
     eight.system.rhs(eight.flat, t0, OctetSystem::floats_of(eight.y), OctetSystem::floats_of(w.row(0)));
-    eight.system.inv(w, t0, eight.y, w.target);
-    copy(w.target, w.values, w.l);
-    eight.system.grad(w, t0, eight.y, w.row(0), w.G);
-    const Mask sound =
-        all_finite(eight.y, n) & all_finite(w.row(0), n) & all_finite(w.target, w.l) & all_finite(w.G, w.l * n);
+    const Mask sound = evaluate_start(eight.system, w, t0, eight.y);
     if (eight.options.watched)
         start_figures<Octet>(eight.y, w.row(0), members.first_steps[first], eight.method, nullptr, eight.options, w);
     for (int64_t lane = 0; lane < LANES; ++lane) eight.alive[lane] = first + lane < members.count && sound.lane(lane);
