@@ -18,7 +18,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checkpoint.own_file import absolute
+from ..checkpoint.locks import absolute
 from ..core import setup
 from ..core.arguments import extra_arguments, floats, parameter_values
 from ..core.inputs import count, flag, is_number, refuse_units, shown
@@ -423,14 +423,9 @@ def ensemble(
     _check_choices(reduce, callback, progress, max_bytes)
     if invariants is not DEFAULT:
         options["invariants"] = invariants
-    _check_places(out, checkpoint, checkpoint_every, resume)
-    out = None if out is None else location(out)
-    checkpoint = None if checkpoint is None else absolute(checkpoint)
+    out, checkpoint = _places(out, checkpoint, checkpoint_every, resume)
     own = own_times(fun, t_span, t_eval, save_every, reduce)
-    starts, parameters = _inputs(fun, y0s, params, options.get("invariants", ()), own)
-    if options.get("args") is not None:
-        shared = floats(extra_arguments(options["args"], params))
-        parameters = np.broadcast_to(shared, (len(starts), shared.size))
+    starts, parameters = _inputs(fun, y0s, params, options, own)
     keep = reduce is None or out is not None
     method = default_method(fun) or EIPRK4 if method is None else method
     common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
@@ -447,14 +442,11 @@ def ensemble(
     held = plan.times.size if reduce is None and out is None else 0
     _check_memory(plan, len(starts), held, max_bytes)
     store: Store | None = None
-    if out is not None or checkpoint is not None:
-        identity = plan.identity(starts, parameters, size, own)
-        times = plan.times if own.times is None else own.padded
-        store = (
-            CheckpointStore(checkpoint, identity, checkpoint_every, resume)
-            if out is None
-            else ZarrStore(out, identity, plan.empty(size), times, len(starts), resume, plan.events)
-        )
+    if out is not None:
+        identity, times = plan.identity(starts, parameters, size, own), plan.times if own.times is None else own.padded
+        store = ZarrStore(out, identity, resume, plan.empty(size), times, len(starts), plan.events)
+    elif checkpoint is not None:
+        store = CheckpointStore(checkpoint, plan.identity(starts, parameters, size, own), resume, checkpoint_every)
     with ended_by_sigterm(store is not None), nullcontext() if store is None else closing(store):
         gathered = _Gathered(plan, len(starts), held, size, store, callback, doubts, own)
         chunks = _chunks(starts, parameters, size, own)
@@ -653,7 +645,8 @@ def _check_options(options: dict[str, Any]) -> None:
     Events(options.get("events"))  # which raises for what is wrong with them
 
 
-def _check_places(out: Any, checkpoint: Any, every: Any, resume: Any) -> None:
+def _places(out: Any, checkpoint: Any, every: Any, resume: Any) -> tuple[str | None, str | None]:
+    """Return where `out` and `checkpoint` lead to now, whatever becomes of the working directory."""
     refuse_units(checkpoint_every=every)
     if not is_number(every) or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
@@ -665,10 +658,11 @@ def _check_places(out: Any, checkpoint: Any, every: Any, resume: Any) -> None:
             raise TypeError(f"{name} must be a path, got {path!r}.")
     if resume and out is None and checkpoint is None:
         raise ValueError("resume=True needs the place to go on from: out= or checkpoint=.")
+    return None if out is None else location(out), None if checkpoint is None else absolute(checkpoint)
 
 
-def _inputs(fun: Any, y0s: Any, params: Any, invariants: Any, times: OwnTimes) -> tuple[np.ndarray, np.ndarray]:
-    """Starts (members, n) and parameters (members, p), p = 0 where there are none."""
+def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: OwnTimes) -> tuple[np.ndarray, np.ndarray]:
+    """Return starts (members, n) and parameters (members, p), p = 0 where there are none."""
     problem = fun if isinstance(fun, Problem) else None
     if y0s is None:
         y0s = None if problem is None else problem.y0
@@ -697,13 +691,14 @@ def _inputs(fun: Any, y0s: Any, params: Any, invariants: Any, times: OwnTimes) -
         )
     elif own.ndim > 2:
         raise ValueError(f"params must have the shape (p,) or (members, p), got {own.shape}.")
-    if own.ndim == 2 and any(item.args for item in as_invariants(invariants)):
+    if own.ndim == 2 and any(item.args for item in as_invariants(options.get("invariants", ()))):
         raise ValueError(
             "ensemble: invariants with args, and params for each member: leave args out; the functions receive each "
             "member's params as their last argument."
         )
-    rows = own if own.ndim == 2 else np.broadcast_to(own, (len(starts), own.size))
-    return starts, rows
+    if options.get("args") is not None:
+        own = floats(extra_arguments(options["args"], params))
+    return starts, own if own.ndim == 2 else np.broadcast_to(own, (len(starts), own.size))
 
 
 def _bare(fun: Any) -> Any:
