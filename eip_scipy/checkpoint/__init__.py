@@ -25,15 +25,13 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.lib import format as npy
 
-from ..core.versions import versions
+from ..core.versions import VERSION, installed
 
 __all__ = ["CheckpointError", "origin", "read", "require_same", "warn_of_other_versions", "write"]
 
 FORMAT, SCHEMA = "eip_scipy checkpoint", 4
 HEADER = "header.json"
 LEFT_OVER = 3600.0
-# Numba's, where it is loaded: else no function of the run is its.
-DECIDING = ("python", "eip_scipy", "numpy", "scipy", "numba")
 
 
 class CheckpointError(Exception):
@@ -155,7 +153,8 @@ def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, An
 
 def warn_of_other_versions(path: str | os.PathLike[str], header: Mapping[str, Any], *, stacklevel: int) -> None:
     """Warn where a checkpoint comes from other versions or another kind of machine: the last bits may differ then."""
-    there, here = ({**(header.get("versions") or {}), "machine": header.get("machine")}, _here())
+    there = {**(header.get("versions") or {}), "machine": header.get("machine")}
+    here = {**_versions(), "machine": _machine()}
     other = [
         f"{name} {there.get(name)}, here {here[name]}"
         for name in here
@@ -188,8 +187,8 @@ def reason(error: OSError) -> str:
 
 @cache
 def _versions() -> dict[str, str | None]:
-    found = versions()
-    return {name: found[name] for name in DECIDING}
+    own = {"python": platform.python_version(), "eip_scipy": VERSION}
+    return {**own, **{name: installed(name) for name in ("numpy", "scipy", "numba")}}
 
 
 def _machine() -> str:
@@ -197,13 +196,10 @@ def _machine() -> str:
 
 
 def origin() -> dict[str, Any]:
-    """Versions and machine, as the header of every checkpoint has them."""
+    """Return versions and machine, as the header of every checkpoint has them."""
+    # Numba's only if it is loaded: otherwise no function of the run is compiled by it.
     decide = {name: version for name, version in _versions().items() if name != "numba" or name in sys.modules}
     return {"versions": decide, "machine": _machine()}
-
-
-def _here() -> dict[str, str | None]:
-    return {**_versions(), "machine": _machine()}
 
 
 def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> None:
