@@ -36,7 +36,8 @@ class Chunk(NamedTuple):
 
     def part(self, first: int, last: int) -> Chunk:
         """Return some of the members, counted from the first one of the chunk."""
-        return Chunk(self.first + first, self.y0s[first:last], self.params[first:last], self.own.part(first, last))
+        params = np.ascontiguousarray(self.params[first:last])
+        return Chunk(self.first + first, self.y0s[first:last], params, self.own.part(first, last))
 
 
 class Part(NamedTuple):

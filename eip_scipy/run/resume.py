@@ -17,7 +17,7 @@ from .. import checkpoint
 from ..checkpoint import CheckpointError
 from ..checkpoint.locks import Lock
 from ..core.callers import users_level
-from ..core.inputs import is_number, shown
+from ..core.inputs import is_number, refuse_units, shown
 from ..core.setup import Run
 from ..core.stepping import Stepping
 from ..engine.data import NEXT_LENGTH, TIME
@@ -73,7 +73,7 @@ class Keeper:
 
 
 @contextmanager
-def keeping(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
+def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Keeper]:
     """The keeper for the options ``checkpoint``, ``checkpoint_every`` and ``resume`` of `integrate`.
 
     Raises
@@ -87,6 +87,7 @@ def keeping(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
     """
     if not isinstance(resume, (bool, np.bool_)):
         raise ValueError(f"resume must be True or False, got {resume!r}.")
+    refuse_units(checkpoint_every=every)
     if not is_number(every) or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
     if path is None:
@@ -96,6 +97,8 @@ def keeping(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
         return
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"checkpoint must be the path of a file, got {path!r}.")
+    if dense_output:
+        raise ValueError("a checkpoint does not keep what dense_output=True needs; give t_eval or save_every instead.")
     with closing(Lock(path)) as lock:
         found, origin = None, ""
         if os.path.lexists(lock.path):
