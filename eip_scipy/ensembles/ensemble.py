@@ -37,7 +37,7 @@ from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
 from ..run.results import Fields
 from ..run.tables import dataset, default_names, to_dataframe
-from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
+from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order, run_elsewhere
 from .happened import Happened
 from .own_times import OwnTimes, own_times
 from .side_by_side import LANES
@@ -777,7 +777,7 @@ def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
         workers = cores() if executor is None else count("executor", executor)
         return ThreadPool(plan, workers if plan.why_not is None else 1)
     if isinstance(executor, Executor):
-        return FuturesPool(executor, task, key)
+        return FuturesPool(executor, partial(run_elsewhere, task, key), cores())
     if executor == "dask" or _is_of_dask(executor):
         if plan.pointers:
             raise plan.pointers[0].unpicklable()  # Dask would bury it in pages of its own
