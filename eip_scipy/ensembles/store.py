@@ -452,12 +452,12 @@ def _name_of(times: np.ndarray) -> str:
 
 
 def is_url(path: str) -> bool:
-    """Whether Zarr finds a store of this name elsewhere than in the local file system."""
+    """Return whether Zarr finds a store of this name elsewhere than in the local file system."""
     return "://" in path
 
 
 def location(path: str | os.PathLike[str]) -> str:
-    """Where a path leads to now; a URL as it is."""
+    """Return where a path leads to now; a URL as it is."""
     text = os.fspath(path)
     return text if is_url(text) else absolute(text)
 
