@@ -143,6 +143,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     """
 
     TABLEAU: ClassVar[Tableau | NystromTableau | GaussJackson | OneStep]
+    # Whether the state is one of several parts, which are projected together.
+    _in_parts: ClassVar[bool] = False
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     _SCIPY: ClassVar[type[OdeSolver] | None] = None
     order: Any = NotImplemented
@@ -257,7 +259,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         # The state that the steps are made from, where `y` is its copy on the manifold.
         self._raw = self._raw_old = run.y0
         self._waits = False, False  # whether the states at both ends of the last step wait for a projection
-        self._shows = run.shows and not self._hooks()  # a hook's projection is its own
+        self._shows = run.shows and not self._in_parts
         if run.y0 is not begin.y:
             self.f = self._derivative(begin.t, run.y0).copy()
         self._steps = 0
@@ -762,6 +764,12 @@ class EIPGJ14(EIPSolver):
     """
 
     TABLEAU = GaussJackson(order=14, corrected=True)
+
+
+def class_named(method: Any) -> str | None:
+    """Return the name of the class that stands in `method` by its name, by SciPy's name of it or as SciPy's class."""
+    name = f"EIP{str(getattr(method, '__name__', method)).upper().removeprefix('EIP')}"
+    return name if name in __all__ else None
 
 
 def eip_method(

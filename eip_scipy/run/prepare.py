@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import setup, solvers, steppers
+from ..core import setup, steppers
 from ..core.acceleration import BY_NAME, AccelerationField, named_accelerations
 from ..core.arguments import Packed, are_same, extra_arguments, floats, names, scalars
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
@@ -24,7 +24,7 @@ from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 from ..core.problem import Problem, made
 from ..core.results import Diagnostics
 from ..core.setup import Counted, Run, Start
-from ..core.solvers import EIPSolver, eip_method
+from ..core.solvers import EIPSolver, class_named, eip_method
 from ..core.stepping import ATOL, AnyMethod, StepOptions, Stepping, interval
 from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
@@ -380,8 +380,8 @@ def _method(method: Any) -> Any:
 
 def _class_of(method: Any) -> str:
     """A hint of the class, where its name came, or SciPy's for the same."""
-    name = f"EIP{str(getattr(method, '__name__', method)).upper().removeprefix('EIP')}"
-    return f". Give the class: from eip_scipy import {name}" if name in solvers.__all__ else ""
+    name = class_named(method)
+    return "" if name is None else f". Give the class: from eip_scipy import {name}"
 
 
 def _check_choices(request: Request) -> None:
