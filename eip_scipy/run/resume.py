@@ -17,8 +17,7 @@ from .. import checkpoint
 from ..checkpoint import CheckpointError
 from ..checkpoint.own_file import OwnFile, unlocked
 from ..core.inputs import is_number, shown
-from ..core.setup import Run
-from ..core.stepping import Stepping
+from ..core.runs import Run
 from ..engine.data import NEXT_LENGTH, TIME
 from ..methods.multistep import Weights
 from .events import Events
@@ -109,10 +108,10 @@ def keeping(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
 
 
 def settings(
-    method: str, stepping: Stepping, y0: np.ndarray, params: np.ndarray, run: Run, schedule: Any, events: Events
+    method: str, y0: np.ndarray, params: np.ndarray, run: Run, schedule: Any, events: Events
 ) -> dict[str, Any]:
     """All that decides the bits of a run, but for the functions, under the names that users give."""
-    span = stepping.span
+    span = run.stepping.span
     # A one-step method of the user's own is known by its name and orders, as functions are by what they give.
     if run.tableau.in_python:
         parts = [run.tableau.order, run.tableau.error_estimator_order]
@@ -122,8 +121,8 @@ def settings(
     found = {
         "method": f"{method} {_digest(parts)[:8]}",
         "t_span": (span.t0, span.t_bound),
-        "h": stepping.h,
-        "first_step": stepping.first_step,
+        "h": run.stepping.h,
+        "first_step": run.stepping.first_step,
         "max_step": span.max_step,
         "y0": y0,
         "params": params,

@@ -16,8 +16,8 @@ from ..core.inputs import shown
 from ..core.invariants import as_invariants, with_args
 from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.results import Diagnostics
-from ..core.setup import initial_state
 from ..core.solvers import EIPDOP853, EIPRK23, EIPRK45, EIPSolver, SolverClass, class_named, eip_method
+from ..core.states import initial_state
 
 if TYPE_CHECKING:
     Result = dict[str, Any]
