@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checkpoint.locks import absolute
-from ..core import setup
 from ..core.arguments import extra_arguments, floats, parameter_values
 from ..core.inputs import count, flag, is_number, refuse_units, shown
 from ..core.invariants import as_invariants
@@ -29,6 +28,7 @@ from ..core.options import ProjectionDetails, ProjectionOptions
 from ..core.pointers import PointerFunction
 from ..core.problem import Problem, component_names
 from ..core.solvers import EIPRK4, EIPSolver
+from ..core.states import states
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
 from ..run.events import Events
@@ -672,7 +672,7 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: Own
         y0s = None if problem is None else problem.y0
         if y0s is None:
             raise TypeError("ensemble: y0s is missing; only a Problem brings a start of its own, and not each does.")
-    starts = setup.states("y0s", y0s)
+    starts = states("y0s", y0s)
     if problem is not None:
         params = problem.plain(params=params)["params"]
     own = None if params is None else np.atleast_1d(parameter_values(params))

@@ -13,8 +13,8 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from ..core import setup
 from ..core.examination import is_check_due, steps_to_check
+from ..core.failures import failure
 from ..core.jitted import is_compiled, is_jitted
 from ..core.names import nearest
 from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
@@ -236,14 +236,14 @@ class Loop:
 
     def __init__(self, prepared: Prepared, keeper: _resume.Keeper, *, compiled: bool | None = None) -> None:
         """`compiled`: instead of what the request says."""
-        request, system, run, start = prepared.request, prepared.system, prepared.run, prepared.start
+        request, system, run = prepared.request, prepared.system, prepared.run
         self.prepared, self.keeper = prepared, keeper
-        self.tableau, self.stepping, self.method = prepared.method, prepared.stepping, prepared.label
+        self.method = prepared.label
         self.rhs, self.events, self.diagnostics = system.rhs, system.events, prepared.diagnostics
         self.callback, self.progress = request.callback, request.progress
         if keeper.keeps:
-            identity = prepared.identity(start.y, system.parameters)
-            keeper.identify(identity, run, system.derivative, start.t, start.y, start.f)
+            identity = prepared.identity(run.begin.y, system.parameters)
+            keeper.identify(identity, run, system.derivative, *run.begin[:3])
         wanted = request.compiled if compiled is None else compiled
         with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
             functions, self.why_not = system.functions(run, wanted)
@@ -335,7 +335,7 @@ class Loop:
             if ended:
                 return 1, ENDED_BY_EVENT
             if code not in (OK, PAUSE, ENDED, FULL):
-                return -1, setup.failure(code, driver.run, driver.schedule.clock)
+                return -1, failure(code, driver.run, driver.schedule.clock)
             if is_check_due(driver.step) or driver.suspects:
                 self._look()
             if code == FULL:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core import setup
 from ..core.inputs import filled
+from ..core.states import as_derivative
 from ..core.steppers import check_halves
 
 __all__ = ["FORMS", "INTERPRETED"]
@@ -30,7 +30,7 @@ def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, na
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
         f = fun(t, y.copy(), *extra)
         known = type(f) is np.ndarray and f.shape == shape and f.dtype == dtype
-        out[:] = f if known else setup.as_derivative(f, n, dtype, t, name)
+        out[:] = f if known else as_derivative(f, n, dtype, t, name)
 
     return rhs
 

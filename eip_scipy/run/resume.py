@@ -18,8 +18,7 @@ from ..checkpoint import CheckpointError
 from ..checkpoint.locks import Lock
 from ..core.callers import users_level
 from ..core.inputs import is_number, refuse_units, shown
-from ..core.setup import Run
-from ..core.stepping import Stepping
+from ..core.runs import Run
 from ..engine.data import NEXT_LENGTH, TIME
 from ..methods.multistep import Weights
 from .events import Events
@@ -111,10 +110,10 @@ def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[K
 
 
 def settings(
-    method: str, stepping: Stepping, y0: np.ndarray, params: np.ndarray, run: Run, schedule: Any, events: Events
+    method: str, y0: np.ndarray, params: np.ndarray, run: Run, schedule: Any, events: Events
 ) -> dict[str, Any]:
     """All that decides the bits of a run, but for the functions, under the names that users give."""
-    span = stepping.span
+    span = run.stepping.span
     # A one-step method of the user's own is known by its name and orders, as functions are by what they give.
     if run.tableau.in_python:
         parts = [run.tableau.order, run.tableau.error_estimator_order]
@@ -124,8 +123,8 @@ def settings(
     found = {
         "method": f"{method} {_digest(parts)[:8]}",
         "t_span": (span.t0, span.t_bound),
-        "h": stepping.h,
-        "first_step": stepping.first_step,
+        "h": run.stepping.h,
+        "first_step": run.stepping.first_step,
         "max_step": span.max_step,
         "y0": y0,
         "params": params,

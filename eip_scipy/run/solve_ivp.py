@@ -16,8 +16,8 @@ from ..core.inputs import shown
 from ..core.invariants import as_invariants, with_args
 from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.results import Diagnostics
-from ..core.setup import initial_state
-from ..core.solvers import EIPDOP853, EIPRK23, EIPRK45, EIPSolver, SolverClass, eip_method
+from ..core.solvers import EIPDOP853, EIPRK23, EIPRK45, EIPSolver, SolverClass, class_named, eip_method
+from ..core.states import initial_state
 
 if TYPE_CHECKING:
     Result = dict[str, Any]
@@ -220,7 +220,7 @@ def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:
 
 def _with_projection(method: Any, given: list[str]) -> Any:
     """Return the EIP method on a method of SciPy if options of EIP methods are given; otherwise the method itself."""
-    if isinstance(method, str) and method.upper().removeprefix("EIP") != method.upper():
+    if isinstance(method, str) and method.upper() == class_named(method):
         raise ValueError(f"solve_ivp: {method!r} is a name; give the class, as in `from eip_scipy import {method}`.")
     is_class = isinstance(method, type) and issubclass(method, OdeSolver)
     if not given or not (is_class or method in EXPLICIT or method in IMPLICIT):
