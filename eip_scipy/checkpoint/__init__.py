@@ -1,16 +1,13 @@
-"""Checkpoint files: a JSON header and arrays in one file that is whole or not there, and known to be undamaged.
+"""Checkpoint files: a JSON header and arrays in one npz archive, which is written whole or not at all.
 
-A file is an uncompressed npz archive, which `numpy.load` opens too: ``header.json``, then an array as ``NAME.npy``
-each. The comment at its end holds the SHA-256 of all its bytes, with zeros in the digest's own place. Nothing in it is
-pickled, and no part is believed before the digest is checked.
+`numpy.load` opens such a file too: ``header.json``, then each array as ``NAME.npy``, uncompressed. The archive has a
+checksum (CRC-32) of each member, which reading compares. Nothing is pickled.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import glob
-import hashlib
 import json
 import math
 import os
@@ -20,7 +17,7 @@ import sys
 import time
 import warnings
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -28,21 +25,13 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.lib import format as npy
 
-from ..core.versions import versions
+from ..core.versions import VERSION, installed
 
 __all__ = ["CheckpointError", "origin", "read", "require_same", "warn_of_other_versions", "write"]
 
-FORMAT, SCHEMA = "eip_scipy checkpoint", 3
+FORMAT, SCHEMA = "eip_scipy checkpoint", 4
 HEADER = "header.json"
-MARK = b"eip_scipy checkpoint, SHA-256 "
-DIGITS = 64
-ZIP = b"PK\x03\x04"
-BLOCK = 2**20
 LEFT_OVER = 3600.0
-# Numba's, where it is loaded: else no function of the run is its.
-DECIDING = ("python", "eip_scipy", "numpy", "scipy", "numba")
-# One date for all members: the same content gives the same bytes.
-DATE = (1980, 1, 1, 0, 0, 0)
 
 
 class CheckpointError(Exception):
@@ -60,8 +49,8 @@ def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mappi
     ----------
     path : path-like
     header : mapping
-        What JSON holds, without NaN and infinity; ``kind`` says whose checkpoint it is. Format, schema, versions and
-        machine are added.
+        What JSON holds, without NaN and infinity; ``kind`` says whose checkpoint it is. Format, schema, names of
+        the arrays, versions and machine are added.
     arrays : mapping of str to ndarray
         Numbers, real or complex.
 
@@ -81,45 +70,21 @@ def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mappi
     ('example', array([0, 1, 2]))
     """
     target = Path(os.path.realpath(path))
-    put(target, header, arrays, lambda temporary, digest: os.replace(temporary, target))
-
-
-def put(
-    path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], place: Callable[[Path, str], None]
-) -> None:
-    """Write a checkpoint to a file in the folder of `path`, bring it to the disk, and let `place` give it its name.
-
-    Parameters
-    ----------
-    path : Path
-        Links resolved.
-    header, arrays
-        As for `write`.
-    place : callable
-        ``place(temporary, digest)``: the temporary file, which is removed if it is still there afterwards, and the
-        SHA-256 that it ends with.
-
-    Raises
-    ------
-    CheckpointError
-        When the file cannot be written.
-    """
-    own = {"format": FORMAT, "schema": SCHEMA, **origin()}
+    own = {"format": FORMAT, "schema": SCHEMA, "arrays": list(arrays), **origin()}
     text = json.dumps({**header, **own}, indent=1, allow_nan=False).encode()
-    temporary = path.with_name(f".{path.name}-{secrets.token_hex(4)}.tmp")
+    temporary = target.with_name(f".{target.name}-{secrets.token_hex(4)}.tmp")
     try:
         try:
             with open(temporary, "xb") as stream:
-                digest = _fill(stream, text, arrays)
+                _fill(stream, text, arrays)
                 stream.flush()
                 os.fsync(stream.fileno())
-            place(temporary, digest)
+            os.replace(temporary, target)
         finally:
             temporary.unlink(missing_ok=True)
-        _sync_folder(path.parent)
-        _remove_leftovers(path)
+        _remove_leftovers(target)
     except OSError as error:
-        raise CheckpointError(f"cannot write the checkpoint {_name(path)}: {_reason(error)}") from error
+        raise CheckpointError(f"cannot write the checkpoint {_name(path)}: {reason(error)}") from error
 
 
 def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -141,47 +106,29 @@ def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[st
     CheckpointError
         For a file that cannot be read, is no checkpoint, is damaged or truncated, or has another schema or kind.
     """
-    header, arrays, _, _ = read_known(path, kind)
+    try:
+        with open(path, "rb") as stream:
+            header, arrays = _parse(path, stream)
+    except OSError as error:
+        raise CheckpointError(f"cannot read the checkpoint {_name(path)}: {reason(error)}") from error
+    except (CheckpointError, MemoryError):
+        raise
+    except Exception as error:  # zipfile, json and numpy raise errors of many kinds for bytes not made by `write`
+        raise CheckpointError(
+            f"{_name(path)} is damaged, or not a checkpoint of eip_scipy: {error}. Go back to a copy of it, or name "
+            "another file to start anew."
+        ) from error
+    if kind is not None and header.get("kind") != kind:
+        raise CheckpointError(f"{_name(path)} is a checkpoint of {header.get('kind')!r}, expected {kind!r}.")
     return header, arrays
 
 
-def read_known(
-    path: str | os.PathLike[str], kind: str | None
-) -> tuple[dict[str, Any], dict[str, np.ndarray], os.stat_result, str]:
-    """As `read`, with what the file is known by: its status, and the SHA-256 that it ends with."""
-    try:
-        with open(path, "rb") as stream:
-            status = os.fstat(stream.fileno())
-            size, digest = _require_undamaged(path, stream)
-            header, arrays = _parse(stream, size)
-    except OSError as error:
-        raise CheckpointError(f"cannot read the checkpoint {_name(path)}: {_reason(error)}") from error
-    except (CheckpointError, MemoryError):
-        raise
-    except Exception as error:  # whatever zipfile, json and numpy say to bytes that `write` has not made
-        raise CheckpointError(f"{_name(path)} is no checkpoint of eip_scipy: {error}") from error
-    if header["schema"] != SCHEMA:
-        raise CheckpointError(
-            f"{_name(path)} has schema {header['schema']!r}, expected {SCHEMA}; "
-            "resume with the version of eip_scipy that wrote it."
-        )
-    if kind is not None and header.get("kind") != kind:
-        raise CheckpointError(f"{_name(path)} is a checkpoint of {header.get('kind')!r}, expected {kind!r}.")
-    return header, arrays, status, digest
-
-
-def digest_of(path: str | os.PathLike[str]) -> str:
-    """The SHA-256 that an undamaged checkpoint ends with.
-
-    Raises
-    ------
-    CheckpointError
-        For another file.
-    OSError
-        When it cannot be read.
-    """
-    with open(path, "rb") as stream:
-        return _require_undamaged(path, stream)[1]
+def existing(name: str, what: str) -> CheckpointError:
+    """Return the error for a place that holds something and is not to be resumed."""
+    return CheckpointError(
+        f"{name!r} exists. resume=True goes on with the {what} that it holds; to start anew, name another place or "
+        "delete this one."
+    )
 
 
 def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, Any]) -> None:
@@ -206,7 +153,8 @@ def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, An
 
 def warn_of_other_versions(path: str | os.PathLike[str], header: Mapping[str, Any], *, stacklevel: int) -> None:
     """Warn where a checkpoint comes from other versions or another kind of machine: the last bits may differ then."""
-    there, here = ({**(header.get("versions") or {}), "machine": header.get("machine")}, _here())
+    there = {**(header.get("versions") or {}), "machine": header.get("machine")}
+    here = {**_versions(), "machine": _machine()}
     other = [
         f"{name} {there.get(name)}, here {here[name]}"
         for name in here
@@ -232,14 +180,15 @@ def _name(path: str | os.PathLike[str]) -> str:
     return repr(os.fspath(path))
 
 
-def _reason(error: OSError) -> str:
+def reason(error: OSError) -> str:
+    """Return what the operating system says."""
     return (error.strerror or str(error)).lower()
 
 
 @cache
 def _versions() -> dict[str, str | None]:
-    found = versions()
-    return {name: found[name] for name in DECIDING}
+    own = {"python": platform.python_version(), "eip_scipy": VERSION}
+    return {**own, **{name: installed(name) for name in ("numpy", "scipy", "numba")}}
 
 
 def _machine() -> str:
@@ -247,56 +196,19 @@ def _machine() -> str:
 
 
 def origin() -> dict[str, Any]:
-    """Versions and machine, as the header of every checkpoint has them."""
+    """Return versions and machine, as the header of every checkpoint has them."""
+    # Numba's only if it is loaded: otherwise no function of the run is compiled by it.
     decide = {name: version for name, version in _versions().items() if name != "numba" or name in sys.modules}
     return {"versions": decide, "machine": _machine()}
 
 
-def _here() -> dict[str, str | None]:
-    return {**_versions(), "machine": _machine()}
-
-
-class _Hashed:
-    """A stream to write to only, whose bytes are hashed on their way."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream, self.digest = stream, hashlib.sha256()
-
-    def write(self, data: Any) -> int:
-        self.digest.update(data)
-        return self._stream.write(data)
-
-    def flush(self) -> None:
-        self._stream.flush()
-
-
-def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> str:
-    """Write header, arrays and digest; returns the digest."""
-    hashed: Any = _Hashed(stream)
-    with zipfile.ZipFile(hashed, "w") as archive:
-        archive.comment = MARK + b"0" * DIGITS
-        archive.writestr(zipfile.ZipInfo(HEADER, DATE), text)
+def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write header and arrays."""
+    with zipfile.ZipFile(stream, "w") as archive:
+        archive.writestr(zipfile.ZipInfo(HEADER), text)  # whose date is the same at any time
         for name, value in arrays.items():
-            with archive.open(zipfile.ZipInfo(f"{name}.npy", DATE), "w", force_zip64=True) as member:
+            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                 npy.write_array(member, np.asarray(value, order="C"), version=(1, 0), allow_pickle=False)
-    digest: str = hashed.digest.hexdigest()
-    stream.seek(-DIGITS, os.SEEK_END)
-    stream.write(digest.encode())
-    return digest
-
-
-def _sync_folder(folder: Path) -> None:
-    """Bring the new name to the disk, where folders can be opened for it and the file system knows how."""
-    if not hasattr(os, "O_DIRECTORY"):
-        return
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
-            raise
-    finally:
-        os.close(descriptor)
 
 
 def _remove_leftovers(target: Path) -> None:
@@ -307,49 +219,28 @@ def _remove_leftovers(target: Path) -> None:
                 leftover.unlink()
 
 
-def _require_undamaged(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[int, str]:
-    """Check mark and digest; returns the size of the file and the digest."""
-    start = stream.read(4)
-    size = stream.seek(0, os.SEEK_END)
-    if start != ZIP:
-        raise CheckpointError(f"{_name(path)} is no file of eip_scipy; name another one.")
-    tail = len(MARK) + DIGITS
-    stream.seek(max(0, size - tail))
-    end = stream.read(tail)
-    if not end.startswith(MARK):
-        raise CheckpointError(
-            f"{_name(path)} is truncated or no checkpoint of eip_scipy: it does not end with a digest."
-        )
-    digest = hashlib.sha256()
-    stream.seek(0)
-    left = size - DIGITS
-    while left > 0 and (block := stream.read(min(BLOCK, left))):
-        digest.update(block)
-        left -= len(block)
-    digest.update(b"0" * DIGITS)
-    if digest.hexdigest().encode() != end[-DIGITS:]:
-        raise CheckpointError(
-            f"{_name(path)} is damaged: its SHA-256 is not the one it was written with. Go back to a copy, or delete "
-            "it and start anew."
-        )
-    return size, digest.hexdigest()
-
-
-def _parse(stream: BinaryIO, size: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of a file of `size` bytes; what members declare is compared with it before it is allocated."""
+def _parse(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return header and arrays; the sizes that members declare are compared with the file's before memory is taken."""
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
         if any(m.compress_type != zipfile.ZIP_STORED or m.file_size != m.compress_size for m in members):
             raise ValueError("it holds compressed members")
-        if sum(m.file_size for m in members) > size:
+        if sum(m.file_size for m in members) > stream.seek(0, os.SEEK_END):
             raise ValueError("its members claim more bytes than it has")
         names = [m.filename for m in members]
-        if not names or names[0] != HEADER or len(set(names)) != len(names):
+        if HEADER not in names:
             raise ValueError(f"its members are {names[:10]}")
         header = json.loads(archive.read(HEADER))
-        if not isinstance(header, dict) or header.get("format") != FORMAT or "schema" not in header:
+        if not isinstance(header, dict) or header.get("format") != FORMAT:
             raise ValueError("its header is another")
-        return header, {m.filename.removesuffix(".npy"): _array(archive, m) for m in members[1:]}
+        if header.get("schema") != SCHEMA:
+            raise CheckpointError(
+                f"{_name(path)} has schema {header.get('schema')!r}, expected {SCHEMA}; "
+                "resume with the version of eip_scipy that wrote it."
+            )
+        if names != [HEADER, *(f"{name}.npy" for name in header["arrays"])]:  # the directory has no checksum
+            raise ValueError(f"its members are {names[:10]}, and not those that its header names")
+        return header, dict(zip(header["arrays"], (_array(archive, m) for m in members[1:]), strict=True))
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
@@ -362,9 +253,6 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         n_bytes = math.prod(shape) * dtype.itemsize
         if n_bytes != member.file_size - stream.tell():
             raise ValueError(f"{member.filename} declares {n_bytes} bytes and has {member.file_size - stream.tell()}")
-        out = np.empty(shape, dtype)
-        flat = out.reshape(-1).view(np.uint8)
-        for begin in range(0, n_bytes, BLOCK):
-            part = flat[begin : begin + BLOCK]
-            part[:] = np.frombuffer(stream.read(part.size), np.uint8, part.size)
-        return out
+    with archive.open(member) as stream:  # anew: after a step back zipfile compares no checksum
+        found: np.ndarray = npy.read_array(stream, allow_pickle=False)
+        return found

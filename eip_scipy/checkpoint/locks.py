@@ -1,4 +1,4 @@
-"""A lock on a path, by which one run at a time writes there, and which ends with the process that holds it."""
+"""A lock on a place that one run at a time writes to, which ends with the process that holds it."""
 
 from __future__ import annotations
 
@@ -7,176 +7,111 @@ import errno
 import os
 import platform
 import sys
+import warnings
 from pathlib import Path
 
-from . import CheckpointError
+from filelock import FileLock, Timeout
 
-__all__ = ["HeldError", "Lock"]
+from ..core.callers import users_level
+from . import CheckpointError, reason
+
+__all__ = ["Lock", "absolute"]
 
 NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
 NO_RIGHT = {errno.EACCES, errno.EPERM, errno.EROFS}
-# No links: the name may be planted in a folder that others write to.
-OPENED = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-READ_ONLY = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0)
-WHO = 200
-
-if sys.platform == "win32":
-    import msvcrt
-
-    HELD = {errno.EACCES, errno.EDEADLK}
-
-    def _take(descriptor: int) -> None:
-        # What is locked cannot be read by others: a byte that is not there.
-        os.lseek(descriptor, 2**30, os.SEEK_SET)
-        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-
-else:
-    import fcntl
-
-    HELD = {errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES}
-
-    def _take(descriptor: int) -> None:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-class HeldError(CheckpointError):
-    """Somebody else holds the lock."""
 
 
 class Lock:
-    """Held from its making to `release`, or to the end of this process.
+    """Exclusive right to write to a file or folder, from its making to `close` or to the end of this process.
 
-    The lock is on a file of its own beside `path`, for a checkpoint is replaced by another file at each writing. That
-    file holds who took it, and is removed at the release, by its holder only; whoever has opened it meanwhile finds
-    that it is no longer the one of that name, and opens the new one. Processes that are started or forked do not
-    inherit the lock.
+    The lock is on a file of its own next to the place, because a checkpoint is replaced by another file at each
+    writing. That file says who holds it, and `close` removes it. Processes that are started or forked do not inherit
+    the lock. A file system without locks is a RuntimeWarning; without the right to write there is nothing to lock.
 
     Parameters
     ----------
-    path : Path
-        Of the file or folder, links resolved; it need not exist.
-    name : str
-        What messages call it.
+    place : path-like
+        It need not exist.
 
     Attributes
     ----------
-    problem : str
-        Why the file system knows no locks; empty where there is one, and where nothing can be written anyway.
+    name : str
+        Its absolute path, whatever becomes of the working directory.
+    path : Path
+        The same, with links resolved.
 
     Raises
     ------
-    HeldError
-        At once, with process and machine of the holder.
     CheckpointError
-        When the file beside `path` cannot be made.
+        At once if another run holds the lock, in this process or another; or if the file for it cannot be made.
     """
 
-    def __init__(self, path: Path, name: str) -> None:
-        self.problem = ""
-        self._file, self._name = path.with_name(f".{path.name}.eip_scipy-lock"), name
-        self._descriptor: int | None = None
-        while self._try():
-            pass
-        if self._descriptor is not None:
-            _held.add(self)
-
-    def release(self) -> None:
-        """Let others in; a second call does nothing."""
-        _held.discard(self)
-        if self._descriptor is None:
-            return
-        # Windows removes only what is closed.
-        if sys.platform != "win32":
-            self._remove()
-        self.forget()
-        if sys.platform == "win32":
-            self._remove()
-
-    def forget(self) -> None:
-        """Close the file: with its last descriptor the lock goes."""
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
-
-    def _try(self) -> bool:
-        """Open the file and lock it; whether to try again."""
-        descriptor = self._opened()
-        if descriptor is None:
-            return False
-        try:
-            try:
-                _take(descriptor)
-            except OSError as error:
-                if error.errno in HELD:
-                    raise HeldError(self._held_by(os.read(descriptor, WHO).decode(errors="replace"))) from None
-                if error.errno not in NO_LOCKS:
-                    raise self._cannot(error) from error
-                self.problem = _reason(error)
-                self._remove()
-            else:
-                if not self._is_current(descriptor):
-                    return True
-                with contextlib.suppress(OSError):  # on a full disk the holder's name is missing, not the lock
-                    os.lseek(descriptor, 0, os.SEEK_SET)
-                    os.ftruncate(descriptor, 0)
-                    os.write(descriptor, _myself().encode())
-                self._descriptor = descriptor
-        finally:
-            if self._descriptor is None:
-                os.close(descriptor)
-        return False
-
-    def _opened(self) -> int | None:
-        """A descriptor; None in a folder that this user cannot write to, where nobody has left a file to lock."""
-        try:
-            return os.open(self._file, OPENED, 0o666)
-        except OSError as error:
-            if error.errno not in NO_RIGHT:
-                raise self._cannot(error) from error
-        try:
-            return os.open(self._file, READ_ONLY)
-        except OSError:
-            return None
-
-    def _is_current(self, descriptor: int) -> bool:
-        try:
-            return os.path.samestat(os.fstat(descriptor), os.stat(self._file))
-        except FileNotFoundError:
-            return False
-
-    def _remove(self) -> None:
-        if self._descriptor is None or self._is_current(self._descriptor):
-            with contextlib.suppress(OSError):  # in use by another on Windows, or of a folder that is gone
-                self._file.unlink()
-
-    def _held_by(self, holder: str) -> str:
-        who = holder or "another process"
-        own = ", this one" if holder == _myself() else ""
-        return (
-            f"{self._name!r} is in use by another run, of {who}{own}. Wait for its end, or end it, or name another "
-            "place."
+    def __init__(self, place: str | os.PathLike[str]) -> None:
+        self.name = absolute(place)
+        self.path = Path(os.path.realpath(self.name))
+        self._file = self.path.with_name(f".{self.path.name}.eip_scipy-lock")
+        self._lock = FileLock(
+            self._file, blocking=False, thread_local=False, fallback_to_soft=False, on_acquired=_write_holder
         )
+        try:
+            os.stat(self.path.parent)  # which filelock would make
+            self._lock.acquire()
+        except Timeout:
+            raise CheckpointError(
+                f"{self.name!r} is in use by another run, of {_holder(self._file)}. Wait for its end, or end it, or "
+                "name another place."
+            ) from None
+        except OSError as error:
+            if error.errno in NO_LOCKS:
+                self._file.unlink(missing_ok=True)
+                warnings.warn(
+                    f"{self.name!r} could not be locked ({reason(error)}): see to it yourself that no other run "
+                    "writes there at the same time.",
+                    RuntimeWarning,
+                    stacklevel=users_level(),
+                )
+            elif error.errno not in NO_RIGHT or os.path.lexists(self._file):
+                raise CheckpointError(f"cannot write {self.name!r}: {reason(error)}") from error
 
-    def _cannot(self, error: OSError) -> CheckpointError:
-        return CheckpointError(f"cannot write {self._name!r}: {_reason(error)}")
+    def close(self) -> None:
+        """Let others in; a second call does nothing."""
+        if self._lock.is_locked:
+            if sys.platform != "win32":  # where filelock removes the file
+                with contextlib.suppress(OSError):  # in a folder that is gone, or can no longer be written to
+                    self._file.unlink()  # before others can lock it
+            self._lock.release()
 
 
-_held: set[Lock] = set()
+def absolute(path: str | os.PathLike[str]) -> str:
+    """Return the absolute path that `path` leads to now.
 
-
-def _reason(error: OSError) -> str:
-    return (error.strerror or str(error)).lower()
+    Raises
+    ------
+    CheckpointError
+        When the working directory is gone.
+    """
+    try:
+        return os.path.abspath(os.fsdecode(path))
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            f"{os.fspath(path)!r} is relative to a folder that is gone; give a whole path."
+        ) from error
 
 
 def _myself() -> str:
     return f"process {os.getpid()} on {platform.node()}"
 
 
-def _forget_all() -> None:
-    for lock in _held:
-        lock.forget()
-    _held.clear()
+def _write_holder(descriptor: int) -> None:
+    with contextlib.suppress(OSError):  # on a full disk the holder's name is missing, not the lock
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, _myself().encode())
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_all)
+def _holder(file: Path) -> str:
+    """Return the process that holds the lock, as it has written it down."""
+    try:
+        found = file.read_text(errors="replace")
+    except OSError:  # Windows lets nobody read it, and the holder may just have removed it
+        found = ""
+    return f"{found}, this one" if found == _myself() else found or "another process"

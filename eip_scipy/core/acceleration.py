@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -85,8 +86,10 @@ def is_acceleration(fun: Callable[..., Any], in_place: bool, extra: tuple[Any, .
     """
     code = getattr(fun, "py_func", fun)
     sizes = (y.size,) if isinstance(fun, PointerFunction) else (y.size, y.size // 2)
-    gives = _fills if in_place else _returns
-    return y.size % 2 == 0 and any(gives(code, extra, t, y.copy()[:size], y.size // 2) for size in sizes)
+    gives = partial(_fills if in_place else _returns, code, extra, t)
+    if y.size % 2 or gives(y.copy(), y.size):
+        return False
+    return any(gives(y.copy()[:size], y.size // 2) for size in sizes)
 
 
 def _returns(fun: Callable[..., Any], extra: tuple[Any, ...], t: float, state: np.ndarray, count: int) -> bool:

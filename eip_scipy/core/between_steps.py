@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from . import setup
 from .inputs import is_number, shown
+from .states import initial_state
 from .stepping import AnyMethod, StepOptions, Stepping, fixed_steps
 
 __all__ = ["N_LEFT", "Settings", "checked_stepping", "checked_vector", "is_state", "kept_state"]
@@ -56,7 +56,7 @@ def checked_vector(name: str, value: Any, like: np.ndarray) -> np.ndarray:
     ValueError
         If it has another shape, is not finite, or is complex where the state was real.
     """
-    found = setup.initial_state(value, name)
+    found = initial_state(value, name)
     if found.shape != like.shape:
         raise ValueError(f"`{name}` was set to an array of {found.size} components; this solver has {like.size}.")
     if found.dtype.kind == "c" and like.dtype.kind != "c":

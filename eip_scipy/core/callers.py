@@ -6,11 +6,11 @@ import sys
 
 __all__ = ["users_level"]
 
-INSIDE = (__name__.partition(".")[0], "scipy")
+INSIDE = (__name__.partition(".")[0], "scipy", "contextlib")
 
 
 def users_level() -> int:
-    """The `stacklevel`, for a warning of the caller, of the first function outside of this package and SciPy.
+    """Return the `stacklevel` for a warning of the caller: that of the first function outside of the package and SciPy.
 
     How many functions lie between differs: `solve_ivp`, `integrate`, `ensemble` and `recommend` prepare runs alike.
     """

@@ -10,9 +10,9 @@ from ..engine.native import BUILD
 from .inputs import shown
 from .versions import VERSION, installed
 
-__all__ = ["configuration", "described", "show_config"]
+__all__ = ["show_config"]
 
-REQUIRED = "numpy", "scipy", "tqdm"
+REQUIRED = "numpy", "scipy", "filelock", "tqdm"
 # What a package that is not needed brings: its extra, and for what.
 EXTRAS = {
     "numba": ("numba", "jitted functions of your own"),
@@ -63,46 +63,23 @@ def show_config(mode: str = "stdout") -> dict[str, Any] | None:
     """
     if mode not in ("stdout", "dicts"):
         raise ValueError(f"mode must be 'stdout' or 'dicts', got {shown(mode)}.")
-    found = configuration()
-    if mode == "dicts":
-        return found
-    print(described(found))
-    return None
-
-
-def configuration() -> dict[str, Any]:
-    """See `show_config`."""
     fast = BUILD.__name__.endswith("_v3")
-    return {
-        "versions": {
-            "eip_scipy": VERSION,
-            "python": platform.python_version(),
-            **{package: installed(package) for package in REQUIRED},
-        },
-        "engine": {"build": BUILD.__name__.rpartition(".")[2], "AVX2 and FMA": fast, "compiler": BUILD.COMPILER},
-        "extras": {
-            module: {"version": installed(module), "extra": extra, "for": what}
-            for module, (extra, what) in EXTRAS.items()
-        },
+    versions: dict[str, str | None] = {"eip_scipy": VERSION, "python": platform.python_version()}
+    versions |= {package: installed(package) for package in REQUIRED}
+    engine = {"build": BUILD.__name__.rpartition(".")[2], "AVX2 and FMA": fast, "compiler": BUILD.COMPILER}
+    extras = {name: {"version": installed(name), "extra": extra, "for": what} for name, (extra, what) in EXTRAS.items()}
+    places = {
         "folder": str(Path(__file__).parents[1]),
         "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
     }
-
-
-def described(found: dict[str, Any]) -> str:
-    """A configuration as lines of text."""
-    engine, extras = found["engine"], found["extras"]
-    kind = "for AVX2 and FMA" if engine["AVX2 and FMA"] else "for any processor"
-    rows = {
-        **found["versions"],
-        "engine": f"{engine['build']}, {kind}, by {engine['compiler']}",
-        "folder": found["folder"],
-        "system": found["system"],
-    }
+    if mode == "dicts":
+        return {"versions": versions, "engine": engine, "extras": extras, **places}
+    kind = "for AVX2 and FMA" if fast else "for any processor"
+    rows = {**versions, "engine": f"{engine['build']}, {kind}, by {engine['compiler']}", **places}
     width = max(map(len, (*rows, *extras)))
-    lines = [f"{name:<{width}}  {value}" for name, value in rows.items()]
-    lines += ["", "extras"]
-    for module, entry in extras.items():
+    lines = [f"{name:<{width}}  {value}" for name, value in rows.items()] + ["", "extras"]
+    for name, entry in extras.items():
         state = entry["version"] or f"absent: pip install 'eip_scipy[{entry['extra']}]'"
-        lines.append(f"{module:<{width}}  {state:<45}  {entry['for']}")
-    return "\n".join(lines)
+        lines.append(f"{name:<{width}}  {state:<45}  {entry['for']}")
+    print("\n".join(lines))
+    return None

@@ -14,7 +14,7 @@ from scipy.integrate import OdeSolver
 from ..engine.data import Work
 from ..engine.trust import Trust
 from .invariants import InvariantSet
-from .setup import Run
+from .runs import Run
 
 __all__ = ["RunParts", "parts_of", "run_of", "scipy_values", "set_scipy_values"]
 

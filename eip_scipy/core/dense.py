@@ -22,7 +22,7 @@ from ..engine.data import (
 )
 from ..engine.native import Engine
 from .kept_dense import AtRealTimes, KeptDenseOutput, kept
-from .setup import Run
+from .runs import Run
 from .steppers import form
 
 __all__ = ["ExactEnds", "Interpolants", "ManifoldDenseOutput", "solution"]

@@ -29,7 +29,9 @@ from ..engine.data import (
     SUSPECT_TO,
     SUSPECT_WAITED,
 )
+from ..methods.runge_kutta import RK4
 from .invariants import InvariantSet
+from .resolution import runge_kutta_step
 
 __all__ = ["Examiner", "is_check_due", "steps_to_check"]
 
@@ -186,11 +188,7 @@ def _on_the_way(
     for _ in range(BACK * (steps + (steps + 1) // 2)):
         if (t - part - begin) * part < 0:
             return None
-        k1 = rhs(t, y)
-        k2 = rhs(t - 0.5 * part, y - 0.5 * part * k1)
-        k3 = rhs(t - 0.5 * part, y - 0.5 * part * k2)
-        k4 = rhs(t - part, y - part * k3)
-        t, y = t - part, y - part / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        t, y = t - part, runge_kutta_step(RK4.A, RK4.b, RK4.c, rhs, t, -part, y)
         if not np.isfinite(y).all():
             return None
         found = _complaint(examiner, known, rhs, t, y, False)

@@ -19,7 +19,6 @@ __all__ = [
     "is_jitted",
     "jit_is_off",
     "jitted",
-    "numba_errors",
 ]
 
 
@@ -38,15 +37,6 @@ def is_jitted(fun: Any) -> bool:
     from numba import extending
 
     return bool(extending.is_jitted(fun))
-
-
-def numba_errors() -> tuple[type[Exception], ...]:
-    """What Numba raises on types that a function does not compile for; none where it is not loaded."""
-    if "numba" not in sys.modules:
-        return ()
-    from numba.core.errors import NumbaError
-
-    return (NumbaError,)
 
 
 def jit_is_off() -> bool:

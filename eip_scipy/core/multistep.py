@@ -10,7 +10,7 @@ import numpy as np
 
 from ..engine.data import AUTO, N_NODE_PLACES, Multistep
 from ..methods.multistep import GaussJackson, damping_limit, stability_limit, weights
-from .setup import Run, Start
+from .runs import Run, Start
 from .stepping import Stepping
 
 __all__ = ["SecondOrder", "attach_history", "times"]

@@ -35,6 +35,7 @@ class SolverOfParts(EIPSolver):
         The run's invariants.
     """
 
+    _in_parts = True
     _fails_elsewhere = False
 
     @property

@@ -9,16 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from ..engine.data import BAND, EPS, LARGE_SHARE, LAST_RANK, Span
+from ..engine.data import BAND, EPS, LARGE_SHARE, LAST_RANK
 from ..engine.trust import ProjectionWarning
-from ..methods.runge_kutta import RK1
-from . import setup
-from .blocks import kinds_of
+from ..methods.orders import AT_REST
+from .failures import projection_failure
 from .inputs import count, is_number, reals, refuse_units, shown
 from .invariants import InvariantSet
 from .one_step import as_vector
 from .options import MOST_ITERATIONS, ProjectionOptions, weights
 from .results import ProjectionResult
+from .run_spec import RunSpec
+from .states import as_derivative, initial_state
 from .stepping import Stepping
 
 __all__ = ["project"]
@@ -92,39 +93,34 @@ def project(
     refuse_units(t=t, sigma=sigma, f=f)
     if not is_number(t) or not math.isfinite(t):
         raise ValueError(f"project: t must be a finite number, got {shown(t)}.")
-    t, y = float(t), setup.initial_state(y_hat, "y_hat")
+    t, y = float(t), initial_state(y_hat, "y_hat")
     n = y.size
     derivative = _derivative(f, t, y)
-    f_hat = derivative(t, y)
-    known = InvariantSet(invariants, t, y, f_hat, 0.0)
-    if known.uses_f and f is None:
-        raise ValueError("project: a gradient uses f; pass f=, the derivative at y_hat or a function f(t, y).")
     iterations = count("iterations", iterations, MOST_ITERATIONS)
-    if known.uses_f and iterations > 1 and not callable(f):
-        raise ValueError(
-            "project: a gradient uses f at each Newton step; with iterations > 1 pass f as a function f(t, y)."
-        )
     given = ProjectionOptions(
+        invariants=invariants,
         metric="euclidean" if sigma is None else weights("sigma", sigma, n),
         frame=frame,
         iterations=iterations,
         check=False,
     )
-    nowhere = Stepping(Span(t, 0.0, t, 1.0, 0, np.inf), 0.0, None, np.zeros(n), np.zeros(n))
-    options, weight, _ = given.settled(RK1, nowhere, y, known)
-    options = options._replace(
+    stepping = Stepping.at_rest(t, n)
+    run = RunSpec(name="project", method=AT_REST, rhs=derivative, stepping=stepping, projection=given).build(y)
+    known, work = run.invariants, run.work
+    if known.uses_f and f is None:
+        raise ValueError("project: a gradient uses f; pass f=, the derivative at y_hat or a function f(t, y).")
+    if known.uses_f and iterations > 1 and not callable(f):
+        raise ValueError(
+            "project: a gradient uses f at each Newton step; with iterations > 1 pass f as a function f(t, y)."
+        )
+    run.options = run.options._replace(
         target=_targets(known, target, start, t),
-        kinds=kinds_of(options.groups, y, f_hat),
         most_left=np.full(known.size, np.inf),  # as many Newton steps as asked for
     )
-    projection = setup.Projection(known, options, derivative)
-    work = projection.work
-    if weight is not None:
-        work.sigma[:] = weight
-    work.K[-1] = f_hat
-    out, status = projection(t, y)
+    work.K[-1] = run.start.f
+    out, status = run.projected(derivative, t, y)
     if status != 0:
-        raise ValueError(setup.projection_failure(known, work, t))
+        raise ValueError(projection_failure(known, work, t))
     left = np.abs(work.defect) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)
     for k in np.flatnonzero(left > LARGE_SHARE):
         warnings.warn(
@@ -138,7 +134,7 @@ def project(
 
 def _derivative(f: Any, t: float, y: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
     if callable(f):
-        return lambda t, state: setup.as_derivative(f(t, state.copy()), y.size, y.dtype, t)
+        return lambda t, state: as_derivative(f(t, state.copy()), y.size, y.dtype, t)
     fixed = np.zeros_like(y) if f is None else as_vector(f, y.size, y.dtype, "project: f has", t)
     return lambda t, state: fixed
 
@@ -161,7 +157,7 @@ def _targets(known: InvariantSet, target: Any, start: Any, t: float) -> np.ndarr
                 "which it has the wanted value."
             )
         return known.target
-    state = setup.initial_state(start, "start")
+    state = initial_state(start, "start")
     if state.shape != known.shape[1:] or (state.dtype.kind == "c" and known.dtype.kind != "c"):
         raise ValueError(
             f"project: start must be a state like y_hat, of {known.shape[1]} components, got {shown(start)}."

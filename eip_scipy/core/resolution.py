@@ -10,7 +10,7 @@ import numpy as np
 from ..engine.data import LEAST_CHANGE, Grouping, Method
 from ..methods.runge_kutta import DOP853
 
-__all__ = ["unresolved"]
+__all__ = ["runge_kutta_step", "unresolved"]
 
 # Consecutive steps that are compared, each with SUBSTEPS of DOP853. At most one of them passes a kink, so the step with
 # the largest error counts only from the share LOST on: what a close passage throws out moves freely from then on. Steps
@@ -50,8 +50,8 @@ def unresolved(
         begin, at = end, t + k * h
         end = begin
         for part in range(SUBSTEPS):
-            end = _step(DOP853.A, DOP853.b, DOP853.c, rhs, at + part * h / SUBSTEPS, h / SUBSTEPS, end)
-        own = _nystrom_step(method, rhs, at, h, begin) if method.nystrom else _step(
+            end = runge_kutta_step(DOP853.A, DOP853.b, DOP853.c, rhs, at + part * h / SUBSTEPS, h / SUBSTEPS, end)
+        own = _nystrom_step(method, rhs, at, h, begin) if method.nystrom else runge_kutta_step(
             method.A, method.b, method.c, rhs, at, h, begin
         )  # fmt: skip
         size = np.max([_norms(part, groups) for part in (end - begin, h * rhs(at, begin), begin)], axis=0)
@@ -70,7 +70,10 @@ def unresolved(
     )
 
 
-def _step(A: Array, b: Array, c: Array, rhs: Callable[[float, Array], Array], t: float, h: float, y: Array) -> Array:
+def runge_kutta_step(
+    A: Array, b: Array, c: Array, rhs: Callable[[float, Array], Array], t: float, h: float, y: Array
+) -> Array:
+    """Return the state after a step of length h, which may be negative, by an explicit Runge-Kutta method."""
     K = np.empty((b.size, y.size), y.dtype)
     for i in range(b.size):
         K[i] = rhs(t + c[i] * h, y + h * (A[i, :i] @ K[:i]))

@@ -6,7 +6,6 @@ import copy
 import copyreg
 import warnings
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
@@ -32,23 +31,25 @@ from ..engine.trust import ProjectionWarning
 from ..methods.multistep import GaussJackson
 from ..methods.nystrom import RKN86, RKN1210, NystromTableau
 from ..methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, Tableau
-from . import setup, steppers
-from .acceleration import BY_NAME, named_accelerations
+from .acceleration import BY_NAME
 from .between_steps import N_LEFT, Settings, checked_stepping, checked_vector, is_state, kept_state
 from .callers import users_level
 from .coefficients import attributes_of, is_same, tableau_of
 from .copies import parts_of, run_of, scipy_values, set_scipy_values
 from .dense import ExactEnds, Interpolants
 from .examination import is_check_due
+from .failures import failure
 from .inputs import refuse_units, shown
 from .invariants import InvariantSet, as_invariants
-from .multistep import SecondOrder, attach_history, times
+from .multistep import times
 from .names import nearest
 from .one_step import OneStep, OneStepMethod
 from .options import ProjectionOptions, takes_projection_options
 from .results import Diagnostics
-from .setup import Start
-from .stepping import ATOL, AnyMethod, StepOptions, Stepping, interval
+from .run_spec import RunSpec
+from .runs import Run, Start
+from .states import as_derivative, initial_state
+from .stepping import ATOL, StepOptions, Stepping, interval
 
 __all__ = [
     "EIPDOP853",
@@ -70,8 +71,8 @@ __all__ = [
 # The attributes that a step of SciPy's solver reads.
 HANDED = ("t", "y", "f", "t_bound", "direction", "max_step", "rtol", "atol", "h_abs")
 # Attributes of a solver that its copies share, and those that are made again for a copy.
-SHARED = {"_user_fun", "_projection", "_jacobian"}
-MADE = {"fun", "fun_single", "fun_vectorized", "_fun", "_bound_fun", "_derivative", "_call", "_method", "_scipy"}
+SHARED = {"_user_fun", "_jacobian"}
+MADE = {"fun", "fun_single", "fun_vectorized", "_fun", "_bound_fun", "_derivative", "_call", "_spec", "_scipy"}
 MADE |= {"_run", "_work", "_schedule", "_engine", "_interpolants", "_left", "_taken", "diagnostics"}
 OPTIONS = ("h", "first_step", "max_step", "rtol", "atol", "vectorized", "diagnostics", *ProjectionOptions.names())
 
@@ -143,6 +144,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     """
 
     TABLEAU: ClassVar[Tableau | NystromTableau | GaussJackson | OneStep]
+    # Whether the state is one of several parts, which are projected together.
+    _in_parts: ClassVar[bool] = False
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     _SCIPY: ClassVar[type[OdeSolver] | None] = None
     order: Any = NotImplemented
@@ -162,7 +165,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     _interpolants: Interpolants | None
     _left: tuple[Any, ...]
     _taken: tuple[Any, ...]
-    _run: setup.Run
+    _run: Run
+    _spec: RunSpec
     _work: Work
 
     def __init__(
@@ -188,26 +192,23 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         if extraneous:
             warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=users_level())
         t0, t_bound = interval((t0, t_bound))
-        start = setup.initial_state(y0)
+        start = initial_state(y0)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
-        self._bind(fun, [0])
         steps = StepOptions(h=h, first_step=first_step, max_step=max_step, rtol=rtol, atol=atol)
         stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, self.n, stacklevel=users_level() + 1)
-        self._take_stepping(stepping)
         kept = as_invariants(projection.invariants)
+        self._jacobian = _checked_jacobian(jacobian)
+        self._bind(fun, [0])
+        self._spec = self._specified(stepping, replace(projection, invariants=kept))
+        self._take_stepping(stepping)
         if self.h is None and stepping.first_step is None:
             stepping.require_scale(start)
-        self._projection, self._jacobian = replace(projection, invariants=kept), _checked_jacobian(jacobian)
         self._scipy = self._scipy_solver(start, bool(kept) or bool(projection.compensated))
-        with self._named_accelerations(t0, start):
-            f0 = self._derivative(t0, start).copy() if self._scipy is None else self._scipy.f
-        self._method = self._checked_method(Start(t0, start, f0, 0.0))
-        self.h_abs = stepping.first_step if self._scipy is None else self._scipy.h_abs
-        if self._scipy is None:
-            self.h_abs = stepping.first(self._derivative, start, f0, self.TABLEAU)
         self.h_previous: float | None = None
         self.diagnostics = Diagnostics() if diagnostics is None else diagnostics
-        self._start(Start(t0, start, f0, self.h_abs or 0.0), check=True)
+        begun = (None, None) if self._scipy is None else (self._scipy.f, float(self._scipy.h_abs or 0.0))
+        self._start(start, *begun)
+        self.h_abs = self._run.start.tau if self._scipy is None else self._scipy.h_abs
         self._work.counters[NFEV] = self._calls[0]
         self._drive(begins=True)
         self.y_old = self.y
@@ -231,35 +232,37 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _take_stepping(self, stepping: Stepping) -> None:
         """Take options of the steps that have been checked."""
-        self._stepping = stepping
+        self._spec = replace(self._spec, stepping=stepping)
         self.h, self.max_step = stepping.h, stepping.span.max_step
         self._taken = self.fun, self.t_bound, self.direction, self.max_step, self.h
         self.rtol, self.atol = _frozen(stepping.rtol), _frozen(stepping.atol)
 
-    def _named_accelerations(self, t: float, y: np.ndarray) -> AbstractContextManager[None]:
-        """Return a context that refuses an acceleration in the place of `fun`, where the method takes (q, v)."""
-        if self.vectorized or not self.TABLEAU.of_second_order:
-            return nullcontext()
-        return named_accelerations(type(self).__name__, self._user_fun, False, (), t, y)
+    def _specified(self, stepping: Stepping, projection: ProjectionOptions) -> RunSpec:
+        """Return what the run is made from, for the present function."""
+        moved = None if self._jacobian is None else times(self._jacobian)
+        return RunSpec(
+            name=type(self).__name__,
+            method=self.TABLEAU,
+            rhs=partial(_copied, self._derivative),
+            stepping=stepping,
+            projection=projection,
+            fun=None if self.vectorized else self._user_fun,
+            jacobian=lambda: moved,
+            level=True,
+            hint=_by_name,
+        )
 
-    def _checked_method(self, start: Start) -> AnyMethod:
-        """Return the method for the present function, which is called where it has to be one of second order."""
-        name = type(self).__name__
-        return steppers.checked(self.TABLEAU, partial(_copied, self._derivative), start, name, _by_name)
-
-    def _start(self, begin: Start, *, check: bool) -> None:
-        """Begin at a state: `check` its invariants there or not, and make the buffers of the run."""
-        run = setup.prepare(self._method, self._derivative, begin, self._projection, self._stepping, check_start=check)
-        self._run, self._work, self._begin = run, run.work, begin
-        self._attach_history(begin)
-        setup.attach(self.diagnostics, run)
-        self.y, self.f = run.y0, begin.f
+    def _start(self, y0: np.ndarray, f0: np.ndarray | None, tau: float | None, *, check: bool = True) -> None:
+        """Begin at a state, and make the buffers of the run; `check`: see `RunSpec.build`."""
+        run = self._spec.build(y0, f0, tau, check_start=check)
+        self._run, self._work = run, run.work
+        self._spec = replace(self._spec, method=run.tableau, is_known=True)
+        run.attach(self.diagnostics)
+        self.y, self.f = run.y0, run.start.f
         # The state that the steps are made from, where `y` is its copy on the manifold.
         self._raw = self._raw_old = run.y0
         self._waits = False, False  # whether the states at both ends of the last step wait for a projection
-        self._shows = run.shows and not self._hooks()  # a hook's projection is its own
-        if run.y0 is not begin.y:
-            self.f = self._derivative(begin.t, run.y0).copy()
+        self._shows = run.shows and not self._in_parts
         self._steps = 0
 
     def _drive(self, *, begins: bool) -> None:
@@ -268,21 +271,13 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         if self._scipy is not None:
             return
         self._work.K[0] = self.f
-        self._schedule = bare_schedule(self._stepping.span, float(self.h_abs or 0.0))
+        self._schedule = bare_schedule(self._spec.stepping.span, float(self.h_abs or 0.0))
         self._schedule.place[PENDING] = 1  # what is handed out between two steps is the end of the last one
         calls, jacobian = self._run.invariants.calls, None
         if self._jacobian is not None:
             jacobian = Call(self._jacobian, (), (self.n // 2,), _never, takes_f=True, in_place=True)
         functions = PythonFunctions(self._call, *calls, (), second_order=False, jacobian=jacobian)
         self._engine = self._run.engine(functions, self._schedule, begins=begins, **self._hooks())
-
-    def _attach_history(self, begin: Start) -> None:
-        """Give a multistep method the history that it makes from a state on."""
-        if not self._method.has_history:
-            return
-        moved = None if self._jacobian is None else times(self._jacobian)
-        seen = SecondOrder(partial(_copied, self._derivative), begin, moved, None)
-        attach_history(self._run, type(self).__name__, seen, self._stepping, level=True)
 
     def _settle(self) -> None:
         """Note what the attributes are between two steps, so that a change of them shows."""
@@ -323,6 +318,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         refunctioned, moved = self.fun is not was.fun, self._moved
         if refunctioned:
             self._bind(self.fun, self._calls)
+            self._spec = self._specified(stepping, self._spec.projection)
         self._take_stepping(stepping)
         if self._scipy is not None:
             self._hand_to_scipy(self._scipy, refunctioned)
@@ -331,8 +327,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         if (refunctioned or moved) and self.f is was.f:
             self.f = self._derivative(self.t, self.y).copy()
         here = Start(float(self.t), self.y, self.f, float(self.h_abs or 0.0))
-        if refunctioned:
-            self._method = self._checked_method(here)
         if moved:
             self._restart(here)
         else:
@@ -350,7 +344,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     def _restart(self, here: Start) -> None:
         """Begin anew at a state that was set; the counts and the largest residuals of the run go on."""
         old = self._run
-        self._start(here, check=False)
+        self._start(*here[1:], check=False)
         new, counters = self._run, self._work.counters
         counters[:] = old.work.counters
         counters[WAITED] = 0
@@ -361,15 +355,19 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _go_on(self, here: Start) -> None:
         """Go on from the last state with other tolerances, another interval or another function."""
-        run = self._run
+        run, spec = self._run, self._spec
+        method, _ = spec.examined(here.y, here.f)
         run.invariants.t_span = (run.invariants.t_span[0], float(self.t_bound))
-        fresh = self._projection.settled(self._method, self._stepping, run.y0, run.invariants).options
+        fresh = spec.projection.settled(method, spec.stepping, run.y0, run.invariants).options
         run.options = run.options._replace(rtol=fresh.rtol, atol=fresh.atol, block_atol=fresh.block_atol)
-        self._attach_history(here)
+        run.stepping = spec.stepping
+        if method.has_history:
+            spec.attach_history(run, here)
+        self._spec = replace(spec, method=method, is_known=True)
 
     def _state(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return what a copy shares with this solver, the user's functions, and what it copies."""
-        shared = {name: getattr(self, name) for name in SHARED}
+        shared = {name: getattr(self, name) for name in SHARED} | {"projection": self._spec.projection}
         was = self._was._asdict()
         if self.fun is not self._bound_fun:  # it was set since the last step
             shared["fun"] = self.fun
@@ -378,7 +376,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             "attributes": {name: value for name, value in vars(self).items() if name not in MADE | SHARED},
             "set": {name: value for name, value in was.items() if getattr(self, name) is not value},
             "replaced": self._user_fun is self._bound_fun,
-            "velocities": getattr(self._method, "velocities", None),
+            "velocities": getattr(self._spec.method, "velocities", None),
             "run": parts_of(self._run),
             "joint": self._run.options.joint is not None,
             "clock": None if self._scipy is not None else self._schedule.clock,
@@ -388,25 +386,26 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _revive(self, shared: dict[str, Any], copied: dict[str, Any]) -> None:
         """Become the solver whose `_state` this is."""
-        begin, user = copied["attributes"]["_begin"], shared["_user_fun"]
+        begin, user = copied["run"].values["begin"], shared["_user_fun"]
         vectorized = copied["attributes"]["vectorized"]
         super().__init__(user, begin.t, begin.y, begin.t + 1.0, vectorized, support_complex=True)
         if copied["replaced"]:
             self.fun = user
+        self._jacobian, self._scipy = shared["_jacobian"], None
         self._bind(user, [0])
-        self._scipy, self._method = None, self.TABLEAU
+        spec = self._specified(copied["run"].values["stepping"], shared["projection"])
         if self.TABLEAU.has_history:
             tableau: Any = self.TABLEAU
-            self._method = replace(tableau, velocities=copied["velocities"])
+            spec = replace(spec, method=replace(tableau, velocities=copied["velocities"]))
+        self._spec = replace(spec, is_known=True)
         if copied["scipy"] is not None and self._SCIPY is not None:
             fresh = partial(_copied, self._derivative)
             self._scipy = self._SCIPY(fresh, begin.t, begin.y, begin.t + 1.0, first_step=1.0)
             self._scipy.fun = self._derivative
             set_scipy_values(self._scipy, copied["scipy"])
-        invariants = InvariantSet(shared["_projection"].invariants, *begin, tell=False)
-        self._run = run_of(copied["run"], invariants, self._method, joint=copied["joint"])
-        self._work, self._begin, self._jacobian = self._run.work, begin, shared["_jacobian"]
-        self.f, self.h_abs, self._stepping = begin.f, 0.0, copied["attributes"]["_stepping"]
+        invariants = InvariantSet(shared["projection"].invariants, *begin, tell=False)
+        self._run = run_of(copied["run"], invariants, self._spec.method, joint=copied["joint"])
+        self._work, self.f, self.h_abs = self._run.work, begin.f, 0.0
         self._drive(begins=False)
         self._work.K[0] = copied["run"].work.K[0]
         if copied["clock"] is not None:
@@ -415,7 +414,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self.__dict__.update(copied["attributes"] | {name: shared[name] for name in SHARED})
         calls[:], self._calls = self._calls, calls
         self.diagnostics = Diagnostics()
-        setup.attach(self.diagnostics, self._run)
+        self._run.attach(self.diagnostics)
         now = {name: getattr(self, name) for name in Settings._fields}
         was = Settings(**now | copied["set"])
         self._left, self._taken = tuple(was[:N_LEFT]), tuple(was[N_LEFT:])
@@ -445,7 +444,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             return None
 
         control = {"max_step": self.max_step, "rtol": self.rtol, "atol": self.atol}
-        control["first_step"] = self._stepping.first_step
+        control["first_step"] = self._spec.stepping.first_step
         solver = self._SCIPY(partial(_copied, self._derivative), self.t, start, self.t_bound, **control)
         if np.isnan(solver.h_abs):
             return None  # SciPy's loop would never end
@@ -492,7 +491,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         found = self._count()
         if status != OK:
             run.trust.failed = True
-            return False, setup.failure(status, run, self._schedule.clock)
+            return False, failure(status, run, self._schedule.clock)
         if t == self.t:
             return False, self.TOO_SMALL_STEP
         self._k += 1
@@ -615,7 +614,7 @@ def _checked(
     called = flat if vectorized else fun
 
     def convert(f: Any, t: float) -> np.ndarray:
-        return np.array(setup.as_derivative(f, n, dtype, t), dtype, order="C")
+        return np.array(as_derivative(f, n, dtype, t), dtype, order="C")
 
     def checked(t: float, y: np.ndarray) -> np.ndarray:
         f = called(t, y.copy())
@@ -762,6 +761,12 @@ class EIPGJ14(EIPSolver):
     """
 
     TABLEAU = GaussJackson(order=14, corrected=True)
+
+
+def class_named(method: Any) -> str | None:
+    """Return the name of the class that stands in `method` by its name, by SciPy's name of it or as SciPy's class."""
+    name = f"EIP{str(getattr(method, '__name__', method)).upper().removeprefix('EIP')}"
+    return name if name in __all__ else None
 
 
 def eip_method(

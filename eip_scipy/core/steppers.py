@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import DOP853 as SCIPY_DOP853
 
-from ..engine.data import CUBIC, HISTORY, NYSTROM, POLYNOMIAL, QUINTIC, SEVENTH, Method
+from ..engine.data import CUBIC, HISTORY, NO_METHOD, NYSTROM, POLYNOMIAL, QUINTIC, SEVENTH, Method
 from ..methods.multistep import GaussJackson, interpolation_weights
 from ..methods.nystrom import RKN1210, NystromTableau
 from ..methods.nystrom_interpolants import LEAST_ORDER
 from ..methods.nystrom_interpolants import interpolant as nystrom_interpolant
+from ..methods.orders import AtRest
 from ..methods.runge_kutta import DOP853, Tableau
 from .one_step import OneStep
 
@@ -40,6 +41,11 @@ def arrays(method: Any) -> Method | OneStep:
 @arrays.register
 def _(method: OneStep) -> OneStep:
     return method
+
+
+@arrays.register
+def _(method: AtRest) -> Method:
+    return NO_METHOD
 
 
 @arrays.register

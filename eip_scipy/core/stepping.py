@@ -13,6 +13,7 @@ import numpy as np
 from ..engine.data import EPS, Span
 from ..methods.multistep import GaussJackson
 from ..methods.nystrom import NystromTableau
+from ..methods.orders import AtRest
 from ..methods.runge_kutta import Tableau
 from .inputs import is_number, reals, refuse_units, shown
 from .one_step import OneStep
@@ -29,7 +30,7 @@ __all__ = [
     "saved_steps",
 ]
 
-AnyMethod = Tableau | NystromTableau | GaussJackson | OneStep
+AnyMethod = Tableau | NystromTableau | GaussJackson | OneStep | AtRest
 UNBOUNDED = 2**62
 LEAST_RTOL = 100 * EPS  # SciPy's
 
@@ -50,6 +51,11 @@ class Stepping:
     first_step: float | None
     rtol: np.ndarray
     atol: np.ndarray
+
+    @classmethod
+    def at_rest(cls, t: float, n: int) -> Stepping:
+        """Return how a state of n components is projected where it is: without a step."""
+        return cls(Span(t, 0.0, t, 1.0, 0, np.inf), 0.0, None, np.zeros(n), np.zeros(n))
 
     def first(
         self,

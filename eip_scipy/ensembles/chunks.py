@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -36,7 +37,8 @@ class Chunk(NamedTuple):
 
     def part(self, first: int, last: int) -> Chunk:
         """Return some of the members, counted from the first one of the chunk."""
-        return Chunk(self.first + first, self.y0s[first:last], self.params[first:last], self.own.part(first, last))
+        params = np.ascontiguousarray(self.params[first:last])
+        return Chunk(self.first + first, self.y0s[first:last], params, self.own.part(first, last))
 
 
 class Part(NamedTuple):
@@ -63,7 +65,7 @@ class Pool(Protocol):
         """Leave nothing running."""
 
 
-def run_chunk(plan: Plan, chunk: Chunk, stop: threading.Event | None = None) -> Part:
+def run_chunk(plan: Plan, chunk: Chunk, *, stop: threading.Event | None = None) -> Part:
     """Run the members of a chunk, and their statistics where they are wanted."""
     return finished(plan.task, plan, run_members(plan, chunk.y0s, chunk.params, stop, chunk.own))
 
@@ -93,41 +95,19 @@ def run_elsewhere(task: Task, key: str, chunk: Chunk) -> Part:
     return run_chunk(plan, chunk)
 
 
-class ThreadPool:
-    """Threads of this process; compiled members run side by side."""
+class FuturesPool:
+    """Chunks on an executor of `concurrent.futures` or like it, which stays open: ``run(chunk)`` makes a `Part`."""
 
-    def __init__(self, plan: Plan, workers: int) -> None:
-        self._plan, self._workers = plan, workers
-        self._stop = threading.Event()
-        self._threads = ThreadPoolExecutor(workers, thread_name_prefix="eip-ensemble")
+    def __init__(self, executor: Executor, run: Callable[[Chunk], Part], workers: int) -> None:
+        self._executor, self._run, self._workers = executor, run, workers
+        self._open: set[Future[Part]] = set()
 
     def capacity(self) -> int:
         return self._workers
 
     def submit(self, chunk: Chunk) -> Future[Part]:
-        return self._threads.submit(run_chunk, self._plan, chunk, self._stop)
-
-    def collect(self, chunk: Chunk, ticket: Future[Part]) -> Part:
-        return ticket.result()
-
-    def close(self) -> None:
-        self._stop.set()
-        self._threads.shutdown(wait=True, cancel_futures=True)
-
-
-class FuturesPool:
-    """An executor of the user's, of `concurrent.futures` or like it; it stays open."""
-
-    def __init__(self, executor: Executor, task: Task, key: str) -> None:
-        self._executor, self._task, self._key = executor, task, key
-        self._open: set[Future[Part]] = set()
-
-    def capacity(self) -> int:
-        return cores()
-
-    def submit(self, chunk: Chunk) -> Future[Part]:
         try:
-            future = self._executor.submit(run_elsewhere, self._task, self._key, chunk)
+            future = self._executor.submit(self._run, chunk)
         except BrokenExecutor as error:
             raise _broken(error, chunk) from error
         except RuntimeError as error:
@@ -148,6 +128,19 @@ class FuturesPool:
     def close(self) -> None:
         for future in self._open:
             future.cancel()
+
+
+class ThreadPool(FuturesPool):
+    """Threads of this process; compiled members run side by side."""
+
+    def __init__(self, plan: Plan, workers: int) -> None:
+        self._stop = threading.Event()
+        threads = ThreadPoolExecutor(workers, thread_name_prefix="eip-ensemble")
+        super().__init__(threads, partial(run_chunk, plan, stop=self._stop), workers)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._executor.shutdown(wait=True, cancel_futures=True)
 
 
 def _broken(error: BrokenExecutor, chunk: Chunk) -> BrokenExecutor:

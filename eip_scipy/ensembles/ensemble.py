@@ -18,8 +18,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checkpoint.own_file import absolute
-from ..core import setup
+from ..checkpoint.locks import absolute
 from ..core.arguments import extra_arguments, floats, parameter_values
 from ..core.inputs import count, flag, is_number, refuse_units, shown
 from ..core.invariants import as_invariants
@@ -29,6 +28,7 @@ from ..core.options import ProjectionDetails, ProjectionOptions
 from ..core.pointers import PointerFunction
 from ..core.problem import Problem, component_names
 from ..core.solvers import EIPRK4, EIPSolver
+from ..core.states import states
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
 from ..run.events import Events
@@ -37,7 +37,7 @@ from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
 from ..run.results import Fields
 from ..run.tables import dataset, default_names, to_dataframe
-from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order
+from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order, run_elsewhere
 from .happened import Happened
 from .own_times import OwnTimes, own_times
 from .side_by_side import LANES
@@ -423,42 +423,35 @@ def ensemble(
     _check_choices(reduce, callback, progress, max_bytes)
     if invariants is not DEFAULT:
         options["invariants"] = invariants
-    _check_places(out, checkpoint, checkpoint_every, resume)
-    out = None if out is None else location(out)
-    checkpoint = None if checkpoint is None else absolute(checkpoint)
+    out, checkpoint = _places(out, checkpoint, checkpoint_every, resume)
     own = own_times(fun, t_span, t_eval, save_every, reduce)
-    starts, parameters = _inputs(fun, y0s, params, options.get("invariants", ()), own)
-    if options.get("args") is not None:
-        shared = floats(extra_arguments(options["args"], params))
-        parameters = np.broadcast_to(shared, (len(starts), shared.size))
+    everyone = _inputs(fun, y0s, params, options, own)
+    total = len(everyone.y0s)
     keep = reduce is None or out is not None
     method = default_method(fun) or EIPRK4 if method is None else method
     common = {"method": method, "h": h, "save_every": save_every, "t_eval": t_eval, **options}
     common["acceleration"] = acceleration
-    request = Request.of(fun=_bare(fun), t_span=t_span, y0=starts[0], params=parameters[0], **common).with_pointers()
-    if request.args is not None or not parameters.shape[1]:
+    request = Request.of(fun=_bare(fun), t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], **common)
+    request = dataclasses.replace(request.with_pointers(), **own.of(0))
+    if request.args is not None or not everyone.params.shape[1]:
         request = dataclasses.replace(request, params=None)
-    if own:
-        request = dataclasses.replace(request, **own.of(0))
-    task = Task(request, reduce, keep, len(starts), own.padded.shape[1] if own else None)
-    plan, doubts = _first_that_starts(task, starts, parameters, own)
-    starts = np.ascontiguousarray(starts, plan.dtype)
-    size = _chunk_size(plan, len(starts), request.function) if chunk is None else count("chunk", chunk)
+    task = Task(request, reduce, keep, total, own.padded.shape[1] if own else None)
+    plan, doubts = _first_that_starts(task, everyone)
+    everyone = everyone._replace(y0s=np.ascontiguousarray(everyone.y0s, plan.dtype))
+    size = _chunk_size(plan, total, request.function) if chunk is None else count("chunk", chunk)
     held = plan.times.size if reduce is None and out is None else 0
-    _check_memory(plan, len(starts), held, max_bytes)
+    _check_memory(plan, total, held, max_bytes)
     store: Store | None = None
     if out is not None or checkpoint is not None:
-        identity = plan.identity(starts, parameters, size, own)
-        times = plan.times if own.times is None else own.padded
+        identity, times = plan.identity(everyone.y0s, everyone.params, size, own), _all_times(plan, own)
         store = (
-            CheckpointStore(checkpoint, identity, checkpoint_every, resume)
+            CheckpointStore(checkpoint, identity, resume, checkpoint_every)
             if out is None
-            else ZarrStore(out, identity, plan.empty(size), times, len(starts), resume, plan.events)
+            else ZarrStore(out, identity, resume, plan.empty(size), times, total, plan.events)
         )
     with ended_by_sigterm(store is not None), nullcontext() if store is None else closing(store):
-        gathered = _Gathered(plan, len(starts), held, size, store, callback, doubts, own)
-        chunks = _chunks(starts, parameters, size, own)
-        result = gathered.run(partial(_pool, executor, plan, progress), chunks, progress)
+        gathered = _Gathered(plan, everyone, held, size, store, callback, doubts)
+        result = gathered.run(partial(_pool, executor, plan, progress), progress)
     _warn(result, np.flatnonzero((result.status >= 0) & ~result.trusted))
     return result
 
@@ -501,27 +494,26 @@ class _Gathered:
     def __init__(
         self,
         plan: Plan,
-        members: int,
+        everyone: Chunk,
         held: int,
         chunk: int,
         store: Store | None,
         callback: Callable[[EnsembleResult], Any] | None,
         doubts: dict[int, str],
-        own: OwnTimes,
     ) -> None:
-        self.own = own
+        self.everyone = everyone
         self.plan, self.chunk, self.store, self.callback, self.doubts = plan, chunk, store, callback, doubts
         self.method = plan.task.request.method.__name__
-        self.whole = Members.empty(members, plan.size, plan.dtype, len(plan.names), held)
+        self.whole = Members.empty(len(everyone.y0s), plan.size, plan.dtype, len(plan.names), held)
         self.statistics: Statistics | None = None
         self.stopped, self.one_by_one = False, ""
         self._begin = time.perf_counter()
 
-    def run(self, pool: Callable[[], Pool], chunks: Callable[[int], Iterator[Chunk]], progress: bool) -> EnsembleResult:
-        """All chunks that are not in the store yet."""
+    def run(self, pool: Callable[[], Pool], progress: bool) -> EnsembleResult:
+        """Run all chunks that are not in the store yet."""
         from tqdm import tqdm
 
-        done = self._stored(chunks)
+        done = self._stored()
         total = len(self.whole.t)
         try:
             if done < total:
@@ -536,13 +528,18 @@ class _Gathered:
                         disable=not progress,
                     ) as bar,
                 ):
-                    self._gather(pool(), chunks(done), bar)
+                    self._gather(pool(), self._chunks(done), bar)
         except BaseException as error:
             error.partial = self.result()  # type: ignore[attr-defined]
             raise
         return self.result()
 
-    def _stored(self, chunks: Callable[[int], Iterator[Chunk]]) -> int:
+    def _chunks(self, done: int) -> Iterator[Chunk]:
+        """Yield the members from number `done` on, chunk by chunk."""
+        for first in range(done, len(self.whole.t), self.chunk):
+            yield self.everyone.part(first, first + self.chunk)
+
+    def _stored(self) -> int:
         """Take what the store has; returns the number of members."""
         if self.store is None:
             return 0
@@ -552,7 +549,7 @@ class _Gathered:
             part = Part(members, None) if statistics is not None else finished(self.plan.task, self.plan, members)
             self._take(first, part)
             if first + self.chunk >= done:
-                last = next(chunks(first))
+                last = self.everyone.part(first, done)
                 here = self.plan.known_by(last.y0s, last.params, members)
                 require_same_functions(self.store.path, self.store.known_by(first), *here, first)
         self.statistics = self.statistics if statistics is None else statistics
@@ -586,7 +583,7 @@ class _Gathered:
         return self._of(self.whole, self.statistics, 0)
 
     def _of(self, members: Members, statistics: Statistics | None, first: int) -> EnsembleResult:
-        plan, counters = self.plan, members.counters
+        plan, counters, times = self.plan, members.counters, _all_times(self.plan, self.everyone.own)
         trajectories = members.saved.swapaxes(1, 2) if members.saved.shape[1] else None
         ends = members.values
         invariants = ends if trajectories is None else members.saved_values.swapaxes(1, 2)
@@ -613,7 +610,7 @@ class _Gathered:
             njev=counters[:, NJEV],
             nlu=counters[:, NLU],
             n_rejected_projections=counters[:, REJECTED],
-            times=self._times(first, len(members.t)),
+            times=times if times.ndim == 1 else times[first : first + len(members.t)],
             trajectories=trajectories,
             invariants=invariants,
             target=members.target,
@@ -631,17 +628,16 @@ class _Gathered:
         object.__setattr__(result, "_ends", ends)  # an attribute, not a field
         return result
 
-    def _times(self, first: int, count: int) -> np.ndarray:
-        """Return the times of saved states, those of `count` members from number `first` on if each has its own."""
-        if not self.own or not self.plan.times.size:
-            return self.plan.times
-        return self.own.padded[first : first + count]
-
     def _events(self, members: Members) -> list[Happened]:
         """Return the events of members; none of those that did not run."""
         n, dtype = self.plan.size, self.plan.dtype
         none = [(np.zeros(0), np.zeros((0, n), dtype))] * self.plan.events
         return [found or none for found in members.happened]
+
+
+def _all_times(plan: Plan, own: OwnTimes) -> np.ndarray:
+    """Return the times of saved states, with a row for each member if they have times of their own."""
+    return plan.times if own.times is None else own.padded
 
 
 def _check_options(options: dict[str, Any]) -> None:
@@ -653,7 +649,8 @@ def _check_options(options: dict[str, Any]) -> None:
     Events(options.get("events"))  # which raises for what is wrong with them
 
 
-def _check_places(out: Any, checkpoint: Any, every: Any, resume: Any) -> None:
+def _places(out: Any, checkpoint: Any, every: Any, resume: Any) -> tuple[str | None, str | None]:
+    """Return where `out` and `checkpoint` lead to now, whatever becomes of the working directory."""
     refuse_units(checkpoint_every=every)
     if not is_number(every) or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
@@ -665,16 +662,17 @@ def _check_places(out: Any, checkpoint: Any, every: Any, resume: Any) -> None:
             raise TypeError(f"{name} must be a path, got {path!r}.")
     if resume and out is None and checkpoint is None:
         raise ValueError("resume=True needs the place to go on from: out= or checkpoint=.")
+    return None if out is None else location(out), None if checkpoint is None else absolute(checkpoint)
 
 
-def _inputs(fun: Any, y0s: Any, params: Any, invariants: Any, times: OwnTimes) -> tuple[np.ndarray, np.ndarray]:
-    """Starts (members, n) and parameters (members, p), p = 0 where there are none."""
+def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: OwnTimes) -> Chunk:
+    """Return all members: their starts (m, n), parameters (m, p), p = 0 where there are none, and own times."""
     problem = fun if isinstance(fun, Problem) else None
     if y0s is None:
         y0s = None if problem is None else problem.y0
         if y0s is None:
             raise TypeError("ensemble: y0s is missing; only a Problem brings a start of its own, and not each does.")
-    starts = setup.states("y0s", y0s)
+    starts = states("y0s", y0s)
     if problem is not None:
         params = problem.plain(params=params)["params"]
     own = None if params is None else np.atleast_1d(parameter_values(params))
@@ -697,13 +695,14 @@ def _inputs(fun: Any, y0s: Any, params: Any, invariants: Any, times: OwnTimes) -
         )
     elif own.ndim > 2:
         raise ValueError(f"params must have the shape (p,) or (members, p), got {own.shape}.")
-    if own.ndim == 2 and any(item.args for item in as_invariants(invariants)):
+    if own.ndim == 2 and any(item.args for item in as_invariants(options.get("invariants", ()))):
         raise ValueError(
             "ensemble: invariants with args, and params for each member: leave args out; the functions receive each "
             "member's params as their last argument."
         )
-    rows = own if own.ndim == 2 else np.broadcast_to(own, (len(starts), own.size))
-    return starts, rows
+    if options.get("args") is not None:
+        own = floats(extra_arguments(options["args"], params))
+    return Chunk(0, starts, own if own.ndim == 2 else np.broadcast_to(own, (len(starts), own.size)), times)
 
 
 def _bare(fun: Any) -> Any:
@@ -717,17 +716,16 @@ def _not_called(t: float, y: np.ndarray) -> np.ndarray:
     raise NotImplementedError("the problem's compiled right-hand side is in use")
 
 
-def _first_that_starts(
-    task: Task, starts: np.ndarray, params: np.ndarray, times: OwnTimes
-) -> tuple[Plan, dict[int, str]]:
+def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str]]:
     """The plan by a member whose start `integrate` takes; its error where it takes none of some members.
 
     Also what the checks of the start found, by member: it holds for all that have the same parameters.
     """
     first: Exception | None = None
+    starts, params = everyone.y0s, everyone.params
     for k in np.unique(np.linspace(0, len(starts) - 1, TRIED).astype(int)):
         own = None if task.request.params is None else params[k].copy()
-        request = dataclasses.replace(task.request, y0=starts[k].copy(), params=own, **times.of(k))
+        request = dataclasses.replace(task.request, y0=starts[k].copy(), params=own, **everyone.own.of(k))
         tried = dataclasses.replace(task, request=request)
         try:
             ready = tried.prepared(tried.request.y0, own, check_start=True)
@@ -771,15 +769,6 @@ def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) 
         )
 
 
-def _chunks(starts: np.ndarray, params: np.ndarray, size: int, own: OwnTimes) -> Callable[[int], Iterator[Chunk]]:
-    def chunks(done: int) -> Iterator[Chunk]:
-        for first in range(done, len(starts), size):
-            last = first + size
-            yield Chunk(first, starts[first:last], np.ascontiguousarray(params[first:last]), own.part(first, last))
-
-    return chunks
-
-
 def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
     """Where the chunks run."""
     task, key = plan.task, uuid.uuid4().hex
@@ -788,7 +777,7 @@ def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
         workers = cores() if executor is None else count("executor", executor)
         return ThreadPool(plan, workers if plan.why_not is None else 1)
     if isinstance(executor, Executor):
-        return FuturesPool(executor, task, key)
+        return FuturesPool(executor, partial(run_elsewhere, task, key), cores())
     if executor == "dask" or _is_of_dask(executor):
         if plan.pointers:
             raise plan.pointers[0].unpicklable()  # Dask would bury it in pages of its own

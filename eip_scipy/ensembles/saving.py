@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from .happened import Flat, flattened, unflattened
 from .statistics import Statistics
 
-__all__ = ["packed", "unpacked"]
+__all__ = ["expanded", "packed", "shortened", "unpacked"]
 
 TUPLES = "names", "component_names"
 
@@ -19,10 +20,7 @@ def packed(result: Any) -> dict[str, Any]:
     """Return the fields of a result as arrays and what JSON holds."""
     fields = dict(result)
     ends = fields.pop("end_invariants", None)
-    messages = [str(text) for text in fields.pop("message")]
-    usual = Counter(messages).most_common(1)[0][0]
-    others = {str(k): text for k, text in enumerate(messages) if text != usual}
-    fields["messages"] = {"usual": usual, "others": others}
+    fields["messages"] = shortened(fields.pop("message"))
     if not isinstance(fields["trajectories"], np.ndarray):
         fields["trajectories"] = None
     if not isinstance(fields["invariants"], np.ndarray):  # which are in the store, as the trajectories are
@@ -42,9 +40,7 @@ def packed(result: Any) -> dict[str, Any]:
 def unpacked(fields: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a result from what `packed` gave."""
     fields = dict(fields)
-    messages = fields.pop("messages")
-    m = len(fields["t"])
-    fields["message"] = np.array([messages["others"].get(str(k), messages["usual"]) for k in range(m)], dtype=object)
+    fields["message"] = np.array(expanded(fields.pop("messages"), 0, len(fields["t"])), dtype=object)
     found = {name: fields.pop(f"statistics.{name}", None) for name in Statistics.__dataclass_fields__}
     fields["statistics"] = None if found["t"] is None else Statistics(**found)
     events = [fields.pop(f"events.{name}", None) for name in Flat._fields]
@@ -57,3 +53,14 @@ def unpacked(fields: dict[str, Any]) -> dict[str, Any]:
         if fields.get(name) is not None:
             fields[name] = tuple(fields[name])
     return fields
+
+
+def shortened(messages: Sequence[str]) -> dict[str, Any]:
+    """Return the messages of members as JSON holds them: the most frequent one, and the others by number."""
+    usual = str(Counter(messages).most_common(1)[0][0])
+    return {"usual": usual, "others": {str(k): str(text) for k, text in enumerate(messages) if text != usual}}
+
+
+def expanded(found: dict[str, Any], first: int, last: int) -> list[str]:
+    """Return the messages of members `first` to `last` from what `shortened` gave."""
+    return [found["others"].get(str(k), found["usual"]) for k in range(first, last)]

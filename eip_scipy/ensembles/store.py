@@ -1,40 +1,49 @@
-"""Ensembles on disk, from which a run goes on: a Zarr group that grows chunk by chunk, or a checkpoint file."""
+"""Ensembles on disk that a later call resumes: a Zarr group that grows chunk by chunk, or a checkpoint file."""
 
 from __future__ import annotations
 
 import os
 import time
 import warnings
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from .. import checkpoint
 from ..checkpoint import CheckpointError
-from ..checkpoint.locks import Lock
-from ..checkpoint.own_file import OwnFile, absolute, unlocked
+from ..checkpoint.locks import Lock, absolute
+from ..core.callers import users_level
 from ..core.inputs import shown
 from .happened import Flat, flattened, unflattened
+from .saving import expanded, shortened
 from .statistics import Statistics
 from .tasks import COMPARED, LISTS, NOT_RUN, Members
 
-__all__ = ["CheckpointStore", "Store", "ZarrStore", "location", "require_identity", "require_same_functions"]
+__all__ = ["CheckpointStore", "Store", "ZarrStore", "location", "require_same_functions"]
 
 KIND = "ensemble"
 LABEL = "eip_scipy_ensemble"
 # Metadata of format 2 may name the codec that unpickles. A group's own file may hold metadata of any format.
 FORMAT: dict[str, Any] = {"zarr_format": 3, "use_consolidated": False}
-OPTIONAL = (
-    "states", "time", "times", "invariants", "end_invariants", "target", "event_count", "event_t", "event_y",
-    "known_by",
-)  # fmt: skip
-ARRAYS = (
-    *OPTIONAL, "y", "t_end", "max_defect", "max_correction", "counters", "side_by_side", "trusted", "message", "status",
-)  # fmt: skip
+# Arrays of a group: the field of Members, and the axes after that of the members. The status is written last.
+ARRAYS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "y": ("y", ("component",)),
+    "states": ("saved", ("component", "time")),
+    "invariants": ("saved_values", ("invariant", "time")),
+    "end_invariants": ("values", ("invariant",)),
+    "target": ("target", ("invariant",)),
+    "t_end": ("t", ()),
+    "max_defect": ("max_defect", ("invariant",)),
+    "max_correction": ("max_correction", ()),
+    "counters": ("counters", ("counter",)),
+    "side_by_side": ("side_by_side", ()),
+    "trusted": ("trusted", ()),
+    "message": ("message", ()),
+    "status": ("status", ()),
+}
+FILLED = {"message": "", "status": NOT_RUN}
 CODECS = {"blosc", "bytes", "crc32c", "gzip", "transpose", "vlen-bytes", "vlen-utf8", "zstd"}
 SAME = 1e-9
 EVENTS_IN_A_FILE = 4096
@@ -42,83 +51,51 @@ EVENTS_IN_A_FILE = 4096
 LEAST_RATIO = 19.0
 
 
-class Store(Protocol):
-    """Where finished chunks are kept."""
+class _Store:
+    """Finished chunks on disk: what both kinds have in common.
 
-    @property
-    def path(self) -> str:
-        """Its absolute path, or its URL."""
+    Attributes
+    ----------
+    path : str
+        Absolute path, or URL.
+    finished : int
+        Number of members whose results were there at the start; whole chunks, from the first one on.
+    statistics : Statistics or None
+        Statistics of these members, if the store keeps them.
+    states, saved_values : zarr.Array or None
+        Saved states (members, n, times) and their invariants (members, l, times), if only the store keeps them.
+    """
 
-    @property
-    def finished(self) -> int:
-        """Members whose results are there; whole chunks, from the first one on."""
-
-    @property
-    def statistics(self) -> Statistics | None:
-        """Those of the finished members, where the store keeps them."""
-
-    @property
-    def states(self) -> Any:
-        """The saved states (members, n, times), where the store keeps them and nobody else."""
-
-    @property
-    def saved_values(self) -> Any:
-        """The invariants of the saved states (members, l, times), likewise."""
-
-    def read(self, first: int, last: int) -> Members:
-        """Results of members `first` to `last`."""
-
-    def known_by(self, first: int) -> np.ndarray:
-        """What was written beside the last finished chunk, which starts with number `first`; empty: nothing was."""
-
-    def write(
-        self, first: int, members: Members, known_by: np.ndarray, whole: Members, statistics: Statistics | None
-    ) -> None:
-        """Results of a chunk that starts with number `first`, the last part of `whole` so far, with its statistics.
-
-        `known_by` is what its functions are recognised by.
-        """
+    path: str
+    finished = 0
+    statistics: Statistics | None = None
+    states: Any = None
+    saved_values: Any = None
+    _lock: Lock | None = None
 
     def flush(self) -> None:
         """Write what is waiting."""
 
     def close(self) -> None:
         """Let other ensembles in."""
+        if self._lock is not None:
+            self._lock.close()
+
+    def _require_same(self, there: dict[str, Any], here: dict[str, Any], missing: list[str]) -> None:
+        """Compare what makes two ensembles the same, and refuse a store that lacks something."""
+        checkpoint.require_same(self.path, there.get("settings"), here["settings"])
+        one, other = ([complex(text) for text in found["start"]] for found in (there, here))
+        if len(one) != len(other) or not np.allclose(one, other, rtol=SAME, atol=0.0, equal_nan=True):
+            raise _other_functions(self.path, f"at the start ({one[:4]} there, {other[:4]} here)")
+        if missing:
+            raise CheckpointError(
+                f"{self.path!r} is no ensemble of eip_scipy, or was written by an earlier version of eip_scipy: "
+                f"{missing[0]!r} is missing. Resume it with that version, or name another place to start anew."
+            )
+        checkpoint.warn_of_other_versions(self.path, there, stacklevel=users_level())
 
 
-def require_identity(path: Any, there: dict[str, Any], here: dict[str, Any]) -> None:
-    """Compare what makes two ensembles the same.
-
-    Raises
-    ------
-    CheckpointError
-        Naming each setting that differs.
-    """
-    checkpoint.require_same(path, there.get("settings"), here["settings"])
-    one, other = ([complex(text) for text in found["start"]] for found in (there, here))
-    if len(one) != len(other) or not np.allclose(one, other, rtol=SAME, atol=0.0, equal_nan=True):
-        raise CheckpointError(
-            f"{os.fspath(path)!r} belongs to another ensemble: fun or an invariant had other values at the start "
-            f"({one[:4]} there, {other[:4]} here). Resume with the functions of that run, or name another place."
-        )
-
-
-def require_all(path: Any, missing: list[str]) -> None:
-    """Refuse a store that lacks something that an ensemble keeps.
-
-    Raises
-    ------
-    CheckpointError
-        Naming the first that is missing.
-    """
-    if missing:
-        raise CheckpointError(
-            f"{os.fspath(path)!r} was written by an earlier version of eip_scipy: {missing[0]!r} is missing. Resume it "
-            "with that version, or name another place to start anew."
-        )
-
-
-def require_same_functions(path: Any, there: np.ndarray, here: np.ndarray, sizes: np.ndarray, first: int) -> None:
+def require_same_functions(path: str, there: np.ndarray, here: np.ndarray, sizes: np.ndarray, first: int) -> None:
     """Compare what functions give where a member of the last finished chunk ended.
 
     Raises
@@ -127,13 +104,17 @@ def require_same_functions(path: Any, there: np.ndarray, here: np.ndarray, sizes
         Where they differ by more than another machine's rounding.
     """
     if there.size and not (there.shape == here.shape and bool(np.all(np.abs(there - here) <= SAME * sizes))):
-        raise CheckpointError(
-            f"{os.fspath(path)!r} belongs to another ensemble: fun or an invariant had other values where a member "
-            f"from number {first} on ended. Resume with the functions of that run, or name another place."
-        )
+        raise _other_functions(path, f"where a member from number {first} on ended")
 
 
-class ZarrStore:
+def _other_functions(path: str, where: str) -> CheckpointError:
+    return CheckpointError(
+        f"{path!r} belongs to another ensemble: fun or an invariant had other values {where}. Resume with the "
+        "functions of that run, or name another place."
+    )
+
+
+class ZarrStore(_Store):
     """A group of arrays whose first axis is the member, one Zarr chunk for each chunk of the ensemble.
 
     The status of a chunk's members is written last: where it is, the chunk is whole. (Zarr puts each file in its place
@@ -145,12 +126,12 @@ class ZarrStore:
         A folder, or the URL of a store.
     identity : dict
         What makes two ensembles the same.
+    resume : bool
     empty : Members
         One chunk's room, for shapes and types.
     times : ndarray, shape (m,) or (members, m)
     members : int
-    resume : bool
-    events : int, optional
+    events : int
         How many there are, of which times and states are kept.
 
     Raises
@@ -162,114 +143,103 @@ class ZarrStore:
         another ensemble is writing there.
     """
 
-    statistics = None
-
     def __init__(
         self,
         path: Any,
         identity: dict[str, Any],
+        resume: bool,
         empty: Members,
         times: np.ndarray,
         members: int,
-        resume: bool,
-        events: int = 0,
+        events: int,
     ) -> None:
         zarr = _zarr()
-        self._events = events
-        self._group: Any = None
-        self.path, self._members, self._chunk = location(path), members, len(empty.t)
-        self._local = None if is_url(self.path) else Path(os.path.realpath(self.path))
-        self._place = self.path if self._local is None else str(self._local)
-        self._lock: Lock | None = None
-        if self._local is not None:
-            with self._written():
-                self._local.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = Lock(self._local, self.path)
-            if self._lock.problem:
-                warnings.warn(unlocked(self.path, self._lock.problem), RuntimeWarning, stacklevel=3)
-        try:
-            with self._written():
-                self._open(zarr, identity, empty, times, resume)
-        except BaseException:
-            self.close()
-            raise
+        self.path, self._members, self._chunk, self._events = location(path), members, len(empty.t), events
+        self._empty, self._arrays = empty, dict[str, Any]()
+        self._place = self.path if is_url(self.path) else os.path.realpath(self.path)
+        with self._written():
+            if not is_url(self.path):
+                os.makedirs(os.path.dirname(self._place), exist_ok=True)
+                self._lock = Lock(self.path)
+            try:
+                self._label = self._open(zarr, identity, times, resume)
+                missing = np.flatnonzero(self._arrays["status"][:] == NOT_RUN)
+            except BaseException:
+                self.close()
+                raise
+        self.finished = int(missing[0]) // self._chunk * self._chunk if missing.size else members
+        self.states, self.saved_values = self._arrays.get("states"), self._arrays.get("invariants")
 
-    def _open(self, zarr: Any, identity: dict[str, Any], empty: Members, times: np.ndarray, resume: bool) -> None:
-        """Go on with what is there, or begin."""
+    def _open(self, zarr: Any, identity: dict[str, Any], times: np.ndarray, resume: bool) -> Any:
+        """Go on with what is there, or begin; return what the group says of itself."""
         mode: Any = "w-"
         if self._exists(zarr):
             if not resume:
-                raise CheckpointError(
-                    f"{self.path!r} exists. resume=True goes on with the ensemble that it holds; to start anew, name "
-                    "another place or delete this one."
-                )
-            found = self._existing(zarr)
-            if found is not None:
-                require_identity(self.path, found, identity)
-                require_all(self.path, [name for name in ("target", "end_invariants") if name not in self._group])
-                self._require_layout(empty, times)
-                checkpoint.warn_of_other_versions(self.path, found, stacklevel=4)
-                self._label, self._mark = found, self._status()
-                return
+                raise checkpoint.existing(self.path, "ensemble")
+            if (found := self._existing(zarr, identity, times)) is not None:
+                return found
             mode = "w"  # left by us before it was whole
         try:
-            self._group = zarr.open_group(self._place, mode=mode, attributes={LABEL: None}, **FORMAT)
+            group = zarr.open_group(self._place, mode=mode, attributes={LABEL: None}, **FORMAT)
         except FileExistsError as error:
             raise CheckpointError(f"{self.path!r} is no ensemble of eip_scipy: {error}") from error
         except OSError:
             with suppress(OSError):  # where Zarr has come no further than to the folder
                 os.rmdir(self._place)
             raise
-        self._create(identity, empty, times)
-        self._label, self._mark = self._group.attrs[LABEL], self._status()
+        self._arrays = {name: group.create_array(name, **how) for name, how in self._layout(times).items()}
+        if times.size:
+            self._arrays[_name_of(times)][...] = times
+        # Last: a group without it was left before it was whole.
+        group.attrs[LABEL] = {**checkpoint.origin(), **identity}
+        return group.attrs[LABEL]
 
     def _exists(self, zarr: Any) -> bool:
-        if self._local is not None:
-            return os.path.lexists(self._local)
+        if self._lock is not None:
+            return os.path.lexists(self._place)
         try:
             zarr.open_group(self._place, mode="r", **FORMAT)
         except FileNotFoundError:
             return False
         return True
 
-    def _existing(self, zarr: Any) -> dict[str, Any] | None:
-        """What the group that is there says of itself; None where it was left before it was whole."""
+    def _existing(self, zarr: Any, identity: dict[str, Any], times: np.ndarray) -> dict[str, Any] | None:
+        """Open the group that is there; None where it was left before it was whole."""
         try:
-            self._group = zarr.open_group(self._place, mode="r+", **FORMAT)
-            found: dict[str, Any] | None = self._group.attrs[LABEL]
-            if found is not None:
-                if not isinstance(found, dict):
-                    raise ValueError(f"its attribute {LABEL!r} is {shown(found)}, not a mapping")
-                self._require_plain_arrays()
+            group = zarr.open_group(self._place, mode="r+", **FORMAT)
+            found: dict[str, Any] | None = group.attrs[LABEL]
+            if found is None:
+                return None
+            if not isinstance(found, dict):
+                raise ValueError(f"its attribute {LABEL!r} is {shown(found)}, not a mapping")
+            layout = self._layout(times)
+            self._require_same(found, identity, [name for name in layout if name not in group])
+            self._arrays = {name: self._plain(name, group[name], how) for name, how in layout.items()}
         except (KeyError, TypeError, ValueError, OSError) as error:  # TypeError: Zarr's, for codecs in a wrong order
-            old = self._local is not None and (self._local / ".zgroup").exists()
+            old = self._lock is not None and os.path.exists(f"{self._place}/.zgroup")
             why = "it is a Zarr group of format 2, whose metadata may name code to run" if old else error
             raise CheckpointError(f"{self.path!r} is no ensemble of eip_scipy: {why}") from error
         return found
 
-    def _require_plain_arrays(self) -> None:
-        """Look at all arrays before one is read: a codec from elsewhere may run what is in the data."""
-        for name in ARRAYS:
-            if name not in self._group:
-                if name in OPTIONAL:
-                    continue
-                raise ValueError(f"it has no array {name!r} of format 3")
-            metadata = self._group[name].metadata.to_dict()
-            if metadata.get("node_type") != "array":
-                raise ValueError(f"its {name!r} is not an array")
-            codecs = {codec["name"] for codec in metadata.get("codecs", ())}
-            if metadata["zarr_format"] != 3 or not codecs <= CODECS:
-                raise ValueError(
-                    f"its array {name!r} is stored by {', '.join(sorted(codecs - CODECS)) or 'another format'}; "
-                    f"expected {', '.join(sorted(CODECS))}"
-                )
-
-    def _status(self) -> tuple[int, int] | None:
-        """What the group is known by: it writes its own file at its making only."""
-        if self._local is None:
-            return None
-        status = os.stat(self._local / "zarr.json")
-        return status.st_ino, status.st_mtime_ns
+    def _plain(self, name: str, there: Any, how: dict[str, Any]) -> Any:
+        """Return an array of the group whose reading runs no code from elsewhere, and takes the memory expected."""
+        metadata = there.metadata.to_dict()
+        if metadata.get("node_type") != "array":
+            raise ValueError(f"its {name!r} is not an array")
+        codecs = {codec["name"] for codec in metadata.get("codecs", ())}
+        if metadata["zarr_format"] != 3 or not codecs <= CODECS:
+            raise ValueError(
+                f"its array {name!r} is stored by {', '.join(sorted(codecs - CODECS)) or 'another format'}; "
+                f"expected {', '.join(sorted(CODECS))}"
+            )
+        shape, chunks = how["shape"], how.get("chunks", there.chunks)
+        grows = name in ("event_t", "event_y")
+        if there.shape[grows:] != shape[grows:] or there.chunks != chunks:
+            raise CheckpointError(
+                f"{self.path!r} is damaged: its array {name!r} has the shape {there.shape} in chunks of "
+                f"{there.chunks}; expected {shape} in chunks of {chunks}. Name another place to start anew."
+            )
+        return there
 
     @contextmanager
     def _written(self) -> Iterator[None]:
@@ -279,188 +249,102 @@ class ZarrStore:
             raise CheckpointError(f"cannot write to {self.path!r}: {error.strerror or error}") from error
 
     def _require_own(self) -> None:
-        """See that the group is the one that was opened; users may add to its attributes.
+        """See that the group in the local file system is the one that was opened.
 
         Raises
         ------
         CheckpointError
         """
+        if self._lock is None:
+            return
         try:
-            mark = self._status()
-            if mark != self._mark:
-                own = _zarr().open_group(self._place, mode="r", **FORMAT).attrs[LABEL] == self._label
-                self._mark = mark if own else None
+            own = _zarr().open_group(self._place, mode="r", **FORMAT).attrs[LABEL] == self._label
         except (KeyError, ValueError, OSError):
-            self._mark = None
-        if self._mark is None and self._local is not None:
+            own = False
+        if not own:
             raise CheckpointError(
                 f"{self.path!r} is no longer the group that this ensemble writes to: it was replaced or removed. "
                 "Nothing more is written there."
             )
 
-    def _create(self, identity: dict[str, Any], empty: Members, times: np.ndarray) -> None:
-        for name, array in self._layout(empty, times).items():
-            self._group.create_array(name, **array)
-        if times.size:
-            self._group[_name_of(times)][...] = times
-        # Last: a group without it was left before it was whole.
-        self._group.attrs[LABEL] = {**checkpoint.origin(), **identity}
-
-    def _layout(self, empty: Members, times: np.ndarray) -> dict[str, dict[str, Any]]:
+    def _layout(self, times: np.ndarray) -> dict[str, dict[str, Any]]:
         """Return what the arrays of this ensemble are created by."""
-        n, (kept, rows) = empty.y.shape[1], (empty.max_defect.shape[1], empty.saved.shape[1])
-        number, count, state = np.dtype(float), np.dtype(np.int64), empty.y.dtype
         layout: dict[str, dict[str, Any]] = {}
 
-        def array(name: str, dtype: Any, axes: tuple[str, ...], *shape: int, fill: Any = np.nan) -> None:
-            chunks = (self._chunk, *(max(1, size) for size in shape))
-            layout[name] = {"shape": (self._members, *shape), "chunks": chunks, "dtype": dtype, "fill_value": fill}
-            layout[name]["dimension_names"] = ("member", *axes)
+        def array(name: str, dtype: Any, axes: tuple[str, ...], shape: tuple[int, ...], rows: int, chunk: int) -> None:
+            chunks = (chunk, *(max(1, size) for size in shape))
+            fill = FILLED.get(name, np.nan if np.dtype(dtype).kind in "fc" else np.dtype(dtype).type())
+            layout[name] = {"shape": (rows, *shape), "chunks": chunks, "dtype": dtype, "dimension_names": axes}
+            layout[name] |= {"fill_value": fill}
 
-        array("y", state, ("component",), n)
+        # xarray takes no two-dimensional array by the name of its axis.
+        rows = "time" if times.ndim == 1 else "row"
+        for name, (field, axes) in ARRAYS.items():
+            if "time" not in axes or times.size:
+                value = _as_stored(getattr(self._empty, field))
+                named = ("member", *(rows if axis == "time" else axis for axis in axes))
+                dtype = str if field == "message" else value.dtype
+                array(name, dtype, named, value.shape[1:], self._members, self._chunk)
         if times.size:
-            axis = "time" if times.ndim == 1 else "row"  # xarray takes no two-dimensional array by its axis' name
-            array("states", state, ("component", axis), n, rows)
-            array("invariants", number, ("invariant", axis), kept, rows)
             axes = ("time",) if times.ndim == 1 else ("member", "row")
             layout[_name_of(times)] = {"shape": times.shape, "dtype": times.dtype, "dimension_names": axes}
-        array("end_invariants", number, ("invariant",), kept)
-        array("target", number, ("invariant",), kept)
+        n, state = self._empty.y.shape[1], self._empty.y.dtype
         if self._events:
-            array("event_count", count, ("event",), self._events, fill=0)
-            layout["event_t"] = {"shape": (0,), "chunks": (EVENTS_IN_A_FILE,), "dtype": number}
-            layout["event_t"]["dimension_names"] = ("happened",)
-            layout["event_y"] = {"shape": (0, n), "chunks": (EVENTS_IN_A_FILE, n), "dtype": state}
-            layout["event_y"]["dimension_names"] = ("happened", "component")
-        array("t_end", number, ())
-        array("max_defect", number, ("invariant",), kept)
-        array("max_correction", number, ())
-        array("counters", count, ("counter",), empty.counters.shape[1], fill=0)
-        array("side_by_side", np.dtype(bool), (), fill=False)
-        array("trusted", np.dtype(bool), (), fill=False)
+            array("event_count", int, ("member", "event"), (self._events,), self._members, self._chunk)
+            array("event_t", float, ("happened",), (), 0, EVENTS_IN_A_FILE)
+            array("event_y", state, ("happened", "component"), (n,), 0, EVENTS_IN_A_FILE)
         # Room for what a chunk's functions are recognised by.
-        width = COMPARED + kept
-        layout["known_by"] = {"shape": (-(-self._members // self._chunk), width), "chunks": (1, width), "dtype": number}
-        layout["known_by"] |= {"fill_value": np.nan, "dimension_names": ("chunk", "value")}
-        array("message", str, (), fill="")
-        array("status", count, (), fill=NOT_RUN)
+        width = COMPARED + self._empty.target.shape[1]
+        array("known_by", float, ("chunk", "value"), (width,), -(-self._members // self._chunk), 1)
         return layout
 
-    def _require_layout(self, empty: Members, times: np.ndarray) -> None:
-        """Refuse arrays of other sizes, whose reading may take any amount of memory.
-
-        Raises
-        ------
-        CheckpointError
-        """
-        for name, array in self._layout(empty, times).items():
-            there = self._group.get(name)
-            if there is None:  # one of OPTIONAL
-                continue
-            shape, chunks = array["shape"], array.get("chunks", there.chunks)
-            grows = name in ("event_t", "event_y")
-            if there.shape[grows:] != shape[grows:] or there.chunks != chunks:
-                raise CheckpointError(
-                    f"{self.path!r} is damaged: its array {name!r} has the shape {there.shape} in chunks of "
-                    f"{there.chunks}; expected {shape} in chunks of {chunks}. Name another place to start anew."
-                )
-
-    @property
-    def finished(self) -> int:
-        missing = np.flatnonzero(self._group["status"][:] == NOT_RUN)
-        return self._members if not missing.size else int(missing[0]) // self._chunk * self._chunk
-
-    @property
-    def states(self) -> Any:
-        return self._group.get("states", None)
-
-    @property
-    def saved_values(self) -> Any:
-        return self._group.get("invariants", None)
-
     def read(self, first: int, last: int) -> Members:
-        group, place = self._group, slice(first, last)
-        y = group["y"][place]
-        none = np.empty((last - first, 0, y.shape[1]), y.dtype)
-        return Members(
-            y=y,
-            t=group["t_end"][place],
-            status=group["status"][place],
-            message=[str(text) for text in group["message"][place]],
-            max_defect=group["max_defect"][place],
-            counters=group["counters"][place],
-            max_correction=group["max_correction"][place],
-            side_by_side=group["side_by_side"][place],
-            trusted=group["trusted"][place],
-            saved=group["states"][place].swapaxes(1, 2) if "states" in group else none,
-            saved_values=group["invariants"][place].swapaxes(1, 2)
-            if "invariants" in group
-            else np.empty((last - first, 0, group["target"].shape[1])),
-            values=group["end_invariants"][place],
-            target=group["target"][place],
-            happened=unflattened(self._flat(first, last)),
-        )
+        """Return the results of members `first` to `last`."""
+        found = {field: self._arrays[name][first:last] for name, (field, _) in ARRAYS.items() if name in self._arrays}
+        found = {field: _as_stored(value) for field, value in found.items()}
+        found["message"] = [str(text) for text in found["message"]]
+        none = Members.empty(last - first, found["y"].shape[1], found["y"].dtype, found["target"].shape[1], 0)
+        return none._replace(**found, happened=unflattened(self._flat(first, last)))
 
     def _flat(self, first: int, last: int) -> Flat:
         """Return the events of members `first` to `last`, behind those of the members before."""
         if not self._events:
             return Flat(np.zeros((last - first, 0), np.int64), np.zeros(0), np.zeros((0, 1)))
-        counts = self._group["event_count"][:last]
+        counts = self._arrays["event_count"][:last]
         begin, end = int(counts[:first].sum()), int(counts.sum())
-        return Flat(counts[first:], self._group["event_t"][begin:end], self._group["event_y"][begin:end])
+        return Flat(counts[first:], self._arrays["event_t"][begin:end], self._arrays["event_y"][begin:end])
 
     def _write_events(self, first: int, members: Members) -> None:
         """Write the events of a chunk, in place of those of one that was broken off before it was whole."""
-        group, y = self._group, members.y
-        flat = flattened(members.happened, self._events, y.shape[1], y.dtype)
-        group["event_count"][first : first + len(members.t)] = flat.counts
-        begin = int(group["event_count"][:first].sum())
+        flat = flattened(members.happened, self._events, members.y.shape[1], members.y.dtype)
+        self._arrays["event_count"][first : first + len(members.t)] = flat.counts
+        begin = int(self._arrays["event_count"][:first].sum())
         end = begin + flat.t.size
         for name, values in (("event_t", flat.t), ("event_y", flat.y)):
-            group[name].resize((end, *values.shape[1:]))
+            self._arrays[name].resize((end, *values.shape[1:]))
             if values.size:
-                group[name][begin:end] = values
+                self._arrays[name][begin:end] = values
 
     def known_by(self, first: int) -> np.ndarray:
-        if "known_by" not in self._group:
-            return np.zeros(0)
-        row = self._group["known_by"][first // self._chunk]
+        """Return what was written with the chunk that starts with number `first`, to recognise its functions."""
+        row = self._arrays["known_by"][first // self._chunk]
         return row[~np.isnan(row)]
 
     def write(
         self, first: int, members: Members, known_by: np.ndarray, whole: Members, statistics: Statistics | None
     ) -> None:
+        """Write the results of a chunk that starts with number `first`; its functions are recognised by `known_by`."""
         self._require_own()
         with self._written():
-            group, place = self._group, slice(first, first + len(members.t))
-            group["y"][place] = members.y
-            group["t_end"][place] = members.t
-            group["max_defect"][place] = members.max_defect
-            group["counters"][place] = members.counters
-            group["max_correction"][place] = members.max_correction
-            group["side_by_side"][place] = members.side_by_side
-            group["trusted"][place] = members.trusted
-            group["end_invariants"][place] = members.values
-            group["target"][place] = members.target
-            if "states" in group:
-                group["states"][place] = members.saved.swapaxes(1, 2)
-                group["invariants"][place] = members.saved_values.swapaxes(1, 2)
             if self._events:
                 self._write_events(first, members)
-            group["known_by"][first // self._chunk, : known_by.size] = known_by
-            group["message"][place] = np.array(members.message, dtype=object)
-            group["status"][place] = members.status
-
-    def flush(self) -> None:
-        """All is written."""
-
-    def close(self) -> None:
-        """Let other ensembles in."""
-        if self._lock is not None:
-            self._lock.release()
+            self._arrays["known_by"][first // self._chunk, : known_by.size] = known_by
+            for name, (field, _) in ARRAYS.items():
+                if name in self._arrays:
+                    self._arrays[name][first : first + len(members.t)] = _as_stored(getattr(members, field))
 
 
-class CheckpointStore:
+class CheckpointStore(_Store):
     """A checkpoint file with the finished members and their statistics, written anew every so many seconds.
 
     Parameters
@@ -468,9 +352,9 @@ class CheckpointStore:
     path : path-like
     identity : dict
         What makes two ensembles the same.
+    resume : bool
     every : float
         Seconds from one writing to the next; more where it would take over a twentieth of the time.
-    resume : bool
 
     Raises
     ------
@@ -478,76 +362,57 @@ class CheckpointStore:
         When there is a file and `resume` is false, or it is damaged, or that of another ensemble, or cannot be written.
     """
 
-    states = saved_values = None
-
-    def __init__(self, path: Any, identity: dict[str, Any], every: float, resume: bool) -> None:
+    def __init__(self, path: Any, identity: dict[str, Any], resume: bool, every: float) -> None:
         self._identity, self._every = identity, every
-        self._header: dict[str, Any] = {"finished": 0, "usual": "", "messages": {}}
-        self._arrays: dict[str, np.ndarray] = {}
         self._waiting: tuple[int, np.ndarray, Members, Statistics | None] | None = None
-        self._file = OwnFile(path)
-        if self._file.problem:
-            warnings.warn(unlocked(self._file.name, self._file.problem), RuntimeWarning, stacklevel=3)
+        self._lock = Lock(path)
+        self.path = self._lock.name
         try:
             self._open(resume)
         except BaseException:
-            self._file.close()
+            self.close()
             raise
         self._written, self._cost = time.perf_counter(), 0.0
 
     def _open(self, resume: bool) -> None:
         """Read what is there, or begin."""
-        if not self._file.exists():
-            self._file.write({"kind": KIND, **self._identity, **self._header}, {})
+        if not os.path.lexists(self.path):
+            checkpoint.write(self.path, {"kind": KIND, **self._identity, "finished": 0}, {})
             return
         if not resume:
-            raise self._file.existing("ensemble")
-        self._header, self._arrays = self._file.read(KIND)
-        require_identity(self._file.name, self._header, self._identity)
-        if self.finished:
-            needed = [f"members_{name}" for name in Members._fields if name not in LISTS]
-            needed += [f"events_{name}" for name in Flat._fields]
-            require_all(self._file.name, [name for name in needed if name not in self._arrays])
-        checkpoint.warn_of_other_versions(self._file.name, self._header, stacklevel=4)
-
-    @property
-    def path(self) -> str:
-        return self._file.name
-
-    @property
-    def finished(self) -> int:
-        return int(self._header["finished"])
-
-    @property
-    def statistics(self) -> Statistics | None:
+            raise checkpoint.existing(self.path, "ensemble")
+        self._header, self._arrays = checkpoint.read(self.path, KIND)
+        self.finished = int(self._header["finished"])
+        needed = [f"members_{name}" for name in Members._fields if name not in LISTS]
+        needed += [f"events_{name}" for name in Flat._fields]
+        missing = [name for name in needed if name not in self._arrays]
+        self._require_same(self._header, self._identity, missing if self.finished else [])
         mark = "statistics_"
         found = {name.removeprefix(mark): a for name, a in self._arrays.items() if name.startswith(mark)}
-        return Statistics(**found) if found else None
+        self.statistics = Statistics(**found) if found else None
 
     def read(self, first: int, last: int) -> Members:
-        usual, others = self._header["usual"], self._header["messages"]
+        """Return the results of members `first` to `last`."""
         arrays = {name: self._arrays[f"members_{name}"][first:last] for name in Members._fields if name not in LISTS}
         flat = Flat(*(self._arrays[f"events_{name}"] for name in Flat._fields))
-        return Members(
-            **arrays,
-            message=[others.get(str(k), usual) for k in range(first, last)],
-            happened=unflattened(flat)[first:last],
-        )
+        message = expanded(self._header["messages"], first, last)
+        return Members(**arrays, message=message, happened=unflattened(flat)[first:last])
 
     def known_by(self, first: int) -> np.ndarray:
-        return self._arrays.get("known_by", np.zeros(0))
+        """Return what was written with the last chunk, to recognise its functions; maybe nothing."""
+        return self._arrays["known_by"]
 
     def write(
         self, first: int, members: Members, known_by: np.ndarray, whole: Members, statistics: Statistics | None
     ) -> None:
+        """Take the results of a chunk that starts with number `first`, the last part of `whole` so far.
+
+        Its functions are recognised by `known_by`; `statistics` are those of `whole`.
+        """
         self._waiting = first + len(members.t), known_by, whole, statistics
         since = time.perf_counter() - self._written
         if since >= max(self._every, LEAST_RATIO * self._cost):
             self.flush()
-
-    def close(self) -> None:
-        """Let other ensembles in."""
-        self._file.close()
 
     def flush(self) -> None:
         """Write what has come since the last time; a disk that is full then is a warning, the former file stays."""
@@ -555,15 +420,7 @@ class CheckpointStore:
             return
         begin = time.perf_counter()
         done, known_by, whole, statistics = self._waiting
-        messages = whole.message[:done]
-        usual = Counter(messages).most_common(1)[0][0]
-        header = {
-            "kind": KIND,
-            **self._identity,
-            "finished": done,
-            "usual": usual,
-            "messages": {str(k): text for k, text in enumerate(messages) if text != usual},
-        }
+        header = {"kind": KIND, **self._identity, "finished": done, "messages": shortened(whole.message[:done])}
         arrays = {f"members_{name}": getattr(whole, name)[:done] for name in Members._fields if name not in LISTS}
         happened = whole.happened[:done]
         flat = flattened(happened, max(map(len, happened), default=0), whole.y.shape[1], whole.y.dtype)
@@ -571,16 +428,22 @@ class CheckpointStore:
         arrays["known_by"] = known_by
         if statistics is not None:
             arrays |= {f"statistics_{name}": value for name, value in vars(statistics).items()}
-        name = self._file.name
         try:
-            self._file.write(header, arrays)
-            if self._file.name != name:
-                warnings.warn(f"{self._file.moved}.", RuntimeWarning, stacklevel=2)
+            checkpoint.write(self.path, header, arrays)
         except CheckpointError as error:
-            warnings.warn(f"{error}; the former checkpoint stays", RuntimeWarning, stacklevel=2)
+            warnings.warn(f"{error}; the former checkpoint stays", RuntimeWarning, stacklevel=users_level())
         self._waiting = None
         self._written = time.perf_counter()
         self._cost = self._written - begin
+
+
+Store = ZarrStore | CheckpointStore
+
+
+def _as_stored(value: Any) -> np.ndarray:
+    """Return a field of Members as the group has it, or one of the group as Members has it."""
+    array = np.array(value, dtype=object) if isinstance(value, list) else value
+    return array.swapaxes(1, 2) if array.ndim == 3 else array
 
 
 def _name_of(times: np.ndarray) -> str:
@@ -589,12 +452,12 @@ def _name_of(times: np.ndarray) -> str:
 
 
 def is_url(path: str) -> bool:
-    """Whether Zarr finds a store of this name elsewhere than in the local file system."""
+    """Return whether Zarr finds a store of this name elsewhere than in the local file system."""
     return "://" in path
 
 
 def location(path: str | os.PathLike[str]) -> str:
-    """Where a path leads to now; a URL as it is."""
+    """Return where a path leads to now; a URL as it is."""
     text = os.fspath(path)
     return text if is_url(text) else absolute(text)
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core import setup
+from ..core.failures import failure
 from ..core.jitted import NotCompilableError
 from ..core.stepping import UNBOUNDED, saved_steps
 from ..engine import data
@@ -191,7 +191,7 @@ class Plan:
         self.names, self.component_names = tuple(run.invariants.names), self._ready.component_names
         self.pointers = self._ready.pointers
         self.size, self.dtype, self.t0 = run.y0.size, run.y0.dtype, schedule.span.t0
-        self.t_bound, self.h = schedule.span.t_bound, self._ready.stepping.h
+        self.t_bound, self.h = schedule.span.t_bound, run.stepping.h
         self.times = saved_times(schedule) if task.rows is None else np.full(task.rows, np.nan)
         self.events = len(self._ready.system.events.functions)
         self.n_steps = None if schedule.span.n_steps >= UNBOUNDED else schedule.span.n_steps
@@ -631,7 +631,7 @@ class Sweeper:
             loop,
             k,
             FAILED,
-            reason or setup.failure(code, driver.run, driver.schedule.clock),
+            reason or failure(code, driver.run, driver.schedule.clock),
             out,
             rows,
             broken=reason is not None,
@@ -641,14 +641,14 @@ class Sweeper:
 
     def _first_steps(self, y0s: np.ndarray, params: np.ndarray) -> np.ndarray:
         """Lengths of the first steps; NaN where none can be estimated."""
-        t0, stepping = self.loop.driver.schedule.span.t0, self.loop.stepping
+        t0, stepping = self.loop.driver.schedule.span.t0, self.loop.driver.run.stepping
         if stepping.h is not None or stepping.first_step is not None:
             return np.full(len(y0s), stepping.h or stepping.first_step, float)
         taus = np.empty(len(y0s))
         for k, (y0, p) in enumerate(zip(y0s, params, strict=True)):
             derivative = self._derivative(p)
             try:
-                taus[k] = stepping.first(derivative, y0, derivative(t0, y0), self.loop.tableau)
+                taus[k] = stepping.first(derivative, y0, derivative(t0, y0), self.loop.driver.run.tableau)
             except Exception:
                 taus[k] = np.nan
         return taus

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-__all__ = ["Ordered", "named_constant"]
+__all__ = ["AT_REST", "AtRest", "Ordered", "named_constant"]
 
 
 def named_constant(value: Any, names: Mapping[str, Any]) -> str | None:
@@ -42,3 +42,14 @@ class Ordered:
         if self.error_estimator_order is None:
             return 1.0
         return (self.order + 1) / (self.error_estimator_order + 1)
+
+
+class AtRest(Ordered):
+    """No method: a state is projected where it is."""
+
+    name = "project"
+    order = 0
+    error_estimator_order = None
+
+
+AT_REST = AtRest()

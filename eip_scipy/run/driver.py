@@ -13,7 +13,7 @@ from scipy.integrate import DenseOutput, OdeSolution
 from ..core.dense import Interpolants, ManifoldDenseOutput, solution
 from ..core.jitted import ChangedShapeError
 from ..core.native_functions import raise_again
-from ..core.setup import Run
+from ..core.runs import Run
 from ..core.stepping import UNBOUNDED
 from ..engine.data import NOTHING, PENDING, REASON, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions

@@ -6,15 +6,15 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import fields
 from typing import Any, Unpack
 
 import numpy as np
 
-from ..core import setup
 from ..core.examination import is_check_due, steps_to_check
-from ..core.inputs import refuse_units
+from ..core.failures import failure
 from ..core.jitted import is_compiled, is_jitted
 from ..core.names import nearest
 from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
@@ -40,26 +40,6 @@ FIRST_CHUNK = 64
 SLOW_SECONDS = 2.0
 ARRIVED, STOPPED = "reached the end of the interval", "stopped by the callback"
 ENDED_BY_EVENT = "A termination event occurred."
-# Names that the projection's options stand beside, for hints.
-OWN = (
-    *(
-        "acceleration",
-        "method",
-        "h",
-        "args",
-        "params",
-        "in_place",
-        "jacobian",
-        "save_every",
-        "t_eval",
-        "events",
-        "dense_output",
-        "callback",
-        "progress",
-    ),
-    *("compiled", "max_bytes", "checkpoint", "checkpoint_every", "resume", "diagnostics", "rtol", "atol"),
-    *("first_step", "max_step"),
-)
 
 
 @takes_projection_options
@@ -210,10 +190,7 @@ def integrate(
     >>> run.y.shape, bool((run.max_defect < 1e-11).all())
     ((4, 68), True)
     """
-    for name in projection:
-        if name not in ProjectionOptions.names():
-            raise TypeError(f"integrate() has no option {name!r}{nearest(name, (*OWN, *ProjectionOptions.names()))}")
-    refuse_units(checkpoint_every=checkpoint_every)
+    _check_names(projection)
     request = Request(
         fun=fun,
         acceleration=acceleration,
@@ -240,11 +217,18 @@ def integrate(
         max_step=max_step,
         projection=projection,
     )
-    if request.dense_output and checkpoint is not None:
-        raise ValueError("a checkpoint does not keep what dense_output=True needs; give t_eval or save_every instead.")
-    keeping = _resume.keeping(checkpoint, checkpoint_every, resume)
+    keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
     with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), keeping as keeper, _start_kept(request):
         return Loop(prepared(request), keeper).run()
+
+
+def _check_names(projection: Iterable[str]) -> None:
+    known = ProjectionOptions.names()
+    for name in projection:
+        if name not in known:
+            own = (item.name for item in fields(Request) if item.name != "projection")
+            others = (*own, "checkpoint", "checkpoint_every", "resume", *known)
+            raise TypeError(f"integrate() has no option {name!r}{nearest(name, others)}")
 
 
 class Loop:
@@ -252,14 +236,14 @@ class Loop:
 
     def __init__(self, prepared: Prepared, keeper: _resume.Keeper, *, compiled: bool | None = None) -> None:
         """`compiled`: instead of what the request says."""
-        request, system, run, start = prepared.request, prepared.system, prepared.run, prepared.start
+        request, system, run = prepared.request, prepared.system, prepared.run
         self.prepared, self.keeper = prepared, keeper
-        self.tableau, self.stepping, self.method = prepared.method, prepared.stepping, prepared.label
+        self.method = prepared.label
         self.rhs, self.events, self.diagnostics = system.rhs, system.events, prepared.diagnostics
         self.callback, self.progress = request.callback, request.progress
         if keeper.keeps:
-            identity = prepared.identity(start.y, system.parameters)
-            keeper.identify(identity, run, system.derivative, start.t, start.y, start.f)
+            identity = prepared.identity(run.begin.y, system.parameters)
+            keeper.identify(identity, run, system.derivative, *run.begin[:3])
         wanted = request.compiled if compiled is None else compiled
         with _compiling(self.progress and wanted is not False and is_jitted(system.fun)):
             functions, self.why_not = system.functions(run, wanted)
@@ -351,7 +335,7 @@ class Loop:
             if ended:
                 return 1, ENDED_BY_EVENT
             if code not in (OK, PAUSE, ENDED, FULL):
-                return -1, setup.failure(code, driver.run, driver.schedule.clock)
+                return -1, failure(code, driver.run, driver.schedule.clock)
             if is_check_due(driver.step) or driver.suspects:
                 self._look()
             if code == FULL:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ..core import setup
 from ..core.inputs import filled
+from ..core.states import as_derivative
 from ..core.steppers import check_halves
 
 __all__ = ["FORMS", "INTERPRETED"]
@@ -29,7 +30,7 @@ def _interpreted_value(fun: Callable[..., Any], extra: tuple, y0: np.ndarray, na
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
         f = fun(t, y.copy(), *extra)
         known = type(f) is np.ndarray and f.shape == shape and f.dtype == dtype
-        out[:] = f if known else setup.as_derivative(f, n, dtype, t, name)
+        out[:] = f if known else as_derivative(f, n, dtype, t, name)
 
     return rhs
 
@@ -52,33 +53,24 @@ def _interpreted_in_place(
     return rhs
 
 
-def _interpreted_acceleration(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
-    return _second_order(_interpreted_value(fun, extra, _positions(y0), "acceleration"))
-
-
-def _interpreted_acceleration_in_place(fun: Callable[..., Any], extra: tuple, y0: np.ndarray) -> Callable[..., None]:
-    return _second_order(_interpreted_in_place(fun, extra, _positions(y0), "acceleration"))
-
-
-def _positions(y0: np.ndarray) -> np.ndarray:
+def _second_order(
+    interpreted: Callable[..., Callable[..., None]], fun: Callable[..., Any], extra: tuple, y0: np.ndarray
+) -> Callable[..., None]:
+    """Return the right-hand side of (q, v) from its acceleration."""
     check_halves(y0.size)
-    return y0[: y0.size // 2]
-
-
-def _second_order(acc: Callable[..., None]) -> Callable[..., None]:
-    """The right-hand side of (q, v) from its acceleration."""
+    half = y0.size // 2
+    acc = interpreted(fun, extra, y0[:half], "acceleration")
 
     def rhs(t: float, y: np.ndarray, out: np.ndarray, params: np.ndarray) -> None:
-        half = y.size // 2
         out[:half] = y[half:]
         acc(t, y[:half], out[half:], params)
 
     return rhs
 
 
-INTERPRETED = {
+INTERPRETED: dict[str, Callable[..., Callable[..., None]]] = {
     "value": _interpreted_value,
     "in place": _interpreted_in_place,
-    "acceleration": _interpreted_acceleration,
-    "acceleration in place": _interpreted_acceleration_in_place,
+    "acceleration": partial(_second_order, _interpreted_value),
+    "acceleration in place": partial(_second_order, _interpreted_in_place),
 }

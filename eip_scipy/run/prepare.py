@@ -4,28 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ..core import setup, solvers, steppers
-from ..core.acceleration import BY_NAME, AccelerationField, named_accelerations
+from ..core.acceleration import BY_NAME, AccelerationField
 from ..core.arguments import Packed, are_same, extra_arguments, floats, names, scalars
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import as_invariants, with_args
 from ..core.jitted import NotCompilableError
-from ..core.multistep import SecondOrder, attach_history, times
+from ..core.multistep import times
 from ..core.native_functions import native_functions, with_events, with_jacobian
 from ..core.options import ProjectionOptions
 from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 from ..core.problem import Problem, made
 from ..core.results import Diagnostics
-from ..core.setup import Counted, Run, Start
-from ..core.solvers import EIPSolver, eip_method
-from ..core.stepping import ATOL, AnyMethod, StepOptions, Stepping, interval
+from ..core.run_spec import RunSpec
+from ..core.runs import Counted, Run
+from ..core.solvers import EIPSolver, class_named, eip_method
+from ..core.states import as_derivative, initial_state
+from ..core.stepping import ATOL, StepOptions, Stepping, interval
 from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
 from .driver import check_memory, saved_rows
@@ -146,12 +146,6 @@ class System:
         """Name of the argument of `integrate` that the function came as."""
         return "acceleration" if self.form.startswith("acceleration") else "fun"
 
-    def derivative(self, t: float, y: np.ndarray) -> np.ndarray:
-        """The derivative as a new array."""
-        out = np.empty_like(y)
-        self.rhs(t, y, out, self.parameters)
-        return out
-
     @property
     def left_out(self) -> str:
         """What NaN in its value may come from, besides NaN."""
@@ -159,15 +153,22 @@ class System:
             return "a C function leaves NaN where it fills nothing, or returns a status above 0"
         return "with in_place=True it must fill all of out" if "in place" in self.form else ""
 
-    def first(self, calls: Counted, t0: float, y0: np.ndarray) -> np.ndarray:
-        """The derivative at the start, where a function that takes other arguments is told."""
+    def derivative(self, t: float, y: np.ndarray) -> np.ndarray:
+        """The derivative as a new array; a function that takes other arguments is refused."""
+        out = np.empty_like(y)
         try:
-            return calls(t0, y0)
+            self.rhs(t, y, out, self.parameters)
         except TypeError:
-            out = ("out",) if "in place" in self.form else ()
+            third = ("out",) if "in place" in self.form else ()
             state, called = ("y", CALLED) if self.name == "fun" else ("q", CALLED_ACCELERATION)
-            require_arguments(self.fun, ("t", state, *out, *names(self.extra)), *called)
+            require_arguments(self.fun, ("t", state, *third, *names(self.extra)), *called)
             raise
+        return out
+
+    def product(self) -> Callable[..., np.ndarray] | None:
+        """Return the Jacobian as a function that returns its product with a vector; it is compiled here."""
+        self.jacobian = made(self.jacobian)
+        return None if self.jacobian is None else times(self.jacobian, *self.extra)
 
     def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
         """The functions of the loop, and which of them Python calls and why (None: none)."""
@@ -233,7 +234,7 @@ class System:
         size = n // 2 if second_order else n
 
         def convert(f: Any, t: float) -> np.ndarray:
-            return np.array(setup.as_derivative(f, size, dtype, t, self.name), dtype, order="C")
+            return np.array(as_derivative(f, size, dtype, t, self.name), dtype, order="C")
 
         rhs = call(self.fun, self.extra, (size,), convert, in_place=in_place)
         jacobian = None
@@ -251,10 +252,7 @@ class Prepared:
 
     asked: Request
     request: Request
-    method: AnyMethod
     system: System
-    stepping: Stepping
-    start: Start
     schedule: Schedule
     run: Run
     diagnostics: Diagnostics
@@ -290,11 +288,11 @@ class Prepared:
 
     def identity(self, y0: Any, params: Any) -> dict[str, Any]:
         """All that decides the bits of a run from y0, but for the functions, under the names that users give."""
-        return settings(self.label, self.stepping, y0, params, self.run, self.schedule, self.system.events)
+        return settings(self.label, y0, params, self.run, self.schedule, self.system.events)
 
 
 def prepared(request: Request, *, check_start: bool = True) -> Prepared:
-    """A run as it is asked for, all that was given checked; `check_start`: see `setup.prepare`."""
+    """A run as it is asked for, all that was given checked; `check_start`: see `RunSpec.build`."""
     request = _plain(request)
     refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
     if request.method is None:
@@ -302,39 +300,44 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     method = _method(request.method)
     _check_choices(request)
     asked, request = request, request.with_pointers()
-    frequencies = request.fun.frequencies if isinstance(request.fun, Problem) else None
     acc = request.fun.acc if method.of_second_order and isinstance(request.fun, Problem) else None
     request, form = _with_problem(request)
     system = System(request, form, acc)
     t0, t_bound = _span(request, system.events)
     y0 = _state(request.y0)
-    name = request.method.__name__
-    stepping = request.steps.checked(name, method, t0, t_bound, y0.size, stacklevel=4)
-    projection = ProjectionOptions(**request.projection)
+    stepping = request.steps.checked(request.method.__name__, method, t0, t_bound, y0.size, stacklevel=4)
     system.bind(y0)
     calls = Counted(system.derivative)
-    given_as_fun = method.of_second_order and not isinstance(asked.fun, Problem) and system.name == "fun"
-    in_place = "in place" in form
-    with named_accelerations(name, system.fun, in_place, system.extra, t0, y0) if given_as_fun else nullcontext():
-        f0 = system.first(calls, t0, y0)
-        method = steppers.checked(method, calls, Start(t0, y0, f0, 0.0), name, partial(_second_order_hint, asked.fun))
-    start = Start(t0, y0, f0, stepping.first(calls, y0, f0, method))
-    schedule = _schedule(stepping.span, start.tau, request, system.events)
-    run = setup.prepare(method, calls, start, projection, stepping, extra=system.extra, check_start=check_start)
-    run.left_out, run.called = system.left_out, system.name
-    if method.has_history:
-        system.jacobian = made(system.jacobian)
-        moved = None if system.jacobian is None else times(system.jacobian, *system.extra)
-        seen = SecondOrder(calls, start, moved, None if frequencies is None else frequencies(y0, t_bound - t0))
-        attach_history(run, name, seen, stepping, level=False)
+    run = _spec(asked.fun, request, system, calls, stepping).build(y0, check_start=check_start)
+    schedule = _schedule(stepping.span, run.start.tau, request, system.events)
     check_memory(saved_rows(schedule), run, request.max_bytes)
     record = Diagnostics() if request.diagnostics is None else request.diagnostics
-    setup.attach(record, run)
+    run.attach(record)
     system.events.fill(t0, run.y0, schedule.g)
-    run.work.K[0] = f0 if run.y0 is y0 else calls(t0, run.y0)
-    system.events.leave(t0, run.y0, run.work.K[0], start.tau * schedule.span.sign, schedule.g)
+    run.work.K[0] = run.start.f
+    system.events.leave(t0, run.y0, run.work.K[0], run.start.tau * schedule.span.sign, schedule.g)
     run.work.counters[NFEV] = calls.count
-    return Prepared(asked, request, method, system, stepping, start, schedule, run, record)
+    return Prepared(asked, request, system, schedule, run, record)
+
+
+def _spec(given: Any, request: Request, system: System, calls: Counted, stepping: Stepping) -> RunSpec:
+    """Return what the run is made from; `given` is the function or the problem as it was given."""
+    problem = given if isinstance(given, Problem) else None
+    return RunSpec(
+        name=request.method.__name__,
+        method=request.method.TABLEAU,
+        rhs=calls,
+        stepping=stepping,
+        projection=ProjectionOptions(**request.projection),
+        extra=system.extra,
+        fun=system.fun if problem is None and system.name == "fun" else None,
+        in_place="in place" in system.form,
+        jacobian=system.product,
+        frequencies=None if problem is None else problem.frequencies,
+        hint=partial(_second_order_hint, given),
+        called=system.name,
+        left_out=system.left_out,
+    )
 
 
 def default_method(fun: Any) -> type[EIPSolver] | None:
@@ -380,8 +383,8 @@ def _method(method: Any) -> Any:
 
 def _class_of(method: Any) -> str:
     """A hint of the class, where its name came, or SciPy's for the same."""
-    name = f"EIP{str(getattr(method, '__name__', method)).upper().removeprefix('EIP')}"
-    return f". Give the class: from eip_scipy import {name}" if name in solvers.__all__ else ""
+    name = class_named(method)
+    return "" if name is None else f". Give the class: from eip_scipy import {name}"
 
 
 def _check_choices(request: Request) -> None:
@@ -467,7 +470,7 @@ def _required(name: str, value: Any) -> Any:
 
 
 def _state(y0: Any) -> np.ndarray:
-    start = setup.initial_state(_required("y0", y0))
+    start = initial_state(_required("y0", y0))
     if start.size == 0:
         raise ValueError("y0 is empty; integrate needs a state of at least one component.")
     return start

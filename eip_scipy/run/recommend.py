@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, TypedDict, Unpack
 
-from ..core import setup
 from ..core.acceleration import AccelerationField
 from ..core.inputs import flag, is_number, refuse_units, shown
 from ..core.invariants import as_invariants
@@ -15,6 +14,7 @@ from ..core.names import nearest
 from ..core.options import Blocks, Frame, Metric
 from ..core.pointers import PointerFunction, by_pointer
 from ..core.problem import Problem, bind
+from ..core.states import initial_state
 from ..core.stepping import interval
 from .recommendation import Recommendation
 from .search import Search
@@ -158,7 +158,7 @@ def _problem(
     t0, t_end = interval(problem.t_span)
     if not math.isfinite(t_end) or t_end == t0:
         raise ValueError(f"recommend needs an interval of finite length, got t_span={shown(problem.t_span)}.")
-    problem = replace(problem, t_span=(t0, t_end), y0=setup.initial_state(problem.y0))
+    problem = replace(problem, t_span=(t0, t_end), y0=initial_state(problem.y0))
     if invariants is not None:
         common["invariants"] = as_invariants(invariants)
     return problem, common

@@ -8,17 +8,17 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .. import checkpoint
 from ..checkpoint import CheckpointError
-from ..checkpoint.own_file import OwnFile, unlocked
-from ..core.inputs import is_number, shown
-from ..core.setup import Run
-from ..core.stepping import Stepping
+from ..checkpoint.locks import Lock
+from ..core.callers import users_level
+from ..core.inputs import is_number, refuse_units, shown
+from ..core.runs import Run
 from ..engine.data import NEXT_LENGTH, TIME
 from ..methods.multistep import Weights
 from .events import Events
@@ -72,7 +72,7 @@ class Keeper:
 
 
 @contextmanager
-def keeping(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
+def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Keeper]:
     """The keeper for the options ``checkpoint``, ``checkpoint_every`` and ``resume`` of `integrate`.
 
     Raises
@@ -86,6 +86,7 @@ def keeping(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
     """
     if not isinstance(resume, (bool, np.bool_)):
         raise ValueError(f"resume must be True or False, got {resume!r}.")
+    refuse_units(checkpoint_every=every)
     if not is_number(every) or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
     if path is None:
@@ -95,24 +96,24 @@ def keeping(path: Any, every: Any, resume: Any) -> Iterator[Keeper]:
         return
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"checkpoint must be the path of a file, got {path!r}.")
-    with OwnFile(path) as file:
-        if file.problem:
-            warnings.warn(unlocked(file.name, file.problem), RuntimeWarning, stacklevel=4)
+    if dense_output:
+        raise ValueError("a checkpoint does not keep what dense_output=True needs; give t_eval or save_every instead.")
+    with closing(Lock(path)) as lock:
         found, origin = None, ""
-        if file.exists():
+        if os.path.lexists(lock.path):
             if not resume:
-                raise file.existing("run")
-            found = file.read(KIND)
+                raise checkpoint.existing(lock.name, "run")
+            found = checkpoint.read(lock.name, KIND)
         elif resume:
             origin = "no checkpoint was there: started at the beginning"
-        yield _FileKeeper(file, float(every), found, origin)
+        yield _FileKeeper(lock.name, float(every), found, origin)
 
 
 def settings(
-    method: str, stepping: Stepping, y0: np.ndarray, params: np.ndarray, run: Run, schedule: Any, events: Events
+    method: str, y0: np.ndarray, params: np.ndarray, run: Run, schedule: Any, events: Events
 ) -> dict[str, Any]:
     """All that decides the bits of a run, but for the functions, under the names that users give."""
-    span = stepping.span
+    span = run.stepping.span
     # A one-step method of the user's own is known by its name and orders, as functions are by what they give.
     if run.tableau.in_python:
         parts = [run.tableau.order, run.tableau.error_estimator_order]
@@ -122,8 +123,8 @@ def settings(
     found = {
         "method": f"{method} {_digest(parts)[:8]}",
         "t_span": (span.t0, span.t_bound),
-        "h": stepping.h,
-        "first_step": stepping.first_step,
+        "h": run.stepping.h,
+        "first_step": run.stepping.first_step,
         "max_step": span.max_step,
         "y0": y0,
         "params": params,
@@ -175,13 +176,9 @@ class _FileKeeper(Keeper):
     keeps = True
 
     def __init__(
-        self,
-        file: OwnFile,
-        every: float,
-        found: tuple[dict[str, Any], dict[str, np.ndarray]] | None,
-        origin: str,
+        self, name: str, every: float, found: tuple[dict[str, Any], dict[str, np.ndarray]] | None, origin: str
     ) -> None:
-        self._file, self._every, self._read = file, every, found
+        self._name, self._every, self._read = name, every, found
         self._origin = origin
         self._failure = ""
         self._ended: Any = None
@@ -200,14 +197,14 @@ class _FileKeeper(Keeper):
         if self._read is None:
             return
         header, arrays = self._read
-        checkpoint.require_same(self._file.name, header.get("settings"), settings)
+        checkpoint.require_same(self._name, header.get("settings"), settings)
         self._require_same_functions(run, arrays, self._start, t0, y0, "at the start")
         self._require_fitting(arrays, {"y": y0, "clock": np.zeros(NEXT_LENGTH + 1)})
         if "state_f" in arrays:
             t, y = float(arrays["clock"][TIME]), arrays["y"]
             here = self._known_by(run, t, y)
             self._require_same_functions(run, arrays, here, t, y, f"at t = {t:.10g}, where it stands,")
-        checkpoint.warn_of_other_versions(self._file.name, header, stacklevel=4)
+        checkpoint.warn_of_other_versions(self._name, header, stacklevel=users_level())
 
     def _known_by(self, run: Run, t: float, y: np.ndarray) -> dict[str, np.ndarray]:
         """What the functions are known by at a state of the run."""
@@ -232,7 +229,7 @@ class _FileKeeper(Keeper):
         if not same.all():
             k = int(np.flatnonzero(~same)[0])
             raise CheckpointError(
-                f"the checkpoint {self._file.name!r} belongs to another run: {labels[k]} was {there[k]:.12g} {where} "
+                f"the checkpoint {self._name!r} belongs to another run: {labels[k]} was {there[k]:.12g} {where} "
                 f"and is {here[k]:.12g} now. Resume with the functions of that run, or name another file to start anew."
             )
 
@@ -242,7 +239,7 @@ class _FileKeeper(Keeper):
             if found is None or (found.dtype, found.shape) != (a.dtype, a.shape):
                 what = "is missing" if found is None else f"is {found.dtype} {found.shape}"
                 raise CheckpointError(
-                    f"{self._file.name!r} is no checkpoint of this run: {name} {what}, expected {a.dtype} {a.shape}."
+                    f"{self._name!r} is no checkpoint of this run: {name} {what}, expected {a.dtype} {a.shape}."
                 )
 
     def begin(self, driver: Any, events: Events) -> None:
@@ -265,7 +262,7 @@ class _FileKeeper(Keeper):
         step, rows, pending = (int(k) for k in arrays["place"])
         if step < 0 or rows < 0 or pending != 0 or not is_number(header.get("wall_time")):
             where = f"it stands at step {step}, row {rows}"
-            raise CheckpointError(f"{self._file.name!r} is no checkpoint of this run: {where}.")
+            raise CheckpointError(f"{self._name!r} is no checkpoint of this run: {where}.")
         n, dtype = driver.run.y0.size, driver.run.y0.dtype
         expected = {"saved_t": np.broadcast_to(0.0, rows), "saved_y": np.broadcast_to(dtype.type(0), (rows, n))}
         for k in range(len(events.functions)):
@@ -286,21 +283,21 @@ class _FileKeeper(Keeper):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        return tuple(note for note in (self._origin, self._file.moved, self._failure) if note)
+        return tuple(note for note in (self._origin, self._failure) if note)
 
     def keep(self) -> None:
         now = time.perf_counter()
         if now >= min(self._due, self._next_snapshot):
             self._take_snapshot()
         if now >= self._due:
-            self._write_or_warn(None, "running", stacklevel=7)
+            self._write_or_warn(None, "running")
 
     def end(self, status: int, message: str) -> None:
         if status == 0:
             self._take_snapshot()
         step = int(self._snapshot.arrays["place"][STEP])
         if self._ended != (status, message, step):  # else the file says so already
-            self._write_or_warn(status, message, stacklevel=5)
+            self._write_or_warn(status, message)
 
     def interrupted(self, error: BaseException) -> None:
         try:
@@ -309,12 +306,8 @@ class _FileKeeper(Keeper):
             error.add_note(str(failure))
         except KeyboardInterrupt:
             error.add_note("interrupted again while the checkpoint was written")
-        again = "resume=True"
-        if self._file.moved:
-            error.add_note(self._file.moved)
-            again = f"checkpoint={self._file.name!r}, {again}"
         error.add_note(
-            f"the checkpoint {self._file.name!r} holds {self._written}: the same call with {again} goes on from there"
+            f"the checkpoint {self._name!r} holds {self._written}: the same call with resume=True goes on from there"
         )
 
     def _state(self) -> dict[str, np.ndarray]:
@@ -336,20 +329,18 @@ class _FileKeeper(Keeper):
         arrays = self._snapshot.arrays
         return f"step {arrays['place'][STEP]}, t = {arrays['clock'][TIME]:.10g}"
 
-    def _write_or_warn(self, status: int | None, message: str, *, stacklevel: int) -> None:
-        """Write; a disk that is full is no reason to end a long run, but one to speak."""
-        self._failure, name = "", self._file.name
+    def _write_or_warn(self, status: int | None, message: str) -> None:
+        """Write; a disk that is full is a warning, and the run continues."""
+        self._failure = ""
         try:
             self._write(status, message)
-            if self._file.name != name:
-                warnings.warn(f"{self._file.moved}.", RuntimeWarning, stacklevel=stacklevel)
         except CheckpointError as error:
             self._due = time.perf_counter() + self._every
             self._failure = f"{error}; it still holds {self._written}"
             then = (
                 f"The run goes on and tries again in {self._every:g} s." if status is None else "The result is whole."
             )
-            warnings.warn(f"{self._failure}. {then}", RuntimeWarning, stacklevel=stacklevel)
+            warnings.warn(f"{self._failure}. {then}", RuntimeWarning, stacklevel=users_level())
 
     def _write(self, status: int | None, message: str) -> None:
         driver, events, snapshot = self._driver, self._events, self._snapshot
@@ -374,7 +365,7 @@ class _FileKeeper(Keeper):
         for k, count in enumerate(snapshot.happened):
             arrays[f"event_{k}_t"] = np.array(events.t[k][:count])
             arrays[f"event_{k}_y"] = np.array(events.y[k][:count], y0.dtype).reshape(count, y0.size)
-        self._file.write(header, arrays)
+        checkpoint.write(self._name, header, arrays)
         end = time.perf_counter()
         self._due = end + max(self._every, LEAST_RATIO * (end - begin))
         self._written = self._where()

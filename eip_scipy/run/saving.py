@@ -36,7 +36,7 @@ def save(result: Any, path: str | os.PathLike[str]) -> None:
         too, except functions: ``sol``, and the run's own. Trajectories in the Zarr group of an ensemble stay there.
     path : path-like
         Taken as it is; a file that is there is replaced in one step, once the new one is whole. The file is an npz
-        archive, which `numpy.load` opens too, with ``header.json`` for all that is no array, and a SHA-256.
+        archive, which `numpy.load` opens too, with ``header.json`` for all that is not an array.
 
     Raises
     ------

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.problem import Problem
 from ..core.results import ProjectionWarning
-from ..core.setup import Counted
+from ..core.runs import Counted
 from ..core.solvers import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12
 from ..core.steppers import depends_on_velocity
 from .integrate import integrate
@@ -338,7 +338,7 @@ def _asked_of_the_field(request: Request) -> tuple[bool | None, bool]:
     """
     ready = prepared(request)
     _, why_not = ready.system.functions(ready.run, None)
-    calls, start = Counted(ready.system.derivative), ready.start
+    calls, start = Counted(ready.system.derivative), ready.run.start
     with np.errstate(all="ignore"):
         try:
             velocities = depends_on_velocity(calls, start, "")

@@ -16,8 +16,8 @@ from ..core.inputs import shown
 from ..core.invariants import as_invariants, with_args
 from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.results import Diagnostics
-from ..core.setup import initial_state
-from ..core.solvers import EIPDOP853, EIPRK23, EIPRK45, EIPSolver, SolverClass, eip_method
+from ..core.solvers import EIPDOP853, EIPRK23, EIPRK45, EIPSolver, SolverClass, class_named, eip_method
+from ..core.states import initial_state
 
 if TYPE_CHECKING:
     Result = dict[str, Any]
@@ -177,9 +177,7 @@ def solve_ivp(
     kept = as_invariants(options.pop("invariants", ()))
     if kept:
         options["invariants"] = kept
-    function = _right_hand_side(fun, acceleration)
-    if t_span is None or y0 is None:
-        raise TypeError(f"solve_ivp: {'t_span' if t_span is None else 'y0'} is missing.")
+    function = _right_hand_side(fun, acceleration, t_span, y0)
     common = {"t_eval": t_eval, "dense_output": dense_output, "events": events, "vectorized": vectorized, "args": args}
     method = _with_projection(method, [name for name in options if name in OWN])
     if not (isinstance(method, type) and issubclass(method, EIPSolver)):
@@ -205,7 +203,7 @@ def solve_ivp(
     return OdeResult(sol, message=message, trusted=bool(sol.success) and record.trusted, diagnostics=record)
 
 
-def _right_hand_side(fun: Any, acceleration: Any) -> Any:
+def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:
     """Return the function that is given, or the right-hand side of an acceleration."""
     name, given = ("fun", fun) if acceleration is None else ("acceleration", acceleration)
     if acceleration is not None and fun is not None:
@@ -215,12 +213,14 @@ def _right_hand_side(fun: Any, acceleration: Any) -> Any:
     if not callable(given):
         hint = "; a Problem is solved by problem.solve_ivp(method=...)" if hasattr(given, "solve_ivp") else ""
         raise TypeError(f"solve_ivp: {name} must be callable, got {shown(given)}{hint}.")
+    if t_span is None or y0 is None:
+        raise TypeError(f"solve_ivp: {'t_span' if t_span is None else 'y0'} is missing.")
     return fun if acceleration is None else AccelerationField(acceleration)
 
 
 def _with_projection(method: Any, given: list[str]) -> Any:
     """Return the EIP method on a method of SciPy if options of EIP methods are given; otherwise the method itself."""
-    if isinstance(method, str) and method.upper().removeprefix("EIP") != method.upper():
+    if isinstance(method, str) and method.upper() == class_named(method):
         raise ValueError(f"solve_ivp: {method!r} is a name; give the class, as in `from eip_scipy import {method}`.")
     is_class = isinstance(method, type) and issubclass(method, OdeSolver)
     if not given or not (is_class or method in EXPLICIT or method in IMPLICIT):

@@ -8,7 +8,6 @@ from scipy.integrate import solve_ivp
 from systems import SQUARE, oscillator
 
 from eip_scipy import EIPRK4, EIPRK45, Invariant, check_gradient, ensemble, integrate, problems, project
-from eip_scipy.core.diagnostics import drift_slope, invariants_along, observed_order
 from eip_scipy.problems import ForceConstants, Grid, GrossPitaevskii, Problem, nbody
 from eip_scipy_studies.comparators import stormer_verlet
 
@@ -102,10 +101,6 @@ def problem(**options):
     return Problem(**{"name": "mine", "fun": oscillator, "y0": np.array(Y0), "t_span": (0, 1), **options})
 
 
-def along(**options):
-    return invariants_along(**{"invariants": SQUARE, "t": [0.0], "y": np.ones((2, 1)), **options})
-
-
 def verlet(**options):
     arguments = {"t_span": (0, 1), "y0": Y0, "h": 0.1, **options}
     return stormer_verlet(lambda t, q, *p: -q, **arguments)
@@ -128,12 +123,6 @@ ARGUMENTS = [
     *((invariant, name, value) for name, value in (("target", 1.0), ("scale", 1.0))),
     *((by_nbody, name, value) for name, value in (*BODIES.items(), ("t_span", (0.0, 1.0)), ("h", 0.1))),
     *((problem, name, value) for name, value in (("y0", Y0), ("t_span", (0.0, 1.0)), ("h", 0.1), ("params", Y0))),
-    *((along, name, value) for name, value in (("t", [0.0]), ("y", np.ones((2, 1))), ("params", [1.0]))),
-    *(
-        (lambda **o: drift_slope(**{"t": [0, 1, 2], "defects": [0, 1, 2], **o}), n, [0.0, 1, 2])
-        for n in ("t", "defects")
-    ),
-    *((lambda **o: observed_order(**{"errors": [1, 2], "steps": [1, 2], **o}), n, Y0) for n in ("errors", "steps")),
     *((lambda **o: check_gradient(SQUARE, **{"t": 0.0, "y": Y0, **o}), n, v) for n, v in (("t", 0.0), ("y", Y0))),
     *((verlet, name, value) for name, value in (("t_span", (0.0, 1.0)), ("y0", Y0), ("h", 0.1), ("params", [1.0]))),
     *((problems.kepler, name, 0.5) for name in ("eccentricity", "relativistic", "t_end", "h")),

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from numba import njit
+from orders import observed_order
 from scipy.integrate import solve_ivp
 from systems import (
     H_USES_F,
@@ -22,7 +23,6 @@ from systems import (
 )
 
 from eip_scipy import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, EIPRK23, EIPRK45, Invariant, eip_method, integrate
-from eip_scipy.core.diagnostics import observed_order
 from eip_scipy.problems import solar_system
 
 EPS = np.finfo(float).eps

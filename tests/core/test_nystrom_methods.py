@@ -6,11 +6,11 @@ import mpmath
 import numba
 import numpy as np
 import pytest
+from orders import observed_order
 from scipy.integrate import solve_ivp
 from systems import energy, jit_energy, jit_energy_gradient, jit_momentum, jit_momentum_gradient
 
 from eip_scipy import EIPRKN8, EIPRKN12, Diagnostics, Invariant, eip_method, integrate
-from eip_scipy.core.diagnostics import observed_order
 from eip_scipy.methods import NystromTableau
 from eip_scipy.problems import solar_system
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from orders import observed_order
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK4, Diagnostics, Invariant, eip_method, integrate
-from eip_scipy.core.diagnostics import observed_order
 from eip_scipy.methods import Tableau
 from eip_scipy.problems import kepler
 from eip_scipy.solvers import OneStepMethod

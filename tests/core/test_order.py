@@ -4,10 +4,10 @@ import mpmath
 import numpy as np
 import pytest
 from mpmath_tables import Kepler
+from orders import observed_order
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, integrate
-from eip_scipy.core.diagnostics import observed_order
 from eip_scipy.problems import kepler
 
 PROBLEM = kepler()

@@ -566,7 +566,7 @@ def test_spacing_by_itself_is_its_rule(h, metric):
     seen, evaluated = [], set()
 
     class Recorder(EIPRK4):
-        """What is known of each step before the errors are added to those of earlier steps."""
+        """A solver that keeps the error of each step before it is added to those of earlier steps."""
 
         def _step_impl(self):
             self._shows = False  # copies on the manifold evaluate the invariant in each step

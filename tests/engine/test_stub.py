@@ -1,4 +1,4 @@
-"""What type checkers know of the engine is what it has."""
+"""The stub that type checkers read describes the engine as it is."""
 
 import runpy
 from pathlib import Path

@@ -706,7 +706,7 @@ def test_another_machine_is_a_warning(where, tmp_path, monkeypatch):
 def test_what_is_no_store(where, tmp_path):
     place = tmp_path / "other"
     place.write_text("something") if where == "checkpoint" else place.mkdir()
-    with pytest.raises(CheckpointError, match=r"is no (ensemble|file) of eip_scipy"):
+    with pytest.raises(CheckpointError, match=r"is no ensemble of eip_scipy|not a checkpoint of eip_scipy"):
         stored(resume=True, **{where: place})
 
 
@@ -867,14 +867,14 @@ def test_checkpoints_in_time(tmp_path):
 
 def test_a_full_disk_is_a_warning(tmp_path, monkeypatch):
     """The result is there all the same, and so is the former file."""
-    path, write = tmp_path / "kept", checkpoint.put
+    path, write = tmp_path / "kept", checkpoint.write
 
     def full(*arguments):
         if path.exists():
             raise CheckpointError("cannot write the checkpoint: no space left on device")
         write(*arguments)
 
-    monkeypatch.setattr(checkpoint, "put", full)
+    monkeypatch.setattr(checkpoint, "write", full)
     with pytest.warns(RuntimeWarning, match="no space left on device; the former checkpoint stays"):
         same(stored(), stored(checkpoint=path))
     assert checkpoint.read(path, "ensemble")[0]["finished"] == 0

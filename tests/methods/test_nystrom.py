@@ -308,7 +308,7 @@ def test_a_step_uses_all_weights(tableau, driver):
 
 @pytest.mark.parametrize("tableau", METHODS[:2], ids=name)
 def test_small_methods_have_their_order(tableau):
-    """Of the pendulum, against twice as many steps."""
+    """The errors of the pendulum are taken against twice as many steps."""
 
     def end(n):
         options = {"method": eip_method(tableau), "h": 2.0 / n}

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from orders import observed_order
 from scipy.linalg import expm
 
 from eip_scipy import EIPDOP853, eip_method, integrate
-from eip_scipy.core.diagnostics import observed_order
 from eip_scipy.problems import Grid, GrossPitaevskii, Splitting, harmonic_trap, soliton
 from eip_scipy.problems.gross_pitaevskii import RKN6, S6, STRANG, LinearFlow, Scheme, at_rest, rotated
 from eip_scipy.problems.gross_pitaevskii.pointwise import local_flow

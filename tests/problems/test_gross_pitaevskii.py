@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from orders import observed_order
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK4, EIPRK45, Diagnostics, ProjectionWarning, integrate
-from eip_scipy.core.diagnostics import observed_order
 from eip_scipy.core.invariants import check_gradient
 from eip_scipy.problems import (
     Grid,

@@ -4,9 +4,9 @@ import pickle
 
 import numpy as np
 import pytest
+from orders import observed_order
 
 from eip_scipy import EIPDOP853, EIPRKN12, Invariant, ProjectionWarning, check_gradient, eip_method, integrate
-from eip_scipy.core.diagnostics import observed_order
 from eip_scipy.methods.runge_kutta import DOP853, RK3, RK4, RK45
 from eip_scipy.problems import (
     Grid,

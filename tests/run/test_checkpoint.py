@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import hashlib
 import io
 import json
 import os
@@ -467,21 +466,21 @@ def test_a_problem(tmp_path, monkeypatch):
 
 def times_written(monkeypatch, path, every, seconds=0.0, **options):
     """How often a run of 200 chunks of 10 ms of a clock of its own writes, each in so many seconds."""
-    now, written, advance, write = [0.0], [], longrun.Driver.advance, checkpoint.put
+    now, written, advance, write = [0.0], [], longrun.Driver.advance, checkpoint.write
 
     def tick(driver, k_end):
         now[0] += 0.01
         return advance(driver, min(k_end, driver.step + 1))
 
-    def note(path, header, arrays, place):
+    def note(path, header, arrays):
         now[0] += seconds
         written.append((now[0], header["step"], header["status"]))
-        write(path, header, arrays, place)
+        write(path, header, arrays)
 
     with monkeypatch.context() as patch:
         patch.setattr(longrun.Driver, "advance", tick)
         patch.setattr(resume.time, "perf_counter", lambda: now[0])
-        patch.setattr(checkpoint, "put", note)
+        patch.setattr(checkpoint, "write", note)
         integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=every, **FIXED | options)
     return written
 
@@ -540,7 +539,7 @@ def test_a_file_that_is_there_is_not_replaced(tmp_path):
         path.write_bytes(content)
         with pytest.raises(CheckpointError, match=r"exists\. resume=True goes on .* delete this one"):
             integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED)
-        with pytest.raises(CheckpointError, match="is no file of eip_scipy"):
+        with pytest.raises(CheckpointError, match="is damaged, or not a checkpoint of eip_scipy"):
             integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
         assert path.read_bytes() == content
 
@@ -769,7 +768,8 @@ def test_header_and_arrays(tmp_path):
     checkpoint.write(path, {"kind": "test", "a": [1, 2.5, None], "b": "ü"}, arrays)
     header, found = checkpoint.read(path, "test")
     assert (header["kind"], header["a"], header["b"]) == ("test", [1, 2.5, None], "ü")
-    assert header["schema"] == 3
+    assert header["schema"] == 4
+    assert header["arrays"] == list(arrays)
     assert header["versions"]["numpy"] == np.__version__
     assert list(found) == list(arrays)
     with np.load(path, allow_pickle=False) as plain:
@@ -779,9 +779,6 @@ def test_header_and_arrays(tmp_path):
             assert found[name].tobytes() == plain[name].tobytes() == a.tobytes()
     with zipfile.ZipFile(path) as archive:
         assert json.loads(archive.read("header.json")) == header
-    # Seal: SHA-256 of the file with zeros in its place.
-    raw = path.read_bytes()
-    assert raw[-64:].decode() == hashlib.sha256(raw[:-64] + b"0" * 64).hexdigest()
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.npz"]
 
 
@@ -830,35 +827,48 @@ def test_only_plain_json_and_numbers(tmp_path):
 # Damage.
 
 
-def sealed(raw):
-    """The bytes of a file with a digest that fits."""
-    return raw[:-64] + hashlib.sha256(raw[:-64] + b"0" * 64).hexdigest().encode()
-
-
 def small_file(path):
     checkpoint.write(path, {"kind": "test"}, {"x": np.arange(3.0), "n": np.array([7, 8], np.int32)})
     return path.read_bytes()
 
 
-def test_each_changed_byte_is_seen(tmp_path):
+def outcome(path):
+    """Return what is read, or that the file is refused by the one kind of error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            header, arrays = checkpoint.read(path)
+        except CheckpointError:
+            return "refused"
+    assert all(a.nbytes < 10**4 for a in arrays.values())
+    return header, {name: (a.dtype, a.tolist()) for name, a in arrays.items()}
+
+
+def test_no_changed_byte_changes_what_is_read(tmp_path):
+    """Some bytes are in no checksum, dates for instance; whatever they are, header and arrays are those written."""
     path = tmp_path / "a"
     raw = small_file(path)
+    known, refused = outcome(path), 0
     for k in range(len(raw)):
-        damaged = bytearray(raw)
-        damaged[k] ^= 1 << k % 8
-        path.write_bytes(damaged)
-        with pytest.raises(CheckpointError, match=r"is damaged|is truncated|is no file"):
-            checkpoint.read(path)
+        for bits in (1 << k % 8, 255):
+            path.write_bytes(raw[:k] + bytes([raw[k] ^ bits]) + raw[k + 1 :])
+            found = outcome(path)
+            refused += found == "refused"
+            assert found in (known, "refused")
+    assert refused > 1.5 * len(raw)
 
 
 def test_a_run_does_not_go_on_from_a_damaged_file(old_run, tmp_path):
     path, raw = tmp_path / "run", old_run[1].read_bytes()
-    for k in np.random.default_rng(1).integers(len(raw), size=40):
-        for damaged in (raw[:k], raw[:k] + bytes([raw[k] ^ 4]) + raw[k + 1 :]):
-            path.write_bytes(damaged)
-            with pytest.raises(CheckpointError, match=r"run' is (damaged|truncated|no checkpoint)"):
-                integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
-            assert path.read_bytes() == damaged
+    data = raw.index(b"header.json") + 11, raw.index(b"PK\x01\x02")  # before the directory of the archive
+    for k in np.random.default_rng(1).integers(*data, size=40):
+        path.write_bytes(raw[:k])
+        with pytest.raises(CheckpointError, match=r"run' is damaged, or not a checkpoint of eip_scipy: .* Go back to"):
+            integrate(orbit, SPAN, Y0, checkpoint=path, resume=True, **FIXED)
+        assert path.read_bytes() == raw[:k]
+        path.write_bytes(raw[:k] + bytes([raw[k] ^ 4]) + raw[k + 1 :])
+        known = outcome(old_run[1])
+        assert outcome(path) in (known, "refused")
 
 
 def test_each_truncation_is_seen(tmp_path):
@@ -866,66 +876,33 @@ def test_each_truncation_is_seen(tmp_path):
     raw = small_file(path)
     for k in range(len(raw)):
         path.write_bytes(raw[:k])
-        with pytest.raises(CheckpointError, match=r"is truncated|is no file|is damaged"):
+        with pytest.raises(CheckpointError, match="is damaged, or not a checkpoint"):
             checkpoint.read(path)
-    path.write_bytes(raw + b"\n")
-    with pytest.raises(CheckpointError, match="is truncated"):
-        checkpoint.read(path)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_each_changed_byte_below_a_digest_that_fits(tmp_path):
-    """Files made to look sound: what comes out is a header and arrays, or one kind of error; nothing is allocated."""
-    path = tmp_path / "a"
-    raw = small_file(path)
-    outcomes = set()
-    for k in range(len(raw) - 64):
-        for value in (raw[k] ^ 1, raw[k] ^ 255):
-            changed = bytearray(raw)
-            changed[k] = value
-            path.write_bytes(sealed(bytes(changed)))
-            outcomes.add(outcome(path))
-    assert outcomes == {"read", "refused"}
-
-
-def outcome(path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            header, arrays = checkpoint.read(path)
-        except CheckpointError:
-            return "refused"
-    assert isinstance(header, dict)
-    assert all(isinstance(a, np.ndarray) and a.nbytes < 10**4 for a in arrays.values())
-    return "read"
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_mutations(data, tmp_path):
-    """Pieces cut out, doubled, overwritten, moved."""
+    """Pieces cut out, doubled, overwritten, moved: a file is refused, or what is read is what was written."""
     path = tmp_path / "a"
     raw = small_file(path)
+    known = outcome(path)
     for _ in range(data.draw(st.integers(1, 4))):
         i, j = sorted(data.draw(st.tuples(*[st.integers(0, len(raw))] * 2)))
         new = data.draw(st.one_of(st.binary(max_size=40), st.just(raw[i:j] * 2), st.just(b"\xff" * (j - i))))
         raw = raw[:i] + new + raw[j:]
     path.write_bytes(raw)
-    assert outcome(path) == ("read" if raw == small_file(tmp_path / "b") else "refused")
-    if len(raw) > 64:
-        path.write_bytes(sealed(raw))
-        outcome(path)
+    assert outcome(path) in (known, "refused")
 
 
 def forged(path, name, member, header=None):
-    """A sealed file with one member of given bytes beside the header."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        archive.comment = checkpoint.MARK + b"0" * 64
-        archive.writestr("header.json", json.dumps({"format": "eip_scipy checkpoint", "schema": 3, **(header or {})}))
+    """A file with one member of given bytes beside the header."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(
+            "header.json",
+            json.dumps({"format": "eip_scipy checkpoint", "schema": 4, "arrays": [name[:-4]], **(header or {})}),
+        )
         archive.writestr(name, member)
-    path.write_bytes(sealed(stream.getvalue()))
 
 
 def npy_bytes(descr, shape, data, fortran=False):
@@ -950,7 +927,7 @@ def test_nothing_is_unpickled(tmp_path, monkeypatch):
     with pytest.raises(CheckpointError, match=r"x\.npy holds object"):
         checkpoint.read(path)
     forged(path, "x.pkl", data)
-    with pytest.raises(CheckpointError, match="is no checkpoint"):
+    with pytest.raises(CheckpointError, match="not a checkpoint"):
         checkpoint.read(path)
     assert not Path("exploded").exists()
 
@@ -959,20 +936,20 @@ def test_nothing_is_unpickled(tmp_path, monkeypatch):
 def test_declared_sizes_are_checked_before_they_are_allocated(shape, tmp_path):
     path = tmp_path / "a"
     forged(path, "x.npy", npy_bytes("<f8", shape, bytes(8)))
-    with pytest.raises(CheckpointError, match=r"x\.npy (declares|holds)|no checkpoint"):
+    with pytest.raises(CheckpointError, match=r"x\.npy (declares|holds)|not a checkpoint"):
         checkpoint.read(path)
 
 
 def test_foreign_archives(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, x=np.arange(3))
-    with pytest.raises(CheckpointError, match="is truncated or no checkpoint of eip_scipy"):
+    with pytest.raises(CheckpointError, match=r"not a checkpoint of eip_scipy: its members are \['x\.npy'\]"):
         checkpoint.read(path)
-    forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"schema": 4})
-    with pytest.raises(CheckpointError, match="has schema 4, expected 3; resume with the version of eip_scipy"):
+    forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"schema": 5})
+    with pytest.raises(CheckpointError, match="has schema 5, expected 4; resume with the version of eip_scipy"):
         checkpoint.read(path)
     forged(path, "x.npy", npy_bytes("<f8", (1, 1), bytes(8), fortran=True))
-    with pytest.raises(CheckpointError, match="no checkpoint"):
+    with pytest.raises(CheckpointError, match="not a checkpoint"):
         checkpoint.read(path)
     forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"format": "another"})
     with pytest.raises(CheckpointError, match="its header is another"):
@@ -983,10 +960,11 @@ def test_foreign_archives(tmp_path):
     with pytest.raises(CheckpointError, match=r"x\.npy has another format"):
         checkpoint.read(path)
     # Members of the same bytes: 40 arrays of 1 kB in a file of a few.
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        archive.comment = checkpoint.MARK + b"0" * 64
-        archive.writestr("header.json", json.dumps({"format": "eip_scipy checkpoint", "schema": 3}))
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(
+            "header.json",
+            json.dumps({"format": "eip_scipy checkpoint", "schema": 4, "arrays": [f"x{k}" for k in range(40)]}),
+        )
         archive.writestr("x0.npy", npy_bytes("<f8", (128,), bytes(1024)))
         first = archive.filelist[-1]
         for k in range(1, 40):
@@ -994,14 +972,10 @@ def test_foreign_archives(tmp_path):
             for name in ("CRC", "compress_size", "file_size", "header_offset"):
                 setattr(twin, name, getattr(first, name))
             archive.filelist.append(twin)
-    path.write_bytes(sealed(stream.getvalue()))
     with pytest.raises(CheckpointError, match="its members claim more bytes than it has"):
         checkpoint.read(path)
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.comment = checkpoint.MARK + b"0" * 64
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("header.json", bytes(10**7))
-    path.write_bytes(sealed(stream.getvalue()))
     with pytest.raises(CheckpointError, match="compressed"):
         checkpoint.read(path)
 
@@ -1069,38 +1043,18 @@ def test_a_full_disk_at_the_last_moment(name, tmp_path, monkeypatch):
     assert [entry.name for entry in tmp_path.iterdir()] == ["a"]
 
 
-def test_folders_that_cannot_be_synced(tmp_path, monkeypatch):
-    """Some network file systems know no fsync of a folder; other failures of it are told."""
-    path, fsync = tmp_path / "a", os.fsync
-    for number, fails in ((errno.EINVAL, False), (errno.EIO, True)):
-        calls = []
-
-        def second_fails(descriptor, number=number, calls=calls):
-            calls.append(descriptor)
-            if len(calls) == 2:
-                raise OSError(number, os.strerror(number))
-            fsync(descriptor)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(os, "fsync", second_fails)
-            with pytest.raises(CheckpointError) if fails else contextlib.nullcontext():
-                checkpoint.write(path, {"kind": "test"}, {})
-        assert len(calls) == 2
-        assert checkpoint.read(path)[0]["kind"] == "test"
-
-
 @pytest.mark.usefixtures("fine")
 def test_a_run_goes_on_while_the_disk_is_full(tmp_path, monkeypatch):
     whole, path = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run"
-    write, calls = checkpoint.put, []
+    write, calls = checkpoint.write, []
 
-    def full_for_a_while(path, header, arrays, place):
+    def full_for_a_while(path, header, arrays):
         calls.append(header["step"])
         if 6 <= len(calls) <= 8:
             raise CheckpointError("cannot write the checkpoint: no space left on device")
-        write(path, header, arrays, place)
+        write(path, header, arrays)
 
-    monkeypatch.setattr(checkpoint, "put", full_for_a_while)
+    monkeypatch.setattr(checkpoint, "write", full_for_a_while)
     match = r"no space left on device; it still holds step 7, t = 0\.21\. The run goes on and tries again"
     with pytest.warns(RuntimeWarning, match=match) as record:
         found = integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=1e-9, **FIXED)
@@ -1164,14 +1118,14 @@ def test_interrupted_with_a_full_disk(reason, tmp_path, monkeypatch):
 @pytest.mark.usefixtures("fine")
 def test_interrupted_while_the_result_is_written(tmp_path, monkeypatch):
     """The run is done: all of it is in the partial result, and in the file after all."""
-    whole, path, write = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", checkpoint.put
+    whole, path, write = integrate(orbit, SPAN, Y0, **FIXED), tmp_path / "run", checkpoint.write
 
-    def interrupt_once(path, header, arrays, place):
+    def interrupt_once(path, header, arrays):
         if header["status"] == 0:
             raise KeyboardInterrupt
-        write(path, header, arrays, place)
+        write(path, header, arrays)
 
-    monkeypatch.setattr(checkpoint, "put", interrupt_once)
+    monkeypatch.setattr(checkpoint, "write", interrupt_once)
     with pytest.raises(KeyboardInterrupt) as info:
         integrate(orbit, SPAN, Y0, checkpoint=path, **FIXED)
     np.testing.assert_array_equal(info.value.partial.y, whole.y)

@@ -87,7 +87,7 @@ def test_axes_of_the_user(run):
 
 
 def test_a_result_of_the_typed_solve_ivp_is_drawn():
-    """It knows the corrections, and not the values of the invariants."""
+    """A record has the corrections, and not the values of the invariants."""
     kept = [Invariant(lambda t, y: y @ y, name="square"), Invariant(lambda t, y: np.array([y @ y, 2 * (y @ y)]))]
     for invariants in (kept[0], kept[1], ()):
         sol = solve_ivp(lambda t, y: [y[1], -y[0]], (0, 5), [1.0, 0.0], method=EIPRK4, h=0.1, invariants=invariants)

@@ -15,7 +15,7 @@ from eip_scipy_studies.timing import clocked, least, many_calls
 
 pytestmark = pytest.mark.needs_jit
 
-# By name: what each run of it is given, and the modules without which it only says how they are installed.
+# Each measurement with its arguments, and with the modules without which it only says how they are installed.
 HEYOKA, REBOUND, REBOUNDX = ("heyoka",), ("rebound",), ("heyoka", "rebound", "reboundx")
 RUNS = [
     ("bodies", "--periods 2 --bodies 10 --json run.json", REBOUND),

@@ -63,9 +63,10 @@ class Search:
     def _search(self, columns: list[int]) -> None:
         """Take in what is kept among some columns, and does not depend on what is there already."""
         null, numerical = self._null_space(columns), self._numerical_null_space(columns)
-        self._take(null, columns)
+        # The larger space first: a row alone of a smaller one is any combination of what spans the larger.
         if len(numerical) > len(null):
             self._take(numerical, columns)
+        self._take(null, columns)
 
     def _take(self, null: Array, columns: list[int]) -> None:
         """Take in of the rows of a null space those that are kept."""

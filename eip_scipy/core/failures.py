@@ -1,0 +1,74 @@
+"""Why a step or a projection failed, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.integrate import OdeSolver
+
+from ..engine.data import HAVE_NODES, LAST_RANK, LENGTH, NEWEST, NOT_FINITE, TIME, TIME_NEW, TOO_SMALL, UNSTABLE, Work
+from .invariants import InvariantSet
+from .runs import Run
+
+__all__ = ["failure", "projection_failure"]
+
+
+def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
+    """Which invariant a failed projection left worst, by how much, and the rank it had."""
+    excess = np.abs(work.defect) / np.maximum(work.band, np.finfo(float).tiny)
+    worst = int(np.argmax(np.where(np.isfinite(excess), excess, np.inf)))
+    broken = [name for name, row in zip(invariants.names, work.G, strict=True) if not np.isfinite(row).all()]
+    because = f"; the gradient of {broken[0]!r} is not finite there" if broken else ""
+    return (
+        f"projection failed at t={t:g}: invariant {invariants.names[worst]!r}, residual {work.defect[worst]:.3g}, "
+        f"rank {int(work.counters[LAST_RANK])} of {invariants.size}{because}"
+    )
+
+
+def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
+    """Why a step failed."""
+    if status == NOT_FINITE:
+        return _not_finite(run, clock[TIME], clock[LENGTH])
+    if status == TOO_SMALL:
+        return OdeSolver.TOO_SMALL_STEP
+    if status == UNSTABLE:
+        return _unstable(run)
+    return projection_failure(run.invariants, run.work, clock[TIME_NEW])
+
+
+def _unstable(run: Run) -> str:
+    """Where a multistep method's step does not do."""
+    history = run.method.multistep
+    assert history is not None  # whose code it is
+    t = history.t0 + int(history.place[NEWEST]) * history.h
+    return (
+        f"the step is too long, or the motion not smooth, at t={t:.10g}: differences of the accelerations of order "
+        f"{history.predict_q.size} are not small beside them, as they are where h={abs(history.h):g} is stable and "
+        "resolves the motion. Take a shorter step, or where bodies meet or forces jump a method of single steps such "
+        "as EIPRKN12"
+    )
+
+
+def _not_finite(run: Run, t: float, h: float) -> str:
+    """Why a step was not finite: the first stage that was not, overflow of the sum, or the error estimate."""
+    work, method = run.work, run.method
+    history = method.multistep
+    if history is not None and history.place[HAVE_NODES] and not np.isfinite(work.K[1]).all():
+        return _bad_value(run, work.K[1], history.t0 + (int(history.place[NEWEST]) + 1) * history.h)
+    for i in range(method.b.size):
+        if not np.isfinite(work.K[i]).all():
+            return _bad_value(run, work.K[i], t + method.c[i] * h)
+    if not np.isfinite(work.y_hat).all():
+        return f"the state is no longer finite at t={t + h:.10g}: it overflowed, or h is too large"
+    if not np.isfinite(work.K[-1]).all():
+        return _bad_value(run, work.K[-1], t + h)
+    return f"the error estimate is not finite at t={t + h:.10g}: it overflowed, or y and `atol` are 0 in a component"
+
+
+def _bad_value(run: Run, f: np.ndarray, t: float) -> str:
+    unset = np.flatnonzero(np.isnan(f))
+    hint = ""
+    if run.left_out and unset.size:
+        hint = f" (component {unset[0]} is NaN; {run.left_out})"
+    return f"{run.called} returned a non-finite value at t={t:.10g}{hint}"

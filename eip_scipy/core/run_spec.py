@@ -1,0 +1,192 @@
+"""From what is asked for to a run that is ready to step: the one way of solve_ivp, integrate, ensemble and project."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..engine.data import EPS, EUCLIDEAN, NEW, Work
+from ..engine.trust import Trust
+from ..methods.orders import AT_REST
+from . import steppers
+from .acceleration import named_accelerations
+from .blocks import kinds_of
+from .failures import projection_failure
+from .frame import spanned
+from .invariants import TARGET_TOLERANCE, InvariantSet
+from .multistep import SecondOrder, attach_history
+from .options import ProjectionOptions
+from .runs import Run, Start
+from .stepping import AnyMethod, Stepping
+
+__all__ = ["RunSpec"]
+
+START_ITERATIONS = 50
+FRAME_DISTANCE = 1e-4
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSpec:
+    """A run as it is asked for, in numbers and functions of (t, y), whichever interface it came by.
+
+    Attributes
+    ----------
+    name : str
+        Name of the solver class, for messages.
+    method : Tableau, NystromTableau, GaussJackson, OneStep or AtRest
+        With `is_known` it is the `tableau` of another run of these equations, and they are not examined again.
+    rhs : callable
+        ``rhs(t, y) -> (n,)``, checked; it returns new arrays.
+    stepping : Stepping
+    projection : ProjectionOptions
+    extra : tuple
+        Further arguments of the invariants' functions, ``(params,)`` or those of ``args``.
+    fun, in_place : callable, bool
+        The user's function, which may be an acceleration by mistake, or None, and how it is called.
+    jacobian : callable
+        Returns the Jacobian of a multistep method, see `SecondOrder`, or None.
+    frequencies : callable, optional
+        ``frequencies(y0, length)`` for an interval of that length, see `Problem`.
+    level : bool
+        Whether states of multistep methods are shown at the newest end of the history.
+    hint : callable
+        Returns the end of a message: what the caller can do if the equations are not of second order.
+    called, left_out : str
+        See `Run`.
+    """
+
+    name: str
+    method: AnyMethod
+    rhs: Callable[[float, Array], Array]
+    stepping: Stepping
+    projection: ProjectionOptions
+    is_known: bool = False
+    extra: tuple[Any, ...] = ()
+    fun: Any = None
+    in_place: bool = False
+    jacobian: Callable[[], Any] = lambda: None
+    frequencies: Callable[[Array, float], tuple[Array, float]] | None = None
+    level: bool = False
+    hint: Callable[[], str] = str
+    called: str = "fun"
+    left_out: str = ""
+
+    def build(self, y0: Array, f0: Array | None = None, tau: float | None = None, *, check_start: bool = True) -> Run:
+        """Return the run from a state on, after a check of the options, the functions and the invariants.
+
+        Parameters
+        ----------
+        y0 : ndarray, shape (n,)
+        f0 : ndarray, shape (n,), optional
+            The derivative there, evaluated if it is not given.
+        tau : float, optional
+            Length of the first step, by default that of `stepping`.
+        check_start : bool
+            False: the invariants have been checked, and their cost told, at the start of another run like this.
+        """
+        t0 = self.stepping.span.t0
+        method, f0 = self.examined(y0, f0)
+        tau = self.stepping.first(self.rhs, y0, f0, method) if tau is None else tau
+        run = self._with_buffers(method, Start(t0, y0, f0, tau), check_start)
+        if method is AT_REST:
+            return run  # its state need not be near the targets
+        self._check(run, check_start)
+        if method.has_history:
+            self.attach_history(run, run.start)
+        return run
+
+    def examined(self, y0: Array, f0: Array | None = None) -> tuple[AnyMethod, Array]:
+        """Return the method for these equations, and the derivative at the start."""
+        t0 = self.stepping.span.t0
+        guard: AbstractContextManager[None] = nullcontext()
+        if self.fun is not None and self.method.of_second_order:
+            guard = named_accelerations(self.name, self.fun, self.in_place, self.extra, t0, y0)
+        with guard:
+            f0 = self.rhs(t0, y0) if f0 is None else f0
+            if self.is_known:
+                return self.method, f0
+            return steppers.checked(self.method, self.rhs, Start(t0, y0, f0, 0.0), self.name, self.hint), f0
+
+    def attach_history(self, run: Run, start: Start) -> None:
+        """Give a run of a multistep method the history that it makes from a start on."""
+        span = self.stepping.span
+        frequencies = None if self.frequencies is None else self.frequencies(start.y, span.t_bound - span.t0)
+        seen = SecondOrder(self.rhs, start, self.jacobian(), frequencies)
+        attach_history(run, self.name, seen, self.stepping, level=self.level)
+
+    def _with_buffers(self, method: AnyMethod, start: Start, tell: bool) -> Run:
+        """Return a run whose invariants have been evaluated at the start; `tell`: see `InvariantSet`."""
+        t_bound, projection = self.stepping.span.t_bound, self.projection
+        invariants = InvariantSet(projection.invariants, *start, self.extra, tell=tell, t_bound=t_bound, rhs=self.rhs)
+        options, sigma, identity = projection.settled(method, self.stepping, start.y, invariants)
+        options = options._replace(kinds=kinds_of(options.groups, start.y, start.f))
+        invariants.kinds = options.kinds
+        arrays = steppers.arrays(method)
+        work = Work(start.y.size, start.y.dtype, arrays.b.size, invariants.size, options.groups.start.size - 1)
+        if sigma is not None:
+            work.sigma[:] = sigma
+        trust = Trust(invariants.names, work.trust)
+        return Run(
+            start, start, self.stepping, method, arrays, options, work, invariants, identity, trust, self.called,
+            self.left_out,
+        )  # fmt: skip
+
+    def _check(self, run: Run, invariants_too: bool) -> None:
+        """Bring a run to its targets where that is asked for, and refuse a start that misses them."""
+        run.options = run.options._replace(scales=_scales(run))
+        if self.projection.project_initial:
+            t0, y0, _, tau = run.begin
+            moved = projected_start(run, self.rhs)
+            run.moved = _moved(y0, moved, run.invariants.floors)
+            run.start = Start(t0, moved, self.rhs(t0, moved), tau)
+        violation = run.invariants.start_violation(*run.start[:3])
+        if violation:
+            raise ValueError(f"{violation}; mend y0 or the target, or pass project_initial=True to project y0 first.")
+        if run.options.watched and invariants_too and np.isfinite(run.start.f).all():
+            run.trust.doubts += run.invariants.check(*run.start)
+
+
+def _scales(run: Run) -> Array:
+    """Scales of the invariants' dead bands: endless ones for what is a function of the frame's C y.
+
+    Corrections do not touch these, and nothing but rounding is left of their gradients once the frame is taken out.
+    At two states, for a gradient may lie in the frame by chance.
+    """
+    (t0, y0, f0, tau), options, invariants = run.begin, run.options, run.invariants
+    if options.frame.products.size == 0:
+        return options.scales
+    away = FRAME_DISTANCE * (np.abs(y0) + tau * np.abs(f0)) * np.cos(np.arange(y0.size))
+    held = [spanned(options.frame, invariants.gradients(t0, y, f0).view(float)) for y in (y0, y0 + away)]
+    return np.where(np.all(held, axis=0), invariants.term_sizes(t0, y0, f0) / EPS, options.scales)
+
+
+def projected_start(run: Run, rhs: Callable[[float, Array], Array]) -> Array:
+    """The start on the targets, by full Newton steps in the euclidean metric."""
+    t0, y0, f0, _ = run.begin
+    options = run.options._replace(
+        metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False, watched=False, limit=np.inf
+    )
+    work = Work(y0.size, y0.dtype, 0, run.invariants.size, options.groups.start.size - 1)
+    work.K[-1] = f0
+    y, status = replace(run, options=options, work=work).projected(rhs, t0, y0)
+    if status != 0 or run.invariants.misses(t0, y, f0).any():
+        raise ValueError(projection_failure(run.invariants, work, t0))
+    return y
+
+
+def _moved(before: Array, after: Array, floors: Array) -> str:
+    """Return how far a start was moved, or nothing where that is no more than a target may be missed by."""
+    share = np.abs(after - before) / np.maximum(np.abs(before), floors)
+    count, k = int(np.count_nonzero(share > TARGET_TOLERANCE)), int(np.argmax(share)) if share.size else 0
+    if not count:
+        return ""
+    return (
+        f"project_initial moved {count} of {share.size} components of y0, most of all y0[{k}], from {before[k]:.6g} to "
+        f"{after[k]:.6g}"
+    )

@@ -1,0 +1,185 @@
+"""A run that is ready to step: its buffers and options, and how it is watched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..engine.data import ERROR, EXAMINED, NO_METHOD, NOTHING, REASON, Schedule, Work
+from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
+from ..engine.trust import Trust
+from .examination import Derivative, Examiner, is_check_due
+from .invariants import InvariantSet
+from .options import Options
+from .resolution import unresolved
+from .results import Diagnostics
+from .stepping import AnyMethod, Stepping
+
+__all__ = ["Counted", "Run", "Start"]
+
+
+class Start(NamedTuple):
+    """Where a run starts: time, state, derivative there, and the scale of time, which is the step or the first one."""
+
+    t: float
+    y: np.ndarray
+    f: np.ndarray
+    tau: float
+
+
+@dataclass
+class Run:
+    """A run as `RunSpec.build` makes it: all that a driver needs, apart from the user's functions.
+
+    Attributes
+    ----------
+    begin, start : Start
+        The start at which the invariants were measured, and the one of the first step, which `project_initial` may
+        have moved.
+    stepping : Stepping
+    tableau : Tableau, NystromTableau, GaussJackson, OneStep or AtRest
+        The method as it was given.
+    method : Method or OneStep
+        What the engine takes the steps by.
+    options : Options
+    work : Work
+    invariants : InvariantSet
+    identity : dict
+        See `Settled`.
+    trust : Trust
+    called : str
+        Name of the argument that gave the right-hand side.
+    left_out : str
+        What NaN in its value may come from.
+    looked : int
+        The step at which the invariants were checked last.
+    moved : str
+        How far `project_initial` has moved the start, or nothing.
+    """
+
+    begin: Start
+    start: Start
+    stepping: Stepping
+    tableau: AnyMethod
+    method: Any
+    options: Options
+    work: Work
+    invariants: InvariantSet
+    identity: dict[str, Any]
+    trust: Trust
+    called: str = "fun"
+    left_out: str = ""
+    looked: int = -1
+    moved: str = ""
+
+    @property
+    def y0(self) -> np.ndarray:
+        """Return the state from which the first step goes."""
+        return self.start.y
+
+    def engine(
+        self, functions: PythonFunctions | NativeFunctions, schedule: Schedule, *, begins: bool = True, **others: Any
+    ) -> Engine:
+        """Return the engine of the run, which `begins` where work.K[0] is the derivative, or is to go on.
+
+        `others` are further `Hooks`.
+        """
+        in_python = self.tableau.in_python
+        hooks = Hooks(
+            one_step=partial(self.method.fill, self.work) if in_python else None,
+            estimates=in_python and self.tableau.has_estimate,
+            joint=None if functions.native else self.options.joint,
+            **others,
+        )
+        engine, w = Engine(self.method, self.options, self.work, functions, schedule, _if_any(hooks)), self.work
+        if self.options.watched and begins:
+            t, f = schedule.span.t0, w.K[0]
+            w.values[:], w.G[:] = self.invariants.values(t, self.y0), self.invariants.gradients(t, self.y0, f)
+            engine.start(self.y0, f, self.start.tau)
+        return engine
+
+    def projected(self, rhs: Derivative, t: float, y: np.ndarray) -> tuple[np.ndarray, int]:
+        """Return a state projected, and the engine's code; work.K[-1] is to hold the derivative there.
+
+        `rhs` returns the derivative at the states of further Newton steps.
+        """
+        derivative = Call(rhs, (), y.shape, lambda value, t: np.array(value, y.dtype))
+        functions = PythonFunctions(derivative, *self.invariants.calls, (), second_order=False)
+        engine = Engine(NO_METHOD, self.options._replace(joint=None), self.work, functions)
+        self.work.y_hat[:], out = y, np.empty_like(y)
+        return out, engine.project(t, y, t, True, out)
+
+    def attach(self, diagnostics: Any) -> None:
+        """Let `diagnostics` read the run's buffers."""
+        if not isinstance(diagnostics, Diagnostics):
+            raise TypeError(f"diagnostics must be a Diagnostics() object, got {diagnostics!r}.")
+        w = self.work
+        diagnostics._attach(
+            w.max_defect,
+            w.defect,
+            w.max_correction,
+            w.counters,
+            self.trust,
+            estimated=self.options.metric == ERROR,
+            moved=self.moved,
+        )
+
+    @property
+    def shows(self) -> bool:
+        """Return whether states that are not projected are handed out as projected copies."""
+        return self.invariants.size > 0 and (self.options.every != 1 or self.tableau.has_history)
+
+    def look(self, steps: int, ended: bool, t: float, y: np.ndarray, rhs: Derivative) -> bool:
+        """Examine a run after `steps` steps, or where it has `ended`. Return whether it is to be reported now.
+
+        Steps that the engine suspects are examined. The invariants are checked after some numbers of steps and at the
+        end, and where the corrections are too large, to find the reason. `rhs` returns a new array.
+        """
+        if not self.options.watched or self.trust.failed:
+            return False  # a failure has its own message
+        suspect = self.work.suspect
+        if self.trust.doubts:
+            # One examination still has to tell how fast the invariants change, by which corrections are judged.
+            if suspect[REASON] != NOTHING and not self.work.trust[:, EXAMINED].any():
+                self.examiner.examine(suspect, rhs)
+            return self._is_doubtful(ended)
+        found = self.examiner.examine(suspect, rhs) if suspect[REASON] != NOTHING else None
+        due = ended or is_check_due(steps)
+        if found is None and ((due and steps != self.looked) or self._is_doubtful(ended)):
+            self.looked = steps
+            found = self.examiner.complaint(rhs, t, y)
+        self.trust.doubts += [found] if found else []
+        return self._is_doubtful(ended) or found is not None
+
+    def _is_doubtful(self, ended: bool) -> bool:
+        """Return whether the corrections contradict the run, or will do so at its end."""
+        return self.trust.beyond_doubt or (ended and bool(self.trust.sick.any()))
+
+    @cached_property
+    def examiner(self) -> Examiner:
+        """Return the examiner of the run's states."""
+        resolution = partial(unresolved, self.method, self.options.groups)
+        return Examiner(self.invariants, self.start.tau, self.work.trust, resolution)
+
+
+class Counted:
+    """A right-hand side that counts its calls and returns new arrays."""
+
+    __slots__ = ("_rhs", "count")
+
+    def __init__(self, rhs: Callable[[float, np.ndarray], np.ndarray]) -> None:
+        self._rhs = rhs
+        self.count = 0
+
+    def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
+        """Return the derivative."""
+        self.count += 1
+        return self._rhs(t, y).copy()
+
+
+def _if_any(hooks: Hooks) -> Hooks | None:
+    return hooks if hooks != Hooks() else None

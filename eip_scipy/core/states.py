@@ -1,0 +1,52 @@
+"""States and derivatives as a user gives them, taken as arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .inputs import reals, refuse_units, shown
+from .one_step import as_vector
+
+__all__ = ["as_derivative", "initial_state", "states"]
+
+
+def as_derivative(value: Any, n: int, dtype: np.dtype, t: float, name: str = "fun") -> np.ndarray:
+    """The value of a user's right-hand side at t as an array (n,), or an error; see `as_vector`."""
+    return as_vector(value, n, dtype, f"{name} returned", t)
+
+
+def initial_state(y0: Any, name: str = "y0") -> np.ndarray:
+    """y0 as a new float64 or complex128 array (n,), with SciPy's messages for what is no state."""
+    y = states(name, y0)
+    if y.ndim != 1:
+        raise ValueError(f"`{name}` must be 1-dimensional.")
+    if not np.isfinite(y).all():
+        raise ValueError(f"All components of the initial state `{name}` must be finite.")
+    return y
+
+
+def states(name: str, value: Any) -> np.ndarray:
+    """A state, or several, as a new float64 or complex128 array of any shape.
+
+    Raises
+    ------
+    TypeError
+        For what holds no numbers, or numbers with a unit.
+    ValueError
+        For masked values.
+    """
+    refuse_units(**{name: value})
+    if np.ma.isMaskedArray(value) and np.ma.is_masked(value):
+        raise ValueError(f"masked values in {name}; fill or drop them first.")
+    found = reals(value)
+    if found is not None:
+        return found
+    try:
+        y = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        raise ValueError(f"`{name}` must be an array of numbers, got {shown(value)}.") from None
+    if y.dtype.kind != "c":
+        raise TypeError(f"`{name}` must hold numbers, got {shown(value)}, dtype {y.dtype}.")
+    return np.array(y, dtype=complex, order="C")
