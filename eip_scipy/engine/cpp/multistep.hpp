@@ -68,13 +68,16 @@ inline void row_sums(const Rows &rows, double *out, int64_t first, int64_t end) 
     });
 }
 
-// out = scale (total + (rest + what the rows add)), to the rows' ends.
-inline void predict(const Rows &rows, double scale, const double *total, const double *rest, double *out) {
+// out = scale (total + (rest + what the rows add)), to the rows' ends. The scale h^2 is a pair of floats: its rounding would
+// move all bodies along their orbits, by -4 times its relative size.
+inline void predict(const Rows &rows, const Pair &scale, const double *total, const double *rest, double *out) {
     in_blocks(rows.stride, [&]<class Value, int COUNT>(int64_t i) {
         Value sums[COUNT];
         row_sums<Value, COUNT>(rows, i, sums);
-        for (int k = 0; k < COUNT; ++k, i += sizeof(Value) / sizeof(double))
-            store_as<Value>(scale * (load_as<Value>(total + i) + (load_as<Value>(rest + i) + sums[k])), out + i);
+        for (int k = 0; k < COUNT; ++k, i += sizeof(Value) / sizeof(double)) {
+            const Value sum = load_as<Value>(total + i) + (load_as<Value>(rest + i) + sums[k]);
+            store_as<Value>(fused(spread<Value>(scale.value), sum, scale.rest * sum), out + i);
+        }
     });
 }
 
@@ -274,8 +277,8 @@ inline Code add_node(const AnyRun &run) {
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] + 1) * ms.h;
     const double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
     double *y = ms.predicted, *older = y + 2 * ms.pitch;
-    predict(latest(ms, ms.predict_q, ms.order), ms.h * ms.h, S, S_rest, y);
-    if (ms.uses_v) predict(latest(ms, ms.predict_v, ms.order), ms.h, s, s_rest, y + ms.half);
+    predict(latest(ms, ms.predict_q, ms.order), two_product(ms.h, ms.h), S, S_rest, y);
+    if (ms.uses_v) predict(latest(ms, ms.predict_v, ms.order), {ms.h, 0.0}, s, s_rest, y + ms.half);
     if (ms.count > 0) row_sums(latest(ms, ms.correction, ms.order), older, ms.first, ms.first + ms.count);
     double *a = next_row(ms);
     run.system.acceleration(w, t, y, w.row(1), a);
