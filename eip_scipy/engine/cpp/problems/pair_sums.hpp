@@ -4,6 +4,7 @@
 // streams, each with its share of the sources, added at the end. The last block overlaps the one before it, so that no
 // lane reads past the arrays. Accelerations take every pair twice, once for each body: that costs less than sums across
 // lanes for the reactions, and keeps the momentum as well, for r_ij and 1/r_ij^3 are the same in both, bit for bit.
+// Sources are added from the last one to the first: where the first is a star, its pull is rounded once.
 //
 // The energy, in which large terms nearly cancel, is summed with the rounding errors carried along: what a projection
 // cannot see it cannot correct.
@@ -175,9 +176,9 @@ inline void accelerate_block(const double *q, const double *gm, int64_t n, int64
     Octet own[3], sums[3] = {0.0, 0.0, 0.0};
     load_targets<TARGETS>(q, first, own);
     const int64_t start = n % STREAMS;
-    if (start > 0) add_sources<TARGETS>(q, gm, own, 0, first, sums, STREAMS_BELOW<TARGETS>(start));
 #pragma GCC unroll 2
-    for (int64_t j = start; j < n; j += STREAMS) add_sources<TARGETS>(q, gm, own, j, first, sums, 1.0);
+    for (int64_t j = n - STREAMS; j >= start; j -= STREAMS) add_sources<TARGETS>(q, gm, own, j, first, sums, 1.0);
+    if (start > 0) add_sources<TARGETS>(q, gm, own, 0, first, sums, STREAMS_BELOW<TARGETS>(start));
     store_targets<TARGETS>(sums, out, first);
 }
 
@@ -185,43 +186,44 @@ inline void accelerate_block(const double *q, const double *gm, int64_t n, int64
 // The last two of 8 k + 2 bodies, by what the blocks of eight have of their pairs: r_ij changes its sign, 1/r_ij^3 is
 // the same. Sums in streams, in the order in which accelerate_block<2> adds them, and so the same bits.
 struct LastTwo {
-    Vector sums[2][3] = {}, w[2] = {}, d[2][3] = {};  // w and r_ij: of the sources behind those that were added last
+    Vector sums[2][3] = {}, w[2], d[2][3];  // w and r_ij: of the two sources before those that were added last
 
-    // Adds the reactions of eight sources to target t.
-    void take(int t, bool begin, const Octet &reaction, const Octet *distance) {
-        const auto across = [=](Vector before, Vector v) {
-            return begin ? __builtin_shufflevector(v, Vector{}, 0, 1, 4, 5)
-                         : __builtin_shufflevector(before, v, 2, 3, 4, 5);
-        };
-        const auto within = [](const Octet &v) { return __builtin_shufflevector(v.part[0], v.part[1], 2, 3, 4, 5); };
-        for (int c = 0; c < 3; ++c) {
-            const Vector pull = -across(w[t], reaction.part[0]);
-            const Vector first = fused(pull, across(d[t][c], distance[c].part[0]), sums[t][c]);
-            sums[t][c] = fused(-within(reaction), within(distance[c]), first);
-            d[t][c] = distance[c].part[1];
-        }
-        w[t] = reaction.part[1];
-    }
-
-    // Adds what is left, with the pull of the two on each other, and stores both accelerations.
-    void store(const double *q, const double *gm, int64_t first, double *out) const {
+    // Begins with the pull of the two on each other; a body's own is 0.
+    LastTwo(const double *q, const double *gm, int64_t first) {
         Octet between[3];
         for (int c = 0; c < 3; ++c) between[c] = q[3 * (first + 1) + c] - q[3 * first + c];
         const Cube cube(squares(between[0], between[1], between[2], 0.0));
-        Vector streams[6];
         for (int t = 0; t < 2; ++t) {
-            // A body's own pull is 0: in the third stream that of the first, in the fourth that of the second.
-            const auto behind = [=](Vector before, Vector v) {
-                const Vector all = __builtin_shufflevector(before, v, 2, 3, 4, 5);
-                return t == 0 ? __builtin_shufflevector(all, Vector{}, 0, 1, 4, 3)
-                              : __builtin_shufflevector(all, Vector{}, 0, 1, 2, 4);
+            const auto beside_own = [=](const Octet &v) {
+                return t == 0 ? __builtin_shufflevector(v.part[0], Vector{}, 4, 0, 4, 4)
+                              : __builtin_shufflevector(v.part[0], Vector{}, 0, 4, 4, 4);
             };
-            const Vector pull = behind(w[t], cube.times(gm[first + 1 - t]).part[0]);
-            for (int c = 0; c < 3; ++c) {
-                const Vector away = t == 0 ? -between[c].part[0] : between[c].part[0];
-                streams[3 * t + c] = fused(-pull, behind(d[t][c], away), sums[t][c]);
-            }
+            w[t] = beside_own(cube.times(gm[first + 1 - t]));
+            for (int c = 0; c < 3; ++c) d[t][c] = beside_own(t == 0 ? -between[c] : between[c]);
         }
+    }
+
+    // Adds the reactions of eight sources to target t, the last blocks first.
+    void take(int t, const Octet &reaction, const Octet *distance) {
+        const auto across = [](const Octet &v, Vector behind) {
+            return __builtin_shufflevector(v.part[1], behind, 2, 3, 4, 5);
+        };
+        const auto within = [](const Octet &v) { return __builtin_shufflevector(v.part[0], v.part[1], 2, 3, 4, 5); };
+        const Vector pull = across(reaction, w[t]);
+        for (int c = 0; c < 3; ++c) {
+            const Vector first = fused(-pull, across(distance[c], d[t][c]), sums[t][c]);
+            sums[t][c] = fused(-within(reaction), within(distance[c]), first);
+            d[t][c] = distance[c].part[0];
+        }
+        w[t] = reaction.part[0];
+    }
+
+    // Adds what is left, and stores both accelerations.
+    void store(int64_t first, double *out) const {
+        Vector streams[6];
+        const auto begin = [](Vector v) { return __builtin_shufflevector(v, Vector{}, 0, 1, 4, 5); };
+        for (int t = 0; t < 2; ++t)
+            for (int c = 0; c < 3; ++c) streams[3 * t + c] = fused(-begin(w[t]), begin(d[t][c]), sums[t][c]);
         // (s[0] + s[2]) + (s[1] + s[3]) of each; stored in vectors, as they are read.
         const auto halves = [&](int k) {
             const Vector u = streams[k], v = streams[k + 1];
@@ -239,17 +241,17 @@ struct LastTwo {
 inline void accelerate_block(const double *q, const double *gm, int64_t n, int64_t first, double *out, LastTwo &last) {
     Octet own[3], sums[3] = {0.0, 0.0, 0.0};
     load_targets<LANES>(q, first, own);
-#pragma GCC unroll 2
-    for (int64_t j = 0; j < n - 2; ++j) add_sources<LANES>(q, gm, own, j, first, sums, 1.0);
-    for (int t = 0; t < 2; ++t) {
+    for (int t = 1; t >= 0; --t) {
         Octet d[3], m;
         load_sources<LANES>(q, gm, n - 2 + t, d, m);
         for (int c = 0; c < 3; ++c) d[c] -= own[c];
         const Cube cube(squares(d[0], d[1], d[2], 0.0));
         const Octet w = cube.times(m);
         for (int c = 0; c < 3; ++c) sums[c] = multiply_add(w, d[c], sums[c]);
-        last.take(t, first == 0, cube.times(Octet::load(gm + first)), d);
+        last.take(t, cube.times(Octet::load(gm + first)), d);
     }
+#pragma GCC unroll 2
+    for (int64_t j = n - 3; j >= 0; --j) add_sources<LANES>(q, gm, own, j, first, sums, 1.0);
     store_targets<LANES>(sums, out, first);
 }
 #endif
@@ -259,9 +261,9 @@ template <class T>
 inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out) {
     using std::sqrt;
     for (int64_t i = 0; i < 3 * n; ++i) out[i] = 0.0;
-    for (int64_t i = 0; i < n; ++i) {
-        T ax = 0.0, ay = 0.0, az = 0.0;
-        for (int64_t j = i + 1; j < n; ++j) {
+    for (int64_t i = n - 1; i > 0; --i) {
+        T ax = out[3 * i], ay = out[3 * i + 1], az = out[3 * i + 2];
+        for (int64_t j = i - 1; j >= 0; --j) {
             const T dx = q[3 * j] - q[3 * i], dy = q[3 * j + 1] - q[3 * i + 1], dz = q[3 * j + 2] - q[3 * i + 2];
             const T r2 = dx * dx + dy * dy + dz * dz;
             const T w = 1.0 / (r2 * sqrt(r2));
@@ -273,9 +275,9 @@ inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out) {
             out[3 * j + 1] -= wj * dy;
             out[3 * j + 2] -= wj * dz;
         }
-        out[3 * i] += ax;
-        out[3 * i + 1] += ay;
-        out[3 * i + 2] += az;
+        out[3 * i] = ax;
+        out[3 * i + 1] = ay;
+        out[3 * i + 2] = az;
     }
 }
 
@@ -291,9 +293,9 @@ inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out) {
     const int64_t rest = n % 8;
 #if defined(__AVX__)
     if (rest == 2) {
-        LastTwo last;
-        for (int64_t first = 0; first < n - 2; first += 8) accelerate_block(q, gm, n, first, out, last);
-        return last.store(q, gm, n - 2, out);
+        LastTwo last(q, gm, n - 2);
+        for (int64_t first = n - 10; first >= 0; first -= 8) accelerate_block(q, gm, n, first, out, last);
+        return last.store(n - 2, out);
     }
 #endif
     for (int64_t k = 0; k < n / 8 + (rest > 4); ++k) accelerate_block<8>(q, gm, n, std::min(8 * k, n - 8), out);
@@ -341,8 +343,8 @@ inline void accelerate(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
     };
     std::fill(out, out + 3 * n, 0.0);
     std::fill(sums, sums + 3 * streams.count * (n - streams.first), 0.0);
-    for (int64_t i = 0; i < n; ++i)
-        for (int64_t j = i + 1; j < n; ++j) {
+    for (int64_t i = n - 1; i > 0; --i)
+        for (int64_t j = i - 1; j >= 0; --j) {
             Octet d[3];
             const Cube cube(difference(q, i, j, d));
             add_pull(cube.times(gm[j]), d, place(i, j));
