@@ -50,6 +50,7 @@ COMMANDS = {
     "view": Entry("view:View", "a page that plays a saved run"),
     "bench": Entry("bench.command:Bench", "this package beside SciPy, REBOUND, heyoka and others, on this machine"),
     "reproduce": Entry("paper.reproduce:Reproduce", "recompute the paper's tables and figures"),
+    "study balances": Entry("measurements.balances:Balances", "what balances bring, and where they do not help"),
     "study bodies": Entry("measurements.bodies:Bodies", "cost against the number of bodies, beside IAS15"),
     "study charged-particle": Entry(
         "measurements.charged_particle:ParticleCost", "speed of a step, and error against cost, for charged particles"
@@ -91,7 +92,9 @@ COMMANDS = {
     "study ring-grids": Entry("measurements.ring_grids:RingGrids", "the paper's ring on several grids"),
     "study scene-reference": Entry("measurements.references:SceneReference", "reference states of the hard scenes"),
     "study solar-cloud": Entry("measurements.solar_cloud:SolarCloud", "an ensemble of solar systems beside REBOUND"),
-    "study solar-reference": Entry("measurements.references:SolarReference", "reference states of the solar system"),
+    "study solar-reference": Entry(
+        "measurements.solar_reference:SolarReference", "states of the solar system in 80 bits"
+    ),
     "study speed": Entry("measurements.speed:Speed", "speed of the compiled step"),
     "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
     "study waves": Entry("measurements.waves:Waves", "errors against cost of waves beside SciPy's DOP853"),

@@ -57,7 +57,7 @@ def test_a_missing_peer_is_told_at_the_end(name, two_methods, tmp_path, capsys, 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--years", "3"], "--years must be one of 1, 10, 100, 1000, 2000, got 3"),
+        (["--years", "3"], "--years must be one of 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, got 3"),
         (["--years", "1", "--data", "paper"], "unrecognized arguments: --data paper"),
     ],
 )

@@ -152,7 +152,7 @@ def load(name: str = "de440", *, as_printed: bool = False) -> SolarSystemData:
 
 
 def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
-    """Accurate states of the Newtonian ten-body problem that starts from ``load("de440")``.
+    """Accurate states of the Newtonian ten-body problem ``solar_system("de440")``.
 
     Parameters
     ----------
@@ -162,8 +162,8 @@ def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
     Returns
     -------
     dict of float to ndarray, shape (60,)
-        Time since the epoch in Julian years (1, 10, 100, 1000, 2000) to the state (q of all bodies, v of all bodies)
-        in AU and AU/day, on the axes of ``load("de440")``.
+        Time since the epoch in Julian years (1, 2, 5, 10 and so on to 10 000) to the state (q of all bodies, v of all
+        bodies) in AU and AU/day, on the axes of ``load("de440")``.
 
     Raises
     ------
@@ -172,16 +172,20 @@ def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
 
     Notes
     -----
-    Integrated by heyoka (Taylor's method) in 80-bit arithmetic at a tolerance of 1e-24. With 1e-22 it agrees to
-    4e-13 AU at 1000 yr and 1.5e-12 AU at 2000 yr.
+    Integrated in 80-bit arithmetic by a summed multistep method of order 14, from the state of
+    ``solar_system("de440")`` in AU and Julian years (`eip-scipy study solar-reference`). After 10 000 years Mercury is
+    6e-12 AU and the others are 2e-13 AU from where another step has them. A start in other units is rounded in another
+    way, which puts Mercury 2e-11 AU off by then.
     """
     if name != "de440":
         known = available()
         raise ValueError(
             f"reference states exist for 'de440' only, got {name!r}" if name in known else _unknown(name, known)
         )
-    states = _read(_REFERENCE_JSON)["states"]
-    return {float(year): _state(np.array(rows, dtype=float)) for year, rows in states.items()}
+    states = {float(year): np.array(y, dtype=float) for year, y in _read(_REFERENCE_JSON)["states"].items()}
+    for y in states.values():
+        y[y.size // 2 :] /= YEAR_D
+    return states
 
 
 def gm_from_km3_s2(gm: Any) -> np.ndarray:

@@ -3,7 +3,7 @@
 1. Ten bodies, Newton, 1000 years: each run once in each of six rotations of the axes, in turns. Errors of position [AU]
    against the packaged reference state: Mercury's, the least and the largest over the rotations, and the largest of
    another planet. The ratios below the table are of least times.
-2. The same over 10 000 years (IAS15 once), against growth_reference.json.
+2. The same over 10 000 years (IAS15 once), against the packaged states.
 3. Kepler's problem with e = 0.6 and the relativistic term to t = 600, beside heyoka, which is compiled before.
 4. EIPRKN12 over 100 years with steps of 0.02 yr, with and without projection, in the same rotations.
 
@@ -23,12 +23,12 @@ from scipy.spatial.transform import Rotation
 
 from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRKN12, integrate
 from eip_scipy.problems import Problem, kepler, solar_system
+from eip_scipy.problems.gravity.solar_data import reference_states
 
 from ..report import needed, table
 from ..solar.cost import by_us, timed
 from ..study import Measurement, Session, option
 from ..work_precision import cost_to_reach
-from .growth import reference
 from .orbits import Methods, Row, by_rebound, daily, orbit_table, rows, yearly
 
 __all__ = ["Multistep"]
@@ -102,7 +102,7 @@ def ten_thousand_years(quick: bool) -> Table:
         }
         return found if turn else found | {"IAS15": (by_rebound(turned, "ias15"), [math.nan])}
 
-    return in_rotations(solar_system(years=years), reference(years)[years], methods, 1 if quick else ROTATIONS)
+    return in_rotations(solar_system(years=years), reference_states()[years], methods, 1 if quick else ROTATIONS)
 
 
 def with_projection(quick: bool) -> Table:

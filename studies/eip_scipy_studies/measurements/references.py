@@ -1,7 +1,7 @@
-"""``eip-scipy study particle-reference``, ``scene-reference`` and ``solar-reference``: states in extended precision.
+"""``eip-scipy study particle-reference`` and ``scene-reference``: states in extended precision.
 
 heyoka's Taylor series in 80 to 160 bits make the reference states that the library and the studies carry as data:
-``particle_references.json``, ``scene_references.json``, ``solar_reference.json`` and ``growth_reference.json``. Each
+``particle_references.json`` and ``scene_references.json``. Each
 command writes its states as a file in the folder of ``--out`` and prints how far they are from what is known otherwise.
 """
 
@@ -11,19 +11,17 @@ import json
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from eip_scipy.problems import ParticleProblem, Problem, comet, figure_eight, pythagorean, tokamak, uniform_field
-from eip_scipy.problems.gravity.solar_data import YEAR_D, SolarSystemData, load, reference_states
 from eip_scipy.problems.particles.charged_particle import ORBITS
 
-from ..report import UsageError, needed
+from ..report import needed
 from ..study import Figures, Session, Study, option
 
-__all__ = ["ParticleReference", "SceneReference", "SolarReference", "particle_equations"]
+__all__ = ["ParticleReference", "SceneReference", "particle_equations"]
 
 FLOAT = np.longdouble
 CHECK_BITS, POINTS = 113, 100
@@ -217,56 +215,4 @@ class SceneReference(Reference):
             "Final states (q of all bodies, v of all bodies) of the scenes in problems/scenes.py: heyoka "
             f"{heyoka.__version__}, Taylor, {self.bits}-bit arithmetic; made by `eip-scipy study scene-reference`."
         )
-        return Found(lines, about, stored)
-
-
-# The solar system in 80 bits, Newtonian, from the packaged "de440" data.
-
-
-def solar_states(data: SolarSystemData, years: Sequence[float], tolerance: float) -> list[np.ndarray]:
-    """Return states (6 N,) in AU and AU/day, all positions first, at times in ascending order."""
-    heyoka = _heyoka()
-    equations = heyoka.model.nbody(len(data.bodies), masses=list(data.gm.astype(FLOAT)), Gconst=FLOAT(1))
-    by_body = np.concatenate([data.position, data.velocity], axis=1).ravel().astype(FLOAT)
-    integrator = heyoka.taylor_adaptive(
-        equations, by_body, fp_type=FLOAT, tol=FLOAT(tolerance), high_accuracy=True, compact_mode=True
-    )
-    found = []
-    for t in years:
-        outcome = integrator.propagate_until(FLOAT(t) * FLOAT(YEAR_D))[0]
-        if outcome != heyoka.taylor_outcome.time_limit:
-            raise UsageError(f"heyoka stopped before {t:g} yr: {outcome}")
-        found.append(integrator.state.copy().reshape(-1, 2, 3).swapaxes(0, 1).ravel())
-    return found
-
-
-@dataclass(frozen=True, kw_only=True)
-class SolarReference(Reference):
-    """States of the ten bodies, and their difference from the packaged ones.
-
-    ``growth_reference.json`` comes from ``--years 1 2 5 10 20 50 100 200 500 1000 2000 5000 10000``.
-    """
-
-    file = "solar-reference.json"
-    years: Sequence[float] = option((1, 10, 100, 1000, 2000), "times in Julian years", type=float, nargs="+")
-    tolerance: float = option(1e-24, "tolerance of the Taylor series (%(default)s)", type=float)
-
-    def measure(self, session: Session) -> Found:
-        heyoka, years, known = _heyoka(), sorted(self.years), reference_states()
-        begin = perf_counter()
-        found = solar_states(load("de440"), years, self.tolerance)
-        lines = [f"heyoka {heyoka.__version__}, tolerance {self.tolerance:g}: {perf_counter() - begin:.1f} s"]
-        for t, state in zip(years, found, strict=True):
-            if t in known:
-                apart = difference(state[None], known[t].astype(FLOAT)[None])[0]
-                lines.append(f"{t:8g} yr: {apart:.1e} AU from the packaged state")
-        about = (
-            "Newtonian ten-body solar system from the data set de440: all positions [AU], then all velocities "
-            f"[AU/day], by time in Julian years; heyoka {heyoka.__version__}, 80 bits, tolerance {self.tolerance:g}; "
-            "made by `eip-scipy study solar-reference`."
-        )
-        stored = {
-            f"{t:g}": [np.format_float_scientific(x, precision=19) for x in y]
-            for t, y in zip(years, found, strict=True)
-        }
         return Found(lines, about, stored)

@@ -1,0 +1,204 @@
+"""``eip-scipy study solar-reference``: states of the solar system in 80 bits, which the library carries as data.
+
+Ten bodies under Newton's gravitation, from the state and the masses of `solar_system` in AU and Julian years, as the
+library's own runs have them. The method is the summed predictor of Gauss and Jackson of order 14, written here in
+NumPy's long double, with sums that carry their rounding. It evaluates at the predicted positions and corrects nothing.
+The truncation error of 2000 steps a year is below the rounding; a run with other steps shows what the rounding is.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import accumulate
+from math import comb
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eip_scipy.problems import Problem, solar_system
+
+from ..report import needed
+from ..study import Figures, Session, Study, option
+
+__all__ = ["SolarReference"]
+
+Array = np.ndarray
+FLOAT = np.longdouble
+ORDER = 14
+TERMS = 30  # of the Taylor series that makes the first states
+WINDOWS = 64  # lengths of the history that are kept before it moves to the first rows
+TIMES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000)
+
+
+class Gravity:
+    """Accelerations of N bodies and the Taylor series of their motion, in the arithmetic of the masses."""
+
+    def __init__(self, gm: Array) -> None:
+        self.first, self.second = np.triu_indices(gm.size, 1)
+        pairs = np.arange(self.first.size)
+        # Times w_p (q_j - q_i) of the pairs p = (i, j).
+        self.pulls = np.zeros((gm.size, pairs.size), gm.dtype)
+        self.pulls[self.first, pairs] = gm[self.second]
+        self.pulls[self.second, pairs] = -gm[self.first]
+
+    def __call__(self, q: Array) -> Array:
+        """Return the accelerations (N, 3)."""
+        d = q[self.second] - q[self.first]
+        r2 = (d * d).sum(axis=1)
+        return self.pulls @ (d / (r2 * np.sqrt(r2))[:, None])
+
+    def stepped(self, q: Array, v: Array, h: Any) -> tuple[Array, Array]:
+        """Return positions and velocities a time h later."""
+        qs, ds, r2, w = [q, v], [], [], []
+        for k in range(TERMS):
+            ds.append(qs[k][self.second] - qs[k][self.first])
+            r2.append(sum((ds[j] * ds[k - j]).sum(axis=1) for j in range(k + 1)))
+            # w = r2^(-3/2), from r2 w' = -3/2 r2' w.
+            if k == 0:
+                w.append(1 / (r2[0] * np.sqrt(r2[0])))
+            else:
+                parts = [(FLOAT(-3 * j) / 2 - (k - j)) * r2[j] * w[k - j] for j in range(1, k + 1)]
+                w.append(sum(parts) / (k * r2[0]))
+            terms = sum(w[j][:, None] * ds[k - j] for j in range(k + 1))
+            qs.append(self.pulls @ terms / ((k + 1) * (k + 2)))
+        position, velocity = np.zeros_like(q), np.zeros_like(q)
+        for k in range(TERMS + 1, 0, -1):
+            position, velocity = (position + qs[k]) * h, velocity * h + k * qs[k]
+        return q + position, velocity
+
+
+def inverse_powers(power: int, terms: int) -> list[Fraction]:
+    """Return the series of (-log(1 - x) / x)^-power."""
+    L = [Fraction(1, k + 1) for k in range(terms)]
+    series = [Fraction(1)] + [Fraction(0)] * (terms - 1)
+    for _ in range(power):
+        quotient: list[Fraction] = []
+        for k in range(terms):
+            quotient.append(series[k] - sum((L[k - j] * quotient[j] for j in range(k)), Fraction(0)))
+        series = quotient
+    return series
+
+
+def ordinates(series: Sequence[Fraction]) -> Array:
+    """Return weights of the nodes, the oldest first, for a sum over backward differences of the newest."""
+    n = len(series)
+    weights = [(-1) ** j * sum((series[k] * comb(k, j) for k in range(j, n)), Fraction(0)) for j in range(n)]
+    return np.array([FLOAT(w.numerator) / FLOAT(w.denominator) for w in reversed(weights)])
+
+
+def two_sum(a: Array, b: Array) -> tuple[Array, Array]:
+    """Return a + b and its rounding error (Knuth)."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)
+
+
+def states(problem: Problem, years: Sequence[float], steps: int) -> Iterator[Array]:
+    """Yield the states (6 N,) at times in ascending order, by `steps` steps a year."""
+    q, v = problem.y0.astype(FLOAT).reshape(2, -1, 3)
+    assert problem.params is not None
+    gravity, per_year = Gravity(problem.params.astype(FLOAT)), FLOAT(steps)
+    squares, one = inverse_powers(2, ORDER + 2), inverse_powers(1, ORDER + 1)
+    sums = list(accumulate(squares))  # one step ahead
+    ahead, of_q, of_v = (ordinates(series) for series in (sums[2:], squares[2:], one[1:]))
+    nodes = np.empty((WINDOWS * ORDER, q.size), FLOAT)
+    for k in range(ORDER):
+        q, v = gravity.stepped(q, v, 1 / per_year) if k else (q, v)
+        nodes[k] = gravity(q).ravel()
+    s, s_rest = two_sum(v.ravel() * per_year, -(of_v @ nodes[:ORDER]))
+    S, S_rest = two_sum(q.ravel() * per_year**2, s)
+    S_rest = S_rest + (s_rest - of_q @ nodes[:ORDER])
+    row = step = ORDER - 1
+    for year in years:
+        for _ in range(step, round(year * steps)):
+            window = nodes[row + 1 - ORDER : row + 1]
+            y = (S + (S_rest + ahead @ window)) / per_year**2
+            if row + 1 == len(nodes):
+                nodes[:ORDER], row = window.copy(), ORDER - 1
+            row += 1
+            nodes[row] = gravity(y.reshape(-1, 3)).ravel()
+            s, lost = two_sum(s, nodes[row])
+            s_rest = s_rest + lost
+            S, lost = two_sum(S, s)
+            S_rest = S_rest + (lost + s_rest)
+        step = round(year * steps)
+        window = nodes[row + 1 - ORDER : row + 1]
+        position = ((S - s) + ((S_rest - s_rest) + of_q @ window)) / per_year**2
+        yield np.concatenate([position, (s + (s_rest + of_v @ window)) / per_year])
+
+
+def by_taylor(problem: Problem, years: Sequence[float]) -> Iterator[Array]:
+    """Yield the states by heyoka in 80 bits."""
+    heyoka = needed("heyoka", '"eip_scipy[heyoka]"')
+    assert problem.params is not None
+    gm, start = problem.params.astype(FLOAT), problem.y0.astype(FLOAT).reshape(2, -1, 3)
+    equations = heyoka.model.nbody(gm.size, masses=list(gm), Gconst=FLOAT(1))
+    integrator = heyoka.taylor_adaptive(
+        equations, start.swapaxes(0, 1).ravel(), fp_type=FLOAT, tol=FLOAT(1e-22), high_accuracy=True, compact_mode=True
+    )
+    for year in years:
+        integrator.propagate_until(FLOAT(year))
+        yield integrator.state.copy().reshape(-1, 2, 3).swapaxes(0, 1).ravel()
+
+
+def apart(a: Array, b: Array) -> Array:
+    """Return the distance between both positions of each body."""
+    return np.linalg.norm((a - b)[: a.size // 2].astype(float).reshape(-1, 3), axis=1)
+
+
+class Found(NamedTuple):
+    """Times, the states, and how far other runs are from them, by what they are."""
+
+    years: list[float]
+    states: list[Array]
+    distances: dict[str, list[Array]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolarReference(Study[Found]):
+    """The command."""
+
+    years: Sequence[float] = option(TIMES, "times in Julian years", type=float, nargs="+")
+    steps: int = option(2000, "steps a year (%(default)s)", type=int)
+    others: int = option(1500, "steps a year of another run, for comparison (%(default)s)", type=int)
+    taylor: float = option(0.0, "compare with heyoka up to this time in years (%(default)g)", type=float)
+
+    def measure(self, session: Session) -> Found:
+        years, problem = sorted(self.years), solar_system()
+        with session.bar(2 * len(years), "80 bits") as bar:
+            rows, others = list[Array](), list[Array]()
+            for kept, steps in ((rows, self.steps), (others, self.others)):
+                for state in states(problem, years, steps):
+                    kept.append(state)
+                    bar.update()
+        distances = {f"{self.others} steps a year": list(map(apart, rows, others))}
+        if self.taylor:
+            early = [year for year in years if year <= self.taylor]
+            distances["heyoka, 80 bits"] = [apart(a, b) for a, b in zip(rows, by_taylor(problem, early), strict=False)]
+        return Found(years, rows, distances)
+
+    def text(self, found: Found) -> str:
+        lines = [f"distances [AU] from the states by {self.steps} steps a year: Mercury, and the largest of the others"]
+        for name, rows in found.distances.items():
+            lines += [
+                f"  {name:20} {year:8g} yr: {row[1]:.1e} {np.delete(row, 1).max():.1e}"
+                for year, row in zip(found.years, rows, strict=False)
+            ]
+        return "\n".join(lines)
+
+    def figures(self, found: Found) -> Figures:
+        """Give the file of the states: what is not a CSV file is written as figures are."""
+        about = (
+            "Newtonian ten-body solar system from the state of problems.solar_system() in AU and Julian years: all "
+            "positions [AU], then all velocities [AU/yr], by time in Julian years; Gauss-Jackson of order 14 in 80 "
+            f"bits, {self.steps} steps a year; made by `eip-scipy study solar-reference`"
+        )
+        rows = {
+            f"{year:g}": [np.format_float_scientific(x, precision=19) for x in row]
+            for year, row in zip(found.years, found.states, strict=True)
+        }
+        text = json.dumps({"about": about, "states": rows}, indent=1) + "\n"
+        yield "solar-reference.json", lambda path: path.write_text(text, encoding="utf-8")
