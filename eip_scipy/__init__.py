@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from . import problems as problems
     from . import results as results
     from . import solvers as solvers
+    from .core.balances import Balance
     from .core.config import show_config
     from .core.invariants import Invariant, check_gradient
     from .core.project import project
@@ -58,6 +59,7 @@ __all__ = [
     "EIPRK45",
     "EIPRKN8",
     "EIPRKN12",
+    "Balance",
     "Diagnostics",
     "Invariant",
     "ProjectionWarning",
@@ -76,6 +78,7 @@ __all__ = [
 ]
 
 _HOMES = {  # the module of each of these names, and the modules that are public themselves
+    "Balance": "core.balances",
     "Diagnostics": "core.results",
     "Invariant": "core.invariants",
     "ProjectionWarning": "core.results",

@@ -56,6 +56,7 @@ def run_of(parts: RunParts, invariants: InvariantSet, method: Any, *, joint: boo
         values["method"] = method
     if joint:
         values["options"] = values["options"]._replace(joint=invariants.items)
+    invariants.target = values["options"].target  # those of balances change
     trust = Trust(invariants.names, work.trust)
     trust.doubts, trust.failed = list(parts.doubts), parts.failed
     return Run(**values, tableau=method, work=work, invariants=invariants, trust=trust)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.integrate import DenseOutput, OdeSolution
 
 from ..engine.data import (
-    ERROR,
+    BY_ERROR,
     GIVEN,
     MOST_CROSSINGS,
     NEW,
@@ -39,7 +39,7 @@ class Interpolants:
     States between two projections are handed out as copies on the manifold. An interpolant is projected onto the
     invariants' levels between those of the step's two ends. The levels are linear between the defects of the two ends,
     which are 1e-15 to 1e-12 after a projection, and what the step left where it was not projected: the ends themselves
-    are met exactly.
+    are met exactly. To them is added what balances change by between the ends, by an interpolant of the same kind.
 
     Parameters
     ----------
@@ -128,6 +128,7 @@ def _record(run: Run, events: int) -> Dense:
     kind, rows, weights, A, c, own_slopes = form(run.tableau, brief)
     stages = run.method.b.size
     n, dtype, invariants = run.y0.size, run.y0.dtype, run.invariants.size
+    carried = run.invariants.balances.places.size
     options = run.options._replace(
         metric=GIVEN, direction=NEW, every=1, compensated=False, iterations=ITERATIONS, watched=False, limit=math.inf
     )
@@ -139,12 +140,12 @@ def _record(run: Run, events: int) -> Dense:
         c=c.copy(),
         own_slopes=own_slopes,
         shows=run.shows,
-        by_travel=invariants > 0 and run.options.metric == ERROR,
+        by_travel=invariants > 0 and run.options.metric == BY_ERROR,
         options=options._replace(target=np.zeros(invariants)),
-        work=Work(n, dtype, stages + c.size if c.size else 1, invariants, options.groups.start.size - 1),
+        work=Work(n, dtype, stages + c.size if c.size else 1, invariants, options.groups.start.size - 1, carried),
         missed=np.zeros(2),
         waiting=np.zeros(2, np.int64),
-        piece=np.zeros(3 + (3 + rows) * n * width + 2 * invariants),
+        piece=np.zeros(3 + (3 + rows) * n * width + 2 * invariants + (2 + rows) * carried),
         event=np.zeros(roots, np.int64),
         t=np.zeros(roots),
         y=np.zeros((roots, n), dtype),

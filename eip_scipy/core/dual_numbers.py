@@ -26,7 +26,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, overload, register_model
 from numba.np.arrayobj import populate_array
 
-__all__ = ["Dual", "seed", "slope", "stack_array"]
+__all__ = ["Dual", "directed", "seed", "slope", "stack_array"]
 
 PLAIN = types.Float | types.Integer
 
@@ -138,6 +138,18 @@ def seed(typingctx, kind, value, lane):
         return _pair(builder, args[1], builder.select(inside, one, ir.Constant(dual.vector, None)))
 
     return dual(kind, types.float64, types.int64), emit
+
+
+@intrinsic
+def directed(typingctx, kind, value, slope):
+    """The dual of one lane whose derivative is `slope`."""
+    dual = kind.instance_type
+
+    def emit(context, builder, sig, args):
+        vector = builder.insert_element(ir.Constant(dual.vector, None), args[2], _index(0))
+        return _pair(builder, args[1], vector)
+
+    return dual(kind, types.float64, types.float64), emit
 
 
 @intrinsic

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..engine.data import EPS
-from ..engine.trust import ROUNDING_OF_DIFFERENCES
+from ..engine.trust import ROUNDING_OF_DIFFERENCES, ProjectionWarning
 from .conditional import is_kept_on_a_surface, on_targets
 from .gradients import DIFFERENCE_WEIGHTS, random_directions
 
 if TYPE_CHECKING:
     from .invariants import InvariantSet
 
-__all__ = ["Complaint", "complaints", "listed", "rates_by_values"]
+__all__ = ["Complaint", "complaints", "listed", "rates_by_values", "time_derivative"]
 
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
@@ -25,6 +25,9 @@ Derivative = Callable[[float, Array], Array]
 CHECK_STEPS = (6e-6, 6e-8, 6e-10)
 CHECK_TOLERANCE, CHECK_NOISE = 1e-4, 6.0
 INVARIANCE_TOLERANCE = 1e-8
+# The same for the rate of a balance, whose error of 1e-3 is 1e-9 of the terms if the rate is 1e-6 of them; right ones
+# differ by 1e-16, those of gradients by differences by 1e-12.
+RATE_TOLERANCE, RATE_TOLERANCE_OF_DIFFERENCES = 1e-11, 1e-9
 # Single precision leaves this share of the terms of a rate.
 SINGLE_TOLERANCE = 1e-5
 # Components smaller than this share of the largest one are not looked at for single precision.
@@ -65,12 +68,15 @@ class Complaint(NamedTuple):
         What follows from it, or what to do about it.
     dependent : bool
         Whether it is about an invariant that is kept where others hold.
+    category : type
+        The class of the warning that a run begins with.
     """
 
     is_error: bool
     text: str
     advice: str = ""
     dependent: bool = False
+    category: type[Warning] = UserWarning
 
 
 class _Samples(NamedTuple):
@@ -263,7 +269,10 @@ def _wrong_gradient(known: InvariantSet, k: int, t: float, difference: float, al
 
 
 class _Rates(NamedTuple):
-    """Rates of change (l,), the sums of their terms, the part of them that is explicit in time, and which are wrong."""
+    """Rates of change (l,), the sums of their terms, the part of them that is explicit in time, and which are wrong.
+
+    From those of balances their own rates are subtracted, which leaves NaN where none is given.
+    """
 
     rate: Array
     terms: Array
@@ -288,6 +297,10 @@ def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> I
                 DOUBLE,
             )
         wrong = wrong & ~small
+    carried = wrong & known.balances.mask
+    if carried.any():
+        yield _wrong_rate_of_balance(known, at, found, carried)
+    wrong = wrong & ~carried
     if not wrong.any():
         return
     if rhs is not None and (moved := on_targets(known, at.t, at.y, at.span, rhs)) is not None:
@@ -319,6 +332,20 @@ def _complaints_of_rates(
             yield Complaint(False, text, advice, those is conditional)
 
 
+def _wrong_rate_of_balance(known: InvariantSet, at: _Samples, found: _Rates, wrong: Array) -> Complaint:
+    """Return one text for all balances whose given rates are wrong, the worst first."""
+    shares = np.where(wrong, np.abs(found.rate) / np.where(found.terms > 0, found.terms, 1.0), 0.0)
+    worst = int(np.argmax(shares))
+    others = [name for k, name in enumerate(known.names) if wrong[k] and k != worst]
+    rate = known.balances.known(at.t, at.y, at.f)[worst]
+    text = (
+        f"the rate of balance {known.names[worst]!r} is wrong: at t={at.t:.6g} rate returned {rate:.10g}, and "
+        f"grad @ f + dF/dt is {rate + found.rate[worst]:.10g}, where the terms sum to {found.terms[worst]:.3g}"
+    )
+    text += f"; the same holds for {listed(others)}" if others else ""
+    return Complaint(False, text, "Correct rate, or omit it to have it computed", category=ProjectionWarning)
+
+
 def _no_invariant(name: str, t: float, rate: float, terms: float) -> str:
     return (
         f"{name!r} is no invariant of this system: at t={t:.6g} it changes at the rate {rate:.3g}, where the terms of "
@@ -341,17 +368,21 @@ def _rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> _Rates 
     if 0 < unit < np.finfo(float).tiny / EPS:
         return None
     unit = unit or 1.0
-    in_time, noise = _time_derivative(known, at)
+    in_time, noise = time_derivative(known, at.t, at.y, at.G, at.here, at.tau)
     in_time, noise = in_time / unit, noise / unit
     products = at.G.conj() * (at.f / unit)
-    rate, terms = in_time + products.sum(axis=1).real, np.abs(in_time) + np.abs(products).sum(axis=1)
+    carried = known.balances.mask
+    own = known.balances.known(at.t, at.y, at.f) / unit
+    rate, terms = in_time + products.sum(axis=1).real - own, np.abs(in_time) + np.abs(products).sum(axis=1)
     noise = noise + RATE_ROUNDINGS * EPS * known.norm_products(at.G, at.f / unit)
-    wrong = np.abs(rate) > INVARIANCE_TOLERANCE * terms + noise
-    if (wrong & known.computed).any():
+    of_balances = np.where(known.by_values, RATE_TOLERANCE_OF_DIFFERENCES, RATE_TOLERANCE)
+    wrong = np.abs(rate) > np.where(carried, of_balances, INVARIANCE_TOLERANCE) * terms + noise
+    computed = np.array(known.computed, bool) & (known.by_values | ~carried)
+    if (wrong & computed).any():
         # Gradients that are computed over a kink are wrong, and the rate with them.
         by_values = rates_by_values(known, at.t, at.y, at.f, at.G) / unit
-        near = np.abs(in_time + by_values) > ROUNDING_OF_DIFFERENCES * terms
-        wrong &= near | ~np.array(known.computed)
+        near = np.abs(in_time + by_values - own) > ROUNDING_OF_DIFFERENCES * terms
+        wrong &= near | ~computed
     if wrong.any():
         wrong &= ~(_rounding_of_rates(known, at, unit, rhs) > np.abs(rate))
     with np.errstate(over="ignore"):
@@ -381,34 +412,34 @@ def rates_by_values(known: InvariantSet, t: float, y: Array, f: Array, G: Array)
     return np.where(np.abs(rates) <= rounding, 0.0, rates)
 
 
-def _time_derivative(known: InvariantSet, at: _Samples) -> tuple[Array, Array]:
+def time_derivative(known: InvariantSet, t: float, y: Array, G: Array, here: Array, tau: float) -> tuple[Array, Array]:
     """Return the partial derivative in time, from times inside the run's interval, and the rounding in it.
 
     The rounding is infinite where the interval has no other time, because nothing is known of the derivative then.
     """
     none = np.zeros(known.size)
     low, high = min(known.t_span), max(known.t_span)
-    before, after = at.t - low, high - at.t
+    before, after = t - low, high - t
     side, room = (1, after) if after >= before else (-1, before)
-    far = at.t + side * min(room, at.tau)
-    if far == at.t or not 0 < at.tau < math.inf:
+    far = t + side * min(room, tau)
+    if far == t or not 0 < tau < math.inf:
         return none, np.full(known.size, np.inf)
     with np.errstate(over="ignore"):
-        rounding = EPS * known.sizes_of_terms(at.y, at.G, at.here)
-        hidden = 4 * rounding / abs(far - at.t)
-    fixed = known.values(far, at.y) == at.here  # as almost always
-    step, centred = 0.01 * at.tau, min(before, after) >= 0.05 * at.tau
+        rounding = EPS * known.sizes_of_terms(y, G, here)
+        hidden = 4 * rounding / abs(far - t)
+    fixed = known.values(far, y) == here  # as almost always
+    step, centred = 0.01 * tau, min(before, after) >= 0.05 * tau
     step = 2.0 ** (round(math.log2(step)) if centred else math.floor(math.log2(min(step, room / 6))))
-    if fixed.all() and (known.values(at.t + side * step, at.y) == at.here).all():
+    if fixed.all() and (known.values(t + side * step, y) == here).all():
         return none, hidden
-    if not step > 100 * np.spacing(abs(at.t)):
+    if not step > 100 * np.spacing(abs(t)):
         return none, np.where(fixed, hidden, np.inf)
     if centred:
         weights = {sign * multiple: sign * weight for multiple, weight in DIFFERENCE_WEIGHTS for sign in (1, -1)}
     else:
         weights = {side * k: side * weight for k, weight in enumerate(ONE_SIDED_WEIGHTS)}
-    values = {multiple: known.values(at.t + multiple * step, at.y) for multiple in weights}
-    changed = np.any([value != at.here for value in values.values()], axis=0)
+    values = {multiple: known.values(t + multiple * step, y) for multiple in weights}
+    changed = np.any([value != here for value in values.values()], axis=0)
     total = np.where(changed, sum(weight * values[multiple] for multiple, weight in weights.items()), 0.0)
     total[~np.isfinite(total)] = 0.0
     with np.errstate(over="ignore"):

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from ..engine.data import EPS, Grouping
-from ..engine.native import Call, call
+from ..engine.native import Call, Rates, call
 from .arguments import names, scalars
 from .callers import users_level
+from .carried import Carried, bound, real_value, time_shift
 from .gradients import NumericalGradient, difference_gradient, typical_sizes
 from .inputs import count, filled, flag, reals, refuse_units, require_arguments, shown
-from .invariant_checks import Complaint, complaints, listed, rates_by_values
+from .invariant_checks import Complaint, complaints, listed, rates_by_values, time_derivative
 from .jitted import NotCompilableError, is_jitted, jit_is_off
 from .pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 
@@ -101,6 +102,17 @@ class Invariant:
     >>> energy = Invariant(lambda t, y: 0.5 * (y @ y), grad=lambda t, y: y, name="energy")
     """
 
+    # What balances have besides: see `Balance`.
+    is_balance = False
+    rate_function: Callable[..., Any] | None = None
+    rate_uses_f = False
+    # Components and weights (s, k) along which all values are projected, or one such pair for every value. Invariants
+    # without any are projected together, along all components.
+    parts: tuple[tuple[Array, Array], ...] = ()
+    value_names: tuple[str, ...] = ()
+    # Whether a run warns of it as a balance that changes too fast to be of help.
+    warns_if_fast = True
+
     def __init__(
         self,
         fun: Callable[..., Any],
@@ -114,26 +126,25 @@ class Invariant:
         in_place: bool = False,
         uses_f: bool = False,
     ) -> None:
-        in_place, uses_f = flag("Invariant: in_place", in_place), flag("Invariant: uses_f", uses_f)
-        size = None if size is None else count("Invariant: size", size)
+        own = type(self).__name__
+        in_place, uses_f = flag(f"{own}: in_place", in_place), flag(f"{own}: uses_f", uses_f)
+        size = None if size is None else count(f"{own}: size", size)
         what = "an invariant" if name is None else f"invariant {name!r}"
         if isinstance(fun, OwnArguments) or isinstance(grad, OwnArguments):
             fun, grad, args = _apart(fun, grad, args)
         fun = by_pointer(fun, what, shape=(size,) if size and size > 1 else ())
         grad = by_pointer(grad, f"gradient of {what}", GRADIENT, takes_f=uses_f)
         if not callable(fun):
-            raise TypeError(f"Invariant: fun must be callable, got {fun!r}{address_hint(fun)}.")
+            raise TypeError(f"{own}: fun must be callable, got {fun!r}{address_hint(fun)}.")
         if grad is not None and not callable(grad):
-            raise TypeError(f"Invariant: grad must be callable or None, got {grad!r}{address_hint(grad)}.")
+            raise TypeError(f"{own}: grad must be callable or None, got {grad!r}{address_hint(grad)}.")
         if grad is None and (in_place or uses_f):
-            raise ValueError("Invariant: in_place and uses_f describe grad; give grad or leave them out.")
+            raise ValueError(f"{own}: in_place and uses_f describe grad; give grad or leave them out.")
         refuse_units(target=target, args=args, scale=scale)
         if not isinstance(args, tuple):
-            raise TypeError(
-                f"Invariant: args must be a tuple, got {shown(args)}; write args=(x,) for a single argument."
-            )
+            raise TypeError(f"{own}: args must be a tuple, got {shown(args)}; write args=(x,) for a single argument.")
         if name is not None and not isinstance(name, str):
-            raise TypeError(f"Invariant: name must be a string, got {shown(name)}.")
+            raise TypeError(f"{own}: name must be a string, got {shown(name)}.")
         self.function, self.gradient = fun, grad
         self.target = None if target is None else _target(target)
         self.is_measured = False  # whether the target is the value at the start of an earlier run
@@ -158,7 +169,7 @@ class Invariant:
 
     def __repr__(self) -> str:
         name = self.name or getattr(self.function, "__name__", "?")
-        return f"Invariant({name})"
+        return f"{type(self).__name__}({name})"
 
 
 class JointInvariants(tuple[Invariant, ...]):
@@ -279,32 +290,12 @@ def _first_value(invariant: Invariant, fun: Any, label: str, t: float, y: Array,
     except TypeError:
         _require_arguments(invariant.function, f"invariant {label!r}", ("t", "y"), invariant.args, extra)
         raise
-    value = _value(value, label, t)
+    value = real_value(value, f"invariant {label!r}", t)
     if value.ndim > 1:
         raise ValueError(f"invariant {label!r} returned shape {value.shape}; expected a number or one dimension (l,).")
     if invariant.size not in (None, value.size):
         raise ValueError(f"invariant {label!r} returned {value.size} values, but has size={invariant.size}.")
     return value.astype(float)
-
-
-def _value(value: Any, label: str, t: float, expected: tuple[int, ...] | None = None) -> Array:
-    """What an invariant returned at t, real and of the expected shape."""
-    refuse_units(**{f"invariant {label!r} returned": value})
-    try:
-        found = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        found = np.asarray(None)
-    if found.dtype.kind == "c":
-        raise ValueError(
-            f"invariant {label!r} returned complex values at t={t:g}; expected a real number or a real array (l,)."
-        )
-    if found.dtype.kind not in "fiub":
-        raise TypeError(
-            f"invariant {label!r} returned {shown(value)} at t={t:g}; expected a real number or a real array (l,)."
-        )
-    if expected is not None and found.shape != expected:
-        raise ValueError(f"invariant {label!r} returned shape {found.shape} at t={t:g}, expected {expected}.")
-    return found
 
 
 def _gradient(value: Any, label: str, t: float, expected: tuple[int, ...], dtype: np.dtype) -> Array:
@@ -331,11 +322,6 @@ def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple,
     require_arguments(fun, given, what, advice)
 
 
-def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
-    """``fun`` with its last arguments given; itself where there are none."""
-    return (lambda *first: fun(*first, *arguments)) if arguments else fun
-
-
 class InvariantSet:
     """All invariants of a run as one: sizes, names, targets, scales, and the functions that the step calls.
 
@@ -357,6 +343,8 @@ class InvariantSet:
 
     Attributes
     ----------
+    balances : Carried
+        The balances among the invariants. Their entries of `target` are the values that the run carries.
     kinds : Grouping or None
         Components that have the same unit, see `kinds_of`. None: nothing is known of them.
     given : ndarray of bool, shape (l,)
@@ -378,7 +366,7 @@ class InvariantSet:
         t_bound: float | None = None,
         rhs: Callable[[float, Array], Array] | None = None,
     ) -> None:
-        self.t_span, self.rhs = (t0, t0 if t_bound is None else t_bound), rhs
+        self.t_span, self.rhs, self.tau = (t0, t0 if t_bound is None else t_bound), rhs, tau
         self.kinds: Grouping | None = None
         self.items = given = as_invariants(invariants)
         self.extra = extra
@@ -400,8 +388,8 @@ class InvariantSet:
         self.size = self.starts[-1]
         self.start_values = np.concatenate([np.atleast_1d(v) for v in values]) if values else np.zeros(0)
         self.names = [
-            label if scalar else f"{label}[{j}]"
-            for label, scalar, size in zip(self.labels, self.scalar, sizes, strict=True)
+            (label if scalar else f"{label}[{j}]") if not item.value_names else item.value_names[j]
+            for item, label, scalar, size in zip(self.items, self.labels, self.scalar, sizes, strict=True)
             for j in range(size)
         ]
         self._require_finite(self.start_values, "not finite at y0")
@@ -420,6 +408,10 @@ class InvariantSet:
         self.shape, self.dtype = (self.size, y0.size), y0.dtype
         self._bind(functions, values, y0)
         self._gradients_at_start(t0, y0, f0)
+        self.balances = Carried(self.items, self.labels, self.starts, [value.shape for value in values], extra)
+        if y0.dtype == FLOAT:
+            self.balances.compile_rates(y0.size)
+        self.balances.check(t0, y0, f0)
         self.calls = self._calls(y0)
 
     def _bind(self, functions: list[Callable[..., Any]], values: list[Array], y0: Array) -> None:
@@ -436,6 +428,15 @@ class InvariantSet:
             (*self._bound_gradient(k), label, place, value.shape + y0.shape)
             for k, (label, place, value) in enumerate(zip(self.labels, places, values, strict=True))
         ]
+
+    @property
+    def by_values(self) -> Array:
+        """Return which gradients come from differences of values, (l,)."""
+        found = [
+            item.gradient is None and not (isinstance(grad, NumericalGradient) and grad.complex_step)
+            for item, grad in zip(self.items, self.grads, strict=True)
+        ]
+        return np.repeat(np.array(found, bool), np.diff(self.starts))
 
     def _scales(self, sizes: list[int]) -> Array:
         scales = np.zeros(self.size)
@@ -486,10 +487,27 @@ class InvariantSet:
         known = zip(self.items, self.labels, strict=True)
         return [label for item, label in known if item.gradient is None and isinstance(item.function, PointerFunction)]
 
-    def with_targets(self) -> tuple[Invariant, ...]:
-        """The invariants with the values that are kept as their targets."""
+    @property
+    def fixed_target(self) -> Array:
+        """Return the values (l,) that are kept throughout; NaN for balances, whose values change."""
+        return np.where(self.balances.mask, np.nan, self.target)
+
+    def rates(self, adaptive: bool, functions: Sequence[Any] | None = None) -> Rates:
+        """Return the rates of the balances as the engine calls them, by `functions` or in Python."""
+        low, high = min(self.t_span), max(self.t_span)
+        return self.balances.rates(low, high, time_shift(self.tau, adaptive, self.t_span), functions)
+
+    def with_targets(self, *, at_end: bool = True) -> tuple[Invariant, ...]:
+        """Return the invariants with the values that are kept as their targets.
+
+        `at_end`: the run goes on from the end of its last step, where balances have the values that it carries.
+        Elsewhere they begin again.
+        """
         kept = [copy(item) for item in self.items]
         for k, item in enumerate(kept):
+            if item.is_balance and not at_end:
+                item.target = None
+                continue
             item.is_measured = item.is_measured or item.target is None
             item.target = self.target[self.starts[k] : self.starts[k + 1]].copy()
         return (
@@ -519,7 +537,7 @@ class InvariantSet:
             _, label, _, shape = self._values[k]
 
             def convert(found: Any, t: float) -> Array:
-                return np.array(_value(found, label, t, shape), float, order="C")
+                return np.array(real_value(found, f"invariant {label!r}", t, shape), float, order="C")
 
             return call(self.items[k].function, self.items[k].args + self.extra, shape, convert, real=True)
 
@@ -597,7 +615,7 @@ class InvariantSet:
                 known = expected == ()
             else:
                 known = type(value) is np.ndarray and value.dtype is FLOAT and value.shape == expected
-            values[place] = value if known else _value(value, label, t, expected)
+            values[place] = value if known else real_value(value, f"invariant {label!r}", t, expected)
 
     def grad(self, t: float, y: Array, f: Array, G: Array, params: Any = None) -> None:
         """Fill the gradients `G` (l, n)."""
@@ -665,11 +683,18 @@ class InvariantSet:
             return np.where(residual == 0, 0.0, residual / allowed)
 
     def rate_shares(self, t: float, y: Array, f: Array) -> tuple[Array, Array]:
-        """Return the rates of change along f by gradients and by values, relative to the terms of these rates; (l,)."""
+        """Return the rates of change along f by gradients and by values, relative to the terms of these rates; (l,).
+
+        From those of balances their own rates are subtracted, which leaves NaN where none is given.
+        """
         G = self.gradients(t, y, f)
         products = G.conj() * f
         terms = np.abs(products).sum(axis=1)
-        rates = np.abs(np.array([products.sum(axis=1).real, rates_by_values(self, t, y, f, G)]))
+        rates = np.array([products.sum(axis=1).real, rates_by_values(self, t, y, f, G)])
+        if self.balances.items:
+            in_time, _ = time_derivative(self, t, y, G, self.values(t, y), self.tau)
+            rates = rates - (self.balances.known(t, y, f) - np.where(self.balances.mask, in_time, 0.0))
+        rates = np.abs(rates)
         by_gradient, by_values = rates / np.where(terms > 0, terms, 1.0)
         return by_gradient, by_values
 
@@ -701,6 +726,8 @@ class InvariantSet:
         -----
         UserWarning
             When an invariant changes along the flow of this system.
+        ProjectionWarning
+            When the rate of a balance is wrong.
         """
         found = list(self.complaints(t, y, f, tau))
         for complaint in found:
@@ -708,7 +735,9 @@ class InvariantSet:
                 raise ValueError(f"{complaint.text}. {complaint.advice}, or pass check=False to skip this check.")
             advice = f" {complaint.advice}." if complaint.advice else ""
             warnings.warn(
-                f"{complaint.text}.{advice} (check=False skips this check.)", UserWarning, stacklevel=users_level()
+                f"{complaint.text}.{advice} (check=False skips this check.)",
+                complaint.category,
+                stacklevel=users_level(),
             )
         return [complaint.text for complaint in found]
 

@@ -11,10 +11,10 @@ from numba import njit, types
 from numba.extending import overload
 
 from .dual_arrays import for_duals, inside
-from .dual_numbers import Dual, seed, slope, stack_array
+from .dual_numbers import Dual, directed, seed, slope, stack_array
 from .jitted import NotCompilableError
 
-__all__ = ["gradient_by_duals"]
+__all__ = ["gradient_by_duals", "rate_by_duals"]
 
 # Derivatives carried through a function at once, at most: more fill the registers.
 LANES = 12
@@ -54,6 +54,52 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
     return _compiled(filled, shape, has_params, scalars)
 
 
+@lru_cache(maxsize=256)
+def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, scalars: str = "") -> Any:
+    """The rate ``rate(t, y, f[, params])`` of a jitted balance: its derivative along (1, f), exact but for rounding.
+
+    With `scalars`, the types of some numbers, it is ``rate(t, y, f, *numbers)``.
+
+    Raises
+    ------
+    NotCompilableError
+        When the function does something that dual numbers cannot.
+    """
+    dual = Dual(1)
+    call = _with_params(for_duals(fun, dual), has_params, bool(scalars))
+    new_state = inside((lambda: np.empty(n, dual)) if n > STACK else (lambda: stack_array(dual, n)), forceinline=True)
+    slopes = inside(_slopes_of(shape))
+
+    def along(t, y, f, params):
+        x = new_state()
+        for i in range(n):
+            x[i] = directed(dual, y[i], f[i])
+        return slopes(call(directed(dual, t, 1.0), x, params))
+
+    along = inside(along)
+    floats = types.Array(types.float64, 1, "C")
+    if scalars:
+        numbers = types.BaseTuple.from_types([NUMBERS[scalar] for scalar in scalars])
+        return _by_signature(lambda t, y, f, *numbers: along(t, y, f, numbers), [floats, floats, numbers])
+    if has_params:
+        return _by_signature(lambda t, y, f, params: along(t, y, f, params), [floats, floats, floats])
+    return _by_signature(lambda t, y, f: along(t, y, f, y), [floats, floats])
+
+
+def _slopes_of(shape: tuple[int, ...]) -> Callable[..., Any]:
+    """Return the derivatives of a value of this shape."""
+    if shape == ():
+        return lambda value: slope(value, 0)
+
+    def slopes(values):
+        out = np.empty(len(values))
+        for j in range(out.size):
+            out[j] = slope(values[j], 0)
+        return out
+
+    return slopes
+
+
 def _with_params(fun: Any, has_params: bool, one_by_one: bool) -> Any:
     if one_by_one:
         return inside(lambda t, x, numbers: fun(t, x, *numbers))
@@ -66,17 +112,21 @@ def _compiled(filled: Callable[..., None], shape: tuple[int, ...], has_params: b
     floats, out = (types.Array(types.float64, ndim, "C") for ndim in (1, 1 + len(shape)))
     if scalars:
         numbers = types.BaseTuple.from_types([NUMBERS[scalar] for scalar in scalars])
-        gradient, arguments = njit(lambda t, y, out, *numbers: filled(t, y, out, numbers)), [floats, out, numbers]
-    elif has_params:
-        gradient, arguments = njit(lambda t, y, out, params: filled(t, y, out, params)), [floats, out, floats]
-    else:
-        gradient, arguments = njit(lambda t, y, out: filled(t, y, out, y)), [floats, out]
+        return _by_signature(lambda t, y, out, *numbers: filled(t, y, out, numbers), [floats, out, numbers])
+    if has_params:
+        return _by_signature(lambda t, y, out, params: filled(t, y, out, params), [floats, out, floats])
+    return _by_signature(lambda t, y, out: filled(t, y, out, y), [floats, out])
+
+
+def _by_signature(function: Callable[..., Any], arguments: list[Any]) -> Any:
+    """Return a function compiled for t and these arguments."""
+    compiled = njit(function)
     try:
-        gradient.compile((types.float64, *arguments))
+        compiled.compile((types.float64, *arguments))
     except Exception as error:  # Numba has no one class for what its parts raise on a type that they do not expect
         said = [line for line in str(error).splitlines() if line.startswith(SAYING)] or [type(error).__name__]
         raise NotCompilableError(f"it does not compile for dual numbers: {said[0].rstrip(':')}") from error
-    return gradient
+    return compiled
 
 
 def put_slopes(value, out, first, count):

@@ -16,7 +16,7 @@ from .stepping import Stepping
 __all__ = ["SecondOrder", "attach_history", "times"]
 
 Array = np.ndarray
-AUTO_SPACING = 64
+AUTO_SPACING, OF_PARTS = 64, 32  # the second one for balances that are projected by themselves
 # Steps of DOP853, which starts where accelerations depend on velocities, in one step.
 SUBSTEPS = 4
 ROWS = 4  # of the history's window, in orders of the method
@@ -66,6 +66,11 @@ def attach_history(run: Run, name: str, system: SecondOrder, stepping: Stepping,
     method: Any = run.tableau
     assert stepping.h is not None
     brief = stepping.span.n_steps - 1 < method.order
+    if brief and run.work.level.size:
+        raise ValueError(
+            f"{name} carries a Balance in its history, which takes more than {method.order} steps; this run has "
+            f"{stepping.span.n_steps}. Take a shorter step, or a Runge-Kutta method such as EIPDOP853."
+        )
     check = run.options.limit < math.inf  # the option of this name bounds the shares of corrections
     corrected = slice(0, 0) if brief else _stable(method, name, system, stepping.h, check)
     run.method = run.method._replace(multistep=_record(run, method, corrected, stepping, brief=brief, level=level))
@@ -151,6 +156,10 @@ def _largest(product: Callable[[Array], Array], y: Array) -> float:
     return found
 
 
+def _has_parts(run: Run) -> bool:
+    return run.options.parts.value.size > 0
+
+
 def _record(
     run: Run, method: GaussJackson, corrected: slice, stepping: Stepping, *, brief: bool, level: bool
 ) -> Multistep:
@@ -167,7 +176,7 @@ def _record(
         t0=stepping.span.t0,
         h=stepping.span.h,
         substeps=SUBSTEPS if method.velocities else 1,
-        spacing=AUTO_SPACING if run.options.every == AUTO else run.options.every,
+        spacing=run.options.every if run.options.every != AUTO else OF_PARTS if _has_parts(run) else AUTO_SPACING,
         corrected_first=corrected.start,
         corrected_count=corrected.stop - corrected.start,
         nodes=_aligned((ROWS * order, pitch)),
@@ -175,6 +184,8 @@ def _record(
         predicted=_aligned((3, pitch)),
         change=_aligned((half,)),
         levels=np.zeros((3, run.invariants.size)),
+        rates=np.zeros((ROWS * order, run.work.level.size)),
+        rate_sums=np.zeros((2, run.work.level.size)),
         place=np.zeros(N_NODE_PLACES, np.int64),
     )
 

@@ -17,7 +17,7 @@ from .pointers import PointerFunction
 if TYPE_CHECKING:
     from .numba_pointers import Compiled
 
-__all__ = ["Kind", "function_alone", "native_functions", "raise_again", "with_events", "with_jacobian"]
+__all__ = ["Kind", "function_alone", "native_functions", "raise_again", "with_events", "with_jacobian", "with_rates"]
 
 
 NO_DUALS = "only jitted functions of real states get one compiled"
@@ -157,6 +157,28 @@ def with_jacobian(
     kind = _number(params, y0)._replace(shape=(half,), size=half, real=False)
     found = _native(jacobian, kind._replace(takes_f=True, in_place=True, gradient=True), "jacobian")
     return functions._replace(jacobian=found.entry, owner=functions.owner | {"jacobian": [found]})
+
+
+def with_rates(
+    functions: NativeFunctions, invariants: InvariantSet, params: Packed | None, y0: np.ndarray, adaptive: bool
+) -> NativeFunctions:
+    """The same with the addresses of the rates of balances.
+
+    Raises
+    ------
+    NotCompilableError
+        As by `native_functions`.
+    """
+    found = list[Native]()
+    for k, item in invariants.balances.items.items():
+        shape = () if invariants.scalar[k] else (invariants.starts[k + 1] - invariants.starts[k],)
+        if item.rate_function is None:
+            found.append(Native(None, math.prod(shape)))
+            continue
+        kind = _number(params, y0)._replace(shape=shape, takes_f=item.rate_uses_f, gradient=True)
+        found.append(_native(item.rate_function, kind, f"rate of balance {invariants.labels[k]!r}"))
+    rates = invariants.rates(adaptive, [native.entry for native in found])
+    return functions._replace(rates=rates, owner=functions.owner | {"rate": found})
 
 
 def raise_again(functions: NativeFunctions, group: str, k: int, t: float, y: bytes, f: bytes, status: int) -> NoReturn:

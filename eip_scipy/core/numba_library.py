@@ -32,11 +32,15 @@ def register() -> None:
 @cache
 def _jitted(function: Any) -> Any:
     """It as a Numba function, on copies of its arguments, which need be neither contiguous nor checked before."""
+    if function.own or function.numbers < 0:
+        raise TypeError(f"{function.__name__} cannot be called by jitted functions.")
     value = njit(_value_of(function))
     if function.in_place and function.takes_f:
         return njit(lambda t, y, f, out, params: _fill(out, value(t, y, f, params)))
     if function.in_place:
         return njit(lambda t, y, out, params: _fill(out, value(t, y, y, params)))
+    if function.takes_f:
+        return njit(lambda t, y, f, params: value(t, y, f, params))
     if function.numbers == 1 and not function.fills_states:
         return njit(lambda t, y, params: value(t, y, y, params)[0])
     return njit(lambda t, y, params: value(t, y, y, params))

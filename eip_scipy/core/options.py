@@ -20,18 +20,24 @@ from ..engine.data import (
     BAND,
     BAND_COMPENSATED,
     BAND_MULTISTEP,
+    BY_ERROR,
+    DISTANT,
     EPS,
-    ERROR,
     EUCLIDEAN,
-    FAR,
     GIVEN,
     LARGE_SHARE,
     MIDPOINT,
     NEW,
+    NO_BALANCES,
+    NO_GROUPS,
     OLD,
+    Balances,
+    Groups,
     Options,
 )
 from ..engine.trust import FAR_IN_TOLERANCES, MOST_FAR
+from ..methods.orders import AT_REST
+from . import steppers
 from .blocks import blocks_of
 from .frame import frame_rows
 from .inputs import count, flag, real_array
@@ -217,6 +223,10 @@ class ProjectionOptions:
         """
         n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
         kind, sigma = self._metric(method, n, width)
+        parts = _groups(known, n, width)
+        if parts is not NO_GROUPS:
+            self._require_plain()
+            kind = EUCLIDEAN  # the groups have weights of their own
         if not isinstance(self.direction, str) or self.direction not in DIRECTIONS:
             raise ValueError(f"direction must be 'new', 'old' or 'midpoint', got {self.direction!r}.")
         if method.has_history and self.direction != "new":
@@ -234,6 +244,8 @@ class ProjectionOptions:
             block_atol=np.sqrt(np.add.reduceat(squares, groups.start[:-1].astype(np.intp))),
             groups=groups,
             frame=frame_rows(self.frame, n, width),
+            balances=_balances(method, known),
+            parts=parts,
             target=known.target,
             scales=known.scales,
             computed=np.array(known.computed, float),
@@ -253,7 +265,7 @@ class ProjectionOptions:
             per_band=1.0 / (_band(method, compensated) * EPS),
             watched=check and known.size > 0,
             limit=(LARGE_SHARE if stepping.h is None else 1.0) if check else np.inf,
-            far=FAR if stepping.h is not None else _far_by_tolerances(rtol),
+            distant=DISTANT if stepping.h is not None else _far_by_tolerances(rtol),
         )
         if _can_project_jointly(options, known):
             options = options._replace(joint=known.items)
@@ -261,13 +273,17 @@ class ProjectionOptions:
         return Settled(options, sigma, self._identity(options, sigma, y0, known))
 
     def _identity(self, o: Options, sigma: np.ndarray | None, y0: np.ndarray, known: InvariantSet) -> dict[str, Any]:
+        carried = [known.labels[k] for k in known.balances.items]
+        grouped = o.parts is not NO_GROUPS
         return {
+            **({"balances": carried} if carried else {}),
+            **({"components": list(o.parts)} if grouped else {}),
             "rtol": o.rtol,
             "atol": o.atol,
             "invariants": [
                 (label, item.target, item.scale) for label, item in zip(known.labels, known.items, strict=True)
             ],
-            "metric": {EUCLIDEAN: "euclidean", ERROR: "error"}.get(o.metric, sigma),
+            "metric": {EUCLIDEAN: "euclidean", BY_ERROR: "error"}.get(o.metric, sigma),
             "blocks": (o.groups.start, o.groups.member),
             # As it was given: what `o` holds comes from LAPACK, whose last bits differ from machine to machine.
             "frame": None if self.frame is None else [np.asarray(a, y0.dtype) for a in self.frame],
@@ -279,6 +295,14 @@ class ProjectionOptions:
             "project_initial": bool(self.project_initial),
             "compensated": o.compensated,
         }
+
+    def _require_plain(self) -> None:
+        """Refuse options that do not apply to balances with components."""
+        if self.metric is not None or self.direction != "new" or self.iterations != 1:
+            raise ValueError(
+                "metric, direction and iterations do not apply to balances with components, which have weights of "
+                "their own and take one Newton step; leave these options out."
+            )
 
     def _compensated(self, method: AnyMethod) -> bool:
         if self.compensated is None:
@@ -304,18 +328,18 @@ class ProjectionOptions:
     def _metric(self, method: AnyMethod, n: int, width: int) -> tuple[int, np.ndarray | None]:
         metric = self.metric
         if metric is None:
-            return (ERROR if method.has_estimate else EUCLIDEAN), None
+            return (BY_ERROR if method.has_estimate else EUCLIDEAN), None
         if isinstance(metric, str):
             if metric == "euclidean":
                 return EUCLIDEAN, None
             if metric == "error":
-                return (ERROR if method.has_estimate else EUCLIDEAN), None
+                return (BY_ERROR if method.has_estimate else EUCLIDEAN), None
             raise ValueError(f"metric must be 'error', 'euclidean' or an array of n weights, got {metric!r}.")
         return GIVEN, np.repeat(weights("metric", metric, n), width)
 
 
 def _far_by_tolerances(rtol: np.ndarray) -> float:
-    return float(min(max(FAR, FAR_IN_TOLERANCES * np.max(rtol, initial=0.0)), MOST_FAR))
+    return float(min(max(DISTANT, FAR_IN_TOLERANCES * np.max(rtol, initial=0.0)), MOST_FAR))
 
 
 def _band(method: AnyMethod, compensated: bool) -> float:
@@ -341,11 +365,60 @@ def weights(name: str, sigma: Any, n: int) -> np.ndarray:
     return a / a.max()
 
 
+def _balances(method: AnyMethod, known: InvariantSet) -> Balances:
+    """Return what a run carries; nothing is carried where a state is projected at rest."""
+    if not known.balances.items or method is AT_REST:
+        return NO_BALANCES
+    return Balances(known.balances.places, steppers.rated(method))
+
+
+def _groups(known: InvariantSet, n: int, width: int) -> Groups:
+    """Return the groups of balances that are projected each by itself.
+
+    Raises
+    ------
+    ValueError
+        If some items have components and others none, components are outside the state, or the state is complex.
+    """
+    lacking = [label for item, label in zip(known.items, known.labels, strict=True) if not item.parts]
+    if len(lacking) == len(known.items):
+        return NO_GROUPS
+    if lacking:
+        raise ValueError(
+            f"invariants: {lacking[0]!r} has no components, but others have. Give components to all balances, or to "
+            "none; an invariant of the whole state cannot be kept together with balances of components."
+        )
+    if width == 2:
+        raise ValueError("invariants: balances of a complex state cannot have components.")
+    groups: dict[Any, tuple[np.ndarray, np.ndarray, list[int]]] = {}
+    for k, item in enumerate(known.items):
+        values = range(known.starts[k], known.starts[k + 1])
+        each = [values] if len(item.parts) == 1 else [range(v, v + 1) for v in values]
+        for (components, weight), own in zip(item.parts, each, strict=True):
+            key = components.shape, components.tobytes(), weight.tobytes()
+            groups.setdefault(key, (components, weight, []))[2].extend(own)
+    places = [row for components, _, _ in groups.values() for row in components]
+    if max(int(row.max()) for row in places) >= n:
+        raise ValueError(f"invariants: the components of a balance are outside the state, which has {n} components.")
+    return Groups(
+        value=np.concatenate([np.array(values, np.int64) for _, _, values in groups.values()]),
+        first_value=_starts([len(values) for _, _, values in groups.values()]),
+        first_direction=_starts([len(components) for components, _, _ in groups.values()]),
+        first_float=_starts([row.size for row in places]),
+        place=np.concatenate(places),
+        weight=np.concatenate([weight.ravel() for _, weight, _ in groups.values()]),
+    )
+
+
+def _starts(sizes: list[int]) -> np.ndarray:
+    return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+
+
 def _can_project_jointly(options: Options, known: InvariantSet) -> bool:
     """Whether the step is the one that `JointInvariants` take a shorter way to."""
     plain = (options.metric, options.direction, options.iterations) == (EUCLIDEAN, NEW, 1)
     free = options.frame.products.size == 0 and options.every != AUTO and not options.compensated
-    return isinstance(known.items, JointInvariants) and plain and free
+    return isinstance(known.items, JointInvariants) and plain and free and not known.balances.items
 
 
 def takes_projection_options(documented: Documented) -> Documented:

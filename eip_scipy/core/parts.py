@@ -53,6 +53,8 @@ class SolverOfParts(EIPSolver):
         return self._run.invariants
 
     def _hooks(self) -> dict[str, Any]:
+        if self.known.balances.items:
+            raise ValueError("invariants: a state in parts on several processes does not carry a Balance.")
         return {"agree": self._all_agree, "project": _Coordinates(self).project}
 
     def _all_agree(self, here: bool) -> bool:

@@ -99,7 +99,7 @@ def project(
     iterations = count("iterations", iterations, MOST_ITERATIONS)
     given = ProjectionOptions(
         invariants=invariants,
-        metric="euclidean" if sigma is None else weights("sigma", sigma, n),
+        metric=None if sigma is None else weights("sigma", sigma, n),  # None: the euclidean metric
         frame=frame,
         iterations=iterations,
         check=False,
@@ -148,6 +148,11 @@ def _targets(known: InvariantSet, target: Any, start: Any, t: float) -> np.ndarr
         if values is None or values.size != known.size or values.ndim > 1 or not np.isfinite(values).all():
             raise ValueError(f"project: target must be {known.size} finite numbers, got {shown(target)}.")
         return values.reshape(-1)
+    for item, label in zip(known.items, known.labels, strict=True):
+        if item.is_balance:
+            raise ValueError(
+                f"project: balance {label!r} changes, and has no value to keep. Pass target=, the values to meet."
+            )
     lacking = [item.target is None for item in known.items]
     if start is None:
         if any(lacking):

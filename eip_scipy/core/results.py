@@ -9,7 +9,7 @@ import numpy as np
 from ..engine.data import N_COUNTERS, N_FIGURES, PROJECTIONS, RANK_REDUCED, REJECTED, SKIPPED, SOFTENED
 from ..engine.trust import ProjectionWarning, Trust
 
-__all__ = ["Diagnostics", "ProjectionResult", "ProjectionWarning"]
+__all__ = ["Diagnostics", "ProjectionResult", "ProjectionWarning", "slowness"]
 
 
 class Diagnostics:
@@ -46,6 +46,10 @@ class Diagnostics:
         healthy runs. None where none was measured.
     corrections : ndarray, shape (l,)
         The largest correction of each invariant, in the same unit; nan where none was measured.
+    slowness : ndarray, shape (l,)
+        How fast each `Balance` changes: the mean of its rate, compared with that of the terms of ``grad @ f``, at some
+        of the projections. The error of a balance is about this share of the error of an invariant, and above 0.05 it
+        hardly helps. nan for invariants, and where ``check=False``.
     """
 
     def __init__(self) -> None:
@@ -62,6 +66,7 @@ class Diagnostics:
         *,
         estimated: bool,
         moved: str = "",
+        slow: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
         """Take the buffers of a run, so that reading costs the run nothing."""
         self.names = trust.names
@@ -72,6 +77,7 @@ class Diagnostics:
         self._counters = counters
         self._estimated = estimated
         self.moved = moved
+        self._slow = (np.zeros(0, np.int64), np.zeros((2, 0))) if slow is None else slow
 
     @property
     def last_defect(self) -> np.ndarray:
@@ -128,6 +134,14 @@ class Diagnostics:
         """Largest correction of each invariant in local errors, (l,)."""
         return self._trust.corrections
 
+    @property
+    def slowness(self) -> np.ndarray:
+        """Mean rate of each balance in units of its terms, (l,)."""
+        places, sums = self._slow
+        found = np.full(len(self.names), np.nan)
+        found[places] = slowness(sums)
+        return found
+
     def __repr__(self) -> str:
         if not self.names:
             return "Diagnostics: no invariants"
@@ -146,6 +160,12 @@ class Diagnostics:
         if self.message:
             lines.append(f"  {self.message}")
         return "\n".join(lines)
+
+
+def slowness(sums: np.ndarray) -> np.ndarray:
+    """Return the mean rates (b,) of balances in units of their terms, from the sums (2, b) of both."""
+    rates, terms = sums
+    return np.where(terms > 0, rates, np.nan) / np.where(terms > 0, terms, 1.0)
 
 
 class ProjectionResult(NamedTuple):

@@ -128,7 +128,10 @@ class RunSpec:
         options = options._replace(kinds=kinds_of(options.groups, start.y, start.f))
         invariants.kinds = options.kinds
         arrays = steppers.arrays(method)
-        work = Work(start.y.size, start.y.dtype, arrays.b.size, invariants.size, options.groups.start.size - 1)
+        carried, blocks = options.balances.place, options.groups.start.size - 1
+        work = Work(start.y.size, start.y.dtype, arrays.b.size, invariants.size, blocks, carried.size)
+        work.level[:] = invariants.target[carried]
+        work.rates[[0, -1]] = np.nan  # not known yet
         if sigma is not None:
             work.sigma[:] = sigma
         trust = Trust(invariants.names, work.trust)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -9,17 +10,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..engine.data import ERROR, EXAMINED, NO_METHOD, NOTHING, REASON, Schedule, Work
+from ..engine.data import BY_ERROR, EXAMINED, NO_BALANCES, NO_METHOD, NOTHING, REASON, Schedule, Work
 from ..engine.native import Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
+from .callers import users_level
 from .examination import Derivative, Examiner, is_check_due
+from .invariant_checks import listed
 from .invariants import InvariantSet
 from .options import Options
 from .resolution import unresolved
-from .results import Diagnostics
+from .results import Diagnostics, slowness
 from .stepping import AnyMethod, Stepping
 
 __all__ = ["Counted", "Run", "Start"]
+
+# The share of the terms of its rate from which on a balance hardly helps.
+MOST_SLOWNESS = 0.05
 
 
 class Start(NamedTuple):
@@ -57,6 +63,8 @@ class Run:
         What NaN in its value may come from.
     looked : int
         The step at which the invariants were checked last.
+    warned_of_balances : bool
+        Whether there was a warning of balances that change too fast.
     moved : str
         How far `project_initial` has moved the start, or nothing.
     """
@@ -75,6 +83,7 @@ class Run:
     left_out: str = ""
     looked: int = -1
     moved: str = ""
+    warned_of_balances: bool = False
 
     @property
     def y0(self) -> np.ndarray:
@@ -109,7 +118,7 @@ class Run:
         """
         derivative = Call(rhs, (), y.shape, lambda value, t: np.array(value, y.dtype))
         functions = PythonFunctions(derivative, *self.invariants.calls, (), second_order=False)
-        engine = Engine(NO_METHOD, self.options._replace(joint=None), self.work, functions)
+        engine = Engine(NO_METHOD, self.options._replace(joint=None, balances=NO_BALANCES), self.work, functions)
         self.work.y_hat[:], out = y, np.empty_like(y)
         return out, engine.project(t, y, t, True, out)
 
@@ -124,8 +133,9 @@ class Run:
             w.max_correction,
             w.counters,
             self.trust,
-            estimated=self.options.metric == ERROR,
+            estimated=self.options.metric == BY_ERROR,
             moved=self.moved,
+            slow=(self.invariants.balances.places, w.slow),
         )
 
     @property
@@ -141,6 +151,8 @@ class Run:
         """
         if not self.options.watched or self.trust.failed:
             return False  # a failure has its own message
+        if ended:
+            self._warn_of_fast_balances()
         suspect = self.work.suspect
         if self.trust.doubts:
             # One examination still has to tell how fast the invariants change, by which corrections are judged.
@@ -154,6 +166,22 @@ class Run:
             found = self.examiner.complaint(rhs, t, y)
         self.trust.doubts += [found] if found else []
         return self._is_doubtful(ended) or found is not None
+
+    def _warn_of_fast_balances(self) -> None:
+        """Warn once of balances that change too fast to be of help."""
+        found = slowness(self.work.slow)
+        carried = self.invariants.balances
+        fast = np.flatnonzero((found > MOST_SLOWNESS) & carried.warn_if_fast)
+        if not fast.size or self.warned_of_balances:
+            return
+        self.warned_of_balances = True
+        names = [self.invariants.names[place] for place in carried.places[fast]]
+        warnings.warn(
+            f"balance {listed(names)} changes at {found[fast].max():.2g} of the terms of its rate. Above "
+            f"{MOST_SLOWNESS:g} balances hardly help: compare with a run without it, or with other tolerances.",
+            UserWarning,
+            stacklevel=users_level(),
+        )
 
     def _is_doubtful(self, ended: bool) -> bool:
         """Return whether the corrections contradict the run, or will do so at its end."""

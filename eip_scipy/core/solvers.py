@@ -276,7 +276,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         calls, jacobian = self._run.invariants.calls, None
         if self._jacobian is not None:
             jacobian = Call(self._jacobian, (), (self.n // 2,), _never, takes_f=True, in_place=True)
-        functions = PythonFunctions(self._call, *calls, (), second_order=False, jacobian=jacobian)
+        rates = self._run.invariants.rates(self._run.options.adaptive)
+        functions = PythonFunctions(self._call, *calls, (), second_order=False, jacobian=jacobian, rates=rates)
         self._engine = self._run.engine(functions, self._schedule, begins=begins, **self._hooks())
 
     def _settle(self) -> None:
@@ -331,6 +332,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             self._restart(here)
         else:
             self._go_on(here)
+            self._work.rates[0] = np.nan if refunctioned else self._work.rates[-1]
         self._work.counters[NFEV] += self._calls[0] - before
         self._drive(begins=moved)
 
@@ -403,11 +405,12 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             self._scipy = self._SCIPY(fresh, begin.t, begin.y, begin.t + 1.0, first_step=1.0)
             self._scipy.fun = self._derivative
             set_scipy_values(self._scipy, copied["scipy"])
-        invariants = InvariantSet(shared["projection"].invariants, *begin, tell=False)
+        t_bound = copied["attributes"]["t_bound"]
+        invariants = InvariantSet(shared["projection"].invariants, *begin, tell=False, t_bound=t_bound)
         self._run = run_of(copied["run"], invariants, self._spec.method, joint=copied["joint"])
         self._work, self.f, self.h_abs = self._run.work, begin.f, 0.0
         self._drive(begins=False)
-        self._work.K[0] = copied["run"].work.K[0]
+        self._work.K[0], self._work.rates[0] = copied["run"].work.K[0], copied["run"].work.rates[-1]
         if copied["clock"] is not None:
             self._schedule.clock[:] = copied["clock"]
         calls = self._calls

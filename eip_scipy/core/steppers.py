@@ -23,7 +23,7 @@ from ..methods.orders import AtRest
 from ..methods.runge_kutta import DOP853, Tableau
 from .one_step import OneStep
 
-__all__ = ["Form", "arrays", "check_halves", "checked", "depends_on_velocity", "form"]
+__all__ = ["Form", "arrays", "check_halves", "checked", "depends_on_velocity", "form", "rated"]
 
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
@@ -102,6 +102,39 @@ def _(method: NystromTableau) -> Method:
 
 def _exponent(method: Tableau | NystromTableau) -> float:
     return -1.0 / ((method.error_estimator_order or 0) + 1)
+
+
+# Balances.
+
+
+@singledispatch
+def rated(method: Any) -> Array:
+    """Return at which stages (s,) of a method the rates of balances are needed.
+
+    Raises
+    ------
+    ValueError
+        If the method does not carry balances.
+    """
+    raise ValueError(
+        f"invariants: {method.name} does not carry a Balance, because it has no stages with velocities, where rates "
+        "are taken. Use EIPRK4, EIPDOP853, eip_method of a tableau, or EIPGJ12, or list invariants only."
+    )
+
+
+@rated.register
+def _(method: GaussJackson) -> Array:
+    coefficients: Any = arrays(method)
+    return np.zeros(coefficients.b.size, np.int64)  # rates are taken at the nodes
+
+
+@rated.register
+def _(method: Tableau) -> Array:
+    stages = (method.b != 0) | (method.b_low != 0)
+    if method.P is not None:
+        stages |= np.any(method.P[: stages.size] != 0, axis=1)
+    stages[0] = True  # for interpolants
+    return stages.astype(np.int64)
 
 
 # Interpolants.

@@ -19,7 +19,7 @@ NEW: int = 0
 OLD: int = 1
 MIDPOINT: int = 2
 EUCLIDEAN: int = 0
-ERROR: int = 1
+BY_ERROR: int = 1
 GIVEN: int = 2
 NFEV: int = 0
 NJEV: int = 1
@@ -94,7 +94,7 @@ MOST_ARGUMENTS: int = 8
 MOST_CROSSINGS: int = 3
 EPS: float = 2.220446049250313e-16
 LARGE: float = 50.0
-FAR: float = 0.03
+DISTANT: float = 0.03
 LARGE_SHARE: float = 0.01
 LEAST_CHANGE: float = 0.01
 SOURCES: str = ...
@@ -106,7 +106,7 @@ class Work:
     Buffers of a run, in memory of the engine; each attribute is an array over one.
     """
 
-    def __init__(self, n: int, dtype: object, stages: int, n_invariants: int, n_blocks: int) -> None: ...
+    def __init__(self, n: int, dtype: object, stages: int, n_invariants: int, n_blocks: int, n_balances: int = 0) -> None: ...
 
     def arrays(self) -> dict[str, numpy.typing.NDArray[Any]]:
         """Return all arrays by name."""
@@ -210,6 +210,27 @@ class Work:
 
     @property
     def trust(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
+    def flow(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
+    def rates(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
+    def level(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
+    def level_old(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
+    def level_carry(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
+    def level_carry_new(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
+
+    @property
+    def slow(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
 
     @property
     def suspect(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
@@ -332,6 +353,15 @@ class LibraryFunction:
     def octet_address(self) -> int:
         """For eight states side by side, 0 where there is none."""
 
+    def bound(self, params: object) -> LibraryFunction:
+        """
+        Return the function with parameters of its own, which replace those of a run.
+        """
+
+    @property
+    def own(self) -> list[float]:
+        """Its own parameters; empty if it takes those of the run."""
+
     def __repr__(self) -> str: ...
 
     def __reduce__(self) -> tuple[Any, ...]: ...
@@ -385,6 +415,8 @@ class Multistep(NamedTuple):
     predicted: numpy.typing.NDArray[numpy.float64]
     change: numpy.typing.NDArray[numpy.float64]
     levels: numpy.typing.NDArray[numpy.float64]
+    rates: numpy.typing.NDArray[numpy.float64]
+    rate_sums: numpy.typing.NDArray[numpy.float64]
     place: numpy.typing.NDArray[numpy.int64]
 
 class Method(NamedTuple):
@@ -416,12 +448,26 @@ class FrameRows(NamedTuple):
     products: numpy.typing.NDArray[numpy.float64]
     bodies: numpy.typing.NDArray[numpy.float64]
 
+class Balances(NamedTuple):
+    place: numpy.typing.NDArray[numpy.int64]
+    rated: numpy.typing.NDArray[numpy.int64]
+
+class Groups(NamedTuple):
+    value: numpy.typing.NDArray[numpy.int64]
+    first_value: numpy.typing.NDArray[numpy.int64]
+    first_direction: numpy.typing.NDArray[numpy.int64]
+    first_float: numpy.typing.NDArray[numpy.int64]
+    place: numpy.typing.NDArray[numpy.int64]
+    weight: numpy.typing.NDArray[numpy.float64]
+
 class Options(NamedTuple):
     rtol: numpy.typing.NDArray[numpy.float64]
     atol: numpy.typing.NDArray[numpy.float64]
     block_atol: numpy.typing.NDArray[numpy.float64]
     groups: Grouping
     frame: FrameRows
+    balances: Balances
+    parts: Groups
     target: numpy.typing.NDArray[numpy.float64]
     scales: numpy.typing.NDArray[numpy.float64]
     computed: numpy.typing.NDArray[numpy.float64]
@@ -439,7 +485,7 @@ class Options(NamedTuple):
     per_band: float
     watched: bool = ...
     limit: float = ...
-    far: float = ...
+    distant: float = ...
     joint: Any = ...
 
 class Members(NamedTuple):

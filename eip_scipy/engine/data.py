@@ -10,7 +10,7 @@ from .native import BUILD
 
 if TYPE_CHECKING:
     from ._native import *  # noqa: F403
-    from ._native import Method, Schedule, Span
+    from ._native import Balances, Groups, Method, Schedule, Span
 else:
     globals().update((name, value) for name, value in vars(BUILD).items() if not name.startswith("_"))
 
@@ -25,7 +25,12 @@ def bare_schedule(span: Span, first: float) -> Schedule:
     return Schedule(span, 0, none, np.zeros(3, np.int64), clock, none, none, none, none, none)
 
 
-# That of an engine which only projects.
+# Those of a run without any, and the method of an engine which only projects.
+NO_BALANCES = Balances(place=np.zeros(0, np.int64), rated=np.zeros(0, np.int64))
+NO_GROUPS = Groups(
+    value=np.zeros(0, np.int64), first_value=np.zeros(1, np.int64), first_direction=np.zeros(1, np.int64),
+    first_float=np.zeros(1, np.int64), place=np.zeros(0, np.int64), weight=np.zeros(0),
+)  # fmt: skip
 _none = np.zeros(0)
 NO_METHOD = Method(
     A=np.zeros((0, 0)), b=_none, b_low=_none, b_v=_none, b_v_low=_none, c=_none, e=_none, e_v=_none, e_low=_none,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,6 +22,7 @@ __all__ = [
     "NativeFunctions",
     "OctetFunctions",
     "PythonFunctions",
+    "Rates",
     "call",
     "library",
     "library_function",
@@ -55,6 +56,27 @@ def call(fun: Callable[..., Any], args: tuple[Any, ...], shape: tuple[int, ...],
     return Call(fun, args, shape, convert, **kind)
 
 
+class Rates(NamedTuple):
+    """The rates at which the balances of a run change.
+
+    Attributes
+    ----------
+    items : tuple of (int, int)
+        Of each balance its place among the functions of the invariants, and the number of its values.
+    functions : tuple
+        Of each balance its rate, as a `Call` or by its address. None: the rate of the gradient along the flow, and of
+        the explicit dependence on time.
+    low, high, shift : float
+        The interval within which derivatives in time are taken, and by what shifts.
+    """
+
+    items: tuple[tuple[int, int], ...] = ()
+    functions: tuple[Any, ...] = ()
+    low: float = 0.0
+    high: float = 0.0
+    shift: float = 0.0
+
+
 class PythonFunctions(NamedTuple):
     """A run's functions in Python; `second_order`: `rhs` gives the accelerations of (q, v)."""
 
@@ -64,6 +86,7 @@ class PythonFunctions(NamedTuple):
     event: tuple[Call, ...]
     second_order: bool
     jacobian: Call | None = None
+    rates: Rates = Rates()
     native: bool = False
 
 
@@ -86,6 +109,7 @@ class NativeFunctions(NamedTuple):
     python: PythonFunctions | None = None
     jacobian: Any = None
     floors: np.ndarray | None = None
+    rates: Rates = Rates()
     native: bool = True
 
 
@@ -153,6 +177,6 @@ library: dict[str, LibraryFunction] = BUILD.LIBRARY
 """The functions of the library's own problems that are in C++, by name."""
 
 
-def library_function(name: str) -> Any:
-    """The function of that name, as it comes back from a pickle."""
-    return library[name]
+def library_function(name: str, own: Sequence[float] = ()) -> Any:
+    """The function of that name, as it comes back from a pickle, with its `own` parameters, if it has any."""
+    return library[name].bound(own) if own else library[name]

@@ -207,9 +207,12 @@ class Plan:
         own_targets = any(item.target is not None for item in ready.run.invariants.items)
         own_start = ready.run.identity["project_initial"] or own_targets or self.task.rows is not None
         by_differences = bool(ready.run.invariants.by_differences)  # whose shifts depend on the start
-        self._together = self.why_not is None and not own_start and not by_differences
+        carries = bool(ready.run.invariants.balances.items)
+        self._together = self.why_not is None and not (own_start or by_differences or carries)
         if self.task.rows is not None:
             own = "members have intervals or times of their own"
+        elif carries:
+            own = "each run carries its balances by itself"
         elif by_differences:
             own = "the gradient of an invariant comes from differences"
         else:
@@ -390,7 +393,7 @@ def _alone(
     out.saved[k, :rows] = loop.driver.y[:rows]
     out.saved_values[k, :rows] = _values(loop.driver, loop.driver.t[:rows], loop.driver.y[:rows])
     out.values[k] = _values(loop.driver, out.t[k : k + 1], out.y[k : k + 1])[0]
-    out.target[k] = loop.driver.run.invariants.target
+    out.target[k] = loop.driver.run.invariants.fixed_target
     schedule = loop.driver.schedule
     after = loop.driver.t[:rows] != schedule.span.t0
     _cover(out, slice(k, k + 1), out.saved_values[k, :rows][None, after], schedule)

@@ -132,6 +132,11 @@ def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callabl
 
 
 def _transformed_invariant(item: Invariant) -> Invariant:
+    if item.is_balance:
+        raise ValueError(
+            f"time_transformed: {item!r} is a Balance, whose rate is one in time. Give the new problem a Balance "
+            "with its rate in the new time, by replace(problem, invariants=...)."
+        )
     fun, grad = _transformed_functions(item.function, item.gradient, item.uses_f)
     return Invariant(fun, grad, args=item.args, in_place=True, uses_f=item.uses_f, name=item.name, scale=item.scale)
 

@@ -145,6 +145,11 @@ class Driver:
             "slope": w.K[0],
             **({"g": schedule.g, "rate": schedule.rate} if schedule.g.size else {"g": schedule.g}),
             "target": self.run.options.target,
+            **({name: getattr(w, name) for name in ("level", "level_carry", "slow")} if w.level.size else {}),
+            **({"balance_rate": w.rates[0]} if w.level.size else {}),
+            **(
+                {"rates": history.rates, "rate_sums": history.rate_sums} if w.level.size and history is not None else {}
+            ),
             **nodes,
             **{name: getattr(w, name) for name in kept},
         }
@@ -156,6 +161,8 @@ class Driver:
             copies["place"][PENDING] = 0
             copies["clock"][TIME] = self.schedule.clock[TIME_NEW]
             copies["y"], copies["slope"] = self.new.copy(), self.run.work.K[-1].copy()
+            if "balance_rate" in copies:
+                copies["balance_rate"] = self.run.work.rates[-1].copy()
             copies["g"] = self.schedule.g_new.copy()
             if self.schedule.g.size:
                 copies["rate"] = self.schedule.rate_new.copy()
@@ -248,7 +255,7 @@ class Driver:
 
     def note(self, values: np.ndarray) -> None:
         """Let the largest defects of the run cover the invariants' values (l, m) at saved states after the start."""
-        largest, target = self.run.work.max_defect, self.run.invariants.target
+        largest, target = self.run.work.max_defect, self.run.invariants.fixed_target
         defects = np.abs(values - target[:, None])[:, self.t[: self.rows] != self.schedule.span.t0]
         np.fmax(largest, np.fmax.reduce(defects, axis=1, initial=0.0), out=largest)
 

@@ -413,7 +413,7 @@ class Loop:
         for row in range(first_row, driver.rows):
             t, y = float(driver.t[row]), driver.y[row].copy()
             invariants = driver.run.invariants
-            if self.callback(t, y, invariants.values(t, y) - invariants.target):
+            if self.callback(t, y, invariants.values(t, y) - invariants.fixed_target):
                 driver.schedule.place[ROW] = row + 1
                 return True
         return False
@@ -427,7 +427,7 @@ class Loop:
             t=driver.t[:rows],
             y=driver.y[:rows].T,
             invariants=values,
-            target=driver.run.invariants.target,
+            target=driver.run.invariants.fixed_target,
             max_defect=driver.run.work.max_defect,
             diagnostics=self.diagnostics,
             t_events=[np.asarray(t) for t in events.t] if events.functions else None,
@@ -450,7 +450,7 @@ class Loop:
             epoch=self.prepared.epoch,
         )
         t, y = events.last if self._event_ended else driver.now
-        kept = driver.run.invariants.with_targets()
+        kept = driver.run.invariants.with_targets(at_end=not self._event_ended)
         origin = Origin(self.prepared.asked, t, y.copy(), driver.schedule.span.sign, kept)
         object.__setattr__(result, "_origin", origin)  # beside the fields, which are items
         return result

@@ -16,7 +16,7 @@ from ..core.inputs import count, flag, real_array, refuse_units, require_argumen
 from ..core.invariants import as_invariants, with_args
 from ..core.jitted import NotCompilableError
 from ..core.multistep import times
-from ..core.native_functions import native_functions, with_events, with_jacobian
+from ..core.native_functions import native_functions, with_events, with_jacobian, with_rates
 from ..core.options import ProjectionOptions
 from ..core.pointers import GRADIENT, PointerFunction, address_hint, by_pointer
 from ..core.problem import Problem, made
@@ -182,6 +182,7 @@ class System:
                 raise NotCompilableError("args are neither numbers nor one array of floats")
             params = Packed(self.parameters, numbers) if self.extra else None
             functions = native_functions(*self._native_form, params, run.invariants, run.y0)
+            functions = with_rates(functions, run.invariants, params, run.y0, run.options.adaptive)
             if self._corrects(run):
                 functions = with_jacobian(functions, self.jacobian, params, run.y0)
         except NotCompilableError as reason:
@@ -219,6 +220,8 @@ class System:
             found[label] = kind(item.function, in_python)
             differences = item.gradient is None and not in_python
             found[f"gradient of {label}"] = "differences" if differences else kind(item.gradient, in_python)
+            if item.rate_function is not None:
+                found[f"rate of {label}"] = kind(item.rate_function, in_python)
         if self._corrects(run):
             found["jacobian"] = kind(self.jacobian, in_python)
         in_python = isinstance(functions, PythonFunctions) or functions.python is not None
@@ -240,7 +243,8 @@ class System:
         jacobian = None
         if self._corrects(run):
             jacobian = call(self.jacobian, self.extra, (n // 2,), convert, in_place=True, takes_f=True)
-        return PythonFunctions(rhs, *run.invariants.calls, self.events.calls, second_order, jacobian)
+        rates = run.invariants.rates(run.options.adaptive)
+        return PythonFunctions(rhs, *run.invariants.calls, self.events.calls, second_order, jacobian, rates)
 
 
 @dataclass
@@ -283,7 +287,7 @@ class Prepared:
         """The C functions by pointer."""
         items = self.run.invariants.items
         functions = [self.system.fun, *self.system.events.functions]
-        functions += [function for item in items for function in (item.function, item.gradient)]
+        functions += [function for item in items for function in (item.function, item.gradient, item.rate_function)]
         return [function for function in functions if isinstance(function, PointerFunction)]
 
     def identity(self, y0: Any, params: Any) -> dict[str, Any]:

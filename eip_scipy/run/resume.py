@@ -32,6 +32,8 @@ SNAPSHOT_SECONDS = 0.2
 LEAST_RATIO = 19.0
 # How far values of one function at one point may differ, on another machine too.
 SAME = 1e-9
+# What rounding of the terms of a rate is counted as, in these terms.
+LEAST_OF_RATES = 1e-6
 SHORT = 16
 STEP = 0
 
@@ -193,7 +195,9 @@ class _FileKeeper(Keeper):
         f0: np.ndarray,
     ) -> None:
         self._settings, self._names, self._derivative = settings, run.invariants.names, derivative
+        rates = run.invariants.balances.given(t0, y0, f0)
         self._start = {"start_f": f0, "start_values": run.invariants.start_values}
+        self._start |= {"start_rates": rates} if rates.size else {}
         if self._read is None:
             return
         header, arrays = self._read
@@ -208,7 +212,10 @@ class _FileKeeper(Keeper):
 
     def _known_by(self, run: Run, t: float, y: np.ndarray) -> dict[str, np.ndarray]:
         """What the functions are known by at a state of the run."""
-        return {"state_f": self._derivative(t, y.copy()), "state_values": run.invariants.values(t, y)}
+        f = self._derivative(t, y.copy())
+        rates = run.invariants.balances.given(t, y, f)
+        known_by = {"state_f": f, "state_values": run.invariants.values(t, y)}
+        return known_by | ({"state_rates": rates} if rates.size else {})
 
     def _require_same_functions(
         self,
@@ -220,11 +227,16 @@ class _FileKeeper(Keeper):
         where: str,
     ) -> None:
         self._require_fitting(arrays, known_by)
-        f, _ = known_by.values()
+        f, _, *rates = known_by.values()
         labels = ["fun"] * f.size + [f"invariant {name!r}" for name in self._names]
+        labels += [f"rate of balance {self._names[place]!r}" for place in run.invariants.balances.given_places]
         there, here = (np.concatenate([a[name] for name in known_by]) for a in (arrays, known_by))
         with np.errstate(invalid="ignore"):
             sizes = np.append(np.full(f.size, np.abs(f).max(initial=0.0)), run.invariants.term_sizes(t, y, f))
+            # Rates are far smaller than the terms that may cancel in them.
+            terms = np.abs(run.invariants.gradients(t, y, f)) @ np.abs(f)
+            own = LEAST_OF_RATES * terms[run.invariants.balances.given_places]
+            sizes = np.concatenate([sizes, *(own + np.abs(rate) for rate in rates)])
             same = (there == here) | (np.abs(there - here) <= SAME * sizes) | (np.isnan(there) & np.isnan(here))
         if not same.all():
             k = int(np.flatnonzero(~same)[0])

@@ -24,6 +24,7 @@ RESULTS: dict[str, Any] = {IntegrationResult.__name__: IntegrationResult}
 RESUMED = ("integrate", "ensemble")  # with the same arguments
 # Buffers of Diagnostics, in the order in which it takes them.
 BUFFERS = ("_max_defect", "_last_defect", "_max_correction", "_counters", "_figures")
+OF_BALANCES = ("_balance_places", "_balance_sums")
 
 
 def save(result: Any, path: str | os.PathLike[str]) -> None:
@@ -135,6 +136,8 @@ def _described(diagnostics: Diagnostics, arrays: dict[str, np.ndarray]) -> dict[
     trust = diagnostics._trust
     buffers = (diagnostics.max_defect, diagnostics._defect, diagnostics._max_correction, diagnostics._counters)
     arrays |= zip(BUFFERS, (*buffers, trust.figures), strict=True)
+    if diagnostics._slow[0].size:
+        arrays |= zip(OF_BALANCES, diagnostics._slow, strict=True)
     return {
         "names": list(trust.names),
         "doubts": trust.doubts,
@@ -148,9 +151,10 @@ def _diagnostics(told: dict[str, Any], arrays: dict[str, np.ndarray]) -> Diagnos
     largest, last, correction, counters, figures = (arrays.pop(name) for name in BUFFERS)
     trust = Trust(told["names"], figures)
     trust.doubts, trust.failed = told["doubts"], told["failed"]
+    slow = (arrays.pop(OF_BALANCES[0]), arrays.pop(OF_BALANCES[1])) if OF_BALANCES[0] in arrays else None
     diagnostics = Diagnostics()
     diagnostics._attach(
-        largest, last, correction, counters, trust, estimated=told["estimated"], moved=told.get("moved", "")
+        largest, last, correction, counters, trust, estimated=told["estimated"], moved=told.get("moved", ""), slow=slow
     )
     return diagnostics
 

@@ -26,6 +26,7 @@ def test_it_uses_all_public_names():
 
 
 def test_it_runs(program, tmp_path):
+    assert 0 < program.slow() < 1e-3
     defect, states, message, trusted = program.one_run()
     assert defect < 1e-14
     assert states.shape == (2, 11)

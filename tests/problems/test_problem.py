@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
+from eip_scipy import EIPRK4, EIPRK45, Balance, Invariant, integrate
 from eip_scipy.problems import Problem, comet, harmonic, kepler, plane_wave, rotating_packet, soliton
 from eip_scipy.problems.gravity.nbody import nbody
 from eip_scipy.problems.gravity.scenes import pythagorean
@@ -85,3 +85,9 @@ def test_solve_ivp():
 def test_solve_ivp_by_a_method_of_scipy_gets_no_options_of_ours():
     sol = harmonic().solve_ivp((0, 1), method="DOP853", rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(sol.y[:, -1], harmonic().reference(1.0), rtol=1e-9)
+
+
+def test_a_balance_is_not_written_in_another_time():
+    balance = Balance(lambda t, y: y @ y, lambda t, y: 0.0, lambda t, y: 2 * y, name="B")
+    with pytest.raises(ValueError, match=r"Balance\(B\) is a Balance, whose rate is one in time"):
+        time_transformed(replace(kepler(), invariants=(balance,)), 1.0, centre_time)

@@ -26,6 +26,7 @@ from eip_scipy import (
     EIPRK45,
     EIPRKN8,
     EIPRKN12,
+    Balance,
     Diagnostics,
     Invariant,
     ProjectionWarning,
@@ -67,7 +68,12 @@ def crossing(t: float, y: Vector, params: Vector) -> float:
     return float(y[0])
 
 
+def damped(t: float, y: Vector) -> Vector:
+    return np.array([y[1], -np.sin(y[0]) - 1e-4 * y[1]])
+
+
 H = Invariant(energy, gradient, name="H", target=None, scale=1.0)
+E = Balance(energy, rate=lambda t, y: -1e-4 * y[1] ** 2, grad=gradient, name="E")
 METHODS: list[type[EIPSolver]] = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]
 METHODS += [EIPRKN8, EIPRKN12, EIPGJ12, EIPGJ14, eip_method(scipy_integrate.RK45)]
 METHODS += [eip_method(Tableau(A=[[0.0]], b=[1.0], order=1, name="Euler", reference="Euler"))]
@@ -81,6 +87,12 @@ def one_run() -> tuple[float, Vector, str, bool]:
     states: Vector = sol.y
     largest: Vector = record.max_defect
     return float(largest.max()), states, message, trusted
+
+
+def slow() -> float:
+    run: OdeResult = solve_ivp(damped, (0.0, 1.0), [1.0, 0.0], method=EIPDOP853, h=0.1, invariants=[E])
+    slowness: Vector = run.diagnostics.slowness
+    return float(slowness[0])
 
 
 def long_run(path: Path) -> int:

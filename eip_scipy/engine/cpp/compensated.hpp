@@ -2,39 +2,9 @@
 #pragma once
 
 #include "data.hpp"
-#include "octet.hpp"
+#include "two_floats.hpp"
 
 namespace eip {
-
-// A number as the sum of two floats, or so many as a vector holds.
-template <class Value>
-struct PairOf {
-    Value value, rest;
-};
-
-using Pair = PairOf<double>;
-
-template <class Value>
-inline PairOf<Value> two_sum(const Value &a, const Value &b) {
-    const Value s = a + b, v = s - a;
-    return {s, (a - (s - v)) + (b - v)};
-}
-
-// The rounding error is exact either way; below, by Dekker's splitting, as a call for each fused operation takes longer.
-template <class Value>
-inline PairOf<Value> two_product(const Value &a, const Value &b) {
-    const Value p = a * b;
-#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
-    return {p, fused(a, b, -p)};
-#else
-    constexpr double SPLITTER = 134217729.0;  // 2^27 + 1
-    Value x = SPLITTER * a;
-    const Value a_high = x - (x - a), a_low = a - a_high;
-    x = SPLITTER * b;
-    const Value b_high = x - (x - b), b_low = b - b_high;
-    return {p, ((a_high * b_high - p) + a_high * b_low + a_low * b_high) + a_low * b_low};
-#endif
-}
 
 // (y_hat, carry_hat) = y + carry + h sum_j (b + b_low)[j] K[j], rounded once to two floats.
 template <class W>
@@ -51,6 +21,37 @@ inline void compensated_step(const double *y, double h, const Method &m, const W
         w.y_hat[i] = sum.value;
         w.carry_hat[i] = sum.rest;
     }
+}
+
+// The same for the balances, whose values at the end of the step become the targets.
+template <class W>
+inline void compensated_levels(double h, const Method &m, const Balances &balances, const W &w) {
+    for (int64_t b = 0; b < w.balances; ++b) {
+        double main = 0.0, low = 0.0;
+        for (int64_t j = 0; j < m.stages; ++j) {
+            if (!balances.rated[j]) continue;
+            main += m.b[j] * w.rate(j)[b];
+            low += m.b_low[j] * w.rate(j)[b];
+        }
+        const Pair increment = two_product(h, main), s = two_sum(w.level[b], increment.value);
+        const Pair sum = two_sum(s.value, s.rest + (increment.rest + h * low + w.level_carry[b]));
+        w.target[balances.place[b]] = sum.value;
+        w.level_carry_new[b] = sum.rest;
+    }
+}
+
+// The balances at the end of a step that is accepted.
+template <class W>
+inline void keep_levels(const Balances &balances, const W &w) {
+    copy(w.level, w.level_old, w.balances);
+    for (int64_t b = 0; b < w.balances; ++b) w.level[b] = w.target[balances.place[b]];
+    copy(w.level_carry_new, w.level_carry, w.balances);
+}
+
+// The targets of the balances at the state at hand, after a step that was not accepted.
+template <class W>
+inline void restore_levels(const Balances &balances, const W &w) {
+    for (int64_t b = 0; b < w.balances; ++b) w.target[balances.place[b]] = w.level[b];
 }
 
 // The same for q + h v + h^2 sum_j (b + b_low)[j] a_j and v + h sum_j (b_v + b_v_low)[j] a_j.

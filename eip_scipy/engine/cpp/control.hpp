@@ -18,7 +18,7 @@ template <class AnyRun>
 inline void make_stages(const AnyRun &run, const Step &step) {
     if (run.method.nystrom)
         rkn_stages(run, step);
-    else
+    else if (!made_with_rates(run, step))
         rk_stages(run, step);
     run.work.counters[NFEV] += run.method.stages - 1;
 }
@@ -30,7 +30,7 @@ inline bool look_back(const AnyRun &run, const Step &step) {
     const Method &m = run.method;
     const Options &o = run.options;
     const auto &w = run.work;
-    const bool estimate = o.adaptive || ((o.metric == ERROR || o.every == AUTO) && w.l > 0);
+    const bool estimate = o.adaptive || ((o.metric == BY_ERROR || o.every == AUTO) && w.l > 0);
     w.counters[HAVE_F] = (estimate && m.fsal) || (step.project && o.uses_f);
     w.counters[HAVE_ERROR] = estimate;
     if (w.counters[HAVE_F]) {
@@ -61,6 +61,19 @@ inline Code any_raw_step(const AnyRun &run, const Step &step) {
     return run.hooks && run.hooks->raw ? static_cast<Code>(run.hooks->raw_step(step)) : raw_step(run, step);
 }
 
+// The balances at the end of a step, and their rates at the state where w.last() is the derivative: rates by another state
+// would hold what the derivatives differ by. Batches of members have no balances.
+template <class AnyRun>
+inline void close_balances(const AnyRun &, const Step &, const double *) {}
+template <class W>
+inline void close_balances(const RunOf<W, System> &run, const Step &step, const double *y) {
+    const auto &w = run.work;
+    if (w.balances == 0) [[likely]]
+        return;
+    keep_levels(run.options.balances, w);
+    run.system.rates(of_any_length(run).work, step.t_new, y, w.last(), w.rate(w.stages));
+}
+
 // After the projection: the carry, the errors gathered, and f for the next step's first stage in w.last().
 template <class AnyRun>
 inline void close_step(const AnyRun &run, const Step &step, Code status) {
@@ -76,12 +89,15 @@ inline void close_step(const AnyRun &run, const Step &step, Code status) {
             copy(w.err, w.err_sum, w.m);
         else if (step.project)
             fill(w.err_sum, 0.0, w.m);
-        else if (o.metric == ERROR || o.every == AUTO || o.adaptive)
+        else if (o.metric == BY_ERROR || o.every == AUTO || o.adaptive)
             quadrature(w.err, w.err_sum, w.err_sum, w.m);
     }
     if (!w.counters[HAVE_F] || (step.project && status == OK && !o.reuse_f)) {
         run.system.rhs(w, step.t_new, step.y_new, w.last());
         ++w.counters[NFEV];
+        close_balances(run, step, step.y_new);
+    } else {
+        close_balances(run, step, w.y_hat);
     }
 }
 
@@ -103,7 +119,7 @@ inline Code finish_step(const AnyRun &run, const Step &step) {
 }
 
 // SciPy's: ten spacings of the numbers at t.
-inline double least_step(double t, double sign) { return 10.0 * std::abs(std::nextafter(t, sign * INFINITE) - t); }
+inline double least_step(double t, double sign) { return 10.0 * std::abs(std::nextafter(t, sign * ENDLESS) - t); }
 
 // Step k: fixed, or the first one that the error control accepts; K[0] = f(t, y) on entry, w.last() = f at its end.
 //

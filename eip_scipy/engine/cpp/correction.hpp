@@ -23,7 +23,7 @@ inline MatrixOf<Value> rows_of(Value *a, const W &w) {
     return {a, w.l, w.m, w.m};
 }
 template <class Value, class W>
-inline MatrixOf<Value> small(Value *a, int64_t size, const W &w) {
+inline MatrixOf<Value> corner(Value *a, int64_t size, const W &w) {
     return {a, size, size, w.l};
 }
 
@@ -66,10 +66,69 @@ inline void move_along(const Options &o, const W &w, const Value *__restrict Q, 
     }
 }
 
+// The Newton step of each group of values by itself, along its own directions; all components together then restore the
+// frame's C y. Defects within rounding are corrected too, because the rounding of values that are carried does not accumulate.
+// Returns the sum of the ranks, -1 where gradients are not finite. w.g are the defects that `judge` compares with: the carried
+// values of a group whose rows are dependent need not agree exactly, so that the defect of a row that was left out may grow to
+// the sum of all.
+template <class W>
+[[gnu::noinline]] inline int64_t move_in_parts(const Options &o, const W &w, double *out) {
+    const Groups &parts = o.parts;
+    double *total = w.stage, *defects = w.inner.g;
+    int64_t rank = 0;
+    fill(total, 0.0, w.m);
+    for (int64_t k = 0; k < parts.count; ++k) {
+        const int64_t *value = parts.value + parts.first_value[k], first = parts.first_direction[k];
+        const int64_t rows = parts.first_value[k + 1] - parts.first_value[k];
+        const int64_t directions = parts.first_direction[k + 1] - first;
+        const Matrix B{w.Q, rows, directions, directions}, R = corner(w.R, rows, w);
+        for (int64_t i = 0; i < rows; ++i) {
+            const double *G = w.gradient(value[i]);
+            defects[i] = w.before[value[i]];
+            for (int64_t d = 0; d < directions; ++d) {
+                double slope = 0.0;
+                for (int64_t j = parts.first_float[first + d]; j < parts.first_float[first + d + 1]; ++j)
+                    slope += parts.weight[j] * G[parts.place[j]];
+                B(i, d) = slope;
+            }
+        }
+        const int64_t found = factor(B, w.inverse_norms, R, w.pivots);
+        if (found < 0) return -1;
+        rank += found;
+        double total_defect = 0.0;
+        for (int64_t i = 0; i < rows; ++i) total_defect += std::abs(defects[i]) * w.inverse_norms[i];
+        for (int64_t i = 0; i < rows; ++i) {
+            const bool grows = found < rows && w.inverse_norms[i] > 0.0;
+            w.g[value[i]] = grows ? 2.0 * total_defect / w.inverse_norms[i] : defects[i];
+        }
+        least_norm(defects, w.inverse_norms, R, w.pivots, found, w.mu);
+        for (int64_t d = 0; d < directions; ++d) {
+            double move = 0.0;
+            for (int64_t i = 0; i < rows; ++i) move += w.mu[i] * B(i, d);
+            for (int64_t j = parts.first_float[first + d]; j < parts.first_float[first + d + 1]; ++j)
+                total[parts.place[j]] += parts.weight[j] * move;
+        }
+    }
+    if (o.frame.rows > 0)
+        keep_frame(o.frame, w, total, w.move);
+    else
+        copy(total, w.move, w.m);
+    for (int64_t j = 0; j < w.m; ++j) out[j] = w.y_hat[j] + w.move[j];
+    return rank;
+}
+
+// The defects that those after a projection are compared with.
+template <class W>
+inline auto *limits(const Options &o, const W &w) {
+    return o.parts.count > 0 ? w.g : w.before;
+}
+
 // The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal.
 template <class W>
 inline int64_t first_move(const Options &o, const W &w, double *out, bool more) {
-    const Matrix R = small(w.R, w.l, w);
+    if (o.parts.count > 0) [[unlikely]]
+        return move_in_parts(o, w, out);
+    const Matrix R = corner(w.R, w.l, w);
     double *rows = more ? nullptr : weighed_gradients(o, w);
     if (rows && solve_gram(rows_of(rows, w), w.g, R, w.mu)) {
         move_along(o, w, rows, out);
@@ -85,7 +144,7 @@ inline int64_t first_move(const Options &o, const W &w, double *out, bool more) 
 // Add to w.mu the Newton step of (B . Q) step = -g, on the rows that the first factorisation chose.
 inline void newton_matrix_solve(int64_t rank, const Work &w) {
     const Inner &inner = w.inner;
-    const Matrix matrix = small(inner.matrix, rank, w), R = small(inner.R, w.l, w);
+    const Matrix matrix = corner(inner.matrix, rank, w), R = corner(inner.R, w.l, w);
     for (int64_t k = 0; k < rank; ++k) {
         for (int64_t q = 0; q < rank; ++q) matrix(k, q) = dot(w.B + w.pivots[k] * w.m, w.Q + w.pivots[q] * w.m, w.m);
         inner.g[k] = w.g[w.pivots[k]];
@@ -116,7 +175,7 @@ inline void newton_matrix_solve(int64_t rank, const Work &w) {
     }
     ++w.counters[NJEV];
     weigh_rows(o.frame, w, w.Q);
-    const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, small(w.R, w.l, w), w.pivots);
+    const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, corner(w.R, w.l, w), w.pivots);
     if (rank >= 0) {
         fill(w.mu, 0.0, w.l);
         newton_matrix_solve(rank, w);
@@ -132,8 +191,8 @@ inline Moved move(const AnyRun &run, const Step &step, double largest_error = -1
     const auto &w = run.work;
     ++w.counters[NLU];
     if (largest_error < 0.0) {
-        largest_error = o.metric == ERROR ? relative_errors(step.y, run) : 0.0;
-        if (o.metric == ERROR) weights_from_errors(step.y, o, w);
+        largest_error = o.metric == BY_ERROR ? relative_errors(step.y, run) : 0.0;
+        if (o.metric == BY_ERROR) weights_from_errors(step.y, o, w);
     }
     const int64_t rank = o.direction == NEW ? first_move(o, w, step.y_new, o.iterations > 1)
                                             : other_directions(of_any_length(run), step);
@@ -217,7 +276,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
         compensated_add(step.y_new, w.carry_hat, w.move, w.m);
     }
     if (o.compensated || !o.has_limits) evaluate_invariants(run, step.t_new, step.y_new);
-    return judge(w.before, origin(step, w), step.y_new, o, w);
+    return judge(limits(o, w), origin(step, w), step.y_new, o, w);
 }
 
 // Further tries with weights ever nearer to equal relative errors; at most MAX_SOFTENED.
@@ -244,7 +303,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
 [[gnu::cold, gnu::noinline]] inline Code correct_with_fewer(const Run &run, const Step &step, int64_t &rank) {
     const Options &o = run.options;
     const auto &w = run.work;
-    const Matrix R = small(w.R, w.l, w);
+    const Matrix R = corner(w.R, w.l, w);
     weigh_rows(o.frame, w, w.Q);
     const int64_t found = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
     rank = std::max<int64_t>(0, std::min(rank, found));
@@ -266,7 +325,7 @@ inline Code stay(const AnyRun &run, const Step &step) {
     const Code status = judge(w.before, origin(step, w), step.y_new, o, w);
     if (status != OK) return status;
     take_note(step, origin(step, w), o, w);
-    if (o.metric == ERROR) {
+    if (o.metric == BY_ERROR) {
         relative_errors(step.y, run);
         remember_errors(o, w);
     }
@@ -286,8 +345,8 @@ inline Code project_step(const AnyRun &run, const Step &step) {
     const auto &w = run.work;
     run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
-    note_rates(step, o, w);
-    if (o.every != 1 && (o.metric == ERROR || o.every == AUTO || o.adaptive)) {
+    note_rates(run, step);
+    if (o.every != 1 && (o.metric == BY_ERROR || o.every == AUTO || o.adaptive)) {
         quadrature(w.err, w.err_sum, w.err, w.m);
         if (o.every == AUTO && !step.last && !tells_more(w)) {
             copy(w.y_hat, step.y_new, w.m);
@@ -303,10 +362,10 @@ template <class AnyRun>
 inline Code project_evaluated(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
-    if (!defects<double>(nullptr, w.y_hat, o, w, w.before)) return stay(run, step);
+    if (!defects<double>(nullptr, w.y_hat, o, w, w.before) && o.parts.count == 0) return stay(run, step);
     Moved moved = move(run, step);
     Code status = correct(run, step, moved.rank);
-    if (o.direction == NEW && o.iterations == 1 && !o.compensated) {
+    if (o.direction == NEW && o.iterations == 1 && !o.compensated && o.parts.count == 0) {
         const bool alone = o.blocks.count * o.blocks.width == w.m;
         const bool doubtful = status != OK ? all_finite(w.defect, w.l) : alone && moved.correction > HEALTHY;
         if (moved.largest_error > 0.0 && doubtful) status = correct_softly(of_any_length(run), step, alone, moved);

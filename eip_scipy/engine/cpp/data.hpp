@@ -17,7 +17,7 @@ namespace eip {
 EIP_ENUM(Code, OK, NOT_FINITE, FAILED_PROJECTION, TOO_SMALL, POSTPONED, UNSTABLE, PAUSE = 10, FULL, ENDED, DOUBTFUL);
 
 EIP_ENUM(Direction, NEW, OLD, MIDPOINT);
-EIP_ENUM(Metric, EUCLIDEAN, ERROR, GIVEN);
+EIP_ENUM(Metric, EUCLIDEAN, BY_ERROR, GIVEN);
 constexpr int64_t AUTO = 0;  // the option `every`
 
 // Places of the numbers that the step counts and leaves for the next one. From HAVE_ERROR on: whether an estimate of the
@@ -35,12 +35,12 @@ EIP_ENUM(Interpolant, CUBIC, QUINTIC, POLYNOMIAL, SEVENTH, HISTORY, NYSTROM);
 
 // Columns of the figures of a run's projections. An invariant's terms at the start, and the largest on the manifold. The
 // number of projections; the defect that the last one left; the largest that one left, in these terms, and when. The
-// largest defect before a projection, in these terms, when, and how many were FAR. Between two projections an invariant
+// largest defect before a projection, in these terms, when, and how many were DISTANT. Between two projections an invariant
 // changes: the largest change in local errors, when, how many were LARGE, and when the first was; the sum of the changes,
 // that of the local errors, and their number. The largest rate of change along the flow, in its own terms; the largest of
 // these terms; the largest rate when a step was kept for an examination last. In the first row only: the largest local
 // error of a block, in what the step changes there, when a step was kept for that reason last. The share of its terms from
-// which on a defect before a projection is FAR. A flag for a gradient that is computed from values, which is not accurate
+// which on a defect before a projection is DISTANT. A flag for a gradient that is computed from values, which is not accurate
 // near kinks; the largest rate of change along the flow that examinations found by short differences, in its own terms.
 EIP_ENUM(Figure, START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MANY, NU, AT, MANY, FIRST, SUM, EXPECTED,
          JUDGED, RATE, RATE_TERMS, RATE_NOTED, ROUGH_NOTED, FAR_FROM, BY_VALUES, EXAMINED, N_FIGURES);
@@ -49,10 +49,10 @@ EIP_ENUM(Figure, START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MA
 EIP_ENUM(SuspectPlace, REASON, SUSPECT_FROM, SUSPECT_TO, SUSPECT_WAITED, N_SUSPECT);
 EIP_ENUM(Reason, NOTHING, LARGE_CORRECTION, LARGE_ERROR, CHANGES_ALONG_FLOW);
 
-// Changes of LARGE local errors are noted, and defects of FAR and LARGE_SHARE of the terms before and after projections.
-constexpr double LARGE = 50.0, FAR = 0.03, LARGE_SHARE = 1e-2;
+// Changes of LARGE local errors are noted, and defects of DISTANT and LARGE_SHARE of the terms before and after projections.
+constexpr double LARGE = 50.0, DISTANT = 0.03, LARGE_SHARE = 1e-2;
 constexpr double EPS = 2.220446049250313e-16;
-constexpr double INFINITE = std::numeric_limits<double>::infinity();
+constexpr double ENDLESS = std::numeric_limits<double>::infinity();
 constexpr double NOT_A_NUMBER = std::numeric_limits<double>::quiet_NaN();
 
 // The records below come from Python, where they are named tuples. `fields` lists a record's fields once, in their order:
@@ -114,7 +114,11 @@ struct Multistep {
     int64_t first, count;                 // components that the Jacobian corrects
     double *nodes, *sums;                 // (rows, pitch), (4, pitch)
     double *predicted, *change, *levels;  // (3, pitch), (half), (3, l)
+    double *rates, *rate_sums;            // of the balances: (rows, balances), (2, balances)
+    int64_t balances;
     int64_t *place;
+
+    double *rates_at(int64_t row) const { return rates + row * balances; }
 };
 
 template <class Visit>
@@ -135,6 +139,8 @@ void fields(Multistep &ms, Visit &visit) {
     visit("predicted", ms.predicted, 3, ms.pitch);
     visit("change", ms.change, visit.sizes.m / 2);
     visit("levels", ms.levels, 3, visit.sizes.l);
+    visit("rates", ms.rates, ms.rows, Bound{ms.balances});
+    visit("rate_sums", ms.rate_sums, 2, ms.balances);
     visit("place", ms.place, N_NODE_PLACES);
     ms.half = visit.sizes.m / 2;
 }
@@ -203,10 +209,44 @@ void fields(Frame &f, Visit &visit) {
     visit("bodies", f.bodies, 2, Bound{f.groups}, Bound{f.count});
 }
 
+// Invariants whose targets change at known rates, by their places, and whether the step takes their rates at each stage.
+struct Balances {
+    const int64_t *place, *rated;
+    int64_t count, stages;
+};
+
+template <class Visit>
+void fields(Balances &b, Visit &visit) {
+    visit("place", b.place, Bound{b.count});
+    visit("rated", b.rated, Bound{b.stages});
+}
+
+// Groups of kept values that are projected each by itself: the values of a group by their places, its directions, and the
+// floats that move along a direction, each by its weight.
+struct Groups {
+    const int64_t *value, *first_value, *first_direction, *first_float, *place;
+    const double *weight;
+    int64_t values, count, ends, directions, floats;  // ends: count + 1
+};
+
+template <class Visit>
+void fields(Groups &g, Visit &visit) {
+    visit("value", g.value, Bound{g.values});
+    visit("first_value", g.first_value, Bound{g.ends});
+    visit("first_direction", g.first_direction, g.ends);
+    g.count = g.ends - 1;
+    visit("first_float", g.first_float, Bound{g.directions});
+    visit("place", g.place, Bound{g.floats});
+    visit("weight", g.weight, g.floats);
+    --g.directions;
+}
+
 struct Options {
     const double *rtol, *atol, *block_atol;  // by float, by component, by block
     Blocks blocks;
     Frame frame;
+    Balances balances;
+    Groups parts;
     double *target;
     const double *scales, *computed;  // computed: 1 for invariants without a gradient of the user's
     const double *most_left;          // the share of its terms that a Newton step may leave without a further one
@@ -217,7 +257,7 @@ struct Options {
     bool reuse_f, uses_f, compensated, adaptive, watched;
     double per_band;  // an invariant's terms are this many dead bands
     double limit;     // the share of the terms that may be left
-    double far;       // defects before a projection are noted from this share of the terms on
+    double distant;   // defects before a projection are noted from this share of the terms on
 };
 
 template <class Visit>
@@ -228,6 +268,8 @@ void fields(Options &o, Visit &visit) {
     visit("block_atol", o.block_atol, is.blocks);
     visit.record("groups", "Grouping", o.blocks);
     visit.record("frame", "FrameRows", o.frame);
+    visit.record("balances", "Balances", o.balances);
+    visit.record("parts", "Groups", o.parts);
     visit("target", o.target, is.l);
     visit("scales", o.scales, is.l);
     visit("computed", o.computed, is.l);
@@ -237,8 +279,8 @@ void fields(Options &o, Visit &visit) {
          o.every, "reuse_f", o.reuse_f, "uses_f", o.uses_f, "compensated", o.compensated, "adaptive", o.adaptive,
          "per_band", o.per_band);
     visit.by_default("watched", o.watched, false);
-    visit.by_default("limit", o.limit, INFINITE);
-    visit.by_default("far", o.far, FAR);
+    visit.by_default("limit", o.limit, ENDLESS);
+    visit.by_default("distant", o.distant, DISTANT);
     visit.in_python("joint", "typing.Any", true);
 }
 
@@ -248,14 +290,18 @@ struct Inner {
     int64_t *pivots;
 };
 
-// Buffers of a run of m values (floats, or those of eight members), l invariants and `stages` + 1 rows of K.
+// Buffers of a run of m values (floats, or those of eight members), l invariants, some of which are balances, and
+// `stages` + 1 rows of K. Of each balance: rows of rates at the stages, its value at the state at hand and what rounding
+// took from it, the same of the step that is tried, its value before the last step, and sums of its rates and of their terms
+// over some steps. `flow`: the rate at which each invariant is to change with the state.
 template <class V>
 struct WorkOf {
     using Value = V;
-    int64_t n, m, l, stages;
+    int64_t n, m, l, stages, balances;
     Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *ratio, *memory, *memory_new,
         *move, *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu, *values, *g, *band, *before, *worth, *defect,
-        *max_defect, *max_correction, *trust, *target, *products;  // the invariants' levels; scratch of the frame
+        *max_defect, *max_correction, *trust, *flow, *rates, *level, *level_old, *level_carry, *level_carry_new, *slow,
+        *target, *products;  // the last two: the invariants' targets; scratch of the frame
     double *norm, *suspect;
     int64_t *pivots, *counters;
     Inner inner;
@@ -265,6 +311,7 @@ struct WorkOf {
     Value *row(int64_t i) const { return K + i * m; }  // f of stage i
     Value *last() const { return K + stages * m; }     // f at the raw result, or at the end of the step
     Value *gradient(int64_t i) const { return G + i * m; }
+    Value *rate(int64_t i) const { return rates + i * balances; }  // of the balances at stage i
     Value *figures(int64_t i) const { return trust + i * N_FIGURES; }
 };
 
@@ -287,6 +334,11 @@ void each_buffer(WorkOf<V> &w, int64_t blocks, Visit &visit) {
          "before", w.before, "worth", w.worth, "defect", w.defect, "max_defect", w.max_defect);
     each(visit, {1}, "max_correction", w.max_correction, "norm", w.norm);
     visit("trust", w.trust, {l, N_FIGURES});
+    visit("flow", w.flow, {l});
+    visit("rates", w.rates, {w.stages + 1, w.balances});
+    each(visit, {w.balances}, "level", w.level, "level_old", w.level_old, "level_carry", w.level_carry,
+         "level_carry_new", w.level_carry_new);
+    visit("slow", w.slow, {2, w.balances});
     visit("suspect", w.suspect, {w.suspect_size()});
     visit("pivots", w.pivots, {l});
     visit("counters", w.counters, {N_COUNTERS});

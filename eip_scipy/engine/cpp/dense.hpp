@@ -36,12 +36,13 @@ struct Dense {
         if (kind == NYSTROM) return (polynomials + 1) / 2 + 1;
         return kind == POLYNOMIAL ? polynomials + 1 : kind == SEVENTH ? 3 + polynomials : 3;
     }
-    int64_t floats() const { return 3 + (3 + rows()) * work.m + 2 * work.l; }
+    int64_t floats() const { return 3 + (3 + rows()) * work.m + 2 * work.l + (2 + rows()) * work.balances; }
 };
 
 // One step's interpolant, in floats() numbers that outlive the step.
 struct Piece {
     double *t_old, *t, *known, *y_old, *y, *rows, *sigma, *levels_old, *levels;
+    double *balance_old, *balance, *balance_rows;  // the balances as the run carries them, interpolated as a state is
 
     Piece(double *first, const Dense &d)
         : t_old(first),
@@ -52,8 +53,28 @@ struct Piece {
           rows(y + d.work.m),
           sigma(rows + d.rows() * d.work.m),
           levels_old(sigma + d.work.m),
-          levels(levels_old + d.work.l) {}
+          levels(levels_old + d.work.l),
+          balance_old(levels + d.work.l),
+          balance(balance_old + d.work.balances),
+          balance_rows(balance + d.work.balances) {}
+
+    // The same for the balances, as if they were the state.
+    Piece of_balances() const {
+        Piece piece(*this);
+        piece.y_old = balance_old;
+        piece.y = balance;
+        piece.rows = balance_rows;
+        return piece;
+    }
 };
+
+// Buffers in which the balances are the state, and their rates its derivatives.
+inline Work work_of_balances(const Work &w) {
+    Work own(w);
+    own.n = own.m = w.balances;
+    own.K = w.rates;
+    return own;
+}
 
 // Dense output as a run of its own.
 struct DenseRun {
@@ -149,17 +170,9 @@ inline void polynomial(const Dense &d, const Piece &piece, double h, const Work 
     }
 }
 
-// DOP853's of order 7, from three more evaluations: rows change, h f_old - change, 2 change - h (f + f_old), h D K.
-inline void seventh(const DenseRun &dense, const Piece &piece, double h, const double *y_old, const Work &step) {
-    const Dense &d = dense.dense;
-    const Work &w = dense.work;
-    const int64_t known = step.stages + 1, m = w.m;
-    copy(step.K, w.K, known * m);
-    for (int64_t k = 0; k < d.further; ++k) {
-        combine(y_old, h, {d.A + k * d.columns, w.K, known + k, m}, w.stage, m);
-        dense.run.system.rhs_of_scratch(w, *piece.t_old + d.c[k] * h, w.stage, w.row(known + k));
-        ++w.counters[NFEV];
-    }
+// Its rows, where w.K holds all stages: change, h f_old - change, 2 change - h (f + f_old), h D K.
+inline void rows_of_seventh(const Dense &d, const Piece &piece, double h, const Work &step, const Work &w) {
+    const int64_t m = w.m;
     double *change = piece.rows, *left = change + m, *bend = left + m;
     for (int64_t i = 0; i < m; ++i) {
         change[i] = piece.y[i] - piece.y_old[i];
@@ -168,6 +181,27 @@ inline void seventh(const DenseRun &dense, const Piece &piece, double h, const d
     }
     for (int64_t j = 0; j < d.polynomials; ++j)
         weighted_sum(h, {d.weights + j * d.columns, w.K, d.columns, m}, bend + (1 + j) * m, m);
+}
+
+// DOP853's of order 7, from three more evaluations.
+inline void seventh(const DenseRun &dense, const Piece &piece, double h, const double *y_old, const Work &step) {
+    const Dense &d = dense.dense;
+    const Work &w = dense.work;
+    const int64_t known = step.stages + 1, m = w.m;
+    copy(step.K, w.K, known * m);
+    copy(step.rates, w.rates, known * w.balances);
+    for (int64_t k = 0; k < d.further; ++k) {
+        const double t = *piece.t_old + d.c[k] * h;
+        combine(y_old, h, {d.A + k * d.columns, w.K, known + k, m}, w.stage, m);
+        if (w.balances == 0) {
+            dense.run.system.rhs_of_scratch(w, t, w.stage, w.row(known + k));
+        } else {
+            dense.run.system.rhs(w, t, w.stage, w.row(known + k));
+            dense.run.system.rates(w, t, w.stage, w.row(known + k), w.rate(known + k));
+        }
+        ++w.counters[NFEV];
+    }
+    rows_of_seventh(d, piece, h, step, w);
 }
 
 // Constants of the recurrences below, which take divisions.
@@ -342,7 +376,7 @@ inline bool project_sample(const Run &run, double t, double *out) {
         for (int64_t i = 0; i < w.l; ++i) sure &= std::abs(w.before[i]) <= SMALL_SHARE * o.per_band * w.band[i];
         if (sure) return all_finite(out, w.m);
         evaluate_invariants(run, t, out);
-        if (judge(w.before, nullptr, out, o, w) != OK) return false;
+        if (judge(limits(o, w), nullptr, out, o, w) != OK) return false;
         for (int64_t i = 0; i < w.l; ++i) met &= std::abs(w.defect[i]) <= w.band[i];
         if (met) return true;
         copy(out, w.y_hat, w.m);
@@ -350,11 +384,12 @@ inline bool project_sample(const Run &run, double t, double *out) {
     return true;
 }
 
-// The state y at t, which no projection has made, as it is handed out: a copy projected onto the targets, or y itself if it
+// The state y at t, where the balances have these values, which no projection has made, as it is handed out: a copy projected onto the targets, or y itself if it
 // misses them by rounding only, or if no state nearby meets them. With the error metric each block moves in proportion to
 // its size. The copy depends on nothing but the state, so that it is the same as the end of one step and as the start of the
 // next.
-inline void hand_out(const Run &run, const DenseRun &dense, double t, const double *y, double *out) {
+inline void hand_out(const Run &run, const DenseRun &dense, double t, const double *y, const double *balances,
+                     double *out) {
     const Dense &d = dense.dense;
     const Work &w = dense.work;
     System &system = dense.run.system;
@@ -364,6 +399,7 @@ inline void hand_out(const Run &run, const DenseRun &dense, double t, const doub
     };
     copy(y, out, w.m);
     copy(run.work.target, w.target, w.l);
+    for (int64_t b = 0; b < w.balances; ++b) w.target[d.options.balances.place[b]] = balances[b];
     system.inv(w, t, y, w.values);
     bool meets = true;
     for (int64_t i = 0; i < w.l; ++i) {
@@ -384,6 +420,22 @@ inline void hand_out(const Run &run, const DenseRun &dense, double t, const doub
     if (!met) copy(y, out, w.m);
 }
 
+// The interpolant of the balances, of the kind that the state has, with their rates in the place of its derivatives.
+inline void describe_balances(const Dense &d, const Piece &piece, double h, const Work &step, const Work &w) {
+    const Work rates = work_of_balances(w), rates_of_step = work_of_balances(step);
+    const Piece balances = piece.of_balances();
+    copy(step.level_old, balances.y_old, w.balances);
+    copy(step.level, balances.y, w.balances);
+    if (d.kind == CUBIC) cubic(balances, h, rates_of_step.row(0), rates_of_step.last(), rates);
+    if (d.kind == HISTORY) {
+        const Multistep &ms = *d.multistep;
+        const int64_t back = nodes_back(ms, *piece.t_old), at = ms.place[NEWEST_ROW] - back;
+        cubic(balances, h, ms.rates_at(at), back > 0 ? ms.rates_at(at + 1) : rates_of_step.last(), rates);
+    }
+    if (d.kind == POLYNOMIAL) polynomial(d, balances, h, rates_of_step, rates);
+    if (d.kind == SEVENTH) rows_of_seventh(d, balances, h, rates_of_step, rates);
+}
+
 // The interpolant over a step from y_old at t_old to y at t, from the buffers that it left. It meets the states at both ends
 // as they are handed out.
 inline void describe(const Run &run, const DenseRun &dense, double t_old, const double *y_old, double t,
@@ -395,12 +447,12 @@ inline void describe(const Run &run, const DenseRun &dense, double t_old, const 
     *piece.t_old = t_old;
     *piece.t = t;
     *piece.known = 0.0;
-    const auto end_of_piece = [&](bool waiting, double time, const double *state, double *end) {
-        if (d.shows && waiting) return hand_out(run, dense, time, state, end);
+    const auto end_of_piece = [&](bool waiting, double time, const double *state, const double *balances, double *end) {
+        if (d.shows && waiting) return hand_out(run, dense, time, state, balances, end);
         copy(state, end, w.m);
     };
-    end_of_piece(d.waiting[0], t_old, y_old, piece.y_old);
-    end_of_piece(d.waiting[1], t, y, piece.y);
+    end_of_piece(d.waiting[0], t_old, y_old, step.level_old, piece.y_old);
+    end_of_piece(d.waiting[1], t, y, step.level, piece.y);
     const double *f_old = step.row(0), *f = step.last();
     if (d.own_slopes) {
         f_old = w.row(0);
@@ -421,10 +473,19 @@ inline void describe(const Run &run, const DenseRun &dense, double t_old, const 
         f_old = w.row(0);
         f = w.last();
     }
+    if (w.balances > 0) describe_balances(d, piece, h, step, w);
     if (d.by_travel)
         travelled(piece, h, f_old, f, d.options.blocks, w);
     else
         copy(step.sigma, piece.sigma, w.m);
+}
+
+// The cubic at t_old + theta h.
+inline void from_cubic(const Piece &piece, double theta, double *out, const Work &w) {
+    const int64_t m = w.m;
+    const double rest = 1.0 - theta, *rows = piece.rows;
+    for (int64_t i = 0; i < m; ++i)
+        out[i] = piece.y_old[i] + theta * rows[i] + theta * rest * (rest * rows[m + i] - theta * rows[2 * m + i]);
 }
 
 // The interpolant itself, at t_old + theta h.
@@ -439,8 +500,7 @@ inline void evaluate(const Dense &d, const Piece &piece, double theta, double *o
         from_accelerations(d, piece, theta, out, w);
         for (int64_t i = 0; i < m; ++i) out[i] += share * missing[i];
     } else if (d.kind == CUBIC) {
-        for (int64_t i = 0; i < m; ++i)
-            out[i] = piece.y_old[i] + theta * rows[i] + theta * rest * (rest * rows[m + i] - theta * rows[2 * m + i]);
+        from_cubic(piece, theta, out, w);
     } else if (d.kind == QUINTIC) {
         const double h = *piece.t - *piece.t_old;
         for (int64_t i = 0; i < half; ++i) {
@@ -486,6 +546,15 @@ inline void interpolate(const DenseRun &dense, double *floats, double t, double 
     }
     const double share = std::min(1.0, std::max(0.0, theta));
     for (int64_t i = 0; i < w.l; ++i) w.target[i] = (1.0 - share) * piece.levels_old[i] + share * piece.levels[i];
+    if (w.balances > 0) {  // these change by more than a line between the two ends
+        if (d.kind == HISTORY)
+            from_cubic(piece.of_balances(), theta, w.rates, work_of_balances(w));
+        else
+            evaluate(d, piece.of_balances(), theta, w.rates, work_of_balances(w));
+        for (int64_t b = 0; b < w.balances; ++b)
+            w.target[d.options.balances.place[b]] +=
+                w.rates[b] - ((1.0 - share) * piece.balance_old[b] + share * piece.balance[b]);
+    }
     copy(piece.sigma, w.sigma, w.m);
     copy(out, w.y_hat, w.m);
     if (project_sample(dense.run, t, out)) return;

@@ -1,6 +1,7 @@
 // Gradients by central differences of order 6; `difference_gradient` in core/invariants.py computes the same bits.
 #pragma once
 
+#include <algorithm>
 #include <limits>
 #include <vector>
 
@@ -69,7 +70,7 @@ inline void difference_gradient(const Values &values_at, const double *y, int64_
     s.values.resize(2 * PAIRS * l);
     s.sums.resize(l);
     for (int64_t j = 0; j < s.m; ++j) {
-        double shift = first_shift(y, j, s), least = INFINITE;
+        double shift = first_shift(y, j, s), least = ENDLESS;
         for (int64_t k = 0; k < l; ++k) G[k * s.m + j] = NOT_A_NUMBER;
         for (int tries = 0; tries < MOST_SHIFTS; ++tries, shift *= SHORTER) {
             const double excess = shifted_sums(values_at, y, j, shift, l, s);
@@ -79,6 +80,48 @@ inline void difference_gradient(const Values &values_at, const double *y, int64_
             }
             if (least <= 1.0) break;
         }
+    }
+}
+
+// Where derivatives in time are taken: the interval of the run, which they do not leave, and the shift, a power of two.
+struct Times {
+    double low = 0.0, high = 0.0, shift = 0.0;
+    std::vector<double> values;
+};
+
+constexpr int64_t ONE_SIDED = 6;
+constexpr double TO_ONE_SIDE[] = {-49.0 / 20.0, 6.0, -15.0 / 2.0, 20.0 / 3.0, -15.0 / 4.0, 6.0 / 5.0, -1.0 / 6.0};
+
+// The derivative in time of `l` values by differences of order 6, to one side next to an end of the interval. It is exactly
+// zero where the values at the two or three outermost times are equal: the others are not looked at then.
+template <class Values>
+[[gnu::noinline]] inline void time_difference(const Values &values_at, double t, int64_t l, Times &times, double *out) {
+    fill(out, 0.0, l);
+    if (!(times.shift > 0.0)) return;
+    times.values.resize((ONE_SIDED + 1) * l);
+    double *values = times.values.data();
+    const double reach = PAIRS * times.shift;
+    const bool central = t - reach >= times.low && t + reach <= times.high;
+    const double shift = central || times.high - t >= t - times.low ? times.shift : -times.shift;
+    const auto evaluate = [&](int64_t k) {
+        values_at(t + static_cast<double>(central ? k - PAIRS : k) * shift, values + k * l);
+    };
+    evaluate(0);
+    evaluate(ONE_SIDED);
+    bool changes = !std::equal(values, values + l, values + ONE_SIDED * l);
+    if (!central) {
+        evaluate(1);
+        changes = changes || !std::equal(values, values + l, values + l);
+    }
+    if (!changes) return;
+    for (int64_t k = central ? 1 : 2; k < ONE_SIDED; ++k)
+        if (!central || k != PAIRS) evaluate(k);
+    for (int64_t i = 0; i < l; ++i) {
+        double sum = 0.0;
+        for (int64_t k = 0; central && k < PAIRS; ++k)
+            sum += ORDER_6[k] * (values[(PAIRS + 1 + k) * l + i] - values[(PAIRS - 1 - k) * l + i]);
+        for (int64_t k = 1; !central && k <= ONE_SIDED; ++k) sum += TO_ONE_SIDE[k] * (values[k * l + i] - values[i]);
+        out[i] = sum / shift;
     }
 }
 

@@ -23,7 +23,7 @@ inline double relative_square(const double *a, int64_t i, const double *y, const
         part = std::hypot(a[2 * i], a[2 * i + 1]);
     }
     const double scale = o.atol[i] + o.rtol[o.blocks.width * i] * size;
-    if (scale == 0.0) return part == 0.0 ? 0.0 : INFINITE;
+    if (scale == 0.0) return part == 0.0 ? 0.0 : ENDLESS;
     const double ratio = part / scale;
     return ratio * ratio;
 }

@@ -2,6 +2,8 @@
 // what fills an array, as users' functions that are given to `integrate`.
 #include "module.hpp"
 
+#include <nanobind/stl/vector.h>
+
 #include "library.hpp"
 
 namespace eip {
@@ -24,32 +26,35 @@ Array out_of(PyObject *object, const LibraryFunction &function, int64_t n) {
 }
 
 void require_count(const LibraryFunction &function, Py_ssize_t count, bool by_f) {
-    const Py_ssize_t expected = 3 + by_f + !function.returns();
-    if (count == expected) return;
+    const Py_ssize_t expected = 3 + by_f + !function.returns() - !function.own.empty();
+    if (count == expected || (count > expected && !function.own.empty())) return;
     refuse(PyExc_TypeError, "%s takes (t, y%s%s, params), %zd arguments; got %zd", function.name, by_f ? ", f" : "",
            function.returns() ? "" : ", out", expected, count);
 }
 
 nb::object called(const LibraryFunction &function, PyObject *const *arguments, Py_ssize_t count) {
-    const bool by_f = function.value == Value::GRADIENT_BY_F;
+    const bool by_f = function.takes_f();
     require_count(function, count, by_f);
     const double t = PyFloat_AsDouble(arguments[0]);
     if (t == -1.0 && PyErr_Occurred()) throw nb::python_error();
-    const Array y = vector_of(arguments[1]), params = vector_of(arguments[count - 1]);
-    const int64_t n = y.size(), p = params.size();
+    const Array y = vector_of(arguments[1]);
+    Array given;
+    if (function.own.empty()) given = vector_of(arguments[count - 1]);
+    const double *params = function.own.empty() ? given.floats() : function.own.data();
+    const int64_t n = y.size(), p = function.own.empty() ? given.size() : std::ssize(function.own);
     require_sizes(function, n, p);
     Array f;
     if (by_f) f = vector_of(arguments[2]);
     if (by_f && f.size() != n)
         refuse(PyExc_ValueError, "%s: f has %lld numbers, y has %lld", function.name, static_cast<long long>(f.size()),
                static_cast<long long>(n));
-    Array out = function.returns() ? new_array({function.filled(n)}) : out_of(arguments[count - 2], function, n);
-    function.one(t, y.floats(), by_f ? f.floats() : nullptr, out.floats(), params.floats(), n, p);
+    Array out = function.returns() ? new_array({function.filled(n)}) : out_of(arguments[2 + by_f], function, n);
+    function.one(t, y.floats(), by_f ? f.floats() : nullptr, out.floats(), params, n, p);
     if (!function.returns()) {
         if (PyArray_ResolveWritebackIfCopy(out.get()) < 0) throw nb::python_error();
         return nb::none();
     }
-    if (function.value == Value::NUMBERS && function.numbers == 1) return nb::float_(out.floats()[0]);
+    if (function.is_numbers() && function.numbers == 1) return nb::float_(out.floats()[0]);
     return out;
 }
 
@@ -92,7 +97,7 @@ PyType_Slot slots[] = {{Py_tp_call, reinterpret_cast<void *>(call)}, {Py_tp_gets
 }  // namespace
 
 void require_sizes(const LibraryFunction &function, int64_t n, int64_t p) {
-    if (function.fits(n, p)) return;
+    if (function.fits(n, function.own.empty() ? p : std::ssize(function.own))) return;
     refuse(PyExc_ValueError, "%s takes %s; got %lld numbers and %lld parameters", function.name, function.sizes,
            static_cast<long long>(n), static_cast<long long>(p));
 }
@@ -102,8 +107,7 @@ void add_library(nb::module_ &module) {
     nb::class_<Function>(module, "LibraryFunction", nb::type_slots(slots),
                          "A function of one of the library's problems.")
         .def_prop_ro(
-            "takes_f", [](const Function &f) { return f.value == Value::GRADIENT_BY_F; },
-            "Whether it takes the derivative of the state.")
+            "takes_f", [](const Function &f) { return f.takes_f(); }, "Whether it takes the derivative of the state.")
         .def_prop_ro(
             "in_place", [](const Function &f) { return !f.returns(); }, "Whether it fills an array.")
         .def_prop_ro(
@@ -116,22 +120,33 @@ void add_library(nb::module_ &module) {
             "fits_address", [](const Function &f) { return address(f.fits); },
             "Of ``bool fits(int64_t n, int64_t p)``.")
         .def_prop_ro(
-            "numbers", [](const Function &f) { return std::max<int64_t>(f.numbers, 1); },
+            "numbers", [](const Function &f) { return f.numbers == 0 ? 1 : f.numbers; },
             "How many numbers, or states, it fills.")
         .def_prop_ro(
-            "fills_states", [](const Function &f) { return f.value != Value::NUMBERS; },
-            "Whether these are of the state's size.")
+            "fills_states", [](const Function &f) { return !f.is_numbers(); }, "Whether these are of the state's size.")
         .def_prop_ro(
-            "octet_address", [](const Function &f) { return address(f.eight); },
+            "octet_address", [](const Function &f) { return f.own.empty() ? address(f.eight) : 0; },
             "For eight states side by side, 0 where there is none.")
+        .def(
+            "bound",
+            [](const Function &f, nb::handle params) {
+                Function out = f;
+                const Array given = vector_of(params.ptr());
+                require(given.size() > 0, "a function is bound to one parameter at least");
+                out.own.assign(given.floats(), given.floats() + given.size());
+                return out;
+            },
+            nb::arg("params"), "Return the function with parameters of its own, which replace those of a run.")
+        .def_prop_ro(
+            "own", [](const Function &f) { return f.own; }, "Its own parameters; empty if it takes those of the run.")
         .def("__repr__", [](const Function &f) { return nb::str("<{} of eip_scipy>").format(f.name); })
         // By its name, so that it travels to other processes.
         .def("__reduce__", [](const Function &f) {
             const nb::object made = nb::module_::import_("eip_scipy.engine.native").attr("library_function");
-            return nb::make_tuple(made, nb::make_tuple(f.name));
+            return nb::make_tuple(made, nb::make_tuple(f.name, f.own));
         });
     nb::dict library;
-    for (const auto functions : {kepler_functions(), gravity_functions(), force_functions()})
+    for (const auto functions : {kepler_functions(), gravity_functions(), force_functions(), orbit_functions()})
         for (const Function &function : functions)
             library[function.name] = nb::cast(&function, nb::rv_policy::reference);
     module.attr("LIBRARY") = library;

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <span>
+#include <vector>
 
 #include "octet.hpp"
 
@@ -29,8 +30,11 @@ void plain(double t, const T *y, const T *f, T *out, const T *params, int64_t n,
 }
 
 // What its value is: the derivative of the state, of its size, in place; the accelerations at positions; numbers, of
-// which one stands for itself; gradients of so many numbers, in place.
-enum class Value { DERIVATIVE, ACCELERATION, NUMBERS, GRADIENT, GRADIENT_BY_F };
+// which one stands for itself; rates of numbers, which take f; gradients of so many numbers, in place.
+enum class Value { DERIVATIVE, ACCELERATION, NUMBERS, RATES, GRADIENT, GRADIENT_BY_F };
+
+// A multiple of it in place of the number of numbers: this many numbers for each of the N - 1 orbits of N bodies.
+constexpr int64_t EACH_ORBIT = -1;
 
 struct LibraryFunction {
     const char *name;
@@ -39,14 +43,34 @@ struct LibraryFunction {
     LibraryPointer<double> one;
     LibraryPointer<Octet> eight;  // null where there is none
     bool (*fits)(int64_t n, int64_t p);
-    const char *sizes;  // what fits
+    const char *sizes;          // what fits
+    std::vector<double> own{};  // parameters that replace those of the run; empty in the library itself
 
     bool is_gradient() const { return value == Value::GRADIENT || value == Value::GRADIENT_BY_F; }
-    bool returns() const { return value == Value::ACCELERATION || value == Value::NUMBERS; }
+    bool is_numbers() const { return value == Value::NUMBERS || value == Value::RATES; }
+    bool takes_f() const { return value == Value::RATES || value == Value::GRADIENT_BY_F; }
+    bool returns() const { return value == Value::ACCELERATION || is_numbers(); }
     // Numbers in `out` for a state of n.
     int64_t filled(int64_t n) const {
-        if (value == Value::NUMBERS) return numbers;
-        return is_gradient() ? numbers * n : n;
+        if (is_numbers()) return numbers_of(n);
+        return is_gradient() ? numbers_of(n) * n : n;
+    }
+    int64_t numbers_of(int64_t n) const { return numbers < 0 ? numbers / EACH_ORBIT * (n / 6 - 1) : numbers; }
+};
+
+// Such a function as a run calls it: with its own parameters if it has any, else with those of the run. The object in Python
+// that holds them must outlive the call.
+template <class T>
+struct LibraryCall {
+    LibraryPointer<T> pointer = nullptr;
+    const T *own = nullptr;
+    int64_t n_own = 0;
+
+    explicit operator bool() const { return pointer; }
+    void operator()(double t, const T *y, const T *f, T *out, const T *params, int64_t n, int64_t p) const {
+        if (own) [[unlikely]]
+            return pointer(t, y, f, out, own, n, n_own);
+        pointer(t, y, f, out, params, n, p);
     }
 };
 
@@ -56,5 +80,6 @@ void require_sizes(const LibraryFunction &function, int64_t n, int64_t p);
 std::span<const LibraryFunction> kepler_functions();
 std::span<const LibraryFunction> gravity_functions();
 std::span<const LibraryFunction> force_functions();
+std::span<const LibraryFunction> orbit_functions();
 
 }  // namespace eip

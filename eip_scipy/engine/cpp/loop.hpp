@@ -220,7 +220,7 @@ inline void give(const AnyRun &run, const Samples *samples, int64_t end, double 
     const auto &w = run.work;
     if (!samples || !samples->dense.shows || !samples->dense.waiting[end]) return copy(y, out, w.m);
     const DenseRun dense(samples->dense, run.system);
-    hand_out(of_any_length(run), dense, t, y, out);
+    hand_out(of_any_length(run), dense, t, y, w.level, out);
     count_calls(dense, of_any_length(run).work);
 }
 
@@ -290,6 +290,7 @@ template <class AnyRun>
         if (place[PENDING] == 1) {
             s.clock[TIME] = s.clock[TIME_NEW];
             copy(w.last(), w.row(0), w.m);
+            copy(w.rate(w.stages), w.rate(0), w.balances);
             copy(y_new, y, w.m);
             copy(s.g_new, s.g, s.n_events);
             copy(s.rate_new, s.rate, s.n_events);
@@ -306,7 +307,10 @@ template <class AnyRun>
         const Code status = stop == k + 1
                                 ? next_step(run, s.span, s.clock, k, y, y_new)
                                 : next_states(OneState{of_any_length(run), y_new}, s.span, s.clock, k, stop, y, y_new);
-        if (status != OK) return status;
+        if (status != OK) {
+            restore_levels(run.options.balances, w);
+            return status;
+        }
         place[STEP] = stop;
         place[PENDING] = 1;
         const double t_new = s.clock[TIME_NEW];

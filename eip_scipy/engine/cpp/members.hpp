@@ -50,7 +50,7 @@ inline void clear_notes(const Members &members, const Options &o, const W &w) {
     std::fill_n(w.counters, static_cast<int64_t>(N_COUNTERS), 0);
     w.counters[NFEV] = members.evaluations;
     fill(w.trust, 0.0, w.l * N_FIGURES);
-    for (int64_t i = 0; i < w.l; ++i) w.figures(i)[TERMS] = INFINITE;
+    for (int64_t i = 0; i < w.l; ++i) w.figures(i)[TERMS] = ENDLESS;
 }
 
 // Targets and gradients at the start y, with f there in the first row of K; whether all of it is finite.

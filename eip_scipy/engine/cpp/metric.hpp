@@ -232,7 +232,7 @@ inline double relative_errors(const double *y, const AnyRun &run) {
 // Remember the errors of a step that is accepted.
 template <class W>
 inline void remember_errors(const Options &o, const W &w) {
-    if (o.metric == ERROR) copy(w.memory_new, w.memory, o.blocks.size == 1 ? w.m : o.blocks.count);
+    if (o.metric == BY_ERROR) copy(w.memory_new, w.memory, o.blocks.size == 1 ? w.m : o.blocks.count);
 }
 
 // Largest ratio over the blocks of the correction to the step's largest local error; 0 where there is none.

@@ -91,6 +91,9 @@ class Engine {
         const int64_t events = schedule_ ? schedule_->n_events : 0;
         const bool native = truth(functions, "native");
         const nb::object python = native ? nb::object(functions.attr("python")) : functions;
+        require(data_.work.balances == 0 || data_.options.balances.stages == data_.work.stages,
+                "engine: the balances do not fit the stages");
+        read_balances(functions, data_.work, system);
         if (native) read_pointers(functions, data_.work, python.is_none() ? events : 0, kept_, system);
         if (!python.is_none()) {
             functions_ = std::make_unique<PythonFunctions>(python, buffers.owner(), data_.work, type_, kept_);
@@ -211,9 +214,11 @@ class Engine {
         const double *from = checked(y, "y");
         copy(checked(f, "f"), w.row(0), w.m);
         s.clock[TIME] = t;
+        if (stepped_) copy(w.rate(w.stages), w.rate(0), w.balances);
         Array y_new = new_array({w.n}, type_), f_new = new_array({w.n}, type_);
         if (hooks_) hooks_->set_state(y_new);
         const Code code = stepped([&](const Run &run) { return step_once(run, s, k, from, y_new.floats()); });
+        stepped_ = true;
         copy(w.last(), f_new.floats(), w.m);
         return {code, s.clock[TIME_NEW], std::move(y_new), std::move(f_new)};
     }
@@ -316,6 +321,7 @@ class Engine {
     std::unique_ptr<PythonHooks> hooks_;
     int type_ = NPY_DOUBLE;
     bool busy_ = false, interpolating_ = false;
+    bool stepped_ = false;  // by `step`
 };
 
 int traverse(PyObject *self, visitproc visit, void *arg) {
@@ -392,7 +398,7 @@ void add_constants(nb::module_ &m) {
     m.attr("MOST_CROSSINGS") = MOST_CROSSINGS;
     m.attr("EPS") = EPS;
     m.attr("LARGE") = LARGE;
-    m.attr("FAR") = FAR;
+    m.attr("DISTANT") = DISTANT;
     m.attr("LARGE_SHARE") = LARGE_SHARE;
     m.attr("LEAST_CHANGE") = LEAST_CHANGE;
     m.attr("SOURCES") = EIP_SOURCES;

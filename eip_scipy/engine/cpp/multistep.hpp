@@ -16,25 +16,6 @@ constexpr double MEMORY = 0.9;
 constexpr int64_t LEVELS = 64;
 constexpr double LEVEL_DISTANCE = 0x1p-44, LEVEL_BANDS = 4.0;
 
-inline Pair quotient(const Pair &a, const Pair &b) {
-    const double first = a.value / b.value;
-    const Pair product = two_product(first, b.value);
-    const double rest = (a.value - product.value) - product.rest + a.rest - first * b.rest;
-    return two_sum(first, rest / b.value);
-}
-
-template <class Value>
-inline PairOf<Value> product(const PairOf<Value> &a, const PairOf<Value> &b) {
-    const PairOf<Value> p = two_product(a.value, b.value);
-    return two_sum<Value>(p.value, p.rest + (a.value * b.rest + a.rest * b.value));
-}
-
-template <class Value>
-inline PairOf<Value> sum(const PairOf<Value> &a, const PairOf<Value> &b) {
-    const PairOf<Value> s = two_sum(a.value, b.value);
-    return two_sum<Value>(s.value, s.rest + (a.rest + b.rest));
-}
-
 inline double *newest(const Multistep &ms) { return ms.nodes + ms.place[NEWEST_ROW] * ms.pitch; }
 
 // The `count` newest nodes under their weights.
@@ -86,6 +67,7 @@ inline double *next_row(const Multistep &ms) {
     int64_t &at = ms.place[NEWEST_ROW];
     if (at + 1 == ms.rows) {
         std::copy(newest(ms) - (ms.order - 1) * ms.pitch, newest(ms) + ms.pitch, ms.nodes);
+        std::copy(ms.rates_at(at + 1 - ms.order), ms.rates_at(at + 1), ms.rates);
         at = ms.order - 1;
     }
     return ms.nodes + (at + 1) * ms.pitch;
@@ -166,6 +148,102 @@ inline void begin_sums(const Multistep &ms, int64_t back, double *scratch) {
     }
 }
 
+// What the rates of the history add to the sum of the rates of balance b, for its value `back` nodes before the newest.
+inline double rates_beside_sum(const Multistep &ms, int64_t back, int64_t b) {
+    const double *weights = ms.states_v + back * ms.order, *oldest = ms.rates_at(ms.place[NEWEST_ROW] + 1 - ms.order);
+    double kick = 0.0;
+    for (int64_t j = 0; j < ms.order; ++j) kick += weights[j] * oldest[j * ms.balances + b];
+    return kick;
+}
+
+// The value of balance b `back` nodes before the newest, as a pair of floats: by the formula of the velocities, with rates in
+// the place of accelerations.
+inline Pair balance_at(const Multistep &ms, int64_t back, int64_t b) {
+    const Pair total{ms.rate_sums[b], ms.rate_sums[ms.balances + b]};
+    const Pair first = sum(total, Pair{rates_beside_sum(ms, back, b), 0.0});
+    return product(Pair{ms.h, 0.0}, first);
+}
+
+// The sum of the rates, from the values at the oldest node, which are those of w.level.
+inline void begin_rate_sums(const Multistep &ms, const Work &w) {
+    for (int64_t b = 0; b < ms.balances; ++b) {
+        const Pair scaled = quotient({w.level[b], w.level_carry[b]}, {ms.h, 0.0});
+        const Pair first = sum(scaled, Pair{-rates_beside_sum(ms, ms.order - 1, b), 0.0});
+        ms.rate_sums[b] = first.value;
+        ms.rate_sums[ms.balances + b] = first.rest;
+    }
+}
+
+// The rates of the next node, whose state is in w.stage and whose acceleration has not been corrected, and their sum. What
+// the correction changes is as large as the errors of the predictor, and more than the rates' own.
+inline void add_rates(const Run &run, double t, const double *a) {
+    const Multistep &ms = *run.method.multistep;
+    const Work &w = run.work;
+    double *rates = ms.rates_at(ms.place[NEWEST_ROW] + 1), *s = ms.rate_sums, *s_rest = s + ms.balances;
+    copy(w.stage + ms.half, w.row(1), ms.half);
+    copy(a, w.row(1) + ms.half, ms.half);
+    run.system.rates(w, t, w.stage, w.row(1), rates);
+    for (int64_t b = 0; b < ms.balances; ++b) {
+        const Pair first = two_sum(s[b], rates[b]);
+        s[b] = first.value;
+        s_rest[b] += first.rest;
+    }
+}
+
+// The values of the balances `back` nodes before the newest as targets.
+inline void aim_at_node(const Run &run, int64_t back) {
+    const Multistep &ms = *run.method.multistep;
+    for (int64_t b = 0; b < ms.balances; ++b)
+        run.work.target[run.options.balances.place[b]] = balance_at(ms, back, b).value;
+}
+
+// The balances at both ends of a step that ends `back` nodes before the newest.
+inline void keep_balances(const Run &run, int64_t back) {
+    const Multistep &ms = *run.method.multistep;
+    const Work &w = run.work;
+    for (int64_t b = 0; b < ms.balances; ++b) {
+        const Pair now = balance_at(ms, back, b);
+        if (back + 1 < ms.order) w.level_old[b] = balance_at(ms, back + 1, b).value;
+        w.level[b] = now.value;
+        w.level_carry[b] = now.rest;
+    }
+    restore_levels(run.options.balances, w);
+}
+
+// The balances at the end of a run, `length` behind the newest node, where w.y_hat is the state and w.last() its derivative:
+// the polynomial through the rates there and at the newest nodes, integrated by Gauss's formula of six points.
+inline void finish_balances(const Run &run, double t, double length) {
+    constexpr int64_t MOST = 12;  // points
+    constexpr double FROM_MIDDLE[] = {0.1193095930415985, 0.3306046932331323, 0.4662347571015760};
+    constexpr double PARTS[] = {0.2339569672863455, 0.1803807865240693, 0.0856622461895852};
+    const Multistep &ms = *run.method.multistep;
+    const Work &w = run.work;
+    const int64_t points = std::min(MOST, ms.order + 1);
+    const double share = length / ms.h;
+    const auto at = [&](int64_t k) { return k == 0 ? share : static_cast<double>(1 - k); };
+    double *end = w.rate(w.stages);
+    run.system.rates(w, t, w.y_hat, w.last(), end);
+    keep_balances(run, 0);
+    copy(w.level, w.level_old, ms.balances);
+    for (int64_t j = 0; j < points; ++j) {
+        double weight = 0.0;
+        for (int g = 0; g < 6; ++g) {
+            const double place = share * (0.5 + (g % 2 ? 1.0 : -1.0) * FROM_MIDDLE[g / 2]);
+            double basis = PARTS[g / 2] * length;
+            for (int64_t k = 0; k < points; ++k)
+                if (k != j) basis *= (place - at(k)) / (at(j) - at(k));
+            weight += basis;
+        }
+        const double *rates = j == 0 ? end : ms.rates_at(ms.place[NEWEST_ROW] + 1 - j);
+        for (int64_t b = 0; b < ms.balances; ++b) {
+            const Pair sum = two_sum(w.level[b], weight * rates[b]);
+            w.level[b] = sum.value;
+            w.level_carry[b] += sum.rest;
+        }
+    }
+    restore_levels(run.options.balances, w);
+}
+
 // As before the first step.
 inline void forget_history(const Multistep &ms, int64_t l) {
     std::fill_n(ms.place, static_cast<int64_t>(N_NODE_PLACES), 0);
@@ -242,6 +320,9 @@ inline Code begin_history(const AnyRun &run, double *y) {
         if (run.system.MEMBERS == 1 && !all_finite(w.row(0), w.m)) return NOT_FINITE;
         copy(w.row(0) + ms.half, next_row(ms), ms.half);
         ++ms.place[NEWEST_ROW];
+        if constexpr (IS_SINGLE<AnyRun>)
+            if (ms.balances > 0)
+                run.system.rates(w, ms.t0 + static_cast<double>(k) * ms.h, y, w.row(0), ms.rates_at(k));
         if (k != ms.order - 1 - ms.middle) continue;
         for (int64_t part = 0; part < 2; ++part) {
             copy(y + part * ms.half, S + 2 * part * ms.pitch, ms.half);
@@ -249,6 +330,7 @@ inline Code begin_history(const AnyRun &run, double *y) {
         }
     }
     begin_sums(ms, ms.middle, w.stage);
+    if constexpr (IS_SINGLE<AnyRun>) begin_rate_sums(ms, w);
     ms.place[NEWEST] = ms.order - 1;
     return OK;
 }
@@ -278,12 +360,17 @@ inline Code add_node(const AnyRun &run) {
     const double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
     double *y = ms.predicted, *older = y + 2 * ms.pitch;
     predict(latest(ms, ms.predict_q, ms.order), two_product(ms.h, ms.h), S, S_rest, y);
-    if (ms.uses_v) predict(latest(ms, ms.predict_v, ms.order), {ms.h, 0.0}, s, s_rest, y + ms.half);
+    if (ms.uses_v || ms.balances > 0) predict(latest(ms, ms.predict_v, ms.order), {ms.h, 0.0}, s, s_rest, y + ms.half);
     if (ms.count > 0) row_sums(latest(ms, ms.correction, ms.order), older, ms.first, ms.first + ms.count);
     double *a = next_row(ms);
+    if (ms.balances > 0) [[unlikely]]
+        copy(y, w.stage, w.m);
     run.system.acceleration(w, t, y, w.row(1), a);
     ++w.counters[NFEV];
     if (run.system.MEMBERS == 1 && !is_finite_row(ms, a)) return NOT_FINITE;
+    if constexpr (IS_SINGLE<AnyRun>)
+        if (ms.balances > 0) [[unlikely]]
+            add_rates(of_any_length(run), t, a);
     if (ms.count > 0) correct_node(run, t, y, older, a);
     add_to_sums(ms, a);
     ++ms.place[NEWEST_ROW];
@@ -394,13 +481,13 @@ inline void defects_in_the_middle(const AnyRun &run, double t, Value *scratch) {
 // small as its rounding only a part is to be taken, the less the smaller it is, because each correction turns the orbit a
 // little, in a direction that no invariant holds. What is left goes into the third row.
 template <class W>
-inline void soften_defects(const Multistep &ms, const W &w) {
+inline void soften_defects(const Multistep &ms, const Options &o, const W &w) {
     using Value = typename W::Value;
     Value *levels = as_values<Value>(ms.levels), *left = levels + 2 * w.l;
     for (int64_t i = 0; i < w.l; ++i) {
         const Value defect = w.target[i], square = defect * defect;
         const Value noise = EPS * abs_dot(w.gradient(i), w.y_hat, w.m);
-        const Value part = where(square > 0.0, square / (square + noise * noise), 0.0);
+        const Value part = o.parts.count > 0 ? Value(1.0) : where(square > 0.0, square / (square + noise * noise), 0.0);
         w.target[i] = w.values[i] - part * defect;
         left[i] = (defect - part * defect) + levels[w.l + i];
     }
@@ -421,7 +508,7 @@ inline void note_what_is_left(const Multistep &ms, const Truth<typename W::Value
 // The projection between both.
 inline Code project_softly(const Run &run, const Step &step) {
     const Multistep &ms = *run.method.multistep;
-    soften_defects(ms, run.work);
+    soften_defects(ms, run.options, run.work);
     const Code status = project_evaluated(run, step);
     note_what_is_left(ms, true, run.work);
     return status;
@@ -465,8 +552,9 @@ inline void move_sums(const Multistep &ms, const Truth<typename W::Value> &those
     gather_errors(size, static_cast<double>(ms.place[SINCE]), w);
     newest_state(run, t);
     w.counters[F_AT_RAW] = 1;
-    note_rates(Step{t, t, ms.h, w.y_hat, scratch, true, true}, o, w);
-    if (o.every == AUTO && !tells_more(w)) return OK;
+    note_rates(run, Step{t, t, ms.h, w.y_hat, scratch, true, true});
+    if (o.every == AUTO && o.parts.count == 0 && !tells_more(w)) return OK;
+    aim_at_node(run, ms.middle);
     copy(w.target, ms.levels, w.l);
     defects_in_the_middle(run, t, scratch);
     const int64_t before = w.counters[PROJECTIONS];
@@ -492,7 +580,7 @@ inline Code project_last(const Run &run, const Step &step, double from) {
     if (w.l == 0) return OK;
     run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
     w.counters[F_AT_RAW] = 1;
-    note_rates(step, run.options, w);
+    note_rates(run, step);
     evaluate_invariants(run, step.t_new, w.y_hat);
     ++w.counters[NJEV];
     copy(w.target, ms.levels, w.l);
@@ -523,6 +611,8 @@ inline Code project_last(const Run &run, const Step &step, double from) {
     ++w.counters[NFEV];
     Code status = OK;
     copy(w.y_hat, step.y_new, w.m);
+    if (step.last && ms.balances > 0)
+        finish_balances(run, step.t_new, step.t_new - (ms.t0 + static_cast<double>(ms.place[NEWEST]) * ms.h));
     if (step.last) status = project_last(run, Step{step.t, step.t_new, step.h, w.y_hat, step.y_new, true, true}, from);
     copy(w.carry_hat, w.carry, w.m);
     return status;
@@ -533,7 +623,10 @@ struct OneState {
     const Run &run;
     double *scratch;
 
-    void begin(const double *y) const { find_levels(run.system, *run.method.multistep, run.work, y); }
+    // Balances begin at their values, which a projection of their own does not take as rounded.
+    void begin(const double *y) const {
+        if (run.options.parts.count == 0) find_levels(run.system, *run.method.multistep, run.work, y);
+    }
     Code look() const { return look_at_nodes(*run.method.multistep, run.options, run.work) ? OK : UNSTABLE; }
     Code project() const { return project_nodes(run, scratch); }
     Code finish(const Step &step) const { return finish_nodes(run, step); }
@@ -586,6 +679,8 @@ inline Code next_states(const States &states, const Span &span, double *clock, i
     const Code status = advance_history(states, std::min(stop + ahead, last_node));
     if (status != OK) return status;
     const int64_t back = place[NEWEST] - stop;
+    if constexpr (IS_SINGLE<decltype(run)>)
+        if (ms.balances > 0 && !last) keep_balances(of_any_length(run), back);
     if (last || back < ahead) {
         const double length = span.between(place[NEWEST] - ms.middle, stop);
         return states.finish(Step{step.t, step.t_new, length, y, y_new, last, last});

@@ -14,7 +14,7 @@ namespace eip {
     eight.take(eights.G, lane, w.G, w.l * w.m);
     eight.take(eights.g, lane, w.g, w.l);
     weigh_rows(o.frame, w, w.Q);
-    const Matrix R = small(w.R, w.l, w);
+    const Matrix R = corner(w.R, w.l, w);
     const int64_t rank = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
     eight.rank[lane] = std::max<int64_t>(rank, 0);
     if (rank >= 0) {
@@ -32,7 +32,10 @@ template <class W>
 inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w) {
     const double waited = static_cast<double>(w.counters[WAITED]), many = std::sqrt(1.0 + waited);
     const double rounding = waited > 0 ? EPS * many : EPS;
-    const double errors = !w.counters[HAVE_ERROR] ? 0.0 : waited == 0 ? 1.0 : o.metric == ERROR ? many : 1.0 + waited;
+    const double errors = !w.counters[HAVE_ERROR] ? 0.0
+                          : waited == 0           ? 1.0
+                          : o.metric == BY_ERROR  ? many
+                                                  : 1.0 + waited;
     const auto expected_of = [&](int64_t i) {
         return errors * w.worth[i] + rounding * (o.per_band * w.band[i]) + TINY;
     };
@@ -40,7 +43,7 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w)
     for (int64_t i = 0; i < w.l; ++i) {
         const Octet *figures = w.figures(i);
         const Octet own = own_terms(i, o, w);
-        more = more | (abs(w.before[i]) > o.far * own) | (abs(w.defect[i]) > LARGE_SHARE * own);
+        more = more | (abs(w.before[i]) > o.distant * own) | (abs(w.defect[i]) > LARGE_SHARE * own);
         if (errors > 0.0)
             more = more | ((w.worth[i] > 0.0) & (abs(w.before[i] - figures[LEFT]) > LARGE * expected_of(i)));
     }
@@ -52,7 +55,7 @@ inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w)
             figures[figure] = where(those, value, figures[figure]);
         };
         set(NOTED, noted, figures[NOTED] + 1.0);
-        set(TERMS, noted, max(where(figures[TERMS] < INFINITE, figures[TERMS], 0.0), o.per_band * w.band[i]));
+        set(TERMS, noted, max(where(figures[TERMS] < ENDLESS, figures[TERMS], 0.0), o.per_band * w.band[i]));
         if (errors > 0.0) {
             const Octet size = abs(w.before[i] - figures[LEFT]), expected = expected_of(i);
             const Mask judged = noted & (w.worth[i] > 0.0);
@@ -83,7 +86,7 @@ template <class W>
     const int64_t blocks = o.blocks.count;
     Mask leave{};
     Octet largest_error = 0.0;
-    if (o.metric == ERROR) {
+    if (o.metric == BY_ERROR) {
         if (!all_move) copy(w.sigma, w.stage, w.m);
         leave = block_sizes<Octet>(y, o.compensated ? 0.0 : EPS, o, w);
         largest_error = remembered_errors(w.scale, w.ratio, w.memory, w.memory_new, memory_kept(run), o, blocks);
@@ -91,7 +94,7 @@ template <class W>
         for (int64_t j = 0; !all_move && j < w.m; ++j) w.sigma[j] = where(moved, w.sigma[j], w.stage[j]);
     }
     Octet *rows = weighed_gradients(o, w);
-    const Mask dependent = moved & !solve_gram(rows_of(rows, w), w.g, small(w.R, w.l, w), w.mu);
+    const Mask dependent = moved & !solve_gram(rows_of(rows, w), w.g, corner(w.R, w.l, w), w.mu);
     move_along(o, w, rows, eight.y_new);
     for (int64_t lane = 0; lane < LANES; ++lane)
         if (all_move || moved.lane(lane)) eight.rank[lane] = w.l;
@@ -114,7 +117,8 @@ template <class W>
     if (o.watched) done = done & !note_octet(t, done, o, w);
     for (int64_t i = 0; i < w.l; ++i)
         w.max_defect[i] = where(done, max(w.max_defect[i], abs(w.defect[i])), w.max_defect[i]);
-    for (int64_t b = 0; o.metric == ERROR && b < blocks; ++b) w.memory[b] = where(done, w.memory_new[b], w.memory[b]);
+    for (int64_t b = 0; o.metric == BY_ERROR && b < blocks; ++b)
+        w.memory[b] = where(done, w.memory_new[b], w.memory[b]);
     const Mask corrected = done & outside;
     *w.max_correction = where(corrected, max(*w.max_correction, correction), *w.max_correction);
     *eight.projections += where(corrected, 1.0, 0.0);
@@ -130,8 +134,9 @@ inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask
     const Options &o = eight.options;
     eight.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
-    if (o.every != 1 && o.metric == ERROR) quadrature(eight.flat.err, eight.flat.err_sum, eight.flat.err, eight.flat.m);
-    const Mask noticed = o.watched && w.counters[F_AT_RAW] ? alive & rates_stand_out(w) : Mask{};
+    if (o.every != 1 && o.metric == BY_ERROR)
+        quadrature(eight.flat.err, eight.flat.err_sum, eight.flat.err, eight.flat.m);
+    const Mask noticed = o.watched && w.counters[F_AT_RAW] ? alive & rates_stand_out(w, LEAST_RATE) : Mask{};
     eight.system.inv(w, step.t_new, w.y_hat, w.values);
     return noticed | project_octet_evaluated(eight, w, step.t_new, eight.y, alive & !noticed, single);
 }
@@ -152,14 +157,14 @@ inline Mask project_octet_nodes(Eight &eight, Mask &alive, const Work &single) {
     for (int lane = 0; lane < LANES; ++lane) since[lane] = static_cast<double>(ms.place[SINCE] - eight.projected[lane]);
     gather_errors(size, Octet::load(since), w);
     newest_state(run, t);
-    const Mask noticed = o.watched ? alive & rates_stand_out(w) : Mask{};
+    const Mask noticed = o.watched ? alive & rates_stand_out(w, LEAST_RATE) : Mask{};
     const Mask those = (o.every == AUTO ? alive & tells_more(w) : alive) & !noticed;
     if (!any(those)) return noticed;
     copy(w.target, as_values<Octet>(ms.levels), w.l);
     const int64_t counted = w.counters[NJEV];
     defects_in_the_middle(run, t, eight.y_new);
     w.counters[NJEV] = counted;
-    soften_defects(ms, w);
+    soften_defects(ms, o, w);
     const Octet before = *eight.projections;
     const Mask leave = project_octet_evaluated(eight, w, t, w.y_hat, those, single), done = those & !leave;
     note_what_is_left(ms, done, w);

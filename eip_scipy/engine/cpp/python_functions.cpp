@@ -127,6 +127,10 @@ PythonFunctions::PythonFunctions(nb::handle functions, nb::handle owner, const W
     calls("grad", grad_, sizes.l * sizes.m);
     calls("event", event_, -1);
     require(rhs_->floats() == (second_order_ ? m_ / 2 : m_), "engine: rhs must give as many numbers as the state has");
+    for (const nb::handle rate : nb::object(nb::object(functions.attr("rates")).attr("functions"))) {
+        rate_.emplace_back();
+        if (!rate.is_none()) rate_.back().emplace(rate, type, sizes.n, kept);
+    }
     const nb::object jacobian = functions.attr("jacobian");
     if (jacobian.is_none()) return;
     jacobian_.emplace(jacobian, type, sizes.n / 2, kept);
@@ -168,6 +172,18 @@ void PythonFunctions::event(double t, const double *y, double *values) {
 
 void PythonFunctions::jacobian(double t, const double *q, const double *dq, double *out) {
     (*jacobian_)(t, q, dq, out, owner_);
+}
+
+void PythonFunctions::inv_of(int64_t k, double t, const double *y, double *values) {
+    inv_[k](t, y, nullptr, values, {});
+}
+
+void PythonFunctions::grad_of(int64_t k, double t, const double *y, const double *f, double *G) {
+    grad_[k](t, y, f, G, owner_);
+}
+
+void PythonFunctions::rate_of(int64_t k, double t, const double *y, const double *f, double *out) {
+    (*rate_[k])(t, y, f, out, {});
 }
 
 PythonHooks::PythonHooks(nb::handle hooks, const Buffers &buffers, const Run &run, nb::list &kept)

@@ -41,7 +41,7 @@ class PythonCall {
 // The functions of a run.
 class PythonFunctions final : public Functions {
   public:
-    // `functions` has rhs, and sequences inv, grad and event; `owner` is what all memory that functions in place fill
+    // `functions` has rhs, sequences inv, grad and event, and the rates of balances; `owner` is what all memory that functions in place fill
     // belongs to.
     PythonFunctions(nb::handle functions, nb::handle owner, const Work &sizes, int type, nb::list &kept);
 
@@ -50,6 +50,9 @@ class PythonFunctions final : public Functions {
     void grad(double t, const double *y, const double *f, double *G) override;
     void event(double t, const double *y, double *values) override;
     void jacobian(double t, const double *q, const double *dq, double *out) override;
+    void inv_of(int64_t k, double t, const double *y, double *values) override;
+    void grad_of(int64_t k, double t, const double *y, const double *f, double *G) override;
+    void rate_of(int64_t k, double t, const double *y, const double *f, double *out) override;
     bool has_jacobian() const { return jacobian_.has_value(); }
     int64_t events() const { return static_cast<int64_t>(event_.size()); }
 
@@ -59,6 +62,7 @@ class PythonFunctions final : public Functions {
   private:
     std::optional<PythonCall> rhs_, jacobian_;
     std::vector<PythonCall> inv_, grad_, event_;
+    std::vector<std::optional<PythonCall>> rate_;  // of each balance that has one
     nb::handle owner_;
     int64_t m_;
     bool second_order_;

@@ -1,7 +1,11 @@
 #include "records.hpp"
 
+#include <nanobind/stl/pair.h>
+
 #include <memory>
 #include <string>
+#include <tuple>
+#include <utility>
 
 #include "library.hpp"
 
@@ -201,6 +205,8 @@ Multistep multistep_of(nb::handle record, const Work &w, nb::list &kept) {
     const bool fits = ms.first >= 0 && ms.count >= 0 && ms.first <= ms.half && ms.count <= ms.half - ms.first;
     const bool sizes =
         fits && ms.order >= 4 && ms.pitch % 4 == 0 && ms.rows > 2 * ms.order && ms.pitch >= ms.half && ms.middle >= 0;
+    require(ms.balances == w.balances && (ms.balances == 0 || !ms.brief),
+            "engine: the history does not fit the balances");
     require(w.m % 2 == 0 && sizes && ms.middle < ms.order && ms.substeps >= 1 && ms.spacing >= 1 && ms.h != 0.0,
             "engine: the record of the multistep method does not fit the run");
     return ms;
@@ -218,6 +224,29 @@ static void check_blocks(const Blocks &b, int64_t m) {
     require(b.starts >= 1 && (b.width == 1 || b.width == 2) && consecutive, "engine: groups do not fit the state");
 }
 
+static void check_balances(const Balances &b, const Work &w) {
+    bool good = b.count == w.balances;
+    for (int64_t k = 0; k < b.count; ++k) good &= b.place[k] >= 0 && b.place[k] < w.l;
+    require(good, "engine: the balances do not fit the run");
+}
+
+// Whether numbers ascend from 0 to the last of them.
+static bool ascend(const int64_t *first, int64_t count, int64_t last) {
+    bool good = first[0] == 0 && first[count] == last;
+    for (int64_t k = 0; k < count; ++k) good &= first[k] <= first[k + 1];
+    return good;
+}
+
+static void check_parts(const Groups &g, const Work &w) {
+    bool good = g.count >= 0 && g.directions >= 0 && ascend(g.first_value, g.count, g.values) &&
+                ascend(g.first_direction, g.count, g.directions) && ascend(g.first_float, g.directions, g.floats) &&
+                (g.count == 0 || g.values == w.l);
+    for (int64_t k = 0; k < g.values; ++k) good &= g.value[k] >= 0 && g.value[k] < w.l;
+    for (int64_t k = 0; k < g.floats; ++k) good &= g.place[k] >= 0 && g.place[k] < w.m;
+    for (int64_t k = 0; good && k < g.count; ++k) good &= g.first_direction[k + 1] - g.first_direction[k] <= w.m;
+    require(good, "engine: the groups of balances do not fit the run");
+}
+
 Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept) {
     Options o{};
     read(o, options, NPY_DOUBLE, {.n = w.n, .m = w.m, .l = w.l, .blocks = blocks}, kept);
@@ -228,9 +257,13 @@ Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept) 
     require(o.frame.groups == 0 || (o.frame.count >= 1 && 3 * o.frame.groups * o.frame.count == w.m),
             "engine: the frame's bodies do not fit the state");
     require(o.every >= 0, "engine: every must not be negative");
+    check_balances(o.balances, w);
+    check_parts(o.parts, w);
     w.target = o.target;
     w.products = o.frame.products;
-    o.has_limits = std::any_of(o.most_left, o.most_left + w.l, [](double share) { return share < INFINITE; });
+    o.has_limits = std::any_of(o.most_left, o.most_left + w.l, [](double share) { return share < ENDLESS; });
+    require(o.parts.count == 0 || (o.direction == NEW && !o.has_limits),
+            "engine: groups of balances take one Newton step along their own directions");
     return o;
 }
 
@@ -264,7 +297,8 @@ Samples samples_of(nb::handle dense, const Data &run, int64_t events, int type, 
     const Buffers &buffers = buffers_of(work);
     kept.append(work);
     d.work = buffers.work;
-    require(buffers.type == type && d.work.n == run.work.n && d.work.l == run.work.l && d.work.stages >= 0,
+    require(buffers.type == type && d.work.n == run.work.n && d.work.l == run.work.l && d.work.stages >= 0 &&
+                d.work.balances == run.work.balances,
             "engine: the buffers for dense output do not fit the run");
     d.options = options_of(dense.attr("options"), d.work, run.options.blocks.count, kept);
     require(buffers.blocks == run.options.blocks.count, "engine: the buffers for dense output do not fit the run");
@@ -290,8 +324,12 @@ Members members_of(nb::handle members, const Data &run, const Schedule &schedule
 }
 
 // A function of the library's for one state or for eight.
-static void take(const LibraryFunction &function, LibraryPointer<double> &place) { place = function.one; }
-static void take(const LibraryFunction &function, LibraryPointer<Octet> &place) { place = function.eight; }
+static void take(const LibraryFunction &function, LibraryCall<double> &place) {
+    place = {function.one, function.own.empty() ? nullptr : function.own.data(), std::ssize(function.own)};
+}
+static void take(const LibraryFunction &function, LibraryCall<Octet> &place) {
+    if (function.own.empty()) place = {function.eight};
+}
 
 // An address, or a function of the library's that takes these sizes and fills so many floats.
 template <class Function>
@@ -354,6 +392,29 @@ static void read_shifts(nb::handle functions, const Work &w, nb::list &kept, Sys
     system.shifts.state.resize(w.m);
 }
 
+void read_balances(nb::handle functions, const Work &w, System &system) {
+    const nb::object rates = functions.attr("rates");
+    const int64_t items = static_cast<int64_t>(nb::len(nb::object(functions.attr("inv"))));
+    int64_t total = 0;
+    for (const nb::handle pair : nb::object(rates.attr("items"))) {
+        Balance balance;
+        std::tie(balance.item, balance.floats) = nb::cast<std::pair<int64_t, int64_t>>(pair);
+        require(balance.item >= 0 && balance.item < items && balance.floats >= 0, "engine: a balance has no function");
+        system.balances.push_back(balance);
+        total += balance.floats;
+    }
+    size_t given = 0;
+    for (const nb::handle function : nb::object(rates.attr("functions"))) {
+        require(given < system.balances.size(), "engine: more rates than balances");
+        system.balances[given++].is_given = !function.is_none();
+    }
+    require(total == w.balances && given == system.balances.size(), "engine: the rates do not fit the balances");
+    system.times.low = number(rates, "low");
+    system.times.high = number(rates, "high");
+    system.times.shift = number(rates, "shift");
+    system.scratch_G.resize(w.l * w.m);
+}
+
 void read_pointers(nb::handle functions, const Work &w, int64_t events, nb::list &kept, System &system) {
     system.by_pointer = true;
     system.second_order = truth(functions, "second_order");
@@ -365,6 +426,10 @@ void read_pointers(nb::handle functions, const Work &w, int64_t events, nb::list
     system.inv_pointers = pointers_of<Native<ValuePointer>>(functions, "inv", w.l, w.m, p);
     system.grad_pointers = pointers_of<Native<GradientPointer>>(functions, "grad", w.l * w.m, w.m, p, true);
     read_shifts(functions, w, kept, system);
+    const nb::object rates = nb::object(functions.attr("rates")).attr("functions");
+    for (size_t b = 0; b < system.balances.size(); ++b)
+        if (Balance &balance = system.balances[b]; balance.is_given)
+            balance.rate = pointer_of<Native<GradientPointer>>(rates[b], "rates", balance.floats, w.m, p);
     system.event_pointers = pointers_of<Native<ValuePointer>>(functions, "event", events, w.m, p);
     const nb::object jacobian = functions.attr("jacobian");
     if (!jacobian.is_none())
@@ -425,8 +490,10 @@ void for_each_buffer(Work &work, int64_t blocks, int type, Found found) {
 
 }  // namespace
 
-Buffers::Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants, int64_t blocks) : blocks(blocks) {
-    require(n >= 0 && stages >= 0 && invariants >= 0 && blocks >= 0, "engine: a negative number of buffers");
+Buffers::Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants, int64_t blocks, int64_t balances)
+    : blocks(blocks) {
+    require(n >= 0 && stages >= 0 && invariants >= 0 && blocks >= 0 && balances >= 0,
+            "engine: a negative number of buffers");
     PyArray_Descr *found = nullptr;
     if (!PyArray_DescrConverter(dtype.ptr(), &found)) throw nb::python_error();
     const auto kept = owned(reinterpret_cast<PyObject *>(found));
@@ -436,6 +503,7 @@ Buffers::Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants
     work.m = type == NPY_CDOUBLE ? 2 * n : n;
     work.l = invariants;
     work.stages = stages;
+    work.balances = balances;
     auto own = std::make_unique<Memory>();
     for_each_buffer(work, blocks, type, [&own]<class T>(const char *, T *&place, int type, auto shape) {
         static_assert(sizeof(T) == sizeof(double));
@@ -446,20 +514,20 @@ Buffers::Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants
     owner_ = nb::capsule(own.get(), [](void *memory) noexcept { delete static_cast<Memory *>(memory); });
     own.release();
     fill(work.sigma, 1.0, work.m);
-    for (int64_t i = 0; i < work.l; ++i) work.figures(i)[TERMS] = INFINITE;
+    for (int64_t i = 0; i < work.l; ++i) work.figures(i)[TERMS] = ENDLESS;
 }
 
 Buffers::Buffers(const nb::tuple &state)
     : Buffers(nb::cast<int64_t>(state[0]), state[1], nb::cast<int64_t>(state[2]), nb::cast<int64_t>(state[3]),
-              nb::cast<int64_t>(state[4])) {
-    for (const auto &[name, array] : nb::cast<nb::dict>(state[5]))
+              nb::cast<int64_t>(state[4]), nb::cast<int64_t>(state[5])) {
+    for (const auto &[name, array] : nb::cast<nb::dict>(state[6]))
         if (PyArray_CopyInto(nb::borrow<Array>(arrays()[name]).get(), nb::cast<Array>(array).get()) < 0)
             throw nb::python_error();
 }
 
 nb::tuple Buffers::state() const {
     return nb::make_tuple(work.n, owned(reinterpret_cast<PyObject *>(PyArray_DescrFromType(type))), work.stages, work.l,
-                          blocks, arrays());
+                          blocks, work.balances, arrays());
 }
 
 const nb::dict &Buffers::arrays() const {
@@ -494,13 +562,15 @@ void add_records(nb::module_ &module) {
     add_record<Method>(module, "Method");
     add_record<Blocks>(module, "Grouping");
     add_record<Frame>(module, "FrameRows");
+    add_record<Balances>(module, "Balances");
+    add_record<Groups>(module, "Groups");
     add_record<Options>(module, "Options");
     add_record<Members>(module, "Members");
     add_record<Samples>(module, "Dense");
     nb::class_<Buffers> type(module, "Work",
                              "Buffers of a run, in memory of the engine; each attribute is an array over one.");
-    type.def(nb::init<int64_t, nb::handle, int64_t, int64_t, int64_t>(), "n"_a, "dtype"_a, "stages"_a, "n_invariants"_a,
-             "n_blocks"_a)
+    type.def(nb::init<int64_t, nb::handle, int64_t, int64_t, int64_t, int64_t>(), "n"_a, "dtype"_a, "stages"_a,
+             "n_invariants"_a, "n_blocks"_a, "n_balances"_a = 0)
         .def("arrays", &Buffers::arrays, nb::sig("def arrays(self) -> dict[str, numpy.typing.NDArray[typing.Any]]"),
              "Return all arrays by name.")
         .def("share", &Buffers::share, "other"_a, "names"_a, "Use the buffers of these names of others from now on.")

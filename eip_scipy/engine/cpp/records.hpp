@@ -14,7 +14,7 @@ namespace eip {
 // Buffers of a run in memory of the engine's own, which arrays over it keep. A complex state has two floats to a number.
 class Buffers {
   public:
-    Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants, int64_t blocks);
+    Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants, int64_t blocks, int64_t balances);
 
     Buffers(const Buffers &) = delete;
     Buffers &operator=(const Buffers &) = delete;
@@ -66,6 +66,8 @@ Members members_of(nb::handle members, const Data &run, const Schedule &schedule
                    nb::list &kept);
 // Functions of eight members of the run.
 OctetSystem octet_system_of(nb::handle functions, const Data &run);
+// The balances among the invariants; their rates by pointer are read with the other functions.
+void read_balances(nb::handle functions, const Work &w, System &system);
 // Functions by pointer.
 void read_pointers(nb::handle functions, const Work &w, int64_t events, nb::list &kept, System &system);
 

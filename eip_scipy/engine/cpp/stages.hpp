@@ -12,6 +12,17 @@ inline void nystrom_position(const double *y, double h, double c, const Rows &ro
     for (int64_t i = 0; i < half; ++i) out[i] = y[i] + h * (c * y[half + i] + h * out[i]);
 }
 
+// The sum of the stages, y_hat.
+template <class AnyRun>
+inline void sum_stages(const AnyRun &run, const Step &step) {
+    const Method &m = run.method;
+    const auto &w = run.work;
+    if (run.options.compensated)
+        compensated_step(step.y, step.h, m, w);
+    else
+        combine(step.y, step.h, {m.b, w.K, m.stages, w.m}, w.y_hat, w.m);
+}
+
 template <class AnyRun>
 inline void rk_stages(const AnyRun &run, const Step &step) {
     const Method &m = run.method;
@@ -20,10 +31,35 @@ inline void rk_stages(const AnyRun &run, const Step &step) {
         combine(step.y, step.h, {m.A + i * m.columns, w.K, i, w.m}, w.stage, w.m);
         run.system.rhs_of_scratch(w, step.t + m.c[i] * step.h, w.stage, w.row(i));
     }
-    if (run.options.compensated)
-        compensated_step(step.y, step.h, m, w);
-    else
-        combine(step.y, step.h, {m.b, w.K, m.stages, w.m}, w.y_hat, w.m);
+    sum_stages(run, step);
+}
+
+// The same with the rates of the balances at the stages where they are needed. Those at the first stage are those at the end
+// of the last step; NaN where there was none. Return whether the run has any balances; batches of members have none.
+template <class AnyRun>
+inline bool made_with_rates(const AnyRun &, const Step &) {
+    return false;
+}
+[[gnu::noinline]] inline void rated_stages(const Run &run, const Step &step) {
+    const Method &m = run.method;
+    const Work &w = run.work;
+    const int64_t *rated = run.options.balances.rated;
+    if (std::isnan(w.rate(0)[0])) run.system.rates(w, step.t, step.y, w.row(0), w.rate(0));
+    for (int64_t i = 1; i < m.stages; ++i) {
+        const double t = step.t + m.c[i] * step.h;
+        combine(step.y, step.h, {m.A + i * m.columns, w.K, i, w.m}, w.stage, w.m);
+        run.system.rhs(w, t, w.stage, w.row(i));
+        if (rated[i]) run.system.rates(w, t, w.stage, w.row(i), w.rate(i));
+    }
+    compensated_levels(step.h, m, run.options.balances, w);
+    sum_stages(run, step);
+}
+template <class W>
+inline bool made_with_rates(const RunOf<W, System> &run, const Step &step) {
+    if (run.work.balances == 0) [[likely]]
+        return false;
+    rated_stages(of_any_length(run), step);
+    return true;
 }
 
 // Stages keep v, which the accelerations do not see.

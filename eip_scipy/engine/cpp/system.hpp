@@ -1,6 +1,7 @@
 // The user's functions as the step calls them, and what a step knows of its run.
 #pragma once
 
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -28,6 +29,10 @@ class Functions {
     virtual void grad(double t, const double *y, const double *f, double *G) = 0;
     virtual void event(double t, const double *y, double *values) = 0;
     virtual void jacobian(double t, const double *q, const double *dq, double *out) = 0;
+    // Of one item of the invariants, and the rate of one balance that has a function for it.
+    virtual void inv_of(int64_t k, double t, const double *y, double *values) = 0;
+    virtual void grad_of(int64_t k, double t, const double *y, const double *f, double *G) = 0;
+    virtual void rate_of(int64_t k, double t, const double *y, const double *f, double *out) = 0;
 };
 
 struct Step;
@@ -49,8 +54,16 @@ class Hooks {
 template <typename Pointer, class Value = double>
 struct Native {
     Pointer pointer;
-    LibraryPointer<Value> library;
+    LibraryCall<Value> library;
     int64_t floats;
+};
+
+// A balance: its place among the functions of the invariants, how many values it has, and its rate by pointer. Without a
+// rate of its own it changes at the rate of its gradient along the flow and of its explicit dependence on time.
+struct Balance {
+    int64_t item = 0, floats = 0;
+    bool is_given = false;
+    Native<GradientPointer> rate{};
 };
 
 // A call by pointer that failed: of which functions, which one, where, and the status that it returned.
@@ -72,9 +85,11 @@ struct System {
     Functions *python = nullptr;
     bool by_pointer = false;
     bool second_order = false;  // rhs_pointer gives the accelerations of y = (q, v)
+    std::vector<Balance> balances;
+    Times times;  // for derivatives in time
     double *params = nullptr;
     int64_t n_params = 0;
-    std::vector<double> scratch, scratch_f;
+    std::vector<double> scratch, scratch_f, scratch_G;
     Shifts shifts;  // for gradients without a function
     FailedCall failed;
 
@@ -116,23 +131,31 @@ struct System {
     void grad(const W &w, double t, const double *y, const double *f, double *G) {
         if (!by_pointer) return python->grad(t, y, f, G);
         for (int64_t k = 0; k < std::ssize(grad_pointers); ++k) {
-            const auto &[pointer, library, floats] = grad_pointers[k];
-            if (library) {
-                library(t, y, f, G, params, w.m, n_params);
-                G += floats;
-                continue;
-            }
-            if (!pointer) {
-                grad_by_differences(w, k, t, y, G);
-                G += floats;
-                continue;
-            }
-            fill(G, NOT_A_NUMBER, floats);  // shows where a gradient leaves a part of it as it was
-            const int status = pointer(t, copied(y, scratch, w.m), copied(f, scratch_f, w.m), G, params);
-            if (status) [[unlikely]]
-                gave_up(status, {"grad", k, t, {y, y + w.m}, {f, f + w.m}}, G, floats);
-            G += floats;
+            grad_by_pointer(w, k, t, y, f, G);
+            G += grad_pointers[k].floats;
         }
+    }
+
+    // The rates of all balances, where f is the derivative at y.
+    template <class W>
+    [[gnu::noinline]] void rates(const W &w, double t, const double *y, const double *f, double *out) {
+        for (int64_t b = 0; b < std::ssize(balances); ++b) {
+            const Balance &balance = balances[b];
+            if (!balance.is_given)
+                rate_along_flow(w, balance, t, y, f, out);
+            else if (!by_pointer)
+                python->rate_of(b, t, y, f, out);
+            else
+                call_with_f(w, balance.rate, "rate", b, t, y, f, out);
+            out += balance.floats;
+        }
+    }
+
+    // What a balance changes by explicitly in time, at the state y.
+    template <class W>
+    void rate_in_time(const W &w, const Balance &balance, double t, const double *y, double *out) {
+        const auto values_at = [&](double time, double *values) { inv_of(w, balance.item, time, y, values); };
+        time_difference(values_at, t, balance.floats, times, out);
     }
 
     // Of the accelerations at positions q, times dq; all three of half a state's length, and q and dq scratch. Only the
@@ -149,6 +172,42 @@ struct System {
     }
 
   private:
+    template <class W>
+    void rate_along_flow(const W &w, const Balance &balance, double t, const double *y, const double *f, double *out) {
+        double *G = scratch_G.data();
+        rate_in_time(w, balance, t, y, out);
+        if (by_pointer)
+            grad_by_pointer(w, balance.item, t, y, f, G);
+        else
+            python->grad_of(balance.item, t, y, f, G);
+        for (int64_t i = 0; i < balance.floats; ++i) out[i] += dot(G + i * w.m, f, w.m);
+    }
+
+    template <class W>
+    void inv_of(const W &w, int64_t k, double t, const double *y, double *values) {
+        if (!by_pointer) return python->inv_of(k, t, y, values);
+        call_for_values(w, inv_pointers, "inv", k, t, y, values);
+    }
+
+    template <class W>
+    [[gnu::always_inline]] void grad_by_pointer(const W &w, int64_t k, double t, const double *y, const double *f,
+                                                double *G) {
+        const Native<GradientPointer> &grad = grad_pointers[k];
+        if (!grad.pointer && !grad.library) return grad_by_differences(w, k, t, y, G);
+        call_with_f(w, grad, "grad", k, t, y, f, G);
+    }
+
+    template <class W>
+    [[gnu::always_inline]] void call_with_f(const W &w, const Native<GradientPointer> &function, const char *name,
+                                            int64_t k, double t, const double *y, const double *f, double *out) {
+        const auto &[pointer, library, floats] = function;
+        if (library) return library(t, y, f, out, params, w.m, n_params);
+        fill(out, NOT_A_NUMBER, floats);  // shows where a function leaves a part of it as it was
+        const int status = pointer(t, copied(y, scratch, w.m), copied(f, scratch_f, w.m), out, params);
+        if (status) [[unlikely]]
+            gave_up(status, {name, k, t, {y, y + w.m}, {f, f + w.m}}, out, floats);
+    }
+
     static const double *copied(const double *y, std::vector<double> &own, int64_t m) {
         copy(y, own.data(), m);
         return own.data();
@@ -174,18 +233,21 @@ struct System {
     void call_each(const W &w, const std::vector<Native<ValuePointer>> &functions, const char *name, double t,
                    const double *y, double *values) {
         for (int64_t k = 0; k < std::ssize(functions); ++k) {
-            const auto &[pointer, library, floats] = functions[k];
-            if (library) {
-                library(t, y, nullptr, values, params, w.m, n_params);
-                values += floats;
-                continue;
-            }
-            fill(values, NOT_A_NUMBER, floats);  // shows where a function leaves a value as it was
-            const int status = pointer(t, copied(y, scratch, w.m), values, params);
-            if (status) [[unlikely]]
-                gave_up(status, {name, k, t, {y, y + w.m}, {}}, values, floats);
-            values += floats;
+            call_for_values(w, functions, name, k, t, y, values);
+            values += functions[k].floats;
         }
+    }
+
+    template <class W>
+    [[gnu::always_inline]] void call_for_values(const W &w, const std::vector<Native<ValuePointer>> &functions,
+                                                const char *name, int64_t k, double t, const double *y,
+                                                double *values) {
+        const auto &[pointer, library, floats] = functions[k];
+        if (library) return library(t, y, nullptr, values, params, w.m, n_params);
+        fill(values, NOT_A_NUMBER, floats);  // shows where a function leaves a value as it was
+        const int status = pointer(t, copied(y, scratch, w.m), values, params);
+        if (status) [[unlikely]]
+            gave_up(status, {name, k, t, {y, y + w.m}, {}}, values, floats);
     }
 
     template <class W>
@@ -239,6 +301,10 @@ struct SizedWith : Sized<M, Value> {
     explicit SizedWith(const WorkOf<Value> &w) : Sized<M, Value>(w) {}
     static constexpr int64_t l = L;
 };
+
+// Whether a run is one of a single state: batches of members have no balances.
+template <class AnyRun>
+constexpr bool IS_SINGLE = std::remove_cvref_t<decltype(std::declval<AnyRun>().system)>::MEMBERS == 1;
 
 // One try of a step from (t, y).
 struct Step {

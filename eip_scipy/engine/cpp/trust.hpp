@@ -10,11 +10,12 @@ constexpr double FAILURE_BANDS = 100.0, NOISE_BANDS = 3.0;
 constexpr double LEAST_SHARE = 1e-3;
 // Coordinates that move by less than this share of their size stand still.
 constexpr double STILL = 1e4 * EPS;
-// A rate of change along the flow is suspicious from LEAST_RATE of its terms on, and again when it has grown by RATE_GROWTH.
+// A rate of change along the flow is suspicious from LEAST_RATE of its terms on, in runs with balances from
+// LEAST_BALANCE_RATE on, because a wrong rate of a slow balance shows no more, and again when it has grown by RATE_GROWTH.
 // Terms that vanish for a moment, as those of velocity constraints do at singular positions, count as LEAST_TERMS of the
 // largest so far.
 constexpr double LARGEST = std::numeric_limits<double>::max();
-constexpr double LEAST_RATE = 1e-8, RATE_GROWTH = 2.0, LEAST_TERMS = 0.1;
+constexpr double LEAST_RATE = 1e-8, LEAST_BALANCE_RATE = 1e-10, RATE_GROWTH = 2.0, LEAST_TERMS = 0.1;
 // A local error is suspicious from this share of what the step changes in its block, or of the block's size, on, and again
 // when it has grown by ERROR_GROWTH; from CLEAR_ERROR on it is clearly too large. Blocks count as if they changed by
 // LEAST_CHANGE of the largest change at least.
@@ -41,7 +42,7 @@ inline Truth<Value> defects(const double *terms, const Value *y, const Options &
         size = max(own, max(size, Value(o.scales[i])));
         w.band[i] = band * size;
         raw[i] = w.values[i] - w.target[i];
-        const Truth<Value> inside = (w.band[i] < INFINITE) & (abs(raw[i]) <= w.band[i]);
+        const Truth<Value> inside = (w.band[i] < ENDLESS) & (abs(raw[i]) <= w.band[i]);
         w.g[i] = where(inside, 0.0, raw[i]);
         outside = outside | !inside;
     }
@@ -65,9 +66,9 @@ inline void start_figures(const Value *y, const Value *f, double tau, const Meth
         figures[RATE] = known ? 0.0 : 1.0;
         figures[EXAMINED] = known ? 0.0 : 1.0;
         figures[BY_VALUES] = o.computed[i];
-        figures[FAR_FROM] = o.far;
-        figures[START] = where(terms < INFINITE, terms, 0.0);
-        figures[TERMS] = where(terms > 0.0, terms, INFINITE);
+        figures[FAR_FROM] = o.distant;
+        figures[START] = where(terms < ENDLESS, terms, 0.0);
+        figures[TERMS] = where(terms > 0.0, terms, ENDLESS);
     }
 }
 
@@ -112,7 +113,7 @@ inline auto own_terms(int64_t i, const Options &o, const W &w) {
 // whose units are unknown have no orientation that could hide anything.
 inline double generous_terms(int64_t i, double own, const double *y, const Options &o, const Work &w) {
     if (!y || o.kinds.count == w.m) return own;
-    if (at_rest(y, o, w)) return INFINITE;
+    if (at_rest(y, o, w)) return ENDLESS;
     const double found = norm_products(w.gradient(i), y, o.kinds);
     return std::abs(w.figures(i)[LEFT]) <= LARGE_SHARE * found ? std::max(own, found) : own;
 }
@@ -126,7 +127,7 @@ inline Truth<Value> defects_held(const Value *before, const Options &o, const W 
     for (int64_t i = 0; i < w.l; ++i) {
         w.defect[i] = w.values[i] - w.target[i];
         const Value size = abs(w.defect[i]);
-        bad = bad | !(size < INFINITE) | ((size > abs(before[i])) & (size > bands * w.band[i]));
+        bad = bad | !(size < ENDLESS) | ((size > abs(before[i])) & (size > bands * w.band[i]));
     }
     return !bad;
 }
@@ -149,7 +150,7 @@ inline auto small_shares(const Options &o, const W &w) {
         const double size = std::abs(w.defect[i]), own = generous_terms(i, own_terms(i, o, w), y_old, o, w);
         const double rounding =
             bands * std::max(w.band[i], norm_products(w.gradient(i), w.y_hat, o.kinds) / o.per_band);
-        bad = bad || !(size < INFINITE) || (size > std::abs(before[i]) && size > rounding) || !(size <= o.limit * own);
+        bad = bad || !(size < ENDLESS) || (size > std::abs(before[i]) && size > rounding) || !(size <= o.limit * own);
     }
     return !bad;
 }
@@ -185,7 +186,7 @@ inline Code judge(const double *before, const double *y_old, const double *y, co
 // Return whether some invariant changes along the flow at y_hat by more than was known before, relative to the terms of that
 // rate; f at y_hat is in w.last(). An explicit dependence on time shows here, too.
 template <class W>
-[[gnu::noinline]] inline auto rates_stand_out(const W &w) {
+[[gnu::noinline]] inline auto rates_stand_out(const W &w, double least) {
     using Value = typename W::Value;
     Truth<Value> found{};
     for (int64_t i = 0; i < w.l; ++i) {
@@ -197,29 +198,53 @@ template <class W>
             sum += product;
             terms += abs(product);
         }
-        const Value rate = abs(sum);
+        const Value rate = abs(sum - w.flow[i]);
         figures[RATE_TERMS] = max(figures[RATE_TERMS], min(terms, Value(LARGEST)));
         const Value unit = max(terms, LEAST_TERMS * figures[RATE_TERMS]) + TINY;
-        const Truth<Value> record = (rate > figures[RATE] * unit) & (rate < INFINITE);
+        const Truth<Value> record = (rate > figures[RATE] * unit) & (rate < ENDLESS);
         if (any(record)) [[unlikely]]
             figures[RATE] = where(record, rate / unit, figures[RATE]);
-        found = found | (figures[RATE] > max(Value(LEAST_RATE), RATE_GROWTH * figures[RATE_NOTED]));
+        found = found | (figures[RATE] > max(Value(least), RATE_GROWTH * figures[RATE_NOTED]));
     }
     return found;
 }
 
+// The rates at which the balances are to change with the state, and sums of rates and of their terms. Nothing is known of
+// those that have no rate of their own.
+[[gnu::cold, gnu::noinline]] inline void note_balances(const Run &run, const Step &step) {
+    const Work &w = run.work;
+    double *rates = w.rate(w.stages);
+    run.system.rates(w, step.t_new, w.y_hat, w.last(), rates);
+    int64_t first = 0;
+    for (const Balance &balance : run.system.balances) {
+        double *in_time = w.mu;
+        if (balance.is_given) run.system.rate_in_time(w, balance, step.t_new, w.y_hat, in_time);
+        for (int64_t k = 0; k < balance.floats; ++k) {
+            const int64_t b = first + k, i = run.options.balances.place[b];
+            const double terms = abs_dot(w.gradient(i), w.last(), w.m);
+            w.flow[i] = balance.is_given ? rates[b] - in_time[k] : NOT_A_NUMBER;
+            if (!std::isfinite(rates[b]) || !std::isfinite(terms)) continue;
+            w.slow[b] += std::abs(rates[b]);
+            w.slow[w.balances + b] += terms;
+        }
+        first += balance.floats;
+    }
+}
+
 // Note the rates where f at y_hat is known.
-template <class W>
-[[gnu::noinline]] inline void note_known_rates(const Step &step, const W &w) {
-    if (!rates_stand_out(w)) return;
+template <class AnyRun>
+[[gnu::noinline]] inline void note_known_rates(const AnyRun &run, const Step &step) {
+    const auto &w = run.work;
+    if (w.balances > 0) note_balances(of_any_length(run), step);
+    if (!rates_stand_out(w, w.balances > 0 ? LEAST_BALANCE_RATE : LEAST_RATE)) return;
     for (int64_t i = 0; i < w.l; ++i) w.figures(i)[RATE_NOTED] = w.figures(i)[RATE];
     suspect(CHANGES_ALONG_FLOW, step, w);
 }
 
-template <class W>
-inline void note_rates(const Step &step, const Options &o, const W &w) {
-    if (o.watched && w.counters[F_AT_RAW]) [[unlikely]]
-        note_known_rates(step, w);
+template <class AnyRun>
+inline void note_rates(const AnyRun &run, const Step &step) {
+    if (run.options.watched && run.work.counters[F_AT_RAW]) [[unlikely]]
+        note_known_rates(run, step);
 }
 
 // The largest local error of a block, relative to what a fixed step of length h from y changes in it and to its size.
@@ -268,7 +293,7 @@ inline void note_share(double share, double t, double *figures, Figure largest_s
 // the components that its gradient touches may vanish by chance in one step.
 [[gnu::cold, gnu::noinline]] inline double remembered_worth(int64_t i, const Options &o, const Work &w) {
     // The errors of several steps hardly vanish together.
-    if (o.metric != ERROR || w.counters[WAITED] > 0) return 0.0;
+    if (o.metric != BY_ERROR || w.counters[WAITED] > 0) return 0.0;
     double largest_error = 0.0, worth = 0.0;
     for (int64_t b = 0; b < o.blocks.count; ++b)
         if (w.scale[b] > 0.0)
@@ -308,9 +333,9 @@ inline void note(const Step &step, double errors, double rounding, const double 
         w.max_defect[i] = std::max(w.max_defect[i], size);
         const double terms = o.per_band * w.band[i];
         double own = own_terms(i, o, w);
-        if (raw > o.far * own || size > LARGE_SHARE * own) own = generous_terms(i, own, y_old, o, w);
+        if (raw > o.distant * own || size > LARGE_SHARE * own) own = generous_terms(i, own, y_old, o, w);
         figures[NOTED] += 1.0;
-        if (raw > o.far * own) {
+        if (raw > o.distant * own) {
             note_share(raw / own, t, figures, RAW, RAW_AT);
             figures[RAW_MANY] += 1.0;
             ++w.counters[FOUND];
@@ -319,7 +344,7 @@ inline void note(const Step &step, double errors, double rounding, const double 
             note_share(size / own, t, figures, SHARE, SHARE_AT);
             ++w.counters[FOUND];
         } else {
-            const double known = figures[TERMS] < INFINITE ? figures[TERMS] : 0.0;
+            const double known = figures[TERMS] < ENDLESS ? figures[TERMS] : 0.0;
             figures[TERMS] = std::max(known, terms);
         }
         // An estimate that vanishes tells nothing: that of RK4 does where f depends on t alone.
@@ -328,7 +353,7 @@ inline void note(const Step &step, double errors, double rounding, const double 
             double expected = errors * w.worth[i] + rounding * terms + TINY;
             if (change > LARGE * expected)
                 expected += rounding * generous_terms(i, 0.0, y_old, o, w) + errors * remembered_worth(i, o, w);
-            if (expected < INFINITE && weigh_change(change, expected, t, figures)) [[unlikely]] {
+            if (expected < ENDLESS && weigh_change(change, expected, t, figures)) [[unlikely]] {
                 ++w.counters[FOUND];
                 if (figures[AT] == t) suspect(LARGE_CORRECTION, step, w);
             }
@@ -347,7 +372,7 @@ inline void take_note(const Step &step, const double *y_old, const Options &o, c
     double rounding = EPS, errors = w.counters[HAVE_ERROR] ? 1.0 : 0.0;
     if (waited > 0) {
         rounding *= std::sqrt(1.0 + waited);
-        const bool gathered = o.metric == ERROR || o.every == AUTO || o.adaptive;
+        const bool gathered = o.metric == BY_ERROR || o.every == AUTO || o.adaptive;
         errors *= gathered ? std::sqrt(1.0 + waited) : 1.0 + waited;
     }
     note(step, errors, rounding, y_old, o, w);

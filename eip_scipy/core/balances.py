@@ -1,0 +1,166 @@
+"""Balances: quantities that change slowly and at a known rate, and are kept as invariants are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from .inputs import flag, reals, refuse_units, shown
+from .invariants import Invariant, OwnArguments
+from .pointers import GRADIENT, address_hint, by_pointer
+
+__all__ = ["Balance"]
+
+LARGEST_INDEX = 2**53  # up to which floats hold all integers
+
+
+class Balance(Invariant):
+    """A quantity that changes slowly and at a known rate, as an energy does under friction; or several at once.
+
+    It stands among the invariants of a run. The run integrates its rate with the stages of each step and projects the
+    state onto the value that results. Where F has a small rate, its numerical error is that much smaller than the
+    error of the state, and the projected state inherits it.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(t, y, *args) -> float or (l_i,)``, as for `Invariant`.
+    rate : callable, optional
+        ``rate(t, y, *args) -> float or (l_i,)``, the total derivative of `fun` in time along the solutions; a Python or
+        Numba function, or a C function by pointer (see Notes). Without it, the rate is ``grad @ f + dF/dt`` with
+        f = fun(t, y) of the system: exact to rounding for a jitted function of a real state, else by the gradient and
+        by differences in time. Its rounding is that of the terms of ``grad @ f``. Write the rate without the terms that
+        cancel where relative errors below 1e-10 matter.
+    grad : callable, optional
+        As for `Invariant`.
+    args : tuple, optional
+        Further arguments of `fun`, `rate` and `grad`, as for `Invariant`.
+    size, name, scale, in_place
+        As for `Invariant`.
+    components : array_like of int, shape (s,) or (s, k), optional
+        The components of the state that the projection onto this balance may move. The k components of a row move by
+        the same amount. Balances with the same components and weights are projected together, as a group. Each group is
+        projected by itself, from the same state: it does not see the corrections of other groups. Afterwards all
+        components together restore the linear invariants of `frame`. Either all invariants of a run have components, or
+        none has. `metric`, `direction` and `iterations` must then be left out.
+    weights : array_like of float, shape (s,), optional
+        The correction is the shortest in units of these weights, such as the sizes of the components. Default: 1.
+    uses_f : bool, optional
+        ``rate(t, y, f, *args)`` and ``grad(t, y, f, *args)``, as far as they are given, also receive f, the derivative
+        of the state.
+
+    Notes
+    -----
+    Balances need a Runge-Kutta method (`EIPRK1` to `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, or one made by
+    `eip_method` of a tableau), which takes the rates at its stages, or a multistep method (`EIPGJ12`, `EIPGJ14`), which
+    sums them as it sums accelerations. The stages of Nystrom methods have no velocities. The value that a run carries
+    begins as F at the start, and again where the state is set between two steps of a solver. It is summed with
+    compensation, takes no part in the error control, and is not changed by the projection. Between the steps it is
+    interpolated as the state is, and states that are handed out there lie on it.
+
+    A given rate is compared with ``grad @ f + dF/dt`` at the start and during the run. A wrong one is reported by a
+    `ProjectionWarning`. `Diagnostics.slowness` says how large the rate is, compared with the terms of ``grad @ f``. If
+    it is above 0.05, a balance hardly helps, and a warning says so. Balances do not help in chaotic motion and under
+    strong driving.
+
+    The derivative in time is a difference of order 6, within the interval of the run, over three 32nds of a fixed step
+    or three eighths of the first adaptive step to both sides (to one side next to the ends of the interval). It is
+    exactly zero where `fun` does not depend on t. Jitted functions take dual numbers instead, which are exact.
+
+    A C function for the rate has the signature of a gradient,
+    ``int r(double t, const double *y, const double *f, double *values, const double *params)``.
+
+    Examples
+    --------
+    A planet with a little drag, whose energy falls at the rate -c v²:
+
+    >>> import numpy as np
+    >>> from scipy.integrate import solve_ivp
+    >>> from eip_scipy import Balance, EIPDOP853
+    >>> c = 1e-6
+    >>> def fun(t, y):
+    ...     return np.concatenate([y[2:], -y[:2] / np.hypot(*y[:2]) ** 3 - c * y[2:]])
+    >>> def energy(t, y):
+    ...     return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2)
+    >>> E = Balance(energy, rate=lambda t, y: -c * (y[2] ** 2 + y[3] ** 2), name="energy")
+    >>> sol = solve_ivp(fun, (0, 200), [0.8, 0, 0, 1.225], method=EIPDOP853, h=0.4, invariants=E)
+    >>> bool(energy(0, sol.y[:, -1]) < energy(0, sol.y[:, 0]))
+    True
+    """
+
+    is_balance = True
+
+    def __init__(
+        self,
+        fun: Callable[..., Any],
+        rate: Callable[..., Any] | None = None,
+        grad: Callable[..., Any] | None = None,
+        *,
+        args: Sequence[Any] = (),
+        size: int | None = None,
+        name: str | None = None,
+        scale: Any = None,
+        in_place: bool = False,
+        uses_f: bool = False,
+        components: Any = None,
+        weights: Any = None,
+    ) -> None:
+        uses_f = flag("Balance: uses_f", uses_f)
+        if uses_f and rate is None and grad is None:
+            raise ValueError("Balance: uses_f describes rate and grad; give one of them or leave it out.")
+        own: Any = rate
+        if isinstance(own, OwnArguments):
+            rate, args = own.function, args or own.args
+        super().__init__(
+            fun,
+            grad,
+            args=args,
+            size=size,
+            name=name,
+            scale=scale,
+            in_place=in_place,
+            uses_f=uses_f and grad is not None,
+        )
+        what = "rate of a balance" if name is None else f"rate of balance {name!r}"
+        shape = (self.size,) if self.size and self.size > 1 else ()
+        rate = by_pointer(rate, what, GRADIENT, takes_f=uses_f, shape=shape)
+        if rate is not None and not callable(rate):
+            raise TypeError(f"Balance: rate must be callable or None, got {rate!r}{address_hint(rate)}.")
+        directions = _directions(components, weights)
+        self.parts = () if directions is None else (directions,)
+        self.rate_function = rate
+        self.rate_uses_f = uses_f and rate is not None
+
+    @property
+    def rate(self) -> Callable[..., Any] | None:
+        """Return the rate, which takes `args` where they are left out; None if it is computed."""
+        if self.rate_function is None or not self.args:
+            return self.rate_function
+        return OwnArguments(self.rate_function, self.args, 2 + self.rate_uses_f)
+
+
+def _directions(components: Any, weights: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return components as integers (s, k) and their weights (s, k), or None."""
+    if components is None:
+        if weights is not None:
+            raise ValueError("Balance: weights without components; weights are those of the components, give both.")
+        return None
+    refuse_units(components=components, weights=weights)
+    found = reals(components)
+    if (
+        found is None
+        or found.ndim not in (1, 2)
+        or found.size == 0
+        or not np.isfinite(found).all()
+        or (found % 1 != 0).any()
+    ):
+        raise ValueError(f"Balance: components must be integers of shape (s,) or (s, k), got {shown(components)}.")
+    if found.min() < 0 or found.max() > LARGEST_INDEX or np.unique(found).size < found.size:
+        raise ValueError(f"Balance: components must be different indices >= 0, got {shown(components)}.")
+    places = found.astype(np.int64).reshape(len(found), -1)
+    sizes = np.ones(len(places)) if weights is None else reals(weights)
+    if sizes is None or sizes.shape != (len(places),) or not ((sizes > 0) & (sizes < np.inf)).all():
+        raise ValueError(f"Balance: weights must be {len(places)} positive numbers, got {shown(weights)}.")
+    return places, np.repeat(sizes[:, None], places.shape[1], 1)

@@ -1,0 +1,163 @@
+"""Balances among the invariants of a run: their places, their rates, and how the engine calls these."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from copy import copy
+from typing import Any
+
+import numpy as np
+
+from ..engine.native import Call, Rates, call
+from .arguments import scalars
+from .inputs import refuse_units, shown
+from .jitted import NotCompilableError, is_jitted, jit_is_off
+
+__all__ = ["Carried", "bound", "real_value", "time_shift"]
+
+Array = np.ndarray
+# Shifts of differences in time, in fixed steps and in first steps of adaptive ones, which are shorter than later ones.
+OF_FIXED, OF_FIRST = 1 / 32, 1 / 8
+# Parts of the run's interval, and roundings of the time, that a shift has at most and at least.
+PARTS, ROUNDINGS = 8.0, 16.0
+
+
+def bound(fun: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
+    """``fun`` with its last arguments given; itself where there are none."""
+    return (lambda *first: fun(*first, *arguments)) if arguments else fun
+
+
+def real_value(value: Any, what: str, t: float, expected: tuple[int, ...] | None = None) -> Array:
+    """Return what a function returned at t, real and of the expected shape."""
+    refuse_units(**{f"{what} returned": value})
+    try:
+        found = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        found = np.asarray(None)
+    if found.dtype.kind == "c":
+        raise ValueError(f"{what} returned complex values at t={t:g}; expected a real number or a real array (l,).")
+    if found.dtype.kind not in "fiub":
+        raise TypeError(f"{what} returned {shown(value)} at t={t:g}; expected a real number or a real array (l,).")
+    if expected is not None and found.shape != expected:
+        raise ValueError(f"{what} returned shape {found.shape} at t={t:g}, expected {expected}.")
+    return found
+
+
+def time_shift(tau: float, adaptive: bool, t_span: tuple[float, float]) -> float:
+    """Return the shift of differences in time, a power of two; 0 if the interval is empty."""
+    t0, length = t_span[0], abs(t_span[1] - t_span[0])
+    wanted = tau * (OF_FIRST if adaptive else OF_FIXED) if 0 < tau < math.inf else math.inf
+    shift = max(min(wanted, length / PARTS), ROUNDINGS * float(np.spacing(abs(t0))))
+    return 2.0 ** math.floor(math.log2(shift)) if length > 0 and shift < math.inf else 0.0
+
+
+class Carried:
+    """The balances among the invariants of a run.
+
+    Parameters
+    ----------
+    items : sequence of Invariant
+        All invariants of the run.
+    labels : sequence of str
+    starts : sequence of int
+        Where the values of each item begin among all values, and their number at the end.
+    shapes : sequence of tuple
+        Shapes of the values of each item.
+    extra : tuple
+        Further arguments of the run, behind those of an item.
+
+    Attributes
+    ----------
+    items : dict of int to Invariant
+        The balances by their places among the items, with a compiled rate where a jitted one has none.
+    places : ndarray of int64, shape (b,)
+        Places of the balances' values among all values.
+    warn_if_fast : ndarray of bool, shape (b,)
+        Whether a run warns of each of these values if it changes fast.
+    mask : ndarray of bool, shape (l,)
+        Which values are those of balances.
+    """
+
+    def __init__(
+        self,
+        items: Sequence[Any],
+        labels: Sequence[str],
+        starts: Sequence[int],
+        shapes: Sequence[tuple[int, ...]],
+        extra: tuple,
+    ) -> None:
+        self._labels, self._starts, self._shapes, self._extra = labels, starts, shapes, extra
+        self.items = {k: item for k, item in enumerate(items) if item.is_balance}
+        self._given = {k for k, item in self.items.items() if item.rate_function is not None}
+        self.mask = np.zeros(starts[-1], bool)
+        for k in self.items:
+            self.mask[starts[k] : starts[k + 1]] = True
+        self.places = np.flatnonzero(self.mask).astype(np.int64)
+        warns = [np.full(starts[k + 1] - starts[k], item.warns_if_fast) for k, item in self.items.items()]
+        self.warn_if_fast = np.concatenate(warns) if warns else np.zeros(0, bool)
+
+    def compile_rates(self, n: int) -> None:
+        """Give jitted balances of a real state of n components rates by dual numbers, if they have none."""
+        numbers = scalars(self._extra)
+        for k, item in self.items.items():
+            lacks = item.rate_function is None and not item.args and is_jitted(item.function) and not jit_is_off()
+            if not lacks or numbers is None:
+                continue
+            from .jitted_gradients import rate_by_duals  # which loads Numba
+
+            item = copy(item)
+            try:
+                item.rate_function = rate_by_duals(item.function, n, self._shapes[k], bool(self._extra), numbers)
+            except NotCompilableError:  # the gradient and differences in time take its place
+                continue
+            item.rate_uses_f = True
+            self.items[k] = item
+
+    def check(self, t: float, y: Array, f: Array) -> None:
+        """Check the shapes of given rates, and that they are finite, at the start."""
+        for k in sorted(self._given):
+            value = self._rate(k, t, y, f)
+            if not np.isfinite(value).all():
+                raise ValueError(f"{self._what(k)} is not finite at y0: it returned {value}.")
+
+    def known(self, t: float, y: Array, f: Array) -> Array:
+        """Return the known rates (l,) of the values: 0 for invariants, NaN for balances without a rate."""
+        rates = np.where(self.mask, np.nan, 0.0)
+        for k in self._given:
+            rates[self._starts[k] : self._starts[k + 1]] = self._rate(k, t, y, f)
+        return rates
+
+    @property
+    def given_places(self) -> Array:
+        """Return the places of the values whose rates are given."""
+        return np.array([p for k in sorted(self._given) for p in range(self._starts[k], self._starts[k + 1])], np.intp)
+
+    def given(self, t: float, y: Array, f: Array) -> Array:
+        """Return the given rates in the order of their places."""
+        return self.known(t, y, f)[self.given_places]
+
+    def rates(self, low: float, high: float, shift: float, functions: Sequence[Any] | None = None) -> Rates:
+        """Return the rates as the engine calls them, by `functions` or in Python."""
+        items = tuple((k, self._starts[k + 1] - self._starts[k]) for k in self.items)
+        return Rates(items, tuple(map(self._call, self.items) if functions is None else functions), low, high, shift)
+
+    def _what(self, k: int) -> str:
+        return f"rate of balance {self._labels[k]!r}"
+
+    def _rate(self, k: int, t: float, y: Array, f: Array) -> Array:
+        item = self.items[k]
+        rate = bound(item.rate_function, item.args + self._extra)
+        value = rate(t, y.copy(), f.copy()) if item.rate_uses_f else rate(t, y.copy())
+        return real_value(value, self._what(k), t, self._shapes[k]).astype(float)
+
+    def _call(self, k: int) -> Call | None:
+        item, shape, what = self.items[k], self._shapes[k], self._what(k)
+        if item.rate_function is None:
+            return None
+
+        def convert(found: Any, t: float) -> Array:
+            return np.array(real_value(found, what, t, shape), float, order="C")
+
+        arguments = item.args + self._extra
+        return call(item.rate_function, arguments, shape, convert, real=True, takes_f=item.rate_uses_f)

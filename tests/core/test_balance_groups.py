@@ -1,0 +1,391 @@
+"""Balances with components: each group is projected by itself."""
+
+import copy
+
+import numpy as np
+import pytest
+import scipy.integrate
+from systems import energy, energy_gradient, momentum, momentum_gradient, orbit, pericentre
+
+import eip_scipy
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ12,
+    EIPRK4,
+    EIPRK45,
+    Balance,
+    Invariant,
+    ProjectionWarning,
+    ensemble,
+    integrate,
+    project,
+)
+from eip_scipy.checkpoint import CheckpointError
+from eip_scipy.engine.data import Groups
+from eip_scipy.problems import nbody
+from eip_scipy.problems.gravity.orbits import orbital_balances
+from eip_scipy.run import resume
+
+EPS = np.finfo(float).eps
+DRAG = 1e-6
+RUNS = [
+    {"method": EIPDOP853, "h": 0.005},
+    {"method": EIPRK4, "h": 0.001, "every": 3},
+    {"method": EIPRK45, "rtol": 1e-9, "atol": 1e-12},
+    {"method": EIPGJ12, "h": 0.001},
+]
+# A star, a planet with a moon, and two planets; AU and years.
+GM = np.array([39.5, 1e-2, 1e-5, 4e-2, 1e-3])
+STAR, PLANET, MOON, SECOND, THIRD = range(5)
+
+
+def places():
+    q, v = np.zeros((2, 5, 3))
+    for k, (distance, tilt) in {PLANET: (1.0, 0.02), SECOND: (2.1, 0.0), THIRD: (3.4, 0.1)}.items():
+        angle = 1.3 * k
+        q[k] = distance * np.array([np.cos(angle), np.sin(angle), tilt])
+        v[k] = np.sqrt(GM[0] / distance) * np.array([-np.sin(angle), np.cos(angle), 0.05])
+    q[MOON] = q[PLANET] + [0.015, 0, 0.001]
+    v[MOON] = v[PLANET] + [0, np.sqrt(1e-2 / 0.015), 0]
+    return np.array([x - GM @ x / GM.sum() for x in (q, v)])
+
+
+PROBLEM = nbody(GM, *places(), t_span=(0, 0.25), h=0.002, units="AU, yr")
+Y0 = PROBLEM.y0
+BODIES = np.arange(30).reshape(2, 5, 3)
+UNIFORM = (PROBLEM.frame[0], np.kron(np.eye(2), np.kron(np.ones((5, 1)), np.eye(3))))
+KEPT = orbital_balances(GM, Y0)
+ALL = orbital_balances(GM, Y0, ("energy", "momentum", "laplace"))
+
+
+def derivative(t, y):
+    out = np.empty(30)
+    PROBLEM.rhs(t, y, out, GM)
+    return out
+
+
+def run(balances=KEPT, **options):
+    options.setdefault("frame", UNIFORM)
+    return integrate(PROBLEM, invariants=balances, **options)
+
+
+def dragged(t, y):
+    return orbit(t, y) - DRAG * np.array([0.0, 0.0, y[2], y[3]])
+
+
+def loss(t, y):
+    return -DRAG * (y[2] ** 2 + y[3] ** 2)
+
+
+def braked(t, y):
+    return -DRAG * momentum(t, y)
+
+
+def pair(**how):
+    return [
+        Balance(energy, loss, energy_gradient, name="E", **how),
+        Balance(momentum, braked, momentum_gradient, name="L", **how),
+    ]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("options", [{"method": EIPDOP853, "h": 0.25}, {"method": EIPRK4, "h": 0.05}])
+def test_one_group_of_all_components_is_the_euclidean_projection(count, options):
+    grouped, plain = (
+        integrate(dragged, (0, 20), pericentre(0.2), invariants=items[:count], save_every=1, **more, **options).y
+        for items, more in ((pair(components=range(4)), {}), (pair(), {"metric": "euclidean"}))
+    )
+    assert np.abs(grouped[:, 1] - plain[:, 1]).max() < 4 * EPS
+    assert np.abs(grouped - plain).max() < 1e-12
+
+
+def test_one_group_by_a_multistep_method():
+    right = scipy.integrate.solve_ivp(dragged, (0, 200), pericentre(0.2), method="DOP853", rtol=1e-13, atol=1e-15).y[
+        :, -1
+    ]
+    for items in (pair(components=range(4)), pair(components=range(4), weights=[1, 1, 2, 2])):
+        found = integrate(dragged, (0, 200), pericentre(0.2), method=EIPGJ12, h=0.04, invariants=items)
+        assert found.trusted
+        assert np.abs(found.y[:, -1] - right).max() < 1e-9
+
+
+def test_weights_and_rows():
+    """The correction is the shortest in units of the weights; the components of a row move alike."""
+    rng = np.random.default_rng(0)
+    g, y, weights = rng.normal(size=6), rng.normal(size=6), np.array([2.0, 0.5])
+
+    def plane(**how):
+        return Balance(lambda t, y: g @ y, lambda t, y: 0.0, lambda t, y: g, **how)
+
+    moved = project(y, plane(components=[[4, 1], [0, 3]], weights=weights), target=g @ y + 1e-3).correction
+    slope = weights * [g[4] + g[1], g[0] + g[3]]
+    steps = weights * slope / (slope @ slope) * 1e-3
+    assert np.allclose(moved, [steps[1], steps[0], 0, steps[1], steps[0], 0], rtol=1e-10, atol=0)
+    assert np.allclose(project(y, plane(components=[2]), target=g @ y + 1e-3).correction[2], 1e-3 / g[2], rtol=1e-10)
+
+
+@pytest.mark.parametrize("kept", [KEPT, ALL], ids=["E", "E, h, e"])
+@pytest.mark.parametrize("frame", [None, UNIFORM, PROBLEM.frame], ids=["none", "uniform", "recoil"])
+def test_a_group_does_not_disturb_the_others(kept, frame):
+    """A planet that is off, with its moon, is brought back without a change of any other relative motion."""
+    f = derivative(0.0, Y0)
+    target = np.concatenate([np.ravel(balance.fun(0.0, Y0)) for balance in kept])
+    off = Y0.copy()
+    off[BODIES[1, [PLANET, MOON]]] += [1e-7, -2e-7, 5e-8]
+    found = project(off, kept, target=target, f=f, frame=frame)
+    q, v = found.y.reshape(2, 5, 3)
+    q0, v0 = off.reshape(2, 5, 3)
+    loose = 4 * EPS
+    for body, centre in [(SECOND, STAR), (THIRD, STAR), (MOON, PLANET)]:
+        assert np.abs((q[body] - q[centre]) - (q0[body] - q0[centre])).max() <= loose
+        assert np.abs((v[body] - v[centre]) - (v0[body] - v0[centre])).max() <= 4 * loose
+    after = np.concatenate([np.ravel(balance.fun(0.0, found.y)) for balance in kept])
+    before = np.concatenate([np.ravel(balance.fun(0.0, off)) for balance in kept])
+    assert np.abs(after - target).max() < 1e-5 * np.abs(before - target).max()
+    moved = PROBLEM.frame[0] @ found.correction  # centre of mass and momentum
+    assert (np.abs(moved) <= EPS * np.abs(PROBLEM.frame[0]) @ np.abs(off)).all()
+    assert found.rank == (4 if kept is KEPT else 4 * 5)
+
+
+def test_seven_rows_of_rank_five():
+    """Energy, angular momentum and Laplace vector of an orbit obey two relations."""
+    for kept, rank in ((ALL, 5), (orbital_balances(GM, Y0, ("energy", "momentum")), 4)):
+        found = run(kept, method=EIPDOP853, h=0.005)
+        assert found.trusted
+        assert found.diagnostics.n_rank_reduced == (found.diagnostics.n_projections if rank == 5 else 0)
+
+
+def exact(times):
+    return scipy.integrate.solve_ivp(derivative, (0, 0.25), Y0, method="DOP853", rtol=1e-13, atol=1e-14, t_eval=times).y
+
+
+TIMES = np.linspace(0, 0.25, 41)
+
+
+@pytest.mark.parametrize("options", RUNS)
+@pytest.mark.parametrize("kept", [KEPT, ALL], ids=["E", "E, h, e"])
+def test_compiled_runs_have_the_bits_of_interpreted_ones(options, kept):
+    compiled, interpreted = (run(kept, compiled=c, t_eval=TIMES, **options) for c in (True, False))
+    assert compiled.compiled
+    assert not interpreted.compiled
+    assert np.array_equal(compiled.y, interpreted.y)
+    assert compiled.trusted
+    assert compiled.diagnostics.names == tuple(name for balance in kept for name in balance.value_names)
+    right = exact(TIMES)
+    assert np.abs(compiled.y - right).max() < (2e-4 if options["method"] is EIPRK4 else 1e-6)
+    assert np.isfinite(compiled.diagnostics.slowness).all()
+
+
+@pytest.mark.parametrize("options", RUNS)
+def test_states_between_the_steps_are_on_the_targets(options):
+    right = [KEPT[0].fun(0.0, y) for y in exact(TIMES).T]
+    loose = 1e-5 if options["method"] is EIPRK4 else 2e-8
+    sol = scipy.integrate.solve_ivp(derivative, (0, 0.25), Y0, t_eval=TIMES, invariants=KEPT, frame=UNIFORM, **options)
+    assert np.abs(np.array([KEPT[0].fun(0.0, y) for y in sol.y.T]) - right).max() < loose
+    dense = scipy.integrate.solve_ivp(
+        derivative, (0, 0.25), Y0, dense_output=True, invariants=KEPT, frame=UNIFORM, **options
+    )
+    assert np.array_equal(dense.sol(TIMES), sol.y)
+    found = run(t_eval=TIMES, **options)
+    assert found.success
+    assert np.abs(np.array([KEPT[0].fun(0.0, y) for y in found.y.T]) - right).max() < loose
+
+
+class StoppedError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("options", RUNS)
+def test_a_resumed_run_has_the_same_bits(tmp_path, monkeypatch, options):
+    monkeypatch.setattr(resume, "SNAPSHOT_SECONDS", 0.0)
+    monkeypatch.setattr(resume, "LEAST_RATIO", 0.0)
+    rows = iter(range(4))
+
+    def stop(t, y, defects):
+        if next(rows, None) is None:
+            raise StoppedError
+
+    file = tmp_path / "run.npz"
+    whole = run(save_every=4, **options)
+    with pytest.raises(StoppedError):
+        run(save_every=4, callback=stop, checkpoint=file, checkpoint_every=1e-9, **options)
+    found = run(save_every=4, checkpoint=file, resume=True, **options)
+    assert "resumed at step" in found.message
+    assert np.array_equal(found.y, whole.y)
+
+
+def test_a_checkpoint_knows_the_components(tmp_path):
+    file = tmp_path / "run.npz"
+
+    def drag(how, **more):
+        return integrate(
+            dragged, (0, 5), pericentre(0.2), method=EIPRK4, h=0.1, invariants=pair(**how), checkpoint=file, **more
+        )
+
+    drag({"components": range(4)})
+    for other in (
+        {"components": range(3)},
+        {"components": range(4), "weights": [1, 1, 2, 2]},
+        {"components": [[0, 1], [2, 3]]},
+    ):
+        with pytest.raises(CheckpointError, match="components"):
+            drag(other, resume=True)
+
+
+@pytest.mark.parametrize("options", RUNS)
+def test_a_run_is_continued(options):
+    halves = run(t_span=(0, 0.125), **options).continue_to(0.25)
+    right = exact([0.25])[:, 0]
+    assert np.abs(KEPT[0].fun(0.0, halves.y[:, -1]) - KEPT[0].fun(0.0, right)).max() < (
+        1e-5 if options["method"] is EIPRK4 else 2e-8
+    )
+
+
+@pytest.mark.parametrize("options", RUNS)
+def test_copies_go_on_to_the_same_bits(options):
+    options = dict(options)
+    method = options.pop("method")
+    solver = method(derivative, 0, Y0, 0.25, invariants=KEPT, frame=UNIFORM, **options)
+    for _ in range(30):
+        solver.step()
+    copies = [solver, copy.deepcopy(solver), copy.deepcopy(copy.deepcopy(solver))]
+    for one in copies:
+        while one.status == "running":
+            one.step()
+        assert np.array_equal(one.y, solver.y)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("options", [RUNS[0], RUNS[3]])
+def test_members_of_ensembles_are_single_runs(options, compiled):
+    starts = np.array([Y0 * (1 + 1e-4 * k) for k in range(10)])
+    many = ensemble(PROBLEM, None, starts, invariants=KEPT, frame=UNIFORM, compiled=compiled, **options)
+    for k in (0, 9):
+        one = run(y0=starts[k], compiled=compiled, **options)
+        assert np.array_equal(many.y[k], one.y[:, -1])
+
+
+@pytest.mark.parametrize("options", RUNS)
+def test_options_that_change_nothing_here(options):
+    """A start is on its own values, and without checks the same steps are made."""
+    plain = run(**options).y[:, -1]
+    for more in ({"project_initial": True}, {"check": False}):
+        assert np.array_equal(run(**more, **options).y[:, -1], plain)
+
+
+@pytest.mark.parametrize("more", [{"compensated": True}, {"every": "auto"}, {"every": 7, "compensated": True}])
+def test_other_options(more):
+    found = run(method=EIPDOP853, h=0.005, **more)
+    assert found.trusted
+    assert np.abs(found.y[:, -1] - exact([0.25])[:, 0]).max() < 1e-6
+
+
+@pytest.mark.parametrize("options", [{"method": EIPDOP853, "h": 0.2}, {"method": EIPGJ12, "h": 0.04}])
+def test_a_wrong_rate_is_named(options):
+    wrong = Balance(energy, lambda t, y: 100 * loss(t, y), energy_gradient, name="E", components=range(4))
+    with pytest.warns(ProjectionWarning, match="the rate of balance 'E' is wrong"):
+        assert not integrate(dragged, (0, 50), pericentre(0.2), invariants=wrong, **options).trusted
+
+
+def test_complex_states():
+    mass = Balance(lambda t, y: np.vdot(y, y).real, lambda t, y: 0.0, lambda t, y: 2 * y, name="mass", components=[0])
+    with pytest.raises(ValueError, match="complex state cannot have components"):
+        integrate(lambda t, y: -1j * y, (0, 1), [1 + 0j, 1j], method=EIPRK4, h=0.1, invariants=mass)
+
+
+@pytest.mark.parametrize(
+    ("components", "weights", "message"),
+    [
+        (None, [1.0], "weights without components"),
+        ([], None, "must be integers of shape"),
+        (3, None, "must be integers of shape"),
+        ([[[0]]], None, "must be integers of shape"),
+        ([0.5], None, "must be integers of shape"),
+        ([np.nan], None, "must be integers of shape"),
+        ([np.inf], None, "must be integers of shape"),
+        (["x"], None, "must be integers of shape"),
+        ([1j], None, "must be integers of shape"),
+        ([[0, 1], [2]], None, "must be integers of shape"),
+        ([-1], None, "different indices >= 0"),
+        ([1e300], None, "different indices >= 0"),
+        ([0, 0], None, "different indices >= 0"),
+        ([[0, 1], [1, 2]], None, "different indices >= 0"),
+        ([0, 1], [1.0], "weights must be 2 positive numbers"),
+        ([0, 1], 1.0, "weights must be 2 positive numbers"),
+        ([0, 1], [1.0, 0.0], "weights must be 2 positive numbers"),
+        ([0, 1], [1.0, -1.0], "weights must be 2 positive numbers"),
+        ([0, 1], [1.0, np.nan], "weights must be 2 positive numbers"),
+        ([0, 1], [1.0, np.inf], "weights must be 2 positive numbers"),
+        ([0, 1], ["a", "b"], "weights must be 2 positive numbers"),
+    ],
+)
+def test_wrong_components_and_weights(components, weights, message):
+    with pytest.raises(ValueError, match=message):
+        Balance(energy, loss, components=components, weights=weights)
+
+
+PLAIN = Invariant(momentum, momentum_gradient, name="L")
+
+
+@pytest.mark.parametrize("solve", [scipy.integrate.solve_ivp, eip_scipy.solve_ivp, integrate])
+@pytest.mark.parametrize(
+    ("items", "more", "message"),
+    [
+        (pair(components=[4]), {}, r"outside the state, which has 4 components"),
+        ([*pair(components=[0]), PLAIN], {}, "'L' has no components, but others have"),
+        ([*pair(components=range(4))[:1], pair()[1]], {}, "'L' has no components, but others have"),
+        (pair(components=[0]), {"metric": "error"}, "metric, direction and iterations do not apply"),
+        (pair(components=[0]), {"metric": [1, 1, 1, 1]}, "metric, direction and iterations do not apply"),
+        (pair(components=[0]), {"iterations": 2}, "metric, direction and iterations do not apply"),
+        (pair(components=[0]), {"direction": "old"}, "metric, direction and iterations do not apply"),
+    ],
+)
+def test_what_does_not_go_together(solve, items, more, message):
+    with pytest.raises(ValueError, match=message):
+        solve(dragged, (0, 1), pericentre(0.2), method=EIPDOP853, h=0.1, invariants=items, **more)
+
+
+def test_project():
+    items, y = pair(components=range(4)), pericentre(0.2) * 1.0001
+    target = [energy(0, pericentre(0.2)), momentum(0, pericentre(0.2))]
+    plain = project(y, [Invariant(energy, energy_gradient), PLAIN], target=target)
+    found = project(y, items, target=target)
+    assert np.abs(found.y - plain.y).max() < 4 * EPS
+    assert np.allclose(found.defect, plain.defect, rtol=1e-3)
+    for more in ({"iterations": 3}, {"sigma": [1, 1, 1, 1]}):
+        with pytest.raises(ValueError, match="do not apply to balances with components"):
+            project(y, items, target=target, **more)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("value", [0, 2]),
+        ("value", [0, -1]),
+        ("value", [0]),
+        ("first_value", [0, 3]),
+        ("first_value", [1, 2]),
+        ("first_value", []),
+        ("first_value", [0, 2, 1, 2]),
+        ("first_direction", [0, 5]),
+        ("first_direction", [0, 1, 4]),
+        ("first_float", [0, 1, 2, 3]),
+        ("first_float", [0, 2, 1, 3, 4]),
+        ("first_float", [0, 1, 2, 3, 5]),
+        ("place", [0, 1, 2, 4]),
+        ("place", [0, 1, 2, -1]),
+        ("weight", [1.0, 1.0, 1.0]),
+        ("weight", [1.0] * 5),
+    ],
+)
+def test_the_engine_checks_the_record(field, value):
+    solver = EIPDOP853(dragged, 0, pericentre(0.2), 1, h=0.1, invariants=pair(components=range(4)))
+    solver.step()
+    options = solver._run.options
+    assert isinstance(options.parts, Groups)
+    wrong = np.array(value, getattr(options.parts, field).dtype)
+    solver._run.options = options._replace(parts=options.parts._replace(**{field: wrong}))
+    with pytest.raises(ValueError, match="engine:"):
+        solver._drive(begins=False)
+    solver._run.options = options
+    solver._drive(begins=False)

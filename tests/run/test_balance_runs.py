@@ -1,0 +1,348 @@
+"""Balances in `integrate` and `ensemble`: compiled and interpreted, checkpoints, continuations, events, C functions."""
+
+import ctypes
+
+import numpy as np
+import pytest
+import scipy.integrate
+from c_compiler import shared_library
+from numba import njit
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ12,
+    EIPGJ14,
+    EIPRK4,
+    EIPRK45,
+    EIPRKN12,
+    Balance,
+    Invariant,
+    ensemble,
+    integrate,
+    load,
+)
+from eip_scipy.checkpoint import CheckpointError
+from eip_scipy.run import resume
+
+NUMBERS = ctypes.POINTER(ctypes.c_double)
+# A quartic oscillator whose stiffness varies slowly: amplitude and frequency of that are the parameters.
+PARAMS = np.array([1e-3, 0.3])
+START = np.array([1.0, 0.3])
+RUNS = [
+    {"method": EIPDOP853, "h": 0.25},
+    {"method": EIPRK4, "h": 0.1, "every": 3},
+    {"method": EIPRK45, "rtol": 1e-8, "atol": 1e-10},
+    {"method": EIPGJ12, "h": 0.025},
+]
+
+
+@njit
+def swinging(t, y, p):
+    return np.array([y[1], -(1 + p[0] * np.sin(p[1] * t)) * y[0] - y[0] ** 3])
+
+
+@njit
+def energy(t, y, p):
+    return 0.5 * y[1] ** 2 + 0.5 * (1 + p[0] * np.sin(p[1] * t)) * y[0] ** 2 + 0.25 * y[0] ** 4
+
+
+@njit
+def gradient(t, y, p):
+    return np.array([(1 + p[0] * np.sin(p[1] * t)) * y[0] + y[0] ** 3, y[1]])
+
+
+@njit
+def rate(t, y, p):
+    return 0.5 * p[0] * p[1] * np.cos(p[1] * t) * y[0] ** 2
+
+
+@njit
+def rate_by_f(t, y, f, p):
+    return y[1] * f[1] + (1 + p[0] * np.sin(p[1] * t)) * y[0] * f[0] + y[0] ** 3 * f[0] + rate(t, y, p)
+
+
+@njit
+def gradient_by_f(t, y, f, p):
+    return np.array([-f[1], f[0]])
+
+
+@njit
+def twice(t, y, p):
+    return np.array([energy(t, y, p), 2 * energy(t, y, p)])
+
+
+BALANCES = {
+    "rate": Balance(energy, rate, gradient, name="H"),
+    "f": Balance(energy, rate_by_f, gradient_by_f, name="H", uses_f=True),
+    "gradient": Balance(energy, grad=gradient, name="H"),
+    "values": Balance(energy, name="H"),
+    "pair": Balance(twice, name="H"),
+}
+BALANCE = BALANCES["rate"]
+
+
+def run(balance=BALANCE, end=20.0, **options):
+    return integrate(swinging, (0, end), START, params=PARAMS, invariants=balance, **options)
+
+
+def exact(end):
+    def fun(t, y):
+        return swinging(t, y, PARAMS)
+
+    return scipy.integrate.solve_ivp(fun, (0, end), START, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+
+
+@pytest.mark.parametrize("options", RUNS)
+@pytest.mark.parametrize("name", BALANCES)
+def test_compiled_runs_have_the_bits_of_interpreted_ones(name, options):
+    times = np.linspace(0, 20, 33)
+    compiled, interpreted = (run(BALANCES[name], compiled=c, t_eval=times, **options) for c in (True, False))
+    assert compiled.compiled
+    assert np.array_equal(compiled.y, interpreted.y)
+    assert np.array_equal(compiled.diagnostics.slowness, interpreted.diagnostics.slowness)
+    assert compiled.trusted
+    end = exact(20.0)
+    loose = 1e-7 if options["method"] is EIPRK4 else 2e-11
+    assert np.abs(compiled.invariants[0, -1] - energy(20.0, end, PARAMS)) < loose
+    assert compiled.calls.get("rate of H") == ("jitted" if name in ("rate", "f") else None)
+
+
+def test_rates_by_dual_numbers_are_those_that_are_given():
+    given, derived = (run(BALANCES[name], method=EIPDOP853, h=0.25).y[:, -1] for name in ("rate", "values"))
+    assert np.abs(given - derived).max() < 1e-13
+
+
+def test_a_rate_in_python_keeps_a_run_from_being_compiled():
+    slow = Balance(energy, lambda t, y, p: rate(t, y, p), gradient, name="H")
+    found = run(slow, method=EIPDOP853, h=0.25)
+    assert not found.compiled
+    assert "rate of balance 'H' is not a Numba function" in found.message
+
+
+@pytest.mark.parametrize("numbers", [(1e-3, 0.3), (1e-3, 0.3, 2)])
+def test_args_reach_the_rate(numbers):
+    def swing(t, y, a, w, *others):
+        return swinging(t, y, np.array([a, w]))
+
+    items = [
+        Balance(
+            lambda t, y, *args: energy(t, y, PARAMS), lambda t, y, a, w, *others: rate(t, y, np.array([a, w])), name="H"
+        ),
+        Balance(lambda t, y, k, *args: energy(t, y, PARAMS), lambda t, y, k, *args: rate(t, y, PARAMS), args=(3,)),
+    ]
+    for balance in items:
+        found = integrate(swing, (0, 20), START, args=numbers, method=EIPDOP853, h=0.25, invariants=balance)
+        assert np.abs(found.y[:, -1] - run(method=EIPDOP853, h=0.25).y[:, -1]).max() < 1e-12
+
+
+SOURCE = """
+#include <math.h>
+int fun(double t, const double *y, double *out, const double *p) {
+    out[0] = y[1];
+    out[1] = -(1 + p[0] * sin(p[1] * t)) * y[0] - y[0] * y[0] * y[0];
+    return 0;
+}
+int energy(double t, const double *y, double *out, const double *p) {
+    const double q2 = y[0] * y[0];
+    out[0] = 0.5 * y[1] * y[1] + 0.5 * (1 + p[0] * sin(p[1] * t)) * q2 + 0.25 * q2 * q2;
+    return 0;
+}
+int rate(double t, const double *y, const double *f, double *out, const double *p) {
+    if (t > p[2]) return -7;
+    out[0] = 0.5 * p[0] * p[1] * cos(p[1] * t) * y[0] * y[0];
+    return 0;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("balances")
+    source = folder / "functions.c"
+    source.write_text(SOURCE, encoding="utf-8")
+    found = ctypes.CDLL(str(shared_library(folder / "functions.so", source)))
+    for name in ("fun", "energy", "rate"):
+        getattr(found, name).argtypes = [ctypes.c_double, *[NUMBERS] * (4 if name == "rate" else 3)]
+    return found
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_c_functions(library, given):
+    """Without a rate the engine takes gradients and the derivative in time by differences."""
+    balance = Balance(library.energy, library.rate if given else None, name="H")
+    for compiled in (True, False):
+        found = integrate(
+            library.fun, (0, 20), START, params=[*PARAMS, 30.0], method=EIPDOP853, h=0.25, invariants=balance,
+            compiled=compiled,
+        )  # fmt: skip
+        assert found.trusted
+        assert found.compiled == compiled
+        assert found.calls.get("rate of H") == (("pointer" if compiled else "python") if given else None)
+        assert np.abs(found.y[:, -1] - run(method=EIPDOP853, h=0.25).y[:, -1]).max() < 1e-11
+
+
+def test_a_c_function_may_end_the_run(library):
+    balance = Balance(library.energy, library.rate, name="H")
+    with pytest.raises(RuntimeError, match="rate of balance 'H' returned the status -7 at t=10"):
+        integrate(library.fun, (0, 20), START, params=[*PARAMS, 10.0], method=EIPRK4, h=0.25, invariants=balance)
+
+
+class StoppedError(Exception):
+    pass
+
+
+def stop_after(count):
+    rows = iter(range(count))
+
+    def callback(t, y, defects):
+        assert np.isnan(defects).all()  # the value that is kept changes
+        if next(rows, None) is None:
+            raise StoppedError
+
+    return callback
+
+
+@pytest.mark.parametrize("options", RUNS)
+@pytest.mark.parametrize("name", ["rate", "gradient"])
+def test_a_resumed_run_has_the_same_bits(tmp_path, monkeypatch, name, options):
+    monkeypatch.setattr(resume, "SNAPSHOT_SECONDS", 0.0)
+    monkeypatch.setattr(resume, "LEAST_RATIO", 0.0)
+    balance, file = BALANCES[name], tmp_path / "run.npz"
+    whole = run(balance, save_every=4, **options)
+    with pytest.raises(StoppedError):
+        run(balance, save_every=4, callback=stop_after(8), checkpoint=file, checkpoint_every=1e-9, **options)
+    found = run(balance, save_every=4, checkpoint=file, resume=True, **options)
+    assert "resumed at step" in found.message
+    assert "step 0" not in found.message
+    assert np.array_equal(found.y, whole.y)
+    assert np.array_equal(found.diagnostics.slowness, whole.diagnostics.slowness)
+
+
+def test_a_checkpoint_knows_which_are_balances(tmp_path):
+    file = tmp_path / "run.npz"
+    run(method=EIPRK4, h=0.1, end=5.0, checkpoint=file)
+    with pytest.raises(CheckpointError, match="balances"):
+        run(
+            Invariant(energy, gradient, name="H"),
+            method=EIPRK4,
+            h=0.1,
+            end=5.0,
+            checkpoint=file,
+            resume=True,
+            check=False,
+        )
+
+
+def test_a_checkpoint_belongs_to_its_rates(tmp_path):
+    def other(t, y, p):
+        return (1 + 1e-6) * rate(t, y, p)
+
+    file = tmp_path / "run.npz"
+    run(method=EIPRK4, h=0.1, end=5.0, checkpoint=file)
+    with pytest.raises(CheckpointError, match="rate of balance 'H' was"):
+        run(
+            Balance(energy, other, gradient, name="H"),
+            method=EIPRK4, h=0.1, end=5.0, checkpoint=file, resume=True, check=False,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("options", RUNS)
+def test_a_run_is_continued(options):
+    """Q goes on from its value at the end, and begins again in a state between two steps."""
+
+    def third_zero(t, y, p):
+        return y[0]
+
+    third_zero.terminal = 3
+    right = energy(20.0, exact(20.0), PARAMS)
+    loose = 1e-7 if options["method"] is EIPRK4 else 2e-11
+    halves = run(end=10.0, **options).continue_to(20.0)
+    at_event = run(events=third_zero, **options).continue_to(20.0, events=None)
+    for found in (halves, at_event):
+        assert found.t[-1] == 20.0
+        assert found.trusted
+        assert abs(energy(20.0, found.y[:, -1], PARAMS) - right) < loose
+        assert np.isfinite(found.diagnostics.slowness).all()
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("options", RUNS)
+def test_members_of_ensembles_are_single_runs(options, compiled):
+    starts = np.array([[1.0, 0.3], [0.8, 0.0], [1.2, -0.1]])
+    times = [3.3, 20.0]
+    members = ensemble(
+        swinging, (0, 20), starts, params=PARAMS, invariants=BALANCE, t_eval=times, compiled=compiled, **options
+    )
+    for k, start in enumerate(starts):
+        single = integrate(
+            swinging, (0, 20), start, params=PARAMS, invariants=BALANCE, t_eval=times, compiled=compiled, **options
+        )
+        assert np.array_equal(members.trajectories[k], single.y)
+        assert np.array_equal(members.max_defect[k], single.max_defect)
+    assert members.trusted.all()
+    assert np.isnan(members.target).all()
+    if compiled:
+        assert "each run carries its balances by itself" in str(members)
+
+
+def test_results_are_saved_with_their_slowness(tmp_path):
+    found = run(method=EIPRK4, h=0.1, end=5.0)
+    found.save(tmp_path / "run.npz")
+    again = load(tmp_path / "run.npz")
+    assert np.array_equal(again.diagnostics.slowness, found.diagnostics.slowness)
+    assert 0 < again.diagnostics.slowness[0] < 1e-3
+    assert np.isnan(again.target).all()
+
+
+@njit
+def perturbed(t, y):
+    r3 = (y[0] ** 2 + y[1] ** 2) ** 1.5
+    return np.array([y[2], y[3], -y[0] / r3 + 1e-5 * np.cos(0.1 * t), -y[1] / r3 + 1e-5 * y[0]])
+
+
+@njit
+def orbital_energy(t, y):
+    return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2)
+
+
+@njit
+def orbital_rate(t, y):
+    return 1e-5 * (np.cos(0.1 * t) * y[2] + y[0] * y[3])
+
+
+def stiffness(t, q, dq, out):
+    r2 = q @ q
+    out[:] = (3 * q * (q @ dq) / r2 - dq) / r2**1.5
+
+
+@pytest.mark.parametrize(
+    ("method", "parts", "plain_error", "error"),
+    [(EIPGJ12, 150, 5e-9, 5e-11), (EIPGJ14, 110, 5e-10, 5e-11)],
+)
+def test_a_perturbed_planet_by_multistep_methods(method, parts, plain_error, error):
+    """Against a Nystrom method with shorter steps that carries its rounding, right to 5e-12."""
+    period = 2 * np.pi
+    y0, t_span = [0.8, 0.0, 0.0, 1.5**0.5], (0, 300.37 * period)
+    right = integrate(perturbed, t_span, y0, method=EIPRKN12, h=period / 120, compensated=True).y[:, -1]
+    options = {"method": method, "h": period / parts}
+    if method is EIPGJ14:
+        options["jacobian"] = stiffness
+    assert np.abs(integrate(perturbed, t_span, y0, **options).y[:, -1] - right).max() > plain_error
+    for rates in (orbital_rate, None):
+        found = integrate(perturbed, t_span, y0, invariants=Balance(orbital_energy, rates), **options)
+        assert found.trusted
+        assert np.abs(found.y[:, -1] - right).max() < error
+
+
+def test_a_failed_step_leaves_the_value_alone():
+    """The last state is handed out on the value that belongs to it, not to the step that failed."""
+
+    def failing(t, y):
+        return swinging(t, y, PARAMS) if t < 3.05 else np.full(2, np.nan)
+
+    balance = Balance(lambda t, y: energy(t, y, PARAMS), lambda t, y: rate(t, y, PARAMS))
+    found = integrate(failing, (0, 20), START, method=EIPDOP853, h=0.25, every=5, invariants=balance)
+    assert found.status == -1
+    assert found.t[-1] == 3.0
+    right = energy(3.0, exact(3.0), PARAMS)
+    assert abs(energy(3.0, found.y[:, -1], PARAMS) - right) < 1e-11
