@@ -40,6 +40,7 @@ def problem_from_simulation(
     forces: str | Sequence[str] | None = None,
     constants: ForceConstants | None = None,
     names: Sequence[str] | None = None,
+    balances: str | Sequence[str] | None = None,
 ) -> Problem:
     """Build an N-body problem from a REBOUND simulation, at its present state.
 
@@ -60,6 +61,8 @@ def problem_from_simulation(
     names : sequence of str, optional
         Names of the bodies; default: those of the particles (REBOUND 5), and numbers for others. Snapshots of an
         archive after the first may have lost them.
+    balances : str or sequence of str, optional
+        As for `nbody`: "kepler" keeps the energy of each orbit in place of the totals.
 
     Returns
     -------
@@ -121,6 +124,7 @@ def problem_from_simulation(
         source=f"REBOUND {rebound.__version__} simulation of {sim.N} bodies at t = {sim.t!r}",
         bodies=_names(sim) if names is None else names,
         G=sim.G,
+        balances=balances,
     )
 
 

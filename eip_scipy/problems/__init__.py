@@ -8,6 +8,7 @@ from .gravity import solar_data as solar_data
 from .gravity.forces import ForceConstants
 from .gravity.nbody import nbody
 from .gravity.orbital_elements import OrbitalElements, orbital_elements
+from .gravity.orbits import orbital_balances
 from .gravity.scenes import comet, figure_eight, pythagorean
 from .gravity.solar_data import SolarSystemData
 from .gravity.solar_system import solar_system
@@ -72,6 +73,7 @@ __all__ = [
     "kepler",
     "korteweg_de_vries_solitons",
     "nbody",
+    "orbital_balances",
     "orbital_elements",
     "pair_time",
     "plane_wave",

@@ -19,6 +19,7 @@ from . import forces as _forces
 from .bodies import body_names, default_units, in_units
 from .forces import ForceConstants
 from .frequencies import orbital_frequencies
+from .orbits import orbital_balances
 
 __all__ = ["component_names", "nbody"]
 
@@ -43,6 +44,7 @@ def nbody(
     bodies: Sequence[str] | None = None,
     epoch: Any = None,
     G: float | None = None,
+    balances: str | Sequence[str] | None = None,
 ) -> Problem:
     """N point masses under Newton's gravitation, with further forces where an accuracy asks for them.
 
@@ -91,6 +93,9 @@ def nbody(
         The constant of gravitation. If it is given, the first argument holds the masses, which are multiplied by it:
         ``nbody([1, 1e-6], ..., G=4 * np.pi**2)`` in AU, years and solar masses. `Problem.G` keeps it, so that a
         simulation of REBOUND gets the same masses.
+    balances : str or sequence of str, optional
+        Keep what each orbit would keep without all other pulls, in place of the totals: "kepler" or "energy",
+        "momentum", "laplace", see `orbital_balances`. For planetary systems without close encounters, over long times.
 
     Returns
     -------
@@ -144,6 +149,10 @@ def nbody(
     chosen = _forces.check_forces(forces)
     y0 = np.concatenate([q.ravel(), v.ravel()])
     params = _forces.parameters(masses, chosen, constants) if chosen else masses
+    if balances is None:
+        kept = _forces.invariants(chosen, params, y0) if chosen else _newtonian(params)
+    else:
+        kept = orbital_balances(masses, y0, balances, bodies=bodies, newton=not chosen)
     rhs, acc = _forces.equations(chosen) if chosen else (library["gravity.rhs"], library["gravity.acc"])
     return Problem(
         name=name,
@@ -154,10 +163,10 @@ def nbody(
         t_span=(float(t_span[0]), float(t_span[1])),
         h=h,
         params=params,
-        invariants=_forces.invariants(chosen, params, y0) if chosen else _newtonian(params),
+        invariants=kept,
         blocks=3,
         component_names=component_names(masses.size, bodies),
-        frame=recoil(masses),
+        frame=recoil(masses) if balances is None else common_shift(masses),
         units=units,
         source=source,
         reference=reference,
@@ -257,3 +266,9 @@ def recoil(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     C = np.kron(np.eye(2), np.kron(share, axes))
     S = np.kron(np.eye(2), np.kron(share[:, None], axes))
     return C, S
+
+
+def common_shift(gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The frame (C, S): centre of mass and momentum, kept by a shift of all bodies, which changes no orbit."""
+    C, _ = recoil(gm)
+    return C, np.kron(np.eye(2), np.kron(np.ones((gm.size, 1)), np.eye(3)))

@@ -33,6 +33,7 @@ def solar_system(
     h: float = 0.002,
     units: str = "AU, yr",
     forces: str | Sequence[str] = (),
+    balances: str | Sequence[str] | None = None,
 ) -> Problem:
     """The solar system from JPL initial data; by default under Newton's gravitation (the paper's Experiment II).
 
@@ -51,13 +52,16 @@ def solar_system(
     forces : str or sequence of str, optional
         "1pn", "eih" or "gr-potential", "j2", "moon-quadrupole": see `nbody`, and for what each is worth the page
         "Forces" of the documentation.
+    balances : str or sequence of str, optional
+        "kepler" keeps each planet's energy about the Sun in place of the totals, see `nbody`: the most accurate way
+        over thousands of years, by `EIPGJ14` or `EIPDOP853`.
 
     Returns
     -------
     Problem
         Of 60 components (66 with the Moon), see `nbody`, named x_Sun, y_Sun and so on, with the data's epoch as its
         `epoch`. With "de440", or the same data from a kernel, and no further forces its `reference` gives stored states
-        at 1, 10, 100, 1000 and 2000 years (Taylor integration in extended precision).
+        at 1, 2, 5, 10 and so on to 10 000 years (in extended precision, see `reference_states`).
 
     Raises
     ------
@@ -77,6 +81,7 @@ def solar_system(
         t_span=(0.0, years * year),
         h=h * year,
         forces=chosen,
+        balances=balances,
         constants=_constants(known, chosen, length, time) if chosen else None,
         name="solar-system",
         units="AU, Julian year" if units == "AU, yr" else "m, s",

@@ -1,0 +1,188 @@
+"""Balances of the orbits of N bodies: energies, angular momenta and Laplace vectors, and their rates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...core.balances import Balance
+from ...core.inputs import flag, real_array, shown
+from ...core.names import nearest
+from ...engine.native import library
+
+__all__ = ["QUANTITIES", "centres", "chosen_quantities", "orbital_balances"]
+
+Array = np.ndarray
+QUANTITIES = ("energy", "momentum", "laplace")
+# Place of the energy at the start among the entries of an orbit, see engine/cpp/problems/orbits.cpp.
+ENERGY = 0
+
+
+class _Orbit(NamedTuple):
+    """Orbit of a body: its parameters for the engine, the components (6, k) that it moves, and their weights."""
+
+    body: int
+    entries: Array
+    components: Array
+    weights: Array
+
+
+def orbital_balances(
+    gm: Any,
+    y0: Any,
+    quantities: str | Sequence[str] = "kepler",
+    *,
+    bodies: Sequence[str] | None = None,
+    newton: bool = False,
+) -> tuple[Balance, ...]:
+    """Return the quantities that Kepler's motion conserves as balances, for the orbit of each body but the heaviest.
+
+    A planet moves about its star, and a moon about its planet. A planet with moons moves as their common barycentre.
+    The perturbing acceleration is that of the right-hand side less the pull of both sides on each other, so that the
+    rates hold for all forces.
+
+    Parameters
+    ----------
+    gm : array_like, shape (N,)
+        G m of each body, at least two.
+    y0 : array_like, shape (6 N,)
+        The start (q_1, ..., q_N, v_1, ..., v_N), from which the orbits are found.
+    quantities : str or sequence of str, optional
+        Quantities of each orbit: "energy", "momentum" (angular momentum) and "laplace" (Laplace's vector), all per
+        reduced mass. "kepler" is the energy alone, which is enough for eccentricities below 0.3.
+    bodies : sequence of str, optional
+        Names of the bodies.
+    newton : bool, optional
+        Whether no forces act except Newton's gravitation. The rates are then sums of the perturbing pulls instead of
+        differences of the accelerations, which reduces rounding for bodies without moons about the heaviest body.
+
+    Returns
+    -------
+    tuple of Balance
+        The energies are those less the energies at the start.
+
+    Raises
+    ------
+    ValueError
+        For unknown quantities, wrong masses or states, and sizes that disagree.
+
+    Notes
+    -----
+    These balances replace the total energy and angular momentum as the invariants of a run. The totals remain an
+    independent check; do not list them with these balances.
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPDOP853, integrate
+    >>> from eip_scipy.problems import orbital_balances, solar_system
+    >>> problem = solar_system(years=1)
+    >>> kept = orbital_balances(problem.params, problem.y0)
+    >>> run = integrate(problem, method=EIPDOP853, h=0.004, invariants=kept)
+    >>> run.invariants.shape[0], run.trusted
+    (9, True)
+    """
+    masses, state = real_array("gm", gm), real_array("y0", y0)
+    newton = flag("newton", newton)
+    if masses.ndim != 1 or masses.size < 2 or state.shape != (6 * masses.size,):
+        raise ValueError(
+            f"orbital_balances: gm has shape {masses.shape} and y0 {state.shape}; expected (N,) and (6 N,), N >= 2."
+        )
+    if not (np.isfinite(masses).all() and masses.min() >= 0 and masses.max() > 0):
+        raise ValueError(f"gm must hold finite numbers >= 0, and one > 0, got {shown(gm)}.")
+    if not np.isfinite(state).all():
+        raise ValueError(f"y0 must be finite, got {shown(y0)}.")
+    names = tuple(map(str, range(masses.size))) if bodies is None else tuple(bodies)
+    if len(names) != masses.size:
+        raise ValueError(f"bodies has {len(names)} names, gm has {masses.size} masses.")
+    about = centres(masses, state)
+    orbits = [_orbit(masses, state, about, body) for body in np.flatnonzero(about >= 0).tolist()]
+    entries = np.concatenate([masses, *(orbit.entries for orbit in orbits)])
+    start = library["orbits.energy"](0.0, state, entries)
+    place = masses.size + ENERGY
+    for orbit, energy in zip(orbits, start.tolist(), strict=True):
+        entries[place] = energy
+        place += orbit.entries.size
+    end = "_rate_newton" if newton else "_rate"
+    return tuple(_balance(quantity, entries, orbits, names, end) for quantity in chosen_quantities(quantities))
+
+
+def chosen_quantities(given: Any) -> tuple[str, ...]:
+    """Return the names of the quantities, without repetitions, in the order of `QUANTITIES`.
+
+    Raises
+    ------
+    ValueError
+        For unknown quantities.
+    """
+    names = (given,) if isinstance(given, str) else tuple(given) if isinstance(given, Iterable) else (given,)
+    for name in names:
+        if name not in (*QUANTITIES, "kepler"):
+            known = ", ".join(map(repr, ("kepler", *QUANTITIES)))
+            hint = nearest(str(name), ("kepler", *QUANTITIES))
+            raise ValueError(f"orbital_balances: unknown quantity {shown(name)}; known: {known}{hint}")
+    wanted = {"energy" if name == "kepler" else name for name in names}
+    return tuple(name for name in QUANTITIES if name in wanted)
+
+
+def centres(gm: Array, y0: Array) -> Array:
+    """Return the number of the body that each body moves about at the start, -1 for the heaviest body.
+
+    Among the heavier bodies that a body is bound to and in whose Hill sphere it is, this is the one with the smallest
+    sphere; without any, it is the heaviest body.
+    """
+    q, v = y0.reshape(2, -1, 3)
+    order = np.argsort(-gm, kind="stable").tolist()
+    about, hill = np.full(gm.size, -1), np.zeros(gm.size)
+    hill[order[0]] = np.inf
+    for place, body in enumerate(order[1:], 1):
+        best = order[0]
+        for other in order[1:place]:
+            distance, speed = np.linalg.norm(q[body] - q[other]), np.linalg.norm(v[body] - v[other])
+            bound = speed**2 * distance < 2 * (gm[body] + gm[other])
+            if bound and distance < hill[other] < hill[best]:
+                best = other
+        about[body] = best
+        hill[body] = np.linalg.norm(q[body] - q[best]) * np.cbrt(gm[body] / (3 * gm[best]))
+    return about
+
+
+def _is_below(about: Array, body: int, top: int) -> bool:
+    """Return whether a body moves about another, or about one that does."""
+    while body >= 0:
+        body = int(about[body])
+        if body == top:
+            return True
+    return False
+
+
+def _orbit(gm: Array, y0: Array, about: Array, body: int) -> _Orbit:
+    """Return the orbit of a body, together with all that move about it, about its centre."""
+    centre = int(about[body])
+    group = [k for k in range(gm.size) if k == body or _is_below(about, k, body)]
+    total = float(gm[group].sum())
+    shares = gm[group] / total if total > 0 else np.ones(1)
+    pairs = [(float(centre), -1.0), *((float(k), share) for k, share in zip(group, shares.tolist(), strict=True))]
+    q, v = y0.reshape(2, -1, 3)
+    sizes = [np.linalg.norm(shares @ a[group] - a[centre]) or 1.0 for a in (q, v)]
+    # The group moves, and the centre with the rest of what belongs to it moves in the opposite direction, so that their
+    # common centre of mass stays. No other orbit is then changed.
+    those = [k for k in range(gm.size) if k == centre or _is_below(about, k, centre)]
+    floats = np.arange(y0.size).reshape(2, -1, 3)[:, those].swapaxes(1, 2).reshape(6, -1)
+    moves = np.isin(those, group) - total / gm[those].sum()
+    entries = np.array([0.0, len(pairs), *np.ravel(pairs)])
+    return _Orbit(body, entries, floats, np.outer(np.repeat(sizes, 3), moves))
+
+
+def _balance(quantity: str, entries: Array, orbits: list[_Orbit], names: tuple[str, ...], end: str) -> Balance:
+    """Return the balance of one quantity for all orbits."""
+    fun, grad, rate = (library[f"orbits.{quantity}{part}"].bound(entries) for part in ("", "_gradient", end))
+    each = 1 if quantity == "energy" else 3
+    kept = Balance(fun, rate, grad, size=each * len(orbits), name=quantity, in_place=True, uses_f=True)
+    # Neptune's energy changes at 0.05 of its terms, because the Sun is moved by Jupiter, and helps all the same.
+    kept.warns_if_fast = False
+    kept.parts = tuple((orbit.components, orbit.weights) for orbit in orbits for _ in range(each))
+    axes = ("",) if each == 1 else ("_x", "_y", "_z")
+    kept.value_names = tuple(f"{quantity}{axis} of {names[orbit.body]}" for orbit in orbits for axis in axes)
+    return kept
