@@ -24,7 +24,7 @@ from .runs import KEPT, Peer, whole_number
 __all__ = ["Found", "Frontier", "methods"]
 
 PATIENCE = 30.0  # a run of so many seconds is not repeated
-LEVELS = (1e-6, 1e-7, 1e-8, 1e-9)
+LEVELS = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 
 
 def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | None) -> dict[str, Any]:
@@ -47,11 +47,14 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
     def own(method: Any, *steps: float, **options: Any) -> tuple[Runner, Sequence[float]]:
         return by_us(problem, method, **options), _dividing(years, steps)
 
+    balanced = solar_system(years=years, balances="kepler")
+    kept = {"invariants": balanced.invariants, "frame": balanced.frame}
     steps = (1 / 24, 1 / 32, 1 / 40, 1 / 48, 1 / 64, 1 / 80, 1 / 100)
     found = {
         "EIPRKN12": own(EIPRKN12, *steps, **KEPT),
         "RKN12, no projection": own(EIPRKN12, *steps, compensated=True, invariants=()),
         "EIPGJ14": own(EIPGJ14, 1 / 255, 1 / 275, 1 / 300, 1 / 350, 1 / 412, 1 / 500, 1 / 600, 1 / 768),
+        "EIPGJ14, balances": own(EIPGJ14, 1 / 350, 1 / 412, 1 / 512, 1 / 640, **kept),
         "EIPGJ12": own(EIPGJ12, 1 / 500, 1 / 550, 1 / 592, 1 / 700, 1 / 850),
         "EIPRKN8": own(EIPRKN8, 1 / 80, 1 / 100, 1 / 160, 1 / 240, **KEPT),
         "EIPDOP853": own(EIPDOP853, 1 / 80, 1 / 120, 1 / 180, 1 / 240, **KEPT),
@@ -114,7 +117,7 @@ class Found(NamedTuple):
 class Frontier(Study[Found]):
     """The command."""
 
-    years: float = option(1000.0, "length in Julian years: 1, 10, 100, 1000 or 2000 (%(default)g)", type=positive)
+    years: float = option(1000.0, "length in Julian years: 1, 2, 5, 10 ... 10000 (%(default)g)", type=positive)
     repeats: int = 3
 
     def check_settings(self) -> None:

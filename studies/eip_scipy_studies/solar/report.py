@@ -13,7 +13,7 @@ from eip_scipy.problems.gravity.solar_data import YEAR_D
 
 from ..report import compact, table
 from .errors import PointErrors, SolarRuns
-from .runs import HIGH_ORDER, MULTISTEP, TIGHT, MethodRun, report_times
+from .runs import BALANCED, HIGH_ORDER, MULTISTEP, TIGHT, MethodRun, report_times
 
 __all__ = ["cost_rows", "csv_rows", "json_content", "text"]
 
@@ -45,7 +45,7 @@ def _reference_line(study: SolarRuns) -> str:
         return "No reference: the runs did not get to the end."
     if sources == {"stored states"}:
         counted = f"; turns counted along {study.tight.name}" if study.tight else ""
-        return f"Reference: stored states (Taylor, 80 bits) at {study.scene.years:g} yr{counted}"
+        return f"Reference: stored states (80 bits) at {study.scene.years:g} yr{counted}"
     return f"Reference: the tightest run at hand, {sources.pop()}"
 
 
@@ -92,6 +92,7 @@ def _notes(study: SolarRuns) -> str:
         f"{MULTISTEP}: multistep, order 14, one evaluation a step, projected when it pays."
         if MULTISTEP in shown
         else "",
+        "balances: keeps each planet's energy about the Sun, at its rate." if BALANCED in shown else "",
         f"{TIGHT}: half of its step." if TIGHT in shown else "",
         "EMB: barycentre of Earth and Moon." if "EMB" in study.scene.planets else "",
     ]

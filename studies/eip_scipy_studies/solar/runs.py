@@ -52,8 +52,9 @@ HIGH_ORDER, TIGHT = "EIPRKN12", "EIPRKN12 (tight)"
 HIGH_ORDER_STEP = 1 / 64  # years: rounding, not the step, makes what errors are left
 KEPT: dict[str, Any] = {"every": 10, "compensated": True}
 """How long runs of high order keep their invariants."""
-MULTISTEP = "EIPGJ14"
+MULTISTEP, BALANCED = "EIPGJ14", "EIPGJ14 (balances)"
 MULTISTEP_STEP = 1 / 600  # years
+POWERS = (1.0, 10.0, 100.0, 1000.0, 10_000.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +214,7 @@ def plan(
         )
     )
     tasks.append(PendingRun(MULTISTEP, partial(_multistep, scene, **checkpoint_of(MULTISTEP)), True))
+    tasks.append(PendingRun(BALANCED, partial(_balanced, scene, **checkpoint_of(BALANCED)), True))
     if peer is None:
         tasks.append(PendingRun(TIGHT, partial(tight_run, scene, **checkpoint_of(TIGHT)), True))
         return tasks
@@ -274,6 +276,14 @@ def _high_order(scene: SolarScene, name: str, word: str, shorter: int, progress:
 def _multistep(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
     per_save = whole_number(scene.interval / MULTISTEP_STEP)
     return _long(scene, EIPGJ14, MULTISTEP, "auto", per_save, progress, **checkpoint)
+
+
+def _balanced(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
+    """Keep each planet's energy about the Sun as a balance, in place of the totals."""
+    per_save = whole_number(scene.interval / MULTISTEP_STEP)
+    kept = solar_system(scene.data, years=scene.years, balances="kepler")
+    options = {"invariants": kept.invariants, "frame": kept.frame, **checkpoint}
+    return _long(scene, EIPGJ14, BALANCED, "balances", per_save, progress, **options)
 
 
 def _long(
@@ -345,7 +355,7 @@ def stored_state(scene: SolarScene, year: float) -> np.ndarray | None:
 
 
 def report_times(scene: SolarScene) -> list[float]:
-    """Years at which errors are reported: those with a stored reference state that were saved, and the end."""
-    times = np.linspace(0.0, scene.years, scene.n_saves + 1)[1:]
+    """Years at which errors are reported: powers of ten with a stored reference state that were saved, and the end."""
+    times = [t for t in np.linspace(0.0, scene.years, scene.n_saves + 1)[1:] if round(t, 9) in POWERS]
     stored = [round(float(t), 9) for t in times if stored_state(scene, t) is not None]
     return sorted({*stored, float(scene.years)})
