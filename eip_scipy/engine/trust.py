@@ -46,8 +46,8 @@ __all__ = ["ProjectionWarning", "Trust"]
 FAR_IN_TOLERANCES, MOST_FAR = 7.5, 0.075
 # What no healthy run shows (docs/explanation/trust.md has the figures). One change of so many local errors (the
 # estimates of pairs of methods vanish by chance, which makes thousands), LARGE ones in such a share of the projections,
-# changes that are together so many times the errors; one defect that is TOO_FAR times what DISTANT means, DISTANT ones in
-# such a share of them.
+# changes that are together so many times the errors; one defect that is TOO_FAR times what DISTANT means, DISTANT ones
+# in such a share of them.
 BEYOND_DOUBT, OFTEN, TOGETHER = 1e4, 0.1, 20.0
 TOO_FAR, FAR_OFTEN = 5 / 3, 0.01
 # Rates of change along the flow are rounding up to this share of their terms.

