@@ -26,6 +26,9 @@ def hamiltonian(
     name: str | None = None,
     poisson: Any = None,
     extended: bool = False,
+    perturbation: Any = None,
+    dissipation: Mapping[str, Any] | None = None,
+    balances: Mapping[str, Any] | None = None,
 ) -> SymbolicProblem:
     """The problem of a Hamiltonian: equations of motion, energy, gradients, from one expression.
 
@@ -51,6 +54,14 @@ def hamiltonian(
     extended : bool, optional
         For an H that depends on t: add a component p_t to the state, with p_t' = -dH/dt, so that H + p_t is kept. Start
         it at 0.
+    perturbation : str or sympy.Expr, optional
+        A second Hamiltonian, which may depend on t: the equations are those of the sum of both.
+    dissipation : mapping, optional
+        What is added to the derivatives of components, by their names: ``{"p": "-c*p"}`` for friction.
+    balances : mapping, optional
+        Expressions, by name, of integrals of `H` alone, each checked by its Poisson bracket with H. With a perturbation
+        or dissipation they are kept as balances. Their rates are the brackets with the perturbation and what the
+        dissipation changes, without the bracket with H, which is 0. Default: H itself.
 
     Returns
     -------
@@ -79,10 +90,11 @@ def hamiltonian(
     True
     """
     _require_sympy("hamiltonian")
-    from .system import hamiltonian_problem
+    from .system import Perturbed, hamiltonian_problem
 
     with _nested("hamiltonian"):
-        return hamiltonian_problem(H, q, p, params, invariants, name, poisson, extended)
+        perturbed = Perturbed(perturbation, dissipation, balances)
+        return hamiltonian_problem(H, q, p, params, invariants, name, poisson, extended, perturbed)
 
 
 def equations(

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy
 
+from ...core.balances import Balance
 from ...core.inputs import is_number, refuse_units, shown
 from ...core.invariants import Invariant
 from ...core.jitted import compiled_like, is_jitted
@@ -29,12 +30,13 @@ LARGEST_JACOBIAN = 16  # coordinates; there are as many second derivatives as th
 
 
 class System(NamedTuple):
-    """What is written: names, derivatives, invariants. Equal systems share their functions."""
+    """Names, derivatives, invariants, balances and their rates, as written. Equal systems share their functions."""
 
     components: tuple[str, ...]
     parameters: tuple[str, ...]
     rates: tuple[Any, ...]
     invariants: tuple[tuple[str, Any], ...]
+    balances: tuple[tuple[str, Any, Any], ...] = ()
 
     @property
     def variables(self) -> list[Any]:
@@ -53,12 +55,13 @@ class System(NamedTuple):
 
 
 class Functions(NamedTuple):
-    """A system's functions; of each invariant the value and the gradient in place."""
+    """A system's functions; of each invariant the value and the gradient in place, of each balance the rate too."""
 
     rhs: Callable[..., None]
     acc: Callable[..., np.ndarray] | None
     jacobian: Deferred | None
     invariants: tuple[tuple[Callable[..., float], Callable[..., None]], ...]
+    balances: tuple[tuple[Callable[..., float], Callable[..., None], Callable[..., float]], ...]
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -72,7 +75,7 @@ class SymbolicProblem(Problem):
     ----------
     system : System
         ``components`` and ``parameters``, their names; ``rates``, the derivatives in time, and ``invariants``, pairs of
-        name and expression, of SymPy's, in real symbols.
+        name and expression, of SymPy's, in real symbols; ``balances``, triples of name, expression and rate.
     checks : mapping
         How it is known that each invariant is one: "by construction", "symbolically" or "numerically, at 8 points".
     pairs : tuple of (str, str)
@@ -114,7 +117,8 @@ class SymbolicProblem(Problem):
         v = sympy.Matrix([symbol(item) for item in new[half:]])
         momenta = dict(zip(p, W.inv() * v, strict=True))
         kept = tuple((label, item.xreplace(momenta)) for label, item in self.system.invariants)
-        system = System(new, self.system.parameters, (*v, *(W * sympy.Matrix(rates[half:]))), kept)
+        slow = tuple((label, item.xreplace(momenta), r.xreplace(momenta)) for label, item, r in self.system.balances)
+        system = System(new, self.system.parameters, (*v, *(W * sympy.Matrix(rates[half:]))), kept, slow)
         return _problem(
             name=self.name,
             system=system,
@@ -148,6 +152,7 @@ class SymbolicProblem(Problem):
             f"{self.name}: y = ({', '.join(self.system.components)})" + (f", pairs {pairs}" if pairs else ""),
             f"  equations   {_cut('; '.join(rates), 400)}",
             f"  invariants  {'; '.join(kept) or 'none'}",
+            *(f"  balance     {name} = {_cut(F)}, at the rate {_cut(rate)}" for name, F, rate in self.system.balances),
             f"  parameters  {', '.join(f'{k} = {v:g}' for k, v in self.parameters.items()) or 'none'}",
             f"  functions   {'jitted by Numba' if is_jitted(self.rhs) else 'plain Python'}",
         ]
@@ -155,7 +160,8 @@ class SymbolicProblem(Problem):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Functions are made again from the expressions where it is read."""
-        own = [fun for fun, _ in _functions(self.system).invariants]
+        functions = _functions(self.system)
+        own = [fun for fun, *_ in (*functions.invariants, *functions.balances)]
         kept = [own.index(item.function) if item.function in own else item for item in self.invariants]
         left = {"fun", "rhs", "acc", "jacobian", "invariants"}
         return _again, (kept, {item.name: getattr(self, item.name) for item in fields(self) if item.name not in left})
@@ -167,7 +173,15 @@ def _again(kept: Sequence[Any], others: dict[str, Any]) -> SymbolicProblem:
 
 
 def hamiltonian_problem(
-    H: Any, q: Any, p: Any, params: Any, invariants: Any, name: str | None, poisson: Any, extended: bool
+    H: Any,
+    q: Any,
+    p: Any,
+    params: Any,
+    invariants: Any,
+    name: str | None,
+    poisson: Any,
+    extended: bool,
+    perturbed: Perturbed,
 ) -> SymbolicProblem:
     """See `hamiltonian`."""
     values = _parameters(params)
@@ -176,6 +190,12 @@ def hamiltonian_problem(
     names, rates, pairs = _canonical(energy, q, p, values) if poisson is None else _lie(energy, q, p, poisson, declared)
     if not energy.has(*map(symbol, names)):
         raise ValueError(f"hamiltonian: H = {_cut(energy)} does not depend on {', '.join(names)}.")
+    if perturbed.given:
+        if extended:
+            raise ValueError("hamiltonian: extended=True keeps H + p_t, and a perturbation or dissipation changes it.")
+        flow = partial(_gradient_flow, names=names, poisson=poisson, pairs=pairs, declared=declared)
+        rates, slow = _with_perturbation(energy, names, rates, values, declared, perturbed, flow)
+        return _checked("H", name or "hamiltonian", names, rates, values, {}, {}, invariants, pairs, slow)
     checks = {"H": "by construction"}
     kept = {"H": energy}
     time = symbol("t")
@@ -192,6 +212,71 @@ def hamiltonian_problem(
         )
         kept, checks = {}, {}
     return _checked("H", name or "hamiltonian", names, rates, values, kept, checks, invariants, pairs)
+
+
+class Perturbed(NamedTuple):
+    """What `hamiltonian` is given beyond H: a second Hamiltonian, further derivatives, and what is kept."""
+
+    perturbation: Any
+    dissipation: Any
+    balances: Any
+
+    @property
+    def given(self) -> bool:
+        """Return whether there is any of it."""
+        if self.perturbation is None and self.dissipation is None:
+            if self.balances is not None:
+                raise TypeError(
+                    "hamiltonian: balances belong to a perturbation or dissipation; H alone is kept exactly."
+                )
+            return False
+        return True
+
+
+def _gradient_flow(energy: Any, names: Sequence[str], poisson: Any, pairs: Any, declared: set[str]) -> tuple[Any, ...]:
+    """Return the derivatives of the components by a Hamiltonian, in their pairs or by the matrix."""
+    if poisson is not None:
+        return tuple(_lie(energy, names, None, poisson, declared)[1])
+    forward = [sympy.diff(energy, symbol(momentum)) for _, momentum in pairs]
+    return (*forward, *(-sympy.diff(energy, symbol(coordinate)) for coordinate, _ in pairs))
+
+
+def _with_perturbation(
+    energy: Any,
+    names: Sequence[str],
+    rates: Sequence[Any],
+    values: Mapping[str, float],
+    declared: set[str],
+    perturbed: Perturbed,
+    flow: Callable[[Any], tuple[Any, ...]],
+) -> tuple[tuple[Any, ...], tuple[tuple[str, Any, Any], ...]]:
+    """Return all derivatives, and the balances: integrals of H, whose rates come from what is added to it."""
+    if energy.has(symbol("t")):
+        raise ValueError("hamiltonian: H depends on t, and is no integral; move what depends on t to perturbation=.")
+    known = {*names, *values, "t"}
+    added = [sympy.Integer(0)] * len(names)
+    if perturbed.perturbation is not None:
+        extra = as_expression("perturbation", perturbed.perturbation, declared | set(names))
+        _require_known("perturbation", extra, known)
+        added = list(flow(extra))
+    given = {} if perturbed.dissipation is None else perturbed.dissipation
+    if not isinstance(given, Mapping):
+        raise TypeError(f"dissipation must be a mapping of components to expressions, got {shown(given)}.")
+    for component, item in zip(as_names("the keys of dissipation", list(given)), given.values(), strict=True):
+        if component not in names:
+            raise ValueError(f"dissipation: {component} is no component of the state ({', '.join(names)}).")
+        force = as_expression(f"dissipation of {component}", item, declared | set(names))
+        _require_known(f"dissipation of {component}", force, known)
+        added[list(names).index(component)] += force
+    variables, parameters = [symbol(item) for item in names], {symbol(k): v for k, v in values.items()}
+    slow = []
+    for label, item in ({"H": energy} if perturbed.balances is None else dict(perturbed.balances)).items():
+        quantity = as_expression(f"balance {label!r}", item, declared | set(names))
+        _require_known(f"balance {label!r}", quantity, known)
+        how_kept(label, quantity, variables, rates, parameters)  # by H alone
+        rate = sympy.Add(*(sympy.diff(quantity, y) * f for y, f in zip(variables, added, strict=True)))
+        slow.append((label, quantity, rate))
+    return tuple(a + b for a, b in zip(rates, added, strict=True)), tuple(slow)
 
 
 def equations_problem(f: Any, y: Any, params: Any, invariants: Any, name: str | None) -> SymbolicProblem:
@@ -250,7 +335,16 @@ def _lie(energy: Any, y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple
 
 
 def _checked(
-    what: str, name: str, names: Any, rates: Any, values: Any, kept: Any, checks: Any, further: Any, pairs: Any
+    what: str,
+    name: str,
+    names: Any,
+    rates: Any,
+    values: Any,
+    kept: Any,
+    checks: Any,
+    further: Any,
+    pairs: Any,
+    slow: tuple[tuple[str, Any, Any], ...] = (),
 ) -> SymbolicProblem:
     """The problem, once all names are known and further invariants are seen to be some."""
     if not isinstance(name, str):
@@ -276,7 +370,7 @@ def _checked(
             raise ValueError(f"invariant {label!r} is {_cut(quantity)}, which does not depend on {', '.join(names)}.")
         checks[label] = how_kept(label, quantity, variables, rates, parameters)
         kept[label] = quantity
-    system = System(tuple(names), tuple(values), tuple(rates), tuple(kept.items()))
+    system = System(tuple(names), tuple(values), tuple(rates), tuple(kept.items()), slow)
     params = np.array(list(values.values())) if values else None
     return _problem(
         name=name, system=system, params=params, checks=checks, pairs=pairs, invariants=_invariants(system, params)
@@ -301,10 +395,16 @@ def _problem(*, system: System, params: np.ndarray | None, **others: Any) -> Sym
 
 def _invariants(system: System, params: np.ndarray | None) -> tuple[Invariant, ...]:
     args = () if params is None else (params,)
-    return tuple(
+    functions = _functions(system)
+    kept = [
         Invariant(fun, grad, args=args, in_place=True, name=name)
-        for (name, _), (fun, grad) in zip(system.invariants, _functions(system).invariants, strict=True)
-    )
+        for (name, _), (fun, grad) in zip(system.invariants, functions.invariants, strict=True)
+    ]
+    slow = [
+        Balance(fun, rate, grad, args=args, in_place=True, name=name)
+        for (name, _, _), (fun, grad, rate) in zip(system.balances, functions.balances, strict=True)
+    ]
+    return (*kept, *slow)
 
 
 @lru_cache(maxsize=64)
@@ -312,12 +412,18 @@ def _functions(system: System) -> Functions:
     """A system's functions: made, and compiled, once."""
     arguments = Arguments(system.components, system.parameters)
     rhs = function("derivative", system.rates, arguments, in_place=True)
-    invariants = []
-    for name, quantity in system.invariants:
+
+    def value_and_gradient(name: str, quantity: Any) -> tuple[Callable[..., float], Callable[..., None]]:
         gradient = [sympy.diff(quantity, variable) for variable in system.variables]
         value = function(f"invariant {name}", [quantity], arguments, in_place=False)
-        invariants.append((value, function(f"gradient of {name}", gradient, arguments, in_place=True)))
-    return Functions(rhs, _acceleration(system), _deferred_jacobian(system), tuple(invariants))
+        return value, function(f"gradient of {name}", gradient, arguments, in_place=True)
+
+    invariants = tuple(value_and_gradient(name, quantity) for name, quantity in system.invariants)
+    balances = tuple(
+        (*value_and_gradient(name, quantity), function(f"rate of {name}", [rate], arguments, in_place=False))
+        for name, quantity, rate in system.balances
+    )
+    return Functions(rhs, _acceleration(system), _deferred_jacobian(system), invariants, balances)
 
 
 def _acceleration(system: System) -> Callable[..., np.ndarray] | None:
