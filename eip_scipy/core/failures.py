@@ -38,7 +38,7 @@ def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
 
 
 def _unstable(run: Run) -> str:
-    """Where a multistep method's step does not do."""
+    """Return the message for a step that is too long for a multistep method."""
     history = run.method.multistep
     assert history is not None  # whose code it is
     t = history.t0 + int(history.place[NEWEST]) * history.h

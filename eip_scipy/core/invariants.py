@@ -102,7 +102,7 @@ class Invariant:
     >>> energy = Invariant(lambda t, y: 0.5 * (y @ y), grad=lambda t, y: y, name="energy")
     """
 
-    # What balances have besides: see `Balance`.
+    # These are attributes of balances, see `Balance`.
     is_balance = False
     rate_function: Callable[..., Any] | None = None
     rate_uses_f = False
@@ -110,7 +110,7 @@ class Invariant:
     # without any are projected together, along all components.
     parts: tuple[tuple[Array, Array], ...] = ()
     value_names: tuple[str, ...] = ()
-    # Whether a run warns of it as a balance that changes too fast to be of help.
+    # A run warns of a balance that changes too fast to be of help, unless this is False.
     warns_if_fast = True
 
     def __init__(

@@ -162,7 +162,7 @@ def with_jacobian(
 def with_rates(
     functions: NativeFunctions, invariants: InvariantSet, params: Packed | None, y0: np.ndarray, adaptive: bool
 ) -> NativeFunctions:
-    """The same with the addresses of the rates of balances.
+    """Return the functions with the addresses of the rates of balances.
 
     Raises
     ------

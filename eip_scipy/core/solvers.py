@@ -144,7 +144,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     """
 
     TABLEAU: ClassVar[Tableau | NystromTableau | GaussJackson | OneStep]
-    # Whether the state is one of several parts, which are projected together.
+    # True if the state is one of several parts, which are projected together.
     _in_parts: ClassVar[bool] = False
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     _SCIPY: ClassVar[type[OdeSolver] | None] = None

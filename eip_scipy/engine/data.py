@@ -25,7 +25,7 @@ def bare_schedule(span: Span, first: float) -> Schedule:
     return Schedule(span, 0, none, np.zeros(3, np.int64), clock, none, none, none, none, none)
 
 
-# Those of a run without any, and the method of an engine which only projects.
+# A run without balances has these; an engine that only projects has this method.
 NO_BALANCES = Balances(place=np.zeros(0, np.int64), rated=np.zeros(0, np.int64))
 NO_GROUPS = Groups(
     value=np.zeros(0, np.int64), first_value=np.zeros(1, np.int64), first_direction=np.zeros(1, np.int64),

@@ -24,10 +24,11 @@ __all__ = ["FLOOR", "MARKERS", "PALETTE", "log_errors", "method_styles", "typese
 
 __getattr__ = moved_names(__name__)
 
-# Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white, and Tol's wine.
-PALETTE = ("#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#777777", "#882255")
-LINES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), "-", "--", (0, (8, 2, 1, 2)))
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "*")
+# Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white, and Tol's
+# wine and olive.
+PALETTE = ("#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#777777", "#882255", "#999933")
+LINES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), "-", "--", (0, (8, 2, 1, 2)), (0, (4, 2)))
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "*", ">")
 GREEK = {"alpha": "α", "beta": "β", "kappa": "κ", "Omega": "Ω"}
 POWERS = "⁰¹²³⁴⁵⁶⁷⁸⁹"
 # Below the spacing of numbers an error means nothing, and a log axis cannot show zero.

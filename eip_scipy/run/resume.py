@@ -32,7 +32,7 @@ SNAPSHOT_SECONDS = 0.2
 LEAST_RATIO = 19.0
 # How far values of one function at one point may differ, on another machine too.
 SAME = 1e-9
-# What rounding of the terms of a rate is counted as, in these terms.
+# Rounding of the terms of a rate counts as this share of them.
 LEAST_OF_RATES = 1e-6
 SHORT = 16
 STEP = 0

@@ -34,7 +34,7 @@ from eip_scipy import (
 
 PERIOD = 2 * np.pi
 DRAG = 1e-6
-# Of a quartic oscillator whose stiffness varies slowly.
+# A quartic oscillator whose stiffness varies slowly.
 EPSILON, OMEGA = 1e-3, 0.3
 FIXED = [(EIPRK1, 0.01), (EIPRK2, 0.05), (EIPRK3, 0.05), (EIPRK4, 0.1), (EIPRK5, 0.1), (EIPDOP853, 0.4)]
 RUNS = [

@@ -76,7 +76,7 @@ def accelerations(gm, q):
 
 
 def exact(gm, y, y0):
-    """Of each orbit (energy, momentum, laplace, their rates by Newton's law), in mpmath."""
+    """Return the values of each orbit, and their rates by Newton's law, in mpmath."""
     big = np.array([MP.mpf(float(x)) for x in gm])
     q, v = np.array([MP.mpf(float(x)) for x in y]).reshape(2, -1, 3)
     a = accelerations(big, q)

@@ -230,7 +230,7 @@ static void check_balances(const Balances &b, const Work &w) {
     require(good, "engine: the balances do not fit the run");
 }
 
-// Whether numbers ascend from 0 to the last of them.
+// True if the numbers ascend from 0 to `last`.
 static bool ascend(const int64_t *first, int64_t count, int64_t last) {
     bool good = first[0] == 0 && first[count] == last;
     for (int64_t k = 0; k < count; ++k) good &= first[k] <= first[k + 1];

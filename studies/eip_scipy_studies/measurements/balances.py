@@ -192,7 +192,7 @@ def drag_power(t, y, a, b, c):
 
 @njit
 def pull_and_drag(y, a, b, c):
-    """What acts besides the pull of a round Earth."""
+    """Return the accelerations other than the pull of a round Earth."""
     r2 = y[0] ** 2 + y[1] ** 2 + y[2] ** 2
     z = a * y[0] + b * y[1] + c * y[2]
     k, s, d, g = 1.5 * J2 * RADIUS**2 / r2, z * z / r2, air(y), GM / r2**1.5
@@ -313,7 +313,7 @@ def about_the_first(t, y, p):
 
 @njit
 def rate_about_the_first(t, y, p):
-    """By the pulls of the second body on the third and on the first."""
+    """Return the rate, by the pulls of the second body on the third and on the first."""
     near = ((y[6] - y[3]) ** 2 + (y[7] - y[4]) ** 2 + (y[8] - y[5]) ** 2) ** 1.5
     far = ((y[0] - y[3]) ** 2 + (y[1] - y[4]) ** 2 + (y[2] - y[5]) ** 2) ** 1.5
     rate = 0.0

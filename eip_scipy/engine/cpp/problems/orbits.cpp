@@ -104,7 +104,7 @@ Three tide(double gm, const Three &s, const Three &d) {
     return sum(gm * change, s, -gm / cube, d);
 }
 
-// The same from the accelerations without the pulls of the body `sun`.
+// This perturbation is taken from the accelerations without the pulls of the body `sun`.
 Three perturbation(const Motion &m, const double *q, const double *a, const double *gm, int64_t sun) {
     const int64_t centre = m.number(0), first = m.number(1);
     const bool about_sun = centre == sun;
