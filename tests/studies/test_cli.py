@@ -149,7 +149,7 @@ def test_one_year_against_the_stored_states(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(solar_system, "images", lambda study, part: {"figure.png": PNG})  # the short run draws them
     assert main(["solar-system", "--years", "1", "--out", str(tmp_path)], **LITTLE) == 0
     text = capsys.readouterr().out
-    assert "Reference: stored states (Taylor, 80 bits) at 1 yr; turns counted along IAS15" in text
+    assert "Reference: stored states (80 bits) at 1 yr; turns counted along IAS15" in text
     assert "IAS15 agrees with the stored states at 1 yr" in text
     assert "FAILED" not in text
     assert max(map(len, text.splitlines()[:-3])) <= 92  # nine columns
