@@ -73,8 +73,8 @@ class Carried:
         The balances by their places among the items, with a compiled rate where a jitted one has none.
     places : ndarray of int64, shape (b,)
         Places of the balances' values among all values.
-    warn_if_fast : ndarray of bool, shape (b,)
-        Whether a run warns of each of these values if it changes fast.
+    most_slowness : ndarray, shape (b,)
+        The slowness of each of these values above which a run warns.
     mask : ndarray of bool, shape (l,)
         Which values are those of balances.
     """
@@ -94,8 +94,8 @@ class Carried:
         for k in self.items:
             self.mask[starts[k] : starts[k + 1]] = True
         self.places = np.flatnonzero(self.mask).astype(np.int64)
-        warns = [np.full(starts[k + 1] - starts[k], item.warns_if_fast) for k, item in self.items.items()]
-        self.warn_if_fast = np.concatenate(warns) if warns else np.zeros(0, bool)
+        most = [np.full(starts[k + 1] - starts[k], item.most_slowness) for k, item in self.items.items()]
+        self.most_slowness = np.concatenate(most) if most else np.zeros(0)
 
     def compile_rates(self, n: int) -> None:
         """Give jitted balances of a real state of n components rates by dual numbers, if they have none."""

@@ -110,8 +110,8 @@ class Invariant:
     # without any are projected together, along all components.
     parts: tuple[tuple[Array, Array], ...] = ()
     value_names: tuple[str, ...] = ()
-    # A run warns of a balance that changes too fast to be of help, unless this is False.
-    warns_if_fast = True
+    # A run warns of a balance whose rate is above this share of the terms of its rate: it hardly helps.
+    most_slowness = 0.05
 
     def __init__(
         self,

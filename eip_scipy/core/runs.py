@@ -24,9 +24,6 @@ from .stepping import AnyMethod, Stepping
 
 __all__ = ["Counted", "Run", "Start"]
 
-# The share of the terms of its rate from which on a balance hardly helps.
-MOST_SLOWNESS = 0.05
-
 
 class Start(NamedTuple):
     """Where a run starts: time, state, derivative there, and the scale of time, which is the step or the first one."""
@@ -171,14 +168,14 @@ class Run:
         """Warn once of balances that change too fast to be of help."""
         found = slowness(self.work.slow)
         carried = self.invariants.balances
-        fast = np.flatnonzero((found > MOST_SLOWNESS) & carried.warn_if_fast)
+        fast = np.flatnonzero(found > carried.most_slowness)
         if not fast.size or self.warned_of_balances:
             return
         self.warned_of_balances = True
-        names = [self.invariants.names[place] for place in carried.places[fast]]
+        names, bound = [self.invariants.names[place] for place in carried.places[fast]], carried.most_slowness[fast[0]]
         warnings.warn(
             f"balance {listed(names)} changes at {found[fast].max():.2g} of the terms of its rate. Above "
-            f"{MOST_SLOWNESS:g} balances hardly help: compare with a run without it, or with other tolerances.",
+            f"{bound:g} balances hardly help: compare with a run without it, or with other tolerances.",
             UserWarning,
             stacklevel=users_level(),
         )
