@@ -165,7 +165,7 @@ def _orbit(gm: Array, y0: Array, about: Array, body: int) -> _Orbit:
     shares = gm[group] / total if total > 0 else np.ones(1)
     pairs = [(float(centre), -1.0), *((float(k), share) for k, share in zip(group, shares.tolist(), strict=True))]
     q, v = y0.reshape(2, -1, 3)
-    sizes = [np.linalg.norm(shares @ a[group] - a[centre]) or 1.0 for a in (q, v)]
+    sizes = [float(np.linalg.norm(shares @ a[group] - a[centre])) or 1.0 for a in (q, v)]
     # The group moves, and the centre with the rest of what belongs to it moves in the opposite direction, so that their
     # common centre of mass stays. No other orbit is then changed.
     those = [k for k in range(gm.size) if k == centre or _is_below(about, k, centre)]
