@@ -40,9 +40,7 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
     lanes = -(-n // passes)
     dual = Dual(lanes)
     call = _with_params(for_duals(fun, dual), has_params, bool(scalars))
-
-    made = (lambda: np.empty(n, dual)) if n > STACK else (lambda: stack_array(dual, n))
-    new_state = inside(made, forceinline=True)
+    new_state = _new_state(dual, n)
 
     def filled(t, y, out, params):
         x = new_state()
@@ -51,7 +49,7 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
                 x[i] = seed(dual, y[i], i - first)
             put_slopes(call(t, x, params), out, first, min(lanes, n - first))
 
-    return _compiled(filled, shape, has_params, scalars)
+    return _compiled(filled, 1 + len(shape), has_params, scalars)
 
 
 @lru_cache(maxsize=256)
@@ -67,8 +65,7 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
     """
     dual = Dual(1)
     call = _with_params(for_duals(fun, dual), has_params, bool(scalars))
-    new_state = inside((lambda: np.empty(n, dual)) if n > STACK else (lambda: stack_array(dual, n)), forceinline=True)
-    slopes = inside(_slopes_of(shape))
+    new_state, slopes = _new_state(dual, n), inside(_slopes_of(shape))
 
     def along(t, y, f, params):
         x = new_state()
@@ -76,14 +73,12 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
             x[i] = directed(dual, y[i], f[i])
         return slopes(call(directed(dual, t, 1.0), x, params))
 
-    along = inside(along)
-    floats = types.Array(types.float64, 1, "C")
-    if scalars:
-        numbers = types.BaseTuple.from_types([NUMBERS[scalar] for scalar in scalars])
-        return _by_signature(lambda t, y, f, *numbers: along(t, y, f, numbers), [floats, floats, numbers])
-    if has_params:
-        return _by_signature(lambda t, y, f, params: along(t, y, f, params), [floats, floats, floats])
-    return _by_signature(lambda t, y, f: along(t, y, f, y), [floats, floats])
+    return _compiled(along, 1, has_params, scalars)
+
+
+def _new_state(dual: Any, n: int) -> Any:
+    """Return a function that makes room for a state of duals."""
+    return inside((lambda: np.empty(n, dual)) if n > STACK else (lambda: stack_array(dual, n)), forceinline=True)
 
 
 def _slopes_of(shape: tuple[int, ...]) -> Callable[..., Any]:
@@ -106,16 +101,19 @@ def _with_params(fun: Any, has_params: bool, one_by_one: bool) -> Any:
     return inside((lambda t, x, params: fun(t, x, params)) if has_params else (lambda t, x, params: fun(t, x)))
 
 
-def _compiled(filled: Callable[..., None], shape: tuple[int, ...], has_params: bool, scalars: str) -> Any:
-    """A gradient compiled for real states, as it is called from Python; from the engine it takes the same types."""
-    filled = inside(filled)
-    floats, out = (types.Array(types.float64, ndim, "C") for ndim in (1, 1 + len(shape)))
+def _compiled(function: Callable[..., Any], ndim: int, has_params: bool, scalars: str) -> Any:
+    """Return a function of (t, y, a, params), with a of `ndim` dimensions, compiled for real states.
+
+    Python calls it with the parameters that the user's function takes, and the engine with the same types.
+    """
+    function = inside(function)
+    floats, third = (types.Array(types.float64, dimensions, "C") for dimensions in (1, ndim))
     if scalars:
         numbers = types.BaseTuple.from_types([NUMBERS[scalar] for scalar in scalars])
-        return _by_signature(lambda t, y, out, *numbers: filled(t, y, out, numbers), [floats, out, numbers])
+        return _by_signature(lambda t, y, a, *numbers: function(t, y, a, numbers), [floats, third, numbers])
     if has_params:
-        return _by_signature(lambda t, y, out, params: filled(t, y, out, params), [floats, out, floats])
-    return _by_signature(lambda t, y, out: filled(t, y, out, y), [floats, out])
+        return _by_signature(lambda t, y, a, params: function(t, y, a, params), [floats, third, floats])
+    return _by_signature(lambda t, y, a: function(t, y, a, y), [floats, third])
 
 
 def _by_signature(function: Callable[..., Any], arguments: list[Any]) -> Any:

@@ -53,7 +53,7 @@ def test_friction():
 
 
 def test_in_positions_and_velocities_and_from_a_pickle():
-    """The oscillator has a mass, so that momenta are no velocities."""
+    """The oscillator has a mass, so that momenta are not velocities."""
     problem = hamiltonian("p**2/(2*m) + k*q**2/2", perturbation="e*q**3", params={"m": 2.0, "k": 3.0, "e": 1e-3})
     second = problem.second_order()
     assert second.system.components == ("q", "v_q")
@@ -80,7 +80,7 @@ def test_a_poisson_matrix():
         ({"balances": {"H": KEPLER}}, "balances belong to a perturbation or dissipation"),
         ({"perturbation": "x", "extended": True}, "extended=True keeps"),
         ({"perturbation": "x*z"}, "perturbation contains z"),
-        ({"dissipation": {"z": "-x"}}, "z is no component of the state"),
+        ({"dissipation": {"z": "-x"}}, "z is not a component of the state"),
         ({"dissipation": "-x"}, "must be a mapping"),
         ({"perturbation": "x", "balances": {"px": "px"}}, "'px' is no invariant"),
     ],

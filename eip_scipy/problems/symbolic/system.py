@@ -187,13 +187,13 @@ def hamiltonian_problem(
     values = _parameters(params)
     declared = {*values, *(name for given in (q, p) if given is not None for name in as_names("q and p", given))}
     energy = as_expression("H", H, declared)
-    names, rates, pairs = _canonical(energy, q, p, values) if poisson is None else _lie(energy, q, p, poisson, declared)
+    names, flow, pairs = _canonical(energy, q, p, values) if poisson is None else _lie(q, p, poisson, declared)
+    rates = flow(energy)
     if not energy.has(*map(symbol, names)):
         raise ValueError(f"hamiltonian: H = {_cut(energy)} does not depend on {', '.join(names)}.")
     if perturbed.given:
         if extended:
             raise ValueError("hamiltonian: extended=True keeps H + p_t, and a perturbation or dissipation changes it.")
-        flow = partial(_gradient_flow, names=names, poisson=poisson, pairs=pairs, declared=declared)
         rates, slow = _with_perturbation(energy, names, rates, values, declared, perturbed, flow)
         return _checked("H", name or "hamiltonian", names, rates, values, {}, {}, invariants, pairs, slow)
     checks = {"H": "by construction"}
@@ -215,7 +215,7 @@ def hamiltonian_problem(
 
 
 class Perturbed(NamedTuple):
-    """What `hamiltonian` is given beyond H: a second Hamiltonian, further derivatives, and what is kept."""
+    """The arguments that `hamiltonian` adds to H: a second Hamiltonian, further derivatives, and the balances."""
 
     perturbation: Any
     dissipation: Any
@@ -233,14 +233,6 @@ class Perturbed(NamedTuple):
         return True
 
 
-def _gradient_flow(energy: Any, names: Sequence[str], poisson: Any, pairs: Any, declared: set[str]) -> tuple[Any, ...]:
-    """Return the derivatives of the components by a Hamiltonian, in their pairs or by the matrix."""
-    if poisson is not None:
-        return tuple(_lie(energy, names, None, poisson, declared)[1])
-    forward = [sympy.diff(energy, symbol(momentum)) for _, momentum in pairs]
-    return (*forward, *(-sympy.diff(energy, symbol(coordinate)) for coordinate, _ in pairs))
-
-
 def _with_perturbation(
     energy: Any,
     names: Sequence[str],
@@ -252,7 +244,7 @@ def _with_perturbation(
 ) -> tuple[tuple[Any, ...], tuple[tuple[str, Any, Any], ...]]:
     """Return all derivatives, and the balances: integrals of H, whose rates come from what is added to it."""
     if energy.has(symbol("t")):
-        raise ValueError("hamiltonian: H depends on t, and is no integral; move what depends on t to perturbation=.")
+        raise ValueError("hamiltonian: H depends on t and is not an integral; move what depends on t to perturbation=.")
     known = {*names, *values, "t"}
     added = [sympy.Integer(0)] * len(names)
     if perturbed.perturbation is not None:
@@ -264,7 +256,7 @@ def _with_perturbation(
         raise TypeError(f"dissipation must be a mapping of components to expressions, got {shown(given)}.")
     for component, item in zip(as_names("the keys of dissipation", list(given)), given.values(), strict=True):
         if component not in names:
-            raise ValueError(f"dissipation: {component} is no component of the state ({', '.join(names)}).")
+            raise ValueError(f"dissipation: {component} is not a component of the state ({', '.join(names)}).")
         force = as_expression(f"dissipation of {component}", item, declared | set(names))
         _require_known(f"dissipation of {component}", force, known)
         added[list(names).index(component)] += force
@@ -302,7 +294,7 @@ def equations_problem(f: Any, y: Any, params: Any, invariants: Any, name: str | 
 
 
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
-    """Names, derivatives and pairs of q' = dH/dp, p' = -dH/dq."""
+    """Return names, the derivatives q' = dH/dp, p' = -dH/dq as a function of H, and pairs."""
     if q is None and p is None:
         q, p = paired({item.name for item in energy.free_symbols} - {"t", *values})
     elif q is None or p is None:
@@ -311,13 +303,16 @@ def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tupl
     if len(q) != len(p) or not q:
         raise ValueError(f"hamiltonian: {len(q)} coordinates ({', '.join(q)}) and {len(p)} momenta ({', '.join(p)}).")
     names = as_names("q and p", (*q, *p))
-    forward = [sympy.diff(energy, symbol(item)) for item in p]
-    back = [-sympy.diff(energy, symbol(item)) for item in q]
-    return names, (*forward, *back), tuple(zip(q, p, strict=True))
+
+    def flow(H: Any) -> tuple[Any, ...]:
+        forward = [sympy.diff(H, symbol(item)) for item in p]
+        return (*forward, *(-sympy.diff(H, symbol(item)) for item in q))
+
+    return names, flow, tuple(zip(q, p, strict=True))
 
 
-def _lie(energy: Any, y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, Any]:
-    """The same of y' = B(y) grad H."""
+def _lie(y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, Any]:
+    """Return the same for y' = B(y) grad H; there are no pairs."""
     if y is None or p is not None:
         raise TypeError("hamiltonian: with poisson= the names of the state are given as q, and p is left out.")
     names = as_names("q", y)
@@ -330,8 +325,11 @@ def _lie(energy: Any, y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple
         total = B[i, j] + B[j, i]
         if not vanishes(total):
             raise ValueError(f"hamiltonian: poisson must be antisymmetric, but [{i}][{j}] + [{j}][{i}] = {total}.")
-    gradient = sympy.Matrix([sympy.diff(energy, symbol(item)) for item in names])
-    return names, tuple(B * gradient), ()
+
+    def flow(H: Any) -> tuple[Any, ...]:
+        return tuple(B * sympy.Matrix([sympy.diff(H, symbol(item)) for item in names]))
+
+    return names, flow, ()
 
 
 def _checked(

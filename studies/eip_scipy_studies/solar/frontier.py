@@ -19,7 +19,7 @@ from ..report import UsageError, compact, describe_machine, table
 from ..study import Figures, Rows, Session, Study, option
 from ..work_precision import Runner, costs_at, curves
 from .cost import MERCURY, TimedRun, by_peer, by_us, by_verlet, panels, timed
-from .runs import KEPT, Peer, whole_number
+from .runs import KEPT, Peer, orbits_kept, whole_number
 
 __all__ = ["Found", "Frontier", "methods"]
 
@@ -47,14 +47,12 @@ def methods(problem: Problem, years: float, peer: Peer | None, heyoka: Peer | No
     def own(method: Any, *steps: float, **options: Any) -> tuple[Runner, Sequence[float]]:
         return by_us(problem, method, **options), _dividing(years, steps)
 
-    balanced = solar_system(years=years, balances="kepler")
-    kept = {"invariants": balanced.invariants, "frame": balanced.frame}
     steps = (1 / 24, 1 / 32, 1 / 40, 1 / 48, 1 / 64, 1 / 80, 1 / 100)
     found = {
         "EIPRKN12": own(EIPRKN12, *steps, **KEPT),
         "RKN12, no projection": own(EIPRKN12, *steps, compensated=True, invariants=()),
         "EIPGJ14": own(EIPGJ14, 1 / 255, 1 / 275, 1 / 300, 1 / 350, 1 / 412, 1 / 500, 1 / 600, 1 / 768),
-        "EIPGJ14, balances": own(EIPGJ14, 1 / 350, 1 / 412, 1 / 512, 1 / 640, **kept),
+        "EIPGJ14, balances": own(EIPGJ14, 1 / 350, 1 / 412, 1 / 512, 1 / 640, **orbits_kept()),
         "EIPGJ12": own(EIPGJ12, 1 / 500, 1 / 550, 1 / 592, 1 / 700, 1 / 850),
         "EIPRKN8": own(EIPRKN8, 1 / 80, 1 / 100, 1 / 160, 1 / 240, **KEPT),
         "EIPDOP853": own(EIPDOP853, 1 / 80, 1 / 120, 1 / 180, 1 / 240, **KEPT),

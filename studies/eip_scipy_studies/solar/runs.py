@@ -35,6 +35,7 @@ __all__ = [
     "leapfrog",
     "make_scene",
     "metric_of",
+    "orbits_kept",
     "plan",
     "rebound_run",
     "report_times",
@@ -278,12 +279,16 @@ def _multistep(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRu
     return _long(scene, EIPGJ14, MULTISTEP, "auto", per_save, progress, **checkpoint)
 
 
+def orbits_kept(data: str | SolarSystemData = "de440") -> dict[str, Any]:
+    """Return the options that keep each planet's energy about the Sun instead of the totals."""
+    problem = solar_system(data, balances="kepler")
+    return {"invariants": problem.invariants, "frame": problem.frame}
+
+
 def _balanced(scene: SolarScene, progress: bool, **checkpoint: Any) -> MethodRun:
     """Keep each planet's energy about the Sun as a balance, in place of the totals."""
     per_save = whole_number(scene.interval / MULTISTEP_STEP)
-    kept = solar_system(scene.data, years=scene.years, balances="kepler")
-    options = {"invariants": kept.invariants, "frame": kept.frame, **checkpoint}
-    return _long(scene, EIPGJ14, BALANCED, "balances", per_save, progress, **options)
+    return _long(scene, EIPGJ14, BALANCED, "balances", per_save, progress, **orbits_kept(scene.data), **checkpoint)
 
 
 def _long(

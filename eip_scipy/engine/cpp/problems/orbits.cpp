@@ -109,13 +109,13 @@ Three perturbation(const Motion &m, const double *q, const double *a, const doub
     const int64_t centre = m.number(0), first = m.number(1);
     const bool about_sun = centre == sun;
     const Three s = about_sun ? m.r : body(q, centre) - body(q, sun);
-    const Three near = body(q, about_sun ? first : centre), shift = about_sun ? m.beside_first(q) : Three{};
+    const Three origin = body(q, about_sun ? first : centre), shift = about_sun ? m.beside_first(q) : Three{};
     double mass = 0.0;
     for (int64_t k = 1; k < m.bodies; ++k) mass += gm[m.number(k)];
     Three rest = sum(1.0, m.relative(a), about_sun ? m.pull * (mass / m.mu.value) : m.pull, m.r);
     if (about_sun && m.bodies == 2) return rest;
     for (int64_t k = 1; k < m.bodies; ++k)
-        rest = sum(1.0, rest, m.list[2 * k + 1], tide(gm[sun], s, (body(q, m.number(k)) - near) - shift));
+        rest = sum(1.0, rest, m.list[2 * k + 1], tide(gm[sun], s, (body(q, m.number(k)) - origin) - shift));
     return rest;
 }
 
