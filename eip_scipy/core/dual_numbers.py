@@ -26,7 +26,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, overload, register_model
 from numba.np.arrayobj import populate_array
 
-__all__ = ["Dual", "directed", "seed", "slope", "stack_array"]
+__all__ = ["Dual", "directed", "put_slope", "seed", "slope", "stack_array", "value_of"]
 
 PLAIN = types.Float | types.Integer
 
@@ -91,7 +91,7 @@ def _constant(context, builder, kind, number):
 
 
 @intrinsic
-def _value(typingctx, x):
+def value_of(typingctx, x):
     """The value of a dual, or the number that is none."""
     if isinstance(x, PLAIN):
         return types.float64(x), lambda context, builder, sig, args: context.cast(builder, args[0], x, types.float64)
@@ -150,6 +150,17 @@ def directed(typingctx, kind, value, slope):
         return _pair(builder, args[1], vector)
 
     return dual(kind, types.float64, types.float64), emit
+
+
+@intrinsic
+def put_slope(typingctx, x, lane, number):
+    """The dual with another derivative in one lane."""
+
+    def emit(context, builder, sig, args):
+        slopes = builder.insert_element(builder.extract_value(args[0], 1), args[2], args[1])
+        return _pair(builder, builder.extract_value(args[0], 0), slopes)
+
+    return x(x, types.int64, types.float64), emit
 
 
 @intrinsic
@@ -266,7 +277,7 @@ def _define_unary(function: Any, slope: Callable[..., Any], *names: Any) -> None
             return None
 
         def of_dual(x):
-            a = _value(x)
+            a = value_of(x)
             v = function(a)
             return _dual(v, slope(a, v), x)
 
@@ -284,17 +295,17 @@ def _define_binary(function: Any, slope: Callable[..., Any], other: Callable[...
             return None
 
         def of_first(x, y):
-            a, b = _value(x), _value(y)
+            a, b = value_of(x), value_of(y)
             v = function(a, b)
             return _dual(v, slope(a, b, v), x)
 
         def of_second(x, y):
-            a, b = _value(x), _value(y)
+            a, b = value_of(x), value_of(y)
             v = function(a, b)
             return _dual(v, other(a, b, v), y)
 
         def of_both(x, y):
-            a, b = _value(x), _value(y)
+            a, b = value_of(x), value_of(y)
             v = function(a, b)
             return _dual_of_two(v, slope(a, b, v), x, other(a, b, v), y)
 
@@ -310,10 +321,10 @@ def _define_flat(function: Any, arguments: int, *names: Any) -> None:
     """What has no derivative, or 0 almost everywhere: the plain function of the values."""
 
     def typed(x, y):
-        return (lambda x, y: function(_value(x), _value(y))) if _is_dual(x, y) else None
+        return (lambda x, y: function(value_of(x), value_of(y))) if _is_dual(x, y) else None
 
     def typed_one(x):
-        return (lambda x: function(_value(x))) if isinstance(x, Dual) else None
+        return (lambda x: function(value_of(x))) if isinstance(x, Dual) else None
 
     for name in (function, *names):
         _overload(name)(typed if arguments == 2 else typed_one)
@@ -382,30 +393,30 @@ def _power(x, y):
     if isinstance(y, types.Integer):
 
         def by_products(x, y):
-            a = _value(x)
+            a = value_of(x)
             if y == 0:
                 return _dual(1.0, 0.0, x)
             below = a ** (y - 1)
             return _dual(below * a if y > 0 else a**y, y * below, x)
 
         def square(x, y):
-            a = _value(x)
+            a = value_of(x)
             return _dual(a * a, 2.0 * a, x)
 
         return square if getattr(y, "literal_value", None) == 2 else by_products
 
     def of_first(x, y):
-        a, b = _value(x), _value(y)
+        a, b = value_of(x), value_of(y)
         v = a**b
         return _dual(v, _slope_of_power(a, b, v), x)
 
     def of_second(x, y):
-        a, b = _value(x), _value(y)
+        a, b = value_of(x), value_of(y)
         v = a**b
         return _dual(v, _slope_of_exponent(a, b, v), y)
 
     def of_both(x, y):
-        a, b = _value(x), _value(y)
+        a, b = value_of(x), value_of(y)
         v = a**b
         return _dual_of_two(v, _slope_of_power(a, b, v), x, _slope_of_exponent(a, b, v), y)
 
@@ -509,7 +520,7 @@ def _norm(a):
         # The largest taken out as a number: it cancels in value and derivatives.
         largest = 0.0
         for i in range(a.size):
-            largest = max(largest, abs(_value(a[i])))
+            largest = max(largest, abs(value_of(a[i])))
         if largest == 0.0:
             largest = 1.0
         total = seed(dual, 0.0, -1)

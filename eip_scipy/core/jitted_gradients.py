@@ -14,7 +14,7 @@ from .dual_arrays import for_duals, inside
 from .dual_numbers import Dual, directed, seed, slope, stack_array
 from .jitted import NotCompilableError
 
-__all__ = ["gradient_by_duals", "rate_by_duals"]
+__all__ = ["LANES", "compiled_for", "gradient_by_duals", "new_state", "rate_by_duals"]
 
 # Derivatives carried through a function at once, at most: more fill the registers.
 LANES = 12
@@ -40,16 +40,16 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
     lanes = -(-n // passes)
     dual = Dual(lanes)
     call = _with_params(for_duals(fun, dual), has_params, bool(scalars))
-    new_state = _new_state(dual, n)
+    make_state = new_state(dual, n)
 
     def filled(t, y, out, params):
-        x = new_state()
+        x = make_state()
         for first in range(0, n, lanes):
             for i in range(n):
                 x[i] = seed(dual, y[i], i - first)
             put_slopes(call(t, x, params), out, first, min(lanes, n - first))
 
-    return _compiled(filled, 1 + len(shape), has_params, scalars)
+    return compiled_for(filled, 1 + len(shape), has_params, scalars)
 
 
 @lru_cache(maxsize=256)
@@ -65,18 +65,18 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
     """
     dual = Dual(1)
     call = _with_params(for_duals(fun, dual), has_params, bool(scalars))
-    new_state, slopes = _new_state(dual, n), inside(_slopes_of(shape))
+    make_state, slopes = new_state(dual, n), inside(_slopes_of(shape))
 
     def along(t, y, f, params):
-        x = new_state()
+        x = make_state()
         for i in range(n):
             x[i] = directed(dual, y[i], f[i])
         return slopes(call(directed(dual, t, 1.0), x, params))
 
-    return _compiled(along, 1, has_params, scalars)
+    return compiled_for(along, 1, has_params, scalars)
 
 
-def _new_state(dual: Any, n: int) -> Any:
+def new_state(dual: Any, n: int) -> Any:
     """Return a function that makes room for a state of duals."""
     return inside((lambda: np.empty(n, dual)) if n > STACK else (lambda: stack_array(dual, n)), forceinline=True)
 
@@ -101,7 +101,7 @@ def _with_params(fun: Any, has_params: bool, one_by_one: bool) -> Any:
     return inside((lambda t, x, params: fun(t, x, params)) if has_params else (lambda t, x, params: fun(t, x)))
 
 
-def _compiled(function: Callable[..., Any], ndim: int, has_params: bool, scalars: str) -> Any:
+def compiled_for(function: Callable[..., Any], ndim: int, has_params: bool, scalars: str) -> Any:
     """Return a function of (t, y, a, params), with a of `ndim` dimensions, compiled for real states.
 
     Python calls it with the parameters that the user's function takes, and the engine with the same types.

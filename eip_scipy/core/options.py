@@ -34,6 +34,7 @@ from ..engine.data import (
     Balances,
     Groups,
     Options,
+    no_columns,
 )
 from ..engine.trust import FAR_IN_TOLERANCES, MOST_FAR
 from ..methods.orders import AT_REST
@@ -246,6 +247,7 @@ class ProjectionOptions:
             frame=frame_rows(self.frame, n, width),
             balances=_balances(method, known),
             parts=parts,
+            columns=no_columns(known.size),
             target=known.target,
             scales=known.scales,
             computed=np.array(known.computed, float),

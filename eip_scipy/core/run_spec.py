@@ -22,6 +22,7 @@ from .multistep import SecondOrder, attach_history
 from .options import ProjectionOptions
 from .runs import Run, Start
 from .stepping import AnyMethod, Stepping
+from .variations import Columns, widened
 
 __all__ = ["RunSpec"]
 
@@ -59,6 +60,8 @@ class RunSpec:
         Returns the end of a message: what the caller can do if the equations are not of second order.
     called, left_out : str
         See `Run`.
+    columns : Columns, optional
+        Columns of derivatives behind the state, which `stepping` and `projection` do not know of.
     """
 
     name: str
@@ -76,6 +79,7 @@ class RunSpec:
     hint: Callable[[], str] = str
     called: str = "fun"
     left_out: str = ""
+    columns: Columns | None = None
 
     def build(self, y0: Array, f0: Array | None = None, tau: float | None = None, *, check_start: bool = True) -> Run:
         """Return the run from a state on, after a check of the options, the functions and the invariants.
@@ -92,7 +96,7 @@ class RunSpec:
         """
         t0 = self.stepping.span.t0
         method, f0 = self.examined(y0, f0)
-        tau = self.stepping.first(self.rhs, y0, f0, method) if tau is None else tau
+        tau = self._first_step(method, y0, f0) if tau is None else tau
         run = self._with_buffers(method, Start(t0, y0, f0, tau), check_start)
         if method is AT_REST:
             return run  # its state need not be near the targets
@@ -120,12 +124,22 @@ class RunSpec:
         seen = SecondOrder(self.rhs, start, self.jacobian(), frequencies)
         attach_history(run, self.name, seen, self.stepping, level=self.level)
 
+    def _first_step(self, method: AnyMethod, y0: Array, f0: Array) -> float:
+        """Return the length of the first step, which columns of derivatives do not change."""
+        if self.columns is None:
+            return self.stepping.first(self.rhs, y0, f0, method)
+        n, behind = self.columns.n, y0[self.columns.n :]
+        return self.stepping.first(lambda t, y: self.rhs(t, np.concatenate([y, behind]))[:n], y0[:n], f0[:n], method)
+
     def _with_buffers(self, method: AnyMethod, start: Start, tell: bool) -> Run:
         """Return a run whose invariants have been evaluated at the start; `tell`: see `InvariantSet`."""
         t_bound, projection = self.stepping.span.t_bound, self.projection
         invariants = InvariantSet(projection.invariants, *start, self.extra, tell=tell, t_bound=t_bound, rhs=self.rhs)
-        options, sigma, identity = projection.settled(method, self.stepping, start.y, invariants)
-        options = options._replace(kinds=kinds_of(options.groups, start.y, start.f))
+        n = start.y.size if self.columns is None else self.columns.n
+        options, sigma, identity = projection.settled(method, self.stepping, start.y[:n], invariants)
+        options = options._replace(kinds=kinds_of(options.groups, start.y[:n], start.f[:n]))
+        if self.columns is not None:
+            options, sigma = widened(options, sigma, self.columns, invariants.gradients(*start[:3]))
         invariants.kinds = options.kinds
         arrays = steppers.arrays(method)
         carried, blocks = options.balances.place, options.groups.start.size - 1

@@ -460,6 +460,12 @@ class Groups(NamedTuple):
     place: numpy.typing.NDArray[numpy.int64]
     weight: numpy.typing.NDArray[numpy.float64]
 
+class Columns(NamedTuple):
+    kept: numpy.typing.NDArray[numpy.float64]
+    size: int
+    seen: int
+    symplectic: bool
+
 class Options(NamedTuple):
     rtol: numpy.typing.NDArray[numpy.float64]
     atol: numpy.typing.NDArray[numpy.float64]
@@ -468,6 +474,7 @@ class Options(NamedTuple):
     frame: FrameRows
     balances: Balances
     parts: Groups
+    columns: Columns
     target: numpy.typing.NDArray[numpy.float64]
     scales: numpy.typing.NDArray[numpy.float64]
     computed: numpy.typing.NDArray[numpy.float64]

@@ -10,7 +10,7 @@ from .native import BUILD
 
 if TYPE_CHECKING:
     from ._native import *  # noqa: F403
-    from ._native import Balances, Groups, Method, Schedule, Span
+    from ._native import Balances, Columns, Groups, Method, Schedule, Span
 else:
     globals().update((name, value) for name, value in vars(BUILD).items() if not name.startswith("_"))
 
@@ -32,6 +32,13 @@ NO_GROUPS = Groups(
     first_float=np.zeros(1, np.int64), place=np.zeros(0, np.int64), weight=np.zeros(0),
 )  # fmt: skip
 _none = np.zeros(0)
+
+
+def no_columns(values: int) -> Columns:
+    """Of a run of so many invariants without derivatives behind the state."""
+    return Columns(kept=np.zeros((values, 0)), size=0, seen=0, symplectic=False)
+
+
 NO_METHOD = Method(
     A=np.zeros((0, 0)), b=_none, b_low=_none, b_v=_none, b_v_low=_none, c=_none, e=_none, e_v=_none, e_low=_none,
     nystrom=False, fsal=False, paired=False, exponent=0.0,

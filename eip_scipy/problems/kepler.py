@@ -56,6 +56,7 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
         reference=partial(_orbit, e) if relativistic == 0 else None,
         blocks=2,
         component_names=("x", "y", "vx", "vy"),
+        canonical=True,
         units="G M = 1, semi-major axis 1: period 2 pi",
         source="Cai, Gong & Wang, section 3.1 (eq. 3.2, with L = q1 p2 - q2 p1)",
     )

@@ -62,6 +62,8 @@ def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult
     both = IntegrationResult(two)
     for name in ("t", "y", "invariants"):
         both[name] = np.concatenate([one[name], two[name][..., new]], axis=-1)
+    if "variations" in one and "variations" in two:
+        both["variations"] = np.concatenate([one["variations"], two["variations"][new]])
     for name in ("nfev", "njev", "nlu", "wall_time"):
         both[name] = one[name] + two[name]
     for name in ("t_events", "y_events"):

@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, Unpack
 
 import numpy as np
@@ -23,6 +23,7 @@ from ..core.problem import Problem
 from ..core.results import Diagnostics
 from ..core.solvers import EIPSolver
 from ..core.stepping import UNBOUNDED
+from ..core.variations import StateSolution
 from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, OK, PAUSE, ROW, STEP, TIME, Schedule
 from ..engine.native import PythonFunctions
 from ..engine.trust import ProjectionWarning
@@ -55,6 +56,9 @@ def integrate(
     params: Any = None,
     in_place: bool = False,
     jacobian: Any = None,
+    variations: Any = None,
+    jvp: Any = None,
+    symplectic: bool | None = None,
     save_every: int | None = None,
     t_eval: Any = None,
     events: Any = None,
@@ -117,6 +121,17 @@ def integrate(
     jacobian : callable, optional
         For a multistep method that takes it (`EIPGJ14`): ``jacobian(t, q, dq, out[, params])`` fills `out` with the
         derivative of the accelerations along dq, a Numba or C function for a compiled run. A problem may bring its own.
+    variations : str, int, sequence of these or array_like, shape (n, k), optional
+        Derivatives of the state to carry along, by the steps of a Runge-Kutta method, and to project with the state so
+        that they fit the invariants. ``"state"``: by the initial state, the state-transition matrix ``run.stm``. Names
+        or places of parameters: ``run.sensitivities``; a list holds several of these. An array: columns that start
+        from these, ``run.variations``. Products with the Jacobian come from the problem, from jitted functions by dual
+        numbers, from `jvp`, or else from complex steps. See :doc:`/how-to/tangent-maps`.
+    jvp : callable, optional
+        ``jvp(t, y, dy[, params]) -> (n,)``: the Jacobian of `fun` times dy, for `variations`.
+    symplectic : bool, optional
+        Whether a state-transition matrix is kept symplectic, for states (q, p) of a Hamiltonian system. Default: where
+        the problem knows that it is one.
     save_every : int, optional
         Save each so many-th step, besides the first and the last state.
     t_eval : array_like, optional
@@ -202,6 +217,9 @@ def integrate(
         params=params,
         in_place=in_place,
         jacobian=jacobian,
+        variations=variations,
+        jvp=jvp,
+        symplectic=symplectic,
         save_every=save_every,
         t_eval=t_eval,
         events=events,
@@ -413,7 +431,7 @@ class Loop:
         for row in range(first_row, driver.rows):
             t, y = float(driver.t[row]), driver.y[row].copy()
             invariants = driver.run.invariants
-            if self.callback(t, y, invariants.values(t, y) - invariants.fixed_target):
+            if self.callback(t, y[: self.prepared.n], invariants.values(t, y) - invariants.fixed_target):
                 driver.schedule.place[ROW] = row + 1
                 return True
         return False
@@ -425,14 +443,14 @@ class Loop:
         driver.note(values)
         result = IntegrationResult(
             t=driver.t[:rows],
-            y=driver.y[:rows].T,
+            y=driver.y[:rows, : self.prepared.n].T,
             invariants=values,
             target=driver.run.invariants.fixed_target,
             max_defect=driver.run.work.max_defect,
             diagnostics=self.diagnostics,
             t_events=[np.asarray(t) for t in events.t] if events.functions else None,
-            y_events=[np.asarray(y) for y in events.y] if events.functions else None,
-            sol=driver.solution(self.events.last[0] if self._event_ended else driver.now[0]),
+            y_events=[_own(np.asarray(y), self.prepared) for y in events.y] if events.functions else None,
+            sol=self._solution(),
             nfev=int(counters[NFEV]),
             njev=int(counters[NJEV]),
             nlu=int(counters[NLU]),
@@ -450,10 +468,23 @@ class Loop:
             epoch=self.prepared.epoch,
         )
         t, y = events.last if self._event_ended else driver.now
-        kept = driver.run.invariants.with_targets(at_end=not self._event_ended)
-        origin = Origin(self.prepared.asked, t, y.copy(), driver.schedule.span.sign, kept)
+        kept, asked = driver.run.invariants.with_targets(at_end=not self._event_ended), self.prepared.asked
+        variations = self.prepared.variations
+        if variations is not None:
+            columns = variations.columns
+            result["variations"] = columns.apart(driver.y[:rows])[1]
+            result["columns"] = {"state": bool(columns.is_transition), "parameters": len(columns.parameters)}
+            asked, kept = replace(asked, variations=columns.after(y)), variations.with_targets(kept)
+        origin = Origin(asked, t, y[: self.prepared.n].copy(), driver.schedule.span.sign, kept)
         object.__setattr__(result, "_origin", origin)  # beside the fields, which are items
         return result
+
+    def _solution(self) -> Any:
+        """Return the run as a function of time, or None."""
+        found = self.driver.solution(self.events.last[0] if self._event_ended else self.driver.now[0])
+        if found is None or self.prepared.variations is None:
+            return found
+        return StateSolution(found, self.prepared.n)
 
     def explained(self, message: str) -> str:
         """With what speaks against the run, and what is to be said about checkpoints and not being compiled."""
@@ -473,6 +504,11 @@ class Loop:
             if not broken:
                 raise
             return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)
+
+
+def _own(rows: np.ndarray, prepared: Prepared) -> np.ndarray:
+    """The user's states of rows that may have columns of derivatives behind them."""
+    return rows if prepared.variations is None or rows.ndim < 2 else rows[:, : prepared.n]
 
 
 def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:

@@ -26,6 +26,7 @@ from ..core.runs import Counted, Run
 from ..core.solvers import EIPSolver, class_named, eip_method
 from ..core.states import as_derivative, initial_state
 from ..core.stepping import ATOL, StepOptions, Stepping, interval
+from ..core.variations import Variations, asked_columns
 from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
 from .driver import check_memory, saved_rows
@@ -69,6 +70,9 @@ class Request:
     params: Any = None
     in_place: bool = False
     jacobian: Any = None
+    variations: Any = None
+    jvp: Any = None
+    symplectic: Any = None
     save_every: Any = None
     t_eval: Any = None
     events: Any = None
@@ -260,6 +264,12 @@ class Prepared:
     schedule: Schedule
     run: Run
     diagnostics: Diagnostics
+    variations: Variations | None = None
+
+    @property
+    def n(self) -> int:
+        """Return the number of components of the user's state."""
+        return self.run.y0.size if self.variations is None else self.variations.columns.n
 
     @property
     def label(self) -> str:
@@ -270,7 +280,7 @@ class Prepared:
     def component_names(self) -> tuple[str, ...] | None:
         """Those of the problem, where it has the run's components."""
         names = self.asked.fun.component_names if isinstance(self.asked.fun, Problem) else None
-        return names if names is not None and len(names) == self.run.y0.size else None
+        return names if names is not None and len(names) == self.n else None
 
     @property
     def units(self) -> str:
@@ -306,13 +316,19 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     asked, request = request, request.with_pointers()
     acc = request.fun.acc if method.of_second_order and isinstance(request.fun, Problem) else None
     request, form = _with_problem(request)
+    variations = _variations(asked.fun, request, form)
+    if variations is not None:
+        request, form, acc = _widened(request, variations), FORMS[False, True], None
     system = System(request, form, acc)
     t0, t_bound = _span(request, system.events)
     y0 = _state(request.y0)
-    stepping = request.steps.checked(request.method.__name__, method, t0, t_bound, y0.size, stacklevel=4)
+    n = y0.size if variations is None else variations.columns.n
+    stepping = request.steps.checked(request.method.__name__, method, t0, t_bound, n, stacklevel=4)
     system.bind(y0)
     calls = Counted(system.derivative)
-    run = _spec(asked.fun, request, system, calls, stepping).build(y0, check_start=check_start)
+    spec = _spec(asked.fun, request, system, calls, stepping)
+    spec = spec if variations is None else replace(spec, columns=variations.columns, fun=None)
+    run = spec.build(y0, check_start=check_start)
     schedule = _schedule(stepping.span, run.start.tau, request, system.events)
     check_memory(saved_rows(schedule), run, request.max_bytes)
     record = Diagnostics() if request.diagnostics is None else request.diagnostics
@@ -321,7 +337,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     run.work.K[0] = run.start.f
     system.events.leave(t0, run.y0, run.work.K[0], run.start.tau * schedule.span.sign, schedule.g)
     run.work.counters[NFEV] = calls.count
-    return Prepared(asked, request, system, schedule, run, record)
+    return Prepared(asked, request, system, schedule, run, record, variations)
 
 
 def _spec(given: Any, request: Request, system: System, calls: Counted, stepping: Stepping) -> RunSpec:
@@ -341,6 +357,54 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
         hint=partial(_second_order_hint, given),
         called=system.name,
         left_out=system.left_out,
+    )
+
+
+def _variations(given: Any, request: Request, form: str) -> Variations | None:
+    """Return the derivatives that a request asks for, or None."""
+    if request.variations is None:
+        if request.jvp is not None or request.symplectic is not None:
+            raise TypeError("jvp and symplectic belong to variations=...; ask for derivatives, or leave them out.")
+        return None
+    method = request.method.TABLEAU
+    if method.of_second_order or method.in_python:
+        raise ValueError(
+            f"variations: {request.method.__name__} carries no derivatives: its steps are no stages of a Runge-Kutta "
+            "tableau over the whole state. Take EIPDOP853 or another Runge-Kutta method."
+        )
+    y0 = _state(request.y0)
+    problem = given if isinstance(given, Problem) else None
+    extra = extra_arguments(request.args, request.params)
+    projection = ProjectionOptions(**request.projection)
+    symplectic = request.symplectic
+    canonical = problem is not None and problem.canonical
+    flag("symplectic", canonical if symplectic is None else symplectic)
+    names = () if problem is None else tuple(problem.parameters)
+    columns = asked_columns(
+        request.variations, y0, floats(extra), names, canonical if symplectic is None else bool(symplectic)
+    )
+    if projection.project_initial and columns.parameters:
+        raise ValueError("variations: project_initial does not go with derivatives by parameters; project y0 first.")
+    own = None if problem is None else problem.variational
+    t0 = interval(_required("t_span", request.t_span))[0]
+    items = as_invariants(projection.invariants)
+    return Variations.of(columns, request.fun, form, t0, y0, extra, items, request.jvp, own)
+
+
+def _widened(request: Request, variations: Variations) -> Request:
+    """The request for the state with its columns."""
+    extra = extra_arguments(request.args, request.params)
+    events = request.events
+    if events is not None:
+        events = as_events(events)
+        events = [variations.event(event) for event in (events if isinstance(events, list | tuple) else [events])]
+    return replace(
+        request,
+        fun=variations.rhs,
+        y0=variations.columns.wide(_state(request.y0), floats(extra)),
+        jacobian=None,
+        events=events,
+        projection={**request.projection, "invariants": variations.invariants},
     )
 
 

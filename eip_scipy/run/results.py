@@ -86,6 +86,9 @@ class IntegrationResult(Fields):
         and so on.
     method : str
     h : float or None
+    variations : ndarray, shape (m, n, k)
+        The columns of derivatives at the saved times, of a run that was asked for them. Between two steps they are
+        interpolated, not projected. See `stm` and `sensitivities`.
     component_names : tuple of str
         Those of the `Problem`, or "y0", "y1" and so on; assign others as you like.
     units : str
@@ -117,12 +120,43 @@ class IntegrationResult(Fields):
     success: bool
     trusted: bool
     wall_time: float
+    variations: np.ndarray
+    columns: dict[str, Any]
     compiled: bool
     calls: dict[str, str]
     method: str
     h: float | None
     units: str
     epoch: tuple[float, float] | None
+
+    @property
+    def stm(self) -> np.ndarray:
+        """State-transition matrices at the saved times, (m, n, n), of a run with ``variations="state"``.
+
+        ``run.stm[k, i, j]`` is the derivative of ``run.y[i, k]`` by component j of the initial state.
+
+        Raises
+        ------
+        AttributeError
+            When the run did not carry it.
+        """
+        if not self.get("columns", {}).get("state"):
+            raise AttributeError('this run has no state-transition matrix; ask for it with variations="state".')
+        return self.variations[:, :, : len(self.y)]
+
+    @property
+    def sensitivities(self) -> np.ndarray:
+        """Derivatives of the state by the parameters of ``variations=[...]`` at the saved times, (m, n, p).
+
+        Raises
+        ------
+        AttributeError
+            When the run did not carry any.
+        """
+        count = self.get("columns", {}).get("parameters", 0)
+        if not count:
+            raise AttributeError("this run has no sensitivities; name parameters in variations=[...].")
+        return self.variations[:, :, self.variations.shape[2] - count :]
 
     @property
     def component_names(self) -> tuple[str, ...]:

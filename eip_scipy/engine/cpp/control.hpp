@@ -1,7 +1,7 @@
 // A whole step: the raw one, the projection, and the control of its length, which is SciPy's.
 #pragma once
 
-#include "correction.hpp"
+#include "columns.hpp"
 #include "multistep.hpp"
 
 namespace eip {
@@ -101,6 +101,15 @@ inline void close_step(const AnyRun &run, const Step &step, Code status) {
     }
 }
 
+// The columns of derivatives behind a state that has been projected. Batches of members have none.
+template <class AnyRun>
+inline void project_any_columns(const AnyRun &, const Step &, Code) {}
+template <class W>
+inline void project_any_columns(const RunOf<W, System> &run, const Step &step, Code status) {
+    if (run.options.columns.count > 0 && status == OK) [[unlikely]]
+        project_columns(of_any_length(run), step);
+}
+
 // The rest of a step whose raw result is accepted; OK or FAILED_PROJECTION.
 template <class AnyRun>
 inline Code finish_step(const AnyRun &run, const Step &step) {
@@ -111,6 +120,7 @@ inline Code finish_step(const AnyRun &run, const Step &step) {
             ++run.work.counters[REJECTED];
             return status;
         }
+        project_any_columns(run, step, status);
     } else {
         copy(run.work.y_hat, step.y_new, run.work.m);
     }

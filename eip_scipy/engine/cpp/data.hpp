@@ -241,12 +241,28 @@ void fields(Groups &g, Visit &visit) {
     --g.directions;
 }
 
+// Columns of derivatives behind a state of `size` floats, of as many each: solutions M of the variational equations. The
+// first `seen` floats of the state are the user's, behind which parameters may stand as constants. `kept`: G M of the
+// invariants' gradients G, which is constant. symplectic: M^T J M = J is restored as well.
+struct Columns {
+    const double *kept;  // (l, count)
+    int64_t count, size, seen;
+    bool symplectic;
+};
+
+template <class Visit>
+void fields(Columns &c, Visit &visit) {
+    visit("kept", c.kept, visit.sizes.l, Bound{c.count});
+    each(visit, "size", c.size, "seen", c.seen, "symplectic", c.symplectic);
+}
+
 struct Options {
     const double *rtol, *atol, *block_atol;  // by float, by component, by block
     Blocks blocks;
     Frame frame;
     Balances balances;
     Groups parts;
+    Columns columns;
     double *target;
     const double *scales, *computed;  // computed: 1 for invariants without a gradient of the user's
     const double *most_left;          // the share of its terms that a Newton step may leave without a further one
@@ -270,6 +286,7 @@ void fields(Options &o, Visit &visit) {
     visit.record("frame", "FrameRows", o.frame);
     visit.record("balances", "Balances", o.balances);
     visit.record("parts", "Groups", o.parts);
+    visit.record("columns", "Columns", o.columns);
     visit("target", o.target, is.l);
     visit("scales", o.scales, is.l);
     visit("computed", o.computed, is.l);

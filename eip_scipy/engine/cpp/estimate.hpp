@@ -54,6 +54,12 @@ inline double paired_error_norm(double *err, const double *low, const double *y,
     return fine / std::sqrt((fine + 0.01 * coarse) * n);
 }
 
+// How many numbers of the state the step control sees: columns of derivatives do not count.
+template <class W>
+inline int64_t controlled(const Options &o, const W &w) {
+    return o.columns.count > 0 ? o.columns.seen : w.n;
+}
+
 // The estimate into w.err, and its norm for the step control.
 template <class AnyRun>
 inline void estimate_error(const AnyRun &run, const Step &step) {
@@ -64,14 +70,14 @@ inline void estimate_error(const AnyRun &run, const Step &step) {
         const int64_t half = w.m / 2;
         weighted_sum(step.h * step.h, {m.e, w.K + half, m.n_e, w.m}, w.err, half);
         weighted_sum(step.h, {m.e_v, w.K + half, m.n_e_v, w.m}, w.err + half, half);
-        if (o.adaptive) w.norm[0] = error_norm(w.err, step.y, w.y_hat, o, w.n);
+        if (o.adaptive) w.norm[0] = error_norm(w.err, step.y, w.y_hat, o, controlled(o, w));
     } else if (m.paired) {
         weighted_sum(step.h, {m.e, w.K, m.n_e, w.m}, w.err, w.m);
         weighted_sum(step.h, {m.e_low, w.K, m.n_e, w.m}, w.err_low, w.m);
-        w.norm[0] = paired_error_norm(w.err, w.err_low, step.y, w.y_hat, o, w.n);
+        w.norm[0] = paired_error_norm(w.err, w.err_low, step.y, w.y_hat, o, controlled(o, w));
     } else {
         weighted_sum(step.h, {m.e, w.K, m.n_e, w.m}, w.err, w.m);
-        w.norm[0] = o.adaptive ? error_norm(w.err, step.y, w.y_hat, o, w.n) : 0.0;
+        w.norm[0] = o.adaptive ? error_norm(w.err, step.y, w.y_hat, o, controlled(o, w)) : 0.0;
     }
 }
 

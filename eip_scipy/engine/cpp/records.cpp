@@ -247,6 +247,12 @@ static void check_parts(const Groups &g, const Work &w) {
     require(good, "engine: the groups of balances do not fit the run");
 }
 
+static void check_columns(const Columns &c, const Work &w) {
+    const bool fits = c.count == 0 || (c.seen > 0 && c.seen <= c.size && c.size * (1 + c.count) == w.m);
+    require(fits && (!c.symplectic || (c.count == c.size && c.size % 2 == 0)),
+            "engine: the columns of derivatives do not fit the state");
+}
+
 Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept) {
     Options o{};
     read(o, options, NPY_DOUBLE, {.n = w.n, .m = w.m, .l = w.l, .blocks = blocks}, kept);
@@ -259,6 +265,7 @@ Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept) 
     require(o.every >= 0, "engine: every must not be negative");
     check_balances(o.balances, w);
     check_parts(o.parts, w);
+    check_columns(o.columns, w);
     w.target = o.target;
     w.products = o.frame.products;
     o.has_limits = std::any_of(o.most_left, o.most_left + w.l, [](double share) { return share < ENDLESS; });
@@ -564,6 +571,7 @@ void add_records(nb::module_ &module) {
     add_record<Frame>(module, "FrameRows");
     add_record<Balances>(module, "Balances");
     add_record<Groups>(module, "Groups");
+    add_record<Columns>(module, "Columns");
     add_record<Options>(module, "Options");
     add_record<Members>(module, "Members");
     add_record<Samples>(module, "Dense");

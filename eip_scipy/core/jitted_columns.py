@@ -1,0 +1,247 @@
+"""Compiled functions of a state with columns of derivatives behind it; loaded only where all of a run is compiled."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from .dual_arrays import for_duals, inside
+from .dual_numbers import Dual, put_slope, seed, slope, value_of
+from .jitted_gradients import LANES, compiled_for, gradient_by_duals, new_state
+
+__all__ = ["parameter_gradient", "rhs_by_duals", "rhs_by_products", "rhs_by_variational", "wide_gradient", "wide_value"]
+
+# A state with columns is (y, p, first column, second column, ...): the parameters p that derivatives are taken by stand
+# behind the n components as constants, so that each column has size = n + len(p) numbers.
+
+
+@lru_cache(maxsize=64)
+def rhs_by_duals(
+    fun: Any, form: str, n: int, parameters: tuple[int, ...], columns: int, has_params: bool, scalars: str
+) -> Any:
+    """The right-hand side in place of a state with columns, by dual numbers: exact but for rounding.
+
+    Raises
+    ------
+    NotCompilableError
+        When the function does something that dual numbers cannot.
+    """
+    passes = -(-columns // LANES)
+    lanes = -(-columns // passes)
+    dual = Dual(lanes)
+    taken = n // 2 if form.startswith("acceleration") else n
+    offset, size = n - taken, n + len(parameters)
+    user = _with_out(for_duals(fun, dual), form, has_params, bool(scalars))
+    new = new_state(dual, taken)
+
+    def seeded(Y, first, i):
+        x = seed(dual, Y[i], lanes)
+        for lane in range(min(lanes, columns - first)):
+            x = put_slope(x, lane, Y[size * (1 + first + lane) + i])
+        return x
+
+    seeded = inside(seeded)
+    seeded_params = _seeded_params(dual, parameters, n, seeded)
+
+    def filled(t, Y, out, params):
+        out[:] = 0.0
+        x, f = new(), new()
+        for first in range(0, columns, lanes):
+            for i in range(taken):
+                x[i] = seeded(Y, first, i)
+            found = user(t, x, f, seeded_params(params, Y, first))
+            for i in range(offset):
+                out[i] = Y[taken + i]
+            for i in range(taken):
+                out[offset + i] = value_of(found[i])
+            for lane in range(min(lanes, columns - first)):
+                start = size * (1 + first + lane)
+                for i in range(offset):
+                    out[start + i] = Y[start + taken + i]
+                for i in range(taken):
+                    out[start + offset + i] = slope(found[i], lane)
+
+    return compiled_for(filled, 1, has_params, scalars)
+
+
+def _seeded_params(dual: Any, parameters: tuple[int, ...], n: int, seeded: Any) -> Any:
+    """Return a function that copies the parameters as duals, where derivatives are taken by some."""
+    if not parameters:
+        return inside(lambda params, Y, first: params)
+    places, lanes = np.array(parameters, np.int64), dual.lanes
+
+    def copied(params, Y, first):
+        p = np.empty(params.size, dual)
+        for i in range(params.size):
+            p[i] = seed(dual, params[i], lanes)
+        for j in range(places.size):
+            p[places[j]] = seeded(Y, first, n + j)
+        return p
+
+    return inside(copied)
+
+
+def _with_out(fun: Any, form: str, has_params: bool, one_by_one: bool) -> Any:
+    """Return a function of (t, x, out, params) that returns the derivative, which it may have filled into out."""
+    if form.endswith("place"):
+        if one_by_one:
+            return inside(lambda t, x, out, numbers: _second(fun(t, x, out, *numbers), out))
+        if has_params:
+            return inside(lambda t, x, out, params: _second(fun(t, x, out, params), out))
+        return inside(lambda t, x, out, params: _second(fun(t, x, out), out))
+    if one_by_one:
+        return inside(lambda t, x, out, numbers: fun(t, x, *numbers))
+    if has_params:
+        return inside(lambda t, x, out, params: fun(t, x, params))
+    return inside(lambda t, x, out, params: fun(t, x))
+
+
+@inside
+def _second(first, second):
+    return second
+
+
+@lru_cache(maxsize=256)
+def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, columns: int) -> Any:
+    """The right-hand side in place of a state with columns, by a jitted ``jvp(t, y, dy, ...) -> (n,)``."""
+    taken = n // 2 if form.startswith("acceleration") else n
+    offset, in_place = n - taken, form.endswith("place")
+
+    def rhs(t, Y, out, *extra):
+        y = Y[:n]
+        for i in range(offset):
+            out[i] = y[taken + i]
+        if in_place:
+            fun(t, y[:taken], out[offset:n], *extra)
+        else:
+            out[offset:n] = fun(t, y[:taken], *extra)
+        for c in range(columns):
+            start = n * (1 + c)
+            out[start : start + n] = jvp(t, y, Y[start : start + n], *extra)
+
+    return njit(rhs)
+
+
+@lru_cache(maxsize=256)
+def rhs_by_variational(rhs: Any, n: int, parameters: int, columns: int) -> Any:
+    """The same by a problem's own, in place of (y, columns) without the parameters behind them.
+
+    The last `parameters` columns have to be the derivatives by these.
+    """
+    if not parameters:
+        return rhs
+    size = n + parameters
+
+    def spread(t, Y, out, *extra):
+        packed = np.empty(n * (1 + columns))
+        for c in range(1 + columns):
+            packed[n * c : n * (c + 1)] = Y[size * c : size * c + n]
+        found = np.empty(packed.size)
+        rhs(t, packed, found, *extra)
+        out[:] = 0.0
+        for c in range(1 + columns):
+            out[size * c : size * c + n] = found[n * c : n * (c + 1)]
+
+    return njit(spread)
+
+
+@lru_cache(maxsize=256)
+def wide_value(fun: Any, n: int, parameters: tuple[int, ...] = ()) -> Any:
+    """A function of the first n components of a state, with these parameters from behind them."""
+    if not parameters:
+        return njit(lambda t, Y, *extra: fun(t, Y[:n], *extra))
+    places = np.array(parameters, np.int64)
+    return njit(lambda t, Y, params: fun(t, Y[:n], _from_state(Y, params, n, places)))
+
+
+@inside
+def _from_state(Y, params, n, places):
+    found = params.copy()
+    for j in range(places.size):
+        found[places[j]] = Y[n + j]
+    return found
+
+
+@lru_cache(maxsize=256)
+def wide_gradient(
+    grad: Any,
+    by_parameters: Any,
+    n: int,
+    parameters: tuple[int, ...],
+    shape: tuple[int, ...],
+    takes_f: bool,
+    in_place: bool,
+) -> Any:
+    """The gradient in place over a state with columns, on which the invariant does not depend.
+
+    `shape`: that of the invariant's value. `takes_f`, `in_place`: how `grad` is called; the result takes f likewise.
+    """
+    places, sizes = np.array(parameters, np.int64), (*shape, n)
+    if not in_place:
+        returned = grad
+        if takes_f:
+            grad = inside(lambda t, y, f, out, *extra: _put(returned(t, y, f, *extra), out))
+        else:
+            grad = inside(lambda t, y, out, *extra: _put(returned(t, y, *extra), out))
+    if parameters:
+        behind = inside(lambda t, y, out, extra: _put_columns(by_parameters(t, y, *extra), out, n, places))
+        own = inside(lambda Y, extra: (_from_state(Y, extra[0], n, places),))
+    else:
+        behind = inside(lambda t, y, out, extra: None)
+        own = inside(lambda Y, extra: extra)
+    if takes_f:
+
+        def with_f(t, Y, f, out, *extra):
+            found = np.empty(sizes)
+            arguments = own(Y, extra)
+            grad(t, Y[:n], f[:n], found, *arguments)
+            out[:] = 0.0
+            out[..., :n] = found
+            behind(t, Y[:n], out, arguments)
+
+        return njit(with_f)
+
+    def without_f(t, Y, out, *extra):
+        found = np.empty(sizes)
+        arguments = own(Y, extra)
+        grad(t, Y[:n], found, *arguments)
+        out[:] = 0.0
+        out[..., :n] = found
+        behind(t, Y[:n], out, arguments)
+
+    return njit(without_f)
+
+
+@inside
+def _put(values, out):
+    out[:] = values
+
+
+@inside
+def _put_columns(slopes, out, n, places):
+    for j in range(places.size):
+        out[..., n + j] = slopes[..., places[j]]
+
+
+@lru_cache(maxsize=256)
+def parameter_gradient(fun: Any, p: int, shape: tuple[int, ...]) -> Any:
+    """The derivatives (..., p) of a jitted invariant by its parameters.
+
+    Raises
+    ------
+    NotCompilableError
+        When the function does something that dual numbers cannot.
+    """
+    swapped = njit(lambda t, params, y: fun(t, y, params))
+    grad = gradient_by_duals(swapped, p, shape, True)
+    sizes = (*shape, p)
+
+    def slopes(t, y, params):
+        out = np.empty(sizes)
+        grad(t, params, out, y)
+        return out
+
+    return njit(slopes)
