@@ -15,7 +15,7 @@ from ..engine.data import Columns as KeptColumns
 from ..engine.native import LibraryFunction
 from .arguments import scalars
 from .gradients import COMPLEX_STEP, NumericalGradient, difference_gradient, typical_sizes
-from .inputs import filled, real_array, shown
+from .inputs import filled, reals, shown
 from .invariants import Invariant
 from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off
 from .pointers import PointerFunction
@@ -27,6 +27,7 @@ Array = np.ndarray
 STATE = "state"
 # How far a complex step may be from a difference, relative to the largest component: that of differences of order 6.
 AGREES = 1e-6
+LEAST = 1e-3  # size of a parameter that is 0, for differences
 
 
 @dataclass(frozen=True)
@@ -99,15 +100,13 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], sy
         if len(set(own)) < len(own):
             raise ValueError(f"variations: {shown(asked)} names a parameter twice.")
         has_state, p = STATE in items, len(own)
-        values = np.zeros((n + p, n * has_state + p))
+        identity = np.zeros((n + p, n * has_state + p))
         if has_state:
-            values[:n, :n] = np.eye(n)
-        values[n:, n * has_state :] = np.eye(p)
-        return Columns(values, tuple(own), has_state, symplectic and has_state and p == 0)
-    try:
-        values = np.array(real_array("variations", asked), float)
-    except (TypeError, ValueError):
-        values = np.zeros(0)
+            identity[:n, :n] = np.eye(n)
+        identity[n:, n * has_state :] = np.eye(p)
+        return Columns(identity, tuple(own), has_state, symplectic and has_state and p == 0)
+    found = reals(asked)
+    values: Array = np.zeros(0) if found is None else np.array(found, float)
     if values.ndim == 1 and values.size == n:
         values = values[:, None]
     if values.ndim != 2 or values.shape[0] != n or values.shape[1] == 0 or not np.isfinite(values).all():
@@ -230,7 +229,7 @@ class Variations:
             wide = wide_value(fun, n)
         else:
 
-            def wide(t, Y, *extra):
+            def wide(t: float, Y: Array, *extra: Any) -> Any:
                 return fun(t, Y[:n], *extra)
 
         for name in ("terminal", "direction"):
@@ -373,78 +372,93 @@ def _difference(
     return np.asarray(difference_gradient(along, np.zeros(1), np.full(1, 1e-2)))[..., 0]
 
 
-def _wide(item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple, compiled: bool) -> Invariant:
-    """An invariant as a function of the wide state, with a gradient."""
-    n, parameters = columns.n, columns.parameters
-    value = np.asarray(item.function(t0, y0.copy(), *item.args, *extra))
-    wide = copy(item)
-    takes_params = bool(extra) and not item.args and bool(parameters)
-    own = copy(item)
-    if compiled and is_compiled(item.function) and not item.args and scalars(extra) is not None:
-        try:
-            return _wide_jitted(own, wide, columns, value.shape, extra, takes_params)
-        except NotCompilableError:
-            pass
-    if own.gradient is None:
-        floors = typical_sizes(y0, np.zeros_like(y0), 0.0)
-        takes_complex = not isinstance(own.function, PointerFunction | LibraryFunction)
-        own.gradient = NumericalGradient(own.function, own.args, takes_complex, t0, y0, floors, extra)
-        own.in_place, own.uses_f, own.args = False, False, ()
-        by_numbers = True
-    else:
-        by_numbers = False
-    args = () if by_numbers else item.args
-    shape, places = value.shape, list(parameters)
+class _WideInvariant:
+    """An invariant as a function of the wide state, with its gradient, as Python calls them."""
 
-    def own_arguments(Y: Array, arguments: tuple) -> tuple:
-        if not takes_params:
-            return arguments
-        params = arguments[0].copy()
-        params[places] = Y[n : n + len(places)]
-        return (params,)
+    def __init__(self, item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple) -> None:
+        self.item, self.n, self.shape = item, columns.n, np.shape(item.function(t0, y0.copy(), *item.args, *extra))
+        self.places = list(columns.parameters) if extra and not item.args else []
+        gradient: Any = item.gradient
+        self.args, self.in_place, self.uses_f = item.args, item.in_place, item.uses_f
+        if gradient is None:
+            floors = typical_sizes(y0, np.zeros_like(y0), 0.0)
+            takes_complex = not isinstance(item.function, PointerFunction | LibraryFunction)
+            gradient = NumericalGradient(item.function, item.args, takes_complex, t0, y0, floors, extra)
+            self.args, self.in_place, self.uses_f = (), False, False
+        self.own_gradient: Callable[..., Any] = gradient
 
-    def function(t: float, Y: Array, *arguments: Any) -> Any:
-        return item.function(t, Y[:n].copy(), *item.args, *own_arguments(Y, arguments))
+    def value(self, t: float, Y: Array, *extra: Any) -> Any:
+        """Return the value, with parameters from behind the state."""
+        return self.item.function(t, Y[: self.n].copy(), *self.item.args, *self._arguments(Y, extra))
 
-    def gradient(t: float, Y: Array, *rest: Any) -> Array:
-        f, arguments = (rest[0][:n].copy(), rest[1:]) if own.uses_f else (None, rest)
-        arguments = own_arguments(Y, arguments)
-        first = (t, Y[:n].copy()) if f is None else (t, Y[:n].copy(), f)
-        out = np.zeros((*shape, Y.size))
-        if own.in_place:
+    def gradient(self, t: float, Y: Array, *rest: Any) -> Array:
+        """Return the gradient over the wide state; `rest` begins with f where it is used."""
+        n = self.n
+        first: tuple[Any, ...] = (t, Y[:n].copy())
+        if self.uses_f:
+            first, rest = (*first, rest[0][:n].copy()), rest[1:]
+        extra = self._arguments(Y, rest)
+        out = np.zeros((*self.shape, Y.size))
+        if self.in_place:
+            shape = (*self.shape, n)
             out[..., :n] = filled(
-                lambda part: own.gradient(*first, part, *args, *arguments), (*shape, n), np.dtype(float), "gradient", t
+                lambda part: self.own_gradient(*first, part, *self.args, *extra), shape, Y.dtype, "gradient", t
             )
         else:
-            out[..., :n] = own.gradient(*first, *args, *arguments)
-        if takes_params:
-            by = difference_gradient(
-                lambda p: np.asarray(item.function(t, Y[:n].copy(), p)), arguments[0], np.abs(arguments[0]) + 1e-3
-            )
-            out[..., n : n + len(places)] = np.asarray(by)[..., places]
+            out[..., :n] = self.own_gradient(*first, *self.args, *extra)
+        if self.places:
+            out[..., n : n + len(self.places)] = self._by_parameters(t, Y[:n], extra[0])
         return out
 
-    wide.function, wide.gradient, wide.args = function, gradient, ()
-    wide.in_place, wide.uses_f = False, own.uses_f
-    return wide
+    def _arguments(self, Y: Array, extra: tuple) -> tuple:
+        if not self.places:
+            return extra
+        params = extra[0].copy()
+        params[self.places] = Y[self.n : self.n + len(self.places)]
+        return (params,)
+
+    def _by_parameters(self, t: float, y: Array, params: Array) -> Array:
+        """Return the derivatives by parameters, by differences of order 6."""
+        slopes = difference_gradient(
+            lambda p: np.asarray(self.item.function(t, y.copy(), p)), params, np.abs(params) + LEAST
+        )
+        return np.asarray(slopes)[..., self.places]
 
 
-def _wide_jitted(
-    own: Invariant, wide: Invariant, columns: Columns, shape: tuple[int, ...], extra: tuple, takes_params: bool
-) -> Invariant:
+def _wide(item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple, compiled: bool) -> Invariant:
+    """Return an invariant as a function of the wide state, with a gradient."""
+    wide = _WideInvariant(item, columns, t0, y0, extra)
+    found = copy(item)
+    if compiled and is_compiled(item.function) and not item.args and scalars(extra) is not None:
+        try:
+            return _jitted(found, item, wide, extra)
+        except NotCompilableError:  # Python then calls it
+            found = copy(item)
+    found.function, found.gradient, found.args = wide.value, wide.gradient, ()
+    found.in_place, found.uses_f = False, wide.uses_f
+    return found
+
+
+def _jitted(found: Invariant, item: Invariant, wide: _WideInvariant, extra: tuple) -> Invariant:
+    """Return the same with compiled functions.
+
+    Raises
+    ------
+    NotCompilableError
+        When one of them cannot be compiled.
+    """
     from .jitted_columns import parameter_gradient, wide_gradient, wide_value
     from .jitted_gradients import gradient_by_duals
 
-    n, parameters = columns.n, columns.parameters if takes_params else ()
-    if own.gradient is None:
-        own.gradient = gradient_by_duals(own.function, n, shape, bool(extra), scalars(extra) or "")
-        own.in_place = True
-    if not is_compiled(own.gradient):
-        raise NotCompilableError("its gradient is not compiled")
-    if takes_params and not is_jitted(own.function):
-        raise NotCompilableError("it is no Numba function")
-    by = parameter_gradient(own.function, extra[0].size, shape) if parameters else None
-    wide.function = wide_value(own.function, n, parameters)
-    wide.gradient = wide_gradient(own.gradient, by, n, parameters, shape, own.uses_f, own.in_place)
-    wide.in_place = True
-    return wide
+    n, parameters = wide.n, tuple(wide.places)
+    gradient, in_place = item.gradient, item.in_place
+    if gradient is None:
+        gradient = gradient_by_duals(item.function, n, wide.shape, bool(extra), scalars(extra) or "")
+        in_place = True
+    if not is_compiled(gradient) or (parameters and not is_jitted(item.function)):
+        raise NotCompilableError("one of its functions is not compiled")
+    by = parameter_gradient(item.function, extra[0].size, wide.shape) if parameters else None
+    found.function = wide_value(item.function, n, parameters)
+    found.gradient = wide_gradient(gradient, by, n, parameters, wide.shape, item.uses_f, in_place)
+    found.in_place = True
+    return found

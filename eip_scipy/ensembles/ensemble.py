@@ -58,7 +58,7 @@ TRIED = 8
 SHOWN = 5
 # Of a request: what an ensemble has of its own, or not at all.
 ALONE = {"fun", "acceleration", "t_span", "y0", "params", "projection"}
-ALONE |= {"callback", "diagnostics", "max_bytes", "progress"}
+ALONE |= {"callback", "diagnostics", "max_bytes", "progress", "variations", "jvp", "symplectic"}
 OWN = ("executor", "reduce", "callback", "out", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(ALONE))
 
 
