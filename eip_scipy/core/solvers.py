@@ -50,6 +50,7 @@ from .run_spec import RunSpec
 from .runs import Run, Start
 from .states import as_derivative, initial_state
 from .stepping import ATOL, StepOptions, Stepping, interval
+from .variations import Columns
 
 __all__ = [
     "EIPDOP853",
@@ -148,6 +149,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     _in_parts: ClassVar[bool] = False
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
     _SCIPY: ClassVar[type[OdeSolver] | None] = None
+    _COLUMNS: ClassVar[Columns | None] = None  # columns of derivatives behind the state
     order: Any = NotImplemented
     error_estimator_order: Any = NotImplemented
     n_stages: Any = NotImplemented
@@ -195,15 +197,16 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         start = initial_state(y0)
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
         steps = StepOptions(h=h, first_step=first_step, max_step=max_step, rtol=rtol, atol=atol)
-        stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, self.n, stacklevel=users_level() + 1)
+        n = self.n if self._COLUMNS is None else self._COLUMNS.n
+        stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, n, stacklevel=users_level() + 1)
         kept = as_invariants(projection.invariants)
         self._jacobian = _checked_jacobian(jacobian)
         self._bind(fun, [0])
         self._spec = self._specified(stepping, replace(projection, invariants=kept))
         self._take_stepping(stepping)
         if self.h is None and stepping.first_step is None:
-            stepping.require_scale(start)
-        self._scipy = self._scipy_solver(start, bool(kept) or bool(projection.compensated))
+            stepping.require_scale(start[:n])
+        self._scipy = self._scipy_solver(start, bool(kept) or bool(projection.compensated) or n < self.n)
         self.h_previous: float | None = None
         self.diagnostics = Diagnostics() if diagnostics is None else diagnostics
         begun = (None, None) if self._scipy is None else (self._scipy.f, float(self._scipy.h_abs or 0.0))
@@ -250,6 +253,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             jacobian=lambda: moved,
             level=True,
             hint=_by_name,
+            columns=self._COLUMNS,
         )
 
     def _start(self, y0: np.ndarray, f0: np.ndarray | None, tau: float | None, *, check: bool = True) -> None:

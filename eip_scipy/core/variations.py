@@ -21,7 +21,7 @@ from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off
 from .pointers import PointerFunction
 from .states import as_derivative
 
-__all__ = ["Columns", "StateSolution", "Variations", "asked_columns", "widened"]
+__all__ = ["Columns", "StateSolution", "Variations", "asked_columns", "require_tableau", "widened"]
 
 Array = np.ndarray
 STATE = "state"
@@ -79,6 +79,21 @@ class Columns:
         """Return those of a run that goes on from a wide state."""
         blocks = wide.reshape(1 + self.count, self.size)
         return Columns(blocks[1:].T.copy(), self.parameters, self.is_transition, self.symplectic)
+
+
+def require_tableau(method: Any) -> None:
+    """Refuse classes of methods that carry no columns.
+
+    Raises
+    ------
+    ValueError
+        For all but Runge-Kutta methods.
+    """
+    if method.TABLEAU.of_second_order or method.TABLEAU.in_python:
+        raise ValueError(
+            f"variations: {method.__name__} carries no derivatives: its steps are not stages of a Runge-Kutta tableau "
+            "over the whole state. Take EIPDOP853 or another Runge-Kutta method."
+        )
 
 
 def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], symplectic: bool) -> Columns:
@@ -201,15 +216,37 @@ class Variations:
         ValueError
             Where there is no way to the derivatives.
         """
-        if any(item.is_balance for item in invariants):
-            raise ValueError(
-                "variations: derivatives are not carried together with balances, whose values depend on the whole "
-                "orbit; leave the balances out of this run."
-            )
+        _refuse_balances(invariants)
         rhs, source = _right_hand_side(columns, fun, form, t0, y0, extra, jvp, own)
         compiled = is_compiled(rhs) and not jit_is_off()
         items = tuple(_wide(item, columns, t0, y0, extra, compiled) for item in invariants)
         return cls(columns, rhs, items, tuple(invariants), source)
+
+    @classmethod
+    def in_python(
+        cls, columns: Columns, fun: Any, t0: float, y0: Array, extra: tuple, items: Any, jvp: Any
+    ) -> Variations:
+        """Make them for a right-hand side ``fun(t, y, *extra)`` and invariants that have their arguments.
+
+        Raises
+        ------
+        ValueError
+            For derivatives by parameters, and as `of`.
+        """
+        if columns.parameters:
+            raise ValueError(
+                "variations: solve_ivp gives derivatives of the state alone; `integrate` by parameters too."
+            )
+        _refuse_balances(items)
+        rhs, source = _right_hand_side(columns, fun, "value", t0, y0, extra, jvp, None)
+        wide = tuple(_wide(item, columns, t0, y0, (), False) for item in items)
+        return cls(columns, rhs, wide, tuple(items), source)
+
+    def derivative(self, t: float, Y: Array, *extra: Any) -> Array:
+        """Return the derivative of the wide state."""
+        out = np.empty_like(Y)
+        self.rhs(t, Y, out, *extra)
+        return out
 
     def with_targets(self, wide: tuple[Invariant, ...]) -> tuple[Invariant, ...]:
         """Return the invariants as functions of the state, with the targets of those of the wide state."""
@@ -236,6 +273,14 @@ class Variations:
             if hasattr(fun, name):
                 setattr(wide, name, getattr(fun, name))
         return wide
+
+
+def _refuse_balances(items: Any) -> None:
+    if any(item.is_balance for item in items):
+        raise ValueError(
+            "variations: derivatives are not carried together with balances, whose values depend on the whole orbit; "
+            "omit the balances in this run."
+        )
 
 
 def _right_hand_side(

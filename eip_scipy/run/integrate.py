@@ -431,7 +431,8 @@ class Loop:
         for row in range(first_row, driver.rows):
             t, y = float(driver.t[row]), driver.y[row].copy()
             invariants = driver.run.invariants
-            if self.callback(t, y[: self.prepared.n], invariants.values(t, y) - invariants.fixed_target):
+            own = y if self.prepared.variations is None else y[: self.prepared.n].copy()
+            if self.callback(t, own, invariants.values(t, y) - invariants.fixed_target):
                 driver.schedule.place[ROW] = row + 1
                 return True
         return False

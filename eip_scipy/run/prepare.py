@@ -26,7 +26,7 @@ from ..core.runs import Counted, Run
 from ..core.solvers import EIPSolver, class_named, eip_method
 from ..core.states import as_derivative, initial_state
 from ..core.stepping import ATOL, StepOptions, Stepping, interval
-from ..core.variations import Variations, asked_columns
+from ..core.variations import Variations, asked_columns, require_tableau
 from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
 from .driver import check_memory, saved_rows
@@ -366,12 +366,7 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
         if request.jvp is not None or request.symplectic is not None:
             raise TypeError("jvp and symplectic belong to variations=...; ask for derivatives, or leave them out.")
         return None
-    method = request.method.TABLEAU
-    if method.of_second_order or method.in_python:
-        raise ValueError(
-            f"variations: {request.method.__name__} carries no derivatives: its steps are no stages of a Runge-Kutta "
-            "tableau over the whole state. Take EIPDOP853 or another Runge-Kutta method."
-        )
+    require_tableau(request.method)
     y0 = _state(request.y0)
     problem = given if isinstance(given, Problem) else None
     extra = extra_arguments(request.args, request.params)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack, cast
 
 import numpy as np
 import scipy.integrate
@@ -18,6 +18,8 @@ from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projecti
 from ..core.results import Diagnostics
 from ..core.solvers import EIPDOP853, EIPRK23, EIPRK45, EIPSolver, SolverClass, class_named, eip_method
 from ..core.states import initial_state
+from ..core.stepping import interval
+from ..core.variations import StateSolution, Variations, asked_columns, require_tableau
 
 if TYPE_CHECKING:
     Result = dict[str, Any]
@@ -27,9 +29,10 @@ else:  # SciPy's class of results has no public name
 __all__ = ["OdeResult", "solve_ivp"]
 
 EXPLICIT = {"RK23": EIPRK23, "RK45": EIPRK45, "DOP853": EIPDOP853}
+NOTHING = np.zeros(0)
 IMPLICIT = ("Radau", "BDF", "LSODA")
 # Options of the EIP methods alone.
-OWN = {"h", "jacobian", "diagnostics", *ProjectionOptions.names()}
+OWN = {"h", "jacobian", "diagnostics", "variations", *ProjectionOptions.names()}
 
 
 class OdeResult(Result):
@@ -57,6 +60,8 @@ class OdeResult(Result):
         Whether no step failed and nothing contradicts the run, see `Diagnostics`.
     diagnostics : Diagnostics
         The record of the projections.
+    variations : ndarray, shape (m, n, k)
+        The columns of derivatives, of a run that was asked for them.
     """
 
     t: np.ndarray
@@ -72,6 +77,7 @@ class OdeResult(Result):
     success: bool
     trusted: bool
     diagnostics: Diagnostics
+    variations: np.ndarray
 
 
 @takes_projection_options
@@ -93,6 +99,8 @@ def solve_ivp(
     rtol: ArrayLike | None = None,
     atol: ArrayLike | None = None,
     jacobian: Callable[..., Any] | None = None,
+    variations: Any = None,
+    jvp: Callable[..., Any] | None = None,
     diagnostics: Diagnostics | None = None,
     jac: Any = None,
     jac_sparsity: Any = None,
@@ -132,6 +140,11 @@ def solve_ivp(
         As for the methods; by default their own.
     jacobian : callable, optional
         For `EIPGJ14`: ``jacobian(t, q, dq, out, *args)``.
+    variations : "state" or array_like, shape (n, k), optional
+        Derivatives of the state to carry along: all n columns of the state-transition matrix, or initial columns; see
+        `integrate`, which also gives those by parameters. The result has them as ``variations``.
+    jvp : callable, optional
+        ``jvp(t, y, dy, *args) -> (n,)``, the Jacobian times dy.
     {names of ProjectionOptions}
         As for the methods, see `EIPSolver`.
     diagnostics : Diagnostics, optional
@@ -171,7 +184,7 @@ def solve_ivp(
     options: dict[str, Any] = {
         "h": h, "first_step": first_step, "max_step": max_step, "rtol": rtol, "atol": atol, "jacobian": jacobian,
         "diagnostics": diagnostics, "jac": jac, "jac_sparsity": jac_sparsity, "lband": lband, "uband": uband,
-        "min_step": min_step,
+        "min_step": min_step, "variations": variations,
     }  # fmt: skip
     options = {name: value for name, value in options.items() if value is not None} | dict(projection)
     kept = as_invariants(options.pop("invariants", ()))
@@ -192,15 +205,57 @@ def solve_ivp(
     if jacobian is not None and extra:
         options["jacobian"] = lambda *first: jacobian(*first, *extra)
     record = options.setdefault("diagnostics", Diagnostics())
+    wide = None
+    if options.pop("variations", None) is not None:
+        wide = _variations(method, function, t_span, y0, variations, extra, options.get("invariants", ()), jvp)
+        method, function, y0 = _carrying(method, wide), wide.derivative, wide.columns.wide(initial_state(y0), NOTHING)
+        options["invariants"], common["events"] = wide.invariants, _events(wide, events)
+    elif jvp is not None:
+        raise TypeError("solve_ivp: jvp belongs to variations=...; ask for derivatives, or omit it.")
     start = initial_state(y0) if options.get("project_initial") else None
-    noting, solvers = _noting(method, start)
+    noting, solvers = _noting(cast(type[EIPSolver], method), start)
     sol = scipy.integrate.solve_ivp(
         function, t_span, y0 if start is None else start, method=noting, **common, **options
     )
+    if wide is not None:
+        _split(sol, wide)
     if sol.status == 1:  # SciPy does not tell the solver that its run has ended
         solvers[0]._watch(ended=True)
     message = "; ".join(filter(None, (sol.message, record.moved, record.message)))
     return OdeResult(sol, message=message, trusted=bool(sol.success) and record.trusted, diagnostics=record)
+
+
+def _variations(
+    method: type[EIPSolver], fun: Any, t_span: Any, y0: Any, asked: Any, extra: tuple, items: Any, jvp: Any
+) -> Variations:
+    """Return the functions of the state with its columns."""
+    require_tableau(method)
+    start = initial_state(y0)
+    columns = asked_columns(asked, start, NOTHING, (), False)
+    return Variations.in_python(columns, fun, interval(t_span)[0], start, extra, as_invariants(items), jvp)
+
+
+def _carrying(method: type[EIPSolver], wide: Variations) -> Any:
+    """Return the class for states with these columns behind them."""
+    return SolverClass(method.__name__, (method,), {"_COLUMNS": wide.columns, "__doc__": method.__doc__})
+
+
+def _events(wide: Variations, events: Any) -> Any:
+    """Return events as functions of the wide state."""
+    if events is None:
+        return None
+    return [wide.event(event) for event in ((events,) if callable(events) else events)]
+
+
+def _split(sol: Any, wide: Variations) -> None:
+    """Give a result the state and the columns apart."""
+    n = wide.columns.n
+    sol.y, sol.variations = wide.columns.apart(sol.y.T)
+    sol.y = sol.y.T
+    if sol.y_events is not None:
+        sol.y_events = [rows[:, :n] if rows.size else rows for rows in sol.y_events]
+    if sol.sol is not None:
+        sol.sol = StateSolution(sol.sol, n)
 
 
 def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:
@@ -229,7 +284,7 @@ def _with_projection(method: Any, given: list[str]) -> Any:
         return EXPLICIT[method]
     if is_class and hasattr(method, "A"):
         return eip_method(method)
-    if refused := [name for name in given if name in ProjectionOptions.names()]:
+    if refused := [name for name in given if name in ("variations", *ProjectionOptions.names())]:
         raise TypeError(
             f"solve_ivp: the method {getattr(method, '__name__', method)} takes no {', '.join(refused)}; give an EIP "
             "method such as EIPDOP853, or omit these options."

@@ -99,10 +99,12 @@ inline double block_norm(const double *a, const double *minus, int64_t b, const 
     return norm(w.move, count);
 }
 
-// Weights sigma, at most 1, from a weight of each block; 1 if all of them are 0.
+// Weights sigma, at most 1, from a weight of each block; 1 if all of them are 0. What is in no block, such as columns of
+// derivatives, does not move.
 template <typename WeightOf>
 inline void weigh_blocks(double *sigma, const Blocks &blocks, const Work &w, WeightOf weight_of) {
     double largest_weight = 0.0;
+    if (blocks.members < w.m) fill(sigma, 0.0, w.m);
     for (int64_t b = 0; b < blocks.count; ++b) {
         const double weight = weight_of(b);
         for (uint64_t p = blocks.start[b]; p < blocks.start[b + 1]; ++p) sigma[blocks.member[p]] = weight;

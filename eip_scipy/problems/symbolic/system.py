@@ -381,7 +381,7 @@ def _problem(*, system: System, params: np.ndarray | None, **others: Any) -> Sym
     unset: dict[str, Any] = {"y0": None, "t_span": None}  # a run is given them
     unset["component_names"] = system.components
     # Of a perturbed system it is not known whether what is added is friction.
-    unset["canonical"] = 2 * len(others["pairs"]) == len(system.components) and not system.balances
+    unset["canonical"] = 2 * len(others.get("pairs", ())) == len(system.components) and not system.balances
     return SymbolicProblem(
         **(unset | others),
         system=system,
