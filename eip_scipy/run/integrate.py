@@ -205,36 +205,9 @@ def integrate(
     >>> run.y.shape, bool((run.max_defect < 1e-11).all())
     ((4, 68), True)
     """
+    asked = dict(locals())  # by the names of the request, whose defaults are these
     _check_names(projection)
-    request = Request(
-        fun=fun,
-        acceleration=acceleration,
-        t_span=t_span,
-        y0=y0,
-        method=method,
-        h=h,
-        args=args,
-        params=params,
-        in_place=in_place,
-        jacobian=jacobian,
-        variations=variations,
-        jvp=jvp,
-        symplectic=symplectic,
-        save_every=save_every,
-        t_eval=t_eval,
-        events=events,
-        dense_output=dense_output,
-        callback=callback,
-        progress=progress,
-        compiled=compiled,
-        max_bytes=max_bytes,
-        diagnostics=diagnostics,
-        rtol=rtol,
-        atol=atol,
-        first_step=first_step,
-        max_step=max_step,
-        projection=projection,
-    )
+    request = Request(**{item.name: asked[item.name] for item in fields(Request)})
     keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
     with kept_ctrl_c(), ended_by_sigterm(checkpoint is not None), keeping as keeper, _start_kept(request):
         return Loop(prepared(request), keeper).run()

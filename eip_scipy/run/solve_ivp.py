@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Unpack, cast
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import scipy.integrate
@@ -32,7 +32,7 @@ EXPLICIT = {"RK23": EIPRK23, "RK45": EIPRK45, "DOP853": EIPDOP853}
 NOTHING = np.zeros(0)
 IMPLICIT = ("Radau", "BDF", "LSODA")
 # Options of the EIP methods alone.
-OWN = {"h", "jacobian", "diagnostics", "variations", *ProjectionOptions.names()}
+OWN = {"h", "jacobian", "diagnostics", "variations", "jvp", *ProjectionOptions.names()}
 
 
 class OdeResult(Result):
@@ -184,7 +184,7 @@ def solve_ivp(
     options: dict[str, Any] = {
         "h": h, "first_step": first_step, "max_step": max_step, "rtol": rtol, "atol": atol, "jacobian": jacobian,
         "diagnostics": diagnostics, "jac": jac, "jac_sparsity": jac_sparsity, "lband": lband, "uband": uband,
-        "min_step": min_step, "variations": variations,
+        "min_step": min_step, "variations": variations, "jvp": jvp,
     }  # fmt: skip
     options = {name: value for name, value in options.items() if value is not None} | dict(projection)
     kept = as_invariants(options.pop("invariants", ()))
@@ -196,24 +196,33 @@ def solve_ivp(
     if not (isinstance(method, type) and issubclass(method, EIPSolver)):
         sol = scipy.integrate.solve_ivp(function, t_span, y0, method=method, **common, **options)
         return OdeResult(sol, trusted=bool(sol.success), diagnostics=Diagnostics())
-    common["args"], extra = _unpacked(args)
-    if kept and extra:
+    return _solve(method, function, t_span, y0, common, options)
+
+
+def _solve(
+    method: type[EIPSolver], function: Any, t_span: Any, y0: Any, common: dict[str, Any], options: dict[str, Any]
+) -> OdeResult:
+    """Return the run by an EIP method; `common`: the options that SciPy's function takes itself."""
+    common["args"], extra = _unpacked(common["args"])
+    variations, jvp = options.pop("variations", None), options.pop("jvp", None)
+    if "invariants" in options and extra:
         # The arguments of the call follow those of an invariant, unless both are the same.
         options["invariants"] = tuple(
-            item if are_same(item.args, extra) else with_args(item, (*item.args, *extra)) for item in kept
+            item if are_same(item.args, extra) else with_args(item, (*item.args, *extra))
+            for item in options["invariants"]
         )
-    if jacobian is not None and extra:
+    if (jacobian := options.get("jacobian")) is not None and extra:
         options["jacobian"] = lambda *first: jacobian(*first, *extra)
     record = options.setdefault("diagnostics", Diagnostics())
     wide = None
-    if options.pop("variations", None) is not None:
+    if variations is not None:
         wide = _variations(method, function, t_span, y0, variations, extra, options.get("invariants", ()), jvp)
         method, function, y0 = _carrying(method, wide), wide.derivative, wide.columns.wide(initial_state(y0), NOTHING)
-        options["invariants"], common["events"] = wide.invariants, _events(wide, events)
+        options["invariants"], common["events"] = wide.invariants, _events(wide, common["events"])
     elif jvp is not None:
         raise TypeError("solve_ivp: jvp belongs to variations=...; ask for derivatives, or omit it.")
     start = initial_state(y0) if options.get("project_initial") else None
-    noting, solvers = _noting(cast(type[EIPSolver], method), start)
+    noting, solvers = _noting(method, start)
     sol = scipy.integrate.solve_ivp(
         function, t_span, y0 if start is None else start, method=noting, **common, **options
     )
@@ -284,7 +293,7 @@ def _with_projection(method: Any, given: list[str]) -> Any:
         return EXPLICIT[method]
     if is_class and hasattr(method, "A"):
         return eip_method(method)
-    if refused := [name for name in given if name in ("variations", *ProjectionOptions.names())]:
+    if refused := [name for name in given if name in ("variations", "jvp", *ProjectionOptions.names())]:
         raise TypeError(
             f"solve_ivp: the method {getattr(method, '__name__', method)} takes no {', '.join(refused)}; give an EIP "
             "method such as EIPDOP853, or omit these options."
