@@ -429,6 +429,10 @@ for _function in (operator.pow, operator.ipow, math.pow, np.power):
     _overload(_function, prefer_literal=True)(_power)
 
 
+def _is_array(kind: Any, *ndims: int) -> bool:
+    return isinstance(kind, types.Array) and kind.ndim in ndims and isinstance(kind.dtype, Dual | PLAIN)
+
+
 def _define_for_arrays(function: Any) -> None:
     """Type an expression of arrays; Numba turns it into a loop over its scalars, which are typed above."""
 
@@ -438,7 +442,7 @@ def _define_for_arrays(function: Any) -> None:
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
             found = [a for a in args if isinstance(a, types.Array)]
             kinds = [a.dtype if isinstance(a, types.Array) else a for a in args]
-            if not found or not _is_dual(*kinds):
+            if not found or not _is_dual(*kinds) or any(isinstance(a, Dual) for a in args):
                 return None
             dual = next(k for k in kinds if isinstance(k, Dual))
             return signature(types.Array(dual, max(a.ndim for a in found), "C"), *args)
@@ -455,8 +459,43 @@ for _function in ARRAY_FUNCTIONS:
     _define_for_arrays(_function)
 
 
-def _is_array(kind: Any, *ndims: int) -> bool:
-    return isinstance(kind, types.Array) and kind.ndim in ndims and isinstance(kind.dtype, Dual | PLAIN)
+def _define_with_scalar(function: Any) -> None:
+    """Write the loops of an expression of an array and one dual, which Numba's expressions do not take."""
+
+    def typed(x, y):
+        of_first = _is_array(x, 1, 2) and isinstance(y, Dual)
+        if not of_first and not (isinstance(x, Dual) and _is_array(y, 1, 2)):
+            return None
+        dual = y if of_first else x
+
+        def array_and_dual(x, y):
+            out = np.empty(x.shape, dual)
+            for place in np.ndindex(x.shape):
+                out[place] = function(x[place], y)
+            return out
+
+        def dual_and_array(x, y):
+            out = np.empty(y.shape, dual)
+            for place in np.ndindex(y.shape):
+                out[place] = function(x, y[place])
+            return out
+
+        return array_and_dual if of_first else dual_and_array
+
+    _overload(function)(typed)
+
+
+for _function in (
+    operator.add,
+    operator.sub,
+    operator.mul,
+    operator.truediv,
+    np.add,
+    np.subtract,
+    np.multiply,
+    np.divide,
+):
+    _define_with_scalar(_function)
 
 
 def _are_arrays_of_duals(*kinds: Any) -> bool:

@@ -12,7 +12,15 @@ from .dual_arrays import for_duals, inside
 from .dual_numbers import Dual, put_slope, seed, slope, value_of
 from .jitted_gradients import LANES, compiled_for, gradient_by_duals, new_state
 
-__all__ = ["parameter_gradient", "rhs_by_duals", "rhs_by_products", "rhs_by_variational", "wide_gradient", "wide_value"]
+__all__ = [
+    "parameter_gradient",
+    "rhs_by_duals",
+    "rhs_by_products",
+    "rhs_by_variational",
+    "rhs_in_halves",
+    "wide_gradient",
+    "wide_value",
+]
 
 # A state with columns is (y, p, first column, second column, ...): the parameters p that derivatives are taken by stand
 # behind the n components as constants, so that each column has size = n + len(p) numbers.
@@ -149,10 +157,44 @@ def rhs_by_variational(rhs: Any, n: int, parameters: int, columns: int) -> Any:
 
 
 @lru_cache(maxsize=256)
-def wide_value(fun: Any, n: int, parameters: tuple[int, ...] = ()) -> Any:
-    """A function of the first n components of a state, with these parameters from behind them."""
+def rhs_in_halves(rhs: Any, half: int, columns: int) -> Any:
+    """The right-hand side of a Nystrom method's wide state: all positions first, then all velocities."""
+    blocks = 1 + columns
+
+    def rearranged(t, Y, out, *extra):
+        packed, found = np.empty(Y.size), np.empty(Y.size)
+        for c in range(blocks):
+            packed[2 * half * c : half * (2 * c + 1)] = Y[half * c : half * (c + 1)]
+            packed[half * (2 * c + 1) : 2 * half * (c + 1)] = Y[half * (blocks + c) : half * (blocks + c + 1)]
+        rhs(t, packed, found, *extra)
+        for c in range(blocks):
+            out[half * c : half * (c + 1)] = found[2 * half * c : half * (2 * c + 1)]
+            out[half * (blocks + c) : half * (blocks + c + 1)] = found[half * (2 * c + 1) : 2 * half * (c + 1)]
+
+    return njit(rearranged)
+
+
+def _state_of(layout: tuple[int, int, int]) -> Any:
+    """Return a function that takes the state out of a wide one, see `variations.layout`."""
+    n, first, second = layout
+    if first == n:
+        return inside(lambda Y: Y[:n])
+
+    def state(Y):
+        y = np.empty(n)
+        y[:first] = Y[:first]
+        y[first:] = Y[second : second + n - first]
+        return y
+
+    return inside(state)
+
+
+@lru_cache(maxsize=256)
+def wide_value(fun: Any, layout: tuple[int, int, int], parameters: tuple[int, ...] = ()) -> Any:
+    """A function of the state in a wide one, with these parameters from behind it."""
+    state, n = _state_of(layout), layout[0]
     if not parameters:
-        return njit(lambda t, Y, *extra: fun(t, Y[:n], *extra))
+        return njit(lambda t, Y, *extra: fun(t, state(Y), *extra))
     places = np.array(parameters, np.int64)
     return njit(lambda t, Y, params: fun(t, Y[:n], _from_state(Y, params, n, places)))
 
@@ -169,7 +211,7 @@ def _from_state(Y, params, n, places):
 def wide_gradient(
     grad: Any,
     by_parameters: Any,
-    n: int,
+    layout: tuple[int, int, int],
     parameters: tuple[int, ...],
     shape: tuple[int, ...],
     takes_f: bool,
@@ -179,6 +221,7 @@ def wide_gradient(
 
     `shape`: that of the invariant's value. `takes_f`, `in_place`: how `grad` is called; the result takes f likewise.
     """
+    (n, first, second), state = layout, _state_of(layout)
     places, sizes = np.array(parameters, np.int64), (*shape, n)
     if not in_place:
         returned = grad
@@ -197,20 +240,22 @@ def wide_gradient(
         def with_f(t, Y, f, out, *extra):
             found = np.empty(sizes)
             arguments = own(Y, extra)
-            grad(t, Y[:n], f[:n], found, *arguments)
+            grad(t, state(Y), state(f), found, *arguments)
             out[:] = 0.0
-            out[..., :n] = found
-            behind(t, Y[:n], out, arguments)
+            out[..., :first] = found[..., :first]
+            out[..., second : second + n - first] = found[..., first:]
+            behind(t, state(Y), out, arguments)
 
         return njit(with_f)
 
     def without_f(t, Y, out, *extra):
         found = np.empty(sizes)
         arguments = own(Y, extra)
-        grad(t, Y[:n], found, *arguments)
+        grad(t, state(Y), found, *arguments)
         out[:] = 0.0
-        out[..., :n] = found
-        behind(t, Y[:n], out, arguments)
+        out[..., :first] = found[..., :first]
+        out[..., second : second + n - first] = found[..., first:]
+        behind(t, state(Y), out, arguments)
 
     return njit(without_f)
 

@@ -126,20 +126,27 @@ class RunSpec:
 
     def _first_step(self, method: AnyMethod, y0: Array, f0: Array) -> float:
         """Return the length of the first step, which columns of derivatives do not change."""
-        if self.columns is None:
+        columns = self.columns
+        if columns is None:
             return self.stepping.first(self.rhs, y0, f0, method)
-        n, behind = self.columns.n, y0[self.columns.n :]
-        return self.stepping.first(lambda t, y: self.rhs(t, np.concatenate([y, behind]))[:n], y0[:n], f0[:n], method)
+
+        def derivative(t: float, y: Array) -> Array:
+            wide = y0.copy()
+            wide[columns.places] = y
+            return columns.own(self.rhs(t, wide))
+
+        return self.stepping.first(derivative, columns.own(y0), columns.own(f0), method)
 
     def _with_buffers(self, method: AnyMethod, start: Start, tell: bool) -> Run:
         """Return a run whose invariants have been evaluated at the start; `tell`: see `InvariantSet`."""
         t_bound, projection = self.stepping.span.t_bound, self.projection
         invariants = InvariantSet(projection.invariants, *start, self.extra, tell=tell, t_bound=t_bound, rhs=self.rhs)
-        n = start.y.size if self.columns is None else self.columns.n
-        options, sigma, identity = projection.settled(method, self.stepping, start.y[:n], invariants)
-        options = options._replace(kinds=kinds_of(options.groups, start.y[:n], start.f[:n]))
-        if self.columns is not None:
-            options, sigma = widened(options, sigma, self.columns, invariants.gradients(*start[:3]))
+        columns = self.columns
+        y, f = start[1:3] if columns is None else map(columns.own, start[1:3])
+        options, sigma, identity = projection.settled(method, self.stepping, y, invariants)
+        options = options._replace(kinds=kinds_of(options.groups, y, f))
+        if columns is not None:
+            options, sigma = widened(options, sigma, columns, invariants.gradients(*start[:3]))
         invariants.kinds = options.kinds
         arrays = steppers.arrays(method)
         carried, blocks = options.balances.place, options.groups.start.size - 1

@@ -205,7 +205,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._spec = self._specified(stepping, replace(projection, invariants=kept))
         self._take_stepping(stepping)
         if self.h is None and stepping.first_step is None:
-            stepping.require_scale(start[:n])
+            stepping.require_scale(start if self._COLUMNS is None else self._COLUMNS.own(start))
         self._scipy = self._scipy_solver(start, bool(kept) or bool(projection.compensated) or n < self.n)
         self.h_previous: float | None = None
         self.diagnostics = Diagnostics() if diagnostics is None else diagnostics

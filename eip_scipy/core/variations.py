@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from ..engine.data import EUCLIDEAN, GIVEN
 from ..engine.data import Columns as KeptColumns
 from ..engine.native import LibraryFunction
 from .arguments import scalars
-from .gradients import COMPLEX_STEP, NumericalGradient, difference_gradient, typical_sizes
+from .blocks import INDEX
+from .gradients import NumericalGradient, difference_gradient, typical_sizes
 from .inputs import filled, reals, shown
 from .invariants import Invariant
 from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off
@@ -27,6 +29,7 @@ Array = np.ndarray
 STATE = "state"
 # How far a complex step may be from a difference, relative to the largest component: that of differences of order 6.
 AGREES = 1e-6
+SHIFT = 332  # binary digits of a complex step, relative to its direction
 LEAST = 1e-3  # size of a parameter that is 0, for differences
 
 
@@ -44,12 +47,16 @@ class Columns:
         Whether the first n columns are those of the state-transition matrix from the start of the first run.
     symplectic : bool
         Whether these are kept symplectic.
+    in_halves : bool
+        Whether the wide state has all positions first and then all velocities, as Nystrom methods take it; otherwise
+        one column follows the other.
     """
 
     values: Array
     parameters: tuple[int, ...]
     is_transition: bool
     symplectic: bool
+    in_halves: bool = False
 
     @property
     def n(self) -> int:
@@ -66,19 +73,43 @@ class Columns:
         """Return the number of columns."""
         return self.values.shape[1]
 
+    @property
+    def half(self) -> int:
+        """Return the number of positions of a Nystrom method, otherwise 0."""
+        return self.n // 2 if self.in_halves else 0
+
+    @cached_property
+    def order(self) -> Array:
+        """Return the places in the wide state of the state and the columns, (1 + k, n + p)."""
+        places = np.arange(self.size * (1 + self.count))
+        if not self.in_halves:
+            return places.reshape(1 + self.count, self.size)
+        return np.concatenate(places.reshape(2, 1 + self.count, self.half), axis=1)
+
+    @cached_property
+    def places(self) -> Array | slice:
+        """Return the places of the state in the wide state."""
+        return self.order[0] if self.in_halves else slice(self.n)
+
     def wide(self, y: Array, params: Array) -> Array:
         """Return the state with its columns."""
-        return np.concatenate([y, params[list(self.parameters)], self.values.T.ravel()])
+        out = np.empty(self.order.size)
+        out[self.order[0]] = np.concatenate([y, params[list(self.parameters)]])
+        out[self.order[1:]] = self.values.T
+        return out
+
+    def own(self, rows: Array) -> Array:
+        """Return the states (..., n) of wide states (..., m), as copies."""
+        return np.array(rows[..., self.places])
 
     def apart(self, rows: Array) -> tuple[Array, Array]:
         """Return states (m, n) and columns (m, n, k) of wide states (m, ...)."""
-        blocks = rows.reshape(len(rows), 1 + self.count, self.size)
+        blocks = rows[:, self.order]
         return blocks[:, 0, : self.n], blocks[:, 1:, : self.n].transpose(0, 2, 1)
 
     def after(self, wide: Array) -> Columns:
         """Return those of a run that goes on from a wide state."""
-        blocks = wide.reshape(1 + self.count, self.size)
-        return Columns(blocks[1:].T.copy(), self.parameters, self.is_transition, self.symplectic)
+        return replace(self, values=wide[self.order[1:]].T.copy())
 
 
 def require_tableau(method: Any) -> None:
@@ -87,16 +118,18 @@ def require_tableau(method: Any) -> None:
     Raises
     ------
     ValueError
-        For all but Runge-Kutta methods.
+        For all but Runge-Kutta and Nystrom methods.
     """
-    if method.TABLEAU.of_second_order or method.TABLEAU.in_python:
+    if method.TABLEAU.has_history or method.TABLEAU.in_python:
         raise ValueError(
-            f"variations: {method.__name__} carries no derivatives: its steps are not stages of a Runge-Kutta tableau "
-            "over the whole state. Take EIPDOP853 or another Runge-Kutta method."
+            f"variations: {method.__name__} carries no derivatives: its steps are not the stages of a tableau. Take "
+            "EIPDOP853, EIPRKN12 or another Runge-Kutta or Nystrom method."
         )
 
 
-def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], symplectic: bool) -> Columns:
+def asked_columns(
+    asked: Any, y0: Array, params: Array, names: Sequence[str], symplectic: bool, in_halves: bool
+) -> Columns:
     """The columns that the option `variations` asks for.
 
     Raises
@@ -105,13 +138,15 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], sy
         For anything else than the option's documentation says, a complex state, or parameters that a run lacks.
     """
     if isinstance(asked, Columns):
-        return asked
+        return replace(asked, in_halves=in_halves)
     n = y0.size
     if y0.dtype.kind == "c":
         raise ValueError("variations: the state is complex; write it in real and imaginary parts.")
     items = [asked] if isinstance(asked, str) else asked
     if isinstance(items, list | tuple) and items and all(isinstance(item, str | int | np.integer) for item in items):
         own = [_parameter(item, params, names) for item in items if item != STATE]
+        if own and in_halves:
+            raise ValueError("variations: Nystrom methods give no derivatives by parameters; take EIPDOP853.")
         if len(set(own)) < len(own):
             raise ValueError(f"variations: {shown(asked)} names a parameter twice.")
         has_state, p = STATE in items, len(own)
@@ -119,7 +154,7 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], sy
         if has_state:
             identity[:n, :n] = np.eye(n)
         identity[n:, n * has_state :] = np.eye(p)
-        return Columns(identity, tuple(own), has_state, symplectic and has_state and p == 0)
+        return Columns(identity, tuple(own), has_state, symplectic and has_state and p == 0, in_halves)
     found = reals(asked)
     values: Array = np.zeros(0) if found is None else np.array(found, float)
     if values.ndim == 1 and values.size == n:
@@ -129,7 +164,7 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], sy
             f'variations must be "state" for all {n} columns of the state-transition matrix, names or places of '
             f"parameters, a list of these, or an array ({n}, k) of finite initial columns, got {shown(asked)}."
         )
-    return Columns(values, (), False, False)
+    return Columns(values, (), False, False, in_halves)
 
 
 def _parameter(item: Any, params: Array, names: Sequence[str]) -> int:
@@ -145,33 +180,42 @@ def _parameter(item: Any, params: Array, names: Sequence[str]) -> int:
 
 def widened(options: Any, sigma: Array | None, columns: Columns, G: Array) -> tuple[Any, Array]:
     """Return the options and weights of a state for the same with columns behind it; `G`: gradients at the start."""
-    n, m = columns.n, columns.size * (1 + columns.count)
-    behind = np.zeros(m - n)
-    weights = np.concatenate([np.ones(n) if sigma is None else sigma, behind])
-    metric = GIVEN if options.metric == EUCLIDEAN and columns.parameters else options.metric
-    # What is done with blocks of one size, and with a frame of bodies, goes over all of a state.
-    groups, kinds = options.groups._replace(size=0), options.kinds._replace(size=0)
+    n, places = columns.n, columns.order[0]
+
+    def spread(values: Array | float) -> Array:
+        wide = np.zeros(columns.order.size)
+        wide[columns.places] = values
+        return wide
+
+    def members(blocks: Any) -> Any:
+        # What is done with blocks of one size goes over all of a state.
+        return blocks._replace(member=places[blocks.member.astype(np.intp)].astype(INDEX), size=0)
+
+    frame = options.frame
     kept = KeptColumns(
-        kept=np.ascontiguousarray(G[:, : columns.size] @ columns.values),
-        size=columns.size, seen=n, symplectic=columns.symplectic,
+        kept=np.ascontiguousarray(G[:, places] @ columns.values),
+        size=columns.size, seen=n, half=columns.half, symplectic=columns.symplectic,
     )  # fmt: skip
     options = options._replace(
-        rtol=np.concatenate([options.rtol, behind]), atol=np.concatenate([options.atol, behind]), groups=groups,
-        kinds=kinds, frame=options.frame._replace(bodies=np.zeros((2, 0, 0))), metric=metric, columns=kept, joint=None,
+        rtol=spread(options.rtol), atol=spread(options.atol), groups=members(options.groups),
+        kinds=members(options.kinds), columns=kept, joint=None,
+        metric=GIVEN if options.metric == EUCLIDEAN and columns.parameters else options.metric,
+        # Likewise what is done with a frame of bodies.
+        frame=frame._replace(bodies=np.zeros((2, 0, 0)), place=places[frame.place.astype(np.intp)].astype(INDEX)),
     )  # fmt: skip
-    return options, weights
+    return options, spread(1.0 if sigma is None else sigma)
 
 
 class StateSolution(OdeSolution):
     """The state alone, of a solution that has columns of derivatives behind it."""
 
-    def __init__(self, solution: OdeSolution, n: int) -> None:
+    def __init__(self, solution: OdeSolution, columns: Columns) -> None:
         super().__init__(solution.ts, solution.interpolants)
-        self._n = n
+        self._columns = columns
 
     def __call__(self, t: Any) -> Array:
         """Return the states (n,) or (n, m)."""
-        return super().__call__(t)[: self._n]
+        return self._columns.own(super().__call__(t).T).T
 
 
 @dataclass(frozen=True)
@@ -218,6 +262,7 @@ class Variations:
         """
         _refuse_balances(invariants)
         rhs, source = _right_hand_side(columns, fun, form, t0, y0, extra, jvp, own)
+        rhs = _rearranged(rhs, columns)
         compiled = is_compiled(rhs) and not jit_is_off()
         items = tuple(_wide(item, columns, t0, y0, extra, compiled) for item in invariants)
         return cls(columns, rhs, items, tuple(invariants), source)
@@ -239,6 +284,7 @@ class Variations:
             )
         _refuse_balances(items)
         rhs, source = _right_hand_side(columns, fun, "value", t0, y0, extra, jvp, None)
+        rhs = _rearranged(rhs, columns)
         wide = tuple(_wide(item, columns, t0, y0, (), False) for item in items)
         return cls(columns, rhs, wide, tuple(items), source)
 
@@ -259,20 +305,26 @@ class Variations:
 
     def event(self, fun: Callable[..., Any]) -> Callable[..., Any]:
         """Return an event as a function of the wide state."""
-        n = self.columns.n
+        columns = self.columns
         if is_jitted(fun) and not jit_is_off() and is_compiled(self.rhs):
             from .jitted_columns import wide_value
 
-            wide = wide_value(fun, n)
+            wide = wide_value(fun, layout(columns))
         else:
 
             def wide(t: float, Y: Array, *extra: Any) -> Any:
-                return fun(t, Y[:n], *extra)
+                return fun(t, columns.own(Y), *extra)
 
         for name in ("terminal", "direction"):
             if hasattr(fun, name):
                 setattr(wide, name, getattr(fun, name))
         return wide
+
+
+def layout(columns: Columns) -> tuple[int, int, int]:
+    """Return where compiled functions find a state: n, the length of its first part, the place of the second."""
+    first = columns.half or columns.n
+    return columns.n, first, first * (1 + columns.count)
 
 
 def _refuse_balances(items: Any) -> None:
@@ -320,6 +372,24 @@ def _right_hand_side(
         else:
             return found, "dual numbers"
     return _by_complex_steps(columns, fun, form, t0, y0, extra), "complex step"
+
+
+def _rearranged(rhs: Callable[..., Any], columns: Columns) -> Callable[..., Any]:
+    """Return a right-hand side of states followed by their columns as one of the wide state."""
+    if not columns.in_halves:
+        return rhs
+    if is_compiled(rhs) and not jit_is_off():
+        from .jitted_columns import rhs_in_halves
+
+        return rhs_in_halves(rhs, columns.half, columns.count)
+    order = columns.order
+
+    def rearranged(t: float, Y: Array, out: Array, *extra: Any) -> None:
+        found = np.empty(order.size)
+        rhs(t, Y[order].ravel(), found, *extra)
+        out[order] = found.reshape(order.shape)
+
+    return rearranged
 
 
 def _spread(rhs: Callable[..., Any], columns: Columns) -> Callable[..., Any]:
@@ -375,7 +445,8 @@ def _by_complex_steps(columns: Columns, fun: Any, form: str, t0: float, y0: Arra
         size = max(np.abs(dy).max(initial=0.0), np.abs(dp).max(initial=0.0))
         if size == 0.0:
             return np.zeros(y.size)
-        step, arguments = COMPLEX_STEP / size, extra
+        # A power of two: the product has the same bits for any other length of the direction.
+        step, arguments = 2.0 ** -(SHIFT + np.frexp(size)[1]), extra
         if places:
             params = extra[0].astype(complex)
             params[places] += 1j * step * dp
@@ -421,7 +492,8 @@ class _WideInvariant:
     """An invariant as a function of the wide state, with its gradient, as Python calls them."""
 
     def __init__(self, item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple) -> None:
-        self.item, self.n, self.shape = item, columns.n, np.shape(item.function(t0, y0.copy(), *item.args, *extra))
+        self.item, self.columns = item, columns
+        self.shape = np.shape(item.function(t0, y0.copy(), *item.args, *extra))
         self.places = list(columns.parameters) if extra and not item.args else []
         gradient: Any = item.gradient
         self.args, self.in_place, self.uses_f = item.args, item.in_place, item.uses_f
@@ -434,32 +506,33 @@ class _WideInvariant:
 
     def value(self, t: float, Y: Array, *extra: Any) -> Any:
         """Return the value, with parameters from behind the state."""
-        return self.item.function(t, Y[: self.n].copy(), *self.item.args, *self._arguments(Y, extra))
+        return self.item.function(t, self.columns.own(Y), *self.item.args, *self._arguments(Y, extra))
 
     def gradient(self, t: float, Y: Array, *rest: Any) -> Array:
         """Return the gradient over the wide state; `rest` begins with f where it is used."""
-        n = self.n
-        first: tuple[Any, ...] = (t, Y[:n].copy())
+        own, places, n = self.columns.own, self.columns.places, self.columns.n
+        first: tuple[Any, ...] = (t, own(Y))
         if self.uses_f:
-            first, rest = (*first, rest[0][:n].copy()), rest[1:]
+            first, rest = (*first, own(rest[0])), rest[1:]
         extra = self._arguments(Y, rest)
         out = np.zeros((*self.shape, Y.size))
         if self.in_place:
             shape = (*self.shape, n)
-            out[..., :n] = filled(
+            out[..., places] = filled(
                 lambda part: self.own_gradient(*first, part, *self.args, *extra), shape, Y.dtype, "gradient", t
             )
         else:
-            out[..., :n] = self.own_gradient(*first, *self.args, *extra)
+            out[..., places] = self.own_gradient(*first, *self.args, *extra)
         if self.places:
-            out[..., n : n + len(self.places)] = self._by_parameters(t, Y[:n], extra[0])
+            out[..., n : n + len(self.places)] = self._by_parameters(t, own(Y), extra[0])
         return out
 
     def _arguments(self, Y: Array, extra: tuple) -> tuple:
         if not self.places:
             return extra
         params = extra[0].copy()
-        params[self.places] = Y[self.n : self.n + len(self.places)]
+        n = self.columns.n
+        params[self.places] = Y[n : n + len(self.places)]
         return (params,)
 
     def _by_parameters(self, t: float, y: Array, params: Array) -> Array:
@@ -495,15 +568,15 @@ def _jitted(found: Invariant, item: Invariant, wide: _WideInvariant, extra: tupl
     from .jitted_columns import parameter_gradient, wide_gradient, wide_value
     from .jitted_gradients import gradient_by_duals
 
-    n, parameters = wide.n, tuple(wide.places)
+    columns, parameters = wide.columns, tuple(wide.places)
     gradient, in_place = item.gradient, item.in_place
     if gradient is None:
-        gradient = gradient_by_duals(item.function, n, wide.shape, bool(extra), scalars(extra) or "")
+        gradient = gradient_by_duals(item.function, columns.n, wide.shape, bool(extra), scalars(extra) or "")
         in_place = True
     if not is_compiled(gradient) or (parameters and not is_jitted(item.function)):
         raise NotCompilableError("one of its functions is not compiled")
     by = parameter_gradient(item.function, extra[0].size, wide.shape) if parameters else None
-    found.function = wide_value(item.function, n, parameters)
-    found.gradient = wide_gradient(gradient, by, n, parameters, wide.shape, item.uses_f, in_place)
+    found.function = wide_value(item.function, layout(columns), parameters)
+    found.gradient = wide_gradient(gradient, by, layout(columns), parameters, wide.shape, item.uses_f, in_place)
     found.in_place = True
     return found

@@ -464,6 +464,7 @@ class Columns(NamedTuple):
     kept: numpy.typing.NDArray[numpy.float64]
     size: int
     seen: int
+    half: int
     symplectic: bool
 
 class Options(NamedTuple):

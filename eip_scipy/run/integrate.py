@@ -404,8 +404,7 @@ class Loop:
         for row in range(first_row, driver.rows):
             t, y = float(driver.t[row]), driver.y[row].copy()
             invariants = driver.run.invariants
-            own = y if self.prepared.variations is None else y[: self.prepared.n].copy()
-            if self.callback(t, own, invariants.values(t, y) - invariants.fixed_target):
+            if self.callback(t, _own(y, self.prepared), invariants.values(t, y) - invariants.fixed_target):
                 driver.schedule.place[ROW] = row + 1
                 return True
         return False
@@ -417,7 +416,7 @@ class Loop:
         driver.note(values)
         result = IntegrationResult(
             t=driver.t[:rows],
-            y=driver.y[:rows, : self.prepared.n].T,
+            y=_own(driver.y[:rows], self.prepared).T,
             invariants=values,
             target=driver.run.invariants.fixed_target,
             max_defect=driver.run.work.max_defect,
@@ -449,7 +448,7 @@ class Loop:
             result["variations"] = columns.apart(driver.y[:rows])[1]
             result["columns"] = {"state": bool(columns.is_transition), "parameters": len(columns.parameters)}
             asked, kept = replace(asked, variations=columns.after(y)), variations.with_targets(kept)
-        origin = Origin(asked, t, y[: self.prepared.n].copy(), driver.schedule.span.sign, kept)
+        origin = Origin(asked, t, _own(y.copy(), self.prepared), driver.schedule.span.sign, kept)
         object.__setattr__(result, "_origin", origin)  # beside the fields, which are items
         return result
 
@@ -458,7 +457,7 @@ class Loop:
         found = self.driver.solution(self.events.last[0] if self._event_ended else self.driver.now[0])
         if found is None or self.prepared.variations is None:
             return found
-        return StateSolution(found, self.prepared.n)
+        return StateSolution(found, self.prepared.variations.columns)
 
     def explained(self, message: str) -> str:
         """With what speaks against the run, and what is to be said about checkpoints and not being compiled."""
@@ -482,7 +481,7 @@ class Loop:
 
 def _own(rows: np.ndarray, prepared: Prepared) -> np.ndarray:
     """The user's states of rows that may have columns of derivatives behind them."""
-    return rows if prepared.variations is None or rows.ndim < 2 else rows[:, : prepared.n]
+    return rows if prepared.variations is None or rows.size == 0 else prepared.variations.columns.own(rows)
 
 
 def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:

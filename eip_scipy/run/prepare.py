@@ -376,7 +376,12 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
     flag("symplectic", canonical if symplectic is None else symplectic)
     names = () if problem is None else tuple(problem.parameters)
     columns = asked_columns(
-        request.variations, y0, floats(extra), names, canonical if symplectic is None else bool(symplectic)
+        request.variations,
+        y0,
+        floats(extra),
+        names,
+        canonical if symplectic is None else bool(symplectic),
+        request.method.TABLEAU.of_second_order,
     )
     if projection.project_initial and columns.parameters:
         raise ValueError("variations: project_initial does not go with derivatives by parameters; project y0 first.")

@@ -240,7 +240,7 @@ def _variations(
     """Return the functions of the state with its columns."""
     require_tableau(method)
     start = initial_state(y0)
-    columns = asked_columns(asked, start, NOTHING, (), False)
+    columns = asked_columns(asked, start, NOTHING, (), False, method.TABLEAU.of_second_order)
     return Variations.in_python(columns, fun, interval(t_span)[0], start, extra, as_invariants(items), jvp)
 
 
@@ -258,13 +258,13 @@ def _events(wide: Variations, events: Any) -> Any:
 
 def _split(sol: Any, wide: Variations) -> None:
     """Give a result the state and the columns apart."""
-    n = wide.columns.n
-    sol.y, sol.variations = wide.columns.apart(sol.y.T)
+    columns = wide.columns
+    sol.y, sol.variations = columns.apart(sol.y.T)
     sol.y = sol.y.T
     if sol.y_events is not None:
-        sol.y_events = [rows[:, :n] if rows.size else rows for rows in sol.y_events]
+        sol.y_events = [columns.own(rows) if rows.size else rows for rows in sol.y_events]
     if sol.sol is not None:
-        sol.sol = StateSolution(sol.sol, n)
+        sol.sol = StateSolution(sol.sol, columns)
 
 
 def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:

@@ -163,7 +163,21 @@ def computed(fun, y, extra=()):
 
 
 # Each takes some seconds to compile: in the gate one of each kind.
-GATE = {"kepler_by_arrays", "exponentials", "hyperbolic", "branch_of_another_type", "array_filled_in_another_function"}
+@case(lambda a, b, c, d: (a / c - b / c + c * a + c - b * d / 2) ** 2)
+def arrays_and_a_number_that_varies(t, y):
+    q = y[:2]
+    one, two, three = -q / y[2], y[2] * q, y[2] - q * y[3] / 2.0
+    return (two[0] + three[1] + one[1] - one[0]) ** 2
+
+
+GATE = {
+    "arrays_and_a_number_that_varies",
+    "kepler_by_arrays",
+    "exponentials",
+    "hyperbolic",
+    "branch_of_another_type",
+    "array_filled_in_another_function",
+}
 NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
 NAMES = [name if name in GATE else pytest.param(name, marks=NIGHTLY) for name in FUNCTIONS]
 

@@ -2,40 +2,68 @@
 // with G the gradients at y(t): linear invariants of the variational equations.
 #pragma once
 
+#include <cstring>
+
 #include "correction.hpp"
 
 namespace eip {
 
-// The columns of w, of a state that is `y`, moved onto G M = kept, each by the least correction in the weights of the state.
+// Each row's numbers of the state, one after the other at its front; the columns of derivatives in it are not needed.
+inline void pack_rows(const Columns &columns, double *rows, int64_t count, int64_t stride) {
+    const int64_t cut = columns.cut();
+    for (int64_t i = 0; i < count; ++i) {
+        double *row = rows + i * stride;
+        std::memmove(row + cut, row + columns.second(-1), (columns.size - cut) * sizeof(double));
+    }
+}
+
+// Column c of a state y, and the same back.
+inline void take_column(const Columns &columns, int64_t c, const double *y, double *column) {
+    const int64_t cut = columns.cut();
+    copy(y + columns.first(c), column, cut);
+    copy(y + columns.second(c), column + cut, columns.size - cut);
+}
+inline void put_column(const Columns &columns, int64_t c, const double *column, double *y) {
+    const int64_t cut = columns.cut();
+    copy(column, y + columns.first(c), cut);
+    copy(column + cut, y + columns.second(c), columns.size - cut);
+}
+
+// A correction of one column, made neutral to the frame, whose rows go over all of a state.
 template <class W>
-inline void project_each(const Options &o, const W &w, double *y, int64_t rank, const Matrix &rows, const Matrix &R) {
+inline void keep_frame_of_column(const Options &o, const W &w, double *move) {
+    double *whole = w.stage;
+    fill(whole, 0.0, w.m);
+    put_column(o.columns, -1, move, whole);
+    keep_frame(o.frame, w, whole, w.move);
+    take_column(o.columns, -1, w.move, move);
+}
+
+// The columns M (count, size) moved onto G M = kept, each by the least correction in the weights sigma of the state. The
+// rows of G and of its factorisation are packed.
+template <class W>
+inline void project_each(const Options &o, const W &w, double *M, int64_t rank, const Matrix &rows, double *sigma) {
     const Columns &columns = o.columns;
     const int64_t n = columns.size;
-    double *move = w.stage;
-    fill(move, 0.0, w.m);
+    double *move = sigma + n;
     for (int64_t c = 0; c < columns.count; ++c) {
-        double *column = y + (c + 1) * n;
+        double *column = M + c * n;
         for (int64_t i = 0; i < w.l; ++i) w.g[i] = dot(w.gradient(i), column, n) - columns.kept[i * columns.count + c];
-        least_norm(w.g, w.inverse_norms, R, w.pivots, rank, w.mu);
+        least_norm(w.g, w.inverse_norms, corner(w.R, w.l, w), w.pivots, rank, w.mu);
         fill(move, 0.0, n);
         for (int64_t k = 0; k < rank; ++k) {
             const double *row = rows.row(w.pivots[k]), factor = w.mu[w.pivots[k]];
             for (int64_t j = 0; j < n; ++j) move[j] += factor * row[j];
         }
-        for (int64_t j = 0; j < n; ++j) move[j] *= w.sigma[j];
-        if (o.frame.rows > 0) {
-            keep_frame(o.frame, w, move, w.move);
-            for (int64_t j = 0; j < n; ++j) column[j] += w.move[j];
-        } else {
-            for (int64_t j = 0; j < n; ++j) column[j] += move[j];
-        }
+        for (int64_t j = 0; j < n; ++j) move[j] *= sigma[j];
+        if (o.frame.rows > 0) keep_frame_of_column(o, w, move);
+        for (int64_t j = 0; j < n; ++j) column[j] += move[j];
     }
 }
 
 // One Newton step on M^T J M = J, for M of as many columns as y = (q, p) has numbers: with E = M^T J M - J, M + M J E / 2.
-inline void restore_symplectic(const Columns &columns, double *y, double *E, double *row) {
-    const int64_t n = columns.size, half = n / 2;
-    double *M = y + n;
+inline void restore_symplectic(int64_t n, double *M, double *E, double *row) {
+    const int64_t half = n / 2;
     const auto product = [&](int64_t a, int64_t b) {
         const double *u = M + a * n, *v = M + b * n;
         double sum = 0.0;
@@ -45,25 +73,25 @@ inline void restore_symplectic(const Columns &columns, double *y, double *E, dou
     for (int64_t a = 0; a < n; ++a) {
         E[a * n + a] = 0.0;
         for (int64_t b = 0; b < a; ++b) {
-            const double j = a == b + half ? -1.0 : 0.0;
-            E[a * n + b] = product(a, b) - j;
+            E[a * n + b] = product(a, b) - (a == b + half ? -1.0 : 0.0);
             E[b * n + a] = -E[a * n + b];
         }
     }
-    // Row i of M J: -(second half) in the first half of the columns, the first half in the second.
+    // Row i of M J: minus the second half of the columns, then the first half.
     for (int64_t i = 0; i < n; ++i) {
         for (int64_t c = 0; c < half; ++c) {
             row[c] = -M[(half + c) * n + i];
             row[half + c] = M[c * n + i];
         }
-        for (int64_t c = 0; c < n; ++c) row[n + c] = 0.0;
+        fill(row + n, 0.0, n);
         for (int64_t a = 0; a < n; ++a)
             for (int64_t c = 0; c < n; ++c) row[n + c] += row[a] * E[a * n + c];
         for (int64_t c = 0; c < n; ++c) M[c * n + i] += 0.5 * row[n + c];
     }
 }
 
-// The columns of a state that has been projected, y_new.
+// The columns of a state that has been projected, y_new. The errors of the step are not needed any more: their buffers, of
+// size (1 + count) numbers each, hold the columns one after the other, the matrix E, or the state's weights and one correction.
 template <class AnyRun>
 [[gnu::noinline]] inline void project_columns(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
@@ -77,12 +105,17 @@ template <class AnyRun>
     run.system.grad(w, step.t_new, step.y_new, w.f_point, w.G);
     ++w.counters[NJEV];
     weigh_rows(o.frame, w, w.Q);
-    const Matrix rows{w.Q, w.l, n, w.m}, R = corner(w.R, w.l, w);
-    const int64_t rank = factor(rows, w.inverse_norms, R, w.pivots);
+    pack_rows(columns, w.G, w.l, w.m);
+    pack_rows(columns, w.Q, w.l, w.m);
+    double *M = w.err, *scratch = w.err_low;
+    for (int64_t c = 0; c < columns.count; ++c) take_column(columns, c, step.y_new, M + c * n);
+    const Matrix rows{w.Q, w.l, n, w.m};
+    const int64_t rank = factor(rows, w.inverse_norms, corner(w.R, w.l, w), w.pivots);
     ++w.counters[NLU];
-    if (rank > 0) project_each(o, w, step.y_new, rank, rows, R);
-    // A state with all its columns has room for n numbers n times and more in two buffers that are free here.
-    if (columns.symplectic) restore_symplectic(columns, step.y_new, w.err_low, w.move);
+    take_column(columns, -1, w.sigma, scratch);
+    if (rank > 0) project_each(o, w, M, rank, rows, scratch);
+    if (columns.symplectic) restore_symplectic(n, M, scratch, w.move);
+    for (int64_t c = 0; c < columns.count; ++c) put_column(columns, c, M + c * n, step.y_new);
 }
 
 }  // namespace eip

@@ -242,18 +242,24 @@ void fields(Groups &g, Visit &visit) {
 }
 
 // Columns of derivatives behind a state of `size` floats, of as many each: solutions M of the variational equations. The
-// first `seen` floats of the state are the user's, behind which parameters may stand as constants. `kept`: G M of the
+// first `seen` floats of the state are the user's, behind which parameters may stand as constants. A Nystrom method, whose
+// states are positions and velocities, has the first `half` floats of all first, then the others. `kept`: G M of the
 // invariants' gradients G, which is constant. symplectic: M^T J M = J is restored as well.
 struct Columns {
     const double *kept;  // (l, count)
-    int64_t count, size, seen;
+    int64_t count, size, seen, half;
     bool symplectic;
+
+    // The places of the first and of the second part of column c, -1 for the state, and the length of the first part.
+    int64_t cut() const { return half > 0 ? half : size; }
+    int64_t first(int64_t c) const { return (c + 1) * cut(); }
+    int64_t second(int64_t c) const { return (1 + count) * cut() + (c + 1) * (size - cut()); }
 };
 
 template <class Visit>
 void fields(Columns &c, Visit &visit) {
     visit("kept", c.kept, visit.sizes.l, Bound{c.count});
-    each(visit, "size", c.size, "seen", c.seen, "symplectic", c.symplectic);
+    each(visit, "size", c.size, "seen", c.seen, "half", c.half, "symplectic", c.symplectic);
 }
 
 struct Options {

@@ -35,6 +35,25 @@ inline double error_norm(const double *err, const double *y, const double *y_hat
     return std::sqrt(total / n);
 }
 
+// The same of a run whose columns of derivatives do not count.
+[[gnu::noinline]] inline double error_norm_of_state(const double *err, const double *y, const double *y_hat,
+                                                    const Options &o) {
+    const Columns &columns = o.columns;
+    const int64_t first = std::min(columns.seen, columns.cut()), second = columns.second(-1);
+    double total = 0.0;
+    for (int64_t i = 0; i < first; ++i) total += relative_square(err, i, y, y_hat, o);
+    for (int64_t i = second; i < second + columns.seen - first; ++i) total += relative_square(err, i, y, y_hat, o);
+    return std::sqrt(total / columns.seen);
+}
+
+// The norm of w.err.
+template <class W>
+inline double norm_of_error(const double *y, const Options &o, const W &w) {
+    if (o.columns.count > 0) [[unlikely]]
+        return error_norm_of_state(w.err, y, w.y_hat, o);
+    return error_norm(w.err, y, w.y_hat, o, w.n);
+}
+
 // The same for DOP853's pair of estimates; then err <- err |err| / hypot(err, low / 10), by component.
 inline double paired_error_norm(double *err, const double *low, const double *y, const double *y_hat, const Options &o,
                                 int64_t n) {
@@ -54,12 +73,6 @@ inline double paired_error_norm(double *err, const double *low, const double *y,
     return fine / std::sqrt((fine + 0.01 * coarse) * n);
 }
 
-// How many numbers of the state the step control sees: columns of derivatives do not count.
-template <class W>
-inline int64_t controlled(const Options &o, const W &w) {
-    return o.columns.count > 0 ? o.columns.seen : w.n;
-}
-
 // The estimate into w.err, and its norm for the step control.
 template <class AnyRun>
 inline void estimate_error(const AnyRun &run, const Step &step) {
@@ -70,14 +83,15 @@ inline void estimate_error(const AnyRun &run, const Step &step) {
         const int64_t half = w.m / 2;
         weighted_sum(step.h * step.h, {m.e, w.K + half, m.n_e, w.m}, w.err, half);
         weighted_sum(step.h, {m.e_v, w.K + half, m.n_e_v, w.m}, w.err + half, half);
-        if (o.adaptive) w.norm[0] = error_norm(w.err, step.y, w.y_hat, o, controlled(o, w));
+        if (o.adaptive) w.norm[0] = norm_of_error(step.y, o, w);
     } else if (m.paired) {
         weighted_sum(step.h, {m.e, w.K, m.n_e, w.m}, w.err, w.m);
         weighted_sum(step.h, {m.e_low, w.K, m.n_e, w.m}, w.err_low, w.m);
-        w.norm[0] = paired_error_norm(w.err, w.err_low, step.y, w.y_hat, o, controlled(o, w));
+        const int64_t seen = o.columns.count > 0 ? o.columns.seen : w.n;
+        w.norm[0] = paired_error_norm(w.err, w.err_low, step.y, w.y_hat, o, seen);
     } else {
         weighted_sum(step.h, {m.e, w.K, m.n_e, w.m}, w.err, w.m);
-        w.norm[0] = o.adaptive ? error_norm(w.err, step.y, w.y_hat, o, controlled(o, w)) : 0.0;
+        w.norm[0] = o.adaptive ? norm_of_error(step.y, o, w) : 0.0;
     }
 }
 

@@ -248,7 +248,8 @@ static void check_parts(const Groups &g, const Work &w) {
 }
 
 static void check_columns(const Columns &c, const Work &w) {
-    const bool fits = c.count == 0 || (c.seen > 0 && c.seen <= c.size && c.size * (1 + c.count) == w.m);
+    const bool halves = c.half == 0 || (2 * c.half == c.size && c.seen == c.size);
+    const bool fits = c.count == 0 || (c.seen > 0 && c.seen <= c.size && c.size * (1 + c.count) == w.m && halves);
     require(fits && (!c.symplectic || (c.count == c.size && c.size % 2 == 0)),
             "engine: the columns of derivatives do not fit the state");
 }
