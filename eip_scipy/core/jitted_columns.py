@@ -235,6 +235,17 @@ def wide_gradient(
     else:
         behind = inside(lambda t, y, out, extra: None)
         own = inside(lambda Y, extra: extra)
+    if not shape and first == n and not parameters:  # its row is filled where it lies
+
+        def row_with_f(t, Y, f, out, *extra):
+            out[n:] = 0.0
+            grad(t, Y[:n], f[:n], out[:n], *extra)
+
+        def row_without_f(t, Y, out, *extra):
+            out[n:] = 0.0
+            grad(t, Y[:n], out[:n], *extra)
+
+        return njit(row_with_f if takes_f else row_without_f)
     if takes_f:
 
         def with_f(t, Y, f, out, *extra):

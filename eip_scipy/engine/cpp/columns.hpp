@@ -107,15 +107,16 @@ template <class AnyRun>
     weigh_rows(o.frame, w, w.Q);
     pack_rows(columns, w.G, w.l, w.m);
     pack_rows(columns, w.Q, w.l, w.m);
-    double *M = w.err, *scratch = w.err_low;
-    for (int64_t c = 0; c < columns.count; ++c) take_column(columns, c, step.y_new, M + c * n);
+    const bool in_halves = columns.half > 0;
+    double *M = in_halves ? w.err : step.y_new + n, *scratch = w.err_low;
+    for (int64_t c = 0; in_halves && c < columns.count; ++c) take_column(columns, c, step.y_new, M + c * n);
     const Matrix rows{w.Q, w.l, n, w.m};
     const int64_t rank = factor(rows, w.inverse_norms, corner(w.R, w.l, w), w.pivots);
     ++w.counters[NLU];
     take_column(columns, -1, w.sigma, scratch);
     if (rank > 0) project_each(o, w, M, rank, rows, scratch);
     if (columns.symplectic) restore_symplectic(n, M, scratch, w.move);
-    for (int64_t c = 0; c < columns.count; ++c) put_column(columns, c, M + c * n, step.y_new);
+    for (int64_t c = 0; in_halves && c < columns.count; ++c) put_column(columns, c, M + c * n, step.y_new);
 }
 
 }  // namespace eip
