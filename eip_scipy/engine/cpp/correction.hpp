@@ -366,7 +366,8 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
     Moved moved = move(run, step);
     Code status = correct(run, step, moved.rank);
     if (o.direction == NEW && o.iterations == 1 && !o.compensated && o.parts.count == 0) {
-        const bool alone = o.blocks.count * o.blocks.width == w.m;
+        const int64_t seen = o.columns.count > 0 ? o.columns.seen : w.m;
+        const bool alone = o.blocks.count * o.blocks.width == seen;
         const bool doubtful = status != OK ? all_finite(w.defect, w.l) : alone && moved.correction > HEALTHY;
         if (moved.largest_error > 0.0 && doubtful) status = correct_softly(of_any_length(run), step, alone, moved);
         if (status != OK && moved.rank > 1) {

@@ -1,0 +1,192 @@
+"""Derivatives of Kepler's problem against its closed form, by all kinds of methods and interfaces."""
+
+import mpmath
+import numpy as np
+import pytest
+from numba import njit
+
+from eip_scipy import (
+    EIPDOP853,
+    EIPGJ14,
+    EIPRK4,
+    EIPRKN8,
+    EIPRKN12,
+    Invariant,
+    eip_method,
+    ensemble,
+    integrate,
+    solve_ivp,
+)
+
+E = 0.6
+START = np.array([1 - E, 0.0, 0.0, np.sqrt((1 + E) / (1 - E))])
+END = 10 * np.pi  # five revolutions
+
+
+@njit
+def kepler(t, y):
+    r3 = (y[0] ** 2 + y[1] ** 2) ** 1.5
+    return np.array([y[2], y[3], -y[0] / r3, -y[1] / r3])
+
+
+@njit
+def acceleration(t, q):
+    return -q / (q[0] ** 2 + q[1] ** 2) ** 1.5
+
+
+@njit
+def energy(t, y):
+    return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2)
+
+
+@njit
+def momentum(t, y):
+    return y[0] * y[3] - y[1] * y[2]
+
+
+KEPT = [Invariant(energy, name="H"), Invariant(momentum, name="L")]
+
+
+def flow(start, t):
+    """The state after a time t, by Lagrange's coefficients and Kepler's equation in differences (Battin 1987, 4.41)."""
+    x, y, u, v = start
+    r0 = mpmath.hypot(x, y)
+    a = 1 / (2 / r0 - u * u - v * v)
+    mean = a ** mpmath.mpf(-1.5)
+    c0, s0 = 1 - r0 / a, (x * u + y * v) / mpmath.sqrt(a)
+    angle = mpmath.findroot(lambda d: d - c0 * mpmath.sin(d) + s0 * (1 - mpmath.cos(d)) - mean * t, mean * t)
+    sin, cos = mpmath.sin(angle), mpmath.cos(angle)
+    r = a * (1 - c0 * cos + s0 * sin)
+    f, g = 1 - a / r0 * (1 - cos), t - (angle - sin) / mean
+    f_dot, g_dot = -mpmath.sqrt(a) / (r * r0) * sin, 1 - a / r * (1 - cos)
+    return [f * x + g * u, f * y + g * v, f_dot * x + g_dot * u, f_dot * y + g_dot * v]
+
+
+@pytest.fixture(scope="module")
+def matrix():
+    with mpmath.workdps(40):
+        start, t, shift = [mpmath.mpf(float(x)) for x in START], mpmath.mpf(END), mpmath.mpf(10) ** -15
+        columns = []
+        for k in range(4):
+            ends = [flow([x + sign * shift * (i == k) for i, x in enumerate(start)], t) for sign in (1, -1)]
+            columns.append([float((a - b) / (2 * shift)) for a, b in zip(*ends, strict=True)])
+    return np.array(columns).T
+
+
+def distance(found, matrix):
+    return np.linalg.norm(found - matrix) / np.linalg.norm(matrix)
+
+
+@pytest.mark.parametrize("compiled", [None, False])
+@pytest.mark.parametrize(
+    ("method", "steps", "worst", "gain"),
+    [(EIPRK4, 400, 2e-6, 100), (EIPDOP853, 50, 2e-6, 50), (EIPRKN8, 60, 5e-8, 300), (EIPRKN12, 40, 2e-9, 100)],
+)
+def test_projected_columns_are_nearer(matrix, method, steps, worst, gain, compiled):
+    options = {"method": method, "h": 2 * np.pi / steps, "compiled": compiled}
+    plain = integrate(kepler, (0, END), START, variations="state", **options)
+    run = integrate(kepler, (0, END), START, invariants=KEPT, variations="state", symplectic=True, **options)
+    assert run.trusted
+    assert run.compiled is (compiled is None)
+    assert distance(run.stm[-1], matrix) < worst
+    assert distance(run.stm[-1], matrix) < distance(plain.stm[-1], matrix) / gain
+
+
+@pytest.mark.parametrize("method", [EIPRK4, EIPDOP853, EIPRKN8])
+def test_columns_fit_the_invariants_and_stay_symplectic(method):
+    run = integrate(
+        kepler, (0, END), START, method=method, h=0.05, invariants=KEPT, variations="state", symplectic=True
+    )
+    J = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
+    M = run.stm[-1]
+
+    def gradients(y):
+        r3 = np.hypot(*y[:2]) ** 3
+        return np.array([[y[0] / r3, y[1] / r3, y[2], y[3]], [y[3], -y[2], -y[1], y[0]]])
+
+    missed = gradients(run.y[:, -1]) @ M - gradients(START)
+    assert np.abs(missed).max() < 1e-6 * np.abs(M).max()  # what the symplectic step moves, of second order
+    exact = integrate(kepler, (0, END), START, method=method, h=0.05, invariants=KEPT, variations="state").stm[-1]
+    assert np.abs(gradients(run.y[:, -1]) @ exact - gradients(START)).max() < 1e-12 * np.abs(exact).max()
+    assert np.abs(M.T @ J @ M - J).max() < 1e-3 * np.abs(exact.T @ J @ exact - J).max()
+
+
+@pytest.mark.parametrize("kept", [(), KEPT])
+@pytest.mark.parametrize(
+    "options", [{"h": 0.05}, {"rtol": 1e-9, "atol": 1e-9}, {"h": 0.05, "every": 3}, {"h": 0.05, "compensated": True}]
+)
+@pytest.mark.parametrize("method", [EIPDOP853, EIPRKN8])
+def test_states_are_those_of_the_run_without(method, options, kept):
+    t_eval = np.linspace(0, END, 7)
+    both = [
+        integrate(kepler, (0, END), START, method=method, invariants=kept, t_eval=t_eval, **options, **more)
+        for more in ({}, {"variations": "state"})
+    ]
+    np.testing.assert_allclose(both[1].y, both[0].y, rtol=0, atol=1e-12)
+    assert both[1].diagnostics.n_projections == both[0].diagnostics.n_projections
+
+
+def test_an_acceleration_and_a_run_that_goes_on(matrix):
+    options = {"method": EIPRKN8, "h": np.pi / 30, "invariants": KEPT, "variations": "state"}
+    whole = integrate(acceleration=acceleration, t_span=(0, END), y0=START, **options)
+    parts = integrate(acceleration=acceleration, t_span=(0, END / 2), y0=START, **options).continue_to(END)
+    assert whole.compiled
+    assert whole.trusted
+    assert parts.trusted
+    assert distance(whole.stm[-1], matrix) < 1e-7
+    assert distance(parts.stm[-1], whole.stm[-1]) < 1e-10
+
+
+@pytest.mark.parametrize("method", [EIPDOP853, EIPRKN8])
+def test_solve_ivp_has_the_same_columns(method):
+    kept = [Invariant(item.function.py_func, name=item.name) for item in KEPT]
+    options = {"invariants": kept, "h": 0.05, "variations": "state"}
+    run = integrate(kepler, (0, 3), START, method=method, **options)
+    sol = solve_ivp(kepler, (0, 3), START, method, events=lambda t, y: y[1] - 0.5, dense_output=True, **options)
+    np.testing.assert_array_equal(sol.variations[-1], run.stm[-1])
+    assert sol.y.shape == (4, sol.t.size)
+    assert sol.y_events[0].shape == (2, 4)
+    assert sol.sol(1.0).shape == (4,)
+
+
+@pytest.mark.parametrize("method", [EIPRK4, EIPRKN8])
+def test_linear_invariants_of_a_frame_stay(method):
+    @njit
+    def pair(t, y):
+        d = y[2:4] - y[:2]
+        pull = d / (d[0] ** 2 + d[1] ** 2) ** 1.5
+        return np.concatenate((y[4:], pull, -pull))
+
+    @njit
+    def of_pair(t, y):
+        d = y[2:4] - y[:2]
+        return 0.5 * np.sum(y[4:] ** 2) - 1 / np.sqrt(d[0] ** 2 + d[1] ** 2)
+
+    C = np.zeros((2, 8))
+    C[0, [4, 6]] = C[1, [5, 7]] = 1.0
+    start = [0.0, 0, 1, 0, 0, -0.4, 0, 0.5]
+    run = integrate(
+        pair, (0, 10), start, method=method, h=0.05, invariants=Invariant(of_pair), frame=(C, C.T), variations="state"
+    )
+    assert np.abs(C @ run.stm[-1] - C).max() < 1e-12
+
+
+def test_what_cannot_carry_them():
+    options = {"h": 0.05, "variations": "state"}
+    with pytest.raises(ValueError, match="EIPGJ14 carries no derivatives"):
+        integrate(kepler, (0, 10), START, method=EIPGJ14, **options)
+
+    class Euler:
+        order, error_estimator_order = 1, None
+
+        def one_step(self, t, y, h):
+            return y + h * kepler(t, y)
+
+    with pytest.raises(ValueError, match="carries no derivatives"):
+        integrate(kepler, (0, 10), START, method=eip_method(Euler()), **options)
+    with pytest.raises(ValueError, match="no derivatives by parameters"):
+        integrate(lambda t, y, p: kepler(t, y), (0, 1), START, method=EIPRKN8, h=0.05, params=[1.0], variations=[0])
+    with pytest.raises(TypeError, match="takes no variations"):
+        solve_ivp(kepler, (0, 1), START, "Radau", variations="state")
+    with pytest.raises(TypeError, match="has no option 'variations'"):
+        ensemble(kepler, (0, 1), [START], method=EIPRK4, h=0.05, variations="state")
