@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eip_scipy import EIPDOP853, Balance, integrate
-from eip_scipy.problems import nbody
+from eip_scipy.problems import nbody, satellite
 from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.problems.gravity.orbits import orbital_balances
 from eip_scipy.problems.gravity.solar_data import YEAR_D, load
@@ -34,10 +34,9 @@ njit = needed("numba", '"eip_scipy[numba]"').njit
 __all__ = ["SYSTEMS", "Balances"]
 
 TURN = 2 * math.pi
-# The Earth in km and s, and an atmosphere that falls by e in SCALE_HEIGHT. Drag per speed squared [1/km] at the base of
-# 400 km: half of 3e-12 kg/m^3 times 0.022 m^2/kg.
-GM, RADIUS, J2 = 398600.4418, 6378.137, 1.08262668e-3
-DENSITY, BASE, SCALE_HEIGHT = 0.5 * 3e-12 * 0.022 * 1e3, 400.0, 60.0
+# Km and s. Drag per squared speed at 400 km: half of 3e-12 kg/m^3 times 0.022 m^2/kg.
+EARTH = {"mu": 398600.4418, "radius": 6378.137, "j2": 1.08262668e-3}
+AIR = {"drag": 0.5 * 3e-12 * 0.022 * 1e3, "height": 400.0, "scale_height": 60.0}
 LUNAR_MONTH = 27.321661 / YEAR_D
 KM_S = 86400 * YEAR_D / 149597870.7  # AU/yr
 SHOWN = 200
@@ -148,114 +147,21 @@ def drag(strength: float, revolutions: float, steps: int = 16, rates: Mapping[st
     return make
 
 
-# A satellite about an oblate Earth with drag.
-
-
-@njit
-def air(y):
-    r = np.sqrt(y[0] ** 2 + y[1] ** 2 + y[2] ** 2)
-    speed = np.sqrt(y[3] ** 2 + y[4] ** 2 + y[5] ** 2)
-    return DENSITY * np.exp((RADIUS + BASE - r) / SCALE_HEIGHT) * speed
-
-
-@njit
-def satellite(t, y, a, b, c):
-    r2 = y[0] ** 2 + y[1] ** 2 + y[2] ** 2
-    z = a * y[0] + b * y[1] + c * y[2]
-    k, s = 1.5 * J2 * RADIUS**2 / r2, z * z / r2
-    d, g = air(y), GM / r2**1.5
-    radial, polar = -g * (1 + k * (1 - 5 * s)), -2 * g * k * z
-    return np.array(
-        [
-            y[3],
-            y[4],
-            y[5],
-            radial * y[0] + polar * a - d * y[3],
-            radial * y[1] + polar * b - d * y[4],
-            radial * y[2] + polar * c - d * y[5],
-        ]
-    )
-
-
-@njit
-def satellite_energy(t, y, a, b, c):
-    r2 = y[0] ** 2 + y[1] ** 2 + y[2] ** 2
-    z = a * y[0] + b * y[1] + c * y[2]
-    potential = -GM / np.sqrt(r2) * (1 - 0.5 * J2 * RADIUS**2 / r2 * (3 * z * z / r2 - 1))
-    return 0.5 * (y[3] ** 2 + y[4] ** 2 + y[5] ** 2) + potential
-
-
-@njit
-def drag_power(t, y, a, b, c):
-    return -air(y) * (y[3] ** 2 + y[4] ** 2 + y[5] ** 2)
-
-
-@njit
-def pull_and_drag(y, a, b, c):
-    """Return the accelerations other than the pull of a round Earth."""
-    r2 = y[0] ** 2 + y[1] ** 2 + y[2] ** 2
-    z = a * y[0] + b * y[1] + c * y[2]
-    k, s, d, g = 1.5 * J2 * RADIUS**2 / r2, z * z / r2, air(y), GM / r2**1.5
-    radial, polar = -g * k * (1 - 5 * s), -2 * g * k * z
-    return (
-        radial * y[0] + polar * a - d * y[3],
-        radial * y[1] + polar * b - d * y[4],
-        radial * y[2] + polar * c - d * y[5],
-    )
-
-
-@njit
-def satellite_spin(t, y, a, b, c):
-    return np.array([y[1] * y[5] - y[2] * y[4], y[2] * y[3] - y[0] * y[5], y[0] * y[4] - y[1] * y[3]])
-
-
-@njit
-def torque(t, y, a, b, c):
-    px, py, pz = pull_and_drag(y, a, b, c)
-    return np.array([y[1] * pz - y[2] * py, y[2] * px - y[0] * pz, y[0] * py - y[1] * px])
-
-
-@njit
-def satellite_laplace(t, y, a, b, c):
-    r = np.sqrt(y[0] ** 2 + y[1] ** 2 + y[2] ** 2)
-    l0, l1, l2 = y[1] * y[5] - y[2] * y[4], y[2] * y[3] - y[0] * y[5], y[0] * y[4] - y[1] * y[3]
-    return np.array([
-        y[4] * l2 - y[5] * l1 - GM * y[0] / r,
-        y[5] * l0 - y[3] * l2 - GM * y[1] / r,
-        y[3] * l1 - y[4] * l0 - GM * y[2] / r,
-    ])  # fmt: skip
-
-
-@njit
-def laplace_change(t, y, a, b, c):
-    px, py, pz = pull_and_drag(y, a, b, c)
-    l0, l1, l2 = y[1] * y[5] - y[2] * y[4], y[2] * y[3] - y[0] * y[5], y[0] * y[4] - y[1] * y[3]
-    m0, m1, m2 = y[1] * pz - y[2] * py, y[2] * px - y[0] * pz, y[0] * py - y[1] * px
-    return np.array([
-        py * l2 - pz * l1 + y[4] * m2 - y[5] * m1,
-        pz * l0 - px * l2 + y[5] * m0 - y[3] * m2,
-        px * l1 - py * l0 + y[3] * m1 - y[4] * m0,
-    ])  # fmt: skip
+# A satellite 400 km above an oblate Earth, with drag.
 
 
 def leo(days: float) -> Any:
-    """Return a maker of a satellite 400 km above the Earth."""
-    energy = Balance(satellite_energy, drag_power, name="E")
-    others = [Balance(satellite_spin, torque, name="h"), Balance(satellite_laplace, laplace_change, name="e")]
-    sets = {"E": energy, "E, h, e": [energy, *others]}
-    a, e, tilt = RADIUS + 420, 2e-3, math.radians(51.6)
-    period = TURN * math.sqrt(a**3 / GM)
-    speed = math.sqrt(GM / a * (1 + e) / (1 - e))
+    """Return a maker of this satellite."""
+    a, e, tilt = EARTH["radius"] + 420, 2e-3, math.radians(51.6)
+    speed = math.sqrt(EARTH["mu"] / a * (1 + e) / (1 - e))
+    start = np.array([[a * (1 - e), 0, 0], [0, speed * math.cos(tilt), speed * math.sin(tilt)]])
 
     def make(turned: np.ndarray, turn: int) -> Case:
-        q, v = [a * (1 - e), 0, 0], [0, speed * math.cos(tilt), speed * math.sin(tilt)]
-        run = runner(
-            fun=satellite,
-            t_span=(0, 86400 * days),
-            y0=np.concatenate([turned @ q, turned @ v]),
-            args=tuple(turned[:, 2].tolist()),
-        )
-        return Case(run, sets, {"h": period / 16}, 16, (slice(0, 3),))
+        pole = tuple(turned[:, 2].tolist())
+        problem = satellite(*(start @ turned.T), **EARTH, **AIR, pole=pole, t_span=(0.0, 86400 * days))
+        assert problem.h is not None
+        sets = {"E": orbital_balances(problem.params[:2], problem.y0), "E, h, e": problem.invariants}
+        return Case(of(problem), sets, {"h": problem.h}, 16, (slice(3, 6),))
 
     return make
 
