@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eip_scipy import EIPDOP853, Balance, integrate
-from eip_scipy.problems import nbody, satellite
+from eip_scipy.problems import ParticleField, charged_particle, nbody, satellite
 from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.problems.gravity.orbits import orbital_balances
 from eip_scipy.problems.gravity.solar_data import YEAR_D, load
@@ -35,8 +35,8 @@ __all__ = ["SYSTEMS", "Balances"]
 
 TURN = 2 * math.pi
 # Km and s. Drag per squared speed at 400 km: half of 3e-12 kg/m^3 times 0.022 m^2/kg.
-EARTH = {"mu": 398600.4418, "radius": 6378.137, "j2": 1.08262668e-3}
-AIR = {"drag": 0.5 * 3e-12 * 0.022 * 1e3, "height": 400.0, "scale_height": 60.0}
+EARTH: dict[str, Any] = {"mu": 398600.4418, "radius": 6378.137, "j2": 1.08262668e-3}
+AIR: dict[str, Any] = {"drag": 0.5 * 3e-12 * 0.022 * 1e3, "height": 400.0, "scale_height": 60.0}
 LUNAR_MONTH = 27.321661 / YEAR_D
 KM_S = 86400 * YEAR_D / 149597870.7  # AU/yr
 SHOWN = 200
@@ -158,8 +158,11 @@ def leo(days: float) -> Any:
 
     def make(turned: np.ndarray, turn: int) -> Case:
         pole = tuple(turned[:, 2].tolist())
-        problem = satellite(*(start @ turned.T), **EARTH, **AIR, pole=pole, t_span=(0.0, 86400 * days))
+        problem = satellite(
+            start[0] @ turned.T, start[1] @ turned.T, **EARTH, **AIR, pole=pole, t_span=(0.0, 86400 * days)
+        )
         assert problem.h is not None
+        assert problem.params is not None
         sets = {"E": orbital_balances(problem.params[:2], problem.y0), "E, h, e": problem.invariants}
         return Case(of(problem), sets, {"h": problem.h}, 16, (slice(3, 6),))
 
@@ -299,6 +302,54 @@ def particle(turned: np.ndarray, turn: int) -> Case:
     return Case(run, sets, {"h": TURN / 16}, 16, (slice(0, 3),))
 
 
+# A charge in a field B(t) (1 + r^2) along the z axis and a potential that varies too.
+
+
+@njit
+def strengths(t):
+    return 1 + 0.02 * np.sin(0.01 * t), 2e-4 * np.cos(0.01 * t), 0.05 + 0.005 * np.sin(0.013 * t)
+
+
+@njit
+def vector_potential(t, x, y, z):
+    around = strengths(t)[0] * (0.5 + 0.25 * (x * x + y * y))
+    return -around * y, around * x, 0.0
+
+
+@njit
+def magnetic(t, x, y, z):
+    return 0.0, 0.0, strengths(t)[0] * (1 + x * x + y * y)
+
+
+@njit
+def potential(t, x, y, z):
+    r2 = x * x + y * y
+    return strengths(t)[2] * (0.5 * r2 + 0.1 * r2 * r2)
+
+
+@njit
+def electric(t, x, y, z):
+    r2 = x * x + y * y
+    around, out = -strengths(t)[1] * (0.5 + 0.25 * r2), -strengths(t)[2] * (1 + 0.4 * r2)
+    return out * x - around * y, out * y + around * x, 0.0
+
+
+VARYING = ParticleField(
+    vector_potential, magnetic=magnetic, potential=potential, electric=electric, axisymmetric=True, varies=True
+)
+
+
+def held(turned: np.ndarray, turn: int) -> Case:
+    """Some 400 gyrations, from several directions of the velocity."""
+    start = [0.5, 0, 0], [0.3 * math.sin(turn), 0.3 * math.cos(turn), 0]
+    made = {
+        name: charged_particle(VARYING, *start, t_span=(0, 2000), form="velocity", balances=name)
+        for name in ("energy", "kinetic")
+    }
+    sets = {"H and L": made["energy"].invariants, "T and L": made["kinetic"].invariants}
+    return Case(of(made["energy"]), sets, {"h": 0.4}, 16, (slice(0, 3),))
+
+
 # Oscillators x'' = -a x - b x^3 - c x' + d cos(w t + phase).
 
 
@@ -385,6 +436,7 @@ SYSTEMS = {
     ),
     "Duffing, driven by 1e-3": System(oscillator(1, 1, 0, 1e-3, 0.4, 1000), "", True),
     "charge in a varying mirror": System(particle, "", True),
+    "charge in a varying field and potential": System(held, "", True),
     "strong driving": System(oscillator(1, 1, 0, 1.0, 0.4, 200), "", False),
     "linear resonance": System(oscillator(1, 0, 0, 1e-2, 1.0, 500), "", False),
     "attractor, damped by 0.02": System(oscillator(1, 1, 0.02, 0.05, 1.2, 2000), "", False),
