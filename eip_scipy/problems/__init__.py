@@ -14,6 +14,7 @@ from .gravity.scenes import comet, figure_eight, pythagorean
 from .gravity.solar_data import SolarSystemData
 from .gravity.solar_system import solar_system
 from .gross_pitaevskii import (
+    DampedGrossPitaevskii,
     FieldProblem,
     Grid,
     GrossPitaevskii,
@@ -46,6 +47,7 @@ __all__ = [
     "TOKAMAK",
     "UNIFORM",
     "CFunctions",
+    "DampedGrossPitaevskii",
     "FieldProblem",
     "ForceConstants",
     "Grid",
