@@ -578,7 +578,7 @@ def test_energies_in_fields_that_do_work(field, balances, names):
 
 
 def test_a_cycloid():
-    """In constant fields E along x and B along z the charge drifts along -y; nothing is told of a potential."""
+    """In constant fields E along x and B along z the charge drifts along -y; the potential is not given."""
     drift, end = 0.01, 600.0
     field = ParticleField(magnetic=lambda x, y, z: (0.0, 0.0, 1.0), electric=lambda x, y, z: (drift, 0.0, 0.0))
     problem = charged_particle(

@@ -144,7 +144,7 @@ class ParticleField:
         return jit_like(fields, E, B)
 
     def _plain(self, key: str) -> Callable[..., Any]:
-        """One of the given functions as one of (t, x, y, z), which is not worth compiling."""
+        """Return one of the given functions as one of (t, x, y, z), interpreted."""
         fun = getattr(self, key)
         return (lambda *where: fun(*where)) if self.varies else (lambda t, *where: fun(*where))
 
