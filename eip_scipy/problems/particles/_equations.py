@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from ...core.gradients import DIFFERENCE_WEIGHTS
-from ...core.jitted import compiled_like, is_compiled
+from ...core.jitted import compiled_like, is_compiled, is_jitted
 
 __all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like"]
 
@@ -281,7 +281,12 @@ def at_any_time(fun: Callable[..., Any]) -> Callable[..., Any]:
     def timeless(t, x, y, z):
         return fun(x, y, z)
 
-    return jit_like(timeless, fun)
+    if not is_jitted(fun):
+        return timeless
+    from numba import njit
+
+    # A function that returns an array needs Numba's memory, which the callers here are compiled without.
+    return cast(Callable[..., Any], njit(timeless, error_model="numpy", _nrt=True))
 
 
 def curl(jacobian: Callable[..., Any]) -> Callable[..., Any]:
