@@ -9,10 +9,12 @@ from .gravity.forces import ForceConstants
 from .gravity.nbody import nbody
 from .gravity.orbital_elements import OrbitalElements, orbital_elements
 from .gravity.orbits import orbital_balances
+from .gravity.satellite import satellite
 from .gravity.scenes import comet, figure_eight, pythagorean
 from .gravity.solar_data import SolarSystemData
 from .gravity.solar_system import solar_system
 from .gross_pitaevskii import (
+    DampedGrossPitaevskii,
     FieldProblem,
     Grid,
     GrossPitaevskii,
@@ -45,6 +47,7 @@ __all__ = [
     "TOKAMAK",
     "UNIFORM",
     "CFunctions",
+    "DampedGrossPitaevskii",
     "FieldProblem",
     "ForceConstants",
     "Grid",
@@ -81,6 +84,7 @@ __all__ = [
     "quartic_trap",
     "reaches",
     "rotating_packet",
+    "satellite",
     "sine_gordon_breather",
     "sine_gordon_kinks",
     "solar_system",

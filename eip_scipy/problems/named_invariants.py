@@ -1,4 +1,4 @@
-"""Invariants of equations on grids, made by their names."""
+"""Invariants of equations on grids, made by their names, and the balances that they become by damping."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from functools import partial
 
 import numpy as np
 
+from ..core.balances import Balance
 from ..core.invariants import Invariant
 from ..core.names import nearest
 
-__all__ = ["named_invariant"]
+__all__ = ["damped_invariant", "named_invariant"]
 
 
 def named_invariant(
@@ -36,3 +37,43 @@ def named_invariant(
 
 def _at(value: Callable[[np.ndarray], float], t: float, y: np.ndarray) -> float:
     return value(y)
+
+
+Parts = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def damped_invariant(
+    item: Invariant, rated: Invariant, parts: Parts, total: Callable[[float], float] | None = None
+) -> Balance:
+    """An invariant of the equation without damping as a balance of that with it.
+
+    Parameters
+    ----------
+    item, rated : Invariant
+        The invariant, twice: one that remembers its last state is asked for rates at other states than for values.
+    parts : callable
+        ``parts(y, f) -> (kept, lost)``, two parts of the derivative f: that without damping, and what damping adds.
+    total : callable, optional
+        Sums over the whole grid from those over the part that is here.
+    """
+    gradient = partial(_damped_gradient, item, parts)
+    return Balance(
+        item.fun, partial(_loss, rated, parts, total), gradient, name=item.name, in_place=True, uses_f=True
+    )  # fmt: skip
+
+
+def _damped_gradient(item: Invariant, parts: Parts, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
+    assert item.gradient is not None
+    item.gradient(t, y, *((parts(y, f)[0],) if item.uses_f else ()), out)
+
+
+def _loss(
+    item: Invariant, parts: Parts, total: Callable[[float], float] | None, t: float, y: np.ndarray, f: np.ndarray
+) -> float:
+    """Return the rate, Re <gradient, lost>."""
+    kept, lost = parts(y, f)
+    gradient = np.empty_like(y)
+    assert item.gradient is not None
+    item.gradient(t, y, *((kept,) if item.uses_f else ()), gradient)
+    rate = float(np.vdot(gradient, lost).real)
+    return rate if total is None else total(rate)

@@ -89,7 +89,7 @@ class ParticleOrbit:
         """H = m v^2 / 2 + q phi (m,); ValueError for a field whose potential is not known."""
         if self.problem.field.functions.phi is None:
             raise ValueError("the energy needs the field's potential; give it to ParticleField.")
-        phi = self.problem.field.along("phi", self.x)
+        phi = self.problem.field.along("phi", self.x, self.t)
         return 0.5 * self.problem.mass * (self.v * self.v).sum(axis=0) + self.problem.charge * phi
 
     @cached_property
@@ -100,12 +100,12 @@ class ParticleOrbit:
         if self.problem.form == "canonical":
             p = self.y[3:]
         else:
-            p = self.problem.mass * self.v + self.problem.charge * self.problem.field.along("A", self.x)
+            p = self.problem.mass * self.v + self.problem.charge * self.problem.field.along("A", self.x, self.t)
         return self.y[0] * p[1] - self.y[1] * p[0]
 
     @cached_property
     def _magnetic(self) -> np.ndarray:
-        return self.problem.field.along("B", self.x)
+        return self.problem.field.along("B", self.x, self.t)
 
     @cached_property
     def _strength(self) -> np.ndarray:
@@ -125,7 +125,7 @@ class ParticleOrbit:
     def _gyrating(self) -> np.ndarray:
         """Velocity across B without the drift E x B / B^2."""
         across = self.v - self.parallel_velocity / self._strength * self._magnetic
-        E = self.problem.field.along("E", self.x)
+        E = self.problem.field.along("E", self.x, self.t)
         return across - np.cross(E, self._magnetic, axis=0) / self._strength**2
 
     @cached_property

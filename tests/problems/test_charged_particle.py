@@ -7,6 +7,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 from numba import njit
+from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, Invariant, check_gradient, integrate
 from eip_scipy.problems import TOKAMAK, UNIFORM, ParticleField, charged_particle, tokamak, uniform_field
@@ -55,10 +56,10 @@ def test_field_is_the_papers(field, paper, point):
         exact = [mp.mpf(c) for c in point]
         A, phi = paper(*exact)
         jacobian, slope = exact_jacobian(paper, exact)
-    np.testing.assert_allclose(functions.A(*point), np.array(A, dtype=float), rtol=1e-14, atol=1e-16)
-    np.testing.assert_allclose(functions.phi(*point), float(phi), rtol=1e-15)
-    np.testing.assert_allclose(np.array(functions.jacobian(*point)), jacobian, rtol=1e-13, atol=1e-15)
-    np.testing.assert_allclose(functions.E(*point), -slope, rtol=1e-13, atol=1e-17)
+    np.testing.assert_allclose(functions.A(0.0, *point), np.array(A, dtype=float), rtol=1e-14, atol=1e-16)
+    np.testing.assert_allclose(functions.phi(0.0, *point), float(phi), rtol=1e-15)
+    np.testing.assert_allclose(np.array(functions.jacobian(0.0, *point)), jacobian, rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(functions.E(0.0, *point), -slope, rtol=1e-13, atol=1e-17)
 
 
 @pytest.mark.parametrize(("field", "paper"), FIELDS, ids=["uniform", "tokamak"])
@@ -69,16 +70,16 @@ def test_magnetic_field_is_the_curl_and_the_papers(field, paper, point):
         d, _ = exact_jacobian(paper, exact)
         printed = (0, 0, 1) if field is UNIFORM else paper_tokamak_magnetic(*exact)
     curl = [d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1]]
-    np.testing.assert_allclose(field.functions.B(*point), curl, rtol=1e-13, atol=1e-15)
-    np.testing.assert_allclose(field.functions.B(*point), np.array(printed, dtype=float), rtol=1e-14, atol=1e-16)
+    np.testing.assert_allclose(field.functions.B(0.0, *point), curl, rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(field.functions.B(0.0, *point), np.array(printed, dtype=float), rtol=1e-14, atol=1e-16)
 
 
 def test_fields_along_many_points():
     x = np.array(POINTS).T
     for key in ("A", "E", "B"):
-        expected = np.array([getattr(UNIFORM.functions, key)(*point) for point in POINTS]).T
+        expected = np.array([getattr(UNIFORM.functions, key)(0.0, *point) for point in POINTS]).T
         np.testing.assert_array_equal(UNIFORM.along(key, x), expected)
-    np.testing.assert_array_equal(UNIFORM.along("phi", x), [UNIFORM.functions.phi(*point) for point in POINTS])
+    np.testing.assert_array_equal(UNIFORM.along("phi", x), [UNIFORM.functions.phi(0.0, *point) for point in POINTS])
 
 
 # --- equations and invariants ---
@@ -353,7 +354,7 @@ def test_differences_take_the_fields_length():
         lambda x, y, z: (-y * math.cos(z / small), x * math.cos(z / small), 0.0), axisymmetric=True, length=small
     )
     x = np.array([0.3, -0.2, 0.5]) * small
-    jacobian = np.array(field.functions.jacobian(*x))
+    jacobian = np.array(field.functions.jacobian(0.0, *x))
     assert jacobian[0, 2] == pytest.approx(x[1] / small * math.sin(0.5), rel=1e-11)
 
 
@@ -510,3 +511,120 @@ def test_further_invariants_can_be_added():
     p_z = Invariant(lambda t, y, params: y[5], lambda t, y, params: np.eye(6)[5], args=(problem.params,), name="p_z")
     run = integrate(problem, method=EIPRK4, invariants=[*problem.invariants, p_z])
     assert run.max_defect[2] == 0.0
+
+
+# --- fields that vary, and balances ---
+
+
+def ring_a(t, x, y, z):
+    around = (1 + 1e-4 * t) * (0.5 + (x * x + y * y) / 4)
+    return -around * y, around * x, 0.0
+
+
+def ring_b(t, x, y, z):
+    return 0.0, 0.0, (1 + 1e-4 * t) * (1 + x * x + y * y)
+
+
+def ring_phi(t, x, y, z):
+    return 0.02 * (1 + 5e-4 * t) * (x * x + y * y)
+
+
+def ring_e(t, x, y, z):
+    out, around = -0.04 * (1 + 5e-4 * t), 1e-4 * (0.5 + (x * x + y * y) / 4)
+    return out * x + around * y, out * y - around * x, 0.0
+
+
+def ring(**options):
+    given = {"vector_potential": ring_a, "magnetic": ring_b, "electric": ring_e, "axisymmetric": True, "varies": True}
+    return ParticleField(**(given | options))
+
+
+def moving(field, balances=None, t_end=20.0, **options):
+    given = {"form": "velocity", "h": 0.4, "mass": 1.5, "charge": -0.7} | options
+    return charged_particle(field, [0.5, 0.1, 0.2], [0.1, 0.3, 0.05], t_span=(0.5, t_end), balances=balances, **given)
+
+
+@pytest.mark.parametrize(
+    ("field", "balances", "names"),
+    [
+        (ring(), None, "L"),
+        (ring(), "energy", "TL"),
+        (ring(potential=ring_phi), None, "L"),
+        (ring(potential=ring_phi), "energy", "HL"),
+        (ring(potential=ring_phi), "kinetic", "TL"),
+        (ParticleField(magnetic=mirror_b, electric=well_force), "energy", "T"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:balance 'T' changes")  # in a potential
+def test_energies_in_fields_that_do_work(field, balances, names):
+    problem = moving(field, balances)
+    assert "".join(item.name for item in problem.invariants) == names
+    y = problem.y0
+    v, m, q = y[3:], problem.mass, problem.charge
+    E = np.array(field.functions.E(0.5, *y[:3]))
+    B = np.array(field.functions.B(0.5, *y[:3]))
+    np.testing.assert_allclose(problem.fun(0.5, y)[3:], q / m * (E + np.cross(v, B)), rtol=1e-14, atol=1e-16)
+    for item in problem.invariants:
+        if item.name == "T":
+            assert item.fun(0.5, y, problem.params) == pytest.approx(0.5 * m * v @ v, rel=1e-15)
+            assert item.rate_function(0.5, y, problem.params) == pytest.approx(q * v @ E, rel=1e-14)
+        elif item.name == "H":
+            expected = 0.5 * m * v @ v + q * ring_phi(0.5, *y[:3])
+            assert item.fun(0.5, y, problem.params) == pytest.approx(expected, rel=1e-15)
+    run = integrate(problem, method=EIPDOP853)
+    assert run.trusted
+    exact = solve_ivp(problem.fun, problem.t_span, y, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    np.testing.assert_allclose(run.y[:, -1], exact, rtol=0, atol=2e-7)
+
+
+def test_a_cycloid():
+    """In constant fields E along x and B along z the charge drifts along -y; the potential is not given."""
+    drift, end = 0.01, 600.0
+    field = ParticleField(magnetic=lambda x, y, z: (0.0, 0.0, 1.0), electric=lambda x, y, z: (drift, 0.0, 0.0))
+    problem = charged_particle(
+        field, [0, 0, 0], [0, 0.5, 0], t_span=(0, end), h=0.5, form="velocity", balances="energy"
+    )
+    speed = 0.5 + drift
+    exact = np.array([speed * (1 - np.cos(end)), speed * np.sin(end) - drift * end])
+    errors = [
+        np.linalg.norm(integrate(problem, method=EIPDOP853, invariants=kept).y[:2, -1] - exact)
+        for kept in ((), problem.invariants)
+    ]
+    assert errors[0] < 1e-4
+    assert errors[1] < 1.1 * errors[0]
+
+
+def test_the_total_energy_keeps_a_place():
+    """Against DOP853 of SciPy with rtol=1e-13; nothing depends on z, so that v_z has to be kept as well."""
+    problem = moving(ring(potential=ring_phi), "energy", t_end=1000.0, h=0.4, mass=1.0, charge=1.0)
+    exact = solve_ivp(problem.fun, problem.t_span, problem.y0, method="DOP853", rtol=1e-13, atol=1e-15).y[:3, -1]
+    along = Invariant(lambda t, y, params: y[5], name="v_z")
+    errors = [
+        np.linalg.norm(integrate(problem, method=EIPDOP853, invariants=kept).y[:3, -1] - exact)
+        for kept in ((), (*problem.invariants, along))
+    ]
+    assert 20 * errors[1] < errors[0]
+
+
+def test_observables_of_a_field_that_varies():
+    problem = moving(ring(potential=ring_phi), "energy")
+    run = integrate(problem, method=EIPDOP853, save_every=1)
+    orbit = ParticleOrbit(problem, run.t, run.y)
+    np.testing.assert_allclose(orbit.gyrofrequency, 0.7 / 1.5 * (1 + 1e-4 * run.t) * (1 + orbit.R**2), rtol=1e-14)
+    np.testing.assert_allclose(orbit.momentum, orbit.momentum[0], rtol=1e-6)
+    assert 1e-6 < np.ptp(orbit.energy) < 1e-2
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: ring(electric=None), "a field that varies needs electric"),
+        (lambda: moving(ring(), form="canonical"), "a field that varies needs form='velocity'"),
+        (lambda: moving(UNIFORM, "energy", form="canonical"), "balances need form='velocity'"),
+        (lambda: moving(ring(), "energie"), "balances must be 'energy', 'kinetic' or None"),
+        (lambda: moving(ring(magnetic=lambda t, x, y, z: (0.0, 0.0, 2.0))), "the curl of"),
+    ],
+)
+def test_what_is_refused_of_varying_fields(make, match):
+    with pytest.raises(ValueError, match=match):
+        make()

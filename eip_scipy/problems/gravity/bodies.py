@@ -12,7 +12,7 @@ from ...core.problem import Problem
 from ...core.units import Unit, in_unit, is_time
 from ...core.units import units as known_units
 from ...engine.native import library
-from .forces import KIND, MOON_BODY, OBLATENESS, RELATIVITY
+from .forces import DRAG, KIND, MOON_BODY, OBLATENESS, RELATIVITY
 
 __all__ = ["Bodies", "bodies_of", "body_names", "default_units", "in_units"]
 
@@ -47,6 +47,7 @@ class Bodies(NamedTuple):
             *kind,
             *(("j2",) if further[OBLATENESS] else ()),
             *(("moon-quadrupole",) if further[MOON_BODY] >= 0 else ()),
+            *(("drag",) if further[DRAG] else ()),
         )
 
 

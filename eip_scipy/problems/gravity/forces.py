@@ -1,4 +1,4 @@
-"""What the bodies feel besides Newton's gravitation: relativity, the Sun's oblateness, a Moon without orbit.
+"""What the bodies feel besides Newton's gravitation: relativity, oblateness, a Moon without orbit, drag.
 
 All terms are chosen by numbers in the vector of parameters, so that one right-hand side serves every combination:
 first G m of each body, then the entries that `parameters` lists. The first body is the Sun; each force on another body
@@ -29,14 +29,15 @@ FORCES = {
     "gr-potential": "a potential in 1/r^2 that advances perihelia as relativity does (Nobili & Roxburgh)",
     "j2": "the Sun's oblateness J2",
     "moon-quadrupole": "the Moon smeared out along a circle around the Earth",
+    "drag": "drag in the first body's atmosphere, whose density falls exponentially",
 }
 """Names of the forces with a line on each."""
 
 RELATIVITY = ("1pn", "eih", "gr-potential")
-VELOCITY_DEPENDENT = ("1pn", "eih")
+VELOCITY_DEPENDENT = ("1pn", "eih", "drag")
 # Entries after the G m: which relativity (0: none, else 1 + its place in RELATIVITY), 1/c^2, J2 R^2, the pole (3), the
-# body with the Moon, its coefficient.
-KIND, OVER_C2, OBLATENESS, POLE, MOON_BODY, MOON, N_ENTRIES = 0, 1, 2, 3, 6, 7, 8
+# body with the Moon, its coefficient; of drag the coefficient, where it holds, the scale height and the air's rotation.
+KIND, OVER_C2, OBLATENESS, POLE, MOON_BODY, MOON, DRAG, N_ENTRIES = 0, 1, 2, 3, 6, 7, 8, 12
 # Round-off of an energy in which large terms nearly cancel: what "kept" means for invariants that are not exact.
 KEPT = 1e-13
 
@@ -52,11 +53,18 @@ class ForceConstants:
     j2 : float, optional
         J2 times the square of the Sun's equatorial radius: "j2".
     pole : sequence of 3 floats, optional
-        The Sun's axis of rotation, of any length: "j2".
+        The Sun's axis of rotation, of any length: "j2", and "drag" with `spin`.
     moon_body : int, optional
         Index of the body that stands for Earth and Moon: "moon-quadrupole".
     moon : float, optional
         ``a^2 m_E m_M / (4 (m_E + m_M)^2)``, a the radius of the Moon's orbit: "moon-quadrupole".
+    drag : float, optional
+        Acceleration per squared speed relative to the air at the distance `drag_radius`, half the density times
+        c_D A / m of the bodies: "drag".
+    drag_radius, scale_height : float, optional
+        Distance from the first body at which `drag` holds, and over how much distance the density falls by e: "drag".
+    spin : float, optional
+        Angular velocity of the atmosphere about the pole, 0 by default: "drag".
     """
 
     c: float | None = None
@@ -64,9 +72,13 @@ class ForceConstants:
     pole: Sequence[float] | None = None
     moon_body: int | None = None
     moon: float | None = None
+    drag: float | None = None
+    drag_radius: float | None = None
+    scale_height: float | None = None
+    spin: float = 0.0
 
     def __post_init__(self) -> None:
-        refuse_units(c=self.c, j2=self.j2, pole=self.pole, moon=self.moon)
+        refuse_units(**vars(self))
 
 
 NEEDS = {
@@ -75,6 +87,7 @@ NEEDS = {
     "gr-potential": ("c",),
     "j2": ("j2", "pole"),
     "moon-quadrupole": ("moon_body", "moon"),
+    "drag": ("drag", "drag_radius", "scale_height"),
 }
 
 
@@ -113,6 +126,10 @@ def parameters(gm: np.ndarray, forces: tuple[str, ...], constants: ForceConstant
     for force in forces:
         for name in NEEDS[force]:
             _check_constant(force, name, getattr(known, name), gm.size)
+    if "drag" in forces and known.spin != 0:
+        _check_constant("drag", "pole", known.pole, gm.size)
+        if not isfinite(known.spin):
+            raise ValueError(f"ForceConstants: spin must be a finite number; got {known.spin!r}.")
     if not gm[0] > 0:
         raise ValueError(f"forces: the first body must be the Sun, with G m > 0; its G m is {gm[0]!r}.")
     entries = np.zeros(N_ENTRIES)
@@ -121,8 +138,12 @@ def parameters(gm: np.ndarray, forces: tuple[str, ...], constants: ForceConstant
         if name in forces:
             entries[KIND], entries[OVER_C2] = place, 1.0 / np.float64(known.c) ** 2
     if "j2" in forces:
+        entries[OBLATENESS] = known.j2
+    if "drag" in forces:
+        entries[DRAG:] = known.drag, known.drag_radius, known.scale_height, known.spin
+    if known.pole is not None and {"j2", "drag"} & set(forces):
         pole = np.asarray(known.pole, dtype=float)
-        entries[OBLATENESS], entries[POLE : POLE + 3] = known.j2, pole / np.linalg.norm(pole)
+        entries[POLE : POLE + 3] = pole / np.linalg.norm(pole)
     if "moon-quadrupole" in forces:
         entries[MOON_BODY], entries[MOON] = known.moon_body, known.moon
     return np.concatenate([gm, entries])
@@ -156,6 +177,8 @@ def acceleration(y: np.ndarray, params: np.ndarray) -> np.ndarray:
 
 def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> tuple[Invariant, ...]:
     """The invariants that the equations have with these forces, see `nbody`."""
+    if "drag" in forces:
+        return ()
     if "1pn" in forces:
         if y0.size > 12 or len(forces) > 1:
             return ()

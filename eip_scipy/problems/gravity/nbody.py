@@ -75,6 +75,8 @@ def nbody(
             The Sun's oblateness.
         "moon-quadrupole"
             The Moon smeared out along a circle around the Earth, for data with one body for the two.
+        "drag"
+            Drag on all other bodies in an atmosphere of the first one, see `satellite`.
 
         At most one of the first three.
     constants : ForceConstants, optional
@@ -129,14 +131,15 @@ def nbody(
     "j2", also with these two         "H" and "L_pole", the component of L along the Sun's pole, exact
     "1pn" alone, two bodies           "H" and "L" of the relative motion, per reduced mass, exact
     "1pn" otherwise                   none: no more bodies have an exact energy with it
+    "drag"                            none
     "eih"                             "H" and "L" ("L_pole" with "j2") with their terms in 1/c^2. What is left
                                       is of the order of 1/c^4; they are given where that is below 1e-13 at
                                       the start, as in the solar system, and otherwise left out
     ================================  ======================================================================
 
     Momentum and centre of mass are Newton's, exact, with all but "eih", whose own momentum differs in 1/c^2; there the
-    frame only keeps corrections from moving the centre of mass. With "1pn" and "eih" accelerations depend on
-    velocities: `acc` is None, and Nystrom methods do not apply.
+    frame only keeps corrections from moving the centre of mass. With "1pn", "eih" and "drag" accelerations depend
+    on velocities: `acc` is None, and Nystrom methods do not apply.
     """
     t_span = apart(t_span)
     units = units or default_units(gm, position, velocity, t_span)

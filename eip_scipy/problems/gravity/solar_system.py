@@ -71,6 +71,8 @@ def solar_system(
     refuse_units(years=years, h=h)
     known = load(data) if isinstance(data, str) else data
     chosen = check_forces(forces)
+    if "drag" in chosen:
+        raise ValueError("solar_system: the force 'drag' needs an atmosphere; see satellite(...), or nbody(...).")
     length, time = _units(units)
     year = YEAR_D * time
     references = reference_states() if _starts_as_references(known) and not chosen else {}

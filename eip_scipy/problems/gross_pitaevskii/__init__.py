@@ -1,5 +1,6 @@
 """The rotating Gross-Pitaevskii equation in one, two and three dimensions."""
 
+from .damped import DampedGrossPitaevskii
 from .equation import FieldProblem, GrossPitaevskii
 from .flows import LinearFlow
 from .frames import at_rest, rotated
@@ -18,6 +19,7 @@ __all__ = [
     "RKN6",
     "S6",
     "STRANG",
+    "DampedGrossPitaevskii",
     "FieldProblem",
     "Grid",
     "GrossPitaevskii",

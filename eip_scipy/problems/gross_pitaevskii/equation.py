@@ -20,7 +20,7 @@ from .pointwise import add_potential, derivative, derivative_at_once
 from .splitting import Splitting
 from .transforms import Axes, make_transforms
 
-__all__ = ["FieldProblem", "GrossPitaevskii"]
+__all__ = ["FieldProblem", "GrossPitaevskii", "on_grid"]
 
 NYQUIST = ("true", "zero")
 MOMENTA = ("momentum_x", "momentum_y", "momentum_z")
@@ -120,7 +120,7 @@ class GrossPitaevskii:
         if Omega != 0 and grid.dim == 1:
             raise ValueError(f"a rotation needs two dimensions: Omega = {Omega!r} on {grid!r}.")
         self.grid, self.Omega, self.beta, self.nyquist = grid, float(Omega), float(beta), nyquist
-        self.V = _on_grid(potential, grid)
+        self.V = on_grid(potential, grid)
         self.transforms = make_transforms(fft, threads)
         self.fft = self.transforms.name
         self._options = {"nyquist": nyquist, "fft": fft, "threads": threads}
@@ -415,15 +415,15 @@ class GrossPitaevskii:
         return float(limit / (self.largest_frequency() + local))
 
 
-def _on_grid(potential: Any, grid: Grid) -> np.ndarray:
-    """The potential's values (J[, K[, L]])."""
+def on_grid(potential: Any, grid: Grid, name: str = "potential") -> np.ndarray:
+    """Return the values (J[, K[, L]]) of a potential, or of what `name` says."""
     values = np.asarray(potential(*grid.mesh()) if callable(potential) else 0.0 if potential is None else potential)
     if values.dtype.kind not in "fiu":
-        raise ValueError(f"potential must be real, got values of type {values.dtype}.")
+        raise ValueError(f"{name} must be real, got values of type {values.dtype}.")
     try:
         values = np.broadcast_to(values, grid.shape)
     except ValueError:
-        raise ValueError(f"potential has shape {values.shape}, which does not fit {grid!r}.") from None
+        raise ValueError(f"{name} has shape {values.shape}, which does not fit {grid!r}.") from None
     if not np.isfinite(values).all():
-        raise ValueError("potential is not finite everywhere on the grid.")
+        raise ValueError(f"{name} is not finite everywhere on the grid.")
     return np.ascontiguousarray(values, dtype=float)

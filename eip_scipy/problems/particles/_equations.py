@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from ...core.gradients import DIFFERENCE_WEIGHTS
-from ...core.jitted import compiled_like, is_compiled
+from ...core.jitted import compiled_like, is_compiled, is_jitted
 
 __all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like"]
 
@@ -21,7 +21,7 @@ MASS, CHARGE = 0, 1  # places in the parameters
 
 
 class FieldFunctions(NamedTuple):
-    """Functions of the position (x, y, z); A with its jacobian, and phi, only where they are known."""
+    """Functions of (t, x, y, z); A with its jacobian, and phi, only where they are known."""
 
     A: Callable[..., Any] | None
     jacobian: Callable[..., Any] | None
@@ -38,6 +38,9 @@ class ParticleEquations(NamedTuple):
     energy_gradient: Callable[..., None]
     momentum: Callable[..., float] | None
     momentum_gradient: Callable[..., None] | None
+    kinetic: Callable[..., float] | None = None
+    kinetic_gradient: Callable[..., None] | None = None
+    power: Callable[..., float] | None = None
 
 
 def jit_like(fun: Callable[..., Any], *others: Callable[..., Any] | None) -> Callable[..., Any]:
@@ -65,12 +68,12 @@ def _register() -> None:
         register_jitable(error_model="numpy", _nrt=False)(fun)
 
 
-def no_potential(x, y, z):
+def no_potential(t, x, y, z):
     """A potential that is 0 everywhere."""
     return 0.0
 
 
-def no_force(x, y, z):
+def no_force(t, x, y, z):
     """An electric field that is 0 everywhere."""
     return 0.0, 0.0, 0.0
 
@@ -99,10 +102,10 @@ def _canonical(field: FieldFunctions) -> ParticleEquations:
     A, jacobian, phi, E = field.A, field.jacobian, field.phi, field.E
 
     def rhs(t, y, out, params):
-        canonical_rhs(A, jacobian, E, y, out, params[MASS], params[CHARGE])
+        canonical_rhs(A, jacobian, E, t, y, out, params[MASS], params[CHARGE])
 
     def energy(t, y, params):
-        return canonical_energy(A, phi, y, params[MASS], params[CHARGE])
+        return canonical_energy(A, phi, t, y, params[MASS], params[CHARGE])
 
     return ParticleEquations(
         jit_like(rhs, A, jacobian, E),
@@ -114,11 +117,11 @@ def _canonical(field: FieldFunctions) -> ParticleEquations:
 
 
 @_jitable
-def canonical_rhs(A, jacobian, E, y, out, m, q):
+def canonical_rhs(A, jacobian, E, t, y, out, m, q):
     """Canonical: x' = v = (p - q A) / m, p_j' = q (sum_i v_i dA_i/dx_j + E_j)."""
-    a = A(y[0], y[1], y[2])
-    d = jacobian(y[0], y[1], y[2])
-    e = E(y[0], y[1], y[2])
+    a = A(t, y[0], y[1], y[2])
+    d = jacobian(t, y[0], y[1], y[2])
+    e = E(t, y[0], y[1], y[2])
     inverse = 1.0 / m  # does not wait for the field, as a division of the velocity would
     u = (y[3] - q * a[0]) * inverse
     v = (y[4] - q * a[1]) * inverse
@@ -132,13 +135,13 @@ def canonical_rhs(A, jacobian, E, y, out, m, q):
 
 
 @_jitable
-def canonical_energy(A, phi, y, m, q):
+def canonical_energy(A, phi, t, y, m, q):
     """H = |p - q A|^2 / (2 m) + q phi (the paper's eq. 3.7)."""
-    a = A(y[0], y[1], y[2])
+    a = A(t, y[0], y[1], y[2])
     u = y[3] - q * a[0]
     v = y[4] - q * a[1]
     w = y[5] - q * a[2]
-    return 0.5 / m * (u * u + v * v + w * w) + q * phi(y[0], y[1], y[2])
+    return 0.5 / m * (u * u + v * v + w * w) + q * phi(t, y[0], y[1], y[2])
 
 
 def canonical_energy_gradient(t, y, f, out, params):
@@ -173,19 +176,23 @@ def _velocity(field: FieldFunctions) -> ParticleEquations:
     A, jacobian, phi, E, B = field
 
     def rhs(t, y, out, params):
-        velocity_rhs(E, B, y, out, params[CHARGE] / params[MASS])
+        velocity_rhs(E, B, t, y, out, params[CHARGE] / params[MASS])
 
     def energy(t, y, params):
-        return velocity_energy(phi, y, params[MASS], params[CHARGE])
+        return velocity_energy(phi, t, y, params[MASS], params[CHARGE])
 
     def energy_gradient(t, y, out, params):
-        velocity_energy_gradient(E, y, out, params[MASS], params[CHARGE])
+        velocity_energy_gradient(E, t, y, out, params[MASS], params[CHARGE])
 
     def momentum(t, y, params):
-        return velocity_momentum(A, y, params[MASS], params[CHARGE])
+        return velocity_momentum(A, t, y, params[MASS], params[CHARGE])
 
     def momentum_gradient(t, y, out, params):
-        velocity_momentum_gradient(A, jacobian, y, out, params[MASS], params[CHARGE])
+        velocity_momentum_gradient(A, jacobian, t, y, out, params[MASS], params[CHARGE])
+
+    def power(t, y, params):
+        e = E(t, y[0], y[1], y[2])
+        return params[CHARGE] * (y[3] * e[0] + y[4] * e[1] + y[5] * e[2])
 
     known = A is not None
     return ParticleEquations(
@@ -194,14 +201,17 @@ def _velocity(field: FieldFunctions) -> ParticleEquations:
         jit_like(energy_gradient, E),
         jit_like(momentum, A) if known else None,
         jit_like(momentum_gradient, A, jacobian) if known else None,
+        jit_like(kinetic_energy, E),
+        jit_like(kinetic_energy_gradient, E),
+        jit_like(power, E),
     )
 
 
 @_jitable
-def velocity_rhs(E, B, y, out, ratio):
+def velocity_rhs(E, B, t, y, out, ratio):
     """Newton's: x' = v, v' = (q / m) (E + v x B) (the paper's eq. 3.8)."""
-    e = E(y[0], y[1], y[2])
-    b = B(y[0], y[1], y[2])
+    e = E(t, y[0], y[1], y[2])
+    b = B(t, y[0], y[1], y[2])
     u, v, w = y[3], y[4], y[5]
     out[0] = u
     out[1] = v
@@ -212,15 +222,28 @@ def velocity_rhs(E, B, y, out, ratio):
 
 
 @_jitable
-def velocity_energy(phi, y, m, q):
+def velocity_energy(phi, t, y, m, q):
     """H = m |v|^2 / 2 + q phi."""
-    return 0.5 * m * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5]) + q * phi(y[0], y[1], y[2])
+    return 0.5 * m * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5]) + q * phi(t, y[0], y[1], y[2])
+
+
+def kinetic_energy(t, y, params):
+    """Kinetic energy m |v|^2 / 2."""
+    return 0.5 * params[MASS] * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5])
+
+
+def kinetic_energy_gradient(t, y, out, params):
+    """Gradient of the kinetic energy, (0, m v)."""
+    out[:3] = 0.0
+    out[3] = params[MASS] * y[3]
+    out[4] = params[MASS] * y[4]
+    out[5] = params[MASS] * y[5]
 
 
 @_jitable
-def velocity_energy_gradient(E, y, out, m, q):
+def velocity_energy_gradient(E, t, y, out, m, q):
     """Of H: (-q E, m v)."""
-    e = E(y[0], y[1], y[2])
+    e = E(t, y[0], y[1], y[2])
     out[0] = -q * e[0]
     out[1] = -q * e[1]
     out[2] = -q * e[2]
@@ -230,17 +253,17 @@ def velocity_energy_gradient(E, y, out, m, q):
 
 
 @_jitable
-def velocity_momentum(A, y, m, q):
+def velocity_momentum(A, t, y, m, q):
     """L = x p_y - y p_x with p = m v + q A."""
-    a = A(y[0], y[1], y[2])
+    a = A(t, y[0], y[1], y[2])
     return y[0] * (m * y[4] + q * a[1]) - y[1] * (m * y[3] + q * a[0])
 
 
 @_jitable
-def velocity_momentum_gradient(A, jacobian, y, out, m, q):
+def velocity_momentum_gradient(A, jacobian, t, y, out, m, q):
     """Of L."""
-    a = A(y[0], y[1], y[2])
-    d = jacobian(y[0], y[1], y[2])
+    a = A(t, y[0], y[1], y[2])
+    d = jacobian(t, y[0], y[1], y[2])
     out[0] = q * (y[0] * d[1][0] - y[1] * d[0][0] + a[1]) + m * y[4]
     out[1] = q * (y[0] * d[1][1] - y[1] * d[0][1] - a[0]) - m * y[3]
     out[2] = q * (y[0] * d[1][2] - y[1] * d[0][2])
@@ -252,11 +275,25 @@ def velocity_momentum_gradient(A, jacobian, y, out, m, q):
 # What a field does not give, from what it gives.
 
 
+def at_any_time(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of (t, x, y, z) that is `fun` of (x, y, z)."""
+
+    def timeless(t, x, y, z):
+        return fun(x, y, z)
+
+    if not is_jitted(fun):
+        return timeless
+    from numba import njit
+
+    # A function that returns an array needs Numba's memory, which the callers here are compiled without.
+    return cast(Callable[..., Any], njit(timeless, error_model="numpy", _nrt=True))
+
+
 def curl(jacobian: Callable[..., Any]) -> Callable[..., Any]:
     """B = curl A from the rows of dA_i/dx_j."""
 
-    def magnetic(x, y, z):
-        d = jacobian(x, y, z)
+    def magnetic(t, x, y, z):
+        d = jacobian(t, x, y, z)
         return d[2][1] - d[1][2], d[0][2] - d[2][0], d[1][0] - d[0][1]
 
     return jit_like(magnetic, jacobian)
@@ -265,11 +302,11 @@ def curl(jacobian: Callable[..., Any]) -> Callable[..., Any]:
 def difference_jacobian(A: Callable[..., Any], step: float) -> Callable[..., Any]:
     """Rows of dA_i/dx_j by central differences of order 6."""
 
-    def along(x, y, z, dx, dy, dz):
+    def along(t, x, y, z, dx, dy, dz):
         d0 = d1 = d2 = 0.0
         for k, weight in DIFFERENCE_WEIGHTS:
-            right = A(x + k * dx, y + k * dy, z + k * dz)
-            left = A(x - k * dx, y - k * dy, z - k * dz)
+            right = A(t, x + k * dx, y + k * dy, z + k * dz)
+            left = A(t, x - k * dx, y - k * dy, z - k * dz)
             d0 += weight * (right[0] - left[0])
             d1 += weight * (right[1] - left[1])
             d2 += weight * (right[2] - left[2])
@@ -277,10 +314,10 @@ def difference_jacobian(A: Callable[..., Any], step: float) -> Callable[..., Any
 
     along = jit_like(along, A)
 
-    def jacobian(x, y, z):
-        a = along(x, y, z, step, 0.0, 0.0)
-        b = along(x, y, z, 0.0, step, 0.0)
-        c = along(x, y, z, 0.0, 0.0, step)
+    def jacobian(t, x, y, z):
+        a = along(t, x, y, z, step, 0.0, 0.0)
+        b = along(t, x, y, z, 0.0, step, 0.0)
+        c = along(t, x, y, z, 0.0, 0.0, step)
         return (a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[2], b[2], c[2])
 
     return jit_like(jacobian, A)
@@ -289,12 +326,12 @@ def difference_jacobian(A: Callable[..., Any], step: float) -> Callable[..., Any
 def difference_force(phi: Callable[..., Any], step: float) -> Callable[..., Any]:
     """E = -grad phi by central differences of order 6."""
 
-    def force(x, y, z):
+    def force(t, x, y, z):
         e0 = e1 = e2 = 0.0
         for k, weight in DIFFERENCE_WEIGHTS:
-            e0 -= weight * (phi(x + k * step, y, z) - phi(x - k * step, y, z))
-            e1 -= weight * (phi(x, y + k * step, z) - phi(x, y - k * step, z))
-            e2 -= weight * (phi(x, y, z + k * step) - phi(x, y, z - k * step))
+            e0 -= weight * (phi(t, x + k * step, y, z) - phi(t, x - k * step, y, z))
+            e1 -= weight * (phi(t, x, y + k * step, z) - phi(t, x, y - k * step, z))
+            e2 -= weight * (phi(t, x, y, z + k * step) - phi(t, x, y, z - k * step))
         return e0 / step, e1 / step, e2 / step
 
     return jit_like(force, phi)

@@ -1,4 +1,4 @@
-"""Charged particles in static electromagnetic fields: the paper's Experiment III, and fields of one's own."""
+"""Charged particles in electromagnetic fields: the paper's Experiment III, and fields of one's own."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.balances import Balance
 from ...core.inputs import refuse_units
 from ...core.invariants import Invariant
 from ...core.names import nearest
@@ -22,6 +23,7 @@ from .fields import TOKAMAK, UNIFORM, ParticleField
 __all__ = ["ORBITS", "ParticleProblem", "charged_particle", "tokamak", "uniform_field"]
 
 FORMS = ("canonical", "velocity")
+BALANCES = ("energy", "kinetic")
 STEP = pi / 10  # a twentieth of the gyro-period
 UNIFORM_STEPS, TOKAMAK_STEPS = 270_000, 500_000
 ORBITS = {"banana": 1.0, "transit": 2.0}
@@ -86,8 +88,9 @@ def charged_particle(
     units: str = "",
     source: str = "",
     reference: Callable[[float], np.ndarray | None] | None = None,
+    balances: str | None = None,
 ) -> ParticleProblem:
-    """One charged particle in a static field, m x'' = q (E(x) + x' x B(x)).
+    """One charged particle in a field, m x'' = q (E(t, x) + x' x B(t, x)).
 
     Parameters
     ----------
@@ -100,16 +103,20 @@ def charged_particle(
         A step; a twentieth of the gyro-period 2 pi m / (q B) is a sensible one.
     mass, charge : float, optional
     form : {"canonical", "velocity"}, optional
-        The state: (x, p) with p = m x' + q A(x), or (x, x').
+        The state: (x, p) with p = m x' + q A(x), or (x, x'). A field that varies needs "velocity".
     name, units, source : str, optional
     reference : callable, optional
+    balances : {"energy", "kinetic"}, optional
+        Keep an energy as a `Balance` in place of the invariant "H", in the form "velocity": "kinetic" the kinetic
+        energy "T", at the rate q v . E; "energy" the total energy "H" of a field that varies and has a potential, at
+        the rate q (dphi/dt - v . dA/dt), and else "T".
 
     Returns
     -------
     ParticleProblem
-        Invariants "H", the energy, where the field has a potential or no electric field; and "L", the angular
-        momentum x p_y - y p_x, where the field is said to be axisymmetric and A is known. Blocks of 3: the error metric
-        does not depend on the orientation of the axes.
+        Invariants "H", the energy, where the field is static and has a potential or no electric field; and "L",
+        the angular momentum x p_y - y p_x, where the field is said to be axisymmetric and A is known. Blocks of 3: the
+        error metric does not depend on the orientation of the axes.
 
     Raises
     ------
@@ -148,11 +155,17 @@ def charged_particle(
         raise ValueError(
             "charged_particle: the canonical form needs the field's vector_potential; give it, or take form='velocity'."
         )
+    if form == "canonical" and (field.varies or balances is not None):
+        what = "balances need" if balances is not None else "a field that varies needs"
+        raise ValueError(f"charged_particle: {what} form='velocity', got the form 'canonical'.")
+    if balances is not None and balances not in BALANCES:
+        hint = nearest(str(balances), BALANCES)
+        raise ValueError(f"charged_particle: balances must be 'energy', 'kinetic' or None, got {balances!r}{hint}")
     x, v = _vector("position", position), _vector("velocity", velocity)
     params = np.array([mass, charge], dtype=float)
     if not (0 < params[MASS] < inf and params[CHARGE] != 0 and np.isfinite(params[CHARGE])):
         raise ValueError(f"charged_particle: mass must be positive and charge not 0, got {mass!r} and {charge!r}.")
-    field.check(x)
+    field.check(x, float(t_span[0]))
     equations = _equations(field, form)
     momentum = v if form == "velocity" else params[MASS] * v + params[CHARGE] * field.along("A", x[:, None])[:, 0]
     return ParticleProblem(
@@ -163,7 +176,7 @@ def charged_particle(
         t_span=(float(t_span[0]), float(t_span[1])),
         h=h,
         params=params,
-        invariants=_invariants(equations, field, form, params),
+        invariants=_invariants(equations, field, form, params, balances),
         blocks=3,
         component_names=("x", "y", "z", *(("vx", "vy", "vz") if form == "velocity" else ("px", "py", "pz"))),
         units=units,
@@ -181,10 +194,16 @@ def _equations(field: ParticleField, form: str) -> ParticleEquations:
 
 
 def _invariants(
-    equations: ParticleEquations, field: ParticleField, form: str, params: np.ndarray
+    equations: ParticleEquations, field: ParticleField, form: str, params: np.ndarray, balances: str | None
 ) -> tuple[Invariant, ...]:
-    found = []
-    if equations.energy is not None:
+    found: list[Invariant] = []
+    if balances == "energy" and field.varies and equations.energy is not None:
+        found.append(Balance(equations.energy, args=(params,), name="H"))
+    elif balances is not None:
+        kinetic, gradient, power = equations.kinetic, equations.kinetic_gradient, equations.power
+        assert kinetic is not None
+        found.append(Balance(kinetic, power, gradient, args=(params,), in_place=True, name="T"))
+    elif equations.energy is not None and not field.varies:
         found.append(
             Invariant(
                 equations.energy,

@@ -14,6 +14,7 @@ import numpy as np
 from ...core.jitted import compilable, jitted
 from ._equations import (
     FieldFunctions,
+    at_any_time,
     curl,
     difference_force,
     difference_jacobian,
@@ -37,7 +38,7 @@ NEAR = ((0.0, 0.0, 0.0), (2.9, -1.7, 1.3), (-2.3, 2.1, 2.7), (1.1, 3.1, -2.2))
 
 @dataclass(frozen=True, eq=False)
 class ParticleField:
-    """A static electromagnetic field, by functions of the position ``(x, y, z)``.
+    """An electromagnetic field, by functions of the position ``(x, y, z)``, or of ``(t, x, y, z)`` if it varies.
 
     Give A, with its derivatives where they are known, or B; and phi and E where there is an electric field. With
     Numba's functions (lazily jitted, three floats in, a float or a tuple of floats out) a particle's equations are
@@ -57,6 +58,9 @@ class ParticleField:
         ``B(x, y, z) -> (B_x, B_y, B_z)``, curl A. Default: from the jacobian.
     axisymmetric : bool
         Whether A and phi do not change under rotations about the z axis; then L = x p_y - y p_x is an invariant.
+    varies : bool
+        Whether all functions take the time first, ``A(t, x, y, z)`` and so on. `electric` is then needed. It is the
+        whole field, ``-grad phi - dA/dt``, with the part that the varying magnetic field induces.
     length : float
         A length over which the field changes little (by some tens of per cent), in the unit of the positions: it sets
         the step of the differences.
@@ -81,6 +85,7 @@ class ParticleField:
     electric: Callable[..., Any] | None = None
     magnetic: Callable[..., Any] | None = None
     axisymmetric: bool = False
+    varies: bool = False
     length: float = 1.0
     name: str = "field"
 
@@ -93,6 +98,8 @@ class ParticleField:
             raise ValueError("ParticleField: give vector_potential, or magnetic, or both; got neither.")
         if self.vector_potential is None and self.jacobian is not None:
             raise ValueError("ParticleField: jacobian is that of vector_potential; give vector_potential too.")
+        if self.varies and self.electric is None:
+            raise ValueError("ParticleField: a field that varies needs electric, -grad phi - dA/dt; give it.")
         if not (self.length > 0 and isfinite(self.length)):
             raise ValueError(f"ParticleField: length must be positive and finite, got {self.length!r}.")
 
@@ -106,7 +113,7 @@ class ParticleField:
         """All functions of the field, those not given made from the others."""
         step = self._step
         given = self.vector_potential, self.jacobian, self.potential, self.electric, self.magnetic
-        A, jacobian, phi, E, B = map(jitted, given)
+        A, jacobian, phi, E, B = (fun if fun is None or self.varies else at_any_time(fun) for fun in map(jitted, given))
         if A is not None and jacobian is None:
             jacobian = difference_jacobian(A, step)
         if E is None and phi is None:
@@ -125,8 +132,8 @@ class ParticleField:
         E, B = self.functions.E, self.functions.B
 
         def fields(t: float, x: np.ndarray, out: np.ndarray) -> None:
-            e = E(x[0], x[1], x[2])
-            b = B(x[0], x[1], x[2])
+            e = E(t, x[0], x[1], x[2])
+            b = B(t, x[0], x[1], x[2])
             out[0] = e[0]
             out[1] = e[1]
             out[2] = e[2]
@@ -136,12 +143,18 @@ class ParticleField:
 
         return jit_like(fields, E, B)
 
-    def check(self, position: np.ndarray) -> None:
-        """See that the functions given go together at one point.
+    def _plain(self, key: str) -> Callable[..., Any]:
+        """Return one of the given functions as one of (t, x, y, z), interpreted."""
+        fun = getattr(self, key)
+        return (lambda *where: fun(*where)) if self.varies else (lambda t, *where: fun(*where))
+
+    def check(self, position: np.ndarray, t: float = 0.0) -> None:
+        """See that the functions given go together at one point and time.
 
         Parameters
         ----------
         position : ndarray, shape (3,)
+        t : float, optional
 
         Raises
         ------
@@ -154,25 +167,24 @@ class ParticleField:
         UserWarning
             When B has a small divergence, as one that is interpolated in a table may have.
         """
-        step = self._step
-        found = {key: self._value(key, shape, position) for key, shape in SHAPES.items() if getattr(self, key)}
-        A, phi = self.vector_potential, self.potential
-        if A is not None:
-            truth = np.array(difference_jacobian(lambda *x: A(*x), step)(*position))  # not worth compiling
+        step, where = self._step, (t, *position)
+        found = {key: self._value(key, shape, where) for key, shape in SHAPES.items() if getattr(self, key)}
+        if self.vector_potential is not None:
+            truth = np.array(difference_jacobian(self._plain("vector_potential"), step)(*where))
             slack = AGREEMENT * np.abs(truth).max() + ROUND_OFF * np.abs(found["vector_potential"]).max() / self.length
             _compare("jacobian", found.get("jacobian"), truth, slack, "the derivatives of vector_potential")
             expected = np.array([truth[2, 1] - truth[1, 2], truth[0, 2] - truth[2, 0], truth[1, 0] - truth[0, 1]])
             _compare("magnetic", found.get("magnetic"), expected, slack, "the curl of vector_potential")
-        if phi is not None:
-            truth = np.array(difference_force(lambda *x: phi(*x), step)(*position))
+        if self.potential is not None and not self.varies:
+            truth = np.array(difference_force(self._plain("potential"), step)(*where))
             slack = AGREEMENT * np.abs(truth).max() + ROUND_OFF * abs(found["potential"]) / self.length
             _compare("electric", found.get("electric"), truth, slack, "minus the gradient of potential")
         if self.magnetic is not None:
-            self._check_divergence(position)
+            self._check_divergence(position, t)
 
-    def _check_divergence(self, position: np.ndarray) -> None:
+    def _check_divergence(self, position: np.ndarray, t: float) -> None:
         points = [position + self._step * np.array(near) for near in NEAR]
-        share, divergence, largest, point = max((*self._divergence(point), tuple(point)) for point in points)
+        share, divergence, largest, point = max((*self._divergence(point, t), tuple(point)) for point in points)
         if not share > AGREEMENT:
             return
         said = (
@@ -183,37 +195,38 @@ class ParticleField:
             raise ValueError(f"{said} Correct it (or `length`, if the field changes over shorter distances).")
         warnings.warn(said, stacklevel=4)
 
-    def _divergence(self, point: np.ndarray) -> tuple[float, float, float]:
+    def _divergence(self, point: np.ndarray, t: float) -> tuple[float, float, float]:
         """The divergence of B: its share in the largest derivative, itself, and that derivative.
 
         Of several steps of the differences the one with the smallest share: their errors shrink with it.
         """
-        B = self.magnetic
-        assert B is not None
-        slack = ROUND_OFF * float(np.abs(B(*point)).max()) / self.length
+        B = self._plain("magnetic")
+        slack = ROUND_OFF * float(np.abs(B(t, *point)).max()) / self.length
         found = []
         for finer in FINER:
-            slopes = np.array(difference_jacobian(lambda *x: B(*x), finer * self._step)(*point))
+            slopes = np.array(difference_jacobian(B, finer * self._step)(t, *point))
             divergence, largest = float(np.trace(slopes)), float(np.abs(slopes).max())
             found.append(((abs(divergence) - slack) / max(largest, slack, TINY), divergence, largest))
         return min(found)
 
-    def _value(self, key: str, shape: tuple[int, ...], position: np.ndarray) -> np.ndarray:
-        value = np.asarray(getattr(self, key)(*position))
+    def _value(self, key: str, shape: tuple[int, ...], where: tuple[float, ...]) -> np.ndarray:
+        value = np.asarray(self._plain(key)(*where))
         if value.shape != shape or value.dtype.kind not in "fiu" or not np.isfinite(value).all():
             raise ValueError(
-                f"ParticleField: {key} returned {value!r} at {position}; expected "
+                f"ParticleField: {key} returned {value!r} at {np.array(where[1:])}; expected "
                 f"{'a finite number' if shape == () else f'finite numbers of shape {shape}'}."
             )
         return value
 
-    def along(self, key: str, position: Any) -> np.ndarray:
+    def along(self, key: str, position: Any, t: Any = 0.0) -> np.ndarray:
         """One of the field's functions at many points.
 
         Parameters
         ----------
         key : {"A", "phi", "E", "B"}
         position : array_like, shape (3, m)
+        t : float or array_like, shape (m,), optional
+            Times, of a field that varies.
 
         Returns
         -------
@@ -222,8 +235,8 @@ class ParticleField:
         fun, points = getattr(self.functions, key), np.ascontiguousarray(np.transpose(position), dtype=float)
         size = 1 if key == "phi" else 3
         out = np.empty((len(points), size))
-        for row, point in zip(out, points, strict=True):
-            row[:] = fun(*point)
+        for row, time, point in zip(out, np.broadcast_to(t, len(points)), points, strict=True):
+            row[:] = fun(time, *point)
         return out[:, 0] if size == 1 else out.T
 
 

@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from ...core.inputs import is_number, refuse_units, shown
 from ...core.invariants import Invariant
 from ...methods.nystrom import RKN1210
+from ...methods.runge_kutta import DOP853
 from ..gross_pitaevskii.grid import Grid
-from ..named_invariants import named_invariant
+from ..named_invariants import damped_invariant, named_invariant
 from .modes import RealModes
 from .record import WaveProblem
 
@@ -23,17 +25,21 @@ SOURCE = "Ablowitz & Segur, Solitons and the Inverse Scattering Transform (SIAM 
 
 
 class SineGordon:
-    """The equation ``q_tt = Laplace q - sin q`` in one, two or three dimensions, Fourier pseudospectral in space.
+    """The equation ``q_tt = Laplace q - sin q - damping q_t`` in one to three dimensions, pseudospectral in space.
 
-    The state is (q, p), both fields flat, with p = q_t: a system of the second order, for Nystrom methods.
+    The state is (q, p), both fields flat, with p = q_t: without damping a system of the second order, for Nystrom
+    methods.
 
     Parameters
     ----------
     grid : Grid
+    damping : float, optional
+        With it, energy and momenta are balances, and Nystrom methods do not apply.
 
     Attributes
     ----------
     grid : Grid
+    damping : float
 
     Notes
     -----
@@ -53,18 +59,21 @@ class SineGordon:
     (True, True)
     """
 
-    def __init__(self, grid: Grid) -> None:
-        self.grid = grid
+    def __init__(self, grid: Grid, damping: float = 0.0) -> None:
+        refuse_units(damping=damping)
+        if not (is_number(damping) and np.isfinite(damping) and damping >= 0):
+            raise ValueError(f"damping must be a finite number >= 0, got {shown(damping)}.")
+        self.grid, self.damping = grid, float(damping)
         self._modes = RealModes(grid)
         self._square = np.zeros(self._modes.shape)
         for axis in range(grid.dim):
             self._square += self._modes.wavenumbers(axis) ** 2
 
     def __repr__(self) -> str:
-        return f"SineGordon({self.grid!r})"
+        return f"SineGordon({self.grid!r}{f', damping={self.damping:g}' if self.damping else ''})"
 
     def acceleration(self, q: np.ndarray) -> np.ndarray:
-        """Laplace q - sin q, flat."""
+        """Laplace q - sin q, flat; without damping."""
         modes = self._modes.forward(q)
         modes *= -self._square
         out = self._modes.backward(modes)
@@ -72,10 +81,12 @@ class SineGordon:
         return out
 
     def rhs(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with (p, Laplace q - sin q)."""
+        """Fill `out` with (p, Laplace q - sin q - damping p)."""
         n = self.grid.size
         out[:n] = y[n:]
         out[n:] = self.acceleration(y[:n])
+        if self.damping:
+            out[n:] -= self.damping * y[n:]
 
     def fun(self, t: float, y: np.ndarray) -> np.ndarray:
         """The same as a new array: what `solve_ivp` takes."""
@@ -103,6 +114,12 @@ class SineGordon:
     def _slope(self, axis: int, field: np.ndarray) -> np.ndarray:
         return self._modes.backward(1j * self._modes.wavenumbers(axis, odd=True) * self._modes.forward(field))
 
+    def _parts(self, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivative without damping, and what damping adds to it."""
+        lost = np.zeros_like(y)
+        lost[self.grid.size :] = -self.damping * y[self.grid.size :]
+        return f - lost, lost
+
     def _energy_gradient(self, t: float, y: np.ndarray, f: np.ndarray, out: np.ndarray) -> None:
         """By f = (p, a): (-w a, w p)."""
         n, cell = self.grid.size, self.grid.cell
@@ -125,7 +142,7 @@ class SineGordon:
         Returns
         -------
         tuple of Invariant
-            The energy's gradient takes the right-hand side, which the step has.
+            Balances, if there is damping. The energy's gradient takes the right-hand side, which the step has.
 
         Raises
         ------
@@ -142,7 +159,8 @@ class SineGordon:
         }
         made["energy"] = self.energy, self._energy_gradient
         known = [name for name in INVARIANTS if name in made]
-        return named_invariant(name, made, known, uses_f=name == "energy", where=f" on {self.grid!r}")
+        item = named_invariant(name, made, known, uses_f=name == "energy", where=f" on {self.grid!r}")
+        return damped_invariant(item, item, self._parts) if self.damping else item
 
     def largest_step(self, limit: float = 8.0) -> float:
         """The step above which an explicit method is unstable.
@@ -190,7 +208,7 @@ class SineGordon:
         Returns
         -------
         WaveProblem
-            Its method is the Nystrom method of `EIPRKN12`.
+            Its method is the Nystrom method of `EIPRKN12`, or with damping the Runge-Kutta method of `EIPDOP853`.
 
         Raises
         ------
@@ -210,7 +228,7 @@ class SineGordon:
             h=h,
             invariants=self.invariants(invariants),
             metric="euclidean",
-            method=RKN1210,
+            method=DOP853 if self.damping else RKN1210,
             reference=reference,
             units="dimensionless",
             source=source,

@@ -19,8 +19,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from eip_scipy import EIPDOP853, Balance, integrate
-from eip_scipy.problems import nbody
+from eip_scipy import EIPDOP853, EIPRK4, Balance, integrate
+from eip_scipy.problems import (
+    DampedGrossPitaevskii,
+    Grid,
+    ParticleField,
+    SineGordon,
+    charged_particle,
+    harmonic_trap,
+    nbody,
+    satellite,
+    sine_gordon_breather,
+)
 from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.problems.gravity.orbits import orbital_balances
 from eip_scipy.problems.gravity.solar_data import YEAR_D, load
@@ -34,10 +44,9 @@ njit = needed("numba", '"eip_scipy[numba]"').njit
 __all__ = ["SYSTEMS", "Balances"]
 
 TURN = 2 * math.pi
-# The Earth in km and s, and an atmosphere that falls by e in SCALE_HEIGHT. Drag per speed squared [1/km] at the base of
-# 400 km: half of 3e-12 kg/m^3 times 0.022 m^2/kg.
-GM, RADIUS, J2 = 398600.4418, 6378.137, 1.08262668e-3
-DENSITY, BASE, SCALE_HEIGHT = 0.5 * 3e-12 * 0.022 * 1e3, 400.0, 60.0
+# Km and s. Drag per squared speed at 400 km: half of 3e-12 kg/m^3 times 0.022 m^2/kg.
+EARTH: dict[str, Any] = {"mu": 398600.4418, "radius": 6378.137, "j2": 1.08262668e-3}
+AIR: dict[str, Any] = {"drag": 0.5 * 3e-12 * 0.022 * 1e3, "height": 400.0, "scale_height": 60.0}
 LUNAR_MONTH = 27.321661 / YEAR_D
 KM_S = 86400 * YEAR_D / 149597870.7  # AU/yr
 SHOWN = 200
@@ -148,114 +157,24 @@ def drag(strength: float, revolutions: float, steps: int = 16, rates: Mapping[st
     return make
 
 
-# A satellite about an oblate Earth with drag.
-
-
-@njit
-def air(y):
-    r = np.sqrt(y[0] ** 2 + y[1] ** 2 + y[2] ** 2)
-    speed = np.sqrt(y[3] ** 2 + y[4] ** 2 + y[5] ** 2)
-    return DENSITY * np.exp((RADIUS + BASE - r) / SCALE_HEIGHT) * speed
-
-
-@njit
-def satellite(t, y, a, b, c):
-    r2 = y[0] ** 2 + y[1] ** 2 + y[2] ** 2
-    z = a * y[0] + b * y[1] + c * y[2]
-    k, s = 1.5 * J2 * RADIUS**2 / r2, z * z / r2
-    d, g = air(y), GM / r2**1.5
-    radial, polar = -g * (1 + k * (1 - 5 * s)), -2 * g * k * z
-    return np.array(
-        [
-            y[3],
-            y[4],
-            y[5],
-            radial * y[0] + polar * a - d * y[3],
-            radial * y[1] + polar * b - d * y[4],
-            radial * y[2] + polar * c - d * y[5],
-        ]
-    )
-
-
-@njit
-def satellite_energy(t, y, a, b, c):
-    r2 = y[0] ** 2 + y[1] ** 2 + y[2] ** 2
-    z = a * y[0] + b * y[1] + c * y[2]
-    potential = -GM / np.sqrt(r2) * (1 - 0.5 * J2 * RADIUS**2 / r2 * (3 * z * z / r2 - 1))
-    return 0.5 * (y[3] ** 2 + y[4] ** 2 + y[5] ** 2) + potential
-
-
-@njit
-def drag_power(t, y, a, b, c):
-    return -air(y) * (y[3] ** 2 + y[4] ** 2 + y[5] ** 2)
-
-
-@njit
-def pull_and_drag(y, a, b, c):
-    """Return the accelerations other than the pull of a round Earth."""
-    r2 = y[0] ** 2 + y[1] ** 2 + y[2] ** 2
-    z = a * y[0] + b * y[1] + c * y[2]
-    k, s, d, g = 1.5 * J2 * RADIUS**2 / r2, z * z / r2, air(y), GM / r2**1.5
-    radial, polar = -g * k * (1 - 5 * s), -2 * g * k * z
-    return (
-        radial * y[0] + polar * a - d * y[3],
-        radial * y[1] + polar * b - d * y[4],
-        radial * y[2] + polar * c - d * y[5],
-    )
-
-
-@njit
-def satellite_spin(t, y, a, b, c):
-    return np.array([y[1] * y[5] - y[2] * y[4], y[2] * y[3] - y[0] * y[5], y[0] * y[4] - y[1] * y[3]])
-
-
-@njit
-def torque(t, y, a, b, c):
-    px, py, pz = pull_and_drag(y, a, b, c)
-    return np.array([y[1] * pz - y[2] * py, y[2] * px - y[0] * pz, y[0] * py - y[1] * px])
-
-
-@njit
-def satellite_laplace(t, y, a, b, c):
-    r = np.sqrt(y[0] ** 2 + y[1] ** 2 + y[2] ** 2)
-    l0, l1, l2 = y[1] * y[5] - y[2] * y[4], y[2] * y[3] - y[0] * y[5], y[0] * y[4] - y[1] * y[3]
-    return np.array([
-        y[4] * l2 - y[5] * l1 - GM * y[0] / r,
-        y[5] * l0 - y[3] * l2 - GM * y[1] / r,
-        y[3] * l1 - y[4] * l0 - GM * y[2] / r,
-    ])  # fmt: skip
-
-
-@njit
-def laplace_change(t, y, a, b, c):
-    px, py, pz = pull_and_drag(y, a, b, c)
-    l0, l1, l2 = y[1] * y[5] - y[2] * y[4], y[2] * y[3] - y[0] * y[5], y[0] * y[4] - y[1] * y[3]
-    m0, m1, m2 = y[1] * pz - y[2] * py, y[2] * px - y[0] * pz, y[0] * py - y[1] * px
-    return np.array([
-        py * l2 - pz * l1 + y[4] * m2 - y[5] * m1,
-        pz * l0 - px * l2 + y[5] * m0 - y[3] * m2,
-        px * l1 - py * l0 + y[3] * m1 - y[4] * m0,
-    ])  # fmt: skip
+# A satellite 400 km above an oblate Earth, with drag.
 
 
 def leo(days: float) -> Any:
-    """Return a maker of a satellite 400 km above the Earth."""
-    energy = Balance(satellite_energy, drag_power, name="E")
-    others = [Balance(satellite_spin, torque, name="h"), Balance(satellite_laplace, laplace_change, name="e")]
-    sets = {"E": energy, "E, h, e": [energy, *others]}
-    a, e, tilt = RADIUS + 420, 2e-3, math.radians(51.6)
-    period = TURN * math.sqrt(a**3 / GM)
-    speed = math.sqrt(GM / a * (1 + e) / (1 - e))
+    """Return a maker of this satellite."""
+    a, e, tilt = EARTH["radius"] + 420, 2e-3, math.radians(51.6)
+    speed = math.sqrt(EARTH["mu"] / a * (1 + e) / (1 - e))
+    start = np.array([[a * (1 - e), 0, 0], [0, speed * math.cos(tilt), speed * math.sin(tilt)]])
 
     def make(turned: np.ndarray, turn: int) -> Case:
-        q, v = [a * (1 - e), 0, 0], [0, speed * math.cos(tilt), speed * math.sin(tilt)]
-        run = runner(
-            fun=satellite,
-            t_span=(0, 86400 * days),
-            y0=np.concatenate([turned @ q, turned @ v]),
-            args=tuple(turned[:, 2].tolist()),
+        pole = tuple(turned[:, 2].tolist())
+        problem = satellite(
+            start[0] @ turned.T, start[1] @ turned.T, **EARTH, **AIR, pole=pole, t_span=(0.0, 86400 * days)
         )
-        return Case(run, sets, {"h": period / 16}, 16, (slice(0, 3),))
+        assert problem.h is not None
+        assert problem.params is not None
+        sets = {"E": orbital_balances(problem.params[:2], problem.y0), "E, h, e": problem.invariants}
+        return Case(of(problem), sets, {"h": problem.h}, 16, (slice(3, 6),))
 
     return make
 
@@ -393,6 +312,77 @@ def particle(turned: np.ndarray, turn: int) -> Case:
     return Case(run, sets, {"h": TURN / 16}, 16, (slice(0, 3),))
 
 
+# A charge in a field B(t) (1 + r^2) along the z axis and a potential that varies too.
+
+
+@njit
+def strengths(t):
+    return 1 + 0.02 * np.sin(0.01 * t), 2e-4 * np.cos(0.01 * t), 0.05 + 0.005 * np.sin(0.013 * t)
+
+
+@njit
+def vector_potential(t, x, y, z):
+    around = strengths(t)[0] * (0.5 + 0.25 * (x * x + y * y))
+    return -around * y, around * x, 0.0
+
+
+@njit
+def magnetic(t, x, y, z):
+    return 0.0, 0.0, strengths(t)[0] * (1 + x * x + y * y)
+
+
+@njit
+def potential(t, x, y, z):
+    r2 = x * x + y * y
+    return strengths(t)[2] * (0.5 * r2 + 0.1 * r2 * r2)
+
+
+@njit
+def electric(t, x, y, z):
+    r2 = x * x + y * y
+    around, out = -strengths(t)[1] * (0.5 + 0.25 * r2), -strengths(t)[2] * (1 + 0.4 * r2)
+    return out * x - around * y, out * y + around * x, 0.0
+
+
+VARYING = ParticleField(
+    vector_potential, magnetic=magnetic, potential=potential, electric=electric, axisymmetric=True, varies=True
+)
+
+
+def held(turned: np.ndarray, turn: int) -> Case:
+    """Some 400 gyrations, from several directions of the velocity."""
+    start = [0.5, 0, 0], [0.3 * math.sin(turn), 0.3 * math.cos(turn), 0]
+    made = {
+        name: charged_particle(VARYING, *start, t_span=(0, 2000), form="velocity", balances=name)
+        for name in ("energy", "kinetic")
+    }
+    sets = {"H and L": made["energy"].invariants, "T and L": made["kinetic"].invariants}
+    return Case(of(made["energy"]), sets, {"h": 0.4}, 16, (slice(0, 3),))
+
+
+# Damped fields.
+
+
+def condensate(turned: np.ndarray, turn: int) -> Case:
+    """A packet in a trap, with losses and Pitaevskii's damping, by RK4; it starts at several places."""
+    grid = Grid(48, -8, 8)
+    equation = DampedGrossPitaevskii(grid, harmonic_trap(1), beta=10.0, damping=1e-4, chemical_potential=3.0, loss=1e-4)
+    packet = np.exp(-((grid.points(0) - 1 - 0.05 * turn) ** 2) / 4)
+    start = packet / math.sqrt(equation.mass(packet))
+    problem = equation.problem(start, 200.0)
+    h = 0.8 * equation.largest_step(start)
+    return Case(of(problem, EIPRK4), {"mass and energy": problem.invariants}, {"h": h}, 8, (slice(0, grid.size),))
+
+
+def wave(turned: np.ndarray, turn: int) -> Case:
+    """The breather of the sine-Gordon equation, with damping 1e-4."""
+    scene = sine_gordon_breather(frequency=0.5 + 0.05 * turn)
+    equation, n = SineGordon(Grid(512, -40, 40), damping=1e-4), scene.y0.size // 2
+    problem = equation.problem(scene.y0[:n], scene.y0[n:], 200.0)
+    h = 0.7 * equation.largest_step(6.0)
+    return Case(of(problem), {"energy": problem.invariants}, {"h": h}, 4, (slice(0, 2 * n),))
+
+
 # Oscillators x'' = -a x - b x^3 - c x' + d cos(w t + phase).
 
 
@@ -479,6 +469,9 @@ SYSTEMS = {
     ),
     "Duffing, driven by 1e-3": System(oscillator(1, 1, 0, 1e-3, 0.4, 1000), "", True),
     "charge in a varying mirror": System(particle, "", True),
+    "charge in a varying field and potential": System(held, "", True),
+    "damped condensate in a trap, RK4": System(condensate, "", True),
+    "damped breather of sine-Gordon": System(wave, "", True),
     "strong driving": System(oscillator(1, 1, 0, 1.0, 0.4, 200), "", False),
     "linear resonance": System(oscillator(1, 0, 0, 1e-2, 1.0, 500), "", False),
     "attractor, damped by 0.02": System(oscillator(1, 1, 0.02, 0.05, 1.2, 2000), "", False),
@@ -501,9 +494,9 @@ def runner(**start: Any) -> Callable[..., Any]:
     return lambda **options: integrate(method=EIPDOP853, **start, **options)
 
 
-def of(problem: Any) -> Callable[..., Any]:
+def of(problem: Any, method: Any = EIPDOP853) -> Callable[..., Any]:
     """Return ``run(**options)`` of a problem."""
-    return lambda **options: integrate(problem, method=EIPDOP853, **options)
+    return lambda **options: integrate(problem, method=method, **options)
 
 
 class Row(NamedTuple):

@@ -25,7 +25,7 @@ __all__ = ["Found", "Model", "ModelRun", "Truth", "errors", "models", "run_model
 PAPER_EPOCH = (2456690.5, 20.3 / 24)
 STEP = 0.001
 MOON = "moon"  # no force but a body, chosen beside the forces
-KNOWN = (*FORCES, MOON)
+KNOWN = (*(force for force in FORCES if force != "drag"), MOON)
 STANDARD = ((), ("1pn",), ("1pn", "moon-quadrupole"), ("1pn", MOON), ("1pn", "j2", MOON))
 REPORTED = (1.0, 10.0, 100.0)
 PANELS = ("Mercury", "EMB", "Mars", "Jupiter")

@@ -7,7 +7,7 @@ namespace eip {
 namespace {
 
 // Entries after the G m, and which relativity the first one names.
-enum Entry { KIND, OVER_C2, OBLATENESS, POLE, MOON_BODY = 6, MOON, N_ENTRIES };
+enum Entry { KIND, OVER_C2, OBLATENESS, POLE, MOON_BODY = 6, MOON, DRAG, BASE, SCALE_HEIGHT, SPIN, N_ENTRIES };
 constexpr double ONE_PN = 1.0, EIH = 2.0, POTENTIAL = 3.0;
 
 struct Bodies {
@@ -40,13 +40,23 @@ Three pull_1pn(const Three &x, const Three &v, const Bodies &b) {
     return sum(w * (4.0 * gm_sun / r - dot(v, v)), x, 4.0 * w * dot(x, v), v);
 }
 
-// Add to out (3 N) the Sun's further pulls on all others, and their reactions on it; v is null where none depends on it.
+// Drag on a body at x with the velocity v, both relative, by air that turns about the pole and whose density falls by e
+// in each scale height.
+Three drag(const Three &x, const Three &v, const Bodies &b) {
+    const Three u = sum(1.0, v, -b.k[SPIN], cross(b.pole(), x));
+    const double height = std::sqrt(dot(x, x)) - b.k[BASE];
+    const double w = -b.k[DRAG] * std::exp(-height / b.k[SCALE_HEIGHT]) * std::sqrt(dot(u, u));
+    return {w * u[0], w * u[1], w * u[2]};
+}
+
+// Add to out (3 N) the Sun's further forces on all others, and their reactions on it; v is null where none depends on it.
 void add_pulls(const double *q, const double *v, const Bodies &b, double *out) {
     Three back{};
     for (int64_t i = 1; i < b.n; ++i) {
         const Three x = body(q, i) - body(q, 0);
         Three a = pull(x, b, i);
         if (v && b.k[KIND] == ONE_PN) a = sum(1.0, a, 1.0, pull_1pn(x, body(v, i) - body(v, 0), b));
+        if (v && b.k[DRAG] > 0.0) a = sum(1.0, a, 1.0, drag(x, body(v, i) - body(v, 0), b));
         add(out, i, 1.0, a);
         const double share = b.gm[i] / b.gm[0];
         for (int c = 0; c < 3; ++c) back[c] += share * a[c];
@@ -218,9 +228,9 @@ void pair_momentum_gradient(const Given<double> &g) {
 bool of_bodies(int64_t n, int64_t p) { return p > N_ENTRIES && n == 6 * (p - N_ENTRIES); }
 bool at_positions(int64_t n, int64_t p) { return p > N_ENTRIES && n == 3 * (p - N_ENTRIES); }
 bool of_two(int64_t n, int64_t p) { return n == 12 && p == 2 + N_ENTRIES; }
-constexpr const char *BODIES = "positions and velocities, 6 numbers a body, every G m and 8 entries";
-constexpr const char *POSITIONS = "positions, 3 numbers a body, every G m and 8 entries";
-constexpr const char *TWO = "12 numbers, two G m and 8 entries";
+constexpr const char *BODIES = "positions and velocities, 6 numbers a body, every G m and 12 entries";
+constexpr const char *POSITIONS = "positions, 3 numbers a body, every G m and 12 entries";
+constexpr const char *TWO = "12 numbers, two G m and 12 entries";
 
 const LibraryFunction functions[] = {
     {"forces.rhs", Value::DERIVATIVE, 0, plain<double, rhs>, nullptr, of_bodies, BODIES},

@@ -1,0 +1,124 @@
+"""The Gross-Pitaevskii equation with phenomenological damping and losses; mass and energy are balances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...core.balances import Balance
+from ...core.inputs import is_number, refuse_units, shown
+from ..named_invariants import damped_invariant
+from .equation import GrossPitaevskii, on_grid
+from .grid import Grid
+
+__all__ = ["DampedGrossPitaevskii"]
+
+
+class DampedGrossPitaevskii(GrossPitaevskii):
+    """The equation ``psi_t = -(i + damping) (H(psi) - mu) psi - loss / 2 psi``, H as in `GrossPitaevskii`.
+
+    Parameters
+    ----------
+    grid, potential
+        As for `GrossPitaevskii`.
+    damping : float, optional
+        Pitaevskii's phenomenological damping, the strength of the exchange with a thermal cloud.
+    chemical_potential : float, optional
+        mu, that of the thermal cloud: the frequency of the rotating phase, about which `damping` relaxes.
+    loss : float, callable or array_like, optional
+        Rate at which ``|psi|^2`` decays at each point, given as a potential is.
+    **options
+        As for `GrossPitaevskii`: Omega, beta, nyquist, fft, threads.
+
+    Raises
+    ------
+    ValueError
+        As by `GrossPitaevskii`, and for a damping that is negative or not finite.
+
+    Notes
+    -----
+    Mass, energy and momenta change at the rate Re <G, d>, G the gradient and d what damping and losses add to psi_t.
+    The derivative at a stage gives H psi, so that the rates of mass and energy take no transform. `invariants` and
+    `problem` have these quantities as balances, for the Runge-Kutta methods that carry them. `Splitting` is that of
+    the equation without damping.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import EIPRK4, integrate
+    >>> from eip_scipy.problems import DampedGrossPitaevskii, Grid
+    >>> equation = DampedGrossPitaevskii(Grid(64, -10, 10), beta=-1.0, loss=1e-3)
+    >>> start = 1 / np.cosh(equation.grid.points(0))
+    >>> run = integrate(equation.problem(start, t_end=2.0, h=0.01), method=EIPRK4)
+    >>> bool(abs(equation.mass(run.y[:, -1]) / equation.mass(start) - np.exp(-2e-3)) < 1e-9)
+    True
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        potential: Any = None,
+        *,
+        damping: float = 0.0,
+        chemical_potential: float = 0.0,
+        loss: Any = 0.0,
+        **options: Any,
+    ) -> None:
+        refuse_units(damping=damping, chemical_potential=chemical_potential, loss=loss)
+        if not (is_number(damping) and np.isfinite(damping) and damping >= 0):
+            raise ValueError(f"damping must be a finite number >= 0, got {shown(damping)}.")
+        if not (is_number(chemical_potential) and np.isfinite(chemical_potential)):
+            raise ValueError(f"chemical_potential must be a finite number, got {shown(chemical_potential)}.")
+        super().__init__(grid, potential, **options)
+        self.damping, self.mu = float(damping), float(chemical_potential)
+        self.loss = on_grid(loss, grid, "loss")
+        self._options |= {"damping": damping, "chemical_potential": chemical_potential, "loss": self.loss}
+        self._growth = (self.damping * self.mu - 0.5 * self.loss).reshape(-1)
+
+    def __repr__(self) -> str:
+        return f"Damped{super().__repr__()[:-1]}, damping={self.damping:g}, chemical_potential={self.mu:g})"
+
+    def _method(self) -> None:
+        return None
+
+    def rhs(self, t: float, y: np.ndarray, out: np.ndarray) -> None:
+        """Fill `out` with psi_t; both flat and contiguous, and not the same array."""
+        super().rhs(t, y, out)
+        out *= 1 - 1j * self.damping
+        out += (self._growth + 1j * self.mu) * y
+
+    def energy(self, psi: Any) -> float:
+        """Energy as of `GrossPitaevskii`."""
+        psi = self.as_field(psi)
+        f = np.empty(psi.size, complex)
+        super().rhs(0.0, psi.reshape(-1), f)
+        return self.grid.cell * self.moments(psi, f).energy(self.beta)
+
+    def _parts(self, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``-i H psi``, and what damping and losses add to it but for the rotation of the phase."""
+        turning = (f - (self._growth + 1j * self.mu) * y) / (1 - 1j * self.damping)
+        return turning, self._growth * y - 1j * self.damping * turning
+
+    def invariants(self, names: Sequence[str] = ("mass", "energy")) -> tuple[Balance, ...]:
+        """Make balances of what `GrossPitaevskii` keeps.
+
+        Parameters
+        ----------
+        names : sequence of str, optional
+            As for `GrossPitaevskii.invariants`.
+
+        Returns
+        -------
+        tuple of Balance
+
+        Raises
+        ------
+        ValueError
+            For other names.
+        """
+        names = (names,) if isinstance(names, str) else tuple(names)
+        return tuple(
+            damped_invariant(self._invariant(name), self._invariant(name), self._parts, self._total) for name in names
+        )

@@ -1,0 +1,138 @@
+"""Condensates and waves with damping: rates against sums and closed forms, and what their balances gain."""
+
+import pickle
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from eip_scipy import EIPDOP853, EIPRK4, Balance, integrate
+from eip_scipy.problems import DampedGrossPitaevskii, Grid, GrossPitaevskii, SineGordon, harmonic_trap
+
+ALL = ("mass", "energy", "momentum_x", "momentum_y", "angular_momentum")
+
+
+def lossy(x, y):
+    return 0.02 * np.exp(-((x - 1) ** 2) - y**2)
+
+
+def condensate(**options):
+    given = {"Omega": 0.3, "beta": 8.0, "damping": 0.03, "chemical_potential": 1.7, "loss": lossy} | options
+    return DampedGrossPitaevskii(Grid((24, 20), (-6, -5), (6, 5)), harmonic_trap(1, 1.3), **given)
+
+
+def packet(equation):
+    x, y = equation.grid.mesh()
+    return np.exp(-((x - 0.6) ** 2) / 2 - y**2 / 1.5 + 0.7j * x - 0.2j * y)
+
+
+def test_the_equation_is_the_one_without_damping_and_what_is_said():
+    equation = condensate()
+    plain = GrossPitaevskii(equation.grid, equation.V, Omega=0.3, beta=8.0)
+    psi = packet(equation)
+    H = plain.hamiltonian(psi)
+    loss = np.broadcast_to(lossy(*equation.grid.mesh()), psi.shape)
+    expected = -(1j + 0.03) * (H - 1.7 * psi) - 0.5 * loss * psi
+    np.testing.assert_allclose(equation.fun(0.0, psi.ravel()), expected.ravel(), rtol=0, atol=1e-13)
+    assert equation.energy(psi) == pytest.approx(plain.energy(psi), rel=1e-15)
+    np.testing.assert_array_equal(equation.changed(beta=8.0).fun(0.0, psi.ravel()), equation.fun(0.0, psi.ravel()))
+    assert "damping=0.03" in repr(equation)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_rates_are_derivatives_along_the_flow(name):
+    """By differences of the values, a step along psi_t and its derivatives that matter to 1e-9."""
+    equation = condensate()
+    y = packet(equation).ravel()
+    (item,) = equation.invariants(name)
+    assert isinstance(item, Balance)
+    f = equation.fun(0.0, y)
+    rate = item.rate(0.0, y, f)
+    G = np.empty_like(y)
+    item.grad(0.0, y, f, G)
+    # The trap has neither momentum nor angular momentum; their rates are those of damping and losses alone.
+    (free,) = GrossPitaevskii(equation.grid, equation.V, Omega=0.3, beta=8.0).invariants(name)
+    step = 1e-4
+    damped = f + 1j * (equation.hamiltonian(y).ravel() - 1.7 * y)
+    ends = [free.fun(0.0, y + k * step * damped) for k in (-2, -1, 1, 2)]
+    slope = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
+    assert rate == pytest.approx(slope, rel=1e-8)
+    assert np.vdot(G, damped).real == pytest.approx(rate, rel=1e-9)
+
+
+@pytest.mark.parametrize(("damping", "loss"), [(0.0, 0.05), (0.02, 0.0), (0.01, 0.02)])
+def test_a_plane_wave(damping, loss):
+    """Its density n follows Bernoulli's equation n' = -a n - b n^2, and its phase the integral of k^2 / 2 - mu + n."""
+    mu, beta, k, n0, t = 0.4, 1.5, 2 * np.pi / 8, 0.8, 3.0
+    equation = DampedGrossPitaevskii(Grid(16, 0, 8), beta=beta, damping=damping, chemical_potential=mu, loss=loss)
+    x = equation.grid.points(0)
+    run = integrate(equation.problem(np.sqrt(n0) * np.exp(1j * k * x), t, 0.01), method=EIPDOP853)
+    assert run.trusted
+    a, b = 2 * damping * (k * k / 2 - mu) + loss, 2 * damping * beta
+    decay = -np.expm1(-a * t) / a
+    n = n0 * np.exp(-a * t) / (1 + b * n0 * decay)
+    filled = np.log1p(b * n0 * decay) / b if b else n0 * decay
+    phase = (k * k / 2 - mu) * t + beta * filled
+    np.testing.assert_allclose(run.y[:, -1], np.sqrt(n) * np.exp(1j * (k * x - phase)), rtol=0, atol=1e-13)
+
+
+def test_balances_of_a_condensate_help():
+    grid = Grid(32, -7, 7)
+    equation = DampedGrossPitaevskii(grid, harmonic_trap(1), beta=10.0, damping=1e-4, chemical_potential=3.0, loss=1e-4)
+    psi = np.exp(-((grid.points(0) - 1) ** 2) / 4)
+    psi /= np.sqrt(equation.mass(psi))
+    problem = equation.problem(psi, 60.0, 0.85 * equation.largest_step(psi))
+    exact = solve_ivp(problem.fun, problem.t_span, problem.y0, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    runs = [integrate(problem, method=EIPRK4, invariants=kept) for kept in ((), problem.invariants)]
+    assert runs[1].trusted
+    assert runs[0].nfev == runs[1].nfev
+    plain, kept = (np.linalg.norm(run.y[:, -1] - exact) for run in runs)
+    assert 1.3 * kept < plain
+
+
+def test_a_damped_condensate_pickles_and_refuses():
+    problem = pickle.loads(pickle.dumps(condensate().problem(packet(condensate()), 0.1, 0.01)))
+    assert [item.name for item in problem.invariants] == ["mass", "energy"]
+    assert problem.method is None
+    for options, match in (
+        ({"damping": -0.1}, "damping must be a finite number >= 0"),
+        ({"chemical_potential": np.inf}, "chemical_potential must be a finite number"),
+        ({"loss": np.ones(3)}, "loss has shape"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            condensate(**options)
+
+
+def sine_gordon(damping=0.05):
+    equation = SineGordon(Grid((16, 12), (0, 0), (5, 4)), damping)
+    x, y = equation.grid.mesh()
+    q = 0.3 * np.cos(2 * np.pi * x / 5) + 0.1 * np.sin(2 * np.pi * (x / 5 + y / 4))
+    return equation, np.concatenate([q.ravel(), (0.2 * np.sin(2 * np.pi * (x / 5 - y / 4))).ravel()])
+
+
+def test_damped_waves():
+    equation, y = sine_gordon()
+    plain, n = SineGordon(equation.grid), equation.grid.size
+    f = plain.fun(0.0, y)
+    f[n:] -= 0.05 * y[n:]
+    np.testing.assert_array_equal(equation.fun(0.0, y), f)
+    energy, along_x, along_y = equation.invariants(("energy", "momentum_x", "momentum_y"))
+    assert energy.rate(0.0, y, f) == pytest.approx(-0.05 * equation.grid.cell * (y[n:] @ y[n:]), rel=1e-14)
+    for item, momentum in zip((along_x, along_y), plain.momentum(y), strict=True):
+        assert item.rate(0.0, y, f) == pytest.approx(-0.05 * momentum, rel=1e-12)
+    problem = equation.problem(y[:n], y[n:], 40.0, 0.3)
+    exact = solve_ivp(problem.fun, problem.t_span, problem.y0, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    run = integrate(problem)  # by DOP853
+    assert run.trusted
+    np.testing.assert_allclose(run.y[:, -1], exact, rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match="damping must be a finite number >= 0"):
+        SineGordon(equation.grid, -1.0)
+
+
+def test_a_uniform_wave_is_a_damped_pendulum():
+    """Its energy decays; small ones by exp(-damping t) on average, and q as the linear equation has it."""
+    equation = SineGordon(Grid(8, 0, 1), 0.02)
+    problem = equation.problem(np.full(8, 1e-6), np.zeros(8), 50.0, 0.02)
+    omega = np.sqrt(1 - 0.01**2)
+    expected = 1e-6 * np.exp(-0.5) * (np.cos(50 * omega) + 0.01 / omega * np.sin(50 * omega))
+    np.testing.assert_allclose(integrate(problem, method=EIPDOP853).y[:8, -1], expected, rtol=1e-9)
