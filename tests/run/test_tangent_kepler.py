@@ -151,13 +151,11 @@ def test_solve_ivp_has_the_same_columns(method):
 
 @pytest.mark.parametrize("method", [EIPRK4, EIPRKN8])
 def test_linear_invariants_of_a_frame_stay(method):
-    @njit
     def pair(t, y):
         d = y[2:4] - y[:2]
         pull = d / (d[0] ** 2 + d[1] ** 2) ** 1.5
         return np.concatenate((y[4:], pull, -pull))
 
-    @njit
     def of_pair(t, y):
         d = y[2:4] - y[:2]
         return 0.5 * np.sum(y[4:] ** 2) - 1 / np.sqrt(d[0] ** 2 + d[1] ** 2)

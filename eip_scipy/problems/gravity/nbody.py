@@ -174,10 +174,23 @@ def nbody(
         source=source,
         reference=reference,
         jacobian=library["gravity.central"],
+        variational=partial(_variational, chosen),
         frequencies=partial(orbital_frequencies, masses),
         epoch=epoch,
         G=G,
     )
+
+
+def _variational(forces: Sequence[str], parameters: tuple[int, ...]) -> Any:
+    """Return the right-hand side with columns of derivatives, see `Problem`."""
+    if forces:
+        raise ValueError(
+            f"variations: the derivatives of nbody with the forces {', '.join(forces)} are not known; give jvp=..., or "
+            "leave the forces out."
+        )
+    if parameters:
+        raise ValueError("variations: nbody gives no derivatives by masses; ask for columns of the state.")
+    return library["gravity.variational"]
 
 
 def component_names(n: int, bodies: Sequence[str] | None) -> tuple[str, ...]:

@@ -37,7 +37,7 @@ inline void add(double *out, int64_t i, double s, const Three &a) {
 }
 
 // Three columns of a matrix (3, n).
-struct Columns {
+struct ThreeColumns {
     double *first;
     int64_t n;
 
@@ -176,8 +176,8 @@ struct Einstein {
     }
 
   private:
-    Columns by_position(double *out, int64_t i) const { return {out + 3 * i, 6 * n}; }
-    Columns by_velocity(double *out, int64_t i) const { return {out + 3 * (n + i), 6 * n}; }
+    ThreeColumns by_position(double *out, int64_t i) const { return {out + 3 * i, 6 * n}; }
+    ThreeColumns by_velocity(double *out, int64_t i) const { return {out + 3 * (n + i), 6 * n}; }
 
     // Body j's pull on body i; x from j to i, u = 1/r.
     void add_pull(double *out, int64_t i, int64_t j, const Three &x, double u, const std::vector<double> &phi,

@@ -218,7 +218,7 @@ void pair_momentum_gradient(const Given<double> &g) {
     std::fill(g.out, g.out + 36, 0.0);
     for (int i = 0; i < 2; ++i) {
         const double sign = i == 0 ? -1.0 : 1.0;
-        const Columns by_q{g.out + 3 * i, 12}, by_v{g.out + 6 + 3 * i, 12};
+        const ThreeColumns by_q{g.out + 3 * i, 12}, by_v{g.out + 6 + 3 * i, 12};
         by_q.add_cross(-sign * growth, p.v);
         by_v.add_cross(sign * growth, p.r);
         by_q.add_outer(-4.0 * sign * p.x * p.u * p.u, L, p.r);

@@ -41,6 +41,24 @@ void kepler_jacobian(const Given<T> &g) {
     g.out[1] = along * q[1] - pull * d[1];
 }
 
+// Of a state with columns of derivatives behind it; `by_parameter`: the last one is that by the relativistic coefficient.
+template <bool BY_PARAMETER>
+void kepler_variational(const Given<double> &g) {
+    kepler_rhs(g);
+    const int64_t columns = g.n / 4 - 1;
+    for (int64_t c = 1; c <= columns; ++c) {
+        const double *column = g.y + 4 * c;
+        double *out = g.out + 4 * c;
+        out[0] = column[2];
+        out[1] = column[3];
+        kepler_jacobian<double>({g.t, g.y, column, out + 2, g.params, 2, g.p});
+    }
+    if (!BY_PARAMETER) return;
+    const double r2 = g.y[0] * g.y[0] + g.y[1] * g.y[1], w = 1.5 / (r2 * r2 * sqrt(r2));
+    g.out[4 * columns + 2] -= w * g.y[0];
+    g.out[4 * columns + 3] -= w * g.y[1];
+}
+
 template <class T>
 void kepler_energy(const Given<T> &g) {
     const T *y = g.y;
@@ -86,8 +104,10 @@ void harmonic_energy_gradient(const Given<T> &g) {
     g.out[1] = g.params[0] * g.y[1];
 }
 
+bool with_columns(int64_t n, int64_t p) { return n > 4 && n % 4 == 0 && p == 1; }
 bool of_four(int64_t n, int64_t p) { return n == 4 && p == 1; }
 bool of_two(int64_t n, int64_t p) { return n == 2 && p == 1; }
+constexpr const char *COLUMNS = "4 numbers, columns of as many, and 1 parameter";
 constexpr const char *FOUR = "a state of 4 numbers and 1 parameter", *TWO = "2 numbers and 1 parameter";
 
 #define EIP_BOTH(function) plain<double, function<double>>, plain<Octet, function<Octet>>
@@ -95,6 +115,10 @@ const LibraryFunction functions[] = {
     {"kepler.rhs", Value::DERIVATIVE, 0, EIP_BOTH(kepler_rhs), of_four, FOUR},
     {"kepler.acc", Value::ACCELERATION, 0, EIP_BOTH(kepler_acc), of_two, TWO},
     {"kepler.jacobian", Value::GRADIENT_BY_F, 1, EIP_BOTH(kepler_jacobian), of_two, TWO},
+    {"kepler.variational", Value::DERIVATIVE, 0, plain<double, kepler_variational<false>>, nullptr, with_columns,
+     COLUMNS},
+    {"kepler.variational_by_parameter", Value::DERIVATIVE, 0, plain<double, kepler_variational<true>>, nullptr,
+     with_columns, COLUMNS},
     {"kepler.energy", Value::NUMBERS, 1, EIP_BOTH(kepler_energy), of_four, FOUR},
     {"kepler.energy_gradient", Value::GRADIENT_BY_F, 1, EIP_BOTH(kepler_energy_gradient), of_four, FOUR},
     {"kepler.momentum", Value::NUMBERS, 1, EIP_BOTH(kepler_momentum), of_four, FOUR},
