@@ -29,7 +29,7 @@ PAGES = (
     "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/rebound-and-astropy",
     "tutorials/pdes", "tutorials/own-pde", "tutorials/ensembles", "how-to/recommend", "how-to/find-invariants",
     "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
-    "how-to/own-methods", "how-to/consistent-starts", "how-to/balances",
+    "how-to/own-methods", "how-to/consistent-starts", "how-to/balances", "how-to/tangent-maps",
 )  # fmt: skip
 NIGHTLY = ("results/hard-scenes", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h")
 
