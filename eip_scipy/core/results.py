@@ -6,10 +6,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..engine.data import N_COUNTERS, N_FIGURES, PROJECTIONS, RANK_REDUCED, REJECTED, SKIPPED, SOFTENED
+from ..engine.data import (
+    ALL_RATES,
+    ALL_TERMS,
+    LATE_RATES,
+    LATE_SHARE,
+    LATE_TERMS,
+    N_COUNTERS,
+    N_FIGURES,
+    N_SLOW,
+    PROJECTIONS,
+    RANK_REDUCED,
+    REJECTED,
+    SAMPLES,
+    SKIPPED,
+    SOFTENED,
+)
 from ..engine.trust import ProjectionWarning, Trust
 
-__all__ = ["Diagnostics", "ProjectionResult", "ProjectionWarning", "slowness"]
+__all__ = ["Diagnostics", "ProjectionResult", "ProjectionWarning", "joined_sums", "slowness"]
 
 
 class Diagnostics:
@@ -48,8 +63,9 @@ class Diagnostics:
         The largest correction of each invariant, in the same unit; nan where none was measured.
     slowness : ndarray, shape (l,)
         How fast each `Balance` changes: the mean of its rate, compared with that of the terms of ``grad @ f``, at some
-        of the projections. The error of a balance is about this share of the error of an invariant, and above 0.05 it
-        hardly helps. nan for invariants, and where ``check=False``.
+        of the projections. It is the larger of two values, of which one is a mean over the whole run, and the other one
+        over about its last eighth. The error of a balance is about this share of the error of an invariant, and above
+        0.05 it hardly helps. nan for invariants, and where ``check=False``.
     """
 
     def __init__(self) -> None:
@@ -77,7 +93,7 @@ class Diagnostics:
         self._counters = counters
         self._estimated = estimated
         self.moved = moved
-        self._slow = (np.zeros(0, np.int64), np.zeros((2, 0))) if slow is None else slow
+        self._slow = (np.zeros(0, np.int64), np.zeros((N_SLOW, 0))) if slow is None else slow
 
     @property
     def last_defect(self) -> np.ndarray:
@@ -136,7 +152,7 @@ class Diagnostics:
 
     @property
     def slowness(self) -> np.ndarray:
-        """Mean rate of each balance in units of its terms, (l,)."""
+        """Mean rate of each balance in units of its terms, over the run or its end, (l,)."""
         places, sums = self._slow
         found = np.full(len(self.names), np.nan)
         found[places] = slowness(sums)
@@ -163,9 +179,23 @@ class Diagnostics:
 
 
 def slowness(sums: np.ndarray) -> np.ndarray:
-    """Return the mean rates (b,) of balances in units of their terms, from the sums (2, b) of both."""
-    rates, terms = sums
-    return np.where(terms > 0, rates, np.nan) / np.where(terms > 0, terms, 1.0)
+    """Return the mean rates (b,) of balances in units of their terms, from the sums (N_SLOW, b) of both.
+
+    A mean over the whole run does not show a balance that is slow only as long as its terms are large, such as the
+    energy of an oscillator that is damped down to its driving. The larger one of both means is returned.
+    """
+    rates, terms = sums[[ALL_RATES, LATE_RATES]], sums[[ALL_TERMS, LATE_TERMS]]
+    known = terms > 0
+    return np.max(np.where(known, rates, np.nan) / np.where(known, terms, 1.0), axis=0)
+
+
+def joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """Return the sums (N_SLOW, b) of a run and of the one that continues it. The late sums forget as one run does."""
+    both = one + two
+    late = [LATE_RATES, LATE_TERMS]
+    kept = (one[SAMPLES] / np.maximum(both[SAMPLES], 1.0)) ** (1 / LATE_SHARE)
+    both[late] = kept * one[late] + two[late]
+    return both
 
 
 class ProjectionResult(NamedTuple):

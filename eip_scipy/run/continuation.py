@@ -10,7 +10,7 @@ from scipy.integrate import OdeSolution
 
 from ..core.inputs import is_number, shown
 from ..core.problem import Problem
-from ..core.results import Diagnostics
+from ..core.results import Diagnostics, joined_sums
 from .events import ContinuedEvents, as_events
 from .integrate import integrate
 from .prepare import Request
@@ -91,7 +91,7 @@ def _diagnostics(one: Diagnostics, two: Diagnostics) -> Diagnostics:
         one._trust.followed_by(two._trust),
         estimated=one._estimated and two._estimated,
         moved=one.moved or two.moved,
-        slow=(two._slow[0], one._slow[1] + two._slow[1]),
+        slow=(two._slow[0], joined_sums(one._slow[1], two._slow[1])),
     )
     return both
 

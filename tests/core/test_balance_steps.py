@@ -455,3 +455,21 @@ def test_a_fast_balance_is_pointed_out(solve):
         run = solve(driven, (0, 50), [1.0, 0.0], method=EIPDOP853, h=0.2, invariants=balance)
     assert len(told) == 1
     assert getattr(run, "trusted", True)
+
+
+@pytest.mark.parametrize("solve", [ivp, eip_scipy.solve_ivp, integrate])
+def test_a_balance_that_is_fast_only_at_the_end_is_pointed_out(solve):
+    """The energy of an oscillator decays to that of its driving, where its rate is as large as its terms."""
+
+    def driven(t, y):
+        return np.array([y[1], -y[0] - 0.02 * y[1] + 0.01 * np.cos(2 * t)])
+
+    def power(t, y):
+        return -0.02 * y[1] ** 2 + 0.01 * y[1] * np.cos(2 * t)
+
+    balance = Balance(slow_energy, power, name="E")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        solve(driven, (0, 200), [1.0, 0.3], method=EIPDOP853, h=0.3, invariants=balance)
+    with pytest.warns(UserWarning, match=r"balance 'E' changes at 0\.\d+ of the terms of its rate"):
+        solve(driven, (0, 1500), [1.0, 0.3], method=EIPDOP853, h=0.3, invariants=balance)

@@ -265,6 +265,36 @@ def test_a_run_is_continued(options):
         assert np.isfinite(found.diagnostics.slowness).all()
 
 
+@njit
+def driven(t, y, p):
+    return np.array([y[1], -y[0] - 0.02 * y[1] + 0.01 * np.cos(2 * t)])
+
+
+@njit
+def plain_energy(t, y, p):
+    return 0.5 * (y[0] ** 2 + y[1] ** 2)
+
+
+@njit
+def power(t, y, p):
+    return -0.02 * y[1] ** 2 + 0.01 * y[1] * np.cos(2 * t)
+
+
+@pytest.mark.filterwarnings("ignore:balance 'E' changes at:UserWarning")
+@pytest.mark.parametrize("options", RUNS)
+def test_a_run_in_two_parts_is_as_slow_as_in_one(options):
+    """The energy decays to that of the driving, so that it is slow at the start only."""
+    balance = Balance(plain_energy, power, name="E")
+
+    def until(end):
+        return integrate(driven, (0, end), START, params=PARAMS, invariants=balance, **options)
+
+    whole, halves = until(1500.0).diagnostics.slowness[0], until(1300.0).continue_to(1500.0).diagnostics.slowness[0]
+    assert whole > 0.1
+    assert halves == pytest.approx(whole, rel=0.15)
+    assert until(200.0).diagnostics.slowness[0] < 0.05
+
+
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("options", RUNS)
 def test_members_of_ensembles_are_single_runs(options, compiled):

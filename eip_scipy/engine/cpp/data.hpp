@@ -49,6 +49,13 @@ EIP_ENUM(Figure, START, TERMS, NOTED, LEFT, SHARE, SHARE_AT, RAW, RAW_AT, RAW_MA
 EIP_ENUM(SuspectPlace, REASON, SUSPECT_FROM, SUSPECT_TO, SUSPECT_WAITED, N_SUSPECT);
 EIP_ENUM(Reason, NOTHING, LARGE_CORRECTION, LARGE_ERROR, CHANGES_ALONG_FLOW);
 
+// Rows of `slow`, with a column for each balance: sums of the sizes of rates and of their terms over the whole run, sums of
+// the same that forget, and the number of samples.
+EIP_ENUM(SlowRow, ALL_RATES, ALL_TERMS, LATE_RATES, LATE_TERMS, SAMPLES, N_SLOW);
+// The late sums of a balance remember this share of the samples so far, and LEAST_MEMORY samples at least, because rate and
+// terms vary within a period.
+constexpr double LATE_SHARE = 1.0 / 8.0, LEAST_LATE = 16.0;
+
 // Changes of LARGE local errors are noted, and defects of DISTANT and LARGE_SHARE of the terms before and after projections.
 constexpr double LARGE = 50.0, DISTANT = 0.03, LARGE_SHARE = 1e-2;
 constexpr double EPS = 2.220446049250313e-16;
@@ -361,7 +368,7 @@ void each_buffer(WorkOf<V> &w, int64_t blocks, Visit &visit) {
     visit("rates", w.rates, {w.stages + 1, w.balances});
     each(visit, {w.balances}, "level", w.level, "level_old", w.level_old, "level_carry", w.level_carry,
          "level_carry_new", w.level_carry_new);
-    visit("slow", w.slow, {2, w.balances});
+    visit("slow", w.slow, {N_SLOW, w.balances});
     visit("suspect", w.suspect, {w.suspect_size()});
     visit("pivots", w.pivots, {l});
     visit("counters", w.counters, {N_COUNTERS});

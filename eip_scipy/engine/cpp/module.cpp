@@ -390,13 +390,15 @@ void add_integers(nb::module_ &m, std::string_view names) {
 }
 
 void add_constants(nb::module_ &m) {
-    for (const char *names : {Code_NAMES, Direction_NAMES, Metric_NAMES, Counter_NAMES, Clock_NAMES, Place_NAMES,
-                              Node_NAMES, Interpolant_NAMES, Figure_NAMES, SuspectPlace_NAMES, Reason_NAMES})
+    for (const char *names :
+         {Code_NAMES, Direction_NAMES, Metric_NAMES, Counter_NAMES, Clock_NAMES, Place_NAMES, Node_NAMES,
+          Interpolant_NAMES, Figure_NAMES, SuspectPlace_NAMES, Reason_NAMES, SlowRow_NAMES})
         add_integers(m, names);
     m.attr("AUTO") = AUTO;
     m.attr("MOST_ARGUMENTS") = MOST_ARGUMENTS;
     m.attr("MOST_CROSSINGS") = MOST_CROSSINGS;
     m.attr("EPS") = EPS;
+    m.attr("LATE_SHARE") = LATE_SHARE;
     m.attr("LARGE") = LARGE;
     m.attr("DISTANT") = DISTANT;
     m.attr("LARGE_SHARE") = LARGE_SHARE;

@@ -209,6 +209,16 @@ template <class W>
     return found;
 }
 
+// Add a sample of balance b to the sums by which its slowness is judged.
+inline void note_slowness(double rate, double terms, int64_t b, const Work &w) {
+    const auto row = [&](SlowRow k) -> double & { return w.slow[k * w.balances + b]; };
+    row(ALL_RATES) += rate;
+    row(ALL_TERMS) += terms;
+    const double kept = 1.0 - 1.0 / std::max(LEAST_LATE, LATE_SHARE * ++row(SAMPLES));
+    row(LATE_RATES) = kept * row(LATE_RATES) + rate;
+    row(LATE_TERMS) = kept * row(LATE_TERMS) + terms;
+}
+
 // The rates at which the balances are to change with the state, and sums of rates and of their terms. Nothing is known of
 // those that have no rate of their own.
 [[gnu::cold, gnu::noinline]] inline void note_balances(const Run &run, const Step &step) {
@@ -224,8 +234,7 @@ template <class W>
             const double terms = abs_dot(w.gradient(i), w.last(), w.m);
             w.flow[i] = balance.is_given ? rates[b] - in_time[k] : NOT_A_NUMBER;
             if (!std::isfinite(rates[b]) || !std::isfinite(terms)) continue;
-            w.slow[b] += std::abs(rates[b]);
-            w.slow[w.balances + b] += terms;
+            note_slowness(std::abs(rates[b]), terms, b, w);
         }
         first += balance.floats;
     }
