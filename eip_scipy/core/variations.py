@@ -99,7 +99,7 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], sy
         if len(set(own)) < len(own):
             raise ValueError(f"variations: {shown(asked)} names a parameter twice.")
         has_state, p = STATE in items, len(own)
-        values = np.zeros((n + p, n * has_state + p))
+        values: Array = np.zeros((n + p, n * has_state + p))
         if has_state:
             values[:n, :n] = np.eye(n)
         values[n:, n * has_state :] = np.eye(p)
@@ -230,7 +230,7 @@ class Variations:
             wide = wide_value(fun, n)
         else:
 
-            def wide(t, Y, *extra):
+            def wide(t: float, Y: Array, *extra: Any) -> Any:
                 return fun(t, Y[:n], *extra)
 
         for name in ("terminal", "direction"):
@@ -393,6 +393,7 @@ def _wide(item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple,
         by_numbers = True
     else:
         by_numbers = False
+    slopes: Any = own.gradient
     args = () if by_numbers else item.args
     shape, places = value.shape, list(parameters)
 
@@ -413,10 +414,10 @@ def _wide(item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple,
         out = np.zeros((*shape, Y.size))
         if own.in_place:
             out[..., :n] = filled(
-                lambda part: own.gradient(*first, part, *args, *arguments), (*shape, n), np.dtype(float), "gradient", t
+                lambda part: slopes(*first, part, *args, *arguments), (*shape, n), np.dtype(float), "gradient", t
             )
         else:
-            out[..., :n] = own.gradient(*first, *args, *arguments)
+            out[..., :n] = slopes(*first, *args, *arguments)
         if takes_params:
             by = difference_gradient(
                 lambda p: np.asarray(item.function(t, Y[:n].copy(), p)), arguments[0], np.abs(arguments[0]) + 1e-3
