@@ -40,6 +40,7 @@ def after_revolutions(n):
 
 
 # Where plain RK4 has 1.5e-2 after 50 revolutions.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "steps", "revolutions", "bound"),
     [(EIPRK4, 388, 50, 1e-4), (EIPRK4, 388, 500, 1e-3), (EIPDOP853, 60, 50, 1e-6)],
@@ -162,12 +163,11 @@ SYSTEMS = {
     ),
 }
 SOURCES = ("SymPy", "dual numbers", "jvp", "jitted jvp", "complex step")
-QUICK = {("pendulum", "SymPy"), ("Kepler", "dual numbers"), *((name, "complex step") for name in SYSTEMS)}
 SOME = ("pendulum", "Kepler", "Lotka-Volterra", "forced Duffing")  # the others take minutes to compile
 
 
 def marks(name, source):
-    if (name, source) in QUICK:
+    if source == "complex step":
         return ()
     return (pytest.mark.slow,) if name in SOME else (pytest.mark.slow, pytest.mark.nightly)
 
@@ -262,6 +262,7 @@ def test_spectrum_of_a_linear_system():
     assert run.trusted
 
 
+@pytest.mark.slow
 def test_spectrum_of_a_hamiltonian_system(henon_heiles):
     """Volumes are kept in all steps, the pairs of exponents in the limit."""
     run = lyapunov_spectrum(henon_heiles, (0, 2000), CHAOTIC, method=EIPDOP853, h=0.1, every=5.0)
@@ -307,6 +308,7 @@ def test_megno_by_its_definition(pendulum):
     assert adaptive.Y[-1] == pytest.approx(run.Y[-1], abs=2e-2)
 
 
+@pytest.mark.slow
 def test_megno_of_a_chaotic_orbit(henon_heiles):
     """It grows by half the exponent times t."""
     run = megno(henon_heiles, (0, 3000), CHAOTIC, method=EIPDOP853, h=0.1)
