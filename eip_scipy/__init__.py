@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from . import problems as problems
     from . import results as results
     from . import solvers as solvers
+    from . import tangent_maps as tangent_maps
     from .core.balances import Balance
     from .core.config import show_config
     from .core.invariants import Invariant, check_gradient
@@ -99,7 +100,7 @@ _HOMES = {  # the module of each of these names, and the modules that are public
 if not _Path(__file__).with_name("integrations").exists():
     __path__.append(str(_Path(__file__).parents[1]))
 
-_MODULES = ("checkpoint", "methods", "problems", "results", "solvers")
+_MODULES = ("checkpoint", "methods", "problems", "results", "solvers", "tangent_maps")
 _moved = _moved_names(__name__, stacklevel=3)
 
 

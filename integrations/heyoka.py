@@ -6,6 +6,7 @@ package.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -21,7 +22,7 @@ except ModuleNotFoundError as error:
         'eip_scipy.integrations.heyoka needs heyoka: pip install "eip_scipy[heyoka]"', name="heyoka"
     ) from error
 
-__all__ = ["HeyokaRun", "run"]
+__all__ = ["HeyokaRun", "largest_exponent", "run"]
 
 
 @dataclass(frozen=True)
@@ -87,3 +88,45 @@ def run(gm: Any, y0: Any, *, t_end: float, tolerance: float | None = None) -> He
         raise ValueError(f"heyoka stopped at t = {integrator.time:g}: {outcome}")
     y = integrator.state.reshape(-1, 2, 3).swapaxes(0, 1).ravel()
     return HeyokaRun(heyoka.__version__, float(t_end), y, wall_time, int(steps))
+
+
+def largest_exponent(energy: Callable[..., Any], y0: Any, deviation: Any, *, t_end: float, every: float) -> float:
+    """Compute the largest Lyapunov exponent of a Hamiltonian system by heyoka's variational equations.
+
+    Parameters
+    ----------
+    energy : callable
+        ``energy(heyoka, *y)``: the Hamiltonian of the components of the state (q, p), as an expression.
+    y0, deviation : array_like, shape (n,)
+        Initial state (q, p) and tangent vector.
+    t_end, every : float
+        End of the run from t = 0, and the time after which the vector is made a unit vector again.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    ValueError
+        When shapes disagree or a time is not positive.
+    """
+    refuse_units(y0=y0, deviation=deviation, t_end=t_end, every=every)
+    y, d = np.array(y0, dtype=float), np.array(deviation, dtype=float)
+    if y.ndim != 1 or y.size % 2 or d.shape != y.shape or not (t_end > 0 and every > 0):
+        raise ValueError(f"the state {y.shape} and the tangent vector {d.shape} must be (q, p), and the times positive")
+    names = heyoka.make_vars(*(f"y{k}" for k in range(y.size)))
+    H, half = energy(heyoka, *names), y.size // 2
+    rates = [*(heyoka.diff(H, p) for p in names[half:]), *(-heyoka.diff(H, q) for q in names[:half])]
+    system = heyoka.var_ode_sys(list(zip(names, rates, strict=True)), heyoka.var_args.vars)
+    integrator = heyoka.taylor_adaptive(system, y, compact_mode=True)
+    matrix, total = integrator.get_vslice(order=1), 0.0
+    pieces = max(1, round(t_end / every))
+    for k in range(1, pieces + 1):
+        integrator.state[matrix] = np.eye(y.size).ravel()
+        integrator.propagate_until(t_end * k / pieces)
+        d = integrator.state[matrix].reshape(y.size, y.size) @ d
+        size = np.linalg.norm(d)
+        total += np.log(size)
+        d /= size
+    return float(total / t_end)

@@ -33,7 +33,7 @@ from ._rebound_exchange import exit_events, problem_from_simulation, read_archiv
 from ._rebound_exchange import state as _state
 
 __all__ = [
-    "INTEGRATORS", "ReboundRun", "ReboundSteps", "exit_events", "ias15_steps", "problem_from_simulation",
+    "INTEGRATORS", "ReboundRun", "ReboundSteps", "exit_events", "ias15_steps", "megno", "problem_from_simulation",
     "read_archive", "run", "simulation", "to_archive", "to_simulation",
 ]  # fmt: skip
 
@@ -127,6 +127,39 @@ def simulation(gm: Any, y: Any) -> rebound.Simulation:
         sim.add(m=m, x=x, y=y_, z=z, vx=vx, vy=vy, vz=vz)
     sim.move_to_com()
     return sim
+
+
+def megno(gm: Any, y: Any, *, t_end: float, dt: float, seed: int = 1) -> tuple[float, float, np.ndarray]:
+    """Compute MEGNO by WHFast and REBOUND's variational particles.
+
+    Parameters
+    ----------
+    gm, y : array_like
+        As for `simulation`.
+    t_end, dt : float
+        End of the run from t = 0, and the step.
+    seed : int, optional
+        Chooses the tangent vector.
+
+    Returns
+    -------
+    megno : float
+        The mean MEGNO at the end.
+    slope : float
+        Its slope against t (``Simulation.lyapunov()``), half of the exponent.
+    deviation : ndarray, shape (6 N,)
+        The tangent vector at the start.
+    """
+    refuse_units(t_end=t_end, dt=dt)
+    sim = simulation(gm, y)
+    n = sim.N
+    sim.integrator, sim.dt = "whfast", dt
+    sim.init_megno(seed=seed)
+    # Version 4 has the variational particles behind the others.
+    varied = list(sim.particles_var) if hasattr(sim, "particles_var") else list(sim.particles)[n:]
+    deviation = np.array([*(p.xyz for p in varied), *(p.vxyz for p in varied)]).ravel()
+    sim.integrate(t_end)
+    return float(sim.megno()), float(sim.lyapunov()), deviation
 
 
 def run(

@@ -96,6 +96,10 @@ COMMANDS = {
         "measurements.solar_reference:SolarReference", "states of the solar system in 80 bits"
     ),
     "study speed": Entry("measurements.speed:Speed", "speed of the compiled step"),
+    "study tangent-maps": Entry(
+        "measurements.tangent_maps:TangentMaps",
+        "derivatives that runs carry along: errors, cost, chaos, a stability map",
+    ),
     "study trust": Entry("measurements.trust:Trust", "whether faulty runs are reported, and correct ones are not"),
     "study waves": Entry("measurements.waves:Waves", "errors against cost of waves beside SciPy's DOP853"),
     "study with-and-without": Entry("measurements.with_and_without:WithAndWithout", "the README's figure"),

@@ -1,0 +1,847 @@
+"""Chaos indicators, periodic orbits and fits, from derivatives that runs carry along (``variations=`` of `integrate`).
+
+Each function takes what `integrate` takes: a function or a `Problem`, and all of its options.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from .core.inputs import count as as_count
+from .core.inputs import is_number, shown
+from .core.names import nearest
+from .core.options import ProjectionOptions
+from .core.results import Diagnostics
+from .run.integrate import integrate
+from .run.prepare import Prepared, Request, prepared
+from .run.results import IntegrationResult
+from .run.tables import default_names
+
+__all__ = [
+    "LyapunovSpectrum",
+    "Megno",
+    "PeriodicOrbit",
+    "TrajectoryFit",
+    "lyapunov_spectrum",
+    "megno",
+    "periodic_orbit",
+]
+
+Array = np.ndarray
+# Pieces of a run between two orthonormalisations when the user gives no length.
+PIECES, PIECES_OF_ONE = 1000, 100
+# A piece in which the columns grow apart by more than this factor is repeated at half its length: the least exponents
+# would otherwise be lost in the rounding of the largest.
+LARGEST_RATIO = 1e8
+# The same for a single column, whose square must not overflow.
+LARGEST_COLUMN = 1e100
+SHORTEST = 2.0**-40
+# Singular values below this share of the largest belong to directions that the equations leave open: the flow, and the
+# gradients of invariants.
+RANK = 1e-8
+HALVINGS = 8
+# How far products of two multipliers may be from 1 for the multipliers to be shown in pairs; the unit pair of a
+# Hamiltonian system carries the square root of the rounding.
+PAIRED = 1e-3
+# Options of `integrate` that these functions set themselves.
+OWN = ("variations", "dense_output", "t_eval", "checkpoint", "checkpoint_every", "resume")
+
+
+@dataclass(frozen=True, eq=False)
+class LyapunovSpectrum:
+    """Result of `lyapunov_spectrum`.
+
+    Attributes
+    ----------
+    exponents : ndarray, shape (k,)
+        The estimates at the end of the run, the largest first.
+    t : ndarray, shape (m,)
+        Times of the orthonormalisations.
+    running : ndarray, shape (m, k)
+        The estimates at these times, in the order of the columns.
+    columns : ndarray, shape (n, k)
+        The orthonormal columns at the end.
+    y : ndarray, shape (n,)
+        The state at the end.
+    diagnostics : Diagnostics
+        Of the whole run.
+    success, trusted : bool
+        As for `integrate`.
+    message : str
+    """
+
+    exponents: Array
+    t: Array
+    running: Array
+    columns: Array = field(repr=False)
+    y: Array = field(repr=False)
+    diagnostics: Diagnostics = field(repr=False)
+    success: bool
+    trusted: bool
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class Megno:
+    """Result of `megno`.
+
+    Attributes
+    ----------
+    megno : float
+        The mean MEGNO at the end: 2 for a regular orbit; it grows by half the exponent times t for a chaotic one.
+    lyapunov : float
+        Estimate of the largest Lyapunov exponent: twice the slope of the mean MEGNO against t, by least squares.
+    t : ndarray, shape (m,)
+        Saved times.
+    Y, mean : ndarray, shape (m,)
+        MEGNO and its mean at these times.
+    log_size : ndarray, shape (m,)
+        Logarithm of the size of the tangent vector, 0 at the start.
+    y : ndarray, shape (n,)
+        The state at the end.
+    diagnostics : Diagnostics
+    success, trusted : bool
+        As for `integrate`.
+    message : str
+    """
+
+    megno: float
+    lyapunov: float
+    t: Array = field(repr=False)
+    Y: Array = field(repr=False)
+    mean: Array = field(repr=False)
+    log_size: Array = field(repr=False)
+    y: Array = field(repr=False)
+    diagnostics: Diagnostics = field(repr=False)
+    success: bool
+    trusted: bool
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodicOrbit:
+    """Result of `periodic_orbit`.
+
+    Attributes
+    ----------
+    y0 : ndarray, shape (n,)
+    period : float
+    monodromy : ndarray, shape (n, n)
+        State-transition matrix M over one period.
+    multipliers : ndarray, shape (n,)
+        Its eigenvalues. Where they come in pairs with the product 1, each is followed by its partner, the pairs by
+        decreasing modulus; otherwise all by decreasing modulus. The unit pair of a Hamiltonian system belongs to a
+        Jordan block, and is known to the square root of the error of M only.
+    closure : float
+        Largest component of ``y(period) - y0``, relative to the size of `y0`.
+    flow_residual : float
+        ``|M f - f| / (|M| |f|)`` with the derivative f at the start, in the 2-norm: 0 for an exact M.
+    invariant_residual : float
+        ``|G M - G| / (|G| |M|)``, with the gradients G of the invariants, the largest; nan without invariants.
+    iterations : int
+    success : bool
+        Whether `closure` is at most `tol`.
+    message : str
+    run : IntegrationResult
+        The run over the last period.
+    """
+
+    y0: Array
+    period: float
+    monodromy: Array = field(repr=False)
+    multipliers: Array
+    closure: float
+    flow_residual: float
+    invariant_residual: float
+    iterations: int
+    success: bool
+    message: str
+    run: IntegrationResult = field(repr=False)
+
+
+class _Piece(NamedTuple):
+    """A part of a run between two orthonormalisations.
+
+    `run` ends with the piece, and has its own rows after the first one. `growth`: R of the QR factorisation at its end;
+    `columns`: Q.
+    """
+
+    run: IntegrationResult
+    growth: Array
+    columns: Array
+
+
+def _refuse(function: str, options: dict[str, Any], also: Sequence[str] = ()) -> None:
+    for name in (*OWN, *also):
+        if name in options:
+            raise TypeError(f"{function}() has no option {name!r}: it sets this option of integrate itself.")
+    known = {*(item.name for item in fields(Request)), *ProjectionOptions.names()} - {*OWN, *also, "projection"}
+    for name in options:
+        if name not in known:
+            raise TypeError(f"{function}() has no option {name!r}{nearest(name, sorted(known))}")
+
+
+def _start(fun: Any, t_span: Any, y0: Any, options: dict[str, Any]) -> Prepared:
+    """What `integrate` makes of its arguments before the first step."""
+    return prepared(Request.of(**{"method": None, **options, "fun": fun, "t_span": t_span, "y0": y0}))
+
+
+def _length(every: Any, start: Prepared, pieces: int) -> float:
+    """The time between two orthonormalisations; by default a whole number of steps, where they have one length."""
+    h, (t0, t_bound) = abs(start.schedule.span.h), _ends(start)
+    span = abs(t_bound - t0)
+    if every is None:
+        return min(h * np.ceil(span / pieces / h), span) if h else span / pieces
+    if not is_number(every) or not 0 < every < np.inf:
+        raise ValueError(f"every must be a time > 0 between two orthonormalisations, got {shown(every)}.")
+    return min(float(every), span)
+
+
+def _pieces(fun: Any, y0: Any, t: tuple[float, float], columns: Array, every: float, options: Any) -> Iterator[_Piece]:
+    """Run from t[0] to t[1] with columns that are orthonormal at the start of each piece.
+
+    Lengths are halved where the columns grow apart too far. A piece that fails for another reason is the last.
+    """
+    begin, end = t
+    now, sign, run = begin, np.sign(end - begin), None
+    total, made, length = abs(end - begin), 0.0, every
+    while made < total:
+        # From the start, so that rounding does not add up; the last piece is no sliver.
+        aim = total if total - made < 1.01 * length else made + length
+        bound = end if aim == total else begin + sign * aim
+        if run is None:
+            following = integrate(fun, (now, bound), y0, variations=columns, **options)
+        else:
+            following = run.continue_to(bound, variations=columns)
+        found = following.variations[-1]
+        finite = bool(np.isfinite(found).all())
+        Q, R = np.linalg.qr(found) if finite else (columns, np.full((columns.shape[1],) * 2, np.nan))
+        sizes = np.abs(np.diag(R))
+        apart = not finite or sizes.max() > LARGEST_COLUMN or sizes.max() > LARGEST_RATIO * sizes.min()
+        if apart and length > SHORTEST * every:
+            length /= 2
+            continue
+        run, made = following, aim
+        yield _Piece(run, R, Q)
+        if run.status != 0:
+            return
+        columns = Q
+        for name in ("t", "y", "invariants"):  # only the last row is needed from here on
+            run[name] = run[name][..., -1:]
+        run["variations"] = run.variations[-1:]
+
+
+def _orthonormal(n: int, k: int) -> Array:
+    """The same k directions in each call, none of them special."""
+    return np.linalg.qr(np.random.default_rng(1).standard_normal((n, k)))[0]
+
+
+def lyapunov_spectrum(
+    fun: Any,
+    t_span: Any = None,
+    y0: Any = None,
+    *,
+    count: int | None = None,
+    every: float | None = None,
+    **options: Any,
+) -> LyapunovSpectrum:
+    """Compute Lyapunov exponents by the growth of tangent vectors that are orthonormalised on the way.
+
+    Parameters
+    ----------
+    fun, t_span, y0
+        As for `integrate`.
+    count : int, optional
+        How many exponents, the largest ones. Default: all n.
+    every : float, optional
+        Time between two orthonormalisations; with a fixed step best a multiple of it. Default: a thousandth of the
+        interval. The time is halved where the columns grow apart by more than 1e8.
+    **options
+        Options of `integrate`: method, steps, params, invariants, jvp and so on.
+
+    Returns
+    -------
+    LyapunovSpectrum
+
+    Raises
+    ------
+    ValueError, TypeError
+        For wrong values, options that the function sets itself, and as by `integrate`.
+
+    Notes
+    -----
+    The estimates converge as 1/t, with fluctuations: look at ``running``. Over a backward run the exponents are those
+    of the reversed flow. The columns are projected with the state, so that a Hamiltonian system's pair of zeros
+    belongs to the energy and to the flow exactly.
+
+    References
+    ----------
+    G. Benettin, L. Galgani, A. Giorgilli, J.-M. Strelcyn, Meccanica 15 (1980), 9-20 and 21-30.
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPDOP853, hamiltonian
+    >>> from eip_scipy.tangent_maps import lyapunov_spectrum
+    >>> pendulum = hamiltonian("p**2/2 - cos(q)")
+    >>> found = lyapunov_spectrum(pendulum, (0, 100), [0.0, 1.0], method=EIPDOP853, h=0.1, every=1.0)
+    >>> bool(abs(found.exponents.sum()) < 1e-12)
+    True
+    """
+    _refuse("lyapunov_spectrum", options, ("save_every", "symplectic"))
+    start = _start(fun, t_span, y0, options)
+    n, (t0, t_bound) = start.n, _ends(start)
+    k = n if count is None else as_count("count", count)
+    if k > n:
+        raise ValueError(f"count is {k}, but the state has {n} components and as many exponents.")
+    times, sums, total = [], [], np.zeros(k)
+    for piece in _pieces(fun, y0, (t0, t_bound), _orthonormal(n, k), _length(every, start, PIECES), options):
+        total = total + np.log(np.abs(np.diag(piece.growth)))
+        times.append(piece.run.t[-1])
+        sums.append(total)
+    t = np.array(times)
+    running = np.array(sums) / np.abs(t - t0)[:, None]
+    run = piece.run
+    return LyapunovSpectrum(
+        np.sort(running[-1])[::-1], t, running, piece.columns, run.y[:, -1],
+        run.diagnostics, run.success, run.trusted, run.message,
+    )  # fmt: skip
+
+
+def _ends(start: Prepared) -> tuple[float, float]:
+    span = start.schedule.span
+    if not np.isfinite(span.t_bound):
+        raise ValueError("t_span must be a finite interval here.")
+    return float(span.t0), float(span.t_bound)
+
+
+def megno(
+    fun: Any,
+    t_span: Any = None,
+    y0: Any = None,
+    *,
+    deviation: Any = None,
+    every: float | None = None,
+    save_every: int = 1,
+    **options: Any,
+) -> Megno:
+    """Compute MEGNO, the mean exponential growth factor of nearby orbits, from one tangent vector.
+
+    Parameters
+    ----------
+    fun, t_span, y0
+        As for `integrate`.
+    deviation : array_like, shape (n,), optional
+        The tangent vector at the start; its length does not matter. Default: a random direction, the same each time.
+    every : float, optional
+        Time after which the vector is made a unit vector again. Default: a hundredth of the interval. Halved
+        where the vector grows by more than 1e100.
+    save_every : int, optional
+        Steps from one saved point to the next. The integrals are those of cubic splines through these points.
+    **options
+        Options of `integrate`: method, steps, params, invariants, jvp and so on.
+
+    Returns
+    -------
+    Megno
+
+    Raises
+    ------
+    ValueError, TypeError
+        For wrong values, options that the function sets itself, and as by `integrate`.
+
+    Notes
+    -----
+    With the tangent vector d, ``Y(t) = (2/t) int_0^t s (d' . d)/(d . d) ds``, and the mean is ``(1/t) int_0^t Y ds``,
+    with t from the start of the run. By parts, ``Y = 2 (L(t) - (1/t) int_0^t L ds)`` with L = ln |d|, so that no
+    derivative is needed: the error is that of the splines, of order 4 in the distance of the saved points. The mean
+    tends to 2 for regular orbits, 0 for a harmonic oscillator, and to half the largest exponent times t for chaotic
+    ones. REBOUND returns the mean, from all positions and velocities without masses; its
+    ``Simulation.lyapunov()`` is the slope of the mean, half of ``lyapunov`` here.
+
+    References
+    ----------
+    P. M. Cincotta, C. Simó, Astron. Astrophys. Suppl. Ser. 147 (2000), 205-228, eqs. 23 to 25.
+    H. Rein, D. Tamayo, MNRAS 459 (2016), 2275-2285, section 4, for REBOUND.
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPDOP853, hamiltonian
+    >>> from eip_scipy.tangent_maps import megno
+    >>> pendulum = hamiltonian("p**2/2 - cos(q)")
+    >>> found = megno(pendulum, (0, 2000), [0.0, 1.0], method=EIPDOP853, h=0.1)
+    >>> round(found.megno, 1)
+    2.0
+    """
+    _refuse("megno", options, ("symplectic",))
+    save_every = as_count("save_every", save_every)
+    start = _start(fun, t_span, y0, options)
+    t0, t_bound = _ends(start)
+    first = _unit(deviation, start.n)
+    length = _length(every, start, PIECES_OF_ONE)
+    times, logs, offset = [np.array([t0])], [np.zeros(1)], 0.0
+    options = {**options, "save_every": save_every}
+    for piece in _pieces(fun, y0, (t0, t_bound), first, length, options):
+        sizes = np.linalg.norm(piece.run.variations[1:, :, 0], axis=1)
+        times.append(piece.run.t[1:])
+        logs.append(offset + np.log(sizes))
+        offset = logs[-1][-1] if sizes.size else offset
+    t, L = np.concatenate(times), np.concatenate(logs)
+    Y, mean = _indicators(np.abs(t - t0), L)
+    slope = np.polyfit(np.abs(t - t0), mean, 1)[0] if t.size > 2 else np.nan
+    run = piece.run
+    return Megno(
+        float(mean[-1]), float(2 * slope), t, Y, mean, L, run.y[:, -1],
+        run.diagnostics, run.success, run.trusted, run.message,
+    )  # fmt: skip
+
+
+def _unit(deviation: Any, n: int) -> Array:
+    if deviation is None:
+        return _orthonormal(n, 1)
+    try:
+        given = np.array(deviation, float)
+    except (TypeError, ValueError):
+        given = np.zeros(0)
+    if given.shape != (n,) or not np.isfinite(given).all() or not given.any():
+        raise ValueError(f"deviation must be a finite vector of {n} numbers, not all 0, got {shown(deviation)}.")
+    return (given / np.linalg.norm(given))[:, None]
+
+
+def _indicators(s: Array, L: Array) -> tuple[Array, Array]:
+    """MEGNO and its mean from the logarithms at the times s, which begin at 0."""
+    if s.size < 2:
+        return np.zeros(s.size), np.zeros(s.size)
+    # Where a run restarts its adaptive steps, two points may be almost the same.
+    after = np.where(s > 0, s, 1.0)
+    Y = 2 * (L - CubicSpline(s, L).antiderivative()(s) / after)
+    Y[0] = 0.0
+    mean = CubicSpline(s, Y).antiderivative()(s) / after
+    return Y, mean
+
+
+def periodic_orbit(
+    fun: Any,
+    y0: Any,
+    period: float,
+    *,
+    fixed: Sequence[str | int] = (),
+    symmetry: Any = None,
+    tol: float = 1e-10,
+    max_iterations: int = 30,
+    **options: Any,
+) -> PeriodicOrbit:
+    """Refine a periodic orbit by differential correction, and return its Floquet multipliers.
+
+    Parameters
+    ----------
+    fun : callable or Problem
+        As for `integrate`; the equations must not depend on t, or ``"period"`` be fixed at the period of the forcing.
+    y0 : array_like, shape (n,)
+        A state near the orbit.
+    period : float
+        An estimate of its period, > 0.
+    fixed : sequence of str or int, optional
+        Components of the start, by name or place, that the correction leaves as they are, and ``"period"``. In a family
+        of orbits they choose one; otherwise it is the one that least corrections lead to.
+    symmetry : array_like of ±1, shape (n,), optional
+        The signs that the components take under a reversing symmetry of the equations: (x, y, z, vx, vy, vz) of the
+        restricted three-body problem has (1, -1, 1, -1, 1, -1). The orbit then starts with all components of
+        sign -1 at 0, and is corrected to have them at 0 after half the period again, which halves the error that an
+        unstable orbit multiplies.
+    tol : float, optional
+        Bound on ``|y(period) - y0|``, the largest component, relative to that of `y0`, of a result that is a success.
+        Corrections go on while they bring more.
+    max_iterations : int, optional
+    **options
+        Options of `integrate`: method, steps, params, invariants, jvp and so on. A fixed step is shortened so that a
+        whole number of steps makes the period.
+
+    Returns
+    -------
+    PeriodicOrbit
+
+    Raises
+    ------
+    ValueError, TypeError
+        For wrong values, options that the function sets itself, and as by `integrate`.
+
+    Notes
+    -----
+    Newton's method on y(T; y0) - y0 = 0, in y0 and T, by least-norm corrections from the state-transition matrix: the
+    directions in which the equations leave the correction open, along the flow and along a family of orbits, are not
+    moved along. A step that does not reduce the residual is halved.
+
+    References
+    ----------
+    K. C. Howell, Celestial Mechanics 32 (1984), 53-71, for the symmetric case.
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPDOP853, hamiltonian
+    >>> from eip_scipy.tangent_maps import periodic_orbit
+    >>> pendulum = hamiltonian("p**2/2 - cos(q)")
+    >>> orbit = periodic_orbit(pendulum, [1.0, 0.0], 7.0, fixed=["p", "period"], method=EIPDOP853, h=0.05)
+    >>> orbit.success, round(float(orbit.y0[0]), 6)
+    (True, 1.284567)
+    """
+    _refuse("periodic_orbit", options, ("t_span", "events", "callback", "save_every"))
+    max_iterations = as_count("max_iterations", max_iterations)
+    for name, value in (("period", period), ("tol", tol)):
+        if not is_number(value) or not 0 < value < np.inf:
+            raise ValueError(f"{name} must be a number > 0, got {shown(value)}.")
+    start = _start(fun, (0.0, float(period)), y0, options)
+    y, T, n = start.run.y0.copy(), float(period), start.n
+    names = start.component_names or default_names(n)
+    free = np.ones(n + 1, bool)
+    for item in [fixed] if isinstance(fixed, str | int) else fixed:
+        free[_place(item, names)] = False
+    odd = _odd(symmetry, y)
+    free[:n] &= ~odd
+    share = 0.5 if odd.any() else 1.0
+    shoot = _Shooting(fun, {**options, "dense_output": False}, odd, share)
+    reached = shoot(y, T)
+    iterations = 0
+    while iterations < max_iterations and reached.size > 0:
+        move, better = reached.correction(free), None
+        # An orbit that closes well enough is only improved by full steps.
+        for k in range(1 if reached.size <= tol else HALVINGS):
+            step = move * 0.5**k
+            trial = shoot(y + step[:n], float(T + step[n])) if T + step[n] > 0 else None
+            if trial is not None and trial.size < reached.size:
+                better = trial
+                break
+        if better is None:
+            break
+        iterations += 1
+        y, T, reached = better.y0, better.period, better
+    full = reached if share == 1.0 else _Shooting(fun, options, np.zeros(n, bool), 1.0)(y, T)
+    return full.result(iterations, tol)
+
+
+def _place(item: Any, names: Sequence[str]) -> int:
+    if item == "period":
+        return len(names)
+    if isinstance(item, str) and item in names:
+        return list(names).index(item)
+    if isinstance(item, int | np.integer) and not isinstance(item, bool) and 0 <= item < len(names):
+        return int(item)
+    raise ValueError(f'fixed: {shown(item)} is neither "period" nor one of the components {", ".join(names)}.')
+
+
+def _odd(symmetry: Any, y: Array) -> Array:
+    """Return which components change their signs; those of y become 0."""
+    if symmetry is None:
+        return np.zeros(y.size, bool)
+    signs = np.asarray(symmetry)
+    if signs.shape != y.shape or not np.isin(signs, (-1, 1)).all():
+        raise ValueError(f"symmetry must be {y.size} signs 1 or -1, got {shown(symmetry)}.")
+    odd = signs == -1
+    if not odd.any():
+        raise ValueError("symmetry must have a component of sign -1, which is 0 at the start.")
+    if np.abs(y[odd]).max() > 1e-3 * np.abs(y).max():
+        raise ValueError("symmetry: y0 is not symmetric; its components of sign -1 must be 0.")
+    y[odd] = 0.0
+    return odd
+
+
+@dataclass(frozen=True)
+class _Shooting:
+    """Runs of one period, or of half of it."""
+
+    fun: Any
+    options: dict[str, Any]
+    odd: Array
+    share: float
+
+    def __call__(self, y: Array, T: float) -> _Reached:
+        options = dict(self.options)
+        h: Any = options.get("h")
+        end = self.share * T
+        if is_number(h) and h > 0:
+            options["h"] = end / np.ceil(end / h * (1 - 1e-12))
+        run = integrate(self.fun, (0.0, end), y, variations="state", **options)
+        if not run.success:
+            raise RuntimeError(f"periodic_orbit: the run over {end:.6g} failed: {run.message}")
+        return _Reached(self, y, T, run)
+
+
+@dataclass(frozen=True)
+class _Reached:
+    """Where a run of one period, or half of it, led to."""
+
+    shooting: _Shooting
+    y0: Array
+    period: float
+    run: IntegrationResult
+
+    @property
+    def residual(self) -> Array:
+        """Return what is to be 0."""
+        y, odd = self.run.y[:, -1], self.shooting.odd
+        return y[odd] if odd.any() else y - self.y0
+
+    @property
+    def size(self) -> float:
+        """Return its size, relative to the start."""
+        return float(np.abs(self.residual).max() / np.abs(self.y0).max())
+
+    def derivative(self, y: Array) -> tuple[Array, Array]:
+        """Return the derivative and the gradients of the invariants at a state."""
+        start = _start(self.shooting.fun, (0.0, self.period), y, {**self.shooting.options, "project_initial": False})
+        f = start.run.start.f
+        return f, start.run.invariants.gradients(0.0, y, f)
+
+    def correction(self, free: Array) -> Array:
+        """Return the least-norm step of Newton in (y0, T), 0 where these are fixed."""
+        odd, M = self.shooting.odd, self.run.stm[-1]
+        f = self.derivative(self.run.y[:, -1])[0]
+        rows = np.column_stack([M, self.shooting.share * f])
+        if odd.any():
+            rows = rows[odd]
+        else:
+            rows[:, :-1] -= np.eye(len(M))
+        move = np.zeros(free.size)
+        move[free] = np.linalg.lstsq(rows[:, free], -self.residual, rcond=RANK)[0]
+        return move
+
+    def result(self, iterations: int, tol: float) -> PeriodicOrbit:
+        M = self.run.stm[-1]
+        f, G = self.derivative(self.y0)
+        size = np.linalg.norm(M, 2)
+        invariants = [np.linalg.norm(g @ M - g) / (np.linalg.norm(g) * size) for g in G if g.any()]
+        closed = self.size <= tol
+        found = "the orbit closes" if closed else "no correction made the orbit close better"
+        return PeriodicOrbit(
+            y0=self.y0,
+            period=self.period,
+            monodromy=M,
+            multipliers=_in_pairs(np.linalg.eigvals(M)),
+            closure=self.size,
+            flow_residual=float(np.linalg.norm(M @ f - f) / (size * np.linalg.norm(f))),
+            invariant_residual=float(max(invariants, default=np.nan)),
+            iterations=iterations,
+            success=closed,
+            message=f"{found}: to {self.size:.1e} of the size of y0 ({iterations} iterations)",
+            run=self.run,
+        )
+
+
+def _in_pairs(values: Array) -> Array:
+    """Multipliers by decreasing modulus, each followed by the one nearest to 1 divided by it if all have one."""
+    left = sorted(values.astype(complex), key=lambda value: (-abs(value), -value.imag))
+    ordered, rest = list(left), list(left)
+    pairs = []
+    while len(rest) > 1:
+        one = rest.pop(0)
+        distances = [abs(one * other - 1) for other in rest]
+        nearest = int(np.argmin(distances))
+        if distances[nearest] > PAIRED:
+            return np.array(ordered)
+        pairs += [one, rest.pop(nearest)]
+    return np.array(ordered if rest else pairs)
+
+
+class TrajectoryFit:
+    """Residuals of a trajectory against data, and their Jacobian, for `scipy.optimize.least_squares`.
+
+    Both come from one integration for each x, whose derivatives by x the run carries along.
+
+    Parameters
+    ----------
+    fun : callable or Problem
+        As for `integrate`.
+    t : array_like, shape (m,)
+        Times of the data, on one side of `t0`, in order from there.
+    data : array_like, shape (d, m)
+        Data at these times; nan for what was not measured.
+    y0 : array_like, shape (n,), optional
+        First guess of the state at `t0`, or its known value. Default: that of the problem.
+    free : sequence of str or int, optional
+        What is fitted: ``"state"``, the initial state, and names or places of parameters, as in ``variations=`` of
+        `integrate`.
+    t0 : float, optional
+        Time of `y0`. Default: the first of `t`.
+    observe : sequence of str or int, or (callable, callable), optional
+        Components that are measured, by name or place; or a function ``g(t, y) -> (d,)`` and its Jacobian
+        ``dg(t, y) -> (d, n)``. Default: all components.
+    sigma : array_like, optional
+        Standard deviations of the data, of a shape that NumPy broadcasts to that of `data`. Default: 1.
+    **options
+        Options of `integrate`: method, steps, params, invariants, jvp and so on.
+
+    Attributes
+    ----------
+    x0 : ndarray
+        The first guess: the state, if it is free, and the free parameters in the order of `free`.
+    evaluations : int
+        Number of integrations up to now.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For wrong values, options that the class sets itself, and as by `integrate`.
+
+    Notes
+    -----
+    Between two steps the derivatives come from the method's interpolant. Where the data need more than its accuracy,
+    choose steps that end at the times of the data.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.optimize import least_squares
+    >>> from eip_scipy import EIPDOP853, hamiltonian, integrate
+    >>> from eip_scipy.tangent_maps import TrajectoryFit
+    >>> pendulum = hamiltonian("p**2/2 - k*cos(q)", params={"k": 1.0})
+    >>> t = np.linspace(0, 5, 20)
+    >>> options = {"method": EIPDOP853, "rtol": 1e-10, "atol": 1e-10}
+    >>> data = integrate(pendulum, (0, 5), [1.0, 0.2], params={"k": 1.3}, t_eval=t, **options).y
+    >>> fit = TrajectoryFit(pendulum, t, data, y0=[0.9, 0.0], free=["state", "k"], **options)
+    >>> found = least_squares(fit.residuals, fit.x0, jac=fit.jacobian)
+    >>> np.allclose(found.x, [1.0, 0.2, 1.3], atol=1e-7)
+    True
+    """
+
+    def __init__(
+        self,
+        fun: Any,
+        t: Any,
+        data: Any,
+        *,
+        y0: Any = None,
+        free: Sequence[str | int] = ("state",),
+        t0: float | None = None,
+        observe: Any = None,
+        sigma: Any = 1.0,
+        **options: Any,
+    ) -> None:
+        _refuse("TrajectoryFit", options, ("t_span", "save_every", "args", "symplectic"))
+        self._fun, self._options = fun, options
+        self._free = [free] if isinstance(free, str | int) else list(free)
+        self._span, self._t, repeated = _times(t, t0)
+        self._from = repeated
+        asked = {**options, "variations": self._free}
+        start = _start(fun, self._span, y0, asked)
+        assert start.variations is not None
+        columns = start.variations.columns
+        self._y0, self._params = start.run.y0[: start.n].copy(), start.system.parameters.copy()
+        self._places, self._has_state = list(columns.parameters), columns.is_transition
+        self._g, self._dg = _observed(observe, start.component_names or default_names(start.n))
+        d = np.asarray(self._g(self._span[0], self._y0)).size
+        self._data = _data(data, (d, self._from.size))
+        self._kept = np.isfinite(self._data)
+        self._sigma = _sigma(sigma, self._data.shape)
+        self.x0 = np.concatenate([self._y0 * 1.0 if self._has_state else [], self._params[self._places]])
+        self.evaluations = 0
+        self._last: tuple[Array, IntegrationResult] | None = None
+
+    def run(self, x: Any) -> IntegrationResult:
+        """Return the run from x, with its derivatives, at the distinct times of the data.
+
+        Raises
+        ------
+        ValueError
+            When x has a wrong shape.
+        RuntimeError
+            When the run does not reach the last of the data.
+        """
+        x = np.array(x, float)
+        if x.shape != self.x0.shape:
+            raise ValueError(f"x must have the shape {self.x0.shape} of x0, got {x.shape}.")
+        if self._last is not None and np.array_equal(self._last[0], x):
+            return self._last[1]
+        n = self._y0.size if self._has_state else 0
+        y, options = x[:n] if self._has_state else self._y0, dict(self._options)
+        if self._params.size:
+            params = self._params.copy()
+            params[self._places] = x[n:]
+            options["params"] = params
+        run = integrate(self._fun, self._span, y, t_eval=self._t, variations=self._free, **options)
+        self.evaluations += 1
+        if run.t.size < self._t.size:
+            raise RuntimeError(f"TrajectoryFit: the run does not reach the last of the data: {run.message}")
+        self._last = x, run
+        return run
+
+    def residuals(self, x: Any) -> Array:
+        """Return (model - data) / sigma, of what was measured: by the components, and within each by time."""
+        run = self.run(x)
+        model = np.array([self._g(t, y) for t, y in zip(run.t, run.y.T, strict=True)]).T[:, self._from]
+        found: Array = ((model - self._data) / self._sigma)[self._kept]
+        return found
+
+    def jacobian(self, x: Any) -> Array:
+        """Return the derivatives of the residuals by x."""
+        run = self.run(x)
+        slopes = [self._dg(t, y) @ M for t, y, M in zip(run.t, run.y.T, run.variations, strict=True)]
+        by_x = np.array(slopes).transpose(1, 0, 2)[:, self._from] / self._sigma[..., None]
+        found: Array = by_x[self._kept]
+        return found
+
+
+def _times(t: Any, t0: Any) -> tuple[tuple[float, float], Array, Array]:
+    """Return the interval, the distinct times in it, and for each of the data the place of its time."""
+    try:
+        times = np.array(t, float)
+    except (TypeError, ValueError):
+        times = np.zeros(0)
+    if times.ndim != 1 or times.size == 0 or not np.isfinite(times).all():
+        raise ValueError(f"t must be an array of finite times, one for each of the data, got {shown(t)}.")
+    if t0 is not None and not is_number(t0):
+        raise ValueError(f"t0 must be the time of y0, got {shown(t0)}.")
+    begin, end = float(times[0] if t0 is None else t0), float(times[-1])
+    sign = np.sign(end - begin)
+    steps = sign * np.diff(times, prepend=begin)
+    if sign == 0 or (steps < 0).any():
+        raise ValueError(f"t must go from t0 = {begin:.10g} on in one direction, to another time.")
+    distinct, places = np.unique(sign * times, return_inverse=True)
+    return (begin, end), sign * distinct, places
+
+
+def _observed(observe: Any, names: Sequence[str]) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return g(t, y) and its Jacobian."""
+    if isinstance(observe, tuple | list) and len(observe) == 2 and all(callable(item) for item in observe):
+        return observe[0], observe[1]
+    if callable(observe):
+        raise TypeError("observe: give a function together with its Jacobian, observe=(g, dg).")
+    items = range(len(names)) if observe is None else [observe] if isinstance(observe, str | int) else observe
+    rows = []
+    for item in items:
+        if isinstance(item, str) and item in names:
+            rows.append(list(names).index(item))
+        elif isinstance(item, int | np.integer) and 0 <= item < len(names):
+            rows.append(int(item))
+        else:
+            raise ValueError(f"observe: {shown(item)} is none of the components {', '.join(names)}.")
+    chosen = np.eye(len(names))[rows]
+    return lambda t, y: y[rows], lambda t, y: chosen
+
+
+def _data(data: Any, shape: tuple[int, int]) -> Array:
+    try:
+        found = np.array(data, float)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    if found.ndim == 1 and shape[0] == 1:
+        found = found[None]
+    if found.shape != shape or np.isinf(found).any() or np.isnan(found).all():
+        raise ValueError(
+            f"data must be an array {shape}, one row for each measured quantity and one column for each time, with nan "
+            f"for what was not measured, got {shown(data)}."
+        )
+    return found
+
+
+def _sigma(sigma: Any, shape: tuple[int, ...]) -> Array:
+    try:
+        found = np.broadcast_to(np.array(sigma, float), shape)
+    except (TypeError, ValueError):
+        found = np.zeros(shape)
+    if not ((found > 0) & np.isfinite(found)).all():
+        raise ValueError(f"sigma must be standard deviations > 0 that broadcast to {shape}, got {shown(sigma)}.")
+    return found

@@ -1,0 +1,391 @@
+"""``eip-scipy study tangent-maps``: what projection brings to derivatives by the start and by parameters.
+
+The state-transition matrix of Kepler's problem against its closed form; periodic orbits of the restricted three-body
+problem; Lyapunov exponents beside heyoka's variational equations and MEGNO beside REBOUND's variational particles; what
+columns of derivatives cost, by the source of the products with the Jacobian, and what they save in a fit. The figure is
+a map of MEGNO over the second of two planets' axis and eccentricity. ``pip install "eip_scipy[heyoka,rebound,sympy]"``.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from eip_scipy import EIPDOP853, EIPRK4, ProjectionWarning, hamiltonian, integrate
+from eip_scipy.tangent_maps import TrajectoryFit, megno, periodic_orbit
+
+from ..report import needed, table
+from ..study import Figures, Measurement, Rows, Session, option
+from ..timing import clocked, least
+
+__all__ = ["TangentMaps"]
+
+PERIOD = 2 * math.pi
+E = 0.6
+PERICENTRE = np.array([1 - E, 0.0, 0.0, math.sqrt((1 + E) / (1 - E))])
+KEPLER = "(px**2 + py**2)/2 - 1/sqrt(x**2 + y**2)"
+WAYS: dict[str, dict[str, Any]] = {
+    "plain": {"invariants": (), "symplectic": False},
+    "projected": {"symplectic": False},
+    "projected, symplectic": {},
+}
+MU = 0.01215058560962404  # Earth and Moon
+TO_EARTH, TO_MOON = "sqrt((x + mu)**2 + y**2 + z**2)", "sqrt((x - 1 + mu)**2 + y**2 + z**2)"
+THREE_BODIES = f"(px**2 + py**2 + pz**2)/2 + px*y - py*x - (1 - mu)/{TO_EARTH} - mu/{TO_MOON}"
+ORBITS = {
+    "halo orbit": ([0.8234, 0.0, 0.0224, 0.0, 0.9577, 0.0], 2.743, "z"),
+    "Lyapunov orbit": ([0.8189, 0.0, 0.0, 0.0, 0.9938, 0.0], 2.78, "x"),
+}
+MIRROR = [1, -1, 1, -1, 1, -1]
+HENON_HEILES = "(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3"
+DOUBLE_PENDULUM = "(p**2 + 2*r**2 - 2*p*r*cos(a - b))/(2*(1 + sin(a - b)**2)) - 2*cos(a) - cos(b)"
+MASS = 1e-3
+REGULAR, CHAOTIC = (1.8, 0.02), (1.38, 0.1)
+STEP = PERIOD / 40
+
+
+def henon_heiles(heyoka: Any, x: Any, y: Any, u: Any, v: Any) -> Any:
+    """Return its Hamiltonian as an expression of heyoka."""
+    return (u * u + v * v + x * x + y * y) / 2.0 + x * x * y - y * y * y / 3.0
+
+
+def double_pendulum(heyoka: Any, a: Any, b: Any, p: Any, r: Any) -> Any:
+    """Return its Hamiltonian as an expression of heyoka."""
+    kinetic = (p * p + 2.0 * r * r - 2.0 * p * r * heyoka.cos(a - b)) / (2.0 * (1.0 + heyoka.sin(a - b) ** 2.0))
+    return kinetic - 2.0 * heyoka.cos(a) - heyoka.cos(b)
+
+
+class Chaotic(NamedTuple):
+    """A Hamiltonian system: for us, for heyoka, and its start, step and factor of the length of the run."""
+
+    text: str
+    energy: Callable[..., Any]
+    y0: list[float]
+    h: float
+    share: float
+
+
+SYSTEMS = {
+    "Hénon-Heiles, E = 1/6": Chaotic(
+        HENON_HEILES,
+        henon_heiles,
+        [0.0, -0.15, math.sqrt(2 * (1 / 6 - 0.15**2 / 2 - 0.15**3 / 3) - 0.1**2), 0.1],
+        0.1,
+        1.0,
+    ),
+    "double pendulum": Chaotic(DOUBLE_PENDULUM, double_pendulum, [2.0, 2.0, 0.0, 0.0], 0.05, 0.2),
+}
+
+
+def after_revolutions(n: int) -> np.ndarray:
+    """Return the matrix after n periods in closed form: I - 3 T f (dH/dy) for each of them."""
+    x, _, _, vy = PERICENTRE
+    f, by_energy = np.array([0.0, vy, -1 / x**2, 0.0]), np.array([1 / x**2, 0.0, 0.0, vy])
+    return np.eye(4) - 3 * PERIOD * n * np.outer(f, by_energy)
+
+
+def planets(numba: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return the equations of bodies and their energy, jitted."""
+
+    @numba.njit
+    def rates(t, y, out, m):
+        n = m.size
+        for i in range(3 * n):
+            out[i], out[3 * n + i] = y[3 * n + i], 0.0
+        for i in range(n):
+            for j in range(i):
+                dx, dy, dz = y[3 * j] - y[3 * i], y[3 * j + 1] - y[3 * i + 1], y[3 * j + 2] - y[3 * i + 2]
+                r2 = dx * dx + dy * dy + dz * dz
+                s = 1.0 / (r2 * np.sqrt(r2))
+                for k, d in enumerate((dx, dy, dz)):
+                    out[3 * (n + i) + k] += m[j] * s * d
+                    out[3 * (n + j) + k] -= m[i] * s * d
+
+    @numba.njit
+    def energy(t, y, m):
+        n, found = m.size, 0.0
+        for i in range(n):
+            v = 3 * (n + i)
+            found += 0.5 * m[i] * (y[v] ** 2 + y[v + 1] ** 2 + y[v + 2] ** 2)
+            for j in range(i):
+                dx, dy, dz = y[3 * j] - y[3 * i], y[3 * j + 1] - y[3 * i + 1], y[3 * j + 2] - y[3 * i + 2]
+                found -= m[i] * m[j] / np.sqrt(dx * dx + dy * dy + dz * dz)
+        return found
+
+    return rates, energy
+
+
+def two_planets(axis: float, e: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return masses and the state (q, v) in the plane, both planets at their pericentres, on opposite sides."""
+    m = np.array([1.0, MASS, MASS])
+    q, v = np.zeros((3, 3)), np.zeros((3, 3))
+    for k, (a, ecc, side) in enumerate(((1.0, 0.02, 1), (axis, e, -1)), 1):
+        q[k, 0] = side * a * (1 - ecc)
+        v[k, 1] = side * math.sqrt((1 + MASS) * (1 + ecc) / (a * (1 - ecc)))
+    q, v = q - m @ q / m.sum(), v - m @ v / m.sum()
+    return m, np.concatenate([q.ravel(), v.ravel()])
+
+
+class Found(NamedTuple):
+    """What was measured, by the tables that are printed."""
+
+    kepler: list[tuple[str, dict[str, float]]]
+    orbits: dict[str, list[float]]
+    exponents: dict[str, list[float | None]]
+    planets: dict[str, list[float | None]]
+    costs: dict[str, float]
+    fit: dict[str, float]
+    axes: np.ndarray
+    eccentricities: np.ndarray
+    map: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class TangentMaps(Measurement[Found]):
+    """The command."""
+
+    writes_files = True
+    revolutions: int = option(50, "revolutions of Kepler's problem, and ten times as many (%(default)s)", type=int)
+    time: float = option(4e5, "length of the runs for exponents (%(default)g)", type=float)
+    periods: int = option(2000, "periods of the two planets (%(default)s)", type=int)
+    grid: int = option(20, "points of the map, each way; 0: no map (%(default)s)", type=int)
+    map_periods: int = option(300, "periods of the runs of the map (%(default)s)", type=int)
+
+    def measure(self, session: Session) -> Found:
+        numba, _ = needed("numba", 'pip install "eip_scipy[numba]"'), needed("sympy", 'pip install "eip_scipy[sympy]"')
+        with session.bar(6, "tangent maps", "part") as bar:
+            parts: dict[str, Any] = {}
+            for part in (_kepler, _orbits, _exponents, _planets, _costs, _fit):
+                parts[part.__name__[1:]] = part(self, session, numba)
+                bar.update()
+            axes, eccentricities = np.linspace(1.25, 1.75, self.grid), np.linspace(0.0, 0.2, self.grid)
+            values = self._map(axes, eccentricities, numba)
+            return Found(**parts, axes=axes, eccentricities=eccentricities, map=values)
+
+    def _map(self, axes: np.ndarray, eccentricities: np.ndarray, numba: Any) -> np.ndarray:
+        rates, energy = planets(numba)
+        found = np.full((eccentricities.size, axes.size), np.nan)
+        end = self.map_periods * PERIOD
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ProjectionWarning)
+            for (i, j), _ in np.ndenumerate(found):
+                m, y0 = two_planets(float(axes[j]), float(eccentricities[i]))
+                run = megno(rates, (0, end), y0, params=m, in_place=True, method=EIPDOP853, h=STEP, every=end / 2,
+                            invariants=energy)  # fmt: skip
+                # Close encounters, which these steps do not resolve, are chaos.
+                found[i, j] = run.megno if run.trusted else np.inf
+        return found
+
+    def table(self, found: Found) -> str:
+        heads = [["error of the", "matrix"]] + [[name, ""] for name in WAYS]
+        blocks = ["Kepler's problem, e = 0.6: relative error of the state-transition matrix"]
+        blocks.append(table(heads[1:], [(name, [f"{row[way]:.1e}" for way in WAYS]) for name, row in found.kepler]))
+        blocks.append("Periodic orbits of the restricted three-body problem (Earth and Moon)")
+        heads = [["period", ""], ["closure", ""], ["M f = f", ""], ["dJ M = dJ", ""], ["largest", "multiplier"],
+                 ["pairs:", "|product - 1|"]]  # fmt: skip
+        rows = [
+            (name, [f"{row[0]:.6f}", *(f"{x:.1e}" for x in row[1:4]), f"{row[4]:.2f}", f"{row[5]:.1e}"])
+            for name, row in found.orbits.items()
+        ]
+        blocks.append(table(heads, rows))
+        blocks.append("Largest Lyapunov exponent, from the same start and tangent vector")
+        heads = [["EIPDOP853", ""], ["heyoka", ""], ["difference", "[%]"]]
+        blocks.append(table(heads, [(name, [_number(x, 5) for x in row]) for name, row in found.exponents.items()]))
+        blocks.append(f"Two planets, {self.periods} periods: mean MEGNO, and twice its slope")
+        heads = [["EIPDOP853", "MEGNO"], ["REBOUND", "MEGNO"], ["EIPDOP853", "exponent"], ["REBOUND", "exponent"]]
+        blocks.append(table(heads, [(name, [_number(x, 4) for x in row]) for name, row in found.planets.items()]))
+        blocks.append("Time of a run with all n columns, as a multiple of (n + 1) plain runs, by where J v comes from")
+        blocks.append(table([["multiple", ""]], [(name, [f"{x:.2f}"]) for name, x in found.costs.items()]))
+        fit = found.fit
+        blocks.append(
+            f"A fit of an orbit of 4 components: {fit['time by columns']:.3f} s and {fit['runs with columns']:.0f} "
+            f"runs with 4 columns, against {fit['time by differences']:.3f} s and {fit['runs for differences']:.0f} "
+            f"plain runs for differences: {fit['ratio']:.2f} of the time; errors {fit['error by columns']:.1e} and "
+            f"{fit['error by differences']:.1e}."
+        )
+        return "\n\n".join(blocks)
+
+    def tables(self, found: Found) -> dict[str, Rows]:
+        rows = [
+            {"axis": a, "eccentricity": e, "megno": found.map[i, j]}
+            for i, e in enumerate(found.eccentricities)
+            for j, a in enumerate(found.axes)
+        ]
+        return {"megno-map.csv": rows} if rows else {}
+
+    def figures(self, found: Found) -> Figures:
+        if not found.map.size:
+            return
+        from ..plotting import blank_figure
+
+        figure = blank_figure(7, 4.8, f"Two planets of 0.001 solar masses: MEGNO after {self.map_periods} periods")
+        axis = figure.subplots()
+        image = axis.pcolormesh(
+            found.axes, found.eccentricities, np.clip(found.map, 1.0, 8.0), cmap="viridis", vmin=1.0, vmax=8.0
+        )
+        figure.colorbar(image, ax=axis, extend="max", label="mean MEGNO (2: regular)")
+        axis.set_xlabel("semi-major axis of the second planet [axis of the first]")
+        axis.set_ylabel("its eccentricity")
+        for p, q in ((3, 2), (5, 3), (2, 1), (7, 5), (8, 5)):
+            place = (p / q) ** (2 / 3)
+            if found.axes[0] < place < found.axes[-1]:
+                axis.axvline(place, color="w", lw=0.8, ls=":")
+                axis.annotate(f"{p}:{q}", (place, found.eccentricities[-1]), (2, -2), textcoords="offset points",
+                              color="w", va="top",
+                              fontsize=8, bbox={"fc": "k", "alpha": 0.6, "lw": 0, "pad": 1.0})  # fmt: skip
+        yield "megno-map.png", figure
+
+
+def _number(x: float | None, digits: int) -> str:
+    return "-" if x is None else f"{x:.{digits}g}"
+
+
+def _kepler(study: TangentMaps, session: Session, numba: Any) -> list[tuple[str, dict[str, float]]]:
+    problem = hamiltonian(KEPLER, invariants={"L": "x*py - y*px"})
+    found = []
+    for method, steps in ((EIPRK4, 388), (EIPDOP853, 60)):
+        for n in (study.revolutions, 10 * study.revolutions):
+            exact = after_revolutions(n)
+            row = {}
+            for way, options in WAYS.items():
+                run = integrate(problem, (0, n * PERIOD), PERICENTRE, method=method, h=PERIOD / steps,
+                                variations="state", **options)  # fmt: skip
+                row[way] = float(np.linalg.norm(run.stm[-1] - exact) / np.linalg.norm(exact))
+            found.append((f"{method.__name__}, {steps} steps, {n} revolutions", row))
+    return found
+
+
+def _orbits(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float]]:
+    problem = hamiltonian(THREE_BODIES, q="x y z", p="px py pz", params={"mu": MU})
+    found = {}
+    for name, (guess, period, fixed) in ORBITS.items():
+        orbit = periodic_orbit(problem, guess, period, fixed=[fixed], symmetry=MIRROR, method=EIPDOP853, h=0.01)
+        pairs = orbit.multipliers.reshape(3, 2)
+        off = float(np.abs(pairs.prod(axis=1) - 1).max())
+        largest = float(np.abs(pairs[0, 0]))
+        found[name] = [orbit.period, orbit.closure, orbit.flow_residual, orbit.invariant_residual, largest, off]
+    return found
+
+
+def _exponents(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float | None]]:
+    heyoka = session.peer("heyoka", "heyoka's variational equations")
+    found: dict[str, list[float | None]] = {}
+    for name, system in SYSTEMS.items():
+        problem = hamiltonian(system.text, q=None if "px" in system.text else "a b",
+                              p=None if "px" in system.text else "p r")  # fmt: skip
+        # The first of these times is one in which rounding does not yet part the orbits.
+        for t_end in (200 * system.share, study.time * system.share):
+            run = megno(problem, (0, t_end), system.y0, deviation=[1.0, 0.0, 0.0, 0.0], method=EIPDOP853, h=system.h)
+            ours, theirs = float(run.log_size[-1] / t_end), None
+            if heyoka is not None:
+                theirs = heyoka.largest_exponent(
+                    system.energy, system.y0, [1.0, 0.0, 0.0, 0.0], t_end=t_end, every=20.0
+                )
+            found[f"{name}, t = {t_end:g}"] = [ours, theirs, None if theirs is None else 100 * (ours / theirs - 1)]
+    return found
+
+
+def _planets(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float | None]]:
+    rebound = session.peer("rebound", "REBOUND's MEGNO")
+    rates, energy = planets(numba)
+    found: dict[str, list[float | None]] = {}
+    t_end = study.periods * PERIOD
+    for name, place in {"regular": REGULAR, "chaotic": CHAOTIC}.items():
+        m, y0 = two_planets(*place)
+        theirs, slope, deviation = None, None, None
+        if rebound is not None:
+            theirs, slope, deviation = rebound.megno(m, y0, t_end=t_end, dt=PERIOD / 60)
+        run = megno(rates, (0, t_end), y0, deviation=deviation, params=m, in_place=True, method=EIPDOP853, h=STEP,
+                    invariants=energy)  # fmt: skip
+        found[f"{name}: a = {place[0]:g}, e = {place[1]:g}"] = [
+            run.megno, theirs, run.lyapunov, None if slope is None else 2 * slope
+        ]  # fmt: skip
+    return found
+
+
+def _costs(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]:
+    """Compare all columns of Kepler's problem, without invariants and with both, by the source of their products."""
+
+    def rates(t, y):
+        r3 = (y[0] * y[0] + y[1] * y[1]) ** 1.5
+        return np.array([y[2], y[3], -y[0] / r3, -y[1] / r3])
+
+    def product(t, y, dy):
+        r2 = y[0] * y[0] + y[1] * y[1]
+        along = 3 * (y[0] * dy[0] + y[1] * dy[1]) / r2
+        return np.array([dy[2], dy[3], (along * y[0] - dy[0]) / r2**1.5, (along * y[1] - dy[1]) / r2**1.5])
+
+    problem = hamiltonian(KEPLER, invariants={"L": "x*py - y*px"})
+    jitted, jitted_product = numba.njit(rates), numba.njit(product)
+    cases: dict[str, tuple[Any, dict[str, Any], int]] = {
+        "SymPy, both invariants": (problem, {}, 200),
+        "SymPy, plain": (problem, {"invariants": ()}, 200),
+        "dual numbers, plain": (jitted, {}, 200),
+        "jitted jvp, plain": (jitted, {"jvp": jitted_product}, 200),
+        "Python jvp, plain": (rates, {"jvp": product}, 2),
+        "complex step, plain": (rates, {}, 2),
+    }
+    found = {}
+    for name, (fun, options, n) in cases.items():
+        common = {"method": EIPDOP853, "h": PERIOD / 60}
+        plain = {key: value for key, value in options.items() if key != "jvp"}
+        times = least(
+            {
+                "alone": partial(_seconds, fun, n, **common, **plain),
+                "wide": partial(_seconds, fun, n, **common, **options, variations="state"),
+            },
+            turns=5,
+        )
+        found[name] = times["wide"] / (5 * times["alone"])
+    return found
+
+
+def _seconds(fun: Any, n: int, **options: Any) -> float:
+    return float(integrate(fun, (0, n * PERIOD), PERICENTRE, **options).wall_time)
+
+
+def _fit(study: TangentMaps, session: Session, numba: Any) -> dict[str, float]:
+    """Fit an orbit to directions, with the Jacobian from columns and by differences of plain runs."""
+    problem = hamiltonian(KEPLER, invariants={"L": "x*py - y*px"})
+    options: dict[str, Any] = {"method": EIPDOP853, "h": PERIOD / 80}
+    t = np.linspace(0.0, 20 * PERIOD, 200)
+    truth = np.array([0.8, 0.1, -0.2, 1.15])
+    states = integrate(problem, (0, t[-1]), truth, t_eval=t, **options).y
+    guess = truth * (1 + 1e-4 * np.array([1, -1, 1, 1]))
+    fit = TrajectoryFit(problem, t, states[:2], y0=guess, observe=["x", "y"], **options)
+    count = [0]
+
+    def plain(x: np.ndarray) -> np.ndarray:
+        count[0] += 1
+        found: np.ndarray = (integrate(problem, (0, t[-1]), x, t_eval=t, **options).y[:2] - states[:2]).ravel()
+        return found
+
+    results: dict[str, Any] = {}
+
+    def by_columns() -> None:
+        fit._last, fit.evaluations = None, 0
+        results["columns"] = least_squares(fit.residuals, guess, jac=fit.jacobian, x_scale="jac", xtol=1e-12)
+
+    def by_differences() -> None:
+        count[0] = 0
+        results["differences"] = least_squares(plain, guess, x_scale="jac", xtol=1e-12)
+
+    by_columns()
+    by_differences()
+    times = least({"columns": clocked(by_columns), "differences": clocked(by_differences)}, turns=3)
+    return {
+        "time by columns": times["columns"],
+        "time by differences": times["differences"],
+        "ratio": times["columns"] / times["differences"],
+        "runs with columns": fit.evaluations,
+        "runs for differences": count[0],
+        "error by columns": float(np.abs(results["columns"].x - truth).max()),
+        "error by differences": float(np.abs(results["differences"].x - truth).max()),
+    }

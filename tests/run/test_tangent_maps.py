@@ -1,0 +1,559 @@
+"""Tangent maps against closed forms, complex steps and REBOUND; exponents, MEGNO, periodic orbits, fits."""
+
+import numpy as np
+import pytest
+import sympy
+from numba import njit
+from scipy.optimize import least_squares
+
+from eip_scipy import EIPDOP853, EIPRK4, equations, hamiltonian, integrate
+from eip_scipy.tangent_maps import TrajectoryFit, lyapunov_spectrum, megno, periodic_orbit
+
+pytestmark = pytest.mark.needs_jit
+
+PERIOD = 2 * np.pi
+E = 0.6
+PERICENTRE = np.array([1 - E, 0.0, 0.0, np.sqrt((1 + E) / (1 - E))])
+
+
+@pytest.fixture(scope="module")
+def kepler():
+    return hamiltonian("(px**2 + py**2)/2 - 1/sqrt(x**2 + y**2)", invariants={"L": "x*py - y*px"})
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return hamiltonian("p**2/2 - k*cos(q)", params={"k": 1.0})
+
+
+@pytest.fixture(scope="module")
+def henon_heiles():
+    return hamiltonian("(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3")
+
+
+def after_revolutions(n):
+    """The closed form: all that a change of the start does in n periods is a change of the period."""
+    x, _, _, vy = PERICENTRE
+    f = np.array([0.0, vy, -1 / x**2, 0.0])
+    by_energy = np.array([1 / x**2, 0.0, 0.0, vy])
+    return np.eye(4) - 3 * PERIOD * n * np.outer(f, by_energy)
+
+
+# Where plain RK4 has 1.5e-2 after 50 revolutions.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "steps", "revolutions", "bound"),
+    [(EIPRK4, 388, 50, 1e-4), (EIPRK4, 388, 500, 1e-3), (EIPDOP853, 60, 50, 1e-6)],
+)
+def test_matrix_of_kepler(kepler, method, steps, revolutions, bound):
+    def error(**options):
+        run = integrate(kepler, (0, revolutions * PERIOD), PERICENTRE, method=method, h=PERIOD / steps,
+                        variations="state", **options)  # fmt: skip
+        exact = after_revolutions(revolutions)
+        return np.linalg.norm(run.stm[-1] - exact) / np.linalg.norm(exact)
+
+    plain = error(invariants=(), symplectic=False)
+    if method is EIPRK4 and revolutions == 50:
+        assert 1.2e-2 < plain < 1.8e-2
+    assert error() < min(bound, plain / 100)
+
+
+# Sensitivities: systems as text, their parameters, invariants, and starts.
+
+SYSTEMS = {
+    "pendulum": ({"q": "p", "p": "-k*sin(q)"}, {"k": 1.3}, ["p**2/2 - k*cos(q)"], [1.0, 0.3]),
+    "oscillators": (
+        {"x": "v", "y": "w", "v": "-a*x", "w": "-b*y"},
+        {"a": 1.0, "b": 2.5},
+        ["v**2 + a*x**2", "w**2 + b*y**2"],
+        [1.0, 0.2, 0.1, 0.7],
+    ),
+    "Kepler": (
+        {"x": "u", "y": "v", "u": "-m*x/(x*x + y*y)**1.5", "v": "-m*y/(x*x + y*y)**1.5"},
+        {"m": 1.1},
+        ["(u*u + v*v)/2 - m/sqrt(x*x + y*y)", "x*v - y*u"],
+        [1.0, 0.0, 0.1, 1.0],
+    ),
+    "Lotka-Volterra": (
+        {"x": "x*(a - b*y)", "y": "y*(c*x - d)"},
+        {"a": 1.0, "b": 0.8, "c": 0.6, "d": 0.9},
+        ["c*x - d*log(x) + b*y - a*log(y)"],
+        [1.5, 1.0],
+    ),
+    "rigid body": (
+        {"x": "(1/C - 1/B)*y*z", "y": "(1/A - 1/C)*z*x", "z": "(1/B - 1/A)*x*y"},
+        {"A": 1.0, "B": 2.0, "C": 3.0},
+        ["x*x + y*y + z*z", "x*x/A + y*y/B + z*z/C"],
+        [0.8, 0.5, 0.9],
+    ),
+    "Lorenz": (
+        {"x": "s*(y - x)", "y": "x*(r - z) - y", "z": "x*y - b*z"},
+        {"s": 10.0, "r": 28.0, "b": 2.6},
+        [],
+        [1.0, 1.0, 20.0],
+    ),
+    "van der Pol": ({"x": "v", "v": "m*(1 - x*x)*v - x"}, {"m": 0.7}, [], [1.0, 0.5]),
+    "forced Duffing": ({"x": "v", "v": "x - x**3 - c*v + F*cos(w*t)"}, {"c": 0.2, "F": 0.3, "w": 1.1}, [], [0.5, 0.1]),
+    "Henon-Heiles": (
+        {"x": "u", "y": "v", "u": "-x - 2*l*x*y", "v": "-y - l*(x*x - y*y)"},
+        {"l": 0.9},
+        ["(u*u + v*v + x*x + y*y)/2 + l*(x*x*y - y**3/3)"],
+        [0.1, 0.2, 0.4, 0.1],
+    ),
+    "Toda": (
+        {"a": "u", "b": "v", "u": "-k*exp(a - b)", "v": "k*exp(a - b)"},
+        {"k": 0.7},
+        ["(u*u + v*v)/2 + k*exp(a - b)", "u + v"],
+        [0.3, 0.1, 0.2, -0.4],
+    ),
+    "SIR": (
+        {"S": "-b*S*I", "I": "b*S*I - g*I", "R": "g*I"},
+        {"b": 1.2, "g": 0.4},
+        ["S + I + R"],
+        [0.99, 0.01, 0.0],
+    ),
+    "Brusselator": (
+        {"x": "a + x*x*y - (b + 1)*x", "y": "b*x - x*x*y"},
+        {"a": 1.0, "b": 2.2},
+        [],
+        [1.1, 1.9],
+    ),
+    "FitzHugh-Nagumo": (
+        {"v": "v - v**3/3 - w + J", "w": "e*(v + a - b*w)"},
+        {"J": 0.5, "e": 0.08, "a": 0.7, "b": 0.8},
+        [],
+        [-1.0, 1.0],
+    ),
+    "Rossler": (
+        {"x": "-y - z", "y": "x + a*y", "z": "b + z*(x - c)"},
+        {"a": 0.2, "b": 0.2, "c": 5.7},
+        [],
+        [1.0, 1.0, 0.5],
+    ),
+    "quartic": (
+        {"x": "u", "y": "v", "u": "-4*x**3 - 2*e*x*y*y", "v": "-4*y**3 - 2*e*x*x*y"},
+        {"e": 0.6},
+        ["(u*u + v*v)/2 + x**4 + y**4 + e*x*x*y*y"],
+        [0.5, 0.4, 0.3, -0.2],
+    ),
+    "magnetic field": (
+        {"x": "u", "y": "v", "u": "B*(1 + x)*v", "v": "-B*(1 + x)*u"},
+        {"B": 1.4},
+        ["u*u + v*v"],
+        [0.1, 0.2, 0.5, 0.3],
+    ),
+    "Volterra of three": (
+        {"x": "k*x*(y - z)", "y": "k*y*(z - x)", "z": "k*z*(x - y)"},
+        {"k": 0.8},
+        ["x + y + z", "log(x) + log(y) + log(z)"],
+        [0.5, 0.8, 1.1],
+    ),
+    "logistic": ({"x": "r*x*(1 - x/K)"}, {"r": 1.1, "K": 2.0}, [], [0.3]),
+    "swinging spring": (
+        {"x": "u", "y": "v", "u": "-k*x*(1 - 1/sqrt(x*x + y*y))", "v": "-k*y*(1 - 1/sqrt(x*x + y*y)) - g"},
+        {"k": 4.0, "g": 0.5},
+        ["(u*u + v*v)/2 + k*(sqrt(x*x + y*y) - 1)**2/2 + g*y"],
+        [0.9, -0.8, 0.1, 0.0],
+    ),
+    "dipole": (
+        {"x": "u", "u": "-m*x/(x*x + d*d)**1.5"},
+        {"m": 1.2, "d": 0.7},
+        ["u*u/2 - m/sqrt(x*x + d*d)"],
+        [0.8, 0.1],
+    ),
+}
+SOURCES = ("SymPy", "dual numbers", "jvp", "jitted jvp", "complex step")
+SOME = ("pendulum", "Kepler", "Lotka-Volterra", "forced Duffing")  # the others take minutes to compile
+
+
+def marks(name, source):
+    if source == "complex step":
+        return ()
+    return (pytest.mark.slow,) if name in SOME else (pytest.mark.slow, pytest.mark.nightly)
+
+
+CASES = [pytest.param(name, source, marks=marks(name, source)) for name in SYSTEMS for source in SOURCES]
+STEP, STEPS = 0.0625, 16
+
+
+def written(name, arguments, texts):
+    """A function of the system's components and parameters as arrays."""
+    rates, params, *_ = SYSTEMS[name]
+    lines = [f"{item} = Y[{k}]" for k, item in enumerate(rates)] + [f"{item} = P[{k}]" for k, item in enumerate(params)]
+    lines += [f"d{k} = dY[{k}]" for k in range(len(rates)) if "dY" in arguments]
+    body = f"[{', '.join(texts)}]"
+    source = f"def f({arguments}):\n    " + "\n    ".join(lines) + f"\n    return np.array({body})\n"
+    space = {"np": np, **{fun: getattr(np, fun) for fun in ("sin", "cos", "sqrt", "exp", "log")}}
+    exec(source, space)
+    return space["f"]
+
+
+def product_with_jacobian(name):
+    rates, params, *_ = SYSTEMS[name]
+    own = {item: sympy.Symbol(item, real=True) for item in (*rates, *params, "t")}
+    read = [sympy.sympify(text, locals=own) for text in rates.values()]
+    return [
+        str(sympy.Add(*(sympy.diff(f, own[item]) * sympy.Symbol(f"d{k}") for k, item in enumerate(rates))))
+        for f in read
+    ]
+
+
+def by_complex_steps(name, tableau, h, steps):
+    """Derivatives (n, n + p) of the state after some steps, by complex steps through the steps themselves."""
+    rates, params, _, y0 = SYSTEMS[name]
+    f = written(name, "t, Y, P", rates.values())
+    A, b, c = (np.asarray(getattr(tableau, item)) for item in "Abc")
+    columns = []
+    for k in range(len(y0) + len(params)):
+        y, p = np.array(y0, complex), np.array(list(params.values()), complex)
+        (y if k < len(y0) else p)[k if k < len(y0) else k - len(y0)] += 1e-30j
+        for step in range(steps):
+            K = []
+            for i in range(len(b)):
+                K.append(f((step + c[i]) * h, y + h * sum((A[i, j] * K[j] for j in range(i)), 0 * y), p))
+            y = y + h * sum(b[i] * K[i] for i in range(len(b)))
+        columns.append(y.imag / 1e-30)
+    return np.array(columns).T
+
+
+def carried(name, source, keeps, **options):
+    rates, params, kept, y0 = SYSTEMS[name]
+    invariants = {f"I{k}": text for k, text in enumerate(kept)} if keeps else {}
+    span, places = (0, STEP * STEPS), list(params)
+    if source == "SymPy":
+        problem = equations(rates, params=params, invariants=invariants)
+        return integrate(problem, span, y0, variations=["state", *places], **options)
+    f = written(name, "t, Y, P", rates.values())
+    items = [written(name, "t, Y, P", [text]) for text in kept] if keeps else []
+    wanted = ["state"] if "jvp" in source else ["state", *range(len(params))]
+    if source in ("dual numbers", "jitted jvp"):
+        f, items = njit(f), [njit(item) for item in items]
+    if "jvp" in source:
+        product = written(name, "t, Y, dY, P", product_with_jacobian(name))
+        options["jvp"] = njit(product) if "jitted" in source else product
+    return integrate(f, span, y0, params=list(params.values()), invariants=items, variations=wanted, **options)
+
+
+@pytest.mark.parametrize(("name", "source"), CASES)
+def test_sensitivities(name, source):
+    """Of a plain run they are the derivatives of its steps; of a projected one those of the flow."""
+    exact = by_complex_steps(name, EIPDOP853.TABLEAU, STEP, STEPS)
+    size = np.abs(exact).max()
+    plain = carried(name, source, False, method=EIPDOP853, h=STEP).variations[-1]
+    assert np.abs(plain - exact[:, : plain.shape[1]]).max() < 1e-12 * size
+    kept = carried(name, source, True, method=EIPDOP853, h=STEP / 4).variations[-1]
+    flow = by_complex_steps(name, EIPDOP853.TABLEAU, STEP / 4, 4 * STEPS)
+    assert np.abs(kept - flow[:, : kept.shape[1]]).max() < 1e-10 * size
+
+
+# Exponents and MEGNO.
+
+CHAOTIC = [0.0, -0.15, np.sqrt(2 * (1 / 6 - 0.15**2 / 2 - 0.15**3 / 3) - 0.1**2), 0.1]  # of energy 1/6
+
+
+def test_spectrum_of_a_linear_system():
+    run = lyapunov_spectrum(lambda t, y: np.array([0.3, -2.0, 1.1]) * y, (0, 400), np.ones(3) * 1e-60, method=EIPRK4,
+                            h=0.05, every=30.0)  # fmt: skip
+    assert run.exponents == pytest.approx([1.1, 0.3, -2.0], abs=0.01)
+    assert run.running.shape == (run.t.size, 3)
+    assert run.t[-1] == 400
+    assert run.t.size > 14  # the columns grew apart by e^93 in 30, and the time was halved
+    assert run.success
+    assert run.trusted
+
+
+@pytest.mark.slow
+def test_spectrum_of_a_hamiltonian_system(henon_heiles):
+    """Volumes are kept in all steps, the pairs of exponents in the limit."""
+    run = lyapunov_spectrum(henon_heiles, (0, 2000), CHAOTIC, method=EIPDOP853, h=0.1, every=5.0)
+    assert np.abs(run.running.sum(axis=1)).max() < 1e-11
+    assert np.abs(run.exponents + run.exponents[::-1]).max() < 0.01
+    assert run.exponents[0] > 0.05
+    assert run.trusted
+    first = lyapunov_spectrum(henon_heiles, (0, 2000), CHAOTIC, count=1, method=EIPDOP853, h=0.1)
+    assert first.exponents[0] == pytest.approx(run.exponents[0], rel=0.3)
+
+
+@pytest.mark.slow
+def test_spectrum_of_lorenz():
+    """The literature's 0.9056, 0, -14.5723 (Sprott, Chaos and Time-Series Analysis, 2003)."""
+    lorenz = equations(SYSTEMS["Lorenz"][0], params={"s": 10, "r": 28, "b": 8 / 3})
+    run = lyapunov_spectrum(lorenz, (0, 2000), [1.0, 1.0, 20.0], method=EIPDOP853, h=0.02, every=1.0)
+    assert run.exponents == pytest.approx([0.9056, 0.0, -14.5723], abs=0.02)
+    assert run.exponents.sum() == pytest.approx(-(1 + 10 + 8 / 3), rel=1e-9)
+
+
+def test_megno_of_a_regular_orbit(pendulum):
+    run = megno(pendulum, (0, 20000), [0.0, 1.5], method=EIPDOP853, h=0.2)
+    assert run.megno == pytest.approx(2.0, abs=0.01)
+    assert abs(run.lyapunov) < 1e-3
+    assert run.Y[0] == run.mean[0] == 0
+    assert run.t.size == run.Y.size == run.mean.size == run.log_size.size
+
+
+def test_megno_by_its_definition(pendulum):
+    """Against the integral itself, by the trapezoidal rule over small steps."""
+    run = megno(pendulum, (0, 20), [0.5, 1.0], deviation=[1.0, 2.0], method=EIPDOP853, h=0.1, every=5.0)
+    fine = integrate(pendulum, (0, 20), [0.5, 1.0], method=EIPDOP853, h=0.0025, save_every=1,
+                     variations=np.array([[1.0], [2.0]]))  # fmt: skip
+    dq, dp = fine.variations[:, :, 0].T
+    rate = (dq * dp - dp * np.cos(fine.y[0]) * dq) / (dq**2 + dp**2)
+    Y = (
+        2
+        / fine.t[1:]
+        * np.cumsum(np.diff(fine.t) * (fine.t * rate)[:-1] / 2 + np.diff(fine.t) * (fine.t * rate)[1:] / 2)
+    )
+    assert np.interp(run.t[10:], fine.t[1:], Y) == pytest.approx(run.Y[10:], abs=3e-4)
+    adaptive = megno(pendulum, (0, 20), [0.5, 1.0], deviation=[1.0, 2.0], method=EIPDOP853, rtol=1e-9, atol=1e-9)
+    assert adaptive.Y[-1] == pytest.approx(run.Y[-1], abs=2e-2)
+
+
+@pytest.mark.slow
+def test_megno_of_a_chaotic_orbit(henon_heiles):
+    """It grows by half the exponent times t."""
+    run = megno(henon_heiles, (0, 3000), CHAOTIC, method=EIPDOP853, h=0.1)
+    rate = run.log_size[-1] / 3000
+    assert rate > 0.05
+    assert run.lyapunov == pytest.approx(rate, rel=0.2)
+    assert run.megno == pytest.approx(rate * 3000 / 2, rel=0.25)
+    half = run.mean[np.searchsorted(run.t, 1500)]
+    assert run.megno / half == pytest.approx(2.0, rel=0.25)
+
+
+def test_backward_runs(pendulum):
+    there = megno(pendulum, (0, 200), [0.0, 1.0], deviation=[1, 2], method=EIPDOP853, h=0.1)
+    back = megno(pendulum, (0, -200), [0.0, 1.0], deviation=[-1, 2], method=EIPDOP853, h=0.1)
+    assert back.t[-1] == -200
+    assert back.megno == pytest.approx(there.megno, rel=1e-10)
+    spectrum = lyapunov_spectrum(lambda t, y: 0.5 * y, (0, -10), [1.0], method=EIPRK4, h=0.1)
+    assert spectrum.exponents == pytest.approx([-0.5])
+
+
+def test_runs_that_end_early():
+    def stop(t, y):
+        return y[0] - 2
+
+    stop.terminal = True
+    run = lyapunov_spectrum(lambda t, y: y, (0, 10), [1.0], method=EIPRK4, h=0.01, events=stop)
+    assert run.t[-1] == pytest.approx(np.log(2))
+    assert run.exponents == pytest.approx([1.0])
+    fails = megno(lambda t, y: y if t < 1 else y * np.nan, (0, 3), [1.0, 1.0], method=EIPRK4, h=0.1)
+    assert not fails.success
+    assert fails.t[-1] <= 1
+
+
+# Two planets, against REBOUND.
+
+
+@njit
+def planets(t, y, out, m):
+    n = m.size
+    for i in range(3 * n):
+        out[i], out[3 * n + i] = y[3 * n + i], 0.0
+    for i in range(n):
+        for j in range(i):
+            dx, dy, dz = y[3 * j] - y[3 * i], y[3 * j + 1] - y[3 * i + 1], y[3 * j + 2] - y[3 * i + 2]
+            r2 = dx * dx + dy * dy + dz * dz
+            s = 1.0 / (r2 * np.sqrt(r2))
+            for k, d in enumerate((dx, dy, dz)):
+                out[3 * (n + i) + k] += m[j] * s * d
+                out[3 * (n + j) + k] -= m[i] * s * d
+
+
+@njit
+def planets_energy(t, y, m):
+    n, e = m.size, 0.0
+    for i in range(n):
+        v = 3 * (n + i)
+        e += 0.5 * m[i] * (y[v] ** 2 + y[v + 1] ** 2 + y[v + 2] ** 2)
+        for j in range(i):
+            dx, dy, dz = y[3 * j] - y[3 * i], y[3 * j + 1] - y[3 * i + 1], y[3 * j + 2] - y[3 * i + 2]
+            e -= m[i] * m[j] / np.sqrt(dx * dx + dy * dy + dz * dz)
+    return e
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("a", "regular"), [(1.8, True), (1.38, False)])
+def test_megno_of_planets_is_that_of_rebound(a, regular):
+    pytest.importorskip("rebound")
+    from eip_scipy.integrations import rebound
+
+    m, q, v = np.array([1.0, 1e-3, 1e-3]), np.zeros((3, 3)), np.zeros((3, 3))
+    for k, (axis, e, side) in enumerate(((1.0, 0.02, 1), (a, 0.02 if regular else 0.1, -1)), 1):
+        q[k, 0], v[k, 1] = side * axis * (1 - e), side * np.sqrt((1 + e) / (axis * (1 - e)))
+    y0 = np.concatenate([(q - m @ q / m.sum()).ravel(), (v - m @ v / m.sum()).ravel()])
+    t_end = 2000 * PERIOD
+    theirs, slope, deviation = rebound.megno(m, y0, t_end=t_end, dt=PERIOD / 60, seed=3)
+    run = megno(planets, (0, t_end), y0, deviation=deviation, params=m, in_place=True, method=EIPDOP853,
+                h=PERIOD / 40, invariants=planets_energy)  # fmt: skip
+    assert run.trusted
+    if regular:
+        assert theirs == pytest.approx(2.0, abs=0.01)
+        assert run.megno == pytest.approx(2.0, abs=0.01)
+        assert run.megno == pytest.approx(theirs, abs=2e-3)
+    else:
+        assert min(run.megno, theirs) > 20
+        assert run.lyapunov == pytest.approx(2 * slope, rel=0.5)
+
+
+# Periodic orbits.
+
+MU = 0.01215058560962404
+TO_EARTH, TO_MOON = "sqrt((x + mu)**2 + y**2 + z**2)", "sqrt((x - 1 + mu)**2 + y**2 + z**2)"
+HALO, LYAPUNOV = [0.8234, 0.0, 0.0224, 0.0, 0.1343, 0.0], [0.8189, 0.0, 0.0, 0.0, 0.1749, 0.0]
+MIRROR = [1, -1, 1, -1, 1, -1]
+
+
+@pytest.fixture(scope="module", params=["equations", "hamiltonian"])
+def three_bodies(request):
+    """The restricted problem, and the momenta's part of a start."""
+    if request.param == "hamiltonian":
+        H = f"(px**2 + py**2 + pz**2)/2 + px*y - py*x - (1 - mu)/{TO_EARTH} - mu/{TO_MOON}"
+        return hamiltonian(H, q="x y z", p="px py pz", params={"mu": MU}), lambda y: np.array([0, 0, 0, -y[1], y[0], 0])
+    symbols = {item: sympy.Symbol(item) for item in ("x", "y", "z", "mu")}
+    U = sympy.sympify(f"(x**2 + y**2)/2 + (1 - mu)/{TO_EARTH} + mu/{TO_MOON}", locals=symbols)
+    rates = {"x": "vx", "y": "vy", "z": "vz"}
+    rates |= {f"v{item}": str(sympy.diff(U, symbols[item])) + more
+              for item, more in (("x", " + 2*vy"), ("y", " - 2*vx"), ("z", ""))}  # fmt: skip
+    jacobi = {"C": f"2*({U}) - vx**2 - vy**2 - vz**2"}
+    return equations(rates, params={"mu": MU}, invariants=jacobi), lambda y: np.zeros(6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("symmetry", [None, MIRROR])
+@pytest.mark.parametrize(("guess", "period", "fixed"), [(HALO, 2.743, "z"), (LYAPUNOV, 2.78, "x")])
+def test_orbits_of_the_restricted_problem(three_bodies, guess, period, fixed, symmetry):
+    problem, momenta = three_bodies
+    orbit = periodic_orbit(problem, guess + momenta(guess), period, fixed=[fixed], symmetry=symmetry,
+                           method=EIPDOP853, h=0.01)  # fmt: skip
+    assert orbit.success, orbit.message
+    assert orbit.closure < 1e-11
+    assert orbit.flow_residual < 1e-11
+    assert orbit.invariant_residual < 1e-11
+    pairs = orbit.multipliers.reshape(3, 2)
+    unit = np.abs(pairs - 1).max(axis=1).argmin()
+    assert np.abs(pairs[unit] - 1).max() < 1e-5  # a Jordan block: the root of rounding
+    assert np.abs(pairs.prod(axis=1) - 1).max() < 1e-8
+    assert 1900 < abs(pairs[0, 0]) < 2300
+
+
+def test_orbit_with_a_given_period(pendulum):
+    """The half-angle formula of the pendulum's period, by the arithmetic-geometric mean."""
+    orbit = periodic_orbit(pendulum, [1.0, 0.0], 7.0, fixed=["p", "period"], method=EIPDOP853, h=0.05)
+    assert orbit.success
+    assert orbit.period == 7.0
+    a, b = 1.0, np.cos(orbit.y0[0] / 2)
+    for _ in range(6):
+        a, b = (a + b) / 2, np.sqrt(a * b)
+    assert 2 * np.pi / a == pytest.approx(7.0, abs=1e-9)
+    assert np.abs(orbit.multipliers - 1).max() < 1e-5
+
+
+def test_limit_cycle():
+    """A multiplier other than 1 is exp of the integral of the divergence; they come in no pairs."""
+
+    def van_der_pol(t, y):
+        return np.array([y[1], 0.5 * (1 - y[0] ** 2) * y[1] - y[0]])
+
+    orbit = periodic_orbit(van_der_pol, [2.0, 0.1], 6.0, method=EIPDOP853, rtol=1e-12, atol=1e-12)
+    assert orbit.success
+    assert orbit.closure < 1e-10
+    assert orbit.multipliers[0] == pytest.approx(1.0, abs=1e-9)
+    fine = integrate(van_der_pol, (0, orbit.period), orbit.y0, method=EIPDOP853, h=orbit.period / 400, save_every=1)
+    divergence = np.mean(0.5 * (1 - fine.y[0, :-1] ** 2)) * orbit.period
+    assert orbit.multipliers[1] == pytest.approx(np.exp(divergence), rel=1e-8)
+    assert np.isnan(orbit.invariant_residual)
+
+
+def test_no_orbit():
+    orbit = periodic_orbit(lambda t, y: np.ones(2), [1.0, 0.0], 1.0, fixed=["period"], method=EIPRK4, h=0.1)
+    assert not orbit.success
+    assert "closes" not in orbit.message
+
+
+# Fits.
+
+FINE = {"method": EIPDOP853, "rtol": 1e-11, "atol": 1e-11}
+
+
+@pytest.mark.slow
+def test_fit_of_an_orbit(kepler):
+    """Directions seen from another orbit; half of the evaluations of the run are saved at least."""
+    t = np.linspace(0.0, 12.0, 40)
+    truth = np.array([0.8, 0.1, -0.2, 1.15])
+    seen_from = 1.3 * np.array([np.cos(0.7 * t), np.sin(0.7 * t)])
+    places = dict(zip(t, seen_from.T, strict=True))
+
+    def direction(time, y):
+        d = y[:2] - places[time]
+        return d / np.hypot(*d)
+
+    def direction_slopes(time, y):
+        d = y[:2] - places[time]
+        turned = np.array([-d[1], d[0]])
+        return np.column_stack([np.outer(turned, turned) / np.hypot(*d) ** 3, np.zeros((2, 2))])
+
+    states = integrate(kepler, (0, 12), truth, t_eval=t, **FINE).y
+    data = np.array([direction(time, y) for time, y in zip(t, states.T, strict=True)]).T
+    fit = TrajectoryFit(kepler, t, data, y0=truth + 0.01, observe=(direction, direction_slopes), sigma=1e-6, **FINE)
+    by_jacobian = least_squares(fit.residuals, fit.x0, jac=fit.jacobian, x_scale="jac")
+    assert by_jacobian.x == pytest.approx(truth, abs=1e-9)
+    assert fit.evaluations == by_jacobian.nfev
+    differences = 5 * by_jacobian.njev + by_jacobian.nfev - by_jacobian.njev
+    assert fit.evaluations < 0.6 * differences
+    step = 1e-6
+    x = truth + 0.01
+    for k in range(4):
+        d = step * np.eye(4)[k]
+        slope = (fit.residuals(x + d) - fit.residuals(x - d)) / (2 * step)
+        assert fit.jacobian(x)[:, k] == pytest.approx(slope, rel=1e-5, abs=1e-5 * np.abs(slope).max())
+
+
+def test_fit_of_state_and_parameter(pendulum):
+    t = np.array([0.0, 0.5, 0.5, 1.5, 3.0])  # two of the data at one time
+    data = integrate(pendulum, (0, 3), [1.0, 0.2], params={"k": 1.3}, t_eval=np.unique(t), **FINE).y[:, [0, 1, 1, 2, 3]]
+    data[1, 2] = np.nan
+    fit = TrajectoryFit(pendulum, t, data, y0=[0.9, 0.0], free=["state", "k"], **FINE)
+    assert fit.x0 == pytest.approx([0.9, 0.0, 1.0])
+    found = least_squares(fit.residuals, fit.x0, jac=fit.jacobian)
+    assert found.x == pytest.approx([1.0, 0.2, 1.3], abs=1e-8)
+    assert found.fun.shape == (9,)
+    assert fit.evaluations == found.nfev
+    only = TrajectoryFit(pendulum, t, data[0], y0=[1.0, 0.2], free="k", observe="q", sigma=0.1, **FINE)
+    found = least_squares(only.residuals, only.x0, jac=only.jacobian)
+    assert found.x == pytest.approx([1.3], abs=1e-8)
+    earlier = TrajectoryFit(pendulum, t, data[0], y0=[1.0, 0.2], t0=-1.0, observe=[0], **FINE)
+    assert earlier.run(earlier.x0).t[0] == 0.0
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda p: lyapunov_spectrum(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, count=3), ValueError, "2 components"),
+        (lambda p: lyapunov_spectrum(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, count=0), ValueError, "count"),
+        (lambda p: lyapunov_spectrum(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, every=-1), ValueError, "every"),
+        (lambda p: lyapunov_spectrum(p, (0, 1), [0, 1], method=EIPRK4, variations="state"), TypeError, "variations"),
+        (lambda p: megno(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, deviation=[0, 0]), ValueError, "deviation"),
+        (lambda p: megno(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, deviation="x"), ValueError, "deviation"),
+        (lambda p: megno(p, (0, 1), [0, 1], metod=EIPRK4, h=0.1), TypeError, "did you mean"),
+        (lambda p: megno(p, (0, 1), [0, 1], method=EIPRK4, h=0.1, save_every=0), ValueError, "save_every"),
+        (lambda p: periodic_orbit(p, [0, 1], -1.0, method=EIPRK4, h=0.1), ValueError, "period"),
+        (lambda p: periodic_orbit(p, [0, 1], 1.0, fixed=["z"], method=EIPRK4, h=0.1), ValueError, "fixed"),
+        (lambda p: periodic_orbit(p, [0, 1], 1.0, symmetry=[1, 2], method=EIPRK4, h=0.1), ValueError, "signs"),
+        (lambda p: periodic_orbit(p, [0, 1], 1.0, symmetry=[1, -1], method=EIPRK4, h=0.1), ValueError, "symmetric"),
+        (lambda p: periodic_orbit(p, [0, 1], 1.0, symmetry=[1, 1], method=EIPRK4, h=0.1), ValueError, "sign -1"),
+        (lambda p: TrajectoryFit(p, [0, 1], np.ones((3, 2)), y0=[0, 1], **FINE), ValueError, "data"),
+        (lambda p: TrajectoryFit(p, [1, 0, 2], np.ones((2, 3)), y0=[0, 1], **FINE), ValueError, "direction"),
+        (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], sigma=0, **FINE), ValueError, "sigma"),
+        (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], free=["x"], **FINE), ValueError, "parameter"),
+        (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], observe="r", **FINE), ValueError, "observe"),
+        (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], observe=len, **FINE), TypeError, "Jacobian"),
+        (lambda p: TrajectoryFit(p, [0, 1], np.ones((2, 2)), y0=[0, 1], **FINE).residuals([1.0]), ValueError, "x0"),
+    ],
+)
+def test_bad_input(pendulum, call, error, words):
+    with pytest.raises(error, match=words):
+        call(pendulum)
