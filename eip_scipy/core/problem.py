@@ -86,6 +86,10 @@ class Problem:
     method : Tableau, NystromTableau, GaussJackson or OneStepMethod, optional
         What `eip_method` takes, of a kind that suits the problem: what `integrate` steps with where it is given no
         method.
+    variational : callable, optional
+        ``variational(parameters) -> rhs``: the right-hand side ``rhs(t, Y, out, params)``, in place, of Y = (y, first
+        column, second column, ...), n numbers each: (f(t, y), Df(t, y) times each column). The last columns are the
+        derivatives by the parameters of these places in `params`. ValueError where there are none.
     units : str
         Units of the state and of time. Of the form "AU, yr" (a length and a time: m, cm, km, AU, pc; s, min, h, d, yr,
         kyr, Myr, Gyr, or a number of m or s) they are more than a note: quantities of astropy are converted to them
@@ -131,6 +135,7 @@ class Problem:
     epoch: Epoch | None = None
     G: float | None = None
     method: Any = None
+    variational: Callable[[tuple[int, ...]], Callable[..., None]] | None = None
 
     def __post_init__(self) -> None:
         refuse_units(y0=self.y0, t_span=self.t_span, h=self.h, params=self.params, metric=self.metric, frame=self.frame)
