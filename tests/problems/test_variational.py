@@ -7,6 +7,8 @@ import pytest
 
 from eip_scipy import equations, hamiltonian
 from eip_scipy.core import jitted
+from eip_scipy.engine.native import library
+from eip_scipy.problems import harmonic, kepler, nbody
 from eip_scipy.problems.symbolic import system
 
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # of central differences of order 8
@@ -130,3 +132,54 @@ def test_arrays_of_wrong_sizes():
         problem.variational(())(0.0, np.ones(6), np.ones(3), params)
     with pytest.raises(ValueError, match="params must hold as many numbers"):
         problem.variational(())(0.0, np.ones(6), np.ones(6), params[:2])
+
+
+# --- problems of the library ---
+
+
+@pytest.mark.parametrize("parameters", [(), (0,)])
+@pytest.mark.parametrize("problem", [kepler(relativistic=0.3), harmonic(omega=1.7)], ids=["kepler", "harmonic"])
+def test_kepler_and_harmonic(problem, parameters):
+    rng = np.random.default_rng(3)
+    for columns in (0, 1, 4):
+        assert_variational(problem, rng.uniform(0.5, 1.5, problem.y0.size), rng, parameters, columns)
+    with pytest.raises(
+        ValueError, match=r"derivatives by its state and only by parameter 0, .*; got parameters=\(1,\)"
+    ):
+        problem.variational((1,))
+    with pytest.raises(ValueError, match="columns of as many and 1 parameter"):
+        in_place(problem.variational(parameters), 0.0, np.ones(7), problem.params)
+
+
+def bodies(rng, n, test_particles=False):
+    """Random bodies that are not close to each other."""
+    gm = rng.uniform(0.1, 1.0, n)
+    if test_particles:
+        gm[1::2] = 0.0
+    places = np.array([(i, j, k) for i in range(3) for j in range(3) for k in range(3)], dtype=float)
+    return gm, rng.permutation(places)[:n] + rng.uniform(-0.2, 0.2, (n, 3)), rng.uniform(-0.5, 0.5, (n, 3))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 16, 17, 18, 27])
+def test_newton(n):
+    rng = np.random.default_rng(n)
+    for columns in (1, 3, 11):
+        problem = nbody(*bodies(rng, n, test_particles=columns == 3), t_span=(0.0, 1.0))
+        assert_variational(problem, problem.y0, rng, (), columns)
+
+
+def test_newton_has_no_derivatives_by_masses():
+    problem = nbody(*bodies(np.random.default_rng(0), 3), t_span=(0.0, 1.0))
+    with pytest.raises(ValueError, match=r"gravity has derivatives by its state and none by parameters; got .*\(0,\)"):
+        problem.variational((0,))
+
+
+def test_columns_do_not_depend_on_each_other():
+    """So that a column has the bits that it has alone."""
+    rng = np.random.default_rng(4)
+    problem = nbody(*bodies(rng, 10), t_span=(0.0, 1.0))
+    columns = rng.standard_normal((19, 60))
+    together = in_place(library["gravity.variational"], 0.0, np.append(problem.y0, columns), problem.params)
+    for column, found in zip(columns, together.reshape(-1, 60)[1:], strict=True):
+        alone = in_place(library["gravity.variational"], 0.0, np.append(problem.y0, column), problem.params)
+        np.testing.assert_array_equal(alone[60:], found)

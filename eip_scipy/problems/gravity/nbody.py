@@ -11,7 +11,7 @@ import numpy as np
 
 from ...core.inputs import has_unit, is_number, refuse_units, shown
 from ...core.invariants import Invariant
-from ...core.problem import Problem, bind, native_invariant
+from ...core.problem import Problem, bind, library_variational, native_invariant
 from ...core.units import Epoch, apart, as_epoch, in_unit, is_time, moment
 from ...core.units import units as known_units
 from ...engine.native import library
@@ -171,6 +171,7 @@ def nbody(
         source=source,
         reference=reference,
         jacobian=library["gravity.central"],
+        variational=None if chosen else partial(library_variational, "gravity.variational", ()),
         frequencies=partial(orbital_frequencies, masses),
         epoch=epoch,
         G=G,

@@ -1,5 +1,6 @@
 // Newton's gravitation of N bodies; the parameters are every G m.
 #include "newton.hpp"
+#include "tides.hpp"
 
 namespace eip {
 namespace {
@@ -25,9 +26,14 @@ void central(const Given<T> &g) {
     central_jacobian(g.y, g.f, g.params, g.n / 3, g.out);
 }
 
+// Of a state with columns of derivatives behind it.
+void variational(const Given<double> &g) { newton_variational(g.y, g.params, g.p, g.n / (6 * g.p) - 1, g.out); }
+
+bool with_columns(int64_t n, int64_t p) { return p > 0 && n > 0 && n % (6 * p) == 0; }
 bool in_phase_space(int64_t n, int64_t p) { return p > 0 && n == 6 * p; }
 bool at_positions(int64_t n, int64_t p) { return p > 0 && n == 3 * p; }
 bool at_positions_first(int64_t n, int64_t p) { return n > 0 && n % 3 == 0 && p >= n / 3; }
+constexpr const char *COLUMNS = "a state of 6 numbers a body, columns of as many and every G m";
 constexpr const char *BODIES = "positions and velocities, 6 numbers a body, and every G m";
 constexpr const char *POSITIONS = "positions, 3 numbers a body, and every G m";
 
@@ -36,6 +42,7 @@ constexpr const char *POSITIONS = "positions, 3 numbers a body, and every G m";
 const LibraryFunction functions[] = {
     {"gravity.rhs", Value::DERIVATIVE, 0, EIP_OF_BODIES(newton_rhs), in_phase_space, BODIES},
     {"gravity.acc", Value::ACCELERATION, 0, EIP_OF_BODIES(accelerate), at_positions, POSITIONS},
+    {"gravity.variational", Value::DERIVATIVE, 0, plain<double, variational>, nullptr, with_columns, COLUMNS},
     {"gravity.central", Value::GRADIENT_BY_F, 1, EIP_BOTH(central), at_positions_first, POSITIONS},
     {"gravity.energy", Value::NUMBERS, 1, EIP_BOTH(energy), in_phase_space, BODIES},
     {"gravity.energy_gradient", Value::GRADIENT_BY_F, 1, EIP_BOTH(gradient_of_energy), in_phase_space, BODIES},
