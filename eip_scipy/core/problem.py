@@ -17,7 +17,7 @@ from .pointers import by_pointer
 from .units import DAY_S, Epoch, Unit, apart, as_epoch, in_unit, is_time, moment, shown_epoch
 from .units import units as known_units
 
-__all__ = ["Deferred", "Problem", "bind", "component_names", "made", "native_invariant"]
+__all__ = ["Deferred", "Problem", "bind", "component_names", "library_variational", "made", "native_invariant"]
 
 MOST = 12  # components that are printed
 MOMENTS, DURATIONS = ("t_span", "t_eval", "t"), ("h", "first_step", "max_step")
@@ -360,3 +360,20 @@ def native_invariant(function: str, name: str, params: np.ndarray) -> Invariant:
     """An invariant by the function of `library` of that name and its gradient."""
     fun, grad = library[function], library[f"{function}_gradient"]
     return Invariant(fun, grad, args=(params,), in_place=True, uses_f=grad.takes_f, name=name)
+
+
+def library_variational(function: str, names: tuple[str, ...], parameters: tuple[int, ...]) -> Callable[..., None]:
+    """Return the function of `library` of that name for a state with columns of derivatives, see `Problem`.
+
+    `names` has at most one parameter, the first of `params`; the function of a last column by it is called
+    ``{function}_by_parameter``.
+    """
+    if not parameters:
+        return library[function]
+    if tuple(parameters) != (0,) or not names:
+        known = f"only by parameter 0, {names[0]}" if names else "none by parameters"
+        raise ValueError(
+            f"variational: {function.partition('.')[0]} has derivatives by its state and {known}; got parameters="
+            f"{tuple(parameters)}."
+        )
+    return library[f"{function}_by_parameter"]

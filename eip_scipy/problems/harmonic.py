@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..core.inputs import refuse_units
-from ..core.problem import Problem, bind, native_invariant
+from ..core.problem import Problem, bind, library_variational, native_invariant
 from ..engine.native import library
 
 __all__ = ["harmonic"]
@@ -44,7 +44,9 @@ def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: f
         params=params,
         invariants=(native_invariant("harmonic.energy", "H", params),),
         reference=partial(_rotated, omega, start),
+        variational=partial(library_variational, "harmonic.variational", ("omega",)),
         component_names=("q", "p"),
+        canonical=True,
         units="dimensionless",
         source="Cai, Gong & Wang, section 2.1",
     )

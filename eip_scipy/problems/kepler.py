@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from functools import partial
 from math import sqrt
-from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
 
 from ..core.inputs import refuse_units
-from ..core.problem import Problem, bind, native_invariant
+from ..core.problem import Problem, bind, library_variational, native_invariant
 from ..engine.native import library
 
 __all__ = ["kepler"]
@@ -56,16 +55,12 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
         invariants=(native_invariant("kepler.energy", "H", params), native_invariant("kepler.momentum", "L", params)),
         reference=partial(_orbit, e) if relativistic == 0 else None,
         blocks=2,
+        variational=partial(library_variational, "kepler.variational", ("relativistic",)),
         component_names=("x", "y", "vx", "vy"),
-        variational=_variational,
         canonical=True,
         units="G M = 1, semi-major axis 1: period 2 pi",
         source="Cai, Gong & Wang, section 3.1 (eq. 3.2, with L = q1 p2 - q2 p1)",
     )
-
-
-def _variational(parameters: tuple[int, ...]) -> Any:
-    return library["kepler.variational_by_parameter" if parameters else "kepler.variational"]
 
 
 def _orbit(e: float, t: float) -> np.ndarray:

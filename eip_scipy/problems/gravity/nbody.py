@@ -11,7 +11,7 @@ import numpy as np
 
 from ...core.inputs import has_unit, is_number, refuse_units, shown
 from ...core.invariants import Invariant
-from ...core.problem import Problem, bind, native_invariant
+from ...core.problem import Problem, bind, library_variational, native_invariant
 from ...core.units import Epoch, apart, as_epoch, in_unit, is_time, moment
 from ...core.units import units as known_units
 from ...engine.native import library
@@ -174,23 +174,11 @@ def nbody(
         source=source,
         reference=reference,
         jacobian=library["gravity.central"],
-        variational=partial(_variational, chosen),
+        variational=None if chosen else partial(library_variational, "gravity.variational", ()),
         frequencies=partial(orbital_frequencies, masses),
         epoch=epoch,
         G=G,
     )
-
-
-def _variational(forces: Sequence[str], parameters: tuple[int, ...]) -> Any:
-    """Return the right-hand side with columns of derivatives, see `Problem`."""
-    if forces:
-        raise ValueError(
-            f"variations: the derivatives of nbody with the forces {', '.join(forces)} are not known; give jvp=..., or "
-            "leave the forces out."
-        )
-    if parameters:
-        raise ValueError("variations: nbody gives no derivatives by masses; ask for columns of the state.")
-    return library["gravity.variational"]
 
 
 def component_names(n: int, bodies: Sequence[str] | None) -> tuple[str, ...]:

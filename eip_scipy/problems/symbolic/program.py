@@ -21,7 +21,7 @@ import sympy
 
 from ...core.jitted import compilable, is_jitted, jitted
 
-__all__ = ["Arguments", "function"]
+__all__ = ["Arguments", "function", "variational"]
 
 # SymPy's functions, and the names that math and NumPy have for them.
 CALLS: dict[Any, tuple[str, str]] = {
@@ -42,7 +42,7 @@ CALLS: dict[Any, tuple[str, str]] = {
     sympy.atanh: ("atanh", "arctanh"),
 }
 OTHERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside, sympy.erf)
-COMMON = {name: getattr(builtins, name) for name in ("abs", "max", "min", "ValueError")} | {"erf": math.erf}
+COMMON = {name: getattr(builtins, name) for name in ("abs", "max", "min", "range", "ValueError")} | {"erf": math.erf}
 COMPILED = {name: getattr(math, name) for name in ("sqrt", *(name for name, _ in CALLS.values()))} | COMMON
 # Without Numba NumPy's: math's would raise where a step reaches too far, instead of giving the NaN that shortens it.
 INTERPRETED = {name: getattr(np, of_numpy) for name, of_numpy in CALLS.values()} | {"sqrt": np.sqrt} | COMMON
@@ -79,7 +79,64 @@ def function(what: str, expressions: Sequence[Any], arguments: Arguments, *, in_
     ValueError
         For what has no function here.
     """
-    code = _compiled(what, _statements(what, expressions, arguments, in_place), arguments, in_place)
+    return _fastest(_compiled(what, _statements(what, expressions, arguments, in_place), arguments, in_place))
+
+
+def variational(
+    what: str,
+    rates: Sequence[Any],
+    jacobian: Mapping[tuple[int, int], Any],
+    by_parameters: Sequence[Mapping[int, Any]],
+    arguments: Arguments,
+) -> Callable[..., None]:
+    """Return a function of ``(t, Y, out[, params])`` for the state with columns of derivatives behind it.
+
+    Its values for the state have the bits of ``function(what, rates, ...)``: the statements of the rates come first, as
+    they are there, and those of their derivatives use what the former computed.
+
+    Parameters
+    ----------
+    what : str
+        What it computes, for tracebacks and errors.
+    rates : sequence of sympy.Expr, of length n
+    jacobian : mapping of (int, int) to sympy.Expr
+        The derivatives of the rates by the components that are not 0, by row and column.
+    by_parameters : sequence of mappings of int to sympy.Expr
+        For each of the last columns the derivatives of the rates by its parameter that are not 0, by row.
+    arguments : Arguments
+
+    Raises
+    ------
+    ValueError
+        For what has no function here.
+    """
+    n = len(rates)
+    writer = Writer(what, arguments)
+    values = writer.values(rates)
+    derivatives = [*jacobian.values(), *(item for column in by_parameters for item in column.values())]
+    found = iter(writer.values(derivatives))
+    entries = {place: next(found) for place in jacobian}
+    added = [{row: next(found) for row in column} for column in by_parameters]
+    body = [*_checks_of_columns(n, len(added)), *_checks(Arguments((), arguments.arrays["params"])), *writer.body]
+    body += [_set(_item("out", k, ast.Store()), value) for k, value in enumerate(values)]
+    bounds: list[ast.expr] = [ast.Constant(value=n), _size("y"), ast.Constant(value=n)]
+    body.append(
+        ast.For(
+            target=ast.Name(id="k", ctx=ast.Store()),
+            iter=ast.Call(func=_load("range"), args=bounds, keywords=[]),
+            body=_products(n, entries),
+            orelse=[],
+        )
+    )
+    for behind, column in enumerate(reversed(added), 1):
+        start = ast.BinOp(left=_size("y"), op=ast.Sub(), right=ast.Constant(value=behind * n))
+        for row, value in column.items():
+            target = ast.Subscript(value=_load("out"), slice=_after(start, row), ctx=ast.Store())
+            body.append(ast.AugAssign(target=target, op=ast.Add(), value=value))
+    return _fastest(_compiled(what, body, arguments, in_place=True))
+
+
+def _fastest(code: CodeType) -> Callable[..., Any]:
     fast = jitted(compilable(_made(code, COMPILED)))
     return fast if is_jitted(fast) else _made(code, INTERPRETED)
 
@@ -102,10 +159,7 @@ def _compiled(what: str, body: list[ast.stmt], arguments: Arguments, in_place: b
 
 def _statements(what: str, expressions: Sequence[Any], arguments: Arguments, in_place: bool) -> list[ast.stmt]:
     writer = Writer(what, arguments)
-    common, reduced = sympy.cse(expressions, symbols=sympy.numbered_symbols(cls=sympy.Dummy), list=True)
-    for name, expression in common:
-        writer.known[name] = writer.value(expression)
-    values = [writer.value(expression) for expression in reduced]
+    values = writer.values(expressions)
     body = [*_checks(arguments), *writer.body]
     if in_place:
         return body + [_set(_item("out", k, ast.Store()), value) for k, value in enumerate(values)]
@@ -113,15 +167,64 @@ def _statements(what: str, expressions: Sequence[Any], arguments: Arguments, in_
     return [*body, ast.Return(value=value)]
 
 
+def _products(n: int, entries: Mapping[tuple[int, int], ast.expr]) -> list[ast.stmt]:
+    """Return the statements that fill the column of `out` at k with the Jacobian times the column of `y` there."""
+    read = sorted({j for _, j in entries})
+    # All of them first: compiled code must not read them anew after each number that it writes.
+    body = [
+        _set(
+            ast.Name(id=f"d{j}", ctx=ast.Store()),
+            ast.Subscript(value=_load("y"), slice=_after(_load("k"), j), ctx=ast.Load()),
+        )
+        for j in read
+    ]
+    for i in range(n):
+        terms: list[ast.expr] = [
+            ast.BinOp(left=value, op=ast.Mult(), right=_load(f"d{j}"))
+            for (row, j), value in entries.items()
+            if row == i
+        ]
+        total = reduce(_plus, terms) if terms else ast.Constant(value=0.0)
+        body.append(_set(ast.Subscript(value=_load("out"), slice=_after(_load("k"), i), ctx=ast.Store()), total))
+    return body
+
+
+def _plus(left: ast.expr, right: ast.expr) -> ast.expr:
+    return ast.BinOp(left=left, op=ast.Add(), right=right)
+
+
+def _after(start: ast.expr, k: int) -> ast.expr:
+    return _plus(start, ast.Constant(value=k))
+
+
+def _size(array: str) -> ast.expr:
+    return ast.Attribute(value=_load(array), attr="size", ctx=ast.Load())
+
+
+def _differ(left: ast.expr, right: ast.expr) -> ast.expr:
+    return ast.Compare(left=left, ops=[ast.NotEq()], comparators=[right])
+
+
+def _refused(wrong: ast.expr, text: str) -> ast.stmt:
+    error = ast.Call(func=_load("ValueError"), args=[ast.Constant(value=text)], keywords=[])
+    return ast.If(test=wrong, body=[ast.Raise(exc=error)], orelse=[])
+
+
 def _checks(arguments: Arguments) -> Iterable[ast.stmt]:
     """Compiled code does not look whether an index is one of the array's. Sizes cost nothing: they are known to it."""
     for array, names in arguments.arrays.items():
         if names:
-            size = ast.Attribute(value=_load(array), attr="size", ctx=ast.Load())
-            wrong = ast.Compare(left=size, ops=[ast.NotEq()], comparators=[ast.Constant(value=len(names))])
             text = f"{array} must hold as many numbers as there are in ({', '.join(names)}): {len(names)}"
-            error = ast.Call(func=_load("ValueError"), args=[ast.Constant(value=text)], keywords=[])
-            yield ast.If(test=wrong, body=[ast.Raise(exc=error)], orelse=[])
+            yield _refused(_differ(_size(array), ast.Constant(value=len(names))), text)
+
+
+def _checks_of_columns(n: int, columns: int) -> Iterable[ast.stmt]:
+    """Check that `y` is the state and whole columns, of which there are at least as many, and that `out` is as long."""
+    rest = ast.BinOp(left=_size("y"), op=ast.Mod(), right=ast.Constant(value=n))
+    few = ast.Compare(left=_size("y"), ops=[ast.Lt()], comparators=[ast.Constant(value=n * (columns + 1))])
+    text = f"y must hold the state and columns of derivatives, {n} numbers each, and at least {columns} columns"
+    yield _refused(ast.BoolOp(op=ast.Or(), values=[_differ(rest, ast.Constant(value=0)), few]), text)
+    yield _refused(_differ(_size("out"), _size("y")), "out must be as long as y")
 
 
 def _load(name: str) -> ast.expr:
@@ -145,6 +248,13 @@ class Writer:
         self.known: dict[Any, ast.expr] = {}
         self._written: dict[str, ast.expr] = {}
         self._places = arguments.places
+
+    def values(self, expressions: Sequence[Any]) -> list[ast.expr]:
+        """Return the names, or the constants, of several expressions, of which what is common is computed once."""
+        common, reduced = sympy.cse(expressions, symbols=sympy.numbered_symbols(cls=sympy.Dummy), list=True)
+        for name, expression in common:
+            self.known[name] = self.value(expression)
+        return [self.value(expression) for expression in reduced]
 
     def value(self, expression: Any) -> ast.expr:
         """The name, or the constant, that stands for an expression."""

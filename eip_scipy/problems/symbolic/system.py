@@ -22,6 +22,7 @@ from .brackets import how_kept, vanishes
 from .pairs import paired
 from .parser import as_expression, as_names, symbol
 from .program import Arguments, function
+from .program import variational as variational_function
 
 __all__ = ["SymbolicProblem", "equations_problem", "hamiltonian_problem"]
 
@@ -163,7 +164,7 @@ class SymbolicProblem(Problem):
         functions = _functions(self.system)
         own = [fun for fun, *_ in (*functions.invariants, *functions.balances)]
         kept = [own.index(item.function) if item.function in own else item for item in self.invariants]
-        left = {"fun", "rhs", "acc", "jacobian", "invariants"}
+        left = {"fun", "rhs", "acc", "jacobian", "variational", "invariants"}
         return _again, (kept, {item.name: getattr(self, item.name) for item in fields(self) if item.name not in left})
 
 
@@ -390,6 +391,7 @@ def _problem(*, system: System, params: np.ndarray | None, **others: Any) -> Sym
         rhs=rhs,
         acc=functions.acc,
         jacobian=functions.jacobian,
+        variational=partial(_variational, system),
     )
 
 
@@ -465,6 +467,36 @@ def _jacobian(system: System) -> Callable[..., None]:
     pairs = [(symbol(q), symbol(d)) for q, d in zip(names, along, strict=True)]
     rows = [sympy.Add(*(sympy.diff(a, q) * d for q, d in pairs)) for a in found]
     return function("Jacobian", rows, Arguments(names, system.parameters, along), in_place=True)
+
+
+def _variational(system: System, parameters: tuple[int, ...]) -> Callable[..., None]:
+    """Return the right-hand side with columns of derivatives, see `Problem`, which is written when it is asked for."""
+    for k in parameters:
+        if not 0 <= k < len(system.parameters):
+            raise ValueError(
+                f"variational: there is no parameter {k}; expected places in ({', '.join(system.parameters)})."
+            )
+    return _with_columns(system, tuple(map(int, parameters)))
+
+
+@lru_cache(maxsize=64)
+def _with_columns(system: System, parameters: tuple[int, ...]) -> Callable[..., None]:
+    for name, rate in zip(system.components, system.rates, strict=True):
+        if jumps := rate.atoms(sympy.sign, sympy.Heaviside):  # of these alone: those of abs, max and min are continuous
+            raise ValueError(
+                f"variational: the derivative of {name} contains {_cut(min(jumps, key=str))}, which jumps; at a jump "
+                "derivatives of the state do not follow from derivatives of the equations."
+            )
+
+    def nonzero(by: Any) -> dict[int, Any]:
+        found = ((i, sympy.diff(rate, by)) for i, rate in enumerate(system.rates))
+        return {i: item for i, item in found if item != 0}
+
+    columns = [nonzero(variable) for variable in system.variables]
+    jacobian = {(i, j): item for j, column in enumerate(columns) for i, item in column.items()}
+    added = [nonzero(symbol(system.parameters[k])) for k in parameters]
+    arguments = Arguments(system.components, system.parameters)
+    return variational_function("variational equations", system.rates, jacobian, added, arguments)
 
 
 def _parameters(params: Any) -> dict[str, float]:

@@ -1,5 +1,6 @@
 // Newton's gravitation of N bodies; the parameters are every G m.
 #include "newton.hpp"
+#include "tides.hpp"
 
 namespace eip {
 namespace {
@@ -25,13 +26,14 @@ void central(const Given<T> &g) {
     central_jacobian(g.y, g.f, g.params, g.n / 3, g.out);
 }
 
+// Of a state with columns of derivatives behind it.
 void variational(const Given<double> &g) { newton_variational(g.y, g.params, g.p, g.n / (6 * g.p) - 1, g.out); }
 
-bool with_columns(int64_t n, int64_t p) { return p > 0 && n > 6 * p && n % (6 * p) == 0; }
+bool with_columns(int64_t n, int64_t p) { return p > 0 && n > 0 && n % (6 * p) == 0; }
 bool in_phase_space(int64_t n, int64_t p) { return p > 0 && n == 6 * p; }
 bool at_positions(int64_t n, int64_t p) { return p > 0 && n == 3 * p; }
 bool at_positions_first(int64_t n, int64_t p) { return n > 0 && n % 3 == 0 && p >= n / 3; }
-constexpr const char *COLUMNS = "a state of 6 numbers a body, and columns of as many";
+constexpr const char *COLUMNS = "a state of 6 numbers a body, columns of as many and every G m";
 constexpr const char *BODIES = "positions and velocities, 6 numbers a body, and every G m";
 constexpr const char *POSITIONS = "positions, 3 numbers a body, and every G m";
 

@@ -41,22 +41,23 @@ void kepler_jacobian(const Given<T> &g) {
     g.out[1] = along * q[1] - pull * d[1];
 }
 
-// Of a state with columns of derivatives behind it; `by_parameter`: the last one is that by the relativistic coefficient.
+// Of a state with columns of derivatives behind it; the last one may be that by the relativistic coefficient.
 template <bool BY_PARAMETER>
 void kepler_variational(const Given<double> &g) {
     kepler_rhs(g);
-    const int64_t columns = g.n / 4 - 1;
-    for (int64_t c = 1; c <= columns; ++c) {
-        const double *column = g.y + 4 * c;
-        double *out = g.out + 4 * c;
-        out[0] = column[2];
-        out[1] = column[3];
-        kepler_jacobian<double>({g.t, g.y, column, out + 2, g.params, 2, g.p});
+    const double *q = g.y, r2 = q[0] * q[0] + q[1] * q[1], inverse = 1.0 / r2, w = inverse / sqrt(r2);
+    const double over = 1.5 * g.params[0] * inverse, pull = w + w * over;
+    const double radial = (3.0 * w + 5.0 * w * over) * inverse;
+    for (int64_t k = 4; k < g.n; k += 4) {
+        const double *d = g.y + k, along = radial * (q[0] * d[0] + q[1] * d[1]);
+        double *out = g.out + k;
+        out[0] = d[2];
+        out[1] = d[3];
+        out[2] = along * q[0] - pull * d[0];
+        out[3] = along * q[1] - pull * d[1];
     }
-    if (!BY_PARAMETER) return;
-    const double r2 = g.y[0] * g.y[0] + g.y[1] * g.y[1], w = 1.5 / (r2 * r2 * sqrt(r2));
-    g.out[4 * columns + 2] -= w * g.y[0];
-    g.out[4 * columns + 3] -= w * g.y[1];
+    if constexpr (BY_PARAMETER)
+        for (int c = 0; c < 2; ++c) g.out[g.n - 2 + c] -= 1.5 * w * inverse * q[c];
 }
 
 template <class T>
@@ -93,6 +94,18 @@ void harmonic_rhs(const Given<T> &g) {
     g.out[1] = -g.params[0] * g.y[0];
 }
 
+template <bool BY_PARAMETER>
+void harmonic_variational(const Given<double> &g) {
+    for (int64_t k = 0; k < g.n; k += 2) {
+        g.out[k] = g.params[0] * g.y[k + 1];
+        g.out[k + 1] = -g.params[0] * g.y[k];
+    }
+    if constexpr (BY_PARAMETER) {
+        g.out[g.n - 2] += g.y[1];
+        g.out[g.n - 1] -= g.y[0];
+    }
+}
+
 template <class T>
 void harmonic_energy(const Given<T> &g) {
     g.out[0] = 0.5 * g.params[0] * (g.y[0] * g.y[0] + g.y[1] * g.y[1]);
@@ -107,27 +120,36 @@ void harmonic_energy_gradient(const Given<T> &g) {
 bool with_columns(int64_t n, int64_t p) { return n > 4 && n % 4 == 0 && p == 1; }
 bool of_four(int64_t n, int64_t p) { return n == 4 && p == 1; }
 bool of_two(int64_t n, int64_t p) { return n == 2 && p == 1; }
-constexpr const char *COLUMNS = "4 numbers, columns of as many, and 1 parameter";
+// With at least so many columns.
+template <int64_t SIZE, int64_t COLUMNS>
+bool with_columns(int64_t n, int64_t p) {
+    return n >= SIZE * (1 + COLUMNS) && n % SIZE == 0 && p == 1;
+}
+constexpr const char *FOURS = "a state of 4 numbers, columns of as many and 1 parameter";
+constexpr const char *TWOS = "a state of 2 numbers, columns of as many and 1 parameter";
 constexpr const char *FOUR = "a state of 4 numbers and 1 parameter", *TWO = "2 numbers and 1 parameter";
 
 #define EIP_BOTH(function) plain<double, function<double>>, plain<Octet, function<Octet>>
+#define EIP_VARIATIONAL(function, by_parameter, size, sizes) \
+    Value::DERIVATIVE, 0, plain<double, function<by_parameter>>, nullptr, with_columns<size, by_parameter>, sizes
 const LibraryFunction functions[] = {
     {"kepler.rhs", Value::DERIVATIVE, 0, EIP_BOTH(kepler_rhs), of_four, FOUR},
     {"kepler.acc", Value::ACCELERATION, 0, EIP_BOTH(kepler_acc), of_two, TWO},
     {"kepler.jacobian", Value::GRADIENT_BY_F, 1, EIP_BOTH(kepler_jacobian), of_two, TWO},
-    {"kepler.variational", Value::DERIVATIVE, 0, plain<double, kepler_variational<false>>, nullptr, with_columns,
-     COLUMNS},
-    {"kepler.variational_by_parameter", Value::DERIVATIVE, 0, plain<double, kepler_variational<true>>, nullptr,
-     with_columns, COLUMNS},
+    {"kepler.variational", EIP_VARIATIONAL(kepler_variational, false, 4, FOURS)},
+    {"kepler.variational_by_parameter", EIP_VARIATIONAL(kepler_variational, true, 4, FOURS)},
     {"kepler.energy", Value::NUMBERS, 1, EIP_BOTH(kepler_energy), of_four, FOUR},
     {"kepler.energy_gradient", Value::GRADIENT_BY_F, 1, EIP_BOTH(kepler_energy_gradient), of_four, FOUR},
     {"kepler.momentum", Value::NUMBERS, 1, EIP_BOTH(kepler_momentum), of_four, FOUR},
     {"kepler.momentum_gradient", Value::GRADIENT, 1, EIP_BOTH(kepler_momentum_gradient), of_four, FOUR},
     {"harmonic.rhs", Value::DERIVATIVE, 0, EIP_BOTH(harmonic_rhs), of_two, TWO},
+    {"harmonic.variational", EIP_VARIATIONAL(harmonic_variational, false, 2, TWOS)},
+    {"harmonic.variational_by_parameter", EIP_VARIATIONAL(harmonic_variational, true, 2, TWOS)},
     {"harmonic.energy", Value::NUMBERS, 1, EIP_BOTH(harmonic_energy), of_two, TWO},
     {"harmonic.energy_gradient", Value::GRADIENT, 1, EIP_BOTH(harmonic_energy_gradient), of_two, TWO},
 };
 #undef EIP_BOTH
+#undef EIP_VARIATIONAL
 
 }  // namespace
 

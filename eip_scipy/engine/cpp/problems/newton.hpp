@@ -62,32 +62,6 @@ inline void central_jacobian(const T *q, const T *dq, const T *gm, int64_t bodie
     }
 }
 
-// The derivative of a state with `columns` of derivatives behind it: those columns times the Jacobian.
-inline void newton_variational(const double *y, const double *gm, int64_t bodies, int64_t columns, double *out) {
-    const int64_t half = 3 * bodies, size = 2 * half;
-    newton_rhs(y, gm, bodies, out);
-    for (int64_t c = 1; c <= columns; ++c) {
-        std::copy(y + c * size + half, y + (c + 1) * size, out + c * size);
-        std::fill(out + c * size + half, out + (c + 1) * size, 0.0);
-    }
-    for (int64_t i = 0; i < bodies; ++i)
-        for (int64_t j = i + 1; j < bodies; ++j) {
-            const double x[3] = {y[3 * j] - y[3 * i], y[3 * j + 1] - y[3 * i + 1], y[3 * j + 2] - y[3 * i + 2]};
-            const double r2 = x[0] * x[0] + x[1] * x[1] + x[2] * x[2], w = 1.0 / (r2 * std::sqrt(r2)), s = 3.0 * w / r2;
-            for (int64_t c = 1; c <= columns; ++c) {
-                const double *a = y + c * size + 3 * i, *b = y + c * size + 3 * j;
-                double *at = out + c * size + half;
-                const double d[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]};
-                const double along = s * (x[0] * d[0] + x[1] * d[1] + x[2] * d[2]);
-                for (int k = 0; k < 3; ++k) {
-                    const double change = w * d[k] - along * x[k];
-                    at[3 * i + k] += gm[j] * change;
-                    at[3 * j + k] -= gm[i] * change;
-                }
-            }
-        }
-}
-
 // From the derivative f of the state.
 template <class T>
 inline void energy_gradient(const T *y, const T *f, const T *gm, int64_t bodies, T *out) {

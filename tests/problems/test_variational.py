@@ -1,0 +1,185 @@
+"""Variational equations of problems: against differences of order 8 of their right-hand sides, at random states."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from eip_scipy import equations, hamiltonian
+from eip_scipy.core import jitted
+from eip_scipy.engine.native import library
+from eip_scipy.problems import harmonic, kepler, nbody
+from eip_scipy.problems.symbolic import system
+
+WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # of central differences of order 8
+STEP = 2.0**-7
+RTOL = 1e-9  # of the largest number in a column
+PENDULUM = (
+    "(m2*l2**2*p1**2 + (m1 + m2)*l1**2*p2**2 - 2*m2*l1*l2*p1*p2*cos(th1 - th2))"
+    " / (2*m2*l1**2*l2**2*(m1 + m2*sin(th1 - th2)**2)) - (m1 + m2)*g*l1*cos(th1) - m2*g*l2*cos(th2)"
+)
+SYMBOLIC = {
+    "henon-heiles": lambda: hamiltonian("(px**2 + py**2 + x**2 + y**2)/2 + x**2*y - y**3/3"),
+    "kepler": lambda: hamiltonian(
+        "(px**2 + py**2)/2 - 1/sqrt(x**2 + y**2) - eps/(2*(x**2 + y**2)**1.5)", params={"eps": 0.1}
+    ),
+    "double pendulum": lambda: hamiltonian(
+        PENDULUM, "th1 th2", "p1 p2", params={"m1": 1.0, "m2": 0.5, "l1": 1.0, "l2": 0.7, "g": 9.81}
+    ),
+    "rigid body": lambda: hamiltonian(
+        "(m1**2/I1 + m2**2/I2 + m3**2/I3)/2",
+        "m1 m2 m3",
+        poisson=[[0, "-m3", "m2"], ["m3", 0, "-m1"], ["-m2", "m1", 0]],
+        params={"I1": 1.0, "I2": 2.0, "I3": 3.0},
+    ),
+    "driven": lambda: hamiltonian(
+        "p**2/2 - cos(q) + a*q*sin(w*t)", params={"a": 0.3, "w": 1.7}, extended=True, name="driven"
+    ),
+    "friction": lambda: hamiltonian("p**2/2 + q**4/4", dissipation={"p": "-c*p"}, params={"c": 0.2}),
+    "lorenz": lambda: equations(
+        {"x": "s*(y - x)", "y": "x*(r - z) - y", "z": "x*y - b*z"}, params={"s": 10.0, "r": 28.0, "b": 8 / 3}
+    ),
+    "functions": lambda: equations({"x": "a*x*abs(x) + atan2(y, 2 + x**2)", "y": "max(x, 3*y)"}, params={"a": 2.0}),
+    "constant": lambda: equations({"x": "1", "y": "0"}),
+}
+
+
+def difference(fun, x, along):
+    """The derivative of fun(x) along a direction."""
+    steps = STEP / np.abs(along).max()
+    return sum(w * (fun(x + k * steps * along) - fun(x - k * steps * along)) for k, w in WEIGHTS.items()) / steps
+
+
+def in_place(rhs, t, y, params):
+    out = np.full_like(y, np.nan)
+    rhs(t, y, out, *(() if params is None else (params,)))
+    return out
+
+
+def assert_variational(problem, y, rng, parameters=(), columns=3, t=0.4, rtol=RTOL):
+    """Compare all columns with differences, and the state's derivative with the problem's own, bit for bit."""
+    n, params = y.size, problem.params
+    directions = rng.standard_normal((columns + len(parameters), n))
+    Y = np.concatenate([y, directions.ravel()])
+    found = in_place(problem.variational(parameters), t, Y, params).reshape(-1, n)
+    np.testing.assert_array_equal(found[0], in_place(problem.rhs, t, y, params))
+    for k, (direction, column) in enumerate(zip(directions, found[1:], strict=True)):
+        expected = difference(lambda y: in_place(problem.rhs, t, y, params), y, direction)
+        if k >= columns:
+            unit = np.eye(params.size)[parameters[k - columns]]
+            expected += difference(lambda p: in_place(problem.rhs, t, y, p), params, unit)
+        np.testing.assert_allclose(column, expected, rtol=0, atol=rtol * max(np.abs(expected).max(), 1e-300))
+
+
+# --- problems of expressions ---
+
+
+@pytest.mark.needs_jit
+@pytest.mark.parametrize("name", SYMBOLIC)
+def test_expressions(name):
+    problem, rng = SYMBOLIC[name](), np.random.default_rng(1)
+    count = len(problem.system.parameters)
+    for parameters in {(), tuple(range(count)), tuple(range(count))[::-2]}:
+        y = rng.uniform(0.3, 1.3, len(problem.system.components))
+        assert_variational(problem, y, rng, parameters, columns=0 if parameters else 3)
+        assert_variational(problem, y, rng, parameters, columns=2)
+
+
+@pytest.mark.parametrize("name", ["kepler", "functions"])
+def test_expressions_without_numba(monkeypatch, name):
+    caches = system._functions, system._with_columns
+    monkeypatch.setattr(jitted, "find_spec", lambda name: None)
+    for cached in caches:
+        cached.cache_clear()
+    problem, rng = SYMBOLIC[name](), np.random.default_rng(2)
+    assert not jitted.is_jitted(problem.variational(()))
+    assert_variational(problem, rng.uniform(0.3, 1.3, len(problem.system.components)), rng, (0,), columns=1)
+    for cached in caches:
+        cached.cache_clear()
+
+
+@pytest.mark.needs_jit
+def test_expressions_are_written_when_they_are_asked_for(monkeypatch):
+    problem = SYMBOLIC["lorenz"]()
+    system._with_columns.cache_clear()
+    monkeypatch.setattr(system, "variational_function", None)
+    again = pickle.loads(pickle.dumps(problem))
+    with pytest.raises(TypeError):
+        again.variational(())
+    monkeypatch.undo()
+    assert again.variational((2, 0)) is problem.variational((2, 0))
+
+
+def test_expressions_that_have_no_derivative():
+    problem = equations({"x": "y", "y": "sign(x)"}, params={"a": 1.0})
+    with pytest.raises(ValueError, match=r"derivative of y contains sign\(x\), which jumps"):
+        problem.variational(())
+    with pytest.raises(ValueError, match="no parameter 1; expected places in"):
+        problem.variational((1,))
+    with pytest.raises(ValueError, match="no parameter -1"):
+        problem.variational((-1,))
+
+
+@pytest.mark.needs_jit
+def test_arrays_of_wrong_sizes():
+    problem = SYMBOLIC["lorenz"]()
+    params = problem.params
+    with pytest.raises(ValueError, match="3 numbers each, and at least 1 columns"):
+        problem.variational((0,))(0.0, np.ones(3), np.ones(3), params)
+    with pytest.raises(ValueError, match="3 numbers each"):
+        problem.variational(())(0.0, np.ones(7), np.ones(7), params)
+    with pytest.raises(ValueError, match="out must be as long as y"):
+        problem.variational(())(0.0, np.ones(6), np.ones(3), params)
+    with pytest.raises(ValueError, match="params must hold as many numbers"):
+        problem.variational(())(0.0, np.ones(6), np.ones(6), params[:2])
+
+
+# --- problems of the library ---
+
+
+@pytest.mark.parametrize("parameters", [(), (0,)])
+@pytest.mark.parametrize("problem", [kepler(relativistic=0.3), harmonic(omega=1.7)], ids=["kepler", "harmonic"])
+def test_kepler_and_harmonic(problem, parameters):
+    rng = np.random.default_rng(3)
+    for columns in (0, 1, 4):
+        assert_variational(problem, rng.uniform(0.5, 1.5, problem.y0.size), rng, parameters, columns)
+    with pytest.raises(
+        ValueError, match=r"derivatives by its state and only by parameter 0, .*; got parameters=\(1,\)"
+    ):
+        problem.variational((1,))
+    with pytest.raises(ValueError, match="columns of as many and 1 parameter"):
+        in_place(problem.variational(parameters), 0.0, np.ones(7), problem.params)
+
+
+def bodies(rng, n, test_particles=False):
+    """Random bodies that are not close to each other."""
+    gm = rng.uniform(0.1, 1.0, n)
+    if test_particles:
+        gm[1::2] = 0.0
+    places = np.array([(i, j, k) for i in range(3) for j in range(3) for k in range(3)], dtype=float)
+    return gm, rng.permutation(places)[:n] + rng.uniform(-0.2, 0.2, (n, 3)), rng.uniform(-0.5, 0.5, (n, 3))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 16, 17, 18, 27])
+def test_newton(n):
+    rng = np.random.default_rng(n)
+    for columns in (1, 3, 11):
+        problem = nbody(*bodies(rng, n, test_particles=columns == 3), t_span=(0.0, 1.0))
+        assert_variational(problem, problem.y0, rng, (), columns)
+
+
+def test_newton_has_no_derivatives_by_masses():
+    problem = nbody(*bodies(np.random.default_rng(0), 3), t_span=(0.0, 1.0))
+    with pytest.raises(ValueError, match=r"gravity has derivatives by its state and none by parameters; got .*\(0,\)"):
+        problem.variational((0,))
+
+
+def test_columns_do_not_depend_on_each_other():
+    """So that a column has the bits that it has alone."""
+    rng = np.random.default_rng(4)
+    problem = nbody(*bodies(rng, 10), t_span=(0.0, 1.0))
+    columns = rng.standard_normal((19, 60))
+    together = in_place(library["gravity.variational"], 0.0, np.append(problem.y0, columns), problem.params)
+    for column, found in zip(columns, together.reshape(-1, 60)[1:], strict=True):
+        alone = in_place(library["gravity.variational"], 0.0, np.append(problem.y0, column), problem.params)
+        np.testing.assert_array_equal(alone[60:], found)
