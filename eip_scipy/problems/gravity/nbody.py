@@ -171,7 +171,7 @@ def nbody(
         source=source,
         reference=reference,
         jacobian=library["gravity.central"],
-        variational=None if chosen else partial(library_variational, "gravity.variational", ()),
+        variational=partial(library_variational, f"{'forces' if chosen else 'gravity'}.variational", ()),
         frequencies=partial(orbital_frequencies, masses),
         epoch=epoch,
         G=G,
