@@ -9,6 +9,7 @@ from eip_scipy import equations, hamiltonian
 from eip_scipy.core import jitted
 from eip_scipy.engine.native import library
 from eip_scipy.problems import harmonic, kepler, nbody
+from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.problems.symbolic import system
 
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # of central differences of order 8
@@ -166,6 +167,39 @@ def test_newton(n):
     for columns in (1, 3, 11):
         problem = nbody(*bodies(rng, n, test_particles=columns == 3), t_span=(0.0, 1.0))
         assert_variational(problem, problem.y0, rng, (), columns)
+
+
+RELATIVITY = [(), ("1pn",), ("eih",), ("gr-potential",)]
+OTHERS = [(), ("j2",), ("moon-quadrupole",), ("j2", "moon-quadrupole")]
+
+
+@pytest.mark.parametrize("others", OTHERS, ids="+".join)
+@pytest.mark.parametrize("relativity", RELATIVITY, ids="+".join)
+@pytest.mark.parametrize("n", [2, 4, 10])
+def test_forces(relativity, others, n):
+    """With constants that make all of them as large as Newton's."""
+    constants = ForceConstants(c=1.5, j2=0.4, pole=[1.0, -2.0, 0.5], moon_body=n - 1, moon=0.3)
+    rng = np.random.default_rng(n)
+    for particles in (False, True):
+        given = bodies(rng, n, particles)
+        problem = nbody(*given, t_span=(0.0, 1.0), forces=(*relativity, *others), constants=constants)
+        assert_variational(problem, problem.y0, rng, (), 5)
+
+
+@pytest.mark.parametrize("force", ["1pn", "eih", "gr-potential", "j2", "moon-quadrupole"])
+def test_what_a_force_adds(force):
+    """Compare the parts of each force alone, so that Newton's larger part hides nothing."""
+    rng = np.random.default_rng(5)
+    constants = ForceConstants(c=1.5, j2=0.4, pole=[1.0, -2.0, 0.5], moon_body=2, moon=0.3)
+    given = bodies(rng, 5)
+    problem = nbody(*given, t_span=(0.0, 1.0), forces=force, constants=constants)
+    plain, y = nbody(*given, t_span=(0.0, 1.0)), problem.y0
+    for direction in rng.standard_normal((6, y.size)):
+        Y = np.append(y, direction)
+        found = in_place(problem.variational(()), 0.0, Y, problem.params)
+        found -= in_place(plain.variational(()), 0.0, Y, plain.params)
+        expected = difference(lambda y: problem.fun(0.0, y) - plain.fun(0.0, y), y, direction)
+        np.testing.assert_allclose(found[y.size :], expected, rtol=0, atol=RTOL * np.abs(expected).max())
 
 
 def test_newton_has_no_derivatives_by_masses():

@@ -156,6 +156,7 @@ def nbody(
         kept = _forces.invariants(chosen, params, y0) if chosen else _newtonian(params)
     else:
         kept = orbital_balances(masses, y0, balances, bodies=bodies, newton=not chosen)
+    equations = "forces" if chosen else "gravity"
     rhs, acc = _forces.equations(chosen) if chosen else (library["gravity.rhs"], library["gravity.acc"])
     return Problem(
         name=name,
@@ -174,7 +175,7 @@ def nbody(
         source=source,
         reference=reference,
         jacobian=library["gravity.central"],
-        variational=None if chosen else partial(library_variational, "gravity.variational", ()),
+        variational=None if "drag" in chosen else partial(library_variational, f"{equations}.variational", ()),
         frequencies=partial(orbital_frequencies, masses),
         epoch=epoch,
         G=G,

@@ -98,6 +98,35 @@ struct Einstein {
             }
     }
 
+    // Add the derivatives of these terms along `count` columns (dq, dv) of 6 N numbers. The same columns of `out` hold
+    // those of Newton's accelerations in their second halves; `newton` (3 N) are the accelerations themselves.
+    void add_slopes(const double *newton, const double *columns, int64_t count, double *out) const {
+        const int64_t half = 3 * n, size = 6 * n;
+        const std::vector<double> phi = potentials();
+        std::vector<double> by_phi(count * n), by_newton(count * half);
+        for (int64_t k = 0; k < count; ++k)
+            std::copy(out + size * k + half, out + size * (k + 1), by_newton.begin() + half * k);
+        for (int64_t i = 0; i < n; ++i)
+            for (int64_t j = i + 1; j < n; ++j) {
+                const Three x = body(q, i) - body(q, j);
+                const double u2 = 1.0 / dot(x, x), u3 = u2 * std::sqrt(u2);
+                for (int64_t k = 0; k < count; ++k) {
+                    const double *column = columns + size * k, du = -u3 * dot(x, body(column, i) - body(column, j));
+                    by_phi[n * k + i] += gm[j] * du;
+                    by_phi[n * k + j] += gm[i] * du;
+                }
+            }
+        for (int64_t i = 0; i < n; ++i)
+            for (int64_t j = 0; j < n; ++j) {
+                if (j == i) continue;
+                const PullSlope pull(*this, i, j, phi, newton);
+                for (int64_t k = 0; k < count; ++k) {
+                    const double *slopes = by_phi.data() + n * k, *accelerations = by_newton.data() + half * k;
+                    pull.add(columns + size * k, 4.0 * slopes[i] + slopes[j], accelerations, out + size * k + half);
+                }
+            }
+    }
+
     double energy() const {
         double total = 0.0;
         for (int64_t i = 0; i < n; ++i) {
@@ -191,6 +220,44 @@ struct Einstein {
         add(out, i, w3 * (4.0 * dot(x, vi) - 3.0 * dot(x, vj)), vi - vj);
         add(out, i, 3.5 * w * u, aj);
     }
+
+    // The derivative of add_pull, with what does not depend on the direction.
+    struct PullSlope {
+        int64_t i, j, n;
+        Three x, vi, vj, aj;
+        double u, radial, along, across, w, w3;
+
+        PullSlope(const Einstein &all, int64_t i, int64_t j, const std::vector<double> &phi, const double *newton)
+            : i(i),
+              j(j),
+              n(all.n),
+              x(body(all.q, i) - body(all.q, j)),
+              vi(body(all.v, i)),
+              vj(body(all.v, j)),
+              aj(body(newton, j)) {
+            u = 1.0 / std::sqrt(dot(x, x));
+            radial = dot(x, vj) * u;
+            along = 4.0 * phi[i] + phi[j] - dot(vi, vi) - 2.0 * dot(vj, vj) + 4.0 * dot(vi, vj);
+            along += 1.5 * radial * radial + 0.5 * dot(x, aj);
+            across = 4.0 * dot(x, vi) - 3.0 * dot(x, vj);
+            w = all.over_c2 * all.gm[j] * u;
+            w3 = w * u * u;
+        }
+
+        // By a column (dq, dv), what it adds to 4 phi_i + phi_j, and what it adds to Newton's accelerations.
+        void add(const double *column, double by_phi, const double *by_newton, double *out) const {
+            const Three dx = body(column, i) - body(column, j), da = body(by_newton, j);
+            const Three di = body(column, n + i), dj = body(column, n + j);
+            const double e = dot(x, dx) * u * u;  // of a power of u the derivative has -e times it
+            const double by_radial = (dot(dx, vj) + dot(x, dj)) * u - e * radial;
+            double by_along = by_phi - 2.0 * dot(vi, di) - 4.0 * dot(vj, dj) + 4.0 * (dot(di, vj) + dot(vi, dj));
+            by_along += 3.0 * radial * by_radial + 0.5 * (dot(dx, aj) + dot(x, da));
+            const double by_across = 4.0 * (dot(dx, vi) + dot(x, di)) - 3.0 * (dot(dx, vj) + dot(x, dj));
+            eip::add(out, i, w3, sum(by_along - 3.0 * e * along, x, along, dx));
+            eip::add(out, i, w3, sum(by_across - 3.0 * e * across, vi - vj, across, di - dj));
+            eip::add(out, i, 3.5 * w, sum(1.0, da, -e, aj));
+        }
+    };
 
     // What pulls body j towards i, as the energy has it.
     Three pair_force(int64_t i, int64_t j, double phi) const {

@@ -2,6 +2,7 @@
 #include <cmath>
 
 #include "einstein.hpp"
+#include "tides.hpp"
 
 namespace eip {
 namespace {
@@ -76,6 +77,67 @@ void acc(const Given<double> &g) {
     const Bodies b(g);
     accelerate(g.y, b.gm, b.n, g.out);
     add_pulls(g.y, nullptr, b, g.out);
+}
+
+// The derivatives of `pull` and `pull_1pn` on body i, with what does not depend on the direction.
+struct PullSlope {
+    Three x, v, pole;
+    double over_r2, potential = 0.0, moon = 0.0, oblate = 0.0, sine, relativity = 0.0, four, even, odd;
+
+    PullSlope(const double *y, const Bodies &b, int64_t i)
+        : x(body(y, i) - body(y, 0)),
+          v(body(y, b.n + i) - body(y, b.n)),
+          pole(b.pole()),
+          sine(dot(x, pole)),
+          odd(dot(x, v)) {
+        const double gm_sun = b.gm[0], r2 = dot(x, x), over_r = 1.0 / std::sqrt(r2);
+        over_r2 = 1.0 / r2;
+        const double over_r3 = over_r * over_r2, over_r5 = over_r3 * over_r2;
+        four = 4.0 * gm_sun * over_r;
+        even = four - dot(v, v);
+        if (b.k[KIND] == POTENTIAL) potential = 6.0 * gm_sun * gm_sun * b.k[OVER_C2] * over_r2 * over_r2;
+        if (b.k[KIND] == ONE_PN) relativity = gm_sun * b.k[OVER_C2] * over_r3;
+        if (b.k[MOON_BODY] == i) moon = 3.0 * gm_sun * b.k[MOON] * over_r5;
+        if (b.k[OBLATENESS] > 0.0) oblate = 1.5 * gm_sun * b.k[OBLATENESS] * over_r5;
+    }
+
+    // Along (dx, dv).
+    Three along(const Three &dx, const Three &dv) const {
+        const double e = dot(x, dx) * over_r2;  // of a power of 1/r the derivative has -e times it
+        const double ratio = 5.0 * sine * sine * over_r2, by_sine = dot(dx, pole);
+        double by_x = e * (4.0 * potential + 5.0 * moon), by_dx = -potential - moon - oblate * (1.0 - ratio);
+        by_x += oblate * (5.0 * e * (1.0 - ratio) + 10.0 * sine * by_sine * over_r2 - 2.0 * e * ratio);
+        const Three still = sum(by_x, x, by_dx, dx);
+        const Three newtonian = sum(1.0, still, -2.0 * oblate * (by_sine - 5.0 * e * sine), pole);
+        if (relativity == 0.0) return newtonian;
+        const double by_even = -e * four - 2.0 * dot(v, dv);
+        const double by_odd = dot(dx, v) + dot(x, dv);
+        const Three along_x = sum(by_even - 3.0 * e * even, x, even, dx);
+        const Three along_v = sum(4.0 * (by_odd - 3.0 * e * odd), v, 4.0 * odd, dv);
+        return sum(1.0, newtonian, relativity, sum(1.0, along_x, 1.0, along_v));
+    }
+};
+
+// Of a state with columns of derivatives behind it: the derivatives first, which need Newton's accelerations.
+void variational(const Given<double> &g) {
+    const Bodies b(g);
+    const int64_t size = 6 * b.n, columns = g.n / size - 1;
+    double *a = g.out + 3 * b.n;
+    newton_variational(g.y, b.gm, b.n, columns, g.out);
+    if (b.k[KIND] == EIH) {
+        b.einstein(g.y).add_slopes(a, g.y + size, columns, g.out + size);
+        b.einstein(g.y).add_accelerations(a);
+    }
+    add_pulls(g.y, g.y + 3 * b.n, b, a);
+    for (int64_t i = 1; i < b.n; ++i) {
+        const PullSlope pull(g.y, b, i);
+        for (int64_t k = 1; k <= columns; ++k) {
+            const double *dq = g.y + size * k, *dv = dq + 3 * b.n;
+            const Three slope = pull.along(body(dq, i) - body(dq, 0), body(dv, i) - body(dv, 0));
+            add(a + size * k, i, 1.0, slope);
+            add(a + size * k, 0, -b.gm[i] / b.gm[0], slope);
+        }
+    }
 }
 
 // G times the potential energy of `pull`.
@@ -225,9 +287,11 @@ void pair_momentum_gradient(const Given<double> &g) {
     }
 }
 
+bool with_columns(int64_t n, int64_t p) { return p > N_ENTRIES && n > 0 && n % (6 * (p - N_ENTRIES)) == 0; }
 bool of_bodies(int64_t n, int64_t p) { return p > N_ENTRIES && n == 6 * (p - N_ENTRIES); }
 bool at_positions(int64_t n, int64_t p) { return p > N_ENTRIES && n == 3 * (p - N_ENTRIES); }
 bool of_two(int64_t n, int64_t p) { return n == 12 && p == 2 + N_ENTRIES; }
+constexpr const char *COLUMNS = "a state of 6 numbers a body, columns of as many, every G m and 12 entries";
 constexpr const char *BODIES = "positions and velocities, 6 numbers a body, every G m and 12 entries";
 constexpr const char *POSITIONS = "positions, 3 numbers a body, every G m and 12 entries";
 constexpr const char *TWO = "12 numbers, two G m and 12 entries";
@@ -235,6 +299,7 @@ constexpr const char *TWO = "12 numbers, two G m and 12 entries";
 const LibraryFunction functions[] = {
     {"forces.rhs", Value::DERIVATIVE, 0, plain<double, rhs>, nullptr, of_bodies, BODIES},
     {"forces.acc", Value::ACCELERATION, 0, plain<double, acc>, nullptr, at_positions, POSITIONS},
+    {"forces.variational", Value::DERIVATIVE, 0, plain<double, variational>, nullptr, with_columns, COLUMNS},
     {"forces.energy", Value::NUMBERS, 1, plain<double, energy>, nullptr, of_bodies, BODIES},
     {"forces.energy_gradient", Value::GRADIENT_BY_F, 1, plain<double, gradient_of_energy>, nullptr, of_bodies, BODIES},
     {"forces.momentum", Value::NUMBERS, 3, plain<double, momentum>, nullptr, of_bodies, BODIES},
