@@ -357,7 +357,7 @@ def megno(
     Notes
     -----
     With the tangent vector d, ``Y(t) = (2/t) int_0^t s (d' . d)/(d . d) ds``, and the mean is ``(1/t) int_0^t Y ds``,
-    with t from the start of the run. By parts, ``Y = 2 (L(t) - (1/t) int_0^t L ds)`` with L = ln |d|, so that no
+    with t from the start of the run. By parts, ``Y = 2 (L(t) - (1/t) int_0^t L ds)`` with L = log(size of d), so no
     derivative is needed: the error is that of the splines, of order 4 in the distance of the saved points. The mean
     tends to 2 for regular orbits, 0 for a harmonic oscillator, and to half the largest exponent times t for chaotic
     ones. REBOUND returns the mean, from all positions and velocities without masses; its
