@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from .core.inputs import count as as_count
-from .core.inputs import is_number, shown
+from .core.inputs import is_number, reals, shown
 from .core.names import nearest
 from .core.options import ProjectionOptions
 from .core.results import Diagnostics
@@ -38,7 +38,7 @@ PIECES, PIECES_OF_ONE = 1000, 100
 # A piece in which the columns grow apart by more than this factor is repeated at half its length: the least exponents
 # would otherwise be lost in the rounding of the largest.
 LARGEST_RATIO = 1e8
-# The same for a single column, whose square must not overflow.
+# A single column may grow by this factor, since its square must not overflow.
 LARGEST_COLUMN = 1e100
 SHORTEST = 2.0**-40
 # Singular values below this share of the largest belong to directions that the equations leave open: the flow, and the
@@ -52,8 +52,24 @@ PAIRED = 1e-3
 OWN = ("variations", "dense_output", "t_eval", "checkpoint", "checkpoint_every", "resume")
 
 
-@dataclass(frozen=True, eq=False)
-class LyapunovSpectrum:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Followed:
+    """Fields of what is found along a whole run, which have their texts in the results."""
+
+    y: Array = field(repr=False)
+    diagnostics: Diagnostics = field(repr=False)
+    success: bool
+    trusted: bool
+    message: str
+
+
+def _end_of(run: IntegrationResult) -> dict[str, Any]:
+    """Return these fields at the end of a run."""
+    return {"y": run.y[:, -1], **{name: run[name] for name in ("diagnostics", "success", "trusted", "message")}}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LyapunovSpectrum(_Followed):
     """Result of `lyapunov_spectrum`.
 
     Attributes
@@ -79,15 +95,10 @@ class LyapunovSpectrum:
     t: Array
     running: Array
     columns: Array = field(repr=False)
-    y: Array = field(repr=False)
-    diagnostics: Diagnostics = field(repr=False)
-    success: bool
-    trusted: bool
-    message: str
 
 
-@dataclass(frozen=True, eq=False)
-class Megno:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Megno(_Followed):
     """Result of `megno`.
 
     Attributes
@@ -116,11 +127,6 @@ class Megno:
     Y: Array = field(repr=False)
     mean: Array = field(repr=False)
     log_size: Array = field(repr=False)
-    y: Array = field(repr=False)
-    diagnostics: Diagnostics = field(repr=False)
-    success: bool
-    trusted: bool
-    message: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +193,7 @@ def _refuse(function: str, options: dict[str, Any], also: Sequence[str] = ()) ->
 
 
 def _start(fun: Any, t_span: Any, y0: Any, options: dict[str, Any]) -> Prepared:
-    """What `integrate` makes of its arguments before the first step."""
+    """Return the run that `integrate` prepares from its arguments, before the first step."""
     return prepared(Request.of(**{"method": None, **options, "fun": fun, "t_span": t_span, "y0": y0}))
 
 
@@ -211,7 +217,7 @@ def _pieces(fun: Any, y0: Any, t: tuple[float, float], columns: Array, every: fl
     now, sign, run = begin, np.sign(end - begin), None
     total, made, length = abs(end - begin), 0.0, every
     while made < total:
-        # From the start, so that rounding does not add up; the last piece is no sliver.
+        # Times are counted from the start, so that rounding does not add up. A short rest is added to the last piece.
         aim = total if total - made < 1.01 * length else made + length
         bound = end if aim == total else begin + sign * aim
         if run is None:
@@ -237,7 +243,7 @@ def _pieces(fun: Any, y0: Any, t: tuple[float, float], columns: Array, every: fl
 
 
 def _orthonormal(n: int, k: int) -> Array:
-    """The same k directions in each call, none of them special."""
+    """Return k random directions, the same in each call."""
     return np.linalg.qr(np.random.default_rng(1).standard_normal((n, k)))[0]
 
 
@@ -305,11 +311,9 @@ def lyapunov_spectrum(
         sums.append(total)
     t = np.array(times)
     running = np.array(sums) / np.abs(t - t0)[:, None]
-    run = piece.run
     return LyapunovSpectrum(
-        np.sort(running[-1])[::-1], t, running, piece.columns, run.y[:, -1],
-        run.diagnostics, run.success, run.trusted, run.message,
-    )  # fmt: skip
+        exponents=np.sort(running[-1])[::-1], t=t, running=running, columns=piece.columns, **_end_of(piece.run)
+    )
 
 
 def _ends(start: Prepared) -> tuple[float, float]:
@@ -393,30 +397,31 @@ def megno(
     t, L = np.concatenate(times), np.concatenate(logs)
     Y, mean = _indicators(np.abs(t - t0), L)
     slope = np.polyfit(np.abs(t - t0), mean, 1)[0] if t.size > 2 else np.nan
-    run = piece.run
     return Megno(
-        float(mean[-1]), float(2 * slope), t, Y, mean, L, run.y[:, -1],
-        run.diagnostics, run.success, run.trusted, run.message,
-    )  # fmt: skip
+        megno=float(mean[-1]), lyapunov=float(2 * slope), t=t, Y=Y, mean=mean, log_size=L, **_end_of(piece.run)
+    )
 
 
 def _unit(deviation: Any, n: int) -> Array:
     if deviation is None:
         return _orthonormal(n, 1)
-    try:
-        given = np.array(deviation, float)
-    except (TypeError, ValueError):
-        given = np.zeros(0)
+    given = _numbers(deviation)
     if given.shape != (n,) or not np.isfinite(given).all() or not given.any():
         raise ValueError(f"deviation must be a finite vector of {n} numbers, not all 0, got {shown(deviation)}.")
     return (given / np.linalg.norm(given))[:, None]
+
+
+def _numbers(given: Any) -> Array:
+    """Return what was given as an array, an empty one if it does not hold real numbers."""
+    found = reals(given)
+    return np.zeros(0) if found is None else found
 
 
 def _indicators(s: Array, L: Array) -> tuple[Array, Array]:
     """MEGNO and its mean from the logarithms at the times s, which begin at 0."""
     if s.size < 2:
         return np.zeros(s.size), np.zeros(s.size)
-    # Where a run restarts its adaptive steps, two points may be almost the same.
+    # At the start the integrals are 0, and so are the indicators.
     after = np.where(s > 0, s, 1.0)
     Y = 2 * (L - CubicSpline(s, L).antiderivative()(s) / after)
     Y[0] = 0.0
@@ -523,14 +528,19 @@ def periodic_orbit(
     return full.result(iterations, tol)
 
 
+def _component(item: Any, names: Sequence[str]) -> int | None:
+    """Return the place of a component that is given by its name or place, None for anything else."""
+    if isinstance(item, str):
+        return list(names).index(item) if item in names else None
+    is_place = isinstance(item, int | np.integer) and not isinstance(item, bool) and 0 <= item < len(names)
+    return int(item) if is_place else None
+
+
 def _place(item: Any, names: Sequence[str]) -> int:
-    if item == "period":
-        return len(names)
-    if isinstance(item, str) and item in names:
-        return list(names).index(item)
-    if isinstance(item, int | np.integer) and not isinstance(item, bool) and 0 <= item < len(names):
-        return int(item)
-    raise ValueError(f'fixed: {shown(item)} is neither "period" nor one of the components {", ".join(names)}.')
+    place = len(names) if item == "period" else _component(item, names)
+    if place is None:
+        raise ValueError(f'fixed: {shown(item)} is neither "period" nor one of the components {", ".join(names)}.')
+    return place
 
 
 def _odd(symmetry: Any, y: Array) -> Array:
@@ -572,7 +582,7 @@ class _Shooting:
 
 @dataclass(frozen=True)
 class _Reached:
-    """Where a run of one period, or half of it, led to."""
+    """The end of a run of one period, or of half of it."""
 
     shooting: _Shooting
     y0: Array
@@ -590,16 +600,14 @@ class _Reached:
         """Return its size, relative to the start."""
         return float(np.abs(self.residual).max() / np.abs(self.y0).max())
 
-    def derivative(self, y: Array) -> tuple[Array, Array]:
-        """Return the derivative and the gradients of the invariants at a state."""
-        start = _start(self.shooting.fun, (0.0, self.period), y, {**self.shooting.options, "project_initial": False})
-        f = start.run.start.f
-        return f, start.run.invariants.gradients(0.0, y, f)
+    def begun_at(self, y: Array) -> Prepared:
+        """Return what a run from a state knows of it."""
+        return _start(self.shooting.fun, (0.0, self.period), y, {**self.shooting.options, "project_initial": False})
 
     def correction(self, free: Array) -> Array:
         """Return the least-norm step of Newton in (y0, T), 0 where these are fixed."""
         odd, M = self.shooting.odd, self.run.stm[-1]
-        f = self.derivative(self.run.y[:, -1])[0]
+        f = self.begun_at(self.run.y[:, -1]).run.start.f
         rows = np.column_stack([M, self.shooting.share * f])
         if odd.any():
             rows = rows[odd]
@@ -611,7 +619,8 @@ class _Reached:
 
     def result(self, iterations: int, tol: float) -> PeriodicOrbit:
         M = self.run.stm[-1]
-        f, G = self.derivative(self.y0)
+        start = self.begun_at(self.y0).run
+        f, G = start.start.f, start.invariants.gradients(0.0, self.y0, start.start.f)
         size = np.linalg.norm(M, 2)
         invariants = [np.linalg.norm(g @ M - g) / (np.linalg.norm(g) * size) for g in G if g.any()]
         closed = self.size <= tol
@@ -736,7 +745,7 @@ class TrajectoryFit:
         self._data = _data(data, (d, self._from.size))
         self._kept = np.isfinite(self._data)
         self._sigma = _sigma(sigma, self._data.shape)
-        self.x0 = np.concatenate([self._y0 * 1.0 if self._has_state else [], self._params[self._places]])
+        self.x0 = np.concatenate([self._y0 if self._has_state else [], self._params[self._places]])
         self.evaluations = 0
         self._last: tuple[Array, IntegrationResult] | None = None
 
@@ -786,10 +795,7 @@ class TrajectoryFit:
 
 def _times(t: Any, t0: Any) -> tuple[tuple[float, float], Array, Array]:
     """Return the interval, the distinct times in it, and for each of the data the place of its time."""
-    try:
-        times = np.array(t, float)
-    except (TypeError, ValueError):
-        times = np.zeros(0)
+    times = _numbers(t)
     if times.ndim != 1 or times.size == 0 or not np.isfinite(times).all():
         raise ValueError(f"t must be an array of finite times, one for each of the data, got {shown(t)}.")
     if t0 is not None and not is_number(t0):
@@ -812,21 +818,16 @@ def _observed(observe: Any, names: Sequence[str]) -> tuple[Callable[..., Any], C
     items = range(len(names)) if observe is None else [observe] if isinstance(observe, str | int) else observe
     rows = []
     for item in items:
-        if isinstance(item, str) and item in names:
-            rows.append(list(names).index(item))
-        elif isinstance(item, int | np.integer) and 0 <= item < len(names):
-            rows.append(int(item))
-        else:
+        place = _component(item, names)
+        if place is None:
             raise ValueError(f"observe: {shown(item)} is none of the components {', '.join(names)}.")
+        rows.append(place)
     chosen = np.eye(len(names))[rows]
     return lambda t, y: y[rows], lambda t, y: chosen
 
 
 def _data(data: Any, shape: tuple[int, int]) -> Array:
-    try:
-        found = np.array(data, float)
-    except (TypeError, ValueError):
-        found = np.zeros(0)
+    found = _numbers(data)
     if found.ndim == 1 and shape[0] == 1:
         found = found[None]
     if found.shape != shape or np.isinf(found).any() or np.isnan(found).all():

@@ -9,15 +9,14 @@ import numpy as np
 from numba import njit
 
 from .dual_arrays import for_duals, inside
-from .dual_numbers import Dual, put_slope, seed, slope, value_of
-from .jitted_gradients import LANES, compiled_for, gradient_by_duals, new_state
+from .dual_numbers import put_slope, seed, slope, value_of
+from .jitted_gradients import compiled_for, dual_along, gradient_by_duals, new_state
 
 __all__ = [
     "parameter_gradient",
+    "rearranged",
     "rhs_by_duals",
     "rhs_by_products",
-    "rhs_by_variational",
-    "rhs_in_halves",
     "wide_gradient",
     "wide_value",
 ]
@@ -37,9 +36,8 @@ def rhs_by_duals(
     NotCompilableError
         When the function does something that dual numbers cannot.
     """
-    passes = -(-columns // LANES)
-    lanes = -(-columns // passes)
-    dual = Dual(lanes)
+    dual = dual_along(columns)
+    lanes = dual.lanes
     taken = n // 2 if form.startswith("acceleration") else n
     offset, size = n - taken, n + len(parameters)
     user = _with_out(for_duals(fun, dual), form, has_params, bool(scalars))
@@ -134,44 +132,20 @@ def rhs_by_products(fun: Any, form: str, jvp: Any, n: int, columns: int) -> Any:
 
 
 @lru_cache(maxsize=256)
-def rhs_by_variational(rhs: Any, n: int, parameters: int, columns: int) -> Any:
-    """The same by a problem's own, in place of (y, columns) without the parameters behind them.
+def rearranged(rhs: Any, places: tuple[int, ...]) -> Any:
+    """The right-hand side in place of a state that has the numbers that `rhs` takes at these places; others stay."""
+    order = np.array(places, np.int64)
 
-    The last `parameters` columns have to be the derivatives by these.
-    """
-    if not parameters:
-        return rhs
-    size = n + parameters
-
-    def spread(t, Y, out, *extra):
-        packed = np.empty(n * (1 + columns))
-        for c in range(1 + columns):
-            packed[n * c : n * (c + 1)] = Y[size * c : size * c + n]
-        found = np.empty(packed.size)
+    def in_place(t, Y, out, *extra):
+        packed, found = np.empty(order.size), np.empty(order.size)
+        for j in range(order.size):
+            packed[j] = Y[order[j]]
         rhs(t, packed, found, *extra)
         out[:] = 0.0
-        for c in range(1 + columns):
-            out[size * c : size * c + n] = found[n * c : n * (c + 1)]
+        for j in range(order.size):
+            out[order[j]] = found[j]
 
-    return njit(spread)
-
-
-@lru_cache(maxsize=256)
-def rhs_in_halves(rhs: Any, half: int, columns: int) -> Any:
-    """The right-hand side of a Nystrom method's wide state: all positions first, then all velocities."""
-    blocks = 1 + columns
-
-    def rearranged(t, Y, out, *extra):
-        packed, found = np.empty(Y.size), np.empty(Y.size)
-        for c in range(blocks):
-            packed[2 * half * c : half * (2 * c + 1)] = Y[half * c : half * (c + 1)]
-            packed[half * (2 * c + 1) : 2 * half * (c + 1)] = Y[half * (blocks + c) : half * (blocks + c + 1)]
-        rhs(t, packed, found, *extra)
-        for c in range(blocks):
-            out[half * c : half * (c + 1)] = found[2 * half * c : half * (2 * c + 1)]
-            out[half * (blocks + c) : half * (blocks + c + 1)] = found[half * (2 * c + 1) : 2 * half * (c + 1)]
-
-    return njit(rearranged)
+    return njit(in_place)
 
 
 def _state_of(layout: tuple[int, int, int]) -> Any:
@@ -223,63 +197,43 @@ def wide_gradient(
     """
     (n, first, second), state = layout, _state_of(layout)
     places, sizes = np.array(parameters, np.int64), (*shape, n)
-    if not in_place:
-        returned = grad
-        if takes_f:
-            grad = inside(lambda t, y, f, out, *extra: _put(returned(t, y, f, *extra), out))
-        else:
-            grad = inside(lambda t, y, out, *extra: _put(returned(t, y, *extra), out))
-    if parameters:
-        behind = inside(lambda t, y, out, extra: _put_columns(by_parameters(t, y, *extra), out, n, places))
-        own = inside(lambda Y, extra: (_from_state(Y, extra[0], n, places),))
+    if takes_f and in_place:
+        own = inside(lambda t, y, F, out, extra: grad(t, y, state(F), out, *extra))
+    elif takes_f:
+        own = inside(lambda t, y, F, out, extra: _put(grad(t, y, state(F), *extra), out))
+    elif in_place:
+        own = inside(lambda t, y, F, out, extra: grad(t, y, out, *extra))
     else:
-        behind = inside(lambda t, y, out, extra: None)
-        own = inside(lambda Y, extra: extra)
-    if not shape and first == n and not parameters:  # its row is filled where it lies
+        own = inside(lambda t, y, F, out, extra: _put(grad(t, y, *extra), out))
 
-        def row_with_f(t, Y, f, out, *extra):
-            out[n:] = 0.0
-            grad(t, Y[:n], f[:n], out[:n], *extra)
+    def row(t, Y, F, out, extra):  # of a number's gradient, where it lies
+        out[n:] = 0.0
+        own(t, Y[:n], F, out[:n], extra)
 
-        def row_without_f(t, Y, out, *extra):
-            out[n:] = 0.0
-            grad(t, Y[:n], out[:n], *extra)
-
-        return njit(row_with_f if takes_f else row_without_f)
-    if takes_f:
-
-        def with_f(t, Y, f, out, *extra):
-            found = np.empty(sizes)
-            arguments = own(Y, extra)
-            grad(t, state(Y), state(f), found, *arguments)
-            out[:] = 0.0
-            out[..., :first] = found[..., :first]
-            out[..., second : second + n - first] = found[..., first:]
-            behind(t, state(Y), out, arguments)
-
-        return njit(with_f)
-
-    def without_f(t, Y, out, *extra):
+    def rows(t, Y, F, out, extra):
         found = np.empty(sizes)
-        arguments = own(Y, extra)
-        grad(t, state(Y), found, *arguments)
+        own(t, state(Y), F, found, extra)
         out[:] = 0.0
         out[..., :first] = found[..., :first]
         out[..., second : second + n - first] = found[..., first:]
-        behind(t, state(Y), out, arguments)
 
-    return njit(without_f)
+    def with_parameters(t, Y, F, out, extra):
+        arguments = (_from_state(Y, extra[0], n, places),)
+        rows(t, Y, F, out, arguments)
+        slopes = by_parameters(t, Y[:n], *arguments)
+        for j in range(places.size):
+            out[..., n + j] = slopes[..., places[j]]
+
+    rows = inside(rows)
+    filled = inside(with_parameters if parameters else row) if parameters or (not shape and first == n) else rows
+    if takes_f:
+        return njit(lambda t, Y, F, out, *extra: filled(t, Y, F, out, extra))
+    return njit(lambda t, Y, out, *extra: filled(t, Y, Y, out, extra))
 
 
 @inside
 def _put(values, out):
     out[:] = values
-
-
-@inside
-def _put_columns(slopes, out, n, places):
-    for j in range(places.size):
-        out[..., n + j] = slopes[..., places[j]]
 
 
 @lru_cache(maxsize=256)

@@ -14,7 +14,7 @@ from .dual_arrays import for_duals, inside
 from .dual_numbers import Dual, directed, seed, slope, stack_array
 from .jitted import NotCompilableError
 
-__all__ = ["LANES", "compiled_for", "gradient_by_duals", "new_state", "rate_by_duals"]
+__all__ = ["compiled_for", "dual_along", "gradient_by_duals", "new_state", "rate_by_duals"]
 
 # Derivatives carried through a function at once, at most: more fill the registers.
 LANES = 12
@@ -36,9 +36,8 @@ def gradient_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool
     NotCompilableError
         When the function does something that dual numbers cannot.
     """
-    passes = -(-n // LANES)
-    lanes = -(-n // passes)
-    dual = Dual(lanes)
+    dual = dual_along(n)
+    lanes = dual.lanes
     call = _with_params(for_duals(fun, dual), has_params, bool(scalars))
     make_state = new_state(dual, n)
 
@@ -74,6 +73,12 @@ def rate_by_duals(fun: Any, n: int, shape: tuple[int, ...], has_params: bool, sc
         return slopes(call(directed(dual, t, 1.0), x, params))
 
     return compiled_for(along, 1, has_params, scalars)
+
+
+def dual_along(directions: int) -> Dual:
+    """Return the duals that carry derivatives along a number of directions in the fewest passes, all alike."""
+    passes = -(-directions // LANES)
+    return Dual(-(-directions // passes))
 
 
 def new_state(dual: Any, n: int) -> Any:

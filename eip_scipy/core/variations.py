@@ -23,7 +23,7 @@ from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off
 from .pointers import PointerFunction
 from .states import as_derivative
 
-__all__ = ["Columns", "StateSolution", "Variations", "asked_columns", "require_tableau", "widened"]
+__all__ = ["Columns", "StateSolution", "Variations", "asked_columns", "require_tableau", "right_hand_side", "widened"]
 
 Array = np.ndarray
 STATE = "state"
@@ -230,63 +230,42 @@ class Variations:
     invariants : tuple of Invariant
     given : tuple of Invariant
         The same as functions of the state.
-    source : str
-        Where the products of the Jacobian come from.
     """
 
     columns: Columns
     rhs: Callable[..., Any]
     invariants: tuple[Invariant, ...]
     given: tuple[Invariant, ...]
-    source: str
 
     @classmethod
     def of(
         cls,
         columns: Columns,
-        fun: Any,
-        form: str,
+        rhs: Callable[..., Any],
         t0: float,
         y0: Array,
         extra: tuple,
         invariants: Any,
-        jvp: Any,
-        own: Any,
+        *,
+        in_python: bool = False,
     ) -> Variations:
-        """Make them; `own`: the problem's ``variational``, or None.
+        """Make them from a right-hand side of the wide state, see `right_hand_side`; `extra`: that of the invariants.
+
+        `in_python`: Python calls the functions, and nothing is compiled for them.
 
         Raises
         ------
         ValueError
-            Where there is no way to the derivatives.
+            For balances.
         """
-        _refuse_balances(invariants)
-        rhs, source = _right_hand_side(columns, fun, form, t0, y0, extra, jvp, own)
-        rhs = _rearranged(rhs, columns)
-        compiled = is_compiled(rhs) and not jit_is_off()
-        items = tuple(_wide(item, columns, t0, y0, extra, compiled) for item in invariants)
-        return cls(columns, rhs, items, tuple(invariants), source)
-
-    @classmethod
-    def in_python(
-        cls, columns: Columns, fun: Any, t0: float, y0: Array, extra: tuple, items: Any, jvp: Any
-    ) -> Variations:
-        """Make them for a right-hand side ``fun(t, y, *extra)`` and invariants that have their arguments.
-
-        Raises
-        ------
-        ValueError
-            For derivatives by parameters, and as `of`.
-        """
-        if columns.parameters:
+        if any(item.is_balance for item in invariants):
             raise ValueError(
-                "variations: solve_ivp gives derivatives of the state alone; `integrate` by parameters too."
+                "variations: derivatives are not carried together with balances, whose values depend on the whole "
+                "orbit; omit the balances in this run."
             )
-        _refuse_balances(items)
-        rhs, source = _right_hand_side(columns, fun, "value", t0, y0, extra, jvp, None)
-        rhs = _rearranged(rhs, columns)
-        wide = tuple(_wide(item, columns, t0, y0, (), False) for item in items)
-        return cls(columns, rhs, wide, tuple(items), source)
+        compiled = is_compiled(rhs) and not jit_is_off() and not in_python
+        items = tuple(_wide(item, columns, t0, y0, extra, compiled) for item in invariants)
+        return cls(columns, rhs, items, tuple(invariants))
 
     def derivative(self, t: float, Y: Array, *extra: Any) -> Array:
         """Return the derivative of the wide state."""
@@ -303,8 +282,11 @@ class Variations:
             kept.append(own)
         return tuple(kept)
 
-    def event(self, fun: Callable[..., Any]) -> Callable[..., Any]:
-        """Return an event as a function of the wide state."""
+    def events(self, events: Sequence[Callable[..., Any]]) -> list[Callable[..., Any]]:
+        """Return events as functions of the wide state."""
+        return [self._event(event) for event in events]
+
+    def _event(self, fun: Callable[..., Any]) -> Callable[..., Any]:
         columns = self.columns
         if is_jitted(fun) and not jit_is_off() and is_compiled(self.rhs):
             from .jitted_columns import wide_value
@@ -327,20 +309,28 @@ def layout(columns: Columns) -> tuple[int, int, int]:
     return columns.n, first, first * (1 + columns.count)
 
 
-def _refuse_balances(items: Any) -> None:
-    if any(item.is_balance for item in items):
-        raise ValueError(
-            "variations: derivatives are not carried together with balances, whose values depend on the whole orbit; "
-            "omit the balances in this run."
-        )
+def right_hand_side(
+    columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, jvp: Any, own: Any = None
+) -> Callable[..., Any]:
+    """Return the right-hand side of the wide state, in place; `own`: the problem's ``variational``, or None.
 
-
-def _right_hand_side(
-    columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, jvp: Any, own: Any
-) -> tuple[Callable[..., Any], str]:
-    n, parameters = columns.n, columns.parameters
-    if parameters and scalars(extra) != "":
+    Raises
+    ------
+    TypeError, ValueError
+        For a wrong `jvp`, and where there is no way to the derivatives.
+    """
+    if columns.parameters and scalars(extra) != "":
         raise ValueError("variations: derivatives by parameters need them as params=[...], one array of numbers.")
+    if own is not None and jvp is None:
+        return _rearranged(own(columns.parameters), columns.order[:, : columns.n])
+    return _rearranged(_of_columns_in_order(columns, fun, form, t0, y0, extra, jvp), columns.order)
+
+
+def _of_columns_in_order(
+    columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, jvp: Any
+) -> Callable[..., Any]:
+    """Return the same for a wide state in which one column follows the other."""
+    n, parameters = columns.n, columns.parameters
     if jvp is not None:
         if parameters:
             raise ValueError(
@@ -351,58 +341,37 @@ def _right_hand_side(
         if is_compiled(fun) and is_jitted(jvp) and not jit_is_off():
             from .jitted_columns import rhs_by_products
 
-            return rhs_by_products(fun, form, jvp, n, columns.count), "jvp"
-        return _interpreted(columns, fun, form, y0, extra, lambda t, y, dy, dp: jvp(t, y, dy, *extra)), "jvp"
-    if own is not None:
-        rhs = own(parameters)
-        if parameters and is_compiled(rhs) and not jit_is_off():
-            from .jitted_columns import rhs_by_variational
-
-            return rhs_by_variational(rhs, n, len(parameters), columns.count), "problem"
-        if not parameters:
-            return rhs, "problem"
-        return _spread(rhs, columns), "problem"
+            return rhs_by_products(fun, form, jvp, n, columns.count)
+        return _interpreted(columns, fun, form, y0, lambda t, y, dy, dp: jvp(t, y, dy, *extra))
     if is_jitted(fun) and not jit_is_off() and scalars(extra) is not None:
         from .jitted_columns import rhs_by_duals
 
         try:
-            found = rhs_by_duals(fun, form, n, parameters, columns.count, bool(extra), scalars(extra) or "")
-        except NotCompilableError:
+            return rhs_by_duals(fun, form, n, parameters, columns.count, bool(extra), scalars(extra) or "")
+        except NotCompilableError:  # a complex step may do
             pass
-        else:
-            return found, "dual numbers"
-    return _by_complex_steps(columns, fun, form, t0, y0, extra), "complex step"
+    return _by_complex_steps(columns, fun, form, t0, y0, extra)
 
 
-def _rearranged(rhs: Callable[..., Any], columns: Columns) -> Callable[..., Any]:
-    """Return a right-hand side of states followed by their columns as one of the wide state."""
-    if not columns.in_halves:
+def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
+    """Return a right-hand side of columns, one after the other, for a state that has their numbers at these places.
+
+    What stands at no place does not change.
+    """
+    if np.array_equal(places.ravel(), np.arange(places.size)):
         return rhs
     if is_compiled(rhs) and not jit_is_off():
-        from .jitted_columns import rhs_in_halves
+        from .jitted_columns import rearranged
 
-        return rhs_in_halves(rhs, columns.half, columns.count)
-    order = columns.order
+        return rearranged(rhs, tuple(places.ravel().tolist()))
 
-    def rearranged(t: float, Y: Array, out: Array, *extra: Any) -> None:
-        found = np.empty(order.size)
-        rhs(t, Y[order].ravel(), found, *extra)
-        out[order] = found.reshape(order.shape)
+    def in_place(t: float, Y: Array, out: Array, *extra: Any) -> None:
+        found = np.empty(places.size)
+        rhs(t, Y[places].ravel(), found, *extra)
+        out[:] = 0.0
+        out[places] = found.reshape(places.shape)
 
-    return rearranged
-
-
-def _spread(rhs: Callable[..., Any], columns: Columns) -> Callable[..., Any]:
-    """A right-hand side of (y, columns), in place, as one of states with parameters behind them."""
-    n, size = columns.n, columns.size
-
-    def spread(t: float, Y: Array, out: Array, *extra: Any) -> None:
-        blocks, found = Y.reshape(-1, size), out.reshape(-1, size)
-        filled_in = np.empty((len(blocks), n))
-        rhs(t, np.ascontiguousarray(blocks[:, :n]).ravel(), filled_in.reshape(-1), *extra)
-        found[:, :n], found[:, n:] = filled_in, 0.0
-
-    return spread
+    return in_place
 
 
 def _derivative(fun: Any, form: str, y0: Array) -> Callable[..., Array]:
@@ -422,9 +391,7 @@ def _derivative(fun: Any, form: str, y0: Array) -> Callable[..., Array]:
     return derivative
 
 
-def _interpreted(
-    columns: Columns, fun: Any, form: str, y0: Array, extra: tuple, product: Callable[..., Array]
-) -> Callable[..., Any]:
+def _interpreted(columns: Columns, fun: Any, form: str, y0: Array, product: Callable[..., Array]) -> Callable[..., Any]:
     derivative, n, size = _derivative(fun, form, y0), columns.n, columns.size
 
     def rhs(t: float, Y: Array, out: Array, *arguments: Any) -> None:
@@ -470,7 +437,7 @@ def _by_complex_steps(columns: Columns, fun: Any, form: str, t0: float, y0: Arra
             "dual numbers, nor right for a complex step. Give jvp=..., a function jvp(t, y, dy) that returns the "
             "product of the Jacobian with dy."
         )
-    return _interpreted(columns, fun, form, y0, extra, product)
+    return _interpreted(columns, fun, form, y0, product)
 
 
 def _difference(
@@ -489,12 +456,22 @@ def _difference(
 
 
 class _WideInvariant:
-    """An invariant as a function of the wide state, with its gradient, as Python calls them."""
+    """An invariant as a function of the wide state, with its gradient, as Python calls them.
 
-    def __init__(self, item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple) -> None:
-        self.item, self.columns = item, columns
-        self.shape = np.shape(item.function(t0, y0.copy(), *item.args, *extra))
-        self.places = list(columns.parameters) if extra and not item.args else []
+    `shape`: that of its value. `parameters`: those that it depends on and derivatives are taken by.
+    """
+
+    def __init__(
+        self,
+        item: Invariant,
+        columns: Columns,
+        shape: tuple[int, ...],
+        parameters: tuple[int, ...],
+        t0: float,
+        y0: Array,
+        extra: tuple,
+    ) -> None:
+        self.item, self.columns, self.shape, self.places = item, columns, shape, list(parameters)
         gradient: Any = item.gradient
         self.args, self.in_place, self.uses_f = item.args, item.in_place, item.uses_f
         if gradient is None:
@@ -545,19 +522,22 @@ class _WideInvariant:
 
 def _wide(item: Invariant, columns: Columns, t0: float, y0: Array, extra: tuple, compiled: bool) -> Invariant:
     """Return an invariant as a function of the wide state, with a gradient."""
-    wide = _WideInvariant(item, columns, t0, y0, extra)
-    found = copy(item)
+    shape = np.shape(item.function(t0, y0.copy(), *item.args, *extra))
+    parameters = columns.parameters if extra and not item.args else ()
     if compiled and is_compiled(item.function) and not item.args and scalars(extra) is not None:
         try:
-            return _jitted(found, item, wide, extra)
+            return _jitted(item, columns, shape, parameters, extra)
         except NotCompilableError:  # Python then calls it
-            found = copy(item)
+            pass
+    wide, found = _WideInvariant(item, columns, shape, parameters, t0, y0, extra), copy(item)
     found.function, found.gradient, found.args = wide.value, wide.gradient, ()
     found.in_place, found.uses_f = False, wide.uses_f
     return found
 
 
-def _jitted(found: Invariant, item: Invariant, wide: _WideInvariant, extra: tuple) -> Invariant:
+def _jitted(
+    item: Invariant, columns: Columns, shape: tuple[int, ...], parameters: tuple[int, ...], extra: tuple
+) -> Invariant:
     """Return the same with compiled functions.
 
     Raises
@@ -568,15 +548,14 @@ def _jitted(found: Invariant, item: Invariant, wide: _WideInvariant, extra: tupl
     from .jitted_columns import parameter_gradient, wide_gradient, wide_value
     from .jitted_gradients import gradient_by_duals
 
-    columns, parameters = wide.columns, tuple(wide.places)
-    gradient, in_place = item.gradient, item.in_place
+    gradient, in_place, found = item.gradient, item.in_place, copy(item)
     if gradient is None:
-        gradient = gradient_by_duals(item.function, columns.n, wide.shape, bool(extra), scalars(extra) or "")
+        gradient = gradient_by_duals(item.function, columns.n, shape, bool(extra), scalars(extra) or "")
         in_place = True
     if not is_compiled(gradient) or (parameters and not is_jitted(item.function)):
         raise NotCompilableError("one of its functions is not compiled")
-    by = parameter_gradient(item.function, extra[0].size, wide.shape) if parameters else None
+    by = parameter_gradient(item.function, extra[0].size, shape) if parameters else None
     found.function = wide_value(item.function, layout(columns), parameters)
-    found.gradient = wide_gradient(gradient, by, layout(columns), parameters, wide.shape, item.uses_f, in_place)
+    found.gradient = wide_gradient(gradient, by, layout(columns), parameters, shape, item.uses_f, in_place)
     found.in_place = True
     return found

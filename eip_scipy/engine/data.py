@@ -35,7 +35,7 @@ _none = np.zeros(0)
 
 
 def no_columns(values: int) -> Columns:
-    """Of a run of so many invariants without derivatives behind the state."""
+    """Return the record of a run with this number of invariants that carries no derivatives."""
     return Columns(kept=np.zeros((values, 0)), size=0, seen=0, half=0, symplectic=False)
 
 

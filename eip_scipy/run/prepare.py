@@ -26,7 +26,7 @@ from ..core.runs import Counted, Run
 from ..core.solvers import EIPSolver, class_named, eip_method
 from ..core.states import as_derivative, initial_state
 from ..core.stepping import ATOL, StepOptions, Stepping, interval
-from ..core.variations import Variations, asked_columns, require_tableau
+from ..core.variations import Variations, asked_columns, require_tableau, right_hand_side
 from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
 from .driver import check_memory, saved_rows
@@ -388,22 +388,19 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
     own = None if problem is None else problem.variational
     t0 = interval(_required("t_span", request.t_span))[0]
     items = as_invariants(projection.invariants)
-    return Variations.of(columns, request.fun, form, t0, y0, extra, items, request.jvp, own)
+    rhs = right_hand_side(columns, request.fun, form, t0, y0, extra, request.jvp, own)
+    return Variations.of(columns, rhs, t0, y0, extra, items)
 
 
 def _widened(request: Request, variations: Variations) -> Request:
     """The request for the state with its columns."""
     extra = extra_arguments(request.args, request.params)
-    events = request.events
-    if events is not None:
-        events = as_events(events)
-        events = [variations.event(event) for event in (events if isinstance(events, list | tuple) else [events])]
     return replace(
         request,
         fun=variations.rhs,
         y0=variations.columns.wide(_state(request.y0), floats(extra)),
         jacobian=None,
-        events=events,
+        events=variations.events(request.events),
         projection={**request.projection, "invariants": variations.invariants},
     )
 

@@ -19,7 +19,7 @@ from ..core.results import Diagnostics
 from ..core.solvers import EIPDOP853, EIPRK23, EIPRK45, EIPSolver, SolverClass, class_named, eip_method
 from ..core.states import initial_state
 from ..core.stepping import interval
-from ..core.variations import StateSolution, Variations, asked_columns, require_tableau
+from ..core.variations import StateSolution, Variations, asked_columns, require_tableau, right_hand_side
 
 if TYPE_CHECKING:
     Result = dict[str, Any]
@@ -218,7 +218,9 @@ def _solve(
     if variations is not None:
         wide = _variations(method, function, t_span, y0, variations, extra, options.get("invariants", ()), jvp)
         method, function, y0 = _carrying(method, wide), wide.derivative, wide.columns.wide(initial_state(y0), NOTHING)
-        options["invariants"], common["events"] = wide.invariants, _events(wide, common["events"])
+        options["invariants"] = wide.invariants
+        if (events := common["events"]) is not None:
+            common["events"] = wide.events((events,) if callable(events) else events)
     elif jvp is not None:
         raise TypeError("solve_ivp: jvp belongs to variations=...; ask for derivatives, or omit it.")
     start = initial_state(y0) if options.get("project_initial") else None
@@ -237,23 +239,17 @@ def _solve(
 def _variations(
     method: type[EIPSolver], fun: Any, t_span: Any, y0: Any, asked: Any, extra: tuple, items: Any, jvp: Any
 ) -> Variations:
-    """Return the functions of the state with its columns."""
+    """Return the functions of the state with its columns; `items`: invariants that have their arguments."""
     require_tableau(method)
-    start = initial_state(y0)
+    start, t0 = initial_state(y0), interval(t_span)[0]
     columns = asked_columns(asked, start, NOTHING, (), False, method.TABLEAU.of_second_order)
-    return Variations.in_python(columns, fun, interval(t_span)[0], start, extra, as_invariants(items), jvp)
+    rhs = right_hand_side(columns, fun, "value", t0, start, extra, jvp)
+    return Variations.of(columns, rhs, t0, start, (), as_invariants(items), in_python=True)
 
 
 def _carrying(method: type[EIPSolver], wide: Variations) -> Any:
     """Return the class for states with these columns behind them."""
     return SolverClass(method.__name__, (method,), {"_COLUMNS": wide.columns, "__doc__": method.__doc__})
-
-
-def _events(wide: Variations, events: Any) -> Any:
-    """Return events as functions of the wide state."""
-    if events is None:
-        return None
-    return [wide.event(event) for event in ((events,) if callable(events) else events)]
 
 
 def _split(sol: Any, wide: Variations) -> None:

@@ -41,7 +41,7 @@ def test_the_equation_is_the_one_without_damping_and_what_is_said():
 
 @pytest.mark.parametrize("name", ALL)
 def test_rates_are_derivatives_along_the_flow(name):
-    """By differences of the values, a step along psi_t and its derivatives that matter to 1e-9."""
+    """Rates agree with differences of the values along psi_t and those of its derivatives that matter at 1e-9."""
     equation = condensate()
     y = packet(equation).ravel()
     (item,) = equation.invariants(name)
@@ -62,7 +62,7 @@ def test_rates_are_derivatives_along_the_flow(name):
 
 @pytest.mark.parametrize(("damping", "loss"), [(0.0, 0.05), (0.02, 0.0), (0.01, 0.02)])
 def test_a_plane_wave(damping, loss):
-    """Its density n follows Bernoulli's equation n' = -a n - b n^2, and its phase the integral of k^2 / 2 - mu + n."""
+    """The density n follows Bernoulli's equation n' = -a n - b n^2, and the phase the integral of k^2 / 2 - mu + n."""
     mu, beta, k, n0, t = 0.4, 1.5, 2 * np.pi / 8, 0.8, 3.0
     equation = DampedGrossPitaevskii(Grid(16, 0, 8), beta=beta, damping=damping, chemical_potential=mu, loss=loss)
     x = equation.grid.points(0)
@@ -130,7 +130,7 @@ def test_damped_waves():
 
 
 def test_a_uniform_wave_is_a_damped_pendulum():
-    """Its energy decays; small ones by exp(-damping t) on average, and q as the linear equation has it."""
+    """The energy of a damped pendulum decays; small ones by exp(-damping t) on average, as in the linear equation."""
     equation = SineGordon(Grid(8, 0, 1), 0.02)
     problem = equation.problem(np.full(8, 1e-6), np.zeros(8), 50.0, 0.02)
     omega = np.sqrt(1 - 0.01**2)

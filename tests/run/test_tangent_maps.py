@@ -39,7 +39,7 @@ def after_revolutions(n):
     return np.eye(4) - 3 * PERIOD * n * np.outer(f, by_energy)
 
 
-# Where plain RK4 has 1.5e-2 after 50 revolutions.
+# The step is the one at which plain RK4 is 1.5e-2 off after 50 revolutions.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "steps", "revolutions", "bound"),
@@ -236,7 +236,7 @@ def carried(name, source, keeps, **options):
 
 @pytest.mark.parametrize(("name", "source"), CASES)
 def test_sensitivities(name, source):
-    """Of a plain run they are the derivatives of its steps; of a projected one those of the flow."""
+    """Columns of a plain run are the derivatives of its steps; those of a projected run, of the flow."""
     exact = by_complex_steps(name, EIPDOP853.TABLEAU, STEP, STEPS)
     size = np.abs(exact).max()
     plain = carried(name, source, False, method=EIPDOP853, h=STEP).variations[-1]
@@ -310,7 +310,7 @@ def test_megno_by_its_definition(pendulum):
 
 @pytest.mark.slow
 def test_megno_of_a_chaotic_orbit(henon_heiles):
-    """It grows by half the exponent times t."""
+    """MEGNO grows by half the exponent times t."""
     run = megno(henon_heiles, (0, 3000), CHAOTIC, method=EIPDOP853, h=0.1)
     rate = run.log_size[-1] / 3000
     assert rate > 0.05

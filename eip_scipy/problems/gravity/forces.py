@@ -1,4 +1,4 @@
-"""What the bodies feel besides Newton's gravitation: relativity, oblateness, a Moon without orbit, drag.
+"""Forces in addition to Newton's gravitation: relativity, oblateness, a Moon without orbit, drag.
 
 All terms are chosen by numbers in the vector of parameters, so that one right-hand side serves every combination:
 first G m of each body, then the entries that `parameters` lists. The first body is the Sun; each force on another body

@@ -97,7 +97,7 @@ class DampedGrossPitaevskii(GrossPitaevskii):
         return self.grid.cell * self.moments(psi, f).energy(self.beta)
 
     def _parts(self, y: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``-i H psi``, and what damping and losses add to it but for the rotation of the phase."""
+        """Return ``-i H psi``, and what damping and losses add to it, without the rotation of the phase."""
         turning = (f - (self._growth + 1j * self.mu) * y) / (1 - 1j * self.damping)
         return turning, self._growth * y - 1j * self.damping * turning
 

@@ -381,7 +381,7 @@ def _problem(*, system: System, params: np.ndarray | None, **others: Any) -> Sym
     rhs = functions.rhs
     unset: dict[str, Any] = {"y0": None, "t_span": None}  # a run is given them
     unset["component_names"] = system.components
-    # Of a perturbed system it is not known whether what is added is friction.
+    # A perturbation may be friction, with which a system is not canonical.
     unset["canonical"] = 2 * len(others.get("pairs", ())) == len(system.components) and not system.balances
     return SymbolicProblem(
         **(unset | others),

@@ -134,7 +134,7 @@ def two_planets(axis: float, e: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Found(NamedTuple):
-    """What was measured, by the tables that are printed."""
+    """The measurements, in the order of the tables that are printed."""
 
     kepler: list[tuple[str, dict[str, float]]]
     orbits: dict[str, list[float]]

@@ -41,7 +41,7 @@ void kepler_jacobian(const Given<T> &g) {
     g.out[1] = along * q[1] - pull * d[1];
 }
 
-// Of a state with columns of derivatives behind it; the last one may be that by the relativistic coefficient.
+// The derivative of a state with columns behind it. The last column may be that by the relativistic coefficient.
 template <bool BY_PARAMETER>
 void kepler_variational(const Given<double> &g) {
     kepler_rhs(g);
@@ -120,7 +120,7 @@ void harmonic_energy_gradient(const Given<T> &g) {
 bool with_columns(int64_t n, int64_t p) { return n > 4 && n % 4 == 0 && p == 1; }
 bool of_four(int64_t n, int64_t p) { return n == 4 && p == 1; }
 bool of_two(int64_t n, int64_t p) { return n == 2 && p == 1; }
-// With at least so many columns.
+// States with at least COLUMNS columns.
 template <int64_t SIZE, int64_t COLUMNS>
 bool with_columns(int64_t n, int64_t p) {
     return n >= SIZE * (1 + COLUMNS) && n % SIZE == 0 && p == 1;

@@ -11,7 +11,7 @@
 
 namespace eip {
 
-// What a block of targets needs of one source, or of one in each stream: q_j - q_i, G m / r^3 and 3 G m / r^5.
+// The terms of one source, or of one in each stream, at a block of targets: q_j - q_i, G m / r^3 and 3 G m / r^5.
 struct Tide {
     Octet way[3], pull, radial;
 
@@ -72,7 +72,7 @@ inline void tidal_block(const double *y, const double *gm, int64_t n, int64_t fi
     }
 }
 
-// Of less than four bodies.
+// The same for fewer than four bodies.
 inline void tides_of_few(const double *y, const double *gm, int64_t n, int64_t columns, double *out) {
     const int64_t half = 3 * n, size = 6 * n;
     accelerate_few(y, gm, n, out + half);
