@@ -211,11 +211,11 @@ class StateSolution(OdeSolution):
 
     def __init__(self, solution: OdeSolution, columns: Columns) -> None:
         super().__init__(solution.ts, solution.interpolants)
-        self._columns = columns
+        self.columns = columns
 
     def __call__(self, t: Any) -> Array:
         """Return the states (n,) or (n, m)."""
-        return self._columns.own(super().__call__(t).T).T
+        return self.columns.own(super().__call__(t).T).T
 
 
 @dataclass(frozen=True)

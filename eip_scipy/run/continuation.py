@@ -11,6 +11,7 @@ from scipy.integrate import OdeSolution
 from ..core.inputs import is_number, shown
 from ..core.problem import Problem
 from ..core.results import Diagnostics, joined_sums
+from ..core.variations import StateSolution
 from .events import ContinuedEvents, as_events
 from .integrate import integrate
 from .prepare import Request
@@ -99,4 +100,5 @@ def _diagnostics(one: Diagnostics, two: Diagnostics) -> Diagnostics:
 def _solution(one: OdeSolution | None, two: OdeSolution | None) -> OdeSolution | None:
     if one is None or two is None:
         return None
-    return OdeSolution(np.append(one.ts, two.ts[1:]), [*one.interpolants, *two.interpolants])
+    both = OdeSolution(np.append(one.ts, two.ts[1:]), [*one.interpolants, *two.interpolants])
+    return StateSolution(both, two.columns) if isinstance(two, StateSolution) else both

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,12 @@ from ..core.inputs import is_number, reals, refuse_units, require_arguments, sho
 from ..core.pointers import address_hint, by_pointer, is_pointer
 from ..engine.native import Call, call
 
-__all__ = ["ContinuedEvents", "Events", "as_events"]
+__all__ = ["ContinuedEvents", "Events", "as_events", "replaced"]
+
+
+def replaced(events: tuple[Callable[..., Any], ...], others: Iterable[Callable[..., Any]]) -> tuple[Any, ...]:
+    """Return other functions for the same events, which have happened as often as these."""
+    return ContinuedEvents(others, events.happened) if isinstance(events, ContinuedEvents) else tuple(others)
 
 
 class ContinuedEvents(tuple):
@@ -180,7 +185,7 @@ def as_events(events: Any) -> tuple[Callable[..., Any], ...]:
     for item in items:
         if not callable(item):
             raise TypeError(f"events must be callable, got {shown(item)}{address_hint(item)}.")
-    return ContinuedEvents(items, events.happened) if isinstance(events, ContinuedEvents) else items
+    return replaced(events, items)
 
 
 def _adapted(event: Any, k: int) -> Any:

@@ -30,7 +30,7 @@ from ..core.variations import Variations, asked_columns, require_tableau, right_
 from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
 from .driver import check_memory, saved_rows
-from .events import Events, as_events
+from .events import Events, as_events, replaced
 from .interpreted_functions import FORMS, INTERPRETED
 from .memory import check_bytes
 from .resume import settings
@@ -400,7 +400,7 @@ def _widened(request: Request, variations: Variations) -> Request:
         fun=variations.rhs,
         y0=variations.columns.wide(_state(request.y0), floats(extra)),
         jacobian=None,
-        events=variations.events(request.events),
+        events=replaced(request.events, variations.events(request.events)),
         projection={**request.projection, "invariants": variations.invariants},
     )
 
