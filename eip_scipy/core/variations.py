@@ -17,18 +17,29 @@ from ..engine.native import LibraryFunction
 from .arguments import scalars
 from .blocks import INDEX
 from .gradients import NumericalGradient, difference_gradient, typical_sizes
-from .inputs import filled, reals, shown
+from .inputs import filled, reals, require_arguments, shown
 from .invariants import Invariant
 from .jitted import NotCompilableError, is_compiled, is_jitted, jit_is_off
 from .pointers import PointerFunction
 from .states import as_derivative
 
-__all__ = ["Columns", "StateSolution", "Variations", "asked_columns", "require_tableau", "right_hand_side", "widened"]
+__all__ = [
+    "Columns",
+    "StateSolution",
+    "Variations",
+    "asked_columns",
+    "kept_symplectic",
+    "require_tableau",
+    "right_hand_side",
+    "widened",
+]
 
 Array = np.ndarray
 STATE = "state"
 # How far a complex step may be from a difference, relative to the largest component: that of differences of order 6.
 AGREES = 1e-6
+# The same for a jvp of the user, whose right-hand side may be rough.
+WRONG = 1e-3
 SHIFT = 332  # binary digits of a complex step, relative to its direction
 LEAST = 1e-3  # size of a parameter that is 0, for differences
 
@@ -103,9 +114,23 @@ class Columns:
         return np.array(rows[..., self.places])
 
     def apart(self, rows: Array) -> tuple[Array, Array]:
-        """Return states (m, n) and columns (m, n, k) of wide states (m, ...)."""
-        blocks = rows[:, self.order]
-        return blocks[:, 0, : self.n], blocks[:, 1:, : self.n].transpose(0, 2, 1)
+        """Return states (..., n) and columns (..., n, k) of wide states (..., m)."""
+        blocks = rows[..., self.order]
+        return blocks[..., 0, : self.n], blocks[..., 1:, : self.n].swapaxes(-1, -2)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Return what decides the bits of a run, as settings of its checkpoint."""
+        return {"variations": self.values, "derivatives by": self.parameters, "symplectic": self.symplectic}
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """Return how results tell which columns are which."""
+        return {
+            "state": self.is_transition,
+            "parameters": len(self.parameters),
+            "symplectic": self.symplectic,
+        }
 
     def after(self, wide: Array) -> Columns:
         """Return those of a run that goes on from a wide state."""
@@ -127,9 +152,7 @@ def require_tableau(method: Any) -> None:
         )
 
 
-def asked_columns(
-    asked: Any, y0: Array, params: Array, names: Sequence[str], symplectic: bool, in_halves: bool
-) -> Columns:
+def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in_halves: bool) -> Columns:
     """The columns that the option `variations` asks for.
 
     Raises
@@ -142,19 +165,19 @@ def asked_columns(
     n = y0.size
     if y0.dtype.kind == "c":
         raise ValueError("variations: the state is complex; write it in real and imaginary parts.")
-    items = [asked] if isinstance(asked, str) else asked
-    if isinstance(items, list | tuple) and items and all(isinstance(item, str | int | np.integer) for item in items):
+    items = [asked] if _is_name(asked) else asked
+    if isinstance(items, list | tuple) and items and all(map(_is_name, items)):
         own = [_parameter(item, params, names) for item in items if item != STATE]
         if own and in_halves:
             raise ValueError("variations: Nystrom methods give no derivatives by parameters; take EIPDOP853.")
-        if len(set(own)) < len(own):
-            raise ValueError(f"variations: {shown(asked)} names a parameter twice.")
+        if len(set(own)) < len(own) or list(items).count(STATE) > 1:
+            raise ValueError(f"variations: {shown(asked)} asks for the same derivatives twice.")
         has_state, p = STATE in items, len(own)
         identity = np.zeros((n + p, n * has_state + p))
         if has_state:
             identity[:n, :n] = np.eye(n)
         identity[n:, n * has_state :] = np.eye(p)
-        return Columns(identity, tuple(own), has_state, symplectic and has_state and p == 0, in_halves)
+        return Columns(identity, tuple(own), has_state, False, in_halves)
     found = reals(asked)
     values: Array = np.zeros(0) if found is None else np.array(found, float)
     if values.ndim == 1 and values.size == n:
@@ -165,6 +188,31 @@ def asked_columns(
             f"parameters, a list of these, or an array ({n}, k) of finite initial columns, got {shown(asked)}."
         )
     return Columns(values, (), False, False, in_halves)
+
+
+def _is_name(item: Any) -> bool:
+    """Whether this names the state or a parameter, or says the place of one."""
+    return isinstance(item, str | int | np.integer) and not isinstance(item, bool)
+
+
+def kept_symplectic(columns: Columns, asked: bool | None, canonical: bool, invariants: Sequence[Invariant]) -> Columns:
+    """Return the columns with the answer to whether they are kept symplectic; `canonical`: the problem's own answer.
+
+    Raises
+    ------
+    ValueError
+        When this is asked for and cannot be done.
+    """
+    reasons = {
+        'derivatives by parameters or along a user\'s directions are no tangent map; ask for variations="state" alone':
+            not columns.is_transition or bool(columns.parameters),
+        f"a state of {columns.n} components is not (q, p)": columns.n % 2 == 1,
+        "without invariants no step is projected; give the energy, at least": not invariants,
+    }  # fmt: skip
+    reason = next((words for words, holds in reasons.items() if holds), None)
+    if asked and reason is not None:
+        raise ValueError(f"symplectic=True: {reason}.")
+    return replace(columns, symplectic=reason is None and (canonical if asked is None else bool(asked)))
 
 
 def _parameter(item: Any, params: Array, names: Sequence[str]) -> int:
@@ -230,18 +278,21 @@ class Variations:
     invariants : tuple of Invariant
     given : tuple of Invariant
         The same as functions of the state.
+    source : str
+        Where the products of the Jacobian come from: "problem", "jvp", "dual numbers" or "complex steps".
     """
 
     columns: Columns
     rhs: Callable[..., Any]
     invariants: tuple[Invariant, ...]
     given: tuple[Invariant, ...]
+    source: str
 
     @classmethod
     def of(
         cls,
         columns: Columns,
-        rhs: Callable[..., Any],
+        products: tuple[Callable[..., Any], str],
         t0: float,
         y0: Array,
         extra: tuple,
@@ -249,7 +300,7 @@ class Variations:
         *,
         in_python: bool = False,
     ) -> Variations:
-        """Make them from a right-hand side of the wide state, see `right_hand_side`; `extra`: that of the invariants.
+        """Make them from what `right_hand_side` returns; `extra`: that of the invariants.
 
         `in_python`: Python calls the functions, and nothing is compiled for them.
 
@@ -263,9 +314,10 @@ class Variations:
                 "variations: derivatives are not carried together with balances, whose values depend on the whole "
                 "orbit; omit the balances in this run."
             )
+        rhs, source = products
         compiled = is_compiled(rhs) and not jit_is_off() and not in_python
         items = tuple(_wide(item, columns, t0, y0, extra, compiled) for item in invariants)
-        return cls(columns, rhs, items, tuple(invariants))
+        return cls(columns, rhs, items, tuple(invariants), source)
 
     def derivative(self, t: float, Y: Array, *extra: Any) -> Array:
         """Return the derivative of the wide state."""
@@ -311,8 +363,10 @@ def layout(columns: Columns) -> tuple[int, int, int]:
 
 def right_hand_side(
     columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, jvp: Any, own: Any = None
-) -> Callable[..., Any]:
-    """Return the right-hand side of the wide state, in place; `own`: the problem's ``variational``, or None.
+) -> tuple[Callable[..., Any], str]:
+    """Return the right-hand side of the wide state, in place, and the source of its products with the Jacobian.
+
+    `own`: the problem's ``variational``, or None.
 
     Raises
     ------
@@ -322,35 +376,74 @@ def right_hand_side(
     if columns.parameters and scalars(extra) != "":
         raise ValueError("variations: derivatives by parameters need them as params=[...], one array of numbers.")
     if own is not None and jvp is None:
-        return _rearranged(own(columns.parameters), columns.order[:, : columns.n])
-    return _rearranged(_of_columns_in_order(columns, fun, form, t0, y0, extra, jvp), columns.order)
+        return _rearranged(own(columns.parameters), columns.order[:, : columns.n]), "problem"
+    rhs, source = _of_columns_in_order(columns, fun, form, t0, y0, extra, jvp)
+    return _rearranged(rhs, columns.order), source
 
 
 def _of_columns_in_order(
     columns: Columns, fun: Any, form: str, t0: float, y0: Array, extra: tuple, jvp: Any
-) -> Callable[..., Any]:
+) -> tuple[Callable[..., Any], str]:
     """Return the same for a wide state in which one column follows the other."""
     n, parameters = columns.n, columns.parameters
     if jvp is not None:
-        if parameters:
-            raise ValueError(
-                "variations: a jvp gives no derivatives by parameters; ask for columns of the state alone."
-            )
-        if not callable(jvp):
-            raise TypeError(f"jvp must be a function jvp(t, y, dy, ...) -> (n,), got {shown(jvp)}.")
+        _require_products(columns, _derivative(fun, form, y0), jvp, t0, y0, extra)
         if is_compiled(fun) and is_jitted(jvp) and not jit_is_off():
             from .jitted_columns import rhs_by_products
 
-            return rhs_by_products(fun, form, jvp, n, columns.count)
-        return _interpreted(columns, fun, form, y0, lambda t, y, dy, dp: jvp(t, y, dy, *extra))
+            return rhs_by_products(fun, form, jvp, n, columns.count), "jvp"
+        return _interpreted(columns, fun, form, y0, lambda t, y, dy, dp: jvp(t, y, dy, *extra)), "jvp"
     if is_jitted(fun) and not jit_is_off() and scalars(extra) is not None:
         from .jitted_columns import rhs_by_duals
 
         try:
-            return rhs_by_duals(fun, form, n, parameters, columns.count, bool(extra), scalars(extra) or "")
+            rhs = rhs_by_duals(fun, form, n, parameters, columns.count, bool(extra), scalars(extra) or "")
+            return rhs, "dual numbers"
         except NotCompilableError:  # a complex step may do
             pass
-    return _by_complex_steps(columns, fun, form, t0, y0, extra)
+    return _by_complex_steps(columns, fun, form, t0, y0, extra), "complex steps"
+
+
+def _require_products(
+    columns: Columns, derivative: Callable[..., Array], jvp: Any, t0: float, y0: Array, extra: tuple
+) -> None:
+    """Refuse a `jvp` that is none of this right-hand side.
+
+    Raises
+    ------
+    TypeError, ValueError
+    """
+    if columns.parameters:
+        raise ValueError("variations: a jvp gives no derivatives by parameters; ask for columns of the state alone.")
+    if not callable(jvp):
+        raise TypeError(f"jvp must be a function jvp(t, y, dy, ...) -> (n,), got {shown(jvp)}.")
+    dy, dp = _direction(y0, 0)
+    try:
+        given = jvp(t0, y0.copy(), dy.copy(), *extra)
+    except TypeError:
+        names = ["t", "y", "dy", *["params"] * len(extra)]
+        require_arguments(jvp, names, "jvp", f"Write jvp({', '.join(names)}).")
+        raise
+    found = as_derivative(given, y0.size, y0.dtype, t0, "jvp")
+    right = _difference(derivative, t0, y0, dy, dp, [], extra)
+    if not _agree(found, right, WRONG):
+        k = int(np.argmax(np.abs(found - right)))
+        raise ValueError(
+            f"jvp is not the Jacobian of the right-hand side times dy: at the start, along {shown(dy)}, component {k} "
+            f"is {found[k]:.6g} where differences of fun give {right[k]:.6g}."
+        )
+
+
+def _direction(y0: Array, parameters: int) -> tuple[Array, Array]:
+    """A direction of a check that leaves no component out, and moves none by much more than its size."""
+    rng = np.random.default_rng(0)
+    dy, dp = rng.standard_normal(y0.size), rng.standard_normal(parameters)
+    sizes = np.abs(y0)
+    return dy * np.where(sizes > 0, sizes, sizes[sizes > 0].min(initial=np.inf) if sizes.any() else 1.0), dp
+
+
+def _agree(found: Array, right: Array, bound: float) -> bool:
+    return bool(np.abs(found - right).max() <= bound * max(np.abs(right).max(), np.abs(found).max()))
 
 
 def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
@@ -420,13 +513,9 @@ def _by_complex_steps(columns: Columns, fun: Any, form: str, t0: float, y0: Arra
             arguments = (params,)
         return derivative(t, y + 1j * step * dy, arguments).imag / step
 
-    rng = np.random.default_rng(0)
-    dy, dp = rng.standard_normal(y0.size), rng.standard_normal(len(places))
-    dy *= np.abs(y0) + np.abs(y0).max(initial=0.0) + (not y0.any())
+    dy, dp = _direction(y0, len(places))
     try:
-        found = product(t0, y0, dy, dp)
-        right = _difference(derivative, t0, y0, dy, dp, places, extra)
-        good = bool(np.abs(found - right).max() <= AGREES * max(np.abs(right).max(), np.abs(found).max()))
+        good = _agree(product(t0, y0, dy, dp), _difference(derivative, t0, y0, dy, dp, places, extra), AGREES)
     except MemoryError:
         raise
     except Exception:  # whatever a function raises for complex numbers

@@ -29,13 +29,14 @@ from ..core.pointers import PointerFunction
 from ..core.problem import Problem, component_names
 from ..core.solvers import EIPRK4, EIPSolver
 from ..core.states import states
+from ..core.variations import Variations
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
 from ..run.events import Events
 from ..run.interrupts import ended_by_sigterm, kept_ctrl_c
 from ..run.memory import check_bytes, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
-from ..run.results import Fields
+from ..run.results import WithColumns
 from ..run.tables import dataset, default_names, to_dataframe
 from .chunks import Chunk, FuturesPool, Part, Pool, ThreadPool, cores, finished, in_order, run_elsewhere
 from .happened import Happened
@@ -58,7 +59,7 @@ TRIED = 8
 SHOWN = 5
 # Of a request: what an ensemble has of its own, or not at all.
 ALONE = {"fun", "acceleration", "t_span", "y0", "params", "projection"}
-ALONE |= {"callback", "diagnostics", "max_bytes", "progress", "variations", "jvp", "symplectic"}
+ALONE |= {"callback", "diagnostics", "max_bytes", "progress"}
 OWN = ("executor", "reduce", "callback", "out", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(ALONE))
 
 
@@ -75,9 +76,12 @@ class EnsembleKeywords(ProjectionDetails, total=False):
     atol: ArrayLike
     first_step: float | None
     max_step: float
+    variations: Any
+    jvp: Callable[..., Any] | None
+    symplectic: bool | None
 
 
-class EnsembleResult(Fields):
+class EnsembleResult(WithColumns):
     """Result of `ensemble`; fields by name or by key, as in SciPy's own results.
 
     Attributes
@@ -122,6 +126,9 @@ class EnsembleResult(Fields):
         array for each event.
     statistics : Statistics or None
         Over all members, by ``reduce=``.
+    variations : ndarray, shape (members, n, k) or (members, m, n, k)
+        With ``variations=``, the columns of derivatives: in the last states, or in the saved states if `trajectories`
+        has them. `stm` and `sensitivities` take theirs from it; `columns` is as in `IntegrationResult`.
     first : int
         Number of the first member: 0, but for what a `callback` gets.
     stopped : bool
@@ -383,7 +390,8 @@ def ensemble(
         Bound on the memory for results; default: half of what is free.
     **keywords
         Options of `integrate`: args (the same for all), in_place, events, compensated, compiled, metric, blocks, frame,
-        direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step. Events are kept
+        direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step, variations,
+        jvp, symplectic. Members with derivatives run one by one, and take neither `out` nor `reduce`. Events are kept
         for each member in ``.t_events`` and ``.y_events``; a terminal one ends its member. `check` looks at one member.
 
     Returns
@@ -424,6 +432,8 @@ def ensemble(
     if invariants is not DEFAULT:
         options["invariants"] = invariants
     out, checkpoint = _places(out, checkpoint, checkpoint_every, resume)
+    if options.get("variations") is not None and (out is not None or reduce is not None):
+        raise ValueError("ensemble: derivatives of the members (variations=) go neither into out= nor into reduce=.")
     own = own_times(fun, t_span, t_eval, save_every, reduce)
     everyone = _inputs(fun, y0s, params, options, own)
     total = len(everyone.y0s)
@@ -625,6 +635,8 @@ class _Gathered:
             chunk=self.chunk,
             component_names=plan.component_names,
         )
+        if plan.variations is not None:
+            _separate(result, plan.variations)
         object.__setattr__(result, "_ends", ends)  # an attribute, not a field
         return result
 
@@ -633,6 +645,18 @@ class _Gathered:
         n, dtype = self.plan.size, self.plan.dtype
         none = [(np.zeros(0), np.zeros((0, n), dtype))] * self.plan.events
         return [found or none for found in members.happened]
+
+
+def _separate(result: EnsembleResult, variations: Variations) -> None:
+    """Give a result the states and their columns of derivatives apart."""
+    columns = variations.columns
+    result["columns"] = columns.described | {"source": variations.source}
+    result["y"], result["variations"] = columns.apart(result.y)
+    if result.trajectories is not None:
+        rows, result["variations"] = columns.apart(result.trajectories.swapaxes(1, 2))
+        result["trajectories"] = rows.swapaxes(1, 2)
+    if result.y_events is not None:
+        result["y_events"] = [[columns.own(rows) for rows in member] for member in result.y_events]
 
 
 def _all_times(plan: Plan, own: OwnTimes) -> np.ndarray:

@@ -179,6 +179,8 @@ class Plan:
         Steps of one member, where that is known.
     pointers : list of PointerFunction
         The C functions by pointer, which no other process takes.
+    variations : Variations or None
+        The derivatives that members carry behind their states.
     """
 
     def __init__(self, task: Task, ready: Prepared | None = None) -> None:
@@ -194,6 +196,7 @@ class Plan:
         self.t_bound, self.h = schedule.span.t_bound, run.stepping.h
         self.times = saved_times(schedule) if task.rows is None else np.full(task.rows, np.nan)
         self.events = len(self._ready.system.events.functions)
+        self.variations = self._ready.variations
         self.n_steps = None if schedule.span.n_steps >= UNBOUNDED else schedule.span.n_steps
         first = np.concatenate([run.work.K[0], run.invariants.start_values])
         self._start_values = [repr(value) for value in first[:COMPARED].tolist()]
@@ -207,12 +210,12 @@ class Plan:
         own_targets = any(item.target is not None for item in ready.run.invariants.items)
         own_start = ready.run.identity["project_initial"] or own_targets or self.task.rows is not None
         by_differences = bool(ready.run.invariants.by_differences)  # whose shifts depend on the start
-        carries = bool(ready.run.invariants.balances.items)
+        carries = bool(ready.run.invariants.balances.items) or self.variations is not None
         self._together = self.why_not is None and not (own_start or by_differences or carries)
         if self.task.rows is not None:
             own = "members have intervals or times of their own"
         elif carries:
-            own = "each run carries its balances by itself"
+            own = f"each run carries its {'balances' if self.variations is None else 'derivatives'} by itself"
         elif by_differences:
             own = "the gradient of an invariant comes from differences"
         else:
@@ -375,7 +378,8 @@ def _alone(
     try:
         loop = plan.loop(y0, params, own)
     except Exception as error:
-        out.y[k], out.t[k] = y0, own.get("t_span", (plan.t0,))[0]
+        places = slice(None) if plan.variations is None else plan.variations.columns.places
+        out.y[k, places], out.t[k] = y0, own.get("t_span", (plan.t0,))[0]
         _describe(out, k, FAILED, _reason(error))
         return
     broken = False

@@ -26,14 +26,14 @@ from ..core.runs import Counted, Run
 from ..core.solvers import EIPSolver, class_named, eip_method
 from ..core.states import as_derivative, initial_state
 from ..core.stepping import ATOL, StepOptions, Stepping, interval
-from ..core.variations import Variations, asked_columns, require_tableau, right_hand_side
+from ..core.variations import Variations, asked_columns, kept_symplectic, require_tableau, right_hand_side
 from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
 from .driver import check_memory, saved_rows
 from .events import Events, as_events, replaced
 from .interpreted_functions import FORMS, INTERPRETED
 from .memory import check_bytes
-from .resume import settings
+from .resume import plain, settings
 
 __all__ = ["DEFAULT", "Prepared", "Request", "default_method", "prepared", "started_at"]
 
@@ -302,7 +302,10 @@ class Prepared:
 
     def identity(self, y0: Any, params: Any) -> dict[str, Any]:
         """All that decides the bits of a run from y0, but for the functions, under the names that users give."""
-        return settings(self.label, y0, params, self.run, self.schedule, self.system.events)
+        found = settings(self.label, y0, params, self.run, self.schedule, self.system.events)
+        if self.variations is not None:
+            found |= {name: plain(value) for name, value in self.variations.columns.identity.items()}
+        return found
 
 
 def prepared(request: Request, *, check_start: bool = True) -> Prepared:
@@ -371,25 +374,19 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
     problem = given if isinstance(given, Problem) else None
     extra = extra_arguments(request.args, request.params)
     projection = ProjectionOptions(**request.projection)
-    symplectic = request.symplectic
-    canonical = problem is not None and problem.canonical
-    flag("symplectic", canonical if symplectic is None else symplectic)
+    if request.symplectic is not None:
+        flag("symplectic", request.symplectic)
     names = () if problem is None else tuple(problem.parameters)
-    columns = asked_columns(
-        request.variations,
-        y0,
-        floats(extra),
-        names,
-        canonical if symplectic is None else bool(symplectic),
-        request.method.TABLEAU.of_second_order,
-    )
+    columns = asked_columns(request.variations, y0, floats(extra), names, request.method.TABLEAU.of_second_order)
     if projection.project_initial and columns.parameters:
         raise ValueError("variations: project_initial does not go with derivatives by parameters; project y0 first.")
     own = None if problem is None else problem.variational
     t0 = interval(_required("t_span", request.t_span))[0]
     items = as_invariants(projection.invariants)
-    rhs = right_hand_side(columns, request.fun, form, t0, y0, extra, request.jvp, own)
-    return Variations.of(columns, rhs, t0, y0, extra, items)
+    canonical = problem is not None and problem.canonical
+    columns = kept_symplectic(columns, request.symplectic, canonical, items)
+    products = right_hand_side(columns, request.fun, form, t0, y0, extra, request.jvp, own)
+    return Variations.of(columns, products, t0, y0, extra, items)
 
 
 def _widened(request: Request, variations: Variations) -> Request:

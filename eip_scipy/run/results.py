@@ -12,7 +12,7 @@ from scipy.optimize import OptimizeResult
 from ..core.results import Diagnostics
 from .tables import default_names, to_dataframe, to_xarray
 
-__all__ = ["Fields", "IntegrationResult", "Origin"]
+__all__ = ["Fields", "IntegrationResult", "Origin", "WithColumns"]
 
 
 class Origin(NamedTuple):
@@ -42,10 +42,58 @@ if TYPE_CHECKING:
     Fields = dict[str, Any]  # of which type checkers know those that are annotated
 else:
     Fields = OptimizeResult
+ABSENT = {
+    "stm": 'this run has no state-transition matrix; ask for it with variations="state".',
+    "sensitivities": "this run has no sensitivities; name parameters in variations=[...].",
+    "variations": "this run carried no derivatives; ask for them with variations=...",
+}
 UNSET = ("units", "epoch")  # fields that print where they hold something
 
 
-class IntegrationResult(Fields):
+class WithColumns(Fields):
+    """A result whose runs may have carried derivatives."""
+
+    variations: np.ndarray
+    columns: dict[str, Any]
+
+    @property
+    def stm(self) -> np.ndarray:
+        """State-transition matrices at the saved times, (m, n, n), of a run with ``variations="state"``.
+
+        ``run.stm[k, i, j]`` is the derivative of ``run.y[i, k]`` by component j of the initial state. In an ensemble
+        those of the members, as its `variations`.
+
+        Raises
+        ------
+        AttributeError
+            When the run did not carry it.
+        """
+        if not self.get("columns", {}).get("state"):
+            raise AttributeError(ABSENT["stm"])
+        return self.variations[..., : self.variations.shape[-2]]
+
+    @property
+    def sensitivities(self) -> np.ndarray:
+        """Derivatives of the state by the parameters of ``variations=[...]`` at the saved times, (m, n, p).
+
+        Raises
+        ------
+        AttributeError
+            When the run did not carry any.
+        """
+        count = self.get("columns", {}).get("parameters", 0)
+        if not count:
+            raise AttributeError(ABSENT["sensitivities"])
+        return self.variations[..., self.variations.shape[-1] - count :]
+
+    def __getattr__(self, name: str) -> Any:
+        # OptimizeResult's own would take the place of what a property has just raised.
+        if name in ABSENT and name not in self:
+            raise AttributeError(ABSENT[name])
+        return OptimizeResult.__getattr__(self, name)
+
+
+class IntegrationResult(WithColumns):
     """Result of `integrate`; fields by name or by key, as in SciPy's own results.
 
     Attributes
@@ -89,6 +137,10 @@ class IntegrationResult(Fields):
     variations : ndarray, shape (m, n, k)
         The columns of derivatives at the saved times, of a run that was asked for them. Between two steps they are
         interpolated, not projected. See `stm` and `sensitivities`.
+    columns : dict
+        Of such a run: "state", whether the state-transition matrix is among them; "parameters", how many derivatives by
+        parameters; "symplectic", whether the matrix was kept so; "source", where products with the Jacobian come from:
+        "problem", "jvp", "dual numbers" or "complex steps".
     component_names : tuple of str
         Those of the `Problem`, or "y0", "y1" and so on; assign others as you like.
     units : str
@@ -120,43 +172,12 @@ class IntegrationResult(Fields):
     success: bool
     trusted: bool
     wall_time: float
-    variations: np.ndarray
-    columns: dict[str, Any]
     compiled: bool
     calls: dict[str, str]
     method: str
     h: float | None
     units: str
     epoch: tuple[float, float] | None
-
-    @property
-    def stm(self) -> np.ndarray:
-        """State-transition matrices at the saved times, (m, n, n), of a run with ``variations="state"``.
-
-        ``run.stm[k, i, j]`` is the derivative of ``run.y[i, k]`` by component j of the initial state.
-
-        Raises
-        ------
-        AttributeError
-            When the run did not carry it.
-        """
-        if not self.get("columns", {}).get("state"):
-            raise AttributeError('this run has no state-transition matrix; ask for it with variations="state".')
-        return self.variations[:, :, : len(self.y)]
-
-    @property
-    def sensitivities(self) -> np.ndarray:
-        """Derivatives of the state by the parameters of ``variations=[...]`` at the saved times, (m, n, p).
-
-        Raises
-        ------
-        AttributeError
-            When the run did not carry any.
-        """
-        count = self.get("columns", {}).get("parameters", 0)
-        if not count:
-            raise AttributeError("this run has no sensitivities; name parameters in variations=[...].")
-        return self.variations[:, :, self.variations.shape[2] - count :]
 
     @property
     def component_names(self) -> tuple[str, ...]:

@@ -242,9 +242,9 @@ def _variations(
     """Return the functions of the state with its columns; `items`: invariants that have their arguments."""
     require_tableau(method)
     start, t0 = initial_state(y0), interval(t_span)[0]
-    columns = asked_columns(asked, start, NOTHING, (), False, method.TABLEAU.of_second_order)
-    rhs = right_hand_side(columns, fun, "value", t0, start, extra, jvp)
-    return Variations.of(columns, rhs, t0, start, (), as_invariants(items), in_python=True)
+    columns = asked_columns(asked, start, NOTHING, (), method.TABLEAU.of_second_order)
+    products = right_hand_side(columns, fun, "value", t0, start, extra, jvp)
+    return Variations.of(columns, products, t0, start, (), as_invariants(items), in_python=True)
 
 
 def _carrying(method: type[EIPSolver], wide: Variations) -> Any:

@@ -29,8 +29,9 @@ PAGES = (
     "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/rebound-and-astropy",
     "tutorials/pdes", "tutorials/own-pde", "tutorials/ensembles", "how-to/recommend", "how-to/find-invariants",
     "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
-    "how-to/own-methods", "how-to/consistent-starts", "how-to/balances", "how-to/tangent-maps",
+    "how-to/own-methods", "how-to/consistent-starts", "how-to/balances", "how-to/tangent-maps", "how-to/gradients",
 )  # fmt: skip
+NEEDED = {"docs/how-to/gradients.md": ("jax", "torch")}
 NIGHTLY = ("results/hard-scenes", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h")
 
 
@@ -44,6 +45,8 @@ NIGHTLY = ("results/hard-scenes", "results/charged-particles", "results/gross-pi
 )
 def test_page(page, capsys, tmp_path, monkeypatch):
     """All blocks of a page in turn, in one namespace; a block of text is what the code before it prints."""
+    for package in NEEDED.get(page, ()):
+        pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)  # where pages write their files
     path = ROOT / page
     text = path.read_text(encoding="utf-8")

@@ -13,7 +13,6 @@ from eip_scipy import (
     EIPRKN12,
     Invariant,
     eip_method,
-    ensemble,
     integrate,
     solve_ivp,
 )
@@ -203,5 +202,3 @@ def test_what_cannot_carry_them():
         integrate(lambda t, y, p: kepler(t, y), (0, 1), START, method=EIPRKN8, h=0.05, params=[1.0], variations=[0])
     with pytest.raises(TypeError, match="takes no variations"):
         solve_ivp(kepler, (0, 1), START, "Radau", variations="state")
-    with pytest.raises(TypeError, match="has no option 'variations'"):
-        ensemble(kepler, (0, 1), [START], method=EIPRK4, h=0.05, variations="state")

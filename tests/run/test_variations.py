@@ -1,0 +1,227 @@
+"""What the options `variations`, `jvp` and `symplectic` take, refuse and say, on a pendulum."""
+
+import numpy as np
+import pytest
+
+from eip_scipy import EIPDOP853, Invariant, ensemble, hamiltonian, integrate, load, solve_ivp
+from eip_scipy.checkpoint import CheckpointError
+
+SPAN, START = (0.0, 3.0), [1.0, 0.3]
+J = np.array([[0.0, 1.0], [-1.0, 0.0]])
+
+
+def pendulum(t, y, params=(1.0,)):
+    return np.array([y[1], -params[0] * np.sin(y[0])])
+
+
+def energy(t, y, params=(1.0,)):
+    return 0.5 * y[1] ** 2 - params[0] * np.cos(y[0])
+
+
+def product(t, y, dy):
+    return np.array([dy[1], -np.cos(y[0]) * dy[0]])
+
+
+def run_of(**options):
+    options = {"method": EIPDOP853, "h": 0.1, "invariants": [Invariant(energy, name="H")], **options}
+    return integrate(pendulum, SPAN, START, **options)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        (["state", "state"], "twice"),
+        ([0, 0], "twice"),
+        ([], "names or places of"),
+        (True, "names or places of"),
+        ([True], "names or places of"),
+        (1.5, "names or places of"),
+        (np.eye(3), r"an array \(2, k\)"),
+        (np.zeros((2, 0)), r"an array \(2, k\)"),
+        ([[np.nan], [0.0]], "finite"),
+        (7, "there is no parameter 7"),
+        ("length", "no parameter 'length'"),
+    ],
+)
+def test_refuses(asked, message):
+    with pytest.raises(ValueError, match=message):
+        run_of(variations=asked, params=[1.3])
+
+
+def test_a_place_stands_for_a_list_of_one():
+    one, several = (run_of(variations=asked, params=[1.3]).sensitivities for asked in (0, [0]))
+    assert one.shape == (2, 2, 1)
+    np.testing.assert_array_equal(one, several)
+
+
+@pytest.mark.parametrize(
+    ("jvp", "error", "message"),
+    [
+        (lambda t, y, dy: np.array([dy[1], np.cos(y[0]) * dy[0]]), ValueError, "jvp is not the Jacobian"),
+        (lambda t, y, dy: dy[:1], ValueError, "jvp returned shape"),
+        (lambda y, dy: dy, TypeError, r"jvp is called with \(t, y, dy\).*time comes first"),
+        (3, TypeError, "jvp must be a function"),
+    ],
+)
+def test_refuses_a_wrong_jvp(jvp, error, message):
+    with pytest.raises(error, match=message):
+        run_of(variations="state", jvp=jvp)
+    with pytest.raises(error, match=message):
+        solve_ivp(pendulum, SPAN, START, method=EIPDOP853, h=0.1, variations="state", jvp=jvp)
+
+
+def test_takes_a_jvp_whose_components_have_sizes_of_their_own():
+    # 7e6 m and 1e-3 m/s with a drag that is not linear: a direction of the largest size would leave the region.
+    def fun(t, y):
+        return np.array([y[1], -np.tanh(1e3 * y[1])])
+
+    def jvp(t, y, dy):
+        return np.array([dy[1], -1e3 * dy[1] / np.cosh(1e3 * y[1]) ** 2])
+
+    run = integrate(fun, (0, 1e-3), [7e6, 1e-3], method=EIPDOP853, h=1e-4, variations="state", jvp=jvp)
+    w = np.arcsinh(np.sinh(1.0) * np.exp(-1.0))  # 1e3 v at the end, in closed form
+    assert run.y[1, -1] == pytest.approx(w / 1e3, rel=1e-9)
+    assert run.stm[-1][1, 1] == pytest.approx(np.cosh(1.0) * np.exp(-1.0) / np.cosh(w), rel=1e-8)
+
+
+def test_says_where_the_products_come_from():
+    assert run_of(variations="state").columns["source"] == "complex steps"
+    assert run_of(variations="state", jvp=product).columns["source"] == "jvp"
+    problem = hamiltonian("p**2/2 - cos(q)")
+    run = integrate(problem, SPAN, START, method=EIPDOP853, h=0.1, variations="state")
+    assert run.columns == {"state": True, "parameters": 0, "symplectic": True, "source": "problem"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"variations": [[1.0], [0.0]]}, "no tangent map"),
+        ({"variations": 0, "params": [1.0]}, "no tangent map"),
+        ({"variations": ["state", 0], "params": [1.0]}, "no tangent map"),
+        ({"variations": "state", "invariants": ()}, "without invariants"),
+    ],
+)
+def test_symplectic_is_refused_where_it_has_no_effect(options, message):
+    with pytest.raises(ValueError, match=f"symplectic=True: .*{message}"):
+        run_of(symplectic=True, **options)
+    assert not run_of(symplectic=False, **options).columns["symplectic"]
+    assert not run_of(**options).columns["symplectic"]
+
+
+def test_symplectic_is_refused_for_states_of_odd_length():
+    with pytest.raises(ValueError, match=r"3 components is not \(q, p\)"):
+        integrate(lambda t, y: -y, SPAN, np.ones(3), method=EIPDOP853, h=0.1, variations="state", symplectic=True,
+                  invariants=[Invariant(lambda t, y: y[0] - y[1])])  # fmt: skip
+
+
+def test_symplectic_keeps_what_it_says():
+    plain, kept = (run_of(h=0.4, variations="state", symplectic=symplectic).stm[-1] for symplectic in (False, True))
+    defect = [np.abs(M.T @ J @ M - J).max() for M in (plain, kept)]
+    assert defect[1] < 1e-13 < 1e-11 < defect[0]
+
+
+def test_results_without_derivatives_say_what_to_ask_for():
+    run = run_of()
+    for name, message in (("stm", 'variations="state"'), ("sensitivities", "name parameters"), ("variations", "=...")):
+        with pytest.raises(AttributeError, match=message):
+            getattr(run, name)
+    with pytest.raises(AttributeError, match="name parameters"):
+        _ = run_of(variations="state").sensitivities
+    with pytest.raises(AttributeError, match='variations="state"'):
+        _ = run_of(variations=0, params=[1.0]).stm
+
+
+def test_columns_are_saved(tmp_path):
+    run = run_of(variations=["state", 0], params=[1.0])
+    run.save(tmp_path / "run.npz")
+    found = load(tmp_path / "run.npz")
+    assert found.columns == run.columns
+    np.testing.assert_array_equal(found.stm, run.stm)
+    np.testing.assert_array_equal(found.sensitivities, run.sensitivities)
+
+
+def broken_off(tmp_path, **options):
+    """A checkpoint of a run that ended in its middle."""
+
+    def stop(t, y, values):
+        if t > 1:
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        run_of(checkpoint=tmp_path / "file", checkpoint_every=1e-9, callback=stop, **options)
+    return tmp_path / "file"
+
+
+def test_a_checkpoint_belongs_to_its_derivatives(tmp_path):
+    options = {"variations": "state", "symplectic": False}
+    file = broken_off(tmp_path, **options)
+    with pytest.raises(CheckpointError, match="symplectic"):
+        run_of(checkpoint=file, resume=True, variations="state", symplectic=True)
+    run = run_of(checkpoint=file, resume=True, **options)
+    np.testing.assert_array_equal(run.stm, run_of(**options).stm)
+
+
+def test_a_checkpoint_belongs_to_its_parameters(tmp_path):
+    file = broken_off(tmp_path, variations=0, params=[1.0, 1.0])
+    with pytest.raises(CheckpointError, match="derivatives by"):
+        run_of(checkpoint=file, resume=True, variations=1, params=[1.0, 1.0])
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_dense_output_is_that_of_the_states(every):
+    t = np.linspace(*SPAN, 41)
+    run = run_of(variations="state", dense_output=True, every=every)
+    plain = run_of(dense_output=True, every=every)
+    assert run.sol(t).shape == (2, 41)
+    np.testing.assert_allclose(run.sol(t), plain.sol(t), rtol=0, atol=1e-15)
+    if every == 1:
+        np.testing.assert_allclose(energy(0, run.sol(t)), energy(0, np.array(START)), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("rows", [{}, {"save_every": 10}, {"t_eval": [1.0, 2.5]}])
+def test_members_of_an_ensemble_have_the_bits_of_their_runs(tmp_path, rows):
+    options = {"method": EIPDOP853, "h": 0.1, "invariants": [Invariant(energy, name="H")], "variations": ["state", 0]}
+    options |= rows | {"events": lambda t, y, params: y[1]}
+    params = [[0.9], [1.0], [1.1]]
+    found = ensemble(pendulum, SPAN, START, params=params, **options)
+    for k, own in enumerate(params):
+        run = integrate(pendulum, SPAN, START, params=own, **options)
+        last = slice(None) if rows else -1
+        np.testing.assert_array_equal(found.stm[k], run.stm[last])
+        np.testing.assert_array_equal(found.sensitivities[k], run.sensitivities[last])
+        np.testing.assert_array_equal(found.trajectories[k] if rows else found.y[k], run.y if rows else run.y[:, -1])
+        np.testing.assert_array_equal(found.y_events[k][0], run.y_events[0])
+    assert found.columns == run.columns
+    found.save(tmp_path / "members.npz")
+    np.testing.assert_array_equal(load(tmp_path / "members.npz").stm, found.stm)
+
+
+def test_members_go_on_from_a_checkpoint_with_the_same_derivatives(tmp_path):
+    starts = np.array(START) * np.linspace(0.9, 1.1, 20)[:, None]
+    options = {"method": EIPDOP853, "h": 0.1, "invariants": [Invariant(energy)], "variations": "state", "chunk": 8}
+    whole = ensemble(pendulum, SPAN, starts, **options)
+    file = {"checkpoint": tmp_path / "file"}
+    ensemble(pendulum, SPAN, starts, **options, **file, callback=lambda part: part.first == 8)
+    with pytest.raises(CheckpointError, match="symplectic"):
+        ensemble(pendulum, SPAN, starts, **options, **file, resume=True, symplectic=True)
+    np.testing.assert_array_equal(ensemble(pendulum, SPAN, starts, **options, **file, resume=True).stm, whole.stm)
+
+
+@pytest.mark.parametrize("option", [{"reduce": "state"}, {"out": "group"}])
+def test_derivatives_of_members_are_not_reduced(option):
+    with pytest.raises(ValueError, match="neither into out= nor into reduce="):
+        ensemble(pendulum, SPAN, np.ones((2, 2)), method=EIPDOP853, h=0.1, variations="state", **option)
+
+
+def test_a_member_that_fails_leaves_the_others_alone():
+    def fun(t, y):
+        if y[0] < -0.5:
+            raise RuntimeError("too far")
+        return np.array([y[1], -y[0]])
+
+    invariants = [Invariant(lambda t, y: y @ y)]
+    found = ensemble(fun, SPAN, [[1.0, 0.0], [0.1, 0.0]], method=EIPDOP853, h=0.1, variations="state",
+                     invariants=invariants)  # fmt: skip
+    assert found.status.tolist() == [-1, 0]
+    turned = [[np.cos(3.0), np.sin(3.0)], [-np.sin(3.0), np.cos(3.0)]]
+    np.testing.assert_allclose(found.stm[1], turned, rtol=0, atol=1e-12)
