@@ -6,7 +6,9 @@ One module for every processor, and on x86-64 another for those with AVX2 and FM
 import hashlib
 import os
 import platform
+import shlex
 import sys
+import sysconfig
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,6 +18,8 @@ import numpy
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 
+from building.compiler import chosen
+
 FOLDER = Path("eip_scipy/engine/cpp")
 # Called once a run, or by Python: these are compiled in half the time without the passes that make loops fast.
 COLD = ["complex_step.cpp", "library.cpp", "module.cpp", "python_functions.cpp", "records.cpp"]
@@ -23,22 +27,22 @@ COLD = ["complex_step.cpp", "library.cpp", "module.cpp", "python_functions.cpp",
 # keeps their types apart, stands in its headers only.
 NANOBIND = Path(nanobind.include_dir()).parent
 INCLUDED = [str(NANOBIND / "include"), str(NANOBIND / "ext" / "robin_map" / "include")]
-if sys.platform == "win32":
-    FLAGS, V3, QUICK, OLD = ["/std:c++20", "/O2", "/fp:precise"], ["/arch:AVX2"], "/O1", []
-    OTHERS, OTHERS_OWN, UNUSED = [f"/I{path}" for path in INCLUDED], ["/std:c++20"], []
-else:
-    # No fused operation but those that are written, no reordering: the same bits from every build. The warnings left
-    # out are about Python's own interface.
-    FLAGS = ["-std=c++20", "-O3", "-g0", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
-    FLAGS += ["-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-cast-function-type", "-Wno-missing-field-initializers"]
-    V3, QUICK, OLD = ["-march=x86-64-v3"], "-O1", ["-O1"]
-    # Not our headers: without warnings. The library handles Python's objects under several types.
-    OTHERS = [f"-isystem{path}" for path in INCLUDED]
-    OTHERS_OWN = ["-std=c++20", "-g0", "-w", "-fvisibility=hidden", "-fno-strict-aliasing", "-ffunction-sections"]
-    UNUSED = ["-Wl,-dead_strip" if sys.platform == "darwin" else "-Wl,--gc-sections"]  # most of it is
-MISSING = """\
-eip_scipy's engine is written in C++20, and no compiler built it. Install one: g++ 12 or newer (Debian, Ubuntu: apt
-install g++; Fedora: dnf install gcc-c++), clang 15 or newer, or on macOS Xcode's tools (xcode-select --install)."""
+COMPILER = chosen()
+# No fused operation but those that are written, no reordering: the same bits from every build. The warnings left
+# out are about Python's own interface.
+FLAGS = ["-std=c++20", "-O3", "-g0", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
+FLAGS += ["-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-cast-function-type", "-Wno-missing-field-initializers"]
+EVERY, V3, QUICK, OLD = [*COMPILER.every], [*COMPILER.v3], "-O1", "-O1"
+# Not our headers: without warnings. The library handles Python's objects under several types.
+OTHERS = [f"-isystem{path}" for path in INCLUDED]
+OTHERS_OWN = ["-std=c++20", "-g0", "-w", "-fvisibility=hidden", "-fno-strict-aliasing", "-ffunction-sections", *EVERY]
+UNUSED = ["-Wl,-dead_strip" if sys.platform == "darwin" else "-Wl,--gc-sections"]  # most of it is
+MISSING = f"""\
+eip_scipy's engine is written in C++20, and {shlex.join(COMPILER.command)!r} did not build it. g++ 12 or newer, clang 15
+or newer and Xcode's tools do, and so does the package ziglang: set EIP_SCIPY_COMPILER=zig, or to another command."""
+HEADERS = """\
+eip_scipy's engine is built with Python's headers, and this Python came without them: no Python.h in {folder}.
+Debian and Ubuntu have them in python3-dev, Fedora in python3-devel; Pythons from elsewhere bring them."""
 
 # For .ci: a folder with modules built before. Those of other sources are refused when they are imported.
 BUILT = os.environ.get("EIP_SCIPY_BUILT")
@@ -79,7 +83,11 @@ class Build(build_ext):
 
     def build_extensions(self) -> None:
         """Build all, the library of nanobind before them."""
+        self.compiler.set_executables(**COMPILER.executables)
         if not BUILT and self.extensions:
+            folder = Path(sysconfig.get_path("include"))
+            if not (folder / "Python.h").exists():
+                raise SystemExit(HEADERS.format(folder=folder))
             source, macros = NANOBIND / "src" / "nb_combined.cpp", [("NB_COMPACT_ASSERTIONS", None)]
             folders = [*self.include_dirs, *INCLUDED]
             self.binding.append(self.compiled("nanobind", [str(source)], macros, folders, [*OTHERS_OWN, QUICK])[0])
@@ -119,11 +127,11 @@ def _longest_first(source: str) -> int:
     return Path(source).name != "engine.cpp"
 
 
-builds: dict[str, list[str]] = {"_native": []}
+builds: dict[str, list[str]] = {"_native": EVERY}
 if platform.machine().lower() in ("x86_64", "amd64"):
     # What is left to the first are processors of 2012 and before, which call a function for a fused operation: of the
     # optimizer the least, which spares a third of its compilation.
-    builds = {"_native": OLD, "_native_v3": V3}
+    builds = {"_native": [*EVERY, OLD], "_native_v3": V3}
 # For .ci: one of them, and further flags; or none, where the package is looked at and not run.
 if only := os.environ.get("EIP_SCIPY_BUILD"):
     name, *further = only.split()

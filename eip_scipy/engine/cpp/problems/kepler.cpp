@@ -117,7 +117,6 @@ void harmonic_energy_gradient(const Given<T> &g) {
     g.out[1] = g.params[0] * g.y[1];
 }
 
-bool with_columns(int64_t n, int64_t p) { return n > 4 && n % 4 == 0 && p == 1; }
 bool of_four(int64_t n, int64_t p) { return n == 4 && p == 1; }
 bool of_two(int64_t n, int64_t p) { return n == 2 && p == 1; }
 // States with at least COLUMNS columns.

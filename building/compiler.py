@@ -1,0 +1,99 @@
+"""The C++ compiler of a build: the machine's own, or the clang in the package ziglang where there is none."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+__all__ = ["Compiler", "chosen", "required"]
+
+# Names the command of a compiler, or "zig", in place of the one that is found.
+VARIABLE = "EIP_SCIPY_COMPILER"
+ZIG = "zig"
+PACKAGE = "ziglang>=0.17"
+# What g++ 12 and clang 15 know and older ones do not.
+PROBE = """\
+#include <bit>
+typedef double Four __attribute__((vector_size(32)));
+Four turned(Four x) { return __builtin_shufflevector(x, x, 1, 0, 3, 2); }
+static_assert(std::bit_ceil(5u) == 8);
+"""
+
+
+class Compiler(NamedTuple):
+    """What compiles the engine.
+
+    Attributes
+    ----------
+    command : tuple of str
+    own : bool
+        Whether setuptools takes it by itself, with the flags that Python was built with.
+    every : tuple of str
+        Flags for code that all processors of this kind run.
+    v3 : tuple of str
+        Flags for x86-64 processors with AVX2 and FMA.
+    """
+
+    command: tuple[str, ...]
+    own: bool = False
+    every: tuple[str, ...] = ()
+    v3: tuple[str, ...] = ("-march=x86-64-v3",)
+
+    @property
+    def executables(self) -> dict[str, list[str]]:
+        """Return what setuptools' compiler is to call, by its names for them."""
+        if self.own:
+            return {}
+        common = ["-DNDEBUG", "-fwrapv", *(() if sys.platform == "win32" else ("-fPIC",))]
+        shared = ["-bundle", "-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-shared"]
+        compiling = [*self.command, *common, *shlex.split(os.environ.get("CXXFLAGS", ""))]
+        linking = [*self.command, *shared, *shlex.split(os.environ.get("LDFLAGS", ""))]
+        return {
+            "compiler_cxx": [*self.command],
+            "linker_exe": [*self.command],
+            "compiler_so": compiling,
+            "compiler_so_cxx": compiling,
+            "linker_so": linking,
+            "linker_so_cxx": linking,
+        }
+
+
+@cache
+def chosen() -> Compiler:
+    """Return the compiler of this build."""
+    given = os.environ.get(VARIABLE, "")
+    if given and given != ZIG:
+        return Compiler(tuple(shlex.split(given)))
+    # Microsoft's compiler does not know the vectors that g++ and clang have in common.
+    if given != ZIG and sys.platform != "win32":
+        usual = os.environ.get("CXX") or sysconfig.get_config_var("CXX")
+        for command in (usual, "g++", "clang++", "c++"):
+            if command and _compiles(tuple(shlex.split(command))):
+                return Compiler(tuple(shlex.split(command)), own=command == usual)
+    # zig builds for the processor at hand unless it is told otherwise, and traps where an integer overflows.
+    zig = (sys.executable, "-m", "ziglang", "c++", "-fno-sanitize=undefined")
+    return Compiler(zig, every=("-mcpu=baseline",), v3=("-mcpu=x86_64_v3",))
+
+
+def required() -> list[str]:
+    """Return what has to be installed before a build, besides what every build needs."""
+    return [PACKAGE] if "ziglang" in chosen().command else []
+
+
+def _compiles(command: tuple[str, ...]) -> bool:
+    """Whether a command compiles C++20 with the vectors of g++ 12 and clang 15."""
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder, "probe.cpp")
+        source.write_text(PROBE)
+        call = [*command, "-std=c++20", "-c", str(source), "-o", str(source.with_suffix(".o"))]
+        try:
+            return subprocess.run(call, capture_output=True, check=False).returncode == 0
+        except OSError:
+            return False
