@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,10 @@ from ..report import needed, table
 from ..solar.cost import TimedRun, by_peer
 from ..work_precision import Runner
 
-__all__ = ["Methods", "Row", "by_rebound", "daily", "one_each", "orbit_table", "rows", "yearly"]
+__all__ = ["ORDERS", "Methods", "Row", "by_rebound", "daily", "one_each", "orbit_table", "reordered", "rows", "yearly"]
 
+ORDERS = tuple(permutations(range(3)))
+"""All orders of the coordinate axes. They change the rounding of steps, but, unlike rotations, no bit of a state."""
 Methods = dict[str, tuple[Runner, Sequence[float]]]
 Row = dict[str, float]
 
@@ -23,6 +26,11 @@ Row = dict[str, float]
 def by_rebound(problem: Problem, integrator: str, **options: Any) -> Runner:
     """Make a run by an integrator of REBOUND, which must be installed; see `by_peer`."""
     return by_peer(problem, needed("eip_scipy.integrations.rebound").run, integrator, **options)
+
+
+def reordered(states: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
+    """Return states (6 N,) or (6 N, m) of N bodies with their coordinate axes in another order."""
+    return states.reshape(-1, 3, *states.shape[1:])[:, axes].reshape(states.shape)
 
 
 def one_each(label: Callable[[float], str], run: Runner, steps: Iterable[float]) -> Methods:
