@@ -81,6 +81,9 @@ COMMANDS = {
     "study nystrom-defaults": Entry(
         "measurements.nystrom_defaults:NystromDefaults", "two options of the Nyström methods that could be defaults"
     ),
+    "study orbit-balances": Entry(
+        "measurements.orbit_balances:OrbitBalances", "what each quantity of the orbits costs and gains as a balance"
+    ),
     "study overhead": Entry("measurements.overhead:Overhead", "cost of a step in solve_ivp beside SciPy's classes"),
     "study particle-reference": Entry(
         "measurements.references:ParticleReference", "reference states of the charged particles"

@@ -36,6 +36,7 @@ RUNS = [
     ("multistep", "--quick --parts 1 2 4 --json run.json", REBOUND),
     ("multistep", "--quick --parts 3 --json run.json", HEYOKA),
     ("nystrom-defaults", "--system figure-eight --json run.json", ()),
+    ("orbit-balances", "--quick --json run.json", ()),
     ("overhead", "--pairs 1 --json run.json", ()),
     ("particle-reference", "--bits 64 --points 2 --json run.json", HEYOKA),
     ("recommend", "--cases pendulum --json run.json", ()),

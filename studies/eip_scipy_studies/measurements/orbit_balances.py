@@ -1,0 +1,134 @@
+"""``eip-scipy study orbit-balances``: what each quantity of the orbits costs and gains, as a balance.
+
+Energies, angular momenta and Laplace vectors of all orbits (``balances=`` of `nbody`), in each combination, beside runs
+without projection and runs that keep the totals. All runs are made in the six orders of the coordinate axes, in turns:
+times (of the processor) are the least of the six, errors of position are medians.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from time import process_time
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from eip_scipy import EIPDOP853, EIPGJ14, integrate
+from eip_scipy.problems import Problem, nbody, solar_system
+from eip_scipy.problems.gravity.solar_data import reference_states
+
+from ..report import table
+from ..study import Measurement, Session, option
+from .orbits import ORDERS, reordered
+
+__all__ = ["OrbitBalances"]
+
+KEPT: dict[str, tuple[str, ...] | None] = {
+    "the totals": None,
+    "nothing": (),
+    "E": ("energy",),
+    "h": ("momentum",),
+    "e": ("laplace",),
+    "E, h": ("energy", "momentum"),
+    "E, e": ("energy", "laplace"),
+    "E, h, e": ("energy", "momentum", "laplace"),
+}
+TILTED = Rotation.from_euler("xyz", [0.3, 0.5, 0.7])
+UNIT = "E"  # whose time is 1
+
+
+class System(NamedTuple):
+    """The problem with these balances, its exact state at the end, and the options of its runs."""
+
+    problem: Callable[..., Problem]
+    truth: np.ndarray
+    options: dict[str, Any]
+
+
+def ten_bodies(years: float, **options: Any) -> System:
+    """Return the solar system against its packaged state at one of the times of `reference_states`."""
+    return System(partial(solar_system, years=years), reference_states()[years], options)
+
+
+def eccentric(years: float, **options: Any) -> System:
+    """Return a planet with a = 1 AU, e = 0.6 and a heavier one outside, against a run with steps 20 times shorter."""
+    sun, masses, e = 4 * math.pi**2, (1e-4, 1e-3), 0.6
+    gm = sun * np.array([1, *masses])
+    speed = math.sqrt(sun * (1 + masses[0]) * (1 + e) / (1 - e))
+    far = math.sqrt(sun * (1 + masses[1]) / 6 * 1.05 / 0.95)
+    q = np.array([[0, 0, 0], [1 - e, 0, 0], [0, 6 * 0.95, 0]])
+    v = np.array([[0, 0, 0], [0, speed * math.cos(0.1), speed * math.sin(0.1)], [-far, 0, 0]])
+    # In planes through no axis: components of h that are 0 would change fast beside their size.
+    q, v = (TILTED.apply(values - gm @ values / gm.sum()) for values in (q, v))
+    problem = partial(nbody, gm, q, v, t_span=(0.0, years))
+    fine = integrate(problem(), method=EIPDOP853, h=options["h"] / 20, invariants=(), compensated=True)
+    return System(problem, fine.y[:, -1], options)
+
+
+# Each takes the share of its span that is run.
+SYSTEMS: dict[str, Callable[[float], System]] = {
+    "ten bodies, 1000 years, EIPGJ14, 1/512 yr": lambda share: ten_bodies(1000 * share, method=EIPGJ14, h=1 / 512),
+    "ten bodies, 100 years, EIPDOP853, 1/256 yr": lambda share: ten_bodies(100 * share, method=EIPDOP853, h=1 / 256),
+    "e = 0.6, 200 years, EIPDOP853, 1/100 yr": lambda share: eccentric(200 * share, method=EIPDOP853, h=1 / 100),
+}
+
+
+class Cost(NamedTuple):
+    """Seconds of the processor, and errors of place [AU] of the innermost planet and of the worst other one."""
+
+    seconds: float
+    innermost: float
+    others: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrbitBalances(Measurement[dict[str, dict[str, Cost]]]):
+    """The command."""
+
+    quick: bool = option(False, "a tenth of the spans, to see that it runs")
+
+    def measure(self, session: Session) -> dict[str, dict[str, Cost]]:
+        found = {}
+        with session.bar(len(SYSTEMS), "orbit-balances", "system") as bar:
+            for name, make in SYSTEMS.items():
+                system = make(0.1 if self.quick else 1.0)
+                found[name] = costs(system)
+                bar.update()
+        return found
+
+    def table(self, found: dict[str, dict[str, Cost]]) -> str:
+        head = [["time [s]"], ["time over", f"that of {UNIT}"], ["innermost", "[AU]"], ["others", "[AU]"]]
+        lines: list[tuple[str, list[str]]] = []
+        for name, own in found.items():
+            lines.append((name, []))
+            for kept, (seconds, innermost, others) in own.items():
+                share = seconds / own[UNIT].seconds
+                lines.append((f"  {kept}", [f"{seconds:.3f}", f"{share:.2f}", f"{innermost:.1e}", f"{others:.1e}"]))
+        return table(head, lines)
+
+
+def costs(system: System) -> dict[str, Cost]:
+    """Return what is measured of each set of balances."""
+    problems = {kept: system.problem(balances=quantities or None) for kept, quantities in KEPT.items()}
+    problems["nothing"] = replace(problems["nothing"], invariants=())
+    found: dict[str, list[Cost]] = {kept: [] for kept in KEPT}
+    for axes in ORDERS:
+        truth = reordered(system.truth, axes)
+        for kept, problem in problems.items():
+            start = replace(problem, y0=reordered(problem.y0, axes))
+            begin = process_time()
+            run = integrate(start, **system.options)
+            seconds = process_time() - begin
+            off = np.linalg.norm((run.y[:, -1] - truth).reshape(2, -1, 3)[0], axis=1)
+            found[kept].append(Cost(seconds, off[1], off[2:].max()))
+    return {kept: best(own) for kept, own in found.items()}
+
+
+def best(runs: list[Cost]) -> Cost:
+    """Return the least time and the median errors."""
+    seconds, innermost, others = zip(*runs, strict=True)
+    return Cost(min(seconds), float(np.median(innermost)), float(np.median(others)))
