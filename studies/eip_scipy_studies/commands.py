@@ -61,6 +61,7 @@ COMMANDS = {
     "study exoplanets": Entry(
         "measurements.exoplanets:Exoplanets", "three systems of exoplanets beside WHFast and IAS15"
     ),
+    "study far": Entry("measurements.far:Far", "ten bodies over 100 000 years by several methods"),
     "study gpe": Entry(
         "measurements.gpe:EquationCost", "cost of the Gross-Pitaevskii equation beside its transforms and RK4"
     ),

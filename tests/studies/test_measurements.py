@@ -23,6 +23,7 @@ RUNS = [
     ("charged-particle", "--quick --json run.json", ()),
     ("ensembles", "--members 10 --steps 100 --repeats 1 --largest 10 --json run.json", ()),
     ("exoplanets", "--share .002 --json run.json", REBOUNDX),
+    ("far", "--years 1 --json run.json", REBOUND),
     ("gpe", "--quick --json run.json", ()),
     ("gpe-efficiency", "--points 16 --repeats 1 --json run.json", ()),
     ("gpe-methods", "--points 64 --t-end .01 --repeats 1 --only RK4-EIP s6-EIP --json run.json", ()),

@@ -1,0 +1,99 @@
+"""``eip-scipy study far``: ten bodies over 100 000 years, where no reference reaches, by methods of several kinds.
+
+How far the runs are from one of them with twice the steps. Two methods that share nothing but the balances, and come to
+the same places, are the evidence; the packaged reference, which ends after 10 000 years, says how good that one run is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eip_scipy import EIPDOP853, EIPGJ14, integrate
+from eip_scipy.problems import solar_system
+from eip_scipy.problems.gravity.solar_data import YEAR_D, reference_states
+
+from ..report import needed, table
+from ..solar.runs import orbits_kept
+from ..study import Measurement, Session, option
+from .growth import distances
+
+__all__ = ["Far"]
+
+FINEST = "EIPGJ14, balances, 1/1024 yr"
+MERCURY, OTHERS = 1, slice(2, None)
+DECADES = (100.0, 1000.0, 10_000.0, 100_000.0)
+
+
+def ways() -> dict[str, dict[str, Any]]:
+    """Return the options of each run of this package."""
+    return {
+        FINEST: {"method": EIPGJ14, "h": 1 / 1024, **orbits_kept()},
+        "EIPGJ14, balances, 1/512 yr": {"method": EIPGJ14, "h": 1 / 512, **orbits_kept()},
+        "EIPDOP853, balances, 1/512 yr": {"method": EIPDOP853, "h": 1 / 512, "compensated": True, **orbits_kept()},
+        "EIPGJ14, 1/600 yr": {"method": EIPGJ14, "h": 1 / 600},
+    }
+
+
+class Found(NamedTuple):
+    """Times, and of each run its seconds and the distances (m, 10) of the bodies from the finest run [AU].
+
+    `known`: those of the finest run from the reference, at its times.
+    """
+
+    times: np.ndarray
+    seconds: dict[str, float]
+    apart: dict[str, np.ndarray]
+    known: dict[float, np.ndarray]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Far(Measurement[Found]):
+    """The command."""
+
+    years: float = option(100_000.0, "length of the runs (%(default)s)", type=float)
+    ias15: bool = option(False, "IAS15 too, which takes minutes")
+
+    def measure(self, session: Session) -> Found:
+        rebound = needed("eip_scipy.integrations.rebound")
+        times = np.array([t for t in DECADES if t < self.years] + [self.years])
+        problem, own = solar_system(years=self.years), ways()
+        peers = {"WHFast (c17), 1 d": "whfast-c17"} | ({"IAS15": "ias15"} if self.ias15 else {})
+        seconds, states = dict[str, float](), dict[str, np.ndarray]()
+        with session.bar(len(own) + len(peers), "far") as bar:
+            for name, options in own.items():
+                run = integrate(problem, (0.0, self.years), t_eval=times, **options)
+                seconds[name], states[name] = run.wall_time, run.y
+                bar.update()
+            for name, integrator in peers.items():
+                counts = [1 if integrator == "ias15" else round(t * YEAR_D) for t in times]
+                runs = [
+                    rebound.run(problem.params, problem.y0, integrator, h=t / n, n_steps=n)
+                    for t, n in zip(times, counts, strict=True)
+                ]
+                seconds[name], states[name] = runs[-1].wall_time, np.array([run.y[:, -1] for run in runs]).T
+                bar.update()
+        references, finest = reference_states(), states.pop(FINEST)
+        known = {
+            float(t): distances(y[:, None], references[t][:, None])[0]
+            for t, y in zip(times, finest.T, strict=True)
+            if t in references
+        }
+        return Found(times, seconds, {name: distances(y, finest) for name, y in states.items()}, known)
+
+    def table(self, found: Found) -> str:
+        def cells(rows: Any) -> list[str]:
+            return [f"{value:.1e}" for row in rows for value in (row[MERCURY], row[OTHERS].max())]
+
+        heads = [["time [s]"], *(head for t in found.times for head in ([f"{t:g} yr", "Mercury"], ["", "others"]))]
+        none = np.full(10, np.nan)
+        body = [
+            (f"{FINEST}: off", [f"{found.seconds[FINEST]:.0f}", *cells(found.known.get(t, none) for t in found.times)])
+        ]
+        body += [(name, [f"{found.seconds[name]:.0f}", *cells(rows)]) for name, rows in found.apart.items()]
+        return f"Distances [AU] from {FINEST}, and its own from the reference in the first row\n\n{table(heads, body)}"
+
+    def numbers(self, found: Found) -> dict[str, Any]:
+        return {"seconds": found.seconds, "times": found.times.tolist()}
