@@ -58,6 +58,7 @@ class Compiler(NamedTuple):
         return {
             "compiler_cxx": [*self.command],
             "linker_exe": [*self.command],
+            "linker_exe_cxx": [*self.command],
             "compiler_so": compiling,
             "compiler_so_cxx": compiling,
             "linker_so": linking,
