@@ -18,7 +18,7 @@ __all__ = ["Compiler", "chosen", "required"]
 VARIABLE = "EIP_SCIPY_COMPILER"
 ZIG = "zig"
 PACKAGE = "ziglang>=0.17"
-# What g++ 12 and clang 15 know and older ones do not.
+# g++ 12 and clang 15 compile this, older ones do not.
 PROBE = """\
 #include <bit>
 typedef double Four __attribute__((vector_size(32)));
@@ -28,7 +28,7 @@ static_assert(std::bit_ceil(5u) == 8);
 
 
 class Compiler(NamedTuple):
-    """What compiles the engine.
+    """The command that compiles the engine, and its flags.
 
     Attributes
     ----------
@@ -78,18 +78,18 @@ def chosen() -> Compiler:
         for command in (usual, "g++", "clang++", "c++"):
             if command and _compiles(tuple(shlex.split(command))):
                 return Compiler(tuple(shlex.split(command)), own=command == usual)
-    # zig builds for the processor at hand unless it is told otherwise, and traps where an integer overflows.
+    # Without these flags zig builds for the processor at hand, and traps where an integer overflows.
     zig = (sys.executable, "-m", "ziglang", "c++", "-fno-sanitize=undefined")
     return Compiler(zig, every=("-mcpu=baseline",), v3=("-mcpu=x86_64_v3",))
 
 
 def required() -> list[str]:
-    """Return what has to be installed before a build, besides what every build needs."""
+    """Return the packages that have to be installed before this build, in addition to those of every build."""
     return [PACKAGE] if "ziglang" in chosen().command else []
 
 
 def _compiles(command: tuple[str, ...]) -> bool:
-    """Whether a command compiles C++20 with the vectors of g++ 12 and clang 15."""
+    """Return whether a command compiles C++20 with the vectors of g++ 12 and clang 15."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder, "probe.cpp")
         source.write_text(PROBE)

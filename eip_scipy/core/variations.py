@@ -38,7 +38,7 @@ Array = np.ndarray
 STATE = "state"
 # How far a complex step may be from a difference, relative to the largest component: that of differences of order 6.
 AGREES = 1e-6
-# The same for a jvp of the user, whose right-hand side may be rough.
+# The bound for a jvp of the user, whose right-hand side may be rough.
 WRONG = 1e-3
 SHIFT = 332  # binary digits of a complex step, relative to its direction
 LEAST = 1e-3  # size of a parameter that is 0, for differences
@@ -191,7 +191,7 @@ def asked_columns(asked: Any, y0: Array, params: Array, names: Sequence[str], in
 
 
 def _is_name(item: Any) -> bool:
-    """Whether this names the state or a parameter, or says the place of one."""
+    """Return whether this names the state or a parameter, or is the place of one."""
     return isinstance(item, str | int | np.integer) and not isinstance(item, bool)
 
 
@@ -204,7 +204,7 @@ def kept_symplectic(columns: Columns, asked: bool | None, canonical: bool, invar
         When this is asked for and cannot be done.
     """
     reasons = {
-        'derivatives by parameters or along a user\'s directions are no tangent map; ask for variations="state" alone':
+        'derivatives by parameters or along directions do not make a tangent map; ask for variations="state" alone':
             not columns.is_transition or bool(columns.parameters),
         f"a state of {columns.n} components is not (q, p)": columns.n % 2 == 1,
         "without invariants no step is projected; give the energy, at least": not invariants,

@@ -1,4 +1,4 @@
-"""What the options `variations`, `jvp` and `symplectic` take, refuse and say, on a pendulum."""
+"""The options `variations`, `jvp` and `symplectic`: values that they take and refuse, and messages, on a pendulum."""
 
 import numpy as np
 import pytest
@@ -95,9 +95,9 @@ def test_says_where_the_products_come_from():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"variations": [[1.0], [0.0]]}, "no tangent map"),
-        ({"variations": 0, "params": [1.0]}, "no tangent map"),
-        ({"variations": ["state", 0], "params": [1.0]}, "no tangent map"),
+        ({"variations": [[1.0], [0.0]]}, "do not make a tangent map"),
+        ({"variations": 0, "params": [1.0]}, "do not make a tangent map"),
+        ({"variations": ["state", 0], "params": [1.0]}, "do not make a tangent map"),
         ({"variations": "state", "invariants": ()}, "without invariants"),
     ],
 )
