@@ -8,10 +8,11 @@ from functools import partial
 import numpy as np
 
 from ..core.balances import Balance
+from ..core.inputs import is_number, refuse_units, shown
 from ..core.invariants import Invariant
 from ..core.names import nearest
 
-__all__ = ["damped_invariant", "named_invariant"]
+__all__ = ["checked_damping", "damped_invariant", "named_invariant"]
 
 
 def named_invariant(
@@ -37,6 +38,20 @@ def named_invariant(
 
 def _at(value: Callable[[np.ndarray], float], t: float, y: np.ndarray) -> float:
     return value(y)
+
+
+def checked_damping(damping: float) -> float:
+    """Return the damping as a float.
+
+    Raises
+    ------
+    ValueError
+        When it is not a finite number >= 0.
+    """
+    refuse_units(damping=damping)
+    if not (is_number(damping) and np.isfinite(damping) and damping >= 0):
+        raise ValueError(f"damping must be a finite number >= 0, got {shown(damping)}.")
+    return float(damping)
 
 
 Parts = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]

@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPDOP853, EIPRK4, Balance, integrate
-from eip_scipy.problems import DampedGrossPitaevskii, Grid, GrossPitaevskii, SineGordon, harmonic_trap
+from eip_scipy import EIPDOP853, EIPRK4, Balance, eip_method, integrate
+from eip_scipy.methods.runge_kutta import RK4
+from eip_scipy.problems import (
+    DampedGrossPitaevskii,
+    Grid,
+    GrossPitaevskii,
+    KortewegDeVries,
+    Lawson,
+    SineGordon,
+    harmonic_trap,
+)
 
 ALL = ("mass", "energy", "momentum_x", "momentum_y", "angular_momentum")
 
@@ -136,3 +145,56 @@ def test_a_uniform_wave_is_a_damped_pendulum():
     omega = np.sqrt(1 - 0.01**2)
     expected = 1e-6 * np.exp(-0.5) * (np.cos(50 * omega) + 0.01 / omega * np.sin(50 * omega))
     np.testing.assert_allclose(integrate(problem, method=EIPDOP853).y[:8, -1], expected, rtol=1e-9)
+
+
+DAMPING = 1e-2
+
+
+def soliton(damping=DAMPING):
+    """Return the equation on a ring of length 32, and a soliton of speed 1."""
+    equation = KortewegDeVries(Grid(64, -16, 16), damping)
+    return equation, 0.5 / np.cosh(equation.grid.points(0) / 2) ** 2
+
+
+def written_again(t, u):
+    """-6 u u_x - u_xxx - damping u at the points alone, by NumPy."""
+    k = 2j * np.pi * np.fft.rfftfreq(64, 0.5)
+    return np.fft.irfft(-3 * k * np.fft.rfft(u * u) - k**3 * np.fft.rfft(u)) - DAMPING * u
+
+
+def test_damped_korteweg_de_vries_against_scipy():
+    equation, start = soliton()
+    problem = equation.problem(start, 20.0)
+    exact = solve_ivp(written_again, (0, 20), problem.y0, method="DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
+    step = eip_method(Lawson(equation, RK4))
+    plain = integrate(problem, method=step, h=0.04, invariants=())
+    kept = integrate(problem, method=step, h=0.04)
+    assert kept.trusted
+    errors = [np.linalg.norm(run.y[:, -1] - exact) for run in (plain, kept)]
+    assert 2 * errors[1] < errors[0] < 1e-4
+    mass, momentum = (getattr(equation, name) for name in ("mass", "momentum"))
+    assert mass(kept.y[:, -1]) == pytest.approx(np.exp(-20 * DAMPING) * mass(problem.y0), rel=1e-13)
+    assert momentum(kept.y[:, -1]) == pytest.approx(np.exp(-40 * DAMPING) * momentum(problem.y0), rel=1e-13)
+
+
+def test_a_damped_soliton_decays_as_perturbation_theory_says():
+    """Its speed falls as exp(-4 damping t / 3) (Ott & Sudan, Phys. Fluids 13 (1970) 1432), to the first order."""
+    equation, start = soliton(1e-3)
+    run = integrate(equation.problem(start, 20.0, 0.05))
+    modes = equation.modes(run.y[:, -1])
+    fine = 64 * np.fft.irfft(modes, 4096) * 64
+    assert 2 * fine.max() == pytest.approx(np.exp(-4 * 20e-3 / 3), rel=2e-3)
+
+
+def test_invariants_of_the_damped_equation():
+    equation, start = soliton()
+    assert [item.name for item in equation.invariants()] == ["momentum"]
+    for item in equation.invariants(("mass", "momentum")):
+        G, step = np.empty(64), 1e-6 * np.cos(np.arange(64))
+        item.grad(3.0, start, G)
+        slope = (item.fun(3.0, start + step) - item.fun(3.0, start - step)) / 2
+        assert G @ step == pytest.approx(slope, rel=1e-8)
+    with pytest.raises(ValueError, match="unknown invariant 'energy' with damping"):
+        equation.invariants("energy")
+    with pytest.raises(ValueError, match="damping must be"):
+        KortewegDeVries(equation.grid, -1.0)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...core.balances import Balance
 from ...core.inputs import is_number, refuse_units, shown
-from ..named_invariants import damped_invariant
+from ..named_invariants import checked_damping, damped_invariant
 from .equation import GrossPitaevskii, on_grid
 from .grid import Grid
 
@@ -66,13 +66,12 @@ class DampedGrossPitaevskii(GrossPitaevskii):
         loss: Any = 0.0,
         **options: Any,
     ) -> None:
-        refuse_units(damping=damping, chemical_potential=chemical_potential, loss=loss)
-        if not (is_number(damping) and np.isfinite(damping) and damping >= 0):
-            raise ValueError(f"damping must be a finite number >= 0, got {shown(damping)}.")
+        refuse_units(chemical_potential=chemical_potential, loss=loss)
+        damping = checked_damping(damping)
         if not (is_number(chemical_potential) and np.isfinite(chemical_potential)):
             raise ValueError(f"chemical_potential must be a finite number, got {shown(chemical_potential)}.")
         super().__init__(grid, potential, **options)
-        self.damping, self.mu = float(damping), float(chemical_potential)
+        self.damping, self.mu = damping, float(chemical_potential)
         self.loss = on_grid(loss, grid, "loss")
         self._options |= {"damping": damping, "chemical_potential": chemical_potential, "loss": self.loss}
         self._growth = (self.damping * self.mu - 0.5 * self.loss).reshape(-1)

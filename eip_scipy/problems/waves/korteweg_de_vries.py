@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from math import exp
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ import scipy.fft
 
 from ...core.invariants import Invariant
 from ..gross_pitaevskii.grid import Grid
-from ..named_invariants import named_invariant
+from ..named_invariants import checked_damping, named_invariant
 from .lawson import Lawson
 from .record import WaveProblem
 
@@ -20,7 +22,7 @@ SOURCE = "Gardner, Greene, Kruskal & Miura, Phys. Rev. Lett. 19 (1967) 1095"
 
 
 class KortewegDeVries:
-    """The equation ``u_t + 6 u u_x + u_xxx = 0`` on a ring, by Galerkin's method in Fourier modes.
+    """The equation ``u_t + 6 u u_x + u_xxx + damping u = 0`` on a ring, by Galerkin's method in Fourier modes.
 
     The state is u at the grid's points. The square is taken on a finer grid, on which its modes are not mistaken for
     others (the 3/2 rule), so that the equations for the modes are exact projections of the equation's.
@@ -29,17 +31,19 @@ class KortewegDeVries:
     ----------
     grid : Grid
         Of one dimension.
+    damping : float, optional
 
     Attributes
     ----------
     grid : Grid
+    damping : float
     frequencies : ndarray
-        Of the linear part: modes of u_t = -u_xxx turn as exp(-i frequency t).
+        Of the linear part: modes of u_t = -u_xxx - damping u change as exp(-i frequency t); complex with damping.
 
     Raises
     ------
     ValueError
-        When the grid has more dimensions than one.
+        When the grid has more dimensions than one, or for a damping that is negative or not finite.
 
     Notes
     -----
@@ -48,6 +52,9 @@ class KortewegDeVries:
     and H does not change when u is moved along the ring. (At the grid's points alone the square is wrong in its
     highest modes, and the momentum is not kept.) The highest of an even number of modes has no derivative and takes
     no part: `problem` leaves it out of the start.
+
+    Damping makes the mass fall by exp(-damping t), the momentum by exp(-2 damping t), exactly, also on the grid. Both
+    are invariants with these factors divided out, which depend on time. The energy has no such law.
 
     Examples
     --------
@@ -61,20 +68,20 @@ class KortewegDeVries:
     (True, True)
     """
 
-    def __init__(self, grid: Grid) -> None:
+    def __init__(self, grid: Grid, damping: float = 0.0) -> None:
         if grid.dim != 1:
             raise ValueError(f"the Korteweg-de Vries equation has one dimension, got {grid!r}.")
-        self.grid = grid
+        self.grid, self.damping = grid, checked_damping(damping)
         self._n = grid.size
         most = (self._n - 1) // 2  # the highest mode that has a sign
         self._kept = most + 1
         self._fine = scipy.fft.next_fast_len(3 * most + 1, real=True)
         self._k = grid.wavenumbers(0)[: self._kept]
-        self.frequencies = -(self._k**3)
+        self.frequencies = -(self._k**3) - 1j * self.damping if self.damping else -(self._k**3)
         self._flux = -3j * self._k
 
     def __repr__(self) -> str:
-        return f"KortewegDeVries({self.grid!r})"
+        return f"KortewegDeVries({self.grid!r}{f', damping={self.damping:g}' if self.damping else ''})"
 
     # In modes: what `Lawson` takes.
 
@@ -103,7 +110,7 @@ class KortewegDeVries:
     # In points.
 
     def rhs(self, t: float, u: np.ndarray, out: np.ndarray) -> None:
-        """Fill `out` with -6 u u_x - u_xxx."""
+        """Fill `out` with -6 u u_x - u_xxx - damping u."""
         modes = self.modes(u)
         out[:] = self.field(self.nonlinear(modes) - 1j * self.frequencies * modes)
 
@@ -140,13 +147,14 @@ class KortewegDeVries:
         found = self._k**2 * modes - 3 * self._square(modes)
         np.multiply(self.field(found), self.grid.cell, out=out)
 
-    def invariants(self, names: Sequence[str] = ("momentum", "energy")) -> tuple[Invariant, ...]:
+    def invariants(self, names: Sequence[str] | None = None) -> tuple[Invariant, ...]:
         """Make the invariants of the equation.
 
         Parameters
         ----------
         names : sequence of {"mass", "momentum", "energy"}, optional
-            The mass is linear: every method keeps it, and `problem` keeps the corrections out of it by its `frame`.
+            Default: momentum and energy, with damping the momentum, whose factor is divided out. The mass is linear:
+            every method keeps it, and `problem` keeps the corrections out of it by its `frame`.
 
         Returns
         -------
@@ -157,6 +165,8 @@ class KortewegDeVries:
         ValueError
             For other names.
         """
+        if names is None:
+            names = ("momentum",) if self.damping else ("momentum", "energy")
         names = (names,) if isinstance(names, str) else tuple(names)
         return tuple(self._invariant(name) for name in names)
 
@@ -166,7 +176,12 @@ class KortewegDeVries:
             "momentum": (self.momentum, self._momentum_gradient),
             "energy": (self.energy, self._energy_gradient),
         }
-        return named_invariant(name, made, tuple(made))
+        if not self.damping:
+            return named_invariant(name, made, tuple(made))
+        del made["energy"]
+        item = named_invariant(name, made, tuple(made), where=" with damping")
+        rate = self.damping * {"mass": 1, "momentum": 2}[name]
+        return Invariant(partial(_value, rate, item), partial(_gradient, rate, item), name=name, in_place=True)
 
     def largest_step(self, u: Any, limit: float = 2.8) -> float:
         """The step above which `Lawson` is unstable: a bound by the nonlinear term alone, for the linear one is exact.
@@ -191,7 +206,7 @@ class KortewegDeVries:
         h: float | None = None,
         *,
         name: str = "korteweg-de-vries",
-        invariants: Sequence[str] = ("momentum", "energy"),
+        invariants: Sequence[str] | None = None,
         reference: Callable[[float], np.ndarray | None] | None = None,
         source: str = SOURCE,
     ) -> WaveProblem:
@@ -241,3 +256,14 @@ class KortewegDeVries:
             source=source,
             equation=self,
         )
+
+
+def _value(rate: float, item: Invariant, t: float, u: np.ndarray) -> float:
+    """Return the invariant times the factor by which it has decayed."""
+    return exp(rate * t) * item.fun(t, u)
+
+
+def _gradient(rate: float, item: Invariant, t: float, u: np.ndarray, out: np.ndarray) -> None:
+    assert item.gradient is not None
+    item.gradient(t, u, out)
+    out *= exp(rate * t)

@@ -77,8 +77,8 @@ class Lawson:
         """One step of length h; with the tableau's error estimate where it has one."""
         if h != self._h:
             nodes = (*self.tableau.c, 1.0)
-            self._turns, self._h = [np.exp(-1j * h * c * self.equation.frequencies) for c in nodes], h
-            self._back = [turn.conj() for turn in self._turns]
+            phases = [1j * h * c * self.equation.frequencies for c in nodes]
+            self._turns, self._back, self._h = [np.exp(-x) for x in phases], [np.exp(x) for x in phases], h
         equation, tableau = self.equation, self.tableau
         modes = equation.modes(y)
         slopes = np.empty((tableau.n_stages + tableau.fsal, modes.size), complex)

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ...core.inputs import is_number, refuse_units, shown
 from ...core.invariants import Invariant
 from ...methods.nystrom import RKN1210
 from ...methods.runge_kutta import DOP853
 from ..gross_pitaevskii.grid import Grid
-from ..named_invariants import damped_invariant, named_invariant
+from ..named_invariants import checked_damping, damped_invariant, named_invariant
 from .modes import RealModes
 from .record import WaveProblem
 
@@ -60,10 +59,7 @@ class SineGordon:
     """
 
     def __init__(self, grid: Grid, damping: float = 0.0) -> None:
-        refuse_units(damping=damping)
-        if not (is_number(damping) and np.isfinite(damping) and damping >= 0):
-            raise ValueError(f"damping must be a finite number >= 0, got {shown(damping)}.")
-        self.grid, self.damping = grid, float(damping)
+        self.grid, self.damping = grid, checked_damping(damping)
         self._modes = RealModes(grid)
         self._square = np.zeros(self._modes.shape)
         for axis in range(grid.dim):
