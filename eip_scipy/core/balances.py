@@ -129,7 +129,7 @@ class Balance(Invariant):
         if rate is not None and not callable(rate):
             raise TypeError(f"Balance: rate must be callable or None, got {rate!r}{address_hint(rate)}.")
         directions = _directions(components, weights)
-        self.parts = () if directions is None else (directions,)
+        self.subspaces = () if directions is None else (directions,)
         self.rate_function = rate
         self.rate_uses_f = uses_f and rate is not None
 

@@ -106,9 +106,9 @@ class Invariant:
     is_balance = False
     rate_function: Callable[..., Any] | None = None
     rate_uses_f = False
-    # Components and weights (s, k) along which all values are projected, or one such pair for every value. Invariants
-    # without any are projected together, along all components.
-    parts: tuple[tuple[Array, Array], ...] = ()
+    # Components and weights (s, k) of the s directions along which all values are projected, or one such pair for every
+    # value. Invariants without any are projected together, along all components.
+    subspaces: tuple[tuple[Array, Array], ...] = ()
     value_names: tuple[str, ...] = ()
     # A run warns of a balance whose rate is above this share of the terms of its rate: it hardly helps.
     most_slowness = 0.05

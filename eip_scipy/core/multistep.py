@@ -157,7 +157,7 @@ def _largest(product: Callable[[Array], Array], y: Array) -> float:
 
 
 def _has_parts(run: Run) -> bool:
-    return run.options.parts.value.size > 0
+    return run.options.balance_groups.value.size > 0
 
 
 def _record(

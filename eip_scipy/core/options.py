@@ -224,8 +224,8 @@ class ProjectionOptions:
         """
         n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
         kind, sigma = self._metric(method, n, width)
-        parts = _groups(known, n, width)
-        if parts is not NO_GROUPS:
+        balance_groups = _groups(known, n, width)
+        if balance_groups is not NO_GROUPS:
             self._require_plain()
             kind = EUCLIDEAN  # the groups have weights of their own
         if not isinstance(self.direction, str) or self.direction not in DIRECTIONS:
@@ -246,7 +246,7 @@ class ProjectionOptions:
             groups=groups,
             frame=frame_rows(self.frame, n, width),
             balances=_balances(method, known),
-            parts=parts,
+            balance_groups=balance_groups,
             columns=no_columns(known.size),
             target=known.target,
             scales=known.scales,
@@ -276,10 +276,10 @@ class ProjectionOptions:
 
     def _identity(self, o: Options, sigma: np.ndarray | None, y0: np.ndarray, known: InvariantSet) -> dict[str, Any]:
         carried = [known.labels[k] for k in known.balances.items]
-        grouped = o.parts is not NO_GROUPS
+        grouped = o.balance_groups is not NO_GROUPS
         return {
             **({"balances": carried} if carried else {}),
-            **({"components": list(o.parts)} if grouped else {}),
+            **({"components": list(o.balance_groups)} if grouped else {}),
             "rtol": o.rtol,
             "atol": o.atol,
             "invariants": [
@@ -382,7 +382,7 @@ def _groups(known: InvariantSet, n: int, width: int) -> Groups:
     ValueError
         If some items have components and others none, components are outside the state, or the state is complex.
     """
-    lacking = [label for item, label in zip(known.items, known.labels, strict=True) if not item.parts]
+    lacking = [label for item, label in zip(known.items, known.labels, strict=True) if not item.subspaces]
     if len(lacking) == len(known.items):
         return NO_GROUPS
     if lacking:
@@ -395,8 +395,8 @@ def _groups(known: InvariantSet, n: int, width: int) -> Groups:
     groups: dict[Any, tuple[np.ndarray, np.ndarray, list[int]]] = {}
     for k, item in enumerate(known.items):
         values = range(known.starts[k], known.starts[k + 1])
-        each = [values] if len(item.parts) == 1 else [range(v, v + 1) for v in values]
-        for (components, weight), own in zip(item.parts, each, strict=True):
+        each = [values] if len(item.subspaces) == 1 else [range(v, v + 1) for v in values]
+        for (components, weight), own in zip(item.subspaces, each, strict=True):
             key = components.shape, components.tobytes(), weight.tobytes()
             groups.setdefault(key, (components, weight, []))[2].extend(own)
     places = [row for components, _, _ in groups.values() for row in components]

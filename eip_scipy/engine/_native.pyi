@@ -481,7 +481,7 @@ class Options(NamedTuple):
     groups: Grouping
     frame: FrameRows
     balances: Balances
-    parts: Groups
+    balance_groups: Groups
     columns: Columns
     target: numpy.typing.NDArray[numpy.float64]
     scales: numpy.typing.NDArray[numpy.float64]

@@ -382,9 +382,9 @@ def test_the_engine_checks_the_record(field, value):
     solver = EIPDOP853(dragged, 0, pericentre(0.2), 1, h=0.1, invariants=pair(components=range(4)))
     solver.step()
     options = solver._run.options
-    assert isinstance(options.parts, Groups)
-    wrong = np.array(value, getattr(options.parts, field).dtype)
-    solver._run.options = options._replace(parts=options.parts._replace(**{field: wrong}))
+    assert isinstance(options.balance_groups, Groups)
+    wrong = np.array(value, getattr(options.balance_groups, field).dtype)
+    solver._run.options = options._replace(balance_groups=options.balance_groups._replace(**{field: wrong}))
     with pytest.raises(ValueError, match="engine:"):
         solver._drive(begins=False)
     solver._run.options = options

@@ -191,7 +191,7 @@ def test_the_moon_moves_about_the_earth():
     (kept,) = orbital_balances(problem.params, problem.y0, bodies=bodies)
     assert "energy of Moon" in kept.value_names
     assert len(kept.value_names) == len(bodies) - 1
-    components, weights = kept.parts[kept.value_names.index("energy of Moon")]
+    components, weights = kept.subspaces[kept.value_names.index("energy of Moon")]
     assert components[:3].tolist() == [[3 * earth + c, 3 * moon + c] for c in range(3)]
     assert np.allclose(weights[:, 0] * problem.params[earth], -weights[:, 1] * problem.params[moon], rtol=1e-14)
 
@@ -213,7 +213,7 @@ def test_moons_of_moons_and_a_passing_body():
         assert centres(gm[order], shuffled).tolist() == expected
     (kept,) = orbital_balances(gm, y)
     for body, moving, staying in [(1, [1, 2, 3], [0, 4]), (2, [2, 3], [1]), (3, [3], [2]), (4, [4], [0, 1, 2, 3])]:
-        components, weights = kept.parts[kept.value_names.index(f"energy of {body}")]
+        components, weights = kept.subspaces[kept.value_names.index(f"energy of {body}")]
         along = dict(zip(components[0] // 3, weights[0], strict=True))
         assert sorted(along) == sorted(moving + staying)
         assert all(along[k] > 0 for k in moving)
@@ -361,7 +361,7 @@ def test_balances_are_pickled():
         again = pickle.loads(pickle.dumps(balance))
         assert again.value_names == balance.value_names
         assert np.array_equal(again.fun(0.0, Y), balance.fun(0.0, Y))
-        for (components, weights), (found, found_weights) in zip(balance.parts, again.parts, strict=True):
+        for (components, weights), (found, found_weights) in zip(balance.subspaces, again.subspaces, strict=True):
             assert np.array_equal(components, found)
             assert np.array_equal(weights, found_weights)
 

@@ -72,23 +72,23 @@ inline void move_along(const Options &o, const W &w, const Value *__restrict Q, 
 // values of a group whose rows are dependent need not agree exactly, so that the defect of a row that was left out may grow to
 // the sum of all.
 template <class W>
-[[gnu::noinline]] inline int64_t move_in_parts(const Options &o, const W &w, double *out) {
-    const Groups &parts = o.parts;
+[[gnu::noinline]] inline int64_t move_in_groups(const Options &o, const W &w, double *out) {
+    const Groups &groups = o.balance_groups;
     double *total = w.stage, *defects = w.inner.g;
     int64_t rank = 0;
     fill(total, 0.0, w.m);
-    for (int64_t k = 0; k < parts.count; ++k) {
-        const int64_t *value = parts.value + parts.first_value[k], first = parts.first_direction[k];
-        const int64_t rows = parts.first_value[k + 1] - parts.first_value[k];
-        const int64_t directions = parts.first_direction[k + 1] - first;
+    for (int64_t k = 0; k < groups.count; ++k) {
+        const int64_t *value = groups.value + groups.first_value[k], first = groups.first_direction[k];
+        const int64_t rows = groups.first_value[k + 1] - groups.first_value[k];
+        const int64_t directions = groups.first_direction[k + 1] - first;
         const Matrix B{w.Q, rows, directions, directions}, R = corner(w.R, rows, w);
         for (int64_t i = 0; i < rows; ++i) {
             const double *G = w.gradient(value[i]);
             defects[i] = w.before[value[i]];
             for (int64_t d = 0; d < directions; ++d) {
                 double slope = 0.0;
-                for (int64_t j = parts.first_float[first + d]; j < parts.first_float[first + d + 1]; ++j)
-                    slope += parts.weight[j] * G[parts.place[j]];
+                for (int64_t j = groups.first_float[first + d]; j < groups.first_float[first + d + 1]; ++j)
+                    slope += groups.weight[j] * G[groups.place[j]];
                 B(i, d) = slope;
             }
         }
@@ -105,8 +105,8 @@ template <class W>
         for (int64_t d = 0; d < directions; ++d) {
             double move = 0.0;
             for (int64_t i = 0; i < rows; ++i) move += w.mu[i] * B(i, d);
-            for (int64_t j = parts.first_float[first + d]; j < parts.first_float[first + d + 1]; ++j)
-                total[parts.place[j]] += parts.weight[j] * move;
+            for (int64_t j = groups.first_float[first + d]; j < groups.first_float[first + d + 1]; ++j)
+                total[groups.place[j]] += groups.weight[j] * move;
         }
     }
     if (o.frame.rows > 0)
@@ -120,14 +120,14 @@ template <class W>
 // The defects that those after a projection are compared with.
 template <class W>
 inline auto *limits(const Options &o, const W &w) {
-    return o.parts.count > 0 ? w.g : w.before;
+    return o.balance_groups.count > 0 ? w.g : w.before;
 }
 
 // The first Newton step along the gradients at y_hat. `more`: others follow, for which Q must be orthonormal.
 template <class W>
 inline int64_t first_move(const Options &o, const W &w, double *out, bool more) {
-    if (o.parts.count > 0) [[unlikely]]
-        return move_in_parts(o, w, out);
+    if (o.balance_groups.count > 0) [[unlikely]]
+        return move_in_groups(o, w, out);
     const Matrix R = corner(w.R, w.l, w);
     double *rows = more ? nullptr : weighed_gradients(o, w);
     if (rows && solve_gram(rows_of(rows, w), w.g, R, w.mu)) {
@@ -362,10 +362,10 @@ template <class AnyRun>
 inline Code project_evaluated(const AnyRun &run, const Step &step) {
     const Options &o = run.options;
     const auto &w = run.work;
-    if (!defects<double>(nullptr, w.y_hat, o, w, w.before) && o.parts.count == 0) return stay(run, step);
+    if (!defects<double>(nullptr, w.y_hat, o, w, w.before) && o.balance_groups.count == 0) return stay(run, step);
     Moved moved = move(run, step);
     Code status = correct(run, step, moved.rank);
-    if (o.direction == NEW && o.iterations == 1 && !o.compensated && o.parts.count == 0) {
+    if (o.direction == NEW && o.iterations == 1 && !o.compensated && o.balance_groups.count == 0) {
         const int64_t seen = o.columns.count > 0 ? o.columns.seen : w.m;
         const bool alone = o.blocks.count * o.blocks.width == seen;
         const bool doubtful = status != OK ? all_finite(w.defect, w.l) : alone && moved.correction > HEALTHY;

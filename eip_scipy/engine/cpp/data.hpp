@@ -274,7 +274,7 @@ struct Options {
     Blocks blocks;
     Frame frame;
     Balances balances;
-    Groups parts;
+    Groups balance_groups;
     Columns columns;
     double *target;
     const double *scales, *computed;  // computed: 1 for invariants without a gradient of the user's
@@ -298,7 +298,7 @@ void fields(Options &o, Visit &visit) {
     visit.record("groups", "Grouping", o.blocks);
     visit.record("frame", "FrameRows", o.frame);
     visit.record("balances", "Balances", o.balances);
-    visit.record("parts", "Groups", o.parts);
+    visit.record("balance_groups", "Groups", o.balance_groups);
     visit.record("columns", "Columns", o.columns);
     visit("target", o.target, is.l);
     visit("scales", o.scales, is.l);

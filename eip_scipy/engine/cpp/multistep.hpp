@@ -487,7 +487,8 @@ inline void soften_defects(const Multistep &ms, const Options &o, const W &w) {
     for (int64_t i = 0; i < w.l; ++i) {
         const Value defect = w.target[i], square = defect * defect;
         const Value noise = EPS * abs_dot(w.gradient(i), w.y_hat, w.m);
-        const Value part = o.parts.count > 0 ? Value(1.0) : where(square > 0.0, square / (square + noise * noise), 0.0);
+        const Value part =
+            o.balance_groups.count > 0 ? Value(1.0) : where(square > 0.0, square / (square + noise * noise), 0.0);
         w.target[i] = w.values[i] - part * defect;
         left[i] = (defect - part * defect) + levels[w.l + i];
     }
@@ -553,7 +554,7 @@ inline void move_sums(const Multistep &ms, const Truth<typename W::Value> &those
     newest_state(run, t);
     w.counters[F_AT_RAW] = 1;
     note_rates(run, Step{t, t, ms.h, w.y_hat, scratch, true, true});
-    if (o.every == AUTO && o.parts.count == 0 && !tells_more(w)) return OK;
+    if (o.every == AUTO && o.balance_groups.count == 0 && !tells_more(w)) return OK;
     aim_at_node(run, ms.middle);
     copy(w.target, ms.levels, w.l);
     defects_in_the_middle(run, t, scratch);
@@ -625,7 +626,7 @@ struct OneState {
 
     // Balances begin at their values, which a projection of their own does not take as rounded.
     void begin(const double *y) const {
-        if (run.options.parts.count == 0) find_levels(run.system, *run.method.multistep, run.work, y);
+        if (run.options.balance_groups.count == 0) find_levels(run.system, *run.method.multistep, run.work, y);
     }
     Code look() const { return look_at_nodes(*run.method.multistep, run.options, run.work) ? OK : UNSTABLE; }
     Code project() const { return project_nodes(run, scratch); }

@@ -237,7 +237,7 @@ static bool ascend(const int64_t *first, int64_t count, int64_t last) {
     return good;
 }
 
-static void check_parts(const Groups &g, const Work &w) {
+static void check_groups(const Groups &g, const Work &w) {
     bool good = g.count >= 0 && g.directions >= 0 && ascend(g.first_value, g.count, g.values) &&
                 ascend(g.first_direction, g.count, g.directions) && ascend(g.first_float, g.directions, g.floats) &&
                 (g.count == 0 || g.values == w.l);
@@ -265,12 +265,12 @@ Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept) 
             "engine: the frame's bodies do not fit the state");
     require(o.every >= 0, "engine: every must not be negative");
     check_balances(o.balances, w);
-    check_parts(o.parts, w);
+    check_groups(o.balance_groups, w);
     check_columns(o.columns, w);
     w.target = o.target;
     w.products = o.frame.products;
     o.has_limits = std::any_of(o.most_left, o.most_left + w.l, [](double share) { return share < ENDLESS; });
-    require(o.parts.count == 0 || (o.direction == NEW && !o.has_limits),
+    require(o.balance_groups.count == 0 || (o.direction == NEW && !o.has_limits),
             "engine: groups of balances take one Newton step along their own directions");
     return o;
 }

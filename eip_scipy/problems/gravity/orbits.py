@@ -182,7 +182,7 @@ def _balance(quantity: str, entries: Array, orbits: list[_Orbit], names: tuple[s
     kept = Balance(fun, rate, grad, size=each * len(orbits), name=quantity, in_place=True, uses_f=True)
     # Neptune's energy changes at 0.05 of its terms, because the Sun is moved by Jupiter, and helps all the same.
     kept.most_slowness = 0.2
-    kept.parts = tuple((orbit.components, orbit.weights) for orbit in orbits for _ in range(each))
+    kept.subspaces = tuple((orbit.components, orbit.weights) for orbit in orbits for _ in range(each))
     axes = ("",) if each == 1 else ("_x", "_y", "_z")
     kept.value_names = tuple(f"{quantity}{axis} of {names[orbit.body]}" for orbit in orbits for axis in axes)
     return kept

@@ -200,7 +200,7 @@ def bodies(
         if "Moon" in names:
             alone = orbital_balances(gm, problem.y0, bodies=names, newton=not relativity)
             for item in alone:
-                item.parts = ()
+                item.subspaces = ()
             sets["E, error metric"] = alone
         if wrong:
             own = (np.asarray(problem.params),)
