@@ -1,14 +1,16 @@
 """Variational equations of problems: against differences of order 8 of their right-hand sides, at random states."""
 
+import math
 import pickle
 
 import numpy as np
 import pytest
+from numba import njit
 
-from eip_scipy import equations, hamiltonian
+from eip_scipy import EIPDOP853, equations, hamiltonian, integrate
 from eip_scipy.core import jitted
 from eip_scipy.engine.native import library
-from eip_scipy.problems import harmonic, kepler, nbody
+from eip_scipy.problems import TOKAMAK, UNIFORM, ParticleField, charged_particle, harmonic, kepler, nbody
 from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.problems.symbolic import system
 
@@ -170,7 +172,8 @@ def test_newton(n):
 
 
 RELATIVITY = [(), ("1pn",), ("eih",), ("gr-potential",)]
-OTHERS = [(), ("j2",), ("moon-quadrupole",), ("j2", "moon-quadrupole")]
+OTHERS = [(), ("j2",), ("moon-quadrupole",), ("j2", "moon-quadrupole"), ("drag",), ("j2", "drag")]
+AIR = {"drag": 0.2, "drag_radius": 0.9, "scale_height": 1.1, "spin": 0.3}
 
 
 @pytest.mark.parametrize("others", OTHERS, ids="+".join)
@@ -178,7 +181,7 @@ OTHERS = [(), ("j2",), ("moon-quadrupole",), ("j2", "moon-quadrupole")]
 @pytest.mark.parametrize("n", [2, 4, 10])
 def test_forces(relativity, others, n):
     """With constants that make all of them as large as Newton's."""
-    constants = ForceConstants(c=1.5, j2=0.4, pole=[1.0, -2.0, 0.5], moon_body=n - 1, moon=0.3)
+    constants = ForceConstants(c=1.5, j2=0.4, pole=[1.0, -2.0, 0.5], moon_body=n - 1, moon=0.3, **AIR)
     rng = np.random.default_rng(n)
     for particles in (False, True):
         given = bodies(rng, n, particles)
@@ -186,11 +189,11 @@ def test_forces(relativity, others, n):
         assert_variational(problem, problem.y0, rng, (), 5)
 
 
-@pytest.mark.parametrize("force", ["1pn", "eih", "gr-potential", "j2", "moon-quadrupole"])
+@pytest.mark.parametrize("force", ["1pn", "eih", "gr-potential", "j2", "moon-quadrupole", "drag"])
 def test_what_a_force_adds(force):
     """Compare the parts of each force alone, so that Newton's larger part hides nothing."""
     rng = np.random.default_rng(5)
-    constants = ForceConstants(c=1.5, j2=0.4, pole=[1.0, -2.0, 0.5], moon_body=2, moon=0.3)
+    constants = ForceConstants(c=1.5, j2=0.4, pole=[1.0, -2.0, 0.5], moon_body=2, moon=0.3, **AIR)
     given = bodies(rng, 5)
     problem = nbody(*given, t_span=(0.0, 1.0), forces=force, constants=constants)
     plain, y = nbody(*given, t_span=(0.0, 1.0)), problem.y0
@@ -217,3 +220,94 @@ def test_columns_do_not_depend_on_each_other():
     for column, found in zip(columns, together.reshape(-1, 60)[1:], strict=True):
         alone = in_place(library["gravity.variational"], 0.0, np.append(problem.y0, column), problem.params)
         np.testing.assert_array_equal(alone[60:], found)
+
+
+# --- charged particles ---
+
+
+def mirror(x, y, z):
+    """The vector potential of a magnetic mirror."""
+    return -0.5 * y * (1 + z * z), 0.5 * x * (1 + z * z), 0.0
+
+
+def mirror_jacobian(x, y, z):
+    return (0.0, -0.5 * (1 + z * z), -y * z), (0.5 * (1 + z * z), 0.0, x * z), (0.0, 0.0, 0.0)
+
+
+def well(x, y, z):
+    return 0.3 * math.exp(-x * x - 2 * y * y - z)
+
+
+def turning(t, x, y, z):
+    """A magnetic field that grows, as an array."""
+    return np.array([x * z * t, -y * z * t, 1.0 + 0.5 * t * (y * y - x * x)])
+
+
+def induced(t, x, y, z):
+    return 0.1 * y * math.cos(t), x * z, 0.2
+
+
+def table(x, y, z):
+    """A field that numbers alone do: no dual numbers, no complex steps."""
+    return math.fsum((0.1, y * y)), math.fsum((0.2, x * z)), 1.0 + 0.2 * math.fsum((x, y)) ** 2
+
+
+FIELDS = {
+    "uniform": lambda jit: UNIFORM,
+    "tokamak": lambda jit: TOKAMAK,
+    "potentials": lambda jit: ParticleField(jit(mirror), potential=jit(well)),
+    "with jacobian": lambda jit: ParticleField(jit(mirror), jacobian=jit(mirror_jacobian)),
+    "varying": lambda jit: ParticleField(magnetic=jit(turning), electric=jit(induced), varies=True),
+    "numbers": lambda jit: ParticleField(magnetic=table),
+}
+FORMS = [(name, form) for name in FIELDS for form in ("canonical", "velocity") if name not in ("varying", "numbers")]
+FORMS += [("varying", "velocity"), ("numbers", "velocity")]
+INTERPRETED = [(*pair, False) for pair in FORMS[4:]]  # the first are compiled wherever Numba is
+COMPILED = [pytest.param(*pair, True, marks=[pytest.mark.needs_jit, pytest.mark.slow]) for pair in FORMS[:-1]]
+
+
+@pytest.mark.filterwarnings("ignore:ParticleField. the divergence")
+@pytest.mark.parametrize(("name", "form", "compiled"), [*INTERPRETED, *COMPILED])
+def test_charged_particle(name, form, compiled):
+    field, rng = FIELDS[name](njit if compiled else lambda fun: fun), np.random.default_rng(6)
+    problem = charged_particle(
+        field, [0.6, -0.7, 0.3], [0.1, 0.2, -0.3], t_span=(0.2, 1.0), mass=1.3, charge=-0.8, form=form
+    )
+    assert jitted.is_jitted(problem.variational(())) == compiled
+    # Second differences, of A where its jacobian is computed, have fewer digits.
+    rtol = 1e-8 if name == "potentials" else RTOL
+    for parameters in ((), (0,), (1,), (1, 0)):
+        y = problem.y0 + rng.uniform(-0.1, 0.1, 6)
+        assert_variational(problem, y, rng, parameters, 3, 0.4, rtol)
+        assert_variational(problem, y, rng, parameters, 0 if parameters else 1, 0.4, rtol)
+    with pytest.raises(ValueError, match=r"by its state, by parameter 0, the mass, .*; got parameters=\(2,\)"):
+        problem.variational((2,))
+
+
+@pytest.mark.needs_jit
+@pytest.mark.slow
+def test_flow_of_a_particle():
+    """Sensitivities of a projected run, against complex steps through the closed form: drift in constant fields."""
+    E, B = 0.3, 1.7
+
+    def exact(s, t):  # s: x, y, u, v, mass, charge; E along x, B along z
+        x, y, u, v, m, q = s
+        w, drift = q * B / m, -E / B
+        c, n, v = np.cos(w * t), np.sin(w * t), v - drift
+        return np.array([x + (u * n + v * (1 - c)) / w, y + drift * t + (v * n - u * (1 - c)) / w,
+                         u * c + v * n, drift + v * c - u * n])  # fmt: skip
+
+    field = ParticleField(
+        magnetic=njit(lambda x, y, z: (0.0, 0.0, B)), potential=njit(lambda x, y, z: -E * x),
+        electric=njit(lambda x, y, z: (E, 0.0, 0.0)),
+    )  # fmt: skip
+    s, t = np.array([0.2, 0.1, 0.4, -0.3, 1.2, 0.9]), 40.0
+    problem = charged_particle(
+        field, [*s[:2], 0.0], [*s[2:4], 0.0], t_span=(0, t), mass=s[4], charge=s[5], form="velocity"
+    )
+    run = integrate(problem, method=EIPDOP853, h=0.1, variations=["state", "mass", "charge"])
+    slopes = np.array([exact(s + 1e-30j * unit, t).imag / 1e-30 for unit in np.eye(6)]).T
+    columns = run.variations[-1][np.ix_([0, 1, 3, 4], [0, 1, 3, 4, 6, 7])]
+    assert np.abs(columns - slopes).max() < 1e-10 * np.abs(slopes).max()
+    alone, wide = (integrate(problem, method=EIPDOP853, h=0.1, variations=asked) for asked in (None, "state"))
+    np.testing.assert_array_equal(wide.y, alone.y)

@@ -175,7 +175,7 @@ def nbody(
         source=source,
         reference=reference,
         jacobian=library["gravity.central"],
-        variational=None if "drag" in chosen else partial(library_variational, f"{equations}.variational", ()),
+        variational=partial(library_variational, f"{equations}.variational", ()),
         frequencies=partial(orbital_frequencies, masses),
         epoch=epoch,
         G=G,

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, cast
 from ...core.gradients import DIFFERENCE_WEIGHTS
 from ...core.jitted import compiled_like, is_compiled, is_jitted
 
-__all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like"]
+__all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like", "jitable"]
 
 MASS, CHARGE = 0, 1  # places in the parameters
 
@@ -53,7 +53,7 @@ def jit_like(fun: Callable[..., Any], *others: Callable[..., Any] | None) -> Cal
 _inlined: list[Callable[..., Any]] = []
 
 
-def _jitable(fun: Callable[..., Any]) -> Callable[..., Any]:
+def jitable(fun: Callable[..., Any]) -> Callable[..., Any]:
     """Mark a function that compiled ones call."""
     _inlined.append(fun)
     return fun
@@ -116,7 +116,7 @@ def _canonical(field: FieldFunctions) -> ParticleEquations:
     )
 
 
-@_jitable
+@jitable
 def canonical_rhs(A, jacobian, E, t, y, out, m, q):
     """Canonical: x' = v = (p - q A) / m, p_j' = q (sum_i v_i dA_i/dx_j + E_j)."""
     a = A(t, y[0], y[1], y[2])
@@ -134,7 +134,7 @@ def canonical_rhs(A, jacobian, E, t, y, out, m, q):
     out[5] = q * (u * d[0][2] + v * d[1][2] + w * d[2][2] + e[2])
 
 
-@_jitable
+@jitable
 def canonical_energy(A, phi, t, y, m, q):
     """H = |p - q A|^2 / (2 m) + q phi (the paper's eq. 3.7)."""
     a = A(t, y[0], y[1], y[2])
@@ -207,7 +207,7 @@ def _velocity(field: FieldFunctions) -> ParticleEquations:
     )
 
 
-@_jitable
+@jitable
 def velocity_rhs(E, B, t, y, out, ratio):
     """Newton's: x' = v, v' = (q / m) (E + v x B) (the paper's eq. 3.8)."""
     e = E(t, y[0], y[1], y[2])
@@ -221,7 +221,7 @@ def velocity_rhs(E, B, t, y, out, ratio):
     out[5] = ratio * (e[2] + u * b[1] - v * b[0])
 
 
-@_jitable
+@jitable
 def velocity_energy(phi, t, y, m, q):
     """H = m |v|^2 / 2 + q phi."""
     return 0.5 * m * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5]) + q * phi(t, y[0], y[1], y[2])
@@ -240,7 +240,7 @@ def kinetic_energy_gradient(t, y, out, params):
     out[5] = params[MASS] * y[5]
 
 
-@_jitable
+@jitable
 def velocity_energy_gradient(E, t, y, out, m, q):
     """Of H: (-q E, m v)."""
     e = E(t, y[0], y[1], y[2])
@@ -252,14 +252,14 @@ def velocity_energy_gradient(E, t, y, out, m, q):
     out[5] = m * y[5]
 
 
-@_jitable
+@jitable
 def velocity_momentum(A, t, y, m, q):
     """L = x p_y - y p_x with p = m v + q A."""
     a = A(t, y[0], y[1], y[2])
     return y[0] * (m * y[4] + q * a[1]) - y[1] * (m * y[3] + q * a[0])
 
 
-@_jitable
+@jitable
 def velocity_momentum_gradient(A, jacobian, t, y, out, m, q):
     """Of L."""
     a = A(t, y[0], y[1], y[2])

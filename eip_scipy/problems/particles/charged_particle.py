@@ -17,6 +17,7 @@ from ...core.inputs import refuse_units
 from ...core.invariants import Invariant
 from ...core.names import nearest
 from ...core.problem import Problem, bind
+from ._columns import variational
 from ._equations import CHARGE, MASS, ParticleEquations, compose
 from .fields import TOKAMAK, UNIFORM, ParticleField
 
@@ -44,6 +45,11 @@ class ParticleProblem(Problem):
 
     field: ParticleField = UNIFORM
     form: str = "canonical"
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values of the parameters by name."""
+        return {"mass": self.mass, "charge": self.charge}
 
     @property
     def mass(self) -> float:
@@ -182,9 +188,21 @@ def charged_particle(
         units=units,
         source=source,
         reference=reference,
+        variational=partial(_variational, equations.rhs, field, form, (float(t_span[0]), *x.tolist())),
         field=field,
         form=form,
     )
+
+
+@lru_cache(maxsize=32)
+def _variational(
+    rhs: Callable[..., None],
+    field: ParticleField,
+    form: str,
+    start: tuple[float, ...],
+    parameters: tuple[int, ...],
+) -> Callable[..., None]:
+    return variational(rhs, field.functions, form, field.length, start, parameters)
 
 
 @lru_cache(maxsize=32)

@@ -118,6 +118,30 @@ struct PullSlope {
     }
 };
 
+// The derivative of `drag` on body i; a body that moves with the air has none.
+struct DragSlope {
+    Three x, u, turn;
+    double over_square = 0.0, density = 0.0, falls = 0.0;
+
+    DragSlope() = default;
+    DragSlope(const double *y, const Bodies &b, int64_t i)
+        : x(body(y, i) - body(y, 0)),
+          turn(sum(b.k[SPIN], b.pole(), 0.0, x)) {
+        u = sum(1.0, body(y, b.n + i) - body(y, b.n), -1.0, cross(turn, x));
+        const double r = std::sqrt(dot(x, x)), square = dot(u, u);
+        falls = 1.0 / (b.k[SCALE_HEIGHT] * r);
+        if (square == 0.0) return;
+        density = -b.k[DRAG] * std::exp(-(r - b.k[BASE]) / b.k[SCALE_HEIGHT]) * std::sqrt(square);
+        over_square = 1.0 / square;
+    }
+
+    // Along (dx, dv).
+    Three along(const Three &dx, const Three &dv) const {
+        const Three du = sum(1.0, dv, -1.0, cross(turn, dx));
+        return sum(density * (dot(u, du) * over_square - dot(x, dx) * falls), u, density, du);
+    }
+};
+
 // Of a state with columns of derivatives behind it: the derivatives first, which need Newton's accelerations.
 void variational(const Given<double> &g) {
     const Bodies b(g);
@@ -131,9 +155,13 @@ void variational(const Given<double> &g) {
     add_pulls(g.y, g.y + 3 * b.n, b, a);
     for (int64_t i = 1; i < b.n; ++i) {
         const PullSlope pull(g.y, b, i);
+        const bool drags = b.k[DRAG] > 0.0;
+        const DragSlope drag = drags ? DragSlope(g.y, b, i) : DragSlope();
         for (int64_t k = 1; k <= columns; ++k) {
-            const double *dq = g.y + size * k, *dv = dq + 3 * b.n;
-            const Three slope = pull.along(body(dq, i) - body(dq, 0), body(dv, i) - body(dv, 0));
+            const double *q = g.y + size * k, *v = q + 3 * b.n;
+            const Three dx = body(q, i) - body(q, 0), dv = body(v, i) - body(v, 0);
+            Three slope = pull.along(dx, dv);
+            if (drags) slope = sum(1.0, slope, 1.0, drag.along(dx, dv));
             add(a + size * k, i, 1.0, slope);
             add(a + size * k, 0, -b.gm[i] / b.gm[0], slope);
         }
