@@ -29,14 +29,28 @@ inline void put_column(const Columns &columns, int64_t c, const double *column, 
     copy(column + cut, y + columns.second(c), columns.size - cut);
 }
 
-// A correction of one column, made neutral to the frame, whose rows go over all of a state.
+// Change a column, or a row as long, as numbers in their places in a state: itself where the places are the same.
+template <class W, class Change>
+inline void change_in_place(const Columns &columns, const W &w, double *column, const Change &change) {
+    if (columns.half == 0) return change(column);
+    put_column(columns, -1, column, w.stage);  // what the other places hold is not read
+    change(w.stage);
+    take_column(columns, -1, w.stage, column);
+}
+
+// The gradients of the state, packed, and from them the rows of Q, in the weights `sigma`. Only what belongs to the state is
+// touched: the columns behind it are many times longer.
 template <class W>
-inline void keep_frame_of_column(const Options &o, const W &w, double *move) {
-    double *whole = w.stage;
-    fill(whole, 0.0, w.m);
-    put_column(o.columns, -1, move, whole);
-    keep_frame(o.frame, w, whole, w.move);
-    take_column(o.columns, -1, w.move, move);
+inline void weigh_packed_rows(const Options &o, const W &w, const double *sigma) {
+    const Columns &columns = o.columns;
+    pack_rows(columns, w.G, w.l, w.m);
+    for (int64_t i = 0; i < w.l; ++i) {
+        double *row = w.Q + i * w.m;
+        copy(w.gradient(i), row, columns.size);
+        if (o.frame.rows > 0)
+            change_in_place(columns, w, row, [&](double *whole) { remove_sparse(o.frame, 1, w.products, whole); });
+        for (int64_t j = 0; j < columns.size; ++j) row[j] *= sigma[j];
+    }
 }
 
 // The columns M (count, size) moved onto G M = kept, each by the least correction in the weights sigma of the state. The
@@ -56,7 +70,8 @@ inline void project_each(const Options &o, const W &w, double *M, int64_t rank, 
             for (int64_t j = 0; j < n; ++j) move[j] += factor * row[j];
         }
         for (int64_t j = 0; j < n; ++j) move[j] *= sigma[j];
-        if (o.frame.rows > 0) keep_frame_of_column(o, w, move);
+        if (o.frame.rows > 0)
+            change_in_place(columns, w, move, [&](double *whole) { remove_sparse(o.frame, 0, w.products, whole); });
         for (int64_t j = 0; j < n; ++j) column[j] += move[j];
     }
 }
@@ -104,16 +119,14 @@ template <class AnyRun>
     }
     run.system.grad(w, step.t_new, step.y_new, w.f_point, w.G);
     ++w.counters[NJEV];
-    weigh_rows(o.frame, w, w.Q);
-    pack_rows(columns, w.G, w.l, w.m);
-    pack_rows(columns, w.Q, w.l, w.m);
     const bool in_halves = columns.half > 0;
     double *M = in_halves ? w.err : step.y_new + n, *scratch = w.err_low;
     for (int64_t c = 0; in_halves && c < columns.count; ++c) take_column(columns, c, step.y_new, M + c * n);
+    take_column(columns, -1, w.sigma, scratch);
+    weigh_packed_rows(o, w, scratch);
     const Matrix rows{w.Q, w.l, n, w.m};
     const int64_t rank = factor(rows, w.inverse_norms, corner(w.R, w.l, w), w.pivots);
     ++w.counters[NLU];
-    take_column(columns, -1, w.sigma, scratch);
     if (rank > 0) project_each(o, w, M, rank, rows, scratch);
     if (columns.symplectic) restore_symplectic(n, M, scratch, w.move);
     for (int64_t c = 0; in_halves && c < columns.count; ++c) put_column(columns, c, M + c * n, step.y_new);
