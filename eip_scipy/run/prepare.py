@@ -277,6 +277,11 @@ class Prepared:
         return str(self.request.method.__name__)
 
     @property
+    def parameter_names(self) -> dict[int, str]:
+        """Return the names of the problem's parameters by their places, as far as it names them."""
+        return dict(enumerate(self.asked.fun.parameters)) if isinstance(self.asked.fun, Problem) else {}
+
+    @property
     def component_names(self) -> tuple[str, ...] | None:
         """Those of the problem, where it has the run's components."""
         names = self.asked.fun.component_names if isinstance(self.asked.fun, Problem) else None

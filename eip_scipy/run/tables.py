@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +37,9 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
     -------
     xarray.Dataset
         ``y`` (component, t) with the coordinates ``component`` and ``t``: ``data.y.sel(component="x")``. With
-        invariants ``invariants`` and ``invariant_errors``, I - target, both (invariant, t), and ``max_defect``. Its
+        invariants ``invariants`` and ``invariant_errors``, I - target, both (invariant, t), and ``max_defect``. With
+        derivatives ``variations`` (t, component, column); a column is named after the component of the initial state or
+        the parameter that it is the derivative by, or 0, 1 and so on. Its
         attributes are method, h (nan: adaptive steps), message, trusted (1 or 0) and the like, as far as there are any.
 
     Raises
@@ -66,6 +69,9 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
         variables["invariants"] = (("invariant", "t"), both[:, 0])
         variables["invariant_errors"] = (("invariant", "t"), both[:, 1])
         variables["max_defect"] = (("invariant",), np.asarray(result.max_defect))
+    if "variations" in result:
+        coordinates["column"] = column_names(result, coordinates["component"])
+        variables["variations"] = (("t", "component", "column"), np.asarray(result.variations))
     attributes = {name: result[name] for name in DESCRIBED if name in result}
     return dataset(variables, coordinates, attributes)
 
@@ -82,7 +88,8 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
     -------
     pandas.DataFrame
         Indexed by ``t``: a column for each component, then for each invariant its value, "H", and "H error", the value
-        less the target. Where a component has the name of an invariant, the latter is "invariant H". Of an ensemble
+        less the target. Where a component has the name of an invariant, the latter is "invariant H". Last come
+        derivatives, "dx/dvy" of x by the initial vy; see `to_xarray` for the names. Of an ensemble
         indexed by ``member``: a column for each component of the last state, then "t_end", "status", "message",
         "trusted", and "H max_defect" for each invariant.
 
@@ -112,6 +119,10 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
     for name, (values, errors) in invariant_rows(result).items():
         label = f"invariant {name}" if name in columns else name
         columns |= {label: values, f"{label} error": errors}
+    if "variations" in result:
+        components = component_names(result, names)
+        for k, by in enumerate(column_names(result, components)):
+            columns |= {f"d{name}/d{by}": result.variations[:, i, k] for i, name in enumerate(components)}
     return pandas.DataFrame(columns, index=pandas.Index(result.t, name="t"))
 
 
@@ -135,6 +146,14 @@ def invariant_rows(result: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     for k, (name, values) in enumerate(zip(result.diagnostics.names, result.invariants, strict=True)):
         rows[f"{name} ({k})" if name in rows else name] = values, values - result.target[k]
     return rows
+
+
+def column_names(result: Any, components: Sequence[str]) -> list[str]:
+    """Return of each column of derivatives what it is by: a component, a parameter, or the column's number."""
+    known = result.get("columns", {})
+    names = [*(components if known.get("state") else ()), *known.get("names", ())]
+    count = result.variations.shape[2]
+    return names if len(names) == count else [str(k) for k in range(count)]
 
 
 def component_names(result: Any, names: Any = None, n: int | None = None) -> tuple[str, ...]:

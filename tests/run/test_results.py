@@ -21,6 +21,7 @@ from eip_scipy import (
     Invariant,
     ProjectionWarning,
     ensemble,
+    hamiltonian,
     integrate,
     load,
 )
@@ -97,6 +98,28 @@ def test_to_xarray():
     for name in ("method", "h", "message", "trusted", "nfev"):
         assert data.attrs[name] == run[name]
     assert to_xarray(run, "a b c d").component.values.tolist() == ["a", "b", "c", "d"]
+
+
+def test_tables_of_derivatives():
+    run = integrate(kepler(), (0, 1), method=EIPRK4, variations=["state", 0])
+    data, frame = run.to_xarray("a b c d"), run.to_dataframe()
+    np.testing.assert_array_equal(data.variations.sel(component="a", column="d"), run.stm[:, 0, 3])
+    np.testing.assert_array_equal(data.variations.sel(column="params[0]"), run.sensitivities[..., 0])
+    np.testing.assert_array_equal(frame["dvx/dy"], run.stm[:, 2, 1])
+    assert frame.columns[-1] == "dvy/dparams[0]"
+    along = integrate(kepler(), (0, 1), method=EIPRK4, variations=np.eye(4)[:, 1:3])
+    assert along.to_xarray().column.values.tolist() == ["0", "1"]
+    np.testing.assert_array_equal(along.to_dataframe()["dx/d1"], along.variations[:, 0, 1])
+
+
+@pytest.mark.needs_jit
+@pytest.mark.slow
+def test_tables_of_named_sensitivities():
+    named = hamiltonian("p**2/2 - k*cos(q)", params={"k": 1.0})
+    run = integrate(named, (0, 1), [0.1, 0.2], method=EIPRK4, h=0.1, variations="k")
+    assert run.to_xarray().column.values.tolist() == ["k"]
+    again = pickle.loads(pickle.dumps(run))
+    np.testing.assert_array_equal(again.to_dataframe()["dq/dk"], run.sensitivities[:, 0, 0])
 
 
 def test_errors_are_from_the_target():
