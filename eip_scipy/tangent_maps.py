@@ -96,6 +96,13 @@ class LyapunovSpectrum(_Followed):
     running: Array
     columns: Array = field(repr=False)
 
+    def plot(self) -> Any:
+        """Draw the estimates against time; needs ``pip install "eip_scipy[plot]"``."""
+        from .plotting.chaos import indicator_figure
+
+        curves = {f"column {k}": values for k, values in enumerate(self.running.T)}
+        return indicator_figure(self.t, curves, ylabel="Lyapunov exponents")
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Megno(_Followed):
@@ -127,6 +134,12 @@ class Megno(_Followed):
     Y: Array = field(repr=False)
     mean: Array = field(repr=False)
     log_size: Array = field(repr=False)
+
+    def plot(self) -> Any:
+        """Draw MEGNO and its mean against time; needs ``pip install "eip_scipy[plot]"``."""
+        from .plotting.chaos import REGULAR, indicator_figure
+
+        return indicator_figure(self.t, {"MEGNO": self.Y, "mean": self.mean}, ylabel="MEGNO", level=REGULAR)
 
 
 @dataclass(frozen=True, eq=False)

@@ -342,6 +342,31 @@ def test_runs_that_end_early():
     assert fails.t[-1] <= 1
 
 
+def test_figures():
+    pytest.importorskip("matplotlib")
+    from eip_scipy.plotting.chaos import stability_map
+
+    def swings(t, y):
+        return np.array([y[1], -np.sin(y[0])])
+
+    run = megno(swings, (0, 5), [0.5, 0.0], method=EIPRK4, h=0.1)
+    (axis,) = run.plot().axes
+    np.testing.assert_array_equal(axis.lines[1].get_ydata(), run.mean)
+    spectrum = lyapunov_spectrum(swings, (0, 5), [0.5, 0.0], method=EIPRK4, h=0.1, every=1.0)
+    (axis,) = spectrum.plot().axes
+    np.testing.assert_array_equal(axis.lines[1].get_ydata(), spectrum.running[:, 1])
+    values = [[2.0, np.inf, 1.9], [np.nan, 5.0, -1.0]]
+    figure = stability_map([1, 2, 3], [0.1, 0.2], values, xlabel="a", ylabel="e", title="T")
+    axis, bar = figure.axes
+    drawn = axis.collections[0].get_array()
+    np.testing.assert_array_equal(np.ma.filled(drawn, np.nan).reshape(2, 3), [[2, 8, 1.9], [np.nan, 5, 0]])
+    assert (axis.get_xlabel(), axis.get_ylabel(), bar.get_ylabel()) == ("a", "e", "mean MEGNO (2: regular)")
+    with pytest.raises(ValueError, match=r"shape \(2, 3\)"):
+        stability_map([1, 2, 3], [0.1, 0.2], np.ones((3, 2)))
+    with pytest.raises(ValueError, match="most must be above 2"):
+        stability_map([1, 2, 3], [0.1, 0.2], values, most=2.0)
+
+
 # Two planets, against REBOUND.
 
 

@@ -1,0 +1,93 @@
+"""Figures of chaos indicators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import method_styles, typeset
+from .shown import shown_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["draw_stability", "indicator_figure", "stability_map"]
+
+REGULAR = 2.0  # MEGNO of a regular orbit
+
+
+def stability_map(
+    x: Any, y: Any, megno: Any, *, xlabel: str = "x", ylabel: str = "y", title: str = "", most: float = 8.0
+) -> Figure:
+    """Draw a map of MEGNO over two quantities.
+
+    Parameters
+    ----------
+    x, y : array_like, shape (k,) and (j,)
+        Values of the quantities, ascending.
+    megno : array_like, shape (j, k)
+        The mean MEGNO at each pair; values above `most` and inf have one colour, nan has none.
+    xlabel, ylabel, title : str, optional
+    most : float, optional
+        Upper end of the colours, above 2.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        When the shapes do not fit.
+    """
+    figure = shown_figure(6.4, 4.6)
+    if title:
+        figure.suptitle(typeset(title), fontsize="large")
+    axis = figure.add_subplot()
+    image = draw_stability(axis, x, y, megno, most)
+    figure.colorbar(image, ax=axis, extend="max", label="mean MEGNO (2: regular)")
+    axis.set_xlabel(xlabel)
+    axis.set_ylabel(ylabel)
+    return figure
+
+
+def draw_stability(axis: Axes, x: Any, y: Any, megno: Any, most: float) -> Any:
+    """Draw the cells of such a map, and return them for a colour bar."""
+    x, y, values = (np.asarray(item, dtype=float) for item in (x, y, megno))
+    if values.shape != (y.size, x.size):
+        raise ValueError(f"megno must have the shape {(y.size, x.size)} of (y, x), got {values.shape}.")
+    if not most > REGULAR:
+        raise ValueError(f"most must be above {REGULAR:g}, MEGNO of a regular orbit, got {most!r}.")
+    # From 0, the value of a harmonic oscillator. Viridis is read without telling red from green.
+    return axis.pcolormesh(x, y, np.clip(values, 0.0, most), cmap="viridis", vmin=0.0, vmax=most, shading="nearest")
+
+
+def indicator_figure(t: Any, curves: Mapping[str, Any], *, ylabel: str, level: float | None = None) -> Figure:
+    """Draw indicators against time.
+
+    Parameters
+    ----------
+    t : array_like, shape (m,)
+    curves : mapping of str to array_like, shape (m,)
+    ylabel : str
+    level : float, optional
+        A value to mark.
+
+    Returns
+    -------
+    Figure
+    """
+    figure = shown_figure(5.6, 4.0)
+    axis = figure.add_subplot()
+    for (name, values), style in zip(curves.items(), method_styles(curves).values(), strict=True):
+        axis.plot(t, values, lw=1.1, **style | {"marker": None, "label": name})
+    if level is not None:
+        axis.axhline(level, color="#777777", lw=0.8, ls=":")
+    axis.set_xlabel("t")
+    axis.set_ylabel(ylabel)
+    axis.legend(fontsize="small", loc="best")
+    axis.grid(alpha=0.3)
+    return figure
