@@ -61,17 +61,26 @@ inline Code any_raw_step(const AnyRun &run, const Step &step) {
     return run.hooks && run.hooks->raw ? static_cast<Code>(run.hooks->raw_step(step)) : raw_step(run, step);
 }
 
-// The balances at the end of a step, and their rates at the state where w.last() is the derivative: rates by another state
-// would hold what the derivatives differ by. Batches of members have no balances.
-template <class AnyRun>
-inline void close_balances(const AnyRun &, const Step &, const double *) {}
-template <class W>
-inline void close_balances(const RunOf<W, System> &run, const Step &step, const double *y) {
-    const auto &w = run.work;
-    if (w.balances == 0) [[likely]]
-        return;
+// The balances at the end y of a step, and their rates at the state where w.last() is the derivative, which is found at y if
+// it is `wanted`: rates by another state would hold what the derivatives differ by.
+[[gnu::noinline]] inline void close_balances(const Run &run, double t, const double *y, bool wanted) {
+    const Work &w = run.work;
     keep_levels(run.options.balances, w);
-    run.system.rates(of_any_length(run).work, step.t_new, y, w.last(), w.rate(w.stages));
+    if (wanted)
+        run.system.rhs_and_rates(w, t, y, w.last(), w.rate(w.stages));
+    else
+        run.system.rates(w, t, w.y_hat, w.last(), w.rate(w.stages));
+}
+
+// f at the end y of a step in w.last(), if it is `wanted`, and the balances there. Batches of members have none.
+template <class AnyRun>
+inline void close_derivative(const AnyRun &run, double t, const double *y, bool wanted) {
+    const auto &w = run.work;
+    w.counters[NFEV] += wanted;
+    if constexpr (IS_SINGLE<AnyRun>)
+        if (w.balances > 0) [[unlikely]]
+            return close_balances(of_any_length(run), t, y, wanted);
+    if (wanted) run.system.rhs(w, t, y, w.last());
 }
 
 // After the projection: the carry, the errors gathered, and f for the next step's first stage in w.last().
@@ -92,13 +101,8 @@ inline void close_step(const AnyRun &run, const Step &step, Code status) {
         else if (o.metric == BY_ERROR || o.every == AUTO || o.adaptive)
             quadrature(w.err, w.err_sum, w.err_sum, w.m);
     }
-    if (!w.counters[HAVE_F] || (step.project && status == OK && !o.reuse_f)) {
-        run.system.rhs(w, step.t_new, step.y_new, w.last());
-        ++w.counters[NFEV];
-        close_balances(run, step, step.y_new);
-    } else {
-        close_balances(run, step, w.y_hat);
-    }
+    const bool wanted = !w.counters[HAVE_F] || (step.project && status == OK && !o.reuse_f);
+    close_derivative(run, step.t_new, step.y_new, wanted);
 }
 
 // The columns of derivatives behind a state that has been projected. Batches of members have none.

@@ -146,7 +146,8 @@ void add_library(nb::module_ &module) {
             return nb::make_tuple(made, nb::make_tuple(f.name, f.own));
         });
     nb::dict library;
-    for (const auto functions : {kepler_functions(), gravity_functions(), force_functions(), orbit_functions()})
+    for (const auto functions :
+         {kepler_functions(), gravity_functions(), force_functions(), orbit_functions(), planet_functions()})
         for (const Function &function : functions)
             library[function.name] = nb::cast(&function, nb::rv_policy::reference);
     module.attr("LIBRARY") = library;

@@ -23,6 +23,10 @@ struct Given {
 template <class T>
 using LibraryPointer = void (*)(double t, const T *y, const T *f, T *out, const T *params, int64_t n, int64_t p);
 
+// The derivative of a state of n numbers, or the accelerations at n numbers of positions, in `out`; in `pulls` the
+// accelerations without those by the first of the p bodies whose G m are the parameters.
+using ApartPointer = void (*)(const double *y, double *out, double *pulls, const double *params, int64_t n, int64_t p);
+
 // A function of `Given` as such a pointer.
 template <class T, void (*FUNCTION)(const Given<T> &)>
 void plain(double t, const T *y, const T *f, T *out, const T *params, int64_t n, int64_t p) {
@@ -43,8 +47,10 @@ struct LibraryFunction {
     LibraryPointer<double> one;
     LibraryPointer<Octet> eight;  // null where there is none
     bool (*fits)(int64_t n, int64_t p);
-    const char *sizes;          // what fits
-    std::vector<double> own{};  // parameters that replace those of the run; empty in the library itself
+    const char *sizes;                          // what fits
+    ApartPointer apart = nullptr;               // null where there is none
+    LibraryPointer<double> by_pulls = nullptr;  // of rates: from such pulls in the place of f
+    std::vector<double> own{};                  // parameters that replace those of the run; empty in the library itself
 
     bool is_gradient() const { return value == Value::GRADIENT || value == Value::GRADIENT_BY_F; }
     bool is_numbers() const { return value == Value::NUMBERS || value == Value::RATES; }
@@ -65,6 +71,8 @@ struct LibraryCall {
     LibraryPointer<T> pointer = nullptr;
     const T *own = nullptr;
     int64_t n_own = 0;
+    ApartPointer apart = nullptr;
+    LibraryPointer<T> by_pulls = nullptr;
 
     explicit operator bool() const { return pointer; }
     void operator()(double t, const T *y, const T *f, T *out, const T *params, int64_t n, int64_t p) const {
@@ -81,5 +89,6 @@ std::span<const LibraryFunction> kepler_functions();
 std::span<const LibraryFunction> gravity_functions();
 std::span<const LibraryFunction> force_functions();
 std::span<const LibraryFunction> orbit_functions();
+std::span<const LibraryFunction> planet_functions();
 
 }  // namespace eip

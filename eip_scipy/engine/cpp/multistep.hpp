@@ -138,7 +138,8 @@ inline void begin_sums(const Multistep &ms, int64_t back, double *scratch) {
     weighted_sum(1.0, latest(ms, ms.states_q + back * n, n), scratch, half);
     weighted_sum(1.0, latest(ms, ms.states_v + back * n, n), scratch + half, half);
     for (int64_t i = 0; i < half; ++i) {
-        const Pair v = quotient({s[i], s[ms.pitch + i]}, h), q = quotient({S[i], S[ms.pitch + i]}, square);
+        const Pair v = quotient<double>({s[i], s[ms.pitch + i]}, h),
+                   q = quotient<double>({S[i], S[ms.pitch + i]}, square);
         const Pair first = sum(v, {-scratch[half + i], 0.0}), moved = product(first, {lag, 0.0});
         const Pair second = sum(sum(q, moved), {-scratch[i], 0.0});
         s[i] = first.value;
@@ -167,22 +168,41 @@ inline Pair balance_at(const Multistep &ms, int64_t back, int64_t b) {
 // The sum of the rates, from the values at the oldest node, which are those of w.level.
 inline void begin_rate_sums(const Multistep &ms, const Work &w) {
     for (int64_t b = 0; b < ms.balances; ++b) {
-        const Pair scaled = quotient({w.level[b], w.level_carry[b]}, {ms.h, 0.0});
+        const Pair scaled = quotient<double>({w.level[b], w.level_carry[b]}, {ms.h, 0.0});
         const Pair first = sum(scaled, Pair{-rates_beside_sum(ms, ms.order - 1, b), 0.0});
         ms.rate_sums[b] = first.value;
         ms.rate_sums[ms.balances + b] = first.rest;
     }
 }
 
-// The rates of the next node, whose state is in w.stage and whose acceleration has not been corrected, and their sum. What
-// the correction changes is as large as the errors of the predictor, and more than the rates' own.
-inline void add_rates(const Run &run, double t, const double *a) {
+// The acceleration of the next node at the predicted state y, and its rates. They are those of the acceleration that has not
+// been corrected: what the correction changes is as large as the errors of the predictor, and more than the rates' own.
+inline void rated_acceleration(const Run &run, double t, double *y, double *a) {
     const Multistep &ms = *run.method.multistep;
     const Work &w = run.work;
-    double *rates = ms.rates_at(ms.place[NEWEST_ROW] + 1), *s = ms.rate_sums, *s_rest = s + ms.balances;
+    double *rates = ms.rates_at(ms.place[NEWEST_ROW] + 1);
+    if (run.system.rates_by_pulls && run.system.second_order) {
+        run.system.accelerate_with_pulls(w, y, a);
+        return run.system.rates_from_pulls(w, t, y, rates);
+    }
+    copy(y, w.stage, w.m);
+    run.system.acceleration(w, t, y, w.row(1), a);
     copy(w.stage + ms.half, w.row(1), ms.half);
     copy(a, w.row(1) + ms.half, ms.half);
     run.system.rates(w, t, w.stage, w.row(1), rates);
+}
+
+template <class AnyRun>
+inline void accelerate_node(const AnyRun &run, double t, double *y, double *a) {
+    if constexpr (IS_SINGLE<AnyRun>)
+        if (run.method.multistep->balances > 0) return rated_acceleration(of_any_length(run), t, y, a);
+    run.system.acceleration(run.work, t, y, run.work.row(1), a);
+}
+
+// These rates to their sum.
+inline void add_rates(const Multistep &ms) {
+    const double *rates = ms.rates_at(ms.place[NEWEST_ROW] + 1);
+    double *s = ms.rate_sums, *s_rest = s + ms.balances;
     for (int64_t b = 0; b < ms.balances; ++b) {
         const Pair first = two_sum(s[b], rates[b]);
         s[b] = first.value;
@@ -363,14 +383,10 @@ inline Code add_node(const AnyRun &run) {
     if (ms.uses_v || ms.balances > 0) predict(latest(ms, ms.predict_v, ms.order), {ms.h, 0.0}, s, s_rest, y + ms.half);
     if (ms.count > 0) row_sums(latest(ms, ms.correction, ms.order), older, ms.first, ms.first + ms.count);
     double *a = next_row(ms);
-    if (ms.balances > 0) [[unlikely]]
-        copy(y, w.stage, w.m);
-    run.system.acceleration(w, t, y, w.row(1), a);
+    accelerate_node(run, t, y, a);
     ++w.counters[NFEV];
     if (run.system.MEMBERS == 1 && !is_finite_row(ms, a)) return NOT_FINITE;
-    if constexpr (IS_SINGLE<AnyRun>)
-        if (ms.balances > 0) [[unlikely]]
-            add_rates(of_any_length(run), t, a);
+    add_rates(ms);
     if (ms.count > 0) correct_node(run, t, y, older, a);
     add_to_sums(ms, a);
     ++ms.place[NEWEST_ROW];

@@ -333,7 +333,8 @@ Members members_of(nb::handle members, const Data &run, const Schedule &schedule
 
 // A function of the library's for one state or for eight.
 static void take(const LibraryFunction &function, LibraryCall<double> &place) {
-    place = {function.one, function.own.empty() ? nullptr : function.own.data(), std::ssize(function.own)};
+    place = {function.one, function.own.empty() ? nullptr : function.own.data(), std::ssize(function.own),
+             function.apart, function.by_pulls};
 }
 static void take(const LibraryFunction &function, LibraryCall<Octet> &place) {
     if (function.own.empty()) place = {function.eight};
@@ -444,6 +445,7 @@ void read_pointers(nb::handle functions, const Work &w, int64_t events, nb::list
         system.jacobian_pointer = pointer_of<Native<GradientPointer>>(jacobian, "jacobian", w.m / 2, w.m / 2, p);
     system.scratch.resize(w.m);
     system.scratch_f.resize(w.m);
+    if (!system.balances.empty()) system.pulls.resize(w.m / 2);
 }
 
 OctetSystem octet_system_of(nb::handle functions, const Data &run) {

@@ -48,8 +48,10 @@ inline bool made_with_rates(const AnyRun &, const Step &) {
     for (int64_t i = 1; i < m.stages; ++i) {
         const double t = step.t + m.c[i] * step.h;
         combine(step.y, step.h, {m.A + i * m.columns, w.K, i, w.m}, w.stage, w.m);
-        run.system.rhs(w, t, w.stage, w.row(i));
-        if (rated[i]) run.system.rates(w, t, w.stage, w.row(i), w.rate(i));
+        if (rated[i])
+            run.system.rhs_and_rates(w, t, w.stage, w.row(i), w.rate(i));
+        else
+            run.system.rhs(w, t, w.stage, w.row(i));
     }
     compensated_levels(step.h, m, run.options.balances, w);
     sum_stages(run, step);

@@ -90,6 +90,8 @@ struct System {
     double *params = nullptr;
     int64_t n_params = 0;
     std::vector<double> scratch, scratch_f, scratch_G;
+    std::vector<double> pulls;  // accelerations without those by the first body
+    bool rates_by_pulls = false;
     Shifts shifts;  // for gradients without a function
     FailedCall failed;
 
@@ -147,6 +149,48 @@ struct System {
                 python->rate_of(b, t, y, f, out);
             else
                 call_with_f(w, balance.rate, "rate", b, t, y, f, out);
+            out += balance.floats;
+        }
+    }
+
+    // Whether all rates are found from the pulls that come with the derivative: those of the same masses, of which none is
+    // larger than the first. Parameters may change from one run to the next.
+    void choose_rates() {
+        const double *first = params, *end = params + n_params;
+        rates_by_pulls = by_pointer && rhs_pointer.library.apart && !balances.empty() && n_params > 0 &&
+                         std::max_element(first, end) == first;
+        for (const Balance &balance : balances) {
+            const LibraryCall<double> &rate = balance.rate.library;
+            rates_by_pulls =
+                rates_by_pulls && rate.by_pulls && rate.n_own >= n_params && std::equal(first, end, rate.own);
+        }
+    }
+
+    // The derivative at a state that is kept, and the rates there.
+    template <class W>
+    void rhs_and_rates(const W &w, double t, const double *y, double *out, double *rates_out) {
+        if (!rates_by_pulls) {
+            rhs(w, t, y, out);
+            return rates(w, t, y, out, rates_out);
+        }
+        const int64_t half = w.m / 2;
+        if (second_order) copy(y + half, out, half);
+        accelerate_with_pulls(w, y, second_order ? out + half : out);
+        rates_from_pulls(w, t, y, rates_out);
+    }
+
+    // With `rates_by_pulls`: the derivative, or in systems of second order the accelerations, and `pulls`.
+    template <class W>
+    void accelerate_with_pulls(const W &w, const double *y, double *out) {
+        rhs_pointer.library.apart(y, out, pulls.data(), params, second_order ? w.m / 2 : w.m, n_params);
+    }
+
+    // And the rates by these, for a state (q, v) at which they were found.
+    template <class W>
+    void rates_from_pulls(const W &w, double t, const double *y, double *out) {
+        for (const Balance &balance : balances) {
+            const LibraryCall<double> &rate = balance.rate.library;
+            rate.by_pulls(t, y, pulls.data(), out, rate.own, w.m, rate.n_own);
             out += balance.floats;
         }
     }

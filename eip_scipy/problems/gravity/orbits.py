@@ -105,7 +105,13 @@ def orbital_balances(
         entries[place] = energy
         place += orbit.entries.size
     end = "_rate_newton" if newton else "_rate"
-    return tuple(_balance(quantity, entries, orbits, names, end) for quantity in chosen_quantities(quantities))
+    # Planets of the first body have functions for many of them side by side.
+    planets = about[0] < 0 and not about[1:].any()
+    own = {"energy": ("planets", np.concatenate([masses, start]))} if planets else {}
+    return tuple(
+        _balance(quantity, *own.get(quantity, ("orbits", entries)), orbits, names, end)
+        for quantity in chosen_quantities(quantities)
+    )
 
 
 def chosen_quantities(given: Any) -> tuple[str, ...]:
@@ -175,9 +181,11 @@ def _orbit(gm: Array, y0: Array, about: Array, body: int) -> _Orbit:
     return _Orbit(body, entries, floats, np.outer(np.repeat(sizes, 3), moves))
 
 
-def _balance(quantity: str, entries: Array, orbits: list[_Orbit], names: tuple[str, ...], end: str) -> Balance:
-    """Return the balance of one quantity for all orbits."""
-    fun, grad, rate = (library[f"orbits.{quantity}{part}"].bound(entries) for part in ("", "_gradient", end))
+def _balance(
+    quantity: str, group: str, entries: Array, orbits: list[_Orbit], names: tuple[str, ...], end: str
+) -> Balance:
+    """Return the balance of one quantity for all orbits, by the functions of a `group` of the library."""
+    fun, grad, rate = (library[f"{group}.{quantity}{part}"].bound(entries) for part in ("", "_gradient", end))
     each = 1 if quantity == "energy" else 3
     kept = Balance(fun, rate, grad, size=each * len(orbits), name=quantity, in_place=True, uses_f=True)
     # Neptune's energy changes at 0.05 of its terms, because the Sun is moved by Jupiter, and helps all the same.

@@ -11,6 +11,15 @@ void of_bodies(const Given<T> &g) {
     FUNCTION(g.y, g.params, g.p, g.out);
 }
 
+void rhs_apart(const double *y, double *out, double *pulls, const double *gm, int64_t, int64_t bodies) {
+    std::copy(y + 3 * bodies, y + 6 * bodies, out);
+    accelerate_apart(y, gm, bodies, out + 3 * bodies, pulls);
+}
+
+void acc_apart(const double *q, double *out, double *pulls, const double *gm, int64_t, int64_t bodies) {
+    accelerate_apart(q, gm, bodies, out, pulls);
+}
+
 template <class T>
 void energy(const Given<T> &g) {
     g.out[0] = energy_sum(g.y, g.params, g.p);
@@ -40,8 +49,8 @@ constexpr const char *POSITIONS = "positions, 3 numbers a body, and every G m";
 #define EIP_BOTH(function) plain<double, function<double>>, plain<Octet, function<Octet>>
 #define EIP_OF_BODIES(function) plain<double, of_bodies<double, function>>, plain<Octet, of_bodies<Octet, function>>
 const LibraryFunction functions[] = {
-    {"gravity.rhs", Value::DERIVATIVE, 0, EIP_OF_BODIES(newton_rhs), in_phase_space, BODIES},
-    {"gravity.acc", Value::ACCELERATION, 0, EIP_OF_BODIES(accelerate), at_positions, POSITIONS},
+    {"gravity.rhs", Value::DERIVATIVE, 0, EIP_OF_BODIES(newton_rhs), in_phase_space, BODIES, rhs_apart},
+    {"gravity.acc", Value::ACCELERATION, 0, EIP_OF_BODIES(accelerate), at_positions, POSITIONS, acc_apart},
     {"gravity.variational", Value::DERIVATIVE, 0, plain<double, variational>, nullptr, with_columns, COLUMNS},
     {"gravity.central", Value::GRADIENT_BY_F, 1, EIP_BOTH(central), at_positions_first, POSITIONS},
     {"gravity.energy", Value::NUMBERS, 1, EIP_BOTH(energy), in_phase_space, BODIES},

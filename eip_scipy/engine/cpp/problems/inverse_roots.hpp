@@ -56,4 +56,10 @@ struct Cube {
     }
 };
 
+// m x^-3/2 as by `Cube`.
+inline Vector over_cube(Vector x, Vector m) {
+    const Vector y = root_estimate(x), y2 = y * y, h = fused(-x, y2, spread_vector(1.0)), w = m * y * y2;
+    return fused(w * h, fused(spread_vector(15.0 / 8.0), h, spread_vector(3.0 / 2.0)), w);
+}
+
 }  // namespace eip

@@ -8,6 +8,10 @@
 //
 // The energy, in which large terms nearly cancel, is summed with the rounding errors carried along: what a projection
 // cannot see it cannot correct.
+//
+// With APART the accelerations come with a second sum, without the pulls of the first body: what is there before these are
+// added, which are the last ones in their stream. So perturbations of orbits about that body take no second pass, and no
+// difference in which its pulls would have to cancel.
 #pragma once
 
 #include <algorithm>
@@ -156,30 +160,38 @@ inline Octet squares(const Octet &x, const Octet &y, const Octet &z, const Octet
     return multiply_add(z, z, multiply_add(y, y, multiply_add(x, x, start)));
 }
 
-// Adds to `sums` the pulls of the sources j, j + 1, ..., each times `used`.
+// Adds to `sums` the pulls of the sources j, j + 1, ..., each times `used`; to `apart`, where it is given, those but the first.
 template <int TARGETS>
 inline void add_sources(const double *q, const double *gm, const Octet *own, int64_t j, int64_t first, Octet *sums,
-                        const Octet &used) {
+                        const Octet &used, Octet *apart = nullptr) {
     Octet d[3], m;
     load_sources<TARGETS>(q, gm, j, d, m);
     for (int c = 0; c < 3; ++c) d[c] -= own[c];
     // A body's own pull is 0 / 1.
     const Octet itself = ITSELF<TARGETS>(j - first + LANES / TARGETS);
     const Octet w = Cube(squares(d[0], d[1], d[2], itself)).times(m * used);
+    if (apart) {
+        const Octet others = TARGETS < LANES ? w * LANES_FROM(TARGETS) : Octet(0.0);
+        for (int c = 0; c < 3; ++c) apart[c] = TARGETS < LANES ? multiply_add(others, d[c], sums[c]) : sums[c];
+    }
     for (int c = 0; c < 3; ++c) sums[c] = multiply_add(w, d[c], sums[c]);
 }
 
-// Accelerations of the bodies `first` to first + TARGETS - 1.
-template <int TARGETS>
-inline void accelerate_block(const double *q, const double *gm, int64_t n, int64_t first, double *out) {
+// Accelerations of the bodies `first` to first + TARGETS - 1; with APART also those without the first body's pulls.
+template <bool APART, int TARGETS>
+inline void accelerate_block(const double *q, const double *gm, int64_t n, int64_t first, double *out, double *pulls) {
     constexpr int STREAMS = LANES / TARGETS;
-    Octet own[3], sums[3] = {0.0, 0.0, 0.0};
+    Octet own[3], sums[3] = {0.0, 0.0, 0.0}, apart[3];
     load_targets<TARGETS>(q, first, own);
-    const int64_t start = n % STREAMS;
+    const int64_t start = n % STREAMS, last = APART && start == 0 ? STREAMS : start;
 #pragma GCC unroll 2
-    for (int64_t j = n - STREAMS; j >= start; j -= STREAMS) add_sources<TARGETS>(q, gm, own, j, first, sums, 1.0);
-    if (start > 0) add_sources<TARGETS>(q, gm, own, 0, first, sums, STREAMS_BELOW<TARGETS>(start));
+    for (int64_t j = n - STREAMS; j >= last; j -= STREAMS) add_sources<TARGETS>(q, gm, own, j, first, sums, 1.0);
+    if (APART || start > 0) {
+        const Octet used = start > 0 ? STREAMS_BELOW<TARGETS>(start) : Octet(1.0);
+        add_sources<TARGETS>(q, gm, own, 0, first, sums, used, APART ? apart : nullptr);
+    }
     store_targets<TARGETS>(sums, out, first);
+    if constexpr (APART) store_targets<TARGETS>(apart, pulls, first);
 }
 
 #if defined(__AVX__)
@@ -218,10 +230,11 @@ struct LastTwo {
         w[t] = reaction.part[0];
     }
 
-    // Adds what is left, and stores both accelerations.
+    // Adds what is left, without the first body's pulls if all are wanted `apart` from these, and stores both accelerations.
+    template <bool APART>
     void store(int64_t first, double *out) const {
         Vector streams[6];
-        const auto begin = [](Vector v) { return __builtin_shufflevector(v, Vector{}, 0, 1, 4, 5); };
+        const auto begin = [](Vector v) { return __builtin_shufflevector(v, Vector{}, APART ? 4 : 0, 1, 4, 5); };
         for (int t = 0; t < 2; ++t)
             for (int c = 0; c < 3; ++c) streams[3 * t + c] = fused(-begin(w[t]), begin(d[t][c]), sums[t][c]);
         // (s[0] + s[2]) + (s[1] + s[3]) of each; stored in vectors, as they are read.
@@ -238,8 +251,10 @@ struct LastTwo {
     }
 };
 
-inline void accelerate_block(const double *q, const double *gm, int64_t n, int64_t first, double *out, LastTwo &last) {
-    Octet own[3], sums[3] = {0.0, 0.0, 0.0};
+template <bool APART>
+inline void accelerate_block(const double *q, const double *gm, int64_t n, int64_t first, double *out, double *pulls,
+                             LastTwo &last) {
+    Octet own[3], sums[3] = {0.0, 0.0, 0.0}, apart[3];
     load_targets<LANES>(q, first, own);
     for (int t = 1; t >= 0; --t) {
         Octet d[3], m;
@@ -251,19 +266,22 @@ inline void accelerate_block(const double *q, const double *gm, int64_t n, int64
         last.take(t, cube.times(Octet::load(gm + first)), d);
     }
 #pragma GCC unroll 2
-    for (int64_t j = n - 3; j >= 0; --j) add_sources<LANES>(q, gm, own, j, first, sums, 1.0);
+    for (int64_t j = n - 3; j >= (APART ? 1 : 0); --j) add_sources<LANES>(q, gm, own, j, first, sums, 1.0);
+    if constexpr (APART) add_sources<LANES>(q, gm, own, 0, first, sums, 1.0, apart);
     store_targets<LANES>(sums, out, first);
+    if constexpr (APART) store_targets<LANES>(apart, pulls, first);
 }
 #endif
 
 // Every pair once, with its reaction: for less than four bodies.
-template <class T>
-inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out) {
+template <bool APART = false, class T>
+inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out, T *pulls = nullptr) {
     using std::sqrt;
     for (int64_t i = 0; i < 3 * n; ++i) out[i] = 0.0;
     for (int64_t i = n - 1; i > 0; --i) {
         T ax = out[3 * i], ay = out[3 * i + 1], az = out[3 * i + 2];
         for (int64_t j = i - 1; j >= 0; --j) {
+            if (APART && j == 0) pulls[3 * i] = ax, pulls[3 * i + 1] = ay, pulls[3 * i + 2] = az;
             const T dx = q[3 * j] - q[3 * i], dy = q[3 * j + 1] - q[3 * i + 1], dz = q[3 * j + 2] - q[3 * i + 2];
             const T r2 = dx * dx + dy * dy + dz * dz;
             const T w = 1.0 / (r2 * sqrt(r2));
@@ -279,30 +297,45 @@ inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out) {
         out[3 * i + 1] = ay;
         out[3 * i + 2] = az;
     }
+    if constexpr (APART) std::copy(out, out + 3, pulls);
 }
 
-// out (3 n) = sum over the other bodies of gm_j (q_j - q_i) / r^3.
-// As one function: of those that it calls the compiler would leave some by themselves, and their sums in memory.
-[[gnu::flatten, gnu::noinline]] inline void accelerate(const double *q, const double *gm, int64_t n, double *out) {
-    if (n < 4) return accelerate_few(q, gm, n, out);
+template <bool APART>
+inline void accelerate_all(const double *q, const double *gm, int64_t n, double *out, double *pulls) {
+    if (n < 4) return accelerate_few<APART>(q, gm, n, out, pulls);
     if (n < 8) {
-        accelerate_block<4>(q, gm, n, 0, out);
-        if (n > 4) accelerate_block<4>(q, gm, n, n - 4, out);
+        accelerate_block<APART, 4>(q, gm, n, 0, out, pulls);
+        if (n > 4) accelerate_block<APART, 4>(q, gm, n, n - 4, out, pulls);
         return;
     }
     const int64_t rest = n % 8;
 #if defined(__AVX__)
     if (rest == 2) {
         LastTwo last(q, gm, n - 2);
-        for (int64_t first = n - 10; first >= 0; first -= 8) accelerate_block(q, gm, n, first, out, last);
-        return last.store(n - 2, out);
+        for (int64_t first = n - 10; first >= 0; first -= 8) accelerate_block<APART>(q, gm, n, first, out, pulls, last);
+        last.store<false>(n - 2, out);
+        if constexpr (APART) last.store<true>(n - 2, pulls);
+        return;
     }
 #endif
-    for (int64_t k = 0; k < n / 8 + (rest > 4); ++k) accelerate_block<8>(q, gm, n, std::min(8 * k, n - 8), out);
+    for (int64_t k = 0; k < n / 8 + (rest > 4); ++k)
+        accelerate_block<APART, 8>(q, gm, n, std::min(8 * k, n - 8), out, pulls);
     if (2 < rest && rest <= 4)
-        accelerate_block<4>(q, gm, n, n - 4, out);
+        accelerate_block<APART, 4>(q, gm, n, n - 4, out, pulls);
     else if (0 < rest && rest <= 2)
-        accelerate_block<2>(q, gm, n, n - 2, out);
+        accelerate_block<APART, 2>(q, gm, n, n - 2, out, pulls);
+}
+
+// out (3 n) = sum over the other bodies of gm_j (q_j - q_i) / r^3.
+// As one function: of those that it calls the compiler would leave some by themselves, and their sums in memory.
+[[gnu::flatten, gnu::noinline]] inline void accelerate(const double *q, const double *gm, int64_t n, double *out) {
+    accelerate_all<false>(q, gm, n, out, nullptr);
+}
+
+// The same, bit for bit, and the sums without the first body: pulls (3 n).
+[[gnu::flatten, gnu::noinline]] inline void accelerate_apart(const double *q, const double *gm, int64_t n, double *out,
+                                                             double *pulls) {
+    accelerate_all<true>(q, gm, n, out, pulls);
 }
 
 // Where the bodies begin whose sources `accelerate` takes in streams, and the number of streams.
