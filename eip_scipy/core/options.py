@@ -399,17 +399,27 @@ def _groups(known: InvariantSet, n: int, width: int) -> Groups:
         for (components, weight), own in zip(item.subspaces, each, strict=True):
             key = components.shape, components.tobytes(), weight.tobytes()
             groups.setdefault(key, (components, weight, []))[2].extend(own)
-    places = [row for components, _, _ in groups.values() for row in components]
-    if max(int(row.max()) for row in places) >= n:
+    size = 3 if all(_are_of_bodies(components, weight) for components, weight, _ in groups.values()) else 1
+    directions = [(components[::size], weight[::size]) for components, weight, _ in groups.values()]
+    if max(int(components.max()) for components, _, _ in groups.values()) >= n:
         raise ValueError(f"invariants: the components of a balance are outside the state, which has {n} components.")
     return Groups(
         value=np.concatenate([np.array(values, np.int64) for _, _, values in groups.values()]),
         first_value=_starts([len(values) for _, _, values in groups.values()]),
-        first_direction=_starts([len(components) for components, _, _ in groups.values()]),
-        first_float=_starts([row.size for row in places]),
-        place=np.concatenate(places),
-        weight=np.concatenate([weight.ravel() for _, weight, _ in groups.values()]),
+        first_direction=_starts([len(components) for components, _ in directions]),
+        first_float=_starts([row.size for components, _ in directions for row in components]),
+        place=np.concatenate([components.ravel() for components, _ in directions]),
+        weight=np.concatenate([weight.ravel() for _, weight in directions]),
+        size=size,
     )
+
+
+def _are_of_bodies(components: np.ndarray, weight: np.ndarray) -> bool:
+    """Return whether directions are those of x, y and z, in which the same bodies move by the same weights."""
+    if len(components) % 3:
+        return False
+    alike = (weight.reshape(-1, 3, weight.shape[1]) == weight[::3, None]).all()
+    return bool(alike and (np.diff(components.reshape(-1, 3, components.shape[1]), axis=1) == 1).all())
 
 
 def _starts(sizes: list[int]) -> np.ndarray:

@@ -466,6 +466,7 @@ class Groups(NamedTuple):
     first_float: numpy.typing.NDArray[numpy.int64]
     place: numpy.typing.NDArray[numpy.int64]
     weight: numpy.typing.NDArray[numpy.float64]
+    size: int
 
 class Columns(NamedTuple):
     kept: numpy.typing.NDArray[numpy.float64]

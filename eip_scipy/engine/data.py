@@ -29,7 +29,7 @@ def bare_schedule(span: Span, first: float) -> Schedule:
 NO_BALANCES = Balances(place=np.zeros(0, np.int64), rated=np.zeros(0, np.int64))
 NO_GROUPS = Groups(
     value=np.zeros(0, np.int64), first_value=np.zeros(1, np.int64), first_direction=np.zeros(1, np.int64),
-    first_float=np.zeros(1, np.int64), place=np.zeros(0, np.int64), weight=np.zeros(0),
+    first_float=np.zeros(1, np.int64), place=np.zeros(0, np.int64), weight=np.zeros(0), size=1,
 )  # fmt: skip
 _none = np.zeros(0)
 

@@ -103,6 +103,24 @@ def test_energies_of_planets_are_those_of_any_orbits(quantities):
     np.testing.assert_allclose(runs[0][:, order], runs[1], rtol=0, atol=2e-12)
 
 
+def test_a_frame_does_what_neutral_directions_do():
+    """A planet that moves alone, before all bodies are shifted, and one that the others move against; 3000 projections."""
+    problem = solar_system(years=12.0, h=1 / 256, balances="kepler")
+    neutral = orbital_balances(problem.params, problem.y0, newton=True)
+    assert [len(components[0]) for components, _ in problem.invariants[0].parts] == [1] * 9
+    assert [len(components[0]) for components, _ in neutral[0].parts] == [10] * 9
+    runs = [
+        integrate(problem, method=EIPDOP853, **options)
+        for options in ({}, {"invariants": neutral, "frame": None}, {"invariants": neutral})
+    ]
+    centre, _ = problem.frame
+    drift = [centre @ (run.y[:, -1] - run.y[:, 0]) for run in runs]
+    start = centre @ problem.y0
+    for run, moved in zip(runs, drift, strict=True):
+        np.testing.assert_allclose(moved[:3], 12 * start[3:], rtol=0, atol=2e-16)
+        np.testing.assert_allclose(run.y[:30, -1], runs[0].y[:30, -1], rtol=0, atol=1e-13)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_sizes_that_do_not_fit_are_refused(name):
     function = library[name]

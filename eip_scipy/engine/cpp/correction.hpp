@@ -27,13 +27,18 @@ inline MatrixOf<Value> corner(Value *a, int64_t size, const W &w) {
     return {a, size, size, w.l};
 }
 
-// w.values = I(y); compensated runs add what the carry is worth, by the gradients at hand.
+// w.values = I(y); compensated runs add what the carry is worth, by gradients G.
 template <class AnyRun, class Value>
-inline void evaluate_invariants(const AnyRun &run, double t, const Value *y) {
+inline void evaluate_carried(const AnyRun &run, double t, const Value *y, const Value *carry, const Value *G) {
     const auto &w = run.work;
     run.system.inv(w, t, y, w.values);
     if (run.options.compensated)
-        for (int64_t i = 0; i < w.l; ++i) w.values[i] += dot(w.gradient(i), w.carry_hat, w.m);
+        for (int64_t i = 0; i < w.l; ++i) w.values[i] += dot(G + i * w.m, carry, w.m);
+}
+// The same by the carry and the gradients at hand.
+template <class AnyRun, class Value>
+inline void evaluate_invariants(const AnyRun &run, double t, const Value *y) {
+    evaluate_carried<AnyRun, Value>(run, t, y, run.work.carry_hat, run.work.G);
 }
 
 // Rows along which a correction goes: w.Q, or the gradients as they are where the weights are 1.
@@ -66,55 +71,74 @@ inline void move_along(const Options &o, const W &w, const Value *__restrict Q, 
     }
 }
 
-// The Newton step of each group of values by itself, along its own directions; all components together then restore the
-// frame's C y. Defects within rounding are corrected too, because the rounding of values that are carried does not accumulate.
-// Returns the sum of the ranks, -1 where gradients are not finite. w.g are the defects that `judge` compares with: the carried
-// values of a group whose rows are dependent need not agree exactly, so that the defect of a row that was left out may grow to
-// the sum of all.
+// Coefficients w.mu of the rows of B in their least-norm solution, and its rank. One row, the usual case, by itself.
 template <class W>
-[[gnu::noinline]] inline int64_t move_in_groups(const Options &o, const W &w, double *out) {
+inline int64_t solve_part(const Matrix &B, const double *defects, const W &w) {
+    if (B.rows == 1) {
+        const double square = dot<double>(B.data, B.data, B.columns);
+        if (1e-200 < square && square < 1e200) {
+            w.mu[0] = -defects[0] / square;
+            return 1;
+        }
+    }
+    const Matrix R = corner(w.R, B.rows, w);
+    const int64_t rank = factor(B, w.inverse_norms, R, w.pivots);
+    if (rank >= 0) least_norm(defects, w.inverse_norms, R, w.pivots, rank, w.mu);
+    return rank;
+}
+
+// The Newton step of each group of values by itself, along its own directions, of which SIZE stand beside each other; all
+// components together then restore the frame's C y. Defects within rounding are corrected too, because the rounding of values
+// that are carried does not accumulate. Returns the sum of the ranks, -1 where gradients are not finite. w.g are the defects
+// that `judge` compares with: the carried values of a group whose rows are dependent need not agree exactly, so that the defect
+// of a row that was left out may grow to the sum of all.
+template <int SIZE, class W>
+[[gnu::noinline]] inline int64_t move_groups(const Options &o, const W &w, double *out) {
     const Groups &groups = o.balance_groups;
-    double *total = w.stage, *defects = w.inner.g;
+    double *total = o.frame.rows > 0 ? w.stage : w.move, *defects = w.inner.g;
     int64_t rank = 0;
     fill(total, 0.0, w.m);
     for (int64_t k = 0; k < groups.count; ++k) {
-        const int64_t *value = groups.value + groups.first_value[k], first = groups.first_direction[k];
+        const int64_t *value = groups.value + groups.first_value[k];
         const int64_t rows = groups.first_value[k + 1] - groups.first_value[k];
-        const int64_t directions = groups.first_direction[k + 1] - first;
-        const Matrix B{w.Q, rows, directions, directions}, R = corner(w.R, rows, w);
+        const int64_t *start = groups.first_float + groups.first_direction[k];
+        const int64_t directions = groups.first_direction[k + 1] - groups.first_direction[k];
+        const Matrix B{w.Q, rows, SIZE * directions, SIZE * directions};
         for (int64_t i = 0; i < rows; ++i) {
             const double *G = w.gradient(value[i]);
             defects[i] = w.before[value[i]];
             for (int64_t d = 0; d < directions; ++d) {
-                double slope = 0.0;
-                for (int64_t j = groups.first_float[first + d]; j < groups.first_float[first + d + 1]; ++j)
-                    slope += groups.weight[j] * G[groups.place[j]];
-                B(i, d) = slope;
+                double slope[SIZE] = {};
+                for (int64_t j = start[d]; j < start[d + 1]; ++j)
+                    for (int c = 0; c < SIZE; ++c) slope[c] += groups.weight[j] * G[groups.place[j] + c];
+                std::copy(slope, slope + SIZE, B.row(i) + SIZE * d);
             }
         }
-        const int64_t found = factor(B, w.inverse_norms, R, w.pivots);
+        const int64_t found = solve_part(B, defects, w);
         if (found < 0) return -1;
         rank += found;
         double total_defect = 0.0;
-        for (int64_t i = 0; i < rows; ++i) total_defect += std::abs(defects[i]) * w.inverse_norms[i];
+        for (int64_t i = 0; found < rows && i < rows; ++i) total_defect += std::abs(defects[i]) * w.inverse_norms[i];
         for (int64_t i = 0; i < rows; ++i) {
             const bool grows = found < rows && w.inverse_norms[i] > 0.0;
             w.g[value[i]] = grows ? 2.0 * total_defect / w.inverse_norms[i] : defects[i];
         }
-        least_norm(defects, w.inverse_norms, R, w.pivots, found, w.mu);
         for (int64_t d = 0; d < directions; ++d) {
-            double move = 0.0;
-            for (int64_t i = 0; i < rows; ++i) move += w.mu[i] * B(i, d);
-            for (int64_t j = groups.first_float[first + d]; j < groups.first_float[first + d + 1]; ++j)
-                total[groups.place[j]] += groups.weight[j] * move;
+            double move[SIZE] = {};
+            for (int64_t i = 0; i < rows; ++i)
+                for (int c = 0; c < SIZE; ++c) move[c] += w.mu[i] * B(i, SIZE * d + c);
+            for (int64_t j = start[d]; j < start[d + 1]; ++j)
+                for (int c = 0; c < SIZE; ++c) total[groups.place[j] + c] += groups.weight[j] * move[c];
         }
     }
-    if (o.frame.rows > 0)
-        keep_frame(o.frame, w, total, w.move);
-    else
-        copy(total, w.move, w.m);
+    if (o.frame.rows > 0) keep_frame(o.frame, w, total, w.move);
     for (int64_t j = 0; j < w.m; ++j) out[j] = w.y_hat[j] + w.move[j];
     return rank;
+}
+
+template <class W>
+inline int64_t move_in_groups(const Options &o, const W &w, double *out) {
+    return o.balance_groups.size == 3 ? move_groups<3>(o, w, out) : move_groups<1>(o, w, out);
 }
 
 // The defects that those after a projection are compared with.

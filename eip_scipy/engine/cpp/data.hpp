@@ -229,11 +229,12 @@ void fields(Balances &b, Visit &visit) {
 }
 
 // Groups of kept values that are projected each by itself: the values of a group by their places, its directions, and the
-// floats that move along a direction, each by its weight.
+// floats that move along a direction, each by its weight. `size` is 3 if what is said of a float holds of three, along a direction
+// of its own each: x, y and z of a body; else it is 1.
 struct Groups {
     const int64_t *value, *first_value, *first_direction, *first_float, *place;
     const double *weight;
-    int64_t values, count, ends, directions, floats;  // ends: count + 1
+    int64_t values, count, ends, directions, floats, size;  // ends: count + 1
 };
 
 template <class Visit>
@@ -245,6 +246,7 @@ void fields(Groups &g, Visit &visit) {
     visit("first_float", g.first_float, Bound{g.directions});
     visit("place", g.place, Bound{g.floats});
     visit("weight", g.weight, g.floats);
+    visit("size", g.size);
     --g.directions;
 }
 

@@ -23,8 +23,8 @@ struct Given {
 template <class T>
 using LibraryPointer = void (*)(double t, const T *y, const T *f, T *out, const T *params, int64_t n, int64_t p);
 
-// The derivative of a state of n numbers, or the accelerations at n numbers of positions, in `out`; in `pulls` the
-// accelerations without those by the first of the p bodies whose G m are the parameters.
+// The derivative of a state of n numbers, or the accelerations at n numbers of positions, in `out`; in `pulls` those of
+// `accelerate_apart` of p bodies.
 using ApartPointer = void (*)(const double *y, double *out, double *pulls, const double *params, int64_t n, int64_t p);
 
 // A function of `Given` as such a pointer.

@@ -11,6 +11,8 @@ namespace eip {
 // Estimates that are collected before one is used, and what is left of each a turn later.
 constexpr int64_t COLLECTED = 20;
 constexpr double MEMORY = 0.9;
+// Each so many-th projection of balances compares their rates with what they change by, which takes about as long as the rest.
+constexpr int64_t RATES_EACH = 4;
 // Values of the invariants around the start that are averaged, how far from it in parts of the state, and how many roundings
 // of an invariant's terms their mean may be off.
 constexpr int64_t LEVELS = 64;
@@ -138,8 +140,7 @@ inline void begin_sums(const Multistep &ms, int64_t back, double *scratch) {
     weighted_sum(1.0, latest(ms, ms.states_q + back * n, n), scratch, half);
     weighted_sum(1.0, latest(ms, ms.states_v + back * n, n), scratch + half, half);
     for (int64_t i = 0; i < half; ++i) {
-        const Pair v = quotient<double>({s[i], s[ms.pitch + i]}, h),
-                   q = quotient<double>({S[i], S[ms.pitch + i]}, square);
+        const Pair v = quotient({s[i], s[ms.pitch + i]}, h), q = quotient({S[i], S[ms.pitch + i]}, square);
         const Pair first = sum(v, {-scratch[half + i], 0.0}), moved = product(first, {lag, 0.0});
         const Pair second = sum(sum(q, moved), {-scratch[i], 0.0});
         s[i] = first.value;
@@ -168,40 +169,49 @@ inline Pair balance_at(const Multistep &ms, int64_t back, int64_t b) {
 // The sum of the rates, from the values at the oldest node, which are those of w.level.
 inline void begin_rate_sums(const Multistep &ms, const Work &w) {
     for (int64_t b = 0; b < ms.balances; ++b) {
-        const Pair scaled = quotient<double>({w.level[b], w.level_carry[b]}, {ms.h, 0.0});
+        const Pair scaled = quotient({w.level[b], w.level_carry[b]}, {ms.h, 0.0});
         const Pair first = sum(scaled, Pair{-rates_beside_sum(ms, ms.order - 1, b), 0.0});
         ms.rate_sums[b] = first.value;
         ms.rate_sums[ms.balances + b] = first.rest;
     }
 }
 
-// The acceleration of the next node at the predicted state y, and its rates. They are those of the acceleration that has not
-// been corrected: what the correction changes is as large as the errors of the predictor, and more than the rates' own.
-inline void rated_acceleration(const Run &run, double t, double *y, double *a) {
-    const Multistep &ms = *run.method.multistep;
-    const Work &w = run.work;
-    double *rates = ms.rates_at(ms.place[NEWEST_ROW] + 1);
-    if (run.system.rates_by_pulls && run.system.second_order) {
-        run.system.accelerate_with_pulls(w, y, a);
-        return run.system.rates_from_pulls(w, t, y, rates);
-    }
-    copy(y, w.stage, w.m);
-    run.system.acceleration(w, t, y, w.row(1), a);
-    copy(w.stage + ms.half, w.row(1), ms.half);
-    copy(a, w.row(1) + ms.half, ms.half);
-    run.system.rates(w, t, w.stage, w.row(1), rates);
+// Whether the accelerations come with the pulls from which the rates are found.
+template <class AnyRun>
+inline bool come_with_pulls(const AnyRun &run) {
+    if constexpr (IS_SINGLE<AnyRun>)
+        return run.system.rates_by_pulls && run.system.second_order;
+    else
+        return false;
 }
 
+// The acceleration of the next node at the predicted state y, and its rates, unless they are found from pulls. They are those
+// of the acceleration that has not been corrected: what the correction changes is as large as the errors of the predictor, and
+// more than the rates' own.
 template <class AnyRun>
 inline void accelerate_node(const AnyRun &run, double t, double *y, double *a) {
-    if constexpr (IS_SINGLE<AnyRun>)
-        if (run.method.multistep->balances > 0) return rated_acceleration(of_any_length(run), t, y, a);
-    run.system.acceleration(run.work, t, y, run.work.row(1), a);
+    const Multistep &ms = *run.method.multistep;
+    const auto &w = run.work;
+    if constexpr (IS_SINGLE<AnyRun>) {
+        if (come_with_pulls(run)) return run.system.accelerate_with_pulls(w, y, a);
+        if (ms.balances > 0) [[unlikely]] {
+            copy(y, w.stage, w.m);
+            run.system.acceleration(w, t, y, w.row(1), a);
+            copy(w.stage + ms.half, w.row(1), ms.half);
+            copy(a, w.row(1) + ms.half, ms.half);
+            return run.system.rates(w, t, w.stage, w.row(1), ms.rates_at(ms.place[NEWEST_ROW] + 1));
+        }
+    }
+    run.system.acceleration(w, t, y, w.row(1), a);
 }
 
-// These rates to their sum.
-inline void add_rates(const Multistep &ms) {
-    const double *rates = ms.rates_at(ms.place[NEWEST_ROW] + 1);
+// The rates of the next node to their sum.
+template <class AnyRun>
+inline void add_rates(const AnyRun &run, double t, const double *y) {
+    const Multistep &ms = *run.method.multistep;
+    double *rates = ms.rates_at(ms.place[NEWEST_ROW] + 1);
+    if constexpr (IS_SINGLE<AnyRun>)
+        if (come_with_pulls(run)) run.system.rates_from_pulls(run.work, t, y, rates);
     double *s = ms.rate_sums, *s_rest = s + ms.balances;
     for (int64_t b = 0; b < ms.balances; ++b) {
         const Pair first = two_sum(s[b], rates[b]);
@@ -380,14 +390,20 @@ inline Code add_node(const AnyRun &run) {
     const double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
     double *y = ms.predicted, *older = y + 2 * ms.pitch;
     predict(latest(ms, ms.predict_q, ms.order), two_product(ms.h, ms.h), S, S_rest, y);
-    if (ms.uses_v || ms.balances > 0) predict(latest(ms, ms.predict_v, ms.order), {ms.h, 0.0}, s, s_rest, y + ms.half);
+    const auto predict_velocity = [&] {
+        predict(latest(ms, ms.predict_v, ms.order), {ms.h, 0.0}, s, s_rest, y + ms.half);
+    };
+    // What has just been written is read later: the rates come last where they can.
+    const bool rated = ms.balances > 0, rates_last = come_with_pulls(run);
+    if (ms.uses_v || (rated && !rates_last)) predict_velocity();
     if (ms.count > 0) row_sums(latest(ms, ms.correction, ms.order), older, ms.first, ms.first + ms.count);
     double *a = next_row(ms);
     accelerate_node(run, t, y, a);
     ++w.counters[NFEV];
     if (run.system.MEMBERS == 1 && !is_finite_row(ms, a)) return NOT_FINITE;
-    add_rates(ms);
+    if (rates_last) predict_velocity();
     if (ms.count > 0) correct_node(run, t, y, older, a);
+    if (rated) add_rates(run, t, y);
     add_to_sums(ms, a);
     ++ms.place[NEWEST_ROW];
     ++ms.place[NEWEST];
@@ -447,19 +463,6 @@ inline Truth<Value> estimate_nodes(const Multistep &ms, const Options &o, Value 
     return smooth;
 }
 
-// (scratch, w.carry_hat): the state in the middle of the history; the invariants there in w.values, their gradients in w.G.
-template <class AnyRun, class Value>
-inline void values_in_the_middle(const AnyRun &run, Value *scratch) {
-    const Multistep &ms = *run.method.multistep;
-    const auto &w = run.work;
-    const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] - ms.middle) * ms.h;
-    state_of(ms, ms.middle, as_floats(scratch), as_floats(w.carry_hat));
-    slope_of(ms, ms.middle, as_floats(scratch), as_floats(w.f_point));
-    run.system.grad(w, t, scratch, w.f_point, w.G);
-    evaluate_invariants(run, t, scratch);
-    ++w.counters[NJEV];
-}
-
 // How far the values in w.values are from where they began, into w.target.
 template <class W>
 inline void defects_of_values(const Multistep &ms, const W &w) {
@@ -479,17 +482,19 @@ inline void newest_state(const AnyRun &run, double t) {
 }
 
 // What is to be corrected at the newest state, into w.target: the defects in the middle of the history, where the formula for
-// the state is the most accurate. Values and gradients at the newest state are left in w.values and w.G.
+// the state is the most accurate. Values at the newest state are left in w.values. (scratch, w.carry) is the state in the
+// middle, and w.Q the gradients there.
 template <class AnyRun, class Value>
 inline void defects_in_the_middle(const AnyRun &run, double t, Value *scratch) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
-    copy(w.G, w.Q, w.l * w.m);
-    copy(w.carry_hat, w.carry, w.m);
-    values_in_the_middle(run, scratch);
+    const double before = ms.t0 + static_cast<double>(ms.place[NEWEST] - ms.middle) * ms.h;
+    state_of(ms, ms.middle, as_floats(scratch), as_floats(w.carry));
+    slope_of(ms, ms.middle, as_floats(scratch), as_floats(w.f_point));
+    run.system.grad(w, before, scratch, w.f_point, w.Q);
+    ++w.counters[NJEV];
+    evaluate_carried(run, before, scratch, w.carry, w.Q);
     defects_of_values(ms, w);
-    copy(w.Q, w.G, w.l * w.m);
-    copy(w.carry, w.carry_hat, w.m);
     evaluate_invariants(run, t, w.y_hat);
 }
 
@@ -502,9 +507,11 @@ inline void soften_defects(const Multistep &ms, const Options &o, const W &w) {
     Value *levels = as_values<Value>(ms.levels), *left = levels + 2 * w.l;
     for (int64_t i = 0; i < w.l; ++i) {
         const Value defect = w.target[i], square = defect * defect;
-        const Value noise = EPS * abs_dot(w.gradient(i), w.y_hat, w.m);
-        const Value part =
-            o.balance_groups.count > 0 ? Value(1.0) : where(square > 0.0, square / (square + noise * noise), 0.0);
+        Value part = 1.0;
+        if (o.balance_groups.count == 0) {
+            const Value noise = EPS * abs_dot(w.gradient(i), w.y_hat, w.m);
+            part = where(square > 0.0, square / (square + noise * noise), 0.0);
+        }
         w.target[i] = w.values[i] - part * defect;
         left[i] = (defect - part * defect) + levels[w.l + i];
     }
@@ -568,7 +575,7 @@ inline void move_sums(const Multistep &ms, const Truth<typename W::Value> &those
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST]) * ms.h;
     gather_errors(size, static_cast<double>(ms.place[SINCE]), w);
     newest_state(run, t);
-    w.counters[F_AT_RAW] = 1;
+    w.counters[F_AT_RAW] = ms.balances == 0 || ms.place[SEEN] % RATES_EACH == 0;
     note_rates(run, Step{t, t, ms.h, w.y_hat, scratch, true, true});
     if (o.every == AUTO && o.balance_groups.count == 0 && !tells_more(w)) return OK;
     aim_at_node(run, ms.middle);

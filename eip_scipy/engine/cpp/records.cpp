@@ -240,10 +240,11 @@ static bool ascend(const int64_t *first, int64_t count, int64_t last) {
 static void check_groups(const Groups &g, const Work &w) {
     bool good = g.count >= 0 && g.directions >= 0 && ascend(g.first_value, g.count, g.values) &&
                 ascend(g.first_direction, g.count, g.directions) && ascend(g.first_float, g.directions, g.floats) &&
-                (g.count == 0 || g.values == w.l);
+                (g.count == 0 || g.values == w.l) && (g.size == 1 || g.size == 3);
     for (int64_t k = 0; k < g.values; ++k) good &= g.value[k] >= 0 && g.value[k] < w.l;
-    for (int64_t k = 0; k < g.floats; ++k) good &= g.place[k] >= 0 && g.place[k] < w.m;
-    for (int64_t k = 0; good && k < g.count; ++k) good &= g.first_direction[k + 1] - g.first_direction[k] <= w.m;
+    for (int64_t k = 0; k < g.floats; ++k) good &= g.place[k] >= 0 && g.place[k] <= w.m - g.size;
+    for (int64_t k = 0; good && k < g.count; ++k)
+        good &= g.size * (g.first_direction[k + 1] - g.first_direction[k]) <= w.m;
     require(good, "engine: the groups of balances do not fit the run");
 }
 

@@ -90,7 +90,7 @@ struct System {
     double *params = nullptr;
     int64_t n_params = 0;
     std::vector<double> scratch, scratch_f, scratch_G;
-    std::vector<double> pulls;  // accelerations without those by the first body
+    std::vector<double> pulls;  // those that come with accelerations
     bool rates_by_pulls = false;
     Shifts shifts;  // for gradients without a function
     FailedCall failed;
@@ -153,12 +153,11 @@ struct System {
         }
     }
 
-    // Whether all rates are found from the pulls that come with the derivative: those of the same masses, of which none is
-    // larger than the first. Parameters may change from one run to the next.
+    // Whether all rates are found from the pulls that come with the derivative: those of the same masses. Parameters may
+    // change from one run to the next.
     void choose_rates() {
         const double *first = params, *end = params + n_params;
-        rates_by_pulls = by_pointer && rhs_pointer.library.apart && !balances.empty() && n_params > 0 &&
-                         std::max_element(first, end) == first;
+        rates_by_pulls = by_pointer && rhs_pointer.library.apart && !balances.empty() && n_params > 0;
         for (const Balance &balance : balances) {
             const LibraryCall<double> &rate = balance.rate.library;
             rates_by_pulls =

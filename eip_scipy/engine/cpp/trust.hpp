@@ -192,13 +192,7 @@ template <class W>
     for (int64_t i = 0; i < w.l; ++i) {
         Value *figures = w.figures(i);
         const Value *G = w.gradient(i), *f = w.last();
-        Value sum = 0.0, terms = 0.0;
-        for (int64_t k = 0; k < w.m; ++k) {
-            const Value product = G[k] * f[k];
-            sum += product;
-            terms += abs(product);
-        }
-        const Value rate = abs(sum - w.flow[i]);
+        const Value rate = abs(dot(G, f, w.m) - w.flow[i]), terms = abs_dot(G, f, w.m);
         figures[RATE_TERMS] = max(figures[RATE_TERMS], min(terms, Value(LARGEST)));
         const Value unit = max(terms, LEAST_TERMS * figures[RATE_TERMS]) + TINY;
         const Truth<Value> record = (rate > figures[RATE] * unit) & (rate < ENDLESS);

@@ -38,12 +38,11 @@ inline PairOf<Value> two_product(const Value &a, const Value &b) {
 }
 
 // Quotients, products and roots are accurate to a few units of 2^-104, sums to that of the larger term.
-template <class Value>
-inline PairOf<Value> quotient(const PairOf<Value> &a, const PairOf<Value> &b) {
-    const Value first = a.value / b.value;
-    const PairOf<Value> product = two_product(first, b.value);
-    const Value rest = (a.value - product.value) - product.rest + a.rest - first * b.rest;
-    return two_sum<Value>(first, rest / b.value);
+inline Pair quotient(const Pair &a, const Pair &b) {
+    const double first = a.value / b.value;
+    const Pair product = two_product(first, b.value);
+    const double rest = (a.value - product.value) - product.rest + a.rest - first * b.rest;
+    return two_sum(first, rest / b.value);
 }
 
 template <class Value>
@@ -58,13 +57,10 @@ inline PairOf<Value> sum(const PairOf<Value> &a, const PairOf<Value> &b) {
     return two_sum<Value>(s.value, s.rest + (a.rest + b.rest));
 }
 
-inline double root(double x) { return std::sqrt(x); }
-
-template <class Value>
-inline PairOf<Value> square_root(const PairOf<Value> &a) {
-    const Value first = root(a.value);
-    const PairOf<Value> square = two_product(first, first);
-    return two_sum<Value>(first, ((a.value - square.value) - square.rest + a.rest) / (2.0 * first));
+inline Pair square_root(const Pair &a) {
+    const double first = std::sqrt(a.value);
+    const Pair square = two_product(first, first);
+    return two_sum(first, ((a.value - square.value) - square.rest + a.rest) / (2.0 * first));
 }
 
 }  // namespace eip

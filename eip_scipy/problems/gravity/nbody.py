@@ -19,7 +19,7 @@ from . import forces as _forces
 from .bodies import body_names, default_units, in_units
 from .forces import ForceConstants
 from .frequencies import orbital_frequencies
-from .orbits import orbital_balances
+from .orbits import balances_beside_frame
 
 __all__ = ["component_names", "nbody"]
 
@@ -155,7 +155,7 @@ def nbody(
     if balances is None:
         kept = _forces.invariants(chosen, params, y0) if chosen else _newtonian(params)
     else:
-        kept = orbital_balances(masses, y0, balances, bodies=bodies, newton=not chosen)
+        kept = balances_beside_frame(masses, y0, balances, bodies, newton=not chosen)
     equations = "forces" if chosen else "gravity"
     rhs, acc = _forces.equations(chosen) if chosen else (library["gravity.rhs"], library["gravity.acc"])
     return Problem(

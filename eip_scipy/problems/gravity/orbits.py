@@ -12,7 +12,7 @@ from ...core.inputs import flag, real_array, shown
 from ...core.names import nearest
 from ...engine.native import library
 
-__all__ = ["QUANTITIES", "centres", "chosen_quantities", "orbital_balances"]
+__all__ = ["QUANTITIES", "balances_beside_frame", "centres", "chosen_quantities", "orbital_balances"]
 
 Array = np.ndarray
 QUANTITIES = ("energy", "momentum", "laplace")
@@ -83,6 +83,24 @@ def orbital_balances(
     >>> run.invariants.shape[0], run.trusted
     (9, True)
     """
+    return _balances(gm, y0, quantities, bodies, newton, neutral=True)
+
+
+def balances_beside_frame(
+    gm: Array, y0: Array, quantities: str | Sequence[str], bodies: Sequence[str] | None, newton: bool
+) -> tuple[Balance, ...]:
+    """Return `orbital_balances` for runs whose frame keeps the centre of mass by a shift of all bodies.
+
+    The shift changes no orbit. So a body that moves about the heaviest one is all that its orbit's correction has to
+    move, where `orbital_balances` moves all other bodies in the opposite direction.
+    """
+    return _balances(gm, y0, quantities, bodies, newton, neutral=False)
+
+
+def _balances(
+    gm: Any, y0: Any, quantities: Any, bodies: Sequence[str] | None, newton: bool, *, neutral: bool
+) -> tuple[Balance, ...]:
+    """Return the balances, whose corrections keep the centre of mass by themselves where they are `neutral`."""
     masses, state = real_array("gm", gm), real_array("y0", y0)
     newton = flag("newton", newton)
     if masses.ndim != 1 or masses.size < 2 or state.shape != (6 * masses.size,):
@@ -97,7 +115,7 @@ def orbital_balances(
     if len(names) != masses.size:
         raise ValueError(f"bodies has {len(names)} names, gm has {masses.size} masses.")
     about = centres(masses, state)
-    orbits = [_orbit(masses, state, about, body) for body in np.flatnonzero(about >= 0).tolist()]
+    orbits = [_orbit(masses, state, about, body, neutral) for body in np.flatnonzero(about >= 0).tolist()]
     entries = np.concatenate([masses, *(orbit.entries for orbit in orbits)])
     start = library["orbits.energy"](0.0, state, entries)
     place = masses.size + ENERGY
@@ -163,7 +181,7 @@ def _is_below(about: Array, body: int, top: int) -> bool:
     return False
 
 
-def _orbit(gm: Array, y0: Array, about: Array, body: int) -> _Orbit:
+def _orbit(gm: Array, y0: Array, about: Array, body: int, neutral: bool) -> _Orbit:
     """Return the orbit of a body, together with all that move about it, about its centre."""
     centre = int(about[body])
     group = [k for k in range(gm.size) if k == body or _is_below(about, k, body)]
@@ -173,10 +191,11 @@ def _orbit(gm: Array, y0: Array, about: Array, body: int) -> _Orbit:
     q, v = y0.reshape(2, -1, 3)
     sizes = [float(np.linalg.norm(shares @ a[group] - a[centre])) or 1.0 for a in (q, v)]
     # The group moves, and the centre with the rest of what belongs to it moves in the opposite direction, so that their
-    # common centre of mass stays. No other orbit is then changed.
-    those = [k for k in range(gm.size) if k == centre or _is_below(about, k, centre)]
+    # common centre of mass stays. No other orbit is then changed. A frame does the same for all bodies together.
+    by_itself = not neutral and about[centre] < 0
+    those = group if by_itself else [k for k in range(gm.size) if k == centre or _is_below(about, k, centre)]
     floats = np.arange(y0.size).reshape(2, -1, 3)[:, those].swapaxes(1, 2).reshape(6, -1)
-    moves = np.isin(those, group) - total / gm[those].sum()
+    moves = np.isin(those, group) - (0.0 if by_itself else total / gm[those].sum())
     entries = np.array([0.0, len(pairs), *np.ravel(pairs)])
     return _Orbit(body, entries, floats, np.outer(np.repeat(sizes, 3), moves))
 

@@ -119,20 +119,10 @@ Three perturbation(const Motion &m, const double *q, const double *a, const doub
     return rest;
 }
 
-// From what perturbations are taken: the derivative f; Newton's law, by the masses, without the pulls of the heaviest body,
-// whose rounding would exceed the perturbation's; or these pulls where they are known, in the place of f, and the heaviest body
-// is the first one.
-enum class From { DERIVATIVE, LAW, PULLS };
-
-// Call `function` with each orbit and its perturbation.
-template <From FROM, class Function>
+// Call `function` with each orbit and its perturbation: from f, or by Newton's law from the masses, without the pulls of the
+// heaviest body, whose rounding would exceed the perturbation's.
+template <bool NEWTON, class Function>
 void each_perturbed(const Given<double> &g, int64_t floats, const Function &function) {
-    if constexpr (FROM == From::PULLS)
-        return each_orbit(g, floats, [&](int64_t k, const Orbit &orbit) {
-            const Motion m(orbit, g.y, g.n / 6);
-            function(k, m, perturbation(m, g.y, g.f, g.params, 0));
-        });
-    constexpr bool NEWTON = FROM == From::LAW;
     const int64_t n = g.n / 6;
     constexpr int64_t FEW = 64;
     double small_masses[FEW], small_pulls[3 * FEW];
@@ -191,9 +181,9 @@ void energy_gradient(const Given<double> &g) {
     });
 }
 
-template <From FROM>
+template <bool NEWTON>
 void energy_rate(const Given<double> &g) {
-    each_perturbed<FROM>(g, g.n / 6 - 1, [&](int64_t k, const Motion &m, const Three &P) { g.out[k] = dot(m.v, P); });
+    each_perturbed<NEWTON>(g, g.n / 6 - 1, [&](int64_t k, const Motion &m, const Three &P) { g.out[k] = dot(m.v, P); });
 }
 
 void momentum(const Given<double> &g) {
@@ -216,10 +206,10 @@ void momentum_gradient(const Given<double> &g) {
     });
 }
 
-template <From FROM>
+template <bool NEWTON>
 void momentum_rate(const Given<double> &g) {
-    each_perturbed<FROM>(g, 3 * (g.n / 6 - 1),
-                         [&](int64_t k, const Motion &m, const Three &P) { put(cross(m.r, P), g.out + 3 * k); });
+    each_perturbed<NEWTON>(g, 3 * (g.n / 6 - 1),
+                           [&](int64_t k, const Motion &m, const Three &P) { put(cross(m.r, P), g.out + 3 * k); });
 }
 
 // v x h - mu r / |r|. Its length is mu times the eccentricity, and it points to the pericentre.
@@ -258,10 +248,10 @@ void laplace_gradient(const Given<double> &g) {
     });
 }
 
-template <From FROM>
+template <bool NEWTON>
 void laplace_rate(const Given<double> &g) {
-    each_perturbed<FROM>(g, 3 * (g.n / 6 - 1),
-                         [&](int64_t k, const Motion &m, const Three &P) { put(kicked(m, P), g.out + 3 * k); });
+    each_perturbed<NEWTON>(g, 3 * (g.n / 6 - 1),
+                           [&](int64_t k, const Motion &m, const Three &P) { put(kicked(m, P), g.out + 3 * k); });
 }
 
 bool of_orbits(int64_t n, int64_t p) { return n >= 12 && n % 6 == 0 && p > n / 6; }
@@ -269,24 +259,20 @@ constexpr const char *SIZES = "positions and velocities, 6 numbers a body, and t
 
 #define EIP_ORBIT(name, function, value, numbers) \
     {name, Value::value, numbers, plain<double, function>, nullptr, of_orbits, SIZES}
-// And rates: from f, and by Newton's law or such pulls.
-#define EIP_RATES(name, rate, numbers)                                                                             \
-    EIP_ORBIT(name, rate<From::DERIVATIVE>, RATES, numbers), {                                                     \
-        name "_newton", Value::RATES, numbers, plain<double, rate<From::LAW>>, nullptr, of_orbits, SIZES, nullptr, \
-            plain<double, rate<From::PULLS>>                                                                       \
-    }
 const LibraryFunction functions[] = {
     EIP_ORBIT("orbits.energy", energy, NUMBERS, EACH_ORBIT),
     EIP_ORBIT("orbits.energy_gradient", energy_gradient, GRADIENT_BY_F, EACH_ORBIT),
-    EIP_RATES("orbits.energy_rate", energy_rate, EACH_ORBIT),
+    EIP_ORBIT("orbits.energy_rate", energy_rate<false>, RATES, EACH_ORBIT),
+    EIP_ORBIT("orbits.energy_rate_newton", energy_rate<true>, RATES, EACH_ORBIT),
     EIP_ORBIT("orbits.momentum", momentum, NUMBERS, 3 * EACH_ORBIT),
     EIP_ORBIT("orbits.momentum_gradient", momentum_gradient, GRADIENT_BY_F, 3 * EACH_ORBIT),
-    EIP_RATES("orbits.momentum_rate", momentum_rate, 3 * EACH_ORBIT),
+    EIP_ORBIT("orbits.momentum_rate", momentum_rate<false>, RATES, 3 * EACH_ORBIT),
+    EIP_ORBIT("orbits.momentum_rate_newton", momentum_rate<true>, RATES, 3 * EACH_ORBIT),
     EIP_ORBIT("orbits.laplace", laplace, NUMBERS, 3 * EACH_ORBIT),
     EIP_ORBIT("orbits.laplace_gradient", laplace_gradient, GRADIENT_BY_F, 3 * EACH_ORBIT),
-    EIP_RATES("orbits.laplace_rate", laplace_rate, 3 * EACH_ORBIT),
+    EIP_ORBIT("orbits.laplace_rate", laplace_rate<false>, RATES, 3 * EACH_ORBIT),
+    EIP_ORBIT("orbits.laplace_rate_newton", laplace_rate<true>, RATES, 3 * EACH_ORBIT),
 };
-#undef EIP_RATES
 #undef EIP_ORBIT
 
 }  // namespace

@@ -9,9 +9,9 @@
 // The energy, in which large terms nearly cancel, is summed with the rounding errors carried along: what a projection
 // cannot see it cannot correct.
 //
-// With APART the accelerations come with a second sum, without the pulls of the first body: what is there before these are
-// added, which are the last ones in their stream. So perturbations of orbits about that body take no second pass, and no
-// difference in which its pulls would have to cancel.
+// With APART the accelerations come with a second sum, of all pulls but those between a body and the first one, for motion about
+// the first body: what is there before its pull is added, which is the last one in its stream, and the reaction in its place.
+// So the perturbations take no second pass, and no difference in which the first body's pulls would have to cancel.
 #pragma once
 
 #include <algorithm>
@@ -160,8 +160,18 @@ inline Octet squares(const Octet &x, const Octet &y, const Octet &z, const Octet
     return multiply_add(z, z, multiply_add(y, y, multiply_add(x, x, start)));
 }
 
-// Adds to `sums` the pulls of the sources j, j + 1, ..., each times `used`; to `apart`, where it is given, those but the first.
+// G m of the targets, in the first stream.
 template <int TARGETS>
+inline Octet masses_of_targets(const double *gm, int64_t first) {
+    if constexpr (TARGETS == LANES) return Octet::load(gm + first);
+    Octet m = 0.0;
+    for (int k = 0; k < TARGETS; ++k) m.part[k / WIDTH][k % WIDTH] = gm[first + k];
+    return m;
+}
+
+// Adds to `sums` the pulls of the sources j, j + 1, ..., each times `used`. With APART j is 0, and `apart` becomes the sums with
+// the targets' own pulls on the first body, which it is accelerated by, in the place of its pulls.
+template <int TARGETS, bool APART = false>
 inline void add_sources(const double *q, const double *gm, const Octet *own, int64_t j, int64_t first, Octet *sums,
                         const Octet &used, Octet *apart = nullptr) {
     Octet d[3], m;
@@ -169,15 +179,17 @@ inline void add_sources(const double *q, const double *gm, const Octet *own, int
     for (int c = 0; c < 3; ++c) d[c] -= own[c];
     // A body's own pull is 0 / 1.
     const Octet itself = ITSELF<TARGETS>(j - first + LANES / TARGETS);
-    const Octet w = Cube(squares(d[0], d[1], d[2], itself)).times(m * used);
-    if (apart) {
-        const Octet others = TARGETS < LANES ? w * LANES_FROM(TARGETS) : Octet(0.0);
-        for (int c = 0; c < 3; ++c) apart[c] = TARGETS < LANES ? multiply_add(others, d[c], sums[c]) : sums[c];
+    const Cube cube(squares(d[0], d[1], d[2], itself));
+    if constexpr (APART) {
+        const Octet others = m * used * LANES_FROM(TARGETS);
+        const Octet w = cube.times(others - masses_of_targets<TARGETS>(gm, first));
+        for (int c = 0; c < 3; ++c) apart[c] = multiply_add(w, d[c], sums[c]);
     }
+    const Octet w = cube.times(m * used);
     for (int c = 0; c < 3; ++c) sums[c] = multiply_add(w, d[c], sums[c]);
 }
 
-// Accelerations of the bodies `first` to first + TARGETS - 1; with APART also those without the first body's pulls.
+// Accelerations of the bodies `first` to first + TARGETS - 1; with APART also their pulls but for those of the first body.
 template <bool APART, int TARGETS>
 inline void accelerate_block(const double *q, const double *gm, int64_t n, int64_t first, double *out, double *pulls) {
     constexpr int STREAMS = LANES / TARGETS;
@@ -188,7 +200,7 @@ inline void accelerate_block(const double *q, const double *gm, int64_t n, int64
     for (int64_t j = n - STREAMS; j >= last; j -= STREAMS) add_sources<TARGETS>(q, gm, own, j, first, sums, 1.0);
     if (APART || start > 0) {
         const Octet used = start > 0 ? STREAMS_BELOW<TARGETS>(start) : Octet(1.0);
-        add_sources<TARGETS>(q, gm, own, 0, first, sums, used, APART ? apart : nullptr);
+        add_sources<TARGETS, APART>(q, gm, own, 0, first, sums, used, apart);
     }
     store_targets<TARGETS>(sums, out, first);
     if constexpr (APART) store_targets<TARGETS>(apart, pulls, first);
@@ -198,7 +210,8 @@ inline void accelerate_block(const double *q, const double *gm, int64_t n, int64
 // The last two of 8 k + 2 bodies, by what the blocks of eight have of their pairs: r_ij changes its sign, 1/r_ij^3 is
 // the same. Sums in streams, in the order in which accelerate_block<2> adds them, and so the same bits.
 struct LastTwo {
-    Vector sums[2][3] = {}, w[2], d[2][3];  // w and r_ij: of the two sources before those that were added last
+    Vector sums[2][3], w[2], d[2][3];  // w and r_ij: of the two sources before those that were added last
+    Vector own[2];                     // w of their own pulls on the sources of a block, of which the first counts
 
     // Begins with the pull of the two on each other; a body's own is 0.
     LastTwo(const double *q, const double *gm, int64_t first) {
@@ -211,12 +224,16 @@ struct LastTwo {
                               : __builtin_shufflevector(v.part[0], Vector{}, 0, 4, 4, 4);
             };
             w[t] = beside_own(cube.times(gm[first + 1 - t]));
-            for (int c = 0; c < 3; ++c) d[t][c] = beside_own(t == 0 ? -between[c] : between[c]);
+            for (int c = 0; c < 3; ++c) {
+                d[t][c] = beside_own(t == 0 ? -between[c] : between[c]);
+                sums[t][c] = Vector{};
+            }
         }
     }
 
-    // Adds the reactions of eight sources to target t, the last blocks first.
-    void take(int t, const Octet &reaction, const Octet *distance) {
+    // Adds the reactions of eight sources to target t, the last blocks first; `w_own` are those of its pulls on the first of them.
+    void take(int t, const Octet &reaction, const Octet *distance, Vector w_own) {
+        own[t] = w_own;
         const auto across = [](const Octet &v, Vector behind) {
             return __builtin_shufflevector(v.part[1], behind, 2, 3, 4, 5);
         };
@@ -230,13 +247,16 @@ struct LastTwo {
         w[t] = reaction.part[0];
     }
 
-    // Adds what is left, without the first body's pulls if all are wanted `apart` from these, and stores both accelerations.
+    // Adds what is left, and stores both accelerations, or their pulls but for those of the first body.
     template <bool APART>
     void store(int64_t first, double *out) const {
         Vector streams[6];
-        const auto begin = [](Vector v) { return __builtin_shufflevector(v, Vector{}, APART ? 4 : 0, 1, 4, 5); };
-        for (int t = 0; t < 2; ++t)
-            for (int c = 0; c < 3; ++c) streams[3 * t + c] = fused(-begin(w[t]), begin(d[t][c]), sums[t][c]);
+        const auto begin = [](Vector v) { return __builtin_shufflevector(v, Vector{}, 0, 1, 4, 5); };
+        for (int t = 0; t < 2; ++t) {
+            Vector last = -begin(w[t]);
+            if constexpr (APART) last = __builtin_shufflevector(last, own[t], 4, 1, 2, 3);
+            for (int c = 0; c < 3; ++c) streams[3 * t + c] = fused(last, begin(d[t][c]), sums[t][c]);
+        }
         // (s[0] + s[2]) + (s[1] + s[3]) of each; stored in vectors, as they are read.
         const auto halves = [&](int k) {
             const Vector u = streams[k], v = streams[k + 1];
@@ -263,11 +283,11 @@ inline void accelerate_block(const double *q, const double *gm, int64_t n, int64
         const Cube cube(squares(d[0], d[1], d[2], 0.0));
         const Octet w = cube.times(m);
         for (int c = 0; c < 3; ++c) sums[c] = multiply_add(w, d[c], sums[c]);
-        last.take(t, cube.times(Octet::load(gm + first)), d);
+        last.take(t, cube.times(Octet::load(gm + first)), d, w.part[0]);
     }
 #pragma GCC unroll 2
     for (int64_t j = n - 3; j >= (APART ? 1 : 0); --j) add_sources<LANES>(q, gm, own, j, first, sums, 1.0);
-    if constexpr (APART) add_sources<LANES>(q, gm, own, 0, first, sums, 1.0, apart);
+    if constexpr (APART) add_sources<LANES, true>(q, gm, own, 0, first, sums, 1.0, apart);
     store_targets<LANES>(sums, out, first);
     if constexpr (APART) store_targets<LANES>(apart, pulls, first);
 }
@@ -281,11 +301,15 @@ inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out, T *pulls 
     for (int64_t i = n - 1; i > 0; --i) {
         T ax = out[3 * i], ay = out[3 * i + 1], az = out[3 * i + 2];
         for (int64_t j = i - 1; j >= 0; --j) {
-            if (APART && j == 0) pulls[3 * i] = ax, pulls[3 * i + 1] = ay, pulls[3 * i + 2] = az;
             const T dx = q[3 * j] - q[3 * i], dy = q[3 * j + 1] - q[3 * i + 1], dz = q[3 * j + 2] - q[3 * i + 2];
             const T r2 = dx * dx + dy * dy + dz * dz;
             const T w = 1.0 / (r2 * sqrt(r2));
             const T wi = w * gm[j], wj = w * gm[i];
+            if (APART && j == 0) {
+                pulls[3 * i] = ax - wj * dx;
+                pulls[3 * i + 1] = ay - wj * dy;
+                pulls[3 * i + 2] = az - wj * dz;
+            }
             ax += wi * dx;
             ay += wi * dy;
             az += wi * dz;
@@ -332,7 +356,9 @@ inline void accelerate_all(const double *q, const double *gm, int64_t n, double 
     accelerate_all<false>(q, gm, n, out, nullptr);
 }
 
-// The same, bit for bit, and the sums without the first body: pulls (3 n).
+// The same, bit for bit, and pulls (3 n): those of all pairs but the ones with the first body, and the first body's acceleration.
+// Of another body the difference from the latter is what perturbs its motion about the first body: the first body's acceleration
+// by the body itself is part of both.
 [[gnu::flatten, gnu::noinline]] inline void accelerate_apart(const double *q, const double *gm, int64_t n, double *out,
                                                              double *pulls) {
     accelerate_all<true>(q, gm, n, out, pulls);

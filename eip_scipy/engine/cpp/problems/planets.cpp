@@ -63,41 +63,43 @@ struct Planets {
         const Triplet a = vectors_at(vectors, first);
         return {a.x - vectors[0], a.y - vectors[1], a.z - vectors[2]};
     }
-    // (G m + `further`) / r^3.
-    Vector pull(const Triplet &r, int64_t first, double further) const {
-        return over_cube(r.dot(r), at(gm, first) + further);
-    }
+    // G m of both bodies over r^3.
+    Vector pull(const Triplet &r, int64_t first) const { return over_cube(r.dot(r), at(gm, first) + gm[0]); }
     void put(Vector value, int64_t first) const {
         if (fills_vectors()) return store(value, out + first - 1);
         for (int64_t k = first; k < bodies; ++k) out[k - 1] = value[k - first];
     }
-    // v . (relative acceleration + (G m + further) r / r^3), from the accelerations a.
-    void put_rates(const double *a, double further) const {
-        each([&](int64_t k) {
-            const Triplet r = relative(q, k);
-            put(relative(v, k).dot(r.times_plus(pull(r, k, further), relative(a, k))), k);
-        });
-    }
 };
 
-PairOf<Vector> square_of_length(const Planets &p, const double *vectors, int64_t first) {
-    const Triplet a = p.vectors_at(vectors, first);
-    const Vector parts[3] = {a.x, a.y, a.z};
-    PairOf<Vector> total{};
-    for (int c = 0; c < 3; ++c) {
-        const PairOf<Vector> part = two_sum<Vector>(parts[c], spread_vector(-vectors[c]));
-        const PairOf<Vector> square = two_product(part.value, part.value);
-        total = sum<Vector>(total, {square.value, square.rest + 2.0 * part.value * part.rest});
-    }
-    return total;
+// The square of a vector's length relative to the first body, as a pair of floats that is not normalised: each coordinate is the
+// exact difference of two floats.
+PairOf<Vector> square_of_length(const Triplet &a, const double *first) {
+    const auto square = [](const Vector &x, double origin) {
+        const PairOf<Vector> part = two_sum<Vector>(x, spread_vector(-origin)),
+                             whole = two_product(part.value, part.value);
+        return PairOf<Vector>{whole.value, fused(2.0 * part.value, part.rest, whole.rest)};
+    };
+    const PairOf<Vector> x = square(a.x, first[0]), y = square(a.y, first[1]), z = square(a.z, first[2]);
+    const PairOf<Vector> two = two_sum(x.value, y.value), three = two_sum(two.value, z.value);
+    return {three.value, (x.rest + y.rest) + z.rest + two.rest + three.rest};
+}
+
+// mu / sqrt(x), by one step of Newton's from the float next to 1 / sqrt(x), whose own error is in h.
+PairOf<Vector> quotient_by_root(const PairOf<Vector> &mu, const PairOf<Vector> &x) {
+    const Vector y = over_root(x.value);
+    const PairOf<Vector> square = two_product(y, y), out = two_product(mu.value, y);
+    const Vector off = fused(-x.value, square.value, spread_vector(1.0));
+    const Vector h = fused(-x.value, square.rest, fused(-x.rest, square.value, off));
+    return {out.value, fused(0.5 * out.value, h, fused(mu.rest, y, out.rest))};
 }
 
 // In pairs of floats, and G m of both bodies too: a projection corrects only what exceeds the rounding.
 void energy(const Given<double> &g) {
     const Planets p(g);
     p.each([&](int64_t k) {
-        const PairOf<Vector> v2 = square_of_length(p, p.v, k), r = square_root(square_of_length(p, p.q, k));
-        const PairOf<Vector> potential = quotient(two_sum<Vector>(spread_vector(p.gm[0]), p.at(p.gm, k)), r);
+        const PairOf<Vector> mu = two_sum<Vector>(spread_vector(p.gm[0]), p.at(p.gm, k));
+        const PairOf<Vector> v2 = square_of_length(p.vectors_at(p.v, k), p.v);
+        const PairOf<Vector> potential = quotient_by_root(mu, square_of_length(p.vectors_at(p.q, k), p.q));
         const PairOf<Vector> kinetic = two_sum<Vector>(0.5 * v2.value, -p.at(p.start - 1, k));
         const PairOf<Vector> whole = two_sum<Vector>(kinetic.value, -potential.value);
         p.put(whole.value + (whole.rest + (kinetic.rest + 0.5 * v2.rest - potential.rest)), k);
@@ -110,7 +112,7 @@ void energy_gradient(const Given<double> &g) {
     std::fill(g.out, g.out + (p.bodies - 1) * g.n, 0.0);
     p.each([&](int64_t first) {
         const Triplet r = p.relative(p.q, first), v = p.relative(p.v, first);
-        const Vector pull = p.pull(r, first, p.gm[0]);
+        const Vector pull = p.pull(r, first);
         const Vector parts[2][3] = {{pull * r.x, pull * r.y, pull * r.z}, {v.x, v.y, v.z}};
         for (int lane = 0; lane < WIDTH && first + lane < p.bodies; ++lane) {
             double *row = g.out + (first + lane - 1) * g.n;
@@ -124,14 +126,20 @@ void energy_gradient(const Given<double> &g) {
     });
 }
 
+// v . P, where P is the relative acceleration less the pull of both bodies on each other.
 void energy_rate(const Given<double> &g) {
     const Planets p(g);
-    p.put_rates(g.f + g.n / 2, p.gm[0]);
+    p.each([&](int64_t k) {
+        const Triplet r = p.relative(p.q, k), a = p.relative(g.f + g.n / 2, k);
+        p.put(p.relative(p.v, k).dot(r.times_plus(p.pull(r, k), a)), k);
+    });
 }
 
-// From the pulls of all bodies but the first, which stand in the place of f: of its motion only what the planet itself causes
-// is to be taken away, and nothing large cancels.
-void energy_rate_by_pulls(const Given<double> &g) { Planets(g).put_rates(g.f, 0.0); }
+// The same by the pulls of `accelerate_apart` in the place of f: nothing large cancels.
+void energy_rate_by_pulls(const Given<double> &g) {
+    const Planets p(g);
+    p.each([&](int64_t k) { p.put(p.relative(p.v, k).dot(p.relative(g.f, k)), k); });
+}
 
 void energy_rate_newton(const Given<double> &g) {
     constexpr int64_t FEW = 64;
