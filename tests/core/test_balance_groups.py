@@ -376,6 +376,9 @@ def test_project():
         ("place", [0, 1, 2, -1]),
         ("weight", [1.0, 1.0, 1.0]),
         ("weight", [1.0] * 5),
+        ("size", 0),
+        ("size", 2),
+        ("size", 3),
     ],
 )
 def test_the_engine_checks_the_record(field, value):
@@ -383,7 +386,8 @@ def test_the_engine_checks_the_record(field, value):
     solver.step()
     options = solver._run.options
     assert isinstance(options.balance_groups, Groups)
-    wrong = np.array(value, getattr(options.balance_groups, field).dtype)
+    held = getattr(options.balance_groups, field)
+    wrong = np.array(value, held.dtype) if isinstance(held, np.ndarray) else value
     solver._run.options = options._replace(balance_groups=options.balance_groups._replace(**{field: wrong}))
     with pytest.raises(ValueError, match="engine:"):
         solver._drive(begins=False)

@@ -11,8 +11,9 @@ namespace eip {
 // Estimates that are collected before one is used, and what is left of each a turn later.
 constexpr int64_t COLLECTED = 20;
 constexpr double MEMORY = 0.9;
-// Each so many-th projection of balances compares their rates with what they change by, which takes about as long as the rest.
-constexpr int64_t RATES_EACH = 4;
+// Each so many-th projection in groups, whose weights do not depend on the estimates, is examined: by the estimates, and by the
+// rates of the balances. That takes as long as the projection itself.
+constexpr int64_t EXAMINED_EACH = 4;
 // Values of the invariants around the start that are averaged, how far from it in parts of the state, and how many roundings
 // of an invariant's terms their mean may be off.
 constexpr int64_t LEVELS = 64;
@@ -205,21 +206,6 @@ inline void accelerate_node(const AnyRun &run, double t, double *y, double *a) {
     run.system.acceleration(w, t, y, w.row(1), a);
 }
 
-// The rates of the next node to their sum.
-template <class AnyRun>
-inline void add_rates(const AnyRun &run, double t, const double *y) {
-    const Multistep &ms = *run.method.multistep;
-    double *rates = ms.rates_at(ms.place[NEWEST_ROW] + 1);
-    if constexpr (IS_SINGLE<AnyRun>)
-        if (come_with_pulls(run)) run.system.rates_from_pulls(run.work, t, y, rates);
-    double *s = ms.rate_sums, *s_rest = s + ms.balances;
-    for (int64_t b = 0; b < ms.balances; ++b) {
-        const Pair first = two_sum(s[b], rates[b]);
-        s[b] = first.value;
-        s_rest[b] += first.rest;
-    }
-}
-
 // The values of the balances `back` nodes before the newest as targets.
 inline void aim_at_node(const Run &run, int64_t back) {
     const Multistep &ms = *run.method.multistep;
@@ -381,29 +367,46 @@ inline void correct_node(const AnyRun &run, double t, double *q, const double *o
     for (int64_t i = first; i < end; ++i) a[i] += product[i];
 }
 
+// The velocities that are predicted for the next node, behind the positions y.
+inline void predict_velocities(const Multistep &ms, double *y) {
+    const double *s = ms.sums + 2 * ms.pitch;
+    predict(latest(ms, ms.predict_v, ms.order), {ms.h, 0.0}, s, s + ms.pitch, y + ms.half);
+}
+
+// The rates of the next node to their sum; those from pulls are found here, because what has just been written is read late.
+template <class AnyRun>
+inline void add_rates(const AnyRun &run, double t, double *y) {
+    const Multistep &ms = *run.method.multistep;
+    double *rates = ms.rates_at(ms.place[NEWEST_ROW] + 1);
+    if constexpr (IS_SINGLE<AnyRun>)
+        if (come_with_pulls(run)) {
+            if (!ms.uses_v) predict_velocities(ms, y);
+            run.system.rates_from_pulls(run.work, t, y, rates);
+        }
+    double *s = ms.rate_sums, *s_rest = s + ms.balances;
+    for (int64_t b = 0; b < ms.balances; ++b) {
+        const Pair first = two_sum(s[b], rates[b]);
+        s[b] = first.value;
+        s_rest[b] += first.rest;
+    }
+}
+
 // One more node.
 template <class AnyRun>
 inline Code add_node(const AnyRun &run) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST] + 1) * ms.h;
-    const double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
     double *y = ms.predicted, *older = y + 2 * ms.pitch;
-    predict(latest(ms, ms.predict_q, ms.order), two_product(ms.h, ms.h), S, S_rest, y);
-    const auto predict_velocity = [&] {
-        predict(latest(ms, ms.predict_v, ms.order), {ms.h, 0.0}, s, s_rest, y + ms.half);
-    };
-    // What has just been written is read later: the rates come last where they can.
-    const bool rated = ms.balances > 0, rates_last = come_with_pulls(run);
-    if (ms.uses_v || (rated && !rates_last)) predict_velocity();
+    predict(latest(ms, ms.predict_q, ms.order), two_product(ms.h, ms.h), ms.sums, ms.sums + ms.pitch, y);
+    if (ms.uses_v || (ms.balances > 0 && !come_with_pulls(run))) predict_velocities(ms, y);
     if (ms.count > 0) row_sums(latest(ms, ms.correction, ms.order), older, ms.first, ms.first + ms.count);
     double *a = next_row(ms);
     accelerate_node(run, t, y, a);
     ++w.counters[NFEV];
     if (run.system.MEMBERS == 1 && !is_finite_row(ms, a)) return NOT_FINITE;
-    if (rates_last) predict_velocity();
     if (ms.count > 0) correct_node(run, t, y, older, a);
-    if (rated) add_rates(run, t, y);
+    if (ms.balances > 0) add_rates(run, t, y);
     add_to_sums(ms, a);
     ++ms.place[NEWEST_ROW];
     ++ms.place[NEWEST];
@@ -569,13 +572,16 @@ inline void move_sums(const Multistep &ms, const Truth<typename W::Value> &those
     const Multistep &ms = *run.method.multistep;
     const Options &o = run.options;
     const auto &w = run.work;
-    double size;
-    if (!estimate_nodes(ms, o, size, w)) return UNSTABLE;
+    const bool examined = o.balance_groups.count == 0 || ms.place[SEEN] < COLLECTED || ms.place[SEEN] % EXAMINED_EACH == 0;
+    double size = 0.0;
+    if (!(examined ? estimate_nodes(ms, o, size, w) : look_at_nodes(ms, o, w))) return UNSTABLE;
+    ms.place[SEEN] += !examined;
     if (w.l == 0 || ms.place[SEEN] <= COLLECTED) return OK;
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST]) * ms.h;
-    gather_errors(size, static_cast<double>(ms.place[SINCE]), w);
+    if (examined) gather_errors(size, static_cast<double>(ms.place[SINCE]), w);
+    w.counters[HAVE_ERROR] = w.counters[F_AT_RAW] = examined;
+    w.counters[WAITED] = 0;
     newest_state(run, t);
-    w.counters[F_AT_RAW] = ms.balances == 0 || ms.place[SEEN] % RATES_EACH == 0;
     note_rates(run, Step{t, t, ms.h, w.y_hat, scratch, true, true});
     if (o.every == AUTO && o.balance_groups.count == 0 && !tells_more(w)) return OK;
     aim_at_node(run, ms.middle);
