@@ -52,7 +52,7 @@ def in_python(balance):
         in_place=True,
         uses_f=True,
     )
-    found.parts, found.most_slowness = balance.parts, balance.most_slowness
+    found.subspaces, found.most_slowness = balance.subspaces, balance.most_slowness
     return found
 
 
@@ -127,7 +127,7 @@ def test_directions_of_x_y_and_z_are_moved_together_as_they_are_one_by_one(quant
     items = orbital_balances(problem.params, problem.y0, quantities, newton=True)
     together = integrate(problem, method=EIPDOP853, invariants=items, frame=None)
     for item in items:  # directions in another order, of which no three are those of a body
-        item.parts = tuple((components[::-1], weights[::-1]) for components, weights in item.parts)
+        item.subspaces = tuple((components[::-1], weights[::-1]) for components, weights in item.subspaces)
     alone = integrate(problem, method=EIPDOP853, invariants=items, frame=None)
     np.testing.assert_allclose(together.y, alone.y, rtol=0, atol=4e-15)
 

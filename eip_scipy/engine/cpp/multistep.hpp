@@ -572,7 +572,8 @@ inline void move_sums(const Multistep &ms, const Truth<typename W::Value> &those
     const Multistep &ms = *run.method.multistep;
     const Options &o = run.options;
     const auto &w = run.work;
-    const bool examined = o.balance_groups.count == 0 || ms.place[SEEN] < COLLECTED || ms.place[SEEN] % EXAMINED_EACH == 0;
+    const bool examined =
+        o.balance_groups.count == 0 || ms.place[SEEN] < COLLECTED || ms.place[SEEN] % EXAMINED_EACH == 0;
     double size = 0.0;
     if (!(examined ? estimate_nodes(ms, o, size, w) : look_at_nodes(ms, o, w))) return UNSTABLE;
     ms.place[SEEN] += !examined;
