@@ -356,9 +356,8 @@ inline void accelerate_all(const double *q, const double *gm, int64_t n, double 
     accelerate_all<false>(q, gm, n, out, nullptr);
 }
 
-// The same, bit for bit, and pulls (3 n): those of all pairs but the ones with the first body, and the first body's acceleration.
-// Of another body the difference from the latter is what perturbs its motion about the first body: the first body's acceleration
-// by the body itself is part of both.
+// The same, bit for bit; and pulls (3 n): of the first body its acceleration, of any other body the pulls of all but the first,
+// plus the acceleration of the first body by this one. The difference of both is what perturbs the motion about the first body.
 [[gnu::flatten, gnu::noinline]] inline void accelerate_apart(const double *q, const double *gm, int64_t n, double *out,
                                                              double *pulls) {
     accelerate_all<true>(q, gm, n, out, pulls);
