@@ -123,15 +123,6 @@ class Columns:
         """Return what decides the bits of a run, as settings of its checkpoint."""
         return {"variations": self.values, "derivatives by": self.parameters, "symplectic": self.symplectic}
 
-    @property
-    def described(self) -> dict[str, Any]:
-        """Return how results tell which columns are which."""
-        return {
-            "state": self.is_transition,
-            "parameters": len(self.parameters),
-            "symplectic": self.symplectic,
-        }
-
     def after(self, wide: Array) -> Columns:
         """Return those of a run that goes on from a wide state."""
         return replace(self, values=wide[self.order[1:]].T.copy())

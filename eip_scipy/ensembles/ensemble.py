@@ -29,7 +29,7 @@ from ..core.pointers import PointerFunction
 from ..core.problem import Problem, component_names
 from ..core.solvers import EIPRK4, EIPSolver
 from ..core.states import states
-from ..core.variations import Variations
+from ..core.variations import Columns
 from ..engine.data import N_COUNTERS, NFEV, NJEV, NLU, REJECTED
 from ..engine.trust import ProjectionWarning
 from ..run.events import Events
@@ -636,7 +636,8 @@ class _Gathered:
             component_names=plan.component_names,
         )
         if plan.variations is not None:
-            _separate(result, plan.variations)
+            _separate(result, plan.variations.columns)
+            result["columns"] = plan.described_columns
         object.__setattr__(result, "_ends", ends)  # an attribute, not a field
         return result
 
@@ -647,10 +648,8 @@ class _Gathered:
         return [found or none for found in members.happened]
 
 
-def _separate(result: EnsembleResult, variations: Variations) -> None:
+def _separate(result: EnsembleResult, columns: Columns) -> None:
     """Give a result the states and their columns of derivatives apart."""
-    columns = variations.columns
-    result["columns"] = columns.described | {"source": variations.source}
     result["y"], result["variations"] = columns.apart(result.y)
     if result.trajectories is not None:
         rows, result["variations"] = columns.apart(result.trajectories.swapaxes(1, 2))

@@ -181,6 +181,8 @@ class Plan:
         The C functions by pointer, which no other process takes.
     variations : Variations or None
         The derivatives that members carry behind their states.
+    described_columns : dict or None
+        The field ``columns`` of the result.
     """
 
     def __init__(self, task: Task, ready: Prepared | None = None) -> None:
@@ -197,6 +199,7 @@ class Plan:
         self.times = saved_times(schedule) if task.rows is None else np.full(task.rows, np.nan)
         self.events = len(self._ready.system.events.functions)
         self.variations = self._ready.variations
+        self.described_columns = None if self.variations is None else self._ready.described_columns
         self.n_steps = None if schedule.span.n_steps >= UNBOUNDED else schedule.span.n_steps
         first = np.concatenate([run.work.K[0], run.invariants.start_values])
         self._start_values = [repr(value) for value in first[:COMPARED].tolist()]

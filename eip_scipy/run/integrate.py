@@ -446,8 +446,7 @@ class Loop:
         if variations is not None:
             columns = variations.columns
             result["variations"] = columns.apart(driver.y[:rows])[1]
-            names = [self.prepared.parameter_names.get(k, f"params[{k}]") for k in columns.parameters]
-            result["columns"] = columns.described | {"source": variations.source, "names": names}
+            result["columns"] = self.prepared.described_columns
             asked, kept = replace(asked, variations=columns.after(y)), variations.with_targets(kept)
         origin = Origin(asked, t, _own(y.copy(), self.prepared), driver.schedule.span.sign, kept)
         object.__setattr__(result, "_origin", origin)  # beside the fields, which are items

@@ -277,9 +277,18 @@ class Prepared:
         return str(self.request.method.__name__)
 
     @property
-    def parameter_names(self) -> dict[int, str]:
-        """Return the names of the problem's parameters by their places, as far as it names them."""
-        return dict(enumerate(self.asked.fun.parameters)) if isinstance(self.asked.fun, Problem) else {}
+    def described_columns(self) -> dict[str, Any]:
+        """Return the field ``columns`` of a result of this run, which carries derivatives."""
+        assert self.variations is not None
+        columns, problem = self.variations.columns, self.asked.fun
+        known = dict(enumerate(problem.parameters)) if isinstance(problem, Problem) else {}
+        return {
+            "state": columns.is_transition,
+            "parameters": len(columns.parameters),
+            "names": [known.get(k, f"params[{k}]") for k in columns.parameters],
+            "symplectic": columns.symplectic,
+            "source": self.variations.source,
+        }
 
     @property
     def component_names(self) -> tuple[str, ...] | None:

@@ -138,9 +138,9 @@ class IntegrationResult(WithColumns):
         The columns of derivatives at the saved times, of a run that was asked for them. Between two steps they are
         interpolated, not projected. See `stm` and `sensitivities`.
     columns : dict
-        Of such a run: "state", whether the state-transition matrix is among them; "parameters", how many derivatives by
-        parameters; "symplectic", whether the matrix was kept so; "source", where products with the Jacobian come from:
-        "problem", "jvp", "dual numbers" or "complex steps".
+        Of such a run: "state", whether the state-transition matrix is among them; "parameters", the number of
+        derivatives by parameters, and their "names"; "symplectic", whether the matrix was kept so; "source", the origin
+        of the products with the Jacobian: "problem", "jvp", "dual numbers" or "complex steps".
     component_names : tuple of str
         Those of the `Problem`, or "y0", "y1" and so on; assign others as you like.
     units : str

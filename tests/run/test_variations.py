@@ -89,7 +89,7 @@ def test_says_where_the_products_come_from():
     assert run_of(variations="state", jvp=product).columns["source"] == "jvp"
     problem = hamiltonian("p**2/2 - cos(q)")
     run = integrate(problem, SPAN, START, method=EIPDOP853, h=0.1, variations="state")
-    assert run.columns == {"state": True, "parameters": 0, "symplectic": True, "source": "problem"}
+    assert run.columns == {"state": True, "parameters": 0, "names": [], "symplectic": True, "source": "problem"}
 
 
 @pytest.mark.parametrize(
