@@ -108,7 +108,7 @@ def test_a_frame_does_what_neutral_directions_do():
     problem = solar_system(years=12.0, h=1 / 256, balances="kepler")
     neutral = orbital_balances(problem.params, problem.y0, newton=True)
     assert [len(components[0]) for components, _ in problem.invariants[0].subspaces] == [1] * 9
-    assert [len(components[0]) for components, _ in neutral[0].parts] == [10] * 9
+    assert [len(components[0]) for components, _ in neutral[0].subspaces] == [10] * 9
     runs = [
         integrate(problem, method=EIPDOP853, **options)
         for options in ({}, {"invariants": neutral, "frame": None}, {"invariants": neutral})
