@@ -7,6 +7,7 @@ from numba import njit
 from scipy.optimize import least_squares
 
 from eip_scipy import EIPDOP853, EIPRK4, equations, hamiltonian, integrate
+from eip_scipy.problems import ForceConstants, nbody
 from eip_scipy.tangent_maps import TrajectoryFit, lyapunov_spectrum, megno, periodic_orbit
 
 pytestmark = pytest.mark.needs_jit
@@ -397,16 +398,54 @@ def planets_energy(t, y, m):
     return e
 
 
+def two_planets(a, e_outer):
+    """Masses and the state of two planets at their pericentres, on opposite sides."""
+    m, q, v = np.array([1.0, 1e-3, 1e-3]), np.zeros((3, 3)), np.zeros((3, 3))
+    for k, (axis, e, side) in enumerate(((1.0, 0.02, 1), (a, e_outer, -1)), 1):
+        q[k, 0], v[k, 1] = side * axis * (1 - e), side * np.sqrt((1 + e) / (axis * (1 - e)))
+    return m, np.concatenate([(q - m @ q / m.sum()).ravel(), (v - m @ v / m.sum()).ravel()])
+
+
+def as_problem(m, y0, **options):
+    return nbody(m, y0[:9].reshape(3, 3), y0[9:].reshape(3, 3), t_span=(0, 1), **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("a", "e"), [(1.8, 0.02), (1.45, 0.05), (1.7, 0.1)])
+def test_a_few_points_of_a_map_are_those_of_rebound(a, e):
+    pytest.importorskip("rebound")
+    from eip_scipy.integrations import rebound
+
+    m, y0 = two_planets(a, e)
+    theirs, _, deviation = rebound.megno(m, y0, t_end=100 * PERIOD, dt=PERIOD / 100)
+    run = megno(as_problem(m, y0), (0, 100 * PERIOD), deviation=deviation, method=EIPDOP853, h=PERIOD / 40)
+    assert run.trusted
+    assert run.megno == pytest.approx(theirs, abs=0.02)
+
+
+@pytest.mark.parametrize("force", [pytest.param("gr-potential", marks=pytest.mark.slow), "1pn"])
+def test_growth_with_relativity_is_that_of_the_distance_of_orbits(force):
+    """A force that REBOUND's variational particles do not know."""
+    (m, y0), t_end, eps = two_planets(1.8, 0.02), 40 * PERIOD, 1e-6
+    problem = as_problem(m, y0, forces=force, constants=ForceConstants(c=100.0))
+    d = np.random.default_rng(0).standard_normal(18)
+    d /= np.linalg.norm(d)
+    steps = {"t_span": (0, t_end), "method": EIPDOP853, "h": PERIOD / 40}
+    run = megno(problem, deviation=d, every=t_end, **steps)
+    newton = megno(as_problem(m, y0), deviation=d, every=t_end, invariants=(), **steps)
+    above, below = (integrate(problem, y0=y0 + side * eps * d, **steps).y[:, -1] for side in (1, -1))
+    expected = np.log(np.linalg.norm(above - below) / (2 * eps))
+    assert run.log_size[-1] == pytest.approx(expected, abs=2e-7)
+    assert abs(newton.log_size[-1] - expected) > 1e-3
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("a", "regular"), [(1.8, True), (1.38, False)])
 def test_megno_of_planets_is_that_of_rebound(a, regular):
     pytest.importorskip("rebound")
     from eip_scipy.integrations import rebound
 
-    m, q, v = np.array([1.0, 1e-3, 1e-3]), np.zeros((3, 3)), np.zeros((3, 3))
-    for k, (axis, e, side) in enumerate(((1.0, 0.02, 1), (a, 0.02 if regular else 0.1, -1)), 1):
-        q[k, 0], v[k, 1] = side * axis * (1 - e), side * np.sqrt((1 + e) / (axis * (1 - e)))
-    y0 = np.concatenate([(q - m @ q / m.sum()).ravel(), (v - m @ v / m.sum()).ravel()])
+    m, y0 = two_planets(a, 0.02 if regular else 0.1)
     t_end = 2000 * PERIOD
     theirs, slope, deviation = rebound.megno(m, y0, t_end=t_end, dt=PERIOD / 60, seed=3)
     run = megno(planets, (0, t_end), y0, deviation=deviation, params=m, in_place=True, method=EIPDOP853,

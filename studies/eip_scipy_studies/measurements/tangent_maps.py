@@ -1,9 +1,11 @@
 """``eip-scipy study tangent-maps``: what projection brings to derivatives by the start and by parameters.
 
 The state-transition matrix of Kepler's problem against its closed form; periodic orbits of the restricted three-body
-problem; Lyapunov exponents beside heyoka's variational equations and MEGNO beside REBOUND's variational particles; what
+problem; Lyapunov exponents beside heyoka's variational equations, from one start and as means over a chaotic sea; MEGNO
+beside REBOUND's variational particles, and with relativity, which these do not know, beside differences of orbits; what
 columns of derivatives cost, by the source of the products with the Jacobian, and what they save in a fit. The figure is
-a map of MEGNO over the second of two planets' axis and eccentricity. ``pip install "eip_scipy[heyoka,rebound,sympy]"``.
+a map of MEGNO over the second of two planets' axis and eccentricity, by both.
+``pip install "eip_scipy[heyoka,rebound,sympy]"``.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from eip_scipy import EIPDOP853, EIPRK4, ProjectionWarning, hamiltonian, integrate
+from eip_scipy.problems import nbody
+from eip_scipy.problems.gravity.forces import ForceConstants
 from eip_scipy.tangent_maps import TrajectoryFit, megno, periodic_orbit
 
 from ..report import needed, table
@@ -49,6 +53,7 @@ DOUBLE_PENDULUM = "(p**2 + 2*r**2 - 2*p*r*cos(a - b))/(2*(1 + sin(a - b)**2)) - 
 MASS = 1e-3
 REGULAR, CHAOTIC = (1.8, 0.02), (1.38, 0.1)
 STEP = PERIOD / 40
+CALM, WILD = 2.2, 4.0  # MEGNO below and above which an orbit counts as regular and as chaotic
 
 
 def henon_heiles(heyoka: Any, x: Any, y: Any, u: Any, v: Any) -> Any:
@@ -70,6 +75,11 @@ class Chaotic(NamedTuple):
     y0: list[float]
     h: float
     share: float
+
+    def problem(self) -> Any:
+        """Return it as a problem."""
+        pair = (None, None) if "px" in self.text else ("a b", "p r")
+        return hamiltonian(self.text, *pair)
 
 
 SYSTEMS = {
@@ -145,6 +155,11 @@ class Found(NamedTuple):
     axes: np.ndarray
     eccentricities: np.ndarray
     map: np.ndarray
+    followed: dict[str, list[float | None]]
+    sea: dict[str, Any]
+    relativity: dict[str, list[float]]
+    rebound: dict[str, np.ndarray]
+    rates: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,32 +171,40 @@ class TangentMaps(Measurement[Found]):
     time: float = option(4e5, "length of the runs for exponents (%(default)g)", type=float)
     periods: int = option(2000, "periods of the two planets (%(default)s)", type=int)
     grid: int = option(20, "points of the map, each way; 0: no map (%(default)s)", type=int)
+    starts: int = option(24, "starts in the chaotic sea, for means (%(default)s)", type=int)
     map_periods: int = option(300, "periods of the runs of the map (%(default)s)", type=int)
 
     def measure(self, session: Session) -> Found:
         numba, _ = needed("numba", 'pip install "eip_scipy[numba]"'), needed("sympy", 'pip install "eip_scipy[sympy]"')
-        with session.bar(6, "tangent maps", "part") as bar:
+        with session.bar(9, "tangent maps", "part") as bar:
             parts: dict[str, Any] = {}
-            for part in (_kepler, _orbits, _exponents, _planets, _costs, _fit):
+            for part in (_kepler, _orbits, _exponents, _followed, _sea, _planets, _relativity, _costs, _fit):
                 parts[part.__name__[1:]] = part(self, session, numba)
                 bar.update()
             axes, eccentricities = np.linspace(1.25, 1.75, self.grid), np.linspace(0.0, 0.2, self.grid)
-            values = self._map(axes, eccentricities, numba)
-            return Found(**parts, axes=axes, eccentricities=eccentricities, map=values)
+            maps = self._maps(axes, eccentricities, numba, session)
+            return Found(**parts, axes=axes, eccentricities=eccentricities, **maps)
 
-    def _map(self, axes: np.ndarray, eccentricities: np.ndarray, numba: Any) -> np.ndarray:
+    def _maps(self, axes: np.ndarray, eccentricities: np.ndarray, numba: Any, session: Session) -> dict[str, Any]:
+        """MEGNO and the exponents over the grid, by us and, where it is installed, by REBOUND from the same vectors."""
+        peer = session.peer("rebound", "REBOUND's map of MEGNO")
         rates, energy = planets(numba)
-        found = np.full((eccentricities.size, axes.size), np.nan)
-        end = self.map_periods * PERIOD
+        shape, end = (eccentricities.size, axes.size), self.map_periods * PERIOD
+        ours, slopes = np.full(shape, np.nan), np.full(shape, np.nan)
+        theirs = {"megno": np.full(shape, np.nan), "exponent": np.full(shape, np.nan)} if peer is not None else {}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ProjectionWarning)
-            for (i, j), _ in np.ndenumerate(found):
+            for i, j in np.ndindex(shape):
                 m, y0 = two_planets(float(axes[j]), float(eccentricities[i]))
-                run = megno(rates, (0, end), y0, params=m, in_place=True, method=EIPDOP853, h=STEP, every=end / 2,
-                            invariants=energy)  # fmt: skip
+                deviation = None
+                if peer is not None:
+                    theirs["megno"][i, j], slope, deviation = peer.megno(m, y0, t_end=end, dt=PERIOD / 60)
+                    theirs["exponent"][i, j] = 2 * slope
+                run = megno(rates, (0, end), y0, deviation=deviation, params=m, in_place=True, method=EIPDOP853, h=STEP,
+                            every=end / 2, invariants=energy)  # fmt: skip
                 # Close encounters, which these steps do not resolve, are chaos.
-                found[i, j] = run.megno if run.trusted else np.inf
-        return found
+                ours[i, j], slopes[i, j] = (run.megno, run.lyapunov) if run.trusted else (np.inf, np.nan)
+        return {"map": ours, "rebound": theirs, "rates": {"exponent": slopes}}
 
     def table(self, found: Found) -> str:
         heads = [["error of the", "matrix"]] + [[name, ""] for name in WAYS]
@@ -198,9 +221,30 @@ class TangentMaps(Measurement[Found]):
         blocks.append("Largest Lyapunov exponent, from the same start and tangent vector")
         heads = [["EIPDOP853", ""], ["heyoka", ""], ["difference", "[%]"]]
         blocks.append(table(heads, [(name, [_number(x, 5) for x in row]) for name, row in found.exponents.items()]))
+        blocks.append("The same along one orbit: heyoka starts anew from our state before rounding parts the two")
+        blocks.append(table(heads, [(name, [_number(x, 8) for x in row]) for name, row in found.followed.items()]))
+        sea = found.sea
+        text = f"{sea['mean']:.5f} +- {sea['error']:.5f}"
+        if "their mean" in sea:
+            apart, sigma = 100 * (sea["mean"] / sea["their mean"] - 1), 100 * math.hypot(
+                sea["error"], sea["their error"]
+            ) / sea["their mean"]  # fmt: skip
+            text += (
+                f", heyoka {sea['their mean']:.5f} +- {sea['their error']:.5f}: {apart:+.2f} % apart, with a standard "
+                f"error of {sigma:.2f} %"
+            )
+        blocks.append(
+            f"Mean exponent over the chaotic sea of Hénon-Heiles, {self.starts} starts on one orbit, t = "
+            f"{self.time / 4:g} each: {text}."
+        )
         blocks.append(f"Two planets, {self.periods} periods: mean MEGNO, and twice its slope")
         heads = [["EIPDOP853", "MEGNO"], ["REBOUND", "MEGNO"], ["EIPDOP853", "exponent"], ["REBOUND", "exponent"]]
         blocks.append(table(heads, [(name, [_number(x, 4) for x in row]) for name, row in found.planets.items()]))
+        blocks.append("Two planets with relativity (c = 100), 50 periods: log of the tangent vector's size, and MEGNO")
+        heads = [["by", "columns"], ["by differences", "of orbits"], ["without", "relativity"], ["mean MEGNO", ""]]
+        blocks.append(table(heads, [(name, [f"{x:.7f}" for x in row]) for name, row in found.relativity.items()]))
+        if found.rebound:
+            blocks.append(self._compared(found))
         blocks.append("Time of a run with all n columns, as a multiple of (n + 1) plain runs, by where J v comes from")
         blocks.append(table([["multiple", ""]], [(name, [f"{x:.2f}"]) for name, x in found.costs.items()]))
         fit = found.fit
@@ -212,9 +256,33 @@ class TangentMaps(Measurement[Found]):
         )
         return "\n\n".join(blocks)
 
+    def _compared(self, found: Found) -> str:
+        """Return how the two maps compare: the regular points of both, and the exponents of the chaotic ones."""
+        ours, theirs = found.map, found.rebound["megno"]
+        regular, chaotic = (ours < CALM) & (theirs < CALM), (ours > WILD) & (theirs > WILD)
+        opposite = (ours < CALM) & (theirs > WILD) | (ours > WILD) & (theirs < CALM)
+        text = (
+            f"Map of MEGNO, {ours.size} points: {regular.sum()} regular by both (below {CALM:g}), {chaotic.sum()} "
+            f"chaotic by both (above {WILD:g}), {opposite.sum()} regular by one and chaotic by the other."
+        )
+        if regular.any():
+            apart = np.abs(ours - theirs)[regular]
+            text += (
+                f" On the regular ones median {np.median(ours[regular]):.4f}, REBOUND "
+                f"{np.median(theirs[regular]):.4f}; apart by {np.median(apart):.1e} (median), {apart.max():.1e} "
+                "(largest)."
+            )
+        both = chaotic & np.isfinite(found.rates["exponent"])
+        if both.any():
+            mean, other = found.rates["exponent"][both].mean(), found.rebound["exponent"][both].mean()
+            text += f" Mean exponent of the chaotic ones {mean:.4f}, REBOUND {other:.4f}."
+        return text
+
     def tables(self, found: Found) -> dict[str, Rows]:
+        values = {"megno": found.map, **found.rates}
+        values |= {f"REBOUND's {key}": item for key, item in found.rebound.items()}
         rows = [
-            {"axis": a, "eccentricity": e, "megno": found.map[i, j]}
+            {"axis": a, "eccentricity": e, **{key: item[i, j] for key, item in values.items()}}
             for i, e in enumerate(found.eccentricities)
             for j, a in enumerate(found.axes)
         ]
@@ -223,23 +291,27 @@ class TangentMaps(Measurement[Found]):
     def figures(self, found: Found) -> Figures:
         if not found.map.size:
             return
+        from eip_scipy.plotting.chaos import draw_stability
+
         from ..plotting import blank_figure
 
-        figure = blank_figure(7, 4.8, f"Two planets of 0.001 solar masses: MEGNO after {self.map_periods} periods")
-        axis = figure.subplots()
-        image = axis.pcolormesh(
-            found.axes, found.eccentricities, np.clip(found.map, 1.0, 8.0), cmap="viridis", vmin=1.0, vmax=8.0
-        )
-        figure.colorbar(image, ax=axis, extend="max", label="mean MEGNO (2: regular)")
-        axis.set_xlabel("semi-major axis of the second planet [axis of the first]")
-        axis.set_ylabel("its eccentricity")
-        for p, q in ((3, 2), (5, 3), (2, 1), (7, 5), (8, 5)):
-            place = (p / q) ** (2 / 3)
-            if found.axes[0] < place < found.axes[-1]:
-                axis.axvline(place, color="w", lw=0.8, ls=":")
-                axis.annotate(f"{p}:{q}", (place, found.eccentricities[-1]), (2, -2), textcoords="offset points",
-                              color="w", va="top",
-                              fontsize=8, bbox={"fc": "k", "alpha": 0.6, "lw": 0, "pad": 1.0})  # fmt: skip
+        maps = {"EIPDOP853": found.map} | ({"REBOUND": found.rebound["megno"]} if found.rebound else {})
+        title = f"Two planets of 0.001 solar masses: MEGNO after {self.map_periods} periods"
+        figure = blank_figure(4.2 * len(maps) + 1.2, 4.4, title)
+        axes = figure.subplots(1, len(maps), sharey=True, squeeze=False)[0]
+        for axis, (name, values) in zip(axes, maps.items(), strict=True):
+            image = draw_stability(axis, found.axes, found.eccentricities, values, 8.0)
+            axis.set_title(name, fontsize="medium")
+            axis.set_xlabel("semi-major axis of the second planet [axis of the first]")
+            for p, q in ((3, 2), (5, 3), (2, 1), (7, 5), (8, 5)):
+                place = (p / q) ** (2 / 3)
+                if found.axes[0] < place < found.axes[-1]:
+                    axis.axvline(place, color="w", lw=0.8, ls=":")
+                    axis.annotate(f"{p}:{q}", (place, found.eccentricities[-1]), (2, -2), textcoords="offset points",
+                                  color="w", va="top", fontsize=8,
+                                  bbox={"fc": "k", "alpha": 0.6, "lw": 0, "pad": 1.0})  # fmt: skip
+        axes[0].set_ylabel("its eccentricity")
+        figure.colorbar(image, ax=axes, extend="max", label="mean MEGNO (2: regular)")
         yield "megno-map.png", figure
 
 
@@ -278,8 +350,7 @@ def _exponents(study: TangentMaps, session: Session, numba: Any) -> dict[str, li
     heyoka = session.peer("heyoka", "heyoka's variational equations")
     found: dict[str, list[float | None]] = {}
     for name, system in SYSTEMS.items():
-        problem = hamiltonian(system.text, q=None if "px" in system.text else "a b",
-                              p=None if "px" in system.text else "p r")  # fmt: skip
+        problem = system.problem()
         # The first of these times is one in which rounding does not yet part the orbits.
         for t_end in (200 * system.share, study.time * system.share):
             run = megno(problem, (0, t_end), system.y0, deviation=[1.0, 0.0, 0.0, 0.0], method=EIPDOP853, h=system.h)
@@ -289,6 +360,81 @@ def _exponents(study: TangentMaps, session: Session, numba: Any) -> dict[str, li
                     system.energy, system.y0, [1.0, 0.0, 0.0, 0.0], t_end=t_end, every=20.0
                 )
             found[f"{name}, t = {t_end:g}"] = [ours, theirs, None if theirs is None else 100 * (ours / theirs - 1)]
+    return found
+
+
+def _sea(study: TangentMaps, session: Session, numba: Any) -> dict[str, Any]:
+    """Average the largest exponent over starts of the chaotic sea: states of one chaotic orbit at equal distances.
+
+    Rounding parts two integrations of a chaotic orbit, and each sticks to islands for long times now and then: what can
+    agree is the mean.
+    """
+    heyoka = session.peer("heyoka", "heyoka's variational equations")
+    system = SYSTEMS["Hénon-Heiles, E = 1/6"]
+    problem, t_end, vector = system.problem(), study.time / 4, [1.0, 0.0, 0.0, 0.0]
+    times = 500.0 * np.arange(study.starts)
+    starts = [np.array(system.y0)]
+    if study.starts > 1:
+        run = integrate(problem, (0, times[-1]), system.y0, method=EIPDOP853, h=system.h, t_eval=times)
+        starts = list(run.y.T)
+    options: dict[str, Any] = {"deviation": vector, "method": EIPDOP853, "h": system.h, "save_every": 100}
+    ours = np.array([megno(problem, (0, t_end), y, **options).log_size[-1] / t_end for y in starts])
+    found: dict[str, Any] = {"mean": ours.mean(), "error": _standard_error(ours), "each": ours.tolist()}
+    if heyoka is not None:
+        theirs = np.array([heyoka.largest_exponent(system.energy, y, vector, t_end=t_end, every=20.0) for y in starts])
+        found |= {
+            "their mean": theirs.mean(),
+            "their error": _standard_error(theirs),
+            "each of theirs": theirs.tolist(),
+        }
+    return found
+
+
+def _followed(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float | None]]:
+    """Compare exponents along one orbit: in pieces in which rounding does not part it, heyoka starts where we are."""
+    heyoka = session.peer("heyoka", "heyoka's variational equations")
+    found: dict[str, list[float | None]] = {}
+    for name, system in SYSTEMS.items():
+        problem, piece, pieces = system.problem(), 100 * system.share, max(1, round(study.time / 2000))
+        y, vector, ours, theirs = np.array(system.y0), np.array([1.0, 0.0, 0.0, 0.0]), 0.0, 0.0
+        for _ in range(pieces):
+            run = integrate(problem, (0, piece), y, method=EIPDOP853, h=system.h, variations=vector)
+            if heyoka is not None:
+                theirs += heyoka.largest_exponent(system.energy, y, vector, t_end=piece, every=piece / 5) / pieces
+            y, size = run.y[:, -1], float(np.linalg.norm(run.variations[-1]))
+            vector = run.variations[-1][:, 0] / size
+            ours += math.log(size) / (piece * pieces)
+        apart = None if heyoka is None else 100 * (ours / theirs - 1)
+        found[f"{name}, t = {pieces * piece:g}"] = [ours, None if heyoka is None else theirs, apart]
+    return found
+
+
+def _standard_error(values: np.ndarray) -> float:
+    return float(values.std(ddof=1) / math.sqrt(values.size)) if values.size > 1 else math.nan
+
+
+def _relativity(study: TangentMaps, session: Session, numba: Any) -> dict[str, list[float]]:
+    """Compare growth with a force that REBOUND's variational particles do not know with that of orbits' distances."""
+    found, t_end, eps = {}, 50 * PERIOD, 1e-6
+    direction = np.random.default_rng(0).standard_normal(18)
+    direction /= np.linalg.norm(direction)
+    for force in ("gr-potential", "1pn"):
+        for place in (REGULAR, CHAOTIC):
+            m, y0 = two_planets(*place)
+            logs = []
+            for forces in (force, ()):
+                problem = nbody(m, y0[:9].reshape(3, 3), y0[9:].reshape(3, 3), t_span=(0, t_end), forces=forces,
+                                constants=ForceConstants(c=100.0) if forces else None)  # fmt: skip
+                run = megno(problem, deviation=direction, method=EIPDOP853, h=STEP, every=t_end)
+                logs.append(run.log_size[-1])
+                if forces:
+                    ends = [
+                        integrate(problem, y0=problem.y0 + side * eps * direction, method=EIPDOP853, h=STEP).y[:, -1]
+                        for side in (1, -1)
+                    ]
+                    logs.append(math.log(np.linalg.norm(ends[0] - ends[1]) / (2 * eps)))
+                    mean = run.megno
+            found[f"{force}: a = {place[0]:g}, e = {place[1]:g}"] = [float(x) for x in (*logs, mean)]
     return found
 
 
