@@ -274,8 +274,9 @@ class TangentMaps(Measurement[Found]):
             )
         both = chaotic & np.isfinite(found.rates["exponent"])
         if both.any():
-            mean, other = found.rates["exponent"][both].mean(), found.rebound["exponent"][both].mean()
-            text += f" Mean exponent of the chaotic ones {mean:.4f}, REBOUND {other:.4f}."
+            # Medians: in close encounters single rates are as large as those of all others together.
+            rate, other = np.median(found.rates["exponent"][both]), np.median(found.rebound["exponent"][both])
+            text += f" Median exponent of {both.sum()} chaotic ones {rate:.4f}, REBOUND {other:.4f}."
         return text
 
     def tables(self, found: Found) -> dict[str, Rows]:
