@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .core.project import project
     from .core.results import Diagnostics, ProjectionWarning
     from .core.solvers import (
+        EIPBDF,
         EIPDOP853,
         EIPGJ12,
         EIPGJ14,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
         EIPRK45,
         EIPRKN8,
         EIPRKN12,
+        EIPRadau,
         eip_method,
     )
     from .ensembles.ensemble import ensemble
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
+    "EIPBDF",
     "EIPDOP853",
     "EIPGJ12",
     "EIPGJ14",
@@ -62,6 +65,7 @@ __all__ = [
     "EIPRKN12",
     "Balance",
     "Diagnostics",
+    "EIPRadau",
     "Invariant",
     "ProjectionWarning",
     "check_gradient",

@@ -26,7 +26,7 @@ def attributes_of(method: Any, scipy_class: type[OdeSolver] | None) -> dict[str,
 
     Parameters
     ----------
-    method : Tableau, NystromTableau, GaussJackson or OneStep
+    method : Tableau, NystromTableau, GaussJackson, OneStep or Driven
     scipy_class : type or None
         SciPy's own class of the same pair, whose attributes are returned as they are.
     """
@@ -64,8 +64,9 @@ def tableau_of(solver: type[OdeSolver]) -> Tableau:
     order = getattr(solver, "order", None)
     if A is None or b is None or c is None or not isinstance(order, int):
         raise TypeError(
-            f"eip_method: {name} has no coefficients A, B, C and order, which an implicit or multistep method does not "
-            f"have; expected {WANTED}, or a Tableau."
+            f"eip_method: {name} has no coefficients A, B, C and order, by which explicit Runge-Kutta methods are "
+            "projected, and of other solvers only SciPy's Radau and BDF can take up a projected state: EIPRadau and "
+            f"EIPBDF do so. Give one of these, {WANTED}, or a Tableau."
         )
     if _array(solver, "Bp") is not None:
         raise TypeError(f"eip_method: {name} is a Runge-Kutta-Nystrom method; give its coefficients as NystromTableau.")

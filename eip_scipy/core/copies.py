@@ -13,6 +13,7 @@ from scipy.integrate import OdeSolver
 
 from ..engine.data import Work
 from ..engine.trust import Trust
+from . import steppers
 from .invariants import InvariantSet
 from .runs import Run
 
@@ -31,11 +32,11 @@ class RunParts(NamedTuple):
 
 
 def parts_of(run: Run) -> RunParts:
-    """Return what makes a run again; the user's one-step method stays out."""
+    """Return what makes a run again; the user's one-step method stays out; of a solver of SciPy its values."""
     values = {item.name: getattr(run, item.name) for item in fields(run) if item.name not in BOUND}
     values["options"] = run.options._replace(joint=None)
     if run.tableau.in_python:
-        values["method"] = None
+        values["method"] = run.method.state() if run.tableau.drives else None
     return RunParts(values, copy.deepcopy(run.work), list(run.trust.doubts), run.trust.failed)
 
 
@@ -47,13 +48,13 @@ def run_of(parts: RunParts, invariants: InvariantSet, method: Any, *, joint: boo
     parts : RunParts
     invariants : InvariantSet
         The same invariants, made at the same start.
-    method : Tableau, NystromTableau, GaussJackson or OneStep
+    method : Tableau, NystromTableau, GaussJackson, OneStep or Driven
     joint : bool
         Whether the run's options hold the invariants that are projected jointly.
     """
     values, work = copy.deepcopy(parts.values), copy.deepcopy(parts.work)
-    if values["method"] is None:
-        values["method"] = method
+    if method.in_python:
+        values["method"] = steppers.arrays(method)
     if joint:
         values["options"] = values["options"]._replace(joint=invariants.items)
     invariants.target = values["options"].target  # those of balances change

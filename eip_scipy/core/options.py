@@ -313,7 +313,9 @@ class ProjectionOptions:
         if method.has_history and not compensated:
             raise ValueError(f"compensated=False: the sums of {method.name} always carry their rounding; leave it out.")
         if compensated and method.in_python:
-            raise ValueError(f"compensated=True carries the rounding of a tableau's sums; {method.name} is no tableau.")
+            raise ValueError(
+                f"compensated=True carries the rounding of a tableau's sums; {method.name} is no tableau. Leave it out."
+            )
         return compensated
 
     def _every(self, method: AnyMethod) -> int:

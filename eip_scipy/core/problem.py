@@ -190,7 +190,8 @@ class Problem:
         if hasattr(method, "TABLEAU"):  # an EIP method; the problem knows no solver
             names = ("invariants", "metric", "blocks", "frame")
             brought = {name: value for name in names if (value := getattr(self, name)) is not None}
-            if self.h is not None and not {"rtol", "atol", "first_step", "max_step"} & options.keys():
+            fixed = self.h is not None and not method.TABLEAU.drives
+            if fixed and not {"rtol", "atol", "first_step", "max_step"} & options.keys():
                 brought["h"] = self.h
         sol = solve_ivp(self.fun, t_span, y0, method=method, **brought | options)
         if self.component_names is not None and len(self.component_names) == len(sol.y):

@@ -40,7 +40,7 @@ class RunSpec:
     ----------
     name : str
         Name of the solver class, for messages.
-    method : Tableau, NystromTableau, GaussJackson, OneStep or AtRest
+    method : Tableau, NystromTableau, GaussJackson, OneStep, Driven or AtRest
         With `is_known` it is the `tableau` of another run of these equations, and they are not examined again.
     rhs : callable
         ``rhs(t, y) -> (n,)``, checked; it returns new arrays.
@@ -51,7 +51,8 @@ class RunSpec:
     fun, in_place : callable, bool
         The user's function, which may be an acceleration by mistake, or None, and how it is called.
     jacobian : callable
-        Returns the Jacobian of a multistep method, see `SecondOrder`, or None.
+        Returns the Jacobian of a multistep method, see `SecondOrder`, that of an implicit method, see `Jacobian`, or
+        None.
     frequencies : callable, optional
         ``frequencies(y0, length)`` for an interval of that length, see `Problem`.
     level : bool
@@ -103,6 +104,8 @@ class RunSpec:
         self._check(run, check_start)
         if method.has_history:
             self.attach_history(run, run.start)
+        if method.drives:
+            self.attach_solver(run, run.start)
         return run
 
     def examined(self, y0: Array, f0: Array | None = None) -> tuple[AnyMethod, Array]:
@@ -123,6 +126,10 @@ class RunSpec:
         frequencies = None if self.frequencies is None else self.frequencies(start.y, span.t_bound - span.t0)
         seen = SecondOrder(self.rhs, start, self.jacobian(), frequencies)
         attach_history(run, self.name, seen, self.stepping, level=self.level)
+
+    def attach_solver(self, run: Run, start: Start) -> None:
+        """Give a run of an implicit method the solver of SciPy that begins at a start."""
+        run.method.begin(self.rhs, start, self.stepping, self.jacobian())
 
     def _first_step(self, method: AnyMethod, y0: Array, f0: Array) -> float:
         """Return the length of the first step, which columns of derivatives do not change."""

@@ -44,9 +44,9 @@ class Run:
         The start at which the invariants were measured, and the one of the first step, which `project_initial` may
         have moved.
     stepping : Stepping
-    tableau : Tableau, NystromTableau, GaussJackson, OneStep or AtRest
+    tableau : Tableau, NystromTableau, GaussJackson, OneStep, Driven or AtRest
         The method as it was given.
-    method : Method or OneStep
+    method : Method, OneStep or Stepper
         What the engine takes the steps by.
     options : Options
     work : Work
@@ -98,6 +98,7 @@ class Run:
         hooks = Hooks(
             one_step=partial(self.method.fill, self.work) if in_python else None,
             estimates=in_python and self.tableau.has_estimate,
+            drives=self.tableau.drives,
             joint=None if functions.native else self.options.joint,
             **others,
         )

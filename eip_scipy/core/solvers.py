@@ -37,6 +37,7 @@ from .callers import users_level
 from .coefficients import attributes_of, is_same, tableau_of
 from .copies import parts_of, run_of, scipy_values, set_scipy_values
 from .dense import ExactEnds, Interpolants
+from .driven import DRIVEN_BDF, DRIVEN_RADAU, Driven, Jacobian
 from .examination import is_check_due
 from .failures import failure
 from .inputs import refuse_units, shown
@@ -53,6 +54,7 @@ from .stepping import ATOL, StepOptions, Stepping, interval
 from .variations import Columns
 
 __all__ = [
+    "EIPBDF",
     "EIPDOP853",
     "EIPGJ12",
     "EIPGJ14",
@@ -65,6 +67,7 @@ __all__ = [
     "EIPRK45",
     "EIPRKN8",
     "EIPRKN12",
+    "EIPRadau",
     "EIPSolver",
     "eip_method",
 ]
@@ -144,7 +147,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
        systems".
     """
 
-    TABLEAU: ClassVar[Tableau | NystromTableau | GaussJackson | OneStep]
+    TABLEAU: ClassVar[Tableau | NystromTableau | GaussJackson | OneStep | Driven]
     # True if the state is one of several parts, which are projected together.
     _in_parts: ClassVar[bool] = False
     # SciPy's class of the same pair: without invariants it takes the steps, so that they are SciPy's to the last bit.
@@ -189,7 +192,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
     ) -> None:
         if not hasattr(self, "TABLEAU"):
             raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
-        jacobian = options.pop("jacobian", None) if self.TABLEAU.has_history else None
+        jacobian = _jacobian(self.TABLEAU, options)
         projection, extraneous = ProjectionOptions.of(options)
         if extraneous:
             warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=users_level())
@@ -200,7 +203,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         n = self.n if self._COLUMNS is None else self._COLUMNS.n
         stepping = steps.checked(type(self).__name__, self.TABLEAU, t0, t_bound, n, stacklevel=users_level() + 1)
         kept = as_invariants(projection.invariants)
-        self._jacobian = _checked_jacobian(jacobian)
+        self._jacobian = jacobian
         self._bind(fun, [0])
         self._spec = self._specified(stepping, replace(projection, invariants=kept))
         self._take_stepping(stepping)
@@ -242,7 +245,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
 
     def _specified(self, stepping: Stepping, projection: ProjectionOptions) -> RunSpec:
         """Return what the run is made from, for the present function."""
-        moved = None if self._jacobian is None else times(self._jacobian)
+        moved = times(self._jacobian) if callable(self._jacobian) else self._jacobian
         return RunSpec(
             name=type(self).__name__,
             method=self.TABLEAU,
@@ -278,7 +281,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._schedule = bare_schedule(self._spec.stepping.span, float(self.h_abs or 0.0))
         self._schedule.place[PENDING] = 1  # what is handed out between two steps is the end of the last one
         calls, jacobian = self._run.invariants.calls, None
-        if self._jacobian is not None:
+        if callable(self._jacobian):
             jacobian = Call(self._jacobian, (), (self.n // 2,), _never, takes_f=True, in_place=True)
         rates = self._run.invariants.rates(self._run.options.adaptive)
         functions = PythonFunctions(self._call, *calls, (), second_order=False, jacobian=jacobian, rates=rates)
@@ -369,6 +372,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         run.stepping = spec.stepping
         if method.has_history:
             spec.attach_history(run, here)
+        if method.drives:
+            spec.attach_solver(run, here)
         self._spec = replace(spec, method=method, is_known=True)
 
     def _state(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -412,6 +417,9 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         t_bound = copied["attributes"]["t_bound"]
         invariants = InvariantSet(shared["projection"].invariants, *begin, tell=False, t_bound=t_bound)
         self._run = run_of(copied["run"], invariants, self._spec.method, joint=copied["joint"])
+        if self.TABLEAU.drives:
+            self._spec.attach_solver(self._run, begin)
+            self._run.method.resume(copied["run"].values["method"])
         self._work, self.f, self.h_abs = self._run.work, begin.f, 0.0
         self._drive(begins=False)
         self._work.K[0], self._work.rates[0] = copied["run"].work.K[0], copied["run"].work.rates[-1]
@@ -584,7 +592,11 @@ def _frozen(a: np.ndarray) -> np.ndarray:
     return a
 
 
-def _checked_jacobian(jacobian: Any) -> Any:
+def _jacobian(method: Any, options: dict[str, Any]) -> Any:
+    """Take the Jacobian out of the options of a solver: as its method takes one."""
+    if method.drives:
+        return Jacobian(options.pop("jac", None), options.pop("jac_sparsity", None))
+    jacobian = options.pop("jacobian", None) if method.has_history else None
     if jacobian is not None and not callable(jacobian):
         raise TypeError(f"jacobian must be a function jacobian(t, q, dq, out), got {shown(jacobian)}.")
     return jacobian
@@ -770,10 +782,54 @@ class EIPGJ14(EIPSolver):
     TABLEAU = GaussJackson(order=14, corrected=True)
 
 
+class EIPRadau(EIPSolver):
+    """EIP method on the steps of SciPy's Radau, the implicit Runge-Kutta method of order 5, for stiff systems.
+
+    Options: see `EIPSolver`, without `h` and `compensated`, and ``jac`` and ``jac_sparsity`` as for
+    `scipy.integrate.Radau`. Without invariants its steps are those of SciPy. As in SciPy, `nfev` does not count the
+    evaluations for a numerical Jacobian. `njev` counts Jacobians and gradients of the invariants, and `nlu` the
+    factorisations of both.
+
+    Notes
+    -----
+    Keep constraints, and not an energy that contains fast, damped oscillations: the method damps these even where the
+    system does not, and the projection of the energy would put what they lose into the slow motion. See
+    :doc:`/how-to/stiff-systems`.
+
+    Raises
+    ------
+    ValueError
+        For a complex `y0`, which SciPy's Radau does not take.
+
+    Examples
+    --------
+    >>> from scipy.integrate import solve_ivp
+    >>> from eip_scipy import EIPRadau, Invariant
+    >>> def robertson(t, y):
+    ...     a, b, c = 0.04 * y[0], 1e4 * y[1] * y[2], 3e7 * y[1] ** 2
+    ...     return [b - a, a - b - c, c]
+    >>> mass = Invariant(lambda t, y: y.sum(), lambda t, y: [1.0, 1.0, 1.0], name="mass")
+    >>> sol = solve_ivp(robertson, (0, 1e5), [1, 0, 0], method=EIPRadau, rtol=1e-6, atol=1e-10, invariants=mass)
+    >>> sol.success, bool(abs(sol.y[:, -1].sum() - 1) < 1e-15)
+    (True, True)
+    """
+
+    TABLEAU = DRIVEN_RADAU
+
+
+class EIPBDF(EIPSolver):
+    """EIP method on the steps of SciPy's BDF, of variable order up to 5, for stiff systems and loose tolerances.
+
+    Options and notes: see `EIPRadau`; complex states are possible.
+    """
+
+    TABLEAU = DRIVEN_BDF
+
+
 def class_named(method: Any) -> str | None:
     """Return the name of the class that stands in `method` by its name, by SciPy's name of it or as SciPy's class."""
     name = f"EIP{str(getattr(method, '__name__', method)).upper().removeprefix('EIP')}"
-    return name if name in __all__ else None
+    return next((known for known in __all__ if known.upper() == name), None)
 
 
 def eip_method(
@@ -786,6 +842,7 @@ def eip_method(
     method : Tableau, NystromTableau, GaussJackson, OneStepMethod or a class like SciPy's RK45
         Of a subclass of SciPy's RungeKutta, or a class of another package with the same attributes, the coefficients A,
         B, C, E and P are read and checked against the order conditions; the step control is the one of this package.
+        SciPy's Radau and BDF give `EIPRadau` and `EIPBDF`.
         A one-step method is any object with ``one_step(t, y, h) -> y_hat`` and ``order``; see `OneStepMethod`. Its
         steps are projected like all others; `fun` serves gradients that take f and dense output (a cubic through both
         ends) only, so that `nfev` does not count what `one_step` evaluates.
@@ -834,4 +891,7 @@ def _on_class(solver: type[OdeSolver]) -> type[EIPSolver]:
     for own in (EIPRK23, EIPRK45, EIPDOP853):
         if own._SCIPY is not None and is_same(solver, own._SCIPY):
             return own
+    for implicit in (EIPRadau, EIPBDF):
+        if is_same(solver, implicit.TABLEAU.solver):
+            return implicit
     return eip_method(tableau_of(solver))

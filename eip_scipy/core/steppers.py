@@ -1,7 +1,8 @@
 """What the families of methods do differently in a run; nothing else asks which family a method belongs to.
 
-Each function is written once for a family: Runge-Kutta tableaux, Nyström tableaux, Gauss-Jackson methods, and one-step
-methods of a user. Facts that need no more than a flag are attributes of `eip_scipy.methods.orders.Ordered`.
+Each function is written once for a family: Runge-Kutta tableaux, Nyström tableaux, Gauss-Jackson methods, one-step
+methods of a user, and solvers of SciPy. Facts that need no more than a flag are attributes of
+`eip_scipy.methods.orders.Ordered`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from ..methods.nystrom_interpolants import LEAST_ORDER
 from ..methods.nystrom_interpolants import interpolant as nystrom_interpolant
 from ..methods.orders import AtRest
 from ..methods.runge_kutta import DOP853, Tableau
+from .driven import Driven, Stepper
 from .one_step import OneStep
 
 __all__ = ["Form", "arrays", "check_halves", "checked", "depends_on_velocity", "form", "rated"]
@@ -33,7 +35,7 @@ Derivative = Callable[[float, Array], Array]
 
 
 @singledispatch
-def arrays(method: Any) -> Method | OneStep:
+def arrays(method: Any) -> Method | OneStep | Stepper:
     """Return a method as the engine takes its steps."""
     raise TypeError(f"{type(method).__name__} is not a family of methods.")
 
@@ -44,12 +46,17 @@ def _(method: OneStep) -> OneStep:
 
 
 @arrays.register
+def _(method: Driven) -> Stepper:
+    return method.stepper()
+
+
+@arrays.register
 def _(method: AtRest) -> Method:
     return NO_METHOD
 
 
 @arrays.register
-def _(method: GaussJackson) -> Method | OneStep:
+def _(method: GaussJackson) -> Any:
     # The method that makes the first states.
     return arrays(DOP853 if method.velocities else RKN1210)
 
@@ -160,6 +167,11 @@ def form(method: Any, brief: bool) -> Form:
 @form.register
 def _(method: OneStep, brief: bool) -> Form:
     return Form(CUBIC, 3, own_slopes=True)
+
+
+@form.register
+def _(method: Driven, brief: bool) -> Form:
+    return Form(POLYNOMIAL, 1 + len(method.weights), method.weights)
 
 
 @form.register

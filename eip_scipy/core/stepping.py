@@ -15,6 +15,7 @@ from ..methods.multistep import GaussJackson
 from ..methods.nystrom import NystromTableau
 from ..methods.orders import AtRest
 from ..methods.runge_kutta import Tableau
+from .driven import Driven
 from .inputs import is_number, reals, refuse_units, shown
 from .one_step import OneStep
 
@@ -30,7 +31,7 @@ __all__ = [
     "saved_steps",
 ]
 
-AnyMethod = Tableau | NystromTableau | GaussJackson | OneStep | AtRest
+AnyMethod = Tableau | NystromTableau | GaussJackson | OneStep | Driven | AtRest
 UNBOUNDED = 2**62
 LEAST_RTOL = 100 * EPS  # SciPy's
 
@@ -145,6 +146,11 @@ class StepOptions:
             raise ValueError(
                 f"{name} {why} and needs the step h=...: without it, and where rtol, atol, first_step "
                 "or max_step ask for them, steps are adaptive."
+            )
+        if h is not None and method.drives:
+            raise ValueError(
+                f"h={shown(h)}: the steps of {name} are those of SciPy's {method.name}, which controls their length. "
+                "Leave h out and give rtol and atol, and max_step to bound the steps."
             )
         if h is not None and (self.first_step is not None or self.max_step != np.inf):
             raise ValueError(

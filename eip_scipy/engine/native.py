@@ -126,13 +126,17 @@ class OctetFunctions(NamedTuple):
 class Hooks(NamedTuple):
     """Parts of a step in Python, in place of the engine's own.
 
-    ``one_step(t, y, h)`` fills work.y_hat, and work.err if it `estimates`. ``project(t_old, t, last, y_new)`` projects
-    work.y_hat and returns the engine's code. `joint` are `JointInvariants`, which come before that. ``agree(here)``:
-    whether the raw result is finite on all processes that have a part of the state, as it is `here`.
+    ``one_step(t, y, h)`` fills work.y_hat, and work.err if it `estimates`. If it `drives`, it is
+    ``one_step(t, y, again)`` of a solver that controls its own error: it fills work.K too, and returns the end of its
+    step and the length of the next one, or None where no step is short enough; `again`: in place of the last one, and
+    shorter. ``project(t_old, t, last, y_new)`` projects work.y_hat and returns the engine's code. `joint` are
+    `JointInvariants`, which come before that. ``agree(here)``: whether the raw result is finite on all processes that
+    have a part of the state, as it is `here`.
     """
 
     one_step: Callable[..., Any] | None = None
     estimates: bool = False
+    drives: bool = False
     project: Callable[..., Any] | None = None
     agree: Callable[..., Any] | None = None
     joint: Any = None

@@ -69,6 +69,7 @@ class EnsembleKeywords(ProjectionDetails, total=False):
     args: Iterable[Any] | None
     in_place: bool
     jacobian: Callable[..., Any] | None
+    jac: Any
     events: Any
     dense_output: bool
     compiled: bool | None

@@ -56,6 +56,7 @@ def integrate(
     params: Any = None,
     in_place: bool = False,
     jacobian: Any = None,
+    jac: Any = None,
     variations: Any = None,
     jvp: Any = None,
     symplectic: bool | None = None,
@@ -101,18 +102,18 @@ def integrate(
         (n/2,)``, in place ``acceleration(t, q, out[, params])``; a Python, Numba or C function as for `fun`.
         Accelerations that depend on velocities belong in `fun`.
     method : type, optional
-        `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, `EIPGJ12`, `EIPGJ14`, or a
-        class made by `eip_method`; one on a one-step method runs interpreted. Default: the problem's
-        own, if it has one.
+        `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, `EIPGJ12`, `EIPGJ14`,
+        `EIPRadau`, `EIPBDF`, or a class made by `eip_method`; one on a one-step method runs interpreted, and so do
+        `EIPRadau` and `EIPBDF`. Default: the problem's own, if it has one.
     h : float, optional
         Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter. None: adaptive steps by
         `rtol`, `atol`, `first_step` and `max_step`. Default: adaptive where one of these is given, else a problem's
         own step, if it has one.
     args : tuple, optional
-        As in `scipy.integrate.solve_ivp`: passed on as the last arguments, to `fun`, events and `jacobian`, and to the
-        invariants' functions behind their own. Numbers reach Numba functions as such (a float, an int, a bool) and C
-        functions as `params`; a single array of floats is the same as ``params``. With anything else Python calls the
-        functions.
+        As in `scipy.integrate.solve_ivp`: passed on as the last arguments, to `fun`, events, `jacobian` and `jac`, and
+        to the invariants' functions behind their own. Numbers reach Numba functions as such (a float, an int, a bool)
+        and C functions as `params`; a single array of floats is the same as ``params``. With anything else Python calls
+        the functions.
     params : array_like of float, optional
         In place of `args`: passed on as the last argument, one array of floats. A problem that names its parameters
         (`hamiltonian`, `equations`) also takes a mapping of those that are to have other values.
@@ -121,6 +122,9 @@ def integrate(
     jacobian : callable, optional
         For a multistep method that takes it (`EIPGJ14`): ``jacobian(t, q, dq, out[, params])`` fills `out` with the
         derivative of the accelerations along dq, a Numba or C function for a compiled run. A problem may bring its own.
+    jac : callable or array_like, shape (n, n), optional
+        For `EIPRadau` and `EIPBDF`, as for SciPy's Radau and BDF: ``jac(t, y[, params]) -> (n, n)``, the matrix of the
+        derivatives of `fun`, dense or sparse, or a constant matrix.
     variations : str, int, sequence of these or array_like, shape (n, k), optional
         Derivatives of the state to carry along, by the steps of a Runge-Kutta method, and to project with the state so
         that they fit the invariants. ``"state"``: by the initial state, the state-transition matrix ``run.stm``. Names

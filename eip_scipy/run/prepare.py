@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.acceleration import BY_NAME, AccelerationField
 from ..core.arguments import Packed, are_same, extra_arguments, floats, names, scalars
+from ..core.driven import Jacobian
 from ..core.inputs import count, flag, real_array, refuse_units, require_arguments, shown
 from ..core.invariants import as_invariants, with_args
 from ..core.jitted import NotCompilableError
@@ -70,6 +71,7 @@ class Request:
     params: Any = None
     in_place: bool = False
     jacobian: Any = None
+    jac: Any = None
     variations: Any = None
     jvp: Any = None
     symplectic: Any = None
@@ -134,7 +136,7 @@ class System:
         self.extra = extra_arguments(request.args, request.params)
         self.parameters = floats(self.extra)
         self.events = Events(request.events, self.extra)
-        self.acc, self.jacobian = acc, request.jacobian
+        self.acc, self.jacobian, self.jac = acc, request.jacobian, request.jac
         if self.jacobian is not None and not callable(self.jacobian):
             raise TypeError(
                 f"jacobian must be a function jacobian(t, q, dq, out[, params]), got {shown(self.jacobian)}."
@@ -174,6 +176,11 @@ class System:
         self.jacobian = made(self.jacobian)
         return None if self.jacobian is None else times(self.jacobian, *self.extra)
 
+    def matrix(self) -> Jacobian:
+        """Return the Jacobian as SciPy's implicit solvers take it."""
+        jac = self.jac
+        return Jacobian((lambda t, y: jac(t, y, *self.extra)) if callable(jac) and self.extra else jac)
+
     def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
         """The functions of the loop, and which of them Python calls and why (None: none)."""
         in_python, numbers = self._in_python(run), scalars(self.extra)
@@ -181,7 +188,7 @@ class System:
             return in_python, "interpreted: compiled=False"
         try:
             if run.tableau.in_python:
-                raise NotCompilableError(f"{run.tableau.name} is a one-step method in Python")
+                raise NotCompilableError(f"the steps of {run.tableau.name} are made in Python")
             if numbers is None:
                 raise NotCompilableError("args are neither numbers nor one array of floats")
             params = Packed(self.parameters, numbers) if self.extra else None
@@ -330,6 +337,10 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
         request = replace(request, method=default_method(request.fun))
     method = _method(request.method)
     _check_choices(request)
+    if request.jac is not None and not method.drives:
+        raise TypeError(
+            f"jac is the Jacobian for EIPRadau and EIPBDF; {request.method.__name__} takes none. Leave it out."
+        )
     asked, request = request, request.with_pointers()
     acc = request.fun.acc if method.of_second_order and isinstance(request.fun, Problem) else None
     request, form = _with_problem(request)
@@ -369,7 +380,7 @@ def _spec(given: Any, request: Request, system: System, calls: Counted, stepping
         extra=system.extra,
         fun=system.fun if problem is None and system.name == "fun" else None,
         in_place="in place" in system.form,
-        jacobian=system.product,
+        jacobian=system.matrix if request.method.TABLEAU.drives else system.product,
         frequencies=None if problem is None else problem.frequencies,
         hint=partial(_second_order_hint, given),
         called=system.name,
@@ -523,7 +534,8 @@ def _with_problem(request: Request) -> tuple[Request, str]:
     own = problem.fun if problem.rhs is None else problem.rhs
     fun, form = _function_and_form(own, problem.rhs is not None)
     jacobian = problem.jacobian if request.jacobian is None else request.jacobian
-    h = problem.h if request.h is DEFAULT and not request.adaptive else request.h
+    fixed = request.h is DEFAULT and not request.adaptive and not request.method.TABLEAU.drives
+    h = problem.h if fixed else request.h
     found = replace(request, fun=fun, t_span=t_span, y0=y0, params=params, h=h, projection=projection)
     return replace(found, jacobian=jacobian), form
 

@@ -16,7 +16,17 @@ from ..core.inputs import shown
 from ..core.invariants import as_invariants, with_args
 from ..core.options import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.results import Diagnostics
-from ..core.solvers import EIPDOP853, EIPRK23, EIPRK45, EIPSolver, SolverClass, class_named, eip_method
+from ..core.solvers import (
+    EIPBDF,
+    EIPDOP853,
+    EIPRK23,
+    EIPRK45,
+    EIPRadau,
+    EIPSolver,
+    SolverClass,
+    class_named,
+    eip_method,
+)
 from ..core.states import initial_state
 from ..core.stepping import interval
 from ..core.variations import StateSolution, Variations, asked_columns, require_tableau, right_hand_side
@@ -28,9 +38,9 @@ else:  # SciPy's class of results has no public name
 
 __all__ = ["OdeResult", "solve_ivp"]
 
-EXPLICIT = {"RK23": EIPRK23, "RK45": EIPRK45, "DOP853": EIPDOP853}
+BY_NAME = {"RK23": EIPRK23, "RK45": EIPRK45, "DOP853": EIPDOP853, "Radau": EIPRadau, "BDF": EIPBDF}
 NOTHING = np.zeros(0)
-IMPLICIT = ("Radau", "BDF", "LSODA")
+WITHOUT = "LSODA"  # has no EIP method
 # Options of the EIP methods alone.
 OWN = {"h", "jacobian", "diagnostics", "variations", "jvp", *ProjectionOptions.names()}
 
@@ -125,8 +135,8 @@ def solve_ivp(
         Initial state, real or complex.
     method : type or str, optional
         An EIP method (default: `EIPRK45`), or a method of SciPy by its name or class. With invariants or any other
-        option of the EIP methods, "RK23", "RK45", "DOP853" and other explicit Runge-Kutta classes stand for the EIP
-        methods on them; without, SciPy's own take the steps.
+        option of the EIP methods, "RK23", "RK45", "DOP853", "Radau", "BDF" and other explicit Runge-Kutta classes stand
+        for the EIP methods on them; without, SciPy's own take the steps.
     t_eval, dense_output, events, vectorized
         As for `scipy.integrate.solve_ivp`.
     args : tuple, optional
@@ -149,8 +159,10 @@ def solve_ivp(
         As for the methods, see `EIPSolver`.
     diagnostics : Diagnostics, optional
         An empty record to be filled; without it, the result has a new one.
-    jac, jac_sparsity, lband, uband, min_step : optional
-        Options of SciPy's implicit methods.
+    jac, jac_sparsity : optional
+        The Jacobian, for `EIPRadau`, `EIPBDF` and SciPy's implicit methods, see `scipy.integrate.Radau`.
+    lband, uband, min_step : optional
+        Options of SciPy's LSODA.
 
     Returns
     -------
@@ -160,7 +172,8 @@ def solve_ivp(
     Raises
     ------
     TypeError
-        If options of the EIP methods are given to an implicit method; and as raised by SciPy and the methods.
+        If options of the EIP methods are given to LSODA or a class without an EIP method; and as raised by SciPy and
+        the methods.
 
     Warns
     -----
@@ -283,11 +296,11 @@ def _with_projection(method: Any, given: list[str]) -> Any:
     if isinstance(method, str) and method.upper() == class_named(method):
         raise ValueError(f"solve_ivp: {method!r} is a name; give the class, as in `from eip_scipy import {method}`.")
     is_class = isinstance(method, type) and issubclass(method, OdeSolver)
-    if not given or not (is_class or method in EXPLICIT or method in IMPLICIT):
+    if not given or not (is_class or method in BY_NAME or method == WITHOUT):
         return method
-    if not is_class and method in EXPLICIT:
-        return EXPLICIT[method]
-    if is_class and hasattr(method, "A"):
+    if not is_class and method in BY_NAME:
+        return BY_NAME[method]
+    if is_class and (hasattr(method, "A") or method.__name__ in BY_NAME):
         return eip_method(method)
     if refused := [name for name in given if name in ("variations", "jvp", *ProjectionOptions.names())]:
         raise TypeError(

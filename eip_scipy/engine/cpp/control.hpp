@@ -135,6 +135,33 @@ inline Code finish_step(const AnyRun &run, const Step &step) {
 // SciPy's: ten spacings of the numbers at t.
 inline double least_step(double t, double sign) { return 10.0 * std::abs(std::nextafter(t, sign * ENDLESS) - t); }
 
+// Says whether step k is projected; the last one always is.
+template <class AnyRun>
+inline bool is_projected(const AnyRun &run, int64_t k, bool last) {
+    const int64_t every = run.options.every, spacing = every == AUTO ? AUTO_SPACING : every;
+    const bool again = every == AUTO && !run.method.multistep && run.work.counters[WAITED] == 0;
+    return run.work.l > 0 && (last || again || spacing == 1 || (k + 1) % spacing == 0);
+}
+
+// Step k of a solver that controls its error and its length. Where a projection fails it takes the step back and makes a
+// shorter one, at most MAX_RETRIES times.
+template <class AnyRun>
+[[gnu::noinline]] inline Code driven_step(const AnyRun &run, const Span &span, double *clock, int64_t k,
+                                          const double *y, double *y_new) {
+    if (std::isnan(clock[NEXT_LENGTH])) return NOT_FINITE;
+    Code status = OK;
+    for (int retries = 0; retries <= MAX_RETRIES; ++retries) {
+        const auto code = static_cast<Code>(run.hooks->drive(clock[TIME], y, retries > 0, clock));
+        if (code != OK) return status == OK ? code : status;
+        const bool last = clock[TIME_NEW] == span.t_bound;
+        const Step step{clock[TIME], clock[TIME_NEW], clock[LENGTH], y, y_new, is_projected(run, k, last), last};
+        status = any_raw_step(run, step);
+        if (status == OK) status = finish_step(run, step);
+        if (status != FAILED_PROJECTION) return status;
+    }
+    return status;
+}
+
 // Step k: fixed, or the first one that the error control accepts; K[0] = f(t, y) on entry, w.last() = f at its end.
 //
 // A failed projection shortens the step, at most MAX_RETRIES times in a row. Returns OK, NOT_FINITE, FAILED_PROJECTION or
@@ -142,10 +169,9 @@ inline double least_step(double t, double sign) { return 10.0 * std::abs(std::ne
 template <class AnyRun>
 inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_t k, const double *y, double *y_new) {
     if (run.method.multistep) return next_states(OneState{of_any_length(run), y_new}, span, clock, k, k + 1, y, y_new);
-    const Options &o = run.options;
+    if (run.hooks && run.hooks->drives) return driven_step(run, span, clock, k, y, y_new);
     const auto &w = run.work;
     const bool adaptive = span.h == 0.0;
-    const int64_t spacing = o.every == AUTO ? AUTO_SPACING : o.every;
     if (!adaptive) clock[TIME] = span.t0 + k * span.h;
     const double t = clock[TIME], least = adaptive ? least_step(t, span.sign) : 0.0;
     double h_abs = clock[NEXT_LENGTH];
@@ -162,9 +188,7 @@ inline Code next_step(const AnyRun &run, const Span &span, double *clock, int64_
         clock[TIME_NEW] = last ? span.t_bound : t_new;
         clock[LENGTH] = adaptive ? clock[TIME_NEW] - t : span.between(k, k + 1);
         h_abs = std::abs(clock[LENGTH]);
-        const bool again = o.every == AUTO && !run.method.multistep && w.counters[WAITED] == 0;
-        const bool project = w.l > 0 && (last || again || spacing == 1 || (k + 1) % spacing == 0);
-        const Step step{t, clock[TIME_NEW], clock[LENGTH], y, y_new, project, last};
+        const Step step{t, clock[TIME_NEW], clock[LENGTH], y, y_new, is_projected(run, k, last), last};
         status = any_raw_step(run, step);
         const double norm = adaptive ? w.norm[0] : 0.0;
         if (status == OK && !std::isfinite(norm)) status = NOT_FINITE;

@@ -198,6 +198,7 @@ PythonHooks::PythonHooks(nb::handle hooks, const Buffers &buffers, const Run &ru
     agree_ = given("agree");
     estimates_ = truth(hooks, "estimates");
     raw = one_step_.is_valid();
+    drives = truth(hooks, "drives");
     project = project_.is_valid();
     agree = agree_.is_valid();
     const nb::handle joint_invariants = given("joint");
@@ -226,11 +227,22 @@ int code_of(const nb::object &returned) { return nb::cast<int>(returned); }
 
 }  // namespace
 
+// A step of a solver into w.y_hat, w.err and w.K, and its times into the clock. TOO_SMALL: it has failed.
+int PythonHooks::drive(double t, const double *y, bool again, double *clock) {
+    const nb::object made = one_step_(time(t), copied(y, run_.work.n, type_), nb::bool_(again));
+    if (made.is_none()) return TOO_SMALL;
+    clock[TIME] = t;
+    clock[TIME_NEW] = nb::cast<double>(made[0]);
+    clock[LENGTH] = clock[TIME_NEW] - t;
+    clock[NEXT_LENGTH] = nb::cast<double>(made[1]);
+    return OK;
+}
+
 // What `raw_step` does, by a method of the user's own. f is evaluated only where a gradient takes it: the steps do not.
 int PythonHooks::raw_step(const Step &step) {
     const Options &o = run_.options;
     const Work &w = run_.work;
-    one_step_(time(step.t), copied(step.y, w.n, type_), time(step.h));
+    if (!drives) one_step_(time(step.t), copied(step.y, w.n, type_), time(step.h));
     if (!all_finite(w.y_hat, w.m)) return NOT_FINITE;
     if (step.project && o.uses_f) {
         if (o.direction == OLD) {
@@ -250,7 +262,7 @@ int PythonHooks::raw_step(const Step &step) {
         trapezoid_error(step.y, w.y_hat, step.h, w.f_point, w.last(), w.err, w.m);
         w.counters[HAVE_ERROR] = 1;
     }
-    if (o.adaptive) w.norm[0] = error_norm(w.err, step.y, w.y_hat, o, w.n);
+    if (o.adaptive && !drives) w.norm[0] = error_norm(w.err, step.y, w.y_hat, o, w.n);
     return OK;
 }
 

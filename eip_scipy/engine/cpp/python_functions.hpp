@@ -73,6 +73,7 @@ class PythonHooks final : public Hooks {
   public:
     PythonHooks(nb::handle hooks, const Buffers &buffers, const Run &run, nb::list &kept);
 
+    int drive(double t, const double *y, bool again, double *clock) override;
     int raw_step(const Step &step) override;
     bool project_jointly(const Step &step) override;
     int project_elsewhere(const Step &step) override;

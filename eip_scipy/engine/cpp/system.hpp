@@ -39,11 +39,13 @@ struct Step;
 
 // Parts of a step that are replaced: one-step methods of a user's own, the end of the step by a subclass, the projection of
 // `JointInvariants`, which may decline, and then that of a state whose parts lie on several processes. These have to agree
-// whether a raw result is finite, too. Codes as the step's own.
+// whether a raw result is finite, too. Codes as the step's own. drives: the raw step is that of a solver which controls its
+// error and its length, and `drive` makes it, `again` in place of one whose projection has failed.
 class Hooks {
   public:
     virtual ~Hooks() = default;
-    bool raw = false, joint = false, project = false, agree = false;
+    bool raw = false, drives = false, joint = false, project = false, agree = false;
+    virtual int drive(double t, const double *y, bool again, double *clock) = 0;
     virtual int raw_step(const Step &step) = 0;
     virtual bool project_jointly(const Step &step) = 0;
     virtual int project_elsewhere(const Step &step) = 0;

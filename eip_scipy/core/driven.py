@@ -1,0 +1,342 @@
+"""SciPy's implicit solvers in the place of the raw step: `EIPRadau` and `EIPBDF` drive them, and project their states.
+
+A solver of SciPy controls its error and the length of its steps. The engine lets it make a step, projects the result,
+and hands the projected state back before the next step. Some attributes that are used here are not public: `PRIVATE`
+lists them, and a run says which one a version of SciPy lacks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import scipy
+from scipy.integrate import BDF, DenseOutput, OdeSolver, Radau
+
+from ..engine.data import NFEV, NJEV, NLU, Work
+from ..methods.orders import Ordered
+
+if TYPE_CHECKING:
+    from .stepping import Stepping
+
+__all__ = ["DRIVEN_BDF", "DRIVEN_RADAU", "Driven", "Jacobian", "Stepper"]
+
+Array = np.ndarray
+Derivative = Callable[[float, Array], Array]
+
+# The largest share of a component by which SciPy shifts it for a numerical Jacobian. SciPy's own shifts of components
+# that do not occur in the equations grow tenfold with each Jacobian until they overflow; this bound is that of MATLAB's
+# numjac.
+LARGEST_SHIFT = 0.1
+# Exponent of the relative errors in the weights of the projection. Weights are tolerances, atol + rtol |y|, but for
+# components that are constant and have no error, which stay.
+KAPPA = 1e-3
+COUNTERS = {"nfev": NFEV, "njev": NJEV, "nlu": NLU}
+# Private attributes of SciPy's solvers.
+PRIVATE = {
+    Radau: ("f", "Z", "h_abs", "solve_lu", "LU_real", "LU_complex", "sol"),
+    BDF: ("D", "order", "error_const", "h_abs", "LU"),
+}
+# x, x^2, x^3 by the stages of Radau's method, at the nodes C: the polynomial through 0 and the stages.
+SQRT_6 = 6**0.5
+NODES = np.array([(4 - SQRT_6) / 10, (4 + SQRT_6) / 10, 1.0])
+MOST_ORDER = 5  # of BDF
+
+
+class Jacobian(NamedTuple):
+    """What SciPy's implicit solvers take as `jac` and `jac_sparsity`."""
+
+    jac: Any = None
+    jac_sparsity: Any = None
+
+
+class Driven(Ordered):
+    """A method whose steps a solver of SciPy makes, in the roles of a tableau.
+
+    Parameters
+    ----------
+    solver : type
+        The class of SciPy.
+    stepper : type
+        The `Stepper` that knows its inside.
+    order, error_estimator_order : int
+    takes_complex : bool
+        Whether it takes complex states.
+    polynomials : ndarray, shape (k, k)
+        Coefficients of x, x^2, ... of the interpolant by what the stepper leaves in work.K.
+
+    Attributes
+    ----------
+    name : str
+    """
+
+    in_python = True
+    drives = True
+    kappa = KAPPA
+
+    def __init__(
+        self,
+        solver: type[OdeSolver],
+        stepper: type[Stepper],
+        order: int,
+        error_estimator_order: int,
+        polynomials: Array,
+        takes_complex: bool,
+    ) -> None:
+        self.name, self.solver, self._stepper = solver.__name__, solver, stepper
+        self.order, self.error_estimator_order, self.takes_complex = order, error_estimator_order, takes_complex
+        # The first and the last row of work.K are the derivatives at both ends of a step.
+        self.weights = np.pad(polynomials, ((0, 0), (1, 1)))
+
+    def __repr__(self) -> str:
+        return f"<Driven {self.name}>"
+
+    def stepper(self) -> Stepper:
+        """Return what makes the steps of one run."""
+        return self._stepper(self)
+
+
+class Stepper:
+    """The solver of one run, made in its first step.
+
+    Attributes
+    ----------
+    method : Driven
+    solver : OdeSolver
+        That of SciPy; None before the first step.
+    b, c, exponent, multistep
+        Of the method as the engine reads it: it leaves as many rows in work.K as a tableau has stages.
+    """
+
+    multistep = None
+    exponent = 0.0
+
+    def __init__(self, method: Driven) -> None:
+        self.method = method
+        self.b = self.c = np.zeros(method.weights.shape[1] - 1)
+        self.solver: Any = None
+        self._make: Callable[[], OdeSolver]
+        self._before: dict[str, Any] = {}
+        self._counted = dict.fromkeys(COUNTERS, 0)
+
+    def begin(self, rhs: Derivative, start: Any, stepping: Stepping, jacobian: Jacobian | None) -> None:
+        """Begin at a start (t, y, f, length of the first step).
+
+        Raises
+        ------
+        ValueError
+            If SciPy's solver does not take such a state or tolerance.
+        """
+        (t, y, f, length), name, rtol = start, self.method.name, stepping.rtol
+        if y.dtype.kind == "c" and not self.method.takes_complex:
+            raise ValueError(
+                f"y0 is complex, and SciPy's {name} takes real states only. Use EIPBDF, or real components."
+            )
+        if rtol.size and np.ptp(rtol) > 0:
+            raise ValueError(f"rtol={rtol}: SciPy's {name} takes one number. Give atol by component instead.")
+        known = [f]  # its first call asks for this
+
+        def fun(t: float, y: Array) -> Array:
+            return known.pop() if known else rhs(t, y)
+
+        make: Any = self.method.solver
+        self.solver, self._make = None, partial(
+            make, fun, t, y, stepping.span.t_bound, max_step=stepping.span.max_step,
+            rtol=float(rtol.max(initial=0.0)), atol=stepping.atol, first_step=length,
+            **(jacobian or Jacobian())._asdict(),
+        )  # fmt: skip
+
+    def _made(self) -> Any:
+        """Return the solver, which evaluates a Jacobian when it is made: these evaluations are not counted."""
+        solver = self._make()
+        solver.nfev = 0
+        self._counted = dict.fromkeys(COUNTERS, 0)
+        lacking = [name for name in PRIVATE[self.method.solver] if not hasattr(solver, name)]
+        if lacking:
+            raise NotImplementedError(
+                f"EIP{self.method.name} uses attributes of scipy.integrate.{self.method.name} that SciPy "
+                f"{scipy.__version__} does not have: {', '.join(lacking)}. Use another version of SciPy, or report it."
+            )
+        self._watch(solver)
+        return solver
+
+    def fill(self, w: Work, t: float, y: Array, again: bool) -> tuple[float, float] | None:
+        """Make a step from the state y into the buffers `w`.
+
+        `again`: in place of the last step, whose projection has failed, with half its length. Returns the end of the
+        step and the length of the next one, or None if no step is short enough.
+        """
+        if self.solver is None:
+            self.solver = self._made()
+        solver = self.solver
+        longest = solver.max_step
+        if again:
+            solver.max_step = 0.5 * abs(solver.t - self._before["t"])
+            self._restore()
+        else:
+            if not np.array_equal(y, solver.y):
+                self._move(y)
+            self._before = self._kept()
+        self._bound_shifts()
+        solver.step()
+        solver.max_step = longest
+        self._count(w)
+        if solver.status == "failed":
+            return None
+        h = solver.t - t
+        w.y_hat[:] = solver.y
+        w.err[:] = self._error(h).view(float)
+        self._describe(h, w.K[1:-1])
+        w.K[-1] = self._slope(w.K[1:-1])
+        return float(solver.t), float(solver.h_abs)
+
+    def _bound_shifts(self) -> None:
+        if self.solver.jac_factor is not None:
+            self.solver.jac_factor = np.minimum(self.solver.jac_factor, LARGEST_SHIFT)
+
+    def _count(self, w: Work) -> None:
+        for name, place in COUNTERS.items():
+            found = getattr(self.solver, name)
+            w.counters[place] += found - self._counted[name]
+            self._counted[name] = found
+
+    def _kept(self) -> dict[str, Any]:
+        """Return what takes the solver back to the state before a step."""
+        return {name: value for name, value in vars(self.solver).items() if name not in (*COUNTERS, "jac_factor")}
+
+    def _restore(self) -> None:
+        """Take the solver back to the state before the last step, with its factorisations left out."""
+        vars(self.solver).update(
+            self._before | dict.fromkeys(self._factors(), None) | {"max_step": self.solver.max_step}
+        )
+
+    def _factors(self) -> list[str]:
+        return [name for name in vars(self.solver) if name.startswith("LU")]
+
+    def state(self) -> dict[str, Any] | None:
+        """Return the values of the solver, from which another one goes on to the same bits; None before a step."""
+        if self.solver is None:
+            return None
+        values = {
+            name: value
+            for name, value in vars(self.solver).items()
+            if isinstance(value, DenseOutput) or not callable(value)
+        }
+        # Sparse factorisations cannot be copied; they are made again.
+        return values | {name: None for name in self._factors() if not isinstance(values[name], tuple)}
+
+    def resume(self, values: dict[str, Any] | None) -> None:
+        """Go on from the `state` of another stepper, after `begin`."""
+        if values is None:
+            return
+        self.solver = self._made()
+        vars(self.solver).update(values)
+        self._counted = {name: getattr(self.solver, name) for name in COUNTERS}
+
+    def _watch(self, solver: Any) -> None:
+        """Have the solver keep what its steps leave nowhere."""
+
+    def _move(self, y: Array) -> None:
+        """Put the solver into the projected state y."""
+        raise NotImplementedError
+
+    def _error(self, h: float) -> Array:
+        """Return the error estimate of each component in the step of length h made last."""
+        raise NotImplementedError
+
+    def _describe(self, h: float, rows: Array) -> None:
+        """Fill `rows` with what the method's `weights` make the interpolant of."""
+        raise NotImplementedError
+
+    def _slope(self, rows: Array) -> Array:
+        """Return the derivative at the end of the step."""
+        raise NotImplementedError
+
+
+class RadauStepper(Stepper):
+    """Knows SciPy's Radau.
+
+    The derivative is evaluated anew at a projected state, because the error estimate takes it. The predictor of the
+    next step continues the polynomial of the last step as it was.
+    """
+
+    _solved: Array
+
+    def _watch(self, solver: Any) -> None:
+        solve = solver.solve_lu
+
+        def solve_lu(factors: Any, b: Array) -> Array:
+            self._solved = solve(factors, b)
+            return self._solved
+
+        solver.solve_lu = solve_lu
+
+    def _move(self, y: Array) -> None:
+        self.solver.y = y
+        self.solver.f = self.solver.fun(self.solver.t, y)
+
+    def _error(self, h: float) -> Array:
+        return self._solved  # the error estimate is the last system that an accepted step solves
+
+    def _describe(self, h: float, rows: Array) -> None:
+        np.divide(self.solver.Z, h, out=rows)
+
+    def _slope(self, rows: Array) -> Array:
+        return self.solver.f
+
+
+class BDFStepper(Stepper):
+    """Knows SciPy's BDF, whose history are backward differences D of the states at equal distances.
+
+    A projection moves the whole history alike: the differences stay as they are.
+    """
+
+    def _kept(self) -> dict[str, Any]:
+        return super()._kept() | {"D": self.solver.D.copy()}
+
+    def _move(self, y: Array) -> None:
+        self.solver.y = y
+        self.solver.D[0] = y
+
+    def _error(self, h: float) -> Array:
+        solver, order = self.solver, self._before["order"]
+        difference = solver.D[order + 1]
+        if solver.order > order:  # it has been scaled to the next step
+            difference = difference / (solver.h_abs / abs(h)) ** (order + 1)
+        return solver.error_const[order] * difference
+
+    def _describe(self, h: float, rows: Array) -> None:
+        """Turn the differences, of the next step's length, into coefficients of powers of x = (t - t_old) / h."""
+        order = self.solver.order
+        ratio = (abs(h) / self.solver.h_abs) ** np.arange(MOST_ORDER + 1)
+        powers = (SHIFTED * ratio) @ NEWTON[:, : order + 1]
+        np.divide(powers[1:] @ self.solver.D[: order + 1], h, out=rows)
+
+    def _slope(self, rows: Array) -> Array:
+        return np.arange(1, MOST_ORDER + 1) @ rows
+
+
+def _newton() -> Array:
+    """Coefficients of powers of s in the columns s (s + 1) ... (s + k - 1) / k!."""
+    out = np.zeros((MOST_ORDER + 1, MOST_ORDER + 1))
+    out[0, 0] = 1.0
+    for k in range(1, MOST_ORDER + 1):
+        out[1:, k] = out[:-1, k - 1]
+        out[:, k] += (k - 1) * out[:, k - 1]
+        out[:, k] /= k
+    return out
+
+
+def _shifted() -> Array:
+    """Coefficients of powers of x in the columns (x - 1)^j."""
+    return np.array(
+        [[(-1.0) ** (j - i) * math.comb(j, i) for j in range(MOST_ORDER + 1)] for i in range(MOST_ORDER + 1)]
+    )
+
+
+NEWTON, SHIFTED = _newton(), _shifted()
+DRIVEN_RADAU = Driven(Radau, RadauStepper, 5, 3, np.linalg.inv(NODES[:, None] ** np.arange(1, 4)), takes_complex=False)
+DRIVEN_BDF = Driven(BDF, BDFStepper, 1, 1, np.eye(MOST_ORDER), takes_complex=True)
