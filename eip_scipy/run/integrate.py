@@ -237,6 +237,11 @@ class Loop:
         self.rhs, self.events, self.diagnostics = system.rhs, system.events, prepared.diagnostics
         self.callback, self.progress = request.callback, request.progress
         if keeper.keeps:
+            if run.tableau.drives:
+                raise ValueError(
+                    f"checkpoint: a file does not hold the inside of SciPy's {run.tableau.name}, by which the run "
+                    "would go on. Leave it out, or save the state of a run and start another one from it."
+                )
             identity = prepared.identity(run.begin.y, system.parameters)
             keeper.identify(identity, run, system.derivative, *run.begin[:3])
         wanted = request.compiled if compiled is None else compiled

@@ -277,19 +277,18 @@ class Search:
             self.notes.append(f"Without the projection the error is {plain.error:.1e}.")
 
     def _say_that_it_is_stiff(self, chosen: Trial) -> bool:
-        """Try SciPy's implicit method if the run is long, and say by how much it is cheaper if it is."""
+        """Try an implicit method if the run is long, and say by how much it is cheaper if it is."""
         bench, share = self.bench, self.bench.share
         if chosen.nfev * share < LEAST_BOUND or np.iscomplexobj(bench.truth):
             return False
-        implicit = implicit_run(bench, self.wanted, int(chosen.nfev * share / STIFF))
+        implicit = implicit_run(bench, self.wanted, int(chosen.nfev * share / STIFF), self.keeps)
         if implicit is None:
             return False
         nfev = round(implicit.nfev / share)
         self.notes.append(
-            f"The equations are stiff: stability bounds the steps of explicit methods. SciPy's implicit method Radau "
+            "The equations are stiff: stability bounds the steps of explicit methods. The implicit method EIPRadau "
             f"has an error of {implicit.error:.1e} with {nfev} evaluations, {chosen.nfev / nfev:.2g} times fewer. Take "
-            f'scipy.integrate.solve_ivp(fun, t_span, y0, method="Radau", rtol={implicit.rtol:.2g}, '
-            f'atol={implicit.atol:.2g}), or "BDF".'
+            f"method=EIPRadau, rtol={implicit.rtol:.2g}, atol={implicit.atol:.2g}, or EIPBDF, in `integrate`."
         )
         return True
 

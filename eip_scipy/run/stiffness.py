@@ -1,13 +1,15 @@
-"""The comparison with SciPy's implicit method that shows whether equations are stiff."""
+"""The comparison with an implicit method that shows whether equations are stiff."""
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from ..core.solvers import EIPDOP853
+from ..core.invariants import as_invariants, with_args
+from ..core.solvers import EIPDOP853, EIPRadau
 from .prepare import Request, prepared
 from .trials import Bench, difference
 
@@ -20,7 +22,7 @@ LARGEST = 500
 
 
 class ImplicitRun(NamedTuple):
-    """Tolerances, error and evaluations of a run by Radau; those for Jacobians are counted."""
+    """Tolerances, error and evaluations of a run by EIPRadau; those for Jacobians are counted."""
 
     rtol: float
     atol: float
@@ -32,8 +34,8 @@ class _TooManyError(Exception):
     """The evaluations are used up."""
 
 
-def implicit_run(bench: Bench, wanted: float, most: int) -> ImplicitRun | None:
-    """Run a problem by SciPy's Radau to the end of the bench's trials.
+def implicit_run(bench: Bench, wanted: float, most: int, keeps: bool) -> ImplicitRun | None:
+    """Run a problem by `EIPRadau` to the end of the bench's trials.
 
     Parameters
     ----------
@@ -43,6 +45,8 @@ def implicit_run(bench: Bench, wanted: float, most: int) -> ImplicitRun | None:
         Error at the last time of the bench.
     most : int
         Evaluations that a run may take.
+    keeps : bool
+        Whether the invariants are kept.
 
     Returns
     -------
@@ -53,7 +57,9 @@ def implicit_run(bench: Bench, wanted: float, most: int) -> ImplicitRun | None:
     if y0.size > LARGEST:
         return None
     options = {**bench.common, "method": EIPDOP853, "rtol": 1e-3, "atol": 1e-6, "invariants": ()}
-    derivative = prepared(Request.of(fun=bench.problem, **options)).system.derivative
+    system = prepared(Request.of(fun=bench.problem, **options)).system
+    items = as_invariants(bench.common.get("invariants", bench.problem.invariants) if keeps else ())
+    kept = tuple(item if item.args else with_args(item, system.extra) for item in items)
     calls = 0
 
     def fun(t: float, y: np.ndarray) -> Any:
@@ -61,15 +67,16 @@ def implicit_run(bench: Bench, wanted: float, most: int) -> ImplicitRun | None:
         calls += 1
         if calls > most:
             raise _TooManyError
-        return derivative(t, y)
+        return system.derivative(t, y)
 
     size = min(1.0, float(np.abs(y0).max())) or 1.0
     for part in TOLERANCES:
         rtol, calls = max(part * wanted, 1e-12), 0
         atol = ATOL_PER_RTOL * rtol * size
         try:
-            with np.errstate(all="ignore"):
-                run = solve_ivp(fun, (bench.t0, times[-1]), y0, method="Radau", rtol=rtol, atol=atol)
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                run = solve_ivp(fun, (bench.t0, times[-1]), y0, method=EIPRadau, rtol=rtol, atol=atol, invariants=kept)
         except (_TooManyError, ValueError, ArithmeticError, np.linalg.LinAlgError):
             return None  # what explicit methods do is recommended all the same
         if not run.success:

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from systems import H, L, orbit, pericentre
 
-from eip_scipy import EIPGJ14, Invariant, ProjectionWarning, integrate, recommend
+from eip_scipy import EIPGJ14, EIPRadau, Invariant, ProjectionWarning, integrate, recommend
 from eip_scipy.problems import kepler, solar_system
 from eip_scipy_studies.hard_cases import hard_cases
 
@@ -160,21 +160,38 @@ STIFF = {
 
 @pytest.mark.parametrize("name", STIFF)
 def test_stiffness_is_named(name):
-    """The reason names the method of SciPy that takes at most 0.33 of the evaluations, as it does when it is run."""
+    """The reason names an implicit method that takes at most 0.33 of the evaluations, as it does when it is run."""
     fun, t_span, y0 = STIFF[name]
     choice = recommend(fun, t_span, y0, error=1e-4)
     assert choice.stiff
-    said = re.search(r"error of (\S+) with (\d+) evaluations.*rtol=(\S+), atol=(\S+)\), or \"BDF\"", choice.reason)
+    said = re.search(r"error of (\S+) with (\d+) evaluations.*rtol=(\S+), atol=(\S+), or EIPBDF", choice.reason)
     error, nfev, rtol, atol = map(float, said.groups())
     assert "The equations are stiff: stability bounds the steps" in choice.reason
     assert error <= 1e-4
     assert 3 * nfev <= choice.nfev
     if choice.share == 1:
-        sol = solve_ivp(fun, t_span, y0, method="Radau", rtol=rtol, atol=atol)
+        sol = integrate(fun, t_span, y0, method=EIPRadau, rtol=rtol, atol=atol)
         assert sol.nfev <= 1.05 * nfev
         if name == "linear":
             exact = expm(A * 10) @ y0
             assert np.abs(sol.y[:, -1] - exact).max() <= 1.1e-4 * np.abs(exact).max()
+
+
+def test_a_stiff_run_keeps_its_invariants():
+    """Fast relaxation onto a circle, round which the motion is slow: the radius is kept by the proposed method."""
+
+    def fun(t, y):
+        turn = np.array([-y[1], y[0], 0.0])
+        return turn + np.array([0.0, 0.0, -2000 * (y[2] - y[0])])
+
+    radius = Invariant(lambda t, y: y[0] ** 2 + y[1] ** 2, lambda t, y: np.array([2 * y[0], 2 * y[1], 0]), name="r")
+    choice = recommend(fun, (0, 10), [1.0, 0.0, 1.0], error=1e-4, invariants=radius)
+    assert choice.stiff
+    error = float(re.search(r"EIPRadau has an error of (\S+) with", choice.reason).group(1))
+    rtol, atol = map(float, re.search(r"rtol=(\S+), atol=(\S+), or", choice.reason).groups())
+    run = integrate(fun, (0, 10), [1.0, 0.0, 1.0], method=EIPRadau, rtol=rtol, atol=atol, invariants=radius)
+    assert run.max_defect[0] < 1e-9
+    assert abs(run.y[0, -1] - math.cos(10)) < 2 * error
 
 
 def test_fast_oscillations_are_not_stiff():

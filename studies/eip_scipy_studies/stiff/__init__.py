@@ -1,0 +1,1 @@
+"""Stiff systems by SciPy's implicit methods, with and without projection."""

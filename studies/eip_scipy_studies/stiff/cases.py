@@ -1,0 +1,241 @@
+"""Stiff problems that have invariants, from chemistry, magnetism, mechanics and phase separation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from eip_scipy import Invariant
+
+from .mechanisms import chain, governor
+
+__all__ = ["CASES", "Case"]
+
+Array = np.ndarray
+TIGHT = 1e-11
+
+
+@dataclass
+class Case:
+    """A stiff problem, and its reference.
+
+    Attributes
+    ----------
+    fun : callable
+    end : float
+        The interval begins at 0.
+    y0 : ndarray, shape (n,)
+    invariants : list of Invariant
+    size : float or ndarray
+        Size of the components, by which the absolute tolerance and errors are measured.
+    """
+
+    fun: Callable[[float, Array], Array]
+    end: float
+    y0: Array
+    invariants: list[Invariant]
+    size: Any = 1.0
+    calls: int = field(default=0, init=False)
+
+    def counted(self, t: float, y: Array) -> Array:
+        """The right-hand side; its calls are counted."""
+        self.calls += 1
+        return self.fun(t, y)
+
+    @cached_property
+    def reference(self) -> Array:
+        """The last state by SciPy's Radau at small tolerances."""
+        atol = 1e-2 * TIGHT * self.size
+        return solve_ivp(self.fun, (0, self.end), self.y0, method="Radau", rtol=TIGHT, atol=atol).y[:, -1]
+
+    def error(self, method: Any, rtol: float, share: float = 1e-2, **options: Any) -> tuple[float, int]:
+        """Run, and return the error of the last state and the calls, those for Jacobians included.
+
+        Parameters
+        ----------
+        method : str or type
+        rtol : float
+        share : float
+            The absolute tolerance is ``share * rtol * size``.
+        **options
+            Of `solve_ivp`.
+        """
+        self.calls = 0
+        run = solve_ivp(
+            self.counted, (0, self.end), self.y0, method=method, rtol=rtol, atol=share * rtol * self.size, **options
+        )
+        if not run.success:
+            raise RuntimeError(run.message)
+        return float(np.max(np.abs(run.y[:, -1] - self.reference) / self.size)), self.calls
+
+
+def _linear(weights: Sequence[float], name: str = "mass") -> Invariant:
+    row = np.array(weights, float)
+    return Invariant(lambda t, y: row @ y, lambda t, y: row, name=name)
+
+
+def robertson() -> Case:
+    """Robertson's autocatalytic reaction; mass."""
+
+    def fun(t: float, y: Array) -> Array:
+        a, b, c = 0.04 * y[0], 1e4 * y[1] * y[2], 3e7 * y[1] ** 2
+        return np.array([b - a, a - b - c, c])
+
+    return Case(fun, 1e4, np.array([1.0, 0.0, 0.0]), [_linear([1, 1, 1])], np.array([1.0, 1e-5, 1.0]))
+
+
+def hires() -> Case:
+    """HIRES of the test set for initial value problem solvers; the sum of the last two species."""
+
+    def fun(t: float, y: Array) -> Array:
+        bound = 280 * y[5] * y[7]
+        return np.array(
+            [
+                -1.71 * y[0] + 0.43 * y[1] + 8.32 * y[2] + 0.0007,
+                1.71 * y[0] - 8.75 * y[1],
+                -10.03 * y[2] + 0.43 * y[3] + 0.035 * y[4],
+                8.32 * y[1] + 1.71 * y[2] - 1.12 * y[3],
+                -1.745 * y[4] + 0.43 * y[5] + 0.43 * y[6],
+                -bound + 0.69 * y[3] + 1.71 * y[4] - 0.43 * y[5] + 0.69 * y[6],
+                bound - 1.81 * y[6],
+                -bound + 1.81 * y[6],
+            ]
+        )
+
+    start = np.array([1, 0, 0, 0, 0, 0, 0, 0.0057])
+    return Case(fun, 321.8122, start, [_linear([0] * 6 + [1, 1])], np.array([0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01]))
+
+
+def pyrolysis() -> Case:
+    """E5 of the test set, the pyrolysis of a gas; a balance of three species."""
+    A, B, M, C = 7.89e-10, 1.1e7, 1e6, 1.13e3
+
+    def fun(t: float, y: Array) -> Array:
+        first, second, third, fourth = A * y[0], B * y[0] * y[2], M * C * y[1] * y[2], C * y[3]
+        return np.array([-first - second, first - third, first - second - third + fourth, second - fourth])
+
+    size = np.array([1.76e-3, 1e-10, 1e-10, 1e-13])
+    kept = Invariant(
+        lambda t, y: y[1] - y[2] - y[3], lambda t, y: np.array([0.0, 1.0, -1.0, -1.0]), scale=1e-10, name="balance"
+    )
+    return Case(fun, 1e5, np.array([1.76e-3, 0, 0, 0]), [kept], size)
+
+
+def enzyme() -> Case:
+    """The reaction of Michaelis and Menten with fast binding; enzyme and substrate."""
+
+    def fun(t: float, y: Array) -> Array:
+        binding, back, made = 1e6 * y[0] * y[1], 1e3 * y[2], 1e1 * y[2]
+        return np.array([back + made - binding, back - binding, binding - back - made, made])
+
+    kept = [_linear([1, 0, 1, 0], "enzyme"), _linear([0, 1, 1, 1], "substrate")]
+    return Case(fun, 20.0, np.array([0.01, 1.0, 0.0, 0.0]), kept, np.array([0.01, 1.0, 0.01, 1.0]))
+
+
+def ozone() -> Case:
+    """Ozone after Chapman, in units of the oxygen; atoms."""
+
+    def fun(t: float, y: Array) -> Array:
+        atom, molecule, ozone = y
+        split, joined, light, lost = 1e-3 * molecule, 1e5 * atom * molecule, 1e1 * ozone, 1e3 * atom * ozone
+        return np.array([2 * split - joined + light - lost, -split - joined + light + 2 * lost, joined - light - lost])
+
+    return Case(fun, 100.0, np.array([0.0, 1.0, 0.0]), [_linear([1, 2, 3], "atoms")], np.array([1e-5, 1.0, 1e-2]))
+
+
+def magnet() -> Case:
+    """A magnetic moment with strong damping after Landau and Lifshitz in a field that turns; its length."""
+
+    def fun(t: float, m: Array) -> Array:
+        field_ = 1e3 * np.array([np.cos(t), np.sin(t), 0.5]) + 1e3 * np.array([0.0, 0.0, m[2]])
+        turn = np.cross(m, field_)
+        return -turn - 5.0 * np.cross(m, turn)
+
+    length = Invariant(lambda t, m: m @ m, lambda t, m: 2 * m, name="length")
+    return Case(fun, 5.0, np.array([0.6, 0.0, 0.8]), [length])
+
+
+def dumbbell() -> Case:
+    """Two masses in the plane on a stiff spring with friction, in a harmonic trap; angular momentum."""
+    k, c = 1e6, 1e4
+
+    def fun(t: float, y: Array) -> Array:
+        q, v = y[:4].reshape(2, 2), y[4:].reshape(2, 2)
+        along, moving = q[1] - q[0], v[1] - v[0]
+        length = np.sqrt(along @ along)
+        pull = (k * (length - 1) + c * (along @ moving) / length) * along / length
+        return np.concatenate([y[4:], (pull - q[0]), 0.5 * (-pull - 2 * q[1])])
+
+    mass = np.array([1.0, 1.0, 2.0, 2.0])
+
+    def momentum(t: float, y: Array) -> Any:
+        q, p = y[:4], mass * y[4:]
+        return q[0] * p[1] - q[1] * p[0] + q[2] * p[3] - q[3] * p[2]
+
+    def gradient(t: float, y: Array) -> Array:
+        q, p = y[:4], mass * y[4:]
+        return np.concatenate([[p[1], -p[0], p[3], -p[2]], mass * np.array([-q[1], q[0], -q[3], q[2]])])
+
+    start = np.array([-1.0, 0.2, 0.0, 0.2, 0.1, -0.8, -0.2, 0.6])
+    return Case(fun, 10.0, start, [Invariant(momentum, gradient, name="L")])
+
+
+def satellite() -> Case:
+    """A rigid body with a damping wheel inside (strong friction); the length of its angular momentum."""
+    inertia, wheel, friction = np.array([1.0, 2.0, 3.0]), 0.5, 1e4
+
+    def fun(t: float, y: Array) -> Array:
+        L, spin = y[:3], y[3:]
+        omega = (L - wheel * spin) / inertia
+        torque = -friction * spin
+        # spin: speed of the fluid wheel against the body; its own momentum is wheel (omega + spin)
+        return np.concatenate([np.cross(L, omega), torque - np.cross(L, omega) / inertia])
+
+    length = Invariant(lambda t, y: y[:3] @ y[:3], lambda t, y: np.concatenate([2 * y[:3], np.zeros(3)]), name="|L|^2")
+    return Case(fun, 50.0, np.array([1.0, 0.9, 0.3, 0.1, 0.0, 0.2]), [length], np.array([1.0] * 3 + [1e-4] * 3))
+
+
+def separation() -> Case:
+    """The equation of Cahn and Hilliard on a ring of 48 points; mass."""
+    n = 48
+    ring = np.roll(np.eye(n), 1, axis=0) + np.roll(np.eye(n), -1, axis=0) - 2 * np.eye(n)
+    step = 1.0 / n
+    laplace = ring / step**2
+    start = 0.1 + 0.2 * np.cos(2 * np.pi * np.arange(n) / n) + 0.1 * np.sin(6 * np.pi * np.arange(n) / n)
+
+    def fun(t: float, u: Array) -> Array:
+        return laplace @ (u**3 - u - 2e-3 * laplace @ u)
+
+    return Case(fun, 0.2, start, [_linear(np.full(n, step))])
+
+
+def damped_chain() -> Case:
+    """The chain with dampers; its constraints."""
+    made = chain([1.2, 0.9, 0.5])
+    return Case(made.fun, 5.0, made.y0, made.invariants)
+
+
+def stiff_governor() -> Case:
+    """The flyball governor; its constraints and its angular momentum."""
+    made = governor()
+    return Case(made.fun, 5.0, made.y0, made.invariants)
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "Robertson": robertson,
+    "HIRES": hires,
+    "E5": pyrolysis,
+    "enzyme": enzyme,
+    "ozone": ozone,
+    "magnet": magnet,
+    "dumbbell": dumbbell,
+    "satellite": satellite,
+    "Cahn-Hilliard": separation,
+    "chain": damped_chain,
+    "governor": stiff_governor,
+}
