@@ -190,6 +190,8 @@ class Problem:
         if hasattr(method, "TABLEAU"):  # an EIP method; the problem knows no solver
             names = ("invariants", "metric", "blocks", "frame")
             brought = {name: value for name in names if (value := getattr(self, name)) is not None}
+            if method.TABLEAU.drives:
+                brought["invariants"] = self.stiff_invariants
             fixed = self.h is not None and not method.TABLEAU.drives
             if fixed and not {"rtol", "atol", "first_step", "max_step"} & options.keys():
                 brought["h"] = self.h
@@ -208,6 +210,15 @@ class Problem:
     def parameters(self) -> dict[str, float]:
         """Values of the parameters by name, of a problem that names them: those of `hamiltonian` and `equations` do."""
         return {}
+
+    @property
+    def stiff_invariants(self) -> tuple[Any, ...]:
+        """The invariants that implicit methods keep by default: they carry no balances.
+
+        A problem that knows which of its invariants is an energy leaves it out: these methods damp fast oscillations,
+        and a projection onto an energy that contains them puts what they lose into the slow motion.
+        """
+        return tuple(item for item in self.invariants if not item.is_balance)
 
     @property
     def has_second_order(self) -> bool:

@@ -526,7 +526,10 @@ def _with_problem(request: Request) -> tuple[Request, str]:
     if request.args is not None:
         raise TypeError("args: a Problem has params; give params=..., or its functions in place of the Problem.")
     brought = {option.name for option in fields(problem)} & set(ProjectionOptions.names())
-    projection = {name: getattr(problem, name) for name in brought} | projection
+    own_options = {name: getattr(problem, name) for name in brought}
+    if request.method.TABLEAU.drives:
+        own_options["invariants"] = problem.stiff_invariants
+    projection = own_options | projection
     projection |= _with_run_params(projection, problem.params)
     if params is None and problem.rhs is not None:
         params = problem.params

@@ -100,6 +100,7 @@ COMMANDS = {
         "measurements.solar_reference:SolarReference", "states of the solar system in 80 bits"
     ),
     "study speed": Entry("measurements.speed:Speed", "speed of the compiled step"),
+    "study stiff": Entry("stiff.command:Stiff", "SciPy's implicit methods with and without projection"),
     "study tangent-maps": Entry(
         "measurements.tangent_maps:TangentMaps",
         "derivatives that runs carry along: errors, cost, chaos, a stability map",

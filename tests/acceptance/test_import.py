@@ -48,7 +48,7 @@ def test_no_name_brings_the_studies():
 
 
 def test_all_public_names_are_there():
-    assert len(eip_scipy.__all__) <= 28  # EIPRadau and EIPBDF are to come
+    assert len(eip_scipy.__all__) <= 30
     for name in eip_scipy.__all__:
         assert getattr(eip_scipy, name).__name__ == name
     assert {*eip_scipy.__all__, "__version__", "checkpoint", "problems"} <= set(dir(eip_scipy))

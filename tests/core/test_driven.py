@@ -24,7 +24,7 @@ from eip_scipy import (
     solve_ivp,
 )
 from eip_scipy.core import driven
-from eip_scipy.problems import kepler
+from eip_scipy.problems import Problem, kepler
 
 METHODS = [EIPRadau, EIPBDF]
 SCIPY = {EIPRadau: Radau, EIPBDF: BDF}
@@ -340,6 +340,16 @@ def test_a_problem_s_own_step_is_left_out(method):
     assert abs(run.y[:, -1] - problem.reference(1.0)).max() < 1e-4
     assert integrate(problem, (0, 1), method=method).success
     assert problem.solve_ivp((0, 1), method=method).success
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_problem_s_balances_are_left_out(method):
+    """Implicit steps carry no balances, and a problem brings what it has: its invariants are kept all the same."""
+    balance = Balance(lambda t, y: y[2], rate=lambda t, y: relaxing(t, y)[2], name="z")
+    problem = Problem("relaxing", relaxing, START, (0, 1), invariants=(RADIUS, balance))
+    run = integrate(problem, method=method, **TIGHT)
+    assert run.diagnostics.names == ("radius",)
+    np.testing.assert_array_equal(problem.solve_ivp(method=method, **TIGHT).y[:, -1], run.y[:, -1])
 
 
 @pytest.mark.parametrize("method", METHODS)

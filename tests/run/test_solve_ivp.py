@@ -161,7 +161,7 @@ def test_methods_of_scipy_with_invariants(method, stands_for):
 
 
 @pytest.mark.parametrize("method", ["LSODA", scipy.integrate.LSODA])
-def test_implicit_methods_refuse_invariants(method):
+def test_methods_that_cannot_be_projected_refuse_invariants(method):
     name = getattr(method, "__name__", method)
     with pytest.raises(TypeError, match=rf"solve_ivp: the method {name} takes no invariants; give an EIP method"):
         solve_ivp(spring, (0, 3), [1.0, 0.0], method, args=(K,), invariants=energy)

@@ -47,6 +47,7 @@ RUNS = [
     ("solar-cloud", "--members 16 --years 1 --sample 2 --json run.json", REBOUND),
     ("solar-reference", "--years .02 --json run.json", ()),
     ("speed", "--quick --json run.json", ()),
+    ("stiff", "--quick --json run.json", ()),
     ("tangent-maps", "--revolutions 2 --time 500 --starts 3 --periods 20 --grid 3 --map-periods 5 --json run.json", ()),
     ("trust", "--only pendulum --json run.json", ()),
     ("waves", "--quick --json run.json", ()),

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import integrate as scipy_integrate
 
 from eip_scipy import (
+    EIPBDF,
     EIPDOP853,
     EIPGJ12,
     EIPGJ14,
@@ -28,6 +29,7 @@ from eip_scipy import (
     EIPRKN12,
     Balance,
     Diagnostics,
+    EIPRadau,
     Invariant,
     ProjectionWarning,
     check_gradient,
@@ -75,7 +77,7 @@ def damped(t: float, y: Vector) -> Vector:
 H = Invariant(energy, gradient, name="H", target=None, scale=1.0)
 E = Balance(energy, rate=lambda t, y: -1e-4 * y[1] ** 2, grad=gradient, name="E")
 METHODS: list[type[EIPSolver]] = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]
-METHODS += [EIPRKN8, EIPRKN12, EIPGJ12, EIPGJ14, eip_method(scipy_integrate.RK45)]
+METHODS += [EIPRKN8, EIPRKN12, EIPGJ12, EIPGJ14, EIPRadau, EIPBDF, eip_method(scipy_integrate.RK45)]
 METHODS += [eip_method(Tableau(A=[[0.0]], b=[1.0], order=1, name="Euler", reference="Euler"))]
 
 
