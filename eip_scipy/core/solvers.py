@@ -824,6 +824,8 @@ class EIPBDF(EIPSolver):
     """
 
     TABLEAU = DRIVEN_BDF
+    order: Any = NotImplemented  # it varies
+    error_estimator_order: Any = NotImplemented
 
 
 def class_named(method: Any) -> str | None:

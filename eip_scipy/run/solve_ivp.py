@@ -293,8 +293,9 @@ def _right_hand_side(fun: Any, acceleration: Any, t_span: Any, y0: Any) -> Any:
 
 def _with_projection(method: Any, given: list[str]) -> Any:
     """Return the EIP method on a method of SciPy if options of EIP methods are given; otherwise the method itself."""
-    if isinstance(method, str) and method.upper() == class_named(method):
-        raise ValueError(f"solve_ivp: {method!r} is a name; give the class, as in `from eip_scipy import {method}`.")
+    known = class_named(method)
+    if isinstance(method, str) and known is not None and method.upper() == known.upper():
+        raise ValueError(f"solve_ivp: {method!r} is a name; give the class, as in `from eip_scipy import {known}`.")
     is_class = isinstance(method, type) and issubclass(method, OdeSolver)
     if not given or not (is_class or method in BY_NAME or method == WITHOUT):
         return method

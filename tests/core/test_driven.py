@@ -21,10 +21,12 @@ from eip_scipy import (
     eip_method,
     ensemble,
     integrate,
+    load,
     solve_ivp,
 )
 from eip_scipy.core import driven
 from eip_scipy.problems import Problem, kepler
+from eip_scipy.results import save
 
 METHODS = [EIPRadau, EIPBDF]
 SCIPY = {EIPRadau: Radau, EIPBDF: BDF}
@@ -301,6 +303,26 @@ def test_the_typed_function_takes_names(name, method):
     np.testing.assert_array_equal(one.y, other.y)
     assert one.trusted
     assert one.diagnostics.n_projections > 0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_names_of_the_classes_are_explained(method):
+    name = method.__name__
+    with pytest.raises(ValueError, match=f"{name.lower()!r} is a name; give the class, as in .* import {name}"):
+        solve_ivp(relaxing, (0, 2), START, name.lower(), **KEEP)
+    for given in (name, method.TABLEAU.name, method.TABLEAU.solver):
+        with pytest.raises(TypeError, match=f"Give the class: from eip_scipy import {name}"):
+            integrate(relaxing, (0, 2), START, method=given, **KEEP)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_run_goes_on_and_is_stored(method, tmp_path):
+    run = integrate(relaxing, (0, 1), START, method=method, save_every=1, dense_output=True, **KEEP)
+    further = run.continue_to(2.0)
+    assert abs(further.y[:2, -1] - exact(2.0)[:2]).max() < 1e-5
+    save(run, tmp_path / "run")
+    np.testing.assert_array_equal(load(tmp_path / "run").y, run.y)
+    assert load(tmp_path / "run").method == method.__name__
 
 
 @pytest.mark.parametrize("method", METHODS)
