@@ -188,7 +188,8 @@ class System:
             return in_python, "interpreted: compiled=False"
         try:
             if run.tableau.in_python:
-                raise NotCompilableError(f"the steps of {run.tableau.name} are made in Python")
+                kind = "a solver" if run.tableau.drives else "a one-step method"
+                raise NotCompilableError(f"{run.tableau.name} is {kind} in Python")
             if numbers is None:
                 raise NotCompilableError("args are neither numbers nor one array of floats")
             params = Packed(self.parameters, numbers) if self.extra else None
