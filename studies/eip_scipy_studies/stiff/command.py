@@ -108,7 +108,8 @@ class Stiff(Study[Found]):
                 body.append((f"{name}, {method}", [*_ratios(rows), f"{largest:.2g}"]))
         heads = [["ratio of", "errors"], ["of calls"], ["largest of", "errors"]]
         parts.append(f"problems, means over the tolerances\n\n{table(heads, body)}")
-        return "\n\n".join([*parts, *(check.line for check in self.checks(found))])
+        lines = "\n".join(check.line for check in self.checks(found))
+        return "\n\n".join([*parts, lines] if lines else parts)
 
     def numbers(self, found: Found) -> dict[str, Any]:
         return {"found": found}
