@@ -616,3 +616,13 @@ class gradients:
         """
         Return the same, or None where it disagrees with a difference of ``fun`` along ``direction * (abs(y) + floors)``, as that of a function does which is not analytic.
         """
+
+class multibody:
+    @staticmethod
+    def solve(matrices: numpy.typing.NDArray[numpy.float64], tolerance: float, acceleration: numpy.typing.NDArray[numpy.float64], multipliers: numpy.typing.NDArray[numpy.float64]) -> int:
+        """
+        Fill u' (n,) and the multipliers (m,) of M u' + G^T lambda = F, G u' = -gamma, from M, F, G and gamma one after the other. Returns the rank of G, or MASS_IS_SINGULAR or NOT_FINITE.
+        """
+    SOLVE_ADDRESS: int = 140435139197703
+    MASS_IS_SINGULAR: int = -1
+    NOT_FINITE: int = -2

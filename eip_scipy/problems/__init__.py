@@ -29,6 +29,7 @@ from .gross_pitaevskii import (
 from .harmonic import harmonic
 from .invariant_search import find_invariants
 from .kepler import kepler
+from .multibody import MechanicsProblem, mechanism
 from .particles.charged_particle import ParticleProblem, charged_particle, tokamak, uniform_field
 from .particles.fields import TOKAMAK, UNIFORM, ParticleField
 from .symbolic import equations, hamiltonian
@@ -55,6 +56,7 @@ __all__ = [
     "JointInvariants",
     "KortewegDeVries",
     "Lawson",
+    "MechanicsProblem",
     "OrbitalElements",
     "ParticleField",
     "ParticleProblem",
@@ -75,6 +77,7 @@ __all__ = [
     "harmonic_trap",
     "kepler",
     "korteweg_de_vries_solitons",
+    "mechanism",
     "nbody",
     "orbital_balances",
     "orbital_elements",

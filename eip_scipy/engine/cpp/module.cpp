@@ -426,4 +426,5 @@ NB_MODULE(EIP_MODULE, m) {
     eip::add_fields(m.def_submodule("fields"));
     eip::add_comparators(m.def_submodule("comparators"));
     eip::add_gradients(m.def_submodule("gradients"));
+    eip::add_multibody(m.def_submodule("multibody"));
 }

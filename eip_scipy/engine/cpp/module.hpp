@@ -10,5 +10,6 @@ void add_condensates(nb::module_ module);
 void add_fields(nb::module_ module);
 void add_comparators(nb::module_ module);
 void add_gradients(nb::module_ module);
+void add_multibody(nb::module_ module);
 
 }  // namespace eip

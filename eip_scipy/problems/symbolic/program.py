@@ -41,7 +41,12 @@ CALLS: dict[Any, tuple[str, str]] = {
     sympy.acosh: ("acosh", "arccosh"),
     sympy.atanh: ("atanh", "arctanh"),
 }
-OTHERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside, sympy.erf)
+# Functions that are 1 over another.
+RECIPROCALS: dict[Any, str] = {sympy.sec: "cos", sympy.csc: "sin", sympy.cot: "tan"}
+COMPARISONS: dict[Any, type[ast.cmpop]] = {
+    sympy.Lt: ast.Lt, sympy.Le: ast.LtE, sympy.Gt: ast.Gt, sympy.Ge: ast.GtE, sympy.Eq: ast.Eq, sympy.Ne: ast.NotEq,
+}  # fmt: skip
+OTHERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside, sympy.erf, sympy.Piecewise, *RECIPROCALS)
 COMMON = {name: getattr(builtins, name) for name in ("abs", "max", "min", "range", "ValueError")} | {"erf": math.erf}
 COMPILED = {name: getattr(math, name) for name in ("sqrt", *(name for name, _ in CALLS.values()))} | COMMON
 # Without Numba NumPy's: math's would raise where a step reaches too far, instead of giving the NaN that shortens it.
@@ -62,7 +67,14 @@ class Arguments:
         return {**places, "t": ("t", None)}
 
 
-def function(what: str, expressions: Sequence[Any], arguments: Arguments, *, in_place: bool) -> Callable[..., Any]:
+def function(
+    what: str,
+    expressions: Sequence[Any],
+    arguments: Arguments,
+    *,
+    in_place: bool,
+    places: Sequence[Any] | None = None,
+) -> Callable[..., Any]:
     """A function of ``(t, y[, dy][, out][, params])``, Numba's where Numba is installed.
 
     Parameters
@@ -73,13 +85,15 @@ def function(what: str, expressions: Sequence[Any], arguments: Arguments, *, in_
         What it fills `out` with, or the one number that it returns.
     arguments : Arguments
     in_place : bool
+    places : sequence of int or of tuples of int, optional
+        The places of the expressions in `out`, whose other numbers become 0. Default: all of them, in this order.
 
     Raises
     ------
     ValueError
         For what has no function here.
     """
-    return _fastest(_compiled(what, _statements(what, expressions, arguments, in_place), arguments, in_place))
+    return _fastest(_compiled(what, _statements(what, expressions, arguments, in_place, places), arguments, in_place))
 
 
 def variational(
@@ -157,12 +171,18 @@ def _compiled(what: str, body: list[ast.stmt], arguments: Arguments, in_place: b
     return code
 
 
-def _statements(what: str, expressions: Sequence[Any], arguments: Arguments, in_place: bool) -> list[ast.stmt]:
+def _statements(
+    what: str, expressions: Sequence[Any], arguments: Arguments, in_place: bool, places: Sequence[Any] | None
+) -> list[ast.stmt]:
     writer = Writer(what, arguments)
     values = writer.values(expressions)
     body = [*_checks(arguments), *writer.body]
+    if places is not None:
+        everything = ast.Subscript(value=_load("out"), slice=ast.Slice(), ctx=ast.Store())
+        body.append(_set(everything, ast.Constant(value=0.0)))
     if in_place:
-        return body + [_set(_item("out", k, ast.Store()), value) for k, value in enumerate(values)]
+        found = zip(range(len(values)) if places is None else places, values, strict=True)
+        return body + [_set(_item("out", k, ast.Store()), value) for k, value in found]
     (value,) = values
     return [*body, ast.Return(value=value)]
 
@@ -231,7 +251,7 @@ def _load(name: str) -> ast.expr:
     return ast.Name(id=name, ctx=ast.Load())
 
 
-def _item(array: str, k: int, context: ast.expr_context) -> ast.expr:
+def _item(array: str, k: Any, context: ast.expr_context) -> ast.expr:
     return ast.Subscript(value=_load(array), slice=ast.Constant(value=k), ctx=context)
 
 
@@ -276,6 +296,8 @@ class Writer:
                 return self._product(expression)
             case sympy.Pow():
                 return self._power(*expression.args)
+            case sympy.Piecewise():
+                return self._cases(expression)
             case sympy.Function() | sympy.Max() | sympy.Min():
                 return self._call(expression)
         raise self._unknown(expression)
@@ -354,6 +376,9 @@ class Writer:
         kind, arguments = type(expression), [self.value(item) for item in expression.args]
         if kind in CALLS:
             return self._function(CALLS[kind][0], *arguments)
+        if kind in RECIPROCALS:
+            below = self._function(RECIPROCALS[kind], *arguments)
+            return self._binary(ast.Constant(value=1.0), ast.Div(), below)
         match expression:
             case sympy.Abs():
                 return self._function("abs", *arguments)
@@ -367,6 +392,30 @@ class Writer:
             case sympy.Heaviside():
                 return self._by_sign(arguments[0], 0.0, 0.5)
         raise self._unknown(expression)
+
+    def _cases(self, expression: Any) -> ast.expr:
+        """The first value whose condition holds, NaN where none does. All values are computed."""
+        chosen: ast.expr = ast.Constant(value=math.nan)
+        for value, condition in reversed(expression.args):
+            found = self.value(value)
+            chosen = found if condition == sympy.true else self._choice(self._condition(condition), found, chosen)
+        return chosen
+
+    def _choice(self, test: ast.expr, yes: ast.expr, no: ast.expr) -> ast.expr:
+        return self._name(ast.IfExp(test=test, body=yes, orelse=no))
+
+    def _condition(self, condition: Any) -> ast.expr:
+        kind = type(condition)
+        if kind in COMPARISONS:
+            left, right = (self.value(item) for item in condition.args)
+            return ast.Compare(left=left, ops=[COMPARISONS[kind]()], comparators=[right])
+        match condition:
+            case sympy.And() | sympy.Or():
+                parts = [self._condition(item) for item in condition.args]
+                return ast.BoolOp(op=ast.And() if isinstance(condition, sympy.And) else ast.Or(), values=parts)
+            case sympy.Not():
+                return ast.UnaryOp(op=ast.Not(), operand=self._condition(condition.args[0]))
+        raise self._unknown(condition)
 
     def _by_sign(self, value: ast.expr, below: float, at_zero: float) -> ast.expr:
         """1 for positive values, `below` for negative ones."""

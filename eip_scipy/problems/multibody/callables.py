@@ -1,0 +1,259 @@
+"""Mechanical systems from functions of arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from ...core.inputs import real_array, shown
+from ...core.problem import component_names
+from .motion import Sizes, plain
+from .numerical import numerical_parts
+from .parts import Given, Parts
+from .problem import MechanicsProblem, mechanics_problem
+from .start import Names
+
+__all__ = ["RANK_TOLERANCE", "mechanism"]
+
+# Gradients of constraints, each scaled to length 1, that are nearer than this to dependent ones lower the rank.
+RANK_TOLERANCE = 1e-6
+
+
+def mechanism(
+    mass: Any,
+    forces: Any,
+    constraints: Any = None,
+    *,
+    q0: Any,
+    u0: Any,
+    t_span: tuple[float, float] | None = None,
+    velocity_constraints: Any = None,
+    kinematics: Any = None,
+    jacobian: Any = None,
+    gamma: Any = None,
+    energy: Any = None,
+    potential: Any = None,
+    power: Any = None,
+    independent: Iterable[str] | None = None,
+    coordinates: Any = None,
+    speeds: Any = None,
+    constraint_names: Any = None,
+    rank_tolerance: float = RANK_TOLERANCE,
+    name: str = "mechanism",
+    **others: Any,
+) -> MechanicsProblem:
+    """Return the problem of a mechanical system with constraints, from functions of arrays.
+
+    The state is (q, u), and the equations are ``q' = u``, ``M u' + G^T lambda = F``, ``G u' = -gamma``, where
+    G u + ... = 0 are the constraints on velocities: the derivatives of those on positions, and those given by
+    `velocity_constraints`. A run keeps all constraints, and the energy where it is constant or changes slowly.
+
+    Parameters
+    ----------
+    mass : array_like or callable
+        The mass matrix M, (n, n) or its diagonal (n,), or ``mass(q)``.
+    forces : array_like or callable
+        The generalised forces F, (n,), or ``forces(t, q, u)``, with all terms of the equations that are not M u'.
+    constraints : callable, optional
+        ``constraints(t, q)``, (m,), which is 0.
+    q0, u0 : array_like or mapping
+        Coordinates and speeds at the start, in order or by name. They must meet the constraints, see `independent`.
+    t_span : tuple of float, optional
+        Start and end of the interval. Without one the start is at 0.
+    velocity_constraints : callable, optional
+        ``velocity_constraints(t, q, u)``, (k,), which is 0 and linear in u: constraints that are not derivatives of
+        `constraints`, such as those of wheels that roll.
+    kinematics : callable, optional
+        ``kinematics(t, q, u)``, the derivatives q', linear in u, for speeds that are not q'.
+    jacobian, gamma : callable, optional
+        ``jacobian(t, q)``, the derivatives (m, n) of `constraints` by q, and ``gamma(t, q, u)``, (m + k,), the second
+        derivatives in time of `constraints` and the first of `velocity_constraints` for u' = 0. By default both are
+        computed; those that are given are compared with that at the start.
+    energy : callable, optional
+        ``energy(t, q, u)``, the total energy.
+    potential : callable, optional
+        ``potential(t, q)``, for the energy u M u / 2 + potential.
+    power : callable, optional
+        ``power(t, q, u)``, the rate of the energy, which is then kept as a `Balance`. By default it is computed.
+    independent : iterable of str, optional
+        Names of the coordinates and speeds that stay as they are in `q0` and `u0`. All others are guesses, from which
+        the start is found. Default: all stay.
+    coordinates, speeds, constraint_names : optional
+        Names, ``"q1 q2"`` or a sequence of strings, those of `velocity_constraints` after those of `constraints`.
+        Default: q1, q2, ..., u1, u2, ..., g1, g2, ...
+    rank_tolerance : float, optional
+        Gradients of constraints, each scaled to length 1, count as dependent within this distance.
+    name : str, optional
+    **others
+        Further attributes of the `Problem`, such as ``units``, ``h``, ``source`` and ``reference``.
+
+    Returns
+    -------
+    MechanicsProblem
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, the start does not meet the constraints, the mass matrix is singular for motions that the
+        constraints allow, or a given derivative is wrong.
+
+    Notes
+    -----
+    With SymPy installed the functions are called once with symbols in place of numbers. Derivatives are then exact, and
+    all functions are compiled where Numba is installed. A function that cannot be called in this way, because it
+    branches by a value, for example, is called as it is, and derivatives are computed by complex steps or differences;
+    `repr` of the problem says so.
+
+    Examples
+    --------
+    A pendulum in Cartesian coordinates:
+
+    >>> from eip_scipy import EIPDOP853, integrate
+    >>> from eip_scipy.problems import mechanism
+    >>> pendulum = mechanism([1, 1], [0, -9.81], lambda t, q: [q[0] ** 2 + q[1] ** 2 - 1], q0=[1, 0], u0=[0, 0],
+    ...                      potential=lambda t, q: 9.81 * q[1])
+    >>> run = integrate(pendulum, (0, 10), method=EIPDOP853, rtol=1e-8, atol=1e-8)
+    >>> bool(abs(run.y[:, 0] ** 2 + run.y[:, 1] ** 2 - 1).max() < 1e-14)
+    True
+    """
+    given = Given(
+        mass, forces, constraints, velocity_constraints, kinematics, jacobian, gamma, energy, potential, power
+    )
+    given = _as_functions(given)
+    t = 0.0 if t_span is None else float(t_span[0])
+    q = _given_state("q0", q0, coordinates)
+    u = _given_state("u0", u0, speeds)
+    _require_shapes(given, t, q, u)
+    m = 0 if given.constraints is None else len(given.constraints(t, q))
+    k = 0 if given.velocity_constraints is None else len(given.velocity_constraints(t, q, u))
+    names = _names(coordinates, speeds, constraint_names, (q.size, u.size, m, k))
+    parts = _parts(given, names, t, q, u)
+    problem = mechanics_problem(
+        name, parts, names, t, (q0, u0), None, independent, rank_tolerance, t_span=t_span, **others
+    )
+    _require_derivatives(given, parts, names, t, problem.y0)
+    return problem
+
+
+def _as_functions(given: Given) -> Given:
+    """Return functions where arrays or lists were given, and functions that return arrays."""
+    mass, forces = given.mass, given.forces
+    if not callable(mass):
+        M = real_array("mass", mass)
+        M = np.diag(M) if M.ndim == 1 else M
+        mass = _constant(M)
+    if not callable(forces):
+        forces = _constant(np.atleast_1d(real_array("forces", forces)))
+    others = {name: getattr(given, name) for name in ("constraints", "velocity_constraints", "kinematics")}
+    for name, value in {**others, "jacobian": given.jacobian, "gamma": given.gamma, "energy": given.energy,
+                        "potential": given.potential, "power": given.power}.items():  # fmt: skip
+        if value is not None and not callable(value):
+            raise TypeError(f"mechanism: {name} must be a function, got {shown(value)}.")
+    return given._replace(mass=mass, forces=forces)
+
+
+def _constant(value: np.ndarray) -> Callable[..., np.ndarray]:
+    return lambda *_: value
+
+
+def _given_state(what: str, given: Any, names: Any) -> np.ndarray:
+    """Return numbers for the first calls of functions."""
+    if isinstance(given, dict):
+        if names is None:
+            raise TypeError(f"{what}: a mapping needs names; give coordinates= and speeds=.")
+        return np.array([float(given.get(name, 0.0)) for name in component_names(names, None)])
+    return np.atleast_1d(real_array(what, given)).astype(float)
+
+
+def _names(coordinates: Any, speeds: Any, constraint_names: Any, sizes: Sequence[int]) -> Names:
+    nq, n, m, k = sizes
+
+    def named(given: Any, letter: str, count: int) -> tuple[str, ...]:
+        return component_names([f"{letter}{j + 1}" for j in range(count)] if given is None else given, count)
+
+    positions = named(constraint_names, "g", m + k)
+    return Names(
+        named(coordinates, "q", nq),
+        named(speeds, "u", n),
+        positions[:m],
+        (*(f"{item}'" for item in positions[:m]), *positions[m:]),
+    )
+
+
+def _require_shapes(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> None:
+    """Raise ValueError if a function returns an array of another shape than is expected."""
+    n = u.size
+
+    def require(what: str, found: Any, shape: tuple[int | str, ...]) -> None:
+        has = np.shape(found)
+        fits = len(has) == len(shape) and all(b in (a, "m") for a, b in zip(has, shape, strict=True))
+        if not fits:
+            raise ValueError(
+                f"mechanism: {what} has the shape {has}; expected ({', '.join(map(str, shape))}) for {q.size} "
+                f"coordinates and {n} speeds."
+            )
+
+    if given.kinematics is None and q.size != n:
+        raise ValueError(
+            f"mechanism: q0 has {q.size} coordinates and u0 {n} speeds; expected as many, or kinematics=, which "
+            "gives q' from the speeds."
+        )
+    require("mass", given.mass(q), (n, n))
+    require("forces", given.forces(t, q, u), (n,))
+    if given.constraints is not None:
+        require("constraints", given.constraints(t, q), ("m",))
+    if given.velocity_constraints is not None:
+        require("velocity_constraints", given.velocity_constraints(t, q, u), ("m",))
+    if given.kinematics is not None:
+        require("kinematics", given.kinematics(t, q, u), (q.size,))
+    for what in ("energy", "power"):
+        if (fun := getattr(given, what)) is not None:
+            require(what, fun(t, q, u), ())
+    if given.potential is not None:
+        require("potential", given.potential(t, q), ())
+    if given.jacobian is not None:
+        if given.constraints is None:
+            raise TypeError("mechanism: jacobian belongs to constraints; give both.")
+        require("jacobian", given.jacobian(t, q), (len(given.constraints(t, q)), q.size))
+
+
+def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:
+    """Return the functions from expressions if the given ones can be traced, else from the given ones."""
+    if find_spec("sympy") is None:
+        return numerical_parts(given, names, t, q, u, "SymPy is not installed")
+    from ..symbolic.traced import NotTraceableError
+    from ..symbolic.traced_mechanisms import traced_parts
+
+    try:
+        return traced_parts(given, names, t, q, u)
+    except NotTraceableError as error:
+        return numerical_parts(given, names, t, q, u, str(error))
+
+
+def _require_derivatives(given: Given, parts: Parts, names: Names, t: float, y: np.ndarray) -> None:
+    """Raise ValueError if a given derivative differs from the one that is computed."""
+    nq, n, m = len(names.coordinates), len(names.speeds), len(names.positions)
+    q, u = y[:nq], y[nq:]
+    rows = len(names.velocities)
+    matrices = np.empty(Sizes(nq, n, rows).matrices + nq)
+    plain(parts.fill)(t, y, matrices)
+    found = {"gamma": matrices[n * n + n + rows * n :][:rows]}
+    if m > 0:
+        gradient = np.empty((m + rows, nq + n))
+        plain(parts.gradient)(t, y, gradient)
+        found["jacobian"] = gradient[:m, :nq]
+    for what, fun, args in (("jacobian", given.jacobian, (t, q)), ("gamma", given.gamma, (t, q, u))):
+        if fun is None:
+            continue
+        own, computed = np.asarray(fun(*args), float), found[what]
+        if own.shape != computed.shape:
+            raise ValueError(f"mechanism: {what} has the shape {own.shape}; expected {computed.shape}.")
+        wrong = np.abs(own - computed).max()
+        if not wrong <= 1e-6 * max(np.abs(computed).max(), np.abs(u).max(), 1e-300):
+            raise ValueError(
+                f"mechanism: {what} differs from the derivatives of the constraints by {wrong:.3g} at the start. "
+                f"Correct it, or omit it to have it computed."
+            )

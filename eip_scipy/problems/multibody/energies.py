@@ -1,0 +1,108 @@
+"""Whether a mechanical system keeps an energy, examined at states that meet its constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...core.balances import Balance
+from ...core.gradients import difference_gradient
+from ...core.invariants import Invariant
+from .motion import plain
+from .start import nearest_start
+
+__all__ = ["Energy", "energy_of", "states_near"]
+
+# States next to the start at which rates are examined, and how far they are away, in units of the components' sizes.
+STATES, AWAY = 6, 0.2
+# An energy is constant if its rate is below this share of the rate's terms.
+CONSTANT = 1e-9
+
+
+class Energy(NamedTuple):
+    """A quantity that may be constant: its name, functions, and optionally its rate ``power(t, y, *params)``."""
+
+    description: str
+    value: Callable[..., float]
+    gradient: Callable[..., None]
+    power: Callable[..., float] | None = None
+
+
+def energy_of(
+    candidates: Sequence[Energy],
+    derivative: Callable[[float, np.ndarray], np.ndarray],
+    states: Sequence[tuple],
+    params: np.ndarray | None,
+) -> tuple[Invariant | None, str]:
+    """Return the energy as an invariant, as a balance, or None, and a description.
+
+    It is the first of the candidates that is constant, else the one of the lowest rate, if that is slow.
+
+    Parameters
+    ----------
+    candidates : sequence of Energy
+    derivative : callable
+        ``derivative(t, y)``.
+    states : sequence of (float, ndarray)
+        Times and states that meet the constraints.
+    params : ndarray or None
+    """
+    args = () if params is None else (params,)
+    slowest, least = None, np.inf
+    for item in candidates:
+        shares, rates, terms = _rates(item, derivative, states, args)
+        if shares.max(initial=0.0) <= CONSTANT and item.power is None:
+            kept = Invariant(item.value, item.gradient, args=args, in_place=True, name="energy")
+            return kept, f"invariant, {item.description}"
+        slowness = rates.sum() / max(terms.sum(), np.finfo(float).tiny)
+        if slowness < least:
+            slowest, least = item, slowness
+    if slowest is None:
+        return None, "not known; give energy= or potential="
+    described = f"{slowest.description}, which changes at {least:.2g} of the terms of its rate"
+    if least > Balance.most_slowness:
+        return None, f"not kept: {described}"
+    kept = Balance(slowest.value, slowest.power, slowest.gradient, args=args, in_place=True, name="energy")
+    return kept, f"balance, {described}"
+
+
+def states_near(
+    t: float, y: np.ndarray, constraints: Sequence[Invariant], derivative: Callable[[float, np.ndarray], np.ndarray]
+) -> list[tuple[float, np.ndarray]]:
+    """Return the start and states next to it that meet the constraints."""
+    rng = np.random.default_rng(20391)
+    half = np.abs(y).max(initial=0.0) or 1.0
+    found = [(t, y)]
+    for _ in range(STATES):
+        moved = y + AWAY * np.maximum(np.abs(y), AWAY * half) * rng.standard_normal(y.size)
+        for item in constraints:
+            moved = nearest_start(moved, item, t, np.ones(y.size))
+        if np.isfinite(derivative(t, moved)).all() and all(_meets(item, t, moved) for item in constraints):
+            found.append((t, moved))
+    return found
+
+
+def _meets(item: Invariant, t: float, y: np.ndarray) -> bool:
+    return bool(np.abs(item.fun(t, y)).max() <= CONSTANT * max(1.0, np.abs(y).max()))
+
+
+def _rates(
+    item: Energy, derivative: Callable[[float, np.ndarray], np.ndarray], states: Sequence[tuple], args: tuple[Any, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rates of an energy relative to their terms, the rates, and the terms, at all states."""
+    rates, terms = np.zeros(len(states)), np.zeros(len(states))
+    for k, (t, y) in enumerate(states):
+        gradient = np.empty(y.size)
+        plain(item.gradient)(t, y, gradient, *args)
+        products = gradient * derivative(t, y)
+        value = plain(item.value)
+        explicit = float(difference_gradient(partial(_at_time, value, t, y, args), np.zeros(1), np.ones(1))[0])
+        rates[k], terms[k] = abs(products.sum() + explicit), np.abs(products).sum() + abs(explicit)
+    return rates / np.where(terms > 0, terms, 1.0), rates, terms
+
+
+def _at_time(value: Callable[..., float], t: float, y: np.ndarray, args: tuple[Any, ...], shift: np.ndarray) -> float:
+    return value(t + shift[0], y, *args)

@@ -1,0 +1,109 @@
+"""The right-hand side of a constrained system, from a function that evaluates its matrices."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...core.jitted import compiled_like, is_jitted
+from ...engine.native import BUILD
+
+__all__ = ["Motion", "Sizes", "motion", "plain", "vector"]
+
+SOLVE = ctypes.CFUNCTYPE(
+    ctypes.c_int64, ctypes.c_void_p, *[ctypes.c_int64] * 2, ctypes.c_double, *[ctypes.c_void_p] * 2
+)(BUILD.multibody.SOLVE_ADDRESS)
+SINGULAR, NOT_FINITE = BUILD.multibody.MASS_IS_SINGULAR, BUILD.multibody.NOT_FINITE
+SINGULAR_MASS = (
+    "the mass matrix is singular for motions that the constraints allow: some speeds have no inertia. Give their "
+    "bodies a mass or an inertia, or constrain them"
+)
+
+
+class Sizes(NamedTuple):
+    """Numbers of coordinates, speeds and constraints on the speeds."""
+
+    coordinates: int
+    speeds: int
+    constraints: int
+
+    @property
+    def matrices(self) -> int:
+        """Number of values that the matrices M, F, G and gamma have together."""
+        n, m = self.speeds, self.constraints
+        return n * n + n + m * n + m
+
+
+class Motion(NamedTuple):
+    """The functions of a system's motion.
+
+    Attributes
+    ----------
+    rhs : callable
+        ``rhs(t, y, out, *params)`` fills `out` with (q', u').
+    solved : callable
+        ``solved(t, y, rates, accelerations, multipliers, *params)`` fills the arrays, the first coordinates of `rates`
+        with q', and returns the rank of the constraints, NOT_FINITE where a matrix is not finite.
+    """
+
+    rhs: Callable[..., None]
+    solved: Callable[..., int]
+
+
+def plain(function: Any) -> Callable[..., Any]:
+    """Return a function as Python calls it: for a few calls, before a run, Numba need not compile it."""
+    return function.py_func if is_jitted(function) else function
+
+
+@lru_cache(maxsize=64)
+def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
+    """Return the functions of the motion M u' + G^T lambda = F, G u' = -gamma.
+
+    Parameters
+    ----------
+    fill : callable
+        ``fill(t, y, out, *params)`` fills `out` with M (by rows), F, G (by rows), gamma and q', one after the other.
+    sizes : Sizes
+    tolerance : float
+        Gradients of constraints that are dependent within this distance, each scaled to length 1, lower the rank.
+    """
+    nq, n, m = sizes
+    matrices = sizes.matrices
+
+    def solved(t, y, rates, accelerations, multipliers, *params):
+        work = np.empty(matrices + nq)
+        fill(t, y, work, *params)
+        for k in range(nq):  # assignments to slices take Numba seconds to compile
+            rates[k] = work[matrices + k]
+        rank = SOLVE(work.ctypes.data, n, m, tolerance, accelerations.ctypes.data, multipliers.ctypes.data)
+        if rank == SINGULAR:
+            raise ValueError(SINGULAR_MASS)
+        if rank < NOT_FINITE:
+            raise MemoryError
+        return rank
+
+    fast = compiled_like(solved, fill)
+
+    def rhs(t, y, out, *params):
+        accelerations, multipliers = np.empty(n), np.empty(m)
+        fast(t, y, out, accelerations, multipliers, *params)
+        for k in range(n):
+            out[nq + k] = accelerations[k]
+
+    return Motion(compiled_like(rhs, fast), fast)
+
+
+@lru_cache(maxsize=64)
+def vector(fill: Callable[..., None], size: int) -> Callable[..., np.ndarray]:
+    """Return a function of (t, y, *params) that returns the array of this size that `fill` fills."""
+
+    def value(t, y, *params):
+        out = np.empty(size)
+        fill(t, y, out, *params)
+        return out
+
+    return compiled_like(value, fill)

@@ -1,0 +1,146 @@
+"""The parts of a mechanism from functions that are called as they are, with numerical derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ...core.gradients import NumericalGradient, difference_gradient
+from .energies import Energy
+from .parts import Given, Parts
+from .start import Names
+
+__all__ = ["numerical_parts"]
+
+Array = np.ndarray
+
+
+def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, why: str) -> Parts:
+    """Return the parts, see `mechanism`; `why` the functions are not written as expressions."""
+    found = _Constraints(given, names, t, q)
+    nq = q.size
+
+    def fill(t: float, y: Array, out: Array) -> None:
+        q, u = y[:nq], y[nq:]
+        F = given.forces(t, q, u)
+        parts = (given.mass(q), F, found.speed_gradient(t, q, u), found.gamma(t, q, u), found.rates(t, q, u))
+        out[:] = np.concatenate([np.ravel(part) for part in parts])
+
+    energies = []
+    if (energy := _energy(given)) is not None:
+        y = np.concatenate([q, u])
+        fun = lambda t, y: energy(t, y[:nq], y[nq:])  # noqa: E731
+        slopes = NumericalGradient(fun, (), True, t, y, _sizes(y), ())
+
+        def energy_gradient(t: float, y: Array, out: Array) -> None:
+            out[:] = slopes(t, y)
+
+        power = given.power
+        rate = None if power is None else (lambda t, y: float(power(t, y[:nq], y[nq:])))
+        energies.append(Energy("energy" if given.energy else "u M u / 2 + potential", fun, energy_gradient, rate))
+
+    def values(t: float, y: Array, out: Array) -> None:
+        out[:] = found.values(t, y[:nq], y[nq:])
+
+    def gradient(t: float, y: Array, out: Array) -> None:
+        found.gradient(t, y[:nq], y[nq:], out)
+
+    return Parts(
+        fill,
+        values,
+        gradient,
+        tuple(energies),
+        f"functions are called as they are, derivatives are numerical where none is given: {why}",
+    )
+
+
+def _energy(given: Given) -> Callable[..., Any] | None:
+    potential = given.potential
+    if given.energy is not None or potential is None:
+        return given.energy
+    return lambda t, q, u: 0.5 * (u @ given.mass(q) @ u) + potential(t, q)
+
+
+def _sizes(y: Array) -> Array:
+    """Return sizes of components, in units of which differences are taken."""
+    return np.where(y != 0, np.abs(y), np.abs(y).max(initial=0.0) or 1.0)
+
+
+class _Constraints:
+    """Constraints on positions and velocities, and their derivatives."""
+
+    def __init__(self, given: Given, names: Names, t: float, q: Array) -> None:
+        self.given = given
+        self._positions, self._rows, self._speeds = len(names.positions), len(names.velocities), len(names.speeds)
+        # Derivatives by q and t at once.
+        constraints = given.constraints
+        joint = np.append(q, t)
+        self._slopes = None
+        if constraints is not None:
+            self._slopes = NumericalGradient(
+                lambda _, x: np.asarray(constraints(x[-1], x[:-1])), (), True, 0.0, joint, _sizes(joint), ()
+            )
+
+    def rates(self, t: float, q: Array, u: Array) -> Array:
+        """Return q'."""
+        return u if self.given.kinematics is None else np.asarray(self.given.kinematics(t, q, u))
+
+    def positions(self, t: float, q: Array) -> Array:
+        """Return the constraints on positions."""
+        return np.zeros(0) if self.given.constraints is None else np.asarray(self.given.constraints(t, q), float)
+
+    def jacobian(self, t: float, q: Array) -> tuple[Array, Array]:
+        """Return the derivatives of the constraints on positions by q and by t."""
+        if self._slopes is None:
+            return np.zeros((0, q.size)), np.zeros(0)
+        slopes = self._slopes(0.0, np.append(q, t))
+        own = slopes[:, :-1] if self.given.jacobian is None else np.asarray(self.given.jacobian(t, q), float)
+        return own, slopes[:, -1]
+
+    def velocities(self, t: float, q: Array, u: Array) -> Array:
+        """Return the constraints on velocities."""
+        J, explicit = self.jacobian(t, q)
+        others = self.given.velocity_constraints
+        own = [] if others is None else [np.asarray(others(t, q, u), float)]
+        return np.concatenate([J @ self.rates(t, q, u) + explicit, *own])
+
+    def values(self, t: float, q: Array, u: Array) -> Array:
+        """Return all constraints."""
+        return np.concatenate([self.positions(t, q), self.velocities(t, q, u)])
+
+    def speed_gradient(self, t: float, q: Array, u: Array) -> Array:
+        """Return G: the constraints on velocities are linear in the speeds."""
+        n, others = u.size, self.given.velocity_constraints
+        J, _ = self.jacobian(t, q)
+        speeds = np.eye(n)
+
+        def linear(fun: Callable[..., Any]) -> Array:
+            zero = np.asarray(fun(t, q, np.zeros(n)), float)
+            return np.stack([np.asarray(fun(t, q, unit), float) - zero for unit in speeds], axis=1)
+
+        G = J if self.given.kinematics is None else J @ linear(self.given.kinematics)
+        return G if others is None else np.concatenate([G, linear(others)])
+
+    def gamma(self, t: float, q: Array, u: Array) -> Array:
+        """Return the derivatives of the constraints on velocities in time for u' = 0."""
+        if self.given.gamma is not None:
+            return np.asarray(self.given.gamma(t, q, u), float)
+        if self._rows == 0:
+            return np.zeros(0)
+        rates = self.rates(t, q, u)
+        fastest = np.abs(rates).max(initial=0.0)
+        duration = np.abs(q).max(initial=0.0) / fastest if fastest > 0 else 1.0
+        return difference_gradient(
+            lambda s: self.velocities(t + s[0], q + s[0] * rates, u), np.zeros(1), np.array([duration or 1.0])
+        )[:, 0]
+
+    def gradient(self, t: float, q: Array, u: Array, out: Array) -> None:
+        """Fill `out` with the derivatives of all constraints by the state."""
+        out[:] = 0.0
+        m, nq = self._positions, q.size
+        out[:m, :nq] = self.jacobian(t, q)[0]
+        if self._rows > 0:
+            out[m:, :nq] = difference_gradient(lambda x: self.velocities(t, x, u), q, _sizes(q))
+            out[m:, nq:] = self.speed_gradient(t, q, u)

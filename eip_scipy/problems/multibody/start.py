@@ -1,0 +1,137 @@
+"""States that meet the constraints of a mechanical system."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...core.inputs import real_array, shown
+from ...core.invariants import Invariant, with_args
+from ...core.names import nearest
+from ...core.project import project
+from ...engine.trust import ProjectionWarning
+
+__all__ = ["Names", "nearest_start", "started"]
+
+# A constraint is met if it is violated by at most this share of its terms, as given targets are.
+MET = 1e-8
+NEWTON_STEPS = 40
+# A component that is solved for is reported if it differs from its guess by this share of its size.
+SEEN = 1e-8
+
+
+class Names(NamedTuple):
+    """Names of coordinates, speeds, constraints on positions, and constraints on velocities."""
+
+    coordinates: tuple[str, ...]
+    speeds: tuple[str, ...]
+    positions: tuple[str, ...]
+    velocities: tuple[str, ...]
+
+    @property
+    def state(self) -> tuple[str, ...]:
+        """Names of all components."""
+        return (*self.coordinates, *self.speeds)
+
+
+def started(
+    what: str,
+    names: Names,
+    constraints: Sequence[Invariant],
+    q0: Any,
+    u0: Any,
+    params: np.ndarray | None,
+    t: float,
+    independent: Iterable[str] | None,
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return a state that meets the constraints, and notes of what was solved for; see `MechanicsProblem.start`."""
+    held = _independent(names, independent)
+    y = np.concatenate(
+        [
+            _numbers("q0", q0, names.coordinates, held),
+            _numbers("u0", u0, names.speeds, held),
+        ]
+    )
+    if not constraints:
+        return y, ()
+    (item,) = constraints
+    if params is not None:
+        item = with_args(item, (params,))
+    sigma = np.array([0.0 if name in held else 1.0 for name in names.state])
+    found = nearest_start(y, item, t, sigma) if sigma.any() else y
+    _require_met(what, found, item, t, solved=bool(sigma.any()))
+    moved = [
+        f"{name} {before:.6g} to {after:.6g}"
+        for name, before, after in zip(names.state, y, found, strict=True)
+        if abs(after - before) > SEEN * max(abs(before), abs(after))
+    ]
+    notes = (f"the start was solved for, from guesses: {', '.join(moved)}",) if moved else ()
+    return found, notes
+
+
+def _independent(names: Names, independent: Iterable[str] | None) -> set[str]:
+    """Return the names of components that stay as they are."""
+    if independent is None:
+        return set(names.state)
+    found = {str(name) for name in ([independent] if isinstance(independent, str) else independent)}
+    for name in sorted(found - set(names.state)):
+        hint = nearest(name, names.state)
+        raise ValueError(
+            f"independent: {name!r} is not a component of the state{hint}; it is {', '.join(names.state)}."
+        )
+    return found
+
+
+def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.ndarray:
+    """Return the values in the order of the names, from a mapping or an array."""
+    if isinstance(given, Mapping):
+        by_name = {str(getattr(name, "func", name)): value for name, value in given.items()}
+        for name in by_name:
+            if name not in names:
+                raise ValueError(f"{what}: there is no {name!r}{nearest(name, names)}; expected {', '.join(names)}.")
+        missing = [name for name in names if name in held and name not in by_name]
+        if missing:
+            raise ValueError(f"{what}: {missing[0]} is missing; give its value, or leave it out of independent=.")
+        given = [by_name.get(name, 0.0) for name in names]
+    values = np.atleast_1d(real_array(what, given)).astype(float)
+    if values.shape != (len(names),):
+        raise ValueError(f"{what}: got {shown(given)}; expected {len(names)} numbers, for {', '.join(names)}.")
+    return values
+
+
+def nearest_start(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> np.ndarray:
+    """Return the state that Newton's method finds from y, which moves in units of `sigma`; y where it fails."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ProjectionWarning)  # what is left is looked at by `_require_met`
+            return project(y, item, t=t, sigma=sigma, iterations=NEWTON_STEPS).y
+    except ValueError:
+        return y
+
+
+def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, *, solved: bool) -> None:
+    """Raise ValueError if a constraint is violated."""
+    values = np.asarray(item.fun(t, y), float)
+    gradient = np.empty((values.size, y.size))
+    assert item.grad is not None
+    item.grad(t, y, gradient)
+    # The terms of a constraint, or what it changes by while a component changes by 1.
+    size = np.maximum(np.abs(gradient) @ np.abs(y), np.abs(gradient).max(axis=1))
+    share = np.abs(values) / np.where(size > 0, size, 1.0)
+    worst = int(np.argmax(share))
+    if share[worst] <= MET:
+        return
+    name, residual = item.value_names[worst], values[worst]
+    if solved:
+        raise ValueError(
+            f"{what}: the start does not meet the constraint {name!r}: it is {residual:.3g}, expected 0, after "
+            f"{NEWTON_STEPS} Newton steps from the guess. Name fewer components as independent=, or give a guess "
+            "that is nearer to a solution; constraints that contradict each other have none."
+        )
+    raise ValueError(
+        f"{what}: the start violates the constraint {name!r}: it is {residual:.3g}, expected 0. Name the components "
+        "that are to stay by independent=, and the others are solved for."
+    )

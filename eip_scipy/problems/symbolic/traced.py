@@ -1,0 +1,213 @@
+"""Functions of NumPy arrays as expressions: they are called once, with symbols in place of numbers."""
+
+from __future__ import annotations
+
+import math
+import types
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import sympy
+
+from ...core.jitted import is_jitted
+from .parser import symbol
+
+__all__ = ["NotTraceableError", "traced"]
+
+LIBRARIES = ("numpy", "scipy", "numba", "builtins")  # whose functions are called as they are
+MOST_OPERATIONS = 20_000  # of one expression, written out
+FUNCTIONS: dict[str, Any] = {
+    **{name: getattr(sympy, name) for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    **{f"arc{name}": getattr(sympy, f"a{name}") for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    "sign": sympy.sign,
+    "fabs": sympy.Abs,
+}
+
+
+class NotTraceableError(TypeError):
+    """A function does something that has no expression, such as a branch by a value."""
+
+
+class Number:
+    """An expression that computes as a number does, for functions of NumPy and of math."""
+
+    __slots__ = ("expression", "size")
+
+    def __init__(self, expression: Any, size: int = 1) -> None:
+        if size > MOST_OPERATIONS:
+            raise NotTraceableError("an expression is too long")
+        self.expression, self.size = expression, size
+
+    def _with(self, other: Any, operation: Callable[[Any, Any], Any]) -> Any:
+        if isinstance(other, np.ndarray):
+            return NotImplemented
+        found = _number(other)
+        return Number(operation(self.expression, found.expression), self.size + found.size + 1)
+
+    def __add__(self, other: Any) -> Any:
+        return self._with(other, lambda a, b: a + b)
+
+    def __sub__(self, other: Any) -> Any:
+        return self._with(other, lambda a, b: a - b)
+
+    def __rsub__(self, other: Any) -> Any:
+        return self._with(other, lambda a, b: b - a)
+
+    def __mul__(self, other: Any) -> Any:
+        return self._with(other, lambda a, b: a * b)
+
+    def __truediv__(self, other: Any) -> Any:
+        return self._with(other, lambda a, b: a / b)
+
+    def __rtruediv__(self, other: Any) -> Any:
+        return self._with(other, lambda a, b: b / a)
+
+    def __pow__(self, other: Any) -> Any:
+        return self._with(other, lambda a, b: a**b)
+
+    def __rpow__(self, other: Any) -> Any:
+        return self._with(other, lambda a, b: b**a)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __neg__(self) -> Number:
+        return Number(-self.expression, self.size + 1)
+
+    def __pos__(self) -> Number:
+        return self
+
+    def __abs__(self) -> Number:
+        return Number(sympy.Abs(self.expression), self.size + 1)
+
+    def conjugate(self) -> Number:
+        """The number itself: all are real."""
+        return self
+
+    def arctan2(self, other: Any) -> Number:
+        """The angle of the point (other, self)."""
+        return self._with(other, sympy.atan2)
+
+    def hypot(self, other: Any) -> Number:
+        """The distance of the point (self, other) from the origin."""
+        return self._with(other, lambda a, b: sympy.sqrt(a**2 + b**2))
+
+    def __getattr__(self, name: str) -> Any:  # NumPy calls the method of each element
+        if name in FUNCTIONS:
+            return lambda: Number(FUNCTIONS[name](self.expression), self.size + 1)
+        raise AttributeError(name)
+
+    def _refuse(self, *_: Any) -> Any:
+        raise NotTraceableError("a branch, an index or a conversion depends on a value")
+
+    __bool__ = __float__ = __int__ = __index__ = __complex__ = _refuse
+    __lt__ = __le__ = __gt__ = __ge__ = _refuse
+
+
+def _number(value: Any) -> Number:
+    if isinstance(value, Number):
+        return value
+    plain = float(value)
+    if not math.isfinite(plain):
+        raise NotTraceableError("a constant is not finite")
+    return Number(sympy.Integer(int(plain)) if plain.is_integer() and abs(plain) < 2**53 else sympy.Float(plain))
+
+
+def traced(what: str, fun: Any, *groups: Any) -> np.ndarray:
+    """Return the value of a function as an array of expressions.
+
+    Parameters
+    ----------
+    what : str
+    fun : callable
+    groups
+        The arguments of the function: a name stands for a number, a sequence of names for an array.
+
+    Raises
+    ------
+    NotTraceableError
+        For a function whose value is no expression of its arguments.
+    """
+    arguments = [
+        Number(symbol(names)) if isinstance(names, str) else _array([Number(symbol(name)) for name in names])
+        for names in groups
+    ]
+    copied = _replaced(fun.py_func if is_jitted(fun) else fun, {})
+    try:
+        found = np.asarray(copied(*arguments), dtype=object)
+        flat = [_number(item).expression for item in found.ravel()]
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever NumPy or a user's function raises for what is not a number
+        raise NotTraceableError(f"{what}: {error}") from error
+    return np.array([*flat, None], dtype=object)[:-1].reshape(found.shape)
+
+
+def _array(items: Sequence[Any]) -> np.ndarray:
+    out = np.empty(len(items), dtype=object)
+    out[:] = items
+    return out
+
+
+class _NumPy(types.ModuleType):
+    """NumPy, whose new arrays hold any numbers."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(np, name)
+
+
+def _made(maker: Callable[..., Any], shape: Any, *args: Any, dtype: Any = None, **kwargs: Any) -> Any:
+    found = maker(shape, *args, **kwargs)
+    return found.astype(object) if dtype in (None, float, np.float64) else found.astype(dtype)
+
+
+def _of_math(name: str, *arguments: Any) -> Any:
+    if not any(isinstance(item, Number) for item in arguments):
+        return getattr(math, name)(*arguments)
+    first, *others = map(_number, arguments)
+    return getattr(first, {"atan2": "arctan2", "pow": "__pow__"}.get(name, name.replace("a", "arc", 1)
+                   if name in ("asin", "acos", "atan", "asinh", "acosh", "atanh") else name))(*others)  # fmt: skip
+
+
+NUMPY = _NumPy("numpy")
+MATH = types.ModuleType("math")
+for _name in ("zeros", "ones", "empty"):
+    setattr(NUMPY, _name, partial(_made, np.zeros if _name == "empty" else getattr(np, _name)))
+for _name in ("zeros_like", "empty_like"):
+    setattr(NUMPY, _name, lambda a, *args, **kwargs: np.zeros(np.shape(a), dtype=object))
+NUMPY.eye = NUMPY.identity = lambda *args, **kwargs: np.eye(*args, **kwargs).astype(object)  # type: ignore[attr-defined]
+for _name in dir(math):
+    _item = getattr(math, _name)
+    setattr(MATH, _name, partial(_of_math, _name) if callable(_item) else _item)
+
+
+def _replaced(item: Any, known: dict[int, Any]) -> Any:
+    """Return what stands for a variable from outside a function: NumPy, math, and functions that use them."""
+    if item is np:
+        return NUMPY
+    if item is math:
+        return MATH
+    for module, others in ((np, NUMPY), (math, MATH)):
+        name = getattr(item, "__name__", None)
+        if callable(item) and isinstance(name, str) and name in vars(others) and getattr(module, name, None) is item:
+            return getattr(others, name)
+    if is_jitted(item):
+        item = item.py_func
+    library = str(getattr(item, "__module__", "")).partition(".")[0] in LIBRARIES
+    if not isinstance(item, types.FunctionType) or library or id(item) in known:
+        return known.get(id(item), item)
+    names, cells = dict(item.__globals__), [types.CellType() for _ in item.__closure__ or ()]
+    copied = types.FunctionType(item.__code__, names, item.__name__, item.__defaults__, tuple(cells))
+    copied.__kwdefaults__ = item.__kwdefaults__
+    known[id(item)] = copied
+    for name in _names(item.__code__) & names.keys():
+        names[name] = _replaced(names[name], known)
+    for cell, own in zip(cells, item.__closure__ or (), strict=True):
+        cell.cell_contents = _replaced(own.cell_contents, known)
+    return copied
+
+
+def _names(code: types.CodeType) -> set[str]:
+    inside = (_names(item) for item in code.co_consts if isinstance(item, types.CodeType))
+    return set(code.co_names).union(*inside)

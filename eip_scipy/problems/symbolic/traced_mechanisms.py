@@ -1,0 +1,73 @@
+"""The parts of a mechanism from expressions of its functions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import sympy
+
+from ..multibody.energies import Energy
+from ..multibody.parts import Given, Parts
+from ..multibody.start import Names
+from .constrained import Constrained, energy_functions, matrices, power_function, values_and_gradient
+from .parser import symbol
+from .traced import NotTraceableError, traced
+
+__all__ = ["traced_parts"]
+
+# A traced function has the value of the function itself at the start, but for rounding.
+AGREES = 1e-9
+
+
+def traced_parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:
+    """Return the parts, see `mechanism`.
+
+    Raises
+    ------
+    NotTraceableError
+        For a function that has no expression.
+    """
+    by_name = {"t": ("t", t), "q": (names.coordinates, q), "u": (names.speeds, u)}
+
+    def expressions(what: str, arguments: str) -> tuple[Any, ...]:
+        fun = getattr(given, what)
+        if fun is None:
+            return ()
+        symbols, numbers = zip(*(by_name[letter] for letter in arguments), strict=True)
+        found = traced(what, fun, *symbols).ravel()
+        _require_agreement(what, found, fun(*numbers), names, (t, q, u))
+        return tuple(found)
+
+    speeds = [symbol(name) for name in names.speeds]
+    system = Constrained(
+        names.coordinates,
+        names.speeds,
+        (),
+        expressions("kinematics", "tqu") or tuple(speeds),
+        expressions("mass", "q"),
+        expressions("forces", "tqu"),
+        expressions("constraints", "tq"),
+        expressions("velocity_constraints", "tqu"),
+    ).with_velocities()
+    energies = []
+    power = expressions("power", "tqu")
+    own = power_function(power[0], system) if power else None
+    if given.energy is not None:
+        energies.append(Energy("energy", *energy_functions(expressions("energy", "tqu")[0], system), own))
+    elif given.potential is not None:
+        M = sympy.Matrix(len(speeds), len(speeds), system.mass)
+        kinetic = (sympy.Matrix(speeds).T * M * sympy.Matrix(speeds))[0] / 2
+        total = kinetic + expressions("potential", "tq")[0]
+        energies.append(Energy("u M u / 2 + potential", *energy_functions(total, system), own))
+    return Parts(matrices(system), *values_and_gradient(system), tuple(energies))
+
+
+def _require_agreement(what: str, found: Any, value: Any, names: Names, numbers: Any) -> None:
+    """Raise NotTraceableError if the expressions have other values at the start than the function."""
+    t, q, u = numbers
+    values = {symbol("t"): t, **{symbol(k): x for k, x in zip(names.state, (*q, *u), strict=True)}}
+    wanted = np.asarray(value, float).ravel()
+    own = np.array([float(sympy.sympify(item).xreplace(values)) for item in found])
+    if not np.allclose(own, wanted, rtol=AGREES, atol=AGREES * max(1.0, np.abs(wanted).max(initial=0.0))):
+        raise NotTraceableError(f"{what}: its value depends on more than its arguments")
