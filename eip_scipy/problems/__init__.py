@@ -32,7 +32,7 @@ from .kepler import kepler
 from .multibody import MechanicsProblem, mechanism
 from .particles.charged_particle import ParticleProblem, charged_particle, tokamak, uniform_field
 from .particles.fields import TOKAMAK, UNIFORM, ParticleField
-from .symbolic import equations, hamiltonian
+from .symbolic import equations, hamiltonian, mechanics
 from .time_transformed import centre_time, pair_time, reaches, time_transformed
 from .waves import (
     KortewegDeVries,
@@ -77,6 +77,7 @@ __all__ = [
     "harmonic_trap",
     "kepler",
     "korteweg_de_vries_solitons",
+    "mechanics",
     "mechanism",
     "nbody",
     "orbital_balances",

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from ...core.inputs import real_array, shown
 from ...core.invariants import Invariant, with_args
@@ -62,6 +63,8 @@ def started(
         item = with_args(item, (params,))
     sigma = np.array([0.0 if name in held else 1.0 for name in names.state])
     found = nearest_start(y, item, t, sigma) if sigma.any() else y
+    if sigma.any() and not _violation(found, item, t)[2] <= MET:
+        found = _downhill(y, item, t, sigma)
     _require_met(what, found, item, t, solved=bool(sigma.any()))
     moved = [
         f"{name} {before:.6g} to {after:.6g}"
@@ -106,30 +109,56 @@ def nearest_start(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -
     """Return the state that Newton's method finds from y, which moves in units of `sigma`; y where it fails."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ProjectionWarning)  # what is left is looked at by `_require_met`
+            warnings.simplefilter("ignore", ProjectionWarning)  # what is left is looked at by `_violation`
             return project(y, item, t=t, sigma=sigma, iterations=NEWTON_STEPS).y
     except ValueError:
         return y
 
 
-def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, *, solved: bool) -> None:
-    """Raise ValueError if a constraint is violated."""
-    values = np.asarray(item.fun(t, y), float)
-    gradient = np.empty((values.size, y.size))
+def _downhill(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> np.ndarray:
+    """Return a state with least residuals, for guesses from which Newton's method fails."""
+    free = sigma > 0
+
+    def whole(x: np.ndarray) -> np.ndarray:
+        state = y.copy()
+        state[free] = x
+        return state
+
+    found = least_squares(
+        lambda x: item.fun(t, whole(x)), y[free], lambda x: _gradient(item, t, whole(x))[:, free], x_scale="jac"
+    )
+    return nearest_start(whole(found.x), item, t, sigma)
+
+
+def _gradient(item: Invariant, t: float, y: np.ndarray) -> np.ndarray:
+    out = np.empty((item.size or 0, y.size))
     assert item.grad is not None
-    item.grad(t, y, gradient)
+    item.grad(t, y, out)
+    return out
+
+
+def _violation(y: np.ndarray, item: Invariant, t: float) -> tuple[int, float, float]:
+    """Return the constraint that is violated most, its value, and its share of the constraint's terms."""
+    values = np.asarray(item.fun(t, y), float)
+    gradient = np.abs(_gradient(item, t, y))
     # The terms of a constraint, or what it changes by while a component changes by 1.
-    size = np.maximum(np.abs(gradient) @ np.abs(y), np.abs(gradient).max(axis=1))
+    size = np.maximum(gradient @ np.abs(y), gradient.max(axis=1))
     share = np.abs(values) / np.where(size > 0, size, 1.0)
     worst = int(np.argmax(share))
-    if share[worst] <= MET:
+    return worst, float(values[worst]), float(share[worst])
+
+
+def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, *, solved: bool) -> None:
+    """Raise ValueError if a constraint is violated."""
+    worst, residual, share = _violation(y, item, t)
+    if share <= MET:
         return
-    name, residual = item.value_names[worst], values[worst]
+    name = item.value_names[worst]
     if solved:
         raise ValueError(
-            f"{what}: the start does not meet the constraint {name!r}: it is {residual:.3g}, expected 0, after "
-            f"{NEWTON_STEPS} Newton steps from the guess. Name fewer components as independent=, or give a guess "
-            "that is nearer to a solution; constraints that contradict each other have none."
+            f"{what}: no start was found that meets the constraint {name!r}: it is {residual:.3g}, expected 0. Name "
+            "fewer components as independent=, or give a guess that is nearer to a solution; constraints that "
+            "contradict each other have none."
         )
     raise ValueError(
         f"{what}: the start violates the constraint {name!r}: it is {residual:.3g}, expected 0. Name the components "

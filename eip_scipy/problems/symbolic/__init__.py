@@ -5,15 +5,18 @@ SymPy is loaded when one of them is called, and nowhere else in the package.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from ..multibody.callables import RANK_TOLERANCE
+
 if TYPE_CHECKING:
+    from ..multibody.problem import MechanicsProblem
     from .system import SymbolicProblem
 
-__all__ = ["equations", "hamiltonian"]
+__all__ = ["equations", "hamiltonian", "mechanics"]
 
 
 def hamiltonian(
@@ -139,6 +142,98 @@ def equations(
 
     with _nested("equations"):
         return equations_problem(f, y, params, invariants, name)
+
+
+def mechanics(
+    model: Any,
+    params: Mapping[Any, float] | None = None,
+    q0: Any = None,
+    u0: Any = None,
+    *,
+    t_span: tuple[float, float] | None = None,
+    inputs: Mapping[Any, Any] | None = None,
+    energy: Any = None,
+    independent: Iterable[Any] | None = None,
+    rank_tolerance: float = RANK_TOLERANCE,
+    name: str = "mechanics",
+    **others: Any,
+) -> MechanicsProblem:
+    """Return the problem of a model of sympy.physics.mechanics.
+
+    Its state is (q, u). A run keeps the constraints on positions and velocities, and the energy where it is constant or
+    changes slowly; the problem's repr shows which.
+
+    Parameters
+    ----------
+    model : KanesMethod, LagrangesMethod or System
+        The model, or any object with the attribute ``eom_method``, which is one of the first two.
+    params : mapping, optional
+        Values of the constants, by SymPy's symbols or by name. Default: ``model.constants``, as PyDy has them.
+    q0, u0 : mapping or array_like, optional
+        Coordinates and speeds at the start, by dynamicsymbols or by name, or in the order of ``model.q`` and
+        ``model.u``, which has dependent speeds last. The speeds of a LagrangesMethod are the derivatives of the
+        coordinates, called ``v_x`` for a coordinate ``x``. Default: ``model.initial_conditions``.
+    t_span : tuple of float, optional
+        Start and end of the interval. Without one the start is at 0.
+    inputs : mapping, optional
+        Expressions, of t and the state, of functions of time in the model that are neither coordinates nor speeds.
+    energy : sympy.Expr, optional
+        The total energy. Default: that of the bodies, to which the potential of constant loads is added if the energy
+        is constant with it; that of the Lagrangian.
+    independent : iterable, optional
+        Coordinates and speeds that stay as they are given; all others are guesses, from which the start is found.
+        Default: those that a KanesMethod does not call dependent; all of a LagrangesMethod.
+    rank_tolerance, name, **others
+        As for `mechanism`.
+
+    Returns
+    -------
+    MechanicsProblem
+
+    Raises
+    ------
+    ValueError
+        If a parameter or an input is missing, the start does not meet the constraints, the mass matrix is singular for
+        motions that the constraints allow, or the model has auxiliary speeds.
+    ImportError
+        Without SymPy.
+
+    Notes
+    -----
+    Dependent speeds of a KanesMethod are not eliminated: its equations are formed again with all speeds independent,
+    and the constraints get Lagrange's multipliers. This avoids poles where the choice of dependent speeds is singular,
+    and gives the forces of the constraints, see ``problem.multipliers``. A configuration constraint whose velocity
+    constraint the model lacks, which KanesMethod ignores, gets one, and a note in the repr.
+
+    Examples
+    --------
+    >>> from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
+    >>> from eip_scipy import EIPDOP853, integrate
+    >>> from eip_scipy.problems import mechanics
+    >>> x, y = dynamicsymbols("x y")
+    >>> L = (x.diff() ** 2 + y.diff() ** 2) / 2 - 9.81 * y
+    >>> rod = mechanics(LagrangesMethod(L, [x, y], hol_coneqs=[x**2 + y**2 - 1]), {}, [1, 0], [0, 0])
+    >>> run = integrate(rod, (0, 10), method=EIPDOP853, rtol=1e-8, atol=1e-8)
+    >>> bool(run.max_defect.max() < 1e-13)
+    True
+    """
+    _require_sympy("mechanics")
+    from .mechanics import mechanics_of_model
+
+    with _nested("mechanics"):
+        return mechanics_of_model(
+            model,
+            params,
+            q0,
+            u0,
+            t_span=t_span,
+            inputs=inputs,
+            energy=energy,
+            independent=independent,
+            rank_tolerance=rank_tolerance,
+            name=name,
+            others=others,
+        )
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from .parser import as_expression, as_names, symbol
 from .program import Arguments, function
 from .program import variational as variational_function
 
-__all__ = ["SymbolicProblem", "equations_problem", "hamiltonian_problem"]
+__all__ = ["SymbolicProblem", "equations_problem", "hamiltonian_problem", "parameter_values"]
 
 
 LARGEST_JACOBIAN = 16  # coordinates; there are as many second derivatives as their square
@@ -185,7 +185,7 @@ def hamiltonian_problem(
     perturbed: Perturbed,
 ) -> SymbolicProblem:
     """See `hamiltonian`."""
-    values = _parameters(params)
+    values = parameter_values(params)
     declared = {*values, *(name for given in (q, p) if given is not None for name in as_names("q and p", given))}
     energy = as_expression("H", H, declared)
     names, flow, pairs = _canonical(energy, q, p, values) if poisson is None else _lie(q, p, poisson, declared)
@@ -288,7 +288,7 @@ def equations_problem(f: Any, y: Any, params: Any, invariants: Any, name: str | 
         given = [f] if isinstance(f, (str, sympy.Expr)) else list(f)
     if len(given) != len(names):
         raise ValueError(f"equations: {len(given)} derivatives for the {len(names)} components {', '.join(names)}.")
-    values = _parameters(params)
+    values = parameter_values(params)
     declared = {*names, *values}
     rates = tuple(as_expression(f"the derivative of {k}", item, declared) for k, item in zip(names, given, strict=True))
     return _checked("f", name or "equations", names, rates, values, {}, {}, invariants, ())
@@ -499,7 +499,7 @@ def _with_columns(system: System, parameters: tuple[int, ...]) -> Callable[..., 
     return variational_function("variational equations", system.rates, jacobian, added, arguments)
 
 
-def _parameters(params: Any) -> dict[str, float]:
+def parameter_values(params: Any) -> dict[str, float]:
     """Finite values by name."""
     if params is None:
         return {}
