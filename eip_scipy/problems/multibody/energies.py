@@ -14,7 +14,7 @@ from ...core.invariants import Invariant
 from .motion import plain
 from .start import nearest_start
 
-__all__ = ["Energy", "energy_of", "states_near"]
+__all__ = ["Energy", "energy_of", "states_near", "typical_speed"]
 
 # States next to the start at which rates are examined, and how far they are away, in units of the components' sizes.
 STATES, AWAY = 6, 0.2
@@ -53,8 +53,9 @@ def energy_of(
     args = () if params is None else (params,)
     slowest, least = None, np.inf
     for item in candidates:
-        shares, rates, terms = _rates(item, derivative, states, args)
-        if shares.max(initial=0.0) <= CONSTANT and item.power is None:
+        rates, terms = _rates(item, derivative, states, args)
+        # Terms may vanish at one state, as in a steady motion, where rates are rounding.
+        if rates.max() <= CONSTANT * terms.max() and item.power is None:
             kept = Invariant(item.value, item.gradient, args=args, in_place=True, name="energy")
             return kept, f"invariant, {item.description}"
         slowness = rates.sum() / max(terms.sum(), np.finfo(float).tiny)
@@ -70,19 +71,31 @@ def energy_of(
 
 
 def states_near(
-    t: float, y: np.ndarray, constraints: Sequence[Invariant], derivative: Callable[[float, np.ndarray], np.ndarray]
+    t: float,
+    y: np.ndarray,
+    constraints: Sequence[Invariant],
+    derivative: Callable[[float, np.ndarray], np.ndarray],
+    coordinates: int,
 ) -> list[tuple[float, np.ndarray]]:
-    """Return the start and states next to it that meet the constraints."""
+    """Return the start and states next to it, at typical speeds, that meet the constraints."""
     rng = np.random.default_rng(20391)
-    half = np.abs(y).max(initial=0.0) or 1.0
+    half = np.abs(y[:coordinates]).max(initial=0.0) or 1.0
+    sizes = np.maximum(np.abs(y), AWAY * half) * AWAY
+    sizes[coordinates:] = typical_speed(y[:coordinates], y[coordinates:], derivative(t, y)[coordinates:])
     found = [(t, y)]
     for _ in range(STATES):
-        moved = y + AWAY * np.maximum(np.abs(y), AWAY * half) * rng.standard_normal(y.size)
+        moved = y + sizes * rng.standard_normal(y.size)
         for item in constraints:
             moved = nearest_start(moved, item, t, np.ones(y.size))
         if np.isfinite(derivative(t, moved)).all() and all(_meets(item, t, moved) for item in constraints):
             found.append((t, moved))
     return found
+
+
+def typical_speed(q: np.ndarray, u: np.ndarray, accelerations: np.ndarray) -> float:
+    """Return the largest speed, or the one that is reached from rest over the size of the coordinates."""
+    size = np.abs(q).max(initial=0.0) or 1.0
+    return float(max(np.abs(u).max(initial=0.0), np.sqrt(size * np.abs(accelerations).max(initial=0.0))))
 
 
 def _meets(item: Invariant, t: float, y: np.ndarray) -> bool:
@@ -91,8 +104,8 @@ def _meets(item: Invariant, t: float, y: np.ndarray) -> bool:
 
 def _rates(
     item: Energy, derivative: Callable[[float, np.ndarray], np.ndarray], states: Sequence[tuple], args: tuple[Any, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rates of an energy relative to their terms, the rates, and the terms, at all states."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rates of an energy and the sums of their terms, at all states."""
     rates, terms = np.zeros(len(states)), np.zeros(len(states))
     for k, (t, y) in enumerate(states):
         gradient = np.empty(y.size)
@@ -101,7 +114,7 @@ def _rates(
         value = plain(item.value)
         explicit = float(difference_gradient(partial(_at_time, value, t, y, args), np.zeros(1), np.ones(1))[0])
         rates[k], terms[k] = abs(products.sum() + explicit), np.abs(products).sum() + abs(explicit)
-    return rates / np.where(terms > 0, terms, 1.0), rates, terms
+    return rates, terms
 
 
 def _at_time(value: Callable[..., float], t: float, y: np.ndarray, args: tuple[Any, ...], shift: np.ndarray) -> float:

@@ -37,3 +37,4 @@ class Parts(NamedTuple):
     gradient: Callable[..., None]
     energies: tuple[Energy, ...]
     note: str = ""
+    origin: Any = None  # arguments of `parts_of` in symbolic/constrained.py, where the functions were made there

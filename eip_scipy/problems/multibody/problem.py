@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from ...core.inputs import real_array
 from ...core.invariants import Invariant
 from ...core.jitted import is_jitted
 from ...core.problem import Problem, bind
-from .energies import energy_of, states_near
+from .energies import energy_of, states_near, typical_speed
 from .motion import Motion, Sizes, motion, plain, vector
 from .parts import Parts
 from .start import Names, started
@@ -65,6 +65,9 @@ class MechanicsProblem(Problem):
     notes : tuple of str
         What was done to the equations and to the start.
     parameter_names : tuple of str
+    rank_tolerance : float
+    origin : optional
+        What the functions were made of, if they can be made again.
     """
 
     names: Names
@@ -74,6 +77,8 @@ class MechanicsProblem(Problem):
     motion: Motion
     notes: tuple[str, ...] = ()
     parameter_names: tuple[str, ...] = ()
+    rank_tolerance: float
+    origin: Any = None
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -108,6 +113,12 @@ class MechanicsProblem(Problem):
         if states.ndim == 1:
             return Multipliers(self.names.velocities, found[:, 0], int(ranks[0]))
         return Multipliers(self.names.velocities, found, ranks)
+
+    def motion_at(self, t: float, y: np.ndarray) -> np.ndarray:
+        """Return the derivative (q', u') of one state, by functions that are not compiled."""
+        out = np.empty(len(self.names.state))
+        self.motion.rhs(t, np.ascontiguousarray(y, float), out, *(() if self.params is None else (self.params,)))
+        return out
 
     def _solved(self, t: float, y: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
         """Return the rank of the constraints, u' and the multipliers."""
@@ -165,6 +176,38 @@ class MechanicsProblem(Problem):
         rest = f" of rank {rank}, {_degrees(n - rank)}"
         return f"{m} on velocities{rest}, {len(self.names.positions)} of them on positions too"
 
+    def __reduce__(self) -> Any:
+        """Functions are made again from the expressions where it is read."""
+        if self.origin is None:
+            return super().__reduce__()
+        own = self._own_invariants
+        kept = [own.index(item) if item in own else item for item in self.invariants]
+        others = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in REMADE}
+        nq = len(self.names.coordinates)
+        arguments = (self.names, self.t_span, (self.y0[:nq], self.y0[nq:]), self.params, self.rank_tolerance)
+        return _again, (self.origin, arguments, kept, others)
+
+    @property
+    def _own_invariants(self) -> tuple[Invariant, ...]:
+        return (*self.constraints, *([] if self.energy is None else [self.energy]))
+
+
+# Attributes that come from others.
+REMADE = {
+    "fun", "rhs", "y0", "t_span", "params", "invariants", "constraints", "energy", "energy_kept", "motion", "names",
+    "rank_tolerance", "origin",
+}  # fmt: skip
+
+
+def _again(origin: Any, arguments: Sequence[Any], kept: Sequence[Any], others: dict[str, Any]) -> MechanicsProblem:
+    from ..symbolic.constrained import parts_of
+
+    names, t_span, start, params, tolerance = arguments
+    t = 0.0 if t_span is None else t_span[0]
+    problem = mechanics_problem("", parts_of(*origin), names, t, start, params, None, tolerance, t_span=t_span)
+    own = problem._own_invariants
+    return replace(problem, invariants=tuple(own[item] if isinstance(item, int) else item for item in kept), **others)
+
 
 def _degrees(count: int) -> str:
     return f"{count} degree{'s' * (count != 1)} of freedom"
@@ -190,9 +233,12 @@ def mechanics_problem(
     once = motion(plain(parts.fill), sizes, tolerance)
     fun = bind(once.rhs, params)
     examined = _constraints_invariant(plain(parts.values), plain(parts.gradient), names, params)
-    kept = _constraints_invariant(parts.values, parts.gradient, names, params)
     y0, solved = started(name, names, examined, *start, params, t, independent)
-    energy, described = energy_of(parts.energies, fun, states_near(t, y0, examined, fun), params)
+    examined = tuple(_scaled(item, t, y0, fun, sizes) for item in examined)
+    kept = _constraints_invariant(parts.values, parts.gradient, names, params)
+    for item, scaled in zip(kept, examined, strict=True):
+        item.scale = scaled.scale
+    energy, described = energy_of(parts.energies, fun, states_near(t, y0, examined, fun, sizes.coordinates), params)
     nq = sizes.coordinates
     return MechanicsProblem(
         name=name,
@@ -210,6 +256,8 @@ def mechanics_problem(
         energy_kept=described,
         motion=once,
         notes=(*notes, *solved, *filter(None, [parts.note])),
+        rank_tolerance=tolerance,
+        origin=parts.origin,
         **others,
     )
 
@@ -227,3 +275,17 @@ def _constraints_invariant(
     )
     item.value_names = (*names.positions, *names.velocities)
     return (item,)
+
+
+def _scaled(
+    item: Invariant, t: float, y: np.ndarray, derivative: Callable[[float, np.ndarray], np.ndarray], sizes: Sizes
+) -> Invariant:
+    """Give the constraints on velocities the size of their terms at a typical speed: at rest they have none."""
+    nq = sizes.coordinates
+    speed = typical_speed(y[:nq], y[nq:], derivative(t, y)[nq:])
+    gradient = np.empty((item.size or 0, y.size))
+    assert item.grad is not None
+    item.grad(t, y, gradient)
+    scale = np.abs(gradient[:, nq:]).sum(axis=1) * speed
+    item.scale = scale if np.isfinite(scale).all() else None
+    return item

@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 
 import sympy
 
+from ..multibody.energies import Energy
 from ..multibody.motion import Sizes
+from ..multibody.parts import Parts
 from .parser import symbol
 from .program import Arguments, function
 
-__all__ = ["Constrained", "energy_functions", "filling", "matrices", "power_function", "values_and_gradient"]
+__all__ = ["Constrained", "filling", "parts_of"]
 
 
 class Constrained(NamedTuple):
@@ -68,6 +70,22 @@ class Constrained(NamedTuple):
         return self._replace(velocities=(*map(self.rate, self.positions), *self.velocities))
 
 
+def parts_of(system: Constrained, energies: Sequence[tuple[str, Any, Any]]) -> Parts:
+    """Return the functions of a system.
+
+    Parameters
+    ----------
+    system : Constrained
+    energies : sequence of (str, expression, expression or None)
+        Descriptions of quantities that may be constant, their expressions, and their rates where these are given.
+    """
+    found = tuple(
+        Energy(label, *energy_functions(item, system), None if rate is None else rate_function(rate, system))
+        for label, item, rate in energies
+    )
+    return Parts(matrices(system), *values_and_gradient(system), found, origin=(system, tuple(energies)))
+
+
 @lru_cache(maxsize=64)
 def matrices(system: Constrained) -> Callable[..., None]:
     """Return ``fill(t, y, out, *params)`` of M, F, G, gamma and q', as `motion` takes it."""
@@ -98,9 +116,9 @@ def energy_functions(energy: Any, system: Constrained) -> tuple[Callable[..., fl
 
 
 @lru_cache(maxsize=64)
-def power_function(power: Any, system: Constrained) -> Callable[..., float]:
-    """Return the rate of an energy, ``power(t, y, *params)``."""
-    return function("power", [power], system.arguments, in_place=False)
+def rate_function(rate: Any, system: Constrained) -> Callable[..., float]:
+    """Return the rate of an energy, ``rate(t, y, *params)``."""
+    return function("power", [rate], system.arguments, in_place=False)
 
 
 def filling(what: str, expressions: Sequence[Any], system: Constrained) -> Callable[..., None]:

@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ..multibody.energies import Energy
-from ..multibody.parts import Parts
 from ..multibody.problem import MechanicsProblem, mechanics_problem
 from ..multibody.start import Names
-from .constrained import energy_functions, matrices, values_and_gradient
+from .constrained import parts_of
 from .models import name_of, read
 from .system import parameter_values
 
@@ -44,8 +42,7 @@ def mechanics_of_model(
     system = found.system
     names = Names(system.coordinates, system.speeds, found.position_names, found.velocity_names)
     held = found.independent if independent is None else [name_of(item) for item in independent]
-    energies = tuple(Energy(label, *energy_functions(item, system)) for label, item in found.energies)
-    parts = Parts(matrices(system), *values_and_gradient(system), energies)
+    parts = parts_of(system, [(label, item, None) for label, item in found.energies])
     start = _by_name(q0, system.coordinates), _by_name(u0, system.speeds)
     numbers = np.array([values[key] for key in system.parameters]) if system.parameters else None
     t = 0.0 if t_span is None else float(t_span[0])

@@ -267,13 +267,13 @@ def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str,
     missing = sorted(needed - values.keys())
     if missing:
         hint = nearest(missing[0], [name for name in values if name not in needed])
-        raise ValueError(f"params: the value of {missing[0]!r} is missing{hint}. The model has {', '.join(sorted(needed))}.")
+        raise ValueError(
+            f"params: the value of {missing[0]!r} is missing{hint}. The model has {', '.join(sorted(needed))}."
+        )
     return tuple(name for name in values if name in needed)
 
 
-def _with_missing_velocities(
-    system: Constrained, values: Mapping[str, float]
-) -> tuple[Constrained, list[str]]:
+def _with_missing_velocities(system: Constrained, values: Mapping[str, float]) -> tuple[Constrained, list[str]]:
     """Add the derivatives of constraints on positions that those on velocities do not contain.
 
     KanesMethod ignores a configuration constraint without its velocity constraint.

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import sympy
 
-from ..multibody.energies import Energy
 from ..multibody.parts import Given, Parts
 from ..multibody.start import Names
-from .constrained import Constrained, energy_functions, matrices, power_function, values_and_gradient
+from .constrained import Constrained, parts_of
 from .parser import symbol
 from .traced import NotTraceableError, traced
 
@@ -50,17 +49,15 @@ def traced_parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndar
         expressions("constraints", "tq"),
         expressions("velocity_constraints", "tqu"),
     ).with_velocities()
+    power = (expressions("power", "tqu") or (None,))[0]
     energies = []
-    power = expressions("power", "tqu")
-    own = power_function(power[0], system) if power else None
     if given.energy is not None:
-        energies.append(Energy("energy", *energy_functions(expressions("energy", "tqu")[0], system), own))
+        energies.append(("energy", expressions("energy", "tqu")[0], power))
     elif given.potential is not None:
         M = sympy.Matrix(len(speeds), len(speeds), system.mass)
         kinetic = (sympy.Matrix(speeds).T * M * sympy.Matrix(speeds))[0] / 2
-        total = kinetic + expressions("potential", "tq")[0]
-        energies.append(Energy("u M u / 2 + potential", *energy_functions(total, system), own))
-    return Parts(matrices(system), *values_and_gradient(system), tuple(energies))
+        energies.append(("u M u / 2 + potential", kinetic + expressions("potential", "tq")[0], power))
+    return parts_of(system, energies)
 
 
 def _require_agreement(what: str, found: Any, value: Any, names: Names, numbers: Any) -> None:

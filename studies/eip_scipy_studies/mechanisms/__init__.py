@@ -1,0 +1,1 @@
+"""Mechanisms with known motions, and a study of them."""

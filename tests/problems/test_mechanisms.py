@@ -1,0 +1,424 @@
+"""Mechanical systems with constraints: closed forms, published states, and SymPy's own equations."""
+
+import dataclasses
+import pickle
+
+import numpy as np
+import pytest
+import sympy
+from scipy.integrate import solve_ivp
+from scipy.special import ellipk
+from sympy.physics import mechanics as me
+
+from eip_scipy import EIPDOP853, Balance, ensemble, integrate
+from eip_scipy.engine.native import BUILD
+from eip_scipy.problems import mechanics, mechanism
+from eip_scipy_studies.mechanisms import examples
+
+G = 9.81
+
+
+def run(problem, tolerance, **options):
+    return integrate(problem, method=EIPDOP853, rtol=tolerance, atol=tolerance, **options)
+
+
+# The solver.
+
+
+def solved(M, F, rows, gamma, tolerance=1e-9):
+    accelerations, multipliers = np.empty(len(F)), np.empty(len(rows))
+    matrices = np.concatenate([M.ravel(), F, rows.ravel(), gamma])
+    return BUILD.multibody.solve(matrices, tolerance, accelerations, multipliers), accelerations, multipliers
+
+
+@pytest.mark.parametrize(
+    ("n", "m", "rank"), [(3, 2, 2), (6, 4, 3), (5, 5, 5), (4, 0, 0), (6, 8, 4), (7, 7, 0), (9, 3, 1)]
+)
+def test_the_solution_is_that_of_the_whole_matrix(n, m, rank):
+    rng = np.random.default_rng(10 * n + m)
+    A = rng.normal(size=(n, n))
+    M, F = A @ A.T + np.eye(n), rng.normal(size=n)
+    rows = rng.normal(size=(m, rank)) @ rng.normal(size=(rank, n))
+    gamma = -rows @ rng.normal(size=n)
+    found, accelerations, multipliers = solved(M, F, rows, gamma)
+    sizes = np.linalg.norm(rows, axis=1)
+    sizes[sizes == 0] = 1
+    unit = rows / sizes[:, None]
+    whole = np.block([[M, unit.T], [unit, np.zeros((m, m))]])
+    expected = np.linalg.lstsq(whole, np.append(F, -gamma / sizes), rcond=1e-10)[0]
+    assert found == rank
+    np.testing.assert_allclose(accelerations, expected[:n], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(multipliers * sizes, expected[n:], rtol=0, atol=1e-10)
+
+
+def test_contradicting_rows_are_met_in_the_mean():
+    _, accelerations, _ = solved(np.eye(2), np.zeros(2), np.array([[1.0, 0], [2.0, 0]]), np.array([-1.0, -4.0]))
+    np.testing.assert_allclose(accelerations, [1.5, 0], atol=1e-15)
+
+
+def test_speeds_without_mass_need_constraints():
+    M, rows = np.diag([1.0, 0, 0, 1]), np.array([[0, 1.0, 0, 0], [0, 1, 1, 0]])
+    rank, accelerations, multipliers = solved(M, np.ones(4), rows, np.ones(2))
+    assert rank == 2
+    np.testing.assert_allclose(accelerations, [1, -1, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(multipliers, [0, 1], atol=1e-15)
+    assert solved(M, np.ones(4), 0 * rows, np.ones(2))[0] == BUILD.multibody.MASS_IS_SINGULAR
+    assert solved(M, np.full(4, np.nan), rows, np.ones(2))[0] == BUILD.multibody.NOT_FINITE
+    with pytest.raises(ValueError, match="expected n n"):
+        BUILD.multibody.solve(np.zeros(3), 1e-9, np.zeros(2), np.zeros(1))
+
+
+# From functions of arrays.
+
+
+def length(t, q):
+    return [(q[0] ** 2 + q[1] ** 2 - 1) / 2]
+
+
+PENDULUM = {"q0": [1, 0], "u0": [0, 0], "potential": lambda t, q: G * q[1]}
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return mechanism([1, 1], [0, -G], length, t_span=(0.0, 4 * float(ellipk(0.5)) / np.sqrt(G)), **PENDULUM)
+
+
+def test_a_pendulum_returns_after_its_period_with_the_known_tension(pendulum):
+    last = run(pendulum, 1e-9)
+    assert last.trusted
+    np.testing.assert_allclose(last.y[:, -1], [1, 0, 0, 0], atol=1e-7)
+    t = np.linspace(*pendulum.t_span, 7)
+    found = run(pendulum, 1e-9, t_eval=t)
+    forces = pendulum.multipliers(t, found.y)
+    # The rod pulls with 3 m g |y|, along -q: -G^T lambda = -lambda q.
+    np.testing.assert_allclose(forces.values[0], -3 * G * found.y[1], atol=1e-6)
+    assert forces.unique.all()
+    assert forces.names == ("g1'",)
+    with pytest.raises(ValueError, match="a column for each time"):
+        pendulum.multipliers(t, found.y.T)
+
+
+def test_its_repr_says_what_is_kept(pendulum):
+    text = repr(pendulum)
+    assert "1 on velocities of rank 1, 1 degree of freedom" in text
+    assert "energy      invariant, u M u / 2 + potential" in text
+
+
+def test_it_pickles_and_its_members_keep_the_constraints(pendulum):
+    chosen = dataclasses.replace(pendulum, invariants=pendulum.constraints)
+    again = pickle.loads(pickle.dumps(chosen))
+    assert [item.name for item in again.invariants] == ["constraints"]
+    one, two = (run(problem, 1e-6, t_span=(0, 1)) for problem in (chosen, again))
+    assert np.array_equal(one.y, two.y)
+    starts = np.array([[1.0, 0, 0, 0], [0, -1, 2, 0]])
+    found = ensemble(pendulum, (0, 1), starts, method=EIPDOP853, rtol=1e-6, atol=1e-6)
+    assert np.abs(found.y[:, 0] ** 2 + found.y[:, 1] ** 2 - 1).max() < 1e-12
+
+
+def untraceable(function):
+    """The same function, which cannot be called with symbols."""
+
+    def call(*args):
+        assert all(float(np.real(x)) == np.real(x) for x in np.ravel(args[-1]))
+        return function(*args)
+
+    return call
+
+
+def test_functions_that_branch_are_called_as_they_are():
+    exact = mechanism([1, 1], [0, -G], length, **PENDULUM)
+    numerical = mechanism([1, 1], [0, -G], untraceable(length), **PENDULUM)
+    assert "called as they are" in repr(numerical)
+    assert exact.notes == ()
+    state = np.array([0.8, -0.6, 0.3, 0.4])
+    np.testing.assert_allclose(numerical.fun(0.0, state), exact.motion_at(0.0, state), atol=1e-12)
+    one, two = numerical.constraints[0].grad, exact.constraints[0].gradient.py_func
+    found, expected = np.empty((2, 4)), np.empty((2, 4))
+    one(0.0, state, found)
+    two(0.0, state, expected)
+    np.testing.assert_allclose(found, expected, atol=1e-11)
+    run_of_it = run(numerical, 1e-6, t_span=(0, 1))
+    assert run_of_it.trusted
+    assert np.abs(run_of_it.y[0] ** 2 + run_of_it.y[1] ** 2 - 1).max() < 1e-12
+
+
+@pytest.mark.parametrize("wrapped", [lambda f: f, untraceable])
+def test_constraints_may_depend_on_time(wrapped):
+    # A bead on a rod that turns at the rate w: r'' = w^2 r.
+    w = 2.0
+    problem = mechanism(
+        [1, 1], [0, 0], wrapped(lambda t, q: [q[0] * np.sin(w * t) - q[1] * np.cos(w * t)]), q0=[1, 0], u0=[0, w]
+    )
+    last = integrate(
+        lambda t, y: problem.motion_at(t, y), (0, 1), problem.y0, method=EIPDOP853, rtol=1e-9, atol=1e-9
+    ).y[:, -1]
+    r, speed = np.cosh(w), w * np.sinh(w)
+    along, across = np.array([np.cos(w), np.sin(w)]), np.array([-np.sin(w), np.cos(w)])
+    np.testing.assert_allclose(last, np.append(r * along, speed * along + w * r * across), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_skate_does_not_slip():
+    problem = examples.knife_edge()
+    found = run(problem, 1e-9)
+    assert found.trusted
+    np.testing.assert_allclose(found.y[:, -1], problem.reference(10.0), atol=1e-7)
+
+
+def test_friction_makes_the_energy_a_balance_while_it_is_slow():
+    def damped(c):
+        return mechanism([1, 1], lambda t, q, u: np.array([0, -G]) - c * u, length, **PENDULUM)
+
+    weak, strong = damped(1e-3), damped(5.0)
+    assert isinstance(weak.energy, Balance)
+    assert "balance" in weak.energy_kept
+    assert strong.energy is None
+    assert "not kept" in strong.energy_kept
+    power = mechanism(
+        [1, 1],
+        lambda t, q, u: [-1e-3 * u[0], -G - 1e-3 * u[1]],
+        length,
+        power=lambda t, q, u: -1e-3 * u @ u,
+        **PENDULUM,
+    )
+    assert power.energy.rate_function is not None
+
+
+def test_a_start_is_found_and_what_is_set_is_not_moved():
+    names = {"coordinates": "x y", "speeds": "vx vy"}
+    problem = mechanism([1, 1], [0, -G], length, q0=[0.6, 0.7], u0=[0.5, 0], independent=["x", "vx"], **names)
+    np.testing.assert_allclose(problem.y0, [0.6, 0.8, 0.5, -0.375], rtol=1e-14)
+    assert problem.y0[0] == 0.6
+    assert problem.y0[2] == 0.5
+    assert "y 0.7 to 0.8" in repr(problem)
+    below = problem.start({"x": 0.6, "y": -0.5}, {"vx": 0.5}, independent=["x", "vx"])
+    np.testing.assert_allclose(below, [0.6, -0.8, 0.5, 0.375], rtol=1e-14)
+
+
+def refused(match, *args, error=ValueError, **options):
+    given = {"q0": [1, 0], "u0": [0, 0], **options}
+    with pytest.raises(error, match=match):
+        mechanism(*(args or ([1, 1], [0, -G], length)), **given)
+
+
+def test_what_is_wrong_is_said():
+    refused('violates the constraint "g1\'": it is 0.5', u0=[0.5, 0])
+    refused("violates the constraint 'rod': it is 1.5", q0=[2, 0], constraint_names="rod")
+    refused("no start was found that meets the constraint", q0=[2, 0], independent=["q1"])
+    refused("'x1' is not a component", independent=["x1"])
+    refused("mass matrix is singular", [1, 0], [0, -G], lambda t, q: [q[0] - 1])
+    refused("mass has the shape", np.eye(3), [0, -G], length)
+    refused("forces has the shape", [1, 1], [0, -G, 0], length)
+    refused("expected as many, or kinematics", [1], [0], None, u0=[0])
+    refused("jacobian differs from the derivatives", jacobian=lambda t, q: [[q[1], q[0]]])
+    refused("gamma differs", gamma=lambda t, q, u: [-1.0])
+    refused("constraints must be a function", [1, 1], [0, -G], [1.0], error=TypeError)
+
+    def contradicting(t, q):
+        return [q[0] - 1, q[0] - 1.5]
+
+    refused("constraints that contradict each other", [1, 1], [0, -G], contradicting, independent=[])
+
+
+def test_given_derivatives_are_compared_and_taken():
+    problem = mechanism(
+        [1, 1],
+        [0, -G],
+        untraceable(length),
+        jacobian=lambda t, q: np.array([[q[0], q[1]]]),
+        gamma=lambda t, q, u: [u @ u],
+        **PENDULUM,
+    )
+    exact = mechanism([1, 1], [0, -G], length, **PENDULUM)
+    state = np.array([0.8, -0.6, 0.3, 0.4])
+    np.testing.assert_allclose(problem.fun(0.0, state), exact.motion_at(0.0, state), atol=1e-14)
+
+
+# Mechanisms with known motions.
+
+
+@pytest.mark.slow
+def test_the_n_four_bar_mechanism_passes_its_singular_positions():
+    problem = examples.n_four_bar(1)
+    for tolerance, error in ((1e-5, 1e-4), (1e-8, 1e-6)):
+        found = run(problem, tolerance)
+        assert found.trusted
+        assert found.nfev < 3000
+        np.testing.assert_allclose(found.y[:4, -1], problem.reference(10.0)[:4], atol=error)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [5, 20])
+def test_longer_ones_do_too(n):
+    problem = examples.n_four_bar(n)
+    for tolerance in (1e-4, 1e-6, 1e-8, 1e-10):
+        found = run(problem, tolerance, invariants=problem.constraints)
+        assert found.trusted
+        assert found.nfev < 6000
+        error = np.abs(found.y[: 2 * n + 2, -1] - problem.reference(10.0)[: 2 * n + 2]).max()
+        assert error < 1e3 * tolerance
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_andrews_squeezing_mechanism_ends_where_it_is_known_to():
+    problem = examples.andrews()
+    found = run(problem, 1e-11)
+    assert found.trusted
+    np.testing.assert_allclose(found.y[:7, -1], examples.END, rtol=1e-8)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_bricards_mechanism_has_redundant_constraints():
+    problem = examples.bricard()
+    assert "24 on velocities of rank 23, 1 degree of freedom" in repr(problem)
+    found = run(problem, 1e-8)
+    assert found.trusted
+    np.testing.assert_allclose(found.y[6:9, -1], [1, -1.00027, 0.99973], atol=5e-6)  # as published
+    assert np.abs(found.invariants[-1] + 29.43).max() < 1e-9
+    again = run(problem, 1e-8, t_span=(4.0, 5.0), y0=run(problem, 1e-8, t_span=(0, 4)).y[:, -1])
+    assert again.trusted
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_it_moves_the_same_in_other_coordinates():
+    states = [run(examples.bricard(0.0, axes, 3.0), 1e-9).y[:12, -1] for axes in (True, False)]
+    np.testing.assert_allclose(*states, atol=1e-7)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@pytest.mark.parametrize("wobbling", [False, True])
+def test_a_disc_rolls(wobbling):
+    problem = examples.disc(wobbling)
+    found = run(problem, 1e-10)
+    assert found.trusted
+    np.testing.assert_allclose(found.y[:, -1], problem.reference(5.0), atol=1e-6)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_the_four_bar_linkage_keeps_constraints_and_energy():
+    problem = examples.four_bar()
+    best = run(problem, 1e-13).y[:, -1]
+    for tolerance in (1e-4, 1e-6, 1e-8, 1e-10):
+        plain = run(problem, tolerance, invariants=())
+        kept = run(problem, tolerance)
+        assert kept.trusted
+        assert kept.nfev <= 1.05 * plain.nfev
+        assert np.abs(kept.y[:, -1] - best).max() <= np.abs(plain.y[:, -1] - best).max() / 30
+
+
+# Models of SymPy.
+
+
+@pytest.fixture(scope="module")
+def four_bar():
+    return examples.four_bar()
+
+
+def test_a_model_moves_as_its_own_equations_say(four_bar):
+    model, constants = examples.four_bar_model()
+    y = four_bar.y0.copy()
+    y[3:] = 1.3 * np.linalg.svd(_speed_gradient(four_bar, y))[2][-1]
+    state = dict(zip([*model.q, *model.u], y, strict=True)) | constants
+    M, f = (np.array(item.xreplace(state), float) for item in (model.mass_matrix, model.forcing))
+    np.testing.assert_allclose(four_bar.motion_at(0.0, y)[3:], np.linalg.solve(M, f)[:, 0], rtol=1e-9)
+    assert "potential of constant loads" in four_bar.energy_kept
+    assert "q2 -0.7 to" in repr(four_bar)
+
+
+def _speed_gradient(problem, y):
+    out = np.empty((4, 6))
+    problem.constraints[0].gradient.py_func(0.0, y, out, problem.params)
+    return out[2:, 3:]
+
+
+def particle(constrained_speeds):
+    """A particle on the parabola y = x^2, with or without the velocity constraint."""
+    x, y, u, v = me.dynamicsymbols("x y u v")
+    m, g = sympy.symbols("m g")
+    N, O = me.ReferenceFrame("N"), me.Point("O")
+    O.set_vel(N, 0)
+    P = O.locatenew("P", x * N.x + y * N.y)
+    P.set_vel(N, u * N.x + v * N.y)
+    dependent = {"u_dependent": [v], "velocity_constraints": [v - 2 * x * u]} if constrained_speeds else {}
+    model = me.KanesMethod(
+        N, [x], [u] if dependent else [u, v], kd_eqs=[x.diff() - u, y.diff() - v], q_dependent=[y],
+        configuration_constraints=[y - x**2], **dependent,
+    )  # fmt: skip
+    model.kanes_equations([me.Particle("A", P, m)], [(P, -m * g * N.y)])
+    return model
+
+
+def test_a_configuration_constraint_without_velocity_constraint_is_added():
+    states = []
+    for constrained in (True, False):
+        problem = mechanics(particle(constrained), {"m": 1, "g": G}, {"x": 1}, {"u": 0.5}, independent=["x", "u"])
+        assert ("velocity constraints were added for g1" in repr(problem)) is not constrained
+        assert "energy      invariant" in repr(problem)
+        states.append(problem.motion_at(0.0, problem.y0))
+    # (1 + 4 x^2) x'' + 4 x x'^2 + 2 g x = 0
+    np.testing.assert_allclose(states[0][2], -(4 * 0.25 + 2 * G) / 5, rtol=1e-14)
+    np.testing.assert_allclose(states[0], states[1], rtol=1e-14)
+
+
+def test_lagranges_method_and_a_system_give_the_same_motion():
+    x, y = me.dynamicsymbols("x y")
+    m, g = sympy.symbols("m g")
+    L = m * (x.diff() ** 2 + y.diff() ** 2) / 2 - m * g * y
+    model = me.LagrangesMethod(L, [x, y], hol_coneqs=[y - x**2])
+    problem = mechanics(model, {m: 1, g: G}, [1, 1], {"v_x": 0.5, y.diff(): 1.0})
+    np.testing.assert_allclose(problem.motion_at(0.0, problem.y0)[2], -(4 * 0.25 + 2 * G) / 5, rtol=1e-14)
+    assert problem.energy_kept == "invariant, of the Lagrangian"
+
+    class System:  # as PyDy's
+        eom_method, constants, initial_conditions = model, {m: 1, g: G}, {x: 1, y: 1, x.diff(): 0.5, y.diff(): 1.0}
+
+    np.testing.assert_array_equal(mechanics(System()).y0, problem.y0)
+
+
+def test_what_is_wrong_with_a_model_is_said():
+    model, start = particle(True), ({"x": 1}, {"u": 0.5})
+    with pytest.raises(ValueError, match="value of 'g' is missing"):
+        mechanics(model, {"m": 1}, *start)
+    with pytest.raises(TypeError, match="expected a KanesMethod"):
+        mechanics(object(), {}, *start)
+    with pytest.raises(TypeError, match="q0 or u0 is missing"):
+        mechanics(model, {"m": 1, "g": G})
+    x, u, aux = me.dynamicsymbols("x u aux")
+    N, P = me.ReferenceFrame("N"), me.Point("P")
+    P.set_vel(N, u * N.x + aux * N.y)
+    kane = me.KanesMethod(N, [x], [u], kd_eqs=[x.diff() - u], u_auxiliary=[aux])
+    kane.kanes_equations([me.Particle("A", P, 1)], [])
+    with pytest.raises(ValueError, match="auxiliary speeds"):
+        mechanics(kane, {}, [0], [0])
+
+
+def test_inputs_are_expressions_of_time_and_state():
+    x, u, push = me.dynamicsymbols("x u push")
+    N, P = me.ReferenceFrame("N"), me.Point("P")
+    P.set_vel(N, u * N.x)
+    kane = me.KanesMethod(N, [x], [u], kd_eqs=[x.diff() - u])
+    kane.kanes_equations([me.Particle("A", P, 2)], [(P, push * N.x)])
+    with pytest.raises(ValueError, match="push.* is neither a coordinate nor a speed"):
+        mechanics(kane, {}, [0], [1])
+    problem = mechanics(kane, {}, [0], [1], inputs={"push": sympy.sin(me.dynamicsymbols._t) - 3 * x})
+    np.testing.assert_allclose(problem.motion_at(0.5, np.array([0.2, 1.0])), [1.0, (np.sin(0.5) - 0.6) / 2], rtol=1e-15)
+
+
+def test_compiled_motion_is_that_of_python(four_bar):
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        y = four_bar.y0 + 0.1 * rng.normal(size=6)
+        np.testing.assert_allclose(four_bar.fun(0.3, y), four_bar.motion_at(0.3, y), rtol=1e-13, atol=1e-13)
+
+
+def test_a_pole_of_dependent_speeds_is_none_of_the_motion():
+    # At y = x^2, x = 0 the other choice of dependent speeds, u by v, is singular.
+    problem = mechanics(particle(True), {"m": 1, "g": G}, [0, 0], [0.7, 0])
+    found = solve_ivp(lambda t, y: problem.motion_at(t, y), (0, 0.1), problem.y0, rtol=1e-9, atol=1e-9)
+    assert found.success
