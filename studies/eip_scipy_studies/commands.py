@@ -74,6 +74,9 @@ COMMANDS = {
     "study long-orbits": Entry(
         "measurements.long_orbits:LongOrbits", "what projection and compensation bring over 1000 years"
     ),
+    "study mechanisms": Entry(
+        "mechanisms.study:Mechanisms", "mechanisms with constraints and energy kept, beside other ways to run them"
+    ),
     "study metric-memory": Entry(
         "measurements.metric_memory:MetricMemory", "the metric on problems whose error estimates mislead it"
     ),

@@ -30,7 +30,7 @@ PAGES = (
     "tutorials/pdes", "tutorials/own-pde", "tutorials/ensembles", "how-to/recommend", "how-to/find-invariants",
     "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
     "how-to/own-methods", "how-to/consistent-starts", "how-to/balances", "how-to/tangent-maps", "how-to/gradients",
-    "how-to/stiff-systems",
+    "how-to/stiff-systems", "how-to/mechanisms",
 )  # fmt: skip
 NEEDED = {"docs/how-to/gradients.md": ("jax", "torch")}
 NIGHTLY = ("results/hard-scenes", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h")

@@ -768,3 +768,13 @@ def test_without_sympy(monkeypatch):
     for call in (lambda: hamiltonian("p**2"), lambda: equations(["x"], "x")):
         with pytest.raises(ImportError, match=r'needs SymPy: python -m pip install "eip_scipy\[sympy\]"'):
             call()
+
+
+def test_piecewise_and_reciprocals_are_those_of_sympy():
+    x, y = sympy.symbols("x y", real=True)
+    steps = sympy.Piecewise((x**2, x < 1), (sympy.sec(x) + sympy.cot(x), (x >= 1) & (x < 2)), (3, True))
+    others = sympy.Piecewise((sympy.csc(y), sympy.Not(sympy.Eq(x, y)) | (x > 5)), (x, x <= y))
+    problem = equations({"x": steps, "y": others})
+    for point in ((0.5, 0.7), (1.0, 0.7), (1.5, 0.7), (2.0, 2.0), (2.5, 0.7), (6.0, 6.0)):
+        expected = [float(item.subs({x: point[0], y: point[1]})) for item in (steps, others)]
+        np.testing.assert_allclose(problem.fun(0.0, np.array(point)), expected, rtol=1e-14)

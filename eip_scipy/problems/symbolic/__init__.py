@@ -218,7 +218,7 @@ def mechanics(
     True
     """
     _require_sympy("mechanics")
-    from .mechanics import mechanics_of_model
+    from .model_problems import mechanics_of_model
 
     with _nested("mechanics"):
         return mechanics_of_model(

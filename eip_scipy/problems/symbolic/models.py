@@ -289,9 +289,9 @@ def _with_missing_velocities(system: Constrained, values: Mapping[str, float]) -
     rng = np.random.default_rng(3)
     missing = np.zeros(len(rates), bool)
     for _ in range(POINTS):
-        found = np.empty(len(items) * len(speeds))
-        plain(rows)(rng.uniform(0.1, 1.0), rng.uniform(0.1, 1.0, len(system.variables)), found, *extra)
-        found = found.reshape(len(items), -1)
+        flat = np.empty(len(items) * len(speeds))
+        plain(rows)(rng.uniform(0.1, 1.0), rng.uniform(0.1, 1.0, len(system.variables)), flat, *extra)
+        found = flat.reshape(len(items), -1)
         own, known = found[: len(rates)], found[len(rates) :]
         left = own
         if len(known):

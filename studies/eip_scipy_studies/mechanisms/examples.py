@@ -34,7 +34,7 @@ def n_four_bar(n: int, t_end: float = 10.0, **options: Any) -> MechanicsProblem:
     q0, u0, forces = (np.zeros(2 * ends) for _ in range(3))
     q0[0::2], q0[1::2], u0[0::2], forces[1::2] = np.arange(ends), 1.0, 1.0, -G * weights
 
-    def lengths(t, q):
+    def lengths(t: Any, q: Any) -> np.ndarray:
         x, y = q[0::2], q[1::2]
         cranks = (x - np.arange(ends)) ** 2 + y**2 - 1
         couplers = (x[1:] - x[:-1]) ** 2 + (y[1:] - y[:-1]) ** 2 - 1
@@ -103,7 +103,7 @@ def andrews() -> MechanicsProblem:
     )
 
 
-def _andrews_mass(q):
+def _andrews_mass(q: Any) -> np.ndarray:
     e, f = E - EA, ZF - FA
     M = np.zeros((7, 7))
     M[0, 0] = M1 * RA**2 + M2 * (RR**2 - 2 * DA * RR * np.cos(q[1]) + DA**2) + I1 + I2
@@ -119,14 +119,14 @@ def _andrews_mass(q):
     return M
 
 
-def _spring(q):
+def _spring(q: Any) -> tuple[Any, Any, Any]:
     """Return the spring's length, and the vector along it."""
     x = SD * np.cos(q[2]) + SC * np.sin(q[2]) + XB - XC
     y = SD * np.sin(q[2]) - SC * np.cos(q[2]) + YB - YC
     return np.sqrt(x**2 + y**2), x, y
 
 
-def _andrews_forces(t, q, u):
+def _andrews_forces(t: Any, q: Any, u: Any) -> np.ndarray:
     e, f = E - EA, ZF - FA
     length, x, y = _spring(q)
     pull = -STIFFNESS * (length - LENGTH) / length
@@ -143,7 +143,7 @@ def _andrews_forces(t, q, u):
     )
 
 
-def _andrews_constraints(t, q):
+def _andrews_constraints(t: Any, q: Any) -> np.ndarray:
     x = RR * np.cos(q[0]) - D * np.cos(q[0] + q[1])
     y = RR * np.sin(q[0]) - D * np.sin(q[0] + q[1])
     return np.array(
@@ -158,9 +158,9 @@ def _andrews_constraints(t, q):
     )
 
 
-# Bricard's mechanism: a loop of six rods of 1 m, the first one the ground. The axis of each joint is perpendicular to both
-# of its rods, and those of the two joints of a rod are perpendicular to each other. At the start all axes are parallel to
-# those of the coordinates.
+# Bricard's mechanism: a loop of six rods of 1 m, the first one the ground. The axis of each joint is perpendicular to
+# both of its rods, and those of the two joints of a rod are perpendicular to each other. At the start all axes are
+# parallel to those of the coordinates.
 
 CORNERS = np.array([[0, 0, 1], [0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1]], float)
 AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
@@ -169,33 +169,33 @@ AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1
 def bricard(section: float = 0.1, axes: bool = True, t_end: float = 10.0, **options: Any) -> MechanicsProblem:
     """Return Bricard's mechanism of five rods of 1 kg with a square section of this side, with gravity along -y.
 
-    Its coordinates are those of the corners P2 to P5 and, if `axes`, those of the axes of the joints there: 24 constraints
-    of rank 23. Otherwise the axes follow from the rods, which are then slender: 12 constraints of rank 11.
+    Its coordinates are those of the corners P2 to P5 and, if `axes`, those of the axes of the joints there: 24
+    constraints of rank 23. Otherwise the axes follow from the rods, which are then slender: 12 constraints of rank 11.
     """
-    M, weights = np.zeros((6, 6)), np.zeros(6)
+    whole, weights = np.zeros((6, 6)), np.zeros(6)
     for i, j in ((k, (k + 1) % 6) for k in range(1, 6)):
-        M[np.ix_([i, j], [i, j])] += np.array([[2, 1], [1, 2]]) / 6
+        whole[np.ix_([i, j], [i, j])] += np.array([[2, 1], [1, 2]]) / 6
         weights[[i, j]] += 0.5
 
-    def rods(q):
+    def rods(q: Any) -> list[Any]:
         P = [CORNERS[0], CORNERS[1], q[0:3], q[3:6], q[6:9], q[9:12]]
         return [P[(k + 1) % 6] - P[k] for k in range(6)]
 
-    def with_axes(t, q):
+    def with_axes(t: Any, q: Any) -> np.ndarray:
         r, a = rods(q), [AXES[0], AXES[1], q[12:15], q[15:18], q[18:21], q[21:24], AXES[0]]
         found = [axis @ axis - 1 for axis in a[2:6]]
         for k in range(1, 6):
             found += [r[k] @ r[k] - 1, a[k] @ r[k], a[k + 1] @ r[k], a[k] @ a[k + 1]]
         return np.array(found)
 
-    def without(t, q):
+    def without(t: Any, q: Any) -> np.ndarray:
         r = rods(q)
         a2, a5 = np.cross(r[1], AXES[1]), np.cross(r[5], AXES[0])
         a3, a4 = np.cross(r[2], a2), np.cross(r[4], a5)
         found = [rod @ rod - 1 for rod in r[1:]]
         return np.array([*found, r[1] @ AXES[1], r[2] @ a2, r[3] @ a3, r[3] @ a4, r[4] @ a5, r[5] @ AXES[0], a3 @ a4])
 
-    M, forces = np.kron(M[2:, 2:], np.eye(3)), -G * np.kron(weights[2:], [0, 1, 0])
+    M, forces = np.kron(whole[2:, 2:], np.eye(3)), -G * np.kron(weights[2:], [0, 1, 0])
     q0 = CORNERS[2:].ravel()
     if axes:
         # The second moments of two rods along each axis.
@@ -246,7 +246,7 @@ def knife_edge(t_end: float = 10.0) -> MechanicsProblem:
 def four_bar_model() -> tuple[Any, dict[Any, float]]:
     """Return a four-bar linkage with particles at the joints' ends as a KanesMethod, and values of its constants."""
     import sympy
-    from sympy.physics import mechanics as me
+    import sympy.physics.mechanics as me
 
     q, u = me.dynamicsymbols("q1:4"), me.dynamicsymbols("u1:4")
     la, lb, lc, ln, m, g = sympy.symbols("la lb lc ln m g")
@@ -281,7 +281,7 @@ def four_bar_model() -> tuple[Any, dict[Any, float]]:
 def four_bar(t_end: float = 30.0) -> MechanicsProblem:
     """Return the four-bar linkage, at rest with its first link at 10 degrees."""
     model, constants = four_bar_model()
-    start = {"q1": np.radians(10), "q2": -0.7, "q3": -3.6}
+    start = {"q1": np.radians(10), "q2": 0.1, "q3": -2.6}
     return mechanics(model, constants, start, [0, 0, 0], t_span=(0.0, t_end), name="four-bar")
 
 
@@ -289,7 +289,7 @@ def four_bar(t_end: float = 30.0) -> MechanicsProblem:
 def _disc_model() -> tuple[Any, dict[Any, float]]:
     """Return a thin disc that rolls on a plane."""
     import sympy
-    from sympy.physics import mechanics as me
+    import sympy.physics.mechanics as me
 
     yaw, lean, spin, x, y, z = q = me.dynamicsymbols("yaw lean spin x y z")
     u = me.dynamicsymbols("u1:7")
@@ -345,11 +345,10 @@ def disc(wobbling: bool, t_end: float = 5.0) -> MechanicsProblem:
 def _rolled(start: np.ndarray, t: float) -> np.ndarray:
     """Return (yaw, lean, spin, x, y, z, rates) from the equations of a thin disc of radius 1 without constraints."""
 
-    def fun(t, s):
-        yaw, lean, _, x, y, u1, u2, u3 = s
+    def fun(t: float, s: np.ndarray) -> list[float]:
+        yaw, lean, _, _, _, u1, u2, u3 = s
         tan = np.tan(lean)
         turning, rolled = u3 / np.cos(lean), u2
-        # The centre: the velocity of the contact point of the disc is 0, L.z = (sin yaw sin lean, -cos yaw sin lean, cos).
         vx, vy, _ = _centre_velocity(yaw, lean, u1, u2)
         return [
             turning, u1, u2 - u3 * tan, vx, vy,
