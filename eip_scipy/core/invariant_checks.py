@@ -30,6 +30,8 @@ INVARIANCE_TOLERANCE = 1e-8
 RATE_TOLERANCE, RATE_TOLERANCE_OF_DIFFERENCES = 1e-11, 1e-9
 # Single precision leaves this share of the terms of a rate.
 SINGLE_TOLERANCE = 1e-5
+# Values below this share of their terms have at most half of the bits of single precision, if their terms have it.
+CANCELLED = 2.0**-12
 # Components smaller than this share of the largest one are not looked at for single precision.
 LEAST_SINGLE = 1e-3
 # A gradient may be rounding and nothing else, as differences find that of a square which is 0: this many roundings of
@@ -177,7 +179,10 @@ def _are_single(values: Array) -> Array:
 
 
 def _single_precision(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
-    single = _are_single(np.concatenate([at.ends.reshape(-1, known.size), at.here[None]]))
+    values = np.concatenate([at.ends.reshape(-1, known.size), at.here[None]])
+    # A constraint that is nearly met is the difference of terms that cancel, of which few bits are left.
+    cancels = np.abs(values).max(axis=0) < CANCELLED * known.sizes_of_terms(at.y, at.G, at.here)
+    single = _are_single(values) & ~cancels
     names = [name for name, found in zip(known.names, single, strict=True) if found]
     if names:
         yield Complaint(
