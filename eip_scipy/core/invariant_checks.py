@@ -181,7 +181,8 @@ def _are_single(values: Array) -> Array:
 def _single_precision(known: InvariantSet, at: _Samples) -> Iterator[Complaint]:
     values = np.concatenate([at.ends.reshape(-1, known.size), at.here[None]])
     # A constraint that is nearly met is the difference of terms that cancel, of which few bits are left.
-    cancels = np.abs(values).max(axis=0) < CANCELLED * known.sizes_of_terms(at.y, at.G, at.here)
+    terms = known.sizes_of_terms(at.y, at.G, at.here) + known.norm_products(at.G, at.y)
+    cancels = np.abs(values).max(axis=0) < CANCELLED * terms
     single = _are_single(values) & ~cancels
     names = [name for name, found in zip(known.names, single, strict=True) if found]
     if names:

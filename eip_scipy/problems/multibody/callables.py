@@ -19,7 +19,7 @@ from .start import Names
 __all__ = ["RANK_TOLERANCE", "mechanism"]
 
 # Gradients of constraints, each scaled to length 1, that are nearer than this to dependent ones lower the rank.
-RANK_TOLERANCE = 1e-4
+RANK_TOLERANCE = 1e-5
 
 
 def mechanism(

@@ -20,6 +20,11 @@ from .start import Names, started
 __all__ = ["MechanicsProblem", "Multipliers", "mechanics_problem"]
 
 
+# Speeds count as at least this share of a typical one where errors of constraints on velocities are compared with their
+# terms, which vanish at rest.
+SLOW = 0.1
+
+
 class Multipliers(NamedTuple):
     """Lagrange's multipliers, by the names of the constraints on velocities.
 
@@ -286,6 +291,6 @@ def _scaled(
     gradient = np.empty((item.size or 0, y.size))
     assert item.grad is not None
     item.grad(t, y, gradient)
-    scale = np.abs(gradient[:, nq:]).sum(axis=1) * speed
+    scale = SLOW * np.abs(gradient[:, nq:]).sum(axis=1) * speed
     item.scale = scale if np.isfinite(scale).all() else None
     return item
