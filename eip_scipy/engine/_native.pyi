@@ -623,6 +623,8 @@ class multibody:
         """
         Fill u' (n,) and the multipliers (m,) of M u' + G^T lambda = F, G u' = -gamma, from M, F, G and gamma one after the other. Returns the rank of G, or MASS_IS_SINGULAR or NOT_FINITE.
         """
-    SOLVE_ADDRESS: int = 140435139197703
+    @staticmethod
+    def solve_address() -> int:
+        """Return the address of `solve` in multibody.cpp, for compiled code."""
     MASS_IS_SINGULAR: int = -1
     NOT_FINITE: int = -2

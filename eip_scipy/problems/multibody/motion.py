@@ -16,7 +16,7 @@ __all__ = ["Motion", "Sizes", "motion", "plain", "vector"]
 
 SOLVE = ctypes.CFUNCTYPE(
     ctypes.c_int64, ctypes.c_void_p, *[ctypes.c_int64] * 2, ctypes.c_double, *[ctypes.c_void_p] * 2
-)(BUILD.multibody.SOLVE_ADDRESS)
+)(BUILD.multibody.solve_address())
 SINGULAR, NOT_FINITE = BUILD.multibody.MASS_IS_SINGULAR, BUILD.multibody.NOT_FINITE
 SINGULAR_MASS = (
     "the mass matrix is singular for motions that the constraints allow: some speeds have no inertia. Give their "

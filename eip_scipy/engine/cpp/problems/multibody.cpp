@@ -271,7 +271,9 @@ void add_multibody(nb::module_ module) {
         "solve", solve_checked, "matrices"_a, "tolerance"_a, "acceleration"_a, "multipliers"_a,
         "Fill u' (n,) and the multipliers (m,) of M u' + G^T lambda = F, G u' = -gamma, from M, F, G and gamma one "
         "after the other. Returns the rank of G, or MASS_IS_SINGULAR or NOT_FINITE.");
-    module.attr("SOLVE_ADDRESS") = reinterpret_cast<uintptr_t>(solve);
+    module.def(
+        "solve_address", [] { return reinterpret_cast<uintptr_t>(solve); },
+        "Return the address of `solve` in multibody.cpp, for compiled code.");
     module.attr("MASS_IS_SINGULAR") = MASS_IS_SINGULAR;
     module.attr("NOT_FINITE") = NOT_FINITE;
 }
