@@ -91,6 +91,11 @@ class MechanicsProblem(Problem):
         values = [] if self.params is None else self.params.tolist()
         return dict(zip(self.parameter_names, values, strict=True))
 
+    @property
+    def stiff_invariants(self) -> tuple[Any, ...]:
+        """The invariants that implicit methods keep by default: all but the energy."""
+        return tuple(item for item in super().stiff_invariants if item is not self.energy)
+
     def multipliers(self, t: Any, y: Any) -> Multipliers:
         """Return Lagrange's multipliers at states of a run.
 
