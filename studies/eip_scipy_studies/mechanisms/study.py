@@ -31,7 +31,7 @@ TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 FACTORS = (1.0, 5.0, 10.0)  # of Baumgarte
 BOTH, CONSTRAINTS, NEITHER = "constraints and energy", "constraints", "DOP853"
 # A run of another method that takes longer than so many calls is not waited for.
-MOST_CALLS = 50_000
+MOST_CALLS = 150_000
 CALLS = 2000  # of a right-hand side that is timed
 
 
