@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 from sympy.physics import mechanics as me
 
-from eip_scipy import EIPDOP853, Balance, Invariant, ProjectionWarning, ensemble, integrate
+from eip_scipy import EIPDOP853, Balance, EIPRadau, Invariant, ProjectionWarning, ensemble, integrate
 from eip_scipy.engine.native import BUILD
 from eip_scipy.problems import mechanics, mechanism
 from eip_scipy_studies.mechanisms import examples
@@ -448,3 +448,15 @@ def test_a_pole_of_dependent_speeds_is_none_of_the_motion():
     problem = mechanics(particle(True), {"m": 1, "g": G}, [0, 0], [0.7, 0])
     found = solve_ivp(lambda t, y: problem.motion_at(t, y), (0, 0.1), problem.y0, rtol=1e-9, atol=1e-9)
     assert found.success
+
+
+def test_implicit_methods_keep_the_constraints_alone():
+    pendulum = mechanism([1, 1], [0, -G], lambda t, q: [q[0] ** 2 + q[1] ** 2 - 1], q0=[1, 0], u0=[0, 0],
+                         potential=lambda t, q: G * q[1])  # fmt: skip
+    options = {"t_span": (0, 1.0), "method": EIPRadau, "rtol": 1e-6, "atol": 1e-6}
+    found = integrate(pendulum, **options)
+    assert len(found.target) == 2
+    assert found.trusted
+    assert np.abs(found.y[0] ** 2 + found.y[1] ** 2 - 1).max() < 1e-14
+    both = integrate(pendulum, invariants=pendulum.invariants, **options)
+    assert len(both.target) == 3
