@@ -428,13 +428,11 @@ def ensemble(
     ((5, 4), True, True)
     """
     options: dict[str, Any] = dict(keywords)
-    _check_options(options)
+    _check_options(options, reduced=out is not None or reduce is not None)
     _check_choices(reduce, callback, progress, max_bytes)
     if invariants is not DEFAULT:
         options["invariants"] = invariants
     out, checkpoint = _places(out, checkpoint, checkpoint_every, resume)
-    if options.get("variations") is not None and (out is not None or reduce is not None):
-        raise ValueError("ensemble: derivatives of the members (variations=) go neither into out= nor into reduce=.")
     own = own_times(fun, t_span, t_eval, save_every, reduce)
     everyone = _inputs(fun, y0s, params, options, own)
     total = len(everyone.y0s)
@@ -664,8 +662,10 @@ def _all_times(plan: Plan, own: OwnTimes) -> np.ndarray:
     return plan.times if own.times is None else own.padded
 
 
-def _check_options(options: dict[str, Any]) -> None:
-    """The options that go on to `integrate`."""
+def _check_options(options: dict[str, Any], *, reduced: bool) -> None:
+    """The options that go on to `integrate`; `reduced`: states go into statistics or a store."""
+    if reduced and options.get("variations") is not None:
+        raise ValueError("ensemble: derivatives of the members (variations=) go neither into out= nor into reduce=.")
     known = {option.name for option in dataclasses.fields(Request)} - ALONE | set(ProjectionOptions.names())
     for name in options:
         if name not in known:
