@@ -99,7 +99,7 @@ def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
 
 @lru_cache(maxsize=64)
 def vector(fill: Callable[..., None], size: int) -> Callable[..., np.ndarray]:
-    """Return a function of (t, y, *params) that returns the array of this size that `fill` fills."""
+    """Return a function of ``(t, y, *params)`` that returns the array of this size that `fill` fills."""
 
     def value(t, y, *params):
         out = np.empty(size)

@@ -36,7 +36,7 @@ class Multipliers(NamedTuple):
         power over that of the constraint's derivative in time.
     rank : int or ndarray of int, shape (k,)
         Rank of the constraints. Where it is below m, forces are distributed over dependent constraints such that the
-        sum of the squares of lambda_i |G_i| is least.
+        sum of the squares of ``lambda_i |G_i|`` is least.
     """
 
     names: tuple[str, ...]

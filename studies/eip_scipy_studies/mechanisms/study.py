@@ -116,10 +116,11 @@ class Mechanisms(Study[Found]):
         return [*_four_bar_checks(found), *_others(found.lines)]
 
     def figures(self, found: Found) -> Figures:
-        from matplotlib.figure import Figure
+        from ..plotting import blank_figure
 
         names = list(dict.fromkeys(line.mechanism for line in found.lines))
-        figure = Figure(figsize=(4 * min(3, len(names)), 3.2 * -(-len(names) // 3)), layout="constrained")
+        width, height = 4 * min(3, len(names)), 3.2 * -(-len(names) // 3)
+        figure = blank_figure(width, height, "Mechanisms: error of the last positions")
         for k, name in enumerate(names):
             axes = figure.add_subplot(-(-len(names) // 3), min(3, len(names)), k + 1)
             for method in dict.fromkeys(line.method for line in found.lines if line.mechanism == name):
