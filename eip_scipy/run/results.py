@@ -86,11 +86,13 @@ class WithColumns(Fields):
             raise AttributeError(ABSENT["sensitivities"])
         return self.variations[..., self.variations.shape[-1] - count :]
 
-    def __getattr__(self, name: str) -> Any:
-        # OptimizeResult's own would take the place of what a property has just raised.
-        if name in ABSENT and name not in self:
-            raise AttributeError(ABSENT[name])
-        return OptimizeResult.__getattr__(self, name)
+    if not TYPE_CHECKING:  # which would take any name for an attribute
+
+        def __getattr__(self, name: str) -> Any:
+            # OptimizeResult's own would take the place of what a property has just raised.
+            if name in ABSENT and name not in self:
+                raise AttributeError(ABSENT[name])
+            return OptimizeResult.__getattr__(self, name)
 
 
 class IntegrationResult(WithColumns):
