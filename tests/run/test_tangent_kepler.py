@@ -200,5 +200,7 @@ def test_what_cannot_carry_them():
         integrate(kepler, (0, 10), START, method=eip_method(Euler()), **options)
     with pytest.raises(ValueError, match="no derivatives by parameters"):
         integrate(lambda t, y, p: kepler(t, y), (0, 1), START, method=EIPRKN8, h=0.05, params=[1.0], variations=[0])
-    with pytest.raises(TypeError, match="takes no variations"):
+    with pytest.raises(ValueError, match="EIPRadau carries no derivatives"):
         solve_ivp(kepler, (0, 1), START, "Radau", variations="state")
+    with pytest.raises(TypeError, match="takes no variations"):
+        solve_ivp(kepler, (0, 1), START, "LSODA", variations="state")

@@ -172,7 +172,7 @@ def _compiled(what: str, body: list[ast.stmt], arguments: Arguments, in_place: b
 
 
 def _statements(
-    what: str, expressions: Sequence[Any], arguments: Arguments, in_place: bool, places: Sequence[Any] | None
+    what: str, expressions: Sequence[Any], arguments: Arguments, in_place: bool, places: Sequence[Any] | None = None
 ) -> list[ast.stmt]:
     writer = Writer(what, arguments)
     values = writer.values(expressions)
