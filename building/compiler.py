@@ -52,7 +52,7 @@ class Compiler(NamedTuple):
         if self.own:
             return {}
         common = ["-DNDEBUG", "-fwrapv", *(() if sys.platform == "win32" else ("-fPIC",))]
-        shared = ["-bundle", "-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-shared"]
+        shared = ["-bundle", "-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-shared", "-Wl,-s"]
         compiling = [*self.command, *common, *shlex.split(os.environ.get("CXXFLAGS", ""))]
         linking = [*self.command, *shared, *shlex.split(os.environ.get("LDFLAGS", ""))]
         return {
