@@ -164,7 +164,7 @@ SYSTEMS = {
     ),
 }
 SOURCES = ("SymPy", "dual numbers", "jvp", "jitted jvp", "complex step")
-SOME = ("pendulum", "forced Duffing")  # the others take minutes to compile
+SOME = ("forced Duffing",)  # the others take minutes to compile
 
 
 def marks(name, source):
@@ -410,6 +410,7 @@ def as_problem(m, y0, **options):
     return nbody(m, y0[:9].reshape(3, 3), y0[9:].reshape(3, 3), t_span=(0, 1), **options)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(("a", "e"), [(1.8, 0.02), (1.45, 0.05), (1.7, 0.1)])
 def test_a_few_points_of_a_map_are_those_of_rebound(a, e):
@@ -423,7 +424,7 @@ def test_a_few_points_of_a_map_are_those_of_rebound(a, e):
     assert run.megno == pytest.approx(theirs, abs=0.02)
 
 
-@pytest.mark.parametrize("force", [pytest.param("gr-potential", marks=pytest.mark.slow), "1pn"])
+@pytest.mark.parametrize("force", [pytest.param("gr-potential", marks=[pytest.mark.nightly, pytest.mark.slow]), "1pn"])
 def test_growth_with_relativity_is_that_of_the_distance_of_orbits(force):
     """A force that REBOUND's variational particles do not know."""
     (m, y0), t_end, eps = two_planets(1.8, 0.02), 40 * PERIOD, 1e-6
