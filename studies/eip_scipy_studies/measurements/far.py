@@ -13,12 +13,13 @@ import numpy as np
 
 from eip_scipy import EIPDOP853, EIPGJ14, integrate
 from eip_scipy.problems import solar_system
-from eip_scipy.problems.gravity.solar_data import YEAR_D, reference_states
+from eip_scipy.problems.gravity.solar_data import reference_states
 
 from ..report import needed, table
 from ..solar.runs import orbits_kept
 from ..study import Measurement, Session, option
 from .growth import distances
+from .orbits import rebound_states
 
 __all__ = ["Far"]
 
@@ -57,7 +58,7 @@ class Far(Measurement[Found]):
     ias15: bool = option(False, "IAS15 too, which takes minutes")
 
     def measure(self, session: Session) -> Found:
-        rebound = needed("eip_scipy.integrations.rebound")
+        needed("eip_scipy.integrations.rebound")  # before runs that take minutes
         times = np.array([t for t in DECADES if t < self.years] + [self.years])
         problem, own = solar_system(years=self.years), ways()
         peers = {"WHFast (c17), 1 d": "whfast-c17"} | ({"IAS15": "ias15"} if self.ias15 else {})
@@ -68,12 +69,7 @@ class Far(Measurement[Found]):
                 seconds[name], states[name] = run.wall_time, run.y
                 bar.update()
             for name, integrator in peers.items():
-                counts = [1 if integrator == "ias15" else round(t * YEAR_D) for t in times]
-                runs = [
-                    rebound.run(problem.params, problem.y0, integrator, h=t / n, n_steps=n)
-                    for t, n in zip(times, counts, strict=True)
-                ]
-                seconds[name], states[name] = runs[-1].wall_time, np.array([run.y[:, -1] for run in runs]).T
+                seconds[name], states[name] = rebound_states(problem, integrator, times)
                 bar.update()
         references, finest = reference_states(), states.pop(FINEST)
         known = {

@@ -17,12 +17,12 @@ import numpy as np
 
 from eip_scipy import EIPGJ14, EIPRKN12, integrate
 from eip_scipy.problems import Problem, solar_system
-from eip_scipy.problems.gravity.solar_data import YEAR_D, load, reference_states
+from eip_scipy.problems.gravity.solar_data import load, reference_states
 
 from ..report import needed, table
 from ..solar.runs import orbits_kept
 from ..study import Figures, Measurement, Rows, Session, option
-from .orbits import ORDERS, reordered
+from .orbits import ORDERS, rebound_states, reordered
 
 __all__ = ["Growth"]
 
@@ -91,7 +91,7 @@ class Growth(Measurement[Found]):
     years: float = option(10_000.0, "length of the runs (%(default)s)", type=float)
 
     def measure(self, session: Session) -> Found:
-        rebound = needed("eip_scipy.integrations.rebound")
+        needed("eip_scipy.integrations.rebound")  # before runs that take minutes
         known = {t: y for t, y in reference_states().items() if t <= self.years}
         times, truth = np.array(list(known)), np.array(list(known.values())).T
         problem = solar_system(years=times[-1])
@@ -103,13 +103,7 @@ class Growth(Measurement[Found]):
                 seconds[name], states[name] = result.wall_time, result.y
                 bar.update()
             for name, integrator in (("WHFast (c17), 1 d", "whfast-c17"), ("IAS15", "ias15")):
-                # From the start to each time: a saved time would cut a step of IAS15.
-                counts = [1 if integrator == "ias15" else round(t * YEAR_D) for t in times]
-                runs = [
-                    rebound.run(problem.params, problem.y0, integrator, h=t / n, n_steps=n)
-                    for t, n in zip(times, counts, strict=True)
-                ]
-                seconds[name], states[name] = runs[-1].wall_time, np.array([run.y[:, -1] for run in runs]).T
+                seconds[name], states[name] = rebound_states(problem, integrator, times)
                 bar.update()
             orders = {}
             for steps in ORDER_STEPS:

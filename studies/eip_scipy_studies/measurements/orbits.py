@@ -15,7 +15,19 @@ from ..report import needed, table
 from ..solar.cost import TimedRun, by_peer
 from ..work_precision import Runner
 
-__all__ = ["ORDERS", "Methods", "Row", "by_rebound", "daily", "one_each", "orbit_table", "reordered", "rows", "yearly"]
+__all__ = [
+    "ORDERS",
+    "Methods",
+    "Row",
+    "by_rebound",
+    "daily",
+    "one_each",
+    "orbit_table",
+    "rebound_states",
+    "reordered",
+    "rows",
+    "yearly",
+]
 
 ORDERS = tuple(permutations(range(3)))
 """All orders of the coordinate axes. They change the rounding of steps, but, unlike rotations, no bit of a state."""
@@ -26,6 +38,18 @@ Row = dict[str, float]
 def by_rebound(problem: Problem, integrator: str, **options: Any) -> Runner:
     """Make a run by an integrator of REBOUND, which must be installed; see `by_peer`."""
     return by_peer(problem, needed("eip_scipy.integrations.rebound").run, integrator, **options)
+
+
+def rebound_states(problem: Problem, integrator: str, times: np.ndarray) -> tuple[float, np.ndarray]:
+    """Run an integrator of REBOUND, WHFast with steps of a day, from the start to each time.
+
+    A time that is saved on the way would cut a step of IAS15. Returns the seconds of the last run, and the states
+    (6 N, m).
+    """
+    run = needed("eip_scipy.integrations.rebound").run
+    counts = [1 if integrator == "ias15" else round(t * YEAR_D) for t in times]
+    runs = [run(problem.params, problem.y0, integrator, h=t / n, n_steps=n) for t, n in zip(times, counts, strict=True)]
+    return runs[-1].wall_time, np.array([own.y[:, -1] for own in runs]).T
 
 
 def reordered(states: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
