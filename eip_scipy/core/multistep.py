@@ -16,7 +16,7 @@ from .stepping import Stepping
 __all__ = ["SecondOrder", "attach_history", "times"]
 
 Array = np.ndarray
-AUTO_SPACING, OF_PARTS = 64, 32  # the second one for balances that are projected by themselves
+AUTO_SPACING, OF_GROUPS = 64, 32  # the second one for balances that are projected by themselves
 # Steps of DOP853, which starts where accelerations depend on velocities, in one step.
 SUBSTEPS = 4
 ROWS = 4  # of the history's window, in orders of the method
@@ -156,7 +156,7 @@ def _largest(product: Callable[[Array], Array], y: Array) -> float:
     return found
 
 
-def _has_parts(run: Run) -> bool:
+def _has_groups(run: Run) -> bool:
     return run.options.balance_groups.value.size > 0
 
 
@@ -176,7 +176,7 @@ def _record(
         t0=stepping.span.t0,
         h=stepping.span.h,
         substeps=SUBSTEPS if method.velocities else 1,
-        spacing=run.options.every if run.options.every != AUTO else OF_PARTS if _has_parts(run) else AUTO_SPACING,
+        spacing=run.options.every if run.options.every != AUTO else OF_GROUPS if _has_groups(run) else AUTO_SPACING,
         corrected_first=corrected.start,
         corrected_count=corrected.stop - corrected.start,
         nodes=_aligned((ROWS * order, pitch)),

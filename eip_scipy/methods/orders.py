@@ -25,7 +25,7 @@ class Ordered:
     has_history: ClassVar[bool] = False
     # Whether the steps are made by a user's Python function, without calls of the right-hand side.
     in_python: ClassVar[bool] = False
-    # Whether a solver of SciPy makes the steps, and controls their error and their length.
+    # True if a solver of SciPy makes the steps, and controls their error and their length.
     drives: ClassVar[bool] = False
 
     @property

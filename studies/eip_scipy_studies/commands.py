@@ -75,7 +75,7 @@ COMMANDS = {
         "measurements.long_orbits:LongOrbits", "what projection and compensation bring over 1000 years"
     ),
     "study mechanisms": Entry(
-        "mechanisms.study:Mechanisms", "mechanisms with constraints and energy kept, beside other ways to run them"
+        "mechanisms.study:Mechanisms", "mechanisms with constraints and energy kept, compared with other ways"
     ),
     "study metric-memory": Entry(
         "measurements.metric_memory:MetricMemory", "the metric on problems whose error estimates mislead it"

@@ -1,4 +1,4 @@
-"""Whether a mechanical system keeps an energy, examined at states that meet its constraints."""
+"""The search for an energy that a mechanical system keeps, at states that meet its constraints."""
 
 from __future__ import annotations
 

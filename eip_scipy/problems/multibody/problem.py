@@ -45,7 +45,7 @@ class Multipliers(NamedTuple):
 
     @property
     def unique(self) -> Any:
-        """Whether the multipliers are the only solution."""
+        """True where the multipliers are the only solution."""
         return self.rank == len(self.names)
 
 

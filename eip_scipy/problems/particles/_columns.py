@@ -171,7 +171,7 @@ def _by_duals(fun: Callable[..., Any], ndim: int) -> Callable[..., Any]:
     dual = Dual(3)
     call = for_duals(fun, dual)
     of_number = inside(lambda value: (slope(value, 0), slope(value, 1), slope(value, 2)))
-    # By constant places, since a tuple may hold duals and plain numbers.
+    # The places are constants, since a tuple may hold duals and plain numbers.
     of_vector = inside(lambda values: (of_number(values[0]), of_number(values[1]), of_number(values[2])))
     of_rows = inside(lambda rows: (of_vector(rows[0]), of_vector(rows[1]), of_vector(rows[2])))
     parts = of_vector if ndim == 1 else of_rows

@@ -19,12 +19,12 @@ from .parser import symbol
 __all__ = ["Model", "name_of", "read"]
 
 TIME = dynamicsymbols._t
-# Rows of constraints depend on others if what is left of them is below this share, at each of so many points.
+# A row of constraints depends on the others if its remainder is below this share at each of this number of points.
 DEPENDENT, POINTS = 1e-9, 3
 
 
 class Model(NamedTuple):
-    """What is known of a model.
+    """The equations of a model, and its known properties.
 
     Attributes
     ----------

@@ -127,7 +127,7 @@ def traced(what: str, fun: Any, *groups: Any) -> np.ndarray:
     Raises
     ------
     NotTraceableError
-        For a function whose value is no expression of its arguments.
+        For a function whose value cannot be written as an expression of its arguments.
     """
     arguments = [
         Number(symbol(names)) if isinstance(names, str) else _array([Number(symbol(name)) for name in names])

@@ -15,7 +15,7 @@ from .traced import NotTraceableError, traced
 
 __all__ = ["traced_parts"]
 
-# A traced function has the value of the function itself at the start, but for rounding.
+# At the start a traced function agrees with the function itself up to rounding errors; this bound is relative.
 AGREES = 1e-9
 
 

@@ -62,7 +62,7 @@ def eccentric(years: float, **options: Any) -> System:
     far = math.sqrt(sun * (1 + masses[1]) / 6 * 1.05 / 0.95)
     q = np.array([[0, 0, 0], [1 - e, 0, 0], [0, 6 * 0.95, 0]])
     v = np.array([[0, 0, 0], [0, speed * math.cos(0.1), speed * math.sin(0.1)], [-far, 0, 0]])
-    # In planes through no axis: components of h that are 0 would change fast beside their size.
+    # The planes contain no axis: components of h that are 0 would change fast relative to their size.
     q, v = (TILTED.apply(values - gm @ values / gm.sum()) for values in (q, v))
     problem = partial(nbody, gm, q, v, t_span=(0.0, years))
     fine = integrate(problem(), method=EIPDOP853, h=options["h"] / 20, invariants=(), compensated=True)
@@ -89,7 +89,7 @@ class Cost(NamedTuple):
 class OrbitBalances(Measurement[dict[str, dict[str, Cost]]]):
     """The command."""
 
-    quick: bool = option(False, "a tenth of the spans, to see that it runs")
+    quick: bool = option(False, "0.1 of the spans, to see that it runs")
 
     def measure(self, session: Session) -> dict[str, dict[str, Cost]]:
         found = {}

@@ -1,4 +1,4 @@
-"""``eip-scipy study mechanisms``: mechanisms with constraints and energy kept, beside other ways to run them.
+"""``eip-scipy study mechanisms``: mechanisms with constraints and energy kept, compared with other ways to run them.
 
 Each mechanism runs by DOP853 without projection, with its constraints kept, and with its energy as well; by SciPy's
 LSODA and Radau; the four-bar linkage also with Baumgarte's terms, -2 alpha g' - alpha^2 g in the accelerations'
@@ -30,7 +30,7 @@ __all__ = ["Mechanisms"]
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 FACTORS = (1.0, 5.0, 10.0)  # of Baumgarte
 BOTH, CONSTRAINTS, NEITHER = "constraints and energy", "constraints", "DOP853"
-# A run of another method that takes longer than so many calls is not waited for.
+# A run of another method ends with an error after this number of calls.
 MOST_CALLS = 150_000
 CALLS = 2000  # of a right-hand side that is timed
 

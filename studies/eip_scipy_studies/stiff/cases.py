@@ -55,7 +55,7 @@ class Case:
 
     @cached_property
     def reference(self) -> Array:
-        """What the last state is compared with."""
+        """The state with which the last one of a run is compared."""
         if self.truth is not None:
             return np.asarray(self.truth())
         atol = 1e-2 * TIGHT * self.size

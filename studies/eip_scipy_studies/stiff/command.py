@@ -1,4 +1,4 @@
-"""``eip-scipy study stiff``: SciPy's Radau and BDF beside `EIPRadau` and `EIPBDF`.
+"""``eip-scipy study stiff``: SciPy's Radau and BDF compared with `EIPRadau` and `EIPBDF`.
 
 1. A plane chain of three links with rotational dampers of 1e4 N m s between them, 20 s, from five starts at rest, with
    its constraints; absolute and relative tolerance alike.
@@ -30,7 +30,7 @@ __all__ = ["Stiff"]
 METHODS = {"Radau": EIPRadau, "BDF": EIPBDF}
 STARTS = ((1.2, 0.9, 0.5), (0.8, 0.3, 1.0), (1.5, 1.4, 1.0), (-0.7, 0.4, 0.9), (2.0, 1.6, 1.9))
 COUNTEREXAMPLE = "satellite"
-# What is required: of a mean error, of mean calls, by method; of the governor's error; of the ten problems.
+# The bounds: on a mean error and on mean calls, by method; on the governor's error; on the ten problems.
 CHAIN = {"Radau": (1 / 5, 1.25), "BDF": (1 / 3, 1.4)}
 GOVERNOR, WORST = 1 / 30, 2.0
 
