@@ -1,7 +1,7 @@
-"""Checkpoint files: a JSON header and arrays in one npz archive, which is written whole or not at all.
+"""Checkpoint files: a JSON header and arrays in one npz archive, which is written completely or not at all.
 
-`numpy.load` opens such a file too: ``header.json``, then each array as ``NAME.npy``, uncompressed. The archive has a
-checksum (CRC-32) of each member, which reading compares. Nothing is pickled.
+`numpy.load` can open such a file: it contains ``header.json`` and each array as ``NAME.npy``, uncompressed. The archive
+has a checksum (CRC-32) of each member, which is compared on reading. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -35,29 +35,30 @@ LEFT_OVER = 3600.0
 
 
 class CheckpointError(Exception):
-    """A checkpoint cannot be written, is damaged, is none, or belongs to another run; the message says what to do."""
+    """Error of a checkpoint that cannot be written, is damaged, or belongs to another run."""
 
 
 def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a checkpoint; a file at `path` is replaced in one step, or stays as it was.
+    """Write a checkpoint; an existing file at `path` is replaced in one step, or stays unchanged.
 
-    The bytes go to a temporary file in the same folder, are brought to the disk, and take the place of `path` then. A
-    process that is killed meanwhile leaves the former checkpoint, and a file ``.NAME-*.tmp`` that the first `write`
-    an hour later removes.
+    The bytes are written to a temporary file in the same folder, flushed to the disk, and then replace `path`. If the
+    process is killed meanwhile, the previous checkpoint remains, and a file ``.NAME-*.tmp`` that the first `write` an
+    hour later removes.
 
     Parameters
     ----------
     path : path-like
+        File to write.
     header : mapping
-        What JSON holds, without NaN and infinity; ``kind`` says whose checkpoint it is. Format, schema, names of
-        the arrays, versions and machine are added.
+        Values that JSON can hold, without NaN and infinity; ``kind`` names the kind of checkpoint. Format, schema,
+        names of the arrays, versions and machine are added.
     arrays : mapping of str to ndarray
-        Numbers, real or complex.
+        Real or complex numbers.
 
     Raises
     ------
     CheckpointError
-        When the file cannot be written, for instance because the disk is full.
+        If the file cannot be written, for instance because the disk is full.
 
     Examples
     --------
@@ -88,23 +89,26 @@ def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mappi
 
 
 def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read a checkpoint that `write` has written.
+    """Read a checkpoint written by `write`.
 
     Parameters
     ----------
     path : path-like
+        File to read.
     kind : str, optional
-        The ``kind`` that its header must have.
+        The ``kind`` that the header must have.
 
     Returns
     -------
     header : dict
+        The values of the header.
     arrays : dict of str to ndarray
+        The arrays.
 
     Raises
     ------
     CheckpointError
-        For a file that cannot be read, is no checkpoint, is damaged or truncated, or has another schema or kind.
+        If the file cannot be read, is not a checkpoint, is damaged or truncated, or has another schema or kind.
     """
     try:
         with open(path, "rb") as stream:
@@ -115,8 +119,8 @@ def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[st
         raise
     except Exception as error:  # zipfile, json and numpy raise errors of many kinds for bytes not made by `write`
         raise CheckpointError(
-            f"{_name(path)} is damaged, or not a checkpoint of eip_scipy: {error}. Go back to a copy of it, or name "
-            "another file to start anew."
+            f"{_name(path)} is damaged, or not a checkpoint of eip_scipy: {error}. Restore a copy of it, or use "
+            "another file for a new run."
         ) from error
     if kind is not None and header.get("kind") != kind:
         raise CheckpointError(f"{_name(path)} is a checkpoint of {header.get('kind')!r}, expected {kind!r}.")
@@ -124,20 +128,20 @@ def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[st
 
 
 def existing(name: str, what: str) -> CheckpointError:
-    """Return the error for a place that holds something and is not to be resumed."""
+    """Return the error for an existing place without ``resume=True``."""
     return CheckpointError(
-        f"{name!r} exists. resume=True goes on with the {what} that it holds; to start anew, name another place or "
-        "delete this one."
+        f"{name!r} exists. Pass resume=True to continue the {what} that it holds; for a new {what}, use another "
+        "place or delete this one."
     )
 
 
 def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, Any]) -> None:
-    """Compare the settings in a header with those of the run that wants to resume.
+    """Compare the settings in a header with those of the run that is to be resumed.
 
     Raises
     ------
     CheckpointError
-        Naming each setting that differs, with both values where they are short.
+        If settings differ; the message names each of them, with both values if they are short.
     """
     here = json.loads(json.dumps(here))
     there = there if isinstance(there, dict) else {}
@@ -146,13 +150,13 @@ def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, An
         return
     what = "; ".join(_difference(name, there.get(name), here.get(name)) for name in names)
     raise CheckpointError(
-        f"the checkpoint {_name(path)} belongs to another run: {what}. Resume with the arguments of that run, or name "
-        "another file to start anew."
+        f"the checkpoint {_name(path)} belongs to another run: {what}. Resume with the arguments of that run, or use "
+        "another file for a new run."
     )
 
 
 def warn_of_other_versions(path: str | os.PathLike[str], header: Mapping[str, Any], *, stacklevel: int) -> None:
-    """Warn where a checkpoint comes from other versions or another kind of machine: the last bits may differ then."""
+    """Warn if a checkpoint was written by other versions or on another kind of machine: the last bits may differ."""
     there = {**(header.get("versions") or {}), "machine": header.get("machine")}
     here = {**_versions(), "machine": _machine()}
     other = [
@@ -163,7 +167,7 @@ def warn_of_other_versions(path: str | os.PathLike[str], header: Mapping[str, An
     if other:
         warnings.warn(
             f"the checkpoint {_name(path)} was written with {'; '.join(other)}: the last bits may differ from those of "
-            "a run that was not interrupted.",
+            "an uninterrupted run.",
             UserWarning,
             stacklevel=stacklevel + 1,
         )
@@ -181,7 +185,7 @@ def _name(path: str | os.PathLike[str]) -> str:
 
 
 def reason(error: OSError) -> str:
-    """Return what the operating system says."""
+    """Return the message of the operating system."""
     return (error.strerror or str(error)).lower()
 
 
@@ -196,8 +200,8 @@ def _machine() -> str:
 
 
 def origin() -> dict[str, Any]:
-    """Return versions and machine, as the header of every checkpoint has them."""
-    # Numba's only if it is loaded: otherwise no function of the run is compiled by it.
+    """Return versions and machine for the header of a checkpoint."""
+    # The version of Numba only if it is loaded: otherwise it has compiled no function of the run.
     decide = {name: version for name, version in _versions().items() if name != "numba" or name in sys.modules}
     return {"versions": decide, "machine": _machine()}
 
@@ -205,26 +209,28 @@ def origin() -> dict[str, Any]:
 def _fill(stream: BinaryIO, text: bytes, arrays: Mapping[str, np.ndarray]) -> None:
     """Write header and arrays."""
     with zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr(zipfile.ZipInfo(HEADER), text)  # whose date is the same at any time
+        archive.writestr(
+            zipfile.ZipInfo(HEADER), text
+        )  # ZipInfo has a fixed date, so that equal contents give equal files
         for name, value in arrays.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                 npy.write_array(member, np.asarray(value, order="C"), version=(1, 0), allow_pickle=False)
 
 
 def _remove_leftovers(target: Path) -> None:
-    """Remove the temporary files of processes that were killed: those that nobody has written to for an hour."""
+    """Remove the temporary files of killed processes: those that have not been written to for an hour."""
     for leftover in target.parent.glob(f".{glob.escape(target.name)}-*.tmp"):
-        with contextlib.suppress(OSError):  # another process may be as tidy; the checkpoint is written in any case
+        with contextlib.suppress(OSError):  # another process may have removed it; the checkpoint is already written
             if time.time() - leftover.stat().st_mtime > LEFT_OVER:
                 leftover.unlink()
 
 
 def _parse(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return header and arrays; the sizes that members declare are compared with the file's before memory is taken."""
+    """Return header and arrays; the declared sizes are compared with that of the file before memory is allocated."""
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
         if any(m.compress_type != zipfile.ZIP_STORED or m.file_size != m.compress_size for m in members):
-            raise ValueError("it holds compressed members")
+            raise ValueError("it contains compressed members")
         if sum(m.file_size for m in members) > stream.seek(0, os.SEEK_END):
             raise ValueError("its members claim more bytes than it has")
         names = [m.filename for m in members]
@@ -232,7 +238,7 @@ def _parse(path: str | os.PathLike[str], stream: BinaryIO) -> tuple[dict[str, An
             raise ValueError(f"its members are {names[:10]}")
         header = json.loads(archive.read(HEADER))
         if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise ValueError("its header is another")
+            raise ValueError("its header has another format")
         if header.get("schema") != SCHEMA:
             raise CheckpointError(
                 f"{_name(path)} has schema {header.get('schema')!r}, expected {SCHEMA}; "
@@ -253,6 +259,6 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         n_bytes = math.prod(shape) * dtype.itemsize
         if n_bytes != member.file_size - stream.tell():
             raise ValueError(f"{member.filename} declares {n_bytes} bytes and has {member.file_size - stream.tell()}")
-    with archive.open(member) as stream:  # anew: after a step back zipfile compares no checksum
+    with archive.open(member) as stream:  # opened again, because zipfile compares no checksum after seeking back
         found: np.ndarray = npy.read_array(stream, allow_pickle=False)
         return found

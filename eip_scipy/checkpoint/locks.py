@@ -1,4 +1,4 @@
-"""A lock on a place that one run at a time writes to, which ends with the process that holds it."""
+"""A lock on a place that only one run at a time may write to; it ends with the process that holds it."""
 
 from __future__ import annotations
 
@@ -22,28 +22,29 @@ NO_RIGHT = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 class Lock:
-    """Exclusive right to write to a file or folder, from its making to `close` or to the end of this process.
+    """Exclusive right to write to a file or folder, until `close` or the end of the process.
 
-    The lock is on a file of its own next to the place, because a checkpoint is replaced by another file at each
-    writing. That file says who holds it, and `close` removes it. Processes that are started or forked do not inherit
-    the lock. A file system without locks is a RuntimeWarning; without the right to write there is nothing to lock.
+    The lock is held on a separate file next to the place, because a checkpoint is replaced by another file each time it
+    is written. The lock file names its holder, and `close` removes it. Processes that are started or forked do not
+    inherit the lock. A file system without locks causes a RuntimeWarning; without permission to write nothing is
+    locked.
 
     Parameters
     ----------
     place : path-like
-        It need not exist.
+        Place to lock; it need not exist.
 
     Attributes
     ----------
     name : str
-        Its absolute path, whatever becomes of the working directory.
+        Absolute path of the place.
     path : Path
-        The same, with links resolved.
+        Absolute path with links resolved.
 
     Raises
     ------
     CheckpointError
-        At once if another run holds the lock, in this process or another; or if the file for it cannot be made.
+        If another run holds the lock, in this process or another, or if the lock file cannot be created.
     """
 
     def __init__(self, place: str | os.PathLike[str]) -> None:
@@ -54,19 +55,19 @@ class Lock:
             self._file, blocking=False, thread_local=False, fallback_to_soft=False, on_acquired=_write_holder
         )
         try:
-            os.stat(self.path.parent)  # which filelock would make
+            os.stat(self.path.parent)  # filelock would create a missing folder
             self._lock.acquire()
         except Timeout:
             raise CheckpointError(
-                f"{self.name!r} is in use by another run, of {_holder(self._file)}. Wait for its end, or end it, or "
-                "name another place."
+                f"{self.name!r} is in use by another run, of {_holder(self._file)}. Wait until it ends, stop it, "
+                "or use another place."
             ) from None
         except OSError as error:
             if error.errno in NO_LOCKS:
                 self._file.unlink(missing_ok=True)
                 warnings.warn(
-                    f"{self.name!r} could not be locked ({reason(error)}): see to it yourself that no other run "
-                    "writes there at the same time.",
+                    f"{self.name!r} could not be locked ({reason(error)}). Make sure that no other run writes there at "
+                    "the same time.",
                     RuntimeWarning,
                     stacklevel=users_level(),
                 )
@@ -74,27 +75,21 @@ class Lock:
                 raise CheckpointError(f"cannot write {self.name!r}: {reason(error)}") from error
 
     def close(self) -> None:
-        """Let others in; a second call does nothing."""
+        """Release the lock; a second call does nothing."""
         if self._lock.is_locked:
-            if sys.platform != "win32":  # where filelock removes the file
-                with contextlib.suppress(OSError):  # in a folder that is gone, or can no longer be written to
+            if sys.platform != "win32":  # filelock removes the file on Windows
+                with contextlib.suppress(OSError):  # the folder may be gone, or no longer writable
                     self._file.unlink()  # before others can lock it
             self._lock.release()
 
 
 def absolute(path: str | os.PathLike[str]) -> str:
-    """Return the absolute path that `path` leads to now.
-
-    Raises
-    ------
-    CheckpointError
-        When the working directory is gone.
-    """
+    """Return the absolute path; raise CheckpointError if the working directory no longer exists."""
     try:
         return os.path.abspath(os.fsdecode(path))
     except FileNotFoundError as error:
         raise CheckpointError(
-            f"{os.fspath(path)!r} is relative to a folder that is gone; give a whole path."
+            f"{os.fspath(path)!r} is relative to a folder that no longer exists; give an absolute path."
         ) from error
 
 
@@ -109,9 +104,9 @@ def _write_holder(descriptor: int) -> None:
 
 
 def _holder(file: Path) -> str:
-    """Return the process that holds the lock, as it has written it down."""
+    """Return the name of the process that holds the lock, from the lock file."""
     try:
         found = file.read_text(errors="replace")
-    except OSError:  # Windows lets nobody read it, and the holder may just have removed it
+    except OSError:  # Windows does not allow reading it, and the holder may just have removed it
         found = ""
     return f"{found}, this one" if found == _myself() else found or "another process"

@@ -1,4 +1,4 @@
-"""What a run's functions take besides time and state: `args` as SciPy hands them on, or one array, `params`."""
+"""Further arguments of the functions of a run: `args` as in SciPy, or one array, `params`."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from .inputs import is_number, real_array, refuse_units, shown
 
 __all__ = ["Packed", "are_same", "extra_arguments", "floats", "names", "parameter_values", "scalars"]
 
-EXACT = 2**53  # an integer up to here is a float as well
+EXACT = 2**53  # integers up to this one are exact as floats
 
 
 class Packed(NamedTuple):
-    """What native functions read: `values` as one array, or, for jitted ones, number by number.
+    """Further arguments of native functions: `values` as one array, or as separate numbers for jitted functions.
 
-    `scalars`: the type of each number, "d" for a float, "q" for an integer, "?" for a bool; "": they take the array.
+    `scalars` contains the type of each number: "d" for a float, "q" for an integer, "?" for a bool. It is "" if the
+    functions take the array.
     """
 
     values: np.ndarray
@@ -25,17 +26,17 @@ class Packed(NamedTuple):
 
 
 def extra_arguments(args: Any, params: Any) -> tuple[Any, ...]:
-    """The last arguments of a run's functions: `args`, or ``(params,)``, or none.
+    """Return the last arguments of the functions of a run: `args`, or ``(params,)``, or none.
 
     Raises
     ------
     TypeError
-        For both, for `args` that cannot be unpacked, and for `params` that are no floats.
+        If both are given, if `args` cannot be unpacked, or if `params` are not numbers.
     """
     if args is None:
         return () if params is None else (parameter_values(params).reshape(-1),)
     if params is not None:
-        raise TypeError("give args or params, not both: either is what the functions take as their last arguments.")
+        raise TypeError("give args or params, not both: each of them defines the last arguments of the functions.")
     try:
         found = tuple(args)
     except TypeError:
@@ -45,30 +46,24 @@ def extra_arguments(args: Any, params: Any) -> tuple[Any, ...]:
 
 
 def are_same(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
-    """Return whether two tuples hold the same arguments, or equal numbers."""
+    """Return True if two tuples contain the same arguments, or equal numbers."""
     pairs = zip(one, other, strict=False)
     return len(one) == len(other) and all(a is b or np.array_equal(a, b) for a, b in pairs)
 
 
 def parameter_values(params: Any) -> np.ndarray:
-    """`params` as an array of floats.
-
-    Raises
-    ------
-    TypeError
-        For what holds no numbers, names among it.
-    """
+    """Return `params` as an array of floats; raise TypeError if they are not numbers, for instance a mapping."""
     if isinstance(params, Mapping):
         raise TypeError(
-            f"params must be an array of numbers, got {shown(params)}: give the values in the order in which fun reads "
-            "them, params=[1.0, 2.0], or the mapping itself by args=(mapping,), with which Python calls fun. Problems "
-            "made by hamiltonian or equations take names."
+            f"params must be an array of numbers, got {shown(params)}. Give the values in the order in which fun reads "
+            "them, params=[1.0, 2.0], or pass the mapping as args=(mapping,); fun is then called from Python. Problems "
+            "made by hamiltonian or equations accept names."
         )
     return real_array("params", params, TypeError)
 
 
 def scalars(extra: tuple[Any, ...]) -> str | None:
-    """The types of the numbers in `extra`, see `Packed`; "" for one array, None: not for native functions."""
+    """Return the types of the numbers in `extra`, see `Packed`; "" for one array, None if only Python can pass them."""
     if _is_array(extra):
         return ""
     types = [_type(item) for item in extra]
@@ -76,19 +71,19 @@ def scalars(extra: tuple[Any, ...]) -> str | None:
 
 
 def floats(extra: tuple[Any, ...]) -> np.ndarray:
-    """The array that native functions read: numbers as floats; empty where they take none of what there is."""
+    """Return the array of floats for native functions; empty if `extra` contains anything else."""
     if _is_array(extra):
         return np.asarray(extra[0])
     return np.array(extra if scalars(extra) else (), float)
 
 
 def names(extra: tuple[Any, ...]) -> tuple[str, ...]:
-    """Of the further arguments, in messages."""
+    """Return the names of the further arguments for messages."""
     return ("params",) if _is_array(extra) else tuple(f"args[{k}]" for k in range(len(extra)))
 
 
 def _is_array(extra: tuple[Any, ...]) -> bool:
-    """Whether they are one array of floats."""
+    """Return True if the further arguments are one array of floats."""
     return len(extra) == 1 and type(extra[0]) is np.ndarray and extra[0].ndim == 1 and extra[0].dtype == float
 
 

@@ -1,4 +1,4 @@
-"""Blocks: components that the error metric weighs together."""
+"""Blocks: groups of components with a common weight in the error metric."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from .inputs import refuse_units, shown
 
 __all__ = ["INDEX", "blocks_of", "kinds_of"]
 
-# Unsigned: Numba then leaves out the test for negative indices, which costs more than the access itself.
+# Unsigned integers: Numba then omits the test for negative indices, which costs more than the access itself.
 INDEX = np.uint64
 
 
 def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
-    """The option ``blocks`` as groups of floats, `width` of them for each of n components.
+    """Return the option ``blocks`` as groups of floats, `width` of them for each of n components.
 
     Raises
     ------
     TypeError
-        For values with a unit.
+        If a value has a unit.
     ValueError
-        For blocks that do not divide the state, or are no lists of its components, or share one.
+        If the size of blocks does not divide the state, or a block is not a list of indices, or two blocks overlap.
     """
     refuse_units(blocks=blocks)
     if blocks is None:
@@ -44,9 +44,9 @@ def blocks_of(blocks: Any, n: int, width: int) -> Grouping:
 def kinds_of(groups: Grouping, y: np.ndarray, f: np.ndarray) -> Grouping:
     """Return the groups of floats that have the same unit, as far as that is known.
 
-    Those of a block have it. Without blocks, the coordinates have one and the velocities or momenta another, where the
-    state looks like (q, p): the derivative of its first half vanishes with the second half, and its product with that,
-    which is twice a kinetic energy, is not negative.
+    The floats of a block have the same unit. Without blocks, coordinates have one unit and velocities or momenta
+    another if the state looks like (q, p): the derivative of its first half vanishes together with the second half, and
+    the product of both, which is twice a kinetic energy, is not negative.
     """
     n = y.size
     if len(groups.start) - 1 < n or n % 2 or n == 0 or y.dtype.kind == "c":
@@ -58,7 +58,7 @@ def kinds_of(groups: Grouping, y: np.ndarray, f: np.ndarray) -> Grouping:
 
 
 def _consecutive(size: int, n: int, width: int) -> Grouping:
-    """Blocks of `size` components each, in their order; no list of them, for a field has a million."""
+    """Return blocks of `size` consecutive components each, without a list of them, because a field has a million."""
     floats = n * width
     start = np.arange(0, floats + 1, size * width, dtype=INDEX)
     return Grouping(np.arange(floats, dtype=INDEX), start, width, size * width if n else 0)
@@ -72,8 +72,8 @@ def _block_lists(blocks: Any, n: int) -> list[np.ndarray]:
     groups = [g for g in groups if g.size]
     for g in groups:
         if g.dtype.kind not in "iu" or g.ndim != 1 or g.min() < 0 or g.max() >= n:
-            raise ValueError(f"blocks: {shown(g)} is no array of indices from 0 to {n - 1}.")
+            raise ValueError(f"blocks: {shown(g)} is not an array of indices from 0 to {n - 1}.")
     used = np.concatenate([*groups, np.array([], dtype=int)]).astype(int)
     if np.unique(used).size != used.size:
-        raise ValueError("blocks: a component stands in two blocks.")
+        raise ValueError("blocks: a component is in two blocks; each component may be in one block only.")
     return groups + [np.array([i]) for i in np.setdiff1d(np.arange(n), used)]

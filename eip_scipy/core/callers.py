@@ -1,4 +1,4 @@
-"""Where a warning belongs: the line of the user's program that led to it."""
+"""The stack level of warnings, so that they show the line of the user's program that caused them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ INSIDE = (__name__.partition(".")[0], "scipy", "contextlib")
 def users_level() -> int:
     """Return the `stacklevel` for a warning of the caller: that of the first function outside of the package and SciPy.
 
-    How many functions lie between differs: `solve_ivp`, `integrate`, `ensemble` and `recommend` prepare runs alike.
+    The number of functions in between differs, because `solve_ivp`, `integrate`, `ensemble` and `recommend` share code.
     """
     frame, level = sys._getframe(1), 1
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in INSIDE:

@@ -1,4 +1,4 @@
-"""What is installed: versions, the engine's build, extras."""
+"""Report of the installation: versions, the build of the engine, extras."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from .versions import VERSION, installed
 __all__ = ["show_config"]
 
 REQUIRED = "numpy", "scipy", "filelock", "tqdm"
-# What a package that is not needed brings: its extra, and for what.
+# Optional packages: the extra that installs each, and its purpose.
 EXTRAS = {
-    "numba": ("numba", "jitted functions of your own"),
+    "numba": ("numba", "user-defined jitted functions"),
     "matplotlib": ("plot", "figures"),
     "sympy": ("sympy", "hamiltonian, equations"),
     "rebound": ("rebound", "simulations of REBOUND; WHFast and IAS15 to compare with"),
@@ -32,28 +32,29 @@ EXTRAS = {
 
 
 def show_config(mode: str = "stdout") -> dict[str, Any] | None:
-    """Show versions, the engine's build and the extras, as `numpy.show_config` does: for a report of a defect.
+    """Show versions, the build of the engine and the extras, as `numpy.show_config` does, for bug reports.
 
     Parameters
     ----------
     mode : {"stdout", "dicts"}
-        Print it, or return it.
+        "stdout" prints the report, "dicts" returns it.
 
     Returns
     -------
     dict or None
-        With "dicts": ``versions``, of the package, Python and what it needs; ``engine``, its ``build``, whether that is
-        for ``AVX2 and FMA``, and its ``compiler``; ``extras``, by module the ``version`` (None: not installed), the
-        ``extra`` that brings it and what it is ``for``; ``folder`` and ``system``.
+        With "dicts": ``versions`` of the package, Python and the required packages; ``engine`` with its ``build``, True
+        for ``AVX2 and FMA`` if it uses these instructions, and its ``compiler``; ``extras`` with the ``version`` of
+        each module (None if it is not installed), the ``extra`` that installs it and what it is ``for``; ``folder`` and
+        ``system``.
 
     Raises
     ------
     ValueError
-        For another mode.
+        If the mode is unknown.
 
     Notes
     -----
-    ``eip-scipy doctor`` shows the same and runs a test of seconds.
+    ``eip-scipy doctor`` shows the same report and runs a test that takes some seconds.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Dense output: interpolants of SciPy's orders that meet the projected states and stay on the manifold."""
+"""Dense output: interpolants of SciPy's orders that agree with the projected states and stay on the manifold."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ __all__ = ["ExactEnds", "Interpolants", "ManifoldDenseOutput", "solution"]
 
 Array = np.ndarray
 ITERATIONS = 5
-# Roots of events that the loop finds before someone looks at them, and the numbers that their states may be.
+# Capacity for roots of events that the loop finds between two queries, and for the floats of their states.
 MOST_ROOTS, ROOT_NUMBERS = 1024, 2**17
 
 
 class Interpolants:
-    """Makes a run's interpolants, by its engine, and evaluates them.
+    """Interpolants of a run, created and evaluated by its engine.
 
-    States between two projections are handed out as copies on the manifold. An interpolant is projected onto the
-    invariants' levels between those of the step's two ends. The levels are linear between the defects of the two ends,
-    which are 1e-15 to 1e-12 after a projection, and what the step left where it was not projected: the ends themselves
-    are met exactly. To them is added what balances change by between the ends, by an interpolant of the same kind.
+    States between two projections are returned as projected copies. An interpolant is projected onto levels of the
+    invariants between those at the two ends of the step. The levels are linear between the errors at the two ends,
+    which are 1e-15 to 1e-12 after a projection, and larger if the step was not projected; the ends themselves are met
+    exactly. The change of balances between the ends is added to the levels, by an interpolant of the same kind.
 
     Parameters
     ----------
     run : Run
     engine : Engine
-        That of the run, which has dense output from now on.
+        Engine of the run, for which dense output is switched on.
     events : int
-        How many events the loop looks at.
+        Number of events that the loop checks.
     errors : callable
-        A context that says what a failed call by pointer means, as `Driver.own_errors`.
+        Context that translates errors of calls by pointer, as `Driver.own_errors`.
     """
 
     def __init__(
@@ -61,33 +61,33 @@ class Interpolants:
     ) -> None:
         self.record = _record(run, events)
         self._engine, self._dtype, self._n, self._errors = engine, run.y0.dtype, run.y0.size, errors
-        self._lock = threading.RLock()  # one buffer for all threads that ask
+        self._lock = threading.RLock()  # all threads share one buffer
         engine.sample(self.record)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Interpolants:
-        return self  # nothing that a copy could change
+        return self  # it is immutable
 
     @property
     def floats(self) -> int:
-        """How many numbers an interpolant takes."""
+        """Number of floats in an interpolant."""
         return self.record.piece.size
 
     def over(self, t_old: float, y_old: Array, t: float, y: Array) -> ManifoldDenseOutput:
-        """Dense output over the step that was made last."""
+        """Return the dense output over the last step."""
         piece = np.empty(self.floats)
         with self._lock, self._errors():
             self._engine.describe(t_old, y_old, t, y, piece)
         return ManifoldDenseOutput(self, piece)
 
     def shown(self, t: float, y: Array) -> Array:
-        """Return the last state, y at t, as the run hands it out."""
+        """Return the last state `y` at `t` in the form in which the run returns it."""
         out = np.empty_like(y)
         with self._lock, self._errors():
             self._engine.show(t, y, out)
         return out
 
     def states(self, piece: Array, times: Array) -> Array:
-        """The states (n, m) at times (m,) by an interpolant."""
+        """Return the states (n, m) of an interpolant at times (m,)."""
         out = np.empty((times.size, self._n), self._dtype)
         with self._lock, self._errors():
             self._engine.interpolate(piece, times, out)
@@ -95,28 +95,28 @@ class Interpolants:
         return out.T
 
     def roots(self) -> tuple[Array, Array, Array]:
-        """Which events the loop has found since the last call, when, and in which states."""
+        """Return the events that the loop has found since the last call, their times and states."""
         record = self.record
         count = int(record.counts[0])
         record.counts[0] = 0
         return record.event[:count], record.t[:count], record.y[:count]
 
     def pending(self) -> tuple[Array, Array]:
-        """Which events happen in the step that is pending, and when, where the loop left their states to the caller."""
+        """Return which events happen in the pending step and when, if the loop left their states to the caller."""
         record = self.record
         count = int(record.counts[2])
         record.counts[2] = 0
         return record.pending_event[:count], record.pending_t[:count]
 
     def warn(self) -> None:
-        """Say where states were left unprojected since the last call."""
+        """Warn about states that were not projected since the last call."""
         missed = self.record.missed
         if missed[0] > 0:
             others = f", and {missed[0] - 1:.0f} more" if missed[0] > 1 else ""
             missed[0] = 0
             warnings.warn(
-                f"dense output at t={missed[1]}{others}: no state near the interpolant meets the invariants' levels; "
-                "it is given as it is",
+                f"dense output at t={missed[1]}{others}: no state near the interpolant has the required values of the "
+                "invariants; the unprojected state is returned",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -157,7 +157,7 @@ def _record(run: Run, events: int) -> Dense:
 
 
 class ExactEnds(AtRealTimes):
-    """Another dense output, but for the step's own states at both ends, which interpolants miss by their rounding."""
+    """A dense output that returns exactly the states at both ends of the step, without the rounding of interpolants."""
 
     def __init__(self, inner: DenseOutput, y_old: Array, y: Array) -> None:
         super().__init__(inner.t_old, inner.t)
@@ -203,7 +203,7 @@ class ManifoldDenseOutput(AtRealTimes):
 
 
 class _Pieces(Sequence[ManifoldDenseOutput]):
-    """The interpolants of all steps, each made where it is asked for."""
+    """The interpolants of all steps, each created when it is requested."""
 
     def __init__(self, interpolants: Interpolants, pieces: Array) -> None:
         self._interpolants, self._pieces = interpolants, pieces
@@ -224,7 +224,7 @@ class _Pieces(Sequence[ManifoldDenseOutput]):
 
 
 class _AtRest(AtRealTimes):
-    """The dense output of a run without a step: one state."""
+    """The dense output of a run without steps: one state."""
 
     def __init__(self, t: float, y: Array) -> None:
         super().__init__(t, t)
@@ -235,9 +235,9 @@ class _AtRest(AtRealTimes):
 
 
 def solution(interpolants: Interpolants, pieces: Array, t_end: float, y_end: Array) -> OdeSolution:
-    """Dense output over a run, from its interpolants (m, floats), up to its end; `y_end` is the state there.
+    """Return the dense output over a run from its interpolants (m, floats); `y_end` is the state at its end.
 
-    Where an event has ended the run at the very beginning of a step, it goes on to that step's end.
+    If an event ended the run at the beginning of a step, the dense output extends to the end of that step.
     """
     if not len(pieces):
         return OdeSolution([t_end, t_end], [_AtRest(t_end, y_end)])

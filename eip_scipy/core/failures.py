@@ -1,4 +1,4 @@
-"""Why a step or a projection failed, in words."""
+"""Messages that explain why a step or a projection failed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["failure", "projection_failure"]
 
 
 def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
-    """Which invariant a failed projection left worst, by how much, and the rank it had."""
+    """Return the message for a failed projection, with the invariant that has the largest residual, and the rank."""
     excess = np.abs(work.defect) / np.maximum(work.band, np.finfo(float).tiny)
     worst = int(np.argmax(np.where(np.isfinite(excess), excess, np.inf)))
     broken = [name for name, row in zip(invariants.names, work.G, strict=True) if not np.isfinite(row).all()]
@@ -27,7 +27,7 @@ def projection_failure(invariants: InvariantSet, work: Work, t: float) -> str:
 
 
 def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
-    """Why a step failed."""
+    """Return the message for a failed step."""
     if status == NOT_FINITE:
         return _not_finite(run, clock[TIME], clock[LENGTH])
     if status == TOO_SMALL:
@@ -40,18 +40,17 @@ def failure(status: int, run: Run, clock: Sequence[float] | np.ndarray) -> str:
 def _unstable(run: Run) -> str:
     """Return the message for a step that is too long for a multistep method."""
     history = run.method.multistep
-    assert history is not None  # whose code it is
+    assert history is not None  # only multistep methods return this code
     t = history.t0 + int(history.place[NEWEST]) * history.h
     return (
         f"the step is too long, or the motion not smooth, at t={t:.10g}: differences of the accelerations of order "
-        f"{history.predict_q.size} are not small beside them, as they are where h={abs(history.h):g} is stable and "
-        "resolves the motion. Take a shorter step, or where bodies meet or forces jump a method of single steps such "
-        "as EIPRKN12"
+        f"{history.predict_q.size} are not small compared with the accelerations for h={abs(history.h):g}. "
+        "Use a shorter step, or a one-step method such as EIPRKN12 if there are close encounters or forces that jump"
     )
 
 
 def _not_finite(run: Run, t: float, h: float) -> str:
-    """Why a step was not finite: the first stage that was not, overflow of the sum, or the error estimate."""
+    """Return the message for a step that is not finite: in a stage, in the sum, or in the error estimate."""
     work, method = run.work, run.method
     history = method.multistep
     if history is not None and history.place[HAVE_NODES] and not np.isfinite(work.K[1]).all():

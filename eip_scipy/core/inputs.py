@@ -1,4 +1,4 @@
-"""What users give where plain numbers belong; errors name the argument."""
+"""Validation of numeric arguments; error messages name the argument."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ __all__ = [
 PLAIN = (int, float, complex, str, bool, type(None), np.float64, np.complex128)
 DATES = (datetime.date, datetime.timedelta, np.datetime64, np.timedelta64)
 SHOWN = 120
-LARGEST_COUNT = 2**63 - 1  # what compiled code holds
+LARGEST_COUNT = 2**63 - 1  # largest 64-bit integer
 
 
 def shown(value: Any) -> str:
-    """The value in an error message, on one line, long ones cut."""
+    """Return a value as text for an error message: on one line, shortened if it is long."""
     try:
         text = " ".join(repr(value).split())
     except ValueError:  # an integer of thousands of digits
@@ -31,17 +31,17 @@ def shown(value: Any) -> str:
 
 
 def refuse_units(**arguments: Any) -> None:
-    """Refuse values with a unit, and dates: NumPy would drop the unit without a word.
+    """Raise TypeError for values with a unit and for dates, because NumPy would silently drop the unit.
 
     Parameters
     ----------
     **arguments
-        Values by the names that the user knows them by; looked for in lists and tuples too.
+        Values, with the names of the user's arguments; items of lists and tuples are checked too.
 
     Raises
     ------
     TypeError
-        For quantities and times of astropy, pint, unyt and their like, and for dates.
+        If a value is a date, or a quantity or time of astropy, pint, unyt or a similar package.
     """
     for name, value in arguments.items():
         for item in _leaves(value):
@@ -58,7 +58,7 @@ def refuse_units(**arguments: Any) -> None:
 
 
 def _leaves(value: Any) -> Any:
-    """The items of nested lists and tuples, and of arrays of objects; all else as it is."""
+    """Yield the items of nested lists and tuples and of object arrays; anything else is yielded unchanged."""
     if type(value) in (list, tuple):
         for item in value:
             if type(item) not in PLAIN:
@@ -70,20 +70,20 @@ def _leaves(value: Any) -> Any:
 
 
 def is_date(value: Any) -> bool:
-    """Whether a value is a date, a time or a duration."""
+    """Return True if a value is a date, a time or a duration."""
     if isinstance(value, DATES) or getattr(getattr(value, "dtype", None), "kind", "") in ("m", "M"):
         return True
-    return hasattr(value, "jd1") and hasattr(value, "jd2")  # times of astropy have no unit of their own
+    return hasattr(value, "jd1") and hasattr(value, "jd2")  # times of astropy have no unit
 
 
 def has_unit(value: Any) -> bool:
-    """Whether a value has a unit, as quantities of astropy, pint and unyt do."""
+    """Return True if a value has a unit, as quantities of astropy, pint and unyt do."""
     numeric = hasattr(value, "__float__") or hasattr(type(value), "__array__")
     return numeric and any(getattr(value, name, None) is not None for name in ("unit", "units"))
 
 
 def reals(value: Any) -> np.ndarray | None:
-    """A value as a new array of floats of its shape; None where it does not hold real numbers that a float holds."""
+    """Return a value as a new array of floats, or None if it does not consist of real numbers."""
     try:
         found = np.asarray(value)
         if found.dtype.kind == "O":
@@ -97,14 +97,14 @@ def reals(value: Any) -> np.ndarray | None:
 
 
 def real_array(name: str, value: Any, error: type[Exception] = ValueError) -> np.ndarray:
-    """A value as a new array of floats.
+    """Return a value as a new array of floats.
 
     Raises
     ------
     TypeError
-        For values with a unit.
+        If a value has a unit.
     ValueError
-        For what does not hold real numbers; `error` in its place.
+        If a value is not a real number; the exception type is `error` if that is given.
     """
     refuse_units(**{name: value})
     found = reals(value)
@@ -114,13 +114,13 @@ def real_array(name: str, value: Any, error: type[Exception] = ValueError) -> np
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a real number that a float holds (no bool, no array)."""
+    """Return True if a value is a real number that a float can represent; False for a bool and for an array."""
     number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     return number and reals(value) is not None
 
 
 def count(name: str, value: Any, most: int = LARGEST_COUNT) -> int:
-    """An integer option >= 1."""
+    """Return an integer option; raise ValueError unless it is >= 1."""
     refuse_units(**{name: value})
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name} must be an integer >= 1, got {shown(value)}.")
@@ -130,35 +130,35 @@ def count(name: str, value: Any, most: int = LARGEST_COUNT) -> int:
 
 
 def flag(name: str, value: Any) -> bool:
-    """An option that is True or False."""
+    """Return a boolean option; raise ValueError unless it is True or False."""
     if not isinstance(value, (bool, np.bool_)):
         raise ValueError(f"{name} must be True or False, got {shown(value)}.")
     return bool(value)
 
 
-def require_arguments(fun: Callable[..., Any], given: Sequence[str], what: str, mend: str) -> None:
-    """After a TypeError in a call of `fun`: say so where it does not take the arguments that it is `given`.
+def require_arguments(fun: Callable[..., Any], given: Sequence[str], what: str, advice: str) -> None:
+    """Raise a clear TypeError if `fun` does not accept the arguments `given`; used after a TypeError in a call.
 
     Raises
     ------
     TypeError
-        Naming `what` was called, how, and how to `mend` it.
+        If the arguments do not match; the message names `what` was called, its arguments, and gives `advice`.
     """
     try:
         signature = inspect.signature(fun)
-    except (TypeError, ValueError):  # of some functions in C
+    except (TypeError, ValueError):  # some functions in C have no signature
         return
     try:
         signature.bind(*given)
     except TypeError as error:
         if _leaves_out_time(signature, given):
             names = ", ".join(given)
-            mend = f"The time comes first, needed or not: write lambda {names}: ..., or def name({names})."
-        raise TypeError(f"{what} is called with ({', '.join(given)}): {error}. {mend}") from None
+            advice = f"The first argument is always the time: write lambda {names}: ..., or def name({names})."
+        raise TypeError(f"{what} is called with ({', '.join(given)}): {error}. {advice}") from None
 
 
 def _leaves_out_time(signature: inspect.Signature, given: Sequence[str]) -> bool:
-    """Whether a function takes what it is given but for the time."""
+    """Return True if a function accepts the given arguments without the time."""
     try:
         signature.bind(*given[1:])
     except TypeError:
@@ -168,14 +168,14 @@ def _leaves_out_time(signature: inspect.Signature, given: Sequence[str]) -> bool
 
 
 def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any, what: str, t: float) -> np.ndarray:
-    """What a user's function in place fills, from an array of NaN.
+    """Return the array that a user's in-place function fills, starting from NaN.
 
     Raises
     ------
     TypeError
-        When it returns a value.
+        If the function returns a value.
     ValueError
-        When it leaves a part as it is, or reads what was there.
+        If the function does not fill the whole array, or reads it before it fills it.
     """
     out, ones = np.empty(shape, dtype), np.empty(shape, dtype)
     found, other = out.view(float), ones.view(float)
@@ -184,7 +184,7 @@ def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any
     if returned is not None and not (isinstance(returned, np.ndarray) and np.may_share_memory(returned, out)):
         raise TypeError(
             f"{what} returned {shown(returned)}, but with in_place=True it must fill its argument out and return "
-            f"nothing, at t={t:.10g}. Write out[:] = ..., or leave in_place=True out."
+            f"nothing, at t={t:.10g}. Write out[:] = ..., or omit in_place=True."
         )
     if not np.isnan(found).any():
         return out
@@ -192,7 +192,7 @@ def filled(call: Callable[[np.ndarray], Any], shape: tuple[int, ...], dtype: Any
     call(ones)
     for places, does in (
         (np.isnan(found) & (other == 1), "does not fill all of its argument out"),
-        (np.isnan(found) & ~np.isnan(other), "reads its argument out, which holds anything, before it fills it"),
+        (np.isnan(found) & ~np.isnan(other), "reads its argument out, whose content is arbitrary, before filling it"),
     ):
         if places.any():
             *row, component = np.argwhere(places)[0].tolist()

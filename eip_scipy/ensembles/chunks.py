@@ -1,4 +1,4 @@
-"""Where the chunks of an ensemble run: threads of this process, or executors of `concurrent.futures`."""
+"""Pools that run the chunks of an ensemble: threads of this process, or executors of `concurrent.futures`."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from .tasks import Members, Plan, Task, run_members
 __all__ = ["Chunk", "FuturesPool", "Part", "Pool", "ThreadPool", "in_order", "run_chunk", "run_elsewhere"]
 
 KEPT = (
-    "What was done is in this exception's .partial; with out= or checkpoint= the same call with resume=True goes on "
-    "from there, on another executor."
+    "The attribute partial of this exception contains the finished members; with out= or checkpoint=, the same call "
+    "with resume=True continues from there, on another executor."
 )
 KEPT_PLANS = 4
 AHEAD = 3
 
 
 class Chunk(NamedTuple):
-    """Members that run together, from number `first` on: their starts (m, n), parameters (m, p) and own times."""
+    """Members that run together, starting at number `first`: initial states (m, n), parameters (m, p) and own times."""
 
     first: int
     y0s: np.ndarray
@@ -36,13 +36,13 @@ class Chunk(NamedTuple):
     own: OwnTimes = OwnTimes()
 
     def part(self, first: int, last: int) -> Chunk:
-        """Return some of the members, counted from the first one of the chunk."""
+        """Return some of the members, counted from the first member of the chunk."""
         params = np.ascontiguousarray(self.params[first:last])
         return Chunk(self.first + first, self.y0s[first:last], params, self.own.part(first, last))
 
 
 class Part(NamedTuple):
-    """What comes back for a chunk; `one_by_one` is the plan's."""
+    """Results of a chunk; `one_by_one` is that of the plan."""
 
     members: Members
     statistics: Statistics | None
@@ -50,28 +50,28 @@ class Part(NamedTuple):
 
 
 class Pool(Protocol):
-    """Where chunks run."""
+    """Interface of what runs chunks."""
 
     def capacity(self) -> int:
-        """How many chunks may run at once now."""
+        """Return how many chunks can run at the same time."""
 
     def submit(self, chunk: Chunk) -> Any:
-        """Start a chunk; what it returns is for `collect`."""
+        """Start a chunk; return a ticket for `collect`."""
 
     def collect(self, chunk: Chunk, ticket: Any) -> Part:
-        """Wait for a chunk."""
+        """Wait for a chunk and return its results."""
 
     def close(self) -> None:
-        """Leave nothing running."""
+        """Stop everything that is running."""
 
 
 def run_chunk(plan: Plan, chunk: Chunk, *, stop: threading.Event | None = None) -> Part:
-    """Run the members of a chunk, and their statistics where they are wanted."""
+    """Run the members of a chunk, and compute their statistics if requested."""
     return finished(plan.task, plan, run_members(plan, chunk.y0s, chunk.params, stop, chunk.own))
 
 
 def finished(task: Task, plan: Plan, members: Members) -> Part:
-    """Statistics of members, and the members without what is not kept of them."""
+    """Return the statistics of members, and the members without states that need not be kept."""
     statistics = None
     if task.reduce is not None:
         statistics = statistics_of(task.reduce, *plan.states(members))
@@ -85,7 +85,7 @@ _making = threading.Lock()
 
 
 def run_elsewhere(task: Task, key: str, chunk: Chunk) -> Part:
-    """`run_chunk` in a process that knows nothing yet: the plan is made once there, and kept under `key`."""
+    """Run a chunk in another process, which creates the plan once and stores it under `key`."""
     with _making:
         plan = _plans.get(key)
         if plan is None:
@@ -96,7 +96,7 @@ def run_elsewhere(task: Task, key: str, chunk: Chunk) -> Part:
 
 
 class FuturesPool:
-    """Chunks on an executor of `concurrent.futures` or like it, which stays open: ``run(chunk)`` makes a `Part`."""
+    """Pool on an executor like those of `concurrent.futures`, which stays open; ``run(chunk)`` returns a `Part`."""
 
     def __init__(self, executor: Executor, run: Callable[[Chunk], Part], workers: int) -> None:
         self._executor, self._run, self._workers = executor, run, workers
@@ -131,7 +131,7 @@ class FuturesPool:
 
 
 class ThreadPool(FuturesPool):
-    """Threads of this process; compiled members run side by side."""
+    """Pool of threads of this process; compiled members run in parallel."""
 
     def __init__(self, plan: Plan, workers: int) -> None:
         self._stop = threading.Event()
@@ -144,23 +144,23 @@ class ThreadPool(FuturesPool):
 
 
 def _broken(error: BrokenExecutor, chunk: Chunk) -> BrokenExecutor:
-    """An executor gives all up when a process dies, and does not say which of the members under way did it."""
+    """Return an error for a worker that died; the executor does not say which of the running members caused it."""
     last = chunk.first + len(chunk.y0s) - 1
     return type(error)(
-        f"a worker of the executor died before members {chunk.first} to {last} came back: it was killed, or ran out of "
-        "memory, or a member ends its process (executor='dask' finds such a member and runs the others). " + KEPT
+        f"a worker of the executor died before members {chunk.first} to {last} finished: it was killed, ran out of "
+        "memory, or a member ended its process (executor='dask' finds such a member and runs the others). " + KEPT
     )
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def in_order(pool: Pool, chunks: Iterable[Chunk]) -> Iterator[tuple[Chunk, Part]]:
-    """Run chunks and yield them in their own order; no more than a few per worker are under way at once."""
+    """Run chunks and yield them in order; only a few per worker are submitted at the same time."""
     waiting = iter(chunks)
     under_way: deque[tuple[Chunk, Any]] = deque()
     while True:

@@ -1,4 +1,4 @@
-"""`ensemble`: many runs of one system, from many starts or with many parameters."""
+"""`ensemble`: many runs of one system, with different initial states or parameters."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ LEAST_CHUNKS = 16
 LEAST_OCTETS = 4  # of members in a chunk
 TRIED = 8
 SHOWN = 5
-# Of a request: what an ensemble has of its own, or not at all.
+# Fields of a request that an ensemble handles itself or does not have.
 ALONE = {"fun", "acceleration", "t_span", "y0", "params", "projection"}
 ALONE |= {"callback", "diagnostics", "max_bytes", "progress"}
 OWN = ("executor", "reduce", "callback", "out", "checkpoint", "checkpoint_every", "resume", "chunk", *sorted(ALONE))
@@ -83,65 +83,69 @@ class EnsembleKeywords(ProjectionDetails, total=False):
 
 
 class EnsembleResult(WithColumns):
-    """Result of `ensemble`; fields by name or by key, as in SciPy's own results.
+    """Result of `ensemble`; fields are accessible by attribute or by key, as in SciPy's results.
 
     Attributes
     ----------
     y : ndarray, shape (members, n)
-        Last states: at the end of the interval, or the last one before a member failed.
+        Last states: at the end of the interval, or before a member failed.
     t : ndarray, shape (members,)
-        Their times.
+        Times of the last states.
     status : ndarray, shape (members,)
-        0: the end was reached; 1: an event ended the member; -1: it failed; -2: it did not run (in what a broken off
-        ensemble leaves behind).
+        0: the end was reached; 1: an event ended the member; -1: it failed; -2: it did not run (in the partial result
+        of an interrupted ensemble).
     message : ndarray of str, shape (members,)
-        What ended each.
+        Reason for the end of each member.
     failed : ndarray
         Indices of the members with status -1.
     success : bool
-        Whether all members ran and none failed.
+        True if all members ran and none failed.
     max_defect : ndarray, shape (members, l)
-        Largest ``|I - target|`` after a projection, where target is each member's own.
+        Largest invariant error ``|I - target|`` after a projection; each member has its own target.
     max_correction : ndarray, shape (members,)
-        Largest correction in local errors; nan where the method estimates none.
+        Largest correction in units of the local error; nan if the method has no error estimate.
     side_by_side : ndarray of bool, shape (members,)
-        Whether each ran in a vector with others, several times faster; the docs' page on ensembles says what it takes.
+        True for members that ran vectorised, in a batch with others, which is several times faster; the page on
+        ensembles in the documentation lists the conditions.
     one_by_one : str
-        Why members ran one after the other instead; "" where they did not, or only those did that had to.
+        Reason why members ran one after the other instead; "" if they did not, or if only exceptions did.
     trusted : ndarray of bool, shape (members,)
-        Whether each did not fail and nothing speaks against it, as in `IntegrationResult`; else `message` says what.
+        True for members that did not fail and are reliable, as in `IntegrationResult`; otherwise `message` says why.
     names : tuple of str
-        Of the l invariants.
+        Names of the l invariants.
     nfev, njev, nlu, n_rejected_projections : ndarray, shape (members,)
+        Evaluations of the right-hand side and of the gradients, factorisations, and rejected projections.
     times : ndarray, shape (m,) or (members, m)
-        Times of saved states; empty if none were asked for. If members have times of their own, there is one row for
-        each, which ends with nan where it is shorter than the others.
+        Times of the saved states; empty if no states are saved. If members have different times, there is one row for
+        each member, padded with nan.
     trajectories : ndarray or zarr.Array or None, shape (members, n, m)
-        Saved states; nan after the end of a member that did not get there. None if they were reduced.
+        Saved states; nan after the end of a member that ended early. None if they were reduced.
     invariants : ndarray or zarr.Array, shape (members, l) or (members, l, m)
-        Values of the invariants: in the last states, or in the saved states if `trajectories` has them.
+        Values of the invariants in the saved states if `trajectories` has them, else in the last states.
     target : ndarray, shape (members, l)
-        The values that were kept, each member's own.
+        Values to which the invariants of each member were projected.
     t_events, y_events : list of list of ndarray, or None
-        With events, ``t_events[k]`` and ``y_events[k]`` are those of member k, as in `scipy.integrate.solve_ivp`: one
-        array for each event.
+        If there are events, ``t_events[k]`` and ``y_events[k]`` are those of member k, as in
+        `scipy.integrate.solve_ivp`: one array for each event.
     statistics : Statistics or None
-        Over all members, by ``reduce=``.
+        Statistics over all members, if ``reduce=`` was given.
     variations : ndarray, shape (members, n, k) or (members, m, n, k)
-        With ``variations=``, the columns of derivatives: in the last states, or in the saved states if `trajectories`
-        has them. `stm` and `sensitivities` take theirs from it; `columns` is as in `IntegrationResult`.
+        Columns of derivatives if ``variations=`` was given, in the saved states if `trajectories` has them, else in the
+        last states. `stm` and `sensitivities` are parts of it; `columns` is as in `IntegrationResult`.
     first : int
-        Number of the first member: 0, but for what a `callback` gets.
+        Number of the first member; it is 0 except in the results that a `callback` receives.
     stopped : bool
-        Whether the callback stopped the ensemble.
+        True if the callback stopped the ensemble.
     wall_time : float
-        Seconds.
+        Run time in seconds.
     method : str
+        Name of the method.
     h : float or None
+        Step size; None for adaptive steps.
     chunk : int
-        Members in a chunk.
+        Number of members in a chunk.
     component_names : tuple of str
-        Those of the `Problem`, or "y0", "y1" and so on.
+        Names of the components from the `Problem`, or "y0", "y1" and so on.
     """
 
     y: np.ndarray
@@ -181,7 +185,7 @@ class EnsembleResult(WithColumns):
         return default_names(self.y.shape[1]) if given is None else tuple(given)
 
     def to_xarray(self, names: Any = None) -> Any:
-        """The members as an `xarray.Dataset`.
+        """Return the members as an `xarray.Dataset`.
 
         Parameters
         ----------
@@ -191,17 +195,17 @@ class EnsembleResult(WithColumns):
         Returns
         -------
         xarray.Dataset
-            The names of a Zarr group that `out` asks for, and more: ``y`` (member, component), ``t_end``, ``status``,
-            ``message``, ``trusted``, ``max_correction`` (member), ``max_defect``, ``target`` (member, invariant), the
-            counts; ``states`` (member, component, time) and ``invariants`` (member, invariant, time) if trajectories
-            are in memory, with ``row`` and ``times`` (member, row) in place of ``time`` if members have times of their
-            own; else ``end_invariants`` (member, invariant). What `out` holds is opened by
-            ``xarray.open_zarr(out, consolidated=False)``.
+            Dataset with the names of the Zarr group that `out` writes, and more: ``y`` (member, component), ``t_end``,
+            ``status``, ``message``, ``trusted``, ``max_correction`` (member), ``max_defect``, ``target`` (member,
+            invariant), and the counts. If trajectories are in memory, also ``states`` (member, component, time) and
+            ``invariants`` (member, invariant, time), with ``row`` and ``times`` (member, row) instead of ``time`` if
+            members have different times; otherwise ``end_invariants`` (member, invariant). To open the group written
+            by `out`, use ``xarray.open_zarr(out, consolidated=False)``.
 
         Raises
         ------
         ImportError
-            Without xarray: ``pip install "eip_scipy[xarray]"``.
+            If xarray is missing: ``pip install "eip_scipy[xarray]"``.
         """
         by_member = ("status", "trusted", "max_correction", "nfev", "njev", "nlu", "n_rejected_projections")
         variables: dict[str, Any] = {name: (("member",), self[name]) for name in by_member}
@@ -235,7 +239,8 @@ class EnsembleResult(WithColumns):
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result to a file that `eip_scipy.load` reads, see `eip_scipy.results.save`.
 
-        Trajectories that `out` holds stay there: after `load` they are None, and `invariants` those of the last states.
+        Trajectories in the Zarr group of `out` stay there: after `load`, `trajectories` is None and `invariants` holds
+        the values in the last states.
         """
         from ..run.saving import save
 
@@ -252,22 +257,22 @@ class EnsembleResult(WithColumns):
         Returns
         -------
         matplotlib.figure.Figure
-            For each component the median of all members in time, with bands that hold 50 % and 90 % of them; or, if no
-            states are saved at common times, the same of the last states. Then the largest error of each invariant in
-            each member, and the numbers of members that came to the end, were ended by an event, are not to be trusted,
-            failed or did not run. A notebook shows the figure, as that of `IntegrationResult.plot`.
+            For each component the median of all members in time, with bands that contain 50 % and 90 % of them; if no
+            states are saved at common times, the distribution of the last states. Further panels show the largest error
+            of each invariant in each member, and how many members reached the end, were ended by an event, are not to
+            be trusted, failed or did not run. A notebook shows the figure automatically.
 
         Raises
         ------
         ImportError
-            Without matplotlib: ``pip install "eip_scipy[plot]"``.
+            If matplotlib is missing: ``pip install "eip_scipy[plot]"``.
         """
         from .figures import plot
 
         return plot(self, names)
 
     def _packed(self) -> dict[str, Any]:
-        """Return the fields as `eip_scipy.results.save` takes them."""
+        """Return the fields in the form that `eip_scipy.results.save` accepts."""
         from .saving import packed
 
         ends = vars(self).get("_ends")
@@ -275,7 +280,7 @@ class EnsembleResult(WithColumns):
 
     @classmethod
     def _unpacked(cls, fields: dict[str, Any]) -> EnsembleResult:
-        """Return a result from what `_packed` gave."""
+        """Return a result from the output of `_packed`."""
         from .saving import unpacked
 
         return cls(unpacked(fields))
@@ -289,15 +294,15 @@ class EnsembleResult(WithColumns):
         members, n = self.y.shape
         lines = [
             f"Ensemble: {members} members of {n} components, {self.method}, {step}; {ran} ran in "
-            f"{self.wall_time:.3g} s, {np.count_nonzero(self.side_by_side)} side by side in vectors, "
+            f"{self.wall_time:.3g} s, {np.count_nonzero(self.side_by_side)} vectorised, "
             f"{self.failed.size} failed",
         ]
         if self.one_by_one:
-            lines.append(f"  one by one: {self.one_by_one}")
+            lines.append(f"  not vectorised: {self.one_by_one}")
         width = max((len(name) for name in self.names), default=0)
         for name, defects in zip(self.names, self.max_defect[self.status >= 0].T, strict=True):
             if defects.size:
-                lines.append(f"  {name:<{width}}  max defect {defects.max():.2e}, median {np.median(defects):.2e}")
+                lines.append(f"  {name:<{width}}  largest error {defects.max():.2e}, median {np.median(defects):.2e}")
         doubtful = np.flatnonzero((self.status >= 0) & ~self.trusted)
         for those, what in ((self.failed, ".failed"), (doubtful, ".trusted")):
             lines += [f"  member {self.first + k}: {self.message[k]}" for k in those[:SHOWN]]
@@ -332,68 +337,70 @@ def ensemble(
 ) -> EnsembleResult:
     """Integrate many members of one system: compiled, on all cores, or on a cluster.
 
-    Each member comes out as from its own `integrate`, bit for bit, on whatever and on however many workers it ran.
-    A member that fails is reported with its index and reason, and disturbs no other.
+    Each member agrees bit by bit with its own `integrate`, for any kind and number of workers. A member that fails is
+    reported with its index and the reason, and does not affect the others.
 
     Parameters
     ----------
     fun : callable or Problem
         As for `integrate`.
     t_span : (float, float) or array_like, shape (members, 2)
-        Start and end: the same for all, or a row for each member.
+        Start and end: the same for all members, or a row for each.
     y0s : array_like, shape (members, n)
-        Starts; one (n,) for all where `params` differ. Default: the start of a `Problem`.
+        Initial states; one state (n,) for all if `params` differ. Default: the initial state of a `Problem`.
     acceleration : callable, optional
-        In place of `fun`, as for `integrate`.
+        Instead of `fun`, as for `integrate`.
     params : array_like of float, shape (p,) or (members, p), optional
-        Parameters of all members, or of each. Of a problem that names them also a mapping, of a name to one value or
-        to one for each member, as in ``params={"k": [1.0, 2.0]}``.
+        Parameters of all members, or of each. For a problem that names its parameters also a mapping from names to one
+        value or to one value for each member, as in ``params={"k": [1.0, 2.0]}``.
     method : type, optional
-        As for `integrate`. Default: the problem's own, if it has one, else `EIPRK4`.
+        As for `integrate`. Default: the method of the problem, if it has one, else `EIPRK4`.
     h : float, optional
-        As for `integrate`: the step; None: adaptive steps; without it, adaptive steps where rtol, atol, first_step or
-        max_step ask for them, else a problem's own step.
+        As for `integrate`: the step; None for adaptive steps. Default: adaptive if rtol, atol, first_step or max_step
+        is given, else the step of the problem.
     invariants : Invariant or sequence of Invariant, optional
-        What to keep: each member keeps the values at its own start. Where `params` differ, their functions take them
-        as the last argument and have no args.
+        Invariants to keep: each member keeps the values at its own start. If `params` differ, the functions receive the
+        parameters as the last argument and must have no args.
     executor : None, int, "dask", distributed.Client, DaskExecutor or concurrent.futures.Executor, optional
-        Where members run. None: threads on all cores (one, where functions are not compiled); a number: so many
-        threads. "dask": the Dask cluster of the configuration (``DASK_SCHEDULER_ADDRESS``), or a local one of a process
-        for each core; see `eip_scipy.integrations.dask`.
+        Where members run. None: threads on all cores (one thread if functions are not compiled). A number: this number
+        of threads. "dask": the configured Dask cluster (``DASK_SCHEDULER_ADDRESS``), or a local cluster with one
+        process for each core; see `eip_scipy.integrations.dask`.
     save_every : int, optional
-        Save each so many-th step of every member in ``.trajectories``; fixed steps only.
+        Save every `save_every`-th step of each member in ``.trajectories``; fixed steps only.
     t_eval : array_like or sequence of array_like, optional
-        Times to save at instead: the same for all, or a row (members, m) or an array for each member. Members that have
-        intervals or times of their own are prepared and run one by one, which takes some milliseconds for each; they
-        take neither `save_every` nor `reduce`.
+        Times to save at instead: the same for all members, or a row (members, m) or an array for each. Members with
+        different intervals or times are prepared and run one after the other, which takes some milliseconds for each;
+        they accept neither `save_every` nor `reduce`.
     reduce : "state" or callable, optional
-        Statistics over members (mean, variance, extremes) of the saved states, or of the last ones where none are
-        saved; a function ``reduce(t, y) -> float or (k,)``: of that. Trajectories are then kept in `out` only.
+        Statistics over members (mean, variance, extremes) of the saved states, or of the last states if none are saved.
+        A function ``reduce(t, y) -> float or (k,)``: statistics of its values. Trajectories are then stored only in
+        `out`.
     callback : callable, optional
-        ``callback(part)`` after each chunk of members, in their order, with an `EnsembleResult` of that chunk; return
+        ``callback(part)``, called after each chunk of members, in order, with an `EnsembleResult` of that chunk; return
         True to stop.
     out : path-like, optional
-        A Zarr group to write to, chunk by chunk, for trajectories that do not fit into memory; xarray opens it. The
-        path of a folder, or a URL.
+        Zarr group to which results are written chunk by chunk, for trajectories that do not fit into memory; xarray can
+        open it. The path of a folder, or a URL.
     checkpoint : path-like, optional
-        Without `out`: a file that keeps finished members, see `eip_scipy.checkpoint`; written every `checkpoint_every`
-        seconds, and when the ensemble ends or is broken off.
+        Without `out`: a file that stores finished members, see `eip_scipy.checkpoint`. It is written every
+        `checkpoint_every` seconds, and when the ensemble ends or is interrupted.
     checkpoint_every : float, optional
-        Seconds; more where writing would take over a twentieth of the time.
+        Seconds from one checkpoint to the next; longer if writing would take more than 5 % of the time.
     resume : bool, optional
-        Go on with what is in `out` or `checkpoint`, with the same arguments: only members that are missing there run,
-        and the result has the same bits. Where there is nothing, start.
+        Continue with the content of `out` or `checkpoint`, with the same arguments: only missing members run, and the
+        result agrees bit by bit. If there is no content, start at the beginning.
     chunk : int, optional
-        Members that run together; results do not depend on it, but for the last bits of `reduce`.
+        Number of members that run together; results do not depend on it, except for the last bits of `reduce`.
     progress : bool, optional
-        Show a progress bar with the time that is left.
+        Show a progress bar with the remaining time.
     max_bytes : float, optional
-        Bound on the memory for results; default: half of what is free.
+        Bound on the memory for results; default: half of the free memory.
     **keywords
         Options of `integrate`: args (the same for all), in_place, events, compensated, compiled, metric, blocks, frame,
         direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step, max_step, variations,
-        jvp, symplectic. Members with derivatives run one by one, and take neither `out` nor `reduce`. Events are kept
-        for each member in ``.t_events`` and ``.y_events``; a terminal one ends its member. `check` looks at one member.
+        jvp, symplectic. Members with derivatives run one after the other, and accept neither `out` nor `reduce`. Events
+        are stored for each member in ``.t_events`` and ``.y_events``; a terminal event ends its member. `check`
+        examines one member.
 
     Returns
     -------
@@ -403,18 +410,18 @@ def ensemble(
     Raises
     ------
     TypeError, ValueError
-        As by `integrate`, for what would fail in every member.
+        As for `integrate`, if every member would fail.
     MemoryError
-        When results would need more than `max_bytes`.
+        If results would need more than `max_bytes`.
     CheckpointError
-        When `out` or `checkpoint` exists and is not to be resumed, or is damaged, or belongs to other arguments or
-        functions, or another ensemble has it, or `out` can no longer be written.
+        If `out` or `checkpoint` exists without ``resume=True``, is damaged, belongs to other arguments or functions, or
+        is used by another ensemble, or if `out` can no longer be written.
 
     Notes
     -----
-    Members run in chunks, whose size depends on the problem only, and chunks come back in their order, so that
-    statistics too have the same bits on any number of workers. When the ensemble is broken off (Ctrl-C, an exception of
-    the callback), the exception carries what there was as ``exception.partial``.
+    Members run in chunks, whose size depends only on the problem, and chunks are collected in order, so that statistics
+    also agree bit by bit for any number of workers. If the ensemble is interrupted (Ctrl-C, or an exception raised by
+    the callback), the attribute ``partial`` of the exception is the result up to that point.
 
     Examples
     --------
@@ -475,12 +482,12 @@ def _check_choices(reduce: Any, callback: Any, progress: Any, max_bytes: Any) ->
 
 
 def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
-    """Warn of members that are not to be trusted, if there are any.
+    """Warn about members that are not to be trusted.
 
     Raises
     ------
     ProjectionWarning
-        Where warnings are errors, with the result as ``partial``.
+        If warnings are errors; its attribute ``partial`` is the result.
     """
     if not doubtful.size:
         return
@@ -498,7 +505,7 @@ def _warn(result: EnsembleResult, doubtful: np.ndarray) -> None:
 
 
 class _Gathered:
-    """What came back so far, and what is made of it at the end."""
+    """The finished members so far, from which the result is made."""
 
     def __init__(
         self,
@@ -519,7 +526,7 @@ class _Gathered:
         self._begin = time.perf_counter()
 
     def run(self, pool: Callable[[], Pool], progress: bool) -> EnsembleResult:
-        """Run all chunks that are not in the store yet."""
+        """Run all chunks that are not stored yet."""
         from tqdm import tqdm
 
         done = self._stored()
@@ -544,12 +551,12 @@ class _Gathered:
         return self.result()
 
     def _chunks(self, done: int) -> Iterator[Chunk]:
-        """Yield the members from number `done` on, chunk by chunk."""
+        """Yield the members starting at number `done`, in chunks."""
         for first in range(done, len(self.whole.t), self.chunk):
             yield self.everyone.part(first, first + self.chunk)
 
     def _stored(self) -> int:
-        """Take what the store has; returns the number of members."""
+        """Read the stored members; return their number."""
         if self.store is None:
             return 0
         done, statistics = self.store.finished, self.store.statistics
@@ -568,7 +575,7 @@ class _Gathered:
         with ExitStack() as stack:
             stack.callback(pool.close)
             if self.store is not None:
-                stack.callback(self.store.flush)  # first: whoever ends the process may not wait long
+                stack.callback(self.store.flush)  # first, because the process may be killed soon
             for chunk, part in in_order(pool, chunks):
                 self._take(chunk.first, part)
                 if self.store is not None:
@@ -588,7 +595,7 @@ class _Gathered:
         self.one_by_one = part.one_by_one or self.one_by_one
 
     def result(self) -> EnsembleResult:
-        """The result as far as it is there."""
+        """Return the result of the members finished so far."""
         return self._of(self.whole, self.statistics, 0)
 
     def _of(self, members: Members, statistics: Statistics | None, first: int) -> EnsembleResult:
@@ -641,14 +648,14 @@ class _Gathered:
         return result
 
     def _events(self, members: Members) -> list[Happened]:
-        """Return the events of members; none of those that did not run."""
+        """Return the events of members, empty for those that did not run."""
         n, dtype = self.plan.size, self.plan.dtype
         none = [(np.zeros(0), np.zeros((0, n), dtype))] * self.plan.events
         return [found or none for found in members.happened]
 
 
 def _separate(result: EnsembleResult, columns: Columns) -> None:
-    """Give a result the states and their columns of derivatives apart."""
+    """Separate the states of a result from their columns of derivatives."""
     result["y"], result["variations"] = columns.apart(result.y)
     if result.trajectories is not None:
         rows, result["variations"] = columns.apart(result.trajectories.swapaxes(1, 2))
@@ -658,44 +665,44 @@ def _separate(result: EnsembleResult, columns: Columns) -> None:
 
 
 def _all_times(plan: Plan, own: OwnTimes) -> np.ndarray:
-    """Return the times of saved states, with a row for each member if they have times of their own."""
+    """Return the times of saved states, with a row for each member if their times differ."""
     return plan.times if own.times is None else own.padded
 
 
 def _check_options(options: dict[str, Any], *, reduced: bool) -> None:
-    """The options that go on to `integrate`; `reduced`: states go into statistics or a store."""
+    """Check the options of `integrate`; `reduced`: states go into statistics or a store."""
     if reduced and options.get("variations") is not None:
-        raise ValueError("ensemble: derivatives of the members (variations=) go neither into out= nor into reduce=.")
+        raise ValueError("ensemble: variations= cannot be combined with out= or reduce=; omit one of them.")
     known = {option.name for option in dataclasses.fields(Request)} - ALONE | set(ProjectionOptions.names())
     for name in options:
         if name not in known:
             raise TypeError(f"ensemble() has no option {name!r}{nearest(name, (*OWN, *known))}")
-    Events(options.get("events"))  # which raises for what is wrong with them
+    Events(options.get("events"))  # raises an error if they are wrong
 
 
 def _places(out: Any, checkpoint: Any, every: Any, resume: Any) -> tuple[str | None, str | None]:
-    """Return where `out` and `checkpoint` lead to now, whatever becomes of the working directory."""
+    """Return the absolute places of `out` and `checkpoint`, so that the working directory may change."""
     refuse_units(checkpoint_every=every)
     if not is_number(every) or not every > 0:
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
     flag("resume", resume)
     if out is not None and checkpoint is not None:
-        raise ValueError("give out= or checkpoint=, not both: out keeps finished members already.")
+        raise ValueError("give out= or checkpoint=, not both: out already stores finished members.")
     for name, path in (("out", out), ("checkpoint", checkpoint)):
         if path is not None and not isinstance(path, (str, os.PathLike)):
             raise TypeError(f"{name} must be a path, got {path!r}.")
     if resume and out is None and checkpoint is None:
-        raise ValueError("resume=True needs the place to go on from: out= or checkpoint=.")
+        raise ValueError("resume=True needs a place to resume from: pass out= or checkpoint=.")
     return None if out is None else location(out), None if checkpoint is None else absolute(checkpoint)
 
 
 def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: OwnTimes) -> Chunk:
-    """Return all members: their starts (m, n), parameters (m, p), p = 0 where there are none, and own times."""
+    """Return all members: initial states (m, n), parameters (m, p) with p = 0 if there are none, and own times."""
     problem = fun if isinstance(fun, Problem) else None
     if y0s is None:
         y0s = None if problem is None else problem.y0
         if y0s is None:
-            raise TypeError("ensemble: y0s is missing; only a Problem brings a start of its own, and not each does.")
+            raise TypeError("ensemble: y0s is missing; it can be omitted only for a Problem with an initial state.")
     starts = states("y0s", y0s)
     if problem is not None:
         params = problem.plain(params=params)["params"]
@@ -721,8 +728,8 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: Own
         raise ValueError(f"params must have the shape (p,) or (members, p), got {own.shape}.")
     if own.ndim == 2 and any(item.args for item in as_invariants(options.get("invariants", ()))):
         raise ValueError(
-            "ensemble: invariants with args, and params for each member: leave args out; the functions receive each "
-            "member's params as their last argument."
+            "ensemble: invariants must not have args if params differ between members: omit args; the functions "
+            "receive the params of each member as their last argument."
         )
     if options.get("args") is not None:
         own = floats(extra_arguments(options["args"], params))
@@ -730,7 +737,7 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any], times: Own
 
 
 def _bare(fun: Any) -> Any:
-    """A problem without what members do not need and other processes may not be able to take."""
+    """Return a problem without the functions that members do not need and that may not be picklable."""
     if not isinstance(fun, Problem) or fun.rhs is None:
         return fun
     return dataclasses.replace(fun, fun=_not_called, reference=None)
@@ -741,9 +748,9 @@ def _not_called(t: float, y: np.ndarray) -> np.ndarray:
 
 
 def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str]]:
-    """The plan by a member whose start `integrate` takes; its error where it takes none of some members.
+    """Return the plan, made from the first member with a valid start; raise the first error if none is found.
 
-    Also what the checks of the start found, by member: it holds for all that have the same parameters.
+    Also return the findings of the checks at the start, which apply to all members with the same parameters.
     """
     first: Exception | None = None
     starts, params = everyone.y0s, everyone.params
@@ -763,13 +770,15 @@ def _first_that_starts(task: Task, everyone: Chunk) -> tuple[Plan, dict[int, str
             alike: list[int] = np.flatnonzero((params == params[k]).all(axis=1)).tolist() if found else []
             return Plan(tried, ready), dict.fromkeys(alike, found)
     assert first is not None
-    # A transposed array meets the user's own function first, which may say little: jitted code says nothing at all.
-    first.add_note(f"ensemble: the rows of y0s are the members, here {len(starts)} of {starts.shape[1]} components.")
+    # A transposed y0s fails in the user's function, whose error may not explain that; jitted code explains nothing.
+    first.add_note(
+        f"ensemble: the rows of y0s are members; y0s has {len(starts)} rows of {starts.shape[1]} components."
+    )
     raise first
 
 
 def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
-    """Members in a chunk, by the problem alone: about a second's work, bounded in bytes, a multiple of the lanes."""
+    """Return the size of a chunk, which depends only on the problem: about one second of work, a multiple of LANES."""
     rhs = fun.rhs or fun.fun if isinstance(fun, Problem) else fun
     native = is_compiled(rhs) or isinstance(rhs, PointerFunction)
     budget = CHUNK_STEPS if native and plan.task.request.compiled is not False else INTERPRETED_STEPS
@@ -781,20 +790,20 @@ def _chunk_size(plan: Plan, members: int, fun: Any) -> int:
 
 
 def _check_memory(plan: Plan, members: int, rows: int, max_bytes: float | None) -> None:
-    """Refuse to gather more than fits."""
+    """Raise MemoryError if the results would need too much memory."""
     each = plan.size * plan.dtype.itemsize * (1 + rows) + 8 * (len(plan.names) * (3 + rows) + N_COUNTERS + 4)
     bound = most_bytes(members * each, max_bytes)
     if members * each > bound:
-        what = f"{rows} states each; raise save_every, take statistics (reduce=), write to a Zarr group (out=)"
-        mend = what if rows else "the last state of each; run them in parts"
+        many = f"{rows} states per member would be stored. Increase save_every, use reduce= or out="
+        advice = many if rows else "The last state of each member would be stored. Run the members in parts"
         raise MemoryError(
             f"{members} members of {plan.size} components need {members * each / 1e9:.3g} GB, the bound is "
-            f"{bound / 1e9:.3g} GB. Kept are {mend}, or raise max_bytes."
+            f"{bound / 1e9:.3g} GB. {advice}, or raise max_bytes."
         )
 
 
 def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
-    """Where the chunks run."""
+    """Return the pool that runs the chunks."""
     task, key = plan.task, uuid.uuid4().hex
     if executor is None or isinstance(executor, (int, np.integer)):
         plan.compile(progress=progress)
@@ -804,8 +813,8 @@ def _pool(executor: Any, plan: Plan, progress: bool) -> Pool:
         return FuturesPool(executor, partial(run_elsewhere, task, key), cores())
     if executor == "dask" or _is_of_dask(executor):
         if plan.pointers:
-            raise plan.pointers[0].unpicklable()  # Dask would bury it in pages of its own
-        # By name: the integrations are built on the package, and need what it does not.
+            raise plan.pointers[0].unpicklable()  # Dask's own message for it is very long
+        # Imported by name, because the integrations depend on this package and need further libraries.
         return import_module("eip_scipy.integrations.dask").pool(executor, task, key)
     raise TypeError(
         f"executor must be None, a number of threads, 'dask', a dask.distributed Client or an executor of "

@@ -1,4 +1,4 @@
-"""Intervals and times of saved states that each member has for itself."""
+"""Intervals and times of saved states that differ between members."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class OwnTimes(NamedTuple):
     Attributes
     ----------
     spans : list of (float, float) or None
-        None where all members have the same interval.
+        None if all members have the same interval.
     times : list of ndarray or None
-        None where all members have the same interval and times, or no times.
+        None if all members have the same interval and times, or no times.
     """
 
     spans: list[tuple[float, float]] | None = None
@@ -33,21 +33,21 @@ class OwnTimes(NamedTuple):
 
     @property
     def members(self) -> int:
-        """How many members have rows."""
+        """Number of members that have rows."""
         return len(self.spans or self.times or ())
 
     @property
     def name(self) -> str:
-        """The argument that has a row for each member."""
+        """Name of the argument that has a row for each member."""
         return "t_eval" if self.spans is None else "t_span"
 
     def part(self, first: int, last: int) -> OwnTimes:
-        """Return those of some members."""
+        """Return the intervals and times of some members."""
         spans = None if self.spans is None else self.spans[first:last]
         return OwnTimes(spans, None if self.times is None else self.times[first:last])
 
     def of(self, k: int) -> dict[str, Any]:
-        """Return what member `k` asks `integrate` for."""
+        """Return the arguments of `integrate` for member `k`."""
         found: dict[str, Any] = {}
         if self.spans is not None:
             found["t_span"] = self.spans[k]
@@ -57,7 +57,7 @@ class OwnTimes(NamedTuple):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """The settings that are compared when an ensemble is resumed."""
+        """Return the settings that are compared when an ensemble is resumed."""
         found: dict[str, Any] = {}
         if self.spans is not None:
             found["t_span"] = np.array(self.spans)
@@ -67,7 +67,7 @@ class OwnTimes(NamedTuple):
 
     @property
     def padded(self) -> np.ndarray:
-        """The times as rows (members, m) that end with nan."""
+        """Return the times as rows (members, m), padded with nan."""
         times = self.times or []
         out = np.full((len(times), max((t.size for t in times), default=0)), np.nan)
         for row, t in zip(out, times, strict=True):
@@ -76,12 +76,12 @@ class OwnTimes(NamedTuple):
 
 
 def own_times(fun: Any, t_span: Any, t_eval: Any, save_every: Any, reduce: Any) -> OwnTimes:
-    """Find out which of `t_span` and `t_eval` have a row for each member.
+    """Return the rows of `t_span` and `t_eval` for each member, if they have such rows.
 
     Raises
     ------
     ValueError
-        For rows of another shape, or together with `save_every` or `reduce`, which need the same times of all members.
+        If a row has a wrong shape, or with `save_every` or `reduce`, which need the same times for all members.
     """
     spans, times = None, None
     if _has_rows(t_span):

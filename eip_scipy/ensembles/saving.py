@@ -1,4 +1,4 @@
-"""An `EnsembleResult` as the plain fields that a file takes, and back."""
+"""Conversion of an `EnsembleResult` to plain fields for a file, and back."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ TUPLES = "names", "component_names"
 
 
 def packed(result: Any) -> dict[str, Any]:
-    """Return the fields of a result as arrays and what JSON holds."""
+    """Return the fields of a result as arrays and values that JSON can hold."""
     fields = dict(result)
     ends = fields.pop("end_invariants", None)
     fields["messages"] = shortened(fields.pop("message"))
     if not isinstance(fields["trajectories"], np.ndarray):
         fields["trajectories"] = None
-    if not isinstance(fields["invariants"], np.ndarray):  # which are in the store, as the trajectories are
+    if not isinstance(fields["invariants"], np.ndarray):  # they are in the store, as the trajectories are
         fields["invariants"] = ends
     statistics = fields.pop("statistics")
     if statistics is not None:
@@ -38,7 +38,7 @@ def packed(result: Any) -> dict[str, Any]:
 
 
 def unpacked(fields: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a result from what `packed` gave."""
+    """Return the fields of a result from the output of `packed`."""
     fields = dict(fields)
     fields["message"] = np.array(expanded(fields.pop("messages"), 0, len(fields["t"])), dtype=object)
     found = {name: fields.pop(f"statistics.{name}", None) for name in Statistics.__dataclass_fields__}
@@ -56,11 +56,11 @@ def unpacked(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def shortened(messages: Sequence[str]) -> dict[str, Any]:
-    """Return the messages of members as JSON holds them: the most frequent one, and the others by number."""
+    """Return the messages of members for JSON: the most frequent one, and the others by number."""
     usual = str(Counter(messages).most_common(1)[0][0])
     return {"usual": usual, "others": {str(k): str(text) for k, text in enumerate(messages) if text != usual}}
 
 
 def expanded(found: dict[str, Any], first: int, last: int) -> list[str]:
-    """Return the messages of members `first` to `last` from what `shortened` gave."""
+    """Return the messages of members `first` to `last` from the output of `shortened`."""
     return [found["others"].get(str(k), found["usual"]) for k in range(first, last)]

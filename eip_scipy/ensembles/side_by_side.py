@@ -1,4 +1,4 @@
-"""Which members of an ensemble go side by side, eight in a vector, and by which functions."""
+"""Vectorised members of an ensemble, in batches of eight: the conditions, and the functions for a batch."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ..engine.native import LibraryFunction, NativeFunctions, OctetFunctions
 __all__ = ["LANES", "need_compiling", "octet_functions", "why_one_by_one"]
 
 LANES = 8
-NAMES = ("rhs", "inv", "grad", "jacobian")  # of a run's functions
+NAMES = ("rhs", "inv", "grad", "jacobian")  # the functions of a run
 
 
 def why_one_by_one(history: Multistep | None, options: Options, schedule: Schedule, dtype: np.dtype) -> str:
-    """Why members with these options have to run one by one; "" where they take the same fixed steps."""
+    """Return the reason why members with these options cannot be vectorised; "" if they have the same fixed steps."""
     reasons = {
         "steps are adaptive": options.adaptive,
-        "the interval is endless": schedule.span.n_steps >= UNBOUNDED,
+        "the interval is infinite": schedule.span.n_steps >= UNBOUNDED,
         "the state is complex": np.dtype(dtype).kind == "c",
         "events may end members at different times": schedule.g.size > 0,
         "there are fewer steps than the method's history has": history is not None and history.brief,
@@ -37,12 +37,12 @@ def why_one_by_one(history: Multistep | None, options: Options, schedule: Schedu
 
 
 def octet_functions(functions: NativeFunctions) -> OctetFunctions:
-    """The functions of a run for eight members.
+    """Return the functions of a run for a batch of eight members.
 
     Raises
     ------
     NotCompilableError
-        Where there are none, with the name of the function and the reason.
+        If a function has no such form; the message names it and the reason.
     """
     owner = functions.owner
     found = {name: [_of_eight(native) for native in owner.get(name, [])] for name in NAMES}
@@ -56,7 +56,7 @@ def octet_functions(functions: NativeFunctions) -> OctetFunctions:
 
 
 def need_compiling(functions: NativeFunctions) -> bool:
-    """Whether some of them are Numba functions, which are compiled once more for eight members."""
+    """Return True if some functions are Numba functions, which must be compiled again for eight members."""
     return any(
         not isinstance(native.function, (PointerFunction, LibraryFunction))
         for name in NAMES
@@ -65,18 +65,18 @@ def need_compiling(functions: NativeFunctions) -> bool:
 
 
 def _of_eight(native: Native) -> tuple[Any, int]:
-    """A function of eight members as the engine takes it, and how many octets it fills."""
+    """Return a function of eight members for the engine, and the number of floats that it fills for each."""
     one = native.function
     if one is None:
-        raise NotCompilableError("the gradient of an invariant comes from differences")
+        raise NotCompilableError("the gradient of an invariant is computed by differences")
     if isinstance(one, LibraryFunction):
         if not one.octet_address:
             raise NotCompilableError(f"{one.__name__} of this package is written for one member at a time")
         return one, native.floats
     if isinstance(one, PointerFunction):
         if not one.octet_address:
-            raise NotCompilableError(f"{one.name} is a C function of one member, without that of eight (CFunctions)")
+            raise NotCompilableError(f"{one.name} is a C function without a form for eight members (CFunctions)")
         return one.octet_address, native.floats
-    from .octets.functions import compiled_for_octets  # which loads Numba
+    from .octets.functions import compiled_for_octets  # loads Numba
 
     return compiled_for_octets(one).address, native.floats

@@ -1,4 +1,4 @@
-"""Statistics over the members of an ensemble, gathered chunk by chunk."""
+"""Statistics over the members of an ensemble, accumulated chunk by chunk."""
 
 from __future__ import annotations
 
@@ -13,18 +13,22 @@ __all__ = ["Statistics", "merge", "statistics_of"]
 
 @dataclass(frozen=True, repr=False)
 class Statistics:
-    """Mean, variance and extremes over members, at each of m times, of k quantities.
+    """Mean, variance and extremes of k quantities over members, at each of m times.
 
-    Members that failed before a time are left out there; `count` says how many remain.
+    Members that failed before a time are not included at that time; `count` is the number of the others.
 
     Attributes
     ----------
     t : ndarray, shape (m,)
+        Times.
     count : ndarray, shape (m,)
+        Number of members included.
     mean : ndarray, shape (k, m)
+        Mean values.
     squares : ndarray, shape (k, m)
         Sum of the squares of the deviations from the mean.
     min, max : ndarray, shape (k, m)
+        Smallest and largest values.
     """
 
     t: np.ndarray
@@ -36,12 +40,12 @@ class Statistics:
 
     @property
     def var(self) -> np.ndarray:
-        """Variance (k, m), that of the members themselves: divided by their number; nan where there are none."""
+        """Variance (k, m) of the members, divided by their number; nan if there are none."""
         return self.squares / np.where(self.count > 0, self.count, np.nan)
 
     @property
     def std(self) -> np.ndarray:
-        """Square root of the variance."""
+        """Standard deviation (k, m)."""
         return np.sqrt(self.var)
 
     def __repr__(self) -> str:
@@ -51,32 +55,33 @@ class Statistics:
 
 
 def statistics_of(reduce: Any, t: np.ndarray, states: np.ndarray) -> Statistics | None:
-    """Statistics of some members.
+    """Compute the statistics of some members.
 
     Parameters
     ----------
     reduce : "state" or callable
-        The quantities: the states themselves, or ``reduce(t, y) -> float or (k,)``.
+        Quantities: the states themselves, or ``reduce(t, y) -> float or (k,)``.
     t : ndarray, shape (m,)
+        Times.
     states : ndarray, shape (members, m, n)
-        With nan where there is none.
+        States; nan if there is none.
 
     Returns
     -------
     Statistics or None
-        None where no member has a state, so that the number of quantities is not known.
+        None if no member has a state, so that the number of quantities is unknown.
 
     Raises
     ------
     TypeError
-        When the quantities are no real numbers.
+        If the quantities are not real numbers.
     """
     there = ~np.isnan(states).any(axis=2)
     values = states if isinstance(reduce, str) else _values(reduce, t, states, there)
     if values is None:
         return None
     if values.dtype.kind == "c":
-        raise TypeError("reduce: statistics are of real numbers; pass a real function reduce(t, y) of the state.")
+        raise TypeError("reduce: the quantities are complex, expected real numbers; pass a real function reduce(t, y).")
     count = there.sum(axis=0)
     weight = there[:, :, None]
     divisor = np.maximum(count, 1)[:, None]
@@ -89,7 +94,7 @@ def statistics_of(reduce: Any, t: np.ndarray, states: np.ndarray) -> Statistics 
 
 
 def _values(reduce: Callable[..., Any], t: np.ndarray, states: np.ndarray, there: np.ndarray) -> np.ndarray | None:
-    """The user's quantities (members, m, k), nan where there is no state."""
+    """Return the user's quantities (members, m, k), nan if there is no state."""
     out: np.ndarray | None = None
     for i, j in zip(*np.nonzero(there), strict=True):
         value = np.atleast_1d(np.asarray(reduce(float(t[j]), states[i, j].copy())))
@@ -103,9 +108,9 @@ def _values(reduce: Callable[..., Any], t: np.ndarray, states: np.ndarray, there
 
 
 def merge(first: Statistics | None, second: Statistics | None) -> Statistics | None:
-    """Statistics of two groups together (Chan, Golub & LeVeque 1983, eq. 2.1).
+    """Return the statistics of two groups together (Chan, Golub & LeVeque 1983, eq. 2.1).
 
-    The order matters in the last bits: merge chunks in their own order.
+    The order affects the last bits: merge chunks in order.
     """
     if first is None or second is None:
         return first if second is None else second

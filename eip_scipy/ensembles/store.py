@@ -1,4 +1,4 @@
-"""Ensembles on disk that a later call resumes: a Zarr group that grows chunk by chunk, or a checkpoint file."""
+"""Ensembles on disk that a later call can resume: a Zarr group written chunk by chunk, or a checkpoint file."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ __all__ = ["CheckpointStore", "Store", "ZarrStore", "location", "require_same_fu
 
 KIND = "ensemble"
 LABEL = "eip_scipy_ensemble"
-# Metadata of format 2 may name the codec that unpickles. A group's own file may hold metadata of any format.
+# Format 2 is refused because its metadata may name a codec that unpickles. Consolidated metadata may be of any format.
 FORMAT: dict[str, Any] = {"zarr_format": 3, "use_consolidated": False}
-# Arrays of a group: the field of Members, and the axes after that of the members. The status is written last.
+# Arrays of a group: the field of Members, and the axes after the member axis. The status is written last.
 ARRAYS: dict[str, tuple[str, tuple[str, ...]]] = {
     "y": ("y", ("component",)),
     "states": ("saved", ("component", "time")),
@@ -47,23 +47,23 @@ FILLED = {"message": "", "status": NOT_RUN}
 CODECS = {"blosc", "bytes", "crc32c", "gzip", "transpose", "vlen-bytes", "vlen-utf8", "zstd"}
 SAME = 1e-9
 EVENTS_IN_A_FILE = 4096
-# Writing a checkpoint takes at most a twentieth of the time.
+# Writing a checkpoint takes at most 5 % of the time.
 LEAST_RATIO = 19.0
 
 
 class _Store:
-    """Finished chunks on disk: what both kinds have in common.
+    """Finished chunks on disk; base class of both kinds.
 
     Attributes
     ----------
     path : str
         Absolute path, or URL.
     finished : int
-        Number of members whose results were there at the start; whole chunks, from the first one on.
+        Number of members whose results were stored at the start: complete chunks, beginning with the first.
     statistics : Statistics or None
-        Statistics of these members, if the store keeps them.
+        Statistics of these members, if the store contains them.
     states, saved_values : zarr.Array or None
-        Saved states (members, n, times) and their invariants (members, l, times), if only the store keeps them.
+        Saved states (members, n, times) and their invariants (members, l, times), if they are only in the store.
     """
 
     path: str
@@ -74,34 +74,34 @@ class _Store:
     _lock: Lock | None = None
 
     def flush(self) -> None:
-        """Write what is waiting."""
+        """Write results that have not been written yet."""
 
     def close(self) -> None:
-        """Let other ensembles in."""
+        """Release the lock."""
         if self._lock is not None:
             self._lock.close()
 
     def _require_same(self, there: dict[str, Any], here: dict[str, Any], missing: list[str]) -> None:
-        """Compare what makes two ensembles the same, and refuse a store that lacks something."""
+        """Compare the identity of two ensembles; raise CheckpointError if they differ or an array is missing."""
         checkpoint.require_same(self.path, there.get("settings"), here["settings"])
         one, other = ([complex(text) for text in found["start"]] for found in (there, here))
         if len(one) != len(other) or not np.allclose(one, other, rtol=SAME, atol=0.0, equal_nan=True):
             raise _other_functions(self.path, f"at the start ({one[:4]} there, {other[:4]} here)")
         if missing:
             raise CheckpointError(
-                f"{self.path!r} is no ensemble of eip_scipy, or was written by an earlier version of eip_scipy: "
-                f"{missing[0]!r} is missing. Resume it with that version, or name another place to start anew."
+                f"{self.path!r} is not an ensemble of eip_scipy, or was written by an earlier version of eip_scipy: "
+                f"{missing[0]!r} is missing. Resume it with that version, or use another place for a new ensemble."
             )
         checkpoint.warn_of_other_versions(self.path, there, stacklevel=users_level())
 
 
 def require_same_functions(path: str, there: np.ndarray, here: np.ndarray, sizes: np.ndarray, first: int) -> None:
-    """Compare what functions give where a member of the last finished chunk ended.
+    """Compare the values of functions at the end of a member of the last finished chunk.
 
     Raises
     ------
     CheckpointError
-        Where they differ by more than another machine's rounding.
+        If they differ by more than rounding errors on another machine.
     """
     if there.size and not (there.shape == here.shape and bool(np.all(np.abs(there - here) <= SAME * sizes))):
         raise _other_functions(path, f"where a member from number {first} on ended")
@@ -110,37 +110,38 @@ def require_same_functions(path: str, there: np.ndarray, here: np.ndarray, sizes
 def _other_functions(path: str, where: str) -> CheckpointError:
     return CheckpointError(
         f"{path!r} belongs to another ensemble: fun or an invariant had other values {where}. Resume with the "
-        "functions of that run, or name another place."
+        "functions of that run, or use another place."
     )
 
 
 class ZarrStore(_Store):
-    """A group of arrays whose first axis is the member, one Zarr chunk for each chunk of the ensemble.
+    """A group of arrays whose first axis is the member, with one Zarr chunk for each chunk of the ensemble.
 
-    The status of a chunk's members is written last: where it is, the chunk is whole. (Zarr puts each file in its place
-    by renaming it.) A group in the local file system is locked, and written to while it is the one that was opened.
+    The status of the members of a chunk is written last: if it is present, the chunk is complete. (Zarr writes each
+    file under a temporary name and renames it.) A group in the local file system is locked, and is written to only
+    while it is the group that was opened.
 
     Parameters
     ----------
     path : path-like or str
         A folder, or the URL of a store.
     identity : dict
-        What makes two ensembles the same.
+        Identity of the ensemble, which must agree when it is resumed.
     resume : bool
     empty : Members
-        One chunk's room, for shapes and types.
+        Buffers of one chunk, which define shapes and types.
     times : ndarray, shape (m,) or (members, m)
     members : int
     events : int
-        How many there are, of which times and states are kept.
+        Number of events whose times and states are stored.
 
     Raises
     ------
     ImportError
-        Without zarr.
+        If zarr is missing.
     CheckpointError
-        When there is something at `path` and `resume` is false, or it is no such group, or that of another ensemble, or
-        another ensemble is writing there.
+        If `path` exists and `resume` is false, is not such a group, belongs to another ensemble, or is in use by
+        another ensemble.
     """
 
     def __init__(
@@ -171,26 +172,26 @@ class ZarrStore(_Store):
         self.states, self.saved_values = self._arrays.get("states"), self._arrays.get("invariants")
 
     def _open(self, zarr: Any, identity: dict[str, Any], times: np.ndarray, resume: bool) -> Any:
-        """Go on with what is there, or begin; return what the group says of itself."""
+        """Open the existing group or create one; return its identity."""
         mode: Any = "w-"
         if self._exists(zarr):
             if not resume:
                 raise checkpoint.existing(self.path, "ensemble")
             if (found := self._existing(zarr, identity, times)) is not None:
                 return found
-            mode = "w"  # left by us before it was whole
+            mode = "w"  # the creation of this group was interrupted
         try:
             group = zarr.open_group(self._place, mode=mode, attributes={LABEL: None}, **FORMAT)
         except FileExistsError as error:
-            raise CheckpointError(f"{self.path!r} is no ensemble of eip_scipy: {error}") from error
+            raise CheckpointError(f"{self.path!r} is not an ensemble of eip_scipy: {error}") from error
         except OSError:
-            with suppress(OSError):  # where Zarr has come no further than to the folder
+            with suppress(OSError):  # Zarr may have created only the folder
                 os.rmdir(self._place)
             raise
         self._arrays = {name: group.create_array(name, **how) for name, how in self._layout(times).items()}
         if times.size:
             self._arrays[_name_of(times)][...] = times
-        # Last: a group without it was left before it was whole.
+        # Written last: the creation of a group without it was interrupted.
         group.attrs[LABEL] = {**checkpoint.origin(), **identity}
         return group.attrs[LABEL]
 
@@ -204,7 +205,7 @@ class ZarrStore(_Store):
         return True
 
     def _existing(self, zarr: Any, identity: dict[str, Any], times: np.ndarray) -> dict[str, Any] | None:
-        """Open the group that is there; None where it was left before it was whole."""
+        """Open the existing group; return its identity, or None if its creation was interrupted."""
         try:
             group = zarr.open_group(self._place, mode="r+", **FORMAT)
             found: dict[str, Any] | None = group.attrs[LABEL]
@@ -215,14 +216,14 @@ class ZarrStore(_Store):
             layout = self._layout(times)
             self._require_same(found, identity, [name for name in layout if name not in group])
             self._arrays = {name: self._plain(name, group[name], how) for name, how in layout.items()}
-        except (KeyError, TypeError, ValueError, OSError) as error:  # TypeError: Zarr's, for codecs in a wrong order
+        except (KeyError, TypeError, ValueError, OSError) as error:  # Zarr raises TypeError for codecs in a wrong order
             old = self._lock is not None and os.path.exists(f"{self._place}/.zgroup")
             why = "it is a Zarr group of format 2, whose metadata may name code to run" if old else error
-            raise CheckpointError(f"{self.path!r} is no ensemble of eip_scipy: {why}") from error
+            raise CheckpointError(f"{self.path!r} is not an ensemble of eip_scipy: {why}") from error
         return found
 
     def _plain(self, name: str, there: Any, how: dict[str, Any]) -> Any:
-        """Return an array of the group whose reading runs no code from elsewhere, and takes the memory expected."""
+        """Return an array of the group, checked that reading it runs no foreign code; check its shape."""
         metadata = there.metadata.to_dict()
         if metadata.get("node_type") != "array":
             raise ValueError(f"its {name!r} is not an array")
@@ -237,7 +238,7 @@ class ZarrStore(_Store):
         if there.shape[grows:] != shape[grows:] or there.chunks != chunks:
             raise CheckpointError(
                 f"{self.path!r} is damaged: its array {name!r} has the shape {there.shape} in chunks of "
-                f"{there.chunks}; expected {shape} in chunks of {chunks}. Name another place to start anew."
+                f"{there.chunks}; expected {shape} in chunks of {chunks}. Use another place for a new ensemble."
             )
         return there
 
@@ -249,12 +250,7 @@ class ZarrStore(_Store):
             raise CheckpointError(f"cannot write to {self.path!r}: {error.strerror or error}") from error
 
     def _require_own(self) -> None:
-        """See that the group in the local file system is the one that was opened.
-
-        Raises
-        ------
-        CheckpointError
-        """
+        """Raise CheckpointError unless the group in the local file system is the one that was opened."""
         if self._lock is None:
             return
         try:
@@ -268,7 +264,7 @@ class ZarrStore(_Store):
             )
 
     def _layout(self, times: np.ndarray) -> dict[str, dict[str, Any]]:
-        """Return what the arrays of this ensemble are created by."""
+        """Return the arguments with which the arrays of this ensemble are created."""
         layout: dict[str, dict[str, Any]] = {}
 
         def array(name: str, dtype: Any, axes: tuple[str, ...], shape: tuple[int, ...], rows: int, chunk: int) -> None:
@@ -277,7 +273,7 @@ class ZarrStore(_Store):
             layout[name] = {"shape": (rows, *shape), "chunks": chunks, "dtype": dtype, "dimension_names": axes}
             layout[name] |= {"fill_value": fill}
 
-        # xarray takes no two-dimensional array by the name of its axis.
+        # xarray rejects a two-dimensional array with the name of one of its axes.
         rows = "time" if times.ndim == 1 else "row"
         for name, (field, axes) in ARRAYS.items():
             if "time" not in axes or times.size:
@@ -293,7 +289,7 @@ class ZarrStore(_Store):
             array("event_count", int, ("member", "event"), (self._events,), self._members, self._chunk)
             array("event_t", float, ("happened",), (), 0, EVENTS_IN_A_FILE)
             array("event_y", state, ("happened", "component"), (n,), 0, EVENTS_IN_A_FILE)
-        # Room for what a chunk's functions are recognised by.
+        # Values by which the functions of a chunk are identified.
         width = COMPARED + self._empty.target.shape[1]
         array("known_by", float, ("chunk", "value"), (width,), -(-self._members // self._chunk), 1)
         return layout
@@ -307,7 +303,7 @@ class ZarrStore(_Store):
         return none._replace(**found, happened=unflattened(self._flat(first, last)))
 
     def _flat(self, first: int, last: int) -> Flat:
-        """Return the events of members `first` to `last`, behind those of the members before."""
+        """Return the events of members `first` to `last`, which follow those of the members before."""
         if not self._events:
             return Flat(np.zeros((last - first, 0), np.int64), np.zeros(0), np.zeros((0, 1)))
         counts = self._arrays["event_count"][:last]
@@ -315,7 +311,7 @@ class ZarrStore(_Store):
         return Flat(counts[first:], self._arrays["event_t"][begin:end], self._arrays["event_y"][begin:end])
 
     def _write_events(self, first: int, members: Members) -> None:
-        """Write the events of a chunk, in place of those of one that was broken off before it was whole."""
+        """Write the events of a chunk; they replace those of an incomplete chunk."""
         flat = flattened(members.happened, self._events, members.y.shape[1], members.y.dtype)
         self._arrays["event_count"][first : first + len(members.t)] = flat.counts
         begin = int(self._arrays["event_count"][:first].sum())
@@ -326,14 +322,14 @@ class ZarrStore(_Store):
                 self._arrays[name][begin:end] = values
 
     def known_by(self, first: int) -> np.ndarray:
-        """Return what was written with the chunk that starts with number `first`, to recognise its functions."""
+        """Return the values stored with the chunk that starts at number `first`, which identify its functions."""
         row = self._arrays["known_by"][first // self._chunk]
         return row[~np.isnan(row)]
 
     def write(
         self, first: int, members: Members, known_by: np.ndarray, whole: Members, statistics: Statistics | None
     ) -> None:
-        """Write the results of a chunk that starts with number `first`; its functions are recognised by `known_by`."""
+        """Write the results of a chunk that starts at number `first`; `known_by` identifies its functions."""
         self._require_own()
         with self._written():
             if self._events:
@@ -345,21 +341,21 @@ class ZarrStore(_Store):
 
 
 class CheckpointStore(_Store):
-    """A checkpoint file with the finished members and their statistics, written anew every so many seconds.
+    """A checkpoint file with the finished members and their statistics, rewritten every `every` seconds.
 
     Parameters
     ----------
     path : path-like
     identity : dict
-        What makes two ensembles the same.
+        Identity of the ensemble, which must agree when it is resumed.
     resume : bool
     every : float
-        Seconds from one writing to the next; more where it would take over a twentieth of the time.
+        Seconds from one writing to the next; longer if writing would take more than 5 % of the time.
 
     Raises
     ------
     CheckpointError
-        When there is a file and `resume` is false, or it is damaged, or that of another ensemble, or cannot be written.
+        If the file exists and `resume` is false, is damaged, belongs to another ensemble, or cannot be written.
     """
 
     def __init__(self, path: Any, identity: dict[str, Any], resume: bool, every: float) -> None:
@@ -375,7 +371,7 @@ class CheckpointStore(_Store):
         self._written, self._cost = time.perf_counter(), 0.0
 
     def _open(self, resume: bool) -> None:
-        """Read what is there, or begin."""
+        """Read the existing file, or create one."""
         if not os.path.lexists(self.path):
             checkpoint.write(self.path, {"kind": KIND, **self._identity, "finished": 0}, {})
             return
@@ -399,15 +395,15 @@ class CheckpointStore(_Store):
         return Members(**arrays, message=message, happened=unflattened(flat)[first:last])
 
     def known_by(self, first: int) -> np.ndarray:
-        """Return what was written with the last chunk, to recognise its functions; maybe nothing."""
+        """Return the values stored with the last chunk, which identify its functions; the array may be empty."""
         return self._arrays["known_by"]
 
     def write(
         self, first: int, members: Members, known_by: np.ndarray, whole: Members, statistics: Statistics | None
     ) -> None:
-        """Take the results of a chunk that starts with number `first`, the last part of `whole` so far.
+        """Take the results of a chunk that starts at number `first`, the last part of `whole` so far.
 
-        Its functions are recognised by `known_by`; `statistics` are those of `whole`.
+        `known_by` identifies its functions; `statistics` are those of `whole`.
         """
         self._waiting = first + len(members.t), known_by, whole, statistics
         since = time.perf_counter() - self._written
@@ -415,7 +411,7 @@ class CheckpointStore(_Store):
             self.flush()
 
     def flush(self) -> None:
-        """Write what has come since the last time; a disk that is full then is a warning, the former file stays."""
+        """Write new results; a full disk only causes a warning, and the previous file is kept."""
         if self._waiting is None:
             return
         begin = time.perf_counter()
@@ -431,7 +427,7 @@ class CheckpointStore(_Store):
         try:
             checkpoint.write(self.path, header, arrays)
         except CheckpointError as error:
-            warnings.warn(f"{error}; the former checkpoint stays", RuntimeWarning, stacklevel=users_level())
+            warnings.warn(f"{error}; the previous checkpoint is kept", RuntimeWarning, stacklevel=users_level())
         self._waiting = None
         self._written = time.perf_counter()
         self._cost = self._written - begin
@@ -441,23 +437,23 @@ Store = ZarrStore | CheckpointStore
 
 
 def _as_stored(value: Any) -> np.ndarray:
-    """Return a field of Members as the group has it, or one of the group as Members has it."""
+    """Convert a field of Members to the axes of the group, or back."""
     array = np.array(value, dtype=object) if isinstance(value, list) else value
     return array.swapaxes(1, 2) if array.ndim == 3 else array
 
 
 def _name_of(times: np.ndarray) -> str:
-    """Return the name of the array of times, which are common to all members or of each."""
+    """Return the name of the array of times, which are common to all members or different for each."""
     return "time" if times.ndim == 1 else "times"
 
 
 def is_url(path: str) -> bool:
-    """Return whether Zarr finds a store of this name elsewhere than in the local file system."""
+    """Return True if a path is a URL, not a place in the local file system."""
     return "://" in path
 
 
 def location(path: str | os.PathLike[str]) -> str:
-    """Return where a path leads to now; a URL as it is."""
+    """Return the absolute path; a URL is returned unchanged."""
     text = os.fspath(path)
     return text if is_url(text) else absolute(text)
 

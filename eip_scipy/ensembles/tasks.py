@@ -1,8 +1,8 @@
-"""The members of an ensemble: one driver, set up once, that runs them one after the other.
+"""The members of an ensemble: a driver that is set up once and runs them one after the other, or in batches.
 
-What the members share is a `Task`, which travels to other processes; in each of them it becomes a `Plan`, with
-compiled functions and buffers, which `run_members` runs. A member's result depends on nothing but the task, its start
-and its parameters: it is that of `integrate`, bit for bit, whatever ran before it and beside it.
+A `Task` contains everything that members share, and can be sent to other processes. In each process it becomes a
+`Plan`, with compiled functions and buffers, which `run_members` runs. The result of a member depends only on the task,
+its start and its parameters: it agrees bit by bit with `integrate`, regardless of the other members.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from .side_by_side import need_compiling, octet_functions, why_one_by_one
 __all__ = ["COMPARED", "FAILED", "LISTS", "NOT_RUN", "Members", "Plan", "StoppedError", "Task", "run_members"]
 
 FAILED, NOT_RUN = -1, -2
-# Steps of the first call of the engine; how long one may take.
+# Number of steps in the first call of the engine, and the target duration of a call.
 FIRST_STEPS, SWEEP_SECONDS = 1024, 0.1
 ENDS = (ARRIVED, ENDED_BY_EVENT)
 BY_MEMBER = (
     *("starts", "params", "first_steps", "y", "t", "status", "max_defect", "counters", "max_correction", "figures"),
     "suspects",
 )
-LEAST_WORK = 3e7  # floats times steps, a second or two: compiling functions for eight members takes as long
+LEAST_WORK = 3e7  # floats times steps, one or two seconds: compiling functions for eight members takes as long
 COMPARED = 16
-LISTS = "message", "happened"  # of the fields of Members; the others are arrays
+LISTS = "message", "happened"  # fields of Members that are lists; the others are arrays
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 SHARED = OwnTimes()
 
@@ -54,20 +54,20 @@ class StoppedError(Exception):
 
 @dataclass(frozen=True)
 class Task:
-    """What all members share, as it travels to other processes.
+    """The part of an ensemble that all members share, in a form that can be sent to other processes.
 
     Attributes
     ----------
     request : Request
-        What `integrate` is asked for a member whose start it takes: all that members share.
+        Arguments of `integrate` for one member with a valid start.
     reduce : callable, "state" or None
-        What `Statistics` are wanted of.
+        Quantity of which `Statistics` are computed.
     keep : bool
-        Whether the saved states themselves are wanted.
+        True if the saved states themselves are needed.
     members : int
-        How many there are in all.
+        Total number of members.
     rows : int or None
-        States that are saved at most, where members have intervals or times of their own.
+        Largest number of saved states of a member, if members have different intervals or times.
     """
 
     request: Request
@@ -79,39 +79,41 @@ class Task:
     def prepared(
         self, y0: np.ndarray, params: np.ndarray | None, own: Mapping[str, Any] = NOTHING, *, check_start: bool = False
     ) -> Prepared:
-        """Prepare the run of one member as `integrate` does; `own` are its interval and times."""
+        """Prepare the run of one member as `integrate` does; `own` contains its interval and times."""
         return prepared(replace(self.request, y0=y0, params=params, **own), check_start=check_start)
 
 
 class Members(NamedTuple):
-    """What some members came to.
+    """Results of some members.
 
     Attributes
     ----------
     y : ndarray, shape (m, n)
         Last states.
     t : ndarray, shape (m,)
-        Their times.
+        Times of the last states.
     status : ndarray, shape (m,)
-        As in `integrate`: 0, 1, or FAILED; NOT_RUN where nothing was computed.
+        As in `integrate`: 0, 1, or FAILED; NOT_RUN for members that did not run.
     message : list of str
+        Reason for the end of each member.
     max_defect : ndarray, shape (m, l)
+        Largest invariant errors.
     counters : ndarray, shape (m, N_COUNTERS)
-        Those of the step, in the places that `result` names.
+        Counters of the step.
     max_correction : ndarray, shape (m,)
-        In local errors.
+        Largest correction in units of the local error.
     side_by_side : ndarray of bool, shape (m,)
-        Whether the member ran in a vector with others.
+        True for members that ran in a batch with others.
     trusted : ndarray of bool, shape (m,)
-        Whether it did not fail and nothing speaks against it.
+        True for members that did not fail and are reliable.
     saved : ndarray, shape (m, times, n)
-        States at the plan's `times`; nan after the end of a member that did not reach them. No times: shape (m, 0, n).
+        States at the `times` of the plan; nan after the end of a member. Shape (m, 0, n) without times.
     saved_values : ndarray, shape (m, times, l)
-        Values of the invariants there.
+        Values of the invariants in the saved states.
     values, target : ndarray, shape (m, l)
-        Values of the invariants in the last states, and those that were kept.
+        Values of the invariants in the last states, and their targets.
     happened : list of Happened
-        Of each member the times and states of its events.
+        Times and states of the events of each member.
     """
 
     y: np.ndarray
@@ -131,7 +133,7 @@ class Members(NamedTuple):
 
     @classmethod
     def joined(cls, parts: Sequence[Members]) -> Members:
-        """Return the members of several parts in their order."""
+        """Return the members of several parts, in order."""
         fields: dict[str, Any] = {}
         for name in cls._fields:
             given = [getattr(part, name) for part in parts]
@@ -140,7 +142,7 @@ class Members(NamedTuple):
 
     @classmethod
     def empty(cls, m: int, n: int, dtype: Any, invariants: int, times: int) -> Members:
-        """Members that did not run."""
+        """Return the results of `m` members that did not run."""
         return cls(
             y=np.full((m, n), np.nan, dtype),
             t=np.full(m, np.nan),
@@ -160,33 +162,33 @@ class Members(NamedTuple):
 
 
 class Plan:
-    """A task in one process: compiled where it can be, with a driver for each thread that asks for one.
+    """A task in one process, compiled if possible, with a driver for each thread that needs one.
 
     Attributes
     ----------
     task : Task
     why_not : str or None
-        Why the members run interpreted; None: they are compiled.
+        Reason why the members run interpreted; None if they are compiled.
     one_by_one : str
-        Why the members run one after the other; "" where they run side by side. Known when the plan is compiled.
+        Reason why the members run one after the other; "" if they are vectorised. Known after compilation.
     names : tuple of str
-        Of the l invariants.
+        Names of the l invariants.
     component_names : tuple of str or None
-        Of the state, where a problem names them.
+        Names of the components of the state, if a problem defines them.
     times : ndarray, shape (rows,)
-        Times at which states are saved; none where only the last state is wanted.
+        Times at which states are saved; empty if only the last state is needed.
     n_steps : int or None
-        Steps of one member, where that is known.
+        Number of steps of one member, if it is known.
     pointers : list of PointerFunction
-        The C functions by pointer, which no other process takes.
+        C functions given as pointers, which cannot be sent to another process.
     variations : Variations or None
-        The derivatives that members carry behind their states.
+        The derivatives that members integrate with their states.
     described_columns : dict or None
         The field ``columns`` of the result.
     """
 
     def __init__(self, task: Task, ready: Prepared | None = None) -> None:
-        """`ready`: the task's own member, where it is prepared already."""
+        """Create the plan; `ready` is the member of the task if it has been prepared already."""
         self.task = task
         self._ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
         schedule, run = self._ready.schedule, self._ready.run
@@ -206,21 +208,21 @@ class Plan:
         self._together, self._idle = False, list[Sweeper]()
 
     def compile(self, *, progress: bool = False) -> Plan:
-        """Make the plan itself ready to run, before there are threads that would all compile."""
+        """Compile the functions and return the plan itself; done before threads start, which would all compile."""
         ready = self._ready
         loop = Loop(replace(ready, request=replace(ready.request, progress=progress)), Keeper())
         self.why_not = loop.why_not
         own_targets = any(item.target is not None for item in ready.run.invariants.items)
         own_start = ready.run.identity["project_initial"] or own_targets or self.task.rows is not None
-        by_differences = bool(ready.run.invariants.by_differences)  # whose shifts depend on the start
+        by_differences = bool(ready.run.invariants.by_differences)  # their shifts depend on the start
         carries = bool(ready.run.invariants.balances.items) or self.variations is not None
         self._together = self.why_not is None and not (own_start or by_differences or carries)
         if self.task.rows is not None:
-            own = "members have intervals or times of their own"
+            own = "members have different intervals or times"
         elif carries:
-            own = f"each run carries its {'balances' if self.variations is None else 'derivatives'} by itself"
+            own = f"the runs have {'balances' if self.variations is None else 'derivatives'}"
         elif by_differences:
-            own = "the gradient of an invariant comes from differences"
+            own = "the gradient of an invariant is computed by differences"
         else:
             own = "the start of each member is projected, or an invariant has a target"
         self.one_by_one = self.why_not or own
@@ -230,34 +232,34 @@ class Plan:
         return self
 
     def empty(self, m: int) -> Members:
-        """Room for `m` members."""
+        """Return buffers for `m` members."""
         return Members.empty(m, self.size, self.dtype, len(self.names), self.times.size)
 
     def states(self, members: Members) -> tuple[np.ndarray, np.ndarray]:
-        """Times (m,) and states (members, m, n) to look at: saved ones, else the last; nan where a member failed."""
+        """Return times (m,) and states (members, m, n): the saved ones, else the last ones; nan if a member failed."""
         if self.times.size:
             return self.times, members.saved
         last = np.where((members.status >= 0)[:, None], members.y, np.nan)
         return np.array([self.t_bound]), last[:, None]
 
     def loop(self, y0: np.ndarray, params: np.ndarray, own: Mapping[str, Any] = NOTHING) -> Loop:
-        """Return the run of one member by itself; `own` are its interval and times."""
+        """Return the run of a single member; `own` contains its interval and times."""
         return Loop(self._prepared(y0, params, own), Keeper())
 
     def _prepared(self, y0: np.ndarray, params: np.ndarray, own: Mapping[str, Any] = NOTHING) -> Prepared:
         return self.task.prepared(y0, None if self.task.request.params is None else params, own)
 
     def identity(self, starts: np.ndarray, params: np.ndarray, chunk: int, own: OwnTimes) -> dict[str, Any]:
-        """What makes two ensembles the same, as JSON holds it: settings, and what their functions give at one start."""
+        """Return what identifies an ensemble, in a form for JSON: settings, and values of its functions at a start."""
         settings = self._ready.identity(starts, params) | {"chunk": chunk}
         settings |= {name: plain(value) for name, value in own.identity.items()}
         return {"settings": settings, "start": self._start_values}
 
     def known_by(self, y0s: np.ndarray, params: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
-        """What the functions give at the end of the first of these members that came to one, and how large they are.
+        """Return values of the functions at the end of the first member that has ended, and the sizes of their terms.
 
-        By it they are recognised when an ensemble goes on, as by what they give at the start. Nothing where no member
-        came to an end, or the functions fail there.
+        They identify the functions when an ensemble is resumed. Both arrays are empty if no member has ended or the
+        functions fail there.
         """
         nothing, ended = np.zeros(0), np.flatnonzero(members.status >= 0)
         if not ended.size:
@@ -277,7 +279,7 @@ class Plan:
 
     @contextmanager
     def driver(self) -> Iterator[Sweeper | None]:
-        """A driver that no other thread uses now; None where each member needs its own."""
+        """Yield a driver that no other thread is using; None if each member needs its own."""
         if not self._together:
             yield None
             return
@@ -291,12 +293,12 @@ class Plan:
 
 
 def saved_times(schedule: Schedule) -> np.ndarray:
-    """Times of the rows that a run saves; none where it saves its two ends only.
+    """Return the times of the rows that a run saves; empty if it saves only its two ends.
 
     Raises
     ------
     ValueError
-        Where each member would save at times of its own.
+        If each member would save at different times.
     """
     if schedule.t_eval.size:
         return schedule.t_eval.copy()
@@ -304,8 +306,8 @@ def saved_times(schedule: Schedule) -> np.ndarray:
         return np.zeros(0)
     if saved_rows(schedule) == 0:
         raise ValueError(
-            "save_every in an ensemble needs fixed steps h and a finite interval: with adaptive steps each member "
-            "would save at times of its own; give t_eval."
+            "save_every in an ensemble needs fixed steps h and a finite interval, because with adaptive steps each "
+            "member would save at different times; give t_eval."
         )
     times = schedule.span.t0 + saved_steps(schedule.span.n_steps, schedule.save_every) * schedule.span.h
     times[-1] = schedule.span.t_bound
@@ -319,30 +321,30 @@ def run_members(
     stop: threading.Event | None = None,
     own: OwnTimes = SHARED,
 ) -> Members:
-    """Run members one after the other.
+    """Run members.
 
     Parameters
     ----------
     plan : Plan
     y0s : ndarray, shape (m, n)
-        Starts, of the plan's dtype.
+        Initial states, with the dtype of the plan.
     params : ndarray, shape (m, p)
-        Parameters of each; p = 0 where the functions take none.
+        Parameters of each member; p = 0 if the functions have none.
     stop : threading.Event, optional
-        Set it to stop within some tenths of a second.
+        If it is set, the members stop within some tenths of a second.
     own : OwnTimes, optional
         Intervals and times of these members.
 
     Returns
     -------
     Members
-        In the order of the starts. A member that fails (also by an exception of the user's functions) has the status
-        FAILED and says why; the others are as if it were not there.
+        Results in the order of the initial states. A member that fails, also by an exception in the user's functions,
+        has the status FAILED and a message with the reason; it does not affect the others.
 
     Raises
     ------
     StoppedError
-        When `stop` is set.
+        If `stop` is set.
     """
     out = plan.empty(len(y0s))
     watch = _Watch(stop)
@@ -356,7 +358,7 @@ def run_members(
 
 
 class _Watch:
-    """In the place of a progress bar: the one thing that a run calls now and then."""
+    """Stand-in for a progress bar, which a run calls regularly; it stops the run if requested."""
 
     n = 0.0
 
@@ -411,20 +413,20 @@ def _alone(
 
 
 def _cover(out: Members, those: slice, rows: np.ndarray, schedule: Schedule) -> None:
-    """Let the largest defects cover the invariants' values at rows (m, rows, l), and those in the last states.
+    """Update the largest invariant errors with the values at rows (m, rows, l) and in the last states.
 
-    As in the result of a single run, which holds no state of an event beside the times that it is asked for.
+    The state at an event that ended a member is not included if `t_eval` was given, as in the result of a single run.
     """
     target, before = out.target[those], out.max_defect[those]
-    beside = (out.status[those] == 1) & (schedule.t_eval.size > 0)
-    with np.errstate(invalid="ignore"):  # of members that have failed
-        last = np.where(beside[:, None], 0.0, np.abs(out.values[those] - target))
+    not_saved = (out.status[those] == 1) & (schedule.t_eval.size > 0)
+    with np.errstate(invalid="ignore"):  # members that have failed contain nan
+        last = np.where(not_saved[:, None], 0.0, np.abs(out.values[those] - target))
         largest = np.fmax(last, np.fmax.reduce(np.abs(rows - target[:, None]), axis=1, initial=0.0))
     out.max_defect[those] = np.where(np.isnan(before), before, np.fmax(before, largest))
 
 
 def _values(driver: Driver, t: np.ndarray, y: np.ndarray, *params: np.ndarray) -> np.ndarray:
-    """Return the invariants (m, l) of states (m, n), nan where an invariant cannot be evaluated."""
+    """Return the invariants (m, l) of states (m, n), nan if an invariant cannot be evaluated."""
     try:
         return driver.values_at(t, y, *params)
     except Exception:
@@ -437,7 +439,7 @@ def _values(driver: Driver, t: np.ndarray, y: np.ndarray, *params: np.ndarray) -
 def _store(
     loop: Loop, k: int, status: int, message: str, out: Members, rows: np.ndarray, *, broken: bool = False
 ) -> None:
-    """Store the results of member k, whose saved states are `rows`; `broken`: a function has raised an exception."""
+    """Store the results of member k with the saved states `rows`; `broken`: a function raised an exception."""
     driver, work = loop.driver, loop.driver.run.work
     t, y = driver.now
     if status == 1:
@@ -467,7 +469,7 @@ class Sweeper:
     Attributes
     ----------
     one_by_one : str
-        Why they run one after the other; "" where they run side by side.
+        Reason why members run one after the other; "" if they are vectorised.
     """
 
     def __init__(self, loop: Loop, members: int) -> None:
@@ -479,7 +481,7 @@ class Sweeper:
         self.one_by_one = self._go_side_by_side(members)
 
     def run(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members, watch: _Watch) -> None:
-        """All members into `out`."""
+        """Run all members and store their results in `out`."""
         each = self._each(plan, y0s, params, out)
         if self.one_by_one:
             self._one_by_one(plan, slice(0, len(y0s)), each, out, watch)
@@ -491,7 +493,7 @@ class Sweeper:
         if each.kept:
             out.saved[:] = each.rows[:, : plan.times.size]
         self._evaluate(plan, y0s, params, out)
-        if np.isnan(self.loop.diagnostics.max_correction):  # no error estimate to measure by
+        if np.isnan(self.loop.diagnostics.max_correction):  # the method has no error estimate
             out.max_correction[:] = np.nan
 
     def _evaluate(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members) -> None:
@@ -515,7 +517,7 @@ class Sweeper:
         reason = why_one_by_one(run.method.multistep, run.options, schedule, run.y0.dtype)
         little = members * schedule.span.n_steps * run.y0.size < LEAST_WORK
         if not reason and little and need_compiling(driver.functions):
-            reason = "there is less to do than functions for eight members take to compile"
+            reason = "compiling functions for eight members would take longer than the run"
         if reason:
             return reason
         try:
@@ -525,7 +527,7 @@ class Sweeper:
         return ""
 
     def _each(self, plan: Plan, y0s: np.ndarray, params: np.ndarray, out: Members) -> data.Members:
-        """What the members bring and where their results go."""
+        """Return the inputs of the members and the buffers for their results."""
         driver, m = self.loop.driver, len(y0s)
         y0s, params = (np.require(a, requirements=["C", "W"]) for a in (y0s, params))
         kept = plan.times.size > 0
@@ -572,9 +574,9 @@ class Sweeper:
                 self._adapt(time.perf_counter() - begin)
 
     def _examine(self, each: data.Members, out: Members) -> None:
-        """Examine the steps that the engine suspects, and check the invariants at ends.
+        """Examine the steps that the engine suspects, and check the invariants at the ends of members.
 
-        They are checked at the end of the first member that got there and, if one is not conserved there, of all.
+        The invariants are checked at the end of the first member that arrived and, if one is not conserved, of all.
         """
         run = self.loop.driver.run
         arrived = np.flatnonzero(out.status >= 0)
@@ -594,7 +596,7 @@ class Sweeper:
             self._judge(k, each, out, [found] if found else [])
 
     def _judge(self, k: int, each: data.Members, out: Members, doubts: list[str]) -> None:
-        """Store whether a member that arrived is reliable, by its corrections and by what examinations found."""
+        """Store whether a member that arrived is reliable, using its corrections and the findings `doubts`."""
         trust = Trust(self.loop.driver.run.invariants.names, each.figures[k])
         trust.doubts += doubts
         end = ENDS[out.status[k]]
@@ -602,14 +604,14 @@ class Sweeper:
         out.message[k] = end if trust.trusted else f"{end}; {trust.message}"
 
     def _arrived(self, those: np.ndarray, each: data.Members, out: Members) -> None:
-        """Judge members that the engine took to their ends."""
+        """Judge members that the engine has completed."""
         for k in those.tolist():
             out.trusted[k], out.message[k] = True, ENDS[out.status[k]]
         for k in those[sick(each.figures[those]).any(axis=1)].tolist():
             self._judge(k, each, out, [])
 
     def _side_by_side(self, each: data.Members, out: Members, watch: _Watch) -> None:
-        """All members in octets, but for those that have to run by themselves."""
+        """Run all members in batches of eight, except those that must run individually."""
         m, where = len(each.t), each.where
         while where[0] < m:
             watch.update()
@@ -622,13 +624,13 @@ class Sweeper:
         self._arrived(done, each, out)
 
     def _adapt(self, seconds: float) -> None:
-        """The steps of the next call, after one that made all of its own."""
+        """Set the number of steps of the next call, after a call that used all of its steps."""
         self._steps = max(1, min(2 * self._steps, int(self._steps * SWEEP_SECONDS / max(seconds, 1e-9))))
 
     def _look_at(
         self, plan: Plan, k: int, code: int, reason: str | None, each: data.Members, out: Members, watch: _Watch
     ) -> None:
-        """A member that the engine came back with."""
+        """Handle a member for which the engine returned early."""
         loop = self.loop
         driver = loop.driver
         if code in (DOUBTFUL, PAUSE):
@@ -650,7 +652,7 @@ class Sweeper:
             each.rows[k, driver.rows :] = np.nan
 
     def _first_steps(self, y0s: np.ndarray, params: np.ndarray) -> np.ndarray:
-        """Lengths of the first steps; NaN where none can be estimated."""
+        """Return the lengths of the first steps; NaN if none can be estimated."""
         t0, stepping = self.loop.driver.schedule.span.t0, self.loop.driver.run.stepping
         if stepping.h is not None or stepping.first_step is not None:
             return np.full(len(y0s), stepping.h or stepping.first_step, float)
@@ -664,13 +666,13 @@ class Sweeper:
         return taus
 
     def _derivative(self, params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
-        """The derivative of a member with these parameters."""
+        """Return the derivative of a member with these parameters."""
         self.loop.driver.params[:] = params
         return self.loop.prepared.system.derivative
 
 
 def _part(each: data.Members, those: slice) -> data.Members:
-    """Some of the members, none of which has begun."""
+    """Return some of the members, none of which has started."""
     own = {name: getattr(each, name)[those] for name in BY_MEMBER}
     rows = each.rows[those] if each.kept else each.rows
     return each._replace(**own, rows=rows, where=np.zeros(2, np.int64))

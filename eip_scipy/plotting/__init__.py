@@ -1,4 +1,4 @@
-"""Styles that all figures share. Matplotlib is imported in this package and in `eip_scipy_studies.plotting` only.
+"""Styles for all figures. Only this package and `eip_scipy_studies.plotting` import matplotlib.
 
 Needs ``pip install "eip_scipy[plot]"``. The figures of runs and ensembles are drawn by ``run.plot()``.
 """
@@ -24,29 +24,29 @@ __all__ = ["FLOOR", "MARKERS", "PALETTE", "log_errors", "method_styles", "typese
 
 __getattr__ = moved_names(__name__)
 
-# Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white, and Tol's
-# wine and olive.
+# Colours of Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white, and
+# wine and olive of Tol.
 PALETTE = ("#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#777777", "#882255", "#999933")
 LINES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), "-", "--", (0, (8, 2, 1, 2)), (0, (4, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "*", ">")
 GREEK = {"alpha": "α", "beta": "β", "kappa": "κ", "Omega": "Ω"}
 POWERS = "⁰¹²³⁴⁵⁶⁷⁸⁹"
-# Below the spacing of numbers an error means nothing, and a log axis cannot show zero.
+# An error below the spacing of floats is meaningless, and a log axis cannot show zero.
 FLOOR = 1e-16
 
 
 def method_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Choose colour, line and marker of each method, so that none is told apart by its colour alone.
+    """Choose colour, line and marker of each method, so that methods differ by more than colour.
 
     Parameters
     ----------
     names : iterable of str
-        All methods that appear in a set of figures, for the same styles in each.
+        All methods in a set of figures, so that the styles agree between figures.
 
     Returns
     -------
     dict
-        For each name keywords of ``Axes.plot``.
+        Keywords of ``Axes.plot`` for each name.
     """
     return {
         name: {
@@ -60,16 +60,16 @@ def method_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def typeset(text: str) -> str:
-    """A title as the terminal shows it, with Greek letters, raised powers and arrows."""
+    """Return a title with Greek letters, superscripts and arrows instead of their ASCII forms."""
     greek = re.sub(r"\b(alpha|beta|kappa|Omega)\b", lambda name: GREEK[name[0]], text.replace("->", "→"))
     return re.sub(r"\^(\d)", lambda power: POWERS[int(power[1])], greek)
 
 
 def log_errors(axis: Axes, x: str, y: str) -> None:
-    """Make y a log axis of errors, with its labels, few ticks and room for at least two powers of ten."""
+    """Make y a log axis of errors, with labels, few ticks and a range of at least two powers of ten."""
     axis.set_yscale("log")
     low, high = axis.get_ylim()
-    # One labelled tick for at most seven or eight powers of ten, and room that is no smaller than two powers.
+    # A range below two powers of ten would have too few labelled ticks.
     if high / low < 100:
         axis.set_ylim(low / 3, high * 3)
     axis.yaxis.set_major_locator(LogLocator(numticks=9))

@@ -27,12 +27,13 @@ def stability_map(
     Parameters
     ----------
     x, y : array_like, shape (k,) and (j,)
-        Values of the quantities, ascending.
+        Values of the quantities, in ascending order.
     megno : array_like, shape (j, k)
-        The mean MEGNO at each pair; values above `most` and inf have one colour, nan has none.
+        Mean MEGNO at each pair; values above `most` and inf have the same colour, nan has none.
     xlabel, ylabel, title : str, optional
+        Labels and title.
     most : float, optional
-        Upper end of the colours, above 2.
+        Upper end of the colour scale, above 2.
 
     Returns
     -------
@@ -41,7 +42,7 @@ def stability_map(
     Raises
     ------
     ValueError
-        When the shapes do not fit.
+        If the shapes do not agree, or `most` is too small.
     """
     figure = shown_figure(6.4, 4.6)
     if title:
@@ -55,13 +56,13 @@ def stability_map(
 
 
 def draw_stability(axis: Axes, x: Any, y: Any, megno: Any, most: float) -> Any:
-    """Draw the cells of such a map, and return them for a colour bar."""
+    """Draw the cells of a stability map, and return them for a colour bar."""
     x, y, values = (np.asarray(item, dtype=float) for item in (x, y, megno))
     if values.shape != (y.size, x.size):
         raise ValueError(f"megno must have the shape {(y.size, x.size)} of (y, x), got {values.shape}.")
     if not most > REGULAR:
         raise ValueError(f"most must be above {REGULAR:g}, MEGNO of a regular orbit, got {most!r}.")
-    # From 0, the value of a harmonic oscillator. Viridis is read without telling red from green.
+    # The scale starts at 0, the value of a harmonic oscillator. Viridis suits colour-blind readers.
     return axis.pcolormesh(x, y, np.clip(values, 0.0, most), cmap="viridis", vmin=0.0, vmax=most, shading="nearest")
 
 
@@ -74,7 +75,7 @@ def indicator_figure(t: Any, curves: Mapping[str, Any], *, ylabel: str, level: f
     curves : mapping of str to array_like, shape (m,)
     ylabel : str
     level : float, optional
-        A value to mark.
+        Value to mark by a horizontal line.
 
     Returns
     -------

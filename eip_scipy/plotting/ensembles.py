@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ensemble_figure"]
 
-MOST = 6  # components with panels of their own
+MOST = 6  # components with a panel
 BANDS = (5, 25, 50, 75, 95)  # percentiles
 WIDE, NARROW = 0.18, 0.32  # opacities of the bands
 FAILURES = "#D55E00"
@@ -47,17 +47,17 @@ def ensemble_figure(
     Parameters
     ----------
     times : array_like, shape (m,), or None
-        None for last states, which are drawn as one box for each component.
+        Times; None for last states, which are drawn as one box for each component.
     components : mapping of str to array_like, shape (members, m)
-        Values of each component, nan where a member has none. Of complex ones the magnitude is drawn.
+        Values of each component, nan if a member has none. The magnitude of complex components is drawn.
     members : array_like, shape (k,)
         Numbers of the members whose errors are drawn.
     errors : mapping of str to array_like, shape (k,)
         Largest error of each invariant in these members.
     failed : array_like of bool, shape (k,)
-        Which of them failed.
+        True for members that failed.
     counts : mapping of str to int
-        How many members ended in each way, of those that `ENDS` names.
+        Number of members that ended in each of the ways in `ENDS`.
     title : str, optional
 
     Returns
@@ -94,11 +94,11 @@ def ensemble_figure(
 
 
 def _draw_fan(axis: Axes, times: np.ndarray, name: str, values: Any, color: str) -> None:
-    """Draw the median of members in time, and bands that hold half of them and nine tenths."""
+    """Draw the median of members in time, and bands that contain 50 % and 90 % of them."""
     values = np.asarray(values)
     is_complex = values.dtype.kind == "c"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of times that no member reached
+        warnings.simplefilter("ignore", RuntimeWarning)  # raised at times that no member reached
         low, lower, middle, upper, high = np.nanpercentile(np.abs(values) if is_complex else values, BANDS, axis=0)
     axis.fill_between(times, low, high, color=color, alpha=WIDE, lw=0)
     axis.fill_between(times, lower, upper, color=color, alpha=NARROW, lw=0)
@@ -108,7 +108,7 @@ def _draw_fan(axis: Axes, times: np.ndarray, name: str, values: Any, color: str)
 
 
 def _explain(axis: Axes) -> None:
-    """Say above the first panel what its line and bands are."""
+    """Draw a legend of the line and the bands above the first panel."""
     parts = [
         Line2D([], [], color="0.25", lw=1.2, label="median"),
         Patch(color="0.25", alpha=WIDE + NARROW, lw=0, label="50 %"),
@@ -118,7 +118,7 @@ def _explain(axis: Axes) -> None:
 
 
 def _draw_last(axis: Axes, components: Mapping[str, Any]) -> None:
-    """Draw the last states of each component: the median, half of the members, nine tenths of them, and the rest."""
+    """Draw box plots of the last states of each component: median, 50 % and 90 % of the members, and outliers."""
     columns = [np.abs(values) if np.iscomplexobj(values) else np.asarray(values) for values in components.values()]
     finite = [column[np.isfinite(column)] for column in columns]
     boxes = axis.boxplot(
@@ -151,7 +151,7 @@ def _draw_errors(axis: Axes, members: np.ndarray, errors: Mapping[str, Any], fai
         drawn = np.where(np.isnan(values), np.nan, drawn)
         style = styles[name] | {"ls": "", "ms": size, "mew": 0, "alpha": 0.8}
         axis.plot(members[~failed], drawn[~failed], **style)
-    if failed.any():  # at the bottom: their errors say nothing
+    if failed.any():  # at the bottom, because their errors are meaningless
         bottom = np.full(np.count_nonzero(failed), 0.03)
         style = {"ls": "", "marker": "x", "ms": 6, "mew": 1.4, "color": FAILURES, "label": "failed"}
         axis.plot(members[failed], bottom, transform=axis.get_xaxis_transform(), **style)

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_run", "run_figure"]
 
-MOST = 9  # components, or bodies, that can be told apart
-TICKS = 5  # of times with five digits: more would touch each other
-WIDE = 10.0  # of two components' sizes: in one frame the smaller one would be a line
-HEALTHY = 5.0  # corrections in local errors, see `Diagnostics`
+MOST = 9  # components, or bodies, that can be distinguished
+TICKS = 5  # more labels of times with five digits would touch each other
+WIDE = 10.0  # ratio of sizes from which on two components get separate axes, because the smaller one would look flat
+USUAL = 5.0  # corrections in units of the local error, see `Diagnostics`
 
 
 def run_figure(
@@ -39,13 +39,13 @@ def run_figure(
     ----------
     t : array_like, shape (m,)
     components : mapping of str to array_like, shape (m,)
-        Real, or complex, of which the magnitude is drawn.
+        Values of each component; the magnitude of complex components is drawn.
     paths : mapping of str to (array_like, array_like)
-        For each body x and y, (m,) both; drawn in place of the components where there are some.
+        x and y of each body, both (m,); if there are any, they are drawn instead of the components.
     errors : mapping of str to array_like, shape (m,)
-        For each invariant; without any there is no panel.
+        Errors of each invariant; without any there is no panel.
     corrections : mapping of str to float
-        For each invariant the largest, in local errors; likewise.
+        Largest correction for each invariant, in units of the local error; without any there is no panel.
     title : str, optional
 
     Returns
@@ -85,7 +85,7 @@ def draw_run(
     t, components, paths
         As for `run_figure`.
     title : str, optional
-        Set where the axes have none.
+        Title, used if the axes have none.
     """
     if paths:
         _draw_paths(axis, paths)
@@ -112,7 +112,7 @@ def _draw_paths(axis: Axes, paths: Mapping[str, tuple[Any, Any]]) -> None:
 
 
 def _draw_components(figure: Figure, place: SubplotSpec, t: np.ndarray, components: Mapping[str, Any]) -> None:
-    """On one axis, or on two where some would lie flat beside others, such as a velocity beside an angle that grows."""
+    """Draw components on one axis, or on two if some would look flat, such as a velocity next to a growing angle."""
     shown = dict(list(components.items())[:MOST])
     groups = _by_size(shown) if len(components) <= MOST else [list(shown)]
     parts = place.subgridspec(len(groups), 1)
@@ -140,7 +140,7 @@ def _draw_lines(
 
 
 def _by_size(components: Mapping[str, Any]) -> list[list[str]]:
-    """The names in one group, or in two where the largest gap between their sizes is a wide one."""
+    """Return the names in one group, or in two groups if the largest gap between their sizes is wide."""
     sizes = {name: np.max(np.abs(values), initial=0.0) for name, values in components.items()}
     ordered = sorted((size, name) for name, size in sizes.items() if 0 < size < np.inf)
     gaps = [above / below for (below, _), (above, _) in itertools.pairwise(ordered)]
@@ -159,7 +159,7 @@ def _counted(axis: Axes, there: int) -> None:
 
 
 def _above_zero(magnitudes: np.ndarray) -> np.ndarray:
-    """Magnitudes for a log axis: zero is drawn as the smallest of the others, whatever the unit."""
+    """Return magnitudes for a log axis, with zeros replaced by the smallest positive magnitude."""
     positive = magnitudes[magnitudes > 0]
     return np.maximum(magnitudes, positive.min() if positive.size else FLOOR)
 
@@ -168,7 +168,7 @@ def _draw_corrections(axis: Axes, corrections: Mapping[str, float], styles: Mapp
     for k, (name, size) in enumerate(corrections.items()):
         axis.bar(k, max(size, FLOOR), width=0.6, color=styles[name]["color"])
     axis.set_xticks(range(len(corrections)), list(corrections))
-    axis.axhline(HEALTHY, color="0.4", lw=1.0, ls=":")
-    text = axis.annotate("most correct runs stay below", (0.02, HEALTHY), xycoords=("axes fraction", "data"))
+    axis.axhline(USUAL, color="0.4", lw=1.0, ls=":")
+    text = axis.annotate("most correct runs stay below", (0.02, USUAL), xycoords=("axes fraction", "data"))
     text.set(va="bottom", fontsize="x-small")
     log_errors(axis, "", "largest correction [local errors]")

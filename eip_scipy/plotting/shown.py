@@ -1,4 +1,4 @@
-"""Figures that show themselves: in a notebook without a magic, and in windows by ``pyplot.show``."""
+"""Figures that are displayed automatically in notebooks, and in windows by ``pyplot.show``."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ INLINE = "inline"  # in the name of the backend of notebooks
 
 
 class ShownFigure(Figure):
-    """A matplotlib Figure that a notebook shows once, whether it is a cell's last value or not.
+    """A matplotlib Figure that a notebook shows once, also if it is not the last value of a cell.
 
     Notes
     -----
     If figures have windows, and in notebooks with the inline backend, the figure belongs to pyplot: ``pyplot.show()``
-    and the end of a cell show it. pyplot keeps at most as many windows as it does without a warning. Elsewhere the
-    figure is freed with its last reference.
+    and the end of a cell show it. The number of windows stays below the one at which pyplot warns. Otherwise the figure
+    is freed with its last reference.
     """
 
     def savefig(self, fname: Any, **options: Any) -> None:
@@ -46,7 +46,7 @@ class ShownFigure(Figure):
         Raises
         ------
         NotImplementedError
-            Elsewhere, for which IPython then takes another representation.
+            With other backends; IPython then uses another representation.
         """
         if INLINE not in _backend():
             raise NotImplementedError
@@ -63,12 +63,12 @@ _windows: list[weakref.ref[ShownFigure]] = []
 
 
 def shown_figure(width: float, height: float) -> ShownFigure:
-    """Make an empty figure, which pyplot shows where it can show figures at all.
+    """Create an empty figure, which pyplot shows if the backend can show figures.
 
     Parameters
     ----------
     width, height : float
-        In inches.
+        Size in inches.
 
     Returns
     -------
@@ -78,11 +78,11 @@ def shown_figure(width: float, height: float) -> ShownFigure:
     if backend in backend_registry.list_builtin(BackendFilter.NON_INTERACTIVE):
         return ShownFigure(figsize=(width, height), dpi=DPI, layout="constrained")
     inline = INLINE in backend
-    if not inline:  # in a notebook the end of the cell closes what it has shown
+    if not inline:  # in a notebook the end of the cell closes its figures
         _close_oldest()
     dpi = DPI if inline else rcParams["figure.dpi"]  # a window of 160 dots per inch would leave the screen
     most = rcParams["figure.max_open_warning"]
-    # Not by rc_context: pyplot may load its backend now, and what that sets (interactive for the inline one) must stay.
+    # rc_context is not used, because pyplot may load its backend now, whose settings must not be reset afterwards.
     rcParams["figure.max_open_warning"] = 0 if inline else most
     try:
         figure = pyplot.figure(FigureClass=ShownFigure, figsize=(width, height), dpi=dpi, layout="constrained")
@@ -94,17 +94,17 @@ def shown_figure(width: float, height: float) -> ShownFigure:
 
 
 def _backend() -> str:
-    """Return the name of pyplot's backend, which is chosen now if it was not before."""
+    """Return the name of pyplot's backend, which is chosen now if it has not been chosen before."""
     return str(pyplot.get_backend()).lower()
 
 
 def _is_open(figure: Figure) -> bool:
-    """Return whether pyplot has a figure."""
+    """Return True if pyplot manages a figure."""
     return figure.canvas.manager is not None and pyplot.fignum_exists(figure.canvas.manager.num)
 
 
 def _close_oldest() -> None:
-    """Let pyplot forget the oldest of these figures before it warns of too many. Who has one may still save it."""
+    """Close the oldest of these figures in pyplot before it warns about too many; they can still be saved."""
     mine = [figure for figure in (window() for window in _windows) if figure is not None and _is_open(figure)]
     most = rcParams["figure.max_open_warning"]
     while mine and 0 < most <= len(pyplot.get_fignums()):

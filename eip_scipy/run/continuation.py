@@ -1,4 +1,4 @@
-"""A run that goes on from its end, and two runs as one."""
+"""Continuation of a run from its end, and the combination of two runs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .results import IntegrationResult, Origin
 
 __all__ = ["continued"]
 
-# What comes from the run's end, or holds for the first run only.
+# Arguments that follow from the end of the run, or apply to the first run only.
 OWN = {"t_span", "y0", "t_eval", "diagnostics", "projection"}
 FIXED = ("fun", "acceleration", "t_span", "y0", "invariants")
 
@@ -29,12 +29,12 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
     origin: Origin | None = vars(result).get("_origin")
     if origin is None:
         raise ValueError(
-            "continue_to: this result does not know its functions, for it was loaded, unpickled or copied. Go on from "
-            "its last state: integrate(fun, (result.t[-1], t), result.y[:, -1], ...)."
+            "continue_to: this result does not know its functions, because it was loaded, unpickled or copied. "
+            "Continue from its last state: integrate(fun, (result.t[-1], t), result.y[:, -1], ...)."
         )
     for name in FIXED:
         if name in options:
-            raise TypeError(f"continue_to: {name} is that of the run; start a new one with integrate.")
+            raise TypeError(f"continue_to: {name} cannot be changed; start a new run with integrate.")
     if isinstance(origin.request.fun, Problem):
         t = origin.request.fun.plain(t=t)["t"]
     if not is_number(t) or not origin.sign * (t - origin.t) > 0:
@@ -58,7 +58,7 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
 
 
 def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult:
-    """Both runs as one."""
+    """Return the combination of two runs."""
     new = slice(1 if one.t.size and two.t.size and two.t[0] == one.t[-1] else 0, None)
     both = IntegrationResult(two)
     for name in ("t", "y", "invariants"):

@@ -22,12 +22,12 @@ from .memory import most_bytes
 
 __all__ = ["Driver", "check_memory", "saved_rows"]
 
-# Room that a run begins with if the number of its steps is not known; it grows.
+# Rows and bytes allocated at the start of a run whose number of steps is unknown; the buffers grow.
 FIRST_ROWS, FIRST_BYTES = 1024, 2**24
 
 
 class Driver:
-    """One run: its functions, buffers and the rows saved so far; `keeps_steps`: their interpolants too."""
+    """One run: its functions, buffers and saved rows, and with `keeps_steps` the interpolants of its steps."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class Driver:
         self._max_bytes = max_bytes
         n, dtype = run.y0.size, run.y0.dtype
         rows = saved_rows(schedule) or _first(run.y0.nbytes)
-        # One row to spare for the last state of a run that ends early.
+        # One extra row for the last state of a run that ends early.
         self.t = np.empty(rows + 1)
         self.y = np.empty((rows + 1, n), dtype)
         self.state = run.y0.copy()
@@ -59,7 +59,7 @@ class Driver:
             self._pieces = self._more_pieces(steps if keeps_steps else 0)
 
     def advance(self, k_end: int) -> int:
-        """Step on to step `k_end`, or to what stops the loop before it; returns the loop's code."""
+        """Advance to step `k_end`, or until something stops the loop earlier; return the loop's code."""
         interpolants = self._interpolants
         if interpolants is not None:
             interpolants.record.left[:] = self._events.left
@@ -71,9 +71,9 @@ class Driver:
                 self._events.take(*interpolants.roots())
 
     def sweep(self, members: Members, steps: int) -> int:
-        """Run members of an ensemble from members.where on, so many steps in all, on the buffers of this run.
+        """Run members of an ensemble, starting at members.where, for `steps` steps in total, on this run's buffers.
 
-        Returns OK where all are at their ends or it is to be called again, else the code of the member at hand.
+        Return OK if all have ended or if more calls are needed, else the code of the current member.
         """
         with self.own_errors():
             code = int(self.engine.sweep(members, steps, self.state, self.new, self.t))
@@ -81,16 +81,16 @@ class Driver:
         return code
 
     def sweep_octets(self, members: Members, steps: int) -> None:
-        """The same, eight members side by side, until all are through or so many steps are made.
+        """Run members in batches of eight until all have ended or `steps` steps are made.
 
-        Whose status is not set then has to run by itself.
+        Members whose status is not set afterwards must be run individually.
         """
         self.engine.sweep_octets(members, steps, self.state, self.new, self.t)
         self.warn()
 
     @contextmanager
     def own_errors(self) -> Iterator[None]:
-        """What compiled functions raise, which C does not see, or mean by a status, in place of the engine's error."""
+        """Replace the engine's error by the exception of a compiled function, or by the meaning of its status."""
         try:
             yield
         except FailedCallError as error:
@@ -104,32 +104,32 @@ class Driver:
             raise
 
     def place(self, error: ChangedShapeError) -> None:
-        """Add the step to an error that compiled code raises, which cannot put a number into it."""
+        """Add the step to the message of an error from compiled code, which cannot format numbers."""
         error.args = (f"{error}, in the step from t={self.schedule.clock[TIME]:.10g}",)
 
     @property
     def step(self) -> int:
-        """Steps made so far."""
+        """Number of steps made so far."""
         return int(self.schedule.place[STEP])
 
     @property
     def suspects(self) -> bool:
-        """Return whether the engine suspects a step, which is to be examined."""
+        """Return True if the engine suspects a step, which must be examined."""
         return bool(self.run.work.suspect[REASON] != NOTHING)
 
     @property
     def rows(self) -> int:
-        """Rows saved so far."""
+        """Number of rows saved so far."""
         return int(self.schedule.place[ROW])
 
     @property
     def now(self) -> tuple[float, np.ndarray]:
-        """Time and state after the last step that was accepted."""
+        """Time and state after the last accepted step."""
         pending = self.schedule.place[PENDING] == 1
         return float(self.schedule.clock[TIME_NEW if pending else TIME]), self.new if pending else self.state
 
     def parts(self) -> dict[str, np.ndarray]:
-        """The buffers that decide the steps to come, or count; all others are filled before they are read."""
+        """Return the buffers that determine the remaining steps, and the counters; others are filled before use."""
         w, schedule = self.run.work, self.schedule
         history = self.run.method.multistep
         nodes = (
@@ -155,7 +155,7 @@ class Driver:
         }
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Copies of these after the last accepted step, made current as the loop does it."""
+        """Return copies of these buffers after the last accepted step, updated as the loop does it."""
         copies = {name: part.copy() for name, part in self.parts().items()}
         if self.schedule.place[PENDING] == 1:
             copies["place"][PENDING] = 0
@@ -169,29 +169,29 @@ class Driver:
         return copies
 
     def load(self, t: np.ndarray, y: np.ndarray) -> None:
-        """Rows of a run that is resumed."""
+        """Store the rows of a run that is resumed."""
         while self.t.size <= t.size:
             self._more_rows()
         self.t[: t.size], self.y[: t.size] = t, y
 
     def save(self, t: float, y: np.ndarray) -> None:
-        """One more row."""
+        """Append a row."""
         self.t[self.rows], self.y[self.rows] = t, y
         self.schedule.place[ROW] += 1
 
     def save_start(self) -> None:
-        """The first row: the start, where it is asked for and not there already."""
+        """Save the start as the first row, if it is requested and not saved already."""
         if self.rows == 0 and (self.schedule.t_eval.size == 0 or self.schedule.t_eval[0] == self.schedule.span.t0):
             self.save(self.schedule.span.t0, self.state)
 
     def save_now(self) -> None:
-        """After an early end: the last accepted state too."""
+        """Save the last accepted state after an early end."""
         t, y = self.now
         if self.rows == 0 or self.t[self.rows - 1] != t:
             self.save(t, self.shown(t, y))
 
     def shown(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Return the last state, y at t, as the rows have it."""
+        """Return the last state `y` at `t` in the form of the saved rows."""
         interpolants = self._interpolants
         return interpolants.shown(t, y) if interpolants is not None and interpolants.record.shows else y
 
@@ -202,12 +202,12 @@ class Driver:
         self.save(t, y)
 
     def grow(self) -> None:
-        """Room for twice as many rows, or interpolants, where there is none left.
+        """Double the buffers of rows or interpolants that are full.
 
         Raises
         ------
         MemoryError
-            When they would need more than the run's `max_bytes`.
+            If they would need more than `max_bytes` of the run.
         """
         if self._kept and self._kept == len(self._pieces):
             self._pieces = np.concatenate([self._pieces, self._more_pieces(self._kept)])
@@ -227,62 +227,62 @@ class Driver:
 
     @property
     def _kept(self) -> int:
-        """Interpolants kept so far."""
+        """Number of interpolants stored so far."""
         return 0 if self._interpolants is None else int(self._interpolants.record.counts[1])
 
     def pending_events(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which events happen in the step that is pending, and when; only where the loop left them to the caller."""
+        """Return which events happen in the pending step and when, if the loop left them to the caller."""
         assert self._interpolants is not None  # the loop pauses for nothing else
         return self._interpolants.pending()
 
     def dense(self) -> DenseOutput:
-        """Dense output over the step that is pending."""
+        """Return the dense output over the pending step."""
         interpolants = self._interpolants
         assert interpolants is not None  # the loop pauses for nothing else
         piece = self._pieces[self._kept - 1] if self._kept else interpolants.record.piece.copy()
         return ManifoldDenseOutput(interpolants, piece)
 
     def warn(self) -> None:
-        """Of states between steps that the loop could not project."""
+        """Warn about states between steps that the loop could not project."""
         if self._interpolants is not None:
             self._interpolants.warn()
 
     def solution(self, t_end: float) -> OdeSolution | None:
-        """Dense output over the whole run, where its steps are kept."""
+        """Return the dense output over the whole run, or None if its steps are not stored."""
         if self._interpolants is None or not self._pieces.size:
             return None
         return solution(self._interpolants, self._pieces[: self._kept], t_end, self.now[1])
 
     def note(self, values: np.ndarray) -> None:
-        """Let the largest defects of the run cover the invariants' values (l, m) at saved states after the start."""
+        """Update the largest invariant errors with the `values` (l, m) at the saved states after the start."""
         largest, target = self.run.work.max_defect, self.run.invariants.fixed_target
         defects = np.abs(values - target[:, None])[:, self.t[: self.rows] != self.schedule.span.t0]
         np.fmax(largest, np.fmax.reduce(defects, axis=1, initial=0.0), out=largest)
 
     def values(self) -> np.ndarray:
-        """Invariants of the saved states, (l, m)."""
+        """Return the invariants of the saved states, (l, m)."""
         return self.values_at(self.t[: self.rows], self.y[: self.rows]).T
 
     def values_at(self, t: np.ndarray, y: np.ndarray, *params: np.ndarray) -> np.ndarray:
-        """Return the invariants (m, l) of states (m, n), each with its own `params` (m, p) where they are given."""
+        """Return the invariants (m, l) of states (m, n), each with its own `params` (m, p) if these are given."""
         out = np.empty((len(t), self.run.invariants.size))
         with self.own_errors():
             self.engine.values(t, y, out, *params)
         return out
 
     def events_found(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return which events the loop has found since the last call, when, and in which states."""
+        """Return the events that the loop has found since the last call, their times and states."""
         assert self._interpolants is not None  # a run with events has them
         return self._interpolants.roots()
 
 
 def _first(size: int) -> int:
-    """Return the number of items of `size` bytes for which room is made at first."""
+    """Return the number of items of `size` bytes for which memory is allocated at first."""
     return min(FIRST_ROWS, max(2, FIRST_BYTES // max(size, 1)))
 
 
 def saved_rows(schedule: Schedule) -> int:
-    """States that a run saves, its start included; 0 where that is not known before."""
+    """Return how many states a run saves, including its start; 0 if that is not known in advance."""
     if schedule.t_eval.size:
         return schedule.t_eval.size
     if schedule.save_every == 0:
@@ -291,26 +291,20 @@ def saved_rows(schedule: Schedule) -> int:
 
 
 def expected_steps(schedule: Schedule) -> int:
-    """Steps of a run; 0 where that is not known before."""
+    """Return the number of steps of a run; 0 if that is not known in advance."""
     return 0 if schedule.span.h == 0.0 or schedule.span.n_steps == UNBOUNDED else schedule.span.n_steps
 
 
 def check_memory(rows: int, run: Run, max_bytes: float | None) -> None:
-    """Refuse to save more than fits."""
+    """Raise MemoryError if the saved rows would need too much memory."""
     needed = rows * (run.y0.nbytes + 8.0 * (1 + run.invariants.size))
     require_memory(needed, f"saving {rows:.3g} states of {run.y0.size} components", max_bytes, "raise save_every")
 
 
-def require_memory(needed: float, what: str, max_bytes: float | None, mend: str) -> None:
-    """Refuse to keep more than fits.
-
-    Raises
-    ------
-    MemoryError
-        With the number of bytes and what to do.
-    """
+def require_memory(needed: float, what: str, max_bytes: float | None, advice: str) -> None:
+    """Raise MemoryError, with the number of bytes and advice, if `needed` exceeds the bound."""
     bound = most_bytes(needed, max_bytes)
     if needed > bound:
         raise MemoryError(
-            f"{what} needs {needed / 1e9:.3g} GB, the bound is {bound / 1e9:.3g} GB; {mend} (or max_bytes)."
+            f"{what} needs {needed / 1e9:.3g} GB, the bound is {bound / 1e9:.3g} GB; {advice} (or max_bytes)."
         )

@@ -18,12 +18,12 @@ __all__ = ["ContinuedEvents", "Events", "as_events", "replaced"]
 
 
 def replaced(events: tuple[Callable[..., Any], ...], others: Iterable[Callable[..., Any]]) -> tuple[Any, ...]:
-    """Return other functions for the same events, which have happened as often as these."""
+    """Return other functions for the same events, with the counts of these."""
     return ContinuedEvents(others, events.happened) if isinstance(events, ContinuedEvents) else tuple(others)
 
 
 class ContinuedEvents(tuple):
-    """Events of a run that is continued, and the times at which each has happened before."""
+    """Events of a continued run, and the times at which each has happened before."""
 
     happened: tuple[np.ndarray, ...]
 
@@ -35,7 +35,7 @@ class ContinuedEvents(tuple):
 
 
 class Events:
-    """The events of a run and the places where they happened.
+    """The events of a run, and the times and states at which they happened.
 
     Parameters
     ----------
@@ -48,9 +48,9 @@ class Events:
     Raises
     ------
     TypeError
-        When an event is not callable.
+        If an event is not callable.
     ValueError
-        When ``terminal`` is no number of times, or ``direction`` no number.
+        If ``terminal`` is not a number of times, or ``direction`` is not a number.
     """
 
     def __init__(self, events: Any, extra: tuple = ()) -> None:
@@ -68,12 +68,12 @@ class Events:
 
     @property
     def terminal(self) -> bool:
-        """Whether an event can end the run."""
+        """True if an event can end the run."""
         return any(math.isfinite(allowed) for allowed in self._allowed)
 
     @property
     def calls(self) -> tuple[Call, ...]:
-        """The events as the engine calls them."""
+        """Return the events in the form that the engine calls."""
 
         def one(k: int) -> Call:
             return call(
@@ -84,7 +84,7 @@ class Events:
 
     @property
     def ends(self) -> list[tuple[float, float]]:
-        """Of each event the direction and the number of times after which it ends the run."""
+        """Return the direction of each event and the number of times after which it ends the run."""
         return list(zip(self.directions.tolist(), self._allowed, strict=True))
 
     def restore(self, k: int, t: np.ndarray, y: np.ndarray) -> None:
@@ -93,11 +93,11 @@ class Events:
 
     @property
     def left(self) -> list[float]:
-        """Of each event how often it may still happen before it ends the run."""
+        """Return how often each event may still happen before it ends the run."""
         return [allowed - count for allowed, count in zip(self._allowed, self._counts, strict=True)]
 
     def take(self, which: np.ndarray, times: np.ndarray, states: np.ndarray) -> None:
-        """Events that the loop has found, in the order in which they happened."""
+        """Record events that the loop has found, in the order in which they happened."""
         for k, t, y in zip(which.tolist(), times.tolist(), states, strict=True):
             self._note(k, t, y.copy())
 
@@ -108,14 +108,14 @@ class Events:
         self.last = t, y
 
     def fill(self, t: float, y: np.ndarray, values: np.ndarray, params: Any = None) -> None:
-        """Values of all events."""
+        """Fill `values` with the values of all events."""
         for k in range(len(self.functions)):
             values[k] = self._value(k, t, y.copy())
 
     def leave(self, t: float, y: np.ndarray, f: np.ndarray, step: float, values: np.ndarray) -> None:
-        """Take the values a little later of those events that happened where the run is continued.
+        """Evaluate events that happened at the start of a continued run slightly later.
 
-        The value there is a rounding error, by whose sign the event would happen again.
+        Their value at the start is a rounding error, whose sign could make the event happen again.
         """
         part = step / 4096
         for k, times in enumerate(self._happened):
@@ -123,20 +123,23 @@ class Events:
                 values[k] = self._value(k, t + part, y + part * f)
 
     def handle(self, which: np.ndarray, times: np.ndarray, sol: DenseOutput) -> float | None:
-        """Note events that happen in a step, in the order of their times; returns the time at which the run ends.
+        """Record events that happen in a step, in the order of their times.
 
-        Returns None where no event ends it.
+        Returns
+        -------
+        float or None
+            The time at which the run ends; None if no event ends it.
 
         Raises
         ------
         ValueError
-            When an event has no root where it changes its sign, because it is NaN there.
+            If an event changes its sign without a root, because it is NaN in between.
         """
         for k, t in zip(which.tolist(), times.tolist(), strict=True):
             if math.isnan(t):
                 raise ValueError(
-                    f"event {k} changes its sign between t={sol.t_old:.10g} and t={sol.t:.10g}, but is NaN between, "
-                    "so that its time cannot be found. Let the event return a finite number for every state."
+                    f"event {k} changes its sign between t={sol.t_old:.10g} and t={sol.t:.10g}, but is NaN in between, "
+                    "so that its time cannot be found. The event must return a finite number for every state."
                 )
             self._note(k, t, sol(t))
             if self._counts[k] >= self._allowed[k]:
@@ -144,13 +147,13 @@ class Events:
         return None
 
     def _value(self, k: int, t: float, y: np.ndarray) -> float:
-        """Event k at (t, y), which it may keep or overwrite."""
+        """Return the value of event k at (t, y); the event may store or overwrite y."""
         try:
             value = self.functions[k](t, y, *self._extra)
         except TypeError:
             given = "t", "y", *names(self._extra)
-            mend = f"What the call or its Problem brings besides t and y comes last: def event({', '.join(given)})."
-            require_arguments(self.functions[k], given, f"event {k}", mend)
+            advice = f"Further arguments of the call or its Problem come last: def event({', '.join(given)})."
+            require_arguments(self.functions[k], given, f"event {k}", advice)
             raise
         return self._number(k, t, value)
 
@@ -165,12 +168,12 @@ class Events:
 
 
 def as_events(events: Any) -> tuple[Callable[..., Any], ...]:
-    """One event or a sequence of them, as a tuple; C functions by pointer as Python calls them.
+    """Return one event or a sequence of events as a tuple; C function pointers are wrapped for Python.
 
     Raises
     ------
     TypeError
-        For anything else.
+        If an event is not callable.
     """
     if events is None:
         return ()
@@ -189,7 +192,7 @@ def as_events(events: Any) -> tuple[Callable[..., Any], ...]:
 
 
 def _adapted(event: Any, k: int) -> Any:
-    """A C function by pointer as Python calls it, with its attributes as an event."""
+    """Wrap an event given as a C function pointer for Python, with its attributes."""
     found = by_pointer(event, f"event {k}", shape=())
     if found is not event:
         found.terminal, found.direction = getattr(event, "terminal", None), getattr(event, "direction", 0)
@@ -197,7 +200,7 @@ def _adapted(event: Any, k: int) -> Any:
 
 
 def _direction(direction: Any) -> float:
-    """The sign that an event's change must have, 0 for both."""
+    """Return the sign that the change of an event must have, 0 for both."""
     if not (is_number(direction) or isinstance(direction, (bool, np.bool_))) or math.isnan(direction):
         raise ValueError(
             f"The `direction` attribute of each event must be a number: positive, negative or 0, got "
@@ -207,7 +210,7 @@ def _direction(direction: Any) -> float:
 
 
 def _allowed(terminal: Any) -> float:
-    """How many times an event may happen before it ends the run."""
+    """Return how many times an event may happen before it ends the run."""
     if terminal is None:
         return math.inf
     known = isinstance(terminal, (bool, np.bool_)) or (is_number(terminal) and float(terminal).is_integer())

@@ -12,38 +12,38 @@ __all__ = ["described", "planes", "plot"]
 
 
 def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any = None) -> Any:
-    """Draw a run: the components or the orbit, the invariants' errors, and the largest corrections.
+    """Draw a run: the components or the orbit, the invariant errors, and the largest corrections.
 
-    A flat line of errors says that the projection works, and nothing about the orbit: that is what the panel of
-    corrections is for.
+    Small invariant errors only show that the projection works and say nothing about the orbit; the panel of corrections
+    shows how much the projection had to correct.
 
     Parameters
     ----------
     result : IntegrationResult, OdeResult or EnsembleResult
-        From `integrate`, from `scipy.integrate.solve_ivp`, or from `ensemble`, whose figure is that of
-        `EnsembleResult.plot`. What was saved is drawn: give `save_every` or `t_eval`.
+        Result of `integrate`, `scipy.integrate.solve_ivp`, or `ensemble` (see `EnsembleResult.plot`). The saved states
+        are drawn: use `save_every` or `t_eval`.
     names : sequence of str or str, optional
         As for `to_xarray`.
     orbit : bool, optional
-        Whether to draw paths in the plane in place of components in time. Default: where components are named x and y,
-        or x_0 and y_0, x_1 and y_1 and so on.
+        True: draw paths in the plane instead of components in time. Default: True if components are named x and y, or
+        x_0 and y_0, x_1 and y_1 and so on.
     ax : matplotlib.axes.Axes, optional
         Draw only the orbit or the components, into these axes.
 
     Returns
     -------
     matplotlib.figure.Figure or matplotlib.axes.Axes
-        The figure, or `ax` where it is given. A notebook shows the figure, without a magic; in a script with windows
-        ``matplotlib.pyplot.show()`` shows it; ``figure.savefig("run.png")`` writes it to a file.
+        The figure, or `ax` if it is given. A notebook shows the figure automatically; in a script
+        ``matplotlib.pyplot.show()`` shows it, and ``figure.savefig("run.png")`` writes it to a file.
 
     Raises
     ------
     ImportError
-        Without matplotlib: ``pip install "eip_scipy[plot]"``.
+        If matplotlib is missing: ``pip install "eip_scipy[plot]"``.
     TypeError
-        When `ax` is not one Axes, or the figure of an ensemble is asked for with `ax` or `orbit`.
+        If `ax` is not one Axes, or `ax` or `orbit` is given for an ensemble.
     ValueError
-        When an orbit is asked for and no components are named so.
+        If an orbit is requested but no components have such names.
 
     Examples
     --------
@@ -59,7 +59,7 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
         raise TypeError(f"plot: ax must be one matplotlib Axes, got {kind}; choose one of several, such as axes[0].")
     if of_members(result):
         if ax is not None or orbit is not None:
-            raise TypeError("plot: the figure of an ensemble takes neither ax nor orbit; leave them out.")
+            raise TypeError("plot: the figure of an ensemble takes neither ax nor orbit; omit them.")
         return result.plot(names)
     labels = component_names(result, names)
     pairs = planes(labels)
@@ -84,7 +84,7 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
 
 
 def planes(names: tuple[str, ...]) -> dict[str, tuple[int, int]]:
-    """Of each body the places of x and y."""
+    """Return the indices of x and y of each body."""
     place = {name: k for k, name in enumerate(names)}
     bodies = [name[1:] for name in names if name[:1] == "x" and name[1:2] in ("", "_")]
     return {
@@ -95,7 +95,7 @@ def planes(names: tuple[str, ...]) -> dict[str, tuple[int, int]]:
 
 
 def described(result: Any) -> str:
-    """The method and the step of a run, and whether it is to be trusted."""
+    """Return the method and the step of a run, with a remark if it is not to be trusted."""
     if "method" not in result:
         return ""
     step = "adaptive steps" if result.h is None else f"h = {result.h:g}"

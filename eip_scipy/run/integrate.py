@@ -37,7 +37,7 @@ __all__ = ["integrate"]
 
 CHUNK_SECONDS = 0.2
 FIRST_CHUNK = 64
-# After which a run says that it could be compiled.
+# Run time in seconds after which compiling the invariants is suggested.
 SLOW_SECONDS = 2.0
 ARRIVED, STOPPED = "reached the end of the interval", "stopped by the callback"
 ENDED_BY_EVENT = "A termination event occurred."
@@ -78,9 +78,9 @@ def integrate(
     max_step: float = np.inf,
     **projection: Unpack[ProjectionKeywords],
 ) -> IntegrationResult:
-    """Integrate with fixed or adaptive steps, compiled where the functions are Numba functions.
+    """Integrate with fixed or adaptive steps, compiled if the functions are Numba functions.
 
-    The solver classes take the same step; with the same jitted functions the same bits come out, compiled or not.
+    The solver classes take the same step. With the same jitted functions the results agree bit by bit, compiled or not.
 
     Parameters
     ----------
@@ -90,89 +90,91 @@ def integrate(
         ``int fun(double t, const double *y, double *out, const double *params)``, see
         :doc:`/tutorials/c-functions`. With a Nystrom method (`EIPRKN8`, `EIPRKN12`) or a multistep one
         (`EIPGJ12`, `EIPGJ14`), whose state is (q, v), ``fun`` must return (v, a); give `acceleration` instead to
-        write a alone. A `Problem` brings everything else with it; options given here take precedence.
+        write only a. A `Problem` contains everything else; options given here take precedence.
     t_span : (float, float)
-        Start and end; backward if the end comes first. Of a `Problem` with units also durations of astropy, and with an
-        epoch its times, in any scale, see :doc:`/tutorials/rebound-and-astropy`; the same goes for `t_eval`, and
-        durations for `h`, `first_step` and `max_step`.
+        Start and end; time runs backward if the end is before the start. For a `Problem` with units they may be
+        durations of astropy, and with an epoch also times of astropy in any scale, see
+        :doc:`/tutorials/rebound-and-astropy`. The same applies to `t_eval`; `h`, `first_step` and `max_step` may be
+        durations.
     y0 : array_like, shape (n,)
         Initial state, real or complex.
     acceleration : callable, optional
-        In place of `fun`, for q'' = a(t, q) with the state (q, v) and any method: ``acceleration(t, q[, params]) ->
+        Instead of `fun`, for q'' = a(t, q) with the state (q, v) and any method: ``acceleration(t, q[, params]) ->
         (n/2,)``, in place ``acceleration(t, q, out[, params])``; a Python, Numba or C function as for `fun`.
         Accelerations that depend on velocities belong in `fun`.
     method : type, optional
         `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, `EIPGJ12`, `EIPGJ14`,
-        `EIPRadau`, `EIPBDF`, or a class made by `eip_method`; one on a one-step method runs interpreted, and so do
-        `EIPRadau` and `EIPBDF`. Default: the problem's own, if it has one.
+        `EIPRadau`, `EIPBDF`, or a class made by `eip_method`. `EIPRadau`, `EIPBDF` and classes made from a one-step
+        method run interpreted. Default: the method of the problem, if it has one.
     h : float, optional
-        Length of the steps, > 0; the last one ends on the end of `t_span` and may be shorter. None: adaptive steps by
-        `rtol`, `atol`, `first_step` and `max_step`. Default: adaptive where one of these is given, else a problem's
-        own step, if it has one.
+        Length of the steps, > 0; the last step ends at the end of `t_span` and may be shorter. None: adaptive steps
+        controlled by `rtol`, `atol`, `first_step` and `max_step`. Default: adaptive if one of these is given, else the
+        step of the problem, if it has one.
     args : tuple, optional
         As in `scipy.integrate.solve_ivp`: passed on as the last arguments, to `fun`, events, `jacobian` and `jac`, and
         to the invariants' functions behind their own. Numbers reach Numba functions as such (a float, an int, a bool)
         and C functions as `params`; a single array of floats is the same as ``params``. With anything else Python calls
         the functions.
     params : array_like of float, optional
-        In place of `args`: passed on as the last argument, one array of floats. A problem that names its parameters
-        (`hamiltonian`, `equations`) also takes a mapping of those that are to have other values.
+        Instead of `args`: one array of floats, passed on as the last argument. A problem that names its parameters
+        (`hamiltonian`, `equations`) also accepts a mapping of the parameters that change.
     in_place : bool, optional
         Whether `fun`, or `acceleration`, fills its third argument.
     jacobian : callable, optional
         For a multistep method that takes it (`EIPGJ14`): ``jacobian(t, q, dq, out[, params])`` fills `out` with the
-        derivative of the accelerations along dq, a Numba or C function for a compiled run. A problem may bring its own.
+        derivative of the accelerations along dq, a Numba or C function for a compiled run. A problem may have its own.
     jac : callable or array_like, shape (n, n), optional
         For `EIPRadau` and `EIPBDF`, as for SciPy's Radau and BDF: ``jac(t, y[, params]) -> (n, n)``, the matrix of the
         derivatives of `fun`, dense or sparse, or a constant matrix.
     variations : str, int, sequence of these or array_like, shape (n, k), optional
-        Derivatives of the state to carry along, by the steps of a Runge-Kutta method, and to project with the state so
-        that they fit the invariants. ``"state"``: by the initial state, the state-transition matrix ``run.stm``. Names
-        or places of parameters: ``run.sensitivities``; a list holds several of these. An array: columns that start
-        from these, ``run.variations``. Products with the Jacobian come from the problem, from jitted functions by dual
-        numbers, from `jvp`, or else from complex steps. See :doc:`/how-to/tangent-maps`.
+        Derivatives of the state that are integrated with it by a Runge-Kutta method, and projected so that they are
+        consistent with the invariants. ``"state"``: with respect to the initial state, the state-transition matrix
+        ``run.stm``. Names or indices of parameters: ``run.sensitivities``; a list combines several of these. An array:
+        columns with these initial values, ``run.variations``. Products with the Jacobian come from the problem, from
+        dual numbers if the functions are jitted, from `jvp`, or else from complex steps. See
+        :doc:`/how-to/tangent-maps`.
     jvp : callable, optional
         ``jvp(t, y, dy[, params]) -> (n,)``: the Jacobian of `fun` times dy, for `variations`.
     symplectic : bool, optional
-        Whether a state-transition matrix is kept symplectic, for states (q, p) of a Hamiltonian system. Default: where
-        the problem knows that it is one.
+        If True, a state-transition matrix is kept symplectic, for states (q, p) of a Hamiltonian system. Default: True
+        if the problem is known to be such a system.
     save_every : int, optional
-        Save each so many-th step, besides the first and the last state.
+        Save every `save_every`-th step, in addition to the first and the last state.
     t_eval : array_like, optional
-        Times to save at instead, inside `t_span`, in its direction; states between steps come from dense output, on
-        the manifold. With neither, the first and the last state are saved.
+        Times to save at instead, inside `t_span`, in its direction. States between steps come from dense output and are
+        projected. Without `save_every` and `t_eval`, the first and the last state are saved.
     events : callable or sequence of callable, optional
         ``event(t, y[, params]) -> float``, with ``terminal`` and ``direction`` as for `scipy.integrate.solve_ivp`;
-        Numba functions or C functions, or Python functions, which Python then calls beside native ones.
+        Numba functions or C functions, or Python functions, which are called from Python even if `fun` is native.
     dense_output : bool, optional
-        Whether to keep the interpolants of all steps, as ``.sol``, a function of time; not with a checkpoint.
+        If True, store the interpolants of all steps as ``.sol``, a function of time; not available with a checkpoint.
     callback : callable, optional
-        ``callback(t, y, defects)`` at each saved point; return True to stop the run. With `save_every` the interval
-        may then be endless, as with a terminal event.
+        ``callback(t, y, defects)``, called at each saved point with the invariant errors `defects`; return True to stop
+        the run. With `save_every` the interval may then be infinite, as with a terminal event.
     progress : bool, optional
-        Show a progress bar with the time that is left.
+        Show a progress bar with the remaining time.
     compiled : bool, optional
-        None: compiled where possible, else interpreted, with the reason in ``.message``. True: TypeError where it is
-        not possible for all functions. False: interpreted.
+        None: compiled if possible, else interpreted, with the reason in ``.message``. True: TypeError if a function
+        cannot be compiled. False: interpreted.
     max_bytes : float, optional
-        Bound on the memory for saved states; default: half of what is free.
+        Bound on the memory for saved states; default: half of the free memory.
     checkpoint : path-like, optional
-        File that holds the run, saved states included, so that it can be resumed; written at the start, every
-        `checkpoint_every` seconds, and when the run ends or is broken off, by SIGTERM too. A file that is there already
-        is replaced only by the run that resumes it, and only one run at a time may have it.
+        File that stores the run, including the saved states, so that it can be resumed. It is written at the start,
+        every `checkpoint_every` seconds, and when the run ends or is interrupted, also by SIGTERM. An existing file is
+        replaced only by the run that resumes it, and only one run at a time may use it.
     checkpoint_every : float, optional
-        Seconds from one checkpoint to the next; more where writing would take over a twentieth of the time.
+        Seconds from one checkpoint to the next; longer if writing would take more than 5 % of the time.
     resume : bool, optional
-        Go on from the checkpoint, with the same arguments: the result has the same bits as a run without the
-        interruption. Where the file does not exist yet the run starts at the beginning; `message` tells which.
+        Continue from the checkpoint, with the same arguments: the result agrees bit by bit with that of an
+        uninterrupted run. If the file does not exist, the run starts at the beginning. `message` says which.
     {names of ProjectionOptions}
         As for the solver classes, see `EIPSolver`. Functions of invariants are called as
-        ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` takes the run's
-        `params` in its place.
+        ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` is called with the `params` of
+        the run instead.
     diagnostics, first_step, max_step
-        Likewise.
+        As for the solver classes.
     rtol, atol : float or array_like, optional
-        Likewise, 1e-3 and 1e-6 by default. Beside a given `h` they only set the scale of the error metric.
+        As for the solver classes, 1e-3 and 1e-6 by default. If `h` is given, they only scale the error metric.
 
     Returns
     -------
@@ -182,24 +184,23 @@ def integrate(
     Raises
     ------
     TypeError
-        Unknown options, values of a wrong kind, or ``compiled=True`` with functions that cannot be compiled.
+        Unknown options, values of a wrong type, or ``compiled=True`` with functions that cannot be compiled.
     ValueError
-        Options with wrong values, a start that misses a given target, a wrong gradient.
+        Options with wrong values, an initial state that misses a given target, or a wrong gradient.
     MemoryError
-        When the saved states would need more than `max_bytes`.
+        If the saved states would need more than `max_bytes`.
     CheckpointError
-        When the file cannot be written at the start, or is there and not to be resumed, or is damaged, or belongs to a
-        run with other arguments or functions, or another run has it.
+        If the file cannot be written at the start, exists without ``resume=True``, is damaged, belongs to a run with
+        other arguments or functions, or is used by another run.
 
     Notes
     -----
-    A step that fails ends the run with ``status=-1`` and everything up to there. Exceptions from user code and
-    KeyboardInterrupt pass through, with what the run had as ``exception.partial`` (one row, the start, before the first
-    step), and with a note that says from where its checkpoint goes on. A checkpoint that cannot be written later on is
-    a RuntimeWarning and stands in `message`; the former one stays.
+    A step that fails ends the run with ``status=-1``; the result holds everything up to that step. Exceptions raised by
+    the user's functions and KeyboardInterrupt propagate. Their attribute ``partial`` is the result up to that point
+    (one row, the initial state, before the first step), and a note says where the checkpoint continues. If a later
+    checkpoint cannot be written, a RuntimeWarning says so, `message` repeats it, and the previous checkpoint is kept.
 
-    The user's functions may keep or overwrite the states that they are given: compiled or not, they get copies where
-    they do.
+    The user's functions may store or overwrite the states that they receive: in that case they receive copies.
 
     Examples
     --------
@@ -209,7 +210,7 @@ def integrate(
     >>> run.y.shape, bool((run.max_defect < 1e-11).all())
     ((4, 68), True)
     """
-    asked = dict(locals())  # by the names of the request, whose defaults are these
+    asked = dict(locals())  # the fields of Request have the same names and defaults
     _check_names(projection)
     request = Request(**{item.name: asked[item.name] for item in fields(Request)})
     keeping = _resume.keeping(checkpoint, checkpoint_every, resume, dense_output)
@@ -227,10 +228,10 @@ def _check_names(projection: Iterable[str]) -> None:
 
 
 class Loop:
-    """Drives chunks of steps: progress, samples, events, callbacks, and what is kept when something goes wrong."""
+    """A run in chunks of steps, with progress, samples, events, callbacks, and a partial result after an error."""
 
     def __init__(self, prepared: Prepared, keeper: _resume.Keeper, *, compiled: bool | None = None) -> None:
-        """`compiled`: instead of what the request says."""
+        """Prepare the run; `compiled` replaces the value of the request."""
         request, system, run = prepared.request, prepared.system, prepared.run
         self.prepared, self.keeper = prepared, keeper
         self.method = prepared.label
@@ -239,8 +240,8 @@ class Loop:
         if keeper.keeps:
             if run.tableau.drives:
                 raise ValueError(
-                    f"checkpoint: a file does not hold the inside of SciPy's {run.tableau.name}, by which the run "
-                    "would go on. Leave it out, or save the state of a run and start another one from it."
+                    f"checkpoint: a file cannot store the internal state of SciPy's {run.tableau.name}, which resuming "
+                    "needs. Omit it, or save the state of a run and start another run from it."
                 )
             identity = prepared.identity(run.begin.y, system.parameters)
             keeper.identify(identity, run, system.derivative, *run.begin[:3])
@@ -272,7 +273,7 @@ class Loop:
             self.keeper.end(status, message)
         except BaseException as error:
             self.wall_time += time.perf_counter() - begin
-            self.keeper.interrupted(error)  # first: whoever ends the process may not wait long
+            self.keeper.interrupted(error)  # first, because the process may be killed soon after SIGTERM
             driver.run.trust.failed = True
             driver.save_now()
             partial = self._result(-1, f"interrupted by {type(error).__name__}", broken=True)
@@ -291,9 +292,9 @@ class Loop:
         return result
 
     def steps(self, bar: Any) -> tuple[int, str]:
-        """Run on to the end of the interval, or to what ends the run before it; returns status and message.
+        """Run to the end of the interval, or until something ends the run earlier; return status and message.
 
-        At the end `told` says whether something speaks against a run that has not failed.
+        Afterwards `told` is True if a run that has not failed is not reliable.
         """
         self._doubtful = False
         status, message = self._steps(bar)
@@ -348,26 +349,26 @@ class Loop:
                 self.chunk = max(1, min(longer, int(steps * CHUNK_SECONDS / max(seconds, 1e-9))))
 
     def _tell_why_slow(self, seconds: float) -> None:
-        """After a chunk of so many seconds: once, in a run that its invariants alone keep from being compiled."""
+        """Warn once if only the invariants prevent a slow run from being compiled; `seconds` is the time of a chunk."""
         self._seconds += seconds
         if self._slowed and self._seconds > SLOW_SECONDS:
             self._slowed = False
             warnings.warn(
                 f"{self.method}: fun is jitted, and the run could be many times faster, but it is {self.why_not}. "
-                "(compiled=False says that this is meant.)",
+                "Pass compiled=False if this is intended.",
                 UserWarning,
                 stacklevel=5,
             )
 
     def _progress(self, shown: float, k: int) -> float:
-        """What the bar is to grow by: steps where their number is known, else time."""
+        """Return the progress since the last call: in steps if their number is known, else in time."""
         schedule = self.driver.schedule
         if schedule.span.h != 0.0:
             return self.driver.step - k
         return abs(self.driver.now[0] - schedule.span.t0) - shown
 
     def _ended(self, code: int) -> bool:
-        """Whether an event ends the run; after a pause, what is asked for in the step that is pending."""
+        """Return True if an event ends the run; after a pause, handle the samples and events of the pending step."""
         driver, schedule = self.driver, self.driver.schedule
         self._event_ended = self._pause() if code == PAUSE else code == ENDED
         if self._event_ended and schedule.t_eval.size == 0:
@@ -375,7 +376,7 @@ class Loop:
         return self._event_ended
 
     def _pause(self) -> bool:
-        """Samples and events in the step that is pending; True where an event ends the run."""
+        """Handle samples and events in the pending step; return True if an event ends the run."""
         driver, schedule = self.driver, self.driver.schedule
         sol = driver.dense()
         end = self.events.handle(*driver.pending_events(), sol)
@@ -386,11 +387,11 @@ class Loop:
         return end is not None
 
     def _chunk(self, chunk: int) -> int:
-        """Steps of the next call: none beyond the next look or, with a callback, the next saved one."""
+        """Return the number of steps of the next call: at most up to the next check or, with a callback, saved step."""
         driver, schedule = self.driver, self.driver.schedule
         history, left = driver.run.method.multistep, schedule.span.n_steps - driver.step
         if history is not None and left - history.middle <= chunk:
-            chunk = left  # the last states cost a step of the method that starts, each of them that is asked for
+            chunk = left  # each of the last states that is requested costs a step of the starting method
         chunk = min(chunk, steps_to_check(driver.step))
         if self.callback is None:
             return chunk
@@ -399,7 +400,7 @@ class Loop:
         return min(chunk, schedule.save_every - driver.step % schedule.save_every) if schedule.save_every else chunk
 
     def _steps_to_next_time(self) -> int:
-        """Steps that are surely made before the next time in t_eval."""
+        """Return a number of steps that certainly ends before the next time in t_eval."""
         driver, schedule = self.driver, self.driver.schedule
         h = abs(schedule.span.h)
         if h == 0.0 or driver.rows == schedule.t_eval.size:
@@ -458,7 +459,7 @@ class Loop:
             result["columns"] = self.prepared.described_columns
             asked, kept = replace(asked, variations=columns.after(y)), variations.with_targets(kept)
         origin = Origin(asked, t, _own(y.copy(), self.prepared), driver.schedule.span.sign, kept)
-        object.__setattr__(result, "_origin", origin)  # beside the fields, which are items
+        object.__setattr__(result, "_origin", origin)  # not a field: fields are items of the result
         return result
 
     def _solution(self) -> Any:
@@ -469,17 +470,19 @@ class Loop:
         return StateSolution(found, self.prepared.variations.columns)
 
     def explained(self, message: str) -> str:
-        """With what speaks against the run, and what is to be said about checkpoints and not being compiled."""
+        """Return the message with doubts about the run, notes on checkpoints, and why the run was not compiled."""
         notes = [*self.keeper.notes, *([] if self.why_not is None else [self.why_not])]
         if labels := self.driver.run.invariants.by_differences:
             names = ", ".join(map(repr, labels))
-            notes.append(f"the gradient of {names} comes from differences: one of its own would be faster and exact")
+            notes.append(
+                f"the gradient of {names} is computed by differences: a function for it would be faster and exact"
+            )
         run = self.driver.run
         message = "; ".join(filter(None, (message, run.moved, run.trust.message)))
         return f"{message} ({'; '.join(notes)})" if notes else message
 
     def _values(self, broken: bool) -> np.ndarray:
-        """Invariants of the saved states; NaN where the run was broken off by an invariant that still raises."""
+        """Return the invariants of the saved states; NaN if an invariant that ended the run raises again."""
         try:
             return self.driver.values()
         except BaseException:
@@ -489,19 +492,19 @@ class Loop:
 
 
 def _own(rows: np.ndarray, prepared: Prepared) -> np.ndarray:
-    """The user's states of rows that may have columns of derivatives behind them."""
+    """Return the states of rows without the derivatives that may follow them."""
     return rows if prepared.variations is None or rows.size == 0 else prepared.variations.columns.own(rows)
 
 
 def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:
-    """Whether a jitted right-hand side is called from Python for the sake of invariants that are not jitted."""
+    """Return True if a jitted right-hand side is called from Python only because invariants are not jitted."""
     kept = [found for item in run.invariants.items for found in (item.function, item.gradient)]
     native = all(is_compiled(found) or isinstance(found, PointerFunction) for found in kept)
     return isinstance(functions, PythonFunctions) and is_jitted(fun) and not native
 
 
 def _compiling(shown: bool) -> Any:
-    """A line while a user's functions compile, which can take some seconds."""
+    """Show a line while functions are compiled, which can take some seconds."""
     if not shown:
         return nullcontext()
     from tqdm import tqdm
@@ -510,7 +513,7 @@ def _compiling(shown: bool) -> Any:
 
 
 class _NoBar:
-    """In the place of a progress bar that is not shown."""
+    """Stand-in for a progress bar that is not shown."""
 
     n = 0.0
 
@@ -530,20 +533,20 @@ def _bar(progress: bool, schedule: Schedule, label: str) -> Any:
     else:
         total = abs(schedule.span.t_bound - schedule.span.t0) if math.isfinite(schedule.span.t_bound) else None
     unit = "step" if fixed else "time"
-    # Beyond 0 where the run is resumed.
+    # Above 0 if the run is resumed.
     initial = int(schedule.place[STEP]) if fixed else abs(float(schedule.clock[TIME]) - schedule.span.t0)
     return tqdm(total=total, initial=initial, desc=label, unit=unit, unit_scale=True, smoothing=0.05)
 
 
 @contextmanager
 def _start_kept(request: Request) -> Iterator[None]:
-    """Give an exception that comes before the first step the start as what the run had."""
+    """Attach the initial state as the partial result to an exception raised before the first step."""
     begin = time.perf_counter()
     try:
         yield
     except BaseException as error:
         if not hasattr(error, "partial"):
-            with suppress(TypeError, ValueError):  # no start that could be read
+            with suppress(TypeError, ValueError):  # the initial state itself cannot be read
                 t0, start = started_at(request)
                 error.partial = IntegrationResult(  # type: ignore[attr-defined]
                     t=np.array([t0]),

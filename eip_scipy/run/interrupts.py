@@ -1,4 +1,4 @@
-"""Ctrl-C, kept where Python forgets it, and SIGTERM, which waits for the checkpoint."""
+"""Handling of Ctrl-C, which Python may drop, and of SIGTERM, which waits for the checkpoint."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["TerminatedError", "ended_by_sigterm", "kept_ctrl_c", "look_for_signa
 
 
 class TerminatedError(KeyboardInterrupt):
-    """SIGTERM has come where there is something to keep first; what Ctrl-C leaves in order, it does."""
+    """Exception raised by SIGTERM while a checkpoint must be written; it is handled as Ctrl-C is."""
 
 
-# Seconds after which a Ctrl-C is tried again that came where Python would drop it.
+# Seconds after which a Ctrl-C is repeated that came where Python would drop it.
 AGAIN = 0.02
 
 
@@ -30,11 +30,11 @@ class _Came:
 
 @contextmanager
 def kept_ctrl_c() -> Iterator[None]:
-    """Let `look_for_signals` know of a Ctrl-C that comes from now on.
+    """Make `look_for_signals` raise KeyboardInterrupt after a Ctrl-C that Python would drop.
 
-    An exception that is raised inside a destructor or a callback from C is printed and dropped, KeyboardInterrupt too,
-    and compilation makes and drops objects of LLVM all the time: a Ctrl-C then would do nothing. Where it can be seen
-    to come there it is put off until Python is out of it. A handler of the user's own stays in place.
+    Python prints and drops exceptions raised inside a destructor or a callback from C, including KeyboardInterrupt.
+    Compilation creates and destroys LLVM objects all the time, so a Ctrl-C could do nothing. In these places it is
+    postponed until Python has left them. A user-defined handler stays in place.
     """
     if not _is_ours(signal.SIGINT, signal.default_int_handler):
         yield
@@ -51,15 +51,15 @@ def kept_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def ended_by_sigterm(wanted: bool) -> Iterator[None]:
-    """Let SIGTERM end the block as an exception, and then the process, as whoever sent it expects.
+    """Let SIGTERM end the block by an exception, and then the process, as its sender expects.
 
-    What exceptions have to say in notes goes to the standard error stream. Only where SIGTERM would end the process at
-    once: in the main thread, without a handler of the user's own. A second SIGTERM does not disturb the first.
+    Notes of exceptions are printed to the standard error stream. This applies only in the main thread and without a
+    user-defined handler, where SIGTERM would end the process at once. A second SIGTERM is ignored.
 
     Parameters
     ----------
     wanted : bool
-        Whether there is anything to do before the end; if not, SIGTERM does what it always does.
+        True if something must be done before the end; otherwise SIGTERM has its usual effect.
     """
     if not (wanted and _is_ours(signal.SIGTERM, signal.SIG_DFL)):
         yield
@@ -74,12 +74,12 @@ def ended_by_sigterm(wanted: bool) -> Iterator[None]:
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         if _Came.sigterm:
-            sys.stdout.flush()  # the signal does not
+            sys.stdout.flush()  # the signal does not flush it
             signal.raise_signal(signal.SIGTERM)
 
 
 def look_for_signals() -> None:
-    """Raise what was dropped.
+    """Raise the exception of a signal that was dropped.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def look_for_signals() -> None:
 
 
 def _is_ours(number: int, usual: object) -> bool:
-    """Whether a signal may be handled here: in the main thread, and not by the user already."""
+    """Return True if a signal may be handled here: in the main thread, and without a user-defined handler."""
     return threading.current_thread() is threading.main_thread() and signal.getsignal(number) is usual
 
 
@@ -101,13 +101,13 @@ def _note_ctrl_c(number: int, frame: FrameType | None) -> None:
     _Came.ctrl_c = True
     if _would_be_dropped(frame):
         _Came.put_off = this = object()
-        _thread.start_new_thread(_press_again, (this,))  # not threading's, which takes locks
+        _thread.start_new_thread(_press_again, (this,))  # threading.Thread would take locks
     else:
         signal.default_int_handler(number, frame)
 
 
 def _would_be_dropped(frame: FrameType | None) -> bool:
-    """Whether Python is in a destructor, or in LLVM, which calls back."""
+    """Return True if Python is in a destructor, or in LLVM, which uses callbacks."""
     while frame is not None:
         if frame.f_code.co_name == "__del__" or frame.f_globals.get("__name__", "").startswith("llvmlite."):
             return True

@@ -1,4 +1,4 @@
-"""Memory for what a run saves: the option ``max_bytes``, and what is free."""
+"""Memory for saved states: the option ``max_bytes``, and the free memory."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from ..core.inputs import is_number, refuse_units, shown
 
 __all__ = ["check_bytes", "most_bytes"]
 
-SMALL = 2**22  # bytes: the system is not asked whether there are so many, which would take longer than to use them
+SMALL = 2**22  # bytes; for fewer bytes the free memory is not determined, because that takes longer than filling them
 
 
 def check_bytes(max_bytes: Any) -> None:
-    """The option ``max_bytes`` is None or a number."""
+    """Raise ValueError unless the option ``max_bytes`` is None or a number."""
     refuse_units(max_bytes=max_bytes)
     if max_bytes is not None and not (is_number(max_bytes) and max_bytes >= 0):
         raise ValueError(f"max_bytes must be a number of bytes >= 0, got {shown(max_bytes)}.")
 
 
 def most_bytes(needed: float, max_bytes: float | None) -> float:
-    """Bytes that may be taken by who needs so many: `max_bytes`, or half of what is free."""
+    """Return the bound on the memory of a run that needs `needed` bytes: `max_bytes`, or half of the free memory."""
     if max_bytes is not None:
         return max_bytes
     return SMALL if needed <= SMALL else 0.5 * free_memory()
 
 
 def free_memory() -> float:
-    """Bytes that a process may still take."""
+    """Return the number of bytes that a process can still allocate."""
     try:
         with open("/proc/meminfo") as lines:
             for line in lines:

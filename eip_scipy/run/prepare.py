@@ -1,4 +1,4 @@
-"""From what a user asks of `integrate` to a run that is ready to step, in steps that an ensemble shares."""
+"""Preparation of a run: from the arguments of `integrate` to a run that is ready to step; ensembles share it."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ DEFAULT: Any = _Default()
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """What `integrate` is asked for, as it was given; of the projection's options those that were."""
+    """The arguments of `integrate` as given; `projection` contains only the projection options that were given."""
 
     fun: Any = None
     acceleration: Any = None
@@ -92,30 +92,30 @@ class Request:
 
     @classmethod
     def of(cls, **keywords: Any) -> Request:
-        """A request from keywords, those of the projection among them."""
+        """Return a request made from keywords, including projection options."""
         projection, others = ProjectionOptions.split(keywords)
         return cls(projection=projection, **others)
 
     def with_pointers(self) -> Request:
-        """The request with its C functions by pointer as Python calls them."""
+        """Return the request with C function pointers wrapped so that Python can call them."""
         jacobian = by_pointer(self.jacobian, "jacobian", GRADIENT, takes_f=True)
         fun, acceleration = by_pointer(self.fun, "fun"), by_pointer(self.acceleration, "acceleration")
         return replace(self, fun=fun, acceleration=acceleration, events=as_events(self.events), jacobian=jacobian)
 
     @property
     def function(self) -> Any:
-        """Return what was given as the right-hand side, or in its place."""
+        """Return the function that was given as the right-hand side or as the acceleration."""
         return self.fun if self.acceleration is None else self.acceleration
 
     @property
     def adaptive(self) -> bool:
-        """Whether an option of adaptive steps was given."""
+        """Return True if an option of adaptive steps was given."""
         no_bound = isinstance(self.max_step, float) and self.max_step == np.inf
         return not (self.rtol is DEFAULT and self.atol is DEFAULT and self.first_step is None and no_bound)
 
     @property
     def steps(self) -> StepOptions:
-        """The options of the step size, with their defaults."""
+        """Return the options of the step size, with their defaults."""
         return StepOptions(
             h=None if self.h is DEFAULT else self.h,
             first_step=self.first_step,
@@ -126,9 +126,9 @@ class Request:
 
 
 class System:
-    """The user's functions of a run: `fun` as it was given, and `rhs`, interpreted, as the loop calls it.
+    """The user's functions of a run: `fun` as given, and `rhs`, the interpreted form that the loop calls.
 
-    `acc`: the accelerations alone, where the method wants nothing else and a problem brings them.
+    `acc` is the acceleration of a problem that has one, if the method needs nothing else.
     """
 
     def __init__(self, request: Request, form: str, acc: Any) -> None:
@@ -144,23 +144,23 @@ class System:
         self.rhs: Callable[..., None]
 
     def bind(self, y0: np.ndarray) -> None:
-        """Make `rhs` for states like y0."""
+        """Make `rhs` for states of the shape and type of y0."""
         self.rhs = INTERPRETED[self.form](self.fun, self.extra, y0)
 
     @property
     def name(self) -> str:
-        """Name of the argument of `integrate` that the function came as."""
+        """Name of the argument of `integrate` with which the function was given."""
         return "acceleration" if self.form.startswith("acceleration") else "fun"
 
     @property
     def left_out(self) -> str:
-        """What NaN in its value may come from, besides NaN."""
+        """Return a possible cause of NaN in the value of the function."""
         if isinstance(self.fun, PointerFunction):
-            return "a C function leaves NaN where it fills nothing, or returns a status above 0"
+            return "a C function leaves NaN in components that it does not fill, and if it returns a status above 0"
         return "with in_place=True it must fill all of out" if "in place" in self.form else ""
 
     def derivative(self, t: float, y: np.ndarray) -> np.ndarray:
-        """The derivative as a new array; a function that takes other arguments is refused."""
+        """Return the derivative as a new array; raise an error if the function has other arguments."""
         out = np.empty_like(y)
         try:
             self.rhs(t, y, out, self.parameters)
@@ -182,7 +182,7 @@ class System:
         return Jacobian((lambda t, y: jac(t, y, *self.extra)) if callable(jac) and self.extra else jac)
 
     def functions(self, run: Run, wanted: bool | None) -> tuple[PythonFunctions | NativeFunctions, str | None]:
-        """The functions of the loop, and which of them Python calls and why (None: none)."""
+        """Return the functions of the loop, and which of them are called from Python and why (None if none is)."""
         in_python, numbers = self._in_python(run), scalars(self.extra)
         if wanted is False:
             return in_python, "interpreted: compiled=False"
@@ -210,14 +210,14 @@ class System:
 
     @property
     def _native_form(self) -> tuple[Any, str]:
-        """`fun` and its form, or the accelerations alone where they are of the same library: nothing else is used."""
+        """Return `fun` and its form, or the acceleration if it comes from the same library and suffices."""
         own = isinstance(self.fun, LibraryFunction) and isinstance(self.acc, LibraryFunction)
         if own and self.fun.__name__.partition(".")[0] == self.acc.__name__.partition(".")[0]:
             return self.acc, "acceleration"
         return self.fun, self.form
 
     def calls(self, run: Run, functions: PythonFunctions | NativeFunctions) -> dict[str, str]:
-        """Which kind of call is made of each function; see `IntegrationResult`."""
+        """Return how each function is called; see `IntegrationResult`."""
 
         def kind(fun: Any, in_python: bool) -> str:
             if in_python:
@@ -261,9 +261,9 @@ class System:
 
 @dataclass
 class Prepared:
-    """A run that is ready but for its functions, which are compiled last.
+    """A validated run whose functions have not been compiled yet.
 
-    `asked` is the request as it came, `request` with what a problem brings.
+    `asked` is the request as given; `request` also contains what a problem provides.
     """
 
     asked: Request
@@ -281,7 +281,7 @@ class Prepared:
 
     @property
     def label(self) -> str:
-        """The name of the method's class."""
+        """Name of the method's class."""
         return str(self.request.method.__name__)
 
     @property
@@ -300,30 +300,30 @@ class Prepared:
 
     @property
     def component_names(self) -> tuple[str, ...] | None:
-        """Those of the problem, where it has the run's components."""
+        """Names of the components from the problem, or None if it has none for this state."""
         names = self.asked.fun.component_names if isinstance(self.asked.fun, Problem) else None
         return names if names is not None and len(names) == self.n else None
 
     @property
     def units(self) -> str:
-        """Those of the problem."""
+        """Units of the problem."""
         return self.asked.fun.units if isinstance(self.asked.fun, Problem) else ""
 
     @property
     def epoch(self) -> tuple[float, float] | None:
-        """That of the problem."""
+        """Epoch of the problem."""
         return self.asked.fun.epoch if isinstance(self.asked.fun, Problem) else None
 
     @property
     def pointers(self) -> list[PointerFunction]:
-        """The C functions by pointer."""
+        """Return the C functions given as pointers."""
         items = self.run.invariants.items
         functions = [self.system.fun, *self.system.events.functions]
         functions += [function for item in items for function in (item.function, item.gradient, item.rate_function)]
         return [function for function in functions if isinstance(function, PointerFunction)]
 
     def identity(self, y0: Any, params: Any) -> dict[str, Any]:
-        """All that decides the bits of a run from y0, but for the functions, under the names that users give."""
+        """Return everything except functions that determines the bits of a run from y0, with the names users know."""
         found = settings(self.label, y0, params, self.run, self.schedule, self.system.events)
         if self.variations is not None:
             found |= {name: plain(value) for name, value in self.variations.columns.identity.items()}
@@ -331,7 +331,7 @@ class Prepared:
 
 
 def prepared(request: Request, *, check_start: bool = True) -> Prepared:
-    """A run as it is asked for, all that was given checked; `check_start`: see `RunSpec.build`."""
+    """Check a request and prepare its run; for `check_start` see `RunSpec.build`."""
     request = _plain(request)
     refuse_units(first_step=request.first_step, max_step=request.max_step, max_bytes=request.max_bytes)
     if request.method is None:
@@ -340,7 +340,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
     _check_choices(request)
     if request.jac is not None and not method.drives:
         raise TypeError(
-            f"jac is the Jacobian for EIPRadau and EIPBDF; {request.method.__name__} takes none. Leave it out."
+            f"jac is the Jacobian for EIPRadau and EIPBDF; {request.method.__name__} does not use one. Omit it."
         )
     asked, request = request, request.with_pointers()
     acc = request.fun.acc if method.of_second_order and isinstance(request.fun, Problem) else None
@@ -370,7 +370,7 @@ def prepared(request: Request, *, check_start: bool = True) -> Prepared:
 
 
 def _spec(given: Any, request: Request, system: System, calls: Counted, stepping: Stepping) -> RunSpec:
-    """Return what the run is made from; `given` is the function or the problem as it was given."""
+    """Return the specification of the run; `given` is the function or the problem as given."""
     problem = given if isinstance(given, Problem) else None
     return RunSpec(
         name=request.method.__name__,
@@ -393,7 +393,7 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
     """Return the derivatives that a request asks for, or None."""
     if request.variations is None:
         if request.jvp is not None or request.symplectic is not None:
-            raise TypeError("jvp and symplectic belong to variations=...; ask for derivatives, or leave them out.")
+            raise TypeError("jvp and symplectic need variations=...; pass variations, or omit them.")
         return None
     require_tableau(request.method)
     y0 = _state(request.y0)
@@ -405,7 +405,10 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
     names = () if problem is None else tuple(problem.parameters)
     columns = asked_columns(request.variations, y0, floats(extra), names, request.method.TABLEAU.of_second_order)
     if projection.project_initial and columns.parameters:
-        raise ValueError("variations: project_initial does not go with derivatives by parameters; project y0 first.")
+        raise ValueError(
+            "variations: project_initial cannot be combined with derivatives with respect to parameters; project y0 "
+            "first."
+        )
     own = None if problem is None else problem.variational
     t0 = interval(_required("t_span", request.t_span))[0]
     items = as_invariants(projection.invariants)
@@ -416,7 +419,7 @@ def _variations(given: Any, request: Request, form: str) -> Variations | None:
 
 
 def _widened(request: Request, variations: Variations) -> Request:
-    """The request for the state with its columns."""
+    """Return the request for the state extended by its columns."""
     extra = extra_arguments(request.args, request.params)
     return replace(
         request,
@@ -429,18 +432,18 @@ def _widened(request: Request, variations: Variations) -> Request:
 
 
 def default_method(fun: Any) -> type[EIPSolver] | None:
-    """Return the class on a problem's own method; None for other functions and problems without one."""
+    """Return the solver class of a problem's own method, or None if there is none."""
     return eip_method(fun.method) if isinstance(fun, Problem) and fun.method is not None else None
 
 
 def started_at(request: Request) -> tuple[float, np.ndarray]:
-    """Time and state at the start, a problem's own where none is given."""
+    """Return time and state at the start; those of the problem if none are given."""
     t_span, y0 = _given_or_brought(_plain(request))
     return interval(t_span)[0], _state(y0)
 
 
 def _plain(request: Request) -> Request:
-    """The request in numbers; only a problem knows the units of a state, and the names of its parameters."""
+    """Return the request in plain numbers; only a problem knows the units of a state and the names of parameters."""
     problem = request.fun
     if not isinstance(problem, Problem):
         return request
@@ -449,7 +452,7 @@ def _plain(request: Request) -> Request:
 
 
 def _second_order_hint(fun: Any) -> str:
-    """Return how a problem is written in (q, v), or how an acceleration is passed."""
+    """Return advice on how to write the problem in (q, v), or how to pass an acceleration."""
     if not isinstance(fun, Problem):
         return f". If fun is the acceleration a(t, q), {BY_NAME}"
     return "; this problem does it: problem.second_order(), with a start (q, v)" if fun.has_second_order else ""
@@ -458,19 +461,19 @@ def _second_order_hint(fun: Any) -> str:
 def _method(method: Any) -> Any:
     if method is None:
         raise TypeError(
-            "integrate: method is missing. Take EIPDOP853 with rtol=1e-9 where the step may vary, EIPRK4 with h=... "
-            "where it is fixed, EIPRKN12 for q'' = a(t, q); eip_scipy.recommend(...) finds method and step."
+            "integrate: method is missing. Use EIPDOP853 with rtol=1e-9 for adaptive steps, EIPRK4 with h=... for "
+            "fixed steps, or EIPRKN12 for q'' = a(t, q); eip_scipy.recommend(...) finds method and step."
         )
     if not (isinstance(method, type) and issubclass(method, EIPSolver) and hasattr(method, "TABLEAU")):
         raise TypeError(
-            f"integrate: method must be an EIP class such as EIPRK4, or one that eip_method made; got {method!r}"
+            f"integrate: method must be an EIP class such as EIPRK4, or a class made by eip_method; got {method!r}"
             f"{_class_of(method)}."
         )
     return method.TABLEAU
 
 
 def _class_of(method: Any) -> str:
-    """A hint of the class, where its name came, or SciPy's for the same."""
+    """Return a hint that names the class if its name was given, or the name of SciPy's method."""
     name = class_named(method)
     return "" if name is None else f". Give the class: from eip_scipy import {name}"
 
@@ -487,7 +490,7 @@ def _check_choices(request: Request) -> None:
 
 
 def _given_or_brought(request: Request) -> tuple[Any, Any]:
-    """t_span and y0 as they are given, else a problem's own."""
+    """Return t_span and y0 as given, or those of the problem."""
     problem, t_span, y0 = request.fun, request.t_span, request.y0
     if isinstance(problem, Problem):
         return problem.t_span if t_span is None else t_span, problem.y0 if y0 is None else y0
@@ -495,7 +498,7 @@ def _given_or_brought(request: Request) -> tuple[Any, Any]:
 
 
 def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
-    """Return the function that the engine calls and what it is: a right-hand side or an acceleration."""
+    """Return the function that the engine calls and its form: a right-hand side or an acceleration."""
     acceleration = isinstance(fun, AccelerationField)
     if acceleration:
         fun, in_place = fun.acceleration, fun.in_place
@@ -506,15 +509,15 @@ def _function_and_form(fun: Any, in_place: bool) -> tuple[Any, str]:
 
 
 def _with_problem(request: Request) -> tuple[Request, str]:
-    """The request with what a `Problem` brings where nothing else is given, and the form of its function."""
+    """Complete the request with what a `Problem` provides; return it and the form of its function."""
     t_span, y0 = _given_or_brought(request)
     projection, params = dict(request.projection), request.params
-    extra_arguments(request.args, params)  # which raises for what is wrong with them
+    extra_arguments(request.args, params)  # raises an error if they are wrong
     problem, in_place = request.fun, flag("in_place", request.in_place)
     if request.acceleration is not None:
         if problem is not None:
             raise TypeError(
-                "give fun or acceleration, not both: acceleration=a stands for the fun(t, y) = (v, a(t, q)) of "
+                "give fun or acceleration, not both: acceleration=a replaces fun(t, y) = (v, a(t, q)) with "
                 "y = (q, v), and a Problem has its own function."
             )
         problem = AccelerationField(request.acceleration, in_place)
@@ -525,7 +528,7 @@ def _with_problem(request: Request) -> tuple[Request, str]:
         fun, form = _function_and_form(problem, in_place)
         return replace(request, fun=fun, t_span=t_span, y0=y0, projection=projection), form
     if request.args is not None:
-        raise TypeError("args: a Problem has params; give params=..., or its functions in place of the Problem.")
+        raise TypeError("args: a Problem has params; pass params=..., or its functions instead of the Problem.")
     brought = {option.name for option in fields(problem)} & set(ProjectionOptions.names())
     own_options = {name: getattr(problem, name) for name in brought}
     if request.method.TABLEAU.drives:
@@ -545,7 +548,7 @@ def _with_problem(request: Request) -> tuple[Request, str]:
 
 
 def _with_run_params(projection: Mapping[str, Any], params: Any, args: Any = None) -> dict[str, Any]:
-    """The invariants without their args, where these are what the run passes on itself."""
+    """Return the invariants without their args if these equal what the run passes on itself."""
     if "invariants" not in projection:
         return {}
     items = as_invariants(projection["invariants"])
@@ -557,19 +560,19 @@ def _with_run_params(projection: Mapping[str, Any], params: Any, args: Any = Non
 
 def _required(name: str, value: Any) -> Any:
     if value is None:
-        raise TypeError(f"integrate: {name} is missing; only a Problem brings its own, and not each does.")
+        raise TypeError(f"integrate: {name} is missing; it can be omitted only for a Problem that has its own.")
     return value
 
 
 def _state(y0: Any) -> np.ndarray:
     start = initial_state(_required("y0", y0))
     if start.size == 0:
-        raise ValueError("y0 is empty; integrate needs a state of at least one component.")
+        raise ValueError("y0 is empty; integrate needs a state with at least one component.")
     return start
 
 
 def _span(request: Request, events: Events) -> tuple[float, float]:
-    """The interval; endless only where something may end the run."""
+    """Return the interval; it may be infinite only if something can end the run."""
     t0, t_bound = interval(request.t_span)
     ends = events.terminal or (request.callback is not None and request.save_every is not None)
     if math.isinf(t_bound) and not ends:

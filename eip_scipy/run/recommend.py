@@ -53,24 +53,24 @@ def recommend(
     Parameters
     ----------
     fun : callable or Problem
-        As for `integrate`, a function of the first order: ``fun(t, y) -> (n,)``. Systems q'' = a(t, q) are recognised
-        by it, where y = (q, v).
+        As for `integrate`, the first-order form: ``fun(t, y) -> (n,)``. Systems q'' = a(t, q) with y = (q, v) are
+        recognised.
     t_span : (float, float)
         Start and end, which must be finite; default: those of the problem.
     y0 : array_like, shape (n,)
-        Likewise.
+        Initial state; default: that of the problem.
     acceleration : callable, optional
-        In place of `fun`, as for `integrate`: the a of q'' = a(t, q), with y = (q, v).
+        Instead of `fun`, as for `integrate`: the a of q'' = a(t, q), with y = (q, v).
     error : float, optional
         Wanted error of the state at the end: largest component of the difference to the exact one, relative to the
         largest component.
     invariants : Invariant or sequence of Invariant, optional
-        What to keep; default: what the problem brings, of a function nothing.
+        Invariants to keep; default: those of the problem, none for a function.
     max_nfev : int, optional
-        Evaluations that one trial may take, about; default: 100 000, and 500 000 of compiled functions. A longer run
-        is tried on the first part of its interval, and its error extrapolated.
+        Approximate bound on the evaluations of one trial; default: 100 000, and 500 000 for compiled functions. A
+        longer run is tried on the first part of its interval, and its error is extrapolated.
     params, in_place, jacobian, metric, blocks, frame, compiled
-        As for `integrate`, for all runs. With `jacobian`, or a problem that brings it, `EIPGJ14` is tried.
+        As for `integrate`, for all runs. With `jacobian`, or a problem that has one, `EIPGJ14` is tried.
 
     Returns
     -------
@@ -81,23 +81,22 @@ def recommend(
     Raises
     ------
     TypeError
-        For options that are not among those above.
+        If an option is unknown.
     ValueError
-        Where no trial has the wanted error, with the least that was found; where the right-hand side cannot be
-        integrated; for options with wrong values, and a wrong gradient.
+        If no trial has the wanted error (the message states the smallest error found), if the right-hand side cannot be
+        integrated, if an option has a wrong value, or if a gradient is wrong.
 
     Warns
     -----
     ProjectionWarning
-        Where the projection onto the invariants is not to be trusted, or keeps the error above the wanted one, so that
-        the run without them is recommended.
+        If the projection is not reliable or keeps the error above the wanted one, so that a run without invariants is
+        recommended.
 
     Notes
     -----
-    Errors of trials are measured against a run with so much smaller tolerances that the next larger one agrees with
-    it to a fiftieth of the wanted error, by `EIPDOP853` without projection where that is possible. The cheapest trial
-    between a seventh of the wanted error and the wanted error itself, by evaluations, is recommended; one that is
-    cheaper still may be more accurate.
+    Errors of trials are measured against a reference run, by `EIPDOP853` without projection if possible. Its tolerances
+    are reduced until two runs agree to 2 % of the wanted error. Of the trials with errors between 15 % and 100 % of the
+    wanted error, the one with the fewest evaluations is recommended; a cheaper trial may be more accurate.
 
     Examples
     --------
@@ -115,7 +114,7 @@ def recommend(
 
 
 def _right_hand_side(fun: Any, acceleration: Any, options: dict[str, Any]) -> Any:
-    """Return what was given as the right-hand side; an acceleration holds `in_place` from now on."""
+    """Return the given right-hand side, or the acceleration together with `in_place`, which is removed from options."""
     if acceleration is None:
         return fun
     if fun is not None:
@@ -132,8 +131,8 @@ def _check(error: Any, max_nfev: Any, options: Mapping[str, Any]) -> None:
     for name in options:
         if name not in COMMON:
             raise TypeError(
-                f"recommend() has no option {name!r}{nearest(name, COMMON) or '.'} Method, step and tolerances are "
-                "what it finds; options of saving, events and the like belong to run()."
+                f"recommend() has no option {name!r}{nearest(name, COMMON) or '.'} It finds method, step and "
+                "tolerances; pass options for saving, events and the like to run()."
             )
     if not is_number(error) or not 0 < error < 1:
         raise ValueError(f"error must be a number between 0 and 1, got {shown(error)}.")
@@ -144,12 +143,12 @@ def _check(error: Any, max_nfev: Any, options: Mapping[str, Any]) -> None:
 def _problem(
     fun: Any, t_span: Any, y0: Any, invariants: Any, options: dict[str, Any]
 ) -> tuple[Problem, dict[str, Any]]:
-    """The problem with the start and interval of the call, and the options that all runs have."""
+    """Return the problem with the start and interval of the call, and the options that all runs have."""
     common = {name: value for name, value in options.items() if value is not None}
     if not isinstance(fun, Problem):
         if t_span is None or y0 is None:
             raise TypeError(
-                f"recommend: {'t_span' if t_span is None else 'y0'} is missing; only a Problem brings its own."
+                f"recommend: {'t_span' if t_span is None else 'y0'} is missing; it can be omitted only for a Problem."
             )
         fun = _made(fun, t_span, y0, common)
     brought = {} if t_span is None else {"t_span": t_span}
@@ -165,7 +164,7 @@ def _problem(
 
 
 def _made(fun: Any, t_span: Any, y0: Any, common: dict[str, Any]) -> Problem:
-    """A problem of a function, which takes `in_place` and `params` out of the options where it holds them itself."""
+    """Return a problem made from a function; `in_place` and `params` move from the options to the problem."""
     if not callable(by_pointer(fun, "fun")):
         raise TypeError(f"recommend: fun must be callable or a Problem, got {shown(fun)}.")
     name = getattr(getattr(fun, "acceleration", fun), "__name__", "problem")

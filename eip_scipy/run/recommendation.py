@@ -1,4 +1,4 @@
-"""What `recommend` returns: method and options for a wanted error, the trials that speak for them, and the reason."""
+"""The result of `recommend`: method and options for a wanted error, the trials that led to them, and the reason."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .trials import Trial
 
 __all__ = ["Recommendation", "called"]
 
-# What a trial that failed says, in the table.
+# Largest width of the reason why a trial failed, in the table.
 WIDTH = 90
 
 
@@ -26,30 +26,30 @@ class Recommendation:
     Attributes
     ----------
     problem : Problem
-        The one given, with the start and the interval of the call; made from the function where one was given.
+        The given problem with the start and the interval of the call, or a problem made from the given function.
     options : dict
-        For `integrate`, ``method`` among them: ``integrate(recommendation.problem, **recommendation.options)``.
+        Options of `integrate`, including ``method``: ``integrate(recommendation.problem, **recommendation.options)``.
     method : type
         The solver class.
     trial : Trial
-        That of the recommended run.
+        Trial of the recommended run.
     wanted : float
-        The error that was asked for.
+        The wanted error.
     error, nfev : float, int
-        What is expected of the run: the error at the end of the interval, largest component of the difference relative
-        to the largest component, and evaluations of the right-hand side.
+        Expected error at the end of the interval (largest component of the difference relative to the largest
+        component), and expected evaluations of the right-hand side.
     share : float
-        The part of the interval that the trials cover; below 1 both numbers are extrapolated.
+        Fraction of the interval that the trials cover; if it is below 1, both numbers are extrapolated.
     trusted : bool
-        Whether the recommended run showed nothing in its trial that speaks against it, with all invariants kept that
-        were asked for.
+        True if the trial of the recommended run was reliable and kept all invariants that were asked for.
     message : str
-        What speaks against it; empty where nothing does.
+        Reason why the recommended run is not reliable; empty if it is.
     reason : str
+        Reason for the choice.
     trials : tuple of Trial
         All trials: ``options``, ``error``, ``nfev``, ``seconds``, and ``trouble`` of those that failed.
     stiff : bool
-        Whether an implicit method takes at most 0.33 of the evaluations; `reason` names it.
+        True if an implicit method needs at most 0.33 of the evaluations; `reason` names it.
     """
 
     problem: Problem
@@ -69,26 +69,26 @@ class Recommendation:
 
     @property
     def error(self) -> float:
-        """What is expected at the end of the interval."""
+        """Expected error at the end of the interval."""
         return self.trial.error
 
     @property
     def nfev(self) -> int:
-        """Evaluations that are expected."""
+        """Expected evaluations of the right-hand side."""
         return self.trial.nfev
 
     @property
     def trusted(self) -> bool:
-        """Whether nothing speaks against the run."""
+        """True if the run is expected to be reliable."""
         return not self.message
 
     def run(self, **options: Any) -> IntegrationResult:
-        """Integrate as recommended.
+        """Integrate with the recommended method and options.
 
         Parameters
         ----------
         **options
-            Of `integrate`, such as ``save_every`` or ``events``; they take precedence.
+            Options of `integrate`, such as ``save_every`` or ``events``; they take precedence.
 
         Returns
         -------
@@ -111,7 +111,7 @@ class Recommendation:
 
 
 def called(options: Mapping[str, Any]) -> str:
-    """Options as they stand in a call; what takes long to write as its name alone."""
+    """Return options as they are written in a call; "..." replaces values that are long to write."""
     return ", ".join(f"{name}={_shown(value)}" for name, value in options.items())
 
 
@@ -128,7 +128,7 @@ def _empty(value: Any) -> bool:
 
 
 def _table(trials: tuple[Trial, ...], chosen: Trial) -> Iterator[str]:
-    """A row for each way to run; "->" before the one recommended."""
+    """Yield the lines of the table of trials; "->" marks the recommended one."""
     rows = []
     for trial in _one_each(trials, chosen):
         cost = f"{trial.error:9.1e} {trial.nfev:11d}" if math.isfinite(trial.error) else f"{'-':>9} {'-':>11}"
@@ -141,13 +141,13 @@ def _table(trials: tuple[Trial, ...], chosen: Trial) -> Iterator[str]:
 
 
 def _telling(options: Mapping[str, Any]) -> str:
-    """The method and the options that do not follow from others."""
+    """Return the method and the options that do not follow from others, as text."""
     others = {name: value for name, value in options.items() if name not in ("method", "atol", "compensated")}
     return f"{options['method'].__name__}, {called(others)}"
 
 
 def _one_each(trials: tuple[Trial, ...], chosen: Trial) -> list[Trial]:
-    """The last trial of each way to run, a good one if there is one; those alike but for the numbers are one way."""
+    """Return one trial for each set of options without h, rtol and atol: the last good one, or the last one."""
     ways: dict[str, Trial] = {}
     for trial in trials:
         options = {name: value for name, value in trial.options.items() if name not in ("h", "rtol", "atol")}

@@ -1,4 +1,4 @@
-"""The result of `integrate`, and what can be done with it: tables, files, figures, a run that goes on."""
+"""The result of `integrate`: tables, files, figures, and the continuation of a run."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ __all__ = ["Fields", "IntegrationResult", "Origin", "WithColumns"]
 
 
 class Origin(NamedTuple):
-    """Where a result comes from, so that its run can go on.
+    """Origin of a result, from which its run can be continued.
 
     Attributes
     ----------
     request : Request
-        What `integrate` was asked for.
+        Arguments of `integrate`.
     t : float
+        Time of the last state.
     y : ndarray, shape (n,)
-        The last state of the run, saved or not.
+        Last state of the run, saved or not.
     sign : float
-        The direction of time, 1 or -1.
+        Direction of time, 1 or -1.
     invariants : tuple of Invariant
-        Those of the run, with the values that it keeps as their targets.
+        Invariants of the run, with the kept values as their targets.
     """
 
     request: Any
@@ -39,7 +40,7 @@ class Origin(NamedTuple):
 
 
 if TYPE_CHECKING:
-    Fields = dict[str, Any]  # of which type checkers know those that are annotated
+    Fields = dict[str, Any]  # type checkers know the annotated fields
 else:
     Fields = OptimizeResult
 ABSENT = {
@@ -47,7 +48,7 @@ ABSENT = {
     "sensitivities": "this run has no sensitivities; name parameters in variations=[...].",
     "variations": "this run carried no derivatives; ask for them with variations=...",
 }
-UNSET = ("units", "epoch")  # fields that print where they hold something
+UNSET = ("units", "epoch")  # fields that are printed only if they are set
 
 
 class WithColumns(Fields):
@@ -60,13 +61,13 @@ class WithColumns(Fields):
     def stm(self) -> np.ndarray:
         """State-transition matrices at the saved times, (m, n, n), of a run with ``variations="state"``.
 
-        ``run.stm[k, i, j]`` is the derivative of ``run.y[i, k]`` by component j of the initial state. In an ensemble
-        those of the members, as its `variations`.
+        ``run.stm[k, i, j]`` is the derivative of ``run.y[i, k]`` with respect to component j of the initial state. For
+        an ensemble the shape is that of its `variations`, with one matrix for each member.
 
         Raises
         ------
         AttributeError
-            When the run did not carry it.
+            If the run did not integrate it.
         """
         if not self.get("columns", {}).get("state"):
             raise AttributeError(ABSENT["stm"])
@@ -74,29 +75,29 @@ class WithColumns(Fields):
 
     @property
     def sensitivities(self) -> np.ndarray:
-        """Derivatives of the state by the parameters of ``variations=[...]`` at the saved times, (m, n, p).
+        """Derivatives of the state with respect to parameters, ``variations=[...]``, at the saved times, (m, n, p).
 
         Raises
         ------
         AttributeError
-            When the run did not carry any.
+            If the run did not integrate any.
         """
         count = self.get("columns", {}).get("parameters", 0)
         if not count:
             raise AttributeError(ABSENT["sensitivities"])
         return self.variations[..., self.variations.shape[-1] - count :]
 
-    if not TYPE_CHECKING:  # which would take any name for an attribute
+    if not TYPE_CHECKING:  # type checkers would accept any attribute name
 
         def __getattr__(self, name: str) -> Any:
-            # OptimizeResult's own would take the place of what a property has just raised.
+            # The __getattr__ of OptimizeResult would replace the error that a property has just raised.
             if name in ABSENT and name not in self:
                 raise AttributeError(ABSENT[name])
             return OptimizeResult.__getattr__(self, name)
 
 
 class IntegrationResult(WithColumns):
-    """Result of `integrate`; fields by name or by key, as in SciPy's own results.
+    """Result of `integrate`; fields are accessible by attribute or by key, as in SciPy's results.
 
     Attributes
     ----------
@@ -105,56 +106,61 @@ class IntegrationResult(WithColumns):
     y : ndarray, shape (n, m)
         Saved states.
     invariants : ndarray, shape (l, m)
-        Values of the invariants there.
+        Values of the invariants at the saved times.
     target : ndarray, shape (l,)
-        The values that were kept.
+        Values to which the invariants were projected.
     max_defect : ndarray, shape (l,)
-        Largest ``|I - target|`` after a projection or at a saved state.
+        Largest invariant error ``|I - target|`` after a projection or at a saved state.
     diagnostics : Diagnostics
+        Record of the projections.
     t_events, y_events : list of ndarray or None
         As in `scipy.integrate.solve_ivp`.
     sol : OdeSolution or None
-        Likewise: the run as a function of time, with ``dense_output=True``.
+        The run as a function of time, with ``dense_output=True``; as in `scipy.integrate.solve_ivp`.
     nfev, njev, nlu : int
-        Evaluations of the right-hand side and of the invariants' gradients, and factorisations. A one-step method of
-        another kind (`Lawson`, `Splitting`) adds what it evaluates in the place of the right-hand side.
+        Evaluations of the right-hand side and of the invariants' gradients, and factorisations. For a one-step method
+        of another kind (`Lawson`, `Splitting`), `nfev` also counts the evaluations that replace the right-hand side.
     status : int
         0: the end was reached; 1: a callback or an event stopped the run; -1: a step failed.
     message : str
+        Reason for the end of the run, and remarks on it.
     success : bool
         ``status >= 0``.
     trusted : bool
-        Whether, besides, nothing speaks against the run; if not, `message` says what. See `Diagnostics`.
+        True if the run succeeded and is reliable; if not, `message` says why. See `Diagnostics`.
     wall_time : float
-        Seconds in the integration, compilation left out.
+        Run time in seconds, without compilation.
     compiled : bool
-        Whether all functions were called natively; if not, `message` says which were not, and why.
+        True if all functions were called natively; if not, `message` says which were not, and why.
     calls : dict of str
-        How each was called: "python", "jitted" (a Numba function, as a C pointer), "pointer" (a C function) or, of a
-        C function's gradient that is not given, "differences". The keys are "fun" or "acceleration", the name of each
-        invariant ("invariant 0" for the first one, if it has none), "gradient of " and that name, "event 0", "event 1"
-        and so on.
+        How each function was called: "python", "jitted" (a Numba function, as a C pointer), "native" (a function of the
+        engine), "pointer" (a C function), or "differences" for the gradient of a C function without one. The keys are
+        "fun" or "acceleration", the name of each invariant ("invariant 0" for the first one, if it has none),
+        "gradient of " followed by that name, "event 0", "event 1" and so on.
     method : str
+        Name of the method.
     h : float or None
+        Step size; None for adaptive steps.
     variations : ndarray, shape (m, n, k)
-        The columns of derivatives at the saved times, of a run that was asked for them. Between two steps they are
-        interpolated, not projected. See `stm` and `sensitivities`.
+        Columns of derivatives at the saved times, if they were requested. Between two steps they are interpolated, not
+        projected. See `stm` and `sensitivities`.
     columns : dict
-        Of such a run: "state", whether the state-transition matrix is among them; "parameters", the number of
-        derivatives by parameters, and their "names"; "symplectic", whether the matrix was kept so; "source", the origin
-        of the products with the Jacobian: "problem", "jvp", "dual numbers" or "complex steps".
+        Description of these columns: "state", True if the state-transition matrix is included; "parameters", the number
+        of derivatives with respect to parameters, and their "names"; "symplectic", True if the matrix was kept
+        symplectic; "source", the origin of the products with the Jacobian: "problem", "jvp", "dual numbers" or "complex
+        steps".
     component_names : tuple of str
-        Those of the `Problem`, or "y0", "y1" and so on; assign others as you like.
+        Names of the components from the `Problem`, or "y0", "y1" and so on; other names can be assigned.
     units : str
-        Those of the `Problem`, "" without one.
+        Units of the `Problem`; "" without one.
     epoch : (float, float) or None
-        When t is 0, see `Problem`.
+        Time of t = 0, see `Problem`.
 
     Notes
     -----
-    The result pickles. A result that was pickled or loaded no longer knows the functions of its run: it cannot
-    `continue_to`, and its ``sol`` holds a polynomial for each step, which meets the states at the steps exactly and
-    those in between to 1e-12.
+    The result can be pickled. A result that was pickled or loaded does not know the functions of its run: `continue_to`
+    raises an error, and ``sol`` holds a polynomial for each step, which agrees with the states at the steps exactly and
+    with those in between to 1e-12.
     """
 
     t: np.ndarray
@@ -188,11 +194,11 @@ class IntegrationResult(WithColumns):
         return default_names(len(self.y)) if given is None else tuple(given)
 
     def to_xarray(self, names: Any = None) -> Any:
-        """The run as an `xarray.Dataset`, see `eip_scipy.results.to_xarray`."""
+        """Return the run as an `xarray.Dataset`, see `eip_scipy.results.to_xarray`."""
         return to_xarray(self, names)
 
     def to_dataframe(self, names: Any = None) -> Any:
-        """The run as a `pandas.DataFrame`, see `eip_scipy.results.to_dataframe`."""
+        """Return the run as a `pandas.DataFrame`, see `eip_scipy.results.to_dataframe`."""
         return to_dataframe(self, names)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -214,40 +220,40 @@ class IntegrationResult(WithColumns):
         return view(self, path, names=names, reference=reference)
 
     def continue_to(self, t: float, **options: Any) -> IntegrationResult:
-        """Go on from the last state to a later time, with the functions and options of the run.
+        """Continue from the last state to a later time, with the functions and options of the run.
 
         Parameters
         ----------
         t : float
-            The new end, beyond the present one in the direction of the run; as in `t_span` of `integrate` also a
+            New end of the run, beyond the present one in its direction; as in `t_span` of `integrate` it may also be a
             duration from t = 0, or a time.
         **options
-            Options of `integrate` that are to be others than before. Times in `t_eval` are not asked for again: give
-            new ones, or the states at both ends are saved. Events keep their counts: one with ``terminal = 3`` that
-            happened twice before ends the run when it happens once more, and one that ended the run ends it again when
-            it happens next; ``events=None`` leaves it out. Events that are given anew begin to count at 0, and may
-            happen at once.
+            Options of `integrate` that change. `t_eval` is not repeated: pass new times, otherwise the states at both
+            ends are saved. Events keep their counts: an event with ``terminal = 3`` that happened twice before ends the
+            run when it happens once more, and an event that ended the run ends it again when it happens next;
+            ``events=None`` removes all events. New events start to count at 0, and may happen at once.
 
         Returns
         -------
         IntegrationResult
-            Both runs as one: rows, events and interpolants in order, counts and seconds summed, defects and corrections
-            the largest of both, `trusted` where both are; status, message, method and h are those of the second.
+            Both runs combined: rows, events and interpolants in order, counts and seconds added, invariant errors and
+            corrections the larger of both, `trusted` if both are; status, message, method and h are those of the second
+            run.
 
         Raises
         ------
         ValueError
-            When `t` is not beyond the end; when the result was loaded, unpickled or copied; when the last state misses
-            an invariant by more than 1e-8 of its terms, as after a run that is not to be trusted or was not checked:
+            If `t` is not beyond the end, if the result was loaded, unpickled or copied, or if the last state misses an
+            invariant by more than 1e-8 of its terms, as after an unreliable run or one without checks;
             ``project_initial=True`` then projects it first.
 
         Notes
         -----
-        The second run is an `integrate` from the last state, and has its bits, but that each invariant keeps the value
-        of the first start: defects do not add up. It is not bit for bit the run that had gone through: times are
-        counted from the new start, `save_every` too; adaptive steps begin with a first step again; compensated sums,
-        and the history of multistep methods, start anew, which costs a rounding error and a new start of the method.
-        For a run that is to have the same bits, checkpoint it (``checkpoint=``, ``resume=True``).
+        The second run agrees bit by bit with an `integrate` from the last state, except that each invariant keeps the
+        value of the first start, so that errors do not add up. It does not agree bit by bit with an uninterrupted run:
+        `save_every` counts from the new start, adaptive steps begin with a first step again, and compensated sums and
+        the history of multistep methods start again, which costs a rounding error and a new start of the method. Use a
+        checkpoint (``checkpoint=``, ``resume=True``) for a run with the same bits.
 
         Examples
         --------
@@ -263,12 +269,12 @@ class IntegrationResult(WithColumns):
         return continued(self, t, options)
 
     def __repr__(self) -> str:
-        """Without what this run has none of."""
+        """Return the fields as text, without those that are not set."""
         return repr(OptimizeResult({key: value for key, value in self.items() if key not in UNSET or value}))
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray", "view"]
 
     def __getstate__(self) -> None:
-        """Of attributes beside the fields there is the origin alone, whose functions stay here."""
+        """Exclude the attributes that are not fields: the origin, whose functions cannot be pickled."""
         return None

@@ -1,4 +1,4 @@
-"""Checkpoints of `integrate`: what identifies a run, what is kept of it and when, and how it goes on."""
+"""Checkpoints of `integrate`: the identity of a run, what is stored and when, and how a run is resumed."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from .events import Events
 __all__ = ["Keeper", "keeping", "plain", "settings"]
 
 KIND = "integrate"
-# A run goes on from its last snapshot: what came after it is done again.
+# A run resumes from its last snapshot; later steps are repeated.
 SNAPSHOT_SECONDS = 0.2
-# Copying and writing take at most a twentieth of a run's time each, however large the state or what was saved.
+# Copying and writing take at most 5 % of the run time each, for any size of the state and of the saved rows.
 LEAST_RATIO = 19.0
-# How far values of one function at one point may differ, on another machine too.
+# Relative difference allowed between values of the same function at the same point, also on another machine.
 SAME = 1e-9
-# Rounding of the terms of a rate counts as this share of them.
+# Rounding error of a rate, relative to its terms.
 LEAST_OF_RATES = 1e-6
 SHORT = 16
 STEP = 0
 
 
 class Keeper:
-    """What a run tells its checkpoints; this one keeps none."""
+    """The events of a run that a checkpoint needs to know; this class stores nothing."""
 
     keeps = False
     seconds = 0.0
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the message of the result says besides."""
+        """Additions to the message of the result."""
         return ()
 
     def identify(
@@ -58,33 +58,33 @@ class Keeper:
         y0: np.ndarray,
         f0: np.ndarray,
     ) -> None:
-        """Before anything is compiled: the settings of the run, and the derivative, f0 at the start."""
+        """Record the settings of the run and its derivative (`f0` at the start), before anything is compiled."""
 
     def begin(self, driver: Any, events: Events) -> None:
-        """All buffers are as at the start; a run that is resumed fills them."""
+        """Take over the driver, whose buffers hold the start; fill them if a run is resumed."""
 
     def keep(self) -> None:
-        """Between two chunks of steps."""
+        """Store a snapshot or write the file if it is due; called between two chunks of steps."""
 
     def end(self, status: int, message: str) -> None:
-        """The run has ended by itself."""
+        """Record that the run has ended regularly."""
 
     def interrupted(self, error: BaseException) -> None:
-        """`error` has broken the run off."""
+        """Record that `error` has ended the run."""
 
 
 @contextmanager
 def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[Keeper]:
-    """The keeper for the options ``checkpoint``, ``checkpoint_every`` and ``resume`` of `integrate`.
+    """Yield the keeper for the options ``checkpoint``, ``checkpoint_every`` and ``resume`` of `integrate`.
 
     Raises
     ------
     TypeError
-        When `path` is none.
+        If `path` is not a path.
     ValueError
-        For other wrong values, and for `resume` without a path.
+        If another value is wrong, or `resume` is given without a path.
     CheckpointError
-        When a file is there and the run is not to resume it, or it cannot be read, or another run has it.
+        If the file exists and `resume` is False, cannot be read, or is used by another run.
     """
     if not isinstance(resume, (bool, np.bool_)):
         raise ValueError(f"resume must be True or False, got {resume!r}.")
@@ -93,13 +93,13 @@ def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[K
         raise ValueError(f"checkpoint_every must be a number of seconds > 0, got {shown(every)}.")
     if path is None:
         if resume:
-            raise ValueError("resume=True needs the file to resume from: checkpoint=path.")
+            raise ValueError("resume=True needs a file to resume from: pass checkpoint=path.")
         yield Keeper()
         return
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"checkpoint must be the path of a file, got {path!r}.")
     if dense_output:
-        raise ValueError("a checkpoint does not keep what dense_output=True needs; give t_eval or save_every instead.")
+        raise ValueError("a checkpoint does not store dense output; omit dense_output=True, use t_eval or save_every.")
     with closing(Lock(path)) as lock:
         found, origin = None, ""
         if os.path.lexists(lock.path):
@@ -107,16 +107,16 @@ def keeping(path: Any, every: Any, resume: Any, dense_output: Any) -> Iterator[K
                 raise checkpoint.existing(lock.name, "run")
             found = checkpoint.read(lock.name, KIND)
         elif resume:
-            origin = "no checkpoint was there: started at the beginning"
+            origin = "there was no checkpoint: started at the beginning"
         yield _FileKeeper(lock.name, float(every), found, origin)
 
 
 def settings(
     method: str, y0: np.ndarray, params: np.ndarray, run: Run, schedule: Any, events: Events
 ) -> dict[str, Any]:
-    """All that decides the bits of a run, but for the functions, under the names that users give."""
+    """Return everything except functions that determines the bits of a run, with the names that users know."""
     span = run.stepping.span
-    # A one-step method of the user's own is known by its name and orders, as functions are by what they give.
+    # A user-defined one-step method is identified by its name and orders; functions are identified by their values.
     if run.tableau.in_python:
         parts = [run.tableau.order, run.tableau.error_estimator_order]
     else:
@@ -139,7 +139,7 @@ def settings(
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON holds it, long arrays by their digest."""
+    """Return a value in a form that JSON can hold; long arrays are replaced by their digest."""
     if isinstance(value, np.ndarray):
         if value.size <= SHORT:
             return plain(value.tolist())
@@ -152,7 +152,7 @@ def plain(value: Any) -> Any:
 
 
 def _digest(values: Iterable[Any]) -> str:
-    """Hash of arrays and numbers."""
+    """Return a hash of arrays and numbers."""
     digest = hashlib.sha256()
     for value in values:
         a = np.ascontiguousarray(value)
@@ -161,7 +161,7 @@ def _digest(values: Iterable[Any]) -> str:
 
 
 class _Snapshot(NamedTuple):
-    """A run after an accepted step: its small arrays, how often each event had happened, and the seconds it took."""
+    """State of a run after an accepted step: its small arrays, the number of events so far, and the run time."""
 
     arrays: dict[str, np.ndarray]
     happened: list[int]
@@ -169,10 +169,10 @@ class _Snapshot(NamedTuple):
 
 
 class _FileKeeper(Keeper):
-    """Checkpoints in a file, one each `every` seconds; `found` is what was read there.
+    """Checkpoints in a file, written every `every` seconds; `found` is the content of an existing file.
 
-    What is written is always the last snapshot, never the buffers as they are: whoever breaks a run off may do so
-    inside a step. Saved rows and events only grow, so that a snapshot knows them by their number.
+    The file always contains the last snapshot, never the current buffers, because an interruption may come inside a
+    step. Saved rows and events only grow, so a snapshot needs only their number.
     """
 
     keeps = True
@@ -207,11 +207,11 @@ class _FileKeeper(Keeper):
         if "state_f" in arrays:
             t, y = float(arrays["clock"][TIME]), arrays["y"]
             here = self._known_by(run, t, y)
-            self._require_same_functions(run, arrays, here, t, y, f"at t = {t:.10g}, where it stands,")
+            self._require_same_functions(run, arrays, here, t, y, f"at t = {t:.10g}, where it was saved,")
         checkpoint.warn_of_other_versions(self._name, header, stacklevel=users_level())
 
     def _known_by(self, run: Run, t: float, y: np.ndarray) -> dict[str, np.ndarray]:
-        """What the functions are known by at a state of the run."""
+        """Return the values by which the functions are identified at a state of the run."""
         f = self._derivative(t, y.copy())
         rates = run.invariants.balances.given(t, y, f)
         known_by = {"state_f": f, "state_values": run.invariants.values(t, y)}
@@ -233,7 +233,7 @@ class _FileKeeper(Keeper):
         there, here = (np.concatenate([a[name] for name in known_by]) for a in (arrays, known_by))
         with np.errstate(invalid="ignore"):
             sizes = np.append(np.full(f.size, np.abs(f).max(initial=0.0)), run.invariants.term_sizes(t, y, f))
-            # Rates are far smaller than the terms that may cancel in them.
+            # Rates may be much smaller than the terms that cancel in them.
             terms = np.abs(run.invariants.gradients(t, y, f)) @ np.abs(f)
             own = LEAST_OF_RATES * terms[run.invariants.balances.given_places]
             sizes = np.concatenate([sizes, *(own + np.abs(rate) for rate in rates)])
@@ -242,7 +242,7 @@ class _FileKeeper(Keeper):
             k = int(np.flatnonzero(~same)[0])
             raise CheckpointError(
                 f"the checkpoint {self._name!r} belongs to another run: {labels[k]} was {there[k]:.12g} {where} "
-                f"and is {here[k]:.12g} now. Resume with the functions of that run, or name another file to start anew."
+                f"and is {here[k]:.12g} now. Resume with the functions of that run, or use another file for a new run."
             )
 
     def _require_fitting(self, arrays: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
@@ -251,7 +251,7 @@ class _FileKeeper(Keeper):
             if found is None or (found.dtype, found.shape) != (a.dtype, a.shape):
                 what = "is missing" if found is None else f"is {found.dtype} {found.shape}"
                 raise CheckpointError(
-                    f"{self._name!r} is no checkpoint of this run: {name} {what}, expected {a.dtype} {a.shape}."
+                    f"{self._name!r} is not a checkpoint of this run: {name} {what}, expected {a.dtype} {a.shape}."
                 )
 
     def begin(self, driver: Any, events: Events) -> None:
@@ -267,14 +267,14 @@ class _FileKeeper(Keeper):
             self._write(None, "running")
 
     def _restore(self, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-        """Fill the run's buffers, after a look at all that is to go there."""
+        """Fill the buffers of the run after all arrays have been checked."""
         driver, events = self._driver, self._events
         parts = driver.parts()
         self._require_fitting(arrays, parts)
         step, rows, pending = (int(k) for k in arrays["place"])
         if step < 0 or rows < 0 or pending != 0 or not is_number(header.get("wall_time")):
-            where = f"it stands at step {step}, row {rows}"
-            raise CheckpointError(f"{self._name!r} is no checkpoint of this run: {where}.")
+            where = f"it is at step {step}, row {rows}"
+            raise CheckpointError(f"{self._name!r} is not a checkpoint of this run: {where}.")
         n, dtype = driver.run.y0.size, driver.run.y0.dtype
         expected = {"saved_t": np.broadcast_to(0.0, rows), "saved_y": np.broadcast_to(dtype.type(0), (rows, n))}
         for k in range(len(events.functions)):
@@ -308,7 +308,7 @@ class _FileKeeper(Keeper):
         if status == 0:
             self._take_snapshot()
         step = int(self._snapshot.arrays["place"][STEP])
-        if self._ended != (status, message, step):  # else the file says so already
+        if self._ended != (status, message, step):  # otherwise the file already contains this
             self._write_or_warn(status, message)
 
     def interrupted(self, error: BaseException) -> None:
@@ -319,15 +319,15 @@ class _FileKeeper(Keeper):
         except KeyboardInterrupt:
             error.add_note("interrupted again while the checkpoint was written")
         error.add_note(
-            f"the checkpoint {self._name!r} holds {self._written}: the same call with resume=True goes on from there"
+            f"the checkpoint {self._name!r} holds {self._written}: the same call with resume=True continues from there"
         )
 
     def _state(self) -> dict[str, np.ndarray]:
-        """What the functions are known by at the snapshot; not counted among the run's evaluations."""
+        """Return the values that identify the functions at the snapshot; these evaluations are not counted."""
         arrays = self._snapshot.arrays
         try:
             return self._known_by(self._driver.run, float(arrays["clock"][TIME]), arrays["y"])
-        except Exception:  # where a function has just broken the run off: the checkpoint matters more
+        except Exception:  # a function may have just ended the run with it: the checkpoint matters more
             return {}
 
     def _take_snapshot(self) -> None:
@@ -342,7 +342,7 @@ class _FileKeeper(Keeper):
         return f"step {arrays['place'][STEP]}, t = {arrays['clock'][TIME]:.10g}"
 
     def _write_or_warn(self, status: int | None, message: str) -> None:
-        """Write; a disk that is full is a warning, and the run continues."""
+        """Write the file; a full disk only causes a warning, and the run continues."""
         self._failure = ""
         try:
             self._write(status, message)
@@ -350,7 +350,9 @@ class _FileKeeper(Keeper):
             self._due = time.perf_counter() + self._every
             self._failure = f"{error}; it still holds {self._written}"
             then = (
-                f"The run goes on and tries again in {self._every:g} s." if status is None else "The result is whole."
+                f"The run continues and tries again in {self._every:g} s."
+                if status is None
+                else "The result is complete."
             )
             warnings.warn(f"{self._failure}. {then}", RuntimeWarning, stacklevel=users_level())
 

@@ -22,7 +22,7 @@ KIND = "result"
 ENSEMBLE = "EnsembleResult"
 RESULTS: dict[str, Any] = {IntegrationResult.__name__: IntegrationResult}
 RESUMED = ("integrate", "ensemble")  # with the same arguments
-# Buffers of Diagnostics, in the order in which it takes them.
+# Buffers of Diagnostics, in the order of its arguments.
 BUFFERS = ("_max_defect", "_last_defect", "_max_correction", "_counters", "_figures")
 OF_BALANCES = ("_balance_places", "_balance_sums")
 
@@ -33,18 +33,19 @@ def save(result: Any, path: str | os.PathLike[str]) -> None:
     Parameters
     ----------
     result : IntegrationResult, EnsembleResult or OdeResult
-        From `integrate`, `ensemble` or `scipy.integrate.solve_ivp`. All its fields are kept, those that you have added
-        too, except functions: ``sol``, and the run's own. Trajectories in the Zarr group of an ensemble stay there.
+        Result of `integrate`, `ensemble` or `scipy.integrate.solve_ivp`. All fields are saved, including those that
+        were added later, except functions: ``sol``, and the functions of the run. Trajectories in the Zarr group of an
+        ensemble stay there.
     path : path-like
-        Taken as it is; a file that is there is replaced in one step, once the new one is whole. The file is an npz
-        archive, which `numpy.load` opens too, with ``header.json`` for all that is not an array.
+        File to write, with any name; an existing file is replaced in one step when the new one is complete. The file is
+        an npz archive, which `numpy.load` can open, with ``header.json`` for everything that is not an array.
 
     Raises
     ------
     TypeError
-        For a field that is neither numbers nor what JSON holds.
+        If a field is neither numeric nor representable in JSON.
     CheckpointError
-        When the file cannot be written.
+        If the file cannot be written.
 
     Examples
     --------
@@ -63,11 +64,11 @@ def save(result: Any, path: str | os.PathLike[str]) -> None:
     arrays: dict[str, np.ndarray] = {}
     values: dict[str, Any] = {}
     lists: dict[str, int] = {}
-    told: dict[str, Any] | None = None
-    packed = getattr(result, "_packed", None)  # of a result that holds more than arrays and numbers
+    described: dict[str, Any] | None = None
+    packed = getattr(result, "_packed", None)  # a result that holds more than arrays and numbers has it
     for name, value in (result if packed is None else packed()).items():
         if isinstance(value, Diagnostics):
-            told = _described(value, arrays)
+            described = _described(value, arrays)
         elif isinstance(value, np.ndarray):
             arrays[name] = _numbers(name, value)
         elif isinstance(value, list) and value and all(isinstance(item, np.ndarray) for item in value):
@@ -75,7 +76,7 @@ def save(result: Any, path: str | os.PathLike[str]) -> None:
             arrays |= {f"{name}.{k}": _numbers(name, item) for k, item in enumerate(value)}
         else:
             values[name] = None if callable(value) else _plain(name, value)
-    header = {"kind": KIND, "class": type(result).__name__, "values": values, "lists": lists, "diagnostics": told}
+    header = {"kind": KIND, "class": type(result).__name__, "values": values, "lists": lists, "diagnostics": described}
     checkpoint.write(path, header, arrays)
 
 
@@ -89,15 +90,15 @@ def load(path: str | os.PathLike[str]) -> Any:
     Returns
     -------
     IntegrationResult or EnsembleResult
-        As it was saved, but without functions: ``sol`` is None, and `IntegrationResult.continue_to` says how to go on.
-        A result of `solve_ivp` comes back as an `scipy.optimize.OptimizeResult`, of which its own class is one.
+        The saved result without functions: ``sol`` is None, and `IntegrationResult.continue_to` raises an error that
+        says how to continue. A result of `solve_ivp` is returned as `scipy.optimize.OptimizeResult`, its base class.
 
     Raises
     ------
     OSError
-        When the file cannot be read, for instance because it is not there.
+        If the file cannot be read, for instance because it does not exist.
     ValueError
-        For a file that `save` has not written, or that is damaged.
+        If the file was not written by `save`, or is damaged.
 
     Examples
     --------
@@ -109,11 +110,11 @@ def load(path: str | os.PathLike[str]) -> Any:
     except CheckpointError as error:
         if isinstance(error.__cause__, OSError):
             raise error.__cause__ from None
-        raise ValueError(f"load: {os.fspath(path)!r} is no result that save has written: {error}") from error
+        raise ValueError(f"load: {os.fspath(path)!r} is not a result written by save: {error}") from error
     if (kind := header.get("kind")) != KIND:
         name = repr(os.fspath(path))
-        again = f"; {kind}(..., checkpoint={name}, resume=True) goes on with it" if kind in RESUMED else ""
-        raise ValueError(f"load: {name} is no result that save has written, but a checkpoint of {kind!r}{again}.")
+        again = f"; {kind}(..., checkpoint={name}, resume=True) continues it" if kind in RESUMED else ""
+        raise ValueError(f"load: {name} is not a result written by save, but a checkpoint of {kind!r}{again}.")
     made = RESULTS.get(header["class"], OptimizeResult)
     if header["class"] == ENSEMBLE:  # by name: ensembles are built on runs
         made = getattr(import_module(f"{__package__.rpartition('.')[0]}.ensembles.ensemble"), ENSEMBLE)
@@ -132,7 +133,7 @@ def load(path: str | os.PathLike[str]) -> Any:
 
 
 def _described(diagnostics: Diagnostics, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """What JSON holds of it; its buffers are added to `arrays`."""
+    """Return the part of diagnostics that JSON can hold; the buffers are added to `arrays`."""
     trust = diagnostics._trust
     buffers = (diagnostics.max_defect, diagnostics._defect, diagnostics._max_correction, diagnostics._counters)
     arrays |= zip(BUFFERS, (*buffers, trust.figures), strict=True)
@@ -147,26 +148,25 @@ def _described(diagnostics: Diagnostics, arrays: dict[str, np.ndarray]) -> dict[
     }
 
 
-def _diagnostics(told: dict[str, Any], arrays: dict[str, np.ndarray]) -> Diagnostics:
+def _diagnostics(described: dict[str, Any], arrays: dict[str, np.ndarray]) -> Diagnostics:
     largest, last, correction, counters, figures = (arrays.pop(name) for name in BUFFERS)
-    trust = Trust(told["names"], figures)
-    trust.doubts, trust.failed = told["doubts"], told["failed"]
+    trust = Trust(described["names"], figures)
+    trust.doubts, trust.failed = described["doubts"], described["failed"]
     slow = (arrays.pop(OF_BALANCES[0]), arrays.pop(OF_BALANCES[1])) if OF_BALANCES[0] in arrays else None
     diagnostics = Diagnostics()
-    diagnostics._attach(
-        largest, last, correction, counters, trust, estimated=told["estimated"], moved=told.get("moved", ""), slow=slow
-    )
+    estimated, moved = described["estimated"], described.get("moved", "")
+    diagnostics._attach(largest, last, correction, counters, trust, estimated=estimated, moved=moved, slow=slow)
     return diagnostics
 
 
 def _numbers(name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in "biufc":
-        raise TypeError(f"save: the field {name!r} holds {array.dtype}, and only numbers can be kept.")
+        raise TypeError(f"save: the field {name!r} has dtype {array.dtype}, expected numbers. Delete it or convert it.")
     return array
 
 
 def _plain(name: str, value: Any) -> Any:
-    """What JSON holds of a value."""
+    """Return a value in a form that JSON can hold."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, dict):
@@ -175,4 +175,4 @@ def _plain(name: str, value: Any) -> Any:
         return [_plain(name, item) for item in value]
     if value is None or isinstance(value, (str, bool, int)) or (isinstance(value, float) and np.isfinite(value)):
         return value
-    raise TypeError(f"save: the field {name!r} is {shown(value)}, which cannot be kept.")
+    raise TypeError(f"save: the field {name!r} is {shown(value)}, which cannot be saved. Delete it or convert it.")

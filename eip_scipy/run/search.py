@@ -1,4 +1,4 @@
-"""The search of `recommend`: which ways to run suit a problem, what each costs at the wanted error, and why."""
+"""The search of `recommend`: methods that suit a problem, what each costs at the wanted error, and the reason."""
 
 from __future__ import annotations
 
@@ -25,50 +25,52 @@ from .tuning import AIM, COARSEST_RTOL, FINEST_RTOL, WINDOW, Kind, best, tune
 __all__ = ["Search"]
 
 PLAIN: dict[str, Any] = {"invariants": ()}
-# For Nystrom methods, whose steps are so accurate that rounding counts.
+# Options of Nystrom methods: their steps are so accurate that rounding errors matter.
 LONG: dict[str, Any] = {"every": "auto", "compensated": True}
-# Evaluations of one trial: by Python functions, and by native ones.
+# Largest number of evaluations in one trial; the key says whether the functions are native.
 MOST_NFEV = {False: 100_000, True: 500_000}
-# The first run may take one part in so many of these: the tightest takes some times as many.
+# The first run may use 1 / FIRST_PART of these evaluations, since the tightest run needs several times as many.
 FIRST_PART = 4
-# Numbers that the first run keeps at most, about.
+# Approximate bound on the numbers that the first run stores.
 MOST_SAVED = 4_000_000
-# A trial that covers a part of the interval is looked at so many times.
+# Number of times at which a trial that covers only a part of the interval is compared.
 LOOKS = 8
-# The tolerances of a reference, going down; it is good enough where two of them agree to this part of the wanted error.
+# Tolerances of the reference runs, in decreasing order. A reference is accepted if two of them agree to this fraction
+# of the wanted error.
 REFERENCE_START, REFERENCE_STEP, FINE_START = 1e-2, 1e-2, 1e-12
 AGREEMENT, LEAST_AGREEMENT = 0.02, 0.3
-# A trial that takes so many times the evaluations of the longest reference is broken off.
+# A trial is stopped when it has used LONGEST times the evaluations of the longest reference.
 LONGEST = 3
-# Rounding is all that is left where a smaller tolerance leaves so much of the difference.
+# Only rounding errors remain if a smaller tolerance leaves more than this fraction of the difference.
 ROUNDED = 0.5
-# Runs with and without projection are the same where they differ by so many times what is uncertain of the latter.
+# Runs with and without projection agree if their difference is below SAME times the uncertainty of the latter.
 SAME = 10.0
-# Methods of low orders, and from which error on they are tried.
+# Methods of low order, and the smallest wanted error for which each is tried.
 LOW_ORDERS = (EIPRK45, 1e-7), (EIPRK23, 1e-3)
-# Where the steps of an adaptive run vary by less, equal ones are tried, and those of multistep methods.
+# Equal steps, and multistep methods, are tried if the steps of an adaptive run vary by less than these factors.
 EVEN, VERY_EVEN = 5.0, 2.5
-# Multistep methods are tried on runs of so many steps of EIPDOP853 at least: their start takes 200 evaluations.
+# Multistep methods are tried if EIPDOP853 needs at least this many steps, because their start takes 200 evaluations.
 LEAST_MULTISTEP = 100
-# An interval holds so many equal steps at least.
+# Smallest number of equal steps in an interval.
 LEAST_STEPS = 40
-# Another metric or other blocks are tuned where the error is so many times less.
+# Another metric or other blocks are tuned if they reduce the error by at least this factor.
 BETTER = 3.0
-# What comes later in the search, less usual, is taken where it takes so few evaluations of what came before.
+# A later, less usual candidate replaces the current choice if it needs less than this fraction of the evaluations.
 CHEAPER = 0.9
-# A run is bound by stability where so many times the tolerance takes no fewer evaluations.
+# Stability limits the steps if a tolerance LOOSER times larger needs more than FEWER times the evaluations.
 LOOSER, FEWER = 10.0, 0.9
 # Equations are stiff if an implicit method takes fewer evaluations by at least this factor.
 STIFF = 3.0
-# What takes fewer evaluations than this is not worth the remark.
+# Runs with fewer evaluations than this are not tested for stiffness or stability.
 LEAST_BOUND = 1000
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a first run shows: the size of the state, the typical step, by what factor the steps vary, the second order.
+    """Results of a first run: the size of the state, the typical step, and the factor by which the steps vary.
 
-    `velocities` tells whether the accelerations of q'' = a(t, q, v) change with v; None: no such system.
+    `velocities` says whether the accelerations of q'' = a(t, q, v) depend on v; it is None if the system is not of
+    that form.
     """
 
     size: float
@@ -93,7 +95,7 @@ class Search:
         self.bench.most = LONGEST * self.longest
 
     def recommendation(self) -> Recommendation:
-        """The cheapest way found, tuned, with the reason."""
+        """Return the cheapest tuned method and options, with the reason."""
         chosen = self._cheapest()
         if chosen is None and self.keeps:
             self._leave_out_invariants()
@@ -120,10 +122,10 @@ class Search:
             stiff=stiff,
         )
 
-    # --- what is known before: size, steps, a truth to compare with ---
+    # --- preparation: size, steps, a reference solution ---
 
     def _look(self, max_nfev: int | None) -> Look:
-        """A first run without projection, over as much of the interval as trials may take."""
+        """Run once without projection, over as much of the interval as a trial may cover."""
         bench, problem = self.bench, self.bench.problem
         rtol = min(max(self.wanted, 1e-10), 1e-4)
         atol = 1e-3 * rtol * min(1.0, float(np.abs(problem.y0).max()) or 1.0)
@@ -151,7 +153,7 @@ class Search:
         return Look(size, float(np.median(lengths)), float(long / short), velocities)
 
     def _find_truth(self) -> None:
-        """States to compare with: of the tighter of two runs that agree well enough."""
+        """Find reference states: those of the tighter of two runs that agree well enough."""
         size, plain = self.look.size, Kind(EIPDOP853, size=self.look.size, options=PLAIN)
         found, enough = [self._reference(plain, REFERENCE_START * self.wanted)], AGREEMENT * self.wanted
         method, options = (EIPRKN12, LONG) if self.look.velocities is False else (EIPDOP853, {})
@@ -169,14 +171,14 @@ class Search:
                 f"Ask for {least:.0e} or more, or for a shorter interval." if least < 0.1 else "Shorten the interval."
             )
             raise ValueError(
-                f"recommend: an error of {self.wanted:g} cannot be reached, or not be told from others: two runs with "
-                f"the smallest tolerances differ by {agreement:.1e} at the end. Rounding errors have grown to that, or "
-                f"the motion is chaotic. {hint}"
+                f"recommend: an error of {self.wanted:g} cannot be reached or cannot be verified: two runs with the "
+                f"smallest tolerances differ by {agreement:.1e} at the end, because rounding errors have grown to that "
+                f"size or the motion is chaotic. {hint}"
             )
         self.bench.truth, self.bench.doubt = reference.y, agreement
 
     def _reference(self, kind: Kind, rtol: float) -> tuple[float, Outcome]:
-        """How well two runs agree at the end, going down in tolerance from `rtol`, and the tighter one."""
+        """Reduce the tolerance from `rtol`; return how well the last two runs agree at the end, and the tighter one."""
         rtol, wider, agreement = max(rtol, FINE_START), None, math.inf
         while True:
             value = kind.near(rtol)
@@ -191,14 +193,14 @@ class Search:
                 return min(agreement, before), done
             wider, rtol = done, max(rtol * REFERENCE_STEP, FINEST_RTOL)
 
-    # --- the ways to run ---
+    # --- candidates ---
 
     def _cheapest(self) -> Trial | None:
-        """The cheapest trial of all kinds that suit the problem; None where none has the wanted error."""
+        """Return the cheapest trial of all kinds that suit the problem, or None if none has the wanted error."""
         first = self._kind(EIPDOP853)
         chosen = self._tuned(first, self.wanted)
         if self.keeps and not any(trial.good for trial in self.trials):
-            return None  # whatever speaks against the invariants does so for all methods
+            return None  # what is wrong with the invariants is wrong for all methods
         rtol = self.wanted if chosen is None else chosen.options["rtol"]
         for kind, value in self._others(rtol):
             other = self._tuned(kind, value, math.inf if chosen is None else chosen.nfev)
@@ -207,7 +209,7 @@ class Search:
         return chosen
 
     def _others(self, rtol: float) -> list[tuple[Kind, float]]:
-        """Kinds beside the first, with the number that each starts from."""
+        """Return the other kinds, each with the step or tolerance at which its search starts."""
         look, found = self.look, []
         if look.velocities is False:
             found += [(self._kind(EIPRKN8, **LONG), rtol), (self._kind(EIPRKN12, **LONG), rtol)]
@@ -229,7 +231,7 @@ class Search:
         return Kind(method, fixed, self.look.size, length / LEAST_STEPS if fixed else COARSEST_RTOL, options)
 
     def _tuned(self, kind: Kind, value: float, bound: float = math.inf) -> Trial | None:
-        """The best trial of a kind, or None where it does not get there."""
+        """Return the best trial of a kind, or None if no trial has the wanted error."""
         tried = tune(kind, value, self.wanted, self._trial, bound)
         for trial in tried:
             self.kinds[id(trial)] = kind
@@ -240,7 +242,7 @@ class Search:
         return self.trials[-1]
 
     def _other_metric(self, chosen: Trial) -> Trial:
-        """The same with another metric or blocks, where that makes the error much smaller and then the run cheaper."""
+        """Return the trial with another metric or blocks if that makes the run cheaper, else `chosen`."""
         for options in self._metrics():
             kind, trial = self.kinds[id(chosen)], self._trial({**chosen.options, **options})
             if not (trial.good and BETTER * trial.error <= chosen.error):
@@ -253,7 +255,7 @@ class Search:
         return chosen
 
     def _metrics(self) -> list[dict[str, Any]]:
-        """Options of the metric that are left open."""
+        """Return the options of the metric that neither the problem nor the user has set."""
         problem, n = self.bench.problem, self.bench.problem.y0.size
         if problem.metric is not None or "metric" in self.bench.common:
             return []
@@ -262,14 +264,14 @@ class Search:
             found += [{"blocks": size} for size in (3, 2) if n % (2 * size) == 0 and n > 2 * size]
         return [*found, {"metric": "euclidean"}]
 
-    # --- what is said of it ---
+    # --- remarks ---
 
     def _leave_out_invariants(self) -> None:
-        """Go on without projection, and say why."""
+        """Continue without projection, and record the reason."""
         self.keeps = False
         good = [trial.error for trial in self.trials if trial.good]
         why = f"with the projection the error stays at {min(good):.1e}" if good else self.trials[-1].trouble
-        self.message = f"the invariants are left out, for no trial that keeps them has the wanted error: {why}"
+        self.message = f"the invariants are left out because no trial that keeps them has the wanted error: {why}"
 
     def _say_what_projection_does(self, chosen: Trial) -> None:
         plain = self._trial({**chosen.options, **PLAIN})
@@ -286,25 +288,25 @@ class Search:
             return False
         nfev = round(implicit.nfev / share)
         self.notes.append(
-            "The equations are stiff: stability bounds the steps of explicit methods. The implicit method EIPRadau "
-            f"has an error of {implicit.error:.1e} with {nfev} evaluations, {chosen.nfev / nfev:.2g} times fewer. Take "
+            "The equations are stiff: stability limits the steps of explicit methods. The implicit method EIPRadau "
+            f"has an error of {implicit.error:.1e} with {nfev} evaluations, {chosen.nfev / nfev:.2g} times fewer. Use "
             f"method=EIPRadau, rtol={implicit.rtol:.2g}, atol={implicit.atol:.2g}, or EIPBDF, in `integrate`."
         )
         return True
 
     def _say_what_binds(self, chosen: Trial) -> None:
-        """Whether stability bounds the steps, where the run is more accurate than wanted."""
+        """Test whether stability limits the steps of a run that is more accurate than wanted, and add a remark."""
         kind = self.kinds[id(chosen)]
         if chosen.error >= WINDOW * self.wanted or kind.fixed or chosen.nfev < LEAST_BOUND:
             return
         looser = self._trial(kind.settings(kind.near(LOOSER * chosen.options["rtol"])))
         if looser.nfev > FEWER * chosen.nfev:
             self.notes.append(
-                "Stability bounds the steps, not accuracy: an implicit method, or a splitting, may cost much less."
+                "Stability limits the steps, not accuracy: an implicit method or a splitting may cost much less."
             )
 
     def _why(self, chosen: Trial) -> str:
-        """The choice of the method in a sentence."""
+        """Return a sentence that explains the choice of the method."""
         look = self.look
         if look.velocities is None:
             form = "The equations are not of the form q'' = a(t, q) with y = (q, v)"
@@ -314,26 +316,29 @@ class Search:
         rivals = [trial for trial in self.trials if self._name(trial) not in ("", kind.name)]
         rival = best(rivals, self.wanted)
         ratio = math.inf if rival is None else rival.nfev / chosen.nfev
-        nearly = "nearly " if ratio < 1 else ""  # the more usual way is taken then
+        nearly = "nearly " if ratio < 1 else ""  # the more usual method was preferred
         words = f"{form}, and the steps vary by a factor of {look.variation:.2g}: {kind.name} needs {nearly}the fewest "
         words += "evaluations" if rival is None else f"evaluations, {self._name(rival)} {ratio:.3g} times as many"
         return f"{words}."
 
     def _name(self, trial: Trial) -> str:
-        """The kind of a trial in words; empty where it is a comparison only."""
+        """Return the name of a trial's kind, or an empty string if the trial only served as a comparison."""
         kind = self.kinds.get(id(trial))
         return "" if kind is None else kind.name
 
     def _unreached(self) -> str:
         good = [trial.error for trial in self.trials if trial.good]
-        found = f"the least found is {min(good):.1e}" if good else self.trials[-1].trouble
-        return f"recommend: no trial has an error of {self.wanted:g}: {found}. Ask for more, or for a shorter interval."
+        found = f"the smallest was {min(good):.1e}" if good else self.trials[-1].trouble
+        return (
+            f"recommend: no trial has an error of {self.wanted:g}: {found}. Allow a larger error or a shorter interval."
+        )
 
 
 def _asked_of_the_field(request: Request) -> tuple[bool | None, bool]:
-    """Whether it is of second order and by velocities (see `Look`), and whether its functions are native.
+    """Return the `velocities` of `Look`, and whether the functions are native.
 
-    The start is checked as for a run with the invariants: a wrong gradient raises, and what is no invariant warns.
+    The start is checked as for a run with the invariants: a wrong gradient raises an error, and a quantity that the
+    system does not conserve causes a warning.
     """
     ready = prepared(request)
     _, why_not = ready.system.functions(ready.run, None)

@@ -16,38 +16,38 @@ if TYPE_CHECKING:
 __all__ = ["component_names", "dataset", "default_names", "invariant_rows", "of_members", "to_dataframe", "to_xarray"]
 
 TABLES = {"xarray": "xarray", "pandas": "dataframe"}
-# Of a result what describes the whole run, in the order of an attribute list.
+# Fields that describe the whole run, in the order of the attributes.
 DESCRIBED = (
     "method", "h", "message", "trusted", "status", "success", "nfev", "njev", "nlu", "wall_time", "compiled", "units",
 )  # fmt: skip
 
 
 def to_xarray(result: Any, names: Any = None) -> Dataset:
-    """A run as an `xarray.Dataset`.
+    """Return a run as an `xarray.Dataset`.
 
     Parameters
     ----------
     result : IntegrationResult, OdeResult or EnsembleResult
-        From `integrate`, `scipy.integrate.solve_ivp` or `ensemble`, whose table is that of ``result.to_xarray()``.
+        Result of `integrate`, `scipy.integrate.solve_ivp` or `ensemble`; for the last see `EnsembleResult.to_xarray`.
     names : sequence of str or str, optional
-        Names of the components, as a list or as ``"x y vx vy"``. Default: those of the run's `Problem`, else "y0", "y1"
-        and so on.
+        Names of the components, as a list or as ``"x y vx vy"``. Default: those of the `Problem`, else "y0", "y1" and
+        so on.
 
     Returns
     -------
     xarray.Dataset
-        ``y`` (component, t) with the coordinates ``component`` and ``t``: ``data.y.sel(component="x")``. With
-        invariants ``invariants`` and ``invariant_errors``, I - target, both (invariant, t), and ``max_defect``. With
-        derivatives ``variations`` (t, component, column); a column is named after the component of the initial state or
-        the parameter that it is the derivative by, or 0, 1 and so on. Its
-        attributes are method, h (nan: adaptive steps), message, trusted (1 or 0) and the like, as far as there are any.
+        ``y`` (component, t) with the coordinates ``component`` and ``t``: ``data.y.sel(component="x")``. If the run has
+        invariants, also ``invariants`` and ``invariant_errors`` (I - target), both (invariant, t), and ``max_defect``.
+        If it has derivatives, also ``variations`` (t, component, column); a column is named after the component of the
+        initial state or the parameter with respect to which it is the derivative, or 0, 1 and so on. Attributes are
+        method, h (nan for adaptive steps), message, trusted (1 or 0) and others that the result has.
 
     Raises
     ------
     ImportError
-        Without xarray: ``pip install "eip_scipy[xarray]"``.
+        If xarray is missing: ``pip install "eip_scipy[xarray]"``.
     ValueError
-        When there are not as many names as components, or two are the same.
+        If the number of names differs from the number of components, or two names are equal.
 
     Examples
     --------
@@ -77,7 +77,7 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
 
 
 def to_dataframe(result: Any, names: Any = None) -> DataFrame:
-    """A run as a `pandas.DataFrame`.
+    """Return a run as a `pandas.DataFrame`.
 
     Parameters
     ----------
@@ -87,18 +87,18 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
     Returns
     -------
     pandas.DataFrame
-        Indexed by ``t``: a column for each component, then for each invariant its value, "H", and "H error", the value
-        less the target. Where a component has the name of an invariant, the latter is "invariant H". Last come
-        derivatives, "dx/dvy" of x by the initial vy; see `to_xarray` for the names. Of an ensemble
-        indexed by ``member``: a column for each component of the last state, then "t_end", "status", "message",
-        "trusted", and "H max_defect" for each invariant.
+        Table indexed by ``t``, with a column for each component, then for each invariant its value, "H", and its error,
+        "H error" (the value minus the target). If a component has the same name, the invariant is "invariant H". The
+        last columns are derivatives, such as "dx/dvy" of x with respect to the initial vy; see `to_xarray` for the
+        names. The table of an ensemble is indexed by ``member``: a column for each component of the last state, then
+        "t_end", "status", "message", "trusted", and "H max_defect" for each invariant.
 
     Raises
     ------
     ImportError
-        Without pandas: ``pip install "eip_scipy[pandas]"``.
+        If pandas is missing: ``pip install "eip_scipy[pandas]"``.
     ValueError
-        As by `to_xarray`.
+        As for `to_xarray`.
 
     Examples
     --------
@@ -127,7 +127,7 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
 
 
 def of_members(result: Any) -> bool:
-    """Return whether a result is that of an ensemble, whose states are (members, components)."""
+    """Return True if a result is that of an ensemble, whose states are (members, components)."""
     return "trajectories" in result
 
 
@@ -139,7 +139,7 @@ def _member_columns(result: Any, names: Any) -> dict[str, np.ndarray]:
 
 
 def invariant_rows(result: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Of each invariant of a result the values and the errors at the saved times, (m,) both, by a name of its own."""
+    """Return values and errors (m,) of each invariant at the saved times; the keys are distinct names."""
     if "invariants" not in result:
         return {}
     rows: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -149,7 +149,7 @@ def invariant_rows(result: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def column_names(result: Any, components: Sequence[str]) -> list[str]:
-    """Return of each column of derivatives what it is by: a component, a parameter, or the column's number."""
+    """Return the name of each column of derivatives: a component, a parameter, or the column's number."""
     known = result.get("columns", {})
     names = [*(components if known.get("state") else ()), *known.get("names", ())]
     count = result.variations.shape[2]
@@ -157,7 +157,7 @@ def column_names(result: Any, components: Sequence[str]) -> list[str]:
 
 
 def component_names(result: Any, names: Any = None, n: int | None = None) -> tuple[str, ...]:
-    """The names given, else a result's own, else "y0", "y1" and so on; `n` of them, default: a row of y for each."""
+    """Return `n` names: the given ones, else those of the result, else "y0", "y1" and so on; default: len(result.y)."""
     n = len(result.y) if n is None else n
     if names is None:
         names = getattr(result, "component_names", None)
@@ -165,18 +165,12 @@ def component_names(result: Any, names: Any = None, n: int | None = None) -> tup
 
 
 def default_names(n: int) -> tuple[str, ...]:
-    """y0, y1 and so on."""
+    """Return the names y0, y1 and so on."""
     return tuple(f"y{k}" for k in range(n))
 
 
 def dataset(variables: dict[str, Any], coordinates: dict[str, Any], attributes: dict[str, Any]) -> Dataset:
-    """A Dataset, where xarray is there.
-
-    Raises
-    ------
-    ImportError
-        Naming the extra.
-    """
+    """Return an `xarray.Dataset`; raise ImportError that names the extra if xarray is missing."""
     try:
         import xarray
     except ModuleNotFoundError as error:
@@ -185,7 +179,7 @@ def dataset(variables: dict[str, Any], coordinates: dict[str, Any], attributes: 
 
 
 def _attribute(value: Any) -> Any:
-    """The value as NetCDF and Zarr store it, which have neither None nor booleans among attributes."""
+    """Return an attribute in a form that NetCDF and Zarr can store: they have neither None nor booleans."""
     if value is None:
         return np.nan
     return int(value) if isinstance(value, (bool, np.bool_)) else value

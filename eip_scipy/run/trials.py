@@ -1,4 +1,4 @@
-"""Trial runs: the error of each against a run that is much more accurate, and what it costs."""
+"""Trial runs: the error of each, compared with a much more accurate run, and its cost."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from .results import IntegrationResult
 
 __all__ = ["Bench", "Outcome", "Trial", "difference"]
 
-# Errors that grow as a higher power of time than this do so exponentially, as far as a trial can tell.
+# Errors that grow faster than this power of time are taken to grow exponentially.
 WILD_POWER = 4.0
 LEAST_POWER, LARGEST_POWER = 1.0, 2.0
-# So many times does an adaptive trial look whether it has gone on for too long.
+# Number of times at which an adaptive trial checks whether it has used too many evaluations.
 ROWS = 16
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What one trial run says of the whole interval.
+    """Result of one trial run, extrapolated to the whole interval.
 
     Attributes
     ----------
     options : dict
-        Those of the run, as `integrate` takes them, besides what all trials have in common.
+        Options of `integrate`, without those that all trials have in common.
     error : float
-        Of the state at the end of the interval: largest component of the difference, relative to the largest
-        component. Extrapolated where the trial is shorter than the interval; nan for a run that failed.
+        Error of the state at the end of the interval: largest component of the difference, relative to the largest
+        component. Extrapolated if the trial is shorter than the interval; nan if the run failed.
     nfev : int
         Evaluations of the right-hand side for the whole interval.
     seconds : float
-        Of the trial itself.
+        Run time of the trial itself.
     trouble : str
-        Why the run failed, or is not to be trusted; empty for a good one.
+        Reason why the run failed or is not reliable; empty for a good run.
     power : float
-        The error was taken to grow as this power of time from the trial's end on; nan where it covers the interval.
+        Power of time with which the error is extrapolated; nan if the trial covers the whole interval.
     """
 
     options: Mapping[str, Any]
@@ -54,12 +54,12 @@ class Trial:
 
     @property
     def good(self) -> bool:
-        """Whether nothing speaks against the run."""
+        """True if the run is reliable and its error is known."""
         return not self.trouble and math.isfinite(self.error)
 
 
 class Outcome(NamedTuple):
-    """States at the times of the bench, (n, k), and what the run cost and said."""
+    """States at the times of the bench, shape (n, k), evaluations, run time, and the reason if the run is not good."""
 
     y: np.ndarray
     nfev: int
@@ -68,9 +68,10 @@ class Outcome(NamedTuple):
 
 
 class Bench:
-    """Where trials are run: a problem, options that all have in common, times to compare at.
+    """A problem, the options that all trials have in common, and the times at which trials are compared.
 
-    `truth` holds the states there, whose own error is about `doubt`; `most` bounds the evaluations of a trial, about.
+    `truth` holds the reference states at these times; their own error is about `doubt`. `most` is an approximate bound
+    on the evaluations of a trial.
     """
 
     def __init__(self, problem: Problem, common: Mapping[str, Any]) -> None:
@@ -80,19 +81,19 @@ class Bench:
         self.truth, self.doubt, self.most = np.zeros(0), 0.0, UNBOUNDED
 
     def shorten(self, t: float, looks: int) -> None:
-        """Let trials end at t, with states at so many times on the way there."""
+        """Let trials end at `t`, and compare them at `looks` equidistant times."""
         self.times = [self.t0 + (t - self.t0) * k / looks for k in range(1, looks + 1)]
 
     @property
     def share(self) -> float:
-        """The part of the interval that a trial covers."""
+        """Fraction of the interval that a trial covers."""
         return (self.times[-1] - self.t0) / (self.t_end - self.t0)
 
     def run(self, options: Mapping[str, Any]) -> Outcome:
-        """Run once; exceptions of the start and of the user's functions pass through."""
+        """Run once; exceptions raised at the start or by the user's functions propagate."""
         asked = {**self.common, **options}
         with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")  # whatever speaks against a run stands in its message
+            warnings.simplefilter("ignore")  # the message of a run repeats its warnings
             if "h" in asked:
                 return self._with_equal_steps(asked)
             steps = max(self.most // asked["method"].TABLEAU.n_stages, ROWS)
@@ -114,7 +115,7 @@ class Bench:
         return _outcome(run, np.array(states).T, f"it takes more than {self.most} evaluations")
 
     def _with_equal_steps(self, asked: dict[str, Any]) -> Outcome:
-        """A multistep method starts once only: each start costs it some 200 evaluations."""
+        """Run with equal steps; a multistep method starts only once, because each start costs about 200 evaluations."""
         method = asked["method"].TABLEAU
         several = method.has_history
         nfev = abs(self.times[-1] - self.t0) / asked["h"] * (1 if several else method.n_stages)
@@ -130,16 +131,18 @@ class Bench:
         return _outcome(run, run.y[:, 1:])
 
     def trial(self, options: Mapping[str, Any]) -> Trial:
-        """Run once and compare with the truth; a run that raises for its options or steps is one that failed."""
+        """Run once and compare with the reference; a run whose options or steps raise an error counts as failed."""
         try:
             done = self.run(options)
         except (ValueError, ArithmeticError) as error:
             return Trial(options, math.nan, 0, 0.0, f"{error}")
         found = self.judged(options, done, self.truth)
-        return replace(found, error=max(found.error, self.doubt)) if found.good else found  # one may be the truth's run
+        return (
+            replace(found, error=max(found.error, self.doubt)) if found.good else found
+        )  # it may be the reference run
 
     def judged(self, options: Mapping[str, Any], done: Outcome, truth: np.ndarray) -> Trial:
-        """What a run says, where its states should have been `truth`."""
+        """Return the trial of a run whose states are compared with `truth`."""
         nfev = round(done.nfev / self.share)
         if done.y.shape != truth.shape or not np.isfinite(done.y).all():
             return Trial(options, math.nan, nfev, done.seconds, done.trouble or "it did not reach its end")
@@ -148,13 +151,15 @@ class Bench:
             return Trial(options, float(errors[0]), nfev, done.seconds, done.trouble)
         power, trouble = _power(errors), done.trouble
         if power > WILD_POWER:
-            trouble = trouble or f"its error grows faster than the {WILD_POWER:g}th power of time: a chaotic motion?"
+            trouble = (
+                trouble or f"its error grows faster than the {WILD_POWER:g}th power of time; the motion may be chaotic"
+            )
         power = min(max(power, LEAST_POWER), LARGEST_POWER)
         return Trial(options, float(errors.max()) / self.share**power, nfev, done.seconds, trouble, power)
 
 
 def _outcome(run: IntegrationResult, y: np.ndarray, stopped: str = "") -> Outcome:
-    """Of a run, with states y; why it was stopped, where it was, or what its diagnostics say against it."""
+    """Return the outcome of a run with states `y`; `stopped` is the reason if the callback stopped it."""
     trouble = run.diagnostics.message if run.status >= 0 else run.message
     if run.status != 0:
         trouble, y = trouble or stopped, np.full_like(y, np.nan)
@@ -162,13 +167,16 @@ def _outcome(run: IntegrationResult, y: np.ndarray, stopped: str = "") -> Outcom
 
 
 def difference(y: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Largest component of the difference, relative to the largest component, of states in columns (n, k)."""
+    """Return the largest difference relative to the largest component, for each column of two arrays (n, k)."""
     sizes = np.abs(truth).max(axis=0)
     return np.abs(y - truth).max(axis=0) / np.where(sizes > 0, sizes, 1.0)
 
 
 def _power(errors: np.ndarray) -> float:
-    """As which power of time errors at equidistant times grow: the slope of the largest so far, on logarithmic axes."""
+    """Return the power of time with which errors at equidistant times grow.
+
+    It is the slope of the running maximum on logarithmic axes.
+    """
     largest = np.maximum.accumulate(errors)
     seen = largest > 0
     if seen.sum() < 2:

@@ -1,4 +1,4 @@
-"""The step or the tolerance at which a method has a wanted error, by a few trials."""
+"""Search for the step or the tolerance with which a method has the wanted error, by a few trials."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from .trials import Trial
 
 __all__ = ["AIM", "COARSEST_RTOL", "FINEST_RTOL", "WINDOW", "Kind", "best", "tune"]
 
-# Of the wanted error: what is aimed at, and from where on a run is accurate enough and not too accurate.
+# Fractions of the wanted error: the target of the search, and the smallest error that is not needlessly accurate.
 AIM, WINDOW = 0.4, 0.15
 MOST_TRIALS, MOST_FAILURES = 8, 4
 ATOL_PER_RTOL = 1e-3
 COARSEST_RTOL, FINEST_RTOL = 0.01, 1e-13
-# A kind is given up where it would cost so many times what another one does.
+# A kind is abandoned if it would cost more than this factor times the cost of another one.
 TOO_DEAR = 1.5
-# By so much the step or the tolerance changes at most at once, in decades; by so little it is no longer changed.
+# Largest and smallest change of the step (True) or the tolerance (False) from one trial to the next, in decades.
 FARTHEST = {True: 0.5, False: 2.0}
 NEAREST = 0.01
-# Not nearer than this to a number with which a run fails.
+# Smallest distance, in decades, from a value with which a run fails.
 AWAY = 0.1
 
 
 @dataclass(frozen=True)
 class Kind:
-    """One way to run a problem: a method with options, tuned by one number, its step `h` or its tolerance `rtol`.
+    """A method with options, tuned by one number: its step `h` or its tolerance `rtol`.
 
-    `size` is that of the state, for `atol`; `coarsest` bounds the number.
+    `size` is the size of the state, from which `atol` follows; `coarsest` is the largest value of the number.
     """
 
     method: type[EIPSolver]
@@ -41,26 +41,26 @@ class Kind:
 
     @property
     def name(self) -> str:
-        """Of the method, and that its steps are equal."""
+        """Name of the method, with the remark that its steps are equal if they are."""
         return f"{self.method.__name__}{' with equal steps' if self.fixed else ''}"
 
     @property
     def knob(self) -> str:
-        """Name of the number."""
+        """Name of the number that is tuned."""
         return "h" if self.fixed else "rtol"
 
     @property
     def order(self) -> int:
-        """Of the method."""
+        """Order of the method."""
         return int(self.method.TABLEAU.order)
 
     @property
     def slope(self) -> float:
-        """How the error depends on the number: as this power of it."""
+        """Power of the tuned number with which the error grows."""
         return self.order if self.fixed else self.order / ((self.method.TABLEAU.error_estimator_order or 0) + 1)
 
     def settings(self, value: float) -> dict[str, Any]:
-        """Options of `integrate` for the value of the number."""
+        """Return the options of `integrate` for a value of the number."""
         if self.fixed:
             return {"method": self.method, "h": value, **self.options}
         return {
@@ -71,25 +71,25 @@ class Kind:
         }
 
     def near(self, value: float) -> float:
-        """The value in few digits, inside its bounds."""
+        """Return the value within its bounds, rounded to few digits."""
         value = min(value, self.coarsest)
         return _short(value, 3) if self.fixed else _short(max(value, FINEST_RTOL), 2)
 
     def dearness(self, trial: Trial, wanted: float) -> float:
-        """What it would cost at the wanted error, going by one trial."""
+        """Estimate the evaluations for the wanted error from one trial."""
         return trial.nfev * (trial.error / wanted) ** (1 / self.order)
 
 
 def tune(
     kind: Kind, value: float, wanted: float, run: Callable[[Mapping[str, Any]], Trial], bound: float
 ) -> list[Trial]:
-    """Trials of a kind, from a first value of its number on, until one has the wanted error.
+    """Run trials of a kind, starting from a value of its number, until one has the wanted error.
 
-    Ends early where nothing helps, and where the kind would cost much more than `bound` evaluations.
+    The search ends early if nothing helps, or if the kind would cost much more than `bound` evaluations.
     """
     tried: dict[float, Trial] = {}
     fine: tuple[float, float] | None = None  # logarithms of number and error: accurate enough
-    coarse: tuple[float, float] | None = None  # not; its error is nan where the run failed
+    coarse: tuple[float, float] | None = None  # not accurate enough; the error is nan if the run failed
     x = math.log10(value)
     while len(tried) < MOST_TRIALS:
         value = kind.near(10**x)
@@ -114,7 +114,7 @@ def tune(
 
 
 def _next(kind: Kind, fine: tuple[float, float] | None, coarse: tuple[float, float] | None, aim: float) -> float:
-    """Where the error would be the one aimed at, going by a value on either side or on one."""
+    """Return the number at which the target error is expected, from known values on one side or on both."""
     farthest = FARTHEST[kind.fixed]
     if fine and coarse:
         width = coarse[0] - fine[0]
@@ -131,7 +131,7 @@ def _next(kind: Kind, fine: tuple[float, float] | None, coarse: tuple[float, flo
 
 
 def best(trials: list[Trial], wanted: float) -> Trial | None:
-    """The cheapest good trial that is accurate enough; None without one."""
+    """Return the cheapest good trial that is accurate enough, or None."""
     enough = [trial for trial in trials if trial.good and trial.error <= wanted]
     return min(enough, key=lambda trial: trial.nfev, default=None)
 

@@ -1,4 +1,4 @@
-"""A run as a page that plays it: one HTML file, with nothing from the network."""
+"""An HTML page that plays a run: one file that needs no network."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .tables import component_names, invariant_rows
 
 __all__ = ["page", "view"]
 
-MOST = 9  # components, or bodies, that can be told apart
+MOST = 9  # components, or bodies, that can be distinguished
 FRAMES = 4000
 NUMBERS = 400_000  # in all frames of the state
 POINTS = 1000  # of a profile
@@ -27,31 +27,32 @@ PLACE = "__RUN__"
 
 
 def view(result: Any, path: str | os.PathLike[str] | None = None, *, names: Any = None, reference: Any = None) -> Path:
-    """Write a page that plays a run: the orbit, or the state, beside errors of the invariants and of the trajectory.
+    """Write a page that plays a run: the orbit, or the state, with the errors of the invariants and of the trajectory.
 
-    The page is one file that needs no network, with play, pause and a slider, for a desk or a phone.
+    The page is one file that needs no network, with play, pause and a slider, for desktop and phone.
 
     Parameters
     ----------
     result : IntegrationResult or OdeResult
-        From `integrate`, `load` or `scipy.integrate.solve_ivp`. What was saved is played: give `save_every` or
-        `t_eval`.
+        Result of `integrate`, `load` or `scipy.integrate.solve_ivp`. The page plays the saved states: use `save_every`
+        or `t_eval`.
     path : path-like, optional
-        Where to write it. Default: a file in the folder for temporary ones, which the browser opens.
+        File to write. Default: a temporary file, which is opened in the browser.
     names : sequence of str or str, optional
         As for `to_xarray`; bodies in the plane are those whose components are named x and y, or x_0 and y_0 and so on.
     reference : callable, array_like (n, m) or result, optional
-        What is right: ``reference(t) -> (n,)`` or None, states at the run's times, or another result with these times.
-        Default: the problem's own, where the run is from its start and with its parameters.
+        Reference solution: ``reference(t) -> (n,)`` or None, states at the times of the run, or another result with
+        these times. Default: the reference of the problem, if the run has its initial state and parameters.
 
     Returns
     -------
     Path
+        The file.
 
     Raises
     ------
     ValueError
-        When fewer than two states were saved, or `reference` is of another size or of other times.
+        If fewer than two states were saved, or if `reference` has another shape or other times.
 
     Examples
     --------
@@ -71,10 +72,12 @@ def view(result: Any, path: str | os.PathLike[str] | None = None, *, names: Any 
 
 
 def page(result: Any, *, names: Any = None, reference: Any = None) -> str:
-    """The page of `view` as text."""
+    """Return the page of `view` as text."""
     y = np.asarray(result.y)
     if y.shape[1] < 2:
-        raise ValueError(f"view: the run has {y.shape[1]} saved states; give save_every=... or t_eval=... for a movie.")
+        raise ValueError(
+            f"view: the run has {y.shape[1]} saved states, expected two or more; use save_every or t_eval."
+        )
     labels = component_names(result, names)
     bodies = planes(labels)
     frames = _frames(y.shape[1], 2 * len(bodies) if bodies else min(len(y), POINTS))
@@ -87,7 +90,7 @@ def page(result: Any, *, names: Any = None, reference: Any = None) -> str:
         "state": _state(y, labels, bodies, frames),
         "errors": _errors(result, y, labels, bodies, reference, frames),
     }
-    # No text of the run's can end the script that holds it.
+    # Text from the run must not end the script element that contains it.
     text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     template = (files("eip_scipy.data") / "view.html").read_text(encoding="utf-8")
     before, after = template.split(PLACE)
@@ -95,18 +98,18 @@ def page(result: Any, *, names: Any = None, reference: Any = None) -> str:
 
 
 def _frames(rows: int, columns: int) -> np.ndarray:
-    """The rows that are shown, both ends among them."""
+    """Return the rows that are shown, including the first and the last."""
     most = min(rows, FRAMES, max(100, NUMBERS // max(columns, 1)))
     return np.unique(np.linspace(0, rows - 1, most).round().astype(int))
 
 
 def _numbers(values: Any, digits: int = 5) -> list[float | None]:
-    """Numbers for JSON, which has no NaN, and none of whose digits is seen beyond the first ones."""
+    """Return numbers for JSON, rounded to `digits` digits; NaN, which JSON lacks, becomes None."""
     return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in np.asarray(values).tolist()]
 
 
 def _state(y: np.ndarray, labels: tuple[str, ...], bodies: dict[str, tuple[int, int]], frames: np.ndarray) -> Any:
-    """What moves: bodies in the plane; of two components one against the other; few in time; many as a profile."""
+    """Return the animated part: bodies in the plane, two components, a few curves in time, or a profile of many."""
     real = np.abs(y) if np.iscomplexobj(y) else y
     if not bodies and len(y) == 2 and not np.iscomplexobj(y):
         bodies = {f"{labels[1]} over {labels[0]}": (0, 1)}
@@ -140,12 +143,12 @@ def _errors(result: Any, y: np.ndarray, labels: Any, bodies: Any, reference: Any
 
 
 def _largest(row: np.ndarray, frames: np.ndarray) -> list[float | None]:
-    """Of each frame the largest value since the one before, so that no peak is lost between two of them."""
+    """Return the largest value since the previous frame, for each frame, so that no peak is lost."""
     return _numbers([row[0], *np.fmax.reduceat(row[1:], frames[:-1])], 3)
 
 
 def _distances(difference: np.ndarray, labels: tuple[str, ...], bodies: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Of each body the distance of its place, in space where z is named; else the largest of all components."""
+    """Return the position error of each body, in space if z is named; without bodies, the largest component."""
     if not bodies:
         return {"largest component": np.abs(difference).max(axis=0)}
     place = {name: k for k, name in enumerate(labels)}
@@ -157,7 +160,7 @@ def _distances(difference: np.ndarray, labels: tuple[str, ...], bodies: dict[str
 
 
 def _reference(result: Any, given: Any) -> np.ndarray | None:
-    """What is right at the saved times, (n, m), NaN where that is not known; None where nothing is."""
+    """Return the reference states at the saved times, (n, m), NaN where they are unknown; None without a reference."""
     t, shape = np.asarray(result.t), np.shape(result.y)
     if given is None:
         given = _own_reference(result)
@@ -172,12 +175,12 @@ def _reference(result: Any, given: Any) -> np.ndarray | None:
         given = given.y
     found = np.asarray(given)
     if found.shape != shape:
-        raise ValueError(f"view: reference has shape {found.shape}, expected that of the run, {shape}: {shown(given)}.")
+        raise ValueError(f"view: reference has shape {found.shape}, expected {shape} as the run: {shown(given)}.")
     return found
 
 
 def _own_reference(result: Any) -> Any:
-    """That of the problem, of a run from its own start and with its own parameters."""
+    """Return the reference of the problem if the run has the problem's initial state and parameters."""
     origin = getattr(result, "_origin", None)
     request = None if origin is None else origin.request
     if request is None or not isinstance(request.fun, Problem) or request.y0 is not None or request.params is not None:
@@ -187,6 +190,6 @@ def _own_reference(result: Any) -> Any:
 
 
 def _time_unit(result: Any) -> str:
-    """The unit of time, where the run names a length and a time, and no more."""
+    """Return the unit of time if the run names exactly two units, a length and a time."""
     parts = (result.get("units") or "").split(", ")
     return parts[1] if len(parts) == 2 and parts[1].replace(" ", "").isalpha() else ""

@@ -611,8 +611,8 @@ WRONG_OPTIONS = [
     ("blocks", True, "blocks must be an integer or a sequence of index arrays"),
     ("blocks", 1.5, "blocks must be an integer or a sequence of index arrays"),
     ("blocks", "ab", "blocks: "),
-    ("blocks", [[0, 1], [1]], "blocks: a component stands in two blocks"),
-    ("blocks", [[0, 0]], "blocks: a component stands in two blocks"),
+    ("blocks", [[0, 1], [1]], "blocks: a component is in two blocks"),
+    ("blocks", [[0, 0]], "blocks: a component is in two blocks"),
     ("blocks", [[0, 2]], "blocks: .* no array of indices from 0 to 1"),
     ("blocks", [[-1]], "blocks: .* no array of indices from 0 to 1"),
     ("blocks", [[0.5]], "blocks: .* no array of indices from 0 to 1"),
@@ -835,7 +835,8 @@ TIME_LEFT_OUT = [
 def test_invariants_without_the_time(driver, invariants):
     names = "t, y, args\\[0\\]" if invariants.args else "t, y"
     with pytest.raises(
-        TypeError, match=rf"'M' is called with \({names}\): .* The time comes first, .* lambda {names}: "
+        TypeError,
+        match=rf"'M' is called with \({names}\): .* The first argument is always the time: .* lambda {names}: ",
     ):
         driver(invariants=invariants)
 
@@ -851,7 +852,7 @@ def test_a_method_by_its_name():
 @pytest.mark.parametrize("driver", [by_integrate, by_ensemble], ids=["integrate", "ensemble"])
 def test_names_of_parameters_that_nobody_knows(driver):
     with pytest.raises(
-        TypeError, match=r"got {'k': 1.0}: give the values .* params=\[1.0, 2.0\], .* args=\(mapping,\)"
+        TypeError, match=r"got {'k': 1.0}\. Give the values .* params=\[1.0, 2.0\], .* args=\(mapping,\)"
     ):
         driver(params={"k": 1.0})
 

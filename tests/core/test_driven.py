@@ -145,7 +145,7 @@ def test_jac_gets_the_arguments_of_the_run(method):
         jac=lambda t, y, p: spring_jac(t, y, p[0]),
     )  # fmt: skip
     np.testing.assert_array_equal(members.y[0], plain.y[:, -1])
-    with pytest.raises(TypeError, match="jac is the Jacobian for EIPRadau and EIPBDF; EIPDOP853 takes none"):
+    with pytest.raises(TypeError, match="jac is the Jacobian for EIPRadau and EIPBDF; EIPDOP853 does not use one"):
         integrate(spring, (0, 9), [1, 0], method=EIPDOP853, jac=spring_jac, args=(1e3,), rtol=1e-3)
 
 
@@ -376,7 +376,7 @@ def test_a_problem_s_balances_are_left_out(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_no_checkpoint(method, tmp_path):
-    with pytest.raises(ValueError, match=re.escape("checkpoint: a file does not hold the inside of SciPy's")):
+    with pytest.raises(ValueError, match=re.escape("checkpoint: a file cannot store the internal state of SciPy's")):
         integrate(relaxing, (0, 1), START, method=method, checkpoint=tmp_path / "file", **KEEP)
 
 

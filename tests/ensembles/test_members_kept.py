@@ -159,7 +159,7 @@ def test_without_events_there_are_none():
 
 def test_intervals_of_members():
     run = ensemble(PROBLEM, SPANS, STARTS, **STEPS)
-    assert run.one_by_one == "members have intervals or times of their own"
+    assert run.one_by_one == "members have different intervals or times"
     for k, alone in pairs(run, span=SPANS, **STEPS):
         assert run.t[k] == SPANS[k, 1]
         np.testing.assert_array_equal(run.y[k], alone.y[:, -1])

@@ -185,7 +185,7 @@ def test_little_work_is_not_worth_compiling_for(monkeypatch):
     starts, options = np.ones((9, 10)), {"h": 0.1, "in_place": True, "invariants": (), "executor": 1}
     run = ensemble(pendulums, (0, 1), starts, params=[1.0], **options)
     assert not run.side_by_side.any()
-    assert "less to do than functions for eight members take to compile" in repr(run)
+    assert "compiling functions for eight members would take longer than the run" in repr(run)
     assert ensemble(kepler(), (0, 1), spread_starts(kepler().y0, 9), executor=1).side_by_side.all()
 
 

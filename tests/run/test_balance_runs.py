@@ -312,7 +312,7 @@ def test_members_of_ensembles_are_single_runs(options, compiled):
     assert members.trusted.all()
     assert np.isnan(members.target).all()
     if compiled:
-        assert "each run carries its balances by itself" in str(members)
+        assert "the runs have balances" in str(members)
 
 
 def test_results_are_saved_with_their_slowness(tmp_path):

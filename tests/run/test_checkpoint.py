@@ -334,7 +334,7 @@ def test_the_progress_bar_goes_on(name, total, tmp_path, monkeypatch):
 def checkpoint_step(error):
     """The step that the note of an exception names."""
     (note,) = error.__notes__
-    return int(re.search(r"holds step (\d+), t = [-\d.e]+: the same call with resume=True goes on", note)[1])
+    return int(re.search(r"holds step (\d+), t = [-\d.e]+: the same call with resume=True continues", note)[1])
 
 
 @pytest.mark.usefixtures("fine")
@@ -546,7 +546,7 @@ def test_a_file_that_is_there_is_not_replaced(tmp_path):
 
 def test_no_file_yet(tmp_path):
     found = integrate(orbit, SPAN, Y0, checkpoint=tmp_path / "run", resume=True, **FIXED)
-    assert "no checkpoint was there: started at the beginning" in found.message
+    assert "there was no checkpoint: started at the beginning" in found.message
     same(integrate(orbit, SPAN, Y0, **FIXED), found)
     assert "checkpoint" not in integrate(orbit, SPAN, Y0, checkpoint=tmp_path / "other", **FIXED).message
 
@@ -554,7 +554,7 @@ def test_no_file_yet(tmp_path):
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [
-        ({"resume": True}, ValueError, "resume=True needs the file to resume from: checkpoint=path"),
+        ({"resume": True}, ValueError, "resume=True needs a file to resume from: checkpoint=path"),
         ({"resume": "yes", "checkpoint": "a"}, ValueError, "resume must be True or False, got 'yes'"),
         ({"checkpoint": 3}, TypeError, "checkpoint must be the path of a file, got 3"),
         ({"checkpoint": "a", "checkpoint_every": 0}, ValueError, "checkpoint_every must be a number of seconds > 0"),
@@ -724,7 +724,7 @@ CHANGES = {
     "a negative number of rows": (lambda h, a: a.update(place=np.array([5, -1, 0])), "it stands at step 5, row -1"),
     "no settings": (lambda h, a: h.pop("settings"), "belongs to another run: method is null there"),
     "settings of another kind": (lambda h, a: h.update(settings=[1]), "belongs to another run"),
-    "no time": (lambda h, a: h.update(wall_time="long"), "is no checkpoint of this run"),
+    "no time": (lambda h, a: h.update(wall_time="long"), "is not a checkpoint of this run"),
     "no start": (lambda h, a: a.pop("start_f"), "start_f is missing"),
 }
 
@@ -952,7 +952,7 @@ def test_foreign_archives(tmp_path):
     with pytest.raises(CheckpointError, match="not a checkpoint"):
         checkpoint.read(path)
     forged(path, "x.npy", npy_bytes("<f8", (1,), bytes(8)), {"format": "another"})
-    with pytest.raises(CheckpointError, match="its header is another"):
+    with pytest.raises(CheckpointError, match="its header has another format"):
         checkpoint.read(path)
     old = io.BytesIO()
     npy.write_array(old, np.zeros(1), version=(2, 0))
@@ -1055,7 +1055,7 @@ def test_a_run_goes_on_while_the_disk_is_full(tmp_path, monkeypatch):
         write(path, header, arrays)
 
     monkeypatch.setattr(checkpoint, "write", full_for_a_while)
-    match = r"no space left on device; it still holds step 7, t = 0\.21\. The run goes on and tries again"
+    match = r"no space left on device; it still holds step 7, t = 0\.21\. The run continues and tries again"
     with pytest.warns(RuntimeWarning, match=match) as record:
         found = integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=1e-9, **FIXED)
     assert len(record) == 3
@@ -1078,7 +1078,7 @@ def test_the_disk_stays_full(tmp_path, monkeypatch):
     monkeypatch.setattr(longrun.Driver, "advance", fill_after_a_while)
     with pytest.warns(RuntimeWarning, match="no space left on device; it still holds step 10") as record:
         found = integrate(orbit, SPAN, Y0, checkpoint=path, checkpoint_every=1e-9, **FIXED)
-    assert str(record[-1].message).endswith("The result is whole.")
+    assert str(record[-1].message).endswith("The result is complete.")
     assert record[-1].filename == __file__
     same(whole, found)
     assert "cannot write the checkpoint" in found.message
@@ -1110,7 +1110,7 @@ def test_interrupted_with_a_full_disk(reason, tmp_path, monkeypatch):
     assert info.value.partial.t[-1] > 1.0
     first, second = info.value.__notes__
     assert ("no space left" if reason == "disk" else "interrupted again") in first
-    assert f"{str(path)!r} holds step 0, t = 0: the same call with resume=True goes on from there" in second
+    assert f"{str(path)!r} holds step 0, t = 0: the same call with resume=True continues from there" in second
     monkeypatch.undo()
     assert checkpoint.read(path)[0]["step"] == 0
 

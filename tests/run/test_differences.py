@@ -119,7 +119,7 @@ def test_bits_and_what_is_said(c):
     assert (native.nfev, native.njev) == (interpreted.nfev, interpreted.njev)
     assert native.calls == {"fun": "pointer", "H, L": "pointer", "gradient of H, L": "differences"}
     for run in (native, interpreted):
-        assert "the gradient of 'H, L' comes from differences" in run.message
+        assert "the gradient of 'H, L' is computed by differences" in run.message
 
 
 def test_complex_states(c):
@@ -151,7 +151,7 @@ def test_members_are_the_single_runs(c):
     starts = pericentre(0.5) * np.linspace(0.98, 1.02, 5)[:, None]
     options = {"h": 0.02, "invariants": Invariant(c("both"), size=2)}
     members = ensemble(c("orbit"), (0, 10), starts, **options)
-    assert members.one_by_one == "the gradient of an invariant comes from differences"
+    assert members.one_by_one == "the gradient of an invariant is computed by differences"
     for start, y in zip(starts, members.y, strict=True):
         np.testing.assert_array_equal(integrate(c("orbit"), (0, 10), start, method=EIPRK4, **options).y[:, -1], y)
 

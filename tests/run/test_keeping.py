@@ -153,7 +153,7 @@ def test_a_zarr_group_at_a_url():
 
 # One run at a time.
 
-IN_USE = rf"in use by another run, of process {os.getpid()} on \S+, this one\. Wait for its end"
+IN_USE = rf"in use by another run, of process {os.getpid()} on \S+, this one\. Wait until it ends"
 
 
 @keeping
@@ -430,9 +430,9 @@ def energy_of_later(t, y):
 @pytest.mark.parametrize(
     ("fun", "more", "match"),
     [
-        (later, {}, r"fun was \S+ at t = 3\.\d+, where it stands, and is \S+ now\. Resume with the functions"),
+        (later, {}, r"fun was \S+ at t = 3\.\d+, where it was saved, and is \S+ now\. Resume with the functions"),
         (orbit, {"invariants": [Invariant(energy_of_later, H.grad, name="energy"), L], "check": False},
-         r"invariant 'energy' was \S+ at t = 3\.\d+, where it stands"),
+         r"invariant 'energy' was \S+ at t = 3\.\d+, where it was saved"),
     ],
 )  # fmt: skip
 def test_a_function_that_differs_later_is_seen(fun, more, match, tmp_path):
@@ -458,7 +458,7 @@ def test_compiled_functions_are_compared_there_before_they_are_compiled(tmp_path
 
     options = {"invariants": (), "compiled": None}
     broken_off(tmp_path / "kept", fun=jit_orbit, **options)
-    with pytest.raises(CheckpointError, match=r"fun was .* where it stands"):
+    with pytest.raises(CheckpointError, match=r"fun was .* where it was saved"):
         run(tmp_path / "kept", other, resume=True, **options)
     whole = integrate(jit_orbit, SPAN, Y0, **OPTIONS | options)
     same(whole, run(tmp_path / "kept", jit_orbit, resume=True, **options))
@@ -557,7 +557,7 @@ def test_sigterm_waits_for_the_checkpoint(keep, tmp_path, terminated):
     assert content(tmp_path) == ["kept"]
     if keep is kept_by_integrate:
         where = (
-            f"the checkpoint {str(place)!r} holds step 7, t = 0.21: the same call with resume=True goes on from there"
+            f"the checkpoint {str(place)!r} holds step 7, t = 0.21: the same call with resume=True continues from there"
         )
         assert err == f"SIGTERM\n{where}\n"
         found = keep(place, resume=True)
@@ -701,13 +701,13 @@ def test_a_disk_fills_up_while_the_run_grows(small_disk):
     """No room for the former checkpoint and the next one: the run ends all the same, and the former one is whole."""
     place, options = small_disk / "kept", {"save_every": 1, "h": 0.003}
     whole = integrate(orbit, SPAN, Y0, **OPTIONS | options)
-    match = r"no space left on device; it still holds step .* The result is whole"
+    match = r"no space left on device; it still holds step .* The result is complete"
     with pytest.warns(RuntimeWarning, match=match):
         found = run(place, **options)
     same(whole, found)
     assert "no space left on device" in found.message
     assert content(small_disk) == ["kept"]
-    with pytest.warns(RuntimeWarning, match="The result is whole"):
+    with pytest.warns(RuntimeWarning, match="The result is complete"):
         same(whole, run(place, resume=True, **options))
 
 
@@ -722,7 +722,7 @@ def test_a_disk_that_is_full_at_the_start(keep, small_disk):
 
 def test_an_ensemble_on_a_disk_that_fills_up(small_disk):
     place = small_disk / "kept"
-    with pytest.warns(RuntimeWarning, match="no space left on device; the former checkpoint stays"):
+    with pytest.warns(RuntimeWarning, match="no space left on device; the previous checkpoint is kept"):
         found = kept_by_ensemble(place, callback=at_once(lambda: fill(small_disk)), checkpoint_every=1e-9)
     same(members(), found)
     (small_disk / "filler").unlink()

@@ -281,7 +281,7 @@ NOT_FILLING = [
     (returning, TypeError, r"fun returned array\(.*in_place=True it must fill its argument out"),
     (half, ValueError, "fun does not fill all of its argument out, in component 1, at t=0"),
     (nothing, ValueError, "fun does not fill all of its argument out, in component 0, at t=0"),
-    (adding, ValueError, "fun reads its argument out, which holds anything, before it fills it, in component 0"),
+    (adding, ValueError, "fun reads its argument out, whose content is arbitrary, before filling it, in component 0"),
 ]
 
 

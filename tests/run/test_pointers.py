@@ -603,7 +603,7 @@ def test_what_has_no_function_of_eight_is_named(c):
     fun, kept = of_eight(c)
     options = {"params": MU, "method": EIPRK4, "h": 0.05}
     run = ensemble(c.kepler, (0, 1), [Y0, Y0], invariants=kept, **options)
-    assert run.one_by_one == "fun is a C function of one member, without that of eight (CFunctions)"
+    assert run.one_by_one == "fun is a C function without a form for eight members (CFunctions)"
     run = ensemble(fun, (0, 1), [Y0, Y0], invariants=alone(c), **options)
     assert run.one_by_one.startswith("invariant 'H L' is a C function of one member")
     run = ensemble(fun, (0, 1), [Y0, Y0], invariants=kept, **options)

@@ -72,7 +72,7 @@ def test_a_reference_is_of_the_same_problem():
         np.testing.assert_allclose(group["rows"][0], np.abs(run.y - finer.y).max(axis=0), rtol=1e-2)
     with pytest.raises(ValueError, match="the reference has other times than the run"):
         of(run, reference=integrate(oscillator, (0, 1), Y0, method=EIPRK4, h=0.05, save_every=1))
-    with pytest.raises(ValueError, match=r"reference has shape \(2,\), expected that of the run, \(2, 11\)"):
+    with pytest.raises(ValueError, match=r"reference has shape \(2,\), expected \(2, 11\) as the run"):
         of(run, reference=Y0)
 
 
@@ -89,7 +89,7 @@ def test_states_of_other_kinds():
     np.testing.assert_allclose(profile["rows"], np.abs(run.y.T), rtol=1e-3)
     sol = solve_ivp(oscillator, (0, 1), Y0)
     assert of(sol, names="x y")["state"]["names"] == ["orbit"]
-    with pytest.raises(ValueError, match=r"1 saved states; give save_every"):
+    with pytest.raises(ValueError, match=r"1 saved states, expected two or more; use save_every"):
         of(integrate(oscillator, (0, 0), Y0, method=EIPRK4, h=0.1))
 
 

@@ -344,7 +344,7 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, no_rebound, monkeypatc
     assert {path.name for path in folder.iterdir()} == done
     before = {name: (folder / name).read_bytes() for name in done}
     assert main([*command, "--out", str(tmp_path / "again")], **LITTLE) == 2
-    assert "exists. resume=True goes on with the run that it holds" in capsys.readouterr().err
+    assert "exists. Pass resume=True to continue the run that it holds" in capsys.readouterr().err
     assert main([*command, "--out", str(tmp_path / "second"), "--resume", "--quiet"], **LITTLE) == 0
     long = {"EIPRKN12.npz", "EIPGJ14.npz", "EIPGJ14-balances.npz", "EIPRKN12-tight.npz"}
     assert {path.name for path in folder.iterdir()} == {*done, *long}

@@ -259,7 +259,7 @@ def test_an_interrupted_command_goes_on(run, evaluation, done, tmp_path, start, 
     assert f"the same command with --resume goes on from the checkpoints in '{folder}'" in captured.err
     assert [line.split()[0] for line in captured.out.splitlines() if line.startswith(("EIP", "RK4"))] == done
     assert main([*command, "--out", str(tmp_path / "again")], **SHORT) == 2
-    assert "exists. resume=True goes on with the run that it holds" in capsys.readouterr().err
+    assert "exists. Pass resume=True to continue the run that it holds" in capsys.readouterr().err
     assert main([*command, "--out", str(tmp_path / "second"), "--resume", "--quiet"], **SHORT) == 0
     assert {path.stem for path in folder.iterdir()} == {*gpe_runs.METHODS, gpe_runs.REFERENCE}
     assert read(tmp_path / "second" / "ring.csv") == read(tmp_path / "whole" / "ring.csv")

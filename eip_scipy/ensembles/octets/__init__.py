@@ -1,1 +1,1 @@
-"""Functions jitted by Numba for eight members of an ensemble at once; loaded only where a function is jitted."""
+"""Functions jitted by Numba for batches of eight members; loaded only if a function is jitted."""

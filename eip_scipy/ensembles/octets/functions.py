@@ -1,4 +1,4 @@
-"""A user's Numba functions for eight members, by C pointers: arrays of n octets are (n, 8) doubles."""
+"""C pointers to a user's Numba functions, compiled for eight members: an array of n floats becomes (n, 8) doubles."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ __all__ = ["compiled_for_octets"]
 
 
 def compiled_for_octets(one: Compiled) -> Compiled:
-    """The function of one member, compiled for eight.
+    """Compile a function of one member for eight members.
 
     Raises
     ------
     NotCompilableError
-        Where it branches on values, makes arrays, or does something else that octets cannot.
+        If it branches on values, creates arrays, or does something else that vectors of members do not support.
     """
     return compiled(one.fun, one.kind, one.name, OCTET)

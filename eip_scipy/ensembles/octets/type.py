@@ -1,11 +1,11 @@
-"""Eight members of an ensemble in one value: functions written for one member, compiled for eight at a time.
+"""Numba type for eight members of an ensemble: functions written for one member are compiled for eight at a time.
 
-An octet holds one float of each of eight members, in a vector register. It adds and multiplies as a float does, lane by
-lane, so that Numba compiles the same source for floats and for octets, and every lane gets the bits of the float. What
-differs between members cannot be branched on: octets are not compared, and a function with such a branch does not
-compile for them.
+A value of this type holds one float of each of eight members in a vector register. Arithmetic applies to each lane as
+to a float, so that Numba compiles the same source for floats and for vectors, and every lane agrees bit by bit with the
+float. A function cannot branch on values that differ between members: vectors cannot be compared, and a function with
+such a branch does not compile.
 
-An array of n octets is (n, 8) doubles.
+An array of n vectors has the layout (n, 8) of doubles.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 
 
 class Octet(types.Type):  # emits LLVM
-    """Numba type of one float of each of eight members."""
+    """Numba type that holds one float of each of eight members."""
 
     def __init__(self) -> None:
         super().__init__(name="octet")
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
-        """Numbers stand for themselves in every lane."""
+        """Allow numbers, which have the same value in every lane."""
         return Conversion.safe if isinstance(other, types.Float | types.Integer) else None
 
 
@@ -67,7 +67,7 @@ def _cast_number(context, builder, from_type, to_type, value):  # emits LLVM
 
 
 def _define(function: Any, arguments: int, emit: Callable[..., Any]) -> None:  # emits LLVM
-    """Type and emit a function of octets, any argument of which may be a plain number."""
+    """Type and emit a function of vectors, any argument of which may be a plain number."""
 
     @infer_global(function)
     class _Template(AbstractTemplate):
@@ -119,7 +119,7 @@ _define(min, 2, _smaller)
 
 
 def _define_by_lanes(function: Any, arguments: int) -> None:  # emits LLVM
-    """What the processor has no vector instruction for: the function of floats, lane after lane."""
+    """Define a function without a vector instruction: it is called as a function of floats for each lane."""
 
     @infer_global(function)
     class _Template(AbstractTemplate):
@@ -135,7 +135,7 @@ def _define_by_lanes(function: Any, arguments: int) -> None:  # emits LLVM
         kind = context.typing_context.resolve_value_type(function)
         of_floats = context.typing_context.resolve_function_type(kind, kinds, {})
         callee = context.get_function(kind, of_floats)
-        # Numba passes constant exponents as they stand in the source.
+        # Numba passes constant exponents as Python numbers.
         args = [context.get_constant(types.int64, a) if isinstance(a, int) else a for a in args]
         out = ir.Constant(VECTOR, ir.Undefined)
         for k in range(LANES):
