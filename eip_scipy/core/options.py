@@ -1,7 +1,7 @@
-"""The options of the projection, in one place: names, defaults, documentation, checks, and what identifies a run.
+"""The options of the projection: names, defaults, documentation, checks, and the identity of a run.
 
-Whatever projects takes them as `ProjectionOptions` or as its keywords. A new option is a field here, a keyword, and,
-where the step is to know it, a field of `Options` in engine/cpp/data.hpp.
+All functions that project accept them as `ProjectionOptions` or as its keywords. A new option is a field here, a
+keyword, and, if the step needs it, a field of `Options` in engine/cpp/data.hpp.
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ __all__ = [
 
 DIRECTIONS = {"new": NEW, "old": OLD, "midpoint": MIDPOINT}
 MOST_ITERATIONS = 1000
-# A tenth of what a start may miss a given target by.
+# One tenth of the error with respect to a given target that is allowed at the start.
 MOST_LEFT = 0.1 * TARGET_TOLERANCE
 WIDTH = 120
-# In docstrings: these lines become the options with their texts, or their names.
+# These lines of docstrings are replaced by the options with their texts, or by their names.
 WHOLE, NAMES = "{ProjectionOptions}", "{names of ProjectionOptions}"
 
 Documented = TypeVar("Documented", bound=Any)
@@ -93,14 +93,14 @@ class ProjectionKeywords(ProjectionDetails, total=False):
 
 
 def _text(kind: str, text: str) -> dict[str, str]:
-    """An option's kind of value, and what it is, for docstrings."""
+    """Return the type and the description of an option for docstrings."""
     return {"kind": kind, "text": " ".join(text.split())}
 
 
 class Settled(NamedTuple):
-    """Options checked for one run: as the step takes them, weights given for the metric, and what identifies the run.
+    """Options checked for one run: in the form for the step, given weights of the metric, and the identity of the run.
 
-    `identity` holds each option that decides bits, under its name, as the run came to take it.
+    `identity` contains the effective value of each option that affects the bits of a run, with its name.
     """
 
     options: Options
@@ -110,129 +110,131 @@ class Settled(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectionOptions:
-    """The options of the projection as a user gives them; checked where a run is known (`settled`)."""
+    """The options of the projection as given by the user; `settled` checks them for a run."""
 
-    invariants: Any = field(default=(), metadata=_text("Invariant or sequence of Invariant", "What to keep."))
+    invariants: Any = field(default=(), metadata=_text("Invariant or sequence of Invariant", "Invariants to keep."))
     metric: Any = field(
         default=None,
         metadata=_text(
             '{"error", "euclidean"} or array_like, shape (n,)',
-            """Weights of the correction's components. "error" (default where the method has an error estimate) makes
-            the least correction measured in local errors of the step; "euclidean" is the least correction in the
-            plain 2-norm; an array gives the weights themselves (larger: moves more).""",
+            """Weights of the components of the correction. "error" (default if the method has an error estimate)
+            minimises the correction in units of the local error of the step; "euclidean" minimises its 2-norm; an array
+            contains the weights themselves (components with larger weights move more).""",
         ),
     )
     blocks: Any = field(
         default=None,
         metadata=_text(
             "int or sequence of index arrays",
-            """Components that the error metric weighs together: consecutive groups of that many, or index arrays.
-            Bodies' positions and velocities in 3 dimensions: ``blocks=3``. Default: each component by itself.""",
+            """Groups of components with a common weight in the error metric: the number of consecutive components in
+            each group, or index arrays. For positions and velocities of bodies in 3 dimensions use ``blocks=3``.
+            Default: each component has its own weight.""",
         ),
     )
     frame: Any = field(
         default=None,
         metadata=_text(
             "(C, S)",
-            """Linear invariants C y, with C of shape (k, n), that corrections must not touch, and the shifts S, (n, k),
-            that compensate for it; C S must be invertible.""",
+            """Linear constraints C y, with C of shape (k, n), that the correction leaves unchanged, and the shifts S,
+            (n, k), that compensate for it; C S must be invertible.""",
         ),
     )
     direction: str = field(
         default="new",
         metadata=_text(
             '{"new", "old", "midpoint"}',
-            """Where the gradients that span the correction are taken: at the step's raw result (default), at its start
-            or in the middle.""",
+            """State at which the gradients that span the correction are evaluated: the raw result of the step
+            (default), its start, or the midpoint.""",
         ),
     )
     iterations: int = field(
         default=1,
         metadata=_text(
-            "int", "Newton steps of the projection. 1 (default) is the EIP method; more is the standard projection."
+            "int",
+            "Number of Newton steps of the projection. 1 (default) is the EIP method, more the standard projection.",
         ),
     )
     every: int | str | None = field(
         default=None,
         metadata=_text(
             'int or "auto"',
-            """Project each `every`-th step and the last one; "auto": when the error estimates, added in quadrature
-            since the last projection, make an invariant more uncertain than round-off (asked at each fifth step
-            and after a projection). In between, states are handed out as projected copies.
-            Default: the method's own, "auto" for a multistep method and 1 for others.""",
+            """Project every `every`-th step and the last one. "auto": project when the error estimates, added in
+            quadrature since the last projection, make an invariant more uncertain than round-off (checked at every
+            fifth step and after a projection). In between, states are returned as projected copies. Default: "auto" for
+            a multistep method and 1 for others.""",
         ),
     )
     reuse_f: bool = field(
         default=True,
         metadata=_text(
             "bool",
-            "Where the step evaluates f at its raw result anyway, let it serve as the next step's first stage.",
+            "If the step evaluates f at its raw result anyway, use it as the first stage of the next step.",
         ),
     )
     compensated: bool | None = field(
         default=None,
         metadata=_text(
             "bool",
-            """Carry the rounding errors of the state along (for steps so small that round-off dominates). Default: the
-            method's own, True for a multistep method and False for others.""",
+            """Use compensated summation for the state (for steps so small that round-off dominates). Default: True for
+            a multistep method and False for others.""",
         ),
     )
     check: bool = field(
         default=True,
         metadata=_text(
             "bool",
-            """Check the invariants and their gradients at the start and again after some steps, watch whether the
-            steps' errors explain the corrections, and fail where a projection leaves a defect as large as its
-            invariant's terms. False: none of these.""",
+            """True: check the invariants and their gradients at the start and again after some steps, monitor whether
+            the errors of the steps explain the corrections, and fail if a projection leaves an error as large as the
+            terms of the invariant. False: none of these.""",
         ),
     )
     project_initial: bool = field(
         default=False,
         metadata=_text(
             "bool",
-            """Project y0 onto given targets before the first step, by the least correction in the plain 2-norm: all
-            components move alike, whatever `metric` and `blocks` are, and C y of a frame stays. `Diagnostics.moved`
-            says how far. `project` with ``sigma=`` holds components that may not move.""",
+            """Project y0 onto given targets before the first step, by the correction with the smallest 2-norm: all
+            components have equal weights, regardless of `metric` and `blocks`, and C y of a frame stays unchanged.
+            `Diagnostics.moved` says how far y0 moved. To fix components, call `project` with ``sigma=``.""",
         ),
     )
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
-        """The names of the options."""
+        """Return the names of the options."""
         return tuple(option.name for option in fields(cls))
 
     @classmethod
     def of(cls, keywords: Mapping[str, Any]) -> tuple[ProjectionOptions, dict[str, Any]]:
-        """The options among some keywords, and the keywords that are none."""
+        """Return the options contained in keywords, and the other keywords."""
         own, others = cls.split(keywords)
         return cls(**own), others
 
     @classmethod
     def split(cls, keywords: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The keywords that are options, and the others."""
+        """Return the keywords that are options, and the others."""
         names = cls.names()
         own = {name: value for name, value in keywords.items() if name in names}
         return own, {name: value for name, value in keywords.items() if name not in own}
 
     def settled(self, method: AnyMethod, stepping: Stepping, y0: np.ndarray, known: InvariantSet) -> Settled:
-        """The options checked for a run of the `known` invariants.
+        """Check the options for a run with the `known` invariants.
 
         Raises
         ------
         TypeError, ValueError
-            For wrong values, and what the method cannot do.
+            If a value is wrong, or the method does not support an option.
         """
         n, width = y0.size, 2 if y0.dtype.kind == "c" else 1
         kind, sigma = self._metric(method, n, width)
         balance_groups = _groups(known, n, width)
         if balance_groups is not NO_GROUPS:
             self._require_plain()
-            kind = EUCLIDEAN  # the groups have weights of their own
+            kind = EUCLIDEAN  # the groups have their own weights
         if not isinstance(self.direction, str) or self.direction not in DIRECTIONS:
             raise ValueError(f"direction must be 'new', 'old' or 'midpoint', got {self.direction!r}.")
         if method.has_history and self.direction != "new":
             raise ValueError(
-                f"direction={self.direction!r}: {method.name} has no step that starts at a state; leave it out."
+                f"direction={self.direction!r}: {method.name} has no step that starts at a state; omit direction."
             )
         compensated = self._compensated(method)
         rtol, atol = stepping.rtol, stepping.atol
@@ -251,7 +253,7 @@ class ProjectionOptions:
             target=known.target,
             scales=known.scales,
             computed=np.array(known.computed, float),
-            # Multistep methods put the defects in place of the targets; their errors leave nothing to speak of.
+            # Multistep methods pass the errors instead of the targets; the remaining errors are negligible.
             most_left=np.where(known.given & (not method.has_history), MOST_LEFT, np.inf),
             kinds=groups,
             kappa=method.kappa,
@@ -259,7 +261,7 @@ class ProjectionOptions:
             direction=DIRECTIONS[self.direction],
             iterations=count("iterations", self.iterations, MOST_ITERATIONS),
             every=self._every(method),
-            # The steps of a one-step method do not take f: there is nothing to evaluate in place of f(y_hat).
+            # The steps of a one-step method do not use f: there is no evaluation that could replace f(y_hat).
             reuse_f=flag("reuse_f", self.reuse_f) or method.in_python,
             uses_f=known.uses_f,
             compensated=compensated,
@@ -287,7 +289,7 @@ class ProjectionOptions:
             ],
             "metric": {EUCLIDEAN: "euclidean", BY_ERROR: "error"}.get(o.metric, sigma),
             "blocks": (o.groups.start, o.groups.member),
-            # As it was given: what `o` holds comes from LAPACK, whose last bits differ from machine to machine.
+            # The given value, because the one in `o` comes from LAPACK, whose last bits differ between machines.
             "frame": None if self.frame is None else [np.asarray(a, y0.dtype) for a in self.frame],
             "direction": self.direction,
             "iterations": o.iterations,
@@ -299,11 +301,11 @@ class ProjectionOptions:
         }
 
     def _require_plain(self) -> None:
-        """Refuse options that do not apply to balances with components."""
+        """Raise ValueError for options that do not apply to balances with components."""
         if self.metric is not None or self.direction != "new" or self.iterations != 1:
             raise ValueError(
-                "metric, direction and iterations do not apply to balances with components, which have weights of "
-                "their own and take one Newton step; leave these options out."
+                "metric, direction and iterations do not apply to balances with components, which have their own "
+                "weights and use one Newton step; omit these options."
             )
 
     def _compensated(self, method: AnyMethod) -> bool:
@@ -311,10 +313,10 @@ class ProjectionOptions:
             return method.has_history
         compensated = flag("compensated", self.compensated)
         if method.has_history and not compensated:
-            raise ValueError(f"compensated=False: the sums of {method.name} always carry their rounding; leave it out.")
+            raise ValueError(f"compensated=False: {method.name} always uses compensated sums; omit compensated.")
         if compensated and method.in_python:
             raise ValueError(
-                f"compensated=True carries the rounding of a tableau's sums; {method.name} is no tableau. Leave it out."
+                f"compensated=True needs the sums of a tableau, and {method.name} is not a tableau; omit compensated."
             )
         return compensated
 
@@ -347,19 +349,19 @@ def _far_by_tolerances(rtol: np.ndarray) -> float:
 
 
 def _band(method: AnyMethod, compensated: bool) -> float:
-    """The dead band of an invariant, in roundings of its terms."""
-    if method.has_history:  # takes a part only of what is within rounding
+    """Return the dead band of an invariant, in units of the rounding error of its terms."""
+    if method.has_history:  # these methods correct only a part of an error within rounding
         return BAND_MULTISTEP
     return BAND_COMPENSATED if compensated else BAND
 
 
 def weights(name: str, sigma: Any, n: int) -> np.ndarray:
-    """Weights of n components, the largest 1.
+    """Return weights of n components, scaled so that the largest is 1.
 
     Raises
     ------
     ValueError
-        For a wrong shape, or weights that are not finite, negative or all 0.
+        If the shape is wrong, or weights are not finite, negative or all 0.
     """
     a = real_array(name, sigma)
     if a.shape != (n,):
@@ -370,27 +372,27 @@ def weights(name: str, sigma: Any, n: int) -> np.ndarray:
 
 
 def _balances(method: AnyMethod, known: InvariantSet) -> Balances:
-    """Return what a run carries; nothing is carried where a state is projected at rest."""
+    """Return the balances of a run; there are none if a single state is projected."""
     if not known.balances.items or method is AT_REST:
         return NO_BALANCES
     return Balances(known.balances.places, steppers.rated(method))
 
 
 def _groups(known: InvariantSet, n: int, width: int) -> Groups:
-    """Return the groups of balances that are projected each by itself.
+    """Return the groups of balances that are projected separately.
 
     Raises
     ------
     ValueError
-        If some items have components and others none, components are outside the state, or the state is complex.
+        If some items have components and others do not, components are outside the state, or the state is complex.
     """
     lacking = [label for item, label in zip(known.items, known.labels, strict=True) if not item.subspaces]
     if len(lacking) == len(known.items):
         return NO_GROUPS
     if lacking:
         raise ValueError(
-            f"invariants: {lacking[0]!r} has no components, but others have. Give components to all balances, or to "
-            "none; an invariant of the whole state cannot be kept together with balances of components."
+            f"invariants: {lacking[0]!r} has no components, but others have. Give components to all balances or to "
+            "none; an invariant of the whole state cannot be combined with balances of components."
         )
     if width == 2:
         raise ValueError("invariants: balances of a complex state cannot have components.")
@@ -417,7 +419,7 @@ def _groups(known: InvariantSet, n: int, width: int) -> Groups:
 
 
 def _are_of_bodies(components: np.ndarray, weight: np.ndarray) -> bool:
-    """Return whether directions are those of x, y and z, in which the same bodies move by the same weights."""
+    """Return True if directions are those of x, y and z, in which the same bodies move with the same weights."""
     if len(components) % 3:
         return False
     alike = (weight.reshape(-1, 3, weight.shape[1]) == weight[::3, None]).all()
@@ -429,14 +431,14 @@ def _starts(sizes: list[int]) -> np.ndarray:
 
 
 def _can_project_jointly(options: Options, known: InvariantSet) -> bool:
-    """Whether the step is the one that `JointInvariants` take a shorter way to."""
+    """Return True if `JointInvariants` can shorten the projection of this step."""
     plain = (options.metric, options.direction, options.iterations) == (EUCLIDEAN, NEW, 1)
     free = options.frame.products.size == 0 and options.every != AUTO and not options.compensated
     return isinstance(known.items, JointInvariants) and plain and free and not known.balances.items
 
 
 def takes_projection_options(documented: Documented) -> Documented:
-    """Put the options into the signature and the docstring of a function, or a class, that takes them as keywords."""
+    """Insert the options into the signature and the docstring of a function or class that accepts them as keywords."""
     function: Any = vars(documented)["__init__"] if isinstance(documented, type) else documented
     signature = inspect.signature(function)
     *own, rest = signature.parameters.values()
@@ -444,9 +446,9 @@ def takes_projection_options(documented: Documented) -> Documented:
         inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=option.default, annotation=option.type)
         for option in fields(ProjectionOptions)
     ]
-    others = [rest] if isinstance(documented, type) else []  # solvers take and ignore what other solvers know
+    others = [rest] if isinstance(documented, type) else []  # solvers accept and ignore options of other solvers
     function.__signature__ = signature.replace(parameters=[*own, *options, *others])
-    if documented.__doc__:  # python -OO leaves none
+    if documented.__doc__:  # python -OO removes docstrings
         text = documented.__doc__.replace(NAMES, ", ".join(ProjectionOptions.names()))
         documented.__doc__ = text.replace(f"    {WHOLE}", _documentation())
     return documented

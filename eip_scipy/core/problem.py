@@ -1,4 +1,4 @@
-"""The record that a scene hands to a driver: equations, state, invariants, and what the step needs to know."""
+"""Definition of an initial value problem: equations, state, invariants, and options that suit them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ __all__ = ["Deferred", "Problem", "bind", "component_names", "library_variationa
 
 MOST = 12  # components that are printed
 MOMENTS, DURATIONS = ("t_span", "t_eval", "t"), ("h", "first_step", "max_step")
-# A start this near that of the problem is the same: a Julian date in one float is up to 20 microseconds off.
+# Starting times that differ by less are equal, because a Julian date in one float has errors of up to 20 microseconds.
 SAME_S = 1e-4
 
 
 class Deferred:
-    """A function that is made when it is first called or asked for.
+    """A function that is created when it is first needed.
 
     Parameters
     ----------
@@ -43,12 +43,12 @@ class Deferred:
 
     @cached_property
     def function(self) -> Callable[..., Any]:
-        """The function itself."""
+        """Return the function itself."""
         return self._make()
 
 
 def made(function: Any) -> Any:
-    """Return the function that a `Deferred` stands for, and any other function as it is."""
+    """Return the function of a `Deferred`; any other function is returned unchanged."""
     return function.function if isinstance(function, Deferred) else function
 
 
@@ -56,64 +56,63 @@ def made(function: Any) -> Any:
 class Problem:
     """A conservative initial value problem.
 
-    A problem knows no solver. `integrate` takes it whole: ``integrate(problem, method=EIPRK4)``; through SciPy it is
-    ``problem.solve_ivp(method=EIPRK4)``. It prints in five lines, and pickles where its functions do: all of the
-    package's, and functions of a module; not C functions by pointer and lambdas.
+    `integrate` accepts a problem instead of a function: ``integrate(problem, method=EIPRK4)``; with SciPy, use
+    ``problem.solve_ivp(method=EIPRK4)``. A problem prints in five lines. It can be pickled if its functions can: those
+    of this package and functions of a module can, C function pointers and lambdas cannot.
 
     Attributes
     ----------
     name : str
-        Short name, as on the command line.
+        Short name, as used on the command line.
     fun : callable
-        ``fun(t, y) -> (n,)``, parameters bound: what SciPy takes.
+        ``fun(t, y) -> (n,)`` with bound parameters, as SciPy needs it.
     y0 : ndarray, shape (n,)
         Initial state, float64 or complex128.
     t_span : tuple of float
-        Start and end in the problem's unit of time.
+        Start and end in the unit of time of the problem.
     invariants : tuple of Invariant
-        The invariants that the equations have (linear ones in `frame`), with ``args=(params,)``. Given as an Invariant,
-        a function, or a sequence of them.
+        Invariants of the equations (linear ones are in `frame`), with ``args=(params,)``. They can be given as an
+        Invariant, a function, or a sequence of them.
     rhs : callable, optional
         Compiled right-hand side in place: ``rhs(t, y, out, params)``, or a C function by pointer.
     acc : callable, optional
         For q'' = a(t, q): ``acc(t, q, params) -> (n/2,)``, compiled; the state is (q, v).
     h : float, optional
-        A sensible fixed step.
+        A suitable fixed step.
     params : ndarray, optional
         Parameters of `rhs`, `acc` and the invariants' functions.
     metric, blocks, frame
         Options of the projection that suit the problem (see `EIPSolver`).
     method : Tableau, NystromTableau, GaussJackson or OneStepMethod, optional
-        What `eip_method` takes, of a kind that suits the problem: what `integrate` steps with where it is given no
-        method.
+        Method that suits the problem, in a form that `eip_method` accepts; `integrate` uses it by default.
     variational : callable, optional
         ``variational(parameters) -> rhs``: the right-hand side ``rhs(t, Y, out, params)``, in place, of Y = (y, first
         column, second column, ...), n numbers each: (f(t, y), Df(t, y) times each column). The last columns are the
-        derivatives by the parameters of these places in `params`. ValueError where there are none.
+        derivatives with respect to the parameters with these indices in `params`. It raises ValueError for parameters
+        without such derivatives.
     canonical : bool, optional
-        Whether the state is (q, p) of a Hamiltonian system: tangent maps are then symplectic.
+        True if the state is (q, p) of a Hamiltonian system: tangent maps are then symplectic.
     units : str
-        Units of the state and of time. Of the form "AU, yr" (a length and a time: m, cm, km, AU, pc; s, min, h, d, yr,
-        kyr, Myr, Gyr, or a number of m or s) they are more than a note: quantities of astropy are converted to them
-        where `integrate` takes times and steps.
+        Units of the state and of time. If they have the form "AU, yr" (a length and a time: m, cm, km, AU, pc; s, min,
+        h, d, yr, kyr, Myr, Gyr, or a number of m or s), `integrate` converts quantities of astropy to them.
     jacobian : callable, optional
         For q'' = a(t, q): ``jacobian(t, q, dq, out, params)`` fills `out` with the derivative of the accelerations
         along dq, or with its largest part; for multistep methods such as `EIPGJ14`.
     frequencies : callable, optional
         ``frequencies(y, duration) -> (bodies, others)``: the largest angular frequency, within a run of this signed
-        length, of each body on its orbit about the body that the Jacobian takes as the centre, which has 0 itself, and
+        length, of each body on its orbit about the central body of the Jacobian (0 for the central body itself), and
         the largest of all other motions.
     reference : callable, optional
-        ``reference(t) -> y``: a closed form, or stored reference states; None at times without one.
+        ``reference(t) -> y``: a closed form, or stored reference states; it returns None at other times.
     source : str
-        Where the equations and data come from.
+        Source of the equations and data.
     component_names : tuple of str, optional
         Names of the components of the state, for tables and figures.
     epoch : (float, float), optional
-        When t is 0: a Julian date in TDB, in two parts. One number, or a Time of astropy in any scale, becomes such a
-        pair.
+        Date of t = 0: a Julian date in TDB, in two parts. One number, or a Time of astropy in any scale, is converted
+        to such a pair.
     G : float, optional
-        Of bodies: the constant of gravitation by which their masses are multiplied in `params`, where it is known.
+        Gravitational constant by which the masses of bodies are multiplied in `params`, if it is known.
     """
 
     name: str
@@ -152,22 +151,23 @@ class Problem:
             object.__setattr__(self, "component_names", component_names(self.component_names, n))
 
     def solve_ivp(self, t_span: Any = None, y0: Any = None, *, method: Any, **options: Any) -> Any:
-        """Solve it by `scipy.integrate.solve_ivp`, with all that the problem brings and the method takes.
+        """Solve the problem by `scipy.integrate.solve_ivp`, with the options of the problem that the method supports.
 
         Parameters
         ----------
         t_span, y0 : optional
-            Default: the problem's own. Quantities and times of astropy are converted as by `integrate`.
+            Interval and initial state; default: those of the problem. Quantities and times of astropy are converted as
+            by `integrate`.
         method : type or str
-            An EIP method, which gets the invariants, metric, blocks and frame, and the step `h` unless rtol, atol,
-            first_step, max_step or h are given; or another of SciPy's, which gets none of these.
+            An EIP method, which receives the invariants, metric, blocks and frame, and the step `h` unless rtol, atol,
+            first_step, max_step or h is given; or a method of SciPy, which receives none of these.
         **options
-            Of `solve_ivp` and of the method; they take precedence.
+            Options of `solve_ivp` and of the method; they take precedence.
 
         Returns
         -------
         OdeResult
-            SciPy's, with the problem's ``units`` and ``epoch``, and ``component_names`` where it names them.
+            Result of SciPy with the additional fields ``units``, ``epoch``, and ``component_names`` if there are names.
 
         Examples
         --------
@@ -187,7 +187,7 @@ class Problem:
         if t_span is None or y0 is None:
             raise TypeError(f"{self.name}: the problem has no {'interval' if t_span is None else 'start'}; give one.")
         brought: dict[str, Any] = {}
-        if hasattr(method, "TABLEAU"):  # an EIP method; the problem knows no solver
+        if hasattr(method, "TABLEAU"):  # an EIP method; this module does not import the solvers
             names = ("invariants", "metric", "blocks", "frame")
             brought = {name: value for name in names if (value := getattr(self, name)) is not None}
             if method.TABLEAU.drives:
@@ -203,51 +203,51 @@ class Problem:
 
     @property
     def unit_system(self) -> tuple[Unit, Unit] | None:
-        """The units of length and time, where `units` names two."""
+        """Units of length and time, if `units` names both."""
         return known_units(self.units)
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values of the parameters by name, of a problem that names them: those of `hamiltonian` and `equations` do."""
+        """Values of the parameters by name; empty for problems that do not name them."""
         return {}
 
     @property
     def stiff_invariants(self) -> tuple[Any, ...]:
-        """The invariants that implicit methods keep by default: they carry no balances.
+        """Invariants that implicit methods keep by default; balances are not included.
 
-        A problem that knows which of its invariants is an energy leaves it out: these methods damp fast oscillations,
-        and a projection onto an energy that contains them puts what they lose into the slow motion.
+        A problem that knows which of its invariants is an energy excludes it: implicit methods damp fast oscillations,
+        and a projection onto an energy that contains them would transfer the lost part to the slow motion.
         """
         return tuple(item for item in self.invariants if not item.is_balance)
 
     @property
     def has_second_order(self) -> bool:
-        """Whether the problem has a method ``second_order()`` that gives it in (q, v)."""
+        """True if the problem has a method ``second_order()`` that returns it in (q, v)."""
         return False
 
     def plain(self, **given: Any) -> dict[str, Any]:
-        """Arguments of a run as plain numbers in the units of the problem, by the names that `integrate` has for them.
+        """Convert arguments of `integrate` to plain numbers in the units of the problem.
 
         Parameters
         ----------
         **given
-            Of ``t_span``, ``t_eval``, ``t`` (times: numbers, durations, or moments where the problem has an `epoch`),
-            ``h``, ``first_step``, ``max_step`` (durations), ``y0``, which is a pair (positions, velocities) where it
-            has units, and ``params``, which may be a mapping of names to values. What is plain stays as it is, and so
-            does None.
+            Any of ``t_span``, ``t_eval``, ``t`` (times: numbers, durations, or dates if the problem has an `epoch`),
+            ``h``, ``first_step``, ``max_step`` (durations), ``y0``, which is a pair (positions, velocities) if it has
+            units, and ``params``, which may be a mapping from names to values. Plain numbers and None stay unchanged.
 
         Returns
         -------
         dict
+            The converted arguments, with the same names.
 
         Raises
         ------
         TypeError
-            For units or dates that the problem cannot convert, for its own `units` name none, or it has no `epoch`;
-            for names of parameters where it has none.
+            If units or dates cannot be converted because the problem has no `units` or no `epoch`, or if parameters
+            are given by name and the problem does not name them.
         ValueError
-            When a moment is given as the start and the problem's own state is that of another, and no `y0` is given;
-            for a parameter that is none of the problem's.
+            If the start is a date at which the initial state of the problem is not known and `y0` is not given, or if
+            a parameter is unknown.
         """
         known, out = self.unit_system, dict(given)
         for name in MOMENTS:
@@ -266,7 +266,7 @@ class Problem:
         return out
 
     def _named_parameters(self, given: Mapping[str, Any]) -> np.ndarray:
-        """Values in the problem's order, its own where none is given: (p,), of columns (members, p)."""
+        """Return the values (p,), or (members, p) for columns, in the order of the problem; defaults are its own."""
         known = self.parameters
         if not known:
             raise TypeError(
@@ -281,7 +281,7 @@ class Problem:
         return np.stack(np.broadcast_arrays(*columns), axis=-1)
 
     def _plain_state(self, y0: Any) -> Any:
-        """Positions and velocities with units as the state; anything else as it is."""
+        """Return the state from positions and velocities with units; anything else is returned unchanged."""
         names, known = self.component_names or (), self.unit_system
         half = len(names) // 2
         pair = isinstance(y0, tuple | list) and len(y0) == 2 and all(map(has_unit, y0))
@@ -295,7 +295,7 @@ class Problem:
         return np.concatenate([q, v])
 
     def _own_start(self, time: Any, t0: float) -> float:
-        """The problem's own start, where it is this moment."""
+        """Return the starting time of the problem if it is the given date, else raise ValueError."""
         known = self.unit_system
         if known is None or self.epoch is None or self.t_span is None:
             return t0
@@ -303,9 +303,9 @@ class Problem:
         if abs(t0 - own) * known[1].si > SAME_S:
             held = (self.epoch[0], self.epoch[1] + own * known[1].si / DAY_S)
             raise ValueError(
-                f"t_span: the run is to start at {shown(time)}, but the state of the problem {self.name!r} is that of "
-                f"{shown_epoch(held)}. Start there, or give the state of that moment, y0=..., or initial data of it, "
-                "such as those of eip_scipy.integrations.jpl.initial_data(time)."
+                f"t_span: the run starts at {shown(time)}, but the initial state of the problem {self.name!r} is that "
+                f"of {shown_epoch(held)}. Start at that date, or give the state at the start as y0=..., for instance "
+                "from eip_scipy.integrations.jpl.initial_data(time)."
             )
         return own
 
@@ -333,12 +333,12 @@ class Problem:
 
 
 def component_names(names: Any, n: int | None) -> tuple[str, ...]:
-    """Names of n components, of as many as there are for None, from a sequence or from text such as "x y".
+    """Return the names of n components from a sequence or from text such as "x y"; any number if `n` is None.
 
     Raises
     ------
     TypeError, ValueError
-        For what are no strings, another number of them, or two that are the same.
+        If the names are not strings, have another number, or two are equal.
     """
     if isinstance(names, str):
         names = names.replace(",", " ").split()
@@ -352,12 +352,12 @@ def component_names(names: Any, n: int | None) -> tuple[str, ...]:
         raise ValueError(f"there are {len(found)} names for {n} components: {shown(found)}.")
     if len(set(found)) < len(found):
         twice = next(name for k, name in enumerate(found) if name in found[:k])
-        raise ValueError(f"{twice!r} names two components; each needs a name of its own.")
+        raise ValueError(f"{twice!r} names two components; names must be different.")
     return found
 
 
 def bind(rhs: Callable[..., None], params: np.ndarray | None) -> Callable[[float, np.ndarray], np.ndarray]:
-    """``fun(t, y)`` from ``rhs(t, y, out, params)``, or ``rhs(t, y, out)`` without; it pickles where `rhs` does."""
+    """Return ``fun(t, y)`` made from ``rhs(t, y, out[, params])``; it can be pickled if `rhs` can."""
     return partial(_derivative, rhs, () if params is None else (params,))
 
 
@@ -369,7 +369,7 @@ def _derivative(rhs: Callable[..., None], extra: tuple[np.ndarray, ...], t: floa
 
 
 def native_invariant(function: str, name: str, params: np.ndarray) -> Invariant:
-    """An invariant by the function of `library` of that name and its gradient."""
+    """Return an invariant made from the function of `library` with that name and its gradient."""
     fun, grad = library[function], library[f"{function}_gradient"]
     return Invariant(fun, grad, args=(params,), in_place=True, uses_f=grad.takes_f, name=name)
 

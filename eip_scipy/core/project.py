@@ -1,4 +1,4 @@
-"""`project`: the projection by itself, without a solver."""
+"""`project`: the projection of a state, without a solver."""
 
 from __future__ import annotations
 
@@ -42,23 +42,24 @@ def project(
     Parameters
     ----------
     y_hat : array_like, shape (n,)
-        The state, real or complex.
+        State to project, real or complex.
     invariants : Invariant or sequence of Invariant
+        Invariants whose targets are to be met.
     t : float, optional
-        Time at which the invariants are taken.
+        Time at which the invariants are evaluated.
     sigma : array_like, shape (n,), optional
-        Weights of the components: larger weights move more. Default: all 1, the euclidean metric.
+        Weights of the components: components with larger weights move more. Default: all 1, the euclidean metric.
     frame : (C, S), optional
-        Linear invariants C y that the correction must not touch; see `EIPSolver`.
+        Linear constraints C y that the correction leaves unchanged; see `EIPSolver`.
     iterations : int, optional
-        Newton steps. 1 leaves defects of second order in the defects of y_hat.
+        Number of Newton steps. One step leaves errors of second order in the errors of y_hat.
     target : array_like, shape (l,), optional
-        Values to meet. Default: each invariant's own `target`, or its value at `start`.
+        Target values. Default: the `target` of each invariant, or its value at `start`.
     f : array_like, shape (n,), or callable, optional
-        The system's derivative at y_hat, or ``f(t, y)``, for invariants with ``uses_f=True``; a callable where
+        Derivative of the system at y_hat, or ``f(t, y)``, for invariants with ``uses_f=True``; it must be a callable if
         `iterations` is above 1.
     start : array_like, shape (n,), optional
-        State at which invariants without a `target` have the values to meet, at the time `t`.
+        State at which invariants without a `target` have their target values, at time `t`.
 
     Returns
     -------
@@ -68,19 +69,20 @@ def project(
     Raises
     ------
     ValueError
-        When an invariant has no target, an argument has a wrong shape or value, or the projection fails: a defect that
-        is not finite, or larger after it than before.
+        If an invariant has no target, an argument has a wrong shape or value, or the projection fails: an invariant
+        error is not finite, or larger after the projection than before.
 
     Warns
     -----
     ProjectionWarning
-        When a defect of more than a hundredth of an invariant's terms is left.
+        If an error of more than 1 % of the terms of an invariant remains.
 
     Notes
     -----
-    The correction is y - y_hat = sigma * x (made neutral to the frame) with x of least 2-norm such that
-    (G sigma) x = -(I(y_hat) - target), G the gradients at y_hat; by column-pivoted QR, so that dependent gradients
-    lower the rank instead of failing. Defects within four rounding errors of an invariant's terms are left alone.
+    The correction is y - y_hat = sigma * x (made neutral to the frame), where x has the smallest 2-norm with
+    (G sigma) x = -(I(y_hat) - target), and G contains the gradients at y_hat. It is computed by column-pivoted QR, so
+    that dependent gradients reduce the rank instead of failing. Errors within four rounding errors of the terms of an
+    invariant are not corrected.
 
     Examples
     --------
@@ -115,7 +117,7 @@ def project(
         )
     run.options = run.options._replace(
         target=_targets(known, target, start, t),
-        most_left=np.full(known.size, np.inf),  # as many Newton steps as asked for
+        most_left=np.full(known.size, np.inf),  # always do all Newton steps
     )
     work.K[-1] = run.start.f
     out, status = run.projected(derivative, t, y)
@@ -124,8 +126,8 @@ def project(
     left = np.abs(work.defect) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)
     for k in np.flatnonzero(left > LARGE_SHARE):
         warnings.warn(
-            f"the projection left {known.names[k]!r} off by {work.defect[k]:.3g}, {left[k]:.2g} of its own terms: the "
-            "state was far from the target, or the gradient is wrong; raise iterations, or mend grad",
+            f"the projection left an error of {work.defect[k]:.3g} in {known.names[k]!r}, {left[k]:.2g} of its terms: "
+            "the state was far from the target, or the gradient is wrong; increase iterations, or correct grad",
             ProjectionWarning,
             stacklevel=2,
         )
@@ -142,7 +144,7 @@ def _derivative(f: Any, t: float, y: np.ndarray) -> Callable[[float, np.ndarray]
 def _targets(known: InvariantSet, target: Any, start: Any, t: float) -> np.ndarray:
     if target is not None:
         if start is not None:
-            raise ValueError("project: give target or start, not both; invariants have targets of their own, too.")
+            raise ValueError("project: give target or start, not both; an invariant may also have its own target.")
         refuse_units(target=target)
         values = reals(target)
         if values is None or values.size != known.size or values.ndim > 1 or not np.isfinite(values).all():
@@ -151,21 +153,21 @@ def _targets(known: InvariantSet, target: Any, start: Any, t: float) -> np.ndarr
     for item, label in zip(known.items, known.labels, strict=True):
         if item.is_balance:
             raise ValueError(
-                f"project: balance {label!r} changes, and has no value to keep. Pass target=, the values to meet."
+                f"project: balance {label!r} changes and has no value to keep. Pass the target values as target=."
             )
     lacking = [item.target is None for item in known.items]
     if start is None:
         if any(lacking):
             label = known.labels[lacking.index(True)]
             raise ValueError(
-                f"project: invariant {label!r} has no target; give it one, or pass target=, or start=, a state at "
-                "which it has the wanted value."
+                f"project: invariant {label!r} has no target. Set its target, pass target=, or pass start=, a state at "
+                "which it has the target value."
             )
         return known.target
     state = initial_state(start, "start")
     if state.shape != known.shape[1:] or (state.dtype.kind == "c" and known.dtype.kind != "c"):
         raise ValueError(
-            f"project: start must be a state like y_hat, of {known.shape[1]} components, got {shown(start)}."
+            f"project: start must be a state with {known.shape[1]} components, as y_hat, got {shown(start)}."
         )
     sizes = np.diff(known.starts)
     values = np.where(np.repeat(lacking, sizes), known.values(t, state.astype(known.dtype)), known.target)

@@ -1,4 +1,4 @@
-"""Records that a run fills: diagnostics, and the result of `project`."""
+"""Diagnostics of a run, and the result of `project`."""
 
 from __future__ import annotations
 
@@ -28,44 +28,44 @@ __all__ = ["Diagnostics", "ProjectionResult", "ProjectionWarning", "joined_sums"
 
 
 class Diagnostics:
-    """What the projection did in a run; pass an empty one as ``diagnostics=`` and read it during or after the run.
+    """Record of the projections in a run; pass an empty one as ``diagnostics=`` and read it during or after the run.
 
     Attributes
     ----------
     names : tuple of str
         Names of the l invariants, in order.
     max_defect, last_defect : ndarray, shape (l,)
-        Largest and last ``|I - target|`` after a projection, in each invariant's own unit.
+        Largest and last invariant error ``|I - target|`` after a projection, in the unit of each invariant.
     n_projections, n_skipped : int
-        Projections done, and those left out because every defect was round-off.
+        Number of projections, and of those omitted because every invariant error was round-off.
     n_rank_reduced : int
-        Projections in which gradients were (nearly) dependent or zero and fewer corrections were made.
+        Number of projections in which gradients were (nearly) dependent or zero, so that the rank was reduced.
     n_softened : int
-        Projections in which the error metric was not believed and its weights were brought nearer to one another,
-        because the correction would have been far larger than any error of the step or would have failed.
+        Number of projections in which the weights of the error metric were made more equal, because the correction
+        would otherwise have been much larger than any error of the step, or would have failed.
     n_rejected_projections : int
-        Projections that failed.
+        Number of projections that failed.
     max_correction : float
-        Largest correction in units of the step's local error: at most about 5 when all is well; nan where the run
-        has no error estimate (the euclidean metric at fixed steps). Where round-off exceeds the local errors, as in
-        compensated runs, it may be thousands and mean nothing; `worst` counts round-off too.
+        Largest correction in units of the local error of the step: at most about 5 in a correct run; nan if the run has
+        no error estimate (the euclidean metric with fixed steps). If round-off exceeds the local errors, as in
+        compensated runs, it may be thousands and is meaningless; `worst` takes round-off into account.
     trusted : bool
-        Whether no step has failed, no check of the invariants has found anything, and the steps' errors explain all
-        corrections. It says nothing about accuracy.
+        True if no step failed, no check of the invariants found an error, and the errors of the steps explain all
+        corrections. It says nothing about the accuracy of the trajectory.
     message : str
-        Why the run is not to be trusted; "" where nothing speaks against it.
+        Reason why the run is not to be trusted; "" if there is none.
     moved : str
-        How far ``project_initial=True`` moved y0; "" where it did not.
+        How far ``project_initial=True`` moved y0; "" if it did not.
     worst : (str, float, float) or None
-        Invariant, time and size of the largest correction, in local errors (rounding counts as one): below 5 in most
-        healthy runs. None where none was measured.
+        Invariant, time and size of the largest correction, in units of the local error including round-off: below 5 in
+        most correct runs. None if no correction was measured.
     corrections : ndarray, shape (l,)
-        The largest correction of each invariant, in the same unit; nan where none was measured.
+        Largest correction of each invariant, in the same unit; nan if none was measured.
     slowness : ndarray, shape (l,)
-        How fast each `Balance` changes: the mean of its rate, compared with that of the terms of ``grad @ f``, at some
-        of the projections. It is the larger of two values, of which one is a mean over the whole run, and the other one
-        over about its last eighth. The error of a balance is about this share of the error of an invariant, and above
-        0.05 it hardly helps. nan for invariants, and where ``check=False``.
+        Rate of change of each `Balance`: the mean of its rate divided by that of the terms of ``grad @ f``, at some of
+        the projections. It is the larger of a mean over the whole run and a mean over about its last eighth. The error
+        of a balance is about this fraction of the error of an invariant; above 0.05 a balance hardly helps. nan for
+        invariants, and with ``check=False``.
     """
 
     def __init__(self) -> None:
@@ -84,7 +84,7 @@ class Diagnostics:
         moved: str = "",
         slow: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        """Take the buffers of a run, so that reading costs the run nothing."""
+        """Attach the buffers of a run, so that reading them does not slow down the run."""
         self.names = trust.names
         self._trust = trust
         self.max_defect = max_defect
@@ -97,57 +97,57 @@ class Diagnostics:
 
     @property
     def last_defect(self) -> np.ndarray:
-        """Last ``|I - target|``, (l,)."""
+        """Last invariant errors ``|I - target|``, (l,)."""
         return np.abs(self._defect)
 
     @property
     def n_projections(self) -> int:
-        """Projections done."""
+        """Number of projections."""
         return int(self._counters[PROJECTIONS])
 
     @property
     def n_skipped(self) -> int:
-        """Projections left out as round-off."""
+        """Number of projections omitted because all invariant errors were round-off."""
         return int(self._counters[SKIPPED])
 
     @property
     def n_rank_reduced(self) -> int:
-        """Projections of reduced rank."""
+        """Number of projections of reduced rank."""
         return int(self._counters[RANK_REDUCED])
 
     @property
     def n_softened(self) -> int:
-        """Projections with weights nearer to one another than the error metric's."""
+        """Number of projections with more equal weights than those of the error metric."""
         return int(self._counters[SOFTENED])
 
     @property
     def n_rejected_projections(self) -> int:
-        """Projections that failed."""
+        """Number of projections that failed."""
         return int(self._counters[REJECTED])
 
     @property
     def max_correction(self) -> float:
-        """Largest correction in local errors."""
+        """Largest correction in units of the local error."""
         return float(self._max_correction[0]) if self._estimated else float("nan")
 
     @property
     def trusted(self) -> bool:
-        """Whether nothing speaks against the run."""
+        """True if the run is reliable."""
         return self._trust.trusted
 
     @property
     def message(self) -> str:
-        """What speaks against the run."""
+        """Reason why the run is not to be trusted; "" if there is none."""
         return self._trust.message
 
     @property
     def worst(self) -> tuple[str, float, float] | None:
-        """Invariant, time and size in local errors of the largest correction."""
+        """Invariant, time and size of the largest correction, in units of the local error."""
         return self._trust.worst
 
     @property
     def corrections(self) -> np.ndarray:
-        """Largest correction of each invariant in local errors, (l,)."""
+        """Largest correction of each invariant in units of the local error, (l,)."""
         return self._trust.corrections
 
     @property
@@ -181,8 +181,8 @@ class Diagnostics:
 def slowness(sums: np.ndarray) -> np.ndarray:
     """Return the mean rates (b,) of balances in units of their terms, from the sums (N_SLOW, b) of both.
 
-    A mean over the whole run does not show a balance that is slow only as long as its terms are large, such as the
-    energy of an oscillator that is damped down to its driving. The larger one of both means is returned.
+    A mean over the whole run does not detect a balance that is slow only while its terms are large, such as the energy
+    of an oscillator that is damped until its driving dominates. The larger of both means is returned.
     """
     rates, terms = sums[[ALL_RATES, LATE_RATES]], sums[[ALL_TERMS, LATE_TERMS]]
     known = terms > 0
@@ -190,7 +190,7 @@ def slowness(sums: np.ndarray) -> np.ndarray:
 
 
 def joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Return the sums (N_SLOW, b) of a run and of the one that continues it. The late sums forget as one run does."""
+    """Return the sums (N_SLOW, b) of a run and its continuation; the late sums decay as in a single run."""
     both = one + two
     late = [LATE_RATES, LATE_TERMS]
     kept = (one[SAMPLES] / np.maximum(both[SAMPLES], 1.0)) ** (1 / LATE_SHARE)
@@ -208,7 +208,7 @@ class ProjectionResult(NamedTuple):
     defect : ndarray, shape (l,)
         I(y) - target.
     rank : int
-        Rank that the gradients had (l when all invariants were independent; 0 when nothing was to be done).
+        Rank of the gradients: l if all invariants are independent; 0 if no correction was necessary.
     correction : ndarray, shape (n,)
         y - y_hat.
     """

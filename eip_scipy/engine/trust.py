@@ -217,5 +217,7 @@ def _reason(name: str, row: np.ndarray) -> str:
             f"{row[FAR_FROM]:g} in {row[RAW_MANY]:.0f} of {row[NOTED]:.0f})"
         )
     if row[SHARE] > 0:
-        parts.append(f"the projection left {name!r} off by {row[SHARE]:.2g} of its own terms, at t={row[SHARE_AT]:.6g}")
+        parts.append(
+            f"the projection left an error of {row[SHARE]:.2g} of its terms in {name!r}, at t={row[SHARE_AT]:.6g}"
+        )
     return ", and ".join(parts)

@@ -165,7 +165,7 @@ def test_without_any_gradient_the_raw_state_stays(driver, direction):
 
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_project_with_zero_gradient(iterations):
-    with pytest.warns(ProjectionWarning, match="left 'S' off by -1, 1 of its own terms"):
+    with pytest.warns(ProjectionWarning, match="left an error of -1 in 'S', 1 of its terms"):
         result = project([0.0, 0.0], SQUARE, target=1.0, iterations=iterations)
     assert result.rank == 0
     np.testing.assert_array_equal(result.y, [0.0, 0.0])
@@ -439,11 +439,11 @@ def test_values_at_a_start():
     np.testing.assert_array_equal(project(rough, first, start=start).y, project(rough, first).y)
     with pytest.raises(ValueError, match="target or start, not both"):
         project(rough, total, start=start, target=[3.0, 7.0])
-    with pytest.raises(ValueError, match="start must be a state like y_hat, of 3 components, got"):
+    with pytest.raises(ValueError, match="start must be a state with 3 components, as y_hat, got"):
         project(rough, total, start=start[:2])
-    with pytest.raises(ValueError, match="start must be a state like y_hat"):
+    with pytest.raises(ValueError, match="start must be a state with"):
         project(rough, total, start=start + 1j)
-    with pytest.raises(ValueError, match=r"'sums' has no target; give it one, or pass target=, or start="):
+    with pytest.raises(ValueError, match=r"'sums' has no target\. Set its target, pass target=, or pass start="):
         project(rough, total)
 
 

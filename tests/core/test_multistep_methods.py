@@ -545,7 +545,7 @@ def test_a_false_invariant_is_told():
     ("options", "error", "message"),
     [
         ({"direction": "old"}, ValueError, "has no step that starts at a state"),
-        ({"compensated": False}, ValueError, "always carry their rounding"),
+        ({"compensated": False}, ValueError, "always uses compensated sums"),
         ({"h": None}, ValueError, "takes fixed steps and needs the step h"),
         ({"rtol": 1e-6, "h": None}, ValueError, "takes fixed steps"),
         ({"jacobian": 3}, TypeError, r"jacobian must be a function jacobian\(t, q, dq, out"),

@@ -182,7 +182,7 @@ def test_an_own_step_runs_interpreted_and_says_so():
     assert run.message == "reached the end of the interval (interpreted: Verlet is a one-step method in Python)"
     with pytest.raises(TypeError, match="Verlet is a one-step method in Python"):
         integrate(oscillator, (0, 1), [1.0, 0.0], method=method, h=0.1, compiled=True)
-    with pytest.raises(ValueError, match=r"compensated=True .* Verlet is no tableau"):
+    with pytest.raises(ValueError, match=r"compensated=True .* Verlet is not a tableau"):
         integrate(oscillator, (0, 1), [1.0, 0.0], method=method, h=0.1, compensated=True)
 
 

@@ -153,9 +153,9 @@ def test_a_start_in_one_float_is_the_epoch():
 
 def test_another_start_needs_its_state():
     later = EPOCH + 10 * DAY
-    with pytest.raises(ValueError, match=r"t_span: the run is to start at .*is that of JD 2456691\.345833 TDB"):
+    with pytest.raises(ValueError, match=r"t_span: the run starts at .*is that of JD 2456691\.345833 TDB"):
         solar((later, later + 1 * YR))
-    with pytest.raises(ValueError, match=r"t_span: the run is to start at"):
+    with pytest.raises(ValueError, match=r"t_span: the run starts at"):
         solar(later + [0, 1] * YR)
     run = solar((later, later + 1 * YR), y0=solar_system().y0)
     assert run.t[0] == pytest.approx(10 / 365.25, rel=1e-12)
