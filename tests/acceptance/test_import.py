@@ -13,17 +13,18 @@ HEAVY = ["eip_scipy_studies", "matplotlib", "numba", "scipy", "tqdm"]
 HEAVY_FOR_STEPS = ["dask", "matplotlib", "scipy.ndimage", "scipy.signal", "scipy.stats", "skimage", "tqdm", "zarr"]
 
 
-def python(code):
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+def python(code, *arguments):
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
 def loaded(code, names):
-    """Which of the modules there are in a fresh process after `code`."""
-    return python(f"{code}\nimport sys\nprint(*(name for name in {names} if name in sys.modules))")
+    """Return those of the modules that are there in a fresh process after `code`."""
+    return python(f"{code}\nimport sys\nprint(*(name for name in {names} if name in sys.modules))").split()
 
 
 def test_the_package_alone_is_light():
-    found = python("import eip_scipy, sys\nprint(*sys.modules)")
+    found = python("import eip_scipy, sys\nprint(*sys.modules)").split()
     assert set(found).isdisjoint(HEAVY)
     own = {name for name in found if name.startswith("eip_scipy.")}
     assert own <= {"eip_scipy.core", "eip_scipy.core.moved"}
@@ -52,12 +53,12 @@ def test_all_public_names_are_there():
     for name in eip_scipy.__all__:
         assert getattr(eip_scipy, name).__name__ == name
     assert {*eip_scipy.__all__, "__version__", "checkpoint", "problems"} <= set(dir(eip_scipy))
-    assert python("from eip_scipy import *\nprint(EIPRK4.__name__, __name__)") == ["EIPRK4", "__main__"]
 
 
-def test_modules_and_version_come_by_name():
+def test_names_modules_and_version_come_by_name():
     code = "import eip_scipy as e\nprint(e.problems.kepler.__name__, e.checkpoint.read.__name__, e.__version__)"
-    assert python(code) == ["kepler", "read", eip_scipy.__version__]
+    code += "\nfrom eip_scipy import *\nprint(EIPRK4.__name__, __name__)"
+    assert python(code).split() == ["kepler", "read", eip_scipy.__version__, "EIPRK4", "__main__"]
 
 
 def test_no_folder_or_module_has_a_public_name():
@@ -71,26 +72,31 @@ def test_an_unknown_name_is_an_attribute_error():
         eip_scipy.EIPRK7  # noqa: B018
 
 
-@pytest.mark.parametrize(
-    ("code", "new"),
-    [
-        ("from eip_scipy.comparators import boris as it", "eip_scipy_studies.comparators.boris"),
-        ("from eip_scipy.problems import hard_cases as it", "eip_scipy_studies.hard_cases.hard_cases"),
-        ("from eip_scipy.problems.hard_cases import HardCase as it", "eip_scipy_studies.hard_cases.HardCase"),
-        ("from eip_scipy.problems import HardCase as it", "eip_scipy_studies.hard_cases.HardCase"),
-        ("from eip_scipy.plotting import cost_figure as it", "eip_scipy_studies.plotting.cost_figure"),
-        *((f"from eip_scipy import {name} as it", f"{home}.{name}") for name, home in MOVED["eip_scipy"].items()),
-    ],
-)
-def test_a_moved_name_is_found_and_says_where_it_is_now(code, new):
-    warned = "import warnings\nwith warnings.catch_warnings(record=True) as all:\n warnings.simplefilter('always')\n "
-    code = code.replace("\n", "\n ")
-    told = "\nprint(callable(it), *{f'{w.category.__name__} {w.filename} {w.message}' for w in all}, sep='|')"
-    callable_, *warnings = " ".join(python(f"{warned}{code}{told}")).split("|")
-    assert callable_ == "True"
-    (warning,) = warnings
-    assert warning.startswith("DeprecationWarning <string> eip_scipy.")
-    assert f"is now {new};" in warning
+MOVED_NAMES = {
+    "from eip_scipy.comparators import boris as it": "eip_scipy_studies.comparators.boris",
+    "from eip_scipy.problems import hard_cases as it": "eip_scipy_studies.hard_cases.hard_cases",
+    "from eip_scipy.problems.hard_cases import HardCase as it": "eip_scipy_studies.hard_cases.HardCase",
+    "from eip_scipy.problems import HardCase as it": "eip_scipy_studies.hard_cases.HardCase",
+    "from eip_scipy.plotting import cost_figure as it": "eip_scipy_studies.plotting.cost_figure",
+    **{f"from eip_scipy import {name} as it": f"{home}.{name}" for name, home in MOVED["eip_scipy"].items()},
+}
+IMPORTS = """
+import sys, warnings
+for code in sys.argv[1:]:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        exec(compile(code, "<code>", "exec"))
+    print(callable(it), *{f"{w.category.__name__} {w.filename} {w.message}" for w in found}, sep="|")
+"""
+
+
+def test_moved_names_are_found_and_say_where_they_are_now():
+    """All in one fresh process, each with one warning that names the importing file."""
+    for (code, new), found in zip(MOVED_NAMES.items(), python(IMPORTS, *MOVED_NAMES).splitlines(), strict=True):
+        callable_, warning = found.split("|")
+        assert callable_ == "True", code
+        assert warning.startswith("DeprecationWarning <code> eip_scipy."), code
+        assert f"is now {new};" in warning, code
 
 
 def test_no_other_name_is_looked_for_in_the_studies():
