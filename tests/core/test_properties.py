@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from systems import H_USES_F, H, L, orbit, oscillator
 
-from eip_scipy import EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, Invariant, integrate, project
+from eip_scipy import EIPRK2, EIPRK3, EIPRK4, EIPRK5, Invariant, integrate, project
 from eip_scipy.problems import harmonic, kepler, nbody
 
 EPS = np.finfo(float).eps
@@ -629,28 +629,3 @@ def test_harmonic_oscillator_multiplier_of_the_paper():
     y_hat = np.array([step[0], -step[1]])
     factor = 1 - 0.5 * (1 - 1 / (y_hat @ y_hat))
     np.testing.assert_allclose(run.y[:, -1], factor * y_hat, rtol=0, atol=2 * EPS)
-
-
-def kepler_errors(method, steps, **options):
-    """Error at the end, and largest defects of H and L, of the package's own problem over half an orbit."""
-    problem = kepler(0.3, 0.0)
-    run = integrate(problem, (0, 3.0), method=method, h=3.0 / steps, compiled=False, **options)
-    assert run.status == 0
-    return np.linalg.norm(run.y[:, -1] - problem.reference(3.0)), run.max_defect
-
-
-@pytest.mark.parametrize("options", [{}, {"blocks": 2}, {"metric": "euclidean"}], ids=["default", "blocks", "plain"])
-@pytest.mark.parametrize(
-    ("method", "steps"), [(EIPRK1, 1600), (EIPRK2, 300), (EIPRK3, 600), (EIPRK4, 300), (EIPRK5, 80)]
-)
-def test_order_is_kept(method, steps, options):
-    error, finer = (kepler_errors(method, n, **options)[0] for n in (steps, 2 * steps))
-    assert np.log2(error / finer) == pytest.approx(method.TABLEAU.order, abs=0.2)
-
-
-@pytest.mark.parametrize(("method", "steps"), [(EIPRK1, 48), (EIPRK2, 24), (EIPRK3, 24), (EIPRK4, 24), (EIPRK5, 12)])
-def test_defects_are_of_twice_the_order(method, steps):
-    """O(h^(2p + 2)), theorem 2.1 of the paper."""
-    coarse, fine = (kepler_errors(method, n, metric="euclidean")[1] for n in (steps, 2 * steps))
-    assert (np.log2(coarse / fine) > 2 * (method.TABLEAU.order + 1) - 0.5)[0]
-    assert (np.log2(coarse / fine) > 2 * (method.TABLEAU.order + 1) - 3)[1]

@@ -357,8 +357,8 @@ def test_the_named_classes_too(case, method, compiled):
 
 @drivers
 @projected
-@own
-@pytest.mark.parametrize("save_every", [2, 7, 1000])
+@pytest.mark.parametrize("method", [OWN["RK45"], EIPRK4], ids=lambda m: m.__name__)
+@pytest.mark.parametrize("save_every", [7, 1000])
 def test_save_every(method, projected, compiled, save_every):
     fun, t_span, y0, invariants = RUNS["orbit"]
     options = {"method": method, "invariants": invariants if projected else ()}
@@ -373,29 +373,13 @@ def test_save_every(method, projected, compiled, save_every):
 
 
 @drivers
-@projected
-@own
-@runs
-def test_t_eval(case, method, projected, compiled):
-    fun, t_span, y0, invariants = RUNS[case]
-    options = {"method": method, "invariants": invariants if projected else (), "t_eval": np.linspace(*t_span, 41)}
-    sol = solve_ivp(fun, t_span, y0, **options)
-    run = integrate(fun, t_span, y0, compiled=compiled, **options)
-    assert run.status == sol.status
-    np.testing.assert_array_equal(run.t, sol.t)
-    # Sums over stages for many times at once are added in another order.
-    assert_close(run.y, sol.y, 8 * EPS)
-    np.testing.assert_array_equal(run.y[:, [0, -1]], sol.y[:, [0, -1]])
-
-
-@drivers
-@projected
 @own
 @runs
 @pytest.mark.parametrize("terminal", [False, 2])
-def test_events_of_integrate(case, method, projected, compiled, terminal):
-    fun, t_span, y0, invariants = RUNS[case]
-    options = {"method": method, "invariants": invariants if projected else ()}
+def test_events_of_integrate(case, method, compiled, terminal):
+    """Without invariants; with them in tests/run/test_samples.py, states at given times too."""
+    fun, t_span, y0, _ = RUNS[case]
+    options = {"method": method}
     jit_event.terminal = terminal
     events = [jit_event, jit_time_event, jit_lower_event]
     try:
@@ -415,7 +399,7 @@ def test_events_of_integrate(case, method, projected, compiled, terminal):
 
 
 @drivers
-@own
+@pytest.mark.parametrize("method", [OWN["RK45"], EIPRK4], ids=lambda m: m.__name__)
 def test_terminal_event_and_t_eval(method, compiled):
     """SciPy drops the samples after the event and does not add its state."""
     fun, (t0, _), y0, invariants = RUNS["orbit"]
@@ -432,39 +416,6 @@ def test_terminal_event_and_t_eval(method, compiled):
     assert_close(run.y, sol.y, 8 * EPS)
     for kind in ("t_events", "y_events"):
         assert_close(run[kind][0].T, sol[kind][0].T, ROOTS)
-
-
-OPTIONS_OF_BOTH = {
-    "tolerances": {"rtol": 1e-7, "atol": 1e-9},
-    "array tolerances": {"rtol": [1e-4, 1e-5, 1e-6, 1e-4], "atol": [1e-6, 1e-7, 1e-8, 1e-4]},
-    "first_step": {"first_step": 0.02},
-    "max_step": {"max_step": 0.1},
-    "metric": {"metric": "euclidean"},
-    "weights": {"metric": [1.0, 2.0, 0.5, 0.1]},
-    "blocks": {"blocks": 2},
-    "direction old": {"direction": "old"},
-    "direction midpoint": {"direction": "midpoint"},
-    "iterations": {"iterations": 3},
-    "every": {"every": 4},
-    "every without an estimate in the metric": {"every": 3, "metric": "euclidean"},
-    "reuse_f": {"reuse_f": False},
-    "check": {"check": False},
-    "several": {"every": 2, "iterations": 2, "blocks": 2, "reuse_f": False, "max_step": 0.5, "rtol": 1e-5},
-}
-
-
-@drivers
-@own
-@pytest.mark.parametrize("option", OPTIONS_OF_BOTH)
-def test_options_of_integrate(method, compiled, option):
-    fun, t_span, y0, invariants = RUNS["orbit"]
-    options = {"method": method, "invariants": invariants, **OPTIONS_OF_BOTH[option]}
-    plain = solve_ivp(fun, t_span, y0, method=method, invariants=invariants)
-    sol = solve_ivp(fun, t_span, y0, **options)
-    run = integrate(fun, t_span, y0, save_every=1, compiled=compiled, **options)
-    compare(run, sol)
-    if option != "check":
-        assert not np.array_equal(sol.y[:, -1], plain.y[:, -1]), "the option has no effect"
 
 
 @drivers
