@@ -17,6 +17,7 @@ from eip_scipy.problems.symbolic import system
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # of central differences of order 8
 STEP = 2.0**-7
 RTOL = 1e-9  # of the largest number in a column
+NIGHTLY = pytest.mark.nightly
 PENDULUM = (
     "(m2*l2**2*p1**2 + (m1 + m2)*l1**2*p2**2 - 2*m2*l1*l2*p1*p2*cos(th1 - th2))"
     " / (2*m2*l1**2*l2**2*(m1 + m2*sin(th1 - th2)**2)) - (m1 + m2)*g*l1*cos(th1) - m2*g*l2*cos(th2)"
@@ -78,7 +79,10 @@ def assert_variational(problem, y, rng, parameters=(), columns=3, t=0.4, rtol=RT
 
 
 @pytest.mark.needs_jit
-@pytest.mark.parametrize("name", SYMBOLIC)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow, NIGHTLY]) if name == "double pendulum" else name for name in SYMBOLIC],
+)
 def test_expressions(name):
     problem, rng = SYMBOLIC[name](), np.random.default_rng(1)
     count = len(problem.system.parameters)
@@ -263,7 +267,12 @@ FIELDS = {
 FORMS = [(name, form) for name in FIELDS for form in ("canonical", "velocity") if name not in ("varying", "numbers")]
 FORMS += [("varying", "velocity"), ("numbers", "velocity")]
 INTERPRETED = [(*pair, False) for pair in FORMS[4:]]  # the first are compiled wherever Numba is
-COMPILED = [pytest.param(*pair, True, marks=[pytest.mark.needs_jit, pytest.mark.slow]) for pair in FORMS[:-1]]
+# Each compiles for seconds: in the gate one whose Jacobian is computed, and one that varies.
+GATE = ("potentials", "canonical"), ("varying", "velocity")
+COMPILED = [
+    pytest.param(*pair, True, marks=[pytest.mark.needs_jit, pytest.mark.slow, *([] if pair in GATE else [NIGHTLY])])
+    for pair in FORMS[:-1]
+]
 
 
 @pytest.mark.filterwarnings("ignore:ParticleField. the divergence")
@@ -286,6 +295,7 @@ def test_charged_particle(name, form, compiled):
 
 @pytest.mark.needs_jit
 @pytest.mark.slow
+@NIGHTLY
 def test_flow_of_a_particle():
     """Sensitivities of a projected run, against complex steps through the closed form: drift in constant fields."""
     E, B = 0.3, 1.7
