@@ -123,7 +123,7 @@ def test_the_state_is_the_one_that_is_augmented_by_hand(method, h):
 
 
 def test_a_planet_with_drag():
-    y0, end, h = pericentre(0.2), 300 * PERIOD, PERIOD / 16
+    y0, end, h = pericentre(0.2), 60 * PERIOD, PERIOD / 16
     right = reference(dragged, (0, end), y0).y[:2, -1]
 
     def error(*invariants):
@@ -131,9 +131,9 @@ def test_a_planet_with_drag():
         assert run.trusted
         return np.linalg.norm(run.y[:2, -1] - right)
 
-    assert error() > 3e-2
+    assert error() > 1e-3
     given = error(Balance(energy, loss, energy_gradient))
-    assert given < 3e-5
+    assert given < 1e-5
     assert error(Balance(energy, grad=energy_gradient)) == pytest.approx(given, rel=1e-4)
     assert error(Balance(smooth_energy)) == pytest.approx(given, rel=1e-4)
 
@@ -146,22 +146,6 @@ def test_a_slowly_varying_field(balance):
     assert run.trusted
     assert np.abs(plain.y[:, -1] - right).max() > 1e-2
     assert np.abs(run.y[:, -1] - right).max() < 1e-4
-
-
-def test_weak_driving_of_duffings_oscillator():
-    def fun(t, y):
-        return np.array([y[1], -y[0] - y[0] ** 3 + 1e-3 * np.cos(0.4 * t)])
-
-    H = Balance(
-        lambda t, y: 0.5 * (y[1] ** 2 + y[0] ** 2) + 0.25 * y[0] ** 4,
-        rate=lambda t, y: 1e-3 * np.cos(0.4 * t) * y[1],
-        grad=lambda t, y: np.array([y[0] + y[0] ** 3, y[1]]),
-    )
-    right = reference(fun, (0, 1000), START).y[:, -1]
-    plain, kept = (
-        integrate(fun, (0, 1000), START, method=EIPDOP853, h=0.4, invariants=items).y[:, -1] for items in ((), H)
-    )
-    assert 100 * np.abs(kept - right).max() < np.abs(plain - right).max()
 
 
 @pytest.mark.parametrize("run", RUNS)
@@ -278,8 +262,8 @@ def test_a_dependence_on_time_is_differentiated():
 
 
 def test_copies_go_on_to_the_same_bits():
-    for balance in (SWING, SWING_ALONE):
-        for options in RUNS:
+    for balance, runs in ((SWING, RUNS), (SWING_ALONE, RUNS[::3])):
+        for options in runs:
             options = dict(options)
             method = options.pop("method")
             whole = method(swinging, 0, START, 20, invariants=balance, **options)
@@ -416,13 +400,13 @@ def test_a_rate_that_goes_wrong_later_is_named(solve, options):
     assert not run.trusted
 
 
-@pytest.mark.parametrize("options", RUNS)
-@pytest.mark.parametrize("by", [swing_gradient, None], ids=["gradient", "values"])
+@pytest.mark.parametrize("options", RUNS[::3])
 @pytest.mark.parametrize("rate", [swing_rate, None], ids=["rate", "no rate"])
-def test_right_rates_are_not_accused(options, by, rate):
+def test_right_rates_are_not_accused(options, rate):
+    """Gradients are computed here; with given ones no test of this file warns."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        run = integrate(swinging, (0, 100), START, invariants=Balance(swing_energy, rate, by), **options)
+        run = integrate(swinging, (0, 100), START, invariants=Balance(swing_energy, rate), **options)
     assert run.trusted
 
 
