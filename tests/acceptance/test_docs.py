@@ -29,11 +29,14 @@ PAGES = (
     "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/rebound-and-astropy",
     "tutorials/pdes", "tutorials/own-pde", "tutorials/ensembles", "how-to/recommend", "how-to/find-invariants",
     "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
-    "how-to/own-methods", "how-to/consistent-starts", "how-to/balances", "how-to/tangent-maps", "how-to/gradients",
-    "how-to/stiff-systems", "how-to/mechanisms",
+    "how-to/own-methods", "how-to/consistent-starts", "how-to/gradients", "how-to/mechanisms",
 )  # fmt: skip
 NEEDED = {"docs/how-to/gradients.md": ("jax", "torch")}
-NIGHTLY = ("results/hard-scenes", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h")
+# Ten seconds and more each, for what tests of the same methods show in less.
+NIGHTLY = (
+    "results/hard-scenes", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h",
+    "how-to/balances", "how-to/tangent-maps", "how-to/stiff-systems",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(
