@@ -1,4 +1,4 @@
-"""The typed program in tests/typing runs, and uses all public names; .ci/run has its types checked."""
+"""The typed program in tests/typing runs, and uses all public names; mypy checks its types."""
 
 import ast
 import importlib.util

@@ -2,11 +2,7 @@
 
 import copy
 import inspect
-import os
 import pickle
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -349,88 +345,6 @@ def test_the_signature_is_scipys_with_the_options():
     assert set(ProjectionOptions.names()) < set(shown)
 
 
-USER_CODE = """
-import numpy as np
-from numpy.typing import NDArray
-
-from eip_scipy import EIPDOP853, EIPRK4, Diagnostics, Invariant, ensemble, integrate, recommend, solve_ivp
-from eip_scipy.results import OdeResult
-
-Array = NDArray[np.float64]
-
-
-def fun(t: float, y: Array, k: float) -> list[float]:
-    return [y[1], -k * y[0]]
-
-
-def energy(t: float, y: Array, k: float) -> float:
-    return float(0.5 * (y[1] ** 2 + k * y[0] ** 2))
-
-
-def run(tight: float) -> OdeResult:
-    sol = solve_ivp(
-        fun, (0, 1), [1.0, 0.0], EIPDOP853, np.linspace(0, 1, 3), events=[energy], args=(2.0,), rtol=tight,
-        atol=[1e-9, 1e-12], invariants=[energy, Invariant(energy, name="H")], metric="euclidean", every="auto",
-        direction="old", blocks=[[0, 1]], project_initial=False, diagnostics=Diagnostics(),
-    )
-    defect: float = sol.diagnostics.max_defect.max()
-    text: str = sol.message
-    print(sol.y[:, -1], sol["t"], defect, text, sol.t_events[0] if sol.t_events else None)
-    plain: OdeResult = solve_ivp(fun, [0, 1], np.ones(2), "Radau", args=[2.0], jac=lambda t, y, k: np.eye(2))
-    return sol if sol.trusted and plain.success else plain
-
-
-longer = integrate(fun, (0, 1), [1.0, 0.0], method=EIPDOP853, invariants=energy, blocks=2).continue_to(3)
-members = ensemble(fun, (0, 1), np.ones((3, 2)), h=0.1, method=EIPRK4, invariants=energy, args=(2.0,), every=2)
-largest: float = max(longer.max_defect.max(), members.max_defect.max())
-choice = recommend(fun, (0, 1), [1.0, 0.0], invariants=energy, params=[2.0], metric="euclidean")
-print(longer.diagnostics.moved + longer.message, members.statistics, choice.reason, largest)
-# Below this line each statement has an error.
-solve_ivp(fun, (0, 1), [1.0, 0.0], hh=0.01)
-solve_ivp(fun, (0, 1), [1.0, 0.0], invariants=3)
-solve_ivp(fun, (0, 1), [1.0, 0.0], iterations="two")
-solve_ivp(fun, (0, 1), [1.0, 0.0], metric="taxicab")
-solve_ivp(fun, (0, 1), [1.0, 0.0], direction="up")
-print(solve_ivp(fun, (0, 1), [1.0, 0.0]).succes)
-integrate(fun, (0, 1), [1.0, 0.0], hh=0.01)
-ensemble(fun, (0, 1), np.ones((3, 2)), hh=0.1)
-recommend(fun, (0, 1), [1.0, 0.0], every=2)
-print(longer.trustd)
-print(members.trustd)
-"""
-
-
 def test_a_name_in_the_place_of_a_class_is_answered_with_the_class():
     with pytest.raises(ValueError, match="'EIPDOP853' is a name; give the class, as in `from eip_scipy"):
         solve_ivp(lambda t, y: -y, (0, 1), [1.0], method="EIPDOP853")
-
-
-@pytest.mark.slow
-def test_user_code_under_mypy(tmp_path):
-    """Correct code passes --strict, and each wrong option is found at its line."""
-    pytest.importorskip("mypy")
-    root = Path(eip_scipy.__file__).parents[1]
-    paths = {} if root.name == "site-packages" else {"MYPYPATH": str(root)}
-    path = tmp_path / "user.py"
-    path.write_text(USER_CODE, encoding="utf-8")
-    command = [
-        sys.executable,
-        "-m",
-        "mypy",
-        "--strict",
-        "--follow-imports=silent",
-        "--config-file=",
-        "--no-error-summary",
-    ]
-    found = subprocess.run(
-        [*command, f"--cache-dir={tmp_path / 'cache'}", str(path)],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-        env=os.environ | paths,
-    )
-    lines = USER_CODE.splitlines()
-    first = next(k for k, line in enumerate(lines, 1) if "each statement" in line) + 1
-    errors = [int(line.split(":")[1]) for line in found.stdout.splitlines() if ": error: " in line]
-    assert errors == list(range(first, len(lines) + 1)), found.stdout + found.stderr

@@ -1,6 +1,6 @@
 """A user's program with types, which uses each public name and the fields of each result.
 
-`mypy --strict` checks it in .ci/run, and tests/acceptance/test_user_code.py runs it.
+mypy checks it as by --strict, and tests/acceptance/test_user_code.py runs it.
 """
 
 from __future__ import annotations
