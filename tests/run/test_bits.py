@@ -246,7 +246,9 @@ def lattice(t, y):
 
 @njit
 def lattice_in_place(t, y, out):
-    out[:] = lattice(t, y)
+    w = lattice(t, y)
+    for i in range(y.size):
+        out[i] = w[i]
 
 
 @njit

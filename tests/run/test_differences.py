@@ -185,16 +185,18 @@ def test_nystrom(c):
 
 def chain(t, y):
     """A field on a ring: q'' = q_xx - sin(q)."""
-    q, v = y[: y.size // 2], y[y.size // 2 :]
-    out = np.empty(y.size)
-    out[: q.size] = v
-    out[q.size :] = np.roll(q, 1) - 2 * q + np.roll(q, -1) - np.sin(q)
+    n, out = y.size // 2, np.empty(y.size)
+    for k in range(n):
+        out[k] = y[n + k]
+        out[n + k] = y[(k - 1) % n] - 2 * y[k] + y[(k + 1) % n] - np.sin(y[k])
     return out
 
 
 def chain_energy(t, y):
-    q, v = y[: y.size // 2], y[y.size // 2 :]
-    return (v * v).sum() / 2 + ((np.roll(q, -1) - q) ** 2).sum() / 2 + (1 - np.cos(q)).sum()
+    n, total = y.size // 2, 0.0
+    for k in range(n):
+        total += y[n + k] ** 2 / 2 + (y[(k + 1) % n] - y[k]) ** 2 / 2 + 1 - np.cos(y[k])
+    return total
 
 
 def pulse(m):
