@@ -594,6 +594,8 @@ def test_a_cycloid():
     assert errors[1] < 1.1 * errors[0]
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 def test_the_total_energy_keeps_a_place():
     """Against DOP853 of SciPy with rtol=1e-13; nothing depends on z, so that v_z has to be kept as well."""
     problem = moving(ring(potential=ring_phi), "energy", t_end=1000.0, h=0.4, mass=1.0, charge=1.0)
