@@ -32,23 +32,25 @@ void require_count(const LibraryFunction &function, Py_ssize_t count, bool by_f)
            function.returns() ? "" : ", out", expected, count);
 }
 
-nb::object called(const LibraryFunction &function, PyObject *const *arguments, Py_ssize_t count) {
+nb::object called(const LibraryFunction &function, PyObject *arguments) {
     const bool by_f = function.takes_f();
+    const Py_ssize_t count = PyTuple_Size(arguments);
     require_count(function, count, by_f);
-    const double t = PyFloat_AsDouble(arguments[0]);
+    const auto argument = [arguments](Py_ssize_t place) { return PyTuple_GetItem(arguments, place); };
+    const double t = PyFloat_AsDouble(argument(0));
     if (t == -1.0 && PyErr_Occurred()) throw nb::python_error();
-    const Array y = vector_of(arguments[1]);
+    const Array y = vector_of(argument(1));
     Array given;
-    if (function.own.empty()) given = vector_of(arguments[count - 1]);
+    if (function.own.empty()) given = vector_of(argument(count - 1));
     const double *params = function.own.empty() ? given.floats() : function.own.data();
     const int64_t n = y.size(), p = function.own.empty() ? given.size() : std::ssize(function.own);
     require_sizes(function, n, p);
     Array f;
-    if (by_f) f = vector_of(arguments[2]);
+    if (by_f) f = vector_of(argument(2));
     if (by_f && f.size() != n)
         refuse(PyExc_ValueError, "%s: f has %lld numbers, y has %lld", function.name, static_cast<long long>(f.size()),
                static_cast<long long>(n));
-    Array out = function.returns() ? new_array({function.filled(n)}) : out_of(arguments[2 + by_f], function, n);
+    Array out = function.returns() ? new_array({function.filled(n)}) : out_of(argument(2 + by_f), function, n);
     function.one(t, y.floats(), by_f ? f.floats() : nullptr, out.floats(), params, n, p);
     if (!function.returns()) {
         if (PyArray_ResolveWritebackIfCopy(out.get()) < 0) throw nb::python_error();
@@ -62,8 +64,8 @@ nb::object called(const LibraryFunction &function, PyObject *const *arguments, P
 PyObject *call(PyObject *self, PyObject *arguments, PyObject *names) noexcept {
     const LibraryFunction &function = *nb::inst_ptr<LibraryFunction>(self);
     try {
-        if (names && PyDict_GET_SIZE(names) > 0) refuse(PyExc_TypeError, "%s takes no keywords", function.name);
-        return called(function, &PyTuple_GET_ITEM(arguments, 0), PyTuple_GET_SIZE(arguments)).release().ptr();
+        if (names && PyDict_Size(names) > 0) refuse(PyExc_TypeError, "%s takes no keywords", function.name);
+        return called(function, arguments).release().ptr();
     } catch (nb::python_error &error) {
         error.restore();
     } catch (const std::bad_alloc &) {

@@ -16,8 +16,10 @@ nb::handle kept_attribute(nb::handle object, const char *name, nb::list &kept) {
 
 // An np.float64: where a function divides by t = 0 it gets inf, as from SciPy.
 nb::object time(double t) {
-    nb::object object = owned(PyArrayScalar_New(Double));
-    PyArrayScalar_ASSIGN(object.ptr(), Double, t);
+    PyTypeObject *type = &PyDoubleArrType_Type;
+    static const auto allocate = reinterpret_cast<allocfunc>(PyType_GetSlot(type, Py_tp_alloc));
+    nb::object object = owned(allocate(type, 0));
+    reinterpret_cast<PyDoubleScalarObject *>(object.ptr())->obval = t;
     return object;
 }
 
@@ -80,19 +82,19 @@ void PythonCall::operator()(double t, const double *y, const double *f, double *
 // Whether a value is a list of as many floats as are expected, Python's or NumPy's: what most functions return.
 bool PythonCall::takes_list(PyObject *value) const {
     if (n_dimensions_ != 1 || value_type_ != NPY_DOUBLE || !PyList_CheckExact(value)) return false;
-    if (PyList_GET_SIZE(value) != dimensions_[0]) return false;
+    if (PyList_Size(value) != dimensions_[0]) return false;
     for (Py_ssize_t k = 0; k < dimensions_[0]; ++k)
-        if (!PyFloat_Check(PyList_GET_ITEM(value, k))) return false;
+        if (!PyFloat_Check(PyList_GetItem(value, k))) return false;
     return true;
 }
 
 void PythonCall::take(PyObject *value, PyObject *t, double *out) const {
     if (n_dimensions_ == 0 && PyFloat_Check(value)) {
-        out[0] = PyFloat_AS_DOUBLE(value);
+        out[0] = PyFloat_AsDouble(value);
         return;
     }
     if (takes_list(value)) {
-        for (Py_ssize_t k = 0; k < floats_; ++k) out[k] = PyFloat_AS_DOUBLE(PyList_GET_ITEM(value, k));
+        for (Py_ssize_t k = 0; k < floats_; ++k) out[k] = PyFloat_AsDouble(PyList_GetItem(value, k));
         return;
     }
     const auto plain = [this](PyObject *a) {
