@@ -5,29 +5,34 @@ One module for every processor, and on x86-64 another for those with AVX2 and FM
 
 import hashlib
 import os
-import platform
 import shlex
-import sys
 import sysconfig
 from concurrent.futures import Future, ThreadPoolExecutor
+from distutils.ccompiler import new_compiler
 from pathlib import Path
 from typing import Any, ClassVar
 
 import nanobind
 import numpy
 from setuptools import Extension, find_packages, setup
+from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
 from building.compiler import chosen
+from building.targets import target
 
 FOLDER = Path("eip_scipy/engine/cpp")
 # Called once a run, or by Python: these are compiled in half the time without the passes that make loops fast.
 COLD = ["complex_step.cpp", "library.cpp", "module.cpp", "python_functions.cpp", "records.cpp"]
+# These files do not include Python's headers, so that zig, which keeps what it has compiled, compiles them once.
+NUMBERS = ["engine.cpp", "forces.cpp", "gravity.cpp", "kepler.cpp", "orbits.cpp", "planets.cpp"]
 # The library of nanobind is compiled once and linked into both modules: what differs between these, the NB_DOMAIN that
 # keeps their types apart, stands in its headers only.
 NANOBIND = Path(nanobind.include_dir()).parent
-INCLUDED = [str(NANOBIND / "include"), str(NANOBIND / "ext" / "robin_map" / "include")]
-COMPILER = chosen()
+COMPILER, TARGET = chosen(), target()
+HERE = Path(sysconfig.get_path("include")), Path(numpy.get_include())
+PYTHON, NUMPY = (TARGET.headers / "python", TARGET.headers / "numpy") if TARGET.headers else HERE
+INCLUDED = [NANOBIND / "include", NANOBIND / "ext" / "robin_map" / "include", NUMPY, PYTHON]
 # No fused operation but those that are written, no reordering: the same bits from every build. The warnings left
 # out are about Python's own interface.
 FLAGS = ["-std=c++20", "-O3", "-g0", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
@@ -35,8 +40,12 @@ FLAGS += ["-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-cast-function-type", 
 EVERY, V3, QUICK, OLD = [*COMPILER.every], [*COMPILER.v3], "-O1", "-O1"
 # Not our headers: without warnings. The library handles Python's objects under several types.
 OTHERS = [f"-isystem{path}" for path in INCLUDED]
+if TARGET.stable:
+    OTHERS += ["-include", "stdio.h"]  # which Python.h includes in other builds, and nanobind needs
 OTHERS_OWN = ["-std=c++20", "-g0", "-w", "-fvisibility=hidden", "-fno-strict-aliasing", "-ffunction-sections", *EVERY]
-UNUSED = ["-Wl,-dead_strip" if sys.platform == "darwin" else "-Wl,--gc-sections"]  # most of it is
+UNUSED = ["-Wl,-dead_strip" if TARGET.system == "darwin" else "-Wl,--gc-sections"]  # most of it is
+# The stable interface as of Python 3.12.
+STABLE = [("Py_LIMITED_API", "0x030C0000")] if TARGET.stable else []
 MISSING = f"""\
 eip_scipy's engine is written in C++20, and {shlex.join(COMPILER.command)!r} did not build it. g++ 12 or newer, clang 15
 or newer and Xcode's tools do, and so does the package ziglang: set EIP_SCIPY_COMPILER=zig, or to another command."""
@@ -60,9 +69,8 @@ def module(name: str, *flags: str) -> Extension:
         f"eip_scipy.engine.{name}",
         sources=[str(path) for path in sorted(FOLDER.rglob("*.cpp"))],
         depends=[str(path) for path in sorted(FOLDER.rglob("*.hpp"))],
-        include_dirs=[numpy.get_include()],
-        define_macros=[("EIP_MODULE", name), ("NB_DOMAIN", name), ("EIP_SOURCES", f'"{stamp()}"')],
-        extra_compile_args=[*FLAGS, *OTHERS, *flags],
+        define_macros=[("EIP_MODULE", name), ("NB_DOMAIN", name), ("EIP_SOURCES", f'"{stamp()}"'), *STABLE],
+        extra_compile_args=[*FLAGS, *flags],
         extra_link_args=UNUSED,
         language="c++",
     )
@@ -83,23 +91,37 @@ class Build(build_ext):
 
     def build_extensions(self) -> None:
         """Build all, the library of nanobind before them."""
-        self.compiler.set_executables(**COMPILER.executables)
+        if not COMPILER.own:
+            self.compiler = new_compiler(compiler="unix")  # on Windows too
+            self.compiler.set_executables(**COMPILER.executables)
+            self.compiler.set_library_dirs(self.library_dirs)
+        if TARGET.headers:
+            self.compiler.set_library_dirs([str(TARGET.headers / "libs")] if TARGET.system == "win32" else [])
+        self.compiler.set_include_dirs([])  # each file has those that it needs
         if not BUILT and self.extensions:
-            folder = Path(sysconfig.get_path("include"))
-            if not (folder / "Python.h").exists():
-                raise SystemExit(HEADERS.format(folder=folder))
-            source, macros = NANOBIND / "src" / "nb_combined.cpp", [("NB_COMPACT_ASSERTIONS", None)]
-            folders = [*self.include_dirs, *INCLUDED]
-            self.binding.append(self.compiled("nanobind", [str(source)], macros, folders, [*OTHERS_OWN, QUICK])[0])
+            if not (PYTHON / "Python.h").exists():
+                raise SystemExit(HEADERS.format(folder=PYTHON))
+            source, macros = NANOBIND / "src" / "nb_combined.cpp", [("NB_COMPACT_ASSERTIONS", None), *STABLE]
+            self.binding += self.compiled("nanobind", [str(source)], macros, [*OTHERS_OWN, *OTHERS, QUICK])
         super().build_extensions()
 
-    def compiled(
-        self, name: str, sources: list[str], macros: list[Any], folders: list[str], flags: list[str]
-    ) -> list[Future[list[str]]]:
+    def compiled(self, name: str, sources: list[str], macros: list[Any], flags: list[str]) -> list[Future[list[str]]]:
         """Start to compile files into a folder of that name."""
-        where = str(Path(self.build_temp) / name)
-        options = {"output_dir": where, "macros": macros, "include_dirs": folders, "extra_postargs": flags}
+        options = {"output_dir": str(Path(self.build_temp) / name), "macros": macros, "extra_postargs": flags}
         return [self.pool.submit(self.compiler.compile, [source], **options) for source in sources]
+
+    def get_ext_filename(self, fullname: str) -> str:
+        """Return the path of a module, with the suffix that the target's Python expects."""
+        if TARGET.suffix is None:
+            return super().get_ext_filename(fullname)
+        return str(Path(*fullname.split("."))) + TARGET.suffix
+
+    def get_libraries(self, ext: Extension) -> list[str]:
+        """Return the libraries to link: on Windows Python's own."""
+        if TARGET.tag is None:
+            return super().get_libraries(ext)
+        version = "3" if TARGET.stable else TARGET.tag[0].removeprefix("cp")
+        return [f"python{version}"] if TARGET.system == "win32" else []
 
     def build_extension(self, ext: Extension) -> None:
         """One module, with objects of its own."""
@@ -108,18 +130,31 @@ class Build(build_ext):
             self.mkpath(str(Path(path).parent))
             self.copy_file(str(Path(BUILT, Path(path).name)), path)
             return
-        hot = sorted((source for source in ext.sources if Path(source).name not in COLD), key=_longest_first)
-        cold = [source for source in ext.sources if source not in hot]
-        given = ext.define_macros, ext.include_dirs
+        numbers = sorted((source for source in ext.sources if Path(source).name in NUMBERS), key=_longest_first)
+        cold = [source for source in ext.sources if Path(source).name in COLD]
+        others = [source for source in ext.sources if source not in {*numbers, *cold}]
+        flags, bound = ext.extra_compile_args, [*ext.extra_compile_args, *OTHERS]
         try:
             # The cold ones are linked after the others: of a function that both have, the fast one is taken.
-            jobs = self.compiled(ext.name, hot, *given, ext.extra_compile_args)
-            jobs += self.compiled(ext.name, cold, *given, [*ext.extra_compile_args, QUICK])
+            jobs = self.compiled(ext.name, numbers, [], flags)
+            jobs += self.compiled(ext.name, others, ext.define_macros, bound)
+            jobs += self.compiled(ext.name, cold, ext.define_macros, [*bound, QUICK])
             ext.extra_objects = [path for job in [*jobs, *self.binding] for path in job.result()]
             ext.sources = []
+            if TARGET.system == "win32":  # keeps the import library, which nothing links, out of the package
+                library = Path(self.build_temp, f"{ext.name}.lib")
+                ext.extra_link_args = [*ext.extra_link_args, f"-Wl,--out-implib,{library}"]
             super().build_extension(ext)
         except Exception as error:
             raise SystemExit(f"{MISSING}\nWhat the build said: {error}") from error
+
+
+class Wheel(bdist_wheel):
+    """Builds a wheel that is named after its target."""
+
+    def get_tag(self) -> tuple[str, str, str]:
+        """Return the tag of the target, or of this machine."""
+        return TARGET.tag or super().get_tag()
 
 
 def _longest_first(source: str) -> int:
@@ -128,7 +163,7 @@ def _longest_first(source: str) -> int:
 
 
 builds: dict[str, list[str]] = {"_native": EVERY}
-if platform.machine().lower() in ("x86_64", "amd64"):
+if TARGET.machine == "x86_64":
     # What is left to the first are processors of 2012 and before, which call a function for a fused operation: of the
     # optimizer the least, which spares a third of its compilation.
     builds = {"_native": [*EVERY, OLD], "_native_v3": V3}
@@ -143,5 +178,5 @@ setup(
         *find_packages("studies"),
     ],
     ext_modules=[module(name, *flags) for name, flags in builds.items()],
-    cmdclass={"build_ext": Build},
+    cmdclass={"bdist_wheel": Wheel, "build_ext": Build},
 )

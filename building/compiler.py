@@ -12,6 +12,8 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from .targets import target
+
 __all__ = ["Compiler", "chosen", "required"]
 
 # Names the command of a compiler, or "zig", in place of the one that is found.
@@ -51,8 +53,9 @@ class Compiler(NamedTuple):
         """Return what setuptools' compiler is to call, by its names for them."""
         if self.own:
             return {}
-        common = ["-DNDEBUG", "-fwrapv", *(() if sys.platform == "win32" else ("-fPIC",))]
-        shared = ["-bundle", "-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-shared", "-Wl,-s"]
+        system = target().system
+        common = ["-DNDEBUG", "-fwrapv", *(() if system == "win32" else ("-fPIC",))]
+        shared = ["-shared", "-Wl,-s", *(("-undefined", "dynamic_lookup") if system == "darwin" else ())]
         compiling = [*self.command, *common, *shlex.split(os.environ.get("CXXFLAGS", ""))]
         linking = [*self.command, *shared, *shlex.split(os.environ.get("LDFLAGS", ""))]
         return {
@@ -69,17 +72,18 @@ class Compiler(NamedTuple):
 @cache
 def chosen() -> Compiler:
     """Return the compiler of this build."""
-    given = os.environ.get(VARIABLE, "")
+    given, triple = os.environ.get(VARIABLE, ""), target().triple
     if given and given != ZIG:
         return Compiler(tuple(shlex.split(given)))
     # Microsoft's compiler does not know the vectors that g++ and clang have in common.
-    if given != ZIG and sys.platform != "win32":
+    if given != ZIG and not triple and target().system != "win32":
         usual = os.environ.get("CXX") or sysconfig.get_config_var("CXX")
         for command in (usual, "g++", "clang++", "c++"):
             if command and _compiles(tuple(shlex.split(command))):
                 return Compiler(tuple(shlex.split(command)), own=command == usual)
     # Without these flags zig builds for the processor at hand, and traps where an integer overflows.
-    zig = (sys.executable, "-m", "ziglang", "c++", "-fno-sanitize=undefined")
+    elsewhere = ("-target", triple) if triple else ()
+    zig = (sys.executable, "-m", "ziglang", "c++", *elsewhere, "-fno-sanitize=undefined")
     return Compiler(zig, every=("-mcpu=baseline",), v3=("-mcpu=x86_64_v3",))
 
 

@@ -1,25 +1,24 @@
-"""Which compiler builds the engine."""
+"""Which compiler builds the engine, and for what."""
 
-import importlib.util
+import importlib
 import sys
 import sysconfig
 from pathlib import Path
 
 import pytest
 
-BUILDING = Path(__file__).parents[2] / "building"
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
 def compiler(monkeypatch):
     """The module as a build finds it, with no variable set."""
-    for name in ("EIP_SCIPY_COMPILER", "CXX"):
+    for name in ("EIP_SCIPY_COMPILER", "EIP_SCIPY_TARGET", "CXX"):
         monkeypatch.delenv(name, raising=False)
-    spec = importlib.util.spec_from_file_location("building_compiler", BUILDING / "compiler.py")
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "building_compiler", module)
-    spec.loader.exec_module(module)
-    return module
+    monkeypatch.syspath_prepend(ROOT)
+    for name in ("building", "building.targets", "building.compiler"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return importlib.import_module("building.compiler")
 
 
 def test_machines_without_a_compiler_bring_one(compiler, monkeypatch, tmp_path):
@@ -68,3 +67,31 @@ def test_the_compiler_of_python_is_left_to_setuptools(compiler):
         pytest.skip("the compiler that built Python is not here")
     assert found.executables == {}
     assert found.v3 == ("-march=x86-64-v3",)
+
+
+@pytest.mark.parametrize(
+    ("tag", "triple", "suffix"),
+    [
+        ("cp312-abi3-manylinux_2_28_aarch64", "aarch64-linux-gnu.2.28", ".abi3.so"),
+        ("cp311-cp311-manylinux_2_28_x86_64", "x86_64-linux-gnu.2.28", ".cpython-311-x86_64-linux-gnu.so"),
+        ("cp312-abi3-win_amd64", "x86_64-windows-gnu", ".pyd"),
+        ("cp311-cp311-win_amd64", "x86_64-windows-gnu", ".cp311-win_amd64.pyd"),
+        ("cp311-cp311-macosx_12_0_arm64", "aarch64-macos.12.0", ".cpython-311-darwin.so"),
+    ],
+)
+def test_wheels_of_other_platforms(compiler, monkeypatch, tmp_path, tag, triple, suffix):
+    """The compiler's platform, and the names that Python looks for there (importlib.machinery.EXTENSION_SUFFIXES)."""
+    monkeypatch.setenv("EIP_SCIPY_TARGET", tag)
+    monkeypatch.setenv("EIP_SCIPY_HEADERS", str(tmp_path))
+    command = compiler.chosen().command
+    assert command[command.index("-target") + 1] == triple
+    assert ("-undefined" in compiler.chosen().executables["linker_so"]) == ("macos" in triple)
+    target = compiler.target()
+    assert target.suffix == suffix
+    assert "-".join(target.tag) == tag
+
+
+def test_a_platform_that_is_not_known_is_named(compiler, monkeypatch):
+    monkeypatch.setenv("EIP_SCIPY_TARGET", "cp312-abi3-beos")
+    with pytest.raises(SystemExit, match="'beos'; expected one of manylinux"):
+        compiler.target()
