@@ -407,6 +407,85 @@ def test_lagranges_method_and_a_system_give_the_same_motion():
     np.testing.assert_array_equal(mechanics(System()).y0, problem.y0)
 
 
+def parabola_as_system(by_speeds):
+    """The same particle as a System of SymPy, whose equations are not formed yet."""
+    x, y, u, v = me.dynamicsymbols("x y u v")
+    m, g = sympy.symbols("m g")
+    N, origin = me.ReferenceFrame("N"), me.Point("O")
+    origin.set_vel(N, 0)
+    P = origin.locatenew("P", x * N.x + y * N.y)
+    P.set_vel(N, u * N.x + v * N.y if by_speeds else x.diff() * N.x + y.diff() * N.y)
+    system = me.System(N, origin)
+    system.add_bodies(me.Particle("A", P, m))
+    system.add_coordinates(x)
+    system.add_coordinates(y, independent=not by_speeds)
+    if by_speeds:
+        system.add_speeds(u)
+        system.add_speeds(v, independent=False)
+        system.add_kdes(x.diff() - u, y.diff() - v)
+    system.add_holonomic_constraints(y - x**2)
+    system.apply_uniform_gravity(-g * N.y)
+    return system
+
+
+@pytest.mark.parametrize("by_speeds", [True, False])
+def test_a_system_of_sympy_gives_the_same_motion(by_speeds):
+    system = parabola_as_system(by_speeds)
+    if not by_speeds:
+        system.form_eoms(eom_method=me.LagrangesMethod)
+    names = ("u", "v") if by_speeds else ("v_x", "v_y")
+    start = {"x": 1, "y": 0.9}, dict(zip(names, (0.5, 0), strict=True))
+    problem = mechanics(system, {"m": 1, "g": G}, *start, independent=["x", names[0]])
+    assert problem.names.speeds == names
+    np.testing.assert_allclose(problem.y0, [1, 1, 0.5, 1], rtol=1e-14)
+    np.testing.assert_allclose(problem.motion_at(0.0, problem.y0)[2], -(4 * 0.25 + 2 * G) / 5, rtol=1e-14)
+    if by_speeds:
+        assert "potential of constant loads" in problem.energy_kept
+
+
+def test_joints_of_a_system_of_sympy():
+    """Two rods on pins; the end of the second one slides along the line of x through the first pin."""
+    m, g = sympy.symbols("m g")
+    ground, rods = me.RigidBody("ground"), [me.RigidBody(f"rod{k}", mass=m) for k in range(2)]
+    for rod in rods:
+        rod.central_inertia = me.inertia(rod.frame, 0, m / 12, m / 12)
+    system = me.System.from_newtonian(ground)
+    for k, (parent, place) in enumerate(((ground, None), (rods[0], rods[0].x / 2))):
+        pin = me.PinJoint(
+            f"pin{k}", parent, rods[k], joint_axis=parent.z, parent_point=place, child_point=-rods[k].x / 2
+        )
+        system.add_joints(pin)
+    (first, second), (one, two) = system.q, system.u
+    system.q_ind, system.q_dep, system.u_ind, system.u_dep = [first], [second], [one], [two]
+    end = rods[1].masscenter.locatenew("end", rods[1].x / 2)
+    system.add_holonomic_constraints(end.pos_from(system.fixed_point).dot(ground.y))
+    system.apply_uniform_gravity(-g * ground.x)
+    angle, rate = 0.7, 0.3
+    problem = mechanics(system, {m: 2.0, g: G}, {first: angle, second: -1.3}, {one: rate})
+    np.testing.assert_allclose(problem.y0, [angle, -2 * angle, rate, -2 * rate], rtol=1e-13)
+    # Rods of 1 m at the angles q and -q from the direction of x: T = (1/3 + sin^2 q) m q'^2, V = 2 m g cos q.
+    sin, cos = np.sin(angle), np.cos(angle)
+    expected = (G - cos * rate**2) * sin / (1 / 3 + sin**2)
+    np.testing.assert_allclose(problem.motion_at(0.0, problem.y0)[2:], [expected, -2 * expected], rtol=1e-12)
+
+
+def test_a_system_of_pydy_brings_constants_and_start():
+    pydy = pytest.importorskip("pydy.system", reason="needs PyDy: python -m pip install pydy")
+    model = particle(True)
+    m, g = sympy.symbols("m g")
+    start = dict(zip([*model.q, *model.u], (1.0, 1.0, 0.5, 1.0), strict=True))
+    system = pydy.System(model, constants={m: 2.0, g: G}, initial_conditions=start, times=np.linspace(0, 1, 5))
+    problem = mechanics(system)
+    assert problem.parameters == {"m": 2.0, "g": G}
+    np.testing.assert_allclose(problem.motion_at(0.0, problem.y0), system.evaluate_ode(), rtol=1e-13)
+    times, states = system.times, system.integrate(rtol=1e-10, atol=1e-10)
+    found = solve_ivp(problem.motion_at, (0, 1), problem.y0, t_eval=times, method="DOP853", rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(found.y.T, states, atol=1e-8)
+    # A constant that is given goes before that of the model.
+    lighter = mechanics(system, {"g": 1.0})
+    np.testing.assert_allclose(lighter.motion_at(0.0, lighter.y0)[2], -(4 * 0.25 + 2) / 5, rtol=1e-13)
+
+
 def test_what_is_wrong_with_a_model_is_said():
     model, start = particle(True), ({"x": 1}, {"u": 0.5})
     with pytest.raises(ValueError, match="value of 'g' is missing"):

@@ -168,7 +168,8 @@ def mechanics(
     model : KanesMethod, LagrangesMethod or System
         The model, or any object with the attribute ``eom_method``, which is one of the first two.
     params : mapping, optional
-        Values of the constants, by SymPy's symbols or by name. Default: ``model.constants``, as PyDy has them.
+        Values of the constants, by SymPy's symbols or by name. Those that are left out are taken from
+        ``model.constants``, which a System of PyDy has.
     q0, u0 : mapping or array_like, optional
         Coordinates and speeds at the start, by dynamicsymbols or by name, or in the order of ``model.q`` and
         ``model.u``, which has dependent speeds last. The speeds of a LagrangesMethod are the derivatives of the

@@ -31,13 +31,13 @@ def mechanics_of_model(
     others: Mapping[str, Any],
 ) -> MechanicsProblem:
     """See `mechanics`."""
-    if params is None:
-        params = getattr(model, "constants", None) or {}
+    # PyDy refuses constants that are in the constraints on positions alone: they are given here.
+    constants = {**(getattr(model, "constants", None) or {}), **(params or {})}
     if q0 is None and u0 is None:
         q0 = u0 = getattr(model, "initial_conditions", None)
     if q0 is None or u0 is None:
         raise TypeError("mechanics: q0 or u0 is missing; give the coordinates and speeds at the start.")
-    values = parameter_values({name_of(key): value for key, value in params.items()})
+    values = parameter_values({name_of(key): value for key, value in constants.items()})
     found = read(model, inputs or {}, values, energy)
     system = found.system
     names = Names(system.coordinates, system.speeds, found.position_names, found.velocity_names)
