@@ -296,6 +296,15 @@ def test_andrews_squeezing_mechanism_ends_where_it_is_known_to():
 
 @pytest.mark.nightly
 @pytest.mark.slow
+def test_the_car_axis_ends_where_it_is_known_to():
+    problem = examples.car_axis()
+    found = run(problem, 1e-12)
+    assert found.trusted
+    np.testing.assert_allclose(found.y[:, -1], examples.CAR_END, rtol=1e-8)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
 def test_bricards_mechanism_has_redundant_constraints():
     problem = examples.bricard()
     assert "24 on velocities of rank 23, 1 degree of freedom" in repr(problem)

@@ -1,7 +1,7 @@
 """Mechanisms with known motions: from functions of arrays, and from models of SymPy.
 
 Sources: the multibody benchmark library of IFToMM (A02 N-four-bar, A04 Bricard), the test set for initial value problem
-solvers (Andrews' squeezing mechanism).
+solvers (Andrews' squeezing mechanism, car axis).
 """
 
 from __future__ import annotations
@@ -15,7 +15,18 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy.problems import MechanicsProblem, mechanics, mechanism
 
-__all__ = ["EXAMPLES", "andrews", "bricard", "disc", "four_bar", "four_bar_model", "knife_edge", "n_four_bar"]
+__all__ = [
+    "EXAMPLES",
+    "PUBLISHED",
+    "andrews",
+    "bricard",
+    "car_axis",
+    "disc",
+    "four_bar",
+    "four_bar_model",
+    "knife_edge",
+    "n_four_bar",
+]
 
 G = 9.81  # m/s^2
 FINEST = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
@@ -156,6 +167,51 @@ def _andrews_constraints(t: Any, q: Any) -> np.ndarray:
             y - ZF * np.sin(q[5] + q[6]) + U * np.cos(q[6]) - YA,
         ]
     )
+
+
+# The car axis: on two springs on two wheels, the left wheel at rest, the right one on a bumpy road.
+
+CAR_END = [
+    0.04934557842755629, 0.4969894602303324, 1.041742524885400, 0.3739110272652214, -0.07705836840321485,
+    0.007446866596327776, 0.01755681574942899, 0.7703410437794031,
+]  # fmt: skip
+CAR_MASS, REST_LENGTH, BUMP, BUMPS = 5e-4, 0.5, 0.1, 10.0  # of an end of the axis; of the springs; of the road
+
+
+def car_axis() -> MechanicsProblem:
+    """Return the car axis: its ends and their velocities, with constraints that depend on t."""
+    return mechanism(
+        np.full(4, CAR_MASS),
+        _car_forces,
+        _car_constraints,
+        q0=[0, REST_LENGTH, 1, REST_LENGTH],
+        u0=[-0.5, 0, -0.5, 0],
+        t_span=(0.0, 3.0),
+        coordinates="x_l y_l x_r y_r",
+        name="car axis",
+        source="test set for initial value problem solvers",
+        reference=lambda t: np.array(CAR_END) if t == 3.0 else None,
+    )
+
+
+def _right_wheel(t: Any) -> np.ndarray:
+    """Return where the right wheel is, at a distance of 1 from the left one."""
+    height = BUMP * np.sin(BUMPS * t)
+    return np.array([np.sqrt(1 - height**2), height])
+
+
+def _car_forces(t: Any, q: Any, u: Any) -> np.ndarray:
+    pulls = []
+    for along in (q[:2], q[2:] - _right_wheel(t)):
+        length = np.sqrt(along @ along)
+        pulls += list((REST_LENGTH - length) / length * along - np.array([0, CAR_MASS]))
+    return np.array(pulls)
+
+
+def _car_constraints(t: Any, q: Any) -> np.ndarray:
+    """The left spring is perpendicular to the line between the wheels, and the axis has the length 1."""
+    axis = q[:2] - q[2:]
+    return np.array([q[:2] @ _right_wheel(t), axis @ axis - 1])
 
 
 # Bricard's mechanism: a loop of six rods of 1 m, the first one the ground. The axis of each joint is perpendicular to
@@ -374,8 +430,10 @@ EXAMPLES: dict[str, Callable[[], MechanicsProblem]] = {
     "5-four-bar": lambda: n_four_bar(5),
     "20-four-bar": lambda: n_four_bar(20),
     "andrews": andrews,
+    "car axis": car_axis,
     "bricard": bricard,
     "wobbling disc": lambda: disc(True),
     "steady disc": lambda: disc(False),
     "knife edge": knife_edge,
 }
+PUBLISHED = ("andrews", "car axis")  # the last state, to 13 digits at least
