@@ -44,6 +44,9 @@ COMMANDS = {
     ),
     "gpe ring": Entry("condensates.ring:Ring", "the paper's ring after its trap is tightened"),
     "gpe vortex-lines": Entry("condensates.lines:VortexLines", "the paper's condensate in 3D, turned faster"),
+    "mechanisms": Entry(
+        "mechanisms.study:Mechanisms", "error against cost of mechanisms with constraints, and IDA, LSODA and Radau"
+    ),
     "work-precision": Entry(
         "kepler.cost:KeplerCost", "error against cost of all methods on the perturbed Kepler problem"
     ),
@@ -73,9 +76,6 @@ COMMANDS = {
     "study import-time": Entry("measurements.import_time:ImportTime", "how long imports take"),
     "study long-orbits": Entry(
         "measurements.long_orbits:LongOrbits", "what projection and compensation bring over 1000 years"
-    ),
-    "study mechanisms": Entry(
-        "mechanisms.study:Mechanisms", "mechanisms with constraints and energy kept, compared with other ways"
     ),
     "study metric-memory": Entry(
         "measurements.metric_memory:MetricMemory", "the metric on problems whose error estimates mislead it"

@@ -29,6 +29,7 @@ __all__ = [
     "Curves",
     "ErrorSeries",
     "FieldPanel",
+    "Linkage",
     "Orbits",
     "ParticleRow",
     "SurfacePanel",
@@ -38,6 +39,7 @@ __all__ = [
     "fields_figure",
     "fields_movie",
     "gains_figure",
+    "linkage_figure",
     "longitude_figure",
     "orbit_in_time_figure",
     "orbits_figure",
@@ -489,11 +491,7 @@ def cost_figure(
             drawn.append((panel, axis))
             if shared and first.setdefault(panel.cost, axis) is not axis:
                 axis.sharex(first[panel.cost])
-            for name, values in panel.curves.items():
-                cost, errors = (np.asarray(value, dtype=float) for value in values)
-                good = (errors > 0) & (errors <= largest)
-                axis.plot(cost[good], errors[good], ms=5, lw=1.2, **styles[name])
-            axis.set_title(panel.title, fontsize="medium")
+            _draw_costs(axis, panel, styles, largest)
     for panel, axis in drawn:
         _log_x(axis)
         log_errors(axis, panel.cost, error if shared and axis in axes[:, 0] else "")
@@ -503,6 +501,90 @@ def cost_figure(
     if not shared:
         figure.supylabel(error, fontsize="medium")
     _legend_below(figure, axes[0, 0])
+    return figure
+
+
+def _draw_costs(axis: Axes, panel: CostPanel, styles: Styles, largest: float) -> None:
+    for name, values in panel.curves.items():
+        cost, errors = (np.asarray(value, dtype=float) for value in values)
+        good = (errors > 0) & (errors <= largest)
+        axis.plot(cost[good], errors[good], ms=5, lw=1.2, **styles[name])
+    axis.set_title(panel.title, fontsize="medium")
+
+
+class Linkage(NamedTuple):
+    """Positions of a linkage in a plane.
+
+    Attributes
+    ----------
+    t : array_like, shape (k,)
+    joints : array_like, shape (k, p, 2)
+        Both ends of the chain of links, and the joints between them.
+    pivots : array_like, shape (2, 2)
+        Points at rest, to which the ends belong.
+    """
+
+    t: Any
+    joints: Any
+    pivots: Any
+
+
+def linkage_figure(
+    drawings: Mapping[str, Linkage],
+    panels: Sequence[CostPanel],
+    *,
+    unit: str,
+    time: str,
+    error: str,
+    title: str = "",
+    largest: float = np.inf,
+) -> Figure:
+    """Draw a linkage at several times, a panel for each run, and below errors against costs.
+
+    A dotted line leads from the last link at the last time to its pivot.
+
+    Parameters
+    ----------
+    drawings : mapping of str to Linkage
+        By the titles of the panels; all with the same times.
+    panels : sequence of CostPanel, as many
+    unit, time, error : str
+        Unit of length, labels of the time and of the error.
+    title : str, optional
+    largest : float, optional
+        Larger errors are left out.
+
+    Returns
+    -------
+    Figure
+    """
+    figure = blank_figure(4.9 * len(panels), 7.4, title)
+    above, below = figure.subplots(2, len(panels), height_ratios=[1, 1.15], squeeze=False)
+    t = np.asarray(next(iter(drawings.values())).t, dtype=float)
+    for axis, (name, linkage) in zip(above, drawings.items(), strict=True):
+        links = LineCollection(
+            list(np.asarray(linkage.joints, dtype=float)), cmap="viridis", norm=Normalize(t[0], t[-1]), lw=1.8, zorder=2
+        )
+        links.set_array(t)
+        axis.add_collection(links)
+        for colour, joints in zip(links.to_rgba(t), np.asarray(linkage.joints), strict=True):
+            axis.plot(*joints.T, ls="", marker="o", ms=4, color=colour, zorder=3)
+        gap = np.array([linkage.joints[-1][-1], linkage.pivots[-1]])  # at the last time
+        axis.plot(*gap.T, color="crimson", ls=":", lw=1.6, zorder=1)
+        axis.plot(*np.asarray(linkage.pivots).T, ls="", marker="^", ms=10, color="black", zorder=4)
+        if axis is not above[0]:
+            axis.sharex(above[0])
+            axis.sharey(above[0])
+        axis.set(aspect="equal", xlabel=f"x [{unit}]", ylabel=f"y [{unit}]")
+        axis.set_title(name, fontsize="medium")
+        axis.grid(alpha=0.2)
+    figure.colorbar(links, ax=list(above), label=time, shrink=0.8, pad=0.01)
+    styles = method_styles(dict.fromkeys(name for panel in panels for name in panel.curves))
+    for axis, panel in zip(below, panels, strict=True):
+        _draw_costs(axis, panel, styles, largest)
+        _log_x(axis)
+        log_errors(axis, panel.cost, error)
+    _legend_below(figure, below[0])
     return figure
 
 

@@ -32,7 +32,6 @@ RUNS = [
     ("growth", "--years 1 --json run.json", REBOUND),
     ("import-time", "--rounds 1 --json run.json", ()),
     ("long-orbits", "--years 1 --json run.json", ()),
-    ("mechanisms", "--only 'knife edge' --json run.json", ()),
     ("metric-memory", "--only gear --json run.json", ()),
     ("metric-table", "--years 100 --rotations 1 --json run.json", ()),
     ("multistep", "--quick --parts 1 2 4 --json run.json", REBOUND),

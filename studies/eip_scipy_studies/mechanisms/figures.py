@@ -1,0 +1,53 @@
+"""The four-bar linkage at several times, above its errors against costs."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from eip_scipy import EIPRK45, integrate
+
+from .examples import four_bar
+
+__all__ = ["four_bar_figure", "joints"]
+
+TOLERANCE, LAST = 1e-4, np.array([2.0, 1.5, 1.0, 0.5, 0.0])  # of the runs that are drawn; seconds before the end
+
+
+def joints(y: np.ndarray, sizes: Mapping[str, float]) -> np.ndarray:
+    """Return the ends of the links of the four-bar linkage of these sizes at states (6, k), as an array (k, 4, 2)."""
+    angles = np.cumsum(y[:3], axis=0).T
+    lengths = np.array([sizes[name] for name in ("la", "lb", "lc")])[:, None]
+    ends = np.cumsum(lengths * np.stack([np.cos(angles), np.sin(angles)], axis=-1), axis=1)
+    return np.concatenate([np.zeros((len(ends), 1, 2)), ends], axis=1)
+
+
+def four_bar_figure(panels: Sequence[Any]) -> Any:
+    """Draw the linkage by RK45, without projection and with constraints and energy kept, and two `CostPanel`."""
+    from ..plotting import Linkage, linkage_figure
+
+    problem = four_bar()
+    pivots, drawings = [[0, 0], [problem.parameters["ln"], 0]], {}
+    options: dict[str, Any] = {
+        "method": EIPRK45,
+        "rtol": TOLERANCE,
+        "atol": TOLERANCE,
+        "t_eval": problem.t_span[1] - LAST,
+    }
+    for name, invariants in (("without projection", ()), ("constraints and energy kept", problem.invariants)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            run = integrate(problem, invariants=invariants, **options)
+        drawings[f"RK45 at {TOLERANCE:g}, {name}"] = Linkage(run.t, joints(run.y, problem.parameters), pivots)
+    return linkage_figure(
+        drawings,
+        panels,
+        unit="m",
+        time="t [s]",
+        error="error of the last angles",
+        title="Four-bar linkage",
+        largest=1.0,
+    )

@@ -1,0 +1,61 @@
+"""The speed of the four-bar linkage's right-hand side, and of the way from a model to its first result."""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+from ..beside import Beside
+from ..timing import least, many_calls
+from .examples import four_bar, four_bar_model
+from .ways import kept, lambdified
+
+__all__ = ["Speed", "first_result", "speed"]
+
+TURNS, TOLERANCE = 10, 1e-10
+
+
+class Speed(NamedTuple):
+    """Processor time: microseconds of a right-hand side, and seconds from a model to its first result.
+
+    Attributes
+    ----------
+    compiled : float
+        The compiled right-hand side, in a run without projection: the run's time by its number of calls.
+    lambdified : float
+        The right-hand side as users write it, with lambdify(cse=True) and numpy.linalg.solve.
+    first : float
+        From a SymPy model whose equations are derived to the last state of a run, in a new process.
+    """
+
+    compiled: float
+    lambdified: float
+    first: float
+
+
+def speed() -> Speed:
+    """Measure."""
+    problem = four_bar()
+    kept(problem, (), TOLERANCE)  # compiles
+    state, plain = problem.y0, lambdified(problem, 0.0)
+
+    def compiled() -> float:
+        began = time.process_time()
+        calls = kept(problem, (), TOLERANCE).nfev
+        return (time.process_time() - began) / calls
+
+    times = least({"compiled": compiled, "lambdified": many_calls(lambda: plain(0.0, state))}, turns=TURNS)
+    with Beside() as process:
+        process.start(first_result)
+        first = process.result()
+    return Speed(1e6 * times["compiled"], 1e6 * times["lambdified"], first)
+
+
+def first_result() -> float:
+    """Return the processor time from the derived model to the first result; nothing is compiled or imported before."""
+    four_bar_model()
+    began = time.process_time()
+    problem = four_bar()
+    run = kept(problem, problem.invariants, 1e-8)
+    assert run.success
+    return time.process_time() - began
