@@ -1,5 +1,6 @@
 """Dense output: exactly y_k at t_k, on the manifold in between, of SciPy's orders, and safe brackets for events."""
 
+import functools
 import math
 
 import numpy as np
@@ -85,6 +86,12 @@ def solve(method, **options):
     return solve_ivp(fun, t_span, y0, method=method, **options)
 
 
+@functools.cache
+def solved(method, variant):
+    """A run whose dense output several tests look at."""
+    return solve(method, **VARIANTS[variant], dense_output=True)
+
+
 def levels(invariants, sol):
     """Values of the invariants at the steps (l, m)."""
     items = invariants if isinstance(invariants, (list, tuple)) else [invariants]
@@ -97,7 +104,7 @@ def levels(invariants, sol):
 @every_class
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_exactly_the_steps(method, variant):
-    sol = solve(method, **VARIANTS[variant], dense_output=True)
+    sol = solved(method, variant)
     assert sol.status == 0
     assert len(sol.t) > 5
     for k, t in enumerate(sol.t):
@@ -113,13 +120,10 @@ def test_exactly_the_steps(method, variant):
 
 
 @every_class
-@pytest.mark.parametrize("variant", [name for name, options in VARIANTS.items() if "invariants" in options])
+@pytest.mark.parametrize("variant", [name for name, options in VARIANTS.items() if options.get("invariants")])
 def test_on_the_level_between_the_ends(method, variant):
     """The level is linear between the defects of a step's ends, whatever they are."""
-    options = VARIANTS[variant]
-    if not options["invariants"]:
-        return
-    sol = solve(method, **options, dense_output=True)
+    options, sol = VARIANTS[variant], solved(method, variant)
     items = options["invariants"] if isinstance(options["invariants"], list) else [options["invariants"]]
     values = levels(items, sol)
     for k in np.unique(np.linspace(0, len(sol.t) - 2, 12).astype(int)):
@@ -142,7 +146,7 @@ def test_unprojected_interpolation_leaves_the_manifold(method):
 @every_class
 @pytest.mark.parametrize("variant", ["plain", "H, L", "backward", "complex", "every 3", "fixed", "uses_f"])
 def test_scalar_and_array_times_agree(method, variant):
-    sol = solve(method, **VARIANTS[variant], dense_output=True)
+    sol = solved(method, variant)
     t = np.random.default_rng(0).permutation(np.linspace(sol.t[0], sol.t[-1], 60))
     together = sol.sol(t)
     assert together.shape == (len(sol.y), 60)
@@ -157,7 +161,7 @@ def test_scalar_and_array_times_agree(method, variant):
 @every_class
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_extrapolation_is_finite(method, variant):
-    sol = solve(method, **VARIANTS[variant], dense_output=True)
+    sol = solved(method, variant)
     t0, t1 = sorted((sol.t[0], sol.t[-1]))
     near = np.array([t0 - 0.01, t1 + 0.01])
     assert np.isfinite(sol.sol(near)).all()

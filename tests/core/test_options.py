@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from eip_scipy import EIPRK4, EIPRK45, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate
+from eip_scipy import EIPRK4, EIPRK45, EIPRKN8, EIPRKN12, ensemble, integrate
 from eip_scipy.core.options import ProjectionKeywords, ProjectionOptions
 from eip_scipy.ensembles.ensemble import EnsembleKeywords
 from eip_scipy.problems import kepler
@@ -73,19 +73,3 @@ def test_compensated_steps_without_invariants_are_not_scipys():
     exact = 1e6 + 1.0 / 3.0
     assert abs(ends[0] - exact) <= np.spacing(exact)
     assert abs(ends[1] - exact) > np.spacing(exact)
-
-
-def test_an_ensemble_takes_the_same_options():
-    norm = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="norm")
-    given = {"metric": "euclidean", "iterations": 2, "direction": "old", "every": 3, "compensated": True}
-    y0s = np.array([[1.0, 0.0], [0.0, 2.0]])
-
-    def fun(t, y):
-        return np.array([y[1], -y[0]])
-
-    run = ensemble(fun, (0, 3), y0s, h=0.1, invariants=norm, compiled=False, **given)
-    for k, y0 in enumerate(y0s):
-        single = integrate(fun, (0, 3), y0, method=EIPRK4, h=0.1, invariants=norm, compiled=False, **given)
-        np.testing.assert_array_equal(run.y[k], single.y[:, -1])
-    with pytest.raises(TypeError, match=r"ensemble\(\) has no option 'metrik'; did you mean 'metric'"):
-        ensemble(fun, (0, 3), y0s, h=0.1, metrik=1)

@@ -120,11 +120,11 @@ def test_other_arguments_are_python_s():
 def test_second_order_in_place_and_jacobian():
     @njit
     def acc(t, q, out, k, m):
-        out[:] = -k / m * q
+        out[0] = -k / m * q[0]
 
     @njit
     def jacobian(t, q, dq, out, k, m):
-        out[:] = -k / m * dq
+        out[0] = -k / m * dq[0]
 
     exact = np.cos(np.sqrt(K / M) * SPAN[1]) + 0.5 * np.sqrt(M / K) * np.sin(np.sqrt(K / M) * SPAN[1])
     options = {"h": 0.05, "args": (K, M), "in_place": True, "jacobian": jacobian}

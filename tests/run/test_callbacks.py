@@ -8,8 +8,7 @@ import pytest
 from numba import njit
 from systems import SQUARE, oscillator
 
-from eip_scipy import EIPRK4, EIPRK45, Invariant, ensemble, integrate
-from eip_scipy.checkpoint import CheckpointError
+from eip_scipy import EIPRK4, EIPRK45, Invariant, integrate
 
 Y0 = [1.0, 2.0]
 # Beyond a thousand doublings of a number of steps, where no float holds it any more.
@@ -125,27 +124,3 @@ def test_endless_needs_a_callback_at_saved_steps(options):
     callback = None if "save_every" in options else lambda t, y, d: t > 3
     with pytest.raises(ValueError, match=r"t_span must be finite unless .*callback.*save_every"):
         integrate(oscillator, (0, math.inf), Y0, method=EIPRK4, h=0.1, callback=callback, **options)
-
-
-@pytest.mark.parametrize("value", [1, "stop", [print]])
-def test_wrong_callbacks(value):
-    with pytest.raises(TypeError, match=r"callback must be a function callback\(t, y, defects\), got"):
-        integrate(oscillator, (0, 1), Y0, method=EIPRK4, h=0.1, callback=value)
-    with pytest.raises(TypeError, match=r"callback must be a function callback\(part\), got"):
-        ensemble(oscillator, (0, 1), [Y0], method=EIPRK4, h=0.1, callback=value)
-
-
-def test_a_callback_that_overwrites_its_state():
-    def callback(t, y, defects):
-        y[:] = math.nan
-        defects[:] = math.nan
-
-    plain = run("fixed", n=10)
-    np.testing.assert_array_equal(run("fixed", n=10, callback=callback).y, plain.y)
-
-
-def test_checkpoint_is_there_already(tmp_path):
-    """The harness above resumes what it means to."""
-    run("fixed", n=10, checkpoint=tmp_path / "a.npz")
-    with pytest.raises(CheckpointError):
-        run("fixed", n=10, checkpoint=tmp_path / "a.npz")

@@ -453,12 +453,14 @@ def test_compiled_functions_that_return_none(part):
 @pytest.mark.slow
 @needs_jit
 @pytest.mark.parametrize("part", ["fun", "value", "gradient"])
-def test_compiled_shapes_that_change(part):
+@pytest.mark.parametrize("late", [1, 3])
+def test_compiled_shapes_that_change(part, late):
+    """Neither spread over the components, nor written or read beyond an array's end."""
     number = ["fun", "value", "gradient"].index(part)
 
     @njit
     def size(place, t):
-        return 3 if place == number and t > 0.55 else 2
+        return late if place == number and t > 0.55 else 2
 
     fun = njit(lambda t, y: np.array([y[1], -y[0], 0.0])[: size(0, t)])
     value = njit(lambda t, y: np.full(size(1, t), y @ y))
