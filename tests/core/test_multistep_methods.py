@@ -74,6 +74,12 @@ def exact(times, y0=Y0):
     return np.array(out).T
 
 
+def run(end, y0=Y0, **options):
+    """Integrate the orbit by its acceleration, with its Jacobian and in steps of 1/256 of its period unless told."""
+    options = {"acceleration": acceleration, "jacobian": jacobian, "h": STEP} | options
+    return integrate(t_span=(0, end), y0=y0, **options)
+
+
 @pytest.mark.parametrize("order", range(8, 15))
 def test_order(order):
     """The error after ten revolutions falls with the order, in steps that truncation decides."""
@@ -88,21 +94,8 @@ def test_order(order):
         14: (100, 140),
     }
     end = 20 * np.pi
-    errors = [
-        np.abs(
-            integrate(
-                acceleration=acceleration,
-                t_span=(0, end),
-                y0=Y0,
-                method=method,
-                h=2 * np.pi / n,
-                jacobian=jacobian,
-                compiled=False,
-            ).y[:, -1]
-            - exact(end)[:, 0]
-        ).max()
-        for n in counts[order]
-    ]
+    ends = [run(end, method=method, h=2 * np.pi / n, compiled=False).y[:, -1] for n in counts[order]]
+    errors = [np.abs(found - exact(end)[:, 0]).max() for found in ends]
     found = np.log(errors[0] / errors[1]) / np.log(counts[order][1] / counts[order][0])
     assert errors[1] > 1e-13
     assert order - 1 < found < order + 4
@@ -113,24 +106,14 @@ def test_order(order):
 def test_a_long_run_keeps_its_invariants_and_its_orbit(method):
     """A hundred revolutions, both errors near round-off; the result says so."""
     record = Diagnostics()
-    run = integrate(
-        acceleration=acceleration,
-        t_span=(0, 200 * np.pi),
-        y0=Y0,
-        method=method,
-        h=STEP,
-        jacobian=jacobian,
-        diagnostics=record,
-        save_every=999,
-        **KEPT,
-    )
-    assert run.success
-    assert run.trusted
-    assert run.compiled
-    assert run.calls["jacobian"] == "jitted" if method is EIPGJ14 else "jacobian" not in run.calls
-    assert np.all(run.max_defect < 1e-15)
-    assert np.abs(run.y - exact(run.t)).max() < 2e-11
-    assert run.nfev < 256 * 100 + 600
+    found = run(200 * np.pi, method=method, diagnostics=record, save_every=999, **KEPT)
+    assert found.success
+    assert found.trusted
+    assert found.compiled
+    assert found.calls["jacobian"] == "jitted" if method is EIPGJ14 else "jacobian" not in found.calls
+    assert np.all(found.max_defect < 1e-15)
+    assert np.abs(found.y - exact(found.t)).max() < 2e-11
+    assert found.nfev < 256 * 100 + 600
     assert record.n_projections + record.n_skipped > 100
 
 
@@ -138,20 +121,16 @@ def test_a_long_run_keeps_its_invariants_and_its_orbit(method):
 def test_projection_is_what_keeps_the_orbit(method):
     """Without invariants the truncation of long steps adds up."""
     h = 2 * np.pi / (190 if method is EIPGJ12 else 90)
-    given = {"method": method, "h": h, "jacobian": jacobian}
     end = 400 * np.pi
-    kept, left = (
-        integrate(acceleration=acceleration, t_span=(0, end), y0=Y0, **given, **options).y[:, -1]
-        for options in (KEPT, {})
-    )
+    kept, left = (run(end, method=method, h=h, **options).y[:, -1] for options in (KEPT, {}))
     assert np.abs(kept - exact(end)[:, 0]).max() < 0.3 * np.abs(left - exact(end)[:, 0]).max()
 
 
 def test_what_is_held_are_the_invariants_of_the_start():
     """Not those on the way, which long steps shift, nor their rounding: Mercury would be 2e-9 AU off by either."""
     problem = solar_system(years=100)
-    run = integrate(problem, method=EIPGJ14, h=1 / 360)
-    missed = (run.y[:, -1] - problem.reference(100))[3:6]
+    found = integrate(problem, method=EIPGJ14, h=1 / 360)
+    missed = (found.y[:, -1] - problem.reference(100))[3:6]
     assert np.linalg.norm(missed) < 6e-10
 
 
@@ -182,14 +161,13 @@ def test_between_steps(method, sign):
     end = 20.3
     y0 = Y0 if sign > 0 else Y0 * [1, 1, -1, -1]
     times = np.linspace(0, end, 111)
-    given = {"method": method, "h": STEP, "jacobian": jacobian, **KEPT}
-    run = integrate(acceleration=acceleration, t_span=(0, sign * end), y0=y0, dense_output=True, save_every=1, **given)
+    given = {"method": method, **KEPT}
+    found = run(sign * end, y0, dense_output=True, save_every=1, **given)
     flip = np.array([1, 1, sign, sign])[:, None]
-    assert np.abs(run.y * flip - exact(np.abs(run.t))).max() < 2e-13
-    assert np.abs(run.sol(sign * times) * flip - exact(times)).max() < 1e-12
-    sampled = integrate(acceleration=acceleration, t_span=(0, sign * end), y0=y0, t_eval=sign * times, **given)
-    assert np.array_equal(sampled.y, run.sol(sign * times))
-    assert np.array_equal(run.sol(run.t), run.y)
+    assert np.abs(found.y * flip - exact(np.abs(found.t))).max() < 2e-13
+    assert np.abs(found.sol(sign * times) * flip - exact(times)).max() < 1e-12
+    assert np.array_equal(run(sign * end, y0, t_eval=sign * times, **given).y, found.sol(sign * times))
+    assert np.array_equal(found.sol(found.t), found.y)
 
 
 @both
@@ -198,10 +176,10 @@ def test_intervals_far_below_the_step(method, end):
     """An interval that is not empty takes a step; y(t) = y0 + t y'(t0) to rounding, because end^2 is below that."""
     rates = np.concatenate([Y0[Y0.size // 2 :], acceleration(0.0, Y0[: Y0.size // 2])])
     given = {"acceleration": acceleration, "t_span": (0, end), "method": method, "h": STEP, "jacobian": jacobian}
-    run = integrate(y0=Y0, **given, **KEPT)
-    assert run.status == 0
-    assert run.t[-1] == end
-    assert np.abs(run.y[:, -1] - (Y0 + end * rates)).max() < 1e-15
+    found = integrate(y0=Y0, **given, **KEPT)
+    assert found.status == 0
+    assert found.t[-1] == end
+    assert np.abs(found.y[:, -1] - (Y0 + end * rates)).max() < 1e-15
     members = ensemble(y0s=np.array([Y0, Y0]), **given, **KEPT)
     assert (members.status == 0).all()
     assert (members.t == end).all()
@@ -213,33 +191,15 @@ def test_few_steps(method):
     for count in (1, 2, 5, 11, 12, 13, 14, 15, 16, 17, 20, 27):
         for extra in (0.0, 0.3):
             end = (count + extra) * STEP
-            run = integrate(
-                acceleration=acceleration,
-                t_span=(0, end),
-                y0=Y0,
-                method=method,
-                h=STEP,
-                save_every=1,
-                jacobian=jacobian,
-                **KEPT,
-            )
-            assert run.t.size == count + 1 + (extra > 0)
-            assert np.abs(run.y - exact(run.t)).max() < 3e-15
+            found = run(end, method=method, save_every=1, **KEPT)
+            assert found.t.size == count + 1 + (extra > 0)
+            assert np.abs(found.y - exact(found.t)).max() < 3e-15
 
 
 def test_bits_do_not_depend_on_what_is_saved():
     """Nor on chunks: rows, times and events are looked at, and change nothing."""
-    given = {"method": EIPGJ14, "h": STEP, "jacobian": jacobian, **KEPT}
-    last = [
-        integrate(acceleration=acceleration, t_span=(0, 60), y0=Y0, **given, **options).y[:, -1]
-        for options in (
-            {},
-            {"save_every": 1},
-            {"save_every": 77},
-            {"dense_output": True},
-            {"events": lambda t, y: y[0]},
-        )
-    ]
+    ways = {}, {"save_every": 1}, {"save_every": 77}, {"dense_output": True}, {"events": lambda t, y: y[0]}
+    last = [run(60, method=EIPGJ14, **KEPT, **options).y[:, -1] for options in ways]
     assert all(np.array_equal(state, last[0]) for state in last)
 
 
@@ -251,9 +211,7 @@ def test_python_jitted_and_native_functions_give_the_same_bits():
     assert native.calls["jacobian"] == "native"
     interpreted = integrate(problem, method=EIPGJ14, compiled=False)
     assert np.array_equal(native.y, interpreted.y)
-    given = {"method": EIPGJ14, "h": STEP, **KEPT}
-    compiled = integrate(acceleration=acceleration, t_span=(0, 20), y0=Y0, jacobian=jacobian, **given)
-    python = integrate(acceleration=acceleration, t_span=(0, 20), y0=Y0, jacobian=jacobian, compiled=False, **given)
+    compiled, python = (run(20, method=EIPGJ14, compiled=how, **KEPT) for how in (None, False))
     assert compiled.compiled
     assert not python.compiled
     assert np.array_equal(compiled.y, python.y)
@@ -324,32 +282,13 @@ def test_events():
         return y[0] * y[2] + y[1] * y[3]
 
     pericentre.direction = 1
-    run = integrate(
-        acceleration=acceleration,
-        t_span=(0, 40),
-        y0=Y0,
-        method=EIPGJ14,
-        h=STEP,
-        jacobian=jacobian,
-        events=pericentre,
-        **KEPT,
-    )
+    (times,) = run(40, method=EIPGJ14, events=pericentre, **KEPT).t_events
     period = 2 * np.pi
-    later = run.t_events[0][run.t_events[0] > 1]
-    assert np.allclose(later, period * np.arange(1, 7), rtol=0, atol=1e-11)
-    pericentre.terminal = run.t_events[0].size - 3
-    run = integrate(
-        acceleration=acceleration,
-        t_span=(0, 40),
-        y0=Y0,
-        method=EIPGJ14,
-        h=STEP,
-        jacobian=jacobian,
-        events=pericentre,
-        **KEPT,
-    )
-    assert run.status == 1
-    assert abs(run.t[-1] - 3 * period) < 1e-11
+    assert np.allclose(times[times > 1], period * np.arange(1, 7), rtol=0, atol=1e-11)
+    pericentre.terminal = times.size - 3
+    found = run(40, method=EIPGJ14, events=pericentre, **KEPT)
+    assert found.status == 1
+    assert abs(found.t[-1] - 3 * period) < 1e-11
 
 
 @both
@@ -396,11 +335,11 @@ def test_members_have_the_bits_of_single_runs():
 def test_forces(forces):
     """Relativity by velocities too, beside a tight run of another method."""
     problem = solar_system(years=1, forces=forces)
-    run = integrate(problem, method=EIPGJ14, h=1 / 600)
+    found = integrate(problem, method=EIPGJ14, h=1 / 600)
     other = integrate(problem, method=EIPDOP853, h=1 / 2000, compensated=True)
-    assert run.trusted
+    assert found.trusted
     # The energy of "eih", kept to 1e-13, is Mercury's to 4e-11.
-    assert np.abs(run.y[:30, -1] - other.y[:30, -1]).max() < (2e-11 if forces == "eih" else 3e-13)
+    assert np.abs(found.y[:30, -1] - other.y[:30, -1]).max() < (2e-11 if forces == "eih" else 3e-13)
 
 
 def test_velocities_are_found_in_solve_ivp():
@@ -453,14 +392,9 @@ def test_a_step_that_is_not_stable_is_refused_with_one_that_is():
         integrate(problem, method=EIPGJ12, h=0.004)
     longest = float(str(error.value).split("Take h <= ")[1].split(",")[0])
     assert integrate(problem, method=EIPGJ12, h=0.99 * longest).trusted
+    springs = lambda t, q: -np.array([1.0, 9.0]) * q  # noqa: E731
     with pytest.raises(ValueError, match=r"of frequency 3 \(period 2\.094\)\. Take h <= 0\.0217"):
-        integrate(
-            acceleration=lambda t, q: -np.array([1.0, 9.0]) * q,
-            t_span=(0, 10),
-            y0=[1.0, 1.0, 0.0, 0.0],
-            method=EIPGJ12,
-            h=0.05,
-        )
+        run(10, [1.0, 1.0, 0.0, 0.0], acceleration=springs, jacobian=None, method=EIPGJ12, h=0.05)
     with pytest.raises(ValueError, match="is not stable"):
         solve_ivp(orbit, (0, 20), Y0, method=EIPGJ14, h=STEP)  # which has no Jacobian here
 
@@ -472,9 +406,9 @@ def test_bodies_without_relative_angular_momentum(method):
     After one period of 6.32591398 the start comes back, to the digits that it is given in.
     """
     problem = figure_eight()
-    run = integrate(problem, (0, 6.32591398), method=method, h=0.01)
-    assert run.trusted
-    np.testing.assert_allclose(run.y[:, -1], problem.y0, rtol=0, atol=1e-7)
+    found = integrate(problem, (0, 6.32591398), method=method, h=0.01)
+    assert found.trusted
+    np.testing.assert_allclose(found.y[:, -1], problem.y0, rtol=0, atol=1e-7)
     brief = integrate(problem, (0, 1e-4), method=method, h=1e-6)
     exact = integrate(problem, (0, 1e-4), method=EIPDOP853, rtol=1e-13, atol=1e-15)
     np.testing.assert_allclose(brief.y[:, -1], exact.y[:, -1], rtol=0, atol=1e-14)
@@ -489,8 +423,8 @@ def test_a_radial_motion_has_a_finite_frequency(apart):
     if apart == 0.0:
         with pytest.raises(ValueError, match=r"Take h <= 0\.000\d+"):
             integrate(problem, (0, 1), method=EIPGJ14)
-    run = integrate(problem, method=EIPGJ14)
-    np.testing.assert_allclose(run.y[:, -1], expected, rtol=0, atol=1e-11)
+    found = integrate(problem, method=EIPGJ14)
+    np.testing.assert_allclose(found.y[:, -1], expected, rtol=0, atol=1e-11)
 
 
 def test_a_moon_is_named_by_its_own_frequency():
@@ -504,41 +438,39 @@ def test_a_moon_is_named_by_its_own_frequency():
 def test_what_becomes_unstable_is_told():
     """A close passage that the start does not show ends the run, with what it had."""
     start = np.array([1.0, 0.0, 0.0, 0.02])
-    run = integrate(acceleration=acceleration, t_span=(0, 5), y0=start, method=EIPGJ12, h=0.005, save_every=10)
-    assert run.status == -1
-    assert not run.trusted
-    assert "the step is too long, or the motion not smooth" in run.message
-    assert "EIPRKN12" in run.message
-    assert 0.5 < run.t[-1] < 1.3
-    assert np.isfinite(run.y).all()
+    found = run(5, start, method=EIPGJ12, h=0.005, save_every=10)
+    assert found.status == -1
+    assert not found.trusted
+    assert "the step is too long, or the motion not smooth" in found.message
+    assert "EIPRKN12" in found.message
+    assert 0.5 < found.t[-1] < 1.3
+    assert np.isfinite(found.y).all()
 
 
 def test_a_passage_is_told_at_whichever_step_it_comes():
     """Not only where it falls near a projection: here none is made, and it comes later by two steps each time."""
     for later in range(0, 70, 2):
         start = np.array([(1 + later * 0.005 / 1.11) ** (2 / 3), 0.0, 0.0, 0.02])
-        run = integrate(acceleration=acceleration, t_span=(0, 3), y0=start, method=EIPGJ12, h=0.005, save_every=10)
+        found = run(3, start, method=EIPGJ12, h=0.005, save_every=10)
         passage = np.pi * np.sqrt((start[0] / 2) ** 3)
-        assert run.status == -1
-        assert passage - 0.1 < run.t[-1] < passage + 0.1
+        assert found.status == -1
+        assert passage - 0.1 < found.t[-1] < passage + 0.1
 
 
 def test_a_force_that_jumps_is_told():
     """Differences of its history do not fall."""
-    run = integrate(
-        acceleration=lambda t, q: -q * (1.0 if t < 3 else 1.5), t_span=(0, 20), y0=[1.0, 0.0], method=EIPGJ12, h=0.03
-    )
-    assert run.status == -1
-    assert "or forces jump" in run.message
-    assert 3 <= float(run.message.split("at t=")[1].split(":")[0]) < 6
+    jumping = lambda t, q: -q * (1.0 if t < 3 else 1.5)  # noqa: E731
+    found = run(20, [1.0, 0.0], acceleration=jumping, jacobian=None, method=EIPGJ12, h=0.03)
+    assert found.status == -1
+    assert "or forces jump" in found.message
+    assert 3 <= float(found.message.split("at t=")[1].split(":")[0]) < 6
 
 
 def test_a_false_invariant_is_told():
     """As of other methods."""
     false = Invariant(lambda t, y: y[0] ** 2 + y[3], lambda t, y: np.array([2 * y[0], 0, 0, 1.0]))
     with pytest.warns(ProjectionWarning, match="is no invariant of this system"):
-        run = integrate(acceleration=acceleration, t_span=(0, 30), y0=Y0, method=EIPGJ12, h=STEP, invariants=false)
-    assert not run.trusted
+        assert not run(30, method=EIPGJ12, invariants=false).trusted
 
 
 @pytest.mark.parametrize(
@@ -554,7 +486,7 @@ def test_a_false_invariant_is_told():
 def test_bad_options(options, error, message):
     """What came, and what to do."""
     with pytest.raises(error, match=message):
-        integrate(acceleration=acceleration, t_span=(0, 1), y0=Y0, **{"method": EIPGJ12, "h": 0.01, **KEPT, **options})
+        run(1, **{"method": EIPGJ12, "h": 0.01, "jacobian": None, **KEPT, **options})
 
 
 def test_states_that_are_none():
@@ -567,11 +499,10 @@ def test_states_that_are_none():
 
 def test_what_is_not_finite():
     """Where it was, as of other methods."""
-    run = integrate(
-        acceleration=lambda t, q: -q if t < 1 else q * np.nan, t_span=(0, 3), y0=[1.0, 0.0], method=EIPGJ12, h=0.03
-    )
-    assert run.status == -1
-    assert "acceleration returned a non-finite value at t=1.02" in run.message
+    broken = lambda t, q: -q if t < 1 else q * np.nan  # noqa: E731
+    found = run(3, [1.0, 0.0], acceleration=broken, jacobian=None, method=EIPGJ12, h=0.03)
+    assert found.status == -1
+    assert "acceleration returned a non-finite value at t=1.02" in found.message
 
 
 @both
@@ -588,14 +519,14 @@ def test_test_particles_and_many_bodies(method):
         [[0, -1e-3 / np.sqrt(5), 0], [0, 1 / np.sqrt(5), 0], *speed],
         t_span=(0, 10),
     )
-    run = integrate(problem, method=method, h=0.02)
+    found = integrate(problem, method=method, h=0.02)
     other = integrate(problem, method=EIPRKN12, h=0.1, compensated=True)
-    assert run.trusted
-    assert np.abs(run.y[:, -1] - other.y[:, -1]).max() < 1e-12
+    assert found.trusted
+    assert np.abs(found.y[:, -1] - other.y[:, -1]).max() < 1e-12
 
 
 def test_a_problem_of_ones_own():
     """Velocities in `fun` of a Problem, which has the whole derivative."""
     problem = Problem(name="orbit", fun=orbit, y0=Y0, t_span=(0, 10), invariants=INVARIANTS, h=STEP)
-    run = integrate(problem, method=EIPGJ12)
-    assert np.abs(run.y[:, -1] - exact(10)[:, 0]).max() < 2e-14
+    found = integrate(problem, method=EIPGJ12)
+    assert np.abs(found.y[:, -1] - exact(10)[:, 0]).max() < 2e-14
