@@ -1,55 +1,13 @@
 """Published examples of solve_ivp run with the method's name changed, and keep what they could not keep before.
 
-The first three are those of the documentation of `scipy.integrate.solve_ivp` (exponential decay, the cannon with its
-events, Lotka-Volterra with args and dense output); the last is the double pendulum of Matplotlib's gallery with its
-equations (masses and lengths 1), where a user would watch the energy.
+Lotka-Volterra, with args and dense output, is in the documentation of `scipy.integrate.solve_ivp`; the double pendulum
+is that of Matplotlib's gallery with its equations (masses and lengths 1), where a user would watch the energy.
 """
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from eip_scipy import EIPRK45, Invariant
-
-
-def test_exponential_decay():
-    def exponential_decay(t, y):
-        return -0.5 * y
-
-    sol = solve_ivp(exponential_decay, [0, 10], [2, 4, 8], method=EIPRK45, t_eval=[0, 1, 2, 4, 10])
-    same = solve_ivp(exponential_decay, [0, 10], [2, 4, 8], t_eval=[0, 1, 2, 4, 10])
-    np.testing.assert_array_equal(sol.y[:, :-1], same.y[:, :-1])
-    # The last point is the step's own state, where SciPy's interpolant has its rounding.
-    np.testing.assert_array_equal(sol.y[:, -1], solve_ivp(exponential_decay, [0, 10], [2, 4, 8]).y[:, -1])
-
-
-def test_cannon():
-    def upward_cannon(t, y):
-        return [y[1], -0.5]
-
-    def hit_ground(t, y):
-        return y[0]
-
-    hit_ground.terminal = True
-    hit_ground.direction = -1
-
-    def apex(t, y):
-        return y[1]
-
-    energy = Invariant(lambda t, y: 0.5 * y[1] ** 2 + 0.5 * y[0], lambda t, y: np.array([0.5, y[1]]), name="energy")
-    for kept in ((), energy):
-        sol = solve_ivp(
-            upward_cannon,
-            [0, 100],
-            [0, 10],
-            method=EIPRK45,
-            events=(hit_ground, apex),
-            dense_output=True,
-            invariants=kept,
-        )
-        assert sol.status == 1
-        np.testing.assert_allclose(sol.t_events[0], [40.0], rtol=1e-12)
-        np.testing.assert_allclose(sol.t_events[1], [20.0], rtol=1e-12)
-        np.testing.assert_allclose(sol.sol(sol.t_events[1][0]), [100.0, 0.0], atol=1e-11)
 
 
 def test_lotka_volterra():
