@@ -1,4 +1,4 @@
-"""Small systems that several test modules share: oscillator, Kepler's problem (G M = 1), Lotka-Volterra."""
+"""Small systems that several test modules share: oscillator, pendulum, Kepler's problem (G M = 1), Lotka-Volterra."""
 
 import math
 
@@ -13,6 +13,30 @@ def oscillator(t, y):
 
 
 SQUARE = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="S")
+
+
+class Verlet:
+    """Position Verlet for the unit oscillator, in place: a one-step method of a user's own."""
+
+    order = 2
+
+    def one_step(self, t, y, h):
+        y[0] += h / 2 * y[1]
+        y[1] -= h * y[0]
+        y[0] += h / 2 * y[1]
+        return y
+
+
+def pendulum(t, y):
+    return np.array([y[1], -np.sin(y[0])])
+
+
+def pendulum_energy(t, y):
+    return 0.5 * y[1] ** 2 - np.cos(y[0])
+
+
+def pendulum_gradient(t, y):
+    return np.array([np.sin(y[0]), y[1]])
 
 
 # Kepler's problem in the plane, y = (x, y, vx, vy). The invariants take states (4, m) too.

@@ -6,6 +6,9 @@ import pickle
 import numpy as np
 import pytest
 from scipy.integrate import DOP853, RK23, RK45
+from systems import pendulum
+from systems import pendulum_energy as energy
+from systems import pendulum_gradient as energy_gradient
 
 from eip_scipy import (
     EIPDOP853,
@@ -32,20 +35,8 @@ def driven(t, y):
     return np.array([y[1], -np.sin(y[0]) + 0.1 * np.cos(t)])
 
 
-def pendulum(t, y):
-    return np.array([y[1], -np.sin(y[0])])
-
-
 def heavier(t, y):
     return np.array([y[1], -2 * np.sin(y[0])])
-
-
-def energy(t, y):
-    return y[1] ** 2 / 2 - np.cos(y[0])
-
-
-def energy_gradient(t, y):
-    return np.array([np.sin(y[0]), y[1]])
 
 
 def jacobian(t, q, dq, out):

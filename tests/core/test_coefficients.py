@@ -5,17 +5,14 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from scipy.integrate import DOP853, LSODA, RK23, RK45, OdeSolver, solve_ivp
+from systems import pendulum, pendulum_energy, pendulum_gradient
 
 from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRK23, EIPRK45, EIPRKN12, Invariant, eip_method, integrate
 
 NAMES = ("order", "error_estimator_order", "n_stages", "A", "B", "C", "E", "P")
 
 
-def pendulum(t, y):
-    return np.array([y[1], -np.sin(y[0])])
-
-
-KEPT = Invariant(lambda t, y: y[1] ** 2 / 2 - np.cos(y[0]), lambda t, y: np.array([np.sin(y[0]), y[1]]))
+KEPT = Invariant(pendulum_energy, pendulum_gradient)
 
 
 class CashKarp(RK45.__bases__[0]):

@@ -5,6 +5,9 @@ import warnings
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from systems import oscillator, pendulum
+from systems import pendulum_energy as energy
+from systems import pendulum_gradient as energy_gradient
 
 from eip_scipy import (
     EIPDOP853,
@@ -24,24 +27,8 @@ from eip_scipy.core.problem import Problem
 NO_COMPLEX_STEP = "has no grad and allows no complex step"
 
 
-def oscillator(t, y):
-    return np.array([y[1], -y[0]])
-
-
 def square(t, y):
     return y @ y
-
-
-def pendulum(t, y):
-    return np.array([y[1], -np.sin(y[0])])
-
-
-def energy(t, y):
-    return 0.5 * y[1] ** 2 - np.cos(y[0])
-
-
-def energy_gradient(t, y):
-    return np.array([np.sin(y[0]), y[1]])
 
 
 def said(call):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from orders import observed_order
 from scipy.integrate import solve_ivp
+from systems import Verlet, oscillator
 
 from eip_scipy import EIPRK4, Diagnostics, Invariant, eip_method, integrate
 from eip_scipy.methods import Tableau
@@ -34,22 +35,6 @@ class RK43(RK4):
     def one_step(self, t, y, h):
         y_hat = super().one_step(t, y, h)
         return y_hat, h / 6 * (self.k4 - self.fun(t + h, y_hat))
-
-
-class Verlet:
-    """Position Verlet for the unit oscillator, in place."""
-
-    order = 2
-
-    def one_step(self, t, y, h):
-        y[0] += h / 2 * y[1]
-        y[1] -= h * y[0]
-        y[0] += h / 2 * y[1]
-        return y
-
-
-def oscillator(t, y):
-    return np.array([y[1], -y[0]])
 
 
 LENGTH = Invariant(lambda t, y: y @ y, lambda t, y: 2 * y, name="length")

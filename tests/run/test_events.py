@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from numba import njit
+from systems import Verlet, oscillator
 
 from eip_scipy import (
     EIPDOP853,
@@ -20,10 +21,6 @@ from eip_scipy.problems import kepler
 
 PHASE = 0.3
 SPAN = 50.0
-
-
-def oscillator(t, y):
-    return np.array([y[1], -y[0]])
 
 
 def energy(t, y):
@@ -215,18 +212,6 @@ def test_backward_in_time():
     end = [math.cos(SPAN + PHASE), -math.sin(SPAN + PHASE)]
     back = integrate(oscillator, (SPAN, 0), end, method=EIPDOP853, h=1.0, events=reaching(0.9), invariants=ENERGY)
     np.testing.assert_allclose(back.t_events[0][::-1], forward.t_events[0], rtol=0, atol=1e-5)
-
-
-class Verlet:
-    """Position Verlet for the unit oscillator."""
-
-    order = 2
-
-    def one_step(self, t, y, h):
-        y[0] += h / 2 * y[1]
-        y[1] -= h * y[0]
-        y[0] += h / 2 * y[1]
-        return y
 
 
 def test_one_step_methods_look_inside_too():

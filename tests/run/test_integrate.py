@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from systems import SQUARE, oscillator
+from systems import SQUARE, oscillator, pendulum, pendulum_energy, pendulum_gradient
 
 from eip_scipy import (
     EIPGJ12,
@@ -558,18 +558,6 @@ def test_compensation_keeps_the_invariants():
 
 
 # Gradients that are computed.
-
-
-def pendulum(t, y):
-    return np.array([y[1], -np.sin(y[0])])
-
-
-def pendulum_energy(t, y):
-    return 0.5 * y[1] ** 2 - np.cos(y[0])
-
-
-def pendulum_gradient(t, y):
-    return np.array([np.sin(y[0]), y[1]])
 
 
 def same_as_by_gradient(value, y0, **options):
