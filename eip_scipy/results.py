@@ -1,6 +1,6 @@
 """Results of runs, of ensembles and of projections, and what is done with them: tables, files, figures, pages."""
 
-from .core.results import Diagnostics, ProjectionResult
+from .core.results import Diagnostics, Multipliers, ProjectionResult
 from .ensembles.ensemble import EnsembleResult
 from .run.figures import plot
 from .run.recommendation import Recommendation
@@ -14,6 +14,7 @@ __all__ = [
     "Diagnostics",
     "EnsembleResult",
     "IntegrationResult",
+    "Multipliers",
     "OdeResult",
     "ProjectionResult",
     "Recommendation",

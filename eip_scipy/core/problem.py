@@ -220,6 +220,18 @@ class Problem:
         """
         return tuple(item for item in self.invariants if not item.is_balance)
 
+    def observed(self, t: Any, y: Any, params: Any = None) -> dict[str, Any]:
+        """Return further quantities at states of a run, by the names of the fields of a result: here none.
+
+        Parameters
+        ----------
+        t : ndarray, shape (m,)
+        y : ndarray, shape (n, m)
+        params : mapping or ndarray, optional
+            Parameters of the run. Default: those of the problem.
+        """
+        return {}
+
     @property
     def has_second_order(self) -> bool:
         """True if the problem has a method ``second_order()`` that returns it in (q, v)."""

@@ -1,4 +1,4 @@
-"""Diagnostics of a run, and the result of `project`."""
+"""Diagnostics of a run, the result of `project`, and Lagrange multipliers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ..engine.data import (
 )
 from ..engine.trust import ProjectionWarning, Trust
 
-__all__ = ["Diagnostics", "ProjectionResult", "ProjectionWarning", "joined_sums", "slowness"]
+__all__ = ["Diagnostics", "Multipliers", "ProjectionResult", "ProjectionWarning", "joined_sums", "slowness"]
 
 
 class Diagnostics:
@@ -196,6 +196,30 @@ def joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
     kept = (one[SAMPLES] / np.maximum(both[SAMPLES], 1.0)) ** (1 / LATE_SHARE)
     both[late] = kept * one[late] + two[late]
     return both
+
+
+class Multipliers(NamedTuple):
+    """Lagrange's multipliers, by the names of the constraints on velocities.
+
+    Attributes
+    ----------
+    names : tuple of str
+    values : ndarray, shape (m,) or (m, k)
+        lambda of M u' + G^T lambda = F: the constraints exert the generalised forces -G^T lambda. The unit is that of
+        power over that of the constraint's derivative in time.
+    rank : int or ndarray of int, shape (k,)
+        Rank of the constraints. Where it is below m, forces are distributed over dependent constraints such that the
+        sum of the squares of ``lambda_i |G_i|`` is least.
+    """
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    rank: Any
+
+    @property
+    def unique(self) -> Any:
+        """True where the multipliers are the only solution."""
+        return self.rank == len(self.names)
 
 
 class ProjectionResult(NamedTuple):

@@ -10,7 +10,7 @@ from scipy.integrate import OdeSolution
 
 from ..core.inputs import is_number, shown
 from ..core.problem import Problem
-from ..core.results import Diagnostics, joined_sums
+from ..core.results import Diagnostics, Multipliers, joined_sums
 from ..core.variations import StateSolution
 from .events import ContinuedEvents, as_events
 from .integrate import integrate
@@ -46,6 +46,8 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
         asked["events"] = ContinuedEvents(as_events(asked["events"]), result.t_events)
     if options.get("t_eval") is not None:
         asked["save_every"] = None
+    if "params" in options:
+        result._observe()  # with those of the first run
     try:
         more = integrate(**(asked | {"t_span": (origin.t, t), "y0": origin.y} | options))
     except BaseException as error:
@@ -73,6 +75,8 @@ def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult
                 np.concatenate([a, b]) if a.size and b.size else b if b.size else a
                 for a, b in zip(one[name], two[name], strict=True)
             ]
+    if "outputs" in one or "multipliers" in one:
+        both.update(_observed(one, two, new))
     both["diagnostics"] = _diagnostics(one.diagnostics, two.diagnostics)
     both["max_defect"] = both.diagnostics.max_defect
     both["trusted"] = both.diagnostics.trusted
@@ -80,6 +84,18 @@ def _joined(one: IntegrationResult, two: IntegrationResult) -> IntegrationResult
     if "_origin" in vars(two):
         object.__setattr__(both, "_origin", vars(two)["_origin"])
     return both
+
+
+def _observed(one: IntegrationResult, two: IntegrationResult, new: slice) -> dict[str, Any]:
+    """Return the fields of both runs that are computed when they are asked for."""
+    two._observe()
+    found: dict[str, Any] = {}
+    if "outputs" in one:
+        found["outputs"] = {name: np.append(row, two.outputs[name][new]) for name, row in one.outputs.items()}
+    if "multipliers" in one:
+        (names, before, ranks), (_, after, more) = one.multipliers, two.multipliers
+        found["multipliers"] = Multipliers(names, np.hstack([before, after[:, new]]), np.append(ranks, more[new]))
+    return found
 
 
 def _diagnostics(one: Diagnostics, two: Diagnostics) -> Diagnostics:

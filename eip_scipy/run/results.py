@@ -9,7 +9,8 @@ import numpy as np
 from scipy.integrate import OdeSolution
 from scipy.optimize import OptimizeResult
 
-from ..core.results import Diagnostics
+from ..core.problem import Problem
+from ..core.results import Diagnostics, Multipliers
 from .tables import default_names, to_dataframe, to_xarray
 
 __all__ = ["Fields", "IntegrationResult", "Origin", "WithColumns"]
@@ -47,7 +48,10 @@ ABSENT = {
     "stm": 'this run has no state-transition matrix; ask for it with variations="state".',
     "sensitivities": "this run has no sensitivities; name parameters in variations=[...].",
     "variations": "this run carried no derivatives; ask for them with variations=...",
+    "multipliers": "this result has no multipliers: its problem is not a mechanical system with constraints.",
+    "outputs": "this result has no outputs; give outputs={name: ...} to `mechanism` or `mechanics`.",
 }
+OBSERVED = ("outputs", "multipliers")  # computed when they are first requested
 UNSET = ("units", "epoch")  # fields that are printed only if they are set
 
 
@@ -155,6 +159,11 @@ class IntegrationResult(WithColumns):
         Units of the `Problem`; "" without one.
     epoch : (float, float) or None
         Time of t = 0, see `Problem`.
+    outputs : dict of str to ndarray, shape (m,)
+        For a mechanical system with ``outputs=``: values of these quantities at the saved times.
+    multipliers : Multipliers
+        For a mechanical system with constraints: Lagrange multipliers at the saved times. Outputs and multipliers are
+        computed when they are first requested.
 
     Notes
     -----
@@ -192,6 +201,41 @@ class IntegrationResult(WithColumns):
         """Names of the components of the state, (n,)."""
         given = self.get("component_names")
         return default_names(len(self.y)) if given is None else tuple(given)
+
+    @property
+    def outputs(self) -> dict[str, np.ndarray]:
+        """Outputs of a mechanical system at the saved times.
+
+        Raises
+        ------
+        AttributeError
+            If the problem has no outputs.
+        """
+        return self._observed("outputs")
+
+    @property
+    def multipliers(self) -> Multipliers:
+        """Lagrange multipliers at the saved times.
+
+        Raises
+        ------
+        AttributeError
+            If the problem has no constraints.
+        """
+        return self._observed("multipliers")
+
+    def _observed(self, name: str) -> Any:
+        self._observe()
+        if name not in self:
+            raise AttributeError(ABSENT[name])
+        return self[name]
+
+    def _observe(self) -> None:
+        """Compute outputs and multipliers, unless they have been computed."""
+        origin = vars(self).get("_origin")
+        if origin is None or any(name in self for name in OBSERVED) or not isinstance(origin.request.fun, Problem):
+            return
+        self.update(origin.request.fun.observed(self.t, self.y, origin.request.params))
 
     def to_xarray(self, names: Any = None) -> Any:
         """Return the run as an `xarray.Dataset`, see `eip_scipy.results.to_xarray`."""
@@ -271,6 +315,32 @@ class IntegrationResult(WithColumns):
     def __repr__(self) -> str:
         """Return the fields as text, without those that are not set."""
         return repr(OptimizeResult({key: value for key, value in self.items() if key not in UNSET or value}))
+
+    def _packed(self) -> dict[str, Any]:
+        """Return the fields in the form that `eip_scipy.results.save` accepts."""
+        self._observe()
+        found = dict(self)
+        if (outputs := found.pop("outputs", None)) is not None:
+            found |= {"outputs.names": list(outputs), "outputs.values": np.array(list(outputs.values()))}
+        if (multipliers := found.pop("multipliers", None)) is not None:
+            found |= {f"multipliers.{name}": value for name, value in multipliers._asdict().items()}
+        return found
+
+    @classmethod
+    def _unpacked(cls, fields: dict[str, Any]) -> IntegrationResult:
+        """Return a result from the output of `_packed`."""
+        found = dict(fields)
+        if "outputs.names" in found:
+            found["outputs"] = dict(zip(found.pop("outputs.names"), found.pop("outputs.values"), strict=True))
+        if "multipliers.names" in found:
+            parts = {name: found.pop(f"multipliers.{name}") for name in Multipliers._fields}
+            found["multipliers"] = Multipliers(**(parts | {"names": tuple(parts["names"])}))
+        return cls(found)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Compute outputs and multipliers first, because a pickle does not contain the functions."""
+        self._observe()
+        return super().__reduce_ex__(protocol)
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), "continue_to", "plot", "save", "to_dataframe", "to_xarray", "view"]

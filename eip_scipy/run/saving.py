@@ -124,12 +124,11 @@ def load(path: str | os.PathLike[str]) -> Any:
     if header["diagnostics"] is not None:
         result["diagnostics"] = _diagnostics(header["diagnostics"], arrays)
     result.update(arrays)
-    if header["class"] == ENSEMBLE:
-        return made._unpacked(result)
-    for name in ("component_names", "epoch"):
-        if result.get(name) is not None:
-            result[name] = tuple(result[name])
-    return result
+    if header["class"] != ENSEMBLE:
+        for name in ("component_names", "epoch"):
+            if result.get(name) is not None:
+                result[name] = tuple(result[name])
+    return made._unpacked(result) if hasattr(made, "_unpacked") else result
 
 
 def _described(diagnostics: Diagnostics, arrays: dict[str, np.ndarray]) -> dict[str, Any]:

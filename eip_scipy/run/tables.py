@@ -39,7 +39,8 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
         ``y`` (component, t) with the coordinates ``component`` and ``t``: ``data.y.sel(component="x")``. If the run has
         invariants, also ``invariants`` and ``invariant_errors`` (I - target), both (invariant, t), and ``max_defect``.
         If it has derivatives, also ``variations`` (t, component, column); a column is named after the component of the
-        initial state or the parameter with respect to which it is the derivative, or 0, 1 and so on. Attributes are
+        initial state or the parameter with respect to which it is the derivative, or 0, 1 and so on. A mechanical
+        system adds ``outputs`` (output, t), ``multipliers`` (constraint, t) and ``constraint_rank`` (t,). Attributes are
         method, h (nan for adaptive steps), message, trusted (1 or 0) and others that the result has.
 
     Raises
@@ -72,6 +73,14 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
     if "variations" in result:
         coordinates["column"] = column_names(result, coordinates["component"])
         variables["variations"] = (("t", "component", "column"), np.asarray(result.variations))
+    outputs, multipliers = getattr(result, "outputs", None), getattr(result, "multipliers", None)
+    if outputs is not None:
+        coordinates["output"] = list(outputs)
+        variables["outputs"] = (("output", "t"), np.array(list(outputs.values())))
+    if multipliers is not None:
+        coordinates["constraint"] = list(multipliers.names)
+        variables["multipliers"] = (("constraint", "t"), multipliers.values)
+        variables["constraint_rank"] = (("t",), multipliers.rank)
     attributes = {name: result[name] for name in DESCRIBED if name in result}
     return dataset(variables, coordinates, attributes)
 
@@ -90,7 +99,8 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
         Table indexed by ``t``, with a column for each component, then for each invariant its value, "H", and its error,
         "H error" (the value minus the target). If a component has the same name, the invariant is "invariant H". The
         last columns are derivatives, such as "dx/dvy" of x with respect to the initial vy; see `to_xarray` for the
-        names. The table of an ensemble is indexed by ``member``: a column for each component of the last state, then
+        names. A mechanical system adds its outputs, "output x" if there is a column x, and its multipliers, such as
+        "multiplier g1'". The table of an ensemble is indexed by ``member``: a column for each component of the last state, then
         "t_end", "status", "message", "trusted", and "H max_defect" for each invariant.
 
     Raises
@@ -123,6 +133,10 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
         components = component_names(result, names)
         for k, by in enumerate(column_names(result, components)):
             columns |= {f"d{name}/d{by}": result.variations[:, i, k] for i, name in enumerate(components)}
+    for name, row in (getattr(result, "outputs", None) or {}).items():
+        columns[f"output {name}" if name in columns else name] = row
+    if (multipliers := getattr(result, "multipliers", None)) is not None:
+        columns |= {f"multiplier {name}": row for name, row in zip(multipliers.names, multipliers.values, strict=True)}
     return pandas.DataFrame(columns, index=pandas.Index(result.t, name="t"))
 
 

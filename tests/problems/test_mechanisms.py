@@ -217,7 +217,15 @@ def test_what_is_wrong_is_said():
     def contradicting(t, q):
         return [q[0] - 1, q[0] - 1.5]
 
-    refused("constraints that contradict each other", [1, 1], [0, -G], contradicting, independent=[])
+    refused("'g1': it is 0.25, expected 0. It contradicts 'g2'", [1, 1], [0, -G], contradicting, independent=[])
+    refused("depends on none of the components that are solved for", q0=[0.6, 0.7], independent=["q1", "q2"])
+    parallel = lambda t, q: [q[0] - 1, q[0] - 1 - t**2]  # noqa: E731
+    refused('no accelerations meet the constraints "g1\'" and "g2\'"', [1, 1], [0, -G], parallel)
+    skate = {"velocity_constraints": lambda t, q, u: [u[0] ** 2 - u[1]]}
+    refused("velocity_constraints must be linear in the speeds", [1, 1], [0, -G], None, **skate)
+    drag = lambda t, q, u: [-0.01 * u[0], -G - 0.01 * u[1]]  # noqa: E731
+    wrong = {"potential": lambda t, q: G * q[1], "power": lambda t, q, u: -0.02 * u @ u}
+    refused("Correct power or the energy", [1, 1], drag, length, **wrong)
 
 
 def test_given_derivatives_are_compared_and_taken():

@@ -12,6 +12,7 @@ from ...core.inputs import real_array, shown
 from ...core.problem import component_names
 from .motion import Sizes, plain
 from .numerical import numerical_parts
+from .outputs import required_outputs
 from .parts import Given, Parts
 from .problem import MechanicsProblem, mechanics_problem
 from .start import Names
@@ -20,6 +21,8 @@ __all__ = ["RANK_TOLERANCE", "mechanism"]
 
 # Gradients of constraints, each scaled to length 1, that are nearer than this to dependent ones lower the rank.
 RANK_TOLERANCE = 1e-5
+# Rounding of functions that are linear in the speeds, as a share of their values.
+LINEAR = 1e-9
 
 
 def mechanism(
@@ -37,6 +40,7 @@ def mechanism(
     energy: Any = None,
     potential: Any = None,
     power: Any = None,
+    outputs: Any = None,
     independent: Iterable[str] | None = None,
     coordinates: Any = None,
     speeds: Any = None,
@@ -49,7 +53,8 @@ def mechanism(
 
     The state is (q, u), and the equations are ``q' = u``, ``M u' + G^T lambda = F``, ``G u' = -gamma``, where
     G u + ... = 0 are the constraints on velocities: the derivatives of those on positions, and those given by
-    `velocity_constraints`. A run keeps all constraints, and the energy where it is constant or changes slowly.
+    `velocity_constraints`. A run keeps all constraints, the norms of quaternions, the momenta of cyclic coordinates,
+    and the energy where it is constant or changes slowly.
 
     Parameters
     ----------
@@ -78,6 +83,8 @@ def mechanism(
         ``potential(t, q)``, for the energy u M u / 2 + potential.
     power : callable, optional
         ``power(t, q, u)``, the rate of the energy, which is then kept as a `Balance`. By default it is computed.
+    outputs : mapping, optional
+        Functions ``f(t, q, u)`` of quantities that are computed at saved states, by name; see ``run.outputs``.
     independent : iterable of str, optional
         Names of the coordinates and speeds that stay as they are in `q0` and `u0`. All others are guesses, from which
         the start is found. Default: all stay.
@@ -129,7 +136,9 @@ def mechanism(
     _require_shapes(given, t, q, u)
     m = 0 if given.constraints is None else len(given.constraints(t, q))
     k = 0 if given.velocity_constraints is None else len(given.velocity_constraints(t, q, u))
+    _require_linear(given, t, q, u)
     names = _names(coordinates, speeds, constraint_names, (q.size, u.size, m, k))
+    given = given._replace(outputs=_as_outputs(outputs, names, t, q, u))
     parts = _parts(given, names, t, q, u)
     problem = mechanics_problem(
         name, parts, names, t, (q0, u0), None, independent, rank_tolerance, t_span=t_span, **others
@@ -153,6 +162,20 @@ def _as_functions(given: Given) -> Given:
         if value is not None and not callable(value):
             raise TypeError(f"mechanism: {name} must be a function, got {shown(value)}.")
     return given._replace(mass=mass, forces=forces)
+
+
+def _as_outputs(outputs: Any, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> dict[str, Callable[..., Any]]:
+    """Return the functions of the outputs by name."""
+    found = required_outputs("mechanism", outputs, names.state)
+    for name, item in found.items():
+        if not callable(item):
+            raise TypeError(f"mechanism: the output {name!r} must be a function f(t, q, u), got {shown(item)}.")
+        if np.shape(value := item(t, q, u)) != ():
+            raise ValueError(
+                f"mechanism: the output {name!r} has the shape {np.shape(value)}; expected a number. Give each "
+                "component a name of its own."
+            )
+    return found
 
 
 def _constant(value: np.ndarray) -> Callable[..., np.ndarray]:
@@ -218,6 +241,25 @@ def _require_shapes(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> Non
         if given.constraints is None:
             raise TypeError("mechanism: jacobian belongs to constraints; give both.")
         require("jacobian", given.jacobian(t, q), (len(given.constraints(t, q)), q.size))
+
+
+def _require_linear(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> None:
+    """Raise ValueError if a function that must be linear in the speeds is not."""
+    rng = np.random.default_rng(7)
+    one, two = rng.uniform(0.5, 1.5, (2, u.size))
+    for what in ("kinematics", "velocity_constraints"):
+        fun = getattr(given, what)
+        if fun is None:
+            continue
+        rest, first, second, both = (np.asarray(fun(t, q, v), float) for v in (0 * u, one, two, one + two))
+        size = np.abs(first) + np.abs(second) + np.abs(rest)
+        wrong = np.abs(both - first - second + rest)
+        if not (wrong <= LINEAR * size.max(initial=0.0)).all():
+            k = int(np.argmax(wrong))
+            raise ValueError(
+                f"mechanism: {what} must be linear in the speeds, and component {k} of its value is not. Write it such "
+                "that the speeds have factors of t and q alone."
+            )
 
 
 def _parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> Parts:

@@ -14,12 +14,17 @@ from ...core.invariants import Invariant
 from .motion import plain
 from .start import nearest_start
 
-__all__ = ["Energy", "energy_of", "states_near", "typical_speed"]
+__all__ = ["CONSTANT", "FEWEST", "Energy", "energy_of", "rates_of", "states_near", "typical_speed"]
 
 # States next to the start at which rates are examined, and how far they are away, in units of the components' sizes.
 STATES, AWAY = 6, 0.2
+NEARER = (1.0, 0.1, 0.01)  # shares of that distance, of which the first is taken that gives a state
+# A quantity is examined at this number of states at least.
+FEWEST = 3
 # An energy is constant if its rate is below this share of the rate's terms.
 CONSTANT = 1e-9
+# A power that is given differs from the rate of its energy by at most this share of the rate's terms.
+RIGHT = 1e-6
 
 
 class Energy(NamedTuple):
@@ -41,6 +46,11 @@ def energy_of(
 
     It is the first of the candidates that is constant, else the one of the lowest rate, if that is slow.
 
+    Raises
+    ------
+    ValueError
+        If a power that is given is not the rate of its energy.
+
     Parameters
     ----------
     candidates : sequence of Energy
@@ -51,11 +61,15 @@ def energy_of(
     params : ndarray or None
     """
     args = () if params is None else (params,)
+    if candidates and len(states) < FEWEST:
+        return None, "not kept: too few states were found next to the start that meet the constraints, to examine it"
     slowest, least = None, np.inf
     for item in candidates:
-        rates, terms = _rates(item, derivative, states, args)
+        rates, terms = rates_of(item, derivative, states, args)
+        _require_power(item, rates, terms, states, args)
+        rates = np.abs(rates)
         # Terms may vanish at one state, as in a steady motion, where rates are rounding.
-        if rates.max() <= CONSTANT * terms.max() and item.power is None:
+        if rates.max() <= CONSTANT * terms.max() and terms.max() > 0 and item.power is None:
             kept = Invariant(item.value, item.gradient, args=args, in_place=True, name="energy")
             return kept, f"invariant, {item.description}"
         slowness = rates.sum() / max(terms.sum(), np.finfo(float).tiny)
@@ -70,25 +84,55 @@ def energy_of(
     return kept, f"balance, {described}"
 
 
+def _require_power(
+    item: Energy, rates: np.ndarray, terms: np.ndarray, states: Sequence[tuple], args: tuple[Any, ...]
+) -> None:
+    """Raise ValueError if the power that is given for an energy is not its rate."""
+    if item.power is None:
+        return
+    given = np.array([float(plain(item.power)(t, y, *args)) for t, y in states])
+    wrong = np.abs(given - rates)
+    k = int(np.argmax(wrong / np.maximum(terms, np.finfo(float).tiny)))
+    if not wrong[k] <= RIGHT * max(terms[k], np.abs(given[k])):
+        raise ValueError(
+            f"power is {given[k]:.6g} at a state next to the start that meets the constraints, where the energy "
+            f"({item.description}) changes at the rate {rates[k]:.6g}. Correct power or the energy, or omit power to "
+            "have it computed."
+        )
+
+
 def states_near(
     t: float,
     y: np.ndarray,
     constraints: Sequence[Invariant],
     derivative: Callable[[float, np.ndarray], np.ndarray],
     coordinates: int,
+    t_end: float | None = None,
 ) -> list[tuple[float, np.ndarray]]:
-    """Return the start and states next to it, at typical speeds, that meet the constraints."""
+    """Return the start and states next to it, at typical speeds and other times, that meet the constraints.
+
+    The times are between t and `t_end`, and not beyond the time in which the coordinates change by their size.
+    """
     rng = np.random.default_rng(20391)
     half = np.abs(y[:coordinates]).max(initial=0.0) or 1.0
     sizes = np.maximum(np.abs(y), AWAY * half) * AWAY
-    sizes[coordinates:] = typical_speed(y[:coordinates], y[coordinates:], derivative(t, y)[coordinates:])
+    speed = typical_speed(y[:coordinates], y[coordinates:], derivative(t, y)[coordinates:])
+    if speed == 0:  # a start in equilibrium
+        speed = half
+    sizes[coordinates:] = speed
+    duration = half / speed
+    if t_end is not None:
+        duration = float(np.copysign(min(duration, abs(t_end - t)), t_end - t))
     found = [(t, y)]
-    for _ in range(STATES):
-        moved = y + sizes * rng.standard_normal(y.size)
-        for item in constraints:
-            moved = nearest_start(moved, item, t, np.ones(y.size))
-        if np.isfinite(derivative(t, moved)).all() and all(_meets(item, t, moved) for item in constraints):
-            found.append((t, moved))
+    for time in t + duration * np.random.default_rng(20392).uniform(size=STATES):
+        direction = sizes * rng.standard_normal(y.size)
+        for share in NEARER:
+            moved = y + share * direction
+            for item in constraints:
+                moved = nearest_start(moved, item, time, np.ones(y.size))
+            if np.isfinite(derivative(time, moved)).all() and all(_meets(item, time, moved) for item in constraints):
+                found.append((time, moved))
+                break
     return found
 
 
@@ -102,10 +146,10 @@ def _meets(item: Invariant, t: float, y: np.ndarray) -> bool:
     return bool(np.abs(item.fun(t, y)).max() <= CONSTANT * max(1.0, np.abs(y).max()))
 
 
-def _rates(
+def rates_of(
     item: Energy, derivative: Callable[[float, np.ndarray], np.ndarray], states: Sequence[tuple], args: tuple[Any, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rates of an energy and the sums of their terms, at all states."""
+    """Return the rates of an energy and the sums of the sizes of their terms, at all states."""
     rates, terms = np.zeros(len(states)), np.zeros(len(states))
     for k, (t, y) in enumerate(states):
         gradient = np.empty(y.size)
@@ -113,7 +157,7 @@ def _rates(
         products = gradient * derivative(t, y)
         value = plain(item.value)
         explicit = float(difference_gradient(partial(_at_time, value, t, y, args), np.zeros(1), np.ones(1))[0])
-        rates[k], terms[k] = abs(products.sum() + explicit), np.abs(products).sum() + abs(explicit)
+        rates[k], terms[k] = products.sum() + explicit, np.abs(products).sum() + abs(explicit)
     return rates, terms
 
 

@@ -9,10 +9,11 @@ import numpy as np
 
 from ...core.gradients import NumericalGradient, difference_gradient
 from .energies import Energy
+from .outputs import Outputs
 from .parts import Given, Parts
 from .start import Names
 
-__all__ = ["numerical_parts"]
+__all__ = ["numerical_parts", "outputs_as_given"]
 
 Array = np.ndarray
 
@@ -53,7 +54,18 @@ def numerical_parts(given: Given, names: Names, t: float, q: Array, u: Array, wh
         gradient,
         tuple(energies),
         f"functions are called as they are, derivatives are numerical where none is given: {why}",
+        outputs=outputs_as_given(given, nq, u.size),
     )
+
+
+def outputs_as_given(given: Given, nq: int, n: int) -> Outputs | None:
+    """Return outputs whose functions are called as they are."""
+    functions = tuple(given.outputs.values())
+
+    def fill(t: float, x: Array, out: Array) -> None:
+        out[:] = [function(t, x[:nq], x[nq : nq + n]) for function in functions]
+
+    return Outputs(tuple(given.outputs), fill) if functions else None
 
 
 def _energy(given: Given) -> Callable[..., Any] | None:

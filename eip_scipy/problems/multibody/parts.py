@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from .energies import Energy
+from .outputs import Outputs
 
 __all__ = ["Given", "Parts"]
 
@@ -23,6 +24,7 @@ class Given(NamedTuple):
     energy: Any
     potential: Any
     power: Any
+    outputs: Any = None  # a mapping
 
 
 class Parts(NamedTuple):
@@ -37,4 +39,6 @@ class Parts(NamedTuple):
     gradient: Callable[..., None]
     energies: tuple[Energy, ...]
     note: str = ""
+    momenta: tuple[Energy, ...] = ()
+    outputs: Outputs | None = None
     origin: Any = None  # arguments of `parts_of` in symbolic/constrained.py, where the functions were made there

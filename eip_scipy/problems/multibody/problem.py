@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,49 +12,30 @@ from ...core.inputs import real_array
 from ...core.invariants import Invariant
 from ...core.jitted import is_jitted
 from ...core.problem import Problem, bind
+from ...core.results import Multipliers
+from .conserved import momenta_of, norms_of
 from .energies import energy_of, states_near, typical_speed
 from .motion import Motion, Sizes, motion, plain, vector
+from .outputs import Outputs, columns_of
 from .parts import Parts
-from .start import Names, started
+from .start import Names, name_of, started
 
-__all__ = ["MechanicsProblem", "Multipliers", "mechanics_problem"]
+__all__ = ["MechanicsProblem", "mechanics_problem"]
 
-
+# Accelerations that leave more than this share of the terms of dependent constraints meet none of them.
+CONTRADICTING = 1e-3
 # Speeds count as at least this share of a typical one where errors of constraints on velocities are compared with their
 # terms, which vanish at rest.
 SLOW = 0.1
-
-
-class Multipliers(NamedTuple):
-    """Lagrange's multipliers, by the names of the constraints on velocities.
-
-    Attributes
-    ----------
-    names : tuple of str
-    values : ndarray, shape (m,) or (m, k)
-        lambda of M u' + G^T lambda = F: the constraints exert the generalised forces -G^T lambda. The unit is that of
-        power over that of the constraint's derivative in time.
-    rank : int or ndarray of int, shape (k,)
-        Rank of the constraints. Where it is below m, forces are distributed over dependent constraints such that the
-        sum of the squares of ``lambda_i |G_i|`` is least.
-    """
-
-    names: tuple[str, ...]
-    values: np.ndarray
-    rank: Any
-
-    @property
-    def unique(self) -> Any:
-        """True where the multipliers are the only solution."""
-        return self.rank == len(self.names)
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class MechanicsProblem(Problem):
     """A `Problem` of a mechanical system with constraints, whose state is (q, u).
 
-    Its invariants are the constraints on positions and velocities, and the energy where it is known. `constraints` and
-    `energy` may be kept apart: ``integrate(problem, invariants=problem.constraints, ...)``.
+    Its invariants are the constraints on positions and velocities, the norms of quaternions, the momenta of cyclic
+    coordinates, and the energy where it is known. They may be chosen apart:
+    ``integrate(problem, invariants=problem.constraints, ...)``.
 
     Attributes
     ----------
@@ -62,6 +43,10 @@ class MechanicsProblem(Problem):
         Names of coordinates, speeds and constraints.
     constraints : tuple of Invariant
         The constraints, with the target 0; empty for a system without any.
+    norms : tuple of Invariant
+        Sums of squares of coordinates, such as the components of a quaternion, that the kinematics keep.
+    momenta : tuple of Invariant
+        Momenta of coordinates that neither the energy nor forces depend on.
     energy : Invariant, Balance or None
     energy_kept : str
         How the energy is kept, or why it is not.
@@ -70,6 +55,8 @@ class MechanicsProblem(Problem):
     notes : tuple of str
         What was done to the equations and to the start.
     parameter_names : tuple of str
+    observer : Outputs, optional
+        The functions of `outputs`.
     rank_tolerance : float
     origin : optional
         What the functions were made of, if they can be made again.
@@ -77,11 +64,14 @@ class MechanicsProblem(Problem):
 
     names: Names
     constraints: tuple[Invariant, ...]
+    norms: tuple[Invariant, ...] = ()
+    momenta: tuple[Invariant, ...] = ()
     energy: Invariant | None
     energy_kept: str
     motion: Motion
     notes: tuple[str, ...] = ()
     parameter_names: tuple[str, ...] = ()
+    observer: Outputs | None = None
     rank_tolerance: float
     origin: Any = None
 
@@ -96,8 +86,10 @@ class MechanicsProblem(Problem):
         """The invariants that implicit methods keep by default: all but the energy."""
         return tuple(item for item in super().stiff_invariants if item is not self.energy)
 
-    def multipliers(self, t: Any, y: Any) -> Multipliers:
+    def multipliers(self, t: Any, y: Any, params: Any = None) -> Multipliers:
         """Return Lagrange's multipliers at states of a run.
+
+        A result of `integrate` has those of its saved states, ``run.multipliers``.
 
         Parameters
         ----------
@@ -105,36 +97,78 @@ class MechanicsProblem(Problem):
             Times, as a run's ``t``.
         y : array_like, shape (n,) or (n, k)
             States, as a run's ``y``.
+        params : mapping or array_like, optional
+            Parameters of the run. Default: those of the problem.
 
         Returns
         -------
         Multipliers
         """
-        times, states = np.atleast_1d(np.asarray(t, float)), np.asarray(y, float)
-        n, columns = len(self.names.state), states.reshape(len(states), -1)
-        if np.ndim(t) != states.ndim - 1 or columns.shape != (n, times.size):
-            raise ValueError(
-                f"multipliers: y has the shape {states.shape} for {times.size} times; expected ({n},) for a number t, "
-                "or a column for each time."
-            )
+        times, columns = columns_of("multipliers", t, y, len(self.names.state))
         found, ranks = np.empty((len(self.names.velocities), times.size)), np.empty(times.size, int)
+        extra = self._extra(params)
         for k, time in enumerate(times):
-            ranks[k], _, found[:, k] = self._solved(time, columns[:, k])
-        if states.ndim == 1:
+            ranks[k], _, found[:, k] = self._solved(time, columns[:, k], extra)
+        if np.ndim(t) == 0:
             return Multipliers(self.names.velocities, found[:, 0], int(ranks[0]))
         return Multipliers(self.names.velocities, found, ranks)
+
+    def outputs(self, t: Any, y: Any, params: Any = None) -> dict[str, Any]:
+        """Return the outputs that the problem was given, at states of a run.
+
+        A result of `integrate` has those of its saved states, ``run.outputs``.
+
+        Parameters
+        ----------
+        t, y, params
+            As for `multipliers`.
+
+        Returns
+        -------
+        dict of str to float or ndarray, shape (k,)
+        """
+        if self.observer is None:
+            return {}
+        times, columns = columns_of("outputs", t, y, len(self.names.state))
+        names, fill = self.observer.names, plain(self.observer.fill)
+        found, extra = np.empty((len(names), times.size)), self._extra(params)
+        for k, time in enumerate(times):
+            state = np.append(columns[:, k], self._solved(time, columns[:, k], extra)[1])
+            row = np.empty(len(names))
+            fill(time, state, row, *extra)
+            found[:, k] = row
+        return dict(zip(names, found[:, 0].tolist() if np.ndim(t) == 0 else found, strict=True))
+
+    def observed(self, t: Any, y: Any, params: Any = None) -> dict[str, Any]:
+        """Return the outputs and the multipliers of a run, see `Problem.observed`."""
+        found: dict[str, Any] = {}
+        if self.observer is not None:
+            found["outputs"] = self.outputs(t, y, params)
+        if self.names.velocities:
+            found["multipliers"] = self.multipliers(t, y, params)
+        return found
+
+    def _extra(self, params: Any) -> tuple[np.ndarray, ...]:
+        """Return the parameters as the last argument of functions, if there are any."""
+        if params is None:
+            params = self.params
+        elif isinstance(params, Mapping):
+            params = self._named_parameters(params)
+        return () if params is None else (np.asarray(params, float),)
+
+    def _named_parameters(self, given: Mapping[Any, Any]) -> np.ndarray:
+        return super()._named_parameters({name_of(name): value for name, value in given.items()})
 
     def motion_at(self, t: float, y: np.ndarray) -> np.ndarray:
         """Return the derivative (q', u') of one state, by functions that are not compiled."""
         out = np.empty(len(self.names.state))
-        self.motion.rhs(t, np.ascontiguousarray(y, float), out, *(() if self.params is None else (self.params,)))
+        self.motion.rhs(t, np.ascontiguousarray(y, float), out, *self._extra(None))
         return out
 
-    def _solved(self, t: float, y: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
+    def _solved(self, t: float, y: np.ndarray, extra: tuple[np.ndarray, ...]) -> tuple[int, np.ndarray, np.ndarray]:
         """Return the rank of the constraints, u' and the multipliers."""
         n, m = len(self.names.speeds), len(self.names.velocities)
         rates, accelerations, multipliers = np.empty(len(self.names.coordinates)), np.empty(n), np.empty(m)
-        extra = () if self.params is None else (self.params,)
         rank = self.motion.solved(float(t), np.ascontiguousarray(y), rates, accelerations, multipliers, *extra)
         return int(rank), accelerations, multipliers
 
@@ -149,7 +183,8 @@ class MechanicsProblem(Problem):
             Coordinates and speeds, in the order of ``names.coordinates`` and ``names.speeds`` or by name. Those that
             are neither given nor independent begin at 0.
         params : mapping or array_like, optional
-            Parameters, by default those of the problem.
+            Parameters, by default those of the problem. Several values of a parameter, or rows of an array, are those
+            of the members of an ensemble.
         t : float, optional
             The time. Default: the start of the problem's interval, or 0.
         independent : iterable of str, optional
@@ -158,7 +193,7 @@ class MechanicsProblem(Problem):
 
         Returns
         -------
-        ndarray, shape (n,)
+        ndarray, shape (n,) or (members, n)
 
         Raises
         ------
@@ -168,13 +203,22 @@ class MechanicsProblem(Problem):
         if params is not None:
             params = self._named_parameters(params) if isinstance(params, Mapping) else real_array("params", params)
         t = (0.0 if self.t_span is None else self.t_span[0]) if t is None else float(t)
+        if params is not None and params.ndim == 2:
+            return np.array([self.start(q0, u0, row, t=t, independent=independent) for row in params])
         return started(self.name, self.names, self.constraints, q0, u0, params, t, independent)[0]
 
     def __repr__(self) -> str:
         first, *others = super().__repr__().splitlines()
         lines = [line for line in others if not line.startswith(("  invariants", "  functions"))]
         kind = "jitted by Numba" if is_jitted(self.rhs) else "plain Python"
-        lines[1:1] = [f"  constraints {self._constraints_described()}", f"  energy      {self.energy_kept}"]
+        conserved = [
+            f"  {label:<12}{', '.join(item.name or '' for item in items)}"
+            for label, items in (("norms", self.norms), ("momenta", self.momenta))
+            if items
+        ]
+        lines[1:1] = [
+            f"  constraints {self._constraints_described()}", *conserved, f"  energy      {self.energy_kept}"
+        ]  # fmt: skip
         lines += [f"  functions   {kind}", *(f"  note        {note}" for note in self.notes)]
         return "\n".join([first, *lines])
 
@@ -182,7 +226,7 @@ class MechanicsProblem(Problem):
         m, n = len(self.names.velocities), len(self.names.speeds)
         if m == 0:
             return f"none, {_degrees(n)}"
-        rank = self._solved(0.0 if self.t_span is None else self.t_span[0], self.y0)[0]
+        rank = self._solved(0.0 if self.t_span is None else self.t_span[0], self.y0, self._extra(None))[0]
         rest = f" of rank {rank}, {_degrees(n - rank)}"
         return f"{m} on velocities{rest}, {len(self.names.positions)} of them on positions too"
 
@@ -199,13 +243,13 @@ class MechanicsProblem(Problem):
 
     @property
     def _own_invariants(self) -> tuple[Invariant, ...]:
-        return (*self.constraints, *([] if self.energy is None else [self.energy]))
+        return (*self.constraints, *self.norms, *self.momenta, *([] if self.energy is None else [self.energy]))
 
 
 # Attributes that come from others.
 REMADE = {
-    "fun", "rhs", "y0", "t_span", "params", "invariants", "constraints", "energy", "energy_kept", "motion", "names",
-    "rank_tolerance", "origin",
+    "fun", "rhs", "y0", "t_span", "params", "invariants", "constraints", "norms", "momenta", "energy", "energy_kept",
+    "motion", "names", "observer", "rank_tolerance", "origin",
 }  # fmt: skip
 
 
@@ -244,11 +288,16 @@ def mechanics_problem(
     fun = bind(once.rhs, params)
     examined = _constraints_invariant(plain(parts.values), plain(parts.gradient), names, params)
     y0, solved = started(name, names, examined, *start, params, t, independent)
-    examined = tuple(_scaled(item, t, y0, fun, sizes) for item in examined)
+    _require_accelerations(name, parts, once, names, t, y0, params)
     kept = _constraints_invariant(parts.values, parts.gradient, names, params)
-    for item, scaled in zip(kept, examined, strict=True):
-        item.scale = scaled.scale
-    energy, described = energy_of(parts.energies, fun, states_near(t, y0, examined, fun, sizes.coordinates), params)
+    for item in (*examined, *kept):
+        item.scale = _at_speed(plain(parts.gradient), item.size, t, y0, fun, sizes, item.args)
+    states = states_near(t, y0, examined, fun, sizes.coordinates, None if t_span is None else float(t_span[1]))
+    energy, described = energy_of(parts.energies, fun, states, params)
+    norms = norms_of(parts, names, examined, states, params)
+    momenta = momenta_of(parts.momenta, (*examined, *norms), fun, states, params)
+    for item in momenta:
+        item.scale = _at_speed(plain(item.gradient), None, t, y0, fun, sizes, item.args)
     nq = sizes.coordinates
     return MechanicsProblem(
         name=name,
@@ -257,11 +306,14 @@ def mechanics_problem(
         y0=y0,
         t_span=t_span,
         params=params,
-        invariants=(*kept, *([] if energy is None else [energy])),
+        invariants=(*kept, *norms, *momenta, *([] if energy is None else [energy])),
         blocks=(np.arange(nq), np.arange(nq, y0.size)),
         component_names=names.state,
         names=names,
         constraints=kept,
+        norms=norms,
+        momenta=momenta,
+        observer=parts.outputs,
         energy=energy,
         energy_kept=described,
         motion=once,
@@ -270,6 +322,28 @@ def mechanics_problem(
         origin=parts.origin,
         **others,
     )
+
+
+def _require_accelerations(
+    what: str, parts: Parts, functions: Motion, names: Names, t: float, y: np.ndarray, params: np.ndarray | None
+) -> None:
+    """Raise ValueError if no acceleration meets all constraints at the start, some of which depend on each other."""
+    nq, n, m = len(names.coordinates), len(names.speeds), len(names.velocities)
+    sizes, extra = Sizes(nq, n, m), () if params is None else (params,)
+    rates, accelerations, matrices = np.empty(nq), np.empty(n), np.empty(sizes.matrices + nq)
+    if functions.solved(t, y, rates, accelerations, np.empty(m), *extra) == m:
+        return
+    plain(parts.fill)(t, y, matrices, *extra)
+    G, gamma = matrices[n * n + n :][: m * n].reshape(m, n), matrices[n * n + n + m * n :][:m]
+    left = G @ accelerations + gamma
+    terms = np.abs(G) @ np.abs(accelerations) + np.abs(gamma)
+    if (np.abs(left) > CONTRADICTING * terms.max(initial=0.0)).any():
+        one, two = sorted(names.velocities[k] for k in np.argsort(-np.abs(left))[:2])
+        raise ValueError(
+            f"{what}: no accelerations meet the constraints {one!r} and {two!r} at the start, where their gradients "
+            f"depend on each other: {np.abs(left).max():.3g} remains, expected 0. Leave out a constraint that "
+            "contradicts others, or start with speeds that the mechanism can have at this singular position."
+        )
 
 
 def _constraints_invariant(
@@ -287,15 +361,19 @@ def _constraints_invariant(
     return (item,)
 
 
-def _scaled(
-    item: Invariant, t: float, y: np.ndarray, derivative: Callable[[float, np.ndarray], np.ndarray], sizes: Sizes
-) -> Invariant:
-    """Give the constraints on velocities the size of their terms at a typical speed: at rest they have none."""
+def _at_speed(
+    gradient: Callable[..., None],
+    size: int | None,
+    t: float,
+    y: np.ndarray,
+    derivative: Callable[[float, np.ndarray], np.ndarray],
+    sizes: Sizes,
+    args: tuple[Any, ...],
+) -> Any:
+    """Return the sizes of the terms of constraints or of a momentum at a typical speed: at rest they have none."""
     nq = sizes.coordinates
     speed = typical_speed(y[:nq], y[nq:], derivative(t, y)[nq:])
-    gradient = np.empty((item.size or 0, y.size))
-    assert item.grad is not None
-    item.grad(t, y, gradient)
-    scale = SLOW * np.abs(gradient[:, nq:]).sum(axis=1) * speed
-    item.scale = scale if np.isfinite(scale).all() else None
-    return item
+    slopes = np.empty((size or 1, y.size))
+    gradient(t, y, slopes if size else slopes[0], *args)
+    scale = SLOW * np.abs(slopes[:, nq:]).sum(axis=1) * speed
+    return (scale if size else float(scale[0])) if np.isfinite(scale).all() else None

@@ -15,11 +15,13 @@ from ...core.names import nearest
 from ...core.project import project
 from ...engine.trust import ProjectionWarning
 
-__all__ = ["Names", "nearest_start", "started"]
+__all__ = ["MET", "Names", "name_of", "nearest_start", "started"]
 
 # A constraint is met if it is violated by at most this share of its terms, as given targets are.
 MET = 1e-8
 NEWTON_STEPS = 40
+# Gradients of which a combination is below this share of them depend on each other.
+DEPENDENT = 1e-6
 # A component that is solved for is reported if it differs from its guess by this share of its size.
 SEEN = 1e-8
 
@@ -36,6 +38,15 @@ class Names(NamedTuple):
     def state(self) -> tuple[str, ...]:
         """Names of all components."""
         return (*self.coordinates, *self.speeds)
+
+
+def name_of(key: Any) -> str:
+    """Return the name that a string, or a symbol or function of SymPy, stands for."""
+    if isinstance(key, str):
+        return key
+    from ..symbolic.models import name_of as of_symbol
+
+    return of_symbol(key)
 
 
 def started(
@@ -65,7 +76,7 @@ def started(
     found = nearest_start(y, item, t, sigma) if sigma.any() else y
     if sigma.any() and not _violation(found, item, t)[2] <= MET:
         found = _downhill(y, item, t, sigma)
-    _require_met(what, found, item, t, solved=bool(sigma.any()))
+    _require_met(what, found, item, t, sigma)
     moved = [
         f"{name} {before:.6g} to {after:.6g}"
         for name, before, after in zip(names.state, y, found, strict=True)
@@ -79,7 +90,7 @@ def _independent(names: Names, independent: Iterable[str] | None) -> set[str]:
     """Return the names of components that stay as they are."""
     if independent is None:
         return set(names.state)
-    found = {str(name) for name in ([independent] if isinstance(independent, str) else independent)}
+    found = {name_of(name) for name in ([independent] if isinstance(independent, str) else independent)}
     for name in sorted(found - set(names.state)):
         hint = nearest(name, names.state)
         raise ValueError(
@@ -91,7 +102,7 @@ def _independent(names: Names, independent: Iterable[str] | None) -> set[str]:
 def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.ndarray:
     """Return the values in the order of the names, from a mapping or an array."""
     if isinstance(given, Mapping):
-        by_name = {str(getattr(name, "func", name)): value for name, value in given.items()}
+        by_name = {name_of(name): value for name, value in given.items()}
         for name in by_name:
             if name not in names:
                 raise ValueError(f"{what}: there is no {name!r}{nearest(name, names)}; expected {', '.join(names)}.")
@@ -148,19 +159,35 @@ def _violation(y: np.ndarray, item: Invariant, t: float) -> tuple[int, float, fl
     return worst, float(values[worst]), float(share[worst])
 
 
-def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, *, solved: bool) -> None:
+def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> None:
     """Raise ValueError if a constraint is violated."""
     worst, residual, share = _violation(y, item, t)
     if share <= MET:
         return
     name = item.value_names[worst]
-    if solved:
+    if not sigma.any():
         raise ValueError(
-            f"{what}: no start was found that meets the constraint {name!r}: it is {residual:.3g}, expected 0. Name "
-            "fewer components as independent=, or give a guess that is nearer to a solution; constraints that "
-            "contradict each other have none."
+            f"{what}: the start violates the constraint {name!r}: it is {residual:.3g}, expected 0. Name the "
+            "components that are to stay by independent=, and the others are solved for."
         )
     raise ValueError(
-        f"{what}: the start violates the constraint {name!r}: it is {residual:.3g}, expected 0. Name the components "
-        "that are to stay by independent=, and the others are solved for."
+        f"{what}: no start was found that meets the constraint {name!r}: it is {residual:.3g}, expected 0. "
+        f"{_why_not(item, item.fun(t, y), _gradient(item, t, y)[:, sigma > 0], worst)}"
     )
+
+
+def _why_not(item: Invariant, values: np.ndarray, gradient: np.ndarray, worst: int) -> str:
+    """Return why a constraint is not met, from the derivatives of all by the components that are solved for."""
+    sizes = np.linalg.norm(gradient, axis=1)
+    if sizes[worst] <= DEPENDENT * sizes.max():
+        return "It depends on none of the components that are solved for; name fewer as independent=."
+    unit = gradient[sizes > 0] / sizes[sizes > 0, None]
+    found = np.linalg.svd(unit, compute_uv=False)
+    left = np.abs(values) / np.where(sizes > 0, sizes, np.inf)
+    others = [repr(item.value_names[k]) for k in np.flatnonzero(left > SEEN * left[worst]) if k != worst]
+    if others and (found > DEPENDENT * found.max()).sum() < len(unit):
+        return (
+            f"It contradicts {', '.join(others)}, on whose gradients its own depends there. Leave one out, name fewer "
+            "components as independent=, or give a guess that is nearer to a solution."
+        )
+    return "Name fewer components as independent=, or give a guess that is nearer to a solution."

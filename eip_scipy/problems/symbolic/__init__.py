@@ -153,6 +153,7 @@ def mechanics(
     t_span: tuple[float, float] | None = None,
     inputs: Mapping[Any, Any] | None = None,
     energy: Any = None,
+    outputs: Mapping[str, Any] | None = None,
     independent: Iterable[Any] | None = None,
     rank_tolerance: float = RANK_TOLERANCE,
     name: str = "mechanics",
@@ -160,8 +161,8 @@ def mechanics(
 ) -> MechanicsProblem:
     """Return the problem of a model of sympy.physics.mechanics.
 
-    Its state is (q, u). A run keeps the constraints on positions and velocities, and the energy where it is constant or
-    changes slowly; the problem's repr shows which.
+    Its state is (q, u). A run keeps the constraints on positions and velocities, the norms of quaternions, the momenta
+    of cyclic coordinates, and the energy where it is constant or changes slowly; the problem's repr shows which.
 
     Parameters
     ----------
@@ -177,10 +178,17 @@ def mechanics(
     t_span : tuple of float, optional
         Start and end of the interval. Without one the start is at 0.
     inputs : mapping, optional
-        Expressions, of t and the state, of functions of time in the model that are neither coordinates nor speeds.
+        Functions of time in the model that are neither coordinates nor speeds, by themselves or by name: numbers,
+        expressions of t and the state, or functions ``f(t, y)`` of the state y = (q, u). A tuple of them takes a
+        function that returns as many numbers. A function is written as an expression if it does not branch; otherwise
+        it is called as it is, and may occur in forces only. Default: ``model.specifieds``, whose functions take
+        (y, t), as PyDy has them.
     energy : sympy.Expr, optional
         The total energy. Default: that of the bodies, to which the potential of constant loads is added if the energy
         is constant with it; that of the Lagrangian.
+    outputs : mapping, optional
+        Expressions, which may contain derivatives of coordinates and speeds, of quantities that are computed at saved
+        states, by name; see ``run.outputs``.
     independent : iterable, optional
         Coordinates and speeds that stay as they are given; all others are guesses, from which the start is found.
         Default: those that a KanesMethod does not call dependent; all of a LagrangesMethod.
@@ -230,6 +238,7 @@ def mechanics(
             t_span=t_span,
             inputs=inputs,
             energy=energy,
+            outputs=outputs,
             independent=independent,
             rank_tolerance=rank_tolerance,
             name=name,

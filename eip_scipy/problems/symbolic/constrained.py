@@ -6,15 +6,20 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import numpy as np
 import sympy
 
+from ...core.jitted import compiled_like
 from ..multibody.energies import Energy
 from ..multibody.motion import Sizes
+from ..multibody.outputs import Outputs
 from ..multibody.parts import Parts
 from .parser import symbol
 from .program import Arguments, function
 
-__all__ = ["Constrained", "filling", "parts_of"]
+__all__ = ["Constrained", "acceleration", "cyclic", "filling", "own_speed", "parts_of"]
+
+BRANCHES = (sympy.Piecewise, sympy.Abs, sympy.sign, sympy.Heaviside, sympy.Max, sympy.Min)
 
 
 class Constrained(NamedTuple):
@@ -33,6 +38,8 @@ class Constrained(NamedTuple):
     positions, velocities : tuple of expressions
         The constraints, which are 0: those on positions, and all of those on velocities, linear in the speeds, the
         derivatives of the former included.
+    inputs : tuple of (str, callable)
+        Names of quantities in the forces that functions ``f(t, y)`` give, and these.
     """
 
     coordinates: tuple[str, ...]
@@ -43,6 +50,7 @@ class Constrained(NamedTuple):
     forces: tuple[Any, ...]
     positions: tuple[Any, ...]
     velocities: tuple[Any, ...]
+    inputs: tuple[tuple[str, Callable[..., float]], ...] = ()
 
     @property
     def sizes(self) -> Sizes:
@@ -70,7 +78,58 @@ class Constrained(NamedTuple):
         return self._replace(velocities=(*map(self.rate, self.positions), *self.velocities))
 
 
-def parts_of(system: Constrained, energies: Sequence[tuple[str, Any, Any]]) -> Parts:
+def own_speed(system: Constrained, k: int) -> list[Any]:
+    """Return the derivatives of the speeds by that of a coordinate with a speed of its own, [] for any other."""
+    speeds = [symbol(name) for name in system.speeds]
+    own = [u for u in speeds if u in system.rates[k].free_symbols]
+    if len(own) != 1 or sum(own[0] in rate.free_symbols for rate in system.rates) != 1:
+        return []
+    slope = sympy.diff(system.rates[k], own[0])
+    return [1 / slope if u == own[0] else sympy.Integer(0) for u in speeds]
+
+
+def cyclic(system: Constrained, speeds_by_rate: Callable[[int], Sequence[Any]]) -> list[int]:
+    """Return the places of coordinates whose momenta may be constant: neither masses nor forces depend on them.
+
+    A constraint on a speed that belongs to one of them alone has a force along it, too.
+
+    Forces that may be 0 only near the start, for they have branches or come from a function, belong to none of these.
+
+    Parameters
+    ----------
+    system : Constrained
+    speeds_by_rate : callable
+        ``speeds_by_rate(k)``, the derivatives (n,) of the speeds by that of coordinate k, or [].
+    """
+    known = set().union(*(item.free_symbols for item in (*system.mass, *system.forces)))
+    inputs = {symbol(name) for name, _ in system.inputs}
+    constrained = set().union(*(item.free_symbols for item in system.velocities))
+    found = []
+    for k, name in enumerate(system.coordinates):
+        if symbol(name) in known:
+            continue
+        column = speeds_by_rate(k)
+        parts = [u for u, part in zip(system.speeds, column, strict=True) if part != 0] if column else []
+        if len(parts) == 1 and symbol(parts[0]) in constrained:
+            continue
+        along = [F for F, part in zip(system.forces, column, strict=True) if part != 0] if column else []
+        unsure = any(F.has(*BRANCHES) or F.free_symbols & inputs for F in along)
+        if along and not unsure:
+            found.append(k)
+    return found
+
+
+def acceleration(speed: str) -> sympy.Symbol:
+    """Return the symbol of the derivative of a speed."""
+    return symbol(f"{speed}'")
+
+
+def parts_of(
+    system: Constrained,
+    energies: Sequence[tuple[str, Any, Any]],
+    momenta: Sequence[tuple[str, Any]] = (),
+    outputs: Sequence[tuple[str, Any]] = (),
+) -> Parts:
     """Return the functions of a system.
 
     Parameters
@@ -78,12 +137,23 @@ def parts_of(system: Constrained, energies: Sequence[tuple[str, Any, Any]]) -> P
     system : Constrained
     energies : sequence of (str, expression, expression or None)
         Descriptions of quantities that may be constant, their expressions, and their rates where these are given.
+    momenta : sequence of (str, expression)
+        Names of further quantities that may be constant, and their expressions.
+    outputs : sequence of (str, expression)
+        Names of quantities that are computed at saved states, and their expressions, which may contain accelerations.
     """
     found = tuple(
         Energy(label, *energy_functions(item, system), None if rate is None else rate_function(rate, system))
         for label, item, rate in energies
     )
-    return Parts(matrices(system), *values_and_gradient(system), found, origin=(system, tuple(energies)))
+    return Parts(
+        matrices(system),
+        *values_and_gradient(system),
+        found,
+        momenta=tuple(Energy(name, *energy_functions(item, system)) for name, item in momenta),
+        outputs=output_functions(tuple(outputs), system) if outputs else None,
+        origin=(system, tuple(energies), tuple(momenta), tuple(outputs)),
+    )
 
 
 @lru_cache(maxsize=64)
@@ -92,7 +162,41 @@ def matrices(system: Constrained) -> Callable[..., None]:
     speeds = system.variables[len(system.coordinates) :]
     gradients = [sympy.diff(item, u) if item.has(u) else sympy.Integer(0) for item in system.velocities for u in speeds]
     gammas = map(system.rate, system.velocities)
-    return filling("equations of motion", (*system.mass, *system.forces, *gradients, *gammas, *system.rates), system)
+    everything = (*system.mass, *system.forces, *gradients, *gammas, *system.rates)
+    return _with_inputs(system, lambda arguments: filling("equations of motion", everything, arguments))
+
+
+@lru_cache(maxsize=64)
+def output_functions(outputs: tuple[tuple[str, Any], ...], system: Constrained) -> Outputs:
+    """Return the outputs."""
+    accelerations = [acceleration(name).name for name in system.speeds]
+    names, items = zip(*outputs, strict=True)
+    return Outputs(names, _with_inputs(system, lambda given: filling("outputs", items, given), accelerations))
+
+
+def _with_inputs(
+    system: Constrained, made: Callable[[Arguments], Callable[..., None]], behind: Sequence[str] = ()
+) -> Callable[..., None]:
+    """Return ``fill(t, y, out, *params)``, where y is the state and what is named `behind` it.
+
+    It calls the functions of the inputs, whose values the function that is `made` finds behind all of that.
+    """
+    names = (*system.coordinates, *system.speeds, *behind, *(name for name, _ in system.inputs))
+    fill = made(Arguments(names, system.parameters))
+    for _, given in reversed(system.inputs):
+        fill = _with_input(fill, given, len(system.variables))
+    return fill
+
+
+def _with_input(fill: Callable[..., None], function: Callable[..., float], n: int) -> Callable[..., None]:
+    def wider(t, y, out, *params):
+        state = np.empty(y.size + 1)
+        for k in range(y.size):
+            state[k] = y[k]
+        state[y.size] = function(t, y[:n])
+        fill(t, state, out, *params)
+
+    return compiled_like(wider, fill, function)
 
 
 @lru_cache(maxsize=64)
@@ -101,7 +205,7 @@ def values_and_gradient(system: Constrained) -> tuple[Callable[..., None], Calla
     items = (*system.positions, *system.velocities)
     found = {(i, k): slope for i, item in enumerate(items) for k, slope in _gradient(item, system).items()}
     rows = function("gradients", list(found.values()), system.arguments, in_place=True, places=list(found))
-    return filling("constraints", items, system), rows
+    return filling("constraints", items, system.arguments), rows
 
 
 @lru_cache(maxsize=64)
@@ -121,10 +225,10 @@ def rate_function(rate: Any, system: Constrained) -> Callable[..., float]:
     return function("power", [rate], system.arguments, in_place=False)
 
 
-def filling(what: str, expressions: Sequence[Any], system: Constrained) -> Callable[..., None]:
+def filling(what: str, expressions: Sequence[Any], arguments: Arguments) -> Callable[..., None]:
     """Return a function that fills an array with expressions, most of which may be 0."""
     found = {k: item for k, item in enumerate(expressions) if item != 0}
-    return function(what, list(found.values()), system.arguments, in_place=True, places=list(found))
+    return function(what, list(found.values()), arguments, in_place=True, places=list(found))
 
 
 def _gradient(item: Any, system: Constrained) -> dict[int, Any]:

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import sympy
 from sympy.core.function import AppliedUndef
-from sympy.physics.mechanics import KanesMethod, Point, dynamicsymbols, msubs
+from sympy.physics.mechanics import KanesMethod, Point, msubs
 
 from ...core.names import nearest
 from ..multibody.motion import plain
-from .constrained import Constrained, filling
-from .parser import symbol
+from .constrained import Constrained, acceleration, cyclic, filling, own_speed
+from .inputs import TIME, read_inputs
+from .parser import as_expression, symbol
 
-__all__ = ["Model", "name_of", "read"]
+__all__ = ["Model", "Start", "name_of", "read"]
 
-TIME = dynamicsymbols._t
 # A row of constraints depends on the others if its remainder is below this share at each of this number of points.
 DEPENDENT, POINTS = 1e-9, 3
 
@@ -31,6 +31,8 @@ class Model(NamedTuple):
     system : Constrained
     energies : tuple of (str, expression)
         Descriptions of quantities that may be the energy, and their expressions.
+    momenta, outputs : tuple of (str, expression)
+        Names and expressions of momenta that may be constant, and of the quantities that are computed at saved states.
     independent : tuple of str or None
         The components of the state that the model calls independent; None if it calls none dependent.
     position_names, velocity_names : tuple of str
@@ -39,6 +41,8 @@ class Model(NamedTuple):
 
     system: Constrained
     energies: tuple[tuple[str, Any], ...]
+    momenta: tuple[tuple[str, Any], ...]
+    outputs: tuple[tuple[str, Any], ...]
     independent: tuple[str, ...] | None
     position_names: tuple[str, ...]
     velocity_names: tuple[str, ...]
@@ -56,6 +60,8 @@ class _Equations(NamedTuple):
     positions: list[Any]
     velocities: list[Any]
     energies: list[tuple[str, Any]]
+    kinetic: Any  # or the Lagrangian
+    method: Any  # a KanesMethod, whose speeds may be any linear functions of the derivatives of coordinates
     independent: list[Any] | None
     by_speeds: dict[Any, Any]  # derivatives of coordinates
 
@@ -68,7 +74,14 @@ def name_of(item: Any) -> str:
     return re.sub(r"\W", "_", text.replace("'", "_prime"))
 
 
-def read(model: Any, inputs: Mapping[Any, Any], parameters: Mapping[str, float], energy: Any) -> Model:
+def read(
+    model: Any,
+    inputs: Mapping[Any, Any],
+    parameters: Mapping[str, float],
+    energy: Any,
+    outputs: Mapping[str, Any],
+    start: Start,
+) -> Model:
     """Return the equations of a model.
 
     Parameters
@@ -76,37 +89,130 @@ def read(model: Any, inputs: Mapping[Any, Any], parameters: Mapping[str, float],
     model
         A KanesMethod, LagrangesMethod, or an object with the attribute ``eom_method``, which is one of these.
     inputs : mapping
-        Expressions of functions of time that are neither coordinates nor speeds.
+        Expressions or functions of functions of time that are neither coordinates nor speeds, see `read_inputs`.
     parameters : mapping
         Values of the parameters by their names.
     energy : expression or None
         The total energy, if it is given.
+    outputs : mapping
+        Expressions of the quantities that are computed at saved states, by name.
+    start : Start
     """
     method = _method(model)
     found = _of_lagrange(method) if hasattr(method, "_L") else _of_kane(method)
-    names = {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
-    _require_distinct(names)
-    given = {_as_function(key, found): value for key, value in inputs.items()}
-    symbols = {item: symbol(name) for item, name in names.items()} | {TIME: symbol("t")}
+    converted = _Conversion(found, inputs, start)
+    system = _system(found, converted, parameters)
+    energies = tuple((label, converted(item)) for label, item in _energies(found, energy, converted))
+    momenta = tuple(_momenta(found, system, converted))
+    shown = tuple((name, converted.output(name, item, parameters)) for name, item in outputs.items())
+    extra = [item for _, item in (*energies, *momenta, *shown)]
+    system = system._replace(parameters=_parameters(system, extra, parameters))
+    system, added = _with_missing_velocities(system, parameters)
+    notes = () if not added else (f"velocity constraints were added for {', '.join(added)}, which the model lacks",)
+    own = len(system.velocities) - len(added)
+    positions = tuple(f"g{k + 1}" for k in range(len(system.positions)))
+    return Model(
+        system,
+        energies,
+        momenta,
+        shown,
+        None if found.independent is None else tuple(converted.names[item] for item in found.independent),
+        positions,
+        (*(f"v{k + 1}" for k in range(own)), *(f"{item}'" for item in added)),
+        (*notes, *converted.inputs.notes),
+    )
 
-    def converted(expression: Any) -> Any:
+
+class Start(NamedTuple):
+    """The time, and the coordinates and speeds at the start, as they were given."""
+
+    t: float
+    q0: Any
+    u0: Any
+
+    def numbers(self, coordinates: Sequence[str], speeds: Sequence[str]) -> np.ndarray:
+        """Return a state from which functions can be called; what is not given is 0."""
+
+        def listed(given: Any, names: Sequence[str]) -> list[float]:
+            if isinstance(given, Mapping):
+                by_name = {name_of(key): value for key, value in given.items()}
+                return [float(by_name.get(name, 0.0)) for name in names]
+            return [float(value) for value in given] if np.shape(given) == (len(names),) else [0.0] * len(names)
+
+        return np.array([*listed(self.q0, coordinates), *listed(self.u0, speeds)])
+
+
+class _Conversion:
+    """From expressions in a model's symbols to those in the package's symbols."""
+
+    def __init__(self, found: _Equations, inputs: Any, start: Start) -> None:
+        self.names = {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
+        _require_distinct(self.names)
+        self._found = found
+        self._symbols = {item: symbol(name) for item, name in self.names.items()} | {TIME: symbol("t")}
+        self._accelerations = {item.diff(TIME): acceleration(self.names[item]) for item in found.speeds}
+        count = len(found.coordinates)
+        state = start.numbers(*(list(self.names.values())[part] for part in (slice(count), slice(count, None))))
+        self.inputs = read_inputs(inputs, _functions_of_time(found), self.names, (start.t, state))
+        self._called = {name for name, _ in self.inputs.called}
+        if taken := self._called & {*self.names.values(), "t"}:
+            raise ValueError(f"inputs: {taken.pop()!r} is also the name of a component of the state; rename one.")
+
+    def __call__(self, expression: Any) -> Any:
+        """Return the expression."""
+        found, given = self._found, self.inputs.expressions
         expression = msubs(sympy.sympify(expression), found.by_speeds)
         if given and expression.has(*given):
             expression = msubs(expression.subs(given).doit(), found.by_speeds)
-        expression = expression.xreplace({k: v for k, v in symbols.items() if isinstance(k, sympy.Derivative)})
-        expression = expression.xreplace({k: v for k, v in symbols.items() if not isinstance(k, sympy.Derivative)})
-        left = sorted(expression.atoms(AppliedUndef, sympy.Derivative), key=str)
-        if left:
-            raise ValueError(
-                f"mechanics: {left[0]} is neither a coordinate nor a speed; give it as an expression of t and the "
-                f"state: inputs={{{name_of(left[0])!r}: ...}}."
-            )
-        others = {item: symbol(name_of(item)) for item in expression.free_symbols - set(symbols.values())}
-        return expression.xreplace(others)
+        for derivatives in (True, False):
+            chosen = {k: v for k, v in self._symbols.items() if isinstance(k, sympy.Derivative) == derivatives}
+            expression = expression.xreplace(chosen)
+        left = sorted(
+            expression.atoms(AppliedUndef, sympy.Derivative), key=lambda item: (item.args != (TIME,), str(item))
+        )
+        unknown = [item for item in left if isinstance(item, sympy.Derivative) or name_of(item) not in self._called]
+        if unknown:
+            raise self._unknown(unknown[-1])
+        expression = expression.xreplace({item: symbol(name_of(item)) for item in left})
+        own = {*self._symbols.values(), *self._accelerations.values()}
+        return expression.xreplace({item: symbol(name_of(item)) for item in expression.free_symbols - own})
 
-    positions = tuple(map(converted, found.positions))
-    velocities = tuple(map(converted, found.velocities))
-    energies = [("energy=", energy)] if energy is not None else found.energies
+    def _unknown(self, item: Any) -> ValueError:
+        inner = item.expr if isinstance(item, sympy.Derivative) else item
+        if name_of(inner) in self._called:
+            return ValueError(
+                f"mechanics: the equations contain the derivative {item} of an input that is a function without an "
+                f"expression; give it as an expression of t: inputs={{{name_of(inner)!r}: ...}}."
+            )
+        return ValueError(
+            f"mechanics: {item} is neither a coordinate nor a speed; give it as an expression of t and the state, or a "
+            f"function f(t, y): inputs={{{name_of(inner)!r}: ...}}."
+        )
+
+    def depends_on_call(self, expression: Any) -> bool:
+        """Return whether an expression contains an input that is called."""
+        return bool({item.name for item in expression.free_symbols} & self._called)
+
+    def output(self, name: str, given: Any, parameters: Mapping[str, float]) -> Any:
+        """Return an output, which may be text, and contain accelerations."""
+        if isinstance(given, str):
+            return as_expression(f"the output {name!r}", given, {*self.names.values(), *parameters})
+        found = self._found
+        second = {q.diff(TIME, 2): value.diff(TIME) for q, value in found.by_speeds.items() for q in (q.args[0],)}
+        expression = sympy.sympify(given).xreplace(second)
+        return self(expression.xreplace(self._accelerations))
+
+
+def _functions_of_time(found: _Equations) -> dict[str, Any]:
+    """Return the functions of time in the equations by name."""
+    items = (*found.forces, *found.positions, *found.velocities, *found.mass, *found.rates)
+    atoms = set().union(*(sympy.sympify(item).atoms(AppliedUndef) for item in items))
+    return {name_of(item): item for item in atoms}
+
+
+def _system(found: _Equations, converted: _Conversion, parameters: Mapping[str, float]) -> Constrained:
+    """Return the equations without parameters, which are not known before all expressions are."""
+    names = converted.names
     system = Constrained(
         tuple(names[item] for item in found.coordinates),
         tuple(names[item] for item in found.speeds),
@@ -114,22 +220,54 @@ def read(model: Any, inputs: Mapping[Any, Any], parameters: Mapping[str, float],
         tuple(map(converted, found.rates)),
         tuple(map(converted, found.mass)),
         tuple(map(converted, found.forces)),
-        positions,
-        velocities,
+        tuple(map(converted, found.positions)),
+        tuple(map(converted, found.velocities)),
+        converted.inputs.called,
     )
-    kept = tuple((label, converted(item)) for label, item in energies)
-    system = system._replace(parameters=_parameters(system, [item for _, item in kept], parameters))
-    system, added = _with_missing_velocities(system, parameters)
-    notes = () if not added else (f"velocity constraints were added for {', '.join(added)}, which the model lacks",)
-    own = len(system.velocities) - len(added)
-    return Model(
-        system,
-        kept,
-        None if found.independent is None else tuple(names[item] for item in found.independent),
-        tuple(f"g{k + 1}" for k in range(len(positions))),
-        (*(f"v{k + 1}" for k in range(own)), *(f"{item}'" for item in added)),
-        notes,
-    )
+    parts = {"constraint": (*system.positions, *system.velocities), "kinematic equation": system.rates}
+    for what, items in parts.items():
+        if any(map(converted.depends_on_call, items)):
+            raise ValueError(
+                f"inputs: a {what} depends on an input that is a function without an expression, and its derivatives "
+                "are needed. Give the input as an expression of t and the state."
+            )
+    return system
+
+
+def _energies(found: _Equations, energy: Any, converted: _Conversion) -> list[tuple[str, Any]]:
+    """Return the quantities that may be the energy; those with inputs that are called are none."""
+    if energy is None:
+        return [(label, item) for label, item in found.energies if not converted.depends_on_call(converted(item))]
+    if converted.depends_on_call(converted(energy)):
+        raise ValueError(
+            "mechanics: energy depends on an input that is a function without an expression, and its derivatives are "
+            "needed; give the input as an expression of t and the state."
+        )
+    return [("energy=", energy)]
+
+
+def _momenta(found: _Equations, system: Constrained, converted: _Conversion) -> Iterator[tuple[str, Any]]:
+    """Yield the names and expressions of momenta that may be constant."""
+
+    def speeds_by_rate(k: int) -> list[Any]:
+        return own_speed(system, k) or (_speeds_by_rate(found.method, k, converted) if found.method else [])
+
+    places = cyclic(system, speeds_by_rate)
+    slopes = [converted(sympy.diff(found.kinetic, u)) for u in found.speeds] if places else []
+    for k in places:
+        products = (a * b for a, b in zip(speeds_by_rate(k), slopes, strict=True))
+        yield f"p_{system.coordinates[k]}", sympy.Add(*products)
+
+
+def _speeds_by_rate(method: Any, k: int, converted: _Conversion) -> list[Any]:
+    """Return the derivatives of the speeds of a KanesMethod by that of a coordinate, [] where there are none."""
+    by_speeds, by_rates = method._k_ku_implicit, method._k_kqdot_implicit
+    if by_speeds.rows != by_speeds.cols:
+        return []
+    column = -by_rates[:, k]
+    if by_speeds.is_diagonal():
+        return [converted(a / b) for a, b in zip(column, by_speeds.diagonal(), strict=True)]
+    return [converted(item) for item in by_speeds.LUsolve(column)]
 
 
 def _method(model: Any) -> Any:
@@ -184,6 +322,8 @@ def _of_kane(method: Any) -> _Equations:
         list(method._f_h),
         velocities,
         energies,
+        kinetic,
+        method,
         [item for item in (*q, *u) if item not in dependent] if dependent else None,
         dict(by_speeds),
     )
@@ -205,6 +345,8 @@ def _of_lagrange(method: Any) -> _Equations:
         list(method._hol_coneqs),
         list(method.coneqs),
         [("of the Lagrangian", energy)],
+        L,
+        None,
         None,
         {},
     )
@@ -247,22 +389,12 @@ def _require_distinct(names: Mapping[Any, str]) -> None:
         raise ValueError(f"mechanics: {twice!r} names two components of the state, or the time; rename one.")
 
 
-def _as_function(key: Any, found: _Equations) -> Any:
-    """Return the function of time of an input that is given by its name or itself."""
-    if not isinstance(key, str):
-        return key
-    atoms = set().union(*(sympy.sympify(item).atoms(AppliedUndef) for item in (*found.forces, *found.positions,
-                        *found.velocities, *found.mass)))  # fmt: skip
-    known = {name_of(item): item for item in atoms}
-    if key not in known:
-        raise ValueError(f"inputs: the model has no function {key!r}{nearest(key, known)}.")
-    return known[key]
-
-
 def _parameters(system: Constrained, others: Sequence[Any], values: Mapping[str, float]) -> tuple[str, ...]:
     """Return the names of the parameters that occur, in the order in which their values are given."""
     items = (*system.rates, *system.mass, *system.forces, *system.positions, *system.velocities, *others)
-    free = set().union(*(item.free_symbols for item in items)) - {*system.variables, symbol("t")}
+    known = {*system.variables, symbol("t"), *map(acceleration, system.speeds)}
+    known |= {symbol(name) for name, _ in system.inputs}
+    free = set().union(*(item.free_symbols for item in items)) - known
     needed = {item.name for item in free}
     missing = sorted(needed - values.keys())
     if missing:
@@ -283,7 +415,7 @@ def _with_missing_velocities(system: Constrained, values: Mapping[str, float]) -
     rates = [system.rate(item) for item in system.positions]
     items = (*rates, *system.velocities)
     speeds = system.variables[len(system.coordinates) :]
-    rows = filling("rows", [sympy.diff(item, u) for item in items for u in speeds], system)
+    rows = filling("rows", [sympy.diff(item, u) for item in items for u in speeds], system.arguments)
     params = np.array([values[name] for name in system.parameters])
     extra = (params,) if system.parameters else ()
     rng = np.random.default_rng(3)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 import sympy
 
+from ..multibody.numerical import outputs_as_given
 from ..multibody.parts import Given, Parts
 from ..multibody.start import Names
-from .constrained import Constrained, parts_of
+from .constrained import Constrained, cyclic, own_speed, parts_of
 from .parser import symbol
 from .traced import NotTraceableError, traced
 
@@ -57,7 +60,32 @@ def traced_parts(given: Given, names: Names, t: float, q: np.ndarray, u: np.ndar
         M = sympy.Matrix(len(speeds), len(speeds), system.mass)
         kinetic = (sympy.Matrix(speeds).T * M * sympy.Matrix(speeds))[0] / 2
         energies.append(("u M u / 2 + potential", kinetic + expressions("potential", "tq")[0], power))
-    return parts_of(system, energies)
+    parts = parts_of(system, energies, tuple(_momenta(system)), _outputs(given, by_name))
+    called = given.outputs and parts.outputs is None
+    return parts._replace(outputs=outputs_as_given(given, q.size, u.size)) if called else parts
+
+
+def _momenta(system: Constrained) -> Iterator[tuple[str, Any]]:
+    """Yield the names and expressions of momenta of coordinates that may be cyclic."""
+    n = len(system.speeds)
+    momenta = sympy.Matrix(n, n, system.mass) * sympy.Matrix([symbol(name) for name in system.speeds])
+    for k in cyclic(system, partial(own_speed, system)):
+        yield f"p_{system.coordinates[k]}", sympy.Matrix([own_speed(system, k)]).dot(momenta)
+
+
+def _outputs(given: Given, by_name: Any) -> list[tuple[str, Any]]:
+    """Return the outputs as expressions, none if one of them has no expression."""
+    symbols, numbers = zip(*(by_name[letter] for letter in "tqu"), strict=True)
+    names = Names(by_name["q"][0], by_name["u"][0], (), ())
+    found = []
+    for name, fun in given.outputs.items():
+        try:
+            item = traced(name, fun, *symbols).ravel()
+            _require_agreement(name, item, fun(*numbers), names, numbers)
+        except NotTraceableError:
+            return []
+        found.append((name, item[0]))
+    return found
 
 
 def _require_agreement(what: str, found: Any, value: Any, names: Names, numbers: Any) -> None:

@@ -1,0 +1,57 @@
+"""Quantities of a mechanical system that a user names, computed from its states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...core.inputs import shown
+
+__all__ = ["Outputs", "columns_of", "required_outputs"]
+
+
+class Outputs(NamedTuple):
+    """Quantities that a user names, and ``fill(t, x, out, *params)``, which computes them from x = (q, u, u')."""
+
+    names: tuple[str, ...]
+    fill: Callable[..., None]
+
+
+def columns_of(what: str, t: Any, y: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and states as columns.
+
+    Raises
+    ------
+    ValueError
+        If they do not belong together.
+    """
+    times, states = np.atleast_1d(np.asarray(t, float)), np.asarray(y, float)
+    columns = states.reshape(len(states), -1)
+    if np.ndim(t) != states.ndim - 1 or columns.shape != (n, times.size):
+        raise ValueError(
+            f"{what}: y has the shape {states.shape} for {times.size} times; expected ({n},) for a number t, or a "
+            "column for each time."
+        )
+    return times, columns
+
+
+def required_outputs(what: str, outputs: Any, taken: Any) -> dict[str, Any]:
+    """Return the outputs by name.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If they are not a mapping of strings, or a name is that of a component of the state.
+    """
+    if outputs is None:
+        return {}
+    if not isinstance(outputs, Mapping):
+        raise TypeError(f"{what}: outputs must be a mapping of names to quantities, got {shown(outputs)}.")
+    for name in outputs:
+        if not isinstance(name, str):
+            raise TypeError(f"{what}: names of outputs must be strings, got {shown(name)}.")
+        if name in taken:
+            raise ValueError(f"{what}: the output {name!r} has the name of a component of the state; rename it.")
+    return dict(outputs)

@@ -1,0 +1,144 @@
+"""Inputs of mechanical models: functions of time in the equations that are neither coordinates nor speeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy
+from sympy.physics.mechanics import dynamicsymbols
+
+from ...core.inputs import is_number, shown
+from ...core.jitted import compiled_like, is_jitted
+from ...core.names import nearest
+from .parser import symbol
+from .traced import NotTraceableError, traced
+
+__all__ = ["Inputs", "read_inputs"]
+
+TIME = dynamicsymbols._t
+# A traced function agrees with the function itself up to rounding errors; this bound is relative.
+AGREES = 1e-9
+
+
+class Inputs(NamedTuple):
+    """Expressions by functions of time, and functions ``f(t, y)`` by name, which are called as they are."""
+
+    expressions: dict[Any, Any]
+    called: tuple[tuple[str, Callable[..., float]], ...]
+    notes: tuple[str, ...]
+
+
+def read_inputs(
+    given: Any, known: Mapping[str, Any], state: Mapping[Any, str], start: tuple[float, np.ndarray]
+) -> Inputs:
+    """Return the inputs as expressions where they have any.
+
+    Parameters
+    ----------
+    given : mapping
+        Of functions of time, their names, or tuples of them, to numbers, expressions, or functions ``f(t, y)``, which
+        return as many numbers.
+    known : mapping
+        The functions of time in the model by name.
+    state : mapping
+        The names of coordinates and speeds, in the order of the state.
+    start : (float, ndarray)
+        A time and a state at which functions are called.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For what is no input.
+    """
+    if not isinstance(given, Mapping):
+        raise TypeError(
+            f"inputs must be a mapping of functions of time to expressions or functions, got {shown(given)}."
+        )
+    expressions: dict[Any, Any] = {}
+    called: list[tuple[str, Callable[..., float]]] = []
+    for key, value in given.items():
+        keys = [_function_of_time(item, known, state) for item in (key if isinstance(key, tuple) else (key,))]
+        if callable(value) and not isinstance(value, sympy.Basic):
+            found = _traced(keys, value, state, start)
+            if found is None:
+                called += _called(keys, value)
+            else:
+                expressions |= found
+        else:
+            expressions |= _as_expressions(keys, value)
+    notes = tuple(f"the input {name} is a function that is called as it is" for name, _ in called)
+    return Inputs(expressions, tuple(called), notes)
+
+
+def _function_of_time(key: Any, known: Mapping[str, Any], state: Mapping[Any, str]) -> Any:
+    if key in state or key in state.values():
+        raise ValueError(f"inputs: {key} is a component of the state; inputs are the other functions of time.")
+    if not isinstance(key, str):
+        return key
+    if key not in known:
+        raise ValueError(f"inputs: the model has no function {key!r}{nearest(key, known)}.")
+    return known[key]
+
+
+def _as_expressions(keys: Sequence[Any], value: Any) -> dict[Any, Any]:
+    """Return numbers or expressions by function of time."""
+    values = [value] if len(keys) == 1 and not isinstance(value, (tuple, list, np.ndarray)) else list(value)
+    if len(values) != len(keys):
+        raise ValueError(f"inputs: got {len(values)} values for {', '.join(map(str, keys))}; expected {len(keys)}.")
+    for item in values:
+        if not (is_number(item) or isinstance(item, sympy.Expr)):
+            raise TypeError(
+                f"inputs: {keys[0]} is {shown(item)}; expected a number, an expression of t and the state, or a "
+                "function f(t, y)."
+            )
+    return dict(zip(keys, map(sympy.sympify, values), strict=True))
+
+
+def _traced(
+    keys: Sequence[Any], fun: Any, state: Mapping[Any, str], start: tuple[float, np.ndarray]
+) -> dict[Any, Any] | None:
+    """Return a function's values as expressions of the model's functions; None if it has none."""
+    names = tuple(state.values())
+    try:
+        found = traced(keys[0].func.__name__, fun, "t", names).ravel()
+    except NotTraceableError:
+        return None
+    _require_size(keys, found)
+    t, y = start
+    values = {symbol("t"): t, **{symbol(name): x for name, x in zip(names, y, strict=True)}}
+    own = [float(sympy.sympify(item).xreplace(values)) for item in found]
+    if not np.allclose(own, np.ravel(fun(t, y)), rtol=AGREES, atol=AGREES):  # it reads more than its arguments
+        return None
+    back = {symbol(name): item for item, name in state.items()} | {symbol("t"): TIME}
+    return {key: sympy.sympify(item).xreplace(back) for key, item in zip(keys, found, strict=True)}
+
+
+def _called(keys: Sequence[Any], fun: Any) -> list[tuple[str, Callable[..., float]]]:
+    """Return the parts of a function that is called as it is."""
+    from .models import name_of
+
+    if len(keys) == 1:
+        return [(name_of(keys[0]), _part(fun, None))]
+    return [(name_of(key), _part(fun, k)) for k, key in enumerate(keys)]
+
+
+def _part(fun: Any, k: int | None) -> Callable[..., float]:
+    if not is_jitted(fun):
+        return partial(_called_in_python, fun, k)
+    if k is None:
+        return fun
+    return compiled_like(lambda t, y: fun(t, y)[k], fun)
+
+
+def _called_in_python(fun: Callable[..., Any], k: int | None, t: float, y: np.ndarray) -> float:
+    return float(fun(t, y) if k is None else fun(t, y)[k])
+
+
+def _require_size(keys: Sequence[Any], found: np.ndarray) -> None:
+    if found.size != len(keys):
+        raise ValueError(
+            f"inputs: the function of {', '.join(map(str, keys))} returns {found.size} numbers; expected {len(keys)}."
+        )
