@@ -106,6 +106,7 @@ def equations(
     *,
     params: Mapping[Any, float] | None = None,
     invariants: Mapping[str, Any] | None = None,
+    constraints: Mapping[str, Any] | None = None,
     name: str | None = None,
 ) -> SymbolicProblem:
     """The problem y' = f(t, y), written as expressions, with its invariants.
@@ -116,8 +117,14 @@ def equations(
         The derivatives as text or SymPy expressions, in the order of `y`; or a mapping of each component to its own.
     y : str or sequence, optional
         Names of the components, ``"x v"``, a list of them, or SymPy symbols. Default: the mapping's keys.
+        Components may be functions of time, `dynamicsymbols` of sympy.physics.mechanics. The keys may then be their
+        derivatives, and derivatives in expressions stand for what they are equal to. If both x and x' are components,
+        the latter is called ``v_x``.
     params, invariants, name
         As for `hamiltonian`. An invariant may depend on t; it is checked by its rate along the equations.
+    constraints : mapping, optional
+        Expressions by name that are 0 at the start, and are kept so, such as ``{"length": "x**2 + y**2 - 1"}`` and the
+        velocity constraint that belongs to it. They and the invariants may be kept only where all of them are 0.
 
     Returns
     -------
@@ -136,12 +143,21 @@ def equations(
     >>> problem = equations(spin, params={"I1": 1.0, "I2": 2.0, "I3": 3.0}, invariants=keeps)
     >>> problem.checks
     {'energy': 'symbolically', '|m|^2': 'symbolically'}
+
+    A pendulum in Cartesian coordinates, whose constraints are kept only where both of them hold:
+
+    >>> motion = {"x": "u", "y": "v", "u": "-s*x", "v": "-s*y - 9.81"}
+    >>> motion = {k: f.replace("s", "(u**2 + v**2 - 9.81*y)") for k, f in motion.items()}
+    >>> pendulum = equations(motion, constraints={"length": "x**2 + y**2 - 1", "rate": "x*u + y*v"},
+    ...                      invariants={"energy": "(u**2 + v**2)/2 + 9.81*y"})
+    >>> pendulum.checks["length"], pendulum.checks["energy"]
+    ('numerically, at 8 points that meet the constraints', 'numerically, at 8 points that meet the constraints')
     """
     _require_sympy("equations")
     from .system import equations_problem
 
     with _nested("equations"):
-        return equations_problem(f, y, params, invariants, name)
+        return equations_problem(f, y, params, invariants, constraints, name)
 
 
 def mechanics(

@@ -11,7 +11,7 @@ import sympy
 from .branches import Switches
 from .sizes import EXPANDED_TERMS, expanded_terms
 
-__all__ = ["how_kept", "vanishes"]
+__all__ = ["NotKeptError", "Rate", "how_kept", "shortened", "vanishes"]
 
 POINTS, TRIES = 8, 200
 DIGITS = 50
@@ -19,6 +19,10 @@ LARGEST = sympy.Integer(10) ** 300
 ROUND_OFF = 1e-20  # of a rate that is 0, to its terms, when computed with DIGITS
 # Operations beyond which `simplify` may take minutes where numbers take milliseconds.
 SIMPLIFIED_OPERATIONS = 120
+
+
+class NotKeptError(ValueError):
+    """A quantity is not an invariant."""
 
 
 class Rate(NamedTuple):
@@ -56,8 +60,10 @@ def how_kept(
 
     Raises
     ------
+    NotKeptError
+        When it is not, naming a point and the rate there.
     ValueError
-        When it is not, naming a point and the rate there; when the rate is finite at no point that was tried.
+        When the rate is finite at no point that was tried.
     """
     time = sympy.Symbol("t", real=True)
     terms = [sympy.diff(quantity, variable) * f for variable, f in zip(variables, rates, strict=True)]
@@ -76,7 +82,7 @@ def how_kept(
             "branch, or a run without it."
         ) from None
     if not points:
-        raise ValueError(f"invariant {name!r}: its rate {_cut(rate.total)} is finite and real at no point tried.")
+        raise ValueError(f"invariant {name!r}: its rate {shortened(rate.total)} is finite and real at no point tried.")
     _require_kept(name, rate, points)
     return f"numerically, at {len(points)} points" + (" with the parameters given" if parameters else "")
 
@@ -85,8 +91,8 @@ def _require_kept(name: str, rate: Rate, points: Sequence[Any]) -> None:
     for point, (total, size) in points:
         if abs(total) > ROUND_OFF * size:
             place = ", ".join(f"{key}={float(value):.3g}" for key, value in point.items())
-            raise ValueError(
-                f"{name!r} is no invariant of these equations: its rate is {_cut(rate.total)}, at {place} "
+            raise NotKeptError(
+                f"{name!r} is no invariant of these equations: its rate is {shortened(rate.total)}, at {place} "
                 f"{float(total):.3g} where its terms sum to {float(size):.3g}."
             )
 
@@ -164,6 +170,7 @@ def _drawn(draw: random.Random, variables: Sequence[Any], signs: Sequence[int]) 
     return {item: draw.choice(signs) * sympy.Rational(draw.randint(300, 1700), 1000) for item in variables}
 
 
-def _cut(expression: Any) -> str:
+def shortened(expression: Any) -> str:
+    """Return the beginning of an expression as text."""
     text = str(expression)
     return text if len(text) <= 120 else f"{text[:120]}..."

@@ -15,11 +15,13 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import sympy
+from sympy.core.function import AppliedUndef
 
 from .sizes import TooLargeError, require_constant, require_function, require_power, require_product, require_sum
 
 __all__ = ["as_expression", "as_names", "symbol"]
 
+TIME = sympy.Symbol("t")  # of dynamicsymbols
 ONE_ARGUMENT = (
     "sqrt", "cbrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh",
     "atanh", "erf", "sign",
@@ -49,7 +51,7 @@ def symbol(name: str) -> sympy.Symbol:
 
 
 def as_names(what: str, names: Any) -> tuple[str, ...]:
-    """Names from "x y", "x, y", or a sequence of strings and SymPy symbols.
+    """Names from "x y", "x, y", or a sequence of strings, SymPy symbols and dynamicsymbols.
 
     Raises
     ------
@@ -88,7 +90,7 @@ def as_expression(what: str, given: Any, declared: Iterable[str] = ()) -> sympy.
 
 
 def _items(what: str, names: Any) -> list[Any]:
-    if isinstance(names, sympy.Symbol):
+    if isinstance(names, sympy.Symbol | AppliedUndef):
         return [names]
     if not isinstance(names, Iterable):
         raise TypeError(f"{what}: expected names, as 'x y' or ['x', 'y'], got {_cut(names)}.")
@@ -98,6 +100,8 @@ def _items(what: str, names: Any) -> list[Any]:
 def _name(what: str, item: Any) -> str:
     if isinstance(item, sympy.Symbol):
         item = item.name
+    elif isinstance(item, AppliedUndef) and item.args == (TIME,):
+        item = item.func.__name__
     if not isinstance(item, str):
         raise TypeError(f"{what}: expected names, as 'x y' or ['x', 'y'], got {_cut(item)} among them.")
     if not item.isidentifier() or keyword.iskeyword(item):
@@ -119,7 +123,17 @@ def _cut(value: Any) -> str:
 
 
 def _with_real_symbols(what: str, given: sympy.Expr) -> sympy.Expr:
-    symbols = sorted(given.free_symbols, key=str)
+    if derivatives := given.atoms(sympy.Derivative):
+        raise ValueError(
+            f"{what}: it contains {_cut(min(derivatives, key=str))}; expected an expression of the state without "
+            "derivatives. equations takes those of components of the state."
+        )
+    functions = {item for item in given.atoms(AppliedUndef) if item.args == (TIME,)}
+    if functions:
+        symbols = given.xreplace({item: sympy.Dummy() for item in functions}).free_symbols
+        symbols = sorted({*functions, *(item for item in symbols if not isinstance(item, sympy.Dummy))}, key=str)
+    else:
+        symbols = sorted(given.free_symbols, key=str)
     names = [_name(what, item) for item in symbols]
     twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
     if twice is not None:

@@ -18,15 +18,18 @@ from ...core.inputs import is_number, refuse_units, shown
 from ...core.invariants import Invariant
 from ...core.jitted import compiled_like, is_jitted
 from ...core.problem import Deferred, Problem, bind
-from .brackets import how_kept, vanishes
+from .brackets import NotKeptError, how_kept, vanishes
+from .manifold import Manifold
 from .pairs import paired
 from .parser import as_expression, as_names, symbol
 from .program import Arguments, function
 from .program import variational as variational_function
+from .timed import Timed
 
 __all__ = ["SymbolicProblem", "equations_problem", "hamiltonian_problem", "parameter_values"]
 
 
+HINT = "If it is kept only where constraints hold, give them as constraints=."
 LARGEST_JACOBIAN = 16  # coordinates; there are as many second derivatives as their square
 
 
@@ -38,6 +41,7 @@ class System(NamedTuple):
     rates: tuple[Any, ...]
     invariants: tuple[tuple[str, Any], ...]
     balances: tuple[tuple[str, Any, Any], ...] = ()
+    constraints: tuple[str, ...] = ()  # names of invariants that are 0
 
     @property
     def variables(self) -> list[Any]:
@@ -119,7 +123,8 @@ class SymbolicProblem(Problem):
         momenta = dict(zip(p, W.inv() * v, strict=True))
         kept = tuple((label, item.xreplace(momenta)) for label, item in self.system.invariants)
         slow = tuple((label, item.xreplace(momenta), r.xreplace(momenta)) for label, item, r in self.system.balances)
-        system = System(new, self.system.parameters, (*v, *(W * sympy.Matrix(rates[half:]))), kept, slow)
+        rates = (*v, *(W * sympy.Matrix(rates[half:])))
+        system = System(new, self.system.parameters, rates, kept, slow, self.system.constraints)
         return _problem(
             name=self.name,
             system=system,
@@ -147,7 +152,11 @@ class SymbolicProblem(Problem):
 
     def __repr__(self) -> str:
         pairs = ", ".join(f"{q} with {p}" for q, p in self.pairs)
-        kept = [f"{name} = {_cut(expression)} ({self.checks[name]})" for name, expression in self.system.invariants]
+        constraints = self.system.constraints
+        kept = [
+            f"{name} = {_cut(expression)}{' = 0' * (name in constraints)} ({self.checks[name]})"
+            for name, expression in self.system.invariants
+        ]
         rates = [f"{k}' = {_cut(f)}" for k, f in zip(self.system.components, self.system.rates, strict=True)]
         lines = [
             f"{self.name}: y = ({', '.join(self.system.components)})" + (f", pairs {pairs}" if pairs else ""),
@@ -196,7 +205,7 @@ def hamiltonian_problem(
         if extended:
             raise ValueError("hamiltonian: extended=True keeps H + p_t, and a perturbation or dissipation changes it.")
         rates, slow = _with_perturbation(energy, names, rates, values, declared, perturbed, flow)
-        return _checked("H", name or "hamiltonian", names, rates, values, {}, {}, invariants, pairs, slow)
+        return _checked("H", name or "hamiltonian", names, rates, values, {}, {}, Further(invariants), pairs, slow)
     checks = {"H": "by construction"}
     kept = {"H": energy}
     time = symbol("t")
@@ -212,7 +221,14 @@ def hamiltonian_problem(
             stacklevel=3,
         )
         kept, checks = {}, {}
-    return _checked("H", name or "hamiltonian", names, rates, values, kept, checks, invariants, pairs)
+    return _checked("H", name or "hamiltonian", names, rates, values, kept, checks, Further(invariants), pairs)
+
+
+class Further(NamedTuple):
+    """Expressions by name of invariants, and of constraints, which are 0."""
+
+    invariants: Any
+    constraints: Any = None
 
 
 class Perturbed(NamedTuple):
@@ -272,26 +288,23 @@ def _with_perturbation(
     return tuple(a + b for a, b in zip(rates, added, strict=True)), tuple(slow)
 
 
-def equations_problem(f: Any, y: Any, params: Any, invariants: Any, name: str | None) -> SymbolicProblem:
+def equations_problem(
+    f: Any, y: Any, params: Any, invariants: Any, constraints: Any, name: str | None
+) -> SymbolicProblem:
     """See `equations`."""
-    if isinstance(f, Mapping):
-        keys = as_names("the keys of f", list(f))
-        names = keys if y is None else as_names("y", y)
-        if set(keys) != set(names):
-            raise ValueError(f"equations: f has derivatives of {', '.join(keys)}, but y is {', '.join(names)}.")
-        by_name = dict(zip(keys, f.values(), strict=True))
-        given = [by_name[item] for item in names]
-    else:
-        if y is None:
-            raise TypeError("equations: y is missing; give the components' names, or f as a mapping of them.")
-        names = as_names("y", y)
-        given = [f] if isinstance(f, (str, sympy.Expr)) else list(f)
-    if len(given) != len(names):
-        raise ValueError(f"equations: {len(given)} derivatives for the {len(names)} components {', '.join(names)}.")
+    timed = Timed(f, y)
     values = parameter_values(params)
-    declared = {*names, *values}
-    rates = tuple(as_expression(f"the derivative of {k}", item, declared) for k, item in zip(names, given, strict=True))
-    return _checked("f", name or "equations", names, rates, values, {}, {}, invariants, ())
+    declared = {*timed.names, *values}
+    rates = tuple(
+        as_expression(f"the derivative of {k}", item, declared)
+        for k, item in zip(timed.names, timed.values, strict=True)
+    )
+    further = Further(*(_timed(given, timed) for given in (invariants, constraints)))
+    return _checked("f", name or "equations", timed.names, rates, values, {}, {}, further, ())
+
+
+def _timed(given: Any, timed: Timed) -> Any:
+    return {key: timed(item) for key, item in given.items()} if isinstance(given, Mapping) else given
 
 
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
@@ -341,15 +354,17 @@ def _checked(
     values: Any,
     kept: Any,
     checks: Any,
-    further: Any,
+    given: Further,
     pairs: Any,
     slow: tuple[tuple[str, Any, Any], ...] = (),
 ) -> SymbolicProblem:
     """The problem, once all names are known and further invariants are seen to be some."""
     if not isinstance(name, str):
         raise TypeError(f"name must be a string, got {shown(name)}.")
-    if further is not None and not isinstance(further, Mapping):
-        raise TypeError(f"invariants must be a mapping of names to expressions, got {shown(further)}.")
+    for kind, items in given._asdict().items():
+        if items is not None and not isinstance(items, Mapping):
+            raise TypeError(f"{kind} must be a mapping of names to expressions, got {shown(items)}.")
+    further, constraints = given.invariants or {}, given.constraints or {}
     both = [item for item in names if item in values]
     if both:
         raise ValueError(f"{both[0]} is a component of the state and a parameter.")
@@ -357,23 +372,48 @@ def _checked(
     known = {*names, *values, "t"}
     for rate in rates:
         _require_known(what, rate, known)
-    variables = [symbol(item) for item in names]
-    for label, given in (further or {}).items():
+    for label in constraints:
+        if label in further:
+            raise ValueError(f"{label!r} is a constraint and an invariant; give it once.")
+    quantities = {}
+    for label, item in (*constraints.items(), *further.items()):
         if not isinstance(label, str):
             raise TypeError(f"invariants: names must be strings, got {shown(label)}.")
         if label in kept:
             raise ValueError(f"invariants: {label} is there already.")
-        quantity = as_expression(f"invariant {label!r}", given, known)
-        _require_known(f"invariant {label!r}", quantity, known)
-        if not quantity.has(*variables):
-            raise ValueError(f"invariant {label!r} is {_cut(quantity)}, which does not depend on {', '.join(names)}.")
-        checks[label] = how_kept(label, quantity, variables, rates, parameters)
+        kind = "constraint" if label in constraints else "invariant"
+        quantities[label] = _quantity(f"{kind} {label!r}", item, names, known)
+    zero = {label: quantities[label] for label in constraints}
+    manifold = Manifold(zero, names, rates, values) if zero else None
+    for label, quantity in quantities.items():
+        checks[label] = _how_kept(label, quantity, names, rates, parameters, manifold, HINT if what == "f" else "")
         kept[label] = quantity
-    system = System(tuple(names), tuple(values), tuple(rates), tuple(kept.items()), slow)
+    system = System(tuple(names), tuple(values), tuple(rates), tuple(kept.items()), slow, tuple(constraints))
     params = np.array(list(values.values())) if values else None
     return _problem(
         name=name, system=system, params=params, checks=checks, pairs=pairs, invariants=_invariants(system, params)
     )
+
+
+def _quantity(what: str, given: Any, names: Sequence[str], known: set[str]) -> Any:
+    """Return the expression of an invariant or a constraint."""
+    quantity = as_expression(what, given, known)
+    _require_known(what, quantity, known)
+    if not quantity.has(*map(symbol, names)):
+        raise ValueError(f"{what} is {_cut(quantity)}, which does not depend on {', '.join(names)}.")
+    return quantity
+
+
+def _how_kept(
+    label: str, quantity: Any, names: Sequence[str], rates: Any, parameters: Any, manifold: Manifold | None, hint: str
+) -> str:
+    """Say how it is known that a quantity is kept, where the constraints hold if there are any."""
+    try:
+        return how_kept(label, quantity, [symbol(item) for item in names], rates, parameters)
+    except NotKeptError as error:
+        if manifold is None:
+            raise (ValueError(f"{error} {hint}") if hint else error) from None
+    return manifold.how_kept(label, quantity)
 
 
 def _problem(*, system: System, params: np.ndarray | None, **others: Any) -> SymbolicProblem:
@@ -399,7 +439,7 @@ def _invariants(system: System, params: np.ndarray | None) -> tuple[Invariant, .
     args = () if params is None else (params,)
     functions = _functions(system)
     kept = [
-        Invariant(fun, grad, args=args, in_place=True, name=name)
+        Invariant(fun, grad, target=0.0 if name in system.constraints else None, args=args, in_place=True, name=name)
         for (name, _), (fun, grad) in zip(system.invariants, functions.invariants, strict=True)
     ]
     slow = [
