@@ -40,8 +40,8 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
         invariants, also ``invariants`` and ``invariant_errors`` (I - target), both (invariant, t), and ``max_defect``.
         If it has derivatives, also ``variations`` (t, component, column); a column is named after the component of the
         initial state or the parameter with respect to which it is the derivative, or 0, 1 and so on. A mechanical
-        system adds ``outputs`` (output, t), ``multipliers`` (constraint, t) and ``constraint_rank`` (t,). Attributes are
-        method, h (nan for adaptive steps), message, trusted (1 or 0) and others that the result has.
+        system adds ``outputs`` (output, t), ``multipliers`` (constraint, t) and ``constraint_rank`` (t,). Attributes
+        are method, h (nan for adaptive steps), message, trusted (1 or 0) and others that the result has.
 
     Raises
     ------
@@ -100,8 +100,8 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
         "H error" (the value minus the target). If a component has the same name, the invariant is "invariant H". The
         last columns are derivatives, such as "dx/dvy" of x with respect to the initial vy; see `to_xarray` for the
         names. A mechanical system adds its outputs, "output x" if there is a column x, and its multipliers, such as
-        "multiplier g1'". The table of an ensemble is indexed by ``member``: a column for each component of the last state, then
-        "t_end", "status", "message", "trusted", and "H max_defect" for each invariant.
+        "multiplier g1'". The table of an ensemble is indexed by ``member``: a column for each component of the last
+        state, then "t_end", "status", "message", "trusted", and "H max_defect" for each invariant.
 
     Raises
     ------
