@@ -101,19 +101,21 @@ def test_to_xarray():
 
 
 def test_tables_of_derivatives():
-    run = integrate(kepler(), (0, 1), method=EIPRK4, variations=["state", 0])
+    options = {"method": EIPRK4, "invariants": ()}  # whose derivatives would be compiled
+    run = integrate(kepler(), (0, 1), variations=["state", 0], **options)
     data, frame = run.to_xarray("a b c d"), run.to_dataframe()
     np.testing.assert_array_equal(data.variations.sel(component="a", column="d"), run.stm[:, 0, 3])
     np.testing.assert_array_equal(data.variations.sel(column="params[0]"), run.sensitivities[..., 0])
     np.testing.assert_array_equal(frame["dvx/dy"], run.stm[:, 2, 1])
     assert frame.columns[-1] == "dvy/dparams[0]"
-    along = integrate(kepler(), (0, 1), method=EIPRK4, variations=np.eye(4)[:, 1:3])
+    along = integrate(kepler(), (0, 1), variations=np.eye(4)[:, 1:3], **options)
     assert along.to_xarray().column.values.tolist() == ["0", "1"]
     np.testing.assert_array_equal(along.to_dataframe()["dx/d1"], along.variations[:, 0, 1])
 
 
-@pytest.mark.needs_jit
+@pytest.mark.nightly
 @pytest.mark.slow
+@pytest.mark.needs_jit
 def test_tables_of_named_sensitivities():
     named = hamiltonian("p**2/2 - k*cos(q)", params={"k": 1.0})
     run = integrate(named, (0, 1), [0.1, 0.2], method=EIPRK4, h=0.1, variations="k")
