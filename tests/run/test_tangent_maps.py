@@ -263,6 +263,7 @@ def test_spectrum_of_a_linear_system():
     assert run.trusted
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_spectrum_of_a_hamiltonian_system(henon_heiles):
     """Volumes are kept in all steps, the pairs of exponents in the limit."""
@@ -275,6 +276,7 @@ def test_spectrum_of_a_hamiltonian_system(henon_heiles):
     assert first.exponents[0] == pytest.approx(run.exponents[0], rel=0.3)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_spectrum_of_lorenz():
     """The literature's 0.9056, 0, -14.5723 (Sprott, Chaos and Time-Series Analysis, 2003)."""
@@ -574,6 +576,8 @@ def test_fit_of_an_orbit(kepler):
         assert fit.jacobian(x)[:, k] == pytest.approx(slope, rel=1e-5, abs=1e-5 * np.abs(slope).max())
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 def test_fit_of_state_and_parameter(pendulum):
     t = np.array([0.0, 0.5, 0.5, 1.5, 3.0])  # two of the data at one time
     data = integrate(pendulum, (0, 3), [1.0, 0.2], params={"k": 1.3}, t_eval=np.unique(t), **FINE).y[:, [0, 1, 1, 2, 3]]
