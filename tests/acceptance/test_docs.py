@@ -30,8 +30,9 @@ PAGES = (
     "tutorials/pdes", "tutorials/own-pde", "tutorials/ensembles", "how-to/recommend", "how-to/find-invariants",
     "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
     "how-to/own-methods", "how-to/consistent-starts", "how-to/gradients", "how-to/mechanisms",
+    "how-to/pydy",
 )  # fmt: skip
-NEEDED = {"docs/how-to/gradients.md": ("jax", "torch")}
+NEEDED = {"docs/how-to/gradients.md": ("jax", "torch"), "docs/how-to/pydy.md": ("pydy",)}
 # Ten seconds and more each, for what tests of the same methods show in less.
 NIGHTLY = (
     "results/hard-scenes", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h",
