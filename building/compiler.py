@@ -81,7 +81,7 @@ def chosen() -> Compiler:
         for command in (usual, "g++", "clang++", "c++"):
             if command and _compiles(tuple(shlex.split(command))):
                 return Compiler(tuple(shlex.split(command)), own=command == usual)
-    # Without these flags zig builds for the processor at hand, and traps where an integer overflows.
+    # Without these flags zig builds for the processor of this machine, and traps where an integer overflows.
     elsewhere = ("-target", triple) if triple else ()
     zig = (sys.executable, "-m", "ziglang", "c++", *elsewhere, "-fno-sanitize=undefined")
     return Compiler(zig, every=("-mcpu=baseline",), v3=("-mcpu=x86_64_v3",))

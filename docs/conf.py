@@ -72,14 +72,14 @@ def formula(writer, node):
 
 
 def without_single_names(app, env):
-    """The sidebar ends at the page of reference: a hundred names more on each page took a third of the build."""
+    """End the sidebar at the page of reference: a hundred more names on each page took 0.33 of the build time."""
     for entry in list(env.tocs["reference/index"].findall(addnodes.toctree)):
         if any("generated" in page for page in entry["includefiles"]):
             entry.parent.remove(entry)
 
 
 def show_notebooks():
-    """Lay the notebooks of examples/ beside their page, and take away what lay there."""
+    """Copy the notebooks of examples/ next to their page, and remove older copies."""
     shown = Path(__file__).parent / "notebooks"
     for page in (*shown.glob("*.md"), *shown.glob("*.ipynb")):
         if page.name != "index.md":

@@ -321,7 +321,7 @@ def _wrong_rates(known: InvariantSet, at: _Samples, rhs: Derivative | None) -> I
 def _complaints_of_rates(
     known: InvariantSet, at: _Samples, found: _Rates, wrong: Array, rhs: Derivative | None
 ) -> Iterator[Complaint]:
-    """Yield one text for all that depend on others, and one for all that are no invariants, the worst first."""
+    """Yield one text for all that depend on others, and one for all that are not invariants, the worst first."""
     with np.errstate(divide="ignore", invalid="ignore"):
         order = np.argsort(-np.nan_to_num(np.abs(found.rate) / found.terms), kind="stable")
     conditional: list[int] = []
@@ -354,8 +354,8 @@ def _wrong_rate_of_balance(known: InvariantSet, at: _Samples, found: _Rates, wro
 
 def _no_invariant(name: str, t: float, rate: float, terms: float) -> str:
     return (
-        f"{name!r} is no invariant of this system: at t={t:.6g} it changes at the rate {rate:.3g}, where the terms of "
-        f"that rate sum to {terms:.3g}"
+        f"{name!r} is not an invariant of this system: at t={t:.6g} it changes at the rate {rate:.3g}, where the terms "
+        f"of that rate sum to {terms:.3g}"
     )
 
 

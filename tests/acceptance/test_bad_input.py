@@ -1078,7 +1078,7 @@ def test_gradients_by_differences_vanish_at_an_extremum(angle):
     assert told(squares) == (True, [])
     trusted, texts = told(lambda t, y: squares(t, y) + 1e-6 * y[:2])
     assert not trusted
-    assert "is no invariant of this system" in texts[0]
+    assert "is not an invariant of this system" in texts[0]
 
 
 @both
@@ -1089,7 +1089,7 @@ def test_no_invariant_warns(driver):
         driver(invariants=first)
     assert [item.category for item in record] == [UserWarning, ProjectionWarning]
     for item in record:
-        assert "'first' is no invariant of this system: at t=0 it changes at the rate 2" in str(item.message)
+        assert "'first' is not an invariant of this system: at t=0 it changes at the rate 2" in str(item.message)
         assert item.filename == __file__
 
 
@@ -1113,7 +1113,7 @@ def test_warnings_come_once_and_name_the_line_that_a_user_wrote(call, size):
         exec(compile(call, "script.py", "exec"), names)
     said = [(str(item.message), item.filename) for item in record if item.category is UserWarning]
     of_cost = ["no grad is given"] if size > 2 else []
-    for words in ("allows no complex step", "is no invariant of this system", *of_cost):
+    for words in ("allows no complex step", "is not an invariant of this system", *of_cost):
         assert [place for text, place in said if words in text] == ["script.py"]
 
 

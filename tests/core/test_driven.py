@@ -251,7 +251,7 @@ def test_what_is_no_invariant_is_reported(method):
     wrong = Invariant(lambda t, y: y[0], lambda t, y: np.array([1.0, 0, 0, 0]), name="x")
     with (
         pytest.warns(ProjectionWarning, match="'x' was corrected by up to"),
-        pytest.warns(UserWarning, match="'x' is no invariant of this system"),
+        pytest.warns(UserWarning, match="'x' is not an invariant of this system"),
     ):
         sol = solve_ivp(relaxing, (0, 0.01), exact(0.5), method, invariants=wrong, **TIGHT)
     assert not sol.trusted

@@ -302,7 +302,7 @@ def test_single_precision_explains_no_friction():
     friction = in_single(lambda t, y: pendulum(t, y) - np.array([0.0, 0.1 * y[1]], np.float32))
     kept = Invariant(energy, energy_gradient, name="E")
     _, texts = said(lambda: integrate(friction, (0, 5), [1.0, 0.3], method=EIPRK4, h=0.05, invariants=kept))
-    assert "'E' is no invariant of this system" in texts[0]
+    assert "'E' is not an invariant of this system" in texts[0]
 
 
 # Times.
@@ -347,7 +347,7 @@ def test_an_explicit_rate_in_time_is_found_at_either_end():
     y, f = np.array([1.0, 0.3]), np.array([0.3, -1.0])
     for start, end in ((0.0, 1.0), (1.0, 0.0)):
         known = InvariantSet(driven, start, y, f, 0.1, t_bound=end)
-        with pytest.warns(UserWarning, match=r"'S' is no invariant.* changes at the rate 0\.1"):
+        with pytest.warns(UserWarning, match=r"'S' is not an invariant.* changes at the rate 0\.1"):
             known.check(start, y, f, 0.1)
 
 

@@ -469,7 +469,7 @@ def test_a_force_that_jumps_is_told():
 def test_a_false_invariant_is_told():
     """As of other methods."""
     false = Invariant(lambda t, y: y[0] ** 2 + y[3], lambda t, y: np.array([2 * y[0], 0, 0, 1.0]))
-    with pytest.warns(ProjectionWarning, match="is no invariant of this system"):
+    with pytest.warns(ProjectionWarning, match="is not an invariant of this system"):
         assert not run(30, method=EIPGJ12, invariants=false).trusted
 
 

@@ -35,7 +35,7 @@ FACTOR = 1e3
 # Errors of the true states and rounding, in units of what the motion makes of a small change.
 FLOOR = 1e-10
 DIFFERENCES = "has no grad and allows no complex step"
-NO_INVARIANT, WRONG_GRADIENT = "is no invariant of this system", "gradient of invariant"
+NO_INVARIANT, WRONG_GRADIENT = "is not an invariant of this system", "gradient of invariant"
 CLOCK_STEP = 0.3  # seconds
 MOST_BREAKS = 3
 

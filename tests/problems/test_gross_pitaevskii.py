@@ -232,7 +232,7 @@ def test_angular_momentum_is_kept_where_the_trap_is_round_and_refused_where_not(
     assert run.diagnostics.n_rank_reduced == 0
     oval = gpe.changed(potential=harmonic_trap(1, 2)).problem(psi, 0.2, 0.01, invariants=names)
     with (
-        pytest.warns(UserWarning, match="'angular_momentum' is no invariant of this system"),
+        pytest.warns(UserWarning, match="'angular_momentum' is not an invariant of this system"),
         pytest.warns(ProjectionWarning, match="'angular_momentum'"),
     ):
         integrate(oval, method=EIPRK4)

@@ -82,7 +82,7 @@ def test_a_poisson_matrix():
         ({"perturbation": "x*z"}, "perturbation contains z"),
         ({"dissipation": {"z": "-x"}}, "z is not a component of the state"),
         ({"dissipation": "-x"}, "must be a mapping"),
-        ({"perturbation": "x", "balances": {"px": "px"}}, "'px' is no invariant"),
+        ({"perturbation": "x", "balances": {"px": "px"}}, "'px' is not an invariant"),
     ],
 )
 def test_what_is_refused(options, match):

@@ -525,7 +525,7 @@ DRIVEN = "p**2/2 + x**2/2 - x*cos(2*t)"
 
 
 def test_h_that_depends_on_time():
-    with pytest.warns(UserWarning, match=r"H depends on t: it is no invariant.*extended=True") as told:
+    with pytest.warns(UserWarning, match=r"H depends on t: it is not an invariant.*extended=True") as told:
         problem = hamiltonian(DRIVEN)
     assert told[0].filename == __file__
     assert problem.invariants == ()
@@ -581,18 +581,18 @@ def test_how_invariants_are_known(H, invariants, params, how):
 @pytest.mark.parametrize(
     ("H", "invariants", "says"),
     [
-        ("(px**2 + py**2)/2 + x**2 + 2*y**2", L, "'L' is no invariant of these equations: its rate is .*, at x="),
-        (HENON_HEILES, {"I": f"({HENON_HEILES})**13 + 1e-9*x"}, "'I' is no invariant"),
+        ("(px**2 + py**2)/2 + x**2 + 2*y**2", L, "'L' is not an invariant of these equations: its rate is .*, at x="),
+        (HENON_HEILES, {"I": f"({HENON_HEILES})**13 + 1e-9*x"}, "'I' is not an invariant"),
         (HENON_HEILES, {"I": "z"}, "contains z, which is neither a component of the state nor a parameter"),
         (HENON_HEILES, {"I": "3"}, "does not depend on x, y, px, py"),
         (HENON_HEILES, {"H": "x"}, "H is there already"),
         (HENON_HEILES, {"I": "sqrt(-2 - x**2)"}, "finite and real at no point tried"),
         # Constant in one branch, which all points of moderate size are in.
         ("(p**2 + q**2)/2", {"I": "max(q, 3)"}, r"its rate is p\*Heaviside\(q - 3\), at q="),
-        ("(p**2 + q**2)/2", {"I": "max(q**2, 1e8)"}, "'I' is no invariant"),
-        ("(p**2 + q**2)/2", {"I": "max(q, 3) - max(q, 3.001)"}, "'I' is no invariant"),
-        ("(p**2 + q**2)/2", {"I": "min(-7, q)*abs(p)"}, "'I' is no invariant"),
-        ("(p**2 + q**2)/2", {"I": "abs(q + 9) - q"}, "'I' is no invariant"),
+        ("(p**2 + q**2)/2", {"I": "max(q**2, 1e8)"}, "'I' is not an invariant"),
+        ("(p**2 + q**2)/2", {"I": "max(q, 3) - max(q, 3.001)"}, "'I' is not an invariant"),
+        ("(p**2 + q**2)/2", {"I": "min(-7, q)*abs(p)"}, "'I' is not an invariant"),
+        ("(p**2 + q**2)/2", {"I": "abs(q + 9) - q"}, "'I' is not an invariant"),
         ("(p**2 + q**2)/2", {"I": "max(sin(q), 2)"}, r"changes its branch, so that it cannot be checked"),
     ],
 )

@@ -74,7 +74,10 @@ def test_constraints_may_depend_on_time():
     [
         ({"constraints": {"length": CONSTRAINTS["length"]}}, r"its rate is 2\*u\*x \+ 2\*v\*y.*add it to constraints"),
         ({"constraints": CONSTRAINTS | {"long": x**2 + y**2 - 4}}, "no state was found that meets 'length', 'rate'"),
-        ({"constraints": CONSTRAINTS, "invariants": {"E": u**2 + g * y}}, "'E' is no invariant .* even where the con"),
+        (
+            {"constraints": CONSTRAINTS, "invariants": {"E": u**2 + g * y}},
+            "'E' is not an invariant .* even where the con",
+        ),
         ({"invariants": ENERGY}, "If it is kept only where constraints hold, give them as constraints="),
         ({"constraints": CONSTRAINTS, "invariants": {"rate": x}}, "'rate' is a constraint and an invariant"),
         ({"constraints": {"length": sympy.Integer(1)}}, "does not depend on x, y, u, v"),

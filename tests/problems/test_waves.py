@@ -177,7 +177,7 @@ def test_gradients(made):
 
 def test_momentum_of_a_field_that_the_grid_does_not_resolve_is_not_trusted():
     scene = breather(points=256, velocity=1.3, t_end=1.0)
-    with pytest.warns(ProjectionWarning, match="'momentum_x' is no invariant of this system"):
+    with pytest.warns(ProjectionWarning, match="'momentum_x' is not an invariant of this system"):
         run = integrate(scene, invariants=scene.equation.invariants(("mass", "energy", "momentum_x")))
     assert not run.trusted
 

@@ -305,7 +305,7 @@ def test_runs_that_are_not_reliable(stopped):
 
     event.terminal = True
     options = {"args": (K,), "diagnostics": record, "h": 0.05, "method": EIPRK4}
-    with pytest.warns(ProjectionWarning, match="'energy' is no invariant of this system") as found:
+    with pytest.warns(ProjectionWarning, match="'energy' is not an invariant of this system") as found:
         sol = solve_ivp(damped, (0, 20), [1.0, 0.0], invariants=ENERGY, events=event if stopped else None, **options)
     assert len(found) == 1
     assert (sol.status, sol.success, sol.trusted) == (int(stopped), True, False)

@@ -75,7 +75,7 @@ def hamiltonian(
     Warns
     -----
     UserWarning
-        When H depends on t, and is no invariant then.
+        When H depends on t, and is not an invariant then.
 
     Raises
     ------

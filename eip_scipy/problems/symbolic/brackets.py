@@ -92,7 +92,7 @@ def _require_kept(name: str, rate: Rate, points: Sequence[Any]) -> None:
         if abs(total) > ROUND_OFF * size:
             place = ", ".join(f"{key}={float(value):.3g}" for key, value in point.items())
             raise NotKeptError(
-                f"{name!r} is no invariant of these equations: its rate is {shortened(rate.total)}, at {place} "
+                f"{name!r} is not an invariant of these equations: its rate is {shortened(rate.total)}, at {place} "
                 f"{float(total):.3g} where its terms sum to {float(size):.3g}."
             )
 

@@ -90,7 +90,7 @@ class Manifold:
         constraints = ", ".join(map(repr, self._names))
         place = ", ".join(f"{key}={value:.3g}" for key, value in zip((*self._components, "t"), (*y, t), strict=True))
         return ValueError(
-            f"{name!r} is no invariant of these equations, even where the constraints {constraints} hold: its "
+            f"{name!r} is not an invariant of these equations, even where the constraints {constraints} hold: its "
             f"rate is {shortened(rate)}, at {place} {values.sum():.3g} where its terms sum to "
             f"{np.abs(values).sum():.3g}. Where that rate is 0, as a constraint on velocities, add it to constraints."
         )

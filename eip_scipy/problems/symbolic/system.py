@@ -215,8 +215,8 @@ def hamiltonian_problem(
         checks = {"H + p_t": "by construction"}
     elif energy.has(time):
         warnings.warn(
-            "H depends on t: it is no invariant, and is not kept. hamiltonian(..., extended=True) adds p_t' = -dH/dt "
-            "to the state and keeps H + p_t.",
+            "H depends on t: it is not an invariant, and is not kept. hamiltonian(..., extended=True) adds "
+            "p_t' = -dH/dt to the state and keeps H + p_t.",
             UserWarning,
             stacklevel=3,
         )

@@ -1,6 +1,6 @@
 """``eip-scipy study trust``: whether faulty runs are reported, and correct ones are not. The runs are in trust_runs/.
 
-Faulty runs: quantities that are no invariants (their rate 0 at the start, or not), leaks, leaks that start late or act
+Faulty runs: quantities that are not invariants (their rate 0 at the start, or not), leaks, leaks that start late or act
 in places, wrong gradients, steps too long, light bodies, passages that blow up, members of ensembles; by all methods,
 fixed and adaptive, solve_ivp and integrate, compiled and interpreted, real and complex. A run is reported by ValueError
 or UserWarning at the start, by ProjectionWarning, status -1, or `trusted` false. Its error is that of the last state,

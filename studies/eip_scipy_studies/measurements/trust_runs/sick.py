@@ -58,7 +58,7 @@ def sick_runs() -> list[Run]:
     return [run for part in every for run in part()]
 
 
-# --- quantities that are no invariants ---
+# --- quantities that are not invariants ---
 
 
 def driven(t, q, v):
