@@ -64,7 +64,7 @@ inline Array view(void *memory, int axes, const npy_intp *shape, int type, nb::h
     return array;
 }
 
-// Whether an object is an array whose memory can be used as it is: of this type and number of axes, C-contiguous, aligned,
+// True if an object is an array whose memory can be used as it is: of this type and number of axes, C-contiguous, aligned,
 // in the machine's byte order.
 inline bool is_plain(PyObject *object, int type, int axes) {
     if (!PyArray_Check(object)) return false;
@@ -82,13 +82,13 @@ constexpr int TYPE = std::is_same_v<std::remove_const_t<T>, double>    ? NPY_DOU
                      : std::is_same_v<std::remove_const_t<T>, int64_t> ? NPY_INT64
                                                                        : NPY_UINT64;
 
-// What stub files say.
+// The text for stub files.
 constexpr auto NUMBERS = nb::detail::const_name("numpy.typing.NDArray[numpy.inexact]");
 constexpr auto FLOATS = nb::detail::const_name("numpy.typing.NDArray[numpy.float64]");
 constexpr auto INTEGERS = nb::detail::const_name("numpy.typing.NDArray[numpy.int64]");
 constexpr auto UNSIGNED = nb::detail::const_name("numpy.typing.NDArray[numpy.uint64]");
 
-// An argument of a function in Python: an array of T and so many axes, which is written to unless T is const. Where T is
+// An argument of a function in Python: an array of T with the given number of axes, which is written to unless T is const. Where T is
 // double and `STATES`, one of a state's type, float64 or complex128; complex numbers are pairs of floats here.
 template <class T, int AXES, bool STATES = false>
 struct ArrayOf {
@@ -114,7 +114,7 @@ struct ArrayOf {
 template <class T, int AXES>
 using StatesOf = ArrayOf<T, AXES, true>;
 
-// The same with any number of axes, of floats, or in PAIRS of complex numbers or an even number of floats; `columns` along
+// As above, with any number of axes, of floats, or in PAIRS of complex numbers or an even number of floats; `columns` along
 // the last axis.
 template <class T, bool PAIRS>
 struct PointsOf {
@@ -167,7 +167,7 @@ class [[maybe_unused]] Released {
 
 namespace nanobind::detail {
 
-// By NumPy's own interface, which costs 1 ns an argument; nb::ndarray takes 115.
+// NumPy's own interface is used, which costs 1 ns an argument; nb::ndarray takes 115.
 template <class Argument>
 struct type_caster<Argument, enable_if_t<(sizeof(Argument::ARGUMENT) > 0)>> {
     NB_TYPE_CASTER(Argument, Argument::ARGUMENT)

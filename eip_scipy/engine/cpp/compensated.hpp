@@ -23,7 +23,7 @@ inline void compensated_step(const double *y, double h, const Method &m, const W
     }
 }
 
-// The same for the balances, whose values at the end of the step become the targets.
+// As above, for the balances, whose values at the end of the step become the targets.
 template <class W>
 inline void compensated_levels(double h, const Method &m, const Balances &balances, const W &w) {
     for (int64_t b = 0; b < w.balances; ++b) {
@@ -48,13 +48,13 @@ inline void keep_levels(const Balances &balances, const W &w) {
     copy(w.level_carry_new, w.level_carry, w.balances);
 }
 
-// The targets of the balances at the state at hand, after a step that was not accepted.
+// The targets of the balances at the current state, after a step that was not accepted.
 template <class W>
 inline void restore_levels(const Balances &balances, const W &w) {
     for (int64_t b = 0; b < w.balances; ++b) w.target[balances.place[b]] = w.level[b];
 }
 
-// The same for q + h v + h^2 sum_j (b + b_low)[j] a_j and v + h sum_j (b_v + b_v_low)[j] a_j.
+// As above, for q + h v + h^2 sum_j (b + b_low)[j] a_j and v + h sum_j (b_v + b_v_low)[j] a_j.
 template <class W>
 inline void compensated_nystrom(const double *y, double h, const Method &m, const W &w) {
     const int64_t half = w.m / 2;

@@ -113,7 +113,7 @@ std::vector<double> values_at(Function &function, const double *y, const std::ve
     return {found.floats(), found.floats() + found.size()};
 }
 
-// Whether the gradient's product with `way` is (above - below) / distance.
+// True if the gradient's product with `way` is (above - below) / distance.
 bool is_slope(const Columns &columns, const std::vector<double> &way, const std::vector<double> &above,
               const std::vector<double> &below, double distance) {
     if (above.size() != below.size()) return false;
@@ -129,7 +129,7 @@ bool is_slope(const Columns &columns, const std::vector<double> &way, const std:
     return true;
 }
 
-// Whether a gradient agrees with the function's differences along one direction, in units of |y_k| + floors_k.
+// True if a gradient agrees with the function's differences along one direction, in units of |y_k| + floors_k.
 bool agrees(Function &function, const Columns &columns, const double *y, npy_intp n, const double *direction,
             const double *floors) {
     std::vector<double> way(n);

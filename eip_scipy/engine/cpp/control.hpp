@@ -10,7 +10,7 @@ constexpr double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
 // A failed projection shrinks the step as CVODE does.
 constexpr double RETRY_FACTOR = 0.25;
 constexpr int MAX_RETRIES = 10;
-// every = AUTO: each so many-th step asks whether a projection is worth it, and the step after one that was.
+// every = AUTO: every few steps the step asks whether a projection is worth it, and the step after one that was.
 constexpr int64_t AUTO_SPACING = 5;
 
 // The stages and their sum, y_hat.
@@ -23,7 +23,7 @@ inline void make_stages(const AnyRun &run, const Step &step) {
     run.work.counters[NFEV] += run.method.stages - 1;
 }
 
-// What follows the stages: f at y_hat in w.last(), the local error in w.err and its norm in w.norm where they are wanted.
+// Computations after the stages: f at y_hat in w.last(), the local error in w.err and its norm in w.norm where they are needed.
 // Return whether the step's local errors are to be compared with what it changes in each block.
 template <class AnyRun>
 inline bool look_back(const AnyRun &run, const Step &step) {

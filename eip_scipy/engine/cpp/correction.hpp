@@ -35,7 +35,7 @@ inline void evaluate_carried(const AnyRun &run, double t, const Value *y, const 
     if (run.options.compensated)
         for (int64_t i = 0; i < w.l; ++i) w.values[i] += dot(G + i * w.m, carry, w.m);
 }
-// The same by the carry and the gradients at hand.
+// As above, by the carry and the current gradients.
 template <class AnyRun, class Value>
 inline void evaluate_invariants(const AnyRun &run, double t, const Value *y) {
     evaluate_carried<AnyRun, Value>(run, t, y, run.work.carry_hat, run.work.G);
@@ -87,7 +87,7 @@ inline int64_t solve_part(const Matrix &B, const double *defects, const W &w) {
     return rank;
 }
 
-// The Newton step of each group of values by itself, along its own directions, of which SIZE stand beside each other; all
+// The Newton step of each group of values separately, along its own directions, SIZE of which are adjacent; all
 // components together then restore the frame's C y. Defects within rounding are corrected too, because the rounding of values
 // that are carried does not accumulate. Returns the sum of the ranks, -1 where gradients are not finite. w.g are the defects
 // that `judge` compares with: the carried values of a group whose rows are dependent need not agree exactly, so that the defect
@@ -279,7 +279,7 @@ inline auto missed_targets(const Options &o, const W &w) {
     return rank;
 }
 
-// What follows the first Newton step: further ones, and whether the projection holds.
+// Computations after the first Newton step: further ones, and whether the projection holds.
 template <class AnyRun>
 inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     const Options &o = run.options;
@@ -322,7 +322,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
 // A last try with the first `rank` directions only.
 //
 // Where gradients are nearly parallel, as on a nearly circular orbit, states near y_hat may not reach a target at all:
-// the distance is of second order, and no shorter step mends it. What the directions left out would have corrected
+// the distance is of second order, and no shorter step corrects it. What the directions left out would have corrected
 // stays, so that a defect may grow to the sum of all.
 [[gnu::cold, gnu::noinline]] inline Code correct_with_fewer(const Run &run, const Step &step, int64_t &rank) {
     const Options &o = run.options;
@@ -412,7 +412,7 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
     return status;
 }
 
-// The same, or the shorter way of joint invariants where that will do, or a hook's.
+// As above, or the shorter way of joint invariants where that will do, or a hook's.
 template <class AnyRun>
 inline Code project_any(const AnyRun &run, const Step &step) {
     if (run.hooks && run.hooks->joint && run.hooks->project_jointly(step)) return OK;

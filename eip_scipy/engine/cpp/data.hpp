@@ -87,7 +87,7 @@ void each(Visit &visit, std::initializer_list<int64_t> shape, const char *name, 
     if constexpr (sizeof...(others) > 0) each(visit, shape, others...);
 }
 
-// Where a run steps: t_k = t0 + k h (h = 0: adaptive steps), the last one on t_bound.
+// Times of the steps of a run: t_k = t0 + k h (h = 0: adaptive steps), the last one on t_bound.
 struct Span {
     double t0, h, t_bound, sign;
     int64_t n_steps;
@@ -107,11 +107,11 @@ void fields(Span &s, Visit &visit) {
          s.max_step);
 }
 
-// What a multistep method knows of a run besides the state (multistep.hpp); weights go from the oldest node to the newest.
+// Data of a multistep method in addition to the state (multistep.hpp); weights go from the oldest node to the newest.
 struct Multistep {
     int64_t order, middle, half, pitch, rows;  // numbers of an acceleration, of a row for it, and rows
     const double *predict_q, *predict_v;       // (order)
-    const double *states_q, *states_v;         // (order, order): of the state so many nodes before the newest
+    const double *states_q, *states_v;         // (order, order): of the state at a number of nodes before the newest
     const double *correction;                  // (order + 1)
     const double *shape_q, *shape_v, *size;    // (order + 1): differences that tell the errors' shape, and their size
     double error_constant, growth;
@@ -323,7 +323,7 @@ struct Inner {
 };
 
 // Buffers of a run of m values (floats, or those of eight members), l invariants, some of which are balances, and
-// `stages` + 1 rows of K. Of each balance: rows of rates at the stages, its value at the state at hand and what rounding
+// `stages` + 1 rows of K. For each balance: rows of rates at the stages, its value at the current state and what rounding
 // took from it, the same of the step that is tried, its value before the last step, and sums of its rates and of their terms
 // over some steps. `flow`: the rate at which each invariant is to change with the state.
 template <class V>
@@ -347,7 +347,7 @@ struct WorkOf {
     Value *figures(int64_t i) const { return trust + i * N_FIGURES; }
 };
 
-// All buffers of a run, by name and shape, for whoever makes them or hands them out. Those of a state's type hold w.n of its
+// All buffers of a run, by name and shape, for code that creates them or passes them on. Those of a state's type hold w.n of its
 // numbers to a row.
 template <class V, class Visit>
 void each_buffer(WorkOf<V> &w, int64_t blocks, Visit &visit) {

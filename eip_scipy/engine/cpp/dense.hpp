@@ -15,7 +15,7 @@ constexpr double SHOWN_ROUNDINGS = 4.0;
 // A share of an invariant's terms: the square of a smaller defect is below rounding.
 constexpr double SMALL_SHARE = 1e-9;
 
-// What the interpolants of a run are made with, and the buffers of their projections. `weights` are rows over the stages:
+// Inputs of the interpolants of a run, and the buffers of their projections. `weights` are rows over the stages:
 // those of a tableau's own polynomial, or of that of DOP853 or a Nystrom method, which have `further` stages, or Lagrange's
 // for the nodes of a multistep method, [interval, node, power].
 struct Dense {
@@ -28,9 +28,9 @@ struct Dense {
     Work work;
     const Multistep *multistep;
     double *missed;    // how many states were left unprojected, and the time of the first
-    int64_t *waiting;  // whether the states at the start and at the end of the step at hand are not projected
+    int64_t *waiting;  // whether the states at the start and at the end of the current step are not projected
 
-    // States that make up an interpolant, besides those of the two ends and the weights.
+    // States that make up an interpolant, in addition to those of the two ends and the weights.
     int64_t rows() const {
         if (kind == HISTORY) return (columns + 1) / 2 + 2;
         if (kind == NYSTROM) return (polynomials + 1) / 2 + 1;
@@ -58,7 +58,7 @@ struct Piece {
           balance(balance_old + d.work.balances),
           balance_rows(balance + d.work.balances) {}
 
-    // The same for the balances, as if they were the state.
+    // As above, for the balances, as if they were the state.
     Piece of_balances() const {
         Piece piece(*this);
         piece.y_old = balance_old;
@@ -172,7 +172,7 @@ inline void polynomial(const Dense &d, const Piece &piece, double h, const Work 
     }
 }
 
-// Its rows, where w.K holds all stages: change, h f_old - change, 2 change - h (f + f_old), h D K.
+// Rows of the interpolant if w.K holds all stages: change, h f_old - change, 2 change - h (f + f_old), h D K.
 inline void rows_of_seventh(const Dense &d, const Piece &piece, double h, const Work &step, const Work &w) {
     const int64_t m = w.m;
     double *change = piece.rows, *left = change + m, *bend = left + m;

@@ -19,7 +19,7 @@ constexpr double ORDER_6[] = {3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0}, ORDER_4[] = {
 // How far both orders may differ: in units of the derivative, and of the rounding of the values.
 constexpr double DIFFER = 1e-8, ROUNDINGS = 1e3, LEAST = std::numeric_limits<double>::min();
 
-// Of a state: its floats, how many of them are a component, below what size each is shifted as if it had that size.
+// Description of a state: its floats, how many of them are a component, below what size each is shifted as if it had that size.
 struct Shifts {
     int64_t m = 0, width = 1;
     const double *floors = nullptr;
@@ -83,7 +83,7 @@ inline void difference_gradient(const Values &values_at, const double *y, int64_
     }
 }
 
-// Where derivatives in time are taken: the interval of the run, which they do not leave, and the shift, a power of two.
+// Times at which derivatives in time are taken: the interval of the run, which they do not leave, and the shift, a power of two.
 struct Times {
     double low = 0.0, high = 0.0, shift = 0.0;
     std::vector<double> values;

@@ -8,7 +8,7 @@
 
 namespace eip {
 
-// Eight members: their buffers, as octets and as 8 n floats, and what each has done.
+// Eight members: their buffers, as vectors and as 8 n floats, and the state of each.
 struct Eight {
     using Run = RunOf<Work, OctetSystem>;
 
@@ -82,7 +82,7 @@ struct Eight {
     double *suspect(int64_t lane) { return suspects.data() + lane * work.suspect_size(); }
     const double *suspect(int64_t lane) const { return suspects.data() + lane * work.suspect_size(); }
 
-    // One member's part of n octets, to floats and back.
+    // Conversion of one member's part of n vectors to floats and back.
     void take(const Octet *a, int64_t lane, double *out, int64_t n) const {
         for (int64_t i = 0; i < n; ++i) out[i] = OctetSystem::floats_of(a)[LANES * i + lane];
     }
@@ -91,7 +91,7 @@ struct Eight {
     }
 
   private:
-    // Where buffers of octets begin, and how many each holds; those of a run that are no octets are not its members'.
+    // Starts and lengths of the buffers of vectors; other buffers of a run do not belong to its members.
     struct Places {
         std::vector<std::pair<Octet **, int64_t>> of;
         int64_t total = 0;
@@ -112,7 +112,7 @@ struct Eight {
 
     Options flat_options_{};
 
-    // The same buffers as those of one state of 8 n floats, as far as the raw step needs them.
+    // As above, buffers as those of one state of 8 n floats, as far as the raw step needs them.
     void flatten(const Work &w) {
         flat.n = flat.m = LANES * w.n;
         flat.l = w.l;

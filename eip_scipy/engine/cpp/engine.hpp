@@ -12,7 +12,7 @@ Code advance_run(const Run &run, Samples *samples, const Schedule &s, int64_t k_
 Code sweep_members(const Run &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps,
                    double *y, double *y_new);
 
-// What octets of members are swept with.
+// Data for sweeping batches of members.
 struct Octets {
     Eight &eight;
     Samples *samples;
@@ -27,7 +27,7 @@ Code project_once(const Run &run, const Step &step);
 // The interpolant over a step of a run from y_old at t_old to y at t, and states at some times by it.
 void describe_step(const Run &run, const Dense &dense, double t_old, const double *y_old, double t, const double *y,
                    double *piece);
-// The state y at t, an end (0 or 1) of the step at hand, as a run hands it out.
+// The state y at t, an end (0 or 1) of the current step, as a run returns it.
 void show_state(const Run &run, const Samples &samples, int64_t end, double t, const double *y, double *out);
 void interpolate_step(const Run &run, const Dense &dense, double *piece, const double *t, int64_t rows, double *out);
 

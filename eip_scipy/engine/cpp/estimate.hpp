@@ -5,7 +5,7 @@
 
 namespace eip {
 
-// Without an estimate of their own, the first so many projections are compared with one, then one in as many.
+// Without an estimate of their own, this number of projections are compared with one at first, then one in this number.
 constexpr int64_t SAMPLED_FIRST = 8, SAMPLED_EACH = 16;
 // With an estimate of their own, every OWN_EACH-th projection looks at rates of change along the flow, and every
 // ADAPTIVE_EACH-th one of adaptive steps, which are longer, if f at the raw result is known anyway. Every RESOLUTION_EACH-th
@@ -35,7 +35,7 @@ inline double error_norm(const double *err, const double *y, const double *y_hat
     return std::sqrt(total / n);
 }
 
-// The same of a run whose columns of derivatives do not count.
+// As above, of a run whose columns of derivatives do not count.
 [[gnu::noinline]] inline double error_norm_of_state(const double *err, const double *y, const double *y_hat,
                                                     const Options &o) {
     const Columns &columns = o.columns;
@@ -54,7 +54,7 @@ inline double norm_of_error(const double *y, const Options &o, const W &w) {
     return error_norm(w.err, y, w.y_hat, o, w.n);
 }
 
-// The same for DOP853's pair of estimates; then err <- err |err| / hypot(err, low / 10), by component.
+// As above, for DOP853's pair of estimates; then err <- err |err| / hypot(err, low / 10), by component.
 inline double paired_error_norm(double *err, const double *low, const double *y, const double *y_hat, const Options &o,
                                 int64_t n) {
     const int64_t width = o.blocks.width;

@@ -40,7 +40,7 @@ inline double norm(const double *a, int64_t n) {
     return top * std::sqrt(total);
 }
 
-// Of each of eight members.
+// One value for each of eight members.
 inline Octet norm(const Octet *a, int64_t n) {
     const Octet square = dot(a, a, n);
     const Mask extreme = !((1e-200 < square) & (square < 1e200));
@@ -56,7 +56,7 @@ inline Octet norm(const Octet *a, int64_t n) {
     return Octet::load(norms);
 }
 
-// Whether no entry is NaN or infinite: the sum of squares is finite too unless it overflows; x - x is 0 then.
+// True if no entry is NaN or infinite: the sum of squares is finite too unless it overflows; x - x is 0 then.
 inline bool all_finite(const double *a, int64_t n) {
     if (std::isfinite(dot(a, a, n))) return true;
     double total = 0.0;

@@ -72,7 +72,7 @@ inline Triple<double> multiply_add(const Triple<double> &a, const Triple<double>
 }
 #endif
 
-// Weighted sums over bodies of their x, y and z, of so many rows side by side: each addition waits for the last one.
+// Weighted sums over bodies of their x, y and z, of several rows at once: each addition waits for the last one.
 template <int ROWS, class Value>
 inline void sum_bodies(const double *weights, const Value *rows, int64_t stride, int64_t count, Triple<Value> *out) {
     using Body = Triple<Value>;
@@ -101,7 +101,7 @@ inline void shift_bodies(const Value *row, const double *weights, const Triple<V
     (factors ? body * Body::load_last(factors + last) : body).store_last(out + last);
 }
 
-// Of `ROWS` rows from G on, sigma * (the row projected along the frame of bodies), from B on.
+// Computes sigma * (row projected along the frame of bodies) for `ROWS` rows from G on, into B.
 template <int ROWS, class Value, class W>
 inline void project_rows(const Frame &frame, const W &w, const Value *G, Value *B) {
     for (int64_t k = 0; k < frame.groups; ++k) {

@@ -142,7 +142,7 @@ void add_library(nb::module_ &module) {
         .def_prop_ro(
             "own", [](const Function &f) { return f.own; }, "Its own parameters; empty if it takes those of the run.")
         .def("__repr__", [](const Function &f) { return nb::str("<{} of eip_scipy>").format(f.name); })
-        // By its name, so that it travels to other processes.
+        // Pickled by its name, so that it can be sent to other processes.
         .def("__reduce__", [](const Function &f) {
             const nb::object made = nb::module_::import_("eip_scipy.engine.native").attr("library_function");
             return nb::make_tuple(made, nb::make_tuple(f.name, f.own));

@@ -8,8 +8,8 @@
 
 namespace eip {
 
-// What such a function gets: a state of n numbers, f there for gradients that take it (else null), `out` to fill, and p
-// parameters. Octets stand one after the other: n of them are (n, 8) doubles.
+// Arguments of such a function: a state of n numbers, f there for gradients that take it (else null), `out` to fill, and p
+// parameters. Vectors are stored one after the other: n of them are (n, 8) doubles.
 template <class T>
 struct Given {
     double t;
@@ -33,8 +33,8 @@ void plain(double t, const T *y, const T *f, T *out, const T *params, int64_t n,
     FUNCTION({t, y, f, out, params, n, p});
 }
 
-// What its value is: the derivative of the state, of its size, in place; the accelerations at positions; numbers, of
-// which one stands for itself; rates of numbers, which take f; gradients of so many numbers, in place.
+// Kind of its value: the derivative of the state, of its size, in place; the accelerations at positions; numbers, of
+// a single one is returned directly; rates of numbers, which take f; gradients of these numbers, in place.
 enum class Value { DERIVATIVE, ACCELERATION, NUMBERS, RATES, GRADIENT, GRADIENT_BY_F };
 
 // A multiple of it in place of the number of numbers: this many numbers for each of the N - 1 orbits of N bodies.

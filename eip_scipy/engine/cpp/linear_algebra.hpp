@@ -26,7 +26,7 @@ using Matrix = MatrixOf<double>;
 // Pivoted QR of the normalised rows of B, in place; returns the numerical rank, -1 where B is not finite.
 //
 // `inverse_norms` normalise the rows (0 for a zero row). Row pivots[k] of B becomes the k-th orthonormal direction;
-// R(k, i) is the component of normalised row i along it, but for i = pivots[k] its reciprocal. By modified
+// R(k, i) is the component of normalised row i along it, except for i = pivots[k] its reciprocal. By modified
 // Gram-Schmidt, with a second pass where cancellation would have spoilt the first.
 [[gnu::noinline]] inline int64_t factor(const Matrix &B, double *inverse_norms, const Matrix &R, int64_t *pivots) {
     const int64_t rows = B.rows, n = B.columns;
@@ -87,7 +87,7 @@ inline void least_norm(const double *g, const double *inverse_norms, const Matri
 // Coefficients mu of rows in the least-norm x with rows . x = -g, if they are far from dependent, from their Gram matrix
 // in the lower half of R, which is overwritten.
 //
-// By its factorisation L D L^T, which costs a third of `factor` and squares the condition number: whether it will do
+// Uses its factorisation L D L^T, which costs 0.33 of `factor` and squares the condition number: whether it will do
 // shows on the way, by the same bound below which one pass of Gram-Schmidt would not. The diagonal of R then holds 1/D.
 // Two rows, the usual case, by Cramer's rule: one division to wait for.
 template <class Value>

@@ -10,8 +10,8 @@
 
 namespace eip {
 
-// Where a run steps and what it saves. `place` holds [step, row, pending]: pending is 1 between a step and its becoming
-// the current state, so that whoever is called in between sees both of its ends. Of the events there are the values and
+// Steps of a run and what it saves. `place` holds [step, row, pending]: pending is 1 between a step and its becoming
+// the current state, so that functions called in between see both of its ends. Of the events there are the values and
 // the rates of change at both ends; a rate that is not known yet is NaN.
 struct Schedule {
     Span span;
@@ -127,7 +127,7 @@ inline bool any_crossing(const Schedule &s) {
     };
     run.system.event(w, t_new, y_new, s.g_new);
     if (std::isnan(s.rate[0])) {
-        // Where a run is continued at an event, s.g is not its value there.
+        // If a run is continued at an event, s.g is not its value there.
         values_near(t, part, y, slope_at_start(run, d, t, y), s.rate);
         run.system.event(w, t, y, s.rate_new);
         for (int64_t i = 0; i < s.n_events; ++i) s.rate[i] = (s.rate[i] - s.rate_new[i]) / part;
@@ -214,7 +214,7 @@ inline void note_waiting(const Samples *samples, int64_t end, const Method &meth
     if (samples) samples->dense.waiting[end] = method.multistep ? inside : waited > 0;
 }
 
-// Saves the state y at t, an end of the step at hand, as a row: as it is handed out.
+// Saves the state y at t, an end of the current step, as a row: as it is returned.
 template <class AnyRun>
 inline void give(const AnyRun &run, const Samples *samples, int64_t end, double t, const double *y, double *out) {
     const auto &w = run.work;
@@ -224,7 +224,7 @@ inline void give(const AnyRun &run, const Samples *samples, int64_t end, double 
     count_calls(dense, of_any_length(run).work);
 }
 
-// What is asked for within the step that is pending: its interpolant, roots of events, states at given times. OK, ENDED by
+// Handles requests within the pending step: its interpolant, roots of events, states at given times. OK, ENDED by
 // an event, or PAUSE where the caller has to do the rest, see `locate`.
 inline Code sample(const Run &run, Samples &samples, const Schedule &s, const double *y, const double *y_new,
                    const Saved &saved) {
@@ -245,7 +245,7 @@ inline Code sample(const Run &run, Samples &samples, const Schedule &s, const do
     return code;
 }
 
-// Whether something within the step is asked for: more than a time that is its end, whose state is saved here.
+// True if something within the step is requested: more than a time that is its end, whose state is saved here.
 template <class AnyRun>
 inline bool wants_samples(const AnyRun &run, const Samples *samples, const Schedule &s, const double *y_new,
                           const Saved &saved) {
@@ -273,7 +273,7 @@ inline int64_t next_stop(const Method &method, const Samples *samples, const Sch
     return std::max(stop, k + 1);
 }
 
-// The step up to which a member goes that is at step k, in so many steps: to its end where a multistep method is near it,
+// The step to which a member at step k advances within the given number of steps: to its end where a multistep method is near it,
 // whose last states cost a step of the method that starts, each of them that is asked for.
 inline int64_t last_of(const Method &method, const Span &span, int64_t k, int64_t steps) {
     const bool at_end = method.multistep && span.n_steps - method.multistep->middle <= k + steps;

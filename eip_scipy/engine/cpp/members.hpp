@@ -6,7 +6,7 @@
 namespace eip {
 
 // All members: `count` starts, parameters and lengths of the first steps, and what each comes to. `where` holds the
-// member at hand and whether it has begun; rows are saved for each member, or where `kept` is false for none.
+// current member and whether it has begun; rows are saved for each member, or for none if `kept` is false.
 struct Members {
     int64_t count, n_rows, evaluations;
     bool kept;
@@ -40,7 +40,7 @@ void fields(Members &m, Visit &visit) {
     m.n_rows = is.rows;
 }
 
-// Of one member or of eight: nothing noted or counted but the evaluations at the start.
+// Resets one member or eight: nothing is recorded or counted except the evaluations at the start.
 template <class W>
 inline void clear_notes(const Members &members, const Options &o, const W &w) {
     fill(w.memory, 0.0, o.blocks.count);
@@ -135,8 +135,8 @@ inline void end_member(const Run &run, Samples *samples, const Schedule &s, cons
     members.max_correction[k] = w.max_correction[0];
 }
 
-// Members from where[0] on, so many steps in all. OK: all are at their ends, or it is to be called again; else what has
-// happened to the member at hand: a code of the step, DOUBTFUL for a start that is not finite, PAUSE as by `advance`.
+// Runs members from where[0] on, up to the given number of steps. OK: all have ended, or more calls are needed; else what has
+// happened to the current member: a code of the step, DOUBTFUL for a start that is not finite, PAUSE as by `advance`.
 template <class AnyRun>
 inline Code sweep(const AnyRun &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps,
                   double *y, double *y_new) {

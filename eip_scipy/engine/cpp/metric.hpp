@@ -111,7 +111,7 @@ inline Truth<Value> block_sizes(const Value *y, double rounding, const Options &
     return extreme;
 }
 
-// The same, squares taken in a unit of each block's own, so that they neither vanish nor overflow.
+// As above, squares taken in a unit of each block's own, so that they neither vanish nor overflow.
 [[gnu::cold, gnu::noinline]] inline void extreme_block_sizes(const double *y, double rounding, const Options &o,
                                                              const Work &w) {
     for (int64_t b = 0; b < o.blocks.count; ++b) {

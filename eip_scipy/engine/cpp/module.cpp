@@ -21,7 +21,7 @@
 
 namespace eip {
 
-// FailedCallError(which functions, which of them, t, bytes of y, of f, status): whoever made them says what it means.
+// FailedCallError(which functions, which of them, t, bytes of y, of f, status): the code that made the functions knows what it means.
 static PyObject *failed_call_error = nullptr;
 
 void raise_broken(const System &system) {
@@ -40,7 +40,7 @@ using State = StatesOf<double, 1>;
 using ConstState = StatesOf<const double, 1>;
 using Times = ArrayOf<const double, 1>;
 
-// Whether the processor takes the other build, for x86-64-v3.
+// True if the processor supports the other build, for x86-64-v3.
 bool has_v3() {
 #if defined(__x86_64__)
     __builtin_cpu_init();
@@ -253,7 +253,7 @@ class Engine {
         start_figures(checked(y, "y"), checked(f, "f"), tau, data_.method, hooks_.get(), data_.options, data_.work);
     }
 
-    // What the garbage collector asks for.
+    // Visitors for the garbage collector.
     nb::handle kept() const { return kept_; }
 
   private:
@@ -413,7 +413,7 @@ void add_constants(nb::module_ &m) {
 
 NB_MODULE(EIP_MODULE, m) {
     if (_import_array() < 0) throw nanobind::python_error();
-    nanobind::set_leak_warnings(false);  // what lives to the end of the process is no leak
+    nanobind::set_leak_warnings(false);  // objects that live until the end of the process are not leaks
     m.doc() = "The step in C++.";
     eip::failed_call_error = PyErr_NewExceptionWithDoc("eip_scipy.engine.FailedCallError",
                                                        "A function by pointer failed.", nullptr, nullptr);

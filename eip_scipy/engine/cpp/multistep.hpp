@@ -11,7 +11,7 @@ namespace eip {
 // Estimates that are collected before one is used, and what is left of each a turn later.
 constexpr int64_t COLLECTED = 20;
 constexpr double MEMORY = 0.9;
-// Each so many-th projection in groups, whose weights do not depend on the estimates, is examined: by the estimates, and by the
+// One in this number of projections in groups, whose weights do not depend on the estimates, is examined: by the estimates, and by the
 // rates of the balances. That takes as long as the projection itself.
 constexpr int64_t EXAMINED_EACH = 4;
 // Values of the invariants around the start that are averaged, how far from it in parts of the state, and how many roundings
@@ -76,7 +76,7 @@ inline double *next_row(const Multistep &ms) {
     return ms.nodes + (at + 1) * ms.pitch;
 }
 
-// S += s + a, s += a; what rounding leaves is added up beside them. Rows' ends are 0.
+// S += s + a, s += a; what rounding leaves is accumulated separately. Rows' ends are 0.
 inline void add_to_sums(const Multistep &ms, const double *a) {
     double *S = ms.sums, *S_rest = S + ms.pitch, *s = S_rest + ms.pitch, *s_rest = s + ms.pitch;
     for (int64_t i = 0; i < ms.pitch; i += WIDTH) {
@@ -89,7 +89,7 @@ inline void add_to_sums(const Multistep &ms, const double *a) {
     }
 }
 
-// Whether no entry of a row is NaN or infinite, which times 0 are NaN.
+// True if no entry of a row is NaN or infinite, which times 0 are NaN.
 inline bool is_finite_row(const Multistep &ms, const double *a) {
     Vector zeros{};
     for (int64_t i = 0; i < ms.pitch; i += WIDTH) zeros += 0.0 * load(a + i);
@@ -151,7 +151,7 @@ inline void begin_sums(const Multistep &ms, int64_t back, double *scratch) {
     }
 }
 
-// What the rates of the history add to the sum of the rates of balance b, for its value `back` nodes before the newest.
+// Contribution of the rates of the history to the sum of the rates of balance b, for its value `back` nodes before the newest.
 inline double rates_beside_sum(const Multistep &ms, int64_t back, int64_t b) {
     const double *weights = ms.states_v + back * ms.order, *oldest = ms.rates_at(ms.place[NEWEST_ROW] + 1 - ms.order);
     double kick = 0.0;
@@ -177,7 +177,7 @@ inline void begin_rate_sums(const Multistep &ms, const Work &w) {
     }
 }
 
-// Whether the accelerations come with the pulls from which the rates are found.
+// True if the accelerations come with the pulls from which the rates are found.
 template <class AnyRun>
 inline bool come_with_pulls(const AnyRun &run) {
     if constexpr (IS_SINGLE<AnyRun>)
@@ -351,7 +351,7 @@ inline Code begin_history(const AnyRun &run, double *y) {
     return OK;
 }
 
-// What the corrector would change of the newest position, times the Jacobian, is added to the newest acceleration; `older`
+// The change of the newest position by the corrector, times the Jacobian, is added to the newest acceleration; `older`
 // is the older nodes' part of it.
 template <class AnyRun>
 inline void correct_node(const AnyRun &run, double t, double *q, const double *older, double *a) {
@@ -414,9 +414,9 @@ inline Code add_node(const AnyRun &run) {
     return OK;
 }
 
-// Whether the highest difference of the newest nodes is small beside the accelerations, in each body or in all together: it
-// is that of a smooth motion in steps that resolve it. Squares beside the newest accelerations, which are almost always
-// enough, cost less than norms beside the largest ones.
+// True if the highest difference of the newest nodes is small compared with the accelerations, in each body or in all together: it
+// is that of a smooth motion in steps that resolve it. Squares compared with the newest accelerations, which are almost always
+// enough, cost less than norms compared with the largest ones.
 template <class Value>
 inline Truth<Value> is_smooth(const Multistep &ms, const Options &o, const Value *highest, int64_t half) {
     const int64_t size = o.blocks.size == 3 && half % 3 == 0 ? 3 : half;
@@ -484,7 +484,7 @@ inline void newest_state(const AnyRun &run, double t) {
     ++w.counters[NJEV];
 }
 
-// What is to be corrected at the newest state, into w.target: the defects in the middle of the history, where the formula for
+// Computes the corrections required at the newest state, into w.target: the defects in the middle of the history, where the formula for
 // the state is the most accurate. Values at the newest state are left in w.values. (scratch, w.carry) is the state in the
 // middle, and w.Q the gradients there.
 template <class AnyRun, class Value>
@@ -649,7 +649,7 @@ inline Code project_last(const Run &run, const Step &step, double from) {
     return status;
 }
 
-// What a run of one state does with it besides adding nodes.
+// Operations of a run of one state in addition to adding nodes.
 struct OneState {
     const Run &run;
     double *scratch;

@@ -97,7 +97,7 @@ struct Octet {
     double lane(int k) const { return part[k / WIDTH][k % WIDTH]; }
 };
 
-// Arrays of octets are also arrays of 8 n floats, and masks choose lane by lane.
+// Arrays of vectors are also arrays of 8 n floats, and masks choose lane by lane.
 static_assert(sizeof(Octet) == LANES * sizeof(double) && sizeof(Mask) == sizeof(Octet) &&
               sizeof(Bits) == sizeof(Vector));
 

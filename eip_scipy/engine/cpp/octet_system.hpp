@@ -8,7 +8,7 @@ namespace eip {
 // A function of eight members gave up: they run one by one.
 struct GaveUp {};
 
-// The functions of eight members: those of a single run on arrays of octets.
+// The functions of eight members: those of a single run, on arrays of vectors.
 struct OctetSystem {
     static constexpr int MEMBERS = LANES;
     Native<ValuePointer, Octet> rhs_pointer{};

@@ -8,7 +8,7 @@
 
 namespace eip {
 
-// Of the floats that are left, as many as a vector holds, and zeros.
+// Loads the remaining floats into a vector and fills it with zeros.
 inline Vector load_some(const double *a, int64_t left) {
     if (left >= WIDTH) return load(a);
     Vector v{};

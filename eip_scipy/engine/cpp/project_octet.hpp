@@ -1,4 +1,4 @@
-// The projection of eight members: that of a single run on octets, but for what only some of them need.
+// The projection of eight members: that of a single run on vectors, except for steps that only some of them need.
 #pragma once
 
 #include "correction.hpp"
@@ -27,7 +27,7 @@ namespace eip {
     eight.give(w.stage, lane, eight.y_new, w.m);
 }
 
-// What `note` does for one member, for those in `done`; returns those for whom there is more to be noted, untouched.
+// Does for the members in `done` what `note` does for one; returns those with more to record, unchanged.
 template <class W>
 inline Mask note_octet(double t, const Mask &done, const Options &o, const W &w) {
     const double waited = static_cast<double>(w.counters[WAITED]), many = std::sqrt(1.0 + waited);

@@ -79,7 +79,7 @@ void PythonCall::operator()(double t, const double *y, const double *f, double *
     if (!in_place_) take(value.ptr(), time_object.ptr(), out);
 }
 
-// Whether a value is a list of as many floats as are expected, Python's or NumPy's: what most functions return.
+// True if a value is a list of the expected number of floats, of Python or NumPy, as most functions return.
 bool PythonCall::takes_list(PyObject *value) const {
     if (n_dimensions_ != 1 || value_type_ != NPY_DOUBLE || !PyList_CheckExact(value)) return false;
     if (PyList_Size(value) != dimensions_[0]) return false;
@@ -240,7 +240,7 @@ int PythonHooks::drive(double t, const double *y, bool again, double *clock) {
     return OK;
 }
 
-// What `raw_step` does, by a method of the user's own. f is evaluated only where a gradient takes it: the steps do not.
+// Does the work of `raw_step` by a user-defined method. f is evaluated only if a gradient needs it: the steps do not.
 int PythonHooks::raw_step(const Step &step) {
     const Options &o = run_.options;
     const Work &w = run_.work;

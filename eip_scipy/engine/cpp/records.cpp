@@ -341,7 +341,7 @@ static void take(const LibraryFunction &function, LibraryCall<Octet> &place) {
     if (function.own.empty()) place = {function.eight};
 }
 
-// An address, or a function of the library's that takes these sizes and fills so many floats.
+// An address, or a function of the library with these sizes that fills the given number of floats.
 template <class Function>
 static Function pointer_of(nb::handle object, const char *name, int64_t floats, int64_t n, int64_t p) {
     Function out{};

@@ -32,7 +32,7 @@ class Buffers {
     int64_t blocks;
     int type;
 
-    // What the memory belongs to.
+    // Owner of the memory.
     nb::handle owner() const { return owner_; }
 
   private:
@@ -40,10 +40,10 @@ class Buffers {
     mutable nb::dict arrays_;  // empty as long as none is asked for
 };
 
-// Those that an object of Python's is.
+// Flags of a Python object.
 const Buffers &buffers_of(nb::handle work);
 
-// What the steps of a run refer to.
+// Objects to which the steps of a run refer.
 struct Data {
     Method method;
     Multistep multistep;
@@ -54,7 +54,7 @@ struct Data {
 
 // Reading adds to `kept` what has to live as long as the engine.
 Method method_of(nb::handle method, bool has_tableau, nb::list &kept);
-// What a multistep method holds besides the run's buffers; its history, which Python may fill.
+// Data of a multistep method in addition to the buffers of the run; its history, which Python may fill.
 Multistep multistep_of(nb::handle record, const Work &w, nb::list &kept);
 void check_history(const Multistep &multistep);
 // Sets what the buffers hold of them too: targets, scratch of the frame.

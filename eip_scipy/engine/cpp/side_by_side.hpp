@@ -1,7 +1,7 @@
-// Members of an ensemble side by side, eight in an octet, where all take the same fixed steps.
+// Vectorised members of an ensemble, in batches of eight, for members with the same fixed steps.
 //
 // What is added and multiplied component by component (stages, error estimates) runs over 8 n floats as over one long
-// state, by the code of a single run; the projection is the single run's too, on octets. So each member gets the bits of
+// state, by the code of a single run; the projection is also that of the single run, on vectors. So each member agrees bit by bit with
 // a run of its own. What only some members need has no place there: where gradients are nearly parallel, the member's
 // Newton step is solved by itself; where more is needed (softened weights, a second try, squares that overflow, figures
 // that stand out), the member makes that step on the buffers of the single run.
@@ -12,7 +12,7 @@
 
 namespace eip {
 
-// What one member has counted, where all have counted `shared`.
+// Counts of one member, if all members have counted `shared`.
 inline void count_of(const Eight &eight, int64_t lane, const int64_t *shared, int64_t *out) {
     for (int c = 0; c < N_COUNTERS; ++c) out[c] = shared[c] + eight.own[lane][c];
     const auto projections = static_cast<int64_t>(eight.at(eight.projections, lane));
@@ -34,7 +34,7 @@ inline void take_params(const Eight &eight, int64_t lane, System &system) {
     eight.take(eight.system.params.data(), lane, system.params, system.n_params);
 }
 
-// What the projections of one member take and change, onto the buffers of the single run.
+// Copies the inputs and outputs of the projections of one member to the buffers of the single run.
 inline void take_member(const Run &run, Eight &eight, int64_t lane) {
     const auto &w = run.work;
     const WorkOf<Octet> &eights = eight.work;
@@ -78,7 +78,7 @@ inline void take_member(const Run &run, Eight &eight, int64_t lane) {
     return true;
 }
 
-// Of a multistep method: what one member's projections need, on the buffers of the single run.
+// For a multistep method: copies the data for the projections of one member to the buffers of the single run.
 inline void take_history(const Run &run, Eight &eight, int64_t lane) {
     const auto &w = run.work;
     const Multistep &one = *run.method.multistep, &all = eight.multistep;
@@ -173,7 +173,7 @@ struct EightStates {
     }
 };
 
-// Whether a time of t_eval lies in the step that ends at t_new.
+// True if a time of t_eval lies in the step that ends at t_new.
 inline bool is_due(const Schedule &s, int64_t row, double t_new) {
     return row < s.n_eval && s.span.sign * (s.t_eval[row] - t_new) <= 0.0;
 }
@@ -343,7 +343,7 @@ inline void end_octet(const Eight &eight, const Schedule &s, const Members &memb
     }
 }
 
-// Octets of members from where[0] on, so many steps in all. OK when none is left, or it is to be called again. Whose
+// Runs batches of members from where[0] on, up to the given number of steps. OK if none is left or more calls are needed. Whose
 // status is not set has to run by itself.
 inline Code sweep_octets(const Run &run, const Octets &octets, const Schedule &s, const Members &members, int64_t steps,
                          double *y, double *y_new) {

@@ -34,7 +34,7 @@ inline void rk_stages(const AnyRun &run, const Step &step) {
     sum_stages(run, step);
 }
 
-// The same with the rates of the balances at the stages where they are needed. Those at the first stage are those at the end
+// As above, with the rates of the balances at the stages where they are needed. Those at the first stage are those at the end
 // of the last step; NaN where there was none. Return whether the run has any balances; batches of members have none.
 template <class AnyRun>
 inline bool made_with_rates(const AnyRun &, const Step &) {

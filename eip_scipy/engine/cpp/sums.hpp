@@ -65,7 +65,7 @@ inline Vector absolute(Vector v) {
 inline double absolute(double x) { return __builtin_fabs(x); }
 
 // The sum of the terms of all i < n; term<Value>(i) is that of one float, or a vector of those from i on. The pointer says
-// what is added: floats, or octets (values.hpp).
+// what is added: floats, or vectors (values.hpp).
 template <class Term>
 inline double sum_of(const double *, int64_t n, const Term &term) {
     const int64_t whole = n - n % LANES;
@@ -170,7 +170,7 @@ inline void combine_blocks(const double *y, double scale, const Rows &rows, doub
         combine_part<Float, COUNT, ADD>(y, scale, rows, out, i < n - LENGTH ? i : n - LENGTH);
 }
 
-// The same for short rows, float by float: the last row has just been written so, and a load of several floats would wait
+// As above, for short rows, float by float: the last row has just been written so, and a load of several floats would wait
 // until all those stores are done.
 template <bool ADD, int COUNT = 2 * WIDTH - 1>
 inline void combine_short(const double *y, double scale, const Rows &rows, double *out, int64_t n) {

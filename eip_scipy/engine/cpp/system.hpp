@@ -29,7 +29,7 @@ class Functions {
     virtual void grad(double t, const double *y, const double *f, double *G) = 0;
     virtual void event(double t, const double *y, double *values) = 0;
     virtual void jacobian(double t, const double *q, const double *dq, double *out) = 0;
-    // Of one item of the invariants, and the rate of one balance that has a function for it.
+    // Values of one item of the invariants, and the rate of one balance that has a function for it.
     virtual void inv_of(int64_t k, double t, const double *y, double *values) = 0;
     virtual void grad_of(int64_t k, double t, const double *y, const double *f, double *G) = 0;
     virtual void rate_of(int64_t k, double t, const double *y, const double *f, double *out) = 0;
@@ -155,7 +155,7 @@ struct System {
         }
     }
 
-    // Whether all rates are found from the pulls that come with the derivative: those of the same masses. Parameters may
+    // True if all rates are found from the pulls that come with the derivative: those of the same masses. Parameters may
     // change from one run to the next.
     void choose_rates() {
         const double *first = params, *end = params + n_params;
@@ -196,14 +196,14 @@ struct System {
         }
     }
 
-    // What a balance changes by explicitly in time, at the state y.
+    // Explicit time derivative of a balance at the state y.
     template <class W>
     void rate_in_time(const W &w, const Balance &balance, double t, const double *y, double *out) {
         const auto values_at = [&](double time, double *values) { inv_of(w, balance.item, time, y, values); };
         time_difference(values_at, t, balance.floats, times, out);
     }
 
-    // Of the accelerations at positions q, times dq; all three of half a state's length, and q and dq scratch. Only the
+    // Jacobian of the accelerations at positions q, times dq; all three of half a state's length, and q and dq scratch. Only the
     // first `count` entries of dq are not 0, and only these of the product are wanted.
     template <class W>
     void jacobian(const W &w, double t, const double *q, const double *dq, double *out, int64_t count) {
@@ -327,7 +327,7 @@ struct RunOf {
 
 using Run = RunOf<Work>;
 
-// By the code for states of any length.
+// Uses the code for states of any length.
 template <class W, class Called>
 inline RunOf<Work, Called> of_any_length(const RunOf<W, Called> &run) {
     return {run.method, run.options, run.work, run.system, run.hooks};
@@ -340,14 +340,14 @@ struct Sized : WorkOf<Value> {
     static constexpr int64_t n = M, m = M;
 };
 
-// The same with a number of invariants that the compiler knows.
+// As above, with a number of invariants that the compiler knows.
 template <int64_t M, int64_t L, class Value = double>
 struct SizedWith : Sized<M, Value> {
     explicit SizedWith(const WorkOf<Value> &w) : Sized<M, Value>(w) {}
     static constexpr int64_t l = L;
 };
 
-// Whether a run is one of a single state: batches of members have no balances.
+// True if a run is one of a single state: batches of members have no balances.
 template <class AnyRun>
 constexpr bool IS_SINGLE = std::remove_cvref_t<decltype(std::declval<AnyRun>().system)>::MEMBERS == 1;
 

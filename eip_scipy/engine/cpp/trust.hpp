@@ -132,7 +132,7 @@ inline Truth<Value> defects_held(const Value *before, const Options &o, const W 
     return !bad;
 }
 
-// Whether no defect is more than o.limit times its invariant's terms.
+// True if no defect is more than o.limit times its invariant's terms.
 template <class W>
 inline auto small_shares(const Options &o, const W &w) {
     Truth<typename W::Value> bad{};
@@ -284,7 +284,7 @@ inline auto is_rough(const Value &share, const Value *figures) {
     suspect(LARGE_ERROR, step, w);
 }
 
-// A defect that is large beside its invariant's terms.
+// A defect that is large compared with the terms of its invariant.
 inline void note_share(double share, double t, double *figures, Figure largest_so_far, Figure at) {
     if (share > figures[largest_so_far]) {
         figures[largest_so_far] = share;
@@ -323,7 +323,7 @@ inline bool weigh_change(double size, double expected, double t, double *figures
     return true;
 }
 
-// What an accepted projection leaves: its defects, and whether the errors of the steps explain its corrections.
+// Records an accepted projection: its defects, and whether the errors of the steps explain its corrections.
 //
 // An invariant's local errors since the last projection are worth `errors` times w.worth, their rounding `rounding` times
 // its terms; with errors = 0 nothing is known of them. y_old: the state at the step's start, or null.
@@ -367,7 +367,7 @@ inline void note(const Step &step, double errors, double rounding, const double 
         keep_accepted(step, w);
 }
 
-// The same for a step, whose estimates, where they are gathered in quadrature, are of errors that add.
+// As above, for a step, whose estimates, where they are gathered in quadrature, are of errors that add.
 template <class W>
 inline void take_note(const Step &step, const double *y_old, const Options &o, const W &w) {
     if (!o.watched) return raise_to(w.defect, w.max_defect, w.l);
@@ -381,7 +381,7 @@ inline void take_note(const Step &step, const double *y_old, const Options &o, c
     note(step, errors, rounding, y_old, o, w);
 }
 
-// Whether the errors gathered make some invariant more uncertain than NOISE_BANDS roundings of its terms.
+// True if the errors gathered make some invariant more uncertain than NOISE_BANDS roundings of its terms.
 template <class W>
 inline auto tells_more(const W &w) {
     using Value = typename W::Value;

@@ -11,7 +11,7 @@
 
 namespace eip {
 
-// What a comparison of two values is; false as it is made.
+// Result of a comparison of two values; initialised as false.
 template <class Value>
 using Truth = decltype(std::declval<Value>() < std::declval<Value>());
 
@@ -31,7 +31,7 @@ inline Octet power(const Octet &x, double exponent) {
     return Octet::load(lanes);
 }
 
-// What the sums of sums.hpp take in place of a float or vector: an octet, whose lanes are added in the same order.
+// Operand of the sums of sums.hpp instead of a float: a vector, whose lanes are added in the same order.
 template <class Value>
 inline const Value &load_as(const Octet *a) {
     return *a;
@@ -63,13 +63,13 @@ inline Value largest(const Value *a, int64_t n) {
     return top;
 }
 
-// Whether the sum of squares is finite: of a state so large that it overflows this says no.
+// True if the sum of squares is finite: of a state so large that it overflows this says no.
 inline Mask all_finite(const Octet *a, int64_t n) {
     const Octet square = dot(a, a, n);
     return square - square == 0.0;
 }
 
-// Floats as values and back: those of eight members stand beside each other.
+// Floats as values and back: those of eight members are adjacent.
 template <class Value>
 inline Value *as_values(double *a) {
     return reinterpret_cast<Value *>(a);

@@ -10,7 +10,7 @@
 
 namespace eip {
 
-// What the schemes call; `f` and `stage` are their room.
+// Functions that the schemes call; `f` and `stage` are their buffers.
 struct Callee {
     System &system;
     const Work &work;

@@ -147,7 +147,7 @@ void rotate(Field a, ConstField b, double c, double s) {
 
 // Sums.
 
-// Those of a block or more.
+// Version for one block or more.
 template <class Term, std::size_t N>
 void sum_blocks(npy_intp floats, std::array<double, N> &total, Term part) {
     for (npy_intp begin = 0; begin < floats; begin += BLOCK) {
@@ -170,7 +170,7 @@ struct Tail {
 };
 
 // The sums over blocks of `Sums`, whose `add` takes eight floats of each field, and `sums` what a block comes to. `add`
-// is told where these floats stand, and how many of them count: fewer than eight at the end.
+// receives the position of these floats and how many of them are valid: fewer than eight at the end.
 template <class Sums, class... Fields>
 auto lane_sums(npy_intp floats, Sums begin, Fields... fields) {
     decltype(begin.sums()) total{};
@@ -208,7 +208,7 @@ struct MomentSums {
     }
 };
 
-// Of psi and f = -i H psi the sums of |psi|^2, Re(conj(psi) H psi), |H psi|^2 and |psi|^4, and of the sizes of the second
+// Sums for psi and f = -i H psi: of |psi|^2, Re(conj(psi) H psi), |H psi|^2 and |psi|^4, and of the sizes of the second
 // one's terms.
 std::array<double, 5> moments(ConstField psi, ConstField f) {
     require_one_length(psi, f);

@@ -244,7 +244,7 @@ struct Einstein {
             w3 = w * u * u;
         }
 
-        // By a column (dq, dv), what it adds to 4 phi_i + phi_j, and what it adds to Newton's accelerations.
+        // Change along a column (dq, dv): what it adds to 4 phi_i + phi_j, and what it adds to Newton's accelerations.
         void add(const double *column, double by_phi, const double *by_newton, double *out) const {
             const Three dx = body(column, i) - body(column, j), da = body(by_newton, j);
             const Three di = body(column, n + i), dj = body(column, n + j);
@@ -259,7 +259,7 @@ struct Einstein {
         }
     };
 
-    // What pulls body j towards i, as the energy has it.
+    // Force that pulls body j towards i, as in the energy.
     Three pair_force(int64_t i, int64_t j, double phi) const {
         const Three vi = body(v, i), vj = body(v, j), x = body(q, i) - body(q, j);
         const double u2 = 1.0 / dot(x, x), w = gm[i] * gm[j] * u2 * std::sqrt(u2), xi = dot(x, vi), xj = dot(x, vj);
@@ -276,7 +276,7 @@ struct Einstein {
         const double w3 = w * u * u2;
         const Three alpha = sum(3.0, va, -3.5, vb), beta = sum(3.0, vb, -3.5, va);
         const Three A = sum(1.0, cross(qa, alpha), 1.0, cross(qb, beta));
-        // By the position: d qa x alpha = -alpha x d qa, and dc = qb x d qa - qa x d qb.
+        // Derivative by the position: d qa x alpha = -alpha x d qa, and dc = qb x d qa - qa x d qb.
         by_position(out, a).add_cross(-w * u, alpha);
         by_position(out, b).add_cross(-w * u, beta);
         by_position(out, a).add_cross(-0.5 * w3 * s, qb);

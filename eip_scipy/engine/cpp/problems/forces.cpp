@@ -142,7 +142,7 @@ struct DragSlope {
     }
 };
 
-// Of a state with columns of derivatives behind it: the derivatives first, which need Newton's accelerations.
+// For a state followed by columns of derivatives: the derivatives first, which need Newton's accelerations.
 void variational(const Given<double> &g) {
     const Bodies b(g);
     const int64_t size = 6 * b.n, columns = g.n / size - 1;
@@ -269,7 +269,7 @@ struct Pair {
 
 // With w = v^2 and u = 1/r the equations give dw/du + 6 mu/c^2 w = 2 mu - 8 mu M u/c^2, linear; this is the constant of
 // its solution. For a test particle it is, to first order in 1/c^2, the known energy
-// v^2/2 - M/r + c^-2 (3/8 v^4 + 3/2 M v^2/r + M^2/(2 r^2)), but for 3/(2 c^2) (v^2/2 - M/r)^2, which is constant too.
+// v^2/2 - M/r + c^-2 (3/8 v^4 + 3/2 M v^2/r + M^2/(2 r^2)), except 3/(2 c^2) (v^2/2 - M/r)^2, which is constant too.
 void pair_energy(const Given<double> &g) {
     const Pair p(g);
     const double third = 2.0 / 3.0 * p.gm_sun;

@@ -35,7 +35,7 @@ void central(const Given<T> &g) {
     central_jacobian(g.y, g.f, g.params, g.n / 3, g.out);
 }
 
-// Of a state with columns of derivatives behind it.
+// For a state followed by columns of derivatives.
 void variational(const Given<double> &g) { newton_variational(g.y, g.params, g.p, g.n / (6 * g.p) - 1, g.out); }
 
 bool with_columns(int64_t n, int64_t p) { return p > 0 && n > 0 && n % (6 * p) == 0; }

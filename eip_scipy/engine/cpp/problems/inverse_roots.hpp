@@ -38,7 +38,7 @@ inline Octet over_root(const Octet &x) {
     return out;
 }
 
-// Of x^-3/2 what the two bodies of a pair share: y and y^2 for y near x^-1/2, h = 1 - x y^2, and 3/2 + 15/8 h.
+// Parts of x^-3/2 shared by the two bodies of a pair: y and y^2 for y near x^-1/2, h = 1 - x y^2, and 3/2 + 15/8 h.
 struct Cube {
     Octet y, y2, h, p;
 

@@ -189,7 +189,7 @@ inline void add_sources(const double *q, const double *gm, const Octet *own, int
     for (int c = 0; c < 3; ++c) sums[c] = multiply_add(w, d[c], sums[c]);
 }
 
-// Accelerations of the bodies `first` to first + TARGETS - 1; with APART also their pulls but for those of the first body.
+// Accelerations of the bodies `first` to first + TARGETS - 1; with APART also their pulls except those of the first body.
 template <bool APART, int TARGETS>
 inline void accelerate_block(const double *q, const double *gm, int64_t n, int64_t first, double *out, double *pulls) {
     constexpr int STREAMS = LANES / TARGETS;
@@ -247,7 +247,7 @@ struct LastTwo {
         w[t] = reaction.part[0];
     }
 
-    // Adds what is left, and stores both accelerations, or their pulls but for those of the first body.
+    // Adds the rest, and stores both accelerations, or their pulls except those of the first body.
     template <bool APART>
     void store(int64_t first, double *out) const {
         Vector streams[6];
@@ -356,14 +356,14 @@ inline void accelerate_all(const double *q, const double *gm, int64_t n, double 
     accelerate_all<false>(q, gm, n, out, nullptr);
 }
 
-// The same, bit for bit; and pulls (3 n): of the first body its acceleration, of any other body the pulls of all but the first,
+// As above, bit for bit; and pulls (3 n): for the first body its acceleration, for any other body the pulls of all but the first,
 // plus the acceleration of the first body by this one. The difference of both is what perturbs the motion about the first body.
 [[gnu::flatten, gnu::noinline]] inline void accelerate_apart(const double *q, const double *gm, int64_t n, double *out,
                                                              double *pulls) {
     accelerate_all<true>(q, gm, n, out, pulls);
 }
 
-// Where the bodies begin whose sources `accelerate` takes in streams, and the number of streams.
+// Index of the first body whose sources `accelerate` takes in streams, and the number of streams.
 struct Streams {
     int64_t first, count;
 
@@ -387,7 +387,7 @@ inline Octet difference(const Octet *q, int64_t i, int64_t j, Octet *d) {
     return multiply_add(d[2], d[2], multiply_add(d[1], d[1], d[0] * d[0]));
 }
 
-// The same for eight members: every pair once, sums in the same order. Bodies that one state leaves to its last block get
+// As above, for eight members: every pair once, sums in the same order. Bodies that one state leaves to its last block get
 // their sums in streams: those of body i stand in `sums` from 3 streams (i - first) on.
 inline void accelerate(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
     if (n < 4) return accelerate_few(q, gm, n, out);
@@ -502,7 +502,7 @@ inline T energy_of_few(const T *y, const T *gm, int64_t n) {
     return total;
 }
 
-// The same for eight members: the bodies' energies added as one state adds its lanes.
+// As above, for eight members: the bodies' energies added as one state adds its lanes.
 inline Carried energy_of_body(const Octet *y, const Octet *gm, int64_t n, int64_t i) {
     Carried square, potential;
     for (int64_t j = i + 1; j < n; ++j) {

@@ -135,7 +135,7 @@ void energy_rate(const Given<double> &g) {
     });
 }
 
-// The same by the pulls of `accelerate_apart` in the place of f: nothing large cancels.
+// As above, by the pulls of `accelerate_apart` instead of f: nothing large cancels.
 void energy_rate_by_pulls(const Given<double> &g) {
     const Planets p(g);
     p.each([&](int64_t k) { p.put(p.relative(p.v, k).dot(p.relative(g.f, k)), k); });
