@@ -267,8 +267,7 @@ FIELDS = {
 FORMS = [(name, form) for name in FIELDS for form in ("canonical", "velocity") if name not in ("varying", "numbers")]
 FORMS += [("varying", "velocity"), ("numbers", "velocity")]
 INTERPRETED = [(*pair, False) for pair in FORMS[4:]]  # the first are compiled wherever Numba is
-# Each compiles for seconds: in the gate one whose Jacobian is computed, and one that varies.
-GATE = ("potentials", "canonical"), ("varying", "velocity")
+GATE = [("varying", "velocity")]  # each compiles for seconds
 COMPILED = [
     pytest.param(*pair, True, marks=[pytest.mark.needs_jit, pytest.mark.slow, *([] if pair in GATE else [NIGHTLY])])
     for pair in FORMS[:-1]
