@@ -576,8 +576,6 @@ def test_fit_of_an_orbit(kepler):
         assert fit.jacobian(x)[:, k] == pytest.approx(slope, rel=1e-5, abs=1e-5 * np.abs(slope).max())
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
 def test_fit_of_state_and_parameter(pendulum):
     t = np.array([0.0, 0.5, 0.5, 1.5, 3.0])  # two of the data at one time
     data = integrate(pendulum, (0, 3), [1.0, 0.2], params={"k": 1.3}, t_eval=np.unique(t), **FINE).y[:, [0, 1, 1, 2, 3]]
