@@ -27,16 +27,16 @@ def assert_output(found, printed):
 
 PAGES = (
     "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/rebound-and-astropy",
-    "tutorials/pdes", "tutorials/own-pde", "tutorials/ensembles", "how-to/recommend", "how-to/find-invariants",
+    "tutorials/pdes", "tutorials/own-pde", "tutorials/ensembles", "how-to/find-invariants",
     "how-to/variable-steps", "how-to/tables-figures-files", "how-to/checkpoints", "how-to/multistep",
     "how-to/own-methods", "how-to/consistent-starts", "how-to/gradients", "how-to/mechanisms",
     "how-to/pydy",
 )  # fmt: skip
 NEEDED = {"docs/how-to/gradients.md": ("jax", "torch"), "docs/how-to/pydy.md": ("pydy",)}
-# Ten seconds and more each, for what tests of the same methods show in less.
+# These take six seconds or more each; quicker tests of the same methods run in the gate.
 NIGHTLY = (
     "results/hard-scenes", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h",
-    "how-to/balances", "how-to/tangent-maps", "how-to/stiff-systems",
+    "how-to/balances", "how-to/tangent-maps", "how-to/stiff-systems", "how-to/recommend",
 )  # fmt: skip
 
 
