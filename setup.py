@@ -144,6 +144,8 @@ class Build(build_ext):
             if TARGET.system == "win32":  # keeps the import library, which nothing links, out of the package
                 library = Path(self.build_temp, f"{ext.name}.lib")
                 ext.extra_link_args = [*ext.extra_link_args, f"-Wl,--out-implib,{library}"]
+            if TARGET.system == "darwin" and TARGET.headers:  # not the path that it was linked at
+                ext.extra_link_args = [*ext.extra_link_args, f"-Wl,-install_name,{ext.name}"]
             super().build_extension(ext)
         except Exception as error:
             raise SystemExit(f"{MISSING}\nWhat the build said: {error}") from error

@@ -19,7 +19,7 @@ from eip_scipy.engine.native import BUILD
 from eip_scipy.problems import kepler, solar_system, soliton
 from eip_scipy.run.view import page
 
-MEGABYTES = 5
+MEGABYTES = 6  # builds by zig contain their C++ library; building/wheels.py limits the size of the wheel itself
 # Of the defects; without projection those of the first example are 9e-5.
 BOUND = 1e-11
 

@@ -165,7 +165,10 @@ def need(module: Path, platform: str) -> str:
 def libraries(binary: lief.Binary) -> Iterator[str]:
     """Yield the libraries that a module is linked with."""
     for library in binary.imports if isinstance(binary, lief.PE.Binary) else binary.libraries:
-        yield library if isinstance(library, str) else library.name
+        if isinstance(library, str):
+            yield library
+        elif getattr(library, "command", None) != lief.MachO.LoadCommand.TYPE.ID_DYLIB:  # a module's own name
+            yield library.name
 
 
 def newest_symbol(binary: lief.ELF.Binary, module: Path, platform: str) -> str:
@@ -182,9 +185,10 @@ def newest_symbol(binary: lief.ELF.Binary, module: Path, platform: str) -> str:
 
 
 def sought(binary: lief.MachO.Binary) -> Iterator[str]:
-    """Yield the symbols that have no library and are looked up in the process, as Python's are."""
+    """Yield the symbols of no library, which are looked up in the process, as Python's are."""
+    own = {symbol.name for symbol in binary.symbols if symbol.numberof_sections}
     for binding in binary.bindings:
-        if binding.has_symbol and not binding.has_library:
+        if binding.has_symbol and not binding.has_library and binding.symbol.name not in own:
             yield binding.symbol.name
 
 
@@ -195,6 +199,7 @@ def main() -> None:
     parser.add_argument("--to", type=Path, default=Path("dist"), metavar="FOLDER", help="folder (default: dist)")
     parser.add_argument("--cache", type=Path, default=ROOT / "build" / "headers", help="folder for headers and sources")
     options = parser.parse_args()
+    lief.logging.disable()
     for folder in (options.to, options.cache):
         folder.mkdir(parents=True, exist_ok=True)
     to, cache = options.to.resolve(), options.cache.resolve()

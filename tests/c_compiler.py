@@ -1,16 +1,26 @@
-"""The C compiler that builds the package, for tests of C functions."""
+"""The C compiler for tests of C functions: the one that builds the package, or that of the package ziglang."""
 
 import os
 import shlex
+import shutil
 import subprocess
+import sys
 import sysconfig
+from importlib.util import find_spec
+
+import pytest
 
 FLAGS = ["-O2", "-ffp-contract=off", "-shared", "-fPIC"]
 
 
 def compiler():
-    """The words of its command."""
-    return shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC"))
+    """Return the words of its command. Skip the test if there is no compiler."""
+    command = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
+    if shutil.which(command[0]):
+        return command
+    if find_spec("ziglang"):
+        return [sys.executable, "-m", "ziglang", "cc"]
+    pytest.skip(f"there is no C compiler here, neither {command[0]} nor ziglang: python -m pip install ziglang")
 
 
 def shared_library(path, *sources):

@@ -15,7 +15,6 @@ from test_docs import ROOT, assert_output
 PAGE = (ROOT / "docs/tutorials/c-functions.md").read_text(encoding="utf-8")
 BUILD = re.compile(r"^```console\n\$ (.*)\n```$", re.MULTILINE)
 PRINTED = re.compile(r"^```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-COMMANDS = {"cc": compiler(), "cythonize": [sys.executable, "-m", "Cython.Build.Cythonize"]}
 
 
 @pytest.mark.parametrize(
@@ -25,8 +24,9 @@ COMMANDS = {"cc": compiler(), "cythonize": [sys.executable, "-m", "Cython.Build.
 def test_example(k, script, tmp_path):
     shutil.copytree(ROOT / "examples" / "c-functions", tmp_path, dirs_exist_ok=True)
     first, *rest = shlex.split(BUILD.findall(PAGE)[k])
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    subprocess.run([*COMMANDS[first], *rest], cwd=tmp_path, check=True, capture_output=True)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)]), "CC": shlex.join(compiler())}
+    command = {"cc": compiler(), "cythonize": [sys.executable, "-m", "Cython.Build.Cythonize"]}[first]
+    subprocess.run([*command, *rest], cwd=tmp_path, env=environment, check=True, capture_output=True)
     ran = [sys.executable, "-W", "error", script]
     found = subprocess.run(ran, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert found.stderr == ""
